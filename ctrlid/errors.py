@@ -1,0 +1,13 @@
+"""What ctrlid says when it refuses or is in doubt."""
+
+
+class CtrlidError(ValueError):
+    """A refusal: what was given, what is needed, and what to do about it.
+
+    Every refusal of ctrlid is one of these. It is a `ValueError` too, so that scripts which guard
+    python-control calls with ``except ValueError`` guard ctrlid calls as well.
+    """
+
+
+class CtrlidWarning(UserWarning):
+    """A result that stands, but on ground the user should look at first."""
