@@ -10,6 +10,7 @@ with the original function afterwards.
 
 import builtins
 import functools
+import inspect
 import math
 import sys
 import types
@@ -190,7 +191,8 @@ def _elementwise(op: Function) -> Function:
     """Lift a function of casadi scalars to numpy arrays of symbols."""
 
     def apply(*args: Any, **kwargs: Any) -> Any:
-        kwargs.pop("out", None)
+        target = kwargs.pop("out", None)
+        target = target[0] if isinstance(target, tuple) else target
         names = {"a_min": "low", "a_max": "high", "min": "low", "max": "high", "decimals": "digits"}
         named = {names.get(key, key): _lift(value) for key, value in kwargs.items()}
         arrays = [np.asarray(_boxed(a), dtype=object) for a in args]
@@ -199,6 +201,9 @@ def _elementwise(op: Function) -> Function:
         out = np.empty(math.prod(shape), dtype=object)
         for k in range(out.size):
             out[k] = Symbol(op(*(_lift(a[k]) for a in flat), **named))
+        if target is not None:  # x += 1 and np.sin(x, out=y)
+            target[...] = out.reshape(shape)
+            return target
         return out.reshape(shape).view(Symbols) if shape else out[0]
 
     return apply
@@ -213,12 +218,7 @@ class Symbols(np.ndarray):  # type: ignore[type-arg]
         if method == "reduce" and ufunc.__name__ in ("maximum", "minimum"):
             return functools.reduce(_elementwise(ELEMENTWISE[ufunc.__name__]), plain[0].ravel())
         if method == "__call__" and op is not None:
-            out = kwargs.pop("out", None)
-            result = _elementwise(op)(*plain)
-            if out is None:
-                return result
-            out[0][...] = result  # x += 1 and np.sin(x, out=y)
-            return out[0]
+            return _elementwise(op)(*plain, out=kwargs.get("out"))
         result = getattr(ufunc, method)(*plain, **kwargs)
         return result.view(Symbols) if isinstance(result, np.ndarray) else result
 
@@ -294,7 +294,21 @@ class _Module:
     def __getattr__(self, name: str) -> Any:
         if name in self._table:
             return self._table[name]
-        return _replace(getattr(self._module, name), {})
+        found = getattr(self._module, name)
+        if self._module is np and inspect.isroutine(found):
+            return _keeping_symbols(found)
+        return _replace(found, {})
+
+
+def _keeping_symbols(function: Function) -> Function:
+    """numpy's function, whose arrays of symbols stay arrays of symbols (hstack, diff, ...)."""
+
+    @functools.wraps(function, updated=())
+    def call(*args: Any, **kwargs: Any) -> Any:
+        result = function(*args, **kwargs)
+        return result.view(Symbols) if _has_symbols(result) and np.ndim(result) else result
+
+    return call
 
 
 class _Instance:

@@ -1,0 +1,158 @@
+"""Operating points and linear models against physics known by hand."""
+
+import control as ct
+import numpy as np
+import pytest
+
+import ctrlid as cid
+from ctrlid import CtrlidError
+
+RNG = np.random.default_rng(11)
+MAGLEVS = [
+    (RNG.uniform(0.01, 0.1), RNG.uniform(0.005, 0.02), RNG.uniform(1, 10)) for _ in range(40)
+]
+
+
+def maglev(mass, gap, voltage):
+    return cid.plants.maglev(m=mass, K=mass * 9.81 * gap**2 / voltage**2)
+
+
+@pytest.mark.parametrize(("mass", "gap", "voltage"), MAGLEVS)
+def test_maglev_operating_point_and_poles(mass, gap, voltage):
+    plant = maglev(mass, gap, voltage)
+    op = cid.operating_point(plant, output=gap)
+    assert op.input == pytest.approx(voltage, rel=1e-13)
+    assert op.states == (pytest.approx(gap, rel=1e-15), 0.0)
+    assert all(isinstance(v, float) for v in (*op.states, op.input, op.output))
+    P = cid.linearize(plant, op)
+    assert P.num[0][0].size == 1
+    assert P.num[0][0][0] == pytest.approx(-2 * 9.81 / voltage, rel=1e-12)
+    np.testing.assert_allclose(P.den[0][0], [1, 0, -2 * 9.81 / gap], rtol=1e-12)
+    assert P.den[0][0][1] == 0.0
+
+
+def test_linearize_equals_finite_differences_of_python_control():
+    plant = cid.plants.pendulum(m=0.2, length=0.5, c=0.01)
+    op = cid.operating_point(plant, output=0.3)
+    reference = ct.tf(ct.linearize(plant, op.states, op.input))
+    omega = np.array([0.1, 3.0, 40.0])
+    np.testing.assert_allclose(
+        cid.linearize(plant, op)(1j * omega), reference(1j * omega), rtol=1e-5
+    )
+
+
+def test_tank_has_its_time_constant():
+    plant = cid.plants.tank(area=0.01, outlet=1e-5, k=1e-5)
+    op = cid.operating_point(plant, output=0.2)
+    assert op.input == pytest.approx(np.sqrt(2 * 9.81 * 0.2))
+    pole = cid.linearize(plant, op).poles()[0].real
+    assert pole == pytest.approx(-1e-5 / 0.01 * np.sqrt(9.81 / (2 * 0.2)))
+
+
+def test_servo_keeps_its_pole_at_the_origin():
+    plant = cid.plants.servo(m=2.0, c=3.0, k=4.0)
+    P = cid.linearize(plant, cid.operating_point(plant, output=0.5))
+    np.testing.assert_array_equal(P.den[0][0], [1.0, 1.5, 0.0])
+    np.testing.assert_array_equal(P.num[0][0], [2.0])
+
+
+@pytest.mark.parametrize(
+    ("plant", "output", "words"),
+    [
+        (cid.plants.maglev(m=0.02, K=3e-6), -0.01, "maglev has no equilibrium with x = -0.01"),
+        (cid.plants.maglev(m=0.02, K=3e-6), 0.0, "no states and input V hold it there"),
+        (cid.plants.tank(area=0.01, outlet=1e-5, k=1e-5), -0.2, "inside the plant's range"),
+        (cid.plants.maglev(m=0.02, K=3e-6), np.nan, "output must be a finite number"),
+    ],
+)
+def test_unreachable_outputs_are_refused(plant, output, words):
+    with pytest.raises(CtrlidError, match=words):
+        cid.operating_point(plant, output=output)
+
+
+def two_signs(t, x, u, params):
+    return [x[1], u[0] ** 2 - 4 * x[0]]
+
+
+def test_smallest_non_negative_input_of_several_equilibria():
+    plant = ct.nlsys(two_signs, lambda t, x, u, p: x[0], inputs=1, outputs=1, states=2, name="sq")
+    assert cid.operating_point(plant, output=1.0).input == pytest.approx(2.0)
+    only_negative = ct.nlsys(
+        lambda t, x, u, p: [u[0] + x[0]], None, inputs=1, outputs=1, states=1, name="neg"
+    )
+    assert cid.operating_point(only_negative, output=3.0).input == pytest.approx(-3.0)
+
+
+def test_guess_chooses_among_equilibria():
+    plant = ct.nlsys(
+        lambda t, x, u, p: [x[0] - x[1], u[0] - np.sin(x[0])], lambda t, x, u, p: np.sin(x[1]),
+        inputs=1, outputs=1, states=2, name="waves",
+    )  # fmt: skip
+    near = cid.operating_point(plant, output=0.5, guess=(6.8, 6.8))
+    assert near.states[0] == pytest.approx(np.pi / 6 + 2 * np.pi)
+    again = cid.operating_point(plant, output=0.5, guess=near)
+    assert again.states == pytest.approx(near.states)
+    with pytest.raises(CtrlidError, match="guess needs 2 states; given 1"):
+        cid.operating_point(plant, output=0.5, guess=(1.0,))
+
+
+def test_discrete_plants_rest_and_linearize():
+    plant = ct.nlsys(
+        lambda t, x, u, p: [0.5 * x[0] + u[0] ** 3], lambda t, x, u, p: x[0],
+        inputs=1, outputs=1, states=1, dt=0.1, name="steps",
+    )  # fmt: skip
+    op = cid.operating_point(plant, output=2.0)
+    assert op.input == pytest.approx(1.0)
+    P = cid.linearize(plant, op)
+    assert P.dt == 0.1
+    np.testing.assert_allclose(np.r_[P.num[0][0], P.den[0][0]], [3.0, 1.0, -0.5])
+
+
+def test_only_unreachable_or_unobservable_states_are_removed():
+    at = cid.OperatingPoint((0.0, 0.0, 0.0), 0.0, 0.0)
+    weak = ct.ss([[1, 0, 0], [0, -2, 1], [0, 0, -3]], [[1], [0], [1e-9]], [[1, 1e-9, 0]], 0)
+    assert len(cid.linearize(weak, at).poles()) == 3
+    cut = ct.ss([[1, 0, 0], [0, -2, 1], [0, 0, -3]], [[1], [0], [0]], [[1, 1e-9, 0]], 0)
+    np.testing.assert_allclose(cid.linearize(cut, at).poles(), [1.0])
+    turn = np.random.default_rng(0).standard_normal((3, 3))
+    back = np.linalg.inv(turn)
+    hidden = ct.ss(
+        turn @ np.diag([1, -2, -3]) @ back, turn @ [[1], [1], [0.0]], np.array([[1, 0, 1.0]]) @ back, 0
+    )
+    np.testing.assert_allclose(cid.linearize(hidden, at).poles(), [1.0], rtol=1e-9)
+    static = ct.ss([[-1.0]], [[0.0]], [[1.0]], [[2.0]])
+    assert cid.linearize(static, cid.OperatingPoint((0.0,), 0, 0)).num[0][0] == [2.0]
+
+
+def test_what_linearize_refuses():
+    plant = cid.plants.maglev(m=0.02, K=3e-6)
+    with pytest.raises(CtrlidError, match="needs an OperatingPoint"):
+        cid.linearize(plant, (0.01, 0.0))
+    with pytest.raises(CtrlidError, match="has 1 states .* maglev has 2: x, v"):
+        cid.linearize(plant, cid.OperatingPoint((0.01,), 3.0, 0.01))
+    with pytest.raises(CtrlidError, match="has no derivative"):
+        cid.linearize(plant, cid.OperatingPoint((-0.01, 0.0), 3.0, -0.01))
+    two = ct.ss(-np.eye(2), np.eye(2), np.eye(2), np.zeros((2, 2)))
+    with pytest.raises(CtrlidError, match="one input and one output"):
+        cid.linearize(two, cid.OperatingPoint((0, 0), 0, 0))
+
+
+def test_operating_point_checks_its_numbers():
+    with pytest.raises(CtrlidError, match="must be finite"):
+        cid.OperatingPoint((0.01, np.inf), 1.0, 0.01)
+    with pytest.raises(CtrlidError, match="given by numbers"):
+        cid.OperatingPoint(("a",), 1.0, 0.01)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: cid.plants.maglev(m=-1, K=1e-6), r"maglev needs m > 0 in SI units; given m=-1"),
+        (lambda: cid.plants.servo(m=1, c=-1, k=1), "servo needs c >= 0"),
+        (lambda: cid.plants.tank(area=0, outlet=1, k=1), "tank needs area > 0"),
+        (lambda: cid.plants.pendulum(m=1, length=1, c=np.nan), "pendulum needs c >= 0"),
+    ],
+)
+def test_plants_refuse_unphysical_parameters(make, words):
+    with pytest.raises(CtrlidError, match=words):
+        make()
