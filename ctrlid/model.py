@@ -299,17 +299,17 @@ def _report(e: Estimate) -> str:
 def _bad_news(e: Estimate) -> list[str]:
     news = [
         f"  {bound.quantity} SITS ON ITS BOUND {bound.bound:.10g}: without {bound.constraint} "
-        f"the data would take it to {bound.free:.7g}. An active bound is a symptom, not a cure: look for "
-        "noise fed back through the controller, a sampling period that is too short, or a "
-        "constraint that does not hold."
+        f"the data would take it to {bound.free:.7g}. An active bound is a symptom, not a cure: "
+        "look for noise fed back through the controller, a sampling period that is too short, or "
+        "a constraint that does not hold."
         for bound in e.active_bounds
     ]
     z = e.poles
     for k in range(len(z) - 1):
-        if e.active_bounds and np.any(np.abs(z[k + 1 :] - z[k]) < 1e-12):
-            where = f"z = {_text.number(z[k])}" if e.structure.domain == "z" else f"s = {z[k]:g}"
-            news.append(f"  TWO POLES MERGE at {where}.")
-    unstable = np.abs(z) > 1 if e.structure.domain == "z" else z.real > 0
+        if e.active_bounds and np.any(np.abs(z[k + 1 :] - z[k]) < 1e-6):
+            news.append(f"  TWO POLES MERGE at {e.structure.domain} = {_text.number(z[k])}.")
+    # A merged pair at the edge is known to half the digits only.
+    unstable = np.abs(z) > 1 + 1e-9 if e.structure.domain == "z" else z.real > 0
     if not unstable.any():
         edge = "OUTSIDE THE UNIT CIRCLE" if e.structure.domain == "z" else "IN THE RIGHT HALF PLANE"
         news.append(f"  NO POLE {edge}.")

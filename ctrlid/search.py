@@ -103,8 +103,10 @@ def _why_none(constraints: Sequence[AbstractConstraint], structure: Structure) -
 def _active_bound(solution: Solution, i: int) -> ActiveBound:
     row, weights = solution.rows.rows[i], solution.rows.weights[i]
     value = float(weights @ solution.theta)
-    bound = row.upper if abs(value - row.upper) <= abs(value - row.lower) else row.lower
-    free = float(weights @ solution.free_theta)
+    above = abs(value - solution.rows.upper[i]) <= abs(value - solution.rows.lower[i])
+    bound = row.upper if above else row.lower
+    # The difference, since the row of a function is its linearisation at the solution.
+    free = bound + float(weights @ (solution.free_theta - solution.theta))
     return ActiveBound(repr(row), solution.rows.owners[i], row.quantity, bound, free)
 
 
