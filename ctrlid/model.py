@@ -95,7 +95,7 @@ class ActiveBound:
     bound : float
         The value it is held at.
     free : float
-        The value it would take if no inequality held it back.
+        The value it would take if no inequality held it back; NaN where that is not known.
     """
 
     row: str
@@ -297,17 +297,22 @@ def _report(e: Estimate) -> str:
 
 
 def _bad_news(e: Estimate) -> list[str]:
-    news = [
-        f"  {bound.quantity} SITS ON ITS BOUND {bound.bound:.10g}: without {bound.constraint} "
-        f"the data would take it to {bound.free:.7g}. An active bound is a symptom, not a cure: "
-        "look for noise fed back through the controller, a sampling period that is too short, or "
-        "a constraint that does not hold."
-        for bound in e.active_bounds
-    ]
+    news = []
+    for bound in e.active_bounds:
+        free = f": without {bound.constraint} the data would take it to {bound.free:.7g}"
+        news.append(
+            f"  {bound.quantity} SITS ON ITS BOUND {bound.bound:.10g}"
+            f"{free if np.isfinite(bound.free) else ''}. An active bound is a symptom, not a "
+            "cure: look for noise fed back through the controller, a sampling period that is "
+            "too short, or a constraint that does not hold."
+        )
     z = e.poles
-    for k in range(len(z) - 1):
-        if e.active_bounds and np.any(np.abs(z[k + 1 :] - z[k]) < 1e-6):
-            news.append(f"  TWO POLES MERGE at {e.structure.domain} = {_text.number(z[k])}.")
+    merged = [
+        f"  TWO POLES MERGE at {e.structure.domain} = {_text.number(z[k])}."
+        for k in range(len(z) - 1)
+        if e.active_bounds and np.any(np.abs(z[k + 1 :] - z[k]) < 1e-6)
+    ]
+    news += merged
     # A merged pair at the edge is known to half the digits only.
     unstable = np.abs(z) > 1 + 1e-9 if e.structure.domain == "z" else z.real > 0
     if not unstable.any():

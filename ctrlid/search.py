@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from . import _text
-from .cases import Case, Infeasible, Rows, cases, explain_conflict, forced, possible
+from .cases import Case, Infeasible, Rows, cases, eliminate, explain_conflict, forced, possible
 from .constraints import AbstractConstraint
 from .errors import CtrlidError
 from .model import ActiveBound, Structure
@@ -36,6 +36,16 @@ class Found:
     active_bounds: tuple[ActiveBound, ...]
     branch: str
     solver: str
+
+
+@dataclass(frozen=True, eq=False)
+class _Candidate:
+    """Minimum of one case, the directions it cannot move in, its label, and an end it sits on."""
+
+    solution: Solution
+    normals: FloatArray
+    label: str
+    edge: tuple[ActiveBound, ...] = ()
 
 
 def minimize(cost: Cost, constraints: Sequence[AbstractConstraint], structure: Structure) -> Found:
@@ -65,28 +75,32 @@ def minimize(cost: Cost, constraints: Sequence[AbstractConstraint], structure: S
     NotExcited
         If data and constraints together leave a combination of coefficients free.
     """
-    best: tuple[Solution, FloatArray, str] | None = None
-    tried = cases(constraints, structure)
-    for case in tried:
+    best: _Candidate | None = None
+    for case in cases(constraints, structure):
         try:
             if forced(case.rows, case.nonzero):
                 continue
-            limit = np.inf if best is None else best[0].cost
-            solution, normals, label = _solve_case(cost, case, limit)
+            limit = np.inf if best is None else best.solution.cost
+            candidate = _solve_case(cost, case, limit)
         except Infeasible:
             continue
-        if best is None or solution.cost < best[0].cost:
-            best = solution, normals, label
+        if candidate.solution.cost < limit:
+            best = candidate
     if best is None:
         raise CtrlidError(_why_none(constraints, structure))
-    solution, normals, label = best
-    covariance, condition = spread(cost, normals)
-    bounds = tuple(_active_bound(solution, i) for i in solution.active)
-    free = (
-        len(cost.origin) - int(np.linalg.matrix_rank(normals)) if len(normals) else len(cost.origin)
-    )
+    solution = best.solution
+    covariance, condition = spread(cost, best.normals)
+    bounds = tuple(_active_bound(solution, i) for i in solution.active) + best.edge
+    free = len(cost.origin) - len(eliminate(best.normals, np.zeros(len(best.normals))).pivots)
     return Found(
-        solution.theta, solution.cost, covariance, free, condition, bounds, label, solution.solver
+        solution.theta,
+        solution.cost,
+        covariance,
+        free,
+        condition,
+        bounds,
+        best.label,
+        solution.solver,
     )
 
 
@@ -110,21 +124,27 @@ def _active_bound(solution: Solution, i: int) -> ActiveBound:
     return ActiveBound(repr(row), solution.rows.owners[i], row.quantity, bound, free)
 
 
-def _solve_case(cost: Cost, case: Case, limit: float) -> tuple[Solution, FloatArray, str]:
-    """Minimum of one case, the directions it cannot move in, and its label."""
+def _solve_case(cost: Cost, case: Case, limit: float) -> _Candidate:
+    label = ", ".join(case.labels)
     if case.family is None:
-        label = ", ".join(case.labels)
         if case.functions:
-            return *solve_nonlinear(cost, case.rows, case.functions), label
+            return _Candidate(*solve_nonlinear(cost, case.rows, case.functions), label)
         solution = solve(cost, case.rows, below=limit)
-        return solution, solution.normals, label
+        return _Candidate(solution, solution.normals, label)
+    owner, _, branch = case.family
     if case.functions:
         raise CtrlidError(
-            f"{case.family[0]} searches for a free number in this model and cannot be combined "
-            f"with {case.functions[0][0]}: write both as functions of one Nonlinear."
+            f"{owner} searches for a free number in this model and cannot be combined with "
+            f"{case.functions[0][0]}: write both as functions of one Nonlinear."
         )
     x, solution, normals = _search(cost, case)
-    return solution, normals, ", ".join([*case.labels, f"{case.family[2].label} = {x:.7g}"])
+    end = f"{branch.label} = {x:.7g}"
+    edge = (ActiveBound(end, owner, branch.label, x, np.nan),) if x in _ends(case) else ()
+    return _Candidate(solution, normals, ", ".join(filter(None, [label, end])), edge)
+
+
+def _ends(case: Case) -> tuple[float, float]:
+    return float(case.grid[0]), float(case.grid[-1])
 
 
 def _search(cost: Cost, case: Case) -> tuple[float, Solution, FloatArray]:
@@ -153,12 +173,10 @@ def _search(cost: Cost, case: Case) -> tuple[float, Solution, FloatArray]:
             x, at_x = float(inside.x), float(inside.fun)
         if at_x < best_value:
             best_x, best_value = x, at_x
-    return _finish(cost, case, best_x, (float(grid[0]), float(grid[-1])))
+    return _finish(cost, case, best_x)
 
 
-def _finish(
-    cost: Cost, case: Case, x: float, ends: tuple[float, float]
-) -> tuple[float, Solution, FloatArray]:
+def _finish(cost: Cost, case: Case, x: float) -> tuple[float, Solution, FloatArray]:
     """Newton steps on coefficients and the family's number together.
 
     A line search in x stops at half the digits of x. To first order the family lets its rows move
@@ -167,6 +185,7 @@ def _finish(
     """
     solution = solve(cost, case.at(x))
     fixed = len(case.rows.lower)
+    ends = _ends(case)
     for _ in range(8):
         rows = case.at(x)
         step = 1e-6 * max(abs(x), 1e-3)
@@ -198,6 +217,7 @@ def _finish(
         fixed:
     ]
     loose = _loosen(rows, fixed, slope)
+    solution = replace(solution, free_theta=solve(cost, loose).free_theta)
     active = rows.weights[list(solution.active)]
     return x, solution, np.vstack([loose.weights[loose.equality], active])
 
