@@ -39,7 +39,8 @@ class _Functions:
                     continue
                 value = np.atleast_1d(np.asarray(function(theta.copy()), dtype=float)).ravel()
                 values.append(value)
-                name = getattr(function, "__name__", kind)
+                name = getattr(function, "__name__", "<lambda>")
+                name = kind if name == "<lambda>" else name
                 words += [(owner, f"{name}(theta)")] * len(value)
                 count += len(value) * (kind == "equality")
         return np.concatenate(values), count, words
