@@ -8,16 +8,17 @@ from typing import Any
 import control as ct
 import numpy as np
 
-from ._rational import Rational, closed_loop, is_stable, rational, to_s
+from ._rational import Rational, closed_loop, is_stable, rational, resolved, to_s
 from .errors import CtrlidError
-from .margins import Margins, loop_margins
+from .margins import gain_crossovers, modulus_margin
 
 # Less phase than this (radians) is none: the answer is a pure gain.
 NO_PHASE = 1e-10
 # The family of leads, as shares of its parameter's range; dense at both ends: some are stable
 # only there.
 FAMILY = tuple(0.5 * (1 - np.cos(np.linspace(0, np.pi, 203)[1:-1])))
-COARSE_FAMILY = FAMILY[::12]
+LOST = "with any margin a lead gives at this crossover, the loop is unstable"
+COARSE_FAMILY = (0.5, *FAMILY[::16])
 
 
 @dataclass(frozen=True)
@@ -75,12 +76,17 @@ class _Task:
         poles = closed_loop(controller * self.plant)
         return poles is not None and is_stable(poles, self.plant.dt)
 
-    def holds(self, margins: Margins) -> bool:
-        """Tell whether crossover and margin are the ones asked for."""
-        return (
-            margins.stable
-            and math.isclose(margins.crossover, self.crossover, rel_tol=1e-8)
-            and math.isclose(margins.phase_margin, self.phase_margin, rel_tol=1e-7)
+    def weakest(self, controller: Rational) -> tuple[float, float]:
+        """Return the crossover with the smallest margin, rad/s, and that margin in degrees."""
+        found = gain_crossovers(controller * self.plant)
+        omega, angle = min(found, key=lambda pair: abs(pair[1]), default=(math.nan, math.nan))
+        return omega, math.degrees(abs(angle))
+
+    def holds(self, crossover: float, phase_margin: float) -> bool:
+        """Tell whether these are what is asked for, to the accuracy of the plant."""
+        accuracy = max(1e-9, 100 * max(self.plant.rounding(self.crossover)))
+        return math.isclose(crossover, self.crossover, rel_tol=accuracy) and math.isclose(
+            phase_margin, self.phase_margin, rel_tol=accuracy
         )
 
 
@@ -166,7 +172,11 @@ def design_lead(P: Any, crossover: float, phase_margin: float) -> Any:
 
     task = _Task(plant, crossover, phase_margin)
     sign = task.sign()
-    found = _why_not_the_phase(task) if sign is None else _best(task, sign)
+    found = _why_not_the_phase(task, (1, -1)) if sign is None else _best(task, sign)
+    if isinstance(found, str) and sign is not None:
+        other = _why_not_the_phase(task, (-sign,))
+        if LOST not in other:
+            found = f"{found} With a gain of the other sign: {other}"
     if isinstance(found, str):
         raise CtrlidError(f"{found} {_which_crossovers(task)}")
     return ct.tf(found.num, found.den, plant.dt, name="lead", inputs=["e"], outputs=["u"])
@@ -191,82 +201,69 @@ def _check_plant(plant: Rational, crossover: float) -> None:
                 f"cancelled by a zero, so no controller can reach it; if both are rounding "
                 f"errors, remove them, for example with P.minreal()."
             )
-    num, den = plant.parts(crossover)
-    point = np.exp(1j * crossover * plant.dt) if plant.dt else 1j * crossover
-    for value, coefficients, word in ((num, plant.num, "zero"), (den, plant.den, "infinite")):
-        # parts() divides by s**order above 1 rad/s; compare like with like.
-        size = float(np.polyval(np.abs(coefficients), abs(point)))
-        if not plant.dt and crossover > 1:
-            size /= crossover**plant.order
-        if abs(complex(value)) <= 1e-12 * size:
+    for error, word in zip(plant.rounding(crossover), ("zero", "infinite"), strict=True):
+        if error > 1e-4:
             raise CtrlidError(
-                f"P is {word} at the crossover {crossover:g} rad/s, so no compensator gives a gain "
-                f"of 1 there; choose another crossover."
+                f"P is {word} at the crossover {crossover:g} rad/s, at least to the accuracy of "
+                f"its coefficients, so no compensator gives a gain of 1 there; choose another one."
             )
 
 
 def _root(value: complex) -> str:
-    return f"{value.real:.4g}" if abs(value.imag) < 1e-9 * abs(value) else f"{value:.4g}"
+    return f"{value.real:.4g}" if abs(value.imag) <= 1e-9 * abs(value) else f"{value:.4g}"
 
 
-def _candidates(task: _Task, sign: int, family: tuple[float, ...]) -> Iterator[Rational]:
-    """Yield the stabilising compensators, the centred lead first."""
-    shares = (0.5,) if abs(task.needed(sign)) <= NO_PHASE else (0.5, *family)
-    for share in shares:
+def _stabilising(task: _Task, sign: int, shares: tuple[float, ...]) -> Iterator[Rational]:
+    """Yield the compensators of these shares whose loop is stable."""
+    for share in shares[:1] if abs(task.needed(sign)) <= NO_PHASE else shares:
         controller = task.compensator(sign, share)
         if task.stabilised(controller):
             yield controller
 
 
+def _works(task: _Task, sign: int) -> bool:
+    """Tell whether some lead, of the centred and a few more, does the task."""
+    return any(
+        task.holds(*task.weakest(controller))
+        for controller in _stabilising(task, sign, COARSE_FAMILY)
+    )
+
+
 def _best(task: _Task, sign: int) -> Rational | str:
     """Return the compensator, or why there is none."""
-    best, reach, worst = None, 0.0, None
-    for k, controller in enumerate(_candidates(task, sign, FAMILY)):
-        margins = loop_margins(controller * task.plant)
-        if not task.holds(margins):
-            if worst is None or margins.phase_margin > worst.phase_margin:
-                worst = margins
-            continue
-        if k == 0 and _is_centred(controller, task, sign):
+    for controller in _stabilising(task, sign, (0.5,)):
+        if task.holds(*task.weakest(controller)):
             return controller
-        if margins.modulus_margin > reach:
-            best, reach = controller, margins.modulus_margin
+    best, reach, worst = None, 0.0, (math.nan, 0.0)
+    for controller in _stabilising(task, sign, FAMILY):
+        weakest = task.weakest(controller)
+        if not task.holds(*weakest):
+            worst = max(worst, weakest, key=lambda pair: pair[1])
+        elif (distance := modulus_margin(controller * task.plant)) > reach:
+            best, reach = controller, distance
     if best is not None:
         return best
     asked = (
         f"the crossover {task.crossover:g} rad/s and the phase margin {task.phase_margin:g} degrees"
     )
-    if worst is not None:
+    if worst[1] > 0:
         return (
             f"Every stabilising lead with {asked} gives the loop another crossover with a smaller "
-            f"margin, at best {worst.phase_margin:.1f} degrees at {worst.crossover:.4g} rad/s."
+            f"margin, at best {worst[1]:.1f} degrees at {worst[0]:.4g} rad/s."
         )
     if abs(task.needed(sign)) <= NO_PHASE:
         return f"The closed loop is unstable with the pure gain that alone has {asked}."
     return f"The closed loop is unstable with every lead that has {asked}."
 
 
-def _is_centred(controller: Rational, task: _Task, sign: int) -> bool:
-    centred = task.compensator(sign, 0.5)
-    return bool(np.array_equal(controller.num, centred.num))
-
-
-def _works(task: _Task, sign: int) -> bool:
-    """Tell whether a lead of the coarse family does the task."""
-    return any(
-        task.holds(loop_margins(controller * task.plant))
-        for controller in _candidates(task, sign, COARSE_FAMILY)
-    )
-
-
-def _why_not_the_phase(task: _Task) -> str:
+def _why_not_the_phase(task: _Task, signs: tuple[int, ...]) -> str:
     """Say how much phase is missing or too much, and which margins this crossover allows."""
 
     def works(phi: float, sign: int) -> bool:
         margin = plain[sign] + phi
         return 0 < margin < 180 and _works(replace(task, phase_margin=margin), sign)
 
-    needed = {sign: math.degrees(task.needed(sign)) for sign in (1, -1)}
+    needed = {sign: math.degrees(task.needed(sign)) for sign in signs}
     plain = {sign: task.phase_margin - needed[sign] for sign in needed}  # what a pure gain gives
     grid = [1e-6, *np.arange(3.0, 90.0, 3.0), 90 - 1e-3]
     allowed = {sign: [phi for phi in grid if works(phi, sign)] for sign in needed}
@@ -283,7 +280,7 @@ def _why_not_the_phase(task: _Task) -> str:
             f"{plain[sign]:.4f} degrees"
         )
     if not allowed[sign]:
-        return f"{text}; with any margin a lead gives at this crossover, the loop is unstable."
+        return f"{text}; {LOST}."
     low, high = allowed[sign][0], allowed[sign][-1]
     if high == grid[-1] or plain[sign] + high > 176.9:
         largest = f"just under {min(plain[sign] + 90, 180):.1f}"
@@ -305,36 +302,34 @@ def _edge(outside: float, inside: float, works: Callable[[float], bool]) -> floa
 
 def _which_crossovers(task: _Task) -> str:
     """Say at which crossovers one lead does give the phase margin, by trying them."""
+    plant = task.plant
 
     def works(omega: float) -> bool:
-        trial = replace(task, crossover=float(omega))
-        sign = trial.sign()
-        return sign is not None and _works(trial, sign)
+        trial = replace(task, crossover=omega)
+        return (sign := trial.sign()) is not None and _works(trial, sign)
 
-    plant = task.plant
-    sizes = np.abs(to_s(np.concatenate([plant.poles(), plant.zeros()]), plant.dt))
-    sizes = np.concatenate([sizes[(sizes > 0) & np.isfinite(sizes)], [task.crossover]])
-    top = min(100 * float(max(sizes)), 0.999 * plant.nyquist)
-    grid = np.geomspace(min(float(min(sizes)) / 100, top / 100), top, 81)
+    s = to_s(np.concatenate([plant.poles(), plant.zeros()]), plant.dt)
+    sizes = np.concatenate([np.abs(s[resolved(s, plant.dt)]), [task.crossover]])
+    top = min(30 * float(max(sizes)), 0.999 * plant.nyquist)
+    grid = np.geomspace(min(float(min(sizes)), top) / 30, top, 61).tolist()
+    # At fast sampling the coefficients do not tell the plant at low frequencies.
+    grid = [omega for omega in grid if max(plant.rounding(omega)) < 1e-7]
     good = [works(omega) for omega in grid]
     if not any(good):
         return (
-            f"No crossover between {grid[0]:.2g} and {top:.4g} rad/s gives that phase margin with "
-            f"one lead."
+            f"None of {len(grid)} crossovers tried from {min(grid, default=top):.2g} to {top:.4g} "
+            f"rad/s gives that phase margin with one lead."
         )
-
+    last = len(grid) - 1
     ranges = []
-    starts = [k for k in range(81) if good[k] and (k == 0 or not good[k - 1])]
+    starts = [k for k in range(last + 1) if good[k] and (k == 0 or not good[k - 1])]
     for start in starts:
-        stop = next((k for k in range(start, 81) if not good[k]), 81) - 1
-        low = _edge(grid[start - 1], grid[start], works) if start else None
-        high = _edge(grid[stop + 1], grid[stop], works) if stop < 80 else None
-        if low is not None and high is not None:
-            ranges.append(f"between about {low:.3g} and {high:.3g} rad/s")
-        elif low is not None:
+        stop = next((k for k in range(start, last + 1) if not good[k]), last + 1) - 1
+        low = _edge(grid[start - 1], grid[start], works) if start else grid[0]
+        if stop == last:
             ranges.append(f"from about {low:.3g} rad/s upwards")
-        elif high is not None:
-            ranges.append(f"up to about {high:.3g} rad/s")
         else:
-            ranges.append(f"from {grid[0]:.2g} to {top:.4g} rad/s")
-    return f"With {task.phase_margin:g} degrees, crossovers are possible {' and '.join(ranges)}."
+            high = _edge(grid[stop + 1], grid[stop], works)
+            begin = f"from about {low:.3g}" if start else "up"
+            ranges.append(f"{begin} to about {high:.3g} rad/s")
+    return f"With {task.phase_margin:g} degrees, crossovers are possible {', '.join(ranges)}."

@@ -105,53 +105,66 @@ def loop_margins(L: Any) -> Margins:
     nan = math.nan
     if poles is None or not is_stable(poles, loop.dt):
         return Margins(False, nan, nan, nan, nan, nan, nan)
-    total = np.polyadd(loop.num, loop.den)
-    grid = frequencies(loop.dt, [loop.num, loop.den, total], _crossing_polynomials(loop))
-    ends = (0.0, loop.nyquist)
+    gain = gain_crossovers(loop)
+    worst, angle = min(gain, key=lambda pair: abs(pair[1]), default=(nan, math.inf))
+    delays = [(angle % (2 * math.pi)) / omega for omega, angle in gain]
+    if not loop.dt and abs(loop.at(math.inf)) >= 1:
+        delays.append(0.0)
+    factors = _critical_factors(loop)
+    return Margins(
+        stable=True,
+        crossover=worst,
+        phase_margin=math.degrees(abs(angle)),
+        gain_margin=min((k for k in factors if k > 1), default=math.inf),
+        gain_reduction_margin=max((k for k in factors if k < 1), default=0.0),
+        modulus_margin=modulus_margin(loop),
+        delay_margin=min(delays, default=math.inf),
+    )
+
+
+def gain_crossovers(loop: Rational) -> list[tuple[float, float]]:
+    """Return all (frequency, angle from -1 in radians) where the loop gain is 1."""
 
     def log_gain(omega: FloatArray) -> FloatArray:
         num, den = loop.parts(omega)
         tiny = np.finfo(float).tiny
         return np.log(np.abs(num) + tiny) - np.log(np.abs(den) + tiny)
 
+    num, den = loop.num, loop.den
+    candidates = np.polysub(np.polymul(num, loop.flipped(num)), np.polymul(den, loop.flipped(den)))
+    found = crossings(log_gain, _grid(loop, candidates))
+    return [(omega, float(np.angle(-loop.at(omega)))) for omega in found]
+
+
+def _critical_factors(loop: Rational) -> list[float]:
+    """Return the factors k for which k L passes through -1."""
+
     def sine_of_phase(omega: FloatArray) -> FloatArray:
         num, den = loop.parts(omega)
         return (num * den.conj()).imag / (np.abs(num) * np.abs(den) + np.finfo(float).tiny)
+
+    num, den = loop.num, loop.den
+    candidates = np.polysub(np.polymul(num, loop.flipped(den)), np.polymul(loop.flipped(num), den))
+    found = crossings(sine_of_phase, _grid(loop, candidates))
+    response = [complex(loop.at(omega)) for omega in (*found, 0.0, loop.nyquist)]
+    # Beyond these sizes the "crossing" is a zero or a pole on the axis.
+    return [-1 / x.real for x in response if -1e9 < x.real < -1e-9]
+
+
+def modulus_margin(loop: Rational) -> float:
+    """Return the smallest distance of L from -1."""
 
     def distance(omega: FloatArray) -> FloatArray:
         num, den = loop.parts(omega)
         with np.errstate(divide="ignore"):
             return np.abs(num + den) / np.abs(den)
 
-    gain = crossings(log_gain, grid)
-    phases = [float(np.angle(-loop.at(w))) for w in gain]  # 0 is the point -1
-    worst = int(np.argmin(np.abs(phases))) if gain else -1
-    delays = [(phase % (2 * math.pi)) / w for phase, w in zip(phases, gain, strict=True)]
-    if not loop.dt and abs(loop.at(math.inf)) >= 1:
-        delays.append(0.0)
-
-    response = [complex(loop.at(w)) for w in (*crossings(sine_of_phase, grid), *ends)]
-    # Beyond these sizes the "crossing" is a zero or a pole on the axis.
-    factors = [-1 / x.real for x in response if -1e9 < x.real < -1e-9]
-    return Margins(
-        stable=True,
-        crossover=gain[worst] if gain else nan,
-        phase_margin=math.degrees(abs(phases[worst])) if gain else math.inf,
-        gain_margin=min((k for k in factors if k > 1), default=math.inf),
-        gain_reduction_margin=max((k for k in factors if k < 1), default=0.0),
-        modulus_margin=smallest(distance, grid, ends)[1],
-        delay_margin=min(delays, default=math.inf),
-    )
+    return smallest(distance, _grid(loop), (0.0, loop.nyquist))[1]
 
 
-def _crossing_polynomials(loop: Rational) -> tuple[FloatArray, FloatArray]:
-    """Return polynomials whose roots on the boundary are the crossovers of gain 1 and Im L = 0."""
-    num, den = loop.num, loop.den
-    num_, den_ = loop.flipped(num), loop.flipped(den)
-    return (
-        np.polysub(np.polymul(num, num_), np.polymul(den, den_)),
-        np.polysub(np.polymul(num, den_), np.polymul(num_, den)),
-    )
+def _grid(loop: Rational, *candidates: FloatArray) -> FloatArray:
+    total = np.polyadd(loop.num, loop.den)
+    return frequencies(loop.dt, [loop.num, loop.den, total], candidates)
 
 
 def nu_gap(P1: Any, P2: Any) -> float:
