@@ -1,6 +1,7 @@
 """Closed-loop identification and diagnosis of unstable plants, on top of python-control."""
 
-from . import plants
+from . import datasets, plants
+from .arx import fit_arx
 from .constraints import (
     Bounds,
     Equal,
@@ -13,22 +14,31 @@ from .constraints import (
     StaticGain,
     SymmetricPoles,
 )
+from .controller_redesign import Performance, Redesign, redesign
 from .controllers import PID
+from .data import Record
 from .errors import CtrlidError, CtrlidWarning
 from .lead import design_lead
 from .linearization import OperatingPoint, linearize, operating_point
 from .loop import Loop
 from .margins import Margins, loop_margins, nu_gap, robust_margin
 from .model import Estimate, IdentifiedModel
+from .predictor import Prediction, predict
+from .residuals import Correlation
 from .signals import multisine, prbs, random_binary, steps
+from .simulation import replay_controller, simulate
+from .validation import Comparison, Curve, compare
 
 __version__ = "0.1.0.dev0"
 
 __all__ = [
     "PID",
     "Bounds",
+    "Comparison",
+    "Correlation",
     "CtrlidError",
     "CtrlidWarning",
+    "Curve",
     "Equal",
     "Estimate",
     "Fixed",
@@ -39,12 +49,19 @@ __all__ = [
     "Margins",
     "Nonlinear",
     "OperatingPoint",
+    "Performance",
     "PoleAt",
+    "Prediction",
     "ReciprocalPoles",
+    "Record",
+    "Redesign",
     "StaticGain",
     "SymmetricPoles",
     "__version__",
+    "compare",
+    "datasets",
     "design_lead",
+    "fit_arx",
     "linearize",
     "loop_margins",
     "multisine",
@@ -52,7 +69,11 @@ __all__ = [
     "operating_point",
     "plants",
     "prbs",
+    "predict",
     "random_binary",
+    "redesign",
+    "replay_controller",
     "robust_margin",
+    "simulate",
     "steps",
 ]

@@ -112,7 +112,9 @@ class PID:
         if self.derivative == "measurement" and self.c not in (0.0, 1.0):
             raise CtrlidError(f"derivative='measurement' means c=0; given c={self.c}")
         if self.anti_windup == "back-calculation":
-            tracking = self.tracking_time if self.ki == 0 or self.tracking_time else self.kp / self.ki
+            tracking = (
+                self.tracking_time if self.ki == 0 or self.tracking_time else self.kp / self.ki
+            )
             if tracking is None or tracking <= 0:
                 raise CtrlidError("back-calculation needs tracking_time > 0 s; given "
                                   f"tracking_time={self.tracking_time} with kp={self.kp}, "
@@ -198,7 +200,9 @@ def _realize(controller: Any) -> tuple[Any, Any, Any, Any]:
                 f"the controller has {len(num) - 1} zeros but {len(den) - 1} poles: no circuit and "
                 "no program differentiates without delay; add a filter pole"
             )
-        blocks.append(ct.ss(ct.tf(num, den, controller.dt)) if len(num) else ct.ss([], [], [], [[0]]))
+        blocks.append(
+            ct.ss(ct.tf(num, den, controller.dt)) if len(num) else ct.ss([], [], [], [[0]])
+        )
     a = linalg.block_diag(*(s.A for s in blocks))
     b = linalg.block_diag(*(s.B for s in blocks))
     return a, b, np.hstack([s.C for s in blocks]), np.hstack([s.D for s in blocks])

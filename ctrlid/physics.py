@@ -114,9 +114,7 @@ def _run(system: Any, t: Any, x: Any, u: Any, p: Mapping[str, Any]) -> tuple[Any
     arguments = (Symbol(t), _array(x), _array(u), dict(p))
     rhs = casadi.SX(0, 1)
     if system.nstates:
-        rhs = _expressions(
-            rebind(system.updfcn)(*arguments), system.nstates, "the update function"
-        )
+        rhs = _expressions(rebind(system.updfcn)(*arguments), system.nstates, "the update function")
     if system.outfcn is None:
         return rhs, x
     out = rebind(system.outfcn)(Symbol(t), _array(x), _array(u), dict(p))

@@ -1,6 +1,5 @@
 """Simulating a loop: sampled or analog controller, held signals, noise, and failures in words."""
 
-import functools
 import math
 import warnings
 from collections.abc import Sequence
@@ -9,6 +8,7 @@ from typing import Any
 
 import casadi
 import numpy as np
+from scipy import optimize
 from scipy.integrate import DOP853
 
 from .data import Record
@@ -227,11 +227,9 @@ def simulate(
     2000
     """
     r, d = _signals(loop, r, d)
-    n = d.size
-    noise = _noise(loop, n, sensor_noise, force_noise, seed)
-    w = np.vstack([np.arange(n) * loop.dt, r if r is not None else np.zeros(n), d, *noise])
-    z = _initial(loop, initial)
-    y, u = _run(loop, w, z)
+    noise = _noise(loop, d.size, sensor_noise, force_noise, seed)
+    simulator = Simulator(loop)
+    y, u = simulator.run(simulator.start(initial), r, d, noise)
     e = loop.equations()
     return Record(
         r=r, u=u, y=y, dt=loop.dt, hold="foh" if loop.analog else "zoh",
@@ -279,69 +277,187 @@ def _noise(loop: Loop, n: int, sensor: float, force: float, seed: int | None) ->
     return [s.standard_normal(n) * v for s, v in zip(streams, (sensor, force), strict=True)]
 
 
-def _initial(loop: Loop, initial: Sequence[float] | None) -> Array:
-    s = stepper(loop, 1)
-    z, n = np.array(s.rest), len(s.plant_states)
-    if initial is not None:
-        given = np.atleast_1d(np.asarray(initial, dtype=float))
-        if given.size not in (n, z.size) or not np.isfinite(given).all():
-            raise CtrlidError(
-                f"initial needs {n} plant states ({', '.join(s.plant_states)}) or these and "
-                f"{z.size - n} controller states, all finite; given {given.tolist()}"
-            )
-        z[: given.size] = given
-    return z
+class Simulator:
+    """A loop made ready to run many times.
+
+    Parameters
+    ----------
+    loop : Loop
+        The loop.
+    """
+
+    def __init__(self, loop: Loop) -> None:
+        self.loop = loop
+        first = stepper(loop, 1)
+        self.plant_states = first.plant_states
+        self.rest: Array = np.array(first.rest, dtype=float)
+        self._runners: dict[tuple[int, int], Any] = {}
+
+    def start(self, initial: Sequence[float] | None) -> Array:
+        """Return the state to start from: at rest, or with the given values."""
+        z, n = self.rest.copy(), len(self.plant_states)
+        if initial is not None:
+            given = np.atleast_1d(np.asarray(initial, dtype=float))
+            if given.size not in (n, z.size) or not np.isfinite(given).all():
+                raise CtrlidError(
+                    f"initial needs {n} plant states ({', '.join(self.plant_states)}) or these and "
+                    f"{z.size - n} controller states, all finite; given {given.tolist()}"
+                )
+            z[: given.size] = given
+        return z
+
+    def _runner(self, substeps: int, size: int) -> Any:
+        key = (substeps, size)
+        if key not in self._runners:
+            self._runners[key] = stepper(self.loop, substeps).step.mapaccum("run", size)
+        return self._runners[key]
+
+    def run(
+        self, z: Array, r: Array | None, d: Array, noise: Sequence[Array] | None = None
+    ) -> tuple[Array, Array]:
+        """Return measured output and applied input, from state `z` on.
+
+        Runs chunk by chunk; the steps of a chunk are halved until its local errors are small.
+        """
+        loop, n = self.loop, d.size
+        quiet = np.zeros(n)
+        w = np.vstack([np.arange(n) * loop.dt, quiet if r is None else r, d,
+                       *(noise or (quiet, quiet))])  # fmt: skip
+        y, u = np.empty(n), np.empty(n)
+        start, reach = z, np.zeros(z.size)
+        substeps, size = 1, min(CHUNK, n)
+        worst, where = 0.0, 0
+        for first in range(0, n, size):
+            block = w[:, first : first + size]
+            count = block.shape[1]
+            if count < size:
+                block = np.hstack([block, np.repeat(block[:, -1:], size - count, axis=1)])
+            previous_stop: int | None = None
+            while True:
+                states, ys, us, errors = (np.asarray(a, float)[:, :count]
+                                          for a in self._runner(substeps, size)(z, block))  # fmt: skip
+                stop = _first_bad(loop, states, ys, us, w)
+                with np.errstate(all="ignore"):
+                    moved = np.maximum(reach, np.max(np.abs(states - start[:, None]), axis=1))
+                    relative = float(np.max(np.where(errors > 0, errors / moved[:, None], 0.0)))
+                fine = stop is None and relative <= TOLERANCE
+                if fine or substeps >= MOST_SUBSTEPS:
+                    break
+                if stop is not None and stop == previous_stop:
+                    break  # finer steps leave at the same sample: it is the loop that leaves
+                previous_stop = stop
+                substeps *= 2
+            if stop is not None:
+                inside = bool(np.isfinite(states[:, stop]).all())
+                raise CtrlidError(_why_left(loop, first + stop, inside, ys[:, : stop + 1],
+                                            us[:, : stop + 1], w))  # fmt: skip
+            if relative > worst:
+                worst, where = relative, first
+            y[first : first + count], u[first : first + count] = ys[0], us[0]
+            z, reach = states[:, -1], moved
+            if relative < TOLERANCE / 1e4 and substeps > 1:
+                substeps //= 2
+        if worst > COARSE:
+            warnings.warn(
+                f"the simulation is only good to about {worst:.0e} of the signals near t = "
+                f"{where * loop.dt:.4g} s: the plant or the controller is too sharp or too fast "
+                f"for {MOST_SUBSTEPS} steps in {loop.dt:g} s; simulate with a smaller dt",
+                CtrlidWarning, stacklevel=3,
+            )  # fmt: skip
+        return y, u
 
 
-def _run(loop: Loop, w: Array, z: Array) -> tuple[Array, Array]:
-    """Run chunk by chunk, refining the steps of a chunk until its local errors are small."""
-    n = w.shape[1]
-    y, u = np.empty(n), np.empty(n)
-    start, reach = z, np.abs(z - z)
-    substeps, size = 1, min(CHUNK, n)
+def controller_output(
+    loop: Loop, y: Array, r: Array | None = None, initial: Sequence[float] | None = None
+) -> Array:
+    """Return what a digital controller computes from a given reference and output.
 
-    @functools.cache
-    def runner(substeps: int) -> Any:
-        return stepper(loop, substeps).step.mapaccum("run", size)
+    Parameters
+    ----------
+    loop : Loop
+        The loop whose controller runs.
+    y : ndarray, shape (n,)
+        Measured output.
+    r : ndarray, shape (n,), optional
+        Reference; by default constant at the operating point.
+    initial : sequence of float, optional
+        Initial controller state; by default at rest.
 
-    worst, where = 0.0, 0
-    for first in range(0, n, size):
-        block = w[:, first : first + size]
-        count = block.shape[1]
-        if count < size:
-            block = np.hstack([block, np.repeat(block[:, -1:], size - count, axis=1)])
-        previous_break: int | None = None
-        while True:
-            states, ys, us, errors = (np.asarray(a, float)[:, :count]
-                                      for a in runner(substeps)(z, block))  # fmt: skip
-            stop = _first_bad(loop, states, ys, us, w)
-            moved = np.maximum(reach, np.max(np.abs(states - start[:, None]), axis=1))
-            with np.errstate(all="ignore"):
-                relative = float(np.max(np.where(errors > 0, errors / moved[:, None], 0.0)))
-            fine = stop is None and relative <= TOLERANCE
-            if fine or substeps >= MOST_SUBSTEPS:
-                break
-            if stop is not None and previous_break is not None and stop == previous_break:
-                break  # finer steps leave at the same sample: it is the loop, not the integration
-            previous_break = stop
-            substeps *= 2
-        if stop is not None:
-            inside = bool(np.isfinite(states[:, stop]).all())
-            raise CtrlidError(_why_left(loop, first + stop, inside, states[:, :stop], ys, us, w))
-        if relative > worst:
-            worst, where = relative, first
-        y[first : first + count], u[first : first + count] = ys[0], us[0]
-        z, reach = states[:, -1], moved
-        if fine and relative < TOLERANCE / 1e4 and substeps > 1:
-            substeps //= 2
-    if worst > COARSE:
-        warnings.warn(
-            f"the simulation is only good to about {worst:.0e} of the signals near t = "
-            f"{where * loop.dt:.4g} s: the plant or the controller is too sharp or too fast for "
-            f"{MOST_SUBSTEPS} steps in {loop.dt:g} s; simulate with a smaller dt",
-            CtrlidWarning, stacklevel=3,
-        )  # fmt: skip
-    return y, u
+    Returns
+    -------
+    ndarray, shape (n,)
+        The input, within the limits of the loop.
+
+    Raises
+    ------
+    CtrlidError
+        If the loop has no controller, or an analog one.
+    """
+    law = loop.law()
+    if law is None or law.dt == 0.0:
+        raise CtrlidError("only a digital controller computes its output from the samples alone; "
+                          f"this loop has {'no controller' if law is None else 'an analog one'}")  # fmt: skip
+    x, w = casadi.SX.sym("x", len(law.rest)), casadi.SX.sym("w", 3)
+    u, after = law.apply(w[0], x, w[1], w[2])
+    run = casadi.Function("controller", [x, w], [casadi.vertcat(after), u])
+    reference = np.full(len(y), loop.point.output) if r is None else np.asarray(r)
+    table = np.vstack([np.arange(len(y)) * loop.dt, reference, y])
+    start = np.array(law.rest if initial is None else initial, dtype=float)
+    out = np.asarray(run.mapaccum("run", len(y))(start, table)[1], float).ravel()
+    return np.clip(out, *loop.input_limits)
+
+
+def replay_controller(loop: Loop, record: Record) -> Array:
+    """Return the input that the controller of a loop computes from a record's own r and y.
+
+    The controller's initial state is not in the record; it is chosen to reproduce the logged u best.
+    What then remains between the result and ``record.u`` is not the controller's: injected
+    pulses or dither, a channel logged late, another controller.
+
+    Parameters
+    ----------
+    loop : Loop
+        Loop with a digital controller.
+    record : Record
+        Record with a reference.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        Input at each sample [input unit].
+
+    Raises
+    ------
+    CtrlidError
+        If there is no digital controller, no reference, or the sampling periods differ.
+
+    Examples
+    --------
+    >>> import ctrlid as cid
+    >>> plant = cid.plants.servo(m=1.0, c=2.0, k=3.0)
+    >>> loop = cid.Loop(plant, cid.PID(kp=5.0, kd=0.1), dt=0.01)
+    >>> record = cid.simulate(loop, cid.random_binary(500, amplitude=0.1, hold=50, seed=1))
+    >>> bool(abs(cid.replay_controller(loop, record) - record.u).max() < 1e-12)
+    True
+    """
+    if abs(loop.dt - record.dt) > 1e-9 * loop.dt:
+        raise CtrlidError(f"the loop is sampled at {loop.dt:g} s, the record at {record.dt:g} s")
+    if record.r is None:
+        raise CtrlidError("the record has no reference r, which the controller needs")
+    law = loop.law()
+    rest = np.array(law.rest if law else ())
+    if not rest.size:
+        return controller_output(loop, record.y, record.r)
+    u = np.asarray(record.u)
+    sensitivity = max(float(np.std(u)), 1e-300)
+    valid = np.asarray(record.valid)
+
+    def misfit(state: Array) -> Array:
+        replayed = controller_output(loop, record.y, record.r, state)
+        return np.asarray((replayed - u)[valid] / sensitivity, dtype=float)
+
+    best = optimize.least_squares(misfit, rest, x_scale="jac")
+    return controller_output(loop, record.y, record.r, best.x)
 
 
 def _first_bad(loop: Loop, states: Array, ys: Array, us: Array, w: Array) -> int | None:
@@ -355,13 +471,11 @@ def _first_bad(loop: Loop, states: Array, ys: Array, us: Array, w: Array) -> int
     return int(np.argmax(bad)) if bad.any() else None
 
 
-def _why_left(
-    loop: Loop, at: int, inside: bool, states: Array, ys: Array, us: Array, w: Array
-) -> str:  # fmt: skip
+def _why_left(loop: Loop, at: int, inside: bool, ys: Array, us: Array, w: Array) -> str:
     """Say when and why a simulation broke off."""
     e, op = loop.equations(), loop.point
     output, inp = e.outputs[0], e.inputs[0]
-    k = min(states.shape[1], ys.shape[1] - 1)
+    k = ys.shape[1] - 1
     good = max(k - 1, 0)
     text = f"the simulation stops at t = {at * loop.dt:.5g} s (sample {at}): "
     if inside:
@@ -376,7 +490,9 @@ def _why_left(
     lower, upper = loop.input_limits
     recent = us[0, max(0, good - 20) : good + 1]
     if loop.controller is None:
-        return text + " The loop is open: an unstable plant cannot be simulated without its controller"
+        return (
+            text + " The loop is open: an unstable plant cannot be simulated without its controller"
+        )
     if growth > 0:
         return text + (f" The closed loop is unstable: small deviations grow at {growth:.3g} 1/s. "
                        "Check the sign and the gain of the controller and the operating point")  # fmt: skip
@@ -386,4 +502,6 @@ def _why_left(
     text += (f" Near the operating point the loop is stable, so the signals are too large for it: "
              f"{inp} moved {swing:.3g} away from {op.input:.4g}")  # fmt: skip
     asked = float(np.max(np.abs(w[1] - op.output)))
-    return text + f", {output} was asked to move by {asked:.3g}. Use a smaller reference or less noise"
+    return (
+        text + f", {output} was asked to move by {asked:.3g}. Use a smaller reference or less noise"
+    )

@@ -57,8 +57,10 @@ class Symbol:
     def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **kwargs: Any) -> Any:
         op = ELEMENTWISE.get(ufunc.__name__) or OPERATORS.get(ufunc.__name__)
         if method != "__call__" or op is None:
-            raise TracingError(f"np.{ufunc.__name__} is not known to the tracing; rewrite it with "
-                               "arithmetic, np.where, np.maximum or np.minimum")
+            raise TracingError(
+                f"np.{ufunc.__name__} is not known to the tracing; rewrite it with "
+                "arithmetic, np.where, np.maximum or np.minimum"
+            )
         return _elementwise(op)(*inputs)
 
     def __abs__(self) -> "Symbol":

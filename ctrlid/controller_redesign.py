@@ -1,0 +1,245 @@
+"""redesign(): a controller designed on an identified model, and what it does on the physics."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import control as ct
+import numpy as np
+
+from .data import Record
+from .errors import CtrlidError
+from .lead import design_lead
+from .loop import Loop
+from .margins import loop_margins, nu_gap, robust_margin
+from .physics import Array, timebase
+from .simulation import growth_rate, simulate
+
+SETTLED = 0.02  # band around the final value
+CLOSE = 0.25  # share of a promised phase margin whose loss is worth a word
+
+
+@dataclass(frozen=True)
+class Performance:
+    """What a controller promises on a model, or achieves on the physics.
+
+    Attributes
+    ----------
+    stable : bool
+        Whether the closed loop is stable.
+    phase_margin : float
+        Smallest phase margin [deg]; NaN for an unstable loop.
+    gain_margin : float
+        Factor by which the gain may grow; infinite if any may.
+    crossover : float
+        Gain crossover [rad/s].
+    overshoot : float
+        Of a small reference step, in percent of the final value.
+    settling_time : float
+        Until the step response stays within 2 % of its final value [s].
+    """
+
+    stable: bool
+    phase_margin: float
+    gain_margin: float
+    crossover: float
+    overshoot: float
+    settling_time: float
+
+
+@dataclass(frozen=True, eq=False)
+class Redesign:
+    """A controller designed on a model, with the promise and what came of it.
+
+    Attributes
+    ----------
+    controller : control.TransferFunction
+        The lead compensator, in the time base of the model.
+    promised, achieved : Performance
+        On the model, and on the nonlinear physics of the loop.
+    nu_gap : float
+        Distance between the model and the linearized physics (0 the same, 1 worlds apart).
+    robust_margin : float
+        Nu-gap that the design is sure to survive.
+    loop : Loop
+        The physics with the new controller.
+    time : ndarray
+        Time of the step responses [s].
+    promised_step, achieved_step : ndarray
+        Responses to a step of the reference by 1 [output unit per output unit]; what was achieved
+        ends early where the simulation broke off.
+    failure : str
+        Why the simulation on the physics broke off, or empty.
+    """
+
+    controller: Any
+    promised: Performance
+    achieved: Performance
+    nu_gap: float
+    robust_margin: float
+    loop: Loop
+    time: Array
+    promised_step: Array
+    achieved_step: Array
+    failure: str = ""
+
+    @property
+    def stable(self) -> bool:
+        """Whether the controller keeps the physics stable."""
+        return self.achieved.stable
+
+    @property
+    def verdict(self) -> str:
+        """The outcome in words."""
+        p, a = self.promised, self.achieved
+        if not a.stable:
+            return ("The controller DOES NOT KEEP THE PHYSICS STABLE: the model is too far from it. "
+                    + self.failure)  # fmt: skip
+        text = (f"Promised {p.phase_margin:.1f} deg at {p.crossover:.4g} rad/s, achieved "
+                f"{a.phase_margin:.1f} deg at {a.crossover:.4g} rad/s on the physics")  # fmt: skip
+        loss = p.phase_margin - a.phase_margin
+        if loss > CLOSE * p.phase_margin:
+            text += f": {loss:.1f} DEGREES OF THE PROMISE ARE LOST"
+        else:
+            text += ": the promise holds"
+        sure = "guaranteed" if self.nu_gap < self.robust_margin else "not guaranteed"
+        return (f"{text}. Stability is {sure} by the nu-gap ({self.nu_gap:.3f} against a robust "
+                f"margin of {self.robust_margin:.3f}).")  # fmt: skip
+
+    def __str__(self) -> str:
+        rows = [f"  {'':<24}{'promised':>12}{'achieved':>12}"]
+        for label, name, form in (
+            ("phase margin [deg]", "phase_margin", ".2f"), ("gain margin [factor]", "gain_margin", ".3f"),
+            ("crossover [rad/s]", "crossover", ".2f"), ("overshoot [%]", "overshoot", ".2f"),
+            ("settling time [s]", "settling_time", ".4f"),
+        ):  # fmt: skip
+            values = (getattr(self.promised, name), getattr(self.achieved, name))
+            rows.append(f"  {label:<24}" + "".join(f"{v:>12{form}}" for v in values))
+        num, den = (" ".join(f"{c:.6g}" for c in p[0][0])
+                    for p in (self.controller.num, self.controller.den))  # fmt: skip
+        return "\n".join([f"controller: ({num}) / ({den})", *rows, "  " + self.verdict])
+
+
+def redesign(
+    G: Any, loop: Loop, crossover: float, phase_margin: float, *, step: float | None = None
+) -> Redesign:
+    """Design a lead on a model and try it on the physics of a loop.
+
+    The controller is `design_lead` on `G`. Its promise is that of the linear loop with `G`. What it
+    achieves is measured on the loop's own plant: margins on the plant linearized at the
+    operating point (and sampled, for a digital controller), step response on the nonlinear
+    equations, within the loop's input limits.
+
+    Parameters
+    ----------
+    G : control.TransferFunction
+        The model, for instance an `IdentifiedModel`. A model in discrete time gives a digital
+        controller at its sampling period, a continuous one an analog controller.
+    loop : Loop
+        The physics and its operating point; its own controller is not used.
+    crossover : float
+        Gain crossover to design for [rad/s].
+    phase_margin : float
+        Phase margin to design for [deg].
+    step : float, optional
+        Height of the reference step [output unit]; by default 1 % of the output at the operating
+        point.
+
+    Returns
+    -------
+    Redesign
+        Controller, promise, achievement and a verdict in words as its text.
+
+    Raises
+    ------
+    CtrlidError
+        If one lead cannot do it on this model, or the arguments do not fit.
+
+    References
+    ----------
+    Vinnicombe, "Frequency domain uncertainty and the graph topology", IEEE Transactions on Automatic
+    Control 38 (1993) 1371-1383.
+
+    Examples
+    --------
+    >>> import ctrlid as cid
+    >>> plant = cid.plants.maglev(m=0.0213, K=3.34e-6)
+    >>> op = cid.operating_point(plant, output=0.012)
+    >>> loop = cid.Loop(plant, None, dt=0.001, at=op)
+    >>> outcome = cid.redesign(cid.linearize(plant, op), loop, crossover=100, phase_margin=50)
+    >>> outcome.stable, round(outcome.achieved.phase_margin, 6)
+    (True, 50.0)
+    """
+    if not isinstance(G, ct.TransferFunction | ct.StateSpace):
+        raise CtrlidError(f"redesign needs a linear model (a TransferFunction, as the fits return); "
+                          f"given {type(G).__name__}")  # fmt: skip
+    if not isinstance(loop, Loop):
+        raise CtrlidError(f"redesign tries the controller on a Loop; given {type(loop).__name__}")
+    G = ct.tf(G)  # a plain transfer function, whatever the fit carried along
+    C = design_lead(G, crossover=crossover, phase_margin=phase_margin)
+    dt = timebase(G)
+    trial = replace(loop, controller=C, dt=dt or loop.dt)
+    P = loop.linearize()
+    if dt and not timebase(P):
+        P = _sampled(P, dt)
+    height = _height(loop, step)
+    # Long enough for the slowest promised pole, at the resolution of the loop.
+    length = int(np.clip(60 / (crossover * trial.dt), 20, 50_000))
+    time = np.arange(length) * trial.dt
+    promised_step = _linear_step(G, C, time)
+    achieved_step, failure = _physical_step(trial, height, length)
+    promised = _performance(loop_margins(G * C), time, promised_step)
+    margins = loop_margins(P * C)
+    achieved = _performance(margins, time, achieved_step)
+    if failure or growth_rate(trial) >= 0:
+        nan = float("nan")
+        achieved = Performance(False, nan, nan, nan, nan, nan)
+        failure = failure or "Small deviations grow."
+    return Redesign(C, promised, achieved, nu_gap(G, P), robust_margin(G, C), trial, time,
+                    promised_step, achieved_step, failure)  # fmt: skip
+
+
+def _sampled(P: Any, dt: float) -> Any:
+    """Return the zero-order-hold equivalent; through state space, which leaves no dust."""
+    return ct.tf(ct.sample_system(ct.ss(ct.tf(P.num, P.den)), dt, "zoh"))
+
+
+def _height(loop: Loop, step: float | None) -> float:
+    if step is None:
+        return 0.01 * abs(loop.point.output) or 0.01
+    if not (np.isfinite(step) and step != 0):
+        raise CtrlidError(f"step is the height of the reference step in output units, not zero; "
+                          f"given {step!r}")  # fmt: skip
+    return float(step)
+
+
+def _linear_step(G: Any, C: Any, time: Array) -> Array:
+    closed = ct.feedback(G * C, 1)
+    return np.asarray(ct.forced_response(ct.ss(closed), time, np.ones(len(time))).outputs, float)
+
+
+def _physical_step(loop: Loop, height: float, length: int) -> tuple[Array, str]:
+    """Return the response to a step less that to no step, per unit of reference."""
+    rest = np.full(length, loop.point.output)
+    try:
+        still = simulate(loop, rest)
+        moved = simulate(loop, rest + height)
+    except CtrlidError as reason:
+        return np.empty(0), str(reason)
+    return _difference(moved, still, height), ""
+
+
+def _difference(moved: Record, still: Record, height: float) -> Array:
+    return np.asarray((moved.y - still.y) / height, dtype=float)
+
+
+def _performance(margins: Any, time: Array, response: Array) -> Performance:
+    overshoot = settling = float("nan")
+    if margins.stable and response.size:
+        final = float(np.mean(response[-max(len(response) // 20, 1) :]))
+        if final:
+            overshoot = max(0.0, 100 * (float(np.max(response / final)) - 1))
+            outside = np.flatnonzero(np.abs(response / final - 1) > SETTLED)
+            last = int(outside[-1]) + 1 if outside.size else 0
+            settling = float(time[last]) if last < len(time) else float("inf")
+    return Performance(margins.stable, margins.phase_margin, margins.gain_margin,
+                       margins.crossover, overshoot, settling)  # fmt: skip

@@ -1,0 +1,256 @@
+"""Predicting a record from its own past: an extended Kalman filter on the plant's equations.
+
+The filter needs u and y only. It never simulates an unstable plant open loop: every sample pulls
+the state back, so it works on plants that no open-loop simulation survives.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import casadi
+import numpy as np
+from scipy import optimize
+
+from .data import Record
+from .errors import CtrlidError
+from .loop import Loop
+from .physics import Array
+from .simulation import integrate
+
+TUNING_SAMPLES = 4000  # enough to choose the ratio of force noise to sensor noise
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """One-step predictions of a record.
+
+    Attributes
+    ----------
+    y : ndarray, shape (n,)
+        Prediction of each output sample from the samples before it [output unit].
+    innovations : ndarray, shape (n,)
+        Measured minus predicted output, zero where the record is not valid.
+    spread : ndarray, shape (n,)
+        Standard deviation of the innovations that the filter expects.
+    states : ndarray, shape (n, states)
+        State at each sample, given the outputs up to and including it.
+    sensor_noise, force_noise : float
+        Standard deviations of the noise model.
+    """
+
+    y: Array
+    innovations: Array
+    spread: Array
+    states: Array
+    sensor_noise: float
+    force_noise: float
+
+
+def _plant_step(loop: Loop, record: Record) -> Any:
+    """Return the CasADi function ``(x, t, u, next u, force) -> next x`` of the plant alone."""
+    e = loop.equations()
+    n = len(e.states)
+    x, t, u, ahead, force = (casadi.SX.sym("x", n), *(casadi.SX.sym(s) for s in "tuaf"))
+    kick = casadi.SX.zeros(n, 1)
+    for j in e.velocities or range(n):
+        kick[j] = force
+    if e.dt:
+        after = e.function(t, x, u, e.values)[0] + kick
+    else:
+        ramp = (ahead - u) / loop.dt if record.hold == "foh" else 0.0
+
+        def rate(tau: Any, z: Any) -> Any:
+            return e.function(t + tau, z, u + ramp * tau, e.values)[0] + kick
+
+        after = integrate(rate, x, loop.dt, 1)[0]
+    return casadi.Function("plant_step", [x, t, u, ahead, force], [after])
+
+
+def _filter_step(loop: Loop, plant_step: Any) -> Any:
+    """Build one sample of the filter with sensor noise of variance one.
+
+    The state is x stacked on the columns of P, the inputs are (t, u, next u, y, valid, q) with q
+    the variance of the force relative to that of the sensor.
+    """
+    e = loop.equations()
+    n = len(e.states)
+    z, w = casadi.SX.sym("z", n + n * n), casadi.SX.sym("w", 6)
+    t, u, ahead, y, valid, q = casadi.vertsplit(w)
+    x, p = z[:n], casadi.reshape(z[n:], n, n)
+    expected = e.function(t, x, u, e.values)[1]
+    h = casadi.jacobian(expected, z)[:, :n]
+    s = casadi.mtimes([h, p, h.T]) + 1.0
+    gain = valid * casadi.mtimes(p, h.T) / s
+    innovation = valid * (y - expected)
+    x = x + gain * innovation
+    keep = casadi.SX.eye(n) - casadi.mtimes(gain, h)
+    p = casadi.mtimes([keep, p, keep.T]) + casadi.mtimes(gain, gain.T)  # Joseph: stays positive
+    state, force = casadi.SX.sym("s", n), casadi.SX.sym("f")
+    after = plant_step(state, t, u, ahead, force)
+    point = casadi.Function("j", [state, t, u, ahead, force], [
+        casadi.jacobian(after, state), casadi.jacobian(after, force)])  # fmt: skip
+    a, b = point(x, t, u, ahead, 0.0)
+    ahead_p = casadi.mtimes([a, p, a.T]) + q * casadi.mtimes(b, b.T)
+    ahead_p = (ahead_p + ahead_p.T) / 2
+    after_z = casadi.vertcat(plant_step(x, t, u, ahead, 0.0), casadi.reshape(ahead_p, n * n, 1))
+    return casadi.Function("filter", [z, w], [after_z, expected, innovation, s, x])
+
+
+def predict(loop: Loop, record: Record, force_noise: float | None = None) -> Prediction:
+    """Predict each output sample of a record from the samples before it.
+
+    .. math:: \\hat y_k = h(\\hat x_{k|k-1}), \\quad
+        \\hat x_{k|k} = \\hat x_{k|k-1} + K_k (y_k - \\hat y_k)
+
+    An extended Kalman filter on the plant's equations, driven by the measured input. Only the ratio
+    of force noise to sensor noise matters for the prediction; it is chosen by maximum
+    likelihood unless given.
+
+    Parameters
+    ----------
+    loop : Loop
+        The model; its controller is not used.
+    record : Record
+        The data.
+    force_noise : float, optional
+        Ratio of force noise to sensor noise, as standard deviations [1/s^2].
+
+    Returns
+    -------
+    Prediction
+        Predictions, innovations and filtered states.
+
+    Raises
+    ------
+    CtrlidError
+        If the sampling periods differ, or the filter loses the record.
+
+    References
+    ----------
+    Anderson and Moore, *Optimal Filtering*, chapter 8.
+
+    Examples
+    --------
+    >>> import ctrlid as cid
+    >>> plant = cid.plants.servo(m=1.0, c=2.0, k=3.0)
+    >>> loop = cid.Loop(plant, 5.0, dt=0.01)
+    >>> r = cid.random_binary(500, amplitude=0.1, hold=50, seed=1)
+    >>> record = cid.simulate(loop, r, sensor_noise=1e-3, seed=2)
+    >>> bool(cid.predict(loop, record).innovations.std() < 1.3e-3)
+    True
+    """
+    if abs(loop.dt - record.dt) > 1e-9 * loop.dt:
+        raise CtrlidError(f"the loop is sampled at {loop.dt:g} s, the record at {record.dt:g} s; "
+                          "give both the same period")  # fmt: skip
+    step = _filter_step(loop, _plant_step(loop, record))
+    z = _start(loop, record)
+    n = len(record)
+    u = np.asarray(record.u)
+    w = np.vstack([
+        np.arange(n) * record.dt, u, np.append(u[1:], u[-1]), record.y, record.valid, np.zeros(n),
+    ])  # fmt: skip
+    if force_noise is None:
+        ratio = _tune(step, z, w)
+    elif np.isfinite(force_noise) and force_noise >= 0:
+        ratio = float(force_noise)
+    else:
+        raise CtrlidError(f"force_noise is a ratio >= 0; given {force_noise!r}")
+    w[5] = ratio**2
+    states, y, innovations, s, filtered = _pass(step, z, w)
+    del states
+    if not np.isfinite(innovations).all():
+        k = int(np.argmin(np.isfinite(innovations)))
+        raise CtrlidError(
+            f"the predictor of {loop.equations().name} lost the record at sample {k} "
+            f"(t = {k * record.dt:.4g} s): the model cannot follow these data there; check units, "
+            "signs and the operating point, or mark the stretch as not valid"
+        )
+    sensor = float(np.sqrt(np.mean(innovations[record.valid] ** 2 / s[record.valid])))
+    return Prediction(y, innovations, sensor * np.sqrt(s), filtered, sensor, sensor * ratio)
+
+
+def _start(loop: Loop, record: Record) -> Array:
+    """Return a state at the operating point that the first samples may overrule."""
+    e, at = loop.equations(), loop.point
+    y = record.y[record.valid]
+    reach = float(np.std(y)) + abs(float(y[0]) - at.output)
+    noise = max(float(np.std(np.diff(y))) / 2, 1e-9 * max(abs(at.output), 1.0))
+    speed = max(float(np.std(np.diff(y))) / record.dt, 1e-9)
+    wide = [max(0.1 * abs(v), reach) for v in at.states]
+    for j in e.velocities:
+        wide[j] = speed
+    # Variances are relative to that of the sensor noise.
+    return np.concatenate([at.states, np.diag((np.array(wide) / noise) ** 2).ravel()])
+
+
+def _pass(step: Any, z: Array, w: Array) -> tuple[Array, Array, Array, Array, Array]:
+    with np.errstate(all="ignore"):
+        out = [np.asarray(m, float) for m in step.mapaccum("pass", w.shape[1])(z, w)]
+    return out[0], out[1][0], out[2][0], out[3][0], out[4].T
+
+
+def _tune(step: Any, z: Array, w: Array) -> float:
+    """Return the ratio of force to sensor noise that makes the innovations most likely."""
+    w = w[:, :TUNING_SAMPLES].copy()
+    runner = step.mapaccum("tune", w.shape[1])
+    valid = w[4] > 0
+    skip = min(20, valid.sum() // 2)  # the start-up tells about the initial state, not the noise
+    period = w[0, 1] - w[0, 0]
+
+    def cost(log_ratio: float) -> float:
+        w[5] = 10.0 ** (2 * log_ratio)
+        _, _, e, s, _ = (np.asarray(m, float) for m in runner(z, w))
+        e, s = e[0][valid][skip:], s[0][valid][skip:]
+        if not np.isfinite(e).all():
+            return 1e12
+        return float(np.log(np.mean(e**2 / s)) + np.mean(np.log(s)))
+
+    scale = -2 * np.log10(period)
+    grid = scale + np.arange(-5.0, 2.0)
+    costs = [cost(g) for g in grid]
+    best = grid[int(np.argmin(costs))]
+    fine = optimize.minimize_scalar(
+        cost, bounds=(best - 1, best + 1), method="bounded", options={"xatol": 0.02}
+    )
+    return float(10.0**fine.x)
+
+
+def predict_ahead(
+    loop: Loop, record: Record, prediction: Prediction, horizon: int
+) -> tuple[Any, Array]:  # fmt: skip
+    """Predict several samples ahead from the filtered states and the measured input.
+
+    Parameters
+    ----------
+    loop : Loop
+        The model.
+    record : Record
+        The data.
+    prediction : Prediction
+        What `predict` returned for them.
+    horizon : int
+        Number of samples to look ahead.
+
+    Returns
+    -------
+    index : ndarray of int
+        Samples that are predicted.
+    y : ndarray
+        Their predictions.
+    """
+    e = loop.equations()
+    every = max(1, horizon // 4)
+    starts = np.arange(0, len(record) - horizon, every)
+    whole = np.array([record.valid[k : k + horizon + 1].all() for k in starts], dtype=bool)
+    starts = starts[whole]
+    x = prediction.states[starts].T
+    plant_step = _plant_step(loop, record).map(max(len(starts), 1))
+    ahead = np.append(record.u[1:], record.u[-1])
+    for j in range(horizon if len(starts) else 0):
+        k = starts + j
+        x = np.asarray(plant_step(x, k * record.dt, record.u[k], ahead[k], 0.0), float)
+    k = starts + horizon
+    y = np.asarray(
+        e.function.map(max(len(k), 1))(k * record.dt, x, record.u[k], e.values)[1], float
+    ).ravel() if len(k) else np.empty(0)  # fmt: skip
+    return k, y

@@ -1,0 +1,293 @@
+"""Simulation against tight-tolerance references, noise statistics, and failures in words.
+
+Groups: accuracy; signals (noise, d, initial states, limits); failures; other plants; the loop itself.
+"""
+
+import copy
+import warnings
+
+import control as ct
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import ctrlid as cid
+from ctrlid import CtrlidError
+from ctrlid.simulation import growth_rate
+
+RNG = np.random.default_rng(5)
+CASES = [
+    (RNG.uniform(0.01, 0.1), RNG.uniform(0.005, 0.02), RNG.uniform(1, 10), share, analog)
+    for share in (0.3, 0.1, 0.02)
+    for analog in (False, True)
+]
+
+
+def make(mass, gap, voltage, share=0.05, analog=False, **kwargs):
+    """Levitate a ball with a lead at 2.5 times its unstable pole p and p*dt = share."""
+    plant = cid.plants.maglev(m=mass, K=mass * 9.81 * gap**2 / voltage**2)
+    op = cid.operating_point(plant, output=gap)
+    p = np.sqrt(2 * 9.81 / gap)
+    C = cid.design_lead(cid.linearize(plant, op), crossover=2.5 * p, phase_margin=50)
+    dt = share / p
+    if not analog:
+        C = ct.sample_system(C, dt, "tustin")
+    return cid.Loop(plant, C, dt=dt, at=op, **kwargs), op
+
+
+def reference(loop, r):
+    """Integrate period by period with SciPy at a tolerance near round-off."""
+    c, op, plant = ct.ss(loop.controller), loop.at, loop.plant
+    n, z = plant.nstates, np.r_[loop.at.states, np.zeros(ct.ss(loop.controller).nstates)]
+    ys, us = [], []
+
+    def control(z, rk):
+        return op.input + (c.C @ z[n:])[0] + c.D[0, 0] * (rk - z[0])
+
+    for rk in r:
+        u = control(z, rk)
+        ys.append(z[0])
+        us.append(u)
+
+        def rate(t, z, rk=rk, u=u):
+            u = control(z, rk) if loop.analog else u
+            slope = c.A @ z[n:] + c.B[:, 0] * (rk - z[0]) if loop.analog else 0 * z[n:]
+            return np.r_[plant.updfcn(t, z[:n], [u], plant.params), slope]
+
+        after = solve_ivp(rate, (0, loop.dt), z, method="DOP853", rtol=1e-12, atol=1e-15).y[:, -1]
+        if not loop.analog:
+            after[n:] = c.A @ z[n:] + c.B[:, 0] * (rk - z[0])
+        z = after
+    return np.array(ys), np.array(us)
+
+
+@pytest.mark.parametrize(("mass", "gap", "voltage", "share", "analog"), CASES)
+def test_simulation_is_accurate(mass, gap, voltage, share, analog):
+    loop, op = make(mass, gap, voltage, share, analog)
+    r = cid.random_binary(150, amplitude=0.01 * gap, hold=7, around=gap, seed=3)
+    record = cid.simulate(loop, r)
+    y, u = reference(loop, r)
+    assert np.abs(record.y - y).max() < 1e-7 * y.std()
+    assert np.abs(record.u - u).max() < 1e-7 * u.std()
+    assert record.hold == ("foh" if analog else "zoh")
+    assert record.names["y"] == "x"
+    assert record.names["u"] == "V"
+    assert op.input == pytest.approx(voltage)
+
+
+def test_linear_sampled_loop_equals_matrix_recursion():
+    a, b, c = np.array([[0.0, 1.0], [4.0, -1.0]]), np.array([[0.0], [-3.0]]), np.array([[1.0, 0]])
+    plant = ct.ss(a, b, c, 0)
+    at = cid.OperatingPoint((0.0, 0.0), 2.0, 0.5)
+    loop = cid.Loop(plant, ct.tf([-8.0, 6.5], [1.0, -0.2], 0.1), dt=0.1, at=at)
+    r = 0.5 + 0.1 * np.sign(np.sin(np.arange(80)))
+    record = cid.simulate(loop, r)
+    sampled = ct.sample_system(plant, 0.1)
+    x, q = np.zeros(2), np.zeros(1)
+    C = ct.ss(loop.controller)
+    for k, rk in enumerate(r):
+        y = (sampled.C @ x)[0]
+        e = rk - (0.5 + y)
+        v = (C.C @ q)[0] + C.D[0, 0] * e
+        assert record.y[k] == pytest.approx(0.5 + y, abs=1e-10)
+        assert record.u[k] == pytest.approx(2.0 + v, abs=1e-9)
+        x = sampled.A @ x + sampled.B[:, 0] * v
+        q = C.A @ q + C.B[:, 0] * e
+
+
+def test_discrete_plant_steps_as_its_difference_equation():
+    G = ct.tf([0.2, 0.1], [1.0, -2.05, 1.0], 0.02)
+    loop = cid.Loop(G, ct.tf([4.0, -3.4], [1.0, 0.2], 0.02), dt=0.02,
+                    at=cid.OperatingPoint((0.012, 0.0), 3.0, 1.0))  # fmt: skip
+    record = cid.simulate(loop, 1.0 + 0.1 * np.ones(50))
+    y, u = record.y - 1.0, record.u - 3.0
+    np.testing.assert_allclose(
+        y[2:], 2.05 * y[1:-1] - y[:-2] + 0.2 * u[1:-1] + 0.1 * u[:-2], atol=1e-12
+    )
+
+
+def test_noise_has_the_size_asked_for_and_its_own_stream():
+    loop, op = make(0.02, 0.01, 3.0)
+    r = np.full(4000, op.output)
+    quiet = cid.simulate(loop, r)
+    assert np.ptp(quiet.y) < 1e-15
+    noisy = cid.simulate(loop, r, sensor_noise=1e-6, seed=1)
+    again = cid.simulate(loop, r, sensor_noise=1e-6, seed=1)
+    np.testing.assert_array_equal(noisy.y, again.y)
+    assert np.any(cid.simulate(loop, r, sensor_noise=1e-6, seed=2).y != noisy.y)
+    # White noise enters y directly: its first difference at the first sample is the noise itself.
+    first = [cid.simulate(loop, r[:2], sensor_noise=1e-6, seed=s).y[0] for s in range(200)]
+    assert np.std(first) == pytest.approx(1e-6, rel=0.2)
+    pushed = cid.simulate(loop, r, force_noise=0.05, seed=1)
+    kick = pushed.y[1] - op.output
+    expected = np.random.default_rng(1).spawn(2)[1].standard_normal() * 0.05 * loop.dt**2 / 2
+    assert kick == pytest.approx(expected, rel=1e-2)
+
+
+def test_injected_signal_adds_to_the_controller_ahead_of_the_limits():
+    loop, op = make(0.02, 0.01, 3.0)
+    r = np.full(300, op.output)
+    d = np.zeros(300)
+    d[100:110] = 0.05
+    free = cid.simulate(loop, r, d=d)
+    assert free.u[100] == pytest.approx(op.input + 0.05)
+    tight = copy.replace(loop, input_limits=(2.9, 3.04)) if hasattr(copy, "replace") else None
+    tight = tight or cid.Loop(loop.plant, loop.controller, dt=loop.dt, at=op,
+                              input_limits=(2.9, 3.04))  # fmt: skip
+    assert cid.simulate(tight, r, d=d).u.max() == 3.04
+
+
+def test_initial_states_of_plant_and_controller():
+    loop, op = make(0.02, 0.01, 3.0)
+    r = np.full(2000, op.output)
+    moved = cid.simulate(loop, r, initial=(1.01 * op.output, 0.0))
+    assert moved.y[0] == 1.01 * op.output
+    assert moved.y[-1] == pytest.approx(op.output, rel=1e-9)
+    charged = cid.simulate(loop, r, initial=(op.output, 0.0, 1e-5))
+    assert charged.u[0] != op.input
+    with pytest.raises(CtrlidError, match=r"initial needs 2 plant states \(x, v\)"):
+        cid.simulate(loop, r, initial=(op.output,))
+
+
+def test_open_loop_runs_from_d():
+    plant = cid.plants.tank(area=0.01, outlet=1e-5, k=1e-5)
+    op = cid.operating_point(plant, output=0.2)
+    loop = cid.Loop(plant, None, dt=5.0, at=op)
+    record = cid.simulate(loop, d=np.full(4000, 0.1))
+    assert record.r is None
+    assert record.u[0] == pytest.approx(op.input + 0.1)
+    level = (op.input + 0.1) ** 2 / (2 * 9.81)
+    assert record.y[-1] == pytest.approx(level, rel=1e-6)
+
+
+def test_a_ball_that_leaves_the_gap_is_an_error_that_says_when_and_why():
+    loop, op = make(0.02, 0.01, 3.0)
+    r = cid.random_binary(400, amplitude=0.4 * op.output, hold=30, around=op.output, seed=1)
+    with pytest.raises(CtrlidError) as failure:
+        cid.simulate(loop, r)
+    text = str(failure.value)
+    assert "the simulation stops at t = " in text
+    assert "x left the range where the plant is defined" in text
+    assert "the signals are too large" in text
+    assert "V moved" in text
+
+
+def test_an_unstable_loop_says_so():
+    loop, op = make(0.02, 0.01, 3.0)
+    weak = cid.Loop(loop.plant, 0.1 * loop.controller, dt=loop.dt, at=op)
+    with pytest.raises(CtrlidError, match=r"closed loop is unstable: small deviations grow at"):
+        cid.simulate(weak, np.full(4000, op.output * 1.001))
+    assert growth_rate(weak) > 0 > growth_rate(loop)
+
+
+def test_a_saturated_loop_says_so():
+    loop, op = make(0.02, 0.01, 3.0)
+    tight = cid.Loop(loop.plant, loop.controller, dt=loop.dt, at=op, input_limits=(2.95, 3.05))
+    with pytest.raises(CtrlidError, match=r"V was at its limit \(2.95..3.05\)"):
+        cid.simulate(tight, np.full(2000, op.output * 1.1))
+
+
+def test_an_unstable_plant_is_not_simulated_without_its_controller():
+    loop, op = make(0.02, 0.01, 3.0)
+    alone = cid.Loop(loop.plant, None, dt=loop.dt, at=op)
+    with pytest.raises(CtrlidError, match="cannot be simulated without its controller"):
+        cid.simulate(alone, d=np.full(5000, 0.01))
+
+
+def test_a_plant_too_sharp_to_integrate_warns():
+    plant = ct.nlsys(
+        lambda t, x, u, p: [x[1], u[0] - 50 * np.sign(x[1]) - 2 * x[1]], lambda t, x, u, p: x[0],
+        inputs=["u"], outputs=["y"], states=["x", "v"], name="rough",
+    )  # fmt: skip
+    loop = cid.Loop(plant, None, dt=0.05)
+    with pytest.warns(cid.CtrlidWarning, match="simulate with a smaller dt"):
+        cid.simulate(loop, d=60 * np.sin(np.arange(100)))
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda loop: cid.simulate(loop), "needs the reference r"),
+        (lambda loop: cid.simulate(loop, np.ones((3, 2))), r"one-dimensional .* shape \(3, 2\)"),
+        (lambda loop: cid.simulate(loop, [0.01, np.nan]), "with 1 not finite"),
+        (lambda loop: cid.simulate(loop, np.ones(5), d=np.ones(4)), "equally long; given"),
+        (lambda loop: cid.simulate(loop, np.ones(5), sensor_noise=-1), "standard deviation >= 0"),
+        (lambda loop: cid.simulate(cid.Loop(loop.plant, None, dt=1.0, at=loop.at)), "needs r or d"),
+    ],
+)
+def test_simulate_refuses_bad_signals(call, words):
+    with pytest.raises(CtrlidError, match=words):
+        call(make(0.02, 0.01, 3.0)[0])
+
+
+def test_force_noise_needs_a_moving_mass():
+    plant = cid.plants.tank(area=0.01, outlet=1e-5, k=1e-5)
+    loop = cid.Loop(plant, None, dt=1.0, at=cid.operating_point(plant, output=0.2))
+    with pytest.raises(CtrlidError, match="a state whose rate is another state; tank has none"):
+        cid.simulate(loop, d=np.zeros(10), force_noise=1.0)
+
+
+MAGLEV = cid.plants.maglev(m=0.02, K=3e-6)
+POINT = cid.operating_point(MAGLEV, output=0.01)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"dt": -1.0}, "sampling period dt > 0 s; given dt=-1.0"),
+        ({}, "sampling period dt > 0"),
+        ({"dt": 0.01, "free": ("Kc",)}, r"free= names \['Kc'\].*\['m', 'K', 'g'\]"),
+        ({"dt": 0.01, "at": (0.01, 0.0)}, "at= needs an OperatingPoint"),
+        ({"dt": 0.01, "at": cid.OperatingPoint((0.01,), 3, 0.01)}, "at= has 1 states, maglev has 2"),
+        ({"dt": 0.01, "input_limits": (3, 1)}, "needs lower < upper"),
+        ({"dt": 0.01, "input_limits": 3}, "is a pair"),
+        ({"dt": 0.01, "controller": "PID"}, "a controller is a TransferFunction"),
+        ({"dt": 0.01, "controller": ct.tf([1], [1, 1], 0.02)}, "runs at 0.02 s, the loop at 0.01"),
+        ({"dt": 0.01, "controller": ct.tf([1, 0], [1])}, "no circuit and no program differentiates"),
+        ({"dt": 0.01, "controller": ct.ss(-np.eye(3), np.eye(3), np.ones((1, 3)), 0)}, "3 inputs"),
+    ],
+)
+def test_loop_refuses_what_does_not_fit(arguments, words):
+    with pytest.raises(CtrlidError, match=words):
+        cid.Loop(MAGLEV, **{"at": POINT, **arguments})
+
+
+def test_loop_refuses_mixed_time_and_algebraic_loops():
+    with pytest.raises(CtrlidError, match="analog controller cannot act on a plant in discrete"):
+        cid.Loop(ct.tf([1], [1, -0.5], 0.1), ct.tf([1], [1, 1]), dt=0.1)
+    with pytest.raises(CtrlidError, match="the plant is sampled at 0.1 s, the loop at 0.2 s"):
+        cid.Loop(ct.tf([1], [1, -0.5], 0.1), dt=0.2)
+    with pytest.raises(CtrlidError, match="passes its input to its output without delay"):
+        cid.Loop(ct.tf([1, 0], [1, 1]), 0.5, dt=0.1)
+
+
+def test_loop_is_a_value_and_gives_its_plant_back():
+    loop, op = make(0.02, 0.01, 3.0)
+    assert loop.system() is loop.plant
+    with pytest.raises(AttributeError):
+        loop.dt = 1.0
+    linear = cid.Loop(ct.tf([2.0], [1.0, 3.0]), None, dt=0.1, at=cid.OperatingPoint((), 1.0, 5.0))
+    system = linear.system()
+    assert isinstance(system, ct.NonlinearIOSystem)
+    assert system.output(0, [0.0], [1.0])[0] == 5.0
+    assert system.dynamics(0, [0.0], [1.0])[0] == 0.0
+    assert "digital controller" in repr(loop)
+    assert "no controller" in repr(linear)
+    assert "V within 0..6" in repr(cid.Loop(MAGLEV, None, dt=1.0, at=POINT, input_limits=(0, 6)))
+
+
+def test_agrees_with_python_control_on_an_analog_loop():
+    loop, op = make(0.02, 0.01, 3.0, share=0.05, analog=True)
+    time = np.arange(60) * loop.dt
+    C = ct.ss(loop.controller, inputs="e", outputs="v", name="C")
+    bias = ct.nlsys(None, lambda t, x, u, p: u[0] + op.input, inputs="v", outputs="V", name="bias")
+    error = ct.summing_junction(["r", "-x"], "e", name="error")
+    whole = ct.interconnect([loop.plant, C, bias, error], inputs="r", outputs=["x", "V"], name="all")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        response = ct.input_output_response(
+            whole, time, np.full(60, 1.005 * op.output), [*op.states, 0.0], rtol=1e-10, atol=1e-13
+        )
+    record = cid.simulate(loop, np.full(60, 1.005 * op.output))
+    np.testing.assert_allclose(record.y, response.outputs[0], rtol=1e-8)
+    np.testing.assert_allclose(record.u, response.outputs[1], rtol=1e-7)
