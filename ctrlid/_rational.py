@@ -108,8 +108,9 @@ class Rational:
             if not zeros:
                 break
             nearest = int(np.argmin(np.abs(np.array(zeros) - pole)))
-            scale = abs(pole) + abs(to_s(np.array([pole]), self.dt)[0]) * (self.dt or 1.0)
-            if abs(zeros[nearest] - pole) <= 1e-8 * scale:
+            # Poles of a fast-sampled plant crowd around z = 1, at distances of |s| dt.
+            scale = min(abs(pole), abs(pole - 1)) if self.dt else abs(pole)
+            if abs(zeros[nearest] - pole) <= 1e-8 * scale + 1e-14 * bool(self.dt):
                 found.append(complex(pole))
                 del zeros[nearest]
         return found
@@ -125,8 +126,6 @@ class Rational:
 
 def rational(system: Any, name: str) -> Rational:
     """Return `system` as polynomials, or refuse and say what `name` has to be."""
-    if isinstance(system, Rational):
-        return system
     if isinstance(system, int | float | np.number):
         system = ct.tf([float(system)], [1.0], 0)
     if not isinstance(system, ct.TransferFunction | ct.StateSpace):

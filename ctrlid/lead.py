@@ -203,9 +203,12 @@ def _check_plant(plant: Rational, crossover: float) -> None:
             )
     for error, word in zip(plant.rounding(crossover), ("zero", "infinite"), strict=True):
         if error > 1e-4:
+            crowd = " (at fast sampling poles crowd around z = 1: sample more slowly, or design on "
+            crowd += "the continuous plant)"
             raise CtrlidError(
-                f"P is {word} at the crossover {crossover:g} rad/s, at least to the accuracy of "
-                f"its coefficients, so no compensator gives a gain of 1 there; choose another one."
+                f"P is {word} at the crossover {crossover:g} rad/s, to the accuracy of its "
+                f"coefficients{crowd if plant.dt else ''}, so no compensator gives a gain of 1 "
+                f"there; choose another one."
             )
 
 

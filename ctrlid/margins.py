@@ -27,7 +27,7 @@ class Margins:
 
     For an unstable loop `stable` is False and every number is NaN: there is no margin to speak of.
 
-    Attributes
+    Parameters
     ----------
     stable : bool
         Whether all closed-loop poles, hidden ones included, are clearly stable.

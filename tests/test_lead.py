@@ -75,6 +75,17 @@ def family(P, crossover, phase_margin, count=400):
             yield ct.tf(K * np.array(num), den, period)
 
 
+def polynomial_stable(P, C):
+    """Judge by the characteristic polynomial: many times faster, for brute force."""
+    pole = np.roots(
+        np.polyadd(
+            np.polymul(P.num[0][0], C.num[0][0]),
+            np.polymul(P.den[0][0], C.den[0][0]),
+        )
+    )
+    return bool(np.all(np.abs(pole) < 1) if P.dt else np.all(pole.real < 0))
+
+
 def random_maglevs(count, seed):
     generator = np.random.default_rng(seed)
     for _ in range(count):
@@ -132,7 +143,7 @@ def test_off_centre_lead_has_the_largest_modulus_margin():
         (
             cid.loop_margins(P * trial).modulus_margin
             for trial in family(P, crossover, 50)
-            if closed_loop_stable(P, trial)
+            if polynomial_stable(P, trial)
         ),
     )
     assert cid.loop_margins(P * C).modulus_margin >= 0.995 * best
@@ -163,7 +174,7 @@ def random_plant(generator, kind):
 def test_random_plants_are_answered_exactly_or_refused_rightly(kind, dt):
     generator = np.random.default_rng([len(kind), int(1000 * dt)])
     answered = refused = 0
-    for _ in range(25):
+    for _ in range(15):
         P = random_plant(generator, kind)
         P = ct.c2d(P, dt) if dt else P
         crossover = min(10 ** generator.uniform(-0.5, 1.2), 2.0 / dt if dt else math.inf)
@@ -176,9 +187,9 @@ def test_random_plants_are_answered_exactly_or_refused_rightly(kind, dt):
             trials = list(family(P, crossover, phase_margin, count=100))
             if "unstable with every lead" in text:
                 assert trials
-                assert not any(closed_loop_stable(P, trial) for trial in trials)
+                assert not any(polynomial_stable(P, trial) for trial in trials)
             elif "another crossover" in text:
-                stable = [trial for trial in trials if closed_loop_stable(P, trial)]
+                stable = [trial for trial in trials if polynomial_stable(P, trial)]
                 margins = [cid.loop_margins(P * trial).phase_margin for trial in stable]
                 assert max(margins) < phase_margin
             else:
@@ -187,7 +198,7 @@ def test_random_plants_are_answered_exactly_or_refused_rightly(kind, dt):
         else:
             answered += 1
             check(P, C, crossover, phase_margin)
-    assert answered >= 4
+    assert answered >= 3
     assert refused >= 1
 
 
@@ -278,7 +289,7 @@ def test_possible_crossovers_are_a_range_for_a_discrete_levitation():
     with pytest.raises(cid.CtrlidError, match=r"possible from about 30\S* to about \S+ rad/s"):
         cid.design_lead(P, 20.0, 50)
     with pytest.raises(cid.CtrlidError, match=r"possible up to about \S+ rad/s"):
-        cid.design_lead(ct.tf([1], [1, 0.1, 0]), 5.0, 91)
+        cid.design_lead(ct.tf([1], [1, 0.1, 0]), 5.0, 95)
 
 
 def test_the_other_sign_of_gain_is_not_forgotten():
@@ -341,6 +352,10 @@ P = ct.tf([1], [1, 0, 0])
         (lambda: cid.design_lead(ct.tf([np.inf], [1, 1]), 1, 45), "NaN or infinite"),
         (lambda: cid.design_lead(ct.tf([1], [1, 0, 1]), 1, 45), "P is infinite at the crossover 1"),
         (lambda: cid.design_lead(ct.tf([1, 0, 9], [1, 3, 3, 1]), 3, 45), "P is zero at the cros"),
+        (
+            lambda: cid.design_lead(ct.c2d(ct.tf([1], [1, 4, 6, 4, 1]), 1e-4), 0.5, 45),
+            "to the accuracy of its coefficients .at fast sampling",
+        ),
         (lambda: cid.design_lead(ct.tf([0], [1, 1]), 3, 45), "P is zero at the crossover 3"),
         (lambda: cid.design_lead(ct.tf([1, -2], [1, -1, -2]), 5, 45), "hidden mode at 2 that is"),
         (lambda: cid.design_lead(ct.tf([1, 0], [1, 1, 0]), 5, 45), "hidden mode at 0 that is"),

@@ -94,6 +94,7 @@ def test_known_unstable_plant():
         ct.tf([1, 0], [1, 1, 0]),  # so is the integrator
         ct.tf([-1, 0], [1, 1]),  # 1 + L vanishes at infinity: ill-posed
         ct.tf([1], [1, -0.5], 0.1) * 2,
+        ct.tf([1, -1], [1, -1.5, 0.5], 0.1),
     ],
     ids=str,
 )
@@ -259,6 +260,10 @@ def test_nu_gap_sees_transfer_functions_only():
     P = ct.tf([1], [1, 1])
     hidden = ct.tf([1, -3], np.polymul([1, 1], [1, -3]))
     assert cid.nu_gap(P, hidden) < 1e-9
+    P = ct.tf([1], [1, -0.5], 0.1)
+    for root in (0.0, 1.0, 0.3):
+        hidden = ct.tf([1, -root], np.polymul([1, -0.5], [1, -root]), 0.1)
+        assert cid.nu_gap(P, hidden) < 1e-9
 
 
 @pytest.mark.parametrize("dt", [0.0, 0.02])
@@ -266,7 +271,7 @@ def test_small_nu_gap_keeps_the_loop_stable(dt):
     """Vinnicombe: arcsin b(P2, C) >= arcsin b(P1, C) - arcsin gap(P1, P2)."""
     generator = np.random.default_rng(21)
     informative = 0
-    for _ in range(150):
+    for _ in range(90):
         order = int(generator.integers(1, 4))
         P = random_system(generator, order, unstable=int(generator.integers(0, 2)), zeros=0)
         C = random_system(generator, 1)
@@ -281,7 +286,7 @@ def test_small_nu_gap_keeps_the_loop_stable(dt):
             informative += 1
             assert closed_loop_stable(other * C)
         assert math.asin(after) >= math.asin(b) - math.asin(gap) - 1e-6
-    assert informative > 8
+    assert informative > 5
 
 
 def test_robust_margin_is_the_norm_it_is_defined_by():
