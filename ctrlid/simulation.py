@@ -144,6 +144,15 @@ def stepper(loop: Loop, substeps: int) -> Stepper:
     return Stepper(e.states, rest, casadi.Function("step", [z, w], [after, y, u, error]))
 
 
+def _sensitivity(s: Stepper, reference: float) -> tuple[Array, Array]:
+    """Return how the state after one period depends on the state and signals at rest."""
+    z, w = casadi.SX.sym("z", len(s.rest)), casadi.SX.sym("w", 5)
+    after = s.step(z, w)[0]
+    both = casadi.Function("j", [z, w], [casadi.jacobian(after, z), casadi.jacobian(after, w)])
+    a, b = both(s.rest, [0.0, reference, 0.0, 0.0, 0.0])
+    return np.asarray(a, float), np.asarray(b, float)
+
+
 def growth_rate(loop: Loop) -> float:
     """Return the growth rate of small deviations in the closed loop [1/s].
 
@@ -162,10 +171,7 @@ def growth_rate(loop: Loop) -> float:
     float
         The rate; minus infinity for a loop that is at rest after one period.
     """
-    s = stepper(loop, 8)
-    z, w = casadi.SX.sym("z", len(s.rest)), casadi.SX.sym("w", 5)
-    jacobian = casadi.Function("j", [z, w], [casadi.jacobian(s.step(z, w)[0], z)])
-    matrix = np.asarray(jacobian(s.rest, [0.0, loop.point.output, 0, 0, 0]), float)
+    matrix = _sensitivity(stepper(loop, 8), loop.point.output)[0]
     largest = np.max(np.abs(np.linalg.eigvals(matrix)), initial=0.0)
     return float(np.log(largest) / loop.dt) if largest > 0 else -math.inf
 
@@ -292,6 +298,9 @@ class Simulator:
         self.plant_states = first.plant_states
         self.rest: Array = np.array(first.rest, dtype=float)
         self._runners: dict[tuple[int, int], Any] = {}
+        # What a millionth of the operating values does to each state: smaller motion is rest.
+        a, b = (np.nan_to_num(np.abs(m)) for m in _sensitivity(first, loop.point.output))
+        self._floor = 1e-6 * (a @ np.abs(self.rest) + b[:, 2] * abs(loop.point.input))
 
     def start(self, initial: Sequence[float] | None) -> Array:
         """Return the state to start from: at rest, or with the given values."""
@@ -324,7 +333,7 @@ class Simulator:
         w = np.vstack([np.arange(n) * loop.dt, quiet if r is None else r, d,
                        *(noise or (quiet, quiet))])  # fmt: skip
         y, u = np.empty(n), np.empty(n)
-        start, reach = z, np.zeros(z.size)
+        start, reach = z, self._floor
         substeps, size = 1, min(CHUNK, n)
         worst, where = 0.0, 0
         for first in range(0, n, size):
