@@ -90,13 +90,6 @@ def fit_arx(
     structure = check_orders(na, nb, nk)
     known = check_constraints(constraints)
     records = as_records(record)
-    dt = records[0].dt
-    if any(abs(other.dt - dt) > 1e-9 * dt for other in records):
-        periods = ", ".join(f"{other.dt:g}" for other in records)
-        raise CtrlidError(
-            f"All records of one fit need the same sampling period; given {periods} s. "
-            "Decimate the faster ones."
-        )
     regression = arx_regression(records, structure, intercept)
     unknowns = na + nb + len(regression.intercept_rows)
     if regression.rows <= unknowns:
@@ -110,9 +103,9 @@ def fit_arx(
     except NotExcited as trouble:
         message = _not_excited(regression, trouble.direction)
         raise CtrlidError(message) from None
-    estimate = _estimate(regression, found, constrained=bool(known), dt=dt)
+    estimate = _estimate(regression, found, constrained=bool(known), dt=records[0].dt)
     names = records[0].names
-    return IdentifiedModel(estimate, inputs=names["u"], outputs=names["y"])
+    return IdentifiedModel(estimate, inputs=names.get("u", "u"), outputs=names.get("y", "y"))
 
 
 def arx_cost(regression: Regression) -> Cost:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,6 +58,10 @@ class Rows:
             self.rows + other.rows,
             self.owners + other.owners,
         )
+
+    def none(self) -> Rows:
+        """Return no rows, for as many coefficients."""
+        return Rows(self.weights[:0], self.lower[:0], self.upper[:0], (), ())
 
     @property
     def equality(self) -> NDArray[np.bool_]:
@@ -141,8 +146,16 @@ class Elimination:
 
 def eliminate(weights: FloatArray, values: FloatArray) -> Elimination:
     """Reduced row echelon form of ``weights @ theta = values``; `Infeasible` if they contradict."""
-    m, p = weights.shape
     work = np.column_stack([weights, values])
+    return _eliminate(work.shape, work.tobytes())
+
+
+@lru_cache(maxsize=64)
+def _eliminate(shape: tuple[int, int], numbers: bytes) -> Elimination:
+    # One fit asks for the same few rows several times, and a study for them in every fit.
+    work = np.frombuffer(numbers).reshape(shape).copy()
+    m, p = shape[0], shape[1] - 1
+    weights = work[:, :p]
     if m:
         # Powers of two scale without rounding: rows of small integers stay exact.
         size = np.maximum(np.abs(weights).max(axis=1), np.finfo(float).tiny)
@@ -170,7 +183,10 @@ def eliminate(weights: FloatArray, values: FloatArray) -> Elimination:
     directions[free, np.arange(len(free))] = 1.0
     directions += 0.0  # no negative zeros in what is printed
     index = np.array(pivots, dtype=np.intp)
-    return Elimination(offset, directions, index, free, work[:rank, :p], work[:rank, p])
+    arrays = (offset, directions, index, free, work[:rank, :p], work[:rank, p])
+    for array in arrays:
+        array.setflags(write=False)
+    return Elimination(*arrays)
 
 
 def one_sided(rows: Rows) -> tuple[FloatArray, FloatArray, NDArray[np.intp], FloatArray]:

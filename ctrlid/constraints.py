@@ -170,11 +170,12 @@ def _denominator(values: Sequence[float] | FloatArray, na: int) -> dict[str, flo
 
 def _pole_rows(structure: Structure, pole: complex) -> list[Row]:
     """``A(pole) = 0``; both parts of it if the pole is complex."""
-    powers = complex(pole) ** np.arange(structure.na, -1, -1)
+    # Products, unlike powers of complex numbers, are exact for poles such as 1j.
+    powers = np.cumprod([1.0, *[complex(pole)] * structure.na])[::-1]
     # Beyond the unit circle the powers grow: divided by the largest, the row stays of size one.
     powers = powers / max(1.0, abs(powers[0]))
     parts = [powers.real] if complex(pole).imag == 0 else [powers.real, powers.imag]
-    return [equals(_denominator(p[1:], structure.na), -float(p[0])) for p in parts]
+    return [equals(_denominator(p[1:], structure.na), 0.0 - float(p[0])) for p in parts]
 
 
 @final
@@ -257,12 +258,13 @@ class SymmetricPoles(_Known):
             return (Branch((equals({"a1": 1.0}, 0.0), Row({"a2": 1.0}, upper=0.0))),)
 
         def pair(p: float) -> Sequence[Row]:
-            powers = p ** np.arange(na, -1.0, -1.0)
+            # Even and odd part of A vanish at p; the odd one is divided by p, for p = 0.
+            power = np.arange(na, -1, -1)
             rows = []
             for parity in (0, 1):
-                part = np.where(np.arange(na, -1, -1) % 2 == parity, powers, 0.0)
-                part = part / np.abs(part).max()
-                rows.append(equals(_denominator(part[1:], na), -float(part[0])))
+                part = np.where(power % 2 == parity, float(p) ** np.maximum(power - parity, 0), 0.0)
+                part = part / part.max()
+                rows.append(equals(_denominator(part[1:], na), 0.0 - float(part[0])))
             return rows
 
         grid = tuple(np.concatenate([[0.0], np.geomspace(1e-3, 1e5, 160)]))

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import qpsolvers
 from numpy.typing import NDArray
+from scipy.optimize import nnls
 
 from .cases import Elimination, Infeasible, Rows, eliminate, feasible, one_sided
 from .errors import CtrlidError
@@ -16,6 +17,9 @@ IndexArray = NDArray[np.intp]
 
 TOLERANCE = 1e-10
 """Absolute tolerance handed to the solver, in units where the largest violation is one."""
+
+
+_ROUNDS = 10  # exchanges of rows per row before the active set is given up
 
 
 class NotExcited(Exception):
@@ -86,21 +90,19 @@ class Solution:
 
 @dataclass(frozen=True, eq=False)
 class _Reduced:
-    """Under equalities: ``s = s0 + N v``, ``cost = || M v - c ||^2 + ...``, M = QR triangular."""
+    """Under equalities: ``s = s0 + step @ (u0 + u)`` and ``cost = | u |^2`` plus a constant."""
 
     elimination: Elimination
     s0: FloatArray
-    null: FloatArray
-    upper: FloatArray
-    target: FloatArray
-    v: FloatArray
+    step: FloatArray
+    u0: FloatArray
+    singular: FloatArray
 
 
 def _reduce(cost: Cost, weights: FloatArray, values: FloatArray) -> _Reduced:
     """Minimise a scaled cost under equalities by an orthogonal null-space method."""
     e = eliminate(weights, values)
-    p = len(cost.origin)
-    rank = len(e.pivots)
+    p, rank = len(cost.origin), len(e.pivots)
     s0, null = np.zeros(p), np.eye(p)
     if rank:
         k = e.weights @ cost.basis
@@ -109,18 +111,17 @@ def _reduce(cost: Cost, weights: FloatArray, values: FloatArray) -> _Reduced:
         right = (e.values - e.weights @ cost.origin) / size
         s0 = q[:, :rank] @ np.linalg.solve(r[:rank].T, right)
         null = q[:, rank:]
-    q, upper = np.linalg.qr(cost.R @ null)
-    target = q.T @ (cost.d - cost.R @ s0)
-    if null.shape[1]:
-        _, singular, directions = np.linalg.svd(upper)
-        if singular[-1] <= cost.floor:
-            raise NotExcited(cost.basis @ null @ directions[-1])
-    v = np.linalg.solve(upper, target)
-    return _Reduced(e, s0, null, upper, target, v)
+    if rank == p:
+        return _Reduced(e, s0, null, np.zeros(0), np.ones(1))
+    left, singular, right_t = np.linalg.svd(cost.R @ null, full_matrices=False)
+    if singular[-1] <= cost.floor:
+        raise NotExcited(cost.basis @ null @ right_t[-1])
+    step = null @ (right_t.T / singular)
+    return _Reduced(e, s0, step, left.T @ (cost.d - cost.R @ s0), singular)
 
 
 def _point(cost: Cost, reduced: _Reduced) -> tuple[FloatArray, float]:
-    s = reduced.s0 + reduced.null @ reduced.v
+    s = reduced.s0 + reduced.step @ reduced.u0
     theta = reduced.elimination.snap(cost.origin + cost.basis @ s)
     return theta, float(np.sum((cost.R @ s - cost.d) ** 2))
 
@@ -163,14 +164,13 @@ def solve(cost: Cost, rows: Rows, below: float = np.inf) -> Solution:
     if free_cost >= below:
         raise Infeasible
     g, h, origin, sign = one_sided(rows)
-    # In u = (upper v - target) the cost is |u|^2, up to a constant.
-    at_free = cost.origin + cost.basis @ (free.s0 + free.null @ free.v)
     full = g @ cost.basis
-    slope = np.linalg.solve(free.upper.T, (full @ free.null).T).T
-    room = h - g @ at_free
+    slope = full @ free.step
+    room = h - g @ cost.origin - full @ (free.s0 + free.step @ free.u0)
     norm = np.linalg.norm(slope, axis=1)
     # Rows that the equalities already decide carry no direction of their own.
-    decided = np.linalg.norm(full @ free.null, axis=1) <= 1e-11 * np.linalg.norm(full, axis=1)
+    size = np.linalg.norm(full, axis=1) / free.singular[-1]
+    decided = norm <= 1e-11 * size
     if np.any(room[decided] < -1e-9 * (1 + np.abs(h[decided]))):
         raise Infeasible
     origin, on_bound = origin[~decided], (sign * h)[~decided]
@@ -198,13 +198,28 @@ def _active_set(slope: FloatArray, room: FloatArray, rows: Rows) -> IndexArray:
     problem = qpsolvers.Problem(np.eye(n), np.zeros(n), slope, room)
     proposal = qpsolvers.solve_problem(problem, solver="proxqp", eps_abs=TOLERANCE, eps_rel=0.0)
     # An infeasible problem leaves numbers in x all the same: only `found` and our own check count.
-    nothing = Rows(rows.weights[:0], rows.lower[:0], rows.upper[:0], (), ())
-    if not proposal.found and not feasible(rows, nothing):
+    if proposal.found and proposal.z is not None:
+        held = _exchange(slope, room, np.flatnonzero(proposal.z > 1e-6))
+        if held is not None:
+            return held
+    if not feasible(rows, rows.none()):
         raise Infeasible
-    multipliers = proposal.z if proposal.found and proposal.z is not None else np.zeros(len(room))
-    held = [int(i) for i in np.flatnonzero(multipliers > 1e-6)]
-    for _ in range(10 + 10 * len(room)):
-        u = np.zeros(n)
+    # Slower, but sure to end: the nearest point as a non-negative least-squares problem.
+    dual = nnls(np.vstack([-slope.T, -room]), np.r_[np.zeros(n), 1.0])[0]
+    held = _exchange(slope, room, np.flatnonzero(dual > 1e-12))
+    if held is not None:
+        return held
+    raise CtrlidError(
+        "The quadratic program of the constrained fit could not be solved to its optimality "
+        f"conditions; its rows are {', '.join(map(repr, rows.rows))}. Nearly contradicting bounds "
+        "do this: loosen or drop one of them."
+    )
+
+
+def _exchange(slope: FloatArray, room: FloatArray, start: IndexArray) -> IndexArray | None:
+    held = [int(i) for i in start]
+    for _ in range(_ROUNDS * (1 + len(room))):
+        u = np.zeros(slope.shape[1])
         if held:
             a = slope[held]
             mu = np.linalg.lstsq(a @ a.T, -room[held], rcond=1e-12)[0]
@@ -213,19 +228,13 @@ def _active_set(slope: FloatArray, room: FloatArray, rows: Rows) -> IndexArray:
                 continue
             u = -a.T @ mu
         violation = slope @ u - room
-        if violation.max() <= 1e-9:
-            return np.array(held, dtype=np.intp)
         worst = int(np.argmax(violation))
+        if violation[worst] <= 1e-9:
+            return np.array(held, dtype=np.intp)
         if worst in held:
-            break
+            return None
         held.append(worst)
-    if not feasible(rows, nothing):
-        raise Infeasible
-    raise CtrlidError(
-        "The quadratic program of the constrained fit could not be solved to its optimality "
-        f"conditions; its rows are {', '.join(map(repr, rows.rows))}. Nearly contradicting bounds "
-        "do this: loosen or drop one of them."
-    )
+    return None
 
 
 def spread(cost: Cost, normals: FloatArray) -> tuple[FloatArray, float]:
@@ -247,8 +256,7 @@ def spread(cost: Cost, normals: FloatArray) -> tuple[FloatArray, float]:
     """
     cost = cost.scaled()
     reduced = _reduce(cost, normals, np.zeros(len(normals)))
-    if not reduced.null.shape[1]:
-        return np.zeros((len(cost.origin), len(cost.origin))), 1.0
-    half = cost.basis @ np.linalg.solve(reduced.upper.T, reduced.null.T).T
+    half = cost.basis @ reduced.step
     half[~reduced.elimination.directions.any(axis=1)] = 0.0
-    return half @ half.T, float(np.linalg.cond(reduced.upper))
+    condition = float(reduced.singular[0] / reduced.singular[-1])
+    return half @ half.T, condition

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,6 +75,7 @@ def merge(factors: Sequence[FloatArray]) -> FloatArray:
     return np.asarray(np.linalg.qr(np.vstack(factors), mode="r"), dtype=float)
 
 
+@lru_cache(maxsize=64)
 def from_differences(structure: Structure) -> tuple[FloatArray, FloatArray]:
     """Coefficients as ``theta = origin + basis @ delta``, delta in the differenced basis.
 
@@ -101,6 +103,8 @@ def from_differences(structure: Structure) -> tuple[FloatArray, FloatArray]:
     basis[na:, na:] = np.asarray(invpascal(nb, kind="lower"), dtype=float).T[::-1]
     origin = np.zeros(na + nb)
     origin[:na] = powers[na, :na][::-1]
+    basis.setflags(write=False)
+    origin.setflags(write=False)
     return basis, origin
 
 
@@ -172,16 +176,28 @@ def arx_regression(
     -------
     Regression
         Reduced to ``p`` rows, whatever the length of the records.
+
+    Raises
+    ------
+    CtrlidError
+        If a record has no row at all.
     """
     p = structure.na + structure.nb
     factors, firsts = [], []
     used = 0
     noise = np.zeros(p)
-    for record in records:
+    for number, record in enumerate(records, start=1):
         y0, u0 = _levels(record) if intercept else (0.0, 0.0)
         factor, rows = _factor(record, structure, y0, u0, intercept)
+        if not rows:
+            needed = max(structure.na, structure.nk + structure.nb - 1) + 1
+            raise CtrlidError(
+                f"Record {number} of {len(records)} has no usable row: that takes {needed} valid "
+                f"samples in succession, and it has {int(record.valid.sum())} valid samples of "
+                f"{len(record.y)}. Leave it out or lower the orders."
+            )
         used += rows
-        if intercept and rows:
+        if intercept:
             firsts.append((factor[0], y0, u0))
             factor = factor[1:, 1:]
         factors.append(factor)
@@ -237,9 +253,7 @@ def _factor(
             out[~counts] = 0.0
             used -= int(np.count_nonzero(~counts))
 
-    # What is not valid may be anything, infinite too.
-    with np.errstate(invalid="ignore"):
-        factor = block_qr(fill, rows, lead + na + nb + 1)
+    factor = block_qr(fill, rows, lead + na + nb + 1)
     return factor, used
 
 
