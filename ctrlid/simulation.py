@@ -8,7 +8,6 @@ from typing import Any
 
 import casadi
 import numpy as np
-from scipy import optimize
 from scipy.integrate import DOP853
 
 from .data import Record
@@ -376,10 +375,26 @@ class Simulator:
         return y, u
 
 
-def controller_output(
-    loop: Loop, y: Array, r: Array | None = None, initial: Sequence[float] | None = None
-) -> Array:
-    """Return what a digital controller computes from a given reference and output.
+def _controller_run(loop: Loop, y: Array, r: Array | None) -> tuple[Any, Array]:
+    """Return the controller over all samples as a function of its initial state, and its rest."""
+    law = loop.law()
+    if law is None or law.dt == 0.0:
+        raise CtrlidError("only a digital controller computes its output from the samples alone; "
+                          f"this loop has {'no controller' if law is None else 'an analog one'}")  # fmt: skip
+    x, w = casadi.SX.sym("x", len(law.rest)), casadi.SX.sym("w", 3)
+    u, after = law.apply(w[0], x, w[1], w[2])
+    lower, upper = loop.input_limits
+    u = casadi.fmin(casadi.fmax(u, lower), upper)
+    step = casadi.Function("controller", [x, w], [casadi.vertcat(after), u])
+    reference = np.full(len(y), loop.point.output) if r is None else np.asarray(r)
+    table = casadi.DM(np.vstack([np.arange(len(y)) * loop.dt, reference, y]))
+    start = casadi.MX.sym("start", len(law.rest))
+    outputs = step.mapaccum("run", len(y))(start, table)[1]
+    return casadi.Function("outputs", [start], [outputs.T]), np.array(law.rest, dtype=float)
+
+
+def controller_output(loop: Loop, y: Array, r: Array | None = None) -> Array:
+    """Return what a digital controller, at rest before, computes from a reference and an output.
 
     Parameters
     ----------
@@ -389,8 +404,6 @@ def controller_output(
         Measured output.
     r : ndarray, shape (n,), optional
         Reference; by default constant at the operating point.
-    initial : sequence of float, optional
-        Initial controller state; by default at rest.
 
     Returns
     -------
@@ -402,18 +415,8 @@ def controller_output(
     CtrlidError
         If the loop has no controller, or an analog one.
     """
-    law = loop.law()
-    if law is None or law.dt == 0.0:
-        raise CtrlidError("only a digital controller computes its output from the samples alone; "
-                          f"this loop has {'no controller' if law is None else 'an analog one'}")  # fmt: skip
-    x, w = casadi.SX.sym("x", len(law.rest)), casadi.SX.sym("w", 3)
-    u, after = law.apply(w[0], x, w[1], w[2])
-    run = casadi.Function("controller", [x, w], [casadi.vertcat(after), u])
-    reference = np.full(len(y), loop.point.output) if r is None else np.asarray(r)
-    table = np.vstack([np.arange(len(y)) * loop.dt, reference, y])
-    start = np.array(law.rest if initial is None else initial, dtype=float)
-    out = np.asarray(run.mapaccum("run", len(y))(start, table)[1], float).ravel()
-    return np.clip(out, *loop.input_limits)
+    run, rest = _controller_run(loop, y, r)
+    return np.asarray(run(rest), float).ravel()
 
 
 def replay_controller(loop: Loop, record: Record) -> Array:
@@ -453,20 +456,21 @@ def replay_controller(loop: Loop, record: Record) -> Array:
         raise CtrlidError(f"the loop is sampled at {loop.dt:g} s, the record at {record.dt:g} s")
     if record.r is None:
         raise CtrlidError("the record has no reference r, which the controller needs")
-    law = loop.law()
-    rest = np.array(law.rest if law else ())
-    if not rest.size:
-        return controller_output(loop, record.y, record.r)
-    u = np.asarray(record.u)
-    sensitivity = max(float(np.std(u)), 1e-300)
-    valid = np.asarray(record.valid)
-
-    def misfit(state: Array) -> Array:
-        replayed = controller_output(loop, record.y, record.r, state)
-        return np.asarray((replayed - u)[valid] / sensitivity, dtype=float)
-
-    best = optimize.least_squares(misfit, rest, x_scale="jac")
-    return controller_output(loop, record.y, record.r, best.x)
+    run, start = _controller_run(loop, record.y, record.r)
+    replayed = np.asarray(run(start), float).ravel()
+    best = float(np.sum((replayed - record.u) ** 2))
+    state = casadi.MX.sym("state", start.size)
+    slope = casadi.Function("slope", [state], [casadi.jacobian(run(state), state)])
+    # Gauss-Newton: one step where the law is linear in its state, a few more around limits.
+    for _ in range(10 if start.size else 0):
+        jacobian = np.asarray(slope(start).full(), float)
+        start = start + np.linalg.lstsq(jacobian, record.u - replayed, rcond=1e-12)[0]
+        trial = np.asarray(run(start), float).ravel()
+        cost = float(np.sum((trial - record.u) ** 2))
+        if not cost < best:
+            break
+        replayed, best = trial, cost
+    return replayed
 
 
 def _first_bad(loop: Loop, states: Array, ys: Array, us: Array, w: Array) -> int | None:
