@@ -33,9 +33,9 @@ from ctrlid.errors import CtrlidError
 DT = 1e-3
 
 
-def maglev(step, beta=3.0):
-    """Coefficients of -beta/(s^2 - p^2) under a zero-order hold, step = p*DT."""
-    b = -2.0 * beta * (DT / step) ** 2 * np.sinh(step / 2) ** 2
+def maglev(step, beta=3.0, dt=DT):
+    """Coefficients of -beta/(s^2 - p^2) under a zero-order hold, step = p*dt."""
+    b = -2.0 * beta * (dt / step) ** 2 * np.sinh(step / 2) ** 2
     return np.array([-2.0 * np.cosh(step), 1.0, b, b])
 
 
@@ -133,6 +133,26 @@ def test_recovers_the_plant_exactly_without_noise(step, offset, constraints):
         assert estimate.active == ()
     if len(constraints) == 2:
         assert estimate["b1"] == estimate["b2"]
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    gap=st.floats(5e-3, 20e-3),
+    voltage=st.floats(1.0, 10.0),
+    step=st.floats(0.005, 0.5),
+    constrained=st.booleans(),
+)
+def test_recovers_any_levitation_in_physical_units(gap, voltage, step, constrained):
+    """alpha = 2 g / x0, beta = 2 g / V0; signals are absolute, the set-point moves by 1 %."""
+    p, beta = np.sqrt(2 * 9.81 / gap), 2 * 9.81 / voltage
+    theta = maglev(step, beta, step / p)
+    lead = place(np.r_[1.0, theta[:2]], theta[2:], np.exp(-1.2 * step))
+    u, y = run(theta, lead, 0.01 * gap * binary(2000, step, 5))
+    record = Record(u=u + voltage, y=y + gap, dt=step / p)
+    known = [ReciprocalPoles()] if constrained else []
+    estimate = fit_arx(record, na=2, nb=2, constraints=known).estimate
+    np.testing.assert_allclose(estimate.values, theta, rtol=1e-8)
+    np.testing.assert_allclose(np.sort(estimate.poles_s.real), [-p, p], rtol=1e-8)
 
 
 @pytest.mark.parametrize("step", [0.22, 0.044, 0.005])
@@ -524,6 +544,24 @@ def test_orders_beyond_the_plant_are_not_excited_without_noise():
     _, record = levitation(0.22)
     with pytest.raises(CtrlidError, match="orders are higher than the plant's"):
         fit_arx(record, 3, 3)
+
+
+@pytest.mark.parametrize(
+    ("constraints", "words"),
+    [
+        ([StaticGain(2.0), Integrator()], r"StaticGain\(2.0\) and Integrator\(\)"),
+        (
+            [Equal("b1", "b2"), ReciprocalPoles(), Fixed("a2", 0.9)],
+            r"contradict each other: ReciprocalPoles\(\) and Fixed\(\"a2\", 0.9\)",
+        ),
+        ([Fixed("c1", 2.0)], "no such coefficient: it has a1, a2, b1, b2"),
+        ("ReciprocalPoles", "must be a list of constraint objects"),
+    ],
+)
+def test_unusable_constraints_are_refused_by_name(constraints, words):
+    _, record = levitation(0.22, n=200)
+    with pytest.raises(CtrlidError, match=words):
+        fit_arx(record, 2, 2, constraints=constraints)
 
 
 def test_a_constraint_can_stand_in_for_excitation():
