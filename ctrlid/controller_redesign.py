@@ -194,8 +194,12 @@ def redesign(
         nan = float("nan")
         achieved = Performance(False, nan, nan, nan, nan, nan)
         failure = failure or "Small deviations grow."
-    return Redesign(C, promised, achieved, nu_gap(G, P), robust_margin(G, C), trial, time,
-                    promised_step, achieved_step, failure)  # fmt: skip
+    # In units in which the model has gain 1 at the crossover, so that volts per metre do not matter.
+    omega = np.exp(1j * crossover * dt) if dt else 1j * crossover
+    unit = float(np.abs(G(omega)))
+    return Redesign(C, promised, achieved, nu_gap(G / unit, P / unit),
+                    robust_margin(G / unit, C * unit), trial, time, promised_step, achieved_step,
+                    failure)  # fmt: skip
 
 
 def _sampled(P: Any, dt: float) -> Any:

@@ -34,6 +34,8 @@ class Prediction:
         Standard deviation of the innovations that the filter expects.
     states : ndarray, shape (n, states)
         State at each sample, given the outputs up to and including it.
+    circuit : ndarray, shape (n, controller states)
+        State of a known analog controller at each sample, else empty.
     sensor_noise, force_noise : float
         Standard deviations of the noise model.
     """
@@ -42,58 +44,86 @@ class Prediction:
     innovations: Array
     spread: Array
     states: Array
+    circuit: Array
     sensor_noise: float
     force_noise: float
 
 
 def _plant_step(loop: Loop, record: Record) -> Any:
-    """Return the CasADi function ``(x, t, u, next u, force) -> next x`` of the plant alone."""
+    """Return the CasADi function ``(x, xc, w, force) -> (next x, next xc)`` over one period.
+
+    ``w`` is ``(t, u, next u, r, y)``. Between the samples u is held or straight, as the record says.
+    Under a known analog controller it moves as the circuit does, from the measured value on:
+    a straight line would miss the jump at each step of the reference. ``xc`` is the state of
+    that circuit, empty otherwise.
+    """
     e = loop.equations()
-    n = len(e.states)
-    x, t, u, ahead, force = (casadi.SX.sym("x", n), *(casadi.SX.sym(s) for s in "tuaf"))
+    law = loop.law() if loop.analog and record.r is not None else None
+    n, nc = len(e.states), len(law.rest) if law else 0
+    x, xc, w, force = (casadi.SX.sym(s, k) for s, k in (("x", n), ("c", nc), ("w", 5), ("f", 1)))
+    t, u, ahead, r, y = casadi.vertsplit(w)
     kick = casadi.SX.zeros(n, 1)
     for j in e.velocities or range(n):
         kick[j] = force
+
+    def plant(tau: Any, x: Any, u: Any) -> tuple[Any, Any]:
+        rhs, output = e.function(t + tau, x, u, e.values)
+        return rhs + kick, output
+
     if e.dt:
-        after = e.function(t, x, u, e.values)[0] + kick
-    else:
+        return casadi.Function("plant_step", [x, xc, w, force], [plant(0.0, x, u)[0], xc])
+    if law is None:
         ramp = (ahead - u) / loop.dt if record.hold == "foh" else 0.0
+        after = integrate(lambda tau, z: plant(tau, z, u + ramp * tau)[0], x, loop.dt, 1)[0]
+        return casadi.Function("plant_step", [x, xc, w, force], [after, xc])
+    noise = y - plant(0.0, x, u)[1]
+    offset = u - law.apply(t, xc, r, y)[0]  # bias, injected signals, what xc does not know
 
-        def rate(tau: Any, z: Any) -> Any:
-            return e.function(t + tau, z, u + ramp * tau, e.values)[0] + kick
+    def rate(tau: Any, z: Any) -> Any:
+        seen = plant(tau, z[:n], u)[1] + noise
+        computed, slope = law.apply(t + tau, z[n:], r, seen)
+        return casadi.vertcat(plant(tau, z[:n], computed + offset)[0], slope)
 
-        after = integrate(rate, x, loop.dt, 1)[0]
-    return casadi.Function("plant_step", [x, t, u, ahead, force], [after])
+    after = integrate(rate, casadi.vertcat(x, xc), loop.dt, 2)[0]
+    return casadi.Function("plant_step", [x, xc, w, force], [after[:n], after[n:]])
 
 
 def _filter_step(loop: Loop, plant_step: Any) -> Any:
     """Build one sample of the filter with sensor noise of variance one.
 
-    The state is x stacked on the columns of P, the inputs are (t, u, next u, y, valid, q) with q
-    the variance of the force relative to that of the sensor.
+    The state is x stacked on the columns of P and on the circuit's state; the inputs are those of
+    the plant step, `valid`, and q, the variance of the force relative to that of the sensor.
     """
     e = loop.equations()
-    n = len(e.states)
-    z, w = casadi.SX.sym("z", n + n * n), casadi.SX.sym("w", 6)
-    t, u, ahead, y, valid, q = casadi.vertsplit(w)
-    x, p = z[:n], casadi.reshape(z[n:], n, n)
-    expected = e.function(t, x, u, e.values)[1]
+    n, nc = len(e.states), plant_step.size1_in(1)
+    z, v = casadi.SX.sym("z", n + n * n + nc), casadi.SX.sym("v", 7)
+    w, valid, q = v[:5], v[5], v[6]
+    x, p, xc = z[:n], casadi.reshape(z[n : n + n * n], n, n), z[n + n * n :]
+    expected = e.function(w[0], x, w[1], e.values)[1]
     h = casadi.jacobian(expected, z)[:, :n]
     s = casadi.mtimes([h, p, h.T]) + 1.0
     gain = valid * casadi.mtimes(p, h.T) / s
-    innovation = valid * (y - expected)
+    innovation = valid * (w[4] - expected)
     x = x + gain * innovation
     keep = casadi.SX.eye(n) - casadi.mtimes(gain, h)
     p = casadi.mtimes([keep, p, keep.T]) + casadi.mtimes(gain, gain.T)  # Joseph: stays positive
-    state, force = casadi.SX.sym("s", n), casadi.SX.sym("f")
-    after = plant_step(state, t, u, ahead, force)
-    point = casadi.Function("j", [state, t, u, ahead, force], [
+    state, circuit, force = casadi.SX.sym("s", n), casadi.SX.sym("k", nc), casadi.SX.sym("f")
+    after = plant_step(state, circuit, w, force)[0]
+    slopes = casadi.Function("j", [state, circuit, w, force], [
         casadi.jacobian(after, state), casadi.jacobian(after, force)])  # fmt: skip
-    a, b = point(x, t, u, ahead, 0.0)
-    ahead_p = casadi.mtimes([a, p, a.T]) + q * casadi.mtimes(b, b.T)
-    ahead_p = (ahead_p + ahead_p.T) / 2
-    after_z = casadi.vertcat(plant_step(x, t, u, ahead, 0.0), casadi.reshape(ahead_p, n * n, 1))
-    return casadi.Function("filter", [z, w], [after_z, expected, innovation, s, x])
+    a, b = slopes(x, xc, w, 0.0)
+    p_after = casadi.mtimes([a, p, a.T]) + q * casadi.mtimes(b, b.T)
+    p_after = (p_after + p_after.T) / 2
+    x_after, xc_after = plant_step(x, xc, w, 0.0)
+    z_after = casadi.vertcat(x_after, casadi.reshape(p_after, n * n, 1), xc_after)
+    return casadi.Function("filter", [z, v], [z_after, expected, innovation, s, x, xc])
+
+
+def _signals(record: Record) -> Array:
+    """Return the rows (t, u, next u, r, y) of a record."""
+    u = np.asarray(record.u)
+    r = record.y if record.r is None else record.r
+    return np.vstack([record.t - record.start, u, np.append(u[1:], u[-1]), r, record.y])
 
 
 def predict(loop: Loop, record: Record, force_noise: float | None = None) -> Prediction:
@@ -142,22 +172,20 @@ def predict(loop: Loop, record: Record, force_noise: float | None = None) -> Pre
     if abs(loop.dt - record.dt) > 1e-9 * loop.dt:
         raise CtrlidError(f"the loop is sampled at {loop.dt:g} s, the record at {record.dt:g} s; "
                           "give both the same period")  # fmt: skip
-    step = _filter_step(loop, _plant_step(loop, record))
-    z = _start(loop, record)
-    n = len(record)
-    u = np.asarray(record.u)
-    w = np.vstack([
-        np.arange(n) * record.dt, u, np.append(u[1:], u[-1]), record.y, record.valid, np.zeros(n),
-    ])  # fmt: skip
+    plant_step = _plant_step(loop, record)
+    step = _filter_step(loop, plant_step)
+    z = np.concatenate([_start(loop, record), np.zeros(plant_step.size1_in(1))])
+    w = np.vstack([_signals(record), record.valid, np.zeros(len(record))])
     if force_noise is None:
         ratio = _tune(step, z, w)
     elif np.isfinite(force_noise) and force_noise >= 0:
         ratio = float(force_noise)
     else:
         raise CtrlidError(f"force_noise is a ratio >= 0; given {force_noise!r}")
-    w[5] = ratio**2
-    states, y, innovations, s, filtered = _pass(step, z, w)
-    del states
+    w[6] = ratio**2
+    with np.errstate(all="ignore"):
+        out = [np.asarray(m, float) for m in step.mapaccum("pass", w.shape[1])(z, w)]
+    y, innovations, s = (row[0] for row in out[1:4])
     if not np.isfinite(innovations).all():
         k = int(np.argmin(np.isfinite(innovations)))
         raise CtrlidError(
@@ -166,7 +194,8 @@ def predict(loop: Loop, record: Record, force_noise: float | None = None) -> Pre
             "signs and the operating point, or mark the stretch as not valid"
         )
     sensor = float(np.sqrt(np.mean(innovations[record.valid] ** 2 / s[record.valid])))
-    return Prediction(y, innovations, sensor * np.sqrt(s), filtered, sensor, sensor * ratio)
+    return Prediction(y, innovations, sensor * np.sqrt(s), out[4].T, out[5].T, sensor,
+                      sensor * ratio)  # fmt: skip
 
 
 def _start(loop: Loop, record: Record) -> Array:
@@ -183,23 +212,17 @@ def _start(loop: Loop, record: Record) -> Array:
     return np.concatenate([at.states, np.diag((np.array(wide) / noise) ** 2).ravel()])
 
 
-def _pass(step: Any, z: Array, w: Array) -> tuple[Array, Array, Array, Array, Array]:
-    with np.errstate(all="ignore"):
-        out = [np.asarray(m, float) for m in step.mapaccum("pass", w.shape[1])(z, w)]
-    return out[0], out[1][0], out[2][0], out[3][0], out[4].T
-
-
 def _tune(step: Any, z: Array, w: Array) -> float:
     """Return the ratio of force to sensor noise that makes the innovations most likely."""
     w = w[:, :TUNING_SAMPLES].copy()
     runner = step.mapaccum("tune", w.shape[1])
-    valid = w[4] > 0
+    valid = w[5] > 0
     skip = min(20, valid.sum() // 2)  # the start-up tells about the initial state, not the noise
     period = w[0, 1] - w[0, 0]
 
     def cost(log_ratio: float) -> float:
-        w[5] = 10.0 ** (2 * log_ratio)
-        _, _, e, s, _ = (np.asarray(m, float) for m in runner(z, w))
+        w[6] = 10.0 ** (2 * log_ratio)
+        e, s = (np.asarray(m, float) for m in runner(z, w)[2:4])
         e, s = e[0][valid][skip:], s[0][valid][skip:]
         if not np.isfinite(e).all():
             return 1e12
@@ -238,19 +261,22 @@ def predict_ahead(
     y : ndarray
         Their predictions.
     """
-    e = loop.equations()
     every = max(1, horizon // 4)
     starts = np.arange(0, len(record) - horizon, every)
     whole = np.array([record.valid[k : k + horizon + 1].all() for k in starts], dtype=bool)
     starts = starts[whole]
-    x = prediction.states[starts].T
-    plant_step = _plant_step(loop, record).map(max(len(starts), 1))
-    ahead = np.append(record.u[1:], record.u[-1])
-    for j in range(horizon if len(starts) else 0):
-        k = starts + j
-        x = np.asarray(plant_step(x, k * record.dt, record.u[k], ahead[k], 0.0), float)
+    if not len(starts):
+        return starts, np.empty(0)
+    e = loop.equations()
+    x, xc = prediction.states[starts].T, prediction.circuit[starts].T
+    plant_step = _plant_step(loop, record).map(len(starts))
+    output = e.function.map(len(starts))
+    table = _signals(record)
+    for j in range(horizon):
+        w = table[:, starts + j]
+        if j:  # the outputs after the start are not known to the prediction
+            w[4] = np.asarray(output(w[0], x, w[1], e.values)[1], float)
+        x, xc = (np.asarray(m, float) for m in plant_step(x, xc, w, 0.0))
     k = starts + horizon
-    y = np.asarray(
-        e.function.map(max(len(k), 1))(k * record.dt, x, record.u[k], e.values)[1], float
-    ).ravel() if len(k) else np.empty(0)  # fmt: skip
+    y = np.asarray(output(table[0, k], x, table[1, k], e.values)[1], float).ravel()
     return k, y
