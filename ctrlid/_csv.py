@@ -1,5 +1,8 @@
 """Records as CSV files: exact round trips, and the files that other tools write."""
 
+import csv
+import io
+import json
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -7,198 +10,220 @@ from typing import Any
 
 import numpy as np
 
+from ._text import split_unit, with_unit
 from .errors import CtrlidError, CtrlidWarning
 
-TIME = ("t", "time", "Time", "T", "timestamp", "seconds")
+TIME = ("t", "time", "timestamp", "seconds")
+SECONDS = {"": 1.0, "s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6,
+           "min": 60.0, "h": 3600.0}  # fmt: skip
+MARK = "# ctrlid "
 JITTER = 0.01  # of the period: what a good clock never shows
 GAP = 1.5  # periods: samples are missing
+CHUNK = 20_000  # rows written at once: bounds the memory that text takes
 
 
-def write_csv(path: str | Path, record: Any) -> None:
-    """Write a record: comment lines with its fields, a header with units, one row per sample."""
+def write_csv(path: Path, record: Any) -> None:
+    """Write a record: a comment with its fields, a header with units, one row per sample."""
     channels = {"t": record.t}
     channels |= {k: getattr(record, k) for k in ("r", "u", "y") if getattr(record, k) is not None}
     channels |= record.extra
     if not record.valid.all():
-        channels["valid"] = record.valid.astype(float)
+        channels["valid"] = record.valid
     units = {"t": "s", **record.units}
-    header = [f"{k} [{units[k]}]" if k in units else k for k in channels]
-    for label in header:
-        if "," in label or "\n" in label:
-            raise CtrlidError(f"the column name {label!r} would break the file: remove the comma or "
-                              "line break from the channel's name or unit")  # fmt: skip
-    comments = {"name": record.name, "dt": repr(record.dt), "start": repr(record.start),
-                "hold": record.hold, **{f"name of {k}": v for k, v in record.names.items()}}  # fmt: skip
-    lines = [f"# {k} = {v}" for k, v in comments.items() if v != ""]
-    table = np.column_stack(list(channels.values()))
-    with Path(path).open("w", encoding="utf-8") as file:
-        file.write("\n".join([*lines, ",".join(header)]) + "\n")
-        np.savetxt(file, table, fmt="%.17g", delimiter=",")
+    line = io.StringIO()
+    header = [with_unit(k, units.get(k, "")) for k in channels]
+    csv.writer(line, lineterminator="").writerow(header)
+    expected = [(k, units.get(k, "")) for k in channels]
+    if "\n" in line.getvalue() or [split_unit(c) for c in _cells(line.getvalue(), ",")] != expected:
+        raise CtrlidError(f"the header {header} would not be read back as it is: remove brackets, "
+                          "outer spaces and line breaks from names and units")  # fmt: skip
+    fields = {key: getattr(record, key) for key in ("name", "dt", "hold")}
+    fields["names"] = dict(record.names)
+    with path.open("w", encoding="utf-8", newline="\n") as file:
+        file.write(f"{MARK}{json.dumps(fields, ensure_ascii=False)}\n{line.getvalue()}\n")
+        for first in range(0, len(record), CHUNK):
+            rows = np.column_stack([c[first : first + CHUNK] for c in channels.values()])
+            # The shortest decimals that give the same number back.
+            file.writelines(",".join(map(repr, row)) + "\n" for row in rows.tolist())
 
 
 def read_csv(
-    path: str | Path, *, r: str | None = None, u: str = "u", y: str = "y", time: str | None = None,
-    dt: float | None = None, extra: Sequence[str] | None = None,
-    units: Mapping[str, str] | None = None, hold: str | None = None, name: str | None = None,
-    gaps: str = "error",
+    path: Path, sources: Mapping[str, str | None], time: str | None, dt: float | None,
+    extra: Sequence[str] | None, units: Mapping[str, str] | None, hold: str | None,
+    name: str | None, gaps: str,
 ) -> dict[str, Any]:  # fmt: skip
-    """Return the fields of a record from a CSV file with a header line.
-
-    Parameters
-    ----------
-    path : str or path
-        The file; columns separated by commas, semicolons or tabs.
-    r, u, y : str, optional
-        Names of the columns; r by default if there is a column so called.
-    time : str, optional
-        Name of the time column [s]; by default one called t, time or the like.
-    dt : float, optional
-        Sampling period [s], for a file without time.
-    extra : sequence of str, optional
-        Further columns to keep; by default all others of a file that ctrlid wrote, else none.
-    units : mapping, optional
-        Units, by signal; units in brackets in the header are read.
-    hold, name : str, optional
-        As in `Record`.
-    gaps : {"error", "mask"}, optional
-        Whether missing samples are refused, or filled with the last value and marked as not
-        valid.
-
-    Returns
-    -------
-    dict
-        Arguments of `Record`.
-
-    Raises
-    ------
-    CtrlidError
-        If a column is missing, the time does not increase or samples are missing.
-    """
+    """Return the fields of a record; see `Record.from_csv`, `sources` are its r, u and y."""
     if gaps not in ("error", "mask"):
         raise CtrlidError(f"gaps must be 'error' or 'mask'; given {gaps!r}")
-    comments, header, table, found = _read_table(Path(path))
-    columns = dict(zip(header, table.T, strict=True))
-    own = "dt" in comments
-    named = {k: v.strip("[]") for k, v in found.items()}
+    own, header, table = _read_table(path)
+    labels = [split_unit(cell) for cell in header]
+    names = [label for label, _ in labels]
 
-    def column(label: str, what: str) -> Any:
-        if label not in columns:
-            raise CtrlidError(f"{path} has no column {label!r} for {what}; its columns are "
-                              f"{', '.join(header)}. Name the right one with {what}=")  # fmt: skip
-        return columns[label]
+    def place(label: str, what: str) -> int:
+        found = [k for k in range(len(header)) if label in (names[k], header[k])]
+        if len(found) != 1:
+            raise CtrlidError(
+                f"{path} has {'no column' if not found else 'several columns'} {label!r} for "
+                f"{what}; its columns are {', '.join(header)}. Name the right one with {what}="
+            )
+        return found[0]
 
-    data = {"u": column(u, "u"), "y": column(y, "y")}
-    sources = {"u": u, "y": y}
-    if r is not None or "r" in columns:
-        sources["r"] = r or "r"
-        data["r"] = column(sources["r"], "r")
-    clock = time or next((t for t in TIME if t in columns), None)
-    taken = {*sources.values(), clock, "valid"}
-    keep = [c for c in header if c not in taken] if extra is None and own else list(extra or ())
-    channels = {c: column(c, "extra") for c in keep}
-    valid = columns["valid"] > 0.5 if "valid" in columns else np.ones(len(table), dtype=bool)
-    start = float(comments.get("start", 0.0))
-    if own and dt is None:
-        dt = float(comments["dt"])
-        clock = None  # the comment is exact, the column is for people
-    if clock is not None:
-        stamps = column(clock, "time")
-        period, index = _uniform(stamps, dt, gaps, str(path))
-        dt, start = period, float(stamps[0])
-        if len(index) != len(stamps):
-            fresh = np.diff(index, prepend=-1) > 0
-            valid = valid[index] & fresh
-            data = {k: v[index] for k, v in data.items()}
-            channels = {k: v[index] for k, v in channels.items()}
-    if dt is None:
-        raise CtrlidError(f"{path} has no time column ({', '.join(TIME)}); its columns are "
-                          f"{', '.join(header)}. Give time= or dt=")  # fmt: skip
-    read = {k: named[s] for k, s in (*sources.items(), *((c, c) for c in keep)) if s in named}
-    names = {k: s for k, s in sources.items() if s != k}
-    names |= {k[8:]: v for k, v in comments.items() if k.startswith("name of ")}
+    wanted = {k: v for k, v in sources.items() if v is not None}
+    if "r" in names:
+        wanted = {"r": "r", **wanted}
+    places = {k: place(v, k) for k, v in wanted.items()}
+    if time is None:
+        time = next((label for label in names if label.lower() in TIME), None)
+    clock = None if time is None else place(time, "time")
+    if isinstance(extra, str):
+        extra = (extra,)
+    if extra is None:
+        taken = {*places.values(), clock}
+        extra = [label for k, label in enumerate(names) if k not in taken and label != "valid"]
+        extra = extra if own else ()
+    further = {names[k]: k for k in (place(c, "extra") for c in extra)}
+    valid = np.ones(len(table), dtype=bool)
+    if "valid" in names:
+        valid = table[:, place("valid", "valid")] > 0.5
+    start, rows = 0.0, None
+    period_given = own.get("dt") if dt is None else dt
+    if clock is None:
+        if period_given is None:
+            raise CtrlidError(f"{path} has no time column ({', '.join(TIME)}); its columns are "
+                              f"{', '.join(header)}. Give time= or dt=")  # fmt: skip
+        dt = period_given
+    else:
+        unit = labels[clock][1]
+        if unit not in SECONDS:
+            raise CtrlidError(f"the time column of {path} is in {unit!r}; known units are "
+                              f"{', '.join(filter(None, SECONDS))}. Convert it, or remove the "
+                              "column and give dt=")  # fmt: skip
+        stamps = table[:, clock] * SECONDS[unit]
+        dt, rows = _uniform(stamps, period_given, gaps, path)
+        start = float(stamps[0])
+    if rows is not None and len(rows) != len(table):
+        valid = valid[rows] & (np.diff(rows, prepend=-1) > 0)
+        table = table[rows]
+    every = {**places, **further}
+    read = {key: labels[k][1] for key, k in every.items() if labels[k][1]}
     return {
-        **data, "dt": dt, "start": start, "extra": channels, "valid": valid, "names": names,
-        "units": {**read, **(units or {})}, "hold": hold or comments.get("hold", "zoh"),
-        "name": Path(path).stem if name is None and not own else (name or comments.get("name", "")),
+        **{key: table[:, k] for key, k in places.items()},
+        "extra": {label: table[:, k] for label, k in further.items()},
+        "dt": dt, "start": start, "valid": valid, "units": {**read, **(units or {})},
+        "names": own.get("names", {k: names[p] for k, p in places.items() if names[p] != k}),
+        "hold": hold or own.get("hold", "zoh"),
+        "name": own.get("name", path.stem) if name is None else name,
     }  # fmt: skip
 
 
-def _read_table(path: Path) -> tuple[dict[str, str], list[str], Any, dict[str, str]]:
-    """Return comments, column names, values and the units found in the header."""
+def _read_table(path: Path) -> tuple[dict[str, Any], list[str], Any]:
+    """Return the fields in ctrlid's own comment, the header cells and the values."""
     try:
-        with path.open(encoding="utf-8-sig") as file:
-            comments, skip = {}, 0
-            line = file.readline()
-            while line.startswith("#") or (line and not line.strip()):
-                key, equals, value = line[1:].partition("=")
-                if equals:
-                    comments[key.strip()] = value.strip()
-                line, skip = file.readline(), skip + 1
+        data = path.read_bytes()
     except OSError as reason:
         raise CtrlidError(f"cannot read {path}: {reason.strerror}") from reason
-    separator = max(",;\t", key=line.count)
-    cells = [c.strip().strip('"') for c in line.rstrip("\n").split(separator)]
-    units = {}
-    labels = []
-    for cell in cells:
-        label, bracket, unit = cell.partition("[")
-        label = label.strip()
-        labels.append(label)
-        if bracket:
-            units[label] = unit.rstrip("] ")
-    if _is_number(cells[0]):
-        raise CtrlidError(f"{path} has no header line: its first line is {line.strip()!r}. Add one "
-                          "with the names of the columns, such as t,r,u,y")  # fmt: skip
     try:
-        table = np.loadtxt(path, delimiter=separator, skiprows=skip + 1, ndmin=2, encoding="utf-8-sig")
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        text = data.decode("cp1252", errors="replace")  # what older Windows tools write
+    own: dict[str, Any] = {}
+    comment, at = "", 0
+    while True:
+        stop = text.find("\n", at)
+        stop = len(text) if stop < 0 else stop + 1
+        line = text[at:stop].strip()
+        if at >= len(text) or (line and not line.startswith("#")):
+            break
+        if line.startswith(MARK):
+            try:
+                own = json.loads(line.removeprefix(MARK))
+            except json.JSONDecodeError as reason:
+                raise CtrlidError(f"the line {line!r} of {path} is damaged: {reason}. Restore or "
+                                  "remove it") from reason  # fmt: skip
+        elif line:
+            comment = line.lstrip("# ")
+        at = stop
+    separator = max(",;\t", key=line.count)
+    header = _cells(line, separator)
+    if all(_is_number(cell) for cell in header):
+        # numpy.savetxt writes its header as a comment.
+        header = _cells(comment, separator)
+        stop = at
+        if not comment or any(_is_number(cell) for cell in header):
+            raise CtrlidError(f"{path} has no header line: its first line is {line!r}. Add one "
+                              "with the names of the columns, such as t,r,u,y")  # fmt: skip
+    body = text[stop:]
+    if not body.strip():
+        raise CtrlidError(f"{path} has no rows of numbers below its header")
+    if separator != "," and "," in body[: body.find("\n")]:
+        body = body.replace(",", ".")  # decimal commas
+    try:
+        table = np.loadtxt(io.StringIO(body), delimiter=separator, ndmin=2, quotechar='"')
     except ValueError as reason:
         raise CtrlidError(f"{path} is not a table of numbers: {reason}") from reason
-    if table.shape[1] != len(labels):
-        raise CtrlidError(f"{path} names {len(labels)} columns but has {table.shape[1]}")
-    return comments, labels, table, units
+    if table.shape[1] != len(header):
+        raise CtrlidError(f"the header of {path} names {len(header)} columns, its rows have "
+                          f"{table.shape[1]}; give every column a name")  # fmt: skip
+    return own, header, table
+
+
+def _cells(line: str, separator: str) -> list[str]:
+    rows = list(csv.reader([line], delimiter=separator, skipinitialspace=True))
+    return [cell.strip() for cell in rows[0]] if rows else [""]
 
 
 def _is_number(cell: str) -> bool:
     try:
-        float(cell)
+        float(cell.replace(",", "."))
     except ValueError:
-        return False
+        return not cell
     return True
 
 
-def _uniform(stamps: Any, dt: float | None, gaps: str, path: str) -> tuple[float, Any]:
+def period(stamps: Any) -> float:
+    """Return the mean period of time stamps, with no digits that only round-off gave it."""
+    mean = float(stamps[-1] - stamps[0]) / (len(stamps) - 1)
+    short = float(f"{mean:.12g}")
+    return short if abs(short - mean) <= 4 * np.spacing(np.abs(stamps).max()) else mean
+
+
+def _uniform(stamps: Any, dt: float | None, gaps: str, path: Path) -> tuple[float, Any]:
     """Return the period of time stamps and, for each uniform sample, its row."""
+    if len(stamps) < 2 or not np.isfinite(stamps).all():
+        raise CtrlidError(f"the time column of {path} needs at least 2 values, all finite")
     steps = np.diff(stamps)
-    if len(steps) == 0 or not np.isfinite(stamps).all():
-        raise CtrlidError(f"the time column of {path} needs at least 2 finite values")
     back = np.flatnonzero(steps <= 0)
     if back.size:
         k = int(back[0])
-        raise CtrlidError(f"the time column of {path} does not increase: {stamps[k]:g} s is followed "
-                          f"by {stamps[k + 1]:g} s at row {k + 1}. Sort the rows, or cut at the "
-                          "restart of the clock")  # fmt: skip
-    usual = float(np.median(steps))
-    regular = steps[steps < GAP * usual]
-    period = dt or float(np.mean(regular))
-    # Stamps printed with few digits show steps of one digit; the grid itself is then regular.
-    missing = np.round(steps / period).astype(int) - 1
-    missing[steps < GAP * period] = 0
+        raise CtrlidError(
+            f"the time column of {path} does not increase: {stamps[k]:g} s in row {k + 1} of the "
+            f"data is followed by {stamps[k + 1]:g} s. Sort the rows, cut at the restart of the "
+            "clock, or give dt= and remove the column"
+        )
+    regular = steps[steps < GAP * np.median(steps)]
+    usual = float(np.mean(regular))
+    if dt is not None and not abs(usual - dt) < 0.05 * usual:
+        raise CtrlidError(f"the time column of {path} steps by {usual:.4g} s, but dt is {dt:g} s. "
+                          "Leave dt= out, or remove the column")  # fmt: skip
+    if dt is None:
+        dt = period(stamps) if len(regular) == len(steps) else usual
+    missing = np.where(steps < GAP * dt, 0, np.round(steps / dt).astype(int) - 1)
     where = np.flatnonzero(missing)
     if where.size and gaps == "error":
         k = int(where[np.argmax(missing[where])])
+        places = "one place" if where.size == 1 else f"{where.size} places"
         raise CtrlidError(
-            f"{path} lacks {missing.sum()} samples in {where.size} places, the longest gap "
-            f"{steps[k]:.4g} s after t = {stamps[k]:.6g} s at a period of {period:.4g} s. Give "
-            "gaps='mask' to fill them with the last value and mark them as not valid"
+            f"{path} lacks {missing.sum()} samples in {places}; the longest gap has {missing[k]}, "
+            f"{steps[k]:.4g} s after t = {stamps[k]:.6g} s, at a period of {dt:.4g} s. Give "
+            "gaps='mask' to fill them with the last values and mark them as not valid"
         )
-    if not where.size and dt is None:
-        period = float((stamps[-1] - stamps[0]) / len(steps))
-    jitter = float(np.max(np.abs(regular - period))) / period
-    digits = np.spacing(np.abs(stamps).max()) / period
-    if jitter > JITTER + 4 * digits:
+    jitter = float(np.max(np.abs(steps - (missing + 1) * dt))) / dt
+    # Times long after zero cannot be written more finely than this.
+    if jitter > JITTER + 4 * float(np.spacing(np.abs(stamps).max())) / dt:
         warnings.warn(
-            f"the time stamps of {path} jitter by up to {100 * jitter:.0f} % of the period "
-            f"{period:.4g} s; they are taken as uniform. If the samples really were taken "
-            "unevenly, resample them first", CtrlidWarning, stacklevel=5,
+            f"the times of {path} jitter by up to {100 * jitter:.2g} % of the period {dt:.4g} s; "
+            "they are taken as uniform. If the samples really were taken unevenly, resample them "
+            "first",
+            CtrlidWarning, stacklevel=4,
         )  # fmt: skip
-    return period, np.repeat(np.arange(len(stamps)), np.concatenate([missing, [0]]) + 1)
+    return dt, np.repeat(np.arange(len(stamps)), np.append(missing, 0) + 1)

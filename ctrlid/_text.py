@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 
 
 def number(value: complex, digits: int = 7) -> str:
@@ -63,3 +64,51 @@ def listing(items: list[str] | tuple[str, ...]) -> str:
     if len(items) < 2:
         return "".join(items)
     return ", ".join(items[:-1]) + " and " + items[-1]
+
+
+def with_unit(name: str, unit: str) -> str:
+    """``name [unit]``, so written that `split_unit` takes it apart again.
+
+    Parameters
+    ----------
+    name, unit : str
+        A signal and its unit; the unit may be empty.
+
+    Returns
+    -------
+    str
+        The label.
+
+    Examples
+    --------
+    >>> with_unit("u", "V"), with_unit("u", ""), with_unit("x[k]", "")
+    ('u [V]', 'u', 'x[k] []')
+    """
+    if unit or split_unit(name) != (name, ""):
+        return f"{name} [{unit}]"
+    return name
+
+
+def split_unit(label: str) -> tuple[str, str]:
+    """Take a label apart into name and unit.
+
+    Parameters
+    ----------
+    label : str
+        As in ``u [V]``, ``u[V]`` or ``u (V)``; ``x[0]`` is an index, not a unit.
+
+    Returns
+    -------
+    (str, str)
+        Name and unit; the unit is empty where there is none.
+
+    Examples
+    --------
+    >>> split_unit("position [m]"), split_unit("x[0]"), split_unit("u (V)")
+    (('position', 'm'), ('x[0]', ''), ('u', 'V'))
+    """
+    found = re.fullmatch(r"(.*\S)(\s*)\[([^\[\]]*)\]|(.*\S)(\s+)\(([^()]*)\)", label)
+    if found is None:
+        return label, ""
+    name, space, unit = found.groups()[:3] if found[1] else found.groups()[3:]
+    return (name, unit) if space or not unit.isdigit() else (label, "")

@@ -2,40 +2,68 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from numbers import Integral, Real
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal, get_args
 
-import control as ct
 import numpy as np
 from scipy import signal
 
-from . import _csv
+from . import _csv, _response
 from .errors import CtrlidError
 
 Hold = Literal["zoh", "foh"]
 SIGNALS = ("r", "u", "y")
+RESERVED = (*SIGNALS, "t", "time", "valid")  # columns of a CSV file
 
 
 def _samples(name: str, values: Any) -> Any:
     """Copy a signal to a read-only (n,) float array, or say what is wrong with it."""
-    array = np.asarray(values)
+    if np.ma.is_masked(values):
+        raise CtrlidError(
+            f"{name} is a masked array, and its masked values would come back to life: fill them "
+            "and give valid=~mask"
+        )
+    try:
+        array = np.asarray(values)
+    except ValueError as reason:
+        raise CtrlidError(f"{name} must be one array of numbers: {reason}") from reason
     if array.dtype.kind not in "fiub":
         raise CtrlidError(f"{name} must be an array of real numbers; given {array.dtype} data")
     if array.ndim != 1:
+        cure = "Pick one channel, as in data[:, 0]" if array.ndim else "Repeat it with np.full"
         raise CtrlidError(
-            f"{name} must be one-dimensional with one value per sample; given shape {array.shape}. "
-            "Pick one channel, for instance data[:, 0]"
+            f"{name} must be one-dimensional with one value per sample; given shape "
+            f"{array.shape}. {cure}"
         )
     array = np.array(array, dtype=float)
     bad = np.flatnonzero(~np.isfinite(array))
     if bad.size:
         raise CtrlidError(
-            f"{name} has {bad.size} values that are NaN or infinite, the first at sample "
-            f"{bad[0]}. Cut them out by slicing, or fill them and mark the samples in valid="
+            f"{name} must be finite; {bad.size} of {array.size} values are NaN or infinite, the "
+            f"first at sample {bad[0]}. Cut them out by slicing, or fill them and mark the samples "
+            "as not counting with valid="
         )
     array.setflags(write=False)
     return array
+
+
+def _words(what: str, given: Any, known: Sequence[str]) -> Mapping[str, str]:
+    """Copy names or units to a read-only mapping of known signals to words."""
+    if not isinstance(given, Mapping) or not all(isinstance(v, str) for v in given.values()):
+        raise CtrlidError(f"{what} maps signals to words, as in {{'y': 'm'}}; given {given!r}")
+    unknown = [k for k in given if k not in known]
+    if unknown:
+        raise CtrlidError(f"{what} has {unknown}, which the record does not; known: {list(known)}")
+    return MappingProxyType(dict(given))
+
+
+def _seconds(what: str, value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, Real) or not np.isfinite(float(value)):
+        raise CtrlidError(f"{what} in seconds, a finite number; given {value!r}")
+    return float(value)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -97,42 +125,47 @@ class Record:
     start: float = 0.0
 
     def __post_init__(self) -> None:
-        signals = {k: _samples(k, getattr(self, k)) for k in SIGNALS if getattr(self, k) is not None}
+        given = {k: getattr(self, k) for k in SIGNALS}
         for key in ("u", "y"):
-            if key not in signals:
+            if given[key] is None:
                 raise CtrlidError(f"a record needs u and y; {key} is None")
-        extra = {str(k): _samples(f"extra[{k!r}]", v) for k, v in dict(self.extra).items()}
-        clash = [k for k in extra if k in (*SIGNALS, "t", "time", "valid")]
+        signals = {k: _samples(k, v) for k, v in given.items() if v is not None}
+        if not isinstance(self.extra, Mapping):
+            raise CtrlidError(f"extra maps names to channels, as in {{'current': i}}; given "
+                              f"{type(self.extra).__name__}")  # fmt: skip
+        clash = [k for k in self.extra if not isinstance(k, str) or not k or k in RESERVED]
         if clash:
-            raise CtrlidError(f"extra channels cannot be called {clash}: these names are taken")
+            raise CtrlidError(f"extra channels need names other than {', '.join(RESERVED)}; given "
+                              f"{clash}")  # fmt: skip
+        extra = {k: _samples(f"extra[{k!r}]", v) for k, v in self.extra.items()}
         sizes = {k: v.size for k, v in (*signals.items(), *extra.items())}
         if len(set(sizes.values())) > 1:
-            raise CtrlidError(f"all signals must be equally long; given "
-                              f"{', '.join(f'{k}: {n}' for k, n in sizes.items())}")  # fmt: skip
+            lengths = ", ".join(f"{k}: {n}" for k, n in sizes.items())
+            raise CtrlidError(f"all signals must be equally long; given {lengths}. Cut them to the "
+                              "samples they have in common")  # fmt: skip
         n = signals["y"].size
         if n < 2:
             raise CtrlidError(f"a record needs at least 2 samples; given {n}")
-        if not (isinstance(self.dt, int | float | np.number) and np.isfinite(self.dt) and self.dt > 0):
+        dt = _seconds("dt is the sampling period", self.dt)
+        if dt <= 0:
             raise CtrlidError(f"dt is the sampling period in seconds, > 0; given {self.dt!r}")
         if self.hold not in get_args(Hold):
             raise CtrlidError(f"hold must be 'zoh' (held between samples) or 'foh' (straight); "
                               f"given {self.hold!r}")  # fmt: skip
         valid = np.ones(n, dtype=bool) if self.valid is None else np.array(self.valid)
         if valid.dtype != bool or valid.shape != (n,):
-            raise CtrlidError(f"valid must be {n} booleans, one per sample; given {valid.dtype} of "
-                              f"shape {valid.shape}")  # fmt: skip
-        if not np.isfinite(self.start):
-            raise CtrlidError(f"start is the time of sample 0 in seconds; given {self.start!r}")
-        for words, allowed in ((self.names, SIGNALS), (self.units, (*SIGNALS, *extra))):
-            unknown = [k for k in words if k not in allowed]
-            if unknown:
-                raise CtrlidError(f"names and units are given for signals of the record; unknown "
-                                  f"{unknown}, known {list(allowed)}")  # fmt: skip
+            raise CtrlidError(
+                f"valid must be {n} booleans, one per sample; given {valid.dtype} of shape "
+                f"{valid.shape}. A comparison makes booleans, as in y > 0"
+            )
+        if not isinstance(self.name, str):
+            raise CtrlidError(f"name is the experiment's name in words; given {self.name!r}")
         valid.setflags(write=False)
         for key, value in {
-            **{k: signals.get(k) for k in SIGNALS}, "extra": MappingProxyType(extra),
-            "valid": valid, "dt": float(self.dt), "start": float(self.start),
-            "names": MappingProxyType(dict(self.names)), "units": MappingProxyType(dict(self.units)),
+            **signals, "extra": MappingProxyType(extra), "valid": valid, "dt": dt,
+            "start": _seconds("start is the time of sample 0", self.start),
+            "names": _words("names", self.names, SIGNALS),
+            "units": _words("units", self.units, (*SIGNALS, *extra)),
         }.items():  # fmt: skip
             object.__setattr__(self, key, value)
 
@@ -174,10 +207,15 @@ class Record:
             raise CtrlidError(f"a record is sliced by samples, record[100:2000]; given {index!r}. "
                               "Single values are in record.y and the other arrays")  # fmt: skip
         if index.step not in (None, 1):
-            raise CtrlidError(f"a step of {index.step} would alias; use record.decimate({index.step})")
+            raise CtrlidError(f"a step of {index.step} would alias; use record.decimate(q), with "
+                              "antialias=False if that is what you want")  # fmt: skip
+        if not all(k is None or isinstance(k, Integral) for k in (index.start, index.stop)):
+            raise CtrlidError(f"a record is sliced by whole sample numbers; given {index}. By "
+                              "seconds it is cut with record.between(t0, t1)")  # fmt: skip
         start, stop, _ = index.indices(len(self))
         if stop - start < 2:
-            raise CtrlidError(f"the slice {start}:{stop} of {len(self)} samples leaves fewer than 2")
+            raise CtrlidError(f"a record needs at least 2 samples; the slice {start}:{stop} of "
+                              f"{len(self)} leaves {max(stop - start, 0)}")  # fmt: skip
         return self._map(lambda s: s[start:stop], valid=self.valid[start:stop],
                          start=self.start + start * self.dt)  # fmt: skip
 
@@ -187,7 +225,7 @@ class Record:
         Parameters
         ----------
         t0, t1 : float
-            Times on the record's own clock [s].
+            Times on the record's own clock [s]; ``np.inf`` means to the end.
 
         Returns
         -------
@@ -199,14 +237,20 @@ class Record:
         CtrlidError
             If fewer than 2 samples lie between.
         """
+        if not t0 < t1:
+            raise CtrlidError(f"between needs t0 < t1 in seconds; given {t0!r} and {t1!r}")
         # A sample that round-off puts a hair before t0 belongs to it.
-        first, last = (int(np.ceil((t - self.start) / self.dt - 1e-6)) for t in (t0, t1))
-        if min(last, len(self)) - max(first, 0) < 2:
+        slack = 1e-6 + 4 * float(np.spacing(abs(self.start) + self.duration)) / self.dt
+        first, last = (
+            int(np.ceil(np.clip((t - self.start) / self.dt - slack, 0, len(self))))
+            for t in (t0, t1)
+        )
+        if last - first < 2:
             raise CtrlidError(
                 f"fewer than 2 samples lie between {t0:g} and {t1:g} s; the record runs from "
                 f"{self.start:g} to {self.start + self.duration:g} s"
             )
-        return self[max(first, 0) : last]
+        return self[first:last]
 
     def split(self, *fractions: float) -> tuple["Record", ...]:
         """Cut the record in time order, by default into halves.
@@ -228,24 +272,26 @@ class Record:
         """
         cuts = fractions or (0.5,)
         edges = np.array([0.0, *cuts, 1.0])
-        if np.any(np.diff(edges) <= 0):
+        if not np.all(np.diff(edges) > 0):
             raise CtrlidError(f"split takes increasing fractions between 0 and 1; given {cuts}")
         at = np.round(edges * len(self)).astype(int)
-        return tuple(self[a:b] for a, b in zip(at[:-1], at[1:], strict=True))
+        return tuple(self[a:b] for a, b in pairwise(at))
 
     def decimate(self, q: int, antialias: bool = True) -> "Record":
         """Return the record at q times the sampling period.
 
-        Every channel passes the same zero-phase low-pass filter, so that nothing folds down and the
-        channels keep their relation. What is held at the fast rate is no longer held exactly at
-        the slow one. Samples near the ends, and near samples that do not count, do not count.
+        Every channel passes the same zero-phase FIR filter, so that the channels keep their
+        relation. It passes what is below two thirds of the new Nyquist frequency and takes 50 dB
+        off what is above the new Nyquist frequency. A sample counts only where all 20 q + 1
+        samples under the filter count, which costs 10 slow samples at either end. An input that
+        was held between the fast samples is no longer held exactly between the slow ones.
 
         Parameters
         ----------
         q : int
             Factor.
         antialias : bool, optional
-            False takes every q-th sample, as a slower recorder would have.
+            False takes every q-th sample: what a slower recorder would have logged.
 
         Returns
         -------
@@ -256,25 +302,42 @@ class Record:
         ------
         CtrlidError
             If q is no positive integer or leaves too few samples.
+
+        Examples
+        --------
+        >>> import ctrlid as cid
+        >>> record = cid.Record(u=[0.0] * 100, y=[1.0] * 100, dt=0.001)
+        >>> slow = record.decimate(4)
+        >>> len(slow), slow.dt, float(slow.y[0]), slow.segments()
+        (25, 0.004, 1.0, [(10, 15)])
         """
-        if int(q) != q or q < 1 or len(self) < 2 * q:
-            raise CtrlidError(f"decimate needs a whole factor from 1 to {len(self) // 2}; given {q!r}")
+        if not isinstance(q, Integral) or not 1 <= q <= len(self) // 2:
+            raise CtrlidError(f"decimate needs a whole factor from 1 to {len(self) // 2} for "
+                              f"{len(self)} samples; given {q!r}")  # fmt: skip
         q = int(q)
         if q == 1:
             return self
         if not antialias:
             return self._map(lambda s: s[::q], valid=self.valid[::q], dt=self.dt * q)
         half = 10 * q
-        taps = signal.firwin(2 * half + 1, 1.0 / q, window="hamming")
-        taps /= taps.sum()
+        count = np.cumsum(np.pad(~self.valid, (half + 1, half), constant_values=True))
+        valid = (count[2 * half + 1 :] == count[: -2 * half - 1])[::q]
+        if not valid.any():
+            longest = max((b - a for a, b in self.segments()), default=0)
+            raise CtrlidError(
+                f"decimate({q}) would leave no sample that counts: its filter spans {2 * half + 1} "
+                f"samples and the longest valid stretch has {longest}. Use a smaller factor, or "
+                "antialias=False"
+            )
+        # The transition band of a Hamming window of this length is a third of the new Nyquist band.
+        taps = signal.firwin(2 * half + 1, (1 - 1 / 6) / q, window="hamming")
 
         def filtered(s: Any) -> Any:
-            # Odd reflection at the ends continues slopes; a constant stays exactly what it is.
-            around = s[0]
-            return around + signal.fftconvolve(_reflect(s - around, half), taps, "valid")[::q]
+            # Filtering the deviation keeps constants exact; odd reflection continues slopes.
+            around = np.pad(s - s[0], half, mode="reflect", reflect_type="odd")
+            return s[0] + signal.fftconvolve(around, taps, "valid")[::q]
 
-        ok = np.lib.stride_tricks.sliding_window_view(np.pad(self.valid, half), 2 * half + 1)
-        return self._map(filtered, valid=ok.all(axis=1)[::q], dt=self.dt * q)
+        return self._map(filtered, valid=valid, dt=self.dt * q)
 
     def with_input(self, channel: str) -> "Record":
         """Return the record with an extra channel as input; the old input becomes an extra one.
@@ -318,16 +381,22 @@ class Record:
 
     def _swap(self, key: str, channel: str) -> "Record":
         if channel not in self.extra:
-            raise CtrlidError(f"the record has no extra channel {channel!r}; it has {list(self.extra)}")
+            raise CtrlidError(f"the record has no extra channel {channel!r}; it has "
+                              f"{', '.join(self.extra) or 'none'}")  # fmt: skip
         old = self.names.get(key, {"u": "input", "y": "output"}[key])
-        extra = {**{k: v for k, v in self.extra.items() if k != channel}, old: getattr(self, key)}
+        extra = {k: v for k, v in self.extra.items() if k != channel}
+        if old in (*extra, *RESERVED):
+            raise CtrlidError(
+                f"the old {key} would move to the extra channels as {old!r}, but that name is "
+                f"taken; name it otherwise with names={{{key!r}: ...}}"
+            )
         units = {k: v for k, v in self.units.items() if k not in (key, channel)}
         if key in self.units:
             units[old] = self.units[key]
         if channel in self.units:
             units[key] = self.units[channel]
-        return replace(self, **{key: self.extra[channel]}, extra=extra, units=units,
-                       names={**self.names, key: channel})  # fmt: skip
+        return replace(self, **{key: self.extra[channel]}, extra={old: getattr(self, key), **extra},
+                       units=units, names={**self.names, key: channel})  # fmt: skip
 
     def segments(self) -> list[tuple[int, int]]:
         """Return the (start, stop) sample indices of the stretches that count.
@@ -341,32 +410,74 @@ class Record:
         return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
 
     @classmethod
-    def from_csv(cls, path: str | Path, **options: Any) -> "Record":
-        """Read a record from a CSV file; see `read_csv` for the options.
+    def from_csv(
+        cls, path: str | Path, *, r: str | None = None, u: str = "u", y: str = "y",
+        time: str | None = None, dt: float | None = None, extra: Sequence[str] | None = None,
+        units: Mapping[str, str] | None = None, hold: Hold | None = None, name: str | None = None,
+        gaps: Literal["error", "mask"] = "error",
+    ) -> "Record":  # fmt: skip
+        """Read a record from a CSV file with a header line.
+
+        Columns are separated by commas, semicolons or tabs; units are read from headers such as
+        ``u [V]`` or ``u (V)``. A column called valid tells which samples count.
 
         Parameters
         ----------
         path : str or path
             The file.
-        **options
-            Options of `read_csv`.
+        r, u, y : str, optional
+            Names of the columns; r by default if there is a column so called.
+        time : str, optional
+            Name of the time column; by default one called t, time, timestamp or seconds. Its unit
+            is s unless the header says ms, us, min or h.
+        dt : float, optional
+            Sampling period [s]; by default that of the time column.
+        extra : sequence of str, optional
+            Further columns to keep; by default all others of a file that `to_csv` wrote, else none.
+        units : mapping, optional
+            Units, by signal, instead of those in the header.
+        hold, name : str, optional
+            As in `Record`; by default what `to_csv` wrote, else ``"zoh"`` and the file's name.
+        gaps : {"error", "mask"}, optional
+            Whether missing samples are refused, or filled with the last values and marked as not
+            valid.
 
         Returns
         -------
         Record
             The record.
+
+        Warns
+        -----
+        CtrlidWarning
+            If the times jitter by more than 1 % of the period.
+
+        Raises
+        ------
+        CtrlidError
+            If the file is no table of numbers, a column is missing, the time does not increase or
+            samples are missing.
         """
-        return cls(**_csv.read_csv(path, **options))
+        return cls(**_csv.read_csv(
+            Path(path), {"r": r, "u": u, "y": y}, time, dt, extra, units, hold, name, gaps
+        ))  # fmt: skip
 
     def to_csv(self, path: str | Path) -> None:
         """Write the record to a CSV file that `from_csv` reads back exactly.
+
+        A comment line at the top holds what a table cannot: name, dt, hold and signal names.
 
         Parameters
         ----------
         path : str or path
             The file.
+
+        Raises
+        ------
+        CtrlidError
+            If a channel's name or unit cannot stand in a header line.
         """
-        _csv.write_csv(path, self)
+        _csv.write_csv(Path(path), self)
 
     @classmethod
     def from_response(
@@ -381,7 +492,8 @@ class Record:
             A single response, uniformly sampled.
         r, u, y : str, optional
             Labels of the reference, input and output among the response's inputs and outputs. By
-            default the signals so labelled, else the only input as u and the only output as y.
+            default the signals so labelled, else the only other input as u and the only other
+            output as y.
         **fields
             Further fields of the record, such as ``hold``, ``names``, ``units``.
 
@@ -393,49 +505,33 @@ class Record:
         Raises
         ------
         CtrlidError
-            If a signal is not there or the time is not uniform.
+            If a signal is not there, the time is not uniform or there are several traces.
+
+        Examples
+        --------
+        >>> import control as ct
+        >>> import ctrlid as cid
+        >>> plant = ct.tf([1], [1, 1], inputs="force", outputs="speed")
+        >>> response = ct.step_response(plant, timepts=[0, 0.5, 1.0])
+        >>> cid.Record.from_response(response, units={"y": "m/s"})
+        Record 3 samples at 0.5 s (1.5 s, zoh)
+          u (force)      1 .. 1
+          y (speed)      0 .. 0.632121 m/s
         """
-        if response.ntraces > 1:
-            raise CtrlidError(f"a record is one experiment; the response has {response.ntraces} "
-                              "traces, take one of them")  # fmt: skip
-        shape = (-1, len(response.time))
-        table = {}
-        for labels, values in ((response.input_labels, response.u), (response.output_labels, response.y)):
-            if values is not None:
-                table.update(zip(labels or [], np.reshape(values, shape), strict=False))
-        outputs, inputs = list(response.output_labels or []), list(response.input_labels or [])
-        default = {"r": "r" if "r" in table else None,
-                   "u": "u" if "u" in table else (inputs[0] if len(inputs) == 1 else None),
-                   "y": "y" if "y" in table else (outputs[0] if len(outputs) == 1 else None)}  # fmt: skip
-        chosen = {k: v or default[k] for k, v in (("r", r), ("u", u), ("y", y))}
-        for key, label in chosen.items():
-            if (label is None and key != "r") or (label is not None and label not in table):
-                raise CtrlidError(f"say which signal is {key}: the response has {list(table)}; "
-                                  f"given {label!r}")  # fmt: skip
-        steps = np.diff(response.time)
-        dt = float(np.median(steps))
-        if np.any(np.abs(steps - dt) > 1e-6 * dt):
-            raise CtrlidError("a record is sampled uniformly, but the times of the response are not; "
-                              "compute it at np.arange(n) * dt")  # fmt: skip
-        names = {k: v for k, v in chosen.items() if v is not None and v != k}
-        fields = {"names": names, "start": float(response.time[0]), **fields}
-        return cls(dt=dt, **{k: table[v] for k, v in chosen.items() if v is not None}, **fields)
+        return cls(**{**_response.read_response(response, {"r": r, "u": u, "y": y}), **fields})
 
     def to_response(self) -> Any:
         """Return a `control.TimeResponseData` with output y and inputs u and, if any, r.
+
+        The labels are the names with their units, as in ``position [m]``, or r, u and y. Extra
+        channels, `valid` and `hold` have no place in a response.
 
         Returns
         -------
         control.TimeResponseData
             The same samples.
         """
-        inputs = {self.names.get(k, k): getattr(self, k) for k in ("u", "r")
-                  if getattr(self, k) is not None}  # fmt: skip
-        return ct.TimeResponseData(
-            self.t, np.array(self.y)[None, :], inputs=np.array(list(inputs.values())),
-            output_labels=[self.names.get("y", "y")], input_labels=list(inputs),
-            sysname=self.name or None,
-        )  # fmt: skip
+        return _response.write_response(self)
 
     def __repr__(self) -> str:
         rows = [f"Record {self.name + ': ' if self.name else ''}{len(self)} samples at "
@@ -446,20 +542,13 @@ class Record:
         for key, values in (*channels, *self.extra.items()):
             label = self.names.get(key, key)
             label = key if label == key else f"{key} ({label})"
-            unit = self.units.get(key, "")
+            unit = self.units.get(key, "").removeprefix("1")
             rows.append(f"  {label:<14} {values.min():.6g} .. {values.max():.6g} {unit}".rstrip())
         return "\n".join(rows)
 
 
 def _rebuild(fields: dict[str, Any]) -> Record:
     return Record(**fields)
-
-
-def _reflect(s: Any, width: int) -> Any:
-    """Extend a signal by odd reflection at both ends, by constants where it is too short."""
-    reach = min(width, len(s) - 1)
-    extended = np.concatenate([2 * s[0] - s[reach:0:-1], s, 2 * s[-1] - s[-2 : -reach - 2 : -1]])
-    return np.pad(extended, width - reach, mode="edge")
 
 
 def as_records(data: Any) -> tuple[Record, ...]:
@@ -481,13 +570,20 @@ def as_records(data: Any) -> tuple[Record, ...]:
         If something else is among them, or sampling period or hold differ.
     """
     records = (data,) if isinstance(data, Record) else data
-    if not isinstance(records, Sequence) or not records or not all(
-        isinstance(r, Record) for r in records
-    ):
-        raise CtrlidError(f"a fit takes a Record or a list of Records; given {type(data).__name__}. "
+    if not isinstance(records, list | tuple):
+        raise CtrlidError(f"a Record or a list of Records is needed; given {type(data).__name__}. "
                           "Make one with Record(u=, y=, dt=) or Record.from_csv(path)")  # fmt: skip
-    kinds = {(r.dt, r.hold) for r in records}
-    if len(kinds) > 1:
-        raise CtrlidError(f"records fitted together need one sampling period and hold; given "
-                          f"{sorted(kinds)}")  # fmt: skip
+    strangers = [type(item).__name__ for item in records if not isinstance(item, Record)]
+    if strangers or not records:
+        what = f"has {', '.join(strangers)}" if strangers else "is empty"
+        raise CtrlidError(f"a Record or a list of Records is needed; the list given {what}")
+    first = records[0]
+    for record in records[1:]:
+        # Periods read from printed times differ by their last digits.
+        if abs(record.dt - first.dt) > 1e-6 * first.dt or record.hold != first.hold:
+            raise CtrlidError(
+                "records used together need one sampling period and one hold; given "
+                f"{first.dt:g} s {first.hold} and {record.dt:g} s {record.hold}. Decimate the "
+                "faster one"
+            )
     return tuple(records)
