@@ -515,8 +515,8 @@ class Record:
         >>> response = ct.step_response(plant, timepts=[0, 0.5, 1.0])
         >>> cid.Record.from_response(response, units={"y": "m/s"})
         Record 3 samples at 0.5 s (1.5 s, zoh)
-          u (force)      1 .. 1
-          y (speed)      0 .. 0.632121 m/s
+          u (force)  1 .. 1
+          y (speed)  0 .. 0.632121 m/s
         """
         return cls(**{**_response.read_response(response, {"r": r, "u": u, "y": y}), **fields})
 
@@ -538,12 +538,14 @@ class Record:
                 f"{self.dt:g} s ({self.duration:.4g} s, {self.hold})"]  # fmt: skip
         if not self.valid.all():
             rows[0] += f", {100 * self.valid.mean():.1f} % valid"
-        channels = [(k, getattr(self, k)) for k in SIGNALS if getattr(self, k) is not None]
-        for key, values in (*channels, *self.extra.items()):
-            label = self.names.get(key, key)
-            label = key if label == key else f"{key} ({label})"
-            unit = self.units.get(key, "").removeprefix("1")
-            rows.append(f"  {label:<14} {values.min():.6g} .. {values.max():.6g} {unit}".rstrip())
+        channels = {k: getattr(self, k) for k in SIGNALS if getattr(self, k) is not None}
+        channels |= self.extra
+        labels = {k: f"{k} ({self.names[k]})" if k in self.names else k for k in channels}
+        width = max(map(len, labels.values()))
+        for key, values in channels.items():
+            unit = self.units.get(key, "")
+            rows.append(f"  {labels[key]:<{width}}  {values.min():.6g} .. {values.max():.6g} "
+                        f"{'' if unit == '1' else unit}".rstrip())  # fmt: skip
         return "\n".join(rows)
 
 

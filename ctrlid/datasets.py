@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -98,14 +98,14 @@ def _emps(table: Any) -> Record:
     extra = {"pulses": _channel(table, "pulses_N")} if "pulses_N" in table else {}
     return Record(
         r=_channel(table, "qg"), u=_channel(table, "vir"), y=_channel(table, "qm"), dt=1e-3,
-        extra=extra, units={"r": "m", "u": "V", "y": "m"},
+        extra=extra, units={"r": "m", "u": "V", "y": "m", **dict.fromkeys(extra, "V")},
         names={"r": "reference", "u": "drive voltage", "y": "position"},
     )  # fmt: skip
 
 
 def _inteco_pid(table: Any) -> Record:
     time = _channel(table, "sim_time")
-    # The ball hits both stops at first, and swings out of the controlled range twice later.
+    # The ball hits both stops at first; after each step it swings far out of the linear range.
     valid = (time >= 2.0) & ~((time >= 10.0) & (time < 12.0)) & ~((time >= 18.0) & (time < 20.0))
     return Record(
         r=_channel(table, "sim_pos", 0), u=_channel(table, "sim_con"),
@@ -126,13 +126,15 @@ def _inteco_coil(table: Any) -> Record:
 
 def _magnetoshield(table: Any) -> list[Record]:
     whole = np.asarray(table["result"], dtype=float)
+    set_points = (14.0, 13.5, 14.5, 15.0, 14.5)  # not logged; where the magnet settles [mm]
     return [
         Record(
             u=part[:, 1], y=part[:, 0] * 1e-3, dt=3.25e-3, extra={"current": part[:, 2] * 1e-3},
+            valid=part[:, 0] < 15.6,  # the magnet lies on the floor until it is lifted
             units={"u": "V", "y": "m", "current": "A"},
-            names={"u": "solenoid voltage", "y": "gap"}, name=f"set-point {k + 1}",
+            names={"u": "solenoid voltage", "y": "gap"}, name=f"set-point {k + 1}, {level:g} mm",
         )
-        for k, part in enumerate(np.split(whole, 5))
+        for k, (part, level) in enumerate(zip(np.split(whole, 5), set_points, strict=True))
     ]  # fmt: skip
 
 
@@ -156,19 +158,50 @@ def _tanks(which: str) -> Callable[[Any], Record]:
     return read
 
 
+_EMPS_TEXT = (
+    "Electro-mechanical positioning system (EMPS) in closed loop: a carriage on a screw, one "
+    "integrator. 24841 samples at 1 ms; r and y position [m], u drive voltage [V]; 35.15 N/V"
+)
+_SERVO_TEXT = (
+    "Servo of a ball-and-beam rig in closed loop, one integrator, {}. {} samples at 1 ms, all in "
+    "volts; y angle, extra['filtered'] the y that the controller sees, u = 3 (r - filtered) "
+    "limited to 10 V"
+)
+_TANKS_TEXT = (
+    "Two cascaded tanks in open loop, {} data. 1024 samples at 4 s; u pump voltage [V], y level "
+    "sensor of the lower tank [V], which clips at 10 V where the tank overflows"
+)
+
 _CATALOGUE: dict[str, tuple[Source, Callable[[Any], Any], str]] = {
-    "emps": (EMPS, _emps, "electro-mechanical positioning system in closed loop, one integrator"),
-    "emps_pulses": (EMPS_PULSES, _emps, "the same with force pulses added to the drive"),
-    "inteco_pid_step": (INTECO_PID, _inteco_pid,
-                        "magnetic levitation under PID control, steps between 8 and 14 mm"),
-    "inteco_coil_step": (INTECO_COIL, _inteco_coil,
-                         "its coil alone: current after a step of the duty, the ball at rest"),
-    "magnetoshield_r3": (MAGNETOSHIELD, _magnetoshield,
-                         "levitated permanent magnet with dither, a list of five set-points"),
-    "servo_random_steps": (SERVO_STEPS, _servo, "servo of a ball-and-beam rig, random steps"),
-    "servo_swept_sine": (SERVO_SINE, _servo, "servo of a ball-and-beam rig, swept sine"),
-    "tanks_estimation": (TANKS, _tanks("Est"), "cascaded tanks in open loop, estimation data"),
-    "tanks_validation": (TANKS, _tanks("Val"), "cascaded tanks in open loop, validation data"),
+    "emps": (EMPS, _emps, _EMPS_TEXT),
+    "emps_pulses": (
+        EMPS_PULSES, _emps,
+        _EMPS_TEXT + ". With pulses added to the drive: u contains them, and extra['pulses'] is "
+        "their signal as logged, 0 or 5 V, which moves u by 5.1 to 5.3 V",
+    ),
+    "inteco_pid_step": (
+        INTECO_PID, _inteco_pid,
+        "INTECO magnetic levitation under PID control, unstable, steps of the reference from 10 to "
+        "12 and 8 mm. 24343 samples at 1 ms; r and y distance from the coil [m], u PWM duty from 0 "
+        "to 1, extra['current'] of the coil [A]. Not valid: the first 2 s, where the ball hits "
+        "both stops, and 2 s from each step, where it swings to 16.8 and 2.6 mm",
+    ),
+    "inteco_coil_step": (
+        INTECO_COIL, _inteco_coil,
+        "Coil of the INTECO magnetic levitation alone, the ball at rest: a step of the duty from 0 "
+        "to 1 at 5 s. 10764 samples at 1 ms; u duty, y coil current [A]",
+    ),
+    "magnetoshield_r3": (
+        MAGNETOSHIELD, _magnetoshield,
+        "MagnetoShield R3, a levitated permanent magnet under PID control with noise of 2 V peak "
+        "to peak added to u, unstable: a list of five records, one per set-point. 1500 samples "
+        "each at 3.25 ms; u solenoid voltage [V], y gap [m], extra['current'] of the coil [A], "
+        "read after u is applied. Not valid: the magnet on the floor at the start of the first",
+    ),
+    "servo_random_steps": (SERVO_STEPS, _servo, _SERVO_TEXT.format("random steps", 59802)),
+    "servo_swept_sine": (SERVO_SINE, _servo, _SERVO_TEXT.format("swept sine", 60001)),
+    "tanks_estimation": (TANKS, _tanks("Est"), _TANKS_TEXT.format("estimation")),
+    "tanks_validation": (TANKS, _tanks("Val"), _TANKS_TEXT.format("validation")),
 }  # fmt: skip
 
 
@@ -217,7 +250,7 @@ def describe(name: str) -> str:
     --------
     >>> import ctrlid as cid
     >>> print(cid.datasets.describe("tanks_validation"))
-    cascaded tanks in open loop, validation data.
+    Two cascaded tanks in open loop, validation data. 1024 samples at 4 s; ...
     Source: https://raw.githubusercontent.com/forgi86/sysid-neural-unc/...
     Terms: public benchmark; cite Schoukens, Mattson, Wigren, Noël (2016)
     """
@@ -251,9 +284,9 @@ def load(name: str) -> Any:
     source, read, _ = _entry(name)
     table = io.loadmat(_path(source))
     loaded = read(table)
-    parts = loaded if isinstance(loaded, list) else [loaded]
-    titled = [p._map(lambda s: s, name=f"{name} {p.name}".strip()) for p in parts]
-    return titled if isinstance(loaded, list) else titled[0]
+    if isinstance(loaded, list):
+        return [replace(record, name=f"{name} {record.name}") for record in loaded]
+    return replace(loaded, name=name)
 
 
 def _path(source: Source) -> Path:
@@ -262,18 +295,21 @@ def _path(source: Source) -> Path:
         local = Path(folder) / source.file
         if local.is_file():
             if pooch.file_hash(str(local)) != source.sha256:
-                raise CtrlidError(f"{local} is not the published file (its SHA-256 differs from "
-                                  f"{source.sha256}); remove it to fetch the original")  # fmt: skip
+                raise CtrlidError(
+                    f"{local} is not the published file: its SHA-256 is not {source.sha256}. "
+                    f"Replace it by {source.address}"
+                )
             return local
-    pooch.get_logger().setLevel("ERROR")
+    pooch.get_logger().setLevel("ERROR")  # a download is no news
     try:
         fetched = pooch.retrieve(
-            source.address, known_hash=f"sha256:{source.sha256}", path=pooch.os_cache("ctrlid")
-        )
-    except Exception as reason:
+            source.address, known_hash=f"sha256:{source.sha256}", path=pooch.os_cache("ctrlid"),
+            progressbar=False,
+        )  # fmt: skip
+    except Exception as reason:  # pooch hands on whatever its downloader raises
         raise CtrlidError(
-            f"cannot fetch {source.address} ({type(reason).__name__}). Connect to the network, or "
-            f"put the file at {source.file} in a folder and name that folder in the environment "
-            f"variable {FOLDER_VARIABLE}"
+            f"cannot fetch {source.address} ({type(reason).__name__}: {reason}). Connect to the "
+            f"network, or put the file into a folder as {source.file} and name that folder in the "
+            f"environment variable {FOLDER_VARIABLE}"
         ) from reason
     return Path(fetched)
