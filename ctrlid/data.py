@@ -284,14 +284,15 @@ class Record:
         relation. It passes what is below two thirds of the new Nyquist frequency and takes 50 dB
         off what is above the new Nyquist frequency. A sample counts only where all 20 q + 1
         samples under the filter count, which costs 10 slow samples at either end. An input that
-        was held between the fast samples is no longer held exactly between the slow ones.
+        was held is smooth afterwards, so `hold` becomes ``"foh"``.
 
         Parameters
         ----------
         q : int
             Factor.
         antialias : bool, optional
-            False takes every q-th sample: what a slower recorder would have logged.
+            False takes every q-th sample: what a slower recorder would have logged. What u did in
+            between is lost, and `hold` is no longer true of it.
 
         Returns
         -------
@@ -337,7 +338,7 @@ class Record:
             around = np.pad(s - s[0], half, mode="reflect", reflect_type="odd")
             return s[0] + signal.fftconvolve(around, taps, "valid")[::q]
 
-        return self._map(filtered, valid=valid, dt=self.dt * q)
+        return self._map(filtered, valid=valid, dt=self.dt * q, hold="foh")
 
     def with_input(self, channel: str) -> "Record":
         """Return the record with an extra channel as input; the old input becomes an extra one.
@@ -383,7 +384,9 @@ class Record:
         if channel not in self.extra:
             raise CtrlidError(f"the record has no extra channel {channel!r}; it has "
                               f"{', '.join(self.extra) or 'none'}")  # fmt: skip
-        old = self.names.get(key, {"u": "input", "y": "output"}[key])
+        old = self.names.get(key, key)
+        if old == key:
+            old = {"u": "input", "y": "output"}[key]
         extra = {k: v for k, v in self.extra.items() if k != channel}
         if old in (*extra, *RESERVED):
             raise CtrlidError(
@@ -540,7 +543,7 @@ class Record:
             rows[0] += f", {100 * self.valid.mean():.1f} % valid"
         channels = {k: getattr(self, k) for k in SIGNALS if getattr(self, k) is not None}
         channels |= self.extra
-        labels = {k: f"{k} ({self.names[k]})" if k in self.names else k for k in channels}
+        labels = {k: f"{k} ({v})" if (v := self.names.get(k, k)) != k else k for k in channels}
         width = max(map(len, labels.values()))
         for key, values in channels.items():
             unit = self.units.get(key, "")
@@ -586,6 +589,6 @@ def as_records(data: Any) -> tuple[Record, ...]:
             raise CtrlidError(
                 "records used together need one sampling period and one hold; given "
                 f"{first.dt:g} s {first.hold} and {record.dt:g} s {record.hold}. Decimate the "
-                "faster one"
+                "faster one, or give both the hold that is nearer the truth"
             )
     return tuple(records)

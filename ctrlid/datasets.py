@@ -112,14 +112,15 @@ def _inteco_pid(table: Any) -> Record:
         y=_channel(table, "sim_pos", 1), dt=1e-3, valid=valid, start=float(time[0]),
         extra={"current": _channel(table, "sim_cur")},
         units={"r": "m", "u": "1", "y": "m", "current": "A"},
-        names={"r": "reference", "u": "duty", "y": "gap"},
+        names={"r": "reference", "u": "duty", "y": "distance"},
     )  # fmt: skip
 
 
 def _inteco_coil(table: Any) -> Record:
     return Record(
         u=_channel(table, "sim_con"), y=_channel(table, "sim_cur"), dt=1e-3,
-        extra={"gap": _channel(table, "sim_pos", 1)}, units={"u": "1", "y": "A", "gap": "m"},
+        extra={"distance": _channel(table, "sim_pos", 1)},
+        units={"u": "1", "y": "A", "distance": "m"},
         names={"u": "duty", "y": "current"},
     )  # fmt: skip
 

@@ -1,0 +1,20 @@
+"""What several test files share."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+
+@pytest.fixture
+def data_dir(monkeypatch):
+    """Return the folder of real measured files, and let `datasets.load` look there first.
+
+    No such file is part of the project; a checkout may have them in a folder next to it.
+    """
+    beside = Path(__file__).parents[2] / "shared" / "data"
+    folder = Path(os.environ.get("CTRLID_DATA_DIR", beside))
+    if not folder.is_dir():
+        pytest.skip(f"needs the measured files: no folder {folder}; set CTRLID_DATA_DIR to theirs")
+    monkeypatch.setenv("CTRLID_DATA_DIR", str(folder))
+    return folder
