@@ -26,7 +26,8 @@ from .model import Estimate, IdentifiedModel
 from .predictor import Prediction, predict
 from .residuals import Correlation
 from .signals import multisine, prbs, random_binary, steps
-from .simulation import replay_controller, simulate
+from .replay import replay_controller
+from .simulation import simulate
 from .validation import Comparison, Curve, compare
 
 __version__ = "0.1.0.dev0"

@@ -12,7 +12,8 @@ from .lead import design_lead
 from .loop import Loop
 from .margins import loop_margins, nu_gap, robust_margin
 from .physics import Array, timebase
-from .simulation import growth_rate, simulate
+from .simulation import simulate
+from .stepping import growth_rate
 
 SETTLED = 0.02  # band around the final value
 CLOSE = 0.25  # share of a promised phase margin whose loss is worth a word

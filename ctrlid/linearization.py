@@ -66,9 +66,9 @@ class OperatingPoint:
 def operating_point(
     plant: Any, *, output: float, guess: Sequence[float] | OperatingPoint | None = None
 ) -> OperatingPoint:
-    """Return the equilibrium of a plant at a given output.
+    r"""Return the equilibrium of a plant at a given output.
 
-    .. math:: f(x_0, u_0) = 0, \\quad h(x_0, u_0) = y_0
+    .. math:: f(x_0, u_0) = 0, \quad h(x_0, u_0) = y_0
 
     States and input are solved together by Newton's method with the exact derivatives of the traced
     equations, from many starting points, and the equations are evaluated at the result. Of several
@@ -229,10 +229,10 @@ def state_matrices(
 
 
 def linearize(plant: Any, at: OperatingPoint) -> Any:
-    """Return the transfer function of a plant for small deviations from an operating point.
+    r"""Return the transfer function of a plant for small deviations from an operating point.
 
-    .. math:: G(s) = C (s I - A)^{-1} B + D, \\quad A = \\partial f/\\partial x, \\;
-        B = \\partial f/\\partial u, \\; C = \\partial h/\\partial x
+    .. math:: G(s) = C (s I - A)^{-1} B + D, \quad A = \partial f/\partial x, \;
+        B = \partial f/\partial u, \; C = \partial h/\partial x
 
     The derivatives are those of the traced equations, without differencing, and the polynomials are
     formed in rational arithmetic, so that no dust coefficients appear: the levitated ball gives

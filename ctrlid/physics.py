@@ -110,7 +110,8 @@ def _run(system: Any, t: Any, x: Any, u: Any, p: Mapping[str, Any]) -> tuple[Any
             casadi.mtimes(casadi.SX(c), x) + casadi.mtimes(casadi.SX(d), u),
         )
     if isinstance(system, InterconnectedSystem):
-        return _run_interconnected(system, t, x, u, p)
+        rhs, out = _run_interconnected(system, t, x, u, p)
+        return rhs, out
     arguments = (Symbol(t), _array(x), _array(u), dict(p))
     rhs = casadi.SX(0, 1)
     if system.nstates:

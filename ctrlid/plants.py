@@ -19,9 +19,9 @@ def _require_positive(plant: str, **parameters: float) -> None:
 
 
 def maglev(m: float, K: float, g: float = 9.81) -> Any:
-    """Return a ball that hangs below an electromagnet.
+    r"""Return a ball that hangs below an electromagnet.
 
-    .. math:: m \\ddot x = m g - K V^2 / x^2
+    .. math:: m \ddot x = m g - K V^2 / x^2
 
     The magnet pulls the ball up with a force that grows with the voltage and falls with the gap;
     the gap is counted from the magnet downwards. Unstable: poles at plus and minus
@@ -72,9 +72,9 @@ def maglev(m: float, K: float, g: float = 9.81) -> Any:
 
 
 def servo(m: float, c: float, k: float) -> Any:
-    """Return a mass on a drive: a pole at the origin and one from friction.
+    r"""Return a mass on a drive: a pole at the origin and one from friction.
 
-    .. math:: m \\ddot x = k V - c \\dot x
+    .. math:: m \ddot x = k V - c \dot x
 
     Parameters
     ----------
@@ -116,9 +116,9 @@ def servo(m: float, c: float, k: float) -> Any:
 
 
 def tank(area: float, outlet: float, k: float, g: float = 9.81) -> Any:
-    """Return a tank that is filled by a pump and drained through a hole.
+    r"""Return a tank that is filled by a pump and drained through a hole.
 
-    .. math:: A \\dot h = k V - a \\sqrt{2 g h}
+    .. math:: A \dot h = k V - a \sqrt{2 g h}
 
     Parameters
     ----------
@@ -163,9 +163,9 @@ def tank(area: float, outlet: float, k: float, g: float = 9.81) -> Any:
 
 
 def pendulum(m: float, length: float, c: float = 0.0, g: float = 9.81) -> Any:
-    """Return an inverted pendulum driven by a torque at its pivot.
+    r"""Return an inverted pendulum driven by a torque at its pivot.
 
-    .. math:: m l^2 \\ddot\\theta = m g l \\sin\\theta - c \\dot\\theta + \\tau
+    .. math:: m l^2 \ddot\theta = m g l \sin\theta - c \dot\theta + \tau
 
     Parameters
     ----------

@@ -15,7 +15,7 @@ from .data import Record
 from .errors import CtrlidError
 from .loop import Loop
 from .physics import Array
-from .simulation import integrate
+from .stepping import integrate
 
 TUNING_SAMPLES = 4000  # enough to choose the ratio of force noise to sensor noise
 

@@ -3,176 +3,21 @@
 import math
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
-import casadi
 import numpy as np
-from scipy.integrate import DOP853
 
 from .data import Record
 from .errors import CtrlidError, CtrlidWarning
 from .loop import Loop
 from .physics import Array
+from .stepping import growth_rate, sensitivity, stepper
 
 TOLERANCE = 1e-9  # local error of one integration step, relative to the excursion of each state
 COARSE = 1e-5  # above this, what could not be refined further is worth a warning
 MOST_SUBSTEPS = 128
 CHUNK = 2048  # samples run at once
 RUNAWAY = 1e3  # an output this many times further out than anything asked for has left
-
-
-@dataclass(frozen=True, eq=False)
-class Stepper:
-    """The loop over one sampling period as a CasADi function.
-
-    ``step(z, w) -> (next z, y, u, local error)``; z stacks plant and controller states, w is
-    ``(t, r, d, sensor noise, force noise)``, all held over the period.
-    """
-
-    plant_states: tuple[str, ...]
-    rest: tuple[float, ...]
-    step: Any
-
-
-def integrate(rate: Any, z: Any, dt: float, substeps: int) -> tuple[Any, Any]:
-    """Advance an expression by Dormand and Prince's eighth-order formula.
-
-    Parameters
-    ----------
-    rate : callable
-        ``rate(tau, z)``, the derivative at time `tau` after the start, as CasADi expression.
-    z : casadi.SX
-        The state at the start.
-    dt : float
-        Time to advance [s].
-    substeps : int
-        Number of steps of equal length.
-
-    Returns
-    -------
-    z : casadi.SX
-        The state after `dt`.
-    error : casadi.SX
-        Largest estimate of the local error of a step, per state.
-
-    References
-    ----------
-    Hairer, Nørsett and Wanner, *Solving Ordinary Differential Equations I*, section II.10.
-    """
-    h = dt / substeps
-    worst = casadi.SX.zeros(z.shape[0], 1)
-    for k in range(substeps):
-        stages: list[Any] = []
-        for row, c in zip(DOP853.A, DOP853.C, strict=True):
-            point = z
-            for weight, stage in zip(row, stages, strict=False):
-                if weight:
-                    point = point + (h * weight) * stage
-            stages.append(rate((k + c) * h, point))
-        total, fifth, third = (
-            sum((w * s for w, s in zip(weights, stages, strict=False) if w), casadi.SX(0))
-            for weights in (DOP853.B, DOP853.E5, DOP853.E3)
-        )
-        z = z + h * total
-        fifth, third = casadi.fabs(h * fifth), casadi.fabs(h * third)
-        worst = casadi.fmax(worst, fifth**2 / casadi.sqrt(fifth**2 + 0.01 * third**2 + 1e-300))
-    return z, worst
-
-
-def stepper(loop: Loop, substeps: int) -> Stepper:
-    """Build the map of a loop over one sampling period.
-
-    Parameters
-    ----------
-    loop : Loop
-        The loop.
-    substeps : int
-        Integration steps in a period.
-
-    Returns
-    -------
-    Stepper
-        The map.
-    """
-    e, law = loop.equations(), loop.law()
-    n, nc = len(e.states), len(law.rest) if law else 0
-    z, w = casadi.SX.sym("z", n + nc), casadi.SX.sym("w", 5)
-    t0, r, d, sensor, force = casadi.vertsplit(w)
-    kick = casadi.SX.zeros(n, 1)
-    for j in e.velocities:
-        kick[j] = force
-    at, (lower, upper) = loop.point, loop.input_limits
-
-    def plant(t: Any, x: Any, u: Any) -> tuple[Any, Any]:
-        rhs, y = e.function(t, x, u, e.values)
-        return rhs + kick, y
-
-    def act(t: Any, z: Any, y: Any) -> tuple[Any, Any]:
-        wish, moved = law.apply(t, z[n:], r, y) if law else (at.input, casadi.SX(0, 1))
-        u = wish + d
-        if math.isfinite(lower):
-            u = casadi.fmax(u, lower)
-        if math.isfinite(upper):
-            u = casadi.fmin(u, upper)
-        return u, moved
-
-    def measured(t: Any, z: Any, u: Any) -> Any:
-        return plant(t, z[:n], u)[1] + sensor
-
-    y = measured(t0, z, at.input)
-    u, moved = act(t0, z, y)
-    if law is None:
-        y = measured(t0, z, u)
-    if loop.analog:
-        # A jump of the reference is a jump of the circuit's input: the period is smooth.
-        def rate(tau: Any, z: Any) -> Any:
-            u, slope = act(t0 + tau, z, measured(t0 + tau, z, at.input))
-            return casadi.vertcat(plant(t0 + tau, z[:n], u)[0], slope)
-
-        after, error = integrate(rate, z, loop.dt, substeps)
-    elif e.dt:
-        after, error = casadi.vertcat(plant(t0, z[:n], u)[0], moved), casadi.SX.zeros(n + nc, 1)
-    else:
-        x, error = integrate(
-            lambda tau, x: plant(t0 + tau, x, u)[0], z[:n], loop.dt, substeps
-        )  # fmt: skip
-        after = casadi.vertcat(x, moved)
-        error = casadi.vertcat(error, casadi.SX.zeros(nc, 1))
-    rest = (*at.states, *(law.rest if law else ()))
-    return Stepper(e.states, rest, casadi.Function("step", [z, w], [after, y, u, error]))
-
-
-def _sensitivity(s: Stepper, reference: float) -> tuple[Array, Array]:
-    """Return how the state after one period depends on the state and signals at rest."""
-    z, w = casadi.SX.sym("z", len(s.rest)), casadi.SX.sym("w", 5)
-    after = s.step(z, w)[0]
-    both = casadi.Function("j", [z, w], [casadi.jacobian(after, z), casadi.jacobian(after, w)])
-    a, b = both(s.rest, [0.0, reference, 0.0, 0.0, 0.0])
-    return np.asarray(a, float), np.asarray(b, float)
-
-
-def growth_rate(loop: Loop) -> float:
-    """Return the growth rate of small deviations in the closed loop [1/s].
-
-    .. math:: \\max_i \\ln|\\lambda_i| / T
-
-    over the eigenvalues of the linearized map over one sampling period T, with the controller as it
-    runs. Negative: the loop is stable.
-
-    Parameters
-    ----------
-    loop : Loop
-        The loop.
-
-    Returns
-    -------
-    float
-        The rate; minus infinity for a loop that is at rest after one period.
-    """
-    matrix = _sensitivity(stepper(loop, 8), loop.point.output)[0]
-    largest = np.max(np.abs(np.linalg.eigvals(matrix)), initial=0.0)
-    return float(np.log(largest) / loop.dt) if largest > 0 else -math.inf
 
 
 def simulate(
@@ -187,8 +32,8 @@ def simulate(
 ) -> Record:
     """Simulate a loop and return the record that its data logger would write.
 
-    At sample k the output is measured, ``y[k] = h(x(kT)) + noise``, the controller computes ``u[k]``
-    from it, and a digital one holds u until the next sample; a continuous controller is
+    At sample k the output is measured, ``y[k] = h(x(kT)) + noise``, the controller computes
+    ``u[k]`` from it, and a digital one holds u until the next sample; a continuous controller is
     integrated together with the plant. The reference, the injected signal and the noise are held
     over each period. Steps are of order eight, as many per period as an error of 1e-9 of each
     state's excursion needs.
@@ -298,7 +143,7 @@ class Simulator:
         self.rest: Array = np.array(first.rest, dtype=float)
         self._runners: dict[tuple[int, int], Any] = {}
         # What a millionth of the operating values does to each state: smaller motion is rest.
-        a, b = (np.nan_to_num(np.abs(m)) for m in _sensitivity(first, loop.point.output))
+        a, b = (np.nan_to_num(np.abs(m)) for m in sensitivity(first, loop.point.output))
         self._floor = 1e-6 * (a @ np.abs(self.rest) + b[:, 2] * abs(loop.point.input))
 
     def start(self, initial: Sequence[float] | None) -> Array:
@@ -342,8 +187,8 @@ class Simulator:
                 block = np.hstack([block, np.repeat(block[:, -1:], size - count, axis=1)])
             previous_stop: int | None = None
             while True:
-                states, ys, us, errors = (np.asarray(a, float)[:, :count]
-                                          for a in self._runner(substeps, size)(z, block))  # fmt: skip
+                results = self._runner(substeps, size)(z, block)
+                states, ys, us, errors = (np.asarray(a, float)[:, :count] for a in results)
                 stop = _first_bad(loop, states, ys, us, w)
                 with np.errstate(all="ignore"):
                     moved = np.maximum(reach, np.max(np.abs(states - start[:, None]), axis=1))
@@ -373,104 +218,6 @@ class Simulator:
                 CtrlidWarning, stacklevel=3,
             )  # fmt: skip
         return y, u
-
-
-def _controller_run(loop: Loop, y: Array, r: Array | None) -> tuple[Any, Array]:
-    """Return the controller over all samples as a function of its initial state, and its rest."""
-    law = loop.law()
-    if law is None or law.dt == 0.0:
-        raise CtrlidError("only a digital controller computes its output from the samples alone; "
-                          f"this loop has {'no controller' if law is None else 'an analog one'}")  # fmt: skip
-    x, w = casadi.SX.sym("x", len(law.rest)), casadi.SX.sym("w", 3)
-    u, after = law.apply(w[0], x, w[1], w[2])
-    lower, upper = loop.input_limits
-    u = casadi.fmin(casadi.fmax(u, lower), upper)
-    step = casadi.Function("controller", [x, w], [casadi.vertcat(after), u])
-    reference = np.full(len(y), loop.point.output) if r is None else np.asarray(r)
-    table = casadi.DM(np.vstack([np.arange(len(y)) * loop.dt, reference, y]))
-    start = casadi.MX.sym("start", len(law.rest))
-    outputs = step.mapaccum("run", len(y))(start, table)[1]
-    return casadi.Function("outputs", [start], [outputs.T]), np.array(law.rest, dtype=float)
-
-
-def controller_output(loop: Loop, y: Array, r: Array | None = None) -> Array:
-    """Return what a digital controller, at rest before, computes from a reference and an output.
-
-    Parameters
-    ----------
-    loop : Loop
-        The loop whose controller runs.
-    y : ndarray, shape (n,)
-        Measured output.
-    r : ndarray, shape (n,), optional
-        Reference; by default constant at the operating point.
-
-    Returns
-    -------
-    ndarray, shape (n,)
-        The input, within the limits of the loop.
-
-    Raises
-    ------
-    CtrlidError
-        If the loop has no controller, or an analog one.
-    """
-    run, rest = _controller_run(loop, y, r)
-    return np.asarray(run(rest), float).ravel()
-
-
-def replay_controller(loop: Loop, record: Record) -> Array:
-    """Return the input that the controller of a loop computes from a record's own r and y.
-
-    The controller's initial state is not in the record; it is chosen to reproduce the logged u best.
-    What then remains between the result and ``record.u`` is not the controller's: injected
-    pulses or dither, a channel logged late, another controller.
-
-    Parameters
-    ----------
-    loop : Loop
-        Loop with a digital controller.
-    record : Record
-        Record with a reference.
-
-    Returns
-    -------
-    ndarray, shape (n,)
-        Input at each sample [input unit].
-
-    Raises
-    ------
-    CtrlidError
-        If there is no digital controller, no reference, or the sampling periods differ.
-
-    Examples
-    --------
-    >>> import ctrlid as cid
-    >>> plant = cid.plants.servo(m=1.0, c=2.0, k=3.0)
-    >>> loop = cid.Loop(plant, cid.PID(kp=5.0, kd=0.1), dt=0.01)
-    >>> record = cid.simulate(loop, cid.random_binary(500, amplitude=0.1, hold=50, seed=1))
-    >>> bool(abs(cid.replay_controller(loop, record) - record.u).max() < 1e-12)
-    True
-    """
-    if abs(loop.dt - record.dt) > 1e-9 * loop.dt:
-        raise CtrlidError(f"the loop is sampled at {loop.dt:g} s, the record at {record.dt:g} s")
-    if record.r is None:
-        raise CtrlidError("the record has no reference r, which the controller needs")
-    run, start = _controller_run(loop, record.y, record.r)
-    replayed = np.asarray(run(start), float).ravel()
-    best = float(np.sum((replayed - record.u) ** 2))
-    state = casadi.MX.sym("state", start.size)
-    slope = casadi.Function("slope", [state], [casadi.jacobian(run(state), state)])
-    # Gauss-Newton: one step where the law is linear in its state, a few more around limits.
-    for _ in range(10 if start.size else 0):
-        jacobian = np.asarray(slope(start).full(), float)
-        start = start + np.linalg.lstsq(jacobian, record.u - replayed, rcond=1e-12)[0]
-        trial = np.asarray(run(start), float).ravel()
-        cost = float(np.sum((trial - record.u) ** 2))
-        if not cost < best:
-            break
-        replayed, best = trial, cost
-    return replayed
 
 
 def _first_bad(loop: Loop, states: Array, ys: Array, us: Array, w: Array) -> int | None:
@@ -507,8 +254,10 @@ def _why_left(loop: Loop, at: int, inside: bool, ys: Array, us: Array, w: Array)
             text + " The loop is open: an unstable plant cannot be simulated without its controller"
         )
     if growth > 0:
-        return text + (f" The closed loop is unstable: small deviations grow at {growth:.3g} 1/s. "
-                       "Check the sign and the gain of the controller and the operating point")  # fmt: skip
+        return (
+            f"{text} The closed loop is unstable: small deviations grow at {growth:.3g} 1/s. Check "
+            "the sign and the gain of the controller and the operating point"
+        )
     if np.any(recent <= lower) or np.any(recent >= upper):
         text += f" {inp} was at its limit ({lower:g}..{upper:g}) when control was lost."
     swing = np.max(np.abs(us[0, : good + 1] - op.input)) if good else 0.0

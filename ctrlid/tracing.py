@@ -52,7 +52,7 @@ class Symbol:
             "in one expression, np.array([a, b]), inside the function and use numpy's functions"
         )
 
-    __int__ = __index__ = __complex__ = __float__  # type: ignore[assignment]
+    __int__ = __index__ = __complex__ = __float__
 
     def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **kwargs: Any) -> Any:
         op = ELEMENTWISE.get(ufunc.__name__) or OPERATORS.get(ufunc.__name__)
@@ -211,7 +211,7 @@ def _elementwise(op: Function) -> Function:
     return apply
 
 
-class Symbols(np.ndarray):  # type: ignore[type-arg]
+class Symbols(np.ndarray):
     """An array of symbols that also compares and reduces element by element."""
 
     def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **kwargs: Any) -> Any:
@@ -234,7 +234,7 @@ def _boxed(value: Any) -> Any:
 
 
 def _or_original(symbolic: Function, original: Function) -> Function:
-    """The symbolic version where a symbol is among the arguments, else the original."""
+    """Choose the symbolic version where a symbol is among the arguments, else the original."""
 
     @functools.wraps(original, updated=())
     def call(*args: Any, **kwargs: Any) -> Any:
@@ -245,7 +245,7 @@ def _or_original(symbolic: Function, original: Function) -> Function:
 
 
 def _object_array(make: Function) -> Function:
-    """numpy's constructor with room for symbols, whatever number type was asked for."""
+    """Numpy's constructor with room for symbols, whatever number type was asked for."""
 
     @functools.wraps(make, updated=())
     def build(*args: Any, **kwargs: Any) -> Any:
@@ -303,7 +303,7 @@ class _Module:
 
 
 def _keeping_symbols(function: Function) -> Function:
-    """numpy's function, whose arrays of symbols stay arrays of symbols (hstack, diff, ...)."""
+    """Numpy's function, whose arrays of symbols stay arrays of symbols (hstack, diff, ...)."""
 
     @functools.wraps(function, updated=())
     def call(*args: Any, **kwargs: Any) -> Any:
@@ -341,7 +341,7 @@ def _numpy_table() -> dict[str, Any]:
     }
     for make in (np.zeros, np.ones, np.empty, np.full, np.array, np.asarray, np.zeros_like,
                  np.ones_like, np.empty_like, np.full_like, np.asanyarray):  # fmt: skip
-        table[make.__name__] = _object_array(make)
+        table[str(getattr(make, "__name__"))] = _object_array(make)  # noqa: B009
     for number in ("float64", "float32", "double"):
         table[number] = _or_original(_identity, getattr(np, number))
     table["interp"] = _or_original(
@@ -432,7 +432,7 @@ def rebind(function: Any, memo: dict[int, Any] | None = None) -> Any:
     if isinstance(function, types.MethodType):
         return types.MethodType(rebind(function.__func__, memo), _Instance(function.__self__))
     if not isinstance(function, types.FunctionType):
-        call = getattr(type(function), "__call__", None)
+        call = vars(type(function)).get("__call__")
         if isinstance(call, types.FunctionType):
             return types.MethodType(rebind(call, memo), _Instance(function))
         return function

@@ -15,7 +15,9 @@ from .loop import Loop
 from .physics import Array, timebase
 from .predictor import predict, predict_ahead
 from .residuals import Correlation, autocorrelation, cross_correlation, explained_share
-from .simulation import Simulator, controller_output, growth_rate
+from .replay import controller_output
+from .simulation import Simulator
+from .stepping import growth_rate
 
 SYSTEMATIC = 0.05  # share of an error that follows the signals and is worth a word
 

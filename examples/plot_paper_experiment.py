@@ -6,15 +6,15 @@ The paper's experiment
 excites the reference with a random binary sequence, logs 45 000 samples and finds that
 
 * plain least squares has no pole outside the unit circle (its equation (6)),
-* with the constraint ``a2 = 1, |a1| > 2`` the poles are reciprocal and nearly the same for different
-  portions of the data (its equation (8): ``1 - 2 z^-1 + z^-2``),
+* with the constraint ``a2 = 1, |a1| > 2`` the poles are reciprocal and nearly the same for
+  different portions of the data (its equation (8): ``1 - 2 z^-1 + z^-2``),
 * 5 ms is the best of the sampling periods tried, and faster sampling is worse.
 
-Here the experiment is repeated on the paper's equation (1), where the truth is known, with two kinds
-of noise: noise of the sensor, which goes round the loop, and noise of the data logger, which the
-controller never sees. All three findings come back. And one more shows: the equation (8) of the
+Here the experiment is repeated on the paper's equation (1), where the truth is known, with two
+kinds of noise: noise of the sensor, which goes round the loop, and noise of the data logger, which
+the controller never sees. All three findings come back. And one more shows: the equation (8) of the
 paper sits exactly on the bound ``|a1| = 2``, a double pole at z = 1. That is where the constrained
-fit ends when the data would rather leave the constraint, so it is a symptom to report, not a result.
+fit ends when the data would rather leave the constraint: a symptom to report, not a result.
 """
 
 from dataclasses import replace
@@ -64,7 +64,9 @@ def row(period, record):
     constraint = [cid.ReciprocalPoles()]
     free = cid.fit_arx(record, na=2, nb=2)
     tied = cid.fit_arx(record, na=2, nb=2, constraints=constraint)
-    parts = [cid.fit_arx(p, na=2, nb=2, constraints=constraint) for p in record.split(0.25, 0.5, 0.75)]
+    parts = [
+        cid.fit_arx(p, na=2, nb=2, constraints=constraint) for p in record.split(0.25, 0.5, 0.75)
+    ]
     return {
         "period": period,
         "free": free,
@@ -81,10 +83,10 @@ def table(title, rows):
         tied = line["tied"]
         largest = [float(np.max(np.abs(m.poles()))) for m in (line["free"], tied)]
         portions = f"{min(line['portions']):.4f} .. {max(line['portions']):.4f}"
+        bound = "YES" if tied.estimate.active else "no"
         print(
             f"  {1e3 * line['period']:6.1f}  {pole * line['period']:.3f}  {largest[0]:18.4f}   "
-            f"{largest[1]:14.4f}  {rate(tied):8.2f}  {'YES' if tied.estimate.active else 'no':>12}  "
-            f"{portions}"
+            f"{largest[1]:14.4f}  {rate(tied):8.2f}  {bound:>12}  {portions}"
         )
 
 
@@ -120,9 +122,23 @@ figure, axes = plt.subplots(figsize=(6.4, 3.6), layout="constrained")
 milliseconds = [1e3 * T for T in PERIODS]
 axes.axhline(pole, color="black", linewidth=1)
 axes.text(milliseconds[0], pole * 1.02, "physics", va="bottom")
-for rows, marker, label in ((in_loop, "o", "sensor noise 10 %"), (in_log, "s", "logger noise 30 %")):
-    axes.plot(milliseconds, [rate(line["tied"]) for line in rows], marker + "-", label=f"constrained, {label}")
-    axes.plot(milliseconds, [rate(line["free"]) for line in rows], marker + ":", label=f"plain, {label}", mfc="white")
+for rows, marker, label in (
+    (in_loop, "o", "sensor noise 10 %"),
+    (in_log, "s", "logger noise 30 %"),
+):
+    axes.plot(
+        milliseconds,
+        [rate(line["tied"]) for line in rows],
+        marker + "-",
+        label=f"constrained, {label}",
+    )
+    axes.plot(
+        milliseconds,
+        [rate(line["free"]) for line in rows],
+        marker + ":",
+        label=f"plain, {label}",
+        mfc="white",
+    )
 axes.set_xscale("log")
 axes.set_xticks(milliseconds, [f"{T:g}" for T in milliseconds])
 axes.minorticks_off()

@@ -117,7 +117,10 @@ def test_only_unreachable_or_unobservable_states_are_removed():
     turn = np.random.default_rng(0).standard_normal((3, 3))
     back = np.linalg.inv(turn)
     hidden = ct.ss(
-        turn @ np.diag([1, -2, -3]) @ back, turn @ [[1], [1], [0.0]], np.array([[1, 0, 1.0]]) @ back, 0
+        turn @ np.diag([1, -2, -3]) @ back,
+        turn @ [[1], [1], [0.0]],
+        np.array([[1, 0, 1.0]]) @ back,
+        0,
     )
     np.testing.assert_allclose(cid.linearize(hidden, at).poles(), [1.0], rtol=1e-9)
     static = ct.ss([[-1.0]], [[0.0]], [[1.0]], [[2.0]])
@@ -128,7 +131,7 @@ def test_what_linearize_refuses():
     plant = cid.plants.maglev(m=0.02, K=3e-6)
     with pytest.raises(CtrlidError, match="needs an OperatingPoint"):
         cid.linearize(plant, (0.01, 0.0))
-    with pytest.raises(CtrlidError, match="has 1 states .* maglev has 2: x, v"):
+    with pytest.raises(CtrlidError, match=r"has 1 states .* maglev has 2: x, v"):
         cid.linearize(plant, cid.OperatingPoint((0.01,), 3.0, 0.01))
     with pytest.raises(CtrlidError, match="has no derivative"):
         cid.linearize(plant, cid.OperatingPoint((-0.01, 0.0), 3.0, -0.01))

@@ -1,6 +1,6 @@
 """Simulation against tight-tolerance references, noise statistics, and failures in words.
 
-Groups: accuracy; signals (noise, d, initial states, limits); failures; other plants; the loop itself.
+Groups: accuracy; signals (noise, d, initial states, limits); failures; the loop itself.
 """
 
 import copy
@@ -13,7 +13,7 @@ from scipy.integrate import solve_ivp
 
 import ctrlid as cid
 from ctrlid import CtrlidError
-from ctrlid.simulation import growth_rate
+from ctrlid.stepping import growth_rate
 
 RNG = np.random.default_rng(5)
 CASES = [
@@ -238,12 +238,18 @@ POINT = cid.operating_point(MAGLEV, output=0.01)
         ({}, "sampling period dt > 0"),
         ({"dt": 0.01, "free": ("Kc",)}, r"free= names \['Kc'\].*\['m', 'K', 'g'\]"),
         ({"dt": 0.01, "at": (0.01, 0.0)}, "at= needs an OperatingPoint"),
-        ({"dt": 0.01, "at": cid.OperatingPoint((0.01,), 3, 0.01)}, "at= has 1 states, maglev has 2"),
+        (
+            {"dt": 0.01, "at": cid.OperatingPoint((0.01,), 3, 0.01)},
+            "at= has 1 states, maglev has 2",
+        ),
         ({"dt": 0.01, "input_limits": (3, 1)}, "needs lower < upper"),
         ({"dt": 0.01, "input_limits": 3}, "is a pair"),
         ({"dt": 0.01, "controller": "PID"}, "a controller is a TransferFunction"),
         ({"dt": 0.01, "controller": ct.tf([1], [1, 1], 0.02)}, "runs at 0.02 s, the loop at 0.01"),
-        ({"dt": 0.01, "controller": ct.tf([1, 0], [1])}, "no circuit and no program differentiates"),
+        (
+            {"dt": 0.01, "controller": ct.tf([1, 0], [1])},
+            "no circuit and no program differentiates",
+        ),
         ({"dt": 0.01, "controller": ct.ss(-np.eye(3), np.eye(3), np.ones((1, 3)), 0)}, "3 inputs"),
     ],
 )
@@ -255,14 +261,14 @@ def test_loop_refuses_what_does_not_fit(arguments, words):
 def test_loop_refuses_mixed_time_and_algebraic_loops():
     with pytest.raises(CtrlidError, match="analog controller cannot act on a plant in discrete"):
         cid.Loop(ct.tf([1], [1, -0.5], 0.1), ct.tf([1], [1, 1]), dt=0.1)
-    with pytest.raises(CtrlidError, match="the plant is sampled at 0.1 s, the loop at 0.2 s"):
+    with pytest.raises(CtrlidError, match=r"the plant is sampled at 0.1 s, the loop at 0.2 s"):
         cid.Loop(ct.tf([1], [1, -0.5], 0.1), dt=0.2)
     with pytest.raises(CtrlidError, match="passes its input to its output without delay"):
         cid.Loop(ct.tf([1, 0], [1, 1]), 0.5, dt=0.1)
 
 
 def test_loop_is_a_value_and_gives_its_plant_back():
-    loop, op = make(0.02, 0.01, 3.0)
+    loop, _ = make(0.02, 0.01, 3.0)
     assert loop.system() is loop.plant
     with pytest.raises(AttributeError):
         loop.dt = 1.0
@@ -282,11 +288,16 @@ def test_agrees_with_python_control_on_an_analog_loop():
     C = ct.ss(loop.controller, inputs="e", outputs="v", name="C")
     bias = ct.nlsys(None, lambda t, x, u, p: u[0] + op.input, inputs="v", outputs="V", name="bias")
     error = ct.summing_junction(["r", "-x"], "e", name="error")
-    whole = ct.interconnect([loop.plant, C, bias, error], inputs="r", outputs=["x", "V"], name="all")
+    whole = ct.interconnect(
+        [loop.plant, C, bias, error], inputs="r", outputs=["x", "V"], name="all"
+    )
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         response = ct.input_output_response(
-            whole, time, np.full(60, 1.005 * op.output), [*op.states, 0.0],
+            whole,
+            time,
+            np.full(60, 1.005 * op.output),
+            [*op.states, 0.0],
             solve_ivp_kwargs={"method": "DOP853", "rtol": 1e-10, "atol": 1e-13},
         )
     record = cid.simulate(loop, np.full(60, 1.005 * op.output))

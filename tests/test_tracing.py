@@ -54,7 +54,7 @@ def imported_names(t, x, u, params):
 def imported_inside(t, x, u, params):
     import math as m
 
-    import numpy
+    import numpy  # noqa: ICN001
 
     def shape(z):
         return numpy.tanh(z) * numpy.where(z > 0, 1.0, 2.0)

@@ -1,0 +1,72 @@
+"""The examples keep their promises: the paper's claims, and the two real levitations."""
+
+import importlib.util
+import runpy
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+
+
+@pytest.fixture(autouse=True)
+def _no_windows():
+    import matplotlib.pyplot as plt
+
+    mpl.use("Agg")
+    yield
+    plt.close("all")
+
+
+def test_the_papers_experiment(capsys):
+    """Equations (6) and (8), the portions and the sampling period, as the paper reports them."""
+    told = runpy.run_path(str(EXAMPLES / "plot_paper_experiment.py"))
+    truth = told["pole"]
+    by_period = {line["period"]: line for line in told["in_loop"]}
+    # Within the loop's noise: a reciprocal pair, nearly the same for different data portions.
+    best = by_period[0.005]
+    z = best["tied"].poles()
+    assert z[0] * z[1] == pytest.approx(1.0, abs=1e-12)
+    assert best["tied"].den[0][0][2] == 1.0
+    assert np.ptp(best["portions"]) < 0.02
+    assert not best["tied"].estimate.active
+    # Plain least squares under the logger's noise finds no pole outside the unit circle, as (6).
+    for line in told["in_log"][:3]:
+        assert np.abs(line["free"].poles()).max() < 1
+        np.testing.assert_array_equal(line["tied"].den[0][0], [1.0, -2.0, 1.0])  # as (8)
+    # Faster sampling is worse, and so is slower under an analog controller.
+    error = {T: abs(told["rate"](line["tied"]) - truth) for T, line in by_period.items()}
+    assert error[0.001] > error[0.002] > error[0.005] < error[0.010]
+    printed = capsys.readouterr().out
+    assert "SITS ON ITS BOUND" in printed
+    assert "NO POLE OUTSIDE THE UNIT CIRCLE" in printed
+
+
+@pytest.fixture
+def levitations(data_dir):
+    del data_dir
+    spec = importlib.util.spec_from_file_location("levitations", EXAMPLES / "real_levitations.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_inteco_needs_the_current(levitations, capsys):
+    """With the coil's current the pair is real and reciprocal, with the duty it is not."""
+    found = levitations.inteco()
+    assert 25 < found["step up, 12 mm", "current"] < 40.4
+    assert 35 < found["step down, 8 mm", "current"] < 50.4
+    assert found["step up, 12 mm", "duty"] == found["step down, 8 mm", "duty"] == 0.0
+    assert "ON THE BOUND" in capsys.readouterr().out
+
+
+def test_magnetoshield_needs_the_delay_and_the_lag(levitations):
+    """One sample of delay and two more poles: the same pair at all five set-points."""
+    found = levitations.magnetoshield()
+    fourth = [pair for (_, order), pair in found.items() if order == 4]
+    assert len(fourth) == 5
+    assert all(47 < pair < 53 for pair in fourth)
+    second = [pair for (_, order), pair in found.items() if order == 2]
+    assert np.ptp(second) > 15
