@@ -155,7 +155,7 @@ def _read_table(path: Path) -> tuple[dict[str, Any], list[str], Any]:
     body = text[stop:]
     if not body.strip():
         raise CtrlidError(f"{path} has no rows of numbers below its header")
-    if separator != "," and "," in body[: body.find("\n")]:
+    if separator != ",":
         body = body.replace(",", ".")  # decimal commas
     try:
         table = np.loadtxt(io.StringIO(body), delimiter=separator, ndmin=2, quotechar='"')
@@ -180,6 +180,53 @@ def _is_number(cell: str) -> bool:
     return True
 
 
+def _resolution(stamps: Any) -> float:
+    """Return the last decimal place that time stamps use, at least their round-off."""
+    finest = 4 * float(np.spacing(np.abs(stamps).max()))
+    for digits in range(13):
+        unit = 10.0**-digits
+        if unit <= finest:
+            break
+        if np.all(np.abs(stamps - np.round(stamps / unit) * unit) <= finest):
+            return unit
+    return finest
+
+
+def _even_period(stamps: Any, rounding: float, dt: float | None) -> float | None:
+    """Return the period of which stamps are rounded multiples, None if they are not.
+
+    A clock of 3.25 ms printed in whole milliseconds steps by 3 and 4 ms, and is regular.
+    """
+    n = len(stamps)
+    k = np.arange(n)
+
+    def fits(period: float, share: float = 1.01) -> bool:
+        return period > 0 and float(np.ptp(stamps - k * period)) <= share * rounding
+
+    finest = 4 * float(np.spacing(np.abs(stamps).max()))
+    mean = float(stamps[-1] - stamps[0]) / (n - 1)
+    if dt is None and mean > 0 and float(np.ptp(stamps - k * mean)) <= finest:
+        return period(stamps)
+    steps = np.diff(stamps)
+    base = float(np.median(steps)) if dt is None else dt
+    if not rounding <= mean or base <= 0:
+        return None
+    # Steps of 1, 1 and 2 units may also be lost samples, unless there are many, evenly spread.
+    longer = np.round(steps / base)
+    if np.all(np.abs(steps - longer * base) <= finest) and (
+        dt is not None or np.count_nonzero(longer > 1) < 5
+    ):
+        return None
+    if dt is not None:
+        return dt if fits(dt) else None
+    slope = float(np.polyfit(k / n, stamps - stamps[0], 1)[0]) / n
+    if not fits(slope, 1.25):
+        return None
+    # Of the periods that the stamps leave open, the one with the fewest digits.
+    short = (float(f"{slope:.{digits}g}") for digits in range(1, 16))
+    return next((p for p in short if fits(p) and abs(p - slope) <= rounding / n), slope)
+
+
 def period(stamps: Any) -> float:
     """Return the mean period of time stamps, with no digits that only round-off gave it."""
     mean = float(stamps[-1] - stamps[0]) / (len(stamps) - 1)
@@ -191,6 +238,10 @@ def _uniform(stamps: Any, dt: float | None, gaps: str, path: Path) -> tuple[floa
     """Return the period of time stamps and, for each uniform sample, its row."""
     if len(stamps) < 2 or not np.isfinite(stamps).all():
         raise CtrlidError(f"the time column of {path} needs at least 2 values, all finite")
+    rounding = _resolution(stamps)
+    even = _even_period(stamps, rounding, dt)
+    if even is not None:
+        return even, np.arange(len(stamps))
     steps = np.diff(stamps)
     back = np.flatnonzero(steps <= 0)
     if back.size:
@@ -218,8 +269,7 @@ def _uniform(stamps: Any, dt: float | None, gaps: str, path: Path) -> tuple[floa
             "gaps='mask' to fill them with the last values and mark them as not valid"
         )
     jitter = float(np.max(np.abs(steps - (missing + 1) * dt))) / dt
-    # Times long after zero cannot be written more finely than this.
-    if jitter > JITTER + 4 * float(np.spacing(np.abs(stamps).max())) / dt:
+    if jitter > JITTER + rounding / dt:
         warnings.warn(
             f"the times of {path} jitter by up to {100 * jitter:.2g} % of the period {dt:.4g} s; "
             "they are taken as uniform. If the samples really were taken unevenly, resample them "

@@ -12,11 +12,17 @@ from .errors import CtrlidError
 
 def read_response(response: Any, chosen: dict[str, str | None]) -> dict[str, Any]:
     """Return the fields of a record from a response; `chosen` maps r, u, y to labels or None."""
+    if not isinstance(response, ct.TimeResponseData):
+        raise CtrlidError(
+            "from_response takes a control.TimeResponseData, as forced_response and "
+            f"input_output_response return; given {type(response).__name__}"
+        )
     if response.ntraces > 1:
         raise CtrlidError(f"a record is one experiment; the response has {response.ntraces} "
                           "traces. Compute it for one input at a time")  # fmt: skip
-    inputs = _channels(response.input_labels, response.u, len(response.time))
-    outputs = _channels(response.output_labels, response.y, len(response.time))
+    n = len(response.time)
+    inputs = _channels("u", response.input_labels, response.u, n)
+    outputs = _channels("y", response.output_labels, response.y, n)
     for label in inputs.keys() & outputs.keys():
         if not np.array_equal(inputs[label], outputs[label]):
             raise CtrlidError(f"the response has an input and an output called {label!r} that "
@@ -77,7 +83,9 @@ def write_response(record: Any) -> Any:
     )  # fmt: skip
 
 
-def _channels(labels: Any, values: Any, n: int) -> dict[str, Any]:
+def _channels(kind: str, labels: Any, values: Any, n: int) -> dict[str, Any]:
     if values is None:
         return {}
-    return dict(zip(labels, np.reshape(values, (-1, n)), strict=True))
+    rows = np.reshape(values, (-1, n))
+    names = labels or ([kind] if len(rows) == 1 else [f"{kind}[{k}]" for k in range(len(rows))])
+    return dict(zip(names, rows, strict=True))

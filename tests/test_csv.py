@@ -1,0 +1,244 @@
+"""CSV files: exact round trips, files that other tools write, and clocks that are not regular."""
+
+import warnings
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import strategies as st
+
+from ctrlid import CtrlidError, CtrlidWarning, Record
+
+WORDS = st.text(
+    st.characters(codec="utf-8", exclude_categories=["C", "Z"], exclude_characters="[]()"),
+    min_size=1, max_size=8,
+)  # fmt: skip
+NUMBERS = st.floats(allow_nan=False, allow_infinity=False)
+
+
+@st.composite
+def records(draw):
+    n = draw(st.integers(2, 12))
+    column = st.lists(NUMBERS, min_size=n, max_size=n)
+    taken = {"r", "u", "y", "t", "time", "valid"}
+    names = draw(st.lists(WORDS.filter(lambda w: w.lower() not in taken), max_size=3, unique=True))
+    has_r = draw(st.booleans())
+    labels = [*(["r"] if has_r else []), "u", "y"]
+    return Record(
+        r=draw(column) if has_r else None, u=draw(column), y=draw(column),
+        dt=draw(st.floats(1e-9, 1e6)), start=draw(st.floats(-1e6, 1e6)),
+        hold=draw(st.sampled_from(["zoh", "foh"])), extra={k: draw(column) for k in names},
+        valid=draw(st.lists(st.booleans(), min_size=n, max_size=n)),
+        names={k: draw(st.text(max_size=8)) for k in labels if draw(st.booleans())},
+        units={k: draw(WORDS) for k in [*labels, *names] if draw(st.booleans())},
+        name=draw(st.text(max_size=10)),
+    )  # fmt: skip
+
+
+@settings(
+    deadline=None,
+    max_examples=150,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+)
+@given(record=records())
+def test_round_trip_is_exact(tmp_path, record):
+    assume(np.all(np.diff(record.t) > 0))  # else a clock beyond its digits
+    path = tmp_path / "r.csv"
+    record.to_csv(path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CtrlidWarning)  # a clock with few digits left
+        twin = Record.from_csv(path)
+    for key in ("r", "u", "y", "valid"):
+        np.testing.assert_array_equal(getattr(twin, key), getattr(record, key))
+    for key in ("dt", "start", "hold", "name", "names", "units"):
+        assert getattr(twin, key) == getattr(record, key), key
+    assert list(twin.extra) == list(record.extra)
+    for key, values in record.extra.items():
+        np.testing.assert_array_equal(twin.extra[key], values)
+
+
+def write(tmp_path, text, name="log.csv", **options):
+    path = tmp_path / name
+    path.write_bytes(text if isinstance(text, bytes) else text.encode("utf-8"))
+    return Record.from_csv(path, **options)
+
+
+ROWS = "0,1,2,3\n0.1,4,5,6\n0.2,7,8,9\n"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "t,r,u,y\n" + ROWS,
+        "t;r;u;y\n" + ROWS.replace(",", ";"),
+        "t;r;u;y\n" + ROWS.replace(",", ";").replace("0.", "0,"),  # decimal commas
+        "t\tr\tu\ty\n" + ROWS.replace(",", "\t"),
+        "\ufefft,r,u,y\n" + ROWS,
+        "t, r, u, y\r\n" + ROWS.replace("\n", "\r\n"),
+        '"t","r","u","y"\n' + ROWS,
+        "# a log of mine\n# dt = fast\n\nt,r,u,y\n" + ROWS + "\n",
+        "# t,r,u,y\n" + ROWS,  # as numpy.savetxt writes it
+        "Time,r,u,y\n" + ROWS.rstrip("\n"),
+        "time [ms],r,u,y\n0,1,2,3\n100,4,5,6\n200,7,8,9\n",
+        "t (s),r,u,y\n" + ROWS,
+    ],
+)
+def test_files_of_other_tools(tmp_path, text):
+    record = write(tmp_path, text)
+    assert record.dt == pytest.approx(0.1, rel=1e-12)
+    np.testing.assert_array_equal(record.r, [1, 4, 7])
+    np.testing.assert_array_equal(record.u, [2, 5, 8])
+    np.testing.assert_array_equal(record.y, [3, 6, 9])
+    assert (record.name, record.hold, record.start) == ("log", "zoh", 0.0)
+    assert record.valid.all()
+
+
+def test_columns_by_name_with_units_and_old_encodings(tmp_path):
+    text = "t [s],Soll [µm],Spannung [V],Weg [µm],Strom [A]\n5,1,2,3,4\n5.5,1,2,3,5\n"
+    record = write(tmp_path, text.encode("cp1252"), u="Spannung", y="Weg", r="Soll",
+                   extra=["Strom"], hold="foh", name="mine", units={"y": "m"})  # fmt: skip
+    assert dict(record.units) == {"u": "V", "y": "m", "r": "µm", "Strom": "A"}
+    assert dict(record.names) == {"u": "Spannung", "y": "Weg", "r": "Soll"}
+    assert (record.hold, record.name, record.start, record.dt) == ("foh", "mine", 5.0, 0.5)
+    np.testing.assert_array_equal(record.extra["Strom"], [4, 5])
+    single = write(tmp_path, text, u="Spannung", y="Weg", extra="Strom")
+    assert list(single.extra) == ["Strom"]
+    assert single.r is None
+
+
+def test_dt_without_a_time_column_and_a_valid_column(tmp_path):
+    record = write(tmp_path, "u,y,valid\n1,2,1\n3,4,0\n5,6,1\n", dt=0.02)
+    assert record.dt == 0.02
+    np.testing.assert_array_equal(record.valid, [True, False, True])
+
+
+@pytest.mark.parametrize(
+    ("text", "options", "words"),
+    [
+        ("t,u\n" + "0,1\n1,2\n", {}, "has no column 'y' for y; its columns are t, u. .* with y="),
+        ("t,u,u,y\n" + ROWS, {}, "has several columns 'u' for u"),
+        ("0,1,2\n1,2,3\n", {}, "has no header line: its first line is '0,1,2'. Add one"),
+        ("t,u,y\n0,1,2\n1,x,3\n", {}, "is not a table of numbers: .*'x'"),
+        ("t,u,y\n0,1,2\n1,,3\n", {}, "is not a table of numbers"),
+        ("t,u,y\n0,1,2\n1,3\n", {}, "is not a table of numbers"),
+        ("t,u,y\n0,1,2,9\n1,3,3,9\n", {}, "names 3 columns, its rows have 4; give every column"),
+        ("t,u,y\n", {}, "has no rows of numbers below its header"),
+        ("", {}, "has no header line"),
+        ("u,y\n1,2\n3,4\n", {}, r"has no time column \(t, time, .*\); its columns are u, y. Give"),
+        ("t,u,y\n0,1,2\n1,3,4\n", {"time": "clock"}, "no column 'clock' for time"),
+        ("t,u,y\n0,1,2\n1,3,4\n", {"extra": ["i"]}, "no column 'i' for extra"),
+        ("t,u,y\n0,1,2\n1,3,4\n", {"gaps": "fill"}, "gaps must be 'error' or 'mask'; given 'fill'"),
+        ("t [days],u,y\n0,1,2\n1,3,4\n", {}, "is in 'days'; known units are s, .* give dt="),
+        ("t,u,y\n0,1,2\n", {}, "needs at least 2 values, all finite"),
+        ("t,u,y\n0,1,2\nnan,3,4\n", {}, "needs at least 2 values, all finite"),
+        ("t,u,y\n0,1,2\n1,nan,4\n", {}, "u must be finite; 1 of 2"),
+        ("t,u,y\n0,1,2\n2,3,4\n1,3,4\n", {},
+         "does not increase: 2 s in row 2 of the data is followed by 1 s. Sort the rows"),
+        ("t,u,y\n0,1,2\n0,3,4\n1,3,4\n", {}, "does not increase: 0 s in row 1"),
+        ("t,u,y\n0,1,2\n1,3,4\n2,5,6\n", {"dt": 0.001}, "steps by 1 s, but dt is 0.001 s"),
+        ('# ctrlid {"dt": \nt,u,y\n0,1,2\n', {}, "is damaged: .*. Restore or remove it"),
+    ],
+)  # fmt: skip
+def test_refusals(tmp_path, text, options, words):
+    with pytest.raises(CtrlidError, match=words):
+        write(tmp_path, text, **options)
+
+
+def test_a_missing_file_and_names_that_break_a_header(tmp_path):
+    with pytest.raises(CtrlidError, match=r"cannot read .*nothing.csv: No such file"):
+        Record.from_csv(tmp_path / "nothing.csv")
+    record = Record(u=[1, 2], y=[3, 4], dt=1.0, extra={"a ": [1, 2]})
+    with pytest.raises(CtrlidError, match="would not be read back as it is: remove brackets"):
+        record.to_csv(tmp_path / "x.csv")
+
+
+def clock(tmp_path, stamps, digits=None, **options):
+    def shown(t):
+        return repr(float(t)) if digits is None else f"{t:.{digits}f}"
+
+    rows = "".join(f"{shown(t)},{k},{2 * k}\n" for k, t in enumerate(stamps))
+    return write(tmp_path, "t,u,y\n" + rows, **options)
+
+
+@pytest.mark.parametrize("start", [0.0, 17.3, 1.7e9])
+@pytest.mark.parametrize("dt", [1e-3, 3.25e-3, 0.1, 1 / 3])
+def test_a_regular_clock_is_read_exactly_and_quietly(tmp_path, start, dt):
+    record = clock(tmp_path, start + dt * np.arange(2000))
+    assert record.dt == pytest.approx(dt, rel=1e-12 if start < 100 else 2e-6 * 0.01 / dt)
+    assert record.start == start
+
+
+@pytest.mark.parametrize("n", [30, 1500])
+@pytest.mark.parametrize(("dt", "digits"), [(3.25e-3, 3), (1.5e-3, 3), (0.0125, 2), (1 / 3, 2)])
+def test_rounded_times_are_a_regular_clock(tmp_path, dt, digits, n):
+    record = clock(tmp_path, dt * np.arange(n), digits)
+    assert len(record) == n
+    # What the first and the last stamp leave open.
+    assert record.dt == pytest.approx(dt, abs=1.1 * 10.0**-digits / (n - 1))
+    if n == 1500 and dt != 1 / 3:
+        assert record.dt == dt
+    floor = np.floor(dt * np.arange(n) * 10**digits) / 10**digits
+    assert clock(tmp_path, floor, digits).dt == pytest.approx(dt, abs=1.1 * 10.0**-digits / (n - 1))
+
+
+def test_a_short_clock_keeps_its_digits(tmp_path):
+    assert clock(tmp_path, [0, 11]).dt == 11
+    assert clock(tmp_path, [0, 0.26]).dt == 0.26
+    assert clock(tmp_path, [0, 0.003, 0.007]).dt == pytest.approx(0.0035)
+
+
+def test_a_given_period_is_kept_where_the_times_agree(tmp_path):
+    assert clock(tmp_path, 3.25e-3 * np.arange(100), 3, dt=3.25e-3).dt == 3.25e-3
+    with pytest.raises(CtrlidError, match=r"but dt is 0.0033 s|lacks"):
+        clock(tmp_path, 1e-3 * np.arange(100), dt=3.3e-3)
+
+
+def test_jitter_warns_with_its_size(tmp_path):
+    t = 0.01 * np.arange(200)
+    t[50] += 0.002
+    with pytest.warns(CtrlidWarning, match=r"jitter by up to 20 % of the period 0.01 s") as caught:
+        record = clock(tmp_path, t)
+    assert caught[0].filename == __file__
+    assert record.dt == pytest.approx(0.01)
+    t[50] -= 0.00199  # 0.1 %: any clock
+    clock(tmp_path, t)
+
+
+def test_gaps_are_refused_with_place_and_length(tmp_path):
+    t = np.delete(0.01 * np.arange(100), [20, 21, 22, 60])
+    with pytest.raises(CtrlidError) as refusal:
+        clock(tmp_path, t)
+    text = str(refusal.value)
+    assert "lacks 4 samples in 2 places; the longest gap has 3" in text
+    assert "0.04 s after t = 0.19 s, at a period of 0.01 s" in text
+    assert "gaps='mask'" in text
+    with pytest.raises(CtrlidError, match="lacks 1 samples in one place"):
+        clock(tmp_path, np.delete(0.01 * np.arange(100), 50), 2)
+    with pytest.raises(CtrlidError, match="lacks 1 samples in one place"):
+        clock(tmp_path, np.delete(0.01 * np.arange(100), 50), 2, dt=0.01)
+    rounded = np.delete(3.25e-3 * np.arange(400), 100)
+    with pytest.raises(CtrlidError, match="lacks 1 samples in one place"):
+        clock(tmp_path, rounded, 3)
+
+
+def test_masked_gaps_keep_all_data(tmp_path):
+    every = np.arange(100)
+    kept = np.delete(every, [20, 21, 22, 60])
+    record = clock(tmp_path, 0.01 * kept, gaps="mask")
+    assert len(record) == 100
+    np.testing.assert_array_equal(np.flatnonzero(~record.valid), [20, 21, 22, 60])
+    np.testing.assert_array_equal(record.u[record.valid], np.arange(96))
+    assert record.u[21] == record.u[19]
+    np.testing.assert_allclose(record.t[record.valid], 0.01 * kept, atol=1e-9)
+    assert record.segments() == [(0, 20), (23, 60), (61, 100)]
+
+
+def test_a_long_record(tmp_path):
+    n = 1_000_000
+    rng = np.random.default_rng(0)
+    record = Record(u=rng.standard_normal(n), y=rng.standard_normal(n), dt=1e-3)
+    record.to_csv(tmp_path / "long.csv")
+    twin = Record.from_csv(tmp_path / "long.csv")
+    np.testing.assert_array_equal(twin.u, record.u)
+    np.testing.assert_array_equal(twin.y, record.y)
+    assert twin.dt == 1e-3
