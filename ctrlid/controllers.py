@@ -8,6 +8,7 @@ rule for its next value (or its rate) and the input it applies, in absolute phys
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from numbers import Real
 from typing import Any, Literal, get_args
 
 import casadi
@@ -96,9 +97,12 @@ class PID:
     def __post_init__(self) -> None:
         for name in ("kp", "ki", "kd", "b", "c", "filter_time", "bias", "tracking_time"):
             value = getattr(self, name)
-            if value is not None and not np.isfinite(value):
-                raise CtrlidError(f"PID needs a finite {name}; given {value!r}")
-        if not self.lower < self.upper:
+            if value is None and name in ("bias", "tracking_time"):
+                continue
+            if not isinstance(value, Real) or not np.isfinite(float(value)):
+                raise CtrlidError(f"PID needs a finite number as {name}; given {value!r}")
+        limits = (self.lower, self.upper)
+        if not all(isinstance(limit, Real) for limit in limits) or not self.lower < self.upper:
             raise CtrlidError(
                 f"PID needs lower < upper; given lower={self.lower}, upper={self.upper}"
             )
@@ -112,10 +116,10 @@ class PID:
         if self.derivative == "measurement" and self.c not in (0.0, 1.0):
             raise CtrlidError(f"derivative='measurement' means c=0; given c={self.c}")
         if self.anti_windup == "back-calculation":
-            tracking = (
-                self.tracking_time if self.ki == 0 or self.tracking_time else self.kp / self.ki
-            )
-            if tracking is None or tracking <= 0:
+            tracking = self.tracking_time
+            if tracking is None and self.ki:
+                tracking = self.kp / self.ki
+            if self.ki and (tracking is None or tracking <= 0):
                 raise CtrlidError("back-calculation needs tracking_time > 0 s; given "
                                   f"tracking_time={self.tracking_time} with kp={self.kp}, "
                                   f"ki={self.ki}")  # fmt: skip
@@ -261,7 +265,7 @@ def _pid_law(pid: PID, at: OperatingPoint, dt: float) -> ControlLaw:
             )
             step = casadi.if_else(outward, 0.0, step)
         elif pid.anti_windup == "back-calculation":
-            tracking = pid.tracking_time or (pid.kp / pid.ki if pid.ki else 1.0)
+            tracking = pid.tracking_time or (pid.kp / pid.ki if pid.ki else math.inf)
             step = step + dt / tracking * (u - wish)
         return u, casadi.vertcat(integral + step, error, difference, slope)
 
