@@ -302,13 +302,14 @@ def test_with_output():
     assert swapped.units["gap"] == "m"
 
 
-def test_unnamed_signals_move_under_plain_words():
-    record = make(extra={"current": np.ones(N)})
+@pytest.mark.parametrize("names", [{}, {"u": "u", "y": "y"}])
+def test_unnamed_signals_move_under_plain_words(names):
+    record = make(extra={"current": np.ones(N)}, names=names)
     assert list(record.with_input("current").extra) == ["input"]
     assert list(record.with_output("current").extra) == ["output"]
 
 
-@pytest.mark.parametrize("old", ["x[0]", "y"])
+@pytest.mark.parametrize("old", ["x[0]", "y", "valid"])
 def test_nothing_is_overwritten(old):
     record = full(names={"u": old})
     words = r"the old u would move to the extra channels as .* taken; name it otherwise with names="
@@ -352,6 +353,8 @@ def test_without_filter_a_fast_sine_folds_down():
     np.testing.assert_array_equal(slow.y, y[::2])
     np.testing.assert_array_equal(slow.valid, record.valid[::2])
     np.testing.assert_array_equal(slow.t, record.t[::2])
+    # Filtered, an input runs smoothly between the samples; taken as it is, nobody knows.
+    assert (slow.hold, record.decimate(2).hold) == ("zoh", "foh")
 
 
 @given(level=st.floats(-1e6, 1e6), q=st.integers(2, 12))

@@ -6,6 +6,7 @@ import logging
 import numpy as np
 import pooch
 import pytest
+from scipy import io
 
 import ctrlid as cid
 from ctrlid import datasets
@@ -198,16 +199,14 @@ def test_another_file_in_the_folder_is_refused(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("folder", [None, "empty"])
-def test_a_file_not_in_the_folder_is_fetched_silently(
-    data_dir, tmp_path, monkeypatch, folder, capfd
-):
-    file = data_dir / "tanks" / "dataBenchmark.mat"
-    if not file.is_file():
-        pytest.skip(f"needs the measured file {file}")
+def test_a_file_not_in_the_folder_is_fetched_silently(tmp_path, monkeypatch, folder, capfd):
+    column = np.linspace(1, 10, 1024)[:, None]
+    file = tmp_path / "fetched.mat"
+    io.savemat(file, {"uVal": column, "yVal": column, "Ts": 4.0})
     if folder:
         monkeypatch.setenv("CTRLID_DATA_DIR", str(tmp_path))
     else:
-        monkeypatch.delenv("CTRLID_DATA_DIR")
+        monkeypatch.delenv("CTRLID_DATA_DIR", raising=False)
     asked = []
 
     def retrieve(url, known_hash, path, progressbar):
