@@ -100,7 +100,7 @@ def operating_point(
     >>> plant = cid.plants.maglev(m=0.0213, K=3.34e-6, g=9.81)
     >>> op = cid.operating_point(plant, output=0.012)
     >>> op.states, round(op.input, 6)
-    ((0.012, 0.0), 3.001483)
+    ((0.012, 0.0), 3.001458)
     """
     equations = trace(plant)
     require_siso(equations)
@@ -198,7 +198,7 @@ def _solve_equilibrium(
                 if np.abs(correction / scale).max() <= (1 - damping / 4) * size:
                     break
         z, jac = z - damping * step, next_jac
-    z = np.where(np.abs(z) < 1e-12 * np.abs(z).max(), 0.0, z)  # what is at rest is at rest exactly
+    z = np.where(np.abs(z) < max(1e-12 * np.abs(z).max(), 1e-20), 0.0, z)  # what is at rest is at rest exactly
     f, jac = evaluate(z)
     if not np.isfinite(f).all():
         return None, np.inf
@@ -268,8 +268,8 @@ def linearize(plant: Any, at: OperatingPoint) -> Any:
     >>> import ctrlid as cid
     >>> plant = cid.plants.maglev(m=0.0213, K=3.34e-6, g=9.81)
     >>> P = cid.linearize(plant, cid.operating_point(plant, output=0.012))
-    >>> P.den[0][0].round(6)
-    array([    1.,     0., -1635.])
+    >>> P.den[0][0].round(6).tolist()
+    [1.0, 0.0, -1635.0]
     """
     if not isinstance(at, OperatingPoint):
         raise CtrlidError(

@@ -252,7 +252,7 @@ def _checked(system: Any, equations: Equations) -> Equations:
     """Compare the traced equations with the Python functions at random points."""
     rng = np.random.default_rng(20090317)
     n, m = len(equations.states), len(equations.inputs)
-    found = 0
+    found, failure = 0, ""
     for trial in range(6 * CHECKS):
         if found >= CHECKS:
             break
@@ -265,7 +265,8 @@ def _checked(system: Any, equations: Equations) -> Equations:
         values = equations.values * rng.uniform(0.8, 1.25, len(equations.parameters))
         params = dict(zip(equations.parameters, values.tolist(), strict=True))
         expected = _python_values(system, t, x, u, params)
-        if expected is None:
+        if isinstance(expected, str):
+            failure = f" (it says: {expected})"
             continue
         traced = np.concatenate(equations.evaluate(x, u, t, values))
         good = np.isfinite(expected)
@@ -287,7 +288,7 @@ def _checked(system: Any, equations: Equations) -> Equations:
     if not found:
         raise TracingError(
             f"the Python function of {system.name} gave no finite value at {6 * CHECKS} random "
-            "points, so the traced equations cannot be checked; see that it is defined for "
+            f"points{failure}, so the traced equations cannot be checked; see that it works for "
             "states between 1e-4 and 1e3"
         )
     return equations
@@ -297,17 +298,17 @@ def _size(values: Array) -> float:
     return float(np.max(np.abs(values), initial=0.0)) * 1e-3
 
 
-def _python_values(system: Any, t: float, x: Array, u: Array, params: Any) -> Array | None:
+def _python_values(system: Any, t: float, x: Array, u: Array, params: Any) -> Array | str:
     try:
         with np.errstate(all="ignore"):
             given = () if isinstance(system, ct.StateSpace) else (params,)
             rhs = system.dynamics(t, x, u, *given) if system.nstates else np.empty(0)
             out = system.output(t, x, u, *given)
         values = np.concatenate([np.ravel(rhs), np.ravel(out)])
-    except (ArithmeticError, ValueError):
-        return None  # outside the domain, as math.sqrt says it
+    except (ArithmeticError, ValueError) as reason:
+        return str(reason)  # outside the domain, as math.sqrt says it
     if np.iscomplexobj(values):
-        return None
+        return "the values are complex"
     return np.asarray(values, dtype=float)
 
 

@@ -181,34 +181,36 @@ class Simulator:
         substeps, size = 1, min(CHUNK, n)
         worst, where = 0.0, 0
         for first in range(0, n, size):
-            block = w[:, first : first + size]
-            count = block.shape[1]
-            if count < size:
-                block = np.hstack([block, np.repeat(block[:, -1:], size - count, axis=1)])
+            count = min(size, n - first)
+            # The last chunk is filled up with its last column, so that one function serves all.
+            block = w[:, np.minimum(np.arange(first, first + size), n - 1)]
             previous_stop: int | None = None
             while True:
                 results = self._runner(substeps, size)(z, block)
                 states, ys, us, errors = (np.asarray(a, float)[:, :count] for a in results)
                 stop = _first_bad(loop, states, ys, us, w)
+                good = count if stop is None else max(stop - 1, 0)
+                travel = np.max(np.abs(states[:, :good] - start[:, None]), axis=1, initial=0.0)
+                moved = np.maximum(reach, travel)
+                largest = np.max(errors[:, :good], axis=1, initial=0.0)
                 with np.errstate(all="ignore"):
-                    moved = np.maximum(reach, np.max(np.abs(states - start[:, None]), axis=1))
-                    relative = float(np.max(np.where(errors > 0, errors / moved[:, None], 0.0)))
-                fine = stop is None and relative <= TOLERANCE
-                if fine or substeps >= MOST_SUBSTEPS:
+                    error = float(np.max(np.where(largest > 0, largest / moved, 0.0)))
+                if (stop is None and error <= TOLERANCE) or substeps >= MOST_SUBSTEPS:
                     break
-                if stop is not None and stop == previous_stop:
-                    break  # finer steps leave at the same sample: it is the loop that leaves
+                if stop is not None and stop == previous_stop and good and error <= COARSE:
+                    break  # accurate until then, and finer steps leave at the same sample
                 previous_stop = stop
                 substeps *= 2
             if stop is not None:
                 inside = bool(np.isfinite(states[:, stop]).all())
-                raise CtrlidError(_why_left(loop, first + stop, inside, ys[:, : stop + 1],
-                                            us[:, : stop + 1], w))  # fmt: skip
-            if relative > worst:
-                worst, where = relative, first
+                raise CtrlidError(
+                    _why_left(loop, first + stop, inside, ys[:, : stop + 1], us[:, : stop + 1], w)
+                )
+            if error > worst:
+                worst, where = error, first
             y[first : first + count], u[first : first + count] = ys[0], us[0]
             z, reach = states[:, -1], moved
-            if relative < TOLERANCE / 1e4 and substeps > 1:
+            if error < TOLERANCE / 1e4 and substeps > 1:
                 substeps //= 2
         if worst > COARSE:
             warnings.warn(
