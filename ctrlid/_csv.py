@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ._text import split_unit, with_unit
+from ._text import shortest, split_unit, with_unit
 from .errors import CtrlidError, CtrlidWarning
 
 TIME = ("t", "time", "timestamp", "seconds")
@@ -230,8 +230,7 @@ def _even_period(stamps: Any, rounding: float, dt: float | None) -> float | None
 def period(stamps: Any) -> float:
     """Return the mean period of time stamps, with no digits that only round-off gave it."""
     mean = float(stamps[-1] - stamps[0]) / (len(stamps) - 1)
-    short = float(f"{mean:.12g}")
-    return short if abs(short - mean) <= 4 * np.spacing(np.abs(stamps).max()) else mean
+    return shortest(mean, 4 * float(np.spacing(np.abs(stamps).max())))
 
 
 def _uniform(stamps: Any, dt: float | None, gaps: str, path: Path) -> tuple[float, Any]:

@@ -58,6 +58,30 @@ def with_error(value: complex, error: float) -> str:
     return f"({text})e{exponent:+03d}" if exponent else text
 
 
+def shortest(value: float, error: float) -> float:
+    """Return the number without the digits that only round-off gave it.
+
+    Parameters
+    ----------
+    value : float
+        The number.
+    error : float
+        How far off round-off may have put it.
+
+    Returns
+    -------
+    float
+        The number of at most 12 digits within the error, or the number itself.
+
+    Examples
+    --------
+    >>> shortest(0.1 + 0.2, 1e-15), shortest(1 / 3, 1e-15)
+    (0.3, 0.3333333333333333)
+    """
+    short = float(f"{value:.12g}")
+    return short if abs(short - value) <= error else value
+
+
 def listing(items: list[str] | tuple[str, ...]) -> str:
     """Join items as in ``a, b and c``."""
     items = list(items)
