@@ -104,9 +104,9 @@ def operating_point(
     """
     equations = trace(plant)
     require_siso(equations)
-    target = float(output)
-    if not np.isfinite(target):
+    if not (isinstance(output, int | float | np.number) and np.isfinite(output)):
         raise CtrlidError(f"output must be a finite number; given {output!r}")
+    target = float(output)
     n = len(equations.states)
     residual = equations.rhs - equations.x if equations.dt else equations.rhs
     z = casadi.vertcat(equations.x, equations.u)
@@ -198,7 +198,9 @@ def _solve_equilibrium(
                 if np.abs(correction / scale).max() <= (1 - damping / 4) * size:
                     break
         z, jac = z - damping * step, next_jac
-    z = np.where(np.abs(z) < max(1e-12 * np.abs(z).max(), 1e-20), 0.0, z)  # what is at rest is at rest exactly
+    z = np.where(
+        np.abs(z) < max(1e-12 * np.abs(z).max(), 1e-20), 0.0, z
+    )  # what is at rest is at rest exactly
     f, jac = evaluate(z)
     if not np.isfinite(f).all():
         return None, np.inf

@@ -76,6 +76,10 @@ def simulate(
     >>> len(cid.simulate(loop, r, sensor_noise=2e-6, seed=2))
     2000
     """
+    if not isinstance(loop, Loop):
+        raise CtrlidError(
+            f"simulate needs a Loop(plant, controller, dt=..., at=...); given {type(loop).__name__}"
+        )
     r, d = _signals(loop, r, d)
     noise = _noise(loop, d.size, sensor_noise, force_noise, seed)
     simulator = Simulator(loop)
@@ -92,7 +96,10 @@ def _signals(loop: Loop, r: Any, d: Any) -> tuple[Array | None, Array]:
     for name, value in (("r", r), ("d", d)):
         if value is None:
             continue
-        array = np.asarray(value, dtype=float)
+        try:
+            array = np.asarray(value, dtype=float)
+        except (TypeError, ValueError) as reason:
+            raise CtrlidError(f"simulate needs {name} as an array of numbers; {reason}") from reason
         if array.ndim != 1 or array.size < 2 or not np.isfinite(array).all():
             raise CtrlidError(
                 f"simulate needs {name} as a one-dimensional array of at least 2 finite numbers, "
@@ -115,7 +122,8 @@ def _signals(loop: Loop, r: Any, d: Any) -> tuple[Array | None, Array]:
 
 def _noise(loop: Loop, n: int, sensor: float, force: float, seed: int | None) -> list[Array]:
     for name, value in (("sensor_noise", sensor), ("force_noise", force)):
-        if not (np.ndim(value) == 0 and np.isfinite(value) and value >= 0):
+        number = isinstance(value, int | float | np.number)
+        if not (number and np.isfinite(value) and value >= 0):
             raise CtrlidError(f"{name} is a standard deviation >= 0; given {value!r}")
     if force and not loop.equations().velocities:
         raise CtrlidError(
@@ -142,6 +150,12 @@ class Simulator:
         self.plant_states = first.plant_states
         self.rest: Array = np.array(first.rest, dtype=float)
         self._runners: dict[tuple[int, int], Any] = {}
+        e = loop.equations()
+        if not np.isfinite(e.evaluate(first.rest[: len(e.states)], loop.point.input)[0]).all():
+            raise CtrlidError(
+                f"{e.name} is not defined at the operating point {loop.point}; give "
+                "at=operating_point(plant, output=...)"
+            )
         # What a millionth of the operating values does to each state: smaller motion is rest.
         a, b = (np.nan_to_num(np.abs(m)) for m in sensitivity(first, loop.point.output))
         self._floor = 1e-6 * (a @ np.abs(self.rest) + b[:, 2] * abs(loop.point.input))

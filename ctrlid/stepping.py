@@ -8,6 +8,7 @@ import casadi
 import numpy as np
 from scipy.integrate import DOP853
 
+from .errors import CtrlidError
 from .loop import Loop
 from .physics import Array
 
@@ -159,7 +160,17 @@ def growth_rate(loop: Loop) -> float:
     -------
     float
         The rate; minus infinity for a loop that is at rest after one period.
+
+    Raises
+    ------
+    CtrlidError
+        If the plant has no derivative at the operating point.
     """
     matrix = sensitivity(stepper(loop, 8), loop.point.output)[0]
+    if not np.isfinite(matrix).all():
+        raise CtrlidError(
+            f"{loop.equations().name} has no derivative at its operating point {loop.point}; "
+            "give at=operating_point(plant, output=...)"
+        )
     largest = np.max(np.abs(np.linalg.eigvals(matrix)), initial=0.0)
     return float(np.log(largest) / loop.dt) if largest > 0 else -math.inf

@@ -63,6 +63,7 @@ def test_servo_keeps_its_pole_at_the_origin():
         (cid.plants.maglev(m=0.02, K=3e-6), 0.0, "no states and input V hold it there"),
         (cid.plants.tank(area=0.01, outlet=1e-5, k=1e-5), -0.2, "inside the plant's range"),
         (cid.plants.maglev(m=0.02, K=3e-6), np.nan, "output must be a finite number"),
+        (cid.plants.maglev(m=0.02, K=3e-6), "high", "output must be a finite number; given 'high'"),
     ],
 )
 def test_unreachable_outputs_are_refused(plant, output, words):

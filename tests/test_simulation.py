@@ -212,6 +212,17 @@ def test_a_plant_too_sharp_to_integrate_warns():
         (lambda loop: cid.simulate(loop, [0.01, np.nan]), "with 1 not finite"),
         (lambda loop: cid.simulate(loop, np.ones(5), d=np.ones(4)), "equally long; given"),
         (lambda loop: cid.simulate(loop, np.ones(5), sensor_noise=-1), "standard deviation >= 0"),
+        (lambda loop: cid.simulate(loop, np.ones(5), force_noise="x"), "force_noise is a standard"),
+        (lambda loop: cid.simulate(loop, "abc"), "needs r as an array of numbers"),
+        (
+            lambda loop: cid.simulate(loop.plant, np.ones(5)),
+            "needs a Loop.*given NonlinearIOSystem",
+        ),
+        (
+            lambda loop: cid.simulate(cid.Loop(loop.plant, 1.0, dt=1.0), np.ones(5)),
+            "not defined at the operating point",
+        ),
+        (lambda loop: growth_rate(cid.Loop(loop.plant, 1.0, dt=1.0)), "no derivative at its"),
         (lambda loop: cid.simulate(cid.Loop(loop.plant, None, dt=1.0, at=loop.at)), "needs r or d"),
     ],
 )
