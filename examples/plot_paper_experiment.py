@@ -121,7 +121,8 @@ print(in_log[2]["tied"].estimate)
 figure, axes = plt.subplots(figsize=(6.4, 3.6), layout="constrained")
 milliseconds = [1e3 * T for T in PERIODS]
 axes.axhline(pole, color="black", linewidth=1)
-axes.text(milliseconds[0], pole * 1.02, "physics", va="bottom")
+axes.text(milliseconds[0], pole + 0.8, "physics", va="bottom")
+axes.set_ylim(top=1.25 * pole)
 for rows, marker, label in (
     (in_loop, "o", "sensor noise 10 %"),
     (in_log, "s", "logger noise 30 %"),
