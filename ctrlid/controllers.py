@@ -1,8 +1,8 @@
 """Controllers as real loops have them, and their laws as equations.
 
-`PID` is the sampled controller of practice; transfer functions, state-space systems and python-control
-functions are taken as they are. `control_law` turns any of them into one form: a state, a
-rule for its next value (or its rate) and the input it applies, in absolute physical units.
+`PID` is the sampled controller of practice; transfer functions, state-space systems and
+python-control functions are taken as they are. `control_law` turns any of them into one form: a
+state, a rule for its next value (or its rate) and the input it applies, in absolute physical units.
 """
 
 import math
@@ -27,11 +27,11 @@ AntiWindup = Literal["clamp", "back-calculation", "none"]
 
 @dataclass(frozen=True)
 class PID:
-    """A sampled PID controller with limits, as microcontrollers run it.
+    r"""A sampled PID controller with limits, as microcontrollers run it.
 
-    .. math:: u = \\mathrm{sat}\\bigl(\\mathrm{bias} + k_p (b r - y) + I + D\\bigr), \\quad
-        I_k = I_{k-1} + k_i T e_k, \\quad
-        D_k = \\frac{T_f D_{k-1} + k_d (c\\,\\Delta r_k - \\Delta y_k)}{T_f + T}
+    .. math:: u = \mathrm{sat}\bigl(\mathrm{bias} + k_p (b r - y) + I + D\bigr), \quad
+        I_k = I_{k-1} + k_i T e_k, \quad
+        D_k = \frac{T_f D_{k-1} + k_d (c\,\Delta r_k - \Delta y_k)}{T_f + T}
 
     The gains multiply error, integral and derivative separately (parallel form) and T is the
     sampling period of the loop that it is put into.

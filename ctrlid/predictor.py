@@ -13,11 +13,15 @@ from scipy import optimize
 
 from .data import Record
 from .errors import CtrlidError
+from .linearization import state_matrices
 from .loop import Loop
 from .physics import Array
 from .stepping import integrate
 
 TUNING_SAMPLES = 4000  # enough to choose the ratio of force noise to sensor noise
+FEWEST = 10  # valid samples, to say anything
+BRIDGE = 20  # samples that do not count and are bridged by the model; then it starts afresh
+SETTLED = 4.0  # times the usual variance: above, the start still dominates the prediction
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,6 +34,9 @@ class Prediction:
         Prediction of each output sample from the samples before it [output unit].
     innovations : ndarray, shape (n,)
         Measured minus predicted output, zero where the record is not valid.
+    settled : ndarray of bool, shape (n,)
+        Where the record is valid and the prediction no longer depends on the guess of the state
+        at the start, or after a long stretch that does not count.
     spread : ndarray, shape (n,)
         Standard deviation of the innovations that the filter expects.
     states : ndarray, shape (n, states)
@@ -42,6 +49,7 @@ class Prediction:
 
     y: Array
     innovations: Array
+    settled: Any
     spread: Array
     states: Array
     circuit: Array
@@ -52,8 +60,8 @@ class Prediction:
 def _plant_step(loop: Loop, record: Record) -> Any:
     """Return the CasADi function ``(x, xc, w, force) -> (next x, next xc)`` over one period.
 
-    ``w`` is ``(t, u, next u, r, y)``. Between the samples u is held or straight, as the record says.
-    Under a known analog controller it moves as the circuit does, from the measured value on:
+    ``w`` is ``(t, u, next u, r, y)``. Between the samples u is held or straight, as the record
+    says. Under a known analog controller it moves as the circuit does, from the measured value on:
     a straight line would miss the jump at each step of the reference. ``xc`` is the state of
     that circuit, empty otherwise.
     """
@@ -91,19 +99,24 @@ def _plant_step(loop: Loop, record: Record) -> Any:
 def _filter_step(loop: Loop, plant_step: Any) -> Any:
     """Build one sample of the filter with sensor noise of variance one.
 
-    The state is x stacked on the columns of P and on the circuit's state; the inputs are those of
-    the plant step, `valid`, and q, the variance of the force relative to that of the sensor.
+    The state is x stacked on the columns of P and on the circuit's state, twice: as it is and as it
+    is at a start. The inputs are those of the plant step, `valid`, `afresh`, and q, the variance
+    of the force relative to that of the sensor.
     """
     e = loop.equations()
     n, nc = len(e.states), plant_step.size1_in(1)
-    z, v = casadi.SX.sym("z", n + n * n + nc), casadi.SX.sym("v", 7)
-    w, valid, q = v[:5], v[5], v[6]
+    size = n + n * n + nc
+    both, v = casadi.SX.sym("z", 2 * size), casadi.SX.sym("v", 8)
+    w, valid, afresh, q = v[:5], v[5], v[6], v[7]
+    z = casadi.if_else(afresh, both[size:], both[:size])
     x, p, xc = z[:n], casadi.reshape(z[n : n + n * n], n, n), z[n + n * n :]
-    expected = e.function(w[0], x, w[1], e.values)[1]
-    h = casadi.jacobian(expected, z)[:, :n]
+    point = casadi.SX.sym("x", n)
+    height = e.function(w[0], point, w[1], e.values)[1]
+    sensor = casadi.Function("sensor", [point, w], [height, casadi.jacobian(height, point)])
+    expected, h = sensor(x, w)
     s = casadi.mtimes([h, p, h.T]) + 1.0
-    gain = valid * casadi.mtimes(p, h.T) / s
-    innovation = valid * (w[4] - expected)
+    gain = casadi.if_else(valid, casadi.mtimes(p, h.T) / s, 0)
+    innovation = casadi.if_else(valid, w[4] - expected, 0)
     x = x + gain * innovation
     keep = casadi.SX.eye(n) - casadi.mtimes(gain, h)
     p = casadi.mtimes([keep, p, keep.T]) + casadi.mtimes(gain, gain.T)  # Joseph: stays positive
@@ -115,8 +128,8 @@ def _filter_step(loop: Loop, plant_step: Any) -> Any:
     p_after = casadi.mtimes([a, p, a.T]) + q * casadi.mtimes(b, b.T)
     p_after = (p_after + p_after.T) / 2
     x_after, xc_after = plant_step(x, xc, w, 0.0)
-    z_after = casadi.vertcat(x_after, casadi.reshape(p_after, n * n, 1), xc_after)
-    return casadi.Function("filter", [z, v], [z_after, expected, innovation, s, x, xc])
+    after = casadi.vertcat(x_after, casadi.reshape(p_after, n * n, 1), xc_after, both[size:])
+    return casadi.Function("filter", [both, v], [after, expected, innovation, s, x, xc])
 
 
 def _signals(record: Record) -> Array:
@@ -127,10 +140,10 @@ def _signals(record: Record) -> Array:
 
 
 def predict(loop: Loop, record: Record, force_noise: float | None = None) -> Prediction:
-    """Predict each output sample of a record from the samples before it.
+    r"""Predict each output sample of a record from the samples before it.
 
-    .. math:: \\hat y_k = h(\\hat x_{k|k-1}), \\quad
-        \\hat x_{k|k} = \\hat x_{k|k-1} + K_k (y_k - \\hat y_k)
+    .. math:: \hat y_k = h(\hat x_{k|k-1}), \quad
+        \hat x_{k|k} = \hat x_{k|k-1} + K_k (y_k - \hat y_k)
 
     An extended Kalman filter on the plant's equations, driven by the measured input. Only the ratio
     of force noise to sensor noise matters for the prediction; it is chosen by maximum
@@ -153,7 +166,7 @@ def predict(loop: Loop, record: Record, force_noise: float | None = None) -> Pre
     Raises
     ------
     CtrlidError
-        If the sampling periods differ, or the filter loses the record.
+        If the sampling periods differ, too few samples are valid, or the filter loses the record.
 
     References
     ----------
@@ -172,17 +185,20 @@ def predict(loop: Loop, record: Record, force_noise: float | None = None) -> Pre
     if abs(loop.dt - record.dt) > 1e-9 * loop.dt:
         raise CtrlidError(f"the loop is sampled at {loop.dt:g} s, the record at {record.dt:g} s; "
                           "give both the same period")  # fmt: skip
+    valid = np.asarray(record.valid)
+    if np.count_nonzero(valid) < FEWEST:
+        raise CtrlidError(f"a prediction needs at least {FEWEST} valid samples; the record has "
+                          f"{np.count_nonzero(valid)} of {len(record)}")  # fmt: skip
+    if force_noise is not None and not (np.isfinite(force_noise) and force_noise >= 0):
+        raise CtrlidError(f"force_noise is a ratio >= 0; given {force_noise!r}")
     plant_step = _plant_step(loop, record)
     step = _filter_step(loop, plant_step)
-    z = np.concatenate([_start(loop, record), np.zeros(plant_step.size1_in(1))])
-    w = np.vstack([_signals(record), record.valid, np.zeros(len(record))])
-    if force_noise is None:
-        ratio = _tune(step, z, w)
-    elif np.isfinite(force_noise) and force_noise >= 0:
-        ratio = float(force_noise)
-    else:
-        raise CtrlidError(f"force_noise is a ratio >= 0; given {force_noise!r}")
-    w[6] = ratio**2
+    start = np.concatenate([_start(loop, record), np.zeros(plant_step.size1_in(1))])
+    z = np.concatenate([start, start])
+    afresh = _fresh_starts(loop, record)
+    w = np.vstack([_signals(record), valid, afresh, np.zeros(len(record))])
+    ratio = _tune(step, z, w) if force_noise is None else float(force_noise)
+    w[7] = ratio**2
     with np.errstate(all="ignore"):
         out = [np.asarray(m, float) for m in step.mapaccum("pass", w.shape[1])(z, w)]
     y, innovations, s = (row[0] for row in out[1:4])
@@ -190,22 +206,44 @@ def predict(loop: Loop, record: Record, force_noise: float | None = None) -> Pre
         k = int(np.argmin(np.isfinite(innovations)))
         raise CtrlidError(
             f"the predictor of {loop.equations().name} lost the record at sample {k} "
-            f"(t = {k * record.dt:.4g} s): the model cannot follow these data there; check units, "
+            f"(t = {record.t[k]:.4g} s): the model cannot follow these data there; check units, "
             "signs and the operating point, or mark the stretch as not valid"
         )
-    sensor = float(np.sqrt(np.mean(innovations[record.valid] ** 2 / s[record.valid])))
-    return Prediction(y, innovations, sensor * np.sqrt(s), out[4].T, out[5].T, sensor,
+    known = valid & np.isfinite(s)
+    settled = known & ~afresh & (s <= SETTLED * np.median(s[known]))
+    sensor = float(np.sqrt(np.mean(innovations[settled] ** 2 / s[settled])))
+    return Prediction(y, innovations, settled, sensor * np.sqrt(s), out[4].T, out[5].T, sensor,
                       sensor * ratio)  # fmt: skip
+
+
+def _fresh_starts(loop: Loop, record: Record) -> Any:
+    """Return at which samples the filter begins anew: at the start and in long gaps."""
+    e = loop.equations()
+    poles = np.linalg.eigvals(state_matrices(e, loop.point)[0])
+    fastest = np.max(np.abs(poles) if e.dt else np.exp(poles.real * loop.dt), initial=0.0)
+    # An unstable model may bridge as long as its errors grow by less than half.
+    bridge = BRIDGE if fastest <= 1 else min(BRIDGE, int(np.log(1.5) / np.log(fastest)))
+    afresh = np.zeros(len(record), dtype=bool)
+    last = -BRIDGE - 1
+    for first, stop in record.segments():
+        if first - last > bridge:
+            afresh[max(last, 0) : first + 1] = True
+        last = stop
+    if len(record) - last > bridge:
+        afresh[last:] = True
+    return afresh
 
 
 def _start(loop: Loop, record: Record) -> Array:
     """Return a state at the operating point that the first samples may overrule."""
     e, at = loop.equations(), loop.point
     y = record.y[record.valid]
-    reach = float(np.std(y)) + abs(float(y[0]) - at.output)
-    noise = max(float(np.std(np.diff(y))) / 2, 1e-9 * max(abs(at.output), 1.0))
-    speed = max(float(np.std(np.diff(y))) / record.dt, 1e-9)
-    wide = [max(0.1 * abs(v), reach) for v in at.states]
+    reach = float(np.std(y)) + abs(float(np.mean(y)) - at.output)
+    # Third differences leave little of a smooth output.
+    noise = float(np.std(np.diff(y, 3))) / np.sqrt(20)
+    noise = max(noise, 1e-9 * max(abs(at.output), reach), 1e-300)
+    speed = max(float(np.std(np.diff(y))) / record.dt, noise / record.dt)
+    wide = [max(0.1 * abs(v), reach, noise) for v in at.states]
     for j in e.velocities:
         wide[j] = speed
     # Variances are relative to that of the sensor noise.
@@ -214,19 +252,23 @@ def _start(loop: Loop, record: Record) -> Array:
 
 def _tune(step: Any, z: Array, w: Array) -> float:
     """Return the ratio of force to sensor noise that makes the innovations most likely."""
-    w = w[:, :TUNING_SAMPLES].copy()
+    first = int(np.argmax(w[5] > 0))
+    w = w[:, first : first + TUNING_SAMPLES].copy()
     runner = step.mapaccum("tune", w.shape[1])
-    valid = w[5] > 0
-    skip = min(20, valid.sum() // 2)  # the start-up tells about the initial state, not the noise
+    known = np.flatnonzero(w[5] > 0)
+    # The start-up tells about the initial state, not about the noise.
+    known = known[min(20, len(known) // 2) :]
     period = w[0, 1] - w[0, 0]
 
     def cost(log_ratio: float) -> float:
-        w[6] = 10.0 ** (2 * log_ratio)
-        e, s = (np.asarray(m, float) for m in runner(z, w)[2:4])
-        e, s = e[0][valid][skip:], s[0][valid][skip:]
-        if not np.isfinite(e).all():
+        w[7] = 10.0 ** (2 * log_ratio)
+        with np.errstate(all="ignore"):
+            e, s = (np.asarray(m, float)[0][known] for m in runner(z, w)[2:4])
+        usual = s <= SETTLED * np.median(s)
+        e, s = e[usual], s[usual]
+        if not e.size or not np.isfinite(e).all():
             return 1e12
-        return float(np.log(np.mean(e**2 / s)) + np.mean(np.log(s)))
+        return float(np.log(max(np.mean(e**2 / s), 1e-300)) + np.mean(np.log(s)))
 
     scale = -2 * np.log10(period)
     grid = scale + np.arange(-5.0, 2.0)
@@ -263,8 +305,8 @@ def predict_ahead(
     """
     every = max(1, horizon // 4)
     starts = np.arange(0, len(record) - horizon, every)
-    whole = np.array([record.valid[k : k + horizon + 1].all() for k in starts], dtype=bool)
-    starts = starts[whole]
+    bad = np.concatenate([[0], np.cumsum(~record.valid)])
+    starts = starts[(bad[starts + horizon + 1] == bad[starts]) & prediction.settled[starts]]
     if not len(starts):
         return starts, np.empty(0)
     e = loop.equations()

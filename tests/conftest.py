@@ -6,6 +6,13 @@ from pathlib import Path
 import pytest
 
 
+def pytest_collection_modifyitems(config, items):
+    """Leave slow tests to those who ask for them with -m."""
+    if not config.option.markexpr:
+        config.hook.pytest_deselected(items=[i for i in items if i.get_closest_marker("slow")])
+        items[:] = [i for i in items if not i.get_closest_marker("slow")]
+
+
 @pytest.fixture
 def data_dir(monkeypatch):
     """Return the folder of real measured files, and let `datasets.load` look there first.
