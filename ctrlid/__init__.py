@@ -1,6 +1,6 @@
 """Closed-loop identification and diagnosis of unstable plants, on top of python-control."""
 
-from . import datasets, plants
+from . import datasets, plants, plot
 from .arx import fit_arx
 from .constraints import (
     Bounds,
@@ -69,6 +69,7 @@ __all__ = [
     "nu_gap",
     "operating_point",
     "plants",
+    "plot",
     "prbs",
     "predict",
     "random_binary",
