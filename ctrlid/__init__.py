@@ -24,6 +24,7 @@ from .loop import Loop
 from .margins import Margins, loop_margins, nu_gap, robust_margin
 from .model import Estimate, IdentifiedModel
 from .predictor import Prediction, predict
+from .report import Section, write_report
 from .residuals import Correlation
 from .signals import multisine, prbs, random_binary, steps
 from .replay import replay_controller
@@ -56,6 +57,7 @@ __all__ = [
     "ReciprocalPoles",
     "Record",
     "Redesign",
+    "Section",
     "StaticGain",
     "SymmetricPoles",
     "__version__",
@@ -78,4 +80,5 @@ __all__ = [
     "robust_margin",
     "simulate",
     "steps",
+    "write_report",
 ]

@@ -1,0 +1,167 @@
+"""Results as tables and sentences, for any page that shows them."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from . import _text
+from .controller_redesign import Redesign
+from .data import SIGNALS, Record
+from .errors import CtrlidError
+from .model import Estimate, IdentifiedModel
+from .validation import Comparison
+
+
+@dataclass(frozen=True)
+class Table:
+    """Numbers in rows, the first column of which says what they are.
+
+    Parameters
+    ----------
+    head : tuple of str
+        Titles of the columns.
+    rows : tuple of tuple of str
+        The rows, as wide as the head.
+    caption : str, optional
+        What the table shows.
+
+    Raises
+    ------
+    CtrlidError
+        If a row is not as wide as the head.
+
+    Examples
+    --------
+    >>> print(Table(("pole", "rad/s"), (("unstable", "25.6"), ("stable", "-25.6"))))
+    pole        rad/s
+    unstable     25.6
+    stable      -25.6
+    """
+
+    head: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    caption: str = ""
+
+    def __post_init__(self) -> None:
+        wrong = [row for row in self.rows if len(row) != len(self.head)]
+        if wrong:
+            raise CtrlidError(
+                f"each row of this table needs {len(self.head)} cells; given {wrong[0]}"
+            )
+
+    def __str__(self) -> str:
+        lines = (self.head, *self.rows)
+        widths = [max(len(line[i]) for line in lines) for i in range(len(self.head))]
+        text = "\n".join(
+            "   ".join([line[0].ljust(widths[0]), *(c.rjust(w) for c, w in
+                       zip(line[1:], widths[1:], strict=True))]).rstrip() for line in lines
+        )  # fmt: skip
+        return f"{self.caption}\n{text}" if self.caption else text
+
+
+def heading(result: Any) -> str:
+    """Return a title for a result, or refuse what cannot be shown."""
+    match result:
+        case Record():
+            return f"Record {result.name}".strip()
+        case IdentifiedModel():
+            return "Identified model"
+        case Comparison():
+            return f"{result.record.name or 'Record'} against {result.what.split('(')[0]}"
+        case Redesign():
+            return "Redesign: promised against achieved"
+        case Table():
+            return result.caption or "Table"
+    raise CtrlidError(
+        "a report shows a Record, IdentifiedModel, Comparison, Redesign, Table or Section, or a "
+        f"sequence of them; given {type(result).__name__}"
+    )
+
+
+def blocks(result: Any) -> list[Table | str]:
+    """Return a result as tables and sentences."""
+    match result:
+        case Table():
+            return [result]
+        case Record():
+            return [_record_table(result)]
+        case IdentifiedModel():
+            return _estimate_blocks(result.estimate)
+        case Comparison():
+            return [*_comparison_tables(result), *result.notes, result.verdict]
+        case Redesign():
+            return [_redesign_table(result), result.verdict]
+    heading(result)  # refuses what has no page
+    return []
+
+
+def _record_table(record: Record) -> Table:
+    channels = [(record.names.get(k, k), record.units.get(k, ""), getattr(record, k))
+                for k in SIGNALS if getattr(record, k) is not None]  # fmt: skip
+    channels += [(k, record.units.get(k, ""), v) for k, v in record.extra.items()]
+    rows = tuple(
+        (name, unit or "not given", *(f"{f(v):.6g}" for f in (np.min, np.mean, np.max, np.std)))
+        for name, unit, v in channels
+    )
+    valid = "" if record.valid.all() else f", {100 * record.valid.mean():.1f} % of them count"
+    between = "held" if record.hold == "zoh" else "straight"
+    caption = (
+        f"{len(record)} samples at {record.dt:g} s, {record.duration:.4g} s in all{valid}; "
+        f"u is {between} between samples."
+    )
+    head = ("signal", "unit", "smallest", "mean", "largest", "standard deviation")
+    return Table(head, rows, caption)
+
+
+def _estimate_blocks(e: Estimate) -> list[Table | str]:
+    held = {bound.quantity for bound in e.active_bounds}
+    rows = []
+    for name, value, error in zip(e.names, e.values, e.standard_errors, strict=True):
+        known = "on its bound" if name in held else "fixed" if error == 0 else f"{error:.2g}"
+        rows.append((name, f"{value:.7g}", known))
+    sampled = e.structure.domain == "z"
+    poles = tuple(
+        (*((_text.number(z, 5),) if sampled else ()), _text.number(s, 5), f"{ds:.2g}")
+        for z, s, ds in zip(e.poles, e.poles_s, e.poles_s_standard_errors, strict=True)
+    )
+    head = (*(("pole in z",) if sampled else ()), "pole in s [rad/s]", "standard error [rad/s]")
+    text = str(e).splitlines()
+    news = text[1 + next(i for i, line in enumerate(text) if "active bounds:" in line) :]
+    period = f", dt = {e.dt:g} s" if e.dt else ""
+    caption = f"{e.method}, {e.n_samples} rows{period}. Standard errors hold for white errors only."
+    return [
+        Table(("coefficient", "value", "standard error"), tuple(rows), caption),
+        Table(head, poles),
+        *(line.strip() for line in news),
+    ]
+
+
+def _comparison_tables(c: Comparison) -> list[Table]:
+    unit = c.record.units.get("y", "unit of y")
+    curves = tuple(
+        (q.label, f"{q.fit:.2f} %", f"{q.rms:.3g}", f"{100 * q.noise_share:.1f} %")
+        for q in c.curves
+    )
+    tests = tuple(
+        (t.name, "chance" if t.passed else "NOT CHANCE", f"{np.abs(t.values).max():.3f}",
+         f"{t.band:.3f}", f"{t.p_value:.2g}") for t in c.tests
+    )  # fmt: skip
+    return [
+        Table(("curve", "fit", f"RMS error [{unit}]", "noise explains"), curves, f"{c.what}."),
+        Table(("correlation", "verdict", "largest", "99 % band", "p"), tests, "One-step errors."),
+    ]
+
+
+def _redesign_table(r: Redesign) -> Table:
+    p, a = r.promised, r.achieved
+    rows = tuple(
+        (label, f"{getattr(p, name):{form}}", f"{getattr(a, name):{form}}")
+        for label, name, form in (
+            ("phase margin [deg]", "phase_margin", ".1f"),
+            ("gain margin [factor]", "gain_margin", ".2f"),
+            ("crossover [rad/s]", "crossover", ".1f"), ("overshoot [%]", "overshoot", ".1f"),
+            ("settling time [s]", "settling_time", ".3g"),
+        )
+    )  # fmt: skip
+    return Table(("", "promised on the model", "achieved on the physics"), rows)
