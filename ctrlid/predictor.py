@@ -4,7 +4,7 @@ The filter needs u and y only. It never simulates an unstable plant open loop: e
 the state back, so it works on plants that no open-loop simulation survives.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import casadi
@@ -57,7 +57,7 @@ class Prediction:
     force_noise: float
 
 
-def _plant_step(loop: Loop, record: Record) -> Any:
+def _plant_step(loop: Loop, record: Record | None) -> Any:
     """Return the CasADi function ``(x, xc, w, force) -> (next x, next xc)`` over one period.
 
     ``w`` is ``(t, u, next u, r, y)``. Between the samples u is held or straight, as the record
@@ -66,7 +66,7 @@ def _plant_step(loop: Loop, record: Record) -> Any:
     that circuit, empty otherwise.
     """
     e = loop.equations()
-    law = loop.law() if loop.analog and record.r is not None else None
+    law = loop.law() if record is not None and record.r is not None and loop.analog else None
     n, nc = len(e.states), len(law.rest) if law else 0
     x, xc, w, force = (casadi.SX.sym(s, k) for s, k in (("x", n), ("c", nc), ("w", 5), ("f", 1)))
     t, u, ahead, r, y = casadi.vertsplit(w)
@@ -81,7 +81,7 @@ def _plant_step(loop: Loop, record: Record) -> Any:
     if e.dt:
         return casadi.Function("plant_step", [x, xc, w, force], [plant(0.0, x, u)[0], xc])
     if law is None:
-        ramp = (ahead - u) / loop.dt if record.hold == "foh" else 0.0
+        ramp = (ahead - u) / loop.dt if record is not None and record.hold == "foh" else 0.0
         after = integrate(lambda tau, z: plant(tau, z, u + ramp * tau)[0], x, loop.dt, 1)[0]
         return casadi.Function("plant_step", [x, xc, w, force], [after, xc])
     noise = y - plant(0.0, x, u)[1]
@@ -322,3 +322,50 @@ def predict_ahead(
     k = starts + horizon
     y = np.asarray(output(table[0, k], x, table[1, k], e.values)[1], float).ravel()
     return k, y
+
+
+def spread_ahead(loop: Loop, prediction: Prediction, horizon: int) -> float:
+    r"""Return the standard deviation that noise gives predictions several samples ahead.
+
+    .. math:: P_{k+1} = A P_k A^T + Q, \quad \sigma^2 = h P_j h^T + R
+
+    from the steady state of the filter, with the plant linearized at the operating point.
+
+    Parameters
+    ----------
+    loop : Loop
+        The model.
+    prediction : Prediction
+        What `predict` returned.
+    horizon : int
+        Number of samples ahead.
+
+    Returns
+    -------
+    float
+        Standard deviation [output unit].
+    """
+    e, at = loop.equations(), loop.point
+    step = _plant_step(replace(loop, controller=None), None)
+    n = len(e.states)
+    x, force = casadi.SX.sym("x", n), casadi.SX.sym("f")
+    after = step(x, casadi.SX(0, 1), [0, at.input, at.input, 0, 0], force)[0]
+    height = e.function(0, x, at.input, e.values)[1]
+    slopes = casadi.Function("j", [x, force], [
+        casadi.jacobian(after, x), casadi.jacobian(after, force), casadi.jacobian(height, x),
+    ])  # fmt: skip
+    a, b, h = (np.asarray(m, float) for m in slopes(at.states, 0.0))
+    r, q = prediction.sensor_noise**2, (prediction.force_noise * b) @ (prediction.force_noise * b).T
+    p = q + r * np.eye(n)
+    for _ in range(5000):
+        gain = p @ h.T / (h @ p @ h.T + r) if r else np.zeros((n, 1))
+        keep = np.eye(n) - gain @ h
+        filtered = keep @ p @ keep.T + r * gain @ gain.T
+        later = a @ filtered @ a.T + q
+        if np.allclose(later, p, rtol=1e-9, atol=0.0):
+            break
+        p = later
+    p = filtered
+    for _ in range(horizon):
+        p = a @ p @ a.T + q
+    return float(np.sqrt((h @ p @ h.T).item() + r))

@@ -91,6 +91,11 @@ def replay_controller(loop: Loop, record: Record) -> Array:
     >>> bool(abs(cid.replay_controller(loop, record) - record.u).max() < 1e-12)
     True
     """
+    return replay_from_best_state(loop, record)[0]
+
+
+def replay_from_best_state(loop: Loop, record: Record) -> tuple[Array, Array]:
+    """Return what `replay_controller` does, and the controller's initial state that it chose."""
     if abs(loop.dt - record.dt) > 1e-9 * loop.dt:
         raise CtrlidError(f"the loop is sampled at {loop.dt:g} s, the record at {record.dt:g} s")
     if record.r is None:
@@ -103,10 +108,10 @@ def replay_controller(loop: Loop, record: Record) -> Array:
     # Gauss-Newton: one step where the law is linear in its state, a few more around limits.
     for _ in range(10 if start.size else 0):
         jacobian = np.asarray(slope(start).full(), float)
-        start = start + np.linalg.lstsq(jacobian, record.u - replayed, rcond=1e-12)[0]
-        trial = np.asarray(run(start), float).ravel()
+        moved = start + np.linalg.lstsq(jacobian, record.u - replayed, rcond=1e-12)[0]
+        trial = np.asarray(run(moved), float).ravel()
         cost = float(np.sum((trial - record.u) ** 2))
         if not cost < best:
             break
-        replayed, best = trial, cost
-    return replayed
+        start, replayed, best = moved, trial, cost
+    return replayed, start

@@ -1,5 +1,6 @@
-"""Whether residuals are white and independent of the signals, with bands that mean what they say."""
+"""Whether residuals are white and independent of the signals, and how much is at stake if not."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,6 +10,8 @@ from scipy import linalg, signal, stats
 from .physics import Array
 
 LEVEL = 0.99  # of the drawn bands and of the tests
+MEMORY = 1000  # longest correlation of residuals that is looked for [samples]
+ROWS = 50_000  # of a regression: more add nothing to the few digits of a share
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +30,10 @@ class Correlation:
         Half width that a coefficient exceeds by chance in one of a hundred cases.
     p_value : float
         Probability of coefficients as large as these, taken together, by chance.
+    share : float
+        Share of the residuals' variance that the signal's past accounts for, less what chance
+        gives. In long records a correlation can be certain and yet negligible: the p-value tells
+        the one, the share the other.
     """
 
     name: str
@@ -34,6 +41,7 @@ class Correlation:
     values: Array
     band: float
     p_value: float
+    share: float = 0.0
 
     @property
     def passed(self) -> bool:
@@ -49,10 +57,10 @@ def _covariance(a: Array, b: Array, lags: int) -> Array:
 
 
 def autocorrelation(e: Array, valid: Any, lags: int = 25, fitted: int = 0) -> Correlation:
-    """Test whether residuals are white.
+    r"""Test whether residuals are white.
 
-    .. math:: \\hat\\rho(\\tau) = \\frac{\\sum_k e_k e_{k-\\tau}}{\\sum_k e_k^2}, \\quad
-        Q = N (N + 2) \\sum_\\tau \\frac{\\hat\\rho(\\tau)^2}{N - \\tau}
+    .. math:: \hat\rho(\tau) = \frac{\sum_k e_k e_{k-\tau}}{\sum_k e_k^2}, \quad
+        Q = N (N + 2) \sum_\tau \frac{\hat\rho(\tau)^2}{N - \tau}
 
     White residuals have coefficients with standard deviation 1/sqrt(N), and Q follows a chi-square
     law with as many degrees of freedom as lags less fitted coefficients.
@@ -84,16 +92,36 @@ def autocorrelation(e: Array, valid: Any, lags: int = 25, fitted: int = 0) -> Co
     q = n * (n + 2) * np.sum(rho**2 / np.maximum(n - tau, 1))
     band = float(stats.norm.ppf(0.5 + LEVEL / 2) / np.sqrt(n))
     p = float(stats.chi2.sf(q, max(lags - fitted, 1)))
-    return Correlation("residual with its own past", tau, rho, band, p)
+    share = 0.0
+    if c[0] > 0:
+        # What the best prediction from this many past residuals would take away.
+        whole = linalg.toeplitz(np.concatenate([[1.0], rho[:-1]])) + 1e-12 * np.eye(lags)
+        share = _beyond_chance(float(rho @ np.linalg.solve(whole, rho)), lags / n)
+    return Correlation("residual with its own past", tau, rho, band, p, share)
+
+
+def _beyond_chance(raw: float, chance: float) -> float:
+    """Return a share of variance less what a fit to independent signals takes by chance."""
+    return float(np.clip((raw - chance) / max(1 - chance, 1e-12), 0.0, 1.0))
+
+
+def _smoothed(e: Array, n: int, memory: int) -> Array:
+    """Return the autocovariance of residuals, zero where it is not clearly there.
+
+    Beyond the noise of its own estimate, and with a window that keeps its matrix positive.
+    """
+    r = _covariance(e, e, memory)
+    sure = np.abs(r) >= 2.6 * r[0] / np.sqrt(n)
+    return np.asarray(np.where(sure, r * (1 - np.arange(memory + 1) / (memory + 1)), 0.0))
 
 
 def cross_correlation(
     e: Array, s: Array, valid: Any, name: str, lags: int = 25, first: int = 1
 ) -> Correlation:
-    """Test whether residuals are independent of a signal's past.
+    r"""Test whether residuals are independent of a signal's past.
 
-    .. math:: N \\operatorname{cov}\\bigl(\\hat R_{es}(i), \\hat R_{es}(j)\\bigr) \\to
-        \\sum_l R_e(l) R_s(l + i - j)
+    .. math:: N \operatorname{cov}\bigl(\hat R_{es}(i), \hat R_{es}(j)\bigr) \to
+        \sum_l R_e(l) R_s(l + i - j)
 
     Under feedback only the past of u says something: its future contains the residual.
 
@@ -123,14 +151,11 @@ def cross_correlation(
     s, _ = _centred(s, valid)
     tau = np.arange(first, first + lags)
     r = _covariance(e, s, int(tau[-1]))[tau]
-    memory = min(n // 10, 200)
-    re, rs = _covariance(e, e, memory), _covariance(s, s, memory + lags)
+    memory = min(n // 10, MEMORY)
+    re, rs = _smoothed(e, n, memory), _covariance(s, s, memory + lags)
     scale = np.sqrt(re[0] * rs[0])
     if scale <= 0:
         return Correlation(f"residual with past {name}", tau, np.zeros(lags), np.inf, 1.0)
-    # Beyond the noise of their own estimate, and with a window that keeps the matrix positive.
-    re = re * (1 - np.arange(memory + 1) / (memory + 1))
-    re[1:][np.abs(re[1:]) < 2.6 * re[0] / np.sqrt(n)] = 0.0
     two_sided_e = np.concatenate([re[:0:-1], re])
     shifted = [
         float(two_sided_e @ rs[np.abs(np.arange(-memory, memory + 1) + k)]) for k in range(lags)
@@ -143,7 +168,18 @@ def cross_correlation(
     keep = values > 1e-6 * values.max()
     z = vectors[:, keep].T @ r / np.sqrt(values[keep] / n)
     p = float(stats.chi2.sf(float(z @ z), int(keep.sum())))
-    return Correlation(f"residual with past {name}", tau, r / scale, band, p)
+    share = _share(r, rs[:lags], re[0], linalg.toeplitz(row) / n)
+    return Correlation(f"residual with past {name}", tau, r / scale, band, p, share)
+
+
+def _share(r: Array, rs: Array, variance: float, covariance: Array) -> float:
+    """Return the share of the variance that a regression on the lagged signal would explain."""
+    values, vectors = linalg.eigh(linalg.toeplitz(rs))
+    keep = values > 1e-6 * values.max()
+    basis = vectors[:, keep] / np.sqrt(values[keep])
+    raw = float(np.sum((basis.T @ r) ** 2)) / variance
+    chance = float(np.trace(basis.T @ covariance @ basis)) / variance
+    return _beyond_chance(raw, chance)
 
 
 def _centred(e: Array, valid: Any) -> tuple[Array, int]:
@@ -153,18 +189,27 @@ def _centred(e: Array, valid: Any) -> tuple[Array, int]:
     return centred, max(n, 1)
 
 
-def explained_share(e: Array, signals: list[Array], valid: Any, lags: int = 30) -> float:
-    """Return the share of the residuals' variance that follows the past of some signals.
+def explained_share(
+    e: Array, signals: Sequence[tuple[Array, int]], valid: Any, lags: int = 30
+) -> float:
+    r"""Return the share of the residuals' variance that follows the past of some signals.
 
-    A linear regression on `lags` past samples of each signal, its R squared corrected for the number
-    of coefficients.
+    A linear regression on `lags` past samples of each signal. What it would take from residuals of
+    this colour by chance is taken off:
+
+    .. math:: \frac{R^2 - c}{1 - c}, \quad c = \frac{1}{N} \sum_i \sum_l
+        \rho_e(l) \sum_k v_{i,k} v_{i,k+l}
+
+    with the regression's orthonormal directions :math:`v_i`; for white residuals c is the number of
+    coefficients over N. A share within what chance does now and then is none.
 
     Parameters
     ----------
     e : ndarray, shape (n,)
         Residuals.
-    signals : list of ndarray, shape (n,)
-        Signals that the residuals should be independent of.
+    signals : sequence of (ndarray, int)
+        Signals that the residuals should be independent of, each with the smallest lag from
+        which they should be.
     valid : ndarray of bool, shape (n,)
         Samples that count.
     lags : int, optional
@@ -173,26 +218,42 @@ def explained_share(e: Array, signals: list[Array], valid: Any, lags: int = 30) 
     Returns
     -------
     float
-        Between 0 (chance alone) and 1.
+        Between 0 (chance can do it) and 1.
     """
+    valid = np.asarray(valid)
     lags = max(1, min(lags, len(e) // (10 * max(len(signals), 1))))
-    windows = np.lib.stride_tricks.sliding_window_view
-    usable = windows(valid, lags + 1).all(axis=1)
-    target = e[lags:][usable]
-    if not signals or len(target) < 3 * lags * len(signals):
+    first = max((delay for _, delay in signals), default=0) + lags - 1
+    rows = np.arange(first, len(e), max(1, -(-len(e) // ROWS)))
+    bad = np.concatenate([[0], np.cumsum(~valid)])
+    rows = rows[bad[rows + 1] == bad[rows - first]]
+    if not signals or len(rows) < 3 * lags * len(signals):
         return 0.0
-    past = np.hstack([windows(s, lags + 1)[usable, :-1] for s in signals])
-    past = past - past.mean(axis=0)
-    target = target - target.mean()
+    target = e[rows] - np.mean(e[rows])
     total = float(target @ target)
     if total == 0:
         return 0.0
+    past = np.column_stack(
+        [s[rows - delay - k] for s, delay in signals for k in range(lags)]
+    )  # fmt: skip
+    past -= past.mean(axis=0)
     scale = np.linalg.norm(past, axis=0)
-    past = past / np.where(scale > 0, scale, 1.0)
+    past /= np.where(scale > 0, scale, 1.0)
     # Through the normal matrix: the share needs few digits, the matrix is small.
     values, vectors = linalg.eigh(past.T @ past)
-    keep = values > 1e-9 * values.max()
-    z = (vectors[:, keep].T @ (past.T @ target)) / np.sqrt(values[keep])
-    n, p = len(target), int(keep.sum())
-    raw = float(z @ z) / total
-    return float(np.clip(1 - (1 - raw) * (n - 1) / max(n - p - 1, 1), 0.0, 1.0))
+    keep = values > 1e-9 * max(values.max(), 1e-300)
+    basis = past @ (vectors[:, keep] / np.sqrt(values[keep]))
+    along = basis.T @ target
+    left = target - basis @ along
+    n = len(rows)
+    rho = _smoothed(left, n, min(n // 10, MEMORY))
+    if rho[0] <= 0:
+        return 1.0
+    # Under independence the squared components along the basis are this matrix on average.
+    kernel = np.concatenate([rho[:0:-1], rho]) / rho[0]
+    coloured = np.column_stack([signal.fftconvolve(v, kernel, "same") for v in basis.T])
+    spread = basis.T @ coloured / n
+    chance = float(np.trace(spread))
+    raw = float(along @ along) / total
+    if raw < chance + 3 * np.sqrt(2 * np.sum(spread**2)):
+        return 0.0
+    return _beyond_chance(raw, min(max(chance, 0.0), 0.9))

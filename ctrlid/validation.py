@@ -1,121 +1,28 @@
-"""compare(): how well a model or a loop reproduces a record, every curve labelled for what it is."""
+"""compare(): how well a model or a loop reproduces a record, every curve labelled."""
 
-from dataclasses import dataclass
+import warnings
+from collections.abc import Sequence
 from typing import Any
 
 import control as ct
 import numpy as np
-from scipy import optimize
+from scipy import optimize, signal
 
+from ._text import number
+from .comparison import EXACT, Comparison, Curve
 from .controllers import PID
 from .data import Record
-from .errors import CtrlidError
+from .errors import CtrlidError, CtrlidWarning
 from .linearization import state_matrices
 from .loop import Loop
 from .physics import Array, timebase
-from .predictor import predict, predict_ahead
+from .predictor import FEWEST, Prediction, predict, predict_ahead, spread_ahead
+from .replay import controller_output, replay_from_best_state
 from .residuals import Correlation, autocorrelation, cross_correlation, explained_share
-from .replay import controller_output
 from .simulation import Simulator
 from .stepping import growth_rate
 
-SYSTEMATIC = 0.05  # share of an error that follows the signals and is worth a word
-
-
-@dataclass(frozen=True, eq=False)
-class Curve:
-    """One reproduction of the measured output.
-
-    Attributes
-    ----------
-    label : str
-        What it is: a prediction (uses measured outputs) or a simulation (does not).
-    y : ndarray, shape (n,)
-        Reproduced output; NaN where there is none.
-    fit : float
-        Fit in percent, ``100 (1 - |y - yhat| / |y - mean(y)|)``.
-    rms : float
-        Root mean square of the error [output unit].
-    noise_share : float
-        Share of the error's variance that does not follow the past of reference and input.
-    """
-
-    label: str
-    y: Array
-    fit: float
-    rms: float
-    noise_share: float
-
-
-@dataclass(frozen=True, eq=False)
-class Comparison:
-    """What `compare` found.
-
-    Attributes
-    ----------
-    what : str
-        The model or loop that was compared.
-    record : Record
-        The data.
-    curves : tuple of Curve
-        Predictions and simulations.
-    residuals : ndarray, shape (n,)
-        One-step prediction errors; NaN where there are none.
-    tests : tuple of Correlation
-        Residuals with their own past, with past u and with past r.
-    notes : tuple of str
-        What could not be computed, and why.
-    """
-
-    what: str
-    record: Record
-    curves: tuple[Curve, ...]
-    residuals: Array
-    tests: tuple[Correlation, ...]
-    notes: tuple[str, ...] = ()
-
-    def __getitem__(self, label: str) -> Curve:
-        for curve in self.curves:
-            if label in curve.label:
-                return curve
-        raise CtrlidError(f"no curve is called {label!r}; there are "
-                          f"{', '.join(c.label for c in self.curves)}")  # fmt: skip
-
-    @property
-    def fit(self) -> dict[str, float]:
-        """Fit in percent by curve label."""
-        return {curve.label: curve.fit for curve in self.curves}
-
-    @property
-    def verdict(self) -> str:
-        """The comparison in a sentence."""
-        last = self.curves[-1]
-        share = 100 * last.noise_share
-        text = f"The {last.label} reproduces {self.record.name or 'the record'} with a fit of {last.fit:.1f} %; "
-        if 1 - last.noise_share < SYSTEMATIC:
-            text += f"{share:.0f} % of what remains does not follow reference or input: noise explains it."
-        else:
-            text += (f"only {share:.0f} % of what remains is unrelated to reference and input, the "
-                     "rest follows them: something is missing in the model.")  # fmt: skip
-        failed = [t.name for t in self.tests if not t.passed]
-        if failed:
-            text += f" The one-step errors are NOT WHITE OR NOT INDEPENDENT ({'; '.join(failed)})."
-        return text
-
-    def __str__(self) -> str:
-        unit = self.record.units.get("y", "")
-        rows = [f"{self.what} against {self.record.name or 'record'} ({len(self.record)} samples, "
-                f"{np.count_nonzero(self.record.valid)} valid)",
-                f"  {'curve':<34}{'fit':>9}{'RMS error':>14}{'noise explains':>17}"]  # fmt: skip
-        rows += [f"  {c.label:<34}{c.fit:>7.2f} %{c.rms:>11.3e} {unit:<2}{100 * c.noise_share:>14.1f} %"
-                 for c in self.curves]  # fmt: skip
-        for t in self.tests:
-            worst = int(np.argmax(np.abs(t.values)))
-            mark = "ok" if t.passed else "NO"
-            rows.append(f"  {t.name:<34}{mark:>9}   largest {t.values[worst]:+.3f} at lag "
-                        f"{t.lags[worst]}, 99 % band {t.band:.3f}, p = {t.p_value:.2g}")  # fmt: skip
-        rows += [f"  note: {note}" for note in self.notes]
-        return "\n".join([*rows, "  " + self.verdict])
+MEANINGFUL = 1e-6  # of the input's size: below, an injected signal is round-off
 
 
 def compare(record: Record, model_or_loop: Any, *, horizon: int | None = None) -> Comparison:
@@ -178,38 +85,67 @@ def compare(record: Record, model_or_loop: Any, *, horizon: int | None = None) -
 
 def _compare_loop(record: Record, loop: Loop, horizon: int | None) -> Comparison:
     prediction = predict(loop, record)
-    residuals = np.where(record.valid, prediction.innovations, np.nan)
-    curves = [_curve("one-step prediction", record, prediction.y)]
-    poles = np.linalg.eigvals(state_matrices(loop.equations(), loop.point)[0])
-    steps = horizon or _time_constant(poles, loop.equations().dt, record)
+    residuals = np.where(prediction.settled, prediction.innovations, np.nan)
+    one_step = np.where(prediction.settled, prediction.y, np.nan)
+    curves = [_curve("one-step prediction", record, one_step, _known_before(record, 1))]
+    notes = []
+    e = loop.equations()
+    poles = np.linalg.eigvals(state_matrices(e, loop.point)[0])
+    steps = horizon or _time_constant(poles, e.dt, record)
     if steps > 1:
         index, values = predict_ahead(loop, record, prediction, steps)
         ahead = np.full(len(record), np.nan)
         ahead[index] = values
-        curves.append(_curve(f"{steps}-step prediction", record, ahead))
-    notes = []
-    try:
-        label, y = _simulated(record, loop, prediction.states)
-        curves.append(_curve(label, record, y))
-    except CtrlidError as reason:
-        notes.append(f"no simulation: {reason}")
-    return Comparison(repr(loop), record, tuple(curves), residuals, _tests(record, residuals),
-                      tuple(notes))  # fmt: skip
+        curves.append(_curve(f"{steps}-step prediction", record, ahead,
+                             _known_before(record, steps),
+                             spread_ahead(loop, prediction, steps)))  # fmt: skip
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", CtrlidWarning)
+        try:
+            curves.append(_simulated(record, loop, prediction))
+        except CtrlidError as reason:
+            notes.append(f"no simulation: {reason}")
+    notes += sorted({str(w.message) for w in caught})[-1:]
+    return _comparison(repr(loop), record, curves, residuals, notes)
+
+
+def _known_before(record: Record, steps: int) -> list[tuple[Array, int]]:
+    """Return the signals that an error `steps` after the last known output should not follow.
+
+    The reference, if there is one: the input carries the noise itself round the loop. Without a
+    reference the input as it was known then.
+    """
+    if record.r is None:
+        return [(np.asarray(record.u), steps)]
+    return [(np.asarray(record.r), 1)]
+
+
+def _comparison(
+    what: str, record: Record, curves: list[Curve], residuals: Array, notes: list[str]
+) -> Comparison:
+    known = tuple(c for c in curves if np.isfinite(c.rms))
+    notes += [f"no {c.label}: no valid stretch is long enough" for c in curves if c not in known]
+    exact = known[0].fit > EXACT
+    tests = () if exact else _tests(record, residuals)
+    return Comparison(what, record, known, residuals, tests, tuple(notes))
 
 
 def _time_constant(poles: Any, dt: float, record: Record) -> int:
-    rates = (np.log(poles.astype(complex)) / dt if dt else poles).real
+    with np.errstate(divide="ignore"):  # a pole at z = 0 is infinitely fast
+        rates = (np.log(poles.astype(complex)) / dt if dt else poles).real
     fast = rates[rates > 1e-6] if np.any(rates > 1e-6) else -rates[rates < -1e-6]
     slowest = float(np.min(fast)) if fast.size else 10 / record.duration
-    return int(np.clip(round(0.67 / (slowest * record.dt)), 1, max(len(record) // 10, 1)))
+    return int(np.clip(round(1 / (slowest * record.dt)), 1, max(len(record) // 10, 1)))
 
 
-def _simulated(record: Record, loop: Loop, states: Array) -> tuple[str, Array]:
-    """Simulate a record, stretch by stretch, each from its own best initial state."""
+def _simulated(record: Record, loop: Loop, prediction: Prediction) -> Curve:
+    """Simulate a record, stretch by stretch, each from its own best initial state.
+
+    Once more with noise of the size found in the one-step errors, to see what it makes of it.
+    """
     r: Any = record.r
     if loop.controller is None:
-        rate = growth_rate(loop)
-        if rate > -1e-9:
+        if growth_rate(loop) > -1e-9:
             raise CtrlidError(
                 "the plant is not stable and the controller is unknown; an open-loop simulation "
                 "would drift without bound. Give the loop its controller"
@@ -219,97 +155,151 @@ def _simulated(record: Record, loop: Loop, states: Array) -> tuple[str, Array]:
         raise CtrlidError("an analog loop is simulated from its reference, but the record has none")
     else:
         label = "closed-loop simulation"
-        if r is None:
-            if (
-                isinstance(loop.controller, PID)
-                and np.isfinite([loop.controller.lower, loop.controller.upper]).any()
-            ):
-                raise CtrlidError("a PID with limits is simulated from its reference, but the "
-                                  "record has none")  # fmt: skip
-            r = np.full(len(record), loop.point.output)
-    y = np.full(len(record), np.nan)
+        pid = loop.controller
+        if r is None and isinstance(pid, PID) and np.isfinite([pid.lower, pid.upper]).any():
+            raise CtrlidError("a PID with limits is simulated from its reference, but the record "
+                              "has none; give it r=, a constant for a fixed set-point")  # fmt: skip
+    y, injected = np.full(len(record), np.nan), np.zeros(len(record))
+    noisy = np.zeros(len(record))
     simulator = Simulator(loop)
+    n = len(simulator.plant_states)
     for start, stop in record.segments():
-        if stop - start < 3:
+        if stop - start < FEWEST:
             continue
         part = record[start:stop]
         reference = r[start:stop] if r is not None else None
+        guess = simulator.rest.copy()
+        guess[:n] = prediction.states[start]
         if loop.controller is None:
             d = part.u - loop.point.input
         elif loop.analog:
             d = np.zeros(len(part))
-        else:
+        elif reference is None:
+            reference = np.full(len(part), loop.point.output)
             d = part.u - controller_output(loop, part.y, reference)
-        y[start:stop] = _from_best_start(simulator, part, reference, d, states[start])
-    return label, y
+        else:
+            replayed, guess[n:] = replay_from_best_state(loop, part)
+            d = part.u - replayed
+        fitted = guess.size if loop.analog else n
+        z = _best_start(simulator, part, reference, d, guess, fitted)
+        y[start:stop] = simulator.run(z, reference, d)[0]
+        injected[start:stop] = d
+        noisy[start:stop] = _noise_effect(simulator, z, reference, d, prediction) - y[start:stop]
+    driven = [] if record.r is None else [(np.asarray(record.r), 1)]
+    if np.std(injected) > MEANINGFUL * np.std(record.u) and not (driven and not loop.controller):
+        driven.append((injected, 1))
+    return _curve(label, record, y, driven, float(np.std(noisy[np.isfinite(y)])))
 
 
-def _from_best_start(
-    simulator: Simulator, part: Record, r: Any, d: Array, guess: Array
+def _noise_effect(
+    simulator: Simulator, z: Array, r: Any, d: Array, prediction: Prediction
 ) -> Array:  # fmt: skip
-    """Simulate from the initial plant state that fits the first samples best."""
-    fitted = slice(0, min(len(part), 400))
-    start = simulator.rest.copy()
-    start[: len(guess)] = guess
-    scale = np.maximum(np.abs(guess), 1e-3 * max(float(np.std(part.y)), 1e-12))
-    spread = max(float(np.std(part.y)), 1e-300)
+    """Return the output of one run with the noise of a prediction, NaN where that cannot be."""
+    unknown = np.full(len(d), np.nan)
+    if not simulator.loop.equations().velocities:
+        return unknown  # the simulation has no place for the noise of the prediction
+    streams = np.random.default_rng(0).standard_normal((2, len(d)))
+    noise = [streams[0] * prediction.sensor_noise, streams[1] * prediction.force_noise]
+    try:
+        return simulator.run(z, r, d, noise)[0]
+    except CtrlidError:
+        return unknown
 
-    def misfit(step: Array) -> Array:
-        z = start.copy()
-        z[: len(guess)] += scale * step
+
+def _best_start(
+    simulator: Simulator, part: Record, r: Any, d: Array, guess: Array, fitted: int
+) -> Array:
+    """Return the initial state whose first entries fit the first samples best."""
+    rows = slice(0, min(len(part), 400))
+    spread = max(float(np.std(part.y)), 1e-12 * float(np.abs(part.y).max()), 1e-300)
+    scale = np.maximum(0.01 * np.abs(guess[:fitted]), spread)
+    for j in simulator.loop.equations().velocities:
+        scale[j] = max(float(np.std(np.diff(part.y))) / part.dt, 1e-300)
+
+    def misfit(point: Array) -> Array:
+        z = guess.copy()
+        z[:fitted] += scale * (point - 1)
         try:
-            y = simulator.run(z, None if r is None else r[fitted], d[fitted])[0]
+            y = simulator.run(z, None if r is None else r[rows], d[rows])[0]
         except CtrlidError:
-            return np.full(fitted.stop, 1e3)
-        return np.asarray((y - part.y[fitted]) / spread, dtype=float)
+            return np.full(rows.stop, 1e3)
+        return np.asarray((y - part.y[rows]) / spread, dtype=float)
 
-    best = optimize.least_squares(misfit, np.zeros(len(guess)), x_scale="jac", diff_step=1e-5,
-                                  max_nfev=20)  # fmt: skip
-    start[: len(guess)] += scale * best.x
-    return simulator.run(start, r, d)[0]
+    # Around 1, so that the differences have the relative size that is asked for.
+    best = optimize.least_squares(misfit, np.ones(fitted), diff_step=[1e-4], max_nfev=20)
+    start = guess.copy()
+    start[:fitted] += scale * (best.x - 1)
+    return start
 
 
 def _compare_model(record: Record, model: Any, horizon: int | None) -> Comparison:
     if model.ninputs != 1 or model.noutputs != 1:
         raise CtrlidError("compare needs a model with one input and one output")
-    dt = timebase(model)
+    dt = record.dt if model.dt is True else timebase(model)
     if dt and abs(dt - record.dt) > 1e-9 * dt:
-        raise CtrlidError(f"the model is sampled at {dt:g} s, the record at {record.dt:g} s; fit or "
-                          "sample the model at the record's period")  # fmt: skip
-    what = f"{model.name}: poles " + ", ".join(f"{p:.4g}" for p in model.poles())
+        raise CtrlidError(
+            f"the model is sampled at {dt:g} s, the record at {record.dt:g} s; fit or sample the "
+            "model at the record's period"
+        )
+    poles = ", ".join(number(p, 4) for p in model.poles())
+    what = f"{model.name}: poles {poles or 'none'}"
     if not dt:
-        model = ct.sample_system(ct.ss(model), record.dt, record.hold)
-        model = ct.tf(model)
+        model = ct.tf(ct.sample_system(ct.ss(model), record.dt, record.hold))
     num, den = (np.asarray(p[0][0], float) for p in (model.num, model.den))
     num = np.concatenate([np.zeros(len(den) - len(num)), num]) / den[0]
     den = den / den[0]
     order = len(den) - 1
     valid = np.asarray(record.valid)
     usable = np.zeros(len(record), dtype=bool)
-    if len(record) <= order + 2:
-        raise CtrlidError(f"a model of order {order} needs more than {order + 2} samples; given "
+    if len(record) > order:
+        windows = np.lib.stride_tricks.sliding_window_view(valid, order + 1)
+        usable[order:] = windows.all(axis=1)
+    if np.count_nonzero(usable) < FEWEST:
+        raise CtrlidError(f"a model of order {order} needs {FEWEST + order} valid samples in "
+                          f"succession; the record has {np.count_nonzero(valid)} valid samples of "
                           f"{len(record)}")  # fmt: skip
-    usable[order:] = np.lib.stride_tricks.sliding_window_view(valid, order + 1).all(axis=1)
     y0, u0 = float(np.mean(record.y[valid])), float(np.mean(record.u[valid]))
     y, u = record.y - y0, record.u - u0
     moved = np.convolve(u, num)[: len(u)]
     error = np.convolve(y, den)[: len(y)] - moved
     constant = float(np.mean(error[usable]))
     residuals = np.where(usable, error - constant, np.nan)
-    curves = [_curve("one-step prediction", record, record.y - residuals)]
-    steps = horizon or _time_constant(np.roots(den), record.dt, record)
+    curves = [_curve("one-step prediction", record, record.y - residuals, _known_before(record, 1))]
+    roots = np.roots(den)
+    # White one-step errors pass through 1/A.
+    white = float(np.std(residuals[usable]))
+    with np.errstate(over="ignore"):
+        impulse = signal.lfilter([1.0], den, np.eye(1, len(record))[0])
+        grown = np.sqrt(np.cumsum(impulse**2))
+    steps = horizon or _time_constant(roots, record.dt, record)
     if steps > 1:
-        curves.append(_curve(f"{steps}-step prediction", record,
-                             y0 + _arx_ahead(y, moved + constant, den, steps, usable)))  # fmt: skip
-    notes = ["an unstable model is not simulated open loop; put it into a Loop with the controller"]
-    if np.all(np.abs(np.roots(den)) < 1 - 1e-9):
-        notes = []
-        from scipy.signal import lfilter
+        ahead = y0 + _arx_ahead(y, moved + constant, den, steps, usable)
+        known = _known_before(record, steps)
+        curves.append(
+            _curve(f"{steps}-step prediction", record, ahead, known, white * grown[steps - 1])
+        )
+    notes = []
+    if np.all(np.abs(roots) < 1 - 1e-9):
+        free = y0 + _arx_free(record, y, moved + constant, den)
+        outside = _known_before(record, 1)
+        curves.append(_curve("open-loop simulation", record, free, outside, white * grown[-1]))
+    else:
+        notes.append("an unstable model is not simulated open loop; put it into a Loop with the "
+                     "controller")  # fmt: skip
+    return _comparison(what, record, curves, residuals, notes)
 
-        free = lfilter([1.0], den, moved + constant)
-        curves.append(_curve("open-loop simulation", record, y0 + np.asarray(free)))
-    return Comparison(what, record, tuple(curves), residuals, _tests(record, residuals),
-                      tuple(notes))  # fmt: skip
+
+def _arx_free(record: Record, y: Array, driven: Array, den: Array) -> Array:
+    """Iterate the ARX equation over each valid stretch from its first measured outputs."""
+    order = len(den) - 1
+    free = np.full(len(y), np.nan)
+    for start, stop in record.segments():
+        if stop - start > order:
+            state = signal.lfiltic([1.0], den, y[start : start + order][::-1])
+            free[start + order : stop] = signal.lfilter(
+                [1.0], den, driven[start + order : stop], zi=state
+            )[0]
+    return free
 
 
 def _arx_ahead(y: Array, driven: Array, den: Array, steps: int, usable: Any) -> Array:
@@ -333,20 +323,25 @@ def _arx_ahead(y: Array, driven: Array, den: Array, steps: int, usable: Any) -> 
     return ahead
 
 
-def _curve(label: str, record: Record, y: Array) -> Curve:
+def _curve(
+    label: str, record: Record, y: Array, signals: Sequence[tuple[Array, int]],
+    noise: float = float("nan"),
+) -> Curve:  # fmt: skip
+    """Judge a reproduction; `noise` is the error that noise alone makes, NaN if not known."""
     known = np.asarray(record.valid) & np.isfinite(y)
     if not known.any():
-        return Curve(label, y, float("nan"), float("nan"), float("nan"))
+        nan = float("nan")
+        return Curve(label, y, nan, nan, nan, nan)
     error = np.where(known, record.y - y, 0.0)
     measured = record.y[known]
     size = float(np.linalg.norm(measured - measured.mean()))
     fit = 100 * (1 - float(np.linalg.norm(error[known])) / size) if size else float("nan")
-    signals = [np.asarray(s) for s in (record.r, record.u) if s is not None]
-    if "simulation" in label and record.r is not None:
-        signals = signals[:1]  # u carries the noise itself round the loop
-    share = 1 - explained_share(error, signals, known)
-    return Curve(label, np.where(known, y, np.nan), fit,
-                 float(np.sqrt(np.mean(error[known] ** 2))), share)  # fmt: skip
+    rms = float(np.sqrt(np.mean(error[known] ** 2)))
+    follows = 0.0 if fit > EXACT else explained_share(error, signals, known)
+    share = 1 - follows
+    if fit <= EXACT and np.isfinite(noise) and noise < rms:
+        share = min(share, (noise / rms) ** 2)
+    return Curve(label, np.where(known, y, np.nan), fit, rms, follows, share)
 
 
 def _tests(record: Record, residuals: Array) -> tuple[Correlation, ...]:
