@@ -18,6 +18,7 @@ from .controller_redesign import Performance, Redesign, redesign
 from .controllers import PID
 from .data import Record
 from .errors import CtrlidError, CtrlidWarning
+from .iv import fit_iv
 from .lead import design_lead
 from .linearization import OperatingPoint, linearize, operating_point
 from .loop import Loop
@@ -65,6 +66,7 @@ __all__ = [
     "datasets",
     "design_lead",
     "fit_arx",
+    "fit_iv",
     "linearize",
     "loop_margins",
     "multisine",

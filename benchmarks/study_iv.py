@@ -1,0 +1,273 @@
+"""fit_iv on levitations drawn at random, against least squares and the Cramér-Rao bound.
+
+Run it as ``python benchmarks/study_iv.py`` (``--runs 100`` for the long one, ``--free`` for fit_iv
+without constraints, ``--given`` with the controller given instead of found in the record,
+``--physics 0.01`` for the nonlinear levitation with the voltage scattering by at most 1 %: the
+linear range; ``--physics 1`` with the reference as drawn, where it is left).
+
+Each run draws a gap of 5-20 mm, a voltage of 1-10 V, a digital lead (crossover 2-3 times the
+unstable pole p, 40-55 degrees; less demanding where such a loop would hardly be stable, at
+p*Ts = 0.5), a random binary reference of 1-2 % of the gap, and 10 000-45 000 samples. Two numbers
+are sought, alpha and beta of -beta/(s^2 - alpha). For each estimator and each of them:
+
+- median size of the error in percent;
+- bias: mean of error / standard error;
+- covered: share of nominal 95 % intervals that hold the truth;
+- efficiency: mean square of error / Cramér-Rao bound; 1 is the best an unbiased estimator can do.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass
+
+import control as ct
+import numpy as np
+from scipy.signal import lfilter
+
+import ctrlid as cid
+from ctrlid.model import Estimate
+
+STEPS = (0.5, 0.2, 0.1, 0.03, 0.01, 0.005)
+NOISES = (0.01, 0.05, 0.2)
+KNOWN = (cid.ReciprocalPoles(), cid.Equal("b1", "b2"))
+
+
+@dataclass(frozen=True, eq=False)
+class Draw:
+    """A levitation, its digital lead and one record, with the bound on what it can tell."""
+
+    alpha: float
+    beta: float
+    lead: ct.TransferFunction
+    record: cid.Record
+    bound: np.ndarray
+
+
+def plant(alpha: float, beta: float, dt: float) -> tuple[np.ndarray, np.ndarray]:
+    """Denominator and numerator of -beta/(s^2 - alpha) behind a hold, in powers of the delay."""
+    step = np.sqrt(alpha) * dt
+    b = -beta / alpha * 2 * np.sinh(step / 2) ** 2
+    return np.array([1.0, -2 * np.cosh(step), 1.0]), np.array([0.0, b, b])
+
+
+def loop(
+    a: np.ndarray, b: np.ndarray, lead: ct.TransferFunction, r: np.ndarray, v: np.ndarray
+) -> tuple[np.ndarray, ...]:
+    """Run the linear loop: u and y caused by the reference, then by the sensor noise."""
+    n, d = lead.num[0][0], lead.den[0][0]
+    both = np.polyadd(np.convolve(a, d), np.convolve(b, n))
+    caused = lfilter(np.convolve(n, a), both, r), lfilter(np.convolve(n, b), both, r)
+    noise = -lfilter(np.convolve(n, a), both, v), lfilter(np.convolve(a, d), both, v)
+    return *caused, *noise
+
+
+def slowest(a: np.ndarray, b: np.ndarray, lead: ct.TransferFunction) -> float:
+    """Decay per sample of the slowest mode of the loop."""
+    both = np.polyadd(np.convolve(a, lead.den[0][0]), np.convolve(b, lead.num[0][0]))
+    return float(-np.log(np.abs(np.roots(both)).max()))
+
+
+def design(rng: np.random.Generator, a: np.ndarray, b: np.ndarray, p: float, dt: float):
+    """Draw leads until one works and leaves no mode slower than a twentieth of p."""
+    for trial in range(1000):
+        # Slow sampling leaves less phase: after some trials, ask for less.
+        ease = 1.0 if trial < 5 else rng.uniform(0.5, 0.9)
+        try:
+            lead = cid.design_lead(
+                ct.tf(b[1:], a, dt), p * rng.uniform(2, 3) * ease, rng.uniform(40, 55) * ease
+            )
+        except cid.CtrlidError:
+            continue
+        if slowest(a, b, lead) > 0.05 * p * dt:
+            return lead
+    raise RuntimeError("no lead found")
+
+
+def draw(rng: np.random.Generator, step: float, noise: float, swing: float | None = None) -> Draw:
+    """Draw a levitation sampled at p*Ts = step, and a record with this share of sensor noise.
+
+    With ``swing`` the nonlinear levitation is simulated, reference and noise made so much smaller
+    that the voltage scatters by no more than this share of itself.
+    """
+    gap, voltage = rng.uniform(5e-3, 20e-3), rng.uniform(1.0, 10.0)
+    mass = np.exp(rng.uniform(np.log(0.01), np.log(0.1)))
+    alpha, beta = 2 * 9.81 / gap, 2 * 9.81 / voltage
+    p = np.sqrt(alpha)
+    dt = step / p
+    a, b = plant(alpha, beta, dt)
+    lead = design(rng, a, b, p, dt)
+    n = int(rng.integers(10_000, 45_001))
+    amplitude = gap * rng.uniform(0.01, 0.02)
+    hold = int(np.exp(rng.uniform(np.log(3), np.log(max(8.0, 2 / step)))))
+    r = cid.random_binary(n, amplitude=amplitude, hold=hold, seed=int(rng.integers(1 << 30)))
+    sigma = noise * amplitude
+    v = sigma * rng.standard_normal(n)
+    ur, yr, uv, yv = loop(a, b, lead, r, v)
+    bound = cramer_rao(alpha, beta, dt, sigma, (ur, yr, uv, yv))
+    if swing is not None:
+        small = min(1.0, swing * voltage / float(np.std(ur + uv)))
+        r, sigma = small * r, small * sigma
+        law = cid.plants.maglev(m=mass, K=mass * 9.81 * gap**2 / voltage**2)
+        at = cid.operating_point(law, output=gap)
+        record = cid.simulate(
+            cid.Loop(law, lead, dt=dt, at=at),
+            gap + r,
+            sensor_noise=sigma,
+            seed=int(rng.integers(1 << 30)),
+        )
+    else:
+        record = cid.Record(r=gap + r, u=voltage + ur + uv, y=gap + yr + yv, dt=dt)
+    return Draw(alpha, beta, lead, record, bound)
+
+
+def cramer_rao(
+    alpha: float,
+    beta: float,
+    dt: float,
+    sigma: float,
+    signals: tuple[np.ndarray, ...],
+) -> np.ndarray:
+    """Bound on the standard deviations of alpha and beta, white Gaussian sensor noise, linear loop.
+
+    The innovations are ``e = A y - B u`` over A with its pole outside reflected; their variance is
+    that of the noise times the square of that pole.
+    """
+
+    def errors(x: np.ndarray) -> np.ndarray:
+        a, b = plant(x[0], x[1], dt)
+        z = np.exp(-np.sqrt(x[0]) * dt)
+        stable = np.array([1.0, -2 * z, z * z])
+        ur, yr, uv, yv = signals
+        # Reference and noise do not depend on each other, so their information adds.
+        pairs = (yr, ur), (yv, uv)
+        return np.array([lfilter(a, stable, y) - lfilter(b, stable, u) for y, u in pairs])
+
+    x = np.array([alpha, beta])
+    h = 1e-4 * x
+    slopes = [(errors(x + e) - errors(x - e)) / (2 * e.sum()) for e in np.diag(h)]
+    variance = (sigma * np.exp(np.sqrt(alpha) * dt)) ** 2
+    information = np.array([[np.sum(s * t) for t in slopes] for s in slopes]) / variance
+    return np.sqrt(np.diag(np.linalg.inv(information)))
+
+
+def physical(estimate: Estimate, values: np.ndarray | None = None) -> np.ndarray:
+    """Alpha from the pole farthest out, beta from the static gain."""
+    a1, a2, b1, b2 = estimate.values if values is None else values
+    x = np.roots([1.0, 2.0 + a1, 1.0 + a1 + a2]).astype(complex)  # poles less one
+    s = np.log1p(x[np.argmax(np.abs(1 + x))]) / estimate.dt
+    alpha = float((s * s).real)
+    return np.array([alpha, alpha * (b1 + b2) / (1 + a1 + a2)])
+
+
+def physical_errors(estimate: Estimate) -> np.ndarray:
+    """Find standard errors of alpha and beta by the delta method."""
+    se = estimate.standard_errors
+    columns = []
+    for i, width in enumerate(1e-3 * se):
+        e = np.zeros(4)
+        e[i] = width
+        high, low = physical(estimate, estimate.values + e), physical(estimate, estimate.values - e)
+        columns.append((high - low) / (2 * width) if width else np.zeros(2))
+    slope = np.column_stack(columns)
+    return np.sqrt(np.diag(slope @ estimate.covariance @ slope.T))
+
+
+def delayed_references(record: cid.Record, count: int = 20) -> np.ndarray:
+    """Coefficients by instruments: references 1 to 20 samples old, with a2 = 1 and b1 = b2."""
+    y, u, r = (s - s.mean() for s in (record.y, record.u, record.r))
+    n = len(y)
+    z = np.column_stack([r[count - i : n - i] for i in range(1, count + 1)])
+    y0, y1, y2 = (y[count - i : n - i] for i in range(3))
+    u1, u2 = (u[count - i : n - i] for i in (1, 2))
+    q = np.linalg.qr(z)[0]
+    columns = q.T @ np.column_stack([-y1, u1 + u2])
+    a1, b = np.linalg.lstsq(columns, q.T @ (y0 + y2), rcond=None)[0]
+    return np.array([a1, 1.0, b, b])
+
+
+ESTIMATORS = ("fit_arx", "fit_arx constrained", "delayed references", "fit_iv")
+
+
+def run(one: Draw, free: bool, given: bool) -> np.ndarray:
+    """Errors and standard errors of each estimator, ``(estimators, 2, 2)``, relative."""
+    truth = np.array([one.alpha, one.beta])
+    found = np.full((len(ESTIMATORS), 2, 2), np.nan)
+    for k, known in enumerate(((), KNOWN)):
+        estimate = cid.fit_arx(one.record, 2, 2, constraints=known).estimate
+        with np.errstate(divide="ignore", invalid="ignore"):
+            found[k] = physical(estimate), physical_errors(estimate)
+    theta = delayed_references(one.record)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        found[2, 0] = physical(estimate, theta)
+    known = () if free else KNOWN
+    controller = one.lead if given else None
+    estimate = cid.fit_iv(one.record, 2, 2, constraints=known, controller=controller).estimate
+    found[3] = physical(estimate), physical_errors(estimate)
+    found[:, 0] -= truth
+    return found / truth
+
+
+def summary(found: np.ndarray, bound: np.ndarray) -> list[np.ndarray]:
+    """Median size of the error in percent, bias, coverage, efficiency, of alpha and beta each."""
+    error, se = found[:, 0], found[:, 1]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        z = error / se
+        covered = np.mean(np.abs(z) < 1.959964, axis=0) + 0 * z[0]
+        return [
+            100 * np.median(np.abs(error), axis=0),
+            z.mean(axis=0),
+            100 * covered,
+            np.mean((error / bound) ** 2, axis=0),
+        ]
+
+
+def study(
+    runs: int,
+    steps: tuple[float, ...] = STEPS,
+    noises: tuple[float, ...] = NOISES,
+    swing: float | None = None,
+    free: bool = False,
+    given: bool = False,
+) -> dict[tuple[float, float], tuple[np.ndarray, np.ndarray]]:
+    """All runs: by p*Ts and noise the errors of each estimator and the bounds, relative."""
+    table = {}
+    for i, step in enumerate(steps):
+        for j, noise in enumerate(noises):
+            found, bounds = [], []
+            for seed in range(runs):
+                one = draw(np.random.default_rng([seed, i, j]), step, noise, swing)
+                found.append(run(one, free, given))
+                bounds.append(one.bound / [one.alpha, one.beta])
+            table[step, noise] = np.array(found), np.array(bounds)
+    return table
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--runs", type=int, default=20, help="draws for each line of the table")
+    parser.add_argument(
+        "--physics",
+        type=float,
+        metavar="SWING",
+        help="simulate the nonlinear levitation, its voltage scattering by at most this share",
+    )
+    parser.add_argument("--free", action="store_true", help="fit_iv without constraints")
+    parser.add_argument("--given", action="store_true", help="give fit_iv the controller")
+    options = parser.parse_args()
+    print("alpha, beta | p*Ts, noise: median error %, bias in s.e., covered %, efficiency")
+    for (step, noise), (found, bound) in study(
+        options.runs, swing=options.physics, free=options.free, given=options.given
+    ).items():
+        print(f"p*Ts {step:<6} noise {100 * noise:g} %, bound {100 * np.median(bound):.2g} %")
+        for k, name in enumerate(ESTIMATORS):
+            cells = [
+                " / ".join("-" if np.isnan(x) else f"{x:.3g}" for x in pair)
+                for pair in summary(found[:, k], bound)
+            ]
+            print(f"  {name:<22}" + "".join(f"{cell:>22}" for cell in cells))
+
+
+if __name__ == "__main__":
+    main()
