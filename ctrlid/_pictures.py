@@ -6,9 +6,9 @@ from typing import Any
 import control as ct
 import numpy as np
 
+from .comparison import Comparison
 from .errors import CtrlidError
 from .physics import Array, timebase
-from .validation import Comparison
 
 PREFIXES = ((1e-1, 1.0, ""), (1e-4, 1e-3, "m"), (1e-7, 1e-6, "µ"), (0.0, 1e-9, "n"))
 PREFIXED = ("m", "V", "A", "N", "m/s", "m/s^2")

@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 
 from . import _text
+from .comparison import Comparison
 from .controller_redesign import Redesign
 from .data import SIGNALS, Record
 from .errors import CtrlidError
 from .model import Estimate, IdentifiedModel
-from .validation import Comparison
 
 
 @dataclass(frozen=True)

@@ -14,11 +14,11 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MultipleLocator
 
 from . import _pictures, _text
+from .comparison import Comparison
 from .controller_redesign import Redesign
 from .data import Record
 from .errors import CtrlidError
 from .physics import Array, timebase
-from .validation import Comparison
 
 # Okabe and Ito's colours, told apart by the colour-blind; lines and markers differ as well.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")

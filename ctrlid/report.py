@@ -9,11 +9,11 @@ from typing import Any
 
 from . import plot
 from ._tables import Table, blocks, heading
+from .comparison import Comparison
 from .controller_redesign import Redesign
 from .data import Record
 from .errors import CtrlidError
 from .model import IdentifiedModel
-from .validation import Comparison
 
 STYLE = """
 :root { color-scheme: light dark; --ink: #1c1e21; --paper: #ffffff; --faint: #5b6168;
@@ -62,8 +62,8 @@ class Section:
     result : object, optional
         A `Table`, `Record`, `IdentifiedModel`, `Comparison` or `Redesign`, or a tuple of them.
     figure : object, optional
-        A matplotlib figure or axes, or a mapping of such by caption. By default the pictures that
-        belong to the result; an empty mapping for none.
+        A matplotlib figure or axes, or the bytes of a PNG file, or a mapping of such by caption. By
+        default the pictures that belong to the result; an empty mapping for none.
 
     Examples
     --------
@@ -175,7 +175,7 @@ def _section(section: Section, alone: bool) -> str:
         for block in blocks(result):
             parts.append(_html_table(block) if isinstance(block, Table) else _paragraph(block))
     for caption, picture in section.figures.items():
-        data = base64.b64encode(plot.png(picture)).decode("ascii")
+        data = base64.b64encode(_bytes(picture)).decode("ascii")
         words = html.escape(caption, quote=True)
         below = f"<figcaption>{words}</figcaption>" if caption else ""
         alt = words or html.escape(section.title, quote=True)
@@ -183,6 +183,10 @@ def _section(section: Section, alone: bool) -> str:
             f'<figure><img alt="{alt}" src="data:image/png;base64,{data}">{below}</figure>'
         )
     return "\n".join([*parts, "</section>"])
+
+
+def _bytes(picture: Any) -> bytes:
+    return picture if isinstance(picture, bytes) else plot.png(picture)
 
 
 def _paragraph(text: str) -> str:

@@ -1,0 +1,172 @@
+"""The command ``ctrlid``, also ``python -m ctrlid``: the main job, told on an embedded default."""
+
+import argparse
+import itertools
+import math
+import os
+import re
+import sys
+import textwrap
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from tqdm import tqdm
+
+from . import __version__, plot
+from ._tables import Table
+from .errors import CtrlidError
+from .report import Section, write_report
+from .story import TITLES, story
+
+FOLDER = "ctrlid-report"
+FEWEST = 500  # samples with which the story can be told
+WIDTH = 88
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command.
+
+    Parameters
+    ----------
+    arguments : sequence of str, optional
+        By default those of the command line.
+
+    Returns
+    -------
+    int
+        0; 1 after a refusal, which is on stderr in one line; 130 after Ctrl-C. A wrong usage exits
+        with 2.
+    """
+    args = _parser().parse_args(arguments)
+    try:
+        code: int = args.run(args)
+        sys.stdout.flush()
+    except CtrlidError as refusal:
+        print(f"ctrlid: {' '.join(str(refusal).split())}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("ctrlid: interrupted", file=sys.stderr)
+        return 130
+    except BrokenPipeError:  # the reader, such as `head`, has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    return code
+
+
+def _parser() -> argparse.ArgumentParser:
+    """Return the parser; without a command the story is told."""
+    parser = argparse.ArgumentParser(
+        prog="ctrlid",
+        description="Identify an unstable plant in closed loop: physics, lead controller, "
+        "experiment, plain and constrained fit, comparison, and a redesign tried on the physics. "
+        "Results go to the terminal; figures and report.html to a new folder.",
+    )
+    parser.add_argument("--version", action="version", version=f"ctrlid {__version__}")
+    parser.add_argument(
+        "--seed", type=_natural, default=1, help="of reference and noise (%(default)s)"
+    )
+    parser.add_argument("--samples", type=_samples, default=45_000, metavar="N",
+                        help="length of the experiment (%(default)s)")  # fmt: skip
+    parser.add_argument("--noise", type=_share, default=0.1, metavar="SHARE",
+                        help="standard deviation of the sensor noise, as a share of the jump "
+                        "of the reference (%(default)s)")  # fmt: skip
+    parser.add_argument("--output", type=Path, metavar="DIR",
+                        help=f"folder for figures and report; by default {FOLDER}, with a number "
+                        "where that exists")  # fmt: skip
+    parser.add_argument("--quiet", action="store_true", help="no progress on the terminal")
+    parser.set_defaults(run=_tell)
+    return parser
+
+
+def _natural(text: str) -> int:
+    value = int(text)
+    if value < 0:
+        raise argparse.ArgumentTypeError(f"needs a whole number from 0; given {text}")
+    return value
+
+
+def _samples(text: str) -> int:
+    value = int(text)
+    if value < FEWEST:
+        raise argparse.ArgumentTypeError(f"needs at least {FEWEST} samples; given {text}")
+    return value
+
+
+def _share(text: str) -> float:
+    value = float(text)
+    if not (math.isfinite(value) and value >= 0):
+        raise argparse.ArgumentTypeError(f"needs a share such as 0.1, not negative; given {text}")
+    return value
+
+
+def _tell(args: argparse.Namespace) -> int:
+    folder = _folder(args.output)
+    sections = []
+    chapters = story(samples=args.samples, noise=args.noise, seed=args.seed)
+    try:
+        # disable=None: silent where stderr is no terminal.
+        with tqdm(total=len(TITLES), disable=args.quiet or None, leave=False, unit="step") as bar:
+            for number, title in enumerate(TITLES, 1):
+                bar.set_description(title)
+                section = _saved(next(chapters), number, folder)
+                sections.append(section)
+                with tqdm.external_write_mode():
+                    print(_text(section, number))
+                bar.update()
+        report = write_report(sections, folder / "report.html",
+                              title="An unstable plant, identified in closed loop")  # fmt: skip
+    except BaseException:
+        if not any(folder.iterdir()):
+            folder.rmdir()
+        raise
+    pictures = len(list(folder.glob("*.png")))
+    print(f"{pictures} figures and {report.name} are in {folder}{os.sep}")
+    return 0
+
+
+def _folder(wanted: Path | None) -> Path:
+    """Make the folder; nothing that exists is touched."""
+    try:
+        if wanted is not None:
+            wanted.mkdir(parents=True, exist_ok=True)
+            if any(wanted.iterdir()):
+                raise CtrlidError(f"{wanted} is not empty and nothing is overwritten; give "
+                                  "--output a new folder")  # fmt: skip
+            return wanted
+        for number in itertools.count(1):
+            folder = Path(FOLDER if number == 1 else f"{FOLDER}-{number}")
+            try:
+                folder.mkdir()
+            except FileExistsError:
+                continue
+            return folder
+    except OSError as reason:
+        raise CtrlidError(f"cannot make a folder for the report: {reason}. Change to a directory "
+                          "that may be written to, or give --output") from reason  # fmt: skip
+    raise AssertionError("unreachable")
+
+
+def _saved(section: Section, number: int, folder: Path) -> Section:
+    """Write the figures of a section as files; the section keeps their bytes for the report."""
+    figures = {caption: plot.png(figure) for caption, figure in section.figures.items()}
+    slug = re.sub(r"[^a-z]+", "-", section.title.lower()).strip("-")
+    for letter, data in zip("abcdefgh", figures.values(), strict=False):
+        name = f"{number}{letter if len(figures) > 1 else ''}-{slug}.png"
+        (folder / name).write_bytes(data)
+    return replace(section, figure=figures)
+
+
+def _text(section: Section, number: int) -> str:
+    lines = [f"{number}. {section.title}"]
+    for paragraph in section.text.split("\n\n"):
+        lines += [textwrap.fill(paragraph, WIDTH, break_on_hyphens=False), ""]
+    results = section.result if isinstance(section.result, tuple) else (section.result,)
+    for table in results:
+        if isinstance(table, Table):
+            lines += [textwrap.indent(str(table), "    "), ""]
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
