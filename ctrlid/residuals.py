@@ -11,6 +11,7 @@ from .physics import Array
 
 LEVEL = 0.99  # of the drawn bands and of the tests
 MEMORY = 1000  # longest correlation of residuals that is looked for [samples]
+MOST_ORDER = 40  # of the autoregression that describes their colour
 ROWS = 50_000  # of a regression: more add nothing to the few digits of a share
 
 
@@ -106,13 +107,31 @@ def _beyond_chance(raw: float, chance: float) -> float:
 
 
 def _smoothed(e: Array, n: int, memory: int) -> Array:
-    """Return the autocovariance of residuals, zero where it is not clearly there.
+    """Return the autocovariance of residuals up to a lag, as an autoregression continues it.
 
-    Beyond the noise of its own estimate, and with a window that keeps its matrix positive.
+    The order is chosen by the Bayesian information criterion: white residuals stay white.
     """
-    r = _covariance(e, e, memory)
-    sure = np.abs(r) >= 2.6 * r[0] / np.sqrt(n)
-    return np.asarray(np.where(sure, r * (1 - np.arange(memory + 1) / (memory + 1)), 0.0))
+    order = min(MOST_ORDER, n // 20, memory)
+    r = _covariance(e, e, max(order, 1))
+    if r[0] <= 0:
+        return np.zeros(memory + 1)
+    a, variance = np.ones(1), 1.0
+    best, chosen = 0.0, a
+    for p in range(1, order + 1):  # Levinson and Durbin
+        reflection = -float(a @ r[p:0:-1]) / (variance * r[0])
+        a = np.append(a, 0.0) + reflection * np.append(a, 0.0)[::-1]
+        variance *= 1 - reflection**2
+        if variance <= 0:
+            break
+        score = n * np.log(variance) + p * np.log(n)
+        if score < best:
+            best, chosen = score, a
+    p = len(chosen) - 1
+    out = np.zeros(memory + 1)
+    out[: p + 1] = r[: p + 1]
+    for k in range(p + 1, memory + 1 if p else 0):
+        out[k] = -float(chosen[1:] @ out[k - 1 : k - p - 1 : -1])
+    return out
 
 
 def cross_correlation(

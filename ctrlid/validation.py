@@ -64,7 +64,7 @@ def compare(record: Record, model_or_loop: Any, *, horizon: int | None = None) -
     >>> r = cid.random_binary(1000, amplitude=0.1, hold=50, seed=1)
     >>> record = cid.simulate(loop, r, sensor_noise=1e-3, seed=2)
     >>> [curve.label for curve in cid.compare(record, loop).curves]
-    ['one-step prediction', '33-step prediction', 'closed-loop simulation']
+    ['one-step prediction', '50-step prediction', 'closed-loop simulation']
     """
     if not isinstance(record, Record):
         raise CtrlidError(f"compare needs a Record; given {type(record).__name__}")
