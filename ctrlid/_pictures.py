@@ -99,3 +99,8 @@ def frequencies(models: Mapping[str, Any]) -> Any:
     corners = corners or [min(limits, default=1.0)]
     top = max(limits) if limits else 10 * max(corners)
     return np.geomspace(min(0.1 * min(corners), 0.1 * top), top, 600)
+
+
+def chance(p: float) -> str:
+    """Return a p-value in words; of the very small ones the size says nothing."""
+    return f"p = {p:.2g}" if p >= 1e-4 else "p < 0.0001"

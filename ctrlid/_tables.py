@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from . import _text
+from . import _pictures, _text
 from .comparison import Comparison
 from .controller_redesign import Redesign
 from .data import SIGNALS, Record
@@ -145,12 +145,15 @@ def _comparison_tables(c: Comparison) -> list[Table]:
     )
     tests = tuple(
         (t.name, "chance" if t.passed else "NOT CHANCE", f"{np.abs(t.values).max():.3f}",
-         f"{t.band:.3f}", f"{t.p_value:.2g}") for t in c.tests
+         f"{t.band:.3f}", _pictures.chance(t.p_value)) for t in c.tests
     )  # fmt: skip
-    return [
-        Table(("curve", "fit", f"RMS error [{unit}]", "noise explains"), curves, f"{c.what}."),
-        Table(("correlation", "verdict", "largest", "99 % band", "p"), tests, "One-step errors."),
+    tables = [
+        Table(("curve", "fit", f"RMS error [{unit}]", "noise explains"), curves, f"{c.what}.")
     ]
+    if tests:
+        head = ("correlation", "verdict", "largest", "99 % band", "by chance")
+        tables.append(Table(head, tests, "One-step errors."))
+    return tables
 
 
 def _redesign_table(r: Redesign) -> Table:

@@ -179,7 +179,7 @@ def residuals(comparison: Comparison, axes: Any = None) -> Any:
     Raises
     ------
     CtrlidError
-        If something else than a comparison is given, or the number of axes differs.
+        If something else than a comparison with tests is given, or the number of axes differs.
 
     Examples
     --------
@@ -191,6 +191,9 @@ def residuals(comparison: Comparison, axes: Any = None) -> Any:
     3
     """
     _require(comparison, Comparison, "plot.residuals draws a Comparison, as compare() returns")
+    if not comparison.tests:
+        raise CtrlidError("plot.residuals has nothing to draw: the one-step errors of this record "
+                          "were not tested, they are round-off or too few")  # fmt: skip
     axes = _axes(axes, len(comparison.tests), sharex=True)
     for ax, test in zip(axes, comparison.tests, strict=True):
         inside = np.abs(test.values) <= test.band
@@ -205,9 +208,8 @@ def residuals(comparison: Comparison, axes: Any = None) -> Any:
                 ax.plot(test.lags[which], test.values[which], marker, color=colour, markersize=4,
                         label=label)  # fmt: skip
         verdict = "chance explains it" if test.passed else "NOT CHANCE"
-        ax.set_title(
-            f"{test.name}: {verdict} (p = {test.p_value:.2g})", loc="left", fontsize="medium"
-        )
+        title = f"{test.name}: {verdict} ({_pictures.chance(test.p_value)})"
+        ax.set_title(title, loc="left", fontsize="medium")
         reach = 1.15 * max(float(np.abs(test.values).max()), min(test.band, 1.0))
         ax.set_ylim(-reach, reach)
         ax.set_ylabel("correlation [1]")

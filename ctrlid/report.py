@@ -36,7 +36,7 @@ th, td { padding: 0.28rem 0.8rem; border-bottom: 1px solid var(--line); text-ali
   vertical-align: top; }
 th:first-child, td:first-child { text-align: left; padding-left: 0.5rem; }
 thead th { background: var(--head); font-weight: 600; }
-tbody th { font-weight: 400; }
+tbody th { font-weight: 400; white-space: nowrap; }
 figure { margin: 1.2rem 0; }
 figure img { display: block; width: 100%; height: auto; background: #ffffff; padding: 0.6rem;
   border: 1px solid var(--line); border-radius: 6px; }
@@ -159,8 +159,10 @@ def _pictures(result: Any) -> dict[str, Any]:
             return {"Poles.": plot.poles({"identified": result}),
                     "Frequency response.": plot.bode({"identified": result})}  # fmt: skip
         case Comparison():
-            return {"Measured output, predictions and simulations.": plot.comparison(result),
-                    "Correlations of the one-step errors.": plot.residuals(result)}  # fmt: skip
+            made = {"Measured output, predictions and simulations.": plot.comparison(result)}
+            if result.tests:
+                made["Correlations of the one-step errors."] = plot.residuals(result)
+            return made
         case Redesign():
             return {"Response to a step of the reference.": plot.step(result)}
     return {}

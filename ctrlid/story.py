@@ -8,7 +8,7 @@ from typing import Any
 import control as ct
 import numpy as np
 
-from . import plot
+from . import _pictures, plot
 from ._tables import Table
 from .arx import fit_arx
 from .comparison import Comparison
@@ -264,7 +264,8 @@ def _comparisons(
         curve = next((q for q in c.curves if "simulation" in q.label), None)
         cells = ("none", "-") if curve is None else (
             f"{curve.fit:.1f} %", f"{100 * curve.noise_share:.0f} %")  # fmt: skip
-        white = "white" if c.tests[0].passed else "not white"
+        # Round-off alone is not tested.
+        white = "none" if not c.tests else "white" if c.tests[0].passed else "not white"
         rows.append((label, steps[label], white, *cells))
     table = Table(
         ("model in the loop", "one-step fit", "its errors", "simulation fit", "noise explains"),
@@ -275,11 +276,16 @@ def _comparisons(
 
 def _comparison_figures(found: dict[str, Comparison]) -> dict[str, Any]:
     known, physics = found["reciprocal poles"], found["physics"]
-    return {
-        "The constrained model in the loop.": plot.comparison(known),
-        "The physics in the loop.": plot.comparison(physics),
-        "One-step errors of the constrained model.": plot.residuals(known),
+    first = _pictures.telling(known)
+    t = known.record.t[first : first + _pictures.WINDOW]
+    window = (t[0], t[-1] + PERIOD)
+    figures = {
+        "The constrained model in the loop.": plot.comparison(known, window=window),
+        "The physics in the loop.": plot.comparison(physics, window=window),
     }
+    if known.tests:
+        figures["One-step errors of the constrained model."] = plot.residuals(known)
+    return figures
 
 
 def _redesigns(bench: _Bench, plain: IdentifiedModel, known: IdentifiedModel) -> Section:

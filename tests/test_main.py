@@ -1,0 +1,204 @@
+"""The command: the story it tells, the files it leaves, and how it ends."""
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import ctrlid as cid
+from ctrlid import __main__ as command
+from ctrlid import story as told
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def run(*arguments):
+    return command.main(["--samples", "3000", "--quiet", *arguments])
+
+
+def test_the_whole_story(folder, capsys):
+    assert run() == 0
+    out, err = capsys.readouterr()
+    assert err == ""
+    text = " ".join(out.split())
+    for number, title in enumerate(told.TITLES, 1):
+        assert f"{number}. {title}" in out
+    for sentence in (
+        "A steel ball of 21.3 g hangs below a magnet",
+        "so it can only be identified in a closed loop",
+        "finds the lead with a crossover of 130 rad/s and a phase margin of 60 degrees",
+        "Logged are 3000 samples",
+        "finds a2 = 1",
+        "The constraint keeps the structure; it does not cure the feedback bias",
+        "what share of this error the noise explains",
+        "On the constrained model: promised 50.0 deg",
+        "On the plain model:",
+    ):
+        assert sentence in text
+    assert out.endswith(f"9 figures and report.html are in ctrlid-report{os.sep}\n")
+    files = sorted(p.name for p in (folder / "ctrlid-report").iterdir())
+    assert len([f for f in files if f.endswith(".png")]) == 9
+    assert "report.html" in files
+    assert "3-the-experiment.png" in files
+    page = (folder / "ctrlid-report" / "report.html").read_text("utf-8")
+    assert page.count('src="data:image/png;base64,') == 9
+    assert all(f"<h2>{title}</h2>" in page for title in told.TITLES)
+
+
+def test_nothing_is_overwritten(folder, monkeypatch):
+    short(monkeypatch)
+    (folder / "ctrlid-report").mkdir()
+    (folder / "ctrlid-report-2").write_text("mine")
+    assert run() == 0
+    assert list((folder / "ctrlid-report").iterdir()) == []
+    assert (folder / "ctrlid-report-2").read_text() == "mine"
+    assert (folder / "ctrlid-report-3" / "report.html").exists()
+
+
+def test_output_folder(folder, monkeypatch, capsys):
+    short(monkeypatch)
+    assert run("--output", "new/place") == 0
+    assert capsys.readouterr().out.endswith(f"are in new{os.sep}place{os.sep}\n")
+    before = (folder / "new" / "place" / "report.html").stat()
+    assert run("--output", "new/place") == 1
+    assert capsys.readouterr().err == (
+        f"ctrlid: new{os.sep}place is not empty and nothing is overwritten; give --output a new "
+        "folder\n"
+    )
+    assert (folder / "new" / "place" / "report.html").stat() == before
+    (folder / "file").write_text("mine")
+    assert run("--output", "file") == 1
+    assert capsys.readouterr().err.startswith("ctrlid: cannot make a folder for the report: ")
+
+
+def short(monkeypatch):
+    """Tell a story without its contents."""
+
+    def one(**settings):
+        for title in told.TITLES:
+            yield cid.Section(title, "Words.")
+
+    monkeypatch.setattr(command, "story", one)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [(["--samples", "10"], "needs at least 500 samples; given 10"),
+     (["--samples", "many"], "invalid _samples value: 'many'"),
+     (["--seed", "-1"], "needs a whole number from 0; given -1"),
+     (["--noise", "-0.1"], "needs a share such as 0.1, not negative; given -0.1"),
+     (["--noise", "nan"], "given nan"), (["--nonsense"], "unrecognized arguments: --nonsense"),
+     (["nonsense"], "unrecognized arguments: nonsense")],
+)  # fmt: skip
+def test_wrong_usage(folder, capsys, arguments, words):
+    with pytest.raises(SystemExit) as end:
+        command.main(arguments)
+    assert end.value.code == 2
+    err = capsys.readouterr().err
+    assert words in err
+    assert err.startswith("usage: ctrlid")
+    assert list(folder.iterdir()) == []
+
+
+def test_help_and_version(capsys):
+    with pytest.raises(SystemExit) as end:
+        command.main(["--help"])
+    assert end.value.code == 0
+    out = capsys.readouterr().out
+    for option in ("--help", "--version", "--seed", "--samples", "--noise", "--output", "--quiet"):
+        assert option in out
+    with pytest.raises(SystemExit) as end:
+        command.main(["--version"])
+    assert end.value.code == 0
+    assert capsys.readouterr().out == f"ctrlid {cid.__version__}\n"
+
+
+def test_a_refusal_is_one_line_and_leaves_nothing(folder, capsys, monkeypatch):
+    def refuse(**settings):
+        raise cid.CtrlidError("the ball\nis lost")
+        yield
+
+    monkeypatch.setattr(command, "story", refuse)
+    assert run() == 1
+    assert capsys.readouterr() == ("", "ctrlid: the ball is lost\n")
+    assert list(folder.iterdir()) == []
+
+
+def test_too_much_noise_throws_the_ball(folder, capsys):
+    assert run("--noise", "200") == 1
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1
+    assert err.startswith("ctrlid: the simulation stops at t = ")
+
+
+def test_ctrl_c(folder, capsys, monkeypatch):
+    def interrupted(**settings):
+        raise KeyboardInterrupt
+        yield
+
+    monkeypatch.setattr(command, "story", interrupted)
+    assert run() == 130
+    assert capsys.readouterr().err == "ctrlid: interrupted\n"
+    assert list(folder.iterdir()) == []
+
+
+def test_as_a_module_into_a_closed_pipe(folder):
+    done = subprocess.run([sys.executable, "-W", "error", "-m", "ctrlid", "--version"],
+                          capture_output=True, text=True, check=False)  # fmt: skip
+    assert (done.returncode, done.stdout, done.stderr) == (0, f"ctrlid {cid.__version__}\n", "")
+    read, write = os.pipe()
+    os.close(read)
+    done = subprocess.run([sys.executable, "-m", "ctrlid", "--samples", "600"], stdout=write,
+                          stderr=subprocess.PIPE, text=True, check=False)  # fmt: skip
+    os.close(write)
+    assert (done.returncode, done.stderr) == (1, "")
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_the_plain_fit_fails_whatever_the_seed(seed):
+    """Equation (6) of the paper is typical of this experiment and no lucky draw."""
+    bench = told._bench()
+    record, perfect = told._records(bench, 45_000, 0.1, seed)
+    plain = cid.fit_arx(record, na=2, nb=2)
+    assert told._unstable(plain) is None
+    # Five standard deviations of this number, over eight seeds, are 0.001.
+    assert np.abs(plain.estimate.poles).max() < 0.999
+    # What the square law of the magnet leaves of the linear model at this amplitude.
+    assert told._unstable(cid.fit_arx(perfect, na=2, nb=2)) == pytest.approx(bench.pole, rel=5e-3)
+    known = cid.fit_arx(record, na=2, nb=2, constraints=[cid.ReciprocalPoles()])
+    assert known.estimate["a2"] == 1.0
+    assert 0.7 < told._unstable(known) / bench.pole < 0.9
+
+
+def chapters(**settings):
+    return {s.title: s for s in told.story(samples=2000, **settings)}
+
+
+def test_without_noise_the_story_does_not_speak_of_its_harm():
+    sections = chapters(noise=0.0)
+    plain, known = sections[told.TITLES[3]].text, sections[told.TITLES[4]].text
+    assert "It finds the unstable pole at +25." in plain
+    assert "NO POLE" not in plain
+    assert "perfect sensor" not in plain
+    assert "bias" not in known
+    assert "the promise holds" in sections[told.TITLES[6]].text
+    assert "gain of the model" not in sections[told.TITLES[6]].text
+
+
+def test_a_model_on_its_bound_is_called_so():
+    text = chapters(noise=0.5)[told.TITLES[4]].text
+    assert "THE MODEL SITS ON ITS BOUND, as the paper's equation (8) does" in text
+
+
+def test_a_refused_redesign_is_reported(monkeypatch):
+    monkeypatch.setattr(told, "WANTED", (5.0, 89.0))
+    section = chapters(noise=0.0)[told.TITLES[6]]
+    assert section.text.count("it is REFUSED: ") == 2
+    assert section.result is None
+    assert section.figures == {}

@@ -1,0 +1,323 @@
+"""Pictures: units and legends that say what is drawn, refusals in words, nothing global changed."""
+
+from dataclasses import replace
+
+import control as ct
+import matplotlib as mpl
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+import ctrlid as cid
+from ctrlid import _pictures, plot
+
+DT = 0.01
+
+
+@pytest.fixture(scope="module")
+def loop():
+    return cid.Loop(cid.plants.servo(m=1.0, c=2.0, k=3.0), 5.0, dt=DT)
+
+
+@pytest.fixture(scope="module")
+def record(loop):
+    r = cid.random_binary(1000, amplitude=0.1, hold=50, seed=1)
+    made = cid.simulate(loop, r, sensor_noise=2e-3, seed=2)
+    return replace(made, units={"r": "m", "u": "V", "y": "m"})
+
+
+@pytest.fixture(scope="module")
+def comparison(record, loop):
+    return cid.compare(record, loop)
+
+
+@pytest.fixture(scope="module")
+def outcome():
+    plant = cid.plants.maglev(m=0.0213, K=3.34e-6)
+    op = cid.operating_point(plant, output=0.012)
+    base = cid.Loop(plant, None, dt=0.001, at=op)
+    return cid.redesign(cid.linearize(plant, op), base, crossover=100, phase_margin=50)
+
+
+def legend(ax):
+    return [text.get_text() for text in ax.get_legend().get_texts()]
+
+
+def labels(ax):
+    return ax.get_xlabel(), ax.get_ylabel()
+
+
+def test_nothing_global_is_changed(record, comparison):
+    before = dict(mpl.rcParams)
+    plot.record(record)
+    plot.png(plot.comparison(comparison))
+    import matplotlib.pyplot as plt
+
+    assert plt.get_fignums() == []
+    assert dict(mpl.rcParams) == before
+
+
+def test_record_has_names_and_units(record):
+    top, bottom = plot.record(record)
+    assert top.get_ylabel() == f"{record.names['y']} [m]"
+    assert bottom.get_ylabel().endswith("[V]")
+    assert bottom.get_xlabel() == "time [s]"
+    assert [text.split()[0] for text in legend(top)] == ["measured", "reference"]
+    assert legend(bottom)[0].startswith("input")
+
+
+def test_record_says_where_no_unit_is_known(record):
+    top, bottom = plot.record(replace(record, units={}))
+    assert top.get_ylabel().endswith("[unit not given]")
+    assert bottom.get_ylabel().endswith("[unit not given]")
+
+
+@pytest.mark.parametrize(
+    ("size", "unit", "expected"),
+    [(0.03, "m", (1e3, "mm")), (7.5, "V", (1, "V")), (2e-5, "m", (1e6, "µm")),
+     (3e-9, "A", (1e9, "nA")), (0.03, "rad", (1, "rad")), (0.0, "m", (1, "m"))],
+)  # fmt: skip
+def test_units_get_the_prefix_people_use(size, unit, expected):
+    factor, text = _pictures.scale([np.array([-size, 0.0])], unit)
+    assert (pytest.approx(factor), text) == expected
+
+
+def test_record_without_reference_and_with_extra_channels(record):
+    made = cid.Record(
+        u=record.u, y=record.y, dt=DT, extra={"current": record.u}, units={"current": "A"}
+    )
+    axes = plot.record(made, extra="current")
+    assert len(axes) == 3
+    assert axes[2].get_ylabel() == "current [A]"
+    assert legend(axes[0]) == ["measured y"]
+    with pytest.raises(
+        cid.CtrlidError, match=r"no extra channel \['speed'\]; it has \['current'\]"
+    ):
+        plot.record(made, extra=["speed"])
+
+
+def test_long_records_keep_every_peak():
+    n = 45_000
+    y = np.zeros(n)
+    y[12_345] = 1.0
+    r = np.where(np.arange(n) // 100 % 2, 0.2, -0.2)
+    top, bottom = plot.record(cid.Record(r=r, u=y, y=y, dt=0.005))
+    assert all("range" in text for text in (*legend(top), *legend(bottom)))
+    for ax in (top, bottom):
+        band = ax.collections[0].get_paths()[0].vertices
+        assert band[:, 1].max() == 1.0
+        assert len(band) < 4 * 1600
+    high, low = (line.get_ydata() for line in top.get_lines())
+    assert set(high) == {0.2}
+    assert set(low) == {-0.2}
+
+
+def test_stretches_that_do_not_count_are_shaded(record):
+    valid = np.ones(len(record), bool)
+    valid[100:200] = valid[500:600] = False
+    top, bottom = plot.record(replace(record, valid=valid))
+    for ax in (top, bottom):
+        spans = [patch.get_x() for patch in ax.patches]
+        assert spans == pytest.approx([1.0, 5.0])
+        assert legend(ax).count("does not count") == 1
+
+
+def test_given_axes_are_drawn_on_and_returned(record, comparison):
+    axes = plot.figure(2, 2)
+    assert list(plot.record(record, axes[:, 0])) == list(axes[:, 0])
+    assert plot.comparison(comparison, axes[0, 1]) is axes[0, 1]
+    with pytest.raises(cid.CtrlidError, match="needs 2 matplotlib Axes; given 1"):
+        plot.record(record, axes[0, 0])
+    with pytest.raises(cid.CtrlidError, match="needs 1 matplotlib Axes; given 1: str"):
+        plot.comparison(comparison, "here")
+
+
+def test_comparison_labels_every_curve(comparison):
+    ax = plot.comparison(comparison)
+    text = legend(ax)
+    assert text[0].startswith("measured")
+    assert len(text) == 1 + len(comparison.curves)
+    for label, curve in zip(text[1:], comparison.curves, strict=True):
+        assert label == f"{curve.label}: fit {curve.fit:.1f} %"
+        assert "prediction" in label or "simulation" in label
+    assert ax.get_ylabel().endswith("m]")
+    assert ax.get_xlabel().startswith("time [s], ")
+    assert ax.get_xlabel().endswith("of a record of 10 s")
+
+
+def test_comparison_window(comparison):
+    ax = plot.comparison(comparison, window=(2, 3))
+    t = ax.get_lines()[0].get_xdata()
+    assert (t[0], len(t)) == (pytest.approx(2), 100)
+    with pytest.raises(cid.CtrlidError, match="fewer than 2 samples lie between 20 and 30 s"):
+        plot.comparison(comparison, window=(20, 30))
+
+
+def test_default_window_is_lively_and_usual(comparison):
+    y = np.array(comparison.record.y)
+    y[:700] = y[0]
+    moved = replace(comparison, record=replace(comparison.record, y=y))
+    assert _pictures.telling(moved) > 400
+    short = replace(comparison, record=comparison.record[:100])
+    assert _pictures.telling(short) == 0
+
+
+def test_a_curve_far_away_leaves_the_measurement_readable(comparison):
+    far = replace(comparison.curves[-1], y=comparison.curves[-1].y + 100)
+    ax = plot.comparison(replace(comparison, curves=(*comparison.curves[:-1], far)))
+    assert legend(ax)[-1].endswith("outside this picture")
+    low, high = ax.get_ylim()
+    assert high - low < 3 * 1e3 * np.ptp(comparison.record.y)
+
+
+def test_predictions_of_every_few_samples_are_connected(comparison):
+    curve = comparison.curves[1]
+    sparse = np.where(np.arange(len(curve.y)) % 3 == 0, curve.y, np.nan)
+    ax = plot.comparison(replace(comparison, curves=(replace(curve, y=sparse),)), window=(2, 5))
+    assert np.isfinite(ax.get_lines()[1].get_ydata()).all()
+
+
+def test_residuals_have_bands_and_verdicts(comparison):
+    axes = plot.residuals(comparison)
+    assert len(axes) == len(comparison.tests) == 3
+    for ax, test in zip(axes, comparison.tests, strict=True):
+        assert ax.get_ylabel() == "correlation [1]"
+        assert ax.get_title(loc="left").startswith(test.name)
+        assert ax.patches[0].get_y() == pytest.approx(-test.band)
+    assert axes[-1].get_xlabel() == "lag [samples]"
+    assert "99 % band of chance" in legend(axes[0])
+
+
+def test_residuals_mark_what_is_no_chance(comparison):
+    test = comparison.tests[0]
+    bad = replace(test, values=np.full_like(test.values, 0.5), p_value=1e-20)
+    endless = replace(test, band=np.inf)
+    axes = plot.residuals(replace(comparison, tests=(bad, endless)))
+    assert axes[0].get_title(loc="left").endswith("NOT CHANCE (p < 0.0001)")
+    assert "outside" in legend(axes[0])
+    assert not axes[1].patches
+
+
+def test_poles_in_the_z_plane():
+    P = ct.tf(-2.6, [1, 0, -654])
+    G = ct.tf([1, 1], [1, -2.01, 1], 0.005)
+    ax = plot.poles({"fit": G}, truth=P)
+    assert labels(ax) == ("real part of z [1]", "imaginary part of z [1]")
+    outer, inner = (np.exp(s * np.sqrt(654) * 0.005) for s in (1, -1))
+    assert legend(ax) == ["fit: 1.105, 0.9049", f"physics: {outer:.4g}, {inner:.4g}"]
+    assert ax.get_xlim()[0] < 0.9 < 1.0 < 1.14 < ax.get_xlim()[1]
+
+
+def test_poles_of_a_fit_are_those_of_its_estimate(record):
+    G = cid.fit_arx(record, na=2, nb=2)
+    assert len(legend(plot.poles({"fit": G}))) == 1
+
+
+def test_poles_in_the_s_plane():
+    ax = plot.poles({"a": ct.tf(1, [1, 2, 10]), "b": ct.tf(1, [1, 0])})
+    assert labels(ax) == ("real part of s [rad/s]", "imaginary part of s [rad/s]")
+    assert legend(ax) == ["a: -1+3j, -1-3j", "b: 0"]
+
+
+@pytest.mark.parametrize("draw", [plot.poles, plot.bode])
+@pytest.mark.parametrize(
+    ("models", "words"),
+    [({}, "at least one model"), ([1], "takes a mapping from labels to models"),
+     ({"a": 3}, "'a' must be a TransferFunction or StateSpace; given int"),
+     ({"a": ct.ss(np.zeros((1, 1)), np.zeros((1, 2)), np.zeros((1, 1)), np.zeros((1, 2)))},
+      "'a' must have one input and one output")],
+)  # fmt: skip
+def test_models_are_checked(draw, models, words):
+    with pytest.raises(cid.CtrlidError, match=words):
+        draw(models)
+
+
+def test_poles_that_do_not_compare_are_refused():
+    one, other = ct.tf(1, [1, 0.5], 0.1), ct.tf(1, [1, 0.5], 0.2)
+    with pytest.raises(cid.CtrlidError, match=r"different sampling periods .*a: 0.1 s, b: 0.2 s"):
+        plot.poles({"a": one, "b": other})
+    with pytest.raises(cid.CtrlidError, match="none of the models has a pole"):
+        plot.poles({"gain": ct.tf(2, 1)})
+
+
+def test_bode_ends_at_the_nyquist_frequency():
+    G = ct.tf([1, 1], [1, -2.01, 1], 0.005)
+    magnitude, phase = plot.bode({"P": ct.tf(-2.6, [1, 0, -654]), "G": G})
+    assert magnitude.get_ylabel() == "magnitude [dB]"
+    assert labels(phase) == ("frequency [rad/s]", "phase [deg]")
+    assert legend(magnitude) == ["P", "G", "Nyquist frequency"]
+    drawn = magnitude.get_lines()[1].get_xdata()
+    assert 0.9 * np.pi / 0.005 < drawn[-1] < np.pi / 0.005
+
+
+def test_bode_phase_runs_on_without_jumps():
+    lag = ct.tf(1, [1, 0.1, 1])
+    _, phase = plot.bode({"four lags": lag**4, "one": lag}, omega=np.geomspace(0.01, 100, 2000))
+    first, second = (line.get_ydata() for line in phase.get_lines())
+    assert (first[0], first[-1]) == (pytest.approx(0, abs=2), pytest.approx(-720, abs=2))
+    assert second[-1] == pytest.approx(-180, abs=2)
+    assert np.abs(np.diff(first)).max() < 90
+
+
+def test_bode_starts_on_the_usual_sheet():
+    _, phase = plot.bode({"double integrator": ct.tf(1, [1, 0, 0])})
+    assert phase.get_lines()[0].get_ydata()[0] == pytest.approx(-180)
+    _, phase = plot.bode({"minus": ct.tf(-1, [1, 1])}, omega=[1e-4, 1.0])
+    assert phase.get_lines()[0].get_ydata()[0] == pytest.approx(-180, abs=0.1)
+
+
+def test_bode_magnitude_is_that_of_the_model():
+    magnitude, _ = plot.bode({"gain": ct.tf(10, 1), "sampled gain": ct.tf(1, 1, 0.1)})
+    assert magnitude.get_lines()[0].get_ydata() == pytest.approx(20)
+
+
+@pytest.mark.parametrize("omega", [[1.0], [0.0, 1.0], [-1.0, 2.0], [1.0, np.nan]])
+def test_bode_refuses_frequencies(omega):
+    with pytest.raises(cid.CtrlidError, match="two positive frequencies in rad/s"):
+        plot.bode({"a": ct.tf(1, [1, 1])}, omega=omega)
+
+
+def test_bode_leaves_out_a_model_sampled_too_slowly_for_the_frequencies():
+    slow = ct.tf(1, [1, 0.5], 1.0)
+    magnitude, _ = plot.bode({"slow": slow, "P": ct.tf(1, [1, 1])}, omega=[10, 100])
+    assert legend(magnitude) == ["P", "Nyquist frequency"]
+
+
+def test_step_shows_promise_and_achievement(outcome):
+    ax = plot.step(outcome)
+    assert labels(ax) == ("time after the step [s]", "output per step of the reference [1]")
+    promised, achieved = legend(ax)
+    assert promised.startswith(
+        f"promised on the model: {outcome.promised.overshoot:.0f} % overshoot"
+    )
+    assert achieved.startswith("achieved on the physics: ")
+
+
+def test_step_says_when_the_physics_is_lost(outcome):
+    lost = replace(outcome.achieved, stable=False)
+    ax = plot.step(replace(outcome, achieved=lost, achieved_step=np.empty(0)))
+    assert legend(ax)[1] == "achieved on the physics: UNSTABLE, the simulation breaks off"
+    never = replace(outcome.promised, settling_time=np.inf)
+    assert plot.step(replace(outcome, promised=never)).get_xlim()[1] >= outcome.time[-1]
+
+
+@pytest.mark.parametrize(
+    ("draw", "words"),
+    [(plot.record, "plot.record draws a Record; given int"),
+     (plot.comparison, "draws a Comparison, as compare"), (plot.residuals, "draws a Comparison"),
+     (plot.step, "plot.step draws a Redesign, as redesign")],
+)  # fmt: skip
+def test_wrong_results_are_refused(draw, words):
+    with pytest.raises(cid.CtrlidError, match=words):
+        draw(3)
+
+
+def test_png_of_figures_and_axes(record):
+    axes = plot.record(record)
+    for drawn in (axes, axes[0], axes[0].figure):
+        assert plot.png(drawn, dpi=50).startswith(b"\x89PNG")
+    assert plot.png(axes, dpi=50) == plot.png(axes, dpi=50)
+    for wrong in (3, [], None):
+        with pytest.raises(cid.CtrlidError, match=r"png\(\) takes a figure or axes"):
+            plot.png(wrong)
+    assert isinstance(axes[0].figure, Figure)
