@@ -4,11 +4,11 @@ import os
 import sys
 import warnings
 
-import matplotlib
+import matplotlib as mpl
 
 import ctrlid
 
-matplotlib.use("Agg")
+mpl.use("Agg")
 # The stories run on simulated data, and a warning in one of them is an error in the manual.
 warnings.filterwarnings("error", category=ctrlid.CtrlidWarning)
 os.environ.setdefault("SOURCE_DATE_EPOCH", "0")
@@ -16,7 +16,7 @@ sys.path.insert(0, os.path.dirname(__file__))
 
 project = "ctrlid"
 author = "the ctrlid authors"
-copyright = "the ctrlid authors"  # noqa: A001
+copyright = "the ctrlid authors"
 release = ctrlid.__version__
 version = release
 
@@ -30,7 +30,8 @@ extensions = [
 templates_path = ["_templates"]
 exclude_patterns = ["_build", "**/GALLERY_HEADER.rst"]
 nitpicky = False
-default_role = "autolink"  # `name` is a link to the API where there is one, else code
+default_role = "py:obj"  # `name` is a link to the API where there is one, else code
+rst_prolog = ".. currentmodule:: ctrlid\n\n"
 highlight_language = "python"
 pygments_style = "friendly"
 
@@ -79,4 +80,4 @@ html_theme_options = {
     "secondary_sidebar_items": ["page-toc"],
     "header_links_before_dropdown": 7,
 }
-html_sidebars = {"index": [], "which_one_when": [], "paper": []}
+html_sidebars = {page: [] for page in ("index", "which_one_when", "paper", "extend", "gallery/**")}

@@ -2,9 +2,9 @@ r"""
 A lead compensator for a levitated ball
 =======================================
 
-A steel ball hangs 12 mm below an electromagnet. Left alone it falls, or jumps to the magnet. A lead
-compensator holds it. This story goes from the physics to the controller, and checks the margins that
-were asked for.
+A steel ball hangs 12 mm below an electromagnet. Left alone it falls, or jumps to the magnet. A
+lead compensator holds it. This story goes from the physics to the controller, and checks the
+margins that were asked for.
 """
 
 import control as ct
@@ -26,8 +26,8 @@ print(op)
 print(P)
 
 # %%
-# The poles lie symmetrically about the imaginary axis, at plus and minus the square root of 2 g / x0.
-# Note the minus sign of the gain: more voltage lifts the ball, and the gap x gets smaller.
+# The poles lie symmetrically about the imaginary axis, at plus and minus the square root of 2 g /
+# x0. Note the minus sign of the gain: more voltage lifts the ball, and the gap x gets smaller.
 
 print("poles [rad/s]:", P.poles().real.round(3))
 print("sqrt(2 g/x0): ", round(float(np.sqrt(2 * 9.81 / 0.012)), 3))
@@ -35,17 +35,19 @@ print("sqrt(2 g/x0): ", round(float(np.sqrt(2 * 9.81 / 0.012)), 3))
 # %%
 # The compensator
 # ---------------
-# `design_lead` takes the gain crossover in rad/s and the phase margin in degrees, and gives the lead
-# that has exactly these. It finds the sign of the gain by itself.
+# `design_lead` takes the gain crossover in rad/s and the phase margin in degrees, and gives the
+# lead that has exactly these. It finds the sign of the gain by itself.
 
 C = cid.design_lead(P, crossover=100.0, phase_margin=50.0)
 print(C)
 margins = cid.loop_margins(C * P)
 print(f"crossover {margins.crossover:.3f} rad/s, phase margin {margins.phase_margin:.3f} deg")
-print(f"stable with the loop gain times {margins.gain_reduction_margin:.3f} to {margins.gain_margin}")
+low, high = margins.gain_reduction_margin, margins.gain_margin
+print(f"stable with the loop gain times {low:.3f} to {high}")
 
 # %%
-# The last line matters for an unstable plant: the loop fails when its gain becomes too *small*, too.
+# The last line matters for an unstable plant: the loop fails when its gain becomes too *small*,
+# too.
 #
 # Not every wish can be granted. A refusal says why, and what is possible instead.
 
@@ -58,8 +60,8 @@ except cid.CtrlidError as refusal:
 # The loop on the nonlinear physics
 # ---------------------------------
 # A step of the reference by 0.2 mm, once by the linear model and once on the equations of the
-# physics. The compensator has no integrator, and the plant's gain at rest is finite: the ball moves
-# farther than it was asked to. Both say so.
+# physics. The compensator has no integrator, and the plant's gain at rest is finite: the ball
+# moves farther than it was asked to. Both say so.
 
 loop = cid.Loop(plant, C, dt=0.0005, at=op)
 n, height = 200, 2e-4

@@ -2,9 +2,9 @@ r"""
 Tutorial: from a CSV log to a redesigned controller
 ===================================================
 
-You have a levitation rig that works, a CSV file that its data logger wrote, and the wish for a better
-controller. This tutorial goes all the way: read the log, look at it, write down what you know, fit,
-validate, redesign, and see what the new controller achieves.
+You have a levitation rig that works, a CSV file that its data logger wrote, and the wish for a
+better controller. This tutorial goes all the way: read the log, look at it, write down what you
+know, fit, validate, redesign, and see what the new controller achieves.
 """
 
 import tempfile
@@ -29,12 +29,13 @@ lead_on_the_rig = ct.tf([-2605.0, 2305.0], [1.0, -0.1957], dt)
 
 
 def write_log():
+    """Simulate the rig and write what its logger writes."""
     rig = cid.plants.maglev(m=0.0213, K=3.34e-6)
     at = cid.operating_point(rig, output=0.012)
     r = cid.random_binary(6000, amplitude=1e-4, hold=8, around=0.012, seed=1)
     log = cid.simulate(cid.Loop(rig, lead_on_the_rig, dt=dt, at=at), r, sensor_noise=3e-6, seed=2)
     columns = np.column_stack([log.t, log.r, log.u, log.y])
-    header = "time [s],reference [m],voltage [V],gap [m]"
+    header = "time [s],setpoint [m],voltage [V],gap [m]"
     np.savetxt(path, columns, fmt=["%.3f", "%.7f", "%.4f", "%.7f"], delimiter=",",
                header=header, comments="")  # fmt: skip
 
@@ -45,29 +46,25 @@ print("\n".join(path.read_text().splitlines()[:4]))
 # %%
 # 1. Read the log
 # ---------------
-# `Record.from_csv` needs the names of the columns. It finds the sampling period from the time column
-# and would complain about gaps, jitter or a clock that runs backwards. Units in brackets are kept.
+# `Record.from_csv` needs the names of the columns. It finds the sampling period from the time
+# column and would complain about gaps, jitter or a clock that runs backwards. Units in brackets
+# are kept.
 
-record = cid.Record.from_csv(path, r="reference", u="voltage", y="gap", time="time")
+record = cid.Record.from_csv(path, r="setpoint", u="voltage", y="gap", time="time")
 print(record)
 
 # %%
-# All values are absolute: metres and volts as logged, no means removed. ctrlid needs it that way, since
-# an operating point is a matter of absolute values.
+# All values are absolute: metres and volts as logged, no means removed. ctrlid needs it that way,
+# since an operating point is a matter of absolute values.
 #
 # 2. Look at it
 # -------------
-# The gap stays within a fraction of a millimetre of 12 mm, so a linear model is a fair description. And
-# the reference moves all the time; without that, nothing could be learnt in closed loop.
+# The gap stays within a fraction of a millimetre of 12 mm, so a linear model is a fair
+# description. And the reference moves all the time; without that, nothing could be learnt in
+# closed loop.
 
-first = record.between(0, 1)
-fig, (above, below) = plt.subplots(2, 1, figsize=(8, 4), sharex=True, layout="constrained")
-above.step(first.t, 1e3 * first.r, "0.6", where="post", label="reference")
-above.plot(first.t, 1e3 * first.y, "k", lw=1, label="measured gap")
-above.set(ylabel="gap [mm]")
-above.legend(loc="upper right")
-below.step(first.t, first.u, "k", where="post", lw=1)
-below.set(xlabel="time [s]", ylabel="voltage [V]")
+fig, axes = plt.subplots(2, 1, figsize=(8, 4.6), sharex=True, layout="constrained")
+cid.plot.record(record.between(0, 1), axes)
 plt.show()
 
 # %%
@@ -80,22 +77,25 @@ expected = np.sqrt(2 * 9.81 / record.y.mean())
 print(f"expected p = {expected:.2f} rad/s, p times sampling period = {expected * dt:.2f}")
 
 # %%
-# The product is between 0.2 and 0.5: the sampling period suits. That there is one pole at +p and one
-# at -p is the constraint `ReciprocalPoles`; see :doc:`/which_one_when` for other plants.
+# The product is between 0.2 and 0.5: the sampling period suits. That there is one pole at +p and
+# one at -p is the constraint `ReciprocalPoles`; see :doc:`/which_one_when` for other plants.
 #
 # 4. Fit
 # ------
 # The first half is for fitting, the second for validation. Two poles, two numerator coefficients.
+# The reference is in the log, so `fit_iv` can use it as an instrument; without it, `fit_arx`.
 
 fitting, validation = record.split(0.5)
-G = cid.fit_arx(fitting, na=2, nb=2, constraints=[cid.ReciprocalPoles()])
+G = cid.fit_iv(fitting, na=2, nb=2, constraints=[cid.ReciprocalPoles()])
 print(G.estimate)
 
 # %%
 # What to look for in this report: a pole outside the unit circle; no active bound; poles near the
-# expected ones. Nothing is in capitals. For comparison, the fit without the constraint:
+# expected ones, within two standard errors. Nothing is in capitals. For comparison, plain least
+# squares without the constraint:
 
-print("free fit, poles [rad/s]:", cid.fit_arx(fitting, na=2, nb=2).estimate.poles_s.real.round(2))
+plain = cid.fit_arx(fitting, na=2, nb=2)
+print("plain least squares, poles [rad/s]:", plain.estimate.poles_s.real.round(2))
 
 # %%
 # 5. Validate
@@ -105,17 +105,21 @@ print("free fit, poles [rad/s]:", cid.fit_arx(fitting, na=2, nb=2).estimate.pole
 print(cid.compare(validation, G))
 
 # %%
-# The tests find the errors not white. With this noise that is expected of an ARX model: it describes
-# sensor noise as if it came in at the plant's equation. The physics in its own loop has no such
-# trouble. For a known mass even the magnet constant K follows from the log: over a long time the
-# mean acceleration is zero, so the mean of K V^2/x^2 is the weight. (The mean of the *square*: the
-# square of the mean voltage is less, and would be wrong by the variance of the voltage.)
+# The tests find the errors not white. That is expected of a transfer function with sensor noise:
+# it predicts as if the noise came in at the plant's equation. The physics in its own loop has no
+# such trouble. For a known mass even the magnet constant K follows from the log: over a long time
+# the mean acceleration is zero, so the mean of K V^2/x^2 is the weight. (The mean of the
+# *square*: the square of the mean voltage is less, and would be wrong by the variance of the
+# voltage.)
 
 m = 0.0213
 plant = cid.plants.maglev(m=m, K=m * 9.81 / np.mean(record.u**2 / record.y**2))
 loop = cid.Loop(plant, lead_on_the_rig, dt=dt, at=cid.operating_point(plant, output=0.012))
 comparison = cid.compare(validation, loop)
 print(comparison)
+fig, ax = plt.subplots(figsize=(8, 3.8), layout="constrained")
+cid.plot.comparison(comparison, ax)
+plt.show()
 
 # %%
 # Prediction and closed-loop simulation agree with the log to within the sensor noise.
@@ -131,9 +135,9 @@ print(f"loop gain may fall to {old.gain_reduction_margin:.2f} of its value")
 print(f"at rest the ball moves {rest:.2f} mm per mm of reference")
 
 # %%
-# The loop gain is too low: a third less and the ball falls, and a step of the reference is overdone
-# threefold. So we ask for a faster loop. `redesign` designs the lead on the fitted model G and tries
-# it on the nonlinear physics.
+# The loop gain is too low: a third less and the ball falls, and a step of the reference is
+# overdone threefold. So we ask for a faster loop. `redesign` designs the lead on the fitted model
+# G and tries it on the nonlinear physics.
 
 result = cid.redesign(G, loop, crossover=140.0, phase_margin=40.0)
 print(result)
@@ -151,13 +155,14 @@ ax.step(1e3 * before.t, 1e3 * before.y, "0.5", where="post", ls="--", lw=2,
         label="simulation, old controller")  # fmt: skip
 ax.step(1e3 * after.t, 1e3 * after.y, "k", where="post", label="simulation, new controller")
 ax.axhline(12.1, color="k", ls=":", lw=1, label="reference")
-ax.set(xlabel="time [ms]", ylabel="gap [mm]", title="Step of the reference by 0.1 mm, nonlinear physics")
-ax.legend(loc="center right")
+ax.set(xlabel="time [ms]", ylabel="gap [mm]",
+       title="Step of the reference by 0.1 mm, nonlinear physics")  # fmt: skip
+ax.legend(loc="lower right")
 plt.show()
 
 # %%
-# What this story asserts: the fitted pole is within 1 % of the physics, and the new controller has the
-# promised phase margin to within one degree.
+# What this story asserts: the fitted pole is within 1 % of the physics, and the new controller
+# has the promised phase margin to within one degree.
 
 assert abs(G.estimate.poles_s.real.max() / expected - 1) < 0.01
 assert abs(result.achieved.phase_margin - 40) < 1

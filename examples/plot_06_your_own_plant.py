@@ -2,10 +2,10 @@ r"""
 Your own plant: written in numpy, traced, linearized, simulated
 ===============================================================
 
-There is no plant class to learn. A plant is a python-control update function, written as you would
-write it anyway. ctrlid traces it: it calls the function once with symbols and so gets the exact
-equations. Here an active magnetic bearing, with a loop over its two magnets, a `math` function and an
-array filled line by line.
+There is no plant class to learn. A plant is a python-control update function, written as you
+would write it anyway. ctrlid traces it: it calls the function once with symbols and so gets the
+exact equations. Here an active magnetic bearing, with a loop over its two magnets, a ``math``
+function and an array filled line by line.
 """
 
 import math
@@ -20,11 +20,12 @@ import ctrlid as cid
 # %%
 # The plant
 # ---------
-# A rotor between two magnets, each with a bias current. The control voltage raises the current of one
-# and lowers that of the other, through the resistance and inductance of the coils.
+# A rotor between two magnets, each with a bias current. The control voltage raises the current of
+# one and lowers that of the other, through the resistance and inductance of the coils.
 
 
 def bearing(t, x, u, params):
+    """Return the rates of position, velocity and current."""
     position, velocity, current = x
     dx = np.zeros(3)
     force = 0.0
@@ -67,22 +68,26 @@ r = cid.steps(600, levels=[0.0, 2e-5, -2e-5], hold=200)
 record = cid.simulate(loop, r)
 
 # %%
-# Is the simulation right? We hand its voltage at the samples aside and solve the whole loop again, plant
-# and circuit, with scipy at a tight tolerance: the Python function itself, not the traced one.
+# Is the simulation right? We solve the whole loop again, plant and circuit, with
+# scipy at a tight tolerance: the Python function itself, not the traced one.
 
 circuit = ct.ss(C)
 
 
 def whole_loop(t, z, reference):
+    """Return the rates of plant and circuit."""
     error = reference - z[0]
     voltage = op.input + (circuit.C @ z[3:] + circuit.D[0, 0] * error).item()
-    return np.append(bearing(t, z[:3], [voltage], parameters), circuit.A @ z[3:] + circuit.B[:, 0] * error)
+    inside = circuit.A @ z[3:] + circuit.B[:, 0] * error
+    return np.append(bearing(t, z[:3], [voltage], parameters), inside)
 
 
 z, positions = np.zeros(4), []
 for level in (0.0, 2e-5, -2e-5):
     times = np.arange(201) * loop.dt
-    solved = solve_ivp(whole_loop, (0, times[-1]), z, "DOP853", times, args=(level,), rtol=1e-11, atol=1e-15)
+    solved = solve_ivp(
+        whole_loop, (0, times[-1]), z, "DOP853", times, args=(level,), rtol=1e-11, atol=1e-15
+    )
     positions.append(solved.y[0, :-1])
     z = solved.y[:, -1]
 independent = np.concatenate(positions)
@@ -109,6 +114,7 @@ plt.show()
 
 
 def with_stop(t, x, u, params):
+    """Return the rates of a mass that sticks beyond a stop."""
     if x[0] > 0.001:
         return np.array([0.0, 0.0])
     return np.array([x[1], u[0]])
@@ -123,8 +129,8 @@ except cid.CtrlidError as refusal:
     print(message[message.index("a Python 'if'") :])
 
 # %%
-# What this story asserts: the poles are those of the formula, and the simulation agrees with an independent
-# one to better than a millionth.
+# What this story asserts: the poles are those of the formula, and the simulation agrees with an
+# independent one to better than a millionth.
 
 assert abs(P.poles().real.max() / spring - 1) < 1e-9
 assert worst < 1e-6
