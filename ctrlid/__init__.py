@@ -14,6 +14,7 @@ from .constraints import (
     StaticGain,
     SymmetricPoles,
 )
+from .continuous import fit_continuous
 from .controller_redesign import Performance, Redesign, redesign
 from .controllers import PID
 from .data import Record
@@ -66,6 +67,7 @@ __all__ = [
     "datasets",
     "design_lead",
     "fit_arx",
+    "fit_continuous",
     "fit_iv",
     "linearize",
     "loop_margins",

@@ -1,0 +1,212 @@
+"""fit_continuous: exact at any sampling rate, right under feedback, honest about what it knows.
+
+Groups: exact recovery; noise (bias, scatter); analog controllers; delay; structure; several records
+and stretches; refusals.
+"""
+
+from dataclasses import replace
+
+import control as ct
+import numpy as np
+import pytest
+
+import ctrlid as cid
+from ctrlid import CtrlidError
+
+ALPHA, BETA = 1635.0, 6.54
+PLANT = ct.tf([-BETA], [1, 0, -ALPHA], inputs=["V"], outputs=["x"], name="maglev")
+POLE = np.sqrt(ALPHA)
+SYMMETRIC = [cid.SymmetricPoles()]
+
+
+def loop_at(dt, analog=False, plant=PLANT):
+    sampled = ct.tf(ct.sample_system(ct.ss(plant), dt))
+    if analog:
+        C = cid.design_lead(plant, crossover=2.5 * POLE, phase_margin=50)
+    elif POLE * dt > 0.4:
+        C = cid.design_lead(sampled, crossover=1.6 * POLE, phase_margin=25)
+    else:
+        C = cid.design_lead(sampled, crossover=2.2 * POLE, phase_margin=40)
+    return cid.Loop(plant, C, dt=dt)
+
+
+def experiment(loop, n=4000, seed=1, hold=0.02, **noise):
+    held = max(1, round(hold / loop.dt))
+    r = cid.random_binary(n, amplitude=1e-4, hold=held, seed=seed)
+    return cid.simulate(loop, r, seed=seed + 100, **noise)
+
+
+@pytest.mark.parametrize("share", [0.5, 0.2, 0.04, 0.01, 0.001])
+def test_exact_without_noise_at_any_sampling_rate(share):
+    record = experiment(loop_at(share / POLE))
+    G = cid.fit_continuous(record, poles=2, constraints=SYMMETRIC)
+    assert G.dt == 0
+    assert G.estimate["a1"] == 0.0
+    assert G.estimate["a2"] == pytest.approx(-ALPHA, rel=1e-6)
+    assert G.estimate["b1"] == pytest.approx(-BETA, rel=1e-6)
+    assert G.input_labels == ["V"]
+    assert G.output_labels == ["x"]
+
+
+def test_offsets_and_units_do_not_matter():
+    record = experiment(loop_at(0.005), sensor_noise=1e-5)
+    plain = cid.fit_continuous(record, 2, constraints=SYMMETRIC).estimate
+    moved = replace(record, y=1e3 * (record.y + 0.012), u=record.u + 3.0, r=1e3 * record.r)
+    scaled = cid.fit_continuous(moved, 2, constraints=SYMMETRIC).estimate
+    assert scaled["a2"] == pytest.approx(plain["a2"], rel=1e-6)
+    assert scaled["b1"] == pytest.approx(1e3 * plain["b1"], rel=1e-6)
+    assert scaled.standard_errors[1] == pytest.approx(plain.standard_errors[1], rel=1e-3)
+
+
+@pytest.mark.parametrize(("noise", "dt"), [
+    ({"sensor_noise": 1e-5}, 0.005),
+    ({"sensor_noise": 1e-5}, 0.001),
+    ({"sensor_noise": 2e-6, "force_noise": 0.05}, 0.002),
+])  # fmt: skip
+def test_right_within_its_errors_under_feedback_where_least_squares_is_not(noise, dt):
+    loop = loop_at(dt)
+    scatter = []
+    for seed in range(6):
+        record = experiment(loop, seed=seed, **noise)
+        e = cid.fit_continuous(record, 2, constraints=SYMMETRIC).estimate
+        scatter.append([(e["a2"] + ALPHA) / e.standard_errors[1],
+                        (e["b1"] + BETA) / e.standard_errors[2]])  # fmt: skip
+    # Twelve standard normal numbers: the mean square stays below 2.6 in 999 of 1000 cases.
+    assert np.mean(np.square(scatter)) < 2.6
+    if "force_noise" in noise:
+        return  # which least squares takes for its own equation error
+    ls = cid.fit_arx(record, 2, 2, constraints=[cid.ReciprocalPoles()]).estimate
+    rate = np.log(np.max(np.abs(ls.poles))) / dt
+    assert abs(rate**2 - ALPHA) > 5 * e.standard_errors[1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("analog", [False, True])
+def test_intervals_cover_as_promised(analog):
+    """95 % intervals cover 93 to 97 %: run with `pytest -m slow tests/test_continuous.py`."""
+    loop = loop_at(0.005, analog)
+    inside = []
+    for seed in range(1000):
+        record = experiment(loop, n=3000, seed=seed, sensor_noise=1e-5)
+        e = cid.fit_continuous(
+            record, 2, constraints=SYMMETRIC, controller=loop.controller if analog else None
+        ).estimate
+        for name, truth in (("a2", -ALPHA), ("b1", -BETA)):
+            low, high = e.confidence_interval(name)
+            inside.append(low < truth < high)
+    assert 0.93 < np.mean(inside) < 0.97
+
+
+def test_known_analog_controller_is_followed_between_the_samples():
+    """At 5 ms the input of the lead moves within the period, and straight lines miss it."""
+    loop = loop_at(0.005, analog=True)
+    clean = experiment(loop)
+    G = cid.fit_continuous(clean, 2, constraints=SYMMETRIC, controller=loop.controller)
+    assert G.estimate["a2"] == pytest.approx(-ALPHA, rel=1e-6)
+    assert G.estimate["b1"] == pytest.approx(-BETA, rel=1e-6)
+    with pytest.warns(cid.CtrlidWarning, match="give controller= .* or sample faster"):
+        straight = cid.fit_continuous(clean, 2, constraints=SYMMETRIC)
+    assert abs(straight.estimate["a2"] / -ALPHA - 1) > 0.02
+    with pytest.warns(cid.CtrlidWarning, match="fastest pole times dt is 1"):
+        cid.fit_continuous(replace(clean, r=None), 2, constraints=SYMMETRIC,
+                           controller=loop.controller)  # fmt: skip
+    noisy = experiment(loop, sensor_noise=1e-5)
+    e = cid.fit_continuous(noisy, 2, constraints=SYMMETRIC, controller=loop.controller).estimate
+    assert abs(e["a2"] + ALPHA) < 4 * e.standard_errors[1]
+
+
+def test_a_smooth_analog_input_needs_no_controller():
+    plant = ct.tf([2.0], [1, 1.0, 0])
+    loop = cid.Loop(plant, ct.tf([3.0], [1.0]), dt=0.002)
+    r = cid.multisine(6000, amplitude=1.0, band=(0.001, 0.01), seed=1)
+    record = cid.simulate(loop, r)
+    G = cid.fit_continuous(record, 2, constraints=[cid.Integrator()])
+    assert G.estimate["a2"] == 0.0
+    assert G.estimate["a1"] == pytest.approx(1.0, rel=0.02)
+
+
+@pytest.mark.parametrize("delay", [0.0012, 0.005, 0.0131])
+def test_delay_is_estimated_on_request(delay):
+    dt = 0.005
+    late, part = divmod(delay / dt, 1.0)
+    fine = 50  # the exact delayed input at a fifty times finer period
+    plant = ct.tf([4.0], [1, 3.0, 2.0])
+    rng = np.random.default_rng(1)
+    u = np.repeat(rng.choice([-1.0, 1.0], 600), 5)
+    shifted = np.repeat(u, fine)
+    shift = round((late + part) * fine)
+    shifted = np.concatenate([np.full(shift, u[0]), shifted[: len(shifted) - shift]])
+    system = ct.sample_system(ct.ss(plant), dt / fine)
+    y = ct.forced_response(system, np.arange(len(shifted)) * dt / fine, shifted).outputs[::fine]
+    record = cid.Record(u=u, y=y + 1e-4 * rng.standard_normal(len(u)), dt=dt)
+    G = cid.fit_continuous(record, 2, delay=None)
+    assert G.delay == pytest.approx(delay, abs=2e-4)
+    assert "delay" in G.estimate.solver
+    known = cid.fit_continuous(record, 2, delay=delay)
+    assert known.estimate["b1"] == pytest.approx(4.0, rel=0.02)
+
+
+def test_open_loop_third_order_with_a_zero():
+    plant = ct.tf([2.0, 6.0], [1, 7.0, 14.0, 8.0])
+    loop = cid.Loop(plant, None, dt=0.05)
+    d = cid.random_binary(4000, amplitude=1.0, hold=6, seed=1)
+    record = cid.simulate(loop, d=d, sensor_noise=1e-3, seed=2)
+    e = cid.fit_continuous(record, poles=3, zeros=1).estimate
+    for name, truth in zip(e.names, (7.0, 14.0, 8.0, 2.0, 6.0), strict=True):
+        error = e.standard_errors[e.names.index(name)]
+        assert abs(e[name] - truth) < 4.5 * error
+        assert error < 0.1 * truth
+
+
+def test_constraints_hold_exactly():
+    record = experiment(loop_at(0.005), sensor_noise=1e-5)
+    G = cid.fit_continuous(record, 2, constraints=[*SYMMETRIC, cid.StaticGain(0.004)])
+    assert G.estimate["b1"] / G.estimate["a2"] == pytest.approx(0.004, rel=1e-12)
+    bounded = cid.fit_continuous(record, 2, constraints=[*SYMMETRIC, cid.Bounds("b1", -6.0, 0.0)])
+    assert bounded.estimate["b1"] == -6.0
+    assert "SITS ON ITS BOUND" in str(bounded.estimate)
+
+
+def test_records_and_stretches_share_one_model():
+    loop = loop_at(0.005)
+    parts = [experiment(loop, n=1500, seed=s, sensor_noise=1e-5) for s in (1, 2)]
+    shifted = replace(parts[1], y=parts[1].y + 0.01, r=parts[1].r + 0.01, u=parts[1].u + 2.0)
+    both = cid.fit_continuous([parts[0], shifted], 2, constraints=SYMMETRIC).estimate
+    alone = cid.fit_continuous(parts[0], 2, constraints=SYMMETRIC).estimate
+    assert abs(both["a2"] + ALPHA) < 4 * both.standard_errors[1] < 4 * alone.standard_errors[1]
+    broken = np.array(parts[0].y)
+    broken[700:705] = 1.0
+    valid = np.ones(1500, dtype=bool)
+    valid[700:705] = False
+    masked = cid.fit_continuous(replace(parts[0], y=broken, valid=valid), 2, constraints=SYMMETRIC)
+    assert abs(masked.estimate["a2"] + ALPHA) < 4 * masked.estimate.standard_errors[1]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"poles": 0}, "poles must be an integer of at least 1; given 0"),
+        ({"poles": 2, "zeros": 2}, "fewer zeros than poles; given 2 zeros and 2 poles"),
+        ({"poles": 2, "delay": -1.0}, "delay is a time >= 0 s"),
+        ({"poles": 2, "controller": "lead"}, "takes the analog controller of r - y"),
+        ({"poles": 2, "constraints": [cid.Fixed("a9", 1.0)]}, "no such coefficient"),
+        ({"poles": 2, "constraints": [cid.Integrator(), cid.StaticGain(1.0)]}, "contradict"),
+    ],
+)
+def test_what_it_refuses(arguments, words):
+    record = experiment(loop_at(0.005), n=500)
+    with pytest.raises(CtrlidError, match=words):
+        cid.fit_continuous(record, **arguments)
+
+
+def test_data_that_do_not_suffice_are_refused():
+    record = experiment(loop_at(0.005), n=500)
+    with pytest.raises(CtrlidError, match="Too few samples: 20 valid ones"):
+        cid.fit_continuous(record[:20], poles=2)
+    with pytest.raises(CtrlidError, match="no valid stretch"):
+        cid.fit_continuous(replace(record, valid=np.arange(500) % 10 > 0), poles=2)
+    with pytest.raises(CtrlidError, match="u is constant wherever the record counts"):
+        cid.fit_continuous(replace(record, u=np.ones(500)), poles=2)
+    analog = experiment(loop_at(0.005, analog=True), n=500)
+    with pytest.raises(CtrlidError, match="a delay is modelled for a held input only"):
+        cid.fit_continuous(analog, 2, delay=None, controller=loop_at(0.005, True).controller)
