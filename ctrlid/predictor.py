@@ -99,15 +99,15 @@ def _plant_step(loop: Loop, record: Record | None) -> Any:
 def _filter_step(loop: Loop, plant_step: Any) -> Any:
     """Build one sample of the filter with sensor noise of variance one.
 
-    The state is x stacked on the columns of P and on the circuit's state, twice: as it is and as it
-    is at a start. The inputs are those of the plant step, `valid`, `afresh`, and q, the variance
-    of the force relative to that of the sensor.
+    The state is x stacked on the columns of P and on the circuit's state, twice: as it is and as
+    it is at a start. The inputs are those of the plant step, `valid`, `afresh`, the variance of u
+    where it is not known, and q, that of the force; variances are relative to that of the sensor.
     """
     e = loop.equations()
     n, nc = len(e.states), plant_step.size1_in(1)
     size = n + n * n + nc
-    both, v = casadi.SX.sym("z", 2 * size), casadi.SX.sym("v", 8)
-    w, valid, afresh, q = v[:5], v[5], v[6], v[7]
+    both, v = casadi.SX.sym("z", 2 * size), casadi.SX.sym("v", 9)
+    w, valid, afresh, doubt, q = v[:5], v[5], v[6], v[7], v[8]
     z = casadi.if_else(afresh, both[size:], both[:size])
     x, p, xc = z[:n], casadi.reshape(z[n : n + n * n], n, n), z[n + n * n :]
     point = casadi.SX.sym("x", n)
@@ -123,9 +123,12 @@ def _filter_step(loop: Loop, plant_step: Any) -> Any:
     state, circuit, force = casadi.SX.sym("s", n), casadi.SX.sym("k", nc), casadi.SX.sym("f")
     after = plant_step(state, circuit, w, force)[0]
     slopes = casadi.Function("j", [state, circuit, w, force], [
-        casadi.jacobian(after, state), casadi.jacobian(after, force)])  # fmt: skip
-    a, b = slopes(x, xc, w, 0.0)
+        casadi.jacobian(after, state), casadi.jacobian(after, force),
+        casadi.jacobian(after, w[1:3]),
+    ])  # fmt: skip
+    a, b, c = slopes(x, xc, w, 0.0)
     p_after = casadi.mtimes([a, p, a.T]) + q * casadi.mtimes(b, b.T)
+    p_after = p_after + doubt * casadi.mtimes(c, c.T)
     p_after = (p_after + p_after.T) / 2
     x_after, xc_after = plant_step(x, xc, w, 0.0)
     after = casadi.vertcat(x_after, casadi.reshape(p_after, n * n, 1), xc_after, both[size:])
@@ -133,10 +136,12 @@ def _filter_step(loop: Loop, plant_step: Any) -> Any:
 
 
 def _signals(record: Record) -> Array:
-    """Return the rows (t, u, next u, r, y) of a record."""
-    u = np.asarray(record.u)
-    r = record.y if record.r is None else record.r
-    return np.vstack([record.t - record.start, u, np.append(u[1:], u[-1]), r, record.y])
+    """Return the rows (t, u, next u, r, y) of a record, the last value where it is not valid."""
+    last = np.maximum.accumulate(np.where(record.valid, np.arange(len(record)), 0))
+    y = np.asarray(record.y)[last]
+    u = np.asarray(record.u)[last]
+    r = y if record.r is None else np.asarray(record.r)[last]
+    return np.vstack([record.t - record.start, u, np.append(u[1:], u[-1]), r, y])
 
 
 def predict(loop: Loop, record: Record, force_noise: float | None = None) -> Prediction:
@@ -193,12 +198,14 @@ def predict(loop: Loop, record: Record, force_noise: float | None = None) -> Pre
         raise CtrlidError(f"force_noise is a ratio >= 0; given {force_noise!r}")
     plant_step = _plant_step(loop, record)
     step = _filter_step(loop, plant_step)
-    start = np.concatenate([_start(loop, record), np.zeros(plant_step.size1_in(1))])
+    state, noise = _start(loop, record)
+    start = np.concatenate([state, np.zeros(plant_step.size1_in(1))])
     z = np.concatenate([start, start])
     afresh = _fresh_starts(loop, record)
-    w = np.vstack([_signals(record), valid, afresh, np.zeros(len(record))])
+    doubt = np.where(valid, 0.0, (np.std(record.u[valid]) / noise) ** 2)
+    w = np.vstack([_signals(record), valid, afresh, doubt, np.zeros(len(record))])
     ratio = _tune(step, z, w) if force_noise is None else float(force_noise)
-    w[7] = ratio**2
+    w[-1] = ratio**2
     with np.errstate(all="ignore"):
         out = [np.asarray(m, float) for m in step.mapaccum("pass", w.shape[1])(z, w)]
     y, innovations, s = (row[0] for row in out[1:4])
@@ -234,8 +241,11 @@ def _fresh_starts(loop: Loop, record: Record) -> Any:
     return afresh
 
 
-def _start(loop: Loop, record: Record) -> Array:
-    """Return a state at the operating point that the first samples may overrule."""
+def _start(loop: Loop, record: Record) -> tuple[Array, float]:
+    """Return a state at the operating point that the first samples may overrule.
+
+    And the size of the sensor noise, roughly.
+    """
     e, at = loop.equations(), loop.point
     y = record.y[record.valid]
     reach = float(np.std(y)) + abs(float(np.mean(y)) - at.output)
@@ -247,7 +257,7 @@ def _start(loop: Loop, record: Record) -> Array:
     for j in e.velocities:
         wide[j] = speed
     # Variances are relative to that of the sensor noise.
-    return np.concatenate([at.states, np.diag((np.array(wide) / noise) ** 2).ravel()])
+    return np.concatenate([at.states, np.diag((np.array(wide) / noise) ** 2).ravel()]), noise
 
 
 def _tune(step: Any, z: Array, w: Array) -> float:
@@ -261,7 +271,7 @@ def _tune(step: Any, z: Array, w: Array) -> float:
     period = w[0, 1] - w[0, 0]
 
     def cost(log_ratio: float) -> float:
-        w[7] = 10.0 ** (2 * log_ratio)
+        w[-1] = 10.0 ** (2 * log_ratio)
         with np.errstate(all="ignore"):
             e, s = (np.asarray(m, float)[0][known] for m in runner(z, w)[2:4])
         usual = s <= SETTLED * np.median(s)

@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Sequence
+from numbers import Integral
 from typing import Any
 
 import control as ct
@@ -68,7 +69,7 @@ def compare(record: Record, model_or_loop: Any, *, horizon: int | None = None) -
     """
     if not isinstance(record, Record):
         raise CtrlidError(f"compare needs a Record; given {type(record).__name__}")
-    if horizon is not None and not 1 <= horizon < len(record):
+    if horizon is not None and not (isinstance(horizon, Integral) and 1 <= horizon < len(record)):
         raise CtrlidError(
             f"horizon must be between 1 and {len(record) - 1} samples; given {horizon}"
         )
@@ -131,7 +132,7 @@ def _comparison(
 
 
 def _time_constant(poles: Any, dt: float, record: Record) -> int:
-    with np.errstate(divide="ignore"):  # a pole at z = 0 is infinitely fast
+    with np.errstate(divide="ignore", invalid="ignore"):  # a pole at z = 0 is infinitely fast
         rates = (np.log(poles.astype(complex)) / dt if dt else poles).real
     fast = rates[rates > 1e-6] if np.any(rates > 1e-6) else -rates[rates < -1e-6]
     slowest = float(np.min(fast)) if fast.size else 10 / record.duration
@@ -310,9 +311,9 @@ def _arx_ahead(y: Array, driven: Array, den: Array, steps: int, usable: Any) -> 
     for j in range(1, steps + 1):
         drive = np.concatenate([driven[j:], np.full(j, np.nan)])
         new = drive - sum((a * p for a, p in zip(den[1:], past, strict=True)), np.zeros(n))
-        past = [new, *past[:-1]]
+        past = [new, *past][:order]
     ahead = np.full(n, np.nan)
-    ahead[steps:] = past[0][: n - steps] if past else driven[steps:]
+    ahead[steps:] = new[: n - steps]
     window = steps + order
     if n > window:
         whole = np.lib.stride_tricks.sliding_window_view(usable, steps).all(axis=1)

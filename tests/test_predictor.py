@@ -176,8 +176,10 @@ def test_what_is_not_valid_is_not_looked_at():
     np.testing.assert_array_equal(a.innovations, b.innovations)
     assert np.all(a.innovations[~valid] == 0)
     assert not a.settled[~valid].any()
-    # A short gap is bridged, a long one starts the filter afresh.
-    assert a.settled[1505]
+    # A short gap is bridged with an unknown input, a long one starts the filter afresh.
+    assert a.settled[1515:2000].all()
+    np.testing.assert_allclose(a.states[1502], a.states[1500], atol=1e-2)
+    np.testing.assert_array_equal(a.states[2200], [loop.at.output, 0.0])
     assert not a.settled[2400]
     assert a.settled[2420:].all()
     assert a.innovations[a.settled].std() < 1.6 * SENSOR
