@@ -1,12 +1,12 @@
 """redesign(): a controller designed on an identified model, and what it does on the physics."""
 
 from dataclasses import dataclass, replace
+from numbers import Real
 from typing import Any
 
 import control as ct
 import numpy as np
 
-from .data import Record
 from .errors import CtrlidError
 from .lead import design_lead
 from .loop import Loop
@@ -16,6 +16,7 @@ from .simulation import simulate
 from .stepping import growth_rate
 
 SETTLED = 0.02  # band around the final value
+LOST = 20  # times the promised response: no longer under control
 CLOSE = 0.25  # share of a promised phase margin whose loss is worth a word
 
 
@@ -36,7 +37,11 @@ class Performance:
     overshoot : float
         Of a small reference step, in percent of the final value.
     settling_time : float
-        Until the step response stays within 2 % of its final value [s].
+        Until the step response stays within 2 % of its final value [s]; infinite if it never does.
+    final_value : float
+        Of the output per unit of reference: a lead alone leaves a steady error.
+
+    A number that does not exist is NaN.
     """
 
     stable: bool
@@ -45,6 +50,7 @@ class Performance:
     crossover: float
     overshoot: float
     settling_time: float
+    final_value: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,8 +74,10 @@ class Redesign:
     promised_step, achieved_step : ndarray
         Responses to a step of the reference by 1 [output unit per output unit]; what was achieved
         ends early where the simulation broke off.
+    step : float
+        Height of the reference step that was tried on the physics [output unit].
     failure : str
-        Why the simulation on the physics broke off, or empty.
+        Why the physics was not kept stable, or empty.
     """
 
     controller: Any
@@ -81,6 +89,7 @@ class Redesign:
     time: Array
     promised_step: Array
     achieved_step: Array
+    step: float
     failure: str = ""
 
     @property
@@ -92,29 +101,46 @@ class Redesign:
     def verdict(self) -> str:
         """The outcome in words."""
         p, a = self.promised, self.achieved
-        if not a.stable:
-            return ("The controller DOES NOT KEEP THE PHYSICS STABLE: the model is too far from it. "
-                    + self.failure)  # fmt: skip
+        if not a.stable and not np.isfinite(a.phase_margin):
+            return (
+                "The controller DOES NOT KEEP THE PHYSICS STABLE: the model is too far from it. "
+                + self.failure
+            )
         text = (f"Promised {p.phase_margin:.1f} deg at {p.crossover:.4g} rad/s, achieved "
                 f"{a.phase_margin:.1f} deg at {a.crossover:.4g} rad/s on the physics")  # fmt: skip
         loss = p.phase_margin - a.phase_margin
+        shift = a.crossover / p.crossover - 1
         if loss > CLOSE * p.phase_margin:
-            text += f": {loss:.1f} DEGREES OF THE PROMISE ARE LOST"
+            text += f": {loss:.1f} DEGREES OF THE PROMISE ARE LOST."
+        elif abs(shift) > CLOSE:
+            text += f": the margin holds, but THE CROSSOVER IS OFF BY {100 * shift:+.0f} %."
         else:
-            text += ": the promise holds"
+            text += ": the promise holds."
+        if not a.stable:
+            text += (f" That is for small signals: A STEP OF {self.step:.3g} LOSES CONTROL. "
+                     f"{self.failure}")  # fmt: skip
+        elif np.isfinite(p.settling_time) and not np.isfinite(a.settling_time):
+            text += (f" That is for small signals: A STEP OF {self.step:.3g} DOES NOT SETTLE, it "
+                     "meets limits or leaves the nearly linear range.")  # fmt: skip
         sure = "guaranteed" if self.nu_gap < self.robust_margin else "not guaranteed"
-        return (f"{text}. Stability is {sure} by the nu-gap ({self.nu_gap:.3f} against a robust "
-                f"margin of {self.robust_margin:.3f}).")  # fmt: skip
+        return (
+            f"{text} Stability near the operating point is {sure} by the nu-gap "
+            f"({self.nu_gap:.3f} against a robust margin of {self.robust_margin:.3f})."
+        )
 
     def __str__(self) -> str:
         rows = [f"  {'':<24}{'promised':>12}{'achieved':>12}"]
         for label, name, form in (
-            ("phase margin [deg]", "phase_margin", ".2f"), ("gain margin [factor]", "gain_margin", ".3f"),
-            ("crossover [rad/s]", "crossover", ".2f"), ("overshoot [%]", "overshoot", ".2f"),
+            ("phase margin [deg]", "phase_margin", ".2f"),
+            ("gain margin [factor]", "gain_margin", ".3f"),
+            ("crossover [rad/s]", "crossover", ".2f"),
+            ("final value per step", "final_value", ".3f"),
+            ("overshoot [%]", "overshoot", ".2f"),
             ("settling time [s]", "settling_time", ".4f"),
-        ):  # fmt: skip
+        ):
             values = (getattr(self.promised, name), getattr(self.achieved, name))
-            rows.append(f"  {label:<24}" + "".join(f"{v:>12{form}}" for v in values))
+            shown = ("-" if np.isnan(v) else f"{v:{form}}" for v in values)
+            rows.append(f"  {label:<24}" + "".join(f"{v:>12}" for v in shown))
         num, den = (" ".join(f"{c:.6g}" for c in p[0][0])
                     for p in (self.controller.num, self.controller.den))  # fmt: skip
         return "\n".join([f"controller: ({num}) / ({den})", *rows, "  " + self.verdict])
@@ -157,8 +183,8 @@ def redesign(
 
     References
     ----------
-    Vinnicombe, "Frequency domain uncertainty and the graph topology", IEEE Transactions on Automatic
-    Control 38 (1993) 1371-1383.
+    Vinnicombe, "Frequency domain uncertainty and the graph topology", IEEE Transactions on
+    Automatic Control 38 (1993) 1371-1383.
 
     Examples
     --------
@@ -171,7 +197,7 @@ def redesign(
     (True, 50.0)
     """
     if not isinstance(G, ct.TransferFunction | ct.StateSpace):
-        raise CtrlidError(f"redesign needs a linear model (a TransferFunction, as the fits return); "
+        raise CtrlidError("redesign needs a linear model (a TransferFunction, as the fits return); "
                           f"given {type(G).__name__}")  # fmt: skip
     if not isinstance(loop, Loop):
         raise CtrlidError(f"redesign tries the controller on a Loop; given {type(loop).__name__}")
@@ -185,22 +211,25 @@ def redesign(
     height = _height(loop, step)
     # Long enough for the slowest promised pole, at the resolution of the loop.
     length = int(np.clip(60 / (crossover * trial.dt), 20, 50_000))
-    time = np.arange(length) * trial.dt
+    time: Array = np.arange(length, dtype=float) * trial.dt
     promised_step = _linear_step(G, C, time)
-    achieved_step, failure = _physical_step(trial, height, length)
+    achieved_step, failure = _physical_step(trial, height, promised_step)
     promised = _performance(loop_margins(G * C), time, promised_step)
     margins = loop_margins(P * C)
-    achieved = _performance(margins, time, achieved_step)
-    if failure or growth_rate(trial) >= 0:
-        nan = float("nan")
-        achieved = Performance(False, nan, nan, nan, nan, nan)
-        failure = failure or "Small deviations grow."
-    # In units in which the model has gain 1 at the crossover, so that volts per metre do not matter.
+    growth = growth_rate(trial)
+    if growth >= 0 or not margins.stable:
+        achieved = Performance(False, *(float("nan"),) * 6)
+        if "deviations grow" not in failure:
+            failure = f"Small deviations grow at {growth:.3g} 1/s. {failure}".strip()
+    else:
+        achieved = _performance(margins, time, np.empty(0) if failure else achieved_step)
+        achieved = replace(achieved, stable=not failure)
+    # The model has gain 1 at the crossover, so that volts per metre do not matter.
     omega = np.exp(1j * crossover * dt) if dt else 1j * crossover
     unit = float(np.abs(G(omega)))
     return Redesign(C, promised, achieved, nu_gap(G / unit, P / unit),
                     robust_margin(G / unit, C * unit), trial, time, promised_step, achieved_step,
-                    failure)  # fmt: skip
+                    height, failure)  # fmt: skip
 
 
 def _sampled(P: Any, dt: float) -> Any:
@@ -211,7 +240,7 @@ def _sampled(P: Any, dt: float) -> Any:
 def _height(loop: Loop, step: float | None) -> float:
     if step is None:
         return 0.01 * abs(loop.point.output) or 0.01
-    if not (np.isfinite(step) and step != 0):
+    if not isinstance(step, Real) or not np.isfinite(float(step)) or step == 0:
         raise CtrlidError(f"step is the height of the reference step in output units, not zero; "
                           f"given {step!r}")  # fmt: skip
     return float(step)
@@ -222,23 +251,29 @@ def _linear_step(G: Any, C: Any, time: Array) -> Array:
     return np.asarray(ct.forced_response(ct.ss(closed), time, np.ones(len(time))).outputs, float)
 
 
-def _physical_step(loop: Loop, height: float, length: int) -> tuple[Array, str]:
+def _physical_step(loop: Loop, height: float, promised: Array) -> tuple[Array, str]:
     """Return the response to a step less that to no step, per unit of reference."""
-    rest = np.full(length, loop.point.output)
+    rest: Array = np.full(len(promised), loop.point.output)
     try:
         still = simulate(loop, rest)
         moved = simulate(loop, rest + height)
     except CtrlidError as reason:
-        return np.empty(0), str(reason)
-    return _difference(moved, still, height), ""
-
-
-def _difference(moved: Record, still: Record, height: float) -> Array:
-    return np.asarray((moved.y - still.y) / height, dtype=float)
+        text = str(reason)
+        return np.empty(0), text[0].upper() + text[1:] + "."
+    response: Array = np.asarray((moved.y - still.y) / height, dtype=float)
+    far = np.abs(response) > LOST * np.max(np.abs(promised))
+    if not far.any():
+        return response, ""
+    k = int(np.argmax(far))
+    text = f"After {k * loop.dt:.4g} s {moved.names['y']} had run away to {moved.y[k]:.4g}"
+    lower, upper = loop.input_limits
+    if np.any(moved.u[: k + 1] <= lower) or np.any(moved.u[: k + 1] >= upper):
+        text += f", with {moved.names['u']} at its limit ({lower:g}..{upper:g})"
+    return response[: k + 1], text + "."
 
 
 def _performance(margins: Any, time: Array, response: Array) -> Performance:
-    overshoot = settling = float("nan")
+    overshoot = settling = final = float("nan")
     if margins.stable and response.size:
         final = float(np.mean(response[-max(len(response) // 20, 1) :]))
         if final:
@@ -247,4 +282,4 @@ def _performance(margins: Any, time: Array, response: Array) -> Performance:
             last = int(outside[-1]) + 1 if outside.size else 0
             settling = float(time[last]) if last < len(time) else float("inf")
     return Performance(margins.stable, margins.phase_margin, margins.gain_margin,
-                       margins.crossover, overshoot, settling)  # fmt: skip
+                       margins.crossover, overshoot, settling, final)  # fmt: skip

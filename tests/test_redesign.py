@@ -1,0 +1,215 @@
+"""redesign(): what is promised on a model and what the physics does with it.
+
+Groups: exact models; wrong models; limits and large steps; texts; refusals.
+"""
+
+import re
+from dataclasses import replace
+
+import control as ct
+import numpy as np
+import pytest
+
+import ctrlid as cid
+from ctrlid import CtrlidError
+
+PLANT = cid.plants.maglev(m=0.0213, K=3.34e-6)
+AT = cid.operating_point(PLANT, output=0.012)
+P = cid.linearize(PLANT, AT)
+DT = 1e-3
+LOOP = cid.Loop(PLANT, None, dt=DT, at=AT)
+SAMPLED = ct.tf(ct.sample_system(ct.ss(ct.tf(P.num, P.den)), DT))
+NUMBERS = ("phase_margin", "gain_margin", "crossover", "final_value", "overshoot", "settling_time")
+
+
+def gain(factor):
+    return ct.tf(factor * P.num[0][0], P.den[0][0])
+
+
+# --- exact models
+
+
+@pytest.mark.parametrize(("crossover", "margin"), [(100, 50), (70, 40), (200, 65)])
+@pytest.mark.parametrize("model", [P, SAMPLED], ids=["continuous", "discrete"])
+def test_an_exact_model_keeps_its_promise(model, crossover, margin):
+    found = cid.redesign(model, LOOP, crossover=crossover, phase_margin=margin)
+    for side in (found.promised, found.achieved):
+        assert side.stable
+        assert side.phase_margin == pytest.approx(margin, abs=1e-6)
+        assert side.crossover == pytest.approx(crossover, rel=1e-6)
+    assert found.stable
+    assert found.achieved.gain_margin == pytest.approx(found.promised.gain_margin, rel=1e-6)
+    assert found.nu_gap < 1e-6 < found.robust_margin
+    assert "the promise holds" in found.verdict
+    assert "is guaranteed by the nu-gap" in found.verdict
+    assert found.failure == ""
+    assert found.loop.analog is (model is P)
+    assert found.controller.dt == model.dt
+
+
+def test_small_steps_on_the_physics_equal_the_promised_ones():
+    for model in (P, SAMPLED):
+        found = cid.redesign(model, LOOP, crossover=100, phase_margin=50, step=1e-7)
+        assert len(found.time) == len(found.promised_step) == len(found.achieved_step) == 600
+        assert np.abs(found.achieved_step - found.promised_step).max() < 1e-3
+        assert found.achieved.settling_time == found.promised.settling_time
+        assert found.step == 1e-7
+
+
+def test_step_figures_against_python_control():
+    found = cid.redesign(P, LOOP, crossover=100, phase_margin=30)
+    closed = ct.feedback(P * found.controller, 1)
+    info = ct.step_info(closed)
+    assert found.promised.final_value == pytest.approx(float(ct.dcgain(closed)), rel=1e-4)
+    assert found.promised.overshoot == pytest.approx(info["Overshoot"], abs=0.5)
+    assert found.promised.settling_time == pytest.approx(info["SettlingTime"], abs=0.005)
+
+
+def test_a_state_space_model_and_an_identified_one():
+    found = cid.redesign(ct.ss(SAMPLED), LOOP, crossover=100, phase_margin=50)
+    assert found.achieved.phase_margin == pytest.approx(50, abs=1e-5)
+    C = ct.sample_system(cid.design_lead(P, 100, 50), DT, "tustin")
+    r = cid.random_binary(3000, amplitude=1e-5, hold=20, around=AT.output, seed=1)
+    record = cid.simulate(cid.Loop(PLANT, C, dt=DT, at=AT), r)
+    G = cid.fit_arx(record, 2, 2, constraints=[cid.ReciprocalPoles()])
+    found = cid.redesign(G, LOOP, crossover=100, phase_margin=50)
+    assert found.stable
+    assert found.achieved.phase_margin == pytest.approx(50, abs=0.5)
+    assert type(found.controller) is ct.TransferFunction
+
+
+def test_a_sampled_loop_of_another_period():
+    found = cid.redesign(SAMPLED, cid.Loop(PLANT, None, dt=0.02, at=AT), 100, 50)
+    assert found.loop.dt == DT
+
+
+def test_linear_plants_and_a_point_at_zero():
+    plant = ct.tf([2.0], [1.0, 0.0, -9.0], inputs="u", outputs="y")
+    found = cid.redesign(plant, cid.Loop(plant, None, dt=0.01), crossover=8, phase_margin=45)
+    assert found.step == 0.01
+    assert found.stable
+    assert "the promise holds" in found.verdict
+
+
+# --- wrong models
+
+
+def test_a_gain_that_is_a_little_wrong():
+    found = cid.redesign(gain(1.1), LOOP, crossover=100, phase_margin=50)
+    assert found.stable
+    assert 0 < found.nu_gap < found.robust_margin
+    assert found.achieved.crossover < 95
+    assert "the promise holds" in found.verdict
+
+
+def test_a_crossover_that_moves_is_said():
+    found = cid.redesign(gain(1.3), LOOP, crossover=100, phase_margin=50)
+    assert "the margin holds, but THE CROSSOVER IS OFF BY -26 %" in found.verdict
+
+
+def test_lost_degrees_are_said():
+    found = cid.redesign(gain(0.25), LOOP, crossover=100, phase_margin=50)
+    assert found.stable
+    lost = 50 - found.achieved.phase_margin
+    assert f"{lost:.1f} DEGREES OF THE PROMISE ARE LOST" in found.verdict
+    assert "is not guaranteed by the nu-gap (0.600 against a robust margin of 0.208)" in (
+        found.verdict
+    )
+
+
+@pytest.mark.parametrize(
+    ("model", "reason"),
+    [
+        (
+            gain(3.0),
+            r"^Small deviations grow at 5.77 1/s. After 0.319 s x had run away to 0.01591.$",
+        ),
+        (ct.tf(SAMPLED.num[0][0] * 3, SAMPLED.den[0][0], DT), "Small deviations grow at"),
+        (gain(-1.0), r"^The simulation stops at t = 0.032 s .* The closed loop is unstable"),
+    ],
+    ids=["continuous", "discrete", "sign"],
+)
+def test_an_unstable_outcome_is_reported_not_raised(model, reason):
+    found = cid.redesign(model, LOOP, crossover=100, phase_margin=50)
+    assert found.stable is False
+    assert found.promised.stable
+    assert found.promised.phase_margin == pytest.approx(50)
+    assert not found.achieved.stable
+    assert all(np.isnan(getattr(found.achieved, name)) for name in NUMBERS)
+    assert found.nu_gap >= found.robust_margin  # it could not be guaranteed
+    assert "DOES NOT KEEP THE PHYSICS STABLE: the model is too far from it." in found.verdict
+    assert found.verdict.endswith(found.failure)
+    assert re.search(reason, found.failure)
+    assert "nan" not in str(found)
+
+
+# --- limits and large steps
+
+
+def test_limits_that_lose_the_ball_are_not_called_stable():
+    tight = cid.Loop(PLANT, None, dt=DT, at=AT, input_limits=(2.95, 3.05))
+    found = cid.redesign(P, tight, crossover=100, phase_margin=50)
+    assert not found.stable
+    assert found.achieved.phase_margin == pytest.approx(50)  # for small signals
+    assert np.isnan(found.achieved.settling_time)
+    assert "A STEP OF 0.00012 LOSES CONTROL. After " in found.verdict
+    assert "with V at its limit (2.95..3.05)" in found.verdict
+    assert len(found.achieved_step) < len(found.time)
+    small = cid.redesign(P, tight, crossover=100, phase_margin=50, step=1e-6)
+    assert small.stable
+    assert "LOSES" not in small.verdict
+
+
+def test_a_step_too_large_for_the_physics():
+    found = cid.redesign(P, LOOP, crossover=100, phase_margin=50, step=-0.009)
+    assert not found.stable
+    assert "A STEP OF -0.009 LOSES CONTROL. The simulation stops at t = " in found.verdict
+    assert found.achieved_step.size == 0
+
+
+def test_a_response_that_never_settles_is_said():
+    found = cid.redesign(P, LOOP, crossover=100, phase_margin=50)
+    assert np.isfinite(found.achieved.settling_time)
+    hunting = replace(found, achieved=replace(found.achieved, settling_time=float("inf")))
+    assert "A STEP OF 0.00012 DOES NOT SETTLE" in hunting.verdict
+
+
+# --- texts
+
+
+def test_the_report():
+    text = str(cid.redesign(P, LOOP, crossover=100, phase_margin=50)).splitlines()
+    assert text[0] == "controller: (-4890.28 -177992) / (1 274.748)"
+    assert text[1].split() == ["promised", "achieved"]
+    assert text[2].split() == ["phase", "margin", "[deg]", "50.00", "50.00"]
+    assert [line.split("  ")[1] for line in text[2:8]] == [
+        "phase margin [deg]", "gain margin [factor]", "crossover [rad/s]", "final value per step",
+        "overshoot [%]", "settling time [s]",
+    ]  # fmt: skip
+    assert text[-1].startswith("  Promised 50.0 deg at 100 rad/s, achieved 50.0 deg at 100 rad/s")
+
+
+# --- refusals
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda: cid.redesign(PLANT, LOOP, 100, 50), "redesign needs a linear model .*Nonlinear"),
+        (lambda: cid.redesign(P, PLANT, 100, 50), "tries the controller on a Loop; given Nonlin"),
+        (lambda: cid.redesign(P, LOOP, 100, 50, step=0), "height of the reference step .* given 0"),
+        (lambda: cid.redesign(P, LOOP, 100, 50, step=np.nan), "not zero; given nan"),
+        (lambda: cid.redesign(P, LOOP, 100, 50, step="1 mm"), "not zero; given '1 mm'"),
+        (lambda: cid.redesign(P, LOOP, -100, 50), "crossover is -100 rad/s"),
+        (lambda: cid.redesign(SAMPLED, LOOP, 4000, 50), "nothing above pi/dt"),
+        (lambda: cid.redesign(P, LOOP, 100, 200), "phase_margin is 200 degrees"),
+        (lambda: cid.redesign(ct.tf([1], [1, 1]), LOOP, 100, 50), "would need phase removed"),
+        (
+            lambda: cid.redesign(P, cid.Loop(SAMPLED, None, dt=DT), 100, 50),
+            "an analog controller cannot act on a plant in discrete time",
+        ),
+    ],
+)
+def test_refusals(call, words):
+    with pytest.raises(CtrlidError, match=words):
+        call()
