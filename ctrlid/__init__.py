@@ -2,6 +2,7 @@
 
 from . import datasets, plants, plot
 from .arx import fit_arx
+from .comparison import Comparison, Curve
 from .constraints import (
     Bounds,
     Equal,
@@ -26,12 +27,12 @@ from .loop import Loop
 from .margins import Margins, loop_margins, nu_gap, robust_margin
 from .model import Estimate, IdentifiedModel
 from .predictor import Prediction, predict
+from .replay import replay_controller
 from .report import Section, write_report
 from .residuals import Correlation
 from .signals import multisine, prbs, random_binary, steps
-from .replay import replay_controller
 from .simulation import simulate
-from .validation import Comparison, Curve, compare
+from .validation import compare
 
 __version__ = "0.1.0.dev0"
 

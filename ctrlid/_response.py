@@ -42,8 +42,8 @@ def read_response(response: Any, chosen: dict[str, str | None]) -> dict[str, Any
         return others[0] if len(others) == 1 else None
 
     labels = {key: label_of(key) for key in ("r", "u", "y")}
-    for key, label in labels.items():
-        if label is None and (key != "r" or chosen[key] is not None):
+    for key, wanted in labels.items():
+        if wanted is None and (key != "r" or chosen[key] is not None):
             raise CtrlidError(
                 f"say which signal is {key}: given {chosen[key]!r}; the response has the inputs "
                 f"{list(inputs)} and the outputs {list(outputs)}"
