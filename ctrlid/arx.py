@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from . import _text
 from .constraints import AbstractConstraint, check_constraints
-from .data import Record, as_records
+from .data import VISIBLE_MOTION, Record, as_records, input_motion
 from .errors import CtrlidError
 from .model import Estimate, IdentifiedModel, Structure
 from .qp import Cost, NotExcited
@@ -104,6 +105,14 @@ def fit_arx(
         message = _not_excited(regression, trouble.direction)
         raise CtrlidError(message) from None
     estimate = _estimate(regression, found, constrained=bool(known), dt=records[0].dt)
+    share = input_motion(records)
+    if share > VISIBLE_MOTION:
+        note = (
+            f"u MOVES BETWEEN THE SAMPLES (hold='foh', by {100 * share:.0f} % of its spread a "
+            "period), but a difference equation takes it as held: the poles are off. "
+            "Sample faster, or use fit_continuous with the controller."
+        )
+        estimate = replace(estimate, notes=(note,))
     names = records[0].names
     return IdentifiedModel(estimate, inputs=names.get("u", "u"), outputs=names.get("y", "y"))
 

@@ -10,7 +10,7 @@ import numpy as np
 from ._text import listing
 from .constraints import AbstractConstraint, check_constraints
 from .controllers import PID
-from .data import Record, as_records
+from .data import VISIBLE_MOTION, Record, as_records, input_motion
 from .errors import CtrlidError, CtrlidWarning
 from .innovations import Circuit
 from .model import Estimate, IdentifiedModel, Structure
@@ -139,8 +139,8 @@ def _circuit(controller: Any, records: Sequence[Record]) -> Circuit | None:
     ):
         return None  # digital: u is held and known
     if controller is None:
-        moves = max(float(np.std(np.diff(r.u)) / max(np.std(r.u), 1e-300)) for r in records)
-        if records[0].hold == "foh" and moves > FAST_CIRCUIT:
+        moves = input_motion(records)
+        if moves > VISIBLE_MOTION:
             warnings.warn(
                 f"the input of an analog controller moves by {100 * moves:.0f} % of its spread "
                 "from sample to sample and is taken as straight between them; give controller= "

@@ -18,6 +18,8 @@ Hold = Literal["zoh", "foh"]
 SIGNALS = ("r", "u", "y")
 RESERVED = (*SIGNALS, "t", "time", "valid")  # columns of a CSV file
 
+VISIBLE_MOTION = 0.1  # of its spread a period: an input that moves more is not held
+
 
 def _samples(name: str, values: Any) -> Any:
     """Copy a signal to a read-only (n,) float array, or say what is wrong with it."""
@@ -592,3 +594,24 @@ def as_records(data: Any) -> tuple[Record, ...]:
                 "faster one, or give both the hold that is nearer the truth"
             )
     return tuple(records)
+
+
+def input_motion(records: Sequence[Record]) -> float:
+    """Return how far u moves from sample to sample where it is not held, as share of its spread.
+
+    Parameters
+    ----------
+    records : sequence of Record
+        The experiments.
+
+    Returns
+    -------
+    float
+        Zero for held inputs; above `VISIBLE_MOTION` a hold assumption shows in the poles.
+    """
+    shares = [0.0]
+    for record in records:
+        spread = float(np.std(record.u))
+        if record.hold == "foh" and spread:
+            shares.append(float(np.std(np.diff(record.u))) / spread)
+    return max(shares)

@@ -141,6 +141,8 @@ class Estimate:
         Sampling period in seconds; 0 for a continuous model, as in python-control.
     condition : float
         Condition number of the scaled regression that was solved.
+    notes : tuple of str
+        What the user should know before believing the numbers.
     """
 
     structure: Structure
@@ -157,6 +159,7 @@ class Estimate:
     solver: str
     dt: float
     condition: float
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         for field in ("values", "covariance", "intercepts"):
@@ -297,7 +300,7 @@ def _report(e: Estimate) -> str:
 
 
 def _bad_news(e: Estimate) -> list[str]:
-    news = []
+    news = [f"  {note}" for note in e.notes]
     for bound in e.active_bounds:
         free = f": without {bound.constraint} the data would take it to {bound.free:.7g}"
         news.append(

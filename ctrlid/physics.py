@@ -242,7 +242,12 @@ def _explain(system: Any, reason: Exception) -> str:
         line = linecache.getline(user[-1].filename, user[-1].lineno or 0).strip()
         where = f" at line {user[-1].lineno} of {user[-1].filename}" + (f": {line}" if line else "")
     cure = str(reason)
-    if not isinstance(reason, CtrlidError):
+    if isinstance(reason, KeyError) and str(reason).strip("'") not in system.params:
+        cure = (
+            f"it asks for the parameter {reason}, which the system does not have: give "
+            f"params={{{reason}: value}} to ct.nlsys (it has {list(system.params)})"
+        )
+    elif not isinstance(reason, CtrlidError):
         cure = (f"{type(reason).__name__}: {reason}. Write the equations with arithmetic and numpy "
                 "functions of the states, np.where for cases and np.interp for tables")  # fmt: skip
     return f"the equations of {system.name} cannot be traced{where}: {cure}"

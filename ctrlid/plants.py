@@ -18,6 +18,19 @@ def _require_positive(plant: str, **parameters: float) -> None:
             raise CtrlidError(f"{plant} needs {name} > 0 in SI units; given {name}={value!r}")
 
 
+def _plant(
+    name: str, update: Any, inputs: list[str], outputs: list[str], states: list[str],
+    parameters: dict[str, float], units: dict[str, str],
+) -> Any:  # fmt: skip
+    """Return a plant whose output is its first state; simulated records take its units."""
+    system = ct.nlsys(
+        update, lambda t, x, u, params: x[0], inputs=inputs, outputs=outputs, states=states,
+        params={key: float(value) for key, value in parameters.items()}, name=name,
+    )  # fmt: skip
+    system.units = units
+    return system
+
+
 def maglev(m: float, K: float, g: float = 9.81) -> Any:
     r"""Return a ball that hangs below an electromagnet.
 
@@ -65,10 +78,9 @@ def maglev(m: float, K: float, g: float = 9.81) -> Any:
         pull = params["K"] * u[0] ** 2 / gap**2
         return np.array([speed, params["g"] - pull / params["m"]])
 
-    return ct.nlsys(
-        update, lambda t, x, u, params: x[0], inputs=["V"], outputs=["x"], states=["x", "v"],
-        params={"m": float(m), "K": float(K), "g": float(g)}, name="maglev",
-    )  # fmt: skip
+    return _plant(
+        "maglev", update, ["V"], ["x"], ["x", "v"], {"m": m, "K": K, "g": g}, {"V": "V", "x": "m"}
+    )
 
 
 def servo(m: float, c: float, k: float) -> Any:
@@ -109,10 +121,9 @@ def servo(m: float, c: float, k: float) -> Any:
     def update(t: float, x: Any, u: Any, params: Any) -> Any:
         return np.array([x[1], (params["k"] * u[0] - params["c"] * x[1]) / params["m"]])
 
-    return ct.nlsys(
-        update, lambda t, x, u, params: x[0], inputs=["V"], outputs=["x"], states=["x", "v"],
-        params={"m": float(m), "c": float(c), "k": float(k)}, name="servo",
-    )  # fmt: skip
+    return _plant(
+        "servo", update, ["V"], ["x"], ["x", "v"], {"m": m, "c": c, "k": k}, {"V": "V", "x": "m"}
+    )
 
 
 def tank(area: float, outlet: float, k: float, g: float = 9.81) -> Any:
@@ -155,11 +166,8 @@ def tank(area: float, outlet: float, k: float, g: float = 9.81) -> Any:
         drain = params["outlet"] * np.sqrt(2 * params["g"] * level)
         return np.array([(params["k"] * u[0] - drain) / params["area"]])
 
-    return ct.nlsys(
-        update, lambda t, x, u, params: x[0], inputs=["V"], outputs=["h"], states=["h"],
-        params={"area": float(area), "outlet": float(outlet), "k": float(k), "g": float(g)},
-        name="tank",
-    )  # fmt: skip
+    parameters = {"area": area, "outlet": outlet, "k": k, "g": g}
+    return _plant("tank", update, ["V"], ["h"], ["h"], parameters, {"V": "V", "h": "m"})
 
 
 def pendulum(m: float, length: float, c: float = 0.0, g: float = 9.81) -> Any:
@@ -205,9 +213,6 @@ def pendulum(m: float, length: float, c: float = 0.0, g: float = 9.81) -> Any:
         weight = params["m"] * params["g"] * params["length"] * np.sin(x[0])
         return np.array([x[1], (weight - params["c"] * x[1] + u[0]) / inertia])
 
-    return ct.nlsys(
-        update, lambda t, x, u, params: x[0], inputs=["tau"], outputs=["theta"],
-        states=["theta", "omega"],
-        params={"m": float(m), "length": float(length), "c": float(c), "g": float(g)},
-        name="pendulum",
-    )  # fmt: skip
+    parameters = {"m": m, "length": length, "c": c, "g": g}
+    units = {"tau": "N m", "theta": "rad"}
+    return _plant("pendulum", update, ["tau"], ["theta"], ["theta", "omega"], parameters, units)

@@ -85,9 +85,13 @@ def simulate(
     simulator = Simulator(loop)
     y, u = simulator.run(simulator.start(initial), r, d, noise)
     e = loop.equations()
+    signals = {"r": e.outputs[0], "u": e.inputs[0], "y": e.outputs[0]}
+    known = getattr(loop.plant, "units", {})
+    units = {key: known[name] for key, name in signals.items() if name in known}
     return Record(
         r=r, u=u, y=y, dt=loop.dt, hold="foh" if loop.analog else "zoh",
         names={"u": e.inputs[0], "y": e.outputs[0]}, name=e.name,
+        units={k: unit for k, unit in units.items() if k != "r" or r is not None},
     )  # fmt: skip
 
 
@@ -156,6 +160,7 @@ class Simulator:
                 f"{e.name} is not defined at the operating point {loop.point}; give "
                 "at=operating_point(plant, output=...)"
             )
+        self._unstable = loop.controller is None and growth_rate(loop) > 0
         # What a millionth of the operating values does to each state: smaller motion is rest.
         a, b = (np.nan_to_num(np.abs(m)) for m in sensitivity(first, loop.point.output))
         self._floor = 1e-6 * (a @ np.abs(self.rest) + b[:, 2] * abs(loop.point.input))
@@ -202,7 +207,7 @@ class Simulator:
             while True:
                 results = self._runner(substeps, size)(z, block)
                 states, ys, us, errors = (np.asarray(a, float)[:, :count] for a in results)
-                stop = _first_bad(loop, states, ys, us, w)
+                stop = _first_bad(loop, self._unstable, states, ys, us, w)
                 good = count if stop is None else max(stop - 1, 0)
                 travel = np.max(np.abs(states[:, :good] - start[:, None]), axis=1, initial=0.0)
                 moved = np.maximum(reach, travel)
@@ -236,13 +241,17 @@ class Simulator:
         return y, u
 
 
-def _first_bad(loop: Loop, states: Array, ys: Array, us: Array, w: Array) -> int | None:
+def _first_bad(
+    loop: Loop, unstable: bool, states: Array, ys: Array, us: Array, w: Array
+) -> int | None:
     """Index of the first sample at which the loop is no longer where it can be."""
     bad = ~(np.isfinite(states).all(axis=0) & np.isfinite(ys[0]) & np.isfinite(us[0]))
+    rest = loop.point.output
+    asked = max(abs(rest), float(np.abs(w[3]).max()))
     if loop.controller is not None:
-        rest = loop.point.output
-        asked = max(abs(rest), float(np.max(np.abs(w[1] - rest))), 1e-300)
-        asked = max(asked, float(np.abs(w[3]).max()))
+        asked = max(asked, float(np.max(np.abs(w[1] - rest))), 1e-300)
+    # An open loop may travel far, an integrator must; only an unstable plant runs away from rest.
+    if loop.controller is not None or (asked and unstable):
         bad |= np.abs(ys[0] - rest) > RUNAWAY * asked
     return int(np.argmax(bad)) if bad.any() else None
 

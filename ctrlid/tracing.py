@@ -58,7 +58,7 @@ class Symbol:
         op = ELEMENTWISE.get(ufunc.__name__) or OPERATORS.get(ufunc.__name__)
         if method != "__call__" or op is None:
             raise TracingError(
-                f"np.{ufunc.__name__} is not known to the tracing; rewrite it with "
+                f"the function {ufunc.__name__} is not known to the tracing; rewrite it with "
                 "arithmetic, np.where, np.maximum or np.minimum"
             )
         return _elementwise(op)(*inputs)

@@ -122,7 +122,6 @@ figure, axes = plt.subplots(figsize=(6.4, 3.6), layout="constrained")
 milliseconds = [1e3 * T for T in PERIODS]
 axes.axhline(pole, color="black", linewidth=1)
 axes.text(milliseconds[0], pole + 0.8, "physics", va="bottom")
-axes.set_ylim(top=1.25 * pole)
 for rows, marker, label in (
     (in_loop, "o", "sensor noise 10 %"),
     (in_log, "s", "logger noise 30 %"),
@@ -140,6 +139,7 @@ for rows, marker, label in (
         label=f"plain, {label}",
         mfc="white",
     )
+axes.set_ylim(top=1.25 * pole)
 axes.set_xscale("log")
 axes.set_xticks(milliseconds, [f"{T:g}" for T in milliseconds])
 axes.minorticks_off()

@@ -569,3 +569,14 @@ def test_a_constraint_can_stand_in_for_excitation():
     still = replace(record, u=np.full(500, 3.3), r=None)
     estimate = fit_arx(still, 2, 2, constraints=[Fixed("b1", 0.0), Fixed("b2", 0.0)]).estimate
     assert estimate["b1"] == estimate["b2"] == 0.0
+
+
+def test_an_input_that_is_not_held_is_said_in_capitals():
+    rng = np.random.default_rng(0)
+    u, y = rng.standard_normal(300), rng.standard_normal(300)
+    held = fit_arx(Record(u=u, y=y, dt=0.1), 1, 1).estimate
+    smooth = fit_arx(Record(u=u, y=y, dt=0.1, hold="foh"), 1, 1).estimate
+    assert held.notes == ()
+    assert "u MOVES BETWEEN THE SAMPLES (hold='foh'" in str(smooth)
+    slow = Record(u=np.sin(np.arange(300) / 50), y=y, dt=0.1, hold="foh")
+    assert fit_arx(slow, 1, 1).estimate.notes == ()

@@ -314,3 +314,13 @@ def test_agrees_with_python_control_on_an_analog_loop():
     record = cid.simulate(loop, np.full(60, 1.005 * op.output))
     np.testing.assert_allclose(record.y, response.outputs[0], rtol=1e-8)
     np.testing.assert_allclose(record.u, response.outputs[1], rtol=1e-7)
+
+
+def test_records_of_textbook_plants_have_units_and_an_open_fall_is_noticed():
+    loop, op = make(0.02, 0.01, 3.0)
+    assert dict(cid.simulate(loop, np.full(10, op.output)).units) == {"r": "m", "u": "V", "y": "m"}
+    alone = cid.Loop(loop.plant, None, dt=loop.dt, at=op)
+    with pytest.raises(CtrlidError, match=r"x ran away to .* The loop is open"):
+        cid.simulate(alone, d=np.full(5000, -0.01))
+    servo = cid.Loop(cid.plants.servo(m=1.0, c=2.0, k=3.0), None, dt=0.1)
+    assert cid.simulate(servo, d=np.ones(4500)).y[-1] > 600  # an integrator may travel far
