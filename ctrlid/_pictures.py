@@ -98,7 +98,7 @@ def frequencies(models: Mapping[str, Any]) -> Any:
         corners += [c for c in np.abs(places) if c > 1e-6 and (not dt or c < np.pi / dt)]
     corners = corners or [min(limits, default=1.0)]
     top = max(limits) if limits else 10 * max(corners)
-    return np.geomspace(min(0.1 * min(corners), 0.1 * top), top, 600)
+    return np.geomspace(min(0.1 * min(corners), 0.01 * top), top, 600)
 
 
 def chance(p: float) -> str:

@@ -534,8 +534,8 @@ def _trace(ax: Any, record: Record, values: Array, i: int, label: str, held: boo
     low, high = np.minimum.reduceat(values, edges), np.maximum.reduceat(values, edges)
     t, label = record.t[edges], f"{label.strip()}, range"
     if bounded:
-        ax.plot(t, high, label=label, **_line(i))
-        ax.plot(t, low, **_line(i))
+        ax.step(t, high, where="post", label=label, **_line(i))
+        ax.step(t, low, where="post", **_line(i))
         return
     ax.fill_between(t, low, high, color=COLOURS[i], alpha=0.55, linewidth=0.4, label=label)
 

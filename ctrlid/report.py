@@ -36,7 +36,8 @@ th, td { padding: 0.28rem 0.8rem; border-bottom: 1px solid var(--line); text-ali
   vertical-align: top; }
 th:first-child, td:first-child { text-align: left; padding-left: 0.5rem; }
 thead th { background: var(--head); font-weight: 600; }
-tbody th { font-weight: 400; white-space: nowrap; }
+tbody th { font-weight: 400; }
+tbody th, td { white-space: nowrap; }
 figure { margin: 1.2rem 0; }
 figure img { display: block; width: 100%; height: auto; background: #ffffff; padding: 0.6rem;
   border: 1px solid var(--line); border-radius: 6px; }

@@ -1,6 +1,7 @@
 """The main job as a story on an embedded default: from physics to a redesign, with its failures."""
 
 import math
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
@@ -15,12 +16,13 @@ from .comparison import Comparison
 from .constraints import ReciprocalPoles
 from .controller_redesign import Redesign, redesign
 from .data import Record
-from .errors import CtrlidError
+from .errors import CtrlidError, CtrlidWarning
+from .iv import fit_iv
 from .lead import design_lead
 from .linearization import OperatingPoint, linearize, operating_point
 from .loop import Loop
 from .margins import loop_margins
-from .model import IdentifiedModel
+from .model import Estimate, IdentifiedModel
 from .plants import maglev
 from .report import Section
 from .signals import random_binary
@@ -33,6 +35,7 @@ TITLES = (
     "The experiment",
     "Plain least squares",
     "What is known beforehand",
+    "What the noise does not reach",
     "What the noise explains",
     "A new controller from the model",
 )
@@ -46,6 +49,8 @@ HOLD = 25  # samples between tosses: what a closed loop passes on is slow
 WANTED = (120.0, 50.0)  # of the redesign: rad/s, deg
 UNITS = {"r": "m", "u": "V", "y": "m"}
 WORTH_A_WORD = 0.02  # relative error that is more than round-off and chance
+
+Models = dict[str, IdentifiedModel]
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,12 +107,16 @@ def story(*, samples: int = 45_000, noise: float = 0.1, seed: int = 1) -> Iterat
     yield _controller(bench)
     record, perfect = _records(bench, samples, noise, seed)
     yield _experiment(record, noise)
-    plain = fit_arx(record, na=2, nb=2)
-    yield _plain_fit(bench, plain, fit_arx(perfect, na=2, nb=2), noise)
-    known = fit_arx(record, na=2, nb=2, constraints=[ReciprocalPoles()])
-    yield _constrained_fit(bench, plain, known)
-    yield _comparisons(bench, record, plain, known)
-    yield _redesigns(bench, plain, known)
+    models = {"plain": fit_arx(record, na=2, nb=2)}
+    yield _plain_fit(bench, models, fit_arx(perfect, na=2, nb=2), noise)
+    models["constrained"] = fit_arx(record, na=2, nb=2, constraints=[ReciprocalPoles()])
+    yield _constrained_fit(bench, models)
+    with warnings.catch_warnings(record=True) as doubts:
+        warnings.simplefilter("always", CtrlidWarning)
+        models["instruments"] = fit_iv(record, na=2, nb=2, constraints=[ReciprocalPoles()])
+    yield _instruments(bench, models, [str(doubt.message) for doubt in doubts])
+    yield _comparisons(bench, record, models)
+    yield _redesigns(bench, models)
 
 
 def _bench() -> _Bench:
@@ -188,9 +197,8 @@ def _experiment(record: Record, noise: float) -> Section:
                    {"The whole record and its beginning.": axes})  # fmt: skip
 
 
-def _plain_fit(
-    bench: _Bench, plain: IdentifiedModel, perfect: IdentifiedModel, noise: float
-) -> Section:
+def _plain_fit(bench: _Bench, models: Models, perfect: IdentifiedModel, noise: float) -> Section:
+    plain = models["plain"]
     text = """
         y(k) + a1 y(k-1) + a2 y(k-2) = b1 u(k-1) + b2 u(k-2) + c is fitted to all samples by least
         squares, as in equation (5) of the paper, "Identification of a class of unstable
@@ -212,12 +220,12 @@ def _plain_fit(
         With a perfect sensor the same experiment gives {clean:+.2f} rad/s, so noise makes the
         difference. It enters the regressors y(k-1) and y(k-2), and through the controller u as
         well, and least squares takes that for dynamics. More samples do not help."""
-    models = {"plain fit": plain, "plain fit, perfect sensor": perfect}
-    return Section(TITLES[3], _plain_words(text), _coefficients(bench, models), {})
+    table = _coefficients(bench, {"plain": plain, "plain, perfect sensor": perfect})
+    return Section(TITLES[3], _plain_words(text), table, {})
 
 
-def _constrained_fit(bench: _Bench, plain: IdentifiedModel, known: IdentifiedModel) -> Section:
-    e, pole = known.estimate, _unstable(known)
+def _constrained_fit(bench: _Bench, models: Models) -> Section:
+    e, pole = models["constrained"].estimate, _unstable(models["constrained"])
     text = f"""
         Physics says that the poles are a pair +/-p. In z their product is then 1, a2 = 1, and that
         one of them is unstable means |a1| > 2. fit_arx() takes this as ReciprocalPoles(), minimises
@@ -226,38 +234,49 @@ def _constrained_fit(bench: _Bench, plain: IdentifiedModel, known: IdentifiedMod
         text += f""" with a1 = {e["a1"]:g}: THE MODEL SITS ON ITS BOUND, as the paper's equation (8)
         does. The data would take it further; that is a symptom, not a cure."""
     else:
-        text += f""" and the unstable pole at {pole:+.2f} rad/s, {_off(pole, bench.pole)} against
-        sqrt(2g/x0) = {bench.pole:.2f}."""
-    errors = [e[name] / bench.coefficients[name] - 1 for name in ("b1", "b2")]
+        text += f""" and the unstable pole at {_against(pole, bench.pole)}."""
+    errors = _gain_errors(bench, e)
     if max(map(abs, errors)) > WORTH_A_WORD:
         text += f"""
 
         The constraint keeps the structure; it does not cure the feedback bias: b1 is off by
         {100 * errors[0]:+.0f} % and b2 by {100 * errors[1]:+.0f} %. The noise is still in the
-        regressors. What cures that is an estimator that does not correlate with the noise
-        (instrumental variables), or a quieter sensor."""
-    models = {"plain fit": plain, "reciprocal poles": known}
-    figures = {
-        "Poles of the fits and of the physics.": plot.poles(models, truth=bench.P),
-        "Frequency responses.": plot.bode({"physics (sampled)": bench.sampled, **models}),
-    }
+        regressors."""
+    figures = {"Poles of the fits and of the physics.": plot.poles(models, truth=bench.P)}
     return Section(TITLES[4], _plain_words(text), _coefficients(bench, models), figures)
 
 
-def _comparisons(
-    bench: _Bench, record: Record, plain: IdentifiedModel, known: IdentifiedModel
-) -> Section:
-    plants = {"plain fit": ct.tf(plain), "reciprocal poles": ct.tf(known), "physics": bench.plant}
-    found = {k: compare(record, replace(bench.loop, plant=p)) for k, p in plants.items()}
+def _instruments(bench: _Bench, models: Models, doubts: list[str]) -> Section:
+    e, pole = models["instruments"].estimate, _unstable(models["instruments"])
+    found = "without an unstable pole" if pole is None else f"at {_against(pole, bench.pole)}"
+    errors = _gain_errors(bench, e)
+    text = f"""
+        The reference was tossed without regard to the noise. fit_iv() takes its past as
+        instruments: it asks for errors that are unrelated to the reference rather than for small
+        ones, under the same constraint.
+
+        The model comes out {found}, with b1 off by {100 * errors[0]:+.1f} % and b2 by
+        {100 * errors[1]:+.1f} %."""
+    text += "".join(f"\n\nIn doubt: {doubt}" for doubt in doubts)
+    responses = plot.bode({"physics (sampled)": bench.sampled, **models})
+    return Section(TITLES[5], _plain_words(text), _coefficients(bench, models),
+                   {"Frequency responses of the fits and of the physics.": responses})  # fmt: skip
+
+
+def _comparisons(bench: _Bench, record: Record, models: Models) -> Section:
+    # A fit knows nothing of the operating point; like its intercept, the means stand in for it.
+    means = replace(bench.op, input=float(record.u.mean()), output=float(record.y.mean()))
+    loops = {k: replace(bench.loop, plant=ct.tf(G), at=means) for k, G in models.items()}
+    found = {k: compare(record, loop) for k, loop in {**loops, "physics": bench.loop}.items()}
     steps = {k: f"{c['one-step'].fit:.1f} %" for k, c in found.items()}
     text = f"""
         Each model is put into the loop with the controller and compared with the record. One step
-        ahead they predict with a fit of {steps["plain fit"]} (plain), {steps["reciprocal poles"]}
-        (constrained) and {steps["physics"]} (the physics itself): curves that lie close together,
-        as in the paper's figures 6 and 7, say little about a model.
+        ahead the plain model predicts with a fit of {steps["plain"]} and the physics itself with
+        {steps["physics"]}: curves that lie close together, as in the paper's figures 6 and 7, say
+        little about a model.
 
-        Simulated in the closed loop, without a look at the measured gap, they part. The last column
-        says what share of this error the noise explains: about 100 % for a model that lacks
+        Simulated in the closed loop, without a look at the measured gap, the models part. The last
+        column says what share of this error the noise explains: about 100 % for a model that lacks
         nothing."""
     rows = []
     for label, c in found.items():
@@ -271,72 +290,57 @@ def _comparisons(
         ("model in the loop", "one-step fit", "its errors", "simulation fit", "noise explains"),
         tuple(rows),
     )
-    return Section(TITLES[5], _plain_words(text), table, _comparison_figures(found))
+    return Section(TITLES[6], _plain_words(text), table, _comparison_figures(found))
 
 
 def _comparison_figures(found: dict[str, Comparison]) -> dict[str, Any]:
-    known, physics = found["reciprocal poles"], found["physics"]
+    known, good = found["constrained"], found["instruments"]
     first = _pictures.telling(known)
     t = known.record.t[first : first + _pictures.WINDOW]
     window = (t[0], t[-1] + PERIOD)
     figures = {
         "The constrained model in the loop.": plot.comparison(known, window=window),
-        "The physics in the loop.": plot.comparison(physics, window=window),
+        "The model from instruments in the loop.": plot.comparison(good, window=window),
     }
     if known.tests:
         figures["One-step errors of the constrained model."] = plot.residuals(known)
     return figures
 
 
-def _redesigns(bench: _Bench, plain: IdentifiedModel, known: IdentifiedModel) -> Section:
+def _redesigns(bench: _Bench, models: Models) -> Section:
     crossover, margin = WANTED
     text = f"""
         A lead with a crossover of {crossover:g} rad/s and a phase margin of {margin:g} degrees is
         designed on each model and tried on the nonlinear physics."""
-    outcomes, figures = {}, {}
-    for label, model in (("constrained", known), ("plain", plain)):
+    rows, figures = [], {}
+    for label, model in models.items():
         try:
             outcome = redesign(model, bench.loop, crossover=crossover, phase_margin=margin)
         except CtrlidError as reason:
-            text += f"\n\nOn the {label} model it is REFUSED: {reason}"
+            text += f"\n\n{label.capitalize()}: REFUSED. {reason}"
             continue
-        outcomes[label] = outcome
-        text += f"\n\nOn the {label} model: {_verdict(outcome)}"
-        figures[f"Step of the reference, designed on the {label} model."] = plot.step(outcome)
-    return Section(TITLES[6], _plain_words(text), _performances(outcomes), figures)
+        text += f"\n\n{label.capitalize()}: {_verdict(outcome)}"
+        rows.append(_performance(label, outcome))
+        figures[f"Step of the reference, designed on: {label}."] = plot.step(outcome)
+    head = ("designed on", "crossover [rad/s]", "phase margin [deg]", "overshoot [%]")
+    table = Table(head, tuple(rows), "Promised / achieved on the physics.") if rows else None
+    return Section(TITLES[7], _plain_words(text), table, figures)
 
 
 def _verdict(outcome: Redesign) -> str:
+    p = outcome.promised
+    if outcome.stable:
+        return outcome.verdict
+    why = outcome.failure.split(". ")[0]
+    return (f"{p.phase_margin:.1f} deg are promised at {p.crossover:.0f} rad/s, but IT DOES NOT "
+            f"KEEP THE BALL. {why[:1].upper()}{why[1:]}.")  # fmt: skip
+
+
+def _performance(label: str, outcome: Redesign) -> tuple[str, ...]:
     p, a = outcome.promised, outcome.achieved
-    if not outcome.stable:
-        why = outcome.failure.split(". ")[0]
-        return (f"{p.phase_margin:.1f} deg are promised at {p.crossover:.0f} rad/s, but it DOES "
-                f"NOT KEEP THE BALL: {why}.")  # fmt: skip
-    text = outcome.verdict[0].lower() + outcome.verdict[1:]
-    if abs(a.crossover / p.crossover - 1) > WORTH_A_WORD:
-        size = "large" if a.crossover < p.crossover else "small"
-        text += (f" The crossover comes out at {a.crossover:.0f} instead of {p.crossover:.0f} "
-                 f"rad/s, because the gain of the model is too {size} there.")  # fmt: skip
-    return text
-
-
-def _performances(outcomes: dict[str, Redesign]) -> Table | None:
-    if not outcomes:
-        return None
-    head, columns = ["designed on the"], []
-    for label, outcome in outcomes.items():
-        head += [f"{label} model: promised", "achieved"]
-        columns += [outcome.promised, outcome.achieved]
-    rows = tuple(
-        (label, *(f"{getattr(c, name):{form}}" if c.stable else "unstable" for c in columns))
-        for label, name, form in (
-            ("crossover [rad/s]", "crossover", ".1f"),
-            ("phase margin [deg]", "phase_margin", ".1f"),
-            ("overshoot [%]", "overshoot", ".1f"),
-            ("settling time [s]", "settling_time", ".3f"),
-        )
-    )
-    return Table(tuple(head), rows)
+    pairs = ((getattr(p, name), getattr(a, name)) for name in
+             ("crossover", "phase_margin", "overshoot"))  # fmt: skip
+    return (label, *(f"{x:.1f} / {y:.1f}" if a.stable else f"{x:.1f} / -" for x, y in pairs))
 
 
 def _largest(G: IdentifiedModel) -> float:
@@ -353,11 +357,16 @@ def _signed(value: float) -> str:
     return f"{'-' if value < 0 else '+'} {abs(value):.4f}"
 
 
-def _off(value: float, truth: float) -> str:
-    return f"{100 * (value / truth - 1):+.1f} %"
+def _against(value: float, truth: float) -> str:
+    error = 100 * (value / truth - 1)
+    return f"{value:+.2f} rad/s, {error:+.1f} % from sqrt(2g/x0) = {truth:.2f}"
 
 
-def _coefficients(bench: _Bench, models: dict[str, IdentifiedModel]) -> Table:
+def _gain_errors(bench: _Bench, e: Estimate) -> list[float]:
+    return [e[name] / bench.coefficients[name] - 1 for name in ("b1", "b2")]
+
+
+def _coefficients(bench: _Bench, models: Models) -> Table:
     rows = [
         (name, f"{value:.5g}", *(f"{G.estimate[name]:.5g}" for G in models.values()))
         for name, value in bench.coefficients.items()

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import warnings
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ def folder(tmp_path, monkeypatch):
 
 
 def run(*arguments):
-    return command.main(["--samples", "3000", "--quiet", *arguments])
+    return command.main(["--samples", "3000", "--seed", "1", "--quiet", *arguments])
 
 
 def test_the_whole_story(folder, capsys):
@@ -37,17 +38,19 @@ def test_the_whole_story(folder, capsys):
         "finds a2 = 1",
         "The constraint keeps the structure; it does not cure the feedback bias",
         "what share of this error the noise explains",
-        "On the constrained model: promised 50.0 deg",
-        "On the plain model:",
+        "fit_iv() takes its past as instruments",
+        "Plain: 50.0 deg are promised at 120 rad/s, but IT DOES NOT KEEP THE BALL.",
+        "Constrained: Promised 50.0 deg at 120 rad/s, achieved",
+        "Instruments: Promised 50.0 deg at 120 rad/s, achieved",
     ):
         assert sentence in text
-    assert out.endswith(f"9 figures and report.html are in ctrlid-report{os.sep}\n")
+    assert out.endswith(f"10 figures and report.html are in ctrlid-report{os.sep}\n")
     files = sorted(p.name for p in (folder / "ctrlid-report").iterdir())
-    assert len([f for f in files if f.endswith(".png")]) == 9
+    assert len([f for f in files if f.endswith(".png")]) == 10
     assert "report.html" in files
     assert "3-the-experiment.png" in files
     page = (folder / "ctrlid-report" / "report.html").read_text("utf-8")
-    assert page.count('src="data:image/png;base64,') == 9
+    assert page.count('src="data:image/png;base64,') == 10
     assert all(f"<h2>{title}</h2>" in page for title in told.TITLES)
 
 
@@ -174,6 +177,9 @@ def test_the_plain_fit_fails_whatever_the_seed(seed):
     known = cid.fit_arx(record, na=2, nb=2, constraints=[cid.ReciprocalPoles()])
     assert known.estimate["a2"] == 1.0
     assert 0.7 < told._unstable(known) / bench.pole < 0.9
+    cured = cid.fit_iv(record, na=2, nb=2, constraints=[cid.ReciprocalPoles()])
+    assert told._unstable(cured) == pytest.approx(bench.pole, rel=0.01)
+    assert np.abs(told._gain_errors(bench, cured.estimate)).max() < 0.03
 
 
 def chapters(**settings):
@@ -187,8 +193,18 @@ def test_without_noise_the_story_does_not_speak_of_its_harm():
     assert "NO POLE" not in plain
     assert "perfect sensor" not in plain
     assert "bias" not in known
-    assert "the promise holds" in sections[told.TITLES[6]].text
-    assert "gain of the model" not in sections[told.TITLES[6]].text
+    assert sections[told.TITLES[7]].text.count("the promise holds") == 3
+
+
+def test_doubts_of_the_estimator_are_passed_on(monkeypatch):
+    def doubtful(record, **orders):
+        warnings.warn("the instruments are weak", cid.CtrlidWarning, stacklevel=1)
+        return cid.fit_arx(record, **orders)
+
+    monkeypatch.setattr(told, "fit_iv", doubtful)
+    text = chapters(noise=0.5)[told.TITLES[5]].text
+    assert "The model comes out without an unstable pole" in text
+    assert text.endswith("In doubt: the instruments are weak")
 
 
 def test_a_model_on_its_bound_is_called_so():
@@ -197,8 +213,8 @@ def test_a_model_on_its_bound_is_called_so():
 
 
 def test_a_refused_redesign_is_reported(monkeypatch):
-    monkeypatch.setattr(told, "WANTED", (5.0, 89.0))
-    section = chapters(noise=0.0)[told.TITLES[6]]
-    assert section.text.count("it is REFUSED: ") == 2
+    monkeypatch.setattr(told, "WANTED", (5.0, 89.0))  # below what an unstable plant allows
+    section = chapters(noise=0.0)[told.TITLES[7]]
+    assert section.text.count(": REFUSED. ") == 3
     assert section.result is None
     assert section.figures == {}

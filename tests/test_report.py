@@ -164,7 +164,8 @@ def test_page_of_a_redesign(outcome, tmp_path):
     assert "promised on the model" in page.cells
     assert f"{outcome.achieved.phase_margin:.1f}" in page.cells
     assert outcome.verdict in page.paragraphs
-    lost = replace(outcome, achieved=replace(outcome.achieved, stable=False))
+    achieved = replace(outcome.achieved, stable=False, phase_margin=np.nan)
+    lost = replace(outcome, achieved=achieved)
     page = read(cid.write_report(lost, tmp_path / "lost.html"))
     assert any("DOES NOT KEEP THE PHYSICS STABLE" in text for text in page.bad)
 
