@@ -18,7 +18,7 @@ ENOUGH = 0.75  # of an error's variance: noise is not known better than this
 class Curve:
     """One reproduction of the measured output.
 
-    Attributes
+    Parameters
     ----------
     label : str
         What it is: a prediction (uses measured outputs) or a simulation (does not).
@@ -48,7 +48,7 @@ class Curve:
 class Comparison:
     """What `compare` found.
 
-    Attributes
+    Parameters
     ----------
     what : str
         The model or loop that was compared.

@@ -24,7 +24,9 @@ CLOSE = 0.25  # share of a promised phase margin whose loss is worth a word
 class Performance:
     """What a controller promises on a model, or achieves on the physics.
 
-    Attributes
+    A number that does not exist is NaN.
+
+    Parameters
     ----------
     stable : bool
         Whether the closed loop is stable.
@@ -40,8 +42,6 @@ class Performance:
         Until the step response stays within 2 % of its final value [s]; infinite if it never does.
     final_value : float
         Of the output per unit of reference: a lead alone leaves a steady error.
-
-    A number that does not exist is NaN.
     """
 
     stable: bool
@@ -57,7 +57,7 @@ class Performance:
 class Redesign:
     """A controller designed on a model, with the promise and what came of it.
 
-    Attributes
+    Parameters
     ----------
     controller : control.TransferFunction
         The lead compensator, in the time base of the model.

@@ -147,7 +147,13 @@ class Loop:
         return law is not None and law.dt == 0.0
 
     def system(self) -> Any:
-        """Return the plant in absolute physical units as a `control.NonlinearIOSystem`."""
+        """Return the plant in absolute physical units.
+
+        Returns
+        -------
+        control.NonlinearIOSystem
+            The plant as given, or a linear one with its operating point added.
+        """
         if not self.linear_plant:
             return self.plant
         e = self.equations()
@@ -162,7 +168,13 @@ class Loop:
                         states=list(e.states), dt=e.dt, name=e.name)  # fmt: skip
 
     def linearize(self) -> Any:
-        """Return the transfer function of the plant at the operating point."""
+        """Return the plant linearized at the operating point.
+
+        Returns
+        -------
+        control.TransferFunction
+            From deviations of the input to deviations of the output.
+        """
         if isinstance(self.plant, ct.TransferFunction):
             return self.plant
         return linearize(self.plant, self.point)

@@ -28,7 +28,7 @@ SETTLED = 4.0  # times the usual variance: above, the start still dominates the 
 class Prediction:
     """One-step predictions of a record.
 
-    Attributes
+    Parameters
     ----------
     y : ndarray, shape (n,)
         Prediction of each output sample from the samples before it [output unit].

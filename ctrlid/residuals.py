@@ -19,7 +19,7 @@ ROWS = 50_000  # of a regression: more add nothing to the few digits of a share
 class Correlation:
     """A correlation function of residuals with its confidence band and test.
 
-    Attributes
+    Parameters
     ----------
     name : str
         What is correlated.

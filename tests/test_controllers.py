@@ -264,6 +264,41 @@ def test_control_law_refuses(controller, words):
         control_law(controller, AT, DT)
 
 
+REPLAY = cid.Loop(ct.tf([1], [1, 1]), cid.PID(kp=2.0, ki=1.0), dt=DT)
+LOG = cid.Record(r=np.ones(20), u=np.ones(20), y=np.zeros(20), dt=DT)
+
+
+@pytest.mark.parametrize(
+    ("loop", "record", "words"),
+    [
+        (REPLAY, LOG.decimate(2, antialias=False), "sampled at 0.5 s, the record at 1 s"),
+        (REPLAY, cid.Record(u=LOG.u, y=LOG.y, dt=DT), "no reference r, which the controller needs"),
+        (cid.Loop(ct.tf([1], [1, 1]), dt=DT), LOG, "this loop has no controller"),
+        (
+            cid.Loop(ct.tf([1], [1, 1]), ct.tf([1], [1, 2]), dt=DT),
+            LOG,
+            "this loop has an analog one",
+        ),
+    ],
+    ids=["period", "reference", "none", "analog"],
+)
+def test_replay_refuses(loop, record, words):
+    with pytest.raises(CtrlidError, match=words):
+        cid.replay_controller(loop, record)
+
+
+def test_replay_finds_the_initial_state_and_leaves_what_was_injected():
+    loop = cid.Loop(ct.tf([1], [1, 1]), cid.PID(kp=2.0, ki=1.0), dt=0.1)
+    d = np.zeros(400)
+    d[200:] = 0.3 * np.random.default_rng(0).standard_normal(200)
+    r = cid.random_binary(400, amplitude=1.0, hold=20, seed=1)
+    part = cid.simulate(loop, r, d=d)[50:]
+    # The integral at the cut is not in the record; the injected noise hardly moves its estimate.
+    assert np.std(part.u[:150] - cid.replay_controller(loop, part)[:150]) < 0.05
+    clean = cid.simulate(loop, r)[50:]
+    np.testing.assert_allclose(cid.replay_controller(loop, clean), clean.u, atol=1e-10)
+
+
 # --- real logs
 
 

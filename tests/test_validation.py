@@ -29,7 +29,7 @@ def reference(n=4000, seed=1):
     return cid.random_binary(n, amplitude=1e-4, hold=20, around=AT.output, seed=seed)
 
 
-def noisy(loop, n=8000, **options):
+def noisy(loop, n=6000, **options):
     given = {"sensor_noise": 2e-6, "force_noise": 0.02, "seed": 2}
     return cid.simulate(loop, reference(n), **{**given, **options})
 
