@@ -24,7 +24,7 @@ from .physics import Array, timebase
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 DASHES = ("-", "--", "-.", (0, (1, 1)), (0, (5, 1, 1, 1, 1, 1)), (0, (8, 3)))
 MARKERS = ("o", "s", "^", "D", "v", "P")
-MEASURED = {"color": "0.35", "linewidth": 1.8}
+MEASURED = {"color": "0.72", "linewidth": 3.2}  # broad and pale: what lies on it stays visible
 BINS = 1500  # a record is drawn as an envelope when it has more than twice as many samples
 
 
@@ -405,10 +405,11 @@ def step(redesign: Redesign, ax: Any = None) -> Any:
     reach = 0.6 * max(float(np.ptp(promised)), 1e-12)
     low, high = ax.get_ylim()
     ax.set_ylim(max(low, promised.min() - reach), min(high, promised.max() + reach))
-    shown = redesign.promised.settling_time
-    if np.isfinite(shown):
-        # Five times what the promise needs: long enough to see it kept or broken.
-        ax.set_xlim(0, min(redesign.time[-1], max(5 * shown, 20 * redesign.loop.dt)))
+    settled = [t for t in (redesign.promised.settling_time, redesign.achieved.settling_time)
+               if np.isfinite(t)]  # fmt: skip
+    if settled:
+        # Long enough to see the promise kept or broken, short enough to see how.
+        ax.set_xlim(0, min(redesign.time[-1], max(3 * max(settled), 20 * redesign.loop.dt)))
     ax.set_xlabel("time after the step [s]")
     ax.set_ylabel("output per step of the reference [1]")
     return _finish(ax, columns=1)
