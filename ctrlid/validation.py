@@ -16,6 +16,8 @@ from .data import Record
 from .errors import CtrlidError, CtrlidWarning
 from .linearization import state_matrices
 from .loop import Loop
+from .model import IdentifiedModel
+from .noise_model import noise_polynomial, whiten
 from .physics import Array, timebase
 from .predictor import FEWEST, Prediction, predict, predict_ahead, spread_ahead
 from .replay import controller_output, replay_from_best_state
@@ -264,17 +266,23 @@ def _compare_model(record: Record, model: Any, horizon: int | None) -> Compariso
     moved = np.convolve(u, num)[: len(u)]
     error = np.convolve(y, den)[: len(y)] - moved
     constant = float(np.mean(error[usable]))
-    residuals = np.where(usable, error - constant, np.nan)
+    error = np.where(usable, error - constant, 0.0)
+    stretches = [(a + order, b) for a, b in record.segments() if b - a > order]
+    noise = np.eye(1, order + 1)[0]
+    if not (isinstance(model, IdentifiedModel) and "ARX" in model.estimate.method):
+        noise = noise_polynomial(error, stretches, den)
+    white_errors = whiten(error, stretches, noise)
+    residuals = np.where(usable, white_errors, np.nan)
     curves = [_curve("one-step prediction", record, record.y - residuals, _known_before(record, 1))]
     roots = np.roots(den)
-    # White one-step errors pass through 1/A.
+    # White one-step errors pass through C/A.
     white = float(np.std(residuals[usable]))
     with np.errstate(over="ignore"):
-        impulse = signal.lfilter([1.0], den, np.eye(1, len(record))[0])
+        impulse = signal.lfilter(noise, den, np.eye(1, len(record))[0])
         grown = np.sqrt(np.cumsum(impulse**2))
     steps = horizon or _time_constant(roots, record.dt, record)
     if steps > 1:
-        ahead = y0 + _arx_ahead(y, moved + constant, den, steps, usable)
+        ahead = y0 + _ahead(y, moved + constant, den, noise, white_errors, steps, usable)
         known = _known_before(record, steps)
         curves.append(
             _curve(f"{steps}-step prediction", record, ahead, known, white * grown[steps - 1])
@@ -303,14 +311,18 @@ def _arx_free(record: Record, y: Array, driven: Array, den: Array) -> Array:
     return free
 
 
-def _arx_ahead(y: Array, driven: Array, den: Array, steps: int, usable: Any) -> Array:
-    """Iterate the ARX equation `steps` times, each time with the predictions made before."""
+def _ahead(
+    y: Array, driven: Array, den: Array, noise: Array, white: Array, steps: int, usable: Any
+) -> Array:  # fmt: skip
+    """Iterate ``A y = B u + C e`` `steps` times, with the predictions and errors made before."""
     order, n = len(den) - 1, len(y)
     # past[i] holds, for each origin k, the (predicted or measured) output at k + j - i.
     past = [np.concatenate([np.zeros(i), y[: n - i]]) for i in range(order)]
     for j in range(1, steps + 1):
         drive = np.concatenate([driven[j:], np.full(j, np.nan)])
         new = drive - sum((a * p for a, p in zip(den[1:], past, strict=True)), np.zeros(n))
+        for i in range(j, order + 1):  # errors after the origin are not known: their mean is zero
+            new += noise[i] * np.concatenate([np.zeros(i - j), white[: n - (i - j)]])
         past = [new, *past][:order]
     ahead = np.full(n, np.nan)
     ahead[steps:] = new[: n - steps]

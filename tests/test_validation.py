@@ -188,19 +188,20 @@ def test_one_step_and_several_steps_of_an_arx_model_by_hand():
         y[k] = 2.05 * y[k - 1] - 1.0 * y[k - 2] + 0.2 * u[k - 1] + 0.1 * u[k - 2]
         y[k] = np.clip(y[k], -50, 50) + 0.01 * rng.standard_normal()
     record = cid.Record(u=u + 3.0, y=y + 1.0, dt=0.1)
-    model = ct.tf([0.2, 0.1], [1.0, -2.05, 1.0], 0.1)
+    model = cid.fit_arx(record, 2, 2, constraints=[cid.ReciprocalPoles()])  # 1/A colours its noise
+    a1, b1, b2 = (model.estimate[name] for name in ("a1", "b1", "b2"))
     found = cid.compare(record, model, horizon=4)
     assert [c.label for c in found.curves] == ["one-step prediction", "4-step prediction"]
     du, dy = record.u - record.u.mean(), record.y - record.y.mean()
     raw = np.full(n, np.nan)
-    raw[2:] = dy[2:] - 2.05 * dy[1:-1] + dy[:-2] - 0.2 * du[1:-1] - 0.1 * du[:-2]
+    raw[2:] = dy[2:] + a1 * dy[1:-1] + dy[:-2] - b1 * du[1:-1] - b2 * du[:-2]
     constant = np.nanmean(raw)
     np.testing.assert_allclose(found.residuals[2:], raw[2:] - constant, atol=1e-10)
     np.testing.assert_allclose(found["one-step"].y[2:], record.y[2:] - raw[2:] + constant)
     for k in (10, 57, 200):  # origin k: outputs up to y[k] are known
         past = [dy[k], dy[k - 1]]
         for j in range(1, 5):
-            new = 2.05 * past[0] - past[1] + 0.2 * du[k + j - 1] + 0.1 * du[k + j - 2] + constant
+            new = -a1 * past[0] - past[1] + b1 * du[k + j - 1] + b2 * du[k + j - 2] + constant
             past = [new, past[0]]
         assert found["4-step"].y[k + 4] == pytest.approx(past[0] + record.y.mean(), abs=1e-9)
     assert "an unstable model is not simulated open loop" in found.notes[0]
