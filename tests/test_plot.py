@@ -298,7 +298,8 @@ def test_step_says_when_the_physics_is_lost(outcome):
     ax = plot.step(replace(outcome, achieved=lost, achieved_step=np.empty(0)))
     assert legend(ax)[1] == "achieved on the physics: UNSTABLE, the simulation breaks off"
     never = replace(outcome.promised, settling_time=np.inf)
-    assert plot.step(replace(outcome, promised=never)).get_xlim()[1] >= outcome.time[-1]
+    endless = replace(outcome, promised=never, achieved=never)
+    assert plot.step(endless).get_xlim()[1] >= outcome.time[-1]
 
 
 @pytest.mark.parametrize(
