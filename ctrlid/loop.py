@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import casadi
@@ -62,11 +62,14 @@ class Loop:
     at: OperatingPoint | None = None
     free: tuple[str, ...] = ()
     input_limits: tuple[float, float] = (-math.inf, math.inf)
+    _traced: Equations = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         if not (isinstance(self.dt, int | float | np.number) and 0 < self.dt < math.inf):
             raise CtrlidError(f"a loop needs its sampling period dt > 0 s; given dt={self.dt!r}")
         equations = trace(self.plant)
+        # A loop is a value: its equations are those of the plant at the time it was made.
+        object.__setattr__(self, "_traced", equations)
         require_siso(equations)
         if equations.dt and self.plant.dt is not True and abs(equations.dt - self.dt) > 1e-9:
             raise CtrlidError(f"the plant is sampled at {equations.dt:g} s, the loop at "
@@ -116,7 +119,7 @@ class Loop:
 
     def equations(self) -> Equations:
         """Return the traced equations of the plant in absolute physical units."""
-        e = trace(self.plant)
+        e = self._traced
         if not self.linear_plant:
             return e
         at = self.point
@@ -130,7 +133,7 @@ class Loop:
         assert self.at is not None
         if not self.linear_plant:
             return self.at
-        n = len(trace(self.plant).states)
+        n = len(self._traced.states)
         return OperatingPoint((0.0,) * n, self.at.input, self.at.output)
 
     def law(self) -> ControlLaw | None:
@@ -180,7 +183,7 @@ class Loop:
         return linearize(self.plant, self.point)
 
     def __repr__(self) -> str:
-        e = trace(self.plant)
+        e = self._traced
         assert self.at is not None
         kind = "no controller" if self.controller is None else (
             "analog controller" if self.analog else "digital controller")  # fmt: skip
