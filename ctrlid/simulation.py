@@ -160,7 +160,8 @@ class Simulator:
                 f"{e.name} is not defined at the operating point {loop.point}; give "
                 "at=operating_point(plant, output=...)"
             )
-        self._unstable = loop.controller is None and growth_rate(loop) > 0
+        # An undamped plant neither grows nor decays; round-off must not decide which.
+        self._unstable = loop.controller is None and growth_rate(loop) * loop.dt > 1e-6
         # What a millionth of the operating values does to each state: smaller motion is rest.
         a, b = (np.nan_to_num(np.abs(m)) for m in sensitivity(first, loop.point.output))
         self._floor = 1e-6 * (a @ np.abs(self.rest) + b[:, 2] * abs(loop.point.input))
@@ -247,9 +248,9 @@ def _first_bad(
     """Index of the first sample at which the loop is no longer where it can be."""
     bad = ~(np.isfinite(states).all(axis=0) & np.isfinite(ys[0]) & np.isfinite(us[0]))
     rest = loop.point.output
-    asked = max(abs(rest), float(np.abs(w[3]).max()))
+    asked = abs(rest)
     if loop.controller is not None:
-        asked = max(asked, float(np.max(np.abs(w[1] - rest))), 1e-300)
+        asked = max(asked, *np.max(np.abs([w[1] - rest, w[3]]), axis=1), 1e-300)
     # An open loop may travel far, an integrator must; only an unstable plant runs away from rest.
     if loop.controller is not None or (asked and unstable):
         bad |= np.abs(ys[0] - rest) > RUNAWAY * asked

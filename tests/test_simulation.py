@@ -324,3 +324,14 @@ def test_records_of_textbook_plants_have_units_and_an_open_fall_is_noticed():
         cid.simulate(alone, d=np.full(5000, -0.01))
     servo = cid.Loop(cid.plants.servo(m=1.0, c=2.0, k=3.0), None, dt=0.1)
     assert cid.simulate(servo, d=np.ones(4500)).y[-1] > 600  # an integrator may travel far
+
+
+def test_an_undamped_plant_swings_for_ever():
+    """It moves far from a point at zero, and round-off makes its poles a hair unstable."""
+    plant = ct.nlsys(
+        lambda t, x, u, p: [x[1], -100 * np.sin(x[0]) + u[0]], lambda t, x, u, p: x[0],
+        inputs=["torque"], outputs=["angle"], states=["angle", "rate"], name="pendulum",
+    )  # fmt: skip
+    d = cid.random_binary(2000, amplitude=0.05, seed=1)
+    record = cid.simulate(cid.Loop(plant, None, dt=0.02), d=d, sensor_noise=1e-6, seed=2)
+    assert np.abs(record.y).max() > 1e-3
