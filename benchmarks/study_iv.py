@@ -14,6 +14,7 @@ are sought, alpha and beta of -beta/(s^2 - alpha). For each estimator and each o
 - bias: mean of error / standard error;
 - covered: share of nominal 95 % intervals that hold the truth;
 - efficiency: mean square of error / Cramér-Rao bound; 1 is the best an unbiased estimator can do.
+  The bound is that of two unknowns, alpha and beta, so ``--free`` with four stays above 1.
 """
 
 from __future__ import annotations
@@ -71,8 +72,8 @@ def slowest(a: np.ndarray, b: np.ndarray, lead: ct.TransferFunction) -> float:
 def design(rng: np.random.Generator, a: np.ndarray, b: np.ndarray, p: float, dt: float):
     """Draw leads until one works and leaves no mode slower than a twentieth of p."""
     for trial in range(1000):
-        # Slow sampling leaves less phase: after some trials, ask for less.
-        ease = 1.0 if trial < 5 else rng.uniform(0.5, 0.9)
+        # Slow sampling leaves less phase: ask for less.
+        ease = 1.0 if trial < 5 and p * dt < 0.4 else rng.uniform(0.4, 0.8)
         try:
             lead = cid.design_lead(
                 ct.tf(b[1:], a, dt), p * rng.uniform(2, 3) * ease, rng.uniform(40, 55) * ease
@@ -260,17 +261,23 @@ def main() -> None:
     parser.add_argument("--free", action="store_true", help="fit_iv without constraints")
     parser.add_argument("--given", action="store_true", help="give fit_iv the controller")
     options = parser.parse_args()
-    print("alpha, beta | p*Ts, noise: median error %, bias in s.e., covered %, efficiency")
-    for (step, noise), (found, bound) in study(
-        options.runs, swing=options.physics, free=options.free, given=options.given
-    ).items():
-        print(f"p*Ts {step:<6} noise {100 * noise:g} %, bound {100 * np.median(bound):.2g} %")
-        for k, name in enumerate(ESTIMATORS):
-            cells = [
-                " / ".join("-" if np.isnan(x) else f"{x:.3g}" for x in pair)
-                for pair in summary(found[:, k], bound)
-            ]
-            print(f"  {name:<22}" + "".join(f"{cell:>22}" for cell in cells))
+    print("alpha / beta: median error %, bias in s.e., covered %, efficiency")
+    table = study(options.runs, swing=options.physics, free=options.free, given=options.given)
+    for (step, noise), (found, bound) in table.items():
+        show(f"p*Ts {step:<6} noise {100 * noise:g} %", found, bound)
+    found, bound = (np.concatenate(parts) for parts in zip(*table.values(), strict=True))
+    show(f"all {len(found)} runs", found, bound)
+
+
+def show(title: str, found: np.ndarray, bound: np.ndarray) -> None:
+    """Print one block: a line for each estimator."""
+    print(f"{title}, bound {100 * np.median(bound):.2g} %", flush=True)
+    for k, name in enumerate(ESTIMATORS):
+        cells = [
+            " / ".join("-" if np.isnan(x) else f"{x:.3g}" for x in pair)
+            for pair in summary(found[:, k], bound)
+        ]
+        print(f"  {name:<22}" + "".join(f"{cell:>22}" for cell in cells))
 
 
 if __name__ == "__main__":
