@@ -9,9 +9,11 @@ from dataclasses import replace
 import control as ct
 import numpy as np
 import pytest
+from scipy import linalg
 
 import ctrlid as cid
 from ctrlid import CtrlidError
+from ctrlid.innovations import _exponential
 
 ALPHA, BETA = 1635.0, 6.54
 PLANT = ct.tf([-BETA], [1, 0, -ALPHA], inputs=["V"], outputs=["x"], name="maglev")
@@ -210,3 +212,13 @@ def test_data_that_do_not_suffice_are_refused():
     analog = experiment(loop_at(0.005, analog=True), n=500)
     with pytest.raises(CtrlidError, match="a delay is modelled for a held input only"):
         cid.fit_continuous(analog, 2, delay=None, controller=loop_at(0.005, True).controller)
+
+
+def test_the_matrix_exponential_equals_scipys():
+    rng = np.random.default_rng(0)
+    for size in (1e-6, 1e-2, 1.0, 30.0):
+        for n in (1, 2, 4, 6):
+            matrix = size * rng.standard_normal((n, n))
+            expected = linalg.expm(matrix)
+            tolerance = 1e-13 * max(1.0, size) * np.abs(expected).max()
+            np.testing.assert_allclose(_exponential(matrix), expected, rtol=0, atol=tolerance)

@@ -1,0 +1,41 @@
+"""What the README shows is what its script prints today, up to the last digits of an estimate."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
+NUMBER = re.compile(r"[-+]?\d[\d_]*\.?\d*(?:e[-+]?\d+)?")
+
+
+def blocks(language):
+    return re.findall(rf"```{language}\n(.*?)```", README, re.DOTALL)
+
+
+def comparable(text):
+    # The largest of 25 correlations and its lag are a matter of the last digit.
+    return [line.split() for line in text.splitlines() if " at lag " not in line and line.strip()]
+
+
+def test_the_ten_lines_print_what_is_shown(capsys):
+    (script,) = blocks("python")
+    assert len(script.strip().splitlines()) <= 12
+    exec(compile(script, "README.md", "exec"), {})
+    printed = comparable(capsys.readouterr().out)
+    shown = next(comparable(b) for b in blocks("text") if "prediction error" in b)
+    assert len(printed) == len(shown)
+    for new, old in zip(printed, shown, strict=True):
+        assert len(new) == len(old)
+        for word, said in zip(new, old, strict=True):
+            assert NUMBER.sub("#", word) == NUMBER.sub("#", said)
+            for a, b in zip(NUMBER.findall(word), NUMBER.findall(said), strict=True):
+                assert float(a) == pytest.approx(float(b), rel=0.05, abs=0.02)
+
+
+def test_the_two_commands_are_one_line_each():
+    commands = [line for b in blocks("bash") for line in b.strip().splitlines()]
+    assert len(commands) == 2
+    assert all(c.startswith("python3 -m venv .venv && .venv/bin/pip install ") for c in commands)
+    assert commands[0].endswith(".venv/bin/python -m ctrlid")
+    assert commands[1].endswith(".venv/bin/pytest")
