@@ -112,10 +112,11 @@ class ActiveBound:
 class Estimate:
     """Coefficients of a fitted model, their uncertainty, and how they were found.
 
-    The standard errors are those of least squares: ``sigma^2 Z (Z' R'R Z)^-1 Z'`` with ``Z`` the
-    directions that the constraints leave free. They hold only if the equation error is white
-    (uncorrelated from sample to sample). In closed loop with sensor noise it is not, the
-    coefficients are biased as well, and the standard errors then are too small.
+    The covariance is ``sigma^2 Z (Z' R'R Z)^-1 Z'`` with ``Z`` the directions that the constraints
+    leave free, and R what the estimator of `method` regresses on. Those of `fit_arx` hold only if
+    the equation error is white (uncorrelated from sample to sample): in closed loop with sensor
+    noise it is not, the coefficients are biased as well, and the standard errors are too small.
+    Those of `fit_iv` and `fit_continuous` hold under feedback.
 
     Parameters
     ----------
@@ -293,7 +294,9 @@ def _report(e: Estimate) -> str:
         if e.structure.domain == "z":
             pole = f"  pole at z = {_text.with_error(z, dz)}, s = {_text.with_error(s, ds)} rad/s"
         lines.append(pole)
-    lines.append(f"  equation error: standard deviation {np.sqrt(e.residual_variance):.3g}")
+    # Least squares minimises the error of the difference equation, the others that of a prediction.
+    what = "equation error" if "ARX" in e.method else "prediction error"
+    lines.append(f"  {what}: standard deviation {np.sqrt(e.residual_variance):.3g}")
     lines.append(f"  solved by {e.solver}")
     lines.append("  active bounds: " + (", ".join(e.active) or "none"))
     return "\n".join([*lines, *_bad_news(e)])
