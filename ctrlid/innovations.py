@@ -78,15 +78,19 @@ def _exponential(matrix: Array) -> Array:
     the linear algebra library for it, which on a busy machine takes a hundred times as long.
     """
     norm = float(np.abs(matrix).sum(axis=0).max())
+    if not np.isfinite(norm):
+        return np.full(matrix.shape, np.nan)
     squarings = max(0, int(np.ceil(np.log2(max(norm, 1e-300)))) + 2)
     scaled = matrix / 2.0**squarings
     total = term = np.eye(len(matrix))
     for k in range(1, 15):  # 0.25^15/15! is below 1e-21
         term = term @ scaled / k
         total = total + term
-    for _ in range(squarings):
-        total = total @ total
-    return total
+    with np.errstate(over="ignore", invalid="ignore"):
+        for _ in range(squarings):
+            total = total @ total
+    # What grows beyond any number within one period has no prediction.
+    return total if np.isfinite(total).all() else np.full(matrix.shape, np.nan)
 
 
 def _hold_integral(a: Array, b: Array, time: float) -> tuple[Array, Array]:
@@ -186,6 +190,8 @@ def prediction_errors(motion: Flow, gain: Array, signals: dict[str, Array]) -> A
     k = np.zeros(size)
     k[: motion.order] = gain
     closed = motion.f - np.outer(k, motion.c)
+    if not np.isfinite(closed).all():
+        return None, np.ones(1)
     poles = np.linalg.eigvals(closed)
     observer = np.real(np.poly(poles))
     if not np.isfinite(poles).all() or np.max(np.abs(poles)) >= 1 - 1e-9:

@@ -13,7 +13,7 @@ from scipy import linalg
 
 import ctrlid as cid
 from ctrlid import CtrlidError
-from ctrlid.innovations import _exponential
+from ctrlid.innovations import Circuit, _exponential, flow, prediction_errors, realize
 
 ALPHA, BETA = 1635.0, 6.54
 PLANT = ct.tf([-BETA], [1, 0, -ALPHA], inputs=["V"], outputs=["x"], name="maglev")
@@ -222,3 +222,16 @@ def test_the_matrix_exponential_equals_scipys():
             expected = linalg.expm(matrix)
             tolerance = 1e-13 * max(1.0, size) * np.abs(expected).max()
             np.testing.assert_allclose(_exponential(matrix), expected, rtol=0, atol=tolerance)
+
+
+def test_an_absurd_trial_of_the_search_is_no_warning():
+    """A step that makes the plant explode within a period has no prediction, and says nothing."""
+    a, b, c = realize(np.array([1.0, -1e16, 0.0]), np.array([1.0]), 1.0)
+    for motion in (
+        flow(a, b, c, 0.1, "zoh"),
+        flow(a, b, c, 0.1, "foh"),
+        flow(a, b, c, 0.1, "zoh", 0.03),
+        flow(a, b, c, 0.1, "zoh", 0.0, Circuit(np.array([[-1.0]]), np.ones(1), np.ones(1), 2.0)),
+    ):
+        signals = {name: np.zeros(50) for name in "yur"}
+        assert prediction_errors(motion, np.zeros(2), signals)[0] is None
