@@ -153,6 +153,7 @@ class Simulator:
         first = stepper(loop, 1)
         self.plant_states = first.plant_states
         self.rest: Array = np.array(first.rest, dtype=float)
+        self._steps: dict[int, Any] = {1: first.step}
         self._runners: dict[tuple[int, int], Any] = {}
         e = loop.equations()
         if not np.isfinite(e.evaluate(first.rest[: len(e.states)], loop.point.input)[0]).all():
@@ -182,7 +183,9 @@ class Simulator:
     def _runner(self, substeps: int, size: int) -> Any:
         key = (substeps, size)
         if key not in self._runners:
-            self._runners[key] = stepper(self.loop, substeps).step.mapaccum("run", size)
+            if substeps not in self._steps:
+                self._steps[substeps] = stepper(self.loop, substeps).step
+            self._runners[key] = self._steps[substeps].mapaccum("run", size)
         return self._runners[key]
 
     def run(

@@ -48,7 +48,6 @@ AMPLITUDE = 5e-6  # m
 HOLD = 25  # samples between tosses: what a closed loop passes on is slow
 COMPARED = 15_000  # samples: more would cost seconds and say the same
 WANTED = (120.0, 50.0)  # of the redesign: rad/s, deg
-UNITS = {"r": "m", "u": "V", "y": "m"}
 WORTH_A_WORD = 0.02  # relative error that is more than round-off and chance
 
 Models = dict[str, IdentifiedModel]
@@ -178,9 +177,7 @@ def _records(bench: _Bench, samples: int, noise: float, seed: int) -> tuple[Reco
     toss, hiss = (int(s) for s in np.random.SeedSequence(seed).generate_state(2))
     r = random_binary(samples, amplitude=AMPLITUDE, hold=HOLD, around=bench.op.output, seed=toss)
     std = noise * 2 * AMPLITUDE
-    measured, perfect = (
-        replace(simulate(bench.loop, r, sensor_noise=s, seed=hiss), units=UNITS) for s in (std, 0.0)
-    )
+    measured, perfect = (simulate(bench.loop, r, sensor_noise=s, seed=hiss) for s in (std, 0.0))
     return measured, perfect
 
 
