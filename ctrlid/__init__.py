@@ -1,6 +1,6 @@
 """Closed-loop identification and diagnosis of unstable plants, on top of python-control."""
 
-from . import datasets, plants, plot
+from . import datasets, effects, plants, plot
 from .arx import fit_arx
 from .comparison import Comparison, Curve
 from .constraints import (
@@ -67,6 +67,7 @@ __all__ = [
     "compare",
     "datasets",
     "design_lead",
+    "effects",
     "fit_arx",
     "fit_continuous",
     "fit_iv",

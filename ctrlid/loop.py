@@ -1,5 +1,6 @@
 """The loop: a plant under control, in absolute physical units."""
 
+import copy
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -10,9 +11,10 @@ import control as ct
 import numpy as np
 
 from .controllers import ControlLaw, control_law
+from .effects import AbstractEffect
 from .errors import CtrlidError
 from .linearization import OperatingPoint, linearize
-from .physics import Equations, require_siso, trace
+from .physics import Equations, require_siso, trace, with_parameters
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +42,9 @@ class Loop:
         Names of the plant parameters that are uncertain.
     input_limits : (float, float), optional
         Limits of the actuator [input unit]; the logged u is the limited one.
+    effects : sequence of effects, optional
+        Physics that the plant lacks, from `ctrlid.effects`; `with_effect` adds one. Each is known
+        by its class name, a second one of a class by name and number: "ViscousFriction2".
 
     Raises
     ------
@@ -62,7 +67,10 @@ class Loop:
     at: OperatingPoint | None = None
     free: tuple[str, ...] = ()
     input_limits: tuple[float, float] = (-math.inf, math.inf)
+    effects: tuple[AbstractEffect, ...] = field(default=(), kw_only=True)
     _traced: Equations = field(init=False, repr=False)
+    _active: Equations = field(init=False, repr=False)
+    _kept: Equations = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         if not (isinstance(self.dt, int | float | np.number) and 0 < self.dt < math.inf):
@@ -84,13 +92,6 @@ class Loop:
         if not self.linear_plant and len(at.states) != n:
             raise CtrlidError(f"at= has {len(at.states)} states, {equations.name} has {n}: "
                               f"{', '.join(equations.states)}")  # fmt: skip
-        free = (self.free,) if isinstance(self.free, str) else tuple(self.free)
-        unknown = [name for name in free if name not in equations.parameters]
-        if unknown:
-            raise CtrlidError(
-                f"free= names {unknown}, but the numeric parameters of {equations.name} are "
-                f"{list(equations.parameters)}; give parameters to ct.nlsys with params={{...}}"
-            )
         try:
             lower, upper = (float(v) for v in self.input_limits)
         except (TypeError, ValueError) as reason:
@@ -100,41 +101,208 @@ class Loop:
             raise CtrlidError(f"input_limits needs lower < upper; given ({lower:g}, {upper:g})")
         object.__setattr__(self, "dt", float(self.dt))
         object.__setattr__(self, "at", at)
-        object.__setattr__(self, "free", free)
         object.__setattr__(self, "input_limits", (lower, upper))
+        self._settle()
         law = self.law()
         if law and law.dt == 0.0 and equations.dt:
             raise CtrlidError("an analog controller cannot act on a plant in discrete time; give "
                               "the plant in continuous time or sample the controller")  # fmt: skip
-        if law and equations.feedthrough:
+        if law and self._active.feedthrough:
             raise CtrlidError(
                 f"{equations.name} passes its input to its output without delay, so the loop with "
                 "a controller is algebraic; add the sensor's or actuator's lag to the plant"
             )
+
+    def _settle(self) -> None:
+        """Put the effects into the equations and see that the free parameters exist."""
+        effects = (self.effects,) if isinstance(self.effects, AbstractEffect) else self.effects
+        effects = tuple(effects)
+        strangers = [e for e in effects if not isinstance(e, AbstractEffect)]
+        if strangers:
+            raise CtrlidError(
+                "effects are instances of the classes in ctrlid.effects, such as "
+                f"CoulombFriction(fc=0.1); given {strangers[0]!r}"
+            )
+        object.__setattr__(self, "effects", effects)
+        kept = self._with_effects(tuple(self.labelled.items()))
+        active = {label: e for label, e in self.labelled.items() if not e.neutral}
+        object.__setattr__(self, "_kept", kept)
+        object.__setattr__(self, "_active", kept if len(active) == len(effects) else
+                           self._with_effects(tuple(active.items())))  # fmt: skip
+        free = (self.free,) if isinstance(self.free, str) else tuple(self.free)
+        unknown = [name for name in free if name not in kept.parameters]
+        if unknown:
+            raise CtrlidError(
+                f"free= names {unknown}, but the numeric parameters of {kept.name} are "
+                f"{list(kept.parameters)}; give parameters to ct.nlsys with params={{...}}"
+            )
+        object.__setattr__(self, "free", free)
+
+    def _with_effects(self, effects: tuple[tuple[str, AbstractEffect], ...]) -> Equations:
+        e = self._absolute()
+        at = self._bare_point
+        for label, effect in sorted(effects, key=lambda pair: pair[1].stage):
+            e = effect.apply(e, at, self.dt, label)
+        return replace(e, rest=_at_rest(e, at)) if e.lags else e
 
     @property
     def linear_plant(self) -> bool:
         """Whether the plant is a linear system and so acts on deviations from `at`."""
         return isinstance(self.plant, ct.TransferFunction | ct.StateSpace)
 
-    def equations(self) -> Equations:
-        """Return the traced equations of the plant in absolute physical units."""
+    @property
+    def labelled(self) -> dict[str, AbstractEffect]:
+        """The effects by name: that of the class, numbered from the second of a class on."""
+        found: dict[str, AbstractEffect] = {}
+        for effect in self.effects:
+            name = type(effect).__name__
+            count = sum(type(e).__name__ == name for e in found.values())
+            found[f"{name}{count + 1}" if count else name] = effect
+        return found
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """Values of the plant's numeric parameters and of those of the effects."""
+        return dict(self._kept.parameters)
+
+    def equations(self, keep: bool = False) -> Equations:
+        """Return the traced equations of the plant with its effects, in absolute physical units.
+
+        Parameters
+        ----------
+        keep : bool, optional
+            Keep effects that are neutral in the formulas, as a fit needs that asks which way they
+            would help. By default they are left out, so that not one sample changes.
+
+        Returns
+        -------
+        Equations
+            The equations.
+        """
+        return self._kept if keep else self._active
+
+    def _absolute(self) -> Equations:
         e = self._traced
         if not self.linear_plant:
             return e
-        at = self.point
+        at = self._bare_point
         rhs = casadi.substitute(e.rhs, e.u, e.u - at.input)
         output = casadi.substitute(e.output, e.u, e.u - at.input) + at.output
         return replace(e, rhs=rhs, output=output)
 
     @property
-    def point(self) -> OperatingPoint:
-        """The operating point with the states of this very plant."""
+    def _bare_point(self) -> OperatingPoint:
         assert self.at is not None
         if not self.linear_plant:
             return self.at
         n = len(self._traced.states)
         return OperatingPoint((0.0,) * n, self.at.input, self.at.output)
+
+    @property
+    def point(self) -> OperatingPoint:
+        """The operating point with the states of this very plant and of its effects."""
+        at = self._bare_point
+        return replace(at, states=(*at.states, *self._active.rest))
+
+    def with_effect(self, effect: AbstractEffect) -> "Loop":
+        """Return the loop with one more effect.
+
+        Parameters
+        ----------
+        effect : AbstractEffect
+            An effect of `ctrlid.effects` or of your own.
+
+        Returns
+        -------
+        Loop
+            A new loop.
+
+        Raises
+        ------
+        CtrlidError
+            If the effect makes no sense for this plant.
+
+        Examples
+        --------
+        >>> import ctrlid as cid
+        >>> loop = cid.Loop(cid.plants.servo(m=2.0, c=1.0, k=3.0), dt=0.01)
+        >>> loop.with_effect(cid.effects.CoulombFriction(fc=0.2)).parameters
+        {'m': 2.0, 'c': 1.0, 'k': 3.0, 'CoulombFriction.fc': 0.2}
+        """
+        return self._revised(effects=(*self.effects, effect))
+
+    def without_effect(self, effect: str | AbstractEffect) -> "Loop":
+        """Return the loop without one of its effects.
+
+        Parameters
+        ----------
+        effect : str or AbstractEffect
+            Its name, as in `labelled`, or the effect itself.
+
+        Returns
+        -------
+        Loop
+            A new loop, in which the parameters of the effect are no longer free.
+
+        Raises
+        ------
+        CtrlidError
+            If the loop has no such effect.
+        """
+        known = self.labelled
+        label = next((key for key, e in known.items() if key == effect or e is effect), None)
+        label = label or next((key for key, e in known.items() if e == effect), None)
+        if label is None:
+            raise CtrlidError(f"the loop has no effect {effect}; it has {list(known) or 'none'}")
+        rest = tuple(e for key, e in known.items() if key != label)
+        free = tuple(name for name in self.free if not name.startswith(f"{label}."))
+        return self._revised(effects=rest, free=free)
+
+    def with_parameters(self, values: Mapping[str, float]) -> "Loop":
+        """Return the loop with other values of plant or effect parameters.
+
+        Parameters
+        ----------
+        values : mapping of str to float
+            New values by name, as in `parameters`: ``{"K": 3e-6, "CoulombFriction.fc": 0.2}``.
+
+        Returns
+        -------
+        Loop
+            A new loop with a copy of the plant; the given plant stays as it is.
+
+        Raises
+        ------
+        CtrlidError
+            If there is no such parameter or the value is out of its bounds.
+        """
+        unknown = [name for name in values if name not in self.parameters]
+        if unknown:
+            raise CtrlidError(
+                f"the loop has no parameter {unknown[0]!r}; it has {list(self.parameters)}"
+            )
+        of_plant = {k: float(v) for k, v in values.items() if k in self._traced.parameters}
+        if not np.isfinite(list(of_plant.values())).all():
+            raise CtrlidError(f"plant parameters are finite numbers; given {of_plant}")
+        effects = [
+            replace(e, **{name: values[f"{label}.{name}"] for name in e.values()
+                          if f"{label}.{name}" in values})
+            for label, e in self.labelled.items()
+        ]  # fmt: skip
+        if not of_plant:
+            return self._revised(effects=tuple(effects))
+        traced = replace(self._traced, parameters={**self._traced.parameters, **of_plant})
+        return self._revised(
+            plant=with_parameters(self.plant, of_plant), _traced=traced, effects=tuple(effects)
+        )
+
+    def _revised(self, **changes: Any) -> "Loop":
+        """Return a copy with other fields, without tracing the plant again."""
+        new = copy.copy(self)
+        for name, value in changes.items():
+            object.__setattr__(new, name, value)
+        new._settle()
+        return new
 
     def law(self) -> ControlLaw | None:
         """Return the controller as equations, None where there is none."""
@@ -193,4 +361,20 @@ class Loop:
             text += f", {e.inputs[0]} within {self.input_limits[0]:g}..{self.input_limits[1]:g}"
         if self.free:
             text += f", free: {', '.join(self.free)}"
+        if self.effects:
+            text += f", effects: {', '.join(self.labelled)}"
         return text + ")"
+
+
+def _at_rest(e: Equations, at: OperatingPoint) -> tuple[float, ...]:
+    """Return the values at rest of the added states: a lag rests where its target does."""
+    own = len(e.states) - len(e.rest)
+    rest = list(e.rest)
+    targets = casadi.Function("targets", [e.t, e.x, e.u, e.p, e.spread],
+                              [lag.target for lag in e.lags])  # fmt: skip
+    for _ in e.lags:  # of lags in a row each waits for the one before
+        point = [*at.states, *rest]
+        values = targets.call([0.0, point, at.input, e.values, np.zeros(len(point))])
+        for lag, value in zip(e.lags, values, strict=True):
+            rest[lag.state - own] = float(value)
+    return tuple(rest)

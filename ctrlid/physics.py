@@ -1,5 +1,6 @@
 """The exact equations of a python-control system, traced into CasADi and checked."""
 
+import copy
 import functools
 import linecache
 import traceback
@@ -22,11 +23,45 @@ AGREEMENT = 1e-9  # relative; round-off apart the two are the same formula
 
 
 @dataclass(frozen=True, eq=False)
+class Lag:
+    """A state that follows `target` as a first-order lag, ``T dx/dt = target - x``.
+
+    Its rate is part of `Equations.rhs` as well; knowing that it is a lag allows it to be advanced
+    by its exact exponential however short T is.
+    """
+
+    state: int
+    time_constant: Any
+    target: Any
+
+
+@dataclass(frozen=True, eq=False)
+class Play:
+    """What an input passes through once per sample before it reaches the plant, with memory.
+
+    ``(next m, applied u)`` as expressions of the memory `m`, the computed input `u` and the
+    parameters; `start` is the memory that belongs to a resting input, an expression of `u`.
+    """
+
+    m: Any
+    u: Any
+    after: Any
+    applied: Any
+    start: Any
+
+
+@dataclass(frozen=True, eq=False)
 class Equations:
     """The equations of one plant: ``dx/dt = rhs(t, x, u, p)``, ``y = output(t, x, u, p)``.
 
     For a discrete-time plant (`dt` > 0) `rhs` is the next state. The members `t`, `x`, `u`, `p`,
     `rhs` and `output` are CasADi expressions; `parameters` holds the value of each entry of `p`.
+
+    Effects (`with_effect`) may add more: `spread` are symbols for the standard deviations of the
+    states, zero in a simulation, by which a filter smooths kinks; `lags` lists states that are
+    plain first-order lags; `play` is a memory between controller and plant; `delay` an expression
+    of `p` for the time by which the input comes late; `readout` what becomes of the noisy
+    `reading`; `rest` the values at rest of states that were added to the plant's own.
     """
 
     name: str
@@ -41,6 +76,13 @@ class Equations:
     p: Any
     rhs: Any
     output: Any
+    spread: Any = None
+    lags: tuple[Lag, ...] = ()
+    play: Play | None = None
+    delay: Any = None
+    reading: Any = None
+    readout: Any = None
+    rest: tuple[float, ...] = ()
 
     @property
     def values(self) -> Array:
@@ -49,11 +91,11 @@ class Equations:
 
     @functools.cached_property
     def velocities(self) -> tuple[int, ...]:
-        """Indices of the states that a force acts on: those that are another state's rate."""
-        rates = [casadi.simplify(self.rhs[i]) for i in range(len(self.states))]
+        """Indices of the plant's own states that are another one's rate: forces act on them."""
+        rates = [casadi.simplify(self.rhs[i]) for i in range(len(self.states) - len(self.rest))]
         return tuple(
             j
-            for j in range(len(self.states))
+            for j in range(len(rates))
             if any(casadi.is_equal(rates[i], self.x[j], 2) for i in range(len(rates)) if i != j)
         )
 
@@ -65,9 +107,26 @@ class Equations:
     @functools.cached_property
     def function(self) -> Any:
         """The CasADi function ``(t, x, u, p) -> (rhs, output)``."""
+        both = casadi.vertcat(self.rhs, self.output)
+        if self.spread is not None:
+            both = casadi.substitute(both, self.spread, casadi.SX.zeros(*self.spread.shape))
+        n = len(self.states)
+        return casadi.Function("plant", [self.t, self.x, self.u, self.p], [both[:n], both[n:]])
+
+    @functools.cached_property
+    def smoothed(self) -> Any:
+        """The CasADi function ``(t, x, u, p, spread) -> (rhs, output)``."""
+        spread = casadi.SX.sym("s", len(self.states)) if self.spread is None else self.spread
         return casadi.Function(
-            "plant", [self.t, self.x, self.u, self.p], [self.rhs, self.output]
+            "smoothed", [self.t, self.x, self.u, self.p, spread], [self.rhs, self.output]
         )  # fmt: skip
+
+    @functools.cached_property
+    def reader(self) -> Any:
+        """The CasADi function ``(noisy output, p) -> reading``, or None."""
+        if self.readout is None:
+            return None
+        return casadi.Function("reader", [self.reading, self.p], [self.readout])
 
     def evaluate(self, x: Any, u: Any, t: float = 0.0, p: Any = None) -> tuple[Array, Array]:
         """Return the numbers ``rhs`` and ``output`` at one point."""
@@ -315,6 +374,26 @@ def _python_values(system: Any, t: float, x: Array, u: Array, params: Any) -> Ar
     if np.iscomplexobj(values):
         return "the values are complex"
     return np.asarray(values, dtype=float)
+
+
+def with_parameters(system: Any, values: Mapping[str, float]) -> Any:
+    """Return a copy of a system with other parameter values; the original stays as it is.
+
+    Parameters
+    ----------
+    system : control.NonlinearIOSystem
+        The system.
+    values : mapping of str to float
+        New values; the parameters that are not named keep theirs.
+
+    Returns
+    -------
+    control.NonlinearIOSystem
+        A shallow copy.
+    """
+    changed = copy.copy(system)
+    changed.params = {**system.params, **values}
+    return changed
 
 
 def require_siso(equations: Equations) -> None:

@@ -1,0 +1,269 @@
+"""Forces that oppose motion, as accelerations of the moving mass.
+
+All are counted in output units per second squared; times the mass they are newtons.
+"""
+
+from dataclasses import dataclass
+from typing import Any, ClassVar, Self, final
+
+import numpy as np
+
+from .base import parameter
+from .moment import Moment
+from .places import ForceEffect
+
+# Within one sample friction changes the velocity by fc*dt: samples cannot show how it sticks.
+STICKING = 0.25
+
+
+@final
+@dataclass(frozen=True)
+class ViscousFriction(ForceEffect):
+    r"""Friction in proportion to the velocity.
+
+    .. math:: a = -c \dot x
+
+    Parameters
+    ----------
+    c : float
+        Friction over mass [1/s].
+
+    Examples
+    --------
+    >>> import ctrlid as cid
+    >>> print(cid.effects.ViscousFriction(c=2.14))
+    ViscousFriction: c = 2.14 1/s
+    """
+
+    c: float = parameter("1/s", lower=0.0, neutral=0.0)
+
+    look_alikes: ClassVar[tuple[str, ...]] = (
+        "EddyCurrentDamping", "CoulombFriction", "InputDelay", "QuadraticDrag",
+        "AsymmetricViscousFriction",
+    )  # fmt: skip
+    sentence: ClassVar[str] = "A force against the motion that grows with the speed."
+    experiment: ClassVar[str] = (
+        "runs at several constant speeds, and at several positions: viscous friction grows in "
+        "proportion to the speed and is the same everywhere"
+    )
+
+    def force(self, m: Moment) -> Any:
+        """Return the acceleration."""
+        return -self.c * m.velocity
+
+
+@final
+@dataclass(frozen=True)
+class AsymmetricViscousFriction(ForceEffect):
+    r"""Viscous friction that differs between the two directions.
+
+    .. math:: a = -(c \dot x + \delta |\dot x|)
+
+    Forwards the coefficient is c + delta, backwards c - delta.
+
+    Parameters
+    ----------
+    c : float
+        Mean friction over mass [1/s].
+    difference : float
+        Half the difference between forward and backward friction [1/s].
+
+    Examples
+    --------
+    >>> import ctrlid as cid
+    >>> cid.effects.AsymmetricViscousFriction(c=2.1, difference=-0.4).neutral
+    False
+    """
+
+    c: float = parameter("1/s", lower=0.0, neutral=0.0)
+    difference: float = parameter("1/s", neutral=0.0)
+
+    look_alikes: ClassVar[tuple[str, ...]] = ("ViscousFriction", "AsymmetricCoulombFriction")
+    sentence: ClassVar[str] = "Viscous friction is stronger in one direction."
+    experiment: ClassVar[str] = "the same strokes forwards and backwards at several speeds"
+
+    def force(self, m: Moment) -> Any:
+        """Return the acceleration."""
+        return -self.c * m.velocity - self.difference * m.abs(m.velocity)
+
+
+@final
+@dataclass(frozen=True)
+class CoulombFriction(ForceEffect):
+    r"""Dry friction of constant size.
+
+    .. math:: a = -f_c \, \mathrm{sign}(\dot x)
+
+    The jump at rest is spread over what friction changes within a quarter of a sample, and, in a
+    filter, over what it does not know of the velocity.
+
+    Parameters
+    ----------
+    fc : float
+        Friction over mass [output unit/s^2].
+
+    Examples
+    --------
+    >>> import ctrlid as cid
+    >>> print(cid.effects.CoulombFriction(fc=0.214))
+    CoulombFriction: fc = 0.214 [y]/s^2
+    """
+
+    fc: float = parameter("{y}/s^2", lower=0.0, neutral=0.0)
+
+    look_alikes: ClassVar[tuple[str, ...]] = (
+        "ViscousFriction", "StribeckFriction", "AsymmetricCoulombFriction", "InputDeadZone",
+    )  # fmt: skip
+    sentence: ClassVar[str] = "A force of constant size against the motion, as of dry surfaces."
+    experiment: ClassVar[str] = "slow motion with reversals: the force jumps when the motion turns"
+
+    def force(self, m: Moment) -> Any:
+        """Return the acceleration."""
+        return -self.fc * m.sign(m.velocity, width=STICKING * self.fc * m.dt)
+
+
+@final
+@dataclass(frozen=True)
+class AsymmetricCoulombFriction(ForceEffect):
+    r"""Dry friction that differs between the two directions.
+
+    .. math:: a = -f_c \, \mathrm{sign}(\dot x) - \delta
+
+    while it moves: a constant force is not told from it, except at rest.
+
+    Parameters
+    ----------
+    fc : float
+        Mean friction over mass [output unit/s^2].
+    difference : float
+        Half the difference between forward and backward friction [output unit/s^2].
+
+    Examples
+    --------
+    >>> import ctrlid as cid
+    >>> cid.effects.AsymmetricCoulombFriction(fc=0.2, difference=0.03).values()
+    {'fc': 0.2, 'difference': 0.03}
+    """
+
+    fc: float = parameter("{y}/s^2", lower=0.0, neutral=0.0)
+    difference: float = parameter("{y}/s^2", neutral=0.0)
+
+    look_alikes: ClassVar[tuple[str, ...]] = (
+        "CoulombFriction", "AsymmetricViscousFriction", "ConstantForce",
+    )  # fmt: skip
+    sentence: ClassVar[str] = "Dry friction is stronger in one direction."
+    experiment: ClassVar[str] = (
+        "moving and resting: a constant force also pulls at rest, friction does not"
+    )
+
+    def force(self, m: Moment) -> Any:
+        """Return the acceleration."""
+        s = m.sign(m.velocity, width=STICKING * self.fc * m.dt)
+        return -self.fc * s - self.difference * s * s
+
+
+@final
+@dataclass(frozen=True)
+class StribeckFriction(ForceEffect):
+    r"""Extra friction near rest, which fades as the motion gets faster.
+
+    .. math:: a = -f_s \, \mathrm{sign}(\dot x) \, e^{-(\dot x / v_s)^2}
+
+    On top of `CoulombFriction`, the classical curve of Stribeck.
+
+    Parameters
+    ----------
+    fs : float
+        Extra friction over mass at rest [output unit/s^2].
+    vs : float
+        Velocity at which it has fallen to 37 % [output unit/s].
+
+    Examples
+    --------
+    >>> import ctrlid as cid
+    >>> cid.effects.StribeckFriction(fs=0.0, vs=0.01).neutral
+    True
+    """
+
+    fs: float = parameter("{y}/s^2", lower=0.0, neutral=0.0)
+    vs: float = parameter("{y}/s", lower=1e-12)
+
+    look_alikes: ClassVar[tuple[str, ...]] = ("CoulombFriction", "AsymmetricCoulombFriction")
+    sentence: ClassVar[str] = "Friction is larger at standstill than in motion."
+    experiment: ClassVar[str] = "very slow motion, where it sticks and slips"
+
+    @classmethod
+    def candidates(cls, loop: Any, record: Any = None) -> tuple[Self, ...]:
+        """Return no friction with a velocity of a tenth of the usual one."""
+        speed = 0.01
+        if record is not None:
+            speed = 0.1 * float(np.std(np.gradient(record.y, record.dt))) or speed
+        return cls._applicable(loop, cls(fs=0.0, vs=speed))
+
+    def force(self, m: Moment) -> Any:
+        """Return the acceleration."""
+        s = m.sign(m.velocity, width=STICKING * self.fs * m.dt)
+        return -self.fs * s * np.exp(-((m.velocity / self.vs) ** 2))
+
+
+@final
+@dataclass(frozen=True)
+class QuadraticDrag(ForceEffect):
+    r"""Drag of a fast motion in a fluid.
+
+    .. math:: a = -c_2 \dot x |\dot x|
+
+    Parameters
+    ----------
+    c2 : float
+        Drag over mass [1/output unit].
+
+    Examples
+    --------
+    >>> import ctrlid as cid
+    >>> print(cid.effects.QuadraticDrag(c2=3.0))
+    QuadraticDrag: c2 = 3 1/[y]
+    """
+
+    c2: float = parameter("1/{y}", lower=0.0, neutral=0.0)
+
+    look_alikes: ClassVar[tuple[str, ...]] = ("ViscousFriction",)
+    sentence: ClassVar[str] = "A force against the motion that grows with the speed squared."
+    experiment: ClassVar[str] = "runs at several speeds: twice the speed, four times the force"
+
+    def force(self, m: Moment) -> Any:
+        """Return the acceleration."""
+        return -self.c2 * m.velocity * np.abs(m.velocity)
+
+
+@final
+@dataclass(frozen=True)
+class EddyCurrentDamping(ForceEffect):
+    r"""Damping by currents that a magnet induces, which grows with its field squared.
+
+    .. math:: a = -c_e u^2 \dot x
+
+    Parameters
+    ----------
+    ce : float
+        Damping over mass per input squared [1/(s input unit^2)].
+
+    Examples
+    --------
+    >>> import ctrlid as cid
+    >>> print(cid.effects.EddyCurrentDamping(ce=0.5))
+    EddyCurrentDamping: ce = 0.5 1/(s [u]^2)
+    """
+
+    ce: float = parameter("1/(s {u}^2)", lower=0.0, neutral=0.0)
+
+    look_alikes: ClassVar[tuple[str, ...]] = ("ViscousFriction",)
+    sentence: ClassVar[str] = "A magnet brakes metal that moves in its field."
+    experiment: ClassVar[str] = (
+        "several operating points with different inputs: this damping grows with the input, "
+        "viscous friction does not"
+    )
+
+    def force(self, m: Moment) -> Any:
+        """Return the acceleration."""
+        return -self.ce * m.u * m.u * m.velocity

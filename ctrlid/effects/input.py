@@ -1,0 +1,358 @@
+"""Between the controller and the plant: lags, delays, limits and curves of the actuator.
+
+The signal passes backlash, delay, then offset, dead zone and limits (the one added last comes
+first), then lags, then the curves of the plant's own input.
+"""
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import Any, ClassVar, Self, final
+
+import casadi
+import numpy as np
+
+from ..errors import CtrlidError
+from ..linearization import OperatingPoint
+from ..physics import Equations, Play
+from .base import expression, parameter
+from .moment import Moment
+from .places import InputEffect
+
+
+def extremes(values: Any, around: float) -> tuple[float, float]:
+    """Return a range a little inside that of a signal, or one around its value at rest."""
+    if values is None:
+        reach = max(abs(around), 1.0)
+        return around - reach, around + reach
+    low, high = float(np.min(values)), float(np.max(values))
+    return low + 0.02 * (high - low), high - 0.02 * (high - low)
+
+
+@final
+@dataclass(frozen=True)
+class ActuatorLag(InputEffect):
+    r"""The plant's input follows the computed one as a first-order lag.
+
+    .. math:: \tau \dot u_a = u - u_a
+
+    The current in a coil (tau = L/R), an amplifier of finite bandwidth.
+
+    Parameters
+    ----------
+    tau : float
+        Time constant [s].
+
+    Examples
+    --------
+    >>> import ctrlid as cid
+    >>> print(cid.effects.ActuatorLag(tau=0.002))
+    ActuatorLag: tau = 0.002 s
+    """
+
+    tau: float = parameter("s", lower=0.0, neutral=0.0)
+
+    stage: ClassVar[int] = 4
+    states: ClassVar[tuple[str, ...]] = ("input",)
+    look_alikes: ClassVar[tuple[str, ...]] = ("InputDelay", "SensorLag")
+    sentence: ClassVar[str] = "The actuator reaches the commanded value only after a while."
+    experiment: ClassVar[str] = (
+        "large jumps of the input: a lag of the actuator acts ahead of the plant's curves, a lag "
+        "of the sensor behind them, and a delay has no tail"
+    )
+
+    @classmethod
+    def candidates(cls, loop: Any, record: Any = None) -> tuple[Self, ...]:
+        """Return a lag of one sampling period: at zero there is no derivative to go by."""
+        del record
+        return cls._applicable(loop, cls(tau=loop.dt))
+
+    def rates(self, m: Moment) -> tuple[Any, ...]:
+        """Return the lag."""
+        return (m.follow(m.u, self.tau),)
+
+    def rest(self, at: OperatingPoint) -> tuple[float, ...]:
+        """Return the input at rest."""
+        return (at.input,)
+
+    def input(self, m: Moment) -> Any:
+        """Return the lagging input."""
+        return m.own["input"]
+
+
+@final
+@dataclass(frozen=True)
+class InputDelay(InputEffect):
+    r"""The computed input arrives late.
+
+    .. math:: u_a(t) = u(t - \theta)
+
+    Computation time, a bus, a conversion. A delay of the output cannot be told from it.
+
+    Parameters
+    ----------
+    delay : float
+        The delay [s], on top of the one that a sampled loop has anyway; any fraction of a period.
+
+    Examples
+    --------
+    >>> import ctrlid as cid
+    >>> cid.effects.InputDelay(delay=0.0005).neutral
+    False
+    """
+
+    delay: float = parameter("s", lower=0.0, neutral=0.0)
+
+    stage: ClassVar[int] = 6
+    look_alikes: ClassVar[tuple[str, ...]] = ("SensorLag", "ActuatorLag", "ViscousFriction")
+    sentence: ClassVar[str] = "The input takes effect a fixed time after it was computed."
+    experiment: ClassVar[str] = (
+        "fast excitation: the phase of a delay goes on falling with frequency where that of a lag "
+        "levels off"
+    )
+
+    @classmethod
+    def candidates(cls, loop: Any, record: Any = None) -> tuple[Self, ...]:
+        """Return a delay of half a period: at zero the derivative has one side only."""
+        del record
+        return cls._applicable(loop, cls(delay=0.5 * loop.dt))
+
+    def build(self, e: Equations, m: Moment) -> Equations:
+        """Return the equations with this delay on top of what there is."""
+        delay = expression(self.delay)
+        return dataclasses.replace(e, delay=delay if e.delay is None else e.delay + delay)
+
+
+@final
+@dataclass(frozen=True)
+class InputSaturation(InputEffect):
+    r"""The actuator has limits.
+
+    .. math:: u_a = \min(\max(u, u_{min}), u_{max})
+
+    Parameters
+    ----------
+    lower, upper : float
+        Absolute limits [input unit]; infinite for none.
+
+    Examples
+    --------
+    >>> import ctrlid as cid
+    >>> cid.effects.InputSaturation(lower=0.0, upper=6.0).values()
+    {'lower': 0.0, 'upper': 6.0}
+    """
+
+    lower: float = parameter("{u}", neutral=-math.inf)
+    upper: float = parameter("{u}", neutral=math.inf)
+
+    look_alikes: ClassVar[tuple[str, ...]] = ("InputSaturatingGain", "InputDeadZone")
+    sentence: ClassVar[str] = "The actuator cannot go beyond its limits."
+    experiment: ClassVar[str] = "larger steps: a limit acts only while the input is beyond it"
+
+    def check(self) -> None:
+        """Refuse limits in the wrong order."""
+        if not self.lower < self.upper:
+            raise CtrlidError(f"InputSaturation needs lower < upper; given lower={self.lower:g}, "
+                              f"upper={self.upper:g}")  # fmt: skip
+
+    @classmethod
+    def candidates(cls, loop: Any, record: Any = None) -> tuple[Self, ...]:
+        """Return limits just inside the range of the recorded input."""
+        low, high = extremes(None if record is None else record.u, loop.point.input)
+        return cls._applicable(loop, cls(low, high)) if low < high else ()
+
+    def input(self, m: Moment) -> Any:
+        """Return the limited input."""
+        return np.minimum(np.maximum(m.u, self.lower), self.upper)
+
+
+@final
+@dataclass(frozen=True)
+class InputDeadZone(InputEffect):
+    r"""Small deviations of the input do nothing.
+
+    .. math:: u_a = u - \min(\max(u - u_0, -w/2), w/2)
+
+    Crossover of an output stage, the overlap of a valve.
+
+    Parameters
+    ----------
+    width : float
+        Full width w of the zone [input unit], centred at the operating point's input.
+
+    Examples
+    --------
+    >>> import ctrlid as cid
+    >>> cid.effects.InputDeadZone(width=0.0).neutral
+    True
+    """
+
+    width: float = parameter("{u}", lower=0.0, neutral=0.0)
+
+    look_alikes: ClassVar[tuple[str, ...]] = (
+        "InputBacklash", "CoulombFriction", "InputSaturation",
+    )  # fmt: skip
+    sentence: ClassVar[str] = "Inputs near the one at rest have no effect."
+    experiment: ClassVar[str] = (
+        "small signals around the operating point against large ones: the gain falls for small ones"
+    )
+
+    @classmethod
+    def candidates(cls, loop: Any, record: Any = None) -> tuple[Self, ...]:
+        """Return a zone of a tenth of the range of the recorded input."""
+        reach = 0.1 * max(abs(loop.point.input), 1.0)
+        if record is not None:
+            reach = 0.1 * float(np.ptp(record.u))
+        return cls._applicable(loop, cls(width=reach))
+
+    def input(self, m: Moment) -> Any:
+        """Return the input without what the zone swallows."""
+        half = self.width / 2
+        return m.u - np.minimum(np.maximum(m.u - m.at.input, -half), half)
+
+
+@final
+@dataclass(frozen=True)
+class InputOffset(InputEffect):
+    r"""The actuator adds a constant.
+
+    .. math:: u_a = u + u_{off}
+
+    Parameters
+    ----------
+    offset : float
+        The constant [input unit].
+
+    Examples
+    --------
+    >>> import ctrlid as cid
+    >>> print(cid.effects.InputOffset(offset=0.05))
+    InputOffset: offset = 0.05 [u]
+    """
+
+    offset: float = parameter("{u}", neutral=0.0)
+
+    look_alikes: ClassVar[tuple[str, ...]] = (
+        "ConstantForce", "InputSaturatingGain", "InputNonlinearity", "PositionOffset",
+    )  # fmt: skip
+    sentence: ClassVar[str] = "The actuator adds a constant to what it is told."
+    experiment: ClassVar[str] = "several operating points: an offset is the same at each"
+
+    def input(self, m: Moment) -> Any:
+        """Return the input with the constant added."""
+        return m.u + self.offset
+
+
+@final
+@dataclass(frozen=True)
+class InputBacklash(InputEffect):
+    r"""Play between the actuator and the plant.
+
+    .. math:: m_{k} = \min(\max(m_{k-1}, u_k - w/2), u_k + w/2), \quad u_a = m_k
+
+    The applied input moves only once the computed one has crossed the gap.
+
+    Parameters
+    ----------
+    width : float
+        Full width w of the gap [input unit].
+
+    Examples
+    --------
+    >>> import ctrlid as cid
+    >>> cid.effects.InputBacklash(width=0.2).place
+    'input'
+    """
+
+    width: float = parameter("{u}", lower=0.0, neutral=0.0)
+
+    stage: ClassVar[int] = 7
+    look_alikes: ClassVar[tuple[str, ...]] = ("InputDeadZone", "InputDelay", "CoulombFriction")
+    sentence: ClassVar[str] = "When the input turns round, it first has to cross a gap."
+    experiment: ClassVar[str] = (
+        "slow triangles of several sizes: play opens a loop of constant width whatever the size"
+    )
+
+    @classmethod
+    def candidates(cls, loop: Any, record: Any = None) -> tuple[Self, ...]:
+        """Return a gap of a tenth of the range of the recorded input."""
+        reach = 0.1 * max(abs(loop.point.input), 1.0)
+        if record is not None:
+            reach = 0.1 * float(np.ptp(record.u))
+        return cls._applicable(loop, cls(width=reach))
+
+    def build(self, e: Equations, m: Moment) -> Equations:
+        """Return the equations with the play ahead of them."""
+        if e.play is not None:
+            raise CtrlidError("there is a backlash already; one loop takes a single InputBacklash")
+        memory, u = casadi.SX.sym("m"), casadi.SX.sym("u")
+        half = expression(self.width) / 2
+        after = casadi.fmin(casadi.fmax(memory, u - half), u + half)
+        return dataclasses.replace(e, play=Play(memory, u, after, after, u))
+
+
+@final
+@dataclass(frozen=True)
+class InputNonlinearity(InputEffect):
+    r"""The actuator's gain changes with the input.
+
+    .. math:: u_a = u + \gamma (u - u_0)^2
+
+    Parameters
+    ----------
+    curvature : float
+        The curvature gamma [1/input unit].
+
+    Examples
+    --------
+    >>> import ctrlid as cid
+    >>> print(cid.effects.InputNonlinearity(curvature=0.01))
+    InputNonlinearity: curvature = 0.01 1/[u]
+    """
+
+    curvature: float = parameter("1/{u}", neutral=0.0)
+
+    stage: ClassVar[int] = 3
+    look_alikes: ClassVar[tuple[str, ...]] = (
+        "InputSaturatingGain", "InputOffset", "ForceExponent",
+    )  # fmt: skip
+    sentence: ClassVar[str] = "The gain of the actuator is not the same everywhere."
+    experiment: ClassVar[str] = "large inputs to both sides: the gain differs between the sides"
+
+    def input(self, m: Moment) -> Any:
+        """Return the input bent around the operating point."""
+        d = m.u - m.at.input
+        return m.u + self.curvature * d * d
+
+
+@final
+@dataclass(frozen=True)
+class InputSaturatingGain(InputEffect):
+    r"""The actuator's gain falls for large inputs, as iron does when it saturates.
+
+    .. math:: u_a = u / \sqrt{1 + s u^2}, \quad s = 1/U_s^2
+
+    Parameters
+    ----------
+    saturation : float
+        One over the square of the largest input that can take effect [1/input unit^2].
+
+    Examples
+    --------
+    >>> import ctrlid as cid
+    >>> cid.effects.InputSaturatingGain(saturation=1 / 10.0**2).values()
+    {'saturation': 0.01}
+    """
+
+    saturation: float = parameter("1/{u}^2", lower=0.0, neutral=0.0)
+
+    stage: ClassVar[int] = 3
+    look_alikes: ClassVar[tuple[str, ...]] = (
+        "InputOffset", "ConstantForce", "InputNonlinearity", "InputSaturation",
+    )  # fmt: skip
+    sentence: ClassVar[str] = "The larger the input, the less of it takes effect."
+    experiment: ClassVar[str] = "a wide range of inputs: operating points far apart"
+
+    def input(self, m: Moment) -> Any:
+        """Return the saturating input."""
+        return m.u / np.sqrt(1 + self.saturation * m.u * m.u)
