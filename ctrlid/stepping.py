@@ -1,6 +1,7 @@
-"""A loop over one sampling period, as exact equations: the map that simulation repeats."""
+"""A plant or a loop over one sampling period, as exact equations: the map that is repeated."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,15 +11,19 @@ from scipy.integrate import DOP853
 
 from .errors import CtrlidError
 from .loop import Loop
-from .physics import Array
+from .physics import Array, Equations, Lag
+
+Piece = tuple[Any, Any, Any]  # duration, input at its start, slope of the input
+SHARP = 8.0  # time constants after which the transient of a lag is over
 
 
 @dataclass(frozen=True, eq=False)
 class Stepper:
     """The loop over one sampling period as a CasADi function.
 
-    ``step(z, w) -> (next z, y, u, local error)``; z stacks plant and controller states, w is
-    ``(t, r, d, sensor noise, force noise)``, all held over the period.
+    ``step(z, w) -> (next z, y, u, local error)``; z stacks plant and controller states, then what
+    the input's path remembers; w is ``(t, r, d, sensor noise, force noise)``, all held over the
+    period.
     """
 
     plant_states: tuple[str, ...]
@@ -26,7 +31,7 @@ class Stepper:
     step: Any
 
 
-def integrate(rate: Any, z: Any, dt: float, substeps: int) -> tuple[Any, Any]:
+def integrate(rate: Any, z: Any, dt: Any, substeps: int) -> tuple[Any, Any]:
     """Advance an expression by Dormand and Prince's eighth-order formula.
 
     Parameters
@@ -35,7 +40,7 @@ def integrate(rate: Any, z: Any, dt: float, substeps: int) -> tuple[Any, Any]:
         ``rate(tau, z)``, the derivative at time `tau` after the start, as CasADi expression.
     z : casadi.SX
         The state at the start.
-    dt : float
+    dt : float or casadi.SX
         Time to advance [s].
     substeps : int
         Number of steps of equal length.
@@ -71,6 +76,202 @@ def integrate(rate: Any, z: Any, dt: float, substeps: int) -> tuple[Any, Any]:
     return z, worst
 
 
+def integrate_fast(rate: Any, z: Any, dt: Any, substeps: int) -> Any:
+    """Advance an expression by the classical fourth-order formula of Runge and Kutta."""
+    h = dt / substeps
+    for k in range(substeps):
+        start = k * h
+        first = rate(start, z)
+        second = rate(start + h / 2, z + h / 2 * first)
+        third = rate(start + h / 2, z + h / 2 * second)
+        fourth = rate(start + h, z + h * third)
+        z = z + h / 6 * (first + 2 * second + 2 * third + fourth)
+    return z
+
+
+def input_pieces(e: Equations, dt: float, path: Sequence[Any], hold: str) -> list[Piece]:
+    r"""Return the input of the plant over one period as straight pieces.
+
+    .. math:: u(t - d), \quad d = (l + \varphi) T
+
+    changes from one sample to the next at the time :math:`\varphi T` after the start.
+
+    Parameters
+    ----------
+    e : Equations
+        The plant, with or without a delay.
+    dt : float
+        Sampling period T [s].
+    path : sequence of 3 expressions
+        The input at the samples k - l - 1, k - l and k - l + 1.
+    hold : {"zoh", "foh"}
+        How the input runs between samples.
+
+    Returns
+    -------
+    list of tuple
+        Duration [s], input at the start of the piece, slope [1/s].
+    """
+    before, now, ahead = path
+    slopes = [(now - before) / dt, (ahead - now) / dt] if hold == "foh" else [0.0, 0.0]
+    if e.delay is None:
+        return [(dt, now, slopes[1])]
+    late = delay_of(e, e.p) / dt - whole_delay(e, dt)
+    return [
+        (late * dt, before + slopes[0] * (1 - late) * dt, slopes[0]),
+        ((1 - late) * dt, now, slopes[1]),
+    ]
+
+
+def delay_of(e: Equations, p: Any) -> Any:
+    """Return the delay of the input [s] for parameter values `p`."""
+    return casadi.substitute(casadi.SX(e.delay), e.p, casadi.SX(p))
+
+
+def whole_delay(e: Equations, dt: float) -> int:
+    """Return by how many whole samples the input comes late, with the parameters as they are."""
+    if e.delay is None:
+        return 0
+    seconds = float(casadi.evalf(delay_of(e, casadi.DM(e.values))))
+    # A delay of whole samples belongs to the interval above it: only there can it grow and fall.
+    return max(math.floor(seconds / dt + 1e-9), 0)
+
+
+def _known_lags(e: Equations) -> tuple[list[Lag], list[Lag]]:
+    """Return the lags that follow the input itself, and those that only the output sees."""
+    driven, seen = [], []
+    for lag in e.lags:
+        others = casadi.vertcat(*(e.rhs[i] for i in range(len(e.states)) if i != lag.state))
+        if casadi.is_equal(lag.target, e.u, 2):
+            driven.append(lag)
+        elif not casadi.depends_on(others, e.x[lag.state]) and not e.dt:
+            seen.append(lag)
+    return driven, seen
+
+
+def advance(
+    e: Equations, t: Any, x: Any, pieces: Sequence[Piece], p: Any, spread: Any = None,
+    kick: Any = None, substeps: int = 0,
+) -> tuple[Any, Any]:  # fmt: skip
+    """Return the state of a plant after the pieces of its input, and the local error.
+
+    Lags of the input and of the output are advanced by their exact exponential, so that a lag
+    far shorter than the period neither disturbs nor slows the integration.
+
+    Parameters
+    ----------
+    e : Equations
+        The plant.
+    t : expression
+        Time at the start [s].
+    x : expression, shape (states,)
+        State at the start.
+    pieces : sequence of tuple
+        Duration, input at the start and slope, as `input_pieces` returns them.
+    p : expression or ndarray
+        Parameter values.
+    spread : expression, optional
+        Standard deviations of the states, which smooth kinks; zero by default.
+    kick : expression, optional
+        Constant added to the rates: a force held over the period.
+    substeps : int, optional
+        Steps of order eight in each piece; with 0, one step of order four.
+
+    Returns
+    -------
+    x : casadi.SX
+        State after the last piece.
+    error : casadi.SX
+        Estimate of the local error per state, zero for steps of order four.
+    """
+    n = len(e.states)
+    spread = casadi.SX.zeros(n, 1) if spread is None else spread
+    kick = casadi.SX.zeros(n, 1) if kick is None else kick
+    worst = casadi.SX.zeros(n, 1)
+    driven, seen = _known_lags(e)
+    hidden = [lag.state for lag in (*driven, *seen)]
+    if e.dt:
+        return e.smoothed(t, x, pieces[-1][1], p, spread)[0] + kick, worst
+    times = {
+        lag.state: casadi.substitute(casadi.SX(lag.time_constant), e.p, casadi.SX(p))
+        for lag in e.lags
+    }
+    for duration, level, slope in _split(pieces, [times[lag.state] for lag in driven]):
+
+        def filled(tau: Any, z: Any, x: Any = x, level: Any = level, slope: Any = slope) -> Any:
+            z = casadi.SX(z)
+            for lag in driven:
+                time = times[lag.state]
+                steady = level - time * slope
+                decay = casadi.exp(-tau / time)
+                z[lag.state] = steady + slope * tau + (x[lag.state] - steady) * decay
+            return z
+
+        def rate(
+            tau: Any,
+            z: Any,
+            level: Any = level,
+            slope: Any = slope,
+            filled: Any = filled,
+            t: Any = t,
+        ) -> Any:
+            rates = e.smoothed(t + tau, filled(tau, z), level + slope * tau, p, spread)[0] + kick
+            for k in hidden:
+                rates[k] = 0
+            return rates
+
+        if substeps:
+            after, error = integrate(rate, x, duration, substeps)
+            worst = casadi.fmax(worst, error)
+        else:
+            after = integrate_fast(rate, x, duration, 1)
+        after = filled(duration, after)
+        for lag in seen:
+            ends = [
+                _followed(e, lag, t + tau, z, level + slope * tau, p, spread)
+                for tau, z in ((0.0, x), (duration, after))
+            ]
+            after[lag.state] = _trail(x[lag.state], times[lag.state], duration, *ends)
+        x, t = after, t + duration
+    return x, worst
+
+
+def _split(pieces: Sequence[Piece], times: Sequence[Any]) -> list[Piece]:
+    """Cut pieces where the transient of the first lag is over."""
+    parts: list[Piece] = []
+    for duration, level, slope in pieces:
+        if not times:
+            parts.append((duration, level, slope))
+            continue
+        sharp = casadi.fmin(duration / 2, SHARP * times[0])
+        parts += [(sharp, level, slope), (duration - sharp, level + slope * sharp, slope)]
+    return parts
+
+
+def _followed(e: Equations, lag: Lag, t: Any, x: Any, u: Any, p: Any, spread: Any) -> Any:
+    """Return what a lag follows, and its rate, at one point."""
+    velocity = casadi.jtimes(lag.target, e.x, e.rhs) + casadi.jacobian(lag.target, e.t)
+    symbols = [e.t, e.x, e.u, e.p]
+    if e.spread is not None:
+        symbols.append(e.spread)
+    function = casadi.Function("followed", symbols, [lag.target, velocity])
+    return function(*[t, x, u, p, spread][: len(symbols)])
+
+
+def _trail(start: Any, time: Any, duration: Any, begin: Any, end: Any) -> Any:
+    """Advance a lag that follows the cubic through two values and two slopes."""
+    a = duration / time
+    decay = casadi.exp(-a)
+    m0 = 1 - decay
+    m1 = 1 - m0 / a
+    m2 = 1 - 2 * m1 / a
+    m3 = 1 - 3 * m2 / a
+    (z0, v0), (z1, v1) = begin, end
+    v0, v1 = duration * v0, duration * v1
+    return (decay * start + m0 * z0 + m1 * v0 + m2 * (3 * (z1 - z0) - 2 * v0 - v1)
+            + m3 * (2 * (z0 - z1) + v0 + v1))  # fmt: skip
+
+
 def stepper(loop: Loop, substeps: int) -> Stepper:
     """Build the map of a loop over one sampling period.
 
@@ -85,19 +286,25 @@ def stepper(loop: Loop, substeps: int) -> Stepper:
     -------
     Stepper
         The map.
+
+    Raises
+    ------
+    CtrlidError
+        If an analog controller acts through a delay or through play, which need a sampled input.
     """
     e, law = loop.equations(), loop.law()
     n, nc = len(e.states), len(law.rest) if law else 0
-    z, w = casadi.SX.sym("z", n + nc), casadi.SX.sym("w", 5)
+    late = whole_delay(e, loop.dt)
+    # What the path remembers: the play, then the inputs of the last samples.
+    kept = 0 if e.delay is None else late + 1
+    size = n + nc + (e.play is not None) + kept
+    z, w = casadi.SX.sym("z", size), casadi.SX.sym("w", 5)
     t0, r, d, sensor, force = casadi.vertsplit(w)
     kick = casadi.SX.zeros(n, 1)
-    for j in e.velocities:
+    for j in e.velocities or (range(n) if e.dt == 0 else ()):
         kick[j] = force
     at, (lower, upper) = loop.point, loop.input_limits
-
-    def plant(t: Any, x: Any, u: Any) -> tuple[Any, Any]:
-        rhs, y = e.function(t, x, u, e.values)
-        return rhs + kick, y
+    p = e.values
 
     def act(t: Any, z: Any, y: Any) -> tuple[Any, Any]:
         wish, moved = law.apply(t, z[n:], r, y) if law else (at.input, casadi.SX(0, 1))
@@ -109,29 +316,65 @@ def stepper(loop: Loop, substeps: int) -> Stepper:
         return u, moved
 
     def measured(t: Any, z: Any, u: Any) -> Any:
-        return plant(t, z[:n], u)[1] + sensor
+        y = e.function(t, z[:n], u, p)[1] + sensor
+        return y if e.reader is None else e.reader(y, p)
 
     y = measured(t0, z, at.input)
-    u, moved = act(t0, z, y)
+    u, moved = act(t0, z[: n + nc], y)
     if law is None:
         y = measured(t0, z, u)
     if loop.analog:
+        if kept or e.play is not None:
+            raise CtrlidError(
+                "a delay or a play acts on the samples of a digital controller; this loop has an "
+                "analog one: put the delay into the plant as a Padé approximation (control.pade)"
+            )
+
         # A jump of the reference is a jump of the circuit's input: the period is smooth.
         def rate(tau: Any, z: Any) -> Any:
             u, slope = act(t0 + tau, z, measured(t0 + tau, z, at.input))
-            return casadi.vertcat(plant(t0 + tau, z[:n], u)[0], slope)
+            return casadi.vertcat(e.function(t0 + tau, z[:n], u, p)[0] + kick, slope)
 
         after, error = integrate(rate, z, loop.dt, substeps)
-    elif e.dt:
-        after, error = casadi.vertcat(plant(t0, z[:n], u)[0], moved), casadi.SX.zeros(n + nc, 1)
     else:
-        x, error = integrate(
-            lambda tau, x: plant(t0 + tau, x, u)[0], z[:n], loop.dt, substeps
-        )  # fmt: skip
-        after = casadi.vertcat(x, moved)
-        error = casadi.vertcat(error, casadi.SX.zeros(nc, 1))
-    rest = (*at.states, *(law.rest if law else ()))
-    return Stepper(e.states, rest, casadi.Function("step", [z, w], [after, y, u, error]))
+        applied, memory = through_play(e, z[n + nc] if e.play is not None else None, u, p)
+        past = z[size - kept :]
+        path = (past[kept - 1] if kept else applied, past[late - 1] if late else applied, applied)
+        pieces = _numbers(e, input_pieces(e, loop.dt, path, "zoh"), p)
+        x, error = advance(e, t0, z[:n], pieces, p, None, kick, substeps)
+        after = casadi.vertcat(x, moved, memory)
+        if kept:
+            after = casadi.vertcat(after, applied, past[: kept - 1])
+        error = casadi.vertcat(error, casadi.SX.zeros(size - n, 1))
+    rest = [*at.states, *(law.rest if law else ())]
+    settled, memory = at.input, []
+    if e.play is not None:
+        start = casadi.substitute(casadi.vertcat(e.play.start), casadi.vertcat(e.play.u, e.p),
+                                  casadi.vertcat(at.input, p))  # fmt: skip
+        memory = [float(casadi.evalf(start))]
+        settled = float(casadi.evalf(casadi.SX(through_play(e, memory[0], at.input, p)[0])))
+    rest += [*memory, *([settled] * kept)]
+    return Stepper(e.states, tuple(rest), casadi.Function("step", [z, w], [after, y, u, error]))
+
+
+def through_play(e: Equations, m: Any, u: Any, p: Any) -> tuple[Any, Any]:
+    """Return the input behind the play and the play's next memory; without one, u and nothing."""
+    if e.play is None:
+        return u, casadi.SX(0, 1)
+    given = casadi.vertcat(e.play.m, e.play.u, e.p)
+    both = casadi.substitute(
+        casadi.vertcat(e.play.applied, e.play.after), given, casadi.vertcat(m, u, p)
+    )
+    return both[0], both[1]
+
+
+def _numbers(e: Equations, pieces: Sequence[Piece], p: Any) -> list[Piece]:
+    """Put parameter values into the durations of pieces."""
+    values = casadi.SX(casadi.DM(p))
+    return [
+        tuple(casadi.substitute(casadi.SX(part), e.p, values) for part in piece)  # type: ignore[misc]
+        for piece in pieces
+    ]
 
 
 def sensitivity(s: Stepper, reference: float) -> tuple[Array, Array]:

@@ -14,12 +14,13 @@ from .comparison import EXACT, Comparison, Curve
 from .controllers import PID
 from .data import Record
 from .errors import CtrlidError, CtrlidWarning
+from .filtering import FEWEST
 from .linearization import state_matrices
 from .loop import Loop
 from .model import IdentifiedModel
 from .noise_model import noise_polynomial, whiten
 from .physics import Array, timebase
-from .predictor import FEWEST, Prediction, predict, predict_ahead, spread_ahead
+from .predictor import Prediction, predict, predict_ahead, spread_ahead
 from .replay import controller_output, replay_from_best_state
 from .residuals import Correlation, autocorrelation, cross_correlation, explained_share
 from .simulation import Simulator
@@ -101,7 +102,7 @@ def _compare_loop(record: Record, loop: Loop, horizon: int | None) -> Comparison
         ahead[index] = values
         curves.append(_curve(f"{steps}-step prediction", record, ahead,
                              _known_before(record, steps),
-                             spread_ahead(loop, prediction, steps)))  # fmt: skip
+                             spread_ahead(loop, record, prediction, steps)))  # fmt: skip
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", CtrlidWarning)
         try:

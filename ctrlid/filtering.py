@@ -1,0 +1,454 @@
+"""A loop's plant along a record: its map over a period, linearized, and the filter run on it.
+
+The extended Kalman filter linearizes about its own estimate. Here all samples are linearized at
+once about the estimate of the pass before, which is the same thing when the two agree; they do
+after two or three passes, and between the passes parameters and noise may move as well.
+"""
+
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import casadi
+import numpy as np
+
+from .data import Record
+from .errors import CtrlidError
+from .kalman import filter_pass
+from .linearization import state_matrices
+from .loop import Loop
+from .physics import Array, Equations
+from .stepping import advance, input_pieces, integrate, through_play, whole_delay
+from .vectorized import Vectorized
+
+FEWEST = 10  # valid samples, to say anything
+BRIDGE = 20  # samples that do not count and are bridged by the model; then it starts afresh
+SETTLED = 4.0  # times the usual variance: above, the start still dominates the prediction
+SLOW = 0.2  # rate times period up to which one step of order four is exact enough
+PASSES = 12  # at most, to let the trajectory settle
+STILL = 1e-3  # of the standard deviations: a trajectory that moves less has settled
+
+
+@dataclass(frozen=True)
+class Noise:
+    """The noise of a loop, as variances relative to that of the sensor.
+
+    Parameters
+    ----------
+    force : tuple of float
+        Variances of the white forces that are held over each period.
+    memory : float
+        Correlation of the coloured force from one sample to the next.
+    drift : float
+        Variance of the steps of the coloured force; zero: there is none.
+    """
+
+    force: tuple[float, ...]
+    memory: float = 0.0
+    drift: float = 0.0
+
+    @property
+    def coloured(self) -> float:
+        """Variance of the coloured force."""
+        return self.drift / (1 - self.memory**2)
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """A record made ready: signals, and where the filter starts and starts anew."""
+
+    record: Record
+    table: Array  # rows t, u, r, y
+    valid: Any
+    afresh: Any
+    doubt: Array
+    start: Array
+    spread: Array
+    scale: float  # of the sensor noise, roughly
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """Where to linearize: states before and after each measurement, and their spreads."""
+
+    predicted: Array
+    filtered: Array
+    spread: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Linearized:
+    """The plant along a trajectory, as `kalman.filter_pass` takes it."""
+
+    step: Array
+    a: Array
+    b: Array
+    du: Array
+    dp: Array
+    height: Array
+    c: Array
+    hp: Array
+    trajectory: Trajectory
+
+
+@dataclass(frozen=True, eq=False)
+class Filtered:
+    """What one pass of the filter gives; variances are relative to the sensor noise's."""
+
+    innovations: Array
+    variance: Array
+    trajectory: Trajectory
+    slopes: Array
+    disturbance: Array
+
+
+class Machine:
+    """The equations of a loop's plant made ready to be filtered along records.
+
+    Parameters
+    ----------
+    loop : Loop
+        The loop; effects at their neutral values take part.
+    names : sequence of str
+        Parameters whose sensitivities are wanted.
+    hold : {"zoh", "foh"}
+        How the input runs between samples.
+    follow : bool
+        Whether a known analog controller moves the input between samples.
+    """
+
+    def __init__(self, loop: Loop, names: Sequence[str], hold: str, follow: bool) -> None:
+        self.loop, self.names, self.hold = loop, tuple(names), hold
+        e = self.e = loop.equations(keep=True)
+        every = list(e.parameters)
+        self.index = [every.index(name) for name in self.names]
+        law = loop.law() if follow and e.play is None and e.delay is None else None
+        self.law = law if law is not None and law.dt == 0.0 else None
+        self.n = len(e.states)
+        self.size = self.n + (len(self.law.rest) if self.law else 0)
+        self.late = whole_delay(e, loop.dt)
+        self.forces = e.velocities or tuple(range(self.n - len(e.rest)))
+        # One force on all velocities; without any, each state has a noise of its own.
+        self.channels = 1 if e.velocities else len(self.forces)
+        self._build()
+
+    def _build(self) -> None:
+        e, n, dt = self.e, self.n, self.loop.dt
+        x, p, s = (casadi.SX.sym(k, m) for k, m in (("x", self.size), ("p", e.p.shape[0]),
+                                                    ("s", n)))  # fmt: skip
+        t, before, now, ahead, r, y = w = [casadi.SX.sym(k) for k in "tbnary"]
+        force = casadi.SX.sym("f", self.channels)
+        kick = casadi.SX.zeros(n, 1)
+        for k, j in enumerate(self.forces):
+            kick[j] = force[k if self.channels > 1 else 0]
+        # A fit repeats the map often; a single prediction can afford to be exact.
+        substeps = _substeps(e, self.loop) if self.names else max(1, _substeps(e, self.loop))
+        if self.law is None:
+            pieces = [
+                tuple(casadi.substitute(casadi.SX(part), e.p, p) for part in piece)
+                for piece in input_pieces(e, dt, (before, now, ahead), self.hold)
+            ]
+            after = advance(e, t, x, pieces, p, s, kick, substeps)[0]  # type: ignore[arg-type]
+        else:
+            after = self._follow(t, x, p, s, kick, now, r, y, max(substeps, 2))
+        free = casadi.vertcat(*(p[k] for k in self.index)) if self.index else casadi.SX(0, 1)
+        given = [x, casadi.vertcat(*w), p, s, force]
+        # Kinks have no slope at the kink itself; everything else is exact.
+        outputs = [after, casadi.jacobian(after, x), casadi.jacobian(after, force),
+                   casadi.jacobian(after, casadi.vertcat(before, now, ahead)),
+                   casadi.jacobian(after, free)]  # fmt: skip
+        self._step = Vectorized(casadi.Function("step", given, outputs, {"cse": True}))
+        height = e.smoothed(t, x[:n], now, p, s)[1]
+        outputs = [height, casadi.jacobian(height, x), casadi.jacobian(height, free)]
+        self._sensor = Vectorized(casadi.Function("sensor", given[:4], outputs, {"cse": True}))
+
+    def _follow(self, t: Any, x: Any, p: Any, s: Any, kick: Any, u: Any, r: Any, y: Any,
+                substeps: int) -> Any:  # fmt: skip
+        """Advance plant and analog controller together, u being the measured one at the start."""
+        e, n, law = self.e, self.n, self.law
+        assert law is not None
+        noise = y - e.smoothed(t, x[:n], u, p, s)[1]
+        offset = u - law.apply(t, x[n:], r, y)[0]  # bias, injected signals, what xc does not know
+
+        def rate(tau: Any, z: Any) -> Any:
+            seen = e.smoothed(t + tau, z[:n], u, p, s)[1] + noise
+            computed, slope = law.apply(t + tau, z[n:], r, seen)
+            moved = e.smoothed(t + tau, z[:n], computed + offset, p, s)[0] + kick
+            return casadi.vertcat(moved, slope)
+
+        return integrate(rate, x, self.loop.dt, substeps)[0]
+
+    def values(self, theta: Any) -> Array:
+        """Return all parameter values with `theta` in the places of the free ones."""
+        p = self.e.values.copy()
+        p[self.index] = theta
+        return p
+
+    def fits(self, theta: Array) -> bool:
+        """Whether these values still have the delay that the map was built for."""
+        if self.e.delay is None:
+            return True
+        p = casadi.SX(casadi.DM(self.values(theta)))
+        late = float(casadi.evalf(casadi.substitute(casadi.SX(self.e.delay), self.e.p, p)))
+        return bool(self.late <= late / self.loop.dt + 1e-9 <= self.late + 1 + 1e-6)
+
+    def linearize(self, track: Track, theta: Array, at: Trajectory) -> Linearized:
+        """Return the plant along a trajectory, for parameter values `theta`."""
+        p = self.values(theta)
+        u = track.table[1]
+        applied, slopes = self._through_play(u, p)
+        w = self._inputs(track, applied)
+        spread = at.spread[:, : self.n].T
+        step, a, b, dw, dp = self._step(at.filtered.T, w, p, spread, np.zeros(self.channels))
+        if slopes is not None:
+            for k in (-1, 0, 1):
+                dp += dw[:, :, k + 1, None] * self._shifted(slopes, k)[:, None, :]
+        height, c, hp = self._sensor(at.predicted.T, w, p, spread)
+        return Linearized(
+            _full(step, len(u))[:, :, 0], _full(a, len(u)), _full(b, len(u)),
+            _full(dw, len(u)).sum(axis=2), _full(dp, len(u)), _full(height, len(u))[:, 0, 0],
+            _full(c, len(u))[:, 0, :], _full(hp, len(u))[:, 0, :], at,
+        )  # fmt: skip
+
+    def _through_play(self, u: Array, p: Array) -> tuple[Array, Array | None]:
+        """Return the input behind the play, and how it depends on the free parameters."""
+        e = self.e
+        if e.play is None:
+            return u, None
+        m, slope = casadi.SX.sym("m"), casadi.SX.sym("d", len(self.index))
+        sample, values = casadi.SX.sym("u"), casadi.SX.sym("p", e.p.shape[0])
+        applied, after = through_play(e, m, sample, values)
+        free = casadi.vertcat(*(values[k] for k in self.index)) if self.index else casadi.SX(0, 1)
+        rows = [
+            casadi.jacobian(out, m) * slope + casadi.jacobian(out, free).T
+            for out in (applied, after)
+        ]
+        step = casadi.Function(
+            "play", [casadi.vertcat(m, slope), sample, values],
+            [casadi.vertcat(after, rows[1]), casadi.vertcat(applied, rows[0])],
+        )  # fmt: skip
+        start = casadi.substitute(
+            casadi.SX(e.play.start), casadi.vertcat(e.play.u, e.p), casadi.vertcat(u[0], p)
+        )
+        z = np.concatenate([np.asarray(casadi.evalf(start), float).ravel(),
+                            np.zeros(len(self.index))])  # fmt: skip
+        out = np.asarray(step.mapaccum("run", len(u))(z, u[None, :], p)[1], float)
+        return out[0], out[1:].T
+
+    def advance(self, track: Track, x: Array, rows: Any, known: bool = True) -> Array:
+        """Return states (k, n) one period after the samples `rows`, with the loop's parameters."""
+        p = self.e.values
+        w = self._inputs(track, self._through_play(track.table[1], p)[0])[:, rows]
+        if not known:
+            w[5] = self.height(track, x, rows)
+        quiet = np.zeros((self.n, 1))
+        return self._step(x.T, w, p, quiet, np.zeros(self.channels))[0][:, :, 0]
+
+    def height(self, track: Track, x: Array, rows: Any) -> Array:
+        """Return the outputs at states (k, n) and the samples `rows`."""
+        p = self.e.values
+        w = self._inputs(track, self._through_play(track.table[1], p)[0])[:, rows]
+        return self._sensor(x.T, w, p, np.zeros((self.n, 1)))[0][:, 0, 0]
+
+    def at_rest(self) -> tuple[Array, Array, Array]:
+        """Return the derivatives of the map by state and force and of the output, at rest."""
+        at, p = self.loop.point, self.e.values
+        x = self._padded(np.array(_rest(self.loop, self.e)))
+        w = np.array([0.0, at.input, at.input, at.input, at.output, at.output])
+        quiet = np.zeros(self.n)
+        _, a, b, _, _ = self._step(x, w, p, quiet, np.zeros(self.channels))
+        _, h, _ = self._sensor(x, w, p, quiet)
+        return a[0], b[0], h[0]
+
+    def _inputs(self, track: Track, applied: Array) -> Array:
+        """Return the rows (t, input before, now, ahead, r, y) over which the map is evaluated."""
+        t, _, r, y = track.table
+        moved = [self._shifted(applied, k) for k in (-1, 0, 1)]
+        return np.vstack([t, *moved, r, y])
+
+    def _shifted(self, values: Array, k: int) -> Array:
+        rows = np.clip(np.arange(len(values)) - self.late + k, 0, len(values) - 1)
+        return np.asarray(values[rows])
+
+    def run(self, track: Track, lin: Linearized, noise: Noise, sensitive: bool = True) -> Filtered:
+        """Run the filter along a linearized plant."""
+        p = len(self.index) if sensitive else 0
+        out = filter_pass(
+            lin.step, lin.a, lin.b, lin.du, np.ascontiguousarray(lin.dp[:, :, :p]), lin.height,
+            lin.c, np.ascontiguousarray(lin.hp[:, :p]), lin.trajectory.predicted,
+            lin.trajectory.filtered, track.table[3], track.valid, track.afresh, track.doubt,
+            self._padded(track.start), self._padded(track.spread), 1.0,
+            np.asarray(noise.force, dtype=float), noise.memory, noise.drift,
+        )  # fmt: skip
+        error, variance, before, after, wide, slopes, disturbance = out
+        counts = track.valid & ~track.afresh
+        sensor = np.sqrt(np.mean(error[counts] ** 2 / variance[counts]))
+        return Filtered(error, variance, Trajectory(before, after, wide * sensor), slopes,
+                        disturbance)  # fmt: skip
+
+    def _padded(self, values: Array) -> Array:
+        """Add the states of a known analog controller, at rest, to a start."""
+        extra = self.size - values.shape[0]
+        return np.pad(values, [(0, extra)] * values.ndim)
+
+    def guess(self, track: Track) -> Trajectory:
+        """Return a trajectory to begin with: at rest, states that are measured as measured."""
+        n, e = len(track.record), self.e
+        rest = np.tile(self._padded(track.start), (n, 1))
+        for j in range(self.n):
+            if casadi.is_equal(e.output, e.x[j], 2):
+                rest[:, j] = track.table[3]
+        for lag in e.lags:
+            if casadi.is_equal(lag.target, e.u, 2):
+                rest[:, lag.state] = track.table[1]
+        spread = np.sqrt(np.diag(self._padded(track.spread)))
+        quiet = np.minimum(spread, 1.0) * track.scale
+        return Trajectory(rest, rest.copy(), np.tile(quiet, (n, 1)))
+
+    def settle(
+        self, track: Track, theta: Array, noise: Noise, at: Trajectory, passes: int = PASSES
+    ) -> tuple[Linearized, Filtered]:
+        """Linearize and filter until the trajectory no longer moves.
+
+        Raises
+        ------
+        CtrlidError
+            If the filter cannot follow the record with this model.
+        """
+        for count in range(passes):
+            at = self._inside(track, theta, at)
+            lin = self.linearize(track, theta, at)
+            out = self.run(track, lin, noise, sensitive=False)
+            moved = np.abs(out.trajectory.filtered - at.filtered)
+            if not np.isfinite(out.innovations).all() or not np.isfinite(moved).all():
+                k = int(np.argmin(np.isfinite(out.innovations)))
+                raise CtrlidError(
+                    f"the predictor of {self.e.name} lost the record at sample {k} "
+                    f"(t = {track.record.t[k]:.4g} s): the model cannot follow these data there; "
+                    "check units, signs and the operating point, or mark the stretch as not valid"
+                )
+            size = np.maximum(np.std(out.trajectory.filtered, axis=0), 1e-300)
+            still = bool((np.sqrt(np.mean(moved**2, axis=0)) <= STILL * size).all())
+            at = out.trajectory
+            if still and count:
+                break
+        return lin, out
+
+    def _inside(self, track: Track, theta: Array, at: Trajectory) -> Trajectory:
+        """Pull samples at which the plant is not defined back to rest."""
+        bad = ~np.isfinite(at.filtered).all(axis=1) | ~np.isfinite(at.predicted).all(axis=1)
+        if not bad.any():
+            lin = self.linearize(track, theta, at)
+            bad = ~(np.isfinite(lin.step).all(axis=1) & np.isfinite(lin.a).all(axis=(1, 2))
+                    & np.isfinite(lin.height) & np.isfinite(lin.c).all(axis=1))  # fmt: skip
+        if not bad.any():
+            return at
+        rest = self.guess(track)
+        return Trajectory(*(np.where(bad[:, None], old, new) for new, old in (
+            (at.predicted, rest.predicted), (at.filtered, rest.filtered),
+            (at.spread, rest.spread))))  # fmt: skip
+
+
+def _full(values: Array, n: int) -> Array:
+    """Repeat what does not depend on the sample."""
+    return values if values.shape[0] == n else np.repeat(values, n, axis=0)
+
+
+def _substeps(e: Equations, loop: Loop) -> int:
+    """Return the steps of order eight that a period needs; zero: one of order four is enough."""
+    if e.dt:
+        return 0
+    driven = [lag for lag in e.lags if casadi.is_equal(lag.target, e.u, 2)]
+    hidden = [lag.state for lag in e.lags]
+    plain = [k for k in range(len(e.states)) if k not in hidden]
+    a = state_matrices(replace(e, delay=None, play=None), loop.point)[0][np.ix_(plain, plain)]
+    if not np.isfinite(a).all():
+        return 2
+    rate = float(np.max(np.abs(np.linalg.eigvals(a)), initial=0.0)) * loop.dt
+    if rate <= SLOW and not driven:
+        return 0
+    return max(1, int(np.ceil(rate / 1.5)))
+
+
+def make_track(loop: Loop, record: Record) -> Track:
+    """Make a record ready for the filter of a loop.
+
+    Raises
+    ------
+    CtrlidError
+        If the sampling periods differ or too few samples are valid.
+    """
+    if abs(loop.dt - record.dt) > 1e-9 * loop.dt:
+        raise CtrlidError(f"the loop is sampled at {loop.dt:g} s, the record at {record.dt:g} s; "
+                          "give both the same period")  # fmt: skip
+    valid = np.asarray(record.valid)
+    if np.count_nonzero(valid) < FEWEST:
+        raise CtrlidError(f"a prediction needs at least {FEWEST} valid samples; the record has "
+                          f"{np.count_nonzero(valid)} of {len(record)}")  # fmt: skip
+    last = np.maximum.accumulate(np.where(valid, np.arange(len(record)), 0))
+    y, u = np.asarray(record.y)[last], np.asarray(record.u)[last]
+    r = y if record.r is None else np.asarray(record.r)[last]
+    start, spread, scale = _start(loop, record)
+    doubt = np.where(valid, 0.0, (np.std(record.u[valid]) / scale) ** 2)
+    return Track(record, np.vstack([record.t - record.start, u, r, y]), valid,
+                 fresh_starts(loop, record), doubt, start, spread, scale)  # fmt: skip
+
+
+def fresh_starts(loop: Loop, record: Record) -> Any:
+    """Return at which samples the filter begins anew: at the start and in long gaps."""
+    e = loop.equations()
+    poles = np.linalg.eigvals(state_matrices(e, loop.point)[0])
+    fastest = np.max(np.abs(poles) if e.dt else np.exp(poles.real * loop.dt), initial=0.0)
+    # An unstable model may bridge as long as its errors grow by less than half.
+    bridge = BRIDGE if fastest <= 1 else min(BRIDGE, int(np.log(1.5) / np.log(fastest)))
+    afresh = np.zeros(len(record), dtype=bool)
+    last = -BRIDGE - 1
+    for first, stop in record.segments():
+        if first - last > bridge:
+            afresh[max(last, 0) : first + 1] = True
+        last = stop
+    if len(record) - last > bridge:
+        afresh[last:] = True
+    return afresh
+
+
+def _start(loop: Loop, record: Record) -> tuple[Array, Array, float]:
+    """Return a state at the operating point that the first samples may overrule.
+
+    With its covariance relative to the sensor noise, and the size of that noise, roughly.
+    """
+    e, at = loop.equations(keep=True), loop.point
+    y = record.y[record.valid]
+    reach = float(np.std(y)) + abs(float(np.mean(y)) - at.output)
+    # Third differences leave little of a smooth output.
+    noise = float(np.std(np.diff(y, 3))) / np.sqrt(20)
+    noise = max(noise, 1e-9 * max(abs(at.output), reach), 1e-300)
+    speed = max(float(np.std(np.diff(y))) / record.dt, noise / record.dt)
+    rest = _rest(loop, e)
+    wide = [max(0.1 * abs(v), reach, noise) for v in rest]
+    for j in e.velocities:
+        wide[j] = speed
+    for lag in e.lags:
+        if casadi.is_equal(lag.target, e.u, 2):
+            wide[lag.state] = max(float(np.std(record.u[record.valid])), noise)
+    return np.array(rest), np.diag((np.array(wide) / noise) ** 2), noise
+
+
+def _rest(loop: Loop, e: Equations) -> tuple[float, ...]:
+    """Return the state at rest, with effects at their neutral values taking part."""
+    states = loop.point.states
+    extra = len(e.states) - len(states)
+    return states if extra == 0 else (*states, *e.rest[len(e.rest) - extra :])
+
+
+@functools.lru_cache(maxsize=64)
+def machine(loop: Loop, names: tuple[str, ...], hold: str, follow: bool) -> Machine:
+    """Return the machine of a loop, made once."""
+    return Machine(loop, names, hold, follow)
+
+
+def machine_for(loop: Loop, names: Sequence[str], record: Record) -> Machine:
+    """Return the machine of a loop for records of one kind."""
+    follow = record.r is not None and loop.analog
+    return machine(loop, tuple(names), record.hold, follow)

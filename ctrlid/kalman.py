@@ -1,0 +1,190 @@
+"""The Kalman filter along a trajectory, with held-gain sensitivities: the one compiled loop.
+
+Everything that depends on the plant comes in as arrays (its map over one period and the derivatives
+of that map, evaluated along a nominal trajectory), so one compiled function serves every plant
+and every effect.
+"""
+
+from typing import Any
+
+import numba
+import numpy as np
+
+LARGE = 1e150
+
+
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def filter_pass(
+    step: Any, a: Any, b: Any, du: Any, dp: Any, height: Any, c: Any, hp: Any, predicted: Any,
+    filtered: Any, y: Any, valid: Any, afresh: Any, doubt: Any, start: Any, spread: Any,
+    sensor: Any, force: Any, memory: Any, drift: Any,
+) -> Any:  # fmt: skip  # pragma: no cover - compiled
+    r"""Run the filter over a record, linearized along a nominal trajectory.
+
+    .. math:: x^-_{k+1} = f_k + A_k (\hat x_k - \bar x_k) + B_k d_k, \quad
+        P^-_{k+1} = A_k P_k A_k^T + q B_k B_k^T, \quad d_{k+1} = \rho d_k + w_k
+
+    where the force d is a state of its own if its variance is positive. The measurement update is
+    in Joseph's form. With the gain held fixed, the sensitivities obey
+
+    .. math:: S^-_{k+1} = A_k S_k + \partial f_k / \partial\theta, \quad
+        S_k = S^-_k - K_k \psi_k, \quad
+        \psi_k = c_k S^-_k + \partial h_k / \partial\theta.
+
+    Parameters
+    ----------
+    step, a, b, du, dp : ndarray, shapes (N, n), (N, n, n), (N, n, m), (N, n), (N, n, p)
+        Next state from the nominal filtered state; its derivatives by state, force, input and
+        parameters.
+    height, c, hp : ndarray, shapes (N,), (N, n), (N, p)
+        Output at the nominal predicted state and its derivatives.
+    predicted, filtered : ndarray, shape (N, n)
+        Nominal trajectory before and after each measurement.
+    y, valid, afresh, doubt : ndarray, shape (N,)
+        Measured output; whether it counts; whether the filter starts anew; variance of the input.
+    start, spread : ndarray, shapes (n,), (n, n)
+        State and covariance at a start.
+    sensor : float
+        Variance of the sensor noise.
+    force : ndarray, shape (m,)
+        Variances of the white forces.
+    memory, drift : float
+        Coefficient rho of the coloured force and variance of its steps; no such force if zero.
+
+    Returns
+    -------
+    tuple
+        innovations (N,), their variances (N,), predicted (N, n), filtered (N, n) states, standard
+        deviations of the filtered states (N, n), sensitivities of the prediction (N, p) and the
+        coloured force (N,).
+    """
+    size, n = step.shape
+    p = dp.shape[2]
+    m = b.shape[2]
+    coloured = drift > 0.0
+    w = n + 1 if coloured else n
+    x = np.zeros(w)
+    x[:n] = start
+    cov = np.zeros((w, w))
+    cov[:n, :n] = spread
+    if coloured:
+        cov[n, n] = drift / (1.0 - memory * memory)
+    sens = np.zeros((w, p))
+    error, variance = np.zeros(size), np.ones(size)
+    before, after = np.empty((size, n)), np.empty((size, n))
+    wide, slopes, disturbance = np.zeros((size, n)), np.zeros((size, p)), np.zeros(size)
+    row, gain = np.zeros(w), np.zeros(w)
+    moved, turned = np.zeros(w), np.zeros((w, w))
+    full, late = np.zeros((w, w)), np.zeros((w, p))
+    ph = np.zeros(w)
+    for k in range(size):
+        if afresh[k]:
+            x[:] = 0.0
+            x[:n] = start
+            cov[:] = 0.0
+            cov[:n, :n] = spread
+            if coloured:
+                cov[n, n] = drift / (1.0 - memory * memory)
+            sens[:] = 0.0
+        for i in range(n):
+            before[k, i] = x[i]
+        expected = height[k]
+        for i in range(n):
+            row[i] = c[k, i]
+            expected += c[k, i] * (x[i] - predicted[k, i])
+        if coloured:
+            row[n] = 0.0
+        s = sensor
+        for i in range(w):
+            total = 0.0
+            for j in range(n):
+                total += cov[i, j] * row[j]
+            ph[i] = total
+        for i in range(n):
+            s += row[i] * ph[i]
+        variance[k] = s
+        for q in range(p):
+            total = hp[k, q]
+            for i in range(n):
+                total += row[i] * sens[i, q]
+            slopes[k, q] = total
+        if valid[k]:
+            e = y[k] - expected
+            error[k] = e
+            for i in range(w):
+                gain[i] = ph[i] / s
+                x[i] += gain[i] * e
+            for i in range(w):
+                for q in range(p):
+                    sens[i, q] -= gain[i] * slopes[k, q]
+            # Joseph's form (I - K c) P (I - K c)' + K R K' stays positive whatever round-off does.
+            for i in range(w):
+                for j in range(w):
+                    total = cov[i, j]
+                    for l in range(n):
+                        total -= gain[i] * row[l] * cov[l, j]
+                    turned[i, j] = total
+            for i in range(w):
+                for j in range(i + 1):
+                    total = turned[i, j] + sensor * gain[i] * gain[j]
+                    for l in range(n):
+                        total -= turned[i, l] * row[l] * gain[j]
+                    cov[i, j] = total
+                    cov[j, i] = total
+        for i in range(n):
+            after[k, i] = x[i]
+            wide[k, i] = np.sqrt(max(cov[i, i], 0.0))
+        if coloured:
+            disturbance[k] = x[n]
+        # Over one period.
+        for i in range(n):
+            total = step[k, i]
+            for j in range(n):
+                value = a[k, i, j]
+                full[i, j] = value
+                total += value * (x[j] - filtered[k, j])
+            if coloured:
+                push = 0.0
+                for j in range(m):
+                    push += b[k, i, j]
+                full[i, n] = push
+                total += push * x[n]
+            moved[i] = total
+        if coloured:
+            for j in range(n):
+                full[n, j] = 0.0
+            full[n, n] = memory
+            moved[n] = memory * x[n]
+        for i in range(w):
+            x[i] = moved[i]
+            for j in range(w):
+                total = 0.0
+                for l in range(w):
+                    total += full[i, l] * cov[l, j]
+                turned[i, j] = total
+        for i in range(w):
+            for j in range(i + 1):
+                total = 0.0
+                for l in range(w):
+                    total += turned[i, l] * full[j, l]
+                if i < n and j < n:
+                    for l in range(m):
+                        total += force[l] * b[k, i, l] * b[k, j, l]
+                    if doubt[k] > 0.0:
+                        total += doubt[k] * du[k, i] * du[k, j]
+                elif i == n and j == n:
+                    total += drift
+                cov[i, j] = total
+                cov[j, i] = total
+        if p > 0:
+            for i in range(w):
+                for q in range(p):
+                    total = dp[k, i, q] if i < n else 0.0
+                    for l in range(w):
+                        total += full[i, l] * sens[l, q]
+                    late[i, q] = total
+            sens[:] = late
+        if not np.isfinite(x[0]) or abs(x[0]) > LARGE:
+            error[k] = np.nan
+            break
+    return error, variance, before, after, wide, slopes, disturbance

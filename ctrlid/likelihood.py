@@ -1,0 +1,496 @@
+"""Maximum likelihood of a loop's parameters and noise, from the innovations of its filter."""
+
+import functools
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy import optimize
+
+from .errors import CtrlidError
+from .filtering import SETTLED, Filtered, Linearized, Machine, Noise, Track, Trajectory
+from .physics import Array
+
+ROUNDS = 25  # Gauss-Newton steps at most
+CLOSE = 0.02  # standard errors: a smaller step ends the search
+QUIET = 1e-14  # of the output's size, squared: the least variance of the sensor noise
+LOG_STEP = 0.2  # of log variances, for derivatives
+SINGULAR = 1e-10  # relative eigenvalue below which a direction is not in the data
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """What is fitted to what.
+
+    Parameters
+    ----------
+    machine : Machine
+        The plant, with the free parameters as its names.
+    tracks : tuple of Track
+        The records.
+    lower, upper : ndarray, shape (p,)
+        Bounds of the parameters.
+    scale : ndarray, shape (p,)
+        Sizes in which steps are measured before the data say better.
+    counts : tuple of ndarray of bool
+        Samples of each record that enter the likelihood.
+    """
+
+    machine: Machine
+    tracks: tuple[Track, ...]
+    lower: Array
+    upper: Array
+    scale: Array
+    counts: tuple[Any, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A point of the likelihood, with all that was computed there.
+
+    `sensor` holds the variance of each record's sensor noise, `linearized` and `filtered` the last
+    pass, `information` the held-gain Fisher information of `theta`.
+    """
+
+    problem: Problem
+    theta: Array
+    noise: Noise
+    value: float
+    sensor: Array
+    linearized: tuple[Linearized, ...]
+    filtered: tuple[Filtered, ...]
+
+    @property
+    def size(self) -> int:
+        """Number of samples that count."""
+        return int(sum(np.count_nonzero(c) for c in self.problem.counts))
+
+    @functools.cached_property
+    def normal(self) -> tuple[Array, Array]:
+        """The held-gain information matrix and score of the parameters."""
+        p = len(self.theta)
+        matrix, score = np.zeros((p, p)), np.zeros(p)
+        for out, keep, r in zip(self.filtered, self.problem.counts, self.sensor, strict=True):
+            slopes, s = out.slopes[keep], out.variance[keep] * r
+            matrix += (slopes / s[:, None]).T @ slopes
+            score += slopes.T @ (out.innovations[keep] / s)
+        return matrix, score
+
+    @property
+    def standardized(self) -> list[Array]:
+        """The innovations divided by their standard deviations; NaN where they do not count."""
+        return [
+            np.where(keep, out.innovations / np.sqrt(out.variance * r), np.nan)
+            for out, keep, r in zip(self.filtered, self.problem.counts, self.sensor, strict=True)
+        ]
+
+
+def begin(problem: Problem, theta: Array, noise: Noise | None, guesses: Any = None) -> Fit:
+    """Return the likelihood at a starting point, with settled trajectories.
+
+    Parameters
+    ----------
+    problem : Problem
+        What is fitted; without `counts` the samples that count are chosen here.
+    theta : ndarray, shape (p,)
+        Parameter values.
+    noise : Noise, optional
+        The noise; by default searched.
+    guesses : sequence of Trajectory, optional
+        Where to linearize first.
+
+    Returns
+    -------
+    Fit
+        The starting point.
+    """
+    m = problem.machine
+    first = noise or Noise((_unit(m) ** 2 * 1e-2,) * m.channels)
+    settled = []
+    for k, track in enumerate(problem.tracks):
+        at = m.guess(track) if guesses is None else guesses[k]
+        if noise is None:
+            at = m.settle(track, theta, first, at, passes=2)[1].trajectory
+        settled.append((track, at))
+    if noise is None:
+        lins = tuple(m.linearize(t, theta, at) for t, at in settled)
+        counts = tuple(t.valid & ~t.afresh for t in problem.tracks)
+        first = _tune(replace(problem, counts=counts), theta, lins, first, wide=True).noise
+    results = [m.settle(track, theta, first, at) for track, at in settled]
+    if not problem.counts:
+        problem = replace(problem, counts=tuple(
+            _settled(track, out) for track, (_, out) in zip(problem.tracks, results, strict=True)
+        ))  # fmt: skip
+    return evaluate(problem, theta, first, [out.trajectory for _, out in results])
+
+
+def _settled(track: Track, out: Filtered) -> Any:
+    known = track.valid & np.isfinite(out.variance)
+    usual = np.median(out.variance[known])
+    return known & ~track.afresh & (out.variance <= SETTLED * usual)
+
+
+def _unit(machine: Machine) -> float:
+    """Return a ratio of force to sensor noise from which others are counted."""
+    return 1.0 / machine.loop.dt ** (2 if machine.e.velocities else 1)
+
+
+def evaluate(problem: Problem, theta: Array, noise: Noise, at: Sequence[Trajectory]) -> Fit:
+    """Return the likelihood of parameters and noise, linearized along given trajectories."""
+    m = problem.machine
+    lins = tuple(m.linearize(t, theta, a) for t, a in zip(problem.tracks, at, strict=True))
+    return _measure(problem, theta, noise, lins)
+
+
+def _measure(
+    problem: Problem, theta: Array, noise: Noise, lins: Sequence[Linearized], sensitive: bool = True
+) -> Fit:
+    m = problem.machine
+    outs = tuple(
+        m.run(t, lin, noise, sensitive) for t, lin in zip(problem.tracks, lins, strict=True)
+    )
+    value, sensors = 0.0, []
+    for track, out, keep in zip(problem.tracks, outs, problem.counts, strict=True):
+        e, s = out.innovations[keep], out.variance[keep]
+        with np.errstate(all="ignore"):
+            r = float(np.mean(e**2 / s))
+        if not np.isfinite(r):
+            value, r = -math.inf, 1.0
+        least = QUIET * float(np.var(track.table[3][keep]) + np.mean(track.table[3][keep]) ** 2)
+        r = max(r, least, 1e-300)
+        value -= 0.5 * (len(e) * (math.log(r) + math.log(2 * math.pi) + 1) + np.sum(np.log(s)))
+        sensors.append(r)
+    return Fit(problem, theta, noise, float(value), np.array(sensors), tuple(lins), outs)
+
+
+def _log_noise(noise: Noise, dt: float) -> Array:
+    logs = list(np.log(noise.force))
+    if noise.drift:
+        logs += [math.log(noise.coloured), math.log(-dt / math.log(noise.memory))]
+    return np.array(logs)
+
+
+def _noise(logs: Array, channels: int, dt: float) -> Noise:
+    force = tuple(np.exp(np.clip(logs[:channels], -300, 300)).tolist())
+    if len(logs) == channels:
+        return Noise(force)
+    memory = math.exp(-dt / math.exp(min(max(logs[channels + 1], -50), 50)))
+    memory = min(max(memory, 1e-6), 1 - 1e-9)
+    return Noise(force, memory, math.exp(min(max(logs[channels], -300), 300)) * (1 - memory**2))
+
+
+def _tune(
+    problem: Problem, theta: Array, lins: Sequence[Linearized], noise: Noise, wide: bool = False
+) -> Fit:
+    """Return the most likely noise for parameters as they are."""
+    m, dt = problem.machine, problem.machine.loop.dt
+
+    def at(logs: Array) -> Noise:
+        return _noise(logs, m.channels, dt)
+
+    def cost(logs: Array) -> float:
+        value = _measure(problem, theta, at(np.atleast_1d(logs)), lins, sensitive=False).value
+        return -value if np.isfinite(value) else 1e15
+
+    start = _log_noise(noise, dt)
+    low, high = _limits(m, len(start) > m.channels)
+    start = np.clip(start, low, high)
+    if wide:
+        grid = np.linspace(low[0], high[0], 16)
+        best = grid[int(np.argmin([cost(np.full(m.channels, g)) for g in grid]))]
+        start[: m.channels] = best
+    if len(start) == 1:
+        best = _line(cost, start[0], low[0], high[0])
+    else:
+        best = _newton(cost, start, low, high)
+    return _measure(problem, theta, at(best), lins)
+
+
+def _line(cost: Callable[[Array], float], x: float, low: float, high: float) -> Array:
+    """Minimise along one logarithm, moving on while the minimum lies at the end of the bracket."""
+    reach = 2.5
+    while True:
+        ends = max(x - reach, low), min(x + reach, high)
+        found = optimize.minimize_scalar(
+            cost, bounds=ends, method="bounded", options={"xatol": 0.03, "maxiter": 20}
+        )
+        moved = abs(float(found.x) - x)
+        x = float(found.x)
+        if moved < 0.9 * reach or x - low < 0.1 or high - x < 0.1:
+            return np.array([x])
+
+
+def _limits(m: Machine, coloured: bool) -> tuple[Array, Array]:
+    """Return bounds of the logarithms of the noise variances."""
+    unit, dt = 2 * math.log(_unit(m)), m.loop.dt
+    low, high = [unit - 32.0] * m.channels, [unit + 6.0] * m.channels
+    if coloured:
+        low += [unit - 32.0, math.log(2 * dt)]
+        high += [unit + 6.0, math.log(2e4 * dt)]
+    return np.array(low), np.array(high)
+
+
+def _newton(cost: Callable[[Array], float], x: Array, low: Array, high: Array) -> Array:
+    """Minimise a smooth function of a few logarithms by damped Newton steps with differences."""
+    n, h = len(x), LOG_STEP
+    here, damping = cost(x), 0.1
+    for _ in range(12):
+        ups = np.array([cost(np.clip(x + h * row, low, high)) for row in np.eye(n)])
+        downs = np.array([cost(np.clip(x - h * row, low, high)) for row in np.eye(n)])
+        slope = (ups - downs) / (2 * h)
+        hessian = np.diag((ups + downs - 2 * here) / h**2)
+        for i in range(n):
+            for j in range(i):
+                both = cost(np.clip(x + h * (np.eye(n)[i] + np.eye(n)[j]), low, high))
+                hessian[i, j] = hessian[j, i] = (both - ups[i] - ups[j] + here) / h**2
+        values, vectors = np.linalg.eigh(hessian)
+        values = np.maximum(np.abs(values), 1e-3)
+        while True:
+            step = -vectors @ ((vectors.T @ slope) / (values + damping))
+            step *= min(1.0, 2.5 / max(float(np.abs(step).max()), 1e-300))
+            trial = np.clip(x + step, low, high)
+            there = cost(trial)
+            if there <= here or damping > 1e6:
+                break
+            damping = max(10 * damping, 1.0)
+        gain = here - there
+        if gain <= 0:
+            break
+        x, here, damping = trial, there, damping / 10
+        if gain < 0.02:
+            break
+    return x
+
+
+def climb(fit: Fit, free: Any = None, rounds: int = ROUNDS) -> Fit:
+    """Climb to the maximum of the likelihood over parameters and noise.
+
+    Gauss-Newton steps on the innovations with the filter's gain held fixed, the noise tuned between
+    them, and at the end Newton steps on the likelihood itself, whose derivative knows that the
+    gain moves as well.
+
+    Parameters
+    ----------
+    fit : Fit
+        Where to begin.
+    free : ndarray of bool, optional
+        Which parameters move; by default all.
+    rounds : int, optional
+        Steps at most.
+
+    Returns
+    -------
+    Fit
+        The maximum, or the best point found.
+    """
+    problem = fit.problem
+    p = len(fit.theta)
+    free = np.ones(p, dtype=bool) if free is None else np.asarray(free)
+    tuned = -math.inf
+    for _ in range(rounds):
+        moved = _relinearized(fit)
+        fit = moved if np.isfinite(moved.value) else fit
+        if fit.value > tuned + 2.0:
+            fit = _tune(problem, fit.theta, fit.linearized, fit.noise)
+            tuned = fit.value
+        step, error = _step(fit, free)
+        if not p or not np.isfinite(step).all():
+            break
+        fit, share = _search(fit, step)
+        if share * np.max(np.abs(step[free]) / error[free], initial=0.0) < CLOSE:
+            if fit.value <= tuned + 0.05:
+                break
+            fit = _tune(problem, fit.theta, fit.linearized, fit.noise)
+            tuned = fit.value
+    return polish(fit, free)
+
+
+def _relinearized(fit: Fit) -> Fit:
+    return evaluate(
+        fit.problem, fit.theta, fit.noise, [out.trajectory for out in fit.filtered]
+    )  # fmt: skip
+
+
+def _step(fit: Fit, free: Any) -> tuple[Array, Array]:
+    """Return the Gauss-Newton step and the standard errors; bounds hold what pushes outwards."""
+    matrix, score = fit.normal
+    return _solve(fit, matrix, score, free)
+
+
+def _solve(fit: Fit, matrix: Array, score: Array, free: Any) -> tuple[Array, Array]:
+    p, problem = len(fit.theta), fit.problem
+    step, error = np.zeros(p), np.full(p, np.inf)
+    moving = free & (np.diag(matrix) > 0)
+    for _ in range(p + 1):
+        rows = np.flatnonzero(moving)
+        if not len(rows):
+            break
+        inverse = pseudo_inverse(matrix[np.ix_(rows, rows)])
+        step[:] = 0.0
+        step[rows] = inverse @ score[rows]
+        error[rows] = np.sqrt(np.maximum(np.diag(inverse), 1e-300))
+        stuck = ((fit.theta <= problem.lower) & (step < 0)) | (
+            (fit.theta >= problem.upper) & (step > 0)
+        )
+        if not (stuck & moving).any():
+            break
+        moving &= ~stuck
+    step[~moving] = 0.0
+    return step, error
+
+
+def pseudo_inverse(matrix: Array) -> Array:
+    """Invert an information matrix, leaving out directions that are not in the data."""
+    size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    values, vectors = np.linalg.eigh(matrix / np.outer(size, size))
+    keep = values > SINGULAR * values.max()
+    inverse = (vectors[:, keep] / values[keep]) @ vectors[:, keep].T
+    return np.asarray(inverse / np.outer(size, size), dtype=float)
+
+
+def _search(fit: Fit, step: Array) -> tuple[Fit, float]:
+    """Go as far along a step as the likelihood grows."""
+    problem, share = fit.problem, 1.0
+    for _ in range(12):
+        theta = np.clip(fit.theta + share * step, problem.lower, problem.upper)
+        if not problem.machine.fits(theta):
+            problem, fit = _rebuilt(fit, theta)
+        trial = evaluate(problem, theta, fit.noise, [o.trajectory for o in fit.filtered])
+        if np.isfinite(trial.value) and trial.value >= fit.value - 1e-6:
+            return trial, share
+        share /= 3
+    return fit, 0.0
+
+
+def _rebuilt(fit: Fit, theta: Array) -> tuple[Problem, Fit]:
+    """Return the problem with a machine for the delay that `theta` has."""
+    m = fit.problem.machine
+    loop = m.loop.with_parameters(dict(zip(m.names, theta.tolist(), strict=True)))
+    problem = replace(fit.problem, machine=Machine(loop, m.names, m.hold, m.law is not None))
+    return problem, replace(fit, problem=problem)
+
+
+def polish(fit: Fit, free: Any, rounds: int = 2) -> Fit:
+    """Take Newton steps on the likelihood itself, by differences over half a standard error."""
+    for _ in range(rounds):
+        matrix, _ = fit.normal
+        _, error = _step(fit, free)
+        score, known = np.zeros(len(fit.theta)), np.isfinite(error) & free
+        at = [out.trajectory for out in fit.filtered]
+        fit = evaluate(fit.problem, fit.theta, fit.noise, at)
+        for k in np.flatnonzero(known):
+            values = []
+            ends = np.clip(
+                fit.theta[k] + np.array([-0.5, 0.5]) * error[k],
+                fit.problem.lower[k], fit.problem.upper[k],
+            )  # fmt: skip
+            for end in ends:
+                theta = fit.theta.copy()
+                theta[k] = end
+                values.append(evaluate(fit.problem, theta, fit.noise, at).value)
+            if ends[1] > ends[0] and np.isfinite(values).all():
+                score[k] = (values[1] - values[0]) / (ends[1] - ends[0])
+        step, error = _solve(fit, matrix, score, free)
+        if not np.isfinite(step).all() or not known.any():
+            return fit
+        fit, share = _search(fit, step)
+        if share * np.max(np.abs(step[known]) / error[known], initial=0.0) < 0.05:
+            break
+    tuned = _tune(fit.problem, fit.theta, fit.linearized, fit.noise)
+    return tuned if tuned.value > fit.value else fit
+
+
+def with_coloured_force(fit: Fit) -> Fit:
+    """Return the fit with a coloured force added, whether it pays or not."""
+    m, dt = fit.problem.machine, fit.problem.machine.loop.dt
+    best: Fit | None = None
+    sizes = np.array([1e-2, 1.0]) * sum(fit.noise.force)
+    for time in (3 * dt, 30 * dt, 300 * dt):
+        for size in sizes:
+            memory = math.exp(-dt / time)
+            force = tuple(0.5 * v for v in fit.noise.force)
+            noise = Noise(force, memory, size * (1 - memory**2))
+            trial = _measure(fit.problem, fit.theta, noise, fit.linearized, sensitive=False)
+            if best is None or trial.value > best.value:
+                best = trial
+    assert best is not None
+    if not np.isfinite(best.value):
+        raise CtrlidError(f"no coloured force can be fitted to {m.e.name}")
+    return _tune(fit.problem, fit.theta, fit.linearized, best.noise)
+
+
+def information(fit: Fit) -> tuple[Array, Array]:
+    r"""Return the exact Fisher information of parameters and noise, and the score.
+
+    .. math:: I = \sum_k \frac{1}{s_k} \frac{\partial e_k}{\partial\eta}
+        \frac{\partial e_k}{\partial\eta}^T + \frac{1}{2 s_k^2}
+        \frac{\partial s_k}{\partial\eta} \frac{\partial s_k}{\partial\eta}^T
+
+    over parameters, logarithms of the noise ratios and of each record's sensor variance, with the
+    gain of the filter moving with them.
+
+    Parameters
+    ----------
+    fit : Fit
+        The maximum of the likelihood.
+
+    Returns
+    -------
+    matrix : ndarray
+        Information of the parameters first, then of the noise.
+    score : ndarray
+        Derivative of the log-likelihood.
+
+    References
+    ----------
+    Åström, "Maximum likelihood and prediction error methods", Automatica 16 (1980).
+    """
+    problem, m = fit.problem, fit.problem.machine
+    dt, p = m.loop.dt, len(fit.theta)
+    at = [out.trajectory for out in fit.filtered]
+    _, error = _step(fit, np.ones(p, dtype=bool))
+    logs = _log_noise(fit.noise, dt)
+
+    def innovations(theta: Array, noise: Noise) -> Any:
+        out = evaluate(problem, theta, noise, at).filtered
+        return [(o.innovations[c], np.log(o.variance[c]))
+                for o, c in zip(out, problem.counts, strict=True)]  # fmt: skip
+
+    columns: list[Any] = []
+    for k in range(p):
+        h = error[k] if np.isfinite(error[k]) else 0.0
+        ends = np.clip(fit.theta[k] + np.array([-0.5, 0.5]) * h, problem.lower[k], problem.upper[k])
+        pair = []
+        for end in ends:
+            theta = fit.theta.copy()
+            theta[k] = end
+            pair.append(innovations(theta, fit.noise))
+        columns.append(_difference(pair, float(ends[1] - ends[0])))
+    for k in range(len(logs)):
+        pair = []
+        for h in (-LOG_STEP, LOG_STEP):
+            moved = logs.copy()
+            moved[k] += h
+            pair.append(innovations(fit.theta, _noise(moved, m.channels, dt)))
+        columns.append(_difference(pair, 2 * LOG_STEP))
+    count, records = len(columns), len(problem.tracks)
+    matrix = np.zeros((count + records, count + records))
+    score = np.zeros(count + records)
+    for k, (out, keep, r) in enumerate(zip(fit.filtered, problem.counts, fit.sensor, strict=True)):
+        s, e = out.variance[keep] * r, out.innovations[keep]
+        size = np.zeros((len(e), records))
+        size[:, k] = 1.0
+        slopes = np.column_stack([c[k][0] for c in columns] + [np.zeros_like(size)])
+        widths = np.column_stack([c[k][1] for c in columns] + [size])
+        matrix += (slopes / s[:, None]).T @ slopes + 0.5 * widths.T @ widths
+        score += -slopes.T @ (e / s) + 0.5 * widths.T @ (e**2 / s - 1)
+    return matrix, score
+
+
+def _difference(pair: Any, width: float) -> list[tuple[Array, Array]]:
+    if width <= 0:
+        return [(np.zeros_like(e), np.zeros_like(s)) for e, s in pair[0]]
+    return [((e1 - e0) / width, (s1 - s0) / width)
+            for (e0, s0), (e1, s1) in zip(*pair, strict=True)]  # fmt: skip

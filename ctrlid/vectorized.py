@@ -1,0 +1,150 @@
+"""CasADi expressions evaluated by numpy over many samples at once.
+
+CasADi's own interpreter walks through an expression once per sample. Walking through it once per
+block of samples, with a numpy operation at each node, gives the same numbers several times faster
+and needs no compiler.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import casadi
+import numpy as np
+from scipy import special
+
+from .errors import CtrlidError
+from .physics import Array
+
+BLOCK = 512  # samples at once: the work space of a large expression still fits in the cache
+
+
+def _sign(a: Any, out: Any) -> Any:
+    return np.sign(a, out=out)
+
+
+def _select(a: Any, b: Any, out: Any) -> Any:
+    # CasADi's if_else_zero: an expression that is not selected must not spoil the rest by NaN.
+    return np.copyto(out, np.where(np.asarray(a) != 0, b, 0.0))
+
+
+def _truth(compare: Callable[..., Any]) -> Callable[..., Any]:
+    def evaluate(a: Any, b: Any, out: Any) -> Any:
+        return np.copyto(out, compare(a, b))
+
+    return evaluate
+
+
+UNARY: dict[int, Callable[..., Any]] = {
+    casadi.OP_ASSIGN: np.positive, casadi.OP_NEG: np.negative, casadi.OP_EXP: np.exp,
+    casadi.OP_LOG: np.log, casadi.OP_SQRT: np.sqrt, casadi.OP_SQ: np.square,
+    casadi.OP_TWICE: lambda a, out: np.add(a, a, out=out), casadi.OP_SIN: np.sin,
+    casadi.OP_COS: np.cos, casadi.OP_TAN: np.tan, casadi.OP_ASIN: np.arcsin,
+    casadi.OP_ACOS: np.arccos, casadi.OP_ATAN: np.arctan, casadi.OP_SINH: np.sinh,
+    casadi.OP_COSH: np.cosh, casadi.OP_TANH: np.tanh, casadi.OP_ASINH: np.arcsinh,
+    casadi.OP_ACOSH: np.arccosh, casadi.OP_ATANH: np.arctanh, casadi.OP_FLOOR: np.floor,
+    casadi.OP_CEIL: np.ceil, casadi.OP_FABS: np.abs, casadi.OP_SIGN: _sign,
+    casadi.OP_ERF: special.erf, casadi.OP_INV: np.reciprocal, casadi.OP_LOG1P: np.log1p,
+    casadi.OP_EXPM1: np.expm1, casadi.OP_NOT: lambda a, out: np.copyto(out, np.asarray(a) == 0),
+}  # fmt: skip
+BINARY: dict[int, Callable[..., Any]] = {
+    casadi.OP_ADD: np.add, casadi.OP_SUB: np.subtract, casadi.OP_MUL: np.multiply,
+    casadi.OP_DIV: np.divide, casadi.OP_POW: np.power, casadi.OP_CONSTPOW: np.power,
+    casadi.OP_FMIN: np.fmin, casadi.OP_FMAX: np.fmax, casadi.OP_FMOD: np.fmod,
+    casadi.OP_ATAN2: np.arctan2, casadi.OP_HYPOT: np.hypot, casadi.OP_COPYSIGN: np.copysign,
+    casadi.OP_LT: _truth(np.less), casadi.OP_LE: _truth(np.less_equal),
+    casadi.OP_EQ: _truth(np.equal), casadi.OP_NE: _truth(np.not_equal),
+    casadi.OP_AND: _truth(np.logical_and), casadi.OP_OR: _truth(np.logical_or),
+    casadi.OP_IF_ELSE_ZERO: _select,
+}  # fmt: skip
+
+
+class Vectorized:
+    """A CasADi function of scalars and columns, evaluated over many samples at once.
+
+    Parameters
+    ----------
+    function : casadi.Function
+        Function of SX expressions.
+
+    Raises
+    ------
+    CtrlidError
+        If an operation of the function is not known here.
+    """
+
+    def __init__(self, function: Any) -> None:
+        self._rows_in = [function.size1_in(k) for k in range(function.n_in())]
+        self._shapes = [(function.size1_out(k), function.size2_out(k))
+                        for k in range(function.n_out())]  # fmt: skip
+        self._places = []
+        for k in range(function.n_out()):
+            pattern = function.sparsity_out(k)
+            rows, columns = pattern.row(), pattern.get_col()
+            self._places.append(list(zip(rows, columns, strict=True)))
+        self._columns = [function.sparsity_in(k).row() for k in range(function.n_in())]
+        self._work = function.sz_w()
+        self._program: list[tuple[int, int, int, int, Any]] = []
+        for k in range(function.n_instructions()):
+            op = function.instruction_id(k)
+            out, into = function.instruction_output(k), function.instruction_input(k)
+            if op == casadi.OP_CONST:
+                step = (0, out[0], 0, 0, function.instruction_constant(k))
+            elif op == casadi.OP_INPUT:
+                step = (1, out[0], into[0], self._columns[into[0]][into[1]], None)
+            elif op == casadi.OP_OUTPUT:
+                step = (2, into[0], out[0], out[1], None)
+            elif op in UNARY:
+                step = (3, out[0], into[0], 0, UNARY[op])
+            elif op in BINARY:
+                step = (4, out[0], into[0], into[1], BINARY[op])
+            else:
+                raise CtrlidError(
+                    f"the equations use an operation (CasADi's number {op}) that cannot be "
+                    "evaluated over many samples; write it with ordinary numpy functions"
+                )
+            self._program.append(step)
+
+    def __call__(self, *arguments: Any) -> list[Array]:
+        """Evaluate; arguments are numbers or arrays of shape (rows,) or (rows, n).
+
+        Returns
+        -------
+        list of ndarray
+            Each output with shape (n, rows, columns).
+        """
+        tables = []
+        n = 1
+        for rows, value in zip(self._rows_in, arguments, strict=True):
+            table = np.asarray(value, dtype=float)
+            table = table.reshape(rows, -1 if rows else 1)
+            n = max(n, table.shape[1])
+            tables.append(table)
+        outputs = [np.zeros((n, *shape)) for shape in self._shapes]
+        flat = [[o[:, i, j] for i, j in places]
+                for o, places in zip(outputs, self._places, strict=True)]  # fmt: skip
+        with np.errstate(all="ignore"):
+            for first in range(0, n, BLOCK):
+                self._run(tables, flat, first, min(first + BLOCK, n))
+        return outputs
+
+    def _run(self, tables: list[Array], flat: Any, first: int, stop: int) -> None:
+        size = stop - first
+        store: list[Any] = [None] * self._work
+        values: list[Any] = [None] * self._work
+        for kind, a, b, c, extra in self._program:
+            if kind >= 3:
+                buffer = store[a]
+                if buffer is None:
+                    buffer = store[a] = np.empty(size)
+                if kind == 4:
+                    extra(values[b], values[c], out=buffer)
+                else:
+                    extra(values[b], out=buffer)
+                values[a] = buffer
+            elif kind == 0:
+                values[a] = extra
+            elif kind == 1:
+                table = tables[b]
+                values[a] = table[c, first:stop] if table.shape[1] > 1 else table[c, 0]
+            else:
+                flat[b][c][first:stop] = values[a]
