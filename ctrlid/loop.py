@@ -107,11 +107,6 @@ class Loop:
         if law and law.dt == 0.0 and equations.dt:
             raise CtrlidError("an analog controller cannot act on a plant in discrete time; give "
                               "the plant in continuous time or sample the controller")  # fmt: skip
-        if law and self._active.feedthrough:
-            raise CtrlidError(
-                f"{equations.name} passes its input to its output without delay, so the loop with "
-                "a controller is algebraic; add the sensor's or actuator's lag to the plant"
-            )
 
     def _settle(self) -> None:
         """Put the effects into the equations and see that the free parameters exist."""
@@ -137,6 +132,11 @@ class Loop:
                 f"{list(kept.parameters)}; give parameters to ct.nlsys with params={{...}}"
             )
         object.__setattr__(self, "free", free)
+        if self.controller is not None and self._active.feedthrough:
+            raise CtrlidError(
+                f"{kept.name} passes its input to its output without delay, so the loop with "
+                "a controller is algebraic; add the sensor's or actuator's lag to the plant"
+            )
 
     def _with_effects(self, effects: tuple[tuple[str, AbstractEffect], ...]) -> Equations:
         e = self._absolute()

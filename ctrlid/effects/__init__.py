@@ -1,6 +1,14 @@
 """The catalogue of effects: what real plants have and models leave out."""
 
 from .base import AbstractEffect, Parameter, parameter
+from .force import (
+    ConstantForce,
+    CubicStiffness,
+    FlexibleMode,
+    LinearStiffness,
+    PeriodicForce,
+    PositionRipple,
+)
 from .friction import (
     AsymmetricCoulombFriction,
     AsymmetricViscousFriction,
@@ -20,7 +28,15 @@ from .input import (
     InputSaturatingGain,
     InputSaturation,
 )
+from .law import ForceExponent, ParameterDrift, ParameterStep, PositionOffset, StateLimit
 from .moment import Moment
+from .output import (
+    Quantization,
+    SensorLag,
+    SensorNonlinearity,
+    SensorOffset,
+    SensorSaturation,
+)
 from .places import ForceEffect, InputEffect, LawEffect, OutputEffect, ReadingEffect
 
 CATALOGUE: tuple[type[AbstractEffect], ...] = (
@@ -39,6 +55,22 @@ CATALOGUE: tuple[type[AbstractEffect], ...] = (
     StribeckFriction,
     QuadraticDrag,
     EddyCurrentDamping,
+    LinearStiffness,
+    CubicStiffness,
+    ConstantForce,
+    PeriodicForce,
+    PositionRipple,
+    FlexibleMode,
+    PositionOffset,
+    ForceExponent,
+    ParameterDrift,
+    ParameterStep,
+    StateLimit,
+    SensorLag,
+    SensorNonlinearity,
+    SensorOffset,
+    SensorSaturation,
+    Quantization,
 )
 
 __all__ = [
@@ -47,9 +79,13 @@ __all__ = [
     "ActuatorLag",
     "AsymmetricCoulombFriction",
     "AsymmetricViscousFriction",
+    "ConstantForce",
     "CoulombFriction",
+    "CubicStiffness",
     "EddyCurrentDamping",
+    "FlexibleMode",
     "ForceEffect",
+    "ForceExponent",
     "InputBacklash",
     "InputDeadZone",
     "InputDelay",
@@ -59,11 +95,23 @@ __all__ = [
     "InputSaturatingGain",
     "InputSaturation",
     "LawEffect",
+    "LinearStiffness",
     "Moment",
     "OutputEffect",
     "Parameter",
+    "ParameterDrift",
+    "ParameterStep",
+    "PeriodicForce",
+    "PositionOffset",
+    "PositionRipple",
     "QuadraticDrag",
+    "Quantization",
     "ReadingEffect",
+    "SensorLag",
+    "SensorNonlinearity",
+    "SensorOffset",
+    "SensorSaturation",
+    "StateLimit",
     "StribeckFriction",
     "ViscousFriction",
     "parameter",

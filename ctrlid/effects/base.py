@@ -298,7 +298,7 @@ def _with_states(
 
 def _takes(loop: Any, effect: AbstractEffect) -> bool:
     try:
-        effect.apply(loop.equations(), loop.point, loop.dt, "candidate")
+        loop.with_effect(effect)
     except CtrlidError:
         return False
     return True

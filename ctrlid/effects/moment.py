@@ -80,6 +80,11 @@ class Moment:
         return found
 
     @property
+    def position_name(self) -> str:
+        """Name of the state that is the position of the moving mass."""
+        return self._e.states[self._motion()[0]]
+
+    @property
     def position(self) -> Any:
         """Position of the moving mass."""
         return Symbol(self._e.x[self._motion()[0]])
@@ -99,6 +104,13 @@ class Moment:
         """Position of the moving mass, counted from where it is at the operating point."""
         index = self._motion()[0]
         return Symbol(self._e.x[index] - self.at.states[index])
+
+    def plant_parameter(self, name: str) -> Any:
+        """Return a parameter of the plant, or refuse."""
+        if name not in self.parameters:
+            raise CtrlidError(f"{self._e.name} has no numeric parameter {name!r}; it has "
+                              f"{list(self.parameters)}")  # fmt: skip
+        return self.parameters[name]
 
     def _variance(self, value: Any, width: Any) -> Any:
         """Variance of an expression when each state is uncertain by its spread."""

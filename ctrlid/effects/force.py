@@ -1,0 +1,266 @@
+"""Forces that depend on place or time, as accelerations of the moving mass."""
+
+import math
+from dataclasses import dataclass
+from typing import Any, ClassVar, Self, final
+
+import numpy as np
+
+from .base import parameter
+from .moment import Moment
+from .places import ForceEffect
+
+
+def middle_frequency(loop: Any, record: Any) -> float:
+    """Return a frequency [Hz] halfway, on a logarithmic scale, of what a record can show."""
+    samples = 1000 if record is None else len(record)
+    return math.sqrt(0.5 / samples) / float(loop.dt)
+
+
+@final
+@dataclass(frozen=True)
+class LinearStiffness(ForceEffect):
+    r"""A spring, relaxed at the operating point.
+
+    .. math:: a = -k_1 (x - x_0)
+
+    Parameters
+    ----------
+    k1 : float
+        Stiffness over mass [1/s^2]; negative for a force that pushes away.
+
+    Examples
+    --------
+    >>> import ctrlid as cid
+    >>> print(cid.effects.LinearStiffness(k1=20.0))
+    LinearStiffness: k1 = 20 1/s^2
+    """
+
+    k1: float = parameter("1/s^2", neutral=0.0)
+
+    look_alikes: ClassVar[tuple[str, ...]] = ("ForceExponent", "PositionOffset", "CubicStiffness")
+    sentence: ClassVar[str] = "A spring, a cable or a guide pulls back."
+    experiment: ClassVar[str] = (
+        "a sweep of the operating point over the whole stroke: a spring has the same stiffness "
+        "everywhere"
+    )
+
+    def force(self, m: Moment) -> Any:
+        """Return the acceleration."""
+        return -self.k1 * m.deviation
+
+
+@final
+@dataclass(frozen=True)
+class CubicStiffness(ForceEffect):
+    r"""A spring that stiffens with its deflection.
+
+    .. math:: a = -k_3 (x - x_0)^3
+
+    Parameters
+    ----------
+    k3 : float
+        Cubic stiffness over mass [1/(s^2 output unit^2)].
+
+    Examples
+    --------
+    >>> import ctrlid as cid
+    >>> cid.effects.CubicStiffness(k3=1e4).units()
+    {'k3': '1/(s^2 [y]^2)'}
+    """
+
+    k3: float = parameter("1/(s^2 {y}^2)", neutral=0.0)
+
+    look_alikes: ClassVar[tuple[str, ...]] = (
+        "LinearStiffness", "ForceExponent", "SensorNonlinearity",
+    )  # fmt: skip
+    sentence: ClassVar[str] = "A spring that gets stiffer the further it is bent."
+    experiment: ClassVar[str] = "small and large deflections to both sides of the operating point"
+
+    def force(self, m: Moment) -> Any:
+        """Return the acceleration."""
+        return -self.k3 * m.deviation**3
+
+
+@final
+@dataclass(frozen=True)
+class ConstantForce(ForceEffect):
+    r"""A force that is always there.
+
+    .. math:: a = b
+
+    A tilted table, a cable's pull, a wrong weight.
+
+    Parameters
+    ----------
+    bias : float
+        Force over mass [output unit/s^2], positive towards larger outputs.
+
+    Examples
+    --------
+    >>> import ctrlid as cid
+    >>> print(cid.effects.ConstantForce(bias=-0.03))
+    ConstantForce: bias = -0.03 [y]/s^2
+    """
+
+    bias: float = parameter("{y}/s^2", neutral=0.0)
+
+    look_alikes: ClassVar[tuple[str, ...]] = (
+        "InputOffset", "InputSaturatingGain", "AsymmetricCoulombFriction", "PositionOffset",
+    )  # fmt: skip
+    sentence: ClassVar[str] = "A constant force acts besides those of the model."
+    experiment: ClassVar[str] = (
+        "several operating points with different inputs: a constant force is the same at each, "
+        "what an offset of the input does changes with the plant's gain"
+    )
+
+    def force(self, m: Moment) -> Any:
+        """Return the acceleration."""
+        return self.bias
+
+
+@final
+@dataclass(frozen=True)
+class PeriodicForce(ForceEffect):
+    r"""A vibration at a fixed frequency.
+
+    .. math:: a = A \sin(2 \pi f t + \varphi)
+
+    Mains hum, an unbalanced fan.
+
+    Parameters
+    ----------
+    amplitude : float
+        Force over mass A [output unit/s^2].
+    frequency : float
+        Frequency f [Hz].
+    phase : float, optional
+        Phase at time zero [rad], private to a record.
+
+    Examples
+    --------
+    >>> import ctrlid as cid
+    >>> cid.effects.PeriodicForce(amplitude=0.0, frequency=50.0).neutral
+    True
+    """
+
+    amplitude: float = parameter("{y}/s^2", lower=0.0, neutral=0.0)
+    frequency: float = parameter("Hz", lower=1e-9)
+    phase: float = parameter("rad", default=0.0)
+
+    look_alikes: ClassVar[tuple[str, ...]] = ("PositionRipple", "FlexibleMode")
+    sentence: ClassVar[str] = "Something shakes the plant at a fixed frequency."
+    experiment: ClassVar[str] = (
+        "a record at rest, and motion at two speeds: a line that stays at its frequency is a "
+        "vibration, one that follows the speed is a ripple"
+    )
+
+    @classmethod
+    def candidates(cls, loop: Any, record: Any = None) -> tuple[Self, ...]:
+        """Return a vibration of no amplitude; its frequency is to be scanned."""
+        return cls._applicable(loop, cls(0.0, middle_frequency(loop, record)))
+
+    def force(self, m: Moment) -> Any:
+        """Return the acceleration."""
+        return self.amplitude * np.sin(2 * np.pi * self.frequency * m.t + self.phase)
+
+
+@final
+@dataclass(frozen=True)
+class PositionRipple(ForceEffect):
+    r"""A force that repeats along the way.
+
+    .. math:: a = A \sin(2 \pi x / p + \varphi)
+
+    The pitch of a screw, the poles of a motor, the teeth of a gear.
+
+    Parameters
+    ----------
+    amplitude : float
+        Force over mass A [output unit/s^2].
+    period : float
+        Length p after which it repeats [output unit].
+    phase : float, optional
+        Phase at position zero [rad].
+
+    Examples
+    --------
+    >>> import ctrlid as cid
+    >>> print(cid.effects.PositionRipple(amplitude=0.05, period=0.0025))
+    PositionRipple: amplitude = 0.05 [y]/s^2, period = 0.0025 [y], phase = 0 rad
+    """
+
+    amplitude: float = parameter("{y}/s^2", lower=0.0, neutral=0.0)
+    period: float = parameter("{y}", lower=1e-12)
+    phase: float = parameter("rad", default=0.0)
+
+    look_alikes: ClassVar[tuple[str, ...]] = ("PeriodicForce", "SensorNonlinearity")
+    sentence: ClassVar[str] = "A force that repeats with the position, as of a screw or a gear."
+    experiment: ClassVar[str] = "the same way at two speeds: the ripple stays where it is"
+
+    @classmethod
+    def candidates(cls, loop: Any, record: Any = None) -> tuple[Self, ...]:
+        """Return a ripple of no amplitude; its period is to be scanned."""
+        way = 0.0 if record is None else float(np.ptp(record.y))
+        return cls._applicable(loop, cls(0.0, way / 10 if way > 0 else 0.1))
+
+    def force(self, m: Moment) -> Any:
+        """Return the acceleration."""
+        return self.amplitude * np.sin(2 * np.pi * m.position / self.period + self.phase)
+
+
+@final
+@dataclass(frozen=True)
+class FlexibleMode(ForceEffect):
+    r"""A small mass on a spring, carried by the moving mass.
+
+    .. math:: \ddot x = \frac{a + \mu\,w}{1 - \mu}, \quad \ddot q = -w - \ddot x, \quad
+        w = \omega^2 q + 2 \zeta \omega \dot q, \quad \omega = 2 \pi f
+
+    where a is the acceleration without it, of both masses together, and q the deflection. The
+    plant's response has a notch at f and a resonance at :math:`f/\sqrt{1 - \mu}`.
+
+    Parameters
+    ----------
+    frequency : float
+        Natural frequency f of the small mass while the large one is held [Hz].
+    damping : float
+        Its damping ratio zeta.
+    coupling : float
+        Its share mu of the moving mass.
+
+    Examples
+    --------
+    >>> import ctrlid as cid
+    >>> cid.effects.FlexibleMode(frequency=30.0, damping=0.02, coupling=0.1).states
+    ('deflection', 'speed')
+    """
+
+    frequency: float = parameter("Hz", lower=1e-9)
+    damping: float = parameter("", lower=0.0)
+    coupling: float = parameter("", lower=0.0, upper=0.95, neutral=0.0)
+
+    stage: ClassVar[int] = 2
+    states: ClassVar[tuple[str, ...]] = ("deflection", "speed")
+    look_alikes: ClassVar[tuple[str, ...]] = ("PeriodicForce", "InputDelay", "ActuatorLag")
+    sentence: ClassVar[str] = "Part of the moving mass is attached by a spring."
+    experiment: ClassVar[str] = "a sine sweep through the resonance, which must repeat"
+
+    @classmethod
+    def candidates(cls, loop: Any, record: Any = None) -> tuple[Self, ...]:
+        """Return a mode of no mass; its frequency is to be scanned."""
+        return cls._applicable(loop, cls(middle_frequency(loop, record), 0.05, 0.0))
+
+    def pull(self, m: Moment) -> Any:
+        """Return the spring's force over the small mass."""
+        omega = 2 * np.pi * self.frequency
+        return omega * (omega * m.own["deflection"] + 2 * self.damping * m.own["speed"])
+
+    def force(self, m: Moment) -> Any:
+        """Return the change of the acceleration."""
+        return self.coupling * (m.acceleration + self.pull(m)) / (1 - self.coupling)
+
+    def rates(self, m: Moment) -> tuple[Any, ...]:
+        """Return the rates of the deflection and of its speed."""
+        carried = m.acceleration + self.force(m)
+        return m.own["speed"], -self.pull(m) - carried

@@ -1,0 +1,209 @@
+"""Between the plant and the record: lags, curves, offsets and steps of the sensor."""
+
+import math
+from dataclasses import dataclass
+from typing import Any, ClassVar, Self, final
+
+import numpy as np
+
+from ..errors import CtrlidError
+from ..linearization import OperatingPoint
+from .base import parameter
+from .input import extremes
+from .moment import Moment
+from .places import OutputEffect, ReadingEffect
+
+
+@final
+@dataclass(frozen=True)
+class SensorLag(OutputEffect):
+    r"""The reading follows the output as a first-order lag.
+
+    .. math:: \tau \dot y_s = y - y_s
+
+    A sensor of finite bandwidth, an anti-alias filter.
+
+    Parameters
+    ----------
+    tau : float
+        Time constant [s].
+
+    Examples
+    --------
+    >>> import ctrlid as cid
+    >>> print(cid.effects.SensorLag(tau=0.001))
+    SensorLag: tau = 0.001 s
+    """
+
+    tau: float = parameter("s", lower=0.0, neutral=0.0)
+
+    states: ClassVar[tuple[str, ...]] = ("reading",)
+    look_alikes: ClassVar[tuple[str, ...]] = ("InputDelay", "ActuatorLag")
+    sentence: ClassVar[str] = "The sensor shows what was a while ago."
+    experiment: ClassVar[str] = (
+        "fast excitation: the phase of a lag levels off where that of a delay goes on falling"
+    )
+
+    @classmethod
+    def candidates(cls, loop: Any, record: Any = None) -> tuple[Self, ...]:
+        """Return a lag of one sampling period: at zero there is no derivative to go by."""
+        del record
+        return cls._applicable(loop, cls(tau=loop.dt))
+
+    def rates(self, m: Moment) -> tuple[Any, ...]:
+        """Return the lag."""
+        return (m.follow(m.y, self.tau),)
+
+    def rest(self, at: OperatingPoint) -> tuple[float, ...]:
+        """Return the output at rest."""
+        return (at.output,)
+
+    def output(self, m: Moment) -> Any:
+        """Return the lagging reading."""
+        return m.own["reading"]
+
+
+@final
+@dataclass(frozen=True)
+class SensorNonlinearity(OutputEffect):
+    r"""The sensor's gain changes over its range.
+
+    .. math:: y_s = y + \gamma (y - y_0)^2
+
+    Parameters
+    ----------
+    curvature : float
+        The curvature gamma [1/output unit].
+
+    Examples
+    --------
+    >>> import ctrlid as cid
+    >>> print(cid.effects.SensorNonlinearity(curvature=2.0))
+    SensorNonlinearity: curvature = 2 1/[y]
+    """
+
+    curvature: float = parameter("1/{y}", neutral=0.0)
+
+    look_alikes: ClassVar[tuple[str, ...]] = ("ForceExponent", "CubicStiffness", "PositionRipple")
+    sentence: ClassVar[str] = "The sensor's gain is not the same over its range."
+    experiment: ClassVar[str] = "positions over the whole range, checked with a gauge"
+
+    def output(self, m: Moment) -> Any:
+        """Return the bent reading."""
+        d = m.y - m.at.output
+        return m.y + self.curvature * d * d
+
+
+@final
+@dataclass(frozen=True)
+class SensorOffset(OutputEffect):
+    r"""The sensor adds a constant.
+
+    .. math:: y_s = y + y_{off}
+
+    Parameters
+    ----------
+    offset : float
+        The constant [output unit].
+
+    Examples
+    --------
+    >>> import ctrlid as cid
+    >>> cid.effects.SensorOffset(offset=1e-4).place
+    'output'
+    """
+
+    offset: float = parameter("{y}", neutral=0.0)
+
+    look_alikes: ClassVar[tuple[str, ...]] = ("PositionOffset", "InputOffset", "ConstantForce")
+    sentence: ClassVar[str] = "The sensor's zero is wrong."
+    experiment: ClassVar[str] = "a gauge at a known position; from input and output alone, none"
+
+    def output(self, m: Moment) -> Any:
+        """Return the shifted reading."""
+        return m.y + self.offset
+
+
+@final
+@dataclass(frozen=True)
+class SensorSaturation(ReadingEffect):
+    r"""The reading is clipped, its noise included.
+
+    .. math:: y_s = \min(\max(y, y_{min}), y_{max})
+
+    Parameters
+    ----------
+    lower, upper : float
+        Limits of the reading [output unit]; infinite for none.
+
+    Examples
+    --------
+    >>> import ctrlid as cid
+    >>> cid.effects.SensorSaturation(lower=0.0, upper=0.016).neutral
+    False
+    """
+
+    lower: float = parameter("{y}", neutral=-math.inf)
+    upper: float = parameter("{y}", neutral=math.inf)
+
+    look_alikes: ClassVar[tuple[str, ...]] = ("StateLimit", "InputSaturation")
+    sentence: ClassVar[str] = "The sensor shows nothing beyond its range."
+    experiment: ClassVar[str] = "motion beyond the range and back: u goes on while y stands still"
+
+    def check(self) -> None:
+        """Refuse limits in the wrong order."""
+        if not self.lower < self.upper:
+            raise CtrlidError(f"SensorSaturation needs lower < upper; given lower={self.lower:g}, "
+                              f"upper={self.upper:g}")  # fmt: skip
+
+    @classmethod
+    def candidates(cls, loop: Any, record: Any = None) -> tuple[Self, ...]:
+        """Return limits just inside the range of the recorded output."""
+        low, high = extremes(None if record is None else record.y, loop.point.output)
+        return cls._applicable(loop, cls(low, high)) if low < high else ()
+
+    def read(self, m: Moment) -> Any:
+        """Return the clipped reading."""
+        return np.minimum(np.maximum(m.y, self.lower), self.upper)
+
+
+@final
+@dataclass(frozen=True)
+class Quantization(ReadingEffect):
+    r"""The reading has steps, its noise included.
+
+    .. math:: y_s = q \, \mathrm{round}(y / q)
+
+    Parameters
+    ----------
+    step : float
+        The step q [output unit].
+
+    Examples
+    --------
+    >>> import ctrlid as cid
+    >>> print(cid.effects.Quantization(step=1e-5))
+    Quantization: step = 1e-05 [y]
+    """
+
+    step: float = parameter("{y}", lower=0.0, neutral=0.0)
+
+    look_alikes: ClassVar[tuple[str, ...]] = ("CoulombFriction", "InputDeadZone")
+    sentence: ClassVar[str] = "The converter knows steps only."
+    experiment: ClassVar[str] = "the distinct values of a slow ramp"
+
+    @classmethod
+    def candidates(cls, loop: Any, record: Any = None) -> tuple[Self, ...]:
+        """Return the smallest step between recorded outputs, if they have few distinct values."""
+        step = 1e-3 * max(abs(loop.point.output), 1.0)
+        if record is not None:
+            gaps = np.diff(np.unique(record.y))
+            seen = gaps[gaps > 1e-9 * max(float(np.ptp(record.y)), np.finfo(float).tiny)]
+            few = seen.size and len(seen) < 0.5 * len(record)
+            step = float(seen.min()) if few else 0.1 * float(np.std(record.y))
+        return cls._applicable(loop, cls(step)) if step > 0 else ()
+
+    def read(self, m: Moment) -> Any:
+        """Return the rounded reading."""
+        steps = np.round(m.y / np.maximum(self.step, 1e-300))
+        return np.where(self.step > 0, self.step * steps, m.y)
