@@ -12,8 +12,10 @@ import numpy as np
 
 from .controllers import ControlLaw, control_law
 from .effects import AbstractEffect
+from .effects.base import substituted
+from .effects.composition import FAR, compose, labels, ordinary, with_spread
 from .errors import CtrlidError
-from .linearization import OperatingPoint, linearize
+from .linearization import OperatingPoint, linearize, operating_point
 from .physics import Equations, require_siso, trace, with_parameters
 
 
@@ -119,11 +121,12 @@ class Loop:
                 f"CoulombFriction(fc=0.1); given {strangers[0]!r}"
             )
         object.__setattr__(self, "effects", effects)
-        kept = self._with_effects(tuple(self.labelled.items()))
+        plant, at = self._absolute(), self._bare_point
+        kept = compose(plant, self.labelled, at, self.dt)
         active = {label: e for label, e in self.labelled.items() if not e.neutral}
         object.__setattr__(self, "_kept", kept)
-        object.__setattr__(self, "_active", kept if len(active) == len(effects) else
-                           self._with_effects(tuple(active.items())))  # fmt: skip
+        changed = kept if len(active) == len(effects) else compose(plant, active, at, self.dt)
+        object.__setattr__(self, "_active", changed)
         free = (self.free,) if isinstance(self.free, str) else tuple(self.free)
         unknown = [name for name in free if name not in kept.parameters]
         if unknown:
@@ -138,13 +141,6 @@ class Loop:
                 "a controller is algebraic; add the sensor's or actuator's lag to the plant"
             )
 
-    def _with_effects(self, effects: tuple[tuple[str, AbstractEffect], ...]) -> Equations:
-        e = self._absolute()
-        at = self._bare_point
-        for label, effect in sorted(effects, key=lambda pair: pair[1].stage):
-            e = effect.apply(e, at, self.dt, label)
-        return replace(e, rest=_at_rest(e, at)) if e.lags else e
-
     @property
     def linear_plant(self) -> bool:
         """Whether the plant is a linear system and so acts on deviations from `at`."""
@@ -153,12 +149,7 @@ class Loop:
     @property
     def labelled(self) -> dict[str, AbstractEffect]:
         """The effects by name: that of the class, numbered from the second of a class on."""
-        found: dict[str, AbstractEffect] = {}
-        for effect in self.effects:
-            name = type(effect).__name__
-            count = sum(type(e).__name__ == name for e in found.values())
-            found[f"{name}{count + 1}" if count else name] = effect
-        return found
+        return labels(self.effects)
 
     @property
     def parameters(self) -> dict[str, float]:
@@ -318,37 +309,72 @@ class Loop:
         return law is not None and law.dt == 0.0
 
     def system(self) -> Any:
-        """Return the plant in absolute physical units.
+        """Return the plant with its effects, in absolute physical units.
+
+        A delay becomes its Padé approximation of order two; kinks are as sharp as in a simulation.
 
         Returns
         -------
         control.NonlinearIOSystem
-            The plant as given, or a linear one with its operating point added.
+            The plant as given, or with its effects and, if it is linear, its operating point. Its
+            parameters are those of the loop.
+
+        Raises
+        ------
+        CtrlidError
+            If there is a backlash, whose memory is no state of a continuous system.
         """
-        if not self.linear_plant:
+        if not self.linear_plant and self._active is self._traced:
             return self.plant
-        e = self.equations()
+        e = ordinary(self._active, self._bare_point)
+
+        def values(params: Mapping[str, Any]) -> list[float]:
+            return [float(params[name]) for name in e.parameters]
 
         def update(t: float, x: Any, u: Any, params: Mapping[str, Any]) -> Any:
-            return e.evaluate(x, u)[0]
+            return e.evaluate(x, u, t, values(params))[0]
 
         def output(t: float, x: Any, u: Any, params: Mapping[str, Any]) -> Any:
-            return e.evaluate(x, u)[1]
+            return e.evaluate(x, u, t, values(params))[1]
 
-        return ct.nlsys(update, output, inputs=list(e.inputs), outputs=list(e.outputs),
-                        states=list(e.states), dt=e.dt, name=e.name)  # fmt: skip
+        names = [name.replace(".", "_") for name in e.states]
+        system = ct.nlsys(update, output, inputs=list(e.inputs), outputs=list(e.outputs),
+                          states=names, dt=e.dt, name=e.name, params=dict(e.parameters),
+                          )  # fmt: skip
+        system.equations = e  # the way back for whoever traces the system again
+        system.units = getattr(self.plant, "units", {})
+        return system
 
     def linearize(self) -> Any:
-        """Return the plant linearized at the operating point.
+        """Return the plant with its effects, linearized at the operating point.
+
+        The point keeps its output; with effects, its states and input are solved for anew.
+        Friction is taken as in motion that is fast against its jump, where it has no slope; dead
+        zones, backlash, steps of a converter and vibrations are left out; a delay is its Padé
+        approximation of order two; what drifts has its value at time zero.
 
         Returns
         -------
         control.TransferFunction
             From deviations of the input to deviations of the output.
+
+        Raises
+        ------
+        CtrlidError
+            If the plant with its effects has no equilibrium at this output.
         """
-        if isinstance(self.plant, ct.TransferFunction):
-            return self.plant
-        return linearize(self.plant, self.point)
+        active = {k: e for k, e in self.labelled.items() if not e.neutral and e.in_linear_model}
+        if not active:
+            if isinstance(self.plant, ct.TransferFunction):
+                return self.plant
+            return linearize(self.plant, self.point)
+        at = self._bare_point
+        changed = compose(self._absolute(), active, at, self.dt)
+        changed = substituted(changed, changed.t, casadi.SX(0.0))
+        resting = ordinary(changed, at)
+        guess = OperatingPoint((*at.states, *resting.rest), at.input, at.output)
+        point = operating_point(resting, output=at.output, guess=guess)
+        return linearize(ordinary(with_spread(changed, FAR), at), point)
 
     def __repr__(self) -> str:
         e = self._traced
@@ -364,17 +390,3 @@ class Loop:
         if self.effects:
             text += f", effects: {', '.join(self.labelled)}"
         return text + ")"
-
-
-def _at_rest(e: Equations, at: OperatingPoint) -> tuple[float, ...]:
-    """Return the values at rest of the added states: a lag rests where its target does."""
-    own = len(e.states) - len(e.rest)
-    rest = list(e.rest)
-    targets = casadi.Function("targets", [e.t, e.x, e.u, e.p, e.spread],
-                              [lag.target for lag in e.lags])  # fmt: skip
-    for _ in e.lags:  # of lags in a row each waits for the one before
-        point = [*at.states, *rest]
-        values = targets.call([0.0, point, at.input, e.values, np.zeros(len(point))])
-        for lag, value in zip(e.lags, values, strict=True):
-            rest[lag.state - own] = float(value)
-    return tuple(rest)

@@ -13,6 +13,7 @@ import control as ct
 import numpy as np
 from control.nlsys import InterconnectedSystem
 
+from . import canonical
 from .errors import CtrlidError
 from .tracing import Symbol, Symbols, TracingError, rebind
 
@@ -145,6 +146,10 @@ def _linear_matrices(system: Any) -> tuple[Array, Array, Array, Array]:
     return tuple(np.asarray(m, float) for m in (space.A, space.B, space.C, space.D))  # type: ignore[return-value]
 
 
+def _lift(value: Any) -> Any:
+    return value.sx if isinstance(value, Symbol) else float(value)
+
+
 def _array(symbols: Any) -> Symbols:
     box = np.empty(symbols.shape[0], dtype=object)
     for k in range(box.size):
@@ -157,11 +162,18 @@ def _expressions(result: Any, rows: int, what: str) -> Any:
     flat = np.asarray(result, dtype=object).reshape(-1)
     if flat.size != rows:
         raise TracingError(f"{what} returned {flat.size} values, but {rows} are declared")
-    return casadi.SX(casadi.vertcat(*(v.sx if isinstance(v, Symbol) else float(v) for v in flat)))
+    return casadi.SX(casadi.vertcat(*(_lift(v) for v in flat)))
 
 
 def _run(system: Any, t: Any, x: Any, u: Any, p: Mapping[str, Any]) -> tuple[Any, Any]:
     """Trace one system: its (rhs, output) as CasADi columns for symbolic t, x, u."""
+    known = getattr(system, "equations", None)
+    if isinstance(known, Equations):  # a plant with its effects, from Loop.system()
+        values = [_lift(p[name]) for name in known.parameters]
+        function = casadi.Function("known", [known.t, known.x, known.u, known.p],
+                                   [known.rhs, known.output])  # fmt: skip
+        rhs, out = function(t, x, u, casadi.vertcat(*values) if values else casadi.SX(0, 1))
+        return rhs, out
     if isinstance(system, ct.StateSpace):  # also a linear interconnection
         a, b, c, d = (casadi.sparsify(casadi.DM(m)) for m in _linear_matrices(system))
         return (
@@ -228,7 +240,8 @@ def trace(system: Any) -> Equations:
     Parameters
     ----------
     system : control.NonlinearIOSystem, control.StateSpace or control.TransferFunction
-        The plant. Interconnected systems are traced part by part.
+        The plant. Interconnected systems are traced part by part. The coefficients of a transfer
+        function become parameters, a1, ... of the monic denominator and b1, ... of the numerator.
 
     Returns
     -------
@@ -241,6 +254,10 @@ def trace(system: Any) -> Equations:
         If the system is of another kind, if a function cannot be traced (the message names the
         line and the cure), or if the formulas disagree with the function.
     """
+    if isinstance(system, Equations):
+        return system
+    if isinstance(system, ct.TransferFunction) and system.issiso() and _proper(system):
+        return _canonical(system)
     if isinstance(system, ct.TransferFunction):
         system = ct.ss(system, name=system.name, inputs=system.input_labels,
                        outputs=system.output_labels)  # fmt: skip
@@ -268,6 +285,24 @@ def trace(system: Any) -> Equations:
             error = error or reason
     assert error is not None
     raise error
+
+
+def _proper(system: Any) -> bool:
+    names = canonical.coefficients(system)
+    return len(names) <= 2 * canonical.order(list(names)) + 1
+
+
+def _canonical(system: Any) -> Equations:
+    values = canonical.coefficients(system)
+    n, dt = canonical.order(list(values)), timebase(system)
+    t, x, u, p = casadi.SX.sym("t"), _vector("x", n), _vector("u", 1), _vector("p", len(values))
+    named = {name: p[k] for k, name in enumerate(values)}
+    rates, output = canonical.state_equations(named, [x[k] for k in range(n)], u, dt == 0)
+    return Equations(
+        system.name, tuple(f"x[{k}]" for k in range(n)), tuple(system.input_labels),
+        tuple(system.output_labels), values, dt, t, x, u, p,
+        casadi.SX(casadi.vertcat(*rates)) if n else casadi.SX(0, 1), casadi.SX(output),
+    )  # fmt: skip
 
 
 def _trace(system: Any, symbolic: Mapping[str, float]) -> Equations:
@@ -381,16 +416,18 @@ def with_parameters(system: Any, values: Mapping[str, float]) -> Any:
 
     Parameters
     ----------
-    system : control.NonlinearIOSystem
+    system : control.NonlinearIOSystem or control.TransferFunction
         The system.
     values : mapping of str to float
         New values; the parameters that are not named keep theirs.
 
     Returns
     -------
-    control.NonlinearIOSystem
-        A shallow copy.
+    control.NonlinearIOSystem or control.TransferFunction
+        A shallow copy, or the transfer function with the new coefficients.
     """
+    if isinstance(system, ct.TransferFunction):
+        return canonical.rebuilt(system, values)
     changed = copy.copy(system)
     changed.params = {**system.params, **values}
     return changed

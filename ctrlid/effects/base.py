@@ -84,6 +84,7 @@ class AbstractEffect:
     sentence: ClassVar[str] = ""
     experiment: ClassVar[str] = ""
     states: ClassVar[tuple[str, ...]] = ()
+    in_linear_model: ClassVar[bool] = True  # False: no part of small deviations from rest
 
     def __post_init__(self) -> None:
         kind = type(self).__name__

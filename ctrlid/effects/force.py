@@ -148,6 +148,7 @@ class PeriodicForce(ForceEffect):
     frequency: float = parameter("Hz", lower=1e-9)
     phase: float = parameter("rad", default=0.0)
 
+    in_linear_model: ClassVar[bool] = False
     look_alikes: ClassVar[tuple[str, ...]] = ("PositionRipple", "FlexibleMode")
     sentence: ClassVar[str] = "Something shakes the plant at a fixed frequency."
     experiment: ClassVar[str] = (

@@ -189,6 +189,7 @@ class InputDeadZone(InputEffect):
 
     width: float = parameter("{u}", lower=0.0, neutral=0.0)
 
+    in_linear_model: ClassVar[bool] = False
     look_alikes: ClassVar[tuple[str, ...]] = (
         "InputBacklash", "CoulombFriction", "InputSaturation",
     )  # fmt: skip
@@ -267,6 +268,7 @@ class InputBacklash(InputEffect):
     width: float = parameter("{u}", lower=0.0, neutral=0.0)
 
     stage: ClassVar[int] = 7
+    in_linear_model: ClassVar[bool] = False
     look_alikes: ClassVar[tuple[str, ...]] = ("InputDeadZone", "InputDelay", "CoulombFriction")
     sentence: ClassVar[str] = "When the input turns round, it first has to cross a gap."
     experiment: ClassVar[str] = (

@@ -188,6 +188,7 @@ class Quantization(ReadingEffect):
 
     step: float = parameter("{y}", lower=0.0, neutral=0.0)
 
+    in_linear_model: ClassVar[bool] = False
     look_alikes: ClassVar[tuple[str, ...]] = ("CoulombFriction", "InputDeadZone")
     sentence: ClassVar[str] = "The converter knows steps only."
     experiment: ClassVar[str] = "the distinct values of a slow ramp"
