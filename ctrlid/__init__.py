@@ -24,6 +24,7 @@ from .iv import fit_iv
 from .lead import design_lead
 from .linearization import OperatingPoint, linearize, operating_point
 from .loop import Loop
+from .loop_fit import LoopEstimate, LoopFit, fit_loop
 from .margins import Margins, loop_margins, nu_gap, robust_margin
 from .model import Estimate, IdentifiedModel
 from .predictor import Prediction, predict
@@ -51,6 +52,8 @@ __all__ = [
     "Integrator",
     "Linear",
     "Loop",
+    "LoopEstimate",
+    "LoopFit",
     "Margins",
     "Nonlinear",
     "OperatingPoint",
@@ -71,6 +74,7 @@ __all__ = [
     "fit_arx",
     "fit_continuous",
     "fit_iv",
+    "fit_loop",
     "linearize",
     "loop_margins",
     "multisine",

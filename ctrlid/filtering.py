@@ -6,6 +6,7 @@ after two or three passes, and between the passes parameters and noise may move 
 """
 
 import functools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -19,13 +20,21 @@ from .kalman import filter_pass
 from .linearization import state_matrices
 from .loop import Loop
 from .physics import Array, Equations
-from .stepping import advance, input_pieces, integrate, through_play, whole_delay
+from .stepping import (
+    Scheme,
+    advance,
+    input_pieces,
+    integrate,
+    known_lags,
+    through_play,
+    whole_delay,
+)
 from .vectorized import Vectorized
 
 FEWEST = 10  # valid samples, to say anything
 BRIDGE = 20  # samples that do not count and are bridged by the model; then it starts afresh
 SETTLED = 4.0  # times the usual variance: above, the start still dominates the prediction
-SLOW = 0.2  # rate times period up to which one step of order four is exact enough
+SLOW = 0.35  # rate times step up to which a step of order four is exact enough
 PASSES = 12  # at most, to let the trajectory settle
 STILL = 1e-3  # of the standard deviations: a trajectory that moves less has settled
 
@@ -143,22 +152,24 @@ class Machine:
         for k, j in enumerate(self.forces):
             kick[j] = force[k if self.channels > 1 else 0]
         # A fit repeats the map often; a single prediction can afford to be exact.
-        substeps = _substeps(e, self.loop) if self.names else max(1, _substeps(e, self.loop))
+        order, steps, cut = self.scheme = _scheme(e, self.loop)
+        scheme = self.scheme if self.names else (8, 1 if order == 4 else steps, cut)
         if self.law is None:
             pieces = [
                 tuple(casadi.substitute(casadi.SX(part), e.p, p) for part in piece)
                 for piece in input_pieces(e, dt, (before, now, ahead), self.hold)
             ]
-            after = advance(e, t, x, pieces, p, s, kick, substeps)[0]  # type: ignore[arg-type]
+            after = advance(e, t, x, pieces, p, s, kick, scheme)[0]  # type: ignore[arg-type]
         else:
-            after = self._follow(t, x, p, s, kick, now, r, y, max(substeps, 2))
+            after = self._follow(t, x, p, s, kick, now, r, y, max(scheme[1], 2))
         free = casadi.vertcat(*(p[k] for k in self.index)) if self.index else casadi.SX(0, 1)
         given = [x, casadi.vertcat(*w), p, s, force]
         # Kinks have no slope at the kink itself; everything else is exact.
         outputs = [after, casadi.jacobian(after, x), casadi.jacobian(after, force),
-                   casadi.jacobian(after, casadi.vertcat(before, now, ahead)),
                    casadi.jacobian(after, free)]  # fmt: skip
         self._step = Vectorized(casadi.Function("step", given, outputs, {"cse": True}))
+        moves = [casadi.jacobian(after, casadi.vertcat(before, now, ahead))]
+        self._moves = Vectorized(casadi.Function("moves", given, moves, {"cse": True}))
         height = e.smoothed(t, x[:n], now, p, s)[1]
         outputs = [height, casadi.jacobian(height, x), casadi.jacobian(height, free)]
         self._sensor = Vectorized(casadi.Function("sensor", given[:4], outputs, {"cse": True}))
@@ -186,12 +197,15 @@ class Machine:
         return p
 
     def fits(self, theta: Array) -> bool:
-        """Whether these values still have the delay that the map was built for."""
-        if self.e.delay is None:
-            return True
+        """Whether the map was built for such values of a delay or of a lag."""
+        e, dt = self.e, self.loop.dt
         p = casadi.SX(casadi.DM(self.values(theta)))
-        late = float(casadi.evalf(casadi.substitute(casadi.SX(self.e.delay), self.e.p, p)))
-        return bool(self.late <= late / self.loop.dt + 1e-9 <= self.late + 1 + 1e-6)
+        if e.delay is not None:
+            late = float(casadi.evalf(casadi.substitute(casadi.SX(e.delay), e.p, p))) / dt + 1e-9
+            if not self.late <= late <= self.late + 1 + 1e-6:
+                return False
+        time = _shortest(e, p)
+        return time > dt / 16 if not self.scheme[2] else time < dt / 4
 
     def linearize(self, track: Track, theta: Array, at: Trajectory) -> Linearized:
         """Return the plant along a trajectory, for parameter values `theta`."""
@@ -200,8 +214,14 @@ class Machine:
         applied, slopes = self._through_play(u, p)
         w = self._inputs(track, applied)
         spread = at.spread[:, : self.n].T
-        step, a, b, dw, dp = self._step(at.filtered.T, w, p, spread, np.zeros(self.channels))
+        given = (at.filtered.T, w, p, spread, np.zeros(self.channels))
+        step, a, b, dp = self._step(*given)
+        # How the input moves the state matters only where the input is not what was measured.
+        unsure = slopes is not None or not track.valid.all()
+        dw = self._moves(*given)[0] if unsure else np.zeros((1, self.size, 3))
         if slopes is not None:
+            dw = _full(dw, len(u))
+            dp = _full(dp, len(u)).copy()
             for k in (-1, 0, 1):
                 dp += dw[:, :, k + 1, None] * self._shifted(slopes, k)[:, None, :]
         height, c, hp = self._sensor(at.predicted.T, w, p, spread)
@@ -257,7 +277,7 @@ class Machine:
         x = self._padded(np.array(_rest(self.loop, self.e)))
         w = np.array([0.0, at.input, at.input, at.input, at.output, at.output])
         quiet = np.zeros(self.n)
-        _, a, b, _, _ = self._step(x, w, p, quiet, np.zeros(self.channels))
+        _, a, b, _ = self._step(x, w, p, quiet, np.zeros(self.channels))
         _, h, _ = self._sensor(x, w, p, quiet)
         return a[0], b[0], h[0]
 
@@ -355,20 +375,30 @@ def _full(values: Array, n: int) -> Array:
     return values if values.shape[0] == n else np.repeat(values, n, axis=0)
 
 
-def _substeps(e: Equations, loop: Loop) -> int:
-    """Return the steps of order eight that a period needs; zero: one of order four is enough."""
+def _scheme(e: Equations, loop: Loop) -> Scheme:
+    """Return how a period is integrated: as cheaply as the plant and its lags allow."""
     if e.dt:
-        return 0
-    driven = [lag for lag in e.lags if casadi.is_equal(lag.target, e.u, 2)]
+        return (4, 1, False)
     hidden = [lag.state for lag in e.lags]
     plain = [k for k in range(len(e.states)) if k not in hidden]
-    a = state_matrices(replace(e, delay=None, play=None), loop.point)[0][np.ix_(plain, plain)]
-    if not np.isfinite(a).all():
-        return 2
+    time = _shortest(e, casadi.SX(casadi.DM(e.values)))
+    driven, cut = np.isfinite(time), bool(time < loop.dt / 8)
+    # The filter's own uncertainty smooths kinks; sharp friction does not make the plant stiff.
+    try:
+        point = replace(loop.point, states=_rest(loop, e))
+        a = state_matrices(e, point, spread=1e6)[0][np.ix_(plain, plain)]
+    except CtrlidError:
+        return (8, 2, cut)
     rate = float(np.max(np.abs(np.linalg.eigvals(a)), initial=0.0)) * loop.dt
-    if rate <= SLOW and not driven:
-        return 0
-    return max(1, int(np.ceil(rate / 1.5)))
+    if rate <= 3 * SLOW and not driven:
+        return (4, max(1, math.ceil(rate / SLOW)), False)
+    return (8, max(1, math.ceil(rate / 1.5)), cut)
+
+
+def _shortest(e: Equations, p: Any) -> float:
+    """Return the time constant of the lag that follows the input; infinite without one."""
+    times = [casadi.substitute(casadi.SX(lag.time_constant), e.p, p) for lag in known_lags(e)[0][:1]]
+    return float(casadi.evalf(times[0])) if times else math.inf
 
 
 def make_track(loop: Loop, record: Record) -> Track:

@@ -32,8 +32,6 @@ class Problem:
         The records.
     lower, upper : ndarray, shape (p,)
         Bounds of the parameters.
-    scale : ndarray, shape (p,)
-        Sizes in which steps are measured before the data say better.
     counts : tuple of ndarray of bool
         Samples of each record that enter the likelihood.
     """
@@ -42,7 +40,6 @@ class Problem:
     tracks: tuple[Track, ...]
     lower: Array
     upper: Array
-    scale: Array
     counts: tuple[Any, ...] = ()
 
 

@@ -209,9 +209,12 @@ def _solve_equilibrium(
 
 
 def state_matrices(
-    equations: Equations, at: OperatingPoint
-) -> tuple[Array, Array, Array, Array]:  # fmt: skip
-    """Return the exact Jacobians (A, B, C, D) of the traced equations at a point."""
+    equations: Equations, at: OperatingPoint, spread: float = 0.0
+) -> tuple[Array, Array, Array, Array]:
+    """Return the exact Jacobians (A, B, C, D) of the traced equations at a point.
+
+    With a `spread` the kinks of effects are smoothed as if each state had that standard deviation.
+    """
     e = equations
     if len(at.states) != len(e.states):
         raise CtrlidError(
@@ -219,6 +222,9 @@ def state_matrices(
             f"{len(e.states)}: {', '.join(e.states)}"
         )
     parts = [casadi.jacobian(f, z) for f in (e.rhs, e.output) for z in (e.x, e.u)]
+    if e.spread is not None:
+        level = casadi.SX.ones(*e.spread.shape) * spread
+        parts = [casadi.substitute(part, e.spread, level) for part in parts]
     jacobians = casadi.Function("jacobians", [e.t, e.x, e.u, e.p], parts)
     a, b, c, d = (np.asarray(casadi.DM(m), float) for m in
                   jacobians(0.0, list(at.states), at.input, e.values))  # fmt: skip

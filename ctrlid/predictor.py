@@ -98,7 +98,7 @@ def predict(loop: Loop, record: Record, force_noise: float | None = None) -> Pre
     if force_noise is not None and not (np.isfinite(force_noise) and force_noise >= 0):
         raise CtrlidError(f"force_noise is a ratio >= 0; given {force_noise!r}")
     track, m = make_track(loop, record), machine_for(loop, (), record)
-    problem = Problem(m, (track,), EMPTY, EMPTY, EMPTY)
+    problem = Problem(m, (track,), EMPTY, EMPTY)
     if force_noise is None:
         fit = climb(begin(problem, EMPTY, None))
     else:

@@ -14,6 +14,7 @@ from .loop import Loop
 from .physics import Array, Equations, Lag
 
 Piece = tuple[Any, Any, Any]  # duration, input at its start, slope of the input
+Scheme = tuple[int, int, bool]  # order, steps in a piece, whether pieces are cut for short lags
 SHARP = 8.0  # time constants after which the transient of a lag is over
 
 
@@ -137,7 +138,7 @@ def whole_delay(e: Equations, dt: float) -> int:
     return max(math.floor(seconds / dt + 1e-9), 0)
 
 
-def _known_lags(e: Equations) -> tuple[list[Lag], list[Lag]]:
+def known_lags(e: Equations) -> tuple[list[Lag], list[Lag]]:
     """Return the lags that follow the input itself, and those that only the output sees."""
     driven, seen = [], []
     for lag in e.lags:
@@ -151,7 +152,7 @@ def _known_lags(e: Equations) -> tuple[list[Lag], list[Lag]]:
 
 def advance(
     e: Equations, t: Any, x: Any, pieces: Sequence[Piece], p: Any, spread: Any = None,
-    kick: Any = None, substeps: int = 0,
+    kick: Any = None, scheme: Scheme = (4, 1, True),
 ) -> tuple[Any, Any]:  # fmt: skip
     """Return the state of a plant after the pieces of its input, and the local error.
 
@@ -174,8 +175,9 @@ def advance(
         Standard deviations of the states, which smooth kinks; zero by default.
     kick : expression, optional
         Constant added to the rates: a force held over the period.
-    substeps : int, optional
-        Steps of order eight in each piece; with 0, one step of order four.
+    scheme : (int, int, bool), optional
+        Order of the steps, four or eight; how many in each piece; and whether pieces are cut where
+        the transient of a short lag of the input is over.
 
     Returns
     -------
@@ -188,7 +190,7 @@ def advance(
     spread = casadi.SX.zeros(n, 1) if spread is None else spread
     kick = casadi.SX.zeros(n, 1) if kick is None else kick
     worst = casadi.SX.zeros(n, 1)
-    driven, seen = _known_lags(e)
+    driven, seen = known_lags(e)
     hidden = [lag.state for lag in (*driven, *seen)]
     if e.dt:
         return e.smoothed(t, x, pieces[-1][1], p, spread)[0] + kick, worst
@@ -196,7 +198,9 @@ def advance(
         lag.state: casadi.substitute(casadi.SX(lag.time_constant), e.p, casadi.SX(p))
         for lag in e.lags
     }
-    for duration, level, slope in _split(pieces, [times[lag.state] for lag in driven]):
+    order, steps, cut = scheme
+    short = [times[lag.state] for lag in driven[:1] if cut]
+    for duration, level, slope in _split(pieces, short):
 
         def filled(tau: Any, z: Any, x: Any = x, level: Any = level, slope: Any = slope) -> Any:
             z = casadi.SX(z)
@@ -220,11 +224,11 @@ def advance(
                 rates[k] = 0
             return rates
 
-        if substeps:
-            after, error = integrate(rate, x, duration, substeps)
+        if order == 8:
+            after, error = integrate(rate, x, duration, steps)
             worst = casadi.fmax(worst, error)
         else:
-            after = integrate_fast(rate, x, duration, 1)
+            after = integrate_fast(rate, x, duration, steps)
         after = filled(duration, after)
         for lag in seen:
             ends = [
@@ -338,13 +342,13 @@ def stepper(loop: Loop, substeps: int) -> Stepper:
         after, error = integrate(rate, z, loop.dt, substeps)
     else:
         applied, memory = through_play(e, z[n + nc] if e.play is not None else None, u, p)
-        past = z[size - kept :]
+        past = [z[k] for k in range(size - kept, size)]
         path = (past[kept - 1] if kept else applied, past[late - 1] if late else applied, applied)
         pieces = _numbers(e, input_pieces(e, loop.dt, path, "zoh"), p)
-        x, error = advance(e, t0, z[:n], pieces, p, None, kick, substeps)
+        x, error = advance(e, t0, z[:n], pieces, p, None, kick, (8, substeps, True))
         after = casadi.vertcat(x, moved, memory)
         if kept:
-            after = casadi.vertcat(after, applied, past[: kept - 1])
+            after = casadi.vertcat(after, applied, *past[: kept - 1])
         error = casadi.vertcat(error, casadi.SX.zeros(size - n, 1))
     rest = [*at.states, *(law.rest if law else ())]
     settled, memory = at.input, []

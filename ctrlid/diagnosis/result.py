@@ -1,0 +1,257 @@
+"""What a diagnosis found, as values."""
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from ..effects import AbstractEffect
+from ..loop import Loop
+from ..physics import Array
+
+Verdict = Literal["nothing missing", "explained", "partly explained", "unknown"]
+
+
+@dataclass(frozen=True, eq=False)
+class Gap:
+    """How far the model is from the data, on samples that no parameter was fitted to.
+
+    Parameters
+    ----------
+    kind : str
+        What was compared: ``"closed-loop simulation"``, ``"open-loop simulation"`` or, for
+        instance, ``"25-step prediction"``.
+    given, before, after : float
+        RMS error of the model as handed in, after recalibrating its free parameters, and with the
+        effects added [output unit]; infinite where the simulation leaves the plant's domain.
+    floor : float
+        RMS error that sensor and force noise alone leave through this very loop [output unit].
+    unit : str
+        Output unit; empty where the record has none.
+    time, measured : ndarray, shape (m,)
+        The held-out samples [s, output unit].
+    simulated_before, simulated_after : ndarray, shape (m,)
+        What the recalibrated model and the model with the effects make of them; NaN where there
+        is nothing.
+    """
+
+    kind: str
+    given: float
+    before: float
+    after: float
+    floor: float
+    unit: str
+    time: Array
+    measured: Array
+    simulated_before: Array
+    simulated_after: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Finding:
+    """An effect that was missing.
+
+    Parameters
+    ----------
+    effect : AbstractEffect
+        The effect with its fitted parameters.
+    standard_errors : dict of str to float
+        Standard errors of the parameters, by name.
+    alternatives : tuple of AbstractEffect
+        Effects that this record cannot tell apart from it, each with its own fitted parameters.
+    equivalents : tuple of str
+        Effects that no record of u and y can tell apart from it, on this plant.
+    evidence : float
+        Gain of log-likelihood over the model without it; 10 is strong.
+    share : float
+        Share of the (squared) gap above the floor that it closes.
+    experiment : str
+        The experiment that would separate the effect from its alternatives; empty without any.
+    reference : ndarray or None
+        That experiment as a reference signal, ready to run.
+    note : str
+        What else should be known, such as the records in which it was present.
+    """
+
+    effect: AbstractEffect
+    standard_errors: dict[str, float]
+    alternatives: tuple[AbstractEffect, ...]
+    equivalents: tuple[str, ...]
+    evidence: float
+    share: float = float("nan")
+    experiment: str = ""
+    reference: Array | None = None
+    note: str = ""
+
+    @property
+    def name(self) -> str:
+        """The name of the effect."""
+        return type(self.effect).__name__
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The name of the effect and those of its alternatives."""
+        return (self.name, *(type(e).__name__ for e in self.alternatives))
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """One effect that was tried.
+
+    Parameters
+    ----------
+    round : int
+        In which round of the search, from 1.
+    effect : AbstractEffect
+        The effect with the parameters it was tried or fitted with.
+    score : float
+        Gain of log-likelihood that its first step promises, with the free parameters of the model
+        moving along.
+    gain : float
+        Gain of log-likelihood after refitting; NaN if it was not refitted.
+    penalty : float
+        Half of the Bayesian penalty for its parameters and for what was scanned.
+    remark : str
+        Why it is out, or what else was seen; empty if nothing.
+    """
+
+    round: int
+    effect: AbstractEffect
+    score: float
+    gain: float
+    penalty: float
+    remark: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """Where along one quantity the innovations are not noise.
+
+    Parameters
+    ----------
+    axis : str
+        ``"time"``, ``"frequency"``, ``"position"``, ``"velocity"``, ``"input"`` or
+        ``"reference"``.
+    unit : str
+        Unit of the axis.
+    edges : ndarray, shape (bins + 1,)
+        Bins of the axis.
+    before, after : ndarray, shape (bins,)
+        Mean square of the innovations in each bin, in units of their expected variance: 1 is
+        noise. Before and after the effects were added.
+    p_before, p_after : float
+        Probability that noise alone looks like this or worse.
+    words : str
+        Where it sits, in words.
+    """
+
+    axis: str
+    unit: str
+    edges: Array
+    before: Array
+    after: Array
+    p_before: float
+    p_after: float
+    words: str
+
+
+@dataclass(frozen=True)
+class Disturbance:
+    """The random forces that were fitted along.
+
+    Parameters
+    ----------
+    white, coloured : float
+        Standard deviations of the white force, held over each period, and of the coloured force
+        [output unit/s^2]; zero where there is none.
+    time_constant : float
+        Time constant of the coloured force [s]; NaN without one.
+    share : float
+        Share of the floor's variance that these forces make; the rest is sensor noise.
+    """
+
+    white: float
+    coloured: float
+    time_constant: float
+    share: float
+
+
+@dataclass(frozen=True)
+class Calibrated:
+    """A free parameter of the model before and after.
+
+    Parameters
+    ----------
+    name : str
+        The parameter.
+    given, before, after : float
+        Its value as handed in, recalibrated alone, and with the effects.
+    standard_error : float
+        Standard error of the last.
+    """
+
+    name: str
+    given: float
+    before: float
+    after: float
+    standard_error: float
+
+
+@dataclass(frozen=True, eq=False)
+class Diagnosis:
+    """What `diagnose` found.
+
+    Parameters
+    ----------
+    verdict : {"nothing missing", "explained", "partly explained", "unknown"}
+        The end of the search.
+    sentence : str
+        The verdict in words, with what it rests on.
+    findings : tuple of Finding
+        The effects that were missing, most important first.
+    loop : Loop
+        The model with the effects added and everything refitted.
+    gap : Gap
+        How far model and data are apart, before and after.
+    where : tuple of Place
+        Where the disagreement sits, before and after; most telling first.
+    ranking : tuple of Candidate
+        Every candidate's evidence, round by round, best first.
+    disturbance : Disturbance
+        The random forces.
+    calibrated : tuple of Calibrated
+        The model's own free parameters.
+    sensitivity : dict of str to float
+        The smallest size of each effect that this record would have shown, by name of the
+        parameter, such as ``"CoulombFriction.fc"``.
+    tests : dict of str to float
+        Probabilities that the final innovations are noise, by name of the test.
+    audit : tuple of str
+        What was noticed about the record itself.
+    notes : tuple of str
+        What else should be known.
+    record : str
+        What was diagnosed.
+    seconds : float
+        Run time [s].
+    """
+
+    verdict: Verdict
+    sentence: str
+    findings: tuple[Finding, ...]
+    loop: Loop
+    gap: Gap
+    where: tuple[Place, ...]
+    ranking: tuple[Candidate, ...]
+    disturbance: Disturbance
+    calibrated: tuple[Calibrated, ...]
+    sensitivity: dict[str, float]
+    tests: dict[str, float]
+    audit: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    record: str = ""
+    seconds: float = 0.0
+    extra: dict[str, Any] = field(default_factory=dict, repr=False)
+
+    @property
+    def effects(self) -> tuple[AbstractEffect, ...]:
+        """The effects that were found."""
+        return tuple(f.effect for f in self.findings)

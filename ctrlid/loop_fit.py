@@ -1,0 +1,338 @@
+"""fit_loop(): the physical parameters of a loop's plant, by maximum likelihood."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ._text import number
+from .data import Record
+from .errors import CtrlidError
+from .filtering import machine_for, make_track
+from .likelihood import (
+    Fit,
+    Problem,
+    begin,
+    climb,
+    information,
+    pseudo_inverse,
+    with_coloured_force,
+)
+from .loop import Loop
+from .physics import Array
+
+UNSEEN = 1e-9  # relative eigenvalue of the information below which a direction is not in the data
+
+
+@dataclass(frozen=True, eq=False)
+class LoopEstimate:
+    """Physical parameters, their uncertainty and the noise that was found with them.
+
+    Parameters
+    ----------
+    names : tuple of str
+        The parameters that were fitted.
+    values : ndarray, shape (p,)
+        Their values [unit of each parameter].
+    covariance : ndarray, shape (p, p)
+        Their covariance, from the exact information matrix; infinite for what is not in the data.
+    sensor_noise : tuple of float
+        Standard deviation of the white sensor noise in each record [output unit].
+    force_noise : float
+        Standard deviation of the white acceleration that is held over each period
+        [output unit/s^2]; for a plant without a moving mass, of the noise on the states' rates.
+    coloured_force : float
+        Standard deviation of the coloured acceleration [output unit/s^2]; zero: none was needed.
+    force_time : float
+        Time constant of the coloured acceleration [s]; NaN without one.
+    log_likelihood : float
+        Logarithm of the likelihood.
+    n_samples : int
+        Samples that count.
+    bounds : tuple of str
+        The parameters that sit on a bound.
+    notes : tuple of str
+        What the user should know before believing the numbers.
+    """
+
+    names: tuple[str, ...]
+    values: Array
+    covariance: Array
+    sensor_noise: tuple[float, ...]
+    force_noise: float
+    coloured_force: float
+    force_time: float
+    log_likelihood: float
+    n_samples: int
+    bounds: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    @property
+    def standard_errors(self) -> Array:
+        """Standard errors of the parameters."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)), dtype=float)
+
+    @property
+    def bic(self) -> float:
+        """Bayesian information criterion, smaller is better."""
+        extra = len(self.names) + 2 * (self.coloured_force > 0)
+        return -2 * self.log_likelihood + extra * math.log(self.n_samples)
+
+    def __getitem__(self, name: str) -> float:
+        if name not in self.names:
+            raise CtrlidError(f"{name!r} was not fitted; fitted were {', '.join(self.names)}")
+        return float(self.values[self.names.index(name)])
+
+    def interval(self, name: str, share: float = 0.95) -> tuple[float, float]:
+        """Return the interval that covers the true value of a parameter with a probability.
+
+        Parameters
+        ----------
+        name : str
+            A fitted parameter.
+        share : float, optional
+            The probability, for normally distributed errors.
+
+        Returns
+        -------
+        tuple of float
+            Lower and upper end [unit of the parameter].
+        """
+        from scipy.stats import norm
+
+        middle = self[name]
+        half = float(norm.ppf((1 + share) / 2)) * self.standard_errors[self.names.index(name)]
+        return middle - half, middle + half
+
+    def __str__(self) -> str:
+        rows = [f"maximum likelihood, {self.n_samples} samples, log-likelihood "
+                f"{self.log_likelihood:.1f}"]  # fmt: skip
+        width = max((len(name) for name in self.names), default=0)
+        for name, value, error in zip(self.names, self.values, self.standard_errors, strict=True):
+            mark = "  (on its bound)" if name in self.bounds else ""
+            rows.append(f"  {name:<{width}} = {_with_error(value, error)}{mark}")
+        noise = ", ".join(number(v, 3) for v in self.sensor_noise)
+        rows.append(f"  sensor noise {noise}, white force noise {number(self.force_noise, 3)}")
+        if self.coloured_force:
+            rows.append(f"  coloured force {number(self.coloured_force, 3)} with a time constant "
+                        f"of {number(self.force_time, 3)} s")  # fmt: skip
+        return "\n".join([*rows, *(f"  note: {note}" for note in self.notes)])
+
+
+def _with_error(value: float, error: float) -> str:
+    if not np.isfinite(error):
+        return f"{number(value, 6)} (not in the data)"
+    digits = 6
+    if error > 0 and value:
+        digits = max(2, min(12, 2 + math.ceil(math.log10(abs(value) / error + 1e-300))))
+    return f"{number(value, digits)} ± {number(error, 2)}"
+
+
+@dataclass(frozen=True, eq=False)
+class LoopFit:
+    """What `fit_loop` returns.
+
+    Parameters
+    ----------
+    loop : Loop
+        The loop with the fitted values.
+    estimate : LoopEstimate
+        Values, standard errors and noise.
+    """
+
+    loop: Loop
+    estimate: LoopEstimate
+
+    def __str__(self) -> str:
+        return f"{self.loop!r}\n{self.estimate}"
+
+
+def fit_loop(
+    loop: Loop,
+    record: Record | Sequence[Record],
+    *,
+    free: Sequence[str] | None = None,
+    coloured: bool | None = None,
+) -> LoopFit:
+    r"""Fit the uncertain physical parameters of a loop's plant to one or several records.
+
+    .. math:: \max_{\theta, \eta} \; -\tfrac12 \sum_k \Bigl( \ln 2\pi s_k +
+        \frac{e_k^2}{s_k} \Bigr), \quad e_k = y_k - \hat y_{k|k-1}(\theta, \eta)
+
+    The innovations e of an extended Kalman filter on the plant's own equations, with variances s,
+    make the likelihood; noise of the sensor and of the force is estimated with the parameters. The
+    filter uses the measured input only: feedback does not bias the estimate, and neither reference
+    nor controller is needed. Sensitivities are exact derivatives of the traced equations.
+
+    Parameters
+    ----------
+    loop : Loop
+        Plant with the names of its uncertain parameters in `free`; its values are the start.
+        Effects in the loop are fitted with them.
+    record : Record or sequence of Record
+        The data; several records share the parameters and the force noise.
+    free : sequence of str, optional
+        Parameters to fit; by default those of `loop.free` and those of the effects.
+    coloured : bool, optional
+        Whether a coloured (Ornstein-Uhlenbeck) random force takes part; by default if it pays by
+        the Bayesian information criterion.
+
+    Returns
+    -------
+    LoopFit
+        The loop with the fitted values, and the estimate with standard errors.
+
+    Raises
+    ------
+    CtrlidError
+        If nothing is free, the records do not fit the loop, or the filter loses them.
+
+    References
+    ----------
+    Åström, "Maximum likelihood and prediction error methods", Automatica 16 (1980) 551-574;
+    Ljung, *System Identification*, sections 7.4 and 9.
+
+    Examples
+    --------
+    >>> import ctrlid as cid
+    >>> plant = cid.plants.maglev(m=0.0213, K=3.34e-6)
+    >>> op = cid.operating_point(plant, output=0.012)
+    >>> C = cid.design_lead(cid.linearize(plant, op), crossover=100, phase_margin=50)
+    >>> loop = cid.Loop(plant, C.sample(0.001, "tustin"), dt=0.001, at=op, free=("K",))
+    >>> r = cid.random_binary(3000, amplitude=1e-4, hold=20, around=op.output, seed=1)
+    >>> record = cid.simulate(loop, r, sensor_noise=2e-6, seed=2)
+    >>> fitted = cid.fit_loop(loop.with_parameters({"K": 3.1e-6}), record)
+    >>> abs(fitted.estimate["K"] - 3.34e-6) < 3 * fitted.estimate.standard_errors[0]
+    True
+    """
+    records = _records(record)
+    names = _free_names(loop, free)
+    start = begin(make_problem(loop, names, records), start_values(loop, names), None)
+    fit = climb(start)
+    if coloured or coloured is None:
+        fit = choose_noise(fit, always=bool(coloured))
+    return summary(loop, fit)
+
+
+def _records(record: Any) -> tuple[Record, ...]:
+    records = (record,) if isinstance(record, Record) else tuple(record)
+    if not records or not all(isinstance(r, Record) for r in records):
+        raise CtrlidError("a fit needs a Record, or a sequence of Records; given "
+                          f"{type(record).__name__}")  # fmt: skip
+    if len({r.hold for r in records}) > 1:
+        raise CtrlidError("records fitted together must have the same hold; given "
+                          f"{[r.hold for r in records]}")  # fmt: skip
+    return records
+
+
+def _free_names(loop: Loop, free: Sequence[str] | None) -> tuple[str, ...]:
+    if not isinstance(loop, Loop):
+        raise CtrlidError(f"fit_loop needs a Loop(plant, ..., dt=...); given {type(loop).__name__}")
+    known = list(loop.equations(keep=True).parameters)
+    if free is None:
+        names = tuple(dict.fromkeys([*loop.free, *effect_bounds(loop)]))
+    else:
+        names = (free,) if isinstance(free, str) else tuple(free)
+    unknown = [name for name in names if name not in known]
+    if unknown or not names:
+        what = f"given {unknown}" if unknown else "none was given"
+        raise CtrlidError(f"fit_loop needs the names of free parameters, {what}; put them into "
+                          f"free= of the loop or of fit_loop. Known are {known}")  # fmt: skip
+    return names
+
+
+def start_values(loop: Loop, names: Sequence[str]) -> Array:
+    """Return the values of parameters as the loop has them."""
+    parameters = loop.equations(keep=True).parameters
+    return np.array([parameters[name] for name in names], dtype=float)
+
+
+def make_problem(loop: Loop, names: Sequence[str], records: Sequence[Record]) -> Problem:
+    """Return the likelihood problem of a loop on records."""
+    m = machine_for(loop, tuple(names), records[0])
+    lower, upper = bounds_of(loop, names)
+    return Problem(m, tuple(make_track(loop, r) for r in records), lower, upper)
+
+
+def effect_bounds(loop: Loop) -> dict[str, tuple[float, float]]:
+    """Return the bounds of the parameters of a loop's effects, by name."""
+    return {
+        f"{label}.{p.name}": (p.lower, p.upper)
+        for label, effect in loop.labelled.items()
+        for p in effect.parameters()
+    }
+
+
+def bounds_of(loop: Loop, names: Sequence[str]) -> tuple[Array, Array]:
+    """Return the bounds of parameters: those of effects, and none that changes a sign."""
+    known = effect_bounds(loop)
+    parameters = loop.equations(keep=True).parameters
+    lower, upper = [], []
+    for name in names:
+        if name in known:
+            low, high = known[name]
+        else:
+            # A mass or a gain may be far off, but not of the other sign.
+            value = parameters[name]
+            low = 1e-3 * value if value > 0 else -math.inf
+            high = 1e-3 * value if value < 0 else math.inf
+        lower.append(low)
+        upper.append(high)
+    return np.array(lower), np.array(upper)
+
+
+def choose_noise(fit: Fit, always: bool = False) -> Fit:
+    """Add a coloured force if the Bayesian information criterion wants it."""
+    richer = with_coloured_force(fit)
+    # Two parameters more: worth trying out in full only if it gains at all.
+    if not always and richer.value < fit.value + 0.5 * math.log(fit.size):
+        return fit
+    richer = climb(richer)
+    return richer if always or richer.value > fit.value + math.log(fit.size) else fit
+
+
+def summary(loop: Loop, fit: Fit) -> LoopFit:
+    """Return a maximum of the likelihood as a loop and an estimate."""
+    m, p = fit.problem.machine, len(fit.theta)
+    names = m.names
+    matrix, _ = information(fit)
+    on_bound = (fit.theta <= fit.problem.lower) | (fit.theta >= fit.problem.upper)
+    inside = np.concatenate([~on_bound, np.ones(len(matrix) - p, dtype=bool)])
+    covariance = np.zeros((p, p))
+    rows = np.flatnonzero(inside & (np.diag(matrix) > 0))
+    inverse = pseudo_inverse(matrix[np.ix_(rows, rows)])
+    kept = rows[rows < p]
+    covariance[np.ix_(kept, kept)] = inverse[: len(kept), : len(kept)]
+    notes = []
+    lost = [k for k in range(p) if inside[k] and (matrix[k, k] <= 0 or _unseen(matrix, rows, k))]
+    for k in lost:
+        covariance[k, :] = covariance[:, k] = 0.0
+        covariance[k, k] = math.inf
+    if lost:
+        notes.append("the data do not determine " + ", ".join(names[k] for k in lost)
+                     + " (other parameters do the same)")  # fmt: skip
+    noise, scale = fit.noise, float(np.mean(fit.sensor))
+    time = -loop.dt / math.log(noise.memory) if noise.drift else math.nan
+    estimate = LoopEstimate(
+        names, fit.theta, covariance, tuple(np.sqrt(fit.sensor).tolist()),
+        math.sqrt(scale * float(np.mean(noise.force))),
+        math.sqrt(scale * noise.coloured) if noise.drift else 0.0, time, fit.value, fit.size,
+        tuple(n for n, b in zip(names, on_bound, strict=True) if b), tuple(notes),
+    )  # fmt: skip
+    fitted = loop.with_parameters(dict(zip(names, fit.theta.tolist(), strict=True)))
+    return LoopFit(fitted, estimate)
+
+
+def _unseen(matrix: Array, rows: Array, k: int) -> bool:
+    """Whether a parameter takes part in a direction that is not in the data."""
+    if k not in rows:
+        return False
+    part = matrix[np.ix_(rows, rows)]
+    size = np.sqrt(np.diag(part))
+    values, vectors = np.linalg.eigh(part / np.outer(size, size))
+    weak = vectors[list(rows).index(k), values < UNSEEN * values.max()]
+    return bool(np.any(np.abs(weak) > 0.1))
+
+
