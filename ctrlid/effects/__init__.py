@@ -1,6 +1,8 @@
 """The catalogue of effects: what real plants have and models leave out."""
 
 from .base import AbstractEffect, Parameter, parameter
+from .catalogue import CATALOGUE
+from .equivalence import equivalents
 from .force import (
     ConstantForce,
     CubicStiffness,
@@ -38,40 +40,6 @@ from .output import (
     SensorSaturation,
 )
 from .places import ForceEffect, InputEffect, LawEffect, OutputEffect, ReadingEffect
-
-CATALOGUE: tuple[type[AbstractEffect], ...] = (
-    ActuatorLag,
-    InputDelay,
-    InputSaturation,
-    InputDeadZone,
-    InputOffset,
-    InputBacklash,
-    InputNonlinearity,
-    InputSaturatingGain,
-    ViscousFriction,
-    AsymmetricViscousFriction,
-    CoulombFriction,
-    AsymmetricCoulombFriction,
-    StribeckFriction,
-    QuadraticDrag,
-    EddyCurrentDamping,
-    LinearStiffness,
-    CubicStiffness,
-    ConstantForce,
-    PeriodicForce,
-    PositionRipple,
-    FlexibleMode,
-    PositionOffset,
-    ForceExponent,
-    ParameterDrift,
-    ParameterStep,
-    StateLimit,
-    SensorLag,
-    SensorNonlinearity,
-    SensorOffset,
-    SensorSaturation,
-    Quantization,
-)
 
 __all__ = [
     "CATALOGUE",
@@ -114,5 +82,6 @@ __all__ = [
     "StateLimit",
     "StribeckFriction",
     "ViscousFriction",
+    "equivalents",
     "parameter",
 ]

@@ -1,0 +1,78 @@
+"""Every effect that a diagnosis tries, as an explicit tuple of classes."""
+
+from .base import AbstractEffect
+from .force import (
+    ConstantForce,
+    CubicStiffness,
+    FlexibleMode,
+    LinearStiffness,
+    PeriodicForce,
+    PositionRipple,
+)
+from .friction import (
+    AsymmetricCoulombFriction,
+    AsymmetricViscousFriction,
+    CoulombFriction,
+    EddyCurrentDamping,
+    QuadraticDrag,
+    StribeckFriction,
+    ViscousFriction,
+)
+from .input import (
+    ActuatorLag,
+    InputBacklash,
+    InputDeadZone,
+    InputDelay,
+    InputNonlinearity,
+    InputOffset,
+    InputSaturatingGain,
+    InputSaturation,
+)
+from .law import (
+    ForceExponent,
+    ParameterDrift,
+    ParameterStep,
+    PositionOffset,
+    StateLimit,
+)
+from .output import (
+    Quantization,
+    SensorLag,
+    SensorNonlinearity,
+    SensorOffset,
+    SensorSaturation,
+)
+
+CATALOGUE: tuple[type[AbstractEffect], ...] = (
+    ActuatorLag,
+    InputDelay,
+    InputSaturation,
+    InputDeadZone,
+    InputOffset,
+    InputBacklash,
+    InputNonlinearity,
+    InputSaturatingGain,
+    ViscousFriction,
+    AsymmetricViscousFriction,
+    CoulombFriction,
+    AsymmetricCoulombFriction,
+    StribeckFriction,
+    QuadraticDrag,
+    EddyCurrentDamping,
+    LinearStiffness,
+    CubicStiffness,
+    ConstantForce,
+    PeriodicForce,
+    PositionRipple,
+    FlexibleMode,
+    PositionOffset,
+    ForceExponent,
+    ParameterDrift,
+    ParameterStep,
+    StateLimit,
+    SensorLag,
+    SensorNonlinearity,
+    SensorOffset,
+    SensorSaturation,
+    Quantization,
+)

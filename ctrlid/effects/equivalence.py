@@ -1,0 +1,189 @@
+"""Which effects no record of input and output can tell apart, found from a plant's equations."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import casadi
+import numpy as np
+
+from ..errors import CtrlidError
+from ..physics import Array, Equations
+from .base import AbstractEffect
+from .catalogue import CATALOGUE
+from .moment import motion
+
+POINTS = 24  # random states and inputs at which two changes are compared
+SAME = 1e-6  # relative difference of changes that are one and the same
+SIZES = (1e-4, 1e-2)  # of a parameter: two, since a change must be the same at every size
+
+
+def equivalents(
+    effect: AbstractEffect, loop: Any, catalogue: Sequence[type[AbstractEffect]] = CATALOGUE
+) -> tuple[str, ...]:
+    """Return what changes the loop's plant in exactly the same way as an effect does.
+
+    Two effects that change rates and output alike, at random points and at two sizes, are one:
+    only a further measurement can tell them apart. So is an offset of the sensor and one of the
+    position in the law, where the output is the position: the state is counted from another zero.
+    So is, on a linear plant, a lag ahead of it and one behind it; and a delay at either end of any.
+
+    Parameters
+    ----------
+    effect : AbstractEffect
+        The effect, at any values.
+    loop : Loop
+        The loop, with or without the effect.
+    catalogue : sequence of effect classes, optional
+        The effects to compare with.
+
+    Returns
+    -------
+    tuple of str
+        Names of effect classes; "parameter g" for a parameter of the plant; and in words what is
+        no effect of the catalogue.
+
+    Examples
+    --------
+    >>> import ctrlid as cid
+    >>> plant = cid.plants.servo(m=2.0, c=1.0, k=3.0)
+    >>> loop = cid.Loop(plant, dt=0.01)
+    >>> cid.effects.equivalents(cid.effects.ConstantForce(bias=0.1), loop)
+    ('InputOffset',)
+    """
+    base = loop.without_effect(effect) if effect in loop.effects else loop
+    name = type(effect).__name__
+    if name == "InputDelay":
+        return ("delay of the output",)
+    if name in LAGS:
+        return tuple(k for k in LAGS if k != name) if _linear(base.equations()) else ()
+    others = [e for e in (_member(cls, base) for cls in catalogue) if e is not None]
+    found = {name: effect}
+    words: set[str] = set()
+    todo = [name]
+    while todo:  # what equals an equal is equal
+        known = todo.pop()
+        shifted = _by_shift(known, base)
+        equal = [e for e in others if type(e).__name__ in shifted or _same(base, found[known], e)]
+        words |= {word for word in shifted if word not in OFFSETS}
+        words |= {f"parameter {key}" for key in base.equations().parameters
+                  if "." not in key and _same_as_parameter(base, found[known], key)}  # fmt: skip
+        new = {type(e).__name__: e for e in equal if type(e).__name__ not in found}
+        found |= new
+        todo += new
+    return (*sorted(found.keys() - {name}), *sorted(words))
+
+
+LAGS = ("ActuatorLag", "SensorLag")
+OFFSETS = ("PositionOffset", "SensorOffset")
+
+
+def _by_shift(name: str, loop: Any) -> set[str]:
+    """Offsets that become one another when the position is counted from another zero."""
+    e = loop.equations()
+    found = motion(e)
+    if name not in OFFSETS or found is None:
+        return set()
+    i, j = found
+    # The output is the position, but for a constant.
+    shown = casadi.simplify(casadi.jacobian(e.output, e.x[i]))
+    rest = casadi.substitute(e.output, e.x[i], casadi.SX(0.0))
+    if not casadi.is_equal(shown, casadi.SX(1.0), 2) or any(
+        casadi.which_depends(rest, casadi.vertcat(e.x, e.u, e.t), 1, True)
+    ):
+        return set()
+    return set(OFFSETS) if casadi.jacobian(e.rhs[j], e.x[i]).nnz() else {"the initial position"}
+
+
+def _linear(e: Equations) -> bool:
+    """Whether rates and output are straight lines in states and input, the same at all times."""
+    if e.dt:
+        return False
+    both = casadi.vertcat(e.rhs, e.output)
+    z = casadi.vertcat(e.x, e.u)
+    bent = any(casadi.which_depends(both, z, 2, True))
+    return not bent and not any(casadi.which_depends(both, e.t, 1, True))
+
+
+def _member(cls: type[AbstractEffect], loop: Any) -> AbstractEffect | None:
+    """Return an instance of a class that has a single parameter and no states, else None."""
+    if len(cls.parameters()) != 1 or cls.states or cls.parameters()[0].neutral is None:
+        return None
+    return next(iter(cls.candidates(loop)), None)
+
+
+def _change(loop: Any, effect: AbstractEffect, size: float) -> Array | None:
+    """Return how rates and output change at random points, None where the effect is not static."""
+    if effect.states or len(effect.parameters()) != 1:
+        return None
+    parameter = effect.parameters()[0]
+    if parameter.neutral is None or not np.isfinite(parameter.neutral):
+        return None
+    try:
+        changed = loop.with_effect(replace(effect, **{parameter.name: parameter.neutral + size}))
+    except CtrlidError:
+        return None
+    e = changed.equations(keep=True)
+    if e.delay is not None or e.play is not None or e.readout is not None:
+        return None
+    return _sampled(e, loop.point) - _sampled(loop.equations(), loop.point)
+
+
+def _sampled(e: Equations, at: Any, values: Array | None = None) -> Array:
+    rng = np.random.default_rng(3)
+    rest = np.array([*at.states, at.input])
+    scale = np.where(rest == 0, 1.0, 0.3 * np.abs(rest))
+    points = rest + scale * rng.uniform(-1, 1, (POINTS, rest.size))
+    rows = [np.concatenate(e.evaluate(z[:-1], z[-1], t, values))
+            for t, z in enumerate(points)]  # fmt: skip
+    return np.concatenate(rows)
+
+
+def _match(first: Array | None, second: Array | None) -> float | None:
+    """Return the factor by which the second change is to be taken, None if it is another one."""
+    if first is None or second is None:
+        return None
+    good = np.isfinite(first) & np.isfinite(second)
+    first, second = first[good], second[good]
+    if not (first.any() and second.any()):
+        return None
+    factor = float(first @ second / (second @ second))
+    near = np.linalg.norm(first - factor * second) <= 0.1 * np.linalg.norm(first)
+    return factor if near else None
+
+
+def _equal(first: Array | None, second: Array | None) -> bool:
+    if first is None or second is None:
+        return False
+    good = np.isfinite(first) & np.isfinite(second)
+    off = float(np.linalg.norm((first - second)[good]))
+    return off <= SAME * float(np.linalg.norm(first[good]))
+
+
+def _same(loop: Any, first: AbstractEffect, second: AbstractEffect) -> bool:
+    if type(first) is type(second):
+        return False
+    for size in SIZES:
+        one = _change(loop, first, size)
+        factor = _match(one, _change(loop, second, size))
+        if factor is None or not _equal(one, _change(loop, second, factor * size)):
+            return False
+    return True
+
+
+def _same_as_parameter(loop: Any, effect: Any, name: str) -> bool:
+    e, at = loop.equations(), loop.point
+    k = list(e.parameters).index(name)
+
+    def change(size: float) -> Array:
+        values = e.values
+        values[k] += size
+        return _sampled(e, at, values) - _sampled(e, at)
+
+    for size in SIZES:
+        one = None if effect is None else _change(loop, effect, size)
+        step = 1e-3 * (abs(e.values[k]) or 1.0)
+        factor = _match(one, change(step))
+        if factor is None or not _equal(one, change(factor * step)):
+            return False
+    return True
