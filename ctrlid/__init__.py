@@ -2,6 +2,7 @@
 
 from . import datasets, effects, plants, plot
 from .arx import fit_arx
+from .audit import Audit, AuditFinding, audit
 from .comparison import Comparison, Curve
 from .constraints import (
     Bounds,
@@ -39,6 +40,8 @@ __version__ = "0.1.0.dev0"
 
 __all__ = [
     "PID",
+    "Audit",
+    "AuditFinding",
     "Bounds",
     "Comparison",
     "Correlation",
@@ -67,6 +70,7 @@ __all__ = [
     "StaticGain",
     "SymmetricPoles",
     "__version__",
+    "audit",
     "compare",
     "datasets",
     "design_lead",

@@ -1,0 +1,356 @@
+"""What sampling, sensors and loggers do to a signal: steps, clipping, repeats, spikes, drift.
+
+Arrays in, numbers out. The bounds are laws of chance for a signal of this length, or ratios to the
+signal's own size; none is in physical units.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy import ndimage, stats
+
+FloatArray = npt.NDArray[np.float64]
+
+ENOUGH = 20_000  # samples from which a grid is read
+LEVELS = 12  # distinct values up to which a signal may be a staircase
+SOME = 4  # equal extreme values that no continuous distribution gives
+QUIET = 8  # samples to either side that tell whether a spike stands alone
+BLOCKS = 40  # of which the means show a drift
+
+
+def runs(mask: Any) -> tuple[Any, Any]:
+    """Return first indices and ends (exclusive) of the stretches where a mask is true."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], np.asarray(mask, dtype=np.int8), [0]])))
+    return edges[::2], edges[1::2]
+
+
+def hair(v: FloatArray) -> float:
+    """Return the difference up to which two values of a signal are the same number."""
+    return 4 * float(np.spacing(np.max(np.abs(v))))
+
+
+def distinct(v: FloatArray) -> tuple[FloatArray, Any]:
+    """Return the values of a signal in rising order and how often each occurs."""
+    values, counts = np.unique(v, return_counts=True)
+    first = np.flatnonzero(np.concatenate([[True], np.diff(values) > hair(v)]))
+    return values[first], np.add.reduceat(counts, first)
+
+
+def held(v: FloatArray) -> bool:
+    """Return whether a signal is a staircase of few levels, as a program gives it out."""
+    if len(np.unique(v[:ENOUGH])) > LEVELS or len(np.unique(v)) > LEVELS:
+        return False
+    return float(np.mean(np.diff(v) != 0)) < 0.2
+
+
+def grid_step(v: FloatArray) -> float:
+    r"""Return the step of the grid on which all values of a signal lie, or 0.
+
+    .. math:: v_k = v_0 + q \, i_k, \quad i_k \text{ whole}
+
+    The greatest common measure of the differences of distinct values, by Euclid's rule with a
+    tolerance. The extreme values may be a limiter's and are left out; one value in a hundred may
+    be off the grid. Where few levels recur all the time but are unevenly spaced, as those of a
+    converter behind a calibration curve, the middle spacing is returned. A staircase of a few
+    levels that are far apart is not quantised.
+
+    Parameters
+    ----------
+    v : ndarray, shape (n,)
+        Signal.
+
+    Returns
+    -------
+    float
+        The step [signal unit]; 0 for a signal of full floating-point resolution.
+    """
+    values, counts = distinct(v[:ENOUGH])
+    if len(values) < 3:
+        return 0.0
+    if len(values) > LEVELS:
+        values, counts = values[1:-1], counts[1:-1]
+    again = counts > 1
+    if np.count_nonzero(again) > 2 and counts[again].sum() >= 0.9 * counts.sum():
+        values, again = values[again], again[again]
+    finest = 250 * hair(v)
+    gaps = np.diff(values)
+    step = float(gaps.min())
+    # Levels that all recur but are unevenly spaced: a converter behind a calibration curve.
+    uneven = float(np.median(gaps)) if len(values) < 0.1 * len(v) and again.all() else 0.0
+    for _ in range(40):
+        if step < finest:
+            return uneven
+        rest = np.abs(gaps - step * np.round(gaps / step))
+        off = rest > 0.03 * step
+        if np.mean(off) <= 0.01:
+            break
+        step = float(rest[off].min())
+    step = float(values[-1] - values[0]) / float(np.sum(np.round(gaps / step)))
+    place = (v - values[0]) / step
+    inner = (v < v.max()) & (v > v.min()) if len(values) > LEVELS else np.ones(len(v), bool)
+    if np.mean(np.abs(place - np.round(place))[inner] < 0.1) < 0.99:
+        return uneven
+    jumps = np.abs(np.diff(v))
+    jumps = jumps[jumps > 0.5 * step]
+    if len(values) <= LEVELS and (not jumps.size or np.median(jumps) > 1.5 * step):
+        return 0.0
+    return step
+
+
+def clipped(
+    v: FloatArray, valid: Any, others: Sequence[FloatArray], step: float, side: int,
+    reference: FloatArray | None = None,
+) -> tuple[Any, float]:  # fmt: skip
+    """Return where a signal sits on its extreme value too often, and that value.
+
+    A continuous distribution never gives its largest value twice; a quantised one gives it about as
+    often as the values beside it. Rest does not count: all other signals stand still too (or, for
+    a quantised signal, its reference does), and the signal came to its value gently, or the record
+    starts there. A single stretch must be twice as long as several together.
+
+    Parameters
+    ----------
+    v : ndarray, shape (n,)
+        Signal.
+    valid : ndarray of bool, shape (n,)
+        Samples that count.
+    others : sequence of ndarray
+        The other signals.
+    step : float
+        Quantisation step of the signal, or 0.
+    side : int
+        1 for the largest value, -1 for the smallest.
+    reference : ndarray, optional
+        What the signal should follow.
+
+    Returns
+    -------
+    mask : ndarray of bool, shape (n,)
+        The samples at the limit, none if chance explains them.
+    limit : float
+        The extreme value.
+    """
+    w = side * v
+    tol, limit = hair(v), float(np.max(w[valid]))
+    at = valid & (w >= limit - tol)
+    none = np.zeros(len(v), dtype=bool)
+    if np.count_nonzero(at) < SOME or limit - np.min(w[valid]) <= tol or held(v[valid]):
+        return none, side * limit
+    first, stop = runs(at)
+    gentle = 1.5 * step if step else 1e-3 * float(np.ptp(v[valid]))
+    before = np.maximum(first - 1, 0)
+    starts = (first == 0) | ~valid[before]
+    slope = np.maximum(
+        np.abs(w[first] - w[before]), np.abs(w[before] - w[np.maximum(first - 2, 0)])
+    )
+    moves = [np.abs(np.diff(s, prepend=s[0])) > 1e-9 * float(np.ptp(s)) for s in others]
+    changes = np.cumsum(np.any(moves, axis=0))
+    since = np.where(starts, first, before)
+    # The sample at which the others move on is the last one at which this signal has not yet.
+    still = changes[np.maximum(stop - 2, since)] == changes[since]
+    if step and reference is not None:
+        steps = np.cumsum(np.diff(reference, prepend=reference[0]) != 0)
+        still |= steps[np.maximum(stop - 2, since)] == steps[since]
+    rest = still & (starts | (slope <= gentle))
+    for a, b in zip(first[rest], stop[rest], strict=True):
+        at[a:b] = False
+    values, counts = distinct(w[valid])
+    near = counts[-4:-1]
+    levels = max(len(near), round((limit - values[-len(near) - 1]) / step) if step else 0)
+    usual = near.sum() / levels if step else near.mean() - 1
+    least = SOME if len(runs(at)[0]) > 1 else 2 * SOME
+    enough = np.count_nonzero(at) >= least + SOME * max(usual, 0.0)
+    return (at if enough else none), side * limit
+
+
+def repeated(v: FloatArray, valid: Any, step: float, ignore: Any) -> Any:
+    """Return where a signal repeats its last value although it moves just before and after.
+
+    A quantised signal that moves by many steps a sample passes through a difference of nought as
+    seldom as through one of one or two steps; what is more is a defect.
+
+    Parameters
+    ----------
+    v : ndarray, shape (n,)
+        Signal.
+    valid : ndarray of bool, shape (n,)
+        Samples that count.
+    step : float
+        Quantisation step, or 0.
+    ignore : ndarray of bool, shape (n,)
+        Samples with another explanation, for instance at a limit.
+
+    Returns
+    -------
+    ndarray of bool, shape (n,)
+        The repeated samples, none if chance explains them.
+    """
+    d = np.diff(v)
+    good = valid[1:] & valid[:-1] & ~ignore[1:]
+    size = np.where(good, np.abs(d), 0.0)
+    moved = size[size > 0]
+    none = np.zeros(len(v), dtype=bool)
+    if moved.size < 10:
+        return none
+    fast = 3.5 * step if step else 1e-3 * float(np.median(moved))
+    padded = np.concatenate([[0.0], size, [0.0]])
+    first, stop = runs(good & (size <= hair(v)))
+    among = (padded[first] > fast) & (padded[stop + 1] > fast)
+    usual = 0.0
+    if step:
+        few = (size > 0.5 * step) & (size < 2.5 * step)
+        usual = np.count_nonzero(few & (padded[:-2] > fast) & (padded[2:] > fast)) / 4
+    if np.count_nonzero(among) < 1 + (2 + 3 * usual + 3 * np.sqrt(usual) if step else 0):
+        return none
+    for a, b in zip(first[among], stop[among], strict=True):
+        none[a + 1 : b + 1] = True
+    return none
+
+
+def spikes(v: FloatArray, valid: Any, step: float) -> FloatArray:
+    r"""Return the height of isolated spikes, 0 where there is none.
+
+    A spike is off the line through the two samples before it, off the line through the two after
+    it, and off the middle of its neighbours, all to the same side; a jump or a kink agrees with one
+    of them. The smallest of the three must exceed what noise of the signal's own size reaches once
+    in a thousand records of this length, half as much again, and the curvature around.
+
+    Parameters
+    ----------
+    v : ndarray, shape (n,)
+        Signal.
+    valid : ndarray of bool, shape (n,)
+        Samples that count.
+    step : float
+        Quantisation step, or 0.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        Heights [signal unit].
+    """
+    height = np.zeros(len(v))
+    if len(v) < 2 * QUIET + 1:
+        return height
+    c = v[2:-2]
+    off = np.array([
+        c - 2 * v[1:-3] + v[:-4], c - 2 * v[3:-1] + v[4:], c - 0.5 * (v[1:-3] + v[3:-1])
+    ])  # fmt: skip
+    small = np.min(np.abs(off), axis=0)
+    small[np.abs(np.sign(off).sum(axis=0)) < 3] = 0.0
+    clear = ndimage.minimum_filter1d(valid.astype(np.int8), 5)[2:-2] > 0
+    bend = np.where(ndimage.minimum_filter1d(valid.astype(np.int8), 3)[1:-1] > 0,
+                    np.abs(np.diff(v, 2)), 0.0)  # fmt: skip
+    if not clear.any():
+        return height
+    noise = max(1.4826 * float(np.median(np.abs(off[2][clear]))), step, 1e-9 * float(np.ptp(v)))
+    bound = 1.5 * float(stats.norm.isf(0.0005 / len(v))) * noise
+    # Curvature centred 3 to 8 samples away on either side does not touch the spike.
+    wide, reach = np.pad(bend, QUIET + 1), QUIET - 2
+    most = ndimage.maximum_filter1d(wide, reach, origin=-(reach // 2))
+    at = np.arange(2, len(v) - 2)
+    around = np.maximum(most[at], most[at + QUIET + 3])
+    found = clear & (small > bound) & (small > 1.5 * around)
+    height[2:-2][found] = off[2][found]
+    return height
+
+
+def drift(y: FloatArray, causes: Sequence[FloatArray]) -> tuple[float, float, float]:
+    r"""Return how far a signal drifts over the record, next to what its causes explain.
+
+    .. math:: \bar y_i = c + \sum_j g_j \bar w_{ij} + d_1 t_i + d_2 t_i^2 + d_3 t_i^3 + e_i
+
+    over means of up to 40 blocks, with the F-test of d. Where neighbouring e are alike there are
+    fewer independent blocks.
+
+    Parameters
+    ----------
+    y : ndarray, shape (n,)
+        Signal.
+    causes : sequence of ndarray
+        Signals that may move it.
+
+    Returns
+    -------
+    change : float
+        Difference of the largest and the smallest value of the drift [signal unit].
+    scatter : float
+        Standard deviation of the signal about its causes and the drift.
+    p_value : float
+        Probability of such a drift by chance.
+    """
+    n = len(y)
+    m = min(BLOCKS, n // 20)
+    if m < 10:
+        return 0.0, 0.0, 1.0
+    edges = np.linspace(0, n, m + 1).astype(int)[:-1]
+    size = np.diff(np.append(edges, n))
+
+    def columns(signals: Sequence[FloatArray], t: FloatArray) -> FloatArray:
+        scaled = [(w - np.mean(w)) / s for w in signals if (s := float(np.std(w))) > 0]
+        return np.column_stack([np.ones(len(t)), *scaled, t, t**2, t**3])
+
+    def split(target: FloatArray, table: FloatArray) -> tuple[FloatArray, FloatArray]:
+        beta = np.asarray(np.linalg.lstsq(table, target, rcond=1e-9)[0], dtype=float)
+        return beta, target - table @ beta
+
+    def means(s: FloatArray) -> FloatArray:
+        out: FloatArray = np.add.reduceat(s, edges) / size
+        return out
+
+    y = y - y[0]
+    whole = columns(causes, np.linspace(-1, 1, n))
+    beta, e = split(y, whole)
+    change = float(np.ptp(whole[:: max(1, n // 200), -3:] @ beta[-3:]))
+    scatter = float(np.std(e))
+    if scatter <= 1e-9 * float(np.std(y)):
+        return change, scatter, 1.0
+    table = columns([means(w) for w in causes], np.linspace(-1, 1, m))
+    _, left = split(means(y), table[:, :-3])
+    _, e = split(means(y), table)
+    rss = float(e @ e)
+    # Neighbouring blocks that are alike make fewer independent ones.
+    alike = float(np.clip(e[1:] @ e[:-1] / max(rss, 1e-300), 0.0, 0.9))
+    free = max((m - table.shape[1]) * (1 - alike) / (1 + alike), 2.0)
+    f = (float(left @ left) - rss) / 3 / max(rss / free, 1e-300)
+    return change, scatter, float(stats.f.sf(f, 3, free))
+
+
+def period(r: FloatArray) -> int:
+    r"""Return after how many samples a signal repeats itself, at least once, or 0.
+
+    .. math:: D(P) = \operatorname{mean}_k (r_{k+P} - r_k)^2
+
+    is zero at a period. Nearly is enough: less than 2 % of the signal's size and a quarter of
+    D(1), the price of being one sample off.
+
+    Parameters
+    ----------
+    r : ndarray, shape (n,)
+        Signal.
+
+    Returns
+    -------
+    int
+        The smallest period of at most half the length.
+    """
+    n, v = len(r), r - np.mean(r)
+    variance = float(np.mean(v**2))
+    if n < 8 or variance <= hair(r) ** 2:
+        return 0
+    size = 1 << (2 * n - 1).bit_length()
+    spectrum = np.fft.rfft(v, size)
+    lags = np.arange(n // 2 + 1)
+    products = np.fft.irfft(np.abs(spectrum) ** 2, size)[: len(lags)]
+    power = np.concatenate([[0.0], np.cumsum(v**2)])
+    D = (power[n - lags] + power[n] - power[lags] - 2 * products) / (n - lags)
+    near = min(4e-4 * variance, 0.25 * float(D[1])) > D
+    near[:2] = False
+    first, stop = runs(near)
+    if not first.size:
+        return 0
+    best = int(first[0] + np.argmin(D[first[0] : stop[0]]))
+    # What repeats must not be mere rest: the part repeated has to hold most of the motion.
+    return best if float(np.var(v[:best])) > 0.1 * variance else 0

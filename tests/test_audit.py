@@ -1,0 +1,325 @@
+"""audit(): silent on healthy records, and each defect found by its name."""
+
+from dataclasses import replace
+
+import control as ct
+import numpy as np
+import pytest
+
+import ctrlid as cid
+from ctrlid import defects
+
+
+def reference(rng, n, amplitude, around):
+    seed = int(rng.integers(1_000_000))
+    kind = rng.choice(["binary", "steps", "multisine", "prbs", "noise"])
+    if kind == "binary":
+        hold = int(rng.integers(1, 60))
+        return cid.random_binary(n, amplitude=amplitude, hold=hold, around=around, seed=seed)
+    if kind == "steps":
+        hold = int(rng.integers(n // 20, n // 6))
+        return around + amplitude * np.repeat(rng.uniform(-1, 1, n // hold + 1), hold)[:n]
+    if kind == "prbs":
+        period = np.repeat(rng.choice([-1.0, 1.0], 127), int(rng.integers(1, 9)))
+        return around + amplitude * np.tile(period, n)[:n]
+    if kind == "multisine":
+        waves = [np.sin(2 * np.pi * (f * np.arange(n) + rng.uniform()))
+                 for f in rng.uniform(1 / 400, 0.1, 12)]  # fmt: skip
+        return around + amplitude * sum(waves) / 5
+    return around + amplitude * np.repeat(rng.standard_normal(n), 5)[:n]
+
+
+def random_loop(rng):
+    """A maglev, servo, tank or lag of any size, under a digital or an analog controller."""
+    plant = rng.choice(["maglev", "servo", "tank", "lag"])
+    digital = bool(rng.random() < 0.6)
+    if plant == "maglev":
+        x0 = rng.uniform(0.008, 0.02)
+        P = cid.plants.maglev(m=rng.uniform(0.01, 0.1), K=10 ** rng.uniform(-6, -4))
+        op = cid.operating_point(P, output=x0)
+        L = cid.linearize(P, op)
+        p = float(np.max(np.abs(L.poles())))
+        dt = float(f"{10 ** rng.uniform(-2, -1.3) / p:.3g}")
+        C = cid.design_lead(L, crossover=2.5 * p, phase_margin=45)
+        C = ct.sample_system(ct.ss(C), dt, "tustin") if digital else C
+        return cid.Loop(P, C, dt=dt, at=op), x0 * 10 ** rng.uniform(-2.5, -1.9)
+    if plant == "servo":
+        m, w = 10 ** rng.uniform(-1, 1), 10 ** rng.uniform(0, 1.5)
+        P = cid.plants.servo(m=m, c=m * w * rng.uniform(0.2, 3), k=m * w**2)
+        dt = float(f"{0.03 / w:.3g}")
+        kp = m * w**2 * rng.uniform(0.5, 4)
+        C = cid.PID(kp, ki=rng.choice([0, 0.3 * m * w**3]), kd=m * w, filter_time=3 * dt)
+        C = C if digital else ct.tf([m * w**2], [1])
+        return cid.Loop(P, C, dt=dt), 10 ** rng.uniform(-3, 1)
+    if plant == "tank":
+        P = cid.plants.tank(area=rng.uniform(0.5, 2), outlet=0.02, k=0.05)
+        level = rng.uniform(0.5, 2)
+        C = cid.PID(rng.uniform(1, 5), ki=rng.choice([0, 0.01])) if digital else ct.tf([2.0], [1])
+        op = cid.operating_point(P, output=level)
+        return cid.Loop(P, C, dt=2.0, at=op), 0.03 * level
+    lag = 10 ** rng.uniform(-2, 2)
+    gain = rng.uniform(0.5, 4)
+    C = cid.PID(gain, ki=rng.uniform(0.1, 2) / lag) if digital else ct.tf([gain], [1])
+    at = cid.OperatingPoint((0.0,), 1.0, 3.0)
+    return cid.Loop(ct.tf([2.0], [lag, 1]), C, dt=0.05 * lag, at=at), 1.0
+
+
+def random_records(count, seed):
+    out = []
+    rng = np.random.default_rng(seed)
+    while len(out) < count:
+        loop, amplitude = random_loop(rng)
+        n = int(10 ** rng.uniform(2.5, 3.7))
+        r = reference(rng, n, amplitude, loop.point.output)
+        noise = amplitude * 10 ** rng.uniform(-2, -0.7)
+        try:
+            record = cid.simulate(loop, r, sensor_noise=noise, seed=int(rng.integers(1_000_000)))
+        except cid.CtrlidError:  # the step was too large for a levitated ball
+            continue
+        out.append((loop, record))
+    return out
+
+
+NEVER = ("saturation", "dropped samples", "outliers", "quantization")
+
+
+@pytest.fixture(scope="module")
+def healthy():
+    return random_records(110, seed=1)
+
+
+def test_healthy_records_are_left_in_peace(healthy):
+    harmful, named = [], []
+    for loop, record in healthy:
+        found = cid.audit(record, loop)
+        harmful += [f for f in found.findings if f.harmful]
+        named += [f for f in found.findings if f.kind in NEVER]
+        said = found["controller"]
+        assert len(said) == (0 if loop.analog else 1)
+        assert all("what the stated controller computes" in f.text for f in said)
+    assert named == []
+    assert len(harmful) <= 1, harmful  # one drift in a few hundred records is chance
+
+
+def clip_y(rng, record):
+    q, side = rng.uniform(0.02, 0.1), rng.choice([-1, 1])
+    y = side * np.minimum(side * record.y, np.quantile(side * record.y, 1 - q))
+    return replace(record, y=y)
+
+
+def clip_u(rng, record):
+    return replace(record, u=np.minimum(record.u, np.quantile(record.u, rng.uniform(0.9, 0.98))))
+
+
+def lose_samples(rng, record):
+    y, u = record.y.copy(), record.u.copy()
+    for k in rng.integers(5, record.n - 8, max(3, int(record.n * rng.uniform(0.003, 0.03)))):
+        end = k + int(rng.integers(1, 4))
+        y[k:end], u[k:end] = y[k - 1], u[k - 1]
+    return replace(record, y=y, u=u)
+
+
+def add_spikes(rng, record):
+    bend = np.abs(np.diff(record.y, 2))
+    size = max(0.6 * float(np.median(bend)), float(bend.max()) / 10)
+    y = record.y.copy()
+    at = rng.integers(10, record.n - 10, max(3, record.n // 500))
+    y[at] += rng.choice([-1, 1], len(at)) * rng.uniform(20, 100, len(at)) * size
+    return replace(record, y=y)
+
+
+def add_drift(rng, record):
+    t = np.linspace(0, 1, record.n)
+    shape = (t, 1 - np.exp(-4 * t), t**2)[rng.integers(3)]
+    return replace(record, y=record.y + rng.uniform(4, 8) * np.std(record.y - record.r) * shape)
+
+
+DEFECTS = [
+    (clip_y, "saturation", "y", 0.02),
+    (clip_u, "saturation", "u", 0.02),
+    (lose_samples, "dropped samples", "y", 0.02),
+    (add_spikes, "outliers", "y", 0.02),
+    (add_drift, "drift", "y", 0.08),  # a few hundred samples of a slow loop are few time constants
+]
+
+
+@pytest.mark.parametrize(("spoil", "kind", "channel", "share"), DEFECTS)
+def test_a_defect_is_found(healthy, spoil, kind, channel, share):
+    rng = np.random.default_rng(2)
+    missed = 0
+    for _, record in healthy:
+        found = cid.audit(spoil(rng, record))
+        missed += not any(f.channel == channel for f in found[kind])
+    assert missed <= share * len(healthy)
+
+
+def test_quantisation_is_measured(healthy):
+    rng = np.random.default_rng(3)
+    for _, record in healthy:
+        step = float(f"{np.std(record.y) * 10 ** rng.uniform(-2.5, -0.6):.3g}")
+        found = cid.audit(replace(record, y=np.round(record.y / step) * step))
+        assert found.quantum["y"] == pytest.approx(step, rel=1e-3)
+        assert found["quantization"][0].channel == "y"
+        assert found["dropped samples"] == found["outliers"] == ()
+
+
+def test_printed_digits_are_a_step_but_no_news():
+    y = np.random.default_rng(4).standard_normal(5000)
+    found = cid.audit(cid.Record(u=y, y=np.array([float(f"{v:.5f}") for v in y]), dt=1.0))
+    assert found.quantum["y"] == pytest.approx(1e-5, rel=1e-6)
+    assert found["quantization"] == ()
+    assert found.quantum["u"] == found.quantum["r"] == 0.0
+
+
+def test_levels_of_a_calibrated_converter():
+    raw = np.round(np.random.default_rng(5).standard_normal(5000) * 30)
+    y = np.exp(raw / 500)  # evenly spaced in counts, not in units
+    assert defects.grid_step(y) == pytest.approx(1 / 500, rel=0.1)
+
+
+@pytest.mark.parametrize("lag", [1, 2, -1, -2])
+@pytest.mark.parametrize("channel", ["u", "y"])
+def test_a_channel_logged_late_or_early(healthy, lag, channel):
+    word = f"{'one' if abs(lag) == 1 else 'two'} sample{'s' if abs(lag) > 1 else ''}"
+    word += " late" if lag > 0 else " early"
+    for loop, record in [pair for pair in healthy if not pair[0].analog][:5]:
+        moved = np.roll(getattr(record, channel), lag)
+        late = replace(record, **{channel: moved})[5:-5]
+        said = cid.audit(late, loop)["controller"]
+        assert said[0].harmful
+        assert f"logged {word}" in said[0].text
+
+
+@pytest.fixture
+def servo():
+    plant = cid.plants.servo(m=1.0, c=2.0, k=3.0)
+    loop = cid.Loop(plant, cid.PID(kp=20.0, kd=0.5), dt=0.01)
+    return loop, cid.random_binary(4000, amplitude=0.1, hold=50, seed=1)
+
+
+def test_injected_signal_is_named_with_its_size(servo):
+    loop, r = servo
+    d = 0.2 * np.random.default_rng(6).standard_normal(len(r))
+    record = cid.simulate(loop, r, d=d, sensor_noise=1e-4, seed=1)
+    said = cid.audit(record, loop)["controller"][0]
+    assert not said.harmful
+    assert "injected signal of RMS 0.2" in said.text
+
+
+def test_another_controller_is_said(servo):
+    loop, r = servo
+    record = cid.simulate(loop, r, sensor_noise=1e-4, seed=1)
+    other = replace(loop, controller=cid.PID(kp=14.0, kd=0.8))
+    said = cid.audit(record, other)["controller"][0]
+    assert said.harmful
+    assert "gains or structure" in said.text
+
+
+def test_u_ahead_of_the_limiter_and_behind_it(servo):
+    loop, r = servo
+    limited = replace(loop, input_limits=(-2.0, 2.0))
+    record = cid.simulate(limited, r, sensor_noise=1e-4, seed=1)
+    found = cid.audit(record, limited)
+    assert found.harmful == ()
+    assert found.saturated["u"][2:] == (-2.0, 2.0)
+    assert min(found.saturated["u"][:2]) > 0.005
+    wish = replace(record, u=cid.replay_controller(loop, record))
+    said = cid.audit(wish, limited)["controller"]
+    assert "ahead of the limiter" in said[0].text
+    assert "what the stated controller computes" in said[1].text
+
+
+def test_wrong_period_of_the_loop_is_a_finding(servo):
+    loop, r = servo
+    record = replace(cid.simulate(loop, r), dt=0.02)
+    assert "cannot be replayed" in cid.audit(record, loop)["controller"][0].text
+
+
+def test_repeats():
+    rng = np.random.default_rng(7)
+    for _ in range(100):
+        n, times = int(rng.integers(20, 2000)), int(rng.integers(2, 6))
+        r = np.tile(np.cumsum(rng.standard_normal(n)), times)
+        r = np.append(r, r[: n // 3]) + 3e-4 * np.std(r) * rng.standard_normal(len(r) + n // 3)
+        assert defects.period(r) == n
+    for _ in range(100):
+        n = int(rng.integers(50, 5000))
+        assert defects.period(np.cumsum(rng.standard_normal(n))) == 0
+        assert defects.period(np.repeat(rng.standard_normal(n // 10 + 1), 10)[:n]) == 0
+
+
+def test_excitation():
+    n = 2000
+    noise = np.random.default_rng(8).standard_normal(n)
+    t = np.arange(n)
+
+    def said(r):
+        return [f.text for f in cid.audit(cid.Record(r=r, u=r - noise, y=noise + r, dt=1.0))
+                ["too little excitation"]]  # fmt: skip
+
+    assert "noise only" in said(np.zeros(n))[0]
+    assert "changes once only" in said(np.where(t > 500, 1.0, 0.0))[0]
+    assert "single sine" in said(np.sin(0.0513 * t))[0]
+    assert said(np.sin(0.0513 * t) + np.sin(0.1713 * t)) == []
+    assert said(np.sin(2e-5 * t**2)) == []
+    assert said(np.repeat(np.random.default_rng(9).choice([-1.0, 1.0], n // 20), 20)) == []
+
+
+def test_slow_sensor_is_named():
+    y = np.cumsum(np.random.default_rng(10).standard_normal(3000))
+    found = cid.audit(cid.Record(u=np.gradient(y), y=np.repeat(y[::3], 3), dt=0.1))
+    assert "refreshed every 3 samples" in found["dropped samples"][0].text
+
+
+def test_staircases_and_rest_are_not_saturation():
+    levels = np.repeat([0.0, 1.0, 0.0, 2.0, 0.0, 3.0, 0.0, 1.0], 100)
+    y = np.zeros(800)
+    for k in range(1, 800):
+        y[k] = 0.9 * y[k - 1] + 0.1 * levels[k - 1]
+    found = cid.audit(cid.Record(u=levels, y=y, dt=1.0))
+    assert found["saturation"] == found["quantization"] == ()
+    assert found.quantum["u"] == 0.0
+
+
+@pytest.mark.parametrize("n", [2, 5, 20])
+def test_few_samples(n):
+    y = np.random.default_rng(n).standard_normal(n)
+    for record in (cid.Record(u=y, y=y, dt=1.0), cid.Record(r=0 * y, u=0 * y, y=y, dt=1.0)):
+        found = cid.audit(record)
+        assert "too few samples" in [f.kind for f in found.harmful]
+        assert "TOO FEW SAMPLES" in str(found)
+    none = cid.Record(u=y, y=y, dt=1.0, valid=np.zeros(n, bool))
+    assert cid.audit(none).harmful[0].size == 0
+
+
+def test_only_what_counts_is_looked_at(healthy):
+    _, record = healthy[0]
+    y = record.y.copy()
+    y[100:120] = y.max() + 1.0
+    valid = np.ones(record.n, bool)
+    valid[95:125] = False
+    found = cid.audit(replace(record, y=y, valid=valid))
+    assert found.harmful == ()
+    assert cid.audit(replace(record, y=y)).harmful != ()
+
+
+def test_constant_signals():
+    y = np.random.default_rng(11).standard_normal(100)
+    found = cid.audit(cid.Record(u=np.full(100, 2.0), y=y, dt=1.0, units={"u": "V"}))
+    assert "u stays at 2 V" in found["constant signal"][0].text
+
+
+def test_refusal_says_what_is_needed():
+    with pytest.raises(cid.CtrlidError, match="audit needs a Record"):
+        cid.audit([1, 2, 3])
+
+
+@pytest.mark.parametrize(("name", "kinds"), [
+    ("tanks_estimation", {("saturation", "y")}),
+    ("emps", {("repeats", "r")}),
+    ("servo_swept_sine", {("saturation", "u"), ("outliers", "y"), ("quantization", "y")}),
+    ("inteco_pid_step", {("too little excitation", "r"), ("quantization", "y")}),
+])  # fmt: skip
+def test_measured_records(data_dir, name, kinds):
+    record = cid.datasets.load(name)
+    assert {(f.kind, f.channel) for f in cid.audit(record).findings} == kinds
