@@ -7,8 +7,10 @@ from typing import Any, ClassVar, Self, final
 
 import casadi
 import numpy as np
+from scipy import signal
 
 from ..errors import CtrlidError
+from ..linearization import state_matrices
 from ..physics import Equations
 from .base import expression, parameter, require_motion
 from .moment import Moment
@@ -86,6 +88,7 @@ class ForceExponent(LawEffect):
 
     n: float = parameter("", lower=0.5, upper=6.0, neutral=2.0)
 
+    stage: ClassVar[int] = -1  # of the law as it is written, before offsets and curves
     look_alikes: ClassVar[tuple[str, ...]] = (
         "PositionOffset", "LinearStiffness", "CubicStiffness", "SensorNonlinearity",
     )  # fmt: skip
@@ -290,14 +293,12 @@ def _high(loop: Any, record: Any, i: int) -> float:
     """Return a value that a state exceeds now and then, as far as a record tells."""
     e, at = loop.equations(), loop.point
     if record is not None and casadi.is_equal(e.output[0], e.x[i], 2):
-        return float(np.quantile(record.y, 0.98))
-    if record is not None:
-        slopes = casadi.Function("slopes", [e.t, e.x, e.u, e.p], [
-            casadi.jacobian(e.rhs, e.x), casadi.jacobian(e.rhs, e.u),
-        ])  # fmt: skip
-        a, b = (np.asarray(v, float) for v in slopes(0.0, list(at.states), at.input, e.values))
-        more = float(np.quantile(record.u, 0.9)) - at.input
-        moved = -np.linalg.lstsq(a, b, rcond=None)[0].ravel()[i] * more
-        if np.isfinite(moved) and moved > 0:
-            return float(at.states[i] + moved)
+        return float(np.quantile(record.y, 0.9))
+    if record is not None:  # by the linear model, from the recorded input
+        a, b, _, _ = state_matrices(e, at)
+        if np.linalg.eigvals(a).real.max() < 0:
+            n = len(a)
+            sampled = signal.cont2discrete((a, b, np.eye(n), np.zeros((n, 1))), record.dt)
+            moved = signal.dlsim(sampled, record.u - at.input)[1][:, i]
+            return float(at.states[i] + np.quantile(moved, 0.9))
     return float(at.states[i] + 0.5 * max(abs(at.states[i]), 1e-3))
