@@ -4,9 +4,12 @@ import copy
 import dataclasses
 import math
 import pickle
+import re
+from pathlib import Path
 
 import control as ct
 import numpy as np
+import numpydoc.validate
 import pytest
 
 import ctrlid as cid
@@ -345,3 +348,26 @@ def test_the_catalogue_is_explicit_and_public():
     for cls in CATALOGUE:
         assert getattr(effects, cls.__name__) is cls
         assert cls.__name__ in effects.__all__
+
+
+def test_the_manual_has_every_effect():
+    page = (Path(__file__).parents[1] / "docs" / "effects.rst").read_text(encoding="utf-8")
+    rows = dict(re.findall(r"\* - `~ctrlid\.effects\.(\w+)`\n((?:     - .*\n)+)", page))
+    assert list(rows) == [cls.__name__ for cls in CATALOGUE]
+    for cls in CATALOGUE:
+        equation, parameters, alike, experiment = re.findall(r"- (.*)", rows[cls.__name__])
+        assert " ".join(equation.split("`")[1].split()) in " ".join(cls.__doc__.split())
+        assert re.findall(r"``(\w+)``", parameters) == [p.name for p in cls.parameters()]
+        assert alike.split(", ") == list(cls.look_alikes)
+        assert experiment == cls.experiment
+    for name in effects.__all__:
+        assert re.search(rf"^   {name}$", page, re.M) or name == "CATALOGUE"
+
+
+@pytest.mark.parametrize("name", [n for n in effects.__all__ if n != "CATALOGUE"])
+def test_docstrings(name):
+    checks = {"GL01", "GL02", "GL03", "GL08", "SS03", "PR01", "PR02", "PR03", "RT01"}
+    found = numpydoc.validate.validate(f"ctrlid.effects.{name}")["errors"]
+    if name in ("Parameter", "Moment"):  # nobody makes one by hand
+        found = [e for e in found if e[0] != "PR01"]
+    assert [e for e in found if e[0] in checks] == []
