@@ -6,12 +6,11 @@ from typing import Any
 import control as ct
 import numpy as np
 
+from . import _text
 from .comparison import Comparison
 from .errors import CtrlidError
 from .physics import Array, timebase
 
-PREFIXES = ((1e-1, 1.0, ""), (1e-4, 1e-3, "m"), (1e-7, 1e-6, "µ"), (0.0, 1e-9, "n"))
-PREFIXED = ("m", "V", "A", "N", "m/s", "m/s^2")
 WINDOW = 250  # samples of a comparison that can be told apart on a page
 
 
@@ -19,11 +18,7 @@ def scale(signals: Sequence[Array], unit: str) -> tuple[float, str]:
     """Return a factor and the unit it leads to: millimetres rather than 0.03 m."""
     if not unit:
         return 1.0, "unit not given"
-    size = max(float(np.abs(s).max()) for s in signals)
-    if unit not in PREFIXED or not size:
-        return 1.0, unit
-    factor, prefix = next((f, p) for limit, f, p in PREFIXES if size >= limit)
-    return 1 / factor, prefix + unit
+    return _text.prefix(max(float(np.abs(s).max()) for s in signals), unit)
 
 
 def telling(comparison: Comparison) -> int:
@@ -99,8 +94,3 @@ def frequencies(models: Mapping[str, Any]) -> Any:
     corners = corners or [min(limits, default=1.0)]
     top = max(limits) if limits else 10 * max(corners)
     return np.geomspace(min(0.1 * min(corners), 0.01 * top), top, 600)
-
-
-def chance(p: float) -> str:
-    """Return a p-value in words; of the very small ones the size says nothing."""
-    return f"p = {p:.2g}" if p >= 1e-4 else "p < 0.0001"

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from . import _pictures, _text
+from . import _text
 from .comparison import Comparison
 from .controller_redesign import Redesign
 from .data import SIGNALS, Record
@@ -145,7 +145,7 @@ def _comparison_tables(c: Comparison) -> list[Table]:
     )
     tests = tuple(
         (t.name, "chance" if t.passed else "NOT CHANCE", f"{np.abs(t.values).max():.3f}",
-         f"{t.band:.3f}", _pictures.chance(t.p_value)) for t in c.tests
+         f"{t.band:.3f}", _text.chance(t.p_value)) for t in c.tests
     )  # fmt: skip
     tables = [
         Table(("curve", "fit", f"RMS error [{unit}]", "noise explains"), curves, f"{c.what}.")

@@ -5,6 +5,9 @@ from __future__ import annotations
 import math
 import re
 
+PREFIXES = ((1e-1, 1.0, ""), (1e-4, 1e-3, "m"), (1e-7, 1e-6, "µ"), (0.0, 1e-9, "n"))
+PREFIXED = ("m", "V", "A", "N", "m/s", "m/s^2", "N s/m", "s")
+
 
 def number(value: complex, digits: int = 7) -> str:
     """Shortest usual form of a real or complex number."""
@@ -56,6 +59,68 @@ def with_error(value: complex, error: float) -> str:
     shown = error / scale
     text += f" ± {shown:.{places}f}" if shown >= 10.0**-places else f" ± {shown:.1e}"
     return f"({text})e{exponent:+03d}" if exponent else text
+
+
+def chance(p: float) -> str:
+    """Return a p-value in words; of the very small ones the size says nothing."""
+    return f"p = {p:.2g}" if p >= 1e-4 else "p < 0.0001"
+
+
+def prefix(size: float, unit: str) -> tuple[float, str]:
+    """Return a factor and the unit it leads to: millimetres rather than 0.03 m.
+
+    Parameters
+    ----------
+    size : float
+        How large the quantity is.
+    unit : str
+        Its unit, of those in SI that take a prefix; others stay as they are.
+
+    Returns
+    -------
+    (float, str)
+        Factor and unit.
+
+    Examples
+    --------
+    >>> prefix(0.03, "m"), prefix(0.03, "1/s")
+    ((1000.0, 'mm'), (1.0, '1/s'))
+    """
+    if unit not in PREFIXED or not 0 < abs(size) < math.inf:
+        return 1.0, unit
+    factor, letter = next((f, p) for limit, f, p in PREFIXES if abs(size) >= limit)
+    return 1 / factor, letter + unit
+
+
+def quantity(value: float, unit: str = "", error: float | None = None, digits: int = 3) -> str:
+    """Write a value with its unit, and its standard error if one is given.
+
+    Parameters
+    ----------
+    value : float
+        The value.
+    unit : str, optional
+        Its unit.
+    error : float, optional
+        Its standard error; infinite if the data do not determine the value.
+    digits : int, optional
+        Significant digits where there is no error.
+
+    Returns
+    -------
+    str
+        The quantity.
+
+    Examples
+    --------
+    >>> quantity(6.1234e-4, "s", 3e-6), quantity(1.23456e-5, "m")
+    ('0.6123 ± 0.0030 ms', '12.3 µm')
+    """
+    factor, unit = prefix(value, unit)
+    if error is None or error == 0 or not math.isfinite(error):
+        known = "" if error is None else " (fixed)" if error == 0 else " (not in the data)"
+        return f"{number(factor * value, digits)} {unit}".strip() + known
+    return f"{with_error(factor * value, factor * error)} {unit}".strip()
 
 
 def shortest(value: float, error: float) -> float:

@@ -208,7 +208,7 @@ def residuals(comparison: Comparison, axes: Any = None) -> Any:
                 ax.plot(test.lags[which], test.values[which], marker, color=colour, markersize=4,
                         label=label)  # fmt: skip
         verdict = "chance explains it" if test.passed else "NOT CHANCE"
-        title = f"{test.name}: {verdict} ({_pictures.chance(test.p_value)})"
+        title = f"{test.name}: {verdict} ({_text.chance(test.p_value)})"
         ax.set_title(title, loc="left", fontsize="medium")
         reach = 1.15 * max(float(np.abs(test.values).max()), min(test.band, 1.0))
         ax.set_ylim(-reach, reach)

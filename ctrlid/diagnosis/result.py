@@ -1,6 +1,8 @@
 """What a diagnosis found, as values."""
 
+import html
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Literal
 
 from ..effects import AbstractEffect
@@ -255,3 +257,42 @@ class Diagnosis:
     def effects(self) -> tuple[AbstractEffect, ...]:
         """The effects that were found."""
         return tuple(f.effect for f in self.findings)
+
+    def __str__(self) -> str:
+        from .words import report  # words are about these values
+
+        return report(self)
+
+    def __repr__(self) -> str:
+        names = ": " + ", ".join(f.name for f in self.findings) if self.findings else ""
+        g = self.gap
+        sizes = f"{g.before:.3g} before, {g.after:.3g} after, floor {g.floor:.3g} {g.unit}"
+        return f"Diagnosis({self.verdict}{names}; gap {sizes.strip()})"
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{html.escape(str(self))}</pre>"
+
+    def save(self, path: str | Path) -> Path:
+        """Write the diagnosis to a file that a person can read; `load_diagnosis` reads it back.
+
+        Everything is kept but the plant and the controller, which are Python code, and what `extra`
+        holds beyond texts, numbers and arrays.
+
+        Parameters
+        ----------
+        path : str or Path
+            The file, in JSON; one that exists is replaced.
+
+        Returns
+        -------
+        Path
+            The file.
+
+        Raises
+        ------
+        CtrlidError
+            If the file cannot be written.
+        """
+        from .saving import save
+
+        return save(self, path)

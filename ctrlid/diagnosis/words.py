@@ -1,0 +1,301 @@
+"""The report of a diagnosis: what a control engineer reads in a minute."""
+
+import math
+import textwrap
+from collections.abc import Iterable
+
+import numpy as np
+
+from .._text import chance, listing, number, prefix, quantity, with_error
+from ..effects import AbstractEffect
+from .result import Diagnosis, Finding, Gap, Place
+from .saving import units_of
+
+WIDTH = 100
+TELLING = 1e-3  # probability below which a place is not noise's doing
+PLACES = 3
+LARGE = 0.5  # share of the floor from which a random force may hide something
+STRONG, CERTAIN = 10.0, 30.0  # evidence
+TRUSTED = ("nothing missing", "explained")
+MASSES = ("m", "M", "mass")
+FORCES = {"m/s^2": "N", "1/s": "N s/m", "1/s^2": "N/m", "1/m": "kg/m"}  # per unit of mass, times it
+
+
+def report(found: Diagnosis) -> str:
+    """Return a diagnosis in plain words.
+
+    Parameters
+    ----------
+    found : Diagnosis
+        From `diagnose`.
+
+    Returns
+    -------
+    str
+        Lines of at most 100 columns. Bad news is in capitals.
+    """
+    good = found.verdict in TRUSTED
+    lines = [f"Diagnosis of {found.record or 'a record'}"]
+    verdict = found.verdict.capitalize() if good else found.verdict.upper()
+    lines += _wrapped(f"{verdict}. {found.sentence}", 2)
+    lines += ["", *gap_lines(found.gap), "", *_where(found)]
+    if found.findings:
+        lines += ["", "  what is missing"]
+        for k, finding in enumerate(found.findings, 1):
+            lines += _finding(found, finding, f"{k}. ")
+        lines += _wrapped(
+            "Evidence: the logarithm of how many times likelier the record is with "
+            "the effect than without; chance reaches 2 or 3, 10 is strong.",
+            4,
+        )
+    elif found.verdict == "nothing missing" and found.sensitivity:
+        lines += ["", *_sensitivity(found)]
+    lines += ["", *_parameters(found)]
+    lines += _wrapped(disturbance(found), 2, hang=4)
+    lines += _wrapped(remains(found), 2, hang=4)
+    for title, remarks in (("about the record", found.audit), ("note", found.notes)):
+        for remark in remarks:
+            lines += _wrapped(f"{title}: {remark}", 2, hang=4)
+    lines.append(f"  {found.seconds:.1f} s")
+    return "\n".join(line.rstrip() for line in lines)
+
+
+def _wrapped(text: str, indent: int, hang: int | None = None) -> list[str]:
+    later = " " * (indent if hang is None else hang)
+    return textwrap.wrap(text, WIDTH, initial_indent=" " * indent, subsequent_indent=later,
+                         break_on_hyphens=False)  # fmt: skip
+
+
+def gap_rows(gap: Gap) -> list[tuple[str, str, str]]:
+    """Return what the gap is, how large, and how many times the noise floor, row by row."""
+    known = [v for v in (gap.floor, gap.after, gap.before) if 0 < v < math.inf]
+    factor, unit = prefix(known[0] if known else 0.0, gap.unit)
+
+    def size(value: float) -> str:
+        if math.isfinite(value):
+            return f"{number(factor * value, 3)} {unit}".strip()
+        return "none" if math.isnan(value) else "LEAVES THE PLANT'S DOMAIN"
+
+    def times(value: float) -> str:
+        ratio = value / gap.floor if gap.floor > 0 else math.nan
+        if not math.isfinite(ratio):
+            return ""
+        return f"{ratio:.2f} x the floor" if ratio < 9.995 else f"{ratio:.0f} x the floor"
+
+    cases = (("the model as given", gap.given), ("recalibrated", gap.before),
+             ("with the effects", gap.after))  # fmt: skip
+    rows = [(label, size(value), times(value)) for label, value in cases]
+    return [*rows, ("noise floor", size(gap.floor), "what noise and random force leave")]
+
+
+def gap_lines(gap: Gap) -> list[str]:
+    """Return the sizes of the gap as aligned lines."""
+    rows = gap_rows(gap)
+    if gap.after == gap.before:
+        rows = [row for row in rows if row[0] != "with the effects"]
+    head = f"  how far apart: {gap.kind} of {len(gap.time)} samples kept back, RMS error"
+    return [head, *(f"    {label:<20}{size:>12}   {times}" for label, size, times in rows),
+            *_wrapped(shrinking(gap), 4)]  # fmt: skip
+
+
+def shrinking(gap: Gap) -> str:
+    """Say how much of the gap above the noise floor the effects close; empty if they do not."""
+    if gap.before == gap.after:
+        return ""
+    above = gap.before**2 - gap.floor**2
+    if not math.isfinite(above):
+        return ""
+    if above <= 0 or gap.after >= gap.before:
+        return "On samples kept back the effects do NOT MAKE THE GAP SMALLER."
+    share = min((gap.before**2 - gap.after**2) / above, 1.0)
+    return (f"On samples kept back the effects close {percent(share)} of the squared gap above the "
+            "noise floor.")  # fmt: skip
+
+
+def percent(share: float) -> str:
+    """Write a share in percent, with more digits near the whole."""
+    return f"{100 * share:.1f} %" if 0.99 < share < 0.9995 else f"{100 * share:.0f} %"
+
+
+def telling(found: Diagnosis) -> list[Place]:
+    """Return the places where the disagreement sits, most telling first."""
+    return [p for p in found.where if p.p_before < TELLING][:PLACES]
+
+
+def worst(levels: Iterable[float]) -> float:
+    """Return the highest level among the bins that hold something, NaN without any."""
+    known = [v for v in levels if math.isfinite(v)]
+    return max(known, default=math.nan)
+
+
+def place_words(place: Place) -> str:
+    """Say where along its axis a place sits."""
+    if place.words:
+        return place.words
+    if not np.isfinite(place.before).any():
+        return "nowhere"
+    k = int(np.nanargmax(place.before))
+    low, high = (number(v, 3) for v in place.edges[k : k + 2])
+    return f"between {low} and {high} {place.unit}".strip()
+
+
+def _where(found: Diagnosis) -> list[str]:
+    places = telling(found)
+    if not places:
+        axes = listing([p.axis for p in found.where])
+        return ["  where it sits: " + (f"nowhere; noise looks like this along {axes}" if axes else
+                                       "not known")]  # fmt: skip
+    same = not found.findings
+    head = "  where it sits: mean square of the one-step errors, 1 is noise"
+    rows = [f"{head:<79}{'worst' if same else 'before':>10}{'' if same else 'after':>10}"]
+    for place in places:
+        first, *more = textwrap.wrap(place_words(place), 60) or [""]
+        after = "" if same else number(worst(place.after), 3)
+        rows.append(f"    {place.axis:<12} {first:<62}{number(worst(place.before), 3):>10}"
+                    f"{after:>10}")  # fmt: skip
+        rows += [f"{'':<17}{line}" for line in more]
+    return rows
+
+
+def sizes(found: Diagnosis, effect: AbstractEffect, errors: dict[str, float] | None = None) -> str:
+    """Write the parameters of an effect with units and standard errors, if they are given."""
+    units = units_of(found.loop, effect)
+    words = []
+    for name, value in vars(effect).items():
+        if name not in units:
+            words.append(f"{name} = {value}")
+            continue
+        error = None if errors is None else errors.get(name)
+        words.append(f"{name} = {quantity(value, units[name], error)}")
+    return ", ".join(words)
+
+
+def newtons(found: Diagnosis, effect: AbstractEffect) -> str:
+    """Write the accelerations among the parameters as forces, where the mass is a parameter."""
+    known = found.loop.parameters
+    mass = next((name for name in MASSES if name in known), None)
+    if effect.place != "force" or mass is None:
+        return ""
+    units = units_of(found.loop, effect)
+    words = [quantity(known[mass] * value, FORCES[units[name]])
+             for name, value in effect.values().items() if units[name] in FORCES]  # fmt: skip
+    return f"{listing(words)} at {mass} = {quantity(known[mass], 'kg')}" if words else ""
+
+
+def certainty(finding: Finding, alone: bool = True) -> str:
+    """Say how sure it is that something like this effect is there, and that it is this one.
+
+    Parameters
+    ----------
+    finding : Finding
+        The finding.
+    alone : bool, optional
+        Whether it is the only one, so that its share of the gap is that of the diagnosis.
+
+    Returns
+    -------
+    str
+        The words.
+    """
+    sure = ("WEAK" if finding.evidence < STRONG else
+            "strong" if finding.evidence < CERTAIN else "beyond doubt")  # fmt: skip
+    text = f"evidence {number(finding.evidence, 3)}, {sure}"
+    if math.isfinite(finding.share) and not alone:
+        text += f"; closes {percent(finding.share)} of the squared gap above the floor"
+    many = len(finding.names)
+    if many > 1:
+        return text + f"; ONE OF {many} that explain the record"
+    return text + "; no other effect explains the record as well"
+
+
+def doubts(found: Diagnosis, finding: Finding) -> list[str]:
+    """Say what else it could be, and which experiment would tell."""
+    lines = []
+    if finding.alternatives:
+        others = [f"{type(e).__name__} ({sizes(found, e)})" for e in finding.alternatives]
+        lines.append(f"this record does not tell it from {listing(others)}")
+    if finding.equivalents:
+        lines.append(f"no record of u and y tells it from {listing(finding.equivalents)}: on this "
+                     "plant they are the same")  # fmt: skip
+    if finding.experiment:
+        lines.append(f"what would tell: {finding.experiment}")
+    if finding.reference is not None:
+        lines.append(f"a reference for it is ready: .reference, {len(finding.reference)} samples")
+    return [*lines, *([finding.note] if finding.note else [])]
+
+
+def _finding(found: Diagnosis, finding: Finding, label: str) -> list[str]:
+    alone = len(found.findings) == 1
+    what = finding.effect.sentence.rstrip(".")
+    what = f": {what[:1].lower()}{what[1:]}" if what else ""
+    lines = _wrapped(f"{label}{finding.name}{what}", 4, hang=7)
+    force = newtons(found, finding.effect)
+    size = sizes(found, finding.effect, finding.standard_errors)
+    lines += _wrapped(size + (f" ({force})" if force else ""), 7, hang=9)
+    for text in (certainty(finding, alone), *doubts(found, finding)):
+        lines += _wrapped(text, 7, hang=9)
+    return lines
+
+
+def sensitivity_rows(found: Diagnosis) -> list[tuple[str, str]]:
+    """Return the smallest visible size of each effect."""
+    tried = {type(c.effect).__name__: c.effect for c in found.ranking}
+    rows = []
+    for key, size in found.sensitivity.items():
+        label, _, name = key.partition(".")
+        effect = tried.get(label)
+        unit = "" if effect is None else units_of(found.loop, effect).get(name, "")
+        rows.append((key, quantity(size, unit) if math.isfinite(size) else "not visible"))
+    return rows
+
+
+def _sensitivity(found: Diagnosis) -> list[str]:
+    rows = [f"{key:<{max(46 - len(size), len(key) + 1)}}{size}"
+            for key, size in sensitivity_rows(found)]  # fmt: skip
+    half = (len(rows) + 1) // 2
+    right = [*rows[half:], ""][:half]
+    head = "  the smallest effects that this record would have shown"
+    return [head, *(f"    {a}    {b}" for a, b in zip(rows[:half], right, strict=True))]
+
+
+def _parameters(found: Diagnosis) -> list[str]:
+    if not found.calibrated:
+        return ["  the model has no free parameters"]
+    last = "with the effects" if found.findings else "fitted"
+    rows = [("the model's own parameters", "given", "recalibrated", last)]
+    for c in found.calibrated:
+        fitted = (with_error(c.after, c.standard_error) if math.isfinite(c.standard_error)
+                  else f"{number(c.after, 4)} (not in the data)")  # fmt: skip
+        rows.append((f"  {c.name}", number(c.given, 4), number(c.before, 4), fitted))
+    if not found.findings:
+        rows = [(a, b, "", d) for a, b, _, d in rows]
+    return [f"  {a:<26}{b:>12}{c:>14}{d:>26}" for a, b, c, d in rows]
+
+
+def disturbance(found: Diagnosis) -> str:
+    """Say how large the random force is, and in capitals if it may hide something."""
+    d, unit = found.disturbance, f"{found.gap.unit}/s^2" if found.gap.unit else ""
+    parts = [f"white {quantity(d.white, unit)}"] if d.white else []
+    if d.coloured:
+        parts.append(f"coloured {quantity(d.coloured, unit)} with a time constant of "
+                     f"{quantity(d.time_constant, 's')}")  # fmt: skip
+    if not parts:
+        return "random force: none; the noise floor is sensor noise"
+    words = f"{' and '.join(parts)}, {percent(d.share)} of the noise floor's variance"
+    if d.share < LARGE:
+        return f"random force: {words}"
+    return (f"A LARGE RANDOM FORCE: {words}. Effects that it hides cannot be seen; the verdict "
+            "holds above it only")  # fmt: skip
+
+
+def remains(found: Diagnosis) -> str:
+    """Say whether what is left is noise, by the tests of the final one-step errors."""
+    failed = {k: p for k, p in found.tests.items() if p < TELLING}
+    if failed:
+        listed = listing([f"{name} ({chance(p)})" for name, p in failed.items()])
+        return f"what remains: NOT NOISE ALONE, by {listed}"
+    if not found.tests:
+        return "what remains: not tested"
+    name, p = min(found.tests.items(), key=lambda item: item[1])
+    return (f"what remains: noise, by {len(found.tests)} tests, the most doubtful of which is "
+            f"{name}, {chance(p)}")  # fmt: skip

@@ -1,0 +1,317 @@
+"""A diagnosis as text, file, picture and page: what each verdict says, and that nothing is lost."""
+
+import dataclasses
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import ctrlid as cid
+from ctrlid import effects as E
+from ctrlid.diagnosis.result import (
+    Calibrated,
+    Candidate,
+    Diagnosis,
+    Disturbance,
+    Finding,
+    Gap,
+    Place,
+)
+from ctrlid.diagnosis.saving import SavedLoop, load_diagnosis
+
+DT, N = 0.002, 3000
+VERDICTS = ("nothing missing", "explained", "partly explained", "unknown")
+FLAT = np.array([1.02, 0.97, 1.0, 1.04, 0.98, 0.99, 1.03, 1.0])
+BAD = np.array([1.0, 1.05, 1.4, 3.02, 2.9, 1.5, 1.1, 1.0])
+SENTENCES = {
+    "nothing missing": "Noise and random forces explain the record; no candidate earns a place.",
+    "explained": "CoulombFriction explains the disagreement; what is left looks like noise.",
+    "partly explained": "CoulombFriction earned its place, but something remains.",
+    "unknown": "The model disagrees with the record, and no candidate earns its place.",
+}
+
+
+@pytest.fixture(scope="module")
+def experiment():
+    """The loop, the record of one with friction, and simulations without and with it."""
+    plant = cid.plants.maglev(m=0.0213, K=3.34e-6)
+    op = cid.operating_point(plant, output=0.012)
+    C = cid.design_lead(cid.linearize(plant, op), crossover=100, phase_margin=50)
+    loop = cid.Loop(plant, C.sample(DT, "tustin"), dt=DT, at=op, free=("K",))
+    true = loop.with_effect(E.CoulombFriction(fc=0.4))
+    r = cid.random_binary(N, amplitude=3e-4, hold=100, around=op.output, seed=1)
+    record = cid.simulate(true, r, sensor_noise=1e-5, force_noise=0.03, seed=2)
+    return loop, record, cid.simulate(loop, r), cid.simulate(true, r)
+
+
+def rms(error):
+    return float(np.sqrt(np.mean(error**2)))
+
+
+def tried():
+    rows = (
+        (1, E.CoulombFriction(fc=0.3987), 790.0, 812.4, ""),
+        (1, E.StribeckFriction(fs=0.41, vs=0.3), 780.0, 811.0, ""),
+        (1, E.ViscousFriction(c=6.0), 402.0, 431.5, "WRONG SIGN"),
+        (1, E.ActuatorLag(tau=0.0), 102.0, math.nan, ""),
+        (1, E.CubicStiffness(k3=0.0), 0.4, math.nan, ""),
+        (2, E.InputDelay(delay=1e-4), 6.1, 6.5, ""),
+        (2, E.InputSaturation(lower=-math.inf, upper=9.0), 2.0, 2.1, ""),
+    )
+    return tuple(Candidate(k, e, s, g, 5.0, remark) for k, e, s, g, remark in rows)
+
+
+@pytest.fixture(scope="module")
+def found(experiment):
+    """A diagnosis by verdict."""
+    loop, record, before, after = experiment
+    y, b, a = (x.y[2 * N // 3 :] for x in (record, before, after))
+    floor = rms(y - a)
+    finding = Finding(
+        E.CoulombFriction(fc=0.3987), {"fc": 0.0061}, (E.StribeckFriction(fs=0.41, vs=0.3),), (),
+        812.4, 0.995, "slow motion with reversals: the force jumps when the motion turns",
+        0.012 + 1e-4 * np.sin(np.arange(200) / 20),
+    )  # fmt: skip
+    made = {}
+    for verdict in VERDICTS:
+        good = verdict == "nothing missing"
+        rest = {"partly explained": 0.6 * a + 0.4 * b, "unknown": b}.get(verdict, a)
+        first = a if good else b
+        gap = Gap("closed-loop simulation", 1.3 * rms(y - first), rms(y - first), rms(y - rest),
+                  floor, "m", record.t[2 * N // 3 :], y, first, rest)  # fmt: skip
+        levels = (FLAT if good else BAD, FLAT if good or verdict == "explained" else BAD)
+        chances = tuple(0.4 if v is FLAT else 1e-30 for v in levels)
+        where = (
+            Place("velocity", "m/s", np.linspace(-0.04, 0.04, 9), *levels, *chances,
+                  "where the motion turns"),
+            Place("position", "m", np.linspace(0.0113, 0.0127, 9), *levels, *chances, ""),
+            Place("time", "s", np.linspace(0, 4, 9), FLAT, FLAT, 0.3, 0.4, "all the time alike"),
+        )  # fmt: skip
+        findings = (finding,) if "explained" in verdict else ()
+        made[verdict] = Diagnosis(
+            verdict, SENTENCES[verdict], findings,
+            loop.with_effect(finding.effect) if findings else loop, gap, where, tried(),
+            Disturbance(0.03, 0.4, 0.11, 0.81) if good else Disturbance(0.03, 0.0, math.nan, 0.12),
+            (Calibrated("K", 3.1e-6, 3.31e-6, 3.3391e-6, 2.1e-9),
+             Calibrated("m", 0.0213, 0.0213, 0.0213, math.inf)),
+            {"CoulombFriction.fc": 0.021, "ActuatorLag.tau": 1.1e-4, "Homemade.size": 3.0,
+             "StribeckFriction.vs": math.inf},
+            {"whiteness": 0.41 if good or verdict == "explained" else 1e-9, "heavy tails": 0.22},
+            ("u moves in steps of 0.00122 V",), ("two samples were left out",),
+            "maglev, 3000 samples at 0.002 s", 8.4, {"horizon": 25, "table": np.eye(2)},
+        )  # fmt: skip
+    return made
+
+
+def text(diagnosis):
+    return " ".join(str(diagnosis).split())
+
+
+@pytest.mark.parametrize("verdict", VERDICTS)
+def test_report_is_read_in_a_minute(found, verdict):
+    lines = str(found[verdict]).splitlines()
+    assert len(lines) <= 45
+    assert max(map(len, lines)) <= 100
+    assert SENTENCES[verdict] in text(found[verdict])
+    for words in ("maglev, 3000 samples", "closed-loop simulation of 1000 samples kept back",
+                  "the model as given", "noise floor", "random force", "8.4 s",
+                  "about the record: u moves in steps", "note: two samples were left out",
+                  "0.0213 (not in the data)"):  # fmt: skip
+        assert words in text(found[verdict])
+    assert "likelihood" not in text(found[verdict])
+
+
+def test_report_of_an_explanation(found):
+    words = text(found["explained"])
+    for part in (
+        "Explained. CoulombFriction explains",
+        "CoulombFriction: a force of constant size against the motion, as of dry surfaces",
+        "fc = 0.3987 ± 0.0061 m/s^2 (8.49 mN at m = 0.0213 kg)",
+        "evidence 812, beyond doubt; ONE OF 2 that explain the record",
+        "this record does not tell it from StribeckFriction (fs = 0.41 m/s^2, vs = 0.3 m/s)",
+        "what would tell: slow motion with reversals",
+        "a reference for it is ready: .reference, 200 samples",
+        "velocity where the motion turns 3.02 1.04",
+        "position between 0.0118 and 0.012 m 3.02 1.04",
+        "K 3.1e-06 3.31e-06 (3.3391 ± 0.0021)e-06",
+        "On samples kept back the effects close",
+        "random force: white 30 mm/s^2, 12 % of the noise floor's variance",
+        "what remains: noise, by 2 tests, the most doubtful of which is heavy tails, p = 0.22",
+        "chance reaches 2 or 3, 10 is strong",
+    ):
+        assert part in words
+    assert "time all the time alike" not in words
+
+
+def test_report_of_a_clean_bill(found):
+    words = text(found["nothing missing"])
+    assert "Nothing missing. Noise" in words
+    assert (
+        "where it sits: nowhere; noise looks like this along velocity, position and time" in words
+    )
+    assert "the smallest effects that this record would have shown" in words
+    assert "CoulombFriction.fc 21 mm/s^2" in words
+    assert "ActuatorLag.tau 0.11 ms" in words
+    assert "Homemade.size 3" in words
+    assert "StribeckFriction.vs not visible" in words
+    assert "A LARGE RANDOM FORCE: white 30 mm/s^2 and coloured 0.4 m/s^2 with a time " in words
+    assert "81 % of the noise floor's variance" in words
+    assert "what is missing" not in words
+
+
+def test_bad_news_is_in_capitals(found):
+    assert "PARTLY EXPLAINED. " in text(found["partly explained"])
+    assert "what remains: NOT NOISE ALONE, by whiteness (p < 0.0001)" in text(found["unknown"])
+    assert "UNKNOWN. " in text(found["unknown"])
+    assert "with the effects" not in text(found["unknown"])
+    assert "velocity where the motion turns 3.02" in text(found["unknown"])
+    base = found["explained"]
+    worse = replace(base, gap=replace(base.gap, after=2 * base.gap.before))
+    assert "the effects do NOT MAKE THE GAP SMALLER" in text(worse)
+    lost = replace(base, gap=replace(base.gap, given=math.inf, before=math.inf))
+    assert "LEAVES THE PLANT'S DOMAIN" in text(lost)
+    assert "of the squared gap" not in text(lost)
+
+
+def test_report_of_rare_cases(found):
+    base = found["explained"]
+    finding = base.findings[0]
+    weak = replace(finding, evidence=8.0, alternatives=(), equivalents=("InputOffset",),
+                   experiment="", reference=None, note="in 2 of 3 records")  # fmt: skip
+    words = text(replace(base, findings=(weak, replace(weak, evidence=20.0)), where=()))
+    assert "1. CoulombFriction" in words
+    assert "2. CoulombFriction" in words
+    assert "evidence 8, WEAK; closes 99.5 % of the squared gap above the floor" in words
+    assert "evidence 20, strong" in words
+    assert (
+        "no record of u and y tells it from InputOffset: on this plant they are the same" in words
+    )
+    assert "in 2 of 3 records" in words
+    assert "where it sits: not known" in words
+    bare = replace(base, calibrated=(), tests={}, disturbance=Disturbance(0.0, 0.0, math.nan, 0.0),
+                   gap=replace(base.gap, unit="", floor=0.0))  # fmt: skip
+    words = text(bare)
+    assert "the model has no free parameters" in words
+    assert "what remains: not tested" in words
+    assert "random force: none; the noise floor is sensor noise" in words
+
+
+def test_repr_and_notebook(found):
+    assert repr(found["explained"]).startswith("Diagnosis(explained: CoulombFriction; gap 7.")
+    assert repr(found["unknown"]).startswith("Diagnosis(unknown; gap ")
+    page = found["explained"]._repr_html_()
+    assert page.startswith("<pre>Diagnosis of maglev")
+    assert found["explained"].effects == (E.CoulombFriction(fc=0.3987),)
+
+
+def same(one, other):
+    """Compare values field by field, arrays by their numbers."""
+    if isinstance(one, np.ndarray):
+        return isinstance(other, np.ndarray) and np.array_equal(one, other, equal_nan=True)
+    if isinstance(one, float) and math.isnan(one):
+        return math.isnan(other)
+    if isinstance(one, tuple):
+        return len(one) == len(other) and all(map(same, one, other))
+    if isinstance(one, dict):
+        return one.keys() == other.keys() and all(same(one[k], other[k]) for k in one)
+    if dataclasses.is_dataclass(one) and not isinstance(one, cid.Loop):
+        fields = dataclasses.fields(one)
+        return type(one) is type(other) and all(
+            same(getattr(one, f.name), getattr(other, f.name)) for f in fields
+            if f.name not in ("loop", "extra")
+        )  # fmt: skip
+    return one == other or isinstance(one, cid.Loop)
+
+
+@pytest.mark.parametrize("verdict", VERDICTS)
+def test_round_trip(found, experiment, verdict, tmp_path):
+    given = found[verdict]
+    before = given.gap.simulated_before.copy()
+    before[:3] = np.nan, np.inf, -np.inf
+    given = replace(given, gap=replace(given.gap, simulated_before=before, given=math.inf))
+    path = given.save(tmp_path / "found.json")
+    json.loads(path.read_text("utf-8"), parse_constant=pytest.fail)  # no NaN, no Infinity
+    back = load_diagnosis(path)
+    assert same(given, back)
+    assert same(back, given)
+    assert str(back) == str(given)
+    assert back.extra == {"horizon": 25, "table": [[1.0, 0.0], [0.0, 1.0]]}
+    assert back.save(tmp_path / "again.json").read_bytes() == path.read_bytes()
+    whole = load_diagnosis(path, loop=experiment[0].with_parameters({"K": 1e-6}))
+    assert whole.loop.parameters == given.loop.parameters
+    assert whole.loop.effects == given.loop.effects
+    assert (whole.loop.free, whole.loop.at) == (given.loop.free, given.loop.at)
+    r = experiment[1].r[:200]
+    np.testing.assert_array_equal(cid.simulate(whole.loop, r).y, cid.simulate(given.loop, r).y)
+    assert whole.save(tmp_path / "whole.json").read_text() == path.read_text()
+
+
+def test_a_person_can_read_the_file(found, tmp_path):
+    rows = found["explained"].save(tmp_path / "f.json").read_text("utf-8").splitlines()
+    assert rows[2] == '  "verdict": "explained",'
+    assert '        "name": "CoulombFriction",' in rows
+    assert max(map(len, rows)) < 250
+    data = json.loads("\n".join(rows))
+    assert data["findings"][0]["effect"] == {
+        "name": "CoulombFriction",
+        "parameters": {"fc": 0.3987},
+    }
+    assert data["loop"]["plant"] == "maglev"
+
+
+def test_a_loop_without_its_plant_says_what_to_do(found, tmp_path):
+    back = load_diagnosis(found["explained"].save(tmp_path / "f.json"))
+    assert isinstance(back.loop, SavedLoop)
+    assert back.loop.parameters["CoulombFriction.fc"] == 0.3987
+    with pytest.raises(cid.CtrlidError, match=r"load_diagnosis\(file, loop=loop\)"):
+        back.loop.linearize()
+
+
+def test_a_loop_that_does_not_fit_is_refused(found, tmp_path):
+    path = found["explained"].save(tmp_path / "f.json")
+    servo = cid.Loop(cid.plants.servo(m=1.0, c=2.0, k=3.0), dt=DT)
+    with pytest.raises(cid.CtrlidError, match=r"of the plant 'maglev'; the loop given has 'servo'"):
+        load_diagnosis(path, loop=servo)
+    with pytest.raises(cid.CtrlidError, match=r"loop= needs the Loop .* given int"):
+        load_diagnosis(path, loop=3)
+
+
+def test_own_effects_are_found_by_name(found, tmp_path):
+    @dataclasses.dataclass(frozen=True)
+    class Homemade(E.ForceEffect):
+        size: float = E.parameter("{y}/s^2", neutral=0.0)
+
+        def force(self, m):
+            return self.size
+
+    base = found["explained"]
+    mine = replace(base, findings=(replace(base.findings[0], effect=Homemade(size=2.0)),))
+    path = mine.save(tmp_path / "f.json")
+    assert load_diagnosis(path).findings[0].effect == Homemade(size=2.0)
+    stranger = path.read_text("utf-8").replace('"Homemade"', '"Unheard"')
+    path.write_text(stranger, "utf-8")
+    with pytest.raises(cid.CtrlidError, match=r"'Unheard', but no effect .*; import it first"):
+        load_diagnosis(path)
+
+
+def test_what_is_no_saved_diagnosis_is_refused(found, tmp_path):
+    path = tmp_path / "f.json"
+    with pytest.raises(cid.CtrlidError, match=r"cannot read .*No such file"):
+        load_diagnosis(path)
+    with pytest.raises(cid.CtrlidError, match="cannot be written to"):
+        found["explained"].save(tmp_path / "nowhere" / "f.json")
+    for content, words in (("{", "is not a saved diagnosis: "), ("[]", "has the format 'list'"),
+                           ('{"format": "x"}', "has the format 'x'"),
+                           ('{"format": "ctrlid diagnosis 1"}', "damaged: 'loop'")):  # fmt: skip
+        path.write_text(content)
+        with pytest.raises(cid.CtrlidError, match=words):
+            load_diagnosis(path)
+
+
+def test_what_is_no_text_is_left_out_and_said(found, tmp_path):
+    odd = replace(found["explained"], extra={"machine": object(), "n": 3})
+    path = odd.save(tmp_path / "f.json")
+    assert json.loads(path.read_text("utf-8"))["left out of extra"] == ["machine"]
+    assert load_diagnosis(path).extra == {"n": 3}
