@@ -21,6 +21,7 @@ from .controller_redesign import Performance, Redesign, redesign
 from .controllers import PID
 from .data import Record
 from .errors import CtrlidError, CtrlidWarning
+from .feedback import FeedbackCheck, check_feedback
 from .iv import fit_iv
 from .lead import design_lead
 from .linearization import OperatingPoint, linearize, operating_point
@@ -50,6 +51,7 @@ __all__ = [
     "Curve",
     "Equal",
     "Estimate",
+    "FeedbackCheck",
     "Fixed",
     "IdentifiedModel",
     "Integrator",
@@ -71,6 +73,7 @@ __all__ = [
     "SymmetricPoles",
     "__version__",
     "audit",
+    "check_feedback",
     "compare",
     "datasets",
     "design_lead",

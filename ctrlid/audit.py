@@ -17,7 +17,8 @@ FEW = 50  # valid samples below which no fit says much
 STRETCH = 20  # in succession
 COARSE = 0.3  # quantisation step over spread that a fit of y would notice
 FEW_CHANGES = 4
-SURE = 5e-4  # chance of a drift that is still chance
+SURE = 2e-4  # chance of a drift that is still chance
+OWN = 0.01  # of u's variance that does not come from y: above, something is added to u
 LINE = 1e-5  # of the largest spectral line, above which there is another one
 
 
@@ -331,10 +332,16 @@ class _Look:
         if changes == 0:
             if injected or key == "u":  # a constant u is said already
                 return []
-            text = ("r does not change while the record counts: unless something else excites the "
-                    "loop, there is noise only. Vary the reference (random_binary) or add a "
-                    "signal to u.")  # fmt: skip
-            return [AuditFinding(kind, key, text, size, self.whole, harmful=True)]
+            text = "r does not change while the record counts, and "
+            share = defects.beyond_law(self.record.u, self.record.y, self.valid)
+            if share > OWN:
+                text += (f"{100 * share:.2g} % of u is no linear function of y: a signal added to "
+                         "u, or noise of the input, is all that excites the loop.")  # fmt: skip
+            else:
+                text += ("u follows from y: there is noise only, of which no fit can learn the "
+                         "plant. Vary the reference (random_binary) or add a signal to "
+                         "u.")  # fmt: skip
+            return [AuditFinding(kind, key, text, size, self.whole, share <= OWN)]
         if changes < FEW_CHANGES:
             text = (f"{key} changes {('once', 'twice', 'three times')[changes - 1]} only: little "
                     "to average over. Use many steps, as random_binary gives.")  # fmt: skip

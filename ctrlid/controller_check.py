@@ -13,7 +13,7 @@ from .residuals import explained_share
 
 MOST = 20_000  # samples that are replayed
 TRIAL = 4000  # samples replayed for each shift that is tried
-LATEST = 3  # samples
+STEPS = (1, -1, 2, -2, 3, -3)  # samples by which a channel may be late
 EXACT = 1e-6  # share of u's variance that rounding and printing leave
 CLEARLY = 0.1  # of the unexplained share: a shift that leaves less is believed
 FOLLOWS = 0.2  # of what is left: above, it comes from r and y, so the law is another one
@@ -92,21 +92,24 @@ def _shift(loop: Loop, record: Record, left: float) -> tuple[str, Record, float]
     """Try u and y earlier and later; return the shift that explains far more, in words."""
     trial = record[:TRIAL]
     _, base = _left(loop, trial)
-    tried = []
-    for k in range(1, LATEST + 1):
-        for u, y in ((k, 0), (-k, 0), (0, k), (0, -k), (k, k), (-k, -k)):
-            tried.append((_left(loop, _moved(trial, u, y))[1], u, y))
-    best, u, y = min(tried)
+    shifts = [(k, 0) for k in STEPS] + [(0, k) for k in STEPS] + [(k, k) for k in STEPS]
+    tried = [(_left(loop, _moved(trial, u, y))[1], u, y) for u, y in shifts]
+    best = min(left_over for left_over, _, _ in tried)
     if best > CLEARLY * min(base, left):
         return None
-    k, late = abs(u or y), "late" if (u or y) > 0 else "early"
-    what = {(True, False): "u is", (False, True): "y is", (True, True): "u and y are"}[
-        u != 0, y != 0
-    ]
-    words = f"{what} logged {_count(k)} {late}"
-    if u and y:
-        words += f" (or r {_count(k)} {'early' if late == 'late' else 'late'})"
+    # Around a constant reference a late u and an early y are the same; u is the likelier one.
+    alike = [(u, y) for left_over, u, y in tried if left_over <= 2 * best + EXACT]
+    u, y = alike[0]
+    words = " or ".join(_late(*shift) for shift in alike)
     return words, _moved(record, u, y), best
+
+
+def _late(u: int, y: int) -> str:
+    """Say which channel is late."""
+    k, late = abs(u or y), "late" if (u or y) > 0 else "early"
+    if u and y:
+        return f"r is logged {_count(k)} {'early' if late == 'late' else 'late'}"
+    return f"{'u' if u else 'y'} is logged {_count(k)} {late}"
 
 
 def _count(k: int) -> str:
@@ -120,11 +123,18 @@ def _remainder(e: Any, left: float, record: Record) -> Fact:
     rms = f"{float(np.sqrt(np.mean(e[record.valid] ** 2))):.3g}" + (
         f" {unit}" if unit not in ("", "1") else ""
     )
+    for name, channel in record.extra.items():
+        like = float(np.corrcoef(channel[record.valid], e[record.valid])[0, 1] ** 2) if (
+            np.ptp(channel[record.valid]) and np.ptp(e[record.valid])) else 0.0  # fmt: skip
+        if like > 0.9:
+            return ("injected", f"besides the controller's part, u contains an injected signal of "
+                    f"RMS {rms} that runs like the channel {name!r}.", left, False)  # fmt: skip
     follows = explained_share(e, [(record.y, 0), (record.r, 0)], record.valid, lags=10)
     if follows > FOLLOWS:
         return ("other", f"the stated controller leaves {100 * left:.3g} % of u unexplained (RMS "
                 f"{rms}), and {100 * follows:.2g} % of that follows r and y: gains or structure "
-                "are others. Correct the controller, or give None.", left, True)  # fmt: skip
+                "are others, or a slow signal is added to u. Correct the controller, or give "
+                "None.", left, True)  # fmt: skip
     return ("injected", f"besides the controller's part, u contains an injected signal of RMS "
             f"{rms}, which r and y do not explain: excitation, dither or rounding.", left,
             False)  # fmt: skip

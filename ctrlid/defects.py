@@ -318,6 +318,37 @@ def drift(y: FloatArray, causes: Sequence[FloatArray]) -> tuple[float, float, fl
     return change, scatter, float(stats.f.sf(f, 3, free))
 
 
+def beyond_law(u: FloatArray, y: FloatArray, valid: Any) -> float:
+    """Return the share of u's variance that no linear law of y and past u gives, at most ten back.
+
+    Parameters
+    ----------
+    u, y : ndarray, shape (n,)
+        Input and output.
+    valid : ndarray of bool, shape (n,)
+        Samples that count.
+
+    Returns
+    -------
+    float
+        0 where a linear controller of a constant reference computes u; 1 with too few samples.
+    """
+    order = 10
+    bad = np.concatenate([[0], np.cumsum(~valid)])
+    rows = np.arange(order, len(u))
+    rows = rows[bad[rows + 1] == bad[rows - order]][:ENOUGH]
+    if len(rows) < 4 * order:
+        return 1.0
+    law = np.column_stack([
+        np.ones(len(rows)), *(y[rows - k] - y[0] for k in range(order + 1)),
+        *(u[rows - k] - u[0] for k in range(1, order + 1)),
+    ])  # fmt: skip
+    law /= np.maximum(np.linalg.norm(law, axis=0), 1e-300)
+    target = u[rows] - np.mean(u[rows])
+    left = target - law @ np.linalg.lstsq(law, target, rcond=1e-12)[0]
+    return float(left @ left / max(target @ target, 1e-300))
+
+
 def period(r: FloatArray) -> int:
     r"""Return after how many samples a signal repeats itself, at least once, or 0.
 

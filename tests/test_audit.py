@@ -139,7 +139,7 @@ DEFECTS = [
     (clip_u, "saturation", "u", 0.02),
     (lose_samples, "dropped samples", "y", 0.02),
     (add_spikes, "outliers", "y", 0.02),
-    (add_drift, "drift", "y", 0.08),  # a few hundred samples of a slow loop are few time constants
+    (add_drift, "drift", "y", 0.12),  # a few hundred samples of a slow loop are few time constants
 ]
 
 
@@ -204,6 +204,27 @@ def test_injected_signal_is_named_with_its_size(servo):
     said = cid.audit(record, loop)["controller"][0]
     assert not said.harmful
     assert "injected signal of RMS 0.2" in said.text
+
+
+def test_injected_channel_is_recognised(servo):
+    loop, r = servo
+    d = np.where(np.arange(len(r)) % 300 < 60, 1.5, 0.0)  # slow: y follows it within a pulse
+    record = replace(cid.simulate(loop, r, d=d, sensor_noise=1e-4, seed=1), extra={"pulses": d})
+    said = cid.audit(record, loop)["controller"][0]
+    assert not said.harmful
+    assert "'pulses'" in said.text
+
+
+def test_around_a_constant_reference_late_u_is_early_y(servo):
+    loop, r = servo
+    d = 0.2 * np.random.default_rng(6).standard_normal(len(r))
+    still = cid.simulate(loop, 0 * r, d=d, sensor_noise=1e-3, seed=1)
+    assert cid.audit(still).harmful == ()  # the dither excites
+    noise = cid.simulate(loop, 0 * r, sensor_noise=1e-3, seed=1)
+    assert "u follows from y" in cid.audit(noise)["too little excitation"][0].text
+    late = replace(noise[1:], u=noise.u[:-1])
+    text = cid.audit(late, loop)["controller"][0].text
+    assert text.startswith("u is logged one sample late or y is logged one sample early")
 
 
 def test_another_controller_is_said(servo):
