@@ -12,10 +12,10 @@ import numpy as np
 
 from .controllers import ControlLaw, control_law
 from .effects import AbstractEffect
-from .effects.base import substituted
-from .effects.composition import FAR, compose, labels, ordinary, with_spread
+from .effects.composition import compose, labels
+from .effects.ordinary import as_system, linear_model
 from .errors import CtrlidError
-from .linearization import OperatingPoint, linearize, operating_point
+from .linearization import OperatingPoint, linearize
 from .physics import Equations, require_siso, trace, with_parameters
 
 
@@ -326,24 +326,7 @@ class Loop:
         """
         if not self.linear_plant and self._active is self._traced:
             return self.plant
-        e = ordinary(self._active, self._bare_point)
-
-        def values(params: Mapping[str, Any]) -> list[float]:
-            return [float(params[name]) for name in e.parameters]
-
-        def update(t: float, x: Any, u: Any, params: Mapping[str, Any]) -> Any:
-            return e.evaluate(x, u, t, values(params))[0]
-
-        def output(t: float, x: Any, u: Any, params: Mapping[str, Any]) -> Any:
-            return e.evaluate(x, u, t, values(params))[1]
-
-        names = [name.replace(".", "_") for name in e.states]
-        system = ct.nlsys(update, output, inputs=list(e.inputs), outputs=list(e.outputs),
-                          states=names, dt=e.dt, name=e.name, params=dict(e.parameters),
-                          )  # fmt: skip
-        system.equations = e  # the way back for whoever traces the system again
-        system.units = getattr(self.plant, "units", {})
-        return system
+        return as_system(self._active, self._bare_point, getattr(self.plant, "units", {}))
 
     def linearize(self) -> Any:
         """Return the plant with its effects, linearized at the operating point.
@@ -368,13 +351,7 @@ class Loop:
             if isinstance(self.plant, ct.TransferFunction):
                 return self.plant
             return linearize(self.plant, self.point)
-        at = self._bare_point
-        changed = compose(self._absolute(), active, at, self.dt)
-        changed = substituted(changed, changed.t, casadi.SX(0.0))
-        resting = ordinary(changed, at)
-        guess = OperatingPoint((*at.states, *resting.rest), at.input, at.output)
-        point = operating_point(resting, output=at.output, guess=guess)
-        return linearize(ordinary(with_spread(changed, FAR), at), point)
+        return linear_model(self._absolute(), active, self._bare_point, self.dt)
 
     def __repr__(self) -> str:
         e = self._traced

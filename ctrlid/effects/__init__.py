@@ -1,7 +1,8 @@
 """The catalogue of effects: what real plants have and models leave out."""
 
-from .base import AbstractEffect, Parameter, parameter
+from .base import AbstractEffect
 from .catalogue import CATALOGUE
+from .change import ParameterDrift, ParameterStep
 from .equivalence import equivalents
 from .force import (
     ConstantForce,
@@ -21,16 +22,13 @@ from .friction import (
     ViscousFriction,
 )
 from .input import (
-    ActuatorLag,
-    InputBacklash,
     InputDeadZone,
-    InputDelay,
     InputNonlinearity,
     InputOffset,
     InputSaturatingGain,
     InputSaturation,
 )
-from .law import ForceExponent, ParameterDrift, ParameterStep, PositionOffset, StateLimit
+from .law import ForceExponent, PositionOffset
 from .moment import Moment
 from .output import (
     Quantization,
@@ -39,7 +37,10 @@ from .output import (
     SensorOffset,
     SensorSaturation,
 )
+from .overflow import StateLimit
+from .parameters import Parameter, parameter
 from .places import ForceEffect, InputEffect, LawEffect, OutputEffect, ReadingEffect
+from .timing import ActuatorLag, InputBacklash, InputDelay
 
 __all__ = [
     "CATALOGUE",

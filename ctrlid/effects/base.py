@@ -2,7 +2,6 @@
 
 import copy
 import dataclasses
-import inspect
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,59 +12,13 @@ import numpy as np
 
 from ..errors import CtrlidError
 from ..linearization import OperatingPoint
-from ..physics import Equations, Lag
-from ..tracing import Symbol, rebind
-from .moment import Follow, Moment, motion
+from ..physics import Equations
+from ..tracing import Symbol
+from .moment import Moment, motion
+from .parameters import Parameter, filled
+from .symbolic import spread_of, traced, with_states
 
 Place = Literal["input", "force", "law", "output"]
-
-
-@dataclass(frozen=True)
-class Parameter:
-    """What is known about one parameter of an effect.
-
-    `unit` is a template in which ``{u}``, ``{y}`` and ``{x}`` stand for the units of the input, the
-    output and the state that the effect names. `neutral` is the value at which the effect vanishes,
-    None for a parameter that does not decide this, such as the frequency of a vibration.
-    """
-
-    name: str
-    unit: str
-    lower: float
-    upper: float
-    neutral: float | None
-
-
-def parameter(
-    unit: str,
-    *,
-    lower: float = -math.inf,
-    upper: float = math.inf,
-    neutral: float | None = None,
-    default: Any = dataclasses.MISSING,
-) -> Any:
-    """Declare a numeric field of an effect.
-
-    Parameters
-    ----------
-    unit : str
-        Unit, with ``{u}`` and ``{y}`` for the units of input and output; "" for a plain number.
-    lower, upper : float, optional
-        Physical bounds, included.
-    neutral : float, optional
-        The value at which the effect vanishes; none if this parameter does not decide it.
-    default : float, optional
-        Value of the field if it is not given.
-
-    Returns
-    -------
-    dataclasses.Field
-        The field.
-    """
-    about = {"unit": unit, "lower": lower, "upper": upper, "neutral": neutral}
-    if default is dataclasses.MISSING:
-        return dataclasses.field(metadata={"parameter": about})
-    return dataclasses.field(default=default, metadata={"parameter": about})
 
 
 @dataclass(frozen=True)
@@ -100,7 +53,7 @@ class AbstractEffect:
                 raise CtrlidError(f"{kind} needs a finite {p.name}; given {value!r}")
             if not p.lower <= value <= p.upper:
                 raise CtrlidError(f"{kind} needs {p.name} between {p.lower:g} and {p.upper:g} "
-                                  f"[{_fill(p.unit)}]; given {value:g}")  # fmt: skip
+                                  f"[{filled(p.unit)}]; given {value:g}")  # fmt: skip
             object.__setattr__(self, p.name, value)
         self.check()
 
@@ -134,7 +87,7 @@ class AbstractEffect:
             e = loop.equations()
             names = {"u": e.inputs[0], "y": e.outputs[0], "x": getattr(self, "name", "")}
             signals = {key: known[name] for key, name in names.items() if name in known}
-        return {p.name: _fill(p.unit, signals) for p in self.parameters()}
+        return {p.name: filled(p.unit, signals) for p in self.parameters()}
 
     def text(self, loop: Any = None) -> str:
         """Return the effect in words, with the units of a loop's plant if one is given."""
@@ -234,7 +187,7 @@ class AbstractEffect:
             equations,
             p=casadi.vertcat(equations.p, *symbols),
             parameters={**equations.parameters, **values},
-            spread=_spread(equations),
+            spread=spread_of(equations),
         )
         m = Moment(e, at, dt, {name: Symbol(s) for name, s in own.items()})
         rates = tuple(traced(symbolic.rates)(m))
@@ -242,59 +195,7 @@ class AbstractEffect:
             raise CtrlidError(f"{type(self).__name__}.rates returned {len(rates)} rates for the "
                               f"states {self.states}")  # fmt: skip
         changed = type(self).build(symbolic, e, m)
-        return _with_states(changed, label, own, rates, self.rest(at))
-
-
-def traced(hook: Any) -> Any:
-    """Return a hook that computes with symbols where it says numpy or math."""
-    return rebind(hook) if inspect.ismethod(hook) else hook
-
-
-def expression(value: Any) -> Any:
-    """Return what a hook returned as a CasADi expression."""
-    if isinstance(value, np.ndarray) and value.size == 1:
-        value = value.reshape(-1)[0]
-    return value.sx if isinstance(value, Symbol) else casadi.SX(float(value))
-
-
-def substituted(e: Equations, old: Any, new: Any) -> Equations:
-    """Return the equations with an expression in place of a symbol, wherever the plant has it."""
-    rhs, output = (casadi.substitute(f, old, new) for f in (e.rhs, e.output))
-    lags = tuple(
-        Lag(lag.state, lag.time_constant, casadi.substitute(lag.target, old, new))
-        for lag in e.lags
-    )  # fmt: skip
-    return dataclasses.replace(e, rhs=rhs, output=output, lags=lags)
-
-
-def _spread(e: Equations) -> Any:
-    return casadi.SX.sym("s", len(e.states)) if e.spread is None else e.spread
-
-
-def _with_states(
-    e: Equations, label: str, own: Mapping[str, Any], rates: Sequence[Any], rest: Sequence[float]
-) -> Equations:
-    """Append an effect's own states to the equations."""
-    if not own:
-        return e
-    n, lags, columns = len(e.states), list(e.lags), []
-    for k, rate in enumerate(rates):
-        if isinstance(rate, Follow):
-            tau, target = expression(rate.time_constant), expression(rate.target)
-            tau = casadi.fmax(tau, rate.shortest)
-            lags.append(Lag(n + k, tau, target))
-            columns.append((target - list(own.values())[k]) / tau)
-        else:
-            columns.append(expression(rate))
-    return dataclasses.replace(
-        e,
-        states=(*e.states, *(f"{label}.{name}" for name in own)),
-        x=casadi.vertcat(e.x, *own.values()),
-        rhs=casadi.vertcat(e.rhs, *columns),
-        spread=casadi.vertcat(e.spread, *(casadi.SX.sym("s") for _ in own)),
-        lags=tuple(lags),
-        rest=(*e.rest, *(float(v) for v in rest)),
-    )
+        return with_states(changed, label, own, rates, self.rest(at))
 
 
 def _takes(loop: Any, effect: AbstractEffect) -> bool:
@@ -303,11 +204,6 @@ def _takes(loop: Any, effect: AbstractEffect) -> bool:
     except CtrlidError:
         return False
     return True
-
-
-def _fill(unit: str, signals: Mapping[str, str] | None = None) -> str:
-    known = {"u": "[u]", "y": "[y]", "x": "[state]", **(signals or {})}
-    return unit.format(**known)
 
 
 def require_motion(effect: AbstractEffect, e: Equations) -> tuple[int, int]:

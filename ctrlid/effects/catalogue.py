@@ -1,6 +1,7 @@
 """Every effect that a diagnosis tries, as an explicit tuple of classes."""
 
 from .base import AbstractEffect
+from .change import ParameterDrift, ParameterStep
 from .force import (
     ConstantForce,
     CubicStiffness,
@@ -19,22 +20,13 @@ from .friction import (
     ViscousFriction,
 )
 from .input import (
-    ActuatorLag,
-    InputBacklash,
     InputDeadZone,
-    InputDelay,
     InputNonlinearity,
     InputOffset,
     InputSaturatingGain,
     InputSaturation,
 )
-from .law import (
-    ForceExponent,
-    ParameterDrift,
-    ParameterStep,
-    PositionOffset,
-    StateLimit,
-)
+from .law import ForceExponent, PositionOffset
 from .output import (
     Quantization,
     SensorLag,
@@ -42,6 +34,8 @@ from .output import (
     SensorOffset,
     SensorSaturation,
 )
+from .overflow import StateLimit
+from .timing import ActuatorLag, InputBacklash, InputDelay
 
 CATALOGUE: tuple[type[AbstractEffect], ...] = (
     ActuatorLag,

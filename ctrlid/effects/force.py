@@ -6,8 +6,8 @@ from typing import Any, ClassVar, Self, final
 
 import numpy as np
 
-from .base import parameter
 from .moment import Moment
+from .parameters import parameter
 from .places import ForceEffect
 
 

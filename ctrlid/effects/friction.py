@@ -8,8 +8,8 @@ from typing import Any, ClassVar, Self, final
 
 import numpy as np
 
-from .base import parameter
 from .moment import Moment
+from .parameters import parameter
 from .places import ForceEffect
 
 # Within one sample friction changes the velocity by fc*dt: samples cannot show how it sticks.

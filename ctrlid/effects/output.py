@@ -8,9 +8,9 @@ import numpy as np
 
 from ..errors import CtrlidError
 from ..linearization import OperatingPoint
-from .base import parameter
 from .input import extremes
 from .moment import Moment
+from .parameters import parameter
 from .places import OutputEffect, ReadingEffect
 
 

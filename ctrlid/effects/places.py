@@ -8,8 +8,9 @@ import casadi
 from ..errors import CtrlidError
 from ..physics import Equations
 from ..tracing import Symbol
-from .base import AbstractEffect, Place, expression, require_motion, substituted, traced
+from .base import AbstractEffect, Place, require_motion
 from .moment import Moment
+from .symbolic import expression, substituted, traced
 
 
 class LawEffect(AbstractEffect):

@@ -1,0 +1,61 @@
+"""What is known about a parameter of an effect: unit, bounds, and the value that does nothing."""
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """What is known about one parameter of an effect.
+
+    `unit` is a template in which ``{u}``, ``{y}`` and ``{x}`` stand for the units of the input, the
+    output and the state that the effect names. `neutral` is the value at which the effect vanishes,
+    None for a parameter that does not decide this, such as the frequency of a vibration.
+    """
+
+    name: str
+    unit: str
+    lower: float
+    upper: float
+    neutral: float | None
+
+
+def parameter(
+    unit: str,
+    *,
+    lower: float = -math.inf,
+    upper: float = math.inf,
+    neutral: float | None = None,
+    default: Any = dataclasses.MISSING,
+) -> Any:
+    """Declare a numeric field of an effect.
+
+    Parameters
+    ----------
+    unit : str
+        Unit, with ``{u}`` and ``{y}`` for the units of input and output; "" for a plain number.
+    lower, upper : float, optional
+        Physical bounds, included.
+    neutral : float, optional
+        The value at which the effect vanishes; none if this parameter does not decide it.
+    default : float, optional
+        Value of the field if it is not given.
+
+    Returns
+    -------
+    dataclasses.Field
+        The field.
+    """
+    about = {"unit": unit, "lower": lower, "upper": upper, "neutral": neutral}
+    if default is dataclasses.MISSING:
+        return dataclasses.field(metadata={"parameter": about})
+    return dataclasses.field(default=default, metadata={"parameter": about})
+
+
+def filled(unit: str, signals: Mapping[str, str] | None = None) -> str:
+    """Return a unit with the units of signals in it, or with [u] and [y] where they are unknown."""
+    known = {"u": "[u]", "y": "[y]", "x": "[state]", **(signals or {})}
+    return unit.format(**known)
