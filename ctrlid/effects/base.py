@@ -95,6 +95,8 @@ class AbstractEffect:
         parts = []
         for f in dataclasses.fields(self):
             value = getattr(self, f.name)
+            if value == "":
+                continue
             shown = f"{value:.4g} {units[f.name]}" if f.name in units else str(value)
             parts.append(f"{f.name} = {shown.strip()}")
         return f"{type(self).__name__}: {', '.join(parts)}"
