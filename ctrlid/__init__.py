@@ -33,6 +33,7 @@ from .predictor import Prediction, predict
 from .replay import replay_controller
 from .report import Section, write_report
 from .residuals import Correlation
+from .sampling import SamplingRow, SamplingSweep, sweep_sampling_period
 from .signals import multisine, prbs, random_binary, steps
 from .simulation import simulate
 from .validation import compare
@@ -68,6 +69,8 @@ __all__ = [
     "ReciprocalPoles",
     "Record",
     "Redesign",
+    "SamplingRow",
+    "SamplingSweep",
     "Section",
     "StaticGain",
     "SymmetricPoles",
@@ -97,5 +100,6 @@ __all__ = [
     "robust_margin",
     "simulate",
     "steps",
+    "sweep_sampling_period",
     "write_report",
 ]

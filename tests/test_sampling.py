@@ -1,0 +1,184 @@
+"""sweep_sampling_period(): the drift of the poles, who is spared it, and honest rows."""
+
+from dataclasses import replace
+
+import control as ct
+import numpy as np
+import pytest
+
+import ctrlid as cid
+from ctrlid.sampling import averaged
+
+POLE = 40.435  # rad/s
+
+
+def levitated(pole_times_period, n, noise=2e-6, digital=True, seed=1):
+    """A maglev loop sampled so fast; the reference switches every 0.6 / pole."""
+    plant = cid.plants.maglev(m=0.0213, K=3.34e-6)
+    at = cid.operating_point(plant, output=0.012)
+    P = cid.linearize(plant, at)
+    dt = pole_times_period / POLE
+    C = cid.design_lead(P, crossover=100, phase_margin=50)
+    C = ct.sample_system(ct.ss(C), dt, "tustin") if digital else C
+    hold = max(1, round(0.6 / pole_times_period))
+    r = cid.random_binary(n, amplitude=1e-4, hold=hold, around=at.output, seed=seed)
+    return cid.simulate(cid.Loop(plant, C, dt=dt, at=at), r, sensor_noise=noise, seed=seed)
+
+
+@pytest.fixture(scope="module")
+def fast():
+    record = levitated(0.01, 20_000)
+    return cid.sweep_sampling_period(record, [q * record.dt for q in (1, 3, 10, 20)])
+
+
+def test_least_squares_drifts_to_the_origin_and_comes_back(fast):
+    """Section II.C of the paper: at p Ts = 0.01 no unstable pole is left, at 0.1 and 0.2 it is."""
+    unstable = [row.poles.real.max() for row in fast["fit_arx"]]
+    assert abs(unstable[0]) < 0.2 * POLE
+    assert unstable[2:] == pytest.approx([POLE, POLE], rel=0.1)
+    assert not fast["fit_arx"][0].independent
+
+
+def test_instruments_and_the_innovations_model_are_spared(fast):
+    for row in fast["fit_iv"]:
+        assert row.poles.real == pytest.approx([-POLE, POLE], rel=0.06)
+    for row in fast["fit_continuous"][:3]:
+        assert row.poles.real == pytest.approx([-POLE, POLE], rel=0.06)
+        assert row.independent
+
+
+def test_recommendation(fast):
+    assert fast.recommended in (fast.table[6].period, fast.table[9].period)
+    assert "fit_iv at every period" in fast.reason
+    assert "within the slower periods" in fast.warning
+    assert fast.poles.real == pytest.approx([-POLE, POLE], rel=0.05)
+    worst = {q: max(row.deviation for row in fast.table if row.factor == q) for q in (1, 3, 10, 20)}
+    assert fast.recommended == fast.record.dt * min(worst, key=worst.get)
+
+
+def test_table_is_ordered_and_readable(fast):
+    assert [row.factor for row in fast.table] == [1, 1, 1, 3, 3, 3, 10, 10, 10, 20, 20, 20]
+    assert [row.input_between for row in fast.table[:6]] == [
+        "as recorded", "as recorded", "as recorded", "filtered", "mean", "mean"]  # fmt: skip
+    text = str(fast)
+    assert len(text.splitlines()) == 2 + 12 + 2
+    assert "FOLLOW u OR r" in text
+    assert fast.table[9].pole_times_period.max() == pytest.approx(0.2, rel=0.1)
+
+
+@pytest.mark.parametrize("seed", [2, 3, 4])
+@pytest.mark.parametrize("digital", [True, False])
+def test_random_noise_and_analog_controllers(seed, digital):
+    rng = np.random.default_rng(seed)
+    record = levitated(0.01, 10_000, noise=10 ** rng.uniform(-6, -5), digital=digital, seed=seed)
+    sweep = cid.sweep_sampling_period(
+        record, [record.dt, 10 * record.dt], estimators=("fit_arx", "fit_iv")
+    )
+    first, later = sweep["fit_arx"]
+    assert first.poles.real.max() < 0.3 * POLE
+    assert later.poles.real.max() > first.poles.real.max()
+    iv = sweep["fit_iv"]
+    assert iv[1].poles.real == pytest.approx([-POLE, POLE], rel=0.15)
+    if not digital:
+        assert "held between samples" in iv[0].failure
+        assert "FAILED" in str(sweep)
+
+
+def test_noise_free_records_need_no_slowing_down():
+    record = levitated(0.05, 4000, noise=0.0)
+    sweep = cid.sweep_sampling_period(record, [record.dt, 4 * record.dt])
+    assert all(row.deviation < 0.2 for row in sweep.table)
+    assert sweep["fit_iv"][0].poles.real == pytest.approx([-POLE, POLE], rel=0.02)
+
+
+def test_constraints_by_estimator_and_the_wrong_ones():
+    record = levitated(0.05, 4000)
+    known = {"fit_arx": [cid.ReciprocalPoles()], "fit_iv": [cid.ReciprocalPoles()],
+             "fit_continuous": [cid.SymmetricPoles()]}  # fmt: skip
+    sweep = cid.sweep_sampling_period(record, [record.dt, 5 * record.dt], constraints=known)
+    for row in sweep.table:
+        assert not row.failure
+        assert np.sum(row.poles.real) == pytest.approx(0.0, abs=1e-6)
+    same = cid.sweep_sampling_period(record, [record.dt], constraints=cid.ReciprocalPoles())
+    assert "SymmetricPoles" in same["fit_continuous"][0].failure
+    assert not same["fit_iv"][0].failure
+
+
+def test_active_bounds_are_in_the_table():
+    record = levitated(0.01, 4000)
+    known = [cid.ReciprocalPoles(), cid.Bounds("a1", upper=-2.0)]
+    sweep = cid.sweep_sampling_period(
+        record, [record.dt], estimators=["fit_arx"], constraints=known
+    )
+    row = sweep.table[0]
+    assert bool(row.active) == ("ON ITS BOUND" in str(sweep))
+
+
+def test_mean_input_is_exact_for_an_integrator():
+    rng = np.random.default_rng(5)
+    u = rng.standard_normal(3000)
+    y = np.concatenate([[0.0], np.cumsum(u)[:-1]]) * 0.01
+    slow = averaged(cid.Record(u=u, y=y, dt=0.01), 7)
+    assert np.diff(slow.y) == pytest.approx(slow.u[:-1] * slow.dt, abs=1e-12)
+    sweep = cid.sweep_sampling_period(
+        cid.Record(u=u, y=y, dt=0.01), [0.01, 0.07], estimators=["fit_continuous"], poles=1
+    )
+    assert [row.poles[0].real for row in sweep.table] == pytest.approx([0, 0], abs=1e-6)
+
+
+def test_gaps_stay_gaps():
+    record = levitated(0.05, 3000)
+    valid = np.ones(record.n, bool)
+    valid[1001] = False
+    slow = averaged(replace(record, valid=valid), 5)
+    assert np.flatnonzero(~slow.valid).tolist() == [200]
+
+
+def test_default_periods_leave_samples_enough():
+    record = levitated(0.05, 2000)
+    sweep = cid.sweep_sampling_period(record, estimators=["fit_arx"])
+    assert [row.factor for row in sweep.table] == [1, 2, 3, 5, 7, 10]
+
+
+def test_too_long_a_period_is_a_row():
+    record = levitated(0.05, 1000)
+    sweep = cid.sweep_sampling_period(record, [record.dt, 400 * record.dt])
+    assert all(row.failure for row in sweep.table[3:])
+    assert sweep.recommended == record.dt
+
+
+def test_processes_give_the_same_table():
+    record = levitated(0.05, 1500)
+    one, two = (
+        cid.sweep_sampling_period(
+            record, [record.dt, 3 * record.dt], estimators=["fit_arx"], jobs=jobs
+        )
+        for jobs in (1, 2)
+    )
+    assert str(one) == str(two)
+
+
+@pytest.mark.parametrize(("options", "words"), [
+    ({"periods": [1e-5]}, "whole multiples"),
+    ({"periods": []}, "whole multiples"),
+    ({"estimators": ["fit_magic"]}, "estimators are of"),
+    ({"estimators": []}, "estimators are of"),
+    ({"jobs": 0}, "number of processes"),
+])  # fmt: skip
+def test_refusals(options, words):
+    record = cid.Record(u=np.ones(300), y=np.arange(300.0), dt=0.01)
+    with pytest.raises(cid.CtrlidError, match=words):
+        cid.sweep_sampling_period(record, **options)
+
+
+def test_nothing_to_fit_is_refused_with_the_reason():
+    record = cid.Record(u=np.ones(300), y=np.arange(300.0), dt=0.01)
+    with pytest.raises(cid.CtrlidError, match=r"no fit succeeded.*u is constant"):
+        cid.sweep_sampling_period(record, [0.01], estimators=["fit_arx"])
+    with pytest.raises(cid.CtrlidError, match="needs one Record"):
+        cid.sweep_sampling_period([record])
+
+
+def test_unknown_estimator_in_the_table(fast):
+    with pytest.raises(cid.CtrlidError, match="has no estimator"):
+        fast["fit_loop"]
