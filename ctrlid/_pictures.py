@@ -1,17 +1,22 @@
 """What the pictures show, apart from the drawing: units, windows, poles and frequency grids."""
 
+import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Literal
 
 import control as ct
 import numpy as np
 
 from . import _text
 from .comparison import Comparison
+from .diagnosis.result import Candidate, Diagnosis, Gap, Place
 from .errors import CtrlidError
 from .physics import Array, timebase
 
 WINDOW = 250  # samples of a comparison that can be told apart on a page
+BARS = 7  # candidates of a round that are drawn
+LEAST = -20.0  # evidence below which a bar says no more
 
 
 def scale(signals: Sequence[Array], unit: str) -> tuple[float, str]:
@@ -94,3 +99,90 @@ def frequencies(models: Mapping[str, Any]) -> Any:
     corners = corners or [min(limits, default=1.0)]
     top = max(limits) if limits else 10 * max(corners)
     return np.geomspace(min(0.1 * min(corners), 0.01 * top), top, 600)
+
+
+def largest_gap(gap: Gap) -> slice:
+    """Return the stretch of the samples kept back in which the model errs most."""
+    n = len(gap.time)
+    width = min(WINDOW, n)
+    if n == width:
+        return slice(0, n)
+    error = np.nan_to_num((gap.measured - gap.simulated_before) ** 2, posinf=0.0)
+    step = np.diff(gap.time)
+    # A window over a break in time shows none of its two sides.
+    broken = np.abs(step - np.median(step)) > 0.5 * np.median(step)
+    error[1:][broken] = -np.inf
+    with np.errstate(invalid="ignore"):
+        sums = np.convolve(np.where(np.isinf(error), -1e9 * (1 + error[error > 0].sum()), error),
+                           np.ones(width), "valid")  # fmt: skip
+    first = int(np.argmax(sums))
+    return slice(first, first + width)
+
+
+def two_places(found: Diagnosis) -> list[Place]:
+    """Return the two most telling places."""
+    return sorted(found.where, key=lambda place: place.p_before)[:2]
+
+
+Kind = Literal["found", "not told apart", "refitted", "not refitted"]
+
+
+@dataclass(frozen=True)
+class Bar:
+    """One candidate of a ranking.
+
+    Parameters
+    ----------
+    label : str
+        Its name.
+    evidence : float
+        Twice its gain of log-likelihood less the penalty, the difference in the Bayesian criterion.
+    kind : {"found", "not told apart", "refitted", "not refitted"}
+        What became of it; of one that was not refitted the evidence is what its first step
+        promises.
+    """
+
+    label: str
+    evidence: float
+    kind: Kind
+
+
+def ranking(found: Diagnosis) -> dict[int, list[Bar]]:
+    """Return the best candidates of each round as bars, the best first."""
+    value = {id(c): _evidence(c) for c in found.ranking}
+    kinds: dict[int, Kind] = {}
+    for finding in found.findings:
+        own = [c for c in found.ranking if type(c.effect).__name__ == finding.name]
+        if not own:
+            continue
+        best = max(own, key=lambda c: value[id(c)])
+        kinds[id(best)] = "found"
+        for c in found.ranking:
+            if c.round == best.round and type(c.effect).__name__ in (
+                *finding.names[1:], *finding.equivalents
+            ):  # fmt: skip
+                kinds.setdefault(id(c), "not told apart")
+    rounds: dict[int, list[Bar]] = {}
+    for number in sorted({c.round for c in found.ranking}):
+        tried = sorted((c for c in found.ranking if c.round == number),
+                       key=lambda c: (id(c) not in kinds, -value[id(c)]))  # fmt: skip
+        shown = sorted(tried[:BARS], key=lambda c: -value[id(c)])
+        rounds[number] = [
+            Bar(type(c.effect).__name__, value[id(c)],
+                kinds.get(id(c), "refitted" if math.isfinite(c.gain) else "not refitted"))
+            for c in shown
+        ]  # fmt: skip
+    return rounds
+
+
+def _evidence(c: Candidate) -> float:
+    gain = c.gain if math.isfinite(c.gain) else c.score
+    return max(2 * (gain - c.penalty), LEAST) if math.isfinite(gain) else LEAST
+
+
+def bin_labels(place: Place) -> tuple[list[str], str]:
+    """Return the edges of the bins of a place as labels, and their unit."""
+    known = place.edges[np.isfinite(place.edges)]
+    factor, unit = scale([known], place.unit) if known.size else (1.0, place.unit)
+    return ([_text.number(factor * e, 3) if np.isfinite(e) else "" for e in place.edges],
+            unit if place.unit else "1")  # fmt: skip

@@ -9,6 +9,8 @@ from . import _text
 from .comparison import Comparison
 from .controller_redesign import Redesign
 from .data import SIGNALS, Record
+from .diagnosis import words
+from .diagnosis.result import Diagnosis
 from .errors import CtrlidError
 from .model import Estimate, IdentifiedModel
 
@@ -71,11 +73,13 @@ def heading(result: Any) -> str:
             return f"{result.record.name or 'Record'} against {result.what.split('(')[0]}"
         case Redesign():
             return "Redesign: promised against achieved"
+        case Diagnosis():
+            return f"Diagnosis of {result.record or 'a record'}"
         case Table():
             return result.caption or "Table"
     raise CtrlidError(
-        "a report shows a Record, IdentifiedModel, Comparison, Redesign, Table or Section, or a "
-        f"sequence of them; given {type(result).__name__}"
+        "a report shows a Record, IdentifiedModel, Comparison, Redesign, Diagnosis, Table or "
+        f"Section, or a sequence of them; given {type(result).__name__}"
     )
 
 
@@ -92,6 +96,8 @@ def blocks(result: Any) -> list[Table | str]:
             return [*_comparison_tables(result), *result.notes, result.verdict]
         case Redesign():
             return [_redesign_table(result), result.verdict]
+        case Diagnosis():
+            return _diagnosis_blocks(result)
     heading(result)  # refuses what has no page
     return []
 
@@ -168,3 +174,54 @@ def _redesign_table(r: Redesign) -> Table:
         )
     )  # fmt: skip
     return Table(("", "promised on the model", "achieved on the physics"), rows)
+
+
+def _diagnosis_blocks(found: Diagnosis) -> list[Table | str]:
+    caption = f"{found.gap.kind.capitalize()} of {len(found.gap.time)} samples kept back."
+    gap = Table(("", "RMS error", "against the noise floor"), tuple(words.gap_rows(found.gap)),
+                caption)  # fmt: skip
+    made: list[Table | str] = [words.headline(found), gap, words.shrinking(found.gap)]
+    for k, finding in enumerate(found.findings, 1):
+        sure = words.certainty(finding, len(found.findings) == 1)
+        made += [f"{k}. {words.named(finding)}. {words.sized(found, finding)}.", f"{_upper(sure)}."]
+        made += [f"{_upper(doubt)}." for doubt in words.doubts(found, finding)]
+    if found.findings:
+        made.append(words.EVIDENCE)
+    made += [f"Along {p.axis}: {words.place_words(p)}." for p in words.telling(found)]
+    sides = 2 if found.findings else 1
+    places = tuple(
+        (p.axis, *(_text.number(words.worst(v), 3) for v in (p.before, p.after)[:sides]),
+         *(_text.chance(v) for v in (p.p_before, p.p_after)[:sides]))
+        for p in found.where
+    )  # fmt: skip
+    if places:
+        columns = ("along", *("before", "after")[:sides], *("by chance", "after")[:sides])
+        made.append(
+            Table(columns, places, "Mean square of the one-step errors at worst; 1 is noise.")
+        )
+    if found.verdict == "nothing missing" and found.sensitivity:
+        made.append(Table(("effect", "smallest size that would have been seen"),
+                          tuple(words.sensitivity_rows(found))))  # fmt: skip
+    parameters = tuple(
+        (c.name, f"{c.given:.6g}", f"{c.before:.6g}", f"{c.after:.6g}",
+         f"{c.standard_error:.2g}" if np.isfinite(c.standard_error) else "not in the data")
+        for c in found.calibrated
+    )  # fmt: skip
+    if parameters:
+        titles = ("parameter", "given", "recalibrated", "final", "standard error")
+        made.append(Table(titles, parameters, "The model's own parameters."))
+    made += [f"{_upper(line)}." for line in (words.disturbance(found), words.remains(found))]
+    made += [f"About the record: {remark.rstrip('.')}." for remark in found.audit]
+    made += [f"Note: {remark.rstrip('.')}." for remark in found.notes]
+    tried = tuple(
+        (type(c.effect).__name__, str(c.round), f"{c.score:.1f}", f"{c.gain:.1f}",
+         f"{c.penalty:.1f}", c.remark) for c in found.ranking if np.isfinite(c.gain)
+    )  # fmt: skip
+    if tried:
+        heads = ("candidate", "round", "first step", "evidence", "penalty", "")
+        made.append(Table(heads, tried, "The candidates that were refitted."))
+    return [block for block in made if block]
+
+
+def _upper(text: str) -> str:
+    return text[:1].upper() + text[1:]

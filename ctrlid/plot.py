@@ -1,22 +1,26 @@
 """Pictures: a result and Axes in, the Axes out. The only file that imports matplotlib.
 
-Without Axes a function makes its own figure, outside pyplot's list of open figures; save it with
-``axes.figure.savefig(...)`` or turn it into bytes with `png`. Nothing global is changed.
+Without Axes a function makes its own figure. A script or notebook that has imported pyplot gets it
+through pyplot, so that ``plt.show()`` shows it; otherwise it is outside pyplot's list of open
+figures. Save it with ``axes.figure.savefig(...)`` or turn it into bytes with `png`. Nothing else
+that is global is changed.
 """
 
 import io
+import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MultipleLocator
+from matplotlib.ticker import MultipleLocator, ScalarFormatter
 
 from . import _pictures, _text
 from .comparison import Comparison
 from .controller_redesign import Redesign
 from .data import Record
+from .diagnosis.result import Diagnosis, Place
 from .errors import CtrlidError
 from .physics import Array, timebase
 
@@ -415,6 +419,51 @@ def step(redesign: Redesign, ax: Any = None) -> Any:
     return _finish(ax, columns=1)
 
 
+def diagnosis(found: Diagnosis, axes: Any = None) -> Any:
+    """Draw what a diagnosis found: the gap before and after, where it sits, and the ranking.
+
+    From top to bottom: the measured output against the model before and after, on those samples
+    kept back on which it erred most; the errors against the noise floor; mean square errors along
+    the two most telling quantities, in units of noise; and the evidence for each candidate, by
+    rounds of the search.
+
+    Parameters
+    ----------
+    found : Diagnosis
+        From `diagnose`.
+    axes : sequence of five matplotlib Axes, optional
+        By default those of a new figure.
+
+    Returns
+    -------
+    numpy.ndarray of matplotlib Axes
+        The axes of the outputs, the errors, the two places and the ranking.
+
+    Raises
+    ------
+    CtrlidError
+        If something else than a diagnosis is given, or the number of axes differs.
+    """
+    _require(found, Diagnosis, "plot.diagnosis draws a Diagnosis, as diagnose() returns")
+    rounds = _pictures.ranking(found)
+    if axes is None:
+        rows = max(sum(len(bars) + 1 for bars in rounds.values()), 3)
+        height = 0.21 * rows + 0.9
+        layout = [["output"] * 2, ["error"] * 2, ["first", "second"], ["ranking"] * 2]
+        heights = [2.5, 1.9, 2.2, height]
+        made = _new_figure((8.0, sum(heights))).subplot_mosaic(
+            layout, gridspec_kw={"height_ratios": heights}
+        )
+        axes = list(made.values())
+    axes = _axes(axes, 5)
+    _gap(axes[0], axes[1], found)
+    places = _pictures.two_places(found)
+    for ax, place in zip(axes[2:4], [*places, None, None][:2], strict=True):
+        _where(ax, place, found)
+    _ranking(axes[4], rounds)
+    return axes
+
+
 def figure(
     rows: int = 1, columns: int = 1, size: tuple[float, float] = (7.2, 4.0), sharex: Any = False
 ) -> Any:
@@ -440,8 +489,7 @@ def figure(
     >>> cid.plot.figure(2, 2).shape
     (2, 2)
     """
-    made = Figure(figsize=size, layout="constrained")
-    return made.subplots(rows, columns, squeeze=False, sharex=sharex)
+    return _new_figure(size).subplots(rows, columns, squeeze=False, sharex=sharex)
 
 
 def png(drawn: Any, dpi: float = 150) -> bytes:
@@ -480,6 +528,20 @@ def png(drawn: Any, dpi: float = 150) -> bytes:
     return buffer.getvalue()
 
 
+def _new_figure(size: tuple[float, float]) -> Any:
+    """Make a figure, through pyplot where the calling code has imported it and may show it."""
+    frame = sys._getframe(1)
+    while frame.f_back is not None and frame.f_globals.get("__name__") == __name__:
+        frame = frame.f_back
+    pyplot = sys.modules.get("matplotlib.pyplot")
+    inside = str(frame.f_globals.get("__name__", "")).split(".")[0] == __name__.split(".")[0]
+    names = [*frame.f_globals.values(), *frame.f_locals.values()]
+    # The package control imports pyplot as well, but it does not show our figures.
+    if pyplot is not None and not inside and any(value is pyplot for value in names):
+        return pyplot.figure(figsize=size, layout="constrained")
+    return Figure(figsize=size, layout="constrained")
+
+
 def _require(value: Any, kind: type, sentence: str) -> None:
     if not isinstance(value, kind):
         raise CtrlidError(f"{sentence}; given {type(value).__name__}")
@@ -507,7 +569,7 @@ def _line(i: int) -> dict[str, Any]:
     }
 
 
-def _finish(ax: Any, *, legend: bool = True, columns: int = 2) -> Any:
+def _finish(ax: Any, *, legend: bool = True, columns: int = 2, size: str = "medium") -> Any:
     """Grid, open frame, and a legend above the axes, where it covers no data."""
     ax.grid(True, color="0.9", linewidth=0.6)
     ax.set_axisbelow(True)
@@ -518,8 +580,121 @@ def _finish(ax: Any, *, legend: bool = True, columns: int = 2) -> Any:
         ax.locator_params(axis="x", nbins=6)
     if legend:
         ax.legend(loc="lower left", bbox_to_anchor=(0, 1.0), ncols=columns, frameon=False,
-                  borderaxespad=0.3, fontsize="medium", handlelength=2.6)  # fmt: skip
+                  borderaxespad=0.3, fontsize=size, handlelength=2.6)  # fmt: skip
     return ax
+
+
+BEFORE = {"color": COLOURS[1], "linestyle": "--", "linewidth": 1.4}
+AFTER = {"color": COLOURS[0], "linestyle": "-", "linewidth": 1.4}
+FILLS: dict[str, dict[str, Any]] = {
+    "found": {"facecolor": COLOURS[0], "edgecolor": "k"},
+    "not told apart": {"facecolor": COLOURS[5], "edgecolor": "k", "hatch": "////"},
+    "refitted": {"facecolor": "0.75", "edgecolor": "0.3"},
+    "not refitted": {"facecolor": "w", "edgecolor": "0.3", "linestyle": "--"},
+}
+GATE = 10.0  # difference in the Bayesian criterion that is strong evidence
+
+
+def _gap(above: Any, below: Any, found: Diagnosis) -> None:
+    """Draw the measured output against the model before and after, and the errors below."""
+    gap, part = found.gap, _pictures.largest_gap(found.gap)
+    t, y = gap.time[part], gap.measured[part]
+    scale, unit = _pictures.scale([y], gap.unit)
+    above.plot(t, scale * y, label="measured", **MEASURED)
+    names = " and ".join(f.name for f in found.findings)
+    cases = [("before" if names else "recalibrated", gap.simulated_before, gap.before,
+              BEFORE if names else AFTER)]  # fmt: skip
+    if names:
+        cases.append(("after", gap.simulated_after, gap.after, AFTER))
+    errors = [y - values[part] for _, values, _, _ in cases]
+    known = [e[np.isfinite(e)] for e in errors if np.isfinite(e).any()] or [np.zeros(1)]
+    floored = np.isfinite(gap.floor) and gap.floor > 0
+    fine, small = _pictures.scale([np.full(1, gap.floor)] if floored else known, gap.unit)
+    if floored:
+        below.axhspan(-2 * fine * gap.floor, 2 * fine * gap.floor, color="0.87", zorder=0,
+                      label=f"±2 x noise floor, {fine * gap.floor:.3g} {small}")  # fmt: skip
+    below.axhline(0, color="0.3", linewidth=0.8)
+    for (label, values, size, style), error in zip(cases, errors, strict=True):
+        rms = "none" if np.isnan(size) else f"RMS {fine * size:.3g} {small}"
+        long = {"before": "recalibrated model", "after": f"with {names}"}.get(label, label)
+        above.plot(t, scale * values[part], label=f"{gap.kind}, {long}", **style)
+        below.plot(t, fine * error, label=f"{label}: {rms}", **style)
+    _limit(above, scale * y)
+    above.set_ylabel(f"output [{unit}]")
+    below.set_ylabel(f"error [{small}]")
+    below.set_xlabel(f"time [s], where the gap is largest among {len(gap.time)} samples kept back")
+    for ax in (above, below):
+        ax.set_xlim(t[0], t[-1])
+        _finish(ax, columns=1 if ax is above else 3, size="small")
+
+
+def _limit(ax: Any, y: Array) -> None:
+    """Keep what was measured readable, wherever a wrong model goes."""
+    span = float(np.ptp(y)) or 1.0
+    low, high = ax.get_ylim()
+    ax.set_ylim(max(low, y.min() - 0.8 * span), min(high, y.max() + 0.8 * span))
+
+
+def _where(ax: Any, place: Place | None, found: Diagnosis) -> None:
+    """Draw the mean square of the one-step errors along one quantity, before and after."""
+    if place is None:
+        ax.text(0.5, 0.5, "no place is known", ha="center", va="center", transform=ax.transAxes)
+        ax.set_axis_off()
+        return
+    at = np.arange(len(place.before))
+    both = bool(found.findings)
+    solid = {"facecolor": COLOURS[0], "edgecolor": COLOURS[0], "linewidth": 0.8}
+    if both:
+        ax.bar(at + 0.3, place.before, 0.4, label="before", facecolor="w", edgecolor=COLOURS[1],
+               hatch="//////", linewidth=0.8)  # fmt: skip
+        ax.bar(at + 0.7, place.after, 0.4, label="after", **solid)
+    else:
+        ax.bar(at + 0.5, place.before, 0.8, label="recalibrated", **solid)
+    ax.axhline(1, color="k", linewidth=1.2, linestyle=":", label="noise")
+    labels, unit = _pictures.bin_labels(place)
+    every = -(-len(at) // 5)
+    ax.set_xlim(0, len(at))
+    ax.set_xlabel(f"{place.axis} [{unit}]")
+    ax.set_ylabel("mean square error /\nthat of noise [1]")
+    top = float(np.nanmax([*place.before, *place.after, 1.0]))
+    _finish(ax, columns=3, size="small")
+    if top > 20:
+        ax.set_yscale("log")
+    else:
+        ax.set_ylim(0, 1.1 * top)
+    ax.set_xticks(np.arange(len(labels))[::every], labels[::every])
+
+
+def _ranking(ax: Any, rounds: Mapping[int, Sequence[_pictures.Bar]]) -> None:
+    """Draw the evidence for each candidate as bars, round below round."""
+    labels, row, drawn = [], 0, set()
+    top = max((bar.evidence for bars in rounds.values() for bar in bars), default=0.0)
+    for number, bars in rounds.items():
+        ax.text(0.0, row, f" round {number}", ha="left", va="center", style="italic",
+                fontsize="small", transform=ax.get_yaxis_transform())  # fmt: skip
+        labels.append("")
+        row += 1
+        for bar in bars:
+            ax.barh(row, bar.evidence, 0.72, linewidth=0.7, **FILLS[bar.kind],
+                    label=None if bar.kind in drawn else bar.kind)  # fmt: skip
+            ax.annotate(f"{bar.evidence:.0f}", (max(bar.evidence, 0.0), row), (3, 0), va="center",
+                        textcoords="offset points", fontsize="x-small")  # fmt: skip
+            drawn.add(bar.kind)
+            labels.append(bar.label)
+            row += 1
+    if not rounds:
+        ax.text(0.5, 0.5, "no candidate was tried", ha="center", transform=ax.transAxes)
+    ax.axvline(GATE, color="k", linewidth=1, linestyle="--", label="strong")
+    ax.axvline(0, color="0.3", linewidth=0.8)
+    ax.set_xscale("symlog", linthresh=GATE)
+    ax.xaxis.set_major_formatter(ScalarFormatter())
+    ax.set_xlim(_pictures.LEAST, 3 * max(top, 2 * GATE))
+    ax.set_yticks(range(row), labels, fontsize="small")
+    ax.tick_params(axis="y", length=0)
+    ax.set_ylim(row - 0.4, -0.6)
+    ax.set_xlabel("gain by the Bayesian criterion (BIC), twice the evidence less the penalty [1]")
+    _finish(ax, columns=5, size="small")
+    ax.grid(False, axis="y")
 
 
 def _trace(ax: Any, record: Record, values: Array, i: int, label: str, held: bool = False) -> None:

@@ -12,6 +12,7 @@ from ._tables import Table, blocks, heading
 from .comparison import Comparison
 from .controller_redesign import Redesign
 from .data import Record
+from .diagnosis.result import Diagnosis
 from .errors import CtrlidError
 from .model import IdentifiedModel
 
@@ -50,6 +51,12 @@ footer { margin-top: 3rem; color: var(--faint); font-size: 0.85rem; }
 """
 
 
+DIAGNOSIS = (
+    "Output and errors where the gap is largest; mean square of the one-step errors along the two "
+    "most telling quantities; the candidates by rounds of the search."
+)
+
+
 @dataclass(frozen=True, eq=False)
 class Section:
     """One chapter of a report.
@@ -61,7 +68,8 @@ class Section:
     text : str, optional
         Plain words; an empty line starts a new paragraph.
     result : object, optional
-        A `Table`, `Record`, `IdentifiedModel`, `Comparison` or `Redesign`, or a tuple of them.
+        A `Table`, `Record`, `IdentifiedModel`, `Comparison`, `Redesign` or `Diagnosis`, or a tuple
+        of them.
     figure : object, optional
         A matplotlib figure or axes, or the bytes of a PNG file, or a mapping of such by caption. By
         default the pictures that belong to the result; an empty mapping for none.
@@ -95,8 +103,8 @@ def write_report(result: Any, path: str | Path, *, title: str = "") -> Path:
 
     Parameters
     ----------
-    result : Record, IdentifiedModel, Comparison, Redesign, Section, or a sequence of them
-        What to report.
+    result : Record, IdentifiedModel, Comparison, Redesign, Diagnosis or Section, or several
+        What to report; several in a sequence.
     path : str or Path
         The file; one that exists is replaced.
     title : str, optional
@@ -166,6 +174,8 @@ def _pictures(result: Any) -> dict[str, Any]:
             return made
         case Redesign():
             return {"Response to a step of the reference.": plot.step(result)}
+        case Diagnosis():
+            return {DIAGNOSIS: plot.diagnosis(result)}
     return {}
 
 
@@ -195,7 +205,8 @@ def _bytes(picture: Any) -> bytes:
 def _paragraph(text: str) -> str:
     # Bad news is in capitals throughout: three such words in a row are no abbreviation.
     words = text.split()
-    loud = [len(w) > 1 and w.isalpha() and w.isupper() for w in words]
+    bare = [w.strip(".,:;") for w in words]
+    loud = [len(w) > 1 and w.isalpha() and w.isupper() for w in bare]
     bad = any(all(loud[i : i + 3]) for i in range(len(words) - 2))
     kind = ' class="bad"' if bad else ""
     return f"<p{kind}>{html.escape(' '.join(words))}</p>"

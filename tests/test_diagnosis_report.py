@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import ctrlid as cid
+from ctrlid import _pictures, plot
 from ctrlid import effects as E
 from ctrlid.diagnosis.result import (
     Calibrated,
@@ -162,9 +163,9 @@ def test_report_of_a_clean_bill(found):
 
 
 def test_bad_news_is_in_capitals(found):
-    assert "PARTLY EXPLAINED. " in text(found["partly explained"])
+    assert "PARTLY EXPLAINED: SOMETHING IS STILL MISSING. " in text(found["partly explained"])
     assert "what remains: NOT NOISE ALONE, by whiteness (p < 0.0001)" in text(found["unknown"])
-    assert "UNKNOWN. " in text(found["unknown"])
+    assert "UNKNOWN: SOMETHING IS MISSING that no candidate explains. " in text(found["unknown"])
     assert "with the effects" not in text(found["unknown"])
     assert "velocity where the motion turns 3.02" in text(found["unknown"])
     base = found["explained"]
@@ -315,3 +316,97 @@ def test_what_is_no_text_is_left_out_and_said(found, tmp_path):
     path = odd.save(tmp_path / "f.json")
     assert json.loads(path.read_text("utf-8"))["left out of extra"] == ["machine"]
     assert load_diagnosis(path).extra == {"n": 3}
+
+
+def legend(ax):
+    return [entry.get_text() for entry in ax.get_legend().get_texts()]
+
+
+def test_picture_of_an_explanation(found):
+    output, error, first, second, ranking = plot.diagnosis(found["explained"])
+    gap = found["explained"].gap
+    assert legend(output) == ["measured", "closed-loop simulation, recalibrated model",
+                              "closed-loop simulation, with CoulombFriction"]  # fmt: skip
+    assert output.get_ylabel() == "output [mm]"
+    assert error.get_ylabel() == "error [µm]"
+    assert legend(error) == [f"±2 x noise floor, {1e6 * gap.floor:.3g} µm",
+                             f"before: RMS {1e6 * gap.before:.3g} µm",
+                             f"after: RMS {1e6 * gap.after:.3g} µm"]  # fmt: skip
+    assert error.get_xlabel() == "time [s], where the gap is largest among 1000 samples kept back"
+    assert [ax.get_xlabel() for ax in (first, second)] == ["velocity [mm/s]", "position [mm]"]
+    assert set(legend(first)) == {"before", "after", "noise"}
+    assert len(first.patches) == 16
+    assert set(legend(ranking)) == {"strong", "found", "not told apart", "refitted", "not refitted"}
+    names = [tick.get_text() for tick in ranking.get_yticklabels()]
+    assert names == ["", "CoulombFriction", "StribeckFriction", "ViscousFriction", "ActuatorLag",
+                     "CubicStiffness", "", "InputDelay", "InputSaturation"]  # fmt: skip
+    assert "BIC" in ranking.get_xlabel()
+    assert plot.png(output).startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("verdict", ["nothing missing", "unknown"])
+def test_picture_without_effects(found, verdict):
+    output, _, first, _, ranking = plot.diagnosis(found[verdict])
+    assert legend(output) == ["measured", "closed-loop simulation, recalibrated"]
+    assert set(legend(first)) == {"recalibrated", "noise"}
+    assert "found" not in legend(ranking)
+    plot.png(output)
+
+
+def test_picture_of_rare_cases(found):
+    base = found["explained"]
+    gone = np.full_like(base.gap.measured, np.nan)
+    place = replace(base.where[0], edges=np.r_[-np.inf, base.where[0].edges[1:]], before=30 * BAD,
+                    axis="frequency", unit="Hz")  # fmt: skip
+    gap = replace(base.gap, simulated_before=gone, before=math.nan, floor=0.0, unit="")
+    odd = replace(base, gap=gap, where=(place,), ranking=())
+    output, error, first, second, ranking = plot.diagnosis(odd)
+    assert output.get_ylabel() == "output [unit not given]"
+    assert legend(error)[0] == "before: none"
+    assert first.get_yscale() == "log"
+    assert [entry.get_text() for entry in second.texts] == ["no place is known"]
+    assert [entry.get_text() for entry in ranking.texts] == ["no candidate was tried"]
+    plot.png(output)
+
+
+def test_picture_on_given_axes(found):
+    axes = plot.figure(5)
+    assert list(plot.diagnosis(found["explained"], axes)) == list(axes[:, 0])
+    with pytest.raises(cid.CtrlidError, match="needs 5 matplotlib Axes; given 1"):
+        plot.diagnosis(found["explained"], axes[0, 0])
+    with pytest.raises(cid.CtrlidError, match="draws a Diagnosis, as diagnose"):
+        plot.diagnosis(3)
+
+
+def test_the_stretch_drawn_has_the_largest_gap_and_no_break():
+    n = 1000
+    time = 0.01 * np.arange(n)
+    error = np.zeros(n)
+    error[600:700] = 1.0
+    gap = Gap("simulation", 1.0, 1.0, 1.0, 0.1, "m", time, error, np.zeros(n), np.zeros(n))
+    part = _pictures.largest_gap(gap)
+    assert part.start <= 600
+    assert part.stop >= 700
+    broken = np.where(np.arange(n) < 650, time, time + 5.0)
+    part = _pictures.largest_gap(replace(gap, time=broken))
+    assert part.start >= 650 or part.stop <= 650
+    fields = ("time", "measured", "simulated_before", "simulated_after")
+    short = replace(gap, **{k: getattr(gap, k)[:40] for k in fields})
+    assert _pictures.largest_gap(short) == slice(0, 40)
+
+
+@pytest.mark.parametrize("verdict", VERDICTS)
+def test_page(found, verdict, tmp_path):
+    path = cid.write_report(found[verdict], tmp_path / "report.html")
+    page = path.read_text("utf-8")
+    assert "<h1>Diagnosis of maglev, 3000 samples at 0.002 s</h1>" in page
+    assert page.count('src="data:image/png;base64,') == 1
+    assert SENTENCES[verdict] in page
+    bad = verdict in ("unknown", "partly explained")
+    assert ('<p class="bad">' in page) == (bad or verdict == "nothing missing")
+    assert ("SOMETHING IS" in page) == bad
+    assert ("1. CoulombFriction: a force of constant size" in page) == ("explained" in verdict)
+    assert ("smallest size that would have been seen" in page) == (verdict == "nothing missing")
+    assert ("LARGE RANDOM FORCE" in page) == (verdict == "nothing missing")
+    assert "StribeckFriction" in page
+    assert "About the record: u moves in steps of 0.00122 V." in page

@@ -57,6 +57,21 @@ def test_nothing_global_is_changed(record, comparison):
     assert dict(mpl.rcParams) == before
 
 
+def test_a_script_with_pyplot_can_show_the_pictures(record, tmp_path):
+    import matplotlib.pyplot as plt
+
+    script = {"plot": plot, "cid": cid, "record": record, "path": tmp_path / "r.html"}
+    exec("plot.record(record)", script)
+    assert plt.get_fignums() == []
+    script["plt"] = plt
+    exec("cid.write_report(record, path)", script)
+    assert plt.get_fignums() == []
+    exec("axes = plot.record(record)", script)
+    (number,) = plt.get_fignums()
+    assert script["axes"][0].figure is plt.figure(number)
+    plt.close(number)
+
+
 def test_record_has_names_and_units(record):
     top, bottom = plot.record(record)
     assert top.get_ylabel() == f"{record.names['y']} [m]"

@@ -16,7 +16,16 @@ TELLING = 1e-3  # probability below which a place is not noise's doing
 PLACES = 3
 LARGE = 0.5  # share of the floor from which a random force may hide something
 STRONG, CERTAIN = 10.0, 30.0  # evidence
-TRUSTED = ("nothing missing", "explained")
+HEADLINES = {
+    "nothing missing": "Nothing missing",
+    "explained": "Explained",
+    "partly explained": "PARTLY EXPLAINED: SOMETHING IS STILL MISSING",
+    "unknown": "UNKNOWN: SOMETHING IS MISSING that no candidate explains",
+}
+EVIDENCE = (
+    "Evidence: the logarithm of how many times likelier the record is with the effect than "
+    "without; chance reaches 2 or 3, 10 is strong."
+)
 MASSES = ("m", "M", "mass")
 FORCES = {"m/s^2": "N", "1/s": "N s/m", "1/s^2": "N/m", "1/m": "kg/m"}  # per unit of mass, times it
 
@@ -34,10 +43,7 @@ def report(found: Diagnosis) -> str:
     str
         Lines of at most 100 columns. Bad news is in capitals.
     """
-    good = found.verdict in TRUSTED
-    lines = [f"Diagnosis of {found.record or 'a record'}"]
-    verdict = found.verdict.capitalize() if good else found.verdict.upper()
-    lines += _wrapped(f"{verdict}. {found.sentence}", 2)
+    lines = [f"Diagnosis of {found.record or 'a record'}", *_wrapped(headline(found), 2)]
     lines += ["", *gap_lines(found.gap), "", *_where(found)]
     if found.findings:
         lines += ["", "  what is missing"]
@@ -58,6 +64,11 @@ def report(found: Diagnosis) -> str:
             lines += _wrapped(f"{title}: {remark}", 2, hang=4)
     lines.append(f"  {found.seconds:.1f} s")
     return "\n".join(line.rstrip() for line in lines)
+
+
+def headline(found: Diagnosis) -> str:
+    """Return the verdict with its sentence."""
+    return f"{HEADLINES[found.verdict]}. {found.sentence}"
 
 
 def _wrapped(text: str, indent: int, hang: int | None = None) -> list[str]:
@@ -84,15 +95,14 @@ def gap_rows(gap: Gap) -> list[tuple[str, str, str]]:
 
     cases = (("the model as given", gap.given), ("recalibrated", gap.before),
              ("with the effects", gap.after))  # fmt: skip
-    rows = [(label, size(value), times(value)) for label, value in cases]
+    shown = cases[:2] if gap.after == gap.before else cases
+    rows = [(label, size(value), times(value)) for label, value in shown]
     return [*rows, ("noise floor", size(gap.floor), "what noise and random force leave")]
 
 
 def gap_lines(gap: Gap) -> list[str]:
     """Return the sizes of the gap as aligned lines."""
     rows = gap_rows(gap)
-    if gap.after == gap.before:
-        rows = [row for row in rows if row[0] != "with the effects"]
     head = f"  how far apart: {gap.kind} of {len(gap.time)} samples kept back, RMS error"
     return [head, *(f"    {label:<20}{size:>12}   {times}" for label, size, times in rows),
             *_wrapped(shrinking(gap), 4)]  # fmt: skip
@@ -224,14 +234,23 @@ def doubts(found: Diagnosis, finding: Finding) -> list[str]:
     return [*lines, *([finding.note] if finding.note else [])]
 
 
-def _finding(found: Diagnosis, finding: Finding, label: str) -> list[str]:
-    alone = len(found.findings) == 1
+def named(finding: Finding) -> str:
+    """Name the effect of a finding and say what it is."""
     what = finding.effect.sentence.rstrip(".")
-    what = f": {what[:1].lower()}{what[1:]}" if what else ""
-    lines = _wrapped(f"{label}{finding.name}{what}", 4, hang=7)
+    return f"{finding.name}: {what[:1].lower()}{what[1:]}" if what else finding.name
+
+
+def sized(found: Diagnosis, finding: Finding) -> str:
+    """Write the fitted parameters of a finding, and its accelerations as forces if they are one."""
     force = newtons(found, finding.effect)
     size = sizes(found, finding.effect, finding.standard_errors)
-    lines += _wrapped(size + (f" ({force})" if force else ""), 7, hang=9)
+    return f"{size} ({force})" if force else size
+
+
+def _finding(found: Diagnosis, finding: Finding, label: str) -> list[str]:
+    alone = len(found.findings) == 1
+    lines = _wrapped(f"{label}{named(finding)}", 4, hang=7)
+    lines += _wrapped(sized(found, finding), 7, hang=9)
     for text in (certainty(finding, alone), *doubts(found, finding)):
         lines += _wrapped(text, 7, hang=9)
     return lines
