@@ -20,6 +20,17 @@ from .continuous import fit_continuous
 from .controller_redesign import Performance, Redesign, redesign
 from .controllers import PID
 from .data import Record
+from .diagnosis import (
+    Calibrated,
+    Candidate,
+    Diagnosis,
+    Disturbance,
+    Finding,
+    Gap,
+    Place,
+    diagnose,
+    load_diagnosis,
+)
 from .errors import CtrlidError, CtrlidWarning
 from .feedback import FeedbackCheck, check_feedback
 from .iv import fit_iv
@@ -36,6 +47,7 @@ from .residuals import Correlation
 from .sampling import SamplingRow, SamplingSweep, sweep_sampling_period
 from .signals import multisine, prbs, random_binary, steps
 from .simulation import simulate
+from .structure import OrderChoice, OrderRow, select_order
 from .validation import compare
 
 __version__ = "0.1.0.dev0"
@@ -45,15 +57,21 @@ __all__ = [
     "Audit",
     "AuditFinding",
     "Bounds",
+    "Calibrated",
+    "Candidate",
     "Comparison",
     "Correlation",
     "CtrlidError",
     "CtrlidWarning",
     "Curve",
+    "Diagnosis",
+    "Disturbance",
     "Equal",
     "Estimate",
     "FeedbackCheck",
+    "Finding",
     "Fixed",
+    "Gap",
     "IdentifiedModel",
     "Integrator",
     "Linear",
@@ -63,7 +81,10 @@ __all__ = [
     "Margins",
     "Nonlinear",
     "OperatingPoint",
+    "OrderChoice",
+    "OrderRow",
     "Performance",
+    "Place",
     "PoleAt",
     "Prediction",
     "ReciprocalPoles",
@@ -80,12 +101,14 @@ __all__ = [
     "compare",
     "datasets",
     "design_lead",
+    "diagnose",
     "effects",
     "fit_arx",
     "fit_continuous",
     "fit_iv",
     "fit_loop",
     "linearize",
+    "load_diagnosis",
     "loop_margins",
     "multisine",
     "nu_gap",
@@ -98,6 +121,7 @@ __all__ = [
     "redesign",
     "replay_controller",
     "robust_margin",
+    "select_order",
     "simulate",
     "steps",
     "sweep_sampling_period",

@@ -190,6 +190,14 @@ class Machine:
 
         return integrate(rate, x, self.loop.dt, substeps)[0]
 
+    @property
+    def position(self) -> int:
+        """Index of the state whose rate is the first velocity."""
+        e, v = self.e, self.e.velocities[0]
+        rates = [casadi.simplify(e.rhs[k]) for k in range(self.n) if k != v]
+        found = [casadi.is_equal(rate, e.x[v], 2) for rate in rates]
+        return [k for k in range(self.n) if k != v][found.index(True)]
+
     def values(self, theta: Any) -> Array:
         """Return all parameter values with `theta` in the places of the free ones."""
         p = self.e.values.copy()
@@ -291,9 +299,13 @@ class Machine:
         rows = np.clip(np.arange(len(values)) - self.late + k, 0, len(values) - 1)
         return np.asarray(values[rows])
 
-    def run(self, track: Track, lin: Linearized, noise: Noise, sensitive: bool = True) -> Filtered:
-        """Run the filter along a linearized plant."""
-        p = len(self.index) if sensitive else 0
+    def run(
+        self, track: Track, lin: Linearized, noise: Noise, sensitive: bool = True,
+        columns: int | None = None,
+    ) -> Filtered:  # fmt: skip
+        """Run the filter along a linearized plant, with sensitivities to its first columns."""
+        p = len(self.index) if columns is None else columns
+        p = p if sensitive else 0
         out = filter_pass(
             lin.step, lin.a, lin.b, lin.du, np.ascontiguousarray(lin.dp[:, :, :p]), lin.height,
             lin.c, np.ascontiguousarray(lin.hp[:, :p]), lin.trajectory.predicted,
@@ -397,8 +409,9 @@ def _scheme(e: Equations, loop: Loop) -> Scheme:
 
 def _shortest(e: Equations, p: Any) -> float:
     """Return the time constant of the lag that follows the input; infinite without one."""
-    times = [casadi.substitute(casadi.SX(lag.time_constant), e.p, p) for lag in known_lags(e)[0][:1]]
-    return float(casadi.evalf(times[0])) if times else math.inf
+    for lag in known_lags(e)[0]:
+        return float(casadi.evalf(casadi.substitute(casadi.SX(lag.time_constant), e.p, p)))
+    return math.inf
 
 
 def make_track(loop: Loop, record: Record) -> Track:

@@ -185,6 +185,6 @@ def filter_pass(
                     late[i, q] = total
             sens[:] = late
         if not np.isfinite(x[0]) or abs(x[0]) > LARGE:
-            error[k] = np.nan
+            error[k:] = np.nan
             break
     return error, variance, before, after, wide, slopes, disturbance

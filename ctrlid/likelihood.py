@@ -151,10 +151,9 @@ def _measure(
     value, sensors = 0.0, []
     for track, out, keep in zip(problem.tracks, outs, problem.counts, strict=True):
         e, s = out.innovations[keep], out.variance[keep]
-        with np.errstate(all="ignore"):
-            r = float(np.mean(e**2 / s))
-        if not np.isfinite(r):
-            value, r = -math.inf, 1.0
+        if not (np.isfinite(e).all() and np.isfinite(s).all() and (s > 0).all()):
+            value, e, s = -math.inf, np.ones(1), np.ones(1)
+        r = float(np.mean(e**2 / s))
         least = QUIET * float(np.var(track.table[3][keep]) + np.mean(track.table[3][keep]) ** 2)
         r = max(r, least, 1e-300)
         value -= 0.5 * (len(e) * (math.log(r) + math.log(2 * math.pi) + 1) + np.sum(np.log(s)))
@@ -261,7 +260,7 @@ def _newton(cost: Callable[[Array], float], x: Array, low: Array, high: Array) -
     return x
 
 
-def climb(fit: Fit, free: Any = None, rounds: int = ROUNDS) -> Fit:
+def climb(fit: Fit, free: Any = None, rounds: int = ROUNDS, exact: bool = True) -> Fit:
     """Climb to the maximum of the likelihood over parameters and noise.
 
     Gauss-Newton steps on the innovations with the filter's gain held fixed, the noise tuned between
@@ -276,6 +275,8 @@ def climb(fit: Fit, free: Any = None, rounds: int = ROUNDS) -> Fit:
         Which parameters move; by default all.
     rounds : int, optional
         Steps at most.
+    exact : bool, optional
+        Whether to end with steps on the likelihood itself.
 
     Returns
     -------
@@ -301,7 +302,7 @@ def climb(fit: Fit, free: Any = None, rounds: int = ROUNDS) -> Fit:
                 break
             fit = _tune(problem, fit.theta, fit.linearized, fit.noise)
             tuned = fit.value
-    return polish(fit, free)
+    return polish(fit, free) if exact else fit
 
 
 def _relinearized(fit: Fit) -> Fit:

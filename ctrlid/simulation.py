@@ -189,15 +189,16 @@ class Simulator:
         return self._runners[key]
 
     def run(
-        self, z: Array, r: Array | None, d: Array, noise: Sequence[Array] | None = None
-    ) -> tuple[Array, Array]:
-        """Return measured output and applied input, from state `z` on.
+        self, z: Array, r: Array | None, d: Array, noise: Sequence[Array] | None = None,
+        begin: float = 0.0,
+    ) -> tuple[Array, Array]:  # fmt: skip
+        """Return measured output and applied input, from state `z` and time `begin` on.
 
         Runs chunk by chunk; the steps of a chunk are halved until its local errors are small.
         """
         loop, n = self.loop, d.size
         quiet = np.zeros(n)
-        w = np.vstack([np.arange(n) * loop.dt, quiet if r is None else r, d,
+        w = np.vstack([begin + np.arange(n) * loop.dt, quiet if r is None else r, d,
                        *(noise or (quiet, quiet))])  # fmt: skip
         y, u = np.empty(n), np.empty(n)
         start, reach = z, self._floor

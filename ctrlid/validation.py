@@ -95,7 +95,7 @@ def _compare_loop(record: Record, loop: Loop, horizon: int | None) -> Comparison
     notes = []
     e = loop.equations()
     poles = np.linalg.eigvals(state_matrices(e, loop.point)[0])
-    steps = horizon or _time_constant(poles, e.dt, record)
+    steps = horizon or time_constant(poles, e.dt, record)
     if steps > 1:
         index, values = predict_ahead(loop, record, prediction, steps)
         ahead = np.full(len(record), np.nan)
@@ -134,7 +134,8 @@ def _comparison(
     return Comparison(what, record, known, residuals, tests, tuple(notes))
 
 
-def _time_constant(poles: Any, dt: float, record: Record) -> int:
+def time_constant(poles: Any, dt: float, record: Record) -> int:
+    """Return the slowest unstable, or else the slowest stable, time constant in samples."""
     with np.errstate(divide="ignore", invalid="ignore"):  # a pole at z = 0 is infinitely fast
         rates = (np.log(poles.astype(complex)) / dt if dt else poles).real
     fast = rates[rates > 1e-6] if np.any(rates > 1e-6) else -rates[rates < -1e-6]
@@ -185,7 +186,7 @@ def _simulated(record: Record, loop: Loop, prediction: Prediction) -> Curve:
             replayed, guess[n:] = replay_from_best_state(loop, part)
             d = part.u - replayed
         fitted = guess.size if loop.analog else n
-        z = _best_start(simulator, part, reference, d, guess, fitted)
+        z = best_start(simulator, part, reference, d, guess, fitted)
         y[start:stop] = simulator.run(z, reference, d)[0]
         injected[start:stop] = d
         noisy[start:stop] = _noise_effect(simulator, z, reference, d, prediction) - y[start:stop]
@@ -210,7 +211,7 @@ def _noise_effect(
         return unknown
 
 
-def _best_start(
+def best_start(
     simulator: Simulator, part: Record, r: Any, d: Array, guess: Array, fitted: int
 ) -> Array:
     """Return the initial state whose first entries fit the first samples best."""
@@ -281,7 +282,7 @@ def _compare_model(record: Record, model: Any, horizon: int | None) -> Compariso
     with np.errstate(over="ignore"):
         impulse = signal.lfilter(noise, den, np.eye(1, len(record))[0])
         grown = np.sqrt(np.cumsum(impulse**2))
-    steps = horizon or _time_constant(roots, record.dt, record)
+    steps = horizon or time_constant(roots, record.dt, record)
     if steps > 1:
         ahead = y0 + _ahead(y, moved + constant, den, noise, white_errors, steps, usable)
         known = _known_before(record, steps)

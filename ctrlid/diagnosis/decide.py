@@ -1,0 +1,72 @@
+"""Which candidates a record can tell apart, and what earns its place."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..physics import Array
+from .trial import Trial, log_terms
+
+GATE = 5.0  # gain of log-likelihood less penalty: 10 in units of the Bayesian criterion
+CLOSE = 3.0  # difference of log-likelihood that says nothing
+Z = 2.0  # standard deviations of Vuong's test
+BLOCK = 50  # samples whose terms are summed before their spread is taken
+
+
+def vuong(best: Array, other: Array, penalty: float) -> float:
+    r"""Return Vuong's statistic of two models on the same samples.
+
+    .. math:: z = \frac{\sum_k d_k - \Delta}{\sqrt{\sum_b (D_b - \bar D)^2}}, \quad
+        d_k = \ell_k^{best} - \ell_k^{other}
+
+    with sums D over blocks, so that neighbours may be correlated.
+
+    Parameters
+    ----------
+    best, other : ndarray, shape (n,)
+        Terms of the log-likelihood.
+    penalty : float
+        What the better model pays more for its parameters.
+
+    Returns
+    -------
+    float
+        Large: the better one is really better.
+
+    References
+    ----------
+    Vuong, Econometrica 57 (1989) 307-333.
+    """
+    d = best - other
+    n = len(d) // BLOCK * BLOCK
+    sums = d[:n].reshape(-1, BLOCK).sum(axis=1) if n else d
+    spread = math.sqrt(float(np.sum((sums - sums.mean()) ** 2)))
+    return float((d.sum() - penalty) / max(spread, 1e-12))
+
+
+def rivals(best: Trial, others: Sequence[Trial]) -> tuple[Trial, ...]:
+    """Return the candidates that the record cannot tell apart from the best, best first.
+
+    Parameters
+    ----------
+    best : Trial
+        The refitted winner.
+    others : sequence of Trial
+        Refitted candidates, on the same samples and beside the same other effects.
+
+    Returns
+    -------
+    tuple of Trial
+        Those within 3 units of log-likelihood, or not rejected by Vuong's test at z = 2.
+    """
+    mine = log_terms(best.model.fit)
+    found = []
+    for trial in others:
+        if trial is best or trial.merit <= GATE:
+            continue
+        lost = best.merit - trial.merit
+        z = vuong(mine, log_terms(trial.model.fit), best.cost - trial.cost)
+        if lost < CLOSE or z < Z:
+            found.append(trial)
+    return tuple(sorted(found, key=lambda t: -t.merit))

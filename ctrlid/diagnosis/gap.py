@@ -1,0 +1,209 @@
+"""How far a model is from data that it was not fitted to, and what noise alone would leave."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy import signal
+
+from ..data import Record
+from ..errors import CtrlidError
+from ..filtering import FEWEST
+from ..likelihood import Fit
+from ..linearization import state_matrices
+from ..loop import Loop
+from ..physics import Array
+from ..predictor import predict, predict_ahead, spread_ahead
+from ..replay import replay_from_best_state
+from ..simulation import Simulator
+from ..stepping import growth_rate
+from ..validation import best_start, time_constant
+
+RUNS = 3  # simulations with noise for the floor
+HELD = 0.25  # share of a record that is kept back for the comparison
+START = 0.02  # share of a stretch in which the guess of the initial state may still show
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """What a model makes of records: the outputs it gives, NaN where it gives none."""
+
+    kind: str
+    outputs: tuple[Array, ...]
+    floors: tuple[float, ...]
+
+
+def way_to_compare(loop: Loop, record: Record) -> str:
+    """Return how a loop is compared with a record: the most telling way there is."""
+    if loop.controller is not None and record.r is not None:
+        return "closed-loop simulation"
+    if loop.controller is None and growth_rate(loop) < -1e-6 / loop.dt:
+        return "open-loop simulation"
+    e = loop.equations()
+    poles = np.linalg.eigvals(state_matrices(e, loop.point)[0])
+    return f"{time_constant(poles, e.dt, record)}-step prediction"
+
+
+def held_out(record: Record) -> Any:
+    """Return the samples that are kept back: the last quarter of what counts."""
+    valid = np.flatnonzero(record.valid)
+    first = valid[int((1 - HELD) * len(valid))]
+    mask = np.zeros(len(record), dtype=bool)
+    mask[first:] = True
+    return mask & record.valid
+
+
+def without(record: Record, mask: Any) -> Record:
+    """Return a record in which masked samples do not count."""
+    return replace(record, valid=np.asarray(record.valid) & ~mask)
+
+
+def root_mean_square(record: Record, y: Array, mask: Any) -> float:
+    """Return the RMS difference on masked samples; infinite where the model gives nothing."""
+    use = mask & record.valid
+    if not np.isfinite(y[use]).any():
+        return math.inf
+    use &= np.isfinite(y)
+    return float(np.sqrt(np.mean((record.y[use] - y[use]) ** 2)))
+
+
+def outputs(loop: Loop, records: Sequence[Record], kind: str) -> tuple[Array, ...]:
+    """Return what a loop makes of each record, without any of its measured outputs but the first.
+
+    Parameters
+    ----------
+    loop : Loop
+        The model.
+    records : sequence of Record
+        The data.
+    kind : str
+        As `way_to_compare` says it.
+
+    Returns
+    -------
+    tuple of ndarray
+        Outputs; NaN where there are none.
+    """
+    return tuple(_output(loop, record, kind) for record in records)
+
+
+def _output(loop: Loop, record: Record, kind: str) -> Array:
+    y = np.full(len(record), np.nan)
+    try:
+        if kind.endswith("prediction"):
+            index, values = predict_ahead(loop, record, predict(loop, record), _steps(kind))
+            y[index] = values
+            return y
+        simulator = Simulator(loop)
+    except CtrlidError:
+        return y
+    for start, stop in record.segments():
+        if stop - start < FEWEST:
+            continue
+        try:
+            part = record[start:stop]
+            z, r, d = _drive(simulator, part)
+            y[start:stop] = simulator.run(z, r, d, None, record.t[start] - record.start)[0]
+        except CtrlidError:
+            continue
+    return y
+
+
+def _steps(kind: str) -> int:
+    return int(kind.partition("-")[0])
+
+
+def _drive(simulator: Simulator, part: Record) -> tuple[Array, Array | None, Array]:
+    """Return initial state, reference and injected signal for one stretch."""
+    loop = simulator.loop
+    n = len(simulator.plant_states)
+    guess = simulator.rest.copy()
+    guess[: len(loop.point.states)] = loop.point.states
+    if loop.controller is None:
+        r, d = None, part.u - loop.point.input
+    elif loop.analog:
+        r, d = np.asarray(part.r), np.zeros(len(part))
+    else:
+        r = np.asarray(part.r)
+        replayed, state = replay_from_best_state(loop, part)
+        guess[n : n + len(state)] = state
+        d = part.u - replayed
+    return best_start(simulator, part, r, d, guess, n), r, d
+
+
+def floor(
+    loop: Loop, fit: Fit, records: Sequence[Record], kind: str, masks: Any, force: bool = True
+) -> float:  # fmt: skip
+    """Return the RMS error that sensor and force noise leave through a loop.
+
+    Parameters
+    ----------
+    loop : Loop
+        The model with everything in it.
+    fit : Fit
+        Its fit, for the noise.
+    records : sequence of Record
+        The data.
+    kind : str
+        As `way_to_compare` says it.
+    masks : sequence of ndarray of bool
+        The samples that are compared.
+    force : bool, optional
+        Whether the force noise takes part.
+
+    Returns
+    -------
+    float
+        RMS error [output unit]; NaN where it cannot be computed.
+    """
+    squares, count = 0.0, 0
+    for k, (record, mask) in enumerate(zip(records, masks, strict=True)):
+        sensor = float(fit.sensor[min(k, len(fit.sensor) - 1)])
+        try:
+            value = _floor(loop, fit, sensor, record, kind, mask, force)
+        except CtrlidError:
+            return math.nan
+        size = int(np.count_nonzero(mask))
+        squares += value**2 * size
+        count += size
+    return math.sqrt(squares / count)
+
+
+def _floor(
+    loop: Loop, fit: Fit, sensor: float, record: Record, kind: str, mask: Any, force: bool
+) -> float:  # fmt: skip
+    if kind.endswith("prediction"):
+        found = predict(loop, record)
+        found = found if force else replace(found, force_noise=0.0)
+        return spread_ahead(loop, record, found, _steps(kind))
+    simulator = Simulator(loop)
+    values = []
+    for start, stop in record.segments():
+        use = mask[start:stop]
+        if stop - start < FEWEST or not use.any():
+            continue
+        part = record[start:stop]
+        begin = record.t[start] - record.start
+        z, r, d = _drive(simulator, part)
+        quiet = simulator.run(z, r, d, None, begin)[0]
+        for seed in range(RUNS):
+            noise = random_noise(fit, sensor, len(part), seed)
+            noise[1] = noise[1] if force else 0 * noise[1]
+            noisy = simulator.run(z, r, d, noise, begin)[0]
+            values.append((noisy - quiet)[use] ** 2)
+    if not values:
+        raise CtrlidError("no stretch is long enough to be simulated")
+    return math.sqrt(float(np.mean(np.concatenate(values))))
+
+
+def random_noise(fit: Fit, sensor: float, n: int, seed: int) -> list[Array]:
+    """Return sensor noise and force noise as a fit found them."""
+    noise, streams = fit.noise, np.random.default_rng(seed).standard_normal((3, n))
+    force = streams[1] * math.sqrt(sensor * float(np.mean(noise.force)))
+    if noise.drift:
+        steps = streams[2] * math.sqrt(sensor * noise.drift)
+        steps[0] *= 1 / math.sqrt(1 - noise.memory**2)
+        force = force + signal.lfilter([1.0], [1.0, -noise.memory], steps)
+    return [streams[0] * math.sqrt(sensor), force]

@@ -1,0 +1,366 @@
+"""diagnose(): from the audit of the record to the verdict."""
+
+import math
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import control as ct
+import joblib
+import numpy as np
+from tqdm.auto import tqdm
+
+from ..audit import audit
+from ..data import Record
+from ..effects import CATALOGUE, AbstractEffect, equivalents
+from ..errors import CtrlidError
+from ..likelihood import Fit, begin, climb
+from ..linearization import OperatingPoint
+from ..loop import Loop
+from ..loop_fit import make_problem, summary
+from . import gap as gaps
+from .experiment import separating_experiment
+from .omnibus import places
+from .result import Calibrated, Candidate, Diagnosis, Disturbance, Finding, Gap, Verdict
+from .search import Found, Search, search
+from .sentences import conclusion
+from .trial import Model, Trial, base_model
+
+HOPELESS = ("too few samples", "constant signal")
+STEPS = 6  # of the progress bar
+
+
+def diagnose(
+    loop: Any,
+    record: Record | Sequence[Record],
+    *,
+    catalogue: Sequence[type[AbstractEffect]] = CATALOGUE,
+    validation: Record | Sequence[Record] | None = None,
+    jobs: int = 1,
+    progress: bool = True,
+) -> Diagnosis:
+    r"""Find where a model and data disagree, name what is missing, and show what it closes.
+
+    The innovations of a Kalman filter on the loop's own equations, driven by the measured input,
+    are what the model does not explain. First the free parameters and the noise are fitted: a
+    wrong mass is not a missing effect. Then every effect of the catalogue is asked what it would
+    gain, the promising ones are refitted by maximum likelihood with everything else, and the
+    best stays if it gains more than ten in units of the Bayesian information criterion,
+
+    .. math:: 2\,(\ell_{with} - \ell_{without}) - n \ln N > 10,
+
+    and so on until nothing more does. What Vuong's test cannot reject against a finding is
+    reported beside it. Tests that name nothing say whether noise is all that is left. The gap is
+    shown on the last quarter of each record, with parameters fitted to the rest, or on records
+    given for `validation`.
+
+    Parameters
+    ----------
+    loop : Loop or control.TransferFunction
+        The model, with the names of its uncertain parameters in `free`. With a controller the gap
+        is that of the closed-loop simulation; without one that of a prediction several
+        samples ahead, or of an open-loop simulation if the plant is stable. A transfer function
+        stands for a linear plant without a known controller.
+    record : Record or sequence of Record
+        The data; several records are diagnosed together.
+    catalogue : sequence of effect classes, optional
+        What may be missing: ``[*cid.effects.CATALOGUE, Mine]``.
+    validation : Record or sequence of Record, optional
+        Data for the comparison before and after.
+    jobs : int, optional
+        Candidates that are tried at the same time, through joblib.
+    progress : bool, optional
+        Whether to show progress.
+
+    Returns
+    -------
+    Diagnosis
+        Verdict, findings, the completed loop, the gap; ``print`` shows the report.
+
+    Raises
+    ------
+    CtrlidError
+        If the record cannot carry a diagnosis (it says why) or does not fit the loop.
+
+    References
+    ----------
+    Kristensen, Madsen and Jørgensen, Computers and Chemical Engineering 28 (2004) 1431-1449;
+    Basseville and Nikiforov, *Detection of Abrupt Changes* (score tests with nuisance parameters);
+    Vuong, Econometrica 57 (1989) 307-333.
+
+    Examples
+    --------
+    >>> import ctrlid as cid
+    >>> plant = cid.plants.servo(m=1.0, c=2.0, k=3.0)
+    >>> op = cid.OperatingPoint(states=(0.0, 0.0), input=0.0, output=0.0)
+    >>> loop = cid.Loop(plant, cid.PID(kp=20.0, kd=1.0), dt=0.01, at=op, free=("k", "c"))
+    >>> r = cid.random_binary(3000, amplitude=0.1, hold=50, seed=1)
+    >>> real = loop.with_effect(cid.effects.CoulombFriction(fc=0.5))
+    >>> record = cid.simulate(real, r, sensor_noise=1e-4, seed=2)
+    >>> found = cid.diagnose(loop, record, progress=False)
+    >>> found.verdict, found.findings[0].name
+    ('explained', 'CoulombFriction')
+    """
+    started = time.perf_counter()
+    records = _records(record)
+    loop = _loop(loop, records[0])
+    fresh = None if validation is None else _records(validation)
+    bar = tqdm(total=STEPS, disable=not progress, leave=False, desc="diagnose")
+
+    def tell(text: str, step: int = 0) -> None:
+        bar.set_description(f"diagnose: {text}")
+        bar.update(step)
+
+    tell("looking the record over", 1)
+    remarks = _look_over(loop, records)
+    tell("recalibrating", 1)
+    base = base_model(loop, records, loop.free)
+    found = search(base, catalogue, _worker(jobs), tell)
+    tell("comparing on fresh data", 2)
+    gap, shares, disturbance = _gaps(loop, found, records, fresh)
+    tell("writing down", 1)
+    result = _result(loop, records, found, gap, shares, disturbance, remarks)
+    bar.close()
+    return replace(result, seconds=time.perf_counter() - started)
+
+
+def _records(record: Any) -> tuple[Record, ...]:
+    records = (record,) if isinstance(record, Record) else tuple(record)
+    if not records or not all(isinstance(r, Record) for r in records):
+        raise CtrlidError("diagnose needs a Record, or a sequence of Records; given "
+                          f"{type(record).__name__}")  # fmt: skip
+    return records
+
+
+def _loop(loop: Any, record: Record) -> Loop:
+    """Return the loop; a transfer function becomes one around the means of the record."""
+    if isinstance(loop, Loop):
+        return loop
+    if not isinstance(loop, ct.TransferFunction):
+        raise CtrlidError(
+            "diagnose needs a Loop(plant, controller, dt=..., at=..., free=...) or a transfer "
+            f"function such as the fits return; given {type(loop).__name__}"
+        )
+    valid = record.valid
+    u, y = float(np.mean(record.u[valid])), float(np.mean(record.y[valid]))
+    plain = ct.tf(loop.num, loop.den, loop.dt)
+    linear = Loop(plain, None, dt=record.dt, at=OperatingPoint((), u, y))
+    return replace(linear, free=tuple(linear.parameters))
+
+
+def _look_over(loop: Loop, records: Sequence[Record]) -> tuple[str, ...]:
+    """Return what is remarkable about the records; refuse those that carry nothing."""
+    remarks = []
+    for k, record in enumerate(records):
+        found = audit(record, loop)
+        hopeless = [f.text for f in found.findings if f.kind in HOPELESS and f.channel != "r"]
+        if hopeless:
+            raise CtrlidError(
+                f"{record.name or 'the record'} cannot be diagnosed: {' '.join(hopeless)}"
+            )
+        which = f"record {k + 1}: " if len(records) > 1 else ""
+        remarks += [f"{which}{f.kind}: {f.text}" for f in found.findings]
+    return tuple(remarks)
+
+
+def _worker(jobs: int) -> Callable[[Callable[..., Any], Iterable[Any]], list[Any]]:
+    def work(function: Callable[..., Any], items: Iterable[Any]) -> list[Any]:
+        if jobs == 1:
+            return [function(item) for item in items]
+        run = joblib.Parallel(n_jobs=jobs, prefer="threads")
+        return list(run(joblib.delayed(function)(item) for item in items))
+
+    return work
+
+
+def _trained(model: Model, records: Sequence[Record]) -> Loop:
+    """Return a model's loop with its parameters fitted to other records."""
+    fit = model.fit
+    problem = make_problem(model.fitted, model.names, records)
+    if not model.names:
+        return model.fitted
+    fit = climb(begin(problem, fit.theta, fit.noise), exact=False)
+    return Model(model.loop, fit).fitted
+
+
+def _gaps(
+    loop: Loop, found: Search, records: Sequence[Record], fresh: Sequence[Record] | None
+) -> tuple[Gap, dict[str, float], Disturbance]:
+    """Return the gap on data that no parameter was fitted to, and what each finding closes."""
+    shown: Sequence[Record] = records if fresh is None else fresh
+    if fresh is None:
+        masks = [gaps.held_out(r) for r in records]
+        rest = [gaps.without(r, m) for r, m in zip(records, masks, strict=True)]
+        before, after = (_trained(m, rest) for m in (found.base, found.final))
+    else:
+        masks = [np.asarray(r.valid).copy() for r in fresh]
+        for mask in masks:
+            mask[: int(gaps.START * len(mask))] = False
+        before, after = found.base.fitted, found.final.fitted
+    kind = gaps.way_to_compare(loop, shown[0])
+    results = [gaps.outputs(x, shown, kind) for x in (loop, before, after)]
+    sizes = [_total(shown, y, masks) for y in results]
+    floor = gaps.floor(after, found.final.fit, shown, kind, masks)
+    quiet = gaps.floor(after, found.final.fit, shown, kind, masks, force=False)
+    shares: dict[str, float] = {}
+    closed = sizes[1] ** 2 - sizes[2] ** 2
+    if len(found.found) == 1:
+        shares[found.found[0].trial.label] = _share(closed, sizes[1], floor)
+    for f in found.found if len(found.found) > 1 else ():
+        left = after.without_effect(f.trial.effect_in(after))
+        error = _total(shown, gaps.outputs(left, shown, kind), masks)
+        shares[f.trial.label] = _share(error**2 - sizes[2] ** 2, sizes[1], floor)
+    first, mask = shown[0], masks[0]
+    gap = Gap(
+        kind, *sizes, floor, first.units.get("y", ""), np.asarray(first.t)[mask],
+        np.asarray(first.y)[mask], results[1][0][mask], results[2][0][mask],
+    )  # fmt: skip
+    return gap, shares, _disturbance(found.final.fit, loop, floor, quiet)
+
+
+def _share(closed: float, before: float, floor: float) -> float:
+    above = before**2 - (floor**2 if math.isfinite(floor) else 0.0)
+    if not (math.isfinite(closed) and math.isfinite(above)) or above <= 0:
+        return math.nan
+    return float(min(max(closed / above, 0.0), 1.0))
+
+
+def _total(records: Sequence[Record], outputs: Sequence[Any], masks: Sequence[Any]) -> float:
+    squares, count = 0.0, 0
+    for record, y, mask in zip(records, outputs, masks, strict=True):
+        size = int(np.count_nonzero(mask))
+        squares += gaps.root_mean_square(record, y, mask) ** 2 * size
+        count += size
+    return math.sqrt(squares / max(count, 1))
+
+
+def _disturbance(fit: Fit, loop: Loop, floor: float, quiet: float) -> Disturbance:
+    noise, scale = fit.noise, float(np.mean(fit.sensor))
+    time_constant = -loop.dt / math.log(noise.memory) if noise.drift else math.nan
+    share = 1 - (quiet / floor) ** 2 if floor > 0 and math.isfinite(quiet) else math.nan
+    coloured = math.sqrt(scale * noise.coloured) if noise.drift else 0.0
+    white = math.sqrt(scale * float(np.mean(noise.force)))
+    return Disturbance(white, coloured, time_constant, float(np.clip(share, 0.0, 1.0)))
+
+
+def _result(
+    loop: Loop, records: Sequence[Record], found: Search, gap: Gap, shares: dict[str, float],
+    disturbance: Disturbance, remarks: tuple[str, ...],
+) -> Diagnosis:  # fmt: skip
+    fitted = summary(found.final.loop, found.final.fit)
+    errors = dict(zip(fitted.estimate.names, fitted.estimate.standard_errors.tolist(), strict=True))
+    findings = tuple(_finding(f, fitted.loop, errors, shares, found, records) for f in found.found)
+    findings = tuple(sorted(findings, key=lambda f: -f.evidence))
+    units = _units(loop, records[0])
+    where = places(found.before, found.after, units)
+    verdict: Verdict
+    if found.after.passed:
+        verdict = "explained" if findings else "nothing missing"
+    else:
+        verdict = "partly explained" if findings else "unknown"
+    notes = list(fitted.estimate.notes)
+    if not loop.free:
+        notes.append("no parameter of the model was free: a wrong value counts as a missing effect")
+    if loop.linear_plant and not found.after.passed:
+        notes.append(
+            "the model is linear; errors that depend on position, velocity or input ask for the "
+            "physics: write the plant with ct.nlsys and diagnose that"
+        )
+    before = dict(zip(found.base.names, found.base.fit.theta.tolist(), strict=True))
+    calibrated = tuple(
+        Calibrated(name, loop.parameters[name], before[name], fitted.loop.parameters[name],
+                   errors.get(name, math.nan))
+        for name in loop.free
+    )  # fmt: skip
+    tests = dict(found.after.p_values)
+    return Diagnosis(
+        verdict, conclusion(verdict, findings, gap, disturbance, found.after, where), findings,
+        fitted.loop, gap, where, _ranking(found), disturbance, calibrated, _sensitivity(found),
+        tests, remarks, tuple(notes), _name(records),
+    )  # fmt: skip
+
+
+def _name(records: Sequence[Record]) -> str:
+    names = ", ".join(dict.fromkeys(r.name or "record" for r in records))
+    size = sum(int(np.count_nonzero(r.valid)) for r in records)
+    many = f"{len(records)} records, " if len(records) > 1 else ""
+    return f"{names} ({many}{size} samples, dt = {records[0].dt:g} s)"
+
+
+def _units(loop: Loop, record: Record) -> dict[str, str]:
+    e = loop.equations()
+    known = dict(getattr(loop.plant, "units", {}))
+    y = record.units.get("y", known.get(e.outputs[0], ""))
+    u = record.units.get("u", known.get(e.inputs[0], ""))
+    units = {"time": "s", "position": y, "reference": y, "input": u,
+             "velocity": f"{y}/s" if y else ""}  # fmt: skip
+    return {**known, **units}
+
+
+def _finding(
+    f: Found, loop: Loop, errors: dict[str, float], shares: dict[str, float], found: Search,
+    records: Sequence[Record],
+) -> Finding:  # fmt: skip
+    effect = f.trial.effect_in(loop)
+    label = next(k for k, e in loop.labelled.items() if e is effect)
+    own = {n.partition(".")[2]: v for n, v in errors.items() if n.startswith(f"{label}.")}
+    same = equivalents(effect, loop)
+    others = tuple(t.fitted for t in f.rivals if t.name not in same)
+    words, reference = "", None
+    if others:
+        words, reference = separating_experiment(f.trial, f.rivals, records[0])
+    return Finding(effect, own, others, same, f.trial.gain, shares.get(f.trial.label, math.nan),
+                   words, reference, _presence(f, found))  # fmt: skip
+
+
+def _presence(f: Found, found: Search) -> str:
+    """Say in which of several records an effect was seen."""
+    problem = found.final.fit.problem
+    if len(problem.tracks) < 2 or f.base is None:
+        return ""
+    from .trial import gain_by_record
+
+    gains = gain_by_record(f.base, f.trial.model)
+    seen = [k + 1 for k, g in enumerate(gains) if g > 2.0]
+    if len(seen) == len(gains):
+        return "seen in every record"
+    return f"seen in record {', '.join(map(str, seen))} of {len(gains)} only"
+
+
+def _ranking(found: Search) -> tuple[Candidate, ...]:
+    rows = []
+    for k, step in enumerate(found.steps):
+        for t in step.trials:
+            refitted = math.isfinite(t.gain)
+            effect = t.fitted if refitted else t.effect
+            price = t.cost if refitted else t.price
+            rows.append(Candidate(k + 1, effect, t.promise, t.gain, price, t.remark))
+    return tuple(rows)
+
+
+def _sensitivity(found: Search) -> dict[str, float]:
+    """Return the size of each one-parameter effect that would have earned a place."""
+    sizes: dict[str, float] = {}
+    if not found.steps:
+        return sizes
+    for t in found.steps[-1].trials:
+        size = _visible(t)
+        key = f"{t.name}.{t.effect.parameters()[0].name}" if t.effect.parameters() else t.name
+        if math.isfinite(size) and key not in sizes:
+            sizes[key] = size
+    return sizes
+
+
+def _visible(t: Trial) -> float:
+    from ..likelihood import pseudo_inverse
+    from .decide import GATE
+
+    if len(t.effect.parameters()) != 1 or not t.label or not math.isfinite(t.promise):
+        return math.nan
+    matrix = t.model.fit.normal[0]
+    k = t.model.names.index(f"{t.label}.{t.effect.parameters()[0].name}")
+    if not matrix[k, k] > 0:
+        return math.nan
+    error = math.sqrt(max(float(pseudo_inverse(matrix)[k, k]), 0.0))
+    return error * math.sqrt(2 * (GATE + t.price))

@@ -1,0 +1,214 @@
+"""Whether innovations are noise: tests that name nothing but miss little."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from ..likelihood import Fit
+from ..physics import Array
+from .result import Place
+
+LAGS = 25
+BINS = 12
+FEWEST = 40  # samples in a bin
+ALPHA = 1e-3  # chance of one false alarm over all tests together
+
+
+@dataclass(frozen=True, eq=False)
+class Omnibus:
+    """Probabilities that the innovations are noise, by test, and where they are not.
+
+    `axes` holds for each quantity its values at the samples that count.
+    """
+
+    p_values: Mapping[str, float]
+    z: Array
+    axes: Mapping[str, Array]
+
+    @property
+    def worst(self) -> tuple[str, float]:
+        """The most telling test, and its probability after paying for the number of tests."""
+        name = min(self.p_values, key=lambda k: self.p_values[k])
+        return name, min(1.0, self.p_values[name] * len(self.p_values))
+
+    @property
+    def passed(self) -> bool:
+        """Whether nothing but noise is seen."""
+        return self.worst[1] > ALPHA
+
+
+def omnibus(fit: Fit) -> Omnibus:
+    """Test the innovations of a fit.
+
+    Whiteness, independence of past input and reference, one line in the spectrum, heavy tails and
+    isolated events, and mean and mean square in bins of time, position, velocity, input and
+    reference.
+
+    Parameters
+    ----------
+    fit : Fit
+        The fitted model.
+
+    Returns
+    -------
+    Omnibus
+        The probabilities.
+
+    References
+    ----------
+    Ljung and Box, Biometrika 65 (1978) 297-303; Fisher, Proceedings of the Royal Society A 125
+    (1929) 54-59.
+    """
+    parts: dict[str, list[Array]] = {}
+    white = cross = 0.0
+    white_df = cross_df = 0
+    lines, tails = [], []
+    p = len(fit.theta)
+    for z, out, track in zip(fit.standardized, fit.filtered, fit.problem.tracks, strict=True):
+        keep = np.isfinite(z)
+        filled = np.where(keep, z, 0.0)
+        n = int(keep.sum())
+        rho = np.array([filled[k:] @ filled[: len(z) - k] for k in range(1, LAGS + 1)]) / n
+        white += n * float(np.sum(rho**2))
+        white_df += LAGS
+        value, df = _cross(filled, keep, track.table[1], track.table[2])
+        cross += value
+        cross_df += df
+        lines.append(_line(filled, n))
+        tails.append(z[keep])
+        for name, values in _axes(fit, out, track).items():
+            parts.setdefault(name, []).append(values[keep])
+    z = np.concatenate(tails)
+    axes = {name: np.concatenate(v) for name, v in parts.items()}
+    p_values = {
+        "whiteness": float(stats.chi2.sf(white, max(white_df - p, 1))),
+        "independence of past signals": float(stats.chi2.sf(cross, max(cross_df - p, 1))),
+        "a single line in the spectrum": min(1.0, min(lines) * len(lines)),
+        **_tails(z),
+    }
+    for name, values in axes.items():
+        mean, square = _binned(z, values)
+        p_values[f"mean by {name}"] = mean
+        p_values[f"size by {name}"] = square
+    return Omnibus(p_values, z, axes)
+
+
+def _cross(z: Array, keep: Array, u: Array, r: Array) -> tuple[float, int]:
+    """Return the gain of regressing innovations on past input and reference, and its freedom."""
+    columns = []
+    for signal in (u, r):
+        moved = np.diff(signal, prepend=signal[0])
+        if np.std(moved) > 0:
+            columns += [np.roll(moved, k) for k in (1, 2, 3, 4, 6, 9, 14)]
+            columns.append(np.roll(signal, 1) - np.mean(signal))
+    if not columns:
+        return 0.0, 0
+    x = np.column_stack(columns)[20:][keep[20:]]
+    x = x - x.mean(axis=0)
+    size = np.sqrt(np.mean(x**2, axis=0))
+    x = x[:, size > 0] / size[size > 0]
+    target = z[20:][keep[20:]]
+    q, triangle = np.linalg.qr(x)
+    good = np.abs(np.diag(triangle)) > 1e-6 * np.abs(np.diag(triangle)).max(initial=0.0)
+    return float(np.sum((q[:, good].T @ target) ** 2)), int(good.sum())
+
+
+def _line(z: Array, n: int) -> float:
+    """Return the probability that noise has as strong a line, of Fisher's test."""
+    power = np.abs(np.fft.rfft(z))[1:-1] ** 2 / n
+    return float(-np.expm1(len(power) * np.log1p(-np.exp(-power.max(initial=0.0)))))
+
+
+def _tails(z: Array) -> dict[str, float]:
+    n = len(z)
+    excess = float(np.mean(z**4) / np.mean(z**2) ** 2 - 3.0)
+    largest = float(np.max(np.abs(z)))
+    return {
+        "heavy tails": float(2 * stats.norm.sf(abs(excess) / math.sqrt(24.0 / n))),
+        "isolated events": float(-np.expm1(n * np.log1p(-2 * stats.norm.sf(largest)))),
+    }
+
+
+def _axes(fit: Fit, out: object, track: object) -> dict[str, Array]:
+    e = fit.problem.machine.e
+    states = out.trajectory.predicted  # type: ignore[attr-defined]
+    table = track.table  # type: ignore[attr-defined]
+    # The input of the same sample is computed from the very output that is predicted.
+    axes = {"time": table[0], "input": np.concatenate([table[1][:1], table[1][:-1]])}
+    moving = [k for k in range(len(e.states) - len(e.rest)) if k not in e.velocities]
+    for k in moving:
+        axes["position" if e.velocities and len(moving) == 1 else e.states[k]] = states[:, k]
+    for k in e.velocities:
+        axes["velocity" if len(e.velocities) == 1 else e.states[k]] = states[:, k]
+    if track.record.r is not None:  # type: ignore[attr-defined]
+        axes["reference"] = table[2]
+    return {name: v for name, v in axes.items() if np.ptp(v) > 0}
+
+
+def bin_edges(values: Array, bins: int = BINS) -> Array:
+    """Return edges of bins that hold equally many samples."""
+    edges = np.unique(np.quantile(values, np.linspace(0, 1, bins + 1)))
+    return edges if len(edges) > 2 else np.array([values.min(), values.mean(), values.max()])
+
+
+def bin_index(values: Array, edges: Array) -> Array:
+    """Return the bin of each value."""
+    return np.clip(np.searchsorted(edges, values, side="right") - 1, 0, len(edges) - 2)
+
+
+def _binned(z: Array, values: Array) -> tuple[float, float]:
+    """Return the probabilities that mean and mean square in bins are those of noise."""
+    edges = bin_edges(values)
+    index = bin_index(values, edges)
+    count = np.bincount(index, minlength=len(edges) - 1)
+    use = count >= FEWEST
+    if use.sum() < 2:
+        return 1.0, 1.0
+    mean = np.bincount(index, z, minlength=len(count))[use] / count[use]
+    square = np.bincount(index, z**2, minlength=len(count))[use] / count[use]
+    flat = float(np.mean(z**4) / np.mean(z**2) ** 2 - 1.0)
+    level = float(np.average(square, weights=count[use]))
+    chi_mean = float(np.sum(count[use] * mean**2))
+    chi_square = float(np.sum(count[use] * (square - level) ** 2) / max(flat, 0.5))
+    return (
+        float(stats.chi2.sf(chi_mean, use.sum())),
+        float(stats.chi2.sf(chi_square, use.sum() - 1)),
+    )
+
+
+def places(before: Omnibus, after: Omnibus, units: Mapping[str, str]) -> tuple[Place, ...]:
+    """Return where the innovations are not noise, before and after; most telling first."""
+    found = []
+    for name, values in before.axes.items():
+        if name not in after.axes or len(after.axes[name]) != len(values):
+            continue
+        edges = bin_edges(values)
+        index = bin_index(values, edges)
+        count = np.maximum(np.bincount(index, minlength=len(edges) - 1), 1)
+        sizes = [np.bincount(index, o.z**2, minlength=len(count)) / count for o in (before, after)]
+        p = [min(1.0, 2 * min(o.p_values[f"{what} by {name}"] for what in ("mean", "size")))
+             for o in (before, after)]  # fmt: skip
+        words = _words(name, units.get(name, ""), edges, before.z, index, count)
+        found.append((name, edges, *sizes, *p, words))
+    found.sort(key=lambda row: row[4])
+    return tuple(
+        Place(name, units.get(name, ""), edges, b, a, p0, p1, words)
+        for name, edges, b, a, p0, p1, words in found
+    )
+
+
+def _words(name: str, unit: str, edges: Array, z: Array, index: Array, count: Array) -> str:
+    mean = np.bincount(index, z, minlength=len(count)) / count
+    square = np.bincount(index, z**2, minlength=len(count)) / count
+    strength = np.sqrt(count) * np.abs(mean)
+    spread = np.sqrt(count / 2) * np.abs(square - 1)
+    k = int(np.argmax(np.maximum(strength, spread)))
+    between = f"{name} {edges[k]:.4g} to {edges[k + 1]:.4g} {unit}".rstrip()
+    if strength[k] >= spread[k]:
+        way = "above" if mean[k] > 0 else "below"
+        return f"at {between} the output lies {way} its prediction, by {abs(mean[k]):.2g} sigma"
+    way = "larger" if square[k] > 1 else "smaller"
+    return f"at {between} the prediction errors are {way}: {math.sqrt(square[k]):.3g} times noise"

@@ -1,0 +1,186 @@
+"""Where along a frequency, a length or the time an effect would have to sit."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from ..effects import AbstractEffect, FlexibleMode, ParameterStep, PeriodicForce, PositionRipple
+from ..likelihood import pseudo_inverse
+from ..physics import Array
+from .trial import Model, Trial, attempt
+
+COLUMNS = 2_000_000  # numbers in a block of shapes at once
+LENGTHS = 150  # wavelengths that are looked for in the travel
+TIMES = 40  # instants at which a parameter might have stepped
+MODES = 7  # frequencies at which a flexible mode is tried
+
+
+def promises(
+    model: Model, shapes: Sequence[Array], parameter: str | None = None, width: int = 1
+) -> tuple[Array, Array]:
+    r"""Return what forces of given shapes would gain, with the model's parameters moving along.
+
+    .. math:: \tfrac12 g^T H^{-1} g, \quad g = \sum_k \psi_k e_k / s_k, \quad
+        H = \sum_k \psi_k \psi_k^T / s_k
+
+    where psi is what the shape does to the predictions, projected on what the model's own
+    parameters cannot do.
+
+    Parameters
+    ----------
+    model : Model
+        The fitted model.
+    shapes : sequence of ndarray, shape (n, shapes)
+        For each record, the shapes over its samples.
+    parameter : str, optional
+        What is modulated: by default a force, else the named parameter of the model.
+    width : int, optional
+        Neighbouring shapes that belong together, such as a sine and a cosine.
+
+    Returns
+    -------
+    gains : ndarray, shape (shapes / width,)
+        Gains of log-likelihood.
+    sizes : ndarray, shape (shapes / width, width)
+        The sizes that the first step gives them.
+    """
+    fit = model.fit
+    m, count = fit.problem.machine, shapes[0].shape[1]
+    samples = max(len(s) for s in shapes)
+    step = max(width, COLUMNS // (samples * (m.size + 1)) // width * width)
+    gains, sizes = [], []
+    p = len(fit.theta)
+    for first in range(0, count, step):
+        size = min(step, count - first)
+        matrix, score = np.zeros((p + size, p + size)), np.zeros(p + size)
+        for track, lin, keep, r, shape in zip(
+            fit.problem.tracks, fit.linearized, fit.problem.counts, fit.sensor, shapes, strict=True
+        ):
+            part = shape[:, None, first : first + size]
+            if parameter is None:
+                extra = lin.b.sum(axis=2)[:, :, None] * part
+            else:
+                extra = lin.dp[:, :, m.names.index(parameter)][:, :, None] * part
+            wide = replace(
+                lin, dp=np.concatenate([lin.dp, extra], axis=2),
+                hp=np.concatenate([lin.hp, np.zeros((len(shape), size))], axis=1),
+            )  # fmt: skip
+            out = m.run(track, wide, fit.noise, columns=p + size)
+            slopes, s = out.slopes[keep], out.variance[keep] * r
+            weighted = slopes / s[:, None]
+            matrix += weighted.T @ slopes
+            score += weighted.T @ out.innovations[keep]
+        own = pseudo_inverse(matrix[:p, :p]) if p else np.zeros((0, 0))
+        through = matrix[p:, :p] @ own
+        left = matrix[p:, p:] - through @ matrix[:p, p:]
+        push = score[p:] - through @ score[:p]
+        for k in range(0, size, width):
+            rows = slice(k, k + width)
+            amount = pseudo_inverse(left[rows, rows]) @ push[rows]
+            gains.append(0.5 * float(push[rows] @ amount))
+            sizes.append(amount)
+    return np.array(gains), np.array(sizes)
+
+
+def scanned(model: Model, effect: AbstractEffect) -> Trial:
+    """Return the trial of an effect at the place where it promises most.
+
+    Parameters
+    ----------
+    model : Model
+        The fitted model.
+    effect : AbstractEffect
+        An effect with a frequency, a period or a time to be looked for; others are tried as
+        they are.
+
+    Returns
+    -------
+    Trial
+        The best place, which has paid for the search.
+    """
+    search = SCANS.get(type(effect))
+    return attempt(model, effect) if search is None else search(model, effect)
+
+
+def _wave(size: Array) -> tuple[float, float]:
+    """Return amplitude and phase of ``size[0] sin + size[1] cos``."""
+    return float(np.hypot(*size)), float(np.arctan2(size[1], size[0]))
+
+
+def _periodic(model: Model, effect: PeriodicForce) -> Trial:
+    z, records = model.fit.standardized, [t.record for t in model.fit.problem.tracks]
+    longest = int(np.argmax([len(v) for v in z]))
+    n, dt = len(z[longest]), records[longest].dt
+    power = np.abs(np.fft.rfft(np.nan_to_num(z[longest]), 4 * n)) ** 2
+    power[: max(8, 1)] = 0.0  # slower than two periods: a drift, not a vibration
+    frequency = int(np.argmax(power)) / (4 * n * dt)
+    shapes = []
+    for record in records:
+        t = record.t - record.start
+        angle = 2 * np.pi * frequency * t
+        shapes.append(np.column_stack([np.sin(angle), np.cos(angle)]))
+    _, sizes = promises(model, shapes, width=2)
+    amplitude, phase = _wave(sizes[0])
+    start = replace(effect, amplitude=amplitude, frequency=frequency, phase=phase)
+    return attempt(model, start, math.log(n / 2))
+
+
+def _ripple(model: Model, effect: PositionRipple) -> Trial:
+    m = model.fit.problem.machine
+    ways = [out.trajectory.filtered[:, m.position] for out in model.fit.filtered]
+    travel = max(float(np.ptp(w[k])) for w, k in zip(ways, model.fit.problem.counts, strict=True))
+    step = max(float(np.median(np.abs(np.diff(w)))) for w in ways)
+    shortest = max(travel / LENGTHS, 4 * step)
+    if not travel > 2 * shortest:
+        return Trial(effect, "", model, -math.inf, remark="the travel is too short to see a ripple")
+    waves = np.arange(1.0 / travel, 1.0 / shortest, 0.5 / travel)
+
+    def shapes(waves: Array) -> list[Array]:
+        angles = [2 * np.pi * np.outer(w, waves) for w in ways]
+        return [
+            np.stack([np.sin(a), np.cos(a)], axis=2).reshape(len(a), -1) for a in angles
+        ]  # fmt: skip
+
+    block = max(1, COLUMNS // (2 * (m.size + 1) * max(len(w) for w in ways)))
+    parts = [promises(model, shapes(waves[k : k + block]), width=2)
+             for k in range(0, len(waves), block)]  # fmt: skip
+    gains, sizes = (np.concatenate(x) for x in zip(*parts, strict=True))
+    best = int(np.argmax(gains))
+    amplitude, phase = _wave(sizes[best])
+    start = replace(effect, amplitude=amplitude, period=float(1 / waves[best]), phase=phase)
+    return attempt(model, start, math.log(max(len(waves) / 2, 1)))
+
+
+def _step(model: Model, effect: ParameterStep) -> Trial:
+    if effect.name not in model.names:
+        return attempt(model, effect)
+    records = [t.record for t in model.fit.problem.tracks]
+    last = max(r.t[-1] - r.start for r in records)
+    times = np.linspace(0.0, last, TIMES + 2)[1:-1]
+    shapes = [(r.t - r.start)[:, None] >= times for r in records]
+    gains, sizes = promises(model, [s.astype(float) for s in shapes], effect.name)
+    best = int(np.argmax(gains))
+    value = float(model.fit.theta[model.names.index(effect.name)])
+    size = float(sizes[best, 0]) / value if value else 0.0
+    start = replace(effect, time=float(times[best]), size=min(max(size, -0.9), 10.0))
+    return attempt(model, start, math.log(TIMES))
+
+
+def _mode(model: Model, effect: FlexibleMode) -> Trial:
+    record = model.fit.problem.tracks[0].record
+    slowest = 5.0 / (len(record) * record.dt)
+    grid = np.geomspace(max(slowest, 1e-2 / record.dt / 10), 0.35 / record.dt, MODES)
+    trials = [attempt(model, replace(effect, frequency=float(f), damping=0.1, coupling=0.0),
+                      math.log(MODES)) for f in grid]  # fmt: skip
+    return max(trials, key=lambda t: t.promise)
+
+
+SCANS: dict[type, Callable[[Model, Any], Trial]] = {
+    PeriodicForce: _periodic,
+    PositionRipple: _ripple,
+    ParameterStep: _step,
+    FlexibleMode: _mode,
+}

@@ -1,0 +1,62 @@
+"""The verdict in one sentence or two."""
+
+from collections.abc import Sequence
+
+from .._text import number
+from .omnibus import Omnibus
+from .result import Disturbance, Finding, Gap, Place, Verdict
+
+LARGE = 0.5  # share of the floor's variance that a random force may make unmentioned
+
+
+def conclusion(
+    verdict: Verdict, findings: Sequence[Finding], gap: Gap, disturbance: Disturbance,
+    after: Omnibus, where: Sequence[Place],
+) -> str:  # fmt: skip
+    """Return the verdict with what it rests on.
+
+    Parameters
+    ----------
+    verdict : str
+        The verdict.
+    findings : sequence of Finding
+        The effects found.
+    gap : Gap
+        The gap.
+    disturbance : Disturbance
+        The random forces.
+    after : Omnibus
+        The tests of what is left.
+    where : sequence of Place
+        Where the disagreement sits.
+
+    Returns
+    -------
+    str
+        One to three sentences.
+    """
+    names = " and ".join(" or ".join(f.names) for f in findings)
+    name, p = after.worst
+    if verdict == "nothing missing":
+        text = "At the sensitivity of this record, what is left is noise."
+    elif verdict == "explained":
+        text = f"Missing was {names}; with it, what is left is noise."
+        if len(findings) > 1:
+            text = f"Missing were {names}; with them, what is left is noise."
+    elif verdict == "partly explained":
+        text = (f"{names} explains part of the gap. Something else remains that no known effect "
+                f"accounts for: the test of {name} fails (p = {p:.1g}).")  # fmt: skip
+    else:
+        text = (f"Something is missing, but none of the known effects accounts for it: the test of "
+                f"{name} fails (p = {p:.1g}).")  # fmt: skip
+    left = [w for w in where if w.p_after < 1e-4]
+    if left and verdict in ("partly explained", "unknown"):
+        text += f" It shows along {' and '.join(w.axis for w in left[:2])}."
+    if disturbance.share > LARGE:
+        kind = "A random force"
+        if disturbance.coloured:
+            kind = (f"A slowly varying random force of {number(disturbance.coloured, 2)} with a "
+                    f"time constant of {number(disturbance.time_constant, 2)} s")  # fmt: skip
+        text += (f" {kind} makes {100 * disturbance.share:.0f} % of the noise floor's variance: "
+                 "it is counted as noise here, and may hide a cause of its own.")  # fmt: skip
+    return text

@@ -1,0 +1,276 @@
+"""Trying an effect: what it promises, and what it gives when everything is refitted."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ..data import Record
+from ..effects import AbstractEffect
+from ..errors import CtrlidError
+from ..filtering import Machine, Trajectory, machine_for, make_track
+from ..likelihood import Fit, Problem, begin, climb, evaluate, pseudo_inverse
+from ..loop import Loop
+from ..loop_fit import bounds_of, choose_noise, start_values
+from ..physics import Array
+
+SCREEN_ROUNDS = 14  # of a refit: a candidate that needs more is not the missing effect
+SEEN = 1e-7  # share of a parameter's information that others must leave to it
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A loop fitted to the records, the base that candidates are added to."""
+
+    loop: Loop
+    fit: Fit
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The parameters that were fitted."""
+        return self.fit.problem.machine.names
+
+    @property
+    def fitted(self) -> Loop:
+        """The loop with the fitted values."""
+        values = dict(zip(self.names, self.fit.theta.tolist(), strict=True))
+        return self.loop.with_parameters(values)
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """A candidate added to a model.
+
+    `promise` is the gain of log-likelihood that the first step expects, `gain` what the refit gave,
+    `cost` half the Bayesian penalty of its parameters and of what was scanned.
+    """
+
+    effect: AbstractEffect
+    label: str
+    model: Model
+    promise: float
+    scan: float = 0.0
+    gain: float = math.nan
+    cost: float = math.nan
+    remark: str = ""
+
+    @property
+    def name(self) -> str:
+        """The name of the effect; drifts and steps belong to a parameter."""
+        return type(self.effect).__name__
+
+    def effect_in(self, loop: Loop) -> AbstractEffect:
+        """Return this effect as it is in another fit of the loop."""
+        known = loop.labelled
+        if type(known.get(self.label)) is type(self.effect):
+            return known[self.label]
+        return next(e for e in known.values() if type(e) is type(self.effect))
+
+    @property
+    def price(self) -> float:
+        """Half the Bayesian penalty if all its parameters count."""
+        size = self.model.fit.size
+        return 0.5 * len(self.effect.parameters()) * math.log(size) + self.scan
+
+    @property
+    def merit(self) -> float:
+        """Gain less penalty; minus infinity for what is out."""
+        if self.remark or not math.isfinite(self.gain):
+            return -math.inf
+        return self.gain - self.cost
+
+    @property
+    def fitted(self) -> AbstractEffect:
+        """The effect with its fitted parameters."""
+        return self.model.fitted.labelled[self.label]
+
+
+def base_model(loop: Loop, records: Sequence[Record], names: Sequence[str]) -> Model:
+    """Fit the model as it is, with the noise that the data want."""
+    m = machine_for(loop, tuple(names), records[0])
+    lower, upper = bounds_of(loop, names)
+    problem = Problem(m, tuple(make_track(loop, r) for r in records), lower, upper)
+    fit = climb(begin(problem, start_values(loop, names), None))
+    return Model(loop, choose_noise(fit))
+
+
+def attempt(base: Model, effect: AbstractEffect, scan: float = 0.0) -> Trial:
+    """Add an effect, as it is or nearer to nothing, and ask what a first step would gain.
+
+    An effect that is faint is tried faint: far from there the first step promises nothing. The
+    arguments are those of `attempt_at`.
+    """
+    trials = [attempt_at(base, effect, scan)]
+    if not effect.neutral and trials[0].promise < 0:
+        fainter = _fainter(effect)
+        trials += [attempt_at(base, fainter, scan)] if fainter else []
+    return max(trials, key=lambda t: t.promise)
+
+
+def _fainter(effect: AbstractEffect) -> AbstractEffect | None:
+    """Return an effect with a tenth of its size; None where that has no meaning."""
+    sizes = {
+        p.name: p.neutral + 0.1 * (getattr(effect, p.name) - p.neutral)
+        for p in effect.parameters()
+        if p.neutral is not None and math.isfinite(p.neutral)
+    }
+    return replace(effect, **sizes) if sizes else None
+
+
+def attempt_at(base: Model, effect: AbstractEffect, scan: float = 0.0) -> Trial:
+    """Add an effect as it is to a model and ask what the first step would gain.
+
+    Parameters
+    ----------
+    base : Model
+        The fitted model.
+    effect : AbstractEffect
+        The candidate at its start.
+    scan : float, optional
+        Logarithm of the number of places at which it was looked for before.
+
+    Returns
+    -------
+    Trial
+        With `promise`; a `remark` if the filter cannot follow the record with it.
+    """
+    try:
+        loop = base.fitted.with_effect(effect)
+    except CtrlidError as reason:
+        return Trial(effect, "", base, -math.inf, scan, remark=str(reason))
+    label = next(k for k in loop.labelled if k not in base.loop.labelled)
+    own = [f"{label}.{k}" for k, v in effect.values().items() if math.isfinite(v)]
+    names = (*base.names, *own)
+    try:
+        fit = _extended(base, loop, names)
+    except CtrlidError as reason:
+        return Trial(effect, label, base, -math.inf, scan, remark=str(reason))
+    model = Model(loop, fit)
+    if not math.isfinite(fit.value):
+        return Trial(effect, label, model, -math.inf, scan, remark="cannot follow the record")
+    matrix, score = fit.normal
+    gain = 0.5 * float(_promised(fit, matrix, score))
+    return Trial(effect, label, model, fit.value - base.fit.value + gain, scan)
+
+
+def _promised(fit: Fit, matrix: Array, score: Array) -> float:
+    """Return twice the gain of a Gauss-Newton step that stays within the bounds."""
+    problem = fit.problem
+    moving = np.diag(matrix) > 0
+    for _ in range(len(score)):
+        rows = np.flatnonzero(moving)
+        if not len(rows):
+            return 0.0
+        step = pseudo_inverse(matrix[np.ix_(rows, rows)]) @ score[rows]
+        out = ((fit.theta[rows] <= problem.lower[rows]) & (step < 0)) | (
+            (fit.theta[rows] >= problem.upper[rows]) & (step > 0)
+        )
+        if not out.any():
+            return float(score[rows] @ step)
+        moving[rows[out]] = False
+    return 0.0
+
+
+def _extended(base: Model, loop: Loop, names: Sequence[str]) -> Fit:
+    """Return the likelihood of a larger model at its start, along the base's trajectory."""
+    old = base.fit.problem
+    m = Machine(loop, names, old.machine.hold, old.machine.law is not None)
+    tracks = tuple(make_track(loop, t.record) for t in old.tracks)
+    lower, upper = bounds_of(loop, names)
+    problem = Problem(m, tracks, lower, upper, old.counts)
+    theta = np.clip(start_values(loop, names), lower, upper)
+    at = [
+        _carried(old.machine, m, out.trajectory, m.guess(track))
+        for out, track in zip(base.fit.filtered, tracks, strict=True)
+    ]
+    fit = evaluate(problem, theta, base.fit.noise, at)
+    if math.isfinite(fit.value) and m.n > old.machine.n:
+        fit = evaluate(problem, theta, base.fit.noise, [o.trajectory for o in fit.filtered])
+    return fit
+
+
+def _carried(old: Machine, new: Machine, known: Trajectory, guess: Trajectory) -> Trajectory:
+    """Take states that both have from the old trajectory, and guess the others."""
+    columns = [(list(new.e.states).index(s), k) for k, s in enumerate(old.e.states)]
+    columns += [(new.n + k, old.n + k) for k in range(old.size - old.n)]
+    result = []
+    for mine, theirs in ((guess.predicted, known.predicted), (guess.filtered, known.filtered),
+                         (guess.spread, known.spread)):  # fmt: skip
+        mixed = mine.copy()
+        for i, k in columns:
+            mixed[:, i] = theirs[:, k]
+        result.append(mixed)
+    return Trajectory(*result)
+
+
+def refit(base: Model, trial: Trial) -> Trial:
+    """Refit a candidate together with the model and its noise."""
+    if trial.remark:
+        return trial
+    try:
+        fit = climb(trial.model.fit, rounds=SCREEN_ROUNDS, exact=False)
+    except CtrlidError as reason:
+        return replace(trial, remark=str(reason))
+    model = Model(trial.model.loop, fit)
+    own = _own_parameters(trial, fit)
+    cost = 0.5 * own * math.log(fit.size) + trial.scan
+    done = replace(trial, model=model, gain=fit.value - base.fit.value, cost=cost)
+    return replace(done, remark=_objection(done))
+
+
+def _own_parameters(trial: Trial, fit: Fit) -> int:
+    """Count the parameters of the effect that the record determines."""
+    matrix, _ = fit.normal
+    own = [k for k, n in enumerate(fit.problem.machine.names) if n.startswith(f"{trial.label}.")]
+    size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    scaled = matrix / np.outer(size, size)
+    rest = [k for k in range(len(size)) if k not in own]
+    left = scaled[np.ix_(own, own)]
+    if rest:
+        cross = scaled[np.ix_(own, rest)]
+        left = left - cross @ np.linalg.pinv(scaled[np.ix_(rest, rest)], rcond=SEEN) @ cross.T
+    return max(1, int(np.sum(np.linalg.eigvalsh(left) > SEEN)))
+
+
+def _objection(trial: Trial) -> str:
+    """Say why a fitted effect cannot be what is missing, if so."""
+    effect = trial.fitted
+    if effect.neutral:
+        return "vanishes when refitted"
+    fit, names = trial.model.fit, trial.model.names
+    for k, name in enumerate(names):
+        if not name.startswith(f"{trial.label}."):
+            continue
+        low, high = fit.problem.lower[k], fit.problem.upper[k]
+        about = next(p for p in effect.parameters() if p.name == name.partition(".")[2])
+        if about.neutral is not None and fit.theta[k] in (low, high) and about.neutral not in (
+            low, high
+        ):  # fmt: skip
+            return f"{about.name} ends on its bound {fit.theta[k]:g}"
+    return ""
+
+
+def log_terms(fit: Fit) -> Array:
+    """Return each sample's share of the log-likelihood, records one after the other."""
+    parts: list[Any] = []
+    for out, keep, r in zip(fit.filtered, fit.problem.counts, fit.sensor, strict=True):
+        s = out.variance[keep] * r
+        parts.append(-0.5 * (np.log(2 * np.pi * s) + out.innovations[keep] ** 2 / s))
+    return np.concatenate(parts)
+
+
+def reduced(model: Model, loop: Loop, names: Sequence[str]) -> Fit:
+    """Return the likelihood of a smaller model at the larger one's values."""
+    return _extended(model, loop, names)
+
+
+def gain_by_record(without: Model, with_effect: Model) -> Array:
+    """Return the gain of log-likelihood in each record."""
+    sums = []
+    for model in (without, with_effect):
+        counts = [int(np.count_nonzero(c)) for c in model.fit.problem.counts]
+        parts = np.split(log_terms(model.fit), np.cumsum(counts)[:-1])
+        sums.append([float(p.sum()) for p in parts])
+    return np.array(sums[1]) - np.array(sums[0])
