@@ -146,10 +146,16 @@ class Simulator:
     ----------
     loop : Loop
         The loop.
+    tolerance : float, optional
+        Local error of a step, relative to the excursion of each state.
+    most : int, optional
+        Integration steps per period at most.
     """
 
-    def __init__(self, loop: Loop) -> None:
-        self.loop = loop
+    def __init__(
+        self, loop: Loop, tolerance: float = TOLERANCE, most: int = MOST_SUBSTEPS
+    ) -> None:  # fmt: skip
+        self.loop, self.tolerance, self.most = loop, tolerance, most
         first = stepper(loop, 1)
         self.plant_states = first.plant_states
         self.rest: Array = np.array(first.rest, dtype=float)
@@ -219,7 +225,7 @@ class Simulator:
                 largest = np.max(errors[:, :good], axis=1, initial=0.0)
                 with np.errstate(all="ignore"):
                     error = float(np.max(np.where(largest > 0, largest / moved, 0.0)))
-                if (stop is None and error <= TOLERANCE) or substeps >= MOST_SUBSTEPS:
+                if (stop is None and error <= self.tolerance) or substeps >= self.most:
                     break
                 if stop is not None and stop == previous_stop and good and error <= COARSE:
                     break  # accurate until then, and finer steps leave at the same sample
@@ -234,9 +240,9 @@ class Simulator:
                 worst, where = error, first
             y[first : first + count], u[first : first + count] = ys[0], us[0]
             z, reach = states[:, -1], moved
-            if error < TOLERANCE / 1e4 and substeps > 1:
+            if error < self.tolerance / 1e4 and substeps > 1:
                 substeps //= 2
-        if worst > COARSE:
+        if worst > COARSE and self.most == MOST_SUBSTEPS:
             warnings.warn(
                 f"the simulation is only good to about {worst:.0e} of the signals near t = "
                 f"{where * loop.dt:.4g} s: the plant or the controller is too sharp or too fast "

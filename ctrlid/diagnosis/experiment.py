@@ -11,6 +11,7 @@ from ..errors import CtrlidError
 from ..physics import Array
 from ..signals import random_binary
 from ..simulation import Simulator
+from .gap import FEW_STEPS, ROUGH
 from .trial import Trial
 
 LONGEST = 20_000  # samples of a recommended experiment
@@ -50,7 +51,7 @@ def separating_experiment(
     models = []
     for trial in (best, *others):
         try:
-            models.append(Simulator(trial.model.fitted))
+            models.append(Simulator(trial.model.fitted, ROUGH, FEW_STEPS))
         except CtrlidError:
             continue
     chosen: tuple[float, str, Array] | None = None

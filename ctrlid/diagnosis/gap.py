@@ -21,6 +21,8 @@ from ..simulation import Simulator
 from ..stepping import growth_rate
 from ..validation import best_start, time_constant
 
+ROUGH = 1e-5  # local error of the integration, far below any gap worth a word
+FEW_STEPS = 8  # of the integration in a period; sharp friction would ask for many more
 RUNS = 3  # simulations with noise for the floor
 HELD = 0.25  # share of a record that is kept back for the comparison
 START = 0.02  # share of a stretch in which the guess of the initial state may still show
@@ -96,7 +98,7 @@ def _output(loop: Loop, record: Record, kind: str) -> Array:
             index, values = predict_ahead(loop, record, predict(loop, record), _steps(kind))
             y[index] = values
             return y
-        simulator = Simulator(loop)
+        simulator = Simulator(loop, ROUGH, FEW_STEPS)
     except CtrlidError:
         return y
     for start, stop in record.segments():
@@ -178,7 +180,7 @@ def _floor(
         found = predict(loop, record)
         found = found if force else replace(found, force_noise=0.0)
         return spread_ahead(loop, record, found, _steps(kind))
-    simulator = Simulator(loop)
+    simulator = Simulator(loop, ROUGH, FEW_STEPS)
     values = []
     for start, stop in record.segments():
         use = mask[start:stop]

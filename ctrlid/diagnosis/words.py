@@ -73,16 +73,22 @@ def headline(found: Diagnosis) -> str:
 
 def _wrapped(text: str, indent: int, hang: int | None = None) -> list[str]:
     later = " " * (indent if hang is None else hang)
-    return textwrap.wrap(text, WIDTH, initial_indent=" " * indent, subsequent_indent=later,
-                         break_on_hyphens=False)  # fmt: skip
+    for sign in ("=", "±"):  # no line ends beside them
+        text = text.replace(f" {sign} ", f"\xa0{sign}\xa0")
+    lines = textwrap.wrap(text, WIDTH, initial_indent=" " * indent, subsequent_indent=later,
+                          break_on_hyphens=False)  # fmt: skip
+    return [line.replace("\xa0", " ") for line in lines]
 
 
 def gap_rows(gap: Gap) -> list[tuple[str, str, str]]:
     """Return what the gap is, how large, and how many times the noise floor, row by row."""
     known = [v for v in (gap.floor, gap.after, gap.before) if 0 < v < math.inf]
     factor, unit = prefix(known[0] if known else 0.0, gap.unit)
+    places = 2 - math.floor(math.log10(factor * min(known))) if known else 0
 
     def size(value: float) -> str:
+        if math.isfinite(value) and places <= 6:
+            return f"{factor * value:.{max(places, 0)}f} {unit}".strip()
         if math.isfinite(value):
             return f"{number(factor * value, 3)} {unit}".strip()
         return "none" if math.isnan(value) else "LEAVES THE PLANT'S DOMAIN"
@@ -141,7 +147,7 @@ def worst(levels: Iterable[float]) -> float:
 def place_words(place: Place) -> str:
     """Say where along its axis a place sits."""
     if place.words:
-        return place.words
+        return place.words.removeprefix(f"at {place.axis} ")
     if not np.isfinite(place.before).any():
         return "nowhere"
     k = int(np.nanargmax(place.before))
@@ -209,7 +215,7 @@ def certainty(finding: Finding, alone: bool = True) -> str:
     """
     sure = ("WEAK" if finding.evidence < STRONG else
             "strong" if finding.evidence < CERTAIN else "beyond doubt")  # fmt: skip
-    text = f"evidence {number(finding.evidence, 3)}, {sure}"
+    text = f"evidence {finding.evidence:.{0 if finding.evidence >= STRONG else 1}f}, {sure}"
     if math.isfinite(finding.share) and not alone:
         text += f"; closes {percent(finding.share)} of the squared gap above the floor"
     many = len(finding.names)
