@@ -44,7 +44,8 @@ from .predictor import Prediction, predict
 from .replay import replay_controller
 from .report import Section, write_report
 from .residuals import Correlation
-from .sampling import SamplingRow, SamplingSweep, sweep_sampling_period
+from .sampling import sweep_sampling_period
+from .sampling_table import SamplingRow, SamplingSweep
 from .signals import multisine, prbs, random_binary, steps
 from .simulation import simulate
 from .structure import OrderChoice, OrderRow, select_order

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy import stats
+from scipy import linalg, stats
 
 from .data import Record
 from .errors import CtrlidError
@@ -213,20 +213,24 @@ def _left(
     size = np.linalg.norm(table, axis=0)
     table = table[:, size > 0] / size[size > 0]
     goal = signals[target][rows] - mean[target]
-    left = goal - table @ np.linalg.lstsq(table, goal, rcond=1e-13)[0]
+    left = goal - table @ _solve(table, goal)
     for _ in range(4 if robust else 0):
         usual = 3 * 1.4826 * float(np.median(np.abs(left)))
         if usual <= NOTHING * float(np.std(goal)):
             break
         weight = np.sqrt(usual / np.maximum(np.abs(left), usual))
-        beta = np.linalg.lstsq(table * weight[:, None], goal * weight, rcond=1e-13)[0]
+        beta = _solve(table * weight[:, None], goal * weight)
         left = goal - table @ beta
         goal = table @ beta + np.clip(left, -usual, usual)
     if robust:  # clipped, it is no longer free of the past
-        left = goal - table @ np.linalg.lstsq(table, goal, rcond=1e-13)[0]
+        left = goal - table @ _solve(table, goal)
     out = np.zeros(len(valid))
     out[rows] = left
     return out, rows
+
+
+def _solve(table: FloatArray, goal: FloatArray) -> FloatArray:
+    return np.asarray(linalg.lstsq(table, goal, cond=1e-13, lapack_driver="gelsy")[0], dtype=float)
 
 
 def _order(signals: dict[str, FloatArray], valid: Any, keys: str, target: str, now: int) -> int:
@@ -272,6 +276,6 @@ def _unstable(signals: dict[str, FloatArray], valid: Any, order: int, now: int) 
     columns += [u[rows - k] - u[rows[0]] for k in range(now, order + 1)]
     table = np.column_stack([*columns, np.ones(len(rows))])
     size = np.linalg.norm(table, axis=0)
-    beta = np.linalg.lstsq(table / size, y[rows] - y[rows[0]], rcond=1e-13)[0] / size
+    beta = _solve(table / size, y[rows] - y[rows[0]]) / size
     poles = np.roots(np.concatenate([[1.0], -beta[:order]]))
     return bool(np.max(np.abs(poles)) > 1 + 1e-4)

@@ -153,6 +153,25 @@ def test_a_defect_is_found(healthy, spoil, kind, channel, share):
     assert missed <= share * len(healthy)
 
 
+@pytest.mark.slow
+def test_rates_over_many_records(capsys):
+    """False alarms and finds by kind: ``pytest -m slow tests/test_audit.py``."""
+    records, rng = random_records(800, seed=20), np.random.default_rng(21)
+    alarms = [f for loop, record in records for f in cid.audit(record, loop).findings]
+    kinds = {kind: sum(f.kind == kind for f in alarms) for kind in (*NEVER, "drift")}
+    found = {
+        f"{kind} of {channel}": sum(
+            any(f.channel == channel for f in cid.audit(spoil(rng, record))[kind])
+            for _, record in records
+        )
+        for spoil, kind, channel, _ in DEFECTS
+    }
+    with capsys.disabled():
+        print(f"\nof {len(records)}: false alarms {kinds}; found {found}")  # noqa: T201
+    assert max(kinds.values()) < 0.01 * len(records)
+    assert all(found[f"{k} of {c}"] >= (1 - s) * len(records) for _, k, c, s in DEFECTS)
+
+
 def test_quantisation_is_measured(healthy):
     rng = np.random.default_rng(3)
     for _, record in healthy:
