@@ -76,7 +76,7 @@ def filter_pass(
     row, gain = np.zeros(w), np.zeros(w)
     moved, turned = np.zeros(w), np.zeros((w, w))
     full, late = np.zeros((w, w)), np.zeros((w, p))
-    ph = np.zeros(w)
+    ph, along = np.zeros(w), np.zeros(w)
     for k in range(size):
         if afresh[k]:
             x[:] = 0.0
@@ -117,20 +117,20 @@ def filter_pass(
             for i in range(w):
                 for q in range(p):
                     sens[i, q] -= gain[i] * slopes[k, q]
-            # Joseph's form (I - K c) P (I - K c)' + K R K' stays positive whatever round-off does.
+            # Joseph's form (I - K c) P (I - K c)' + K R K' stays positive whatever round-off does;
+            # its products with c are formed once.
             for i in range(w):
+                total = 0.0
                 for j in range(w):
-                    total = cov[i, j]
-                    for l in range(n):
-                        total -= gain[i] * row[l] * cov[l, j]
-                    turned[i, j] = total
+                    value = cov[i, j] - gain[i] * ph[j]
+                    turned[i, j] = value
+                    total += value * row[j]
+                along[i] = total
             for i in range(w):
                 for j in range(i + 1):
-                    total = turned[i, j] + sensor * gain[i] * gain[j]
-                    for l in range(n):
-                        total -= turned[i, l] * row[l] * gain[j]
-                    cov[i, j] = total
-                    cov[j, i] = total
+                    value = turned[i, j] + (sensor * gain[i] - along[i]) * gain[j]
+                    cov[i, j] = value
+                    cov[j, i] = value
         for i in range(n):
             after[k, i] = x[i]
             wide[k, i] = np.sqrt(max(cov[i, i], 0.0))

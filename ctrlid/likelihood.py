@@ -14,6 +14,7 @@ from .filtering import SETTLED, Filtered, Linearized, Machine, Noise, Track, Tra
 from .physics import Array
 
 ROUNDS = 25  # Gauss-Newton steps at most
+FAR = 3.0  # standard errors: after a longer step the trajectory is settled anew
 CLOSE = 0.02  # standard errors: a smaller step ends the search
 QUIET = 1e-14  # of the output's size, squared: the least variance of the sensor noise
 LOG_STEP = 0.2  # of log variances, for derivatives
@@ -178,8 +179,9 @@ def _noise(logs: Array, channels: int, dt: float) -> Noise:
 
 
 def _tune(
-    problem: Problem, theta: Array, lins: Sequence[Linearized], noise: Noise, wide: bool = False
-) -> Fit:
+    problem: Problem, theta: Array, lins: Sequence[Linearized], noise: Noise, wide: bool = False,
+    enough: float = 0.02,
+) -> Fit:  # fmt: skip
     """Return the most likely noise for parameters as they are."""
     m, dt = problem.machine, problem.machine.loop.dt
 
@@ -200,7 +202,7 @@ def _tune(
     if len(start) == 1:
         best = _line(cost, start[0], low[0], high[0])
     else:
-        best = _newton(cost, start, low, high)
+        best = _newton(cost, start, low, high, enough)
     return _measure(problem, theta, at(best), lins)
 
 
@@ -228,7 +230,9 @@ def _limits(m: Machine, coloured: bool) -> tuple[Array, Array]:
     return np.array(low), np.array(high)
 
 
-def _newton(cost: Callable[[Array], float], x: Array, low: Array, high: Array) -> Array:
+def _newton(
+    cost: Callable[[Array], float], x: Array, low: Array, high: Array, enough: float
+) -> Array:  # fmt: skip
     """Minimise a smooth function of a few logarithms by damped Newton steps with differences."""
     n, h = len(x), LOG_STEP
     here, damping = cost(x), 0.1
@@ -255,7 +259,7 @@ def _newton(cost: Callable[[Array], float], x: Array, low: Array, high: Array) -
         if gain <= 0:
             break
         x, here, damping = trial, there, damping / 10
-        if gain < 0.02:
+        if gain < enough:
             break
     return x
 
@@ -286,21 +290,25 @@ def climb(fit: Fit, free: Any = None, rounds: int = ROUNDS, exact: bool = True) 
     problem = fit.problem
     p = len(fit.theta)
     free = np.ones(p, dtype=bool) if free is None else np.asarray(free)
-    tuned = -math.inf
+    tuned, far, enough = -math.inf, True, 0.02 if exact else 0.3
     for _ in range(rounds):
-        moved = _relinearized(fit)
+        # A short step was already evaluated along the trajectory of the pass before.
+        moved = _relinearized(fit) if far else fit
         fit = moved if np.isfinite(moved.value) else fit
+        problem = fit.problem
         if fit.value > tuned + 2.0:
-            fit = _tune(problem, fit.theta, fit.linearized, fit.noise)
+            fit = _tune(problem, fit.theta, fit.linearized, fit.noise, enough=enough)
             tuned = fit.value
         step, error = _step(fit, free)
         if not p or not np.isfinite(step).all():
             break
         fit, share = _search(fit, step)
-        if share * np.max(np.abs(step[free]) / error[free], initial=0.0) < CLOSE:
-            if fit.value <= tuned + 0.05:
+        length = share * np.max(np.abs(step[free]) / error[free], initial=0.0)
+        far = length > FAR
+        if length < (CLOSE if exact else 5 * CLOSE):
+            if fit.value <= tuned + 2.5 * enough:
                 break
-            fit = _tune(problem, fit.theta, fit.linearized, fit.noise)
+            fit = _tune(fit.problem, fit.theta, fit.linearized, fit.noise, enough=enough)
             tuned = fit.value
     return polish(fit, free) if exact else fit
 
