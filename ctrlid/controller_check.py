@@ -13,6 +13,7 @@ from .residuals import explained_share
 
 MOST = 20_000  # samples that are replayed
 TRIAL = 4000  # samples replayed for each shift that is tried
+FEWEST = 20  # samples
 STEPS = (1, -1, 2, -2, 3, -3)  # samples by which a channel may be late
 EXACT = 1e-6  # share of u's variance that rounding and printing leave
 CLEARLY = 0.1  # of the unexplained share: a shift that leaves less is believed
@@ -35,13 +36,15 @@ def check_controller(loop: Loop, record: Record) -> list[Fact]:
     -------
     list of (str, str, float, bool)
         Kind, words, share of u that the controller does not explain, and whether it is harmful;
-        empty if there is no digital controller or no reference.
+        empty if there is no digital controller, no reference, or too little to compare.
     """
     law = loop.law()
     if law is None or law.dt == 0.0 or record.r is None:
         return []
     first = int(np.argmax(record.valid))
-    part = record[first : first + MOST] if record.n - first > 1 else record
+    if record.n - first < FEWEST:
+        return []
+    part = record[first : first + MOST]
     facts: list[Fact] = []
     lower, upper = loop.input_limits
     slack = 1e-6 * (float(np.ptp(part.u)) + 1e-300)
@@ -129,7 +132,8 @@ def _remainder(e: Any, left: float, record: Record) -> Fact:
         if like > 0.9:
             return ("injected", f"besides the controller's part, u contains an injected signal of "
                     f"RMS {rms} that runs like the channel {name!r}.", left, False)  # fmt: skip
-    follows = explained_share(e, [(record.y, 0), (record.r, 0)], record.valid, lags=10)
+    moving = [(s, 0) for s in (record.y, record.r) if np.ptp(s[record.valid]) > 0]
+    follows = explained_share(e, moving, record.valid, lags=10)
     if follows > FOLLOWS:
         return ("other", f"the stated controller leaves {100 * left:.3g} % of u unexplained (RMS "
                 f"{rms}), and {100 * follows:.2g} % of that follows r and y: gains or structure "

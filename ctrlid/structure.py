@@ -147,10 +147,11 @@ def select_order(
         raise CtrlidError(f"select_order needs a Record; given {type(record).__name__}")
     grids = [_whole(name, values) for name, values in (("na", na), ("nb", nb), ("nk", nk))]
     most = max(grids[0]) + max(grids[1]) + max(grids[2])
-    for key in ("u", "y"):
-        if np.ptp(getattr(record, key)[record.valid]) == 0:
-            raise CtrlidError(f"{key} is constant: no structure shows. Excite the loop")
     cut = int(SHARE * record.n)
+    if record.valid.any():
+        for key in ("u", "y"):
+            if np.ptp(getattr(record, key)[record.valid]) == 0:
+                raise CtrlidError(f"{key} is constant: no structure shows. Excite the loop")
     length = _length(record, cut, most)
     long = _regress(record, 0, cut, length)
     judge = _rows(record, cut, record.n, length)

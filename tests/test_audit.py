@@ -332,6 +332,27 @@ def test_few_samples(n):
     assert cid.audit(none).harmful[0].size == 0
 
 
+def test_no_record_is_too_odd(servo):
+    """Ramps, spikes, constants, steps, of any size, with any gaps: findings, never an exception."""
+    for seed in range(300):
+        rng = np.random.default_rng(seed)
+        n, size = int(10 ** rng.uniform(0.31, 2.7)), 10.0 ** rng.integers(-12, 12)
+        shapes = [
+            rng.standard_normal(n),
+            np.zeros(n),
+            np.repeat(rng.choice([-1.0, 1.0], n), 7)[:n],
+            np.round(rng.standard_normal(n)),
+            np.clip(rng.standard_normal(n), -1, 1),
+            np.arange(n) * 1.0,
+            np.sin(0.1 * np.arange(n)),
+            (rng.random(n) < 0.02) * 1.0,
+        ]
+        r, u, y = (size * shapes[rng.integers(8)] + rng.choice([0, 1e3 * size]) for _ in range(3))
+        valid = rng.random(n) < rng.choice([0, 0.5, 0.95, 1])
+        record = cid.Record(r=r if seed % 3 else None, u=u, y=y, dt=0.01, valid=valid)
+        str(cid.audit(record, servo[0] if seed % 10 == 0 else None))
+
+
 def test_only_what_counts_is_looked_at(healthy):
     _, record = healthy[0]
     y = record.y.copy()
