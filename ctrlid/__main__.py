@@ -14,9 +14,13 @@ from pathlib import Path
 from tqdm import tqdm
 
 from . import __version__, plot
+from ._command import add_parser, new_folder
 from ._tables import Table
+from .diagnosis import Diagnosis
 from .errors import CtrlidError
 from .report import Section, write_report
+from .second_act import TITLES as SECOND
+from .second_act import second_act
 from .story import TITLES, story
 
 FOLDER = "ctrlid-report"
@@ -60,11 +64,16 @@ def _parser() -> argparse.ArgumentParser:
         prog="ctrlid",
         description="Identify an unstable plant in closed loop: physics, lead controller, "
         "experiment, plain and constrained fit, comparison, and a redesign tried on the physics. "
-        "Results go to the terminal; figures and report.html to a new folder.",
+        "Then find what a model lacks: an effect drawn by the seed is hidden in a record and "
+        "diagnosed without being told. Results go to the terminal; figures and report.html to a "
+        "new folder.",
     )
     parser.add_argument("--version", action="version", version=f"ctrlid {__version__}")
     parser.add_argument(
-        "--seed", type=_natural, default=1, help="of reference and noise (%(default)s)"
+        "--seed",
+        type=_natural,
+        default=1,
+        help="of reference, noise and what is hidden (%(default)s)",
     )
     parser.add_argument("--samples", type=_samples, default=45_000, metavar="N",
                         help="length of the experiment (%(default)s)")  # fmt: skip
@@ -75,6 +84,7 @@ def _parser() -> argparse.ArgumentParser:
                         help=f"folder for figures and report; by default {FOLDER}, with a number "
                         "where that exists")  # fmt: skip
     parser.add_argument("--quiet", action="store_true", help="no progress on the terminal")
+    add_parser(parser.add_subparsers(title="commands", metavar="COMMAND"))
     parser.set_defaults(run=_tell)
     return parser
 
@@ -101,21 +111,23 @@ def _share(text: str) -> float:
 
 
 def _tell(args: argparse.Namespace) -> int:
-    folder = _folder(args.output)
+    folder = new_folder(args.output, "--output", FOLDER)
     sections = []
-    chapters = story(samples=args.samples, noise=args.noise, seed=args.seed)
+    first = story(samples=args.samples, noise=args.noise, seed=args.seed)
+    chapters = itertools.chain(first, second_act(samples=args.samples, seed=args.seed))
+    titles = (*TITLES, *SECOND)
     try:
         # disable=None: silent where stderr is no terminal.
-        with tqdm(total=len(TITLES), disable=args.quiet or None, leave=False, unit="step") as bar:
-            for number, title in enumerate(TITLES, 1):
+        with tqdm(total=len(titles), disable=args.quiet or None, leave=False, unit="step") as bar:
+            for number, title in enumerate(titles, 1):
                 bar.set_description(title)
                 section = _saved(next(chapters), number, folder)
                 sections.append(section)
                 with tqdm.external_write_mode():
                     print(_text(section, number))
                 bar.update()
-        report = write_report(sections, folder / "report.html",
-                              title="An unstable plant, identified in closed loop")  # fmt: skip
+        title = "An unstable plant, identified and diagnosed in closed loop"
+        report = write_report(sections, folder / "report.html", title=title)
     except BaseException:
         if not any(folder.iterdir()):
             folder.rmdir()
@@ -123,28 +135,6 @@ def _tell(args: argparse.Namespace) -> int:
     pictures = len(list(folder.glob("*.png")))
     print(f"{pictures} figures and {report.name} are in {folder}{os.sep}")
     return 0
-
-
-def _folder(wanted: Path | None) -> Path:
-    """Make the folder; nothing that exists is touched."""
-    try:
-        if wanted is not None:
-            wanted.mkdir(parents=True, exist_ok=True)
-            if any(wanted.iterdir()):
-                raise CtrlidError(f"{wanted} is not empty and nothing is overwritten; give "
-                                  "--output a new folder")  # fmt: skip
-            return wanted
-        for number in itertools.count(1):
-            folder = Path(FOLDER if number == 1 else f"{FOLDER}-{number}")
-            try:
-                folder.mkdir()
-            except FileExistsError:
-                continue
-            return folder
-    except OSError as reason:
-        raise CtrlidError(f"cannot make a folder for the report: {reason}. Change to a directory "
-                          "that may be written to, or give --output") from reason  # fmt: skip
-    raise AssertionError("unreachable")
 
 
 def _saved(section: Section, number: int, folder: Path) -> Section:
@@ -159,12 +149,14 @@ def _saved(section: Section, number: int, folder: Path) -> Section:
 
 def _text(section: Section, number: int) -> str:
     lines = [f"{number}. {section.title}"]
-    for paragraph in section.text.split("\n\n"):
+    for paragraph in filter(None, section.text.split("\n\n")):
         lines += [textwrap.fill(paragraph, WIDTH, break_on_hyphens=False), ""]
     results = section.result if isinstance(section.result, tuple) else (section.result,)
     for table in results:
         if isinstance(table, Table):
             lines += [textwrap.indent(str(table), "    "), ""]
+        if isinstance(table, Diagnosis):
+            lines += [str(table), ""]
     return "\n".join(lines)
 
 

@@ -181,8 +181,13 @@ def _evidence(c: Candidate) -> float:
 
 
 def bin_labels(place: Place) -> tuple[list[str], str]:
-    """Return the edges of the bins of a place as labels, and their unit."""
+    """Return the edges of the bins of a place as labels, and the title of the axis."""
     known = place.edges[np.isfinite(place.edges)]
     factor, unit = scale([known], place.unit) if known.size else (1.0, place.unit)
-    return ([_text.number(factor * e, 3) if np.isfinite(e) else "" for e in place.edges],
-            unit if place.unit else "1")  # fmt: skip
+    digits = next((d for d in (2, 3, 4) if len({_text.number(e, d) for e in known}) == known.size),
+                  5)  # fmt: skip
+    labels = [_text.number(factor * e, digits) if np.isfinite(e) else "" for e in place.edges]
+    widths = np.diff(known)
+    even = widths.size == 0 or float(np.ptp(widths)) < 0.01 * float(np.max(widths))
+    title = f"{place.axis} [{unit if place.unit else '1'}]"
+    return labels, title if even else f"{title}, at the edges of the bins"

@@ -651,10 +651,10 @@ def _where(ax: Any, place: Place | None, found: Diagnosis) -> None:
     else:
         ax.bar(at + 0.5, place.before, 0.8, label="recalibrated", **solid)
     ax.axhline(1, color="k", linewidth=1.2, linestyle=":", label="noise")
-    labels, unit = _pictures.bin_labels(place)
+    labels, title = _pictures.bin_labels(place)
     every = -(-len(at) // 5)
     ax.set_xlim(0, len(at))
-    ax.set_xlabel(f"{place.axis} [{unit}]")
+    ax.set_xlabel(title)
     ax.set_ylabel("mean square error /\nthat of noise [1]")
     top = float(np.nanmax([*place.before, *place.after, 1.0]))
     _finish(ax, columns=3, size="small")

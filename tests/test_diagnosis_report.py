@@ -184,7 +184,7 @@ def test_report_of_rare_cases(found):
     words = text(replace(base, findings=(weak, replace(weak, evidence=20.0)), where=()))
     assert "1. CoulombFriction" in words
     assert "2. CoulombFriction" in words
-    assert "evidence 8, WEAK; closes 99.5 % of the squared gap above the floor" in words
+    assert "evidence 8.0, WEAK; closes 99.5 % of the squared gap above the floor" in words
     assert "evidence 20, strong" in words
     assert (
         "no record of u and y tells it from InputOffset: on this plant they are the same" in words

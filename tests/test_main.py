@@ -4,12 +4,14 @@ import os
 import subprocess
 import sys
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import ctrlid as cid
 from ctrlid import __main__ as command
+from ctrlid import second_act as act
 from ctrlid import story as told
 
 
@@ -28,7 +30,7 @@ def test_the_whole_story(folder, capsys):
     out, err = capsys.readouterr()
     assert err == ""
     text = " ".join(out.split())
-    for number, title in enumerate(told.TITLES, 1):
+    for number, title in enumerate((*told.TITLES, *act.TITLES), 1):
         assert f"{number}. {title}" in out
     for sentence in (
         "A steel ball of 21.3 g hangs below a magnet",
@@ -42,16 +44,21 @@ def test_the_whole_story(folder, capsys):
         "Plain: 50.0 deg are promised at 120 rad/s, but IT DOES NOT KEEP THE BALL.",
         "Constrained: Promised 50.0 deg at 120 rad/s, achieved",
         "Instruments: Promised 50.0 deg at 120 rad/s, achieved",
+        "The same ball at a gap of 12 mm",
+        "3000 samples every 2 ms",
+        "Diagnosis of maglev (3000 samples, dt = 0.002 s)",
+        "what is missing",
+        "Hidden was ForceExponent: n = 1.79. It was found and named",
     ):
         assert sentence in text
-    assert out.endswith(f"10 figures and report.html are in ctrlid-report{os.sep}\n")
+    assert out.endswith(f"12 figures and report.html are in ctrlid-report{os.sep}\n")
     files = sorted(p.name for p in (folder / "ctrlid-report").iterdir())
-    assert len([f for f in files if f.endswith(".png")]) == 10
+    assert len([f for f in files if f.endswith(".png")]) == 12
     assert "report.html" in files
-    assert "3-the-experiment.png" in files
+    assert {"3-the-experiment.png", "10-what-is-missing.png"} <= set(files)
     page = (folder / "ctrlid-report" / "report.html").read_text("utf-8")
-    assert page.count('src="data:image/png;base64,') == 10
-    assert all(f"<h2>{title}</h2>" in page for title in told.TITLES)
+    assert page.count('src="data:image/png;base64,') == 12
+    assert all(f"<h2>{title}</h2>" in page for title in (*told.TITLES, *act.TITLES))
 
 
 def test_nothing_is_overwritten(folder, monkeypatch):
@@ -87,7 +94,12 @@ def short(monkeypatch):
         for title in told.TITLES:
             yield cid.Section(title, "Words.")
 
+    def two(**settings):
+        for title in act.TITLES:
+            yield cid.Section(title, "Words.")
+
     monkeypatch.setattr(command, "story", one)
+    monkeypatch.setattr(command, "second_act", two)
 
 
 @pytest.mark.parametrize(
@@ -97,7 +109,7 @@ def short(monkeypatch):
      (["--seed", "-1"], "needs a whole number from 0; given -1"),
      (["--noise", "-0.1"], "needs a share such as 0.1, not negative; given -0.1"),
      (["--noise", "nan"], "given nan"), (["--nonsense"], "unrecognized arguments: --nonsense"),
-     (["nonsense"], "unrecognized arguments: nonsense")],
+     (["nonsense"], "invalid choice: 'nonsense' (choose from ")],
 )  # fmt: skip
 def test_wrong_usage(folder, capsys, arguments, words):
     with pytest.raises(SystemExit) as end:
@@ -218,3 +230,36 @@ def test_a_refused_redesign_is_reported(monkeypatch):
     assert section.text.count(": REFUSED. ") == 3
     assert section.result is None
     assert section.figures == {}
+
+
+def test_the_second_act_hides_what_the_seed_draws():
+    drawn = {type(act.hide(seed)[0]).__name__ for seed in range(40)}
+    assert drawn == {kind.__name__ for kind, _ in act.HIDDEN}
+    for seed in range(40):
+        effect, factor = act.hide(seed)
+        ranges = next(ranges for kind, ranges in act.HIDDEN if kind is type(effect))
+        for name, value in effect.values().items():
+            assert ranges[name][0] <= value <= ranges[name][1]
+        assert abs(factor - 1) == pytest.approx(act.BELIEVED)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", [kind for kind, _ in act.HIDDEN])
+def test_the_second_act_names_it(kind):
+    seed = next(s for s in range(50) if type(act.hide(s)[0]) is kind)
+    first, second, third = act.second_act(seed=seed)
+    assert "It is not told what was hidden." in first.text
+    assert second.result.findings[0].name == kind.__name__
+    assert f"Hidden was {kind.__name__}" in third.text
+    assert "It was found and named" in third.text
+    assert "noise alone leaves" in third.text
+
+
+def test_the_second_act_admits_what_it_missed():
+    sections = list(act.second_act(samples=4000, seed=2))
+    found, effect, loop = sections[1].result, act.hide(2)[0], None
+    assert "It was found and named alone." in sections[2].text
+    stranger = cid.effects.Quantization(step=1.0)
+    assert "IT WAS NOT NAMED: the verdict is " in act.reveal(found, stranger, loop)
+    two = replace(found, findings=found.findings * 2)
+    assert "It is among what was named." in act.reveal(two, effect, loop)

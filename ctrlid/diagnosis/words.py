@@ -83,7 +83,8 @@ def _wrapped(text: str, indent: int, hang: int | None = None) -> list[str]:
 def gap_rows(gap: Gap) -> list[tuple[str, str, str]]:
     """Return what the gap is, how large, and how many times the noise floor, row by row."""
     known = [v for v in (gap.floor, gap.after, gap.before) if 0 < v < math.inf]
-    factor, unit = prefix(known[0] if known else 0.0, gap.unit)
+    middle = math.exp(sum(map(math.log, known)) / len(known)) if known else 0.0
+    factor, unit = prefix(middle, gap.unit)
     places = 2 - math.floor(math.log10(factor * min(known))) if known else 0
 
     def size(value: float) -> str:
@@ -130,6 +131,8 @@ def shrinking(gap: Gap) -> str:
 
 def percent(share: float) -> str:
     """Write a share in percent, with more digits near the whole."""
+    if 0 < share < 0.005:
+        return "under 1 %"
     return f"{100 * share:.1f} %" if 0.99 < share < 0.9995 else f"{100 * share:.0f} %"
 
 
@@ -306,8 +309,10 @@ def disturbance(found: Diagnosis) -> str:
                      f"{quantity(d.time_constant, 's')}")  # fmt: skip
     if not parts:
         return "random force: none; the noise floor is sensor noise"
-    words = f"{' and '.join(parts)}, {percent(d.share)} of the noise floor's variance"
-    if d.share < LARGE:
+    words = " and ".join(parts)
+    if math.isfinite(d.share):
+        words += f", {percent(d.share)} of the noise floor's variance"
+    if not d.share >= LARGE:
         return f"random force: {words}"
     return (f"A LARGE RANDOM FORCE: {words}. Effects that it hides cannot be seen; the verdict "
             "holds above it only")  # fmt: skip

@@ -1,0 +1,267 @@
+"""``ctrlid diagnose``: what the words mean, what is refused, and a diagnosis from a file."""
+
+import argparse
+import math
+import os
+
+import control as ct
+import numpy as np
+import pytest
+
+import ctrlid as cid
+from ctrlid import __main__ as command
+from ctrlid import _command, _spoken
+from ctrlid import effects as E
+
+DT = 0.01
+SERVO = ("--model", "servo", "--param", "m=1", "c=2", "k=3")
+COLUMNS = ("--columns", "r=ref,u=volt,y=angle")
+
+
+@pytest.fixture(scope="module")
+def record():
+    """A servo with a drag that its model lacks."""
+    loop = cid.Loop(cid.plants.servo(m=1.0, c=2.0, k=3.0), cid.PID(kp=20.0, kd=1.0), dt=DT)
+    r = cid.random_binary(2000, amplitude=0.1, hold=50, seed=3)
+    real = loop.with_effect(E.QuadraticDrag(c2=3.0))
+    return cid.simulate(real, r, sensor_noise=1e-4, seed=2)
+
+
+@pytest.fixture
+def folder(record, tmp_path, monkeypatch):
+    """A folder with the record in other words, in which a user works."""
+    rows = np.column_stack([record.t, record.r, record.u, record.y])
+    np.savetxt(tmp_path / "log.csv", rows, delimiter=",", comments="",
+               header="time [s],ref [m],volt [V],angle [m]", fmt="%.9g")  # fmt: skip
+    np.savetxt(tmp_path / "bare.csv", rows[:, 1:], delimiter=",", comments="", header="r,u,y")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def asked(monkeypatch):
+    """Catch what the diagnosis is asked; it ends there."""
+    calls = []
+
+    class Answer(str):
+        __slots__ = ()
+
+    def diagnose(loop, record, **settings):
+        calls.append((loop, record, settings))
+        return Answer("the report")
+
+    monkeypatch.setattr(_command, "diagnose", diagnose)
+    return calls
+
+
+def run(*arguments):
+    return command.main(["diagnose", *map(str, arguments)])
+
+
+def refused(capsys, *arguments):
+    assert run(*arguments) == 1
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.count("\n") == 1
+    return err
+
+
+def test_a_file_is_diagnosed(folder, capsys):
+    assert run("log.csv", *COLUMNS, *SERVO, "--controller", "kp=20,kd=1", "--at-output", 0,
+               "--save", "found") == 0  # fmt: skip
+    out, err = capsys.readouterr()
+    assert err == ""
+    assert out.startswith("Diagnosis of log (2000 samples, dt = 0.01 s)\n")
+    assert "QuadraticDrag" in out
+    assert out.endswith("report.html, report.txt, diagnosis.png and diagnosis.json are in "
+                        f"found{os.sep}\n")  # fmt: skip
+    files = sorted(path.name for path in (folder / "found").iterdir())
+    assert files == ["diagnosis.json", "diagnosis.png", "report.html", "report.txt"]
+    found = cid.diagnosis.load_diagnosis(folder / "found" / "diagnosis.json")
+    assert out.startswith(str(found))
+    assert found.findings[0].name == "QuadraticDrag"
+    assert found.findings[0].effect.c2 == pytest.approx(3.0, rel=0.02)
+    assert {c.name for c in found.calibrated} == {"c", "k"}
+    page = (folder / "found" / "report.html").read_text("utf-8")
+    assert "<h1>Diagnosis of log (2000 samples" in page
+
+
+def test_what_the_command_line_means(folder, asked, record, capsys):
+    assert run("log.csv", *COLUMNS, *SERVO, "--free", "c", "--at-output", 0.02, "--input-bias", 0.1,
+               "--controller", "kp=20,kd=1,derivative=measurement,upper=10", "--jobs", 2,
+               "--validation", "log.csv", "--hold", "foh", "--quiet") == 0  # fmt: skip
+    ((loop, read, settings),) = asked
+    assert loop.parameters == {"m": 1.0, "c": 2.0, "k": 3.0}
+    assert (loop.free, loop.dt) == (("c",), DT)
+    assert (loop.at.output, loop.at.input) == (0.02, 0.1)
+    assert loop.controller == cid.PID(kp=20.0, kd=1.0, derivative="measurement", upper=10.0)
+    np.testing.assert_allclose(read.y, record.y, rtol=1e-8, atol=1e-12)
+    assert (read.hold, read.names["u"], read.units["y"]) == ("foh", "volt", "m")
+    assert settings.keys() == {"validation", "jobs", "progress"}
+    assert (settings["jobs"], settings["progress"]) == (2, False)
+    assert capsys.readouterr().out == "the report\n"
+
+
+def test_what_is_taken_without_saying(folder, asked, record):
+    assert run("bare.csv", "--dt", DT, *SERVO) == 0
+    ((loop, read, settings),) = asked
+    assert loop.controller is None
+    assert loop.free == ("c", "k")
+    assert loop.at.output == pytest.approx(record.y.mean())
+    assert read.hold == "zoh"
+    assert read.r is not None
+    assert settings == {"progress": False}
+    assert run("bare.csv", "--dt", DT, *SERVO, "--free") == 0
+    assert asked[1][0].free == ()
+
+
+def test_every_textbook_plant_has_its_uncertain_parameters():
+    for name, free in _spoken.PLANTS.items():
+        needed = {"maglev": {"m": 1.0, "K": 1.0}, "servo": {"m": 1.0, "c": 1.0, "k": 1.0},
+                  "tank": {"area": 1.0, "outlet": 1.0, "k": 1.0},
+                  "pendulum": {"m": 1.0, "length": 1.0}}[name]  # fmt: skip
+        plant = _spoken.plant(name, dict(needed))
+        assert set(free) <= set(cid.Loop(plant, dt=DT).parameters)
+
+
+PLANT = """
+import control as ct
+import numpy as np
+import ctrlid as cid
+
+def update(t, x, u, params):
+    return np.array([x[1], (params["k"] * u[0] - 2.0 * x[1]) / params["m"]])
+
+mine = ct.nlsys(update, lambda t, x, u, params: x[0], inputs=["V"], outputs=["x"],
+                states=["x", "v"], params={"m": 1.0, "k": 3.0}, name="mine")
+loop = cid.Loop(mine, cid.PID(kp=20.0, kd=1.0), dt=0.01, free=("k",))
+law = cid.PID(kp=7.0)
+linear = ct.tf(3, [1, 2, 0])
+number = 3
+
+def make(k, m=1.0):
+    return cid.plants.servo(m=m, c=2.0, k=k)
+
+def nothing():
+    return None
+"""
+
+
+def test_models_of_ones_own(folder, asked):
+    (folder / "bench.py").write_text(PLANT)
+    for source in ("bench.py", "bench"):
+        assert run("log.csv", *COLUMNS, "--model", f"{source}:mine", "--param", "k=2.5",
+                   "--free", "k", "--controller", f"{source}:law") == 0  # fmt: skip
+    for loop, _, _ in asked:
+        assert loop.parameters == {"m": 1.0, "k": 2.5}
+        assert (loop.free, loop.controller.kp) == (("k",), 7.0)
+    assert run("log.csv", *COLUMNS, "--model", "bench.py:loop", "--param", "m=1.2") == 0
+    loop = asked[2][0]
+    assert (loop.parameters, loop.free) == ({"m": 1.2, "k": 3.0}, ("k",))
+    assert loop.controller.kp == 20.0
+    assert run("log.csv", *COLUMNS, "--model", "bench.py:make", "--param", "k=4") == 0
+    assert asked[3][0].parameters == {"m": 1.0, "c": 2.0, "k": 4.0}
+    assert run("log.csv", *COLUMNS, "--model", "bench.py:linear") == 0
+    assert isinstance(asked[4][0].plant, ct.TransferFunction)
+    assert asked[4][0].at.input == pytest.approx(asked[4][1].u.mean())
+
+
+def test_refusals_say_what_to_do(folder, asked, capsys):
+    (folder / "bench.py").write_text(PLANT)
+    for words, arguments in (
+        ("no column 'volts' for u; its columns are time [s], ref [m], volt [V], angle [m]. Name "
+         "the right one with --columns u=NAME", ("--columns", "u=volts", *SERVO)),
+        ("--columns names r, u, y, time, as in --columns u=volt,y=gap; given v",
+         ("--columns", "v=volt", *SERVO)),
+        ("the model servo needs m, c; give them in SI units, as in --param m=... c=...",
+         (*COLUMNS, "--model", "servo", "--param", "k=3")),
+        ("servo has no parameter 'q'; it has m, c, k", (*COLUMNS, *SERVO, "--param", "q=3")),
+        ("servo has no parameter 'K'; it has m, c, k", (*COLUMNS, *SERVO, "--free", "K")),
+        ("--model is one of maglev, servo, tank, pendulum, MODULE:NAME or FILE.py:NAME; given ball",
+         (*COLUMNS, "--model", "ball")),
+        ("--model nowhere:ball: nowhere cannot be imported: No module named 'nowhere'",
+         (*COLUMNS, "--model", "nowhere:ball")),
+        ("--model nowhere.py:ball: nowhere.py cannot be imported",
+         (*COLUMNS, "--model", "nowhere.py:ball")),
+        ("bench.py has no ball; its control systems and loops are mine, loop, linear",
+         (*COLUMNS, "--model", "bench.py:ball")),
+        ("--model bench.py:number is a int; needed is a control system",
+         (*COLUMNS, "--model", "bench.py:number")),
+        ("--model bench.py:nothing returns a NoneType", (*COLUMNS, "--model", "bench.py:nothing")),
+        ("bench.py:loop is a whole loop and has its own operating point and controller: leave out "
+         "--at-output", (*COLUMNS, "--model", "bench.py:loop", "--at-output", "0")),
+        ("bench.py:mine has no parameter 'c'; it has m, k",
+         (*COLUMNS, "--model", "bench.py:mine", "--param", "c=3")),
+        ("a PID has no parameter 'gain'; it has kp, ki",
+         (*COLUMNS, *SERVO, "--controller", "gain=3")),
+        ("a PID needs kp", (*COLUMNS, *SERVO, "--controller", "ki=3")),
+        ("--controller kp= needs a number; given high",
+         (*COLUMNS, *SERVO, "--controller", "kp=high")),
+        ("--controller needs NAME=VALUE,NAME=VALUE; given kp=",
+         (*COLUMNS, *SERVO, "--controller", "kp=")),
+        ("--controller is MODULE:NAME or FILE.py:NAME; given fast",
+         (*COLUMNS, *SERVO, "--controller", "fast")),
+    ):  # fmt: skip
+        assert words in refused(capsys, "log.csv", *arguments)
+    assert "cannot read nowhere.csv" in refused(capsys, "nowhere.csv", *SERVO)
+    assert "Give --columns time=NAME or --dt" in refused(capsys, "bare.csv", *SERVO)
+    slow = ("bare.csv", "--dt", 0.02, "--model", "bench.py:loop")
+    assert "is sampled at 0.01 s, the record at 0.02 s" in refused(capsys, *slow)
+    assert asked == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [(("log.csv",), "the following arguments are required: --model"),
+     ((*SERVO,), "the following arguments are required: FILE.csv"),
+     (("log.csv", *SERVO, "--param", "k"), "needs NAME=VALUE, as in K=3.3e-6; given k"),
+     (("log.csv", *SERVO, "--param", "k=much"), "k= needs a number; given much"),
+     (("log.csv", *SERVO, "--columns", "volt"), "needs NAME=VALUE,NAME=VALUE; given volt"),
+     (("log.csv", *SERVO, "--hold", "spline"), "invalid choice: 'spline'")],
+)  # fmt: skip
+def test_wrong_usage(folder, capsys, arguments, words):
+    with pytest.raises(SystemExit) as end:
+        run(*arguments)
+    assert end.value.code == 2
+    err = capsys.readouterr().err
+    assert err.startswith("usage: ctrlid diagnose")
+    assert words in err
+
+
+def test_help_has_a_worked_example(capsys):
+    with pytest.raises(SystemExit) as end:
+        run("--help")
+    assert end.value.code == 0
+    out = capsys.readouterr().out
+    for option in (
+        "--model", "--param", "--free", "--at-output", "--input-bias", "--dt", "--quiet",
+        "--columns", "--controller", "--hold", "--validation", "--jobs", "--save",
+    ):  # fmt: skip
+        assert option in out
+    example = out[out.index("  ctrlid diagnose log.csv") :].split("\n\n")[0]
+    parser = argparse.ArgumentParser()
+    _command.add_parser(parser.add_subparsers())
+    args = parser.parse_args(example.replace("\\\n", " ").split()[1:])
+    assert args.param == [("m", 0.0213), ("K", 3.3e-6)]
+    assert _spoken.controller(args.controller) == cid.PID(kp=-1200.0, kd=-20.0, bias=3.0)
+
+
+def test_a_failed_diagnosis_leaves_no_folder(folder, capsys, monkeypatch):
+    def refuse(*arguments, **settings):
+        raise cid.CtrlidError("too few samples")
+
+    monkeypatch.setattr(_command, "diagnose", refuse)
+    assert "ctrlid: too few samples" in refused(
+        capsys, "log.csv", *COLUMNS, *SERVO, "--save", "new"
+    )
+    assert not (folder / "new").exists()
+    (folder / "old").mkdir()
+    (folder / "old" / "mine").write_text("mine")
+    words = refused(capsys, "log.csv", *COLUMNS, *SERVO, "--save", "old")
+    assert "old is not empty and nothing is overwritten; give --save a new folder" in words
+
+
+def test_numbers_that_are_none():
+    assert math.isinf(_spoken._number("x", "inf"))
+    with pytest.raises(cid.CtrlidError, match="x needs a number; given nan"):
+        _spoken._number("x", "nan")
