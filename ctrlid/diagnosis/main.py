@@ -15,17 +15,18 @@ from ..audit import audit
 from ..data import Record
 from ..effects import CATALOGUE, AbstractEffect, equivalents
 from ..errors import CtrlidError
-from ..likelihood import Fit, begin, climb
+from ..likelihood import Fit, begin, climb, pseudo_inverse
 from ..linearization import OperatingPoint
 from ..loop import Loop
 from ..loop_fit import make_problem, summary
 from . import gap as gaps
+from .decide import GATE
 from .experiment import separating_experiment
 from .omnibus import places
 from .result import Calibrated, Candidate, Diagnosis, Disturbance, Finding, Gap, Verdict
 from .search import Found, Search, search
 from .sentences import conclusion
-from .trial import Model, Trial, base_model
+from .trial import Model, Trial, base_model, gain_by_record
 
 HOPELESS = ("too few samples", "constant signal")
 STEPS = 6  # of the progress bar
@@ -186,7 +187,7 @@ def _trained(model: Model, records: Sequence[Record]) -> Loop:
 
 def _gaps(
     loop: Loop, found: Search, records: Sequence[Record], fresh: Sequence[Record] | None
-) -> tuple[Gap, dict[str, float], Disturbance]:
+) -> tuple[Gap, dict[int, float], Disturbance]:
     """Return the gap on data that no parameter was fitted to, and what each finding closes."""
     shown: Sequence[Record] = records if fresh is None else fresh
     if fresh is None:
@@ -203,14 +204,14 @@ def _gaps(
     sizes = [_total(shown, y, masks) for y in results]
     floor = gaps.floor(after, found.final.fit, shown, kind, masks)
     quiet = gaps.floor(after, found.final.fit, shown, kind, masks, force=False)
-    shares: dict[str, float] = {}
+    shares: dict[int, float] = {}
     closed = sizes[1] ** 2 - sizes[2] ** 2
     if len(found.found) == 1:
-        shares[found.found[0].trial.label] = _share(closed, sizes[1], floor)
+        shares[found.found[0].position] = _share(closed, sizes[1], floor)
     for f in found.found if len(found.found) > 1 else ():
-        left = after.without_effect(f.trial.effect_in(after))
+        left = after.without_effect(list(after.labelled)[f.position])
         error = _total(shown, gaps.outputs(left, shown, kind), masks)
-        shares[f.trial.label] = _share(error**2 - sizes[2] ** 2, sizes[1], floor)
+        shares[f.position] = _share(error**2 - sizes[2] ** 2, sizes[1], floor)
     first, mask = shown[0], masks[0]
     gap = Gap(
         kind, *sizes, floor, first.units.get("y", ""), np.asarray(first.t)[mask],
@@ -245,7 +246,7 @@ def _disturbance(fit: Fit, loop: Loop, floor: float, quiet: float) -> Disturbanc
 
 
 def _result(
-    loop: Loop, records: Sequence[Record], found: Search, gap: Gap, shares: dict[str, float],
+    loop: Loop, records: Sequence[Record], found: Search, gap: Gap, shares: dict[int, float],
     disturbance: Disturbance, remarks: tuple[str, ...],
 ) -> Diagnosis:  # fmt: skip
     fitted = summary(found.final.loop, found.final.fit)
@@ -299,28 +300,25 @@ def _units(loop: Loop, record: Record) -> dict[str, str]:
 
 
 def _finding(
-    f: Found, loop: Loop, errors: dict[str, float], shares: dict[str, float], found: Search,
+    f: Found, loop: Loop, errors: dict[str, float], shares: dict[int, float], found: Search,
     records: Sequence[Record],
 ) -> Finding:  # fmt: skip
-    effect = f.trial.effect_in(loop)
-    label = next(k for k, e in loop.labelled.items() if e is effect)
+    label, effect = list(loop.labelled.items())[f.position]
     own = {n.partition(".")[2]: v for n, v in errors.items() if n.startswith(f"{label}.")}
     same = equivalents(effect, loop)
     others = tuple(t.fitted for t in f.rivals if t.name not in same)
     words, reference = "", None
     if others:
         words, reference = separating_experiment(f.trial, f.rivals, records[0])
-    return Finding(effect, own, others, same, f.trial.gain, shares.get(f.trial.label, math.nan),
+    return Finding(effect, own, others, same, f.trial.gain, shares.get(f.position, math.nan),
                    words, reference, _presence(f, found))  # fmt: skip
 
 
 def _presence(f: Found, found: Search) -> str:
     """Say in which of several records an effect was seen."""
     problem = found.final.fit.problem
-    if len(problem.tracks) < 2 or f.base is None:
+    if len(problem.tracks) < 2:
         return ""
-    from .trial import gain_by_record
-
     gains = gain_by_record(f.base, f.trial.model)
     seen = [k + 1 for k, g in enumerate(gains) if g > 2.0]
     if len(seen) == len(gains):
@@ -353,9 +351,6 @@ def _sensitivity(found: Search) -> dict[str, float]:
 
 
 def _visible(t: Trial) -> float:
-    from ..likelihood import pseudo_inverse
-    from .decide import GATE
-
     if len(t.effect.parameters()) != 1 or not t.label or not math.isfinite(t.promise):
         return math.nan
     matrix = t.model.fit.normal[0]

@@ -158,15 +158,21 @@ def _step(model: Model, effect: ParameterStep) -> Trial:
     if effect.name not in model.names:
         return attempt(model, effect)
     records = [t.record for t in model.fit.problem.tracks]
-    last = max(r.t[-1] - r.start for r in records)
-    times = np.linspace(0.0, last, TIMES + 2)[1:-1]
-    shapes = [(r.t - r.start)[:, None] >= times for r in records]
-    gains, sizes = promises(model, [s.astype(float) for s in shapes], effect.name)
-    best = int(np.argmax(gains))
+    low, high = 0.0, float(max(r.t[-1] - r.start for r in records))
+    # The likelihood is rugged in the time of a step: the scan must come within a sample of it.
+    while True:
+        times = np.linspace(low, high, TIMES + 2)[1:-1]
+        shapes = [(r.t - r.start)[:, None] >= times for r in records]
+        gains, sizes = promises(model, [s.astype(float) for s in shapes], effect.name)
+        best = int(np.argmax(gains))
+        width = times[1] - times[0]
+        if width < 0.5 * records[0].dt:
+            break
+        low, high = times[best] - 2 * width, times[best] + 2 * width
     value = float(model.fit.theta[model.names.index(effect.name)])
     size = float(sizes[best, 0]) / value if value else 0.0
     start = replace(effect, time=float(times[best]), size=min(max(size, -0.9), 10.0))
-    return attempt(model, start, math.log(TIMES))
+    return attempt(model, start, math.log(len(records[0])))
 
 
 def _mode(model: Model, effect: FlexibleMode) -> Trial:

@@ -15,7 +15,7 @@ from ..loop_fit import choose_noise
 from .decide import GATE, rivals
 from .omnibus import Omnibus, omnibus
 from .scan import scanned
-from .trial import Model, Trial, attempt, reduced, refit
+from .trial import Model, Trial, attempt_at, reduced, refit
 
 MOST = 5  # effects in one record
 TOP = 5  # candidates refitted because of what they promise
@@ -41,7 +41,8 @@ class Found:
 
     trial: Trial
     rivals: tuple[Trial, ...]
-    base: Model | None = None
+    base: Model
+    position: int  # among the effects of the final loop
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,9 +117,10 @@ def search(base: Model, catalogue: Sequence[type[AbstractEffect]], work: Work,
         The rounds and the final model.
     """
     record = base.fit.problem.tracks[0].record
-    model, steps, kept = base, [], []
+    given = len(base.loop.effects)
+    model, steps = base, []
     before = omnibus(base.fit)
-    while len(kept) < MOST:
+    while len(model.loop.effects) - given < MOST and len(steps) < MOST + 2:
         tell(f"round {len(steps) + 1}: screening")
         pool = [c for c in candidates(catalogue, model.fitted, record) if not _there(model, c)]
         step = one_round(model, pool, work)
@@ -126,12 +128,8 @@ def search(base: Model, catalogue: Sequence[type[AbstractEffect]], work: Work,
         if step.best is None:
             break
         tell(f"round {len(steps)}: {step.best.name}")
-        kept.append(step.best.label)
-        model = _renoised(step.best.model)
-        model, kept = _without_superfluous(model, kept)
-        if len(steps) > MOST + 2:
-            break
-    model, found = _settled(model, kept, steps, work)
+        model = _without_superfluous(_renoised(step.best.model), given)
+    model, found = _settled(model, given, steps, work)
     return Search(base, tuple(steps), model, found, before, omnibus(model.fit))
 
 
@@ -155,60 +153,75 @@ def _renoised(model: Model) -> Model:
     return Model(model.loop, choose_noise(fit))
 
 
-def _without_superfluous(model: Model, kept: list[str]) -> tuple[Model, list[str]]:
+def _without_superfluous(model: Model, given: int) -> Model:
     """Drop effects that the later ones made superfluous."""
-    for label in kept[:-1]:
-        smaller, trial = _taken_out(model, label)
+    for position in range(given, len(model.loop.effects) - 1):
+        smaller, trial = _taken_out(model, position)
         if trial.merit <= GATE:
-            return _without_superfluous(smaller, [k for k in kept if k != label])
-    return model, kept
+            return _without_superfluous(smaller, given)
+    return model
 
 
-def _taken_out(model: Model, label: str) -> tuple[Model, Trial]:
+def _taken_out(model: Model, position: int) -> tuple[Model, Trial]:
     """Return the model without one effect, refitted, and the effect as a trial on top of it."""
     fitted = model.fitted
-    effect = fitted.labelled[label]
-    names = [n for n in model.names if not n.startswith(f"{label}.")]
+    labels = list(fitted.labelled)
+    label, effect = labels[position], fitted.effects[position]
     loop = fitted.without_effect(label)
-    labels = dict(zip([k for k in fitted.labelled if k != label], loop.labelled, strict=True))
-    renamed = []
-    for name in names:
+    renamed = dict(zip(labels[:position] + labels[position + 1 :], loop.labelled, strict=True))
+    names = []
+    for name in model.names:
         head, dot, tail = name.partition(".")
-        renamed.append(f"{labels.get(head, head)}{dot}{tail}")
-    fit = climb(reduced(model, loop, renamed), rounds=10)
-    smaller = Model(loop, fit)
-    return smaller, refit(smaller, attempt(smaller, effect))
+        if not (dot and head == label):
+            names.append(f"{renamed.get(head, head)}.{tail}" if dot else name)
+    smaller = Model(loop, climb(reduced(model, loop, names), rounds=10))
+    return smaller, refit(smaller, attempt_at(smaller, effect))
 
 
 def _settled(
-    model: Model, kept: Sequence[str], steps: Sequence[Step], work: Work
+    model: Model, given: int, steps: Sequence[Step], work: Work
 ) -> tuple[Model, tuple[Found, ...]]:
     """Ask for each effect what else could stand in its place, all others being in the model."""
-    if len(kept) == 1 and len(steps) <= 2:
-        first = steps[0]
-        assert first.best is not None
-        same = bool(first.best.model.fit.noise.drift) == bool(model.fit.noise.drift)
-        if same:
-            best = first.best
-            return model, (Found(best, rivals(best, first.trials), first.base),)
+    first = steps[0] if steps else None
+    if len(model.loop.effects) == given:
+        return model, ()
+    assert first is not None
+    if len(model.loop.effects) == given + 1 and first.best is not None and len(steps) <= 2:
+        best = first.best
+        if bool(best.model.fit.noise.drift) == bool(model.fit.noise.drift):
+            return model, (Found(best, rivals(best, first.trials), first.base, given),)
     found: list[Found] = []
-    for label in list(kept):
-        effect = model.fitted.labelled.get(label)
-        if effect is None:
-            continue
-        smaller, mine = _taken_out(model, label)
+    for position in range(given, len(model.loop.effects)):
+        smaller, mine = _taken_out(model, position)
+        if mine.merit <= GATE:
+            return _settled(_renoised(smaller), given, steps, work)
         there = {type(e).__name__ for e in smaller.loop.effects}
         rest = [t for t in _close(mine, steps) if t.name not in there]
-        again = work(lambda t, smaller=smaller: refit(smaller, attempt(smaller, t.fitted)), rest)
+        again = work(lambda t, smaller=smaller: refit(smaller, attempt_at(smaller, t.fitted)), rest)
         best = max([mine, *again], key=lambda t: t.merit)
         if best.merit <= mine.merit + 1.0:
             best = mine
         else:
-            model = best.model
+            model = _moved(best.model, position)
         close = rivals(best, [t for t in [mine, *again] if t is not best])
-        found.append(Found(best, close, smaller))
+        found.append(Found(best, close, smaller, position))
     found.sort(key=lambda f: -f.trial.gain)
     return model, tuple(found)
+
+
+def _moved(model: Model, position: int) -> Model:
+    """Return the model with its last effect at another position among the effects."""
+    fitted = model.fitted
+    order = [*range(position), len(fitted.effects) - 1, *range(position, len(fitted.effects) - 1)]
+    labels = list(fitted.labelled)
+    loop = replace(fitted, effects=tuple(fitted.effects[k] for k in order), free=())
+    renamed = dict(zip([labels[k] for k in order], loop.labelled, strict=True))
+    loop = replace(loop, free=tuple(n for n in fitted.free if "." not in n))
+    names = []
+    for name in model.names:
+        head, dot, tail = name.partition(".")
+        names.append(f"{renamed.get(head, head)}.{tail}" if dot else name)
+    return Model(loop, climb(reduced(model, loop, names), rounds=4))
 
 
 def _close(mine: Trial, steps: Sequence[Step]) -> list[Trial]:

@@ -61,13 +61,6 @@ class Trial:
         """The name of the effect; drifts and steps belong to a parameter."""
         return type(self.effect).__name__
 
-    def effect_in(self, loop: Loop) -> AbstractEffect:
-        """Return this effect as it is in another fit of the loop."""
-        known = loop.labelled
-        if type(known.get(self.label)) is type(self.effect):
-            return known[self.label]
-        return next(e for e in known.values() if type(e) is type(self.effect))
-
     @property
     def price(self) -> float:
         """Half the Bayesian penalty if all its parameters count."""
@@ -193,12 +186,13 @@ def _extended(base: Model, loop: Loop, names: Sequence[str]) -> Fit:
 
 def _carried(old: Machine, new: Machine, known: Trajectory, guess: Trajectory) -> Trajectory:
     """Take states that both have from the old trajectory, and guess the others."""
-    columns = [(list(new.e.states).index(s), k) for k, s in enumerate(old.e.states)]
+    mine = list(new.e.states)
+    columns = [(mine.index(s), k) for k, s in enumerate(old.e.states) if s in mine]
     columns += [(new.n + k, old.n + k) for k in range(old.size - old.n)]
     result = []
-    for mine, theirs in ((guess.predicted, known.predicted), (guess.filtered, known.filtered),
+    for start, theirs in ((guess.predicted, known.predicted), (guess.filtered, known.filtered),
                          (guess.spread, known.spread)):  # fmt: skip
-        mixed = mine.copy()
+        mixed = start.copy()
         for i, k in columns:
             mixed[:, i] = theirs[:, k]
         result.append(mixed)
