@@ -18,6 +18,8 @@ from .errors import CtrlidError
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
+PAIRS = ("ReciprocalPoles", "SymmetricPoles")  # constraints that say that a plant is unstable
+
 
 @dataclass(frozen=True)
 class Structure:
@@ -322,9 +324,17 @@ def _bad_news(e: Estimate) -> list[str]:
     # A merged pair at the edge is known to half the digits only.
     unstable = np.abs(z) > 1 + 1e-9 if e.structure.domain == "z" else z.real > 0
     if not unstable.any():
-        edge = "OUTSIDE THE UNIT CIRCLE" if e.structure.domain == "z" else "IN THE RIGHT HALF PLANE"
-        news.append(f"  NO POLE {edge}.")
+        edge = "outside the unit circle" if e.structure.domain == "z" else "in the right half plane"
+        if _said_unstable(e):
+            news.append(f"  NO POLE {edge.upper()}.")
+        else:
+            news.append(f"  no pole {edge}: the model is stable.")
     return news
+
+
+def _said_unstable(e: Estimate) -> bool:
+    """Whether a constraint said that the plant is unstable: a pair ±p has one unstable pole."""
+    return any(bound.constraint.startswith(PAIRS) for bound in e.active_bounds)
 
 
 class IdentifiedModel(control.TransferFunction):

@@ -284,7 +284,7 @@ def test_active_bound_is_exact_and_in_capitals():
     _, record = levitation(0.044, sensor_noise=0.1)
     plain = fit_arx(record, na=2, nb=2)
     assert np.all(np.abs(plain.estimate.poles) < 1)
-    assert "NO POLE OUTSIDE THE UNIT CIRCLE" in str(plain)
+    assert "no pole outside the unit circle: the model is stable" in str(plain)
     model = fit_arx(record, na=2, nb=2, constraints=[ReciprocalPoles()])
     estimate = model.estimate
     assert estimate["a1"] == -2.0

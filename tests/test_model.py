@@ -150,7 +150,7 @@ def test_continuous_model():
     stable = estimate(
         [3.0, 2.0, 1.0], np.zeros((3, 3)), structure=Structure(2, 1, domain="s"), dt=0
     )
-    assert "NO POLE IN THE RIGHT HALF PLANE" in str(stable)
+    assert "no pole in the right half plane: the model is stable." in str(stable)
 
 
 GOLDEN = """\
