@@ -106,7 +106,7 @@ def _output(loop: Loop, record: Record, kind: str) -> Array:
             continue
         try:
             part = record[start:stop]
-            z, r, d = _drive(simulator, part)
+            z, r, d = drive(simulator, part)
             y[start:stop] = simulator.run(z, r, d, None, record.t[start] - record.start)[0]
         except CtrlidError:
             continue
@@ -117,7 +117,7 @@ def _steps(kind: str) -> int:
     return int(kind.partition("-")[0])
 
 
-def _drive(simulator: Simulator, part: Record) -> tuple[Array, Array | None, Array]:
+def drive(simulator: Simulator, part: Record) -> tuple[Array, Array | None, Array]:
     """Return initial state, reference and injected signal for one stretch."""
     loop = simulator.loop
     n = len(simulator.plant_states)
@@ -188,7 +188,7 @@ def _floor(
             continue
         part = record[start:stop]
         begin = record.t[start] - record.start
-        z, r, d = _drive(simulator, part)
+        z, r, d = drive(simulator, part)
         quiet = simulator.run(z, r, d, None, begin)[0]
         for seed in range(RUNS):
             noise = random_noise(fit, sensor, len(part), seed)

@@ -306,10 +306,11 @@ def _finding(
     label, effect = list(loop.labelled.items())[f.position]
     own = {n.partition(".")[2]: v for n, v in errors.items() if n.startswith(f"{label}.")}
     same = equivalents(effect, loop)
-    others = tuple(t.fitted for t in f.rivals if t.name not in same)
+    others = tuple(t.fitted for t in f.rivals)
+    apart = [t for t in f.rivals if t.name not in same]
     words, reference = "", None
-    if others:
-        words, reference = separating_experiment(f.trial, f.rivals, records[0])
+    if apart:
+        words, reference = separating_experiment(f.trial, apart, records[0])
     return Finding(effect, own, others, same, f.trial.gain, shares.get(f.position, math.nan),
                    words, reference, _presence(f, found))  # fmt: skip
 

@@ -234,6 +234,8 @@ class Diagnosis:
         What was diagnosed.
     seconds : float
         Run time [s].
+    extra : dict of str to object
+        What else was computed along.
     """
 
     verdict: Verdict

@@ -172,6 +172,12 @@ def _extended(base: Model, loop: Loop, names: Sequence[str]) -> Fit:
     m = Machine(loop, names, old.machine.hold, old.machine.law is not None)
     tracks = tuple(make_track(loop, t.record) for t in old.tracks)
     lower, upper = bounds_of(loop, names)
+    longest = max(len(t.record) for t in tracks) * loop.dt
+    for k, name in enumerate(names):
+        if name.endswith(".frequency"):  # what samples show: below Nyquist's, above one period
+            lower[k], upper[k] = max(lower[k], 1.0 / longest), min(upper[k], 0.4 / loop.dt)
+        if name.endswith(".damping"):
+            upper[k] = min(upper[k], 1.0)
     problem = Problem(m, tracks, lower, upper, old.counts)
     theta = np.clip(start_values(loop, names), lower, upper)
     at = [
@@ -239,9 +245,8 @@ def _objection(trial: Trial) -> str:
             continue
         low, high = fit.problem.lower[k], fit.problem.upper[k]
         about = next(p for p in effect.parameters() if p.name == name.partition(".")[2])
-        if about.neutral is not None and fit.theta[k] in (low, high) and about.neutral not in (
-            low, high
-        ):  # fmt: skip
+        on_bound = fit.theta[k] in (low, high)
+        if on_bound and (about.name == "frequency" or about.neutral not in (None, low, high)):
             return f"{about.name} ends on its bound {fit.theta[k]:g}"
     return ""
 

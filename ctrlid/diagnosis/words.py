@@ -230,8 +230,9 @@ def certainty(finding: Finding, alone: bool = True) -> str:
 def doubts(found: Diagnosis, finding: Finding) -> list[str]:
     """Say what else it could be, and which experiment would tell."""
     lines = []
-    if finding.alternatives:
-        others = [f"{type(e).__name__} ({sizes(found, e)})" for e in finding.alternatives]
+    apart = [e for e in finding.alternatives if type(e).__name__ not in finding.equivalents]
+    if apart:
+        others = [f"{type(e).__name__} ({sizes(found, e)})" for e in apart]
         lines.append(f"this record does not tell it from {listing(others)}")
     if finding.equivalents:
         lines.append(f"no record of u and y tells it from {listing(finding.equivalents)}: on this "
