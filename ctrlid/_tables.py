@@ -214,11 +214,11 @@ def _diagnosis_blocks(found: Diagnosis) -> list[Table | str]:
     made += [f"About the record: {remark.rstrip('.')}." for remark in found.audit]
     made += [f"Note: {remark.rstrip('.')}." for remark in found.notes]
     tried = tuple(
-        (type(c.effect).__name__, str(c.round), f"{c.score:.1f}", f"{c.gain:.1f}",
-         f"{c.penalty:.1f}", c.remark) for c in found.ranking if np.isfinite(c.gain)
+        (type(c.effect).__name__, str(c.round), f"{c.gain:.1f}", f"{c.penalty:.1f}", c.remark)
+        for c in found.ranking if np.isfinite(c.gain)
     )  # fmt: skip
     if tried:
-        heads = ("candidate", "round", "first step", "evidence", "penalty", "")
+        heads = ("candidate", "round", "evidence", "penalty", "")
         made.append(Table(heads, tried, "The candidates that were refitted."))
     return [block for block in made if block]
 
