@@ -414,8 +414,8 @@ def _shortest(e: Equations, p: Any) -> float:
     return math.inf
 
 
-def make_track(loop: Loop, record: Record) -> Track:
-    """Make a record ready for the filter of a loop.
+def make_track(loop: Loop, record: Record, begin: float = 0.0) -> Track:
+    """Make a record ready for the filter of a loop; `begin` is the time of its first sample.
 
     Raises
     ------
@@ -434,7 +434,7 @@ def make_track(loop: Loop, record: Record) -> Track:
     r = y if record.r is None else np.asarray(record.r)[last]
     start, spread, scale = _start(loop, record)
     doubt = np.where(valid, 0.0, (np.std(record.u[valid]) / scale) ** 2)
-    return Track(record, np.vstack([record.t - record.start, u, r, y]), valid,
+    return Track(record, np.vstack([begin + record.t - record.start, u, r, y]), valid,
                  fresh_starts(loop, record), doubt, start, spread, scale)  # fmt: skip
 
 
@@ -485,7 +485,7 @@ def _rest(loop: Loop, e: Equations) -> tuple[float, ...]:
     return states if extra == 0 else (*states, *e.rest[len(e.rest) - extra :])
 
 
-@functools.lru_cache(maxsize=64)
+@functools.lru_cache(maxsize=8)
 def machine(loop: Loop, names: tuple[str, ...], hold: str, follow: bool) -> Machine:
     """Return the machine of a loop, made once."""
     return Machine(loop, names, hold, follow)

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from typing import Any
 
 import numpy as np
@@ -249,11 +250,14 @@ def start_values(loop: Loop, names: Sequence[str]) -> Array:
     return np.array([parameters[name] for name in names], dtype=float)
 
 
-def make_problem(loop: Loop, names: Sequence[str], records: Sequence[Record]) -> Problem:
-    """Return the likelihood problem of a loop on records."""
+def make_problem(
+    loop: Loop, names: Sequence[str], records: Sequence[Record], begins: Sequence[float] = ()
+) -> Problem:
+    """Return the likelihood problem of a loop on records that begin at given times."""
     m = machine_for(loop, tuple(names), records[0])
     lower, upper = bounds_of(loop, names)
-    return Problem(m, tuple(make_track(loop, r) for r in records), lower, upper)
+    tracks = [make_track(loop, r, b) for r, b in zip_longest(records, begins, fillvalue=0.0)]
+    return Problem(m, tuple(tracks), lower, upper)
 
 
 def effect_bounds(loop: Loop) -> dict[str, tuple[float, float]]:

@@ -29,6 +29,9 @@ from .sentences import conclusion
 from .trial import Model, Trial, base_model, gain_by_record
 
 HOPELESS = ("too few samples", "constant signal")
+LONGEST = 120_000  # samples that are fitted; of longer records, even stretches
+STRETCHES = 12  # of a long record
+TIE = 0.02  # difference of log-likelihood between effects that are one and the same
 STEPS = 6  # of the progress bar
 
 
@@ -116,7 +119,7 @@ def diagnose(
     tell("looking the record over", 1)
     remarks = _look_over(loop, records)
     tell("recalibrating", 1)
-    base = base_model(loop, records, loop.free)
+    base = base_model(loop, *_stretches(records, loop.free))
     found = search(base, catalogue, _worker(jobs), tell)
     tell("comparing on fresh data", 2)
     gap, shares, disturbance = _gaps(loop, found, records, fresh)
@@ -163,6 +166,25 @@ def _look_over(loop: Loop, records: Sequence[Record]) -> tuple[str, ...]:
         which = f"record {k + 1}: " if len(records) > 1 else ""
         remarks += [f"{which}{f.kind}: {f.text}" for f in found.findings]
     return tuple(remarks)
+
+
+def _stretches(
+    records: Sequence[Record], names: Sequence[str]
+) -> tuple[list[Record], Sequence[str], list[float]]:
+    """Return records short enough to be fitted many times: even stretches of long ones."""
+    total = sum(len(r) for r in records)
+    if total <= LONGEST:
+        return list(records), names, [0.0] * len(records)
+    parts, begins = [], []
+    for record in records:
+        size = max(LONGEST * len(record) // total // STRETCHES, 1000)
+        firsts = np.linspace(0, max(len(record) - size, 0), STRETCHES).astype(int)
+        for first in dict.fromkeys(firsts.tolist()):
+            part = record[first : first + size]
+            if np.count_nonzero(part.valid) > size // 2:
+                parts.append(part)
+                begins.append(first * record.dt)
+    return parts, names, begins
 
 
 def _worker(jobs: int) -> Callable[[Callable[..., Any], Iterable[Any]], list[Any]]:
@@ -306,19 +328,22 @@ def _finding(
     label, effect = list(loop.labelled.items())[f.position]
     own = {n.partition(".")[2]: v for n, v in errors.items() if n.startswith(f"{label}.")}
     same = equivalents(effect, loop)
+    # With the free parameters moving along, two effects may be one on every record.
+    ties = {t.name for t in f.rivals if abs(t.gain - f.trial.gain) < TIE and t.cost == f.trial.cost}
+    same = (*same, *sorted(ties - set(same)))
     others = tuple(t.fitted for t in f.rivals)
     apart = [t for t in f.rivals if t.name not in same]
     words, reference = "", None
     if apart:
         words, reference = separating_experiment(f.trial, apart, records[0])
     return Finding(effect, own, others, same, f.trial.gain, shares.get(f.position, math.nan),
-                   words, reference, _presence(f, found))  # fmt: skip
+                   words, reference, _presence(f, found, records))  # fmt: skip
 
 
-def _presence(f: Found, found: Search) -> str:
+def _presence(f: Found, found: Search, records: Sequence[Record]) -> str:
     """Say in which of several records an effect was seen."""
     problem = found.final.fit.problem
-    if len(problem.tracks) < 2:
+    if len(records) < 2 or len(problem.tracks) != len(records):
         return ""
     gains = gain_by_record(f.base, f.trial.model)
     seen = [k + 1 for k, g in enumerate(gains) if g > 2.0]

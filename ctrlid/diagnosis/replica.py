@@ -39,10 +39,11 @@ def replica(model: Model, seed: int = 0) -> Model | None:
     loop, fit = model.fitted, model.fit
     try:
         records = [
-            _simulated(model, t.record, float(r), seed + 101 * k)
+            _simulated(model, t.record, float(t.table[0, 0]), float(r), seed + 101 * k)
             for k, (t, r) in enumerate(zip(fit.problem.tracks, fit.sensor, strict=True))
         ]
-        problem = make_problem(loop, model.names, records)
+        begins = [float(t.table[0, 0]) for t in fit.problem.tracks]
+        problem = make_problem(loop, model.names, records, begins)
         problem = replace(problem, counts=fit.problem.counts)
         at = [out.trajectory for out in fit.filtered]
         start = evaluate(problem, fit.theta, fit.noise, at)
@@ -52,7 +53,7 @@ def replica(model: Model, seed: int = 0) -> Model | None:
     return Model(loop, again) if math.isfinite(again.value) else None
 
 
-def _simulated(model: Model, record: Record, sensor: float, seed: int) -> Record:
+def _simulated(model: Model, record: Record, first: float, sensor: float, seed: int) -> Record:
     simulator = Simulator(model.fitted, ROUGH, FEW_STEPS)
     y, u = np.array(record.y), np.array(record.u)
     for start, stop in record.segments():
@@ -61,7 +62,7 @@ def _simulated(model: Model, record: Record, sensor: float, seed: int) -> Record
         part = record[start:stop]
         z, r, d = drive(simulator, part)
         noise = random_noise(model.fit, sensor, len(part), seed + start)
-        begin = float(record.t[start] - record.start)
+        begin = first + float(record.t[start] - record.start)
         y[start:stop], u[start:stop] = simulator.run(z, r, d, noise, begin)
     return replace(record, y=y, u=u)
 

@@ -14,6 +14,7 @@ from .trial import Model, Trial, attempt
 
 COLUMNS = 2_000_000  # numbers in a block of shapes at once
 LENGTHS = 150  # wavelengths that are looked for in the travel
+EDGE = 0.03  # of the record, at either end
 TIMES = 40  # instants at which a parameter might have stepped
 MODES = 7  # frequencies at which a flexible mode is tried
 
@@ -118,9 +119,8 @@ def _periodic(model: Model, effect: PeriodicForce) -> Trial:
     power[: max(8, 1)] = 0.0  # slower than two periods: a drift, not a vibration
     frequency = int(np.argmax(power)) / (4 * n * dt)
     shapes = []
-    for record in records:
-        t = record.t - record.start
-        angle = 2 * np.pi * frequency * t
+    for track in model.fit.problem.tracks:
+        angle = 2 * np.pi * frequency * track.table[0]
         shapes.append(np.column_stack([np.sin(angle), np.cos(angle)]))
     _, sizes = promises(model, shapes, width=2)
     amplitude, phase = _wave(sizes[0])
@@ -158,17 +158,19 @@ def _step(model: Model, effect: ParameterStep) -> Trial:
     if effect.name not in model.names:
         return attempt(model, effect)
     records = [t.record for t in model.fit.problem.tracks]
-    low, high = 0.0, float(max(r.t[-1] - r.start for r in records))
+    last = float(max(t.table[0, -1] for t in model.fit.problem.tracks))
+    # At the very ends a step is only another name for the initial state.
+    low, high = EDGE * last, (1 - EDGE) * last
     # The likelihood is rugged in the time of a step: the scan must come within a sample of it.
     while True:
         times = np.linspace(low, high, TIMES + 2)[1:-1]
-        shapes = [(r.t - r.start)[:, None] >= times for r in records]
+        shapes = [t.table[0][:, None] >= times for t in model.fit.problem.tracks]
         gains, sizes = promises(model, [s.astype(float) for s in shapes], effect.name)
         best = int(np.argmax(gains))
         width = times[1] - times[0]
         if width < 0.5 * records[0].dt:
             break
-        low, high = times[best] - 2 * width, times[best] + 2 * width
+        low, high = max(times[best] - 2 * width, low), min(times[best] + 2 * width, high)
     value = float(model.fit.theta[model.names.index(effect.name)])
     size = float(sizes[best, 0]) / value if value else 0.0
     start = replace(effect, time=float(times[best]), size=min(max(size, -0.9), 10.0))

@@ -10,10 +10,10 @@ import numpy as np
 from ..data import Record
 from ..effects import AbstractEffect
 from ..errors import CtrlidError
-from ..filtering import Machine, Trajectory, machine_for, make_track
+from ..filtering import Machine, Trajectory, make_track
 from ..likelihood import Fit, Problem, begin, climb, evaluate, pseudo_inverse
 from ..loop import Loop
-from ..loop_fit import bounds_of, choose_noise, start_values
+from ..loop_fit import bounds_of, choose_noise, make_problem, start_values
 from ..physics import Array
 
 SCREEN_ROUNDS = 14  # of a refit: a candidate that needs more is not the missing effect
@@ -80,11 +80,11 @@ class Trial:
         return self.model.fitted.labelled[self.label]
 
 
-def base_model(loop: Loop, records: Sequence[Record], names: Sequence[str]) -> Model:
+def base_model(
+    loop: Loop, records: Sequence[Record], names: Sequence[str], begins: Sequence[float] = ()
+) -> Model:
     """Fit the model as it is, with the noise that the data want."""
-    m = machine_for(loop, tuple(names), records[0])
-    lower, upper = bounds_of(loop, names)
-    problem = Problem(m, tuple(make_track(loop, r) for r in records), lower, upper)
+    problem = make_problem(loop, names, records, begins)
     fit = climb(begin(problem, start_values(loop, names), None))
     return Model(loop, choose_noise(fit))
 
@@ -145,7 +145,15 @@ def attempt_at(base: Model, effect: AbstractEffect, scan: float = 0.0) -> Trial:
         return Trial(effect, label, model, -math.inf, scan, remark="cannot follow the record")
     matrix, score = fit.normal
     gain = 0.5 * float(_promised(fit, matrix, score))
-    return Trial(effect, label, model, fit.value - base.fit.value + gain, scan)
+    return Trial(effect, label, Model(loop, light(fit)), fit.value - base.fit.value + gain, scan)
+
+
+def light(fit: Fit) -> Fit:
+    """Return a fit without its arrays: many candidates on a long record must fit into memory."""
+    normal = fit.normal
+    bare = replace(fit, linearized=(), filtered=())
+    bare.__dict__["normal"] = normal
+    return bare
 
 
 def _promised(fit: Fit, matrix: Array, score: Array) -> float:
@@ -170,7 +178,7 @@ def _extended(base: Model, loop: Loop, names: Sequence[str]) -> Fit:
     """Return the likelihood of a larger model at its start, along the base's trajectory."""
     old = base.fit.problem
     m = Machine(loop, names, old.machine.hold, old.machine.law is not None)
-    tracks = tuple(make_track(loop, t.record) for t in old.tracks)
+    tracks = tuple(make_track(loop, t.record, float(t.table[0, 0])) for t in old.tracks)
     lower, upper = bounds_of(loop, names)
     longest = max(len(t.record) for t in tracks) * loop.dt
     for k, name in enumerate(names):
@@ -210,14 +218,17 @@ def refit(base: Model, trial: Trial) -> Trial:
     if trial.remark:
         return trial
     try:
-        fit = climb(trial.model.fit, rounds=SCREEN_ROUNDS, exact=False)
+        names = trial.model.names
+        start = _extended(base, trial.model.loop, names)
+        fit = climb(start, rounds=SCREEN_ROUNDS, exact=False)
     except CtrlidError as reason:
         return replace(trial, remark=str(reason))
     model = Model(trial.model.loop, fit)
     own = _own_parameters(trial, fit)
     cost = 0.5 * own * math.log(fit.size) + trial.scan
     done = replace(trial, model=model, gain=fit.value - base.fit.value, cost=cost)
-    return replace(done, remark=_objection(done))
+    done = replace(done, remark=_objection(done))
+    return done if done.merit > 0 else replace(done, model=Model(model.loop, light(fit)))
 
 
 def _own_parameters(trial: Trial, fit: Fit) -> int:
