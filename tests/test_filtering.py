@@ -1,0 +1,490 @@
+"""The filter: textbook Kalman filters, held-gain sensitivities, fixed point, maps over a period.
+
+Groups: one pass; sensitivities; the extended filter; maps over one period; long records.
+"""
+
+import math
+
+import control as ct
+import numpy as np
+import pytest
+from scipy import integrate, linalg
+
+import ctrlid as cid
+from ctrlid import effects as E
+from ctrlid.filtering import Machine, Noise, Trajectory, make_track
+from ctrlid.kalman import filter_pass
+
+# --- one pass
+
+
+def system(rng, size, n, m, p, varying):
+    """A random plant along a random nominal trajectory; unstable now and then."""
+    one = 1 if not varying else size
+
+    def some(*shape, scale=1.0):
+        values = scale * rng.standard_normal((one, *shape))
+        return np.broadcast_to(values, (size, *shape)).copy()
+
+    a = some(n, n)
+    a *= rng.uniform(0.5, 1.1) / np.abs(np.linalg.eigvals(a)).max(axis=1)[:, None, None]
+    return {
+        "step": some(n), "a": a, "b": some(n, m), "du": some(n), "dp": some(n, p),
+        "height": some(), "c": some(n), "hp": some(p), "predicted": some(n), "filtered": some(n),
+        "y": 3 * rng.standard_normal(size),
+    }  # fmt: skip
+
+
+def run(s, valid=None, afresh=None, doubt=None, start=None, spread=None, sensor=0.3,
+        force=None, memory=0.0, drift=0.0):  # fmt: skip
+    size, n = s["step"].shape
+    m = s["b"].shape[2]
+    valid = np.ones(size, dtype=bool) if valid is None else valid
+    if afresh is None:
+        afresh = np.arange(size) == 0
+    return filter_pass(
+        *s.values(), valid, afresh, np.zeros(size) if doubt is None else doubt,
+        np.zeros(n) if start is None else start, 2.0 * np.eye(n) if spread is None else spread,
+        sensor, np.full(m, 0.2) if force is None else force, memory, drift,
+    )  # fmt: skip
+
+
+def textbook(s, valid, afresh, doubt, start, spread, sensor, force, memory, drift):
+    """The Kalman filter of the augmented plant, as in a lecture; returns e, s, P, x and force."""
+    size, n = s["step"].shape
+    wide = n + 1 if drift else n
+    first = np.zeros((wide, wide))
+    first[:n, :n] = spread
+    if drift:
+        first[n, n] = drift / (1 - memory**2)
+    x, p = np.append(start, 0.0)[:wide], first
+    rows = []
+    for k in range(size):
+        if afresh[k]:
+            x, p = np.append(start, 0.0)[:wide], first
+        c = np.append(s["c"][k], 0.0)[:wide]
+        y = s["height"][k] + s["c"][k] @ (x[:n] - s["predicted"][k])
+        var = c @ p @ c + sensor
+        before, e = x[:n], 0.0
+        if valid[k]:
+            e = s["y"][k] - y
+            gain = p @ c / var
+            x, p = x + gain * e, p - np.outer(gain, gain) * var
+        rows.append((e, var, before, x[:n], np.sqrt(np.diag(p)[:n]), x[n] if drift else 0.0))
+        full = np.zeros((wide, wide))
+        full[:n, :n] = s["a"][k]
+        noise = np.zeros((wide, wide))
+        unsure = np.outer(s["du"][k], s["du"][k])
+        noise[:n, :n] = (s["b"][k] * force) @ s["b"][k].T + doubt[k] * unsure
+        moved = s["step"][k] + s["a"][k] @ (x[:n] - s["filtered"][k])
+        if drift:
+            full[:n, n], full[n, n], noise[n, n] = s["b"][k].sum(axis=1), memory, drift
+            moved = np.append(moved + full[:n, n] * x[n], memory * x[n])
+        x, p = moved, full @ p @ full.T + noise
+    return [np.array(column) for column in zip(*rows, strict=True)]
+
+
+@pytest.mark.parametrize("seed", range(24))
+def test_a_pass_is_the_textbook_filter(seed):
+    rng = np.random.default_rng([1, seed])
+    size, n, m = 150, int(rng.integers(1, 6)), int(rng.integers(1, 3))
+    s = system(rng, size, n, m, 0, varying=bool(seed % 2))
+    valid = rng.uniform(size=size) > (0.3 if seed % 3 == 0 else 0.0)
+    afresh = np.arange(size) == 0
+    if seed % 4 == 0:
+        afresh[[60, 61, 90]] = True
+    root = rng.standard_normal((n, n))
+    options = {
+        "valid": valid, "afresh": afresh, "doubt": np.where(valid, 0.0, rng.uniform(0, 2)),
+        "start": rng.standard_normal(n), "spread": root @ root.T, "sensor": rng.uniform(0.05, 2),
+        "force": rng.uniform(0, 1, m), "memory": 0.0, "drift": 0.0,
+    }  # fmt: skip
+    if seed % 2:
+        options |= {"memory": rng.uniform(-0.5, 0.99), "drift": rng.uniform(0.01, 1)}
+    found = run(s, **options)
+    expected = textbook(s, **options)
+    for k, j in ((0, 0), (1, 1), (2, 2), (3, 3), (4, 4), (6, 5)):
+        scale = np.abs(expected[j]).max() + 1e-12
+        np.testing.assert_allclose(found[k] / scale, expected[j] / scale, rtol=1e-8, atol=1e-9)
+
+
+def test_without_noise_the_variance_is_that_of_the_sensor_alone():
+    rng = np.random.default_rng(2)
+    s = system(rng, 40, 3, 1, 0, varying=True)
+    found = run(s, spread=np.zeros((3, 3)), force=np.zeros(1))
+    np.testing.assert_allclose(found[1], 0.3)
+
+
+def test_a_filter_that_runs_away_says_so_by_nan():
+    rng = np.random.default_rng(3)
+    s = system(rng, 2000, 2, 1, 0, varying=False)
+    s["a"] = np.broadcast_to(3.0 * np.eye(2), (2000, 2, 2)).copy()
+    s["c"] = np.zeros((2000, 2))  # sees nothing
+    s["step"] = s["step"] + 1.0
+    error = run(s)[0]
+    assert np.isnan(error[-1])
+    lost = int(np.argmax(np.isnan(error)))
+    assert 100 < lost < 500
+    assert np.isfinite(error[:lost]).all()
+
+
+# --- sensitivities
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_sensitivities_are_derivatives_at_a_held_gain(seed):
+    """Parameters move step and output; gain and derivatives of the map stay as they are."""
+    rng = np.random.default_rng([4, seed])
+    size, n, p = 120, int(rng.integers(1, 5)), 3
+    s = system(rng, size, n, 1, p, varying=True)
+    valid = rng.uniform(size=size) > 0.1
+    colour = {"memory": 0.8, "drift": 0.3} if seed % 2 else {}
+    found = run(s, valid=valid, **colour)
+    for q in range(p):
+        ends = []
+        for h in (-1e-3, 1e-3):  # linear in the parameter: no truncation
+            moved = {**s, "step": s["step"] + h * s["dp"][:, :, q],
+                     "height": s["height"] + h * s["hp"][:, q]}  # fmt: skip
+            out = run(moved, valid=valid, **colour)
+            ends.append(s["y"] - out[0])
+        slope = (ends[1] - ends[0]) / 2e-3
+        scale = np.abs(slope).max()
+        np.testing.assert_allclose(found[5][valid, q] / scale, slope[valid] / scale, atol=1e-9)
+
+
+def levitated(*effects, dt=1e-3, free=(), analog=False):
+    plant = cid.plants.maglev(m=0.0213, K=3.34e-6)
+    op = cid.operating_point(plant, output=0.012)
+    C = cid.design_lead(cid.linearize(plant, op), crossover=100, phase_margin=50)
+    loop = cid.Loop(plant, C if analog else C.sample(dt, "tustin"), dt=dt, at=op)
+    for effect in effects:
+        loop = loop.with_effect(effect)
+    return loop
+
+
+def test_the_machines_derivatives_are_those_of_its_map():
+    loop = levitated(E.CoulombFriction(fc=0.1), E.SensorLag(tau=5e-4), E.ActuatorLag(tau=3e-4),
+                     E.SensorNonlinearity(curvature=2.0))  # fmt: skip
+    names = ("K", "m", "CoulombFriction.fc", "SensorLag.tau", "ActuatorLag.tau",
+             "SensorNonlinearity.curvature")  # fmt: skip
+    r = cid.random_binary(200, amplitude=2e-4, hold=20, around=0.012, seed=1)
+    record = cid.simulate(levitated(), r, sensor_noise=2e-6, seed=2)
+    m = Machine(loop, names, "zoh", False)
+    track = make_track(loop, record)
+    rng = np.random.default_rng(5)
+    guess = m.guess(track)
+    x = guess.filtered * (1 + 0.01 * rng.standard_normal(guess.filtered.shape))
+    x[:, 1] = 0.01 * rng.standard_normal(200)
+    at = Trajectory(x, x.copy(), np.tile([1e-6, 2e-3, 1e-3, 1e-6][: m.n], (200, 1)))
+    theta = np.array([loop.parameters[k] for k in names])
+    lin = m.linearize(track, theta, at)
+    for k in range(len(names)):
+        h = 1e-5 * theta[k]
+        up, down = (m.linearize(track, theta + s * h * np.eye(len(names))[k], at) for s in (1, -1))
+        for slope, ends in ((lin.dp[:, :, k], (up.step, down.step)),
+                            (lin.hp[:, k], (up.height, down.height))):  # fmt: skip
+            measured = (ends[0] - ends[1]) / (2 * h)
+            scale = np.abs(measured).max() + 1e-9 * np.abs(ends[0]).max() / abs(theta[k])
+            np.testing.assert_allclose(slope / scale, measured / scale, atol=2e-5)
+    for j in range(m.n):
+        h = 1e-5 * np.abs(x[:, j]).max()
+        ends = []
+        for s in (1, -1):
+            moved = x.copy()
+            moved[:, j] += s * h
+            ends.append(m.linearize(track, theta, Trajectory(x, moved, at.spread)).step)
+        measured = (ends[0] - ends[1]) / (2 * h)
+        scale = np.abs(measured).max(axis=0) + 1e-12
+        np.testing.assert_allclose(lin.a[:, :, j] / scale, measured / scale, atol=1e-5)
+
+
+# --- the extended filter
+
+
+def sequential(record, q, sensor, m, K, steps=40):
+    """An extended Kalman filter on the levitation as in any textbook, sample after sample."""
+    dt = record.dt
+
+    def rate(z, u):
+        # State, its derivatives by the initial state and by a constant acceleration.
+        x, v = z[:2]
+        pull = K * u**2 / (m * x**2)
+        a = np.array([[0.0, 1.0], [2 * pull / x, 0.0]])
+        phi, gamma = z[2:6].reshape(2, 2), z[6:]
+        return np.concatenate([[v, 9.81 - pull], (a @ phi).ravel(), a @ gamma + [0.0, 1.0]])
+
+    def over_a_period(x, u):
+        z, h = np.concatenate([x, [1, 0, 0, 1], [0, 0]]), dt / steps
+        for _ in range(steps):
+            k1 = rate(z, u)
+            k2 = rate(z + h / 2 * k1, u)
+            k3 = rate(z + h / 2 * k2, u)
+            k4 = rate(z + h * k3, u)
+            z = z + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+        return z[:2], z[2:6].reshape(2, 2), z[6:]
+
+    x, p = np.array([record.y[0], 0.0]), np.diag([1e-4, 1e-1])
+    errors, variances, states = [], [], []
+    for u, y in zip(record.u, record.y, strict=True):
+        s = p[0, 0] + sensor**2
+        errors.append(y - x[0])
+        variances.append(s)
+        gain = p[:, 0] / s
+        x = x + gain * (y - x[0])
+        p = p - np.outer(gain, gain) * s
+        states.append(x)
+        x, phi, gamma = over_a_period(x, u)
+        p = phi @ p @ phi.T + q**2 * np.outer(gamma, gamma)
+    return np.array(errors), np.array(variances), np.array(states)
+
+
+def test_the_fixed_point_is_the_extended_kalman_filter():
+    loop = levitated(dt=4e-3)
+    r = cid.random_binary(500, amplitude=1e-3, hold=15, around=0.012, seed=3)
+    with_less = cid.Loop(loop.plant, cid.design_lead(
+        ct.sample_system(cid.linearize(loop.plant, loop.at), 4e-3), 90, 45
+    ), dt=4e-3, at=loop.at)  # fmt: skip
+    record = cid.simulate(with_less, 0.012 + 0.4 * (r - 0.012), sensor_noise=2e-5, force_noise=0.3,
+                          seed=4)  # fmt: skip
+    expected, s, states = sequential(record, 0.3, 2e-5, 0.0213, 3.34e-6)
+    found = cid.predict(with_less, record, force_noise=0.3 / 2e-5)
+    late = slice(40, None)
+    # Far from linear: a filter about the operating point differs much.
+    flat = linearized_at_rest(with_less, record)
+    assert np.std((flat - expected)[late]) > 0.02 * np.std(expected[late])
+    np.testing.assert_allclose(found.innovations[late], expected[late],
+                               atol=2e-3 * np.std(expected[late]))  # fmt: skip
+    np.testing.assert_allclose((found.spread / found.sensor_noise)[late] ** 2,
+                               (s / 2e-5**2)[late], rtol=5e-3)  # fmt: skip
+    spread = np.std(found.states - states, axis=0)[1]
+    assert spread < 2e-3 * np.std(states[:, 1])
+
+
+def linearized_at_rest(loop, record):
+    """Innovations of the filter that is linearized at the operating point once and for all."""
+    P = cid.linearize(loop.plant, loop.at)
+    linear = cid.Loop(P, None, dt=loop.dt, at=cid.OperatingPoint((), loop.at.input, 0.012))
+    return cid.predict(linear, record, force_noise=0.3 / 2e-5).innovations
+
+
+# --- maps over one period
+
+
+def one_period(loop, x, u_before, u_now, free=()):
+    """The machine's map of states `x` (k, n) when the input goes from one value to the next."""
+    m = Machine(loop, free, "zoh", False)
+    late = m.late
+    k = late + 1  # the sample at which u_now is the one in force
+    size = max(k + 3, 12)
+    u = np.full(size, u_now)
+    u[:1] = u_before
+    record = cid.Record(u=u, y=np.linspace(0.01, 0.013, size), dt=loop.dt)
+    track = make_track(loop, record)
+    theta = [loop.parameters[name] for name in m.names]
+    at = np.zeros((size, m.size))
+    at[k] = x
+    wide = np.zeros((size, m.size))
+    return m.linearize(track, np.array(theta), Trajectory(at, at, wide)).step[k], m
+
+
+DT = 4e-3
+
+
+@pytest.mark.parametrize("ratio", [0.01, 0.03, 0.1, 0.124, 0.126, 0.2, 0.3, 1.0, 3.0, 10.0])
+@pytest.mark.parametrize("free", [False, True])
+def test_an_actuator_lag_of_any_length(ratio, free):
+    tau = ratio * DT
+    loop = levitated(E.ActuatorLag(tau=tau), dt=DT)
+    names = ("ActuatorLag.tau",) if free else ()
+    rng = np.random.default_rng(6)
+    for _ in range(3):
+        x = np.array([rng.uniform(0.008, 0.016), 0.02 * rng.standard_normal(), rng.uniform(2, 4)])
+        u = rng.uniform(2, 4)
+        found, _ = one_period(loop, x, u, u, names)
+
+        def rate(t, z, u=u):
+            pull = 3.34e-6 * z[2] ** 2 / (0.0213 * z[0] ** 2)
+            return [z[1], 9.81 - pull, (u - z[2]) / tau]
+
+        exact, quick = (
+            integrate.solve_ivp(rate, (0, DT), z, method="LSODA", rtol=1e-12, atol=1e-15).y[:, -1]
+            for z in (x, [*x[:2], u])
+        )
+        assert abs(found[2] - exact[2]) < 1e-10
+        # Within 2 % of what the transient of the lag does, mostly far less.
+        assert (np.abs(found - exact)[:2] < 0.02 * np.abs(exact - quick)[:2]).all()
+        if ratio >= 0.3:
+            assert (np.abs(found - exact)[:2] < 5e-4 * np.abs(exact - quick)[:2]).all()
+
+
+@pytest.mark.parametrize("ratio", [0.01, 0.1, 0.5, 1.0, 10.0])
+def test_a_sensor_lag_of_any_length(ratio):
+    """The sensor's state is filled by an output that runs nearly straight over a period."""
+    tau, dt = ratio * 1e-3, 1e-3
+    loop = levitated(E.SensorLag(tau=tau), dt=dt)
+    rng = np.random.default_rng(7)
+    for _ in range(3):
+        x = np.array([rng.uniform(0.011, 0.013), 0.02 * rng.standard_normal(), 0.012])
+        u = rng.uniform(2.5, 3.5)
+        found, _ = one_period(loop, x, u, u)
+
+        def rate(t, z, u=u):
+            pull = 3.34e-6 * u**2 / (0.0213 * z[0] ** 2)
+            return [z[1], 9.81 - pull, (z[0] - z[2]) / tau]
+
+        exact = integrate.solve_ivp(rate, (0, dt), x, method="LSODA", rtol=1e-12, atol=1e-16).y
+        moved = np.abs(exact[:, -1] - x)
+        assert (np.abs(found[:2] - exact[:2, -1]) < 1e-6 * moved[:2] + 1e-14).all()
+        bend = 0.5 * abs(rate(0, x)[1]) * dt**2  # what a straight line misses of the way
+        assert abs(found[2] - exact[2, -1]) < 0.2 * bend + 1e-6 * moved[2]
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.001, 0.3, 0.5, 0.999, 1.0, 1.4, 2.0, 3.75])
+def test_a_delay_of_any_length(delay):
+    loop = levitated(E.InputDelay(delay=delay * DT), dt=DT)
+    rng = np.random.default_rng(8)
+    x = np.array([0.011, 0.015])
+    before, now = rng.uniform(2, 4, 2)
+    found, m = one_period(loop, x, before, now, ("InputDelay.delay",))
+    assert m.late == math.floor(delay)
+    z, part = x, delay - math.floor(delay)
+
+    def rate(t, z, u):
+        return [z[1], 9.81 - 3.34e-6 * u**2 / (0.0213 * z[0] ** 2)]
+
+    # At this sample the last but one input has just been followed by the last.
+    for u, time in ((before, part * DT), (now, (1 - part) * DT)):
+        if time:
+            z = integrate.solve_ivp(rate, (0, time), z, args=(u,), rtol=1e-12, atol=1e-16).y[:, -1]
+    np.testing.assert_allclose(found, z, rtol=0, atol=5e-5 * np.abs(z - x).max())
+
+
+def test_a_straight_input_with_a_delay():
+    """First-order hold, late by 1.3 samples: the plant is two integrators, in closed form."""
+    plant = ct.nlsys(lambda t, x, u, p: [x[1], u[0]], lambda t, x, u, p: x[0], name="mass",
+                     inputs=["u"], outputs=["x"], states=["x", "v"])  # fmt: skip
+    dt, late = 0.1, 1.3
+    loop = cid.Loop(plant, None, dt=dt).with_effect(E.InputDelay(delay=late * dt))
+    rng = np.random.default_rng(9)
+    u = rng.standard_normal(30)
+    record = cid.Record(u=u, y=rng.standard_normal(30), dt=dt, hold="foh")
+    m = Machine(loop, (), "foh", False)
+    track = make_track(loop, record)
+    still = np.zeros((30, 2))
+    step = m.linearize(track, np.empty(0), Trajectory(still, still, still)).step
+    for k in range(5, 28):
+
+        def applied(t, k=k):
+            return np.interp(k + t / dt - late, np.arange(30), u)
+
+        kinks = [0.3 * dt]
+        v = integrate.quad(applied, 0, dt, points=kinks, epsabs=1e-14)[0]
+        x = integrate.quad(lambda t: (dt - t) * applied(t), 0, dt, points=kinks, epsabs=1e-14)[0]
+        np.testing.assert_allclose(step[k], [x, v], atol=1e-12)
+
+
+def test_play_is_followed_with_its_derivative():
+    width = 0.3
+    loop = levitated(E.InputBacklash(width=width), dt=DT)
+    rng = np.random.default_rng(10)
+    n = 400
+    u = 3 + 0.5 * np.sin(np.arange(n) / 9) + 0.1 * rng.standard_normal(n)
+    record = cid.Record(u=u, y=np.full(n, 0.012) + 1e-6 * rng.standard_normal(n), dt=DT)
+
+    def behind(w):
+        m, out = u[0], []
+        for value in u:
+            m = min(max(m, value - w / 2), value + w / 2)
+            out.append(m)
+        return np.array(out)
+
+    m = Machine(loop, ("InputBacklash.width",), "zoh", False)
+    track = make_track(loop, record)
+    x = np.tile([0.012, 0.0], (n, 1))
+    at = Trajectory(x, x, np.zeros((n, 2)))
+    lin = m.linearize(track, np.array([width]), at)
+    plain = Machine(levitated(dt=DT), (), "zoh", False)
+    applied = cid.Record(u=behind(width), y=record.y, dt=DT)
+    expected = plain.linearize(make_track(plain.loop, applied), np.empty(0), at).step
+    np.testing.assert_allclose(lin.step, expected, atol=1e-4 * np.std(expected[:, 1]))
+    h = 1e-6
+    ends = [m.linearize(track, np.array([width + s * h]), at).step for s in (1, -1)]
+    slope = (ends[0] - ends[1]) / (2 * h)
+    close = np.abs(lin.dp[:, :, 0] - slope) < 1e-6 * np.abs(slope).max()
+    assert close.all(axis=1).mean() > 0.99  # but where the step of the difference met a corner
+    assert np.abs(slope).max() > 0
+
+
+def test_coulomb_friction_is_smoothed_by_the_uncertain_velocity():
+    """Expected sign of a normal velocity: erf(v / (sqrt(2) s))."""
+    plant = ct.nlsys(lambda t, x, u, p: [x[1], u[0]], lambda t, x, u, p: x[0], name="mass",
+                     inputs=["u"], outputs=["x"], states=["x", "v"])  # fmt: skip
+    loop = cid.Loop(plant, None, dt=1e-6).with_effect(E.CoulombFriction(fc=2.0))
+    m = Machine(loop, (), "zoh", False)
+    rng = np.random.default_rng(11)
+    v, s = 0.1 * rng.standard_normal(40), np.exp(rng.uniform(-6, 0, 40))
+    record = cid.Record(u=np.zeros(40), y=rng.standard_normal(40), dt=1e-6)
+    x = np.column_stack([np.zeros(40), v])
+    at = Trajectory(x, x, np.column_stack([np.zeros(40), s]))
+    step = m.linearize(make_track(loop, record), np.empty(0), at).step
+    deviates = np.linspace(-8, 8, 200_001)
+    weight = np.exp(-0.5 * deviates**2)
+    expected = [np.sum(weight * np.sign(a + b * deviates)) / weight.sum() for a, b in
+                zip(v, s, strict=True)]  # fmt: skip
+    np.testing.assert_allclose((v - step[:, 1]) / 1e-6 / 2.0, expected, atol=2e-4)
+
+
+def test_an_analog_circuit_moves_the_input_between_samples():
+    loop = levitated(analog=True, dt=2e-3)
+    r = cid.random_binary(60, amplitude=1e-4, hold=5, around=0.012, seed=5)
+    record = cid.simulate(loop, r)
+    m = Machine(loop, (), "foh", True)
+    track = make_track(loop, record)
+    fit = m.settle(track, np.empty(0), Noise((1e12,)), m.guess(track))[1]
+    late = slice(15, None)
+    assert np.abs(fit.innovations[late]).max() < 1e-4 * np.std(record.y)
+
+
+# --- long records
+
+
+def test_a_million_samples_of_an_unstable_plant_stay_positive():
+    """One pass over 1e6 samples: positive, finite, and still the Riccati equation's solution."""
+    n, dt = 1_000_000, 1e-3
+    A = np.array([[0.0, 1.0], [1635.0, 0.0]])
+    whole = linalg.expm(dt * np.vstack([np.column_stack([A, [0.0, 1.0]]), np.zeros((1, 3))]))
+    a, b = whole[:2, :2], whole[:2, 2]
+    rng = np.random.default_rng(12)
+
+    def every(values):
+        return np.ascontiguousarray(np.broadcast_to(values, (n, *np.shape(values))))
+
+    # A stable closed loop drives it; the filter knows y and what the input does.
+    feedback = np.array([-4000.0, -60.0])
+    step, y, x = np.empty((n, 2)), np.empty(n), np.zeros(2)
+    hiss, kicks = 2e-6 * rng.standard_normal(n), 0.05 * rng.standard_normal(n)
+    shaken = np.outer(kicks, b)
+    closed = a + np.outer(b, feedback)
+    poles = np.abs(np.linalg.eigvals(closed))
+    assert poles.max() < 1
+    for k in range(n):
+        y[k] = x[0]
+        step[k] = x
+        x = closed @ x + shaken[k]
+    y += hiss
+    pushes = step @ feedback
+    zero = np.zeros((n, 2))
+    ratio = (0.05 / 2e-6) ** 2
+    out = filter_pass(
+        np.outer(pushes, b), every(a), every(b[:, None]), zero, np.zeros((n, 2, 1)), np.zeros(n),
+        every(np.array([1.0, 0.0])), np.zeros((n, 1)), zero, zero, y, np.ones(n, dtype=bool),
+        np.arange(n) == 0, np.zeros(n), np.zeros(2), 1e12 * np.eye(2), 1.0, np.array([ratio]),
+        0.0, 0.0,
+    )  # fmt: skip
+    steady = linalg.solve_discrete_are(a.T, np.array([[1.0], [0.0]]), ratio * np.outer(b, b),
+                                       np.eye(1))  # fmt: skip
+    assert np.isfinite(out[0]).all()
+    np.testing.assert_allclose(out[1][1000:], steady[0, 0] + 1, rtol=1e-6)
+    z = out[0][1000:] / (2e-6 * np.sqrt(out[1][1000:]))
+    assert z.std() == pytest.approx(1.0, abs=0.005)
+    assert abs(z[1:] @ z[:-1]) / len(z) < 0.005
