@@ -21,6 +21,7 @@ from ctrlid.simulation import Simulator
 
 SAMPLES = 20_000
 OFF = 0.1  # a free parameter is believed at most this far off
+FINE, MOST = 1e-8, 24  # local error of a simulation, and its steps in a period: enough for friction
 
 
 @dataclass(frozen=True)
@@ -81,7 +82,7 @@ class Draw:
         """Return a record of a real loop; `spread` scales the sensor noise, sample by sample."""
         given = self.excitation(seed) if r is None else np.asarray(r, dtype=float)
         n, closed = len(given), real.controller is not None
-        simulator = Simulator(real)
+        simulator = Simulator(real, FINE, MOST)
         hiss = (noise or self.noise).draw(np.random.default_rng([seed, 7]), n)
         if spread is not None:
             hiss[0] = hiss[0] * spread

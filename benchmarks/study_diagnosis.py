@@ -52,7 +52,9 @@ from ctrlid.effects import CATALOGUE, AbstractEffect, equivalents
 KINDS = ("named", "none", "outside", "two", "three", "lookalike")
 WORTH = {"faint": (50.0, 300.0), "moderate": (300.0, 3e3), "ordinary": (3e3, 3e4)}
 TRIES = 40  # draws until one can carry an effect of the wanted worth
-ROUNDS = 8  # of finding its size
+ROUNDS = 9  # of finding its size
+SHORT = 5  # the first of them on records so many times shorter
+LARGEST = 40.0  # of what is easily seen: beyond, friction holds everything fast
 MARGINAL = 100.0  # what each of several effects must be worth beside the others
 CONFUSED = "InputDelay", "SensorLag", "ForceExponent", "PositionOffset", "LinearStiffness"
 
@@ -277,31 +279,45 @@ def sized(one: Draw, make: Any, band: tuple[float, float], target: float, seed: 
     """Scale an effect until it is worth what it should be; None where it cannot be.
 
     The gain grows about with the square of the size; between two sizes with known gains the next
-    one is interpolated on logarithmic scales.
+    one is interpolated on logarithmic scales. The first sizes are tried on short records.
     """
-    z, known, failed = 1.0, [], math.inf
+    first = make(1.0)
+    timed = isinstance(first, effects.ParameterStep | effects.ParameterDrift | GainLoss)
+    z, full, known, failed = 1.0, timed, [], math.inf
     for _ in range(ROUNDS):
+        tried = one if full else replace(one, samples=one.samples // SHORT)
         try:
             effect = make(z)
             real = one.loop.with_effect(effect)
-            record = one.run(real, seed)
+            record = tried.run(real, seed)
             gain, truth = worth(one, [effect], record)
         except cid.CtrlidError:
             failed = min(failed, z)
             z /= 4
             continue
-        if band[0] <= gain <= band[1] and abs(math.log(gain / target)) < 0.5:
+        near = abs(math.log(max(gain, 0.5) * one.samples / tried.samples / target))
+        if full and band[0] <= gain <= band[1] and near < 0.5:
             label = type(effect).__name__
             return Case(one, real, (effect,), record, seed, truth, gain, label=label)
-        known.append((z, max(gain, 0.5)))
+        if near < 0.5 and not full:
+            full, known = True, []
+            continue
+        known.append((z, max(gain, 0.5) * one.samples / tried.samples))
+        if len(known) > 2 and _flat(known[-3:]):
+            return None  # the noise model takes it for noise, however large it is
         z = _next_size(known, target)
         if z >= failed:
             z = math.sqrt(failed * known[-1][0])
             if z > 0.8 * failed:
                 return None
-        if not 1e-6 < z < 1e5:
+        if not 1e-6 < z < LARGEST:
             return None
     return None
+
+
+def _flat(known: list[tuple[float, float]]) -> bool:
+    (z0, gain0), (z1, gain1) = min(known), max(known)
+    return z1 > 3 * z0 and gain1 < gain0 * (z1 / z0) ** 0.3
 
 
 def _next_size(known: list[tuple[float, float]], target: float) -> float:
@@ -521,7 +537,7 @@ class Row:
         names = "; ".join(" | ".join(n) for n in self.named) or "-"
         mark = "right" if self.right else "WRONG"
         if self.in_set and not self.right:
-            mark = "first, but DOWNGRADED" if self.extra.get("first") else "in set"
+            mark = "in set" if self.verdict == "explained" else "in set, DOWNGRADED"
         text = f"{head}{hid} worth {self.worth:.0f}: {self.verdict}: {names}: {mark}"
         if self.beside:
             text += " + FALSE"
