@@ -196,9 +196,7 @@ def _diagnosis_blocks(found: Diagnosis) -> list[Table | str]:
     )  # fmt: skip
     if places:
         columns = ("along", *("before", "after")[:sides], *("by chance", "after")[:sides])
-        made.append(
-            Table(columns, places, "Mean square of the one-step errors at worst; 1 is noise.")
-        )
+        made.append(Table(columns, places, "RMS of the one-step errors at worst; 1 is noise."))
     if found.verdict == "nothing missing" and found.sensitivity:
         made.append(Table(("effect", "smallest size that would have been seen"),
                           tuple(words.sensitivity_rows(found))))  # fmt: skip

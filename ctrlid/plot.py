@@ -423,7 +423,7 @@ def diagnosis(found: Diagnosis, axes: Any = None) -> Any:
     """Draw what a diagnosis found: the gap before and after, where it sits, and the ranking.
 
     From top to bottom: the measured output against the model before and after, on those samples
-    kept back on which it erred most; the errors against the noise floor; mean square errors along
+    kept back on which it erred most; the errors against the noise floor; RMS one-step errors along
     the two most telling quantities, in units of noise; and the evidence for each candidate, by
     rounds of the search.
 
@@ -636,29 +636,29 @@ def _limit(ax: Any, y: Array) -> None:
 
 
 def _where(ax: Any, place: Place | None, found: Diagnosis) -> None:
-    """Draw the mean square of the one-step errors along one quantity, before and after."""
+    """Draw the RMS of the one-step errors along one quantity, before and after."""
     if place is None:
         ax.text(0.5, 0.5, "no place is known", ha="center", va="center", transform=ax.transAxes)
         ax.set_axis_off()
         return
-    at = np.arange(len(place.before))
+    at, before, after = np.arange(len(place.before)), np.sqrt(place.before), np.sqrt(place.after)
     both = bool(found.findings)
     solid = {"facecolor": COLOURS[0], "edgecolor": COLOURS[0], "linewidth": 0.8}
     if both:
-        ax.bar(at + 0.3, place.before, 0.4, label="before", facecolor="w", edgecolor=COLOURS[1],
+        ax.bar(at + 0.3, before, 0.4, label="before", facecolor="w", edgecolor=COLOURS[1],
                hatch="//////", linewidth=0.8)  # fmt: skip
-        ax.bar(at + 0.7, place.after, 0.4, label="after", **solid)
+        ax.bar(at + 0.7, after, 0.4, label="after", **solid)
     else:
-        ax.bar(at + 0.5, place.before, 0.8, label="recalibrated", **solid)
+        ax.bar(at + 0.5, before, 0.8, label="recalibrated", **solid)
     ax.axhline(1, color="k", linewidth=1.2, linestyle=":", label="noise")
     labels, title = _pictures.bin_labels(place)
     every = -(-len(at) // 5)
     ax.set_xlim(0, len(at))
     ax.set_xlabel(title)
-    ax.set_ylabel("mean square error /\nthat of noise [1]")
-    top = float(np.nanmax([*place.before, *place.after, 1.0]))
+    ax.set_ylabel("one-step RMS error /\nthat of noise [1]")
+    top = float(np.nanmax([*before, *after, 1.0]))
     _finish(ax, columns=3, size="small")
-    if top > 20:
+    if top > 10:
         ax.set_yscale("log")
     else:
         ax.set_ylim(0, 1.1 * top)

@@ -52,8 +52,8 @@ footer { margin-top: 3rem; color: var(--faint); font-size: 0.85rem; }
 
 
 DIAGNOSIS = (
-    "Output and errors where the gap is largest; mean square of the one-step errors along the two "
-    "most telling quantities; the candidates by rounds of the search."
+    "Output and errors where the gap is largest; RMS of the one-step errors along the two most "
+    "telling quantities; the candidates by rounds of the search."
 )
 
 

@@ -142,9 +142,9 @@ def telling(found: Diagnosis) -> list[Place]:
 
 
 def worst(levels: Iterable[float]) -> float:
-    """Return the highest level among the bins that hold something, NaN without any."""
+    """Return the highest RMS among the bins that hold something, from mean squares; NaN without."""
     known = [v for v in levels if math.isfinite(v)]
-    return max(known, default=math.nan)
+    return math.sqrt(max(known, default=math.nan))
 
 
 def place_words(place: Place) -> str:
@@ -165,7 +165,7 @@ def _where(found: Diagnosis) -> list[str]:
         return ["  where it sits: " + (f"nowhere; noise looks like this along {axes}" if axes else
                                        "not known")]  # fmt: skip
     same = not found.findings
-    head = "  where it sits: mean square of the one-step errors, 1 is noise"
+    head = "  where it sits: RMS of the one-step errors, 1 is noise"
     rows = [f"{head:<79}{'worst' if same else 'before':>10}{'' if same else 'after':>10}"]
     for place in places:
         first, *more = textwrap.wrap(place_words(place), 60) or [""]
