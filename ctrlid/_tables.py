@@ -182,7 +182,7 @@ def _diagnosis_blocks(found: Diagnosis) -> list[Table | str]:
                 caption)  # fmt: skip
     made: list[Table | str] = [words.headline(found), gap, words.shrinking(found.gap)]
     for k, finding in enumerate(found.findings, 1):
-        sure = words.certainty(finding, len(found.findings) == 1)
+        sure = words.certainty(found, finding)
         made += [f"{k}. {words.named(finding)}. {words.sized(found, finding)}.", f"{_upper(sure)}."]
         made += [f"{_upper(doubt)}." for doubt in words.doubts(found, finding)]
     if found.findings:

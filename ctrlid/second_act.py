@@ -38,7 +38,7 @@ LONGEST = 10_000  # samples: a diagnosis in seconds
 BELIEVED = 0.05  # how far off the magnet's constant is believed, relative
 # Ordinary sizes: what a student's apparatus has and a textbook leaves out.
 HIDDEN: tuple[tuple[type[AbstractEffect], dict[str, tuple[float, float]]], ...] = (
-    (CoulombFriction, {"fc": (0.2, 0.5)}),
+    (CoulombFriction, {"fc": (0.1, 0.2)}),
     (ViscousFriction, {"c": (3.0, 8.0)}),
     (ActuatorLag, {"tau": (0.001, 0.003)}),
     (ForceExponent, {"n": (1.7, 1.9)}),

@@ -164,9 +164,13 @@ def test_report_of_a_clean_bill(found):
 
 def test_bad_news_is_in_capitals(found):
     assert "PARTLY EXPLAINED: SOMETHING IS STILL MISSING. " in text(found["partly explained"])
-    assert "what remains: NOT NOISE ALONE, by whiteness (p < 0.0001)" in text(found["unknown"])
+    assert "NOT NOISE ALONE, by 1 of 2 tests: whiteness (p < 0.0001)" in text(found["unknown"])
     assert "UNKNOWN: SOMETHING IS MISSING that no candidate explains. " in text(found["unknown"])
     assert "with the effects" not in text(found["unknown"])
+    assert "It may stand in for what is still missing" in text(found["partly explained"])
+    many = dict.fromkeys(("a", "b", "c", "d", "e", "f"), 1e-5)
+    words = text(replace(found["unknown"], tests={**many, "g": 0.5}))
+    assert "by 6 of 7 tests: a, b, c and 3 others (p < 0.0001)" in words
     assert "velocity where the motion turns 1.74" in text(found["unknown"])
     base = found["explained"]
     worse = replace(base, gap=replace(base.gap, after=2 * base.gap.before))

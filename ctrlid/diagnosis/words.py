@@ -14,6 +14,7 @@ from .saving import units_of
 WIDTH = 100
 TELLING = 1e-3  # probability below which a place is not noise's doing
 PLACES = 3
+LISTED = 4  # tests that fail
 LARGE = 0.5  # share of the floor from which a random force may hide something
 STRONG, CERTAIN = 10.0, 30.0  # evidence
 HEADLINES = {
@@ -201,30 +202,21 @@ def newtons(found: Diagnosis, effect: AbstractEffect) -> str:
     return f"{listing(words)} at {mass} = {quantity(known[mass], 'kg')}" if words else ""
 
 
-def certainty(finding: Finding, alone: bool = True) -> str:
-    """Say how sure it is that something like this effect is there, and that it is this one.
-
-    Parameters
-    ----------
-    finding : Finding
-        The finding.
-    alone : bool, optional
-        Whether it is the only one, so that its share of the gap is that of the diagnosis.
-
-    Returns
-    -------
-    str
-        The words.
-    """
+def certainty(found: Diagnosis, finding: Finding) -> str:
+    """Say how sure it is that something like this effect is there, and that it is this one."""
     sure = ("WEAK" if finding.evidence < STRONG else
             "strong" if finding.evidence < CERTAIN else "beyond doubt")  # fmt: skip
     text = f"evidence {finding.evidence:.{0 if finding.evidence >= STRONG else 1}f}, {sure}"
-    if math.isfinite(finding.share) and not alone:
+    if math.isfinite(finding.share) and len(found.findings) > 1:
         text += f"; closes {percent(finding.share)} of the squared gap above the floor"
     many = len(finding.names)
     if many > 1:
-        return text + f"; ONE OF {many} that explain the record"
-    return text + "; no other effect explains the record as well"
+        text += f"; ONE OF {many} that explain the record"
+    else:
+        text += "; no other effect explains the record as well"
+    if found.verdict == "partly explained":
+        text += ". It may stand in for what is still missing"
+    return text
 
 
 def doubts(found: Diagnosis, finding: Finding) -> list[str]:
@@ -258,10 +250,9 @@ def sized(found: Diagnosis, finding: Finding) -> str:
 
 
 def _finding(found: Diagnosis, finding: Finding, label: str) -> list[str]:
-    alone = len(found.findings) == 1
     lines = _wrapped(f"{label}{named(finding)}", 4, hang=7)
     lines += _wrapped(sized(found, finding), 7, hang=9)
-    for text in (certainty(finding, alone), *doubts(found, finding)):
+    for text in (certainty(found, finding), *doubts(found, finding)):
         lines += _wrapped(text, 7, hang=9)
     return lines
 
@@ -321,10 +312,13 @@ def disturbance(found: Diagnosis) -> str:
 
 def remains(found: Diagnosis) -> str:
     """Say whether what is left is noise, by the tests of the final one-step errors."""
-    failed = {k: p for k, p in found.tests.items() if p < TELLING}
+    failed = sorted((p, name) for name, p in found.tests.items() if p < TELLING)
     if failed:
-        listed = listing([f"{name} ({chance(p)})" for name, p in failed.items()])
-        return f"what remains: NOT NOISE ALONE, by {listed}"
+        names = [name for _, name in failed[:LISTED]]
+        if len(failed) > LISTED:
+            names[-1] = f"{len(failed) - LISTED + 1} others"
+        return (f"what remains: NOT NOISE ALONE, by {len(failed)} of {len(found.tests)} tests: "
+                f"{listing(names)} ({chance(failed[0][0])})")  # fmt: skip
     if not found.tests:
         return "what remains: not tested"
     name, p = min(found.tests.items(), key=lambda item: item[1])
