@@ -24,17 +24,9 @@ from ..validation import best_start, time_constant
 ROUGH = 1e-5  # local error of the integration, far below any gap worth a word
 FEW_STEPS = 8  # of the integration in a period; sharp friction would ask for many more
 RUNS = 3  # simulations with noise for the floor
+MOST_HELD = 30_000  # samples that are simulated for the comparison
 HELD = 0.25  # share of a record that is kept back for the comparison
 START = 0.02  # share of a stretch in which the guess of the initial state may still show
-
-
-@dataclass(frozen=True, eq=False)
-class Comparison:
-    """What a model makes of records: the outputs it gives, NaN where it gives none."""
-
-    kind: str
-    outputs: tuple[Array, ...]
-    floors: tuple[float, ...]
 
 
 def way_to_compare(loop: Loop, record: Record) -> str:
@@ -48,37 +40,55 @@ def way_to_compare(loop: Loop, record: Record) -> str:
     return f"{time_constant(poles, e.dt, record)}-step prediction"
 
 
-def held_out(record: Record) -> Any:
-    """Return the samples that are kept back: the last quarter of what counts."""
+@dataclass(frozen=True, eq=False)
+class Window:
+    """A stretch of a record that is compared, with a lead in which the start may still show.
+
+    `begin` is the time of its first sample since the start of the record, `mask` what is compared.
+    """
+
+    record: Record
+    begin: float
+    mask: Any
+
+
+def held_out(record: Record) -> tuple[Window, Record]:
+    """Return the last quarter of what counts, and the record before it."""
     valid = np.flatnonzero(record.valid)
-    first = valid[int((1 - HELD) * len(valid))]
-    mask = np.zeros(len(record), dtype=bool)
-    mask[first:] = True
-    return mask & record.valid
+    first = max(int(valid[int((1 - HELD) * len(valid))]), len(record) - MOST_HELD)
+    start = max(first - max((len(record) - first) // 5, 200), 0)
+    part = record[start:]
+    mask = np.asarray(part.valid) & (np.arange(len(part)) >= first - start)
+    return Window(part, start * record.dt, mask), record[:first]
 
 
-def without(record: Record, mask: Any) -> Record:
-    """Return a record in which masked samples do not count."""
-    return replace(record, valid=np.asarray(record.valid) & ~mask)
+def whole(record: Record) -> Window:
+    """Return a record of which all but the very start is compared."""
+    mask = np.asarray(record.valid).copy()
+    mask[: max(int(START * len(mask)), 1)] = False
+    return Window(record, 0.0, mask)
 
 
-def root_mean_square(record: Record, y: Array, mask: Any) -> float:
-    """Return the RMS difference on masked samples; infinite where the model gives nothing."""
-    use = mask & record.valid
-    if not np.isfinite(y[use]).any():
-        return math.inf
-    use &= np.isfinite(y)
-    return float(np.sqrt(np.mean((record.y[use] - y[use]) ** 2)))
+def root_mean_square(windows: Sequence[Window], results: Sequence[Array]) -> float:
+    """Return the RMS difference on compared samples; infinite where the model gives nothing."""
+    squares, count = 0.0, 0
+    for window, y in zip(windows, results, strict=True):
+        use = window.mask & np.isfinite(y)
+        if window.mask.any() and not use.any():
+            return math.inf
+        squares += float(np.sum((window.record.y[use] - y[use]) ** 2))
+        count += int(use.sum())
+    return math.sqrt(squares / max(count, 1))
 
 
-def outputs(loop: Loop, records: Sequence[Record], kind: str) -> tuple[Array, ...]:
-    """Return what a loop makes of each record, without any of its measured outputs but the first.
+def outputs(loop: Loop, windows: Sequence[Window], kind: str) -> tuple[Array, ...]:
+    """Return what a loop makes of each window, without any of its measured outputs but the first.
 
     Parameters
     ----------
     loop : Loop
         The model.
-    records : sequence of Record
+    windows : sequence of Window
         The data.
     kind : str
         As `way_to_compare` says it.
@@ -88,10 +98,10 @@ def outputs(loop: Loop, records: Sequence[Record], kind: str) -> tuple[Array, ..
     tuple of ndarray
         Outputs; NaN where there are none.
     """
-    return tuple(_output(loop, record, kind) for record in records)
+    return tuple(_output(loop, w.record, w.begin, kind) for w in windows)
 
 
-def _output(loop: Loop, record: Record, kind: str) -> Array:
+def _output(loop: Loop, record: Record, first: float, kind: str) -> Array:
     y = np.full(len(record), np.nan)
     try:
         if kind.endswith("prediction"):
@@ -107,7 +117,8 @@ def _output(loop: Loop, record: Record, kind: str) -> Array:
         try:
             part = record[start:stop]
             z, r, d = drive(simulator, part)
-            y[start:stop] = simulator.run(z, r, d, None, record.t[start] - record.start)[0]
+            begin = first + float(record.t[start] - record.start)
+            y[start:stop] = simulator.run(z, r, d, None, begin)[0]
         except CtrlidError:
             continue
     return y
@@ -136,7 +147,7 @@ def drive(simulator: Simulator, part: Record) -> tuple[Array, Array | None, Arra
 
 
 def floor(
-    loop: Loop, fit: Fit, records: Sequence[Record], kind: str, masks: Any, force: bool = True
+    loop: Loop, fit: Fit, windows: Sequence[Window], kind: str, force: bool = True
 ) -> float:  # fmt: skip
     """Return the RMS error that sensor and force noise leave through a loop.
 
@@ -146,12 +157,10 @@ def floor(
         The model with everything in it.
     fit : Fit
         Its fit, for the noise.
-    records : sequence of Record
+    windows : sequence of Window
         The data.
     kind : str
         As `way_to_compare` says it.
-    masks : sequence of ndarray of bool
-        The samples that are compared.
     force : bool, optional
         Whether the force noise takes part.
 
@@ -161,21 +170,22 @@ def floor(
         RMS error [output unit]; NaN where it cannot be computed.
     """
     squares, count = 0.0, 0
-    for k, (record, mask) in enumerate(zip(records, masks, strict=True)):
+    for k, window in enumerate(windows):
         sensor = float(fit.sensor[min(k, len(fit.sensor) - 1)])
         try:
-            value = _floor(loop, fit, sensor, record, kind, mask, force)
+            value = _floor(loop, fit, sensor, window, kind, force)
         except CtrlidError:
             return math.nan
-        size = int(np.count_nonzero(mask))
+        size = int(np.count_nonzero(window.mask))
         squares += value**2 * size
         count += size
     return math.sqrt(squares / count)
 
 
 def _floor(
-    loop: Loop, fit: Fit, sensor: float, record: Record, kind: str, mask: Any, force: bool
+    loop: Loop, fit: Fit, sensor: float, window: Window, kind: str, force: bool
 ) -> float:  # fmt: skip
+    record = window.record
     if kind.endswith("prediction"):
         found = predict(loop, record)
         found = found if force else replace(found, force_noise=0.0)
@@ -183,11 +193,11 @@ def _floor(
     simulator = Simulator(loop, ROUGH, FEW_STEPS)
     values = []
     for start, stop in record.segments():
-        use = mask[start:stop]
+        use = window.mask[start:stop]
         if stop - start < FEWEST or not use.any():
             continue
         part = record[start:stop]
-        begin = record.t[start] - record.start
+        begin = window.begin + float(record.t[start] - record.start)
         z, r, d = drive(simulator, part)
         quiet = simulator.run(z, r, d, None, begin)[0]
         for seed in range(RUNS):

@@ -200,9 +200,10 @@ def _worker(jobs: int) -> Callable[[Callable[..., Any], Iterable[Any]], list[Any
 def _trained(model: Model, records: Sequence[Record]) -> Loop:
     """Return a model's loop with its parameters fitted to other records."""
     fit = model.fit
-    problem = make_problem(model.fitted, model.names, records)
     if not model.names:
         return model.fitted
+    parts, _, begins = _stretches(records, model.names)
+    problem = make_problem(model.fitted, model.names, parts, begins)
     fit = climb(begin(problem, fit.theta, fit.noise), exact=False)
     return Model(model.loop, fit).fitted
 
@@ -211,33 +212,31 @@ def _gaps(
     loop: Loop, found: Search, records: Sequence[Record], fresh: Sequence[Record] | None
 ) -> tuple[Gap, dict[int, float], Disturbance]:
     """Return the gap on data that no parameter was fitted to, and what each finding closes."""
-    shown: Sequence[Record] = records if fresh is None else fresh
     if fresh is None:
-        masks = [gaps.held_out(r) for r in records]
-        rest = [gaps.without(r, m) for r, m in zip(records, masks, strict=True)]
+        windows, rest = zip(*(gaps.held_out(r) for r in records), strict=True)
         before, after = (_trained(m, rest) for m in (found.base, found.final))
     else:
-        masks = [np.asarray(r.valid).copy() for r in fresh]
-        for mask in masks:
-            mask[: int(gaps.START * len(mask))] = False
+        windows = tuple(gaps.whole(r) for r in fresh)
         before, after = found.base.fitted, found.final.fitted
-    kind = gaps.way_to_compare(loop, shown[0])
-    results = [gaps.outputs(x, shown, kind) for x in (loop, before, after)]
-    sizes = [_total(shown, y, masks) for y in results]
-    floor = gaps.floor(after, found.final.fit, shown, kind, masks)
-    quiet = gaps.floor(after, found.final.fit, shown, kind, masks, force=False)
+    kind = gaps.way_to_compare(loop, windows[0].record)
+    results = [gaps.outputs(x, windows, kind) for x in (loop, before, after)]
+    sizes = [gaps.root_mean_square(windows, y) for y in results]
+    fit = found.final.fit
+    floor = gaps.floor(after, fit, windows, kind)
+    quiet = gaps.floor(after, fit, windows, kind, force=False)
     shares: dict[int, float] = {}
-    closed = sizes[1] ** 2 - sizes[2] ** 2
-    if len(found.found) == 1:
-        shares[found.found[0].position] = _share(closed, sizes[1], floor)
-    for f in found.found if len(found.found) > 1 else ():
-        left = after.without_effect(list(after.labelled)[f.position])
-        error = _total(shown, gaps.outputs(left, shown, kind), masks)
+    for f in found.found:
+        error = sizes[1]
+        if len(found.found) > 1:
+            left = after.without_effect(list(after.labelled)[f.position])
+            error = gaps.root_mean_square(windows, gaps.outputs(left, windows, kind))
         shares[f.position] = _share(error**2 - sizes[2] ** 2, sizes[1], floor)
-    first, mask = shown[0], masks[0]
+    first = windows[0]
     gap = Gap(
-        kind, *sizes, floor, first.units.get("y", ""), np.asarray(first.t)[mask],
-        np.asarray(first.y)[mask], results[1][0][mask], results[2][0][mask],
+        kind, *sizes, floor, first.record.units.get("y", ""),
+        first.begin + np.asarray(first.record.t - first.record.start)[first.mask],
+        np.asarray(first.record.y)[first.mask], results[1][0][first.mask],
+        results[2][0][first.mask],
     )  # fmt: skip
     return gap, shares, _disturbance(found.final.fit, loop, floor, quiet)
 
@@ -247,15 +246,6 @@ def _share(closed: float, before: float, floor: float) -> float:
     if not (math.isfinite(closed) and math.isfinite(above)) or above <= 0:
         return math.nan
     return float(min(max(closed / above, 0.0), 1.0))
-
-
-def _total(records: Sequence[Record], outputs: Sequence[Any], masks: Sequence[Any]) -> float:
-    squares, count = 0.0, 0
-    for record, y, mask in zip(records, outputs, masks, strict=True):
-        size = int(np.count_nonzero(mask))
-        squares += gaps.root_mean_square(record, y, mask) ** 2 * size
-        count += size
-    return math.sqrt(squares / max(count, 1))
 
 
 def _disturbance(fit: Fit, loop: Loop, floor: float, quiet: float) -> Disturbance:

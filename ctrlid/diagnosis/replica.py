@@ -16,7 +16,7 @@ from .gap import FEW_STEPS, ROUGH, drive, random_noise
 from .omnibus import ALPHA, Omnibus, omnibus
 from .trial import Model, Trial, attempt_at, refit
 
-DOUBTFUL = 400.0  # a gain above this is never an artefact of the filter
+DOUBTFUL = 400.0  # a gain above this is no artefact of the filter, if the model has no effect yet
 TWICE = 1.5  # what the replica gains counts this much against a candidate
 BEYOND = 3.0  # logarithms of chance by which a test must fail more than on a replica
 

@@ -104,7 +104,8 @@ def _checked(base: Model, trials: list[Trial]) -> list[Trial]:
     for _ in range(MOST):
         trials.sort(key=lambda t: (-t.merit, -t.promise))
         best = trials[0]
-        if best.merit <= GATE or best.gain > DOUBTFUL or not simulable(base):
+        sure = best.gain > DOUBTFUL and not base.loop.effects
+        if best.merit <= GATE or sure or not simulable(base):
             break
         copy = copy if tried else replica(base)
         tried = True
