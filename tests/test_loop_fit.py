@@ -1,0 +1,468 @@
+"""fit_loop: exact recovery, scatter as the standard errors say, exact information, refusals.
+
+Groups: without noise; scatter; what is fitted with what; information; noise; limits; refusals.
+"""
+
+from dataclasses import replace
+
+import control as ct
+import numpy as np
+import pytest
+from scipy import stats
+
+import ctrlid as cid
+from ctrlid import CtrlidError
+from ctrlid import effects as E
+from ctrlid.likelihood import evaluate, information
+from ctrlid.loop_fit import make_problem, start_values
+from ctrlid.simulation import Simulator
+
+RARE = 1e-5  # chance at which a test of chance may fail a right program
+
+
+def levitation(dt=2e-3, analog=False, free=("K",), **options):
+    plant = cid.plants.maglev(m=0.0213, K=3.34e-6)
+    op = cid.operating_point(plant, output=0.012)
+    C = cid.design_lead(cid.linearize(plant, op), crossover=100, phase_margin=50)
+    C = C if analog else C.sample(dt, "tustin")
+    return cid.Loop(plant, C, dt=dt, at=op, free=free, **options)
+
+
+def drive(free=("c", "k")):
+    plant = cid.plants.servo(m=2.0, c=5.0, k=30.0)
+    C = cid.PID(kp=6.0, ki=4.0, kd=0.4, filter_time=0.02)
+    at = cid.OperatingPoint((0.0, 0.0), 0.0, 0.0)
+    return cid.Loop(plant, C, dt=0.01, at=at, free=free)
+
+
+def sampled(free=("gain", "pole")):
+    """A first-order plant that grows, written in discrete time."""
+
+    def update(t, x, u, params):
+        return np.array([params["pole"] * x[0] + params["gain"] * np.tanh(u[0])])
+
+    values = {"gain": 0.3, "pole": 1.05}
+    plant = ct.nlsys(update, lambda t, x, u, params: x[0], name="reactor", inputs=["q"],
+                     outputs=["T"], states=["T"], dt=0.5, params=values)  # fmt: skip
+    return cid.Loop(plant, ct.tf([0.6], [1.0], 0.5), dt=0.5, free=free)
+
+
+LOOPS = {
+    "levitation": (levitation, 1e-4, 15, 5e-6),
+    "analog levitation": (lambda **k: levitation(analog=True, **k), 1e-4, 15, 5e-6),
+    "drive": (drive, 0.05, 40, 2e-3),
+    "discrete time": (sampled, 0.5, 5, 0.02),
+}  # fmt: skip
+
+
+def experiment(loop, swing, hold, n=3000, seed=1, **noise):
+    r = cid.random_binary(n, amplitude=swing, hold=hold, around=loop.point.output, seed=seed)
+    return cid.simulate(loop, r, seed=seed + 1000, **noise)
+
+
+def astray(loop, seed):
+    """The loop with its free parameters up to 10 % off."""
+    rng = np.random.default_rng(seed)
+    known = loop.parameters
+    return loop.with_parameters({k: known[k] * (1 + rng.uniform(-0.1, 0.1)) for k in loop.free})
+
+
+def shaken(loop, r, seed, sensor, force=0.0, coloured=0.0, time=1.0):
+    """A record with a coloured force; `time` is its time constant [s]."""
+    rng = np.random.default_rng(seed)
+    memory = np.exp(-loop.dt / time)
+    white = rng.standard_normal((3, len(r)))
+    push = np.empty(len(r))
+    d = white[2, 0]
+    for k in range(len(r)):
+        push[k] = d
+        d = memory * d + np.sqrt(1 - memory**2) * white[2, k]
+    simulator = Simulator(loop)
+    noise = [sensor * white[0], force * white[1] + coloured * push]
+    y, u = simulator.run(simulator.start(None), r, np.zeros(len(r)), noise)
+    return cid.Record(r=r, u=u, y=y, dt=loop.dt, hold="foh" if loop.analog else "zoh")
+
+
+# --- without noise
+
+
+@pytest.mark.parametrize("name", list(LOOPS))
+def test_without_noise_the_truth_is_found(name):
+    build, swing, hold, _ = LOOPS[name]
+    loop = build()
+    record = experiment(loop, swing, hold, n=1500)
+    for seed in range(2):
+        fitted = cid.fit_loop(astray(loop, seed), record)
+        for key in loop.free:
+            assert fitted.estimate[key] == pytest.approx(loop.parameters[key], rel=1e-5)
+        assert fitted.loop.parameters == {
+            **loop.parameters, **dict(zip(fitted.estimate.names, fitted.estimate.values,
+                                          strict=True))}  # fmt: skip
+
+
+@pytest.mark.parametrize("hold", ["zoh", "foh"])
+def test_a_straight_or_held_input(hold):
+    plant = cid.plants.servo(m=2.0, c=5.0, k=30.0)
+    t = 0.02 * np.arange(1500)
+    u = np.sin(3 * t) + 0.4 * np.sin(11 * t + 1)
+    if hold == "foh":
+        y = np.ravel(ct.forced_response(ct.tf([30.0], [2.0, 5.0, 0.0]), t, u).outputs)
+    else:
+        G = ct.sample_system(ct.tf([30.0], [2.0, 5.0, 0.0]), 0.02)
+        y = np.ravel(ct.forced_response(G, t, u).outputs)
+    loop = cid.Loop(plant, None, dt=0.02, free=("c", "k"))
+    record = cid.Record(u=u, y=y, dt=0.02, hold=hold)
+    found = cid.fit_loop(astray(loop, 1), record).estimate
+    assert found["c"] == pytest.approx(5.0, rel=1e-6)
+    assert found["k"] == pytest.approx(30.0, rel=1e-6)
+
+
+# --- scatter
+
+
+@pytest.mark.parametrize("name", list(LOOPS))
+def test_errors_scatter_as_their_standard_errors_say(name):
+    """Both sums are of normal deviates, if intervals are to cover as they promise."""
+    build, swing, hold, sensor = LOOPS[name]
+    loop = build()
+    runs = 10 if loop.analog else 20
+    z = []
+    for seed in range(runs):
+        record = experiment(loop, swing, hold, n=1000, seed=3000 + seed, sensor_noise=sensor)
+        found = cid.fit_loop(astray(loop, seed), record, coloured=False).estimate
+        truth = [loop.parameters[k] for k in found.names]
+        z.append((found.values - truth) / found.standard_errors)
+    for column in np.transpose(z):
+        total = float(np.sum(column**2))
+        assert stats.chi2.cdf(total, runs) > RARE
+        assert stats.chi2.sf(total, runs) > RARE
+        assert abs(column.mean()) * np.sqrt(runs) < stats.norm.isf(RARE)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", list(LOOPS))
+def test_intervals_cover(name):
+    build, swing, hold, sensor = LOOPS[name]
+    loop = build()
+    runs, inside = 400, 0
+    for seed in range(runs):
+        record = experiment(loop, swing, hold, n=3000, seed=90_000 + seed, sensor_noise=sensor)
+        found = cid.fit_loop(astray(loop, seed), record).estimate
+        for key in found.names:
+            low, high = found.interval(key)
+            inside += low < loop.parameters[key] < high
+    assert stats.binomtest(inside, runs * len(loop.free), 0.95).pvalue > 1e-3
+
+
+# --- what is fitted with what
+
+
+def test_effects_are_fitted_with_the_plant():
+    loop = levitation()
+    real = loop.with_effect(E.ViscousFriction(c=3.0)).with_effect(E.ActuatorLag(tau=1.5e-3))
+    record = experiment(real, 1e-4, 15, n=4000, sensor_noise=2e-6)
+    start = loop.with_effect(E.ViscousFriction(c=0.0)).with_effect(E.ActuatorLag(tau=2e-3))
+    found = cid.fit_loop(start, record).estimate
+    assert found.names == ("K", "ViscousFriction.c", "ActuatorLag.tau")
+    truth = np.array([3.34e-6, 3.0, 1.5e-3])
+    assert (np.abs(found.values - truth) < 4.5 * found.standard_errors).all()
+    assert (found.standard_errors < [1e-2 * 3.34e-6, 0.5, 2e-4]).all()
+    only = cid.fit_loop(start, record, free="ViscousFriction.c")
+    assert only.estimate.names == ("ViscousFriction.c",)
+    assert only.loop.parameters["ActuatorLag.tau"] == 2e-3
+
+
+def test_free_coefficients_of_an_unstable_transfer_function():
+    """No reference in the record, no controller known: instruments would have nothing to use."""
+    dt, u0, y0 = 2e-3, 3.0, 0.012
+    G = ct.tf([-6.5], [1.0, 0.0, -1635.0])
+    C = cid.design_lead(G, crossover=100, phase_margin=50).sample(dt, "tustin")
+    at = cid.OperatingPoint((), u0, y0)
+    real = cid.Loop(G, C, dt=dt, at=at)
+    r = cid.random_binary(6000, amplitude=1e-4, hold=15, around=y0, seed=5)
+    record = cid.simulate(real, r, sensor_noise=5e-6, seed=6)
+    bare = cid.Record(u=record.u, y=record.y, dt=dt)
+    start = cid.Loop(ct.tf([-5.0], [1.0, 10.0, -1300.0]), None, dt=dt, at=at,
+                     free=("a1", "a2", "b1"))  # fmt: skip
+    fitted = cid.fit_loop(start, bare)
+    found = fitted.estimate
+    truth = np.array([0.0, -1635.0, -6.5])
+    assert (np.abs(found.values - truth) < 4.5 * found.standard_errors).all()
+    assert (found.standard_errors < [2.0, 30.0, 0.1]).all()
+    assert isinstance(fitted.loop.plant, ct.TransferFunction)
+    assert fitted.loop.plant.num[0][0][0] == pytest.approx(-6.5, rel=0.05)
+    # A fit that knows of no noise in y is far off on the same record.
+    naive = cid.fit_arx(bare, na=2, nb=2).estimate
+    b = ct.sample_system(G, dt).num[0][0].sum()
+    assert abs((naive["b1"] + naive["b2"]) / b - 1) > 0.05
+
+
+def test_several_records_share_what_they_have_in_common():
+    loop = levitation()
+    records = [experiment(loop, 1e-4, 15, n=1500, seed=s, sensor_noise=v)
+               for s, v in ((11, 3e-6), (12, 9e-6))]  # fmt: skip
+    start = astray(loop, 3)
+    alone = [cid.fit_loop(start, r, coloured=False).estimate for r in records]
+    both = cid.fit_loop(start, records, coloured=False).estimate
+    turned = cid.fit_loop(start, records[::-1], coloured=False).estimate
+    np.testing.assert_allclose(both.values, turned.values, atol=0.02 * both.standard_errors[0])
+    np.testing.assert_allclose(both.sensor_noise, [3e-6, 9e-6], rtol=0.1)
+    np.testing.assert_allclose(turned.sensor_noise[::-1], both.sensor_noise, rtol=1e-2)
+    weights = np.array([e.standard_errors[0] ** -2 for e in alone])
+    mean = weights @ [e["K"] for e in alone] / weights.sum()
+    assert abs(both["K"] - mean) < 0.3 * both.standard_errors[0]
+    assert both.standard_errors[0] == pytest.approx(weights.sum() ** -0.5, rel=0.1)
+    assert both.n_samples == sum(e.n_samples for e in alone)
+    twice = cid.fit_loop(start, [records[0]] * 2, coloured=False).estimate
+    assert twice["K"] == pytest.approx(alone[0]["K"], abs=0.05 * alone[0].standard_errors[0])
+    assert twice.standard_errors[0] == pytest.approx(alone[0].standard_errors[0] / 2**0.5, rel=2e-2)
+
+
+def test_what_is_not_valid_and_the_reference_do_not_matter():
+    loop = levitation()
+    record = experiment(loop, 1e-4, 15, n=2500, sensor_noise=5e-6)
+    plain = cid.fit_loop(astray(loop, 1), record, coloured=False).estimate
+    bare = cid.Record(u=record.u, y=record.y, dt=record.dt)
+    unknown = cid.Loop(loop.plant, None, dt=loop.dt, at=loop.at, free=loop.free)
+    other = cid.fit_loop(astray(unknown, 2), bare, coloured=False).estimate
+    assert other["K"] == pytest.approx(plain["K"], abs=0.05 * plain.standard_errors[0])
+    valid = np.ones(2500, dtype=bool)
+    valid[600:900] = valid[1700:1703] = False
+    y, u = record.y.copy(), record.u.copy()
+    y[~valid], u[~valid] = 1.0, 99.0
+    fits = [cid.fit_loop(loop, cid.Record(u=a, y=b, dt=record.dt, valid=valid), coloured=False)
+            for a, b in ((record.u, record.y), (u, y))]  # fmt: skip
+    np.testing.assert_array_equal(fits[0].estimate.values, fits[1].estimate.values)
+    assert fits[0].estimate.n_samples < 2197
+    assert abs(fits[0].estimate["K"] - 3.34e-6) < 4.5 * fits[0].estimate.standard_errors[0]
+
+
+def test_the_start_does_not_matter():
+    loop = drive()
+    record = experiment(loop, 0.05, 40, sensor_noise=2e-3)
+    ends = [cid.fit_loop(astray(loop, s), record, coloured=False).estimate for s in range(4)]
+    ends.append(cid.fit_loop(loop.with_parameters({"c": 1.0, "k": 90.0}), record,
+                             coloured=False).estimate)  # fmt: skip
+    for e in ends[1:]:
+        assert (np.abs(e.values - ends[0].values) < 0.15 * ends[0].standard_errors).all()
+        # Which samples count at the start may differ by a few.
+        assert abs(e.n_samples - ends[0].n_samples) < 10
+        mean = ends[0].log_likelihood / ends[0].n_samples
+        assert e.log_likelihood / e.n_samples == pytest.approx(mean, rel=1e-3)
+
+
+# --- information
+
+
+def point(loop, record, **noise):
+    """The likelihood at its maximum, as `fit_loop` finds it."""
+    from ctrlid.likelihood import begin, climb
+
+    problem = make_problem(loop, loop.free, [record])
+    return climb(begin(problem, start_values(loop, loop.free), None))
+
+
+def moved(fit, theta):
+    at = [out.trajectory for out in fit.filtered]
+    for _ in range(3):  # the trajectory follows the parameters
+        there = evaluate(fit.problem, theta, fit.noise, at)
+        at = [out.trajectory for out in there.filtered]
+    return there.value
+
+
+@pytest.mark.parametrize("name", ["levitation", "analog levitation", "drive"])
+def test_the_information_is_the_curvature_of_the_likelihood(name):
+    """By differences, the sensor's variance being the best at every point, the ratio held."""
+    build, swing, hold, sensor = LOOPS[name]
+    loop = build(free=("K", "g")) if "lev" in name else build()
+    record = experiment(loop, swing, hold, n=6000, seed=21, sensor_noise=sensor,
+                        force_noise=0.3 if "lev" in name else 1.0)  # fmt: skip
+    fit = point(loop, record)
+    matrix, score = information(fit)
+    p = len(fit.theta)
+    assert len(matrix) == p + 2  # force ratio and sensor variance beside them
+    np.testing.assert_allclose(matrix, matrix.T, rtol=1e-10)
+    # The score vanishes at the maximum, in units of its own spread.
+    assert (np.abs(score) < 0.1 * np.sqrt(np.diag(matrix))).all()
+    h = 0.5 / np.sqrt(np.diag(matrix)[:p])
+    hessian = np.zeros((p, p))
+    for i in range(p):
+        for j in range(p):
+            values = [moved(fit, fit.theta + a * h[i] * np.eye(p)[i] + b * h[j] * np.eye(p)[j])
+                      for a, b in ((1, 1), (1, -1), (-1, 1), (-1, -1))]  # fmt: skip
+            both = values[0] - values[1] - values[2] + values[3]
+            hessian[i, j] = -both / (4 * h[i] * h[j])
+    # The variance was profiled: take it out of the information in the same way.
+    keep = [*range(p), p + 1]
+    inner = matrix[np.ix_(keep, keep)]
+    expected = inner[:p, :p] - np.outer(inner[:p, p], inner[p, :p]) / inner[p, p]
+    size = np.sqrt(np.diag(expected))
+    np.testing.assert_allclose(hessian / np.outer(size, size), expected / np.outer(size, size),
+                               atol=0.1)  # fmt: skip
+
+
+def test_the_covariance_is_the_inverse_of_the_information():
+    loop = drive()
+    record = experiment(loop, 0.05, 40, n=2000, sensor_noise=2e-3, force_noise=1.0)
+    fitted = cid.fit_loop(loop, record, coloured=False)
+    again = point(loop, record)
+    inverse = np.linalg.inv(information(again)[0])[:2, :2]
+    np.testing.assert_allclose(fitted.estimate.covariance, inverse, rtol=1e-2)
+    low, high = fitted.estimate.interval("c", 0.68269)
+    assert (high - low) / 2 == pytest.approx(fitted.estimate.standard_errors[0], rel=1e-4)
+    assert (high + low) / 2 == pytest.approx(fitted.estimate["c"])
+
+
+# --- noise
+
+
+def test_the_noise_is_found_with_the_parameters():
+    loop = levitation()
+    r = cid.random_binary(8000, amplitude=1e-4, hold=15, around=0.012, seed=31)
+    record = cid.simulate(loop, r, sensor_noise=5e-6, force_noise=0.2, seed=32)
+    found = cid.fit_loop(astray(loop, 5), record).estimate
+    assert found.sensor_noise[0] == pytest.approx(5e-6, rel=0.1)
+    assert found.force_noise == pytest.approx(0.2, rel=0.2)
+    assert found.coloured_force == 0.0
+    assert np.isnan(found.force_time)
+    assert abs(found["K"] - 3.34e-6) < 4.5 * found.standard_errors[0]
+
+
+@pytest.mark.parametrize("analog", [False, True])
+def test_a_coloured_force_is_found(analog):
+    loop = levitation(analog=analog)
+    r = cid.random_binary(8000, amplitude=1e-4, hold=15, around=0.012, seed=41)
+    record = shaken(loop, r, 42, 3e-6, coloured=0.2, time=0.05)
+    found = cid.fit_loop(astray(loop, 6), record).estimate
+    assert found.coloured_force == pytest.approx(0.2, rel=0.3)
+    assert 0.03 < found.force_time < 0.09
+    assert abs(found["K"] - 3.34e-6) < 4.5 * found.standard_errors[0]
+    white = cid.fit_loop(astray(loop, 6), record, coloured=False).estimate
+    assert white.coloured_force == 0.0
+    assert white.bic > found.bic + 20
+    assert "coloured force" in str(found)
+    assert "coloured force" not in str(white)
+
+
+def test_a_coloured_force_can_be_asked_for():
+    loop = drive()
+    record = experiment(loop, 0.05, 40, n=1500, sensor_noise=2e-3)
+    asked = cid.fit_loop(loop, record, coloured=True).estimate
+    plain = cid.fit_loop(loop, record).estimate
+    assert asked.coloured_force > 0
+    assert plain.coloured_force == 0
+    assert asked.log_likelihood > plain.log_likelihood - 0.5
+    assert asked.bic > plain.bic
+
+
+# --- limits
+
+
+def test_a_parameter_on_its_bound_is_said_to_be():
+    loop = levitation()
+    # Less friction than none: the plant pushes itself along.
+    real = loop.with_effect(E.ViscousFriction(c=0.0))
+    plant = ct.nlsys(
+        lambda t, x, u, p: np.array([x[1], 9.81 - 3.34e-6 * u[0] ** 2 / (0.0213 * x[0] ** 2)
+                                     + 8.0 * x[1]]),
+        lambda t, x, u, p: x[0], inputs=["V"], outputs=["x"], states=["x", "v"],
+    )  # fmt: skip
+    driven = cid.Loop(plant, loop.controller, dt=loop.dt, at=loop.at)
+    record = experiment(driven, 1e-4, 15, sensor_noise=2e-6)
+    found = cid.fit_loop(real, record, coloured=False).estimate
+    assert found.bounds == ("ViscousFriction.c",)
+    assert found["ViscousFriction.c"] == 0.0
+    assert "(on its bound)" in str(found)
+
+
+def test_parameters_that_do_the_same_are_said_to():
+    loop = levitation(free=("K", "m"))
+    record = experiment(loop, 1e-4, 15, sensor_noise=5e-6)
+    fitted = cid.fit_loop(astray(loop, 7), record)
+    found = fitted.estimate
+    assert np.isinf(found.standard_errors).all()
+    assert found.notes == ("the data do not determine K, m (other parameters do the same)",)
+    assert str(found).count("(not in the data)") == 2
+    ratio = fitted.loop.parameters["K"] / fitted.loop.parameters["m"]
+    assert ratio == pytest.approx(3.34e-6 / 0.0213, rel=1e-3)
+    alone = cid.fit_loop(levitation(), record).estimate
+    assert np.isfinite(alone.standard_errors).all()
+    assert alone.notes == ()
+
+
+def test_the_rest_is_determined_all_the_same():
+    loop = drive(free=("m", "c", "k"))
+    record = experiment(loop, 0.05, 40, sensor_noise=2e-3)
+    found = cid.fit_loop(loop, record).estimate
+    assert np.isinf(found.standard_errors).all()  # only the ratios are in u and y
+    real = levitation(free=("m", "K")).with_effect(E.ViscousFriction(c=3.0))
+    record = experiment(real, 1e-4, 15, sensor_noise=5e-6)
+    found = cid.fit_loop(real, record).estimate
+    assert np.isinf(found.standard_errors[:2]).all()
+    assert np.isfinite(found.standard_errors[2])
+    assert abs(found["ViscousFriction.c"] - 3.0) < 4.5 * found.standard_errors[2]
+
+
+def test_a_parameter_without_any_influence():
+    plant = ct.nlsys(
+        lambda t, x, u, p: np.array([p["gain"] * u[0] - x[0] + 0.0 * p["idle"]]),
+        lambda t, x, u, p: x[0], inputs=["u"], outputs=["y"], states=["x"],
+        params={"gain": 2.0, "idle": 1.0},
+    )  # fmt: skip
+    loop = cid.Loop(plant, None, dt=0.1, free=("gain", "idle"))
+    u = cid.random_binary(1000, amplitude=1.0, hold=10, seed=1)
+    record = cid.simulate(loop, d=u, sensor_noise=0.05, seed=2)
+    found = cid.fit_loop(loop, record).estimate
+    assert found["idle"] == 1.0
+    assert np.isinf(found.standard_errors[1])
+    assert abs(found["gain"] - 2.0) < 4.5 * found.standard_errors[0]
+    assert np.isfinite(found.standard_errors[0])
+
+
+# --- refusals and texts
+
+
+def test_refusals():
+    loop = levitation()
+    record = experiment(loop, 1e-4, 15, n=300, sensor_noise=2e-6)
+    for bad in (None, 3, [], [record, 3], "record"):
+        with pytest.raises((CtrlidError, TypeError)):
+            cid.fit_loop(loop, bad)
+    with pytest.raises(CtrlidError, match=r"needs a Record, or a sequence of Records; given list"):
+        cid.fit_loop(loop, [])
+    with pytest.raises(CtrlidError, match=r"fit_loop needs a Loop\(plant, .* given Transfer"):
+        cid.fit_loop(ct.tf([1.0], [1.0, 1.0]), record)
+    with pytest.raises(
+        CtrlidError, match=r"none was given; put them into free= .* \['m', 'K', 'g'"
+    ):
+        cid.fit_loop(levitation(free=()), record)
+    with pytest.raises(CtrlidError, match=r"names of free parameters, given \['Km'\]"):
+        cid.fit_loop(loop, record, free=("K", "Km"))
+    with pytest.raises(CtrlidError, match=r"sampled at 0\.002 s, the record at 0\.004 s"):
+        cid.fit_loop(loop, record.decimate(2, antialias=False))
+    other = replace(record, hold="foh")
+    with pytest.raises(CtrlidError, match=r"must have the same hold; given \['zoh', 'foh'\]"):
+        cid.fit_loop(loop, [record, other])
+    blind = cid.Record(u=record.u, y=record.y, dt=record.dt, valid=np.arange(300) < 9)
+    with pytest.raises(CtrlidError, match="at least 10 valid samples; the record has 9 of 300"):
+        cid.fit_loop(loop, blind)
+
+
+def test_texts():
+    loop = levitation()
+    record = experiment(loop, 1e-4, 15, n=1500, sensor_noise=5e-6)
+    fitted = cid.fit_loop(loop, record)
+    text = str(fitted)
+    assert text.startswith("Loop(maglev, digital controller, dt=0.002 s")
+    assert f"maximum likelihood, {fitted.estimate.n_samples} samples, log-likelihood" in text
+    shown = float(text.split("  K = ")[1].split(" ± ")[0])
+    assert shown == pytest.approx(fitted.estimate["K"], abs=fitted.estimate.standard_errors[0])
+    assert " ± " in text
+    assert "sensor noise" in text
+    assert "note:" not in text
+    with pytest.raises(CtrlidError, match="'m' was not fitted; fitted were K"):
+        fitted.estimate["m"]
+    with pytest.raises(CtrlidError, match="'g' was not fitted"):
+        fitted.estimate.interval("g")
+    assert fitted.loop.free == ("K",)
+    assert loop.parameters["K"] == 3.34e-6
