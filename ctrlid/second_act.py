@@ -16,7 +16,7 @@ from .effects import (
     ActuatorLag,
     CoulombFriction,
     EddyCurrentDamping,
-    ForceExponent,
+    InputDelay,
     ViscousFriction,
 )
 from .lead import design_lead
@@ -41,7 +41,7 @@ HIDDEN: tuple[tuple[type[AbstractEffect], dict[str, tuple[float, float]]], ...] 
     (CoulombFriction, {"fc": (0.1, 0.2)}),
     (ViscousFriction, {"c": (3.0, 8.0)}),
     (ActuatorLag, {"tau": (0.001, 0.003)}),
-    (ForceExponent, {"n": (1.7, 1.9)}),
+    (InputDelay, {"delay": (0.001, 0.003)}),
     (EddyCurrentDamping, {"ce": (0.3, 0.8)}),
 )
 

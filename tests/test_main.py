@@ -48,7 +48,8 @@ def test_the_whole_story(folder, capsys):
         "3000 samples every 2 ms",
         "Diagnosis of maglev (3000 samples, dt = 0.002 s)",
         "what is missing",
-        "Hidden was ForceExponent: n = 1.79. It was found and named",
+        "Hidden was InputDelay: delay = 0.00",
+        "It was found and named alone.",
     ):
         assert sentence in text
     assert out.endswith(f"12 figures and report.html are in ctrlid-report{os.sep}\n")
