@@ -146,10 +146,10 @@ def drive(simulator: Simulator, part: Record) -> tuple[Array, Array | None, Arra
     return best_start(simulator, part, r, d, guess, n), r, d
 
 
-def floor(
-    loop: Loop, fit: Fit, windows: Sequence[Window], kind: str, force: bool = True
-) -> float:  # fmt: skip
-    """Return the RMS error that sensor and force noise leave through a loop.
+def floors(
+    loop: Loop, fit: Fit, windows: Sequence[Window], kind: str
+) -> tuple[float, float]:  # fmt: skip
+    """Return the RMS error that noise leaves through a loop: all noise, and the sensor's alone.
 
     Parameters
     ----------
@@ -161,37 +161,34 @@ def floor(
         The data.
     kind : str
         As `way_to_compare` says it.
-    force : bool, optional
-        Whether the force noise takes part.
 
     Returns
     -------
-    float
-        RMS error [output unit]; NaN where it cannot be computed.
+    both, sensor : float
+        RMS errors [output unit]; NaN where they cannot be computed.
     """
-    squares, count = 0.0, 0
+    squares, count = np.zeros(2), 0
     for k, window in enumerate(windows):
-        sensor = float(fit.sensor[min(k, len(fit.sensor) - 1)])
+        noise = float(fit.sensor[min(k, len(fit.sensor) - 1)])
         try:
-            value = _floor(loop, fit, sensor, window, kind, force)
+            values = _floors(loop, fit, noise, window, kind)
         except CtrlidError:
-            return math.nan
+            return math.nan, math.nan
         size = int(np.count_nonzero(window.mask))
-        squares += value**2 * size
+        squares += values**2 * size
         count += size
-    return math.sqrt(squares / count)
+    both, sensor = np.sqrt(squares / max(count, 1))
+    return float(both), float(sensor)
 
 
-def _floor(
-    loop: Loop, fit: Fit, sensor: float, window: Window, kind: str, force: bool
-) -> float:  # fmt: skip
+def _floors(loop: Loop, fit: Fit, sensor: float, window: Window, kind: str) -> Array:
     record = window.record
     if kind.endswith("prediction"):
         found = predict(loop, record)
-        found = found if force else replace(found, force_noise=0.0)
-        return spread_ahead(loop, record, found, _steps(kind))
+        quiet = replace(found, force_noise=0.0)
+        return np.array([spread_ahead(loop, record, p, _steps(kind)) for p in (found, quiet)])
     simulator = Simulator(loop, ROUGH, FEW_STEPS)
-    values = []
+    squares, count = np.zeros(2), 0
     for start, stop in record.segments():
         use = window.mask[start:stop]
         if stop - start < FEWEST or not use.any():
@@ -199,15 +196,16 @@ def _floor(
         part = record[start:stop]
         begin = window.begin + float(record.t[start] - record.start)
         z, r, d = drive(simulator, part)
-        quiet = simulator.run(z, r, d, None, begin)[0]
+        rest = simulator.run(z, r, d, None, begin)[0]
         for seed in range(RUNS):
             noise = random_noise(fit, sensor, len(part), seed)
-            noise[1] = noise[1] if force else 0 * noise[1]
-            noisy = simulator.run(z, r, d, noise, begin)[0]
-            values.append((noisy - quiet)[use] ** 2)
-    if not values:
+            for k, both in enumerate((noise, [noise[0], 0 * noise[1]])):
+                moved = simulator.run(z, r, d, both, begin)[0] - rest
+                squares[k] += float(np.sum(moved[use] ** 2))
+            count += int(use.sum())
+    if not count:
         raise CtrlidError("no stretch is long enough to be simulated")
-    return math.sqrt(float(np.mean(np.concatenate(values))))
+    return np.sqrt(squares / count)
 
 
 def random_noise(fit: Fit, sensor: float, n: int, seed: int) -> list[Array]:

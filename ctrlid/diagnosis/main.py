@@ -222,8 +222,7 @@ def _gaps(
     results = [gaps.outputs(x, windows, kind) for x in (loop, before, after)]
     sizes = [gaps.root_mean_square(windows, y) for y in results]
     fit = found.final.fit
-    floor = gaps.floor(after, fit, windows, kind)
-    quiet = gaps.floor(after, fit, windows, kind, force=False)
+    floor, quiet = gaps.floors(after, fit, windows, kind)
     shares: dict[int, float] = {}
     for f in found.found:
         error = sizes[1]

@@ -10,7 +10,7 @@ import numpy as np
 from ..effects import AbstractEffect, FlexibleMode, ParameterStep, PeriodicForce, PositionRipple
 from ..likelihood import pseudo_inverse
 from ..physics import Array
-from .trial import Model, Trial, attempt
+from .trial import Model, Trial, attempt, attempt_best
 
 COLUMNS = 2_000_000  # numbers in a block of shapes at once
 LENGTHS = 150  # wavelengths that are looked for in the travel
@@ -181,9 +181,8 @@ def _mode(model: Model, effect: FlexibleMode) -> Trial:
     record = model.fit.problem.tracks[0].record
     slowest = 5.0 / (len(record) * record.dt)
     grid = np.geomspace(max(slowest, 1e-2 / record.dt / 10), 0.35 / record.dt, MODES)
-    trials = [attempt(model, replace(effect, frequency=float(f), damping=0.1, coupling=0.0),
-                      math.log(MODES)) for f in grid]  # fmt: skip
-    return max(trials, key=lambda t: t.promise)
+    modes = [replace(effect, frequency=float(f), damping=0.1, coupling=0.0) for f in grid]
+    return attempt_best(model, modes, math.log(MODES))
 
 
 SCANS: dict[type, Callable[[Model, Any], Trial]] = {

@@ -148,6 +148,29 @@ def attempt_at(base: Model, effect: AbstractEffect, scan: float = 0.0) -> Trial:
     return Trial(effect, label, Model(loop, light(fit)), fit.value - base.fit.value + gain, scan)
 
 
+def attempt_best(base: Model, effects: Sequence[AbstractEffect], scan: float) -> Trial:
+    """Try effects that differ in their values only, and return the one that promises most."""
+    best = attempt_at(base, effects[0], scan)
+    if best.remark:
+        return best
+    label, loop, names = best.label, best.model.loop, best.model.names
+    start = _extended(base, loop, names)
+    for effect in effects[1:]:
+        theta = start.theta.copy()
+        for field, value in effect.values().items():
+            theta[names.index(f"{label}.{field}")] = value
+        fit = start
+        for _ in range(2):  # the second time along its own states
+            fit = evaluate(start.problem, theta, start.noise, [o.trajectory for o in fit.filtered])
+        if not math.isfinite(fit.value):
+            continue
+        promise = fit.value - base.fit.value + 0.5 * _promised(fit, *fit.normal)
+        if promise > best.promise:
+            moved = loop.with_parameters(dict(zip(names, theta.tolist(), strict=True)))
+            best = Trial(effect, label, Model(moved, light(fit)), promise, scan)
+    return best
+
+
 def light(fit: Fit) -> Fit:
     """Return a fit without its arrays: many candidates on a long record must fit into memory."""
     normal = fit.normal
