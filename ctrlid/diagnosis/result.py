@@ -261,7 +261,7 @@ class Diagnosis:
         return tuple(f.effect for f in self.findings)
 
     def __str__(self) -> str:
-        from .words import report  # words are about these values
+        from .printed import report  # which is about these values
 
         return report(self)
 

@@ -1,17 +1,15 @@
-"""The report of a diagnosis: what a control engineer reads in a minute."""
+"""What a diagnosis found, phrase by phrase, for any report."""
 
 import math
-import textwrap
 from collections.abc import Iterable
 
 import numpy as np
 
-from .._text import chance, listing, number, prefix, quantity, with_error
+from .._text import chance, listing, number, prefix, quantity
 from ..effects import AbstractEffect
 from .result import Diagnosis, Finding, Gap, Place
 from .saving import units_of
 
-WIDTH = 100
 TELLING = 1e-3  # probability below which a place is not noise's doing
 PLACES = 3
 LISTED = 4  # tests that fail
@@ -31,54 +29,9 @@ MASSES = ("m", "M", "mass")
 FORCES = {"m/s^2": "N", "1/s": "N s/m", "1/s^2": "N/m", "1/m": "kg/m"}  # per unit of mass, times it
 
 
-def report(found: Diagnosis) -> str:
-    """Return a diagnosis in plain words.
-
-    Parameters
-    ----------
-    found : Diagnosis
-        From `diagnose`.
-
-    Returns
-    -------
-    str
-        Lines of at most 100 columns. Bad news is in capitals.
-    """
-    lines = [f"Diagnosis of {found.record or 'a record'}", *_wrapped(headline(found), 2)]
-    lines += ["", *gap_lines(found.gap), "", *_where(found)]
-    if found.findings:
-        lines += ["", "  what is missing"]
-        for k, finding in enumerate(found.findings, 1):
-            lines += _finding(found, finding, f"{k}. ")
-        lines += _wrapped(
-            "Evidence: the logarithm of how many times likelier the record is with "
-            "the effect than without; chance reaches 2 or 3, 10 is strong.",
-            4,
-        )
-    elif found.verdict == "nothing missing" and found.sensitivity:
-        lines += ["", *_sensitivity(found)]
-    lines += ["", *_parameters(found)]
-    lines += _wrapped(disturbance(found), 2, hang=4)
-    lines += _wrapped(remains(found), 2, hang=4)
-    for title, remarks in (("about the record", found.audit), ("note", found.notes)):
-        for remark in remarks:
-            lines += _wrapped(f"{title}: {remark}", 2, hang=4)
-    lines.append(f"  {found.seconds:.1f} s")
-    return "\n".join(line.rstrip() for line in lines)
-
-
 def headline(found: Diagnosis) -> str:
     """Return the verdict with its sentence."""
     return f"{HEADLINES[found.verdict]}. {found.sentence}"
-
-
-def _wrapped(text: str, indent: int, hang: int | None = None) -> list[str]:
-    later = " " * (indent if hang is None else hang)
-    for sign in ("=", "±"):  # no line ends beside them
-        text = text.replace(f" {sign} ", f"\xa0{sign}\xa0")
-    lines = textwrap.wrap(text, WIDTH, initial_indent=" " * indent, subsequent_indent=later,
-                          break_on_hyphens=False)  # fmt: skip
-    return [line.replace("\xa0", " ") for line in lines]
 
 
 def gap_rows(gap: Gap) -> list[tuple[str, str, str]]:
@@ -106,14 +59,6 @@ def gap_rows(gap: Gap) -> list[tuple[str, str, str]]:
     shown = cases[:2] if gap.after == gap.before else cases
     rows = [(label, size(value), times(value)) for label, value in shown]
     return [*rows, ("noise floor", size(gap.floor), "what noise and random force leave")]
-
-
-def gap_lines(gap: Gap) -> list[str]:
-    """Return the sizes of the gap as aligned lines."""
-    rows = gap_rows(gap)
-    head = f"  how far apart: {gap.kind} of {len(gap.time)} samples kept back, RMS error"
-    return [head, *(f"    {label:<20}{size:>12}   {times}" for label, size, times in rows),
-            *_wrapped(shrinking(gap), 4)]  # fmt: skip
 
 
 def shrinking(gap: Gap) -> str:
@@ -157,24 +102,6 @@ def place_words(place: Place) -> str:
     k = int(np.nanargmax(place.before))
     low, high = (number(v, 3) for v in place.edges[k : k + 2])
     return f"between {low} and {high} {place.unit}".strip()
-
-
-def _where(found: Diagnosis) -> list[str]:
-    places = telling(found)
-    if not places:
-        axes = listing([p.axis for p in found.where])
-        return ["  where it sits: " + (f"nowhere; noise looks like this along {axes}" if axes else
-                                       "not known")]  # fmt: skip
-    same = not found.findings
-    head = "  where it sits: RMS of the one-step errors, 1 is noise"
-    rows = [f"{head:<79}{'worst' if same else 'before':>10}{'' if same else 'after':>10}"]
-    for place in places:
-        first, *more = textwrap.wrap(place_words(place), 60) or [""]
-        after = "" if same else number(worst(place.after), 3)
-        rows.append(f"    {place.axis:<12} {first:<62}{number(worst(place.before), 3):>10}"
-                    f"{after:>10}")  # fmt: skip
-        rows += [f"{'':<17}{line}" for line in more]
-    return rows
 
 
 def sizes(found: Diagnosis, effect: AbstractEffect, errors: dict[str, float] | None = None) -> str:
@@ -249,14 +176,6 @@ def sized(found: Diagnosis, finding: Finding) -> str:
     return f"{size} ({force})" if force else size
 
 
-def _finding(found: Diagnosis, finding: Finding, label: str) -> list[str]:
-    lines = _wrapped(f"{label}{named(finding)}", 4, hang=7)
-    lines += _wrapped(sized(found, finding), 7, hang=9)
-    for text in (certainty(found, finding), *doubts(found, finding)):
-        lines += _wrapped(text, 7, hang=9)
-    return lines
-
-
 def sensitivity_rows(found: Diagnosis) -> list[tuple[str, str]]:
     """Return the smallest visible size of each effect."""
     tried = {type(c.effect).__name__: c.effect for c in found.ranking}
@@ -267,29 +186,6 @@ def sensitivity_rows(found: Diagnosis) -> list[tuple[str, str]]:
         unit = "" if effect is None else units_of(found.loop, effect).get(name, "")
         rows.append((key, quantity(size, unit) if math.isfinite(size) else "not visible"))
     return rows
-
-
-def _sensitivity(found: Diagnosis) -> list[str]:
-    rows = [f"{key:<{max(46 - len(size), len(key) + 1)}}{size}"
-            for key, size in sensitivity_rows(found)]  # fmt: skip
-    half = (len(rows) + 1) // 2
-    right = [*rows[half:], ""][:half]
-    head = "  the smallest effects that this record would have shown"
-    return [head, *(f"    {a}    {b}" for a, b in zip(rows[:half], right, strict=True))]
-
-
-def _parameters(found: Diagnosis) -> list[str]:
-    if not found.calibrated:
-        return ["  the model has no free parameters"]
-    last = "with the effects" if found.findings else "fitted"
-    rows = [("the model's own parameters", "given", "recalibrated", last)]
-    for c in found.calibrated:
-        fitted = (with_error(c.after, c.standard_error) if math.isfinite(c.standard_error)
-                  else f"{number(c.after, 4)} (not in the data)")  # fmt: skip
-        rows.append((f"  {c.name}", number(c.given, 4), number(c.before, 4), fitted))
-    if not found.findings:
-        rows = [(a, b, "", d) for a, b, _, d in rows]
-    return [f"  {a:<26}{b:>12}{c:>14}{d:>26}" for a, b, c, d in rows]
 
 
 def disturbance(found: Diagnosis) -> str:

@@ -1,0 +1,108 @@
+"""The printed report of a diagnosis: what a control engineer reads in a minute."""
+
+import math
+import textwrap
+
+from .._text import listing, number, with_error
+from . import words
+from .result import Diagnosis, Finding, Gap
+
+WIDTH = 100
+
+
+def report(found: Diagnosis) -> str:
+    """Return a diagnosis in plain words.
+
+    Parameters
+    ----------
+    found : Diagnosis
+        From `diagnose`.
+
+    Returns
+    -------
+    str
+        Lines of at most 100 columns. Bad news is in capitals.
+    """
+    lines = [f"Diagnosis of {found.record or 'a record'}", *_wrapped(words.headline(found), 2)]
+    lines += ["", *gap_lines(found.gap), "", *_where(found)]
+    if found.findings:
+        lines += ["", "  what is missing"]
+        for k, finding in enumerate(found.findings, 1):
+            lines += _finding(found, finding, f"{k}. ")
+        lines += _wrapped(words.EVIDENCE, 4)
+    elif found.verdict == "nothing missing" and found.sensitivity:
+        lines += ["", *_sensitivity(found)]
+    lines += ["", *_parameters(found)]
+    lines += _wrapped(words.disturbance(found), 2, hang=4)
+    lines += _wrapped(words.remains(found), 2, hang=4)
+    for title, remarks in (("about the record", found.audit), ("note", found.notes)):
+        for remark in remarks:
+            lines += _wrapped(f"{title}: {remark}", 2, hang=4)
+    lines.append(f"  {found.seconds:.1f} s")
+    return "\n".join(line.rstrip() for line in lines)
+
+
+def _wrapped(text: str, indent: int, hang: int | None = None) -> list[str]:
+    later = " " * (indent if hang is None else hang)
+    for sign in ("=", "±"):  # no line ends beside them
+        text = text.replace(f" {sign} ", f"\xa0{sign}\xa0")
+    lines = textwrap.wrap(text, WIDTH, initial_indent=" " * indent, subsequent_indent=later,
+                          break_on_hyphens=False)  # fmt: skip
+    return [line.replace("\xa0", " ") for line in lines]
+
+
+def gap_lines(gap: Gap) -> list[str]:
+    """Return the sizes of the gap as aligned lines."""
+    rows = words.gap_rows(gap)
+    head = f"  how far apart: {gap.kind} of {len(gap.time)} samples kept back, RMS error"
+    return [head, *(f"    {label:<20}{size:>12}   {times}" for label, size, times in rows),
+            *_wrapped(words.shrinking(gap), 4)]  # fmt: skip
+
+
+def _where(found: Diagnosis) -> list[str]:
+    places = words.telling(found)
+    if not places:
+        axes = listing([p.axis for p in found.where])
+        return ["  where it sits: " + (f"nowhere; noise looks like this along {axes}" if axes else
+                                       "not known")]  # fmt: skip
+    same = not found.findings
+    head = "  where it sits: RMS of the one-step errors, 1 is noise"
+    rows = [f"{head:<79}{'worst' if same else 'before':>10}{'' if same else 'after':>10}"]
+    for place in places:
+        first, *more = textwrap.wrap(words.place_words(place), 60) or [""]
+        after = "" if same else number(words.worst(place.after), 3)
+        rows.append(f"    {place.axis:<12} {first:<62}{number(words.worst(place.before), 3):>10}"
+                    f"{after:>10}")  # fmt: skip
+        rows += [f"{'':<17}{line}" for line in more]
+    return rows
+
+
+def _finding(found: Diagnosis, finding: Finding, label: str) -> list[str]:
+    lines = _wrapped(f"{label}{words.named(finding)}", 4, hang=7)
+    lines += _wrapped(words.sized(found, finding), 7, hang=9)
+    for text in (words.certainty(found, finding), *words.doubts(found, finding)):
+        lines += _wrapped(text, 7, hang=9)
+    return lines
+
+
+def _sensitivity(found: Diagnosis) -> list[str]:
+    rows = [f"{key:<{max(46 - len(size), len(key) + 1)}}{size}"
+            for key, size in words.sensitivity_rows(found)]  # fmt: skip
+    half = (len(rows) + 1) // 2
+    right = [*rows[half:], ""][:half]
+    head = "  the smallest effects that this record would have shown"
+    return [head, *(f"    {a}    {b}" for a, b in zip(rows[:half], right, strict=True))]
+
+
+def _parameters(found: Diagnosis) -> list[str]:
+    if not found.calibrated:
+        return ["  the model has no free parameters"]
+    last = "with the effects" if found.findings else "fitted"
+    rows = [("the model's own parameters", "given", "recalibrated", last)]
+    for c in found.calibrated:
+        fitted = (with_error(c.after, c.standard_error) if math.isfinite(c.standard_error)
+                  else f"{number(c.after, 4)} (not in the data)")  # fmt: skip
+        rows.append((f"  {c.name}", number(c.given, 4), number(c.before, 4), fitted))
+    if not found.findings:
+        rows = [(a, b, "", d) for a, b, _, d in rows]
+    return [f"  {a:<26}{b:>12}{c:>14}{d:>26}" for a, b, c, d in rows]
