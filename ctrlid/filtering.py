@@ -369,7 +369,7 @@ class Machine:
 
     def _inside(self, track: Track, theta: Array, at: Trajectory) -> Trajectory:
         """Pull samples at which the plant is not defined back to rest."""
-        bad = ~np.isfinite(at.filtered).all(axis=1) | ~np.isfinite(at.predicted).all(axis=1)
+        bad: Any = ~(np.isfinite(at.filtered) & np.isfinite(at.predicted)).all(axis=1)
         if not bad.any():
             lin = self.linearize(track, theta, at)
             bad = ~(np.isfinite(lin.step).all(axis=1) & np.isfinite(lin.a).all(axis=(1, 2))

@@ -212,8 +212,9 @@ def _line(cost: Callable[[Array], float], x: float, low: float, high: float) -> 
     while True:
         ends = max(x - reach, low), min(x + reach, high)
         found = optimize.minimize_scalar(
-            cost, bounds=ends, method="bounded", options={"xatol": 0.03, "maxiter": 20}
-        )
+            lambda v: cost(np.atleast_1d(np.asarray(v))), bounds=ends, method="bounded",
+            options={"xatol": 0.03, "maxiter": 20},
+        )  # fmt: skip
         moved = abs(float(found.x) - x)
         x = float(found.x)
         if moved < 0.9 * reach or x - low < 0.1 or high - x < 0.1:

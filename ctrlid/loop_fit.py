@@ -3,7 +3,6 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import zip_longest
 from typing import Any
 
 import numpy as np
@@ -256,7 +255,8 @@ def make_problem(
     """Return the likelihood problem of a loop on records that begin at given times."""
     m = machine_for(loop, tuple(names), records[0])
     lower, upper = bounds_of(loop, names)
-    tracks = [make_track(loop, r, b) for r, b in zip_longest(records, begins, fillvalue=0.0)]
+    begins = begins or [0.0] * len(records)
+    tracks = [make_track(loop, r, b) for r, b in zip(records, begins, strict=True)]
     return Problem(m, tuple(tracks), lower, upper)
 
 
@@ -329,7 +329,7 @@ def summary(loop: Loop, fit: Fit) -> LoopFit:
     return LoopFit(fitted, estimate)
 
 
-def _unseen(matrix: Array, rows: Array, k: int) -> bool:
+def _unseen(matrix: Array, rows: Any, k: int) -> bool:
     """Whether a parameter takes part in a direction that is not in the data."""
     if k not in rows:
         return False
@@ -338,5 +338,3 @@ def _unseen(matrix: Array, rows: Array, k: int) -> bool:
     values, vectors = np.linalg.eigh(part / np.outer(size, size))
     weak = vectors[list(rows).index(k), values < UNSEEN * values.max()]
     return bool(np.any(np.abs(weak) > 0.1))
-
-

@@ -232,7 +232,7 @@ def _gaps(
         shares[f.position] = _share(error**2 - sizes[2] ** 2, sizes[1], floor)
     first = windows[0]
     gap = Gap(
-        kind, *sizes, floor, first.record.units.get("y", ""),
+        kind, sizes[0], sizes[1], sizes[2], floor, first.record.units.get("y", ""),
         first.begin + np.asarray(first.record.t - first.record.start)[first.mask],
         np.asarray(first.record.y)[first.mask], results[1][0][first.mask],
         results[2][0][first.mask],

@@ -181,23 +181,23 @@ def _binned(z: Array, values: Array) -> tuple[float, float]:
 
 def places(before: Omnibus, after: Omnibus, units: Mapping[str, str]) -> tuple[Place, ...]:
     """Return where the innovations are not noise, before and after; most telling first."""
-    found = []
+    found: list[Place] = []
     for name, values in before.axes.items():
         if name not in after.axes or len(after.axes[name]) != len(values):
             continue
         edges = bin_edges(values)
         index = bin_index(values, edges)
         count = np.maximum(np.bincount(index, minlength=len(edges) - 1), 1)
-        sizes = [np.bincount(index, o.z**2, minlength=len(count)) / count for o in (before, after)]
-        p = [min(1.0, 2 * min(o.p_values[f"{what} by {name}"] for what in ("mean", "size")))
-             for o in (before, after)]  # fmt: skip
-        words = _words(name, units.get(name, ""), edges, before.z, index, count)
-        found.append((name, edges, *sizes, *p, words))
-    found.sort(key=lambda row: row[4])
-    return tuple(
-        Place(name, units.get(name, ""), edges, b, a, p0, p1, words)
-        for name, edges, b, a, p0, p1, words in found
-    )
+        was, now = (np.bincount(index, o.z**2, minlength=len(count)) / count
+                    for o in (before, after))  # fmt: skip
+        p_was, p_now = (
+            min(1.0, 2 * min(o.p_values[f"{what} by {name}"] for what in ("mean", "size")))
+            for o in (before, after)
+        )
+        unit = units.get(name, "")
+        words = _words(name, unit, edges, before.z, index, count)
+        found.append(Place(name, unit, edges, was, now, p_was, p_now, words))
+    return tuple(sorted(found, key=lambda place: place.p_before))
 
 
 def _words(name: str, unit: str, edges: Array, z: Array, index: Array, count: Array) -> str:

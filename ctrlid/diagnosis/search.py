@@ -139,7 +139,8 @@ def search(base: Model, catalogue: Sequence[type[AbstractEffect]], work: Work,
     """
     record = base.fit.problem.tracks[0].record
     given = len(base.loop.effects)
-    model, steps = base, []
+    model = base
+    steps: list[Step] = []
     before = omnibus(base.fit)
     while len(model.loop.effects) - given < MOST and len(steps) < MOST + 2:
         tell(f"round {len(steps) + 1}: screening")

@@ -306,4 +306,4 @@ def gain_by_record(without: Model, with_effect: Model) -> Array:
         counts = [int(np.count_nonzero(c)) for c in model.fit.problem.counts]
         parts = np.split(log_terms(model.fit), np.cumsum(counts)[:-1])
         sums.append([float(p.sum()) for p in parts])
-    return np.array(sums[1]) - np.array(sums[0])
+    return np.asarray(np.array(sums[1]) - np.array(sums[0]), dtype=float)
