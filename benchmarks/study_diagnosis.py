@@ -21,6 +21,7 @@ import argparse
 import itertools
 import json
 import math
+import signal
 import time
 import warnings
 from collections import Counter
@@ -36,6 +37,7 @@ from _random_loops import (
     PLANTS,
     SHARES,
     Draw,
+    Noise,
     Scales,
     draw,
     hidden,
@@ -45,7 +47,6 @@ from _random_loops import (
 
 import ctrlid as cid
 from ctrlid import effects
-from ctrlid.diagnosis import gap as gaps
 from ctrlid.diagnosis.trial import Model, base_model
 from ctrlid.effects import CATALOGUE, AbstractEffect, equivalents
 
@@ -599,17 +600,13 @@ def fresh_ratio(found: Any, case: Case) -> float:
     """Return the gap on a fresh record over that of the refit that knows what is hidden."""
     if case.spread:
         return math.nan
+    one, quiet = case.one, Noise(0.0)
     try:
-        record = case.one.run(case.real, case.seed + 1)
+        y = one.run(case.real, case.seed + 1).y
+        made = [one.run(loop, case.seed + 1, quiet).y for loop in (found.loop, case.truth.fitted)]
     except cid.CtrlidError:
         return math.nan
-    kind = gaps.way_to_compare(case.one.believed, record)
-    mask = np.asarray(record.valid).copy()
-    mask[: int(gaps.START * len(mask))] = False
-    sizes = []
-    for loop in (found.loop, case.truth.fitted):
-        (y,) = gaps.outputs(loop, [record], kind)
-        sizes.append(gaps.root_mean_square(record, y, mask))
+    sizes = [float(np.sqrt(np.mean((y - other) ** 2))) for other in made]
     return sizes[0] / sizes[1] if sizes[1] > 0 else math.nan
 
 
@@ -624,9 +621,14 @@ def answered(found: Any, case: Case) -> float:
     return case.truth.fit.value - mine.fit.value
 
 
+def _too_long(*_: Any) -> None:
+    raise TimeoutError("the diagnosis took longer than --limit")
+
+
 def run(
-    kind: str, band_name: str, seed: int, index: int, classes: Sequence[Any] = CATALOGUE
-) -> Row:
+    kind: str, band_name: str, seed: int, index: int, classes: Sequence[Any] = CATALOGUE,
+    limit: int = 0,
+) -> Row:  # fmt: skip
     """Draw, simulate, diagnose and judge once."""
     warnings.simplefilter("ignore")
     row = Row(kind, band_name, seed, index)
@@ -639,9 +641,13 @@ def run(
     describe(row, case)
     started = time.perf_counter()
     try:
+        if limit:
+            signal.signal(signal.SIGALRM, _too_long)
+            signal.alarm(limit)
         found = cid.diagnose(
             case.one.believed, case.record, catalogue=case.catalogue, progress=False
         )
+        signal.alarm(0)
         row.seconds = time.perf_counter() - started
         judge(row, found, case)
         row.ratio = fresh_ratio(found, case)
@@ -854,6 +860,7 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0, help="number of the first run")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--limit", type=int, default=0, help="seconds for a diagnosis; 0: none")
     parser.add_argument("--only", nargs="+", type=int, help="numbers of runs")
     parser.add_argument("--out", help="a file to which each run is appended as a line of JSON")
     parser.add_argument("--report", nargs="+", metavar="FILE", help="print the tables of files")
@@ -869,7 +876,8 @@ def main() -> None:
     work = joblib.Parallel(n_jobs=options.jobs, return_as="generator")
     rows = []
     for row in work(
-        joblib.delayed(run)(options.kind, band, options.seed, k, classes) for k in numbers
+        joblib.delayed(run)(options.kind, band, options.seed, k, classes, options.limit)
+        for k in numbers
     ):
         rows.append(row)
         print(row.text() if not row.extra.get("skipped") else
