@@ -62,7 +62,7 @@ def separating_experiment(
     if chosen is None or len(models) < 2:
         return words, None
     times = chosen[0] / max(_own_distance(models, record, sensor, loop), 1e-12)
-    text = (f"{words} Recommended: {chosen[1]}; there the candidates differ "
+    text = (f"{words.rstrip('.')}. Recommended: {chosen[1]}; there the candidates differ "
             f"{times:.1f} times as much for the same number of samples.")  # fmt: skip
     return text.strip(), chosen[2]
 

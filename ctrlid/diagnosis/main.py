@@ -32,6 +32,7 @@ HOPELESS = ("too few samples", "constant signal")
 LONGEST = 120_000  # samples that are fitted; of longer records, even stretches
 STRETCHES = 12  # of a long record
 TIE = 0.02  # difference of log-likelihood between effects that are one and the same
+EXCESS = 1.5  # times the noise floor (twice that with a coloured force): above, not explained
 STEPS = 6  # of the progress bar
 
 
@@ -267,7 +268,9 @@ def _result(
     units = _units(loop, records[0])
     where = places(found.before, found.after, units)
     verdict: Verdict
-    if found.after.passed:
+    excess = EXCESS * (2 if found.final.fit.noise.drift else 1)
+    left = math.isfinite(gap.floor) and gap.after > excess * gap.floor
+    if found.after.passed and not left:
         verdict = "explained" if findings else "nothing missing"
     else:
         verdict = "partly explained" if findings else "unknown"

@@ -14,7 +14,7 @@ from ..simulation import Simulator
 from ..stepping import growth_rate
 from .gap import FEW_STEPS, ROUGH, drive, random_noise
 from .omnibus import ALPHA, Omnibus, omnibus
-from .trial import Model, Trial, attempt_at, refit
+from .trial import Model, Trial, attempt_at, reduced, refit
 
 DOUBTFUL = 400.0  # a gain above this is no artefact of the filter, if the model has no effect yet
 TWICE = 1.5  # what the replica gains counts this much against a candidate
@@ -94,6 +94,37 @@ def artefact(copy: Model | None, trial: Trial) -> float:
         return 0.0
     again = refit(copy, attempt_at(copy, trial.fitted, trial.scan))
     return max(again.gain, 0.0) if math.isfinite(again.gain) else 0.0
+
+
+def more_than_simple(base: Model, best: Trial, simple: Trial) -> bool:
+    """Whether an effect earns its further parameters over a simpler one.
+
+    What the further parameters gain on a record simulated with the simpler effect, they gain
+    from the approximations of the filter.
+
+    Parameters
+    ----------
+    base : Model
+        The model without either.
+    best, simple : Trial
+        The refitted candidates.
+
+    Returns
+    -------
+    bool
+        True where it cannot be simulated.
+    """
+    copy = replica(simple.model)
+    if copy is None:
+        return True
+    try:
+        under = reduced(copy, base.fitted, base.names)
+    except CtrlidError:
+        return True
+    again = refit(Model(base.fitted, under), attempt_at(Model(base.fitted, under), best.fitted))
+    usual = again.model.fit.value - copy.fit.value if math.isfinite(again.gain) else 0.0
+    won = best.gain - simple.gain - TWICE * max(usual, 0.0)
+    return won > best.cost - simple.cost
 
 
 def forgiven(tests: Omnibus, copies: Sequence[Model | None]) -> Omnibus:

@@ -14,7 +14,15 @@ from ..likelihood import climb, polish
 from ..loop_fit import choose_noise
 from .decide import GATE, rivals
 from .omnibus import Omnibus, omnibus
-from .replica import DOUBTFUL, TWICE, artefact, forgiven, replica, simulable
+from .replica import (
+    DOUBTFUL,
+    TWICE,
+    artefact,
+    forgiven,
+    more_than_simple,
+    replica,
+    simulable,
+)
 from .scan import scanned
 from .trial import Model, Trial, attempt_at, reduced, refit
 
@@ -92,9 +100,24 @@ def one_round(base: Model, pool: Sequence[AbstractEffect], work: Work) -> Step:
     late = [t for t in tried if id(t) not in done and t.name in alike and t.promise > -math.inf]
     done |= {id(t): r for t, r in zip(late, work(lambda t: refit(base, t), late), strict=True)}
     trials = [done.get(id(t), t) for t in tried]
-    trials = _checked(base, trials)
+    trials = _simplest(base, _checked(base, trials))
     best = trials[0]
     return Step(base, tuple(trials), best if best.merit > GATE else None)
+
+
+def _simplest(base: Model, trials: list[Trial]) -> list[Trial]:
+    """Put out a winner whose further parameters gain from the filter's approximations only."""
+    best = trials[0]
+    for simple in trials[1:MOST]:
+        fewer = len(simple.effect.parameters()) < len(best.effect.parameters())
+        if not fewer or simple.merit <= GATE or not simulable(base):
+            continue
+        if best.gain - simple.gain > 0.1 * best.gain or simple.name not in best.effect.look_alikes:
+            continue
+        if not more_than_simple(base, best, simple):
+            out = replace(best, remark=f"{simple.name} explains as much with fewer parameters")
+            return sorted([out, *trials[1:]], key=lambda t: (-t.merit, -t.promise))
+    return trials
 
 
 def _checked(base: Model, trials: list[Trial]) -> list[Trial]:

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from .._text import number
+from .._text import chance, number
 from .omnibus import Omnibus
 from .result import Disturbance, Finding, Gap, Place, Verdict
 
@@ -37,18 +37,20 @@ def conclusion(
     """
     names = " and ".join(" or ".join(f.names) for f in findings)
     name, p = after.worst
+    why = f"the test of {name} fails ({chance(p)})"
+    if after.passed:
+        why = "on data kept back the gap stays well above the noise floor"
+    were, them = ("were", "them") if len(findings) > 1 else ("was", "it")
     if verdict == "nothing missing":
         text = "At the sensitivity of this record, what is left is noise."
     elif verdict == "explained":
-        text = f"Missing was {names}; with it, what is left is noise."
-        if len(findings) > 1:
-            text = f"Missing were {names}; with them, what is left is noise."
+        text = f"Missing {were} {names}; with {them}, what is left is noise."
     elif verdict == "partly explained":
-        text = (f"{names} explains part of the gap. Something else remains that no known effect "
-                f"accounts for: the test of {name} fails (p = {p:.1g}).")  # fmt: skip
+        verb = "explain" if len(findings) > 1 else "explains"
+        text = (f"{names} {verb} part of the gap. Something else remains that no known effect "
+                f"accounts for: {why}.")  # fmt: skip
     else:
-        text = (f"Something is missing, but none of the known effects accounts for it: the test of "
-                f"{name} fails (p = {p:.1g}).")  # fmt: skip
+        text = f"Something is missing, but none of the known effects accounts for it: {why}."
     left = [w for w in where if w.p_after < 1e-4]
     if left and verdict in ("partly explained", "unknown"):
         text += f" It shows along {' and '.join(w.axis for w in left[:2])}."

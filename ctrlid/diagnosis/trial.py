@@ -17,6 +17,7 @@ from ..loop_fit import bounds_of, choose_noise, make_problem, start_values
 from ..physics import Array
 
 SCREEN_ROUNDS = 14  # of a refit: a candidate that needs more is not the missing effect
+SIGNIFICANT = 2.0  # standard errors that a fitted effect must at least be large
 SEEN = 1e-7  # share of a parameter's information that others must leave to it
 
 
@@ -202,6 +203,10 @@ def _extended(base: Model, loop: Loop, names: Sequence[str]) -> Fit:
     old = base.fit.problem
     m = Machine(loop, names, old.machine.hold, old.machine.law is not None)
     tracks = tuple(make_track(loop, t.record, float(t.table[0, 0])) for t in old.tracks)
+    at = [
+        _carried(old.machine, m, out.trajectory, m.guess(track))
+        for out, track in zip(base.fit.filtered, tracks, strict=True)
+    ]
     lower, upper = bounds_of(loop, names)
     longest = max(len(t.record) for t in tracks) * loop.dt
     for k, name in enumerate(names):
@@ -209,16 +214,21 @@ def _extended(base: Model, loop: Loop, names: Sequence[str]) -> Fit:
             lower[k], upper[k] = max(lower[k], 1.0 / longest), min(upper[k], 0.4 / loop.dt)
         if name.endswith(".damping"):
             upper[k] = min(upper[k], 1.0)
+        if name.endswith(".vs"):  # of the speeds that there are
+            fastest = max(_speed(m, a) for a in at)
+            lower[k], upper[k] = max(lower[k], 1e-3 * fastest), min(upper[k], 3.0 * fastest)
     problem = Problem(m, tracks, lower, upper, old.counts)
     theta = np.clip(start_values(loop, names), lower, upper)
-    at = [
-        _carried(old.machine, m, out.trajectory, m.guess(track))
-        for out, track in zip(base.fit.filtered, tracks, strict=True)
-    ]
     fit = evaluate(problem, theta, base.fit.noise, at)
     if math.isfinite(fit.value) and m.n > old.machine.n:
         fit = evaluate(problem, theta, base.fit.noise, [o.trajectory for o in fit.filtered])
     return fit
+
+
+def _speed(m: Machine, at: Trajectory) -> float:
+    """Return the largest usual speed along a trajectory."""
+    fastest = [float(np.quantile(np.abs(at.filtered[:, j]), 0.99)) for j in m.e.velocities]
+    return max(fastest, default=1.0) or 1.0
 
 
 def _carried(old: Machine, new: Machine, known: Trajectory, guess: Trajectory) -> Trajectory:
@@ -282,7 +292,24 @@ def _objection(trial: Trial) -> str:
         on_bound = fit.theta[k] in (low, high)
         if on_bound and (about.name == "frequency" or about.neutral not in (None, low, high)):
             return f"{about.name} ends on its bound {fit.theta[k]:g}"
+    if _insignificant(trial, effect):
+        return "no larger than its uncertainty"
     return ""
+
+
+def _insignificant(trial: Trial, effect: AbstractEffect) -> bool:
+    """Whether every parameter that decides about an effect may as well be neutral."""
+    fit, names = trial.model.fit, trial.model.names
+    error = np.sqrt(np.maximum(np.diag(pseudo_inverse(fit.normal[0])), 0.0))
+    sure = []
+    for p in effect.parameters():
+        key = f"{trial.label}.{p.name}"
+        if p.neutral is None or key not in names:
+            continue
+        k = names.index(key)
+        away = math.inf if math.isinf(p.neutral) else abs(fit.theta[k] - p.neutral)
+        sure.append(away > SIGNIFICANT * error[k] and fit.normal[0][k, k] > 0)
+    return not any(sure)
 
 
 def log_terms(fit: Fit) -> Array:
