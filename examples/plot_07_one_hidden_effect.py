@@ -9,7 +9,6 @@ worth: one lead designed without it, one with it, both run on the rig.
 
 import control as ct
 import matplotlib.pyplot as plt
-import numpy as np
 
 import ctrlid as cid
 
@@ -64,10 +63,10 @@ named = cid.redesign(found.loop.linearize(), rig, 180, 45)
 print("without the lag:", naive.verdict)
 print("with the lag:   ", named.verdict)
 
-fig, axes = plt.subplots(1, 2, figsize=(9, 3.6), sharey=True, layout="constrained")
-for ax, outcome, title in zip(axes, (naive, named), ("without", "with"), strict=True):
+fig, axes = plt.subplots(2, 1, figsize=(8, 5.6), sharex=True, layout="constrained")
+for ax, outcome, design in zip(axes, (naive, named), ("without", "with"), strict=True):
     cid.plot.step(outcome, ax)
-    ax.set_title(f"Designed {title} the lag")
+    ax.text(0.98, 0.08, f"lead designed {design} the lag", transform=ax.transAxes, ha="right")
 plt.show()
 
 # %%
