@@ -27,15 +27,16 @@ record = cid.simulate(cid.Loop(P, C, dt=5e-4), r, sensor_noise=3e-6, seed=2)
 # %%
 # The sweep
 # ---------
-# Three estimators at eight periods, without any constraint: poles in the s-plane do not depend on the
-# period if they are right.
+# Three estimators at eight periods, without any constraint: poles in the s-plane do not depend on
+# the period if they are right.
 
 sweep = cid.sweep_sampling_period(record, [5e-4 * q for q in (1, 2, 3, 5, 7, 10, 15, 20)])
 print(sweep)
 
 # %%
-# The unstable pole against the period. Least squares begins near the origin and rises to the
-# truth as the period grows; the other two are there from the start.
+# The unstable pole against the period. Least squares begins near the origin and rises to the truth
+# as the period grows. The other two are there from the start, and lose it at long periods, where u
+# moves between the samples that are left.
 
 fig, ax = plt.subplots(figsize=(8, 3.8), layout="constrained")
 pole = {}
@@ -48,7 +49,9 @@ for name, marker in (("fit_arx", "o"), ("fit_iv", "s"), ("fit_continuous", "^"))
 ax.axhline(40, color="0.6", ls=":", label="truth")
 ax.axvline(1e3 * sweep.recommended, color="0.6", lw=0.8)
 ax.annotate("recommended", (1e3 * sweep.recommended, 5), rotation=90, ha="right")
-ax.set(xlabel="sampling period [ms]", ylabel="unstable pole [rad/s]")
+ticks = [0.5, 1, 2, 5, 10]
+ax.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+ax.set(xlabel="sampling period [ms]", ylabel="unstable pole [rad/s]", ylim=(-12, 52))
 ax.legend(loc="lower center", ncols=4)
 plt.show()
 
