@@ -53,8 +53,8 @@ for name in [finding.name for finding in found.findings]:
     print(f"without {name}: k = {values['k']:.3f}, c = {values['c']:.3f}; true 3.15 and 2.1")
 
 # %%
-# What this story asserts: two names and no third, both sizes and both parameters right within half a
-# percent, and a gap that shrinks from sixty times the noise to the noise.
+# What this story asserts: two names and no third, both sizes and both parameters right within half
+# a percent, and a gap that shrinks from sixty times the noise to the noise.
 
 print(f"gap {1e3 * found.gap.before:.2f} mm before, {1e3 * found.gap.after:.3f} mm after, "
       f"floor {1e3 * found.gap.floor:.3f} mm")  # fmt: skip
