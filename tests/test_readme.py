@@ -18,12 +18,13 @@ def comparable(text):
     return [line.split() for line in text.splitlines() if " at lag " not in line and line.strip()]
 
 
-def test_the_ten_lines_print_what_is_shown(capsys):
-    (script,) = blocks("python")
+def printed_by(script, capsys):
     assert len(script.strip().splitlines()) <= 12
     exec(compile(script, "README.md", "exec"), {})
-    printed = comparable(capsys.readouterr().out)
-    shown = next(comparable(b) for b in blocks("text") if "prediction error" in b)
+    return comparable(capsys.readouterr().out)
+
+
+def agree(printed, shown):
     assert len(printed) == len(shown)
     for new, old in zip(printed, shown, strict=True):
         assert len(new) == len(old)
@@ -31,6 +32,22 @@ def test_the_ten_lines_print_what_is_shown(capsys):
             assert NUMBER.sub("#", word) == NUMBER.sub("#", said)
             for a, b in zip(NUMBER.findall(word), NUMBER.findall(said), strict=True):
                 assert float(a) == pytest.approx(float(b), rel=0.05, abs=0.02)
+
+
+def test_the_ten_lines_print_what_is_shown(capsys):
+    shown = next(comparable(b) for b in blocks("text") if "prediction error" in b)
+    agree(printed_by(blocks("python")[0], capsys), shown)
+
+
+def test_the_diagnosis_prints_what_is_shown(capsys):
+    """Between the dots; the parts appear in this order."""
+    shown = next(b for b in blocks("text") if "Diagnosis of" in b)
+    left = printed_by(blocks("python")[1], capsys)
+    parts = [comparable(part) for part in shown.split("\n...\n")]
+    for part in filter(None, parts):
+        start = next(k for k, words in enumerate(left) if words[:3] == part[0][:3])
+        agree(left[start : start + len(part)], part)
+        left = left[start + len(part) :]
 
 
 def test_the_two_commands_are_one_line_each():
