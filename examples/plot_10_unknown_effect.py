@@ -59,9 +59,9 @@ record = cid.simulate(rig, r, sensor_noise=5e-6, seed=2)
 # %%
 # With the catalogue as it is
 # ---------------------------
-# The search reaches for the next best name and for a large random force. It does not sell them as
-# the answer: the gap on samples kept back is no smaller, something is still missing, and what is
-# named "may stand in for what is still missing".
+# The search reaches for the next best name, or for a large random force. It does not sell them as
+# the answer: something is still missing, and what is named "may stand in for what is still
+# missing". Above, before and after hardly differ.
 
 first = cid.diagnose(model, record, progress=False)
 print(first)
