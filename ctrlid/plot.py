@@ -601,7 +601,8 @@ def _gap(above: Any, below: Any, found: Diagnosis) -> None:
     t, y = gap.time[part], gap.measured[part]
     scale, unit = _pictures.scale([y], gap.unit)
     above.plot(t, scale * y, label="measured", **MEASURED)
-    names = " and ".join(f.name for f in found.findings)
+    names = " and ".join(f.name for f in found.findings[:2])
+    names += f" and {len(found.findings) - 2} more" if len(found.findings) > 2 else ""
     cases = [("before" if names else "recalibrated", gap.simulated_before, gap.before,
               BEFORE if names else AFTER)]  # fmt: skip
     if names:

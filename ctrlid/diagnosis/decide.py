@@ -10,6 +10,7 @@ from .trial import Trial, log_terms
 
 GATE = 5.0  # gain of log-likelihood less penalty: 10 in units of the Bayesian criterion
 CLOSE = 3.0  # difference of log-likelihood that says nothing
+SAME = 4.0  # spread of a likelihood ratio: two models that differ by less are nested
 Z = 2.0  # standard deviations of Vuong's test
 BLOCK = 50  # samples whose terms are summed before their spread is taken
 
@@ -39,10 +40,15 @@ def vuong(best: Array, other: Array, penalty: float) -> float:
     Vuong, Econometrica 57 (1989) 307-333.
     """
     d = best - other
+    spread = _spread(d)
+    return float((d.sum() - penalty) / max(spread, 1e-12))
+
+
+def _spread(d: Array) -> float:
+    """Return the standard deviation of a sum whose terms may be correlated with neighbours."""
     n = len(d) // BLOCK * BLOCK
     sums = d[:n].reshape(-1, BLOCK).sum(axis=1) if n else d
-    spread = math.sqrt(float(np.sum((sums - sums.mean()) ** 2)))
-    return float((d.sum() - penalty) / max(spread, 1e-12))
+    return math.sqrt(float(np.sum((sums - sums.mean()) ** 2)))
 
 
 def rivals(best: Trial, others: Sequence[Trial]) -> tuple[Trial, ...]:
@@ -66,6 +72,9 @@ def rivals(best: Trial, others: Sequence[Trial]) -> tuple[Trial, ...]:
         if trial is best or trial.merit <= GATE:
             continue
         lost = best.merit - trial.merit
+        # A larger model that predicts the same contains the best one, and pays for nothing.
+        if trial.cost > best.cost and _spread(mine - log_terms(trial.model.fit)) < SAME:
+            continue
         z = vuong(mine, log_terms(trial.model.fit), best.cost - trial.cost)
         if lost < CLOSE or z < Z:
             found.append(trial)

@@ -16,6 +16,7 @@ from .trial import Trial
 
 LONGEST = 20_000  # samples of a recommended experiment
 LEVELS = (-1.0, 1.0, -0.5, 0.5, 0.0)  # set-points it visits, in units of its reach
+WORTH = 1.5  # times the distance of the record itself: below, no experiment worth the name
 RAMP = 0.1  # share of each level that is spent on the way to it
 
 
@@ -61,7 +62,12 @@ def separating_experiment(
             chosen = (distance, text, r)
     if chosen is None or len(models) < 2:
         return words, None
-    times = chosen[0] / max(_own_distance(models, record, sensor, loop), 1e-12)
+    own = _own_distance(models, record, sensor, loop)
+    if chosen[0] < WORTH * own:
+        return words, None
+    if own <= 0:
+        return f"{words.rstrip('.')}. Recommended: {chosen[1]}.", chosen[2]
+    times = chosen[0] / own
     text = (f"{words.rstrip('.')}. Recommended: {chosen[1]}; there the candidates differ "
             f"{times:.1f} times as much for the same number of samples.")  # fmt: skip
     return text.strip(), chosen[2]

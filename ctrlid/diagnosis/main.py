@@ -124,6 +124,10 @@ def diagnose(
     found = search(base, catalogue, _worker(jobs), tell)
     tell("comparing on fresh data", 2)
     gap, shares, disturbance = _gaps(loop, found, records, fresh)
+    if found.found and not found.after.passed and gap.after > gap.before:
+        # What names something and leaves more unexplained than before has the wrong name.
+        found = replace(found, final=found.base, found=(), after=found.before)
+        gap, shares, disturbance = _gaps(loop, found, records, fresh)
     tell("writing down", 1)
     result = _result(loop, records, found, gap, shares, disturbance, remarks)
     bar.close()

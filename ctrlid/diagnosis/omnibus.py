@@ -27,6 +27,7 @@ class Omnibus:
     p_values: Mapping[str, float]
     z: Array
     axes: Mapping[str, Array]
+    alpha: float = ALPHA
 
     @property
     def worst(self) -> tuple[str, float]:
@@ -37,7 +38,7 @@ class Omnibus:
     @property
     def passed(self) -> bool:
         """Whether nothing but noise is seen."""
-        return self.worst[1] > ALPHA
+        return self.worst[1] > self.alpha
 
 
 def omnibus(fit: Fit) -> Omnibus:

@@ -105,4 +105,4 @@ def _parameters(found: Diagnosis) -> list[str]:
         rows.append((f"  {c.name}", number(c.given, 4), number(c.before, 4), fitted))
     if not found.findings:
         rows = [(a, b, "", d) for a, b, _, d in rows]
-    return [f"  {a:<26}{b:>12}{c:>14}{d:>26}" for a, b, c, d in rows]
+    return [f"  {a:<26}{b:>12}{c:>14}  {d:>28}" for a, b, c, d in rows]

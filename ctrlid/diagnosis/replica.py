@@ -17,7 +17,10 @@ from .omnibus import ALPHA, Omnibus, omnibus
 from .trial import Model, Trial, attempt_at, reduced, refit
 
 DOUBTFUL = 400.0  # a gain above this is no artefact of the filter, if the model has no effect yet
-TWICE = 1.5  # what the replica gains counts this much against a candidate
+TWICE = 2.0  # what the replica gains counts this much against a candidate
+KINKED = (
+    1e-8  # chance of a false alarm for a model with friction: the filter only nearly follows it
+)
 BEYOND = 3.0  # logarithms of chance by which a test must fail more than on a replica
 
 
@@ -75,13 +78,18 @@ def simulable(model: Model) -> bool:
     return all(t.record.r is not None for t in model.fit.problem.tracks)
 
 
-def artefact(copy: Model | None, trial: Trial) -> float:
-    """Return what a candidate gains on a record in which it is known not to be.
+def kinked(model: Model) -> bool:
+    """Whether a model has kinks in its states, such as dry friction."""
+    return model.fit.problem.machine.e.spread is not None
+
+
+def artefact(copies: Sequence[Model | None], trial: Trial) -> float:
+    """Return what a candidate gains on records in which it is known not to be.
 
     Parameters
     ----------
-    copy : Model or None
-        The replica of the model that the candidate was added to.
+    copies : sequence of Model or None
+        Replicas of the model that the candidate was added to.
     trial : Trial
         The candidate.
 
@@ -90,10 +98,8 @@ def artefact(copy: Model | None, trial: Trial) -> float:
     float
         Gain of log-likelihood, zero at least.
     """
-    if copy is None:
-        return 0.0
-    again = refit(copy, attempt_at(copy, trial.fitted, trial.scan))
-    return max(again.gain, 0.0) if math.isfinite(again.gain) else 0.0
+    again = [refit(c, attempt_at(c, trial.fitted, trial.scan)) for c in copies if c is not None]
+    return max([0.0, *(t.gain for t in again if math.isfinite(t.gain))])
 
 
 def more_than_simple(base: Model, best: Trial, simple: Trial) -> bool:
@@ -127,7 +133,7 @@ def more_than_simple(base: Model, best: Trial, simple: Trial) -> bool:
     return won > best.cost - simple.cost
 
 
-def forgiven(tests: Omnibus, copies: Sequence[Model | None]) -> Omnibus:
+def forgiven(tests: Omnibus, copies: Sequence[Model | None], alpha: float = ALPHA) -> Omnibus:
     """Return the tests without alarms that the filter's own approximation raises.
 
     A test that fails on the record, and on records simulated with the very model, says nothing
@@ -135,7 +141,7 @@ def forgiven(tests: Omnibus, copies: Sequence[Model | None]) -> Omnibus:
     """
     known = [omnibus(copy.fit).p_values for copy in copies if copy is not None]
     if not known:
-        return tests
+        return replace(tests, alpha=alpha)
     p = {}
     for name, value in tests.p_values.items():
         usual = min(k.get(name, 1.0) for k in known)
@@ -143,4 +149,4 @@ def forgiven(tests: Omnibus, copies: Sequence[Model | None]) -> Omnibus:
             max(usual, 1e-300)
         )
         p[name] = max(value, 0.5) if failed else value
-    return replace(tests, p_values=p)
+    return replace(tests, p_values=p, alpha=alpha)

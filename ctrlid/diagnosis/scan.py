@@ -7,7 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from ..effects import AbstractEffect, FlexibleMode, ParameterStep, PeriodicForce, PositionRipple
+from ..effects import (
+    AbstractEffect,
+    FlexibleMode,
+    ParameterStep,
+    PeriodicForce,
+    PositionRipple,
+    StateLimit,
+)
 from ..likelihood import pseudo_inverse
 from ..physics import Array
 from .trial import Model, Trial, attempt, attempt_best
@@ -16,6 +23,7 @@ COLUMNS = 2_000_000  # numbers in a block of shapes at once
 LENGTHS = 150  # wavelengths that are looked for in the travel
 EDGE = 0.03  # of the record, at either end
 TIMES = 40  # instants at which a parameter might have stepped
+LIMITS = (0.8, 0.9, 0.95, 0.98, 0.995)  # quantiles at which a state may be limited
 MODES = 7  # frequencies at which a flexible mode is tried
 
 
@@ -111,13 +119,27 @@ def _wave(size: Array) -> tuple[float, float]:
     return float(np.hypot(*size)), float(np.arctan2(size[1], size[0]))
 
 
+def _strongest(model: Model) -> tuple[float, int]:
+    """Return the frequency of the strongest line in the innovations [Hz], and their number."""
+    z = max(model.fit.standardized, key=len)
+    n, dt = len(z), model.loop.dt
+    power = np.abs(np.fft.rfft(np.nan_to_num(z), 4 * n)) ** 2
+    power[:8] = 0.0  # slower than two periods: a drift, not a vibration
+    return int(np.argmax(power)) / (4 * n * dt), n
+
+
+def _limit(model: Model, effect: StateLimit) -> Trial:
+    states = list(model.fit.problem.machine.e.states)
+    if effect.name not in states:
+        return attempt(model, effect)
+    k = states.index(effect.name)
+    values = np.concatenate([out.trajectory.filtered[:, k] for out in model.fit.filtered])
+    limits = [float(v) for v in np.quantile(values, LIMITS)]
+    return attempt_best(model, [replace(effect, upper=v) for v in limits], math.log(len(limits)))
+
+
 def _periodic(model: Model, effect: PeriodicForce) -> Trial:
-    z, records = model.fit.standardized, [t.record for t in model.fit.problem.tracks]
-    longest = int(np.argmax([len(v) for v in z]))
-    n, dt = len(z[longest]), records[longest].dt
-    power = np.abs(np.fft.rfft(np.nan_to_num(z[longest]), 4 * n)) ** 2
-    power[: max(8, 1)] = 0.0  # slower than two periods: a drift, not a vibration
-    frequency = int(np.argmax(power)) / (4 * n * dt)
+    frequency, n = _strongest(model)
     shapes = []
     for track in model.fit.problem.tracks:
         angle = 2 * np.pi * frequency * track.table[0]
@@ -182,6 +204,9 @@ def _mode(model: Model, effect: FlexibleMode) -> Trial:
     slowest = 5.0 / (len(record) * record.dt)
     grid = np.geomspace(max(slowest, 1e-2 / record.dt / 10), 0.35 / record.dt, MODES)
     modes = [replace(effect, frequency=float(f), damping=0.1, coupling=0.0) for f in grid]
+    # A lightly damped mode is a line in the innovations, too narrow for any grid.
+    line = min(max(_strongest(model)[0], 2.0 / (len(record) * record.dt)), 0.35 / record.dt)
+    modes += [replace(effect, frequency=line, damping=0.03, coupling=c) for c in (0.0, 0.05)]
     return attempt_best(model, modes, math.log(MODES))
 
 
@@ -190,4 +215,5 @@ SCANS: dict[type, Callable[[Model, Any], Trial]] = {
     PositionRipple: _ripple,
     ParameterStep: _step,
     FlexibleMode: _mode,
+    StateLimit: _limit,
 }

@@ -8,28 +8,34 @@ from typing import Any
 import numpy as np
 
 from ..data import Record
-from ..effects import AbstractEffect
+from ..effects import AbstractEffect, SensorOffset
 from ..errors import CtrlidError
 from ..likelihood import climb, polish
+from ..linearization import state_matrices
+from ..loop import Loop
 from ..loop_fit import choose_noise
 from .decide import GATE, rivals
-from .omnibus import Omnibus, omnibus
+from .omnibus import ALPHA, Omnibus, omnibus
 from .replica import (
     DOUBTFUL,
+    KINKED,
     TWICE,
     artefact,
     forgiven,
+    kinked,
     more_than_simple,
     replica,
     simulable,
 )
 from .scan import scanned
-from .trial import Model, Trial, attempt_at, reduced, refit
+from .trial import Model, Trial, anchor, attempt_at, reduced, refit
 
 MOST = 5  # effects in one record
 TOP = 5  # candidates refitted because of what they promise
 SHARE = 0.2  # of the best promise: what promises more is refitted as well
 NEAR = 0.5  # of the winner's merit: what came so close is asked again when all effects are in
+MINOR = 0.15  # of the whole gain: less, beside something unknown, is a stand-in
+OFFSETS = (SensorOffset,)
 FAINT = 0.5  # of what would earn a place: a fainter promise is not worth a refit
 
 Work = Callable[[Callable[..., Any], Iterable[Any]], list[Any]]
@@ -75,13 +81,29 @@ def candidates(
         if not (isinstance(kind, type) and issubclass(kind, AbstractEffect)):
             raise CtrlidError("catalogue= holds classes of effects, such as those of "
                               f"ctrlid.effects.CATALOGUE; given {kind!r}")  # fmt: skip
+        if kind.place == "output" and kind in OFFSETS and not _place_matters(loop):
+            continue  # the initial position, of which nobody knows where it is counted from
         found += kind.candidates(loop, record)
     return found
+
+
+def _place_matters(loop: Loop) -> bool:
+    """Whether the plant moves differently when its output is shifted."""
+    a, _, c, _ = state_matrices(loop.equations(), loop.point, spread=1e6)
+    return bool(np.any(np.abs(a[:, np.flatnonzero(c[0])]).sum(axis=0) > 0))
 
 
 def one_round(base: Model, pool: Sequence[AbstractEffect], work: Work) -> Step:
     """Screen all candidates, refit the promising, and return the best that earns its place."""
     tried: list[Trial] = work(lambda effect: scanned(base, effect), pool)
+    other = anchor(base)
+    if other is not None:
+        lost = other.fit.value - base.fit.value
+        more: list[Trial] = work(lambda effect: scanned(other, effect), pool)
+        more = [replace(t, promise=t.promise + lost) for t in more]
+        pairs = zip(tried, more, strict=True)
+        tried = [a if a.promise > 0 or a.promise >= b.promise else b for a, b in pairs]
+        tried += [b for b in more if b.promise > 0]
     tried.sort(key=lambda t: -t.promise)
     leader = tried[0] if tried else None
     if leader is None or not math.isfinite(leader.promise):
@@ -122,17 +144,15 @@ def _simplest(base: Model, trials: list[Trial]) -> list[Trial]:
 
 def _checked(base: Model, trials: list[Trial]) -> list[Trial]:
     """Put out what gains as much on records in which it is known not to be."""
-    copy: Model | None = None
-    tried = False
+    copies: list[Model | None] = []
     for _ in range(MOST):
         trials.sort(key=lambda t: (-t.merit, -t.promise))
         best = trials[0]
         sure = best.gain > DOUBTFUL and not base.loop.effects
         if best.merit <= GATE or sure or not simulable(base):
             break
-        copy = copy if tried else replica(base)
-        tried = True
-        if best.merit - TWICE * artefact(copy, best) > GATE:
+        copies = copies or [replica(base, seed) for seed in range(2 if kinked(base) else 1)]
+        if best.merit - TWICE * artefact(copies, best) > GATE:
             break
         trials[0] = replace(
             best, remark="gains as much on a simulated record in which it is known not to be"
@@ -175,10 +195,38 @@ def search(base: Model, catalogue: Sequence[type[AbstractEffect]], work: Work,
         tell(f"round {len(steps)}: {step.best.name}")
         model = _without_superfluous(_renoised(step.best.model), given)
     model, found = _settled(model, given, steps, work)
+    after = _judged(model)
+    if not after.passed and len(found) > 1:
+        model, found = _main_ones(base, model, found, given)
+        after = _judged(model)
+    return Search(base, tuple(steps), model, found, before, after)
+
+
+def _judged(model: Model) -> Omnibus:
+    """Return the tests of what a model leaves, without the alarms of the filter itself."""
     after = omnibus(model.fit)
     if not after.passed and simulable(model):
-        after = forgiven(after, [replica(model, seed) for seed in (1, 2)])
-    return Search(base, tuple(steps), model, found, before, after)
+        copies = [replica(model, seed) for seed in (1, 2)]
+        after = forgiven(after, copies, KINKED if kinked(model) else ALPHA)
+    return after
+
+
+def _main_ones(
+    base: Model, model: Model, found: tuple[Found, ...], given: int
+) -> tuple[Model, tuple[Found, ...]]:
+    """Keep the effects that carry the explanation where something unknown remains.
+
+    Small effects beside something unknown are stand-ins for it: a wrong name is worse than none.
+    """
+    total = model.fit.value - base.fit.value
+    minor = [f for f in found if f.trial.gain < MINOR * total]
+    if not minor:
+        return model, found
+    left = [f for f in found if f not in minor]
+    for f in sorted(minor, key=lambda f: -f.position):
+        model = _taken_out(model, f.position)[0]
+        left = [replace(k, position=k.position - (k.position > f.position)) for k in left]
+    return model, tuple(left)
 
 
 def _there(model: Model, effect: AbstractEffect) -> bool:

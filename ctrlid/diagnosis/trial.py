@@ -17,6 +17,8 @@ from ..loop_fit import bounds_of, choose_noise, make_problem, start_values
 from ..physics import Array
 
 SCREEN_ROUNDS = 14  # of a refit: a candidate that needs more is not the missing effect
+AWAY = 0.3  # of a given value: a recalibration beyond is doubted
+FAR = 10.0  # times its given value: no recalibration goes further
 SIGNIFICANT = 2.0  # standard errors that a fitted effect must at least be large
 SEEN = 1e-7  # share of a parameter's information that others must leave to it
 
@@ -86,8 +88,37 @@ def base_model(
 ) -> Model:
     """Fit the model as it is, with the noise that the data want."""
     problem = make_problem(loop, names, records, begins)
+    lower, upper = _near(loop, names, problem.lower, problem.upper)
+    problem = replace(problem, lower=lower, upper=upper)
     fit = climb(begin(problem, start_values(loop, names), None))
     return Model(loop, choose_noise(fit))
+
+
+def anchor(base: Model) -> Model | None:
+    """Return the model at its given values if recalibration has led far away from them.
+
+    Where much is missing, the likelihood of the model alone may be largest at absurd values; the
+    missing effect shows at the given ones.
+    """
+    given = start_values(base.loop, base.names)
+    size = np.maximum(np.abs(given), 1e-300)
+    if not np.any(np.abs(base.fit.theta - given) > AWAY * size):
+        return None
+    try:
+        fit = begin(base.fit.problem, given, None)
+    except CtrlidError:
+        return None
+    return Model(base.loop, fit) if math.isfinite(fit.value) else None
+
+
+def _near(loop: Loop, names: Sequence[str], lower: Array, upper: Array) -> tuple[Array, Array]:
+    """Narrow the bounds of the plant's parameters: a model ten times off is another model."""
+    lower, upper = lower.copy(), upper.copy()
+    for k, (name, value) in enumerate(zip(names, start_values(loop, names), strict=True)):
+        if "." not in name and value:
+            ends = sorted((value / FAR, value * FAR))
+            lower[k], upper[k] = max(lower[k], ends[0]), min(upper[k], ends[1])
+    return lower, upper
 
 
 def attempt(base: Model, effect: AbstractEffect, scan: float = 0.0) -> Trial:
@@ -208,6 +239,10 @@ def _extended(base: Model, loop: Loop, names: Sequence[str]) -> Fit:
         for out, track in zip(base.fit.filtered, tracks, strict=True)
     ]
     lower, upper = bounds_of(loop, names)
+    for k, name in enumerate(names):
+        if name in base.names:
+            i = base.names.index(name)
+            lower[k], upper[k] = old.lower[i], old.upper[i]
     longest = max(len(t.record) for t in tracks) * loop.dt
     for k, name in enumerate(names):
         if name.endswith(".frequency"):  # what samples show: below Nyquist's, above one period
@@ -235,7 +270,8 @@ def _carried(old: Machine, new: Machine, known: Trajectory, guess: Trajectory) -
     """Take states that both have from the old trajectory, and guess the others."""
     mine = list(new.e.states)
     columns = [(mine.index(s), k) for k, s in enumerate(old.e.states) if s in mine]
-    columns += [(new.n + k, old.n + k) for k in range(old.size - old.n)]
+    if new.size - new.n == old.size - old.n:  # a delay keeps a known circuit from being followed
+        columns += [(new.n + k, old.n + k) for k in range(old.size - old.n)]
     result = []
     for start, theirs in ((guess.predicted, known.predicted), (guess.filtered, known.filtered),
                          (guess.spread, known.spread)):  # fmt: skip
@@ -260,7 +296,10 @@ def refit(base: Model, trial: Trial) -> Trial:
     own = _own_parameters(trial, fit)
     cost = 0.5 * own * math.log(fit.size) + trial.scan
     done = replace(trial, model=model, gain=fit.value - base.fit.value, cost=cost)
-    done = replace(done, remark=_objection(done))
+    try:
+        done = replace(done, remark=_objection(done))
+    except CtrlidError as reason:  # values that do not go together, such as crossed limits
+        return replace(trial, remark=str(reason))
     return done if done.merit > 0 else replace(done, model=Model(model.loop, light(fit)))
 
 
