@@ -537,7 +537,11 @@ class Row:
             return f"{head}{hid} worth {self.worth:.0f}: RAISED {self.error}"
         names = "; ".join(" | ".join(n) for n in self.named) or "-"
         mark = "right" if self.right else "WRONG"
-        if self.in_set and not self.right:
+        if self.kind == "outside" and self.verdict in ("unknown", "partly explained"):
+            mark = "not taken for known"
+        elif self.kind == "none" and self.verdict == "nothing missing":
+            mark = "right"
+        elif self.in_set and not self.right:
             mark = "in set" if self.verdict == "explained" else "in set, DOWNGRADED"
         text = f"{head}{hid} worth {self.worth:.0f}: {self.verdict}: {names}: {mark}"
         if self.beside:
@@ -606,7 +610,8 @@ def fresh_ratio(found: Any, case: Case) -> float:
         made = [one.run(loop, case.seed + 1, quiet).y for loop in (found.loop, case.truth.fitted)]
     except cid.CtrlidError:
         return math.nan
-    sizes = [float(np.sqrt(np.mean((y - other) ** 2))) for other in made]
+    later = slice(len(y) // 20, None)  # equivalent effects start from different places
+    sizes = [float(np.sqrt(np.mean((y - other)[later] ** 2))) for other in made]
     return sizes[0] / sizes[1] if sizes[1] > 0 else math.nan
 
 
