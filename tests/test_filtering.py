@@ -434,6 +434,34 @@ def test_coulomb_friction_is_smoothed_by_the_uncertain_velocity():
     np.testing.assert_allclose((v - step[:, 1]) / 1e-6 / 2.0, expected, atol=2e-4)
 
 
+@pytest.mark.xfail(reason="one step of order four runs across the kink", strict=True)
+def test_a_velocity_that_turns_within_a_period():
+    """Sharp friction against tight integration of the same smoothed equation.
+
+    What is lost here is what makes a fitted fc 2 % too large, several standard errors.
+    """
+    dt, push, fc = 2e-3, 1.0, 0.05
+    plant = ct.nlsys(lambda t, x, u, p: [x[1], u[0]], lambda t, x, u, p: x[0], name="mass",
+                     inputs=["u"], outputs=["x"], states=["x", "v"])  # fmt: skip
+    loop = cid.Loop(plant, None, dt=dt).with_effect(E.CoulombFriction(fc=fc))
+    m = Machine(loop, ("CoulombFriction.fc",), "zoh", False)
+    n = 60
+    rng = np.random.default_rng(13)
+    v, s = rng.uniform(-1.5, 0.5, n) * push * dt, 0.1 * push * dt
+    record = cid.Record(u=np.full(n, push), y=rng.standard_normal(n), dt=dt)
+    x = np.column_stack([np.zeros(n), v])
+    at = Trajectory(x, x, np.column_stack([np.zeros(n), np.full(n, s)]))
+    step = m.linearize(make_track(loop, record), np.array([fc]), at).step
+    error = []
+    for k in range(n):
+        turning = integrate.solve_ivp(
+            lambda t, z: [z[1], push - fc * math.erf(z[1] / (math.sqrt(2) * s))],
+            (0, dt), x[k], method="LSODA", rtol=1e-11, atol=1e-14, max_step=dt / 50,
+        )  # fmt: skip
+        error.append(step[k, 1] - turning.y[1, -1])
+    assert np.sqrt(np.mean(np.square(error))) < 0.02 * fc * dt
+
+
 def test_an_analog_circuit_moves_the_input_between_samples():
     loop = levitated(analog=True, dt=2e-3)
     r = cid.random_binary(60, amplitude=1e-4, hold=5, around=0.012, seed=5)
