@@ -1,0 +1,134 @@
+"""A slice of the study of diagnose(): random loops, hidden effects, their names."""
+
+import importlib
+import json
+import re
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import ctrlid as cid
+from ctrlid import effects
+
+BENCHMARKS = str(Path(__file__).parents[1] / "benchmarks")
+
+
+def _load_study():
+    sys.path.insert(0, BENCHMARKS)
+    try:
+        return importlib.import_module("study_diagnosis")
+    finally:
+        sys.path.remove(BENCHMARKS)
+
+
+study = _load_study()
+
+SEED = 90_210  # none of the study
+
+
+def drawn(kind, index, band="ordinary"):
+    row = study.run(kind, band if kind in ("named", "outside") else "", SEED, index)
+    assert not row.error, row.error
+    assert not row.extra.get("skipped")
+    return row
+
+
+def index_of(kind):
+    return effects.CATALOGUE.index(kind)
+
+
+@pytest.mark.parametrize("kind", [effects.InputDelay, effects.LinearStiffness])
+def test_an_ordinary_effect_is_named_and_closes_the_gap(kind):
+    row = drawn("named", index_of(kind))
+    assert row.extra["first"]
+    assert row.verdict == "explained"
+    assert 3e3 <= row.worth <= 3e4
+    assert row.ratio < 1.02
+    assert abs(row.left) < 10
+
+
+def test_where_nothing_is_missing_nothing_is_named():
+    row = drawn("none", 1)
+    assert row.verdict == "nothing missing"
+    assert row.named == ()
+    assert row.ratio == pytest.approx(1.0, abs=0.02)
+
+
+def test_what_no_catalogue_has_gets_no_clean_bill():
+    row = drawn("outside", list(study.OUTSIDE).index("multiplicative noise"))
+    assert row.verdict in ("unknown", "partly explained")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("index", range(len(effects.CATALOGUE)))
+def test_every_class_is_in_the_set_that_names_it(index):
+    row = drawn("named", index)
+    assert row.in_set
+    assert row.verdict == "explained"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("index", range(len(study.OUTSIDE)))
+def test_every_outsider_is_unknown(index):
+    assert drawn("outside", index).verdict in ("unknown", "partly explained")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("index", range(6))
+def test_two_effects_are_both_in_the_sets(index):
+    row = drawn("two", index)
+    assert min(row.shares) > study.MARGINAL
+    assert row.in_set
+
+
+def test_the_size_of_an_effect_is_drawn_by_what_it_is_worth():
+    case = study.case_of("named", study.WORTH["faint"], SEED, index_of(effects.ViscousFriction))
+    assert 50 <= case.worth <= 300
+    known = case.truth.fitted.parameters
+    label = next(k for k in known if k.startswith("ViscousFriction."))
+    assert known[label] == pytest.approx(case.effects[0].c, rel=0.5)
+    for name in case.one.loop.free:
+        believed = case.one.believed.parameters[name] / case.one.loop.parameters[name]
+        assert 0.9 <= believed <= 1.1
+        assert known[name] == pytest.approx(case.one.loop.parameters[name], rel=0.05)
+
+
+def test_draws_are_repeatable_and_differ_by_seed():
+    first, again = (study.case_of("none", (1, 1e9), SEED, 3) for _ in range(2))
+    other = study.case_of("none", (1, 1e9), SEED + 1, 3)
+    assert np.array_equal(first.record.y, again.record.y)
+    assert len(other.record) == len(first.record) == 20_000
+    assert not np.array_equal(first.record.y, other.record.y)
+    poles = cid.linearize(first.one.loop.plant, first.one.loop.at).poles()
+    assert np.max(np.abs(poles)) * first.one.loop.dt < 0.5
+
+
+def test_tables_count_what_the_rows_say(capsys):
+    rows = [
+        study.Row("named", "ordinary", 1, 0, truth=("InputDelay",), named=(("InputDelay",),),
+                  verdict="explained", in_set=True, right=True, ratio=1.0, inside=(True,),
+                  seconds=3.0, extra={"first": True}),
+        study.Row("named", "ordinary", 1, 1, truth=("SensorLag",), named=(("InputDelay",),),
+                  verdict="explained", seconds=4.0),
+        study.Row("none", "", 1, 2, truth=("none",), verdict="unknown"),
+        study.Row("outside", "", 1, 3, truth=("BoucWen",), verdict="partly explained"),
+        study.Row("named", "ordinary", 1, 4, truth=("InputOffset",), error="ValueError: no"),
+    ]  # fmt: skip
+    study.report(rows)
+    text = capsys.readouterr().out
+    for line in ("exact name first .* 33.3 % of 3", "wrong single name .* 1$",
+                 "needless unknown .* 100.0 % of 1", "unknown or partly .* 100.0 % of 1",
+                 "raised .* 1$", "SensorLag .*0/1  1 InputDelay"):  # fmt: skip
+        assert re.search(line, text, re.MULTILINE), line
+
+
+def test_rows_survive_their_file(tmp_path):
+    row = study.Row("two", "", 3, 4, truth=("A", "B"), named=(("A", "C"), ("B",)), worth=1e3)
+    path = tmp_path / "rows.jsonl"
+    path.write_text(2 * (json.dumps(vars(row)) + "\n"))
+    (again,) = study.read([str(path)])
+    assert again.named == row.named
+    assert again.truth == row.truth
+    assert again.text() == row.text()
