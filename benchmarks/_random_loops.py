@@ -250,9 +250,7 @@ def tanks(rng: np.random.Generator) -> tuple[cid.Loop, float, float, Noise]:
         loop = cid.Loop(plant, None, dt=dt, at=op, free=free)
         return loop, volts * rng.uniform(0.1, 0.3), volts * rng.uniform(0.05, 0.2), noise
     gain = volts / level * rng.uniform(0.5, 2)
-    loop = cid.Loop(
-        plant, cid.PID(kp=gain), dt=dt, at=op, free=free, input_limits=(0.0, 4 * volts)
-    )
+    loop = cid.Loop(plant, cid.PID(kp=gain), dt=dt, at=op, free=free, input_limits=(0.0, 4 * volts))
     return loop, level * rng.uniform(0.05, 0.15), level * rng.uniform(0.1, 0.2), noise
 
 
@@ -265,9 +263,7 @@ SHARES = {"maglev": 0.4, "servo": 0.2, "pendulum": 0.15, "spring": 0.15, "tank":
           "two tanks": 0.04}  # fmt: skip
 
 
-def draw(
-    rng: np.random.Generator, plant: str, coloured: bool, samples: int = SAMPLES
-) -> Draw:
+def draw(rng: np.random.Generator, plant: str, coloured: bool, samples: int = SAMPLES) -> Draw:
     """Draw a loop of a kind of plant; `coloured` shakes it by a coloured random force as well."""
     loop, swing, levels, noise = PLANTS[plant](rng)
     speed = 1.0
@@ -427,6 +423,4 @@ def _full(rng: np.random.Generator, one: Draw, s: Scales) -> Sized:
         return lambda z: effects.StateLimit(names[0], rest + (high - rest) / (1 + z))
     share, top = rng.uniform(0.2, 1.0), one.loop.point.states[0]
     far = top * (high / rest - 1)
-    return lambda z: effects.StateLimit(
-        names[0], top + 2 * far / (1 + z), names[1], float(share)
-    )
+    return lambda z: effects.StateLimit(names[0], top + 2 * far / (1 + z), names[1], float(share))

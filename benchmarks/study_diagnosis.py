@@ -260,9 +260,9 @@ def knowing(one: Draw, hidden_ones: Sequence[AbstractEffect], record: cid.Record
     return base_model(loop, [record], (*loop.free, *own))
 
 
-def worth(one: Draw, hidden_ones: Sequence[AbstractEffect], record: cid.Record) -> tuple[
-    float, Model
-]:
+def worth(
+    one: Draw, hidden_ones: Sequence[AbstractEffect], record: cid.Record
+) -> tuple[float, Model]:
     """Return the gain of log-likelihood of a refit that knows, and that refit."""
     base = base_model(one.believed, [record], one.believed.free)
     truth = knowing(one, hidden_ones, record)

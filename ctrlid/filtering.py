@@ -35,6 +35,7 @@ FEWEST = 10  # valid samples, to say anything
 BRIDGE = 20  # samples that do not count and are bridged by the model; then it starts afresh
 SETTLED = 4.0  # times the usual variance: above, the start still dominates the prediction
 SLOW = 0.35  # rate times step up to which a step of order four is exact enough
+KINK_STEPS = 4  # of order four in a period where friction has a kink
 PASSES = 12  # at most, to let the trajectory settle
 STILL = 1e-3  # of the standard deviations: a trajectory that moves less has settled
 
@@ -403,7 +404,9 @@ def _scheme(e: Equations, loop: Loop) -> Scheme:
         return (8, 2, cut)
     rate = float(np.max(np.abs(np.linalg.eigvals(a)), initial=0.0)) * loop.dt
     if rate <= 3 * SLOW and not driven:
-        return (4, max(1, math.ceil(rate / SLOW)), False)
+        # A velocity that turns within a period crosses the kink of friction there.
+        kinks = e.spread is not None and casadi.depends_on(e.rhs, e.spread)
+        return (4, max(KINK_STEPS if kinks else 1, math.ceil(rate / SLOW)), False)
     return (8, max(1, math.ceil(rate / 1.5)), cut)
 
 

@@ -41,19 +41,16 @@ UNARY: dict[int, Callable[..., Any]] = {
     casadi.OP_ACOSH: np.arccosh, casadi.OP_ATANH: np.arctanh, casadi.OP_FLOOR: np.floor,
     casadi.OP_CEIL: np.ceil, casadi.OP_FABS: np.abs, casadi.OP_SIGN: _sign,
     casadi.OP_ERF: special.erf, casadi.OP_INV: np.reciprocal, casadi.OP_LOG1P: np.log1p,
-    casadi.OP_EXPM1: np.expm1,
+    casadi.OP_EXPM1: np.expm1, casadi.OP_NOT: np.logical_not,
 }  # fmt: skip
 BINARY: dict[int, Callable[..., Any]] = {
     casadi.OP_ADD: np.add, casadi.OP_SUB: np.subtract, casadi.OP_MUL: np.multiply,
     casadi.OP_DIV: np.divide, casadi.OP_POW: np.power, casadi.OP_CONSTPOW: np.power,
     casadi.OP_FMIN: np.fmin, casadi.OP_FMAX: np.fmax, casadi.OP_FMOD: np.fmod,
     casadi.OP_ATAN2: np.arctan2, casadi.OP_HYPOT: np.hypot, casadi.OP_COPYSIGN: np.copysign,
-    casadi.OP_IF_ELSE_ZERO: _select,
-}  # fmt: skip
-LOGICAL: dict[int, Callable[..., Any]] = {
-    casadi.OP_LT: np.less, casadi.OP_LE: np.less_equal, casadi.OP_EQ: np.equal,
-    casadi.OP_NE: np.not_equal, casadi.OP_AND: np.logical_and, casadi.OP_OR: np.logical_or,
-    casadi.OP_NOT: np.logical_not,
+    casadi.OP_IF_ELSE_ZERO: _select, casadi.OP_LT: np.less, casadi.OP_LE: np.less_equal,
+    casadi.OP_EQ: np.equal, casadi.OP_NE: np.not_equal, casadi.OP_AND: np.logical_and,
+    casadi.OP_OR: np.logical_or,
 }  # fmt: skip
 
 
@@ -92,9 +89,6 @@ class Vectorized:
                 step = (1, out[0], into[0], self._columns[into[0]][into[1]], None)
             elif op == casadi.OP_OUTPUT:
                 step = (2, into[0], out[0], out[1], None)
-            elif op in LOGICAL:
-                last = into[1] if len(into) > 1 and op != casadi.OP_NOT else -1
-                step = (5, out[0], into[0], last, LOGICAL[op])
             elif op in UNARY:
                 step = (3, out[0], into[0], 0, UNARY[op])
             elif op in BINARY:
@@ -134,9 +128,7 @@ class Vectorized:
         store: list[Any] = [None] * self._work
         values: list[Any] = [None] * self._work
         for kind, a, b, c, extra in self._program:
-            if kind == 5:
-                values[a] = extra(values[b]) if c < 0 else extra(values[b], values[c])
-            elif kind >= 3:
+            if kind >= 3:
                 buffer = store[a]
                 if buffer is None:
                     buffer = store[a] = np.empty(size)

@@ -434,7 +434,6 @@ def test_coulomb_friction_is_smoothed_by_the_uncertain_velocity():
     np.testing.assert_allclose((v - step[:, 1]) / 1e-6 / 2.0, expected, atol=2e-4)
 
 
-@pytest.mark.xfail(reason="one step of order four runs across the kink", strict=True)
 def test_a_velocity_that_turns_within_a_period():
     """Sharp friction against tight integration of the same smoothed equation.
 

@@ -155,7 +155,8 @@ def _ripple(model: Model, effect: PositionRipple) -> Trial:
     ways = [out.trajectory.filtered[:, m.position] for out in model.fit.filtered]
     travel = max(float(np.ptp(w[k])) for w, k in zip(ways, model.fit.problem.counts, strict=True))
     step = max(float(np.median(np.abs(np.diff(w)))) for w in ways)
-    shortest = max(travel / LENGTHS, 4 * step)
+    grain = max(_grain(track.record.y) for track in model.fit.problem.tracks)
+    shortest = max(travel / LENGTHS, 4 * step, 4 * grain)
     if not travel > 2 * shortest:
         return Trial(effect, "", model, -math.inf, remark="the travel is too short to see a ripple")
     waves = np.arange(1.0 / travel, 1.0 / shortest, 0.5 / travel)
@@ -174,6 +175,12 @@ def _ripple(model: Model, effect: PositionRipple) -> Trial:
     amplitude, phase = _wave(sizes[best])
     start = replace(effect, amplitude=amplitude, period=float(1 / waves[best]), phase=phase)
     return attempt(model, start, math.log(max(len(waves) / 2, 1)))
+
+
+def _grain(y: Array) -> float:
+    """Return the step of a coarsely quantised sensor, whose rounding repeats along the way."""
+    values = np.unique(y)
+    return float(np.min(np.diff(values))) if 1 < len(values) < len(y) / 8 else 0.0
 
 
 def _step(model: Model, effect: ParameterStep) -> Trial:

@@ -363,13 +363,3 @@ def log_terms(fit: Fit) -> Array:
 def reduced(model: Model, loop: Loop, names: Sequence[str]) -> Fit:
     """Return the likelihood of a smaller model at the larger one's values."""
     return _extended(model, loop, names)
-
-
-def gain_by_record(without: Model, with_effect: Model) -> Array:
-    """Return the gain of log-likelihood in each record."""
-    sums = []
-    for model in (without, with_effect):
-        counts = [int(np.count_nonzero(c)) for c in model.fit.problem.counts]
-        parts = np.split(log_terms(model.fit), np.cumsum(counts)[:-1])
-        sums.append([float(p.sum()) for p in parts])
-    return np.asarray(np.array(sums[1]) - np.array(sums[0]), dtype=float)
