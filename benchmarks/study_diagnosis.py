@@ -763,9 +763,9 @@ TARGETS = {
 def _named(name: str, rows: list[Row]) -> list[tuple[str, str, str]]:
     """Return the lines of one class of worth."""
     found = [r for r in rows if r.named]
-    single = [r for r in found if len(r.named) == 1 and len(set(r.named[0])) == 1]
+    sizes = [len(_different(r)) for r in found]
+    single = [r for r, size in zip(found, sizes, strict=True) if size == 1]
     first = [r.extra.get("first", False) for r in rows]
-    sizes = [len({n for s in r.named for n in s}) for r in found]
     wrong_single = [r for r in single if not r.in_set]
     wanted = TARGETS[name]
     lines = [
@@ -782,6 +782,12 @@ def _named(name: str, rows: list[Row]) -> list[tuple[str, str, str]]:
         lines.append(("exact name first, outside declared look-alikes", ">= 97 %",
                       share([r.extra.get("first", False) for r in clear])))  # fmt: skip
     return [(f"{name}: {what}", target, measured) for what, target, measured in lines]
+
+
+def _different(row: Row) -> set[str]:
+    """Return the names of an answer, those that are exactly the same on this plant as one."""
+    one = {*row.truth, *row.equal}
+    return {row.truth[0] if n in one else n for s in row.named for n in s}
 
 
 def _declared(row: Row) -> bool:
