@@ -134,7 +134,15 @@ def diagnose(
     coarse = steps(found.final.fit, audits, catalogue)
     if coarse and not found.after.passed and simulable(found.final):
         # Rounding is no white noise: a record simulated with it says what it does to the tests.
-        rounded = Model(found.final.loop.with_effect(coarse.effect), found.final.fit)
+        fit = found.final.fit
+        sensor = np.maximum(
+            fit.sensor - coarse.effect.values()["step"] ** 2 / 12, 0.05 * fit.sensor
+        )
+        ratio = float(np.mean(fit.sensor) / np.mean(sensor))
+        force = tuple(v * ratio for v in fit.noise.force)
+        noise = replace(fit.noise, force=force, drift=fit.noise.drift * ratio)
+        finer = replace(fit, sensor=sensor, noise=noise)
+        rounded = Model(found.final.loop.with_effect(coarse.effect), finer)
         copies = [replica(rounded, seed) for seed in (1, 2)]
         found = replace(found, after=forgiven(found.after, copies))
     gap, shares, disturbance = _gaps(given, found, records, fresh)
