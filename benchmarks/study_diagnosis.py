@@ -242,7 +242,7 @@ class Case:
     worth: float
     shares: tuple[float, ...] = ()  # what each of several effects is worth beside the others
     catalogue: tuple[type[AbstractEffect], ...] = CATALOGUE
-    spread: bool = False
+    spread: bool = False  # no refit knows what is hidden
     label: str = ""
 
 
@@ -276,7 +276,22 @@ def with_all(loop: cid.Loop, hidden_ones: Iterable[AbstractEffect]) -> cid.Loop:
     return loop
 
 
-def sized(one: Draw, make: Any, band: tuple[float, float], target: float, seed: int) -> Case | None:
+def lost(one: Draw, record: cid.Record, seed: int) -> tuple[float, Model]:
+    """Return what a hidden effect costs in log-likelihood, and the model without any.
+
+    The same noise without the effect is what a model that knew everything would leave. No filter
+    has to describe what is hidden, such as a hysteresis with its kinks.
+    """
+    quiet = one.run(one.loop, seed)
+    clean = base_model(one.loop, [quiet], one.loop.free)
+    base = base_model(one.believed, [record], one.believed.free)
+    return clean.fit.value - base.fit.value, clean
+
+
+def sized(
+    one: Draw, make: Any, band: tuple[float, float], target: float, seed: int,
+    describable: bool = True,
+) -> Case | None:  # fmt: skip
     """Scale an effect until it is worth what it should be; None where it cannot be.
 
     The gain grows about with the square of the size; between two sizes with known gains the next
@@ -291,7 +306,10 @@ def sized(one: Draw, make: Any, band: tuple[float, float], target: float, seed: 
             effect = make(z)
             real = one.loop.with_effect(effect)
             record = tried.run(real, seed)
-            gain, truth = worth(one, [effect], record)
+            if describable:
+                gain, truth = worth(one, [effect], record)
+            else:
+                gain, truth = lost(tried, record, seed)
         except cid.CtrlidError:
             failed = min(failed, z)
             z /= 4
@@ -447,7 +465,8 @@ def _outside(
         bits = 0.5 * len(y) * (math.log(np.mean(spread**2)) - float(np.mean(np.log(spread**2))))
         return Case(one, one.loop, (), record, number, knowing(one, (), record), bits, label=what,
                     spread=True)  # fmt: skip
-    return sized(one, make(rng, one, s), band, target, number)
+    case = sized(one, make(rng, one, s), band, target, number, describable=False)
+    return case and replace(case, spread=True)
 
 
 def _several(
@@ -622,6 +641,8 @@ def answered(found: Any, case: Case) -> float:
         f"{label}.{p.name}" for label, e in loop.labelled.items() for p in e.parameters()
         if math.isfinite(getattr(e, p.name))
     ]  # fmt: skip
+    if case.spread:
+        return math.nan
     mine = base_model(loop, [case.record], (*loop.free, *own))
     return case.truth.fit.value - mine.fit.value
 
@@ -659,6 +680,8 @@ def run(
         row.left = answered(found, case)
         if kind == "lookalike":
             shrink(row, found, case)
+    except (TimeoutError, SystemError):  # the alarm; compiled code tells of it in its own way
+        row.error = f"the diagnosis took longer than {limit} s"
     except Exception as error:  # every failure of a healthy record is to be listed
         row.error = f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"
     return row

@@ -39,7 +39,9 @@ def index_of(kind):
     return effects.CATALOGUE.index(kind)
 
 
-@pytest.mark.parametrize("kind", [effects.InputDelay, effects.LinearStiffness])
+@pytest.mark.parametrize(
+    "kind", [pytest.param(effects.InputDelay, marks=pytest.mark.slow), effects.LinearStiffness]
+)
 def test_an_ordinary_effect_is_named_and_closes_the_gap(kind):
     row = drawn("named", index_of(kind))
     assert row.extra["first"]
@@ -83,6 +85,7 @@ def test_two_effects_are_both_in_the_sets(index):
     assert row.in_set
 
 
+@pytest.mark.slow
 def test_the_size_of_an_effect_is_drawn_by_what_it_is_worth():
     case = study.case_of("named", study.WORTH["faint"], SEED, index_of(effects.ViscousFriction))
     assert 50 <= case.worth <= 300
