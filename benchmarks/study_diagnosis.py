@@ -297,6 +297,7 @@ def sized(
     The gain grows about with the square of the size; between two sizes with known gains the next
     one is interpolated on logarithmic scales. The first sizes are tried on short records.
     """
+    near_enough = 0.5 if describable else 2.0
     first = make(1.0)
     timed = isinstance(first, effects.ParameterStep | effects.ParameterDrift | GainLoss)
     z, full, known, failed = 1.0, timed, [], math.inf
@@ -315,10 +316,10 @@ def sized(
             z /= 4
             continue
         near = abs(math.log(max(gain, 0.5) * one.samples / tried.samples / target))
-        if full and band[0] <= gain <= band[1] and near < 0.5:
+        if full and band[0] <= gain <= band[1] and near < near_enough:
             label = type(effect).__name__
             return Case(one, real, (effect,), record, seed, truth, gain, label=label)
-        if near < 0.5 and not full:
+        if near < near_enough and not full:
             full, known = True, []
             continue
         known.append((z, max(gain, 0.5) * one.samples / tried.samples))
@@ -684,6 +685,8 @@ def run(
         row.error = f"the diagnosis took longer than {limit} s"
     except Exception as error:  # every failure of a healthy record is to be listed
         row.error = f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"
+    finally:
+        signal.alarm(0)
     return row
 
 
