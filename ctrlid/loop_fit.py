@@ -104,7 +104,7 @@ class LoopEstimate:
 
         middle = self[name]
         half = float(norm.ppf((1 + share) / 2)) * self.standard_errors[self.names.index(name)]
-        return middle - half, middle + half
+        return float(middle - half), float(middle + half)
 
     def __str__(self) -> str:
         rows = [f"maximum likelihood, {self.n_samples} samples, log-likelihood "
@@ -204,7 +204,8 @@ def fit_loop(
     >>> r = cid.random_binary(3000, amplitude=1e-4, hold=20, around=op.output, seed=1)
     >>> record = cid.simulate(loop, r, sensor_noise=2e-6, seed=2)
     >>> fitted = cid.fit_loop(loop.with_parameters({"K": 3.1e-6}), record)
-    >>> abs(fitted.estimate["K"] - 3.34e-6) < 3 * fitted.estimate.standard_errors[0]
+    >>> low, high = fitted.estimate.interval("K", share=0.999)
+    >>> low < 3.34e-6 < high
     True
     """
     records = _records(record)
