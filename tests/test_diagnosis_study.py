@@ -39,9 +39,8 @@ def index_of(kind):
     return effects.CATALOGUE.index(kind)
 
 
-@pytest.mark.parametrize(
-    "kind", [pytest.param(effects.InputDelay, marks=pytest.mark.slow), effects.LinearStiffness]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", [effects.InputDelay, effects.LinearStiffness])
 def test_an_ordinary_effect_is_named_and_closes_the_gap(kind):
     row = drawn("named", index_of(kind))
     assert row.extra["first"]
