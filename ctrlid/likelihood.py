@@ -49,7 +49,7 @@ class Fit:
     """A point of the likelihood, with all that was computed there.
 
     `sensor` holds the variance of each record's sensor noise, `linearized` and `filtered` the last
-    pass, `information` the held-gain Fisher information of `theta`.
+    pass, `normal` the held-gain Fisher information of `theta` and its score.
     """
 
     problem: Problem
@@ -85,7 +85,7 @@ class Fit:
         ]
 
 
-def begin(problem: Problem, theta: Array, noise: Noise | None, guesses: Any = None) -> Fit:
+def begin(problem: Problem, theta: Array, noise: Noise | None) -> Fit:
     """Return the likelihood at a starting point, with settled trajectories.
 
     Parameters
@@ -96,8 +96,6 @@ def begin(problem: Problem, theta: Array, noise: Noise | None, guesses: Any = No
         Parameter values.
     noise : Noise, optional
         The noise; by default searched.
-    guesses : sequence of Trajectory, optional
-        Where to linearize first.
 
     Returns
     -------
@@ -107,8 +105,8 @@ def begin(problem: Problem, theta: Array, noise: Noise | None, guesses: Any = No
     m = problem.machine
     first = noise or Noise((_unit(m) ** 2 * 1e-2,) * m.channels)
     settled = []
-    for k, track in enumerate(problem.tracks):
-        at = m.guess(track) if guesses is None else guesses[k]
+    for track in problem.tracks:
+        at = m.guess(track)
         if noise is None:
             at = m.settle(track, theta, first, at, passes=2)[1].trajectory
         settled.append((track, at))
@@ -265,7 +263,7 @@ def _newton(
     return x
 
 
-def climb(fit: Fit, free: Any = None, rounds: int = ROUNDS, exact: bool = True) -> Fit:
+def climb(fit: Fit, rounds: int = ROUNDS, exact: bool = True) -> Fit:
     """Climb to the maximum of the likelihood over parameters and noise.
 
     Gauss-Newton steps on the innovations with the filter's gain held fixed, the noise tuned between
@@ -276,8 +274,6 @@ def climb(fit: Fit, free: Any = None, rounds: int = ROUNDS, exact: bool = True) 
     ----------
     fit : Fit
         Where to begin.
-    free : ndarray of bool, optional
-        Which parameters move; by default all.
     rounds : int, optional
         Steps at most.
     exact : bool, optional
@@ -288,30 +284,26 @@ def climb(fit: Fit, free: Any = None, rounds: int = ROUNDS, exact: bool = True) 
     Fit
         The maximum, or the best point found.
     """
-    problem = fit.problem
-    p = len(fit.theta)
-    free = np.ones(p, dtype=bool) if free is None else np.asarray(free)
     tuned, far, enough = -math.inf, True, 0.02 if exact else 0.3
     for _ in range(rounds):
         # A short step was already evaluated along the trajectory of the pass before.
         moved = _relinearized(fit) if far else fit
         fit = moved if np.isfinite(moved.value) else fit
-        problem = fit.problem
         if fit.value > tuned + 2.0:
-            fit = _tune(problem, fit.theta, fit.linearized, fit.noise, enough=enough)
+            fit = _tune(fit.problem, fit.theta, fit.linearized, fit.noise, enough=enough)
             tuned = fit.value
-        step, error = _step(fit, free)
-        if not p or not np.isfinite(step).all():
+        step, error = bounded_step(fit, *fit.normal)
+        if not len(step) or not np.isfinite(step).all():
             break
         fit, share = _search(fit, step)
-        length = share * np.max(np.abs(step[free]) / error[free], initial=0.0)
-        far = length > FAR
+        length = share * np.max(np.abs(step) / error, initial=0.0)
+        far = bool(length > FAR)
         if length < (CLOSE if exact else 5 * CLOSE):
             if fit.value <= tuned + 2.5 * enough:
                 break
             fit = _tune(fit.problem, fit.theta, fit.linearized, fit.noise, enough=enough)
             tuned = fit.value
-    return polish(fit, free) if exact else fit
+    return polish(fit) if exact else fit
 
 
 def _relinearized(fit: Fit) -> Fit:
@@ -320,16 +312,11 @@ def _relinearized(fit: Fit) -> Fit:
     )  # fmt: skip
 
 
-def _step(fit: Fit, free: Any) -> tuple[Array, Array]:
-    """Return the Gauss-Newton step and the standard errors; bounds hold what pushes outwards."""
-    matrix, score = fit.normal
-    return _solve(fit, matrix, score, free)
-
-
-def _solve(fit: Fit, matrix: Array, score: Array, free: Any) -> tuple[Array, Array]:
+def bounded_step(fit: Fit, matrix: Array, score: Array) -> tuple[Array, Array]:
+    """Return the Newton step and the standard errors; bounds hold what pushes outwards."""
     p, problem = len(fit.theta), fit.problem
     step, error = np.zeros(p), np.full(p, np.inf)
-    moving = free & (np.diag(matrix) > 0)
+    moving = np.diag(matrix) > 0
     for _ in range(p + 1):
         rows = np.flatnonzero(moving)
         if not len(rows):
@@ -379,12 +366,12 @@ def _rebuilt(fit: Fit, theta: Array) -> tuple[Problem, Fit]:
     return problem, replace(fit, problem=problem)
 
 
-def polish(fit: Fit, free: Any, rounds: int = 2) -> Fit:
+def polish(fit: Fit, rounds: int = 2) -> Fit:
     """Take Newton steps on the likelihood itself, by differences over half a standard error."""
     for _ in range(rounds):
         matrix, _ = fit.normal
-        _, error = _step(fit, free)
-        score, known = np.zeros(len(fit.theta)), np.isfinite(error) & free
+        _, error = bounded_step(fit, *fit.normal)
+        score, known = np.zeros(len(fit.theta)), np.isfinite(error)
         at = [out.trajectory for out in fit.filtered]
         fit = evaluate(fit.problem, fit.theta, fit.noise, at)
         for k in np.flatnonzero(known):
@@ -399,7 +386,7 @@ def polish(fit: Fit, free: Any, rounds: int = 2) -> Fit:
                 values.append(evaluate(fit.problem, theta, fit.noise, at).value)
             if ends[1] > ends[0] and np.isfinite(values).all():
                 score[k] = (values[1] - values[0]) / (ends[1] - ends[0])
-        step, error = _solve(fit, matrix, score, free)
+        step, error = bounded_step(fit, matrix, score)
         if not np.isfinite(step).all() or not known.any():
             return fit
         fit, share = _search(fit, step)
@@ -457,7 +444,7 @@ def information(fit: Fit) -> tuple[Array, Array]:
     problem, m = fit.problem, fit.problem.machine
     dt, p = m.loop.dt, len(fit.theta)
     at = [out.trajectory for out in fit.filtered]
-    _, error = _step(fit, np.ones(p, dtype=bool))
+    _, error = bounded_step(fit, *fit.normal)
     logs = _log_noise(fit.noise, dt)
 
     def innovations(theta: Array, noise: Noise) -> Any:

@@ -72,10 +72,11 @@ def rivals(best: Trial, others: Sequence[Trial]) -> tuple[Trial, ...]:
         if trial is best or trial.merit <= GATE:
             continue
         lost = best.merit - trial.merit
+        theirs = log_terms(trial.model.fit)
         # A larger model that predicts the same contains the best one, and pays for nothing.
-        if trial.cost > best.cost and _spread(mine - log_terms(trial.model.fit)) < SAME:
+        if trial.cost > best.cost and _spread(mine - theirs) < SAME:
             continue
-        z = vuong(mine, log_terms(trial.model.fit), best.cost - trial.cost)
+        z = vuong(mine, theirs, best.cost - trial.cost)
         if lost < CLOSE or z < Z:
             found.append(trial)
     return tuple(sorted(found, key=lambda t: -t.merit))

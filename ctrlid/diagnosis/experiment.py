@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -57,12 +56,12 @@ def separating_experiment(
             continue
     chosen: tuple[float, str, Array] | None = None
     for text, r in _references(record):
-        distance = _distance(models, r, sensor, loop)
+        distance = _distance(models, r, sensor)
         if distance is not None and (chosen is None or distance > 1.2 * chosen[0]):
             chosen = (distance, text, r)
     if chosen is None or len(models) < 2:
         return words, None
-    own = _own_distance(models, record, sensor, loop)
+    own = _distance(models, np.asarray(record.r), sensor) or 0.0
     if chosen[0] < WORTH * own:
         return words, None
     if own <= 0:
@@ -111,23 +110,12 @@ def _levels(n: int, reach: float) -> Array:
     return np.asarray(np.interp(np.arange(n), times, values), dtype=float)
 
 
-def _distance(models: Sequence[Simulator], r: Array, sensor: float, loop: Any) -> float | None:
+def _distance(models: Sequence[Simulator], r: Array, sensor: float) -> float | None:
     """Return the least distance of the first model from any other, per sample."""
     try:
-        outputs = [
-            m.run(m.start(None), r, np.zeros(len(r)))[0] for m in models
-        ]  # fmt: skip
+        outputs = [m.run(m.start(None), r, np.zeros(len(r)))[0] for m in models]
     except CtrlidError:
         return None
-    low, high = loop.input_limits
-    del low, high
     if len(outputs) < 2:
         return None
     return min(float(np.mean((y - outputs[0]) ** 2)) for y in outputs[1:]) / sensor**2
-
-
-def _own_distance(
-    models: Sequence[Simulator], record: Record, sensor: float, loop: Any
-) -> float:  # fmt: skip
-    value = _distance(models, np.asarray(record.r), sensor, loop)
-    return 0.0 if value is None else value

@@ -128,22 +128,13 @@ def diagnose(
         loop = loop.with_effect(r.effect)
         used = tuple(censored(record, r.effect) for record in records)
     tell("recalibrating", 1)
-    base = base_model(loop, *_stretches(used, loop.free))
+    parts, begins = _stretches(used)
+    base = base_model(loop, parts, loop.free, begins)
     found = search(base, catalogue, _worker(jobs), tell)
     tell("comparing on fresh data", 2)
     coarse = steps(found.final.fit, audits, catalogue)
     if coarse and not found.after.passed and simulable(found.final):
-        # Rounding is no white noise: a record simulated with it says what it does to the tests.
-        fit = found.final.fit
-        sensor = np.maximum(
-            fit.sensor - coarse.effect.values()["step"] ** 2 / 12, 0.05 * fit.sensor
-        )
-        ratio = float(np.mean(fit.sensor) / np.mean(sensor))
-        force = tuple(v * ratio for v in fit.noise.force)
-        noise = replace(fit.noise, force=force, drift=fit.noise.drift * ratio)
-        finer = replace(fit, sensor=sensor, noise=noise)
-        rounded = Model(found.final.loop.with_effect(coarse.effect), finer)
-        copies = [replica(rounded, seed) for seed in (1, 2)]
+        copies = [replica(_rounded(found.final, coarse), seed) for seed in (1, 2)]
         found = replace(found, after=forgiven(found.after, copies))
     gap, shares, disturbance = _gaps(given, found, records, fresh)
     alone = len(records) == 1  # an effect of one record only may widen the gap in others
@@ -200,13 +191,11 @@ def _look_over(
     return tuple(audits), tuple(remarks)
 
 
-def _stretches(
-    records: Sequence[Record], names: Sequence[str]
-) -> tuple[list[Record], Sequence[str], list[float]]:
+def _stretches(records: Sequence[Record]) -> tuple[list[Record], list[float]]:
     """Return records short enough to be fitted many times: even stretches of long ones."""
     total = sum(len(r) for r in records)
     if total <= LONGEST:
-        return list(records), names, [0.0] * len(records)
+        return list(records), [0.0] * len(records)
     parts, begins = [], []
     for record in records:
         size = max(LONGEST * len(record) // total // STRETCHES, 1000)
@@ -216,7 +205,22 @@ def _stretches(
             if np.count_nonzero(part.valid) > size // 2:
                 parts.append(part)
                 begins.append(first * record.dt)
-    return parts, names, begins
+    return parts, begins
+
+
+def _rounded(model: Model, coarse: Readout) -> Model:
+    """Return the model with a rounding sensor, whose steps are then no part of its noise.
+
+    Rounding is no white noise: a record simulated with it says what it does to the tests.
+    """
+    fit = model.fit
+    step = coarse.effect.values()["step"]
+    sensor = np.maximum(fit.sensor - step**2 / 12, 0.05 * fit.sensor)
+    ratio = float(np.mean(fit.sensor) / np.mean(sensor))
+    force = tuple(v * ratio for v in fit.noise.force)
+    noise = replace(fit.noise, force=force, drift=fit.noise.drift * ratio)
+    loop = model.loop.with_effect(coarse.effect)
+    return Model(loop, replace(fit, sensor=sensor, noise=noise))
 
 
 def _worker(jobs: int) -> Callable[[Callable[..., Any], Iterable[Any]], list[Any]]:
@@ -234,7 +238,7 @@ def _trained(model: Model, records: Sequence[Record]) -> Loop:
     fit = model.fit
     if not model.names:
         return model.fitted
-    parts, _, begins = _stretches(records, model.names)
+    parts, begins = _stretches(records)
     problem = make_problem(model.fitted, model.names, parts, begins)
     fit = climb(begin(problem, fit.theta, fit.noise), exact=False)
     return Model(model.loop, fit).fitted

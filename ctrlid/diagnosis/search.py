@@ -1,7 +1,7 @@
 """The search for missing effects: screen, refit, decide, add, drop, and again."""
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -240,7 +240,7 @@ def _there(model: Model, effect: AbstractEffect) -> bool:
 
 def _renoised(model: Model) -> Model:
     """Ask again whether the data want a coloured force, now that an effect is in the model."""
-    fit = polish(model.fit, np.ones(len(model.fit.theta), dtype=bool))
+    fit = polish(model.fit)
     if fit.noise.drift:
         plain = climb(replace(fit, noise=replace(fit.noise, memory=0.0, drift=0.0)))
         if plain.value > fit.value - math.log(fit.size):
@@ -265,11 +265,7 @@ def _taken_out(model: Model, position: int) -> tuple[Model, Trial]:
     label, effect = labels[position], fitted.effects[position]
     loop = fitted.without_effect(label)
     renamed = dict(zip(labels[:position] + labels[position + 1 :], loop.labelled, strict=True))
-    names = []
-    for name in model.names:
-        head, dot, tail = name.partition(".")
-        if not (dot and head == label):
-            names.append(f"{renamed.get(head, head)}.{tail}" if dot else name)
+    names = _relabelled([n for n in model.names if not n.startswith(f"{label}.")], renamed)
     smaller = Model(loop, climb(reduced(model, loop, names), rounds=10))
     return smaller, refit(smaller, attempt_at(smaller, effect))
 
@@ -313,11 +309,14 @@ def _moved(model: Model, position: int) -> Model:
     loop = replace(fitted, effects=tuple(fitted.effects[k] for k in order), free=())
     renamed = dict(zip([labels[k] for k in order], loop.labelled, strict=True))
     loop = replace(loop, free=tuple(n for n in fitted.free if "." not in n))
-    names = []
-    for name in model.names:
-        head, dot, tail = name.partition(".")
-        names.append(f"{renamed.get(head, head)}.{tail}" if dot else name)
+    names = _relabelled(model.names, renamed)
     return Model(loop, climb(reduced(model, loop, names), rounds=4))
+
+
+def _relabelled(names: Sequence[str], labels: Mapping[str, str]) -> list[str]:
+    """Return names of parameters with the new labels of their effects."""
+    parts = [name.partition(".") for name in names]
+    return [f"{labels.get(head, head)}.{tail}" if dot else head for head, dot, tail in parts]
 
 
 def _close(mine: Trial, steps: Sequence[Step]) -> list[Trial]:

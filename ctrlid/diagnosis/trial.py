@@ -11,7 +11,7 @@ from ..data import Record
 from ..effects import AbstractEffect
 from ..errors import CtrlidError
 from ..filtering import Machine, Trajectory, make_track
-from ..likelihood import Fit, Problem, begin, climb, evaluate, pseudo_inverse
+from ..likelihood import Fit, Problem, begin, bounded_step, climb, evaluate, pseudo_inverse
 from ..loop import Loop
 from ..loop_fit import bounds_of, choose_noise, make_problem, start_values
 from ..physics import Array
@@ -175,9 +175,8 @@ def attempt_at(base: Model, effect: AbstractEffect, scan: float = 0.0) -> Trial:
     model = Model(loop, fit)
     if not math.isfinite(fit.value):
         return Trial(effect, label, model, -math.inf, scan, remark="cannot follow the record")
-    matrix, score = fit.normal
-    gain = 0.5 * float(_promised(fit, matrix, score))
-    return Trial(effect, label, Model(loop, light(fit)), fit.value - base.fit.value + gain, scan)
+    promise = fit.value - base.fit.value + _promised(fit)
+    return Trial(effect, label, Model(loop, light(fit)), promise, scan)
 
 
 def attempt_best(base: Model, effects: Sequence[AbstractEffect], scan: float) -> Trial:
@@ -196,7 +195,7 @@ def attempt_best(base: Model, effects: Sequence[AbstractEffect], scan: float) ->
             fit = evaluate(start.problem, theta, start.noise, [o.trajectory for o in fit.filtered])
         if not math.isfinite(fit.value):
             continue
-        promise = fit.value - base.fit.value + 0.5 * _promised(fit, *fit.normal)
+        promise = fit.value - base.fit.value + _promised(fit)
         if promise > best.promise:
             moved = loop.with_parameters(dict(zip(names, theta.tolist(), strict=True)))
             best = Trial(effect, label, Model(moved, light(fit)), promise, scan)
@@ -211,22 +210,10 @@ def light(fit: Fit) -> Fit:
     return bare
 
 
-def _promised(fit: Fit, matrix: Array, score: Array) -> float:
-    """Return twice the gain of a Gauss-Newton step that stays within the bounds."""
-    problem = fit.problem
-    moving = np.diag(matrix) > 0
-    for _ in range(len(score)):
-        rows = np.flatnonzero(moving)
-        if not len(rows):
-            return 0.0
-        step = pseudo_inverse(matrix[np.ix_(rows, rows)]) @ score[rows]
-        out = ((fit.theta[rows] <= problem.lower[rows]) & (step < 0)) | (
-            (fit.theta[rows] >= problem.upper[rows]) & (step > 0)
-        )
-        if not out.any():
-            return float(score[rows] @ step)
-        moving[rows[out]] = False
-    return 0.0
+def _promised(fit: Fit) -> float:
+    """Return the gain that a Gauss-Newton step within the bounds expects."""
+    matrix, score = fit.normal
+    return 0.5 * float(score @ bounded_step(fit, matrix, score)[0])
 
 
 def _extended(base: Model, loop: Loop, names: Sequence[str]) -> Fit:
