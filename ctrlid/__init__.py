@@ -3,6 +3,7 @@
 from . import datasets, effects, plants, plot
 from .arx import fit_arx
 from .audit import Audit, AuditFinding, audit
+from .band import ResponseBand, response_band
 from .comparison import Comparison, Curve
 from .constraints import (
     Bounds,
@@ -31,6 +32,7 @@ from .diagnosis import (
     diagnose,
     load_diagnosis,
 )
+from .each import FitSeries, PoleTrend, fit_each
 from .errors import CtrlidError, CtrlidWarning
 from .feedback import FeedbackCheck, check_feedback
 from .iv import fit_iv
@@ -71,6 +73,7 @@ __all__ = [
     "Estimate",
     "FeedbackCheck",
     "Finding",
+    "FitSeries",
     "Fixed",
     "Gap",
     "IdentifiedModel",
@@ -87,10 +90,12 @@ __all__ = [
     "Performance",
     "Place",
     "PoleAt",
+    "PoleTrend",
     "Prediction",
     "ReciprocalPoles",
     "Record",
     "Redesign",
+    "ResponseBand",
     "SamplingRow",
     "SamplingSweep",
     "Section",
@@ -106,6 +111,7 @@ __all__ = [
     "effects",
     "fit_arx",
     "fit_continuous",
+    "fit_each",
     "fit_iv",
     "fit_loop",
     "linearize",
@@ -121,6 +127,7 @@ __all__ = [
     "random_binary",
     "redesign",
     "replay_controller",
+    "response_band",
     "robust_margin",
     "select_order",
     "simulate",

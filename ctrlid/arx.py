@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from . import _text
+from ._jobs import check_jobs
 from .constraints import AbstractConstraint, check_constraints
-from .data import VISIBLE_MOTION, Record, as_records, input_motion
+from .data import VISIBLE_MOTION, Record, input_motion, stream_records
 from .errors import CtrlidError
 from .model import Estimate, IdentifiedModel, Structure
 from .qp import Cost, NotExcited
@@ -21,12 +22,13 @@ FloatArray = NDArray[np.float64]
 
 
 def fit_arx(
-    record: Record | Sequence[Record],
+    record: Record | Iterable[Record],
     na: int,
     nb: int,
     nk: int = 1,
     constraints: AbstractConstraint | Sequence[AbstractConstraint] = (),
     intercept: bool = True,
+    jobs: int | None = None,
 ) -> IdentifiedModel:
     """Fit a difference equation by least squares under constraints, equations (5) and (7) of [1]_.
 
@@ -38,9 +40,10 @@ def fit_arx(
 
     Parameters
     ----------
-    record : Record or sequence of Record
+    record : Record or iterable of Record
         Data; of several records each has its own intercept, since set-points differ. Rows that
-        touch a sample marked not valid are left out.
+        touch a sample marked not valid are left out. An iterator, such as a generator that cuts a
+        memory-mapped log into records, is read once and in constant memory.
     na : int
         Number of poles.
     nb : int
@@ -53,6 +56,9 @@ def fit_arx(
     intercept : bool
         Estimate the constant c. Signals are absolute and the operating point is never known
         exactly, so leave it on unless the signals are deviations from a true equilibrium.
+    jobs : int, optional
+        Jobs among which the records are shared, through joblib; by default one, or what
+        ``joblib.parallel_config`` says. The answer does not depend on it.
 
     Returns
     -------
@@ -90,8 +96,10 @@ def fit_arx(
     """
     structure = check_orders(na, nb, nk)
     known = check_constraints(constraints)
-    records = as_records(record)
-    regression = arx_regression(records, structure, intercept)
+    first, records = stream_records(record)
+    motions: list[float] = []
+    watched = records if first.hold == "zoh" else _watched(records, motions)
+    regression = arx_regression(watched, structure, intercept, check_jobs(jobs))
     unknowns = na + nb + len(regression.intercept_rows)
     if regression.rows <= unknowns:
         raise CtrlidError(
@@ -104,8 +112,8 @@ def fit_arx(
     except NotExcited as trouble:
         message = _not_excited(regression, trouble.direction)
         raise CtrlidError(message) from None
-    estimate = _estimate(regression, found, constrained=bool(known), dt=records[0].dt)
-    share = input_motion(records)
+    estimate = _estimate(regression, found, constrained=bool(known), dt=first.dt)
+    share = max(motions, default=0.0)
     if share > VISIBLE_MOTION:
         note = (
             f"u MOVES BETWEEN THE SAMPLES (hold='foh', by {100 * share:.0f} % of its spread a "
@@ -113,8 +121,15 @@ def fit_arx(
             "Sample faster, or use fit_continuous with the controller."
         )
         estimate = replace(estimate, notes=(note,))
-    names = records[0].names
+    names = first.names
     return IdentifiedModel(estimate, inputs=names.get("u", "u"), outputs=names.get("y", "y"))
+
+
+def _watched(records: Iterable[Record], motions: list[float]) -> Iterator[Record]:
+    """Pass records on, and note of each how far its input moves between samples."""
+    for record in records:
+        motions.append(input_motion([record]))
+        yield record
 
 
 def arx_cost(regression: Regression) -> Cost:

@@ -1,8 +1,8 @@
 """Record: one experiment in one loop, measured or simulated."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
+from itertools import chain, islice, pairwise
 from numbers import Integral, Real
 from pathlib import Path
 from types import MappingProxyType
@@ -584,19 +584,56 @@ def as_records(data: Any) -> tuple[Record, ...]:
     if strangers or not records:
         what = f"has {', '.join(strangers)}" if strangers else "is empty"
         raise CtrlidError(f"a Record or a list of Records is needed; the list given {what}")
-    first = records[0]
     for record in records[1:]:
-        # Periods read from printed times differ by their last digits.
-        if abs(record.dt - first.dt) > 1e-6 * first.dt or record.hold != first.hold:
-            raise CtrlidError(
-                "records used together need one sampling period and one hold; given "
-                f"{first.dt:g} s {first.hold} and {record.dt:g} s {record.hold}. Decimate the "
-                "faster one, or give both the hold that is nearer the truth"
-            )
+        _same_kind(records[0], record)
     return tuple(records)
 
 
 def input_motion(records: Sequence[Record]) -> float:
+def stream_records(data: Any) -> tuple[Record, Iterable[Record]]:
+    """Return the first record and all of them, checked to be of one kind as they pass.
+
+    Parameters
+    ----------
+    data : Record or iterable of Record
+        The experiments; an iterator is read once.
+
+    Returns
+    -------
+    first : Record
+        The first record.
+    records : iterable of Record
+        All records, the first one too.
+
+    Raises
+    ------
+    CtrlidError
+        As `as_records`, for what an iterator yields when it yields it.
+    """
+    if not isinstance(data, Iterator):
+        records = as_records(data)
+        return records[0], records
+    first = as_records(list(islice(data, 1)))[0]
+    return first, chain([first], _checked(first, data))
+
+
+def _checked(first: Record, rest: Iterator[Any]) -> Iterator[Record]:
+    for record in rest:
+        as_records([record])
+        _same_kind(first, record)
+        yield record
+
+
+def _same_kind(first: Record, record: Record) -> None:
+    # Periods read from printed times differ by their last digits.
+    if abs(record.dt - first.dt) > 1e-6 * first.dt or record.hold != first.hold:
+        raise CtrlidError(
+            "records used together need one sampling period and one hold; given "
+            f"{first.dt:g} s {first.hold} and {record.dt:g} s {record.hold}. Decimate the "
+            "faster one, or give both the hold that is nearer the truth"
+        )
+
+
     """Return how far u moves from sample to sample where it is not held, as share of its spread.
 
     Parameters

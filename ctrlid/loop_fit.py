@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,9 @@ from .likelihood import (
     pseudo_inverse,
     with_coloured_force,
 )
+from .linearization import operating_point
 from .loop import Loop
+from .model import root_errors
 from .physics import Array
 
 UNSEEN = 1e-9  # relative eigenvalue of the information below which a direction is not in the data
@@ -145,6 +147,41 @@ class LoopFit:
     loop: Loop
     estimate: LoopEstimate
 
+    @property
+    def model(self) -> Any:
+        """Return the plant with its effects, linearized where it rests at the loop's output."""
+        return _at_rest(self.loop)
+
+    @property
+    def poles(self) -> Any:
+        """Return the poles of `model`, in rad/s (in z for a plant in discrete time)."""
+        return np.roots(self.model.den[0][0]).astype(complex)
+
+    @property
+    def poles_standard_errors(self) -> Array:
+        """Return the standard errors of `poles`, by the delta method.
+
+        The denominator is differenced along each fitted parameter; the operating point moves with
+        it. Infinite where a pole depends on a parameter that the data do not determine.
+        """
+        estimate, values = self.estimate, self.estimate.values
+        slopes = []
+        for name, value, error in zip(
+            estimate.names, values, estimate.standard_errors, strict=True
+        ):
+            h = 1e-4 * abs(value) or 1e-2 * (error if np.isfinite(error) else 1.0)
+            if name in estimate.bounds or h == 0:
+                slopes.append(np.zeros(len(self.poles)))
+                continue
+            ends = [_at_rest(self.loop.with_parameters({name: value + d})) for d in (h, -h)]
+            slopes.append((ends[0].den[0][0] - ends[1].den[0][0])[1:] / (2 * h))
+        slope = np.column_stack(slopes)
+        lost = ~np.isfinite(estimate.standard_errors)
+        if np.any(slope[:, lost] != 0):
+            return np.full(len(slope), np.inf)
+        covariance = np.where(np.outer(~lost, ~lost), estimate.covariance, 0.0)
+        return root_errors(self.poles, slope @ covariance @ slope.T)
+
     def __str__(self) -> str:
         return f"{self.loop!r}\n{self.estimate}"
 
@@ -215,6 +252,15 @@ def fit_loop(
     if coloured or coloured is None:
         fit = choose_noise(fit, always=bool(coloured))
     return summary(loop, fit)
+
+
+def _at_rest(loop: Loop) -> Any:
+    """Return the linear model at the loop's output, with input and states solved for anew."""
+    if not loop.linear_plant:
+        assert loop.at is not None
+        at = operating_point(loop.plant, output=loop.at.output, guess=loop.at)
+        loop = replace(loop, at=at)
+    return loop.linearize()
 
 
 def _records(record: Any) -> tuple[Record, ...]:

@@ -250,19 +250,7 @@ class Estimate:
         the denominator is fixed.
         """
         na = self.structure.na
-        z = self.poles
-        covariance = self.covariance[:na, :na]
-        if not covariance.any():
-            return np.zeros(na)
-        errors = np.empty(na)
-        for k in range(na):
-            slope = np.prod(z[k] - np.delete(z, k))
-            if slope == 0:
-                errors[k] = np.inf
-                continue
-            gradient = -(z[k] ** np.arange(na - 1, -1, -1)) / slope
-            errors[k] = np.sqrt(max(float((gradient.conj() @ covariance @ gradient).real), 0.0))
-        return errors
+        return root_errors(self.poles, self.covariance[:na, :na])
 
     @property
     def poles_s_standard_errors(self) -> FloatArray:
@@ -275,6 +263,35 @@ class Estimate:
 
     def __str__(self) -> str:
         return _report(self)
+
+
+def root_errors(roots: ComplexArray, covariance: FloatArray) -> FloatArray:
+    """Return the standard errors of the roots of a monic polynomial, by the delta method.
+
+    Parameters
+    ----------
+    roots : (n,) array
+        Its roots.
+    covariance : (n, n) array
+        Covariance of its coefficients after the leading 1, in falling powers.
+
+    Returns
+    -------
+    (n,) array
+        Standard errors; infinite where roots coincide, unless all coefficients are fixed.
+    """
+    n = len(roots)
+    if not covariance.any():
+        return np.zeros(n)
+    errors = np.empty(n)
+    for k in range(n):
+        slope = np.prod(roots[k] - np.delete(roots, k))
+        if slope == 0:
+            errors[k] = np.inf
+            continue
+        gradient = -(roots[k] ** np.arange(n - 1, -1, -1)) / slope
+        errors[k] = np.sqrt(max(float((gradient.conj() @ covariance @ gradient).real), 0.0))
+    return errors
 
 
 def _report(e: Estimate) -> str:

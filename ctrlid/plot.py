@@ -17,11 +17,14 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MultipleLocator, ScalarFormatter
 
 from . import _pictures, _text
+from .band import response_band
 from .comparison import Comparison
 from .controller_redesign import Redesign
 from .data import Record
 from .diagnosis.result import Diagnosis, Place
+from .each import FitSeries
 from .errors import CtrlidError
+from .model import IdentifiedModel
 from .physics import Array, timebase
 
 # Okabe and Ito's colours, told apart by the colour-blind; lines and markers differ as well.
@@ -287,8 +290,10 @@ def poles(models: Mapping[str, Any], ax: Any = None, *, truth: Any = None) -> An
     return _finish(ax, columns=1)
 
 
-def bode(models: Mapping[str, Any], axes: Any = None, *, omega: Any = None) -> Any:
-    """Draw the frequency responses of models, magnitude above phase.
+def bode(
+    models: Mapping[str, Any], axes: Any = None, *, omega: Any = None, level: float | None = 0.95
+) -> Any:
+    """Draw the frequency responses of models, magnitude above phase, of fits with their bands.
 
     Parameters
     ----------
@@ -298,6 +303,9 @@ def bode(models: Mapping[str, Any], axes: Any = None, *, omega: Any = None) -> A
         By default those of a new figure.
     omega : array_like, optional
         Frequencies [rad/s]; by default around all poles and zeros.
+    level : float or None, optional
+        Probability of the confidence bands of fitted models, as in `response_band`; None leaves
+        them out.
 
     Returns
     -------
@@ -308,7 +316,8 @@ def bode(models: Mapping[str, Any], axes: Any = None, *, omega: Any = None) -> A
     Raises
     ------
     CtrlidError
-        If there is nothing to draw, or a frequency is not positive.
+        If there is nothing to draw, a frequency is not positive, or the level is not between 0 and
+        1.
 
     Examples
     --------
@@ -326,7 +335,7 @@ def bode(models: Mapping[str, Any], axes: Any = None, *, omega: Any = None) -> A
     if not (np.isfinite(grid).all() and grid.size > 1 and (grid > 0).all()):
         raise CtrlidError("omega needs at least two positive frequencies in rad/s")
     axes = _axes(axes, 2, sharex=True)
-    level: float | None = None
+    sheet: float | None = None
     limits = []
     for i, (label, model) in enumerate(models.items()):
         dt = timebase(model)
@@ -341,15 +350,17 @@ def bode(models: Mapping[str, Any], axes: Any = None, *, omega: Any = None) -> A
         # On the sheet of the first model; that one starts within (-270, 90].
         turn = (
             np.floor((phase[0] + 270) / 360)
-            if level is None
-            else np.round((phase[0] - level) / 360)
+            if sheet is None
+            else np.round((phase[0] - sheet) / 360)
         )
-        if level is None and phase[0] - 360 * turn == -270:
+        if sheet is None and phase[0] - 360 * turn == -270:
             turn -= 1
         phase = phase - 360 * turn
-        level = float(phase[0]) if level is None else level
+        sheet = float(phase[0]) if sheet is None else sheet
         axes[0].semilogx(w, 20 * np.log10(np.abs(values)), label=label, **_line(i))
         axes[1].semilogx(w, phase, **_line(i))
+        if level is not None and isinstance(model, IdentifiedModel):
+            _band(axes, model, w, level, phase, _line(i)["color"], label)
     for limit in sorted(set(np.round(limits, 9))):
         for ax in axes:
             ax.axvline(limit, color="0.5", linewidth=1, linestyle=":",
@@ -361,6 +372,77 @@ def bode(models: Mapping[str, Any], axes: Any = None, *, omega: Any = None) -> A
     _finish(axes[0])
     _finish(axes[1], legend=False)
     return axes
+
+
+def _band(
+    axes: Any, model: IdentifiedModel, w: Array, level: float, phase: Array, color: str, label: str
+) -> None:
+    """Shade where the response of a fit lies, without letting a wide band set the view."""
+    band = response_band(model, w, level)
+    if not model.estimate.covariance.any():
+        return
+    shift = phase - band.phase
+    sides = [
+        (20 * np.log10(band.magnitude_low), 20 * np.log10(band.magnitude_high)),
+        (band.phase_low + shift, band.phase_high + shift),
+    ]
+    for ax, (low, high) in zip(axes, sides, strict=True):
+        view = ax.get_ylim()
+        name = f"{label}: {100 * level:g} % confidence" if ax is axes[0] else None
+        ax.fill_between(w, low, high, color=color, alpha=0.22, linewidth=0.6, label=name)
+        reach = 0.5 * (view[1] - view[0])
+        ax.set_ylim(
+            max(min(view[0], low.min()), view[0] - reach),
+            min(max(view[1], high.max()), view[1] + reach),
+        )
+        ax.autoscale(True, axis="x")
+
+
+def trend(series: FitSeries, ax: Any = None, *, truth: Any = None) -> Any:
+    """Draw the rightmost pole of each record against its mean output, and the line through them.
+
+    Parameters
+    ----------
+    series : FitSeries
+        From `fit_each`.
+    ax : matplotlib Axes, optional
+        By default that of a new figure.
+    truth : callable, optional
+        What physics says: from an array of outputs [output unit] to poles [rad/s].
+
+    Returns
+    -------
+    matplotlib Axes
+        The axes; bars are 95 % intervals.
+
+    Raises
+    ------
+    CtrlidError
+        If something else is given, or the records do not allow a line.
+
+    Examples
+    --------
+    >>> import control as ct, ctrlid as cid
+    >>> loop = cid.Loop(cid.plants.servo(m=1.0, c=2.0, k=3.0), ct.tf(5, 1, 0.05), dt=0.05)
+    >>> runs = [cid.simulate(loop, cid.random_binary(500, amplitude=0.1, hold=9, around=at, seed=1),
+    ...                      sensor_noise=1e-3, seed=2) for at in (0, 1)]
+    >>> cid.plot.trend(cid.fit_each(cid.fit_iv, runs, na=2, nb=2)).get_ylabel()
+    'rightmost pole [rad/s]'
+    """
+    _require(series, FitSeries, "plot.trend draws a FitSeries, as fit_each() returns")
+    line = series.trend
+    ax = _axes(ax, 1)[0]
+    scale, unit = _pictures.scale([series.levels], series.unit)
+    y = np.linspace(series.levels.min(), series.levels.max(), 101)
+    ax.plot(scale * y, line.pole + line.slope * (y - line.level), label="line through the fits",
+            **_line(0))  # fmt: skip
+    if truth is not None:
+        ax.plot(scale * y, truth(y), label="physics", **_line(1))
+    ax.errorbar(scale * series.levels, series.rates, 1.96 * series.rate_errors, fmt=MARKERS[0],
+                color="k", capsize=4, label="fits, 95 % intervals")  # fmt: skip
+    ax.set_xlabel(f"mean output [{unit}]")
+    ax.set_ylabel("rightmost pole [rad/s]")
+    return _finish(ax, columns=3)
 
 
 def step(redesign: Redesign, ax: Any = None) -> Any:

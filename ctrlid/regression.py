@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence, Sized
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import invpascal, pascal
 from scipy.linalg.lapack import dgeqrf, dgeqrf_lwork
 
+from ._jobs import spread
 from .data import Record
 from .errors import CtrlidError
 from .model import Structure
@@ -158,19 +159,47 @@ class Regression:
         return np.array(constants)
 
 
+@dataclass(frozen=True, eq=False)
+class Part:
+    """What a record says, reduced to the triangular factor of its regression.
+
+    Factors of several records merge into the factor of all of them, so that one regression can be
+    shared among processes, and a record can be forgotten once it is reduced.
+    """
+
+    factor: FloatArray
+    rows: int
+    levels: tuple[float, float]
+    samples: int
+    valid: int
+
+
+def reduce_record(record: Record, structure: Structure, intercept: bool = True) -> Part:
+    """Return the factor of ``[1 | y D y ... | u D u ... | D^na y]`` of one record."""
+    y0, u0 = _levels(record) if intercept else (0.0, 0.0)
+    factor, rows = _factor(record, structure, y0, u0, intercept)
+    return Part(factor, rows, (y0, u0), len(record.y), int(record.valid.sum()))
+
+
 def arx_regression(
-    records: Sequence[Record], structure: Structure, intercept: bool = True
+    records: Iterable[Record],
+    structure: Structure,
+    intercept: bool = True,
+    jobs: int | None = None,
 ) -> Regression:
     """Regression of ``A y = B u + c`` on one or several records, one intercept each.
 
     Parameters
     ----------
-    records : sequence of Record
-        Experiments; no row spans two of them, or a sample that is not valid.
+    records : iterable of Record
+        Experiments; no row spans two of them, or a sample that is not valid. Each is read once and
+        then forgotten.
     structure : Structure
         Orders of the model.
     intercept : bool
         Estimate a constant for each record.
+    jobs : int, optional
+        Jobs among which the records are shared.
 
     Returns
     -------
@@ -183,26 +212,26 @@ def arx_regression(
         If a record has no row at all.
     """
     p = structure.na + structure.nb
-    factors, firsts = [], []
+    total, firsts = np.zeros((p + 1, p + 1)), []
     used = 0
     noise = np.zeros(p)
-    for number, record in enumerate(records, start=1):
-        y0, u0 = _levels(record) if intercept else (0.0, 0.0)
-        factor, rows = _factor(record, structure, y0, u0, intercept)
-        if not rows:
+    task = partial(reduce_record, structure=structure, intercept=intercept)
+    for number, part in enumerate(spread(task, records, jobs), start=1):
+        factor = part.factor
+        if not part.rows:
             needed = max(structure.na, structure.nk + structure.nb - 1) + 1
+            count = f" of {len(records)}" if isinstance(records, Sized) else ""
             raise CtrlidError(
-                f"Record {number} of {len(records)} has no usable row: that takes {needed} valid "
-                f"samples in succession, and it has {int(record.valid.sum())} valid samples of "
-                f"{len(record.y)}. Leave it out or lower the orders."
+                f"Record {number}{count} has no usable row: that takes {needed} valid samples in "
+                f"succession, and it has {part.valid} valid samples of {part.samples}. Leave it "
+                "out or lower the orders."
             )
-        used += rows
+        used += part.rows
         if intercept:
-            firsts.append((factor[0], y0, u0))
+            firsts.append((factor[0], *part.levels))
             factor = factor[1:, 1:]
-        factors.append(factor)
-        noise += _rounding(factor, structure, y0, u0, rows) ** 2
-    total = merge(factors)
+        total = factor if number == 1 else merge([total, factor])
+        noise += _rounding(factor, structure, *part.levels, part.rows) ** 2
     return Regression(
         structure,
         total[:p, :p],

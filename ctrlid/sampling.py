@@ -2,12 +2,12 @@
 
 import warnings
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from ._jobs import spread
 from ._text import listing
 from .arx import fit_arx
 from .comparison import SYSTEMATIC
@@ -77,7 +77,8 @@ def sweep_sampling_period(
         As in `fit_iv` and `fit_continuous`; used at the record's own period, since a slower record
         has no controller of this form.
     jobs : int, optional
-        Processes that share the fits.
+        Processes that share the fits, through joblib; with ``joblib.parallel_config`` it can be
+        another backend, such as a dask cluster.
 
     Returns
     -------
@@ -127,11 +128,7 @@ def sweep_sampling_period(
         for factor in factors
         for name in names
     ]
-    if jobs == 1:
-        rows = [_fit(task) for task in tasks]
-    else:
-        with ProcessPoolExecutor(jobs) as pool:
-            rows = list(pool.map(_fit, tasks))
+    rows = list(spread(_fit, tasks, jobs))
     done = [row for row in rows if not row.failure]
     if not done:
         raise CtrlidError(f"no fit succeeded at any period; the first one: {rows[0].failure}")

@@ -466,3 +466,34 @@ def test_texts():
         fitted.estimate.interval("g")
     assert fitted.loop.free == ("K",)
     assert loop.parameters["K"] == 3.34e-6
+
+
+# -- poles -------------------------------------------------------------------------------------------
+
+
+def test_poles_are_those_of_the_fitted_plant_at_rest():
+    """The poles of a drive are known by c and m alone, those of a levitation by g and the gap."""
+    loop = drive(("c", "k"))
+    fitted = cid.fit_loop(loop, experiment(loop, 0.05, 40, sensor_noise=2e-3))
+    c, error = fitted.estimate["c"], fitted.estimate.standard_errors[0]
+    order = np.argsort(fitted.poles.real)
+    assert fitted.poles[order].real == pytest.approx([-c / 2.0, 0.0], abs=1e-9)
+    assert fitted.poles_standard_errors[order] == pytest.approx([error / 2.0, 0.0], rel=1e-5)
+    loop = levitation(free=("K", "g"))
+    fitted = cid.fit_loop(loop, experiment(loop, 1e-4, 15, sensor_noise=5e-6))
+    g, error = fitted.estimate["g"], fitted.estimate.standard_errors[1]
+    pole = np.sqrt(2 * g / 0.012)
+    assert np.sort(fitted.poles.real) == pytest.approx([-pole, pole], rel=1e-6)
+    assert fitted.poles_standard_errors == pytest.approx(0.5 * pole * error / g, rel=1e-3)
+
+
+def test_poles_include_effects_and_say_what_is_not_in_the_data():
+    loop = levitation().with_effect(E.ActuatorLag(tau=2e-3))
+    fitted = cid.fit_loop(loop, experiment(loop, 1e-4, 15, sensor_noise=5e-6))
+    lag = int(np.argmin(fitted.poles.real))
+    tau = fitted.estimate["ActuatorLag.tau"]
+    error = fitted.estimate.standard_errors[fitted.estimate.names.index("ActuatorLag.tau")]
+    assert fitted.poles[lag].real == pytest.approx(-1 / tau, rel=1e-6)
+    assert fitted.poles_standard_errors[lag] == pytest.approx(error / tau**2, rel=1e-3)
+    lost = replace(fitted, estimate=replace(fitted.estimate, covariance=np.diag([np.inf, np.inf])))
+    assert np.isinf(lost.poles_standard_errors).all()

@@ -1,0 +1,60 @@
+"""Work shared among processes, threads or a cluster: through joblib, in bounded memory."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from itertools import islice
+from typing import Any, TypeVar
+
+import joblib
+
+from .errors import CtrlidError
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+BATCH = 16  # items that are in work at a time
+
+
+def check_jobs(jobs: Any) -> int | None:
+    """Return a number of jobs as joblib takes it, refused in words otherwise."""
+    if jobs is None or (isinstance(jobs, int) and not isinstance(jobs, bool) and jobs != 0):
+        return jobs
+    raise CtrlidError(
+        "jobs is a number of processes, at least 1, or -1 for all processors, or None for what "
+        f"joblib.parallel_config says; given {jobs!r}"
+    )
+
+
+def spread(
+    function: Callable[[Item], Result], items: Iterable[Item], jobs: int | None
+) -> Iterator[Result]:
+    """Apply a function to each item, in order, with at most `BATCH` items in memory.
+
+    Parameters
+    ----------
+    function : callable
+        It and the items must be picklable if there is more than one job.
+    items : iterable
+        May be a generator without end in sight.
+    jobs : int or None
+        As in joblib; None is 1, or what ``joblib.parallel_config`` says. Which backend does the
+        work (processes, threads, dask) is for that to say too.
+
+    Yields
+    ------
+    object
+        ``function(item)`` for each item, in the order of the items.
+
+    Examples
+    --------
+    >>> list(spread(abs, (-1, 2, -3), None))
+    [1, 2, 3]
+    """
+    if joblib.effective_n_jobs(jobs) == 1:
+        yield from map(function, items)
+        return
+    source = iter(items)
+    with joblib.Parallel(n_jobs=jobs) as run:
+        while batch := list(islice(source, BATCH)):
+            yield from run(joblib.delayed(function)(item) for item in batch)
