@@ -589,7 +589,6 @@ def as_records(data: Any) -> tuple[Record, ...]:
     return tuple(records)
 
 
-def input_motion(records: Sequence[Record]) -> float:
 def stream_records(data: Any) -> tuple[Record, Iterable[Record]]:
     """Return the first record and all of them, checked to be of one kind as they pass.
 
@@ -634,6 +633,7 @@ def _same_kind(first: Record, record: Record) -> None:
         )
 
 
+def input_motion(records: Sequence[Record]) -> float:
     """Return how far u moves from sample to sample where it is not held, as share of its spread.
 
     Parameters
