@@ -15,8 +15,8 @@ from .errors import CtrlidError
 from .model import Estimate, IdentifiedModel
 
 
-@dataclass(frozen=True)
-class Table:
+@dataclass(frozen=True, repr=False)
+class Table(_text.Printed):
     """Numbers in rows, the first column of which says what they are.
 
     Parameters

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import html
 import math
 import re
+import textwrap
 
 PREFIXES = ((1e-1, 1.0, ""), (1e-4, 1e-3, "m"), (1e-7, 1e-6, "µ"), (0.0, 1e-9, "n"))
 PREFIXED = ("m", "V", "A", "N", "m/s", "m/s^2", "N s/m", "s")
@@ -201,3 +203,73 @@ def split_unit(label: str) -> tuple[str, str]:
         return label, ""
     name, space, unit = found.groups()[:3] if found[1] else found.groups()[3:]
     return (name, unit) if space or not unit.isdigit() else (label, "")
+
+
+def is_bad_news(text: str) -> bool:
+    """Whether a sentence has bad news in it: three or more words in capitals in a row.
+
+    Parameters
+    ----------
+    text : str
+        A sentence.
+
+    Returns
+    -------
+    bool
+        True for bad news; two such words may be abbreviations.
+
+    Examples
+    --------
+    >>> is_bad_news("a1 SITS ON ITS BOUND -2"), is_bad_news("a PID under FOH")
+    (True, False)
+    """
+    words = [w.strip(".,:;()") for w in text.split()]
+    loud = [len(w) > 1 and w.isalpha() and w.isupper() for w in words]
+    return any(all(loud[i : i + 3]) for i in range(len(words) - 2))
+
+
+def html_lines(text: str, width: int = 100) -> str:
+    r"""Return a printed report as HTML for a notebook.
+
+    The block has no colours of its own and so suits a light and a dark notebook. Columns stay
+    columns, long sentences are wrapped, bad news is bold.
+
+    Parameters
+    ----------
+    text : str
+        What ``print`` shows.
+    width : int, optional
+        Where sentences are wrapped [characters].
+
+    Returns
+    -------
+    str
+        One ``pre`` element.
+
+    Examples
+    --------
+    >>> print(html_lines("p < 0.01\n  NO POLE OUTSIDE"))
+    <pre class="ctrlid" style="line-height: 1.35; overflow-x: auto">p &lt; 0.01
+    <strong>  NO POLE OUTSIDE</strong></pre>
+    """
+    shown = []
+    for line in text.splitlines():
+        indent = line[: len(line) - len(line.lstrip())]
+        # Two spaces within a line make a table of it.
+        folded = [line]
+        if "  " not in line.strip():
+            folded = textwrap.wrap(line, width, subsequent_indent=indent)
+        escaped = html.escape("\n".join(folded))
+        shown.append(f"<strong>{escaped}</strong>" if is_bad_news(line) else escaped)
+    style = "line-height: 1.35; overflow-x: auto"
+    return f'<pre class="ctrlid" style="{style}">' + "\n".join(shown) + "</pre>"
+
+
+class Printed:
+    """A result with a text of its own: a prompt and a notebook show what ``print`` shows."""
+
+    def __repr__(self) -> str:
+        return str(self)
+
+    def _repr_html_(self) -> str:
+        return html_lines(str(self))

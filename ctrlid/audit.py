@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from . import defects
+from ._text import Printed
 from .controller_check import check_controller
 from .data import SIGNALS, Record
 from .errors import CtrlidError
@@ -54,8 +55,8 @@ class AuditFinding:
     harmful: bool = False
 
 
-@dataclass(frozen=True)
-class Audit:
+@dataclass(frozen=True, repr=False)
+class Audit(Printed):
     """What `audit` found.
 
     Parameters

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ._text import Printed
 from .data import Record
 from .errors import CtrlidError
 from .physics import Array
@@ -44,8 +45,8 @@ class Curve:
     noise_share: float
 
 
-@dataclass(frozen=True, eq=False)
-class Comparison:
+@dataclass(frozen=True, eq=False, repr=False)
+class Comparison(Printed):
     """What `compare` found.
 
     Parameters

@@ -7,6 +7,7 @@ from typing import Any
 import control as ct
 import numpy as np
 
+from ._text import Printed
 from .errors import CtrlidError
 from .lead import design_lead
 from .loop import Loop
@@ -53,8 +54,8 @@ class Performance:
     final_value: float
 
 
-@dataclass(frozen=True, eq=False)
-class Redesign:
+@dataclass(frozen=True, eq=False, repr=False)
+class Redesign(Printed):
     """A controller designed on a model, with the promise and what came of it.
 
     Parameters

@@ -12,6 +12,7 @@ import numpy as np
 from scipy import signal
 
 from . import _csv, _response
+from ._text import Printed
 from .errors import CtrlidError
 
 Hold = Literal["zoh", "foh"]
@@ -69,7 +70,7 @@ def _seconds(what: str, value: Any) -> float:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Record:
+class Record(Printed):
     """Reference, input and output of one experiment, sampled together.
 
     At sample k the output ``y[k]`` is measured, then ``u[k]`` is computed and applied until sample

@@ -49,8 +49,8 @@ class PoleTrend:
     p_value: float
 
 
-@dataclass(frozen=True, eq=False)
-class FitSeries:
+@dataclass(frozen=True, eq=False, repr=False)
+class FitSeries(_text.Printed):
     """Models of several records, as `fit_each` returns them.
 
     Attributes

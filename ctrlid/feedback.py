@@ -7,6 +7,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import linalg, stats
 
+from ._text import Printed
 from .data import Record
 from .errors import CtrlidError
 from .residuals import Correlation, cross_correlation
@@ -23,8 +24,8 @@ LAW = 6  # most past samples in an exact law
 TELLING = 0.01  # of what r and past u leave of u: if y takes all but this away, u is made from y
 
 
-@dataclass(frozen=True, eq=False)
-class FeedbackCheck:
+@dataclass(frozen=True, eq=False, repr=False)
+class FeedbackCheck(Printed):
     """What `check_feedback` found.
 
     Parameters

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ._text import number
+from ._text import Printed, number
 from .data import Record
 from .errors import CtrlidError
 from .filtering import machine_for, make_track
@@ -28,8 +28,8 @@ from .physics import Array
 UNSEEN = 1e-9  # relative eigenvalue of the information below which a direction is not in the data
 
 
-@dataclass(frozen=True, eq=False)
-class LoopEstimate:
+@dataclass(frozen=True, eq=False, repr=False)
+class LoopEstimate(Printed):
     """Physical parameters, their uncertainty and the noise that was found with them.
 
     Parameters
@@ -132,8 +132,8 @@ def _with_error(value: float, error: float) -> str:
     return f"{number(value, digits)} ± {number(error, 2)}"
 
 
-@dataclass(frozen=True, eq=False)
-class LoopFit:
+@dataclass(frozen=True, eq=False, repr=False)
+class LoopFit(Printed):
     """What `fit_loop` returns.
 
     Parameters

@@ -110,8 +110,8 @@ class ActiveBound:
         return f"{self.row} [{self.constraint}]"
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Estimate:
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
+class Estimate(_text.Printed):
     """Coefficients of a fitted model, their uncertainty, and how they were found.
 
     The covariance is ``sigma^2 Z (Z' R'R Z)^-1 Z'`` with ``Z`` the directions that the constraints
@@ -396,3 +396,7 @@ class IdentifiedModel(control.TransferFunction):
     def __str__(self) -> str:
         text: Any = super().__str__()
         return f"{text}\n\n{self.estimate}"
+
+    def _repr_html_(self, var: str | None = None) -> str:
+        formula: Any = super()._repr_html_(var)  # as python-control shows every transfer function
+        return f"{formula}\n{_text.html_lines(str(self.estimate))}"

@@ -9,6 +9,7 @@ from typing import Any
 
 from . import plot
 from ._tables import Table, blocks, heading
+from ._text import is_bad_news
 from .comparison import Comparison
 from .controller_redesign import Redesign
 from .data import Record
@@ -203,13 +204,8 @@ def _bytes(picture: Any) -> bytes:
 
 
 def _paragraph(text: str) -> str:
-    # Bad news is in capitals throughout: three such words in a row are no abbreviation.
-    words = text.split()
-    bare = [w.strip(".,:;") for w in words]
-    loud = [len(w) > 1 and w.isalpha() and w.isupper() for w in bare]
-    bad = any(all(loud[i : i + 3]) for i in range(len(words) - 2))
-    kind = ' class="bad"' if bad else ""
-    return f"<p{kind}>{html.escape(' '.join(words))}</p>"
+    kind = ' class="bad"' if is_bad_news(text) else ""
+    return f"<p{kind}>{html.escape(' '.join(text.split()))}</p>"
 
 
 def _html_table(table: Table) -> str:

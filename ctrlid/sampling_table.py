@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ._text import listing, number
+from ._text import Printed, listing, number
 from .data import Record
 from .errors import CtrlidError
 
@@ -70,8 +70,8 @@ class SamplingRow:
         return np.asarray(np.abs(self.poles) * self.period, dtype=float)
 
 
-@dataclass(frozen=True, eq=False)
-class SamplingSweep:
+@dataclass(frozen=True, eq=False, repr=False)
+class SamplingSweep(Printed):
     """What `sweep_sampling_period` found.
 
     Parameters

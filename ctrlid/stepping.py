@@ -331,7 +331,8 @@ def stepper(loop: Loop, substeps: int) -> Stepper:
         if kept or e.play is not None:
             raise CtrlidError(
                 "a delay or a play acts on the samples of a digital controller; this loop has an "
-                "analog one: put the delay into the plant as a Padé approximation (control.pade)"
+                "analog one: sample it (redesign does so for a sampled model, ct.sample_system(G, "
+                "dt)), or put the delay into the plant as a Padé approximation (control.pade)"
             )
 
         # A jump of the reference is a jump of the circuit's input: the period is smooth.

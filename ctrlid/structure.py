@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import linalg, stats
 
+from ._text import Printed
 from .data import Record
 from .errors import CtrlidError
 
@@ -53,8 +54,8 @@ class OrderRow:
     values: FloatArray
 
 
-@dataclass(frozen=True, eq=False)
-class OrderChoice:
+@dataclass(frozen=True, eq=False, repr=False)
+class OrderChoice(Printed):
     """What `select_order` found.
 
     Parameters

@@ -207,7 +207,8 @@ def test_repr_and_notebook(found):
     assert repr(found["explained"]).startswith("Diagnosis(explained: CoulombFriction; gap 7.")
     assert repr(found["unknown"]).startswith("Diagnosis(unknown; gap ")
     page = found["explained"]._repr_html_()
-    assert page.startswith("<pre>Diagnosis of maglev")
+    assert page.startswith('<pre class="ctrlid"')
+    assert ">Diagnosis of maglev" in page
     assert found["explained"].effects == (E.CoulombFriction(fc=0.3987),)
 
 

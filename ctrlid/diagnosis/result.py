@@ -1,10 +1,10 @@
 """What a diagnosis found, as values."""
 
-import html
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+from .._text import Printed
 from ..effects import AbstractEffect
 from ..loop import Loop
 from ..physics import Array
@@ -198,7 +198,7 @@ class Calibrated:
 
 
 @dataclass(frozen=True, eq=False)
-class Diagnosis:
+class Diagnosis(Printed):
     """What `diagnose` found.
 
     Parameters
@@ -270,9 +270,6 @@ class Diagnosis:
         g = self.gap
         sizes = f"{g.before:.3g} before, {g.after:.3g} after, floor {g.floor:.3g} {g.unit}"
         return f"Diagnosis({self.verdict}{names}; gap {sizes.strip()})"
-
-    def _repr_html_(self) -> str:
-        return f"<pre>{html.escape(str(self))}</pre>"
 
     def save(self, path: str | Path) -> Path:
         """Write the diagnosis to a file that a person can read; `load_diagnosis` reads it back.

@@ -1,0 +1,155 @@
+"""What a notebook shows of a result, and the notebook among the examples."""
+
+import html
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import control as ct
+import nbclient
+import nbformat
+import numpy as np
+import pytest
+
+import ctrlid as cid
+from ctrlid._tables import Table
+from ctrlid._text import Printed, html_lines
+
+ROOT = Path(__file__).resolve().parents[1]
+NOTEBOOK = ROOT / "examples" / "ten_lines.ipynb"
+
+
+def read(page):
+    """Return what a reader sees of a block, and check that it is one."""
+    assert re.fullmatch(r'<pre class="ctrlid" style="[^"]*">.*</pre>', page, re.DOTALL)
+    inside = page[page.index(">") + 1 : -len("</pre>")]
+    bare = re.sub(r"</?strong>", "", inside)
+    assert "<" not in bare
+    return html.unescape(bare)
+
+
+@pytest.fixture(scope="module")
+def loop():
+    at = cid.OperatingPoint(states=(0.0, 0.0), input=0.0, output=0.0)
+    plant = cid.plants.servo(m=1.0, c=2.0, k=3.0)
+    return cid.Loop(plant, cid.PID(kp=20.0, kd=1.0), dt=0.01, at=at, free=("k",))
+
+
+@pytest.fixture(scope="module")
+def record(loop):
+    r = cid.random_binary(1000, amplitude=0.1, hold=50, seed=1)
+    return cid.simulate(loop, r, sensor_noise=1e-3, seed=2)
+
+
+@pytest.fixture(scope="module")
+def results(loop, record):
+    G = cid.fit_arx(record, na=2, nb=2)
+    fitted = cid.fit_loop(loop, record)
+    return [
+        G.estimate, fitted, fitted.estimate, cid.compare(record, loop), cid.audit(record),
+        cid.check_feedback(record), cid.select_order(record, na=[1, 2], nb=[1, 2], nk=[1]),
+        cid.sweep_sampling_period(record, [0.01, 0.02]),
+        cid.redesign(G, loop, crossover=8.0, phase_margin=60.0), Table(("a", "b"), (("1", "2"),)),
+    ]  # fmt: skip
+
+
+def test_a_notebook_shows_what_print_shows(results, record):
+    for shown in results:
+        assert read(shown._repr_html_()).split() == str(shown).split(), type(shown).__name__
+        assert repr(shown) == str(shown)
+    assert read(record._repr_html_()) == repr(record)
+
+
+def test_every_printed_result_is_shown():
+    """A public result with a text of its own has it in a notebook, and at a prompt as well."""
+    for name in cid.__all__:
+        value = getattr(cid, name)
+        if isinstance(value, type) and "__str__" in vars(value) and name != "IdentifiedModel":
+            assert issubclass(value, Printed), name
+            assert value.__repr__ is Printed.__repr__ or name == "Diagnosis"
+    assert issubclass(cid.Record, Printed)
+
+
+def test_a_model_shows_formula_and_estimate(record):
+    G = cid.fit_arx(record, na=2, nb=2)
+    page = G._repr_html_()
+    formula, block = page.split("<pre", 1)
+    assert formula.rstrip() == ct.TransferFunction._repr_html_(G).rstrip()
+    assert r"\dfrac" in formula
+    assert read("<pre" + block) == str(G.estimate)
+    assert G._repr_markdown_() == page
+    assert "$" not in block  # which a notebook would read as a formula
+    plain = ct.tf(G)
+    plain.repr_format = "latex"
+    assert repr(plain).startswith("&lt;TransferFunction")  # what control has stays as it is
+
+
+def test_bad_news_is_bold_and_names_are_escaped(record):
+    held = cid.fit_arx(record, na=2, nb=2, constraints=[cid.Bounds("a1", -1.0, 0.0)])
+    page = held.estimate._repr_html_()
+    assert "SITS ON ITS BOUND" in re.search("<strong>(.*?)</strong>", page, re.DOTALL)[1]
+    named = replace(record, name="<b> & co")
+    assert "&lt;b&gt; &amp; co" in named._repr_html_()
+    assert "<b>" not in named._repr_html_()
+
+
+def test_sentences_are_wrapped_and_tables_are_not():
+    sentence, table = "  " + 40 * "word ", "a" + 40 * "  1.0"
+    lines = read(html_lines(f"{sentence}\n\n{table}")).splitlines()
+    assert max(map(len, lines[:2])) <= 100
+    assert all(line.startswith("  word") for line in lines[:-2])
+    assert lines[-2:] == ["", table]
+
+
+def test_the_block_suits_light_and_dark():
+    """No colour of its own: text and background are those of the notebook."""
+    assert "color" not in html_lines("NO POLE OUTSIDE")
+    assert "background" not in html_lines("NO POLE OUTSIDE")
+
+
+@pytest.fixture(scope="module")
+def notebook():
+    return nbformat.read(NOTEBOOK, as_version=4)
+
+
+def test_the_notebook_is_committed_without_outputs(notebook):
+    nbformat.validate(notebook)
+    code = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    assert all(cell.outputs == [] and cell.execution_count is None for cell in code)
+    assert notebook.metadata == {
+        "kernelspec": {"display_name": "Python 3", "language": "python", "name": "python3"},
+        "language_info": {"name": "python"},
+    }
+
+
+def test_the_notebook_has_the_ten_lines_of_the_readme(notebook):
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    script = re.search(r"```python\n(.*?)```", readme, re.DOTALL)[1]
+    lines = [line for line in script.splitlines() if line]
+    cells = [line for cell in notebook.cells if cell.cell_type == "code"
+             for line in cell.source.splitlines() if line]  # fmt: skip
+    # A notebook shows the last value of a cell, and a model with its estimate: no print is needed.
+    wanted = [re.sub(r"^print\((.*)\)$", r"\1", line).replace("G.estimate", "G") for line in lines]
+    missing = [line for line in wanted if not any(line in cell for cell in cells)]
+    assert missing == []
+
+
+def test_the_notebook_runs_from_top_to_bottom(notebook, monkeypatch, tmp_path):
+    monkeypatch.setenv("IPYTHONDIR", str(tmp_path))
+    monkeypatch.setenv("JUPYTER_PLATFORM_DIRS", "1")
+    monkeypatch.setenv("MPLBACKEND", "module://matplotlib_inline.backend_inline")
+    done = nbclient.NotebookClient(
+        notebook.copy(), timeout=300, kernel_name="python3",
+        resources={"metadata": {"path": str(tmp_path)}},
+    ).execute()  # fmt: skip
+    outputs = [out for cell in done.cells if cell.cell_type == "code" for out in cell.outputs]
+    pages = [out.data["text/html"] for out in outputs if "text/html" in out.get("data", {})]
+    pictures = [out for out in outputs if "image/png" in out.get("data", {})]
+    # Without the widgets tqdm warns that its bars will be text.
+    said = [out for out in outputs if out.output_type in ("error", "stream")]
+    assert [out for out in said if "IProgress" not in out.get("text", "")] == []
+    assert any(r"\dfrac" in page and "pole at s = 40.4" in page.replace("-", "") for page in pages)
+    assert any("the promise holds" in " ".join(page.split()) for page in pages)
+    assert any("one-step prediction" in page for page in pages)
+    assert len(pictures) == 2
+    assert np.all([len(out.data["image/png"]) > 10_000 for out in pictures])
