@@ -128,7 +128,7 @@ def comparison(
     >>> found = cid.compare(cid.simulate(loop, r, sensor_noise=1e-3, seed=2), loop)
     >>> ax = cid.plot.comparison(found, window=(0, 5))
     >>> ax.get_xlabel()
-    'time [s], 0 to 5 s of a record of 10 s'
+    'time [s], 0 to 5 s of a record from 0 to 10 s'
     """
     _require(comparison, Comparison, "plot.comparison draws a Comparison, as compare() returns")
     whole = comparison.record
@@ -163,8 +163,9 @@ def comparison(
             line.set_label(f"{line.get_label()}, outside this picture")
     _shade(ax, whole[first:stop])
     ax.set_ylabel(f"{whole.names.get('y', 'y')} [{unit}]")
-    ax.set_xlabel(f"time [s], {t[0]:.4g} to {t[0] + len(t) * whole.dt:.4g} s of a record of "
-                  f"{whole.duration:.4g} s")  # fmt: skip
+    ends = [f"{a:.4g} to {a + n * whole.dt:.4g} s" for a, n in
+            ((t[0], len(t)), (whole.start, len(whole)))]  # fmt: skip
+    ax.set_xlabel(f"time [s], {ends[0]} of a record from {ends[1]}")
     return _finish(ax)
 
 
@@ -497,7 +498,7 @@ def step(redesign: Redesign, ax: Any = None) -> Any:
         # Long enough to see the promise kept or broken, short enough to see how.
         ax.set_xlim(0, min(redesign.time[-1], max(3 * max(settled), 20 * redesign.loop.dt)))
     ax.set_xlabel("time after the step [s]")
-    ax.set_ylabel("output per step of the reference [1]")
+    ax.set_ylabel("output per step\nof the reference [1]")
     return _finish(ax, columns=1)
 
 

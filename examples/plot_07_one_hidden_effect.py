@@ -67,6 +67,7 @@ fig, axes = plt.subplots(2, 1, figsize=(8, 5.6), sharex=True, layout="constraine
 for ax, outcome, design in zip(axes, (naive, named), ("without", "with"), strict=True):
     cid.plot.step(outcome, ax)
     ax.text(0.98, 0.08, f"lead designed {design} the lag", transform=ax.transAxes, ha="right")
+axes[0].set_xlabel("")
 plt.show()
 
 # %%

@@ -70,3 +70,15 @@ def test_magnetoshield_needs_the_delay_and_the_lag(levitations):
     assert all(47 < pair < 53 for pair in fourth)
     second = [pair for (_, order), pair in found.items() if order == 2]
     assert np.ptp(second) > 15
+
+
+def test_the_tutorial(capsys):
+    """From a CSV file to a controller whose promise only the named effect lets it keep."""
+    told = runpy.run_path(str(EXAMPLES / "plot_04_csv_to_controller.py"))
+    printed = capsys.readouterr().out
+    assert "SOMETHING IS MISSING" in printed
+    assert "Explained. Missing was InputDelay" in printed
+    assert printed.count("the promise holds") == 2
+    assert printed.count("DEGREES OF THE PROMISE ARE LOST") == 2
+    assert told["found"].loop.parameters["K"] == pytest.approx(1.04 * 3.34e-6, rel=1e-3)
+    assert told["page"].read_text("utf-8").count("<img ") >= 6

@@ -157,7 +157,7 @@ def test_comparison_labels_every_curve(comparison):
         assert "prediction" in label or "simulation" in label
     assert ax.get_ylabel().endswith("m]")
     assert ax.get_xlabel().startswith("time [s], ")
-    assert ax.get_xlabel().endswith("of a record of 10 s")
+    assert ax.get_xlabel().endswith("of a record from 0 to 10 s")
 
 
 def test_comparison_window(comparison):
@@ -300,7 +300,7 @@ def test_bode_leaves_out_a_model_sampled_too_slowly_for_the_frequencies():
 
 def test_step_shows_promise_and_achievement(outcome):
     ax = plot.step(outcome)
-    assert labels(ax) == ("time after the step [s]", "output per step of the reference [1]")
+    assert labels(ax) == ("time after the step [s]", "output per step\nof the reference [1]")
     promised, achieved = legend(ax)
     assert promised.startswith(
         f"promised on the model: {outcome.promised.overshoot:.0f} % overshoot"
