@@ -12,7 +12,9 @@ from .data import SIGNALS, Record
 from .diagnosis import words
 from .diagnosis.result import Diagnosis
 from .errors import CtrlidError
+from .loop_fit import LoopFit
 from .model import Estimate, IdentifiedModel
+from .physics import timebase
 
 
 @dataclass(frozen=True, repr=False)
@@ -62,15 +64,33 @@ class Table(_text.Printed):
         return f"{self.caption}\n{text}" if self.caption else text
 
 
+@dataclass(frozen=True)
+class Title:
+    """A heading within the page of a result.
+
+    Parameters
+    ----------
+    text : str
+        The heading.
+    """
+
+    text: str
+
+
+Block = Table | Title | str
+
+
 def heading(result: Any) -> str:
     """Return a title for a result, or refuse what cannot be shown."""
     match result:
         case Record():
             return f"Record {result.name}".strip()
         case IdentifiedModel():
-            return "Identified model"
+            return f"Model by {result.estimate.method}"
+        case LoopFit():
+            return f"Physical parameters of {result.loop.plant.name}"
         case Comparison():
-            return f"{result.record.name or 'Record'} against {result.what.split('(')[0]}"
+            return f"{result.what.split('(')[0]} against the record {result.record.name}".strip()
         case Redesign():
             return "Redesign: promised against achieved"
         case Diagnosis():
@@ -78,13 +98,13 @@ def heading(result: Any) -> str:
         case Table():
             return result.caption or "Table"
     raise CtrlidError(
-        "a report shows a Record, IdentifiedModel, Comparison, Redesign, Diagnosis, Table or "
-        f"Section, or a sequence of them; given {type(result).__name__}"
+        "a report shows a Record, IdentifiedModel, LoopFit, Comparison, Redesign, Diagnosis, Table "
+        f"or Section, or a sequence of them; given {type(result).__name__}"
     )
 
 
-def blocks(result: Any) -> list[Table | str]:
-    """Return a result as tables and sentences."""
+def blocks(result: Any) -> list[Block]:
+    """Return a result as tables, headings and sentences."""
     match result:
         case Table():
             return [result]
@@ -92,10 +112,12 @@ def blocks(result: Any) -> list[Table | str]:
             return [_record_table(result)]
         case IdentifiedModel():
             return _estimate_blocks(result.estimate)
+        case LoopFit():
+            return _loop_fit_blocks(result)
         case Comparison():
             return [*_comparison_tables(result), *result.notes, result.verdict]
         case Redesign():
-            return [_redesign_table(result), result.verdict]
+            return _redesign_blocks(result)
         case Diagnosis():
             return _diagnosis_blocks(result)
     heading(result)  # refuses what has no page
@@ -120,7 +142,7 @@ def _record_table(record: Record) -> Table:
     return Table(head, rows, caption)
 
 
-def _estimate_blocks(e: Estimate) -> list[Table | str]:
+def _estimate_blocks(e: Estimate) -> list[Block]:
     held = {bound.quantity for bound in e.active_bounds}
     rows = []
     for name, value, error in zip(e.names, e.values, e.standard_errors, strict=True):
@@ -135,7 +157,8 @@ def _estimate_blocks(e: Estimate) -> list[Table | str]:
     text = str(e).splitlines()
     news = text[1 + next(i for i, line in enumerate(text) if "active bounds:" in line) :]
     period = f", dt = {e.dt:g} s" if e.dt else ""
-    caption = f"{e.method}, {e.n_samples} rows{period}. Standard errors hold for white errors only."
+    white = " Standard errors hold for white errors only." if "ARX" in e.method else ""
+    caption = f"{_upper(e.method)}, {e.n_samples} rows{period}.{white}"
     return [
         Table(("coefficient", "value", "standard error"), tuple(rows), caption),
         Table(head, poles),
@@ -162,31 +185,44 @@ def _comparison_tables(c: Comparison) -> list[Table]:
     return tables
 
 
-def _redesign_table(r: Redesign) -> Table:
-    p, a = r.promised, r.achieved
-    rows = tuple(
-        (label, f"{getattr(p, name):{form}}", f"{getattr(a, name):{form}}")
-        for label, name, form in (
-            ("phase margin [deg]", "phase_margin", ".1f"),
-            ("gain margin [factor]", "gain_margin", ".2f"),
-            ("crossover [rad/s]", "crossover", ".1f"), ("overshoot [%]", "overshoot", ".1f"),
-            ("settling time [s]", "settling_time", ".3g"),
-        )
-    )  # fmt: skip
-    return Table(("", "promised on the model", "achieved on the physics"), rows)
+def _loop_fit_blocks(fit: LoopFit) -> list[Block]:
+    e = fit.estimate
+    errors = ("on its bound" if name in e.bounds else
+              f"{error:.2g}" if np.isfinite(error) else "not in the data"
+              for name, error in zip(e.names, e.standard_errors, strict=True))  # fmt: skip
+    rows = tuple(zip(e.names, (f"{v:.7g}" for v in e.values), errors, strict=True))
+    first, *rest = str(e).splitlines()
+    return [
+        Table(("parameter", "value", "standard error"), rows, f"{_upper(first)}."),
+        *(_upper(line.strip()) + "." for line in rest[len(e.names) :]),
+        f"{fit.loop!r}.",
+    ]
 
 
-def _diagnosis_blocks(found: Diagnosis) -> list[Table | str]:
+def _redesign_blocks(r: Redesign) -> list[Block]:
+    z = "z" if timebase(r.controller) else "s"
+    return [
+        Table(("", "promised on the model", "achieved on the physics"), r.rows),
+        r.verdict,
+        f"{_upper(str(r).splitlines()[0])}, coefficients in falling powers of {z}.",
+    ]
+
+
+def _diagnosis_blocks(found: Diagnosis) -> list[Block]:
     caption = f"{found.gap.kind.capitalize()} of {len(found.gap.time)} samples kept back."
     gap = Table(("", "RMS error", "against the noise floor"), tuple(words.gap_rows(found.gap)),
                 caption)  # fmt: skip
-    made: list[Table | str] = [words.headline(found), gap, words.shrinking(found.gap)]
+    made: list[Block] = [words.headline(found), gap, words.shrinking(found.gap)]
+    if found.findings:
+        made.append(Title("What is missing"))
     for k, finding in enumerate(found.findings, 1):
         sure = words.certainty(found, finding)
         made += [f"{k}. {words.named(finding)}. {words.sized(found, finding)}.", f"{_upper(sure)}."]
         made += [f"{_upper(doubt)}." for doubt in words.doubts(found, finding)]
     if found.findings:
         made.append(words.EVIDENCE)
+    if found.where:
+        made.append(Title("Where it sits"))
     made += [f"Along {p.axis}: {words.place_words(p)}." for p in words.telling(found)]
     sides = 2 if found.findings else 1
     places = tuple(
@@ -195,11 +231,16 @@ def _diagnosis_blocks(found: Diagnosis) -> list[Table | str]:
         for p in found.where
     )  # fmt: skip
     if places:
-        columns = ("along", *("before", "after")[:sides], *("by chance", "after")[:sides])
+        columns = (
+            "along",
+            *("before", "after")[:sides],
+            *("chance before", "chance after")[:sides],
+        )
         made.append(Table(columns, places, "RMS of the one-step errors at worst; 1 is noise."))
     if found.verdict == "nothing missing" and found.sensitivity:
         made.append(Table(("effect", "smallest size that would have been seen"),
                           tuple(words.sensitivity_rows(found))))  # fmt: skip
+    made.append(Title("Parameters, noise and remarks"))
     parameters = tuple(
         (c.name, f"{c.given:.6g}", f"{c.before:.6g}", f"{c.after:.6g}",
          f"{c.standard_error:.2g}" if np.isfinite(c.standard_error) else "not in the data")
@@ -216,8 +257,10 @@ def _diagnosis_blocks(found: Diagnosis) -> list[Table | str]:
         for c in found.ranking if np.isfinite(c.gain)
     )  # fmt: skip
     if tried:
-        heads = ("candidate", "round", "evidence", "penalty", "")
-        made.append(Table(heads, tried, "The candidates that were refitted."))
+        width = 5 if any(row[-1] for row in tried) else 4  # remarks are rare
+        heads = ("candidate", "round", "evidence", "penalty", "remark")[:width]
+        rows = tuple(row[:width] for row in tried)
+        made += [Title("What was tried"), Table(heads, rows, "The candidates that were refitted.")]
     return [block for block in made if block]
 
 

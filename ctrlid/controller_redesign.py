@@ -129,8 +129,10 @@ class Redesign(Printed):
             f"({self.nu_gap:.3f} against a robust margin of {self.robust_margin:.3f})."
         )
 
-    def __str__(self) -> str:
-        rows = [f"  {'':<24}{'promised':>12}{'achieved':>12}"]
+    @property
+    def rows(self) -> tuple[tuple[str, str, str], ...]:
+        """Return quantity, promised and achieved value as printed, row by row."""
+        made = []
         for label, name, form in (
             ("phase margin [deg]", "phase_margin", ".2f"),
             ("gain margin [factor]", "gain_margin", ".3f"),
@@ -139,9 +141,17 @@ class Redesign(Printed):
             ("overshoot [%]", "overshoot", ".2f"),
             ("settling time [s]", "settling_time", ".4f"),
         ):
-            values = (getattr(self.promised, name), getattr(self.achieved, name))
-            shown = ("-" if np.isnan(v) else f"{v:{form}}" for v in values)
-            rows.append(f"  {label:<24}" + "".join(f"{v:>12}" for v in shown))
+            promised, achieved = (
+                "-" if np.isnan(v) else f"{v:{form}}"
+                for v in (getattr(self.promised, name), getattr(self.achieved, name))
+            )
+            made.append((label, promised, achieved))
+        return tuple(made)
+
+    def __str__(self) -> str:
+        rows = [
+            f"  {a:<24}{b:>12}{c:>12}" for a, b, c in (("", "promised", "achieved"), *self.rows)
+        ]
         num, den = (" ".join(f"{c:.6g}" for c in p[0][0])
                     for p in (self.controller.num, self.controller.den))  # fmt: skip
         return "\n".join([f"controller: ({num}) / ({den})", *rows, "  " + self.verdict])

@@ -8,13 +8,14 @@ from pathlib import Path
 from typing import Any
 
 from . import plot
-from ._tables import Table, blocks, heading
+from ._tables import Table, Title, blocks, heading
 from ._text import is_bad_news
 from .comparison import Comparison
 from .controller_redesign import Redesign
 from .data import Record
 from .diagnosis.result import Diagnosis
 from .errors import CtrlidError
+from .loop_fit import LoopFit
 from .model import IdentifiedModel
 
 STYLE = """
@@ -29,10 +30,12 @@ main { max-width: 48rem; margin: 0 auto; padding: 2rem 1.2rem 4rem; }
 h1 { font-size: 1.75rem; line-height: 1.25; margin: 0 0 1.5rem; }
 h2 { font-size: 1.25rem; margin: 2.6rem 0 0.6rem; padding-top: 0.9rem;
   border-top: 1px solid var(--line); }
+h3 { font-size: 1.05rem; margin: 1.8rem 0 0.4rem; }
 p { margin: 0.6rem 0; overflow-wrap: anywhere; }
 p.bad { color: var(--bad); font-weight: 600; }
 .wide { overflow-x: auto; margin: 1rem 0; }
-table { border-collapse: collapse; font-size: 0.92rem; font-variant-numeric: tabular-nums; }
+table { border-collapse: collapse; min-width: min(100%, 32rem); font-size: 0.92rem;
+  font-variant-numeric: tabular-nums; }
 caption { text-align: left; color: var(--faint); padding-bottom: 0.3rem; }
 th, td { padding: 0.28rem 0.8rem; border-bottom: 1px solid var(--line); text-align: right;
   vertical-align: top; }
@@ -47,11 +50,14 @@ figcaption { color: var(--faint); font-size: 0.92rem; margin-top: 0.4rem; }
 footer { margin-top: 3rem; color: var(--faint); font-size: 0.85rem; }
 @media print { :root { --ink: #000000; --paper: #ffffff; --faint: #444444; --line: #bbbbbb;
   --head: #eeeeee; --bad: #7a2b00; }
-  main { max-width: none; padding: 0; } figure, table { break-inside: avoid; }
-  h2 { break-after: avoid; } .wide { overflow: visible; } }
+  body { font-size: 10.5pt; } main { max-width: none; padding: 0; }
+  figure, table { break-inside: avoid; } h2 { margin-top: 1.6rem; }
+  figure img { width: auto; max-width: 15cm; max-height: 21cm; }
+  h2, h3 { break-after: avoid; } .wide { overflow: visible; } }
 """
 
 
+CLOSE = 600  # samples of a long record that are drawn one by one
 DIAGNOSIS = (
     "Output and errors where the gap is largest; RMS of the one-step errors along the two most "
     "telling quantities; the candidates by rounds of the search."
@@ -69,8 +75,8 @@ class Section:
     text : str, optional
         Plain words; an empty line starts a new paragraph.
     result : object, optional
-        A `Table`, `Record`, `IdentifiedModel`, `Comparison`, `Redesign` or `Diagnosis`, or a tuple
-        of them.
+        A `Table`, `Record`, `IdentifiedModel`, `LoopFit`, `Comparison`, `Redesign` or `Diagnosis`,
+        or a tuple of them.
     figure : object, optional
         A matplotlib figure or axes, or the bytes of a PNG file, or a mapping of such by caption. By
         default the pictures that belong to the result; an empty mapping for none.
@@ -104,8 +110,8 @@ def write_report(result: Any, path: str | Path, *, title: str = "") -> Path:
 
     Parameters
     ----------
-    result : Record, IdentifiedModel, Comparison, Redesign, Diagnosis or Section, or several
-        What to report; several in a sequence.
+    result : Record, IdentifiedModel, LoopFit, Comparison, Redesign, Diagnosis or Section
+        What to report, or several of them in a sequence.
     path : str or Path
         The file; one that exists is replaced.
     title : str, optional
@@ -164,10 +170,18 @@ def _pictures(result: Any) -> dict[str, Any]:
     """Draw what belongs to a result."""
     match result:
         case Record():
-            return {"The experiment.": plot.record(result)}
+            made = {"The experiment.": plot.record(result)}
+            if len(result) > 2 * plot.BINS:
+                middle = len(result) // 2
+                part = result[middle : middle + CLOSE]
+                made["A part of it."] = plot.record(part)
+            return made
         case IdentifiedModel():
             return {"Poles.": plot.poles({"identified": result}),
                     "Frequency response.": plot.bode({"identified": result})}  # fmt: skip
+        case LoopFit():
+            return {"Poles of the fitted physics.": plot.poles({"fitted": result.model}),
+                    "Its frequency response.": plot.bode({"fitted": result.model})}  # fmt: skip
         case Comparison():
             made = {"Measured output, predictions and simulations.": plot.comparison(result)}
             if result.tests:
@@ -187,7 +201,7 @@ def _section(section: Section, alone: bool) -> str:
     parts += [_paragraph(p) for p in section.text.split("\n\n") if p.strip()]
     for result in _several(section.result):
         for block in blocks(result):
-            parts.append(_html_table(block) if isinstance(block, Table) else _paragraph(block))
+            parts.append(_html(block))
     for caption, picture in section.figures.items():
         data = base64.b64encode(_bytes(picture)).decode("ascii")
         words = html.escape(caption, quote=True)
@@ -201,6 +215,12 @@ def _section(section: Section, alone: bool) -> str:
 
 def _bytes(picture: Any) -> bytes:
     return picture if isinstance(picture, bytes) else plot.png(picture)
+
+
+def _html(block: Table | Title | str) -> str:
+    if isinstance(block, Title):
+        return f"<h3>{html.escape(block.text)}</h3>"
+    return _html_table(block) if isinstance(block, Table) else _paragraph(block)
 
 
 def _paragraph(text: str) -> str:

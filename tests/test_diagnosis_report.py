@@ -406,6 +406,8 @@ def test_page(found, verdict, tmp_path):
     page = path.read_text("utf-8")
     assert "<h1>Diagnosis of maglev, 3000 samples at 0.002 s</h1>" in page
     assert page.count('src="data:image/png;base64,') == 1
+    assert ("<h3>What is missing</h3>" in page) == ("explained" in verdict)
+    assert "<h3>Where it sits</h3>" in page
     assert SENTENCES[verdict] in page
     bad = verdict in ("unknown", "partly explained")
     assert ('<p class="bad">' in page) == (bad or verdict == "nothing missing")

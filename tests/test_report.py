@@ -158,11 +158,41 @@ def test_page_of_a_comparison_without_noise(record, tmp_path):
         plot.residuals(found)
 
 
+def test_page_of_physical_parameters(record, tmp_path):
+    loop = replace(record[0], free=("k", "c"))
+    fitted = cid.fit_loop(loop, record[1])
+    page = read(cid.write_report(fitted, tmp_path / "r.html"))
+    assert len(page.images) == 2
+    assert {"k", f"{fitted.estimate['k']:.7g}", "standard error"} <= set(page.cells)
+    assert any(text.startswith("Sensor noise") for text in page.paragraphs)
+    assert any("servo, " in text for text in page.paragraphs)
+    lost = replace(fitted.estimate, covariance=np.diag([np.inf, 1e-6]), bounds=("c",))
+    cells = read(cid.write_report(replace(fitted, estimate=lost), tmp_path / "l.html")).cells
+    assert "not in the data" in cells
+    assert "on its bound" in cells
+
+
+def test_page_of_a_long_record_shows_a_part_too(tmp_path):
+    r = cid.random_binary(4000, amplitude=1.0, hold=20, seed=1)
+    page = read(cid.write_report(cid.Record(r=r, u=r, y=r, dt=0.01), tmp_path / "r.html"))
+    assert [image["alt"] for image in page.images] == ["The experiment.", "A part of it."]
+
+
+def test_standard_errors_are_qualified_where_they_need_it(record, tmp_path):
+    for fit, said in ((cid.fit_arx, True), (cid.fit_iv, False)):
+        G = fit(replace(record[1], hold="zoh"), na=2, nb=2)
+        text = cid.write_report(G, tmp_path / "r.html").read_text("utf-8")
+        assert ("hold for white errors only" in text) == said
+
+
 def test_page_of_a_redesign(outcome, tmp_path):
     page = read(cid.write_report(outcome, tmp_path / "r.html"))
+    assert any(text.startswith("Controller: (") and "falling powers of s" in text
+               for text in page.paragraphs)  # fmt: skip
+    assert {"final value per step", outcome.rows[0][1]} <= set(page.cells)
     assert len(page.images) == 1
     assert "promised on the model" in page.cells
-    assert f"{outcome.achieved.phase_margin:.1f}" in page.cells
+    assert f"{outcome.achieved.phase_margin:.2f}" in page.cells
     assert outcome.verdict in page.paragraphs
     achieved = replace(outcome.achieved, stable=False, phase_margin=np.nan)
     lost = replace(outcome, achieved=achieved)
