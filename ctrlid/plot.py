@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.rcsetup import cycler
 from matplotlib.ticker import MultipleLocator, ScalarFormatter
 
 from . import _pictures, _text
@@ -33,6 +34,13 @@ DASHES = ("-", "--", "-.", (0, (1, 1)), (0, (5, 1, 1, 1, 1, 1)), (0, (8, 3)))
 MARKERS = ("o", "s", "^", "D", "v", "P")
 MEASURED = {"color": "0.72", "linewidth": 3.2}  # broad and pale: what lies on it stays visible
 BINS = 1500  # a record is drawn as an envelope when it has more than twice as many samples
+# For axes of your own: plt.rcParams.update(cid.plot.STYLE) makes them look like those here.
+STYLE = {
+    "axes.prop_cycle": cycler(color=COLOURS) + cycler(linestyle=DASHES),
+    "axes.spines.top": False, "axes.spines.right": False, "axes.axisbelow": True,
+    "axes.grid": True, "grid.color": "0.9", "grid.linewidth": 0.6,
+    "lines.linewidth": 1.4, "legend.frameon": False,
+}  # fmt: skip
 
 
 def record(record: Record, axes: Any = None, *, extra: Sequence[str] = ()) -> Any:

@@ -132,12 +132,13 @@ print(comparison)
 # In one picture
 # --------------
 
+plt.rcParams.update(cid.plot.STYLE)
 fig, (left, right) = plt.subplots(1, 2, figsize=(9, 3.8), layout="constrained")
 start = slice(0, 900)
 left.semilogy(1e3 * record.t[start], 1e3 * error[start], color="0.6", lw=0.8,
-              label="open-loop simulation less measurement")  # fmt: skip
+              label="of the simulation")  # fmt: skip
 growth = error[lost] * np.exp(true_pole * dt * (np.arange(900) - lost))
-left.semilogy(1e3 * record.t[start], 1e3 * growth, "k--", label="proportional to exp(p t)")
+left.semilogy(1e3 * record.t[start], 1e3 * growth, "k--", label="growing like exp(p t)")
 left.axhline(1e3 * op.output, color="k", ls=":", lw=1)
 left.text(5, 1.3e3 * op.output, "the whole gap")
 left.set(xlabel="time [ms]", ylabel="error of the gap [mm]", ylim=(1e-4, 1e3),

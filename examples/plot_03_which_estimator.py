@@ -72,6 +72,7 @@ for what, errors in (("unstable pole", pole), ("gain b1 + b2", gain)):
 # - Instruments remove the bias, since sensor noise never reaches the reference.
 # - Instruments and constraint together scatter least.
 
+plt.rcParams.update(cid.plot.STYLE)
 fig, axes = plt.subplots(1, 2, figsize=(9, 4.2), layout="constrained", sharex=True)
 styles = dict(zip(ways, ("k^:", "ks--", "ko-.", "kD-"), strict=True))
 for ax, errors, title in zip(axes, (pole, gain), ("Unstable pole", "Gain b1 + b2"), strict=True):
@@ -82,7 +83,7 @@ for ax, errors, title in zip(axes, (pole, gain), ("Unstable pole", "Gain b1 + b2
         )  # fmt: skip
     ax.axhline(0, color="0.6", lw=0.8)
     ax.set_yscale("symlog", linthresh=1)
-    ax.set(xlabel="standard deviation of the sensor noise [um]", title=title)
+    ax.set(xlabel="standard deviation of the sensor noise [µm]", title=title)
     ax.set(ylabel="error [%], linear within 1 %", yticks=[-100, -10, -1, 0, 1, 10, 100])
     ax.yaxis.set_major_formatter("{x:g}")
 fig.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)

@@ -94,13 +94,14 @@ independent = np.concatenate(positions)
 worst = np.abs(record.y - independent).max() / np.ptp(independent)
 print(f"largest difference: {worst:.1e} of the motion")
 
+plt.rcParams.update(cid.plot.STYLE)
 fig, (above, below) = plt.subplots(2, 1, figsize=(8, 4.4), sharex=True, layout="constrained")
 milliseconds = 1e3 * record.t
 above.plot(milliseconds, 1e6 * record.y, "k", label="simulation, ctrlid")
 above.plot(milliseconds[::10], 1e6 * independent[::10], "ko", mfc="none", ms=5,
            label="simulation, scipy")  # fmt: skip
 above.step(milliseconds, 1e6 * r, "0.5", where="post", ls="--", label="reference")
-above.set(ylabel="position [um]")
+above.set(ylabel="position [µm]")
 above.legend(loc="lower left")
 below.plot(milliseconds, record.u, "k")
 below.set(xlabel="time [ms]", ylabel="control voltage [V]")

@@ -62,15 +62,15 @@ for name, G in models.items():
 # In one picture
 # --------------
 
+plt.rcParams.update(cid.plot.STYLE)
 fig, ax = plt.subplots(figsize=(7.2, 4.0), layout="constrained")
 ax.axhline(45, color="k", ls=":", lw=1.2, label="promised by both")
-ax.plot(crossovers, achieved["with the lag"], "o-", color=cid.plot.COLOURS[0],
+ax.plot(crossovers, achieved["with the lag"], "o-",
         label="achieved on the rig, designed with the lag")  # fmt: skip
-ax.plot(crossovers, achieved["without the lag"], "s--", color=cid.plot.COLOURS[1],
+ax.plot(crossovers, achieved["without the lag"], "s--",
         label="achieved on the rig, designed without the lag")  # fmt: skip
 ax.set(xlabel="crossover asked for [rad/s]", ylabel="phase margin [deg]", ylim=(0, 55))
 ax.legend(loc="lower left")
-ax.grid(True, color="0.9")
 plt.show()
 
 # %%

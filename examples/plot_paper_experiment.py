@@ -118,6 +118,7 @@ print(in_log[2]["tied"].estimate)
 # The drift of the pole towards the origin, as in section II.C of the paper, and what is left of it
 # when the samples are read at the best period.
 
+plt.rcParams.update(cid.plot.STYLE)
 figure, axes = plt.subplots(figsize=(6.4, 3.6), layout="constrained")
 milliseconds = [1e3 * T for T in PERIODS]
 axes.axhline(pole, color="black", linewidth=1)
@@ -145,7 +146,7 @@ axes.set_xticks(milliseconds, [f"{T:g}" for T in milliseconds])
 axes.minorticks_off()
 axes.set_xlabel("sampling period [ms]")
 axes.set_ylabel("rate of the largest pole [rad/s]")
-axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False)
+axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2)
 
 # %%
 # What the story asserts.

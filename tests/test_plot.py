@@ -147,6 +147,15 @@ def test_given_axes_are_drawn_on_and_returned(record, comparison):
         plot.comparison(comparison, "here")
 
 
+def test_axes_of_ones_own_in_the_same_style():
+    with mpl.rc_context(plot.STYLE):
+        ax = plot.figure()[0, 0]
+        lines = [ax.plot([0, 1], [k, k])[0] for k in range(len(plot.COLOURS))]
+    assert tuple(line.get_color() for line in lines) == plot.COLOURS
+    assert len({str(line._dash_pattern) for line in lines}) == len(lines)
+    assert not ax.spines["top"].get_visible()
+
+
 def test_comparison_labels_every_curve(comparison):
     ax = plot.comparison(comparison)
     text = legend(ax)
