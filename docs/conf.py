@@ -78,6 +78,9 @@ html_theme_options = {
     "show_toc_level": 2,
     "navigation_with_keys": False,
     "secondary_sidebar_items": ["page-toc"],
-    "header_links_before_dropdown": 7,
+    "header_links_before_dropdown": 9,
 }
-html_sidebars = {page: [] for page in ("index", "which_one_when", "paper", "extend", "gallery/**")}
+WITHOUT_SECTIONS = (
+    "index", "failure", "which_one_when", "paper", "extend", "effects", "gallery/**",
+)  # fmt: skip
+html_sidebars = {page: [] for page in WITHOUT_SECTIONS}
