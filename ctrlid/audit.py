@@ -64,7 +64,7 @@ class Audit(Printed):
     findings : tuple of AuditFinding
         Harmful ones first.
     quantum : mapping of str to float
-        Quantisation step by signal, 0 where there is none.
+        Quantisation step by signal [its unit], 0 where there is none.
     repeats : (int, int)
         Period of the reference in samples and number of whole periods; (0, 0) if it has none.
     saturated : mapping of str to (float, float, float, float)

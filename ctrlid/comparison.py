@@ -24,7 +24,7 @@ class Curve:
     label : str
         What it is: a prediction (uses measured outputs) or a simulation (does not).
     y : ndarray, shape (n,)
-        Reproduced output; NaN where there is none.
+        Reproduced output [output unit]; NaN where there is none.
     fit : float
         Fit in percent, ``100 (1 - |y - yhat| / |y - mean(y)|)``.
     rms : float
@@ -58,7 +58,7 @@ class Comparison(Printed):
     curves : tuple of Curve
         Predictions and simulations.
     residuals : ndarray, shape (n,)
-        One-step prediction errors; NaN where there are none.
+        One-step prediction errors [output unit]; NaN where there are none.
     tests : tuple of Correlation
         Residuals with their own past, with past u and with past r.
     notes : tuple of str

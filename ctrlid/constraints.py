@@ -368,7 +368,7 @@ class Fixed(_Known):
     name : str
         Coefficient, for instance ``"a2"``.
     value : float
-        Its value.
+        Its value [unit of the coefficient].
 
     Examples
     --------
@@ -397,7 +397,7 @@ class Bounds(_Known):
     name : str
         Coefficient, for instance ``"b1"``.
     lower, upper : float
-        Bounds, both allowed values.
+        Bounds, both allowed values [unit of the coefficient].
 
     Examples
     --------
@@ -459,9 +459,9 @@ class Linear(_Known):
     weights : mapping of str to float
         Weight of each coefficient in the sum.
     lower, upper : float
-        Bounds of the sum.
+        Bounds of the sum [its unit].
     equals : float, optional
-        Value of the sum, instead of bounds.
+        Value of the sum [its unit], instead of bounds.
 
     Examples
     --------

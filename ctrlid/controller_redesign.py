@@ -65,9 +65,9 @@ class Redesign(Printed):
     promised, achieved : Performance
         On the model, and on the nonlinear physics of the loop.
     nu_gap : float
-        Distance between the model and the linearized physics (0 the same, 1 worlds apart).
+        Distance [1] between the model and the linearized physics (0 the same, 1 worlds apart).
     robust_margin : float
-        Nu-gap that the design is sure to survive.
+        Nu-gap [1] that the design is sure to survive.
     loop : Loop
         The physics with the new controller.
     time : ndarray

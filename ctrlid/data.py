@@ -89,7 +89,7 @@ class Record(Printed):
         How u runs between samples: held, as a digital controller does, or straight, as a smooth
         analog signal nearly does.
     extra : mapping of str to array_like, optional
-        Further measured channels, for instance a coil current.
+        Further measured channels [as in `units`], for instance a coil current.
     valid : array_like of bool, shape (n,), optional
         Which samples count in fits and comparisons; by default all.
     names : mapping, optional

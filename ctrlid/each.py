@@ -33,8 +33,8 @@ class PoleTrend:
     slope, slope_error : float
         Change of the pole with the output and its standard error [rad/s per output unit].
     exponent, exponent_error : float
-        ``slope level / pole``: the pole goes as the output to this power, minus one half for a ball
-        in a field that falls with the square of the gap. NaN where output or pole change sign.
+        ``slope level / pole`` [1]: the pole goes as the output to this power, minus one half for a
+        ball in a field that falls with the square of the gap. NaN where output or pole change sign.
     p_value : float
         Chance that the standard errors explain the distances from the line; NaN for two records.
     """

@@ -25,11 +25,11 @@ class OperatingPoint:
     Parameters
     ----------
     states : sequence of float
-        State values in the order of the plant's states.
+        State values in the order of the plant's states [their units].
     input : float
-        The input there, which is also the bias that a one-input controller adds.
+        The input there [its unit], which is also the bias that a one-input controller adds.
     output : float
-        The output there.
+        The output there [its unit].
 
     Raises
     ------
@@ -82,7 +82,8 @@ def operating_point(
     output : float
         The output to rest at [output unit].
     guess : sequence of float or OperatingPoint, optional
-        States near which to look first; then the equilibrium found from there is returned.
+        States near which to look first [their units]; then the equilibrium found from there is
+        returned.
 
     Returns
     -------

@@ -255,7 +255,8 @@ class Loop:
         Parameters
         ----------
         values : mapping of str to float
-            New values by name, as in `parameters`: ``{"K": 3e-6, "CoulombFriction.fc": 0.2}``.
+            New values by name as in `parameters`, each in its unit:
+            ``{"K": 3e-6, "CoulombFriction.fc": 0.2}``.
 
         Returns
         -------

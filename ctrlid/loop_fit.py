@@ -39,7 +39,8 @@ class LoopEstimate(Printed):
     values : ndarray, shape (p,)
         Their values [unit of each parameter].
     covariance : ndarray, shape (p, p)
-        Their covariance, from the exact information matrix; infinite for what is not in the data.
+        Their covariance [products of units], from the exact information matrix; infinite for what
+        is not in the data.
     sensor_noise : tuple of float
         Standard deviation of the white sensor noise in each record [output unit].
     force_noise : float

@@ -42,7 +42,7 @@ class Margins:
     gain_reduction_margin : float
         The largest factor below 1 that does: an unstable plant needs its loop gain; 0 if none does.
     modulus_margin : float
-        The smallest distance of L from -1 over all frequencies, that is 1/Ms.
+        The smallest distance [1] of L from -1 over all frequencies, that is 1/Ms.
     delay_margin : float
         The smallest extra delay, in seconds, that reaches the stability limit; 0 if the loop gain
         stays above 1 up to infinite frequency, infinite without a crossover.

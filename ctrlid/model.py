@@ -127,7 +127,8 @@ class Estimate(_text.Printed):
     values : (p,) array
         The coefficients ``a1 .. a_na, b1 .. b_nb``.
     covariance : (p, p) array
-        Their covariance; zero for what a constraint or an active bound fixes.
+        Their covariance, in products of their units; zero for what a constraint or an active bound
+        fixes.
     intercepts : (records,) array
         The constant of each record, in units of the output.
     rss, residual_variance : float

@@ -28,18 +28,18 @@ class Prediction:
     y : ndarray, shape (n,)
         Prediction of each output sample from the samples before it [output unit].
     innovations : ndarray, shape (n,)
-        Measured minus predicted output, zero where the record is not valid.
+        Measured minus predicted output [output unit], zero where the record is not valid.
     settled : ndarray of bool, shape (n,)
         Where the record is valid and the prediction no longer depends on the guess of the state
         at the start, or after a long stretch that does not count.
     spread : ndarray, shape (n,)
-        Standard deviation of the innovations that the filter expects.
+        Standard deviation of the innovations that the filter expects [output unit].
     states : ndarray, shape (n, states)
-        State at each sample, given the outputs up to and including it.
+        State at each sample [units of the states], given the outputs up to and including it.
     circuit : ndarray, shape (n, controller states)
-        State of a known analog controller at each sample, else empty.
+        State of a known analog controller at each sample [units of the controller], else empty.
     sensor_noise, force_noise : float
-        Standard deviations of the noise model.
+        Standard deviations of the noise model [output unit, and unit of the acceleration].
     """
 
     y: Array

@@ -43,7 +43,7 @@ class SamplingRow:
     active : tuple of str
         Inequalities on which the estimate sits.
     deviation : float
-        Largest distance of a pole to that of the whole table, over the largest of those.
+        Ratio: largest distance of a pole to that of the whole table, over the largest of those.
     failure : str
         Why there is no fit; empty if there is one.
     notes : tuple of str

@@ -55,7 +55,7 @@ def random_binary(
     hold : int
         Samples for which each toss is kept.
     around : float
-        The centre r0, for a reference the operating point's output.
+        The centre r0, in the unit of the signal; for a reference the operating point's output.
     seed : int, optional
         Of the random numbers; the same seed gives the same signal.
 
@@ -93,7 +93,7 @@ def steps(n: int, *, levels: Sequence[float] | npt.ArrayLike, hold: int) -> Floa
     n : int
         Number of samples.
     levels : sequence of float
-        The values, in order; after the last one the first follows.
+        The values, in order, in the unit of the signal; after the last one the first follows.
     hold : int
         Samples on each level; long enough for the loop to settle, if its gain is of interest.
 
@@ -155,7 +155,7 @@ def multisine(
         Schroeder's phases pack the most power into the amplitude; random ones are uniformly drawn
         and make independent realisations, for telling nonlinearity from noise.
     around : float
-        The centre r0.
+        The centre r0, in the unit of the signal.
     seed : int, optional
         Of the random phases.
 
@@ -241,7 +241,7 @@ def prbs(
     hold : int
         Samples for which each bit is kept, h.
     around : float
-        The centre r0.
+        The centre r0, in the unit of the signal.
     seed : int
         The register's first state, 1 to 2^order - 1: it shifts the sequence in time.
 

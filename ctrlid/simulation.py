@@ -51,7 +51,8 @@ def simulate(
     d : array_like, shape (n,), optional
         Signal added to the controller's output, ahead of the limits [input unit]: dither, pulses.
     initial : sequence of float, optional
-        Initial plant states, or plant and controller states; by default those at rest.
+        Initial plant states, or plant and controller states [their units]; by default those at
+        rest.
     seed : int, optional
         Seed of the noise.
 

@@ -32,13 +32,13 @@ class OrderRow:
     na, nb, nk : int
         Poles, numerator coefficients, delay in samples.
     misfit : float
-        Chi-square distance to the long regression.
+        Chi-square distance to the long regression [1].
     p_value : float
         Probability of such a distance by chance if the structure is right.
     bic : float
         Misfit plus a price for each coefficient; the smallest is best.
     held_out : float
-        One-step error on the part of the record that was not fitted, over that of the long
+        Ratio: one-step error on the part of the record that was not fitted, over that of the long
         regression there.
     values : ndarray
         Coefficients ``a1 .. a_na, b1 .. b_nb``.

@@ -92,6 +92,25 @@ def test_docstring_matches_signature(name):
     assert problems(name) == {}
 
 
+# A unit in brackets or in words, or a word for a number that has none.
+UNIT = re.compile(
+    r"\[|\bunits?\b|rad/s|in seconds|degrees|percent|\bshares?\b|probabilit|\bchance\b|likelihood|"
+    r"\bfactor|\bratio\b|correlation|coefficient|\bweights?\b|penalty|between 0 and 1|in samples|"
+    r"number of|condition number|criterion|Axes|of bool", re.IGNORECASE
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("name", [*NAMES, *OF_MODULES, *METHODS])
+def test_every_number_has_a_unit(name):
+    target = functools.reduce(getattr, name.split("."), ctrlid)
+    parsed = numpydoc.docscrape.NumpyDocString(inspect.getdoc(target) or "")
+    entries = [*parsed["Parameters"], *parsed["Attributes"], *parsed["Returns"]]
+    silent = [entry.name or "what it returns" for entry in entries
+              if re.search("float|array", entry.type)
+              and not UNIT.search(f"{entry.type} {' '.join(entry.desc)}")]  # fmt: skip
+    assert silent == []
+
+
 @pytest.mark.parametrize("page", PAGES, ids=identifier)
 def test_what_a_page_shows_is_what_the_code_does(page):
     flags = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE

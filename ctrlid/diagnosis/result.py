@@ -31,8 +31,8 @@ class Gap:
     time, measured : ndarray, shape (m,)
         The held-out samples [s, output unit].
     simulated_before, simulated_after : ndarray, shape (m,)
-        What the recalibrated model and the model with the effects make of them; NaN where there
-        is nothing.
+        What the recalibrated model and the model with the effects make of them [output unit]; NaN
+        where there is nothing.
     """
 
     kind: str
@@ -56,7 +56,7 @@ class Finding:
     effect : AbstractEffect
         The effect with its fitted parameters.
     standard_errors : dict of str to float
-        Standard errors of the parameters, by name.
+        Standard errors of the parameters, by name [unit of each].
     alternatives : tuple of AbstractEffect
         Effects that this record cannot tell apart from it, each with its own fitted parameters.
     equivalents : tuple of str
@@ -68,7 +68,7 @@ class Finding:
     experiment : str
         The experiment that would separate the effect from its alternatives; empty without any.
     reference : ndarray or None
-        That experiment as a reference signal, ready to run.
+        That experiment as a reference signal [output unit], ready to run.
     note : str
         What else should be known, such as the records in which it was present.
     """
@@ -135,7 +135,7 @@ class Place:
     unit : str
         Unit of the axis.
     edges : ndarray, shape (bins + 1,)
-        Bins of the axis.
+        Bins of the axis [`unit`].
     before, after : ndarray, shape (bins,)
         Mean square of the innovations in each bin, in units of their expected variance: 1 is
         noise. Before and after the effects were added.
@@ -185,9 +185,9 @@ class Calibrated:
     name : str
         The parameter.
     given, before, after : float
-        Its value as handed in, recalibrated alone, and with the effects.
+        Its value as handed in, recalibrated alone, and with the effects [its unit].
     standard_error : float
-        Standard error of the last.
+        Standard error of the last [its unit].
     """
 
     name: str
@@ -222,8 +222,8 @@ class Diagnosis(Printed):
     calibrated : tuple of Calibrated
         The model's own free parameters.
     sensitivity : dict of str to float
-        The smallest size of each effect that this record would have shown, by name of the
-        parameter, such as ``"CoulombFriction.fc"``.
+        The smallest size [unit of the parameter] of each effect that this record would have shown,
+        by name of the parameter, such as ``"CoulombFriction.fc"``.
     tests : dict of str to float
         Probabilities that the final innovations are noise, by name of the test.
     audit : tuple of str
