@@ -27,11 +27,9 @@ import joblib
 import numpy as np
 from _random_loops import Noise, log_uniform
 from scipy.stats import beta
-from study_iv import design, plant
+from study_iv import design, information_bound, plant
 
 import ctrlid as cid
-from ctrlid.likelihood import begin, information, pseudo_inverse
-from ctrlid.loop_fit import choose_noise, make_problem, start_values
 from ctrlid.simulation import Simulator
 
 Z95 = 1.959964
@@ -132,18 +130,6 @@ def draw(seed: int, run: int, only: str | None, long: bool) -> Draw:
         return Draw(kind, loop, loop.with_parameters(wrong), record, tags)
 
 
-def bounds(one: Draw) -> np.ndarray:
-    """Cramér-Rao bound on the standard deviations, at the true parameters."""
-    names = one.loop.free
-    start = begin(make_problem(one.loop, names, [one.record]), start_values(one.loop, names), None)
-    fit = choose_noise(start)
-    if fit.theta is not start.theta:  # the choice of the noise may have moved the parameters
-        at = [out.trajectory for out in fit.filtered]
-        fit = begin(start.problem, start.theta, fit.noise, at)
-    inverse = pseudo_inverse(information(fit)[0])
-    return np.sqrt(np.diag(inverse)[: len(names)])
-
-
 def run(seed: int, number: int, only: str | None, long: bool) -> list[dict[str, Any]]:
     """One draw: a row for each parameter."""
     one = draw(seed, number, only, long)
@@ -155,7 +141,11 @@ def run(seed: int, number: int, only: str | None, long: bool) -> list[dict[str, 
     spent = time.perf_counter() - started
     rows = []
     for name, bound, value, error in zip(
-        estimate.names, bounds(one), estimate.values, estimate.standard_errors, strict=True
+        estimate.names,
+        information_bound(one.loop, one.record),
+        estimate.values,
+        estimate.standard_errors,
+        strict=True,
     ):
         truth = one.loop.parameters[name]
         rows.append({

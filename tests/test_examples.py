@@ -72,6 +72,45 @@ def test_magnetoshield_needs_the_delay_and_the_lag(levitations):
     assert np.ptp(second) > 15
 
 
+def test_magnetoshield_is_as_fast_at_every_gap(levitations, capsys):
+    """The continuous fit, free of the bias: one pair at all set-points, though the gaps differ."""
+    series = levitations.set_points()
+    assert np.all((series.rates > 48) & (series.rates < 52))
+    assert np.all(series.rate_errors < 1)
+    line = series.trend
+    assert line.p_value > 0.01
+    assert line.exponent - 2.6 * line.exponent_error > -0.5  # a ball's would be at -0.5
+    assert "one model of all five: p = 50.0 ± 0.3" in capsys.readouterr().out
+
+
+def load_benchmark(name):
+    spec = importlib.util.spec_from_file_location(
+        name, EXAMPLES.parent / "benchmarks" / f"{name}.py"
+    )
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_real_records_and_their_physics(data_dir, capsys):
+    """What statics say, from gaps and currents at rest, is what the fits find in the motion."""
+    del data_dir
+    rigs = load_benchmark("real_records")
+    series, statics = rigs.magnetoshield()
+    assert np.abs(series.rates / statics - 1).max() < 0.06
+    for level, poles, errors in rigs.inteco():
+        expected = np.sqrt(2 * 9.81 / (level + 0.00225))
+        off = np.abs(poles - [expected, -expected])
+        assert np.all(off < 0.16 * expected + 3 * errors), level
+    assert "the pull falls as i^2/(x + 2.2 mm)^2" in capsys.readouterr().out
+
+
+def test_a_long_log_is_fitted_in_blocks(capsys, monkeypatch):
+    monkeypatch.setattr("sys.argv", ["bench_long.py", "--samples", "1200000"])
+    load_benchmark("bench_long").main()
+    assert "1199998 rows" in capsys.readouterr().out
+
+
 def test_the_tutorial(capsys):
     """From a CSV file to a controller whose promise only the named effect lets it keep."""
     told = runpy.run_path(str(EXAMPLES / "plot_04_csv_to_controller.py"))
