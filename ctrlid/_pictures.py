@@ -52,7 +52,9 @@ def telling(comparison: Comparison) -> int:
 
 
 def checked_models(models: Any, who: str) -> dict[str, Any]:
-    """Return models by label, or refuse in the name of a picture."""
+    """Return models by label, a single one by its name, or refuse in the name of a picture."""
+    if isinstance(models, ct.TransferFunction | ct.StateSpace):
+        models = {models.name: models}
     if not isinstance(models, Mapping) or not models:
         raise CtrlidError(f"{who} takes a mapping from labels to models, {{'fitted': G}}, with at "
                           f"least one model; given {type(models).__name__}")  # fmt: skip

@@ -39,7 +39,7 @@ class Loop:
     dt : float
         Sampling period of the record [s].
     at : OperatingPoint, optional
-        Operating point; by default all zero.
+        Operating point; by default all zero, which a plant must be defined at.
     free : sequence of str, optional
         Names of the plant parameters that are uncertain.
     input_limits : (float, float), optional
@@ -85,6 +85,9 @@ class Loop:
             raise CtrlidError(f"the plant is sampled at {equations.dt:g} s, the loop at "
                               f"{self.dt:g} s; give dt={equations.dt:g}")  # fmt: skip
         n = len(equations.states)
+        if self.at is None and not np.isfinite(equations.evaluate(np.zeros(n), 0.0)[0]).all():
+            raise CtrlidError(f"{equations.name} is not defined where all its signals are zero; "
+                              "give at=operating_point(plant, output=...)")  # fmt: skip
         at = self.at or OperatingPoint((0.0,) * n, 0.0, 0.0)
         if not isinstance(at, OperatingPoint):
             raise CtrlidError(

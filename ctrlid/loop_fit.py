@@ -265,7 +265,7 @@ def _at_rest(loop: Loop) -> Any:
 
 
 def _records(record: Any) -> tuple[Record, ...]:
-    records = (record,) if isinstance(record, Record) else tuple(record)
+    records = tuple(record) if isinstance(record, Sequence) else (record,)
     if not records or not all(isinstance(r, Record) for r in records):
         raise CtrlidError("a fit needs a Record, or a sequence of Records; given "
                           f"{type(record).__name__}")  # fmt: skip

@@ -235,7 +235,7 @@ def residuals(comparison: Comparison, axes: Any = None) -> Any:
     return axes
 
 
-def poles(models: Mapping[str, Any], ax: Any = None, *, truth: Any = None) -> Any:
+def poles(models: Any, ax: Any = None, *, truth: Any = None) -> Any:
     """Draw the poles of models against the border of stability.
 
     If one of the models is sampled, all are drawn in the z-plane (continuous ones at
@@ -245,7 +245,7 @@ def poles(models: Mapping[str, Any], ax: Any = None, *, truth: Any = None) -> An
     Parameters
     ----------
     models : mapping of str to control.TransferFunction or control.StateSpace
-        The models by label.
+        The models by label, or one model.
     ax : matplotlib Axes, optional
         By default that of a new figure.
     truth : control.TransferFunction or control.StateSpace, optional
@@ -299,15 +299,14 @@ def poles(models: Mapping[str, Any], ax: Any = None, *, truth: Any = None) -> An
     return _finish(ax, columns=1)
 
 
-def bode(
-    models: Mapping[str, Any], axes: Any = None, *, omega: Any = None, level: float | None = 0.95
-) -> Any:
+def bode(models: Any, axes: Any = None, *, omega: Any = None, level: float | None = 0.95) -> Any:
     """Draw the frequency responses of models, magnitude above phase, of fits with their bands.
 
     Parameters
     ----------
     models : mapping of str to control.TransferFunction or control.StateSpace
-        The models by label. Sampled ones end at their Nyquist frequency, which is marked.
+        The models by label, or one model. Sampled ones end at their Nyquist frequency, which is
+        marked.
     axes : sequence of two matplotlib Axes, optional
         By default those of a new figure.
     omega : array_like, optional

@@ -71,7 +71,9 @@ def compare(record: Record, model_or_loop: Any, *, horizon: int | None = None) -
     ['one-step prediction', '50-step prediction', 'closed-loop simulation']
     """
     if not isinstance(record, Record):
-        raise CtrlidError(f"compare needs a Record; given {type(record).__name__}")
+        raise CtrlidError(
+            f"compare needs a Record first, then the model; given {type(record).__name__}"
+        )
     if horizon is not None and not (isinstance(horizon, Integral) and 1 <= horizon < len(record)):
         raise CtrlidError(
             f"horizon must be between 1 and {len(record) - 1} samples; given {horizon}"

@@ -425,8 +425,8 @@ def test_a_parameter_without_any_influence():
 def test_refusals():
     loop = levitation()
     record = experiment(loop, 1e-4, 15, n=300, sensor_noise=2e-6)
-    for bad in (None, 3, [], [record, 3], "record"):
-        with pytest.raises((CtrlidError, TypeError)):
+    for bad in (None, 3, [], [record, 3], "record", loop):
+        with pytest.raises(CtrlidError, match="a fit needs a Record"):
             cid.fit_loop(loop, bad)
     with pytest.raises(CtrlidError, match=r"needs a Record, or a sequence of Records; given list"):
         cid.fit_loop(loop, [])

@@ -256,6 +256,12 @@ def test_models_are_checked(draw, models, words):
         draw(models)
 
 
+@pytest.mark.parametrize("draw", [plot.poles, plot.bode])
+def test_one_model_needs_no_label(draw):
+    ax = np.ravel(draw(ct.tf(1, [1, 0.5], name="tank")))[0]
+    assert legend(ax)[0].startswith("tank")
+
+
 def test_poles_that_do_not_compare_are_refused():
     one, other = ct.tf(1, [1, 0.5], 0.1), ct.tf(1, [1, 0.5], 0.2)
     with pytest.raises(cid.CtrlidError, match=r"different sampling periods .*a: 0.1 s, b: 0.2 s"):

@@ -204,6 +204,9 @@ def test_a_plant_too_sharp_to_integrate_warns():
         cid.simulate(loop, d=60 * np.sin(np.arange(100)))
 
 
+NOWHERE = cid.OperatingPoint(states=(0.0, 0.0), input=0.0, output=0.0)
+
+
 @pytest.mark.parametrize(
     ("call", "words"),
     [
@@ -219,10 +222,13 @@ def test_a_plant_too_sharp_to_integrate_warns():
             "needs a Loop.*given NonlinearIOSystem",
         ),
         (
-            lambda loop: cid.simulate(cid.Loop(loop.plant, 1.0, dt=1.0), np.ones(5)),
+            lambda loop: cid.simulate(cid.Loop(loop.plant, 1.0, dt=1.0, at=NOWHERE), np.ones(5)),
             "not defined at the operating point",
         ),
-        (lambda loop: growth_rate(cid.Loop(loop.plant, 1.0, dt=1.0)), "no derivative at its"),
+        (
+            lambda loop: growth_rate(cid.Loop(loop.plant, 1.0, dt=1.0, at=NOWHERE)),
+            "no derivative at its",
+        ),
         (lambda loop: cid.simulate(cid.Loop(loop.plant, None, dt=1.0, at=loop.at)), "needs r or d"),
     ],
 )
@@ -247,6 +253,10 @@ POINT = cid.operating_point(MAGLEV, output=0.01)
     [
         ({"dt": -1.0}, "sampling period dt > 0 s; given dt=-1.0"),
         ({}, "sampling period dt > 0"),
+        (
+            {"at": None, "dt": 0.001},
+            "maglev is not defined where all its signals are zero; give at=",
+        ),
         ({"dt": 0.01, "free": ("Kc",)}, r"free= names \['Kc'\].*\['m', 'K', 'g'\]"),
         ({"dt": 0.01, "at": (0.01, 0.0)}, "at= needs an OperatingPoint"),
         (
