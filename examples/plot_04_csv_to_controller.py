@@ -153,6 +153,14 @@ cid.plot.diagnosis(found)
 plt.show()
 
 # %%
+# The same without a script, with the controller in a file ``rig.py``:
+#
+# .. code-block:: bash
+#
+#    python -m ctrlid diagnose levitation.csv --columns r=setpoint,u=voltage,y=gap \
+#        --model maglev --param m=0.0213 K=3.34e-6 --free K --at-output 0.012 \
+#        --controller rig.py:lead_on_the_rig --save found
+#
 # 7. Redesign
 # -----------
 # `found.loop` is the completed model. `redesign` designs a lead on a linear model, a digital one
