@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import control as ct
+import matplotlib as mpl
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -38,12 +39,13 @@ for noise in noises:
     for name, fit in fits.items():
         rates[name].append(float(np.max(fit(record).estimate.poles_s.real)))
 
-figure = Figure(figsize=(7.2, 3.6), layout="constrained", dpi=160)
+mpl.rcParams.update(cid.plot.STYLE)
+figure = Figure(figsize=(7.2, 4.0), layout="constrained", dpi=160)
 FigureCanvasAgg(figure)
 axes = figure.add_subplot()
 truth = float(np.max(P.poles().real))
 axes.axhline(truth, color="black", linewidth=1)
-axes.text(noises[-1] * 100, truth + 0.8, "physics", ha="right")
+axes.text(25, truth + 0.8, "physics", ha="center")
 styles = (
     ("o", ":", "#D55E00"),
     ("s", "--", "#0072B2"),
@@ -56,8 +58,8 @@ for (name, values), (marker, line, color) in zip(rates.items(), styles, strict=T
     print(f"{name:<30}" + "".join(f"{v:8.2f}" for v in values))
 axes.axhline(0, color="0.6", linewidth=0.8)
 axes.text(100 * noises[0], -0.8, "stable below", va="top", color="0.4")
-axes.set_ylim(top=1.12 * truth)
+axes.set_ylim(top=1.15 * truth)
 axes.set_xlabel("sensor noise [% of the reference's amplitude]")
 axes.set_ylabel("unstable pole found [rad/s]")
-axes.legend(frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2)
 figure.savefig(Path(__file__).parent / "_static" / "readme.png")
