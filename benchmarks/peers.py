@@ -31,6 +31,8 @@ from study_iv import KNOWN, Draw, draw
 
 import ctrlid as cid
 
+TIGHT = {"ftol": 1e-10, "xtol": 1e-8, "gtol": 1e-8}  # archimedes stops early by default
+
 
 @dataclass(frozen=True)
 class Scaled:
@@ -147,9 +149,10 @@ def archimedes_pem(one: Draw) -> np.ndarray:
     observer = ExtendedKalmanFilter(
         model, lambda t, x, u, p: x[0], Q=1e-8 * sigma**2 * np.eye(2), R=np.array([[sigma**2]])
     )
-    data = Timeseries(ts=record.t, us=u[None, :], ys=y[None, :])
+    # Its filter predicts y(k) with the input of the same row: that is u(k-1).
+    data = Timeseries(ts=record.t[1:], us=u[None, :-1], ys=y[None, 1:])
     start = {"alpha": 1.05, "beta": 0.95}
-    found = pem(observer, data, start, x0=np.zeros(2), P0=sigma**2 * np.eye(2)).p
+    found = pem(observer, data, start, x0=np.zeros(2), P0=sigma**2 * np.eye(2), options=TIGHT).p
     return np.array([found["alpha"] * one.alpha, found["beta"] * one.beta])
 
 
@@ -173,7 +176,7 @@ PEERS: dict[str, tuple[str, Callable[[Scaled], np.ndarray]]] = {
     "pysib arx": ("pysib", pysib_arx),
     "pysib armax": ("pysib", pysib_armax),
     "SIPPY ARX": ("sippy_unipi", sippy_arx),
-    "SIPPY ARMAX": ("sippy_unipi", sippy_armax),
+    "SIPPY ARMAX, ILLS": ("sippy_unipi", sippy_armax),
     "SIPPY PARSIM-K": ("sippy_unipi", sippy_parsim),
     "SysIdentPy FROLS": ("sysidentpy", sysidentpy_arx),
     "SysIdentPy FROLS, extended LS": ("sysidentpy", sysidentpy_extended),

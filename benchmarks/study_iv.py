@@ -222,9 +222,14 @@ def cramer_rao(
 
 def physical(estimate: Estimate, values: np.ndarray | None = None) -> np.ndarray:
     """Alpha from the pole farthest out, beta from the static gain."""
-    a1, a2, b1, b2 = estimate.values if values is None else values
+    return physical_values(estimate.values if values is None else values, estimate.dt)
+
+
+def physical_values(theta: np.ndarray, dt: float) -> np.ndarray:
+    """Alpha and beta of the coefficients a1, a2, b1, b2."""
+    a1, a2, b1, b2 = theta
     x = np.roots([1.0, 2.0 + a1, 1.0 + a1 + a2]).astype(complex)  # poles less one
-    s = np.log1p(x[np.argmax(np.abs(1 + x))]) / estimate.dt
+    s = np.log1p(x[np.argmax(np.abs(1 + x))]) / dt
     alpha = float((s * s).real)
     return np.array([alpha, alpha * (b1 + b2) / (1 + a1 + a2)])
 
@@ -263,10 +268,9 @@ def _regression(one: Draw, known: Sequence[object]) -> tuple[np.ndarray, np.ndar
 
 
 def _delayed(one: Draw) -> tuple[np.ndarray, np.ndarray]:
-    # Any fit will do: of it only the sampling period is used.
-    estimate = cid.fit_arx(one.record[:100], 2, 2).estimate
     with np.errstate(divide="ignore", invalid="ignore"):
-        return physical(estimate, delayed_references(one.record)), np.full(2, np.nan)
+        theta = delayed_references(one.record)
+        return physical_values(theta, one.record.dt), np.full(2, np.nan)
 
 
 def _instruments(one: Draw, free: bool, given: bool) -> tuple[np.ndarray, np.ndarray]:
@@ -348,8 +352,12 @@ def study(
     analog: bool = False,
     only: Sequence[str] = ESTIMATORS[:4],
     jobs: int = 1,
+    tell: bool = False,
 ) -> dict[tuple[float, float], tuple[np.ndarray, np.ndarray]]:
-    """All runs: by p*Ts and noise the errors of each estimator and the bounds, relative."""
+    """All runs: by p*Ts and noise the errors of each estimator and the bounds, relative.
+
+    With ``tell`` each line of the table is printed as soon as it is known.
+    """
 
     def one_run(seed: int, i: int, j: int) -> tuple[np.ndarray, np.ndarray]:
         rng = np.random.default_rng([seed, i, j])
@@ -367,6 +375,8 @@ def study(
             done = work(joblib.delayed(one_run)(seed, i, j) for seed in range(runs))
             found, bounds = zip(*done, strict=True)
             table[step, noise] = np.array(found), np.array(bounds)
+            if tell:
+                show(f"p*Ts {step:<6} noise {100 * noise:g} %", *table[step, noise])
     return table
 
 
@@ -389,10 +399,8 @@ def main() -> None:
     print("alpha / beta: median error %, bias in s.e., covered %, efficiency")
     table = study(
         options.runs, swing=options.physics, free=options.free, given=options.given,
-        analog=options.analog, only=options.only, jobs=options.jobs,
+        analog=options.analog, only=options.only, jobs=options.jobs, tell=True,
     )  # fmt: skip
-    for (step, noise), (found, bound) in table.items():
-        show(f"p*Ts {step:<6} noise {100 * noise:g} %", found, bound)
     found, bound = (np.concatenate(parts) for parts in zip(*table.values(), strict=True))
     show(f"all {len(found)} runs", found, bound)
 

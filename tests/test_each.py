@@ -1,8 +1,11 @@
 """Many and long records: one model each, trends, jobs, a dask cluster, constant memory."""
 
 import tracemalloc
+from contextlib import contextmanager
 from dataclasses import replace
 
+import cloudpickle
+import distributed
 import joblib
 import numpy as np
 import pytest
@@ -117,12 +120,18 @@ def test_processes_give_the_same_numbers(records, series):
     assert same([cid.fit_arx(records, 2, 2)], [cid.fit_arx(records, 2, 2, jobs=2)])
 
 
-def test_a_dask_cluster_gives_the_same_numbers(records, series):
-    distributed = pytest.importorskip("distributed")
+@contextmanager
+def local_cluster():
+    """A dask cluster of two workers in this process, to which joblib sends as to a distant one."""
     cluster = distributed.LocalCluster(
         n_workers=2, threads_per_worker=1, processes=False, dashboard_address=None
     )
-    with cluster, distributed.Client(cluster), joblib.parallel_config(backend="dask"):
+    with cluster, distributed.Client(cluster):
+        yield
+
+
+def test_a_dask_cluster_gives_the_same_numbers(records, series):
+    with local_cluster(), joblib.parallel_config(backend="dask"):
         spread = cid.fit_each(cid.fit_iv, records, na=2, nb=2, constraints=KNOWN)
         one = cid.fit_arx(records, 2, 2)
         sweep = cid.sweep_sampling_period(
@@ -208,3 +217,39 @@ def test_what_a_generator_yields_is_checked(records):
         cid.fit_arx(iter([]), 2, 2)
     with pytest.raises(cid.CtrlidError, match="Record 2 has no usable row"):
         cid.fit_arx(iter([records[0], records[1][:2]]), 2, 2)
+
+
+def test_a_loop_travels_to_other_processes():
+    """Plant, effects and equations survive cloudpickle, which joblib and dask send work with."""
+    plant = cid.plants.maglev(m=0.0213, K=3.34e-6)
+    at = cid.operating_point(plant, output=0.012)
+    lead = cid.design_lead(cid.linearize(plant, at), crossover=100, phase_margin=50)
+    loop = cid.Loop(plant, lead.sample(0.002, "tustin"), dt=0.002, at=at, free=("K",))
+    for effect in (
+        cid.effects.ActuatorLag(2e-3), cid.effects.InputDelay(1e-3),
+        cid.effects.InputBacklash(0.01), cid.effects.CoulombFriction(0.1),
+        cid.effects.Quantization(1e-6),
+    ):  # fmt: skip
+        loop = loop.with_effect(effect)
+    again = cloudpickle.loads(cloudpickle.dumps(loop))
+    assert repr(again) == repr(loop)
+    r = cid.random_binary(300, amplitude=1e-4, hold=15, around=0.012, seed=1)
+    one, other = (cid.simulate(it, r, sensor_noise=1e-6, seed=2) for it in (loop, again))
+    assert np.array_equal(one.y, other.y)
+    assert again.parameters == loop.parameters
+
+
+def test_a_diagnosis_on_a_dask_cluster_finds_the_same():
+    plant = cid.plants.maglev(m=0.0213, K=3.34e-6)
+    at = cid.operating_point(plant, output=0.012)
+    lead = cid.design_lead(cid.linearize(plant, at), crossover=100, phase_margin=50)
+    model = cid.Loop(plant, lead.sample(0.002, "tustin"), dt=0.002, at=at, free=("K",))
+    rig = model.with_effect(cid.effects.ActuatorLag(tau=0.002))
+    r = cid.random_binary(1000, amplitude=2e-4, hold=20, around=at.output, seed=1)
+    record = cid.simulate(rig, r, sensor_noise=5e-6, seed=2)
+    few = {"catalogue": (cid.effects.ActuatorLag, cid.effects.CoulombFriction), "progress": False}
+    with local_cluster(), joblib.parallel_config(backend="dask"):
+        spread = cid.diagnose(model, record, jobs=2, **few)
+    alone = cid.diagnose(model, record, **few)
+    assert [f.name for f in spread.findings] == [f.name for f in alone.findings] == ["ActuatorLag"]
+    assert spread.loop.parameters == alone.loop.parameters
