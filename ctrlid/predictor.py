@@ -95,6 +95,9 @@ def predict(loop: Loop, record: Record, force_noise: float | None = None) -> Pre
     >>> bool(cid.predict(loop, record).innovations.std() < 1.3e-3)
     True
     """
+    if not (isinstance(loop, Loop) and isinstance(record, Record)):
+        raise CtrlidError("predict needs the Loop first, then the Record; given "
+                          f"{type(loop).__name__} and {type(record).__name__}")  # fmt: skip
     if force_noise is not None and not (np.isfinite(force_noise) and force_noise >= 0):
         raise CtrlidError(f"force_noise is a ratio >= 0; given {force_noise!r}")
     track, m = make_track(loop, record), machine_for(loop, (), record)
