@@ -230,7 +230,7 @@ def test_several_steps_need_as_many_valid_samples():
 def test_refusals():
     loop = maglev()
     record = experiment(loop, n=200)
-    with pytest.raises(CtrlidError, match="the Loop first, .*; given Record and Loop"):
+    with pytest.raises(CtrlidError, match=r"the Loop first, .*; given Record and Loop"):
         cid.predict(record, loop)
     with pytest.raises(CtrlidError, match=r"the loop is sampled at 0.001 s, the record at 0.002 s"):
         cid.predict(loop, record.decimate(2, antialias=False))
