@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy import optimize
+from scipy import linalg, optimize, signal
 
 from .errors import CtrlidError
 from .filtering import SETTLED, Filtered, Linearized, Machine, Noise, Track, Trajectory
@@ -17,8 +17,22 @@ ROUNDS = 25  # Gauss-Newton steps at most
 FAR = 3.0  # standard errors: after a longer step the trajectory is settled anew
 CLOSE = 0.02  # standard errors: a smaller step ends the search
 QUIET = 1e-14  # of the output's size, squared: the least variance of the sensor noise
+WHITENER = 40  # coefficients of a filter that makes innovations white
 LOG_STEP = 0.2  # of log variances, for derivatives
 SINGULAR = 1e-10  # relative eigenvalue below which a direction is not in the data
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """Noise that is known beforehand: ratios, and the variance of each record's sensor noise.
+
+    `whitener` holds the coefficients of a filter that makes white what this noise leaves in the
+    innovations, such as the lines of a mains hum in the sensor.
+    """
+
+    noise: Noise
+    sensor: Array
+    whitener: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +49,11 @@ class Problem:
         Bounds of the parameters.
     counts : tuple of ndarray of bool
         Samples of each record that enter the likelihood.
+    known : Known, optional
+        The noise, where it is not to be searched.
+    periods : tuple of int
+        For each record, after how many samples it repeats itself: then only the differences
+        between the repeats count, which no wrong model can have made.
     """
 
     machine: Machine
@@ -42,6 +61,8 @@ class Problem:
     lower: Array
     upper: Array
     counts: tuple[Any, ...] = ()
+    known: Known | None = None
+    periods: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,6 +124,7 @@ def begin(problem: Problem, theta: Array, noise: Noise | None) -> Fit:
         The starting point.
     """
     m = problem.machine
+    noise = problem.known.noise if problem.known else noise
     first = noise or Noise((_unit(m) ** 2 * 1e-2,) * m.channels)
     settled = []
     for track in problem.tracks:
@@ -145,19 +167,50 @@ def _measure(
 ) -> Fit:
     m = problem.machine
     outs = tuple(
-        m.run(t, lin, noise, sensitive) for t, lin in zip(problem.tracks, lins, strict=True)
+        whitened(m.run(t, lin, noise, sensitive), problem.known)
+        for t, lin in zip(problem.tracks, lins, strict=True)
     )
     value, sensors = 0.0, []
-    for track, out, keep in zip(problem.tracks, outs, problem.counts, strict=True):
+    for k, (track, out, keep) in enumerate(zip(problem.tracks, outs, problem.counts, strict=True)):
         e, s = out.innovations[keep], out.variance[keep]
+        if problem.periods:
+            e, s = _between_repeats(out, keep, problem.periods[k])
         if not (np.isfinite(e).all() and np.isfinite(s).all() and (s > 0).all()):
             value, e, s = -math.inf, np.ones(1), np.ones(1)
-        r = float(np.mean(e**2 / s))
-        least = QUIET * float(np.var(track.table[3][keep]) + np.mean(track.table[3][keep]) ** 2)
-        r = max(r, least, 1e-300)
-        value -= 0.5 * (len(e) * (math.log(r) + math.log(2 * math.pi) + 1) + np.sum(np.log(s)))
+        mean = float(np.mean(e**2 / s))
+        if problem.known is not None:
+            r = float(problem.known.sensor[k])
+        else:
+            least = QUIET * float(np.var(track.table[3][keep]) + np.mean(track.table[3][keep]) ** 2)
+            r = max(mean, least, 1e-300)
+        value -= 0.5 * (len(e) * (math.log(2 * math.pi * r) + mean / r) + np.sum(np.log(s)))
         sensors.append(r)
     return Fit(problem, theta, noise, float(value), np.array(sensors), tuple(lins), outs)
+
+
+def whitened(out: Filtered, known: Known | None) -> Filtered:
+    """Return what a pass of the filter gave, with innovations and slopes made white."""
+    if known is None or known.whitener is None:
+        return out
+    e, slopes = (
+        signal.lfilter(known.whitener, [1.0], np.nan_to_num(x), axis=0)
+        for x in (out.innovations, out.slopes)
+    )
+    return replace(out, innovations=e, slopes=slopes)
+
+
+def _between_repeats(out: Filtered, keep: Any, period: int) -> tuple[Array, Array]:
+    """Return what differs between repeats of the innovations, as large as they are, and variances.
+
+    Counted from the end: whatever dies out at the start does not repeat.
+    """
+    first = len(keep) % period
+    e, use = out.innovations[first:].reshape(-1, period), keep[first:].reshape(-1, period)
+    count = use.sum(axis=0)
+    mean = np.sum(np.where(use, e, 0.0), axis=0) / np.maximum(count, 1)
+    use = use & (count > 1)
+    size = np.sqrt(count / np.maximum(count - 1, 1))
+    return ((e - mean) * size)[use], out.variance[first:].reshape(-1, period)[use]
 
 
 def _log_noise(noise: Noise, dt: float) -> Array:
@@ -182,6 +235,8 @@ def _tune(
 ) -> Fit:  # fmt: skip
     """Return the most likely noise for parameters as they are."""
     m, dt = problem.machine, problem.machine.loop.dt
+    if problem.known is not None:
+        return _measure(problem, theta, problem.known.noise, lins)
 
     def at(logs: Array) -> Noise:
         return _noise(logs, m.channels, dt)
@@ -415,6 +470,75 @@ def with_coloured_force(fit: Fit) -> Fit:
     return _tune(fit.problem, fit.theta, fit.linearized, best.noise)
 
 
+def known_from_repeats(fit: Fit, periods: Sequence[int]) -> Known:
+    r"""Return the noise that differs between repeats of the same experiment.
+
+    .. math:: d_k^p = \sqrt{\tfrac{P}{P-1}} \Bigl( e_k^p - \tfrac{1}{P} \sum_q e_k^q \Bigr)
+
+    What a wrong model leaves in the innovations e is the same in each of the P periods; what
+    differs is noise. A coloured force takes part if the Bayesian criterion wants it.
+
+    Parameters
+    ----------
+    fit : Fit
+        A fit of any model that follows the records.
+    periods : sequence of int
+        For each record, after how many samples it repeats itself.
+
+    Returns
+    -------
+    Known
+        The noise.
+
+    References
+    ----------
+    Pintelon and Schoukens, *System Identification: A Frequency Domain Approach*, section 4.3.
+    """
+    problem = replace(fit.problem, known=None, periods=tuple(periods))
+    plain = _tune(problem, fit.theta, fit.linearized, Noise(fit.noise.force), wide=True)
+    richer = with_coloured_force(plain)
+    best = richer if richer.value > plain.value + math.log(fit.size) else plain
+    return Known(best.noise, best.sensor)
+
+
+def known_from_rest(fit: Fit, rest: Sequence[Any]) -> Known:
+    r"""Return the noise of the samples at which nothing is asked of the plant.
+
+    There a wrong model has little to be wrong about. A filter
+
+    .. math:: w_k = e_k + a_1 e_{k-1} + \dots + a_p e_{k-p}
+
+    from the autocorrelation of the innovations e makes white what the noise model leaves.
+
+    Parameters
+    ----------
+    fit : Fit
+        A fit of any model that follows the records.
+    rest : sequence of ndarray of bool
+        For each record, the samples at rest.
+
+    Returns
+    -------
+    Known
+        The noise.
+
+    References
+    ----------
+    Ljung, *System Identification*, section 7.3 (Yule-Walker equations).
+    """
+    problem = replace(fit.problem, known=None, counts=tuple(rest))
+    plain = _tune(problem, fit.theta, fit.linearized, Noise(fit.noise.force), wide=True)
+    richer = with_coloured_force(plain)
+    best = richer if richer.value > plain.value + math.log(fit.size) else plain
+    products = np.zeros(WHITENER + 1)
+    for z in best.standardized:
+        filled = np.nan_to_num(z)
+        products += [filled[k:] @ filled[: len(filled) - k] for k in range(WHITENER + 1)]
+    a = linalg.solve_toeplitz(products[:-1], -products[1:])
+    share = float(1 + a @ products[1:] / products[0])
+    return Known(best.noise, best.sensor * share, np.concatenate([[1.0], a]))
+
+
 def information(fit: Fit) -> tuple[Array, Array]:
     r"""Return the exact Fisher information of parameters and noise, and the score.
 
@@ -445,7 +569,7 @@ def information(fit: Fit) -> tuple[Array, Array]:
     dt, p = m.loop.dt, len(fit.theta)
     at = [out.trajectory for out in fit.filtered]
     _, error = bounded_step(fit, *fit.normal)
-    logs = _log_noise(fit.noise, dt)
+    logs = _log_noise(fit.noise, dt) if problem.known is None else np.zeros(0)
 
     def innovations(theta: Array, noise: Noise) -> Any:
         out = evaluate(problem, theta, noise, at).filtered
@@ -469,13 +593,13 @@ def information(fit: Fit) -> tuple[Array, Array]:
             moved[k] += h
             pair.append(innovations(fit.theta, _noise(moved, m.channels, dt)))
         columns.append(_difference(pair, 2 * LOG_STEP))
-    count, records = len(columns), len(problem.tracks)
+    count, records = len(columns), len(problem.tracks) if problem.known is None else 0
     matrix = np.zeros((count + records, count + records))
     score = np.zeros(count + records)
     for k, (out, keep, r) in enumerate(zip(fit.filtered, problem.counts, fit.sensor, strict=True)):
         s, e = out.variance[keep] * r, out.innovations[keep]
         size = np.zeros((len(e), records))
-        size[:, k] = 1.0
+        size[:, k : k + 1] = 1.0
         slopes = np.column_stack([c[k][0] for c in columns] + [np.zeros_like(size)])
         widths = np.column_stack([c[k][1] for c in columns] + [size])
         matrix += (slopes / s[:, None]).T @ slopes + 0.5 * widths.T @ widths

@@ -337,6 +337,8 @@ def bounds_of(loop: Loop, names: Sequence[str]) -> tuple[Array, Array]:
 
 def choose_noise(fit: Fit, always: bool = False) -> Fit:
     """Add a coloured force if the Bayesian information criterion wants it."""
+    if fit.problem.known is not None:
+        return fit
     richer = with_coloured_force(fit)
     # Two parameters more: worth trying out in full only if it gains at all.
     if not always and richer.value < fit.value + 0.5 * math.log(fit.size):

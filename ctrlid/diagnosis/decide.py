@@ -69,7 +69,7 @@ def rivals(best: Trial, others: Sequence[Trial]) -> tuple[Trial, ...]:
     mine = log_terms(best.model.fit)
     found = []
     for trial in others:
-        if trial is best or trial.merit <= GATE:
+        if trial.same_kind(best) or trial.merit <= GATE:
             continue
         lost = best.merit - trial.merit
         theirs = log_terms(trial.model.fit)

@@ -147,14 +147,14 @@ def drive(simulator: Simulator, part: Record) -> tuple[Array, Array | None, Arra
 
 
 def floors(
-    loop: Loop, fit: Fit, windows: Sequence[Window], kind: str
-) -> tuple[float, float]:  # fmt: skip
+    loops: Sequence[Loop], fit: Fit, windows: Sequence[Window], kind: str
+) -> tuple[float, float]:
     """Return the RMS error that noise leaves through a loop: all noise, and the sensor's alone.
 
     Parameters
     ----------
-    loop : Loop
-        The model with everything in it.
+    loops : sequence of Loop
+        The model with everything in it, for each window.
     fit : Fit
         Its fit, for the noise.
     windows : sequence of Window
@@ -168,7 +168,7 @@ def floors(
         RMS errors [output unit]; NaN where they cannot be computed.
     """
     squares, count = np.zeros(2), 0
-    for k, window in enumerate(windows):
+    for k, (loop, window) in enumerate(zip(loops, windows, strict=True)):
         noise = float(fit.sensor[min(k, len(fit.sensor) - 1)])
         try:
             values = _floors(loop, fit, noise, window, kind)

@@ -1,5 +1,6 @@
 """diagnose(): from the audit of the record to the verdict."""
 
+import functools
 import math
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -9,32 +10,41 @@ from typing import Any
 import control as ct
 import joblib
 import numpy as np
-from tqdm.auto import tqdm
+from tqdm import tqdm
 
 from ..audit import Audit, audit
 from ..data import Record
 from ..effects import CATALOGUE, AbstractEffect, equivalents
 from ..errors import CtrlidError
-from ..likelihood import Fit, begin, climb, pseudo_inverse
+from ..likelihood import Fit, pseudo_inverse
 from ..linearization import OperatingPoint
 from ..loop import Loop
-from ..loop_fit import make_problem, summary
+from ..loop_fit import summary
 from . import gap as gaps
 from .decide import GATE
 from .experiment import separating_experiment
+from .fresh import Fresh, fresh_data, stretches
 from .omnibus import places
 from .readout import Readout, censored, clipping, steps
 from .replica import forgiven, replica, simulable
 from .result import Calibrated, Candidate, Diagnosis, Disturbance, Finding, Gap, Verdict
-from .search import Found, Search, search
+from .search import Found, Search, main_ones, search
 from .sentences import conclusion
-from .trial import Model, Trial, attempt_at, base_model, refit
+from .trial import (
+    Model,
+    Trial,
+    attempt_at,
+    base_model,
+    refit,
+    weighted_by_repeats,
+    weighted_by_rest,
+)
 
 HOPELESS = ("too few samples", "constant signal")
-LONGEST = 120_000  # samples that are fitted; of longer records, even stretches
-STRETCHES = 12  # of a long record
 TIE = 0.02  # difference of log-likelihood between effects that are one and the same
+HELPS = 0.05  # of what is left without an effect, on fresh data
 EXCESS = 1.5  # times the noise floor (twice that with a coloured force): above, not explained
+REPEATS = 3  # of an experiment, from which its noise is taken
 STEPS = 6  # of the progress bar
 
 
@@ -112,7 +122,7 @@ def diagnose(
     started = time.perf_counter()
     records = _records(record)
     loop = _loop(loop, records[0])
-    fresh = None if validation is None else _records(validation)
+    fresh = fresh_data(loop, records, None if validation is None else _records(validation))
     bar = tqdm(total=STEPS, disable=not progress, leave=False, desc="diagnose")
 
     def tell(text: str, step: int = 0) -> None:
@@ -128,20 +138,28 @@ def diagnose(
         loop = loop.with_effect(r.effect)
         used = tuple(censored(record, r.effect) for record in records)
     tell("recalibrating", 1)
-    parts, begins = _stretches(used)
+    parts, begins = stretches(used)
     base = base_model(loop, parts, loop.free, begins)
+    periods = _periods(parts, audits)
+    if periods:
+        base = weighted_by_repeats(base, periods)
     found = search(base, catalogue, _worker(jobs), tell)
+    if not found.after.passed and not periods:
+        found = _second_opinion(
+            found, fresh, lambda base: search(base, catalogue, _worker(jobs), tell)
+        )
     tell("comparing on fresh data", 2)
     coarse = steps(found.final.fit, audits, catalogue)
     if coarse and not found.after.passed and simulable(found.final):
         copies = [replica(_rounded(found.final, coarse), seed) for seed in (1, 2)]
         found = replace(found, after=forgiven(found.after, copies))
-    gap, shares, disturbance = _gaps(given, found, records, fresh)
+    found = main_ones(found, _helps(fresh))
+    gap, shares, disturbance = _gaps(given, found, fresh)
     alone = len(records) == 1  # an effect of one record only may widen the gap in others
     if alone and found.found and not found.after.passed and gap.after > gap.before:
         # What names something and leaves more unexplained than before has the wrong name.
         found = replace(found, final=found.base, found=(), after=found.before)
-        gap, shares, disturbance = _gaps(given, found, records, fresh)
+        gap, shares, disturbance = _gaps(given, found, fresh)
     tell("writing down", 1)
     read += [coarse] if coarse else []
     result = _result(given, records, found, gap, shares, disturbance, remarks, read)
@@ -191,21 +209,13 @@ def _look_over(
     return tuple(audits), tuple(remarks)
 
 
-def _stretches(records: Sequence[Record]) -> tuple[list[Record], list[float]]:
-    """Return records short enough to be fitted many times: even stretches of long ones."""
-    total = sum(len(r) for r in records)
-    if total <= LONGEST:
-        return list(records), [0.0] * len(records)
-    parts, begins = [], []
-    for record in records:
-        size = max(LONGEST * len(record) // total // STRETCHES, 1000)
-        firsts = np.linspace(0, max(len(record) - size, 0), STRETCHES).astype(int)
-        for first in dict.fromkeys(firsts.tolist()):
-            part = record[first : first + size]
-            if np.count_nonzero(part.valid) > size // 2:
-                parts.append(part)
-                begins.append(first * record.dt)
-    return parts, begins
+def _periods(parts: Sequence[Record], audits: Sequence[Audit]) -> list[int]:
+    """Return after how many samples each record repeats itself; empty if one does not."""
+    if len(parts) != len(audits):
+        return []
+    periods = [a.repeats[0] for a in audits]
+    whole = [p and len(part) // p for p, part in zip(periods, parts, strict=True)]
+    return periods if min(whole) >= REPEATS else []
 
 
 def _rounded(model: Model, coarse: Readout) -> Model:
@@ -233,31 +243,13 @@ def _worker(jobs: int) -> Callable[[Callable[..., Any], Iterable[Any]], list[Any
     return work
 
 
-def _trained(model: Model, records: Sequence[Record]) -> Loop:
-    """Return a model's loop with its parameters fitted to other records."""
-    fit = model.fit
-    if not model.names:
-        return model.fitted
-    parts, begins = _stretches(records)
-    problem = make_problem(model.fitted, model.names, parts, begins)
-    fit = climb(begin(problem, fit.theta, fit.noise), exact=False)
-    return Model(model.loop, fit).fitted
-
-
-def _gaps(
-    loop: Loop, found: Search, records: Sequence[Record], fresh: Sequence[Record] | None
-) -> tuple[Gap, dict[int, float], Disturbance]:
+def _gaps(loop: Loop, found: Search, fresh: Fresh) -> tuple[Gap, dict[int, float], Disturbance]:
     """Return the gap on data that no parameter was fitted to, and what each finding closes."""
-    if fresh is None:
-        windows, rest = zip(*(gaps.held_out(r) for r in records), strict=True)
-        before, after = (_trained(m, rest) for m in (found.base, found.final))
-    else:
-        windows = tuple(gaps.whole(r) for r in fresh)
-        before, after = found.base.fitted, found.final.fitted
+    windows, kind = fresh.windows, fresh.kind
+    before, after = (fresh.loops(m) for m in (found.base, found.final))
     for effect in found.base.loop.effects[len(loop.effects) :]:
-        before = before.without_effect(type(effect).__name__)
-    kind = gaps.way_to_compare(loop, windows[0].record)
-    results = [gaps.outputs(x, windows, kind) for x in (loop, before, after)]
+        before = tuple(x.without_effect(type(effect).__name__) for x in before)
+    results = [fresh.outputs(x) for x in ((loop,) * len(windows), before, after)]
     sizes = [gaps.root_mean_square(windows, y) for y in results]
     fit = found.final.fit
     floor, quiet = gaps.floors(after, fit, windows, kind)
@@ -265,8 +257,8 @@ def _gaps(
     for f in found.found:
         error = sizes[1]
         if len(found.found) > 1:
-            left = after.without_effect(list(after.labelled)[f.position])
-            error = gaps.root_mean_square(windows, gaps.outputs(left, windows, kind))
+            label = list(after[0].labelled)[f.position]
+            error = fresh.gap([x.without_effect(label) for x in after])
         shares[f.position] = _share(error**2 - sizes[2] ** 2, sizes[1], floor)
     first = windows[0]
     gap = Gap(
@@ -276,6 +268,44 @@ def _gaps(
         results[2][0][first.mask],
     )  # fmt: skip
     return gap, shares, _disturbance(found.final.fit, loop, floor, quiet)
+
+
+def _second_opinion(
+    found: Search, fresh: Fresh, again: Callable[[Model], Search]
+) -> Search:  # fmt: skip
+    """Search again with the noise of the stretches at rest, where all noise explains too little.
+
+    Noise fitted to what a model leaves takes part of what is missing for noise; the search that
+    leaves the smaller gap on fresh data stands.
+    """
+    base = weighted_by_rest(found.base)
+    if base is None:
+        return found
+    other = again(base)
+    if not other.found:
+        return found
+    first, second = (fresh.gap(fresh.loops(s.final)) for s in (found, other))
+    return other if second < first else found
+
+
+def _helps(fresh: Fresh) -> Callable[[Found, Model], bool]:
+    """Return whether an effect closes a fair part of what is left without it, on fresh data.
+
+    Of the gap, or, where noise is known, of the one-step errors: a small fast force is seen there.
+    """
+    loops = functools.cache(fresh.loops)
+
+    def helps(f: Found, model: Model) -> bool:
+        with_it, without = loops(model), loops(f.base)
+        if model.fit.problem.known is not None:
+            left = fresh.excess(without, model.fit)
+            if left - fresh.excess(with_it, model.fit) > HELPS * left:
+                return True
+        floor = gaps.floors(with_it, model.fit, fresh.windows, fresh.kind)[0]
+        gap, before = fresh.gap(with_it), fresh.gap(without)
+        return _share(before**2 - gap**2, before, floor) > HELPS
+
+    return helps
 
 
 def _share(closed: float, before: float, floor: float) -> float:

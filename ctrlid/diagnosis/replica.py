@@ -47,7 +47,7 @@ def replica(model: Model, seed: int = 0) -> Model | None:
         ]
         begins = [float(t.table[0, 0]) for t in fit.problem.tracks]
         problem = make_problem(loop, model.names, records, begins)
-        problem = replace(problem, counts=fit.problem.counts)
+        problem = replace(problem, counts=fit.problem.counts, known=fit.problem.known)
         at = [out.trajectory for out in fit.filtered]
         start = evaluate(problem, fit.theta, fit.noise, at)
         again = climb(start, rounds=8, exact=False)
@@ -72,7 +72,9 @@ def _simulated(model: Model, record: Record, first: float, sensor: float, seed: 
 
 def simulable(model: Model) -> bool:
     """Whether the records can be simulated with this model."""
-    loop = model.loop
+    loop, known = model.loop, model.fit.problem.known
+    if known is not None and known.whitener is not None:
+        return False
     if loop.controller is None:
         return growth_rate(loop) < -1e-6 / loop.dt
     return all(t.record.r is not None for t in model.fit.problem.tracks)

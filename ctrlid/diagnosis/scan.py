@@ -15,7 +15,7 @@ from ..effects import (
     PositionRipple,
     StateLimit,
 )
-from ..likelihood import pseudo_inverse
+from ..likelihood import pseudo_inverse, whitened
 from ..physics import Array
 from .trial import Model, Trial, attempt, attempt_best
 
@@ -77,7 +77,7 @@ def promises(
                 lin, dp=np.concatenate([lin.dp, extra], axis=2),
                 hp=np.concatenate([lin.hp, np.zeros((len(shape), size))], axis=1),
             )  # fmt: skip
-            out = m.run(track, wide, fit.noise, columns=p + size)
+            out = whitened(m.run(track, wide, fit.noise, columns=p + size), fit.problem.known)
             slopes, s = out.slopes[keep], out.variance[keep] * r
             weighted = slopes / s[:, None]
             matrix += weighted.T @ slopes

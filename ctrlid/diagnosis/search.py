@@ -10,7 +10,7 @@ import numpy as np
 from ..data import Record
 from ..effects import AbstractEffect, SensorOffset
 from ..errors import CtrlidError
-from ..likelihood import climb, polish
+from ..likelihood import Fit, climb, polish
 from ..linearization import state_matrices
 from ..loop import Loop
 from ..loop_fit import choose_noise
@@ -28,7 +28,7 @@ from .replica import (
     simulable,
 )
 from .scan import scanned
-from .trial import Model, Trial, anchor, attempt_at, reduced, refit
+from .trial import Model, Trial, anchor, attempt_at, promised, reduced, refit
 
 MOST = 5  # effects in one record
 TOP = 5  # candidates refitted because of what they promise
@@ -36,6 +36,7 @@ SHARE = 0.2  # of the best promise: what promises more is refitted as well
 NEAR = 0.5  # of the winner's merit: what came so close is asked again when all effects are in
 MINOR = 0.15  # of the whole gain: less, beside something unknown, is a stand-in
 OFFSETS = (SensorOffset,)
+LITTLE = 0.1  # of what known noise does not explain: less, beside so much, is a stand-in
 FAINT = 0.5  # of what would earn a place: a fainter promise is not worth a refit
 
 Work = Callable[[Callable[..., Any], Iterable[Any]], list[Any]]
@@ -93,12 +94,18 @@ def _place_matters(loop: Loop) -> bool:
     return bool(np.any(np.abs(a[:, np.flatnonzero(c[0])]).sum(axis=0) > 0))
 
 
-def one_round(base: Model, pool: Sequence[AbstractEffect], work: Work) -> Step:
-    """Screen all candidates, refit the promising, and return the best that earns its place."""
+def one_round(
+    base: Model, pool: Sequence[AbstractEffect], work: Work, other: Model | None = None
+) -> Step:
+    """Screen all candidates, refit the promising, and return the best that earns its place.
+
+    They are added to the base, and to the `other` model in its place if one is given.
+    """
     tried: list[Trial] = work(lambda effect: scanned(base, effect), pool)
-    other = anchor(base)
     if other is not None:
+        # What the model alone would regain from there is no merit of a candidate.
         lost = other.fit.value - base.fit.value
+        lost -= max(0.0, lost + promised(other.fit))
         more: list[Trial] = work(lambda effect: scanned(other, effect), pool)
         more = [replace(t, promise=t.promise + lost) for t in more]
         pairs = zip(tried, more, strict=True)
@@ -188,18 +195,24 @@ def search(base: Model, catalogue: Sequence[type[AbstractEffect]], work: Work,
     while len(model.loop.effects) - given < MOST and len(steps) < MOST + 2:
         tell(f"round {len(steps) + 1}: screening")
         pool = [c for c in candidates(catalogue, model.fitted, record) if not _there(model, c)]
-        step = one_round(model, pool, work)
+        step = one_round(model, pool, work, None if steps else anchor(base))
+        if step.best is not None and step.best.gain < LITTLE * excess(model.fit):
+            step = replace(step, best=None)
         steps.append(step)
         if step.best is None:
             break
         tell(f"round {len(steps)}: {step.best.name}")
         model = _without_superfluous(_renoised(step.best.model), given)
     model, found = _settled(model, given, steps, work)
-    after = _judged(model)
-    if not after.passed and len(found) > 1:
-        model, found = _main_ones(base, model, found, given)
-        after = _judged(model)
-    return Search(base, tuple(steps), model, found, before, after)
+    return Search(base, tuple(steps), model, found, before, _judged(model))
+
+
+def excess(fit: Fit) -> float:
+    """Return the log-likelihood above that of noise which is known; zero where none is known."""
+    if fit.problem.known is None:
+        return 0.0
+    z = np.concatenate(fit.standardized)
+    return max(0.0, 0.5 * float(np.nansum(z**2 - 1)))
 
 
 def _judged(model: Model) -> Omnibus:
@@ -211,22 +224,37 @@ def _judged(model: Model) -> Omnibus:
     return after
 
 
-def _main_ones(
-    base: Model, model: Model, found: tuple[Found, ...], given: int
-) -> tuple[Model, tuple[Found, ...]]:
+def main_ones(found: Search, helps: Callable[[Found, Model], bool]) -> Search:
     """Keep the effects that carry the explanation where something unknown remains.
 
-    Small effects beside something unknown are stand-ins for it: a wrong name is worse than none.
+    Small effects beside something unknown are stand-ins for it, and a wrong name is worse than
+    none: they stay if they help on data that they were not fitted to.
+
+    Parameters
+    ----------
+    found : Search
+        The end of a search.
+    helps : callable
+        ``helps(finding, model)``: whether an effect narrows the gap of the model on fresh data.
+
+    Returns
+    -------
+    Search
+        Without those that do not.
     """
-    total = model.fit.value - base.fit.value
-    minor = [f for f in found if f.trial.gain < MINOR * total]
-    if not minor:
-        return model, found
-    left = [f for f in found if f not in minor]
-    for f in sorted(minor, key=lambda f: -f.position):
+    total = found.final.fit.value - found.base.fit.value
+    if found.after.passed or len(found.found) < 2:
+        return found
+    model, left = found.final, list(found.found)
+    for f in sorted(found.found, key=lambda f: -f.position):
+        if f.trial.gain >= MINOR * total or helps(f, found.final):
+            continue
         model = _taken_out(model, f.position)[0]
-        left = [replace(k, position=k.position - (k.position > f.position)) for k in left]
-    return model, tuple(left)
+        left = [replace(k, position=k.position - (k.position > f.position))
+                for k in left if k.trial is not f.trial]  # fmt: skip
+    if len(left) == len(found.found):
+        return found
+    return replace(found, final=model, found=tuple(left), after=_judged(model))
 
 
 def _there(model: Model, effect: AbstractEffect) -> bool:

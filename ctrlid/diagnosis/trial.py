@@ -11,7 +11,17 @@ from ..data import Record
 from ..effects import AbstractEffect
 from ..errors import CtrlidError
 from ..filtering import Machine, Trajectory, make_track
-from ..likelihood import Fit, Problem, begin, bounded_step, climb, evaluate, pseudo_inverse
+from ..likelihood import (
+    Fit,
+    Known,
+    begin,
+    bounded_step,
+    climb,
+    evaluate,
+    known_from_repeats,
+    known_from_rest,
+    pseudo_inverse,
+)
 from ..loop import Loop
 from ..loop_fit import bounds_of, choose_noise, make_problem, start_values
 from ..physics import Array
@@ -20,6 +30,8 @@ SCREEN_ROUNDS = 14  # of a refit: a candidate that needs more is not the missing
 AWAY = 0.3  # of a given value: a recalibration beyond is doubted
 FAR = 10.0  # times its given value: no recalibration goes further
 SIGNIFICANT = 2.0  # standard errors that a fitted effect must at least be large
+RESTING = 1000  # samples at rest, and others, from which noise is taken
+STILL = 0.2  # of the output's spread: a rest moves less
 SEEN = 1e-7  # share of a parameter's information that others must leave to it
 
 
@@ -64,6 +76,13 @@ class Trial:
         """The name of the effect; drifts and steps belong to a parameter."""
         return type(self.effect).__name__
 
+    def same_kind(self, other: "Trial") -> bool:
+        """Whether another trial is of the same effect, begun elsewhere."""
+        mine, theirs = self.effect, other.effect
+        return type(mine) is type(theirs) and getattr(mine, "name", "") == getattr(
+            theirs, "name", ""
+        )
+
     @property
     def price(self) -> float:
         """Half the Bayesian penalty if all its parameters count."""
@@ -92,6 +111,52 @@ def base_model(
     problem = replace(problem, lower=lower, upper=upper)
     fit = climb(begin(problem, start_values(loop, names), None))
     return Model(loop, choose_noise(fit))
+
+
+def weighted_by_repeats(base: Model, periods: Sequence[int]) -> Model:
+    """Return the model fitted with the noise that differs between repeats.
+
+    A noise that is fitted to what a model leaves takes part of a missing effect for noise.
+    """
+    return _weighted(base, known_from_repeats(base.fit, periods))
+
+
+def weighted_by_rest(base: Model) -> Model | None:
+    """Return the model fitted with the noise of stretches at rest; None where it never rests."""
+    tracks, counts = base.fit.problem.tracks, base.fit.problem.counts
+    rest = [keep & at_rest(t.record) for t, keep in zip(tracks, counts, strict=True)]
+    sizes = [int(np.count_nonzero(r)) for r in rest]
+    moving = sum(int(np.count_nonzero(c)) for c in counts) - sum(sizes)
+    if min(sizes) < RESTING or moving < RESTING:
+        return None
+    return _weighted(base, known_from_rest(base.fit, rest))
+
+
+def at_rest(record: Record) -> Any:
+    """Return the samples at which the reference has stood still for as long as it still will."""
+    rest = np.zeros(len(record), dtype=bool)
+    if record.r is None:
+        return rest
+    r, y = np.asarray(record.r), np.asarray(record.y)
+    ends = np.flatnonzero(np.diff(r, append=np.nan) != 0) + 1
+    for first, stop in zip([0, *ends[:-1]], ends, strict=True):
+        middle = (first + stop) // 2
+        if stop - middle >= RESTING // 4 and np.std(y[middle:stop]) < STILL * np.std(y):
+            rest[middle:stop] = True
+    return rest
+
+
+def _weighted(base: Model, known: Known) -> Model:
+    """Return the model fitted with a known noise, from where it is or from its given values."""
+    problem, fits = replace(base.fit.problem, known=known), []
+    for start in (base.fit.theta, start_values(base.loop, base.names)):
+        try:
+            fits.append(climb(begin(problem, start, None), exact=False))
+        except CtrlidError:
+            continue
+    if not fits:
+        return base
+    return Model(base.loop, max(fits, key=lambda f: f.value))
 
 
 def anchor(base: Model) -> Model | None:
@@ -172,11 +237,47 @@ def attempt_at(base: Model, effect: AbstractEffect, scan: float = 0.0) -> Trial:
         fit = _extended(base, loop, names)
     except CtrlidError as reason:
         return Trial(effect, label, base, -math.inf, scan, remark=str(reason))
+    doubled = _doubled(fit, label, effect)
+    if doubled:
+        loop = loop.with_parameters(doubled)
+        names = tuple(n for n in names if n not in doubled)
+        fit = _extended(base, loop, names)
     model = Model(loop, fit)
     if not math.isfinite(fit.value):
         return Trial(effect, label, model, -math.inf, scan, remark="cannot follow the record")
-    promise = fit.value - base.fit.value + _promised(fit)
+    promise = fit.value - base.fit.value + promised(fit)
     return Trial(effect, label, Model(loop, light(fit)), promise, scan)
+
+
+def _doubled(fit: Fit, label: str, effect: AbstractEffect) -> dict[str, float]:
+    """Return the neutral values of an effect's parameters that do what the model's own do.
+
+    The viscous part of an asymmetric friction is one, beside a viscous friction in the model.
+    """
+    names, matrix = fit.problem.machine.names, fit.normal[0]
+    neutral = {f"{label}.{p.name}": p.neutral for p in effect.parameters()}
+    deciding = {n: v for n, v in neutral.items() if n in names and v is not None}
+    others = [k for k, n in enumerate(names) if not n.startswith(f"{label}.")]
+    if len(deciding) < 2 or not np.isfinite(matrix).all():
+        return {}
+    found = {}
+    for name, value in deciding.items():
+        k = names.index(name)
+        if matrix[k, k] > 0 and _left(matrix, [k], others)[0, 0] < SEEN:
+            found[name] = value
+    return found if len(found) < len(deciding) else {}
+
+
+def _left(matrix: Array, own: Sequence[int], others: Sequence[int]) -> Array:
+    """Return the scaled information of parameters that others leave to them."""
+    size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    scaled = matrix / np.outer(size, size)
+    left = scaled[np.ix_(own, own)]
+    if not len(others):
+        return np.asarray(left)
+    cross = scaled[np.ix_(own, others)]
+    inverse = np.linalg.pinv(scaled[np.ix_(others, others)], rcond=SEEN)
+    return np.asarray(left - cross @ inverse @ cross.T)
 
 
 def attempt_best(base: Model, effects: Sequence[AbstractEffect], scan: float) -> Trial:
@@ -195,7 +296,7 @@ def attempt_best(base: Model, effects: Sequence[AbstractEffect], scan: float) ->
             fit = evaluate(start.problem, theta, start.noise, [o.trajectory for o in fit.filtered])
         if not math.isfinite(fit.value):
             continue
-        promise = fit.value - base.fit.value + _promised(fit)
+        promise = fit.value - base.fit.value + promised(fit)
         if promise > best.promise:
             moved = loop.with_parameters(dict(zip(names, theta.tolist(), strict=True)))
             best = Trial(effect, label, Model(moved, light(fit)), promise, scan)
@@ -210,7 +311,7 @@ def light(fit: Fit) -> Fit:
     return bare
 
 
-def _promised(fit: Fit) -> float:
+def promised(fit: Fit) -> float:
     """Return the gain that a Gauss-Newton step within the bounds expects."""
     matrix, score = fit.normal
     return 0.5 * float(score @ bounded_step(fit, matrix, score)[0])
@@ -239,7 +340,7 @@ def _extended(base: Model, loop: Loop, names: Sequence[str]) -> Fit:
         if name.endswith(".vs"):  # of the speeds that there are
             fastest = max(_speed(m, a) for a in at)
             lower[k], upper[k] = max(lower[k], 1e-3 * fastest), min(upper[k], 3.0 * fastest)
-    problem = Problem(m, tracks, lower, upper, old.counts)
+    problem = replace(old, machine=m, tracks=tracks, lower=lower, upper=upper)
     theta = np.clip(start_values(loop, names), lower, upper)
     fit = evaluate(problem, theta, base.fit.noise, at)
     if math.isfinite(fit.value) and m.n > old.machine.n:
@@ -294,13 +395,7 @@ def _own_parameters(trial: Trial, fit: Fit) -> int:
     """Count the parameters of the effect that the record determines."""
     matrix, _ = fit.normal
     own = [k for k, n in enumerate(fit.problem.machine.names) if n.startswith(f"{trial.label}.")]
-    size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-    scaled = matrix / np.outer(size, size)
-    rest = [k for k in range(len(size)) if k not in own]
-    left = scaled[np.ix_(own, own)]
-    if rest:
-        cross = scaled[np.ix_(own, rest)]
-        left = left - cross @ np.linalg.pinv(scaled[np.ix_(rest, rest)], rcond=SEEN) @ cross.T
+    left = _left(matrix, own, [k for k in range(len(matrix)) if k not in own])
     return max(1, int(np.sum(np.linalg.eigvalsh(left) > SEEN)))
 
 

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from .._text import chance, listing, number, prefix, quantity
-from ..effects import AbstractEffect
+from ..effects import AbstractEffect, ReadingEffect
 from .result import Diagnosis, Finding, Gap, Place
 from .saving import units_of
 
@@ -141,7 +141,7 @@ def certainty(found: Diagnosis, finding: Finding) -> str:
         text += f"; ONE OF {many} that explain the record"
     else:
         text += "; no other effect explains the record as well"
-    if found.verdict == "partly explained":
+    if found.verdict == "partly explained" and not isinstance(finding.effect, ReadingEffect):
         text += ". It may stand in for what is still missing"
     return text
 

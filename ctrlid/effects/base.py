@@ -37,6 +37,7 @@ class AbstractEffect:
     sentence: ClassVar[str] = ""
     experiment: ClassVar[str] = ""
     states: ClassVar[tuple[str, ...]] = ()
+    private: ClassVar[tuple[str, ...]] = ()  # parameters that another record has otherwise
     in_linear_model: ClassVar[bool] = True  # False: no part of small deviations from rest
 
     def __post_init__(self) -> None:

@@ -148,6 +148,7 @@ class PeriodicForce(ForceEffect):
     frequency: float = parameter("Hz", lower=1e-9)
     phase: float = parameter("rad", default=0.0)
 
+    private: ClassVar[tuple[str, ...]] = ("phase",)
     in_linear_model: ClassVar[bool] = False
     look_alikes: ClassVar[tuple[str, ...]] = ("PositionRipple", "FlexibleMode")
     sentence: ClassVar[str] = "Something shakes the plant at a fixed frequency."
@@ -182,7 +183,7 @@ class PositionRipple(ForceEffect):
     period : float
         Length p after which it repeats [output unit].
     phase : float, optional
-        Phase at position zero [rad].
+        Phase at position zero [rad], private to a record: where zero is, differs.
 
     Examples
     --------
@@ -195,6 +196,7 @@ class PositionRipple(ForceEffect):
     period: float = parameter("{y}", lower=1e-12)
     phase: float = parameter("rad", default=0.0)
 
+    private: ClassVar[tuple[str, ...]] = ("phase",)
     look_alikes: ClassVar[tuple[str, ...]] = ("PeriodicForce", "SensorNonlinearity")
     sentence: ClassVar[str] = "A force that repeats with the position, as of a screw or a gear."
     experiment: ClassVar[str] = "the same way at two speeds: the ripple stays where it is"

@@ -1,0 +1,127 @@
+"""Models on data that they were not fitted to."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..data import Record
+from ..errors import CtrlidError
+from ..likelihood import Fit, Known, begin, climb, evaluate
+from ..loop import Loop
+from ..loop_fit import make_problem, start_values
+from ..physics import Array
+from . import gap as gaps
+from .trial import Model
+
+LONGEST = 120_000  # samples that are fitted; of longer records, even stretches
+STRETCHES = 12  # of a long record
+TURNS = 4  # phases from which a private phase is looked for
+
+
+@dataclass(frozen=True, eq=False)
+class Fresh:
+    """What models are compared on.
+
+    `rest` holds the records without the windows, which the parameters are fitted to for the
+    comparison; None where the windows are records that took no part in any fit.
+    """
+
+    windows: tuple[gaps.Window, ...]
+    rest: tuple[Record, ...] | None
+    kind: str
+
+    def loops(self, model: Model) -> tuple[Loop, ...]:
+        """Return the loop of a model for each window, ready to be compared there."""
+        if self.rest is None:
+            return tuple(_with_private_parts(model, w) for w in self.windows)
+        return (self._trained(model, self.rest),) * len(self.windows)
+
+    def _trained(self, model: Model, records: Sequence[Record]) -> Loop:
+        """Return a model's loop with its parameters fitted to other records."""
+        fit = model.fit
+        if not model.names:
+            return model.fitted
+        parts, begins = stretches(records)
+        problem = make_problem(model.fitted, model.names, parts, begins)
+        known = fit.problem.known
+        if known is not None and len(parts) == len(known.sensor):
+            problem = replace(problem, known=known)
+        return Model(model.loop, climb(begin(problem, fit.theta, fit.noise), exact=False)).fitted
+
+    def outputs(self, loops: Sequence[Loop]) -> tuple[Array, ...]:
+        """Return what each loop makes of its window."""
+        pairs = zip(loops, self.windows, strict=True)
+        return tuple(gaps.outputs(loop, [w], self.kind)[0] for loop, w in pairs)
+
+    def gap(self, loops: Sequence[Loop]) -> float:
+        """Return the RMS error of loops [output unit]."""
+        return gaps.root_mean_square(self.windows, self.outputs(loops))
+
+    def excess(self, loops: Sequence[Loop], fit: Fit) -> float:
+        r"""Return what noise, as a fit knows it, leaves unexplained of the innovations.
+
+        .. math:: \\tfrac12 \\sum_k (e_k^2 / s_k - 1)
+        """
+        known = fit.problem.known or Known(fit.noise, fit.sensor)
+        known = replace(known, sensor=np.full(1, float(np.mean(fit.sensor))))
+        total = 0.0
+        for loop, window in zip(loops, self.windows, strict=True):
+            problem = make_problem(loop, (), [window.record], [window.begin])
+            here = begin(replace(problem, known=known), np.zeros(0), None)
+            z = here.standardized[0][window.mask]
+            total += 0.5 * float(np.nansum(z**2 - 1))
+        return max(total, 0.0)
+
+
+def fresh_data(
+    loop: Loop, records: Sequence[Record], validation: Sequence[Record] | None
+) -> Fresh:  # fmt: skip
+    """Return the records given for validation, or the last quarter of each record."""
+    rest: tuple[Record, ...] | None = None
+    if validation is None:
+        windows, rest = zip(*(gaps.held_out(r) for r in records), strict=True)
+    else:
+        windows = tuple(gaps.whole(r) for r in validation)
+    return Fresh(windows, rest, gaps.way_to_compare(loop, windows[0].record))
+
+
+def stretches(records: Sequence[Record]) -> tuple[list[Record], list[float]]:
+    """Return records short enough to be fitted many times: even stretches of long ones."""
+    total = sum(len(r) for r in records)
+    if total <= LONGEST:
+        return list(records), [0.0] * len(records)
+    parts, begins = [], []
+    for record in records:
+        size = max(LONGEST * len(record) // total // STRETCHES, 1000)
+        firsts = np.linspace(0, max(len(record) - size, 0), STRETCHES).astype(int)
+        for first in dict.fromkeys(firsts.tolist()):
+            part = record[first : first + size]
+            if np.count_nonzero(part.valid) > size // 2:
+                parts.append(part)
+                begins.append(first * record.dt)
+    return parts, begins
+
+
+def _with_private_parts(model: Model, window: gaps.Window) -> Loop:
+    """Return the loop with what is private to a record, such as a phase, fitted to this one."""
+    loop, fit = model.fitted, model.fit
+    names = [f"{label}.{k}" for label, e in loop.labelled.items() for k in e.private]
+    if not names:
+        return loop
+    sensor = np.full(1, float(np.mean(fit.sensor)))
+    try:
+        problem = make_problem(loop, names, [window.record], [window.begin])
+        problem = replace(problem, known=Known(fit.noise, sensor))
+        start = begin(problem, start_values(loop, names), None)
+        at = [out.trajectory for out in start.filtered]
+        for k in range(len(names)):
+            turned = [start.theta + turn * np.eye(len(names))[k]
+                      for turn in np.arange(TURNS) * 2 * math.pi / TURNS]  # fmt: skip
+            tried = [evaluate(start.problem, theta, fit.noise, at) for theta in turned]
+            start = max(tried, key=lambda f: f.value)
+        best = climb(start, exact=False)
+    except CtrlidError:
+        return loop
+    return loop.with_parameters(dict(zip(names, best.theta.tolist(), strict=True)))
