@@ -316,7 +316,8 @@ class Machine:
         )  # fmt: skip
         error, variance, before, after, wide, slopes, disturbance = out
         counts = track.valid & ~track.afresh
-        sensor = np.sqrt(np.mean(error[counts] ** 2 / variance[counts]))
+        with np.errstate(all="ignore"):  # a filter that lost the record says so later
+            sensor = np.sqrt(np.mean(error[counts] ** 2 / variance[counts]))
         return Filtered(error, variance, Trajectory(before, after, wide * sensor), slopes,
                         disturbance)  # fmt: skip
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy import linalg, optimize, signal
+from scipy import optimize
 
 from .errors import CtrlidError
 from .filtering import SETTLED, Filtered, Linearized, Machine, Noise, Track, Trajectory
@@ -17,22 +17,17 @@ ROUNDS = 25  # Gauss-Newton steps at most
 FAR = 3.0  # standard errors: after a longer step the trajectory is settled anew
 CLOSE = 0.02  # standard errors: a smaller step ends the search
 QUIET = 1e-14  # of the output's size, squared: the least variance of the sensor noise
-WHITENER = 40  # coefficients of a filter that makes innovations white
+SLOWEST = 0.05  # of the longest record: the time constant of a coloured force
 LOG_STEP = 0.2  # of log variances, for derivatives
 SINGULAR = 1e-10  # relative eigenvalue below which a direction is not in the data
 
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """Noise that is known beforehand: ratios, and the variance of each record's sensor noise.
-
-    `whitener` holds the coefficients of a filter that makes white what this noise leaves in the
-    innovations, such as the lines of a mains hum in the sensor.
-    """
+    """Noise that is known beforehand: ratios, and the variance of each record's sensor noise."""
 
     noise: Noise
     sensor: Array
-    whitener: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,8 +162,7 @@ def _measure(
 ) -> Fit:
     m = problem.machine
     outs = tuple(
-        whitened(m.run(t, lin, noise, sensitive), problem.known)
-        for t, lin in zip(problem.tracks, lins, strict=True)
+        m.run(t, lin, noise, sensitive) for t, lin in zip(problem.tracks, lins, strict=True)
     )
     value, sensors = 0.0, []
     for k, (track, out, keep) in enumerate(zip(problem.tracks, outs, problem.counts, strict=True)):
@@ -186,17 +180,6 @@ def _measure(
         value -= 0.5 * (len(e) * (math.log(2 * math.pi * r) + mean / r) + np.sum(np.log(s)))
         sensors.append(r)
     return Fit(problem, theta, noise, float(value), np.array(sensors), tuple(lins), outs)
-
-
-def whitened(out: Filtered, known: Known | None) -> Filtered:
-    """Return what a pass of the filter gave, with innovations and slopes made white."""
-    if known is None or known.whitener is None:
-        return out
-    e, slopes = (
-        signal.lfilter(known.whitener, [1.0], np.nan_to_num(x), axis=0)
-        for x in (out.innovations, out.slopes)
-    )
-    return replace(out, innovations=e, slopes=slopes)
 
 
 def _between_repeats(out: Filtered, keep: Any, period: int) -> tuple[Array, Array]:
@@ -246,7 +229,8 @@ def _tune(
         return -value if np.isfinite(value) else 1e15
 
     start = _log_noise(noise, dt)
-    low, high = _limits(m, len(start) > m.channels)
+    longest = max(len(t.record) for t in problem.tracks)
+    low, high = _limits(m, len(start) > m.channels, longest)
     start = np.clip(start, low, high)
     if wide:
         grid = np.linspace(low[0], high[0], 16)
@@ -274,13 +258,16 @@ def _line(cost: Callable[[Array], float], x: float, low: float, high: float) -> 
             return np.array([x])
 
 
-def _limits(m: Machine, coloured: bool) -> tuple[Array, Array]:
-    """Return bounds of the logarithms of the noise variances."""
+def _limits(m: Machine, coloured: bool, longest: int) -> tuple[Array, Array]:
+    """Return bounds of the logarithms of the noise variances.
+
+    A force that hardly changes during a record is an offset, not noise.
+    """
     unit, dt = 2 * math.log(_unit(m)), m.loop.dt
     low, high = [unit - 32.0] * m.channels, [unit + 6.0] * m.channels
     if coloured:
         low += [unit - 32.0, math.log(2 * dt)]
-        high += [unit + 6.0, math.log(2e4 * dt)]
+        high += [unit + 6.0, math.log(max(min(SLOWEST * longest, 2e4), 4.0) * dt)]
     return np.array(low), np.array(high)
 
 
@@ -499,44 +486,6 @@ def known_from_repeats(fit: Fit, periods: Sequence[int]) -> Known:
     richer = with_coloured_force(plain)
     best = richer if richer.value > plain.value + math.log(fit.size) else plain
     return Known(best.noise, best.sensor)
-
-
-def known_from_rest(fit: Fit, rest: Sequence[Any]) -> Known:
-    r"""Return the noise of the samples at which nothing is asked of the plant.
-
-    There a wrong model has little to be wrong about. A filter
-
-    .. math:: w_k = e_k + a_1 e_{k-1} + \dots + a_p e_{k-p}
-
-    from the autocorrelation of the innovations e makes white what the noise model leaves.
-
-    Parameters
-    ----------
-    fit : Fit
-        A fit of any model that follows the records.
-    rest : sequence of ndarray of bool
-        For each record, the samples at rest.
-
-    Returns
-    -------
-    Known
-        The noise.
-
-    References
-    ----------
-    Ljung, *System Identification*, section 7.3 (Yule-Walker equations).
-    """
-    problem = replace(fit.problem, known=None, counts=tuple(rest))
-    plain = _tune(problem, fit.theta, fit.linearized, Noise(fit.noise.force), wide=True)
-    richer = with_coloured_force(plain)
-    best = richer if richer.value > plain.value + math.log(fit.size) else plain
-    products = np.zeros(WHITENER + 1)
-    for z in best.standardized:
-        filled = np.nan_to_num(z)
-        products += [filled[k:] @ filled[: len(filled) - k] for k in range(WHITENER + 1)]
-    a = linalg.solve_toeplitz(products[:-1], -products[1:])
-    share = float(1 + a @ products[1:] / products[0])
-    return Known(best.noise, best.sensor * share, np.concatenate([[1.0], a]))
 
 
 def information(fit: Fit) -> tuple[Array, Array]:

@@ -37,13 +37,13 @@ from .trial import (
     base_model,
     refit,
     weighted_by_repeats,
-    weighted_by_rest,
 )
 
 HOPELESS = ("too few samples", "constant signal")
 TIE = 0.02  # difference of log-likelihood between effects that are one and the same
 HELPS = 0.05  # of what is left without an effect, on fresh data
 EXCESS = 1.5  # times the noise floor (twice that with a coloured force): above, not explained
+WORSE = 1.2  # times the gap of the model as given: above, the fit explains nothing
 REPEATS = 3  # of an experiment, from which its noise is taken
 STEPS = 6  # of the progress bar
 
@@ -144,10 +144,6 @@ def diagnose(
     if periods:
         base = weighted_by_repeats(base, periods)
     found = search(base, catalogue, _worker(jobs), tell)
-    if not found.after.passed and not periods:
-        found = _second_opinion(
-            found, fresh, lambda base: search(base, catalogue, _worker(jobs), tell)
-        )
     tell("comparing on fresh data", 2)
     coarse = steps(found.final.fit, audits, catalogue)
     if coarse and not found.after.passed and simulable(found.final):
@@ -270,24 +266,6 @@ def _gaps(loop: Loop, found: Search, fresh: Fresh) -> tuple[Gap, dict[int, float
     return gap, shares, _disturbance(found.final.fit, loop, floor, quiet)
 
 
-def _second_opinion(
-    found: Search, fresh: Fresh, again: Callable[[Model], Search]
-) -> Search:  # fmt: skip
-    """Search again with the noise of the stretches at rest, where all noise explains too little.
-
-    Noise fitted to what a model leaves takes part of what is missing for noise; the search that
-    leaves the smaller gap on fresh data stands.
-    """
-    base = weighted_by_rest(found.base)
-    if base is None:
-        return found
-    other = again(base)
-    if not other.found:
-        return found
-    first, second = (fresh.gap(fresh.loops(s.final)) for s in (found, other))
-    return other if second < first else found
-
-
 def _helps(fresh: Fresh) -> Callable[[Found, Model], bool]:
     """Return whether an effect closes a fair part of what is left without it, on fresh data.
 
@@ -341,6 +319,8 @@ def _result(
     verdict: Verdict
     excess = EXCESS * (2 if found.final.fit.noise.drift else 1)
     left = math.isfinite(gap.floor) and gap.after > excess * gap.floor
+    # A random force that may do anything explains everything, and nothing.
+    left = left or gap.after > WORSE * gap.given
     if found.after.passed and not left:
         verdict = "explained" if findings else "nothing missing"
     else:

@@ -72,9 +72,7 @@ def _simulated(model: Model, record: Record, first: float, sensor: float, seed: 
 
 def simulable(model: Model) -> bool:
     """Whether the records can be simulated with this model."""
-    loop, known = model.loop, model.fit.problem.known
-    if known is not None and known.whitener is not None:
-        return False
+    loop = model.loop
     if loop.controller is None:
         return growth_rate(loop) < -1e-6 / loop.dt
     return all(t.record.r is not None for t in model.fit.problem.tracks)

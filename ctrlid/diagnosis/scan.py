@@ -15,7 +15,8 @@ from ..effects import (
     PositionRipple,
     StateLimit,
 )
-from ..likelihood import pseudo_inverse, whitened
+from ..errors import CtrlidError
+from ..likelihood import pseudo_inverse
 from ..physics import Array
 from .trial import Model, Trial, attempt, attempt_best
 
@@ -77,7 +78,7 @@ def promises(
                 lin, dp=np.concatenate([lin.dp, extra], axis=2),
                 hp=np.concatenate([lin.hp, np.zeros((len(shape), size))], axis=1),
             )  # fmt: skip
-            out = whitened(m.run(track, wide, fit.noise, columns=p + size), fit.problem.known)
+            out = m.run(track, wide, fit.noise, columns=p + size)
             slopes, s = out.slopes[keep], out.variance[keep] * r
             weighted = slopes / s[:, None]
             matrix += weighted.T @ slopes
@@ -110,8 +111,11 @@ def scanned(model: Model, effect: AbstractEffect) -> Trial:
     Trial
         The best place, which has paid for the search.
     """
-    search = SCANS.get(type(effect))
-    return attempt(model, effect) if search is None else search(model, effect)
+    search = SCANS.get(type(effect), attempt)
+    try:
+        return search(model, effect)
+    except CtrlidError as reason:  # a place that the effect cannot have
+        return Trial(effect, "", model, -math.inf, remark=str(reason))
 
 
 def _wave(size: Array) -> tuple[float, float]:

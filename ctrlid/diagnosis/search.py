@@ -167,8 +167,10 @@ def _checked(base: Model, trials: list[Trial]) -> list[Trial]:
     return trials
 
 
-def search(base: Model, catalogue: Sequence[type[AbstractEffect]], work: Work,
-           tell: Callable[[str], None]) -> Search:  # fmt: skip
+def search(
+    base: Model, catalogue: Sequence[type[AbstractEffect]], work: Work,
+    tell: Callable[[str], None],
+) -> Search:  # fmt: skip
     """Add effects to a base model until nothing more earns a place.
 
     Parameters

@@ -40,6 +40,8 @@ def conclusion(
     why = f"the test of {name} fails ({chance(p)})"
     if after.passed:
         why = "on data kept back the gap stays well above the noise floor"
+        if gap.after > gap.given:
+            why = "on data kept back the gap is wider than that of the model as given"
     were, them = ("were", "them") if len(findings) > 1 else ("was", "it")
     if verdict == "nothing missing":
         text = "At the sensitivity of this record, what is left is noise."

@@ -13,13 +13,11 @@ from ..errors import CtrlidError
 from ..filtering import Machine, Trajectory, make_track
 from ..likelihood import (
     Fit,
-    Known,
     begin,
     bounded_step,
     climb,
     evaluate,
     known_from_repeats,
-    known_from_rest,
     pseudo_inverse,
 )
 from ..loop import Loop
@@ -30,8 +28,6 @@ SCREEN_ROUNDS = 14  # of a refit: a candidate that needs more is not the missing
 AWAY = 0.3  # of a given value: a recalibration beyond is doubted
 FAR = 10.0  # times its given value: no recalibration goes further
 SIGNIFICANT = 2.0  # standard errors that a fitted effect must at least be large
-RESTING = 1000  # samples at rest, and others, from which noise is taken
-STILL = 0.2  # of the output's spread: a rest moves less
 SEEN = 1e-7  # share of a parameter's information that others must leave to it
 
 
@@ -118,45 +114,8 @@ def weighted_by_repeats(base: Model, periods: Sequence[int]) -> Model:
 
     A noise that is fitted to what a model leaves takes part of a missing effect for noise.
     """
-    return _weighted(base, known_from_repeats(base.fit, periods))
-
-
-def weighted_by_rest(base: Model) -> Model | None:
-    """Return the model fitted with the noise of stretches at rest; None where it never rests."""
-    tracks, counts = base.fit.problem.tracks, base.fit.problem.counts
-    rest = [keep & at_rest(t.record) for t, keep in zip(tracks, counts, strict=True)]
-    sizes = [int(np.count_nonzero(r)) for r in rest]
-    moving = sum(int(np.count_nonzero(c)) for c in counts) - sum(sizes)
-    if min(sizes) < RESTING or moving < RESTING:
-        return None
-    return _weighted(base, known_from_rest(base.fit, rest))
-
-
-def at_rest(record: Record) -> Any:
-    """Return the samples at which the reference has stood still for as long as it still will."""
-    rest = np.zeros(len(record), dtype=bool)
-    if record.r is None:
-        return rest
-    r, y = np.asarray(record.r), np.asarray(record.y)
-    ends = np.flatnonzero(np.diff(r, append=np.nan) != 0) + 1
-    for first, stop in zip([0, *ends[:-1]], ends, strict=True):
-        middle = (first + stop) // 2
-        if stop - middle >= RESTING // 4 and np.std(y[middle:stop]) < STILL * np.std(y):
-            rest[middle:stop] = True
-    return rest
-
-
-def _weighted(base: Model, known: Known) -> Model:
-    """Return the model fitted with a known noise, from where it is or from its given values."""
-    problem, fits = replace(base.fit.problem, known=known), []
-    for start in (base.fit.theta, start_values(base.loop, base.names)):
-        try:
-            fits.append(climb(begin(problem, start, None), exact=False))
-        except CtrlidError:
-            continue
-    if not fits:
-        return base
-    return Model(base.loop, max(fits, key=lambda f: f.value))
+    problem = replace(base.fit.problem, known=known_from_repeats(base.fit, periods))
+    return Model(base.loop, climb(begin(problem, base.fit.theta, None), exact=False))
 
 
 def anchor(base: Model) -> Model | None:
@@ -337,6 +296,9 @@ def _extended(base: Model, loop: Loop, names: Sequence[str]) -> Fit:
             lower[k], upper[k] = max(lower[k], 1.0 / longest), min(upper[k], 0.4 / loop.dt)
         if name.endswith(".damping"):
             upper[k] = min(upper[k], 1.0)
+        if name.endswith(".period") and m.e.velocities:  # what repeats has to repeat
+            way = max(float(np.ptp(a.filtered[:, m.position])) for a in at)
+            upper[k] = max(min(upper[k], way), lower[k])
         if name.endswith(".vs"):  # of the speeds that there are
             fastest = max(_speed(m, a) for a in at)
             lower[k], upper[k] = max(lower[k], 1e-3 * fastest), min(upper[k], 3.0 * fastest)
@@ -411,7 +373,8 @@ def _objection(trial: Trial) -> str:
         low, high = fit.problem.lower[k], fit.problem.upper[k]
         about = next(p for p in effect.parameters() if p.name == name.partition(".")[2])
         on_bound = fit.theta[k] in (low, high)
-        if on_bound and (about.name == "frequency" or about.neutral not in (None, low, high)):
+        scanned = about.name in ("frequency", "period")
+        if on_bound and (scanned or about.neutral not in (None, low, high)):
             return f"{about.name} ends on its bound {fit.theta[k]:g}"
     if _insignificant(trial, effect):
         return "no larger than its uncertainty"
