@@ -15,7 +15,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.rcsetup import cycler
-from matplotlib.ticker import MultipleLocator, ScalarFormatter
+from matplotlib.ticker import MultipleLocator
 
 from . import _pictures, _text
 from .band import response_band
@@ -778,7 +778,7 @@ def _ranking(ax: Any, rounds: Mapping[int, Sequence[_pictures.Bar]]) -> None:
     ax.axvline(GATE, color="k", linewidth=1, linestyle="--", label="strong")
     ax.axvline(0, color="0.3", linewidth=0.8)
     ax.set_xscale("symlog", linthresh=GATE)
-    ax.xaxis.set_major_formatter(ScalarFormatter())
+    ax.xaxis.set_major_formatter("{x:g}")
     ax.set_xlim(_pictures.LEAST, 3 * max(top, 2 * GATE))
     ax.set_yticks(range(row), labels, fontsize="small")
     ax.tick_params(axis="y", length=0)

@@ -404,7 +404,11 @@ def _presence(f: Found, found: Search, records: Sequence[Record]) -> str:
 def _ranking(found: Search) -> tuple[Candidate, ...]:
     rows = []
     for k, step in enumerate(found.steps):
+        begun: list[Trial] = []  # the same effect, begun elsewhere, is shown once
         for t in step.trials:
+            if any(t.same_kind(b) for b in begun):
+                continue
+            begun.append(t)
             refitted = math.isfinite(t.gain)
             effect = t.fitted if refitted else t.effect
             price = t.cost if refitted else t.price

@@ -1,0 +1,23 @@
+"""The diagnosis on real records: the stories assert what the literature knows."""
+
+import runpy
+from pathlib import Path
+
+import matplotlib as mpl
+import pytest
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["real_emps", "real_inteco"])
+def test_the_story(name, data_dir, capsys):
+    """Each story ends in assertions of its own; here it must also print its report."""
+    del data_dir
+    import matplotlib.pyplot as plt
+
+    mpl.use("Agg")
+    told = runpy.run_path(str(EXAMPLES / f"{name}.py"))
+    plt.close("all")
+    assert told["found"].verdict == "partly explained"
+    assert "PARTLY EXPLAINED" in capsys.readouterr().out
