@@ -231,7 +231,10 @@ def redesign(
     if growth >= 0 or not margins.stable:
         achieved = Performance(False, *(float("nan"),) * 6)
         if "deviations grow" not in failure:
-            failure = f"Small deviations grow at {growth:.3g} 1/s. {failure}".strip()
+            # Dry friction holds what is at rest; the loop around it may be unstable all the same.
+            why = (f"Small deviations grow at {growth:.3g} 1/s." if growth >= 0 else
+                   "Friction aside, the loop is unstable.")  # fmt: skip
+            failure = f"{why} {failure}".strip()
     else:
         achieved = _performance(margins, time, np.empty(0) if failure else achieved_step)
         achieved = replace(achieved, stable=not failure)
