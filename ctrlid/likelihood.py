@@ -17,6 +17,7 @@ ROUNDS = 25  # Gauss-Newton steps at most
 FAR = 3.0  # standard errors: after a longer step the trajectory is settled anew
 CLOSE = 0.02  # standard errors: a smaller step ends the search
 QUIET = 1e-14  # of the output's size, squared: the least variance of the sensor noise
+LEAST = -24.0  # logarithm of the least force noise: below, only the start of the record counts
 SLOWEST = 0.05  # of the longest record: the time constant of a coloured force
 LOG_STEP = 0.2  # of log variances, for derivatives
 SINGULAR = 1e-10  # relative eigenvalue below which a direction is not in the data
@@ -264,9 +265,9 @@ def _limits(m: Machine, coloured: bool, longest: int) -> tuple[Array, Array]:
     A force that hardly changes during a record is an offset, not noise.
     """
     unit, dt = 2 * math.log(_unit(m)), m.loop.dt
-    low, high = [unit - 32.0] * m.channels, [unit + 6.0] * m.channels
+    low, high = [unit + LEAST] * m.channels, [unit + 6.0] * m.channels
     if coloured:
-        low += [unit - 32.0, math.log(2 * dt)]
+        low += [unit + LEAST, math.log(2 * dt)]
         high += [unit + 6.0, math.log(max(min(SLOWEST * longest, 2e4), 4.0) * dt)]
     return np.array(low), np.array(high)
 

@@ -3,7 +3,9 @@
 Groups: without noise; scatter; what is fitted with what; information; noise; limits; refusals.
 """
 
+import runpy
 from dataclasses import replace
+from pathlib import Path
 
 import control as ct
 import numpy as np
@@ -13,7 +15,7 @@ from scipy import stats
 import ctrlid as cid
 from ctrlid import CtrlidError
 from ctrlid import effects as E
-from ctrlid.likelihood import evaluate, information
+from ctrlid.likelihood import begin, climb, evaluate, information, pseudo_inverse
 from ctrlid.loop_fit import make_problem, start_values
 from ctrlid.simulation import Simulator
 
@@ -299,6 +301,23 @@ def test_the_information_is_the_curvature_of_the_likelihood(name):
     size = np.sqrt(np.diag(expected))
     np.testing.assert_allclose(hessian / np.outer(size, size), expected / np.outer(size, size),
                                atol=0.1)  # fmt: skip
+
+
+def test_standard_errors_without_any_force_noise():
+    """An analog loop sampled slowly, where no force noise is found: errors are as large as held.
+
+    With the gain of the filter held, the information is that of the slopes; the exact one is nearly
+    the same, as what the noise tells of the parameters is little.
+    """
+    study = runpy.run_path(str(Path(__file__).parents[1] / "benchmarks" / "study_iv.py"))
+    draw = study["draw_analog"](np.random.default_rng([3, 0, 0]), 0.5, 0.01)
+    loop, record = draw.loop, draw.record
+    names = loop.free
+    start = begin(make_problem(loop, names, [record]), start_values(loop, names), None)
+    fit = climb(start)
+    held = np.sqrt(np.diag(pseudo_inverse(fit.normal[0])))
+    exact = np.sqrt(np.diag(pseudo_inverse(information(fit)[0])))[: len(names)]
+    np.testing.assert_allclose(exact, held, rtol=0.05)
 
 
 def test_the_covariance_is_the_inverse_of_the_information():
