@@ -111,6 +111,7 @@ def test_a_long_log_is_fitted_in_blocks(capsys, monkeypatch):
     assert "1199998 rows" in capsys.readouterr().out
 
 
+@pytest.mark.slow  # the manual executes it as well
 def test_the_tutorial(capsys):
     """From a CSV file to a controller whose promise only the named effect lets it keep."""
     told = runpy.run_path(str(EXAMPLES / "plot_04_csv_to_controller.py"))
