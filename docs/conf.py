@@ -43,10 +43,10 @@ numpydoc_show_class_members = False
 sphinx_gallery_conf = {
     "examples_dirs": "../examples",
     "gallery_dirs": "gallery",
-    # Examples on measured records are shown everywhere and executed where the records are; EMPS,
-    # which takes two minutes, is executed by `pytest -m slow tests/test_real_diagnosis.py`.
+    # Examples on measured records are shown everywhere and executed where the records are; the
+    # diagnoses, which take minutes, by `pytest -m slow tests/test_real_diagnosis.py`.
     "filename_pattern": (
-        r"/(plot_|real_(?!emps))" if os.environ.get("CTRLID_DATA_DIR") else r"/plot_"
+        r"/(plot_|real_(?!emps|inteco))" if os.environ.get("CTRLID_DATA_DIR") else r"/plot_"
     ),
     "within_subsection_order": "FileNameSortKey",
     "abort_on_example_error": True,

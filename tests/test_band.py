@@ -38,6 +38,7 @@ def fitted(structure, values, covariance, dt):
     ],
     ids=["fit_iv", "fit_iv constrained", "fit_continuous"],
 )  # fmt: skip
+@pytest.mark.slow
 def test_bands_cover_the_truth_as_often_as_they_say(fit, known):
     rig, w, runs = loop(), np.array([3.0, 40.0, 150.0, 400.0]), 40
     inside = np.zeros((2, len(w)))

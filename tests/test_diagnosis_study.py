@@ -50,6 +50,7 @@ def test_an_ordinary_effect_is_named_and_closes_the_gap(kind):
     assert abs(row.left) < 10
 
 
+@pytest.mark.slow
 def test_where_nothing_is_missing_nothing_is_named():
     row = drawn("none", 1)
     assert row.verdict == "nothing missing"

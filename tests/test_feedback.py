@@ -119,6 +119,7 @@ def test_unstable_plant_without_noise_or_reference():
     assert "unstable" in str(found)
 
 
+@pytest.mark.slow
 def test_p_values_are_honest():
     """White u and white noise: a tenth of the cases lies below 0.1."""
     rng = np.random.default_rng(4)

@@ -38,6 +38,7 @@ def levitated(pole_times_period, noise, n=8000):
     return cid.simulate(cid.Loop(P, C, dt=dt), r, sensor_noise=noise, seed=2)
 
 
+@pytest.mark.slow
 def test_poles_and_delay_of_random_plants():
     rng = np.random.default_rng(1)
     right = []

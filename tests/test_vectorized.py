@@ -224,7 +224,8 @@ def test_sparse_inputs_and_empty_outputs():
 
 
 def test_a_plants_map_with_effects_and_derivatives():
-    loop = cid.Loop(cid.plants.maglev(m=0.02, K=3e-6), None, dt=0.001)
+    plant = cid.plants.maglev(m=0.02, K=3e-6)
+    loop = cid.Loop(plant, None, dt=0.001, at=cid.operating_point(plant, output=0.01))
     for effect in (cid.effects.CoulombFriction(fc=0.1), cid.effects.InputDeadZone(width=0.2)):
         loop = loop.with_effect(effect)
     e = loop.equations()
