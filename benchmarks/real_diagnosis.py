@@ -7,10 +7,9 @@ fetched once, or read from the folder named by CTRLID_DATA_DIR. About five minut
 
 from __future__ import annotations
 
-import argparse
-
 import control as ct
 import numpy as np
+from real_records import run
 from scipy import signal
 
 import ctrlid as cid
@@ -95,14 +94,5 @@ def servo() -> None:
 RIGS = {"emps": emps, "magnetoshield": magnetoshield, "tanks": tanks, "servo": servo}
 
 
-def main() -> None:
-    """Print the reports."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("rigs", nargs="*", default=list(RIGS), help=", ".join(RIGS))
-    for name in parser.parse_args().rigs:
-        RIGS[name]()
-        print(flush=True)
-
-
 if __name__ == "__main__":
-    main()
+    run(RIGS, __doc__)

@@ -7,7 +7,7 @@ for some of them). The records are fetched once, or read from the folder named b
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import control as ct
@@ -218,14 +218,14 @@ def servo() -> list[cid.LoopFit]:
 RIGS = {"magnetoshield": magnetoshield, "inteco": inteco, "emps": emps, "servo": servo}
 
 
-def main() -> None:
-    """Print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("rigs", nargs="*", default=list(RIGS), help=", ".join(RIGS))
+def run(rigs: dict[str, Callable[[], object]], about: str) -> None:
+    """Print the tables of the rigs that the command line names, by default of all."""
+    parser = argparse.ArgumentParser(description=about.splitlines()[0])
+    parser.add_argument("rigs", nargs="*", default=list(rigs), help=", ".join(rigs))
     for name in parser.parse_args().rigs:
-        RIGS[name]()
+        rigs[name]()
         print(flush=True)
 
 
 if __name__ == "__main__":
-    main()
+    run(RIGS, __doc__)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..physics import Array
-from .trial import Trial, log_terms
+from .trial import Trial, log_terms, same_kind
 
 GATE = 5.0  # gain of log-likelihood less penalty: 10 in units of the Bayesian criterion
 CLOSE = 3.0  # difference of log-likelihood that says nothing
@@ -69,7 +69,7 @@ def rivals(best: Trial, others: Sequence[Trial]) -> tuple[Trial, ...]:
     mine = log_terms(best.model.fit)
     found = []
     for trial in others:
-        if trial.same_kind(best) or trial.merit <= GATE:
+        if same_kind(trial.effect, best.effect) or trial.merit <= GATE:
             continue
         lost = best.merit - trial.merit
         theirs = log_terms(trial.model.fit)

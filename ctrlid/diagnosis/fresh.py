@@ -53,7 +53,7 @@ class Fresh:
     def outputs(self, loops: Sequence[Loop]) -> tuple[Array, ...]:
         """Return what each loop makes of its window."""
         pairs = zip(loops, self.windows, strict=True)
-        return tuple(gaps.outputs(loop, [w], self.kind)[0] for loop, w in pairs)
+        return tuple(gaps.output(loop, w, self.kind) for loop, w in pairs)
 
     def gap(self, loops: Sequence[Loop]) -> float:
         """Return the RMS error of loops [output unit]."""
@@ -62,7 +62,7 @@ class Fresh:
     def excess(self, loops: Sequence[Loop], fit: Fit) -> float:
         r"""Return what noise, as a fit knows it, leaves unexplained of the innovations.
 
-        .. math:: \\tfrac12 \\sum_k (e_k^2 / s_k - 1)
+        .. math:: \tfrac12 \sum_k (e_k^2 / s_k - 1)
         """
         known = fit.problem.known or Known(fit.noise, fit.sensor)
         known = replace(known, sensor=np.full(1, float(np.mean(fit.sensor))))

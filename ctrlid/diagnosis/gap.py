@@ -81,27 +81,24 @@ def root_mean_square(windows: Sequence[Window], results: Sequence[Array]) -> flo
     return math.sqrt(squares / max(count, 1))
 
 
-def outputs(loop: Loop, windows: Sequence[Window], kind: str) -> tuple[Array, ...]:
-    """Return what a loop makes of each window, without any of its measured outputs but the first.
+def output(loop: Loop, window: Window, kind: str) -> Array:
+    """Return what a loop makes of a window, without any of its measured outputs but the first.
 
     Parameters
     ----------
     loop : Loop
         The model.
-    windows : sequence of Window
+    window : Window
         The data.
     kind : str
         As `way_to_compare` says it.
 
     Returns
     -------
-    tuple of ndarray
+    ndarray
         Outputs; NaN where there are none.
     """
-    return tuple(_output(loop, w.record, w.begin, kind) for w in windows)
-
-
-def _output(loop: Loop, record: Record, first: float, kind: str) -> Array:
+    record, first = window.record, window.begin
     y = np.full(len(record), np.nan)
     try:
         if kind.endswith("prediction"):

@@ -36,6 +36,7 @@ from .trial import (
     attempt_at,
     base_model,
     refit,
+    same_kind,
     weighted_by_repeats,
 )
 
@@ -404,11 +405,11 @@ def _presence(f: Found, found: Search, records: Sequence[Record]) -> str:
 def _ranking(found: Search) -> tuple[Candidate, ...]:
     rows = []
     for k, step in enumerate(found.steps):
-        begun: list[Trial] = []  # the same effect, begun elsewhere, is shown once
+        begun: list[AbstractEffect] = []  # the same effect, begun elsewhere, is shown once
         for t in step.trials:
-            if any(t.same_kind(b) for b in begun):
+            if any(same_kind(t.effect, b) for b in begun):
                 continue
-            begun.append(t)
+            begun.append(t.effect)
             refitted = math.isfinite(t.gain)
             effect = t.fitted if refitted else t.effect
             price = t.cost if refitted else t.price

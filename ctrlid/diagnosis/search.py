@@ -28,7 +28,7 @@ from .replica import (
     simulable,
 )
 from .scan import scanned
-from .trial import Model, Trial, anchor, attempt_at, promised, reduced, refit
+from .trial import Model, Trial, anchor, attempt_at, promised, reduced, refit, same_kind
 
 MOST = 5  # effects in one record
 TOP = 5  # candidates refitted because of what they promise
@@ -262,15 +262,14 @@ def main_ones(found: Search, helps: Callable[[Found, Model], bool]) -> Search:
 def _there(model: Model, effect: AbstractEffect) -> bool:
     """Whether the model has this effect already; there may be several vibrations."""
     waves = {"frequency", "period"} & set(effect.values())
-    return not waves and any(
-        type(e) is type(effect) and getattr(e, "name", "") == getattr(effect, "name", "")
-        for e in model.loop.effects
-    )
+    return not waves and any(same_kind(e, effect) for e in model.loop.effects)
 
 
 def _renoised(model: Model) -> Model:
     """Ask again whether the data want a coloured force, now that an effect is in the model."""
     fit = polish(model.fit)
+    if fit.problem.known is not None:
+        return Model(model.loop, fit)
     if fit.noise.drift:
         plain = climb(replace(fit, noise=replace(fit.noise, memory=0.0, drift=0.0)))
         if plain.value > fit.value - math.log(fit.size):

@@ -72,13 +72,6 @@ class Trial:
         """The name of the effect; drifts and steps belong to a parameter."""
         return type(self.effect).__name__
 
-    def same_kind(self, other: "Trial") -> bool:
-        """Whether another trial is of the same effect, begun elsewhere."""
-        mine, theirs = self.effect, other.effect
-        return type(mine) is type(theirs) and getattr(mine, "name", "") == getattr(
-            theirs, "name", ""
-        )
-
     @property
     def price(self) -> float:
         """Half the Bayesian penalty if all its parameters count."""
@@ -96,6 +89,11 @@ class Trial:
     def fitted(self) -> AbstractEffect:
         """The effect with its fitted parameters."""
         return self.model.fitted.labelled[self.label]
+
+
+def same_kind(one: AbstractEffect, other: AbstractEffect) -> bool:
+    """Whether two effects differ in their values only: of one class, and of one state or name."""
+    return type(one) is type(other) and getattr(one, "name", "") == getattr(other, "name", "")
 
 
 def base_model(
