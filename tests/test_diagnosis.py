@@ -222,7 +222,6 @@ def test_a_transfer_function_as_the_model():
 # --- several records
 
 
-@pytest.mark.xfail(reason="fitted jointly, half an effect looks like another", strict=True)
 def test_an_effect_that_only_some_records_have():
     loop = levitation()
     rubbing = loop.with_effect(E.ViscousFriction(c=4.0))

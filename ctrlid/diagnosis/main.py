@@ -28,8 +28,9 @@ from .omnibus import places
 from .readout import Readout, censored, clipping, steps
 from .replica import forgiven, replica, simulable
 from .result import Calibrated, Candidate, Diagnosis, Disturbance, Finding, Gap, Verdict
-from .search import Found, Search, main_ones, search
+from .search import Found, Search, Work, main_ones, search
 from .sentences import conclusion
+from .several import merged, presence
 from .trial import (
     Model,
     Trial,
@@ -45,6 +46,7 @@ TIE = 0.02  # difference of log-likelihood between effects that are one and the 
 HELPS = 0.05  # of what is left without an effect, on fresh data
 EXCESS = 1.5  # times the noise floor (twice that with a coloured force): above, not explained
 WORSE = 1.2  # times the gap of the model as given: above, the fit explains nothing
+COMPLETE = ("explained", "nothing missing")
 REPEATS = 3  # of an experiment, from which its noise is taken
 STEPS = 6  # of the progress bar
 
@@ -130,11 +132,25 @@ def diagnose(
         bar.set_description(f"diagnose: {text}")
         bar.update(step)
 
-    tell("looking the record over", 1)
+    tell("looking the records over", 1)
     audits, remarks = _look_over(loop, records)
+    options = catalogue, _worker(jobs), tell
+    result, found = _diagnosed(loop, records, audits, fresh, *options)
+    if len(records) > 1 and not _alike(result):
+        result = _one_by_one(loop, records, audits, found, *options) or result
+    bar.close()
+    return replace(result, audit=remarks, record=_name(records),
+                   seconds=time.perf_counter() - started)  # fmt: skip
+
+
+def _diagnosed(
+    loop: Loop, records: Sequence[Record], audits: Sequence[Audit], fresh: Fresh,
+    catalogue: Sequence[type[AbstractEffect]], work: Work, tell: Callable[..., None],
+) -> tuple[Diagnosis, Search]:  # fmt: skip
+    """Diagnose records together."""
     given = loop
     read = [r for r in (clipping(records, audits, catalogue),) if r is not None]
-    used = records
+    used = tuple(records)
     for r in read:
         loop = loop.with_effect(r.effect)
         used = tuple(censored(record, r.effect) for record in records)
@@ -144,7 +160,7 @@ def diagnose(
     periods = _periods(parts, audits)
     if periods:
         base = weighted_by_repeats(base, periods)
-    found = search(base, catalogue, _worker(jobs), tell)
+    found = search(base, catalogue, work, tell)
     tell("comparing on fresh data", 2)
     coarse = steps(found.final.fit, audits, catalogue)
     if coarse and not found.after.passed and simulable(found.final):
@@ -159,9 +175,42 @@ def diagnose(
         gap, shares, disturbance = _gaps(given, found, fresh)
     tell("writing down", 1)
     read += [coarse] if coarse else []
-    result = _result(given, records, found, gap, shares, disturbance, remarks, read)
-    bar.close()
-    return replace(result, seconds=time.perf_counter() - started)
+    return _result(given, records, found, gap, shares, disturbance, read), found
+
+
+def _alike(result: Diagnosis) -> bool:
+    """Whether records that were diagnosed together seem to have the same in them."""
+    whole = result.verdict in COMPLETE
+    return whole and not any(f.note.endswith(" only") for f in result.findings)
+
+
+def _one_by_one(
+    loop: Loop, records: Sequence[Record], audits: Sequence[Audit], together: Search,
+    catalogue: Sequence[type[AbstractEffect]], work: Work, tell: Callable[..., None],
+) -> Diagnosis | None:  # fmt: skip
+    """Diagnose each record alone; None where that does not explain all of them, and better."""
+    parts: list[Diagnosis] = []
+    won = size = 0.0
+    for record, looked in zip(records, audits, strict=True):
+        tell(f"record {len(parts) + 1} alone")
+        fresh = fresh_data(loop, [record], None)
+        try:
+            result, found = _diagnosed(loop, [record], [looked], fresh, catalogue, work, tell)
+        except CtrlidError:  # one that says too little when it stands alone
+            return None
+        if result.verdict not in COMPLETE:
+            return None
+        parts.append(result)
+        won += _merit(found.final.fit)
+        size += found.final.fit.size
+    fit = together.final.fit
+    better = size != fit.size or won > _merit(fit) + GATE
+    return merged(loop, parts) if better else None
+
+
+def _merit(fit: Fit) -> float:
+    """Return the log-likelihood less half the Bayesian penalty."""
+    return fit.value - 0.5 * len(fit.theta) * math.log(fit.size)
 
 
 def _records(record: Any) -> tuple[Record, ...]:
@@ -305,7 +354,7 @@ def _disturbance(fit: Fit, loop: Loop, floor: float, quiet: float) -> Disturbanc
 
 def _result(
     loop: Loop, records: Sequence[Record], found: Search, gap: Gap, shares: dict[int, float],
-    disturbance: Disturbance, remarks: tuple[str, ...], read: Sequence[Readout],
+    disturbance: Disturbance, read: Sequence[Readout],
 ) -> Diagnosis:  # fmt: skip
     fitted = summary(found.final.loop, found.final.fit)
     errors = dict(zip(fitted.estimate.names, fitted.estimate.standard_errors.tolist(), strict=True))
@@ -344,7 +393,7 @@ def _result(
     return Diagnosis(
         verdict, conclusion(verdict, findings, gap, disturbance, found.after, where), findings,
         final, gap, where, _ranking(found), disturbance, calibrated, _sensitivity(found),
-        tests, remarks, tuple(notes), _name(records),
+        tests, notes=tuple(notes),
     )  # fmt: skip
 
 
@@ -395,11 +444,8 @@ def _presence(f: Found, found: Search, records: Sequence[Record]) -> str:
         except CtrlidError:
             continue
         if refit(alone, attempt_at(alone, f.trial.fitted)).merit > GATE:
-            seen.append(k + 1)
-    if len(seen) == len(records):
-        return "seen in every record"
-    which = ", ".join(map(str, seen)) or "none"
-    return f"seen in record {which} of {len(records)} only"
+            seen.append(k)
+    return presence(seen, len(records))
 
 
 def _ranking(found: Search) -> tuple[Candidate, ...]:

@@ -1,0 +1,187 @@
+"""Several records that do not have the same in them: what each says alone, put together."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import stats
+
+from .._text import listing, number, with_error
+from ..effects import AbstractEffect
+from ..loop import Loop
+from .result import Calibrated, Candidate, Diagnosis, Finding, Gap
+from .trial import same_kind
+
+DIFFERENT = 1e-3  # chance that one value looks so different in several records
+
+
+@dataclass(frozen=True, eq=False)
+class Shared:
+    """One effect and the findings that may be it, by the number of their record."""
+
+    kinds: tuple[AbstractEffect, ...]
+    seen: dict[int, Finding]
+
+
+def merged(loop: Loop, parts: Sequence[Diagnosis]) -> Diagnosis:
+    """Return one diagnosis of several records, each of which was diagnosed alone.
+
+    Parameters
+    ----------
+    loop : Loop
+        The model as given.
+    parts : sequence of Diagnosis
+        One for each record, all of them explained or with nothing missing.
+
+    Returns
+    -------
+    Diagnosis
+        Findings say in which records they were seen, and how large. Where no effect but a
+        parameter of the model tells the records apart, the verdict is ``"unknown"``.
+    """
+    lead = max(parts, key=lambda p: max((f.evidence for f in p.findings), default=0.0))
+    findings = tuple(sorted((_finding(s, len(parts)) for s in _shared(parts)),
+                            key=lambda f: -f.evidence))  # fmt: skip
+    calibrated, differing = _calibrated(parts)
+    complete = loop.with_parameters({c.name: c.after for c in calibrated})
+    for f in findings:
+        if not any(same_kind(f.effect, e) for e in complete.effects):
+            complete = complete.with_effect(f.effect)
+    notes = list(dict.fromkeys(n for p in parts for n in p.notes))
+    notes.append(
+        "the records do not have the same in them, so each was fitted alone; the gap is that of "
+        "all, on the last quarter of each; axes and curves are those of record "
+        f"{parts.index(lead) + 1}"
+    )
+    verdict, sentence = lead.verdict, _sentence(findings, len(parts))
+    if differing:
+        words = "; ".join(differing)
+        notes.append(f"the model's own parameters differ between the records: {words}")
+    if not findings and differing:
+        verdict = "unknown"
+        sentence = (f"Each record alone is explained by the model, but with other values: {words}. "
+                    "What changed between the records is not in it.")  # fmt: skip
+    return replace(
+        lead, verdict=verdict, sentence=sentence, findings=findings, loop=complete,
+        gap=_gap(lead, parts), ranking=_ranking(parts), calibrated=calibrated,
+        tests={name: min(p.tests.get(name, 1.0) for p in parts) for name in lead.tests},
+        notes=tuple(notes),
+    )  # fmt: skip
+
+
+def _shared(parts: Sequence[Diagnosis]) -> list[Shared]:
+    """Put findings of different records together that may be one and the same effect."""
+    every = [(k, f) for k, p in enumerate(parts) for f in p.findings]
+    found: list[Shared] = []
+    for k, f in sorted(every, key=lambda pair: -pair[1].evidence):
+        mine = (f.effect, *f.alternatives)
+        for i, s in enumerate(found):
+            common = tuple(e for e in s.kinds if any(same_kind(e, other) for other in mine))
+            if common and k not in s.seen:
+                found[i] = Shared(common, {**s.seen, k: f})
+                break
+        else:
+            found.append(Shared(mine, {k: f}))
+    return found
+
+
+def presence(seen: Sequence[int], records: int) -> str:
+    """Say in which of several records an effect was seen.
+
+    Parameters
+    ----------
+    seen : sequence of int
+        Numbers of the records, from 0.
+    records : int
+        How many there are.
+
+    Returns
+    -------
+    str
+        ``"seen in every record"`` or, for instance, ``"seen in record 1 of 2 only"``.
+    """
+    if len(seen) == records:
+        return "seen in every record"
+    if not seen:
+        return "seen in no record alone"
+    which = listing([str(k + 1) for k in seen])
+    return f"seen in record{'s' if len(seen) > 1 else ''} {which} of {records} only"
+
+
+def _values(effect: AbstractEffect) -> str:
+    return ", ".join(f"{k} = {number(v, 4)}" for k, v in effect.values().items())
+
+
+def _as(kind: AbstractEffect, f: Finding) -> AbstractEffect:
+    return next(e for e in (f.effect, *f.alternatives) if same_kind(kind, e))
+
+
+def _finding(s: Shared, records: int) -> Finding:
+    """Return what several records say of an effect; the clearest gives the values."""
+    best = max(s.seen.values(), key=lambda f: f.evidence)
+    chosen, *others = (_as(kind, best) for kind in s.kinds)
+    numbers = sorted(s.seen)
+    note = presence(numbers, records)
+    if len(numbers) > 1:
+        sizes = [f"{_values(_as(chosen, s.seen[k]))} in record {k + 1}" for k in numbers]
+        note += f"; each has its own size: {listing(sizes)}"
+    sure = same_kind(chosen, best.effect)
+    return replace(
+        best, effect=chosen, alternatives=tuple(others),
+        standard_errors=best.standard_errors if sure else {},
+        evidence=sum(f.evidence for f in s.seen.values()), note=note,
+        experiment=best.experiment if others else "", reference=best.reference if others else None,
+    )  # fmt: skip
+
+
+def _calibrated(parts: Sequence[Diagnosis]) -> tuple[tuple[Calibrated, ...], list[str]]:
+    """Return the parameters' weighted means, and those that no single value explains."""
+    means, differing = [], []
+    for same in zip(*(p.calibrated for p in parts), strict=True):
+        first = same[0]
+        sure = [c for c in same if math.isfinite(c.standard_error) and c.standard_error > 0]
+        if not sure:
+            means.append(first)
+            continue
+        values = np.array([c.after for c in sure])
+        weights = np.array([c.standard_error**-2 for c in sure])
+        mean = float(weights @ values / weights.sum())
+        before = float(np.mean([c.before for c in same]))
+        means.append(
+            Calibrated(first.name, first.given, before, mean, float(weights.sum()) ** -0.5)
+        )
+        spread = float(weights @ (values - mean) ** 2)
+        if len(sure) > 1 and stats.chi2.sf(spread, len(sure) - 1) < DIFFERENT:
+            sizes = [f"{with_error(c.after, c.standard_error)} in record {k + 1}"
+                     for k, c in enumerate(same)]  # fmt: skip
+            differing.append(f"{first.name} = {listing(sizes)}")
+    return tuple(means), differing
+
+
+def _sentence(findings: Sequence[Finding], records: int) -> str:
+    if not findings:
+        return "At the sensitivity of these records, what is left is noise."
+    names = " and ".join(f"{' or '.join(f.names)} ({f.note.partition(';')[0]})" for f in findings)
+    were, them = ("were", "them") if len(findings) > 1 else ("was", "it")
+    return f"Missing {were} {names}; with {them}, what is left is noise."
+
+
+def _gap(lead: Diagnosis, parts: Sequence[Diagnosis]) -> Gap:
+    """Return the RMS over all records; the curves are those of one."""
+    weights = np.array([len(p.gap.time) for p in parts], dtype=float)
+
+    def rms(name: str) -> float:
+        sizes = np.array([getattr(p.gap, name) for p in parts])
+        return float(np.sqrt(np.average(sizes**2, weights=weights)))
+
+    given, before, after, floor = map(rms, ("given", "before", "after", "floor"))
+    return replace(lead.gap, given=given, before=before, after=after, floor=floor)
+
+
+def _ranking(parts: Sequence[Diagnosis]) -> tuple[Candidate, ...]:
+    rows: list[Candidate] = []
+    for p in parts:
+        done = max((c.round for c in rows), default=0)
+        rows += [replace(c, round=c.round + done) for c in p.ranking]
+    return tuple(rows)

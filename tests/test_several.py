@@ -1,0 +1,71 @@
+"""Records diagnosed together that do not have the same in them."""
+
+import pytest
+
+import ctrlid as cid
+from ctrlid import effects as E
+from ctrlid.diagnosis.several import presence
+
+FEW = (E.ViscousFriction, E.CoulombFriction, E.InputDelay, E.LinearStiffness)
+
+
+def drive():
+    plant = cid.plants.servo(m=2.0, c=5.0, k=30.0)
+    C = cid.PID(kp=6.0, ki=4.0, kd=0.4, filter_time=0.02)
+    at = cid.OperatingPoint((0.0, 0.0), 0.0, 0.0)
+    return cid.Loop(plant, C, dt=0.01, at=at, free=("c", "k"))
+
+
+def record_of(real, seed, n=2000):
+    r = cid.random_binary(n, amplitude=0.3, hold=60, seed=seed)
+    return cid.simulate(real, r, sensor_noise=1e-3, seed=seed + 1)
+
+
+def diagnosed(*reals, seed, catalogue=FEW):
+    records = [record_of(real, seed + 10 * k) for k, real in enumerate(reals)]
+    return cid.diagnose(drive(), records, catalogue=catalogue, progress=False)
+
+
+def test_each_record_lacks_something_else(tmp_path):
+    loop = drive()
+    rubbing = loop.with_effect(E.CoulombFriction(fc=0.4))
+    late = loop.with_effect(E.InputDelay(delay=0.008))
+    found = diagnosed(rubbing, late, seed=8300)
+    assert found.verdict == "explained"
+    notes = {f.name: f.note for f in found.findings}
+    assert notes == {"CoulombFriction": "seen in record 1 of 2 only",
+                     "InputDelay": "seen in record 2 of 2 only"}  # fmt: skip
+    assert {type(e).__name__ for e in found.loop.effects} == set(notes)
+    assert "CoulombFriction (seen in record 1 of 2 only)" in found.sentence
+    assert found.gap.after < 1.1 * found.gap.floor < 0.2 * found.gap.before
+    assert any("each was fitted alone" in note for note in found.notes)
+    assert str(cid.load_diagnosis(found.save(tmp_path / "found.json"), loop)) == str(found)
+
+
+def test_the_same_effect_in_two_sizes():
+    loop = drive()
+    reals = [loop.with_effect(E.CoulombFriction(fc=fc)) for fc in (0.3, 0.6)]
+    found = diagnosed(*reals, loop, seed=8400, catalogue=(E.CoulombFriction,))
+    (finding,) = found.findings
+    assert finding.name == "CoulombFriction"
+    assert finding.note.startswith(
+        "seen in records 1 and 2 of 3 only; each has its own size: fc = "
+    )
+    # The clearest record gives the size.
+    assert finding.effect.fc == pytest.approx(0.6, abs=5 * finding.standard_errors["fc"])
+
+
+def test_a_parameter_that_changed_between_the_records():
+    loop = drive()
+    found = diagnosed(loop, loop.with_parameters({"k": 27.0}), seed=8500)
+    assert found.verdict == "unknown"
+    assert not found.findings
+    assert "other values: k = " in found.sentence
+    (k,) = (c for c in found.calibrated if c.name == "k")
+    assert 27.0 < k.after < 30.0
+
+
+def test_in_which_records():
+    assert presence([0, 1], 2) == "seen in every record"
+    assert presence([0, 2], 3) == "seen in records 1 and 3 of 3 only"
+    assert presence([], 2) == "seen in no record alone"
