@@ -5,13 +5,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ..likelihood import pseudo_inverse
 from ..physics import Array
-from .trial import Trial, log_terms, same_kind
+from .trial import Trial, contains, log_terms, same_kind
 
 GATE = 5.0  # gain of log-likelihood less penalty: 10 in units of the Bayesian criterion
 CLOSE = 3.0  # difference of log-likelihood that says nothing
 SAME = 4.0  # spread of a likelihood ratio: two models that differ by less are nested
 Z = 2.0  # standard deviations of Vuong's test
+OPEN = 0.1  # standard error over the size of an effect: beyond, a further parameter may matter
 BLOCK = 50  # samples whose terms are summed before their spread is taken
 
 
@@ -51,6 +53,22 @@ def _spread(d: Array) -> float:
     return math.sqrt(float(np.sum((sums - sums.mean()) ** 2)))
 
 
+def _open(trial: Trial, simple: Trial) -> bool:
+    """Whether what an effect has beyond a simpler one may be large, for all the record says."""
+    names = trial.model.names
+    errors = np.sqrt(np.maximum(np.diag(pseudo_inverse(trial.model.fit.normal[0])), 0.0))
+    units = {p.name: p.unit for p in trial.effect.parameters() if p.neutral is not None}
+    shared = simple.fitted.values()
+    for k in units.keys() - shared.keys():
+        size = max(
+            (abs(v) for i, v in shared.items() if units.get(i) == units[k]), default=math.inf
+        )
+        key = f"{trial.label}.{k}"
+        if key in names and errors[names.index(key)] > OPEN * size:
+            return True
+    return False
+
+
 def rivals(best: Trial, others: Sequence[Trial]) -> tuple[Trial, ...]:
     """Return the candidates that the record cannot tell apart from the best, best first.
 
@@ -73,8 +91,11 @@ def rivals(best: Trial, others: Sequence[Trial]) -> tuple[Trial, ...]:
             continue
         lost = best.merit - trial.merit
         theirs = log_terms(trial.model.fit)
-        # A larger model that predicts the same contains the best one, and pays for nothing.
+        # A larger model that predicts the same contains the best one, and pays for nothing; but a
+        # record that says nothing of what it has more cannot exclude it.
         if trial.cost > best.cost and _spread(mine - theirs) < SAME:
+            if contains(trial.effect, best.effect) and _open(trial, best):
+                found.append(trial)
             continue
         z = vuong(mine, theirs, best.cost - trial.cost)
         if lost < CLOSE or z < Z:

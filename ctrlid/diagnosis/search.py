@@ -28,7 +28,17 @@ from .replica import (
     simulable,
 )
 from .scan import scanned
-from .trial import Model, Trial, anchor, attempt_at, promised, reduced, refit, same_kind
+from .trial import (
+    Model,
+    Trial,
+    anchor,
+    attempt_at,
+    contains,
+    promised,
+    reduced,
+    refit,
+    same_kind,
+)
 
 MOST = 5  # effects in one record
 TOP = 5  # candidates refitted because of what they promise
@@ -130,8 +140,24 @@ def one_round(
     done |= {id(t): r for t, r in zip(late, work(lambda t: refit(base, t), late), strict=True)}
     trials = [done.get(id(t), t) for t in tried]
     trials = _simplest(base, _checked(base, trials))
+    plain = _plainer(base, trials[0], trials[1:])
+    if plain is not trials[0]:
+        trials = [plain, *(t for t in trials if not same_kind(t.effect, plain.effect))]
     best = trials[0]
     return Step(base, tuple(trials), best if best.merit > GATE else None)
+
+
+def _plainer(base: Model, best: Trial, others: Sequence[Trial]) -> Trial:
+    """Return an effect that the best one contains, if it does as well when it starts from there."""
+    for t in others:
+        if not math.isfinite(best.merit) or not contains(best.effect, t.effect):
+            continue
+        values = best.fitted.values()
+        start = replace(t.effect, **{k: values[k] for k in t.effect.values()})
+        again = refit(base, attempt_at(base, start, t.scan), best.model)
+        if again.merit >= best.merit:
+            return again
+    return best
 
 
 def _simplest(base: Model, trials: list[Trial]) -> list[Trial]:
@@ -322,7 +348,8 @@ def _settled(
         best = max([mine, *again], key=lambda t: t.merit)
         if best.merit <= mine.merit + 1.0:
             best = mine
-        else:
+        best = _plainer(smaller, best, [mine, *again])
+        if best is not mine:
             model = _moved(best.model, position)
         close = rivals(best, [t for t in [mine, *again] if t is not best])
         found.append(Found(best, close, smaller, position))

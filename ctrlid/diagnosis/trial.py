@@ -27,6 +27,7 @@ from ..physics import Array
 SCREEN_ROUNDS = 14  # of a refit: a candidate that needs more is not the missing effect
 AWAY = 0.3  # of a given value: a recalibration beyond is doubted
 FAR = 10.0  # times its given value: no recalibration goes further
+FAINTER = 3  # times that an effect which promises nothing is tried at a tenth of its size
 SIGNIFICANT = 2.0  # standard errors that a fitted effect must at least be large
 SEEN = 1e-7  # share of a parameter's information that others must leave to it
 
@@ -149,11 +150,15 @@ def attempt(base: Model, effect: AbstractEffect, scan: float = 0.0) -> Trial:
     An effect that is faint is tried faint: far from there the first step promises nothing. The
     arguments are those of `attempt_at`.
     """
-    trials = [attempt_at(base, effect, scan)]
-    if not effect.neutral and trials[0].promise < 0:
-        fainter = _fainter(effect)
-        trials += [attempt_at(base, fainter, scan)] if fainter else []
-    return max(trials, key=lambda t: t.promise)
+    best = attempt_at(base, effect, scan)
+    for _ in range(FAINTER):
+        if effect.neutral or best.promise > 0:
+            break
+        fainter = _fainter(best.effect)
+        if fainter is None:
+            break
+        best = max(best, attempt_at(base, fainter, scan), key=lambda t: t.promise)
+    return best
 
 
 def _fainter(effect: AbstractEffect) -> AbstractEffect | None:
@@ -235,6 +240,12 @@ def _left(matrix: Array, own: Sequence[int], others: Sequence[int]) -> Array:
     cross = scaled[np.ix_(own, others)]
     inverse = np.linalg.pinv(scaled[np.ix_(others, others)], rcond=SEEN)
     return np.asarray(left - cross @ inverse @ cross.T)
+
+
+def contains(effect: AbstractEffect, simple: AbstractEffect) -> bool:
+    """Whether one effect is another with further parameters, as asymmetric friction is friction."""
+    more = set(effect.values()) > set(simple.values())
+    return more and type(simple).__name__ in effect.look_alikes
 
 
 def attempt_best(base: Model, effects: Sequence[AbstractEffect], scan: float) -> Trial:
@@ -330,13 +341,31 @@ def _carried(old: Machine, new: Machine, known: Trajectory, guess: Trajectory) -
     return Trajectory(*result)
 
 
-def refit(base: Model, trial: Trial) -> Trial:
-    """Refit a candidate together with the model and its noise."""
+def refit(base: Model, trial: Trial, near: Model | None = None) -> Trial:
+    """Refit a candidate together with the model and its noise.
+
+    Parameters
+    ----------
+    base : Model
+        The model without it.
+    trial : Trial
+        The candidate at its start.
+    near : Model, optional
+        A model from whose values and noise to start in place of those of `base`.
+
+    Returns
+    -------
+    Trial
+        With gain and cost, or with a remark that puts it out.
+    """
     if trial.remark:
         return trial
+    loop, names = trial.model.loop, trial.model.names
+    if near is not None:
+        known = dict(zip(near.names, near.fit.theta.tolist(), strict=True))
+        loop = loop.with_parameters({n: known[n] for n in names if n in known})
     try:
-        names = trial.model.names
-        start = _extended(base, trial.model.loop, names)
+        start = _extended(near or base, loop, names)
         fit = climb(start, rounds=SCREEN_ROUNDS, exact=False)
     except CtrlidError as reason:
         return replace(trial, remark=str(reason))

@@ -55,6 +55,8 @@ def equivalents(
     name = type(effect).__name__
     if name == "InputDelay":
         return ("delay of the output",)
+    if name == "AsymmetricCoulombFriction":
+        return ("CoulombFriction with a constant force",)
     if name in LAGS:
         return tuple(k for k in LAGS if k != name) if _linear(base.equations()) else ()
     others = [e for e in (_member(cls, base) for cls in catalogue) if e is not None]

@@ -129,7 +129,8 @@ class AsymmetricCoulombFriction(ForceEffect):
 
     .. math:: a = -f_c \, \mathrm{sign}(\dot x) - \delta
 
-    while it moves: a constant force is not told from it, except at rest.
+    while it moves, and what holds it at rest. Nothing tells it from `CoulombFriction` together with
+    a `ConstantForce`: what sticks is held against the one as against the other.
 
     Parameters
     ----------
@@ -153,13 +154,14 @@ class AsymmetricCoulombFriction(ForceEffect):
     )  # fmt: skip
     sentence: ClassVar[str] = "Dry friction is stronger in one direction."
     experiment: ClassVar[str] = (
-        "moving and resting: a constant force also pulls at rest, friction does not"
+        "slow strokes forwards and backwards: the force that each direction takes is read off one "
+        "by one"
     )
 
     def force(self, m: Moment) -> Any:
         """Return the acceleration."""
-        s = m.sign(m.velocity, width=STICKING * self.fc * m.dt)
-        return -self.fc * s - self.difference * s * s
+        v, width = m.velocity, STICKING * self.fc * m.dt
+        return -self.fc * m.sign(v, width) - self.difference * m.moving(v, width)
 
 
 @final

@@ -140,6 +140,17 @@ class Moment:
         """
         return Symbol(casadi.erf(v.sx / casadi.sqrt(2 * self._variance(v, width))))
 
+    def moving(self, v: Any, width: Any = 0.0) -> Any:
+        r"""Return one where something moves and zero at rest, averaged as in `sign`.
+
+        .. math:: 1 - \frac{w}{\sqrt{s^2 + w^2}}\, e^{-v^2 / 2 (s^2 + w^2)}
+
+        The square of an average would be no average: what turns back and forth moves all the time.
+        """
+        rest, both = self._variance(Symbol(casadi.SX(0.0)), width), self._variance(v, width)
+        share = casadi.sqrt(rest / both) * casadi.exp(-(v.sx**2) / (2 * both))
+        return Symbol(1 - share)
+
     def abs(self, v: Any, width: Any = 0.0) -> Any:
         """Return the absolute value of an expression, averaged as in `sign`."""
         return 2 * self.above(v, width) - v

@@ -1,0 +1,84 @@
+"""The single steps of a search: where it begins, what contains what, what stays possible."""
+
+import numpy as np
+import pytest
+
+import ctrlid as cid
+from ctrlid import effects as E
+from ctrlid.diagnosis.decide import rivals
+from ctrlid.diagnosis.search import _plainer
+from ctrlid.diagnosis.trial import attempt, attempt_at, base_model, contains, refit
+
+
+def levitation():
+    plant = cid.plants.maglev(m=0.0213, K=3.34e-6)
+    op = cid.operating_point(plant, output=0.012)
+    C = cid.design_lead(cid.linearize(plant, op), crossover=100, phase_margin=50)
+    return cid.Loop(plant, C.sample(2e-3, "tustin"), dt=2e-3, at=op, free=("K",))
+
+
+def drive():
+    plant = cid.plants.servo(m=2.0, c=5.0, k=30.0)
+    C = cid.PID(kp=6.0, ki=4.0, kd=0.4, filter_time=0.02)
+    at = cid.OperatingPoint((0.0, 0.0), 0.0, 0.0)
+    return cid.Loop(plant, C, dt=0.01, at=at, free=("c", "k"))
+
+
+def record_of(loop, effect, swing, noise, seed, n=3000):
+    r = cid.random_binary(n, amplitude=swing, hold=60, around=loop.point.output, seed=seed)
+    return cid.simulate(loop.with_effect(effect), r, sensor_noise=noise, seed=seed + 1)
+
+
+def test_a_small_zone_is_found_from_a_large_start():
+    loop = drive()
+    base = base_model(loop, [record_of(loop, E.InputDeadZone(0.004), 0.3, 1e-5, 9100)], loop.free)
+    start = E.InputDeadZone(width=2.0)
+    assert attempt_at(base, start).promise < 0
+    trial = attempt(base, start)
+    assert trial.promise > 0
+    found = refit(base, trial)
+    assert found.fitted.width == pytest.approx(0.004, rel=0.1)
+
+
+def test_what_contains_what():
+    simple, more = E.CoulombFriction(0.1), E.AsymmetricCoulombFriction(0.1, 0.02)
+    assert contains(more, simple)
+    assert not contains(simple, more)
+    assert not contains(more, E.ViscousFriction(0.1))
+    assert contains(E.AsymmetricViscousFriction(0.1, 0.02), E.ViscousFriction(0.1))
+
+
+@pytest.fixture(scope="module")
+def one_level():
+    """A levitation at one height: a constant force does what its magnet constant does."""
+    loop = levitation()
+    record = record_of(loop, E.CoulombFriction(0.1), 1e-4, 1e-5, 9200)
+    base = base_model(loop, [record], loop.free)
+    plain, more = (refit(base, attempt(base, e)) for e in (
+        E.CoulombFriction(0.0), E.AsymmetricCoulombFriction(0.0, 0.0)))  # fmt: skip
+    return base, plain, more
+
+
+def test_what_the_record_says_nothing_of_stays_possible(one_level):
+    _, plain, more = one_level
+    assert plain.merit > more.merit
+    assert [t.name for t in rivals(plain, [more])] == ["AsymmetricCoulombFriction"]
+
+
+def test_what_the_record_excludes_does_not():
+    loop = drive()
+    record = record_of(loop, E.CoulombFriction(0.5), 0.3, 1e-4, 9300)
+    base = base_model(loop, [record], loop.free)
+    plain, more = (refit(base, attempt(base, e)) for e in (
+        E.CoulombFriction(0.0), E.AsymmetricCoulombFriction(0.0, 0.0)))  # fmt: skip
+    assert plain.gain > 100
+    assert rivals(plain, [more]) == ()
+
+
+def test_the_simple_effect_begins_where_the_larger_one_ended(one_level):
+    base, plain, more = one_level
+    poor = attempt_at(base, E.CoulombFriction(5.0))  # from where no refit would find it
+    again = _plainer(base, more, [poor])
+    assert again.name == "CoulombFriction"
+    assert again.gain == pytest.approx(plain.gain, abs=1.0)
+    assert np.isfinite(again.merit)
