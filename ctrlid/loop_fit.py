@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ._text import Printed, number
-from .data import Record
+from .data import Record, as_records
 from .errors import CtrlidError
 from .filtering import machine_for, make_track
 from .likelihood import (
@@ -246,7 +246,7 @@ def fit_loop(
     >>> low < 3.34e-6 < high
     True
     """
-    records = _records(record)
+    records = as_records(record)
     names = _free_names(loop, free)
     start = begin(make_problem(loop, names, records), start_values(loop, names), None)
     fit = climb(start)
@@ -262,17 +262,6 @@ def _at_rest(loop: Loop) -> Any:
         at = operating_point(loop.plant, output=loop.at.output, guess=loop.at)
         loop = replace(loop, at=at)
     return loop.linearize()
-
-
-def _records(record: Any) -> tuple[Record, ...]:
-    records = tuple(record) if isinstance(record, Sequence) else (record,)
-    if not records or not all(isinstance(r, Record) for r in records):
-        raise CtrlidError("a fit needs a Record, or a sequence of Records; given "
-                          f"{type(record).__name__}")  # fmt: skip
-    if len({r.hold for r in records}) > 1:
-        raise CtrlidError("records fitted together must have the same hold; given "
-                          f"{[r.hold for r in records]}")  # fmt: skip
-    return records
 
 
 def _free_names(loop: Loop, free: Sequence[str] | None) -> tuple[str, ...]:

@@ -24,12 +24,13 @@ class Stepper:
 
     ``step(z, w) -> (next z, y, u, local error)``; z stacks plant and controller states, then what
     the input's path remembers; w is ``(t, r, d, sensor noise, force noise)``, all held over the
-    period.
+    period. ``rate(z, w)`` is the derivative of z for a loop with an analog controller, else None.
     """
 
     plant_states: tuple[str, ...]
     rest: tuple[float, ...]
     step: Any
+    rate: Any = None
 
 
 def integrate(rate: Any, z: Any, dt: Any, substeps: int) -> tuple[Any, Any]:
@@ -323,6 +324,7 @@ def stepper(loop: Loop, substeps: int) -> Stepper:
         y = e.function(t, z[:n], u, p)[1] + sensor
         return y if e.reader is None else e.reader(y, p)
 
+    slope = None
     y = measured(t0, z, at.input)
     u, moved = act(t0, z[: n + nc], y)
     if law is None:
@@ -337,9 +339,10 @@ def stepper(loop: Loop, substeps: int) -> Stepper:
 
         # A jump of the reference is a jump of the circuit's input: the period is smooth.
         def rate(tau: Any, z: Any) -> Any:
-            u, slope = act(t0 + tau, z, measured(t0 + tau, z, at.input))
-            return casadi.vertcat(e.function(t0 + tau, z[:n], u, p)[0] + kick, slope)
+            u, charge = act(t0 + tau, z, measured(t0 + tau, z, at.input))
+            return casadi.vertcat(e.function(t0 + tau, z[:n], u, p)[0] + kick, charge)
 
+        slope = casadi.Function("rate", [z, w], [rate(0.0, z)])
         after, error = integrate(rate, z, loop.dt, substeps)
     else:
         applied, memory = through_play(e, z[n + nc] if e.play is not None else None, u, p)
@@ -359,7 +362,8 @@ def stepper(loop: Loop, substeps: int) -> Stepper:
         memory = [float(casadi.evalf(start))]
         settled = float(casadi.evalf(casadi.SX(through_play(e, memory[0], at.input, p)[0])))
     rest += [*memory, *([settled] * kept)]
-    return Stepper(e.states, tuple(rest), casadi.Function("step", [z, w], [after, y, u, error]))
+    step = casadi.Function("step", [z, w], [after, y, u, error])
+    return Stepper(e.states, tuple(rest), step, slope)
 
 
 def through_play(e: Equations, m: Any, u: Any, p: Any) -> tuple[Any, Any]:
@@ -397,7 +401,7 @@ def growth_rate(loop: Loop) -> float:
     .. math:: \max_i \ln|\lambda_i| / T
 
     over the eigenvalues of the linearized map over one sampling period T, with the controller as it
-    runs. Negative: the loop is stable.
+    runs; with an analog controller the largest real part of the loop's poles. Negative: stable.
 
     Parameters
     ----------
@@ -414,11 +418,18 @@ def growth_rate(loop: Loop) -> float:
     CtrlidError
         If the plant has no derivative at the operating point.
     """
-    matrix = sensitivity(stepper(loop, 8), loop.point.output)[0]
+    s = stepper(loop, 8)
+    z, w = casadi.SX.sym("z", len(s.rest)), casadi.SX.sym("w", 5)
+    map_ = s.step(z, w)[0] if s.rate is None else s.rate(z, w)
+    slope = casadi.Function("slope", [z, w], [casadi.jacobian(map_, z)])
+    matrix = np.asarray(slope(s.rest, [0.0, loop.point.output, 0.0, 0.0, 0.0]), float)
     if not np.isfinite(matrix).all():
         raise CtrlidError(
             f"{loop.equations().name} has no derivative at its operating point {loop.point}; "
             "give at=operating_point(plant, output=...)"
         )
-    largest = np.max(np.abs(np.linalg.eigvals(matrix)), initial=0.0)
+    poles = np.linalg.eigvals(matrix)
+    if s.rate is not None:  # no step of an integration stands between a stiff circuit and its poles
+        return float(np.max(poles.real, initial=-math.inf))
+    largest = np.max(np.abs(poles), initial=0.0)
     return float(np.log(largest) / loop.dt) if largest > 0 else -math.inf

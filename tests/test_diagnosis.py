@@ -351,10 +351,12 @@ def test_refusals():
     dead = replace(record, u=np.full(600, 3.0))
     refuse("cannot be diagnosed: u stays at 3", loop, dead)
     for bad in (3, None, "record", [], [record, 3]):
-        with pytest.raises((CtrlidError, TypeError)):
-            cid.diagnose(loop, bad, progress=False)
+        refuse("a Record or a list of Records is needed", loop, bad)
+    refuse(r"the loop comes first: diagnose\(loop, record\)", record, loop)
+    refuse(r"the loop comes first", [record, record], loop)
+    refuse(r"put the one given into brackets", loop, record, catalogue=E.ViscousFriction)
     refuse("needs a Loop.* or a transfer function.*given NonlinearIOSystem", loop.plant, record)
     for bad in (E.ViscousFriction(c=1.0), int, "ViscousFriction"):
-        refuse("catalogue= holds classes of effects", loop, record, catalogue=[bad])
+        refuse("catalogue= is a list of classes of effects", loop, record, catalogue=[bad])
     refuse(r"sampled at 0\.002 s, the record at 0\.004 s", loop,
            record.decimate(2, antialias=False))  # fmt: skip

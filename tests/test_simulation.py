@@ -180,6 +180,17 @@ def test_an_unstable_loop_says_so():
     assert growth_rate(weak) > 0 > growth_rate(loop)
 
 
+def test_the_growth_of_a_loop_with_an_analog_controller_is_that_of_its_poles():
+    plant = cid.plants.servo(m=2.0, c=5.0, k=30.0)
+    for filter_time in (1e-2, 1e-7):  # the second is far faster than any step of an integration
+        num = [6.0 * filter_time + 0.4, 6.0]
+        C = ct.tf(num, [filter_time, 1.0])
+        closed = np.polyadd(np.polymul([2.0, 5.0, 0.0], [filter_time, 1.0]), 30.0 * np.array(num))
+        loop = cid.Loop(plant, C, dt=0.01, at=cid.OperatingPoint((0.0, 0.0), 0.0, 0.0))
+        assert loop.analog
+        assert growth_rate(loop) == pytest.approx(np.roots(closed).real.max(), rel=1e-6)
+
+
 def test_a_saturated_loop_says_so():
     loop, op = make(0.02, 0.01, 3.0)
     tight = cid.Loop(loop.plant, loop.controller, dt=loop.dt, at=op, input_limits=(2.95, 3.05))

@@ -13,7 +13,7 @@ import numpy as np
 from tqdm import tqdm
 
 from ..audit import Audit, audit
-from ..data import Record
+from ..data import Record, as_records
 from ..effects import CATALOGUE, AbstractEffect, equivalents
 from ..errors import CtrlidError
 from ..likelihood import Fit, pseudo_inverse
@@ -28,7 +28,7 @@ from .omnibus import places
 from .readout import Readout, censored, clipping, steps
 from .replica import forgiven, replica, simulable
 from .result import Calibrated, Candidate, Diagnosis, Disturbance, Finding, Gap, Verdict
-from .search import Found, Search, Work, main_ones, search
+from .search import Found, Search, Work, check_catalogue, main_ones, search
 from .sentences import conclusion
 from .several import merged, presence
 from .trial import (
@@ -123,9 +123,12 @@ def diagnose(
     ('explained', 'CoulombFriction')
     """
     started = time.perf_counter()
-    records = _records(record)
+    check_catalogue(catalogue)
+    if isinstance(loop, Record) or (isinstance(loop, list | tuple) and isinstance(record, Loop)):
+        raise CtrlidError("the loop comes first: diagnose(loop, record)")
+    records = as_records(record)
     loop = _loop(loop, records[0])
-    fresh = fresh_data(loop, records, None if validation is None else _records(validation))
+    fresh = fresh_data(loop, records, None if validation is None else as_records(validation))
     bar = tqdm(total=STEPS, disable=not progress, leave=False, desc="diagnose")
 
     def tell(text: str, step: int = 0) -> None:
@@ -211,14 +214,6 @@ def _one_by_one(
 def _merit(fit: Fit) -> float:
     """Return the log-likelihood less half the Bayesian penalty."""
     return fit.value - 0.5 * len(fit.theta) * math.log(fit.size)
-
-
-def _records(record: Any) -> tuple[Record, ...]:
-    records = (record,) if isinstance(record, Record) else tuple(record)
-    if not records or not all(isinstance(r, Record) for r in records):
-        raise CtrlidError("diagnose needs a Record, or a sequence of Records; given "
-                          f"{type(record).__name__}")  # fmt: skip
-    return records
 
 
 def _loop(loop: Any, record: Record) -> Loop:

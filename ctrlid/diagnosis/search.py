@@ -89,13 +89,24 @@ def candidates(
     """Return every effect of a catalogue that a plant can have, at its start."""
     found: list[AbstractEffect] = []
     for kind in catalogue:
-        if not (isinstance(kind, type) and issubclass(kind, AbstractEffect)):
-            raise CtrlidError("catalogue= holds classes of effects, such as those of "
-                              f"ctrlid.effects.CATALOGUE; given {kind!r}")  # fmt: skip
         if kind.place == "output" and kind in OFFSETS and not _place_matters(loop):
             continue  # the initial position, of which nobody knows where it is counted from
         found += kind.candidates(loop, record)
     return found
+
+
+def check_catalogue(catalogue: Sequence[type[AbstractEffect]]) -> None:
+    """Refuse what is no class of effects, with what is needed."""
+    kinds = catalogue if isinstance(catalogue, Sequence) else [catalogue]
+    for kind in kinds:
+        if isinstance(catalogue, str) or not (
+            isinstance(kind, type) and issubclass(kind, AbstractEffect)
+        ):
+            raise CtrlidError("catalogue= is a list of classes of effects, such as "
+                              f"ctrlid.effects.CATALOGUE; given {kind!r}")  # fmt: skip
+    if kinds is not catalogue:
+        raise CtrlidError("catalogue= is a list of classes of effects; put the one given into "
+                          f"brackets: [{catalogue!r}]")  # fmt: skip
 
 
 def _place_matters(loop: Loop) -> bool:
