@@ -168,12 +168,14 @@ class Machine:
         # Kinks have no slope at the kink itself; everything else is exact.
         outputs = [after, casadi.jacobian(after, x), casadi.jacobian(after, force),
                    casadi.jacobian(after, free)]  # fmt: skip
-        self._step = Vectorized(casadi.Function("step", given, outputs, {"cse": True}))
+        self.step_function = casadi.Function("step", given, outputs, {"cse": True})
+        self._step = Vectorized(self.step_function)
         moves = [casadi.jacobian(after, casadi.vertcat(before, now, ahead))]
         self._moves = Vectorized(casadi.Function("moves", given, moves, {"cse": True}))
         height = e.smoothed(t, x[:n], now, p, s)[1]
         outputs = [height, casadi.jacobian(height, x), casadi.jacobian(height, free)]
-        self._sensor = Vectorized(casadi.Function("sensor", given[:4], outputs, {"cse": True}))
+        self.sensor_function = casadi.Function("sensor", given[:4], outputs, {"cse": True})
+        self._sensor = Vectorized(self.sensor_function)
 
     def _follow(self, t: Any, x: Any, p: Any, s: Any, kick: Any, u: Any, r: Any, y: Any,
                 substeps: int) -> Any:  # fmt: skip
@@ -264,6 +266,10 @@ class Machine:
                             np.zeros(len(self.index))])  # fmt: skip
         out = np.asarray(step.mapaccum("run", len(u))(z, u[None, :], p)[1], float)
         return out[0], out[1:].T
+
+    def inputs(self, track: Track, theta: Array) -> Array:
+        """Return the rows over which the map is evaluated, shape (6, n), behind any play."""
+        return self._inputs(track, self._through_play(track.table[1], self.values(theta))[0])
 
     def advance(self, track: Track, x: Array, rows: Any, known: bool = True) -> Array:
         """Return states (k, n) one period after the samples `rows`, with the loop's parameters."""

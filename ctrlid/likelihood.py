@@ -25,10 +25,13 @@ SINGULAR = 1e-10  # relative eigenvalue below which a direction is not in the da
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """Noise that is known beforehand: ratios, and the variance of each record's sensor noise."""
+    """Noise that is known beforehand.
+
+    Ratios, and the variance of each record's sensor noise; None: what the model leaves.
+    """
 
     noise: Noise
-    sensor: Array
+    sensor: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,7 +176,7 @@ def _measure(
         if not (np.isfinite(e).all() and np.isfinite(s).all() and (s > 0).all()):
             value, e, s = -math.inf, np.ones(1), np.ones(1)
         mean = float(np.mean(e**2 / s))
-        if problem.known is not None:
+        if problem.known is not None and problem.known.sensor is not None:
             r = float(problem.known.sensor[k])
         else:
             least = QUIET * float(np.var(track.table[3][keep]) + np.mean(track.table[3][keep]) ** 2)

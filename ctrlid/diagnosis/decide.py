@@ -100,4 +100,8 @@ def rivals(best: Trial, others: Sequence[Trial]) -> tuple[Trial, ...]:
         z = vuong(mine, theirs, best.cost - trial.cost)
         if lost < CLOSE or z < Z:
             found.append(trial)
-    return tuple(sorted(found, key=lambda t: -t.merit))
+    found.sort(key=lambda t: -t.merit)
+    # One that was begun at several places is one.
+    return tuple(
+        t for k, t in enumerate(found) if not any(same_kind(t.effect, b.effect) for b in found[:k])
+    )

@@ -34,9 +34,17 @@ class Fresh:
 
     def loops(self, model: Model) -> tuple[Loop, ...]:
         """Return the loop of a model for each window, ready to be compared there."""
+        if model.errors is not None:
+            return (model.fitted,) * len(self.windows)
         if self.rest is None:
             return tuple(_with_private_parts(model, w) for w in self.windows)
         return (self._trained(model, self.rest),) * len(self.windows)
+
+    def without_windows(self, records: Sequence[Record]) -> list[Record]:
+        """Return of the diagnosed records what may be fitted without touching the windows."""
+        if self.rest is None:
+            return list(records)
+        return [r[: len(rest)] for r, rest in zip(records, self.rest, strict=True)]
 
     def _trained(self, model: Model, records: Sequence[Record]) -> Loop:
         """Return a model's loop with its parameters fitted to other records."""
@@ -46,7 +54,7 @@ class Fresh:
         parts, begins = stretches(records)
         problem = make_problem(model.fitted, model.names, parts, begins)
         known = fit.problem.known
-        if known is not None and len(parts) == len(known.sensor):
+        if known is not None and (known.sensor is None or len(parts) == len(known.sensor)):
             problem = replace(problem, known=known)
         return Model(model.loop, climb(begin(problem, fit.theta, fit.noise), exact=False)).fitted
 

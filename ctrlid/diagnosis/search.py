@@ -324,14 +324,21 @@ def _without_superfluous(model: Model, given: int) -> Model:
     return model
 
 
+def taken_out(
+    loop: Loop, position: int, names: Sequence[str]
+) -> tuple[Loop, tuple[str, ...]]:  # fmt: skip
+    """Return a loop without one of its effects, and the names of what is free then."""
+    labels = list(loop.labelled)
+    label, less = labels[position], loop.without_effect(labels[position])
+    renamed = dict(zip(labels[:position] + labels[position + 1 :], less.labelled, strict=True))
+    left = [n for n in names if not n.startswith(f"{label}.")]
+    return less, tuple(_relabelled(left, renamed))
+
+
 def _taken_out(model: Model, position: int) -> tuple[Model, Trial]:
     """Return the model without one effect, refitted, and the effect as a trial on top of it."""
-    fitted = model.fitted
-    labels = list(fitted.labelled)
-    label, effect = labels[position], fitted.effects[position]
-    loop = fitted.without_effect(label)
-    renamed = dict(zip(labels[:position] + labels[position + 1 :], loop.labelled, strict=True))
-    names = _relabelled([n for n in model.names if not n.startswith(f"{label}.")], renamed)
+    effect = model.fitted.effects[position]
+    loop, names = taken_out(model.fitted, position, model.names)
     smaller = Model(loop, climb(reduced(model, loop, names), rounds=10))
     return smaller, refit(smaller, attempt_at(smaller, effect))
 

@@ -1,7 +1,7 @@
 """Trying an effect: what it promises, and what it gives when everything is refitted."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -34,10 +34,15 @@ SEEN = 1e-7  # share of a parameter's information that others must leave to it
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """A loop fitted to the records, the base that candidates are added to."""
+    """A loop fitted to the records, the base that candidates are added to.
+
+    One that was fitted by another criterion, and without the data that it is compared on, has
+    standard `errors` of its own.
+    """
 
     loop: Loop
     fit: Fit
+    errors: Mapping[str, float] | None = None
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -110,7 +110,7 @@ def sizes(found: Diagnosis, effect: AbstractEffect, errors: dict[str, float] | N
     words = []
     for name, value in vars(effect).items():
         if name not in units:
-            words.append(f"{name} = {value}")
+            words += [f"{name} = {value}"] if value != "" else []
             continue
         error = None if errors is None else errors.get(name)
         words.append(f"{name} = {quantity(value, units[name], error)}")

@@ -1,0 +1,198 @@
+"""Fitting a stable plant by the error of its open-loop simulation, with exact sensitivities."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import casadi
+import numpy as np
+from scipy import optimize
+
+from ..data import Record
+from ..filtering import Machine, Noise, Trajectory
+from ..likelihood import Fit, Known, evaluate, pseudo_inverse
+from ..loop import Loop
+from ..loop_fit import make_problem
+from ..physics import Array
+
+EVALUATIONS = 60  # of a refit
+LOST = 1e3  # times the output's spread: the error where a simulation leaves the plant's domain
+
+
+@dataclass(frozen=True, eq=False)
+class Simulated:
+    """A loop fitted to what an open-loop simulation makes of records.
+
+    `starts` are the states at the first sample of each record, by name; `errors` and `slopes` the
+    errors at the samples that count, records one after the other, and their derivatives by
+    parameters and initial states.
+    """
+
+    loop: Loop
+    names: tuple[str, ...]
+    theta: Array
+    starts: tuple[Mapping[str, float], ...]
+    errors: Array
+    slopes: Array
+    states: tuple[Array, ...]
+
+    @property
+    def square(self) -> float:
+        """Mean square of the errors."""
+        return float(np.mean(self.errors**2))
+
+    @property
+    def fitted(self) -> Loop:
+        """The loop with the fitted values."""
+        return self.loop.with_parameters(dict(zip(self.names, self.theta.tolist(), strict=True)))
+
+    @property
+    def standard_errors(self) -> dict[str, float]:
+        """Standard errors of the parameters, for as many samples as are independent."""
+        matrix = self.slopes.T @ self.slopes / (self.square * self.correlated)
+        variance = np.diag(pseudo_inverse(matrix))[: len(self.names)]
+        seen = np.diag(matrix)[: len(self.names)] > 0
+        sizes = np.where(seen, np.sqrt(np.maximum(variance, 0.0)), np.inf)
+        return dict(zip(self.names, sizes.tolist(), strict=True))
+
+    @property
+    def correlated(self) -> float:
+        """How many neighbouring errors say no more than one that is independent."""
+        e = self.errors
+        n = 1 << (2 * len(e) - 1).bit_length()
+        acf = np.fft.irfft(np.abs(np.fft.rfft(e, n)) ** 2)[: len(e) // 4]
+        rho = acf / max(acf[0], 1e-300)
+        ends = np.flatnonzero(rho <= 0)
+        return float(1 + 2 * np.sum(rho[1 : ends[0] if len(ends) else len(rho)]))
+
+
+class Simulation:
+    """Records simulated open loop by a plant, with sensitivities to parameters and initial states.
+
+    Parameters
+    ----------
+    loop : Loop
+        The plant with its effects; no controller takes part.
+    names : sequence of str
+        The free parameters.
+    records : sequence of Record
+        The data, of one sampling period and hold.
+    begins : sequence of float
+        Times of their first samples since the start of the experiment [s].
+    """
+
+    def __init__(
+        self, loop: Loop, names: Sequence[str], records: Sequence[Record], begins: Sequence[float]
+    ) -> None:
+        self.loop, self.names = loop, tuple(names)
+        self.problem = make_problem(loop, self.names, records, begins)
+        m = self.machine = self.problem.machine
+        step = _with_slopes(m, len(self.names))
+        self.runs = [step.mapaccum("run", len(t.record)) for t in self.problem.tracks]
+
+    def states_from(self, starts: Sequence[Mapping[str, float]]) -> Array:
+        """Return initial states, shape (records, states); what is not known begins at rest."""
+        m = self.machine
+        rest = [np.resize(t.start, m.size) for t in self.problem.tracks]
+        for x, known in zip(rest, starts, strict=True):
+            for k, name in enumerate(m.e.states):
+                x[k] = known.get(name, x[k])
+        return np.array(rest)
+
+    def run(self, theta: Array, x0: Array) -> tuple[Array, Array, tuple[Array, ...]]:
+        """Return errors, their derivatives and the states, for all records."""
+        m, p = self.machine, len(self.names)
+        n, count = m.size, len(self.runs)
+        values, errors, slopes, states = m.values(theta), [], [], []
+        for k, (track, run) in enumerate(zip(self.problem.tracks, self.runs, strict=True)):
+            z = np.concatenate([x0[k], np.zeros(n * p), np.eye(n).ravel()])
+            after, seen = (np.asarray(out, float) for out in
+                           run(z, m.inputs(track, theta), values))  # fmt: skip
+            states.append(np.vstack([x0[k], after[:n, :-1].T]))
+            y, keep = track.table[3], track.valid
+            error = y - seen[0]
+            wide = np.zeros((len(y), p + n * count))
+            wide[:, :p] = -seen[1 : p + 1].T
+            wide[:, p + n * k : p + n * (k + 1)] = -seen[p + 1 :].T
+            lost = ~(np.isfinite(error) & np.isfinite(wide).all(axis=1))
+            error[lost], wide[lost] = LOST * float(np.std(y)), 0.0
+            errors.append(error[keep])
+            slopes.append(wide[keep])
+        return np.concatenate(errors), np.vstack(slopes), tuple(states)
+
+    def at(self, theta: Array, x0: Array) -> Simulated:
+        """Return the simulation of given values."""
+        errors, slopes, states = self.run(theta, x0)
+        names = self.machine.e.states
+        starts = tuple(dict(zip(names, x.tolist(), strict=False)) for x in x0)
+        return Simulated(self.loop, self.names, theta, starts, errors, slopes, states)
+
+    def fit(self, theta: Array, x0: Array, evaluations: int = EVALUATIONS) -> Simulated:
+        """Return the values and initial states with the smallest error nearby."""
+        p, shape = len(theta), x0.shape
+        free = np.full(x0.size, np.inf)
+        lower = np.concatenate([self.problem.lower, -free])
+        upper = np.concatenate([self.problem.upper, free])
+        inside = 1e-9 * (1.0 + np.abs(np.concatenate([theta, x0.ravel()])))
+        start = np.clip(np.concatenate([theta, x0.ravel()]),
+                        np.where(np.isfinite(lower), lower + inside, lower),
+                        np.where(np.isfinite(upper), upper - inside, upper))  # fmt: skip
+        last: dict[bytes, tuple[Array, Array]] = {}
+
+        def both(v: Array) -> tuple[Array, Array]:
+            if v.tobytes() not in last:
+                last.clear()
+                last[v.tobytes()] = self.run(v[:p], v[p:].reshape(shape))[:2]
+            return last[v.tobytes()]
+
+        def error(v: Array) -> Array:
+            return both(v)[0]
+
+        def slope(v: Array) -> Array:
+            return both(v)[1]
+
+        found = optimize.least_squares(error, start, slope, bounds=(lower, upper), x_scale="jac",
+                                       max_nfev=evaluations)  # fmt: skip
+        return self.at(found.x[:p], found.x[p:].reshape(shape))
+
+
+def _with_slopes(m: Machine, p: int) -> casadi.Function:
+    """Return one period of a plant together with that of its sensitivities."""
+    n = m.size
+    x, s, w, values = (casadi.SX.sym(k, *size) for k, size in (
+        ("x", (n, 1)), ("s", (n, p + n)), ("w", (6, 1)), ("p", m.e.p.shape)))  # fmt: skip
+    still = casadi.SX.zeros(m.n)
+    after, a, _, dp = m.step_function(x, w, values, still, casadi.SX.zeros(m.channels))
+    y, c, hp = m.sensor_function(x, w, values, still)
+    moved = casadi.mtimes(a, s) + casadi.horzcat(dp, casadi.SX.zeros(n, n))
+    seen = casadi.mtimes(c, s) + casadi.horzcat(hp, casadi.SX.zeros(1, n))
+    return casadi.Function(
+        "period", [casadi.vertcat(x, casadi.vec(s)), w, values],
+        [casadi.vertcat(after, casadi.vec(moved)), casadi.vertcat(y, seen.T)], {"cse": True},
+    )  # fmt: skip
+
+
+def as_fit(task: Simulation, found: Simulated, sensor: Array) -> Fit:
+    """Return a simulation as a point of the likelihood that knows no random force.
+
+    Parameters
+    ----------
+    task : Simulation
+        The simulation.
+    found : Simulated
+        Its values.
+    sensor : ndarray, shape (records,)
+        Variances of the sensor noise [output unit^2].
+
+    Returns
+    -------
+    Fit
+        Its innovations are the errors of the simulation.
+    """
+    silent = Noise((0.0,) * task.machine.channels)
+    problem = replace(task.problem, known=Known(silent, sensor), tracks=tuple(
+        replace(t, start=x[0], spread=np.zeros_like(t.spread), doubt=np.zeros(len(x)),
+                afresh=np.arange(len(x)) == 0)
+        for t, x in zip(task.problem.tracks, found.states, strict=True)
+    ), counts=tuple(t.valid for t in task.problem.tracks))  # fmt: skip
+    at = [Trajectory(x, x.copy(), np.zeros_like(x)) for x in found.states]
+    return evaluate(problem, found.theta, silent, at)

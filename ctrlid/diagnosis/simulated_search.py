@@ -1,0 +1,272 @@
+"""Looking for missing effects by the error of an open-loop simulation.
+
+A filter that may blame a random force for everything leaves nothing to be named. A stable plant can
+do without: simulated from its own initial state, what it lacks shows in full.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..data import Record
+from ..effects import AbstractEffect, ParameterStep, PeriodicForce, StateLimit
+from ..errors import CtrlidError
+from ..loop_fit import start_values
+from ..physics import Array
+from .decide import CLOSE, GATE
+from .fresh import Fresh
+from .omnibus import omnibus
+from .scan import LIMITS
+from .search import MOST, Found, Search, Step, candidates, taken_out
+from .simulated import Simulated, Simulation, as_fit
+from .trial import Model, Trial, same_kind
+
+REFITTED = 8  # candidates of a round
+EDGES = 12  # instants at which a parameter might have stepped
+CLOSES = 0.95  # of the error that must not remain when an effect is added
+ALIKE = 0.2  # of an effect's merit: what comes nearer is not told from it
+BETTER = 0.8  # of the gap of the other search that must not remain
+
+
+@dataclass(frozen=True, eq=False)
+class Tried:
+    """An effect added to a simulated loop."""
+
+    effect: AbstractEffect
+    label: str
+    promise: float
+    task: Simulation
+    theta: Array
+    x0: Array
+    found: Simulated | None = None
+    gain: float = math.nan
+    cost: float = math.nan
+    remark: str = ""
+
+    @property
+    def merit(self) -> float:
+        """Gain less penalty; minus infinity for what is out."""
+        return -math.inf if self.remark or not math.isfinite(self.gain) else self.gain - self.cost
+
+
+def search_by_simulation(
+    other: Search, fresh: Fresh, catalogue: Sequence[type[AbstractEffect]],
+    tell: Callable[[str], None], gap: float,
+) -> Search | None:  # fmt: skip
+    """Look for effects again where a random force had taken up what is missing.
+
+    Parameters
+    ----------
+    other : Search
+        The search with filters, which left something unexplained.
+    fresh : Fresh
+        What models are compared on; nothing is fitted to it.
+    catalogue : sequence of effect classes
+        What may be missing.
+    tell : callable
+        Told what is being done.
+    gap : float
+        The smallest gap so far, on the fresh data [output unit].
+
+    Returns
+    -------
+    Search or None
+        The base, the rounds and the final model, whose parameters are not to be fitted again; None
+        if no effect was found or the gap is hardly smaller.
+    """
+    loop, names = other.base.loop, other.base.names
+    records = fresh.without_windows([t.record for t in other.base.fit.problem.tracks])
+    begins = [0.0] * len(records)
+    task = Simulation(loop, names, records, begins)
+    x0 = task.states_from([{} for _ in records])
+    begun = [task.fit(t, x0) for t in (start_values(loop, names), other.base.fit.theta)]
+    base = now = min(begun, key=lambda s: s.square)
+    sensor, given = other.final.fit.sensor, len(loop.effects)
+    before = _gap(base, fresh)
+    rounds: list[tuple[Simulated, list[Tried], Tried | None]] = []
+    while len(rounds) < MOST:
+        tell(f"by simulation, round {len(rounds) + 1}")
+        tried = _round(now, records, begins, catalogue)
+        best = tried[0] if tried and math.isfinite(tried[0].merit) else None
+        new = best and best.found
+        after = _gap(new, fresh) if new else math.inf
+        if not (new and new.square < CLOSES**2 * now.square and after < CLOSES * before):
+            rounds.append((now, tried, None))
+            break
+        rounds.append((now, tried, best))
+        now, before = new, after
+    tell("by simulation, what is needed")
+    now = _needed(now, given, records, begins)
+    if len(now.loop.effects) == given or _gap(now, fresh) > BETTER * gap:
+        return None
+    first, final = (_model(s, records, begins, sensor) for s in (base, now))
+    steps = []
+    for s, tried, best in rounds:
+        model = _model(s, records, begins, sensor)
+        done = {id(t): _trial(t, model) for t in tried}
+        steps.append(Step(model, tuple(done.values()), None if best is None else done[id(best)]))
+    found = [_found(now, k, rounds, records, begins, final)
+             for k in range(given, len(now.loop.effects))]  # fmt: skip
+    found.sort(key=lambda f: -f.trial.gain)
+    return Search(first, tuple(steps), final, tuple(found), omnibus(first.fit), omnibus(final.fit))
+
+
+def _gap(s: Simulated, fresh: Fresh) -> float:
+    return fresh.gap((s.fitted,) * len(fresh.windows))
+
+
+def _model(
+    s: Simulated, records: Sequence[Record], begins: Sequence[float], sensor: Array
+) -> Model:
+    """Return a simulated loop as a model of the filter, without random forces."""
+    task = Simulation(s.loop, s.names, records, begins)
+    fit = as_fit(task, s, np.resize(sensor, len(records)))
+    return Model(s.loop, fit, s.standard_errors)
+
+
+def _needed(
+    now: Simulated, given: int, records: Sequence[Record], begins: Sequence[float]
+) -> Simulated:
+    """Take effects out until each of those left is worth its parameters."""
+    while len(now.loop.effects) > given:
+        smaller = [_without(now, k, records, begins) for k in range(given, len(now.loop.effects))]
+        merits = [_gain(s, now.square) - _cost(s, now) for s in smaller]
+        if min(merits) > GATE:
+            break
+        now = smaller[int(np.argmin(merits))]
+    return now
+
+
+def _without(
+    now: Simulated, position: int, records: Sequence[Record], begins: Sequence[float]
+) -> Simulated:
+    """Return the loop without one of its effects, fitted again."""
+    fitted = now.fitted
+    loop, names = taken_out(fitted, position, now.names)
+    task = Simulation(loop, names, records, begins)
+    return task.fit(np.array(start_values(loop, names)), task.states_from(now.starts))
+
+
+def _found(
+    now: Simulated, position: int, rounds: Sequence[tuple[Simulated, list[Tried], Tried | None]],
+    records: Sequence[Record], begins: Sequence[float], final: Model,
+) -> Found:  # fmt: skip
+    """Return an effect with what closes nearly as much of the error in its place."""
+    label, effect = list(now.fitted.labelled.items())[position]
+    smaller = _without(now, position, records, begins)
+    gain, cost = _gain(smaller, now.square), _cost(smaller, now)
+    base = _model(smaller, records, begins, final.fit.sensor)
+    mine = Trial(effect, label, final, gain, 0.0, gain, cost)
+    near = max(CLOSE, ALIKE * mine.merit)
+    close: list[Trial] = []
+    for _, tried, best in rounds:
+        if best is None or not same_kind(best.effect, effect):
+            continue
+        there = [*now.loop.effects]
+        for t in tried[:REFITTED]:
+            if t.merit <= 0 or any(same_kind(t.effect, e) for e in there):
+                continue
+            screened = _screened(smaller, t.effect, records, begins)
+            again = screened and _refitted(smaller, screened)
+            if again and mine.merit - again.merit < near and again.merit > GATE:
+                close.append(_trial(again, base))
+    return Found(mine, tuple(sorted(close, key=lambda t: -t.merit)), base, position)
+
+
+def _round(
+    now: Simulated, records: Sequence[Record], begins: Sequence[float],
+    catalogue: Sequence[type[AbstractEffect]],
+) -> list[Tried]:  # fmt: skip
+    """Screen all candidates, refit the promising, best first."""
+    loop = now.fitted
+    pool = [c for c in candidates(catalogue, loop, records[0])
+            if not any(same_kind(e, c) for e in loop.effects)]  # fmt: skip
+    tried = [t for c in pool if (t := _screened(now, c, records, begins)) is not None]
+    tried.sort(key=lambda t: -t.promise)
+    done = [_refitted(now, t) for t in tried[:REFITTED]]
+    return sorted(done, key=lambda t: (-t.merit, -t.promise)) + tried[REFITTED:]
+
+
+def _screened(
+    now: Simulated, effect: AbstractEffect, records: Sequence[Record], begins: Sequence[float]
+) -> Tried | None:
+    """Return an effect at the start from which a first step promises most."""
+    best: Tried | None = None
+    task: Simulation | None = None
+    for one in _begun(now, effect, records):
+        try:
+            loop = now.fitted.with_effect(one)
+            label = next(k for k in loop.labelled if k not in now.loop.labelled)
+            own = {f"{label}.{k}": v for k, v in one.values().items() if math.isfinite(v)}
+            names = (*now.names, *own)
+            if task is None:
+                task = Simulation(loop, names, records, begins)
+            if task.machine.e.play is not None:  # its sensitivities need another recursion
+                return None
+            theta = np.array([*now.theta, *own.values()])
+            theta = np.clip(theta, task.problem.lower, task.problem.upper)
+            x0 = task.states_from(now.starts)
+            errors, slopes, _ = task.run(theta, x0)
+        except CtrlidError:
+            continue
+        step = np.linalg.lstsq(slopes, -errors, rcond=1e-10)[0]
+        left = float(np.mean((errors + slopes @ step) ** 2))
+        promise = _gain(now, min(left, float(np.mean(errors**2))))
+        if best is None or promise > best.promise:
+            best = Tried(one, label, promise, task, theta, x0)
+    return best
+
+
+def _gain(now: Simulated, square: float) -> float:
+    """Return what a smaller error is worth, for as many samples as are independent."""
+    count = len(now.errors) / now.correlated
+    return 0.5 * count * math.log(now.square / max(square, 1e-300))
+
+
+def _cost(smaller: Simulated, larger: Simulated) -> float:
+    """Return half the Bayesian penalty of the further parameters."""
+    free = len(larger.names) - len(smaller.names)
+    return 0.5 * free * math.log(max(len(smaller.errors) / smaller.correlated, math.e))
+
+
+def _refitted(now: Simulated, t: Tried) -> Tried:
+    try:
+        found = t.task.fit(t.theta, t.x0)
+    except (CtrlidError, ValueError, np.linalg.LinAlgError) as reason:
+        return replace(t, remark=str(reason))
+    gain = _gain(now, found.square)
+    cost = _cost(now, found)
+    effect = found.fitted.labelled[t.label]
+    return replace(t, found=found, gain=gain, cost=cost,
+                   remark="vanishes when refitted" if effect.neutral else "")  # fmt: skip
+
+
+def _begun(
+    now: Simulated, effect: AbstractEffect, records: Sequence[Record]
+) -> list[AbstractEffect]:
+    """Return an effect at the places where it may be: limits, instants, frequencies."""
+    if isinstance(effect, StateLimit) and effect.name in now.starts[0]:
+        k = list(now.starts[0]).index(effect.name)
+        levels = np.quantile(np.concatenate([x[:, k] for x in now.states]), LIMITS)
+        return [replace(effect, upper=float(v)) for v in levels]
+    if isinstance(effect, ParameterStep):
+        last = max(float(r.t[-1] - r.start) for r in records)
+        times = np.linspace(0, last, EDGES + 2)[1:-1]
+        return [replace(effect, time=float(t)) for t in times]
+    if isinstance(effect, PeriodicForce):
+        power = np.abs(np.fft.rfft(now.errors, 4 * len(now.errors))) ** 2
+        power[:8] = 0.0
+        line = int(np.argmax(power)) / (4 * len(now.errors) * records[0].dt)
+        return [replace(effect, frequency=line, phase=p) for p in (0.0, np.pi / 2)]
+    return [effect]
+
+
+def _trial(t: Tried, base: Model) -> Trial:
+    """Return what was tried in the words of the other search."""
+    model, label = base, ""
+    if t.found is not None:
+        sensor, label = base.fit.sensor, t.label
+        model = Model(t.found.loop, as_fit(t.task, t.found, sensor), t.found.standard_errors)
+    return Trial(t.effect, label, model, t.promise, 0.0, t.gain, t.cost, t.remark)
