@@ -267,6 +267,25 @@ class Machine:
         out = np.asarray(step.mapaccum("run", len(u))(z, u[None, :], p)[1], float)
         return out[0], out[1:].T
 
+    def with_slopes(self) -> casadi.Function:
+        """Return one period of the plant, as it is, together with that of its sensitivities.
+
+        ``f(z, w, p) -> (next z, y and its slopes)``; z stacks the state and its derivatives by the
+        free parameters and the initial state, w is a column of `inputs`.
+        """
+        n, p = self.size, len(self.index)
+        x, s, w, values = (casadi.SX.sym(k, *size) for k, size in (
+            ("x", (n, 1)), ("s", (n, p + n)), ("w", (6, 1)), ("p", self.e.p.shape)))  # fmt: skip
+        still, quiet = casadi.SX.zeros(self.n), casadi.SX.zeros(self.channels)
+        after, a, _, dp = self.step_function(x, w, values, still, quiet)
+        y, c, hp = self.sensor_function(x, w, values, still)
+        moved = casadi.mtimes(a, s) + casadi.horzcat(dp, casadi.SX.zeros(n, n))
+        seen = casadi.mtimes(c, s) + casadi.horzcat(hp, casadi.SX.zeros(1, n))
+        return casadi.Function(
+            "period", [casadi.vertcat(x, casadi.vec(s)), w, values],
+            [casadi.vertcat(after, casadi.vec(moved)), casadi.vertcat(y, seen.T)], {"cse": True},
+        )  # fmt: skip
+
     def inputs(self, track: Track, theta: Array) -> Array:
         """Return the rows over which the map is evaluated, shape (6, n), behind any play."""
         return self._inputs(track, self._through_play(track.table[1], self.values(theta))[0])

@@ -3,12 +3,11 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-import casadi
 import numpy as np
 from scipy import optimize
 
 from ..data import Record
-from ..filtering import Machine, Noise, Trajectory
+from ..filtering import Noise, Trajectory
 from ..likelihood import Fit, Known, evaluate, pseudo_inverse
 from ..loop import Loop
 from ..loop_fit import make_problem
@@ -86,7 +85,7 @@ class Simulation:
         self.loop, self.names = loop, tuple(names)
         self.problem = make_problem(loop, self.names, records, begins)
         m = self.machine = self.problem.machine
-        step = _with_slopes(m, len(self.names))
+        step = m.with_slopes()
         self.runs = [step.mapaccum("run", len(t.record)) for t in self.problem.tracks]
 
     def states_from(self, starts: Sequence[Mapping[str, float]]) -> Array:
@@ -153,22 +152,6 @@ class Simulation:
         found = optimize.least_squares(error, start, slope, bounds=(lower, upper), x_scale="jac",
                                        max_nfev=evaluations)  # fmt: skip
         return self.at(found.x[:p], found.x[p:].reshape(shape))
-
-
-def _with_slopes(m: Machine, p: int) -> casadi.Function:
-    """Return one period of a plant together with that of its sensitivities."""
-    n = m.size
-    x, s, w, values = (casadi.SX.sym(k, *size) for k, size in (
-        ("x", (n, 1)), ("s", (n, p + n)), ("w", (6, 1)), ("p", m.e.p.shape)))  # fmt: skip
-    still = casadi.SX.zeros(m.n)
-    after, a, _, dp = m.step_function(x, w, values, still, casadi.SX.zeros(m.channels))
-    y, c, hp = m.sensor_function(x, w, values, still)
-    moved = casadi.mtimes(a, s) + casadi.horzcat(dp, casadi.SX.zeros(n, n))
-    seen = casadi.mtimes(c, s) + casadi.horzcat(hp, casadi.SX.zeros(1, n))
-    return casadi.Function(
-        "period", [casadi.vertcat(x, casadi.vec(s)), w, values],
-        [casadi.vertcat(after, casadi.vec(moved)), casadi.vertcat(y, seen.T)], {"cse": True},
-    )  # fmt: skip
 
 
 def as_fit(task: Simulation, found: Simulated, sensor: Array) -> Fit:
