@@ -452,6 +452,8 @@ def _outside(
         if not case:
             return None
         out = {cls.__name__, *equivalents(case.effects[0], one.loop)}
+        if any(" with " in name for name in out):  # two of the others together are the same
+            return None
         left = tuple(c for c in CATALOGUE if c.__name__ not in out)
         return replace(case, catalogue=left, label=f"removed {cls.__name__}")
     one = draw(rng, a_plant(rng, MOVING), coloured)

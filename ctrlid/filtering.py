@@ -141,6 +141,7 @@ class Machine:
         self.forces = e.velocities or tuple(range(self.n - len(e.rest)))
         # One force on all velocities; without any, each state has a noise of its own.
         self.channels = 1 if e.velocities else len(self.forces)
+        self._plays: dict[int, casadi.Function] = {}
         self._build()
 
     def _build(self) -> None:
@@ -247,6 +248,20 @@ class Machine:
         e = self.e
         if e.play is None:
             return u, None
+        start = casadi.substitute(
+            casadi.SX(e.play.start), casadi.vertcat(e.play.u, e.p), casadi.vertcat(u[0], p)
+        )
+        z = np.concatenate([np.asarray(casadi.evalf(start), float).ravel(),
+                            np.zeros(len(self.index))])  # fmt: skip
+        if len(u) not in self._plays:  # building it takes longer than running it
+            self._plays[len(u)] = self._play().mapaccum("run", len(u))
+        out = np.asarray(self._plays[len(u)](z, u[None, :], p)[1], float)
+        return out[0], out[1:].T
+
+    def _play(self) -> casadi.Function:
+        """Return one sample of the play, with its slopes by the free parameters."""
+        e = self.e
+        assert e.play is not None
         m, slope = casadi.SX.sym("m"), casadi.SX.sym("d", len(self.index))
         sample, values = casadi.SX.sym("u"), casadi.SX.sym("p", e.p.shape[0])
         applied, after = through_play(e, m, sample, values)
@@ -255,17 +270,10 @@ class Machine:
             casadi.jacobian(out, m) * slope + casadi.jacobian(out, free).T
             for out in (applied, after)
         ]
-        step = casadi.Function(
+        return casadi.Function(
             "play", [casadi.vertcat(m, slope), sample, values],
             [casadi.vertcat(after, rows[1]), casadi.vertcat(applied, rows[0])],
         )  # fmt: skip
-        start = casadi.substitute(
-            casadi.SX(e.play.start), casadi.vertcat(e.play.u, e.p), casadi.vertcat(u[0], p)
-        )
-        z = np.concatenate([np.asarray(casadi.evalf(start), float).ravel(),
-                            np.zeros(len(self.index))])  # fmt: skip
-        out = np.asarray(step.mapaccum("run", len(u))(z, u[None, :], p)[1], float)
-        return out[0], out[1:].T
 
     def with_slopes(self) -> casadi.Function:
         """Return one period of the plant, as it is, together with that of its sensitivities.

@@ -1,11 +1,18 @@
-"""The single steps of a search: where it begins, what contains what, what stays possible."""
+"""The single steps of a search: where it begins, what contains what, what stays possible.
+
+And what a random force that is none looks like.
+"""
+
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from scipy import signal, stats
 
 import ctrlid as cid
 from ctrlid import effects as E
 from ctrlid.diagnosis.decide import rivals
+from ctrlid.diagnosis.omnibus import _shape, omnibus
 from ctrlid.diagnosis.search import _plainer
 from ctrlid.diagnosis.trial import attempt, attempt_at, base_model, contains, refit
 
@@ -82,3 +89,46 @@ def test_the_simple_effect_begins_where_the_larger_one_ended(one_level):
     assert again.name == "CoulombFriction"
     assert again.gain == pytest.approx(plain.gain, abs=1.0)
     assert np.isfinite(again.merit)
+
+
+def test_the_shape_of_gaussian_noise_is_that_of_scipy():
+    x = np.random.default_rng(1).standard_normal(5000)
+    expected = [stats.skewtest(x).statistic, stats.kurtosistest(x).statistic]
+    np.testing.assert_allclose(_shape(x), expected, atol=0.02)  # but for a chance correlation
+    assert _shape(np.zeros(100)) == []
+
+
+def test_the_shape_of_a_slow_gaussian_force_is_no_alarm():
+    rng = np.random.default_rng(2)
+    sizes = []
+    for _ in range(300):
+        x = signal.lfilter([1.0], [1.0, -0.97], rng.standard_normal(5000))[1000:]
+        sizes.append(stats.chi2.sf(np.sum(np.square(_shape(x))), 2))
+    assert np.mean(np.array(sizes) < 0.1) == pytest.approx(0.1, abs=0.05)
+    assert min(sizes) > 1e-5
+
+
+@dataclass(frozen=True)
+class Pulses(E.ForceEffect):
+    """A force that is there for a tenth of the time."""
+
+    push: float = E.parameter("{y}/s^2", neutral=0.0)
+
+    def force(self, m):
+        beat = np.sin(2 * np.pi * 0.31 * m.t) + np.sin(2 * np.pi * 0.5 * m.t)
+        return self.push * 0.5 * (1 + np.tanh(20 * (beat - 1.2)))
+
+
+def test_a_force_of_pulses_is_not_taken_for_a_random_one():
+    loop = levitation()
+    r = cid.random_binary(12_000, amplitude=1e-4, hold=60, around=loop.point.output, seed=9400)
+    noise = np.random.default_rng(1).standard_normal(len(r))
+    random = signal.lfilter([0.05 * np.sqrt(1 - 0.99**2)], [1.0, -0.99], noise)  # m/s^2
+    tests = []
+    for real, force in ((loop.with_effect(Pulses(0.15)), 0 * random), (loop, random)):
+        d = -force * loop.point.input / (2 * 9.81)  # what the magnet pulls more or less, in volts
+        record = cid.simulate(real, r, d=d, sensor_noise=1e-5, seed=9401)
+        fit = base_model(loop, [replace(record, u=record.u - d)], loop.free).fit
+        assert fit.noise.drift > 0
+        tests.append(omnibus(fit).p_values["shape of the random force"])
+    assert tests[0] < 1e-5 < 1e-3 < tests[1]

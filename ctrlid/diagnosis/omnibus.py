@@ -13,6 +13,8 @@ from .result import Place
 
 LAGS = 25
 BINS = 12
+SETTLING = 0.05  # of a record, in which a force is still being found
+INDEPENDENT = 40  # samples of a force, from which its distribution shows
 FEWEST = 40  # samples in a bin
 ALPHA = 1e-3  # chance of one false alarm over all tests together
 
@@ -46,7 +48,8 @@ def omnibus(fit: Fit) -> Omnibus:
 
     Whiteness, independence of past input and reference, one line in the spectrum, heavy tails and
     isolated events, and mean and mean square in bins of time, position, velocity, input and
-    reference.
+    reference; where a coloured force was fitted, whether its estimate has the skewness and the
+    tails of a random one.
 
     Parameters
     ----------
@@ -61,12 +64,12 @@ def omnibus(fit: Fit) -> Omnibus:
     References
     ----------
     Ljung and Box, Biometrika 65 (1978) 297-303; Fisher, Proceedings of the Royal Society A 125
-    (1929) 54-59.
+    (1929) 54-59; Lobato and Velasco, Econometric Theory 20 (2004) 671-689.
     """
     parts: dict[str, list[Array]] = {}
     white = cross = 0.0
     white_df = cross_df = 0
-    lines, tails = [], []
+    lines, tails, shapes = [], [], []
     p = len(fit.theta)
     for z, out, track in zip(fit.standardized, fit.filtered, fit.problem.tracks, strict=True):
         keep = np.isfinite(z)
@@ -80,6 +83,8 @@ def omnibus(fit: Fit) -> Omnibus:
         cross_df += df
         lines.append(_line(filled, n))
         tails.append(z[keep])
+        if fit.noise.drift:
+            shapes += _shape(out.disturbance[int(SETTLING * len(z)) :])
         for name, values in _axes(fit, out, track).items():
             parts.setdefault(name, []).append(values[keep])
     z = np.concatenate(tails)
@@ -90,6 +95,10 @@ def omnibus(fit: Fit) -> Omnibus:
         "a single line in the spectrum": min(1.0, min(lines) * len(lines)),
         **_tails(z),
     }
+    if shapes:
+        p_values["shape of the random force"] = float(
+            stats.chi2.sf(sum(v**2 for v in shapes), len(shapes))
+        )
     for name, values in axes.items():
         mean, square = _binned(z, values)
         p_values[f"mean by {name}"] = mean
@@ -131,6 +140,39 @@ def _tails(z: Array) -> dict[str, float]:
         "heavy tails": float(2 * stats.norm.sf(abs(excess) / math.sqrt(24.0 / n))),
         "isolated events": float(-np.expm1(n * np.log1p(-2 * stats.norm.sf(largest)))),
     }
+
+
+def _shape(force: Array) -> list[float]:
+    """Return how far skewness and kurtosis of a correlated force are from those of a Gaussian one.
+
+    As standard normal deviates, for as many samples as are independent in the third and fourth
+    moment; by the transformations of D'Agostino and of Anscombe and Glynn, which hold for few.
+    """
+    x = force - force.mean()
+    if len(x) < FEWEST or not np.ptp(x) > 0:
+        return []
+    length = 1 << (2 * len(x) - 1).bit_length()
+    acf = np.fft.irfft(np.abs(np.fft.rfft(x, length)) ** 2)[: len(x) // 4]
+    rho = acf / acf[0]
+    ends = np.flatnonzero(rho <= 0)
+    rho = rho[1 : ends[0] if len(ends) else len(rho)]
+    skew, kurtosis = stats.skew(x), stats.kurtosis(x, fisher=False)
+    n, m = (len(x) / float(1 + 2 * np.sum(rho**k)) for k in (3, 4))
+    if n < INDEPENDENT:
+        return []
+    y = skew * math.sqrt((n + 1) * (n + 3) / (6 * (n - 2)))
+    beta = 3 * (n**2 + 27 * n - 70) * (n + 1) * (n + 3) / ((n - 2) * (n + 5) * (n + 7) * (n + 9))
+    w = math.sqrt(2 * (beta - 1)) - 1
+    first = math.asinh(y * math.sqrt((w - 1) / 2)) / math.sqrt(0.5 * math.log(w))
+    mean = 3 * (m - 1) / (m + 1)
+    variance = 24 * m * (m - 2) * (m - 3) / ((m + 1) ** 2 * (m + 3) * (m + 5))
+    x4 = (kurtosis - mean) / math.sqrt(variance)
+    bend = 6 * (m**2 - 5 * m + 2) / ((m + 7) * (m + 9))
+    bend *= math.sqrt(6 * (m + 3) * (m + 5) / (m * (m - 2) * (m - 3)))
+    a = 6 + 8 / bend * (2 / bend + math.sqrt(1 + 4 / bend**2))
+    ratio = (1 - 2 / a) / (1 + x4 * math.sqrt(2 / (a - 4)))
+    second = (1 - 2 / (9 * a) - np.cbrt(ratio)) / math.sqrt(2 / (9 * a))
+    return [float(first), float(second)]
 
 
 def _axes(fit: Fit, out: object, track: object) -> dict[str, Array]:
