@@ -34,6 +34,7 @@ from .trial import (
     anchor,
     attempt_at,
     contains,
+    needed,
     promised,
     reduced,
     refit,
@@ -47,6 +48,7 @@ NEAR = 0.5  # of the winner's merit: what came so close is asked again when all 
 MINOR = 0.15  # of the whole gain: less, beside something unknown, is a stand-in
 OFFSETS = (SensorOffset,)
 LITTLE = 0.1  # of what known noise does not explain: less, beside so much, is a stand-in
+SURE = 100.0  # times the gate: an effect so significant is not asked whether it is needed
 FAINT = 0.5  # of what would earn a place: a fainter promise is not worth a refit
 
 Work = Callable[[Callable[..., Any], Iterable[Any]], list[Any]]
@@ -318,6 +320,8 @@ def _renoised(model: Model) -> Model:
 def _without_superfluous(model: Model, given: int) -> Model:
     """Drop effects that the later ones made superfluous."""
     for position in range(given, len(model.loop.effects) - 1):
+        if needed(model, position) > SURE * GATE:
+            continue
         smaller, trial = _taken_out(model, position)
         if trial.merit <= GATE:
             return _without_superfluous(smaller, given)

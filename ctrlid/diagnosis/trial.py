@@ -413,6 +413,29 @@ def _objection(trial: Trial) -> str:
     return ""
 
 
+def needed(model: Model, position: int) -> float:
+    """Return what a model would lose of log-likelihood without an effect, less its penalty.
+
+    In the quadratic approximation around the fitted values, all other parameters and the size of
+    the noise moving along (a coloured force may take up much of it).
+    Zero where that says nothing, as for a limit.
+    """
+    fit, names = model.fit, list(model.names)
+    label, effect = list(model.fitted.labelled.items())[position]
+    away = {f"{label}.{p.name}": getattr(effect, p.name) - p.neutral
+            for p in effect.parameters() if p.neutral is not None}  # fmt: skip
+    own = [names.index(n) for n, d in away.items() if n in names and math.isfinite(d)]
+    matrix = fit.normal[0]
+    if not own or len(own) < len(away) or not np.isfinite(matrix).all():
+        return 0.0
+    every = [k for k, n in enumerate(names) if n.startswith(f"{label}.")]
+    size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    left = _left(matrix, own, [k for k in range(len(matrix)) if k not in every])
+    d = np.array([away[names[k]] for k in own]) * size[own]
+    gain = 0.5 * fit.size * math.log1p(float(d @ left @ d) / fit.size)
+    return gain - 0.5 * len(every) * math.log(fit.size)
+
+
 def _insignificant(trial: Trial, effect: AbstractEffect) -> bool:
     """Whether every parameter that decides about an effect may as well be neutral."""
     fit, names = trial.model.fit, trial.model.names
