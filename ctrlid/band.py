@@ -117,7 +117,7 @@ def response_band(model: IdentifiedModel, omega: Any, level: float = 0.95) -> Re
         half * np.sqrt(np.maximum(np.einsum("ik,ij,jk->k", part, estimate.covariance, part), 0.0))
         for part in (slopes.real, slopes.imag)
     ]
-    response = num / den
+    response = num / den * np.exp(-1j * w * model.delay)
     magnitude, phase = np.abs(response), np.degrees(np.unwrap(np.angle(response)))
     spread, turn = np.exp(errors[0]), np.degrees(errors[1])
     return ResponseBand(

@@ -55,8 +55,8 @@ def fit_continuous(
     Returns
     -------
     IdentifiedModel
-        The transfer function in s, with `.estimate`. An estimated delay is in the estimate's
-        `solver` text and in the attribute `delay`.
+        The transfer function in s, with `.estimate`. A delay is in the attribute
+        `delay`, and counts wherever ctrlid looks at the model.
 
     Raises
     ------

@@ -212,7 +212,8 @@ def redesign(
                           f"given {type(G).__name__}")  # fmt: skip
     if not isinstance(loop, Loop):
         raise CtrlidError(f"redesign tries the controller on a Loop; given {type(loop).__name__}")
-    G = ct.tf(G)  # a plain transfer function, whatever the fit carried along
+    # A plain transfer function, whatever the fit carried along, but its delay.
+    G = G.with_delay() if getattr(G, "delay", 0.0) else ct.tf(G)
     C = design_lead(G, crossover=crossover, phase_margin=phase_margin)
     dt = timebase(G)
     trial = replace(loop, controller=C, dt=dt or loop.dt)

@@ -130,7 +130,7 @@ class Loop:
         object.__setattr__(self, "_kept", kept)
         changed = kept if len(active) == len(effects) else compose(plant, active, at, self.dt)
         object.__setattr__(self, "_active", changed)
-        free = (self.free,) if isinstance(self.free, str) else tuple(self.free)
+        free = (self.free,) if isinstance(self.free, str) else tuple(dict.fromkeys(self.free))
         unknown = [name for name in free if name not in kept.parameters]
         if unknown:
             raise CtrlidError(

@@ -371,6 +371,13 @@ class IdentifiedModel(control.TransferFunction):
     name : str
         Name of the system.
 
+    Attributes
+    ----------
+    delay : float
+        Delay of the input that `fit_continuous` was given or found [s]. A rational function cannot
+        hold it: `compare`, `redesign`, `diagnose` and Bode plots add it, `with_delay` does for
+        everything else.
+
     Examples
     --------
     >>> import numpy as np
@@ -386,6 +393,7 @@ class IdentifiedModel(control.TransferFunction):
     """
 
     estimate: Estimate
+    delay: float = 0.0
 
     def __init__(
         self, estimate: Estimate, *, inputs: str = "u", outputs: str = "y", name: str = "identified"
@@ -393,6 +401,27 @@ class IdentifiedModel(control.TransferFunction):
         num, den = estimate.structure.fraction(estimate.values)
         super().__init__(num, den, estimate.dt, inputs=inputs, outputs=outputs, name=name)
         self.estimate = estimate
+
+    def with_delay(self, order: int = 3) -> control.TransferFunction:
+        r"""Return the model with its delay, as a rational function.
+
+        .. math:: G(s)\, e^{-s\tau} \approx G(s)\, P(s)
+
+        with Padé's approximation P, whose phase at the order n is right to a degree up to
+        :math:`\omega \tau \approx n`.
+
+        Parameters
+        ----------
+        order : int, optional
+            Order of the approximation.
+
+        Returns
+        -------
+        control.TransferFunction
+            A plain transfer function; the model itself if it has no delay.
+        """
+        plain = control.tf(self.num, self.den, self.dt)
+        return plain * control.tf(*control.pade(self.delay, order)) if self.delay else plain
 
     def __str__(self) -> str:
         text: Any = super().__str__()

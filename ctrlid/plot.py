@@ -354,6 +354,7 @@ def bode(models: Any, axes: Any = None, *, omega: Any = None, level: float | Non
         if not w.size:
             continue
         values = np.atleast_1d(model(np.exp(1j * w * dt) if dt else 1j * w))
+        values = values * np.exp(-1j * w * float(getattr(model, "delay", 0.0)))
         phase = np.degrees(np.unwrap(np.angle(values)))
         # On the sheet of the first model; that one starts within (-270, 90].
         turn = (

@@ -239,6 +239,21 @@ def best_start(
     return start
 
 
+def _held(model: Any, record: Record, part: float) -> Any:
+    """Return a continuous model between samples, its input late by a part of a period."""
+    plain = ct.ss(ct.tf(model.num, model.den))
+    whole = ct.ss(ct.sample_system(plain, record.dt, record.hold))
+    if part < 1e-9:
+        return ct.tf(whole)
+    # The old input acts for the first part of the period, the new one for the rest.
+    rest = ct.ss(ct.sample_system(plain, (1 - part) * record.dt, "zoh"))
+    late = ct.tf(ct.ss(whole.A, whole.B - rest.B, whole.C, 0.0, record.dt))
+    soon = ct.tf(ct.ss(whole.A, rest.B, whole.C, 0.0, record.dt))
+    den = np.asarray(soon.den[0][0], float)
+    num = np.polyadd(np.append(soon.num[0][0], 0.0), late.num[0][0])
+    return ct.tf(num, np.append(den, 0.0), record.dt)
+
+
 def _compare_model(record: Record, model: Any, horizon: int | None) -> Comparison:
     if model.ninputs != 1 or model.noutputs != 1:
         raise CtrlidError("compare needs a model with one input and one output")
@@ -250,8 +265,12 @@ def _compare_model(record: Record, model: Any, horizon: int | None) -> Compariso
         )
     poles = ", ".join(number(p, 4) for p in model.poles())
     what = f"{model.name}: poles {poles or 'none'}"
+    delay = float(getattr(model, "delay", 0.0))
+    if delay:
+        what += f", delay {number(delay, 4)} s"
     if not dt:
-        model = ct.tf(ct.sample_system(ct.ss(model), record.dt, record.hold))
+        late, part = divmod(delay / record.dt, 1.0)
+        model = _held(model, record, part) * ct.tf([1.0], [1.0, *[0.0] * int(late)], record.dt)
     num, den = (np.asarray(p[0][0], float) for p in (model.num, model.den))
     num = np.concatenate([np.zeros(len(den) - len(num)), num]) / den[0]
     den = den / den[0]

@@ -7,12 +7,13 @@ and stretches; refusals.
 from dataclasses import replace
 
 import control as ct
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from scipy import linalg
 
 import ctrlid as cid
-from ctrlid import CtrlidError
+from ctrlid import CtrlidError, plot
 from ctrlid.innovations import Circuit, _exponential, flow, prediction_errors, realize
 
 ALPHA, BETA = 1635.0, 6.54
@@ -146,6 +147,41 @@ def test_delay_is_estimated_on_request(delay):
     assert "delay" in G.estimate.solver
     known = cid.fit_continuous(record, 2, delay=delay)
     assert known.estimate["b1"] == pytest.approx(4.0, rel=0.02)
+    # Whoever looks at the model sees the delay.
+    seen = cid.compare(record, known)
+    assert f"delay {delay:.4g} s" in str(seen)
+    assert seen.curves[0].rms < 1.5e-4
+    known.delay = 0.0
+    assert cid.compare(record, known).curves[0].follows > 0.05 > seen.curves[0].follows
+    known.delay = delay
+    w = np.array([2.0, 20.0])
+    exact = known(1j * w) * np.exp(-1j * w * delay)
+    np.testing.assert_allclose(known.with_delay()(1j * w), exact, rtol=1e-4)
+    phase = cid.response_band(known, w).phase
+    np.testing.assert_allclose(phase, np.degrees(np.unwrap(np.angle(exact))), atol=1e-6)
+    drawn = plot.bode({"late": known}, omega=w)[1].lines[0].get_ydata()
+    np.testing.assert_allclose(drawn, phase, atol=1e-6)
+    plt.close("all")
+
+
+def test_a_redesign_counts_the_delay():
+    delay, dt = 0.05, 0.01
+    plant = ct.tf([4.0], [1, 3.0, 2.0]) * ct.tf(*ct.pade(delay, 4))  # that of an analog loop
+    digital = cid.Loop(plant, ct.tf([1.0], [1.0], dt), dt=dt)
+    r = cid.random_binary(4000, amplitude=1.0, hold=30, seed=3)
+    record = cid.simulate(digital, r, sensor_noise=1e-3, seed=4)
+    G = cid.fit_continuous(record, 2, delay=delay)
+    outcome = cid.redesign(G, digital, crossover=6.0, phase_margin=45.0)
+    assert outcome.promised.phase_margin == pytest.approx(45.0, abs=0.5)
+    assert outcome.achieved.phase_margin == pytest.approx(45.0, abs=3.0)
+    G.delay = 0.0  # forgotten, 6 rad/s times 0.05 s are missing
+    hasty = cid.redesign(G, digital, crossover=6.0, phase_margin=45.0)
+    assert hasty.achieved.phase_margin == pytest.approx(45.0 - np.degrees(0.3), abs=3.0)
+    G.delay = delay
+    few = (cid.effects.InputOffset, cid.effects.SensorLag)
+    found = cid.diagnose(G, record, catalogue=few, progress=False)
+    assert cid.effects.InputDelay(delay) in found.loop.effects
+    assert found.verdict == "nothing missing"
 
 
 def test_open_loop_third_order_with_a_zero():

@@ -14,7 +14,7 @@ from tqdm import tqdm
 
 from ..audit import Audit, audit
 from ..data import Record, as_records
-from ..effects import CATALOGUE, AbstractEffect, equivalents
+from ..effects import CATALOGUE, AbstractEffect, InputDelay, InputOffset, equivalents
 from ..errors import CtrlidError
 from ..likelihood import Fit, pseudo_inverse
 from ..linearization import OperatingPoint
@@ -252,7 +252,10 @@ def _loop(loop: Any, record: Record) -> Loop:
     u, y = float(np.mean(record.u[valid])), float(np.mean(record.y[valid]))
     plain = ct.tf(loop.num, loop.den, loop.dt)
     linear = Loop(plain, None, dt=record.dt, at=OperatingPoint((), u, y))
-    return replace(linear, free=tuple(linear.parameters))
+    delay = float(getattr(loop, "delay", 0.0))
+    linear = linear.with_effect(InputOffset(0.0))  # where it rests, the means only guess
+    linear = replace(linear, free=tuple(linear.parameters))
+    return linear.with_effect(InputDelay(delay)) if delay else linear
 
 
 def _look_over(
