@@ -15,7 +15,7 @@ from ..physics import Array
 from . import gap as gaps
 from .trial import Model
 
-LONGEST = 120_000  # samples that are fitted; of longer records, even stretches
+LONGEST = 40_000  # samples that are fitted; of longer records, even stretches
 STRETCHES = 12  # of a long record
 TURNS = 4  # phases from which a private phase is looked for
 

@@ -39,6 +39,7 @@ from .trial import (
     reduced,
     refit,
     same_kind,
+    spared,
 )
 
 MOST = 5  # effects in one record
@@ -239,7 +240,7 @@ def search(
         step = one_round(model, pool, work, None if steps else anchor(base))
         if step.best is not None and step.best.gain < LITTLE * excess(model.fit):
             step = replace(step, best=None)
-        steps.append(step)
+        steps.append(replace(step, base=Model(model.loop, spared(model.fit))))
         if step.best is None:
             break
         tell(f"round {len(steps)}: {step.best.name}")
@@ -343,7 +344,7 @@ def _taken_out(model: Model, position: int) -> tuple[Model, Trial]:
     """Return the model without one effect, refitted, and the effect as a trial on top of it."""
     effect = model.fitted.effects[position]
     loop, names = taken_out(model.fitted, position, model.names)
-    smaller = Model(loop, climb(reduced(model, loop, names), rounds=10))
+    smaller = Model(loop, spared(climb(reduced(model, loop, names), rounds=10)))
     return smaller, refit(smaller, attempt_at(smaller, effect))
 
 
