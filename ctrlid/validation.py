@@ -13,6 +13,7 @@ from ._text import number
 from .comparison import EXACT, Comparison, Curve
 from .controllers import PID
 from .data import Record
+from .effects.moment import motion
 from .errors import CtrlidError, CtrlidWarning
 from .filtering import FEWEST
 from .linearization import state_matrices
@@ -223,19 +224,47 @@ def best_start(
     for j in simulator.loop.equations().velocities:
         scale[j] = max(float(np.std(np.diff(part.y))) / part.dt, 1e-300)
 
-    def misfit(point: Array) -> Array:
-        z = guess.copy()
-        z[:fitted] += scale * (point - 1)
+    def run(z: Array) -> Array | None:
         try:
             y = simulator.run(z, None if r is None else r[rows], d[rows])[0]
         except CtrlidError:
-            return np.full(rows.stop, 1e3)
+            return None
         return np.asarray((y - part.y[rows]) / spread, dtype=float)
+
+    # From rest a short search does not find a start that is far away.
+    seen = _as_measured(simulator, part, guess)
+    there, here = run(seen), run(guess)
+    if there is not None and (here is None or there @ there < here @ here):
+        guess = seen
+
+    def misfit(point: Array) -> Array:
+        z = guess.copy()
+        z[:fitted] += scale * (point - 1)
+        found = run(z)
+        return np.full(rows.stop, 1e3) if found is None else found
 
     # Around 1, so that the differences have the relative size that is asked for.
     best = optimize.least_squares(misfit, np.ones(fitted), diff_step=[1e-4], max_nfev=20)
     start = guess.copy()
     start[:fitted] += scale * (best.x - 1)
+    return start
+
+
+def _as_measured(simulator: Simulator, part: Record, guess: Array) -> Array:
+    """Return a guess moved to where the first samples see the plant, and how fast."""
+    loop, start = simulator.loop, guess.copy()
+    e = loop.equations()
+    n = len(e.states)
+    few = min(len(part), 8)
+    slope, first = np.polyfit(np.arange(few) * part.dt, part.y[:few], 1)
+    c = state_matrices(e, loop.point, spread=1e6)[2][0]
+    off = first - float(e.evaluate(guess[:n], loop.point.input, 0.0)[1][0])
+    seen = np.array([0.0 if j in e.velocities else c[j] for j in range(n)])
+    if seen.any():
+        start[:n] += seen * off / (seen @ seen)
+    moving = motion(e)
+    if moving is not None and c[moving[0]]:
+        start[moving[1]] = slope / c[moving[0]]
     return start
 
 

@@ -11,6 +11,8 @@ import pytest
 import ctrlid as cid
 from ctrlid import _pictures, plot
 from ctrlid import effects as E
+from ctrlid.diagnosis import gap as gap_of
+from ctrlid.diagnosis import words
 from ctrlid.diagnosis.result import (
     Calibrated,
     Candidate,
@@ -116,11 +118,11 @@ def test_report_is_read_in_a_minute(found, verdict):
     assert len(lines) <= 45
     assert max(map(len, lines)) <= 100
     assert SENTENCES[verdict] in text(found[verdict])
-    for words in ("maglev, 3000 samples", "closed-loop simulation of 1000 samples kept back",
-                  "the model as given", "noise floor", "random force", "8.4 s",
-                  "about the record: u moves in steps", "note: two samples were left out",
-                  "0.0213 (not in the data)"):  # fmt: skip
-        assert words in text(found[verdict])
+    for part in ("maglev, 3000 samples", "closed-loop simulation of 1000 samples kept back",
+                 "the model as given", "noise floor", "random force", "8.4 s",
+                 "about the record: u moves in steps", "note: two samples were left out",
+                 "0.0213 (not in the data)"):  # fmt: skip
+        assert part in text(found[verdict])
     assert "likelihood" not in text(found[verdict])
 
 
@@ -308,11 +310,11 @@ def test_what_is_no_saved_diagnosis_is_refused(found, tmp_path):
         load_diagnosis(path)
     with pytest.raises(cid.CtrlidError, match="cannot be written to"):
         found["explained"].save(tmp_path / "nowhere" / "f.json")
-    for content, words in (("{", "is not a saved diagnosis: "), ("[]", "has the format 'list'"),
-                           ('{"format": "x"}', "has the format 'x'"),
-                           ('{"format": "ctrlid diagnosis 1"}', "damaged: 'loop'")):  # fmt: skip
+    for content, reason in (("{", "is not a saved diagnosis: "), ("[]", "has the format 'list'"),
+                            ('{"format": "x"}', "has the format 'x'"),
+                            ('{"format": "ctrlid diagnosis 1"}', "damaged: 'loop'")):  # fmt: skip
         path.write_text(content)
-        with pytest.raises(cid.CtrlidError, match=words):
+        with pytest.raises(cid.CtrlidError, match=reason):
             load_diagnosis(path)
 
 
@@ -417,3 +419,29 @@ def test_page(found, verdict, tmp_path):
     assert ("LARGE RANDOM FORCE" in page) == (verdict == "nothing missing")
     assert "StribeckFriction" in page
     assert "About the record: u moves in steps of 0.00122 V." in page
+
+
+def test_a_gap_where_only_the_given_model_can_be_simulated():
+    nothing = np.zeros(3)
+    gap = Gap("closed-loop simulation", 2.7e-3, math.inf, math.inf, math.nan, "m", *[nothing] * 4)
+    rows = {label: size for label, size, _ in words.gap_rows(gap)}
+    assert rows["the model as given"] == "2.70 mm"
+    assert rows["recalibrated"] == "LEAVES THE PLANT'S DOMAIN"
+
+
+def test_a_window_far_from_rest_finds_its_start():
+    """In a stretch that begins far away, the operating point is no place to begin from."""
+    plant = cid.plants.maglev(m=0.0213, K=3.34e-6)
+    op = cid.operating_point(plant, output=0.013)
+    C = cid.design_lead(cid.linearize(plant, op), crossover=100, phase_margin=50)
+    loop = cid.Loop(plant, C.sample(DT, "tustin"), dt=DT, at=op, input_limits=(0.0, 4.5))
+    r = np.linspace(op.output, 0.006, 4000) + cid.random_binary(
+        4000, amplitude=1e-4, hold=50, seed=1
+    )
+    record = cid.simulate(loop, r, sensor_noise=2e-6, seed=2)[3500:]
+    assert abs(record.y[0] - op.output) > 4e-3
+    window = gap_of.whole(record)
+    error = gap_of.root_mean_square(
+        [window], [gap_of.output(loop, window, "closed-loop simulation")]
+    )
+    assert error < 1e-5

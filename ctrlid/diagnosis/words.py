@@ -37,6 +37,7 @@ def headline(found: Diagnosis) -> str:
 def gap_rows(gap: Gap) -> list[tuple[str, str, str]]:
     """Return what the gap is, how large, and how many times the noise floor, row by row."""
     known = [v for v in (gap.floor, gap.after, gap.before) if 0 < v < math.inf]
+    known = known or [v for v in (gap.given,) if 0 < v < math.inf]
     middle = math.exp(sum(map(math.log, known)) / len(known)) if known else 0.0
     factor, unit = prefix(middle, gap.unit)
     places = 2 - math.floor(math.log10(factor * min(known))) if known else 0
