@@ -12,6 +12,7 @@ from scipy import signal, stats
 import ctrlid as cid
 from ctrlid import effects as E
 from ctrlid.diagnosis.decide import rivals
+from ctrlid.diagnosis.experiment import separating_experiment
 from ctrlid.diagnosis.omnibus import _shape, omnibus
 from ctrlid.diagnosis.search import _plainer
 from ctrlid.diagnosis.trial import attempt, attempt_at, base_model, contains, refit
@@ -132,3 +133,32 @@ def test_a_force_of_pulses_is_not_taken_for_a_random_one():
         assert fit.noise.drift > 0
         tests.append(omnibus(fit).p_values["shape of the random force"])
     assert tests[0] < 1e-5 < 1e-3 < tests[1]
+
+
+def refitted(loop, record, *candidates):
+    base = base_model(loop, [record], loop.free)
+    return [refit(base, attempt(base, e)) for e in candidates]
+
+
+def test_an_experiment_is_recommended_that_tells():
+    """Around one height an exponent and an offset of the law are one; over several they are two."""
+    loop = levitation()
+    record = record_of(loop, E.ForceExponent(n=2.2), 1e-4, 2e-6, 9500)
+    best, other = refitted(loop, record, E.ForceExponent(n=2.0), E.PositionOffset(0.0))
+    words, reference = separating_experiment(best, [other], record)
+    assert "Recommended: " in words
+    real = loop.with_effect(E.ForceExponent(n=2.2))
+    second = cid.simulate(real, reference, sensor_noise=2e-6, seed=9502)
+    best, other = refitted(loop, second, E.ForceExponent(n=2.0), E.PositionOffset(0.0))
+    assert rivals(best, [other]) == ()
+
+
+def test_no_experiment_is_recommended_where_none_tells():
+    """A delay and a lag of a hundredth of a sample are the same for any record."""
+    loop = levitation()
+    record = record_of(loop, E.InputDelay(2e-5), 1e-4, 2e-7, 9600)
+    best, other = refitted(loop, record, E.InputDelay(1e-5), E.SensorLag(1e-5))
+    assert abs(best.gain - other.gain) < 3 < best.gain
+    words, reference = separating_experiment(best, [other], record)
+    assert reference is None
+    assert "No steps of the reference" in words

@@ -2,30 +2,42 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from ..data import Record
 from ..errors import CtrlidError
+from ..likelihood import Known, begin
+from ..loop_fit import make_problem
 from ..physics import Array
 from ..signals import random_binary
 from ..simulation import Simulator
 from .gap import FEW_STEPS, ROUGH
-from .trial import Trial
+from .trial import Trial, promised
 
 LONGEST = 20_000  # samples of a recommended experiment
+TRIED = 5000  # samples on which references are compared
 LEVELS = (-1.0, 1.0, -0.5, 0.5, 0.0)  # set-points it visits, in units of its reach
 WORTH = 1.5  # times the distance of the record itself: below, no experiment worth the name
+ENOUGH = 40.0  # squared distance in noise: twice the log-likelihood that tells, three times over
+SAFE = 1.2  # times its amplitude that the loop must survive
+MANY = 1000.0  # times as much: the record itself says nothing
 RAMP = 0.1  # share of each level that is spent on the way to it
 
 
 def separating_experiment(
     best: Trial, others: Sequence[Trial], record: Record
 ) -> tuple[str, Array | None]:
-    """Return the experiment that separates a finding from its rivals best.
+    r"""Return the experiment that separates a finding from its rivals best.
 
-    References that the loop survives are simulated with each of the rival models; the one on which
-    their outputs differ most, against the sensor noise, is recommended.
+    References that the loop survives are simulated with the finding, without noise. What each
+    rival's filter cannot predict of that record, however its parameters move along, is the distance
+
+    .. math:: D = \sum_k e_k^2 / s_k - g^T H^{-1} g,
+
+    twice the log-likelihood that the experiment is expected to bring. The reference with the
+    largest least distance is recommended, if it is enough to tell.
 
     Parameters
     ----------
@@ -43,33 +55,33 @@ def separating_experiment(
     reference : ndarray or None
         The reference signal; None where the loop has no controller to run it.
     """
-    words = type(best.effect).experiment
+    words = type(best.effect).experiment.rstrip(".")
     loop = best.model.fitted
     if loop.controller is None or record.r is None:
         return words, None
-    sensor = math.sqrt(float(np.mean(best.model.fit.sensor)))
-    models = []
-    for trial in (best, *others):
-        try:
-            models.append(Simulator(trial.model.fitted, ROUGH, FEW_STEPS))
-        except CtrlidError:
-            continue
+    try:
+        simulator = Simulator(loop, ROUGH, FEW_STEPS)
+    except CtrlidError:
+        return words, None
     chosen: tuple[float, str, Array] | None = None
     for text, r in _references(record):
-        distance = _distance(models, r, sensor)
+        distance = _distance(simulator, best, others, r[:TRIED], record)
         if distance is not None and (chosen is None or distance > 1.2 * chosen[0]):
             chosen = (distance, text, r)
-    if chosen is None or len(models) < 2:
+    if chosen is None:
         return words, None
-    own = _distance(models, np.asarray(record.r), sensor) or 0.0
+    own = _distance(simulator, best, others, np.asarray(record.r)[:TRIED], record) or 0.0
+    if chosen[0] * len(chosen[2]) < ENOUGH:
+        return (f"{words}. No steps of the reference that the loop is sure to survive would tell, "
+                f"within {len(chosen[2])} samples"), None  # fmt: skip
     if chosen[0] < WORTH * own:
         return words, None
-    if own <= 0:
-        return f"{words.rstrip('.')}. Recommended: {chosen[1]}.", chosen[2]
+    if own <= 0 or chosen[0] > MANY * own:
+        return f"{words}. Recommended: {chosen[1]}.", chosen[2]
     times = chosen[0] / own
-    text = (f"{words.rstrip('.')}. Recommended: {chosen[1]}; there the candidates differ "
-            f"{times:.1f} times as much for the same number of samples.")  # fmt: skip
-    return text.strip(), chosen[2]
+    text = (f"{words}. Recommended: {chosen[1]}; there the candidates differ {times:.1f} times as "
+            "much for the same number of samples.")  # fmt: skip
+    return text, chosen[2]
 
 
 def _references(record: Record) -> list[tuple[str, Array]]:
@@ -94,6 +106,9 @@ def _references(record: Record) -> list[tuple[str, Array]]:
         ("steps that change four times as often on several set-points", step, max(2, hold // 4),
          reach),
         ("slow steps, four times as long, on several set-points", step, 4 * hold, reach),
+        ("steps four times as large that change four times as often", 4 * step, max(2, hold // 4),
+         0.0),
+        ("steps four times as large that change every other sample", 4 * step, 2, 0.0),
     ):  # fmt: skip
         signal = random_binary(n, amplitude=amplitude, hold=width, around=middle, seed=0)
         found.append((label, signal + _levels(n, levels)))
@@ -110,12 +125,30 @@ def _levels(n: int, reach: float) -> Array:
     return np.asarray(np.interp(np.arange(n), times, values), dtype=float)
 
 
-def _distance(models: Sequence[Simulator], r: Array, sensor: float) -> float | None:
-    """Return the least distance of the first model from any other, per sample."""
+def _distance(
+    simulator: Simulator, best: Trial, others: Sequence[Trial], r: Array, record: Record
+) -> float | None:
+    """Return the least distance of a finding from its rivals, per sample."""
+    middle = float(np.mean(r))
     try:
-        outputs = [m.run(m.start(None), r, np.zeros(len(r)))[0] for m in models]
+        simulator.run(simulator.start(None), middle + SAFE * (r - middle), np.zeros(len(r)))
+        y, u = simulator.run(simulator.start(None), r, np.zeros(len(r)))
     except CtrlidError:
         return None
-    if len(outputs) < 2:
+    made = Record(u=u, y=y, r=r, dt=record.dt, hold=record.hold)
+    sizes = [d for t in others if (d := _unlike(t, best, made)) is not None]
+    return min(sizes) / len(r) if sizes else None
+
+
+def _unlike(rival: Trial, best: Trial, record: Record) -> float | None:
+    """Return what a rival cannot predict of a record that the finding made."""
+    model = rival.model
+    known = Known(best.model.fit.noise, np.full(1, float(np.mean(best.model.fit.sensor))))
+    try:
+        problem = replace(make_problem(model.fitted, model.names, [record]), known=known)
+        fit = begin(problem, model.fit.theta, None)
+    except CtrlidError:
         return None
-    return min(float(np.mean((y - outputs[0]) ** 2)) for y in outputs[1:]) / sensor**2
+    errors = sum(float(np.nansum(z**2)) for z in fit.standardized)
+    left = errors - 2 * promised(fit)
+    return max(left, 0.0) if math.isfinite(left) else None

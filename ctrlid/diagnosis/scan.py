@@ -24,7 +24,7 @@ COLUMNS = 2_000_000  # numbers in a block of shapes at once
 LENGTHS = 150  # wavelengths that are looked for in the travel
 EDGE = 0.03  # of the record, at either end
 TIMES = 40  # instants at which a parameter might have stepped
-LIMITS = (0.8, 0.9, 0.95, 0.98, 0.995)  # quantiles at which a state may be limited
+LIMITS = (0.8, 0.9, 0.95, 0.98, 0.995, 0.999)  # quantiles at which a state may be limited
 MODES = 7  # frequencies at which a flexible mode is tried
 
 
