@@ -35,6 +35,7 @@ FEWEST = 10  # valid samples, to say anything
 BRIDGE = 20  # samples that do not count and are bridged by the model; then it starts afresh
 SETTLED = 4.0  # times the usual variance: above, the start still dominates the prediction
 SLOW = 0.35  # rate times step up to which a step of order four is exact enough
+MOST_STEPS = 100  # of order eight in a period: more make an expression that takes minutes to build
 KINK_STEPS = 4  # of order four in a period where friction has a kink
 PASSES = 12  # at most, to let the trajectory settle
 STILL = 1e-3  # of the standard deviations: a trajectory that moves less has settled
@@ -441,7 +442,14 @@ def _scheme(e: Equations, loop: Loop) -> Scheme:
         # A velocity that turns within a period crosses the kink of friction there.
         kinks = e.spread is not None and casadi.depends_on(e.rhs, e.spread)
         return (4, max(KINK_STEPS if kinks else 1, math.ceil(rate / SLOW)), False)
-    return (8, max(1, math.ceil(rate / 1.5)), cut)
+    steps = max(1, math.ceil(rate / 1.5))
+    if steps > MOST_STEPS:
+        raise CtrlidError(
+            f"{e.name} moves at {rate / loop.dt:.3g} rad/s, {rate:.3g} times faster than it is "
+            "sampled; what settles within a sample is a constant for the filter: leave that motion "
+            "out of the plant, or sample faster"
+        )
+    return (8, steps, cut)
 
 
 def _shortest(e: Equations, p: Any) -> float:

@@ -396,7 +396,11 @@ def _search(fit: Fit, step: Array) -> tuple[Fit, float]:
     for _ in range(12):
         theta = np.clip(fit.theta + share * step, problem.lower, problem.upper)
         if not problem.machine.fits(theta):
-            problem, fit = _rebuilt(fit, theta)
+            try:
+                problem, fit = _rebuilt(fit, theta)
+            except CtrlidError:  # too far: what moves so fast is no longer followed
+                share /= 3
+                continue
         trial = evaluate(problem, theta, fit.noise, [o.trajectory for o in fit.filtered])
         if np.isfinite(trial.value) and trial.value >= fit.value - 1e-6:
             return trial, share

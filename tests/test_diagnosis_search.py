@@ -14,8 +14,18 @@ from ctrlid import effects as E
 from ctrlid.diagnosis.decide import rivals
 from ctrlid.diagnosis.experiment import separating_experiment
 from ctrlid.diagnosis.omnibus import _shape, omnibus
+from ctrlid.diagnosis.scan import scanned
 from ctrlid.diagnosis.search import _plainer
-from ctrlid.diagnosis.trial import attempt, attempt_at, base_model, contains, refit
+from ctrlid.diagnosis.trial import (
+    Model,
+    attempt,
+    attempt_at,
+    base_model,
+    contains,
+    refit,
+    spared,
+    whole,
+)
 
 
 def levitation():
@@ -162,3 +172,24 @@ def test_no_experiment_is_recommended_where_none_tells():
     words, reference = separating_experiment(best, [other], record)
     assert reference is None
     assert "No steps of the reference" in words
+
+
+def test_a_model_without_its_arrays_can_be_searched_on():
+    loop = drive()
+    record = record_of(loop, E.CoulombFriction(0.3), 0.3, 1e-4, 9700)
+    base = base_model(loop, [record], loop.free)
+    lean = Model(base.loop, spared(base.fit))
+    assert not lean.fit.linearized
+    assert whole(base) is base
+    full = whole(lean)
+    assert full.fit.value == pytest.approx(base.fit.value, abs=0.1)
+    effect = E.PeriodicForce(amplitude=0.0, frequency=1.0, phase=0.0)
+    assert scanned(full, effect).promise == pytest.approx(scanned(base, effect).promise, rel=0.05)
+
+
+def test_a_motion_far_faster_than_the_samples_is_refused():
+    plant = cid.plants.servo(m=1e-6, c=1.0, k=1.0)
+    loop = cid.Loop(plant, cid.PID(kp=1.0), dt=0.01, at=drive().point, free=("k",))
+    still = record_of(drive(), E.CoulombFriction(0.3), 0.3, 1e-4, 9800)
+    with pytest.raises(cid.CtrlidError, match="times faster than it is sampled"):
+        cid.fit_loop(loop, still)

@@ -40,6 +40,7 @@ from .trial import (
     refit,
     same_kind,
     spared,
+    whole,
 )
 
 MOST = 5  # effects in one record
@@ -164,7 +165,7 @@ def one_round(
 def _plainer(base: Model, best: Trial, others: Sequence[Trial]) -> Trial:
     """Return an effect that the best one contains, if it does as well when it starts from there."""
     for t in others:
-        if not math.isfinite(best.merit) or not contains(best.effect, t.effect):
+        if not best.merit > 0 or not contains(best.effect, t.effect):
             continue
         values = best.fitted.values()
         start = replace(t.effect, **{k: values[k] for k in t.effect.values()})
@@ -244,7 +245,7 @@ def search(
         if step.best is None:
             break
         tell(f"round {len(steps)}: {step.best.name}")
-        model = _without_superfluous(_renoised(step.best.model), given)
+        model = whole(_without_superfluous(_renoised(step.best.model), given))
     model, found = _settled(model, given, steps, work)
     return Search(base, tuple(steps), model, found, before, _judged(model))
 

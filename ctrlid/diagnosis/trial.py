@@ -295,6 +295,15 @@ def spared(fit: Fit) -> Fit:
     return bare
 
 
+def whole(model: Model) -> Model:
+    """Return a model whose fit has the plant along its trajectory."""
+    fit = model.fit
+    if fit.linearized:
+        return model
+    at = [out.trajectory for out in fit.filtered]
+    return replace(model, fit=evaluate(fit.problem, fit.theta, fit.noise, at))
+
+
 def promised(fit: Fit) -> float:
     """Return the gain that a Gauss-Newton step within the bounds expects."""
     matrix, score = fit.normal
