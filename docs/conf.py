@@ -43,11 +43,9 @@ numpydoc_show_class_members = False
 sphinx_gallery_conf = {
     "examples_dirs": "../examples",
     "gallery_dirs": "gallery",
-    # Examples on measured records are shown everywhere and executed where the records are; the
-    # diagnoses, which take minutes, by `pytest -m slow tests/test_real_diagnosis.py`.
-    "filename_pattern": (
-        r"/(plot_|real_(?!emps|inteco))" if os.environ.get("CTRLID_DATA_DIR") else r"/plot_"
-    ),
+    # Examples on measured records are shown everywhere and executed where the records are.
+    "filename_pattern": r"/(plot_|real_)" if os.environ.get("CTRLID_DATA_DIR") else r"/plot_",
+    "parallel": 2,
     "within_subsection_order": "FileNameSortKey",
     "abort_on_example_error": True,
     "download_all_examples": False,
