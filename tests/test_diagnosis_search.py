@@ -13,9 +13,11 @@ import ctrlid as cid
 from ctrlid import effects as E
 from ctrlid.diagnosis.decide import rivals
 from ctrlid.diagnosis.experiment import separating_experiment
-from ctrlid.diagnosis.omnibus import _shape, omnibus
+from ctrlid.diagnosis.omnibus import Omnibus, _shape, omnibus
+from ctrlid.diagnosis.result import Disturbance, Finding, Gap
 from ctrlid.diagnosis.scan import scanned
 from ctrlid.diagnosis.search import _plainer
+from ctrlid.diagnosis.sentences import conclusion
 from ctrlid.diagnosis.trial import (
     Model,
     attempt,
@@ -193,3 +195,18 @@ def test_a_motion_far_faster_than_the_samples_is_refused():
     still = record_of(drive(), E.CoulombFriction(0.3), 0.3, 1e-4, 9800)
     with pytest.raises(cid.CtrlidError, match="times faster than it is sampled"):
         cid.fit_loop(loop, still)
+
+
+def test_many_effects_at_once_are_no_explanation():
+    gap = Gap("closed-loop simulation", 3.0, 2.0, 1.1, 1.0, "m", *[np.zeros(3)] * 4)
+    quiet = Disturbance(0.0, 0.0, np.nan, 0.0)
+    tests = Omnibus({"whiteness": 0.5}, np.zeros(3), {})
+    kinds = (
+        E.CoulombFriction(0.1),
+        E.LinearStiffness(1.0),
+        E.InputOffset(0.1),
+        E.QuadraticDrag(1.0),
+    )
+    findings = [Finding(e, {}, (), (), 50.0) for e in kinds]
+    text = conclusion("partly explained", findings, gap, quiet, tests, ())
+    assert "so many effects at once describe almost any error" in text

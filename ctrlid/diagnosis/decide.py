@@ -14,6 +14,7 @@ CLOSE = 3.0  # difference of log-likelihood that says nothing
 SAME = 4.0  # spread of a likelihood ratio: two models that differ by less are nested
 Z = 2.0  # standard deviations of Vuong's test
 OPEN = 0.1  # standard error over the size of an effect: beyond, a further parameter may matter
+MANY = 4  # effects at once: such a list describes almost any error, and explains none
 BLOCK = 50  # samples whose terms are summed before their spread is taken
 
 

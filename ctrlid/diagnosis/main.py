@@ -21,7 +21,7 @@ from ..linearization import OperatingPoint
 from ..loop import Loop
 from ..loop_fit import summary
 from . import gap as gaps
-from .decide import GATE
+from .decide import GATE, MANY
 from .experiment import separating_experiment
 from .fresh import Fresh, fresh_data, stretches
 from .omnibus import places
@@ -393,7 +393,7 @@ def _result(
     left = math.isfinite(gap.floor) and gap.after > excess * gap.floor
     # A random force that may do anything explains everything, and nothing.
     left = left or gap.after > WORSE * gap.given
-    if found.after.passed and not left:
+    if found.after.passed and not left and len(found.found) < MANY:
         verdict = "explained" if findings else "nothing missing"
     else:
         verdict = "partly explained" if findings else "unknown"

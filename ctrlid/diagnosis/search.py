@@ -14,7 +14,7 @@ from ..likelihood import Fit, climb, polish
 from ..linearization import state_matrices
 from ..loop import Loop
 from ..loop_fit import choose_noise
-from .decide import GATE, rivals
+from .decide import GATE, MANY, rivals
 from .omnibus import ALPHA, Omnibus, omnibus
 from .replica import (
     DOUBTFUL,
@@ -286,7 +286,8 @@ def main_ones(found: Search, helps: Callable[[Found, Model], bool]) -> Search:
         Without those that do not.
     """
     total = found.final.fit.value - found.base.fit.value
-    if found.after.passed or len(found.found) < 2:
+    complete = found.after.passed and len(found.found) < MANY
+    if complete or len(found.found) < 2:
         return found
     model, left = found.final, list(found.found)
     for f in sorted(found.found, key=lambda f: -f.position):

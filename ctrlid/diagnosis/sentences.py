@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 from .._text import chance, number
+from .decide import MANY
 from .omnibus import Omnibus
 from .result import Disturbance, Finding, Gap, Place, Verdict
 
@@ -40,7 +41,9 @@ def conclusion(
     why = f"the test of {name} fails ({chance(p)})"
     if after.passed:
         why = "on data kept back the gap stays well above the noise floor"
-        if gap.after > gap.given:
+        if len(findings) >= MANY:
+            why = "so many effects at once describe almost any error, and prove little"
+        elif gap.after > gap.given:
             why = "on data kept back the gap is wider than that of the model as given"
     were, them = ("were", "them") if len(findings) > 1 else ("was", "it")
     if verdict == "nothing missing":
