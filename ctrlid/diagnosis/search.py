@@ -293,8 +293,7 @@ def main_ones(found: Search, helps: Callable[[Found, Model], bool]) -> Search:
     for f in sorted(found.found, key=lambda f: -f.position):
         if f.trial.gain >= MINOR * total or helps(f, found.final):
             continue
-        smaller = _taken_out(model, f.position)[0]
-        model = Model(smaller.loop, polish(smaller.fit))
+        model = _taken_out(model, f.position)[0]
         left = [replace(k, position=k.position - (k.position > f.position))
                 for k in left if k.trial is not f.trial]  # fmt: skip
     if len(left) == len(found.found):
@@ -328,7 +327,7 @@ def _without_superfluous(model: Model, given: int) -> Model:
             continue
         smaller, trial = _taken_out(model, position)
         if trial.merit <= GATE:
-            return _without_superfluous(Model(smaller.loop, polish(smaller.fit)), given)
+            return _without_superfluous(smaller, given)
     return model
 
 
@@ -347,8 +346,7 @@ def _taken_out(model: Model, position: int) -> tuple[Model, Trial]:
     """Return the model without one effect, refitted, and the effect as a trial on top of it."""
     effect = model.fitted.effects[position]
     loop, names = taken_out(model.fitted, position, model.names)
-    fit = climb(reduced(model, loop, names), rounds=10, exact=False)
-    smaller = Model(loop, spared(fit))
+    smaller = Model(loop, spared(climb(reduced(model, loop, names), rounds=10)))
     return smaller, refit(smaller, attempt_at(smaller, effect))
 
 
