@@ -12,6 +12,7 @@ from .errors import CtrlidError
 from .lead import design_lead
 from .loop import Loop
 from .margins import loop_margins, nu_gap, robust_margin
+from .model import IdentifiedModel
 from .physics import Array, timebase
 from .simulation import simulate
 from .stepping import growth_rate
@@ -213,7 +214,7 @@ def redesign(
     if not isinstance(loop, Loop):
         raise CtrlidError(f"redesign tries the controller on a Loop; given {type(loop).__name__}")
     # A plain transfer function, whatever the fit carried along, but its delay.
-    G = G.with_delay() if getattr(G, "delay", 0.0) else ct.tf(G)
+    G = G.with_delay() if isinstance(G, IdentifiedModel) else ct.tf(G)
     C = design_lead(G, crossover=crossover, phase_margin=phase_margin)
     dt = timebase(G)
     trial = replace(loop, controller=C, dt=dt or loop.dt)

@@ -97,6 +97,11 @@ class Fit:
         return matrix, score
 
     @property
+    def standard_errors(self) -> Array:
+        """Standard errors of the parameters, the noise held."""
+        return np.sqrt(np.maximum(np.diag(pseudo_inverse(self.normal[0])), 0.0))
+
+    @property
     def standardized(self) -> list[Array]:
         """The innovations divided by their standard deviations; NaN where they do not count."""
         return [
@@ -333,7 +338,7 @@ def climb(fit: Fit, rounds: int = ROUNDS, exact: bool = True) -> Fit:
     tuned, far, enough = -math.inf, True, 0.02 if exact else 0.3
     for _ in range(rounds):
         # A short step was already evaluated along the trajectory of the pass before.
-        moved = _relinearized(fit) if far else fit
+        moved = relinearized(fit) if far else fit
         fit = moved if np.isfinite(moved.value) else fit
         if fit.value > tuned + 2.0:
             fit = _tune(fit.problem, fit.theta, fit.linearized, fit.noise, enough=enough)
@@ -352,10 +357,10 @@ def climb(fit: Fit, rounds: int = ROUNDS, exact: bool = True) -> Fit:
     return polish(fit) if exact else fit
 
 
-def _relinearized(fit: Fit) -> Fit:
-    return evaluate(
-        fit.problem, fit.theta, fit.noise, [out.trajectory for out in fit.filtered]
-    )  # fmt: skip
+def relinearized(fit: Fit) -> Fit:
+    """Return the likelihood of the same values, the plant linearized along its last trajectory."""
+    along = [out.trajectory for out in fit.filtered]
+    return evaluate(fit.problem, fit.theta, fit.noise, along)
 
 
 def bounded_step(fit: Fit, matrix: Array, score: Array) -> tuple[Array, Array]:

@@ -355,6 +355,11 @@ def _said_unstable(e: Estimate) -> bool:
     return any(bound.constraint.startswith(PAIRS) for bound in e.active_bounds)
 
 
+def delay_of(model: Any) -> float:
+    """Return the delay [s] that an identified model has beside its polynomials, 0 for others."""
+    return model.delay if isinstance(model, IdentifiedModel) else 0.0
+
+
 class IdentifiedModel(control.TransferFunction):
     """A fitted transfer function that carries its ``.estimate``.
 

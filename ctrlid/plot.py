@@ -25,7 +25,7 @@ from .data import Record
 from .diagnosis.result import Diagnosis, Place
 from .each import FitSeries
 from .errors import CtrlidError
-from .model import IdentifiedModel
+from .model import IdentifiedModel, delay_of
 from .physics import Array, timebase
 
 # Okabe and Ito's colours, told apart by the colour-blind; lines and markers differ as well.
@@ -354,7 +354,7 @@ def bode(models: Any, axes: Any = None, *, omega: Any = None, level: float | Non
         if not w.size:
             continue
         values = np.atleast_1d(model(np.exp(1j * w * dt) if dt else 1j * w))
-        values = values * np.exp(-1j * w * float(getattr(model, "delay", 0.0)))
+        values = values * np.exp(-1j * w * delay_of(model))
         phase = np.degrees(np.unwrap(np.angle(values)))
         # On the sheet of the first model; that one starts within (-270, 90].
         turn = (

@@ -101,6 +101,15 @@ def autocorrelation(e: Array, valid: Any, lags: int = 25, fitted: int = 0) -> Co
     return Correlation("residual with its own past", tau, rho, band, p, share)
 
 
+def remembered(e: Array) -> Array:
+    """Return the autocorrelation of a signal from lag 1 on, as far as it stays positive."""
+    n = 1 << (2 * len(e) - 1).bit_length()
+    acf = np.fft.irfft(np.abs(np.fft.rfft(e, n)) ** 2)[: len(e) // 4]
+    rho = acf / max(acf[0], 1e-300)
+    ends = np.flatnonzero(rho <= 0)
+    return np.asarray(rho[1 : ends[0] if len(ends) else len(rho)])
+
+
 def _beyond_chance(raw: float, chance: float) -> float:
     """Return a share of variance less what a fit to independent signals takes by chance."""
     return float(np.clip((raw - chance) / max(1 - chance, 1e-12), 0.0, 1.0))

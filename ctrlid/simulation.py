@@ -171,7 +171,7 @@ class Simulator:
         # An undamped plant neither grows nor decays; round-off must not decide which.
         self._unstable = loop.controller is None and growth_rate(loop) * loop.dt > 1e-6
         # What a millionth of the operating values does to each state: smaller motion is rest.
-        a, b = (np.nan_to_num(np.abs(m)) for m in sensitivity(first, loop.point.output))
+        a, b = (np.nan_to_num(np.abs(m)) for m in sensitivity(first, loop.point.output, first.step))
         self._floor = 1e-6 * (a @ np.abs(self.rest) + b[:, 2] * abs(loop.point.input))
 
     def start(self, initial: Sequence[float] | None) -> Array:

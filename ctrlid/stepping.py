@@ -386,11 +386,11 @@ def _numbers(e: Equations, pieces: Sequence[Piece], p: Any) -> list[Piece]:
     ]
 
 
-def sensitivity(s: Stepper, reference: float) -> tuple[Array, Array]:
-    """Return how the state after one period depends on the state and signals at rest."""
+def sensitivity(s: Stepper, reference: float, function: Any) -> tuple[Array, Array]:
+    """Return how a function (step, rate) depends on the state and signals at rest."""
     z, w = casadi.SX.sym("z", len(s.rest)), casadi.SX.sym("w", 5)
-    after = s.step(z, w)[0]
-    both = casadi.Function("j", [z, w], [casadi.jacobian(after, z), casadi.jacobian(after, w)])
+    first = function.call([z, w])[0]
+    both = casadi.Function("j", [z, w], [casadi.jacobian(first, z), casadi.jacobian(first, w)])
     a, b = both(s.rest, [0.0, reference, 0.0, 0.0, 0.0])
     return np.asarray(a, float), np.asarray(b, float)
 
@@ -419,10 +419,8 @@ def growth_rate(loop: Loop) -> float:
         If the plant has no derivative at the operating point.
     """
     s = stepper(loop, 8)
-    z, w = casadi.SX.sym("z", len(s.rest)), casadi.SX.sym("w", 5)
-    map_ = s.step(z, w)[0] if s.rate is None else s.rate(z, w)
-    slope = casadi.Function("slope", [z, w], [casadi.jacobian(map_, z)])
-    matrix = np.asarray(slope(s.rest, [0.0, loop.point.output, 0.0, 0.0, 0.0]), float)
+    function = s.step if s.rate is None else s.rate
+    matrix, _ = sensitivity(s, loop.point.output, function)
     if not np.isfinite(matrix).all():
         raise CtrlidError(
             f"{loop.equations().name} has no derivative at its operating point {loop.point}; "

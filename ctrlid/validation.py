@@ -16,9 +16,10 @@ from .data import Record
 from .effects.moment import motion
 from .errors import CtrlidError, CtrlidWarning
 from .filtering import FEWEST
+from .innovations import flow
 from .linearization import state_matrices
 from .loop import Loop
-from .model import IdentifiedModel
+from .model import IdentifiedModel, delay_of
 from .noise_model import noise_polynomial, whiten
 from .physics import Array, timebase
 from .predictor import Prediction, predict, predict_ahead, spread_ahead
@@ -268,19 +269,20 @@ def _as_measured(simulator: Simulator, part: Record, guess: Array) -> Array:
     return start
 
 
-def _held(model: Any, record: Record, part: float) -> Any:
-    """Return a continuous model between samples, its input late by a part of a period."""
-    plain = ct.ss(ct.tf(model.num, model.den))
-    whole = ct.ss(ct.sample_system(plain, record.dt, record.hold))
-    if part < 1e-9:
-        return ct.tf(whole)
-    # The old input acts for the first part of the period, the new one for the rest.
-    rest = ct.ss(ct.sample_system(plain, (1 - part) * record.dt, "zoh"))
-    late = ct.tf(ct.ss(whole.A, whole.B - rest.B, whole.C, 0.0, record.dt))
-    soon = ct.tf(ct.ss(whole.A, rest.B, whole.C, 0.0, record.dt))
-    den = np.asarray(soon.den[0][0], float)
-    num = np.polyadd(np.append(soon.num[0][0], 0.0), late.num[0][0])
-    return ct.tf(num, np.append(den, 0.0), record.dt)
+def _sampled(model: Any, record: Record, delay: float) -> tuple[Array, Array]:
+    """Return the polynomials in z of a continuous model, its input held and late."""
+    if delay and record.hold != "zoh":
+        model, delay = model.with_delay(), 0.0
+    plant = ct.ss(ct.tf(model.num, model.den))
+    direct = float(plant.D[0, 0])
+    motion = flow(plant.A, plant.B[:, 0], plant.C[0], record.dt, record.hold, delay)
+    den = np.real(np.poly(motion.f))
+    late = max(lag for _, lag, _ in motion.inputs)
+    num = direct * den
+    for _, lag, b in motion.inputs:
+        path = np.real(np.poly(motion.f - np.outer(b, motion.c))) - den
+        num = np.polyadd(num, np.append(path[1:], np.zeros(late - lag)))
+    return num, np.append(den, np.zeros(late))
 
 
 def _compare_model(record: Record, model: Any, horizon: int | None) -> Comparison:
@@ -294,13 +296,13 @@ def _compare_model(record: Record, model: Any, horizon: int | None) -> Compariso
         )
     poles = ", ".join(number(p, 4) for p in model.poles())
     what = f"{model.name}: poles {poles or 'none'}"
-    delay = float(getattr(model, "delay", 0.0))
+    delay = delay_of(model)
     if delay:
         what += f", delay {number(delay, 4)} s"
     if not dt:
-        late, part = divmod(delay / record.dt, 1.0)
-        model = _held(model, record, part) * ct.tf([1.0], [1.0, *[0.0] * int(late)], record.dt)
-    num, den = (np.asarray(p[0][0], float) for p in (model.num, model.den))
+        num, den = _sampled(model, record, delay)
+    else:
+        num, den = (np.asarray(p[0][0], float) for p in (model.num, model.den))
     num = np.concatenate([np.zeros(len(den) - len(num)), num]) / den[0]
     den = den / den[0]
     order = len(den) - 1

@@ -5,7 +5,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..likelihood import pseudo_inverse
 from ..physics import Array
 from .trial import Trial, contains, log_terms, same_kind
 
@@ -57,7 +56,7 @@ def _spread(d: Array) -> float:
 def _open(trial: Trial, simple: Trial) -> bool:
     """Whether what an effect has beyond a simpler one may be large, for all the record says."""
     names = trial.model.names
-    errors = np.sqrt(np.maximum(np.diag(pseudo_inverse(trial.model.fit.normal[0])), 0.0))
+    errors = trial.model.fit.standard_errors
     units = {p.name: p.unit for p in trial.effect.parameters() if p.neutral is not None}
     shared = simple.fitted.values()
     for k in units.keys() - shared.keys():

@@ -16,10 +16,11 @@ from ..audit import Audit, audit
 from ..data import Record, as_records
 from ..effects import CATALOGUE, AbstractEffect, InputDelay, InputOffset, equivalents
 from ..errors import CtrlidError
-from ..likelihood import Fit, pseudo_inverse
+from ..likelihood import Fit
 from ..linearization import OperatingPoint
 from ..loop import Loop
 from ..loop_fit import summary
+from ..model import delay_of
 from . import gap as gaps
 from .decide import GATE, MANY
 from .experiment import separating_experiment
@@ -252,7 +253,7 @@ def _loop(loop: Any, record: Record) -> Loop:
     u, y = float(np.mean(record.u[valid])), float(np.mean(record.y[valid]))
     plain = ct.tf(loop.num, loop.den, loop.dt)
     linear = Loop(plain, None, dt=record.dt, at=OperatingPoint((), u, y))
-    delay = float(getattr(loop, "delay", 0.0))
+    delay = delay_of(loop)
     linear = linear.with_effect(InputOffset(0.0))  # where it rests, the means only guess
     linear = replace(linear, free=tuple(linear.parameters))
     return linear.with_effect(InputDelay(delay)) if delay else linear
@@ -502,9 +503,8 @@ def _sensitivity(found: Search) -> dict[str, float]:
 def _visible(t: Trial) -> float:
     if len(t.effect.parameters()) != 1 or not t.label or not math.isfinite(t.promise):
         return math.nan
-    matrix = t.model.fit.normal[0]
+    fit = t.model.fit
     k = t.model.names.index(f"{t.label}.{t.effect.parameters()[0].name}")
-    if not matrix[k, k] > 0:
+    if not fit.normal[0][k, k] > 0:
         return math.nan
-    error = math.sqrt(max(float(pseudo_inverse(matrix)[k, k]), 0.0))
-    return error * math.sqrt(2 * (GATE + t.price))
+    return float(fit.standard_errors[k]) * math.sqrt(2 * (GATE + t.price))

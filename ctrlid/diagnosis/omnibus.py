@@ -9,6 +9,7 @@ from scipy import stats
 
 from ..likelihood import Fit
 from ..physics import Array
+from ..residuals import remembered
 from .result import Place
 
 LAGS = 25
@@ -151,11 +152,7 @@ def _shape(force: Array) -> list[float]:
     x = force - force.mean()
     if len(x) < FEWEST or not np.ptp(x) > 0:
         return []
-    length = 1 << (2 * len(x) - 1).bit_length()
-    acf = np.fft.irfft(np.abs(np.fft.rfft(x, length)) ** 2)[: len(x) // 4]
-    rho = acf / acf[0]
-    ends = np.flatnonzero(rho <= 0)
-    rho = rho[1 : ends[0] if len(ends) else len(rho)]
+    rho = remembered(x)
     skew, kurtosis = stats.skew(x), stats.kurtosis(x, fisher=False)
     n, m = (len(x) / float(1 + 2 * np.sum(rho**k)) for k in (3, 4))
     if n < INDEPENDENT:

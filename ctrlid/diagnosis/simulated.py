@@ -1,5 +1,7 @@
 """Fitting a stable plant by the error of its open-loop simulation, with exact sensitivities."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -12,6 +14,7 @@ from ..likelihood import Fit, Known, evaluate, pseudo_inverse
 from ..loop import Loop
 from ..loop_fit import make_problem
 from ..physics import Array
+from ..residuals import remembered
 
 EVALUATIONS = 60  # of a refit
 LOST = 1e3  # times the output's spread: the error where a simulation leaves the plant's domain
@@ -21,18 +24,27 @@ LOST = 1e3  # times the output's spread: the error where a simulation leaves the
 class Simulated:
     """A loop fitted to what an open-loop simulation makes of records.
 
-    `starts` are the states at the first sample of each record, by name; `errors` and `slopes` the
-    errors at the samples that count, records one after the other, and their derivatives by
-    parameters and initial states.
+    `task` is what was simulated, `theta` its parameters; `starts` are the states at the first
+    sample of each record, by name; `errors` and `slopes` the errors at the samples that count,
+    records one after the other, and their derivatives by parameters and initial states.
     """
 
-    loop: Loop
-    names: tuple[str, ...]
+    task: Simulation
     theta: Array
     starts: tuple[Mapping[str, float], ...]
     errors: Array
     slopes: Array
     states: tuple[Array, ...]
+
+    @property
+    def loop(self) -> Loop:
+        """The loop with the values that the search began at."""
+        return self.task.loop
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The parameters that were fitted."""
+        return self.task.names
 
     @property
     def square(self) -> float:
@@ -56,12 +68,7 @@ class Simulated:
     @property
     def correlated(self) -> float:
         """How many neighbouring errors say no more than one that is independent."""
-        e = self.errors
-        n = 1 << (2 * len(e) - 1).bit_length()
-        acf = np.fft.irfft(np.abs(np.fft.rfft(e, n)) ** 2)[: len(e) // 4]
-        rho = acf / max(acf[0], 1e-300)
-        ends = np.flatnonzero(rho <= 0)
-        return float(1 + 2 * np.sum(rho[1 : ends[0] if len(ends) else len(rho)]))
+        return float(1 + 2 * np.sum(remembered(self.errors)))
 
 
 class Simulation:
@@ -83,10 +90,15 @@ class Simulation:
         self, loop: Loop, names: Sequence[str], records: Sequence[Record], begins: Sequence[float]
     ) -> None:
         self.loop, self.names = loop, tuple(names)
+        self.records, self.begins = tuple(records), tuple(begins)
         self.problem = make_problem(loop, self.names, records, begins)
         m = self.machine = self.problem.machine
         step = m.with_slopes()
         self.runs = [step.mapaccum("run", len(t.record)) for t in self.problem.tracks]
+
+    def of(self, loop: Loop, names: Sequence[str]) -> Simulation:
+        """Return the same records, simulated by another loop."""
+        return Simulation(loop, names, self.records, self.begins)
 
     def states_from(self, starts: Sequence[Mapping[str, float]]) -> Array:
         """Return initial states, shape (records, states); what is not known begins at rest."""
@@ -123,7 +135,7 @@ class Simulation:
         errors, slopes, states = self.run(theta, x0)
         names = self.machine.e.states
         starts = tuple(dict(zip(names, x.tolist(), strict=False)) for x in x0)
-        return Simulated(self.loop, self.names, theta, starts, errors, slopes, states)
+        return Simulated(self, theta, starts, errors, slopes, states)
 
     def fit(self, theta: Array, x0: Array, evaluations: int = EVALUATIONS) -> Simulated:
         """Return the values and initial states with the smallest error nearby."""
@@ -154,15 +166,13 @@ class Simulation:
         return self.at(found.x[:p], found.x[p:].reshape(shape))
 
 
-def as_fit(task: Simulation, found: Simulated, sensor: Array) -> Fit:
+def as_fit(found: Simulated, sensor: Array) -> Fit:
     """Return a simulation as a point of the likelihood that knows no random force.
 
     Parameters
     ----------
-    task : Simulation
-        The simulation.
     found : Simulated
-        Its values.
+        The simulation.
     sensor : ndarray, shape (records,)
         Variances of the sensor noise [output unit^2].
 
@@ -171,6 +181,7 @@ def as_fit(task: Simulation, found: Simulated, sensor: Array) -> Fit:
     Fit
         Its innovations are the errors of the simulation.
     """
+    task = found.task
     silent = Noise((0.0,) * task.machine.channels)
     problem = replace(task.problem, known=Known(silent, sensor), tracks=tuple(
         replace(t, start=x[0], spread=np.zeros_like(t.spread), doubt=np.zeros(len(x)),

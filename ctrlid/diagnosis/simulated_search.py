@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..data import Record
 from ..effects import AbstractEffect, ParameterStep, PeriodicForce, StateLimit
 from ..errors import CtrlidError
 from ..loop_fit import start_values
@@ -78,8 +77,7 @@ def search_by_simulation(
     """
     loop, names = other.base.loop, other.base.names
     records = fresh.without_windows([t.record for t in other.base.fit.problem.tracks])
-    begins = [0.0] * len(records)
-    task = Simulation(loop, names, records, begins)
+    task = Simulation(loop, names, records, [0.0] * len(records))
     x0 = task.states_from([{} for _ in records])
     begun = [task.fit(t, x0) for t in (start_values(loop, names), other.base.fit.theta)]
     base = now = min(begun, key=lambda s: s.square)
@@ -88,7 +86,7 @@ def search_by_simulation(
     rounds: list[tuple[Simulated, list[Tried], Tried | None]] = []
     while len(rounds) < MOST:
         tell(f"by simulation, round {len(rounds) + 1}")
-        tried = _round(now, records, begins, catalogue)
+        tried = _round(now, catalogue)
         best = tried[0] if tried and math.isfinite(tried[0].merit) else None
         new = best and best.found
         after = _gap(new, fresh) if new else math.inf
@@ -98,17 +96,16 @@ def search_by_simulation(
         rounds.append((now, tried, best))
         now, before = new, after
     tell("by simulation, what is needed")
-    now = _needed(now, given, records, begins)
+    now, smaller = _needed(now, given)
     if len(now.loop.effects) == given or _gap(now, fresh) > BETTER * gap:
         return None
-    first, final = (_model(s, records, begins, sensor) for s in (base, now))
+    first, final = (_model(s, sensor) for s in (base, now))
     steps = []
     for s, tried, best in rounds:
-        model = _model(s, records, begins, sensor)
+        model = _model(s, sensor)
         done = {id(t): _trial(t, model) for t in tried}
         steps.append(Step(model, tuple(done.values()), None if best is None else done[id(best)]))
-    found = [_found(now, k, rounds, records, begins, final)
-             for k in range(given, len(now.loop.effects))]  # fmt: skip
+    found = [_found(final, now, given + k, s, rounds) for k, s in enumerate(smaller)]
     found.sort(key=lambda f: -f.trial.gain)
     return Search(first, tuple(steps), final, tuple(found), omnibus(first.fit), omnibus(final.fit))
 
@@ -117,47 +114,37 @@ def _gap(s: Simulated, fresh: Fresh) -> float:
     return fresh.gap((s.fitted,) * len(fresh.windows))
 
 
-def _model(
-    s: Simulated, records: Sequence[Record], begins: Sequence[float], sensor: Array
-) -> Model:
+def _model(s: Simulated, sensor: Array) -> Model:
     """Return a simulated loop as a model of the filter, without random forces."""
-    task = Simulation(s.loop, s.names, records, begins)
-    fit = as_fit(task, s, np.resize(sensor, len(records)))
+    fit = as_fit(s, np.resize(sensor, len(s.task.records)))
     return Model(s.loop, fit, s.standard_errors)
 
 
-def _needed(
-    now: Simulated, given: int, records: Sequence[Record], begins: Sequence[float]
-) -> Simulated:
-    """Take effects out until each of those left is worth its parameters."""
-    while len(now.loop.effects) > given:
-        smaller = [_without(now, k, records, begins) for k in range(given, len(now.loop.effects))]
+def _needed(now: Simulated, given: int) -> tuple[Simulated, list[Simulated]]:
+    """Take effects out until each is worth its parameters; return also the loops without each."""
+    while True:
+        smaller = [_without(now, k) for k in range(given, len(now.loop.effects))]
         merits = [_gain(s, now.square) - _cost(s, now) for s in smaller]
-        if min(merits) > GATE:
-            break
+        if min(merits, default=math.inf) > GATE:
+            return now, smaller
         now = smaller[int(np.argmin(merits))]
-    return now
 
 
-def _without(
-    now: Simulated, position: int, records: Sequence[Record], begins: Sequence[float]
-) -> Simulated:
+def _without(now: Simulated, position: int) -> Simulated:
     """Return the loop without one of its effects, fitted again."""
-    fitted = now.fitted
-    loop, names = taken_out(fitted, position, now.names)
-    task = Simulation(loop, names, records, begins)
+    loop, names = taken_out(now.fitted, position, now.names)
+    task = now.task.of(loop, names)
     return task.fit(np.array(start_values(loop, names)), task.states_from(now.starts))
 
 
 def _found(
-    now: Simulated, position: int, rounds: Sequence[tuple[Simulated, list[Tried], Tried | None]],
-    records: Sequence[Record], begins: Sequence[float], final: Model,
+    final: Model, now: Simulated, position: int, smaller: Simulated,
+    rounds: Sequence[tuple[Simulated, list[Tried], Tried | None]],
 ) -> Found:  # fmt: skip
     """Return an effect with what closes nearly as much of the error in its place."""
     label, effect = list(now.fitted.labelled.items())[position]
-    smaller = _without(now, position, records, begins)
     gain, cost = _gain(smaller, now.square), _cost(smaller, now)
-    base = _model(smaller, records, begins, final.fit.sensor)
+    base = _model(smaller, final.fit.sensor)
     mine = Trial(effect, label, final, gain, 0.0, gain, cost)
     near = max(CLOSE, ALIKE * mine.merit)
     close: list[Trial] = []
@@ -168,41 +155,36 @@ def _found(
         for t in tried[:REFITTED]:
             if t.merit <= 0 or any(same_kind(t.effect, e) for e in there):
                 continue
-            screened = _screened(smaller, t.effect, records, begins)
+            screened = _screened(smaller, t.effect)
             again = screened and _refitted(smaller, screened)
             if again and mine.merit - again.merit < near and again.merit > GATE:
                 close.append(_trial(again, base))
     return Found(mine, tuple(sorted(close, key=lambda t: -t.merit)), base, position)
 
 
-def _round(
-    now: Simulated, records: Sequence[Record], begins: Sequence[float],
-    catalogue: Sequence[type[AbstractEffect]],
-) -> list[Tried]:  # fmt: skip
+def _round(now: Simulated, catalogue: Sequence[type[AbstractEffect]]) -> list[Tried]:
     """Screen all candidates, refit the promising, best first."""
     loop = now.fitted
-    pool = [c for c in candidates(catalogue, loop, records[0])
+    pool = [c for c in candidates(catalogue, loop, now.task.records[0])
             if not any(same_kind(e, c) for e in loop.effects)]  # fmt: skip
-    tried = [t for c in pool if (t := _screened(now, c, records, begins)) is not None]
+    tried = [t for c in pool if (t := _screened(now, c)) is not None]
     tried.sort(key=lambda t: -t.promise)
     done = [_refitted(now, t) for t in tried[:REFITTED]]
     return sorted(done, key=lambda t: (-t.merit, -t.promise)) + tried[REFITTED:]
 
 
-def _screened(
-    now: Simulated, effect: AbstractEffect, records: Sequence[Record], begins: Sequence[float]
-) -> Tried | None:
+def _screened(now: Simulated, effect: AbstractEffect) -> Tried | None:
     """Return an effect at the start from which a first step promises most."""
     best: Tried | None = None
     task: Simulation | None = None
-    for one in _begun(now, effect, records):
+    for one in _begun(now, effect):
         try:
             loop = now.fitted.with_effect(one)
             label = next(k for k in loop.labelled if k not in now.loop.labelled)
             own = {f"{label}.{k}": v for k, v in one.values().items() if math.isfinite(v)}
             names = (*now.names, *own)
             if task is None:
-                task = Simulation(loop, names, records, begins)
+                task = now.task.of(loop, names)
             if task.machine.e.play is not None:  # its sensitivities need another recursion
                 return None
             theta = np.array([*now.theta, *own.values()])
@@ -243,22 +225,20 @@ def _refitted(now: Simulated, t: Tried) -> Tried:
                    remark="vanishes when refitted" if effect.neutral else "")  # fmt: skip
 
 
-def _begun(
-    now: Simulated, effect: AbstractEffect, records: Sequence[Record]
-) -> list[AbstractEffect]:
+def _begun(now: Simulated, effect: AbstractEffect) -> list[AbstractEffect]:
     """Return an effect at the places where it may be: limits, instants, frequencies."""
     if isinstance(effect, StateLimit) and effect.name in now.starts[0]:
         k = list(now.starts[0]).index(effect.name)
         levels = np.quantile(np.concatenate([x[:, k] for x in now.states]), LIMITS)
         return [replace(effect, upper=float(v)) for v in levels]
     if isinstance(effect, ParameterStep):
-        last = max(float(r.t[-1] - r.start) for r in records)
+        last = max(float(r.t[-1] - r.start) for r in now.task.records)
         times = np.linspace(0, last, EDGES + 2)[1:-1]
         return [replace(effect, time=float(t)) for t in times]
     if isinstance(effect, PeriodicForce):
         power = np.abs(np.fft.rfft(now.errors, 4 * len(now.errors))) ** 2
         power[:8] = 0.0
-        line = int(np.argmax(power)) / (4 * len(now.errors) * records[0].dt)
+        line = int(np.argmax(power)) / (4 * len(now.errors) * now.task.records[0].dt)
         return [replace(effect, frequency=line, phase=p) for p in (0.0, np.pi / 2)]
     return [effect]
 
@@ -267,6 +247,5 @@ def _trial(t: Tried, base: Model) -> Trial:
     """Return what was tried in the words of the other search."""
     model, label = base, ""
     if t.found is not None:
-        sensor, label = base.fit.sensor, t.label
-        model = Model(t.found.loop, as_fit(t.task, t.found, sensor), t.found.standard_errors)
+        model, label = _model(t.found, base.fit.sensor), t.label
     return Trial(t.effect, label, model, t.promise, 0.0, t.gain, t.cost, t.remark)

@@ -18,7 +18,7 @@ from ..likelihood import (
     climb,
     evaluate,
     known_from_repeats,
-    pseudo_inverse,
+    relinearized,
 )
 from ..loop import Loop
 from ..loop_fit import bounds_of, choose_noise, make_problem, start_values
@@ -278,10 +278,7 @@ def attempt_best(base: Model, effects: Sequence[AbstractEffect], scan: float) ->
 
 def light(fit: Fit) -> Fit:
     """Return a fit without its arrays: many candidates on a long record must fit into memory."""
-    normal = fit.normal
-    bare = replace(fit, linearized=(), filtered=())
-    bare.__dict__["normal"] = normal
-    return bare
+    return _as_known(fit, replace(fit, linearized=(), filtered=()))
 
 
 def spared(fit: Fit) -> Fit:
@@ -289,19 +286,18 @@ def spared(fit: Fit) -> Fit:
 
     Whatever climbs on from it linearizes anew.
     """
-    normal = fit.normal
-    bare = replace(fit, linearized=())
-    bare.__dict__["normal"] = normal
+    return _as_known(fit, replace(fit, linearized=()))
+
+
+def _as_known(fit: Fit, bare: Fit) -> Fit:
+    """Return a fit that lost its arrays with what had been computed from them."""
+    bare.__dict__["normal"] = fit.normal
     return bare
 
 
 def whole(model: Model) -> Model:
     """Return a model whose fit has the plant along its trajectory."""
-    fit = model.fit
-    if fit.linearized:
-        return model
-    at = [out.trajectory for out in fit.filtered]
-    return replace(model, fit=evaluate(fit.problem, fit.theta, fit.noise, at))
+    return model if model.fit.linearized else replace(model, fit=relinearized(model.fit))
 
 
 def promised(fit: Fit) -> float:
@@ -459,7 +455,7 @@ def needed(model: Model, position: int) -> float:
 def _insignificant(trial: Trial, effect: AbstractEffect) -> bool:
     """Whether every parameter that decides about an effect may as well be neutral."""
     fit, names = trial.model.fit, trial.model.names
-    error = np.sqrt(np.maximum(np.diag(pseudo_inverse(fit.normal[0])), 0.0))
+    error = fit.standard_errors
     sure = []
     for p in effect.parameters():
         key = f"{trial.label}.{p.name}"
