@@ -10,7 +10,7 @@ import control as ct
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
-from scipy import linalg
+from scipy import linalg, signal
 
 import ctrlid as cid
 from ctrlid import CtrlidError, plot
@@ -81,6 +81,20 @@ def test_right_within_its_errors_under_feedback_where_least_squares_is_not(noise
     ls = cid.fit_arx(record, 2, 2, constraints=[cid.ReciprocalPoles()]).estimate
     rate = np.log(np.max(np.abs(ls.poles))) / dt
     assert abs(rate**2 - ALPHA) > 5 * e.standard_errors[1]
+
+
+def test_the_search_reaches_the_minimum_at_short_periods():
+    """A search that slides along the border of unstable observers stops up to 3 errors short."""
+    dt = 0.005 / POLE
+    loop = loop_at(dt)
+    motion = flow(*realize(np.array([1.0, 0.0, -ALPHA]), np.array([-BETA]), POLE), dt, "zoh")
+    poles = np.exp([-POLE * dt, -POLE * dt * 1.001])  # the observer of pure sensor noise
+    gain = signal.place_poles(motion.f.T, motion.c[:, None], poles).gain_matrix[0]
+    for seed in (1, 2):
+        record = experiment(loop, n=15_000, seed=seed, hold=0.01, sensor_noise=5e-6)
+        e = cid.fit_continuous(record, 2, constraints=SYMMETRIC).estimate
+        truth, _ = prediction_errors(motion, gain, {"u": record.u, "y": record.y})
+        assert e.rss < float(np.sum(truth**2))
 
 
 @pytest.mark.slow
