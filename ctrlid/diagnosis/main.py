@@ -432,7 +432,7 @@ def _units(loop: Loop, record: Record) -> dict[str, str]:
     known = dict(getattr(loop.plant, "units", {}))
     y = record.units.get("y", known.get(e.outputs[0], ""))
     u = record.units.get("u", known.get(e.inputs[0], ""))
-    units = {"time": "s", "position": y, "reference": y, "input": u,
+    units = {"time": "s", "position": y, "reference": y, "input": u, "input change": u,
              "velocity": f"{y}/s" if y else ""}  # fmt: skip
     return {**known, **units}
 

@@ -10,13 +10,12 @@ from scipy import stats
 from ..likelihood import Fit
 from ..physics import Array
 from ..residuals import remembered
+from .constancy import FEWEST, bin_edges, bin_index, constancy
 from .result import Place
 
 LAGS = 25
-BINS = 12
 SETTLING = 0.05  # of a record, in which a force is still being found
 INDEPENDENT = 40  # samples of a force, from which its distribution shows
-FEWEST = 40  # samples in a bin
 ALPHA = 1e-3  # chance of one false alarm over all tests together
 
 
@@ -49,8 +48,8 @@ def omnibus(fit: Fit) -> Omnibus:
 
     Whiteness, independence of past input and reference, one line in the spectrum, heavy tails and
     isolated events, and mean and mean square in bins of time, position, velocity, input and
-    reference; where a coloured force was fitted, whether its estimate has the skewness and the
-    tails of a random one.
+    reference; whether each parameter is the same there; where a coloured force was fitted, whether
+    its estimate has the skewness and the tails of a random one.
 
     Parameters
     ----------
@@ -104,6 +103,7 @@ def omnibus(fit: Fit) -> Omnibus:
         mean, square = _binned(z, values)
         p_values[f"mean by {name}"] = mean
         p_values[f"size by {name}"] = square
+    p_values |= constancy(fit, axes)
     return Omnibus(p_values, z, axes)
 
 
@@ -177,7 +177,9 @@ def _axes(fit: Fit, out: object, track: object) -> dict[str, Array]:
     states = out.trajectory.predicted  # type: ignore[attr-defined]
     table = track.table  # type: ignore[attr-defined]
     # The input of the same sample is computed from the very output that is predicted.
-    axes = {"time": table[0], "input": np.concatenate([table[1][:1], table[1][:-1]])}
+    u = table[1]
+    axes = {"time": table[0], "input": np.concatenate([u[:1], u[:-1]])}
+    axes["input change"] = np.diff(axes["input"], prepend=axes["input"][0])
     moving = [k for k in range(len(e.states) - len(e.rest)) if k not in e.velocities]
     for k in moving:
         axes["position" if e.velocities and len(moving) == 1 else e.states[k]] = states[:, k]
@@ -186,17 +188,6 @@ def _axes(fit: Fit, out: object, track: object) -> dict[str, Array]:
     if track.record.r is not None:  # type: ignore[attr-defined]
         axes["reference"] = table[2]
     return {name: v for name, v in axes.items() if np.ptp(v) > 0}
-
-
-def bin_edges(values: Array, bins: int = BINS) -> Array:
-    """Return edges of bins that hold equally many samples."""
-    edges = np.unique(np.quantile(values, np.linspace(0, 1, bins + 1)))
-    return edges if len(edges) > 2 else np.array([values.min(), values.mean(), values.max()])
-
-
-def bin_index(values: Array, edges: Array) -> Array:
-    """Return the bin of each value."""
-    return np.clip(np.searchsorted(edges, values, side="right") - 1, 0, len(edges) - 2)
 
 
 def _binned(z: Array, values: Array) -> tuple[float, float]:

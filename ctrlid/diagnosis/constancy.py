@@ -1,0 +1,91 @@
+"""Whether each parameter of a model is one number: the same everywhere, and at all times."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from scipy import stats
+
+from ..likelihood import Fit
+from ..physics import Array
+
+BINS = 12
+FEWEST = 40  # samples in a bin
+SLOW = 0.05  # of Nyquist's frequency: up to there a periodic change is looked for
+
+
+def constancy(fit: Fit, axes: Mapping[str, Array]) -> dict[str, float]:
+    r"""Test that the fitted parameters do not depend on anything.
+
+    With the innovations :math:`e_k` of variance :math:`S_k` and their slope :math:`x_k` in a
+    parameter, what the samples of a bin b say of the parameter alone is
+
+    .. math:: U_b = \sum_{k \in b} \frac{x_k e_k}{S_k}, \quad
+        I_b = \sum_{k \in b} \frac{x_k^2}{S_k}
+
+    and :math:`\sum_b U_b^2 / I_b` is chi-squared where the parameter is the same in all bins:
+    the slopes are known before the innovations are. At one frequency,
+    :math:`|\sum_k x_k e_k e^{i \omega k} / S_k|^2 / I` is exponential. An effect that a known one
+    only nearly describes, or that comes and goes, shows here long before it shows in the
+    innovations themselves.
+
+    Parameters
+    ----------
+    fit : Fit
+        The fitted model.
+    axes : mapping of str to ndarray
+        Values of a quantity at the samples that count, records one after the other.
+
+    Returns
+    -------
+    dict of str to float
+        Probabilities by the name of the test.
+
+    References
+    ----------
+    Nyblom, Journal of the American Statistical Association 84 (1989) 223-230 (constancy of
+    parameters from scores).
+    """
+    names = fit.problem.machine.names
+    parts = [
+        (out.slopes[keep], out.innovations[keep], out.variance[keep] * r, keep)
+        for out, keep, r in zip(fit.filtered, fit.problem.counts, fit.sensor, strict=True)
+    ]
+    scores = np.concatenate([x * (e / s)[:, None] for x, e, s, _ in parts])
+    told = np.concatenate([x**2 / s[:, None] for x, _, s, _ in parts])
+    p_values = {}
+    for axis, values in axes.items():
+        index = bin_index(values, bin_edges(values))
+        count = np.bincount(index)
+        for j, name in enumerate(names):
+            score, size = (np.bincount(index, v[:, j]) for v in (scores, told))
+            use = (count >= FEWEST) & (size > 0)
+            if use.sum() > 1:
+                p_values[f"{name} by {axis}"] = float(
+                    stats.chi2.sf(np.sum(score[use] ** 2 / size[use]), use.sum())
+                )
+    for j, name in enumerate(names):
+        lines = [_line(x[:, j] * e / s, float(np.sum(x[:, j] ** 2 / s)), keep)
+                 for x, e, s, keep in parts if np.any(x[:, j])]  # fmt: skip
+        if lines:
+            p_values[f"a rhythm of {name}"] = min(1.0, min(lines) * len(lines))
+    return p_values
+
+
+def _line(score: Array, size: float, keep: Array) -> float:
+    """Return the probability that the score of a constant has as strong a slow line."""
+    filled = np.zeros(len(keep))
+    filled[keep] = score
+    power = np.abs(np.fft.rfft(filled)) ** 2 / size
+    power = power[1 : max(int(SLOW * len(power)), 2)]
+    return float(-np.expm1(len(power) * np.log1p(-np.exp(-power.max(initial=0.0)))))
+
+
+def bin_edges(values: Array, bins: int = BINS) -> Array:
+    """Return edges of bins that hold equally many samples."""
+    edges = np.unique(np.quantile(values, np.linspace(0, 1, bins + 1)))
+    return edges if len(edges) > 2 else np.array([values.min(), values.mean(), values.max()])
+
+
+def bin_index(values: Array, edges: Array) -> Array:
+    """Return the bin of each value."""
+    return np.clip(np.searchsorted(edges, values, side="right") - 1, 0, len(edges) - 2)
