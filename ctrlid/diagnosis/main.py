@@ -393,7 +393,8 @@ def _result(
     excess = EXCESS * (2 if found.final.fit.noise.drift else 1)
     left = math.isfinite(gap.floor) and gap.after > excess * gap.floor
     # A random force that may do anything explains everything, and nothing.
-    left = left or gap.after > WORSE * gap.given
+    blamed = disturbance.large or math.isnan(disturbance.share)
+    left = left or (blamed and gap.after > WORSE * gap.given)
     if found.after.passed and not left and len(found.found) < MANY:
         verdict = "explained" if findings else "nothing missing"
     else:

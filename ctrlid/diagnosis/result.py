@@ -10,6 +10,7 @@ from ..loop import Loop
 from ..physics import Array
 
 Verdict = Literal["nothing missing", "explained", "partly explained", "unknown"]
+LARGE = 0.5  # share of the floor's variance from which a random force may hide something
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,6 +175,11 @@ class Disturbance:
     coloured: float
     time_constant: float
     share: float
+
+    @property
+    def large(self) -> bool:
+        """Whether they make more than half of the floor's variance, and may hide something."""
+        return self.share > LARGE
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,6 @@ from .decide import MANY
 from .omnibus import Omnibus
 from .result import Disturbance, Finding, Gap, Place, Verdict
 
-LARGE = 0.5  # share of the floor's variance that a random force may make unmentioned
-
 
 def conclusion(
     verdict: Verdict, findings: Sequence[Finding], gap: Gap, disturbance: Disturbance,
@@ -59,7 +57,7 @@ def conclusion(
     left = [w for w in where if w.p_after < 1e-4]
     if left and verdict in ("partly explained", "unknown"):
         text += f" It shows along {' and '.join(w.axis for w in left[:2])}."
-    if disturbance.share > LARGE:
+    if disturbance.large:
         kind = "A random force"
         if disturbance.coloured:
             kind = (f"A slowly varying random force of {number(disturbance.coloured, 2)} with a "

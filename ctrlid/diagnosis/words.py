@@ -11,9 +11,9 @@ from .result import Diagnosis, Finding, Gap, Place
 from .saving import units_of
 
 TELLING = 1e-3  # probability below which a place is not noise's doing
+NEAR = 1.2  # times the floor: a gap that noise explains
 PLACES = 3
 LISTED = 4  # tests that fail
-LARGE = 0.5  # share of the floor from which a random force may hide something
 STRONG, CERTAIN = 10.0, 30.0  # evidence
 HEADLINES = {
     "nothing missing": "Nothing missing",
@@ -69,6 +69,9 @@ def shrinking(gap: Gap) -> str:
     above = gap.before**2 - gap.floor**2
     if not math.isfinite(above):
         return ""
+    if above <= 0 and gap.after < NEAR * gap.floor:
+        return ("Noise alone moves two runs of the completed model apart by as much, so "
+                "the gap cannot show what the effects close; the one-step errors do.")  # fmt: skip
     if above <= 0 or gap.after >= gap.before:
         return "On samples kept back the effects do NOT MAKE THE GAP SMALLER."
     share = min((gap.before**2 - gap.after**2) / above, 1.0)
@@ -201,7 +204,7 @@ def disturbance(found: Diagnosis) -> str:
     words = " and ".join(parts)
     if math.isfinite(d.share):
         words += f", {percent(d.share)} of the noise floor's variance"
-    if not d.share >= LARGE:
+    if not d.large:
         return f"random force: {words}"
     return (f"A LARGE RANDOM FORCE: {words}. Effects that it hides cannot be seen; the verdict "
             "holds above it only")  # fmt: skip
