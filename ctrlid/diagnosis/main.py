@@ -263,7 +263,7 @@ def _look_over(
     loop: Loop, records: Sequence[Record]
 ) -> tuple[tuple[Audit, ...], tuple[str, ...]]:  # fmt: skip
     """Return what is remarkable about the records; refuse those that carry nothing."""
-    remarks, audits = [], []
+    audits, remarks = [], _foreign_units(loop, records[0])
     for k, record in enumerate(records):
         found = audit(record, loop)
         audits.append(found)
@@ -275,6 +275,18 @@ def _look_over(
         which = f"record {k + 1}: " if len(records) > 1 else ""
         remarks += [f"{which}{f.kind}: {f.text}" for f in found.findings]
     return tuple(audits), tuple(remarks)
+
+
+def _foreign_units(loop: Loop, record: Record) -> list[str]:
+    """Say where a record counts in other units than the plant, whose words sizes are written in."""
+    e, known = loop.equations(), getattr(loop.plant, "units", {})
+    pairs = [("u", known.get(e.inputs[0], "")), ("y", known.get(e.outputs[0], ""))]
+    return [
+        f"units: {key} is recorded in {there}, and the plant counts it in {here}; where sizes say "
+        f"{here}, it stands for {there}."
+        for key, here in pairs
+        if (there := record.units.get(key, "")) and here and there != here
+    ]
 
 
 def _periods(parts: Sequence[Record], audits: Sequence[Audit]) -> list[int]:

@@ -43,7 +43,7 @@ from .trial import (
     whole,
 )
 
-MOST = 5  # effects in one record
+NEXT = 5  # candidates after the best that are looked at closely
 TOP = 5  # candidates refitted because of what they promise
 SHARE = 0.2  # of the best promise: what promises more is refitted as well
 NEAR = 0.5  # of the winner's merit: what came so close is asked again when all effects are in
@@ -178,7 +178,7 @@ def _plainer(base: Model, best: Trial, others: Sequence[Trial]) -> Trial:
 def _simplest(base: Model, trials: list[Trial]) -> list[Trial]:
     """Put out a winner whose further parameters gain from the filter's approximations only."""
     best = trials[0]
-    for simple in trials[1:MOST]:
+    for simple in trials[1:NEXT]:
         fewer = len(simple.effect.parameters()) < len(best.effect.parameters())
         if not fewer or simple.merit <= GATE or not simulable(base):
             continue
@@ -193,7 +193,7 @@ def _simplest(base: Model, trials: list[Trial]) -> list[Trial]:
 def _checked(base: Model, trials: list[Trial]) -> list[Trial]:
     """Put out what gains as much on records in which it is known not to be."""
     copies: list[Model | None] = []
-    for _ in range(MOST):
+    for _ in range(NEXT):
         trials.sort(key=lambda t: (-t.merit, -t.promise))
         best = trials[0]
         sure = best.gain > DOUBTFUL and not base.loop.effects
@@ -235,7 +235,7 @@ def search(
     model = base
     steps: list[Step] = []
     before = omnibus(base.fit)
-    while len(model.loop.effects) - given < MOST and len(steps) < MOST + 2:
+    while len(model.loop.effects) - given < MANY and len(steps) < MANY + 2:
         tell(f"round {len(steps) + 1}: screening")
         pool = [c for c in candidates(catalogue, model.fitted, record) if not _there(model, c)]
         step = one_round(model, pool, work, None if steps else anchor(base))
@@ -316,7 +316,9 @@ def _renoised(model: Model) -> Model:
         plain = climb(replace(fit, noise=replace(fit.noise, memory=0.0, drift=0.0)))
         if plain.value > fit.value - math.log(fit.size):
             return Model(model.loop, plain)
-        return Model(model.loop, fit)
+        # The force that stood for the effect may be far from the one that is left.
+        anew = choose_noise(plain)
+        return Model(model.loop, max(fit, anew, key=lambda f: f.value))
     return Model(model.loop, choose_noise(fit))
 
 
@@ -411,5 +413,5 @@ def _close(mine: Trial, steps: Sequence[Step]) -> list[Trial]:
             if t.name != mine.name and t.merit > GATE
             and (t.name in alike or t.merit > NEAR * step.best.merit)
         ]  # fmt: skip
-        return near[:MOST]
+        return near[:NEXT]
     return []

@@ -18,10 +18,11 @@ from .decide import CLOSE, GATE
 from .fresh import Fresh
 from .omnibus import omnibus
 from .scan import LIMITS
-from .search import MOST, Found, Search, Step, candidates, taken_out
+from .search import Found, Search, Step, candidates, taken_out
 from .simulated import Simulated, Simulation, as_fit
 from .trial import Model, Trial, same_kind
 
+ROUNDS = 5
 REFITTED = 8  # candidates of a round
 EDGES = 12  # instants at which a parameter might have stepped
 CLOSES = 0.95  # of the error that must not remain when an effect is added
@@ -84,7 +85,7 @@ def search_by_simulation(
     sensor, given = other.final.fit.sensor, len(loop.effects)
     before = _gap(base, fresh)
     rounds: list[tuple[Simulated, list[Tried], Tried | None]] = []
-    while len(rounds) < MOST:
+    while len(rounds) < ROUNDS:
         tell(f"by simulation, round {len(rounds) + 1}")
         tried = _round(now, catalogue)
         best = tried[0] if tried and math.isfinite(tried[0].merit) else None

@@ -1,0 +1,70 @@
+"""Whether a parameter is one number: silent where it is, loud where a law is only nearly right."""
+
+import control as ct
+import numpy as np
+
+import ctrlid as cid
+from ctrlid import effects as E
+from ctrlid.diagnosis.omnibus import omnibus
+from ctrlid.diagnosis.trial import base_model
+
+OF_INNOVATIONS = ("whiteness", "independence of past signals", "heavy tails", "isolated events")
+
+
+def drive(rhythm=0.0):
+    """A servo whose gain may breathe at 0.15 Hz; the model has a gain that does not."""
+
+    def rates(t, x, u, p):
+        gain = 30.0 * (1 + rhythm * np.sin(0.3 * np.pi * t)) if rhythm else p["k"]
+        return np.array([x[1], (gain * u[0] - 5.0 * x[1]) / 2.0])
+
+    plant = ct.nlsys(rates, lambda t, x, u, p: x[0], inputs=["u"], outputs=["y"],
+                     states=["x", "v"], params={"k": 30.0}, name="drive")  # fmt: skip
+    C = cid.PID(kp=6.0, ki=4.0, kd=0.4, filter_time=0.02)
+    at = cid.OperatingPoint((0.0, 0.0), 0.0, 0.0)
+    return cid.Loop(plant, C, dt=0.01, at=at, free=("k",))
+
+
+def record_of(loop, seed, n=6000, noise=1e-4):
+    r = cid.random_binary(n, amplitude=0.3, hold=60, seed=seed)
+    return cid.simulate(loop, r, sensor_noise=noise, seed=seed + 1)
+
+
+def seen_in(loop, record):
+    return omnibus(base_model(loop, [record], loop.free).fit).p_values
+
+
+def test_nothing_is_seen_where_a_parameter_is_one_number():
+    loop = drive()
+    found = [seen_in(loop, record_of(loop, seed)) for seed in range(9700, 9716)]
+    names = [k for k in found[0] if k.startswith("k by ") or k == "a rhythm of k"]
+    assert len(names) == 7  # time, input, its change, position, velocity, reference; a rhythm
+    p = np.array([[f[k] for k in names] for f in found])
+    # Uniform, or larger where the estimate has used up freedom: 112 of them.
+    assert p.min() > 1e-5
+    assert np.mean(p < 0.05) < 0.13
+    assert np.mean(p < 0.5) < 0.65
+
+
+def test_a_rhythm_of_a_parameter_shows_where_the_innovations_look_like_noise():
+    record = record_of(drive(rhythm=0.0007), 9720)
+    p = seen_in(drive(), record)
+    assert p["a rhythm of k"] < 1e-8
+    assert min(p[k] for k in OF_INNOVATIONS) > 1e-5
+
+
+def test_a_force_law_that_is_only_nearly_right_shows_in_its_parameter():
+    loop = drive()
+    real = loop.with_effect(E.CubicStiffness(300.0))
+    record = record_of(real, 9730)
+    named = loop.with_effect(E.LinearStiffness(20.0))
+    named = cid.Loop(named.plant, named.controller, dt=named.dt, at=named.at, effects=named.effects,
+                     free=("k", "LinearStiffness.k1"))  # fmt: skip
+    assert seen_in(named, record)["LinearStiffness.k1 by position"] < 1e-12
+
+
+def test_a_diagnosis_is_not_clean_where_a_gain_breathes():
+    found = cid.diagnose(drive(), record_of(drive(rhythm=0.03), 9740), progress=False,
+                         catalogue=[E.CoulombFriction, E.ActuatorLag])  # fmt: skip
+    assert found.verdict == "unknown"
+    assert "rhythm of k" in str(found)
