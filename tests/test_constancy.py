@@ -37,7 +37,7 @@ def seen_in(loop, record):
 def test_nothing_is_seen_where_a_parameter_is_one_number():
     loop = drive()
     found = [seen_in(loop, record_of(loop, seed)) for seed in range(9700, 9716)]
-    names = [k for k in found[0] if k.startswith("k by ") or k == "a rhythm of k"]
+    names = [k for k in found[0] if k.startswith("constancy of k over ") or k == "rhythm of k"]
     assert len(names) == 7  # time, input, its change, position, velocity, reference; a rhythm
     p = np.array([[f[k] for k in names] for f in found])
     # Uniform, or larger where the estimate has used up freedom: 112 of them.
@@ -49,7 +49,7 @@ def test_nothing_is_seen_where_a_parameter_is_one_number():
 def test_a_rhythm_of_a_parameter_shows_where_the_innovations_look_like_noise():
     record = record_of(drive(rhythm=0.0007), 9720)
     p = seen_in(drive(), record)
-    assert p["a rhythm of k"] < 1e-8
+    assert p["rhythm of k"] < 1e-8
     assert min(p[k] for k in OF_INNOVATIONS) > 1e-5
 
 
@@ -60,7 +60,7 @@ def test_a_force_law_that_is_only_nearly_right_shows_in_its_parameter():
     named = loop.with_effect(E.LinearStiffness(20.0))
     named = cid.Loop(named.plant, named.controller, dt=named.dt, at=named.at, effects=named.effects,
                      free=("k", "LinearStiffness.k1"))  # fmt: skip
-    assert seen_in(named, record)["LinearStiffness.k1 by position"] < 1e-12
+    assert seen_in(named, record)["constancy of LinearStiffness.k1 over position"] < 1e-12
 
 
 def test_a_diagnosis_is_not_clean_where_a_gain_breathes():

@@ -60,14 +60,14 @@ def constancy(fit: Fit, axes: Mapping[str, Array]) -> dict[str, float]:
             score, size = (np.bincount(index, v[:, j]) for v in (scores, told))
             use = (count >= FEWEST) & (size > 0)
             if use.sum() > 1:
-                p_values[f"{name} by {axis}"] = float(
+                p_values[f"constancy of {name} over {axis}"] = float(
                     stats.chi2.sf(np.sum(score[use] ** 2 / size[use]), use.sum())
                 )
     for j, name in enumerate(names):
         lines = [_line(x[:, j] * e / s, float(np.sum(x[:, j] ** 2 / s)), keep)
                  for x, e, s, keep in parts if np.any(x[:, j])]  # fmt: skip
         if lines:
-            p_values[f"a rhythm of {name}"] = min(1.0, min(lines) * len(lines))
+            p_values[f"rhythm of {name}"] = min(1.0, min(lines) * len(lines))
     return p_values
 
 

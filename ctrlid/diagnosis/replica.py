@@ -8,7 +8,7 @@ import numpy as np
 
 from ..data import Record
 from ..errors import CtrlidError
-from ..likelihood import climb, evaluate
+from ..likelihood import begin, climb
 from ..loop_fit import make_problem
 from ..simulation import Simulator
 from ..stepping import growth_rate
@@ -48,9 +48,7 @@ def replica(model: Model, seed: int = 0) -> Model | None:
         begins = [float(t.table[0, 0]) for t in fit.problem.tracks]
         problem = make_problem(loop, model.names, records, begins)
         problem = replace(problem, counts=fit.problem.counts, known=fit.problem.known)
-        at = [out.trajectory for out in fit.filtered]
-        start = evaluate(problem, fit.theta, fit.noise, at)
-        again = climb(start, rounds=8, exact=False)
+        again = climb(begin(problem, fit.theta, fit.noise), rounds=8, exact=False)
     except CtrlidError:
         return None
     return Model(loop, again) if math.isfinite(again.value) else None
@@ -99,7 +97,7 @@ def artefact(copies: Sequence[Model | None], trial: Trial) -> float:
         Gain of log-likelihood, zero at least.
     """
     again = [refit(c, attempt_at(c, trial.fitted, trial.scan)) for c in copies if c is not None]
-    return max([0.0, *(t.gain for t in again if math.isfinite(t.gain))])
+    return max([0.0, *(t.gain for t in again if math.isfinite(t.merit))])
 
 
 def more_than_simple(base: Model, best: Trial, simple: Trial) -> bool:
