@@ -14,7 +14,7 @@ from ..likelihood import Fit, climb, polish
 from ..linearization import state_matrices
 from ..loop import Loop
 from ..loop_fit import choose_noise
-from .decide import GATE, MANY, rivals
+from .decide import CLOSE, GATE, MANY, rivals
 from .omnibus import ALPHA, Omnibus, omnibus
 from .replica import (
     DOUBTFUL,
@@ -46,6 +46,9 @@ from .trial import (
 NEXT = 5  # candidates after the best that are looked at closely
 TOP = 5  # candidates refitted because of what they promise
 SHARE = 0.2  # of the best promise: what promises more is refitted as well
+NEARLY = 0.8  # of the best merit: what comes so close may be the better half of a pair
+FORESEEN = 2  # of them
+PAIR = 4.0  # times the gate: how much better a pair must promise to be
 NEAR = 0.5  # of the winner's merit: what came so close is asked again when all effects are in
 MINOR = 0.15  # of the whole gain: less, beside something unknown, is a stand-in
 OFFSETS = (SensorOffset,)
@@ -241,6 +244,7 @@ def search(
         step = one_round(model, pool, work, None if steps else anchor(base))
         if step.best is not None and step.best.gain < LITTLE * excess(model.fit):
             step = replace(step, best=None)
+        step = _foreseen(step, catalogue, work)
         steps.append(replace(step, base=Model(model.loop, spared(model.fit))))
         if step.best is None:
             break
@@ -248,6 +252,33 @@ def search(
         model = whole(_without_superfluous(_renoised(step.best.model), given))
     model, found = _settled(model, given, steps, work)
     return Search(base, tuple(steps), model, found, before, _judged(model))
+
+
+def _foreseen(step: Step, catalogue: Sequence[type[AbstractEffect]], work: Work) -> Step:
+    """Ask what could follow on each of the effects that did nearly as well; the best pair wins.
+
+    Where two effects hide together, the one that alone gains most may be a mixture of both.
+    """
+    best = step.best
+    near = [t for t in step.trials[1:NEXT] if best and _nearly(t, best)][:FORESEEN]
+    if best is None or not near or omnibus(best.model.fit).passed:
+        return step
+    record = best.model.fit.problem.tracks[0].record
+
+    def following(trial: Trial) -> float:
+        model = whole(trial.model)
+        pool = [c for c in candidates(catalogue, model.fitted, record) if not _there(model, c)]
+        tried: list[Trial] = work(lambda effect: scanned(model, effect), pool)
+        return trial.merit + max((t.promise - t.price for t in tried), default=0.0)
+
+    first, *others = (following(t) for t in (best, *near))
+    k = int(np.argmax(others))
+    return replace(step, best=near[k]) if others[k] > first + PAIR * GATE else step
+
+
+def _nearly(trial: Trial, best: Trial) -> bool:
+    """Whether a candidate did nearly as well as the best, and is not the same on this record."""
+    return NEARLY * best.merit < trial.merit < best.merit - CLOSE
 
 
 def excess(fit: Fit) -> float:
