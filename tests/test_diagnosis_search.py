@@ -5,6 +5,7 @@ And what a random force that is none looks like.
 
 from dataclasses import dataclass, replace
 
+import control as ct
 import numpy as np
 import pytest
 from scipy import signal, stats
@@ -14,6 +15,7 @@ from ctrlid import effects as E
 from ctrlid.diagnosis.decide import rivals
 from ctrlid.diagnosis.experiment import separating_experiment
 from ctrlid.diagnosis.omnibus import Omnibus, _shape, omnibus
+from ctrlid.diagnosis.replica import replica
 from ctrlid.diagnosis.result import Disturbance, Finding, Gap
 from ctrlid.diagnosis.scan import scanned
 from ctrlid.diagnosis.search import _plainer
@@ -210,3 +212,40 @@ def test_many_effects_at_once_are_no_explanation():
     findings = [Finding(e, {}, (), (), 50.0) for e in kinds]
     text = conclusion("partly explained", findings, gap, quiet, tests, ())
     assert "so many effects at once describe almost any error" in text
+
+
+def test_a_pair_is_not_taken_for_the_mixture_that_alone_gains_most():
+    """Brake and dead zone: a quadratic drag gains more than either, and then needs two more."""
+    plant = cid.plants.maglev(m=0.0787, K=1.561e-5)
+    at = cid.operating_point(plant, output=0.01868)
+    lead = ct.tf([-5996, 5780], [1, -0.6211], 1.4e-3)
+    loop = cid.Loop(plant, lead, dt=1.4e-3, at=at, free=("K",))
+    real = loop.with_effect(E.InputDeadZone(0.143)).with_effect(E.EddyCurrentDamping(1.4))
+    r = cid.random_binary(4000, amplitude=3.7e-4, hold=38, around=at.output, seed=5)
+    record = cid.simulate(real, r, sensor_noise=1.2e-5, force_noise=0.036, seed=6)
+    found = cid.diagnose(loop, record, progress=False, catalogue=[
+        E.QuadraticDrag, E.EddyCurrentDamping, E.InputDeadZone, E.ForceExponent,
+        E.InputSaturatingGain,
+    ])  # fmt: skip
+    first = next(c for c in found.ranking if c.round == 1)
+    assert type(first.effect) is E.QuadraticDrag
+    assert {f.name for f in found.findings} == {"EddyCurrentDamping", "InputDeadZone"}
+    assert found.verdict == "explained"
+
+
+def test_a_replica_is_fitted_from_its_own_trajectory():
+    """Another noise, and the ball moves a quarter of a ripple elsewhere: the record is no guide."""
+    plant = cid.plants.maglev(m=0.0307, K=4.21e-6)
+    at = cid.operating_point(plant, output=0.00762)
+    C = cid.design_lead(cid.linearize(plant, at), crossover=130, phase_margin=45)
+    loop = cid.Loop(plant, C.sample(6.6e-4, "tustin"), dt=6.6e-4, at=at, free=("K",))
+    hidden = E.PositionRipple(amplitude=0.8, period=1.6e-4, phase=1.0)
+    r = cid.random_binary(4000, amplitude=1e-4, hold=70, around=at.output, seed=9800)
+    record = cid.simulate(loop.with_effect(hidden), r, sensor_noise=7.5e-6, seed=9801)
+    real = loop.with_effect(hidden)
+    names = ("K", "PositionRipple.amplitude", "PositionRipple.period", "PositionRipple.phase")
+    model = base_model(real, [record], names)
+    for seed in (0, 1):
+        copy = replica(model, seed)
+        np.testing.assert_allclose(copy.fit.theta[1], model.fit.theta[1], rtol=0.05)
+        assert copy.fit.value > model.fit.value - 300

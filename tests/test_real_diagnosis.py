@@ -9,8 +9,11 @@ import pytest
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
 
+RIGS = ("emps", "inteco", "magnetoshield", "servo", "tanks")
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["real_emps", "real_inteco"])
+@pytest.mark.parametrize("name", [f"real_{rig}" for rig in RIGS])
 def test_the_story(name, data_dir, capsys):
     """Each story ends in assertions of its own; here it must also print its report."""
     del data_dir

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..data import Record
 from ..errors import CtrlidError
-from ..likelihood import begin, climb
+from ..likelihood import Fit, begin, climb, evaluate
 from ..loop_fit import make_problem
 from ..simulation import Simulator
 from ..stepping import growth_rate
@@ -48,10 +48,17 @@ def replica(model: Model, seed: int = 0) -> Model | None:
         begins = [float(t.table[0, 0]) for t in fit.problem.tracks]
         problem = make_problem(loop, model.names, records, begins)
         problem = replace(problem, counts=fit.problem.counts, known=fit.problem.known)
-        again = climb(begin(problem, fit.theta, fit.noise), rounds=8, exact=False)
+        # With other noise a loop may take another path; or the first guess of one may lead astray.
+        along = evaluate(problem, fit.theta, fit.noise, [o.trajectory for o in fit.filtered])
+        starts = along, begin(problem, fit.theta, fit.noise)
+        again = climb(max(starts, key=_likely), rounds=8, exact=False)
     except CtrlidError:
         return None
     return Model(loop, again) if math.isfinite(again.value) else None
+
+
+def _likely(fit: Fit) -> float:
+    return fit.value if math.isfinite(fit.value) else -math.inf
 
 
 def _simulated(model: Model, record: Record, first: float, sensor: float, seed: int) -> Record:

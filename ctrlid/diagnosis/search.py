@@ -48,7 +48,6 @@ TOP = 5  # candidates refitted because of what they promise
 SHARE = 0.2  # of the best promise: what promises more is refitted as well
 NEARLY = 0.8  # of the best merit: what comes so close may be the better half of a pair
 FORESEEN = 2  # of them
-PAIR = 4.0  # times the gate: how much better a pair must promise to be
 NEAR = 0.5  # of the winner's merit: what came so close is asked again when all effects are in
 MINOR = 0.15  # of the whole gain: less, beside something unknown, is a stand-in
 OFFSETS = (SensorOffset,)
@@ -237,43 +236,56 @@ def search(
     given = len(base.loop.effects)
     model = base
     steps: list[Step] = []
-    before = omnibus(base.fit)
+    before, changed = omnibus(base.fit), False
+
+    def grown(best: Trial) -> Model:
+        return whole(_without_superfluous(_renoised(best.model), given))
+
     while len(model.loop.effects) - given < MANY and len(steps) < MANY + 2:
         tell(f"round {len(steps) + 1}: screening")
         pool = [c for c in candidates(catalogue, model.fitted, record) if not _there(model, c)]
         step = one_round(model, pool, work, None if steps else anchor(base))
         if step.best is not None and step.best.gain < LITTLE * excess(model.fit):
             step = replace(step, best=None)
-        step = _foreseen(step, catalogue, work)
+        other = _foreseen(steps[-1], step, catalogue, work) if steps and step.best else None
+        if other is not None and not changed:
+            changed = True
+            steps[-1] = replace(steps[-1], best=other)
+            model = grown(other)
+            continue
+        changed = False
         steps.append(replace(step, base=Model(model.loop, spared(model.fit))))
         if step.best is None:
             break
         tell(f"round {len(steps)}: {step.best.name}")
-        model = whole(_without_superfluous(_renoised(step.best.model), given))
+        model = grown(step.best)
     model, found = _settled(model, given, steps, work)
     return Search(base, tuple(steps), model, found, before, _judged(model))
 
 
-def _foreseen(step: Step, catalogue: Sequence[type[AbstractEffect]], work: Work) -> Step:
-    """Ask what could follow on each of the effects that did nearly as well; the best pair wins.
+def _foreseen(
+    last: Step, step: Step, catalogue: Sequence[type[AbstractEffect]], work: Work
+) -> Trial | None:  # fmt: skip
+    """Return what would have been the better choice of the last round, now that more is found.
 
-    Where two effects hide together, the one that alone gains most may be a mixture of both.
+    Where two effects hide together, the one that alone gains most may be a mixture of both. So each
+    effect that did nearly as well is asked what could follow on it; the best pair wins.
     """
-    best = step.best
-    near = [t for t in step.trials[1:NEXT] if best and _nearly(t, best)][:FORESEEN]
-    if best is None or not near or omnibus(best.model.fit).passed:
-        return step
-    record = best.model.fit.problem.tracks[0].record
-
-    def following(trial: Trial) -> float:
+    assert last.best is not None
+    assert step.best is not None
+    best = last.best
+    near = [t for t in last.trials[1:NEXT] if _nearly(t, best)][:FORESEEN]
+    record = last.base.fit.problem.tracks[0].record
+    pairs: list[tuple[float, int]] = []
+    for k, trial in enumerate(near):
         model = whole(trial.model)
         pool = [c for c in candidates(catalogue, model.fitted, record) if not _there(model, c)]
-        tried: list[Trial] = work(lambda effect: scanned(model, effect), pool)
-        return trial.merit + max((t.promise - t.price for t in tried), default=0.0)
-
-    first, *others = (following(t) for t in (best, *near))
-    k = int(np.argmax(others))
-    return replace(step, best=near[k]) if others[k] > first + PAIR * GATE else step
+        tried: list[Trial] = work(lambda effect, model=model: scanned(model, effect), pool)
+        tried = sorted(tried, key=lambda t: t.price - t.promise)[:2]
+        done = work(lambda t, model=model: refit(model, t), tried)
+        pairs.append((trial.merit + max((t.merit for t in done), default=-math.inf), k))
+    total, k = max(pairs, default=(-math.inf, 0))
+    return near[k] if total > best.merit + step.best.merit + GATE else None
 
 
 def _nearly(trial: Trial, best: Trial) -> bool:

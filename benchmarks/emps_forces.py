@@ -1,15 +1,13 @@
-"""What `diagnose` finds on real records, with the force error of EMPS that its literature quotes.
+"""Forces of the EMPS drive: the model that `diagnose` completes, beside the published one.
 
-Run it as ``python benchmarks/real_diagnosis.py`` (``emps``, ``magnetoshield``, ``tanks``, ``servo``
-for some of them; INTECO has a story of its own, ``examples/real_inteco.py``). The records are
-fetched once, or read from the folder named by CTRLID_DATA_DIR. About five minutes in all.
+Run it as ``python benchmarks/emps_forces.py``; it prints the diagnosis of the story
+``examples/real_emps.py`` first, about two minutes. The records are fetched once, or read from the
+folder named by CTRLID_DATA_DIR.
 """
 
 from __future__ import annotations
 
-import control as ct
 import numpy as np
-from real_records import run
 from scipy import signal
 
 import ctrlid as cid
@@ -17,7 +15,6 @@ from ctrlid import effects
 from ctrlid.diagnosis.fresh import fresh_data
 from ctrlid.diagnosis.gap import FEW_STEPS, ROUGH, drive
 from ctrlid.diagnosis.trial import base_model
-from ctrlid.sampling import averaged
 from ctrlid.simulation import Simulator
 
 GAIN = 35.15065  # N/V, of the EMPS drive
@@ -55,7 +52,7 @@ def inverse_error(loop: cid.Loop, record: cid.Record) -> float:
     return float(100 * np.linalg.norm(off[inner]) / np.linalg.norm(force[inner]))
 
 
-def emps() -> None:
+def main() -> None:
     """Diagnose mass with viscous friction; compare forces on the record with pulses."""
     record, pulses = (cid.datasets.load(name) for name in ("emps", "emps_pulses"))
     rest = cid.OperatingPoint((0.0, 0.0), 0.0, 0.0)
@@ -70,53 +67,12 @@ def emps() -> None:
     # The phase of a ripple is private to a record.
     fitted = base_model(found.loop, [record], ())
     (moved,) = fresh_data(model, [], [pulses]).loops(fitted)
-    print(
-        "\nforce error below 50 Hz [%]          estimation      pulses   inverse model, estimation"
-    )
+    print("\nforce error below 50 Hz [%]          estimation      pulses   inverse model")
     for name, there, here in (("published symmetric model", published, published),
                               ("with the effects", found.loop, moved)):  # fmt: skip
         print(f"  {name:<30}{force_error(there, record):14.2f}{force_error(here, pulses):12.2f}"
-              f"{inverse_error(there, record):28.2f}")  # fmt: skip
-
-
-def magnetoshield() -> None:
-    """Diagnose a magnet as if it were a ball of iron; compare at another set-point."""
-    records = cid.datasets.load("magnetoshield_r3")
-    plant = cid.plants.maglev(m=0.000945, K=0.000945 * 9.81 * 0.014**2 / 5.0**2)
-    at = cid.operating_point(plant, output=0.014)
-    model = cid.Loop(plant, None, dt=records[0].dt, at=at, free=("K",))
-    print(cid.diagnose(model, records[0], validation=records[3], progress=False))
-
-
-def tanks() -> None:
-    """Diagnose two tanks with square-root outflow; compare on the validation record."""
-
-    def rates(t: float, x: np.ndarray, u: np.ndarray, p: dict[str, float]) -> np.ndarray:
-        upper, lower = np.sqrt(np.maximum(x, 1e-6))
-        return np.array([p["k4"] * u[0] - p["k1"] * upper, p["k1"] * upper - p["k3"] * lower])
-
-    plant = ct.nlsys(rates, lambda t, x, u, p: x[1], inputs=["u"], outputs=["y"],
-                     states=["h1", "h2"], params={"k1": 0.05, "k3": 0.05, "k4": 0.05},
-                     name="two tanks")  # fmt: skip
-    at = cid.operating_point(plant, output=6.0)
-    record, other = (cid.datasets.load(f"tanks_{k}") for k in ("estimation", "validation"))
-    model = cid.Loop(plant, None, dt=record.dt, at=at, free=("k1", "k3", "k4"))
-    print(cid.diagnose(model, record, validation=other, progress=False))
-
-
-def servo() -> None:
-    """Diagnose a drive with viscous friction at 10 ms, where the hum of its sensor is less."""
-    record, other = (
-        averaged(cid.datasets.load(f"servo_{k}"), 10) for k in ("swept_sine", "random_steps")
-    )
-    rest = cid.OperatingPoint((0.0, 0.0), 0.0, 0.0)
-    plant = cid.plants.servo(m=1 / 160, c=27 / 160, k=1.0)
-    model = cid.Loop(plant, None, dt=record.dt, at=rest, free=("k", "c"))
-    print(cid.diagnose(model, record, validation=other, progress=False))
-
-
-RIGS = {"emps": emps, "magnetoshield": magnetoshield, "tanks": tanks, "servo": servo}
+              f"{inverse_error(there, record):16.2f}")  # fmt: skip
 
 
 if __name__ == "__main__":
-    run(RIGS, __doc__)
+    main()
