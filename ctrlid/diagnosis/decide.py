@@ -12,6 +12,7 @@ GATE = 5.0  # gain of log-likelihood less penalty: 10 in units of the Bayesian c
 CLOSE = 3.0  # difference of log-likelihood that says nothing
 SAME = 4.0  # spread of a likelihood ratio: two models that differ by less are nested
 Z = 2.0  # standard deviations of Vuong's test
+DOUBT = 0.6  # of the best merit: where something is left, a look-alike with more is not excluded
 OPEN = 0.1  # standard error over the size of an effect: beyond, a further parameter may matter
 MANY = 4  # effects at once: such a list describes almost any error, and explains none
 BLOCK = 50  # samples whose terms are summed before their spread is taken
@@ -69,7 +70,7 @@ def _open(trial: Trial, simple: Trial) -> bool:
     return False
 
 
-def rivals(best: Trial, others: Sequence[Trial]) -> tuple[Trial, ...]:
+def rivals(best: Trial, others: Sequence[Trial], sure: bool = True) -> tuple[Trial, ...]:
     """Return the candidates that the record cannot tell apart from the best, best first.
 
     Parameters
@@ -78,11 +79,15 @@ def rivals(best: Trial, others: Sequence[Trial]) -> tuple[Trial, ...]:
         The refitted winner.
     others : sequence of Trial
         Refitted candidates, on the same samples and beside the same other effects.
+    sure : bool, optional
+        Whether what all of them leave is noise; if not, a difference of likelihood may come from
+        what is still missing.
 
     Returns
     -------
     tuple of Trial
-        Those within 3 units of log-likelihood, or not rejected by Vuong's test at z = 2.
+        Those within 3 units of log-likelihood, or not rejected by Vuong's test at z = 2; unless
+        `sure`, also what is known to resemble the best and gains nearly as much.
     """
     mine = log_terms(best.model.fit)
     found = []
@@ -98,7 +103,9 @@ def rivals(best: Trial, others: Sequence[Trial]) -> tuple[Trial, ...]:
                 found.append(trial)
             continue
         z = vuong(mine, theirs, best.cost - trial.cost)
-        if lost < CLOSE or z < Z:
+        alike = trial.name in type(best.effect).look_alikes
+        doubtful = not sure and alike and trial.merit > DOUBT * best.merit
+        if lost < CLOSE or z < Z or doubtful:
             found.append(trial)
     found.sort(key=lambda t: -t.merit)
     # One that was begun at several places is one.

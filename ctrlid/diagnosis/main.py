@@ -172,6 +172,12 @@ def _diagnosed(
     if periods:
         base = weighted_by_repeats(base, periods)
     found = search(base, catalogue, work, tell)
+    if found.turned and not found.after.passed:
+        # Neither way explains the record, perhaps: fresh data tell which leads further.
+        tell("another way")
+        greedy = search(base, catalogue, work, tell, look_back=False)
+        ways = [main_ones(s, _helps(fresh)) for s in (found, greedy)]
+        found = min(ways, key=lambda s: (not s.after.passed, fresh.gap(fresh.loops(s.final))))
     tell("comparing on fresh data", 2)
     coarse = steps(found.final.fit, audits, catalogue)
     if coarse and not found.after.passed and simulable(found.final):
@@ -285,8 +291,9 @@ def _foreign_units(loop: Loop, record: Record) -> list[str]:
         f"units: {key} is recorded in {there}, and the plant counts it in {here}; where sizes say "
         f"{here}, it stands for {there}."
         for key, here in pairs
-        if (there := record.units.get(key, "")) and here and there != here
-    ]
+        if (there := record.units.get(key, "").replace("1", "plain numbers")) and here
+        and there != here
+    ]  # fmt: skip
 
 
 def _periods(parts: Sequence[Record], audits: Sequence[Audit]) -> list[int]:

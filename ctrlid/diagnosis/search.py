@@ -79,7 +79,10 @@ class Found:
 
 @dataclass(frozen=True, eq=False)
 class Search:
-    """The end of a search: the base, the rounds, the final model and its effects."""
+    """The end of a search: the base, the rounds, the final model and its effects.
+
+    `turned` says whether the choice of a round was taken back for a better pair.
+    """
 
     base: Model
     steps: tuple[Step, ...]
@@ -87,6 +90,7 @@ class Search:
     found: tuple[Found, ...]
     before: Omnibus
     after: Omnibus
+    turned: bool = False
 
 
 def candidates(
@@ -212,7 +216,7 @@ def _checked(base: Model, trials: list[Trial]) -> list[Trial]:
 
 def search(
     base: Model, catalogue: Sequence[type[AbstractEffect]], work: Work,
-    tell: Callable[[str], None],
+    tell: Callable[[str], None], look_back: bool = True,
 ) -> Search:  # fmt: skip
     """Add effects to a base model until nothing more earns a place.
 
@@ -226,6 +230,8 @@ def search(
         ``work(function, items)``, a map that may run in parallel.
     tell : callable
         Told what is being done.
+    look_back : bool, optional
+        Whether the choice of a round may be taken back when the next one is known.
 
     Returns
     -------
@@ -236,7 +242,7 @@ def search(
     given = len(base.loop.effects)
     model = base
     steps: list[Step] = []
-    before, changed = omnibus(base.fit), False
+    before, changed, turned = omnibus(base.fit), False, False
 
     def grown(best: Trial) -> Model:
         return whole(_without_superfluous(_renoised(best.model), given))
@@ -247,9 +253,10 @@ def search(
         step = one_round(model, pool, work, None if steps else anchor(base))
         if step.best is not None and step.best.gain < LITTLE * excess(model.fit):
             step = replace(step, best=None)
-        other = _foreseen(steps[-1], step, catalogue, work) if steps and step.best else None
-        if other is not None and not changed:
-            changed = True
+        asked = look_back and steps and step.best and not changed
+        other = _foreseen(steps[-1], step, catalogue, work) if asked else None
+        if other is not None:
+            changed = turned = True
             steps[-1] = replace(steps[-1], best=other)
             model = grown(other)
             continue
@@ -260,7 +267,7 @@ def search(
         tell(f"round {len(steps)}: {step.best.name}")
         model = grown(step.best)
     model, found = _settled(model, given, steps, work)
-    return Search(base, tuple(steps), model, found, before, _judged(model))
+    return Search(base, tuple(steps), model, found, before, _judged(model), turned)
 
 
 def _foreseen(
@@ -269,7 +276,7 @@ def _foreseen(
     """Return what would have been the better choice of the last round, now that more is found.
 
     Where two effects hide together, the one that alone gains most may be a mixture of both. So each
-    effect that did nearly as well is asked what could follow on it; the best pair wins.
+    effect of its kind that did nearly as well is asked what could follow on it; the best pair wins.
     """
     assert last.best is not None
     assert step.best is not None
@@ -289,8 +296,9 @@ def _foreseen(
 
 
 def _nearly(trial: Trial, best: Trial) -> bool:
-    """Whether a candidate did nearly as well as the best, and is not the same on this record."""
-    return NEARLY * best.merit < trial.merit < best.merit - CLOSE
+    """Whether a candidate did nearly as well as one that resembles it, and not the same."""
+    mine, its = ({t.name, *type(t.effect).look_alikes} for t in (best, trial))
+    return bool(mine & its) and NEARLY * best.merit < trial.merit < best.merit - CLOSE
 
 
 def excess(fit: Fit) -> float:
@@ -403,10 +411,11 @@ def _settled(
     if len(model.loop.effects) == given:
         return model, ()
     assert first is not None
+    sure = omnibus(model.fit).passed
     if len(model.loop.effects) == given + 1 and first.best is not None and len(steps) <= 2:
         best = first.best
         if bool(best.model.fit.noise.drift) == bool(model.fit.noise.drift):
-            return model, (Found(best, rivals(best, first.trials), first.base, given),)
+            return model, (Found(best, rivals(best, first.trials, sure), first.base, given),)
     found: list[Found] = []
     for position in range(given, len(model.loop.effects)):
         smaller, mine = _taken_out(model, position)
@@ -421,7 +430,7 @@ def _settled(
         best = _plainer(smaller, best, [mine, *again])
         if best is not mine:
             model = _moved(best.model, position)
-        close = rivals(best, [t for t in [mine, *again] if t is not best])
+        close = rivals(best, [t for t in [mine, *again] if t is not best], sure)
         found.append(Found(best, close, smaller, position))
     found.sort(key=lambda f: -f.trial.gain)
     return model, tuple(found)
