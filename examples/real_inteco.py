@@ -40,9 +40,9 @@ model = cid.Loop(plant, None, dt=record.dt, at=at, free=("K",))
 # %%
 # What is missing?
 # ----------------
-# The law of the force in the gap, and a lag between the duty and what the sensor shows: of the
-# actuator or of the sensor, which one swing does not tell apart. A small friction is named beside
-# them, in air; it may stand in for something else, as the report says, and something is left.
+# A lag between the duty and what the sensor shows, of the actuator or of the sensor, which one
+# swing does not tell apart; and the law of the force in the gap. A small friction is named beside
+# them, in air, or a force at 32 Hz, which others have seen in this rig. Something is left.
 
 found = cid.diagnose(model, record, progress=False)
 print(found)

@@ -249,3 +249,16 @@ def test_a_replica_is_fitted_from_its_own_trajectory():
         copy = replica(model, seed)
         np.testing.assert_allclose(copy.fit.theta[1], model.fit.theta[1], rtol=0.05)
         assert copy.fit.value > model.fit.value - 300
+
+
+def test_units_of_the_record_that_are_not_those_of_the_plant_are_told():
+    loop = drive()
+    record = record_of(loop, E.CoulombFriction(2.0), 0.3, 1e-4, 9850, n=1500)
+    volts = replace(record, units={"u": "1", "y": "V"})
+    found = cid.diagnose(loop, volts, progress=False, catalogue=[E.CoulombFriction])
+    told = [text for text in found.audit if text.startswith("units: ")]
+    assert len(told) == 2
+    assert "u is recorded in plain numbers" in told[0]
+    assert "y is recorded in V, and the plant counts it in m" in told[1]
+    again = cid.diagnose(loop, record, progress=False, catalogue=[E.CoulombFriction])
+    assert not [text for text in again.audit if text.startswith("units: ")]

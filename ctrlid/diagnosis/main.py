@@ -286,14 +286,16 @@ def _look_over(
 def _foreign_units(loop: Loop, record: Record) -> list[str]:
     """Say where a record counts in other units than the plant, whose words sizes are written in."""
     e, known = loop.equations(), getattr(loop.plant, "units", {})
-    pairs = [("u", known.get(e.inputs[0], "")), ("y", known.get(e.outputs[0], ""))]
-    return [
-        f"units: {key} is recorded in {there}, and the plant counts it in {here}; where sizes say "
-        f"{here}, it stands for {there}."
-        for key, here in pairs
-        if (there := record.units.get(key, "").replace("1", "plain numbers")) and here
-        and there != here
-    ]  # fmt: skip
+    remarks = []
+    for key, name in (("u", e.inputs[0]), ("y", e.outputs[0])):
+        there, here = record.units.get(key, ""), known.get(name, "")
+        if there and here and there != here:
+            there = "plain numbers" if there == "1" else there
+            remarks.append(
+                f"units: {key} is recorded in {there}, and the plant counts it in {here}; where "
+                f"sizes say {here}, it stands for {there}."
+            )
+    return remarks
 
 
 def _periods(parts: Sequence[Record], audits: Sequence[Audit]) -> list[int]:
