@@ -17,8 +17,8 @@ from ctrlid.diagnosis.experiment import separating_experiment
 from ctrlid.diagnosis.omnibus import Omnibus, _shape, omnibus
 from ctrlid.diagnosis.replica import replica
 from ctrlid.diagnosis.result import Disturbance, Finding, Gap
+from ctrlid.diagnosis.rounds import plainer
 from ctrlid.diagnosis.scan import scanned
-from ctrlid.diagnosis.search import _plainer
 from ctrlid.diagnosis.sentences import conclusion
 from ctrlid.diagnosis.trial import (
     Model,
@@ -100,7 +100,7 @@ def test_what_the_record_excludes_does_not():
 def test_the_simple_effect_begins_where_the_larger_one_ended(one_level):
     base, plain, more = one_level
     poor = attempt_at(base, E.CoulombFriction(5.0))  # from where no refit would find it
-    again = _plainer(base, more, [poor])
+    again = plainer(base, more, [poor])
     assert again.name == "CoulombFriction"
     assert again.gain == pytest.approx(plain.gain, abs=1.0)
     assert np.isfinite(again.merit)

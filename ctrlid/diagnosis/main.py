@@ -29,8 +29,10 @@ from .omnibus import places
 from .readout import Readout, censored, clipping, steps
 from .replica import forgiven, replica, simulable
 from .result import Calibrated, Candidate, Diagnosis, Disturbance, Finding, Gap, Verdict
-from .search import Found, Search, Work, check_catalogue, main_ones, search
+from .rounds import Work, check_catalogue
+from .search import Search, main_ones, search
 from .sentences import conclusion
+from .settling import Found
 from .several import merged, presence
 from .simulated_search import search_by_simulation
 from .trial import (

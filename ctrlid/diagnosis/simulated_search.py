@@ -17,8 +17,10 @@ from ..physics import Array
 from .decide import CLOSE, GATE
 from .fresh import Fresh
 from .omnibus import omnibus
+from .rounds import Step, candidates
 from .scan import LIMITS
-from .search import Found, Search, Step, candidates, taken_out
+from .search import Search
+from .settling import Found, taken_out
 from .simulated import Simulated, Simulation, as_fit
 from .trial import Model, Trial, same_kind
 

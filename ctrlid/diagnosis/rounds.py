@@ -1,0 +1,156 @@
+"""One round of the search: every candidate screened, the promising refitted, the best checked."""
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ..data import Record
+from ..effects import AbstractEffect, SensorOffset
+from ..errors import CtrlidError
+from ..linearization import state_matrices
+from ..loop import Loop
+from .decide import GATE
+from .replica import DOUBTFUL, TWICE, artefact, kinked, more_than_simple, replica, simulable
+from .scan import scanned
+from .trial import Model, Trial, attempt_at, contains, promised, refit, same_kind
+
+NEXT = 5  # candidates after the best that are looked at closely
+TOP = 5  # candidates refitted because of what they promise
+SHARE = 0.2  # of the best promise: what promises more is refitted as well
+FAINT = 0.5  # of what would earn a place: a fainter promise is not worth a refit
+OFFSETS = (SensorOffset,)
+
+Work = Callable[[Callable[..., Any], Iterable[Any]], list[Any]]
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """One round: the model it started from, what was tried, and what won."""
+
+    base: Model
+    trials: tuple[Trial, ...]
+    best: Trial | None
+
+
+def candidates(
+    catalogue: Sequence[type[AbstractEffect]], loop: Any, record: Record
+) -> list[AbstractEffect]:
+    """Return every effect of a catalogue that a plant can have, at its start."""
+    found: list[AbstractEffect] = []
+    for kind in catalogue:
+        if kind.place == "output" and kind in OFFSETS and not _place_matters(loop):
+            continue  # the initial position, of which nobody knows where it is counted from
+        found += kind.candidates(loop, record)
+    return found
+
+
+def check_catalogue(catalogue: Sequence[type[AbstractEffect]]) -> None:
+    """Refuse what is no class of effects, with what is needed."""
+    kinds = catalogue if isinstance(catalogue, Sequence) else [catalogue]
+    for kind in kinds:
+        if isinstance(catalogue, str) or not (
+            isinstance(kind, type) and issubclass(kind, AbstractEffect)
+        ):
+            raise CtrlidError("catalogue= is a list of classes of effects, such as "
+                              f"ctrlid.effects.CATALOGUE; given {kind!r}")  # fmt: skip
+    if kinds is not catalogue:
+        raise CtrlidError("catalogue= is a list of classes of effects; put the one given into "
+                          f"brackets: [{catalogue!r}]")  # fmt: skip
+
+
+def _place_matters(loop: Loop) -> bool:
+    """Whether the plant moves differently when its output is shifted."""
+    a, _, c, _ = state_matrices(loop.equations(), loop.point, spread=1e6)
+    return bool(np.any(np.abs(a[:, np.flatnonzero(c[0])]).sum(axis=0) > 0))
+
+
+def one_round(
+    base: Model, pool: Sequence[AbstractEffect], work: Work, other: Model | None = None
+) -> Step:
+    """Screen all candidates, refit the promising, and return the best that earns its place.
+
+    They are added to the base, and to the `other` model in its place if one is given.
+    """
+    tried: list[Trial] = work(lambda effect: scanned(base, effect), pool)
+    if other is not None:
+        # What the model alone would regain from there is no merit of a candidate.
+        lost = other.fit.value - base.fit.value
+        lost -= max(0.0, lost + promised(other.fit))
+        more: list[Trial] = work(lambda effect: scanned(other, effect), pool)
+        more = [replace(t, promise=t.promise + lost) for t in more]
+        pairs = zip(tried, more, strict=True)
+        tried = [a if a.promise > 0 or a.promise >= b.promise else b for a, b in pairs]
+        tried += [b for b in more if b.promise > 0]
+    tried.sort(key=lambda t: -t.promise)
+    leader = tried[0] if tried else None
+    if leader is None or not math.isfinite(leader.promise):
+        return Step(base, tuple(tried), None)
+    wanted = {t.name for t in tried[:TOP]} | set(type(leader.effect).look_alikes)
+    chosen = [
+        t
+        for t in tried
+        if t.promise > FAINT * (GATE + t.price)
+        and (t.name in wanted or t.promise > SHARE * leader.promise)
+    ]
+    done = {id(t): r for t, r in zip(chosen, work(lambda t: refit(base, t), chosen), strict=True)}
+    trials = [done.get(id(t), t) for t in tried]
+    best = max(trials, key=lambda t: t.merit)
+    alike = set(type(best.effect).look_alikes) if math.isfinite(best.merit) else set()
+    late = [t for t in tried if id(t) not in done and t.name in alike and t.promise > -math.inf]
+    done |= {id(t): r for t, r in zip(late, work(lambda t: refit(base, t), late), strict=True)}
+    trials = [done.get(id(t), t) for t in tried]
+    trials = _simplest(base, _checked(base, trials))
+    plain = plainer(base, trials[0], trials[1:])
+    if plain is not trials[0]:
+        trials = [plain, *(t for t in trials if not same_kind(t.effect, plain.effect))]
+    best = trials[0]
+    return Step(base, tuple(trials), best if best.merit > GATE else None)
+
+
+def plainer(base: Model, best: Trial, others: Sequence[Trial]) -> Trial:
+    """Return an effect that the best one contains, if it does as well when it starts from there."""
+    for t in others:
+        if not best.merit > 0 or not contains(best.effect, t.effect):
+            continue
+        values = best.fitted.values()
+        start = replace(t.effect, **{k: values[k] for k in t.effect.values()})
+        again = refit(base, attempt_at(base, start, t.scan), best.model)
+        if again.merit >= best.merit:
+            return again
+    return best
+
+
+def _simplest(base: Model, trials: list[Trial]) -> list[Trial]:
+    """Put out a winner whose further parameters gain from the filter's approximations only."""
+    best = trials[0]
+    for simple in trials[1:NEXT]:
+        fewer = len(simple.effect.parameters()) < len(best.effect.parameters())
+        if not fewer or simple.merit <= GATE or not simulable(base):
+            continue
+        if best.gain - simple.gain > 0.1 * best.gain or simple.name not in best.effect.look_alikes:
+            continue
+        if not more_than_simple(base, best, simple):
+            out = replace(best, remark=f"{simple.name} explains as much with fewer parameters")
+            return sorted([out, *trials[1:]], key=lambda t: (-t.merit, -t.promise))
+    return trials
+
+
+def _checked(base: Model, trials: list[Trial]) -> list[Trial]:
+    """Put out what gains as much on records in which it is known not to be."""
+    copies: list[Model | None] = []
+    for _ in range(NEXT):
+        trials.sort(key=lambda t: (-t.merit, -t.promise))
+        best = trials[0]
+        sure = best.gain > DOUBTFUL and not base.loop.effects
+        if best.merit <= GATE or sure or not simulable(base):
+            break
+        copies = copies or [replica(base, seed) for seed in range(2 if kinked(base) else 1)]
+        if best.merit - TWICE * artefact(copies, best) > GATE:
+            break
+        trials[0] = replace(
+            best, remark="gains as much on a simulated record in which it is known not to be"
+        )
+    return trials

@@ -1,0 +1,137 @@
+"""When all effects are found: what is superfluous, and what could stand in the place of each."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from ..likelihood import climb, polish
+from ..loop import Loop
+from ..loop_fit import choose_noise
+from .decide import GATE, rivals
+from .omnibus import omnibus
+from .rounds import NEXT, Step, Work, plainer
+from .trial import Model, Trial, attempt_at, needed, reduced, refit, spared
+
+NEAR = 0.5  # of the winner's merit: what came so close is asked again when all effects are in
+SURE = 100.0  # times the gate: an effect so significant is not asked whether it is needed
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """An effect that earned its place, and what cannot be told apart from it."""
+
+    trial: Trial
+    rivals: tuple[Trial, ...]
+    base: Model
+    position: int  # among the effects of the final loop
+
+
+def settled(
+    model: Model, given: int, steps: Sequence[Step], work: Work
+) -> tuple[Model, tuple[Found, ...]]:
+    """Ask for each effect what else could stand in its place, all others being in the model."""
+    first = steps[0] if steps else None
+    if len(model.loop.effects) == given:
+        return model, ()
+    assert first is not None
+    sure = omnibus(model.fit).passed
+    if len(model.loop.effects) == given + 1 and first.best is not None and len(steps) <= 2:
+        best = first.best
+        if bool(best.model.fit.noise.drift) == bool(model.fit.noise.drift):
+            return model, (Found(best, rivals(best, first.trials, sure), first.base, given),)
+    found: list[Found] = []
+    for position in range(given, len(model.loop.effects)):
+        smaller, mine = cut(model, position)
+        if mine.merit <= GATE:
+            return settled(renoised(smaller), given, steps, work)
+        there = {type(e).__name__ for e in smaller.loop.effects}
+        rest = [t for t in _close(mine, steps) if t.name not in there]
+        again = work(lambda t, smaller=smaller: refit(smaller, attempt_at(smaller, t.fitted)), rest)
+        best = max([mine, *again], key=lambda t: t.merit)
+        if best.merit <= mine.merit + 1.0:
+            best = mine
+        best = plainer(smaller, best, [mine, *again])
+        if best is not mine:
+            model = _moved(best.model, position)
+        close = rivals(best, [t for t in [mine, *again] if t is not best], sure)
+        found.append(Found(best, close, smaller, position))
+    found.sort(key=lambda f: -f.trial.gain)
+    return model, tuple(found)
+
+
+def _moved(model: Model, position: int) -> Model:
+    """Return the model with its last effect at another position among the effects."""
+    fitted = model.fitted
+    order = [*range(position), len(fitted.effects) - 1, *range(position, len(fitted.effects) - 1)]
+    labels = list(fitted.labelled)
+    loop = replace(fitted, effects=tuple(fitted.effects[k] for k in order), free=())
+    renamed = dict(zip([labels[k] for k in order], loop.labelled, strict=True))
+    loop = replace(loop, free=tuple(n for n in fitted.free if "." not in n))
+    names = _relabelled(model.names, renamed)
+    return Model(loop, climb(reduced(model, loop, names), rounds=4))
+
+
+def _close(mine: Trial, steps: Sequence[Step]) -> list[Trial]:
+    """Return the candidates that came close to an effect in the round that it won."""
+    alike = set(type(mine.effect).look_alikes)
+    for step in steps:
+        if step.best is None or step.best.name != mine.name:
+            continue
+        near = [
+            t for t in step.trials
+            if t.name != mine.name and t.merit > GATE
+            and (t.name in alike or t.merit > NEAR * step.best.merit)
+        ]  # fmt: skip
+        return near[:NEXT]
+    return []
+
+
+def taken_out(
+    loop: Loop, position: int, names: Sequence[str]
+) -> tuple[Loop, tuple[str, ...]]:  # fmt: skip
+    """Return a loop without one of its effects, and the names of what is free then."""
+    labels = list(loop.labelled)
+    label, less = labels[position], loop.without_effect(labels[position])
+    renamed = dict(zip(labels[:position] + labels[position + 1 :], less.labelled, strict=True))
+    left = [n for n in names if not n.startswith(f"{label}.")]
+    return less, tuple(_relabelled(left, renamed))
+
+
+def cut(model: Model, position: int) -> tuple[Model, Trial]:
+    """Return the model without one effect, refitted, and the effect as a trial on top of it."""
+    effect = model.fitted.effects[position]
+    loop, names = taken_out(model.fitted, position, model.names)
+    smaller = Model(loop, spared(climb(reduced(model, loop, names), rounds=10)))
+    return smaller, refit(smaller, attempt_at(smaller, effect))
+
+
+def renoised(model: Model) -> Model:
+    """Ask again whether the data want a coloured force, now that an effect is in the model."""
+    fit = polish(model.fit)
+    if fit.problem.known is not None:
+        return Model(model.loop, fit)
+    if fit.noise.drift:
+        plain = climb(replace(fit, noise=replace(fit.noise, memory=0.0, drift=0.0)))
+        if plain.value > fit.value - math.log(fit.size):
+            return Model(model.loop, plain)
+        # The force that stood for the effect may be far from the one that is left.
+        anew = choose_noise(plain)
+        return Model(model.loop, max(fit, anew, key=lambda f: f.value))
+    return Model(model.loop, choose_noise(fit))
+
+
+def without_superfluous(model: Model, given: int) -> Model:
+    """Drop effects that the later ones made superfluous."""
+    for position in range(given, len(model.loop.effects) - 1):
+        if needed(model, position) > SURE * GATE:
+            continue
+        smaller, trial = cut(model, position)
+        if trial.merit <= GATE:
+            return without_superfluous(smaller, given)
+    return model
+
+
+def _relabelled(names: Sequence[str], labels: Mapping[str, str]) -> list[str]:
+    """Return names of parameters with the new labels of their effects."""
+    parts = [name.partition(".") for name in names]
+    return [f"{labels.get(head, head)}.{tail}" if dot else head for head, dot, tail in parts]
