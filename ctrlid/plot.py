@@ -709,8 +709,11 @@ def _gap(above: Any, below: Any, found: Diagnosis) -> None:
     for (label, values, size, style), error in zip(cases, errors, strict=True):
         rms = "none" if np.isnan(size) else f"RMS {fine * size:.3g} {small}"
         long = {"before": "recalibrated model", "after": f"with {names}"}.get(label, label)
-        above.plot(t, scale * values[part], label=f"{gap.kind}, {long}", **style)
-        below.plot(t, fine * error, label=f"{label}: {rms}", **style)
+        # A long prediction is made at some of the samples only.
+        made = np.isfinite(error) if gap.kind.endswith("prediction") else slice(None)
+        shown = scale * values[part]
+        above.plot(t[made], shown[made], label=f"{gap.kind}, {long}", **style)
+        below.plot(t[made], fine * error[made], label=f"{label}: {rms}", **style)
     _limit(above, scale * y)
     above.set_ylabel(f"output [{unit}]")
     below.set_ylabel(f"error [{small}]")

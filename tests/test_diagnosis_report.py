@@ -376,6 +376,19 @@ def test_picture_of_rare_cases(found):
     plot.png(output)
 
 
+def test_predictions_at_some_samples_only_are_drawn_as_lines(found):
+    base = found["explained"]
+    sparse = np.where(np.arange(len(base.gap.time)) % 3 == 0, base.gap.simulated_after, np.nan)
+    gap = replace(base.gap, kind="12-step prediction", simulated_after=sparse)
+    output, error, *_ = plot.diagnosis(replace(base, gap=gap))
+    for ax in (output, error):
+        drawn = [line.get_ydata() for line in ax.get_lines() if "after" in line.get_label()
+                 or "prediction, with" in line.get_label()]  # fmt: skip
+        assert len(drawn) == 1
+        assert len(drawn[0]) > 5
+        assert np.isfinite(drawn[0]).all()
+
+
 def test_picture_on_given_axes(found):
     axes = plot.figure(5)
     assert list(plot.diagnosis(found["explained"], axes)) == list(axes[:, 0])
