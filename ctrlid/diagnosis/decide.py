@@ -96,9 +96,11 @@ def rivals(best: Trial, others: Sequence[Trial], sure: bool = True) -> tuple[Tri
             continue
         lost = best.merit - trial.merit
         theirs = log_terms(trial.model.fit)
-        # A larger model that predicts the same contains the best one, and pays for nothing; but a
+        # A larger model that predicts the same contains the best one, and pays for nothing; but one
+        # that gains more may be right (a Stribeck curve hardly told from dry friction), and a
         # record that says nothing of what it has more cannot exclude it.
-        if trial.cost > best.cost and _spread(mine - theirs) < SAME:
+        nothing = trial.gain < best.gain + CLOSE and _spread(mine - theirs) < SAME
+        if trial.cost > best.cost and nothing:
             if contains(trial.effect, best.effect) and _open(trial, best):
                 found.append(trial)
             continue
