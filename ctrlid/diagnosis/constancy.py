@@ -64,19 +64,23 @@ def constancy(fit: Fit, axes: Mapping[str, Array]) -> dict[str, float]:
                     stats.chi2.sf(np.sum(score[use] ** 2 / size[use]), use.sum())
                 )
     for j, name in enumerate(names):
-        lines = [_line(x[:, j] * e / s, float(np.sum(x[:, j] ** 2 / s)), keep)
+        lines = [_slow_line(x[:, j] * e / s, float(np.sum(x[:, j] ** 2 / s)), keep)
                  for x, e, s, keep in parts if np.any(x[:, j])]  # fmt: skip
         if lines:
             p_values[f"rhythm of {name}"] = min(1.0, min(lines) * len(lines))
     return p_values
 
 
-def _line(score: Array, size: float, keep: Array) -> float:
+def _slow_line(score: Array, size: float, keep: Array) -> float:
     """Return the probability that the score of a constant has as strong a slow line."""
     filled = np.zeros(len(keep))
     filled[keep] = score
     power = np.abs(np.fft.rfft(filled)) ** 2 / size
-    power = power[1 : max(int(SLOW * len(power)), 2)]
+    return line_chance(power[1 : max(int(SLOW * len(power)), 2)])
+
+
+def line_chance(power: Array) -> float:
+    """Return the probability that noise, of mean power one, has as strong a line somewhere."""
     return float(-np.expm1(len(power) * np.log1p(-np.exp(-power.max(initial=0.0)))))
 
 

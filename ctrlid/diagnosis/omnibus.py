@@ -10,7 +10,7 @@ from scipy import stats
 from ..likelihood import Fit
 from ..physics import Array
 from ..residuals import remembered
-from .constancy import FEWEST, bin_edges, bin_index, constancy
+from .constancy import FEWEST, bin_edges, bin_index, constancy, line_chance
 from .result import Place
 
 LAGS = 25
@@ -129,8 +129,7 @@ def _cross(z: Array, keep: Array, u: Array, r: Array) -> tuple[float, int]:
 
 def _line(z: Array, n: int) -> float:
     """Return the probability that noise has as strong a line, of Fisher's test."""
-    power = np.abs(np.fft.rfft(z))[1:-1] ** 2 / n
-    return float(-np.expm1(len(power) * np.log1p(-np.exp(-power.max(initial=0.0)))))
+    return line_chance(np.abs(np.fft.rfft(z))[1:-1] ** 2 / n)
 
 
 def _tails(z: Array) -> dict[str, float]:

@@ -62,7 +62,6 @@ def search(
     Search
         The rounds and the final model.
     """
-    record = base.fit.problem.tracks[0].record
     given = len(base.loop.effects)
     model = base
     steps: list[Step] = []
@@ -73,7 +72,7 @@ def search(
 
     while len(model.loop.effects) - given < MANY and len(steps) < MANY + 2:
         tell(f"round {len(steps) + 1}: screening")
-        pool = [c for c in candidates(catalogue, model.fitted, record) if not _there(model, c)]
+        pool = _pool(model, catalogue)
         step = one_round(model, pool, work, None if steps else anchor(base))
         if step.best is not None and step.best.gain < LITTLE * excess(model.fit):
             step = replace(step, best=None)
@@ -106,11 +105,10 @@ def _foreseen(
     assert step.best is not None
     best = last.best
     near = [t for t in last.trials[1:NEXT] if _nearly(t, best)][:FORESEEN]
-    record = last.base.fit.problem.tracks[0].record
     pairs: list[tuple[float, int]] = []
     for k, trial in enumerate(near):
         model = whole(trial.model)
-        pool = [c for c in candidates(catalogue, model.fitted, record) if not _there(model, c)]
+        pool = _pool(model, catalogue)
         tried: list[Trial] = work(lambda effect, model=model: scanned(model, effect), pool)
         tried = sorted(tried, key=lambda t: t.price - t.promise)[:2]
         done = work(lambda t, model=model: refit(model, t), tried)
@@ -174,6 +172,12 @@ def main_ones(found: Search, helps: Callable[[Found, Model], bool]) -> Search:
     if len(left) == len(found.found):
         return found
     return replace(found, final=model, found=tuple(left), after=_judged(model))
+
+
+def _pool(model: Model, catalogue: Sequence[type[AbstractEffect]]) -> list[AbstractEffect]:
+    """Return the candidates that a model does not have yet."""
+    record = model.fit.problem.tracks[0].record
+    return [c for c in candidates(catalogue, model.fitted, record) if not _there(model, c)]
 
 
 def _there(model: Model, effect: AbstractEffect) -> bool:
