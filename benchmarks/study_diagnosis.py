@@ -317,6 +317,8 @@ def sized(
             continue
         near = abs(math.log(max(gain, 0.5) * one.samples / tried.samples / target))
         if full and band[0] <= gain <= band[1] and near < near_enough:
+            if any(f.kind == "constant signal" for f in cid.audit(record).findings):
+                return None  # the plant is gone, the sensor sits on its limit
             label = type(effect).__name__
             return Case(one, real, (effect,), record, seed, truth, gain, label=label)
         if near < near_enough and not full:

@@ -201,12 +201,20 @@ class _Look:
         return [AuditFinding("too few samples", "", text, count, self.whole, harmful=True)]
 
     def constant(self) -> list[AuditFinding]:
-        return [
-            AuditFinding("constant signal", key, f"{key} stays at {self.show(key, float(v[0]))}: "
-                         "nothing can be learnt from it.", 0.0, self.whole, harmful=True)
-            for key in ("u", "y")
-            if np.ptp(v := self.signals[key][self.valid]) <= defects.hair(v)
-        ]  # fmt: skip
+        out = []
+        driver = self.signals.get("r", self.signals["u"])[self.valid]
+        for key in ("u", "y"):
+            v = self.signals[key][self.valid]
+            value, long = float(v[0]), ""
+            if np.ptp(v) > defects.hair(v):
+                share, value = defects.stuck(v, driver) if key == "y" else (0.0, 0.0)
+                if not share:
+                    continue
+                long = f" for {100 * share:.4g} % of the samples, whatever moves it"
+            text = f"{key} stays at {self.show(key, value)}{long}: nothing can be learnt from it."
+            kind = "constant signal"
+            out.append(AuditFinding(kind, key, text, 0.0, self.whole, harmful=True))
+        return out
 
     def limits(self) -> list[AuditFinding]:
         out = []

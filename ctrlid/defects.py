@@ -15,9 +15,11 @@ FloatArray = npt.NDArray[np.float64]
 
 ENOUGH = 20_000  # samples from which a grid is read
 LEVELS = 12  # distinct values up to which a signal may be a staircase
+STUCK = 0.9  # of the samples on one value: whatever moves the signal is not seen
 SOME = 4  # equal extreme values that no continuous distribution gives
 QUIET = 8  # samples to either side that tell whether a spike stands alone
 BLOCKS = 40  # of which the means show a drift
+PLENTY = 100_000  # samples that tell how large a drift is; of longer records every k-th
 
 
 def runs(mask: Any) -> tuple[Any, Any]:
@@ -97,6 +99,20 @@ def grid_step(v: FloatArray) -> float:
     if len(values) <= LEVELS and (not jumps.size or np.median(jumps) > 1.5 * step):
         return 0.0
     return step
+
+
+def stuck(v: FloatArray, driver: FloatArray) -> tuple[float, float]:
+    """Return the share of the samples at which a signal sits on its extreme, and that value.
+
+    Zero unless it is nearly all of them, and the signal leaves the value far less often than what
+    drives it changes: one that rests between moves is not stuck.
+    """
+    changes = np.count_nonzero(np.abs(np.diff(driver)) > hair(driver))
+    for value in (float(v.min()), float(v.max())):
+        at = np.abs(v - value) <= hair(v)
+        if np.mean(at) > STUCK and len(runs(at)[0]) < (1 - STUCK) * changes:
+            return float(np.mean(at)), value
+    return 0.0, 0.0
 
 
 def clipped(
@@ -301,9 +317,10 @@ def drift(y: FloatArray, causes: Sequence[FloatArray]) -> tuple[float, float, fl
         return out
 
     y = y - y[0]
-    whole = columns(causes, np.linspace(-1, 1, n))
-    beta, e = split(y, whole)
-    change = float(np.ptp(whole[:: max(1, n // 200), -3:] @ beta[-3:]))
+    some = slice(None, None, max(1, n // PLENTY))
+    whole = columns([w[some] for w in causes], np.linspace(-1, 1, n)[some])
+    beta, e = split(y[some], whole)
+    change = float(np.ptp(whole[:: max(1, len(e) // 200), -3:] @ beta[-3:]))
     scatter = float(np.std(e))
     if scatter <= 1e-9 * float(np.std(y)):
         return change, scatter, 1.0

@@ -483,6 +483,12 @@ def make_track(loop: Loop, record: Record, begin: float = 0.0) -> Track:
                  fresh_starts(loop, record), doubt, start, spread, scale)  # fmt: skip
 
 
+def retracked(track: Track, loop: Loop) -> Track:
+    """Return a track made ready for another model of the same loop; the signals are shared."""
+    start, spread, _ = _start(loop, track.record)
+    return replace(track, afresh=fresh_starts(loop, track.record), start=start, spread=spread)
+
+
 def fresh_starts(loop: Loop, record: Record) -> Any:
     """Return at which samples the filter begins anew: at the start and in long gaps."""
     e = loop.equations()

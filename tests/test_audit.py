@@ -370,6 +370,21 @@ def test_constant_signals():
     assert "u stays at 2 V" in found["constant signal"][0].text
 
 
+def test_a_signal_that_is_stuck_most_of_the_time():
+    rng = np.random.default_rng(12)
+    r = np.repeat(rng.choice([-1.0, 1.0], 100), 20)
+    u = r + 0.1 * rng.standard_normal(2000)
+    fallen = np.full(2000, -0.3)
+    fallen[:5] = [0.0, -0.02, -0.07, -0.15, -0.25]
+    found = cid.audit(cid.Record(r=r, u=u, y=fallen, dt=0.01))["constant signal"]
+    assert "y stays at -0.3 for 99.75 % of the samples" in found[0].text
+    rests = np.zeros(2000)  # a drive that goes out and back now and then, and rests at nought
+    r = np.zeros(2000)
+    for k in (300, 900, 1500):
+        r[k : k + 40], rests[k + 5 : k + 60] = 1.0, np.sin(np.linspace(0, np.pi, 55))
+    assert not cid.audit(cid.Record(r=r, u=rests - r, y=rests, dt=0.01))["constant signal"]
+
+
 def test_refusal_says_what_is_needed():
     with pytest.raises(cid.CtrlidError, match="audit needs a Record"):
         cid.audit([1, 2, 3])

@@ -15,7 +15,16 @@ from ..loop import Loop
 from .decide import GATE
 from .replica import DOUBTFUL, TWICE, artefact, kinked, more_than_simple, replica, simulable
 from .scan import scanned
-from .trial import Model, Trial, attempt_at, contains, promised, refit, same_kind
+from .trial import (
+    Model,
+    Trial,
+    attempt_at,
+    comparable,
+    contains,
+    promised,
+    refit,
+    same_kind,
+)
 
 NEXT = 5  # candidates after the best that are looked at closely
 TOP = 5  # candidates refitted because of what they promise
@@ -107,6 +116,7 @@ def one_round(
     if plain is not trials[0]:
         trials = [plain, *(t for t in trials if not same_kind(t.effect, plain.effect))]
     best = trials[0]
+    trials = [*trials[:NEXT], *map(comparable, trials[NEXT:])]
     return Step(base, tuple(trials), best if best.merit > GATE else None)
 
 

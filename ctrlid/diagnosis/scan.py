@@ -20,7 +20,7 @@ from ..likelihood import pseudo_inverse
 from ..physics import Array
 from .trial import Model, Trial, attempt, attempt_best
 
-COLUMNS = 2_000_000  # numbers in a block of shapes at once
+COLUMNS = 500_000  # numbers in a block of shapes at once
 LENGTHS = 150  # wavelengths that are looked for in the travel
 EDGE = 0.03  # of the record, at either end
 TIMES = 40  # instants at which a parameter might have stepped
@@ -198,7 +198,7 @@ def _step(model: Model, effect: ParameterStep) -> Trial:
     while True:
         times = np.linspace(low, high, TIMES + 2)[1:-1]
         shapes = [t.table[0][:, None] >= times for t in model.fit.problem.tracks]
-        gains, sizes = promises(model, [s.astype(float) for s in shapes], effect.name)
+        gains, sizes = promises(model, shapes, effect.name)
         best = int(np.argmax(gains))
         width = times[1] - times[0]
         if width < 0.5 * records[0].dt:

@@ -10,7 +10,7 @@ import numpy as np
 from ..data import Record
 from ..effects import AbstractEffect
 from ..errors import CtrlidError
-from ..filtering import Machine, Trajectory, make_track
+from ..filtering import Machine, Trajectory, retracked
 from ..likelihood import (
     Fit,
     begin,
@@ -289,6 +289,17 @@ def spared(fit: Fit) -> Fit:
     return _as_known(fit, replace(fit, linearized=()))
 
 
+def comparable(trial: Trial) -> Trial:
+    """Return a trial with what a comparison of likelihoods needs, without what a refit would."""
+    fit, none = trial.model.fit, np.zeros((0, 0))
+    nowhere = Trajectory(none, none, none)
+    bare = tuple(
+        replace(out, trajectory=nowhere, slopes=none, disturbance=none) for out in fit.filtered
+    )
+    slim = _as_known(fit, replace(fit, linearized=(), filtered=bare))
+    return replace(trial, model=replace(trial.model, fit=slim))
+
+
 def _as_known(fit: Fit, bare: Fit) -> Fit:
     """Return a fit that lost its arrays with what had been computed from them."""
     bare.__dict__["normal"] = fit.normal
@@ -310,7 +321,7 @@ def _extended(base: Model, loop: Loop, names: Sequence[str]) -> Fit:
     """Return the likelihood of a larger model at its start, along the base's trajectory."""
     old = base.fit.problem
     m = Machine(loop, names, old.machine.hold, old.machine.law is not None)
-    tracks = tuple(make_track(loop, t.record, float(t.table[0, 0])) for t in old.tracks)
+    tracks = tuple(retracked(track, loop) for track in old.tracks)
     at = [
         _carried(old.machine, m, out.trajectory, m.guess(track))
         for out, track in zip(base.fit.filtered, tracks, strict=True)
