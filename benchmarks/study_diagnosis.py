@@ -57,6 +57,8 @@ ROUNDS = 9  # of finding its size
 SHORT = 5  # the first of them on records so many times shorter
 LARGEST = 40.0  # of what is easily seen: beyond, friction holds everything fast
 MARGINAL = 100.0  # what each of several effects must be worth beside the others
+MUTE = 10.0  # of log-likelihood: what is outside gains no more than the answer has
+QUICK = 0.05  # samples: how fast an actuator or a sensor follows where nothing holds it
 CONFUSED = "InputDelay", "SensorLag", "ForceExponent", "PositionOffset", "LinearStiffness"
 
 
@@ -72,7 +74,7 @@ class RateLimit(effects.InputEffect):
 
     def rates(self, m: Any) -> tuple[Any, ...]:
         """Return the rate, limited."""
-        wanted = (m.u - m.own["moving"]) / (0.3 * m.dt)
+        wanted = (m.u - m.own["moving"]) / (QUICK * m.dt)
         return (np.minimum(np.maximum(wanted, -self.rate), self.rate),)
 
     def rest(self, at: Any) -> tuple[float, ...]:
@@ -134,7 +136,7 @@ class SensorHysteresis(effects.OutputEffect):
         """Return the rate at which the shown value is taken along."""
         apart = m.y - m.own["shown"]
         half = self.width / 2
-        return ((apart - np.minimum(np.maximum(apart, -half), half)) / (0.2 * m.dt),)
+        return ((apart - np.minimum(np.maximum(apart, -half), half)) / (QUICK * m.dt),)
 
     def rest(self, at: Any) -> tuple[float, ...]:
         """Return the output at rest."""
@@ -646,7 +648,7 @@ def answered(found: Any, case: Case) -> float:
         f"{label}.{p.name}" for label, e in loop.labelled.items() for p in e.parameters()
         if math.isfinite(getattr(e, p.name))
     ]  # fmt: skip
-    if case.spread:
+    if case.spread and not case.effects:
         return math.nan
     mine = base_model(loop, [case.record], (*loop.free, *own))
     return case.truth.fit.value - mine.fit.value
@@ -764,6 +766,8 @@ def report(rows: Sequence[Row]) -> None:
     if outside:
         open_end = [r.verdict in ("unknown", "partly explained") for r in outside]
         lines.append(("outside: unknown or partly explained", ">= 95 %", share(open_end)))
+        mute = [not o and r.left < MUTE for o, r in zip(open_end, outside, strict=True)]
+        lines.append(("outside: the record says no more than the answer", "", share(mute)))
     for kind, both, exact in (("two", ">= 95 %", ">= 90 %"), ("three", ">= 85 %", "")):
         some = [r for r in done if r.kind == kind]
         if some:

@@ -13,7 +13,7 @@ import numpy as np
 LARGE = 1e150
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def filter_pass(
     step: Any, a: Any, b: Any, du: Any, dp: Any, height: Any, c: Any, hp: Any, predicted: Any,
     filtered: Any, y: Any, valid: Any, afresh: Any, doubt: Any, start: Any, spread: Any,

@@ -24,7 +24,16 @@ COLUMNS = 500_000  # numbers in a block of shapes at once
 LENGTHS = 150  # wavelengths that are looked for in the travel
 EDGE = 0.03  # of the record, at either end
 TIMES = 40  # instants at which a parameter might have stepped
-LIMITS = (0.8, 0.9, 0.95, 0.98, 0.995, 0.999)  # quantiles at which a state may be limited
+LIMITS = (
+    0.999,
+    0.998,
+    0.995,
+    0.99,
+    0.98,
+    0.95,
+    0.9,
+    0.8,
+)  # quantiles at which a state may be limited
 MODES = 7  # frequencies at which a flexible mode is tried
 
 
@@ -138,6 +147,7 @@ def _limit(model: Model, effect: StateLimit) -> Trial:
         return attempt(model, effect)
     k = states.index(effect.name)
     values = np.concatenate([out.trajectory.filtered[:, k] for out in model.fit.filtered])
+    # From the highest down: where it cuts off little, the trajectory of the model still holds.
     limits = [float(v) for v in np.quantile(values, LIMITS)]
     return attempt_best(model, [replace(effect, upper=v) for v in limits], math.log(len(limits)))
 

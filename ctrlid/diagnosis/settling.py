@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from ..likelihood import climb, polish
 from ..loop import Loop
 from ..loop_fit import choose_noise
-from .decide import GATE, rivals
+from .decide import CLOSE, GATE, rivals
 from .omnibus import omnibus
 from .rounds import NEXT, Step, Work, plainer
 from .trial import Model, Trial, attempt_at, needed, reduced, refit, spared
@@ -102,7 +102,12 @@ def cut(model: Model, position: int) -> tuple[Model, Trial]:
     effect = model.fitted.effects[position]
     loop, names = taken_out(model.fitted, position, model.names)
     smaller = Model(loop, spared(climb(reduced(model, loop, names), rounds=10)))
-    return smaller, refit(smaller, attempt_at(smaller, effect))
+    start = attempt_at(smaller, effect)
+    back = refit(smaller, start)
+    if back.remark or back.model.fit.value < model.fit.value - CLOSE:
+        # Without it all else may have gone too far astray to come back; the way is known.
+        back = max(back, refit(smaller, start, model), key=lambda t: t.merit)
+    return smaller, back
 
 
 def renoised(model: Model) -> Model:

@@ -399,6 +399,12 @@ def refit(base: Model, trial: Trial, near: Model | None = None) -> Trial:
     try:
         start = _extended(near or base, loop, names)
         fit = spared(climb(start, rounds=SCREEN_ROUNDS, exact=False))
+        short = fit.value - base.fit.value < trial.promise
+        if short and start.noise.drift and start.problem.known is None:
+            # A random force that was fitted while the effect was missing may never let it in.
+            plain = replace(start, noise=replace(start.noise, memory=0.0, drift=0.0))
+            alone = spared(climb(plain, rounds=SCREEN_ROUNDS, exact=False))
+            fit = alone if alone.value > fit.value else fit
     except CtrlidError as reason:
         return replace(trial, remark=str(reason))
     model = Model(trial.model.loop, fit)
@@ -437,7 +443,8 @@ def _objection(trial: Trial) -> str:
             return f"{about.name} ends on its bound {fit.theta[k]:g}"
     if _insignificant(trial, effect):
         return "no larger than its uncertainty"
-    return ""
+    every = all(f"{trial.label}.{p.name}" in names for p in effect.parameters())
+    return effect.doubt() if every else ""  # what is held still, another effect has
 
 
 def needed(model: Model, position: int) -> float:

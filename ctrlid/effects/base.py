@@ -61,6 +61,10 @@ class AbstractEffect:
     def check(self) -> None:
         """Refuse values that do not fit together; nothing by default."""
 
+    def doubt(self) -> str:
+        """Say why values that were fitted cannot be this effect; nothing by default."""
+        return ""
+
     @classmethod
     def parameters(cls) -> tuple[Parameter, ...]:
         """Return what is known about each parameter."""

@@ -14,6 +14,7 @@ from .places import ForceEffect
 
 # Within one sample friction changes the velocity by fc*dt: samples cannot show how it sticks.
 STICKING = 0.25
+PUSHING = 1.5  # half the difference over the mean: with some room for their uncertainty
 
 
 @final
@@ -157,6 +158,12 @@ class AsymmetricCoulombFriction(ForceEffect):
         "slow strokes forwards and backwards: the force that each direction takes is read off one "
         "by one"
     )
+
+    def doubt(self) -> str:
+        """Say so where it would push: friction is against the motion in both directions."""
+        if abs(self.difference) > PUSHING * self.fc:
+            return "in one direction it would push along, as a constant force does and no friction"
+        return ""
 
     def force(self, m: Moment) -> Any:
         """Return the acceleration."""
