@@ -262,3 +262,49 @@ def test_units_of_the_record_that_are_not_those_of_the_plant_are_told():
     assert "y is recorded in V, and the plant counts it in m" in told[1]
     again = cid.diagnose(loop, record, progress=False, catalogue=[E.CoulombFriction])
     assert not [text for text in again.audit if text.startswith("units: ")]
+
+
+def test_a_limit_is_found_behind_a_random_force_that_stood_for_it():
+    plant = cid.plants.tank(area=0.0147, outlet=7.7e-5, k=5.9e-5)
+    op = cid.operating_point(plant, output=0.8)
+    loop = cid.Loop(plant, cid.PID(kp=4.0, ki=0.03), dt=12.0, at=op, free=("k", "outlet"))
+    real = loop.with_effect(E.StateLimit("h", upper=0.82))
+    r = cid.random_binary(12000, amplitude=0.045, hold=40, around=0.8, seed=9300)
+    record = cid.simulate(real, r, sensor_noise=3e-3, seed=9301)
+    believed = loop.with_parameters({"k": 6.1e-5, "outlet": 7.1e-5})
+    base = base_model(believed, [record], believed.free)
+    assert base.fit.noise.drift > 0  # there is none in the record
+    (start,) = E.StateLimit.candidates(base.fitted, record)
+    trial = refit(base, scanned(base, start))
+    assert trial.model.fit.noise.drift == 0
+    assert trial.fitted.upper == pytest.approx(0.82, abs=2e-4)
+    assert trial.model.fitted.parameters["k"] == pytest.approx(5.9e-5, rel=0.02)
+
+
+def test_an_overflow_is_looked_for_from_above():
+    def rates(t, x, u, p):
+        upper, lower = np.sqrt(np.maximum(x, 1e-6))
+        return np.array([p["k"] * u[0] - 0.05 * upper, 0.05 * upper - 0.06 * lower])
+
+    plant = ct.nlsys(rates, lambda t, x, u, p: x[1], inputs=["u"], outputs=["y"],
+                     states=["h1", "h2"], params={"k": 0.05}, name="two tanks")  # fmt: skip
+    at = cid.operating_point(plant, output=6.0)
+    loop = cid.Loop(plant, cid.PID(kp=0.5, ki=0.005), dt=4.0, at=at, free=("k",))
+    full = at.states[0] * 1.3
+    record = record_of(loop, E.StateLimit("h1", full, "h2", share=0.3), 1.5, 1e-2, 9320)
+    base = base_model(loop, [record], loop.free)
+    start, _ = E.StateLimit.candidates(base.fitted, record)
+    trial = scanned(base, start)
+    assert trial.promise > 20
+    fitted = refit(base, trial).fitted
+    assert (fitted.upper, fitted.share) == pytest.approx((full, 0.3), rel=0.1)
+
+
+def test_friction_that_would_push_is_none():
+    assert not E.AsymmetricCoulombFriction(fc=0.2, difference=-0.25).doubt()
+    assert "push" in E.AsymmetricCoulombFriction(fc=0.1, difference=-0.25).doubt()
+    loop = levitation()
+    record = record_of(loop, E.ConstantForce(-0.5), 4e-4, 1e-6, 9330)
+    base = base_model(loop, [record], loop.free)
+    start = E.AsymmetricCoulombFriction(fc=0.0, difference=0.0)
+    assert "push" in refit(base, attempt_at(base, start)).remark

@@ -399,8 +399,7 @@ def refit(base: Model, trial: Trial, near: Model | None = None) -> Trial:
     try:
         start = _extended(near or base, loop, names)
         fit = spared(climb(start, rounds=SCREEN_ROUNDS, exact=False))
-        short = fit.value - base.fit.value < trial.promise
-        if short and start.noise.drift and start.problem.known is None:
+        if start.noise.drift and start.problem.known is None:
             # A random force that was fitted while the effect was missing may never let it in.
             plain = replace(start, noise=replace(start.noise, memory=0.0, drift=0.0))
             alone = spared(climb(plain, rounds=SCREEN_ROUNDS, exact=False))
