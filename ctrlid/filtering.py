@@ -37,6 +37,7 @@ SETTLED = 4.0  # times the usual variance: above, the start still dominates the 
 SLOW = 0.35  # rate times step up to which a step of order four is exact enough
 MOST_STEPS = 100  # of order eight in a period: more make an expression that takes minutes to build
 KINK_STEPS = 4  # of order four in a period where friction has a kink
+NEWTON = 6  # steps that unbend the curve of a sensor
 PASSES = 12  # at most, to let the trajectory settle
 STILL = 1e-3  # of the standard deviations: a trajectory that moves less has settled
 
@@ -364,15 +365,37 @@ class Machine:
         """Return a trajectory to begin with: at rest, states that are measured as measured."""
         n, e = len(track.record), self.e
         rest = np.tile(self._padded(track.start), (n, 1))
-        for j in range(self.n):
-            if casadi.is_equal(e.output, e.x[j], 2):
-                rest[:, j] = track.table[3]
+        seen, values = e.output, track.table[3]
+        for _ in range(1 + len(e.lags)):  # behind a lag of the sensor is what it follows, nearly
+            columns = casadi.jacobian(seen, e.x).sparsity().get_col()
+            if len(columns) != 1 or casadi.depends_on(seen, casadi.vertcat(e.t, e.u)):
+                break
+            j = columns[0]
+            rest[:, j] = values = self._unbent(seen, e.x[j], float(rest[0, j]), values)
+            behind = [lag.target for lag in e.lags if lag.state == j]
+            if not behind:
+                break
+            seen = behind[0]
         for lag in e.lags:
             if casadi.is_equal(lag.target, e.u, 2):
                 rest[:, lag.state] = track.table[1]
         spread = np.sqrt(np.diag(self._padded(track.spread)))
         quiet = np.minimum(spread, 1.0) * track.scale
         return Trajectory(rest, rest.copy(), np.tile(quiet, (n, 1)))
+
+    def _unbent(self, seen: Any, x: Any, at: float, values: Array) -> Array:
+        """Return the state x that is seen as given values, by Newton's rule; else at rest."""
+        if casadi.is_equal(seen, x, 2):
+            return values
+        f = Vectorized(casadi.Function("seen", [x, self.e.p], [seen, casadi.jacobian(seen, x)]))
+        found = np.full(len(values), at)
+        first = np.abs(f(found, self.e.values)[0].ravel() - values)
+        with np.errstate(all="ignore"):
+            for _ in range(NEWTON):
+                height, slope = (part.ravel() for part in f(found, self.e.values))
+                found = found + (values - height) / slope
+            left = np.abs(f(found, self.e.values)[0].ravel() - values)
+        return np.where(left <= first, found, at)  # also where it is no number
 
     def settle(
         self, track: Track, theta: Array, noise: Noise, at: Trajectory, passes: int = PASSES

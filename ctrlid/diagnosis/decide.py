@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ..effects import AbstractEffect, PositionRipple
 from ..physics import Array
 from .trial import Trial, contains, log_terms, same_kind
 
@@ -15,7 +16,33 @@ Z = 2.0  # standard deviations of Vuong's test
 DOUBT = 0.6  # of the best merit: where something is left, a look-alike with more is not excluded
 OPEN = 0.1  # standard error over the size of an effect: beyond, a further parameter may matter
 MANY = 4  # effects at once: such a list describes almost any error, and explains none
+SOME = 3  # effects at once, of which none may be slight
+SLIGHT = 0.05  # of the largest gain: what corrects so little of it corrects a wrong law, perhaps
 BLOCK = 50  # samples whose terms are summed before their spread is taken
+
+
+def doubt_of_all(effects: Sequence[AbstractEffect], gains: Sequence[float]) -> str:
+    """Say why effects that explain a record together may yet be no explanation.
+
+    Parameters
+    ----------
+    effects : sequence of effects
+        Those that were found.
+    gains : sequence of float
+        What each gains of log-likelihood beside the others.
+
+    Returns
+    -------
+    str
+        The reason, empty if there is none.
+    """
+    if len(effects) >= MANY:
+        return "so many effects at once describe almost any error, and prove little"
+    if sum(isinstance(e, PositionRipple) for e in effects) > 1:
+        return "several ripples together describe any curve over the position, and prove little"
+    if len(effects) >= SOME and min(gains) < SLIGHT * max(gains):
+        return "the smallest of so many effects may only correct what a larger one gets wrong"
+    return ""
 
 
 def vuong(best: Array, other: Array, penalty: float) -> float:

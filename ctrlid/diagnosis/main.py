@@ -22,7 +22,7 @@ from ..loop import Loop
 from ..loop_fit import summary
 from ..model import delay_of
 from . import gap as gaps
-from .decide import GATE, MANY
+from .decide import GATE, doubt_of_all
 from .experiment import separating_experiment
 from .fresh import Fresh, fresh_data, stretches
 from .omnibus import places
@@ -418,7 +418,8 @@ def _result(
     # A random force that may do anything explains everything, and nothing.
     blamed = disturbance.large or math.isnan(disturbance.share)
     left = left or (blamed and gap.after > WORSE * gap.given)
-    if found.after.passed and not left and len(found.found) < MANY:
+    loose = doubt_of_all([f.trial.effect for f in found.found], [f.trial.gain for f in found.found])
+    if found.after.passed and not left and not loose:
         verdict = "explained" if findings else "nothing missing"
     else:
         verdict = "partly explained" if findings else "unknown"

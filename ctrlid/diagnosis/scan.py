@@ -18,9 +18,11 @@ from ..effects import (
 from ..errors import CtrlidError
 from ..likelihood import pseudo_inverse
 from ..physics import Array
-from .trial import Model, Trial, attempt, attempt_best
+from .trial import Model, Trial, attempt, attempt_at, attempt_best, refit
 
 COLUMNS = 500_000  # numbers in a block of shapes at once
+NEARLY = 0.7  # of the best promise: another wave that may be the right one
+PEAKS = 4  # such waves at most
 LENGTHS = 150  # wavelengths that are looked for in the travel
 EDGE = 0.03  # of the record, at either end
 TIMES = 40  # instants at which a parameter might have stepped
@@ -173,7 +175,7 @@ def _ripple(model: Model, effect: PositionRipple) -> Trial:
     shortest = max(travel / LENGTHS, 4 * step, 4 * grain)
     if not travel > 2 * shortest:
         return Trial(effect, "", model, -math.inf, remark="the travel is too short to see a ripple")
-    waves = np.arange(1.0 / travel, 1.0 / shortest, 0.5 / travel)
+    waves = np.arange(1.0 / travel, 1.0 / shortest, 0.25 / travel)
 
     def shapes(waves: Array) -> list[Array]:
         angles = [2 * np.pi * np.outer(w, waves) for w in ways]
@@ -185,10 +187,30 @@ def _ripple(model: Model, effect: PositionRipple) -> Trial:
     parts = [promises(model, shapes(waves[k : k + block]), width=2)
              for k in range(0, len(waves), block)]  # fmt: skip
     gains, sizes = (np.concatenate(x) for x in zip(*parts, strict=True))
-    best = int(np.argmax(gains))
-    amplitude, phase = _wave(sizes[best])
-    start = replace(effect, amplitude=amplitude, period=float(1 / waves[best]), phase=phase)
-    return attempt(model, start, math.log(max(len(waves) / 2, 1)))
+    price = math.log(max(len(waves) / 4, 1))
+
+    def at(k: int) -> Trial:
+        amplitude, phase = _wave(sizes[k])
+        wave = replace(effect, amplitude=amplitude, period=float(1 / waves[k]), phase=phase)
+        return attempt(model, wave, price)
+
+    tops = _peaks(gains)
+    tried = [at(k) for k in tops]
+    if len(tried) > 1 and tried[0].promise > tried[0].price:
+        # Motion between a few levels sees several waves nearly alike: only fits tell them apart.
+        fits = [refit(model, t) for t in tried]
+        best = max(range(len(fits)), key=lambda k: fits[k].merit)
+        if math.isfinite(fits[best].merit):
+            return attempt_at(model, fits[best].fitted, price)
+    return tried[0]
+
+
+def _peaks(gains: Array) -> list[int]:
+    """Return the highest peaks, at most a few that are nearly as high as the best."""
+    padded = np.concatenate([[-np.inf], gains, [-np.inf]])
+    tops = np.flatnonzero((gains >= padded[:-2]) & (gains > padded[2:]))
+    tops = tops[gains[tops] > NEARLY * gains.max()]
+    return [int(k) for k in tops[np.argsort(-gains[tops])][:PEAKS]] or [int(np.argmax(gains))]
 
 
 def _grain(y: Array) -> float:

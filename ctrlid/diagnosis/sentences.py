@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from .._text import chance, number
-from .decide import MANY
+from .decide import doubt_of_all
 from .omnibus import Omnibus
 from .result import Disturbance, Finding, Gap, Place, Verdict
 
@@ -39,8 +39,9 @@ def conclusion(
     why = f"the test of {name} fails ({chance(p)})"
     if after.passed:
         why = "on data kept back the gap stays well above the noise floor"
-        if len(findings) >= MANY:
-            why = "so many effects at once describe almost any error, and prove little"
+        loose = doubt_of_all([f.effect for f in findings], [f.evidence for f in findings])
+        if loose:
+            why = loose
         elif gap.after > gap.given:
             why = "on data kept back the gap is wider than that of the model as given"
     were, them = ("were", "them") if len(findings) > 1 else ("was", "it")
