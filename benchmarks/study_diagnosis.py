@@ -321,6 +321,9 @@ def sized(
         if full and band[0] <= gain <= band[1] and near < near_enough:
             if any(f.kind == "constant signal" for f in cid.audit(record).findings):
                 return None  # the plant is gone, the sensor sits on its limit
+            own = [k for k, n in enumerate(truth.names) if "." in n]
+            if describable and not np.any(np.diag(truth.fit.normal[0])[own] > 0):
+                return None  # nothing moves any more: any size is the same
             label = type(effect).__name__
             return Case(one, real, (effect,), record, seed, truth, gain, label=label)
         if near < near_enough and not full:

@@ -18,6 +18,7 @@ FAR = 3.0  # standard errors: after a longer step the trajectory is settled anew
 CLOSE = 0.02  # standard errors: a smaller step ends the search
 QUIET = 1e-14  # of the output's size, squared: the least variance of the sensor noise
 LEAST = -24.0  # logarithm of the least force noise: below, only the start of the record counts
+MOST = 14.0  # and of the largest: above, the sensor is exact
 SLOWEST = 0.05  # of the longest record: the time constant of a coloured force
 LOG_STEP = 0.2  # of log variances, for derivatives
 SINGULAR = 1e-10  # relative eigenvalue below which a direction is not in the data
@@ -242,7 +243,7 @@ def _tune(
     low, high = _limits(m, len(start) > m.channels, longest)
     start = np.clip(start, low, high)
     if wide:
-        grid = np.linspace(low[0], high[0], 16)
+        grid = np.linspace(low[0], high[0], 20)
         best = grid[int(np.argmin([cost(np.full(m.channels, g)) for g in grid]))]
         start[: m.channels] = best
     if len(start) == 1:
@@ -273,10 +274,10 @@ def _limits(m: Machine, coloured: bool, longest: int) -> tuple[Array, Array]:
     A force that hardly changes during a record is an offset, not noise.
     """
     unit, dt = 2 * math.log(_unit(m)), m.loop.dt
-    low, high = [unit + LEAST] * m.channels, [unit + 6.0] * m.channels
+    low, high = [unit + LEAST] * m.channels, [unit + MOST] * m.channels
     if coloured:
         low += [unit + LEAST, math.log(2 * dt)]
-        high += [unit + 6.0, math.log(max(min(SLOWEST * longest, 2e4), 4.0) * dt)]
+        high += [unit + MOST, math.log(max(min(SLOWEST * longest, 2e4), 4.0) * dt)]
     return np.array(low), np.array(high)
 
 

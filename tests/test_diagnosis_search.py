@@ -12,7 +12,7 @@ from scipy import signal, stats
 
 import ctrlid as cid
 from ctrlid import effects as E
-from ctrlid.diagnosis.decide import rivals
+from ctrlid.diagnosis.decide import doubt_of_all, rivals
 from ctrlid.diagnosis.experiment import separating_experiment
 from ctrlid.diagnosis.omnibus import Omnibus, _shape, omnibus
 from ctrlid.diagnosis.replica import replica
@@ -30,6 +30,7 @@ from ctrlid.diagnosis.trial import (
     spared,
     whole,
 )
+from ctrlid.filtering import machine_for, make_track
 
 
 def levitation():
@@ -308,3 +309,44 @@ def test_friction_that_would_push_is_none():
     base = base_model(loop, [record], loop.free)
     start = E.AsymmetricCoulombFriction(fc=0.0, difference=0.0)
     assert "push" in refit(base, attempt_at(base, start)).remark
+
+
+def test_waves_that_two_levels_see_nearly_alike_are_fitted():
+    loop = levitation()
+    ripple = E.PositionRipple(amplitude=0.4, period=2.3e-4, phase=1.0)
+    record = record_of(loop, ripple, 2.5e-4, 1e-6, 9340, n=6000)
+    base = base_model(loop, [record], loop.free)
+    (start,) = E.PositionRipple.candidates(base.fitted, record)
+    trial = refit(base, scanned(base, start))
+    assert trial.fitted.period == pytest.approx(2.3e-4, rel=0.005)
+    assert trial.fitted.amplitude == pytest.approx(0.4, rel=0.1)
+
+
+def test_a_limit_of_the_input_is_found_wherever_it_cuts():
+    loop = levitation()
+    record = record_of(loop, E.InputSaturation(-np.inf, 4.0), 6e-4, 1e-6, 9350)
+    base = base_model(loop, [record], loop.free)
+    (start,) = E.InputSaturation.candidates(base.fitted, record)
+    trial = refit(base, scanned(base, start))
+    assert trial.fitted.upper == pytest.approx(4.0, abs=0.01)
+    assert trial.gain > 1000
+
+
+def test_lists_that_prove_little():
+    ripples = [E.PositionRipple(0.1, period, 0.0) for period in (1e-3, 2e-3)]
+    assert "several ripples" in doubt_of_all(ripples, [100.0, 90.0])
+    three = [E.QuadraticDrag(1.0), E.LinearStiffness(1.0), E.EddyCurrentDamping(0.1)]
+    assert not doubt_of_all(three, [900.0, 300.0, 60.0])
+    assert "larger one gets wrong" in doubt_of_all(three, [900.0, 24.0, 11.0])
+    assert not doubt_of_all(three[:2], [900.0, 11.0])
+
+
+def test_a_filter_begins_where_a_curved_sensor_points():
+    loop = levitation().with_effect(E.SensorLag(4e-4)).with_effect(E.SensorNonlinearity(20.0))
+    truth = np.linspace(0.010, 0.015, 500)
+    y = truth + 20.0 * (truth - loop.point.output) ** 2
+    record = cid.Record(r=y, u=np.full(500, loop.point.input), y=y, dt=2e-3)
+    machine = machine_for(loop, (), record)
+    begun = machine.guess(make_track(loop, record)).predicted
+    position = list(machine.e.states).index("x")
+    np.testing.assert_allclose(begun[:, position], truth, rtol=1e-6)

@@ -10,6 +10,7 @@ import numpy as np
 from ..effects import (
     AbstractEffect,
     FlexibleMode,
+    InputSaturation,
     ParameterStep,
     PeriodicForce,
     PositionRipple,
@@ -154,6 +155,16 @@ def _limit(model: Model, effect: StateLimit) -> Trial:
     return attempt_best(model, [replace(effect, upper=v) for v in limits], math.log(len(limits)))
 
 
+def _saturation(model: Model, effect: InputSaturation) -> Trial:
+    u = np.concatenate([t.table[1][t.valid] for t in model.fit.problem.tracks])
+    upper = [replace(effect, upper=float(v)) for v in np.quantile(u, LIMITS)]
+    lower = [replace(effect, lower=float(v)) for v in np.quantile(u, 1 - np.array(LIMITS))]
+    sides = [[e for e in side if e.lower < e.upper] for side in ([effect], upper, lower)]
+    price = math.log(sum(len(side) for side in sides))
+    return max((attempt_best(model, side, price) for side in sides if side),
+               key=lambda t: t.promise)  # fmt: skip
+
+
 def _periodic(model: Model, effect: PeriodicForce) -> Trial:
     frequency, n = _strongest(model)
     shapes = []
@@ -259,4 +270,5 @@ SCANS: dict[type, Callable[[Model, Any], Trial]] = {
     ParameterStep: _step,
     FlexibleMode: _mode,
     StateLimit: _limit,
+    InputSaturation: _saturation,
 }

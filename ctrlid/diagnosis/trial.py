@@ -263,7 +263,8 @@ def attempt_best(base: Model, effects: Sequence[AbstractEffect], scan: float) ->
     for effect in effects[1:]:
         theta = start.theta.copy()
         for field, value in effect.values().items():
-            theta[names.index(f"{label}.{field}")] = value
+            if f"{label}.{field}" in names:  # and not one that the model's own double
+                theta[names.index(f"{label}.{field}")] = value
         fit = start
         for _ in range(2):  # the second time along its own states
             fit = evaluate(start.problem, theta, start.noise, [o.trajectory for o in fit.filtered])
