@@ -27,7 +27,7 @@ from .experiment import separating_experiment
 from .fresh import Fresh, fresh_data, stretches
 from .omnibus import places
 from .readout import Readout, censored, clipping, steps
-from .replica import forgiven, replica, simulable
+from .replica import forgiven, replica
 from .result import Calibrated, Candidate, Diagnosis, Disturbance, Finding, Gap, Verdict
 from .rounds import Work, check_catalogue
 from .search import Search, main_ones, search
@@ -42,6 +42,7 @@ from .trial import (
     base_model,
     refit,
     same_kind,
+    simulable,
     weighted_by_repeats,
 )
 

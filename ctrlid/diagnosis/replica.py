@@ -11,7 +11,6 @@ from ..errors import CtrlidError
 from ..likelihood import Fit, begin, climb, evaluate
 from ..loop_fit import make_problem
 from ..simulation import Simulator
-from ..stepping import growth_rate
 from .gap import FEW_STEPS, ROUGH, drive, random_noise
 from .omnibus import ALPHA, Omnibus, omnibus
 from .trial import Model, Trial, attempt_at, reduced, refit
@@ -73,14 +72,6 @@ def _simulated(model: Model, record: Record, first: float, sensor: float, seed: 
         begin = first + float(record.t[start] - record.start)
         y[start:stop], u[start:stop] = simulator.run(z, r, d, noise, begin)
     return replace(record, y=y, u=u)
-
-
-def simulable(model: Model) -> bool:
-    """Whether the records can be simulated with this model."""
-    loop = model.loop
-    if loop.controller is None:
-        return growth_rate(loop) < -1e-6 / loop.dt
-    return all(t.record.r is not None for t in model.fit.problem.tracks)
 
 
 def kinked(model: Model) -> bool:

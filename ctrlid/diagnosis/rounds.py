@@ -13,7 +13,7 @@ from ..errors import CtrlidError
 from ..linearization import state_matrices
 from ..loop import Loop
 from .decide import GATE
-from .replica import DOUBTFUL, TWICE, artefact, kinked, more_than_simple, replica, simulable
+from .replica import DOUBTFUL, TWICE, artefact, kinked, more_than_simple, replica
 from .scan import scanned
 from .trial import (
     Model,
@@ -24,6 +24,7 @@ from .trial import (
     promised,
     refit,
     same_kind,
+    simulable,
 )
 
 NEXT = 5  # candidates after the best that are looked at closely

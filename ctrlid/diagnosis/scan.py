@@ -25,7 +25,7 @@ COLUMNS = 500_000  # numbers in a block of shapes at once
 NEARLY = 0.7  # of the best promise: another wave that may be the right one
 PEAKS = 4  # such waves at most
 LENGTHS = 150  # wavelengths that are looked for in the travel
-EDGE = 0.03  # of the record, at either end
+EDGE = 0.05  # of the record, at either end
 TIMES = 40  # instants at which a parameter might have stepped
 LIMITS = (
     0.999,

@@ -10,11 +10,11 @@ from ..effects import AbstractEffect
 from ..likelihood import Fit
 from .decide import CLOSE, GATE, MANY
 from .omnibus import ALPHA, Omnibus, omnibus
-from .replica import KINKED, forgiven, kinked, replica, simulable
+from .replica import KINKED, forgiven, kinked, replica
 from .rounds import NEXT, Step, Work, candidates, one_round
 from .scan import scanned
 from .settling import Found, cut, renoised, settled, without_superfluous
-from .trial import Model, Trial, anchor, refit, same_kind, spared, whole
+from .trial import Model, Trial, anchor, refit, same_kind, simulable, spared, whole
 
 NEARLY = 0.8  # of the best merit: what comes so close may be the better half of a pair
 FORESEEN = 2  # of them

@@ -10,7 +10,7 @@ from ..loop_fit import choose_noise
 from .decide import CLOSE, GATE, rivals
 from .omnibus import omnibus
 from .rounds import NEXT, Step, Work, plainer
-from .trial import Model, Trial, attempt_at, needed, reduced, refit, spared
+from .trial import Model, Trial, attempt_at, needed, reduced, refit, simulable, spared
 
 NEAR = 0.5  # of the winner's merit: what came so close is asked again when all effects are in
 SURE = 100.0  # times the gate: an effect so significant is not asked whether it is needed
@@ -104,7 +104,8 @@ def cut(model: Model, position: int) -> tuple[Model, Trial]:
     smaller = Model(loop, spared(climb(reduced(model, loop, names), rounds=10)))
     start = attempt_at(smaller, effect)
     back = refit(smaller, start)
-    if back.remark or back.model.fit.value < model.fit.value - CLOSE:
+    short = back.remark or back.model.fit.value < model.fit.value - CLOSE
+    if short and simulable(model):
         # Without it all else may have gone too far astray to come back; the way is known.
         back = max(back, refit(smaller, start, model), key=lambda t: t.merit)
     return smaller, back

@@ -23,6 +23,7 @@ from ..likelihood import (
 from ..loop import Loop
 from ..loop_fit import bounds_of, choose_noise, make_problem, start_values
 from ..physics import Array
+from ..stepping import growth_rate
 
 SCREEN_ROUNDS = 14  # of a refit: a candidate that needs more is not the missing effect
 AWAY = 0.3  # of a given value: a recalibration beyond is doubted
@@ -95,6 +96,14 @@ class Trial:
     def fitted(self) -> AbstractEffect:
         """The effect with its fitted parameters."""
         return self.model.fitted.labelled[self.label]
+
+
+def simulable(model: Model) -> bool:
+    """Whether the records can be simulated with this model."""
+    loop = model.loop
+    if loop.controller is None:
+        return growth_rate(loop) < -1e-6 / loop.dt
+    return all(t.record.r is not None for t in model.fit.problem.tracks)
 
 
 def same_kind(one: AbstractEffect, other: AbstractEffect) -> bool:
@@ -400,8 +409,9 @@ def refit(base: Model, trial: Trial, near: Model | None = None) -> Trial:
     try:
         start = _extended(near or base, loop, names)
         fit = spared(climb(start, rounds=SCREEN_ROUNDS, exact=False))
-        if start.noise.drift and start.problem.known is None:
+        if start.noise.drift and start.problem.known is None and simulable(base):
             # A random force that was fitted while the effect was missing may never let it in.
+            # (Where no simulation can check it, the likelihood also leads to absurd values.)
             plain = replace(start, noise=replace(start.noise, memory=0.0, drift=0.0))
             alone = spared(climb(plain, rounds=SCREEN_ROUNDS, exact=False))
             fit = alone if alone.value > fit.value else fit
