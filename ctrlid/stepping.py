@@ -431,3 +431,8 @@ def growth_rate(loop: Loop) -> float:
         return float(np.max(poles.real, initial=-math.inf))
     largest = np.max(np.abs(poles), initial=0.0)
     return float(np.log(largest) / loop.dt) if largest > 0 else -math.inf
+
+
+def comes_to_rest(loop: Loop) -> bool:
+    """Whether small deviations die out in a loop; without a controller, in the plant itself."""
+    return growth_rate(loop) < -1e-6 / loop.dt

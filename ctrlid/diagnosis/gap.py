@@ -18,7 +18,7 @@ from ..physics import Array
 from ..predictor import predict, predict_ahead, spread_ahead
 from ..replay import replay_from_best_state
 from ..simulation import Simulator
-from ..stepping import growth_rate
+from ..stepping import comes_to_rest
 from ..validation import best_start, time_constant
 
 ROUGH = 1e-5  # local error of the integration, far below any gap worth a word
@@ -33,7 +33,7 @@ def way_to_compare(loop: Loop, record: Record) -> str:
     """Return how a loop is compared with a record: the most telling way there is."""
     if loop.controller is not None and record.r is not None:
         return "closed-loop simulation"
-    if loop.controller is None and growth_rate(loop) < -1e-6 / loop.dt:
+    if loop.controller is None and comes_to_rest(loop):
         return "open-loop simulation"
     e = loop.equations()
     poles = np.linalg.eigvals(state_matrices(e, loop.point)[0])

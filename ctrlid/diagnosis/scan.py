@@ -27,16 +27,7 @@ PEAKS = 4  # such waves at most
 LENGTHS = 150  # wavelengths that are looked for in the travel
 EDGE = 0.05  # of the record, at either end
 TIMES = 40  # instants at which a parameter might have stepped
-LIMITS = (
-    0.999,
-    0.998,
-    0.995,
-    0.99,
-    0.98,
-    0.95,
-    0.9,
-    0.8,
-)  # quantiles at which a state may be limited
+LIMITS = (0.999, 0.998, 0.995, 0.99, 0.98, 0.95, 0.9, 0.8)  # quantiles that may be cut off
 MODES = 7  # frequencies at which a flexible mode is tried
 
 
@@ -205,14 +196,12 @@ def _ripple(model: Model, effect: PositionRipple) -> Trial:
         wave = replace(effect, amplitude=amplitude, period=float(1 / waves[k]), phase=phase)
         return attempt(model, wave, price)
 
-    tops = _peaks(gains)
-    tried = [at(k) for k in tops]
+    tried = [at(k) for k in _peaks(gains)]
     if len(tried) > 1 and tried[0].promise > tried[0].price:
         # Motion between a few levels sees several waves nearly alike: only fits tell them apart.
-        fits = [refit(model, t) for t in tried]
-        best = max(range(len(fits)), key=lambda k: fits[k].merit)
-        if math.isfinite(fits[best].merit):
-            return attempt_at(model, fits[best].fitted, price)
+        best = max((refit(model, t) for t in tried), key=lambda t: t.merit)
+        if math.isfinite(best.merit):
+            return attempt_at(model, best.fitted, price)
     return tried[0]
 
 

@@ -23,7 +23,7 @@ from ..likelihood import (
 from ..loop import Loop
 from ..loop_fit import bounds_of, choose_noise, make_problem, start_values
 from ..physics import Array
-from ..stepping import growth_rate
+from ..stepping import comes_to_rest
 
 SCREEN_ROUNDS = 14  # of a refit: a candidate that needs more is not the missing effect
 AWAY = 0.3  # of a given value: a recalibration beyond is doubted
@@ -102,7 +102,7 @@ def simulable(model: Model) -> bool:
     """Whether the records can be simulated with this model."""
     loop = model.loop
     if loop.controller is None:
-        return growth_rate(loop) < -1e-6 / loop.dt
+        return comes_to_rest(loop)
     return all(t.record.r is not None for t in model.fit.problem.tracks)
 
 
@@ -408,13 +408,13 @@ def refit(base: Model, trial: Trial, near: Model | None = None) -> Trial:
         loop = loop.with_parameters({n: known[n] for n in names if n in known})
     try:
         start = _extended(near or base, loop, names)
-        fit = spared(climb(start, rounds=SCREEN_ROUNDS, exact=False))
+        starts = [start]
         if start.noise.drift and start.problem.known is None and simulable(base):
             # A random force that was fitted while the effect was missing may never let it in.
             # (Where no simulation can check it, the likelihood also leads to absurd values.)
-            plain = replace(start, noise=replace(start.noise, memory=0.0, drift=0.0))
-            alone = spared(climb(plain, rounds=SCREEN_ROUNDS, exact=False))
-            fit = alone if alone.value > fit.value else fit
+            starts.append(replace(start, noise=replace(start.noise, memory=0.0, drift=0.0)))
+        fits = [spared(climb(s, rounds=SCREEN_ROUNDS, exact=False)) for s in starts]
+        fit = max(fits, key=lambda f: f.value)
     except CtrlidError as reason:
         return replace(trial, remark=str(reason))
     model = Model(trial.model.loop, fit)
