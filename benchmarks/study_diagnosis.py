@@ -35,6 +35,7 @@ import numpy as np
 from _random_loops import (
     MOVING,
     PLANTS,
+    SAMPLES,
     SHARES,
     Draw,
     Noise,
@@ -401,35 +402,37 @@ def seen_at_all(effect: AbstractEffect, one: Draw) -> bool:
 
 
 def case_of(
-    kind: str, band: tuple[float, float], seed: int, index: int, classes: Sequence[Any] = CATALOGUE
-) -> Case | None:
+    kind: str, band: tuple[float, float], seed: int, index: int,
+    classes: Sequence[Any] = CATALOGUE, samples: int = SAMPLES,
+) -> Case | None:  # fmt: skip
     """Draw until a loop can carry what is to be hidden."""
     for attempt in range(TRIES):
         rng = np.random.default_rng([seed, index, attempt, KINDS.index(kind)])
-        case = _case(kind, band, rng, index, classes)
+        case = _case(kind, band, rng, index, classes, samples)
         if case is not None:
             return case
     return None
 
 
 def _case(
-    kind: str, band: tuple[float, float], rng: np.random.Generator, index: int, classes: Any
-) -> Case | None:
+    kind: str, band: tuple[float, float], rng: np.random.Generator, index: int, classes: Any,
+    samples: int,
+) -> Case | None:  # fmt: skip
     coloured = index % 3 == 0
     number = int(rng.integers(1 << 30))
     target = log_uniform(rng, *band)
     if kind == "none":
-        one = draw(rng, a_plant(rng, list(PLANTS)), coloured)
+        one = draw(rng, a_plant(rng, list(PLANTS)), coloured, samples)
         if not calm(one, number):
             return None
         record = one.run(one.loop, number)
         return Case(one, one.loop, (), record, number, knowing(one, (), record), 0.0, label="none")
     if kind == "outside":
-        return _outside(rng, index, coloured, number, band, target)
+        return _outside(rng, index, coloured, number, band, target, samples)
     if kind in ("two", "three"):
-        return _several(2 if kind == "two" else 3, rng, coloured, number, band, index)
+        return _several(2 if kind == "two" else 3, rng, coloured, number, band, index, samples)
     cls = classes[index % len(classes)]
-    one = draw(rng, a_plant(rng, plants_for(cls)), coloured)
+    one = draw(rng, a_plant(rng, plants_for(cls)), coloured, samples)
     made = _made(cls, one, rng, number)
     return made and sized(one, made, band, target, number)
 
@@ -448,12 +451,13 @@ def _made(cls: Any, one: Draw, rng: np.random.Generator, number: int) -> Any:
 
 
 def _outside(
-    rng: np.random.Generator, index: int, coloured: bool, number: int, band: Any, target: float
-) -> Case | None:
+    rng: np.random.Generator, index: int, coloured: bool, number: int, band: Any, target: float,
+    samples: int,
+) -> Case | None:  # fmt: skip
     what = list(OUTSIDE)[index % len(OUTSIDE)]
     if what == "removed":
         cls = CATALOGUE[int(rng.integers(len(CATALOGUE)))]
-        one = draw(rng, a_plant(rng, plants_for(cls)), coloured)
+        one = draw(rng, a_plant(rng, plants_for(cls)), coloured, samples)
         made = _made(cls, one, rng, number)
         case = made and sized(one, made, band, target, number)
         if not case:
@@ -463,7 +467,7 @@ def _outside(
             return None
         left = tuple(c for c in CATALOGUE if c.__name__ not in out)
         return replace(case, catalogue=left, label=f"removed {cls.__name__}")
-    one = draw(rng, a_plant(rng, MOVING), coloured)
+    one = draw(rng, a_plant(rng, MOVING), coloured, samples)
     if not calm(one, number):
         return None
     s = scales_of(one, number)
@@ -480,11 +484,12 @@ def _outside(
 
 
 def _several(
-    count: int, rng: np.random.Generator, coloured: bool, number: int, band: Any, index: int
-) -> Case | None:
+    count: int, rng: np.random.Generator, coloured: bool, number: int, band: Any, index: int,
+    samples: int,
+) -> Case | None:  # fmt: skip
     """Hide several effects, each of which is worth something beside the others."""
     plant = a_plant(rng, MOVING)
-    one = draw(rng, plant, coloured)
+    one = draw(rng, plant, coloured, samples)
     if not calm(one, number):
         return None
     fitting = [c for c in CATALOGUE if plant in plants_for(c)]
@@ -663,13 +668,13 @@ def _too_long(*_: Any) -> None:
 
 def run(
     kind: str, band_name: str, seed: int, index: int, classes: Sequence[Any] = CATALOGUE,
-    limit: int = 0,
+    limit: int = 0, samples: int = SAMPLES,
 ) -> Row:  # fmt: skip
     """Draw, simulate, diagnose and judge once."""
     warnings.simplefilter("ignore")
     row = Row(kind, band_name, seed, index)
     band = WORTH.get(band_name, (WORTH["moderate"][0], WORTH["ordinary"][1]))
-    case = case_of(kind, band, seed, index, classes)
+    case = case_of(kind, band, seed, index, classes, samples)
     if case is None:
         row.extra["skipped"] = True
         row.truth = (classes[index % len(classes)].__name__,) if kind == "named" else ()
@@ -905,6 +910,7 @@ def main() -> None:
     parser.add_argument("--kind", choices=KINDS, default="named")
     parser.add_argument("--worth", choices=list(WORTH), help="for named; by default moderate")
     parser.add_argument("--runs", type=int, default=len(CATALOGUE))
+    parser.add_argument("--samples", type=int, default=SAMPLES, help="length of the records")
     parser.add_argument("--first", type=int, default=0, help="number of the first run")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--jobs", type=int, default=1)
@@ -924,7 +930,9 @@ def main() -> None:
     work = joblib.Parallel(n_jobs=options.jobs, return_as="generator")
     rows = []
     for row in work(
-        joblib.delayed(run)(options.kind, band, options.seed, k, classes, options.limit)
+        joblib.delayed(run)(
+            options.kind, band, options.seed, k, classes, options.limit, options.samples
+        )
         for k in numbers
     ):
         rows.append(row)

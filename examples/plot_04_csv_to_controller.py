@@ -186,11 +186,7 @@ result = cid.redesign(sampled(found.loop), found.loop, crossover=130, phase_marg
 print("without the delay:", without.verdict)
 print("with the delay:", result.verdict)
 
-fig, axes = plt.subplots(2, 1, figsize=(8, 5.6), sharex=True, layout="constrained")
-for ax, outcome, design in zip(axes, (without, result), ("without", "with"), strict=True):
-    cid.plot.step(outcome, ax)
-    ax.text(0.98, 0.08, f"lead designed {design} the delay", transform=ax.transAxes, ha="right")
-axes[0].set_xlabel("")
+cid.plot.step({"lead designed without the delay": without, "lead designed with the delay": result})
 plt.show()
 
 # %%

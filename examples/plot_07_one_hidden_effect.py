@@ -63,11 +63,7 @@ named = cid.redesign(found.loop.linearize(), rig, 180, 45)
 print("without the lag:", naive.verdict)
 print("with the lag:   ", named.verdict)
 
-fig, axes = plt.subplots(2, 1, figsize=(8, 5.6), sharex=True, layout="constrained")
-for ax, outcome, design in zip(axes, (naive, named), ("without", "with"), strict=True):
-    cid.plot.step(outcome, ax)
-    ax.text(0.98, 0.08, f"lead designed {design} the lag", transform=ax.transAxes, ha="right")
-axes[0].set_xlabel("")
+cid.plot.step({"lead designed without the lag": naive, "lead designed with the lag": named})
 plt.show()
 
 # %%

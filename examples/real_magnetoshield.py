@@ -66,11 +66,7 @@ for name, loop in {"as given": given, "completed": physics}.items():
     outcomes[name] = cid.redesign(G, physics, crossover=80, phase_margin=30)
     print(f"designed on the model {name}: {outcomes[name].verdict}")
 
-with plt.style.context(cid.plot.STYLE):
-    _, axes = plt.subplots(2, 1, figsize=(7.2, 6.4), layout="constrained")
-    for ax, (name, outcome) in zip(axes, outcomes.items(), strict=True):
-        cid.plot.step(outcome, ax)
-        ax.set_ylabel(f"designed on the model {name}:\n{ax.get_ylabel()}")
+cid.plot.step({f"designed on the model {name}": o for name, o in outcomes.items()})
 plt.show()
 
 delay = next(f for f in found.findings if "InputDelay" in f.names)
