@@ -6,6 +6,7 @@ after two or three passes, and between the passes parameters and noise may move 
 """
 
 import functools
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -29,7 +30,7 @@ from .stepping import (
     through_play,
     whole_delay,
 )
-from .vectorized import Vectorized
+from .vectorized import Vectorized, through
 
 FEWEST = 10  # valid samples, to say anything
 BRIDGE = 20  # samples that do not count and are bridged by the model; then it starts afresh
@@ -158,27 +159,78 @@ class Machine:
         # A fit repeats the map often; a single prediction can afford to be exact.
         order, steps, cut = self.scheme = _scheme(e, self.loop)
         scheme = self.scheme if self.names else (8, 1 if order == 4 else steps, cut)
+        part = casadi.SX.sym("i")
         if self.law is None:
             pieces = [
-                tuple(casadi.substitute(casadi.SX(part), e.p, p) for part in piece)
+                tuple(casadi.substitute(casadi.SX(value), e.p, p) for value in piece)
                 for piece in input_pieces(e, dt, (before, now, ahead), self.hold)
             ]
-            after = advance(e, t, x, pieces, p, s, kick, scheme)[0]  # type: ignore[arg-type]
+            ends, self._parts = self._stages_of(t, x, pieces, p, s, kick, scheme, part)
         else:
-            after = self._follow(t, x, p, s, kick, now, r, y, max(scheme[1], 2))
+            ends = [self._follow(t, x, p, s, kick, now, r, y, max(scheme[1], 2))]
+            self._parts = 1
         free = casadi.vertcat(*(p[k] for k in self.index)) if self.index else casadi.SX(0, 1)
-        given = [x, casadi.vertcat(*w), p, s, force]
-        # Kinks have no slope at the kink itself; everything else is exact.
-        outputs = [after, casadi.jacobian(after, x), casadi.jacobian(after, force),
-                   casadi.jacobian(after, free)]  # fmt: skip
-        self.step_function = casadi.Function("step", given, outputs, {"cse": True})
-        self._step = Vectorized(self.step_function)
-        moves = [casadi.jacobian(after, casadi.vertcat(before, now, ahead))]
-        self._moves = Vectorized(casadi.Function("moves", given, moves, {"cse": True}))
+        self._carries = len(ends) * self._parts > 1
+        self._given = [casadi.vertcat(*w), p, s, force, part]
+        self._functions = self._chained(x, ends, (force, free))
+        self._stages = [Vectorized(f) for f in self._functions]
+        self._moved_by = x, ends, (casadi.vertcat(before, now, ahead),)
         height = e.smoothed(t, x[:n], now, p, s)[1]
         outputs = [height, casadi.jacobian(height, x), casadi.jacobian(height, free)]
-        self.sensor_function = casadi.Function("sensor", given[:4], outputs, {"cse": True})
+        given = [x, *self._given[:3]]
+        self.sensor_function = casadi.Function("sensor", given, outputs, {"cse": True})
         self._sensor = Vectorized(self.sensor_function)
+
+    def _stages_of(self, t: Any, x: Any, pieces: Any, p: Any, s: Any, kick: Any, scheme: Scheme,
+                   part: Any) -> tuple[list[Any], int]:  # fmt: skip
+        """Return the maps that make up a period, and how many equal parts each of them has.
+
+        Several steps of one kind are one short expression that is gone through several times.
+        """
+        order, steps, cut = scheme
+        if self.e.dt or cut or steps == 1:
+            return [advance(self.e, t, x, pieces, p, s, kick, scheme)[0]], 1
+        ends, begin = [], t
+        for duration, level, slope in pieces:
+            h = duration / steps
+            piece = (h, level + slope * part * h, slope)
+            after = advance(self.e, begin + part * h, x, [piece], p, s, kick, (order, 1, False))[0]
+            ends.append(after)
+            begin = begin + duration
+        return ends, steps
+
+    def _chained(self, x: Any, ends: Sequence[Any], by: Sequence[Any]) -> list[casadi.Function]:
+        """Return maps that carry the state and its derivatives, by itself first, along.
+
+        Kinks have no slope at the kink itself; everything else is exact.
+        """
+        n = self.size
+        before = [casadi.SX.eye(n), *(casadi.SX(n, v.shape[0]) for v in by)]
+        carried = []
+        if self._carries:
+            before = carried = [casadi.SX.sym("s", *value.shape) for value in before]
+        functions = []
+        for end in ends:
+            a = casadi.jacobian(end, x)
+            own = [casadi.SX(n, n), *(casadi.jacobian(end, v) for v in by)]
+            outputs = [casadi.mtimes(a, s) + d for s, d in zip(before, own, strict=True)]
+            given = [x, *carried, *self._given]
+            functions.append(casadi.Function("step", given, [end, *outputs], {"cse": True}))
+        return functions
+
+    @functools.cached_property
+    def _moves(self) -> list[Vectorized]:
+        """How the state after a period depends on the input."""
+        return [Vectorized(f) for f in self._chained(*self._moved_by)]
+
+    def _period(self, stages: Sequence[Vectorized], x: Array, *given: Any) -> list[Array]:
+        """Go through a period; return the state after it and its derivatives, by itself first."""
+        if not self._carries:
+            return through(stages, [], [x, *given, 0])
+        n = self.size
+        widths = [size // n for size in stages[0].sizes[2 : -len(given) - 1]]
+        still = [np.eye(n).ravel(), *(np.zeros(n * k) for k in widths)]
+        return through(stages, [x, *still], given, self._parts)
 
     def _follow(self, t: Any, x: Any, p: Any, s: Any, kick: Any, u: Any, r: Any, y: Any,
                 substeps: int) -> Any:  # fmt: skip
@@ -229,10 +281,10 @@ class Machine:
         w = self._inputs(track, applied)
         spread = at.spread[:, : self.n].T
         given = (at.filtered.T, w, p, spread, np.zeros(self.channels))
-        step, a, b, dp = self._step(*given)
+        step, a, b, dp = self._period(self._stages, *given)
         # How the input moves the state matters only where the input is not what was measured.
         unsure = slopes is not None or not track.valid.all()
-        dw = self._moves(*given)[0] if unsure else np.zeros((1, self.size, 3))
+        dw = self._period(self._moves, *given)[2] if unsure else np.zeros((1, self.size, 3))
         if slopes is not None:
             dw = _full(dw, len(u))
             dp = _full(dp, len(u)).copy()
@@ -287,10 +339,14 @@ class Machine:
         x, s, w, values = (casadi.SX.sym(k, *size) for k, size in (
             ("x", (n, 1)), ("s", (n, p + n)), ("w", (6, 1)), ("p", self.e.p.shape)))  # fmt: skip
         still, quiet = casadi.SX.zeros(self.n), casadi.SX.zeros(self.channels)
-        after, a, _, dp = self.step_function(x, w, values, still, quiet)
         y, c, hp = self.sensor_function(x, w, values, still)
-        moved = casadi.mtimes(a, s) + casadi.horzcat(dp, casadi.SX.zeros(n, n))
         seen = casadi.mtimes(c, s) + casadi.horzcat(hp, casadi.SX.zeros(1, n))
+        stage = [x, casadi.SX.eye(n), casadi.SX(n, self.channels), casadi.SX(n, p)]
+        carried = len(stage) if self._carries else 1
+        for function, part in itertools.product(self._functions, range(self._parts)):
+            stage = function.call([*stage[:carried], w, values, still, quiet, part])
+        after, a, _, dp = stage
+        moved = casadi.mtimes(a, s) + casadi.horzcat(dp, casadi.SX.zeros(n, n))
         return casadi.Function(
             "period", [casadi.vertcat(x, casadi.vec(s)), w, values],
             [casadi.vertcat(after, casadi.vec(moved)), casadi.vertcat(y, seen.T)], {"cse": True},
@@ -307,7 +363,7 @@ class Machine:
         if not known:
             w[5] = self.height(track, x, rows)
         quiet = np.zeros((self.n, 1))
-        return self._step(x.T, w, p, quiet, np.zeros(self.channels))[0][:, :, 0]
+        return self._period(self._stages, x.T, w, p, quiet, np.zeros(self.channels))[0][:, :, 0]
 
     def height(self, track: Track, x: Array, rows: Any) -> Array:
         """Return the outputs at states (k, n) and the samples `rows`."""
@@ -321,7 +377,7 @@ class Machine:
         x = self._padded(np.array(_rest(self.loop, self.e)))
         w = np.array([0.0, at.input, at.input, at.input, at.output, at.output])
         quiet = np.zeros(self.n)
-        _, a, b, _ = self._step(x, w, p, quiet, np.zeros(self.channels))
+        _, a, b, _ = self._period(self._stages, x, w, p, quiet, np.zeros(self.channels))
         _, h, _ = self._sensor(x, w, p, quiet)
         return a[0], b[0], h[0]
 

@@ -492,8 +492,11 @@ def step(redesigns: Any, axes: Any = None) -> Any:
     if not several:
         raise CtrlidError("plot.step has nothing to draw: the mapping is empty")
     for redesign in several.values():
-        _require(redesign, Redesign,
-                 "plot.step draws a Redesign, as redesign() returns, or a mapping of them")
+        _require(
+            redesign,
+            Redesign,
+            "plot.step draws a Redesign, as redesign() returns, or a mapping of them",
+        )
     size = (7.2, 3.2 * len(several)) if len(several) > 1 else None
     axes = _axes(axes, len(several), size, sharex=True)
     ends = []

@@ -5,7 +5,8 @@ block of samples, with a numpy operation at each node, gives the same numbers se
 and needs no compiler.
 """
 
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import casadi
@@ -69,15 +70,16 @@ class Vectorized:
     """
 
     def __init__(self, function: Any) -> None:
-        self._rows_in = [function.size1_in(k) for k in range(function.n_in())]
-        self._shapes = [(function.size1_out(k), function.size2_out(k))
+        # Rows of each argument, rows and columns of each output.
+        self.sizes = [function.numel_in(k) for k in range(function.n_in())]
+        self.shapes = [(function.size1_out(k), function.size2_out(k))
                         for k in range(function.n_out())]  # fmt: skip
         self._places = []
         for k in range(function.n_out()):
             pattern = function.sparsity_out(k)
             rows, columns = pattern.row(), pattern.get_col()
             self._places.append(list(zip(rows, columns, strict=True)))
-        self._columns = [function.sparsity_in(k).row() for k in range(function.n_in())]
+        self._elements = [function.sparsity_in(k).find() for k in range(function.n_in())]
         self._work = function.sz_w()
         self._program: list[tuple[int, int, int, int, Any]] = []
         for k in range(function.n_instructions()):
@@ -86,7 +88,7 @@ class Vectorized:
             if op == casadi.OP_CONST:
                 step = (0, out[0], 0, 0, function.instruction_constant(k))
             elif op == casadi.OP_INPUT:
-                step = (1, out[0], into[0], self._columns[into[0]][into[1]], None)
+                step = (1, out[0], into[0], self._elements[into[0]][into[1]], None)
             elif op == casadi.OP_OUTPUT:
                 step = (2, into[0], out[0], out[1], None)
             elif op in UNARY:
@@ -108,25 +110,13 @@ class Vectorized:
         list of ndarray
             Each output with shape (n, rows, columns).
         """
-        tables = []
-        n = 1
-        for rows, value in zip(self._rows_in, arguments, strict=True):
-            table = np.asarray(value, dtype=float)
-            table = table.reshape(rows, -1 if rows else 1)
-            n = max(n, table.shape[1])
-            tables.append(table)
-        outputs = [np.zeros((n, *shape)) for shape in self._shapes]
-        flat = [[o[:, i, j] for i, j in places]
-                for o, places in zip(outputs, self._places, strict=True)]  # fmt: skip
-        with np.errstate(all="ignore"):
-            for first in range(0, n, BLOCK):
-                self._run(tables, flat, first, min(first + BLOCK, n))
-        return outputs
+        return through([self], [], arguments)
 
-    def _run(self, tables: list[Array], flat: Any, first: int, stop: int) -> None:
-        size = stop - first
+    def run(self, inputs: Sequence[Sequence[Any]], size: int) -> list[list[Any]]:
+        """Evaluate over a block; return the elements of each output, columns one after another."""
         store: list[Any] = [None] * self._work
         values: list[Any] = [None] * self._work
+        outputs: list[list[Any]] = [[0.0] * (rows * columns) for rows, columns in self.shapes]
         for kind, a, b, c, extra in self._program:
             if kind >= 3:
                 buffer = store[a]
@@ -140,7 +130,51 @@ class Vectorized:
             elif kind == 0:
                 values[a] = extra
             elif kind == 1:
-                table = tables[b]
-                values[a] = table[c, first:stop] if table.shape[1] > 1 else table[c, 0]
+                values[a] = inputs[b][c]
             else:
-                flat[b][c][first:stop] = values[a]
+                row, column = self._places[b][c]
+                outputs[b][row + self.shapes[b][0] * column] = values[a]
+                store[a] = None  # what comes next must not overwrite it
+        return outputs
+
+
+def through(
+    stages: Sequence[Vectorized], carried: Sequence[Any], given: Sequence[Any], parts: int = 1
+) -> list[Array]:
+    """Evaluate functions one after another, each fed with what the one before it returned.
+
+    Parameters
+    ----------
+    stages : sequence of Vectorized
+        The functions, of the carried values, the given ones and, last, the number of the part;
+        or a single one of the given values alone.
+    carried : sequence of array_like
+        Columns (rows, n) or (rows,) that the first function begins with.
+    given : sequence of array_like
+        Columns that all of them see.
+    parts : int, optional
+        How often in turn each function is gone through.
+
+    Returns
+    -------
+    list of ndarray
+        The outputs of the last one, each with shape (n, rows, columns).
+    """
+    alone = not carried
+    numbers = [np.asarray(value, dtype=float) for value in (*carried, *given)]
+    tables = [t.reshape(rows, -1 if rows else 1)
+              for t, rows in zip(numbers, stages[0].sizes, strict=alone)]  # fmt: skip
+    n = max([1, *(t.shape[1] for t in tables)])
+    outputs = [np.zeros((n, *shape)) for shape in stages[-1].shapes]
+    count = len(carried)
+    with np.errstate(all="ignore"):
+        for first in range(0, n, BLOCK):
+            stop = min(first + BLOCK, n)
+            inputs = [[row[first:stop] if len(row) > 1 else row[0] for row in t] for t in tables]
+            state, rest = inputs[:count], inputs[count:]
+            for stage, part in itertools.product(stages, range(parts)):
+                state = stage.run([*state, *rest, *([] if alone else [[part]])], stop - first)
+            for out, values in zip(outputs, state, strict=True):
+                for k, value in enumerate(values):
+                    out[first:stop, k % out.shape[1], k // out.shape[1]] = value
+    return outputs
