@@ -21,6 +21,8 @@ LEAST = -24.0  # logarithm of the least force noise: below, only the start of th
 MOST = 14.0  # and of the largest: above, the sensor is exact
 SLOWEST = 0.05  # of the longest record: the time constant of a coloured force
 LOG_STEP = 0.2  # of log variances, for derivatives
+LIGHT = 0.1  # the least damping of a step
+TRIES = 5  # steps, each with ten times the damping
 SINGULAR = 1e-10  # relative eigenvalue below which a direction is not in the data
 
 
@@ -337,6 +339,7 @@ def climb(fit: Fit, rounds: int = ROUNDS, exact: bool = True) -> Fit:
         The maximum, or the best point found.
     """
     tuned, far, enough = -math.inf, True, 0.02 if exact else 0.3
+    damping = 0.0
     for _ in range(rounds):
         # A short step was already evaluated along the trajectory of the pass before.
         moved = relinearized(fit) if far else fit
@@ -344,11 +347,7 @@ def climb(fit: Fit, rounds: int = ROUNDS, exact: bool = True) -> Fit:
         if fit.value > tuned + 2.0:
             fit = _tune(fit.problem, fit.theta, fit.linearized, fit.noise, enough=enough)
             tuned = fit.value
-        step, error = bounded_step(fit, *fit.normal)
-        if not len(step) or not np.isfinite(step).all():
-            break
-        fit, share = _search(fit, step)
-        length = share * np.max(np.abs(step) / error, initial=0.0)
+        fit, length, damping = _ascend(fit, *fit.normal, damping)
         far = bool(length > FAR)
         if length < (CLOSE if exact else 5 * CLOSE):
             if fit.value <= tuned + 2.5 * enough:
@@ -396,22 +395,41 @@ def pseudo_inverse(matrix: Array) -> Array:
     return np.asarray(inverse / np.outer(size, size), dtype=float)
 
 
-def _search(fit: Fit, step: Array) -> tuple[Fit, float]:
-    """Go as far along a step as the likelihood grows."""
-    problem, share = fit.problem, 1.0
-    for _ in range(12):
-        theta = np.clip(fit.theta + share * step, problem.lower, problem.upper)
-        if not problem.machine.fits(theta):
-            try:
+def _ascend(fit: Fit, matrix: Array, score: Array, damping: float) -> tuple[Fit, float, float]:
+    r"""Take a step after Levenberg and Marquardt, shorter ones until the likelihood grows.
+
+    .. math:: (H + \lambda \operatorname{diag} H)\, s = g
+
+    A large damping shortens what the record hardly determines first.
+
+    Returns
+    -------
+    fit : Fit
+        A better point, or the same.
+    length : float
+        Length of the step in standard errors; zero if none is better.
+    damping : float
+        For the next step.
+    """
+    problem = fit.problem
+    _, error = bounded_step(fit, matrix, score)
+    for _ in range(TRIES):
+        step, _ = bounded_step(fit, matrix + damping * np.diag(np.diag(matrix)), score)
+        if not len(step) or not np.isfinite(step).all():
+            break
+        theta = np.clip(fit.theta + step, problem.lower, problem.upper)
+        trial = None
+        try:
+            if not problem.machine.fits(theta):
                 problem, fit = _rebuilt(fit, theta)
-            except CtrlidError:  # too far: what moves so fast is no longer followed
-                share /= 3
-                continue
-        trial = evaluate(problem, theta, fit.noise, [o.trajectory for o in fit.filtered])
-        if np.isfinite(trial.value) and trial.value >= fit.value - 1e-6:
-            return trial, share
-        share /= 3
-    return fit, 0.0
+            trial = evaluate(problem, theta, fit.noise, [o.trajectory for o in fit.filtered])
+        except CtrlidError:  # too far: what moves so fast is no longer followed
+            pass
+        if trial and np.isfinite(trial.value) and trial.value >= fit.value - 1e-6:
+            length = float(np.max(np.abs(step) / error, initial=0.0))
+            return trial, length, damping / 10 if damping > LIGHT else 0.0
+        damping = max(10 * damping, LIGHT)
+    return fit, 0.0, 0.0
 
 
 def _rebuilt(fit: Fit, theta: Array) -> tuple[Problem, Fit]:
@@ -442,11 +460,10 @@ def polish(fit: Fit, rounds: int = 2) -> Fit:
                 values.append(evaluate(fit.problem, theta, fit.noise, at).value)
             if ends[1] > ends[0] and np.isfinite(values).all():
                 score[k] = (values[1] - values[0]) / (ends[1] - ends[0])
-        step, error = bounded_step(fit, matrix, score)
-        if not np.isfinite(step).all() or not known.any():
+        if not known.any():
             return fit
-        fit, share = _search(fit, step)
-        if share * np.max(np.abs(step[known]) / error[known], initial=0.0) < 0.05:
+        fit, length, _ = _ascend(fit, matrix, score, 0.0)
+        if length < 0.05:
             break
     tuned = _tune(fit.problem, fit.theta, fit.linearized, fit.noise)
     return tuned if tuned.value > fit.value else fit

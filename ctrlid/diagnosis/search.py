@@ -14,7 +14,7 @@ from .replica import KINKED, forgiven, kinked, replica
 from .rounds import NEXT, Step, Work, candidates, one_round
 from .scan import scanned
 from .settling import Found, cut, renoised, settled, without_superfluous
-from .trial import Model, Trial, anchor, refit, same_kind, simulable, spared, whole
+from .trial import Model, Trial, anchor, contains, refit, same_kind, simulable, spared, whole
 
 NEARLY = 0.8  # of the best merit: what comes so close may be the better half of a pair
 FORESEEN = 2  # of them
@@ -118,7 +118,9 @@ def _foreseen(
 
 
 def _nearly(trial: Trial, best: Trial) -> bool:
-    """Whether a candidate did nearly as well as one that resembles it, and not the same."""
+    """Whether a candidate did nearly as well as one that resembles it, and is another."""
+    if contains(trial.effect, best.effect) or contains(best.effect, trial.effect):
+        return False
     mine, its = ({t.name, *type(t.effect).look_alikes} for t in (best, trial))
     return bool(mine & its) and NEARLY * best.merit < trial.merit < best.merit - CLOSE
 
