@@ -607,6 +607,7 @@ def judge(row: Row, found: Any, case: Case) -> None:
     row.verdict = found.verdict
     sets = [(key(f.effect), *(key(e) for e in f.alternatives)) for f in found.findings]
     row.named = tuple(sets)
+    row.extra["evidence"] = [round(f.evidence, 1) for f in found.findings]
     truths = [same_as(e, case.one.loop) for e in case.effects]
     row.equal = tuple(sorted(set().union(*truths) - set(row.truth))) if truths else ()
     hit = [next((k for k, s in enumerate(sets) if s[0] in t), None) for t in truths]

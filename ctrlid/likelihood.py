@@ -21,8 +21,10 @@ LEAST = -24.0  # logarithm of the least force noise: below, only the start of th
 MOST = 14.0  # and of the largest: above, the sensor is exact
 SLOWEST = 0.05  # of the longest record: the time constant of a coloured force
 LOG_STEP = 0.2  # of log variances, for derivatives
-LIGHT = 0.1  # the least damping of a step
-TRIES = 5  # steps, each with ten times the damping
+LIGHT = 0.01  # the least damping of a step
+MORE = 10.0  # times the damping, where a step failed
+TRIES = 6  # steps at most
+NOTHING = 1e-3  # of log-likelihood: a step that promises less is not worth taking
 SINGULAR = 1e-10  # relative eigenvalue below which a direction is not in the data
 
 
@@ -415,7 +417,7 @@ def _ascend(fit: Fit, matrix: Array, score: Array, damping: float) -> tuple[Fit,
     _, error = bounded_step(fit, matrix, score)
     for _ in range(TRIES):
         step, _ = bounded_step(fit, matrix + damping * np.diag(np.diag(matrix)), score)
-        if not len(step) or not np.isfinite(step).all():
+        if not np.isfinite(step).all() or 0.5 * score @ step < NOTHING:
             break
         theta = np.clip(fit.theta + step, problem.lower, problem.upper)
         trial = None
@@ -427,8 +429,8 @@ def _ascend(fit: Fit, matrix: Array, score: Array, damping: float) -> tuple[Fit,
             pass
         if trial and np.isfinite(trial.value) and trial.value >= fit.value - 1e-6:
             length = float(np.max(np.abs(step) / error, initial=0.0))
-            return trial, length, damping / 10 if damping > LIGHT else 0.0
-        damping = max(10 * damping, LIGHT)
+            return trial, length, damping / MORE if damping > LIGHT else 0.0
+        damping = max(MORE * damping, LIGHT)
     return fit, 0.0, 0.0
 
 

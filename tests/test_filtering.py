@@ -162,14 +162,19 @@ def levitated(*effects, dt=1e-3, free=(), analog=False):
     return loop
 
 
-def test_the_machines_derivatives_are_those_of_its_map():
-    loop = levitated(E.CoulombFriction(fc=0.1), E.SensorLag(tau=5e-4), E.ActuatorLag(tau=3e-4),
-                     E.SensorNonlinearity(curvature=2.0))  # fmt: skip
-    names = ("K", "m", "CoulombFriction.fc", "SensorLag.tau", "ActuatorLag.tau",
-             "SensorNonlinearity.curvature")  # fmt: skip
+@pytest.mark.parametrize(
+    ("hidden", "stages", "parts"),
+    [((E.SensorLag(tau=5e-4), E.ActuatorLag(tau=3e-4), E.SensorNonlinearity(curvature=2.0)), 1, 1),
+     ((), 1, 4), ((E.InputDelay(delay=4e-4), E.SensorNonlinearity(curvature=2.0)), 2, 4)],
+)  # fmt: skip
+def test_the_machines_derivatives_are_those_of_its_map(hidden, stages, parts):
+    loop = levitated(E.CoulombFriction(fc=0.1), *hidden)
+    names = ("K", "m", *(f"{label}.{p.name}" for label, e in loop.labelled.items()
+                         for p in e.parameters()))  # fmt: skip
     r = cid.random_binary(200, amplitude=2e-4, hold=20, around=0.012, seed=1)
     record = cid.simulate(levitated(), r, sensor_noise=2e-6, seed=2)
     m = Machine(loop, names, "zoh", False)
+    assert (len(m._stages), m._parts) == (stages, parts)
     track = make_track(loop, record)
     rng = np.random.default_rng(5)
     guess = m.guess(track)

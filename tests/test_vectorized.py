@@ -1,6 +1,6 @@
 """Vectorized: every operation and whole functions against CasADi's own interpreter.
 
-Groups: single operations; registers and constants; shapes and blocks; refusals.
+Groups: single operations; registers and constants; shapes and blocks; one after another; refusals.
 """
 
 import casadi
@@ -9,7 +9,7 @@ import pytest
 
 import ctrlid as cid
 from ctrlid import CtrlidError
-from ctrlid.vectorized import BINARY, BLOCK, UNARY, Vectorized
+from ctrlid.vectorized import BINARY, BLOCK, UNARY, Vectorized, through
 
 EVERYWHERE = np.array([-np.inf, -1e200, -3.0, -1.0, -0.5, -0.0, 0.0, 1e-300, 0.5, 1.0, 2.0, 2.5,
                        1e200, np.inf, np.nan])  # fmt: skip
@@ -237,6 +237,28 @@ def test_a_plants_map_with_effects_and_derivatives():
     spread[:, ::7] = 0.0
     p = np.tile(e.values[:, None], 60) * rng.uniform(0.8, 1.2, (len(e.values), 60))
     same(f, np.zeros((1, 60)), x, rng.uniform(0, 5, (1, 60)), p, spread, rtol=1e-10)
+
+
+# --- one after another
+
+
+def test_stages_feed_each_other_over_several_blocks():
+    x, s, a, part = (casadi.SX.sym(k, n) for k, n in (("x", 2), ("s", 2), ("a", 1), ("i", 1)))
+    turned = casadi.vertcat(x[1] + part, x[0] * casadi.sin(a))
+    along = casadi.mtimes(casadi.jacobian(turned, x), s)
+    stages = [casadi.Function("f", [x, s, a, part], outputs)
+              for outputs in ([turned, along], [x * x - a, 2 * x * s])]  # fmt: skip
+    n = BLOCK + 5
+    rng = np.random.default_rng(5)
+    first, given = rng.standard_normal((2, n)), rng.standard_normal((1, n))
+    values, slopes = through([Vectorized(f) for f in stages], [first, [1.0, 0.0]], [given], parts=2)
+    for k in (0, BLOCK - 1, BLOCK, n - 1):
+        x_, s_ = first[:, k], [1.0, 0.0]
+        for f in stages:
+            for i in range(2):
+                x_, s_ = f(x_, s_, given[0, k], i)
+        np.testing.assert_allclose(values[k], x_, rtol=1e-12)
+        np.testing.assert_allclose(slopes[k], s_, rtol=1e-12)
 
 
 # --- refusals
