@@ -21,9 +21,8 @@ LEAST = -24.0  # logarithm of the least force noise: below, only the start of th
 MOST = 14.0  # and of the largest: above, the sensor is exact
 SLOWEST = 0.05  # of the longest record: the time constant of a coloured force
 LOG_STEP = 0.2  # of log variances, for derivatives
-LIGHT = 0.01  # the least damping of a step
-MORE = 10.0  # times the damping, where a step failed
-TRIES = 6  # steps at most
+# Damping and share of a step, one after the other until the likelihood grows.
+WAYS = (0.0, 1.0), (0.0, 1 / 3), (0.03, 1.0), (0.0, 0.1), (3.0, 1.0), (0.0, 0.01), (100.0, 1.0)
 NOTHING = 1e-3  # of log-likelihood: a step that promises less is not worth taking
 SINGULAR = 1e-10  # relative eigenvalue below which a direction is not in the data
 
@@ -341,7 +340,6 @@ def climb(fit: Fit, rounds: int = ROUNDS, exact: bool = True) -> Fit:
         The maximum, or the best point found.
     """
     tuned, far, enough = -math.inf, True, 0.02 if exact else 0.3
-    damping = 0.0
     for _ in range(rounds):
         # A short step was already evaluated along the trajectory of the pass before.
         moved = relinearized(fit) if far else fit
@@ -349,7 +347,7 @@ def climb(fit: Fit, rounds: int = ROUNDS, exact: bool = True) -> Fit:
         if fit.value > tuned + 2.0:
             fit = _tune(fit.problem, fit.theta, fit.linearized, fit.noise, enough=enough)
             tuned = fit.value
-        fit, length, damping = _ascend(fit, *fit.normal, damping)
+        fit, length = _ascend(fit, *fit.normal)
         far = bool(length > FAR)
         if length < (CLOSE if exact else 5 * CLOSE):
             if fit.value <= tuned + 2.5 * enough:
@@ -397,12 +395,12 @@ def pseudo_inverse(matrix: Array) -> Array:
     return np.asarray(inverse / np.outer(size, size), dtype=float)
 
 
-def _ascend(fit: Fit, matrix: Array, score: Array, damping: float) -> tuple[Fit, float, float]:
-    r"""Take a step after Levenberg and Marquardt, shorter ones until the likelihood grows.
+def _ascend(fit: Fit, matrix: Array, score: Array) -> tuple[Fit, float]:
+    r"""Take a Gauss-Newton step, or one that is shortened until the likelihood grows.
 
-    .. math:: (H + \lambda \operatorname{diag} H)\, s = g
+    .. math:: s = \sigma\, (H + \lambda \operatorname{diag} H)^{-1} g
 
-    A large damping shortens what the record hardly determines first.
+    By a share :math:`\sigma`, along the valley, and after Levenberg and Marquardt, across it.
 
     Returns
     -------
@@ -410,28 +408,23 @@ def _ascend(fit: Fit, matrix: Array, score: Array, damping: float) -> tuple[Fit,
         A better point, or the same.
     length : float
         Length of the step in standard errors; zero if none is better.
-    damping : float
-        For the next step.
     """
     problem = fit.problem
     _, error = bounded_step(fit, matrix, score)
-    for _ in range(TRIES):
-        step, _ = bounded_step(fit, matrix + damping * np.diag(np.diag(matrix)), score)
-        if not np.isfinite(step).all() or 0.5 * score @ step < NOTHING:
+    for damping, share in WAYS:
+        step = share * bounded_step(fit, matrix + damping * np.diag(np.diag(matrix)), score)[0]
+        if not np.isfinite(step).all() or 0.5 * score @ step < NOTHING * share:
             break
         theta = np.clip(fit.theta + step, problem.lower, problem.upper)
-        trial = None
         try:
             if not problem.machine.fits(theta):
                 problem, fit = _rebuilt(fit, theta)
             trial = evaluate(problem, theta, fit.noise, [o.trajectory for o in fit.filtered])
         except CtrlidError:  # too far: what moves so fast is no longer followed
-            pass
-        if trial and np.isfinite(trial.value) and trial.value >= fit.value - 1e-6:
-            length = float(np.max(np.abs(step) / error, initial=0.0))
-            return trial, length, damping / MORE if damping > LIGHT else 0.0
-        damping = max(MORE * damping, LIGHT)
-    return fit, 0.0, 0.0
+            continue
+        if np.isfinite(trial.value) and trial.value >= fit.value - 1e-6:
+            return trial, float(np.max(np.abs(step) / error, initial=0.0))
+    return fit, 0.0
 
 
 def _rebuilt(fit: Fit, theta: Array) -> tuple[Problem, Fit]:
@@ -464,7 +457,7 @@ def polish(fit: Fit, rounds: int = 2) -> Fit:
                 score[k] = (values[1] - values[0]) / (ends[1] - ends[0])
         if not known.any():
             return fit
-        fit, length, _ = _ascend(fit, matrix, score, 0.0)
+        fit, length = _ascend(fit, matrix, score)
         if length < 0.05:
             break
     tuned = _tune(fit.problem, fit.theta, fit.linearized, fit.noise)
