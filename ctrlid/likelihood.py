@@ -21,8 +21,7 @@ LEAST = -24.0  # logarithm of the least force noise: below, only the start of th
 MOST = 14.0  # and of the largest: above, the sensor is exact
 SLOWEST = 0.05  # of the longest record: the time constant of a coloured force
 LOG_STEP = 0.2  # of log variances, for derivatives
-# Damping and share of a step, one after the other until the likelihood grows.
-WAYS = (0.0, 1.0), (0.0, 1 / 3), (0.03, 1.0), (0.0, 0.1), (3.0, 1.0), (0.0, 0.01), (100.0, 1.0)
+SHARES = tuple(3.0**-k for k in range(6))  # of a step, until the likelihood grows
 NOTHING = 1e-3  # of log-likelihood: a step that promises less is not worth taking
 SINGULAR = 1e-10  # relative eigenvalue below which a direction is not in the data
 
@@ -396,11 +395,7 @@ def pseudo_inverse(matrix: Array) -> Array:
 
 
 def _ascend(fit: Fit, matrix: Array, score: Array) -> tuple[Fit, float]:
-    r"""Take a Gauss-Newton step, or one that is shortened until the likelihood grows.
-
-    .. math:: s = \sigma\, (H + \lambda \operatorname{diag} H)^{-1} g
-
-    By a share :math:`\sigma`, along the valley, and after Levenberg and Marquardt, across it.
+    """Take a Gauss-Newton step, or as much of it as makes the likelihood grow.
 
     Returns
     -------
@@ -410,11 +405,10 @@ def _ascend(fit: Fit, matrix: Array, score: Array) -> tuple[Fit, float]:
         Length of the step in standard errors; zero if none is better.
     """
     problem = fit.problem
-    _, error = bounded_step(fit, matrix, score)
-    for damping, share in WAYS:
-        step = share * bounded_step(fit, matrix + damping * np.diag(np.diag(matrix)), score)[0]
-        if not np.isfinite(step).all() or 0.5 * score @ step < NOTHING * share:
-            break
+    whole, error = bounded_step(fit, matrix, score)
+    if not np.isfinite(whole).all() or 0.5 * score @ whole < NOTHING:
+        return fit, 0.0
+    for step in (share * whole for share in SHARES):
         theta = np.clip(fit.theta + step, problem.lower, problem.upper)
         try:
             if not problem.machine.fits(theta):

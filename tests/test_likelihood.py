@@ -1,4 +1,4 @@
-"""Climbing the likelihood: damped steps, bounds, and giving up."""
+"""Climbing the likelihood: steps, bounds, and giving up."""
 
 from types import SimpleNamespace
 
@@ -79,7 +79,7 @@ def test_a_wrong_slope_gives_up_where_it_is(hill):
     same, length = likelihood._ascend(fit, np.array([[2.0]]), np.array([5.0]))
     assert same is fit
     assert length == 0.0
-    assert len(hill.tried) == len(likelihood.WAYS)
+    assert len(hill.tried) == len(likelihood.SHARES)
 
 
 def test_what_promises_nothing_is_not_tried(hill):
