@@ -99,7 +99,7 @@ def search_by_simulation(
         rounds.append((now, tried, best))
         now, before = new, after
     tell("by simulation, what is needed")
-    now, smaller = _needed(now, given)
+    now, smaller = _needed(_settled(now, given), given)
     if len(now.loop.effects) == given or _gap(now, fresh) > BETTER * gap:
         return None
     first, final = (_model(s, sensor) for s in (base, now))
@@ -131,6 +131,20 @@ def _needed(now: Simulated, given: int) -> tuple[Simulated, list[Simulated]]:
         if min(merits, default=math.inf) > GATE:
             return now, smaller
         now = smaller[int(np.argmin(merits))]
+
+
+def _settled(now: Simulated, given: int) -> Simulated:
+    """Return a simulation in which each effect was looked for once more beside all others."""
+    position = given
+    for _ in range(given, len(now.loop.effects)):
+        smaller = _without(now, position)
+        screened = _screened(smaller, now.fitted.effects[position])
+        again = screened and _refitted(smaller, screened).found
+        if again and again.square < now.square:
+            now = again  # the effect stands last now, and the next one in its place
+        else:
+            position += 1
+    return now
 
 
 def _without(now: Simulated, position: int) -> Simulated:
