@@ -147,7 +147,8 @@ class Machine:
         self._plays: dict[int, casadi.Function] = {}
         self._build()
 
-    def _build(self) -> None:
+    def _map(self) -> tuple[Any, list[Any], list[Any], dict[str, Any]]:
+        """Return the state, its value after each stage of a period, what is given, and symbols."""
         e, n, dt = self.e, self.n, self.loop.dt
         x, p, s = (casadi.SX.sym(k, m) for k, m in (("x", self.size), ("p", e.p.shape[0]),
                                                     ("s", n)))  # fmt: skip
@@ -171,14 +172,17 @@ class Machine:
             self._parts = 1
         free = casadi.vertcat(*(p[k] for k in self.index)) if self.index else casadi.SX(0, 1)
         self._carries = len(ends) * self._parts > 1
-        self._given = [casadi.vertcat(*w), p, s, force, part]
-        self._functions = self._chained(x, ends, (force, free))
+        by = {"force": force, "free": free, "path": casadi.vertcat(before, now, ahead),
+              "height": e.smoothed(t, x[:n], now, p, s)[1]}  # fmt: skip
+        return x, ends, [casadi.vertcat(*w), p, s, force, part], by
+
+    def _build(self) -> None:
+        x, ends, given, by = self._map()
+        self._functions = self._chained(x, ends, given, (by["force"], by["free"]))
         self._stages = [Vectorized(f) for f in self._functions]
-        self._moved_by = x, ends, (casadi.vertcat(before, now, ahead),)
-        height = e.smoothed(t, x[:n], now, p, s)[1]
-        outputs = [height, casadi.jacobian(height, x), casadi.jacobian(height, free)]
-        given = [x, *self._given[:3]]
-        self.sensor_function = casadi.Function("sensor", given, outputs, {"cse": True})
+        height = by["height"]
+        outputs = [height, casadi.jacobian(height, x), casadi.jacobian(height, by["free"])]
+        self.sensor_function = casadi.Function("sensor", [x, *given[:3]], outputs, {"cse": True})
         self._sensor = Vectorized(self.sensor_function)
 
     def _stages_of(self, t: Any, x: Any, pieces: Any, p: Any, s: Any, kick: Any, scheme: Scheme,
@@ -199,7 +203,9 @@ class Machine:
             begin = begin + duration
         return ends, steps
 
-    def _chained(self, x: Any, ends: Sequence[Any], by: Sequence[Any]) -> list[casadi.Function]:
+    def _chained(
+        self, x: Any, ends: Sequence[Any], given: Sequence[Any], by: Sequence[Any]
+    ) -> list[casadi.Function]:
         """Return maps that carry the state and its derivatives, by itself first, along.
 
         Kinks have no slope at the kink itself; everything else is exact.
@@ -214,14 +220,16 @@ class Machine:
             a = casadi.jacobian(end, x)
             own = [casadi.SX(n, n), *(casadi.jacobian(end, v) for v in by)]
             outputs = [casadi.mtimes(a, s) + d for s, d in zip(before, own, strict=True)]
-            given = [x, *carried, *self._given]
-            functions.append(casadi.Function("step", given, [end, *outputs], {"cse": True}))
+            functions.append(
+                casadi.Function("step", [x, *carried, *given], [end, *outputs], {"cse": True})
+            )
         return functions
 
     @functools.cached_property
     def _moves(self) -> list[Vectorized]:
         """How the state after a period depends on the input."""
-        return [Vectorized(f) for f in self._chained(*self._moved_by)]
+        x, ends, given, by = self._map()  # expressions themselves do not travel to other processes
+        return [Vectorized(f) for f in self._chained(x, ends, given, (by["path"],))]
 
     def _period(self, stages: Sequence[Vectorized], x: Array, *given: Any) -> list[Array]:
         """Go through a period; return the state after it and its derivatives, by itself first."""
