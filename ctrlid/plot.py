@@ -491,12 +491,9 @@ def step(redesigns: Any, axes: Any = None) -> Any:
     several = redesigns if isinstance(redesigns, Mapping) else {"": redesigns}
     if not several:
         raise CtrlidError("plot.step has nothing to draw: the mapping is empty")
+    needed = "plot.step draws a Redesign, as redesign() returns, or a mapping of them"
     for redesign in several.values():
-        _require(
-            redesign,
-            Redesign,
-            "plot.step draws a Redesign, as redesign() returns, or a mapping of them",
-        )
+        _require(redesign, Redesign, needed)
     size = (7.2, 3.2 * len(several)) if len(several) > 1 else None
     axes = _axes(axes, len(several), size, sharex=True)
     ends = []

@@ -74,12 +74,9 @@ class Vectorized:
         self.sizes = [function.numel_in(k) for k in range(function.n_in())]
         self.shapes = [(function.size1_out(k), function.size2_out(k))
                         for k in range(function.n_out())]  # fmt: skip
-        self._places = []
-        for k in range(function.n_out()):
-            pattern = function.sparsity_out(k)
-            rows, columns = pattern.row(), pattern.get_col()
-            self._places.append(list(zip(rows, columns, strict=True)))
-        self._elements = [function.sparsity_in(k).find() for k in range(function.n_in())]
+        # Where the elements that are not always zero stand, columns one after another.
+        into_at = [function.sparsity_in(k).find() for k in range(function.n_in())]
+        out_at = [function.sparsity_out(k).find() for k in range(function.n_out())]
         self._work = function.sz_w()
         self._program: list[tuple[int, int, int, int, Any]] = []
         for k in range(function.n_instructions()):
@@ -88,9 +85,9 @@ class Vectorized:
             if op == casadi.OP_CONST:
                 step = (0, out[0], 0, 0, function.instruction_constant(k))
             elif op == casadi.OP_INPUT:
-                step = (1, out[0], into[0], self._elements[into[0]][into[1]], None)
+                step = (1, out[0], into[0], into_at[into[0]][into[1]], None)
             elif op == casadi.OP_OUTPUT:
-                step = (2, into[0], out[0], out[1], None)
+                step = (2, into[0], out[0], out_at[out[0]][out[1]], None)
             elif op in UNARY:
                 step = (3, out[0], into[0], 0, UNARY[op])
             elif op in BINARY:
@@ -132,8 +129,7 @@ class Vectorized:
             elif kind == 1:
                 values[a] = inputs[b][c]
             else:
-                row, column = self._places[b][c]
-                outputs[b][row + self.shapes[b][0] * column] = values[a]
+                outputs[b][c] = values[a]
                 store[a] = None  # what comes next must not overwrite it
         return outputs
 
