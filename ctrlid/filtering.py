@@ -527,8 +527,7 @@ def _scheme(e: Equations, loop: Loop) -> Scheme:
     rate = float(np.max(np.abs(np.linalg.eigvals(a)), initial=0.0)) * loop.dt
     if rate <= 3 * SLOW and not driven:
         # A velocity that turns within a period crosses the kink of friction there.
-        kinks = e.spread is not None and casadi.depends_on(e.rhs, e.spread)
-        return (4, max(KINK_STEPS if kinks else 1, math.ceil(rate / SLOW)), False)
+        return (4, max(KINK_STEPS if e.kinked else 1, math.ceil(rate / SLOW)), False)
     steps = max(1, math.ceil(rate / 1.5))
     if steps > MOST_STEPS:
         raise CtrlidError(

@@ -143,6 +143,11 @@ class Equations:
         return bool(casadi.which_depends(self.output, self.u, 1, False)[0])
 
     @functools.cached_property
+    def kinked(self) -> bool:
+        """Whether the motion has kinks that a filter smooths, such as dry friction at rest."""
+        return self.spread is not None and bool(casadi.depends_on(self.rhs, self.spread))
+
+    @functools.cached_property
     def function(self) -> Any:
         """The CasADi function ``(t, x, u, p) -> (rhs, output)``."""
         both = casadi.vertcat(self.rhs, self.output)

@@ -17,7 +17,7 @@ from ctrlid.diagnosis.experiment import separating_experiment
 from ctrlid.diagnosis.omnibus import Omnibus, _shape, omnibus
 from ctrlid.diagnosis.replica import replica
 from ctrlid.diagnosis.result import Disturbance, Finding, Gap
-from ctrlid.diagnosis.rounds import plainer
+from ctrlid.diagnosis.rounds import one_round, plainer
 from ctrlid.diagnosis.scan import scanned
 from ctrlid.diagnosis.sentences import conclusion
 from ctrlid.diagnosis.trial import (
@@ -350,3 +350,59 @@ def test_a_filter_begins_where_a_curved_sensor_points():
     begun = machine.guess(make_track(loop, record)).predicted
     position = list(machine.e.states).index("x")
     np.testing.assert_allclose(begun[:, position], truth, rtol=1e-6)
+
+
+def test_limits_far_inside_are_found_though_none_promises_anything():
+    """A rolling ball under an observer that kicks: limits at a third of what it asks for."""
+
+    def ball(c, w):
+        return ct.nlsys(
+            lambda t, x, u, p: [x[1], p["c"] * np.sin(x[2]), p["w"] * (u[0] - x[2])],
+            lambda t, x, u, p: x[0], inputs=["u"], outputs=["x"], states=["x", "v", "tilt"],
+            params={"c": c, "w": w}, name="ball_beam",
+        )  # fmt: skip
+
+    C = ct.tf([118.2, -94.08, -117.6, 94.68], [1.0, -0.7534, 0.4893, -0.07494], 0.01)
+    at = cid.OperatingPoint((0.0, 0.0, 0.0), 0.0, 0.0)
+    real, believed = (cid.Loop(ball(*p), C, dt=0.01, at=at, free=("c", "w"))
+                      for p in ((9.37, 19.2), (8.66, 19.74)))  # fmt: skip
+    record = record_of(real, E.InputSaturation(-3.4, 3.4), 0.05, 5e-4, 9700, 4000)
+    base = base_model(believed, [record], believed.free)
+    pool = [E.InputSaturatingGain(0.0), *E.InputSaturation.candidates(believed, record)]
+    step = one_round(base, pool, lambda f, given: [f(x) for x in given])
+    assert step.best is not None
+    assert step.best.name == "InputSaturation"
+    assert step.best.fitted.upper == pytest.approx(3.4, rel=1e-3)
+    first, _ = sorted(step.trials, key=lambda t: -t.merit)
+    assert first.merit > 1.5 * refit(base, scanned(base, pool[1])).merit
+
+
+def test_dry_friction_is_not_lost_to_a_curve_that_contains_it():
+    """A fit that a large random force smooths is stuck; one that starts without it is not."""
+
+    def coil(K, R):
+        return ct.nlsys(
+            lambda t, x, u, p: [x[1], 9.81 - p["K"] / 0.1076 * (x[2] / x[0]) ** 2,
+                                (u[0] - p["R"] * x[2]) / 0.0245],
+            lambda t, x, u, p: x[0], inputs=["V"], outputs=["y"], states=["x", "v", "i"],
+            params={"K": K, "R": R}, name="maglev_coil",
+        )  # fmt: skip
+
+    C = ct.tf([-8862.054, 7623.508, 8819.593, -7665.969], [1.0, -0.612588, -0.892843, 0.641762],
+              0.001)  # fmt: skip
+    real, believed = (
+        cid.Loop(plant, C, dt=0.001, at=cid.operating_point(plant, output=0.01), free=("K", "R"))
+        for plant in (coil(9.13e-5, 2.2), coil(9.09e-5, 2.1))
+    )
+    r = cid.random_binary(10_000, amplitude=3e-4, hold=40, around=0.01, seed=5)
+    rig = real.with_effect(E.CoulombFriction(0.082))
+    record = cid.simulate(rig, r, sensor_noise=5e-6, seed=6)
+    base = base_model(believed, [record], believed.free)
+    friction, curve = (kind.candidates(believed, record)[0]
+                       for kind in (E.CoulombFriction, E.StribeckFriction))  # fmt: skip
+    alone, other = (refit(base, attempt(base, e)) for e in (friction, curve))
+    assert alone.merit < other.merit
+    step = one_round(base, [friction, curve], lambda f, given: [f(x) for x in given])
+    assert step.best is not None
+    assert step.best.name == "CoulombFriction"
+    assert step.best.merit > alone.merit + 50

@@ -76,7 +76,7 @@ def _simulated(model: Model, record: Record, first: float, sensor: float, seed: 
 
 def kinked(model: Model) -> bool:
     """Whether a model has kinks in its states, such as dry friction."""
-    return model.fit.problem.machine.e.spread is not None
+    return model.fit.problem.machine.e.kinked
 
 
 def artefact(copies: Sequence[Model | None], trial: Trial) -> float:

@@ -14,7 +14,7 @@ from ..linearization import state_matrices
 from ..loop import Loop
 from .decide import GATE
 from .replica import DOUBTFUL, TWICE, artefact, kinked, more_than_simple, replica
-from .scan import scanned
+from .scan import elsewhere, scanned
 from .trial import (
     Model,
     Trial,
@@ -22,6 +22,7 @@ from .trial import (
     comparable,
     contains,
     promised,
+    quiet,
     refit,
     same_kind,
     simulable,
@@ -85,33 +86,20 @@ def one_round(
     They are added to the base, and to the `other` model in its place if one is given.
     """
     tried: list[Trial] = work(lambda effect: scanned(base, effect), pool)
+    more: list[Trial] = []
     if other is not None:
         # What the model alone would regain from there is no merit of a candidate.
         lost = other.fit.value - base.fit.value
         lost -= max(0.0, lost + promised(other.fit))
-        more: list[Trial] = work(lambda effect: scanned(other, effect), pool)
+        more = work(lambda effect: scanned(other, effect), pool)
         more = [replace(t, promise=t.promise + lost) for t in more]
         pairs = zip(tried, more, strict=True)
         tried = [a if a.promise > 0 or a.promise >= b.promise else b for a, b in pairs]
-        tried += [b for b in more if b.promise > 0]
+        tried += [b for b in more if b.promise > 0 and all(b is not t for t in tried)]
     tried.sort(key=lambda t: -t.promise)
-    leader = tried[0] if tried else None
-    if leader is None or not math.isfinite(leader.promise):
+    if not tried or not math.isfinite(tried[0].promise):
         return Step(base, tuple(tried), None)
-    wanted = {t.name for t in tried[:TOP]} | set(type(leader.effect).look_alikes)
-    chosen = [
-        t
-        for t in tried
-        if t.promise > FAINT * (GATE + t.price)
-        and (t.name in wanted or t.promise > SHARE * leader.promise)
-    ]
-    done = {id(t): r for t, r in zip(chosen, work(lambda t: refit(base, t), chosen), strict=True)}
-    trials = [done.get(id(t), t) for t in tried]
-    best = max(trials, key=lambda t: t.merit)
-    alike = set(type(best.effect).look_alikes) if math.isfinite(best.merit) else set()
-    late = [t for t in tried if id(t) not in done and t.name in alike and t.promise > -math.inf]
-    done |= {id(t): r for t, r in zip(late, work(lambda t: refit(base, t), late), strict=True)}
-    trials = [done.get(id(t), t) for t in tried]
+    trials = _refitted(base, tried, more, work)
     trials = _simplest(base, _checked(base, trials))
     plain = plainer(base, trials[0], trials[1:])
     if plain is not trials[0]:
@@ -119,6 +107,52 @@ def one_round(
     best = trials[0]
     trials = [*trials[:NEXT], *map(comparable, trials[NEXT:])]
     return Step(base, tuple(trials), best if best.merit > GATE else None)
+
+
+def _refitted(
+    base: Model, tried: Sequence[Trial], more: Sequence[Trial], work: Work
+) -> list[Trial]:
+    """Return the trials, the promising and what resembles the best refitted.
+
+    `more` are trials around other values of the model, for those whose fit may be stuck.
+    """
+    done: dict[int, Trial] = {}
+
+    def fit(jobs: Sequence[tuple[Trial, Trial, Model | None]]) -> Trial:
+        fits: list[Trial] = work(lambda job: refit(base, *job[1:]), jobs)
+        for (t, _, _), r in zip(jobs, fits, strict=True):
+            done[id(t)] = max(done.get(id(t), r), r, key=lambda t: t.merit)
+        return max((*done.values(), *tried), key=lambda t: t.merit)
+
+    leader = tried[0]
+    wanted = {t.name for t in tried[:TOP]} | set(type(leader.effect).look_alikes)
+    promising = [t for t in tried if t.promise > FAINT * (GATE + t.price)]
+    best = fit([(t, t, None) for t in promising
+                if t.name in wanted or t.promise > SHARE * leader.promise])  # fmt: skip
+    if math.isfinite(best.merit):
+        alike = set(type(best.effect).look_alikes)
+        fit([(t, t, None) for t in tried
+             if id(t) not in done and t.name in alike and t.promise > -math.inf])  # fmt: skip
+        best = fit([(t, attempt_at(base, e, t.scan), None) for t in tried
+                    if id(t) in done and t.name in {best.name, *alike}
+                    for e in elsewhere(base, t.effect)])  # fmt: skip
+        stuck = [t for t in tried if id(t) in done and _may_be_stuck(t, best, tried)]
+        fit([(t, t, quiet(best.model)) for t in stuck])
+        fit([(t, m, None) for t in stuck for m in more if m is not t and m.name == t.name])
+    return [done.get(id(t), t) for t in tried]
+
+
+def _may_be_stuck(trial: Trial, best: Trial, tried: Sequence[Trial]) -> bool:
+    """Whether an effect may have lost only because its likelihood is rugged, as dry friction's is.
+
+    Where a large random force smooths the kink away, a fit stays there.
+    """
+    if trial.name == best.name or not best.merit > 0:
+        return False
+    own = [t for t in tried if t.name == best.name or contains(best.effect, t.effect)]
+    kin = {name for t in own for name in type(t.effect).look_alikes}
+    plain = len(trial.effect.parameters()) <= len(best.effect.parameters())
+    return plain and trial.name in kin and kinked(trial.model)
 
 
 def plainer(base: Model, best: Trial, others: Sequence[Trial]) -> Trial:

@@ -28,6 +28,7 @@ LENGTHS = 150  # wavelengths that are looked for in the travel
 EDGE = 0.05  # of the record, at either end
 TIMES = 40  # instants at which a parameter might have stepped
 LIMITS = (0.999, 0.998, 0.995, 0.99, 0.98, 0.95, 0.9, 0.8)  # quantiles that may be cut off
+DEPTHS = (0.5, 0.25)  # of the range of the input, to which it may have been limited
 MODES = 7  # frequencies at which a flexible mode is tried
 
 
@@ -154,6 +155,23 @@ def _saturation(model: Model, effect: InputSaturation) -> Trial:
     price = math.log(sum(len(side) for side in sides))
     return max((attempt_best(model, side, price) for side in sides if side),
                key=lambda t: t.promise)  # fmt: skip
+
+
+def elsewhere(model: Model, effect: AbstractEffect) -> list[AbstractEffect]:
+    """Return other starts of an effect whose likelihood has maxima far apart.
+
+    An input that is limited nearly always has made the model's parameters fit the limited one: no
+    limit promises anything then, and a fit from the edge of the range stays there.
+    """
+    if not isinstance(effect, InputSaturation):
+        return []
+    u = np.concatenate([t.table[1][t.valid] for t in model.fit.problem.tracks])
+    middle, low, high = float(np.median(u)), float(np.min(u)), float(np.max(u))
+    return [
+        InputSaturation(middle - d * (middle - low), middle + d * (high - middle))
+        for d in DEPTHS
+        if low < middle < high
+    ]
 
 
 def _periodic(model: Model, effect: PeriodicForce) -> Trial:

@@ -10,7 +10,7 @@ import numpy as np
 from ..data import Record
 from ..effects import AbstractEffect
 from ..errors import CtrlidError
-from ..filtering import Machine, Trajectory, retracked
+from ..filtering import Machine, Noise, Trajectory, retracked
 from ..likelihood import (
     Fit,
     begin,
@@ -26,6 +26,7 @@ from ..physics import Array
 from ..stepping import comes_to_rest
 
 SCREEN_ROUNDS = 14  # of a refit: a candidate that needs more is not the missing effect
+QUIET = 1e-4  # of the variance of a random force, with which kinks are sharp
 AWAY = 0.3  # of a given value: a recalibration beyond is doubted
 FAR = 10.0  # times its given value: no recalibration goes further
 FAINTER = 3  # times that an effect which promises nothing is tried at a tenth of its size
@@ -434,6 +435,15 @@ def _own_parameters(trial: Trial, fit: Fit) -> int:
     own = [k for k, n in enumerate(fit.problem.machine.names) if n.startswith(f"{trial.label}.")]
     left = _left(matrix, own, [k for k in range(len(matrix)) if k not in own])
     return max(1, int(np.sum(np.linalg.eigvalsh(left) > SEEN)))
+
+
+def quiet(model: Model) -> Model:
+    """Return a model with hardly any random force, to begin a fit with; known noise is kept."""
+    noise = model.fit.noise
+    if model.fit.problem.known is not None:
+        return model
+    force = tuple(QUIET * v for v in noise.force)
+    return replace(model, fit=replace(model.fit, noise=Noise(force)))
 
 
 def _objection(trial: Trial) -> str:
