@@ -17,9 +17,10 @@ from ctrlid.diagnosis.experiment import separating_experiment
 from ctrlid.diagnosis.omnibus import Omnibus, _shape, omnibus
 from ctrlid.diagnosis.replica import replica
 from ctrlid.diagnosis.result import Disturbance, Finding, Gap
-from ctrlid.diagnosis.rounds import one_round, plainer
+from ctrlid.diagnosis.rounds import Step, one_round, plainer
 from ctrlid.diagnosis.scan import scanned
 from ctrlid.diagnosis.sentences import conclusion
+from ctrlid.diagnosis.settling import _close
 from ctrlid.diagnosis.trial import (
     Model,
     attempt,
@@ -148,6 +149,27 @@ def test_a_force_of_pulses_is_not_taken_for_a_random_one():
         assert fit.noise.drift > 0
         tests.append(omnibus(fit).p_values["shape of the random force"])
     assert tests[0] < 1e-5 < 1e-3 < tests[1]
+
+
+def test_a_curve_that_gains_more_than_chance_stays_possible():
+    loop = drive()
+    record = record_of(loop, E.CoulombFriction(0.5), 0.3, 1e-3, 9310)
+    plain, curve = refitted(loop, record, E.CoulombFriction(0.0), E.StribeckFriction(0.0, 5.0))
+    assert plain.merit > curve.merit
+    by_chance, by_more = (replace(curve, gain=plain.gain + d) for d in (0.5, 2.0))
+    assert rivals(plain, [by_chance]) == ()
+    assert [t.name for t in rivals(plain, [by_more])] == ["StribeckFriction"]
+
+
+def test_what_took_the_place_of_another_has_its_rivals():
+    loop = levitation()
+    record = record_of(loop, E.ActuatorLag(1e-3), 1e-4, 1e-5, 9320)
+    base = base_model(loop, [record], loop.free)
+    lag, late = (refit(base, attempt(base, e)) for e in (E.ActuatorLag(5e-4), E.InputDelay(0.0)))
+    step = Step(base, (lag, late), lag)
+    assert lag.merit > late.merit
+    assert [t.name for t in _close(lag, [step])] == ["InputDelay"]
+    assert [t.name for t in _close(late, [step])] == ["ActuatorLag"]
 
 
 def refitted(loop, record, *candidates):

@@ -11,6 +11,7 @@ from .trial import Trial, contains, log_terms, same_kind
 
 GATE = 5.0  # gain of log-likelihood less penalty: 10 in units of the Bayesian criterion
 CLOSE = 3.0  # difference of log-likelihood that says nothing
+HINT = 1.0  # of log-likelihood, that a larger model gains by chance in one record of ten
 SAME = 4.0  # spread of a likelihood ratio: two models that differ by less are nested
 Z = 2.0  # standard deviations of Vuong's test
 DOUBT = 0.6  # of the best merit: where something is left, a look-alike with more is not excluded
@@ -126,13 +127,14 @@ def rivals(best: Trial, others: Sequence[Trial], sure: bool = True) -> tuple[Tri
         # A larger model that predicts the same contains the best one, and pays for nothing; but one
         # that gains more may be right (a Stribeck curve hardly told from dry friction), and a
         # record that says nothing of what it has more cannot exclude it.
+        alike = trial.name in type(best.effect).look_alikes
         nothing = trial.gain < best.gain + CLOSE and _spread(mine - theirs) < SAME
         if trial.cost > best.cost and nothing:
-            if contains(trial.effect, best.effect) and _open(trial, best):
+            free = contains(trial.effect, best.effect) and _open(trial, best)
+            if free or (alike and trial.gain > best.gain + HINT):
                 found.append(trial)
             continue
         z = vuong(mine, theirs, best.cost - trial.cost)
-        alike = trial.name in type(best.effect).look_alikes
         doubtful = not sure and alike and trial.merit > DOUBT * best.merit
         if lost < CLOSE or z < Z or doubtful:
             found.append(trial)
