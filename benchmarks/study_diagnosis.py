@@ -783,6 +783,11 @@ def report(rows: Sequence[Row]) -> None:
             lines += [
                 (f"{kind}: all in the sets", both, share([r.in_set for r in some])),
                 (f"{kind}: exactly right", exact, share([r.right for r in some])),
+                (
+                    f"{kind}: the right names first, and no others",
+                    "",
+                    share([r.extra.get("first", False) for r in some]),
+                ),
             ]
     sets = [r for r in done if r.kind == "lookalike" and r.extra.get("set")]
     if sets:

@@ -17,9 +17,8 @@ from .trial import Model, Trial, attempt_at, reduced, refit
 
 DOUBTFUL = 400.0  # a gain above this is no artefact of the filter, if the model has no effect yet
 TWICE = 2.0  # what the replica gains counts this much against a candidate
-KINKED = (
-    1e-4  # chance of a false alarm for a model with friction: the filter only nearly follows it
-)
+# Chance of a false alarm for a model with effects: the filter only nearly follows kinks and limits.
+WITH_EFFECTS = 1e-4
 BEYOND = 3.0  # logarithms of chance by which a test must fail more than on a replica
 
 

@@ -10,7 +10,7 @@ from ..effects import AbstractEffect
 from ..likelihood import Fit
 from .decide import CLOSE, GATE, MANY
 from .omnibus import ALPHA, Omnibus, omnibus
-from .replica import KINKED, forgiven, kinked, replica
+from .replica import WITH_EFFECTS, forgiven, replica
 from .rounds import NEXT, Step, Work, candidates, one_round
 from .scan import scanned
 from .settling import Found, cut, renoised, settled, without_superfluous
@@ -138,7 +138,7 @@ def _judged(model: Model) -> Omnibus:
     after = omnibus(model.fit)
     if not after.passed and simulable(model):
         copies = [replica(model, seed) for seed in (1, 2)]
-        after = forgiven(after, copies, KINKED if kinked(model) else ALPHA)
+        after = forgiven(after, copies, WITH_EFFECTS if model.loop.effects else ALPHA)
     return after
 
 
