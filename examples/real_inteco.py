@@ -40,7 +40,8 @@ model = cid.Loop(plant, None, dt=record.dt, at=at, free=("K",))
 # %%
 # What is missing?
 # ----------------
-# A lag of the actuator, and the law of the force in the gap. A small friction is named beside
+# A lag between the duty and what the sensor shows, of the actuator or of the sensor, which one
+# swing does not tell apart; and the law of the force in the gap. A small friction is named beside
 # them, in air, or a force at 32 Hz, which others have seen in this rig. Something is left.
 
 found = cid.diagnose(model, record, progress=False)
@@ -67,18 +68,6 @@ lag = next(f for f in found.findings if "ActuatorLag" in f.names)
 mine = next(e for e in (lag.effect, *lag.alternatives) if type(e).__name__ == "ActuatorLag")
 print(f"lag named by the diagnosis {1e3 * mine.tau:.1f} ms, current of the coil alone "
       f"{1e3 * tau:.1f} ms, the authors 24.9 ms")  # fmt: skip
-
-# %%
-# The name is right and the size a fifth too large: nothing rubs in air, and what the friction
-# stands in for pulls at the lag. Without it the lag is nearer.
-
-smooth = found.loop
-for label in found.loop.labelled:
-    if "Friction" in label:
-        smooth = smooth.without_effect(label)
-smooth = cid.fit_loop(smooth, record).loop
-without = smooth.labelled["ActuatorLag"].tau
-print(f"lag without the friction {1e3 * without:.1f} ms")
 print(f"gap {1e6 * found.gap.given:.0f} um as given, "
       f"{1e6 * found.gap.after:.1f} um with the effects")  # fmt: skip
 
@@ -86,9 +75,19 @@ cid.plot.diagnosis(found)
 plt.show()
 
 # %%
+# How large the lag comes out depends on what stands beside it, since the law of the force is only
+# nearly right. With another zero of the law alone, and no friction:
+
+beside = model.with_effect(cid.effects.ActuatorLag(tau=mine.tau))
+beside = beside.with_effect(cid.effects.PositionOffset(offset=0.002))
+fit = cid.fit_loop(beside, record, free=("K", "ActuatorLag.tau", "PositionOffset.offset"))
+beside_zero = fit.loop.labelled["ActuatorLag"].tau
+print(f"lag beside another zero of the law {1e3 * beside_zero:.1f} ms")
+
+# %%
 # What the name is worth
 # ----------------------
-# A lead with a crossover of 50 rad/s and a phase margin of 20 degrees, at 1 ms: designed once on
+# A lead with a crossover of 60 rad/s and a phase margin of 20 degrees, at 1 ms: designed once on
 # the model as given, once on the diagnosed one, and both tried on the diagnosed physics. A single
 # lead cannot promise much more: the lag has taken the phase.
 
@@ -99,7 +98,7 @@ for effect in (mine if f is lag else f.effect for f in found.findings):
 outcomes = {}
 for name, loop in {"as given": given, "diagnosed": physics}.items():
     G = ct.tf(ct.sample_system(ct.ss(loop.linearize()), 0.001, "zoh"))
-    outcomes[name] = cid.redesign(G, physics, crossover=50, phase_margin=20)
+    outcomes[name] = cid.redesign(G, physics, crossover=60, phase_margin=20)
     print(f"designed on the model {name}: {outcomes[name].verdict}")
 
 cid.plot.step({f"designed on the model {name}": o for name, o in outcomes.items()})
@@ -108,5 +107,6 @@ plt.show()
 assert outcomes["diagnosed"].achieved.stable
 assert not outcomes["as given"].achieved.stable
 assert found.verdict == "partly explained"
-assert abs(without - 0.0249) < 0.004
+assert abs(mine.tau - 0.0249) < 0.004
+assert abs(beside_zero - 0.0249) < 0.004
 assert found.gap.after < 0.1 * found.gap.given
