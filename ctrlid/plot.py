@@ -500,7 +500,8 @@ def step(redesigns: Any, axes: Any = None) -> Any:
     for ax, (label, redesign) in zip(axes, several.items(), strict=True):
         ends.append(_step(ax, redesign))
         if label:
-            ax.text(0.98, 0.08, label, transform=ax.transAxes, ha="right")
+            ax.get_legend().set_title(label)
+            ax.get_legend().set_alignment("left")
     for ax in axes:
         ax.set_xlim(0, max(ends))
         ax.set_xlabel("time after the step [s]" if ax is axes[-1] else "")
@@ -679,13 +680,16 @@ def _step(ax: Any, redesign: Redesign) -> float:
     for i, (what, performance, values) in enumerate(cases):
         if not performance.stable:
             label = f"{what}: UNSTABLE" + ("" if len(values) else ", the simulation breaks off")
+        elif not np.isfinite(performance.settling_time):
+            label = f"{what}: DOES NOT SETTLE"
         else:
             label = (f"{what}: {performance.overshoot:.0f} % overshoot, "
                      f"{performance.settling_time:.2g} s to settle")  # fmt: skip
         ax.plot(redesign.time[: len(values)], values, label=label, **_line(i),
                 marker=MARKERS[i], markevery=max(len(values) // 25, 1), markersize=4)  # fmt: skip
     promised = redesign.promised_step
-    reach = 0.6 * max(float(np.ptp(promised)), 1e-12)
+    restless = any(p.stable and not np.isfinite(p.settling_time) for _, p, _ in cases)
+    reach = (1.5 if restless else 0.6) * max(float(np.ptp(promised)), 1e-12)
     low, high = ax.get_ylim()
     ax.set_ylim(max(low, promised.min() - reach), min(high, promised.max() + reach))
     settled = [t for t in (redesign.promised.settling_time, redesign.achieved.settling_time)

@@ -335,9 +335,13 @@ def test_step_says_when_the_physics_is_lost(outcome):
 def test_step_draws_redesigns_by_their_labels_over_one_time(outcome):
     longer = replace(outcome, achieved=replace(outcome.achieved, settling_time=outcome.time[-1]))
     axes = plot.step({"first": outcome, "second": longer})
-    assert [ax.texts[0].get_text() for ax in axes] == ["first", "second"]
+    legends = [ax.get_legend() for ax in axes]
+    assert [legend.get_title().get_text() for legend in legends] == ["first", "second"]
     assert [ax.get_xlabel() for ax in axes] == ["", "time after the step [s]"]
     assert axes[0].get_xlim() == axes[1].get_xlim() == (0, plot.step(longer).get_xlim()[1])
+    restless = replace(outcome, achieved=replace(outcome.achieved, settling_time=np.inf))
+    _, achieved = plot.step(restless).get_legend().get_texts()
+    assert achieved.get_text() == "achieved on the physics: DOES NOT SETTLE"
     with pytest.raises(cid.CtrlidError, match="the mapping is empty"):
         plot.step({})
     with pytest.raises(cid.CtrlidError, match="or a mapping of them; given int"):

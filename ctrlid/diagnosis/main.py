@@ -178,7 +178,7 @@ def _diagnosed(
     if found.turned and not found.after.passed:
         # Neither way explains the record, perhaps: fresh data tell which leads further.
         tell("another way")
-        greedy = search(base, catalogue, work, tell, look_back=False)
+        greedy = search(base, catalogue, work, tell, found.steps[0])
         ways = [main_ones(s, _helps(fresh)) for s in (found, greedy)]
         found = min(ways, key=lambda s: (not s.after.passed, fresh.gap(fresh.loops(s.final))))
     tell("comparing on fresh data", 2)

@@ -40,7 +40,7 @@ class Search:
 
 def search(
     base: Model, catalogue: Sequence[type[AbstractEffect]], work: Work,
-    tell: Callable[[str], None], look_back: bool = True,
+    tell: Callable[[str], None], first: Step | None = None,
 ) -> Search:  # fmt: skip
     """Add effects to a base model until nothing more earns a place.
 
@@ -54,8 +54,9 @@ def search(
         ``work(function, items)``, a map that may run in parallel.
     tell : callable
         Told what is being done.
-    look_back : bool, optional
-        Whether the choice of a round may be taken back when the next one is known.
+    first : Step, optional
+        The first round of a search that took back the choice of one when the next was known. This
+        one goes on from that round and takes nothing back.
 
     Returns
     -------
@@ -73,10 +74,13 @@ def search(
     while len(model.loop.effects) - given < MANY and len(steps) < MANY + 2:
         tell(f"round {len(steps) + 1}: screening")
         pool = _pool(model, catalogue)
-        step = one_round(model, pool, work, None if steps else anchor(base))
+        if first is not None and not steps:
+            step = replace(first, best=first.trials[0])
+        else:
+            step = one_round(model, pool, work, None if steps else anchor(base))
         if step.best is not None and step.best.gain < LITTLE * excess(model.fit):
             step = replace(step, best=None)
-        asked = look_back and steps and step.best and not changed
+        asked = first is None and steps and step.best and not changed
         other = _foreseen(steps[-1], step, catalogue, work) if asked else None
         if other is not None:
             changed = turned = True
