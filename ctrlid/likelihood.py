@@ -22,6 +22,7 @@ MOST = 14.0  # and of the largest: above, the sensor is exact
 SLOWEST = 0.05  # of the longest record: the time constant of a coloured force
 LOG_STEP = 0.2  # of log variances, for derivatives
 SHARES = tuple(3.0**-k for k in range(6))  # of a step, until the likelihood grows
+ELSEWHERE = 2.0  # of log-likelihood, that a noise far away must gain to go on from there
 NOTHING = 1e-3  # of log-likelihood: a step that promises less is not worth taking
 SINGULAR = 1e-10  # relative eigenvalue below which a direction is not in the data
 
@@ -354,6 +355,17 @@ def climb(fit: Fit, rounds: int = ROUNDS, exact: bool = True) -> Fit:
             fit = _tune(fit.problem, fit.theta, fit.linearized, fit.noise, enough=enough)
             tuned = fit.value
     return polish(fit) if exact else fit
+
+
+def retuned(fit: Fit) -> Fit:
+    """Return the fit climbed on from a noise sought over its whole range, if that is far better.
+
+    A random force that stood for a wrong parameter at the start may have left no noise to the
+    sensor, from where small changes lead nowhere.
+    """
+    plain = Noise(fit.noise.force)
+    other = _tune(fit.problem, fit.theta, fit.linearized, plain, wide=True)
+    return climb(other) if other.value > fit.value + ELSEWHERE else fit
 
 
 def relinearized(fit: Fit) -> Fit:

@@ -18,6 +18,7 @@ from .likelihood import (
     climb,
     information,
     pseudo_inverse,
+    retuned,
     with_coloured_force,
 )
 from .linearization import operating_point
@@ -249,7 +250,7 @@ def fit_loop(
     records = as_records(record)
     names = _free_names(loop, free)
     start = begin(make_problem(loop, names, records), start_values(loop, names), None)
-    fit = climb(start)
+    fit = retuned(climb(start))
     if coloured or coloured is None:
         fit = choose_noise(fit, always=bool(coloured))
     return summary(loop, fit)

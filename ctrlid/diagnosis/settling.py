@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from ..effects import AbstractEffect
-from ..likelihood import climb, polish
+from ..likelihood import climb, polish, retuned
 from ..loop import Loop
 from ..loop_fit import choose_noise
 from .decide import CLOSE, GATE, rivals
@@ -132,7 +132,7 @@ def cut(model: Model, position: int) -> tuple[Model, Trial]:
 
 def renoised(model: Model) -> Model:
     """Ask again whether the data want a coloured force, now that an effect is in the model."""
-    fit = polish(model.fit)
+    fit = retuned(polish(model.fit))
     if fit.problem.known is not None:
         return Model(model.loop, fit)
     if fit.noise.drift:

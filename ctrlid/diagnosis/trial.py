@@ -19,6 +19,7 @@ from ..likelihood import (
     evaluate,
     known_from_repeats,
     relinearized,
+    retuned,
 )
 from ..loop import Loop
 from ..loop_fit import bounds_of, choose_noise, make_problem, start_values
@@ -119,7 +120,7 @@ def base_model(
     problem = make_problem(loop, names, records, begins)
     lower, upper = _near(loop, names, problem.lower, problem.upper)
     problem = replace(problem, lower=lower, upper=upper)
-    fit = climb(begin(problem, start_values(loop, names), None))
+    fit = retuned(climb(begin(problem, start_values(loop, names), None)))
     return Model(loop, choose_noise(fit))
 
 
