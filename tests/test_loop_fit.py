@@ -516,3 +516,24 @@ def test_poles_include_effects_and_say_what_is_not_in_the_data():
     assert fitted.poles_standard_errors[lag] == pytest.approx(error / tau**2, rel=1e-3)
     lost = replace(fitted, estimate=replace(fitted.estimate, covariance=np.diag([np.inf, np.inf])))
     assert np.isinf(lost.poles_standard_errors).all()
+
+
+def test_a_wrong_gain_at_the_start_does_not_take_the_noise_from_the_sensor():
+    """Two tanks, the lower level measured: at first a random force explains what the gain does."""
+
+    def tanks(k):
+        def update(t, x, u, p):
+            upper, lower = np.sqrt(np.maximum(x[0], 0.0)), np.sqrt(np.maximum(x[1], 0.0))
+            return [p["k"] * u[0] - p["a"] * upper, p["a"] * upper - p["b"] * lower]
+
+        return ct.nlsys(update, lambda t, x, u, p: x[1], inputs=["V"], outputs=["h2"],
+                        states=["h1", "h2"], params={"k": k, "a": 0.0708, "b": 0.068})  # fmt: skip
+
+    at = cid.operating_point(tanks(0.0463), output=4.37)
+    real, believed = (cid.Loop(tanks(k), None, dt=8.0, at=at, free=("k",))
+                      for k in (0.0463, 0.0495))  # fmt: skip
+    d = cid.random_binary(3000, amplitude=0.6, hold=60, around=0.0, seed=1)
+    record = cid.simulate(real, d=d, sensor_noise=0.011, seed=2)
+    estimate = cid.fit_loop(believed, record).estimate
+    assert estimate.sensor_noise[0] == pytest.approx(0.011, rel=0.05)
+    assert abs(estimate.values[0] - 0.0463) < 4 * estimate.standard_errors[0]

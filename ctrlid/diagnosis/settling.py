@@ -4,7 +4,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from ..effects import AbstractEffect
 from ..likelihood import climb, polish, retuned
 from ..loop import Loop
 from ..loop_fit import choose_noise
@@ -47,7 +46,7 @@ def settled(
             return settled(renoised(smaller), given, steps, work)
         there = {type(e).__name__ for e in smaller.loop.effects}
         rest = [t for t in _close(mine, steps) if t.name not in there]
-        again = _instead(smaller, [t.fitted for t in rest], mine, model, work)
+        again = work(lambda t, smaller=smaller: refit(smaller, attempt_at(smaller, t.fitted)), rest)
         best = max([mine, *again], key=lambda t: t.merit)
         if best.merit <= mine.merit + 1.0:
             best = mine
@@ -58,20 +57,6 @@ def settled(
         found.append(Found(best, close, smaller, position))
     found.sort(key=lambda f: -f.trial.gain)
     return model, tuple(found)
-
-
-def _instead(
-    smaller: Model, effects: Sequence[AbstractEffect], mine: Trial, model: Model, work: Work
-) -> list[Trial]:
-    """Return effects in the place of one, begun without it and, where short of it, with its values.
-
-    What the one does in the whole model another may do as well, and not find the way from without.
-    """
-    again: list[Trial] = work(lambda e: refit(smaller, attempt_at(smaller, e)), effects)
-    short = [t for t in again if not t.merit > mine.merit - CLOSE] if simulable(model) else []
-    near = work(lambda t: refit(smaller, attempt_at(smaller, t.effect), model), short)
-    better = {id(t): n for t, n in zip(short, near, strict=True) if n.merit > t.merit}
-    return [better.get(id(t), t) for t in again]
 
 
 def _moved(model: Model, position: int) -> Model:
