@@ -136,23 +136,25 @@ def _refitted(
         best = fit([(t, attempt_at(base, e, t.scan), None) for t in tried
                     if id(t) in done and t.name in {best.name, *alike}
                     for e in elsewhere(base, t.effect)])  # fmt: skip
-        stuck = [t for t in tried if id(t) in done and _may_be_stuck(t, best, tried)]
-        fit([(t, t, quiet(best.model)) for t in stuck])
+        stuck = [t for t in _maybe_stuck(best, tried) if id(t) in done]
+        near = quiet(best.model)
+        fit([(t, t, near) for t in stuck])
         fit([(t, m, None) for t in stuck for m in more if m is not t and m.name == t.name])
     return [done.get(id(t), t) for t in tried]
 
 
-def _may_be_stuck(trial: Trial, best: Trial, tried: Sequence[Trial]) -> bool:
-    """Whether an effect may have lost only because its likelihood is rugged, as dry friction's is.
+def _maybe_stuck(best: Trial, tried: Sequence[Trial]) -> list[Trial]:
+    """Return what may have lost only because its likelihood is rugged, as dry friction's is.
 
     Where a large random force smooths the kink away, a fit stays there.
     """
-    if trial.name == best.name or not best.merit > 0:
-        return False
+    if not best.merit > 0:
+        return []
     own = [t for t in tried if t.name == best.name or contains(best.effect, t.effect)]
-    kin = {name for t in own for name in type(t.effect).look_alikes}
-    plain = len(trial.effect.parameters()) <= len(best.effect.parameters())
-    return plain and trial.name in kin and kinked(trial.model)
+    kin = {name for t in own for name in type(t.effect).look_alikes} - {best.name}
+    most = len(best.effect.parameters())
+    plain = [t for t in tried if t.name in kin and len(t.effect.parameters()) <= most]
+    return [t for t in plain if kinked(t.model)]
 
 
 def plainer(base: Model, best: Trial, others: Sequence[Trial]) -> Trial:

@@ -147,8 +147,13 @@ def _limit(model: Model, effect: StateLimit) -> Trial:
     return attempt_best(model, [replace(effect, upper=v) for v in limits], math.log(len(limits)))
 
 
+def _inputs(model: Model) -> Array:
+    """Return the recorded inputs that count, one record after the other."""
+    return np.concatenate([t.table[1][t.valid] for t in model.fit.problem.tracks])
+
+
 def _saturation(model: Model, effect: InputSaturation) -> Trial:
-    u = np.concatenate([t.table[1][t.valid] for t in model.fit.problem.tracks])
+    u = _inputs(model)
     upper = [replace(effect, upper=float(v)) for v in np.quantile(u, LIMITS)]
     lower = [replace(effect, lower=float(v)) for v in np.quantile(u, 1 - np.array(LIMITS))]
     sides = [[e for e in side if e.lower < e.upper] for side in ([effect], upper, lower)]
@@ -165,13 +170,12 @@ def elsewhere(model: Model, effect: AbstractEffect) -> list[AbstractEffect]:
     """
     if not isinstance(effect, InputSaturation):
         return []
-    u = np.concatenate([t.table[1][t.valid] for t in model.fit.problem.tracks])
+    u = _inputs(model)
     middle, low, high = float(np.median(u)), float(np.min(u)), float(np.max(u))
-    return [
-        InputSaturation(middle - d * (middle - low), middle + d * (high - middle))
-        for d in DEPTHS
-        if low < middle < high
-    ]
+    if not low < middle < high:
+        return []
+    return [InputSaturation(middle - d * (middle - low), middle + d * (high - middle))
+            for d in DEPTHS]  # fmt: skip
 
 
 def _periodic(model: Model, effect: PeriodicForce) -> Trial:
