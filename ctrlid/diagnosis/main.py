@@ -3,15 +3,15 @@
 import functools
 import math
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
 import control as ct
-import joblib
 import numpy as np
 from tqdm import tqdm
 
+from .._jobs import check_jobs, spread
 from ..audit import Audit, audit
 from ..data import Record, as_records
 from ..effects import CATALOGUE, AbstractEffect, InputDelay, InputOffset, equivalents
@@ -68,7 +68,7 @@ def diagnose(
     *,
     catalogue: Sequence[type[AbstractEffect]] = CATALOGUE,
     validation: Record | Sequence[Record] | None = None,
-    jobs: int = 1,
+    jobs: int | None = None,
     progress: bool = True,
 ) -> Diagnosis:
     r"""Find where a model and data disagree, name what is missing, and show what it closes.
@@ -100,7 +100,8 @@ def diagnose(
     validation : Record or sequence of Record, optional
         Data for the comparison before and after.
     jobs : int, optional
-        Candidates that are tried at the same time, through joblib.
+        Candidates that are tried at the same time, each in a process of its own, through joblib;
+        by default one, or what ``joblib.parallel_config`` says.
     progress : bool, optional
         Whether to show progress.
 
@@ -148,7 +149,7 @@ def diagnose(
 
     tell("looking the records over", 1)
     audits, remarks = _look_over(loop, records)
-    options = catalogue, _worker(jobs), tell
+    options = catalogue, _worker(check_jobs(jobs)), tell
     result, found = _diagnosed(loop, records, audits, fresh, *options)
     if len(records) > 1 and not _alike(result):
         result = _one_by_one(loop, records, audits, found, *options) or result
@@ -325,14 +326,8 @@ def _rounded(model: Model, coarse: Readout) -> Model:
     return Model(loop, replace(fit, sensor=sensor, noise=noise))
 
 
-def _worker(jobs: int) -> Callable[[Callable[..., Any], Iterable[Any]], list[Any]]:
-    def work(function: Callable[..., Any], items: Iterable[Any]) -> list[Any]:
-        if jobs == 1:
-            return [function(item) for item in items]
-        run = joblib.Parallel(n_jobs=jobs, prefer="threads")
-        return list(run(joblib.delayed(function)(item) for item in items))
-
-    return work
+def _worker(jobs: int | None) -> Work:
+    return lambda function, items: list(spread(function, items, jobs))
 
 
 def _gaps(loop: Loop, found: Search, fresh: Fresh) -> tuple[Gap, dict[int, float], Disturbance]:

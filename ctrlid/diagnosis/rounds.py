@@ -35,6 +35,7 @@ FAINT = 0.5  # of what would earn a place: a fainter promise is not worth a refi
 OFFSETS = (SensorOffset,)
 
 Work = Callable[[Callable[..., Any], Iterable[Any]], list[Any]]
+Job = tuple[Trial, Trial | AbstractEffect, Model | None]  # whose fit, from where, near what
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,22 +119,28 @@ def _refitted(
     """
     done: dict[int, Trial] = {}
 
-    def fit(jobs: Sequence[tuple[Trial, Trial, Model | None]]) -> Trial:
-        fits: list[Trial] = work(lambda job: refit(base, *job[1:]), jobs)
-        for (t, _, _), r in zip(jobs, fits, strict=True):
+    def one(job: Job) -> Trial:
+        trial, start, near = job
+        if isinstance(start, AbstractEffect):
+            start = attempt_at(base, start, trial.scan)
+        return refit(base, start, near)
+
+    def fit(jobs: Sequence[Job]) -> Trial:
+        for (t, _, _), r in zip(jobs, work(one, jobs), strict=True):
             done[id(t)] = max(done.get(id(t), r), r, key=lambda t: t.merit)
         return max((*done.values(), *tried), key=lambda t: t.merit)
 
     leader = tried[0]
     wanted = {t.name for t in tried[:TOP]} | set(type(leader.effect).look_alikes)
     promising = [t for t in tried if t.promise > FAINT * (GATE + t.price)]
-    best = fit([(t, t, None) for t in promising
-                if t.name in wanted or t.promise > SHARE * leader.promise])  # fmt: skip
+    first = [t for t in promising if t.name in wanted or t.promise > SHARE * leader.promise]
+    fit([(t, e, None) for t in first for e in t.others])
+    best = fit([(t, t, None) for t in first])
     if math.isfinite(best.merit):
         alike = set(type(best.effect).look_alikes)
         fit([(t, t, None) for t in tried
              if id(t) not in done and t.name in alike and t.promise > -math.inf])  # fmt: skip
-        best = fit([(t, attempt_at(base, e, t.scan), None) for t in tried
+        best = fit([(t, e, None) for t in tried
                     if id(t) in done and t.name in {best.name, *alike}
                     for e in elsewhere(base, t.effect)])  # fmt: skip
         stuck = [t for t in _maybe_stuck(best, tried) if id(t) in done]

@@ -19,7 +19,7 @@ from ..effects import (
 from ..errors import CtrlidError
 from ..likelihood import pseudo_inverse
 from ..physics import Array
-from .trial import Model, Trial, attempt, attempt_at, attempt_best, refit
+from .trial import Model, Trial, attempt, attempt_best
 
 COLUMNS = 500_000  # numbers in a block of shapes at once
 NEARLY = 0.7  # of the best promise: another wave that may be the right one
@@ -199,40 +199,43 @@ def _ripple(model: Model, effect: PositionRipple) -> Trial:
     shortest = max(travel / LENGTHS, 4 * step, 4 * grain)
     if not travel > 2 * shortest:
         return Trial(effect, "", model, -math.inf, remark="the travel is too short to see a ripple")
-    waves = np.arange(1.0 / travel, 1.0 / shortest, 0.25 / travel)
+    finest, price = 0.25 / travel, math.log(max((1.0 / shortest - 1.0 / travel) * travel, 1))
 
-    def shapes(waves: Array) -> list[Array]:
-        angles = [2 * np.pi * np.outer(w, waves) for w in ways]
-        return [
-            np.stack([np.sin(a), np.cos(a)], axis=2).reshape(len(a), -1) for a in angles
-        ]  # fmt: skip
+    def gains_of(waves: Array) -> tuple[Array, Array]:
+        block = max(1, COLUMNS // (2 * (m.size + 1) * max(len(w) for w in ways)))
+        parts = []
+        for k in range(0, len(waves), block):
+            angles = [2 * np.pi * np.outer(w, waves[k : k + block]) for w in ways]
+            shapes = [np.stack([np.sin(a), np.cos(a)], axis=2).reshape(len(a), -1) for a in angles]
+            parts.append(promises(model, shapes, width=2))
+        gains, sizes = zip(*parts, strict=True)
+        return np.concatenate(gains), np.concatenate(sizes)
 
-    block = max(1, COLUMNS // (2 * (m.size + 1) * max(len(w) for w in ways)))
-    parts = [promises(model, shapes(waves[k : k + block]), width=2)
-             for k in range(0, len(waves), block)]  # fmt: skip
-    gains, sizes = (np.concatenate(x) for x in zip(*parts, strict=True))
-    price = math.log(max(len(waves) / 4, 1))
+    waves = np.arange(1.0 / travel, 1.0 / shortest, 2 * finest)
+    gains, sizes = gains_of(waves)
+    # A peak is about one over the travel wide: only those that may be the highest are seen finely.
+    tops = _peaks(gains, NEARLY**2, 2 * PEAKS)
+    between = np.concatenate([waves[tops] - finest, waves[tops] + finest])
+    between = np.unique(between[between > 0])
+    more, theirs = gains_of(between)
+    waves, first = np.unique(np.concatenate([waves, between]), return_index=True)
+    gains, sizes = (np.concatenate(x)[first] for x in ((gains, more), (sizes, theirs)))
 
-    def at(k: int) -> Trial:
+    def at(k: int) -> PositionRipple:
         amplitude, phase = _wave(sizes[k])
-        wave = replace(effect, amplitude=amplitude, period=float(1 / waves[k]), phase=phase)
-        return attempt(model, wave, price)
+        return replace(effect, amplitude=amplitude, period=float(1 / waves[k]), phase=phase)
 
-    tried = [at(k) for k in _peaks(gains)]
-    if len(tried) > 1 and tried[0].promise > tried[0].price:
-        # Motion between a few levels sees several waves nearly alike: only fits tell them apart.
-        best = max((refit(model, t) for t in tried), key=lambda t: t.merit)
-        if math.isfinite(best.merit):
-            return attempt_at(model, best.fitted, price)
-    return tried[0]
+    best, *others = map(at, _peaks(gains, NEARLY, PEAKS))
+    # Motion between a few levels sees several waves nearly alike: only fits tell them apart.
+    return replace(attempt(model, best, price), others=tuple(others))
 
 
-def _peaks(gains: Array) -> list[int]:
-    """Return the highest peaks, at most a few that are nearly as high as the best."""
+def _peaks(gains: Array, nearly: float, most: int) -> list[int]:
+    """Return the highest peaks: those that are nearly as high as the best, at most so many."""
     padded = np.concatenate([[-np.inf], gains, [-np.inf]])
     tops = np.flatnonzero((gains >= padded[:-2]) & (gains > padded[2:]))
-    tops = tops[gains[tops] > NEARLY * gains.max()]
-    return [int(k) for k in tops[np.argsort(-gains[tops])][:PEAKS]] or [int(np.argmax(gains))]
+    tops = tops[gains[tops] > nearly * gains.max()]
+    return [int(k) for k in tops[np.argsort(-gains[tops])][:most]] or [int(np.argmax(gains))]
 
 
 def _grain(y: Array) -> float:

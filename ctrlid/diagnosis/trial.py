@@ -64,7 +64,8 @@ class Trial:
     """A candidate added to a model.
 
     `promise` is the gain of log-likelihood that the first step expects, `gain` what the refit gave,
-    `cost` half the Bayesian penalty of its parameters and of what was scanned.
+    `cost` half the Bayesian penalty of its parameters and of what was scanned. `others` are starts
+    that promise nearly as much, which only a refit tells apart.
     """
 
     effect: AbstractEffect
@@ -75,6 +76,7 @@ class Trial:
     gain: float = math.nan
     cost: float = math.nan
     remark: str = ""
+    others: tuple[AbstractEffect, ...] = ()
 
     @property
     def name(self) -> str:
