@@ -16,6 +16,8 @@ from .result import Place
 LAGS = 25
 SETTLING = 0.05  # of a record, in which a force is still being found
 INDEPENDENT = 40  # samples of a force, from which its distribution shows
+OF_NOISE = ("size", "heavy", "isolated", "shape")  # tests of what no effect explains
+LEAST = 1e-300  # probability
 ALPHA = 1e-3  # chance of one false alarm over all tests together
 
 
@@ -36,6 +38,15 @@ class Omnibus:
         """The most telling test, and its probability after paying for the number of tests."""
         name = min(self.p_values, key=lambda k: self.p_values[k])
         return name, min(1.0, self.p_values[name] * len(self.p_values))
+
+    @property
+    def told(self) -> float:
+        """What the most telling test of means says [log-likelihood].
+
+        That is what an effect that is still missing would gain, about, or more.
+        """
+        means = [p for name, p in self.p_values.items() if not name.startswith(OF_NOISE)]
+        return -math.log(max(min(means), LEAST))
 
     @property
     def passed(self) -> bool:

@@ -19,6 +19,7 @@ from .trial import Model, Trial, anchor, contains, refit, same_kind, simulable, 
 NEARLY = 0.8  # of the best merit: what comes so close may be the better half of a pair
 FORESEEN = 2  # of them
 MINOR = 0.15  # of the whole gain: less, beside something unknown, is a stand-in
+SMALL = 0.6  # of what the tests say is missing: what gains less beside other effects is a stand-in
 LITTLE = 0.1  # of what known noise does not explain: less, beside so much, is a stand-in
 
 
@@ -78,7 +79,7 @@ def search(
             step = replace(first, best=first.trials[0])
         else:
             step = one_round(model, pool, work, None if steps else anchor(base))
-        if step.best is not None and step.best.gain < LITTLE * excess(model.fit):
+        if step.best is not None and _stands_in(step.best, model, beside=bool(steps)):
             step = replace(step, best=None)
         asked = first is None and steps and step.best and not changed
         other = _foreseen(steps[-1], step, catalogue, work) if asked else None
@@ -95,6 +96,26 @@ def search(
         model = grown(step.best)
     model, found = settled(model, given, steps, work)
     return Search(base, tuple(steps), model, found, before, _judged(model), turned)
+
+
+def _stands_in(best: Trial, model: Model, beside: bool) -> bool:
+    """Whether an effect gains so much less than what is missing that it can only stand in for it.
+
+    Parameters
+    ----------
+    best : Trial
+        The best candidate.
+    model : Model
+        The model that it was added to.
+    beside : bool
+        Whether an effect was found before; the best of several unknown ones may gain little.
+    """
+    if best.gain < LITTLE * excess(model.fit):
+        return True
+    if not (beside and simulable(model)) or best.gain >= SMALL * omnibus(model.fit).told:
+        return False
+    # The tests may be alarmed by the filter itself: replicas, which take their time, forgive that.
+    return best.gain < SMALL * _judged(model).told
 
 
 def _foreseen(

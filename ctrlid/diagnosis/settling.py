@@ -1,5 +1,6 @@
 """When all effects are found: what is superfluous, and what could stand in the place of each."""
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -10,9 +11,20 @@ from ..loop_fit import choose_noise
 from .decide import CLOSE, GATE, rivals
 from .omnibus import omnibus
 from .rounds import NEXT, Step, Work, plainer
-from .trial import Model, Trial, attempt_at, needed, reduced, refit, simulable, spared
+from .trial import (
+    Model,
+    Trial,
+    attempt_at,
+    contains,
+    needed,
+    reduced,
+    refit,
+    simulable,
+    spared,
+)
 
 NEAR = 0.5  # of the winner's merit: what came so close is asked again when all effects are in
+ALMOST = 0.5  # of what leaving an effect out loses: what regains less does not stand for it
 SURE = 100.0  # times the gate: an effect so significant is not asked whether it is needed
 
 
@@ -39,6 +51,9 @@ def settled(
         best = first.best
         if bool(best.model.fit.noise.drift) == bool(model.fit.noise.drift):
             return model, (Found(best, rivals(best, first.trials, sure), first.base, given),)
+    one = fused(model, given, steps)
+    if one is not model:
+        return settled(renoised(one), given, steps, work)
     found: list[Found] = []
     for position in range(given, len(model.loop.effects)):
         smaller, mine = cut(model, position)
@@ -57,6 +72,39 @@ def settled(
         found.append(Found(best, close, smaller, position))
     found.sort(key=lambda f: -f.trial.gain)
     return model, tuple(found)
+
+
+def fused(model: Model, given: int, steps: Sequence[Step]) -> Model:
+    """Return a model in which one effect stands for two, if it explains as much with as few.
+
+    Dry friction found first and a constant force after it may be one asymmetric friction.
+    """
+    effects = model.fitted.effects
+    richer = {t.name: t.effect for s in steps for t in s.trials}
+    for k, other in itertools.permutations(range(given, len(effects)), 2):
+        for start in richer.values():
+            if not contains(start, effects[k]):
+                continue
+            more = len(effects[k].parameters()) + len(effects[other].parameters())
+            saved = 0.5 * (more - len(start.parameters())) * math.log(model.fit.size)
+            without = _without(model, [other])
+            smaller = _without(model, [k, other])
+            trial = attempt_at(smaller, replace(start, **effects[k].values()))
+            lost = model.fit.value - without.fit.value
+            if smaller.fit.value + trial.promise < model.fit.value - ALMOST * lost:
+                continue
+            trial = refit(smaller, trial, model)
+            if trial.merit > GATE and trial.model.fit.value + saved > model.fit.value:
+                return trial.model
+    return model
+
+
+def _without(model: Model, positions: Sequence[int]) -> Model:
+    """Return the model without some of its effects, all else as it is."""
+    loop, names = model.fitted, model.names
+    for position in sorted(positions, reverse=True):
+        loop, names = taken_out(loop, position, names)
+    return Model(loop, reduced(model, loop, names))
 
 
 def _moved(model: Model, position: int) -> Model:
