@@ -20,7 +20,8 @@ from ctrlid.diagnosis.result import Disturbance, Finding, Gap
 from ctrlid.diagnosis.rounds import Step, one_round, plainer
 from ctrlid.diagnosis.scan import scanned
 from ctrlid.diagnosis.sentences import conclusion
-from ctrlid.diagnosis.settling import _close
+from ctrlid.diagnosis.search import _stands_in
+from ctrlid.diagnosis.settling import _close, fused
 from ctrlid.diagnosis.trial import (
     Model,
     attempt,
@@ -339,9 +340,11 @@ def test_waves_that_two_levels_see_nearly_alike_are_fitted():
     record = record_of(loop, ripple, 2.5e-4, 1e-6, 9340, n=6000)
     base = base_model(loop, [record], loop.free)
     (start,) = E.PositionRipple.candidates(base.fitted, record)
-    trial = refit(base, scanned(base, start))
-    assert trial.fitted.period == pytest.approx(2.3e-4, rel=0.005)
-    assert trial.fitted.amplitude == pytest.approx(0.4, rel=0.1)
+    assert scanned(base, start).others
+    step = one_round(base, [start], lambda f, given: [f(x) for x in given])
+    assert step.best is not None
+    assert step.best.fitted.period == pytest.approx(2.3e-4, rel=0.005)
+    assert step.best.fitted.amplitude == pytest.approx(0.4, rel=0.1)
 
 
 def test_a_limit_of_the_input_is_found_wherever_it_cuts():
@@ -428,3 +431,54 @@ def test_dry_friction_is_not_lost_to_a_curve_that_contains_it():
     assert step.best is not None
     assert step.best.name == "CoulombFriction"
     assert step.best.merit > alone.merit + 50
+
+
+def test_one_asymmetric_friction_is_not_called_two_effects():
+    loop = levitation()
+    record = record_of(loop, E.AsymmetricCoulombFriction(0.2, 0.15), 4e-4, 1e-6, 9400)
+    pair = loop.with_effect(E.CoulombFriction(0.2)).with_effect(E.ConstantForce(0.05))
+    names = ("K", "CoulombFriction.fc", "ConstantForce.bias")
+    model = base_model(pair, [record], names)
+    base = base_model(loop, [record], loop.free)
+    rounds = (Step(base, (attempt(base, E.AsymmetricCoulombFriction(0.1, 0.0)),), None),)
+    one = fused(model, 0, rounds)
+    assert [type(e).__name__ for e in one.loop.effects] == ["AsymmetricCoulombFriction"]
+    assert one.fitted.effects[0].fc == pytest.approx(0.2, rel=0.02)
+    assert one.fitted.effects[0].difference == pytest.approx(0.15, rel=0.05)
+    assert fused(model, 0, ()) is model
+
+
+def test_two_effects_that_are_two_stay_two():
+    loop = levitation()
+    pair = loop.with_effect(E.CoulombFriction(0.2)).with_effect(E.LinearStiffness(300.0))
+    record = record_of(pair, E.ConstantForce(0.0), 4e-4, 1e-6, 9410)
+    names = ("K", "CoulombFriction.fc", "LinearStiffness.k1")
+    model = base_model(pair, [record], names)
+    base = base_model(loop, [record], loop.free)
+    rounds = (Step(base, (attempt(base, E.AsymmetricCoulombFriction(0.1, 0.0)),), None),)
+    assert fused(model, 0, rounds) is model
+
+
+@dataclass(frozen=True)
+class CubicDrag(E.ForceEffect):
+    """A drag that grows with the third power of the speed."""
+
+    c3: float = E.parameter("s/{y}^2", neutral=0.0)
+
+    def force(self, m):
+        return -self.c3 * m.velocity**3
+
+
+def test_what_gains_far_less_than_is_missing_only_stands_in_for_it():
+    loop = levitation()
+    record = record_of(loop, CubicDrag(3e5), 4e-4, 1e-6, 9420)
+    base = base_model(loop, [record], loop.free)
+    nearly = whole(refit(base, attempt(base, E.QuadraticDrag(10.0))).model)
+    right = refit(nearly, attempt(nearly, CubicDrag(1e4)))
+    assert right.gain > 1500
+    assert not _stands_in(right, nearly, beside=True)
+    (bent,) = E.SensorNonlinearity.candidates(loop, record)
+    little = refit(nearly, attempt(nearly, bent))
+    assert 200 < little.gain < 400
+    assert _stands_in(little, nearly, beside=True)
+    assert not _stands_in(little, nearly, beside=False)

@@ -24,7 +24,7 @@ from .trial import (
 )
 
 NEAR = 0.5  # of the winner's merit: what came so close is asked again when all effects are in
-ALMOST = 0.5  # of what leaving an effect out loses: what regains less does not stand for it
+REGAINED = 0.1  # of what leaving an effect out loses: what promises less does not stand for it
 SURE = 100.0  # times the gate: an effect so significant is not asked whether it is needed
 
 
@@ -91,7 +91,8 @@ def fused(model: Model, given: int, steps: Sequence[Step]) -> Model:
             smaller = _without(model, [k, other])
             trial = attempt_at(smaller, replace(start, **effects[k].values()))
             lost = model.fit.value - without.fit.value
-            if smaller.fit.value + trial.promise < model.fit.value - ALMOST * lost:
+            regained = smaller.fit.value + trial.promise - without.fit.value
+            if regained < REGAINED * lost:
                 continue
             trial = refit(smaller, trial, model)
             if trial.merit > GATE and trial.model.fit.value + saved > model.fit.value:
