@@ -19,8 +19,8 @@ from ctrlid.diagnosis.replica import replica
 from ctrlid.diagnosis.result import Disturbance, Finding, Gap
 from ctrlid.diagnosis.rounds import Step, one_round, plainer
 from ctrlid.diagnosis.scan import scanned
-from ctrlid.diagnosis.sentences import conclusion
 from ctrlid.diagnosis.search import _stands_in
+from ctrlid.diagnosis.sentences import conclusion
 from ctrlid.diagnosis.settling import _close, fused
 from ctrlid.diagnosis.trial import (
     Model,
@@ -477,8 +477,8 @@ def test_what_gains_far_less_than_is_missing_only_stands_in_for_it():
     right = refit(nearly, attempt(nearly, CubicDrag(1e4)))
     assert right.gain > 1500
     assert not _stands_in(right, nearly, beside=True)
-    (bent,) = E.SensorNonlinearity.candidates(loop, record)
-    little = refit(nearly, attempt(nearly, bent))
-    assert 200 < little.gain < 400
+    (spring,) = E.LinearStiffness.candidates(loop, record)
+    little = refit(nearly, attempt(nearly, spring))
+    assert 0 < little.gain < 50
     assert _stands_in(little, nearly, beside=True)
     assert not _stands_in(little, nearly, beside=False)
