@@ -14,12 +14,13 @@ import ctrlid as cid
 from ctrlid import effects as E
 from ctrlid.diagnosis.decide import doubt_of_all, rivals
 from ctrlid.diagnosis.experiment import separating_experiment
+from ctrlid.diagnosis.main import _wider
 from ctrlid.diagnosis.omnibus import Omnibus, _shape, omnibus
 from ctrlid.diagnosis.replica import replica
 from ctrlid.diagnosis.result import Disturbance, Finding, Gap
 from ctrlid.diagnosis.rounds import Step, one_round, plainer
 from ctrlid.diagnosis.scan import scanned
-from ctrlid.diagnosis.search import _stands_in
+from ctrlid.diagnosis.search import _foreseen, _stands_in, _there
 from ctrlid.diagnosis.sentences import conclusion
 from ctrlid.diagnosis.settling import _close, fused
 from ctrlid.diagnosis.trial import (
@@ -482,3 +483,47 @@ def test_what_gains_far_less_than_is_missing_only_stands_in_for_it():
     assert 0 < little.gain < 50
     assert _stands_in(little, nearly, beside=True)
     assert not _stands_in(little, nearly, beside=False)
+
+
+def test_where_nothing_follows_equals_of_the_best_are_asked():
+    """With a constant force in place of an offset, the middle of the spring is wrong."""
+    plant = ct.nlsys(
+        lambda t, x, u, p: [x[1], p["k"] * u[0] - p["s"] * x[0] - p["d"] * x[1]],
+        lambda t, x, u, p: x[0], inputs=["u"], outputs=["x"], states=["x", "v"],
+        params={"k": 2.0, "s": 40.0, "d": 4.0}, name="spring",
+    )  # fmt: skip
+    at = cid.OperatingPoint((0.0, 0.0), 0.0, 0.0)
+    loop = cid.Loop(plant, cid.PID(kp=20.0, ki=30.0, kd=2.0, filter_time=0.02), dt=0.01, at=at,
+                    free=("s", "d"))  # fmt: skip
+    spring, offset = E.CubicStiffness(8000.0), E.SensorOffset(-0.05)
+    record = record_of(loop.with_effect(offset), spring, 0.05, 1e-5, 9430, 4000)
+    base = base_model(loop, [record], loop.free)
+    force, zero = (refit(base, attempt(base, *kind.candidates(loop, record)))
+                   for kind in (E.ConstantForce, E.SensorOffset))  # fmt: skip
+    assert force.merit == pytest.approx(zero.merit, abs=0.1)
+    first = Step(base, (force, zero), force)
+    nothing = Step(whole(force.model), (), None)
+    other = _foreseen(first, nothing, [E.CubicStiffness], lambda f, given: [f(x) for x in given])
+    assert other is zero
+    assert E.equivalents(offset, loop.with_effect(spring)) == ()
+
+
+def test_waves_may_be_several_and_modes_may_not():
+    loop = levitation()
+    mode, wave = E.FlexibleMode(40.0, 0.1, 0.2), E.PeriodicForce(0.1, 3.0, 0.0)
+    fit = base_model(loop, [record_of(loop, wave, 1e-4, 1e-5, 9440)], loop.free).fit
+    model = Model(loop.with_effect(mode).with_effect(wave), fit)
+    assert _there(model, E.FlexibleMode(9.0, 0.3, 0.1))
+    assert not _there(model, E.PeriodicForce(0.1, 5.0, 0.0))
+    assert not _there(model, E.CoulombFriction(0.1))
+
+
+def test_a_loop_that_hunts_keeps_its_names():
+    def gap(after):
+        return Gap("closed-loop simulation", 9.0, 3.0, after, 4.0, "m", *[np.zeros(3)] * 4)
+
+    sensor, force = Disturbance(0.1, 0.0, np.nan, 0.2), Disturbance(0.1, 0.0, np.nan, 0.9)
+    assert not _wider(gap(2.9), force)
+    assert not _wider(gap(4.4), sensor)
+    assert _wider(gap(4.4), force)
+    assert _wider(gap(6.1), sensor)

@@ -190,7 +190,7 @@ def _diagnosed(
     found = main_ones(found, _helps(fresh))
     gap, shares, disturbance = _gaps(given, found, fresh)
     alone = len(records) == 1  # an effect of one record only may widen the gap in others
-    if alone and found.found and not found.after.passed and gap.after > gap.before:
+    if alone and found.found and not found.after.passed and _wider(gap, disturbance):
         # What names something and leaves more unexplained than before has the wrong name.
         found = replace(found, final=found.base, found=(), after=found.before)
         gap, shares, disturbance = _gaps(given, found, fresh)
@@ -355,6 +355,15 @@ def _gaps(loop: Loop, found: Search, fresh: Fresh) -> tuple[Gap, dict[int, float
         results[2][0][first.mask],
     )  # fmt: skip
     return gap, shares, _disturbance(found.final.fit, loop, floor, quiet)
+
+
+def _wider(gap: Gap, disturbance: Disturbance) -> bool:
+    """Whether effects leave a wider gap than sensor noise does, by itself, in a loop with them.
+
+    With friction and play a loop hunts, and no simulation follows it for long.
+    """
+    by_noise = not disturbance.large and gap.after <= EXCESS * gap.floor
+    return gap.after > gap.before and not by_noise
 
 
 def _helps(fresh: Fresh) -> Callable[[Found, Model], bool]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..effects import AbstractEffect
+from ..effects import AbstractEffect, PeriodicForce, PositionRipple
 from ..likelihood import Fit
 from .decide import CLOSE, GATE, MANY
 from .omnibus import ALPHA, Omnibus, omnibus
@@ -18,6 +18,7 @@ from .trial import Model, Trial, anchor, contains, refit, same_kind, simulable, 
 
 NEARLY = 0.8  # of the best merit: what comes so close may be the better half of a pair
 FORESEEN = 2  # of them
+WAVES = (PeriodicForce, PositionRipple)  # of which there may be several
 MINOR = 0.15  # of the whole gain: less, beside something unknown, is a stand-in
 SMALL = 0.6  # of what the tests say is missing: what gains less beside other effects is a stand-in
 LITTLE = 0.1  # of what known noise does not explain: less, beside so much, is a stand-in
@@ -81,7 +82,7 @@ def search(
             step = one_round(model, pool, work, None if steps else anchor(base))
         if step.best is not None and _stands_in(step.best, model, beside=bool(steps)):
             step = replace(step, best=None)
-        asked = first is None and steps and step.best and not changed
+        asked = first is None and steps and not changed
         other = _foreseen(steps[-1], step, catalogue, work) if asked else None
         if other is not None:
             changed = turned = True
@@ -125,13 +126,16 @@ def _foreseen(
 
     Where two effects hide together, the one that alone gains most may be a mixture of both. So each
     effect of its kind that did nearly as well is asked what could follow on it; the best pair wins.
+    Where nothing follows on the best although something is left, those that did as well are asked:
+    an offset of the sensor moves the middle of a spring, and a constant force does not.
     """
-    assert last.best is not None
-    assert step.best is not None
+    if step.best is None and omnibus(step.base.fit).passed:
+        return None
     best = last.best
-    near = [t for t in last.trials[1:NEXT] if _nearly(t, best)][:FORESEEN]
+    assert best is not None
+    near = [t for t in last.trials[1:NEXT] if _nearly(t, best, ties=step.best is None)]
     pairs: list[tuple[float, int]] = []
-    for k, trial in enumerate(near):
+    for k, trial in enumerate(near[:FORESEEN]):
         model = whole(trial.model)
         pool = _pool(model, catalogue)
         tried: list[Trial] = work(lambda effect, model=model: scanned(model, effect), pool)
@@ -139,15 +143,21 @@ def _foreseen(
         done = work(lambda t, model=model: refit(model, t), tried)
         pairs.append((trial.merit + max((t.merit for t in done), default=-math.inf), k))
     total, k = max(pairs, default=(-math.inf, 0))
-    return near[k] if total > best.merit + step.best.merit + GATE else None
+    own = best.merit + (step.best.merit if step.best is not None else GATE)
+    return near[k] if total > own + GATE else None
 
 
-def _nearly(trial: Trial, best: Trial) -> bool:
-    """Whether a candidate did nearly as well as one that resembles it, and is another."""
+def _nearly(trial: Trial, best: Trial, ties: bool) -> bool:
+    """Whether a candidate did nearly as well as one that resembles it, and is another.
+
+    One that did as well is asked for `ties` only: it is another name for the same, as a rule.
+    """
     if contains(trial.effect, best.effect) or contains(best.effect, trial.effect):
         return False
+    if not NEARLY * best.merit < trial.merit:
+        return False
     mine, its = ({t.name, *type(t.effect).look_alikes} for t in (best, trial))
-    return bool(mine & its) and NEARLY * best.merit < trial.merit < best.merit - CLOSE
+    return ties or (bool(mine & its) and trial.merit < best.merit - CLOSE)
 
 
 def excess(fit: Fit) -> float:
@@ -208,6 +218,5 @@ def _pool(model: Model, catalogue: Sequence[type[AbstractEffect]]) -> list[Abstr
 
 
 def _there(model: Model, effect: AbstractEffect) -> bool:
-    """Whether the model has this effect already; there may be several vibrations."""
-    waves = {"frequency", "period"} & set(effect.values())
-    return not waves and any(same_kind(e, effect) for e in model.loop.effects)
+    """Whether the model has this effect already; there may be several waves."""
+    return not isinstance(effect, WAVES) and any(same_kind(e, effect) for e in model.loop.effects)

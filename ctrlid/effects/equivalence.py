@@ -11,6 +11,7 @@ from ..errors import CtrlidError
 from ..physics import Array, Equations
 from .base import AbstractEffect
 from .catalogue import CATALOGUE
+from .law import PositionOffset
 from .moment import motion
 
 POINTS = 24  # random states and inputs at which two changes are compared
@@ -94,7 +95,26 @@ def _by_shift(name: str, loop: Any) -> set[str]:
         casadi.which_depends(rest, casadi.vertcat(e.x, e.u, e.t), 1, True)
     ):
         return set()
-    return set(OFFSETS) if casadi.jacobian(e.rhs[j], e.x[i]).nnz() else {"the initial position"}
+    if not casadi.jacobian(e.rhs[j], e.x[i]).nnz():
+        return {"the initial position"}
+    return set(OFFSETS) if _law_is_all(loop, i) else set()
+
+
+def _law_is_all(loop: Any, i: int) -> bool:
+    """Whether the law of the plant alone sees the position, state i, and no spring beside it."""
+    size = 1e-2 * (abs(loop.point.states[i]) or 1.0)
+    try:
+        changed = loop.with_effect(PositionOffset(size)).equations()
+    except CtrlidError:
+        return False
+    e, shift = loop.equations(), np.zeros(len(loop.point.states))
+    shift[i] = size
+    rates = [
+        (changed.evaluate(x, u, t)[0], e.evaluate(x + shift, u, t)[0], e.evaluate(x, u, t)[0])
+        for t, (x, u) in enumerate(_points(loop.point))
+    ]
+    offset, elsewhere, here = (np.concatenate(part) for part in zip(*rates, strict=True))
+    return _equal(elsewhere - here, offset - here)
 
 
 def _linear(e: Equations) -> bool:
@@ -132,13 +152,17 @@ def _change(loop: Any, effect: AbstractEffect, size: float) -> Array | None:
 
 
 def _sampled(e: Equations, at: Any, values: Array | None = None) -> Array:
+    rows = [np.concatenate(e.evaluate(x, u, t, values)) for t, (x, u) in enumerate(_points(at))]
+    return np.concatenate(rows)
+
+
+def _points(at: Any) -> list[tuple[Array, float]]:
+    """Return random states and inputs around rest."""
     rng = np.random.default_rng(3)
     rest = np.array([*at.states, at.input])
     scale = np.where(rest == 0, 1.0, 0.3 * np.abs(rest))
     points = rest + scale * rng.uniform(-1, 1, (POINTS, rest.size))
-    rows = [np.concatenate(e.evaluate(z[:-1], z[-1], t, values))
-            for t, z in enumerate(points)]  # fmt: skip
-    return np.concatenate(rows)
+    return [(z[:-1], float(z[-1])) for z in points]
 
 
 def _match(first: Array | None, second: Array | None) -> float | None:
