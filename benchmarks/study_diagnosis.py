@@ -48,7 +48,7 @@ from _random_loops import (
 
 import ctrlid as cid
 from ctrlid import effects
-from ctrlid.diagnosis.trial import Model, base_model
+from ctrlid.diagnosis.trial import Model, base_model, contains
 from ctrlid.effects import CATALOGUE, AbstractEffect, equivalents
 
 KINDS = ("named", "none", "outside", "two", "three", "lookalike")
@@ -450,11 +450,6 @@ def _made(cls: Any, one: Draw, rng: np.random.Generator, number: int) -> Any:
     return made if seen_at_all(made(1.0), one) else None
 
 
-def _contains(cls: type[AbstractEffect], simple: AbstractEffect) -> bool:
-    more = {p.name for p in cls.parameters()} > set(simple.values())
-    return more and type(simple).__name__ in cls.look_alikes
-
-
 def _outside(
     rng: np.random.Generator, index: int, coloured: bool, number: int, band: Any, target: float,
     samples: int,
@@ -471,7 +466,8 @@ def _outside(
         if any(" with " in name for name in out):  # two of the others together are the same
             return None
         # A friction is an asymmetric friction without a difference.
-        out |= {cls.__name__ for cls in CATALOGUE if _contains(cls, case.effects[0])}
+        others = [e for c in CATALOGUE for e in c.candidates(one.loop, case.record)]
+        out |= {type(e).__name__ for e in others if contains(e, case.effects[0])}
         left = tuple(c for c in CATALOGUE if c.__name__ not in out)
         return replace(case, catalogue=left, label=f"removed {cls.__name__}")
     one = draw(rng, a_plant(rng, MOVING), coloured, samples)
