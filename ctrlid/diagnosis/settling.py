@@ -153,8 +153,8 @@ def taken_out(
 def cut(model: Model, position: int) -> tuple[Model, Trial]:
     """Return the model without one effect, refitted, and the effect as a trial on top of it."""
     effect = model.fitted.effects[position]
-    loop, names = taken_out(model.fitted, position, model.names)
-    smaller = Model(loop, spared(climb(reduced(model, loop, names), rounds=10)))
+    bare = _without(model, [position])
+    smaller = replace(bare, fit=spared(climb(bare.fit, rounds=10)))
     start = attempt_at(smaller, effect)
     back = refit(smaller, start)
     short = back.remark or back.model.fit.value < model.fit.value - CLOSE
