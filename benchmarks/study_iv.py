@@ -36,8 +36,9 @@ import numpy as np
 from scipy.signal import lfilter
 
 import ctrlid as cid
-from ctrlid.likelihood import begin, information, pseudo_inverse
+from ctrlid.likelihood import pseudo_inverse
 from ctrlid.loop_fit import choose_noise, make_problem, start_values
+from ctrlid.maximum import begin, information
 from ctrlid.model import Estimate
 
 STEPS = (0.5, 0.2, 0.1, 0.03, 0.01, 0.005)

@@ -1,43 +1,24 @@
-"""A loop's plant along a record: its map over a period, linearized, and the filter run on it.
+"""The filter run along a record, on the plant linearized.
 
 The extended Kalman filter linearizes about its own estimate. Here all samples are linearized at
 once about the estimate of the pass before, which is the same thing when the two agree; they do
 after two or three passes, and between the passes parameters and noise may move as well.
 """
 
-import functools
-import itertools
-import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import casadi
 import numpy as np
 
-from .data import Record
 from .errors import CtrlidError
 from .kalman import filter_pass
-from .linearization import state_matrices
-from .loop import Loop
-from .physics import Array, Equations
-from .stepping import (
-    Scheme,
-    advance,
-    input_pieces,
-    integrate,
-    known_lags,
-    through_play,
-    whole_delay,
-)
-from .vectorized import Vectorized, through
+from .machine import Linearized, Machine, Trajectory
+from .physics import Array
+from .tracks import Track
+from .vectorized import Vectorized
 
-FEWEST = 10  # valid samples, to say anything
-BRIDGE = 20  # samples that do not count and are bridged by the model; then it starts afresh
 SETTLED = 4.0  # times the usual variance: above, the start still dominates the prediction
-SLOW = 0.35  # rate times step up to which a step of order four is exact enough
-MOST_STEPS = 100  # of order eight in a period: more make an expression that takes minutes to build
-KINK_STEPS = 4  # of order four in a period where friction has a kink
 NEWTON = 6  # steps that unbend the curve of a sensor
 PASSES = 12  # at most, to let the trajectory settle
 STILL = 1e-3  # of the standard deviations: a trajectory that moves less has settled
@@ -68,44 +49,6 @@ class Noise:
 
 
 @dataclass(frozen=True, eq=False)
-class Track:
-    """A record made ready: signals, and where the filter starts and starts anew."""
-
-    record: Record
-    table: Array  # rows t, u, r, y
-    valid: Any
-    afresh: Any
-    doubt: Array
-    start: Array
-    spread: Array
-    scale: float  # of the sensor noise, roughly
-
-
-@dataclass(frozen=True, eq=False)
-class Trajectory:
-    """Where to linearize: states before and after each measurement, and their spreads."""
-
-    predicted: Array
-    filtered: Array
-    spread: Array
-
-
-@dataclass(frozen=True, eq=False)
-class Linearized:
-    """The plant along a trajectory, as `kalman.filter_pass` takes it."""
-
-    step: Array
-    a: Array
-    b: Array
-    du: Array
-    dp: Array
-    height: Array
-    c: Array
-    hp: Array
-    trajectory: Trajectory
-
-
-@dataclass(frozen=True, eq=False)
 class Filtered:
     """What one pass of the filter gives; variances are relative to the sensor noise's."""
 
@@ -116,519 +59,108 @@ class Filtered:
     disturbance: Array
 
 
-class Machine:
-    """The equations of a loop's plant made ready to be filtered along records.
-
-    Parameters
-    ----------
-    loop : Loop
-        The loop; effects at their neutral values take part.
-    names : sequence of str
-        Parameters whose sensitivities are wanted.
-    hold : {"zoh", "foh"}
-        How the input runs between samples.
-    follow : bool
-        Whether a known analog controller moves the input between samples.
-    """
-
-    def __init__(self, loop: Loop, names: Sequence[str], hold: str, follow: bool) -> None:
-        self.loop, self.names, self.hold = loop, tuple(names), hold
-        e = self.e = loop.equations(keep=True)
-        every = list(e.parameters)
-        self.index = [every.index(name) for name in self.names]
-        law = loop.law() if follow and e.play is None and e.delay is None else None
-        self.law = law if law is not None and law.dt == 0.0 else None
-        self.n = len(e.states)
-        self.size = self.n + (len(self.law.rest) if self.law else 0)
-        self.late = whole_delay(e, loop.dt)
-        self.forces = e.velocities or tuple(range(self.n - len(e.rest)))
-        # One force on all velocities; without any, each state has a noise of its own.
-        self.channels = 1 if e.velocities else len(self.forces)
-        self._plays: dict[int, casadi.Function] = {}
-        self._build()
-
-    def _map(self) -> tuple[Any, list[Any], list[Any], dict[str, Any]]:
-        """Return the state, its value after each stage of a period, what is given, and symbols."""
-        e, n, dt = self.e, self.n, self.loop.dt
-        x, p, s = (casadi.SX.sym(k, m) for k, m in (("x", self.size), ("p", e.p.shape[0]),
-                                                    ("s", n)))  # fmt: skip
-        t, before, now, ahead, r, y = w = [casadi.SX.sym(k) for k in "tbnary"]
-        force = casadi.SX.sym("f", self.channels)
-        kick = casadi.SX.zeros(n, 1)
-        for k, j in enumerate(self.forces):
-            kick[j] = force[k if self.channels > 1 else 0]
-        # A fit repeats the map often; a single prediction can afford to be exact.
-        order, steps, cut = self.scheme = _scheme(e, self.loop)
-        scheme = self.scheme if self.names else (8, 1 if order == 4 else steps, cut)
-        part = casadi.SX.sym("i")
-        if self.law is None:
-            pieces = [
-                tuple(casadi.substitute(casadi.SX(value), e.p, p) for value in piece)
-                for piece in input_pieces(e, dt, (before, now, ahead), self.hold)
-            ]
-            ends, self._parts = self._stages_of(t, x, pieces, p, s, kick, scheme, part)
-        else:
-            ends = [self._follow(t, x, p, s, kick, now, r, y, max(scheme[1], 2))]
-            self._parts = 1
-        free = casadi.vertcat(*(p[k] for k in self.index)) if self.index else casadi.SX(0, 1)
-        self._carries = len(ends) * self._parts > 1
-        by = {"force": force, "free": free, "path": casadi.vertcat(before, now, ahead),
-              "height": e.smoothed(t, x[:n], now, p, s)[1]}  # fmt: skip
-        return x, ends, [casadi.vertcat(*w), p, s, force, part], by
-
-    def _build(self) -> None:
-        x, ends, given, by = self._map()
-        self._functions = self._chained(x, ends, given, (by["force"], by["free"]))
-        self._stages = [Vectorized(f) for f in self._functions]
-        height = by["height"]
-        outputs = [height, casadi.jacobian(height, x), casadi.jacobian(height, by["free"])]
-        self.sensor_function = casadi.Function("sensor", [x, *given[:3]], outputs, {"cse": True})
-        self._sensor = Vectorized(self.sensor_function)
-
-    def _stages_of(self, t: Any, x: Any, pieces: Any, p: Any, s: Any, kick: Any, scheme: Scheme,
-                   part: Any) -> tuple[list[Any], int]:  # fmt: skip
-        """Return the maps that make up a period, and how many equal parts each of them has.
-
-        Several steps of one kind are one short expression that is gone through several times.
-        """
-        order, steps, cut = scheme
-        if self.e.dt or cut or steps == 1:
-            return [advance(self.e, t, x, pieces, p, s, kick, scheme)[0]], 1
-        ends, begin = [], t
-        for duration, level, slope in pieces:
-            h = duration / steps
-            piece = (h, level + slope * part * h, slope)
-            after = advance(self.e, begin + part * h, x, [piece], p, s, kick, (order, 1, False))[0]
-            ends.append(after)
-            begin = begin + duration
-        return ends, steps
-
-    def _chained(
-        self, x: Any, ends: Sequence[Any], given: Sequence[Any], by: Sequence[Any]
-    ) -> list[casadi.Function]:
-        """Return maps that carry the state and its derivatives, by itself first, along.
-
-        Kinks have no slope at the kink itself; everything else is exact.
-        """
-        n = self.size
-        before = [casadi.SX.eye(n), *(casadi.SX(n, v.shape[0]) for v in by)]
-        carried = []
-        if self._carries:
-            before = carried = [casadi.SX.sym("s", *value.shape) for value in before]
-        functions = []
-        for end in ends:
-            a = casadi.jacobian(end, x)
-            own = [casadi.SX(n, n), *(casadi.jacobian(end, v) for v in by)]
-            outputs = [casadi.mtimes(a, s) + d for s, d in zip(before, own, strict=True)]
-            functions.append(
-                casadi.Function("step", [x, *carried, *given], [end, *outputs], {"cse": True})
-            )
-        return functions
-
-    @functools.cached_property
-    def _moves(self) -> list[Vectorized]:
-        """How the state after a period depends on the input."""
-        x, ends, given, by = self._map()  # expressions themselves do not travel to other processes
-        return [Vectorized(f) for f in self._chained(x, ends, given, (by["path"],))]
-
-    def _period(self, stages: Sequence[Vectorized], x: Array, *given: Any) -> list[Array]:
-        """Go through a period; return the state after it and its derivatives, by itself first."""
-        if not self._carries:
-            return through(stages, [], [x, *given, 0])
-        n = self.size
-        widths = [size // n for size in stages[0].sizes[2 : -len(given) - 1]]
-        still = [np.eye(n).ravel(), *(np.zeros(n * k) for k in widths)]
-        return through(stages, [x, *still], given, self._parts)
-
-    def _follow(self, t: Any, x: Any, p: Any, s: Any, kick: Any, u: Any, r: Any, y: Any,
-                substeps: int) -> Any:  # fmt: skip
-        """Advance plant and analog controller together, u being the measured one at the start."""
-        e, n, law = self.e, self.n, self.law
-        assert law is not None
-        noise = y - e.smoothed(t, x[:n], u, p, s)[1]
-        offset = u - law.apply(t, x[n:], r, y)[0]  # bias, injected signals, what xc does not know
-
-        def rate(tau: Any, z: Any) -> Any:
-            seen = e.smoothed(t + tau, z[:n], u, p, s)[1] + noise
-            computed, slope = law.apply(t + tau, z[n:], r, seen)
-            moved = e.smoothed(t + tau, z[:n], computed + offset, p, s)[0] + kick
-            return casadi.vertcat(moved, slope)
-
-        return integrate(rate, x, self.loop.dt, substeps)[0]
-
-    @property
-    def position(self) -> int:
-        """Index of the state whose rate is the first velocity."""
-        e, v = self.e, self.e.velocities[0]
-        rates = [casadi.simplify(e.rhs[k]) for k in range(self.n) if k != v]
-        found = [casadi.is_equal(rate, e.x[v], 2) for rate in rates]
-        return [k for k in range(self.n) if k != v][found.index(True)]
-
-    def values(self, theta: Any) -> Array:
-        """Return all parameter values with `theta` in the places of the free ones."""
-        p = self.e.values.copy()
-        p[self.index] = theta
-        return p
-
-    def fits(self, theta: Array) -> bool:
-        """Whether the map was built for such values of a delay or of a lag."""
-        e, dt = self.e, self.loop.dt
-        p = casadi.SX(casadi.DM(self.values(theta)))
-        if e.delay is not None:
-            late = float(casadi.evalf(casadi.substitute(casadi.SX(e.delay), e.p, p))) / dt + 1e-9
-            if not self.late <= late <= self.late + 1 + 1e-6:
-                return False
-        time = _shortest(e, p)
-        return time > dt / 16 if not self.scheme[2] else time < dt / 4
-
-    def linearize(self, track: Track, theta: Array, at: Trajectory) -> Linearized:
-        """Return the plant along a trajectory, for parameter values `theta`."""
-        p = self.values(theta)
-        u = track.table[1]
-        applied, slopes = self._through_play(u, p)
-        w = self._inputs(track, applied)
-        spread = at.spread[:, : self.n].T
-        given = (at.filtered.T, w, p, spread, np.zeros(self.channels))
-        step, a, b, dp = self._period(self._stages, *given)
-        # How the input moves the state matters only where the input is not what was measured.
-        unsure = slopes is not None or not track.valid.all()
-        dw = self._period(self._moves, *given)[2] if unsure else np.zeros((1, self.size, 3))
-        if slopes is not None:
-            dw = _full(dw, len(u))
-            dp = _full(dp, len(u)).copy()
-            for k in (-1, 0, 1):
-                dp += dw[:, :, k + 1, None] * self._shifted(slopes, k)[:, None, :]
-        height, c, hp = self._sensor(at.predicted.T, w, p, spread)
-        return Linearized(
-            _full(step, len(u))[:, :, 0], _full(a, len(u)), _full(b, len(u)),
-            _full(dw, len(u)).sum(axis=2), _full(dp, len(u)), _full(height, len(u))[:, 0, 0],
-            _full(c, len(u))[:, 0, :], _full(hp, len(u))[:, 0, :], at,
-        )  # fmt: skip
-
-    def _through_play(self, u: Array, p: Array) -> tuple[Array, Array | None]:
-        """Return the input behind the play, and how it depends on the free parameters."""
-        e = self.e
-        if e.play is None:
-            return u, None
-        start = casadi.substitute(
-            casadi.SX(e.play.start), casadi.vertcat(e.play.u, e.p), casadi.vertcat(u[0], p)
-        )
-        z = np.concatenate([np.asarray(casadi.evalf(start), float).ravel(),
-                            np.zeros(len(self.index))])  # fmt: skip
-        if len(u) not in self._plays:  # building it takes longer than running it
-            self._plays[len(u)] = self._play().mapaccum("run", len(u))
-        out = np.asarray(self._plays[len(u)](z, u[None, :], p)[1], float)
-        return out[0], out[1:].T
-
-    def _play(self) -> casadi.Function:
-        """Return one sample of the play, with its slopes by the free parameters."""
-        e = self.e
-        assert e.play is not None
-        m, slope = casadi.SX.sym("m"), casadi.SX.sym("d", len(self.index))
-        sample, values = casadi.SX.sym("u"), casadi.SX.sym("p", e.p.shape[0])
-        applied, after = through_play(e, m, sample, values)
-        free = casadi.vertcat(*(values[k] for k in self.index)) if self.index else casadi.SX(0, 1)
-        rows = [
-            casadi.jacobian(out, m) * slope + casadi.jacobian(out, free).T
-            for out in (applied, after)
-        ]
-        return casadi.Function(
-            "play", [casadi.vertcat(m, slope), sample, values],
-            [casadi.vertcat(after, rows[1]), casadi.vertcat(applied, rows[0])],
-        )  # fmt: skip
-
-    def with_slopes(self) -> casadi.Function:
-        """Return one period of the plant, as it is, together with that of its sensitivities.
-
-        ``f(z, w, p) -> (next z, y and its slopes)``; z stacks the state and its derivatives by the
-        free parameters and the initial state, w is a column of `inputs`.
-        """
-        n, p = self.size, len(self.index)
-        x, s, w, values = (casadi.SX.sym(k, *size) for k, size in (
-            ("x", (n, 1)), ("s", (n, p + n)), ("w", (6, 1)), ("p", self.e.p.shape)))  # fmt: skip
-        still, quiet = casadi.SX.zeros(self.n), casadi.SX.zeros(self.channels)
-        y, c, hp = self.sensor_function(x, w, values, still)
-        seen = casadi.mtimes(c, s) + casadi.horzcat(hp, casadi.SX.zeros(1, n))
-        stage = [x, casadi.SX.eye(n), casadi.SX(n, self.channels), casadi.SX(n, p)]
-        carried = len(stage) if self._carries else 1
-        for function, part in itertools.product(self._functions, range(self._parts)):
-            stage = function.call([*stage[:carried], w, values, still, quiet, part])
-        after, a, _, dp = stage
-        moved = casadi.mtimes(a, s) + casadi.horzcat(dp, casadi.SX.zeros(n, n))
-        return casadi.Function(
-            "period", [casadi.vertcat(x, casadi.vec(s)), w, values],
-            [casadi.vertcat(after, casadi.vec(moved)), casadi.vertcat(y, seen.T)], {"cse": True},
-        )  # fmt: skip
-
-    def inputs(self, track: Track, theta: Array) -> Array:
-        """Return the rows over which the map is evaluated, shape (6, n), behind any play."""
-        return self._inputs(track, self._through_play(track.table[1], self.values(theta))[0])
-
-    def advance(self, track: Track, x: Array, rows: Any, known: bool = True) -> Array:
-        """Return states (k, n) one period after the samples `rows`, with the loop's parameters."""
-        p = self.e.values
-        w = self._inputs(track, self._through_play(track.table[1], p)[0])[:, rows]
-        if not known:
-            w[5] = self.height(track, x, rows)
-        quiet = np.zeros((self.n, 1))
-        return self._period(self._stages, x.T, w, p, quiet, np.zeros(self.channels))[0][:, :, 0]
-
-    def height(self, track: Track, x: Array, rows: Any) -> Array:
-        """Return the outputs at states (k, n) and the samples `rows`."""
-        p = self.e.values
-        w = self._inputs(track, self._through_play(track.table[1], p)[0])[:, rows]
-        return self._sensor(x.T, w, p, np.zeros((self.n, 1)))[0][:, 0, 0]
-
-    def at_rest(self) -> tuple[Array, Array, Array]:
-        """Return the derivatives of the map by state and force and of the output, at rest."""
-        at, p = self.loop.point, self.e.values
-        x = self._padded(np.array(_rest(self.loop, self.e)))
-        w = np.array([0.0, at.input, at.input, at.input, at.output, at.output])
-        quiet = np.zeros(self.n)
-        _, a, b, _ = self._period(self._stages, x, w, p, quiet, np.zeros(self.channels))
-        _, h, _ = self._sensor(x, w, p, quiet)
-        return a[0], b[0], h[0]
-
-    def _inputs(self, track: Track, applied: Array) -> Array:
-        """Return the rows (t, input before, now, ahead, r, y) over which the map is evaluated."""
-        t, _, r, y = track.table
-        moved = [self._shifted(applied, k) for k in (-1, 0, 1)]
-        return np.vstack([t, *moved, r, y])
-
-    def _shifted(self, values: Array, k: int) -> Array:
-        rows = np.clip(np.arange(len(values)) - self.late + k, 0, len(values) - 1)
-        return np.asarray(values[rows])
-
-    def run(
-        self, track: Track, lin: Linearized, noise: Noise, sensitive: bool = True,
-        columns: int | None = None,
-    ) -> Filtered:  # fmt: skip
-        """Run the filter along a linearized plant, with sensitivities to its first columns."""
-        p = len(self.index) if columns is None else columns
-        p = p if sensitive else 0
-        out = filter_pass(
-            lin.step, lin.a, lin.b, lin.du, np.ascontiguousarray(lin.dp[:, :, :p]), lin.height,
-            lin.c, np.ascontiguousarray(lin.hp[:, :p]), lin.trajectory.predicted,
-            lin.trajectory.filtered, track.table[3], track.valid, track.afresh, track.doubt,
-            self._padded(track.start), self._padded(track.spread), 1.0,
-            np.asarray(noise.force, dtype=float), noise.memory, noise.drift,
-        )  # fmt: skip
-        error, variance, before, after, wide, slopes, disturbance = out
-        counts = track.valid & ~track.afresh
-        with np.errstate(all="ignore"):  # a filter that lost the record says so later
-            sensor = np.sqrt(np.mean(error[counts] ** 2 / variance[counts]))
-        return Filtered(error, variance, Trajectory(before, after, wide * sensor), slopes,
-                        disturbance)  # fmt: skip
-
-    def _padded(self, values: Array) -> Array:
-        """Add the states of a known analog controller, at rest, to a start."""
-        extra = self.size - values.shape[0]
-        return np.pad(values, [(0, extra)] * values.ndim)
-
-    def guess(self, track: Track) -> Trajectory:
-        """Return a trajectory to begin with: at rest, states that are measured as measured."""
-        n, e = len(track.record), self.e
-        rest = np.tile(self._padded(track.start), (n, 1))
-        seen, values = e.output, track.table[3]
-        for _ in range(1 + len(e.lags)):  # behind a lag of the sensor is what it follows, nearly
-            columns = casadi.jacobian(seen, e.x).sparsity().get_col()
-            if len(columns) != 1 or casadi.depends_on(seen, casadi.vertcat(e.t, e.u)):
-                break
-            j = columns[0]
-            rest[:, j] = values = self._unbent(seen, e.x[j], float(rest[0, j]), values)
-            behind = [lag.target for lag in e.lags if lag.state == j]
-            if not behind:
-                break
-            seen = behind[0]
-        for lag in e.lags:
-            if casadi.is_equal(lag.target, e.u, 2):
-                rest[:, lag.state] = track.table[1]
-        spread = np.sqrt(np.diag(self._padded(track.spread)))
-        quiet = np.minimum(spread, 1.0) * track.scale
-        return Trajectory(rest, rest.copy(), np.tile(quiet, (n, 1)))
-
-    def _unbent(self, seen: Any, x: Any, at: float, values: Array) -> Array:
-        """Return the state x that is seen as given values, by Newton's rule; else at rest."""
-        if casadi.is_equal(seen, x, 2):
-            return values
-        f = Vectorized(casadi.Function("seen", [x, self.e.p], [seen, casadi.jacobian(seen, x)]))
-        found = np.full(len(values), at)
-        first = np.abs(f(found, self.e.values)[0].ravel() - values)
-        with np.errstate(all="ignore"):
-            for _ in range(NEWTON):
-                height, slope = (part.ravel() for part in f(found, self.e.values))
-                found = found + (values - height) / slope
-            left = np.abs(f(found, self.e.values)[0].ravel() - values)
-        return np.where(left <= first, found, at)  # also where it is no number
-
-    def settle(
-        self, track: Track, theta: Array, noise: Noise, at: Trajectory, passes: int = PASSES
-    ) -> tuple[Linearized, Filtered]:
-        """Linearize and filter until the trajectory no longer moves.
-
-        Raises
-        ------
-        CtrlidError
-            If the filter cannot follow the record with this model.
-        """
-        for count in range(passes):
-            at = self._inside(track, theta, at)
-            lin = self.linearize(track, theta, at)
-            out = self.run(track, lin, noise, sensitive=False)
-            moved = np.abs(out.trajectory.filtered - at.filtered)
-            if not np.isfinite(out.innovations).all() or not np.isfinite(moved).all():
-                k = int(np.argmin(np.isfinite(out.innovations)))
-                raise CtrlidError(
-                    f"the predictor of {self.e.name} lost the record at sample {k} "
-                    f"(t = {track.record.t[k]:.4g} s): the model cannot follow these data there; "
-                    "check units, signs and the operating point, or mark the stretch as not valid"
-                )
-            size = np.maximum(np.std(out.trajectory.filtered, axis=0), 1e-300)
-            still = bool((np.sqrt(np.mean(moved**2, axis=0)) <= STILL * size).all())
-            at = out.trajectory
-            if still and count:
-                break
-        return lin, out
-
-    def _inside(self, track: Track, theta: Array, at: Trajectory) -> Trajectory:
-        """Pull samples at which the plant is not defined back to rest."""
-        bad: Any = ~(np.isfinite(at.filtered) & np.isfinite(at.predicted)).all(axis=1)
-        if not bad.any():
-            lin = self.linearize(track, theta, at)
-            bad = ~(np.isfinite(lin.step).all(axis=1) & np.isfinite(lin.a).all(axis=(1, 2))
-                    & np.isfinite(lin.height) & np.isfinite(lin.c).all(axis=1))  # fmt: skip
-        if not bad.any():
-            return at
-        rest = self.guess(track)
-        return Trajectory(*(np.where(bad[:, None], old, new) for new, old in (
-            (at.predicted, rest.predicted), (at.filtered, rest.filtered),
-            (at.spread, rest.spread))))  # fmt: skip
+def run(
+    m: Machine, track: Track, lin: Linearized, noise: Noise, sensitive: bool = True,
+    columns: int | None = None,
+) -> Filtered:  # fmt: skip
+    """Run the filter along a linearized plant, with sensitivities to its first columns."""
+    p = len(m.index) if columns is None else columns
+    p = p if sensitive else 0
+    out = filter_pass(
+        lin.step, lin.a, lin.b, lin.du, np.ascontiguousarray(lin.dp[:, :, :p]), lin.height,
+        lin.c, np.ascontiguousarray(lin.hp[:, :p]), lin.trajectory.predicted,
+        lin.trajectory.filtered, track.table[3], track.valid, track.afresh, track.doubt,
+        m.padded(track.start), m.padded(track.spread), 1.0,
+        np.asarray(noise.force, dtype=float), noise.memory, noise.drift,
+    )  # fmt: skip
+    error, variance, before, after, wide, slopes, disturbance = out
+    counts = track.valid & ~track.afresh
+    with np.errstate(all="ignore"):  # a filter that lost the record says so later
+        sensor = np.sqrt(np.mean(error[counts] ** 2 / variance[counts]))
+    return Filtered(error, variance, Trajectory(before, after, wide * sensor), slopes,
+                    disturbance)  # fmt: skip
 
 
-def _full(values: Array, n: int) -> Array:
-    """Repeat what does not depend on the sample."""
-    return values if values.shape[0] == n else np.repeat(values, n, axis=0)
+def first_guess(m: Machine, track: Track) -> Trajectory:
+    """Return a trajectory to begin with: at rest, states that are measured as measured."""
+    n, e = len(track.record), m.e
+    rest = np.tile(m.padded(track.start), (n, 1))
+    seen, values = e.output, track.table[3]
+    for _ in range(1 + len(e.lags)):  # behind a lag of the sensor is what it follows, nearly
+        columns = casadi.jacobian(seen, e.x).sparsity().get_col()
+        if len(columns) != 1 or casadi.depends_on(seen, casadi.vertcat(e.t, e.u)):
+            break
+        j = columns[0]
+        rest[:, j] = values = _unbent(m, seen, e.x[j], float(rest[0, j]), values)
+        behind = [lag.target for lag in e.lags if lag.state == j]
+        if not behind:
+            break
+        seen = behind[0]
+    for lag in e.lags:
+        if casadi.is_equal(lag.target, e.u, 2):
+            rest[:, lag.state] = track.table[1]
+    spread = np.sqrt(np.diag(m.padded(track.spread)))
+    quiet = np.minimum(spread, 1.0) * track.scale
+    return Trajectory(rest, rest.copy(), np.tile(quiet, (n, 1)))
 
 
-def _scheme(e: Equations, loop: Loop) -> Scheme:
-    """Return how a period is integrated: as cheaply as the plant and its lags allow."""
-    if e.dt:
-        return (4, 1, False)
-    hidden = [lag.state for lag in e.lags]
-    plain = [k for k in range(len(e.states)) if k not in hidden]
-    time = _shortest(e, casadi.SX(casadi.DM(e.values)))
-    driven, cut = np.isfinite(time), bool(time < loop.dt / 8)
-    # The filter's own uncertainty smooths kinks; sharp friction does not make the plant stiff.
-    try:
-        point = replace(loop.point, states=_rest(loop, e))
-        a = state_matrices(e, point, spread=1e6)[0][np.ix_(plain, plain)]
-    except CtrlidError:
-        return (8, 2, cut)
-    rate = float(np.max(np.abs(np.linalg.eigvals(a)), initial=0.0)) * loop.dt
-    if rate <= 3 * SLOW and not driven:
-        # A velocity that turns within a period crosses the kink of friction there.
-        return (4, max(KINK_STEPS if e.kinked else 1, math.ceil(rate / SLOW)), False)
-    steps = max(1, math.ceil(rate / 1.5))
-    if steps > MOST_STEPS:
-        raise CtrlidError(
-            f"{e.name} moves at {rate / loop.dt:.3g} rad/s, {rate:.3g} times faster than it is "
-            "sampled; what settles within a sample is a constant for the filter: leave that motion "
-            "out of the plant, or sample faster"
-        )
-    return (8, steps, cut)
+def _unbent(m: Machine, seen: Any, x: Any, at: float, values: Array) -> Array:
+    """Return the state x that is seen as given values, by Newton's rule; else at rest."""
+    if casadi.is_equal(seen, x, 2):
+        return values
+    f = Vectorized(casadi.Function("seen", [x, m.e.p], [seen, casadi.jacobian(seen, x)]))
+    found = np.full(len(values), at)
+    first = np.abs(f(found, m.e.values)[0].ravel() - values)
+    with np.errstate(all="ignore"):
+        for _ in range(NEWTON):
+            height, slope = (part.ravel() for part in f(found, m.e.values))
+            found = found + (values - height) / slope
+        left = np.abs(f(found, m.e.values)[0].ravel() - values)
+    return np.where(left <= first, found, at)  # also where it is no number
 
 
-def _shortest(e: Equations, p: Any) -> float:
-    """Return the time constant of the lag that follows the input; infinite without one."""
-    for lag in known_lags(e)[0]:
-        return float(casadi.evalf(casadi.substitute(casadi.SX(lag.time_constant), e.p, p)))
-    return math.inf
-
-
-def make_track(loop: Loop, record: Record, begin: float = 0.0) -> Track:
-    """Make a record ready for the filter of a loop; `begin` is the time of its first sample.
+def settle(
+    m: Machine, track: Track, theta: Array, noise: Noise, at: Trajectory, passes: int = PASSES
+) -> tuple[Linearized, Filtered]:
+    """Linearize and filter until the trajectory no longer moves.
 
     Raises
     ------
     CtrlidError
-        If the sampling periods differ or too few samples are valid.
+        If the filter cannot follow the record with this model.
     """
-    if abs(loop.dt - record.dt) > 1e-9 * loop.dt:
-        raise CtrlidError(f"the loop is sampled at {loop.dt:g} s, the record at {record.dt:g} s; "
-                          "give both the same period")  # fmt: skip
-    valid = np.asarray(record.valid)
-    if np.count_nonzero(valid) < FEWEST:
-        raise CtrlidError(f"a prediction needs at least {FEWEST} valid samples; the record has "
-                          f"{np.count_nonzero(valid)} of {len(record)}")  # fmt: skip
-    last = np.maximum.accumulate(np.where(valid, np.arange(len(record)), 0))
-    y, u = np.asarray(record.y)[last], np.asarray(record.u)[last]
-    r = y if record.r is None else np.asarray(record.r)[last]
-    start, spread, scale = _start(loop, record)
-    doubt = np.where(valid, 0.0, (np.std(record.u[valid]) / scale) ** 2)
-    return Track(record, np.vstack([begin + record.t - record.start, u, r, y]), valid,
-                 fresh_starts(loop, record), doubt, start, spread, scale)  # fmt: skip
+    for count in range(passes):
+        at, lin = _inside(m, track, theta, at)
+        out = run(m, track, lin, noise, sensitive=False)
+        moved = np.abs(out.trajectory.filtered - at.filtered)
+        if not np.isfinite(out.innovations).all() or not np.isfinite(moved).all():
+            k = int(np.argmin(np.isfinite(out.innovations)))
+            raise CtrlidError(
+                f"the predictor of {m.e.name} lost the record at sample {k} "
+                f"(t = {track.record.t[k]:.4g} s): the model cannot follow these data there; "
+                "check units, signs and the operating point, or mark the stretch as not valid"
+            )
+        size = np.maximum(np.std(out.trajectory.filtered, axis=0), 1e-300)
+        still = bool((np.sqrt(np.mean(moved**2, axis=0)) <= STILL * size).all())
+        at = out.trajectory
+        if still and count:
+            break
+    return lin, out
 
 
-def retracked(track: Track, loop: Loop) -> Track:
-    """Return a track made ready for another model of the same loop; the signals are shared."""
-    start, spread, _ = _start(loop, track.record)
-    return replace(track, afresh=fresh_starts(loop, track.record), start=start, spread=spread)
-
-
-def fresh_starts(loop: Loop, record: Record) -> Any:
-    """Return at which samples the filter begins anew: at the start and in long gaps."""
-    e = loop.equations()
-    poles = np.linalg.eigvals(state_matrices(e, loop.point)[0])
-    fastest = np.max(np.abs(poles) if e.dt else np.exp(poles.real * loop.dt), initial=0.0)
-    # An unstable model may bridge as long as its errors grow by less than half.
-    bridge = BRIDGE if fastest <= 1 else min(BRIDGE, int(np.log(1.5) / np.log(fastest)))
-    afresh = np.zeros(len(record), dtype=bool)
-    last = -BRIDGE - 1
-    for first, stop in record.segments():
-        if first - last > bridge:
-            afresh[max(last, 0) : first + 1] = True
-        last = stop
-    if len(record) - last > bridge:
-        afresh[last:] = True
-    return afresh
-
-
-def _start(loop: Loop, record: Record) -> tuple[Array, Array, float]:
-    """Return a state at the operating point that the first samples may overrule.
-
-    With its covariance relative to the sensor noise, and the size of that noise, roughly.
-    """
-    e, at = loop.equations(keep=True), loop.point
-    y = record.y[record.valid]
-    reach = float(np.std(y)) + abs(float(np.mean(y)) - at.output)
-    # Third differences leave little of a smooth output.
-    noise = float(np.std(np.diff(y, 3))) / np.sqrt(20)
-    noise = max(noise, 1e-9 * max(abs(at.output), reach), 1e-300)
-    speed = max(float(np.std(np.diff(y))) / record.dt, noise / record.dt)
-    rest = _rest(loop, e)
-    wide = [max(0.1 * abs(v), reach, noise) for v in rest]
-    for j in e.velocities:
-        wide[j] = speed
-    for lag in e.lags:
-        if casadi.is_equal(lag.target, e.u, 2):
-            wide[lag.state] = max(float(np.std(record.u[record.valid])), noise)
-    return np.array(rest), np.diag((np.array(wide) / noise) ** 2), noise
-
-
-def _rest(loop: Loop, e: Equations) -> tuple[float, ...]:
-    """Return the state at rest, with effects at their neutral values taking part."""
-    states = loop.point.states
-    extra = len(e.states) - len(states)
-    return states if extra == 0 else (*states, *e.rest[len(e.rest) - extra :])
-
-
-@functools.lru_cache(maxsize=8)
-def machine(loop: Loop, names: tuple[str, ...], hold: str, follow: bool) -> Machine:
-    """Return the machine of a loop, made once."""
-    return Machine(loop, names, hold, follow)
-
-
-def machine_for(loop: Loop, names: Sequence[str], record: Record) -> Machine:
-    """Return the machine of a loop for records of one kind."""
-    follow = record.r is not None and loop.analog
-    return machine(loop, tuple(names), record.hold, follow)
+def _inside(
+    m: Machine, track: Track, theta: Array, at: Trajectory
+) -> tuple[Trajectory, Linearized]:
+    """Linearize, with samples at which the plant is not defined pulled back to rest."""
+    bad: Any = ~(np.isfinite(at.filtered) & np.isfinite(at.predicted)).all(axis=1)
+    if not bad.any():
+        lin = m.linearize(track, theta, at)
+        bad = ~(np.isfinite(lin.step).all(axis=1) & np.isfinite(lin.a).all(axis=(1, 2))
+                & np.isfinite(lin.height) & np.isfinite(lin.c).all(axis=1))  # fmt: skip
+        if not bad.any():
+            return at, lin
+    rest = first_guess(m, track)
+    at = Trajectory(*(np.where(bad[:, None], old, new) for new, old in (
+        (at.predicted, rest.predicted), (at.filtered, rest.filtered),
+        (at.spread, rest.spread))))  # fmt: skip
+    return at, m.linearize(track, theta, at)

@@ -10,21 +10,15 @@ import numpy as np
 from ._text import Printed, number
 from .data import Record, as_records
 from .errors import CtrlidError
-from .filtering import machine_for, make_track
-from .likelihood import (
-    Fit,
-    Problem,
-    begin,
-    climb,
-    information,
-    pseudo_inverse,
-    retuned,
-    with_coloured_force,
-)
+from .likelihood import Fit, Problem, pseudo_inverse
 from .linearization import operating_point
 from .loop import Loop
+from .machine import machine_for
+from .maximum import begin, climb, information, retuned
 from .model import root_errors
+from .noise_search import with_coloured_force
 from .physics import Array
+from .tracks import make_track
 
 UNSEEN = 1e-9  # relative eigenvalue of the information below which a direction is not in the data
 

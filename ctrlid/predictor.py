@@ -11,10 +11,13 @@ import numpy as np
 
 from .data import Record
 from .errors import CtrlidError
-from .filtering import Noise, machine_for, make_track
-from .likelihood import Problem, begin, climb
+from .filtering import Noise
+from .likelihood import Problem
 from .loop import Loop
+from .machine import machine_for
+from .maximum import begin, climb
 from .physics import Array
+from .tracks import make_track
 
 EMPTY: Array = np.empty(0)
 

@@ -15,7 +15,6 @@ from .controllers import PID
 from .data import Record
 from .effects.moment import motion
 from .errors import CtrlidError, CtrlidWarning
-from .filtering import FEWEST
 from .innovations import flow
 from .linearization import state_matrices
 from .loop import Loop
@@ -27,6 +26,7 @@ from .replay import controller_output, replay_from_best_state
 from .residuals import Correlation, autocorrelation, cross_correlation, explained_share
 from .simulation import Simulator
 from .stepping import growth_rate
+from .tracks import FEWEST
 
 MEANINGFUL = 1e-6  # of the input's size: below, an injected signal is round-off
 

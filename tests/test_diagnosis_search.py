@@ -33,7 +33,9 @@ from ctrlid.diagnosis.trial import (
     spared,
     whole,
 )
-from ctrlid.filtering import machine_for, make_track
+from ctrlid.filtering import first_guess
+from ctrlid.machine import machine_for
+from ctrlid.tracks import make_track
 
 
 def levitation():
@@ -373,7 +375,7 @@ def test_a_filter_begins_where_a_curved_sensor_points():
     y = truth + 20.0 * (truth - loop.point.output) ** 2
     record = cid.Record(r=y, u=np.full(500, loop.point.input), y=y, dt=2e-3)
     machine = machine_for(loop, (), record)
-    begun = machine.guess(make_track(loop, record)).predicted
+    begun = first_guess(machine, make_track(loop, record)).predicted
     position = list(machine.e.states).index("x")
     np.testing.assert_allclose(begun[:, position], truth, rtol=1e-6)
 

@@ -12,8 +12,10 @@ from scipy import integrate, linalg
 
 import ctrlid as cid
 from ctrlid import effects as E
-from ctrlid.filtering import Machine, Noise, Trajectory, make_track
+from ctrlid.filtering import Noise, first_guess, settle
 from ctrlid.kalman import filter_pass
+from ctrlid.machine import Machine, Trajectory
+from ctrlid.tracks import make_track
 
 # --- one pass
 
@@ -177,7 +179,7 @@ def test_the_machines_derivatives_are_those_of_its_map(hidden, stages, parts):
     assert (len(m._stages), m._parts) == (stages, parts)
     track = make_track(loop, record)
     rng = np.random.default_rng(5)
-    guess = m.guess(track)
+    guess = first_guess(m, track)
     x = guess.filtered * (1 + 0.01 * rng.standard_normal(guess.filtered.shape))
     x[:, 1] = 0.01 * rng.standard_normal(200)
     at = Trajectory(x, x.copy(), np.tile([1e-6, 2e-3, 1e-3, 1e-6][: m.n], (200, 1)))
@@ -472,7 +474,7 @@ def test_an_analog_circuit_moves_the_input_between_samples():
     record = cid.simulate(loop, r)
     m = Machine(loop, (), "foh", True)
     track = make_track(loop, record)
-    fit = m.settle(track, np.empty(0), Noise((1e12,)), m.guess(track))[1]
+    fit = settle(m, track, np.empty(0), Noise((1e12,)), first_guess(m, track))[1]
     late = slice(15, None)
     assert np.abs(fit.innovations[late]).max() < 1e-4 * np.std(record.y)
 

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from ctrlid import likelihood
+from ctrlid import maximum
 
 
 @pytest.fixture
@@ -26,7 +26,7 @@ def hill(monkeypatch):
             lower=np.full(len(theta), lower), upper=np.full(len(theta), upper),
             machine=SimpleNamespace(fits=lambda theta: True),
         )  # fmt: skip
-        monkeypatch.setattr(likelihood, "evaluate", evaluate)
+        monkeypatch.setattr(maximum, "evaluate", evaluate)
         return at(theta)
 
     fit_on.tried = tried
@@ -46,7 +46,7 @@ def normal(theta):
 
 
 def test_a_step_that_is_right_is_taken_whole(hill):
-    fit, length = likelihood._ascend(
+    fit, length = maximum._ascend(
         hill(lambda t: -2 * t[0] ** 2, [3.0]), np.array([[4.0]]), np.array([-12.0])
     )
     assert fit.theta == pytest.approx([0.0])
@@ -58,7 +58,7 @@ def test_a_bent_valley_is_followed_to_its_end(hill):
     fit = hill(valley, [-1.2, 1.0])
     heights = [fit.value]
     for _ in range(60):
-        fit, length = likelihood._ascend(fit, *normal(fit.theta))
+        fit, length = maximum._ascend(fit, *normal(fit.theta))
         heights.append(fit.value)
         if length < 1e-6:
             break
@@ -68,7 +68,7 @@ def test_a_bent_valley_is_followed_to_its_end(hill):
 
 def test_a_step_that_is_too_long_is_shortened(hill):
     fit = hill(lambda t: -((t[0] - 1) ** 2), [0.0])
-    better, length = likelihood._ascend(fit, np.array([[0.02]]), np.array([2.0]))
+    better, length = maximum._ascend(fit, np.array([[0.02]]), np.array([2.0]))
     assert better.value > fit.value
     assert 0 < length < 100 / np.sqrt(50)
     assert len(hill.tried) > 1
@@ -76,19 +76,19 @@ def test_a_step_that_is_too_long_is_shortened(hill):
 
 def test_a_wrong_slope_gives_up_where_it_is(hill):
     fit = hill(lambda t: -(t[0] ** 2), [0.0])
-    same, length = likelihood._ascend(fit, np.array([[2.0]]), np.array([5.0]))
+    same, length = maximum._ascend(fit, np.array([[2.0]]), np.array([5.0]))
     assert same is fit
     assert length == 0.0
-    assert len(hill.tried) == len(likelihood.SHARES)
+    assert len(hill.tried) == len(maximum.SHARES)
 
 
 def test_what_promises_nothing_is_not_tried(hill):
     fit = hill(lambda t: 0.0, [0.0])
-    assert likelihood._ascend(fit, np.array([[4.0]]), np.array([0.01]))[0] is fit
+    assert maximum._ascend(fit, np.array([[4.0]]), np.array([0.01]))[0] is fit
     assert not hill.tried
 
 
 def test_bounds_hold(hill):
     fit = hill(lambda t: -((t[0] - 3) ** 2) - (t[1] - 1) ** 2, [0.0, 0.0], upper=2.0)
-    top, _ = likelihood._ascend(fit, 2 * np.eye(2), np.array([6.0, 2.0]))
+    top, _ = maximum._ascend(fit, 2 * np.eye(2), np.array([6.0, 2.0]))
     assert top.theta == pytest.approx([2.0, 1.0])

@@ -9,7 +9,9 @@ import ctrlid as cid
 from ctrlid import effects as E
 from ctrlid.diagnosis.fresh import Fresh, fresh_data
 from ctrlid.diagnosis.trial import Model, attempt_at, base_model, refit, weighted_by_repeats
-from ctrlid.likelihood import climb, evaluate, known_from_repeats
+from ctrlid.likelihood import evaluate
+from ctrlid.maximum import climb
+from ctrlid.noise_search import known_from_repeats
 
 PERIOD, TIMES = 800, 5
 SENSOR, FORCE = 1e-4, 0.3

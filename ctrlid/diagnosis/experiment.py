@@ -8,8 +8,9 @@ import numpy as np
 
 from ..data import Record
 from ..errors import CtrlidError
-from ..likelihood import Known, begin
+from ..likelihood import Known
 from ..loop_fit import make_problem
+from ..maximum import begin
 from ..physics import Array
 from ..signals import random_binary
 from ..simulation import Simulator

@@ -8,9 +8,10 @@ import numpy as np
 
 from ..data import Record
 from ..errors import CtrlidError
-from ..likelihood import Fit, Known, begin, climb, evaluate
+from ..likelihood import Fit, Known, evaluate
 from ..loop import Loop
 from ..loop_fit import make_problem, start_values
+from ..maximum import begin, climb
 from ..physics import Array
 from . import gap as gaps
 from .trial import Model

@@ -10,7 +10,6 @@ from scipy import signal
 
 from ..data import Record
 from ..errors import CtrlidError
-from ..filtering import FEWEST
 from ..likelihood import Fit
 from ..linearization import state_matrices
 from ..loop import Loop
@@ -19,6 +18,7 @@ from ..predictor import predict, predict_ahead, spread_ahead
 from ..replay import replay_from_best_state
 from ..simulation import Simulator
 from ..stepping import comes_to_rest
+from ..tracks import FEWEST
 from ..validation import best_start, time_constant
 
 ROUGH = 1e-5  # local error of the integration, far below any gap worth a word

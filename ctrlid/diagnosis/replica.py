@@ -8,8 +8,9 @@ import numpy as np
 
 from ..data import Record
 from ..errors import CtrlidError
-from ..likelihood import Fit, begin, climb, evaluate
+from ..likelihood import Fit, evaluate
 from ..loop_fit import make_problem
+from ..maximum import begin, climb
 from ..simulation import Simulator
 from .gap import FEW_STEPS, ROUGH, drive, random_noise
 from .omnibus import ALPHA, Omnibus, omnibus

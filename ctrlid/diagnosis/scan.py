@@ -17,6 +17,7 @@ from ..effects import (
     StateLimit,
 )
 from ..errors import CtrlidError
+from ..filtering import run
 from ..likelihood import pseudo_inverse
 from ..physics import Array
 from .trial import Model, Trial, attempt, attempt_best
@@ -82,7 +83,7 @@ def promises(
                 lin, dp=np.concatenate([lin.dp, extra], axis=2),
                 hp=np.concatenate([lin.hp, np.zeros((len(shape), size))], axis=1),
             )  # fmt: skip
-            out = m.run(track, wide, fit.noise, columns=p + size)
+            out = run(m, track, wide, fit.noise, columns=p + size)
             slopes, s = out.slopes[keep], out.variance[keep] * r
             weighted = slopes / s[:, None]
             matrix += weighted.T @ slopes

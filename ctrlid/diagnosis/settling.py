@@ -5,9 +5,9 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from ..likelihood import climb, polish, retuned
 from ..loop import Loop
 from ..loop_fit import choose_noise
+from ..maximum import climb, polish, retuned
 from .decide import CLOSE, GATE, rivals
 from .omnibus import omnibus
 from .rounds import NEXT, Step, Work, plainer

@@ -9,10 +9,11 @@ import numpy as np
 from scipy import optimize
 
 from ..data import Record
-from ..filtering import Noise, Trajectory
+from ..filtering import Noise
 from ..likelihood import Fit, Known, evaluate, pseudo_inverse
 from ..loop import Loop
 from ..loop_fit import make_problem
+from ..machine import Trajectory
 from ..physics import Array
 from ..residuals import remembered
 

@@ -10,21 +10,16 @@ import numpy as np
 from ..data import Record
 from ..effects import AbstractEffect
 from ..errors import CtrlidError
-from ..filtering import Machine, Noise, Trajectory, retracked
-from ..likelihood import (
-    Fit,
-    begin,
-    bounded_step,
-    climb,
-    evaluate,
-    known_from_repeats,
-    relinearized,
-    retuned,
-)
+from ..filtering import Noise, first_guess
+from ..likelihood import Fit, evaluate, relinearized
 from ..loop import Loop
 from ..loop_fit import bounds_of, choose_noise, make_problem, start_values
+from ..machine import Machine, Trajectory
+from ..maximum import begin, bounded_step, climb, retuned
+from ..noise_search import known_from_repeats
 from ..physics import Array
 from ..stepping import comes_to_rest
+from ..tracks import retracked
 
 SCREEN_ROUNDS = 14  # of a refit: a candidate that needs more is not the missing effect
 QUIET = 1e-4  # of the variance of a random force, with which kinks are sharp
@@ -337,7 +332,7 @@ def _extended(base: Model, loop: Loop, names: Sequence[str]) -> Fit:
     m = Machine(loop, names, old.machine.hold, old.machine.law is not None)
     tracks = tuple(retracked(track, loop) for track in old.tracks)
     at = [
-        _carried(old.machine, m, out.trajectory, m.guess(track))
+        _carried(old.machine, m, out.trajectory, first_guess(m, track))
         for out, track in zip(base.fit.filtered, tracks, strict=True)
     ]
     lower, upper = bounds_of(loop, names)
