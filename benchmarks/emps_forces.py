@@ -12,9 +12,9 @@ from scipy import signal
 
 import ctrlid as cid
 from ctrlid import effects
+from ctrlid.diagnosis.fitted import base_model
 from ctrlid.diagnosis.fresh import fresh_data
 from ctrlid.diagnosis.gap import FEW_STEPS, ROUGH, drive
-from ctrlid.diagnosis.trial import base_model
 from ctrlid.simulation import Simulator
 
 GAIN = 35.15065  # N/V, of the EMPS drive

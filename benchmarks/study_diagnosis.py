@@ -48,7 +48,8 @@ from _random_loops import (
 
 import ctrlid as cid
 from ctrlid import effects
-from ctrlid.diagnosis.trial import Model, base_model, contains
+from ctrlid.diagnosis.fitted import Model, base_model
+from ctrlid.diagnosis.trial import contains
 from ctrlid.effects import CATALOGUE, AbstractEffect, equivalents
 
 KINDS = ("named", "none", "outside", "two", "three", "lookalike")

@@ -5,8 +5,8 @@ import numpy as np
 
 import ctrlid as cid
 from ctrlid import effects as E
+from ctrlid.diagnosis.fitted import base_model
 from ctrlid.diagnosis.omnibus import omnibus
-from ctrlid.diagnosis.trial import base_model
 
 OF_INNOVATIONS = ("whiteness", "independence of past signals", "heavy tails", "isolated events")
 

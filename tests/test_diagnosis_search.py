@@ -12,9 +12,11 @@ from scipy import signal, stats
 
 import ctrlid as cid
 from ctrlid import effects as E
+from ctrlid.diagnosis.attempts import attempt, attempt_at, refit
+from ctrlid.diagnosis.closing import wider
 from ctrlid.diagnosis.decide import doubt_of_all, rivals
 from ctrlid.diagnosis.experiment import separating_experiment
-from ctrlid.diagnosis.main import _wider
+from ctrlid.diagnosis.fitted import Model, base_model, spared, whole
 from ctrlid.diagnosis.omnibus import Omnibus, _shape, omnibus
 from ctrlid.diagnosis.replica import replica
 from ctrlid.diagnosis.result import Disturbance, Finding, Gap
@@ -23,16 +25,7 @@ from ctrlid.diagnosis.scan import scanned
 from ctrlid.diagnosis.search import _foreseen, _stands_in, _there
 from ctrlid.diagnosis.sentences import conclusion
 from ctrlid.diagnosis.settling import _close, fused
-from ctrlid.diagnosis.trial import (
-    Model,
-    attempt,
-    attempt_at,
-    base_model,
-    contains,
-    refit,
-    spared,
-    whole,
-)
+from ctrlid.diagnosis.trial import contains
 from ctrlid.filtering import first_guess
 from ctrlid.machine import machine_for
 from ctrlid.tracks import make_track
@@ -525,7 +518,7 @@ def test_a_loop_that_hunts_keeps_its_names():
         return Gap("closed-loop simulation", 9.0, 3.0, after, 4.0, "m", *[np.zeros(3)] * 4)
 
     sensor, force = Disturbance(0.1, 0.0, np.nan, 0.2), Disturbance(0.1, 0.0, np.nan, 0.9)
-    assert not _wider(gap(2.9), force)
-    assert not _wider(gap(4.4), sensor)
-    assert _wider(gap(4.4), force)
-    assert _wider(gap(6.1), sensor)
+    assert not wider(gap(2.9), force)
+    assert not wider(gap(4.4), sensor)
+    assert wider(gap(4.4), force)
+    assert wider(gap(6.1), sensor)

@@ -7,8 +7,9 @@ import pytest
 
 import ctrlid as cid
 from ctrlid import effects as E
+from ctrlid.diagnosis.attempts import attempt_at, refit
+from ctrlid.diagnosis.fitted import Model, base_model, weighted_by_repeats
 from ctrlid.diagnosis.fresh import Fresh, fresh_data
-from ctrlid.diagnosis.trial import Model, attempt_at, base_model, refit, weighted_by_repeats
 from ctrlid.likelihood import evaluate
 from ctrlid.maximum import climb
 from ctrlid.noise_search import known_from_repeats

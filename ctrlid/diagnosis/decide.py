@@ -7,7 +7,8 @@ import numpy as np
 
 from ..effects import AbstractEffect, PositionRipple
 from ..physics import Array
-from .trial import Trial, contains, log_terms, same_kind
+from .fitted import log_terms
+from .trial import Trial, contains, same_kind
 
 GATE = 5.0  # gain of log-likelihood less penalty: 10 in units of the Bayesian criterion
 CLOSE = 3.0  # difference of log-likelihood that says nothing

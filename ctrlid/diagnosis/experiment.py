@@ -14,8 +14,9 @@ from ..maximum import begin
 from ..physics import Array
 from ..signals import random_binary
 from ..simulation import Simulator
+from .carrying import promised
 from .gap import FEW_STEPS, ROUGH
-from .trial import Trial, promised
+from .trial import Trial
 
 LONGEST = 20_000  # samples of a recommended experiment
 TRIED = 5000  # samples on which references are compared

@@ -14,7 +14,7 @@ from ..loop_fit import make_problem, start_values
 from ..maximum import begin, climb
 from ..physics import Array
 from . import gap as gaps
-from .trial import Model
+from .fitted import Model
 
 LONGEST = 40_000  # samples that are fitted; of longer records, even stretches
 STRETCHES = 12  # of a long record

@@ -12,9 +12,12 @@ from ..likelihood import Fit, evaluate
 from ..loop_fit import make_problem
 from ..maximum import begin, climb
 from ..simulation import Simulator
+from .attempts import attempt_at, refit
+from .carrying import carried_over
+from .fitted import Model
 from .gap import FEW_STEPS, ROUGH, drive, random_noise
 from .omnibus import ALPHA, Omnibus, omnibus
-from .trial import Model, Trial, attempt_at, reduced, refit
+from .trial import Trial
 
 DOUBTFUL = 400.0  # a gain above this is no artefact of the filter, if the model has no effect yet
 TWICE = 2.0  # what the replica gains counts this much against a candidate
@@ -120,7 +123,7 @@ def more_than_simple(base: Model, best: Trial, simple: Trial) -> bool:
     if copy is None:
         return True
     try:
-        under = reduced(copy, base.fitted, base.names)
+        under = carried_over(copy, base.fitted, base.names)
     except CtrlidError:
         return True
     again = refit(Model(base.fitted, under), attempt_at(Model(base.fitted, under), best.fitted))

@@ -12,21 +12,13 @@ from ..effects import AbstractEffect, SensorOffset
 from ..errors import CtrlidError
 from ..linearization import state_matrices
 from ..loop import Loop
+from .attempts import attempt_at, refit
+from .carrying import promised
 from .decide import GATE
+from .fitted import Model, quiet, simulable
 from .replica import DOUBTFUL, TWICE, artefact, kinked, more_than_simple, replica
 from .scan import elsewhere, scanned
-from .trial import (
-    Model,
-    Trial,
-    attempt_at,
-    comparable,
-    contains,
-    promised,
-    quiet,
-    refit,
-    same_kind,
-    simulable,
-)
+from .trial import Trial, comparable, contains, same_kind
 
 NEXT = 5  # candidates after the best that are looked at closely
 TOP = 5  # candidates refitted because of what they promise

@@ -20,7 +20,9 @@ from ..errors import CtrlidError
 from ..filtering import run
 from ..likelihood import pseudo_inverse
 from ..physics import Array
-from .trial import Model, Trial, attempt, attempt_best
+from .attempts import attempt, attempt_best
+from .fitted import Model
+from .trial import Trial
 
 COLUMNS = 500_000  # numbers in a block of shapes at once
 NEARLY = 0.7  # of the best promise: another wave that may be the right one

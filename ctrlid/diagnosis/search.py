@@ -8,13 +8,15 @@ import numpy as np
 
 from ..effects import AbstractEffect, PeriodicForce, PositionRipple
 from ..likelihood import Fit
+from .attempts import refit
 from .decide import CLOSE, GATE, MANY
+from .fitted import Model, anchor, simulable, spared, whole
 from .omnibus import ALPHA, Omnibus, omnibus
 from .replica import WITH_EFFECTS, forgiven, replica
 from .rounds import NEXT, Step, Work, candidates, one_round
 from .scan import scanned
 from .settling import Found, cut, renoised, settled, without_superfluous
-from .trial import Model, Trial, anchor, contains, refit, same_kind, simulable, spared, whole
+from .trial import Trial, contains, same_kind
 
 NEARLY = 0.8  # of the best merit: what comes so close may be the better half of a pair
 FORESEEN = 2  # of them

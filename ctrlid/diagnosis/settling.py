@@ -8,20 +8,14 @@ from dataclasses import dataclass, replace
 from ..loop import Loop
 from ..loop_fit import choose_noise
 from ..maximum import climb, polish, retuned
+from .attempts import attempt_at, refit
+from .carrying import carried_over
 from .decide import CLOSE, GATE, rivals
+from .fitted import Model, simulable, spared
 from .omnibus import omnibus
 from .rounds import NEXT, Step, Work, plainer
-from .trial import (
-    Model,
-    Trial,
-    attempt_at,
-    contains,
-    needed,
-    reduced,
-    refit,
-    simulable,
-    spared,
-)
+from .trial import Trial, contains
+from .weighing import needed
 
 NEAR = 0.5  # of the winner's merit: what came so close is asked again when all effects are in
 REGAINED = 0.1  # of what leaving an effect out loses: what promises less does not stand for it
@@ -105,7 +99,7 @@ def _without(model: Model, positions: Sequence[int]) -> Model:
     loop, names = model.fitted, model.names
     for position in sorted(positions, reverse=True):
         loop, names = taken_out(loop, position, names)
-    return Model(loop, reduced(model, loop, names))
+    return Model(loop, carried_over(model, loop, names))
 
 
 def _moved(model: Model, position: int) -> Model:
@@ -117,7 +111,7 @@ def _moved(model: Model, position: int) -> Model:
     renamed = dict(zip([labels[k] for k in order], loop.labelled, strict=True))
     loop = replace(loop, free=tuple(n for n in fitted.free if "." not in n))
     names = _relabelled(model.names, renamed)
-    return Model(loop, climb(reduced(model, loop, names), rounds=4))
+    return Model(loop, climb(carried_over(model, loop, names), rounds=4))
 
 
 def _close(mine: Trial, steps: Sequence[Step]) -> list[Trial]:

@@ -15,6 +15,7 @@ from ..errors import CtrlidError
 from ..loop_fit import start_values
 from ..physics import Array
 from .decide import CLOSE, GATE
+from .fitted import Model
 from .fresh import Fresh
 from .omnibus import omnibus
 from .rounds import Step, candidates
@@ -22,7 +23,7 @@ from .scan import LIMITS
 from .search import Search
 from .settling import Found, taken_out
 from .simulated import Simulated, Simulation, as_fit
-from .trial import Model, Trial, same_kind
+from .trial import Trial, same_kind
 
 ROUNDS = 5
 REFITTED = 8  # candidates of a round

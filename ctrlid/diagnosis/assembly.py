@@ -1,0 +1,168 @@
+"""The result of a diagnosis, put together from its search."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..data import Record
+from ..effects import AbstractEffect, equivalents
+from ..errors import CtrlidError
+from ..loop import Loop
+from ..loop_fit import summary
+from .attempts import attempt_at, refit
+from .closing import EXCESS
+from .decide import GATE, doubt_of_all
+from .experiment import separating_experiment
+from .fitted import base_model
+from .omnibus import places
+from .readout import Readout
+from .result import Calibrated, Candidate, Diagnosis, Disturbance, Finding, Gap, Verdict
+from .search import Search
+from .sentences import conclusion
+from .settling import Found
+from .several import presence
+from .trial import Trial, same_kind
+
+TIE = 0.02  # difference of log-likelihood between effects that are one and the same
+WORSE = 1.2  # times the gap of the model as given: above, the fit explains nothing
+
+
+def put_together(
+    loop: Loop, records: Sequence[Record], found: Search, gap: Gap, shares: dict[int, float],
+    disturbance: Disturbance, read: Sequence[Readout],
+) -> Diagnosis:  # fmt: skip
+    """Return verdict, findings, gap and whatever else a diagnosis tells."""
+    fitted = summary(found.final.loop, found.final.fit)
+    names, known = fitted.estimate.names, found.final.errors
+    errors = dict(known or zip(names, fitted.estimate.standard_errors.tolist(), strict=True))
+    findings = tuple(_finding(f, fitted.loop, errors, shares, found, records) for f in found.found)
+    findings += tuple(Finding(r.effect, r.errors, (), (), r.evidence) for r in read)
+    findings = tuple(sorted(findings, key=lambda f: -f.evidence))
+    final = fitted.loop
+    for r in read:
+        final = final if r.effect in final.effects else final.with_effect(r.effect)
+    units = _units(loop, records[0])
+    where = places(found.before, found.after, units)
+    verdict: Verdict
+    excess = EXCESS * (2 if found.final.fit.noise.drift else 1)
+    left = math.isfinite(gap.floor) and gap.after > excess * gap.floor
+    # A random force that may do anything explains everything, and nothing.
+    blamed = disturbance.large or math.isnan(disturbance.share)
+    left = left or (blamed and gap.after > WORSE * gap.given)
+    loose = doubt_of_all([f.trial.effect for f in found.found], [f.trial.gain for f in found.found])
+    if found.after.passed and not left and not loose:
+        verdict = "explained" if findings else "nothing missing"
+    else:
+        verdict = "partly explained" if findings else "unknown"
+    notes = list(fitted.estimate.notes)
+    if not loop.free:
+        notes.append("no parameter of the model was free: a wrong value counts as a missing effect")
+    if loop.linear_plant and not found.after.passed:
+        notes.append(
+            "the model is linear; errors that depend on position, velocity or input ask for the "
+            "physics: write the plant with ct.nlsys and diagnose that"
+        )
+    before = dict(zip(found.base.names, found.base.fit.theta.tolist(), strict=True))
+    calibrated = tuple(
+        Calibrated(name, loop.parameters[name], before[name], fitted.loop.parameters[name],
+                   errors.get(name, math.nan))
+        for name in loop.free
+    )  # fmt: skip
+    tests = dict(found.after.p_values)
+    return Diagnosis(
+        verdict, conclusion(verdict, findings, gap, disturbance, found.after, where), findings,
+        final, gap, where, _ranking(found), disturbance, calibrated, _sensitivity(found),
+        tests, notes=tuple(notes),
+    )  # fmt: skip
+
+
+def name_of(records: Sequence[Record]) -> str:
+    """Return what the records are called, with their size."""
+    names = ", ".join(dict.fromkeys(r.name or "record" for r in records))
+    size = sum(int(np.count_nonzero(r.valid)) for r in records)
+    many = f"{len(records)} records, " if len(records) > 1 else ""
+    return f"{names} ({many}{size} samples, dt = {records[0].dt:g} s)"
+
+
+def _units(loop: Loop, record: Record) -> dict[str, str]:
+    e = loop.equations()
+    known = dict(getattr(loop.plant, "units", {}))
+    y = record.units.get("y", known.get(e.outputs[0], ""))
+    u = record.units.get("u", known.get(e.inputs[0], ""))
+    units = {"time": "s", "position": y, "reference": y, "input": u, "input change": u,
+             "velocity": f"{y}/s" if y else ""}  # fmt: skip
+    return {**known, **units}
+
+
+def _finding(
+    f: Found, loop: Loop, errors: dict[str, float], shares: dict[int, float], found: Search,
+    records: Sequence[Record],
+) -> Finding:  # fmt: skip
+    label, effect = list(loop.labelled.items())[f.position]
+    own = {n.partition(".")[2]: v for n, v in errors.items() if n.startswith(f"{label}.")}
+    same = equivalents(effect, loop)
+    # With the free parameters moving along, two effects may be one on every record.
+    ties = {t.name for t in f.rivals if abs(t.gain - f.trial.gain) < TIE and t.cost == f.trial.cost}
+    same = (*same, *sorted(ties - set(same)))
+    others = tuple(t.fitted for t in f.rivals)
+    apart = [t for t in f.rivals if t.name not in same]
+    words, reference = "", None
+    if apart:
+        words, reference = separating_experiment(f.trial, apart, records[0])
+    return Finding(effect, own, others, same, f.trial.gain, shares.get(f.position, math.nan),
+                   words, reference, _presence(f, found, records))  # fmt: skip
+
+
+def _presence(f: Found, found: Search, records: Sequence[Record]) -> str:
+    """Say in which of several records an effect is seen when each is fitted alone."""
+    several = len(records) > 1 and len(found.final.fit.problem.tracks) == len(records)
+    if not several or found.final.errors is not None:
+        return ""
+    seen = []
+    for k, record in enumerate(records):
+        try:
+            alone = base_model(f.base.fitted, [record], f.base.names)
+        except CtrlidError:
+            continue
+        if refit(alone, attempt_at(alone, f.trial.fitted)).merit > GATE:
+            seen.append(k)
+    return presence(seen, len(records))
+
+
+def _ranking(found: Search) -> tuple[Candidate, ...]:
+    rows = []
+    for k, step in enumerate(found.steps):
+        begun: list[AbstractEffect] = []  # the same effect, begun elsewhere, is shown once
+        for t in step.trials:
+            if any(same_kind(t.effect, b) for b in begun):
+                continue
+            begun.append(t.effect)
+            refitted = math.isfinite(t.gain)
+            effect = t.fitted if refitted else t.effect
+            price = t.cost if refitted else t.price
+            rows.append(Candidate(k + 1, effect, t.promise, t.gain, price, t.remark))
+    return tuple(rows)
+
+
+def _sensitivity(found: Search) -> dict[str, float]:
+    """Return the size of each one-parameter effect that would have earned a place."""
+    sizes: dict[str, float] = {}
+    if not found.steps:
+        return sizes
+    for t in found.steps[-1].trials:
+        size = _visible(t)
+        key = f"{t.name}.{t.effect.parameters()[0].name}" if t.effect.parameters() else t.name
+        if math.isfinite(size) and key not in sizes:
+            sizes[key] = size
+    return sizes
+
+
+def _visible(t: Trial) -> float:
+    if len(t.effect.parameters()) != 1 or not t.label or not math.isfinite(t.promise):
+        return math.nan
+    fit = t.model.fit
+    k = t.model.names.index(f"{t.label}.{t.effect.parameters()[0].name}")
+    if not fit.normal[0][k, k] > 0:
+        return math.nan
+    return float(fit.standard_errors[k]) * math.sqrt(2 * (GATE + t.price))

@@ -1,0 +1,91 @@
+"""What effects close of the gap, on data that no parameter was fitted to."""
+
+import functools
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from ..likelihood import Fit
+from ..loop import Loop
+from . import gap as gaps
+from .fitted import Model
+from .fresh import Fresh
+from .result import Disturbance, Gap
+from .search import Search
+from .settling import Found
+
+HELPS = 0.05  # of what is left without an effect, on fresh data
+EXCESS = 1.5  # times the noise floor (twice that with a coloured force): above, not explained
+
+
+def gaps_of(loop: Loop, found: Search, fresh: Fresh) -> tuple[Gap, dict[int, float], Disturbance]:
+    """Return the gap on data that no parameter was fitted to, and what each finding closes."""
+    windows, kind = fresh.windows, fresh.kind
+    before, after = (fresh.loops(m) for m in (found.base, found.final))
+    for effect in found.base.loop.effects[len(loop.effects) :]:
+        before = tuple(x.without_effect(type(effect).__name__) for x in before)
+    results = [fresh.outputs(x) for x in ((loop,) * len(windows), before, after)]
+    sizes = [gaps.root_mean_square(windows, y) for y in results]
+    fit = found.final.fit
+    floor, quiet = gaps.floors(after, fit, windows, kind)
+    shares: dict[int, float] = {}
+    for f in found.found:
+        error = sizes[1]
+        if len(found.found) > 1:
+            label = list(after[0].labelled)[f.position]
+            error = fresh.gap([x.without_effect(label) for x in after])
+        shares[f.position] = _share(error**2 - sizes[2] ** 2, sizes[1], floor)
+    first = windows[0]
+    gap = Gap(
+        kind, sizes[0], sizes[1], sizes[2], floor, first.record.units.get("y", ""),
+        first.begin + np.asarray(first.record.t - first.record.start)[first.mask],
+        np.asarray(first.record.y)[first.mask], results[1][0][first.mask],
+        results[2][0][first.mask],
+    )  # fmt: skip
+    return gap, shares, _disturbance(found.final.fit, loop, floor, quiet)
+
+
+def wider(gap: Gap, disturbance: Disturbance) -> bool:
+    """Whether effects leave a wider gap than sensor noise does, by itself, in a loop with them.
+
+    With friction and play a loop hunts, and no simulation follows it for long.
+    """
+    by_noise = not disturbance.large and gap.after <= EXCESS * gap.floor
+    return gap.after > gap.before and not by_noise
+
+
+def helps_on(fresh: Fresh) -> Callable[[Found, Model], bool]:
+    """Return whether an effect closes a fair part of what is left without it, on fresh data.
+
+    Of the gap, or, where noise is known, of the one-step errors: a small fast force is seen there.
+    """
+    loops = functools.cache(fresh.loops)
+
+    def helps(f: Found, model: Model) -> bool:
+        with_it, without = loops(model), loops(f.base)
+        if model.fit.problem.known is not None:
+            left = fresh.excess(without, model.fit)
+            if left - fresh.excess(with_it, model.fit) > HELPS * left:
+                return True
+        floor = gaps.floors(with_it, model.fit, fresh.windows, fresh.kind)[0]
+        gap, before = fresh.gap(with_it), fresh.gap(without)
+        return _share(before**2 - gap**2, before, floor) > HELPS
+
+    return helps
+
+
+def _share(closed: float, before: float, floor: float) -> float:
+    above = before**2 - (floor**2 if math.isfinite(floor) else 0.0)
+    if not (math.isfinite(closed) and math.isfinite(above)) or above <= 0:
+        return math.nan
+    return float(min(max(closed / above, 0.0), 1.0))
+
+
+def _disturbance(fit: Fit, loop: Loop, floor: float, quiet: float) -> Disturbance:
+    noise, scale = fit.noise, float(np.mean(fit.sensor))
+    time_constant = -loop.dt / math.log(noise.memory) if noise.drift else math.nan
+    share = 1 - (quiet / floor) ** 2 if floor > 0 and math.isfinite(quiet) else math.nan
+    coloured = math.sqrt(scale * noise.coloured) if noise.drift else 0.0
+    white = math.sqrt(scale * float(np.mean(noise.force)))
+    return Disturbance(white, coloured, time_constant, float(np.clip(share, 0.0, 1.0)))

@@ -1,0 +1,113 @@
+"""What a record tells of an effect's parameters, and what speaks against a fitted effect."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..effects import AbstractEffect
+from ..likelihood import Fit
+from ..physics import Array
+from .fitted import Model
+from .trial import Trial
+
+SIGNIFICANT = 2.0  # standard errors that a fitted effect must at least be large
+SEEN = 1e-7  # share of a parameter's information that others must leave to it
+
+
+def left_to(matrix: Array, own: Sequence[int], others: Sequence[int]) -> Array:
+    """Return the scaled information of parameters that others leave to them."""
+    size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    scaled = matrix / np.outer(size, size)
+    left = scaled[np.ix_(own, own)]
+    if not len(others):
+        return np.asarray(left)
+    cross = scaled[np.ix_(own, others)]
+    inverse = np.linalg.pinv(scaled[np.ix_(others, others)], rcond=SEEN)
+    return np.asarray(left - cross @ inverse @ cross.T)
+
+
+def doubled_by(fit: Fit, label: str, effect: AbstractEffect) -> dict[str, float]:
+    """Return the neutral values of an effect's parameters that do what the model's own do.
+
+    The viscous part of an asymmetric friction is one, beside a viscous friction in the model.
+    """
+    names, matrix = fit.problem.machine.names, fit.normal[0]
+    neutral = {f"{label}.{p.name}": p.neutral for p in effect.parameters()}
+    deciding = {n: v for n, v in neutral.items() if n in names and v is not None}
+    others = [k for k, n in enumerate(names) if not n.startswith(f"{label}.")]
+    if len(deciding) < 2 or not np.isfinite(matrix).all():
+        return {}
+    found = {}
+    for name, value in deciding.items():
+        k = names.index(name)
+        if matrix[k, k] > 0 and left_to(matrix, [k], others)[0, 0] < SEEN:
+            found[name] = value
+    return found if len(found) < len(deciding) else {}
+
+
+def own_parameters(trial: Trial, fit: Fit) -> int:
+    """Count the parameters of the effect that the record determines."""
+    matrix, _ = fit.normal
+    own = [k for k, n in enumerate(fit.problem.machine.names) if n.startswith(f"{trial.label}.")]
+    left = left_to(matrix, own, [k for k in range(len(matrix)) if k not in own])
+    return max(1, int(np.sum(np.linalg.eigvalsh(left) > SEEN)))
+
+
+def needed(model: Model, position: int) -> float:
+    """Return what a model would lose of log-likelihood without an effect, less its penalty.
+
+    In the quadratic approximation around the fitted values, all other parameters and the size of
+    the noise moving along (a coloured force may take up much of it).
+    Zero where that says nothing, as for a limit.
+    """
+    fit, names = model.fit, list(model.names)
+    label, effect = list(model.fitted.labelled.items())[position]
+    away = {f"{label}.{p.name}": getattr(effect, p.name) - p.neutral
+            for p in effect.parameters() if p.neutral is not None}  # fmt: skip
+    own = [names.index(n) for n, d in away.items() if n in names and math.isfinite(d)]
+    matrix = fit.normal[0]
+    if not own or len(own) < len(away) or not np.isfinite(matrix).all():
+        return 0.0
+    every = [k for k, n in enumerate(names) if n.startswith(f"{label}.")]
+    size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    left = left_to(matrix, own, [k for k in range(len(matrix)) if k not in every])
+    d = np.array([away[names[k]] for k in own]) * size[own]
+    gain = 0.5 * fit.size * math.log1p(float(d @ left @ d) / fit.size)
+    return gain - 0.5 * len(every) * math.log(fit.size)
+
+
+def objection(trial: Trial) -> str:
+    """Say why a fitted effect cannot be what is missing, if so."""
+    effect = trial.fitted
+    if effect.neutral:
+        return "vanishes when refitted"
+    fit, names = trial.model.fit, trial.model.names
+    for k, name in enumerate(names):
+        if not name.startswith(f"{trial.label}."):
+            continue
+        low, high = fit.problem.lower[k], fit.problem.upper[k]
+        about = next(p for p in effect.parameters() if p.name == name.partition(".")[2])
+        on_bound = fit.theta[k] in (low, high)
+        scanned = about.name in ("frequency", "period")
+        if on_bound and (scanned or about.neutral not in (None, low, high)):
+            return f"{about.name} ends on its bound {fit.theta[k]:g}"
+    if _insignificant(trial, effect):
+        return "no larger than its uncertainty"
+    every = all(f"{trial.label}.{p.name}" in names for p in effect.parameters())
+    return effect.doubt() if every else ""  # what is held still, another effect has
+
+
+def _insignificant(trial: Trial, effect: AbstractEffect) -> bool:
+    """Whether every parameter that decides about an effect may as well be neutral."""
+    fit, names = trial.model.fit, trial.model.names
+    error = fit.standard_errors
+    sure = []
+    for p in effect.parameters():
+        key = f"{trial.label}.{p.name}"
+        if p.neutral is None or key not in names:
+            continue
+        k = names.index(key)
+        away = math.inf if math.isinf(p.neutral) else abs(fit.theta[k] - p.neutral)
+        sure.append(away > SIGNIFICANT * error[k] and fit.normal[0][k, k] > 0)
+    return not any(sure)
