@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from . import _text
 from ._jobs import check_jobs
 from .constraints import AbstractConstraint, check_constraints
-from .data import VISIBLE_MOTION, Record, input_motion, stream_records
+from .data import Record
 from .errors import CtrlidError
 from .model import Estimate, IdentifiedModel, Structure
 from .qp import Cost, NotExcited
+from .records import VISIBLE_MOTION, input_motion, stream_records
 from .regression import Regression, arx_regression, check_orders, from_differences
 from .search import Found, minimize
 

@@ -10,11 +10,12 @@ import numpy as np
 from ._text import listing
 from .constraints import AbstractConstraint, check_constraints
 from .controllers import PID
-from .data import VISIBLE_MOTION, Record, as_records, input_motion
+from .data import Record
 from .errors import CtrlidError, CtrlidWarning
 from .innovations import Circuit
 from .model import Estimate, IdentifiedModel, Structure
 from .prediction_error import Piece, Task, best_fit
+from .records import VISIBLE_MOTION, as_records, input_motion
 
 FAST_CIRCUIT = 0.1  # dt times the fastest controller pole, above which u moves between samples
 

@@ -1,9 +1,9 @@
 """Record: one experiment in one loop, measured or simulated."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import chain, islice, pairwise
-from numbers import Integral, Real
+from itertools import pairwise
+from numbers import Integral
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal, get_args
@@ -12,61 +12,13 @@ import numpy as np
 from scipy import signal
 
 from . import _csv, _response
+from ._signals import samples, seconds, words
 from ._text import Printed
 from .errors import CtrlidError
 
 Hold = Literal["zoh", "foh"]
 SIGNALS = ("r", "u", "y")
 RESERVED = (*SIGNALS, "t", "time", "valid")  # columns of a CSV file
-
-VISIBLE_MOTION = 0.1  # of its spread a period: an input that moves more is not held
-
-
-def _samples(name: str, values: Any) -> Any:
-    """Copy a signal to a read-only (n,) float array, or say what is wrong with it."""
-    if np.ma.is_masked(values):
-        raise CtrlidError(
-            f"{name} is a masked array, and its masked values would come back to life: fill them "
-            "and give valid=~mask"
-        )
-    try:
-        array = np.asarray(values)
-    except ValueError as reason:
-        raise CtrlidError(f"{name} must be one array of numbers: {reason}") from reason
-    if array.dtype.kind not in "fiub":
-        raise CtrlidError(f"{name} must be an array of real numbers; given {array.dtype} data")
-    if array.ndim != 1:
-        cure = "Pick one channel, as in data[:, 0]" if array.ndim else "Repeat it with np.full"
-        raise CtrlidError(
-            f"{name} must be one-dimensional with one value per sample; given shape "
-            f"{array.shape}. {cure}"
-        )
-    array = np.array(array, dtype=float)
-    bad = np.flatnonzero(~np.isfinite(array))
-    if bad.size:
-        raise CtrlidError(
-            f"{name} must be finite; {bad.size} of {array.size} values are NaN or infinite, the "
-            f"first at sample {bad[0]}. Cut them out by slicing, or fill them and mark the samples "
-            "as not counting with valid="
-        )
-    array.setflags(write=False)
-    return array
-
-
-def _words(what: str, given: Any, known: Sequence[str]) -> Mapping[str, str]:
-    """Copy names or units to a read-only mapping of known signals to words."""
-    if not isinstance(given, Mapping) or not all(isinstance(v, str) for v in given.values()):
-        raise CtrlidError(f"{what} maps signals to words, as in {{'y': 'm'}}; given {given!r}")
-    unknown = [k for k in given if k not in known]
-    if unknown:
-        raise CtrlidError(f"{what} has {unknown}, which the record does not; known: {list(known)}")
-    return MappingProxyType(dict(given))
-
-
-def _seconds(what: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, Real) or not np.isfinite(float(value)):
-        raise CtrlidError(f"{what} in seconds, a finite number; given {value!r}")
-    return float(value)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -132,7 +84,7 @@ class Record(Printed):
         for key in ("u", "y"):
             if given[key] is None:
                 raise CtrlidError(f"a record needs u and y; {key} is None")
-        signals = {k: _samples(k, v) for k, v in given.items() if v is not None}
+        signals = {k: samples(k, v) for k, v in given.items() if v is not None}
         if not isinstance(self.extra, Mapping):
             raise CtrlidError(f"extra maps names to channels, as in {{'current': i}}; given "
                               f"{type(self.extra).__name__}")  # fmt: skip
@@ -140,7 +92,7 @@ class Record(Printed):
         if clash:
             raise CtrlidError(f"extra channels need names other than {', '.join(RESERVED)}; given "
                               f"{clash}")  # fmt: skip
-        extra = {k: _samples(f"extra[{k!r}]", v) for k, v in self.extra.items()}
+        extra = {k: samples(f"extra[{k!r}]", v) for k, v in self.extra.items()}
         sizes = {k: v.size for k, v in (*signals.items(), *extra.items())}
         if len(set(sizes.values())) > 1:
             lengths = ", ".join(f"{k}: {n}" for k, n in sizes.items())
@@ -149,7 +101,7 @@ class Record(Printed):
         n = signals["y"].size
         if n < 2:
             raise CtrlidError(f"a record needs at least 2 samples; given {n}")
-        dt = _seconds("dt is the sampling period", self.dt)
+        dt = seconds("dt is the sampling period", self.dt)
         if dt <= 0:
             raise CtrlidError(f"dt is the sampling period in seconds, > 0; given {self.dt!r}")
         if self.hold not in get_args(Hold):
@@ -166,9 +118,9 @@ class Record(Printed):
         valid.setflags(write=False)
         for key, value in {
             **signals, "extra": MappingProxyType(extra), "valid": valid, "dt": dt,
-            "start": _seconds("start is the time of sample 0", self.start),
-            "names": _words("names", self.names, SIGNALS),
-            "units": _words("units", self.units, (*SIGNALS, *extra)),
+            "start": seconds("start is the time of sample 0", self.start),
+            "names": words("names", self.names, SIGNALS),
+            "units": words("units", self.units, (*SIGNALS, *extra)),
         }.items():  # fmt: skip
             object.__setattr__(self, key, value)
 
@@ -557,99 +509,3 @@ class Record(Printed):
 
 def _rebuild(fields: dict[str, Any]) -> Record:
     return Record(**fields)
-
-
-def as_records(data: Any) -> tuple[Record, ...]:
-    """Return one or several records as a tuple, checked to be of one kind.
-
-    Parameters
-    ----------
-    data : Record or sequence of Record
-        The experiments.
-
-    Returns
-    -------
-    tuple of Record
-        The same records.
-
-    Raises
-    ------
-    CtrlidError
-        If something else is among them, or sampling period or hold differ.
-    """
-    records = (data,) if isinstance(data, Record) else data
-    if not isinstance(records, list | tuple):
-        raise CtrlidError(f"a Record or a list of Records is needed; given {type(data).__name__}. "
-                          "Make one with Record(u=, y=, dt=) or Record.from_csv(path)")  # fmt: skip
-    strangers = [type(item).__name__ for item in records if not isinstance(item, Record)]
-    if strangers or not records:
-        what = f"has {', '.join(strangers)}" if strangers else "is empty"
-        raise CtrlidError(f"a Record or a list of Records is needed; the list given {what}")
-    for record in records[1:]:
-        _same_kind(records[0], record)
-    return tuple(records)
-
-
-def stream_records(data: Any) -> tuple[Record, Iterable[Record]]:
-    """Return the first record and all of them, checked to be of one kind as they pass.
-
-    Parameters
-    ----------
-    data : Record or iterable of Record
-        The experiments; an iterator is read once.
-
-    Returns
-    -------
-    first : Record
-        The first record.
-    records : iterable of Record
-        All records, the first one too.
-
-    Raises
-    ------
-    CtrlidError
-        As `as_records`, for what an iterator yields when it yields it.
-    """
-    if not isinstance(data, Iterator):
-        records = as_records(data)
-        return records[0], records
-    first = as_records(list(islice(data, 1)))[0]
-    return first, chain([first], _checked(first, data))
-
-
-def _checked(first: Record, rest: Iterator[Any]) -> Iterator[Record]:
-    for record in rest:
-        as_records([record])
-        _same_kind(first, record)
-        yield record
-
-
-def _same_kind(first: Record, record: Record) -> None:
-    # Periods read from printed times differ by their last digits.
-    if abs(record.dt - first.dt) > 1e-6 * first.dt or record.hold != first.hold:
-        raise CtrlidError(
-            "records used together need one sampling period and one hold; given "
-            f"{first.dt:g} s {first.hold} and {record.dt:g} s {record.hold}. Decimate the "
-            "faster one, or give both the hold that is nearer the truth"
-        )
-
-
-def input_motion(records: Sequence[Record]) -> float:
-    """Return how far u moves from sample to sample where it is not held, as share of its spread.
-
-    Parameters
-    ----------
-    records : sequence of Record
-        The experiments.
-
-    Returns
-    -------
-    float
-        Zero for held inputs; above `VISIBLE_MOTION` a hold assumption shows in the poles.
-    """
-    shares = [0.0]
-    for record in records:
-        spread = float(np.std(record.u))
-        if record.hold == "foh" and spread:
-            shares.append(float(np.std(np.diff(record.u))) / spread)
-    return max(shares)

@@ -13,7 +13,7 @@ from scipy import stats
 
 from . import _text
 from .constraints import AbstractConstraint, check_constraints
-from .data import Record, as_records
+from .data import Record
 from .errors import CtrlidError, CtrlidWarning
 from .feedback_law import Law, found_law, given_law, loop_signals
 from .instruments import Signals, check_instruments
@@ -21,6 +21,7 @@ from .model import Estimate, IdentifiedModel, Structure
 from .moments import Moments, Residuals, Task, compute_moments, curved_force, separate
 from .prefilter import View, autoregression, stable_factor
 from .qp import NotExcited
+from .records import as_records
 from .regression import check_orders, to_differences
 from .search import Found, minimize
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ._text import Printed, number
-from .data import Record, as_records
+from .data import Record
 from .errors import CtrlidError
 from .likelihood import Fit, Problem, pseudo_inverse
 from .linearization import operating_point
@@ -18,6 +18,7 @@ from .maximum import begin, climb, information, retuned
 from .model import root_errors
 from .noise_search import with_coloured_force
 from .physics import Array
+from .records import as_records
 from .tracks import make_track
 
 UNSEEN = 1e-9  # relative eigenvalue of the information below which a direction is not in the data

@@ -12,7 +12,7 @@ from hypothesis.extra.numpy import arrays
 
 import ctrlid as cid
 from ctrlid._text import split_unit, with_unit
-from ctrlid.data import as_records
+from ctrlid.records import as_records
 
 N = 40
 

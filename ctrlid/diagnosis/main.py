@@ -11,11 +11,12 @@ from tqdm import tqdm
 
 from .._jobs import check_jobs, spread
 from ..audit import Audit
-from ..data import Record, as_records
+from ..data import Record
 from ..effects import CATALOGUE, AbstractEffect
 from ..errors import CtrlidError
 from ..likelihood import Fit
 from ..loop import Loop
+from ..records import as_records
 from .assembly import name_of, put_together
 from .closing import gaps_of, helps_on, wider
 from .decide import GATE
