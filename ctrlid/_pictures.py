@@ -154,8 +154,9 @@ def ranking(found: Diagnosis) -> dict[int, list[Bar]]:
     value = {id(c): _evidence(c) for c in found.ranking}
     kinds: dict[int, Kind] = {}
     for finding in found.findings:
-        own = [c for c in found.ranking if type(c.effect).__name__ == finding.name]
-        if not own:
+        own = [c for c in found.ranking
+               if type(c.effect).__name__ == finding.name and value[id(c)] > 0]  # fmt: skip
+        if not own:  # read off the record itself, such as the steps of a converter
             continue
         best = max(own, key=lambda c: value[id(c)])
         kinds[id(best)] = "found"

@@ -360,6 +360,15 @@ def test_picture_without_effects(found, verdict):
     plot.png(output)
 
 
+def test_a_candidate_that_no_round_took_is_not_drawn_as_found(found):
+    # What is found by other means than a round of the search, such as a converter's steps.
+    base = found["explained"]
+    lost = tuple(replace(c, gain=-5.0) for c in base.ranking)
+    bars = [bar for bars in _pictures.ranking(replace(base, ranking=lost)).values() for bar in bars]
+    assert bars
+    assert "found" not in {bar.kind for bar in bars}
+
+
 def test_picture_of_rare_cases(found):
     base = found["explained"]
     gone = np.full_like(base.gap.measured, np.nan)
