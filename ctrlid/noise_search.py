@@ -2,11 +2,11 @@
 
 import itertools
 import math
-import os
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
+import joblib
 import numpy as np
 from scipy import optimize
 
@@ -106,7 +106,7 @@ def _line(cost: Callable[[Array], float], x: float, low: float, high: float) -> 
 
 def _costs(cost: Callable[[Array], float], points: Iterable[Array]) -> Array:
     """Return the cost at each point, computed side by side: the filter leaves Python alone."""
-    with ThreadPoolExecutor(os.cpu_count()) as threads:
+    with ThreadPoolExecutor(joblib.cpu_count()) as threads:
         return np.array(list(threads.map(cost, points)))
 
 
