@@ -110,10 +110,11 @@ def predict(loop: Loop, record: Record, force_noise: float | None = None) -> Pre
     else:
         fit = begin(problem, EMPTY, Noise((max(force_noise, 1e-150) ** 2,) * m.channels))
     out, sensor = fit.filtered[0], float(np.sqrt(fit.sensor[0]))
-    states, n = out.trajectory.filtered, len(loop.equations().states)
+    states = out.trajectory.filtered
+    own = [m.e.states.index(name) for name in loop.equations().states]  # of neutral effects none
     return Prediction(
         record.y - out.innovations, out.innovations, fit.problem.counts[0],
-        sensor * np.sqrt(out.variance), states[:, :n], states[:, n:], sensor,
+        sensor * np.sqrt(out.variance), states[:, own], states[:, m.n :], sensor,
         sensor * float(np.sqrt(fit.noise.force[0])),
     )  # fmt: skip
 

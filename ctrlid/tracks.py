@@ -102,6 +102,5 @@ def _start(loop: Loop, record: Record) -> tuple[Array, Array, float]:
 
 def state_at_rest(loop: Loop, e: Equations) -> tuple[float, ...]:
     """Return the state at rest, with effects at their neutral values taking part."""
-    states = loop.point.states
-    extra = len(e.states) - len(states)
-    return states if extra == 0 else (*states, *e.rest[len(e.rest) - extra :])
+    own = len(e.states) - len(e.rest)  # those of effects stand behind, in an order of their own
+    return (*loop.point.states[:own], *e.rest)

@@ -15,7 +15,7 @@ from ctrlid import effects as E
 from ctrlid.filtering import Noise, first_guess, settle
 from ctrlid.kalman import filter_pass
 from ctrlid.machine import Machine, Trajectory
-from ctrlid.tracks import make_track
+from ctrlid.tracks import make_track, state_at_rest
 
 # --- one pass
 
@@ -522,3 +522,25 @@ def test_a_million_samples_of_an_unstable_plant_stay_positive():
     z = out[0][1000:] / (2e-6 * np.sqrt(out[1][1000:]))
     assert z.std() == pytest.approx(1.0, abs=0.005)
     assert abs(z[1:] @ z[:-1]) / len(z) < 0.005
+
+
+def test_a_neutral_effect_rests_in_the_place_of_its_own_states():
+    # A mode acts on the plant before an actuator's lag does, and its states stand before the lag's.
+    plant = cid.plants.maglev(m=0.0213, K=3.34e-6)
+    at = cid.operating_point(plant, output=0.012)
+    loop = cid.Loop(plant, None, dt=1e-3, at=at, effects=(E.ActuatorLag(tau=2e-3),))
+    mode = E.FlexibleMode(frequency=28.0, damping=0.03, coupling=0.0)
+    both = loop.with_effect(mode)
+    resting = dict(zip(both.equations(keep=True).states,
+                       state_at_rest(both, both.equations(keep=True)), strict=True))  # fmt: skip
+    assert resting == {"x": 0.012, "v": 0.0, "FlexibleMode.deflection": 0.0,
+                       "FlexibleMode.speed": 0.0, "ActuatorLag.input": at.input}  # fmt: skip
+    # So nothing moves the mode at the start, and the filter is that with next to nothing of it.
+    lead = cid.design_lead(cid.linearize(plant, at), crossover=100, phase_margin=50)
+    driven = cid.Loop(plant, lead.sample(1e-3, "tustin"), dt=1e-3, at=at, effects=loop.effects)
+    r = cid.random_binary(400, amplitude=1e-4, hold=20, around=0.012, seed=1)
+    record = cid.simulate(driven, r, sensor_noise=1e-5, seed=2)
+    slight = loop.with_effect(E.FlexibleMode(frequency=28.0, damping=0.03, coupling=1e-9))
+    still, moved = (cid.predict(x, record, force_noise=0.1) for x in (both, slight))
+    assert still.circuit.shape == moved.circuit.shape == (400, 0)
+    np.testing.assert_allclose(still.states, moved.states[:, [0, 1, 4]], rtol=1e-6, atol=1e-9)
