@@ -29,6 +29,8 @@ from .vectorized import Vectorized, through
 
 SLOW = 0.35  # rate times step up to which a step of order four is exact enough
 MOST_STEPS = 100  # of order eight in a period: more make an expression that takes minutes to build
+BRISK = 0.35  # of a lag's time constant: a step of order four that follows it exactly enough
+FEW_STEPS = 3  # of order four, which cost less than one of order eight
 KINK_STEPS = 4  # of order four in a period where friction has a kink
 
 
@@ -218,8 +220,10 @@ class Machine:
             late = float(casadi.evalf(casadi.substitute(casadi.SX(e.delay), e.p, p))) / dt + 1e-9
             if not self.late <= late <= self.late + 1 + 1e-6:
                 return False
-        time = _shortest(e, p)
-        return time > dt / 16 if not self.scheme[2] else time < dt / 4
+        time, (order, steps, cut) = _shortest(e, p), self.scheme
+        if order == 4:
+            return time > dt / steps / (2 * BRISK)
+        return time < dt / 4 if cut else time > dt / 16
 
     def linearize(self, track: Track, theta: Array, at: Trajectory) -> Linearized:
         """Return the plant along a trajectory, for parameter values `theta`."""
@@ -365,9 +369,13 @@ def _scheme(e: Equations, loop: Loop) -> Scheme:
     except CtrlidError:
         return (8, 2, cut)
     rate = float(np.max(np.abs(np.linalg.eigvals(a)), initial=0.0)) * loop.dt
-    if rate <= 3 * SLOW and not driven:
+    if rate <= 3 * SLOW:
         # A velocity that turns within a period crosses the kink of friction there.
-        return (4, max(KINK_STEPS if e.kinked else 1, math.ceil(rate / SLOW)), False)
+        few = max(KINK_STEPS if e.kinked else 1, math.ceil(rate / SLOW),
+                  math.ceil(min(loop.dt / time / BRISK, MOST_STEPS)))  # fmt: skip
+        # What a lag of the input does is known exactly; the plant has to follow it.
+        if not driven or few <= FEW_STEPS:
+            return (4, few, False)
     steps = max(1, math.ceil(rate / 1.5))
     if steps > MOST_STEPS:
         raise CtrlidError(

@@ -17,6 +17,8 @@ from .tracks import Track
 ROUNDS = 25  # Gauss-Newton steps at most
 FAR = 3.0  # standard errors: after a longer step the trajectory is settled anew
 CLOSE = 0.02  # standard errors: a smaller step ends the search
+PATIENCE = 4  # steps after which a climb may be given up
+HOPE = 10.0  # times what the next step promises: no climb gains more after that
 SHARES = tuple(3.0**-k for k in range(6))  # of a step, until the likelihood grows
 ELSEWHERE = 2.0  # of log-likelihood, that a noise far away must gain to go on from there
 NOTHING = 1e-3  # of log-likelihood: a step that promises less is not worth taking
@@ -66,7 +68,9 @@ def _settled(track: Track, out: Filtered) -> Any:
     return known & ~track.afresh & (out.variance <= SETTLED * usual)
 
 
-def climb(fit: Fit, rounds: int = ROUNDS, exact: bool = True) -> Fit:
+def climb(
+    fit: Fit, rounds: int = ROUNDS, exact: bool = True, beat: float = -math.inf
+) -> Fit:  # fmt: skip
     """Climb to the maximum of the likelihood over parameters and noise.
 
     Gauss-Newton steps on the innovations with the filter's gain held fixed, the noise tuned between
@@ -81,6 +85,8 @@ def climb(fit: Fit, rounds: int = ROUNDS, exact: bool = True) -> Fit:
         Steps at most.
     exact : bool, optional
         Whether to end with steps on the likelihood itself.
+    beat : float, optional
+        A likelihood from elsewhere: a climb that does not seem to get there is given up.
 
     Returns
     -------
@@ -88,7 +94,9 @@ def climb(fit: Fit, rounds: int = ROUNDS, exact: bool = True) -> Fit:
         The maximum, or the best point found.
     """
     tuned, far, enough = -math.inf, True, 0.02 if exact else 0.3
-    for _ in range(rounds):
+    for count in range(rounds):
+        if count >= PATIENCE and fit.value + HOPE * max(promised(fit), 1.0) < beat:
+            return fit
         # A short step was already evaluated along the trajectory of the pass before.
         moved = relinearized(fit) if far else fit
         fit = moved if np.isfinite(moved.value) else fit
@@ -114,6 +122,12 @@ def retuned(fit: Fit) -> Fit:
     plain = Noise(fit.noise.force)
     other = tune(fit.problem, fit.theta, fit.linearized, plain, wide=True)
     return climb(other) if other.value > fit.value + ELSEWHERE else fit
+
+
+def promised(fit: Fit) -> float:
+    """Return the gain that a Gauss-Newton step within the bounds expects."""
+    matrix, score = fit.normal
+    return 0.5 * float(score @ bounded_step(fit, matrix, score)[0])
 
 
 def bounded_step(fit: Fit, matrix: Array, score: Array) -> tuple[Array, Array]:

@@ -1,5 +1,6 @@
 """A plant or a loop over one sampling period, as exact equations: the map that is repeated."""
 
+import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -433,6 +434,7 @@ def growth_rate(loop: Loop) -> float:
     return float(np.log(largest) / loop.dt) if largest > 0 else -math.inf
 
 
+@functools.lru_cache(maxsize=32)
 def comes_to_rest(loop: Loop) -> bool:
     """Whether small deviations die out in a loop; without a controller, in the plant itself."""
     return growth_rate(loop) < -1e-6 / loop.dt

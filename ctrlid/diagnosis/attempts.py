@@ -7,8 +7,8 @@ from dataclasses import replace
 from ..effects import AbstractEffect
 from ..errors import CtrlidError
 from ..likelihood import evaluate
-from ..maximum import climb
-from .carrying import carried_over, promised
+from ..maximum import climb, promised
+from .carrying import carried_over
 from .fitted import Model, light, simulable, spared
 from .trial import Trial
 from .weighing import doubled_by, objection, own_parameters
@@ -133,12 +133,12 @@ def refit(base: Model, trial: Trial, near: Model | None = None) -> Trial:
         loop = loop.with_parameters({n: known[n] for n in names if n in known})
     try:
         start = carried_over(near or base, loop, names)
-        starts = [start]
+        fits = [spared(climb(start, rounds=SCREEN_ROUNDS, exact=False))]
         if start.noise.drift and start.problem.known is None and simulable(base):
             # A random force that was fitted while the effect was missing may never let it in.
             # (Where no simulation can check it, the likelihood also leads to absurd values.)
-            starts.append(replace(start, noise=replace(start.noise, memory=0.0, drift=0.0)))
-        fits = [spared(climb(s, rounds=SCREEN_ROUNDS, exact=False)) for s in starts]
+            plain = replace(start, noise=replace(start.noise, memory=0.0, drift=0.0))
+            fits.append(spared(climb(plain, SCREEN_ROUNDS, exact=False, beat=fits[0].value)))
         fit = max(fits, key=lambda f: f.value)
     except CtrlidError as reason:
         return replace(trial, remark=str(reason))

@@ -11,7 +11,6 @@ from ..likelihood import Fit, evaluate
 from ..loop import Loop
 from ..loop_fit import bounds_of, start_values
 from ..machine import Machine, Trajectory
-from ..maximum import bounded_step
 from ..tracks import retracked
 from .fitted import Model
 
@@ -70,9 +69,3 @@ def _carried(old: Machine, new: Machine, known: Trajectory, guess: Trajectory) -
             mixed[:, i] = theirs[:, k]
         result.append(mixed)
     return Trajectory(*result)
-
-
-def promised(fit: Fit) -> float:
-    """Return the gain that a Gauss-Newton step within the bounds expects."""
-    matrix, score = fit.normal
-    return 0.5 * float(score @ bounded_step(fit, matrix, score)[0])

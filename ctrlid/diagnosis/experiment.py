@@ -10,11 +10,10 @@ from ..data import Record
 from ..errors import CtrlidError
 from ..likelihood import Known
 from ..loop_fit import make_problem
-from ..maximum import begin
+from ..maximum import begin, promised
 from ..physics import Array
 from ..signals import random_binary
 from ..simulation import Simulator
-from .carrying import promised
 from .gap import FEW_STEPS, ROUGH
 from .trial import Trial
 

@@ -12,8 +12,8 @@ from ..effects import AbstractEffect, SensorOffset
 from ..errors import CtrlidError
 from ..linearization import state_matrices
 from ..loop import Loop
+from ..maximum import promised
 from .attempts import attempt_at, refit
-from .carrying import promised
 from .decide import GATE
 from .fitted import Model, quiet, simulable
 from .replica import DOUBTFUL, TWICE, artefact, kinked, more_than_simple, replica

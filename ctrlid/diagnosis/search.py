@@ -14,7 +14,7 @@ from .fitted import Model, anchor, simulable, spared, whole
 from .omnibus import ALPHA, Omnibus, omnibus
 from .replica import WITH_EFFECTS, forgiven, replica
 from .rounds import NEXT, Step, Work, candidates, one_round
-from .scan import scanned
+from .scan import SCANS, scanned
 from .settling import Found, cut, renoised, settled, without_superfluous
 from .trial import Trial, contains, same_kind
 
@@ -136,10 +136,14 @@ def _foreseen(
     best = last.best
     assert best is not None
     near = [t for t in last.trials[1:NEXT] if _nearly(t, best, ties=step.best is None)]
+    # What promised little beside the best is not scanned again, which takes most of the time.
+    ranked = sorted(step.trials, key=lambda t: -t.promise)
+    likely = {t.name for t in (ranked if step.best is None else ranked[:NEXT])}
     pairs: list[tuple[float, int]] = []
     for k, trial in enumerate(near[:FORESEEN]):
         model = whole(trial.model)
-        pool = _pool(model, catalogue)
+        pool = [c for c in _pool(model, catalogue)
+                if type(c) not in SCANS or type(c).__name__ in likely]  # fmt: skip
         tried: list[Trial] = work(lambda effect, model=model: scanned(model, effect), pool)
         tried = sorted(tried, key=lambda t: t.price - t.promise)[:2]
         done = work(lambda t, model=model: refit(model, t), tried)
