@@ -372,7 +372,7 @@ def _scheme(e: Equations, loop: Loop) -> Scheme:
     if rate <= 3 * SLOW:
         # A velocity that turns within a period crosses the kink of friction there.
         few = max(KINK_STEPS if e.kinked else 1, math.ceil(rate / SLOW),
-                  math.ceil(min(loop.dt / time / BRISK, MOST_STEPS)))  # fmt: skip
+                  2 * driven, math.ceil(min(loop.dt / time / BRISK, MOST_STEPS)))  # fmt: skip
         # What a lag of the input does is known exactly; the plant has to follow it.
         if not driven or few <= FEW_STEPS:
             return (4, few, False)

@@ -17,8 +17,6 @@ from .tracks import Track
 ROUNDS = 25  # Gauss-Newton steps at most
 FAR = 3.0  # standard errors: after a longer step the trajectory is settled anew
 CLOSE = 0.02  # standard errors: a smaller step ends the search
-PATIENCE = 4  # steps after which a climb may be given up
-HOPE = 10.0  # times what the next step promises: no climb gains more after that
 SHARES = tuple(3.0**-k for k in range(6))  # of a step, until the likelihood grows
 ELSEWHERE = 2.0  # of log-likelihood, that a noise far away must gain to go on from there
 NOTHING = 1e-3  # of log-likelihood: a step that promises less is not worth taking
@@ -68,9 +66,7 @@ def _settled(track: Track, out: Filtered) -> Any:
     return known & ~track.afresh & (out.variance <= SETTLED * usual)
 
 
-def climb(
-    fit: Fit, rounds: int = ROUNDS, exact: bool = True, beat: float = -math.inf
-) -> Fit:  # fmt: skip
+def climb(fit: Fit, rounds: int = ROUNDS, exact: bool = True) -> Fit:
     """Climb to the maximum of the likelihood over parameters and noise.
 
     Gauss-Newton steps on the innovations with the filter's gain held fixed, the noise tuned between
@@ -85,8 +81,6 @@ def climb(
         Steps at most.
     exact : bool, optional
         Whether to end with steps on the likelihood itself.
-    beat : float, optional
-        A likelihood from elsewhere: a climb that does not seem to get there is given up.
 
     Returns
     -------
@@ -94,9 +88,7 @@ def climb(
         The maximum, or the best point found.
     """
     tuned, far, enough = -math.inf, True, 0.02 if exact else 0.3
-    for count in range(rounds):
-        if count >= PATIENCE and fit.value + HOPE * max(promised(fit), 1.0) < beat:
-            return fit
+    for _ in range(rounds):
         # A short step was already evaluated along the trajectory of the pass before.
         moved = relinearized(fit) if far else fit
         fit = moved if np.isfinite(moved.value) else fit

@@ -133,12 +133,12 @@ def refit(base: Model, trial: Trial, near: Model | None = None) -> Trial:
         loop = loop.with_parameters({n: known[n] for n in names if n in known})
     try:
         start = carried_over(near or base, loop, names)
-        fits = [spared(climb(start, rounds=SCREEN_ROUNDS, exact=False))]
+        starts = [start]
         if start.noise.drift and start.problem.known is None and simulable(base):
             # A random force that was fitted while the effect was missing may never let it in.
             # (Where no simulation can check it, the likelihood also leads to absurd values.)
-            plain = replace(start, noise=replace(start.noise, memory=0.0, drift=0.0))
-            fits.append(spared(climb(plain, SCREEN_ROUNDS, exact=False, beat=fits[0].value)))
+            starts.append(replace(start, noise=replace(start.noise, memory=0.0, drift=0.0)))
+        fits = [spared(climb(s, rounds=SCREEN_ROUNDS, exact=False)) for s in starts]
         fit = max(fits, key=lambda f: f.value)
     except CtrlidError as reason:
         return replace(trial, remark=str(reason))
