@@ -25,12 +25,12 @@ MODULES = [name for name in ctrlid.__all__ if inspect.ismodule(getattr(ctrlid, n
 
 
 def functions_of(module):
-    """Public functions written in a public module."""
+    """Public functions written in a public module, or in a file of it."""
     return [
         f"{module.__name__.partition('.')[2]}.{name}"
         for name, value in vars(module).items()
         if not name.startswith("_")
-        and getattr(value, "__module__", "") == module.__name__
+        and f"{getattr(value, '__module__', '')}.".startswith(f"{module.__name__}.")
         and inspect.isfunction(value)
     ]
 
@@ -48,7 +48,12 @@ def methods_of(name):
 
 
 NAMES = [n for n in ctrlid.__all__ if not n.startswith("__") and n not in MODULES]
-OF_MODULES = [name for module in MODULES for name in functions_of(getattr(ctrlid, module))]
+OF_MODULES = [
+    name
+    for module in MODULES
+    if module != "effects"  # which have a page of their own
+    for name in functions_of(getattr(ctrlid, module))
+]
 METHODS = [m for n in NAMES if inspect.isclass(getattr(ctrlid, n)) for m in methods_of(n)]
 
 
