@@ -16,7 +16,7 @@ from .fitted import Model
 
 
 def carried_over(base: Model, loop: Loop, names: Sequence[str]) -> Fit:
-    """Return the likelihood of a larger model at its start, along the base's trajectory."""
+    """Return the likelihood of a larger or smaller model, along the trajectory of the base."""
     old = base.fit.problem
     m = Machine(loop, names, old.machine.hold, old.machine.law is not None)
     tracks = tuple(retracked(track, loop) for track in old.tracks)
