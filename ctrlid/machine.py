@@ -14,16 +14,9 @@ from .data import Record
 from .errors import CtrlidError
 from .linearization import state_matrices
 from .loop import Loop
+from .maps import Plan, maps_of, moves_of, play_of
 from .physics import Array, Equations
-from .stepping import (
-    Scheme,
-    advance,
-    input_pieces,
-    integrate,
-    known_lags,
-    through_play,
-    whole_delay,
-)
+from .stepping import Scheme, known_lags, whole_delay
 from .tracks import Track, state_at_rest
 from .vectorized import Vectorized, through
 
@@ -61,6 +54,8 @@ class Linearized:
 class Machine:
     """The equations of a loop's plant made ready to be filtered along records.
 
+    Machines whose equations differ in the values of their parameters only share their maps.
+
     Parameters
     ----------
     loop : Loop
@@ -86,117 +81,19 @@ class Machine:
         self.forces = e.velocities or tuple(range(self.n - len(e.rest)))
         # One force on all velocities; without any, each state has a noise of its own.
         self.channels = 1 if e.velocities else len(self.forces)
-        self._plays: dict[int, casadi.Function] = {}
-        self._build()
-
-    def _map(self) -> tuple[Any, list[Any], list[Any], dict[str, Any]]:
-        """Return the state, its value after each stage of a period, what is given, and symbols."""
-        e, n, dt = self.e, self.n, self.loop.dt
-        x, p, s = (casadi.SX.sym(k, m) for k, m in (("x", self.size), ("p", e.p.shape[0]),
-                                                    ("s", n)))  # fmt: skip
-        t, before, now, ahead, r, y = w = [casadi.SX.sym(k) for k in "tbnary"]
-        force = casadi.SX.sym("f", self.channels)
-        kick = casadi.SX.zeros(n, 1)
-        for k, j in enumerate(self.forces):
-            kick[j] = force[k if self.channels > 1 else 0]
-        # A fit repeats the map often; a single prediction can afford to be exact.
-        order, steps, cut = self.scheme = _scheme(e, self.loop)
-        scheme = self.scheme if self.names else (8, 1 if order == 4 else steps, cut)
-        part = casadi.SX.sym("i")
-        if self.law is None:
-            pieces = [
-                tuple(casadi.substitute(casadi.SX(value), e.p, p) for value in piece)
-                for piece in input_pieces(e, dt, (before, now, ahead), self.hold)
-            ]
-            ends, self._parts = self._stages_of(t, x, pieces, p, s, kick, scheme, part)
-        else:
-            ends = [self._follow(t, x, p, s, kick, now, r, y, max(scheme[1], 2))]
-            self._parts = 1
-        free = casadi.vertcat(*(p[k] for k in self.index)) if self.index else casadi.SX(0, 1)
-        self._carries = len(ends) * self._parts > 1
-        by = {"force": force, "free": free, "path": casadi.vertcat(before, now, ahead),
-              "height": e.smoothed(t, x[:n], now, p, s)[1]}  # fmt: skip
-        return x, ends, [casadi.vertcat(*w), p, s, force, part], by
-
-    def _build(self) -> None:
-        x, ends, given, by = self._map()
-        self._functions = self._chained(x, ends, given, (by["force"], by["free"]))
-        self._stages = [Vectorized(f) for f in self._functions]
-        height = by["height"]
-        outputs = [height, casadi.jacobian(height, x), casadi.jacobian(height, by["free"])]
-        self.sensor_function = casadi.Function("sensor", [x, *given[:3]], outputs, {"cse": True})
-        self._sensor = Vectorized(self.sensor_function)
-
-    def _stages_of(self, t: Any, x: Any, pieces: Any, p: Any, s: Any, kick: Any, scheme: Scheme,
-                   part: Any) -> tuple[list[Any], int]:  # fmt: skip
-        """Return the maps that make up a period, and how many equal parts each of them has.
-
-        Several steps of one kind are one short expression that is gone through several times.
-        """
-        order, steps, cut = scheme
-        if self.e.dt or cut or steps == 1:
-            return [advance(self.e, t, x, pieces, p, s, kick, scheme)[0]], 1
-        ends, begin = [], t
-        for duration, level, slope in pieces:
-            h = duration / steps
-            piece = (h, level + slope * part * h, slope)
-            after = advance(self.e, begin + part * h, x, [piece], p, s, kick, (order, 1, False))[0]
-            ends.append(after)
-            begin = begin + duration
-        return ends, steps
-
-    def _chained(
-        self, x: Any, ends: Sequence[Any], given: Sequence[Any], by: Sequence[Any]
-    ) -> list[casadi.Function]:
-        """Return maps that carry the state and its derivatives, by itself first, along.
-
-        Kinks have no slope at the kink itself; everything else is exact.
-        """
-        n = self.size
-        before = [casadi.SX.eye(n), *(casadi.SX(n, v.shape[0]) for v in by)]
-        carried = []
-        if self._carries:
-            before = carried = [casadi.SX.sym("s", *value.shape) for value in before]
-        functions = []
-        for end in ends:
-            a = casadi.jacobian(end, x)
-            own = [casadi.SX(n, n), *(casadi.jacobian(end, v) for v in by)]
-            outputs = [casadi.mtimes(a, s) + d for s, d in zip(before, own, strict=True)]
-            functions.append(
-                casadi.Function("step", [x, *carried, *given], [end, *outputs], {"cse": True})
-            )
-        return functions
-
-    @functools.cached_property
-    def _moves(self) -> list[Vectorized]:
-        """How the state after a period depends on the input."""
-        x, ends, given, by = self._map()  # expressions themselves do not travel to other processes
-        return [Vectorized(f) for f in self._chained(x, ends, given, (by["path"],))]
+        self.scheme = _scheme(e, loop)
+        self.plan = Plan(e, self.law, loop.dt, hold, self.scheme, self.forces, self.channels,
+                         tuple(self.index), self.late)  # fmt: skip
+        self.maps = maps_of(self.plan)
 
     def _period(self, stages: Sequence[Vectorized], x: Array, *given: Any) -> list[Array]:
         """Go through a period; return the state after it and its derivatives, by itself first."""
-        if not self._carries:
+        if not self.maps.carries:
             return through(stages, [], [x, *given, 0])
         n = self.size
         widths = [size // n for size in stages[0].sizes[2 : -len(given) - 1]]
         still = [np.eye(n).ravel(), *(np.zeros(n * k) for k in widths)]
-        return through(stages, [x, *still], given, self._parts)
-
-    def _follow(self, t: Any, x: Any, p: Any, s: Any, kick: Any, u: Any, r: Any, y: Any,
-                substeps: int) -> Any:  # fmt: skip
-        """Advance plant and analog controller together, u being the measured one at the start."""
-        e, n, law = self.e, self.n, self.law
-        assert law is not None
-        noise = y - e.smoothed(t, x[:n], u, p, s)[1]
-        offset = u - law.apply(t, x[n:], r, y)[0]  # bias, injected signals, what xc does not know
-
-        def rate(tau: Any, z: Any) -> Any:
-            seen = e.smoothed(t + tau, z[:n], u, p, s)[1] + noise
-            computed, slope = law.apply(t + tau, z[n:], r, seen)
-            moved = e.smoothed(t + tau, z[:n], computed + offset, p, s)[0] + kick
-            return casadi.vertcat(moved, slope)
-
-        return integrate(rate, x, self.loop.dt, substeps)[0]
+        return through(stages, [x, *still], given, self.maps.parts)
 
     @property
     def position(self) -> int:
@@ -233,16 +130,18 @@ class Machine:
         w = self._inputs(track, applied)
         spread = at.spread[:, : self.n].T
         given = (at.filtered.T, w, p, spread, np.zeros(self.channels))
-        step, a, b, dp = self._period(self._stages, *given)
+        step, a, b, dp = self._period(self.maps.stages, *given)
         # How the input moves the state matters only where the input is not what was measured.
         unsure = slopes is not None or not track.valid.all()
-        dw = self._period(self._moves, *given)[2] if unsure else np.zeros((1, self.size, 3))
+        dw = np.zeros((1, self.size, 3))
+        if unsure:
+            dw = self._period(moves_of(self.plan), *given)[2]
         if slopes is not None:
             dw = _full(dw, len(u))
             dp = _full(dp, len(u)).copy()
             for k in (-1, 0, 1):
                 dp += dw[:, :, k + 1, None] * self._shifted(slopes, k)[:, None, :]
-        height, c, hp = self._sensor(at.predicted.T, w, p, spread)
+        height, c, hp = self.maps.sensor(at.predicted.T, w, p, spread)
         return Linearized(
             _full(step, len(u))[:, :, 0], _full(a, len(u)), _full(b, len(u)),
             _full(dw, len(u)).sum(axis=2), _full(dp, len(u)), _full(height, len(u))[:, 0, 0],
@@ -259,27 +158,8 @@ class Machine:
         )
         z = np.concatenate([np.asarray(casadi.evalf(start), float).ravel(),
                             np.zeros(len(self.index))])  # fmt: skip
-        if len(u) not in self._plays:  # building it takes longer than running it
-            self._plays[len(u)] = self._play().mapaccum("run", len(u))
-        out = np.asarray(self._plays[len(u)](z, u[None, :], p)[1], float)
+        out = np.asarray(play_of(self.plan, len(u))(z, u[None, :], p)[1], float)
         return out[0], out[1:].T
-
-    def _play(self) -> casadi.Function:
-        """Return one sample of the play, with its slopes by the free parameters."""
-        e = self.e
-        assert e.play is not None
-        m, slope = casadi.SX.sym("m"), casadi.SX.sym("d", len(self.index))
-        sample, values = casadi.SX.sym("u"), casadi.SX.sym("p", e.p.shape[0])
-        applied, after = through_play(e, m, sample, values)
-        free = casadi.vertcat(*(values[k] for k in self.index)) if self.index else casadi.SX(0, 1)
-        rows = [
-            casadi.jacobian(out, m) * slope + casadi.jacobian(out, free).T
-            for out in (applied, after)
-        ]
-        return casadi.Function(
-            "play", [casadi.vertcat(m, slope), sample, values],
-            [casadi.vertcat(after, rows[1]), casadi.vertcat(applied, rows[0])],
-        )  # fmt: skip
 
     def with_slopes(self) -> casadi.Function:
         """Return one period of the plant, as it is, together with that of its sensitivities.
@@ -291,11 +171,11 @@ class Machine:
         x, s, w, values = (casadi.SX.sym(k, *size) for k, size in (
             ("x", (n, 1)), ("s", (n, p + n)), ("w", (6, 1)), ("p", self.e.p.shape)))  # fmt: skip
         still, quiet = casadi.SX.zeros(self.n), casadi.SX.zeros(self.channels)
-        y, c, hp = self.sensor_function(x, w, values, still)
+        y, c, hp = self.maps.sensor_function(x, w, values, still)
         seen = casadi.mtimes(c, s) + casadi.horzcat(hp, casadi.SX.zeros(1, n))
         stage = [x, casadi.SX.eye(n), casadi.SX(n, self.channels), casadi.SX(n, p)]
-        carried = len(stage) if self._carries else 1
-        for function, part in itertools.product(self._functions, range(self._parts)):
+        carried = len(stage) if self.maps.carries else 1
+        for function, part in itertools.product(self.maps.functions, range(self.maps.parts)):
             stage = function.call([*stage[:carried], w, values, still, quiet, part])
         after, a, _, dp = stage
         moved = casadi.mtimes(a, s) + casadi.horzcat(dp, casadi.SX.zeros(n, n))
@@ -315,13 +195,13 @@ class Machine:
         if not known:
             w[5] = self.height(track, x, rows)
         quiet = np.zeros((self.n, 1))
-        return self._period(self._stages, x.T, w, p, quiet, np.zeros(self.channels))[0][:, :, 0]
+        return self._period(self.maps.stages, x.T, w, p, quiet, np.zeros(self.channels))[0][:, :, 0]
 
     def height(self, track: Track, x: Array, rows: Any) -> Array:
         """Return the outputs at states (k, n) and the samples `rows`."""
         p = self.e.values
         w = self._inputs(track, self._through_play(track.table[1], p)[0])[:, rows]
-        return self._sensor(x.T, w, p, np.zeros((self.n, 1)))[0][:, 0, 0]
+        return self.maps.sensor(x.T, w, p, np.zeros((self.n, 1)))[0][:, 0, 0]
 
     def at_rest(self) -> tuple[Array, Array, Array]:
         """Return the derivatives of the map by state and force and of the output, at rest."""
@@ -329,8 +209,8 @@ class Machine:
         x = self.padded(np.array(state_at_rest(self.loop, self.e)))
         w = np.array([0.0, at.input, at.input, at.input, at.output, at.output])
         quiet = np.zeros(self.n)
-        _, a, b, _ = self._period(self._stages, x, w, p, quiet, np.zeros(self.channels))
-        _, h, _ = self._sensor(x, w, p, quiet)
+        _, a, b, _ = self._period(self.maps.stages, x, w, p, quiet, np.zeros(self.channels))
+        _, h, _ = self.maps.sensor(x, w, p, quiet)
         return a[0], b[0], h[0]
 
     def _inputs(self, track: Track, applied: Array) -> Array:

@@ -1,58 +1,24 @@
-"""CasADi expressions evaluated by numpy over many samples at once.
+"""CasADi expressions evaluated over many samples at once.
 
 CasADi's own interpreter walks through an expression once per sample. Walking through it once per
-block of samples, with a numpy operation at each node, gives the same numbers several times faster
-and needs no compiler.
+block of samples, with a loop over the block at each instruction, gives the same numbers many times
+faster and costs no compilation per expression.
 """
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import casadi
+import joblib
 import numpy as np
-from scipy import special
 
 from .errors import CtrlidError
+from .interpreter import BINARY, UNARY, run
 from .physics import Array
 
-BLOCK = 4096  # samples at once: long enough that a call costs little, short enough for the cache
-
-
-def _sign(a: Any, out: Any) -> Any:
-    return np.sign(a, out=out)
-
-
-def _select(a: Any, b: Any, out: Any) -> Any:
-    # CasADi's if_else_zero: an expression that is not selected must not spoil the rest by NaN.
-    chosen = np.asarray(a, dtype=bool)
-    if b is not out:
-        np.copyto(out, b)
-    np.copyto(out, 0.0, where=~chosen)
-    return out
-
-
-UNARY: dict[int, Callable[..., Any]] = {
-    casadi.OP_ASSIGN: np.positive, casadi.OP_NEG: np.negative, casadi.OP_EXP: np.exp,
-    casadi.OP_LOG: np.log, casadi.OP_SQRT: np.sqrt, casadi.OP_SQ: np.square,
-    casadi.OP_TWICE: lambda a, out: np.add(a, a, out=out), casadi.OP_SIN: np.sin,
-    casadi.OP_COS: np.cos, casadi.OP_TAN: np.tan, casadi.OP_ASIN: np.arcsin,
-    casadi.OP_ACOS: np.arccos, casadi.OP_ATAN: np.arctan, casadi.OP_SINH: np.sinh,
-    casadi.OP_COSH: np.cosh, casadi.OP_TANH: np.tanh, casadi.OP_ASINH: np.arcsinh,
-    casadi.OP_ACOSH: np.arccosh, casadi.OP_ATANH: np.arctanh, casadi.OP_FLOOR: np.floor,
-    casadi.OP_CEIL: np.ceil, casadi.OP_FABS: np.abs, casadi.OP_SIGN: _sign,
-    casadi.OP_ERF: special.erf, casadi.OP_INV: np.reciprocal, casadi.OP_LOG1P: np.log1p,
-    casadi.OP_EXPM1: np.expm1, casadi.OP_NOT: np.logical_not,
-}  # fmt: skip
-BINARY: dict[int, Callable[..., Any]] = {
-    casadi.OP_ADD: np.add, casadi.OP_SUB: np.subtract, casadi.OP_MUL: np.multiply,
-    casadi.OP_DIV: np.divide, casadi.OP_POW: np.power, casadi.OP_CONSTPOW: np.power,
-    casadi.OP_FMIN: np.fmin, casadi.OP_FMAX: np.fmax, casadi.OP_FMOD: np.fmod,
-    casadi.OP_ATAN2: np.arctan2, casadi.OP_HYPOT: np.hypot, casadi.OP_COPYSIGN: np.copysign,
-    casadi.OP_IF_ELSE_ZERO: _select, casadi.OP_LT: np.less, casadi.OP_LE: np.less_equal,
-    casadi.OP_EQ: np.equal, casadi.OP_NE: np.not_equal, casadi.OP_AND: np.logical_and,
-    casadi.OP_OR: np.logical_or,
-}  # fmt: skip
+BLOCK = 512  # samples at once: long enough that a call costs little, short enough for the cache
 
 
 class Vectorized:
@@ -74,30 +40,10 @@ class Vectorized:
         self.sizes = [function.numel_in(k) for k in range(function.n_in())]
         self.shapes = [(function.size1_out(k), function.size2_out(k))
                         for k in range(function.n_out())]  # fmt: skip
-        # Where the elements that are not always zero stand, columns one after another.
-        into_at = [function.sparsity_in(k).find() for k in range(function.n_in())]
-        out_at = [function.sparsity_out(k).find() for k in range(function.n_out())]
-        self._work = function.sz_w()
-        self._program: list[tuple[int, int, int, int, Any]] = []
-        for k in range(function.n_instructions()):
-            op = function.instruction_id(k)
-            out, into = function.instruction_output(k), function.instruction_input(k)
-            if op == casadi.OP_CONST:
-                step = (0, out[0], 0, 0, function.instruction_constant(k))
-            elif op == casadi.OP_INPUT:
-                step = (1, out[0], into[0], into_at[into[0]][into[1]], None)
-            elif op == casadi.OP_OUTPUT:
-                step = (2, into[0], out[0], out_at[out[0]][out[1]], None)
-            elif op in UNARY:
-                step = (3, out[0], into[0], 0, UNARY[op])
-            elif op in BINARY:
-                step = (4, out[0], into[0], into[1], BINARY[op])
-            else:
-                raise CtrlidError(
-                    f"the equations use an operation (CasADi's number {op}) that cannot be "
-                    "evaluated over many samples; write it with ordinary numpy functions"
-                )
-            self._program.append(step)
+        self.rows_in = sum(self.sizes)
+        self.rows_out = sum(rows * columns for rows, columns in self.shapes)
+        steps, self.constants = _instructions(function)
+        self.program, self.registers = _allocated(steps)
 
     def __call__(self, *arguments: Any) -> list[Array]:
         """Evaluate; arguments are numbers or arrays of shape (rows,) or (rows, n).
@@ -109,29 +55,78 @@ class Vectorized:
         """
         return through([self], [], arguments)
 
-    def run(self, inputs: Sequence[Sequence[Any]], size: int) -> list[list[Any]]:
-        """Evaluate over a block; return the elements of each output, columns one after another."""
-        store: list[Any] = [None] * self._work
-        values: list[Any] = [None] * self._work
-        outputs: list[list[Any]] = [[0.0] * (rows * columns) for rows, columns in self.shapes]
-        for kind, a, b, c, extra in self._program:
-            if kind >= 3:
-                buffer = store[a]
-                if buffer is None:
-                    buffer = store[a] = np.empty(size)
-                if kind == 4:
-                    extra(values[b], values[c], out=buffer)
-                else:
-                    extra(values[b], out=buffer)
-                values[a] = buffer
-            elif kind == 0:
-                values[a] = extra
-            elif kind == 1:
-                values[a] = inputs[b][c]
-            else:
-                outputs[b][c] = values[a]
-                store[a] = None  # what comes next must not overwrite it
-        return outputs
+
+def _instructions(function: Any) -> tuple[list[tuple[int, int, int, int]], Array]:
+    """Return the instructions of a function, inputs and outputs by their rows, and its numbers.
+
+    The elements of inputs and outputs stand one column after another, one table after another.
+    """
+    into, out = [], []
+    first = 0
+    for k in range(function.n_in()):
+        into.append([first + i for i in function.sparsity_in(k).find()])
+        first += function.numel_in(k)
+    first = 0
+    for k in range(function.n_out()):
+        out.append([first + i for i in function.sparsity_out(k).find()])
+        first += function.numel_out(k)
+    steps: list[tuple[int, int, int, int]] = []
+    constants: list[float] = []
+    for k in range(function.n_instructions()):
+        op = function.instruction_id(k)
+        to, a = function.instruction_output(k), function.instruction_input(k)
+        if op == casadi.OP_CONST:
+            steps.append((op, to[0], len(constants), 0))
+            constants.append(function.instruction_constant(k))
+        elif op == casadi.OP_INPUT:
+            steps.append((op, to[0], into[a[0]][a[1]], 0))
+        elif op == casadi.OP_OUTPUT:
+            steps.append((op, out[to[0]][to[1]], a[0], 0))
+        elif op in UNARY:
+            steps.append((op, to[0], a[0], a[0]))
+        elif op in BINARY:
+            steps.append((op, to[0], a[0], a[1]))
+        else:
+            raise CtrlidError(
+                f"the equations use an operation (CasADi's number {op}) that cannot be "
+                "evaluated over many samples; write it with ordinary numpy functions"
+            )
+    return steps, np.array(constants, dtype=float)
+
+
+def _allocated(steps: Sequence[tuple[int, int, int, int]]) -> tuple[Any, int]:
+    """Return the program with registers of its own, and their number.
+
+    CasADi lets a result overwrite an operand. Here it never does: a loop in place is no vector.
+    """
+    fed = (casadi.OP_CONST, casadi.OP_INPUT)
+    holds: dict[int, int] = {}  # which instruction's result CasADi's register holds
+    operands: list[tuple[int, ...]] = []
+    last: dict[int, int] = {}  # where each result is used for the last time
+    for k, (op, to, a, b) in enumerate(steps):
+        operands.append(() if op in fed else (holds[a],) if op == casadi.OP_OUTPUT
+                        else (holds[a], holds[b]))  # fmt: skip
+        last.update(dict.fromkeys(operands[-1], k))
+        if op != casadi.OP_OUTPUT:
+            holds[to] = k
+            last[k] = k
+    done: list[list[int]] = [[] for _ in steps]
+    for result, k in last.items():
+        done[k].append(result)
+    free: list[int] = []
+    place: dict[int, int] = {}
+    program = np.zeros((len(steps), 4), dtype=np.int64)
+    count = 0
+    for k, (op, to, a, b) in enumerate(steps):
+        if op != casadi.OP_OUTPUT:
+            if not free:
+                free.append(count)
+                count += 1
+            to = place[k] = free.pop()
+        read = [place[i] for i in operands[k]]
+        program[k] = op, to, *(read * 2 if len(read) == 1 else read or (a, b))
+        free += [place[i] for i in done[k]]
+    return program, count
 
 
 def through(
@@ -162,15 +157,39 @@ def through(
               for t, rows in zip(numbers, stages[0].sizes, strict=alone)]  # fmt: skip
     n = max([1, *(t.shape[1] for t in tables)])
     outputs = [np.zeros((n, *shape)) for shape in stages[-1].shapes]
-    count = len(carried)
-    with np.errstate(all="ignore"):
-        for first in range(0, n, BLOCK):
-            stop = min(first + BLOCK, n)
-            inputs = [[row[first:stop] if len(row) > 1 else row[0] for row in t] for t in tables]
-            state, rest = inputs[:count], inputs[count:]
+    rows = [row for t in tables for row in t]
+    moving = [(k, row) for k, row in enumerate(rows) if len(row) > 1]
+    block = min(n, BLOCK)
+    still = np.zeros((stages[0].rows_in, block))
+    for k, row in enumerate(rows):
+        still[k] = row[0]
+    again = len([row for t in tables[: len(carried)] for row in t])
+
+    def work(firsts: Iterable[int]) -> None:
+        inputs, results = still.copy(), np.zeros((stages[-1].rows_out, block))
+        room = np.empty((max(s.registers for s in stages), block))
+        for first in firsts:
+            size = min(block, n - first)
+            inputs[:again] = still[:again]
+            for k, row in moving:
+                inputs[k, :size] = row[first : first + size]
             for stage, part in itertools.product(stages, range(parts)):
-                state = stage.run([*state, *rest, *([] if alone else [[part]])], stop - first)
-            for out, values in zip(outputs, state, strict=True):
-                for k, value in enumerate(values):
-                    out[first:stop, k % out.shape[1], k // out.shape[1]] = value
+                if not alone:
+                    inputs[-1] = part
+                run(stage.program, stage.constants, inputs, room, results, size)
+                inputs[:again] = results[:again]
+            at = 0
+            for out in outputs:
+                count = out.shape[1] * out.shape[2]
+                values = results[at : at + count, :size].reshape(out.shape[2], out.shape[1], size)
+                out[first : first + size] = values.T
+                at += count
+
+    share = range(0, n, block)
+    threads = min(joblib.cpu_count(), len(share))
+    if threads == 1:
+        work(share)
+    else:
+        with ThreadPoolExecutor(threads) as pool:
+            list(pool.map(work, (share[k::threads] for k in range(threads))))
     return outputs

@@ -176,7 +176,7 @@ def test_the_machines_derivatives_are_those_of_its_map(hidden, stages, parts):
     r = cid.random_binary(200, amplitude=2e-4, hold=20, around=0.012, seed=1)
     record = cid.simulate(levitated(), r, sensor_noise=2e-6, seed=2)
     m = Machine(loop, names, "zoh", False)
-    assert (len(m._stages), m._parts) == (stages, parts)
+    assert (len(m.maps.stages), m.maps.parts) == (stages, parts)
     track = make_track(loop, record)
     rng = np.random.default_rng(5)
     guess = first_guess(m, track)
@@ -544,3 +544,23 @@ def test_a_neutral_effect_rests_in_the_place_of_its_own_states():
     still, moved = (cid.predict(x, record, force_noise=0.1) for x in (both, slight))
     assert still.circuit.shape == moved.circuit.shape == (400, 0)
     np.testing.assert_allclose(still.states, moved.states[:, [0, 1, 4]], rtol=1e-6, atol=1e-9)
+
+
+def test_machines_share_what_values_do_not_change():
+    """Other values share the maps; other free parameters, holds or constants do not."""
+    plant = cid.plants.servo(m=1.0, c=2.0, k=3.0)
+    loop = cid.Loop(plant, None, dt=0.01, free=("k",))
+    friction = loop.with_effect(cid.effects.CoulombFriction(fc=0.1))
+    one = Machine(friction, ["k"], "zoh", False)
+    other = Machine(friction.with_parameters({"k": 4.0, "CoulombFriction.fc": 0.2}), ["k"], "zoh",
+                    False)  # fmt: skip
+    assert one.maps is other.maps
+    assert other.values(np.array([5.0])).tolist() == [1.0, 2.0, 5.0, 0.2]
+    assert one.values(np.array([5.0])).tolist() == [1.0, 2.0, 5.0, 0.1]
+    for different in (
+        Machine(friction, ["c"], "zoh", False), Machine(friction, ["k"], "foh", False),
+        Machine(loop, ["k"], "zoh", False),
+        Machine(loop.with_effect(cid.effects.CubicStiffness(k3=0.1)), ["k"], "zoh", False),
+        Machine(cid.Loop(plant, None, dt=0.02, free=("k",)), ["k"], "zoh", False),
+    ):  # fmt: skip
+        assert different.maps is not one.maps

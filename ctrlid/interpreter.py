@@ -1,0 +1,206 @@
+"""The instructions of a CasADi expression carried out over a block of samples.
+
+Compiled once: an expression comes in as data.
+"""
+
+import math
+from typing import Any
+
+import casadi
+import numba
+import numpy as np
+
+UNARY = {
+    casadi.OP_SQ, casadi.OP_TWICE, casadi.OP_NEG, casadi.OP_INV, casadi.OP_FABS, casadi.OP_SQRT,
+    casadi.OP_EXP, casadi.OP_LOG, casadi.OP_SIN, casadi.OP_COS, casadi.OP_TAN, casadi.OP_ASIN,
+    casadi.OP_ACOS, casadi.OP_ATAN, casadi.OP_SINH, casadi.OP_COSH, casadi.OP_TANH, casadi.OP_ASINH,
+    casadi.OP_ACOSH, casadi.OP_ATANH, casadi.OP_LOG1P, casadi.OP_EXPM1, casadi.OP_ERF,
+    casadi.OP_FLOOR, casadi.OP_CEIL, casadi.OP_SIGN, casadi.OP_NOT, casadi.OP_ASSIGN,
+}  # fmt: skip
+BINARY = {
+    casadi.OP_MUL, casadi.OP_ADD, casadi.OP_SUB, casadi.OP_DIV, casadi.OP_IF_ELSE_ZERO,
+    casadi.OP_LT, casadi.OP_LE, casadi.OP_EQ, casadi.OP_NE, casadi.OP_AND, casadi.OP_OR,
+    casadi.OP_FMIN, casadi.OP_FMAX, casadi.OP_POW, casadi.OP_CONSTPOW, casadi.OP_FMOD,
+    casadi.OP_ATAN2, casadi.OP_HYPOT, casadi.OP_COPYSIGN,
+}  # fmt: skip
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def run(
+    program: Any, constants: Any, inputs: Any, work: Any, outputs: Any, size: int
+) -> None:  # pragma: no cover - compiled
+    """Carry out a program over the first `size` samples of a block.
+
+    The loops are short, plain and never in place, which lets the compiler make vectors of them.
+
+    Parameters
+    ----------
+    program : ndarray of int, shape (instructions, 4)
+        CasADi's number of the operation, where the result goes, and its operands: registers,
+        but for an input, an output or a constant the row of their table.
+    constants : ndarray, shape (constants,)
+        Numbers of the expression.
+    inputs : ndarray, shape (rows, block)
+        Arguments.
+    work : ndarray, shape (registers, block)
+        Room for what is calculated on the way.
+    outputs : ndarray, shape (rows, block)
+        Where the results go.
+    size : int
+        Samples.
+    """
+    samples = range(size)
+    for i in range(len(program)):
+        op, to, a, b = program[i, 0], program[i, 1], program[i, 2], program[i, 3]
+        if op == casadi.OP_MUL:
+            for k in samples:
+                work[to, k] = work[a, k] * work[b, k]
+        elif op == casadi.OP_ADD:
+            for k in samples:
+                work[to, k] = work[a, k] + work[b, k]
+        elif op == casadi.OP_SUB:
+            for k in samples:
+                work[to, k] = work[a, k] - work[b, k]
+        elif op == casadi.OP_DIV:
+            for k in samples:
+                work[to, k] = work[a, k] / work[b, k]
+        elif op == casadi.OP_INPUT:
+            for k in samples:
+                work[to, k] = inputs[a, k]
+        elif op == casadi.OP_OUTPUT:
+            for k in samples:
+                outputs[to, k] = work[a, k]
+        elif op == casadi.OP_CONST:
+            for k in samples:
+                work[to, k] = constants[a]
+        elif op == casadi.OP_SQ:
+            for k in samples:
+                work[to, k] = work[a, k] * work[a, k]
+        elif op == casadi.OP_TWICE:
+            for k in samples:
+                work[to, k] = work[a, k] + work[a, k]
+        elif op == casadi.OP_NEG:
+            for k in samples:
+                work[to, k] = -work[a, k]
+        elif op == casadi.OP_INV:
+            for k in samples:
+                work[to, k] = 1.0 / work[a, k]
+        elif op == casadi.OP_IF_ELSE_ZERO:
+            for k in samples:
+                work[to, k] = work[b, k] if work[a, k] != 0.0 else 0.0
+        elif op == casadi.OP_LT:
+            for k in samples:
+                work[to, k] = 1.0 if work[a, k] < work[b, k] else 0.0
+        elif op == casadi.OP_LE:
+            for k in samples:
+                work[to, k] = 1.0 if work[a, k] <= work[b, k] else 0.0
+        elif op == casadi.OP_FABS:
+            for k in samples:
+                work[to, k] = abs(work[a, k])
+        elif op == casadi.OP_SQRT:
+            for k in samples:
+                work[to, k] = np.sqrt(work[a, k])
+        elif op == casadi.OP_EXP:
+            for k in samples:
+                work[to, k] = np.exp(work[a, k])
+        elif op == casadi.OP_LOG:
+            for k in samples:
+                work[to, k] = np.log(work[a, k])
+        elif op == casadi.OP_SIN:
+            for k in samples:
+                work[to, k] = np.sin(work[a, k])
+        elif op == casadi.OP_COS:
+            for k in samples:
+                work[to, k] = np.cos(work[a, k])
+        elif op == casadi.OP_TAN:
+            for k in samples:
+                work[to, k] = np.tan(work[a, k])
+        elif op == casadi.OP_ASIN:
+            for k in samples:
+                work[to, k] = np.arcsin(work[a, k])
+        elif op == casadi.OP_ACOS:
+            for k in samples:
+                work[to, k] = np.arccos(work[a, k])
+        elif op == casadi.OP_ATAN:
+            for k in samples:
+                work[to, k] = np.arctan(work[a, k])
+        elif op == casadi.OP_SINH:
+            for k in samples:
+                work[to, k] = np.sinh(work[a, k])
+        elif op == casadi.OP_COSH:
+            for k in samples:
+                work[to, k] = np.cosh(work[a, k])
+        elif op == casadi.OP_TANH:
+            for k in samples:
+                work[to, k] = np.tanh(work[a, k])
+        elif op == casadi.OP_ASINH:
+            for k in samples:
+                work[to, k] = np.arcsinh(work[a, k])
+        elif op == casadi.OP_ACOSH:
+            for k in samples:
+                work[to, k] = np.arccosh(work[a, k])
+        elif op == casadi.OP_ATANH:
+            for k in samples:
+                work[to, k] = np.arctanh(work[a, k])
+        elif op == casadi.OP_LOG1P:
+            for k in samples:
+                work[to, k] = np.log1p(work[a, k])
+        elif op == casadi.OP_EXPM1:
+            for k in samples:
+                work[to, k] = np.expm1(work[a, k])
+        elif op == casadi.OP_ERF:
+            for k in samples:
+                work[to, k] = math.erf(work[a, k])
+        elif op == casadi.OP_FLOOR:
+            for k in samples:
+                work[to, k] = np.floor(work[a, k])
+        elif op == casadi.OP_CEIL:
+            for k in samples:
+                work[to, k] = np.ceil(work[a, k])
+        elif op == casadi.OP_SIGN:
+            for k in samples:
+                x = work[a, k]
+                work[to, k] = 1.0 if x > 0.0 else (-1.0 if x < 0.0 else x)
+        elif op == casadi.OP_NOT:
+            for k in samples:
+                work[to, k] = 1.0 if work[a, k] == 0.0 else 0.0
+        elif op == casadi.OP_ASSIGN:
+            for k in samples:
+                work[to, k] = work[a, k]
+        elif op == casadi.OP_EQ:
+            for k in samples:
+                work[to, k] = 1.0 if work[a, k] == work[b, k] else 0.0
+        elif op == casadi.OP_NE:
+            for k in samples:
+                work[to, k] = 1.0 if work[a, k] != work[b, k] else 0.0
+        elif op == casadi.OP_AND:
+            for k in samples:
+                x, y = work[a, k], work[b, k]
+                work[to, k] = 1.0 if x != 0.0 and y != 0.0 else 0.0
+        elif op == casadi.OP_OR:
+            for k in samples:
+                x, y = work[a, k], work[b, k]
+                work[to, k] = 1.0 if x != 0.0 or y != 0.0 else 0.0
+        elif op == casadi.OP_FMIN:
+            for k in samples:
+                x, y = work[a, k], work[b, k]
+                work[to, k] = x if x < y or y != y else y
+        elif op == casadi.OP_FMAX:
+            for k in samples:
+                x, y = work[a, k], work[b, k]
+                work[to, k] = x if x > y or y != y else y
+        elif op in (casadi.OP_POW, casadi.OP_CONSTPOW):
+            for k in samples:
+                work[to, k] = work[a, k] ** work[b, k]
+        elif op == casadi.OP_FMOD:
+            for k in samples:
+                work[to, k] = np.fmod(work[a, k], work[b, k])
+        elif op == casadi.OP_ATAN2:
+            for k in samples:
+                work[to, k] = math.atan2(work[a, k], work[b, k])
+        elif op == casadi.OP_HYPOT:
+            for k in samples:
+                work[to, k] = math.hypot(work[a, k], work[b, k])
+        elif op == casadi.OP_COPYSIGN:
+            for k in samples:
+                work[to, k] = math.copysign(work[a, k], work[b, k])
