@@ -41,7 +41,7 @@ def make_track(loop: Loop, record: Record, begin: float = 0.0) -> Track:
     if abs(loop.dt - record.dt) > 1e-9 * loop.dt:
         raise CtrlidError(f"the loop is sampled at {loop.dt:g} s, the record at {record.dt:g} s; "
                           "give both the same period")  # fmt: skip
-    valid = np.asarray(record.valid)
+    valid = np.array(record.valid)  # writable as any other: the compiled loop is compiled once
     if np.count_nonzero(valid) < FEWEST:
         raise CtrlidError(f"a prediction needs at least {FEWEST} valid samples; the record has "
                           f"{np.count_nonzero(valid)} of {len(record)}")  # fmt: skip

@@ -128,7 +128,7 @@ def test_errors_scatter_as_their_standard_errors_say(name):
     """Both sums are of normal deviates, if intervals are to cover as they promise."""
     build, swing, hold, sensor = LOOPS[name]
     loop = build()
-    runs = 10 if loop.analog else 20
+    runs = 6 if loop.analog else 12
     z = []
     for seed in range(runs):
         record = experiment(loop, swing, hold, n=1000, seed=3000 + seed, sensor_noise=sensor)
