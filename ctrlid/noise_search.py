@@ -3,13 +3,12 @@
 import itertools
 import math
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
-import joblib
 import numpy as np
 from scipy import optimize
 
+from ._jobs import side_by_side
 from .errors import CtrlidError
 from .filtering import Noise
 from .likelihood import Fit, Known, Problem, measure
@@ -106,8 +105,7 @@ def _line(cost: Callable[[Array], float], x: float, low: float, high: float) -> 
 
 def _costs(cost: Callable[[Array], float], points: Iterable[Array]) -> Array:
     """Return the cost at each point, computed side by side: the filter leaves Python alone."""
-    with ThreadPoolExecutor(joblib.cpu_count()) as threads:
-        return np.array(list(threads.map(cost, points)))
+    return np.array(side_by_side(cost, points))
 
 
 def _newton(

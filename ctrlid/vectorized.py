@@ -7,13 +7,13 @@ faster and costs no compilation per expression.
 
 import itertools
 from collections.abc import Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import casadi
 import joblib
 import numpy as np
 
+from ._jobs import side_by_side
 from .errors import CtrlidError
 from .interpreter import BINARY, UNARY, run
 from .physics import Array
@@ -185,11 +185,10 @@ def through(
                 out[first : first + size] = values.T
                 at += count
 
-    share = range(0, n, block)
-    threads = min(joblib.cpu_count(), len(share))
-    if threads == 1:
-        work(share)
+    firsts = range(0, n, block)
+    if len(firsts) == 1:
+        work(firsts)
     else:
-        with ThreadPoolExecutor(threads) as pool:
-            list(pool.map(work, (share[k::threads] for k in range(threads))))
+        share = joblib.cpu_count()
+        side_by_side(work, (firsts[k::share] for k in range(share)))
     return outputs

@@ -24,7 +24,7 @@ from .attempts import attempt, attempt_best
 from .fitted import Model
 from .trial import Trial
 
-COLUMNS = 2_000_000  # numbers in a block of shapes at once
+COLUMNS = 500_000  # numbers in a block of shapes at once
 NEARLY = 0.7  # of the best promise: another wave that may be the right one
 PEAKS = 4  # such waves at most
 LENGTHS = 150  # wavelengths that are looked for in the travel
