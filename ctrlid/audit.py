@@ -151,7 +151,7 @@ def audit(record: Record, loop: Loop | None = None) -> Audit:
         still = dict.fromkeys(SIGNALS, (0.0, 0.0, 0.0, 0.0))
         return Audit((few,), MappingProxyType(dict.fromkeys(SIGNALS, 0.0)), (0, 0),
                      MappingProxyType(still))  # fmt: skip
-    look = _Look(record)
+    look = _Look(record, () if loop is None else loop.input_limits)
     findings = [
         *look.length(), *look.constant(), *look.limits(), *look.steps(), *look.gaps(),
         *look.outliers(), *look.wander(), *look.repetition(),
@@ -170,8 +170,8 @@ def audit(record: Record, loop: Loop | None = None) -> Audit:
 class _Look:
     """The looks at one record; what one finds, the next ones use."""
 
-    def __init__(self, record: Record) -> None:
-        self.record, self.valid = record, record.valid
+    def __init__(self, record: Record, limits: tuple[float, ...]) -> None:
+        self.record, self.valid, self.stated = record, record.valid, limits
         self.signals = {k: v for k in SIGNALS if (v := getattr(record, k)) is not None}
         self.whole = (0, record.n)
         self.quantum = dict.fromkeys(SIGNALS, 0.0) | {
@@ -241,8 +241,11 @@ class _Look:
                 cure = ("the sensor, or a stop, hides what y does there. Mark these samples "
                         "with valid=, with some before and after.")  # fmt: skip
             else:
+                reached = [v for share, v in zip(shares, values, strict=True) if share]
+                known = all(np.isclose(v, self.stated, rtol=1e-3).any() for v in reached)
+                tell = "its limits are known" if known else "tell the loop with input_limits="
                 cure = ("a limiter at work. Fits from u to y stand if the logged u is the "
-                        "limited one; tell the loop with input_limits=.")  # fmt: skip
+                        f"limited one; {tell}.")  # fmt: skip
             where = np.flatnonzero(mask)
             out.append(AuditFinding("saturation", key, f"{key} sits exactly at {ends}: {cure}",
                                     float(np.mean(mask[self.valid])),

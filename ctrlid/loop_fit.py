@@ -324,7 +324,12 @@ def choose_noise(fit: Fit, always: bool = False) -> Fit:
     """Add a coloured force if the Bayesian information criterion wants it."""
     if fit.problem.known is not None:
         return fit
-    richer = with_coloured_force(fit)
+    try:
+        richer = with_coloured_force(fit)
+    except CtrlidError:
+        if always:
+            raise
+        return fit
     # Two parameters more: worth trying out in full only if it gains at all.
     if not always and richer.value < fit.value + 0.5 * math.log(fit.size):
         return fit

@@ -263,6 +263,8 @@ def test_u_ahead_of_the_limiter_and_behind_it(servo):
     assert found.harmful == ()
     assert found.saturated["u"][2:] == (-2.0, 2.0)
     assert min(found.saturated["u"][:2]) > 0.005
+    assert "limits are known" in found["saturation"][0].text
+    assert "tell the loop" in cid.audit(record, loop)["saturation"][0].text
     wish = replace(record, u=cid.replay_controller(loop, record))
     said = cid.audit(wish, limited)["controller"]
     assert "ahead of the limiter" in said[0].text

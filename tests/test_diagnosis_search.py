@@ -14,7 +14,7 @@ import ctrlid as cid
 from ctrlid import effects as E
 from ctrlid.diagnosis.attempts import attempt, attempt_at, refit
 from ctrlid.diagnosis.closing import wider
-from ctrlid.diagnosis.decide import doubt_of_all, rivals
+from ctrlid.diagnosis.decide import GATE, doubt_of_all, rivals
 from ctrlid.diagnosis.experiment import separating_experiment
 from ctrlid.diagnosis.fitted import Model, base_model, spared, whole
 from ctrlid.diagnosis.omnibus import Omnibus, _shape, omnibus
@@ -24,10 +24,12 @@ from ctrlid.diagnosis.rounds import Step, one_round, plainer
 from ctrlid.diagnosis.scan import scanned
 from ctrlid.diagnosis.search import _foreseen, _stands_in, _there
 from ctrlid.diagnosis.sentences import conclusion
-from ctrlid.diagnosis.settling import _close, fused
+from ctrlid.diagnosis.settling import _close, cut, fused
 from ctrlid.diagnosis.trial import contains
 from ctrlid.filtering import first_guess
+from ctrlid.loop_fit import choose_noise, make_problem, start_values
 from ctrlid.machine import machine_for
+from ctrlid.maximum import begin
 from ctrlid.tracks import make_track
 
 
@@ -522,3 +524,39 @@ def test_a_loop_that_hunts_keeps_its_names():
     assert not wider(gap(4.4), sensor)
     assert wider(gap(4.4), force)
     assert wider(gap(6.1), sensor)
+
+
+def test_an_effect_without_which_nothing_follows_stays():
+    # The saturating gain lets the ball fall: a filter without it cannot follow, however noisy.
+    plant = cid.plants.maglev(m=0.037, K=3.8264e-5)
+    op = cid.operating_point(plant, output=0.0154)
+    C = cid.design_lead(cid.linearize(plant, op), crossover=55, phase_margin=50)
+    loop = cid.Loop(plant, C.sample(3e-3, "tustin"), dt=3e-3, at=op, input_limits=(0, 3.76),
+                    free=("K",))  # fmt: skip
+    real = loop.with_effect(E.QuadraticDrag(c2=7725.0))
+    real = real.with_effect(E.InputSaturatingGain(saturation=0.036))
+    r = cid.random_binary(2000, amplitude=1.7e-4, hold=40, around=op.output, seed=5)
+    record = cid.simulate(real, r, sensor_noise=1e-5, force_noise=0.01, seed=2)
+    names = ("K", "QuadraticDrag.c2", "InputSaturatingGain.saturation")
+    model = base_model(real, [record], names)
+    smaller, back = cut(model, 1)
+    assert smaller.fit.value == -np.inf
+    assert np.isfinite(back.merit)
+    assert back.merit > 10 * GATE
+    assert back.fitted.saturation == pytest.approx(0.036, rel=1e-2)
+    fit = whole(smaller).fit
+    assert choose_noise(fit) is fit
+
+
+def test_values_of_two_effects_of_a_class_stay_with_their_own():
+    loop = levitation()
+    both = loop.with_effect(E.ViscousFriction(c=1.0)).with_effect(E.ViscousFriction(c=2.0))
+    r = cid.random_binary(1500, amplitude=1e-4, hold=40, around=0.012, seed=3)
+    record = cid.simulate(both, r, sensor_noise=2e-6, seed=4)
+    names = ("K", *(f"{label}.c" for label in both.labelled))
+    problem = make_problem(both, names, [record], ())
+    fit = begin(problem, start_values(both, names), None)
+    model = Model(both, fit)
+    smaller, back = cut(model, 0)
+    assert len(smaller.loop.effects) == 1
+    assert back.model.fit.value > fit.value - 1.0

@@ -4,9 +4,11 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from ..effects import AbstractEffect
 from ..errors import CtrlidError
-from ..likelihood import evaluate
+from ..likelihood import Fit, evaluate
 from ..maximum import climb, promised
 from .carrying import carried_over
 from .fitted import Model, light, simulable, spared
@@ -142,12 +144,27 @@ def refit(base: Model, trial: Trial, near: Model | None = None) -> Trial:
         fit = max(fits, key=lambda f: f.value)
     except CtrlidError as reason:
         return replace(trial, remark=str(reason))
+    return outcome(base, trial, fit)
+
+
+def outcome(base: Model, trial: Trial, fit: Fit) -> Trial:
+    """Return a trial with what a fit of it gained, what that cost, and what speaks against it."""
     model = Model(trial.model.loop, fit)
     own = own_parameters(trial, fit)
     cost = 0.5 * own * math.log(fit.size) + trial.scan
-    done = replace(trial, model=model, gain=fit.value - base.fit.value, cost=cost)
+    before = base.fit.value if math.isfinite(base.fit.value) else _of_no_model(fit)
+    done = replace(trial, model=model, gain=fit.value - before, cost=cost)
     try:
         done = replace(done, remark=objection(done))
     except CtrlidError as reason:  # values that do not go together, such as crossed limits
         return replace(trial, remark=str(reason))
     return done if done.merit > 0 else replace(done, model=Model(model.loop, light(fit)))
+
+
+def _of_no_model(fit: Fit) -> float:
+    """Return the likelihood of outputs that scatter about their mean, whatever drives them."""
+    value = 0.0
+    for track, keep in zip(fit.problem.tracks, fit.problem.counts, strict=True):
+        y = track.table[3][keep]
+        value -= 0.5 * len(y) * (math.log(2 * math.pi * float(np.var(y)) + 1e-300) + 1)
+    return value

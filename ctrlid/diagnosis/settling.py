@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 
 from ..loop import Loop
 from ..loop_fit import choose_noise
-from ..maximum import climb, polish, retuned
-from .attempts import attempt_at, refit
+from ..maximum import begin, climb, polish, retuned
+from .attempts import attempt_at, outcome, refit
 from .carrying import carried_over
 from .decide import CLOSE, GATE, rivals
-from .fitted import Model, simulable, spared
+from .fitted import Model, light, simulable, spared
 from .omnibus import omnibus
 from .rounds import NEXT, Step, Work, plainer
 from .trial import Trial, contains
@@ -99,7 +99,10 @@ def _without(model: Model, positions: Sequence[int]) -> Model:
     loop, names = model.fitted, model.names
     for position in sorted(positions, reverse=True):
         loop, names = taken_out(loop, position, names)
-    return Model(loop, carried_over(model, loop, names))
+    fit = carried_over(model, loop, names)
+    if not math.isfinite(fit.value):  # with noise as small as that, it cannot follow the record
+        fit = begin(fit.problem, fit.theta, None)
+    return Model(loop, fit)
 
 
 def _moved(model: Model, position: int) -> Model:
@@ -154,8 +157,22 @@ def cut(model: Model, position: int) -> tuple[Model, Trial]:
     short = back.remark or back.model.fit.value < model.fit.value - CLOSE
     if short and simulable(model):
         # Without it all else may have gone too far astray to come back; the way is known.
-        back = max(back, refit(smaller, start, model), key=lambda t: t.merit)
+        back = max(back, _put_back(smaller, model, position), key=lambda t: t.merit)
     return smaller, back
+
+
+def _put_back(smaller: Model, model: Model, position: int) -> Trial:
+    """Return the effect as a trial on top of the model without it, all values as they were."""
+    effect, before = model.fitted.effects[position], list(model.loop.labelled)[position]
+    own = [n for n in model.names if n.startswith(f"{before}.")]
+    known = dict(zip(model.names, model.fit.theta.tolist(), strict=True))
+    rest = [known[n] for n in model.names if n not in own]
+    loop = smaller.loop.with_parameters(dict(zip(smaller.names, rest, strict=True)))
+    loop = loop.with_effect(effect)
+    label = next(k for k in loop.labelled if k not in smaller.loop.labelled)
+    names = (*smaller.names, *_relabelled(own, {before: label}))
+    fit = spared(climb(carried_over(model, loop, names), rounds=4))
+    return outcome(smaller, Trial(effect, label, Model(loop, light(fit)), -math.inf), fit)
 
 
 def renoised(model: Model) -> Model:
