@@ -238,7 +238,7 @@ def _scheme(e: Equations, loop: Loop) -> Scheme:
     """Return how a period is integrated: as cheaply as the plant and its lags allow."""
     if e.dt:
         return (4, 1, False)
-    hidden = [lag.state for lag in e.lags]
+    hidden = [lag.state for lags in known_lags(e) for lag in lags]
     plain = [k for k in range(len(e.states)) if k not in hidden]
     time = _shortest(e, casadi.SX(casadi.DM(e.values)))
     driven, cut = np.isfinite(time), bool(time < loop.dt / 8)

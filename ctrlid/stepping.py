@@ -141,15 +141,19 @@ def whole_delay(e: Equations, dt: float) -> int:
 
 
 def known_lags(e: Equations) -> tuple[list[Lag], list[Lag]]:
-    """Return the lags that follow the input itself, and those that only the output sees."""
+    """Return the lags that follow the input or a curve of it, and those that only outputs see."""
     driven, seen = [], []
     for lag in e.lags:
         others = casadi.vertcat(*(e.rhs[i] for i in range(len(e.states)) if i != lag.state))
-        if casadi.is_equal(lag.target, e.u, 2):
+        if not casadi.depends_on(lag.target, casadi.vertcat(e.t, e.x, *_spreads(e))):
             driven.append(lag)
         elif not casadi.depends_on(others, e.x[lag.state]) and not e.dt:
             seen.append(lag)
     return driven, seen
+
+
+def _spreads(e: Equations) -> list[Any]:
+    return [] if e.spread is None else [e.spread]
 
 
 def advance(
@@ -203,14 +207,15 @@ def advance(
     order, steps, cut = scheme
     short = [times[lag.state] for lag in driven[:1] if cut]
     for duration, level, slope in _split(pieces, short):
+        followed = [_straight(e, lag.target, duration, level, slope, p) for lag in driven]
 
-        def filled(tau: Any, z: Any, x: Any = x, level: Any = level, slope: Any = slope) -> Any:
+        def filled(tau: Any, z: Any, x: Any = x, followed: Any = followed) -> Any:
             z = casadi.SX(z)
-            for lag in driven:
+            for lag, (first, climb) in zip(driven, followed, strict=True):
                 time = times[lag.state]
-                steady = level - time * slope
+                steady = first - time * climb
                 decay = casadi.exp(-tau / time)
-                z[lag.state] = steady + slope * tau + (x[lag.state] - steady) * decay
+                z[lag.state] = steady + climb * tau + (x[lag.state] - steady) * decay
             return z
 
         def rate(
@@ -254,12 +259,23 @@ def _split(pieces: Sequence[Piece], times: Sequence[Any]) -> list[Piece]:
     return parts
 
 
+def _straight(
+    e: Equations, target: Any, duration: Any, level: Any, slope: Any, p: Any
+) -> tuple[Any, Any]:
+    """Return start and slope of a curve of the input over a piece of it, straight as well."""
+    if casadi.is_equal(target, e.u, 2):
+        return level, slope
+    curve = casadi.Function("curve", [e.u, e.p], [target])
+    first = curve(level, p)
+    if isinstance(slope, float) and slope == 0.0:
+        return first, 0.0
+    return first, (curve(level + slope * duration, p) - first) / duration
+
+
 def _followed(e: Equations, lag: Lag, t: Any, x: Any, u: Any, p: Any, spread: Any) -> Any:
     """Return what a lag follows, and its rate, at one point."""
     velocity = casadi.jtimes(lag.target, e.x, e.rhs) + casadi.jacobian(lag.target, e.t)
-    symbols = [e.t, e.x, e.u, e.p]
-    if e.spread is not None:
-        symbols.append(e.spread)
+    symbols = [e.t, e.x, e.u, e.p, *_spreads(e)]
     function = casadi.Function("followed", symbols, [lag.target, velocity])
     return function(*[t, x, u, p, spread][: len(symbols)])
 

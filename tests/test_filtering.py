@@ -5,6 +5,7 @@ Groups: one pass; sensitivities; the extended filter; maps over one period; long
 
 import math
 
+import casadi
 import control as ct
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from ctrlid import effects as E
 from ctrlid.filtering import Noise, first_guess, settle
 from ctrlid.kalman import filter_pass
 from ctrlid.machine import Machine, Trajectory
+from ctrlid.stepping import advance
 from ctrlid.tracks import make_track, state_at_rest
 
 # --- one pass
@@ -322,6 +324,45 @@ def test_an_actuator_lag_of_any_length(ratio, free):
         assert (np.abs(found - exact)[:2] < 0.02 * np.abs(exact - quick)[:2]).all()
         if ratio >= 0.3:
             assert (np.abs(found - exact)[:2] < 5e-4 * np.abs(exact - quick)[:2]).all()
+
+
+@pytest.mark.parametrize("ratio", [0.01, 0.05, 0.3, 1.0, 5.0])
+@pytest.mark.parametrize("hold", ["zoh", "foh"])
+@pytest.mark.parametrize(
+    ("effect", "curve"),
+    [
+        (E.InputSaturation(lower=2.2, upper=3.1), lambda u: np.clip(u, 2.2, 3.1)),
+        (E.InputOffset(offset=0.2), lambda u: u + 0.2),
+    ],
+    ids=["saturation", "offset"],
+)
+def test_an_actuator_lag_behind_a_curve_of_the_input(effect, curve, hold, ratio):
+    """A lag that follows what an effect makes of the input is as exact as one of the input."""
+    tau = ratio * DT
+    loop = levitated(effect, E.ActuatorLag(tau=tau), dt=DT)
+    e = loop.equations(keep=True)
+    scheme = Machine(loop, (), hold, False).scheme
+    rng = np.random.default_rng(8)
+    for _ in range(3):
+        x = np.array([rng.uniform(0.008, 0.016), 0.02 * rng.standard_normal(), 2.8])
+        u = rng.uniform(2.3, 4.0)
+        slope = rng.uniform(0.2, 0.7) / DT if hold == "foh" else 0.0
+        if slope and curve(u) != curve(u + slope * DT):
+            slope = 0.02 / DT  # straight all the way
+        piece = (DT, casadi.SX(u), slope)
+        moved, _ = advance(e, 0.0, casadi.SX(x), [piece], casadi.DM(e.values), scheme=scheme)
+        found = np.array(casadi.evalf(moved)).ravel()
+
+        def rate(t, z, u=u, slope=slope):
+            pull = 3.34e-6 * z[2] ** 2 / (0.0213 * z[0] ** 2)
+            return [z[1], 9.81 - pull, (curve(u + slope * t) - z[2]) / tau]
+
+        exact, quick = (
+            integrate.solve_ivp(rate, (0, DT), z, method="LSODA", rtol=1e-12, atol=1e-15).y[:, -1]
+            for z in (x, [*x[:2], curve(u)])
+        )
+        assert abs(found[2] - exact[2]) < 1e-8
+        assert (np.abs(found - exact)[:2] < 0.02 * np.abs(exact - quick)[:2]).all()
 
 
 @pytest.mark.parametrize("ratio", [0.01, 0.1, 0.5, 1.0, 10.0])
