@@ -10,7 +10,7 @@ from ..loop_fit import choose_noise
 from ..maximum import begin, climb, polish, retuned
 from .attempts import attempt_at, outcome, refit
 from .carrying import carried_over
-from .decide import CLOSE, GATE, rivals
+from .decide import GATE, rivals
 from .fitted import Model, light, simulable, spared
 from .omnibus import omnibus
 from .rounds import NEXT, Step, Work, plainer
@@ -149,16 +149,12 @@ def taken_out(
 
 def cut(model: Model, position: int) -> tuple[Model, Trial]:
     """Return the model without one effect, refitted, and the effect as a trial on top of it."""
-    effect = model.fitted.effects[position]
     bare = _without(model, [position])
     smaller = replace(bare, fit=spared(climb(bare.fit, rounds=10)))
-    start = attempt_at(smaller, effect)
-    back = refit(smaller, start)
-    short = back.remark or back.model.fit.value < model.fit.value - CLOSE
-    if short and simulable(model):
+    if simulable(model):
         # Without it all else may have gone too far astray to come back; the way is known.
-        back = max(back, _put_back(smaller, model, position), key=lambda t: t.merit)
-    return smaller, back
+        return smaller, _put_back(smaller, model, position)
+    return smaller, refit(smaller, attempt_at(smaller, model.fitted.effects[position]))
 
 
 def _put_back(smaller: Model, model: Model, position: int) -> Trial:
