@@ -17,6 +17,7 @@ from ctrlid.diagnosis.closing import wider
 from ctrlid.diagnosis.decide import GATE, doubt_of_all, rivals
 from ctrlid.diagnosis.experiment import separating_experiment
 from ctrlid.diagnosis.fitted import Model, base_model, spared, whole
+from ctrlid.diagnosis.instants import timed
 from ctrlid.diagnosis.omnibus import Omnibus, _shape, omnibus
 from ctrlid.diagnosis.replica import replica
 from ctrlid.diagnosis.result import Disturbance, Finding, Gap
@@ -29,7 +30,7 @@ from ctrlid.diagnosis.trial import contains
 from ctrlid.filtering import first_guess
 from ctrlid.loop_fit import choose_noise, make_problem, start_values
 from ctrlid.machine import machine_for
-from ctrlid.maximum import begin
+from ctrlid.maximum import begin, climb
 from ctrlid.tracks import make_track
 
 
@@ -560,3 +561,20 @@ def test_values_of_two_effects_of_a_class_stay_with_their_own():
     smaller, back = cut(model, 0)
     assert len(smaller.loop.effects) == 1
     assert back.model.fit.value > fit.value - 1.0
+
+
+@pytest.mark.parametrize("late", [-45, 37, 150])
+def test_an_instant_that_is_dozens_of_samples_off_is_found(late):
+    loop = drive()
+    real = loop.with_effect(E.ParameterStep("k", time=14.2, size=-0.15))
+    r = cid.random_binary(3000, amplitude=0.3, hold=60, around=0.0, seed=21)
+    record = cid.simulate(real, r, sensor_noise=1e-4, seed=22)
+    begun = loop.with_effect(E.ParameterStep("k", time=14.2 + late * 0.01, size=-0.1))
+    names = ("c", "k", "ParameterStep.time", "ParameterStep.size")
+    problem = make_problem(begun, names, [record], ())
+    climbed = climb(begin(problem, start_values(begun, names), None))
+    fit = timed(climbed)
+    assert fit.value > climbed.value + 10.0
+    assert fit.theta[2] == pytest.approx(14.2, abs=0.01)
+    assert fit.theta[3] == pytest.approx(-0.15, abs=0.01)
+    assert timed(fit) is fit

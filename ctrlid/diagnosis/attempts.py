@@ -12,6 +12,7 @@ from ..likelihood import Fit, evaluate
 from ..maximum import climb, promised
 from .carrying import carried_over
 from .fitted import Model, light, simulable, spared
+from .instants import timed
 from .trial import Trial
 from .weighing import doubled_by, objection, own_parameters
 
@@ -140,7 +141,7 @@ def refit(base: Model, trial: Trial, near: Model | None = None) -> Trial:
             # A random force that was fitted while the effect was missing may never let it in.
             # (Where no simulation can check it, the likelihood also leads to absurd values.)
             starts.append(replace(start, noise=replace(start.noise, memory=0.0, drift=0.0)))
-        fits = [spared(climb(s, rounds=SCREEN_ROUNDS, exact=False)) for s in starts]
+        fits = [spared(timed(climb(s, rounds=SCREEN_ROUNDS, exact=False))) for s in starts]
         fit = max(fits, key=lambda f: f.value)
     except CtrlidError as reason:
         return replace(trial, remark=str(reason))
