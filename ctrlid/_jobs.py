@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import functools
+import os
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from itertools import islice
@@ -84,5 +87,36 @@ def side_by_side(function: Callable[[Item], Result], items: Iterable[Item]) -> l
     >>> side_by_side(abs, (-1, 2, -3))
     [1, 2, 3]
     """
-    with ThreadPoolExecutor(joblib.cpu_count()) as threads:
-        return list(threads.map(function, items))
+    given = list(items)
+    waiting, results = deque(range(len(given))), dict[int, Result]()
+
+    def take() -> None:
+        while waiting:
+            try:
+                k = waiting.popleft()
+            except IndexError:  # another thread was faster
+                return
+            results[k] = function(given[k])
+
+    helpers = [_threads().submit(take) for _ in range(min(processors(), len(given)) - 1)]
+    take()  # at once, while the others wake up
+    for helper in helpers:
+        if not helper.cancel():  # one that never woke up is not needed
+            helper.result()
+    return [results[k] for k in range(len(given))]
+
+
+@functools.cache
+def processors() -> int:
+    """Return the number of processors that this process may use."""
+    return int(joblib.cpu_count())
+
+
+@functools.cache
+def _threads() -> ThreadPoolExecutor:
+    """Return the threads, started once: that takes as long as a short job."""
+    return ThreadPoolExecutor(processors())
+
+
+if hasattr(os, "register_at_fork"):  # a forked process has none of its parent's threads
+    os.register_at_fork(after_in_child=_threads.cache_clear)

@@ -71,7 +71,8 @@ def run(
         lin.c, np.ascontiguousarray(lin.hp[:, :p]), lin.trajectory.predicted,
         lin.trajectory.filtered, track.table[3], track.valid, track.afresh, track.doubt,
         m.padded(track.start), m.padded(track.spread), 1.0,
-        np.asarray(noise.force, dtype=float), noise.memory, noise.drift,
+        np.asarray(noise.force, dtype=float), noise.memory, noise.drift, (0,) * m.size,
+        (0,) * (m.size + bool(noise.drift > 0)),
     )  # fmt: skip
     error, variance, before, after, wide, slopes, disturbance = out
     counts = track.valid & ~track.afresh

@@ -204,3 +204,82 @@ def run(
         elif op == casadi.OP_COPYSIGN:
             for k in samples:
                 work[to, k] = math.copysign(work[a, k], work[b, k])
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def sweep(
+    program: Any,
+    starts: Any,
+    constants: Any,
+    parts: int,
+    carried: int,
+    still: Any,
+    places: Any,
+    moving: Any,
+    registers: int,
+    tables: Any,
+    out: Any,
+    everything: int,
+    first: int,
+    block: int,
+) -> None:  # pragma: no cover - compiled
+    """Carry out programs one after another over a stretch of samples, a block at a time.
+
+    Parameters
+    ----------
+    program : ndarray of int, shape (instructions, 4)
+        The programs as `run` takes them, one below the other.
+    starts : ndarray of int, shape (programs + 1,)
+        Where each begins, and the end.
+    constants : ndarray, shape (constants,)
+        Numbers of all programs.
+    parts : int
+        How often in turn each program is carried out.
+    carried : int
+        Rows of the results that are the first rows of the next program's inputs; its last row is
+        then the number of the part. Zero: there is one program, and no such row.
+    still : ndarray, shape (rows,)
+        Values of the inputs, where they are the same for all samples.
+    places : ndarray of int, shape (moving,)
+        Rows of the inputs that are not.
+    moving : ndarray, shape (moving, samples)
+        Their values.
+    registers : int
+        Room that the programs need.
+    tables : ndarray of int, shape (outputs, 3)
+        First row among the results, rows and columns of each output of the last program.
+    out : ndarray, shape (everything * rows of the results,)
+        Where the outputs go, each with shape (everything, rows, columns), one behind the other.
+    everything : int
+        Samples in all.
+    first : int
+        The sample at which the stretch begins.
+    block : int
+        Samples of a block.
+    """
+    size = moving.shape[1]
+    count = tables[-1, 0] + tables[-1, 1] * tables[-1, 2]
+    inputs, work = np.empty((len(still), block)), np.empty((registers, block))
+    results = np.zeros((count, block))
+    for row in range(len(still)):
+        inputs[row] = still[row]
+    for begin in range(0, size, block):
+        samples = min(block, size - begin)
+        for row in range(carried):
+            inputs[row] = still[row]
+        for k in range(len(places)):
+            inputs[places[k], :samples] = moving[k, begin : begin + samples]
+        for s in range(len(starts) - 1):
+            for part in range(parts):
+                if carried:
+                    inputs[-1] = part
+                run(program[starts[s] : starts[s + 1]], constants, inputs, work, results, samples)
+                inputs[:carried] = results[:carried]
+        for j in range(len(tables)):
+            at, rows, columns = tables[j]
+            base = everything * at + (first + begin) * rows * columns
+            for column in range(columns):
+                for row in range(rows):
+                    place = base + row * columns + column
+                    for k in range(samples):
+                        out[place + k * rows * columns] = results[at + column * rows + row, k]

@@ -1,8 +1,8 @@
 """The Kalman filter along a trajectory, with held-gain sensitivities: the one compiled loop.
 
 Everything that depends on the plant comes in as arrays (its map over one period and the derivatives
-of that map, evaluated along a nominal trajectory), so one compiled function serves every plant
-and every effect.
+of that map, evaluated along a nominal trajectory), so one function, compiled for each number
+of states, serves every plant and every effect.
 """
 
 from typing import Any
@@ -17,7 +17,7 @@ LARGE = 1e150
 def filter_pass(
     step: Any, a: Any, b: Any, du: Any, dp: Any, height: Any, c: Any, hp: Any, predicted: Any,
     filtered: Any, y: Any, valid: Any, afresh: Any, doubt: Any, start: Any, spread: Any,
-    sensor: Any, force: Any, memory: Any, drift: Any,
+    sensor: Any, force: Any, memory: Any, drift: Any, states: Any, widths: Any,
 ) -> Any:  # fmt: skip  # pragma: no cover - compiled
     r"""Run the filter over a record, linearized along a nominal trajectory.
 
@@ -50,6 +50,10 @@ def filter_pass(
         Variances of the white forces.
     memory, drift : float
         Coefficient rho of the coloured force and variance of its steps; no such force if zero.
+    states, widths : tuple of int
+        As many elements, whatever they are, as the plant has states, and as the filter has: one
+        more if there is a coloured force. The length of a tuple is known when this is compiled,
+        once for each, which makes it twice as fast as sizes that are found out later.
 
     Returns
     -------
@@ -58,18 +62,12 @@ def filter_pass(
         deviations of the filtered states (N, n), sensitivities of the prediction (N, p) and the
         coloured force (N,).
     """
-    size, n = step.shape
+    size = step.shape[0]
+    n, w = len(states), len(widths)
     p = dp.shape[2]
     m = b.shape[2]
     coloured = drift > 0.0
-    w = n + 1 if coloured else n
-    x = np.zeros(w)
-    x[:n] = start
-    cov = np.zeros((w, w))
-    cov[:n, :n] = spread
-    if coloured:
-        cov[n, n] = drift / (1.0 - memory * memory)
-    sens = np.zeros((w, p))
+    x, cov, sens = np.zeros(w), np.zeros((w, w)), np.zeros((w, p))
     error, variance = np.zeros(size), np.ones(size)
     before, after = np.empty((size, n)), np.empty((size, n))
     wide, slopes, disturbance = np.zeros((size, n)), np.zeros((size, p)), np.zeros(size)
@@ -78,14 +76,15 @@ def filter_pass(
     full, late = np.zeros((w, w)), np.zeros((w, p))
     ph, along = np.zeros(w), np.zeros(w)
     for k in range(size):
-        if afresh[k]:
-            x[:] = 0.0
-            x[:n] = start
-            cov[:] = 0.0
-            cov[:n, :n] = spread
+        if afresh[k] or k == 0:
+            for i in range(w):
+                x[i] = start[i] if i < n else 0.0
+                for j in range(w):
+                    cov[i, j] = spread[i, j] if i < n and j < n else 0.0
+                for q in range(p):
+                    sens[i, q] = 0.0
             if coloured:
                 cov[n, n] = drift / (1.0 - memory * memory)
-            sens[:] = 0.0
         for i in range(n):
             before[k, i] = x[i]
         expected = height[k]
@@ -183,8 +182,9 @@ def filter_pass(
                     for l in range(w):
                         total += full[i, l] * sens[l, q]
                     late[i, q] = total
-            sens[:] = late
+            sens, late = late, sens
         if not np.isfinite(x[0]) or abs(x[0]) > LARGE:
-            error[k:] = np.nan
+            for rest in range(k, size):
+                error[rest] = np.nan
             break
     return error, variance, before, after, wide, slopes, disturbance

@@ -144,7 +144,7 @@ class Machine:
         height, c, hp = self.maps.sensor(at.predicted.T, w, p, spread)
         return Linearized(
             _full(step, len(u))[:, :, 0], _full(a, len(u)), _full(b, len(u)),
-            _full(dw, len(u)).sum(axis=2), _full(dp, len(u)), _full(height, len(u))[:, 0, 0],
+            _full(dw.sum(axis=2), len(u)), _full(dp, len(u)), _full(height, len(u))[:, 0, 0],
             _full(c, len(u))[:, 0, :], _full(hp, len(u))[:, 0, :], at,
         )  # fmt: skip
 
@@ -220,8 +220,9 @@ class Machine:
         return np.vstack([t, *moved, r, y])
 
     def _shifted(self, values: Array, k: int) -> Array:
-        rows = np.clip(np.arange(len(values)) - self.late + k, 0, len(values) - 1)
-        return np.asarray(values[rows])
+        late, ahead = max(self.late - k, 0), max(k - self.late, 0)
+        first, last = np.repeat(values[:1], late, axis=0), np.repeat(values[-1:], ahead, axis=0)
+        return np.concatenate([first, values[ahead:], last])[: len(values)]
 
     def padded(self, values: Array) -> Array:
         """Add the states of a known analog controller, at rest, to a start."""

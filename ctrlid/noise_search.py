@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy import optimize
 
 from ._jobs import side_by_side
 from .errors import CtrlidError
@@ -19,6 +18,7 @@ LEAST = -24.0  # logarithm of the least force noise: below, only the start of th
 MOST = 14.0  # and of the largest: above, the sensor is exact
 SLOWEST = 0.05  # of the longest record: the time constant of a coloured force
 LOG_STEP = 0.2  # of log variances, for derivatives
+BOWL = 0.05  # second derivative by a log variance above which a parabola tells how far it is
 
 
 def tune(
@@ -45,11 +45,7 @@ def tune(
         grid = np.linspace(low[0], high[0], 20)
         best = grid[int(np.argmin(_costs(cost, [np.full(m.channels, g) for g in grid])))]
         start[: m.channels] = best
-    if len(start) == 1:
-        best = _line(cost, start[0], low[0], high[0])
-    else:
-        best = _newton(cost, start, low, high, enough)
-    return measure(problem, theta, at(best), lins)
+    return measure(problem, theta, at(_newton(cost, start, low, high, enough)), lins)
 
 
 def unit_of(machine: Machine) -> float:
@@ -88,21 +84,6 @@ def _limits(m: Machine, coloured: bool, longest: int) -> tuple[Array, Array]:
     return np.array(low), np.array(high)
 
 
-def _line(cost: Callable[[Array], float], x: float, low: float, high: float) -> Array:
-    """Minimise along one logarithm, moving on while the minimum lies at the end of the bracket."""
-    reach = 2.5
-    while True:
-        ends = max(x - reach, low), min(x + reach, high)
-        found = optimize.minimize_scalar(
-            lambda v: cost(np.atleast_1d(np.asarray(v))), bounds=ends, method="bounded",
-            options={"xatol": 0.03, "maxiter": 20},
-        )  # fmt: skip
-        moved = abs(float(found.x) - x)
-        x = float(found.x)
-        if moved < 0.9 * reach or x - low < 0.1 or high - x < 0.1:
-            return np.array([x])
-
-
 def _costs(cost: Callable[[Array], float], points: Iterable[Array]) -> Array:
     """Return the cost at each point, computed side by side: the filter leaves Python alone."""
     return np.array(side_by_side(cost, points))
@@ -111,7 +92,12 @@ def _costs(cost: Callable[[Array], float], points: Iterable[Array]) -> Array:
 def _newton(
     cost: Callable[[Array], float], x: Array, low: Array, high: Array, enough: float
 ) -> Array:  # fmt: skip
-    """Minimise a smooth function of a few logarithms by damped Newton steps with differences."""
+    """Minimise a smooth function of a few logarithms by damped Newton steps with differences.
+
+    Where a step gained what the parabola g^2/2h foresaw but for e, a function with a third
+    derivative has e^2 / (g^2/2h) * 9/4 left to gain: on a line that tells the end. With more
+    directions the errors of several may cancel.
+    """
     n, h = len(x), LOG_STEP
     pairs = list(itertools.combinations(range(n), 2))
     unit = np.eye(n)
@@ -125,11 +111,16 @@ def _newton(
         for (i, j), value in zip(pairs, both, strict=True):
             hessian[i, j] = hessian[j, i] = (value - ups[i] - ups[j] + here) / h**2
         values, vectors = np.linalg.eigh(hessian)
+        bowl = n == 1 and values[0] > BOWL
         values = np.maximum(np.abs(values), 1e-3)
         while True:
             step = -vectors @ ((vectors.T @ slope) / (values + damping))
             step *= min(1.0, 2.5 / max(float(np.abs(step).max()), 1e-300))
             trial = np.clip(x + step, low, high)
+            moved = vectors.T @ (trial - x)
+            foreseen = -float((vectors.T @ slope + 0.5 * values * moved) @ moved)
+            if bowl and foreseen < 0.1 * enough:
+                return x
             there = cost(trial)
             if there <= here or damping > 1e6:
                 break
@@ -138,7 +129,9 @@ def _newton(
         if gain <= 0:
             break
         x, here, damping = trial, there, damping / 10
-        if gain < enough:
+        pull = vectors.T @ slope + values * moved  # that the parabola leaves after this step
+        left = 0.5 * float(pull @ (pull / values)) + 2.25 * (gain - foreseen) ** 2 / foreseen
+        if gain < enough or (bowl and left < 0.5 * enough):
             break
     return x
 

@@ -5,20 +5,19 @@ block of samples, with a loop over the block at each instruction, gives the same
 faster and costs no compilation per expression.
 """
 
-import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import casadi
-import joblib
 import numpy as np
 
-from ._jobs import side_by_side
+from ._jobs import processors, side_by_side
 from .errors import CtrlidError
-from .interpreter import BINARY, UNARY, run
+from .interpreter import BINARY, UNARY, sweep
 from .physics import Array
 
-BLOCK = 512  # samples at once: long enough that a call costs little, short enough for the cache
+BLOCK = 512  # samples at once: long enough that a loop costs little, short enough for the cache
+BLOCKS = 64  # at most that a thread takes at a time: their inputs are copied
 
 
 class Vectorized:
@@ -36,12 +35,12 @@ class Vectorized:
     """
 
     def __init__(self, function: Any) -> None:
-        # Rows of each argument, rows and columns of each output.
+        # Rows of each argument; first row, rows and columns of each output.
         self.sizes = [function.numel_in(k) for k in range(function.n_in())]
-        self.shapes = [(function.size1_out(k), function.size2_out(k))
-                        for k in range(function.n_out())]  # fmt: skip
-        self.rows_in = sum(self.sizes)
-        self.rows_out = sum(rows * columns for rows, columns in self.shapes)
+        shapes = [(function.size1_out(k), function.size2_out(k)) for k in range(function.n_out())]
+        ends = np.cumsum([0, *(rows * columns for rows, columns in shapes)])
+        self.tables = np.array([(at, *s) for at, s in zip(ends, shapes, strict=False)])
+        self.rows_out = int(ends[-1])
         steps, self.constants = _instructions(function)
         self.program, self.registers = _allocated(steps)
 
@@ -156,39 +155,40 @@ def through(
     tables = [t.reshape(rows, -1 if rows else 1)
               for t, rows in zip(numbers, stages[0].sizes, strict=alone)]  # fmt: skip
     n = max([1, *(t.shape[1] for t in tables)])
-    outputs = [np.zeros((n, *shape)) for shape in stages[-1].shapes]
     rows = [row for t in tables for row in t]
-    moving = [(k, row) for k, row in enumerate(rows) if len(row) > 1]
-    block = min(n, BLOCK)
-    still = np.zeros((stages[0].rows_in, block))
-    for k, row in enumerate(rows):
-        still[k] = row[0]
-    again = len([row for t in tables[: len(carried)] for row in t])
+    still = np.array([row[0] for row in rows] + ([] if alone else [0.0]))
+    moving = [k for k, row in enumerate(rows) if len(row) > 1]
+    again = sum(len(t) for t in tables[: len(carried)])
+    program, starts, constants = _joined(stages)
+    room, places = max(s.registers for s in stages), np.array(moving, dtype=np.int64)
+    last = stages[-1]
+    out = np.empty(n * last.rows_out)
+    blocks = -(-n // BLOCK)
+    stretch = BLOCK * min(-(-blocks // processors()), BLOCKS)
 
-    def work(firsts: Iterable[int]) -> None:
-        inputs, results = still.copy(), np.zeros((stages[-1].rows_out, block))
-        room = np.empty((max(s.registers for s in stages), block))
-        for first in firsts:
-            size = min(block, n - first)
-            inputs[:again] = still[:again]
-            for k, row in moving:
-                inputs[k, :size] = row[first : first + size]
-            for stage, part in itertools.product(stages, range(parts)):
-                if not alone:
-                    inputs[-1] = part
-                run(stage.program, stage.constants, inputs, room, results, size)
-                inputs[:again] = results[:again]
-            at = 0
-            for out in outputs:
-                count = out.shape[1] * out.shape[2]
-                values = results[at : at + count, :size].reshape(out.shape[2], out.shape[1], size)
-                out[first : first + size] = values.T
-                at += count
+    def work(first: int) -> None:
+        columns = [rows[k][first : first + stretch] for k in moving]
+        values = np.array(columns).reshape(len(moving), min(stretch, n - first))
+        sweep(program, starts, constants, parts, again, still, places, values, room, last.tables,
+              out, n, first, min(n, BLOCK))  # fmt: skip
 
-    firsts = range(0, n, block)
+    firsts = range(0, n, stretch)
     if len(firsts) == 1:
-        work(firsts)
+        work(0)
     else:
-        share = joblib.cpu_count()
-        side_by_side(work, (firsts[k::share] for k in range(share)))
-    return outputs
+        side_by_side(work, firsts)
+    return [
+        out[n * at : n * (at + r * c)].reshape(n, r, c) for at, r, c in last.tables.tolist()
+    ]  # fmt: skip
+
+
+def _joined(stages: Sequence[Vectorized]) -> tuple[Any, Any, Array]:
+    """Return the programs one below the other, where each begins, and all their numbers."""
+    programs, count = [], 0
+    for stage in stages:
+        program = stage.program.copy()
+        program[program[:, 0] == casadi.OP_CONST, 2] += count
+        programs.append(program)
+        count += len(stage.constants)
+    starts = np.cumsum([0, *map(len, programs)])
+    return np.concatenate(programs), starts, np.concatenate([s.constants for s in stages])

@@ -50,6 +50,7 @@ def run(s, valid=None, afresh=None, doubt=None, start=None, spread=None, sensor=
         *s.values(), valid, afresh, np.zeros(size) if doubt is None else doubt,
         np.zeros(n) if start is None else start, 2.0 * np.eye(n) if spread is None else spread,
         sensor, np.full(m, 0.2) if force is None else force, memory, drift,
+        (0,) * n, (0,) * (n + bool(drift)),
     )  # fmt: skip
 
 
@@ -554,7 +555,7 @@ def test_a_million_samples_of_an_unstable_plant_stay_positive():
         np.outer(pushes, b), every(a), every(b[:, None]), zero, np.zeros((n, 2, 1)), np.zeros(n),
         every(np.array([1.0, 0.0])), np.zeros((n, 1)), zero, zero, y, np.ones(n, dtype=bool),
         np.arange(n) == 0, np.zeros(n), np.zeros(2), 1e12 * np.eye(2), 1.0, np.array([ratio]),
-        0.0, 0.0,
+        0.0, 0.0, (0, 0), (0, 0),
     )  # fmt: skip
     steady = linalg.solve_discrete_are(a.T, np.array([[1.0], [0.0]]), ratio * np.outer(b, b),
                                        np.eye(1))  # fmt: skip

@@ -9,7 +9,7 @@ import pytest
 
 import ctrlid as cid
 from ctrlid import CtrlidError
-from ctrlid.vectorized import BINARY, BLOCK, UNARY, Vectorized, through
+from ctrlid.vectorized import BINARY, BLOCK, BLOCKS, UNARY, Vectorized, through
 
 EVERYWHERE = np.array([-np.inf, -1e200, -3.0, -1.0, -0.5, -0.0, 0.0, 1e-300, 0.5, 1.0, 2.0, 2.5,
                        1e200, np.inf, np.nan])  # fmt: skip
@@ -187,7 +187,8 @@ def test_random_expressions_share_registers_as_casadi_does(seed):
 # --- shapes and blocks
 
 
-@pytest.mark.parametrize("n", [1, 2, BLOCK - 1, BLOCK, BLOCK + 1, 2 * BLOCK, 2 * BLOCK + 17])
+@pytest.mark.parametrize("n", [1, 2, BLOCK - 1, BLOCK, BLOCK + 1, 2 * BLOCK, 2 * BLOCK + 17,
+                               2 * BLOCK * BLOCKS + 3])  # fmt: skip
 def test_block_boundaries(n):
     x, p = casadi.SX.sym("x", 2), casadi.SX.sym("p")
     matrix = casadi.vertcat(casadi.horzcat(x[0], 0, p), casadi.horzcat(0, casadi.sin(x[1]), 1))

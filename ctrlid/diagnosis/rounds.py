@@ -137,7 +137,7 @@ def _refitted(
                     for e in elsewhere(base, t.effect)])  # fmt: skip
         stuck = [t for t in _maybe_stuck(best, tried) if id(t) in done]
         near = quiet(best.model)
-        fit([(t, t, near) for t in stuck])
+        fit([(t, done[id(t)].fitted, near) for t in stuck])
         fit([(t, m, None) for t in stuck for m in more if m is not t and m.name == t.name])
     return [done.get(id(t), t) for t in tried]
 
@@ -145,7 +145,8 @@ def _refitted(
 def _maybe_stuck(best: Trial, tried: Sequence[Trial]) -> list[Trial]:
     """Return what may have lost only because its likelihood is rugged, as dry friction's is.
 
-    Where a large random force smooths the kink away, a fit stays there.
+    Where a large random force smooths the kink away, a fit stays there. It is climbed on with
+    hardly any such force: from its own values, which are near; from its first ones that is chance.
     """
     if not best.merit > 0:
         return []
