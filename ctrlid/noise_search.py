@@ -112,13 +112,13 @@ def _newton(
             hessian[i, j] = hessian[j, i] = (value - ups[i] - ups[j] + here) / h**2
         values, vectors = np.linalg.eigh(hessian)
         bowl = n == 1 and values[0] > BOWL
-        values = np.maximum(np.abs(values), 1e-3)
+        values, turned = np.maximum(np.abs(values), 1e-3), vectors.T @ slope
         while True:
-            step = -vectors @ ((vectors.T @ slope) / (values + damping))
+            step = -vectors @ (turned / (values + damping))
             step *= min(1.0, 2.5 / max(float(np.abs(step).max()), 1e-300))
             trial = np.clip(x + step, low, high)
             moved = vectors.T @ (trial - x)
-            foreseen = -float((vectors.T @ slope + 0.5 * values * moved) @ moved)
+            foreseen = -float((turned + 0.5 * values * moved) @ moved)
             if bowl and foreseen < 0.1 * enough:
                 return x
             there = cost(trial)
@@ -129,10 +129,13 @@ def _newton(
         if gain <= 0:
             break
         x, here, damping = trial, there, damping / 10
-        pull = vectors.T @ slope + values * moved  # that the parabola leaves after this step
-        left = 0.5 * float(pull @ (pull / values)) + 2.25 * (gain - foreseen) ** 2 / foreseen
-        if gain < enough or (bowl and left < 0.5 * enough):
+        if gain < enough:
             break
+        if bowl:
+            pull = turned + values * moved  # that the parabola leaves after this step
+            left = 0.5 * float(pull @ (pull / values)) + 2.25 * (gain - foreseen) ** 2 / foreseen
+            if left < 0.5 * enough:
+                break
     return x
 
 
