@@ -1,5 +1,7 @@
 """What a loop's controller computes from signals that are already there."""
 
+import math
+from dataclasses import replace
 from typing import Any
 
 import casadi
@@ -101,17 +103,37 @@ def replay_from_best_state(loop: Loop, record: Record) -> tuple[Array, Array]:
     if record.r is None:
         raise CtrlidError("the record has no reference r, which the controller needs")
     run, start = _controller_run(loop, record.y, record.r)
-    replayed = np.asarray(run(start), float).ravel()
-    best = float(np.sum((replayed - record.u) ** 2))
-    state = casadi.MX.sym("state", start.size)
-    slope = casadi.Function("slope", [state], [casadi.jacobian(run(state), state)])
+    replayed, best = _compared(run, start, record)
+    if start.size and np.isfinite(loop.input_limits).any():
+        # From the wrong state all may be cut off, and the state is then nowhere to be seen.
+        unlimited = replace(loop, input_limits=(-math.inf, math.inf))
+        inside = (record.u > loop.input_limits[0]) & (record.u < loop.input_limits[1])
+        free, _ = _controller_run(unlimited, record.y, record.r)
+        moved = _stepped(free, start, record.u, inside)
+        trial, cost = _compared(run, moved, record)
+        if cost < best:
+            start, replayed, best = moved, trial, cost
     # Gauss-Newton: one step where the law is linear in its state, a few more around limits.
     for _ in range(10 if start.size else 0):
-        jacobian = np.asarray(slope(start).full(), float)
-        moved = start + np.linalg.lstsq(jacobian, record.u - replayed, rcond=1e-12)[0]
-        trial = np.asarray(run(moved), float).ravel()
-        cost = float(np.sum((trial - record.u) ** 2))
+        moved = _stepped(run, start, record.u, np.full(len(record), True))
+        trial, cost = _compared(run, moved, record)
         if not cost < best:
             break
         start, replayed, best = moved, trial, cost
     return replayed, start
+
+
+def _compared(run: Any, start: Array, record: Record) -> tuple[Array, float]:
+    """Return what a controller computes from a state, and how far the logged input is from it."""
+    replayed = np.asarray(run(start), float).ravel()
+    return replayed, float(np.sum((replayed - record.u) ** 2))
+
+
+def _stepped(run: Any, start: Array, u: Array, use: Any) -> Array:
+    """Return a state by one Gauss-Newton step towards a logged input, on the samples to use."""
+    state = casadi.MX.sym("state", start.size)
+    outputs = run(state)
+    slope = casadi.Function("slope", [state], [casadi.jacobian(outputs, state), outputs])
+    jacobian, replayed = (np.asarray(v.full(), float) for v in slope(start))
+    step = np.linalg.lstsq(jacobian[use], (u - replayed.ravel())[use], rcond=1e-12)[0]
+    return np.asarray(start + step)

@@ -219,36 +219,43 @@ def best_start(
     simulator: Simulator, part: Record, r: Any, d: Array, guess: Array, fitted: int
 ) -> Array:
     """Return the initial state whose first entries fit the first samples best."""
-    rows = slice(0, min(len(part), 400))
     spread = max(float(np.std(part.y)), 1e-12 * float(np.abs(part.y).max()), 1e-300)
     scale = np.maximum(0.01 * np.abs(guess[:fitted]), spread)
     for j in simulator.loop.equations().velocities:
         scale[j] = max(float(np.std(np.diff(part.y))) / part.dt, 1e-300)
 
-    def run(z: Array) -> Array | None:
+    def misfit(z: Array, count: int) -> Array | None:
         try:
-            y = simulator.run(z, None if r is None else r[rows], d[rows])[0]
+            y = simulator.run(z, None if r is None else r[:count], d[:count])[0]
         except CtrlidError:
             return None
-        return np.asarray((y - part.y[rows]) / spread, dtype=float)
+        return np.asarray((y - part.y[:count]) / spread, dtype=float)
+
+    def moved(start: Array, point: Array) -> Array:
+        z = start.copy()
+        z[:fitted] += scale * (point - 1)
+        return z
+
+    def nearby(start: Array, count: int) -> Array:
+        def residual(point: Array) -> Array:
+            found = misfit(moved(start, point), count)
+            return np.full(count, 1e3) if found is None else found
+
+        # Around 1, so that the differences have the relative size that is asked for.
+        best = optimize.least_squares(residual, np.ones(fitted), diff_step=[1e-4], max_nfev=20)
+        return moved(start, best.x)
 
     # From rest a short search does not find a start that is far away.
-    seen = _as_measured(simulator, part, guess)
-    there, here = run(seen), run(guess)
+    seen, count = _as_measured(simulator, part, guess), min(len(part), 400)
+    there, here = misfit(seen, count), misfit(guess, count)
+    if there is None and here is None:
+        # An unstable plant is lost soon from a start that is only nearly right.
+        for few in (10, 30, 100):
+            seen = nearby(seen, min(few, count))
+        return nearby(seen, count)
     if there is not None and (here is None or there @ there < here @ here):
         guess = seen
-
-    def misfit(point: Array) -> Array:
-        z = guess.copy()
-        z[:fitted] += scale * (point - 1)
-        found = run(z)
-        return np.full(rows.stop, 1e3) if found is None else found
-
-    # Around 1, so that the differences have the relative size that is asked for.
-    best = optimize.least_squares(misfit, np.ones(fitted), diff_step=[1e-4], max_nfev=20)
-    start = guess.copy()
-    start[:fitted] += scale * (best.x - 1)
-    return start
+    return nearby(guess, count)
 
 
 def _as_measured(simulator: Simulator, part: Record, guess: Array) -> Array:

@@ -302,6 +302,17 @@ def test_replay_finds_the_initial_state_and_leaves_what_was_injected():
 # --- real logs
 
 
+def test_replay_finds_a_state_from_which_everything_was_cut_off():
+    # A lead sampled slowly rings: from rest, all that it computes from these samples is at a limit.
+    plant = cid.plants.maglev(m=0.02, K=2e-6)
+    at = cid.operating_point(plant, output=0.01)
+    lead = ct.tf([-6585.0, 5440.0], [1.0, 0.9995], 0.0044)
+    loop = cid.Loop(plant, lead, dt=0.0044, at=at, input_limits=(0.0, 7.8))
+    r = cid.random_binary(1500, amplitude=2.8e-4, hold=20, around=0.01, seed=7)
+    part = cid.simulate(loop, r)[500:]
+    np.testing.assert_allclose(cid.replay_controller(loop, part), part.u, atol=1e-8)
+
+
 def explained(replayed, logged):
     return 1 - np.var(replayed - logged) / np.var(logged)
 

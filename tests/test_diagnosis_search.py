@@ -19,6 +19,7 @@ from ctrlid.diagnosis.experiment import separating_experiment
 from ctrlid.diagnosis.fitted import Model, base_model, spared, whole
 from ctrlid.diagnosis.instants import timed
 from ctrlid.diagnosis.omnibus import Omnibus, _shape, omnibus
+from ctrlid.diagnosis.ordering import reordered
 from ctrlid.diagnosis.replica import replica
 from ctrlid.diagnosis.result import Disturbance, Finding, Gap
 from ctrlid.diagnosis.rounds import Step, one_round, plainer
@@ -578,3 +579,34 @@ def test_an_instant_that_is_dozens_of_samples_off_is_found(late):
     assert fit.theta[2] == pytest.approx(14.2, abs=0.01)
     assert fit.theta[3] == pytest.approx(-0.15, abs=0.01)
     assert timed(fit) is fit
+
+
+# --- in which order effects act
+
+
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)], ids=["offset behind", "offset before"])
+def test_effects_at_one_place_end_in_the_order_in_which_they_act(order):
+    loop, real = levitation(), levitation()
+    hidden = E.InputDeadZone(0.04), E.InputOffset(0.3)
+    for k in order:
+        real = real.with_effect(hidden[k])
+    r = cid.random_binary(4000, amplitude=2e-4, hold=60, around=0.012, seed=9900)
+    record = cid.simulate(real, r, sensor_noise=2e-6, seed=9901)
+    for found in (hidden, hidden[::-1]):
+        both = loop.with_effect(found[0]).with_effect(found[1])
+        own = ("InputDeadZone.width", "InputOffset.offset")
+        model = base_model(both, [record], (*loop.free, *own))
+        names = [type(e).__name__ for e in reordered(model, given=0).fitted.effects]
+        assert names == [type(hidden[k]).__name__ for k in order]
+
+
+def test_an_order_that_makes_no_difference_is_kept():
+    loop = drive()
+    record = record_of(loop, E.CoulombFriction(0.1), 0.3, 1e-5, 9910)
+    model = base_model(loop, [record], loop.free)
+    for effect in (E.CoulombFriction(0.1), E.QuadraticDrag(0.1)):
+        model = refit(model, attempt_at(model, effect)).model
+    assert reordered(model, given=0) is model
+    one = base_model(loop.with_effect(E.InputOffset(0.1)), [record], loop.free)
+    two = refit(one, attempt_at(one, E.InputDeadZone(0.01))).model
+    assert reordered(two, given=1) is two  # whose place the user knows

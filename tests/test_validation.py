@@ -11,6 +11,7 @@ import pytest
 import ctrlid as cid
 from ctrlid import CtrlidError
 from ctrlid.comparison import Comparison, Curve
+from ctrlid.diagnosis.gap import output, way_to_compare, whole
 from ctrlid.residuals import Correlation
 
 PLANT = cid.plants.maglev(m=0.0213, K=3.34e-6)
@@ -62,6 +63,26 @@ def test_a_record_cut_out_of_a_run_starts_from_its_own_states():
     analog = loop_with(LEAD)
     part = cid.simulate(analog, reference())[1013:3000]
     assert cid.compare(part, analog)["closed-loop"].fit > 99.99
+
+
+def test_a_run_is_followed_from_the_middle_of_a_fall():
+    # So much acceleration that the speed over a few samples is none to begin with: from there, and
+    # from rest, the simulated ball is lost within 400 samples.
+    plant = cid.plants.maglev(m=0.0234, K=9e-7)
+    at = cid.operating_point(plant, output=0.0169)
+    loop = cid.Loop(plant, cid.PID(kp=-1266.0, kd=-39.4, filter_time=0.0037), dt=2e-3, at=at,
+                    input_limits=(0.0, 25.1))  # fmt: skip
+    loop = loop.with_effect(cid.effects.InputDeadZone(0.33))
+    loop = loop.with_effect(cid.effects.InputOffset(2.9))
+    r = cid.random_binary(3000, amplitude=7e-4, hold=56, around=0.0169, seed=5)
+    record = cid.simulate(loop, r, sensor_noise=1e-5, seed=4)
+    way = way_to_compare(loop, record)
+    assert way == "closed-loop simulation"
+    speed = np.diff(record.y)
+    hardest = 500 + np.argsort(-np.abs(np.diff(speed)[500:2000]))[:10]
+    for k in hardest.tolist():
+        part = record[k:]
+        assert np.std(output(loop, whole(part), way) - part.y) < 4e-5  # its noise, through the loop
 
 
 def test_injected_signals_are_found_and_injected_again():

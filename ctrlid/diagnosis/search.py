@@ -12,6 +12,7 @@ from .attempts import refit
 from .decide import CLOSE, GATE, MANY
 from .fitted import Model, anchor, simulable, spared, whole
 from .omnibus import ALPHA, Omnibus, omnibus
+from .ordering import reordered
 from .replica import WITH_EFFECTS, forgiven, replica
 from .rounds import NEXT, Step, Work, candidates, one_round
 from .scan import SCANS, scanned
@@ -73,7 +74,8 @@ def search(
     before, changed, turned = omnibus(base.fit), False, False
 
     def grown(best: Trial) -> Model:
-        return whole(without_superfluous(renoised(best.model), given))
+        model = renoised(reordered(best.model, given))
+        return whole(without_superfluous(model, given))
 
     while len(model.loop.effects) - given < MANY and len(steps) < MANY + 2:
         tell(f"round {len(steps) + 1}: screening")

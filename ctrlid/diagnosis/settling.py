@@ -2,7 +2,7 @@
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from ..loop import Loop
@@ -11,8 +11,9 @@ from ..maximum import begin, climb, polish, retuned
 from .attempts import attempt_at, outcome, refit
 from .carrying import carried_over
 from .decide import GATE, rivals
-from .fitted import Model, light, simulable, spared
+from .fitted import Model, simulable, spared
 from .omnibus import omnibus
+from .ordering import moved, relabelled
 from .rounds import NEXT, Step, Work, plainer
 from .trial import Trial, contains
 from .weighing import needed
@@ -61,7 +62,8 @@ def settled(
             best = mine
         best = plainer(smaller, best, [mine, *again])
         if best is not mine:
-            model = _moved(best.model, position)
+            model = moved(best.model, position)
+            model = replace(model, fit=climb(model.fit, rounds=4))
         close = rivals(best, [t for t in [mine, *again] if t is not best], sure)
         found.append(Found(best, close, smaller, position))
     found.sort(key=lambda f: -f.trial.gain)
@@ -105,18 +107,6 @@ def _without(model: Model, positions: Sequence[int]) -> Model:
     return Model(loop, fit)
 
 
-def _moved(model: Model, position: int) -> Model:
-    """Return the model with its last effect at another position among the effects."""
-    fitted = model.fitted
-    order = [*range(position), len(fitted.effects) - 1, *range(position, len(fitted.effects) - 1)]
-    labels = list(fitted.labelled)
-    loop = replace(fitted, effects=tuple(fitted.effects[k] for k in order), free=())
-    renamed = dict(zip([labels[k] for k in order], loop.labelled, strict=True))
-    loop = replace(loop, free=tuple(n for n in fitted.free if "." not in n))
-    names = _relabelled(model.names, renamed)
-    return Model(loop, climb(carried_over(model, loop, names), rounds=4))
-
-
 def _close(mine: Trial, steps: Sequence[Step]) -> list[Trial]:
     """Return the candidates that came close to an effect in the round that it won.
 
@@ -144,31 +134,20 @@ def taken_out(
     label, less = labels[position], loop.without_effect(labels[position])
     renamed = dict(zip(labels[:position] + labels[position + 1 :], less.labelled, strict=True))
     left = [n for n in names if not n.startswith(f"{label}.")]
-    return less, tuple(_relabelled(left, renamed))
+    return less, tuple(relabelled(left, renamed))
 
 
 def cut(model: Model, position: int) -> tuple[Model, Trial]:
     """Return the model without one effect, refitted, and the effect as a trial on top of it."""
     bare = _without(model, [position])
     smaller = replace(bare, fit=spared(climb(bare.fit, rounds=10)))
+    effect = model.fitted.effects[position]
     if simulable(model):
-        # Without it all else may have gone too far astray to come back; the way is known.
-        return smaller, _put_back(smaller, model, position)
-    return smaller, refit(smaller, attempt_at(smaller, model.fitted.effects[position]))
-
-
-def _put_back(smaller: Model, model: Model, position: int) -> Trial:
-    """Return the effect as a trial on top of the model without it, all values as they were."""
-    effect, before = model.fitted.effects[position], list(model.loop.labelled)[position]
-    own = [n for n in model.names if n.startswith(f"{before}.")]
-    known = dict(zip(model.names, model.fit.theta.tolist(), strict=True))
-    rest = [known[n] for n in model.names if n not in own]
-    loop = smaller.loop.with_parameters(dict(zip(smaller.names, rest, strict=True)))
-    loop = loop.with_effect(effect)
-    label = next(k for k in loop.labelled if k not in smaller.loop.labelled)
-    names = (*smaller.names, *_relabelled(own, {before: label}))
-    fit = spared(climb(carried_over(model, loop, names), rounds=4))
-    return outcome(smaller, Trial(effect, label, Model(loop, light(fit)), -math.inf), fit)
+        # Put back anew, it would come last; and all else may have gone too far astray without it.
+        label = list(model.loop.labelled)[position]
+        known = Trial(effect, label, model, -math.inf)
+        return smaller, outcome(smaller, known, model.fit)
+    return smaller, refit(smaller, attempt_at(smaller, effect))
 
 
 def renoised(model: Model) -> Model:
@@ -195,9 +174,3 @@ def without_superfluous(model: Model, given: int) -> Model:
         if trial.merit <= GATE:
             return without_superfluous(smaller, given)
     return model
-
-
-def _relabelled(names: Sequence[str], labels: Mapping[str, str]) -> list[str]:
-    """Return names of parameters with the new labels of their effects."""
-    parts = [name.partition(".") for name in names]
-    return [f"{labels.get(head, head)}.{tail}" if dot else head for head, dot, tail in parts]
