@@ -27,7 +27,7 @@ from .readout import Readout, censored, clipping, steps
 from .replica import forgiven, replica
 from .result import Diagnosis, Disturbance
 from .rounds import Work, check_catalogue
-from .search import Search, main_ones, search
+from .search import Search, main_ones, named, search
 from .several import merged
 from .simulated_search import search_by_simulation
 
@@ -155,10 +155,10 @@ def _diagnosed(
     if periods:
         base = weighted_by_repeats(base, periods)
     found = search(base, catalogue, work, tell)
-    if found.turned and not found.after.passed:
+    if found.other and not found.after.passed:
         # Neither way explains the record, perhaps: fresh data tell which leads further.
         tell("another way")
-        greedy = search(base, catalogue, work, tell, found.steps[0])
+        greedy = search(base, catalogue, work, tell, found.other)
         ways = [main_ones(s, helps_on(fresh)) for s in (found, greedy)]
         found = min(ways, key=lambda s: (not s.after.passed, fresh.gap(fresh.loops(s.final))))
     tell("comparing on fresh data", 2)
@@ -166,7 +166,8 @@ def _diagnosed(
     if coarse and not found.after.passed and simulable(found.final):
         copies = [replica(_rounded(found.final, coarse), seed) for seed in (1, 2)]
         found = replace(found, after=forgiven(found.after, copies))
-    found = main_ones(found, helps_on(fresh))
+    tell("comparing names")
+    found = named(main_ones(found, helps_on(fresh)), work)
     gap, shares, disturbance = gaps_of(given, found, fresh)
     alone = len(records) == 1  # an effect of one record only may widen the gap in others
     if alone and found.found and not found.after.passed and wider(gap, disturbance):

@@ -16,7 +16,7 @@ from .ordering import reordered
 from .replica import WITH_EFFECTS, forgiven, replica
 from .rounds import NEXT, Step, Work, candidates, one_round
 from .scan import SCANS, scanned
-from .settling import Found, cut, renoised, settled, without_superfluous
+from .settling import Found, compared, cut, renoised, settled, without_superfluous
 from .trial import Trial, contains, same_kind
 
 NEARLY = 0.8  # of the best merit: what comes so close may be the better half of a pair
@@ -31,7 +31,8 @@ LITTLE = 0.1  # of what known noise does not explain: less, beside so much, is a
 class Search:
     """The end of a search: the base, the rounds, the final model and its effects.
 
-    `turned` says whether the choice of a round was taken back for a better pair.
+    Where the choice of a round was taken back for a better pair, `other` are the rounds of the way
+    that was left, with the one that showed it.
     """
 
     base: Model
@@ -40,14 +41,14 @@ class Search:
     found: tuple[Found, ...]
     before: Omnibus
     after: Omnibus
-    turned: bool = False
+    other: tuple[Step, ...] = ()
 
 
 def search(
     base: Model, catalogue: Sequence[type[AbstractEffect]], work: Work,
-    tell: Callable[[str], None], first: Step | None = None,
+    tell: Callable[[str], None], first: Sequence[Step] = (),
 ) -> Search:  # fmt: skip
-    """Add effects to a base model until nothing more earns a place.
+    """Add effects to a base model until nothing more earns a place, and drop what is superfluous.
 
     Parameters
     ----------
@@ -59,9 +60,9 @@ def search(
         ``work(function, items)``, a map that may run in parallel.
     tell : callable
         Told what is being done.
-    first : Step, optional
-        The first round of a search that took back the choice of one when the next was known. This
-        one goes on from that round and takes nothing back.
+    first : sequence of Step, optional
+        The rounds of a way that another search has left. This one goes on from there and takes
+        nothing back.
 
     Returns
     -------
@@ -69,38 +70,41 @@ def search(
         The rounds and the final model.
     """
     given = len(base.loop.effects)
-    model = base
-    steps: list[Step] = []
-    before, changed, turned = omnibus(base.fit), False, False
-
-    def grown(best: Trial) -> Model:
-        model = renoised(reordered(best.model, given))
-        return whole(without_superfluous(model, given))
-
-    while len(model.loop.effects) - given < MANY and len(steps) < MANY + 2:
+    steps = list(first)
+    model = whole(first[-1].base) if first else base
+    changed, left = False, tuple[Step, ...]()
+    while not steps or steps[-1].best is not None:
+        if steps and steps[-1].best is not None:
+            tell(f"round {len(steps)}: {steps[-1].best.name}")
+            model = renoised(reordered(steps[-1].best.model, given))
+            model = whole(without_superfluous(model, given))
+        if len(model.loop.effects) - given >= MANY or len(steps) >= MANY + 2:
+            break
         tell(f"round {len(steps) + 1}: screening")
         pool = _pool(model, catalogue)
-        if first is not None and not steps:
-            step = replace(first, best=first.trials[0])
-        else:
-            step = one_round(model, pool, work, None if steps else anchor(base))
+        step = one_round(model, pool, work, None if steps else anchor(base))
+        step = replace(step, base=Model(model.loop, spared(model.fit)))
         if step.best is not None and _stands_in(step.best, model, beside=bool(steps)):
             step = replace(step, best=None)
-        asked = first is None and steps and not changed
-        other = _foreseen(steps[-1], step, catalogue, work) if asked else None
-        if other is not None:
-            changed = turned = True
-            steps[-1] = replace(steps[-1], best=other)
-            model = grown(other)
-            continue
-        changed = False
-        steps.append(replace(step, base=Model(model.loop, spared(model.fit))))
-        if step.best is None:
-            break
-        tell(f"round {len(steps)}: {step.best.name}")
-        model = grown(step.best)
-    model, found = settled(model, given, steps, work)
-    return Search(base, tuple(steps), model, found, before, _judged(model), turned)
+        asked = steps and not first and not changed
+        better = _foreseen(steps[-1], step, catalogue, work) if asked else None
+        changed = better is not None
+        if changed:
+            left = (*steps, step)
+            steps[-1] = replace(steps[-1], best=better)
+        else:
+            steps.append(step)
+    model, found = settled(model, given, steps)
+    tests = omnibus(base.fit), _judged(model)
+    return Search(base, tuple(steps), model, found, *tests, left)
+
+
+def named(found: Search, work: Work) -> Search:
+    """Return the search with what could stand in the place of each effect."""
+    given = len(found.base.loop.effects)
+    model, each = compared(found.final, found.found, given, found.steps, work)
+    after = found.after if model is found.final else _judged(model)
+    return replace(found, final=model, found=each, after=after)
 
 
 def _stands_in(best: Trial, model: Model, beside: bool) -> bool:
@@ -207,16 +211,14 @@ def main_ones(found: Search, helps: Callable[[Found, Model], bool]) -> Search:
     complete = found.after.passed and len(found.found) < MANY
     if complete or len(found.found) < 2:
         return found
-    model, left = found.final, list(found.found)
+    model = found.final
     for f in sorted(found.found, key=lambda f: -f.position):
-        if f.trial.gain >= MINOR * total or helps(f, found.final):
-            continue
-        model = cut(model, f.position)[0]
-        left = [replace(k, position=k.position - (k.position > f.position))
-                for k in left if k.trial is not f.trial]  # fmt: skip
-    if len(left) == len(found.found):
+        if f.trial.gain < MINOR * total and not helps(f, found.final):
+            model = cut(model, f.position)[0]
+    if model is found.final:
         return found
-    return replace(found, final=model, found=tuple(left), after=_judged(model))
+    model, left = settled(model, len(found.base.loop.effects), found.steps)
+    return replace(found, final=model, found=left, after=_judged(model))
 
 
 def _pool(model: Model, catalogue: Sequence[type[AbstractEffect]]) -> list[AbstractEffect]:

@@ -33,27 +33,45 @@ class Found:
     position: int  # among the effects of the final loop
 
 
-def settled(
-    model: Model, given: int, steps: Sequence[Step], work: Work
-) -> tuple[Model, tuple[Found, ...]]:
-    """Ask for each effect what else could stand in its place, all others being in the model."""
-    first = steps[0] if steps else None
+def settled(model: Model, given: int, steps: Sequence[Step]) -> tuple[Model, tuple[Found, ...]]:
+    """Return the model without what is superfluous, and each effect on top of all the others."""
     if len(model.loop.effects) == given:
         return model, ()
-    assert first is not None
-    sure = omnibus(model.fit).passed
-    if len(model.loop.effects) == given + 1 and first.best is not None and len(steps) <= 2:
-        best = first.best
-        if bool(best.model.fit.noise.drift) == bool(model.fit.noise.drift):
-            return model, (Found(best, rivals(best, first.trials, sure), first.base, given),)
+    best = steps[0].best
+    alone = len(model.loop.effects) == given + 1 and len(steps) <= 2
+    if alone and best is not None and _drifts(best.model) == _drifts(model):
+        return model, (Found(best, (), steps[0].base, given),)
     one = fused(model, given, steps)
     if one is not model:
-        return settled(renoised(one), given, steps, work)
+        return settled(renoised(one), given, steps)
     found: list[Found] = []
     for position in range(given, len(model.loop.effects)):
         smaller, mine = cut(model, position)
         if mine.merit <= GATE:
-            return settled(renoised(smaller), given, steps, work)
+            return settled(renoised(smaller), given, steps)
+        found.append(Found(mine, (), smaller, position))
+    found.sort(key=lambda f: -f.trial.gain)
+    return model, tuple(found)
+
+
+def _drifts(model: Model) -> bool:
+    return bool(model.fit.noise.drift)
+
+
+def compared(
+    model: Model, found: Sequence[Found], given: int, steps: Sequence[Step], work: Work
+) -> tuple[Model, tuple[Found, ...]]:
+    """Ask for each effect what else could stand in its place, all others being in the model."""
+    sure = omnibus(model.fit).passed
+    if len(found) == 1 and found[0].trial is steps[0].best:
+        best = found[0].trial
+        return model, (replace(found[0], rivals=rivals(best, steps[0].trials, sure)),)
+    done, now = [], model
+    for f in sorted(found, key=lambda f: f.position):
+        smaller, mine = (f.base, f.trial) if now is model else cut(now, f.position)
+        if mine.merit <= GATE:  # what took the place of another makes this one superfluous
+            fewer, left = settled(renoised(smaller), given, steps)
+            return compared(fewer, left, given, steps, work)
         there = {type(e).__name__ for e in smaller.loop.effects}
         rest = [t for t in _close(mine, steps) if t.name not in there]
         again = work(lambda t, smaller=smaller: refit(smaller, attempt_at(smaller, t.fitted)), rest)
@@ -62,12 +80,12 @@ def settled(
             best = mine
         best = plainer(smaller, best, [mine, *again])
         if best is not mine:
-            model = moved(best.model, position)
-            model = replace(model, fit=climb(model.fit, rounds=4))
+            now = moved(best.model, f.position)
+            now = replace(now, fit=climb(now.fit, rounds=4))
         close = rivals(best, [t for t in [mine, *again] if t is not best], sure)
-        found.append(Found(best, close, smaller, position))
-    found.sort(key=lambda f: -f.trial.gain)
-    return model, tuple(found)
+        done.append(Found(best, close, smaller, f.position))
+    done.sort(key=lambda f: -f.trial.gain)
+    return now, tuple(done)
 
 
 def fused(model: Model, given: int, steps: Sequence[Step]) -> Model:
