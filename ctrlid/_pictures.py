@@ -11,8 +11,9 @@ import numpy as np
 from . import _text
 from .comparison import Comparison
 from .diagnosis.result import Candidate, Diagnosis, Gap, Place
+from .equations import Array
 from .errors import CtrlidError
-from .physics import Array, timebase
+from .physics import timebase
 
 WINDOW = 250  # samples of a comparison that can be told apart on a page
 BARS = 7  # candidates of a round that are drawn

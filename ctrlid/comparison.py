@@ -6,8 +6,8 @@ import numpy as np
 
 from ._text import Printed
 from .data import Record
+from .equations import Array
 from .errors import CtrlidError
-from .physics import Array
 from .residuals import Correlation
 
 SYSTEMATIC = 0.05  # share of an error that follows the signals and is worth a word

@@ -8,12 +8,13 @@ import control as ct
 import numpy as np
 
 from ._text import Printed
+from .equations import Array
 from .errors import CtrlidError
 from .lead import design_lead
 from .loop import Loop
 from .margins import loop_margins, nu_gap, robust_margin
 from .model import IdentifiedModel
-from .physics import Array, timebase
+from .physics import timebase
 from .simulation import simulate
 from .stepping import growth_rate
 

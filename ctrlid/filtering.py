@@ -11,10 +11,10 @@ from typing import Any
 import casadi
 import numpy as np
 
+from .equations import Array
 from .errors import CtrlidError
 from .kalman import filter_pass
 from .machine import Linearized, Machine, Trajectory
-from .physics import Array
 from .tracks import Track
 from .vectorized import Vectorized
 

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from .equations import Array
 from .filtering import Filtered, Noise, run
 from .machine import Linearized, Machine, Trajectory
-from .physics import Array
 from .tracks import Track
 
 QUIET = 1e-14  # of the output's size, squared: the least variance of the sensor noise

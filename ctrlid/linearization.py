@@ -10,8 +10,9 @@ import control as ct
 import numpy as np
 from scipy import linalg
 
+from .equations import Array, Equations, require_siso
 from .errors import CtrlidError
-from .physics import Array, Equations, require_siso, trace
+from .physics import trace
 
 UNREACHABLE = 1e-12  # relative coupling below which a state is only round-off away from the input
 EQUILIBRIUM = 1e-9  # relative residual of an accepted equilibrium

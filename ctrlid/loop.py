@@ -14,9 +14,10 @@ from .controllers import ControlLaw, control_law
 from .effects import AbstractEffect
 from .effects.composition import compose, labels
 from .effects.ordinary import as_system, linear_model
+from .equations import Equations, require_siso
 from .errors import CtrlidError
 from .linearization import OperatingPoint, linearize
-from .physics import Equations, require_siso, trace, with_parameters
+from .physics import trace, with_parameters
 
 
 @dataclass(frozen=True, eq=False)

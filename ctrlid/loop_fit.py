@@ -9,6 +9,7 @@ import numpy as np
 
 from ._text import Printed, number
 from .data import Record
+from .equations import Array
 from .errors import CtrlidError
 from .likelihood import Fit, Problem, pseudo_inverse
 from .linearization import operating_point
@@ -17,7 +18,6 @@ from .machine import machine_for
 from .maximum import begin, climb, information, retuned
 from .model import root_errors
 from .noise_search import with_coloured_force
-from .physics import Array
 from .records import as_records
 from .tracks import make_track
 

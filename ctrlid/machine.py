@@ -11,12 +11,12 @@ import casadi
 import numpy as np
 
 from .data import Record
+from .equations import Array, Equations
 from .errors import CtrlidError
+from .integration import Scheme, known_lags, whole_delay
 from .linearization import state_matrices
 from .loop import Loop
 from .maps import Plan, maps_of, moves_of, play_of
-from .physics import Array, Equations
-from .stepping import Scheme, known_lags, whole_delay
 from .tracks import Track, state_at_rest
 from .vectorized import Vectorized, through
 

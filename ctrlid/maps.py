@@ -8,8 +8,9 @@ from typing import Any
 import casadi
 
 from .controllers import ControlLaw
-from .physics import Equations
-from .stepping import Scheme, advance, input_pieces, integrate, through_play
+from .equations import Equations
+from .integration import Scheme, advance, input_pieces, integrate
+from .stepping import through_play
 from .vectorized import Vectorized
 
 BUILT = 64  # structures whose maps are kept

@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 
+from .equations import Array
 from .errors import CtrlidError
 from .filtering import SETTLED, Filtered, Noise, first_guess, settle
 from .likelihood import Fit, Problem, evaluate, pseudo_inverse, relinearized
 from .machine import Machine
 from .noise_search import LOG_STEP, logs_of, noise_of, tune, unit_of
-from .physics import Array
 from .tracks import Track
 
 ROUNDS = 25  # Gauss-Newton steps at most

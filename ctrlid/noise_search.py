@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 
 from ._jobs import side_by_side
+from .equations import Array
 from .errors import CtrlidError
 from .filtering import Noise
 from .likelihood import Fit, Known, Problem, measure
 from .machine import Linearized, Machine
-from .physics import Array
 
 LEAST = -24.0  # logarithm of the least force noise: below, only the start of the record counts
 MOST = 14.0  # and of the largest: above, the sensor is exact

@@ -9,10 +9,10 @@ import numpy as np
 
 from ._text import listing
 from .constraints import AbstractConstraint
+from .equations import Array
 from .errors import CtrlidError
 from .innovations import Circuit, Flow, flow, prediction_errors, realize
 from .model import Structure
-from .physics import Array
 from .qp import Cost, NotExcited
 from .regression import block_qr, merge
 from .search import Found, minimize

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 
 from .data import Record
+from .equations import Array
 from .errors import CtrlidError
 from .filtering import Noise
 from .likelihood import Problem
 from .loop import Loop
 from .machine import machine_for
 from .maximum import begin, climb
-from .physics import Array
 from .tracks import make_track
 
 EMPTY: Array = np.empty(0)

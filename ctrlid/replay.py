@@ -8,9 +8,9 @@ import casadi
 import numpy as np
 
 from .data import Record
+from .equations import Array
 from .errors import CtrlidError
 from .loop import Loop
-from .physics import Array
 
 
 def _controller_run(loop: Loop, y: Array, r: Array | None) -> tuple[Any, Array]:

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from .data import Record
+from .equations import Array
 from .errors import CtrlidError, CtrlidWarning
 from .loop import Loop
-from .physics import Array
 from .stepping import growth_rate, sensitivity, stepper
 
 TOLERANCE = 1e-9  # local error of one integration step, relative to the excursion of each state

@@ -14,223 +14,22 @@ import inspect
 import math
 import sys
 import types
-from collections.abc import Callable
 from typing import Any
 
 import casadi
 import numpy as np
 
-from .errors import CtrlidError
-
-Function = Callable[..., Any]
-
-
-class TracingError(CtrlidError):
-    """A plant's function does something that equations cannot express."""
-
-
-class Symbol:
-    """A scalar expression that numpy treats as an opaque number."""
-
-    __slots__ = ("sx",)
-    __hash__ = object.__hash__
-
-    def __init__(self, sx: Any) -> None:
-        self.sx = sx
-
-    def __bool__(self) -> bool:
-        raise TracingError(
-            "a Python 'if', 'while', 'and', 'or', 'not', 'max' or 'min' decides on the value of a "
-            "state, input or time; write np.where(condition, a, b), np.maximum, np.minimum, "
-            "or & and | between conditions instead"
-        )
-
-    def __float__(self) -> float:
-        raise TracingError(
-            "an expression of the states is turned into a plain float, by float(...), a "
-            "preallocated array of floats or a function that knows numbers only; build the array "
-            "in one expression, np.array([a, b]), inside the function and use numpy's functions"
-        )
-
-    __int__ = __index__ = __complex__ = __float__
-
-    def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **kwargs: Any) -> Any:
-        op = ELEMENTWISE.get(ufunc.__name__) or OPERATORS.get(ufunc.__name__)
-        if method != "__call__" or op is None:
-            raise TracingError(
-                f"the function {ufunc.__name__} is not known to the tracing; rewrite it with "
-                "arithmetic, np.where, np.maximum or np.minimum"
-            )
-        return _elementwise(op)(*inputs)
-
-    def __abs__(self) -> "Symbol":
-        return Symbol(casadi.fabs(self.sx))
-
-    def __pos__(self) -> "Symbol":
-        return self
-
-    def __neg__(self) -> "Symbol":
-        return Symbol(-self.sx)
-
-    def __invert__(self) -> "Symbol":
-        return Symbol(casadi.logic_not(self.sx))
-
-    def __round__(self, digits: int | None = None) -> "Symbol":
-        return Symbol(_round(self.sx, digits or 0))
-
-
-def _lift(value: Any) -> Any:
-    return value.sx if isinstance(value, Symbol) else value
-
-
-def _floor_mod(a: Any, b: Any) -> Any:
-    return a - b * casadi.floor(a / b)
-
-
-def _round(a: Any, digits: int = 0) -> Any:
-    # Half to even, as Python and numpy round.
-    scaled = a * 10.0**digits
-    low = casadi.floor(scaled)
-    even = casadi.if_else(_floor_mod(low, 2) == 0, low, low + 1)
-    diff = scaled - low
-    up = casadi.if_else(diff > 0.5, low + 1, casadi.if_else(diff < 0.5, low, even))
-    return up / 10.0**digits
-
-
-OPERATORS: dict[str, Function] = {
-    "add": lambda a, b: a + b,
-    "subtract": lambda a, b: a - b,
-    "multiply": lambda a, b: a * b,
-    "divide": lambda a, b: a / b,
-    "true_divide": lambda a, b: a / b,
-    "floor_divide": lambda a, b: casadi.floor(a / b),
-    "remainder": _floor_mod,
-    "power": lambda a, b: a**b,
-    "less": lambda a, b: a < b,
-    "less_equal": lambda a, b: a <= b,
-    "greater": lambda a, b: a > b,
-    "greater_equal": lambda a, b: a >= b,
-    "equal": lambda a, b: a == b,
-    "not_equal": lambda a, b: a != b,
-    "bitwise_and": casadi.logic_and,
-    "bitwise_or": casadi.logic_or,
-    "negative": lambda a: -a,
-    "positive": lambda a: a,
-}
-_DUNDERS = {
-    "add": "add", "sub": "subtract", "mul": "multiply", "truediv": "divide",
-    "floordiv": "floor_divide", "mod": "remainder", "pow": "power", "and": "bitwise_and",
-    "or": "bitwise_or", "lt": "less", "le": "less_equal", "gt": "greater",
-    "ge": "greater_equal", "eq": "equal", "ne": "not_equal",
-}  # fmt: skip
-
-
-def _binary(op: Function, swapped: bool) -> Function:
-    def method(self: Symbol, other: Any) -> Any:
-        if isinstance(other, np.ndarray):
-            return NotImplemented  # numpy's own loop comes back element by element
-        pair = (_lift(other), self.sx) if swapped else (self.sx, _lift(other))
-        try:
-            return Symbol(op(*pair))
-        except (NotImplementedError, TypeError):
-            return NotImplemented
-
-    return method
-
-
-for _dunder, _ufunc in _DUNDERS.items():
-    setattr(Symbol, f"__{_dunder}__", _binary(OPERATORS[_ufunc], swapped=False))
-    setattr(Symbol, f"__r{_dunder}__", _binary(OPERATORS[_ufunc], swapped=True))
-
-
-def _clip(a: Any, low: Any = None, high: Any = None) -> Any:
-    a = a if low is None else casadi.fmax(a, low)
-    return a if high is None else casadi.fmin(a, high)
-
-
-def _interp(a: Any, xp: Any, fp: Any) -> Any:
-    xp, fp = np.asarray(xp, float), np.asarray(fp, float)
-    value: Any = fp[0]
-    for k in range(len(xp) - 1):
-        slope = (fp[k + 1] - fp[k]) / (xp[k + 1] - xp[k])
-        value = casadi.if_else(a >= xp[k], fp[k] + slope * (a - xp[k]), value)
-    return casadi.if_else(a >= xp[-1], fp[-1], value)
-
-
-ELEMENTWISE: dict[str, Function] = {
-    **{name: getattr(casadi, name) for name in (
-        "sin", "cos", "tan", "sinh", "cosh", "tanh", "arcsin", "arccos", "arctan", "arctan2",
-        "arcsinh", "arccosh", "arctanh", "exp", "expm1", "log", "log10", "log1p", "sqrt", "sign",
-        "floor", "ceil", "fmax", "fmin", "hypot", "erf", "copysign")},
-    "asin": casadi.arcsin, "acos": casadi.arccos, "atan": casadi.arctan,
-    "atan2": casadi.arctan2, "asinh": casadi.arcsinh, "acosh": casadi.arccosh,
-    "atanh": casadi.arctanh, "abs": casadi.fabs, "absolute": casadi.fabs, "fabs": casadi.fabs,
-    "maximum": casadi.fmax, "minimum": casadi.fmin, "pow": lambda a, b: a**b,
-    "float_power": lambda a, b: a**b, "square": lambda a: a * a,
-    "reciprocal": lambda a: 1.0 / a, "cbrt": lambda a: casadi.sign(a) * casadi.fabs(a) ** (1 / 3),
-    "log2": lambda a: casadi.log(a) / math.log(2.0), "exp2": lambda a: 2.0**a,
-    "fmod": casadi.fmod, "mod": _floor_mod, "deg2rad": lambda a: a * (math.pi / 180),
-    "rad2deg": lambda a: a * (180 / math.pi), "radians": lambda a: a * (math.pi / 180),
-    "degrees": lambda a: a * (180 / math.pi), "clip": _clip,
-    "heaviside": lambda a, at0: casadi.if_else(a > 0, 1.0, casadi.if_else(a < 0, 0.0, at0)),
-    "sinc": lambda a: casadi.if_else(a == 0, 1.0, casadi.sin(math.pi * a) / (math.pi * a)),
-    "logical_and": casadi.logic_and, "logical_or": casadi.logic_or,
-    "logical_not": casadi.logic_not, "where": casadi.if_else,
-    "round": _round, "around": _round, "trunc": lambda a: casadi.sign(a) * casadi.floor(
-        casadi.fabs(a)),
-}  # fmt: skip
-
-
-def _has_symbols(value: Any) -> bool:
-    if isinstance(value, (list, tuple)):
-        return any(_has_symbols(v) for v in value)
-    if isinstance(value, np.ndarray) and value.dtype == object:
-        return any(isinstance(v, Symbol) for v in value.flat)
-    return isinstance(value, Symbol)
-
-
-def _elementwise(op: Function) -> Function:
-    """Lift a function of casadi scalars to numpy arrays of symbols."""
-
-    def apply(*args: Any, **kwargs: Any) -> Any:
-        target = kwargs.pop("out", None)
-        target = target[0] if isinstance(target, tuple) else target
-        names = {"a_min": "low", "a_max": "high", "min": "low", "max": "high", "decimals": "digits"}
-        named = {names.get(key, key): _lift(value) for key, value in kwargs.items()}
-        arrays = [np.asarray(_boxed(a), dtype=object) for a in args]
-        shape = np.broadcast_shapes(*(a.shape for a in arrays))
-        flat = [np.broadcast_to(a, shape).reshape(-1) for a in arrays]
-        out = np.empty(math.prod(shape), dtype=object)
-        for k in range(out.size):
-            out[k] = Symbol(op(*(_lift(a[k]) for a in flat), **named))
-        if target is not None:  # x += 1 and np.sin(x, out=y)
-            target[...] = out.reshape(shape)
-            return target
-        return out.reshape(shape).view(Symbols) if shape else out[0]
-
-    return apply
-
-
-class Symbols(np.ndarray):
-    """An array of symbols that also compares and reduces element by element."""
-
-    def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **kwargs: Any) -> Any:
-        plain = [np.asarray(a) if isinstance(a, Symbols) else a for a in inputs]
-        op = ELEMENTWISE.get(ufunc.__name__) or OPERATORS.get(ufunc.__name__)
-        if method == "reduce" and ufunc.__name__ in ("maximum", "minimum"):
-            return functools.reduce(_elementwise(ELEMENTWISE[ufunc.__name__]), plain[0].ravel())
-        if method == "__call__" and op is not None:
-            return _elementwise(op)(*plain, out=kwargs.get("out"))
-        result = getattr(ufunc, method)(*plain, **kwargs)
-        return result.view(Symbols) if isinstance(result, np.ndarray) else result
-
-
-def _boxed(value: Any) -> Any:
-    if isinstance(value, Symbol):
-        box = np.empty((), dtype=object)
-        box[()] = value
-        return box
-    return value
+from .symbols import (
+    ELEMENTWISE,
+    Function,
+    Symbol,
+    Symbols,
+    TracingError,
+    elementwise,
+    has_symbols,
+    interp,
+    lift,
+)  # fmt: skip
 
 
 def _or_original(symbolic: Function, original: Function) -> Function:
@@ -238,7 +37,7 @@ def _or_original(symbolic: Function, original: Function) -> Function:
 
     @functools.wraps(original, updated=())
     def call(*args: Any, **kwargs: Any) -> Any:
-        symbols = _has_symbols(args) or any(_has_symbols(v) for v in kwargs.values())
+        symbols = has_symbols(args) or any(has_symbols(v) for v in kwargs.values())
         return (symbolic if symbols else original)(*args, **kwargs)
 
     return call
@@ -259,7 +58,7 @@ def _object_array(make: Function) -> Function:
 
 def _casadi_matrix(array: Any) -> Any:
     rows = np.atleast_2d(np.asarray(array, dtype=object))
-    return casadi.vertcat(*(casadi.horzcat(*(_lift(v) for v in row)) for row in rows))
+    return casadi.vertcat(*(casadi.horzcat(*(lift(v) for v in row)) for row in rows))
 
 
 def _from_casadi(matrix: Any, shape: tuple[int, ...]) -> Any:
@@ -282,7 +81,7 @@ LINALG: dict[str, Function] = {
     ),
     "det": _or_original(lambda a: Symbol(casadi.det(_casadi_matrix(a))), np.linalg.det),
     "norm": _or_original(
-        lambda a: Symbol(casadi.sqrt(sum(_lift(v) ** 2 for v in np.ravel(a)))), np.linalg.norm
+        lambda a: Symbol(casadi.sqrt(sum(lift(v) ** 2 for v in np.ravel(a)))), np.linalg.norm
     ),
 }
 
@@ -308,7 +107,7 @@ def _keeping_symbols(function: Function) -> Function:
     @functools.wraps(function, updated=())
     def call(*args: Any, **kwargs: Any) -> Any:
         result = function(*args, **kwargs)
-        return result.view(Symbols) if _has_symbols(result) and np.ndim(result) else result
+        return result.view(Symbols) if has_symbols(result) and np.ndim(result) else result
 
     return call
 
@@ -335,7 +134,7 @@ def _identity(value: Any = 0.0) -> Any:
 
 def _numpy_table() -> dict[str, Any]:
     table: dict[str, Any] = {
-        name: _or_original(_elementwise(op), getattr(np, name))
+        name: _or_original(elementwise(op), getattr(np, name))
         for name, op in ELEMENTWISE.items()
         if hasattr(np, name)
     }
@@ -345,7 +144,7 @@ def _numpy_table() -> dict[str, Any]:
     for number in ("float64", "float32", "double"):
         table[number] = _or_original(_identity, getattr(np, number))
     table["interp"] = _or_original(
-        lambda a, xp, fp: _elementwise(lambda s: _interp(s, xp, fp))(a), np.interp
+        lambda a, xp, fp: elementwise(lambda s: interp(s, xp, fp))(a), np.interp
     )
     table["linalg"] = _Module(np.linalg, LINALG)
     return table
@@ -354,7 +153,7 @@ def _numpy_table() -> dict[str, Any]:
 _NUMPY = _Module(np, _numpy_table())
 _MATH = _Module(
     math,
-    {n: _or_original(_elementwise(op), getattr(math, n)) for n, op in ELEMENTWISE.items()
+    {n: _or_original(elementwise(op), getattr(math, n)) for n, op in ELEMENTWISE.items()
      if hasattr(math, n)},
 )  # fmt: skip
 _MODULES: dict[str, Any] = {"numpy": _NUMPY, "math": _MATH}
@@ -373,10 +172,10 @@ _BUILTINS = {
     **vars(builtins),
     "float": _or_original(_identity, float),
     "max": _or_original(
-        lambda *a: functools.reduce(_elementwise(casadi.fmax), a if len(a) > 1 else a[0]), max
+        lambda *a: functools.reduce(elementwise(casadi.fmax), a if len(a) > 1 else a[0]), max
     ),
     "min": _or_original(
-        lambda *a: functools.reduce(_elementwise(casadi.fmin), a if len(a) > 1 else a[0]), min
+        lambda *a: functools.reduce(elementwise(casadi.fmin), a if len(a) > 1 else a[0]), min
     ),
     "__import__": _import,
 }

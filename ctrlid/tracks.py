@@ -7,10 +7,10 @@ import casadi
 import numpy as np
 
 from .data import Record
+from .equations import Array, Equations
 from .errors import CtrlidError
 from .linearization import state_matrices
 from .loop import Loop
-from .physics import Array, Equations
 
 FEWEST = 10  # valid samples, to say anything
 BRIDGE = 20  # samples that do not count and are bridged by the model; then it starts afresh

@@ -14,13 +14,14 @@ from .comparison import EXACT, Comparison, Curve
 from .controllers import PID
 from .data import Record
 from .effects.moment import motion
+from .equations import Array
 from .errors import CtrlidError, CtrlidWarning
 from .innovations import flow
 from .linearization import state_matrices
 from .loop import Loop
 from .model import IdentifiedModel, delay_of
 from .noise_model import noise_polynomial, whiten
-from .physics import Array, timebase
+from .physics import timebase
 from .predictor import Prediction, predict, predict_ahead, spread_ahead
 from .replay import controller_output, replay_from_best_state
 from .residuals import Correlation, autocorrelation, cross_correlation, explained_share

@@ -12,9 +12,9 @@ import casadi
 import numpy as np
 
 from ._jobs import processors, side_by_side
+from .equations import Array
 from .errors import CtrlidError
 from .interpreter import BINARY, UNARY, sweep
-from .physics import Array
 
 BLOCK = 512  # samples at once: long enough that a loop costs little, short enough for the cache
 BLOCKS = 64  # at most that a thread takes at a time: their inputs are copied

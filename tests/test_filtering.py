@@ -14,9 +14,9 @@ from scipy import integrate, linalg
 import ctrlid as cid
 from ctrlid import effects as E
 from ctrlid.filtering import Noise, first_guess, settle
+from ctrlid.integration import advance
 from ctrlid.kalman import filter_pass
 from ctrlid.machine import Machine, Trajectory
-from ctrlid.stepping import advance
 from ctrlid.tracks import make_track, state_at_rest
 
 # --- one pass

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 
 from ..data import Record
+from ..equations import Array
 from ..errors import CtrlidError
 from ..likelihood import Known
 from ..loop_fit import make_problem
 from ..maximum import begin, promised
-from ..physics import Array
 from ..signals import random_binary
 from ..simulation import Simulator
 from .gap import FEW_STEPS, ROUGH

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..data import Record
+from ..equations import Array
 from ..errors import CtrlidError
 from ..filtering import Noise
 from ..likelihood import Fit, relinearized
@@ -15,7 +16,6 @@ from ..loop import Loop
 from ..loop_fit import choose_noise, make_problem, start_values
 from ..maximum import begin, climb, retuned
 from ..noise_search import known_from_repeats
-from ..physics import Array
 from ..stepping import comes_to_rest
 
 QUIET = 1e-4  # of the variance of a random force, with which kinks are sharp

@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..data import Record
+from ..equations import Array
 from ..errors import CtrlidError
 from ..likelihood import Fit, Known, evaluate
 from ..loop import Loop
 from ..loop_fit import make_problem, start_values
 from ..maximum import begin, climb
-from ..physics import Array
 from . import gap as gaps
 from .fitted import Model
 

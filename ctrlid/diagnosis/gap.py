@@ -9,11 +9,11 @@ import numpy as np
 from scipy import signal
 
 from ..data import Record
+from ..equations import Array
 from ..errors import CtrlidError
 from ..likelihood import Fit
 from ..linearization import state_matrices
 from ..loop import Loop
-from ..physics import Array
 from ..predictor import predict, predict_ahead, spread_ahead
 from ..replay import replay_from_best_state
 from ..simulation import Simulator

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
+from ..equations import Array
 from ..likelihood import Fit
-from ..physics import Array
 from ..residuals import remembered
 from .constancy import FEWEST, bin_edges, bin_index, constancy, line_chance
 from .result import Place

@@ -6,8 +6,8 @@ from typing import Any, Literal
 
 from .._text import Printed
 from ..effects import AbstractEffect
+from ..equations import Array
 from ..loop import Loop
-from ..physics import Array
 
 Verdict = Literal["nothing missing", "explained", "partly explained", "unknown"]
 LARGE = 0.5  # share of the floor's variance from which a random force may hide something

@@ -16,10 +16,10 @@ from ..effects import (
     PositionRipple,
     StateLimit,
 )
+from ..equations import Array
 from ..errors import CtrlidError
 from ..filtering import run
 from ..likelihood import pseudo_inverse
-from ..physics import Array
 from .attempts import attempt, attempt_best
 from .fitted import Model
 from .trial import Trial

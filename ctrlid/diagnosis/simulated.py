@@ -9,12 +9,12 @@ import numpy as np
 from scipy import optimize
 
 from ..data import Record
+from ..equations import Array
 from ..filtering import Noise
 from ..likelihood import Fit, Known, evaluate, pseudo_inverse
 from ..loop import Loop
 from ..loop_fit import make_problem
 from ..machine import Trajectory
-from ..physics import Array
 from ..residuals import remembered
 
 EVALUATIONS = 60  # of a refit

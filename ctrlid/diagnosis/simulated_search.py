@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..effects import AbstractEffect, ParameterStep, PeriodicForce, StateLimit
+from ..equations import Array
 from ..errors import CtrlidError
 from ..loop_fit import start_values
-from ..physics import Array
 from .decide import CLOSE, GATE
 from .fitted import Model
 from .fresh import Fresh

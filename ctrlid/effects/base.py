@@ -10,10 +10,10 @@ from typing import Any, ClassVar, Literal, Self
 import casadi
 import numpy as np
 
+from ..equations import Equations
 from ..errors import CtrlidError
 from ..linearization import OperatingPoint
-from ..physics import Equations
-from ..tracing import Symbol
+from ..symbols import Symbol
 from .moment import Moment, motion
 from .parameters import Parameter, filled
 from .symbolic import spread_of, traced, with_states

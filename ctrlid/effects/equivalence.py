@@ -7,8 +7,8 @@ from typing import Any
 import casadi
 import numpy as np
 
+from ..equations import Array, Equations
 from ..errors import CtrlidError
-from ..physics import Array, Equations
 from .base import AbstractEffect
 from .catalogue import CATALOGUE
 from .law import PositionOffset

@@ -7,8 +7,8 @@ from typing import Any, ClassVar, final
 import casadi
 import numpy as np
 
+from ..equations import Equations
 from ..errors import CtrlidError
-from ..physics import Equations
 from .base import require_motion
 from .moment import Moment
 from .parameters import parameter

@@ -6,10 +6,10 @@ from typing import Any
 import casadi
 import numpy as np
 
+from ..equations import Equations
 from ..errors import CtrlidError
 from ..linearization import OperatingPoint
-from ..physics import Equations
-from ..tracing import Symbol
+from ..symbols import Symbol
 
 SHARPEST = 1e-12  # of a velocity unit (or whatever has the kink): keeps derivatives finite
 INSTANT = 1e-6  # of a sampling period: a shorter lag is none

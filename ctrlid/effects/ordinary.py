@@ -7,9 +7,9 @@ from typing import Any
 import casadi
 import control as ct
 
+from ..equations import Equations
 from ..errors import CtrlidError
 from ..linearization import OperatingPoint, linearize, operating_point
-from ..physics import Equations
 from .base import AbstractEffect
 from .composition import compose
 from .symbolic import substituted

@@ -9,9 +9,9 @@ import casadi
 import numpy as np
 from scipy import signal
 
+from ..equations import Equations
 from ..errors import CtrlidError
 from ..linearization import state_matrices
-from ..physics import Equations
 from .moment import Moment
 from .parameters import parameter
 from .places import LawEffect

@@ -5,9 +5,9 @@ from typing import Any, ClassVar
 
 import casadi
 
+from ..equations import Equations
 from ..errors import CtrlidError
-from ..physics import Equations
-from ..tracing import Symbol
+from ..symbols import Symbol
 from .base import AbstractEffect, Place, require_motion
 from .moment import Moment
 from .symbolic import expression, substituted, traced

@@ -8,8 +8,9 @@ from typing import Any
 import casadi
 import numpy as np
 
-from ..physics import Equations, Lag
-from ..tracing import Symbol, rebind
+from ..equations import Equations, Lag
+from ..symbols import Symbol
+from ..tracing import rebind
 from .moment import Follow
 
 

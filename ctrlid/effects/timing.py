@@ -7,9 +7,9 @@ from typing import Any, ClassVar, Self, final
 import casadi
 import numpy as np
 
+from ..equations import Equations, Play
 from ..errors import CtrlidError
 from ..linearization import OperatingPoint
-from ..physics import Equations, Play
 from .moment import Moment
 from .parameters import parameter
 from .places import InputEffect

@@ -7,7 +7,7 @@ import numpy as np
 
 from .. import _pictures
 from ..diagnosis.result import Diagnosis, Place
-from ..physics import Array
+from ..equations import Array
 from .axes import COLOURS, MEASURED, finish, new_figure, require, take_axes
 
 BEFORE = {"color": COLOURS[1], "linestyle": "--", "linewidth": 1.4}

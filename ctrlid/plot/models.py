@@ -8,9 +8,10 @@ from matplotlib.ticker import MultipleLocator
 from .. import _pictures, _text
 from ..band import response_band
 from ..each import FitSeries
+from ..equations import Array
 from ..errors import CtrlidError
 from ..model import IdentifiedModel, delay_of
-from ..physics import Array, timebase
+from ..physics import timebase
 from .axes import COLOURS, MARKERS, finish, line_style, require, take_axes
 
 

@@ -8,8 +8,8 @@ import numpy as np
 from .. import _pictures, _text
 from ..comparison import Comparison
 from ..data import Record
+from ..equations import Array
 from ..errors import CtrlidError
-from ..physics import Array
 from .axes import BINS, COLOURS, DASHES, MEASURED, finish, line_style, require, take_axes
 
 

@@ -1,0 +1,274 @@
+"""A plant advanced over pieces of its input: formulas of integration, and lags exactly."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import casadi
+from scipy.integrate import DOP853
+
+from .equations import Equations, Lag
+
+Piece = tuple[Any, Any, Any]  # duration, input at its start, slope of the input
+Scheme = tuple[int, int, bool]  # order, steps in a piece, whether pieces are cut for short lags
+SHARP = 8.0  # time constants after which the transient of a lag is over
+
+
+def integrate(rate: Any, z: Any, dt: Any, substeps: int) -> tuple[Any, Any]:
+    """Advance an expression by Dormand and Prince's eighth-order formula.
+
+    Parameters
+    ----------
+    rate : callable
+        ``rate(tau, z)``, the derivative at time `tau` after the start, as CasADi expression.
+    z : casadi.SX
+        The state at the start.
+    dt : float or casadi.SX
+        Time to advance [s].
+    substeps : int
+        Number of steps of equal length.
+
+    Returns
+    -------
+    z : casadi.SX
+        The state after `dt`.
+    error : casadi.SX
+        Largest estimate of the local error of a step, per state.
+
+    References
+    ----------
+    Hairer, Nørsett and Wanner, *Solving Ordinary Differential Equations I*, section II.10.
+    """
+    h = dt / substeps
+    worst = casadi.SX.zeros(z.shape[0], 1)
+    for k in range(substeps):
+        stages: list[Any] = []
+        for row, c in zip(DOP853.A, DOP853.C, strict=True):
+            point = z
+            for weight, stage in zip(row, stages, strict=False):
+                if weight:
+                    point = point + (h * weight) * stage
+            stages.append(rate((k + c) * h, point))
+        total, fifth, third = (
+            sum((w * s for w, s in zip(weights, stages, strict=False) if w), casadi.SX(0))
+            for weights in (DOP853.B, DOP853.E5, DOP853.E3)
+        )
+        z = z + h * total
+        fifth, third = casadi.fabs(h * fifth), casadi.fabs(h * third)
+        worst = casadi.fmax(worst, fifth**2 / casadi.sqrt(fifth**2 + 0.01 * third**2 + 1e-300))
+    return z, worst
+
+
+def integrate_fast(rate: Any, z: Any, dt: Any, substeps: int) -> Any:
+    """Advance an expression by the classical fourth-order formula of Runge and Kutta."""
+    h = dt / substeps
+    for k in range(substeps):
+        start = k * h
+        first = rate(start, z)
+        second = rate(start + h / 2, z + h / 2 * first)
+        third = rate(start + h / 2, z + h / 2 * second)
+        fourth = rate(start + h, z + h * third)
+        z = z + h / 6 * (first + 2 * second + 2 * third + fourth)
+    return z
+
+
+def input_pieces(e: Equations, dt: float, path: Sequence[Any], hold: str) -> list[Piece]:
+    r"""Return the input of the plant over one period as straight pieces.
+
+    .. math:: u(t - d), \quad d = (l + \varphi) T
+
+    changes from one sample to the next at the time :math:`\varphi T` after the start.
+
+    Parameters
+    ----------
+    e : Equations
+        The plant, with or without a delay.
+    dt : float
+        Sampling period T [s].
+    path : sequence of 3 expressions
+        The input at the samples k - l - 1, k - l and k - l + 1.
+    hold : {"zoh", "foh"}
+        How the input runs between samples.
+
+    Returns
+    -------
+    list of tuple
+        Duration [s], input at the start of the piece, slope [1/s].
+    """
+    before, now, ahead = path
+    slopes = [(now - before) / dt, (ahead - now) / dt] if hold == "foh" else [0.0, 0.0]
+    if e.delay is None:
+        return [(dt, now, slopes[1])]
+    late = delay_of(e, e.p) / dt - whole_delay(e, dt)
+    return [
+        (late * dt, before + slopes[0] * (1 - late) * dt, slopes[0]),
+        ((1 - late) * dt, now, slopes[1]),
+    ]
+
+
+def delay_of(e: Equations, p: Any) -> Any:
+    """Return the delay of the input [s] for parameter values `p`."""
+    return casadi.substitute(casadi.SX(e.delay), e.p, casadi.SX(p))
+
+
+def whole_delay(e: Equations, dt: float) -> int:
+    """Return by how many whole samples the input comes late, with the parameters as they are."""
+    if e.delay is None:
+        return 0
+    seconds = float(casadi.evalf(delay_of(e, casadi.DM(e.values))))
+    # A delay of whole samples belongs to the interval above it: only there can it grow and fall.
+    return max(math.floor(seconds / dt + 1e-9), 0)
+
+
+def known_lags(e: Equations) -> tuple[list[Lag], list[Lag]]:
+    """Return the lags that follow the input or a curve of it, and those that only outputs see."""
+    driven, seen = [], []
+    for lag in e.lags:
+        others = casadi.vertcat(*(e.rhs[i] for i in range(len(e.states)) if i != lag.state))
+        if not casadi.depends_on(lag.target, casadi.vertcat(e.t, e.x, *_spreads(e))):
+            driven.append(lag)
+        elif not casadi.depends_on(others, e.x[lag.state]) and not e.dt:
+            seen.append(lag)
+    return driven, seen
+
+
+def _spreads(e: Equations) -> list[Any]:
+    return [] if e.spread is None else [e.spread]
+
+
+def advance(
+    e: Equations, t: Any, x: Any, pieces: Sequence[Piece], p: Any, spread: Any = None,
+    kick: Any = None, scheme: Scheme = (4, 1, True),
+) -> tuple[Any, Any]:  # fmt: skip
+    """Return the state of a plant after the pieces of its input, and the local error.
+
+    Lags of the input and of the output are advanced by their exact exponential, so that a lag
+    far shorter than the period neither disturbs nor slows the integration.
+
+    Parameters
+    ----------
+    e : Equations
+        The plant.
+    t : expression
+        Time at the start [s].
+    x : expression, shape (states,)
+        State at the start.
+    pieces : sequence of tuple
+        Duration, input at the start and slope, as `input_pieces` returns them.
+    p : expression or ndarray
+        Parameter values.
+    spread : expression, optional
+        Standard deviations of the states, which smooth kinks; zero by default.
+    kick : expression, optional
+        Constant added to the rates: a force held over the period.
+    scheme : (int, int, bool), optional
+        Order of the steps, four or eight; how many in each piece; and whether pieces are cut where
+        the transient of a short lag of the input is over.
+
+    Returns
+    -------
+    x : casadi.SX
+        State after the last piece.
+    error : casadi.SX
+        Estimate of the local error per state, zero for steps of order four.
+    """
+    n = len(e.states)
+    spread = casadi.SX.zeros(n, 1) if spread is None else spread
+    kick = casadi.SX.zeros(n, 1) if kick is None else kick
+    worst = casadi.SX.zeros(n, 1)
+    driven, seen = known_lags(e)
+    hidden = [lag.state for lag in (*driven, *seen)]
+    if e.dt:
+        return e.smoothed(t, x, pieces[-1][1], p, spread)[0] + kick, worst
+    times = {
+        lag.state: casadi.substitute(casadi.SX(lag.time_constant), e.p, casadi.SX(p))
+        for lag in e.lags
+    }
+    order, steps, cut = scheme
+    short = [times[lag.state] for lag in driven[:1] if cut]
+    for duration, level, slope in _split(pieces, short):
+        followed = [_straight(e, lag.target, duration, level, slope, p) for lag in driven]
+
+        def filled(tau: Any, z: Any, x: Any = x, followed: Any = followed) -> Any:
+            z = casadi.SX(z)
+            for lag, (first, climb) in zip(driven, followed, strict=True):
+                time = times[lag.state]
+                steady = first - time * climb
+                decay = casadi.exp(-tau / time)
+                z[lag.state] = steady + climb * tau + (x[lag.state] - steady) * decay
+            return z
+
+        def rate(
+            tau: Any,
+            z: Any,
+            level: Any = level,
+            slope: Any = slope,
+            filled: Any = filled,
+            t: Any = t,
+        ) -> Any:
+            rates = e.smoothed(t + tau, filled(tau, z), level + slope * tau, p, spread)[0] + kick
+            for k in hidden:
+                rates[k] = 0
+            return rates
+
+        if order == 8:
+            after, error = integrate(rate, x, duration, steps)
+            worst = casadi.fmax(worst, error)
+        else:
+            after = integrate_fast(rate, x, duration, steps)
+        after = filled(duration, after)
+        for lag in seen:
+            ends = [
+                _followed(e, lag, t + tau, z, level + slope * tau, p, spread)
+                for tau, z in ((0.0, x), (duration, after))
+            ]
+            after[lag.state] = _trail(x[lag.state], times[lag.state], duration, *ends)
+        x, t = after, t + duration
+    return x, worst
+
+
+def _split(pieces: Sequence[Piece], times: Sequence[Any]) -> list[Piece]:
+    """Cut pieces where the transient of the first lag is over."""
+    parts: list[Piece] = []
+    for duration, level, slope in pieces:
+        if not times:
+            parts.append((duration, level, slope))
+            continue
+        sharp = casadi.fmin(duration / 2, SHARP * times[0])
+        parts += [(sharp, level, slope), (duration - sharp, level + slope * sharp, slope)]
+    return parts
+
+
+def _straight(
+    e: Equations, target: Any, duration: Any, level: Any, slope: Any, p: Any
+) -> tuple[Any, Any]:
+    """Return start and slope of a curve of the input over a piece of it, straight as well."""
+    if casadi.is_equal(target, e.u, 2):
+        return level, slope
+    curve = casadi.Function("curve", [e.u, e.p], [target])
+    first = curve(level, p)
+    if isinstance(slope, float) and slope == 0.0:
+        return first, 0.0
+    return first, (curve(level + slope * duration, p) - first) / duration
+
+
+def _followed(e: Equations, lag: Lag, t: Any, x: Any, u: Any, p: Any, spread: Any) -> Any:
+    """Return what a lag follows, and its rate, at one point."""
+    velocity = casadi.jtimes(lag.target, e.x, e.rhs) + casadi.jacobian(lag.target, e.t)
+    symbols = [e.t, e.x, e.u, e.p, *_spreads(e)]
+    function = casadi.Function("followed", symbols, [lag.target, velocity])
+    return function(*[t, x, u, p, spread][: len(symbols)])
+
+
+def _trail(start: Any, time: Any, duration: Any, begin: Any, end: Any) -> Any:
+    """Advance a lag that follows the cubic through two values and two slopes."""
+    a = duration / time
+    decay = casadi.exp(-a)
+    m0 = 1 - decay
+    m1 = 1 - m0 / a
+    m2 = 1 - 2 * m1 / a
+    m3 = 1 - 3 * m2 / a
+    (z0, v0), (z1, v1) = begin, end
+    v0, v1 = duration * v0, duration * v1
+    return (decay * start + m0 * z0 + m1 * v0 + m2 * (3 * (z1 - z0) - 2 * v0 - v1)
+            + m3 * (2 * (z0 - z1) + v0 + v1))  # fmt: skip
