@@ -39,7 +39,8 @@ from .iv import fit_iv
 from .lead import design_lead
 from .linearization import OperatingPoint, linearize, operating_point
 from .loop import Loop
-from .loop_fit import LoopEstimate, LoopFit, fit_loop
+from .loop_estimate import LoopEstimate, LoopFit
+from .loop_fit import fit_loop
 from .margins import Margins, loop_margins, nu_gap, robust_margin
 from .model import Estimate, IdentifiedModel
 from .predictor import Prediction, predict

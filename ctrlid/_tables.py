@@ -12,7 +12,7 @@ from .data import SIGNALS, Record
 from .diagnosis import words
 from .diagnosis.result import Diagnosis
 from .errors import CtrlidError
-from .loop_fit import LoopFit
+from .loop_estimate import LoopFit
 from .model import Estimate, IdentifiedModel
 from .physics import timebase
 

@@ -15,7 +15,7 @@ from .controller_redesign import Redesign
 from .data import Record
 from .diagnosis.result import Diagnosis
 from .errors import CtrlidError
-from .loop_fit import LoopFit
+from .loop_estimate import LoopFit
 from .model import IdentifiedModel
 
 STYLE = """

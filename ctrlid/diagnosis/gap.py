@@ -17,9 +17,10 @@ from ..loop import Loop
 from ..predictor import predict, predict_ahead, spread_ahead
 from ..replay import replay_from_best_state
 from ..simulation import Simulator
+from ..starts import best_start
 from ..stepping import comes_to_rest
 from ..tracks import FEWEST
-from ..validation import best_start, time_constant
+from ..validation import time_constant
 
 ROUGH = 1e-5  # local error of the integration, far below any gap worth a word
 FEW_STEPS = 8  # of the integration in a period; sharp friction would ask for many more
