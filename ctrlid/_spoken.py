@@ -21,6 +21,7 @@ from .data import Record
 from .errors import CtrlidError
 from .linearization import OperatingPoint, operating_point
 from .loop import Loop
+from .physics import trace, with_parameters
 
 PLANTS = {"maglev": ("K",), "servo": ("c", "k"), "tank": ("outlet", "k"), "pendulum": ("m",)}
 CHANNELS = ("r", "u", "y", "time")
@@ -61,11 +62,10 @@ def spoken_loop(args: argparse.Namespace, record: Record) -> Loop:
         _known(args.model, list(model.parameters), [*values, *free])
         return dataclasses.replace(model.with_parameters(values), free=free)
     free = PLANTS.get(args.model, ()) if args.free is None else tuple(args.free)
-    bare = Loop(model, None, dt=record.dt)
-    _known(args.model, list(bare.parameters), [*values, *free])
-    model = bare.with_parameters(values).plant
+    _known(args.model, list(trace(model).parameters), [*values, *free])
+    model = with_parameters(model, values) if values else model
     output = float(np.mean(record.y[record.valid])) if args.at_output is None else args.at_output
-    if bare.linear_plant:  # it acts on deviations
+    if isinstance(model, ct.TransferFunction | ct.StateSpace):  # it acts on deviations
         at = OperatingPoint((), float(np.mean(record.u[record.valid])), output)
     else:
         at = operating_point(model, output=output)

@@ -1,5 +1,6 @@
 """audit(): what a colleague would say about a record before anything is fitted to it."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -20,6 +21,7 @@ COARSE = 0.3  # quantisation step over spread that a fit of y would notice
 FEW_CHANGES = 4
 SURE = 2e-4  # chance of a drift that is still chance
 OWN = 0.01  # of u's variance that does not come from y: above, something is added to u
+ELSEWHERE = 100.0  # times where the loop rests, and y is something else or in other units
 LINE = 1e-5  # of the largest spectral line, above which there is another one
 
 
@@ -32,15 +34,15 @@ class AuditFinding:
     kind : str
         ``"saturation"``, ``"quantization"``, ``"repeats"``, ``"dropped samples"``, ``"outliers"``,
         ``"drift"``, ``"offset"``, ``"too little excitation"``, ``"constant signal"``,
-        ``"too few samples"`` or ``"controller"``.
+        ``"too few samples"``, ``"controller"`` or ``"operating point"``.
     channel : str
         ``"r"``, ``"u"`` or ``"y"``; empty where it concerns the whole record.
     text : str
         The finding in words, with what to do about it.
     size : float
         How large it is: a share of the samples (saturation, dropped samples, outliers), a ratio to
-        the signal's spread (quantization, drift, offset), a number (repeats, changes, samples), or
-        the share of u that the controller does not explain.
+        the signal's spread (quantization, drift, offset), a number (repeats, changes, samples), the
+        share of u that the controller does not explain, or the ratio of y to where the loop rests.
     where : (int, int)
         First sample concerned and the one after the last.
     harmful : bool
@@ -158,6 +160,7 @@ def audit(record: Record, loop: Loop | None = None) -> Audit:
     ]  # fmt: skip
     injected = False
     if loop is not None:
+        findings += look.place(loop)
         for kind, text, size, harmful in check_controller(loop, record):
             injected = injected or kind == "injected"
             findings.append(AuditFinding("controller", "u", text, size, look.whole, harmful))
@@ -322,6 +325,17 @@ class _Look:
                 out.append(AuditFinding("offset", "y", text, abs(mean) / max(sd, 1e-300),
                                         self.whole))  # fmt: skip
         return out
+
+    def place(self, loop: Loop) -> list[AuditFinding]:
+        assert loop.at is not None
+        y, rest = np.abs(self.signals["y"][self.valid]), abs(loop.at.output)
+        ratio = float(np.median(y)) / rest if rest else 0.0
+        if ratio < ELSEWHERE or y.min() < math.sqrt(ELSEWHERE) * rest:
+            return []
+        text = (f"y is {ratio:.3g} times as large as where the loop rests, {loop.at.output:.4g}: "
+                "logged in other units than the plant counts in, or u and y swapped? Scale or swap "
+                "the channels, or give the loop the operating point of this record.")  # fmt: skip
+        return [AuditFinding("operating point", "y", text, ratio, self.whole, harmful=True)]
 
     def repetition(self) -> list[AuditFinding]:
         r = self.record.r

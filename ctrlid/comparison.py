@@ -90,6 +90,8 @@ class Comparison(Printed):
         last = self.curves[-1]
         what = self.record.name or "the record"
         text = f"The {last.label} reproduces {what} with a fit of {_fit(last.fit)}"
+        if last.fit <= 0:
+            text = f"The {last.label} does not reproduce {what}: it errs by more than y moves"
         if last.fit > EXACT:
             return text + ": nothing is left to explain."
         failed = [t for t in self.tests if not t.passed]

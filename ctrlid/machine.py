@@ -203,16 +203,6 @@ class Machine:
         w = self._inputs(track, self._through_play(track.table[1], p)[0])[:, rows]
         return self.maps.sensor(x.T, w, p, np.zeros((self.n, 1)))[0][:, 0, 0]
 
-    def at_rest(self) -> tuple[Array, Array, Array]:
-        """Return the derivatives of the map by state and force and of the output, at rest."""
-        at, p = self.loop.point, self.e.values
-        x = self.padded(np.array(state_at_rest(self.loop, self.e)))
-        w = np.array([0.0, at.input, at.input, at.input, at.output, at.output])
-        quiet = np.zeros(self.n)
-        _, a, b, _ = self._period(self.maps.stages, x, w, p, quiet, np.zeros(self.channels))
-        _, h, _ = self.maps.sensor(x, w, p, quiet)
-        return a[0], b[0], h[0]
-
     def _inputs(self, track: Track, applied: Array) -> Array:
         """Return the rows (t, input before, now, ahead, r, y) over which the map is evaluated."""
         t, _, r, y = track.table

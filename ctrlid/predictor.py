@@ -4,6 +4,7 @@ The filter needs u and y only. It never simulates an unstable plant open loop: e
 the state back, so it works on plants that no open-loop simulation survives.
 """
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,6 +21,8 @@ from .maximum import begin, climb
 from .tracks import make_track
 
 EMPTY: Array = np.empty(0)
+LEAD = 4  # horizons in which a filter's covariance settles
+STARTS = 300  # predictions whose spread is computed
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,12 +160,16 @@ def predict_ahead(
     return k, m.height(track, x, k)
 
 
-def spread_ahead(loop: Loop, record: Record, prediction: Prediction, horizon: int) -> float:
+def spread_ahead(
+    loop: Loop, record: Record, prediction: Prediction, horizon: int
+) -> tuple[float, float]:  # fmt: skip
     r"""Return the standard deviation that noise gives predictions several samples ahead.
 
-    .. math:: P_{k+1} = A P_k A^T + Q, \quad \sigma^2 = h P_j h^T + R
+    .. math:: P_{k+1} = A_k P_k A_k^T + Q, \quad \sigma^2 = h P_{k+j} h^T + R
 
-    from the steady state of the filter, with the plant linearized at the operating point.
+    from the covariance P of the filtered states, with the plant linearized along the record, and
+    averaged over it. Dry friction, which holds still what rests, damps nothing that moves: at one
+    operating point there is no such average.
 
     Parameters
     ----------
@@ -177,23 +184,34 @@ def spread_ahead(loop: Loop, record: Record, prediction: Prediction, horizon: in
 
     Returns
     -------
-    float
-        Standard deviation [output unit].
+    both, sensor : float
+        Standard deviations by all noise, and by the sensor's alone [output unit]; NaN where no
+        stretch is long enough.
     """
-    m = machine_for(replace(loop, controller=None), (), record)
-    a, b, h = m.at_rest()
-    n = len(a)
-    r, q = prediction.sensor_noise**2, (prediction.force_noise * b) @ (prediction.force_noise * b).T
-    p = q + r * np.eye(n)
-    for _ in range(5000):
-        gain = p @ h.T / (h @ p @ h.T + r) if r else np.zeros((n, 1))
-        keep = np.eye(n) - gain @ h
-        filtered = keep @ p @ keep.T + r * gain @ gain.T
-        later = a @ filtered @ a.T + q
-        if np.allclose(later, p, rtol=1e-9, atol=0.0):
-            break
-        p = later
-    p = filtered
-    for _ in range(horizon):
-        p = a @ p @ a.T + q
-    return float(np.sqrt((h @ p @ h.T).item() + r))
+    plain = replace(loop, controller=None)
+    track, m = make_track(plain, record), machine_for(plain, (), record)
+    r, force = prediction.sensor_noise**2, prediction.force_noise**2
+    ratio = max(force / r, 1e-300) if r else 1.0
+    plant = begin(
+        Problem(m, (track,), EMPTY, EMPTY), EMPTY, Noise((ratio,) * m.channels)
+    ).linearized[0]
+    lead = int(np.clip(LEAD * horizon, 50, 500))
+    starts = np.arange(0, len(record) - lead - horizon, max(1, len(record) // STARTS))
+    bad = np.concatenate([[0], np.cumsum(~record.valid)])
+    starts = starts[bad[starts + lead + horizon + 1] == bad[starts]]
+    if not len(starts):
+        return math.nan, math.nan
+    found = []
+    for variance in (force, 0.0):
+        p = np.broadcast_to(r * np.eye(plant.a.shape[1]), (len(starts), *plant.a.shape[1:]))
+        for j in range(lead + horizon):
+            k = starts + j
+            if j <= lead:
+                h = plant.c[k][:, None, :]
+                seen = p @ h.transpose(0, 2, 1)
+                p = p - seen @ seen.transpose(0, 2, 1) / np.maximum(h @ seen + r, 1e-300)
+            a, b = plant.a[k], plant.b[k]
+            p = a @ p @ a.transpose(0, 2, 1) + variance * (b @ b.transpose(0, 2, 1))
+        h = plant.c[starts + lead + horizon][:, None, :]
+        found.append(math.sqrt(float(np.mean(h @ p @ h.transpose(0, 2, 1))) + r))
+    return found[0], found[1]

@@ -99,15 +99,14 @@ def _compare_loop(record: Record, loop: Loop, horizon: int | None) -> Comparison
     curves = [_curve("one-step prediction", record, one_step, _known_before(record, 1))]
     notes = []
     e = loop.equations()
-    poles = np.linalg.eigvals(state_matrices(e, loop.point)[0])
-    steps = horizon or time_constant(poles, e.dt, record)
+    steps = horizon or time_constant(moving_poles(loop), e.dt, record)
     if steps > 1:
         index, values = predict_ahead(loop, record, prediction, steps)
         ahead = np.full(len(record), np.nan)
         ahead[index] = values
         curves.append(_curve(f"{steps}-step prediction", record, ahead,
                              _known_before(record, steps),
-                             spread_ahead(loop, record, prediction, steps)))  # fmt: skip
+                             spread_ahead(loop, record, prediction, steps)[0]))  # fmt: skip
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", CtrlidWarning)
         try:
@@ -137,6 +136,11 @@ def _comparison(
     exact = known[0].fit > EXACT
     tests = () if exact else _tests(record, residuals)
     return Comparison(what, record, known, residuals, tests, tuple(notes))
+
+
+def moving_poles(loop: Loop) -> Any:
+    """Return the poles of a plant in motion, where dry friction does not damp it as at rest."""
+    return np.linalg.eigvals(state_matrices(loop.equations(), loop.point, spread=1e6)[0])
 
 
 def time_constant(poles: Any, dt: float, record: Record) -> int:
@@ -198,7 +202,9 @@ def _simulated(record: Record, loop: Loop, prediction: Prediction) -> Curve:
     driven = [] if record.r is None else [(np.asarray(record.r), 1)]
     if np.std(injected) > MEANINGFUL * np.std(record.u) and not (driven and not loop.controller):
         driven.append((injected, 1))
-    return _curve(label, record, y, driven, float(np.std(noisy[np.isfinite(y)])))
+    # Through a curved law noise moves the mean as well, and that is its doing too.
+    by_noise = float(np.sqrt(np.mean(noisy[np.isfinite(y)] ** 2)))
+    return _curve(label, record, y, driven, by_noise)
 
 
 def _noise_effect(

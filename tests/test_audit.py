@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import ctrlid as cid
-from ctrlid import defects
+from ctrlid import CtrlidError, defects
 
 
 def reference(rng, n, amplitude, around):
@@ -401,3 +401,22 @@ def test_refusal_says_what_is_needed():
 def test_measured_records(data_dir, name, kinds):
     record = cid.datasets.load(name)
     assert {(f.kind, f.channel) for f in cid.audit(record).findings} == kinds
+
+
+def test_an_output_in_other_units_than_the_loop():
+    plant = cid.plants.maglev(m=0.0213, K=3.34e-6)
+    at = cid.operating_point(plant, output=0.012)
+    lead = cid.design_lead(cid.linearize(plant, at), crossover=100, phase_margin=50)
+    loop = cid.Loop(plant, lead.sample(2e-3, "tustin"), dt=2e-3, at=at)
+    r = cid.random_binary(1000, amplitude=2e-4, hold=50, around=0.012, seed=1)
+    record = cid.simulate(loop, r, sensor_noise=1e-6, seed=2)
+    assert not cid.audit(record, loop)["operating point"]
+    for wrong in (replace(record, y=1e3 * record.y, r=1e3 * r), replace(record, y=record.u)):
+        (finding,) = cid.audit(wrong, loop)["operating point"]
+        assert finding.harmful
+        assert "times as large as where the loop rests, 0.012" in finding.text
+        with pytest.raises(CtrlidError, match="cannot be diagnosed: y is .* other units"):
+            cid.diagnose(loop, wrong, progress=False)
+    servo = cid.Loop(cid.plants.servo(m=1.0, c=2.0, k=3.0), cid.PID(kp=5.0), dt=0.01)
+    far = cid.simulate(servo, 5.0 + cid.random_binary(1000, amplitude=0.1, hold=50, seed=3))
+    assert not cid.audit(far, servo)["operating point"]  # which rests at zero: nobody knows

@@ -115,6 +115,14 @@ def test_what_is_taken_without_saying(folder, asked, record):
     assert asked[1][0].free == ()
 
 
+def test_a_plant_that_is_not_defined_at_zero(folder, asked):
+    arguments = ("bare.csv", "--dt", DT, "--model", "maglev", "--param", "m=0.0213", "K=3.34e-6")
+    assert run(*arguments, "--at-output", 0.012) == 0
+    ((loop, _, _),) = asked
+    assert loop.at == cid.operating_point(cid.plants.maglev(m=0.0213, K=3.34e-6), output=0.012)
+    assert loop.free == ("K",)
+
+
 def test_every_textbook_plant_has_its_uncertain_parameters():
     for name, free in _spoken.PLANTS.items():
         needed = {"maglev": {"m": 1.0, "K": 1.0}, "servo": {"m": 1.0, "c": 1.0, "k": 1.0},

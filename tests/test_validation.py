@@ -4,6 +4,8 @@ Groups: exact loops; noise; wrong models; transfer functions; stretches and miss
 texts; refusals; real logs.
 """
 
+from dataclasses import replace
+
 import control as ct
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ import ctrlid as cid
 from ctrlid import CtrlidError
 from ctrlid.comparison import Comparison, Curve
 from ctrlid.diagnosis.gap import output, way_to_compare, whole
+from ctrlid.predictor import predict_ahead, spread_ahead
 from ctrlid.residuals import Correlation
 
 PLANT = cid.plants.maglev(m=0.0213, K=3.34e-6)
@@ -83,6 +86,22 @@ def test_a_run_is_followed_from_the_middle_of_a_fall():
     for k in hardest.tolist():
         part = record[k:]
         assert np.std(output(loop, whole(part), way) - part.y) < 4e-5  # its noise, through the loop
+
+
+@pytest.mark.parametrize("fc", [0.05, 0.3])
+def test_dry_friction_damps_no_prediction_of_what_moves(fc):
+    # At rest its steep slope makes the fall a hundred times slower; on the move it does not.
+    loop = cid.Loop(PLANT, DIGITAL, dt=DT, at=AT)
+    loop = loop.with_effect(cid.effects.CoulombFriction(fc))
+    r = cid.random_binary(3000, amplitude=2e-4, hold=60, around=0.012, seed=1)
+    record = cid.simulate(loop, r, sensor_noise=5e-6, seed=2)
+    found = cid.compare(record, replace(loop, controller=None))
+    assert [c.label for c in found.curves[:2]] == ["one-step prediction", "25-step prediction"]
+    prediction = cid.predict(loop, record)
+    both, sensor = spread_ahead(loop, record, prediction, 25)
+    assert 0.9 * prediction.sensor_noise < sensor <= both
+    index, y = predict_ahead(loop, record, prediction, 25)
+    assert 0.4 < np.std(record.y[index] - y) / both < 1.2
 
 
 def test_injected_signals_are_found_and_injected_again():

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,6 @@ from ..data import Record
 from ..equations import Array
 from ..errors import CtrlidError
 from ..likelihood import Fit
-from ..linearization import state_matrices
 from ..loop import Loop
 from ..predictor import predict, predict_ahead, spread_ahead
 from ..replay import replay_from_best_state
@@ -20,7 +19,7 @@ from ..simulation import Simulator
 from ..starts import best_start
 from ..stepping import comes_to_rest
 from ..tracks import FEWEST
-from ..validation import time_constant
+from ..validation import moving_poles, time_constant
 
 ROUGH = 1e-5  # local error of the integration, far below any gap worth a word
 FEW_STEPS = 8  # of the integration in a period; sharp friction would ask for many more
@@ -36,9 +35,8 @@ def way_to_compare(loop: Loop, record: Record) -> str:
         return "closed-loop simulation"
     if loop.controller is None and comes_to_rest(loop):
         return "open-loop simulation"
-    e = loop.equations()
-    poles = np.linalg.eigvals(state_matrices(e, loop.point)[0])
-    return f"{time_constant(poles, e.dt, record)}-step prediction"
+    steps = time_constant(moving_poles(loop), loop.equations().dt, record)
+    return f"{steps}-step prediction"
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,9 +180,7 @@ def floors(
 def _floors(loop: Loop, fit: Fit, sensor: float, window: Window, kind: str) -> Array:
     record = window.record
     if kind.endswith("prediction"):
-        found = predict(loop, record)
-        quiet = replace(found, force_noise=0.0)
-        return np.array([spread_ahead(loop, record, p, _steps(kind)) for p in (found, quiet)])
+        return np.array(spread_ahead(loop, record, predict(loop, record), _steps(kind)))
     simulator = Simulator(loop, ROUGH, FEW_STEPS)
     squares, count = np.zeros(2), 0
     for start, stop in record.segments():

@@ -15,7 +15,7 @@ from ..linearization import OperatingPoint
 from ..loop import Loop
 from ..model import delay_of
 
-HOPELESS = ("too few samples", "constant signal")
+HOPELESS = ("too few samples", "constant signal", "operating point")
 REPEATS = 3  # of an experiment, from which its noise is taken
 
 

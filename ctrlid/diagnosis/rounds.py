@@ -53,11 +53,10 @@ def candidates(
 
 def check_catalogue(catalogue: Sequence[type[AbstractEffect]]) -> None:
     """Refuse what is no class of effects, with what is needed."""
-    kinds = catalogue if isinstance(catalogue, Sequence) else [catalogue]
+    several = isinstance(catalogue, Sequence) and not isinstance(catalogue, str)
+    kinds = catalogue if several else [catalogue]
     for kind in kinds:
-        if isinstance(catalogue, str) or not (
-            isinstance(kind, type) and issubclass(kind, AbstractEffect)
-        ):
+        if not (isinstance(kind, type) and issubclass(kind, AbstractEffect)):
             raise CtrlidError("catalogue= is a list of classes of effects, such as "
                               f"ctrlid.effects.CATALOGUE; given {kind!r}")  # fmt: skip
     if kinds is not catalogue:

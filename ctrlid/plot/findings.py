@@ -82,12 +82,13 @@ def _gap(above: Any, below: Any, found: Diagnosis) -> None:
     known = [e[np.isfinite(e)] for e in errors if np.isfinite(e).any()] or [np.zeros(1)]
     floored = np.isfinite(gap.floor) and gap.floor > 0
     fine, small = _pictures.scale([np.full(1, gap.floor)] if floored else known, gap.unit)
+    short = f" {small}" if gap.unit else ""  # that it is not given stands at the axis
     if floored:
         below.axhspan(-2 * fine * gap.floor, 2 * fine * gap.floor, color="0.87", zorder=0,
-                      label=f"±2 x noise floor, {fine * gap.floor:.3g} {small}")  # fmt: skip
+                      label=f"±2 x noise floor, {fine * gap.floor:.3g}{short}")  # fmt: skip
     below.axhline(0, color="0.3", linewidth=0.8)
     for (label, values, size, style), error in zip(cases, errors, strict=True):
-        rms = "none" if np.isnan(size) else f"RMS {fine * size:.3g} {small}"
+        rms = "none" if np.isnan(size) else f"RMS {fine * size:.3g}{short}"
         long = {"before": "recalibrated model", "after": f"with {names}"}.get(label, label)
         # A long prediction is made at some of the samples only.
         made = np.isfinite(error) if gap.kind.endswith("prediction") else slice(None)
