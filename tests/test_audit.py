@@ -415,7 +415,7 @@ def test_an_output_in_other_units_than_the_loop():
         (finding,) = cid.audit(wrong, loop)["operating point"]
         assert finding.harmful
         assert "times as large as where the loop rests, 0.012" in finding.text
-        with pytest.raises(CtrlidError, match="cannot be diagnosed: y is .* other units"):
+        with pytest.raises(CtrlidError, match="other units than the plant counts in"):
             cid.diagnose(loop, wrong, progress=False)
     servo = cid.Loop(cid.plants.servo(m=1.0, c=2.0, k=3.0), cid.PID(kp=5.0), dt=0.01)
     far = cid.simulate(servo, 5.0 + cid.random_binary(1000, amplitude=0.1, hold=50, seed=3))
