@@ -109,13 +109,14 @@ def replay_from_best_state(loop: Loop, record: Record) -> tuple[Array, Array]:
         unlimited = replace(loop, input_limits=(-math.inf, math.inf))
         inside = (record.u > loop.input_limits[0]) & (record.u < loop.input_limits[1])
         free, _ = _controller_run(unlimited, record.y, record.r)
-        moved = _stepped(free, start, record.u, inside)
+        moved = _stepped(free, _slope(free, start.size), start, record.u, inside)
         trial, cost = _compared(run, moved, record)
         if cost < best:
             start, replayed, best = moved, trial, cost
     # Gauss-Newton: one step where the law is linear in its state, a few more around limits.
+    slope, every = _slope(run, start.size), np.full(len(record), True)
     for _ in range(10 if start.size else 0):
-        moved = _stepped(run, start, record.u, np.full(len(record), True))
+        moved = _stepped(run, slope, start, record.u, every)
         trial, cost = _compared(run, moved, record)
         if not cost < best:
             break
@@ -129,11 +130,15 @@ def _compared(run: Any, start: Array, record: Record) -> tuple[Array, float]:
     return replayed, float(np.sum((replayed - record.u) ** 2))
 
 
-def _stepped(run: Any, start: Array, u: Array, use: Any) -> Array:
+def _slope(run: Any, size: int) -> Any:
+    """Return how the outputs of a controller depend on its initial state, as a function of it."""
+    state = casadi.MX.sym("state", size)
+    return casadi.Function("slope", [state], [casadi.jacobian(run(state), state)])
+
+
+def _stepped(run: Any, slope: Any, start: Array, u: Array, use: Any) -> Array:
     """Return a state by one Gauss-Newton step towards a logged input, on the samples to use."""
-    state = casadi.MX.sym("state", start.size)
-    outputs = run(state)
-    slope = casadi.Function("slope", [state], [casadi.jacobian(outputs, state), outputs])
-    jacobian, replayed = (np.asarray(v.full(), float) for v in slope(start))
-    step = np.linalg.lstsq(jacobian[use], (u - replayed.ravel())[use], rcond=1e-12)[0]
+    jacobian = np.asarray(slope(start).full(), float)
+    left = u - np.asarray(run(start), float).ravel()
+    step = np.linalg.lstsq(jacobian[use], left[use], rcond=1e-12)[0]
     return np.asarray(start + step)
