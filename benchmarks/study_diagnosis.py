@@ -673,9 +673,9 @@ def _too_long(*_: Any) -> None:
 
 def run(
     kind: str, band_name: str, seed: int, index: int, classes: Sequence[Any] = CATALOGUE,
-    limit: int = 0, samples: int = SAMPLES,
+    limit: int = 0, samples: int = SAMPLES, known: bool = True,
 ) -> Row:  # fmt: skip
-    """Draw, simulate, diagnose and judge once."""
+    """Draw, simulate, diagnose and judge once, with the controller known or not."""
     warnings.simplefilter("ignore")
     row = Row(kind, band_name, seed, index)
     band = WORTH.get(band_name, (WORTH["moderate"][0], WORTH["ordinary"][1]))
@@ -685,14 +685,14 @@ def run(
         row.truth = (classes[index % len(classes)].__name__,) if kind == "named" else ()
         return row
     describe(row, case)
+    believed = case.one.believed if known else replace(case.one.believed, controller=None)
+    row.extra["known controller"] = known
     started = time.perf_counter()
     try:
         if limit:
             signal.signal(signal.SIGALRM, _too_long)
             signal.alarm(limit)
-        found = cid.diagnose(
-            case.one.believed, case.record, catalogue=case.catalogue, progress=False
-        )
+        found = cid.diagnose(believed, case.record, catalogue=case.catalogue, progress=False)
         signal.alarm(0)
         row.seconds = time.perf_counter() - started
         judge(row, found, case)
@@ -926,6 +926,7 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--limit", type=int, default=0, help="seconds for a diagnosis; 0: none")
     parser.add_argument("--only", nargs="+", type=int, help="numbers of runs")
+    parser.add_argument("--unknown", action="store_true", help="diagnose without the controller")
     parser.add_argument("--out", help="a file to which each run is appended as a line of JSON")
     parser.add_argument("--report", nargs="+", metavar="FILE", help="print the tables of files")
     options = parser.parse_args()
@@ -941,7 +942,8 @@ def main() -> None:
     rows = []
     for row in work(
         joblib.delayed(run)(
-            options.kind, band, options.seed, k, classes, options.limit, options.samples
+            options.kind, band, options.seed, k, classes, options.limit, options.samples,
+            not options.unknown,
         )
         for k in numbers
     ):

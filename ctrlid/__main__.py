@@ -90,21 +90,22 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _natural(text: str) -> int:
-    value = int(text)
-    if value < 0:
+    if not text.isdecimal():
         raise argparse.ArgumentTypeError(f"needs a whole number from 0; given {text}")
-    return value
+    return int(text)
 
 
 def _samples(text: str) -> int:
-    value = int(text)
-    if value < FEWEST:
+    if not text.isdecimal() or int(text) < FEWEST:
         raise argparse.ArgumentTypeError(f"needs at least {FEWEST} samples; given {text}")
-    return value
+    return int(text)
 
 
 def _share(text: str) -> float:
-    value = float(text)
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
     if not (math.isfinite(value) and value >= 0):
         raise argparse.ArgumentTypeError(f"needs a share such as 0.1, not negative; given {text}")
     return value

@@ -60,6 +60,8 @@ def add_parser(commands: Any) -> None:
         help="as for --model, or a PID as in kp=..,ki=..,kd=..; by default unknown")  # fmt: skip
     add("--hold", choices=("zoh", "foh"),
         help="u between samples: held (default), or straight, as of an analog circuit")  # fmt: skip
+    add("--gaps", choices=("error", "mask"), default="error",
+        help="missing samples: refuse the file (default), or leave them out")  # fmt: skip
     add("--validation", type=Path, metavar="FILE2.csv",
         help="a second record, to show the gap on; by default a part of the first")  # fmt: skip
     add("--jobs", type=int, default=None, metavar="N", help="processor cores to use")

@@ -35,12 +35,13 @@ def spoken_record(path: Path, args: argparse.Namespace) -> Record:
         raise CtrlidError(f"--columns names {', '.join(CHANNELS)}, as in --columns u=volt,y=gap; "
                           f"given {unknown[0]}")  # fmt: skip
     try:
-        return Record.from_csv(path, dt=args.dt, hold=args.hold, **args.columns)
+        return Record.from_csv(path, dt=args.dt, hold=args.hold, gaps=args.gaps, **args.columns)
     except CtrlidError as reason:
         text = str(reason)
         for key in CHANNELS:
             text = text.replace(f"with {key}=", f"with --columns {key}=NAME")
         text = text.replace("Give time= or dt=", "Give --columns time=NAME or --dt")
+        text = text.replace("gaps='mask'", "--gaps mask")
         raise CtrlidError(text) from reason
 
 

@@ -6,6 +6,7 @@ import html
 import math
 import re
 import textwrap
+from collections.abc import Sequence
 
 PREFIXES = ((1e-1, 1.0, ""), (1e-4, 1e-3, "m"), (1e-7, 1e-6, "µ"), (0.0, 1e-9, "n"))
 PREFIXED = ("m", "V", "A", "N", "m/s", "m/s^2", "N s/m", "s")
@@ -147,6 +148,40 @@ def shortest(value: float, error: float) -> float:
     """
     short = float(f"{value:.12g}")
     return short if abs(short - value) <= error else value
+
+
+def polynomial(coefficients: Sequence[float], variable: str, digits: int = 6) -> str:
+    """Write a polynomial by falling powers.
+
+    Parameters
+    ----------
+    coefficients : sequence of float
+        Highest power first.
+    variable : str
+        Name of the variable.
+    digits : int, optional
+        Significant digits.
+
+    Returns
+    -------
+    str
+        Zero if all are zero.
+
+    Examples
+    --------
+    >>> polynomial([2.0, -1.0, 0.0, 0.5], "s"), polynomial([-1, 0, 1], "z"), polynomial([0], "z")
+    ('2 s^3 - s^2 + 0.5', '-z^2 + 1', '0')
+    """
+    text = ""
+    for power, value in zip(range(len(coefficients) - 1, -1, -1), coefficients, strict=True):
+        if value == 0:
+            continue
+        times = {0: "", 1: variable}.get(power, f"{variable}^{power}")
+        size = "" if times and abs(value) == 1 else f"{abs(value):.{digits}g}"
+        sign = "-" if value < 0 else "+"
+        text += f" {sign} " if text else sign.strip("+")
+        text += f"{size} {times}".strip()
+    return text or "0"
 
 
 def listing(items: list[str] | tuple[str, ...]) -> str:

@@ -1,5 +1,6 @@
 """redesign(): a controller designed on an identified model, and what it does on the physics."""
 
+import math
 from dataclasses import dataclass, replace
 from numbers import Real
 from typing import Any
@@ -7,7 +8,7 @@ from typing import Any
 import control as ct
 import numpy as np
 
-from ._text import Printed
+from ._text import Printed, polynomial, quantity
 from .equations import Array
 from .errors import CtrlidError
 from .lead import design_lead
@@ -37,10 +38,12 @@ class Performance:
         Smallest phase margin [deg]; NaN for an unstable loop.
     gain_margin : float
         Factor by which the gain may grow; infinite if any may.
+    gain_reduction_margin : float
+        Factor to which the gain may fall, below one: an unstable plant needs its loop gain.
     crossover : float
         Gain crossover [rad/s].
     overshoot : float
-        Of a small reference step, in percent of the final value.
+        Of a reference step, in percent of the final value. On the physics the step has a height.
     settling_time : float
         Until the step response stays within 2 % of its final value [s]; infinite if it never does.
     final_value : float
@@ -50,6 +53,7 @@ class Performance:
     stable: bool
     phase_margin: float
     gain_margin: float
+    gain_reduction_margin: float
     crossover: float
     overshoot: float
     settling_time: float
@@ -118,7 +122,8 @@ class Redesign(Printed):
         elif abs(shift) > CLOSE:
             text += f": the margin holds, but THE CROSSOVER IS OFF BY {100 * shift:+.0f} %."
         else:
-            text += ": the promise holds."
+            worst = max(loss / p.phase_margin, abs(shift))
+            text += f": the promise holds within {max(math.ceil(100 * worst), 1)} %."
         if not a.stable:
             text += (f" That is for small signals: A STEP OF {self.step:.3g} LOSES CONTROL. "
                      f"{self.failure}")  # fmt: skip
@@ -138,6 +143,7 @@ class Redesign(Printed):
         for label, name, form in (
             ("phase margin [deg]", "phase_margin", ".2f"),
             ("gain margin [factor]", "gain_margin", ".3f"),
+            ("gain reduction margin [factor]", "gain_reduction_margin", ".3f"),
             ("crossover [rad/s]", "crossover", ".2f"),
             ("final value per step", "final_value", ".3f"),
             ("overshoot [%]", "overshoot", ".2f"),
@@ -152,11 +158,16 @@ class Redesign(Printed):
 
     def __str__(self) -> str:
         rows = [
-            f"  {a:<24}{b:>12}{c:>12}" for a, b, c in (("", "promised", "achieved"), *self.rows)
+            f"  {a:<32}{b:>12}{c:>12}" for a, b, c in (("", "promised", "achieved"), *self.rows)
         ]
-        num, den = (" ".join(f"{c:.6g}" for c in p[0][0])
+        variable = "z" if self.controller.dt else "s"
+        num, den = (polynomial(p[0][0], variable)
                     for p in (self.controller.num, self.controller.den))  # fmt: skip
-        return "\n".join([f"controller: ({num}) / ({den})", *rows, "  " + self.verdict])
+        loop = self.loop
+        unit = getattr(loop.plant, "units", {}).get(loop.equations().outputs[0], "")
+        step = (f"  The last three were achieved with a step of {quantity(self.step, unit)} on the "
+                "nonlinear physics; a smaller step= comes nearer to the promise.")  # fmt: skip
+        return "\n".join([f"controller: ({num}) / ({den})", *rows, step, "  " + self.verdict])
 
 
 def redesign(
@@ -232,7 +243,7 @@ def redesign(
     margins = loop_margins(P * C)
     growth = growth_rate(trial)
     if growth >= 0 or not margins.stable:
-        achieved = Performance(False, *(float("nan"),) * 6)
+        achieved = Performance(False, *(float("nan"),) * 7)
         if "deviations grow" not in failure:
             # Dry friction holds what is at rest; the loop around it may be unstable all the same.
             why = (f"Small deviations grow at {growth:.3g} 1/s." if growth >= 0 else
@@ -276,7 +287,7 @@ def _physical_step(loop: Loop, height: float, promised: Array) -> tuple[Array, s
         moved = simulate(loop, rest + height)
     except CtrlidError as reason:
         text = str(reason)
-        return np.empty(0), text[0].upper() + text[1:] + "."
+        return _until_broken(loop, rest, height), text[0].upper() + text[1:] + "."
     response: Array = np.asarray((moved.y - still.y) / height, dtype=float)
     far = np.abs(response) > LOST * np.max(np.abs(promised))
     if not far.any():
@@ -289,6 +300,21 @@ def _physical_step(loop: Loop, height: float, promised: Array) -> tuple[Array, s
     return response[: k + 1], text + "."
 
 
+def _until_broken(loop: Loop, rest: Array, height: float) -> Array:
+    """Return the step response up to where its simulation breaks off, empty where none begins."""
+    response: Array = np.empty(0)
+    good, bad = 1, len(rest)
+    while bad - good > 1:
+        n = (good + bad) // 2
+        try:
+            still, moved = (simulate(loop, r[:n]) for r in (rest, rest + height))
+        except CtrlidError:
+            bad = n
+            continue
+        good, response = n, np.asarray((moved.y - still.y) / height, dtype=float)
+    return response
+
+
 def _performance(margins: Any, time: Array, response: Array) -> Performance:
     overshoot = settling = final = float("nan")
     if margins.stable and response.size:
@@ -299,4 +325,5 @@ def _performance(margins: Any, time: Array, response: Array) -> Performance:
             last = int(outside[-1]) + 1 if outside.size else 0
             settling = float(time[last]) if last < len(time) else float("inf")
     return Performance(margins.stable, margins.phase_margin, margins.gain_margin,
-                       margins.crossover, overshoot, settling, final)  # fmt: skip
+                       margins.gain_reduction_margin, margins.crossover, overshoot, settling,
+                       final)  # fmt: skip

@@ -132,9 +132,15 @@ def sweep_sampling_period(
     done = [row for row in rows if not row.failure]
     if not done:
         raise CtrlidError(f"no fit succeeded at any period; the first one: {rows[0].failure}")
-    centre = min(done, key=lambda row: _middle(row.poles, done)).poles
+    # A fit whose one-step errors follow u or r leaves dynamics out, and has no vote.
+    sound = [row for row in done if row.independent]
+    voters = sound or done
+    centre = min(voters, key=lambda row: _middle(row.poles, voters)).poles
     rows = [_rated(row, centre) for row in rows]
-    best, reason = _recommend(rows, names)
+    best, reason = _recommend(rows, names, "sound rows" if sound else "rows")
+    reason += (" Sound are those whose one-step errors are independent of u and r." if sound else
+               " In no row are the one-step errors known to be independent of u and r: MOST ROWS "
+               "MAY AGREE ON WRONG POLES.")  # fmt: skip
     warning = ""
     if max(factors) > 1:
         what = (
@@ -252,7 +258,9 @@ def _rated(row: SamplingRow, centre: Any) -> SamplingRow:
     return replace(row, deviation=_distance(row.poles, centre))
 
 
-def _recommend(rows: Sequence[SamplingRow], names: Sequence[str]) -> tuple[float, str]:
+def _recommend(
+    rows: Sequence[SamplingRow], names: Sequence[str], voters: str
+) -> tuple[float, str]:
     """Return the period at which the worst estimator is least off, and the words for it."""
     worst: dict[float, float] = {}
     for row in rows:
@@ -269,9 +277,9 @@ def _recommend(rows: Sequence[SamplingRow], names: Sequence[str]) -> tuple[float
             words.append(f"{name} at {reach} s ({len(good)} of {tried})")
         else:
             words.append(f"{name} AT NONE")
-    off = "more than all of it" if worst[best] >= 1 else f"{100 * worst[best]:.2g} %"
+    off = "more than all" if worst[best] >= 1 else f"{100 * worst[best]:.2g} %"
     return best, (
-        f"Recommended: {best:.4g} s, where the farthest estimate is off by {off} of the largest "
-        f"pole. Within {100 * AGREES:.0f} % of the poles on which most rows agree: "
-        f"{'; '.join(words)}."
+        f"Recommended: {best:.4g} s, where the farthest estimate differs by {off} of the largest "
+        f"pole from the poles on which most {voters} agree. Within {100 * AGREES:.0f} % of these "
+        f"poles: {'; '.join(words)}."
     )

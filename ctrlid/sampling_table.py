@@ -43,7 +43,8 @@ class SamplingRow:
     active : tuple of str
         Inequalities on which the estimate sits.
     deviation : float
-        Ratio: largest distance of a pole to that of the whole table, over the largest of those.
+        Ratio: largest distance of a pole to that of the whole table, over the largest of those,
+        printed as "differs".
     failure : str
         Why there is no fit; empty if there is one.
     notes : tuple of str
@@ -81,7 +82,8 @@ class SamplingSweep(Printed):
     table : tuple of SamplingRow
         One row for each period and estimator, shortest period first.
     poles : ndarray of complex
-        The poles on which most rows agree [rad/s].
+        The poles on which most rows agree [rad/s], of those whose one-step errors are independent
+        of u and r where there are any.
     recommended : float
         The sampling period at which the estimators differ least [s].
     reason : str
@@ -111,7 +113,7 @@ class SamplingSweep(Printed):
         lines = [f"Sampling period of {self.record.name or 'the record'}: {self.record.n} samples "
                  f"at {self.record.dt:g} s",
                  f"  {'Ts [s]':>9} {'p Ts':>7}  {'estimator':<15}{'samples':>8}  "
-                 f"{'poles [rad/s]':<34}{'off by':>8}  one-step errors"]  # fmt: skip
+                 f"{'poles [rad/s]':<34}{'differs':>8}  one-step errors"]  # fmt: skip
         for row in self.table:
             head = (f"  {row.period:>9.4g} {largest * row.period:>7.3g}  {row.estimator:<15}"
                     f"{row.n:>8}  ")  # fmt: skip

@@ -115,6 +115,17 @@ def test_what_is_taken_without_saying(folder, asked, record):
     assert asked[1][0].free == ()
 
 
+def test_a_file_with_lost_samples(folder, asked, record, capsys):
+    lines = (folder / "log.csv").read_text().splitlines()
+    (folder / "lost.csv").write_text("\n".join(lines[:501] + lines[511:]) + "\n")
+    assert run("lost.csv", *COLUMNS, *SERVO) == 1
+    assert "lacks 10 samples in one place" in (said := capsys.readouterr().err)
+    assert "Give --gaps mask" in said
+    assert run("lost.csv", *COLUMNS, *SERVO, "--gaps", "mask") == 0
+    ((_, read, _),) = asked
+    assert (len(read), int((~read.valid).sum())) == (len(record), 10)
+
+
 def test_a_plant_that_is_not_defined_at_zero(folder, asked):
     arguments = ("bare.csv", "--dt", DT, "--model", "maglev", "--param", "m=0.0213", "K=3.34e-6")
     assert run(*arguments, "--at-output", 0.012) == 0

@@ -106,8 +106,10 @@ def short(monkeypatch):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [(["--samples", "10"], "needs at least 500 samples; given 10"),
-     (["--samples", "many"], "invalid _samples value: 'many'"),
      (["--seed", "-1"], "needs a whole number from 0; given -1"),
+     (["--seed", "x"], "needs a whole number from 0; given x"),
+     (["--samples", "many"], "needs at least 500 samples; given many"),
+     (["--noise", "loud"], "needs a share such as 0.1, not negative; given loud"),
      (["--noise", "-0.1"], "needs a share such as 0.1, not negative; given -0.1"),
      (["--noise", "nan"], "given nan"), (["--nonsense"], "unrecognized arguments: --nonsense"),
      (["nonsense"], "invalid choice: 'nonsense' (choose from ")],

@@ -325,8 +325,9 @@ def test_step_shows_promise_and_achievement(outcome):
 
 def test_step_says_when_the_physics_is_lost(outcome):
     lost = replace(outcome.achieved, stable=False)
-    ax = plot.step(replace(outcome, achieved=lost, achieved_step=np.empty(0)))
-    assert legend(ax)[1] == "achieved on the physics: UNSTABLE, the simulation breaks off"
+    ax = plot.step(replace(outcome, achieved=lost, achieved_step=outcome.achieved_step[:4]))
+    assert legend(ax)[1] == f"achieved on the physics: UNSTABLE, lost after {outcome.time[4]:.2g} s"
+    assert len(ax.lines[1].get_ydata()) == 4
     never = replace(outcome.promised, settling_time=np.inf)
     endless = replace(outcome, promised=never, achieved=never)
     assert plot.step(endless).get_xlim()[1] >= outcome.time[-1]

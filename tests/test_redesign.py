@@ -19,7 +19,8 @@ P = cid.linearize(PLANT, AT)
 DT = 1e-3
 LOOP = cid.Loop(PLANT, None, dt=DT, at=AT)
 SAMPLED = ct.tf(ct.sample_system(ct.ss(ct.tf(P.num, P.den)), DT))
-NUMBERS = ("phase_margin", "gain_margin", "crossover", "final_value", "overshoot", "settling_time")
+NUMBERS = ("phase_margin", "gain_margin", "gain_reduction_margin", "crossover", "final_value",
+           "overshoot", "settling_time")  # fmt: skip
 
 
 def gain(factor):
@@ -164,7 +165,10 @@ def test_a_step_too_large_for_the_physics():
     found = cid.redesign(P, LOOP, crossover=100, phase_margin=50, step=-0.009)
     assert not found.stable
     assert "A STEP OF -0.009 LOSES CONTROL. The simulation stops at t = " in found.verdict
-    assert found.achieved_step.size == 0
+    # What there is before the ball is lost is shown: every sample until the one of the message.
+    assert f"(sample {found.achieved_step.size})" in found.verdict
+    assert found.achieved_step[0] == pytest.approx(0)
+    assert np.all(np.diff(found.achieved_step) > 0)
 
 
 def test_a_response_that_never_settles_is_said():
@@ -179,13 +183,14 @@ def test_a_response_that_never_settles_is_said():
 
 def test_the_report():
     text = str(cid.redesign(P, LOOP, crossover=100, phase_margin=50)).splitlines()
-    assert text[0] == "controller: (-4890.28 -177992) / (1 274.748)"
+    assert text[0] == "controller: (-4890.28 s - 177992) / (s + 274.748)"
     assert text[1].split() == ["promised", "achieved"]
     assert text[2].split() == ["phase", "margin", "[deg]", "50.00", "50.00"]
-    assert [line.split("  ")[1] for line in text[2:8]] == [
-        "phase margin [deg]", "gain margin [factor]", "crossover [rad/s]", "final value per step",
-        "overshoot [%]", "settling time [s]",
+    assert [line.split("  ")[1] for line in text[2:9]] == [
+        "phase margin [deg]", "gain margin [factor]", "gain reduction margin [factor]",
+        "crossover [rad/s]", "final value per step", "overshoot [%]", "settling time [s]",
     ]  # fmt: skip
+    assert "a step of 0.12 mm on the nonlinear physics" in text[-2]
     assert text[-1].startswith("  Promised 50.0 deg at 100 rad/s, achieved 50.0 deg at 100 rad/s")
 
 

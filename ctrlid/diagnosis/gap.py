@@ -124,14 +124,21 @@ def _steps(kind: str) -> int:
     return int(kind.partition("-")[0])
 
 
-def drive(simulator: Simulator, part: Record) -> tuple[Array, Array | None, Array]:
-    """Return initial state, reference and injected signal for one stretch."""
+def drive(
+    simulator: Simulator, part: Record, follows: bool = False
+) -> tuple[Array, Array | None, Array]:
+    """Return initial state, reference and injected signal for one stretch.
+
+    Where the controller `follows` the record, the reference is its output.
+    """
     loop = simulator.loop
     n = len(simulator.plant_states)
     guess = simulator.rest.copy()
     guess[: len(loop.point.states)] = loop.point.states
     if loop.controller is None:
         r, d = None, part.u - loop.point.input
+    elif follows:
+        r, d = np.asarray(part.y), part.u - loop.point.input
     elif loop.analog:
         r, d = np.asarray(part.r), np.zeros(len(part))
     else:

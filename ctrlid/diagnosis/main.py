@@ -20,7 +20,7 @@ from ..records import as_records
 from .assembly import name_of, put_together
 from .closing import gaps_of, helps_on, wider
 from .decide import GATE
-from .fitted import Model, base_model, simulable, weighted_by_repeats
+from .fitted import Model, base_model, weighted_by_repeats
 from .fresh import Fresh, fresh_data, stretches
 from .intake import as_loop, look_over, repeat_periods
 from .readout import Readout, censored, clipping, steps
@@ -163,7 +163,7 @@ def _diagnosed(
         found = min(ways, key=lambda s: (not s.after.passed, fresh.gap(fresh.loops(s.final))))
     tell("comparing on fresh data", 2)
     coarse = steps(found.final.fit, audits, catalogue)
-    if coarse and not found.after.passed and simulable(found.final):
+    if coarse and not found.after.passed:
         copies = [replica(_rounded(found.final, coarse), seed) for seed in (1, 2)]
         found = replace(found, after=forgiven(found.after, copies))
     tell("comparing names")

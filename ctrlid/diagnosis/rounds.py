@@ -15,7 +15,7 @@ from ..loop import Loop
 from ..maximum import promised
 from .attempts import attempt_at, refit
 from .decide import GATE
-from .fitted import Model, quiet, simulable
+from .fitted import Model, quiet
 from .replica import DOUBTFUL, TWICE, artefact, kinked, more_than_simple, replica
 from .scan import elsewhere, scanned
 from .trial import Trial, comparable, contains, same_kind
@@ -91,11 +91,13 @@ def one_round(
     tried.sort(key=lambda t: -t.promise)
     if not tried or not math.isfinite(tried[0].promise):
         return Step(base, tuple(tried), None)
-    trials = _refitted(base, tried, more, work)
-    trials = _simplest(base, _checked(base, trials))
+    copies: list[Model | None] = []
+    trials = _checked(base, _refitted(base, tried, more, work), copies)
+    trials = _simplest(base, trials)
     plain = plainer(base, trials[0], trials[1:])
     if plain is not trials[0]:
         trials = [plain, *(t for t in trials if not same_kind(t.effect, plain.effect))]
+        trials = _checked(base, trials, copies)
     best = trials[0]
     trials = [*trials[:NEXT], *map(comparable, trials[NEXT:])]
     return Step(base, tuple(trials), best if best.merit > GATE else None)
@@ -174,7 +176,7 @@ def _simplest(base: Model, trials: list[Trial]) -> list[Trial]:
     best = trials[0]
     for simple in trials[1:NEXT]:
         fewer = len(simple.effect.parameters()) < len(best.effect.parameters())
-        if not fewer or simple.merit <= GATE or not simulable(base):
+        if not fewer or simple.merit <= GATE:
             continue
         if best.gain - simple.gain > 0.1 * best.gain or simple.name not in best.effect.look_alikes:
             continue
@@ -184,16 +186,19 @@ def _simplest(base: Model, trials: list[Trial]) -> list[Trial]:
     return trials
 
 
-def _checked(base: Model, trials: list[Trial]) -> list[Trial]:
-    """Put out what gains as much on records in which it is known not to be."""
-    copies: list[Model | None] = []
+def _checked(base: Model, trials: list[Trial], copies: list[Model | None]) -> list[Trial]:
+    """Put out what gains as much on records in which it is known not to be.
+
+    The `copies` are made when the first candidate needs them.
+    """
     for _ in range(NEXT):
         trials.sort(key=lambda t: (-t.merit, -t.promise))
         best = trials[0]
         sure = best.gain > DOUBTFUL and not base.loop.effects
-        if best.merit <= GATE or sure or not simulable(base):
+        if best.merit <= GATE or sure:
             break
-        copies = copies or [replica(base, seed) for seed in range(2 if kinked(base) else 1)]
+        if not copies:
+            copies += [replica(base, seed) for seed in range(2 if kinked(base) else 1)]
         if best.merit - TWICE * artefact(copies, best) > GATE:
             break
         trials[0] = replace(

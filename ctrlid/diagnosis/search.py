@@ -183,7 +183,7 @@ def excess(fit: Fit) -> float:
 def _judged(model: Model) -> Omnibus:
     """Return the tests of what a model leaves, without the alarms of the filter itself."""
     after = omnibus(model.fit)
-    if not after.passed and simulable(model):
+    if not after.passed:
         copies = [replica(model, seed) for seed in (1, 2)]
         after = forgiven(after, copies, WITH_EFFECTS if model.loop.effects else ALPHA)
     return after

@@ -70,7 +70,9 @@ def _step(ax: Any, redesign: Redesign) -> float:
              ("achieved on the physics", redesign.achieved, redesign.achieved_step))  # fmt: skip
     for i, (what, performance, values) in enumerate(cases):
         if not performance.stable:
-            label = f"{what}: UNSTABLE" + ("" if len(values) else ", the simulation breaks off")
+            label = f"{what}: UNSTABLE"
+            if len(values) < len(redesign.time):
+                label += f", lost after {redesign.time[len(values)]:.2g} s"
         elif not np.isfinite(performance.settling_time):
             label = f"{what}: DOES NOT SETTLE"
         else:
