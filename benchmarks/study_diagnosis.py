@@ -644,9 +644,10 @@ def fresh_ratio(found: Any, case: Case) -> float:
     if case.spread:
         return math.nan
     one, quiet = case.one, Noise(0.0)
+    whole = replace(found.loop, controller=one.loop.controller)
     try:
         y = one.run(case.real, case.seed + 1).y
-        made = [one.run(loop, case.seed + 1, quiet).y for loop in (found.loop, case.truth.fitted)]
+        made = [one.run(loop, case.seed + 1, quiet).y for loop in (whole, case.truth.fitted)]
     except cid.CtrlidError:
         return math.nan
     later = slice(len(y) // 20, None)  # equivalent effects start from different places

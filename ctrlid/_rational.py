@@ -193,7 +193,7 @@ def same_time_base(first: Rational, second: Rational, names: str) -> None:
 
 def product(first: FloatArray, second: FloatArray) -> FloatArray:
     """Return the product of two polynomials."""
-    return np.asarray(np.polymul(first, second), dtype=float)
+    return np.convolve(first, second)
 
 
 def roots(polynomial: npt.ArrayLike) -> ComplexArray:

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import control as ct
@@ -29,7 +30,7 @@ class _Task:
     crossover: float
     phase_margin: float
 
-    @property
+    @cached_property
     def target(self) -> complex:
         """The value the compensator must have at the crossover."""
         turn = complex(np.exp(1j * math.radians(self.phase_margin)))
