@@ -32,7 +32,7 @@ class Search:
     """The end of a search: the base, the rounds, the final model and its effects.
 
     Where the choice of a round was taken back for a better pair, `other` are the rounds of the way
-    that was left, with the one that showed it.
+    that was left first, with the one that showed it.
     """
 
     base: Model
@@ -90,7 +90,7 @@ def search(
         better = _foreseen(steps[-1], step, catalogue, work) if asked else None
         changed = better is not None
         if changed:
-            left = (*steps, step)
+            left = left or (*steps, step)
             steps[-1] = replace(steps[-1], best=better)
         else:
             steps.append(step)

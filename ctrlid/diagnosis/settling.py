@@ -75,6 +75,7 @@ def compared(
         there = {type(e).__name__ for e in smaller.loop.effects}
         rest = [t for t in _close(mine, steps) if t.name not in there]
         again = work(lambda t, smaller=smaller: refit(smaller, attempt_at(smaller, t.fitted)), rest)
+        again = [t for t in again if _on_bounds(t.model) <= _on_bounds(mine.model)]
         best = max([mine, *again], key=lambda t: t.merit)
         if best.merit <= mine.merit + 1.0:
             best = mine
@@ -123,6 +124,13 @@ def _without(model: Model, positions: Sequence[int]) -> Model:
     if not math.isfinite(fit.value):  # with noise as small as that, it cannot follow the record
         fit = begin(fit.problem, fit.theta, None)
     return Model(loop, fit)
+
+
+def _on_bounds(model: Model) -> set[str]:
+    """Return the plant's own parameters that are as far from their given values as is allowed."""
+    problem, theta = model.fit.problem, model.fit.theta
+    ends = zip(model.names, theta, problem.lower, problem.upper, strict=True)
+    return {name for name, v, low, high in ends if "." not in name and v in (low, high)}
 
 
 def _close(mine: Trial, steps: Sequence[Step]) -> list[Trial]:
