@@ -36,7 +36,7 @@ def following(loop: Loop, record: Record) -> Loop | None:
 
     References
     ----------
-    Jonckheere and Silverman, IEEE Transactions on Automatic Control 28 (1983) 944-961.
+    Jonckheere and Silverman, IEEE Transactions on Automatic Control 28 (1983) 953-964.
     """
     try:
         plant = ct.ss(loop.linearize())

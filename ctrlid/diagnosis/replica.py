@@ -103,8 +103,15 @@ def artefact(copies: Sequence[Model | None], trial: Trial) -> float:
     float
         Gain of log-likelihood, zero at least.
     """
-    again = [refit(c, attempt_at(c, trial.fitted, trial.scan)) for c in copies if c is not None]
-    return max([0.0, *(t.gain for t in again if math.isfinite(t.merit))])
+    gains = [0.0]
+    for copy in copies:
+        if copy is None:
+            continue
+        again = refit(copy, attempt_at(copy, trial.fitted, trial.scan))
+        if not again.gain > 0:  # from there dry friction may have led it another way
+            again = refit(copy, attempt_at(copy, trial.effect, trial.scan))
+        gains.append(again.gain if math.isfinite(again.gain) else 0.0)
+    return max(gains)
 
 
 def more_than_simple(base: Model, best: Trial, simple: Trial) -> bool:

@@ -25,6 +25,8 @@ TOP = 5  # candidates refitted because of what they promise
 SHARE = 0.2  # of the best promise: what promises more is refitted as well
 FAINT = 0.5  # of what would earn a place: a fainter promise is not worth a refit
 OFFSETS = (SensorOffset,)
+SLIGHT = 30.0  # a merit below this, beside a kink, is compared with
+MANY = 4  # replicas
 
 Work = Callable[[Callable[..., Any], Iterable[Any]], list[Any]]
 Job = tuple[Trial, Trial | AbstractEffect, Model | None]  # whose fit, from where, near what
@@ -197,8 +199,8 @@ def _checked(base: Model, trials: list[Trial], copies: list[Model | None]) -> li
         sure = best.gain > DOUBTFUL and not base.loop.effects
         if best.merit <= GATE or sure:
             break
-        if not copies:
-            copies += [replica(base, seed) for seed in range(2 if kinked(base) else 1)]
+        enough = (MANY if best.merit < SLIGHT else 2) if kinked(base) else 1
+        copies += [replica(base, seed) for seed in range(len(copies), enough)]
         if best.merit - TWICE * artefact(copies, best) > GATE:
             break
         trials[0] = replace(
