@@ -68,4 +68,4 @@ limits = [f.effect for f in found.findings if f.name == "StateLimit"]
 assert found.verdict == "partly explained"
 assert any(e.name == "h1" and e.spill_to == "h2" for e in limits)
 assert "SensorSaturation" in [f.name for f in found.findings]
-assert found.gap.after < 0.30
+assert found.gap.after < 0.33  # of the published neural network
