@@ -943,7 +943,13 @@ def main() -> None:
     rows = []
     for row in work(
         joblib.delayed(run)(
-            options.kind, band, options.seed, k, classes, options.limit, options.samples,
+            options.kind,
+            band,
+            options.seed,
+            k,
+            classes,
+            options.limit,
+            options.samples,
             not options.unknown,
         )
         for k in numbers

@@ -258,9 +258,7 @@ def _rated(row: SamplingRow, centre: Any) -> SamplingRow:
     return replace(row, deviation=_distance(row.poles, centre))
 
 
-def _recommend(
-    rows: Sequence[SamplingRow], names: Sequence[str], voters: str
-) -> tuple[float, str]:
+def _recommend(rows: Sequence[SamplingRow], names: Sequence[str], voters: str) -> tuple[float, str]:
     """Return the period at which the worst estimator is least off, and the words for it."""
     worst: dict[float, float] = {}
     for row in rows:

@@ -64,8 +64,8 @@ def constancy(fit: Fit, axes: Mapping[str, Array]) -> dict[str, float]:
                     stats.chi2.sf(np.sum(score[use] ** 2 / size[use]), use.sum())
                 )
     for j, name in enumerate(names):
-        lines = [_slow_line(x[:, j] * e / s, size, keep) for x, e, s, keep in parts
-                 if (size := float(np.sum(x[:, j] ** 2 / s))) > 0]  # fmt: skip
+        lines = [_slow_line(x[:, j] * e / s, whole, keep) for x, e, s, keep in parts
+                 if (whole := float(np.sum(x[:, j] ** 2 / s))) > 0]  # fmt: skip
         if lines:
             p_values[f"rhythm of {name}"] = min(1.0, min(lines) * len(lines))
     return p_values
