@@ -41,8 +41,8 @@ model = cid.Loop(plant, None, dt=record.dt, at=at, free=("K",))
 # What is missing?
 # ----------------
 # A lag between the duty and what the sensor shows, of the actuator or of the sensor, which one
-# swing does not tell apart; and the law of the force in the gap. A small friction is named beside
-# them, in air, or a force at 32 Hz, which others have seen in this rig. Something is left.
+# swing does not tell apart; and the law of the force in the gap, another zero or another power. A
+# small friction is named beside them, in air, which may stand in for what is left.
 
 found = cid.diagnose(model, record, progress=False)
 print(found)
@@ -76,7 +76,8 @@ plt.show()
 
 # %%
 # How large the lag comes out depends on what stands beside it, since the law of the force is only
-# nearly right. With another zero of the law alone, and no friction:
+# nearly right: with a friction it is 30 to 33 ms, whichever law is taken. With another zero of the
+# law alone, and no friction:
 
 beside = model.with_effect(cid.effects.ActuatorLag(tau=mine.tau))
 beside = beside.with_effect(cid.effects.PositionOffset(offset=0.002))
@@ -87,7 +88,7 @@ print(f"lag beside another zero of the law {1e3 * beside_zero:.1f} ms")
 # %%
 # What the name is worth
 # ----------------------
-# A lead with a crossover of 60 rad/s and a phase margin of 20 degrees, at 1 ms: designed once on
+# A lead with a crossover of 50 rad/s and a phase margin of 20 degrees, at 1 ms: designed once on
 # the model as given, once on the diagnosed one, and both tried on the diagnosed physics. A single
 # lead cannot promise much more: the lag has taken the phase.
 
@@ -98,7 +99,7 @@ for effect in (mine if f is lag else f.effect for f in found.findings):
 outcomes = {}
 for name, loop in {"as given": given, "diagnosed": physics}.items():
     G = ct.tf(ct.sample_system(ct.ss(loop.linearize()), 0.001, "zoh"))
-    outcomes[name] = cid.redesign(G, physics, crossover=60, phase_margin=20)
+    outcomes[name] = cid.redesign(G, physics, crossover=50, phase_margin=20)
     print(f"designed on the model {name}: {outcomes[name].verdict}")
 
 cid.plot.step({f"designed on the model {name}": o for name, o in outcomes.items()})
@@ -107,6 +108,6 @@ plt.show()
 assert outcomes["diagnosed"].achieved.stable
 assert not outcomes["as given"].achieved.stable
 assert found.verdict == "partly explained"
-assert abs(mine.tau - 0.0249) < 0.004
+assert 0.0249 < mine.tau < 0.033
 assert abs(beside_zero - 0.0249) < 0.004
 assert found.gap.after < 0.1 * found.gap.given
