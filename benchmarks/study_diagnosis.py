@@ -6,10 +6,12 @@ kinds are
 - ``named``: one effect of the catalogue, every class in turn, of a size drawn by what it is worth:
   the gain of log-likelihood of a refit that knows what is hidden (``--worth faint``, 50 to 300,
   ``moderate``, 300 to 3 000, ``ordinary``, 3 000 to 30 000);
-- ``none``: nothing is hidden; ``two``, ``three``: several effects at once;
+- ``none``: nothing is hidden; ``inside``: nothing either, and the model has an effect, every class
+  in turn, at its true values; ``two``, ``three``: several effects at once;
 - ``outside``: something that the catalogue does not have, or a member taken out of it;
 - ``lookalike``: a set of names, and then the recommended experiment.
 
+With ``--unknown`` the diagnosis is not told the controller.
 ``--out FILE`` keeps the runs as lines of JSON, and ``--report FILE...`` prints their tables again.
 Each run draws plant, controller, reference, noise and effect from its own seed; a third have a
 coloured random force. Free parameters are believed up to 10 % off. Seeds of tests are others.
@@ -52,7 +54,7 @@ from ctrlid.diagnosis.fitted import Model, base_model
 from ctrlid.diagnosis.trial import contains
 from ctrlid.effects import CATALOGUE, AbstractEffect, equivalents
 
-KINDS = ("named", "none", "outside", "two", "three", "lookalike")
+KINDS = ("named", "none", "outside", "two", "three", "lookalike", "inside")
 WORTH = {"faint": (50.0, 300.0), "moderate": (300.0, 3e3), "ordinary": (3e3, 3e4)}
 TRIES = 40  # draws until one can carry an effect of the wanted worth
 ROUNDS = 9  # of finding its size
@@ -435,7 +437,15 @@ def _case(
     cls = classes[index % len(classes)]
     one = draw(rng, a_plant(rng, plants_for(cls)), coloured, samples)
     made = _made(cls, one, rng, number)
-    return made and sized(one, made, band, target, number)
+    case = made and sized(one, made, band, target, number)
+    return _inside(case) if case and kind == "inside" else case
+
+
+def _inside(case: Case) -> Case:
+    """Return a case whose model has what was to be hidden: nothing is missing then."""
+    (effect,) = case.effects
+    model = case.one.believed.with_effect(effect)
+    return replace(case, one=replace(case.one, believed=model), effects=(), label=key(effect))
 
 
 def _made(cls: Any, one: Draw, rng: np.random.Generator, number: int) -> Any:
@@ -577,7 +587,7 @@ class Row:
         mark = "right" if self.right else "WRONG"
         if self.kind == "outside" and self.verdict in ("unknown", "partly explained"):
             mark = "not taken for known"
-        elif self.kind == "none" and self.verdict == "nothing missing":
+        elif self.kind in ("none", "inside") and self.verdict == "nothing missing":
             mark = "right"
         elif self.in_set and not self.right:
             mark = "in set" if self.verdict == "explained" else "in set, DOWNGRADED"
@@ -769,13 +779,14 @@ def report(rows: Sequence[Row]) -> None:
         some = [r for r in done if r.kind == "named" and r.worth_class == worth_class]
         if some:
             lines += _named(worth_class, some)
-    none = [r for r in done if r.kind == "none"]
-    if none:
-        lines += [
-            ("none: any name given", "<= 1 %", share([r.named for r in none])),
-            ("none: a needless unknown", "<= 2 %",
-             share([r.verdict not in ("nothing missing", "explained") for r in none])),
-        ]  # fmt: skip
+    for kind in ("none", "inside"):
+        some = [r for r in done if r.kind == kind]
+        if some:
+            lines += [
+                (f"{kind}: any name given", "<= 1 %", share([r.named for r in some])),
+                (f"{kind}: a needless unknown", "<= 2 %",
+                 share([r.verdict not in ("nothing missing", "explained") for r in some])),
+            ]  # fmt: skip
     outside = [r for r in done if r.kind == "outside"]
     if outside:
         open_end = [r.verdict in ("unknown", "partly explained") for r in outside]
@@ -934,7 +945,9 @@ def main() -> None:
     if options.report:
         report(read(options.report))
         return
-    band = options.worth or {"named": "moderate", "lookalike": "moderate"}.get(options.kind, "")
+    band = options.worth or dict.fromkeys(("named", "lookalike", "inside"), "moderate").get(
+        options.kind, ""
+    )
     numbers = options.only or range(options.first, options.first + options.runs)
     classes: Sequence[Any] = CATALOGUE
     if options.kind == "lookalike":
