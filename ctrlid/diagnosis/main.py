@@ -27,7 +27,7 @@ from .readout import Readout, censored, clipping, steps
 from .replica import forgiven, replica
 from .result import Diagnosis, Disturbance
 from .rounds import Work, check_catalogue
-from .search import Search, main_ones, named, search
+from .search import Search, judged, main_ones, named, search
 from .several import merged
 from .simulated_search import search_by_simulation
 
@@ -172,7 +172,7 @@ def _diagnosed(
     alone = len(records) == 1  # an effect of one record only may widen the gap in others
     if alone and found.found and not found.after.passed and wider(gap, disturbance):
         # What names something and leaves more unexplained than before has the wrong name.
-        found = replace(found, final=found.base, found=(), after=found.before)
+        found = replace(found, final=found.base, found=(), after=judged(found.base))
         gap, shares, disturbance = gaps_of(given, found, fresh)
     tell("writing down", 1)
     read += [coarse] if coarse else []

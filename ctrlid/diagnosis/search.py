@@ -95,7 +95,7 @@ def search(
         else:
             steps.append(step)
     model, found = settled(model, given, steps)
-    tests = omnibus(base.fit), _judged(model)
+    tests = omnibus(base.fit), judged(model)
     return Search(base, tuple(steps), model, found, *tests, left)
 
 
@@ -103,7 +103,7 @@ def named(found: Search, work: Work) -> Search:
     """Return the search with what could stand in the place of each effect."""
     given = len(found.base.loop.effects)
     model, each = compared(found.final, found.found, given, found.steps, work)
-    after = found.after if model is found.final else _judged(model)
+    after = found.after if model is found.final else judged(model)
     return replace(found, final=model, found=each, after=after)
 
 
@@ -124,7 +124,7 @@ def _stands_in(best: Trial, model: Model, beside: bool) -> bool:
     if not (beside and simulable(model)) or best.gain >= SMALL * omnibus(model.fit).told:
         return False
     # The tests may be alarmed by the filter itself: replicas, which take their time, forgive that.
-    return best.gain < SMALL * _judged(model).told
+    return best.gain < SMALL * judged(model).told
 
 
 def _foreseen(
@@ -180,7 +180,7 @@ def excess(fit: Fit) -> float:
     return max(0.0, 0.5 * float(np.nansum(z**2 - 1)))
 
 
-def _judged(model: Model) -> Omnibus:
+def judged(model: Model) -> Omnibus:
     """Return the tests of what a model leaves, without the alarms of the filter itself."""
     after = omnibus(model.fit)
     if not after.passed:
@@ -218,7 +218,7 @@ def main_ones(found: Search, helps: Callable[[Found, Model], bool]) -> Search:
     if model is found.final:
         return found
     model, left = settled(model, len(found.base.loop.effects), found.steps)
-    return replace(found, final=model, found=left, after=_judged(model))
+    return replace(found, final=model, found=left, after=judged(model))
 
 
 def _pool(model: Model, catalogue: Sequence[type[AbstractEffect]]) -> list[AbstractEffect]:
