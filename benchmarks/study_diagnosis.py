@@ -945,9 +945,8 @@ def main() -> None:
     if options.report:
         report(read(options.report))
         return
-    band = options.worth or dict.fromkeys(("named", "lookalike", "inside"), "moderate").get(
-        options.kind, ""
-    )
+    one_effect = options.kind in ("named", "lookalike", "inside")
+    band = options.worth or ("moderate" if one_effect else "")
     numbers = options.only or range(options.first, options.first + options.runs)
     classes: Sequence[Any] = CATALOGUE
     if options.kind == "lookalike":

@@ -16,7 +16,7 @@ from .loop import Loop
 from .margins import loop_margins, nu_gap, robust_margin
 from .model import IdentifiedModel
 from .physics import timebase
-from .simulation import simulate
+from .simulation import SimulationStopped, simulate
 from .stepping import growth_rate
 
 SETTLED = 0.02  # band around the final value
@@ -284,10 +284,12 @@ def _physical_step(loop: Loop, height: float, promised: Array) -> tuple[Array, s
     rest: Array = np.full(len(promised), loop.point.output)
     try:
         still = simulate(loop, rest)
-        moved = simulate(loop, rest + height)
     except CtrlidError as reason:
-        text = str(reason)
-        return _until_broken(loop, rest, height), text[0].upper() + text[1:] + "."
+        return np.empty(0), _sentence(reason)
+    try:
+        moved = simulate(loop, rest + height)
+    except SimulationStopped as reason:
+        return (reason.y - still.y[: len(reason.y)]) / height, _sentence(reason)
     response: Array = np.asarray((moved.y - still.y) / height, dtype=float)
     far = np.abs(response) > LOST * np.max(np.abs(promised))
     if not far.any():
@@ -300,19 +302,9 @@ def _physical_step(loop: Loop, height: float, promised: Array) -> tuple[Array, s
     return response[: k + 1], text + "."
 
 
-def _until_broken(loop: Loop, rest: Array, height: float) -> Array:
-    """Return the step response up to where its simulation breaks off, empty where none begins."""
-    response: Array = np.empty(0)
-    good, bad = 1, len(rest)
-    while bad - good > 1:
-        n = (good + bad) // 2
-        try:
-            still, moved = (simulate(loop, r[:n]) for r in (rest, rest + height))
-        except CtrlidError:
-            bad = n
-            continue
-        good, response = n, np.asarray((moved.y - still.y) / height, dtype=float)
-    return response
+def _sentence(reason: CtrlidError) -> str:
+    text = str(reason)
+    return text[0].upper() + text[1:] + "."
 
 
 def _performance(margins: Any, time: Array, response: Array) -> Performance:

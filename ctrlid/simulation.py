@@ -20,6 +20,12 @@ CHUNK = 2048  # samples run at once
 RUNAWAY = 1e3  # an output this many times further out than anything asked for has left
 
 
+class SimulationStopped(CtrlidError):
+    """A loop that left the range in which it can be simulated; `y` is its output until then."""
+
+    y: Array = np.empty(0)
+
+
 def simulate(
     loop: Loop,
     r: Any = None,
@@ -234,9 +240,11 @@ class Simulator:
                 substeps *= 2
             if stop is not None:
                 inside = bool(np.isfinite(states[:, stop]).all())
-                raise CtrlidError(
+                stopped = SimulationStopped(
                     _why_left(loop, first + stop, inside, ys[:, : stop + 1], us[:, : stop + 1], w)
                 )
+                stopped.y = np.concatenate([y[:first], ys[0, :stop]])
+                raise stopped
             if error > worst:
                 worst, where = error, first
             y[first : first + count], u[first : first + count] = ys[0], us[0]
