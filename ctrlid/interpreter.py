@@ -262,19 +262,25 @@ def sweep(
     inputs, work = np.empty((len(still), block)), np.empty((registers, block))
     results = np.zeros((count, block))
     for row in range(len(still)):
-        inputs[row] = still[row]
+        for k in range(block):
+            inputs[row, k] = still[row]
     for begin in range(0, size, block):
         samples = min(block, size - begin)
         for row in range(carried):
-            inputs[row] = still[row]
-        for k in range(len(places)):
-            inputs[places[k], :samples] = moving[k, begin : begin + samples]
+            for k in range(samples):
+                inputs[row, k] = still[row]
+        for row in range(len(places)):
+            for k in range(samples):
+                inputs[places[row], k] = moving[row, begin + k]
         for s in range(len(starts) - 1):
             for part in range(parts):
                 if carried:
-                    inputs[-1] = part
+                    for k in range(samples):
+                        inputs[len(still) - 1, k] = part
                 run(program[starts[s] : starts[s + 1]], constants, inputs, work, results, samples)
-                inputs[:carried] = results[:carried]
+                for row in range(carried):
+                    for k in range(samples):
+                        inputs[row, k] = results[row, k]
         for j in range(len(tables)):
             at, rows, columns = tables[j]
             base = everything * at + (first + begin) * rows * columns

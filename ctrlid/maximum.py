@@ -18,6 +18,7 @@ ROUNDS = 25  # Gauss-Newton steps at most
 FAR = 3.0  # standard errors: after a longer step the trajectory is settled anew
 CLOSE = 0.02  # standard errors: a smaller step ends the search
 SHARES = tuple(3.0**-k for k in range(6))  # of a step, until the likelihood grows
+CURVED = 2  # of them, from where a second step may lead higher than the first began
 ELSEWHERE = 2.0  # of log-likelihood, that a noise far away must gain to go on from there
 NOTHING = 1e-3  # of log-likelihood: a step that promises less is not worth taking
 
@@ -159,17 +160,35 @@ def _ascend(fit: Fit, matrix: Array, score: Array) -> tuple[Fit, float]:
     whole, error = bounded_step(fit, matrix, score)
     if not np.isfinite(whole).all() or 0.5 * score @ whole < NOTHING:
         return fit, 0.0
-    for step in (share * whole for share in SHARES):
+    for k, step in enumerate(share * whole for share in SHARES):
         theta = np.clip(fit.theta + step, problem.lower, problem.upper)
         try:
             if not problem.machine.fits(theta):
                 problem, fit = _rebuilt(fit, theta)
             trial = evaluate(problem, theta, fit.noise, [o.trajectory for o in fit.filtered])
+            worse = not trial.value >= fit.value - 1e-6
+            if worse and k < CURVED and np.isfinite(trial.value):
+                trial = _second_step(trial)
+                worse = not trial.value > fit.value + NOTHING
         except CtrlidError:  # too far: what moves so fast is no longer followed
             continue
-        if np.isfinite(trial.value) and trial.value >= fit.value - 1e-6:
-            return trial, float(np.max(np.abs(step) / error, initial=0.0))
+        if np.isfinite(trial.value) and not worse:
+            return trial, float(np.max(np.abs(trial.theta - fit.theta) / error, initial=0.0))
     return fit, 0.0
+
+
+def _second_step(fit: Fit) -> Fit:
+    """Return where a whole Gauss-Newton step leads from a point that may lie beside the ridge.
+
+    Where a product of two parameters is all that the record knows, the ridge is curved: along its
+    tangent only short steps climb, but a long one and a second from there come back to it.
+    """
+    there, problem = relinearized(fit), fit.problem
+    step, _ = bounded_step(there, *there.normal)
+    theta = np.clip(there.theta + step, problem.lower, problem.upper)
+    if not problem.machine.fits(theta):
+        return fit
+    return evaluate(problem, theta, there.noise, [o.trajectory for o in there.filtered])
 
 
 def _rebuilt(fit: Fit, theta: Array) -> tuple[Problem, Fit]:

@@ -10,13 +10,18 @@ from ctrlid import maximum
 
 @pytest.fixture
 def hill(monkeypatch):
-    """Make a fit on a hill of any shape: `hill(value)` returns one by its parameters."""
+    """Make a fit on a hill of any shape: `hill(value)` returns one by its parameters.
+
+    Without `normal`, nobody knows a second step.
+    """
     tried = []
 
-    def fit_on(value, theta, lower=-np.inf, upper=np.inf):
+    def fit_on(value, theta, lower=-np.inf, upper=np.inf, normal=None):
         def at(theta):
+            nothing = np.zeros((len(theta), len(theta))), np.zeros(len(theta))
             return SimpleNamespace(value=value(theta), theta=np.asarray(theta, dtype=float),
-                                   noise=None, filtered=(), problem=problem)  # fmt: skip
+                                   noise=None, filtered=(), problem=problem,
+                                   normal=normal(theta) if normal else nothing)  # fmt: skip
 
         def evaluate(problem, theta, noise, along):
             tried.append(theta)
@@ -27,6 +32,7 @@ def hill(monkeypatch):
             machine=SimpleNamespace(fits=lambda theta: True),
         )  # fmt: skip
         monkeypatch.setattr(maximum, "evaluate", evaluate)
+        monkeypatch.setattr(maximum, "relinearized", lambda fit: fit)
         return at(theta)
 
     fit_on.tried = tried
@@ -66,6 +72,15 @@ def test_a_bent_valley_is_followed_to_its_end(hill):
     assert fit.theta == pytest.approx([1.0, 1.0], abs=1e-3)
 
 
+def test_along_a_curved_ridge_a_second_step_saves_many_short_ones(hill):
+    """Gauss and Newton's second step ends at the top of Rosenbrock's valley, wherever it began."""
+    fit = hill(valley, [-1.2, 1.0], normal=normal)
+    top, length = maximum._ascend(fit, *normal(fit.theta))
+    assert top.theta == pytest.approx([1.0, 1.0], abs=1e-9)
+    assert length > 1
+    assert len(hill.tried) == 2
+
+
 def test_a_step_that_is_too_long_is_shortened(hill):
     fit = hill(lambda t: -((t[0] - 1) ** 2), [0.0])
     better, length = maximum._ascend(fit, np.array([[0.02]]), np.array([2.0]))
@@ -79,7 +94,7 @@ def test_a_wrong_slope_gives_up_where_it_is(hill):
     same, length = maximum._ascend(fit, np.array([[2.0]]), np.array([5.0]))
     assert same is fit
     assert length == 0.0
-    assert len(hill.tried) == len(maximum.SHARES)
+    assert len(hill.tried) == len(maximum.SHARES) + maximum.CURVED
 
 
 def test_what_promises_nothing_is_not_tried(hill):
