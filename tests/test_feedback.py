@@ -77,7 +77,7 @@ def many(make, count, seed, **options):
 
 
 def test_open_loops_stay_open():
-    records = many(open_record, 40, 1)
+    records = many(open_record, 25, 1)
     wrong = [r for r in records if cid.check_feedback(r).closed_loop]
     assert len(wrong) <= 1
 
@@ -90,7 +90,7 @@ def test_closed_loops_are_found():
 
 
 def test_closed_loops_without_noise():
-    records = many(closed_record, 40, 3, noisy=False)
+    records = many(closed_record, 25, 3, noisy=False)
     found = [cid.check_feedback(r).closed_loop for r in records if r.hold == "zoh"]
     assert all(found)
 

@@ -26,7 +26,7 @@ def levitation(fc):
     return loop.with_effect(E.CoulombFriction(fc=fc)) if fc else loop
 
 
-def record_of(loop, seed, n=5000):
+def record_of(loop, seed, n=3000):
     r = cid.random_binary(n, amplitude=3e-4, hold=30, around=loop.point.output, seed=seed)
     return cid.simulate(loop, r, sensor_noise=4e-6, force_noise=0.01, seed=seed + 1)
 

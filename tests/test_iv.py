@@ -122,7 +122,7 @@ def test_coloured_noise_does_not_bias_and_is_modelled():
 
 def test_intervals_cover_the_truth():
     """A slice of the study: nominal 95 % intervals, efficiency and bias over drawn loops."""
-    table = study.study(8, steps=(0.2, 0.03, 0.005), noises=(0.02, 0.2))
+    table = study.study(4, steps=(0.2, 0.03, 0.005), noises=(0.02, 0.2))
     found = np.concatenate([errors[:, 3] for errors, _ in table.values()])
     bounds = np.concatenate([bound for _, bound in table.values()])
     median, bias, covered, efficiency = study.summary(found, bounds)

@@ -16,7 +16,7 @@ def drive():
     return cid.Loop(plant, C, dt=0.01, at=at, free=("c", "k"))
 
 
-def record_of(real, seed, n=2000):
+def record_of(real, seed, n=1200):
     r = cid.random_binary(n, amplitude=0.3, hold=60, seed=seed)
     return cid.simulate(real, r, sensor_noise=1e-3, seed=seed + 1)
 
