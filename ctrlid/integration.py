@@ -40,36 +40,59 @@ def integrate(rate: Any, z: Any, dt: Any, substeps: int) -> tuple[Any, Any]:
     Hairer, Nørsett and Wanner, *Solving Ordinary Differential Equations I*, section II.10.
     """
     h = dt / substeps
-    worst = casadi.SX.zeros(z.shape[0], 1)
-    for k in range(substeps):
+
+    def one(start: Any, z: Any) -> list[Any]:
         stages: list[Any] = []
         for row, c in zip(DOP853.A, DOP853.C, strict=True):
             point = z
             for weight, stage in zip(row, stages, strict=False):
                 if weight:
                     point = point + (h * weight) * stage
-            stages.append(rate((k + c) * h, point))
+            stages.append(rate(start + c * h, point))
         total, fifth, third = (
             sum((w * s for w, s in zip(weights, stages, strict=False) if w), casadi.SX(0))
             for weights in (DOP853.B, DOP853.E5, DOP853.E3)
         )
-        z = z + h * total
         fifth, third = casadi.fabs(h * fifth), casadi.fabs(h * third)
-        worst = casadi.fmax(worst, fifth**2 / casadi.sqrt(fifth**2 + 0.01 * third**2 + 1e-300))
+        error = fifth**2 / casadi.sqrt(fifth**2 + 0.01 * third**2 + 1e-300)
+        return [z + h * total, error]
+
+    worst = casadi.SX.zeros(z.shape[0], 1)
+    step = _repeated(one, z.shape[0], substeps)
+    for k in range(substeps):
+        z, error = step(k * h, z)
+        worst = casadi.fmax(worst, error)
     return z, worst
 
 
 def integrate_fast(rate: Any, z: Any, dt: Any, substeps: int) -> Any:
     """Advance an expression by the classical fourth-order formula of Runge and Kutta."""
     h = dt / substeps
-    for k in range(substeps):
-        start = k * h
+
+    def one(start: Any, z: Any) -> list[Any]:
         first = rate(start, z)
         second = rate(start + h / 2, z + h / 2 * first)
         third = rate(start + h / 2, z + h / 2 * second)
         fourth = rate(start + h, z + h * third)
-        z = z + h / 6 * (first + 2 * second + 2 * third + fourth)
+        return [z + h / 6 * (first + 2 * second + 2 * third + fourth)]
+
+    step = _repeated(one, z.shape[0], substeps)
+    for k in range(substeps):
+        (z,) = step(k * h, z)
     return z
+
+
+def _repeated(one: Any, size: int, count: int) -> Any:
+    """Return ``one(start, z)`` made ready to be called many times: its expression is built once."""
+    if count == 1:
+        return one
+    start, z = casadi.SX.sym("start"), casadi.SX.sym("z", size)
+    results = one(start, z)
+    own = {s.element_hash() for s in (start, *casadi.vertsplit(z))}
+    every = casadi.symvar(casadi.vertcat(*results))
+    others = [s for s in every if s.element_hash() not in own]
+    made = casadi.Function("one", [start, z, *others], results)
+    return lambda start, z: made.call([start, z, *others])
 
 
 def input_pieces(e: Equations, dt: float, path: Sequence[Any], hold: str) -> list[Piece]:
