@@ -141,10 +141,11 @@ def _tell(args: argparse.Namespace) -> int:
 def _saved(section: Section, number: int, folder: Path) -> Section:
     """Write the figures of a section as files; the section keeps their bytes for the report."""
     figures = {caption: plot.png(figure) for caption, figure in section.figures.items()}
-    slug = re.sub(r"[^a-z]+", "-", section.title.lower()).strip("-")
-    for letter, data in zip("abcdefgh", figures.values(), strict=False):
-        name = f"{number}{letter if len(figures) > 1 else ''}-{slug}.png"
-        (folder / name).write_bytes(data)
+    several = len(figures) > 1
+    for letter, (caption, data) in zip("abcdefgh", figures.items(), strict=False):
+        words = caption if several else section.title
+        slug = re.sub(r"[^a-z]+", "-", words.lower()).strip("-")
+        (folder / f"{number}{letter if several else ''}-{slug}.png").write_bytes(data)
     return replace(section, figure=figures)
 
 

@@ -177,6 +177,9 @@ def test_bad_news_is_in_capitals(found):
     base = found["explained"]
     worse = replace(base, gap=replace(base.gap, after=2 * base.gap.before))
     assert "the effects do NOT MAKE THE GAP SMALLER" in text(worse)
+    for given, widened in ((0.5 * base.gap.before, True), (base.gap.before, False)):
+        other = replace(base, gap=replace(base.gap, given=given))
+        assert ("Recalibrating alone makes" in text(other)) == widened
     lost = replace(base, gap=replace(base.gap, given=math.inf, before=math.inf))
     assert "LEAVES THE PLANT'S DOMAIN" in text(lost)
     assert "of the squared gap" not in text(lost)
