@@ -1,6 +1,7 @@
 """Lead compensators with exactly the crossover and the phase margin asked for."""
 
 import math
+import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -10,7 +11,7 @@ import control as ct
 import numpy as np
 
 from ._rational import Rational, closed_loop, is_stable, rational, resolved, to_s
-from .errors import CtrlidError
+from .errors import CtrlidError, CtrlidWarning
 from .margins import gain_crossovers, modulus_margin
 
 # Less phase than this (radians) is none: the answer is a pure gain.
@@ -131,6 +132,11 @@ def design_lead(P: Any, crossover: float, phase_margin: float) -> Any:
         possible. Also for anything that is not a proper, finite, one-input one-output linear plant
         with a known time base, and for numbers outside their range.
 
+    Warns
+    -----
+    CtrlidWarning
+        If the phase margin is so small that it is likely to be in radians.
+
     See Also
     --------
     loop_margins : The margins of the result, from L = C P.
@@ -169,6 +175,11 @@ def design_lead(P: Any, crossover: float, phase_margin: float) -> Any:
         raise CtrlidError(
             f"phase_margin is {phase_margin:g} degrees; needed is one between 0 and 180."
         )
+    if phase_margin < math.pi / 2:
+        warnings.warn(
+            f"phase_margin is {phase_margin:g} degrees, next to none; if that was in radians, ask for "
+            f"{math.degrees(phase_margin):.3g}", CtrlidWarning, stacklevel=2,
+        )  # fmt: skip
     _check_plant(plant, crossover)
 
     task = _Task(plant, crossover, phase_margin)

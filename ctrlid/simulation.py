@@ -309,6 +309,8 @@ def _why_left(loop: Loop, at: int, inside: bool, ys: Array, us: Array, w: Array)
     text += (f" Near the operating point the loop is stable, so the signals are too large for it: "
              f"{inp} moved {swing:.3g} away from {op.input:.4g}")  # fmt: skip
     asked = float(np.max(np.abs(w[1] - op.output)))
-    return (
-        text + f", {output} was asked to move by {asked:.3g}. Use a smaller reference or less noise"
-    )
+    text += f", {output} was asked to move by {asked:.3g}."
+    if np.max(np.abs(w[1])) < abs(op.output) / 2:
+        return (f"{text} If r was meant as a deviation from the operating point, add {op.output:.6g}: "
+                "signals are absolute")  # fmt: skip
+    return f"{text} Use a smaller reference or less noise"

@@ -372,3 +372,9 @@ P = ct.tf([1], [1, 0, 0])
 def test_refusals_say_what_is_needed(call, words):
     with pytest.raises(cid.CtrlidError, match=words):
         call()
+
+
+def test_a_margin_in_radians_is_doubted():
+    P = ct.tf([-6.54], [1, 0, -1635])
+    with pytest.warns(cid.CtrlidWarning, match=r"ask for 45\.8"):
+        cid.design_lead(P, 100.0, 0.8)

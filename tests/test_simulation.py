@@ -170,6 +170,13 @@ def test_a_ball_that_leaves_the_gap_is_an_error_that_says_when_and_why():
     assert "x left the range where the plant is defined" in text
     assert "the signals are too large" in text
     assert "V moved" in text
+    assert text.endswith("Use a smaller reference or less noise")
+
+
+def test_a_reference_of_deviations_is_recognized():
+    loop, op = make(0.02, 0.01, 3.0)
+    with pytest.raises(CtrlidError, match=r"add 0\.01: signals are absolute"):
+        cid.simulate(loop, cid.random_binary(400, amplitude=0.01 * op.output, hold=30, seed=1))
 
 
 def test_an_unstable_loop_says_so():
@@ -297,6 +304,8 @@ def test_loop_refuses_mixed_time_and_algebraic_loops():
         cid.Loop(ct.tf([1], [1, -0.5], 0.1), dt=0.2)
     with pytest.raises(CtrlidError, match="passes its input to its output without delay"):
         cid.Loop(ct.tf([1, 0], [1, 1]), 0.5, dt=0.1)
+    with pytest.raises(CtrlidError, match=r"the order is Loop\(plant, controller, \.\.\.\)"):
+        cid.Loop(ct.tf([1, 0], [1, 1]), MAGLEV, dt=0.1)
 
 
 def test_loop_is_a_value_and_gives_its_plant_back():
