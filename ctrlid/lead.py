@@ -177,8 +177,8 @@ def design_lead(P: Any, crossover: float, phase_margin: float) -> Any:
         )
     if phase_margin < math.pi / 2:
         warnings.warn(
-            f"phase_margin is {phase_margin:g} degrees, next to none; if that was in radians, ask for "
-            f"{math.degrees(phase_margin):.3g}", CtrlidWarning, stacklevel=2,
+            f"phase_margin is {phase_margin:g} degrees, next to none; if that was in radians, ask "
+            f"for {math.degrees(phase_margin):.3g}", CtrlidWarning, stacklevel=2,
         )  # fmt: skip
     _check_plant(plant, crossover)
 

@@ -142,8 +142,8 @@ class Loop:
         if self.controller is not None and self._active.feedthrough:
             raise CtrlidError(
                 f"{kept.name} passes its input to its output without delay, so the loop with "
-                "a controller is algebraic; add the sensor's or actuator's lag to the plant. If this "
-                "is the controller, the order is Loop(plant, controller, ...)"
+                "a controller is algebraic; add the sensor's or actuator's lag to the plant. If "
+                "this is the controller, the order is Loop(plant, controller, ...)"
             )
 
     @property

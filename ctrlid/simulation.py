@@ -311,6 +311,6 @@ def _why_left(loop: Loop, at: int, inside: bool, ys: Array, us: Array, w: Array)
     asked = float(np.max(np.abs(w[1] - op.output)))
     text += f", {output} was asked to move by {asked:.3g}."
     if np.max(np.abs(w[1])) < abs(op.output) / 2:
-        return (f"{text} If r was meant as a deviation from the operating point, add {op.output:.6g}: "
-                "signals are absolute")  # fmt: skip
+        return (f"{text} If r was meant as a deviation from the operating point, add "
+                f"{op.output:.6g}: signals are absolute")  # fmt: skip
     return f"{text} Use a smaller reference or less noise"

@@ -80,8 +80,8 @@ def shrinking(gap: Gap) -> str:
     if above <= 0 or gap.after >= gap.before:
         return "On samples kept back the effects do NOT MAKE THE GAP SMALLER."
     share = min((gap.before**2 - gap.after**2) / above, 1.0)
-    closed = (f"On samples kept back the effects close {percent(share)} of the squared gap above the "
-              "noise floor.")  # fmt: skip
+    closed = (f"On samples kept back the effects close {percent(share)} of the squared gap above "
+              "the noise floor.")  # fmt: skip
     return f"{closed} {WIDENED}" if gap.before > gap.given * WIDER else closed
 
 
