@@ -19,6 +19,8 @@ FAR = 3.0  # standard errors: after a longer step the trajectory is settled anew
 CLOSE = 0.02  # standard errors: a smaller step ends the search
 SHARES = tuple(3.0**-k for k in range(6))  # of a step, until the likelihood grows
 CURVED = 1  # the one of them from where a second step may lead higher than the first began
+SMALL = 3  # the last of them to be tried off a curved ridge
+BEND = 30.0  # of log-likelihood: a step that promises less is on none
 ELSEWHERE = 2.0  # of log-likelihood, that a noise far away must gain to go on from there
 NOTHING = 1e-3  # of log-likelihood: a step that promises less is not worth taking
 
@@ -158,7 +160,8 @@ def _ascend(fit: Fit, matrix: Array, score: Array) -> tuple[Fit, float]:
     """
     problem = fit.problem
     whole, error = bounded_step(fit, matrix, score)
-    if not np.isfinite(whole).all() or 0.5 * score @ whole < NOTHING:
+    promise = 0.5 * float(score @ whole)
+    if not np.isfinite(whole).all() or promise < NOTHING:
         return fit, 0.0
     for k, step in enumerate(share * whole for share in SHARES):
         theta = np.clip(fit.theta + step, problem.lower, problem.upper)
@@ -167,13 +170,15 @@ def _ascend(fit: Fit, matrix: Array, score: Array) -> tuple[Fit, float]:
                 problem, fit = _rebuilt(fit, theta)
             trial = evaluate(problem, theta, fit.noise, [o.trajectory for o in fit.filtered])
             worse = not trial.value >= fit.value - 1e-6
-            if worse and k == CURVED and np.isfinite(trial.value):
+            if worse and k == CURVED and promise > BEND and np.isfinite(trial.value):
                 trial = _second_step(trial)
                 worse = not trial.value > fit.value + NOTHING
         except CtrlidError:  # too far: what moves so fast is no longer followed
             continue
         if np.isfinite(trial.value) and not worse:
             return trial, float(np.max(np.abs(trial.theta - fit.theta) / error, initial=0.0))
+        if k >= SMALL and promise <= BEND and np.isfinite(trial.value):
+            break
     return fit, 0.0
 
 

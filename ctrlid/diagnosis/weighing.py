@@ -30,12 +30,14 @@ def left_to(matrix: Array, own: Sequence[int], others: Sequence[int]) -> Array:
 def doubled_by(fit: Fit, label: str, effect: AbstractEffect) -> dict[str, float]:
     """Return the neutral values of an effect's parameters that do what the model's own do.
 
-    The viscous part of an asymmetric friction is one, beside a viscous friction in the model.
+    The viscous part of an asymmetric friction is one, beside a viscous friction in the model. What
+    has come to a bound of its own can do no more.
     """
-    names, matrix = fit.problem.machine.names, fit.normal[0]
+    names, matrix, problem = fit.problem.machine.names, fit.normal[0], fit.problem
+    moving = (fit.theta > problem.lower) & (fit.theta < problem.upper)
     neutral = {f"{label}.{p.name}": p.neutral for p in effect.parameters()}
     deciding = {n: v for n, v in neutral.items() if n in names and v is not None}
-    others = [k for k, n in enumerate(names) if not n.startswith(f"{label}.")]
+    others = [k for k, n in enumerate(names) if moving[k] and not n.startswith(f"{label}.")]
     if len(deciding) < 2 or not np.isfinite(matrix).all():
         return {}
     found = {}
