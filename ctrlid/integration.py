@@ -12,6 +12,7 @@ from .equations import Equations, Lag
 Piece = tuple[Any, Any, Any]  # duration, input at its start, slope of the input
 Scheme = tuple[int, int, bool]  # order, steps in a piece, whether pieces are cut for short lags
 SHARP = 8.0  # time constants after which the transient of a lag is over
+SHARP_STEPS = 6  # of order four in it where friction has a kink, which no order is high enough for
 
 
 def integrate(rate: Any, z: Any, dt: Any, substeps: int) -> tuple[Any, Any]:
@@ -186,7 +187,8 @@ def advance(
         Constant added to the rates: a force held over the period.
     scheme : (int, int, bool), optional
         Order of the steps, four or eight; how many in each piece; and whether pieces are cut where
-        the transient of a short lag of the input is over.
+        the transient of a short lag of the input is over. The transient itself takes a step of
+        order eight, or several of order four where friction has a kink.
 
     Returns
     -------
@@ -209,7 +211,7 @@ def advance(
     }
     order, steps, cut = scheme
     short = [times[lag.state] for lag in driven[:1] if cut]
-    for duration, level, slope in _split(pieces, short):
+    for sharp, (duration, level, slope) in _split(pieces, short):
         followed = [_straight(e, lag.target, duration, level, slope, p) for lag in driven]
 
         def filled(tau: Any, z: Any, x: Any = x, followed: Any = followed) -> Any:
@@ -234,11 +236,11 @@ def advance(
                 rates[k] = 0
             return rates
 
-        if order == 8:
-            after, error = integrate(rate, x, duration, steps)
+        if order == 8 or (sharp and not e.kinked):
+            after, error = integrate(rate, x, duration, steps if order == 8 else 1)
             worst = casadi.fmax(worst, error)
         else:
-            after = integrate_fast(rate, x, duration, steps)
+            after = integrate_fast(rate, x, duration, SHARP_STEPS if sharp else steps)
         after = filled(duration, after)
         for lag in seen:
             ends = [
@@ -250,15 +252,16 @@ def advance(
     return x, worst
 
 
-def _split(pieces: Sequence[Piece], times: Sequence[Any]) -> list[Piece]:
-    """Cut pieces where the transient of the first lag is over."""
-    parts: list[Piece] = []
+def _split(pieces: Sequence[Piece], times: Sequence[Any]) -> list[tuple[bool, Piece]]:
+    """Cut pieces where the transient of the first lag is over; say which parts hold one."""
+    parts: list[tuple[bool, Piece]] = []
     for duration, level, slope in pieces:
         if not times:
-            parts.append((duration, level, slope))
+            parts.append((False, (duration, level, slope)))
             continue
         sharp = casadi.fmin(duration / 2, SHARP * times[0])
-        parts += [(sharp, level, slope), (duration - sharp, level + slope * sharp, slope)]
+        parts += [(True, (sharp, level, slope)),
+                  (False, (duration - sharp, level + slope * sharp, slope))]  # fmt: skip
     return parts
 
 

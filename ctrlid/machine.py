@@ -23,8 +23,9 @@ from .vectorized import Vectorized, through
 SLOW = 0.35  # rate times step up to which a step of order four is exact enough
 MOST_STEPS = 100  # of order eight in a period: more make an expression that takes minutes to build
 BRISK = 0.35  # of a lag's time constant: a step of order four that follows it exactly enough
+ROUGH = 0.7  # the same beside the kink of friction, where no formula is more exact
 FEW_STEPS = 3  # of order four, which cost less than one of order eight
-KINK_STEPS = 4  # of order four in a period where friction has a kink
+KINK_STEPS = 4  # of order four in a period where friction has a kink; twice as many beside a lag
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,9 +119,9 @@ class Machine:
             if not self.late <= late <= self.late + 1 + 1e-6:
                 return False
         time, (order, steps, cut) = _shortest(e, p), self.scheme
-        if order == 4:
-            return time > dt / steps / (2 * BRISK)
-        return time < dt / 4 if cut else time > dt / 16
+        if cut:
+            return time < dt / 4
+        return time > (dt / steps / (2 * _brisk(e)) if order == 4 else dt / 16)
 
     def linearize(self, track: Track, theta: Array, at: Trajectory) -> Linearized:
         """Return the plant along a trajectory, for parameter values `theta`."""
@@ -242,12 +243,14 @@ def _scheme(e: Equations, loop: Loop) -> Scheme:
     rate = float(np.max(np.abs(np.linalg.eigvals(a)), initial=0.0)) * loop.dt
     if rate <= 3 * SLOW:
         # A velocity that turns within a period crosses the kink of friction there.
-        few = max(KINK_STEPS if e.kinked else 1, math.ceil(rate / SLOW),
-                  2 * driven, math.ceil(min(loop.dt / time / BRISK, MOST_STEPS)))  # fmt: skip
+        few = max(KINK_STEPS if e.kinked else 1, math.ceil(rate / SLOW))
+        if not driven or (cut and e.kinked):
+            return (4, few, cut)
         # What a lag of the input does is known exactly; the plant has to follow it.
-        if not driven or few <= FEW_STEPS:
+        few = max(2 * few if e.kinked else few, 2, math.ceil(loop.dt / time / _brisk(e)))
+        if e.kinked or few <= FEW_STEPS:
             return (4, few, False)
-    steps = max(1, math.ceil(rate / 1.5))
+    steps = max(2 if e.kinked else 1, math.ceil(rate / 1.5))
     if steps > MOST_STEPS:
         raise CtrlidError(
             f"{e.name} moves at {rate / loop.dt:.3g} rad/s, {rate:.3g} times faster than it is "
@@ -255,6 +258,10 @@ def _scheme(e: Equations, loop: Loop) -> Scheme:
             "out of the plant, or sample faster"
         )
     return (8, steps, cut)
+
+
+def _brisk(e: Equations) -> float:
+    return ROUGH if e.kinked else BRISK
 
 
 def _shortest(e: Equations, p: Any) -> float:

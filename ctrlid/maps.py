@@ -143,7 +143,7 @@ def _period(plan: Plan) -> tuple[Any, list[Any], list[Any], dict[str, Any], int]
         kick[j] = force[k if plan.channels > 1 else 0]
     # A fit repeats the map often; a single prediction can afford to be exact.
     order, steps, cut = plan.scheme
-    scheme = plan.scheme if plan.index else (8, 1 if order == 4 else steps, cut)
+    scheme = plan.scheme if plan.index else (8, steps if e.kinked or order == 8 else 1, cut)
     part = casadi.SX.sym("i")
     if plan.law is None:
         pieces = [

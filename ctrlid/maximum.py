@@ -18,7 +18,7 @@ ROUNDS = 25  # Gauss-Newton steps at most
 FAR = 3.0  # standard errors: after a longer step the trajectory is settled anew
 CLOSE = 0.02  # standard errors: a smaller step ends the search
 SHARES = tuple(3.0**-k for k in range(6))  # of a step, until the likelihood grows
-CURVED = 1  # the one of them from where a second step may lead higher than the first began
+CURVED = 2  # of them, from where a second step may lead higher than the first began
 SMALL = 3  # the last of them to be tried off a curved ridge
 BEND = 30.0  # of log-likelihood: a step that promises less is on none
 ELSEWHERE = 2.0  # of log-likelihood, that a noise far away must gain to go on from there
@@ -170,7 +170,7 @@ def _ascend(fit: Fit, matrix: Array, score: Array) -> tuple[Fit, float]:
                 problem, fit = _rebuilt(fit, theta)
             trial = evaluate(problem, theta, fit.noise, [o.trajectory for o in fit.filtered])
             worse = not trial.value >= fit.value - 1e-6
-            if worse and k == CURVED and promise > BEND and np.isfinite(trial.value):
+            if worse and k < CURVED and promise > BEND and np.isfinite(trial.value):
                 trial = _second_step(trial)
                 worse = not trial.value > fit.value + NOTHING
         except CtrlidError:  # too far: what moves so fast is no longer followed

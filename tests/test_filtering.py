@@ -169,8 +169,9 @@ def levitated(*effects, dt=1e-3, free=(), analog=False):
 
 @pytest.mark.parametrize(
     ("hidden", "stages", "parts"),
-    [((E.SensorLag(tau=5e-4), E.ActuatorLag(tau=3e-4), E.SensorNonlinearity(curvature=2.0)), 1, 1),
-     ((), 1, 4), ((E.InputDelay(delay=4e-4), E.SensorNonlinearity(curvature=2.0)), 2, 4)],
+    [((E.SensorLag(tau=5e-4), E.ActuatorLag(tau=3e-4), E.SensorNonlinearity(curvature=2.0)), 1, 8),
+     ((E.ActuatorLag(tau=1e-4),), 1, 1), ((), 1, 4),
+     ((E.InputDelay(delay=4e-4), E.SensorNonlinearity(curvature=2.0)), 2, 4)],
 )  # fmt: skip
 def test_the_machines_derivatives_are_those_of_its_map(hidden, stages, parts):
     loop = levitated(E.CoulombFriction(fc=0.1), *hidden)

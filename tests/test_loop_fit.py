@@ -538,3 +538,19 @@ def test_a_wrong_gain_at_the_start_does_not_take_the_noise_from_the_sensor():
     estimate = cid.fit_loop(believed, record).estimate
     assert estimate.sensor_noise[0] == pytest.approx(0.011, rel=0.05)
     assert abs(estimate.values[0] - 0.0463) < 4 * estimate.standard_errors[0]
+
+
+@pytest.mark.parametrize(("ratio", "seed"), [(0.0125, 4), (0.2, 1)])
+def test_a_lag_beside_dry_friction_is_within_its_errors(ratio, seed):
+    """One step of any order takes the kink, which is crossed within a period, for a curve."""
+    dt = 0.01
+    true = {"c": 10.0, "k": 11.0, "CoulombFriction.fc": 0.3, "ActuatorLag.tau": ratio * dt}
+    plant = cid.plants.servo(m=2.7, c=true["c"], k=true["k"])
+    hidden = (cid.effects.CoulombFriction(fc=0.3), cid.effects.ActuatorLag(tau=ratio * dt))
+    pid = cid.PID(kp=15.0, kd=1.5, filter_time=0.05)
+    loop = cid.Loop(plant, pid, dt=dt, effects=hidden, free=tuple(true))
+    r = cid.random_binary(4000, amplitude=0.02, hold=60, seed=seed)
+    record = cid.simulate(loop, r, sensor_noise=4e-6, force_noise=0.02, seed=seed + 50)
+    e = cid.fit_loop(loop, record).estimate
+    off = [(e[n] - true[n]) / s for n, s in zip(e.names, e.standard_errors, strict=True)]
+    assert np.abs(off).max() < 2.9
