@@ -347,6 +347,16 @@ def test_waves_that_two_levels_see_nearly_alike_are_fitted():
     assert step.best.fitted.amplitude == pytest.approx(0.4, rel=0.1)
 
 
+def test_a_wave_that_half_the_samples_pass_in_a_hurry_is_found():
+    loop = drive()
+    record = record_of(loop, E.PositionRipple(amplitude=1.0, period=3e-4, phase=1.0), 4e-3, 4e-6,
+                       9350, n=4000)  # fmt: skip
+    assert 4 * np.median(np.abs(np.diff(record.y))) > 3e-4
+    base = base_model(loop, [record], loop.free)
+    (start,) = E.PositionRipple.candidates(base.fitted, record)
+    assert scanned(base, start).effect.period == pytest.approx(3e-4, rel=0.01)
+
+
 def test_a_limit_of_the_input_is_found_wherever_it_cuts():
     loop = levitation()
     record = record_of(loop, E.InputSaturation(-np.inf, 4.0), 6e-4, 1e-6, 9350)

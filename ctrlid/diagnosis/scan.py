@@ -28,6 +28,7 @@ COLUMNS = 500_000  # numbers in a block of shapes at once
 NEARLY = 0.7  # of the best promise: another wave that may be the right one
 PEAKS = 4  # such waves at most
 LENGTHS = 150  # wavelengths that are looked for in the travel
+UNHURRIED = 0.25  # of the samples: a wave that these can follow is looked for
 EDGE = 0.05  # of the record, at either end
 TIMES = 40  # instants at which a parameter might have stepped
 LIMITS = (0.999, 0.998, 0.995, 0.99, 0.98, 0.95, 0.9, 0.8)  # quantiles that may be cut off
@@ -197,7 +198,7 @@ def _ripple(model: Model, effect: PositionRipple) -> Trial:
     m = model.fit.problem.machine
     ways = [out.trajectory.filtered[:, m.position] for out in model.fit.filtered]
     travel = max(float(np.ptp(w[k])) for w, k in zip(ways, model.fit.problem.counts, strict=True))
-    step = max(float(np.median(np.abs(np.diff(w)))) for w in ways)
+    step = max(float(np.quantile(np.abs(np.diff(w)), UNHURRIED)) for w in ways)
     grain = max(_grain(track.record.y) for track in model.fit.problem.tracks)
     shortest = max(travel / LENGTHS, 4 * step, 4 * grain)
     if not travel > 2 * shortest:
