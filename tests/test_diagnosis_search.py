@@ -12,6 +12,7 @@ from scipy import signal, stats
 
 import ctrlid as cid
 from ctrlid import effects as E
+from ctrlid.diagnosis import rounds
 from ctrlid.diagnosis.attempts import attempt, attempt_at, refit
 from ctrlid.diagnosis.closing import wider
 from ctrlid.diagnosis.decide import GATE, doubt_of_all, rivals
@@ -88,6 +89,21 @@ def test_what_the_record_says_nothing_of_stays_possible(one_level):
     _, plain, more = one_level
     assert plain.merit > more.merit
     assert [t.name for t in rivals(plain, [more])] == ["AsymmetricCoulombFriction"]
+
+
+@pytest.mark.parametrize(
+    ("more", "first", "left"), [(0.4, 0, False), (3.0, 0, True), (9.0, 1, True)]
+)
+def test_a_gain_too_small_to_prove_anything_is_still_compared(
+    one_level, monkeypatch, more, first, left
+):
+    """Beyond what the filter's approximations gain, it has to be paid for, or stays possible."""
+    base, plain, rich = one_level
+    rich = replace(rich, gain=plain.gain + 10.0)
+    monkeypatch.setattr(rounds, "more_than_simple", lambda *_: more)
+    trials = rounds._simplest(base, [rich, plain])
+    assert trials[0].name == (plain.name, rich.name)[first]
+    assert all(np.isfinite(t.merit) for t in trials) == left
 
 
 def test_what_the_record_excludes_does_not():

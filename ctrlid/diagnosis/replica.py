@@ -114,11 +114,11 @@ def artefact(copies: Sequence[Model | None], trial: Trial) -> float:
     return max(gains)
 
 
-def more_than_simple(base: Model, best: Trial, simple: Trial) -> bool:
-    """Whether an effect earns its further parameters over a simpler one.
+def more_than_simple(base: Model, best: Trial, simple: Trial) -> float:
+    """Return what the further parameters of an effect gain over a simpler one.
 
     What the further parameters gain on a record simulated with the simpler effect, they gain
-    from the approximations of the filter.
+    from the approximations of the filter: twice that is taken off.
 
     Parameters
     ----------
@@ -129,20 +129,19 @@ def more_than_simple(base: Model, best: Trial, simple: Trial) -> bool:
 
     Returns
     -------
-    bool
-        True where it cannot be simulated.
+    float
+        Gain of log-likelihood; infinite where no record can be simulated.
     """
     copy = replica(simple.model)
     if copy is None:
-        return True
+        return math.inf
     try:
         under = carried_over(copy, base.fitted, base.names)
     except CtrlidError:
-        return True
+        return math.inf
     again = refit(Model(base.fitted, under), attempt_at(Model(base.fitted, under), best.fitted))
     usual = again.model.fit.value - copy.fit.value if math.isfinite(again.gain) else 0.0
-    won = best.gain - simple.gain - TWICE * max(usual, 0.0)
-    return won > best.cost - simple.cost
+    return best.gain - simple.gain - TWICE * max(usual, 0.0)
 
 
 def forgiven(tests: Omnibus, copies: Sequence[Model | None], alpha: float = ALPHA) -> Omnibus:

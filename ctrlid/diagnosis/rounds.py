@@ -14,7 +14,7 @@ from ..linearization import state_matrices
 from ..loop import Loop
 from ..maximum import promised
 from .attempts import attempt_at, refit
-from .decide import GATE
+from .decide import GATE, HINT
 from .fitted import Model, quiet
 from .replica import DOUBTFUL, TWICE, artefact, kinked, more_than_simple, replica
 from .scan import elsewhere, scanned
@@ -174,7 +174,11 @@ def plainer(base: Model, best: Trial, others: Sequence[Trial]) -> Trial:
 
 
 def _simplest(base: Model, trials: list[Trial]) -> list[Trial]:
-    """Put out a winner whose further parameters gain from the filter's approximations only."""
+    """Put a winner behind what it contains if its further parameters do not earn their price.
+
+    What the filter's approximations gain counts for nothing. A gain beyond that is too small to
+    prove anything, and too large to exclude it: it is left to be compared.
+    """
     best = trials[0]
     for simple in trials[1:NEXT]:
         fewer = len(simple.effect.parameters()) < len(best.effect.parameters())
@@ -182,8 +186,13 @@ def _simplest(base: Model, trials: list[Trial]) -> list[Trial]:
             continue
         if best.gain - simple.gain > 0.1 * best.gain or simple.name not in best.effect.look_alikes:
             continue
-        if not more_than_simple(base, best, simple):
-            out = replace(best, remark=f"{simple.name} explains as much with fewer parameters")
+        more = more_than_simple(base, best, simple)
+        if more <= best.cost - simple.cost:
+            out = (
+                replace(best, gain=simple.gain + more)
+                if more > HINT
+                else replace(best, remark=f"{simple.name} explains as much with fewer parameters")
+            )
             return sorted([out, *trials[1:]], key=lambda t: (-t.merit, -t.promise))
     return trials
 
