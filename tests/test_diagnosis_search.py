@@ -13,7 +13,7 @@ from scipy import signal, stats
 import ctrlid as cid
 from ctrlid import effects as E
 from ctrlid.diagnosis import rounds
-from ctrlid.diagnosis.attempts import attempt, attempt_at, refit
+from ctrlid.diagnosis.attempts import attempt, attempt_at, refit, under
 from ctrlid.diagnosis.closing import wider
 from ctrlid.diagnosis.decide import GATE, doubt_of_all, rivals
 from ctrlid.diagnosis.experiment import separating_experiment
@@ -30,6 +30,7 @@ from ctrlid.diagnosis.sentences import conclusion
 from ctrlid.diagnosis.settling import _close, cut, fused
 from ctrlid.diagnosis.trial import contains
 from ctrlid.filtering import first_guess
+from ctrlid.likelihood import relinearized
 from ctrlid.loop_fit import choose_noise, make_problem, start_values
 from ctrlid.machine import machine_for
 from ctrlid.maximum import begin, climb
@@ -104,6 +105,24 @@ def test_a_gain_too_small_to_prove_anything_is_still_compared(
     trials = rounds._simplest(base, [rich, plain])
     assert trials[0].name == (plain.name, rich.name)[first]
     assert all(np.isfinite(t.merit) for t in trials) == left
+
+
+def test_candidates_are_compared_under_the_same_random_force():
+    """A slow force that stood for the missing spring may stay beside one candidate only."""
+    loop = levitation()
+    record = record_of(loop, E.LinearStiffness(120.0), 2e-4, 2e-6, 9210)
+    base = base_model(loop, [record], loop.free)
+    right = refit(base, attempt(base, E.LinearStiffness(0.0)))
+    assert rounds._apart(right, right) is False
+    good = right.model.fit.noise
+    slow = replace(good, memory=0.999, drift=1e6)
+    wrong = replace(right.model, fit=replace(right.model.fit, noise=slow))
+    wrong = replace(wrong, fit=relinearized(wrong.fit))
+    lost = replace(right, model=wrong, gain=wrong.fit.value - base.fit.value)
+    assert lost.gain < right.gain - 10.0
+    assert rounds._apart(lost, right)
+    assert under(base, lost, good).gain == pytest.approx(right.gain, abs=0.5)
+    assert under(base, right, slow).gain >= right.gain  # never lower
 
 
 def test_what_the_record_excludes_does_not():

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..effects import AbstractEffect
 from ..errors import CtrlidError
+from ..filtering import Noise
 from ..likelihood import Fit, evaluate
 from ..maximum import climb, promised
 from .carrying import carried_over
@@ -146,6 +147,20 @@ def refit(base: Model, trial: Trial, near: Model | None = None) -> Trial:
     except CtrlidError as reason:
         return replace(trial, remark=str(reason))
     return outcome(base, trial, fit)
+
+
+def under(base: Model, trial: Trial, noise: Noise) -> Trial:
+    """Return a refitted candidate, climbed on from another noise if that leads higher.
+
+    The likelihood of the noise has several maxima: a slow force that stood for what is missing may
+    stay beside one candidate and leave the next, which says nothing of the candidates.
+    """
+    try:
+        moved = replace(trial.model.fit, noise=noise)
+        fit = spared(climb(moved, rounds=SCREEN_ROUNDS, exact=False))
+    except CtrlidError:
+        return trial
+    return outcome(base, trial, fit) if fit.value > trial.model.fit.value else trial
 
 
 def outcome(base: Model, trial: Trial, fit: Fit) -> Trial:

@@ -13,7 +13,7 @@ from ..errors import CtrlidError
 from ..linearization import state_matrices
 from ..loop import Loop
 from ..maximum import promised
-from .attempts import attempt_at, refit
+from .attempts import attempt_at, refit, under
 from .decide import GATE, HINT
 from .fitted import Model, quiet
 from .replica import DOUBTFUL, TWICE, artefact, kinked, more_than_simple, replica
@@ -25,6 +25,8 @@ TOP = 5  # candidates refitted because of what they promise
 SHARE = 0.2  # of the best promise: what promises more is refitted as well
 FAINT = 0.5  # of what would earn a place: a fainter promise is not worth a refit
 OFFSETS = (SensorOffset,)
+NEARLY = 0.5  # of the best merit: what did so well is asked again under the noise of the best
+DIFFERENT = math.log(2.0)  # of time constants of two random forces
 SLIGHT = 30.0  # a merit below this, beside a kink, is compared with
 MANY = 4  # replicas
 
@@ -142,7 +144,20 @@ def _refitted(
         near = quiet(best.model)
         fit([(t, done[id(t)].fitted, near) for t in stuck])
         fit([(t, m, None) for t in stuck for m in more if m is not t and m.name == t.name])
+        best = max(done.values(), key=lambda t: t.merit)
+        apart = [k for k, t in done.items() if t.merit > NEARLY * best.merit and _apart(t, best)]
+        noise = best.model.fit.noise
+        again = work(lambda k: under(base, done[k], noise), apart)
+        done |= dict(zip(apart, again, strict=True))
     return [done.get(id(t), t) for t in tried]
+
+
+def _apart(one: Trial, other: Trial) -> bool:
+    """Whether the random forces that two fits ended with are not the same."""
+    a, b = one.model.fit.noise, other.model.fit.noise
+    if not (a.drift and b.drift):
+        return bool(a.drift) != bool(b.drift)
+    return abs(math.log((1 - a.memory) / (1 - b.memory))) > DIFFERENT
 
 
 def _maybe_stuck(best: Trial, tried: Sequence[Trial]) -> list[Trial]:
