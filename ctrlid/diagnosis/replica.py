@@ -139,8 +139,11 @@ def more_than_simple(base: Model, best: Trial, simple: Trial) -> float:
         under = carried_over(copy, base.fitted, base.names)
     except CtrlidError:
         return math.inf
-    again = refit(Model(base.fitted, under), attempt_at(Model(base.fitted, under), best.fitted))
-    usual = again.model.fit.value - copy.fit.value if math.isfinite(again.gain) else 0.0
+    # Both climb from the same start: from where the replica was fitted, the simple one may be stuck.
+    without = Model(base.fitted, under)
+    again, plain = (refit(without, attempt_at(without, t.fitted)) for t in (best, simple))
+    least = max(copy.fit.value, plain.model.fit.value)
+    usual = again.model.fit.value - least if math.isfinite(again.gain) else 0.0
     return best.gain - simple.gain - TWICE * max(usual, 0.0)
 
 
