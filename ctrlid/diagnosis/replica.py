@@ -139,7 +139,7 @@ def more_than_simple(base: Model, best: Trial, simple: Trial) -> float:
         under = carried_over(copy, base.fitted, base.names)
     except CtrlidError:
         return math.inf
-    # Both climb from the same start: from where the replica was fitted, the simple one may be stuck.
+    # Both climb from the same start: where the replica was fitted, the simple one may be stuck.
     without = Model(base.fitted, under)
     again, plain = (refit(without, attempt_at(without, t.fitted)) for t in (best, simple))
     least = max(copy.fit.value, plain.model.fit.value)
