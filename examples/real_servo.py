@@ -42,9 +42,9 @@ model = cid.Loop(plant, None, dt=record.dt, at=rest, free=("a", "b"))
 # What is missing?
 # ----------------
 # Dry friction, more of it in one direction: the same, on this plant, as dry friction and a
-# constant force, and no record of u and y could tell the two apart. Beside it stand a drift and a
-# ripple which the report doubts, and so should its reader. The gap is that of a prediction four
-# samples ahead on the random steps, which no parameter was fitted to.
+# constant force, and no record of u and y could tell the two apart. What it leaves is not noise,
+# and the report says so: the friction may stand in for a part of it. The gap is that of a
+# prediction four samples ahead on the random steps, which no parameter was fitted to.
 
 found = cid.diagnose(model, record, validation=other, progress=False)
 print(found)
