@@ -19,7 +19,6 @@ FAR = 3.0  # standard errors: after a longer step the trajectory is settled anew
 CLOSE = 0.02  # standard errors: a smaller step ends the search
 SHARES = tuple(3.0**-k for k in range(6))  # of a step, until the likelihood grows
 CURVED = 2  # of them, from where a second step may lead higher than the first began
-SMALL = 3  # the last of them to be tried off a curved ridge
 BEND = 30.0  # of log-likelihood: a step that promises less is on none
 ELSEWHERE = 2.0  # of log-likelihood, that a noise far away must gain to go on from there
 NOTHING = 1e-3  # of log-likelihood: a step that promises less is not worth taking
@@ -177,8 +176,6 @@ def _ascend(fit: Fit, matrix: Array, score: Array) -> tuple[Fit, float]:
             continue
         if np.isfinite(trial.value) and not worse:
             return trial, float(np.max(np.abs(trial.theta - fit.theta) / error, initial=0.0))
-        if k >= SMALL and promise <= BEND and np.isfinite(trial.value):
-            break
     return fit, 0.0
 
 

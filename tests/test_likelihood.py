@@ -94,7 +94,7 @@ def test_a_wrong_slope_gives_up_where_it_is(hill):
     same, length = maximum._ascend(fit, np.array([[2.0]]), np.array([5.0]))
     assert same is fit
     assert length == 0.0
-    assert len(hill.tried) == maximum.SMALL + 1
+    assert len(hill.tried) == len(maximum.SHARES)  # and no second step, for so little
 
 
 def test_what_promises_nothing_is_not_tried(hill):
