@@ -568,6 +568,7 @@ def test_a_loop_that_hunts_keeps_its_names():
 
     sensor, force = Disturbance(0.1, 0.0, np.nan, 0.2), Disturbance(0.1, 0.0, np.nan, 0.9)
     assert not wider(gap(2.9), force)
+    assert not wider(gap(3.9), force)  # above the gap before, and below the floor
     assert not wider(gap(4.4), sensor)
     assert wider(gap(4.4), force)
     assert wider(gap(6.1), sensor)

@@ -49,10 +49,11 @@ def gaps_of(loop: Loop, found: Search, fresh: Fresh) -> tuple[Gap, dict[int, flo
 def wider(gap: Gap, disturbance: Disturbance) -> bool:
     """Whether effects leave a wider gap than sensor noise does, by itself, in a loop with them.
 
-    With friction and play a loop hunts, and no simulation follows it for long.
+    With friction and play a loop hunts, and no simulation follows it for long. Two gaps below the
+    floor differ by chance.
     """
     by_noise = not disturbance.large and gap.after <= EXCESS * gap.floor
-    return gap.after > gap.before and not by_noise
+    return max(gap.before, gap.floor) < gap.after and not by_noise
 
 
 def helps_on(fresh: Fresh) -> Callable[[Found, Model], bool]:
