@@ -562,6 +562,17 @@ def test_waves_may_be_several_and_modes_may_not():
     assert not _there(model, E.CoulombFriction(0.1))
 
 
+@pytest.mark.parametrize(("size", "alone"), [(1.0, False), (40.0, True)])
+def test_a_parameter_at_its_bound_does_nothing_for_an_effect(size, alone):
+    """The drive's own friction may grow to ten times its given value; the rest is the effect's."""
+    loop = drive()
+    hidden = E.AsymmetricViscousFriction(c=size, difference=-0.5 * size)
+    base = base_model(loop, [record_of(loop, hidden, 0.3, 1e-4, 9450, n=2000)], loop.free)
+    trial = attempt(base, E.AsymmetricViscousFriction(0.0, 0.0))
+    assert (base.fit.theta[0] == pytest.approx(50.0)) == alone
+    assert ("AsymmetricViscousFriction.c" in trial.model.names) == alone
+
+
 def test_a_loop_that_hunts_keeps_its_names():
     def gap(after):
         return Gap("closed-loop simulation", 9.0, 3.0, after, 4.0, "m", *[np.zeros(3)] * 4)
