@@ -12,7 +12,7 @@ from .equations import Equations, Lag
 Piece = tuple[Any, Any, Any]  # duration, input at its start, slope of the input
 Scheme = tuple[int, int, bool]  # order, steps in a piece, whether pieces are cut for short lags
 SHARP = 8.0  # time constants after which the transient of a lag is over
-SHARP_STEPS = 6  # of order four in it where friction has a kink, which no order is high enough for
+SHARP_STEPS = 6  # of order four in it, where friction has a kink that no order is high enough for
 
 
 def integrate(rate: Any, z: Any, dt: Any, substeps: int) -> tuple[Any, Any]:
@@ -187,8 +187,8 @@ def advance(
         Constant added to the rates: a force held over the period.
     scheme : (int, int, bool), optional
         Order of the steps, four or eight; how many in each piece; and whether pieces are cut where
-        the transient of a short lag of the input is over. The transient itself takes a step of
-        order eight, or several of order four where friction has a kink.
+        the transient of a short lag of the input is over. With steps of order four, which friction
+        is given for its kinks, the transient has a number of its own.
 
     Returns
     -------
@@ -236,8 +236,8 @@ def advance(
                 rates[k] = 0
             return rates
 
-        if order == 8 or (sharp and not e.kinked):
-            after, error = integrate(rate, x, duration, steps if order == 8 else 1)
+        if order == 8:
+            after, error = integrate(rate, x, duration, steps)
             worst = casadi.fmax(worst, error)
         else:
             after = integrate_fast(rate, x, duration, SHARP_STEPS if sharp else steps)

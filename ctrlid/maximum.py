@@ -19,7 +19,7 @@ FAR = 3.0  # standard errors: after a longer step the trajectory is settled anew
 CLOSE = 0.02  # standard errors: a smaller step ends the search
 SHARES = tuple(3.0**-k for k in range(6))  # of a step, until the likelihood grows
 CURVED = 2  # of them, from where a second step may lead higher than the first began
-BEND = 30.0  # of log-likelihood: a step that promises less is on none
+BEND = 30.0  # of log-likelihood: of steps that promise less, hardly a second one leads higher
 ELSEWHERE = 2.0  # of log-likelihood, that a noise far away must gain to go on from there
 NOTHING = 1e-3  # of log-likelihood: a step that promises less is not worth taking
 

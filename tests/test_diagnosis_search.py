@@ -12,10 +12,11 @@ from scipy import signal, stats
 
 import ctrlid as cid
 from ctrlid import effects as E
+from ctrlid.diagnosis import replica as replicas
 from ctrlid.diagnosis import rounds
 from ctrlid.diagnosis.attempts import attempt, attempt_at, refit, under
 from ctrlid.diagnosis.closing import wider
-from ctrlid.diagnosis.decide import GATE, doubt_of_all, rivals
+from ctrlid.diagnosis.decide import GATE, HINT, doubt_of_all, rivals
 from ctrlid.diagnosis.experiment import separating_experiment
 from ctrlid.diagnosis.fitted import Model, base_model, spared, whole
 from ctrlid.diagnosis.instants import timed
@@ -105,6 +106,20 @@ def test_a_gain_too_small_to_prove_anything_is_still_compared(
     trials = rounds._simplest(base, [rich, plain])
     assert trials[0].name == (plain.name, rich.name)[first]
     assert all(np.isfinite(t.merit) for t in trials) == left
+
+
+def test_the_simple_effect_of_a_replica_climbs_from_where_the_richer_one_does(
+    one_level, monkeypatch
+):
+    """Where the replica's own fit is stuck, all that it lost would count as the filter's error."""
+    base, plain, rich = one_level
+    copy = plain.model
+    stuck = replace(copy, fit=replace(copy.fit, theta=1.2 * copy.fit.theta))
+    stuck = replace(stuck, fit=relinearized(stuck.fit))
+    assert stuck.fit.value < copy.fit.value - 100.0
+    monkeypatch.setattr(replicas, "replica", lambda model: stuck)
+    won = replicas.more_than_simple(base, rich, plain)
+    assert won == pytest.approx(rich.gain - plain.gain, abs=2 * HINT)
 
 
 def test_candidates_are_compared_under_the_same_random_force():

@@ -25,7 +25,7 @@ TOP = 5  # candidates refitted because of what they promise
 SHARE = 0.2  # of the best promise: what promises more is refitted as well
 FAINT = 0.5  # of what would earn a place: a fainter promise is not worth a refit
 OFFSETS = (SensorOffset,)
-NEARLY = 0.5  # of the best merit: what did so well is asked again under the noise of the best
+NEAR = 0.5  # of the winner's merit: what came so close is asked again
 DIFFERENT = math.log(2.0)  # of time constants of two random forces
 SLIGHT = 30.0  # a merit below this, beside a kink, is compared with
 MANY = 4  # replicas
@@ -143,9 +143,8 @@ def _refitted(
         stuck = [t for t in _maybe_stuck(best, tried) if id(t) in done]
         near = quiet(best.model)
         fit([(t, done[id(t)].fitted, near) for t in stuck])
-        fit([(t, m, None) for t in stuck for m in more if m is not t and m.name == t.name])
-        best = max(done.values(), key=lambda t: t.merit)
-        apart = [k for k, t in done.items() if t.merit > NEARLY * best.merit and _apart(t, best)]
+        best = fit([(t, m, None) for t in stuck for m in more if m is not t and m.name == t.name])
+        apart = [k for k, t in done.items() if t.merit > NEAR * best.merit and _apart(t, best)]
         noise = best.model.fit.noise
         again = work(lambda k: under(base, done[k], noise), apart)
         done |= dict(zip(apart, again, strict=True))

@@ -14,11 +14,10 @@ from .decide import GATE, rivals
 from .fitted import Model, simulable, spared
 from .omnibus import omnibus
 from .ordering import moved, relabelled
-from .rounds import NEXT, Step, Work, plainer
+from .rounds import NEAR, NEXT, Step, Work, plainer
 from .trial import Trial, contains
 from .weighing import needed
 
-NEAR = 0.5  # of the winner's merit: what came so close is asked again when all effects are in
 REGAINED = 0.1  # of what leaving an effect out loses: what promises less does not stand for it
 SURE = 100.0  # times the gate: an effect so significant is not asked whether it is needed
 
