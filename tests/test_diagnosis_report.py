@@ -13,6 +13,8 @@ from ctrlid import _pictures, plot
 from ctrlid import effects as E
 from ctrlid.diagnosis import gap as gap_of
 from ctrlid.diagnosis import words
+from ctrlid.diagnosis.closing import stands_out
+from ctrlid.diagnosis.fitted import base_model
 from ctrlid.diagnosis.result import (
     Calibrated,
     Candidate,
@@ -470,3 +472,27 @@ def test_a_window_far_from_rest_finds_its_start():
         [window], [gap_of.output(loop, window, "closed-loop simulation")]
     )
     assert error < 1e-5
+
+
+def test_noise_that_parts_a_loop_from_itself_explains_a_gap():
+    """A drive that rests in one hollow of its ripple or in the next, as noise will have it."""
+    plant = cid.plants.servo(m=1.0, c=4.0, k=1.0)
+    at = cid.OperatingPoint(states=(0.0, 0.0), input=0.0, output=0.0)
+    calm = cid.Loop(plant, cid.PID(kp=20.0, kd=3.0), dt=0.01, at=at, free=("k",))
+    rough = calm.with_effect(E.PositionRipple(amplitude=0.25, period=0.01, phase=0.0))
+    r = cid.random_binary(3000, amplitude=0.03, hold=90, seed=3)
+    record = cid.simulate(rough, r, sensor_noise=1e-4, force_noise=0.005, seed=4)
+    windows, fitted = [gap_of.whole(record)], base_model(rough, [record], ("k",)).fit
+    kind = "closed-loop simulation"
+    floors = [
+        gap_of.floor_of([loop], fitted, windows, kind, gap_of.MORE_RUNS) for loop in (rough, calm)
+    ]
+    assert floors[0].widest > 2 * floors[0].both
+    assert floors[1].widest < 1.2 * floors[1].both
+    for loop, floor in zip((rough, calm), floors, strict=True):
+        left = 2 * floor.both
+        gap = Gap(kind, 1.0, 1.0, left, floor.both, "m", *[np.zeros(3)] * 4, floor.widest)
+        assert stands_out(gap, fitted) == (loop is calm)
+        assert ("differ in noise alone" in words.shrinking(replace(gap, before=0.9))) == (
+            loop is rough
+        )

@@ -11,7 +11,7 @@ from ..errors import CtrlidError
 from ..loop import Loop
 from ..loop_fit import summary
 from .attempts import attempt_at, refit
-from .closing import EXCESS
+from .closing import stands_out
 from .decide import GATE, doubt_of_all
 from .experiment import separating_experiment
 from .fitted import base_model
@@ -45,8 +45,7 @@ def put_together(
     units = _units(loop, records[0])
     where = places(found.before, found.after, units)
     verdict: Verdict
-    excess = EXCESS * (2 if found.final.fit.noise.drift else 1)
-    left = math.isfinite(gap.floor) and gap.after > excess * gap.floor
+    left = stands_out(gap, found.final.fit)
     # A random force that may do anything explains everything, and nothing.
     blamed = disturbance.large or math.isnan(disturbance.share)
     left = left or (blamed and gap.after > WORSE * gap.given)

@@ -11,12 +11,11 @@ from ..loop import Loop
 from . import gap as gaps
 from .fitted import Model
 from .fresh import Fresh
-from .result import Disturbance, Gap
+from .result import EXCESS, Disturbance, Gap
 from .search import Search
 from .settling import Found
 
 HELPS = 0.05  # of what is left without an effect, on fresh data
-EXCESS = 1.5  # times the noise floor (twice that with a coloured force): above, not explained
 
 
 def gaps_of(loop: Loop, found: Search, fresh: Fresh) -> tuple[Gap, dict[int, float], Disturbance]:
@@ -28,22 +27,34 @@ def gaps_of(loop: Loop, found: Search, fresh: Fresh) -> tuple[Gap, dict[int, flo
     results = [fresh.outputs(x) for x in ((loop,) * len(windows), before, after)]
     sizes = [gaps.root_mean_square(windows, y) for y in results]
     fit = found.final.fit
-    floor, quiet = gaps.floors(after, fit, windows, kind)
+    floor = gaps.floor_of(after, fit, windows, kind)
+    if sizes[2] > EXCESS * floor.both:
+        floor = gaps.floor_of(after, fit, windows, kind, gaps.MORE_RUNS)
     shares: dict[int, float] = {}
     for f in found.found:
         error = sizes[1]
         if len(found.found) > 1:
             label = list(after[0].labelled)[f.position]
             error = fresh.gap([x.without_effect(label) for x in after])
-        shares[f.position] = _share(error**2 - sizes[2] ** 2, sizes[1], floor)
+        shares[f.position] = _share(error**2 - sizes[2] ** 2, sizes[1], floor.both)
     first = windows[0]
     gap = Gap(
-        kind, sizes[0], sizes[1], sizes[2], floor, first.record.units.get("y", ""),
+        kind, sizes[0], sizes[1], sizes[2], floor.both, first.record.units.get("y", ""),
         first.begin + np.asarray(first.record.t - first.record.start)[first.mask],
         np.asarray(first.record.y)[first.mask], results[1][0][first.mask],
-        results[2][0][first.mask],
+        results[2][0][first.mask], floor.widest,
     )  # fmt: skip
-    return gap, shares, _disturbance(found.final.fit, loop, floor, quiet)
+    return gap, shares, _disturbance(fit, loop, floor)
+
+
+def stands_out(gap: Gap, fit: Fit) -> bool:
+    """Whether the gap with the effects is wider than noise, as a fit knows it, accounts for.
+
+    A loop that hunts leaves a narrow gap in one run and a wide one in another; the record is but
+    one more run, so the widest of several counts.
+    """
+    noise = max(gap.floor, gap.widest)
+    return math.isfinite(noise) and gap.after > EXCESS * (2 if fit.noise.drift else 1) * noise
 
 
 def wider(gap: Gap, disturbance: Disturbance) -> bool:
@@ -69,7 +80,7 @@ def helps_on(fresh: Fresh) -> Callable[[Found, Model], bool]:
             left = fresh.excess(without, model.fit)
             if left - fresh.excess(with_it, model.fit) > HELPS * left:
                 return True
-        floor = gaps.floors(with_it, model.fit, fresh.windows, fresh.kind)[0]
+        floor = gaps.floor_of(with_it, model.fit, fresh.windows, fresh.kind).both
         gap, before = fresh.gap(with_it), fresh.gap(without)
         return _share(before**2 - gap**2, before, floor) > HELPS
 
@@ -83,10 +94,10 @@ def _share(closed: float, before: float, floor: float) -> float:
     return float(min(max(closed / above, 0.0), 1.0))
 
 
-def _disturbance(fit: Fit, loop: Loop, floor: float, quiet: float) -> Disturbance:
+def _disturbance(fit: Fit, loop: Loop, floor: gaps.Floor) -> Disturbance:
     noise, scale = fit.noise, float(np.mean(fit.sensor))
     time_constant = -loop.dt / math.log(noise.memory) if noise.drift else math.nan
-    share = 1 - (quiet / floor) ** 2 if floor > 0 and math.isfinite(quiet) else math.nan
+    share = 1 - (floor.sensor / floor.both) ** 2 if floor.both > 0 else math.nan
     coloured = math.sqrt(scale * noise.coloured) if noise.drift else 0.0
     white = math.sqrt(scale * float(np.mean(noise.force)))
     return Disturbance(white, coloured, time_constant, float(np.clip(share, 0.0, 1.0)))

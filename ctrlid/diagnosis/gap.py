@@ -24,6 +24,7 @@ from ..validation import moving_poles, time_constant
 ROUGH = 1e-5  # local error of the integration, far below any gap worth a word
 FEW_STEPS = 8  # of the integration in a period; sharp friction would ask for many more
 RUNS = 3  # simulations with noise for the floor
+MORE_RUNS = 8  # where a gap stands out: loops that hunt differ much from run to run
 MOST_HELD = 30_000  # samples that are simulated for the comparison
 HELD = 0.25  # share of a record that is kept back for the comparison
 START = 0.02  # share of a stretch in which the guess of the initial state may still show
@@ -149,10 +150,23 @@ def drive(
     return best_start(simulator, part, r, d, guess, n), r, d
 
 
-def floors(
-    loops: Sequence[Loop], fit: Fit, windows: Sequence[Window], kind: str
-) -> tuple[float, float]:
-    """Return the RMS error that noise leaves through a loop: all noise, and the sensor's alone.
+@dataclass(frozen=True)
+class Floor:
+    """The RMS error that noise leaves through a loop [output unit].
+
+    `both` with sensor noise and random force, `sensor` with sensor noise alone, `widest` that of
+    the simulation with both that erred most; NaN where they cannot be computed.
+    """
+
+    both: float
+    sensor: float
+    widest: float
+
+
+def floor_of(
+    loops: Sequence[Loop], fit: Fit, windows: Sequence[Window], kind: str, runs: int = RUNS
+) -> Floor:
+    """Return the RMS error that noise leaves through a loop.
 
     Parameters
     ----------
@@ -164,32 +178,38 @@ def floors(
         The data.
     kind : str
         As `way_to_compare` says it.
+    runs : int
+        Simulations with noise.
 
     Returns
     -------
-    both, sensor : float
+    Floor
         RMS errors [output unit]; NaN where they cannot be computed.
     """
-    squares, count = np.zeros(2), 0
+    squares, count = np.zeros((runs, 2)), 0
     for k, (loop, window) in enumerate(zip(loops, windows, strict=True)):
         noise = float(fit.sensor[min(k, len(fit.sensor) - 1)])
         try:
-            values = _floors(loop, fit, noise, window, kind)
+            squares += _squares(loop, fit, noise, window, kind, runs)
         except CtrlidError:
-            return math.nan, math.nan
-        size = int(np.count_nonzero(window.mask))
-        squares += values**2 * size
-        count += size
-    both, sensor = np.sqrt(squares / max(count, 1))
-    return float(both), float(sensor)
+            return Floor(math.nan, math.nan, math.nan)
+        count += int(np.count_nonzero(window.mask))
+    errors = np.sqrt(squares / max(count, 1))
+    both, sensor = np.sqrt(np.mean(errors**2, axis=0)).tolist()
+    return Floor(both, sensor, float(np.max(errors[:, 0])))
 
 
-def _floors(loop: Loop, fit: Fit, sensor: float, window: Window, kind: str) -> Array:
+def _squares(
+    loop: Loop, fit: Fit, sensor: float, window: Window, kind: str, runs: int
+) -> Array:  # fmt: skip
+    """Return what noise leaves in a window, squared and summed over its samples, for each run."""
     record = window.record
+    size = int(np.count_nonzero(window.mask))
     if kind.endswith("prediction"):
-        return np.array(spread_ahead(loop, record, predict(loop, record), _steps(kind)))
+        known = np.array(spread_ahead(loop, record, predict(loop, record), _steps(kind)))
+        return np.tile(size * known**2, (runs, 1))
     simulator = Simulator(loop, ROUGH, FEW_STEPS)
-    squares, count = np.zeros(2), 0
+    squares, count = np.zeros((runs, 2)), 0
     for start, stop in record.segments():
         use = window.mask[start:stop]
         if stop - start < FEWEST or not use.any():
@@ -198,15 +218,15 @@ def _floors(loop: Loop, fit: Fit, sensor: float, window: Window, kind: str) -> A
         begin = window.begin + float(record.t[start] - record.start)
         z, r, d = drive(simulator, part)
         rest = simulator.run(z, r, d, None, begin)[0]
-        for seed in range(RUNS):
+        for seed in range(runs):
             noise = random_noise(fit, sensor, len(part), seed)
             for k, both in enumerate((noise, [noise[0], 0 * noise[1]])):
                 moved = simulator.run(z, r, d, both, begin)[0] - rest
-                squares[k] += float(np.sum(moved[use] ** 2))
-            count += int(use.sum())
+                squares[seed, k] += float(np.sum(moved[use] ** 2))
+        count += int(use.sum())
     if not count:
         raise CtrlidError("no stretch is long enough to be simulated")
-    return np.sqrt(squares / count)
+    return squares * (size / count)
 
 
 def random_noise(fit: Fit, sensor: float, n: int, seed: int) -> list[Array]:

@@ -1,5 +1,6 @@
 """What a diagnosis found, as values."""
 
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -10,6 +11,7 @@ from ..equations import Array
 from ..loop import Loop
 
 Verdict = Literal["nothing missing", "explained", "partly explained", "unknown"]
+EXCESS = 1.5  # times what noise leaves (twice that with a coloured force): above, not explained
 LARGE = 0.5  # share of the floor's variance from which a random force may hide something
 
 
@@ -34,6 +36,9 @@ class Gap:
     simulated_before, simulated_after : ndarray, shape (m,)
         What the recalibrated model and the model with the effects make of them [output unit]; NaN
         where there is nothing.
+    widest : float
+        RMS error of the widest of several simulations with noise [output unit]: far above the
+        floor where a loop hunts, which no simulation follows for long.
     """
 
     kind: str
@@ -46,6 +51,7 @@ class Gap:
     measured: Array
     simulated_before: Array
     simulated_after: Array
+    widest: float = math.nan
 
 
 @dataclass(frozen=True, eq=False)

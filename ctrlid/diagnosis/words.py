@@ -7,7 +7,7 @@ import numpy as np
 
 from .._text import chance, listing, number, prefix, quantity
 from ..effects import AbstractEffect, ReadingEffect
-from .result import Diagnosis, Finding, Gap, Place
+from .result import EXCESS, Diagnosis, Finding, Gap, Place
 from .saving import units_of
 
 TELLING = 1e-3  # probability below which a place is not noise's doing
@@ -74,6 +74,11 @@ def shrinking(gap: Gap) -> str:
     above = gap.before**2 - gap.floor**2
     if not math.isfinite(above):
         return ""
+    if EXCESS * gap.floor < gap.after < EXCESS * gap.widest:
+        widest = quantity(gap.widest, gap.unit)
+        return (f"Two runs of the completed model that differ in noise alone end up as far as "
+                f"{widest} apart, so the gap shows little of what the effects close; the "
+                "one-step errors do.")  # fmt: skip
     if above <= 0 and gap.after < NEAR * gap.floor:
         return ("Noise alone moves two runs of the completed model apart by as much, so "
                 "the gap cannot show what the effects close; the one-step errors do.")  # fmt: skip
