@@ -31,7 +31,8 @@ class Play:
     """What an input passes through once per sample before it reaches the plant, with memory.
 
     ``(next m, applied u)`` as expressions of the memory `m`, the computed input `u` and the
-    parameters; `start` is the memory that belongs to a resting input, an expression of `u`.
+    parameters; `start` is the memory that belongs to a resting input, an expression of `u`, and
+    `reach` how far from it the memory may be where nobody knows what went before.
     """
 
     m: Any
@@ -39,6 +40,7 @@ class Play:
     after: Any
     applied: Any
     start: Any
+    reach: Any
 
 
 def _put_away(value: Any, found: list[Any]) -> Any:

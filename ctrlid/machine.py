@@ -25,6 +25,8 @@ MOST_STEPS = 100  # of order eight in a period: more make an expression that tak
 BRISK = 0.35  # of a lag's time constant: a step of order four that follows it exactly enough
 ROUGH = 0.7  # the same beside the kink of friction, where no formula is more exact
 FEW_STEPS = 3  # of order four, which cost less than one of order eight
+FORGOTTEN = 200  # samples after which one looks whether a play has forgotten how it began
+LASTING = 10  # samples: an error that stays moves the plant as far as noise of so many variances
 KINK_STEPS = 4  # of order four in a period where friction has a kink; twice as many beside a lag
 
 
@@ -49,6 +51,7 @@ class Linearized:
     height: Array
     c: Array
     hp: Array
+    doubt: Array  # variance of the input, relative to the sensor's
     trajectory: Trajectory
 
 
@@ -115,7 +118,7 @@ class Machine:
         e, dt = self.e, self.loop.dt
         p = casadi.SX(casadi.DM(self.values(theta)))
         if e.delay is not None:
-            late = float(casadi.evalf(casadi.substitute(casadi.SX(e.delay), e.p, p))) / dt + 1e-9
+            late = self._delay(p) / dt + 1e-9
             if not self.late <= late <= self.late + 1 + 1e-6:
                 return False
         time, (order, steps, cut) = _shortest(e, p), self.scheme
@@ -128,39 +131,74 @@ class Machine:
         p = self.values(theta)
         u = track.table[1]
         applied, slopes = self._through_play(u, p)
+        doubt = track.doubt + self._unknown(u, p) / track.scale**2
         w = self._inputs(track, applied)
         spread = at.spread[:, : self.n].T
         given = (at.filtered.T, w, p, spread, np.zeros(self.channels))
         step, a, b, dp = self._period(self.maps.stages, *given)
         # How the input moves the state matters only where the input is not what was measured.
-        unsure = slopes is not None or not track.valid.all()
-        dw = np.zeros((1, self.size, 3))
-        if unsure:
-            dw = self._period(moves_of(self.plan), *given)[2]
+        dw = np.zeros((len(u), self.size, 3))
         if slopes is not None:
-            dw = _full(dw, len(u))
+            dw = _full(self._period(moves_of(self.plan), *given)[2], len(u))
+        elif doubt.any():
+            rows = np.flatnonzero(doubt)
+            some = [v[:, rows] if k in (0, 1, 3) else v for k, v in enumerate(given)]
+            dw[rows] = self._period(moves_of(self.plan), *some)[2]
+        if slopes is not None:
             dp = _full(dp, len(u)).copy()
             for k in (-1, 0, 1):
                 dp += dw[:, :, k + 1, None] * self._shifted(slopes, k)[:, None, :]
         height, c, hp = self.maps.sensor(at.predicted.T, w, p, spread)
         return Linearized(
             _full(step, len(u))[:, :, 0], _full(a, len(u)), _full(b, len(u)),
-            _full(dw.sum(axis=2), len(u)), _full(dp, len(u)), _full(height, len(u))[:, 0, 0],
-            _full(c, len(u))[:, 0, :], _full(hp, len(u))[:, 0, :], at,
+            dw.sum(axis=2), _full(dp, len(u)), _full(height, len(u))[:, 0, 0],
+            _full(c, len(u))[:, 0, :], _full(hp, len(u))[:, 0, :], doubt, at,
         )  # fmt: skip
 
     def _through_play(self, u: Array, p: Array) -> tuple[Array, Array | None]:
         """Return the input behind the play, and how it depends on the free parameters."""
-        e = self.e
-        if e.play is None:
+        if self.e.play is None:
             return u, None
-        start = casadi.substitute(
-            casadi.SX(e.play.start), casadi.vertcat(e.play.u, e.p), casadi.vertcat(u[0], p)
-        )
-        z = np.concatenate([np.asarray(casadi.evalf(start), float).ravel(),
-                            np.zeros(len(self.index))])  # fmt: skip
-        out = np.asarray(play_of(self.plan, len(u))(z, u[None, :], p)[1], float)
-        return out[0], out[1:].T
+        out = play_of(self.plan, len(u))(self._memory(u[0], p)[0], u[None, :], p)[1]
+        return np.asarray(out, float)[0], np.asarray(out, float)[1:].T
+
+    def _unknown(self, u: Array, p: Array) -> Array:
+        """Return the variance of the input, as far as it is older than the record."""
+        variance = self._shifted(self._forgetting(u, p), 0)
+        if self.e.delay is not None:
+            late = self._delay(p) / self.loop.dt - np.arange(len(u))
+            variance = variance + np.clip(late, 0.0, 1.0) ** 2 * np.var(u)
+        return variance
+
+    def _delay(self, p: Any) -> float:
+        return float(casadi.evalf(casadi.substitute(casadi.SX(self.e.delay), self.e.p, p)))
+
+    def _forgetting(self, u: Array, p: Array) -> Array:
+        """Return the variance of the input behind the play, until it forgets how it began."""
+        variance = np.zeros(len(u))
+        if self.e.play is None:
+            return variance
+        middle, reach = self._memory(u[0], p)
+        ends = [middle - reach, middle + reach]
+        for first in range(0, len(u), FORGOTTEN):
+            some = u[None, first : first + FORGOTTEN]
+            out = [play_of(self.plan, some.shape[1])(z, some, p) for z in ends]
+            low, high = (np.asarray(applied, float)[0] for _, applied in out)
+            variance[first : first + FORGOTTEN] = LASTING * (high - low) ** 2 / 12
+            if high[-1] == low[-1]:
+                break
+            ends = [np.asarray(z, float)[:, -1] for z, _ in out]
+        return variance
+
+    def _memory(self, u: float, p: Array) -> tuple[Array, Array]:
+        """Return the play's memory at the start with its slopes, and how far off it may be."""
+        play = self.e.play
+        assert play is not None
+        given = casadi.vertcat(play.u, self.e.p), casadi.vertcat(u, p)
+        found = casadi.substitute(casadi.vertcat(play.start, play.reach), *given)
+        start, reach = np.asarray(casadi.evalf(found), float).ravel()
+        first = np.eye(1 + len(self.index))[0]
+        return start * first, reach * first
 
     def with_slopes(self) -> casadi.Function:
         """Return one period of the plant, as it is, together with that of its sensitivities.

@@ -178,7 +178,7 @@ def test_slices():
     np.testing.assert_array_equal(record[: np.int64(5)].y, record.y[:5])
 
 
-@given(a=st.integers(0, 18), b=st.integers(22, 40), c=st.integers(0, 5), d=st.integers(10, 15))
+@given(a=st.integers(0, 15), b=st.integers(22, 40), c=st.integers(0, 5), d=st.integers(10, 15))
 @settings(deadline=None, max_examples=30)
 def test_slices_of_slices(a, b, c, d):
     record = full()

@@ -465,6 +465,47 @@ def test_play_is_followed_with_its_derivative():
     assert np.abs(slope).max() > 0
 
 
+def test_nobody_knows_where_a_play_begins():
+    """A record cut out of a longer one begins anywhere in the gap; the filter allows for it."""
+    plant = cid.plants.pendulum(m=0.12, length=0.25, c=0.013)
+    at = cid.OperatingPoint(states=(0.0, 0.0), input=0.0, output=0.0)
+    lead = cid.design_lead(cid.linearize(plant, at), crossover=15, phase_margin=50)
+    loop = cid.Loop(plant, lead.sample(0.015, "tustin"), dt=0.015, at=at)
+    loop = loop.with_effect(E.InputBacklash(0.2))
+    r = cid.random_binary(2000, amplitude=0.1, hold=40, seed=1)
+    record = cid.simulate(loop, r, sensor_noise=3e-4, force_noise=0.03, seed=2)
+    known = Noise((1e4,))
+    for first in range(0, 40, 5):
+        track = make_track(loop, record[first:])
+        m = Machine(loop, ("InputBacklash.width",), "zoh", False)
+        lin, out = settle(m, track, np.array([0.2]), known, first_guess(m, track), 30)
+        z = out.innovations / np.sqrt(out.variance) / 3e-4
+        assert np.abs(z).max() < 5
+        assert np.mean(z[:60] ** 2) < 1.6
+        u = record.u[first:]
+        crossed = np.argmax(np.maximum.accumulate(u) - np.minimum.accumulate(u) >= 0.2)
+        assert np.array_equal(np.flatnonzero(lin.doubt), np.arange(crossed))
+        assert lin.doubt[0] * track.scale**2 == pytest.approx(10 * 0.2**2 / 12)
+
+
+def test_nobody_knows_what_a_delay_brings_at_first():
+    plant = cid.plants.pendulum(m=0.12, length=0.25, c=0.013)
+    at = cid.OperatingPoint(states=(0.0, 0.0), input=0.0, output=0.0)
+    lead = cid.design_lead(cid.linearize(plant, at), crossover=15, phase_margin=50)
+    loop = cid.Loop(plant, lead.sample(0.005, "tustin"), dt=0.005, at=at)
+    loop = loop.with_effect(E.InputDelay(0.016))
+    r = cid.random_binary(2000, amplitude=0.1, hold=40, seed=1)
+    record = cid.simulate(loop, r, sensor_noise=1e-4, force_noise=0.03, seed=2)
+    for first in range(0, 80, 10):
+        track = make_track(loop, record[first:])
+        m = Machine(loop, (), "zoh", False)
+        lin, out = settle(m, track, np.zeros(0), Noise((9e4,)), first_guess(m, track), 30)
+        z = out.innovations / np.sqrt(out.variance) / 1e-4
+        assert np.abs(z).max() < 6
+        relative = lin.doubt[:5] * track.scale**2 / np.var(track.record.u)
+        assert relative == pytest.approx([1, 1, 1, 0.2**2, 0])
+
+
 def test_coulomb_friction_is_smoothed_by_the_uncertain_velocity():
     """Expected sign of a normal velocity: erf(v / (sqrt(2) s))."""
     plant = ct.nlsys(lambda t, x, u, p: [x[1], u[0]], lambda t, x, u, p: x[0], name="mass",

@@ -156,4 +156,4 @@ class InputBacklash(InputEffect):
         memory, u = casadi.SX.sym("m"), casadi.SX.sym("u")
         half = expression(self.width) / 2
         after = casadi.fmin(casadi.fmax(memory, u - half), u + half)
-        return dataclasses.replace(e, play=Play(memory, u, after, after, u))
+        return dataclasses.replace(e, play=Play(memory, u, after, after, u, half))
