@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import casadi
 import numpy as np
 from scipy import optimize
 
@@ -11,6 +12,11 @@ from .equations import Array
 from .errors import CtrlidError
 from .linearization import state_matrices
 from .simulation import Simulator
+
+FASTEST = 20.0  # standard deviations of the measured speed: no start is faster
+NEAR = 3.0  # times the largest step between the first samples: the start is where it is seen
+FEW = 8  # samples that tell where a record starts, and how fast
+NARROW = 1e-6  # of the scale: a search begins so far within its bounds
 
 
 def best_start(
@@ -36,12 +42,17 @@ def best_start(
     Returns
     -------
     ndarray
-        The state.
+        The state: where it is measured, no faster than the record moves, and with lags of the
+        input within what they follow.
     """
     spread = max(float(np.std(part.y)), 1e-12 * float(np.abs(part.y).max()), 1e-300)
     scale = np.maximum(0.01 * np.abs(guess[:fitted]), spread)
-    for j in simulator.loop.equations().velocities:
+    e = simulator.loop.equations()
+    for j in e.velocities:
         scale[j] = max(float(np.std(np.diff(part.y))) / part.dt, 1e-300)
+    low, high = _limits(simulator, part, guess)
+    for lag in _following(simulator, fitted):
+        scale[lag] = max(float(np.std(part.u)), 1e-300)
 
     def misfit(z: Array, count: int) -> Array | None:
         try:
@@ -60,8 +71,14 @@ def best_start(
             found = misfit(moved(start, point), count)
             return np.full(count, 1e3) if found is None else found
 
+        # A force that acts from the first sample on is not to be paid for by an absurd start.
+        lower, upper = (1 + (v[:fitted] - start[:fitted]) / scale for v in (low, high))
+        upper = np.maximum(upper, lower + 4 * NARROW)
         # Around 1, so that the differences have the relative size that is asked for.
-        best = optimize.least_squares(residual, np.ones(fitted), diff_step=[1e-4], max_nfev=20)
+        best = optimize.least_squares(
+            residual, np.clip(np.ones(fitted), lower + NARROW, upper - NARROW),
+            bounds=(lower, upper), diff_step=[1e-4], max_nfev=20,
+        )  # fmt: skip
         return moved(start, best.x)
 
     # From rest a short search does not find a start that is far away.
@@ -82,9 +99,9 @@ def _as_measured(simulator: Simulator, part: Record, guess: Array) -> Array:
     loop, start = simulator.loop, guess.copy()
     e = loop.equations()
     n = len(e.states)
-    few = min(len(part), 8)
+    few = min(len(part), FEW)
     slope, first = np.polyfit(np.arange(few) * part.dt, part.y[:few], 1)
-    c = state_matrices(e, loop.point, spread=1e6)[2][0]
+    c = _seen(simulator)
     off = first - float(e.evaluate(guess[:n], loop.point.input, 0.0)[1][0])
     seen = np.array([0.0 if j in e.velocities else c[j] for j in range(n)])
     if seen.any():
@@ -93,3 +110,34 @@ def _as_measured(simulator: Simulator, part: Record, guess: Array) -> Array:
     if moving is not None and c[moving[0]]:
         start[moving[1]] = slope / c[moving[0]]
     return start
+
+
+def _limits(simulator: Simulator, part: Record, guess: Array) -> tuple[Array, Array]:
+    """Return between what values the state of the plant may start."""
+    e = simulator.loop.equations()
+    low, high = np.full(len(guess), -np.inf), np.full(len(guess), np.inf)
+    moving, c = motion(e), _seen(simulator)
+    if moving is not None and c[moving[0]]:
+        where, speed = moving
+        steps = np.diff(part.y)
+        high[speed] = FASTEST * float(np.std(steps)) / part.dt / abs(c[where])
+        low[speed] = -high[speed]
+        if not casadi.depends_on(casadi.jacobian(e.output, e.x), e.x):
+            start = _as_measured(simulator, part, guess)[where]
+            off = NEAR * float(np.abs(steps[:FEW]).max()) / abs(c[where])
+            low[where], high[where] = start - off, start + off
+    for lag in _following(simulator, len(guess)):
+        low[lag], high[lag] = float(part.u.min()), float(part.u.max())
+    return low, high
+
+
+def _following(simulator: Simulator, fitted: int) -> list[int]:
+    """Return the states that are lags of the input."""
+    e = simulator.loop.equations()
+    return [x.state for x in e.lags if x.state < fitted and casadi.is_equal(x.target, e.u, 2)]
+
+
+def _seen(simulator: Simulator) -> Array:
+    """Return how the output depends on the states, at rest."""
+    loop = simulator.loop
+    return np.asarray(state_matrices(loop.equations(), loop.point, spread=1e6)[2][0])

@@ -25,6 +25,7 @@ from ctrlid.diagnosis.result import (
     Place,
 )
 from ctrlid.diagnosis.saving import SavedLoop, load_diagnosis
+from ctrlid.simulation import Simulator
 
 DT, N = 0.002, 3000
 VERDICTS = ("nothing missing", "explained", "partly explained", "unknown")
@@ -472,6 +473,24 @@ def test_a_window_far_from_rest_finds_its_start():
         [window], [gap_of.output(loop, window, "closed-loop simulation")]
     )
     assert error < 1e-5
+
+
+def test_an_unknown_force_is_not_paid_for_by_an_absurd_start():
+    """Behind a lag, a huge input that dies at once could stand for a kick, and did: 700 V."""
+    plant = cid.plants.servo(m=1.0, c=4.0, k=1.0)
+    at = cid.OperatingPoint(states=(0.0, 0.0), input=0.0, output=0.0)
+    loop = cid.Loop(plant, cid.PID(kp=20.0, kd=3.0), dt=0.01, at=at)
+    loop = loop.with_effect(E.ActuatorLag(0.006))
+    r = cid.random_binary(600, amplitude=0.03, hold=60, seed=3)
+    force = 0.6 * np.sin(np.arange(600) / 40)
+    record = cid.simulate(loop, r, sensor_noise=1e-6, d=force, seed=1)
+    simulator = Simulator(loop, gap_of.ROUGH, gap_of.FEW_STEPS)
+    x, v, lag = gap_of.drive(simulator, replace(record, u=record.u - force))[0][:3]
+    assert abs(x) < 5e-3
+    assert abs(v) < 0.5
+    assert abs(lag) < 20
+    still = replace(record, y=np.zeros(600), u=np.zeros(600), r=np.zeros(600))
+    assert np.allclose(gap_of.drive(simulator, still)[0], 0.0, atol=1e-6)
 
 
 def test_noise_that_parts_a_loop_from_itself_explains_a_gap():

@@ -19,7 +19,7 @@ DOUBT = 0.6  # of the best merit: where something is left, a look-alike with mor
 OPEN = 0.1  # standard error over the size of an effect: beyond, a further parameter may matter
 MANY = 4  # effects at once: such a list describes almost any error, and explains none
 SOME = 3  # effects at once, of which none may be slight
-SLIGHT = 0.05  # of the largest gain: what corrects so little of it corrects a wrong law, perhaps
+SLIGHT = 0.02  # of the largest gain: what corrects so little of it corrects a wrong law, perhaps
 BLOCK = 50  # samples whose terms are summed before their spread is taken
 
 
