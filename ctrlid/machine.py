@@ -27,6 +27,7 @@ ROUGH = 0.7  # the same beside the kink of friction, where no formula is more ex
 FEW_STEPS = 3  # of order four, which cost less than one of order eight
 FORGOTTEN = 200  # samples after which one looks whether a play has forgotten how it began
 LASTING = 10  # samples: an error that stays moves the plant as far as noise of so many variances
+NEARLY = 0.01  # of the sensor's variance: how well what a lag shows is known where it is short
 KINK_STEPS = 4  # of order four in a period where friction has a kink; twice as many beside a lag
 
 
@@ -52,6 +53,7 @@ class Linearized:
     c: Array
     hp: Array
     doubt: Array  # variance of the input, relative to the sensor's
+    spread: Array  # covariance of the state at a start, relative to the sensor's
     trajectory: Trajectory
 
 
@@ -152,7 +154,8 @@ class Machine:
         return Linearized(
             _full(step, len(u))[:, :, 0], _full(a, len(u)), _full(b, len(u)),
             dw.sum(axis=2), _full(dp, len(u)), _full(height, len(u))[:, 0, 0],
-            _full(c, len(u))[:, 0, :], _full(hp, len(u))[:, 0, :], doubt, at,
+            _full(c, len(u))[:, 0, :], _full(hp, len(u))[:, 0, :], doubt,
+            self.padded(self._spread(track, p)), at,
         )  # fmt: skip
 
     def _through_play(self, u: Array, p: Array) -> tuple[Array, Array | None]:
@@ -169,6 +172,30 @@ class Machine:
             late = self._delay(p) / self.loop.dt - np.arange(len(u))
             variance = variance + np.clip(late, 0.0, 1.0) ** 2 * np.var(u)
         return variance
+
+    @functools.cached_property
+    def _behind(self) -> list[tuple[int, casadi.Function]]:
+        """Lags of what the plant shows, each with its time and how its target depends on states."""
+        e, found = self.e, []
+        for lag in e.lags:
+            near = casadi.jacobian(lag.target, e.x)
+            if near.nnz() and not casadi.depends_on(lag.target, casadi.vertcat(e.t, e.u)):
+                parts = [casadi.SX(lag.time_constant), casadi.densify(near)]
+                found.append((lag.state, casadi.Function("behind", [e.x, e.p], parts)))
+        return found
+
+    def _spread(self, track: Track, p: Array) -> Array:
+        """Return the covariance at a start: what lags behind the plant is near what it follows."""
+        if not self._behind:
+            return track.spread
+        spread = track.spread.copy()
+        step = np.var(np.diff(track.table[3])) / track.scale**2 / self.loop.dt**2
+        for k, function in self._behind:
+            time, near = (np.asarray(v, float).ravel() for v in function(track.start, p))
+            spread[k] = spread[:, k] = near @ spread
+            wide = near @ spread @ near
+            spread[k, k] = wide + min(time[0] ** 2 * step, wide) + NEARLY
+        return spread
 
     def _delay(self, p: Any) -> float:
         return float(casadi.evalf(casadi.substitute(casadi.SX(self.e.delay), self.e.p, p)))

@@ -16,7 +16,9 @@ from ctrlid import effects as E
 from ctrlid.filtering import Noise, first_guess, settle
 from ctrlid.integration import advance
 from ctrlid.kalman import filter_pass
+from ctrlid.loop_fit import make_problem
 from ctrlid.machine import Machine, Trajectory
+from ctrlid.maximum import begin
 from ctrlid.tracks import make_track, state_at_rest
 
 # --- one pass
@@ -504,6 +506,20 @@ def test_nobody_knows_what_a_delay_brings_at_first():
         assert np.abs(z).max() < 6
         relative = lin.doubt[:5] * track.scale**2 / np.var(track.record.u)
         assert relative == pytest.approx([1, 1, 1, 0.2**2, 0])
+
+
+@pytest.mark.parametrize("effects", [(), (E.SensorNonlinearity(20.0),)])
+def test_a_sensor_lag_of_no_length_costs_nothing(effects):
+    """What it shows at first is near what it follows; counted as unknown, a lag lost to a delay."""
+    loop = levitated(*effects)
+    op, dt = loop.point, loop.dt
+    r = cid.random_binary(500, amplitude=1e-4, hold=30, around=op.output, seed=8)
+    record = cid.simulate(loop, r, sensor_noise=1e-6, force_noise=0.01, seed=9)
+    both = [
+        begin(make_problem(model, (), [record], [0.0]), np.zeros(0), Noise((1e4,))).value
+        for model in (loop, loop.with_effect(E.SensorLag(1e-5 * dt)))
+    ]
+    assert both[1] == pytest.approx(both[0], abs=0.1)
 
 
 def test_coulomb_friction_is_smoothed_by_the_uncertain_velocity():
