@@ -148,6 +148,9 @@ def test_what_the_record_excludes_does_not():
         E.CoulombFriction(0.0), E.AsymmetricCoulombFriction(0.0, 0.0)))  # fmt: skip
     assert plain.gain > 100
     assert rivals(plain, [more]) == ()
+    # One record in five gains so much by a difference that is none: here it is below a fifth.
+    by_chance = replace(more, gain=plain.gain + 2 * HINT)
+    assert rivals(plain, [by_chance]) == ()
 
 
 def test_the_simple_effect_begins_where_the_larger_one_ended(one_level):

@@ -16,7 +16,7 @@ HINT = 1.0  # of log-likelihood, that a larger model gains by chance in one reco
 SAME = 4.0  # spread of a likelihood ratio: two models that differ by less are nested
 Z = 2.0  # standard deviations of Vuong's test
 DOUBT = 0.6  # of the best merit: where something is left, a look-alike with more is not excluded
-OPEN = 0.1  # standard error over the size of an effect: beyond, a further parameter may matter
+SMALL = 0.2  # of the size of an effect: a further parameter that is no larger is no other effect
 MANY = 4  # effects at once: such a list describes almost any error, and explains none
 SOME = 3  # effects at once, of which none may be slight
 SLIGHT = 0.02  # of the largest gain: what corrects so little of it corrects a wrong law, perhaps
@@ -83,20 +83,21 @@ def _spread(d: Array) -> float:
     return math.sqrt(float(np.sum((sums - sums.mean()) ** 2)))
 
 
-def _open(trial: Trial, simple: Trial) -> bool:
-    """Whether what an effect has beyond a simpler one may be large, for all the record says."""
+def _beyond(trial: Trial, simple: Trial) -> float:
+    """Return how large what an effect has beyond a simpler one may be, over what both have.
+
+    NaN where the two have nothing of one unit.
+    """
     names = trial.model.names
     errors = trial.model.fit.standard_errors
     units = {p.name: p.unit for p in trial.effect.parameters() if p.neutral is not None}
-    shared = simple.fitted.values()
+    shared, values, shares = simple.fitted.values(), trial.fitted.values(), []
     for k in units.keys() - shared.keys():
-        size = max(
-            (abs(v) for i, v in shared.items() if units.get(i) == units[k]), default=math.inf
-        )
+        size = max((abs(v) for i, v in shared.items() if units.get(i) == units[k]), default=0.0)
         key = f"{trial.label}.{k}"
-        if key in names and errors[names.index(key)] > OPEN * size:
-            return True
-    return False
+        if key in names and size > 0:
+            shares.append((abs(values[k]) + Z * errors[names.index(key)]) / size)
+    return max(shares, default=math.nan)
 
 
 def rivals(best: Trial, others: Sequence[Trial], sure: bool = True) -> tuple[Trial, ...]:
@@ -126,13 +127,15 @@ def rivals(best: Trial, others: Sequence[Trial], sure: bool = True) -> tuple[Tri
         lost = best.merit - trial.merit
         theirs = log_terms(trial.model.fit)
         # A larger model that predicts the same contains the best one, and pays for nothing; but one
-        # that gains more may be right (a Stribeck curve hardly told from dry friction), and a
-        # record that says nothing of what it has more cannot exclude it.
+        # that gains more may be right (a Stribeck curve hardly told from dry friction), and one
+        # whose further part may be large, for all the record says, cannot be excluded.
         alike = trial.name in type(best.effect).look_alikes
         nothing = trial.gain < best.gain + CLOSE and _spread(mine - theirs) < SAME
         if trial.cost > best.cost and nothing:
-            free = contains(trial.effect, best.effect) and _open(trial, best)
-            if free or (alike and trial.gain > best.gain + HINT):
+            larger = contains(trial.effect, best.effect)
+            share = _beyond(trial, best) if larger else math.nan
+            hinted = alike and trial.gain > best.gain + HINT and not share <= SMALL
+            if share > SMALL or hinted:
                 found.append(trial)
             continue
         z = vuong(mine, theirs, best.cost - trial.cost)
