@@ -189,7 +189,9 @@ def judged(model: Model) -> Omnibus:
     return after
 
 
-def main_ones(found: Search, helps: Callable[[Found, Model], bool]) -> Search:
+def main_ones(
+    found: Search, helps: Callable[[Found, Model], bool], minor: float = MINOR
+) -> Search:  # fmt: skip
     """Keep the effects that carry the explanation where something unknown remains.
 
     Small effects beside something unknown are stand-ins for it, and a wrong name is worse than
@@ -201,6 +203,8 @@ def main_ones(found: Search, helps: Callable[[Found, Model], bool]) -> Search:
         The end of a search.
     helps : callable
         ``helps(finding, model)``: whether an effect narrows the gap of the model on fresh data.
+    minor : float, optional
+        Share of the whole gain above which an effect stays whatever it does there.
 
     Returns
     -------
@@ -213,7 +217,7 @@ def main_ones(found: Search, helps: Callable[[Found, Model], bool]) -> Search:
         return found
     model = found.final
     for f in sorted(found.found, key=lambda f: -f.position):
-        if f.trial.gain < MINOR * total and not helps(f, found.final):
+        if f.trial.gain < minor * total and not helps(f, found.final):
             model = cut(model, f.position)[0]
     if model is found.final:
         return found
