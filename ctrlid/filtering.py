@@ -70,7 +70,7 @@ def run(
         lin.step, lin.a, lin.b, lin.du, np.ascontiguousarray(lin.dp[:, :, :p]), lin.height,
         lin.c, np.ascontiguousarray(lin.hp[:, :p]), lin.trajectory.predicted,
         lin.trajectory.filtered, track.table[3], track.valid, track.afresh, lin.doubt,
-        m.padded(track.start), lin.spread, 1.0,
+        lin.start, lin.spread, 1.0,
         np.asarray(noise.force, dtype=float), noise.memory, noise.drift, (0,) * m.size,
         (0,) * (m.size + bool(noise.drift > 0)),
     )  # fmt: skip

@@ -53,7 +53,8 @@ class Linearized:
     c: Array
     hp: Array
     doubt: Array  # variance of the input, relative to the sensor's
-    spread: Array  # covariance of the state at a start, relative to the sensor's
+    start: Array
+    spread: Array  # of the start: its covariance, relative to the sensor's variance
     trajectory: Trajectory
 
 
@@ -150,12 +151,13 @@ class Machine:
             dp = _full(dp, len(u)).copy()
             for k in (-1, 0, 1):
                 dp += dw[:, :, k + 1, None] * self._shifted(slopes, k)[:, None, :]
+        start, wide = self._start(track, p)
         height, c, hp = self.maps.sensor(at.predicted.T, w, p, spread)
         return Linearized(
             _full(step, len(u))[:, :, 0], _full(a, len(u)), _full(b, len(u)),
             dw.sum(axis=2), _full(dp, len(u)), _full(height, len(u))[:, 0, 0],
             _full(c, len(u))[:, 0, :], _full(hp, len(u))[:, 0, :], doubt,
-            self.padded(self._spread(track, p)), at,
+            self.padded(start), self.padded(wide), at,
         )  # fmt: skip
 
     def _through_play(self, u: Array, p: Array) -> tuple[Array, Array | None]:
@@ -174,28 +176,42 @@ class Machine:
         return variance
 
     @functools.cached_property
-    def _behind(self) -> list[tuple[int, casadi.Function]]:
-        """Lags of what the plant shows, each with its time and how its target depends on states."""
+    def _lags(self) -> list[tuple[int, bool, casadi.Function]]:
+        """Lags behind the input, or behind what the plant shows: whether so, time and target."""
         e, found = self.e, []
         for lag in e.lags:
-            near = casadi.jacobian(lag.target, e.x)
-            if near.nnz() and not casadi.depends_on(lag.target, casadi.vertcat(e.t, e.u)):
-                parts = [casadi.SX(lag.time_constant), casadi.densify(near)]
-                found.append((lag.state, casadi.Function("behind", [e.x, e.p], parts)))
+            shown = not casadi.depends_on(lag.target, casadi.vertcat(e.t, e.u))
+            driven = not casadi.depends_on(lag.target, casadi.vertcat(e.t, e.x))
+            if shown != driven:
+                given = e.x if shown else e.u
+                near = casadi.densify(casadi.jacobian(lag.target, e.x))
+                parts = [casadi.SX(lag.time_constant), lag.target, near]
+                found.append((lag.state, shown, casadi.Function("lag", [given, e.p], parts)))
         return found
 
-    def _spread(self, track: Track, p: Array) -> Array:
-        """Return the covariance at a start: what lags behind the plant is near what it follows."""
-        if not self._behind:
-            return track.spread
-        spread = track.spread.copy()
-        step = np.var(np.diff(track.table[3])) / track.scale**2 / self.loop.dt**2
-        for k, function in self._behind:
-            time, near = (np.asarray(v, float).ravel() for v in function(track.start, p))
-            spread[k] = spread[:, k] = near @ spread
-            wide = near @ spread @ near
-            spread[k, k] = wide + min(time[0] ** 2 * step, wide) + NEARLY
-        return spread
+    def _start(self, track: Track, p: Array) -> tuple[Array, Array]:
+        """Return state and covariance at a start: a lag is near what it follows."""
+        start, spread = track.start.copy(), track.spread.copy()
+        _, u, _, y = track.table
+        alone = not track.afresh[int(np.argmax(track.valid)) + 1 :].any()
+        for k, shown, function in self._lags:
+            time, target, near = (
+                np.asarray(v, float) for v in function(start if shown else u[None, :], p)
+            )
+            late = float(time.flat[0]) / self.loop.dt
+            if shown:
+                spread[k] = spread[:, k] = near[0] @ spread
+                wide = near[0] @ spread @ near[0]
+                moved = late**2 * float(np.var(np.diff(y))) / track.scale**2
+                spread[k, k] = wide + min(moved, wide) + NEARLY
+            else:
+                before = float(np.mean((target[0] - start[k]) ** 2))
+                if alone:  # as far as the input moves within the lag's time, if it does not return
+                    start[k] = target[0, 0]
+                    steps = float(np.var(np.diff(target[0])))
+                    before = min((1 + late / 2) * steps, 2 * float(np.var(target[0])))
+                spread[k, k] = before / track.scale**2 + NEARLY
+        return start, spread
 
     def _delay(self, p: Any) -> float:
         return float(casadi.evalf(casadi.substitute(casadi.SX(self.e.delay), self.e.p, p)))

@@ -3,7 +3,6 @@
 from dataclasses import dataclass, replace
 from typing import Any
 
-import casadi
 import numpy as np
 
 from .data import Record
@@ -94,9 +93,6 @@ def _start(loop: Loop, record: Record) -> tuple[Array, Array, float]:
     wide = [max(0.1 * abs(v), reach, noise) for v in rest]
     for j in e.velocities:
         wide[j] = speed
-    for lag in e.lags:
-        if casadi.is_equal(lag.target, e.u, 2):
-            wide[lag.state] = max(float(np.std(record.u[record.valid])), noise)
     return np.array(rest), np.diag((np.array(wide) / noise) ** 2), noise
 
 

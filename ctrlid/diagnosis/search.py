@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..effects import AbstractEffect, PeriodicForce, PositionRipple
+from ..errors import CtrlidError
 from ..likelihood import Fit
 from .attempts import refit
 from .decide import CLOSE, GATE, MANY
@@ -94,7 +95,10 @@ def search(
             steps[-1] = replace(steps[-1], best=better)
         else:
             steps.append(step)
-    model, found = settled(model, given, steps)
+    try:
+        model, found = settled(model, given, steps)
+    except CtrlidError:  # what cannot be taken out again cannot be weighed, and explains nothing
+        model, found = base, ()
     tests = omnibus(base.fit), judged(model)
     return Search(base, tuple(steps), model, found, *tests, left)
 

@@ -167,12 +167,13 @@ def cut(model: Model, position: int) -> tuple[Model, Trial]:
     bare = _without(model, [position])
     smaller = replace(bare, fit=spared(climb(bare.fit, rounds=10)))
     effect = model.fitted.effects[position]
+    # Put back anew, it would come last; and all else may have gone too far astray without it.
+    label = list(model.loop.labelled)[position]
+    known = outcome(smaller, Trial(effect, label, model, -math.inf), model.fit)
     if simulable(model):
-        # Put back anew, it would come last; and all else may have gone too far astray without it.
-        label = list(model.loop.labelled)[position]
-        known = Trial(effect, label, model, -math.inf)
-        return smaller, outcome(smaller, known, model.fit)
-    return smaller, refit(smaller, attempt_at(smaller, effect))
+        return smaller, known
+    again = refit(smaller, attempt_at(smaller, effect))
+    return smaller, max(again, known, key=lambda t: t.gain)
 
 
 def renoised(model: Model) -> Model:
