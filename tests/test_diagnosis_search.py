@@ -591,6 +591,20 @@ def test_a_parameter_at_its_bound_does_nothing_for_an_effect(size, alone):
     assert ("AsymmetricViscousFriction.c" in trial.model.names) == alone
 
 
+def test_an_offset_ahead_of_a_curve_is_no_force_behind_it():
+    """Alone the two are the same; beside a gain that falls with the input they are not."""
+    loop = drive()
+    real = loop.with_effect(E.InputSaturatingGain(0.004)).with_effect(E.InputOffset(-0.7))
+    r = cid.random_binary(4000, amplitude=0.05, hold=60, around=loop.point.output, seed=5)
+    record = cid.simulate(real, r, sensor_noise=2e-5, force_noise=0.05, seed=6)
+    found = cid.diagnose(loop, record, progress=False, catalogue=[
+        E.ConstantForce, E.InputOffset, E.InputSaturatingGain, E.InputDelay, E.CoulombFriction,
+    ])  # fmt: skip
+    assert found.verdict == "explained"
+    assert [f.name for f in found.findings] == ["InputOffset", "InputSaturatingGain"]
+    assert not any(f.alternatives or f.equivalents for f in found.findings)
+
+
 def test_a_loop_that_hunts_keeps_its_names():
     def gap(after):
         return Gap("closed-loop simulation", 9.0, 3.0, after, 4.0, "m", *[np.zeros(3)] * 4)

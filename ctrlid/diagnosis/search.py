@@ -138,14 +138,15 @@ def _foreseen(
 
     Where two effects hide together, the one that alone gains most may be a mixture of both. So each
     effect of its kind that did nearly as well is asked what could follow on it; the best pair wins.
-    Where nothing follows on the best although something is left, those that did as well are asked:
-    an offset of the sensor moves the middle of a spring, and a constant force does not.
+    Where nothing follows on the best that leaves noise alone, those that did as well are asked: an
+    offset of the sensor moves the middle of a spring, and a constant force does not.
     """
     if step.best is None and omnibus(step.base.fit).passed:
         return None
     best = last.best
     assert best is not None
-    near = [t for t in last.trials[1:NEXT] if _nearly(t, best, ties=step.best is None)]
+    ties = step.best is None or not omnibus(step.best.model.fit).passed
+    near = [t for t in last.trials[1:NEXT] if _nearly(t, best, ties)]
     # What promised little beside the best is not scanned again, which takes most of the time.
     ranked = sorted(step.trials, key=lambda t: -t.promise)
     likely = {t.name for t in (ranked if step.best is None else ranked[:NEXT])}
