@@ -41,8 +41,8 @@ model = cid.Loop(plant, None, dt=record.dt, at=at, free=("K",))
 # What is missing?
 # ----------------
 # A lag between the duty and what the sensor shows, of the actuator or of the sensor, which one
-# swing does not tell apart; and the law of the force in the gap, another zero or another power. A
-# small friction is named beside them, in air, which may stand in for what is left.
+# swing does not tell apart; and the law of the force in the gap, which has another zero. A small
+# friction, in air, and a bent scale are named beside them, and may stand in for what is left.
 
 found = cid.diagnose(model, record, progress=False)
 print(found)
@@ -76,8 +76,7 @@ plt.show()
 
 # %%
 # How large the lag comes out depends on what stands beside it, since the law of the force is only
-# nearly right: with a friction it is 30 to 33 ms, whichever law is taken. With another zero of the
-# law alone, and no friction:
+# nearly right. With another zero of the law alone, and no friction:
 
 beside = model.with_effect(cid.effects.ActuatorLag(tau=mine.tau))
 beside = beside.with_effect(cid.effects.PositionOffset(offset=0.002))

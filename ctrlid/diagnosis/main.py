@@ -27,7 +27,7 @@ from .readout import Readout, censored, clipping, steps
 from .replica import forgiven, replica
 from .result import Diagnosis, Disturbance
 from .rounds import Work, check_catalogue
-from .search import Search, judged, main_ones, named, search
+from .search import Search, main_ones, named, search, without_worst
 from .several import merged
 from .simulated_search import search_by_simulation
 
@@ -169,14 +169,12 @@ def _diagnosed(
     tell("comparing names")
     found = named(main_ones(found, helps_on(fresh)), work)
     gap, shares, disturbance = gaps_of(given, found, fresh)
-    # What names something and leaves more unexplained than before has a wrong name; the others
-    # may be right. An effect of one record only may widen the gap in others.
-    for fewer in (_helpful, _none):
-        if len(records) > 1 or found.after.passed or not found.found:
-            break
-        if wider(gap, disturbance):
-            found = fewer(found, fresh)
-            gap, shares, disturbance = gaps_of(given, found, fresh)
+    # What names something and leaves more unexplained than before has a wrong name among its
+    # names. An effect of one record only may widen the gap in others.
+    alone = len(records) == 1
+    while alone and found.found and not found.after.passed and wider(gap, disturbance):
+        found = without_worst(found, lambda model: fresh.gap(fresh.loops(model)))
+        gap, shares, disturbance = gaps_of(given, found, fresh)
     tell("writing down", 1)
     read += [coarse] if coarse else []
     result = put_together(given, records, found, gap, shares, disturbance, read)
@@ -190,14 +188,6 @@ def _diagnosed(
             again = put_together(given, records, other, gap, shares, quiet, read)
             return replace(again, notes=(*again.notes, BY_SIMULATION)), other
     return result, found
-
-
-def _helpful(found: Search, fresh: Fresh) -> Search:
-    return main_ones(found, helps_on(fresh), math.inf)
-
-
-def _none(found: Search, fresh: Fresh) -> Search:
-    return replace(found, final=found.base, found=(), after=judged(found.base))
 
 
 def _worth_simulating(fresh: Fresh, records: Sequence[Record]) -> bool:

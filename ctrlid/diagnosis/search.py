@@ -194,9 +194,7 @@ def judged(model: Model) -> Omnibus:
     return after
 
 
-def main_ones(
-    found: Search, helps: Callable[[Found, Model], bool], minor: float = MINOR
-) -> Search:  # fmt: skip
+def main_ones(found: Search, helps: Callable[[Found, Model], bool]) -> Search:
     """Keep the effects that carry the explanation where something unknown remains.
 
     Small effects beside something unknown are stand-ins for it, and a wrong name is worse than
@@ -208,8 +206,6 @@ def main_ones(
         The end of a search.
     helps : callable
         ``helps(finding, model)``: whether an effect narrows the gap of the model on fresh data.
-    minor : float, optional
-        Share of the whole gain above which an effect stays whatever it does there.
 
     Returns
     -------
@@ -222,11 +218,18 @@ def main_ones(
         return found
     model = found.final
     for f in sorted(found.found, key=lambda f: -f.position):
-        if f.trial.gain < minor * total and not helps(f, found.final):
+        if f.trial.gain < MINOR * total and not helps(f, found.final):
             model = cut(model, f.position)[0]
     if model is found.final:
         return found
     model, left = settled(model, len(found.base.loop.effects), found.steps)
+    return replace(found, final=model, found=left, after=judged(model))
+
+
+def without_worst(found: Search, gap: Callable[[Model], float]) -> Search:
+    """Take back the effect without which a model leaves the narrowest gap."""
+    worst = min(found.found, key=lambda f: gap(f.base))
+    model, left = settled(worst.base, len(found.base.loop.effects), found.steps)
     return replace(found, final=model, found=left, after=judged(model))
 
 

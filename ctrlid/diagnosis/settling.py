@@ -172,8 +172,9 @@ def cut(model: Model, position: int) -> tuple[Model, Trial]:
     known = outcome(smaller, Trial(effect, label, model, -math.inf), model.fit)
     if simulable(model):
         return smaller, known
+    # Where no simulation can check it, a likelihood may be that of absurd values.
     again = refit(smaller, attempt_at(smaller, effect))
-    return smaller, max(again, known, key=lambda t: t.gain)
+    return smaller, again if again.gain > 0 else known  # below nothing it was stuck
 
 
 def renoised(model: Model) -> Model:
