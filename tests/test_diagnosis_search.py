@@ -13,7 +13,7 @@ from scipy import signal, stats
 import ctrlid as cid
 from ctrlid import effects as E
 from ctrlid.diagnosis import replica as replicas
-from ctrlid.diagnosis import rounds
+from ctrlid.diagnosis import rounds, settling
 from ctrlid.diagnosis.attempts import attempt, attempt_at, refit, under
 from ctrlid.diagnosis.closing import wider
 from ctrlid.diagnosis.decide import GATE, HINT, doubt_of_all, rivals
@@ -26,7 +26,7 @@ from ctrlid.diagnosis.replica import replica
 from ctrlid.diagnosis.result import Disturbance, Finding, Gap
 from ctrlid.diagnosis.rounds import Step, one_round, plainer
 from ctrlid.diagnosis.scan import scanned
-from ctrlid.diagnosis.search import _foreseen, _stands_in, _there
+from ctrlid.diagnosis.search import _foreseen, _stands_in, _there, search, without_worst
 from ctrlid.diagnosis.sentences import conclusion
 from ctrlid.diagnosis.settling import _close, cut, fused
 from ctrlid.diagnosis.trial import contains
@@ -603,6 +603,37 @@ def test_an_offset_ahead_of_a_curve_is_no_force_behind_it():
     assert found.verdict == "explained"
     assert [f.name for f in found.findings] == ["InputOffset", "InputSaturatingGain"]
     assert not any(f.alternatives or f.equivalents for f in found.findings)
+
+
+@pytest.fixture(scope="module")
+def two_found():
+    """A search that found a friction and a spring."""
+    loop = replace(drive(), controller=None)
+    real = drive().with_effect(E.CoulombFriction(0.3)).with_effect(E.LinearStiffness(20.0))
+    r = cid.random_binary(2000, amplitude=0.3, hold=60, seed=9470)
+    record = cid.simulate(real, r, sensor_noise=1e-4, seed=9471)
+    base = base_model(loop, [record], loop.free)
+    kinds = (E.CoulombFriction, E.LinearStiffness)
+    return search(base, kinds, lambda f, items: [f(x) for x in items], lambda text: None)
+
+
+def test_the_name_without_which_the_gap_is_narrowest_goes_first(two_found):
+    names = {f.trial.name for f in two_found.found}
+    assert names == {"CoulombFriction", "LinearStiffness"}
+    for name in names:
+        left = without_worst(two_found, lambda model, name=name: float(name in model.loop.labelled))
+        assert {f.trial.name for f in left.found} == names - {name}
+        assert list(left.final.loop.labelled) == [*names - {name}]
+
+
+def test_what_is_put_back_and_stuck_keeps_its_evidence(two_found, monkeypatch):
+    model = two_found.final
+    right = cut(model, 0)[1]
+    assert right.gain > 100
+    monkeypatch.setattr(settling, "refit", lambda base, trial: replace(trial, gain=-10.0))
+    smaller, kept = cut(model, 0)
+    assert kept.gain == model.fit.value - smaller.fit.value
+    assert kept.gain == pytest.approx(right.gain, rel=0.01)
 
 
 def test_a_loop_that_hunts_keeps_its_names():
