@@ -140,22 +140,22 @@ class Machine:
         given = (at.filtered.T, w, p, spread, np.zeros(self.channels))
         step, a, b, dp = self._period(self.maps.stages, *given)
         # How the input moves the state matters only where the input is not what was measured.
-        dw = np.zeros((len(u), self.size, 3))
+        du = np.zeros((len(u), self.size))
         if slopes is not None:
             dw = _full(self._period(moves_of(self.plan), *given)[2], len(u))
-        elif doubt.any():
-            rows = np.flatnonzero(doubt)
-            some = [v[:, rows] if k in (0, 1, 3) else v for k, v in enumerate(given)]
-            dw[rows] = self._period(moves_of(self.plan), *some)[2]
-        if slopes is not None:
+            du = dw.sum(axis=2)
             dp = _full(dp, len(u)).copy()
             for k in (-1, 0, 1):
                 dp += dw[:, :, k + 1, None] * self._shifted(slopes, k)[:, None, :]
+        elif doubt.any():
+            rows = np.flatnonzero(doubt)
+            some = [v[:, rows] if k in (0, 1, 3) else v for k, v in enumerate(given)]
+            du[rows] = self._period(moves_of(self.plan), *some)[2].sum(axis=2)
         start, wide = self._start(track, p)
         height, c, hp = self.maps.sensor(at.predicted.T, w, p, spread)
         return Linearized(
             _full(step, len(u))[:, :, 0], _full(a, len(u)), _full(b, len(u)),
-            dw.sum(axis=2), _full(dp, len(u)), _full(height, len(u))[:, 0, 0],
+            du, _full(dp, len(u)), _full(height, len(u))[:, 0, 0],
             _full(c, len(u))[:, 0, :], _full(hp, len(u))[:, 0, :], doubt,
             self.padded(start), self.padded(wide), at,
         )  # fmt: skip
