@@ -13,7 +13,7 @@ import numpy as np
 from .data import Record
 from .equations import Array, Equations
 from .errors import CtrlidError
-from .integration import Scheme, known_lags, whole_delay
+from .integration import Scheme, delay_of, known_lags, whole_delay
 from .linearization import state_matrices
 from .loop import Loop
 from .maps import Plan, maps_of, moves_of, play_of
@@ -214,7 +214,7 @@ class Machine:
         return start, spread
 
     def _delay(self, p: Any) -> float:
-        return float(casadi.evalf(casadi.substitute(casadi.SX(self.e.delay), self.e.p, p)))
+        return float(casadi.evalf(delay_of(self.e, p)))
 
     def _forgetting(self, u: Array, p: Array) -> Array:
         """Return the variance of the input behind the play, until it forgets how it began."""

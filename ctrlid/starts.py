@@ -50,7 +50,8 @@ def best_start(
     e = simulator.loop.equations()
     for j in e.velocities:
         scale[j] = max(float(np.std(np.diff(part.y))) / part.dt, 1e-300)
-    low, high = _limits(simulator, part, guess)
+    seen = _as_measured(simulator, part, guess)
+    low, high = _limits(simulator, part, seen)
     for lag in _following(simulator, fitted):
         scale[lag] = max(float(np.std(part.u)), 1e-300)
 
@@ -82,7 +83,7 @@ def best_start(
         return moved(start, best.x)
 
     # From rest a short search does not find a start that is far away.
-    seen, count = _as_measured(simulator, part, guess), min(len(part), 400)
+    count = min(len(part), 400)
     there, here = misfit(seen, count), misfit(guess, count)
     if there is None and here is None:
         # An unstable plant is lost soon from a start that is only nearly right.
@@ -112,10 +113,10 @@ def _as_measured(simulator: Simulator, part: Record, guess: Array) -> Array:
     return start
 
 
-def _limits(simulator: Simulator, part: Record, guess: Array) -> tuple[Array, Array]:
-    """Return between what values the state of the plant may start."""
+def _limits(simulator: Simulator, part: Record, seen: Array) -> tuple[Array, Array]:
+    """Return between what values the state of the plant may start, around where it is seen."""
     e = simulator.loop.equations()
-    low, high = np.full(len(guess), -np.inf), np.full(len(guess), np.inf)
+    low, high = np.full(len(seen), -np.inf), np.full(len(seen), np.inf)
     moving, c = motion(e), _seen(simulator)
     if moving is not None and c[moving[0]]:
         where, speed = moving
@@ -123,10 +124,9 @@ def _limits(simulator: Simulator, part: Record, guess: Array) -> tuple[Array, Ar
         high[speed] = FASTEST * float(np.std(steps)) / part.dt / abs(c[where])
         low[speed] = -high[speed]
         if not casadi.depends_on(casadi.jacobian(e.output, e.x), e.x):
-            start = _as_measured(simulator, part, guess)[where]
             off = NEAR * float(np.abs(steps[:FEW]).max()) / abs(c[where])
-            low[where], high[where] = start - off, start + off
-    for lag in _following(simulator, len(guess)):
+            low[where], high[where] = seen[where] - off, seen[where] + off
+    for lag in _following(simulator, len(seen)):
         low[lag], high[lag] = float(part.u.min()), float(part.u.max())
     return low, high
 

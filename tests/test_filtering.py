@@ -467,15 +467,21 @@ def test_play_is_followed_with_its_derivative():
     assert np.abs(slope).max() > 0
 
 
-def test_nobody_knows_where_a_play_begins():
-    """A record cut out of a longer one begins anywhere in the gap; the filter allows for it."""
+def balanced(effect, dt, sensor_noise):
+    """Return the loop of a pendulum that stands on its head, and a record of it."""
     plant = cid.plants.pendulum(m=0.12, length=0.25, c=0.013)
     at = cid.OperatingPoint(states=(0.0, 0.0), input=0.0, output=0.0)
     lead = cid.design_lead(cid.linearize(plant, at), crossover=15, phase_margin=50)
-    loop = cid.Loop(plant, lead.sample(0.015, "tustin"), dt=0.015, at=at)
-    loop = loop.with_effect(E.InputBacklash(0.2))
+    loop = cid.Loop(plant, lead.sample(dt, "tustin"), dt=dt, at=at)
+    loop = loop.with_effect(effect)
     r = cid.random_binary(2000, amplitude=0.1, hold=40, seed=1)
-    record = cid.simulate(loop, r, sensor_noise=3e-4, force_noise=0.03, seed=2)
+    record = cid.simulate(loop, r, sensor_noise=sensor_noise, force_noise=0.03, seed=2)
+    return loop, record
+
+
+def test_nobody_knows_where_a_play_begins():
+    """A record cut out of a longer one begins anywhere in the gap; the filter allows for it."""
+    loop, record = balanced(E.InputBacklash(0.2), 0.015, 3e-4)
     known = Noise((1e4,))
     for first in range(0, 40, 5):
         track = make_track(loop, record[first:])
@@ -491,13 +497,7 @@ def test_nobody_knows_where_a_play_begins():
 
 
 def test_nobody_knows_what_a_delay_brings_at_first():
-    plant = cid.plants.pendulum(m=0.12, length=0.25, c=0.013)
-    at = cid.OperatingPoint(states=(0.0, 0.0), input=0.0, output=0.0)
-    lead = cid.design_lead(cid.linearize(plant, at), crossover=15, phase_margin=50)
-    loop = cid.Loop(plant, lead.sample(0.005, "tustin"), dt=0.005, at=at)
-    loop = loop.with_effect(E.InputDelay(0.016))
-    r = cid.random_binary(2000, amplitude=0.1, hold=40, seed=1)
-    record = cid.simulate(loop, r, sensor_noise=1e-4, force_noise=0.03, seed=2)
+    loop, record = balanced(E.InputDelay(0.016), 0.005, 1e-4)
     for first in range(0, 80, 10):
         track = make_track(loop, record[first:])
         m = Machine(loop, (), "zoh", False)
