@@ -207,6 +207,35 @@ def run(
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
+def follow(
+    program: Any, constants: Any, inputs: Any, work: Any, outputs: Any, signal: Any
+) -> Any:  # pragma: no cover - compiled
+    """Carry out a program once per sample, its result the first input of the next sample.
+
+    Parameters
+    ----------
+    program, constants, work, outputs
+        As `run` takes them, in blocks of one sample.
+    inputs : ndarray, shape (rows, 1)
+        Arguments: the first value of what is carried, room for the signal, and others.
+    signal : ndarray, shape (n,)
+        Values of the second argument.
+
+    Returns
+    -------
+    ndarray, shape (n + 1,)
+        What is carried: before each sample, and after the last.
+    """
+    carried = np.empty(len(signal) + 1)
+    carried[0] = inputs[0, 0]
+    for k in range(len(signal)):
+        inputs[0, 0], inputs[1, 0] = carried[k], signal[k]
+        run(program, constants, inputs, work, outputs, 1)
+        carried[k + 1] = outputs[0, 0]
+    return carried
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def sweep(
     program: Any,
     starts: Any,

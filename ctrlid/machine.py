@@ -13,10 +13,12 @@ import numpy as np
 from .data import Record
 from .equations import Array, Equations
 from .errors import CtrlidError
-from .integration import Scheme, delay_of, known_lags, whole_delay
+from .integration import Scheme, known_lags, whole_delay
 from .linearization import state_matrices
 from .loop import Loop
-from .maps import Plan, maps_of, moves_of, play_of
+from .maps import Plan, maps_of, moving_maps_of
+from .onset import Onset, delay, shifted
+from .plays import path_of
 from .tracks import Track, state_at_rest
 from .vectorized import Vectorized, through
 
@@ -25,9 +27,6 @@ MOST_STEPS = 100  # of order eight in a period: more make an expression that tak
 BRISK = 0.35  # of a lag's time constant: a step of order four that follows it exactly enough
 ROUGH = 0.7  # the same beside the kink of friction, where no formula is more exact
 FEW_STEPS = 3  # of order four, which cost less than one of order eight
-FORGOTTEN = 200  # samples after which one looks whether a play has forgotten how it began
-LASTING = 10  # samples: an error that stays moves the plant as far as noise of so many variances
-NEARLY = 0.01  # of the sensor's variance: how well what a lag shows is known where it is short
 KINK_STEPS = 4  # of order four in a period where friction has a kink; twice as many beside a lag
 
 
@@ -92,6 +91,7 @@ class Machine:
         self.plan = Plan(e, self.law, loop.dt, hold, self.scheme, self.forces, self.channels,
                          tuple(self.index), self.late)  # fmt: skip
         self.maps = maps_of(self.plan)
+        self.onset = Onset(self.plan)
 
     def _period(self, stages: Sequence[Vectorized], x: Array, *given: Any) -> list[Array]:
         """Go through a period; return the state after it and its derivatives, by itself first."""
@@ -121,7 +121,7 @@ class Machine:
         e, dt = self.e, self.loop.dt
         p = casadi.SX(casadi.DM(self.values(theta)))
         if e.delay is not None:
-            late = self._delay(p) / dt + 1e-9
+            late = delay(e, p) / dt + 1e-9
             if not self.late <= late <= self.late + 1 + 1e-6:
                 return False
         time, (order, steps, cut) = _shortest(e, p), self.scheme
@@ -134,24 +134,26 @@ class Machine:
         p = self.values(theta)
         u = track.table[1]
         applied, slopes = self._through_play(u, p)
-        doubt = track.doubt + self._unknown(u, p) / track.scale**2
+        doubt = track.doubt + self.onset.doubt(u, p) / track.scale**2
         w = self._inputs(track, applied)
         spread = at.spread[:, : self.n].T
         given = (at.filtered.T, w, p, spread, np.zeros(self.channels))
-        step, a, b, dp = self._period(self.maps.stages, *given)
         # How the input moves the state matters only where the input is not what was measured.
         du = np.zeros((len(u), self.size))
         if slopes is not None:
-            dw = _full(self._period(moves_of(self.plan), *given)[2], len(u))
+            step, a, b, dp, dw = self._period(moving_maps_of(self.plan), *given)
+            dw = _full(dw, len(u))
             du = dw.sum(axis=2)
             dp = _full(dp, len(u)).copy()
             for k in (-1, 0, 1):
-                dp += dw[:, :, k + 1, None] * self._shifted(slopes, k)[:, None, :]
-        elif doubt.any():
+                dp += dw[:, :, k + 1, None] * shifted(slopes, self.late - k)[:, None, :]
+        else:
+            step, a, b, dp = self._period(self.maps.stages, *given)
             rows = np.flatnonzero(doubt)
-            some = [v[:, rows] if k in (0, 1, 3) else v for k, v in enumerate(given)]
-            du[rows] = self._period(moves_of(self.plan), *some)[2].sum(axis=2)
-        start, wide = self._start(track, p)
+            if len(rows):
+                some = [v[:, rows] if k in (0, 1, 3) else v for k, v in enumerate(given)]
+                du[rows] = self._period(moving_maps_of(self.plan), *some)[4].sum(axis=2)
+        start, wide = self.onset.start(track, p)
         height, c, hp = self.maps.sensor(at.predicted.T, w, p, spread)
         return Linearized(
             _full(step, len(u))[:, :, 0], _full(a, len(u)), _full(b, len(u)),
@@ -164,84 +166,7 @@ class Machine:
         """Return the input behind the play, and how it depends on the free parameters."""
         if self.e.play is None:
             return u, None
-        out = play_of(self.plan, len(u))(self._memory(u[0], p)[0], u[None, :], p)[1]
-        return np.asarray(out, float)[0], np.asarray(out, float)[1:].T
-
-    def _unknown(self, u: Array, p: Array) -> Array:
-        """Return the variance of the input, as far as it is older than the record."""
-        variance = self._shifted(self._forgetting(u, p), 0)
-        if self.e.delay is not None:
-            late = self._delay(p) / self.loop.dt - np.arange(len(u))
-            variance = variance + np.clip(late, 0.0, 1.0) ** 2 * np.var(u)
-        return variance
-
-    @functools.cached_property
-    def _lags(self) -> list[tuple[int, bool, casadi.Function]]:
-        """Lags behind the input, or behind what the plant shows: whether so, time and target."""
-        e, found = self.e, []
-        for lag in e.lags:
-            shown = not casadi.depends_on(lag.target, casadi.vertcat(e.t, e.u))
-            driven = not casadi.depends_on(lag.target, casadi.vertcat(e.t, e.x))
-            if shown != driven:
-                given = e.x if shown else e.u
-                near = casadi.densify(casadi.jacobian(lag.target, e.x))
-                parts = [casadi.SX(lag.time_constant), lag.target, near]
-                found.append((lag.state, shown, casadi.Function("lag", [given, e.p], parts)))
-        return found
-
-    def _start(self, track: Track, p: Array) -> tuple[Array, Array]:
-        """Return state and covariance at a start: a lag is near what it follows."""
-        start, spread = track.start.copy(), track.spread.copy()
-        _, u, _, y = track.table
-        alone = not track.afresh[int(np.argmax(track.valid)) + 1 :].any()
-        for k, shown, function in self._lags:
-            time, target, near = (
-                np.asarray(v, float) for v in function(start if shown else u[None, :], p)
-            )
-            late = float(time.flat[0]) / self.loop.dt
-            if shown:
-                spread[k] = spread[:, k] = near[0] @ spread
-                wide = near[0] @ spread @ near[0]
-                moved = late**2 * float(np.var(np.diff(y))) / track.scale**2
-                spread[k, k] = wide + min(moved, wide) + NEARLY
-            else:
-                before = float(np.mean((target[0] - start[k]) ** 2))
-                if alone:  # as far as the input moves within the lag's time, if it does not return
-                    start[k] = target[0, 0]
-                    steps = float(np.var(np.diff(target[0])))
-                    before = min((1 + late / 2) * steps, 2 * float(np.var(target[0])))
-                spread[k, k] = before / track.scale**2 + NEARLY
-        return start, spread
-
-    def _delay(self, p: Any) -> float:
-        return float(casadi.evalf(delay_of(self.e, p)))
-
-    def _forgetting(self, u: Array, p: Array) -> Array:
-        """Return the variance of the input behind the play, until it forgets how it began."""
-        variance = np.zeros(len(u))
-        if self.e.play is None:
-            return variance
-        middle, reach = self._memory(u[0], p)
-        ends = [middle - reach, middle + reach]
-        for first in range(0, len(u), FORGOTTEN):
-            some = u[None, first : first + FORGOTTEN]
-            out = [play_of(self.plan, some.shape[1])(z, some, p) for z in ends]
-            low, high = (np.asarray(applied, float)[0] for _, applied in out)
-            variance[first : first + FORGOTTEN] = LASTING * (high - low) ** 2 / 12
-            if high[-1] == low[-1]:
-                break
-            ends = [np.asarray(z, float)[:, -1] for z, _ in out]
-        return variance
-
-    def _memory(self, u: float, p: Array) -> tuple[Array, Array]:
-        """Return the play's memory at the start with its slopes, and how far off it may be."""
-        play = self.e.play
-        assert play is not None
-        given = casadi.vertcat(play.u, self.e.p), casadi.vertcat(u, p)
-        found = casadi.substitute(casadi.vertcat(play.start, play.reach), *given)
-        start, reach = np.asarray(casadi.evalf(found), float).ravel()
-        first = np.eye(1 + len(self.index))[0]
-        return start * first, reach * first
+        return path_of(self.plan).along(self.onset.memory(float(u[0]), p)[0], u, p)
 
     def with_slopes(self) -> casadi.Function:
         """Return one period of the plant, as it is, together with that of its sensitivities.
@@ -288,13 +213,8 @@ class Machine:
     def _inputs(self, track: Track, applied: Array) -> Array:
         """Return the rows (t, input before, now, ahead, r, y) over which the map is evaluated."""
         t, _, r, y = track.table
-        moved = [self._shifted(applied, k) for k in (-1, 0, 1)]
+        moved = [shifted(applied, self.late - k) for k in (-1, 0, 1)]
         return np.vstack([t, *moved, r, y])
-
-    def _shifted(self, values: Array, k: int) -> Array:
-        late, ahead = max(self.late - k, 0), max(k - self.late, 0)
-        first, last = np.repeat(values[:1], late, axis=0), np.repeat(values[-1:], ahead, axis=0)
-        return np.concatenate([first, values[ahead:], last])[: len(values)]
 
     def padded(self, values: Array) -> Array:
         """Add the states of a known analog controller, at rest, to a start."""

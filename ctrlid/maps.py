@@ -10,7 +10,6 @@ import casadi
 from .controllers import ControlLaw
 from .equations import Equations
 from .integration import Scheme, advance, input_pieces, integrate
-from .stepping import through_play
 from .vectorized import Vectorized
 
 BUILT = 64  # structures whose maps are kept
@@ -106,29 +105,11 @@ def maps_of(plan: Plan) -> Maps:
 
 
 @functools.lru_cache(maxsize=BUILT)
-def moves_of(plan: Plan) -> tuple[Vectorized, ...]:
-    """Return how the state after a period depends on the input, built once."""
+def moving_maps_of(plan: Plan) -> tuple[Vectorized, ...]:
+    """Return the stages that also tell how the state depends on the input, built once."""
     x, ends, given, by, parts = _period(plan)
-    return tuple(Vectorized(f) for f in _chained(x, ends, parts, given, (by["path"],)))
-
-
-@functools.lru_cache(maxsize=BUILT)
-def play_of(plan: Plan, samples: int) -> casadi.Function:
-    """Return the play along so many samples, with its slopes by the free parameters, built once."""
-    e = plan.equations
-    assert e.play is not None
-    m, slope = casadi.SX.sym("m"), casadi.SX.sym("d", len(plan.index))
-    sample, values = casadi.SX.sym("u"), casadi.SX.sym("p", e.p.shape[0])
-    applied, after = through_play(e, m, sample, values)
-    free = casadi.vertcat(*(values[k] for k in plan.index)) if plan.index else casadi.SX(0, 1)
-    rows = [
-        casadi.jacobian(out, m) * slope + casadi.jacobian(out, free).T for out in (applied, after)
-    ]
-    one = casadi.Function(
-        "play", [casadi.vertcat(m, slope), sample, values],
-        [casadi.vertcat(after, rows[1]), casadi.vertcat(applied, rows[0])],
-    )  # fmt: skip
-    return one.mapaccum("run", samples)
+    chained = _chained(x, ends, parts, given, (by["force"], by["free"], by["path"]))
+    return tuple(Vectorized(f) for f in chained)
 
 
 def _period(plan: Plan) -> tuple[Any, list[Any], list[Any], dict[str, Any], int]:
