@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import casadi
@@ -10,9 +11,27 @@ from scipy.integrate import DOP853
 from .equations import Equations, Lag
 
 Piece = tuple[Any, Any, Any]  # duration, input at its start, slope of the input
-Scheme = tuple[int, int, bool]  # order, steps in a piece, whether pieces are cut for short lags
 SHARP = 8.0  # time constants after which the transient of a lag is over
-SHARP_STEPS = 6  # of order four in it, where friction has a kink that no order is high enough for
+
+
+@dataclass(frozen=True)
+class Scheme:
+    """How a period is integrated.
+
+    Parameters
+    ----------
+    order : int
+        Order of the steps, four or eight.
+    steps : int
+        How many in each piece.
+    sharp : (int, int), optional
+        Order and steps for the transient of a short lag of the input; pieces are cut where it is
+        over. By default they are not.
+    """
+
+    order: int
+    steps: int
+    sharp: tuple[int, int] | None = None
 
 
 def integrate(rate: Any, z: Any, dt: Any, substeps: int) -> tuple[Any, Any]:
@@ -162,7 +181,7 @@ def _spreads(e: Equations) -> list[Any]:
 
 def advance(
     e: Equations, t: Any, x: Any, pieces: Sequence[Piece], p: Any, spread: Any = None,
-    kick: Any = None, scheme: Scheme = (4, 1, True),
+    kick: Any = None, *, scheme: Scheme,
 ) -> tuple[Any, Any]:  # fmt: skip
     """Return the state of a plant after the pieces of its input, and the local error.
 
@@ -185,10 +204,8 @@ def advance(
         Standard deviations of the states, which smooth kinks; zero by default.
     kick : expression, optional
         Constant added to the rates: a force held over the period.
-    scheme : (int, int, bool), optional
-        Order of the steps, four or eight; how many in each piece; and whether pieces are cut where
-        the transient of a short lag of the input is over. With steps of order four, which friction
-        is given for its kinks, the transient has a number of its own.
+    scheme : Scheme
+        Order and number of the steps.
 
     Returns
     -------
@@ -209,8 +226,7 @@ def advance(
         lag.state: casadi.substitute(casadi.SX(lag.time_constant), e.p, casadi.SX(p))
         for lag in e.lags
     }
-    order, steps, cut = scheme
-    short = [times[lag.state] for lag in driven[:1] if cut]
+    short = [times[lag.state] for lag in driven[:1] if scheme.sharp]
     for sharp, (duration, level, slope) in _split(pieces, short):
         followed = [_straight(e, lag.target, duration, level, slope, p) for lag in driven]
 
@@ -236,11 +252,12 @@ def advance(
                 rates[k] = 0
             return rates
 
+        order, steps = scheme.sharp if sharp and scheme.sharp else (scheme.order, scheme.steps)
         if order == 8:
             after, error = integrate(rate, x, duration, steps)
             worst = casadi.fmax(worst, error)
         else:
-            after = integrate_fast(rate, x, duration, SHARP_STEPS if sharp else steps)
+            after = integrate_fast(rate, x, duration, steps)
         after = filled(duration, after)
         for lag in seen:
             ends = [

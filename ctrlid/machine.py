@@ -27,6 +27,7 @@ MOST_STEPS = 100  # of order eight in a period: more make an expression that tak
 BRISK = 0.35  # of a lag's time constant: a step of order four that follows it exactly enough
 ROUGH = 0.7  # the same beside the kink of friction, where no formula is more exact
 FEW_STEPS = 3  # of order four, which cost less than one of order eight
+SHARP_STEPS = 6  # of order four in the transient of a short lag, where friction has a kink
 KINK_STEPS = 4  # of order four in a period where friction has a kink; twice as many beside a lag
 
 
@@ -124,10 +125,10 @@ class Machine:
             late = delay(e, p) / dt + 1e-9
             if not self.late <= late <= self.late + 1 + 1e-6:
                 return False
-        time, (order, steps, cut) = _shortest(e, p), self.scheme
-        if cut:
+        time, scheme = _shortest(e, p), self.scheme
+        if scheme.sharp:
             return time < dt / 4
-        return time > (dt / steps / (2 * _brisk(e)) if order == 4 else dt / 16)
+        return time > (dt / scheme.steps / (2 * _brisk(e)) if scheme.order == 4 else dt / 16)
 
     def linearize(self, track: Track, theta: Array, at: Trajectory) -> Linearized:
         """Return the plant along a trajectory, for parameter values `theta`."""
@@ -230,7 +231,7 @@ def _full(values: Array, n: int) -> Array:
 def _scheme(e: Equations, loop: Loop) -> Scheme:
     """Return how a period is integrated: as cheaply as the plant and its lags allow."""
     if e.dt:
-        return (4, 1, False)
+        return Scheme(4, 1)
     hidden = [lag.state for lags in known_lags(e) for lag in lags]
     plain = [k for k in range(len(e.states)) if k not in hidden]
     time = _shortest(e, casadi.SX(casadi.DM(e.values)))
@@ -240,17 +241,19 @@ def _scheme(e: Equations, loop: Loop) -> Scheme:
         point = replace(loop.point, states=state_at_rest(loop, e))
         a = state_matrices(e, point, spread=1e6)[0][np.ix_(plain, plain)]
     except CtrlidError:
-        return (8, 2, cut)
+        return Scheme(8, 2, (8, 2) if cut else None)
     rate = float(np.max(np.abs(np.linalg.eigvals(a)), initial=0.0)) * loop.dt
     if rate <= 3 * SLOW:
         # A velocity that turns within a period crosses the kink of friction there.
         few = max(KINK_STEPS if e.kinked else 1, math.ceil(rate / SLOW))
-        if not driven or (cut and e.kinked):
-            return (4, few, cut)
+        if not driven:
+            return Scheme(4, few)
+        if cut and e.kinked:  # no order is high enough for a kink
+            return Scheme(4, few, (4, SHARP_STEPS))
         # What a lag of the input does is known exactly; the plant has to follow it.
         few = max(2 * few if e.kinked else few, 2, math.ceil(loop.dt / time / _brisk(e)))
         if e.kinked or few <= FEW_STEPS:
-            return (4, few, False)
+            return Scheme(4, few)
     steps = max(2 if e.kinked else 1, math.ceil(rate / 1.5))
     if steps > MOST_STEPS:
         raise CtrlidError(
@@ -258,7 +261,7 @@ def _scheme(e: Equations, loop: Loop) -> Scheme:
             "sampled; what settles within a sample is a constant for the filter: leave that motion "
             "out of the plant, or sample faster"
         )
-    return (8, steps, cut)
+    return Scheme(8, steps, (8, steps) if cut else None)
 
 
 def _brisk(e: Equations) -> float:

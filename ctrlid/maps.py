@@ -123,8 +123,7 @@ def _period(plan: Plan) -> tuple[Any, list[Any], list[Any], dict[str, Any], int]
     for k, j in enumerate(plan.forces):
         kick[j] = force[k if plan.channels > 1 else 0]
     # A fit repeats the map often; a single prediction can afford to be exact.
-    order, steps, cut = plan.scheme
-    scheme = plan.scheme if plan.index else (8, steps if e.kinked or order == 8 else 1, cut)
+    scheme = plan.scheme if plan.index else _exact(plan.scheme, e.kinked)
     part = casadi.SX.sym("i")
     if plan.law is None:
         pieces = [
@@ -133,12 +132,18 @@ def _period(plan: Plan) -> tuple[Any, list[Any], list[Any], dict[str, Any], int]
         ]
         ends, parts = _stages_of(plan, t, x, pieces, p, s, kick, scheme, part)
     else:
-        ends = [_followed(plan, t, x, p, s, kick, now, r, y, max(scheme[1], 2))]
+        ends = [_followed(plan, t, x, p, s, kick, now, r, y, max(scheme.steps, 2))]
         parts = 1
     free = casadi.vertcat(*(p[k] for k in plan.index)) if plan.index else casadi.SX(0, 1)
     by = {"force": force, "free": free, "path": casadi.vertcat(before, now, ahead),
           "height": e.smoothed(t, x[:n], now, p, s)[1]}  # fmt: skip
     return x, ends, [casadi.vertcat(*w), p, s, force, part], by, parts
+
+
+def _exact(scheme: Scheme, kinked: bool) -> Scheme:
+    """Return a scheme of order eight throughout."""
+    steps = scheme.steps if kinked or scheme.order == 8 else 1
+    return Scheme(8, steps, (8, steps) if scheme.sharp else None)
 
 
 def _stages_of(plan: Plan, t: Any, x: Any, pieces: Any, p: Any, s: Any, kick: Any, scheme: Scheme,
@@ -147,14 +152,14 @@ def _stages_of(plan: Plan, t: Any, x: Any, pieces: Any, p: Any, s: Any, kick: An
 
     Several steps of one kind are one short expression that is gone through several times.
     """
-    e, (order, steps, cut) = plan.equations, scheme
-    if e.dt or cut or steps == 1:
-        return [advance(e, t, x, pieces, p, s, kick, scheme)[0]], 1
-    ends, begin = [], t
+    e, steps = plan.equations, scheme.steps
+    if e.dt or scheme.sharp or steps == 1:
+        return [advance(e, t, x, pieces, p, s, kick, scheme=scheme)[0]], 1
+    ends, begin, one = [], t, Scheme(scheme.order, 1)
     for duration, level, slope in pieces:
         h = duration / steps
         piece = (h, level + slope * part * h, slope)
-        after = advance(e, begin + part * h, x, [piece], p, s, kick, (order, 1, False))[0]
+        after = advance(e, begin + part * h, x, [piece], p, s, kick, scheme=one)[0]
         ends.append(after)
         begin = begin + duration
     return ends, steps

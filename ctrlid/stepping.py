@@ -11,7 +11,7 @@ import numpy as np
 
 from .equations import Array, Equations
 from .errors import CtrlidError
-from .integration import Piece, advance, input_pieces, integrate, whole_delay
+from .integration import Piece, Scheme, advance, input_pieces, integrate, whole_delay
 from .loop import Loop
 
 
@@ -102,7 +102,8 @@ def stepper(loop: Loop, substeps: int) -> Stepper:
         past = [z[k] for k in range(size - kept, size)]
         path = (past[kept - 1] if kept else applied, past[late - 1] if late else applied, applied)
         pieces = _numbers(e, input_pieces(e, loop.dt, path, "zoh"), p)
-        x, error = advance(e, t0, z[:n], pieces, p, None, kick, (8, substeps, True))
+        scheme = Scheme(8, substeps, sharp=(8, substeps))
+        x, error = advance(e, t0, z[:n], pieces, p, None, kick, scheme=scheme)
         after = casadi.vertcat(x, moved, memory)
         if kept:
             after = casadi.vertcat(after, applied, *past[: kept - 1])
