@@ -152,8 +152,7 @@ class Machine:
             step, a, b, dp = self._period(self.maps.stages, *given)
             rows = np.flatnonzero(doubt)
             if len(rows):
-                some = [v[:, rows] if k in (0, 1, 3) else v for k, v in enumerate(given)]
-                du[rows] = self._period(moving_maps_of(self.plan), *some)[4].sum(axis=2)
+                du[rows] = self._moved(rows, given, 1e-3 * float(np.std(u[track.valid])))
         start, wide = self.onset.start(track, p)
         height, c, hp = self.maps.sensor(at.predicted.T, w, p, spread)
         return Linearized(
@@ -162,6 +161,19 @@ class Machine:
             _full(c, len(u))[:, 0, :], _full(hp, len(u))[:, 0, :], doubt,
             self.padded(start), self.padded(wide), at,
         )  # fmt: skip
+
+    def _moved(self, rows: Any, given: Sequence[Array], h: float) -> Array:
+        """Return by differences how the state after the samples `rows` depends on the input."""
+        x, w, p, spread, force = given
+        path = np.array([0.0, 1.0, 1.0, 1.0, 0.0, 0.0])[:, None]
+        above, below = (
+            self._period(
+                self.maps.stages, x[:, rows], w[:, rows] + s * h * path, p, spread[:, rows], force
+            )[0]
+            for s in (1, -1)
+        )
+        slope: Array = (above - below)[:, :, 0] / (2 * h)
+        return slope
 
     def _through_play(self, u: Array, p: Array) -> tuple[Array, Array | None]:
         """Return the input behind the play, and how it depends on the free parameters."""

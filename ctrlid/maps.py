@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import casadi
+import numpy as np
 
 from .controllers import ControlLaw
 from .equations import Equations
@@ -13,6 +14,7 @@ from .integration import Scheme, advance, input_pieces, integrate
 from .vectorized import Vectorized
 
 BUILT = 64  # structures whose maps are kept
+LONG = 3000  # instructions
 
 
 @dataclass(frozen=True)
@@ -196,10 +198,19 @@ def _chained(
         before = carried = [casadi.SX.sym("s", *value.shape) for value in before]
     functions = []
     for end in ends:
-        a = casadi.jacobian(end, x)
-        own = [casadi.SX(n, n), *(casadi.jacobian(end, v) for v in by)]
+        # All at once, which shares what the derivatives have in common.
+        widths = [n, *(v.shape[0] for v in by)]
+        slopes = casadi.jacobian(end, casadi.vertcat(x, *by))
+        a, *own = casadi.horzsplit(slopes, [int(k) for k in np.cumsum([0, *widths])])
+        own = [casadi.SX(n, n), *own]
         outputs = [casadi.mtimes(a, s) + d for s, d in zip(before, own, strict=True)]
-        functions.append(
-            casadi.Function("step", [x, *carried, *given], [end, *outputs], {"cse": True})
-        )
+        functions.append(_function([x, *carried, *given], [end, *outputs]))
     return tuple(functions)
+
+
+def _function(inputs: Sequence[Any], outputs: Sequence[Any]) -> casadi.Function:
+    """Return a function, common parts found once where that pays: long ones have few."""
+    plain = casadi.Function("step", inputs, outputs)
+    if plain.n_instructions() > LONG:
+        return plain
+    return casadi.Function("step", inputs, outputs, {"cse": True})

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import casadi
+import numba
 import numpy as np
 
 from ._jobs import processors, side_by_side
@@ -55,10 +56,12 @@ class Vectorized:
         return through([self], [], arguments)
 
 
-def _instructions(function: Any) -> tuple[list[tuple[int, int, int, int]], Array]:
-    """Return the instructions of a function, inputs and outputs by their rows, and its numbers.
+def _instructions(function: Any) -> tuple[Any, Array]:
+    """Return the instructions of a function as CasADi has them, and its numbers.
 
-    The elements of inputs and outputs stand one column after another, one table after another.
+    Each as operation, register of the result, operands; for inputs, outputs and constants the row
+    of their table stands in place of a register. The elements of inputs and outputs stand one
+    column after another, one table after another.
     """
     into, out = [], []
     first = 0
@@ -80,7 +83,7 @@ def _instructions(function: Any) -> tuple[list[tuple[int, int, int, int]], Array
         elif op == casadi.OP_INPUT:
             steps.append((op, to[0], into[a[0]][a[1]], 0))
         elif op == casadi.OP_OUTPUT:
-            steps.append((op, out[to[0]][to[1]], a[0], 0))
+            steps.append((op, out[to[0]][to[1]], a[0], a[0]))
         elif op in UNARY:
             steps.append((op, to[0], a[0], a[0]))
         elif op in BINARY:
@@ -90,42 +93,51 @@ def _instructions(function: Any) -> tuple[list[tuple[int, int, int, int]], Array
                 f"the equations use an operation (CasADi's number {op}) that cannot be "
                 "evaluated over many samples; write it with ordinary numpy functions"
             )
-    return steps, np.array(constants, dtype=float)
+    return np.array(steps, dtype=np.int64).reshape(-1, 4), np.array(constants, dtype=float)
 
 
-def _allocated(steps: Sequence[tuple[int, int, int, int]]) -> tuple[Any, int]:
+@numba.njit(cache=True)
+def _allocated(steps: Any) -> tuple[Any, int]:  # pragma: no cover - compiled
     """Return the program with registers of its own, and their number.
 
     CasADi lets a result overwrite an operand. Here it never does: a loop in place is no vector.
     """
-    fed = (casadi.OP_CONST, casadi.OP_INPUT)
-    holds: dict[int, int] = {}  # which instruction's result CasADi's register holds
-    operands: list[tuple[int, ...]] = []
-    last: dict[int, int] = {}  # where each result is used for the last time
-    for k, (op, to, a, b) in enumerate(steps):
-        operands.append(() if op in fed else (holds[a],) if op == casadi.OP_OUTPUT
-                        else (holds[a], holds[b]))  # fmt: skip
-        last.update(dict.fromkeys(operands[-1], k))
+    count = len(steps)
+    most = steps.max() + 1 if count else 1
+    holds = np.zeros(most, np.int64)  # which instruction's result CasADi's register holds
+    operands = np.full((count, 2), -1)
+    last = np.arange(count)  # where each result is used for the last time
+    for k in range(count):
+        op = steps[k, 0]
+        if op != casadi.OP_CONST and op != casadi.OP_INPUT:
+            for j in range(2):
+                operands[k, j] = holds[steps[k, 2 + j]]
+                last[operands[k, j]] = k
         if op != casadi.OP_OUTPUT:
-            holds[to] = k
-            last[k] = k
-    done: list[list[int]] = [[] for _ in steps]
-    for result, k in last.items():
-        done[k].append(result)
-    free: list[int] = []
-    place: dict[int, int] = {}
-    program = np.zeros((len(steps), 4), dtype=np.int64)
-    count = 0
-    for k, (op, to, a, b) in enumerate(steps):
-        if op != casadi.OP_OUTPUT:
-            if not free:
-                free.append(count)
-                count += 1
-            to = place[k] = free.pop()
-        read = [place[i] for i in operands[k]]
-        program[k] = op, to, *(read * 2 if len(read) == 1 else read or (a, b))
-        free += [place[i] for i in done[k]]
-    return program, count
+            holds[steps[k, 1]] = k
+    program = steps.copy()
+    place = np.zeros(count, np.int64)
+    free = np.zeros(count, np.int64)
+    spare = registers = 0
+    for k in range(count):
+        if steps[k, 0] != casadi.OP_OUTPUT:
+            if not spare:
+                free[0], spare = registers, 1
+                registers += 1
+            spare -= 1
+            place[k] = program[k, 1] = free[spare]
+        read = operands[k]
+        for j in range(2):
+            if read[j] >= 0:
+                program[k, 2 + j] = place[read[j]]
+        for j in range(2):
+            if read[j] >= 0 and last[read[j]] == k and not (j and read[0] == read[1]):
+                free[spare] = place[read[j]]
+                spare += 1
+        if steps[k, 0] != casadi.OP_OUTPUT and last[k] == k:  # a result that nothing uses
+            free[spare] = place[k]
+            spare += 1
+    return program, registers
 
 
 def through(
