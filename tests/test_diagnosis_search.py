@@ -287,7 +287,9 @@ def test_many_effects_at_once_are_no_explanation():
         E.QuadraticDrag(1.0),
     )
     findings = [Finding(e, {}, (), (), 50.0) for e in kinds]
-    text = conclusion("partly explained", findings, gap, quiet, tests, ())
+    loose = doubt_of_all(kinds, [50.0] * 4, 200.0)
+    text = conclusion("partly explained", findings, gap, quiet, tests, (), loose)
+    assert text.startswith("With CoulombFriction and LinearStiffness and")
     assert "so many effects at once describe almost any error" in text
 
 
@@ -422,11 +424,20 @@ def test_a_limit_of_the_input_is_found_wherever_it_cuts():
 
 def test_lists_that_prove_little():
     ripples = [E.PositionRipple(0.1, period, 0.0) for period in (1e-3, 2e-3)]
-    assert "several ripples" in doubt_of_all(ripples, [100.0, 90.0])
+    assert "several ripples" in doubt_of_all(ripples, [100.0, 90.0], 200.0)
     three = [E.QuadraticDrag(1.0), E.LinearStiffness(1.0), E.EddyCurrentDamping(0.1)]
-    assert not doubt_of_all(three, [900.0, 300.0, 60.0])
-    assert "larger one gets wrong" in doubt_of_all(three, [900.0, 24.0, 11.0])
-    assert not doubt_of_all(three[:2], [900.0, 11.0])
+    assert not doubt_of_all(three, [900.0, 300.0, 60.0], 1200.0)
+    assert "larger one gets wrong" in doubt_of_all(three, [900.0, 24.0, 11.0], 1000.0)
+    assert not doubt_of_all(three[:2], [900.0, 11.0], 1000.0)
+
+
+def test_two_look_alikes_of_which_either_would_do_are_one_thing():
+    """A limited rate is nearly a delay and nearly a lag; the rest is filled with the other."""
+    both = [E.InputDelay(1e-3), E.ActuatorLag(1e-3)]
+    text = doubt_of_all(both, [80.0, 57.0], 2050.0)
+    assert "InputDelay and ActuatorLag resemble each other" in text
+    assert not doubt_of_all(both, [1240.0, 240.0], 4200.0)
+    assert not doubt_of_all([both[0], E.LinearStiffness(1.0)], [80.0, 57.0], 4100.0)
 
 
 def test_a_filter_begins_where_a_curved_sensor_points():

@@ -49,7 +49,9 @@ def put_together(
     # A random force that may do anything explains everything, and nothing.
     blamed = disturbance.large or math.isnan(disturbance.share)
     left = left or (blamed and gap.after > WORSE * gap.given)
-    loose = doubt_of_all([f.trial.effect for f in found.found], [f.trial.gain for f in found.found])
+    total = found.final.fit.value - found.base.fit.value
+    effects, gains = [f.trial.effect for f in found.found], [f.trial.gain for f in found.found]
+    loose = doubt_of_all(effects, gains, total if math.isfinite(total) else 0.0)
     if found.after.passed and not left and not loose:
         verdict = "explained" if findings else "nothing missing"
     else:
@@ -69,10 +71,12 @@ def put_together(
         for name in loop.free
     )  # fmt: skip
     tests = dict(found.after.p_values)
+    sentence = conclusion(
+        verdict, findings, gap, disturbance, found.after, where, "" if left else loose
+    )
     return Diagnosis(
-        verdict, conclusion(verdict, findings, gap, disturbance, found.after, where), findings,
-        final, gap, where, _ranking(found), disturbance, calibrated, _sensitivity(found),
-        tests, notes=tuple(notes),
+        verdict, sentence, findings, final, gap, where, _ranking(found), disturbance, calibrated,
+        _sensitivity(found), tests, notes=tuple(notes),
     )  # fmt: skip
 
 

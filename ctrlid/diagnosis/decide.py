@@ -1,5 +1,6 @@
 """Which candidates a record can tell apart, and what earns its place."""
 
+import itertools
 import math
 from collections.abc import Sequence
 
@@ -20,10 +21,11 @@ SMALL = 0.2  # of the size of an effect: a further parameter that is no larger i
 MANY = 4  # effects at once: such a list describes almost any error, and explains none
 SOME = 3  # effects at once, of which none may be slight
 SLIGHT = 0.02  # of the largest gain: what corrects so little of it corrects a wrong law, perhaps
+RESIDUE = 0.1  # of what all explain: two look-alikes that both add less are one thing, perhaps
 BLOCK = 50  # samples whose terms are summed before their spread is taken
 
 
-def doubt_of_all(effects: Sequence[AbstractEffect], gains: Sequence[float]) -> str:
+def doubt_of_all(effects: Sequence[AbstractEffect], gains: Sequence[float], total: float) -> str:
     """Say why effects that explain a record together may yet be no explanation.
 
     Parameters
@@ -32,6 +34,8 @@ def doubt_of_all(effects: Sequence[AbstractEffect], gains: Sequence[float]) -> s
         Those that were found.
     gains : sequence of float
         What each gains of log-likelihood beside the others.
+    total : float
+        What they gain together.
 
     Returns
     -------
@@ -44,7 +48,19 @@ def doubt_of_all(effects: Sequence[AbstractEffect], gains: Sequence[float]) -> s
         return "several ripples together describe any curve over the position, and prove little"
     if len(effects) >= SOME and min(gains) < SLIGHT * max(gains):
         return "the smallest of so many effects may only correct what a larger one gets wrong"
+    for one, other in itertools.combinations(range(len(effects)), 2):
+        alone = max(gains[one], gains[other]) < RESIDUE * total
+        if alone and _alike(effects[one], effects[other]):
+            names = [type(effects[k]).__name__ for k in (one, other)]
+            return (f"{names[0]} and {names[1]} resemble each other, and either alone explains "
+                    "nearly all of it: one effect of another kind may be behind both")  # fmt: skip
     return ""
+
+
+def _alike(one: AbstractEffect, other: AbstractEffect) -> bool:
+    """Whether one of two effects is known to resemble the other."""
+    names = type(one).__name__, type(other).__name__
+    return names[1] in type(one).look_alikes or names[0] in type(other).look_alikes
 
 
 def vuong(best: Array, other: Array, penalty: float) -> float:

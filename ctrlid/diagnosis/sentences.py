@@ -3,14 +3,13 @@
 from collections.abc import Sequence
 
 from .._text import chance, number
-from .decide import doubt_of_all
 from .omnibus import Omnibus
 from .result import Disturbance, Finding, Gap, Place, Verdict
 
 
 def conclusion(
     verdict: Verdict, findings: Sequence[Finding], gap: Gap, disturbance: Disturbance,
-    after: Omnibus, where: Sequence[Place],
+    after: Omnibus, where: Sequence[Place], loose: str = "",
 ) -> str:  # fmt: skip
     """Return the verdict with what it rests on.
 
@@ -28,6 +27,8 @@ def conclusion(
         The tests of what is left.
     where : sequence of Place
         Where the disagreement sits.
+    loose : str, optional
+        Why effects that leave nothing but noise may yet be no explanation.
 
     Returns
     -------
@@ -39,16 +40,15 @@ def conclusion(
     why = f"the test of {name} fails ({chance(p)})"
     if after.passed:
         why = "on data kept back the gap stays well above the noise floor"
-        loose = doubt_of_all([f.effect for f in findings], [f.evidence for f in findings])
-        if loose:
-            why = loose
-        elif gap.after > gap.given:
+        if gap.after > gap.given:
             why = "on data kept back the gap is wider than that of the model as given"
     were, them = ("were", "them") if len(findings) > 1 else ("was", "it")
     if verdict == "nothing missing":
         text = "At the sensitivity of this record, what is left is noise."
     elif verdict == "explained":
         text = f"Missing {were} {names}; with {them}, what is left is noise."
+    elif verdict == "partly explained" and after.passed and loose:
+        text = f"With {names} what is left is noise; but {loose}."
     elif verdict == "partly explained":
         verb = "explain" if len(findings) > 1 else "explains"
         text = (f"{names} {verb} part of the gap. Something else remains that no known effect "
