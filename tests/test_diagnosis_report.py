@@ -15,6 +15,7 @@ from ctrlid.diagnosis import gap as gap_of
 from ctrlid.diagnosis import words
 from ctrlid.diagnosis.closing import stands_out
 from ctrlid.diagnosis.fitted import base_model
+from ctrlid.diagnosis.omnibus import ALPHA, alarm_level
 from ctrlid.diagnosis.result import (
     Calibrated,
     Candidate,
@@ -165,6 +166,21 @@ def test_report_of_a_clean_bill(found):
     assert "A LARGE RANDOM FORCE: white 30 mm/s^2 and coloured 0.4 m/s^2 with a time " in words
     assert "81 % of the noise floor's variance" in words
     assert "what is missing" not in words
+
+
+def test_one_of_many_tests_may_look_bad(found):
+    """The verdict counts how many tests there are; the line on what remains does not deny it."""
+    tests = {**{f"test {k}": 0.5 for k in range(30)}, "rhythm of K": 4e-4}
+    words = text(replace(found["explained"], tests=tests))
+    assert "noise, by 31 tests, the most doubtful of which is rhythm of K, p = 0.0004" in words
+    assert "among so many p = 0.012" in words
+    assert "NOT NOISE ALONE" not in words
+    assert "NOT NOISE ALONE" in text(replace(found["unknown"], tests={**tests, "whiteness": 1e-6}))
+
+
+def test_the_more_effects_the_sooner_an_alarm():
+    assert alarm_level(0) == alarm_level(1) == ALPHA
+    assert alarm_level(3) == pytest.approx(3 * ALPHA)
 
 
 def test_bad_news_is_in_capitals(found):

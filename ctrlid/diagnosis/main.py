@@ -25,7 +25,7 @@ from .fresh import Fresh, fresh_data, stretches
 from .intake import as_loop, look_over, repeat_periods
 from .readout import Readout, censored, clipping, steps
 from .replica import forgiven, replica
-from .result import Diagnosis, Disturbance
+from .result import COMPLETE, Diagnosis, Disturbance
 from .rounds import Work, check_catalogue
 from .search import Search, main_ones, named, search, without_worst
 from .several import merged
@@ -37,7 +37,6 @@ BY_SIMULATION = (
     "of an open-loop simulation, and sizes are those that simulate best. What is called one-step "
     "errors above are errors of that simulation; evidence counts as many samples as are independent"
 )
-COMPLETE = ("explained", "nothing missing")
 STEPS = 6  # of the progress bar
 
 

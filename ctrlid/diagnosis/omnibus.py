@@ -18,7 +18,15 @@ SETTLING = 0.05  # of a record, in which a force is still being found
 INDEPENDENT = 40  # samples of a force, from which its distribution shows
 OF_NOISE = ("size", "heavy", "isolated", "shape")  # tests of what no effect explains
 LEAST = 1e-300  # probability
-ALPHA = 1e-3  # chance of one false alarm over all tests together
+ALPHA = 2e-3  # chance of one false alarm over all tests together
+
+
+def alarm_level(effects: int) -> float:
+    """Return the chance of a false alarm that a model with so many effects is given.
+
+    The more effects an explanation takes, the likelier it stands in for something else.
+    """
+    return ALPHA * max(effects, 1)
 
 
 @dataclass(frozen=True, eq=False)

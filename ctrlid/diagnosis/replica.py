@@ -22,8 +22,7 @@ from .trial import Trial
 
 DOUBTFUL = 400.0  # a gain above this is no artefact of the filter, if the model has no effect yet
 TWICE = 2.0  # what the replica gains counts this much against a candidate
-# Chance of a false alarm for a model with effects: the filter only nearly follows kinks and limits.
-WITH_EFFECTS = 1e-4
+KINKED = 1e-4  # chance of a false alarm where the filter only nearly follows a kink
 BEYOND = 3.0  # logarithms of chance by which a test must fail more than on a replica
 
 
@@ -147,12 +146,13 @@ def more_than_simple(base: Model, best: Trial, simple: Trial) -> float:
     return best.gain - simple.gain - TWICE * max(usual, 0.0)
 
 
-def forgiven(tests: Omnibus, copies: Sequence[Model | None], alpha: float = ALPHA) -> Omnibus:
+def forgiven(tests: Omnibus, copies: Sequence[Model | None]) -> Omnibus:
     """Return the tests without alarms that the filter's own approximation raises.
 
     A test that fails on the record, and on records simulated with the very model, says nothing
     against the model.
     """
+    bent = any(copy is not None and copy.loop.effects and kinked(copy) for copy in copies)
     known = [omnibus(copy.fit).p_values for copy in copies if copy is not None]
     if not known:
         return tests
@@ -163,4 +163,4 @@ def forgiven(tests: Omnibus, copies: Sequence[Model | None], alpha: float = ALPH
             max(usual, 1e-300)
         )
         p[name] = max(value, 0.5) if failed else value
-    return replace(tests, p_values=p, alpha=alpha)
+    return replace(tests, p_values=p, alpha=KINKED if bent else tests.alpha)

@@ -11,6 +11,7 @@ from ..equations import Array
 from ..loop import Loop
 
 Verdict = Literal["nothing missing", "explained", "partly explained", "unknown"]
+COMPLETE: tuple[Verdict, ...] = ("explained", "nothing missing")
 EXCESS = 1.5  # times what noise leaves (twice that with a coloured force): above, not explained
 LARGE = 0.5  # share of the floor's variance from which a random force may hide something
 

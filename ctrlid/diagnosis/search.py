@@ -12,9 +12,9 @@ from ..likelihood import Fit
 from .attempts import refit
 from .decide import CLOSE, GATE, MANY
 from .fitted import Model, anchor, simulable, spared, whole
-from .omnibus import ALPHA, Omnibus, omnibus
+from .omnibus import Omnibus, alarm_level, omnibus
 from .ordering import reordered
-from .replica import WITH_EFFECTS, forgiven, replica
+from .replica import forgiven, replica
 from .rounds import NEXT, Step, Work, candidates, one_round
 from .scan import SCANS, scanned
 from .settling import Found, compared, cut, renoised, settled, without_superfluous
@@ -187,10 +187,10 @@ def excess(fit: Fit) -> float:
 
 def judged(model: Model) -> Omnibus:
     """Return the tests of what a model leaves, without the alarms of the filter itself."""
-    after = omnibus(model.fit)
+    after = replace(omnibus(model.fit), alpha=alarm_level(len(model.loop.effects)))
     if not after.passed:
         copies = [replica(model, seed) for seed in (1, 2)]
-        after = forgiven(after, copies, WITH_EFFECTS if model.loop.effects else ALPHA)
+        after = forgiven(after, copies)
     return after
 
 

@@ -7,7 +7,8 @@ import numpy as np
 
 from .._text import chance, listing, number, prefix, quantity
 from ..effects import AbstractEffect, ReadingEffect
-from .result import EXCESS, Diagnosis, Finding, Gap, Place
+from .omnibus import alarm_level
+from .result import COMPLETE, EXCESS, Diagnosis, Finding, Gap, Place
 from .saving import units_of
 
 TELLING = 1e-3  # probability below which a place is not noise's doing
@@ -223,15 +224,19 @@ def disturbance(found: Diagnosis) -> str:
 
 def remains(found: Diagnosis) -> str:
     """Say whether what is left is noise, by the tests of the final one-step errors."""
-    failed = sorted((p, name) for name, p in found.tests.items() if p < TELLING)
-    if failed:
-        names = [name for _, name in failed[:LISTED]]
-        if len(failed) > LISTED:
-            names[-1] = f"{len(failed) - LISTED + 1} others"
-        return (f"what remains: NOT NOISE ALONE, by {len(failed)} of {len(found.tests)} tests: "
-                f"{listing(names)} ({chance(failed[0][0])})")  # fmt: skip
     if not found.tests:
         return "what remains: not tested"
+    count = len(found.tests)
     name, p = min(found.tests.items(), key=lambda item: item[1])
-    return (f"what remains: noise, by {len(found.tests)} tests, the most doubtful of which is "
-            f"{name}, {chance(p)}")  # fmt: skip
+    together = min(1.0, count * p)
+    if found.verdict in COMPLETE or together > alarm_level(len(found.findings)):
+        doubt = f"{name}, {chance(p)}"
+        if p < TELLING:
+            doubt += f", among so many {chance(together)}"
+        return f"what remains: noise, by {count} tests, the most doubtful of which is {doubt}"
+    failed = sorted((p, name) for name, p in found.tests.items() if p < TELLING)
+    names = [name for _, name in failed[:LISTED]]
+    if len(failed) > LISTED:
+        names[-1] = f"{len(failed) - LISTED + 1} others"
+    return (f"what remains: NOT NOISE ALONE, by {len(failed)} of {count} tests: "
+            f"{listing(names)} ({chance(failed[0][0])})")  # fmt: skip
