@@ -5,6 +5,7 @@ import numpy as np
 
 import ctrlid as cid
 from ctrlid import effects as E
+from ctrlid.diagnosis.constancy import bin_edges
 from ctrlid.diagnosis.fitted import base_model
 from ctrlid.diagnosis.omnibus import omnibus
 
@@ -68,3 +69,11 @@ def test_a_diagnosis_is_not_clean_where_a_gain_breathes():
                          catalogue=[E.CoulombFriction, E.ActuatorLag])  # fmt: skip
     assert found.verdict == "unknown"
     assert "rhythm of k" in str(found)
+
+
+def test_edges_of_bins_have_no_rounding_errors_in_place_of_zero():
+    values = np.concatenate([np.full(300, 4.7e-13), np.linspace(-1.0, 1.0, 300)])
+    edges = bin_edges(values)
+    assert 0.0 in edges
+    assert (np.abs(edges[edges != 0.0]) > 1e-3).all()
+    assert bin_edges(1e-12 * values).max() == 1e-12

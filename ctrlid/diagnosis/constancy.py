@@ -10,6 +10,7 @@ from ..likelihood import Fit
 
 BINS = 12
 FEWEST = 40  # samples in a bin
+ROUNDING = 1e-9  # of the range of a quantity
 SLOW = 0.05  # of Nyquist's frequency: up to there a periodic change is looked for
 
 
@@ -85,8 +86,9 @@ def line_chance(power: Array) -> float:
 
 
 def bin_edges(values: Array, bins: int = BINS) -> Array:
-    """Return edges of bins that hold equally many samples."""
-    edges = np.unique(np.quantile(values, np.linspace(0, 1, bins + 1)))
+    """Return edges of bins that hold equally many samples; what rounding left of zero is zero."""
+    edges = np.quantile(values, np.linspace(0, 1, bins + 1))
+    edges = np.unique(np.where(np.abs(edges) < ROUNDING * np.ptp(values), 0.0, edges))
     return edges if len(edges) > 2 else np.array([values.min(), values.mean(), values.max()])
 
 
