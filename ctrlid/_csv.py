@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+import math
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -85,6 +86,7 @@ def read_csv(
     valid = np.ones(len(table), dtype=bool)
     if "valid" in names:
         valid = table[:, place("valid", "valid")] > 0.5
+    table, valid = _bridged(table, places, valid, gaps, path)
     start, rows = 0.0, None
     period_given = own.get("dt") if dt is None else dt
     if clock is None:
@@ -159,12 +161,58 @@ def _read_table(path: Path) -> tuple[dict[str, Any], list[str], Any]:
         body = body.replace(",", ".")  # decimal commas
     try:
         table = np.loadtxt(io.StringIO(body), delimiter=separator, ndmin=2, quotechar='"')
-    except ValueError as reason:
-        raise CtrlidError(f"{path} is not a table of numbers: {reason}") from reason
+    except ValueError:
+        table = _with_blanks(path, body, separator, text.count("\n", 0, stop))
     if table.shape[1] != len(header):
         raise CtrlidError(f"the header of {path} names {len(header)} columns, its rows have "
                           f"{table.shape[1]}; give every column a name")  # fmt: skip
     return own, header, table
+
+
+def _with_blanks(path: Path, body: str, separator: str, above: int) -> Any:
+    """Read a table with blank cells, which are NaN, below so many lines."""
+    rows = []
+    for k, cells in enumerate(csv.reader(io.StringIO(body), delimiter=separator)):
+        if not cells or cells[0].lstrip().startswith("#"):
+            continue
+        try:
+            rows.append([float(cell) if cell.strip() else math.nan for cell in cells])
+        except ValueError:
+            word = next(c for c in cells if c.strip() and not _is_number(c))
+            raise CtrlidError(f"{path} is not a table of numbers: {word.strip()!r} stands in line "
+                              f"{above + k + 1}. Remove it, or leave the cell blank and give "
+                              "gaps='mask'") from None  # fmt: skip
+        if len(cells) != len(rows[0]):
+            raise CtrlidError(f"{path} is not a table of numbers: line {above + k + 1} has "
+                              f"{len(cells)} cells, the lines above it {len(rows[0])}")  # fmt: skip
+    return np.array(rows)
+
+
+def _bridged(
+    table: Any, places: Mapping[str, int], valid: Any, gaps: str, path: Path
+) -> tuple[Any, Any]:
+    """Return table and validity with the last values where numbers are missing."""
+    columns = list(places.values())
+    missing = np.isnan(table[:, columns])
+    rows = np.flatnonzero(missing.any(axis=1) & valid)
+    if not missing.any():
+        return table, valid
+    if gaps == "error" and rows.size:
+        k = int(rows[0])
+        names = ", ".join(n for n, lacks in zip(places, missing[k], strict=True) if lacks)
+        raise CtrlidError(
+            f"{path} has no number for {names} in row {k + 1} of the data, and lacks some in "
+            f"{rows.size} of {len(table)} rows. Give gaps='mask' to fill them with the last values "
+            "and mark them as not valid"
+        )
+    table = table.copy()
+    for column, lacks in zip(columns, missing.T, strict=True):
+        known = np.flatnonzero(~lacks)
+        if not known.size:
+            raise CtrlidError(f"{path} has no number at all in one of its columns; it is needed")
+        last = np.maximum.accumulate(np.where(lacks, known[0], np.arange(len(table))))
+        table[:, column] = table[last, column]
+    return table, valid & ~missing.any(axis=1)
 
 
 def _cells(line: str, separator: str) -> list[str]:

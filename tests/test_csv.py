@@ -119,7 +119,7 @@ def test_dt_without_a_time_column_and_a_valid_column(tmp_path):
         ("t,u,u,y\n" + ROWS, {}, "has several columns 'u' for u"),
         ("0,1,2\n1,2,3\n", {}, "has no header line: its first line is '0,1,2'. Add one"),
         ("t,u,y\n0,1,2\n1,x,3\n", {}, "is not a table of numbers: .*'x'"),
-        ("t,u,y\n0,1,2\n1,,3\n", {}, "is not a table of numbers"),
+        ("t,u,y\n0,1,2\n1,,3\n", {}, "has no number for u in row 2"),
         ("t,u,y\n0,1,2\n1,3\n", {}, "is not a table of numbers"),
         ("t,u,y\n0,1,2,9\n1,3,3,9\n", {}, "names 3 columns, its rows have 4; give every column"),
         ("t,u,y\n", {}, "has no rows of numbers below its header"),
@@ -131,7 +131,7 @@ def test_dt_without_a_time_column_and_a_valid_column(tmp_path):
         ("t [days],u,y\n0,1,2\n1,3,4\n", {}, "is in 'days'; known units are s, .* give dt="),
         ("t,u,y\n0,1,2\n", {}, "needs at least 2 values, all finite"),
         ("t,u,y\n0,1,2\nnan,3,4\n", {}, "needs at least 2 values, all finite"),
-        ("t,u,y\n0,1,2\n1,nan,4\n", {}, "u must be finite; 1 of 2"),
+        ("t,u,y\n0,1,2\n1,nan,4\n", {}, "has no number for u in row 2"),
         ("t,u,y\n0,1,2\n2,3,4\n1,3,4\n", {},
          "does not increase: 2 s in row 2 of the data is followed by 1 s. Sort the rows"),
         ("t,u,y\n0,1,2\n0,3,4\n1,3,4\n", {}, "does not increase: 0 s in row 1"),
@@ -242,3 +242,31 @@ def test_a_long_record(tmp_path):
     np.testing.assert_array_equal(twin.u, record.u)
     np.testing.assert_array_equal(twin.y, record.y)
     assert twin.dt == 1e-3
+
+
+BLANKS = "t,u,y\n0,1,2\n0.01,,4\n0.02,5,nan\n0.03,7,8\n0.04,9,10\n"
+
+
+def test_blank_cells_are_refused_with_what_to_do(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text(BLANKS)
+    with pytest.raises(CtrlidError, match=r"no number for u in row 2 .* 2 of 5 rows.*gaps='mask'"):
+        Record.from_csv(path)
+    path.write_text(BLANKS.replace("5,nan", "5,off"))
+    with pytest.raises(CtrlidError, match="'off' stands in line 4"):
+        Record.from_csv(path, gaps="mask")
+    path.write_text(BLANKS + "0.05,1\n,1,2\n")
+    with pytest.raises(CtrlidError, match="line 7 has 2 cells, the lines above it 3"):
+        Record.from_csv(path, gaps="mask")
+    path.write_text("t,u,y\n0,1,\n0.01,2,\n")
+    with pytest.raises(CtrlidError, match="no number at all"):
+        Record.from_csv(path, gaps="mask")
+
+
+def test_blank_cells_are_masked(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text(BLANKS)
+    record = Record.from_csv(path, gaps="mask")
+    assert record.valid.tolist() == [True, False, False, True, True]
+    assert record.u.tolist() == [1, 1, 5, 7, 9]
+    assert record.y.tolist() == [2, 4, 4, 8, 10]

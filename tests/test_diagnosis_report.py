@@ -168,6 +168,11 @@ def test_report_of_a_clean_bill(found):
     assert "what is missing" not in words
 
 
+def test_a_parameter_at_its_limit_is_said_to_be(found):
+    stuck = replace(found["explained"].calibrated[0], after=3.1e-5, standard_error=0.0)
+    assert "3.1e-05 (AT ITS LIMIT)" in text(replace(found["explained"], calibrated=(stuck,)))
+
+
 def test_one_of_many_tests_may_look_bad(found):
     """The verdict counts how many tests there are; the line on what remains does not deny it."""
     tests = {**{f"test {k}": 0.5 for k in range(30)}, "rhythm of K": 4e-4}
@@ -200,7 +205,7 @@ def test_bad_news_is_in_capitals(found):
         other = replace(base, gap=replace(base.gap, given=given))
         assert ("Recalibrating alone makes" in text(other)) == widened
     lost = replace(base, gap=replace(base.gap, given=math.inf, before=math.inf))
-    assert "LEAVES THE PLANT'S DOMAIN" in text(lost)
+    assert "RUNS AWAY" in text(lost)
     assert "of the squared gap" not in text(lost)
 
 
@@ -470,7 +475,7 @@ def test_a_gap_where_only_the_given_model_can_be_simulated():
     gap = Gap("closed-loop simulation", 2.7e-3, math.inf, math.inf, math.nan, "m", *[nothing] * 4)
     rows = {label: size for label, size, _ in words.gap_rows(gap)}
     assert rows["the model as given"] == "2.70 mm"
-    assert rows["recalibrated"] == "LEAVES THE PLANT'S DOMAIN"
+    assert rows["recalibrated"] == "RUNS AWAY"
 
 
 def test_a_window_far_from_rest_finds_its_start():

@@ -17,7 +17,7 @@ from ctrlid.diagnosis import rounds, settling
 from ctrlid.diagnosis.attempts import attempt, attempt_at, refit, under
 from ctrlid.diagnosis.closing import wider
 from ctrlid.diagnosis.decide import GATE, HINT, doubt_of_all, rivals
-from ctrlid.diagnosis.experiment import separating_experiment
+from ctrlid.diagnosis.experiment import _survives, separating_experiment
 from ctrlid.diagnosis.fitted import Model, base_model, spared, whole
 from ctrlid.diagnosis.instants import timed
 from ctrlid.diagnosis.omnibus import Omnibus, _shape, omnibus
@@ -35,6 +35,7 @@ from ctrlid.likelihood import relinearized
 from ctrlid.loop_fit import choose_noise, make_problem, start_values
 from ctrlid.machine import machine_for
 from ctrlid.maximum import begin, climb
+from ctrlid.simulation import Simulator
 from ctrlid.tracks import make_track
 
 
@@ -253,6 +254,36 @@ def test_no_experiment_is_recommended_where_none_tells():
     words, reference = separating_experiment(best, [other], record)
     assert reference is None
     assert "No steps of the reference" in words
+
+
+def test_an_experiment_under_which_the_plant_falls_is_not_recommended():
+    """Behind limits of the input a pendulum that has fallen stays bounded: no simulation fails."""
+    plant = cid.plants.pendulum(m=0.12, length=0.25, c=0.013)
+    at = cid.OperatingPoint(states=(0.0, 0.0), input=0.0, output=0.0)
+    lead = cid.design_lead(cid.linearize(plant, at), crossover=15, phase_margin=50)
+    loop = cid.Loop(plant, lead.sample(0.005, "tustin"), dt=0.005, at=at)
+    loop = loop.with_effect(E.InputSaturation(-0.1, 0.1))
+    r = cid.random_binary(6000, amplitude=0.02, hold=60, seed=3)
+    record = cid.simulate(loop, r, sensor_noise=1e-4, seed=4)
+    simulator = Simulator(loop, 1e-6, 8)
+    assert _survives(simulator, r, record)
+    bold = cid.random_binary(6000, amplitude=0.4, hold=60, seed=3)
+    assert np.ptp(simulator.run(simulator.start(None), bold, np.zeros(6000))[0]) > 3.0
+    assert not _survives(simulator, bold, record)
+
+
+def test_a_filter_that_lost_the_record_passes_no_test():
+    loop = drive()
+    record = record_of(loop, E.CoulombFriction(0.3), 0.3, 1e-4, 9701)
+    fit = base_model(loop, [record], loop.free).fit
+    assert omnibus(replace(fit, value=-np.inf)).worst == ("following the record", 0.0)
+
+
+def test_records_for_validation_are_sampled_as_the_loop_is():
+    loop = drive()
+    record = record_of(loop, E.CoulombFriction(0.3), 0.3, 1e-4, 9702)
+    with pytest.raises(cid.CtrlidError, match=r"sampled at 0\.02 s, the loop at 0\.01 s"):
+        cid.diagnose(loop, record, validation=record.decimate(2), progress=False)
 
 
 def test_a_model_without_its_arrays_can_be_searched_on():

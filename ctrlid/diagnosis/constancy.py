@@ -49,7 +49,9 @@ def constancy(fit: Fit, axes: Mapping[str, Array]) -> dict[str, float]:
     names = fit.problem.machine.names
     parts = [
         (out.slopes[keep], out.innovations[keep], out.variance[keep] * r, keep)
-        for out, keep, r in zip(fit.filtered, fit.problem.counts, fit.sensor, strict=True)
+        for out, r, keep in zip(
+            fit.filtered, fit.sensor, map(np.isfinite, fit.standardized), strict=True
+        )
     ]
     scores = np.concatenate([x * (e / s)[:, None] for x, e, s, _ in parts])
     told = np.concatenate([x**2 / s[:, None] for x, _, s, _ in parts])

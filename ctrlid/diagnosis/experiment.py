@@ -23,6 +23,7 @@ LEVELS = (-1.0, 1.0, -0.5, 0.5, 0.0)  # set-points it visits, in units of its re
 WORTH = 1.5  # times the distance of the record itself: below, no experiment worth the name
 ENOUGH = 60.0  # squared distance in noise, at which Vuong's statistic is near four on average
 SAFE = 1.2  # times its amplitude that the loop must survive
+FOLLOWS = 3.0  # times the range of reference or record: an output that goes further is lost
 MANY = 1000.0  # times as much: the record itself says nothing
 RAMP = 0.1  # share of each level that is spent on the way to it
 
@@ -61,14 +62,19 @@ def separating_experiment(
     if loop.controller is None or record.r is None:
         return words, None
     try:
-        simulator = Simulator(loop, ROUGH, FEW_STEPS)
+        simulators = [Simulator(t.model.fitted, ROUGH, FEW_STEPS) for t in (best, *others)]
     except CtrlidError:
         return words, None
-    chosen: tuple[float, str, Array] | None = None
-    for text, r in _references(record):
-        distance = _distance(simulator, best, others, r[:TRIED], record)
-        if distance is not None and (chosen is None or distance > 1.2 * chosen[0]):
-            chosen = (distance, text, r)
+    simulator = simulators[0]
+    able = [
+        (d, text, r)
+        for text, r in _references(record)
+        if (d := _distance(simulator, best, others, r[:TRIED], record)) is not None
+    ]
+    chosen = _clearest(able)
+    while chosen is not None and not all(_survives(s, chosen[2], record) for s in simulators):
+        able = [a for a in able if a is not chosen]
+        chosen = _clearest(able)
     if chosen is None:
         return words, None
     own = _distance(simulator, best, others, np.asarray(record.r)[:TRIED], record) or 0.0
@@ -83,6 +89,33 @@ def separating_experiment(
     text = (f"{words}. Recommended: {chosen[1]}; there the candidates differ {times:.1f} times as "
             "much for the same number of samples.")  # fmt: skip
     return text, chosen[2]
+
+
+def _clearest(able: Sequence[tuple[float, str, Array]]) -> tuple[float, str, Array] | None:
+    """Return the experiment with the largest distance; a bolder one has to be clearly better."""
+    chosen = None
+    for one in able:
+        if chosen is None or one[0] > 1.2 * chosen[0]:
+            chosen = one
+    return chosen
+
+
+def _survives(simulator: Simulator, r: Array, record: Record) -> bool:
+    """Whether a loop follows a reference, also one that is somewhat larger.
+
+    Behind limits of the input, a loop that has lost its plant may yet stay bounded.
+    """
+    middle = float(np.mean(r))
+    reach = FOLLOWS * max(float(np.ptp(r)), float(np.ptp(record.y[record.valid])))
+    for size in (1.0, SAFE):
+        bold = middle + size * (r - middle)
+        try:
+            y = simulator.run(simulator.start(None), bold, np.zeros(len(r)))[0]
+        except CtrlidError:
+            return False
+        if np.ptp(y) > size * reach:
+            return False
+    return True
 
 
 def _references(record: Record) -> list[tuple[str, Array]]:
@@ -130,12 +163,9 @@ def _distance(
     simulator: Simulator, best: Trial, others: Sequence[Trial], r: Array, record: Record
 ) -> float | None:
     """Return the least distance of a finding from its rivals, per sample."""
-    middle = float(np.mean(r))
-    try:
-        simulator.run(simulator.start(None), middle + SAFE * (r - middle), np.zeros(len(r)))
-        y, u = simulator.run(simulator.start(None), r, np.zeros(len(r)))
-    except CtrlidError:
+    if not _survives(simulator, r, record):
         return None
+    y, u = simulator.run(simulator.start(None), r, np.zeros(len(r)))
     made = Record(u=u, y=y, r=r, dt=record.dt, hold=record.hold)
     sizes = [d for t in others if (d := _unlike(t, best, made)) is not None]
     return min(sizes) / len(r) if sizes else None

@@ -87,7 +87,17 @@ class Fresh:
 def fresh_data(
     loop: Loop, records: Sequence[Record], validation: Sequence[Record] | None
 ) -> Fresh:  # fmt: skip
-    """Return the records given for validation, or the last quarter of each record."""
+    """Return the records given for validation, or the last quarter of each record.
+
+    Raises
+    ------
+    CtrlidError
+        If a record for validation is sampled in another way than the loop.
+    """
+    for r in validation or ():
+        if abs(r.dt - loop.dt) > 1e-9 * loop.dt:
+            raise CtrlidError(f"validation= is sampled at {r.dt:g} s, the loop at {loop.dt:g} s; "
+                              "give both the same period")  # fmt: skip
     rest: tuple[Record, ...] | None = None
     if validation is None:
         windows, rest = zip(*(gaps.held_out(r) for r in records), strict=True)

@@ -67,7 +67,8 @@ def diagnose(
     Parameters
     ----------
     loop : Loop or control.TransferFunction
-        The model, with the names of its uncertain parameters in `free`. With a controller the gap
+        The model, with the names of its uncertain parameters in `free`; each is sought between a
+        tenth and ten times its given value: further off is another model. With a controller the gap
         is that of the closed-loop simulation; without one that of a prediction several
         samples ahead, or of an open-loop simulation if the plant is stable. A transfer function
         stands for a linear plant without a known controller.

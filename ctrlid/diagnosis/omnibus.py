@@ -85,6 +85,8 @@ def omnibus(fit: Fit) -> Omnibus:
     Ljung and Box, Biometrika 65 (1978) 297-303; Fisher, Proceedings of the Royal Society A 125
     (1929) 54-59; Lobato and Velasco, Econometric Theory 20 (2004) 671-689.
     """
+    if not math.isfinite(fit.value):
+        return Omnibus({"following the record": 0.0}, np.zeros(0), {})
     parts: dict[str, list[Array]] = {}
     white = cross = 0.0
     white_df = cross_df = 0

@@ -100,8 +100,10 @@ def _parameters(found: Diagnosis) -> list[str]:
     last = "with the effects" if found.findings else "fitted"
     rows = [("the model's own parameters", "given", "recalibrated", last)]
     for c in found.calibrated:
-        fitted = (with_error(c.after, c.standard_error) if math.isfinite(c.standard_error)
-                  else f"{number(c.after, 4)} (not in the data)")  # fmt: skip
+        fitted = f"{number(c.after, 4)} (not in the data)"
+        if math.isfinite(c.standard_error):
+            fitted = (with_error(c.after, c.standard_error) if c.standard_error > 0
+                      else f"{number(c.after, 4)} (AT ITS LIMIT)")  # fmt: skip
         rows.append((f"  {c.name}", number(c.given, 4), number(c.before, 4), fitted))
     if not found.findings:
         rows = [(a, b, "", d) for a, b, _, d in rows]

@@ -53,7 +53,7 @@ def gap_rows(gap: Gap) -> list[tuple[str, str, str]]:
             return f"{factor * value:.{max(places, 0)}f} {unit}".strip()
         if math.isfinite(value):
             return f"{number(factor * value, 3)} {unit}".strip()
-        return "none" if math.isnan(value) else "LEAVES THE PLANT'S DOMAIN"
+        return "none" if math.isnan(value) else "RUNS AWAY"
 
     def times(value: float) -> str:
         ratio = value / gap.floor if gap.floor > 0 else math.nan
