@@ -57,8 +57,11 @@ def spoken_loop(args: argparse.Namespace, record: Record) -> Loop:
             raise CtrlidError(f"{args.model} is a whole loop and has its own operating point and "
                               f"controller: leave out {', '.join(clash)}")  # fmt: skip
         if abs(model.dt - record.dt) > 1e-6 * record.dt:
+            advice = "give both the same period"
+            if abs(1000 * model.dt - record.dt) < 0.01 * record.dt:
+                advice = "if the times are milliseconds, head their column t [ms]"
             raise CtrlidError(f"{args.model} is sampled at {model.dt:g} s, the record at "
-                              f"{record.dt:g} s; make them agree")  # fmt: skip
+                              f"{record.dt:g} s; {advice}")  # fmt: skip
         free = model.free if args.free is None else tuple(args.free)
         _known(args.model, list(model.parameters), [*values, *free])
         return dataclasses.replace(model.with_parameters(values), free=free)

@@ -225,7 +225,9 @@ def test_refusals_say_what_to_do(folder, asked, capsys):
     assert "cannot read nowhere.csv" in refused(capsys, "nowhere.csv", *SERVO)
     assert "Give --columns time=NAME or --dt" in refused(capsys, "bare.csv", *SERVO)
     slow = ("bare.csv", "--dt", 0.02, "--model", "bench.py:loop")
-    assert "is sampled at 0.01 s, the record at 0.02 s" in refused(capsys, *slow)
+    assert "is sampled at 0.01 s, the record at 0.02 s; give" in refused(capsys, *slow)
+    slow = ("bare.csv", "--dt", 10.0, "--model", "bench.py:loop")
+    assert "if the times are milliseconds, head their column t [ms]" in refused(capsys, *slow)
     assert asked == []
 
 
