@@ -20,7 +20,7 @@ from .scan import SCANS, scanned
 from .settling import Found, compared, cut, renoised, settled, without_superfluous
 from .trial import Trial, contains, same_kind
 
-NEARLY = 0.8  # of the best merit: what comes so close may be the better half of a pair
+NEARLY = 0.7  # of the best merit: what comes so close may be the better half of a pair
 FORESEEN = 2  # of them
 WAVES = (PeriodicForce, PositionRipple)  # of which there may be several
 MINOR = 0.15  # of the whole gain: less, beside something unknown, is a stand-in
