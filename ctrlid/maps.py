@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import casadi
-import numpy as np
 
 from .controllers import ControlLaw
 from .equations import Equations
@@ -198,10 +197,7 @@ def _chained(
         before = carried = [casadi.SX.sym("s", *value.shape) for value in before]
     functions = []
     for end in ends:
-        # All at once, which shares what the derivatives have in common.
-        widths = [n, *(v.shape[0] for v in by)]
-        slopes = casadi.jacobian(end, casadi.vertcat(x, *by))
-        a, *own = casadi.horzsplit(slopes, [int(k) for k in np.cumsum([0, *widths])])
+        a, *own = (casadi.jacobian(end, v) for v in (x, *by))
         own = [casadi.SX(n, n), *own]
         outputs = [casadi.mtimes(a, s) + d for s, d in zip(before, own, strict=True)]
         functions.append(_function([x, *carried, *given], [end, *outputs]))
