@@ -175,13 +175,16 @@ def _with_blanks(path: Path, body: str, separator: str, above: int) -> Any:
     for k, cells in enumerate(csv.reader(io.StringIO(body), delimiter=separator)):
         if not cells or cells[0].lstrip().startswith("#"):
             continue
-        try:
-            rows.append([float(cell) if cell.strip() else math.nan for cell in cells])
-        except ValueError:
-            word = next(c for c in cells if c.strip() and not _is_number(c))
-            raise CtrlidError(f"{path} is not a table of numbers: {word.strip()!r} stands in line "
-                              f"{above + k + 1}. Remove it, or leave the cell blank and give "
-                              "gaps='mask'") from None  # fmt: skip
+        numbers = []
+        for cell in cells:
+            try:
+                numbers.append(float(cell) if cell.strip() else math.nan)
+            except ValueError:
+                raise CtrlidError(
+                    f"{path} is not a table of numbers: {cell.strip()!r} stands in line "
+                    f"{above + k + 1}. Remove it, or leave the cell blank and give gaps='mask'"
+                ) from None
+        rows.append(numbers)
         if len(cells) != len(rows[0]):
             raise CtrlidError(f"{path} is not a table of numbers: line {above + k + 1} has "
                               f"{len(cells)} cells, the lines above it {len(rows[0])}")  # fmt: skip

@@ -40,11 +40,10 @@ class Path:
         Those have shape (n, free); the first memory is held.
         """
         memories = self.memories(first, u, p)[:-1]
-        applied, seen, moved = self.slopes(memories[None, :], u[None, :], p)
-        free = seen.shape[2] - 1
-        still = [np.repeat(v, len(u), axis=0) if len(v) < len(u) else v for v in (seen, moved)]
-        by_memory = _carried(still[1][:, 0, 0], still[1][:, 0, 1:], np.zeros(free))
-        return applied[:, 0, 0], still[0][:, 0, :1] * by_memory + still[0][:, 0, 1:]
+        applied, *slopes = self.slopes(memories[None, :], u[None, :], p)
+        seen, moved = (np.broadcast_to(v, (len(u), *v.shape[1:]))[:, 0, :] for v in slopes)
+        by_memory = _carried(moved[:, 0], moved[:, 1:])
+        return applied[:, 0, 0], seen[:, :1] * by_memory + seen[:, 1:]
 
 
 @functools.lru_cache(maxsize=64)
@@ -60,12 +59,10 @@ def path_of(plan: Plan) -> Path:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _carried(gain: Any, push: Any, first: Any) -> Any:  # pragma: no cover - compiled
-    """Return what obeys ``s[k + 1] = gain[k] s[k] + push[k]``, from the first on."""
-    out = np.empty(push.shape)
-    now = first.copy()
-    for k in range(len(push)):
-        for j in range(len(now)):
-            out[k, j] = now[j]
-            now[j] = gain[k] * now[j] + push[k, j]
+def _carried(gain: Any, push: Any) -> Any:  # pragma: no cover - compiled
+    """Return what obeys ``s[k + 1] = gain[k] s[k] + push[k]`` and begins at zero."""
+    out = np.zeros(push.shape)
+    for k in range(len(push) - 1):
+        for j in range(push.shape[1]):
+            out[k + 1, j] = gain[k] * out[k, j] + push[k, j]
     return out

@@ -255,6 +255,9 @@ def test_blank_cells_are_refused_with_what_to_do(tmp_path):
     path.write_text(BLANKS.replace("5,nan", "5,off"))
     with pytest.raises(CtrlidError, match="'off' stands in line 4"):
         Record.from_csv(path, gaps="mask")
+    path.write_text(BLANKS.replace("5,nan", '5,"1,5"'))
+    with pytest.raises(CtrlidError, match="'1,5' stands in line 4"):
+        Record.from_csv(path, gaps="mask")
     path.write_text(BLANKS + "0.05,1\n,1,2\n")
     with pytest.raises(CtrlidError, match="line 7 has 2 cells, the lines above it 3"):
         Record.from_csv(path, gaps="mask")

@@ -183,6 +183,12 @@ def test_one_of_many_tests_may_look_bad(found):
     assert "NOT NOISE ALONE" in text(replace(found["unknown"], tests={**tests, "whiteness": 1e-6}))
 
 
+def test_an_alarm_of_many_effects_is_told(found):
+    partly = found["partly explained"]
+    many = replace(partly, findings=partly.findings * 4, tests={"whiteness": 1.5e-3, "size": 0.5})
+    assert "NOT NOISE ALONE, by 1 of 2 tests: whiteness (p = 0.0015)" in text(many)
+
+
 def test_the_more_effects_the_sooner_an_alarm():
     assert alarm_level(0) == alarm_level(1) == ALPHA
     assert alarm_level(3) == pytest.approx(3 * ALPHA)

@@ -101,21 +101,18 @@ def _clearest(able: Sequence[tuple[float, str, Array]]) -> tuple[float, str, Arr
 
 
 def _survives(simulator: Simulator, r: Array, record: Record) -> bool:
-    """Whether a loop follows a reference, also one that is somewhat larger.
+    """Whether a loop follows a reference somewhat larger than this one.
 
     Behind limits of the input, a loop that has lost its plant may yet stay bounded.
     """
     middle = float(np.mean(r))
     reach = FOLLOWS * max(float(np.ptp(r)), float(np.ptp(record.y[record.valid])))
-    for size in (1.0, SAFE):
-        bold = middle + size * (r - middle)
-        try:
-            y = simulator.run(simulator.start(None), bold, np.zeros(len(r)))[0]
-        except CtrlidError:
-            return False
-        if np.ptp(y) > size * reach:
-            return False
-    return True
+    bold = middle + SAFE * (r - middle)
+    try:
+        y = simulator.run(simulator.start(None), bold, np.zeros(len(r)))[0]
+    except CtrlidError:
+        return False
+    return bool(np.ptp(y) <= SAFE * reach)
 
 
 def _references(record: Record) -> list[tuple[str, Array]]:
@@ -165,7 +162,10 @@ def _distance(
     """Return the least distance of a finding from its rivals, per sample."""
     if not _survives(simulator, r, record):
         return None
-    y, u = simulator.run(simulator.start(None), r, np.zeros(len(r)))
+    try:
+        y, u = simulator.run(simulator.start(None), r, np.zeros(len(r)))
+    except CtrlidError:
+        return None
     made = Record(u=u, y=y, r=r, dt=record.dt, hold=record.hold)
     sizes = [d for t in others if (d := _unlike(t, best, made)) is not None]
     return min(sizes) / len(r) if sizes else None

@@ -234,7 +234,7 @@ def remains(found: Diagnosis) -> str:
         if p < TELLING:
             doubt += f", among so many {chance(together)}"
         return f"what remains: noise, by {count} tests, the most doubtful of which is {doubt}"
-    failed = sorted((p, name) for name, p in found.tests.items() if p < TELLING)
+    failed = sorted((v, k) for k, v in found.tests.items() if v < TELLING) or [(p, name)]
     names = [name for _, name in failed[:LISTED]]
     if len(failed) > LISTED:
         names[-1] = f"{len(failed) - LISTED + 1} others"
