@@ -195,8 +195,7 @@ def _bridged(
     table: Any, places: Mapping[str, int], valid: Any, gaps: str, path: Path
 ) -> tuple[Any, Any]:
     """Return table and validity with the last values where numbers are missing."""
-    columns = list(places.values())
-    missing = np.isnan(table[:, columns])
+    missing = np.isnan(table[:, list(places.values())])
     rows = np.flatnonzero(missing.any(axis=1) & valid)
     if not missing.any():
         return table, valid
@@ -209,10 +208,10 @@ def _bridged(
             "and mark them as not valid"
         )
     table = table.copy()
-    for column, lacks in zip(columns, missing.T, strict=True):
+    for (name, column), lacks in zip(places.items(), missing.T, strict=True):
         known = np.flatnonzero(~lacks)
         if not known.size:
-            raise CtrlidError(f"{path} has no number at all in one of its columns; it is needed")
+            raise CtrlidError(f"{path} has no number at all for {name}, which is needed")
         last = np.maximum.accumulate(np.where(lacks, known[0], np.arange(len(table))))
         table[:, column] = table[last, column]
     return table, valid & ~missing.any(axis=1)

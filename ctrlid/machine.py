@@ -16,7 +16,7 @@ from .errors import CtrlidError
 from .integration import Scheme, known_lags, whole_delay
 from .linearization import state_matrices
 from .loop import Loop
-from .maps import Plan, maps_of, moving_maps_of
+from .maps import Plan, maps_of
 from .onset import Onset, delay, shifted
 from .plays import path_of
 from .tracks import Track, state_at_rest
@@ -139,20 +139,18 @@ class Machine:
         w = self._inputs(track, applied)
         spread = at.spread[:, : self.n].T
         given = (at.filtered.T, w, p, spread, np.zeros(self.channels))
+        step, a, b, dp, *moved = self._period(self.maps.stages, *given)
         # How the input moves the state matters only where the input is not what was measured.
         du = np.zeros((len(u), self.size))
+        rows = np.flatnonzero(doubt)
         if slopes is not None:
-            step, a, b, dp, dw = self._period(moving_maps_of(self.plan), *given)
-            dw = _full(dw, len(u))
+            dw = _full(moved[0], len(u))
             du = dw.sum(axis=2)
             dp = _full(dp, len(u)).copy()
             for k in (-1, 0, 1):
                 dp += dw[:, :, k + 1, None] * shifted(slopes, self.late - k)[:, None, :]
-        else:
-            step, a, b, dp = self._period(self.maps.stages, *given)
-            rows = np.flatnonzero(doubt)
-            if len(rows):
-                du[rows] = self._moved(rows, given, 1e-3 * float(np.std(u[track.valid])))
+        elif len(rows):
+            du[rows] = self._moved(rows, given, 1e-3 * float(np.std(u[track.valid])))
         start, wide = self.onset.start(track, p)
         height, c, hp = self.maps.sensor(at.predicted.T, w, p, spread)
         return Linearized(
@@ -193,11 +191,12 @@ class Machine:
         still, quiet = casadi.SX.zeros(self.n), casadi.SX.zeros(self.channels)
         y, c, hp = self.maps.sensor_function(x, w, values, still)
         seen = casadi.mtimes(c, s) + casadi.horzcat(hp, casadi.SX.zeros(1, n))
-        stage = [x, casadi.SX.eye(n), casadi.SX(n, self.channels), casadi.SX(n, p)]
+        widths = [self.channels, p] + ([] if self.e.play is None else [3])
+        stage = [x, casadi.SX.eye(n), *(casadi.SX(n, width) for width in widths)]
         carried = len(stage) if self.maps.carries else 1
         for function, part in itertools.product(self.maps.functions, range(self.maps.parts)):
             stage = function.call([*stage[:carried], w, values, still, quiet, part])
-        after, a, _, dp = stage
+        after, a, _, dp, *_ = stage
         moved = casadi.mtimes(a, s) + casadi.horzcat(dp, casadi.SX.zeros(n, n))
         return casadi.Function(
             "period", [casadi.vertcat(x, casadi.vec(s)), w, values],

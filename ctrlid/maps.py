@@ -97,20 +97,14 @@ class Maps:
 def maps_of(plan: Plan) -> Maps:
     """Return the maps, built once: that takes the time of several passes."""
     x, ends, given, by, parts = _period(plan)
-    functions = _chained(x, ends, parts, given, (by["force"], by["free"]))
+    # Behind a play, the input itself depends on the free parameters.
+    own = ("force", "free") if plan.equations.play is None else ("force", "free", "path")
+    functions = _chained(x, ends, parts, given, [by[key] for key in own])
     height = by["height"]
     outputs = [height, casadi.jacobian(height, x), casadi.jacobian(height, by["free"])]
     sensor = casadi.Function("sensor", [x, *given[:3]], outputs, {"cse": True})
     stages = tuple(Vectorized(f) for f in functions)
     return Maps(functions, stages, parts, sensor, Vectorized(sensor))
-
-
-@functools.lru_cache(maxsize=BUILT)
-def moving_maps_of(plan: Plan) -> tuple[Vectorized, ...]:
-    """Return the stages that also tell how the state depends on the input, built once."""
-    x, ends, given, by, parts = _period(plan)
-    chained = _chained(x, ends, parts, given, (by["force"], by["free"], by["path"]))
-    return tuple(Vectorized(f) for f in chained)
 
 
 def _period(plan: Plan) -> tuple[Any, list[Any], list[Any], dict[str, Any], int]:
