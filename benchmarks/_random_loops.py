@@ -17,7 +17,7 @@ from scipy.signal import lfilter
 
 import ctrlid as cid
 from ctrlid import effects
-from ctrlid.simulation import Simulator
+from ctrlid.loop.simulation import Simulator
 
 SAMPLES = 20_000
 OFF = 0.1  # a free parameter is believed at most this far off

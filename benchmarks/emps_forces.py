@@ -15,7 +15,7 @@ from ctrlid import effects
 from ctrlid.diagnosis.fitted import base_model
 from ctrlid.diagnosis.fresh import fresh_data
 from ctrlid.diagnosis.gap import FEW_STEPS, ROUGH, drive
-from ctrlid.simulation import Simulator
+from ctrlid.loop.simulation import Simulator
 
 GAIN = 35.15065  # N/V, of the EMPS drive
 BAND = 50.0  # Hz, in which its forces are compared

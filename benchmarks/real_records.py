@@ -15,7 +15,7 @@ import numpy as np
 
 import ctrlid as cid
 from ctrlid import effects
-from ctrlid.sampling import averaged
+from ctrlid.validation.sampling_sweep import averaged
 
 G = 9.81  # m/s^2
 LEVELS = (0.008, 0.010, 0.012, 0.014)  # of the swings of the INTECO ball [m]

@@ -30,7 +30,7 @@ from scipy.stats import beta
 from study_iv import design, information_bound, plant
 
 import ctrlid as cid
-from ctrlid.simulation import Simulator
+from ctrlid.loop.simulation import Simulator
 
 Z95 = 1.959964
 FREE = {

@@ -36,10 +36,10 @@ import numpy as np
 from scipy.signal import lfilter
 
 import ctrlid as cid
-from ctrlid.likelihood import pseudo_inverse
-from ctrlid.loop_fit import choose_noise, make_problem, start_values
-from ctrlid.maximum import begin, information
-from ctrlid.model import Estimate
+from ctrlid.estimation.identified_model import Estimate
+from ctrlid.estimation.likelihood.likelihood import pseudo_inverse
+from ctrlid.estimation.likelihood.maximization import begin, information
+from ctrlid.estimation.likelihood.physics_fit import choose_noise, make_problem, start_values
 
 STEPS = (0.5, 0.2, 0.1, 0.03, 0.01, 0.005)
 NOISES = (0.01, 0.05, 0.2)

@@ -1,26 +1,15 @@
 """Closed-loop identification and diagnosis of unstable plants, on top of python-control."""
 
-from . import datasets, effects, plants, plot
-from .arx import fit_arx
-from .audit import Audit, AuditFinding, audit
-from .band import ResponseBand, response_band
-from .comparison import Comparison, Curve
-from .constraints import (
-    Bounds,
-    Equal,
-    Fixed,
-    Integrator,
-    Linear,
-    Nonlinear,
-    PoleAt,
-    ReciprocalPoles,
-    StaticGain,
-    SymmetricPoles,
-)
-from .continuous import fit_continuous
-from .controller_redesign import Performance, Redesign, redesign
-from .controllers import PID
-from .data import Record
+import sys
+
+from . import effects
+from ._base.errors import CtrlidError, CtrlidWarning
+from .data import datasets
+from .data.record import Record
+from .data.references import multisine, prbs, random_binary, steps
+from .design.lead import design_lead
+from .design.margins import Margins, loop_margins, nu_gap, robust_margin
+from .design.redesigning import Performance, Redesign, redesign
 from .diagnosis import (
     Calibrated,
     Candidate,
@@ -32,27 +21,43 @@ from .diagnosis import (
     diagnose,
     load_diagnosis,
 )
-from .each import FitSeries, PoleTrend, fit_each
-from .errors import CtrlidError, CtrlidWarning
-from .feedback import FeedbackCheck, check_feedback
-from .iv import fit_iv
-from .lead import design_lead
-from .linearization import OperatingPoint, linearize, operating_point
-from .loop import Loop
-from .loop_estimate import LoopEstimate, LoopFit
-from .loop_fit import fit_loop
-from .margins import Margins, loop_margins, nu_gap, robust_margin
-from .model import Estimate, IdentifiedModel
-from .predictor import Prediction, predict
-from .replay import replay_controller
-from .report import Section, write_report
-from .residuals import Correlation
-from .sampling import sweep_sampling_period
-from .sampling_table import SamplingRow, SamplingSweep
-from .signals import multisine, prbs, random_binary, steps
-from .simulation import simulate
-from .structure import OrderChoice, OrderRow, select_order
-from .validation import compare
+from .estimation.confidence_band import ResponseBand, response_band
+from .estimation.constraints import (
+    Bounds,
+    Equal,
+    Fixed,
+    Integrator,
+    Linear,
+    Nonlinear,
+    PoleAt,
+    ReciprocalPoles,
+    StaticGain,
+    SymmetricPoles,
+)
+from .estimation.identified_model import Estimate, IdentifiedModel
+from .estimation.likelihood.physics_estimate import LoopEstimate, LoopFit
+from .estimation.likelihood.physics_fit import fit_loop
+from .estimation.likelihood.prediction import Prediction, predict
+from .estimation.linear.arx import fit_arx
+from .estimation.linear.continuous import fit_continuous
+from .estimation.linear.iv import fit_iv
+from .estimation.series import FitSeries, PoleTrend, fit_each
+from .loop.controller_replay import replay_controller
+from .loop.controllers import PID
+from .loop.loop import Loop
+from .loop.simulation import simulate
+from .physics import plants
+from .physics.linearization import OperatingPoint, linearize, operating_point
+from .reporting import plot
+from .reporting.html_page import Section, write_report
+from .validation.comparing import compare
+from .validation.comparison import Comparison, Curve
+from .validation.feedback_check import FeedbackCheck, check_feedback
+from .validation.order_selection import OrderChoice, OrderRow, select_order
+from .validation.record_audit import Audit, AuditFinding, audit
+from .validation.residual_tests import Correlation
+from .validation.sampling_sweep import sweep_sampling_period
+from .validation.sampling_table import SamplingRow, SamplingSweep
 
 __version__ = "0.1.0.dev0"
 
@@ -136,3 +141,12 @@ __all__ = [
     "sweep_sampling_period",
     "write_report",
 ]
+
+# The rooms in which these three live are nobody's business: ``import ctrlid.plot`` and
+# ``from ctrlid.plants import maglev`` find them where the names above do.
+sys.modules |= {f"{__name__}.{m.__name__.rpartition('.')[2]}": m for m in (datasets, plants, plot)}
+
+
+def __dir__() -> list[str]:
+    """Return the public names, without the rooms behind them."""
+    return __all__

@@ -13,15 +13,16 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from . import __version__, plot
-from ._command import add_parser, new_folder
-from ._tables import Table
+from . import __version__
+from ._base.errors import CtrlidError
 from .diagnosis import Diagnosis
-from .errors import CtrlidError
-from .report import Section, write_report
-from .second_act import TITLES as SECOND
-from .second_act import second_act
-from .story import TITLES, story
+from .reporting import plot
+from .reporting.cli.demo_diagnosis import TITLES as SECOND
+from .reporting.cli.demo_diagnosis import second_act
+from .reporting.cli.demo_identification import TITLES, story
+from .reporting.cli.diagnose_command import add_parser, new_folder
+from .reporting.html_page import Section, write_report
+from .reporting.tables import Table
 
 FOLDER = "ctrlid-report"
 FEWEST = 500  # samples with which the story can be told

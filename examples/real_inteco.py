@@ -19,7 +19,7 @@ import numpy as np
 from scipy import optimize
 
 import ctrlid as cid
-from ctrlid.sampling import averaged
+from ctrlid.validation.sampling_sweep import averaged
 
 # %%
 # What to use of the record

@@ -15,7 +15,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import ctrlid as cid
-from ctrlid.sampling import averaged
+from ctrlid.validation.sampling_sweep import averaged
 
 # %%
 # The mains in the sensor

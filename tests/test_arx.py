@@ -11,8 +11,9 @@ import qpsolvers
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ctrlid.arx import fit_arx
-from ctrlid.constraints import (
+from ctrlid._base.errors import CtrlidError
+from ctrlid.data.record import Record
+from ctrlid.estimation.constraints import (
     AbstractConstraint,
     Bounds,
     Branch,
@@ -27,8 +28,7 @@ from ctrlid.constraints import (
     SymmetricPoles,
     equals,
 )
-from ctrlid.data import Record
-from ctrlid.errors import CtrlidError
+from ctrlid.estimation.linear.arx import fit_arx
 
 DT = 1e-3
 

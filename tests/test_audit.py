@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 import ctrlid as cid
-from ctrlid import CtrlidError, defects
+from ctrlid import CtrlidError
+from ctrlid.validation import signal_defects as defects
 
 
 def reference(rng, n, amplitude, around):

@@ -7,7 +7,7 @@ from scipy import stats
 
 import ctrlid as cid
 from ctrlid import plot
-from ctrlid.model import Estimate, IdentifiedModel, Structure
+from ctrlid.estimation.identified_model import Estimate, IdentifiedModel, Structure
 
 RARE = 1e-5  # chance at which a test of chance may fail a right program
 PLANT = ct.tf([-6.5], [1, 0, -1600])

@@ -6,10 +6,22 @@ import numpy as np
 import pytest
 
 import ctrlid as cid
-from ctrlid.cases import Infeasible, cases, eliminate, explain_conflict, possible
-from ctrlid.constraints import CONSTRAINTS, AbstractConstraint, Branch, Row, check_constraints
-from ctrlid.errors import CtrlidError
-from ctrlid.model import Structure
+from ctrlid._base.errors import CtrlidError
+from ctrlid.estimation.constraints import (
+    CONSTRAINTS,
+    AbstractConstraint,
+    Branch,
+    Row,
+    check_constraints,
+)
+from ctrlid.estimation.constraints.branches import (
+    Infeasible,
+    cases,
+    eliminate,
+    explain_conflict,
+    possible,
+)
+from ctrlid.estimation.identified_model import Structure
 
 Z2, Z3 = Structure(2, 2), Structure(3, 2)
 S2, S3 = Structure(2, 1, domain="s"), Structure(3, 1, domain="s")

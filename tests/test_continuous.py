@@ -14,7 +14,13 @@ from scipy import linalg, signal
 
 import ctrlid as cid
 from ctrlid import CtrlidError, plot
-from ctrlid.innovations import Circuit, _exponential, flow, prediction_errors, realize
+from ctrlid.estimation.linear.sampled_motion import (
+    Circuit,
+    _exponential,
+    flow,
+    prediction_errors,
+    realize,
+)
 
 ALPHA, BETA = 1635.0, 6.54
 PLANT = ct.tf([-BETA], [1, 0, -ALPHA], inputs=["V"], outputs=["x"], name="maglev")

@@ -13,7 +13,7 @@ from scipy import signal
 
 import ctrlid as cid
 from ctrlid import PID, CtrlidError
-from ctrlid.controllers import control_law
+from ctrlid.loop.controllers import control_law
 
 AT = cid.OperatingPoint((0.0,), 2.0, 1.0)
 DT = 0.5

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 import ctrlid as cid
-from ctrlid._text import split_unit, with_unit
-from ctrlid.records import as_records
+from ctrlid._base.text import split_unit, with_unit
+from ctrlid.data.several_records import as_records
 
 N = 40
 

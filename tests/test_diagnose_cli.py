@@ -10,8 +10,9 @@ import pytest
 
 import ctrlid as cid
 from ctrlid import __main__ as command
-from ctrlid import _command, _spoken
 from ctrlid import effects as E
+from ctrlid.reporting.cli import arguments as _spoken
+from ctrlid.reporting.cli import diagnose_command as _command
 
 DT = 0.01
 SERVO = ("--model", "servo", "--param", "m=1", "c=2", "k=3")

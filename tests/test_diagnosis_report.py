@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import ctrlid as cid
-from ctrlid import _pictures, plot
 from ctrlid import effects as E
+from ctrlid import plot
 from ctrlid.diagnosis import gap as gap_of
 from ctrlid.diagnosis import words
 from ctrlid.diagnosis.closing import stands_out
@@ -26,7 +26,8 @@ from ctrlid.diagnosis.result import (
     Place,
 )
 from ctrlid.diagnosis.saving import SavedLoop, load_diagnosis
-from ctrlid.simulation import Simulator
+from ctrlid.loop.simulation import Simulator
+from ctrlid.reporting import pictures as _pictures
 
 DT, N = 0.002, 3000
 VERDICTS = ("nothing missing", "explained", "partly explained", "unknown")

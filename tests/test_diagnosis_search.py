@@ -30,13 +30,13 @@ from ctrlid.diagnosis.search import _foreseen, _stands_in, _there, search, witho
 from ctrlid.diagnosis.sentences import conclusion
 from ctrlid.diagnosis.settling import _close, cut, fused
 from ctrlid.diagnosis.trial import contains
-from ctrlid.filtering import first_guess
-from ctrlid.likelihood import relinearized
-from ctrlid.loop_fit import choose_noise, make_problem, start_values
-from ctrlid.machine import machine_for
-from ctrlid.maximum import begin, climb
-from ctrlid.simulation import Simulator
-from ctrlid.tracks import make_track
+from ctrlid.estimation.likelihood.filter_data import make_track
+from ctrlid.estimation.likelihood.kalman_filter import first_guess
+from ctrlid.estimation.likelihood.likelihood import relinearized
+from ctrlid.estimation.likelihood.maximization import begin, climb
+from ctrlid.estimation.likelihood.physics_fit import choose_noise, make_problem, start_values
+from ctrlid.estimation.likelihood.sampled_plant import machine_for
+from ctrlid.loop.simulation import Simulator
 
 
 def levitation():

@@ -13,8 +13,8 @@ from scipy.signal import lfilter
 
 import ctrlid as cid
 from ctrlid import plot
-from ctrlid.model import Structure
-from ctrlid.regression import reduce_record
+from ctrlid.estimation.identified_model import Structure
+from ctrlid.estimation.linear.regression import reduce_record
 
 KNOWN = (cid.ReciprocalPoles(), cid.Equal("b1", "b2"))
 GAPS = (0.008, 0.010, 0.012, 0.015)

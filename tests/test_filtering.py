@@ -13,13 +13,13 @@ from scipy import integrate, linalg, signal
 
 import ctrlid as cid
 from ctrlid import effects as E
-from ctrlid.filtering import Noise, first_guess, settle
-from ctrlid.integration import advance
-from ctrlid.kalman import filter_pass
-from ctrlid.loop_fit import make_problem
-from ctrlid.machine import Machine, Trajectory
-from ctrlid.maximum import begin
-from ctrlid.tracks import make_track, state_at_rest
+from ctrlid.estimation.likelihood.filter_data import make_track, state_at_rest
+from ctrlid.estimation.likelihood.kalman_filter import Noise, first_guess, settle
+from ctrlid.estimation.likelihood.kalman_recursion import filter_pass
+from ctrlid.estimation.likelihood.maximization import begin
+from ctrlid.estimation.likelihood.physics_fit import make_problem
+from ctrlid.estimation.likelihood.sampled_plant import Machine, Trajectory
+from ctrlid.physics.integration import advance
 
 # --- one pass
 

@@ -13,7 +13,7 @@ from ctrlid.diagnosis.following import following
 from ctrlid.diagnosis.omnibus import omnibus
 from ctrlid.diagnosis.replica import artefact, replica
 from ctrlid.diagnosis.rounds import one_round
-from ctrlid.stepping import comes_to_rest
+from ctrlid.loop.period_map import comes_to_rest
 
 DT = 0.001
 

@@ -13,12 +13,12 @@ import pytest
 from scipy.signal import lfilter
 
 import ctrlid as cid
-from ctrlid.errors import CtrlidError
-from ctrlid.feedback_law import found_law, given_law, loop_signals
-from ctrlid.instruments import cut, two_stage
-from ctrlid.iv import fit_iv
-from ctrlid.model import Structure
-from ctrlid.prefilter import autoregression, stable_factor
+from ctrlid._base.errors import CtrlidError
+from ctrlid.estimation.identified_model import Structure
+from ctrlid.estimation.linear.controller_model import found_law, given_law, loop_signals
+from ctrlid.estimation.linear.instruments import cut, two_stage
+from ctrlid.estimation.linear.iv import fit_iv
+from ctrlid.estimation.linear.prefilter import autoregression, stable_factor
 
 KNOWN = [cid.ReciprocalPoles(), cid.Equal("b1", "b2")]
 
@@ -248,7 +248,7 @@ def test_two_signals_tell_more_than_one():
 
 def test_what_does_not_settle_warns_and_says_so(monkeypatch):
     _, record, _ = levitation(0.1, noise=0.2)
-    monkeypatch.setattr("ctrlid.iv._MOST", 1)
+    monkeypatch.setattr("ctrlid.estimation.linear.iv._MOST", 1)
     with pytest.warns(cid.CtrlidWarning, match="DID NOT SETTLE"):
         model = fit_iv(record, 2, 2)
     assert "DID NOT SETTLE" in str(model)

@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from ctrlid._jobs import processors, side_by_side
+from ctrlid._base.jobs import processors, side_by_side
 
 
 def test_results_are_in_the_order_of_the_items():

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from ctrlid import maximum
+from ctrlid.estimation.likelihood import maximization as maximum
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ from scipy import special
 
 import ctrlid as cid
 from ctrlid import effects as E
-from ctrlid.physics import trace
+from ctrlid.physics.trace import trace
 
 
 def first(t, x, u, params):

@@ -15,10 +15,10 @@ from scipy import stats
 import ctrlid as cid
 from ctrlid import CtrlidError
 from ctrlid import effects as E
-from ctrlid.likelihood import evaluate, pseudo_inverse
-from ctrlid.loop_fit import make_problem, start_values
-from ctrlid.maximum import begin, climb, information
-from ctrlid.simulation import Simulator
+from ctrlid.estimation.likelihood.likelihood import evaluate, pseudo_inverse
+from ctrlid.estimation.likelihood.maximization import begin, climb, information
+from ctrlid.estimation.likelihood.physics_fit import make_problem, start_values
+from ctrlid.loop.simulation import Simulator
 
 RARE = 1e-5  # chance at which a test of chance may fail a right program
 
@@ -259,7 +259,7 @@ def test_the_start_does_not_matter():
 
 def point(loop, record, **noise):
     """The likelihood at its maximum, as `fit_loop` finds it."""
-    from ctrlid.maximum import begin, climb
+    from ctrlid.estimation.likelihood.maximization import begin, climb
 
     problem = make_problem(loop, loop.free, [record])
     return climb(begin(problem, start_values(loop, loop.free), None))

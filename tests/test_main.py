@@ -11,8 +11,8 @@ import pytest
 
 import ctrlid as cid
 from ctrlid import __main__ as command
-from ctrlid import second_act as act
-from ctrlid import story as told
+from ctrlid.reporting.cli import demo_diagnosis as act
+from ctrlid.reporting.cli import demo_identification as told
 
 
 @pytest.fixture

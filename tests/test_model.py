@@ -10,9 +10,9 @@ import control
 import numpy as np
 import pytest
 
-from ctrlid import _text
-from ctrlid.errors import CtrlidError
-from ctrlid.model import ActiveBound, Estimate, IdentifiedModel, Structure
+from ctrlid._base import text as _text
+from ctrlid._base.errors import CtrlidError
+from ctrlid.estimation.identified_model import ActiveBound, Estimate, IdentifiedModel, Structure
 
 
 def estimate(values=(-1.9, 0.85, 0.2, 0.1), covariance=None, **changes):

@@ -6,7 +6,7 @@ import pytest
 from scipy import signal
 
 import ctrlid as cid
-from ctrlid.noise_model import noise_polynomial, whiten
+from ctrlid.validation.noise_model import noise_polynomial, whiten
 
 
 @pytest.mark.parametrize("colour", [[1.0, 0.0, 0.0], [1.0, -1.4, 0.5], [1.0, 0.6, 0.1]])

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 import ctrlid as cid
-from ctrlid._tables import Table
-from ctrlid._text import Printed, html_lines
+from ctrlid._base.text import Printed, html_lines
+from ctrlid.reporting.tables import Table
 
 ROOT = Path(__file__).resolve().parents[1]
 NOTEBOOK = ROOT / "examples" / "ten_lines.ipynb"

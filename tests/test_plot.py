@@ -9,7 +9,8 @@ import pytest
 from matplotlib.figure import Figure
 
 import ctrlid as cid
-from ctrlid import _pictures, plot
+from ctrlid import plot
+from ctrlid.reporting import pictures as _pictures
 
 DT = 0.01
 

@@ -10,8 +10,8 @@ from scipy import linalg
 
 import ctrlid as cid
 from ctrlid import CtrlidError
-from ctrlid.predictor import predict_ahead
-from ctrlid.residuals import autocorrelation, cross_correlation
+from ctrlid.estimation.likelihood.prediction import predict_ahead
+from ctrlid.validation.residual_tests import autocorrelation, cross_correlation
 
 SENSOR, FORCE = 2e-6, 0.02
 

@@ -9,13 +9,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import ctrlid as cid
-from ctrlid import qp
-from ctrlid.cases import Infeasible, Rows, cases
-from ctrlid.constraints import Row
-from ctrlid.errors import CtrlidError
-from ctrlid.model import Structure
-from ctrlid.qp import Cost, NotExcited, solve, spread
-from ctrlid.search import minimize
+from ctrlid._base.errors import CtrlidError
+from ctrlid.estimation.constraints import Row
+from ctrlid.estimation.constraints import quadratic_program as qp
+from ctrlid.estimation.constraints.branches import Infeasible, Rows, cases
+from ctrlid.estimation.constraints.constrained_minimum import minimize
+from ctrlid.estimation.constraints.quadratic_program import Cost, NotExcited, solve, spread
+from ctrlid.estimation.identified_model import Structure
 
 Z2 = Structure(2, 2)
 

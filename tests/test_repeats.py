@@ -10,9 +10,9 @@ from ctrlid import effects as E
 from ctrlid.diagnosis.attempts import attempt_at, refit
 from ctrlid.diagnosis.fitted import Model, base_model, weighted_by_repeats
 from ctrlid.diagnosis.fresh import Fresh, fresh_data
-from ctrlid.likelihood import evaluate
-from ctrlid.maximum import climb
-from ctrlid.noise_search import known_from_repeats
+from ctrlid.estimation.likelihood.likelihood import evaluate
+from ctrlid.estimation.likelihood.maximization import climb
+from ctrlid.estimation.likelihood.noise_fit import known_from_repeats
 
 PERIOD, TIMES = 800, 5
 SENSOR, FORCE = 1e-4, 0.3

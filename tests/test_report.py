@@ -11,7 +11,7 @@ import pytest
 
 import ctrlid as cid
 from ctrlid import plot
-from ctrlid._tables import Table
+from ctrlid.reporting.tables import Table
 
 VOID = {"meta", "img", "br", "hr", "link", "input"}
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from ctrlid.residuals import autocorrelation, cross_correlation, explained_share
+from ctrlid.validation.residual_tests import autocorrelation, cross_correlation, explained_share
 
 N, DRAWS = 1000, 1000
 ALL = np.ones(N, dtype=bool)

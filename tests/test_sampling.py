@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import ctrlid as cid
-from ctrlid.sampling import averaged
+from ctrlid.validation.sampling_sweep import averaged
 
 POLE = 40.435  # rad/s
 

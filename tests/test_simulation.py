@@ -13,7 +13,7 @@ from scipy.integrate import solve_ivp
 
 import ctrlid as cid
 from ctrlid import CtrlidError
-from ctrlid.stepping import growth_rate
+from ctrlid.loop.period_map import growth_rate
 
 RNG = np.random.default_rng(5)
 CASES = [

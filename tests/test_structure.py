@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import ctrlid as cid
-from ctrlid.structure import _reduce, _regress
+from ctrlid.validation.order_selection import _reduce, _regress
 
 
 def random_record(rng, n=6000):

@@ -13,7 +13,7 @@ import pytest
 from numpy import clip
 
 from ctrlid import CtrlidError
-from ctrlid.physics import trace
+from ctrlid.physics.trace import trace
 
 BUFFER = np.zeros(2)
 CALLS = {"n": 0}

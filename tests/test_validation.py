@@ -12,10 +12,10 @@ import pytest
 
 import ctrlid as cid
 from ctrlid import CtrlidError
-from ctrlid.comparison import Comparison, Curve
 from ctrlid.diagnosis.gap import output, way_to_compare, whole
-from ctrlid.predictor import predict_ahead, spread_ahead
-from ctrlid.residuals import Correlation
+from ctrlid.estimation.likelihood.prediction import predict_ahead, spread_ahead
+from ctrlid.validation.comparison import Comparison, Curve
+from ctrlid.validation.residual_tests import Correlation
 
 PLANT = cid.plants.maglev(m=0.0213, K=3.34e-6)
 AT = cid.operating_point(PLANT, output=0.012)
@@ -379,7 +379,7 @@ def test_the_table_reads_as_it_should():
      (0.99999, "100 %"), (1.0, "100 %")],
 )  # fmt: skip
 def test_percentages(share, words):
-    from ctrlid.comparison import _percent
+    from ctrlid.validation.comparison import _percent
 
     assert _percent(share) == words
 

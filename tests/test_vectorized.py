@@ -9,7 +9,7 @@ import pytest
 
 import ctrlid as cid
 from ctrlid import CtrlidError
-from ctrlid.vectorized import BINARY, BLOCK, BLOCKS, UNARY, Vectorized, through
+from ctrlid.physics.block_evaluation import BINARY, BLOCK, BLOCKS, UNARY, Vectorized, through
 
 EVERYWHERE = np.array([-np.inf, -1e200, -3.0, -1.0, -0.5, -0.0, 0.0, 1e-300, 0.5, 1.0, 2.0, 2.5,
                        1e200, np.inf, np.nan])  # fmt: skip

@@ -5,11 +5,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..data import Record
+from .._base.errors import CtrlidError
+from ..data.record import Record
 from ..effects import AbstractEffect, equivalents
-from ..errors import CtrlidError
-from ..loop import Loop
-from ..loop_fit import summary
+from ..estimation.likelihood.physics_fit import summary
+from ..loop.loop import Loop
 from .attempts import attempt_at, refit
 from .closing import stands_out
 from .decide import GATE, doubt_of_all

@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from .._base.errors import CtrlidError
 from ..effects import AbstractEffect
-from ..errors import CtrlidError
-from ..filtering import Noise
-from ..likelihood import Fit, evaluate
-from ..maximum import climb, promised
+from ..estimation.likelihood.kalman_filter import Noise
+from ..estimation.likelihood.likelihood import Fit, evaluate
+from ..estimation.likelihood.maximization import climb, promised
 from .carrying import carried_over
 from .fitted import Model, light, simulable, spared
 from .instants import timed

@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..filtering import first_guess
-from ..likelihood import Fit, evaluate
-from ..loop import Loop
-from ..loop_fit import bounds_of, start_values
-from ..machine import Machine, Trajectory
-from ..tracks import retracked
+from ..estimation.likelihood.filter_data import retracked
+from ..estimation.likelihood.kalman_filter import first_guess
+from ..estimation.likelihood.likelihood import Fit, evaluate
+from ..estimation.likelihood.physics_fit import bounds_of, start_values
+from ..estimation.likelihood.sampled_plant import Machine, Trajectory
+from ..loop.loop import Loop
 from .fitted import Model
 
 

@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ..likelihood import Fit
-from ..loop import Loop
+from ..estimation.likelihood.likelihood import Fit
+from ..loop.loop import Loop
 from . import gap as gaps
 from .fitted import Model
 from .fresh import Fresh

@@ -5,8 +5,8 @@ from collections.abc import Mapping
 import numpy as np
 from scipy import stats
 
-from ..equations import Array
-from ..likelihood import Fit
+from ..estimation.likelihood.likelihood import Fit
+from ..physics.equations import Array
 
 BINS = 12
 FEWEST = 40  # samples in a bin

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..effects import AbstractEffect, PositionRipple
-from ..equations import Array
+from ..physics.equations import Array
 from .fitted import log_terms
 from .trial import Trial, contains, same_kind
 

@@ -6,14 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..data import Record
-from ..equations import Array
-from ..errors import CtrlidError
-from ..likelihood import Known
-from ..loop_fit import make_problem
-from ..maximum import begin, promised
-from ..signals import random_binary
-from ..simulation import Simulator
+from .._base.errors import CtrlidError
+from ..data.record import Record
+from ..data.references import random_binary
+from ..estimation.likelihood.likelihood import Known
+from ..estimation.likelihood.maximization import begin, promised
+from ..estimation.likelihood.physics_fit import make_problem
+from ..loop.simulation import Simulator
+from ..physics.equations import Array
 from .gap import FEW_STEPS, ROUGH
 from .trial import Trial
 

@@ -7,16 +7,16 @@ from typing import Any
 
 import numpy as np
 
-from ..data import Record
-from ..equations import Array
-from ..errors import CtrlidError
-from ..filtering import Noise
-from ..likelihood import Fit, relinearized
-from ..loop import Loop
-from ..loop_fit import choose_noise, make_problem, start_values
-from ..maximum import begin, climb, retuned
-from ..noise_search import known_from_repeats
-from ..stepping import comes_to_rest
+from .._base.errors import CtrlidError
+from ..data.record import Record
+from ..estimation.likelihood.kalman_filter import Noise
+from ..estimation.likelihood.likelihood import Fit, relinearized
+from ..estimation.likelihood.maximization import begin, climb, retuned
+from ..estimation.likelihood.noise_fit import known_from_repeats
+from ..estimation.likelihood.physics_fit import choose_noise, make_problem, start_values
+from ..loop.loop import Loop
+from ..loop.period_map import comes_to_rest
+from ..physics.equations import Array
 
 QUIET = 1e-4  # of the variance of a random force, with which kinks are sharp
 AWAY = 0.3  # of a given value: a recalibration beyond is doubted

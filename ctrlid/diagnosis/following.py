@@ -6,10 +6,10 @@ from typing import Any
 import control as ct
 import numpy as np
 
-from ..data import Record
-from ..errors import CtrlidError
-from ..loop import Loop
-from ..stepping import comes_to_rest
+from .._base.errors import CtrlidError
+from ..data.record import Record
+from ..loop.loop import Loop
+from ..loop.period_map import comes_to_rest
 
 
 def following(loop: Loop, record: Record) -> Loop | None:

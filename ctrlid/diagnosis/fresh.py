@@ -6,13 +6,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..data import Record
-from ..equations import Array
-from ..errors import CtrlidError
-from ..likelihood import Fit, Known, evaluate
-from ..loop import Loop
-from ..loop_fit import make_problem, start_values
-from ..maximum import begin, climb
+from .._base.errors import CtrlidError
+from ..data.record import Record
+from ..estimation.likelihood.likelihood import Fit, Known, evaluate
+from ..estimation.likelihood.maximization import begin, climb
+from ..estimation.likelihood.physics_fit import make_problem, start_values
+from ..loop.loop import Loop
+from ..physics.equations import Array
 from . import gap as gaps
 from .fitted import Model
 

@@ -8,18 +8,18 @@ from typing import Any
 import numpy as np
 from scipy import signal
 
-from ..data import Record
-from ..equations import Array
-from ..errors import CtrlidError
-from ..likelihood import Fit
-from ..loop import Loop
-from ..predictor import predict, predict_ahead, spread_ahead
-from ..replay import replay_from_best_state
-from ..simulation import Simulator
-from ..starts import best_start
-from ..stepping import comes_to_rest
-from ..tracks import FEWEST
-from ..validation import moving_poles, time_constant
+from .._base.errors import CtrlidError
+from ..data.record import Record
+from ..estimation.likelihood.filter_data import FEWEST
+from ..estimation.likelihood.likelihood import Fit
+from ..estimation.likelihood.prediction import predict, predict_ahead, spread_ahead
+from ..loop.controller_replay import replay_from_best_state
+from ..loop.initial_state import best_start
+from ..loop.loop import Loop
+from ..loop.period_map import comes_to_rest
+from ..loop.simulation import Simulator
+from ..physics.equations import Array
+from ..validation.comparing import moving_poles, time_constant
 
 ROUGH = 1e-5  # local error of the integration, far below any gap worth a word
 FEW_STEPS = 8  # of the integration in a period; sharp friction would ask for many more

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..errors import CtrlidError
-from ..likelihood import Fit, evaluate
-from ..maximum import ELSEWHERE, climb
+from .._base.errors import CtrlidError
+from ..estimation.likelihood.likelihood import Fit, evaluate
+from ..estimation.likelihood.maximization import ELSEWHERE, climb
 
 REACH = 2.0 ** np.arange(11)  # samples to either side
 

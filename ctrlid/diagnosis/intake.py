@@ -7,13 +7,13 @@ from typing import Any
 import control as ct
 import numpy as np
 
-from ..audit import Audit, audit
-from ..data import Record
+from .._base.errors import CtrlidError
+from ..data.record import Record
 from ..effects import InputDelay, InputOffset
-from ..errors import CtrlidError
-from ..linearization import OperatingPoint
-from ..loop import Loop
-from ..model import delay_of
+from ..estimation.identified_model import delay_of
+from ..loop.loop import Loop
+from ..physics.linearization import OperatingPoint
+from ..validation.record_audit import Audit, audit
 
 HOPELESS = ("too few samples", "constant signal", "operating point")
 REPEATS = 3  # of an experiment, from which its noise is taken

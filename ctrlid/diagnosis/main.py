@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from .._jobs import check_jobs, spread
-from ..audit import Audit
-from ..data import Record
+from .._base.errors import CtrlidError
+from .._base.jobs import check_jobs, spread
+from ..data.record import Record
+from ..data.several_records import as_records
 from ..effects import CATALOGUE, AbstractEffect
-from ..errors import CtrlidError
-from ..likelihood import Fit
-from ..loop import Loop
-from ..records import as_records
+from ..estimation.likelihood.likelihood import Fit
+from ..loop.loop import Loop
+from ..validation.record_audit import Audit
 from .assembly import name_of, put_together
 from .closing import gaps_of, helps_on, wider
 from .decide import GATE

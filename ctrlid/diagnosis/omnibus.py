@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-from ..equations import Array
-from ..likelihood import Fit
-from ..residuals import remembered
+from ..estimation.likelihood.likelihood import Fit
+from ..physics.equations import Array
+from ..validation.residual_tests import remembered
 from .constancy import FEWEST, bin_edges, bin_index, constancy, line_chance
 from .result import Place
 

@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-from ..maximum import climb
+from ..estimation.likelihood.maximization import climb
 from .carrying import carried_over
 from .decide import CLOSE
 from .fitted import Model

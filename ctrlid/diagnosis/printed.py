@@ -3,7 +3,7 @@
 import math
 import textwrap
 
-from .._text import listing, number, with_error
+from .._base.text import listing, number, with_error
 from . import words
 from .result import Diagnosis, Finding, Gap
 

@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..audit import Audit
-from ..data import Record
+from ..data.record import Record
 from ..effects import AbstractEffect, Quantization, SensorSaturation
-from ..likelihood import Fit
+from ..estimation.likelihood.likelihood import Fit
+from ..validation.record_audit import Audit
 
 CLIPPED = 0.005  # share of the samples at a limit that is worth a name
 COARSE = 0.25  # share of the sensor noise's variance that comes from the steps

@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..data import Record
-from ..errors import CtrlidError
-from ..likelihood import Fit, evaluate
-from ..loop_fit import make_problem
-from ..maximum import begin, climb
-from ..simulation import Simulator
+from .._base.errors import CtrlidError
+from ..data.record import Record
+from ..estimation.likelihood.likelihood import Fit, evaluate
+from ..estimation.likelihood.maximization import begin, climb
+from ..estimation.likelihood.physics_fit import make_problem
+from ..loop.simulation import Simulator
 from .attempts import attempt_at, refit
 from .carrying import carried_over
 from .fitted import Model, simulable

@@ -5,10 +5,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from .._text import Printed
+from .._base.text import Printed
 from ..effects import AbstractEffect
-from ..equations import Array
-from ..loop import Loop
+from ..loop.loop import Loop
+from ..physics.equations import Array
 
 Verdict = Literal["nothing missing", "explained", "partly explained", "unknown"]
 COMPLETE: tuple[Verdict, ...] = ("explained", "nothing missing")

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from ..data import Record
+from .._base.errors import CtrlidError
+from ..data.record import Record
 from ..effects import AbstractEffect, SensorOffset
-from ..errors import CtrlidError
-from ..linearization import state_matrices
-from ..loop import Loop
-from ..maximum import promised
+from ..estimation.likelihood.maximization import promised
+from ..loop.loop import Loop
+from ..physics.linearization import state_matrices
 from .attempts import attempt_at, refit, under
 from .decide import GATE, HINT
 from .fitted import Model, quiet

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from .._base.errors import CtrlidError
 from ..effects import AbstractEffect
-from ..errors import CtrlidError
-from ..linearization import OperatingPoint
-from ..loop import Loop
+from ..loop.loop import Loop
+from ..physics.linearization import OperatingPoint
 from .readable import numbers, readable
 from .result import Calibrated, Candidate, Diagnosis, Disturbance, Finding, Gap, Place
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from .._base.errors import CtrlidError
 from ..effects import (
     AbstractEffect,
     FlexibleMode,
@@ -16,10 +17,9 @@ from ..effects import (
     PositionRipple,
     StateLimit,
 )
-from ..equations import Array
-from ..errors import CtrlidError
-from ..filtering import run
-from ..likelihood import pseudo_inverse
+from ..estimation.likelihood.kalman_filter import run
+from ..estimation.likelihood.likelihood import pseudo_inverse
+from ..physics.equations import Array
 from .attempts import attempt, attempt_best
 from .fitted import Model
 from .trial import Trial

@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from .._base.errors import CtrlidError
 from ..effects import AbstractEffect, PeriodicForce, PositionRipple
-from ..errors import CtrlidError
-from ..likelihood import Fit
+from ..estimation.likelihood.likelihood import Fit
 from .attempts import refit
 from .decide import CLOSE, GATE, MANY
 from .fitted import Model, anchor, simulable, spared, whole

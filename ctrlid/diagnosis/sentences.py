@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from .._text import chance, number
+from .._base.text import chance, number
 from .omnibus import Omnibus
 from .result import Disturbance, Finding, Gap, Place, Verdict
 

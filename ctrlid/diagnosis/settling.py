@@ -5,9 +5,9 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from ..loop import Loop
-from ..loop_fit import choose_noise
-from ..maximum import begin, climb, polish, retuned
+from ..estimation.likelihood.maximization import begin, climb, polish, retuned
+from ..estimation.likelihood.physics_fit import choose_noise
+from ..loop.loop import Loop
 from .attempts import attempt_at, outcome, refit
 from .carrying import carried_over
 from .decide import GATE, rivals

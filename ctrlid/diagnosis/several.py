@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import stats
 
-from .._text import listing, number, with_error
+from .._base.text import listing, number, with_error
 from ..effects import AbstractEffect
-from ..loop import Loop
+from ..loop.loop import Loop
 from .result import Calibrated, Candidate, Diagnosis, Finding, Gap
 from .trial import same_kind
 

@@ -8,14 +8,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import optimize
 
-from ..data import Record
-from ..equations import Array
-from ..filtering import Noise
-from ..likelihood import Fit, Known, evaluate, pseudo_inverse
-from ..loop import Loop
-from ..loop_fit import make_problem
-from ..machine import Trajectory
-from ..residuals import remembered
+from ..data.record import Record
+from ..estimation.likelihood.kalman_filter import Noise
+from ..estimation.likelihood.likelihood import Fit, Known, evaluate, pseudo_inverse
+from ..estimation.likelihood.physics_fit import make_problem
+from ..estimation.likelihood.sampled_plant import Trajectory
+from ..loop.loop import Loop
+from ..physics.equations import Array
+from ..validation.residual_tests import remembered
 
 EVALUATIONS = 60  # of a refit
 LOST = 1e3  # times the output's spread: the error where a simulation leaves the plant's domain

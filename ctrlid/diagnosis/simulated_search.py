@@ -10,10 +10,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from .._base.errors import CtrlidError
 from ..effects import AbstractEffect, ParameterStep, PeriodicForce, StateLimit
-from ..equations import Array
-from ..errors import CtrlidError
-from ..loop_fit import start_values
+from ..estimation.likelihood.physics_fit import start_values
+from ..physics.equations import Array
 from .decide import CLOSE, GATE
 from .fitted import Model
 from .fresh import Fresh

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..effects import AbstractEffect
-from ..machine import Trajectory
+from ..estimation.likelihood.sampled_plant import Trajectory
 from .fitted import Model, as_known
 
 

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..effects import AbstractEffect
-from ..equations import Array
-from ..likelihood import Fit
+from ..estimation.likelihood.likelihood import Fit
+from ..physics.equations import Array
 from .fitted import Model
 from .trial import Trial
 

@@ -5,7 +5,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from .._text import chance, listing, number, prefix, quantity
+from .._base.text import chance, listing, number, prefix, quantity
 from ..effects import AbstractEffect, ReadingEffect
 from .omnibus import alarm_level
 from .result import COMPLETE, EXCESS, Diagnosis, Finding, Gap, Place

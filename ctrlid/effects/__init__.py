@@ -2,7 +2,8 @@
 
 from .base import AbstractEffect
 from .catalogue import CATALOGUE
-from .change import ParameterDrift, ParameterStep
+from .context import Moment
+from .delays import ActuatorLag, InputBacklash, InputDelay
 from .equivalence import equivalents
 from .force import (
     ConstantForce,
@@ -28,8 +29,8 @@ from .input import (
     InputSaturatingGain,
     InputSaturation,
 )
+from .kinds import ForceEffect, InputEffect, LawEffect, OutputEffect, ReadingEffect
 from .law import ForceExponent, PositionOffset
-from .moment import Moment
 from .output import (
     Quantization,
     SensorLag,
@@ -37,10 +38,9 @@ from .output import (
     SensorOffset,
     SensorSaturation,
 )
-from .overflow import StateLimit
 from .parameters import Parameter, parameter
-from .places import ForceEffect, InputEffect, LawEffect, OutputEffect, ReadingEffect
-from .timing import ActuatorLag, InputBacklash, InputDelay
+from .state_limit import StateLimit
+from .time_varying import ParameterDrift, ParameterStep
 
 __all__ = [
     "CATALOGUE",

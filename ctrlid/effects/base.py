@@ -10,11 +10,11 @@ from typing import Any, ClassVar, Literal, Self
 import casadi
 import numpy as np
 
-from ..equations import Equations
-from ..errors import CtrlidError
-from ..linearization import OperatingPoint
-from ..symbols import Symbol
-from .moment import Moment, motion
+from .._base.errors import CtrlidError
+from ..physics.equations import Equations
+from ..physics.linearization import OperatingPoint
+from ..physics.symbols import Symbol
+from .context import Moment, motion
 from .parameters import Parameter, filled
 from .symbolic import spread_of, traced, with_states
 

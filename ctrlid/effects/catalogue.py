@@ -1,7 +1,7 @@
 """Every effect that a diagnosis tries, as an explicit tuple of classes."""
 
 from .base import AbstractEffect
-from .change import ParameterDrift, ParameterStep
+from .delays import ActuatorLag, InputBacklash, InputDelay
 from .force import (
     ConstantForce,
     CubicStiffness,
@@ -34,8 +34,8 @@ from .output import (
     SensorOffset,
     SensorSaturation,
 )
-from .overflow import StateLimit
-from .timing import ActuatorLag, InputBacklash, InputDelay
+from .state_limit import StateLimit
+from .time_varying import ParameterDrift, ParameterStep
 
 CATALOGUE: tuple[type[AbstractEffect], ...] = (
     ActuatorLag,

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 import casadi
 import numpy as np
 
-from ..equations import Equations
-from ..linearization import OperatingPoint
+from ..physics.equations import Equations
+from ..physics.linearization import OperatingPoint
 from .base import AbstractEffect
 
 

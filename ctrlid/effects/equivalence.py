@@ -7,12 +7,12 @@ from typing import Any
 import casadi
 import numpy as np
 
-from ..equations import Array, Equations
-from ..errors import CtrlidError
+from .._base.errors import CtrlidError
+from ..physics.equations import Array, Equations
 from .base import AbstractEffect
 from .catalogue import CATALOGUE
+from .context import motion
 from .law import PositionOffset
-from .moment import motion
 
 POINTS = 24  # random states and inputs at which two changes are compared
 SAME = 1e-6  # relative difference of changes that are one and the same

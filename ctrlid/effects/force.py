@@ -6,9 +6,9 @@ from typing import Any, ClassVar, Self, final
 
 import numpy as np
 
-from .moment import Moment
+from .context import Moment
+from .kinds import ForceEffect
 from .parameters import parameter
-from .places import ForceEffect
 
 
 def middle_frequency(loop: Any, record: Any) -> float:

@@ -8,9 +8,9 @@ from typing import Any, ClassVar, Self, final
 
 import numpy as np
 
-from .moment import Moment
+from .context import Moment
+from .kinds import ForceEffect
 from .parameters import parameter
-from .places import ForceEffect
 
 # Within one sample friction changes the velocity by fc*dt: samples cannot show how it sticks.
 STICKING = 0.25

@@ -10,10 +10,10 @@ from typing import Any, ClassVar, Self, final
 
 import numpy as np
 
-from ..errors import CtrlidError
-from .moment import Moment
+from .._base.errors import CtrlidError
+from .context import Moment
+from .kinds import InputEffect
 from .parameters import parameter
-from .places import InputEffect
 
 
 def extremes(values: Any, around: float) -> tuple[float, float]:

@@ -7,12 +7,12 @@ from typing import Any, ClassVar, final
 import casadi
 import numpy as np
 
-from ..equations import Equations
-from ..errors import CtrlidError
+from .._base.errors import CtrlidError
+from ..physics.equations import Equations
 from .base import require_motion
-from .moment import Moment
+from .context import Moment
+from .kinds import LawEffect
 from .parameters import parameter
-from .places import LawEffect
 from .symbolic import expression
 
 INVERSE_SQUARE = 1e-9  # relative agreement with a force that falls with the distance squared

@@ -6,12 +6,12 @@ from typing import Any, ClassVar, Self, final
 
 import numpy as np
 
-from ..errors import CtrlidError
-from ..linearization import OperatingPoint
+from .._base.errors import CtrlidError
+from ..physics.linearization import OperatingPoint
+from .context import Moment
 from .input import extremes
-from .moment import Moment
+from .kinds import OutputEffect, ReadingEffect
 from .parameters import parameter
-from .places import OutputEffect, ReadingEffect
 
 
 @final

@@ -8,10 +8,10 @@ from typing import Any
 import casadi
 import numpy as np
 
-from ..equations import Equations, Lag
-from ..symbols import Symbol
-from ..tracing import rebind
-from .moment import Follow
+from ..physics.equations import Equations, Lag
+from ..physics.symbols import Symbol
+from ..physics.tracing import rebind
+from .context import Follow
 
 
 def traced(hook: Any) -> Any:

@@ -1,0 +1,1 @@
+"""What every room uses: refusals, words and numbers for people, jobs."""

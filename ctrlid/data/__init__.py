@@ -1,0 +1,1 @@
+"""Records of experiments: one, several, from files, from simulations, from public sources."""

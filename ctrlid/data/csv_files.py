@@ -1,0 +1,328 @@
+"""Records as CSV files: exact round trips, and the files that other tools write."""
+
+import csv
+import io
+import json
+import math
+import warnings
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .._base.errors import CtrlidError, CtrlidWarning
+from .._base.text import shortest, split_unit, with_unit
+
+TIME = ("t", "time", "timestamp", "seconds")
+SECONDS = {"": 1.0, "s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6,
+           "min": 60.0, "h": 3600.0}  # fmt: skip
+MARK = "# ctrlid "
+JITTER = 0.01  # of the period: what a good clock never shows
+GAP = 1.5  # periods: samples are missing
+CHUNK = 20_000  # rows written at once: bounds the memory that text takes
+
+
+def write_csv(path: Path, record: Any) -> None:
+    """Write a record: a comment with its fields, a header with units, one row per sample."""
+    channels = {"t": record.t}
+    channels |= {k: getattr(record, k) for k in ("r", "u", "y") if getattr(record, k) is not None}
+    channels |= record.extra
+    if not record.valid.all():
+        channels["valid"] = record.valid
+    units = {"t": "s", **record.units}
+    line = io.StringIO()
+    header = [with_unit(k, units.get(k, "")) for k in channels]
+    csv.writer(line, lineterminator="").writerow(header)
+    expected = [(k, units.get(k, "")) for k in channels]
+    if "\n" in line.getvalue() or [split_unit(c) for c in _cells(line.getvalue(), ",")] != expected:
+        raise CtrlidError(f"the header {header} would not be read back as it is: remove brackets, "
+                          "outer spaces and line breaks from names and units")  # fmt: skip
+    fields = {key: getattr(record, key) for key in ("name", "dt", "hold")}
+    fields["names"] = dict(record.names)
+    with path.open("w", encoding="utf-8", newline="\n") as file:
+        file.write(f"{MARK}{json.dumps(fields, ensure_ascii=False)}\n{line.getvalue()}\n")
+        for first in range(0, len(record), CHUNK):
+            rows = np.column_stack([c[first : first + CHUNK] for c in channels.values()])
+            # The shortest decimals that give the same number back.
+            file.writelines(",".join(map(repr, row)) + "\n" for row in rows.tolist())
+
+
+def read_csv(
+    path: Path, sources: Mapping[str, str | None], time: str | None, dt: float | None,
+    extra: Sequence[str] | None, units: Mapping[str, str] | None, hold: str | None,
+    name: str | None, gaps: str,
+) -> dict[str, Any]:  # fmt: skip
+    """Return the fields of a record; see `Record.from_csv`, `sources` are its r, u and y."""
+    if gaps not in ("error", "mask"):
+        raise CtrlidError(f"gaps must be 'error' or 'mask'; given {gaps!r}")
+    own, header, table = _read_table(path)
+    labels = [split_unit(cell) for cell in header]
+    names = [label for label, _ in labels]
+
+    def place(label: str, what: str) -> int:
+        found = [k for k in range(len(header)) if label in (names[k], header[k])]
+        if len(found) != 1:
+            raise CtrlidError(
+                f"{path} has {'no column' if not found else 'several columns'} {label!r} for "
+                f"{what}; its columns are {', '.join(header)}. Name the right one with {what}="
+            )
+        return found[0]
+
+    wanted = {k: v for k, v in sources.items() if v is not None}
+    if "r" in names:
+        wanted = {"r": "r", **wanted}
+    places = {k: place(v, k) for k, v in wanted.items()}
+    if time is None:
+        time = next((label for label in names if label.lower() in TIME), None)
+    clock = None if time is None else place(time, "time")
+    if isinstance(extra, str):
+        extra = (extra,)
+    if extra is None:
+        taken = {*places.values(), clock}
+        extra = [label for k, label in enumerate(names) if k not in taken and label != "valid"]
+        extra = extra if own else ()
+    further = {names[k]: k for k in (place(c, "extra") for c in extra)}
+    valid = np.ones(len(table), dtype=bool)
+    if "valid" in names:
+        valid = table[:, place("valid", "valid")] > 0.5
+    table, valid = _bridged(table, places, valid, gaps, path)
+    start, rows = 0.0, None
+    period_given = own.get("dt") if dt is None else dt
+    if clock is None:
+        if period_given is None:
+            raise CtrlidError(f"{path} has no time column ({', '.join(TIME)}); its columns are "
+                              f"{', '.join(header)}. Give time= or dt=")  # fmt: skip
+        dt = period_given
+    else:
+        unit = labels[clock][1]
+        if unit not in SECONDS:
+            raise CtrlidError(f"the time column of {path} is in {unit!r}; known units are "
+                              f"{', '.join(filter(None, SECONDS))}. Convert it, or remove the "
+                              "column and give dt=")  # fmt: skip
+        stamps = table[:, clock] * SECONDS[unit]
+        dt, rows = _uniform(stamps, period_given, gaps, path)
+        start = float(stamps[0])
+    if rows is not None and len(rows) != len(table):
+        valid = valid[rows] & (np.diff(rows, prepend=-1) > 0)
+        table = table[rows]
+    every = {**places, **further}
+    read = {key: labels[k][1] for key, k in every.items() if labels[k][1]}
+    return {
+        **{key: table[:, k] for key, k in places.items()},
+        "extra": {label: table[:, k] for label, k in further.items()},
+        "dt": dt, "start": start, "valid": valid, "units": {**read, **(units or {})},
+        "names": own.get("names", {k: names[p] for k, p in places.items() if names[p] != k}),
+        "hold": hold or own.get("hold", "zoh"),
+        "name": own.get("name", path.stem) if name is None else name,
+    }  # fmt: skip
+
+
+def _read_table(path: Path) -> tuple[dict[str, Any], list[str], Any]:
+    """Return the fields in ctrlid's own comment, the header cells and the values."""
+    try:
+        data = path.read_bytes()
+    except OSError as reason:
+        raise CtrlidError(f"cannot read {path}: {reason.strerror}") from reason
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        text = data.decode("cp1252", errors="replace")  # what older Windows tools write
+    own: dict[str, Any] = {}
+    comment, at = "", 0
+    while True:
+        stop = text.find("\n", at)
+        stop = len(text) if stop < 0 else stop + 1
+        line = text[at:stop].strip()
+        if at >= len(text) or (line and not line.startswith("#")):
+            break
+        if line.startswith(MARK):
+            try:
+                own = json.loads(line.removeprefix(MARK))
+            except json.JSONDecodeError as reason:
+                raise CtrlidError(f"the line {line!r} of {path} is damaged: {reason}. Restore or "
+                                  "remove it") from reason  # fmt: skip
+        elif line:
+            comment = line.lstrip("# ")
+        at = stop
+    separator = max(",;\t", key=line.count)
+    header = _cells(line, separator)
+    if all(_is_number(cell) for cell in header):
+        # numpy.savetxt writes its header as a comment.
+        header = _cells(comment, separator)
+        stop = at
+        if not comment or any(_is_number(cell) for cell in header):
+            raise CtrlidError(f"{path} has no header line: its first line is {line!r}. Add one "
+                              "with the names of the columns, such as t,r,u,y")  # fmt: skip
+    body = text[stop:]
+    if not body.strip():
+        raise CtrlidError(f"{path} has no rows of numbers below its header")
+    if separator != ",":
+        body = body.replace(",", ".")  # decimal commas
+    try:
+        table = np.loadtxt(io.StringIO(body), delimiter=separator, ndmin=2, quotechar='"')
+    except ValueError:
+        table = _with_blanks(path, body, separator, text.count("\n", 0, stop))
+    if table.shape[1] != len(header):
+        raise CtrlidError(f"the header of {path} names {len(header)} columns, its rows have "
+                          f"{table.shape[1]}; give every column a name")  # fmt: skip
+    return own, header, table
+
+
+def _with_blanks(path: Path, body: str, separator: str, above: int) -> Any:
+    """Read a table with blank cells, which are NaN, below so many lines."""
+    rows = []
+    for k, cells in enumerate(csv.reader(io.StringIO(body), delimiter=separator)):
+        if not cells or cells[0].lstrip().startswith("#"):
+            continue
+        numbers = []
+        for cell in cells:
+            try:
+                numbers.append(float(cell) if cell.strip() else math.nan)
+            except ValueError:
+                raise CtrlidError(
+                    f"{path} is not a table of numbers: {cell.strip()!r} stands in line "
+                    f"{above + k + 1}. Remove it, or leave the cell blank and give gaps='mask'"
+                ) from None
+        rows.append(numbers)
+        if len(cells) != len(rows[0]):
+            raise CtrlidError(f"{path} is not a table of numbers: line {above + k + 1} has "
+                              f"{len(cells)} cells, the lines above it {len(rows[0])}")  # fmt: skip
+    return np.array(rows)
+
+
+def _bridged(
+    table: Any, places: Mapping[str, int], valid: Any, gaps: str, path: Path
+) -> tuple[Any, Any]:
+    """Return table and validity with the last values where numbers are missing."""
+    missing = np.isnan(table[:, list(places.values())])
+    rows = np.flatnonzero(missing.any(axis=1) & valid)
+    if not missing.any():
+        return table, valid
+    if gaps == "error" and rows.size:
+        k = int(rows[0])
+        names = ", ".join(n for n, lacks in zip(places, missing[k], strict=True) if lacks)
+        raise CtrlidError(
+            f"{path} has no number for {names} in row {k + 1} of the data, and lacks some in "
+            f"{rows.size} of {len(table)} rows. Give gaps='mask' to fill them with the last values "
+            "and mark them as not valid"
+        )
+    table = table.copy()
+    for (name, column), lacks in zip(places.items(), missing.T, strict=True):
+        known = np.flatnonzero(~lacks)
+        if not known.size:
+            raise CtrlidError(f"{path} has no number at all for {name}, which is needed")
+        last = np.maximum.accumulate(np.where(lacks, known[0], np.arange(len(table))))
+        table[:, column] = table[last, column]
+    return table, valid & ~missing.any(axis=1)
+
+
+def _cells(line: str, separator: str) -> list[str]:
+    rows = list(csv.reader([line], delimiter=separator, skipinitialspace=True))
+    return [cell.strip() for cell in rows[0]] if rows else [""]
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell.replace(",", "."))
+    except ValueError:
+        return not cell
+    return True
+
+
+def _resolution(stamps: Any) -> float:
+    """Return the last decimal place that time stamps use, at least their round-off."""
+    finest = 4 * float(np.spacing(np.abs(stamps).max()))
+    for digits in range(13):
+        unit = 10.0**-digits
+        if unit <= finest:
+            break
+        if np.all(np.abs(stamps - np.round(stamps / unit) * unit) <= finest):
+            return unit
+    return finest
+
+
+def _even_period(stamps: Any, rounding: float, dt: float | None) -> float | None:
+    """Return the period of which stamps are rounded multiples, None if they are not.
+
+    A clock of 3.25 ms printed in whole milliseconds steps by 3 and 4 ms, and is regular.
+    """
+    n = len(stamps)
+    k = np.arange(n)
+
+    def fits(period: float, share: float = 1.01) -> bool:
+        return period > 0 and float(np.ptp(stamps - k * period)) <= share * rounding
+
+    finest = 4 * float(np.spacing(np.abs(stamps).max()))
+    mean = float(stamps[-1] - stamps[0]) / (n - 1)
+    if dt is None and mean > 0 and float(np.ptp(stamps - k * mean)) <= finest:
+        return period(stamps)
+    steps = np.diff(stamps)
+    base = float(np.median(steps)) if dt is None else dt
+    if not rounding <= mean or base <= 0:
+        return None
+    # Steps of 1, 1 and 2 units may also be lost samples, unless there are many, evenly spread.
+    longer = np.round(steps / base)
+    if np.all(np.abs(steps - longer * base) <= finest) and (
+        dt is not None or np.count_nonzero(longer > 1) < 5
+    ):
+        return None
+    if dt is not None:
+        return dt if fits(dt) else None
+    slope = float(np.polyfit(k / n, stamps - stamps[0], 1)[0]) / n
+    if not fits(slope, 1.25):
+        return None
+    # Of the periods that the stamps leave open, the one with the fewest digits.
+    short = (float(f"{slope:.{digits}g}") for digits in range(1, 16))
+    return next((p for p in short if fits(p) and abs(p - slope) <= rounding / n), slope)
+
+
+def period(stamps: Any) -> float:
+    """Return the mean period of time stamps, with no digits that only round-off gave it."""
+    mean = float(stamps[-1] - stamps[0]) / (len(stamps) - 1)
+    return shortest(mean, 4 * float(np.spacing(np.abs(stamps).max())))
+
+
+def _uniform(stamps: Any, dt: float | None, gaps: str, path: Path) -> tuple[float, Any]:
+    """Return the period of time stamps and, for each uniform sample, its row."""
+    if len(stamps) < 2 or not np.isfinite(stamps).all():
+        raise CtrlidError(f"the time column of {path} needs at least 2 values, all finite")
+    rounding = _resolution(stamps)
+    even = _even_period(stamps, rounding, dt)
+    if even is not None:
+        return even, np.arange(len(stamps))
+    steps = np.diff(stamps)
+    back = np.flatnonzero(steps <= 0)
+    if back.size:
+        k = int(back[0])
+        raise CtrlidError(
+            f"the time column of {path} does not increase: {stamps[k]:g} s in row {k + 1} of the "
+            f"data is followed by {stamps[k + 1]:g} s. Sort the rows, cut at the restart of the "
+            "clock, or give dt= and remove the column"
+        )
+    regular = steps[steps < GAP * np.median(steps)]
+    usual = float(np.mean(regular))
+    if dt is not None and not abs(usual - dt) < 0.05 * usual:
+        raise CtrlidError(f"the time column of {path} steps by {usual:.4g} s, but dt is {dt:g} s. "
+                          "Leave dt= out, or remove the column")  # fmt: skip
+    if dt is None:
+        dt = period(stamps) if len(regular) == len(steps) else usual
+    missing = np.where(steps < GAP * dt, 0, np.round(steps / dt).astype(int) - 1)
+    where = np.flatnonzero(missing)
+    if where.size and gaps == "error":
+        k = int(where[np.argmax(missing[where])])
+        places = "one place" if where.size == 1 else f"{where.size} places"
+        raise CtrlidError(
+            f"{path} lacks {missing.sum()} samples in {places}; the longest gap has {missing[k]}, "
+            f"{steps[k]:.4g} s after t = {stamps[k]:.6g} s, at a period of {dt:.4g} s. Give "
+            "gaps='mask' to fill them with the last values and mark them as not valid"
+        )
+    jitter = float(np.max(np.abs(steps - (missing + 1) * dt))) / dt
+    if jitter > JITTER + rounding / dt:
+        warnings.warn(
+            f"the times of {path} jitter by up to {100 * jitter:.2g} % of the period {dt:.4g} s; "
+            "they are taken as uniform. If the samples really were taken unevenly, resample them "
+            "first",
+            CtrlidWarning, stacklevel=4,
+        )  # fmt: skip
+    return dt, np.repeat(np.arange(len(stamps)), np.append(missing, 0) + 1)

@@ -1,0 +1,316 @@
+"""Public measured records, fetched by address and checksum, as SI records."""
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pooch
+from scipy import io
+
+from .._base.errors import CtrlidError
+from .record import Record
+
+FOLDER_VARIABLE = "CTRLID_DATA_DIR"
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where a public file comes from, and on what terms."""
+
+    file: str  # in the local folder
+    repository: str
+    commit: str
+    path: str  # in the repository
+    sha256: str
+    terms: str
+
+    @property
+    def address(self) -> str:
+        """The public address of the file."""
+        return f"https://raw.githubusercontent.com/{self.repository}/{self.commit}/{self.path}"
+
+
+def _emps_source(file: str, sha256: str) -> Source:
+    return Source(
+        f"emps/{file}", "forgi86/sysid-neural-continuous",
+        "956aa7ecd73061b0321c6f6098d74c9e4a7ce67a", f"examples/EMPS/data/{file}", sha256,
+        "public benchmark; cite Janot, Gautier, Brunot (2019), Data Set and Reference Models of "
+        "EMPS",
+    )  # fmt: skip
+
+
+def _inteco_source(file: str, sha256: str) -> Source:
+    return Source(
+        f"inteco/{file}", "MPKowalczyk/Magnetic_levitation",
+        "2fe9575ce557f9e2e9461efeca98d189162c28c4", f"Matlab/{file}", sha256, "no licence stated",
+    )  # fmt: skip
+
+
+def _servo_source(file: str, sha256: str) -> Source:
+    return Source(
+        f"servo/{file}", "helonayala/bab_datasets", "584399a037c9a8f2793b51cca76ce7cd9823c2d0",
+        f"data/{file}", sha256, "no licence stated",
+    )  # fmt: skip
+
+
+EMPS = _emps_source(
+    "DATA_EMPS.mat", "6cf6814ae14618795da0101aae2bb97ff0c6351b0501b5492751b02b07facf7e"
+)
+EMPS_PULSES = _emps_source(
+    "DATA_EMPS_PULSES.mat", "0eab75bb1f6b16228ee78791343a88bf9bfd9a51036ac9807d7b5fc11c0e1704"
+)
+INTECO_PID = _inteco_source(
+    "data_PID_step.mat", "88ea9852dbb14d5f7ff9d3dda3476ff50f5bff34de2748238ce3e92967cf86b4"
+)
+INTECO_COIL = _inteco_source(
+    "data_stepcon.mat", "18e19ab2dd1b198603d2f8052fa169f9b2eb6e9692536f582a24c6a3891e018f"
+)
+MAGNETOSHIELD = Source(
+    "magnetoshield/MagnetoShield_ID_Data.mat", "gergelytakacs/AutomationShield",
+    "bc0778f97a156d4ea5158725e09068d438e59a39",
+    "matlab/examples/MagnetoShield/MagnetoShield_ID_Data.mat",
+    "0d268ef80702641b7e7c125b447dab4bd7e797e89ea62880a2f5eb437e895cb7", "CC BY-NC-ND 4.0",
+)  # fmt: skip
+SERVO_STEPS = _servo_source(
+    "03_random_steps_01.mat", "c7c104e0e9406f22b9567beb73f914085991a3628e4b7ede422507b7a65b32bd"
+)
+SERVO_SINE = _servo_source(
+    "04_swept_sine.mat", "9b4c7e08602acaa8b72ff1fbfdf38d08bf9e0466fd7bea7102916b1f8f6d3fac"
+)
+TANKS = Source(
+    "tanks/dataBenchmark.mat", "forgi86/sysid-neural-unc",
+    "4652931922a0a482babe6395057c54c8ceafda7e",
+    "examples/CTS/data/CascadedTanksFiles/dataBenchmark.mat",
+    "cb2f88d4388be4d3f2a24c6402fba804976aac5f2e1f26cda59ea0a38d016eab",
+    "public benchmark; cite Schoukens, Mattson, Wigren, Noël (2016)",
+)  # fmt: skip
+
+
+def _channel(table: Any, key: str, column: int = 0) -> Any:
+    values = np.asarray(table[key], dtype=float)
+    return values.ravel() if 1 in values.shape else values[:, column]
+
+
+def _emps(table: Any) -> Record:
+    extra = {"pulses": _channel(table, "pulses_N")} if "pulses_N" in table else {}
+    return Record(
+        r=_channel(table, "qg"), u=_channel(table, "vir"), y=_channel(table, "qm"), dt=1e-3,
+        extra=extra, units={"r": "m", "u": "V", "y": "m", **dict.fromkeys(extra, "V")},
+        names={"r": "reference", "u": "drive voltage", "y": "position"},
+    )  # fmt: skip
+
+
+def _inteco_pid(table: Any) -> Record:
+    time = _channel(table, "sim_time")
+    # The ball hits both stops at first; after each step it swings far out of the linear range.
+    valid = (time >= 2.0) & ~((time >= 10.0) & (time < 12.0)) & ~((time >= 18.0) & (time < 20.0))
+    return Record(
+        r=_channel(table, "sim_pos", 0), u=_channel(table, "sim_con"),
+        y=_channel(table, "sim_pos", 1), dt=1e-3, valid=valid, start=float(time[0]),
+        extra={"current": _channel(table, "sim_cur")},
+        units={"r": "m", "u": "1", "y": "m", "current": "A"},
+        names={"r": "reference", "u": "duty", "y": "distance"},
+    )  # fmt: skip
+
+
+def _inteco_coil(table: Any) -> Record:
+    return Record(
+        u=_channel(table, "sim_con"), y=_channel(table, "sim_cur"), dt=1e-3,
+        extra={"distance": _channel(table, "sim_pos", 1)},
+        units={"u": "1", "y": "A", "distance": "m"},
+        names={"u": "duty", "y": "current"},
+    )  # fmt: skip
+
+
+def _magnetoshield(table: Any) -> list[Record]:
+    whole = np.asarray(table["result"], dtype=float)
+    set_points = (14.0, 13.5, 14.5, 15.0, 14.5)  # not logged; where the magnet settles [mm]
+    return [
+        Record(
+            u=part[:, 1], y=part[:, 0] * 1e-3, dt=3.25e-3, extra={"current": part[:, 2] * 1e-3},
+            valid=part[:, 0] < 15.6,  # the magnet lies on the floor until it is lifted
+            units={"u": "V", "y": "m", "current": "A"},
+            names={"u": "solenoid voltage", "y": "gap"}, name=f"set-point {k + 1}, {level:g} mm",
+        )
+        for k, (part, level) in enumerate(zip(np.split(whole, 5), set_points, strict=True))
+    ]  # fmt: skip
+
+
+def _servo(table: Any) -> Record:
+    return Record(
+        r=_channel(table, "ref"), u=_channel(table, "u"), y=_channel(table, "y"), dt=1e-3,
+        extra={"filtered": _channel(table, "yf")},
+        units={"r": "V", "u": "V", "y": "V", "filtered": "V"},
+        names={"r": "reference", "u": "drive voltage", "y": "angle"},
+    )  # fmt: skip
+
+
+def _tanks(which: str) -> Callable[[Any], Record]:
+    def read(table: Any) -> Record:
+        return Record(
+            u=_channel(table, "u" + which), y=_channel(table, "y" + which),
+            dt=float(_channel(table, "Ts")[0]), units={"u": "V", "y": "V"},
+            names={"u": "pump voltage", "y": "level sensor"},
+        )  # fmt: skip
+
+    return read
+
+
+_EMPS_TEXT = (
+    "Electro-mechanical positioning system (EMPS) in closed loop: a carriage on a screw, one "
+    "integrator. 24841 samples at 1 ms; r and y position [m], u drive voltage [V]; 35.15 N/V"
+)
+_SERVO_TEXT = (
+    "Servo of a ball-and-beam rig in closed loop, one integrator, {}. {} samples at 1 ms, all in "
+    "volts; y angle, extra['filtered'] the y that the controller sees, u = 3 (r - filtered) "
+    "limited to 10 V"
+)
+_TANKS_TEXT = (
+    "Two cascaded tanks in open loop, {} data. 1024 samples at 4 s; u pump voltage [V], y level "
+    "sensor of the lower tank [V], which clips at 10 V where the tank overflows"
+)
+
+_CATALOGUE: dict[str, tuple[Source, Callable[[Any], Any], str]] = {
+    "emps": (EMPS, _emps, _EMPS_TEXT),
+    "emps_pulses": (
+        EMPS_PULSES, _emps,
+        _EMPS_TEXT + ". With pulses added to the drive: u contains them, and extra['pulses'] is "
+        "their signal as logged, 0 or 5 V, which moves u by 5.1 to 5.3 V",
+    ),
+    "inteco_pid_step": (
+        INTECO_PID, _inteco_pid,
+        "INTECO magnetic levitation under PID control, unstable, steps of the reference from 10 to "
+        "12 and 8 mm. 24343 samples at 1 ms; r and y distance from the coil [m], u PWM duty from 0 "
+        "to 1, extra['current'] of the coil [A]. Not valid: the first 2 s, where the ball hits "
+        "both stops, and 2 s from each step, where it swings to 16.8 and 2.6 mm",
+    ),
+    "inteco_coil_step": (
+        INTECO_COIL, _inteco_coil,
+        "Coil of the INTECO magnetic levitation alone, the ball at rest: a step of the duty from 0 "
+        "to 1 at 5 s. 10764 samples at 1 ms; u duty, y coil current [A]",
+    ),
+    "magnetoshield_r3": (
+        MAGNETOSHIELD, _magnetoshield,
+        "MagnetoShield R3, a levitated permanent magnet under PID control with noise of 2 V peak "
+        "to peak added to u, unstable: a list of five records, one per set-point. 1500 samples "
+        "each at 3.25 ms; u solenoid voltage [V], y gap [m], extra['current'] of the coil [A], "
+        "read after u is applied. Not valid: the magnet on the floor at the start of the first",
+    ),
+    "servo_random_steps": (SERVO_STEPS, _servo, _SERVO_TEXT.format("random steps", 59802)),
+    "servo_swept_sine": (SERVO_SINE, _servo, _SERVO_TEXT.format("swept sine", 60001)),
+    "tanks_estimation": (TANKS, _tanks("Est"), _TANKS_TEXT.format("estimation")),
+    "tanks_validation": (TANKS, _tanks("Val"), _TANKS_TEXT.format("validation")),
+}  # fmt: skip
+
+
+def names() -> tuple[str, ...]:
+    """Return the names of the records that `load` knows.
+
+    Returns
+    -------
+    tuple of str
+        The names.
+
+    Examples
+    --------
+    >>> import ctrlid as cid
+    >>> "emps" in cid.datasets.names()
+    True
+    """
+    return tuple(_CATALOGUE)
+
+
+def _entry(name: str) -> tuple[Source, Callable[[Any], Any], str]:
+    if name not in _CATALOGUE:
+        raise CtrlidError(f"there is no dataset {name!r}; there are {', '.join(_CATALOGUE)}")
+    return _CATALOGUE[name]
+
+
+def describe(name: str) -> str:
+    """Return what a record is, where it comes from and on what terms.
+
+    Parameters
+    ----------
+    name : str
+        One of `names`.
+
+    Returns
+    -------
+    str
+        The description.
+
+    Raises
+    ------
+    CtrlidError
+        If there is no such record.
+
+    Examples
+    --------
+    >>> import ctrlid as cid
+    >>> print(cid.datasets.describe("tanks_validation"))
+    Two cascaded tanks in open loop, validation data. 1024 samples at 4 s; ...
+    Source: https://raw.githubusercontent.com/forgi86/sysid-neural-unc/...
+    Terms: public benchmark; cite Schoukens, Mattson, Wigren, Noël (2016)
+    """
+    source, _, text = _entry(name)
+    return f"{text}.\nSource: {source.address}\nTerms: {source.terms}"
+
+
+def load(name: str) -> Any:
+    """Load a public measured record.
+
+    The file is looked for in the folder named by the environment variable ``CTRLID_DATA_DIR``, else
+    fetched once from its public address and kept in the user's cache; either way its SHA-256 is
+    checked. Signals are converted to SI units, and stretches that are known not to count are
+    marked in `valid`.
+
+    Parameters
+    ----------
+    name : str
+        One of `names`.
+
+    Returns
+    -------
+    Record or list of Record
+        The record; ``"magnetoshield_r3"`` is a list of five, one per set-point.
+
+    Raises
+    ------
+    CtrlidError
+        If there is no such record, the file cannot be fetched or is not the published one.
+    """
+    source, read, _ = _entry(name)
+    table = io.loadmat(_path(source))
+    loaded = read(table)
+    if isinstance(loaded, list):
+        return [replace(record, name=f"{name} {record.name}") for record in loaded]
+    return replace(loaded, name=name)
+
+
+def _path(source: Source) -> Path:
+    folder = os.environ.get(FOLDER_VARIABLE)
+    if folder:
+        local = Path(folder) / source.file
+        if local.is_file():
+            if pooch.file_hash(str(local)) != source.sha256:
+                raise CtrlidError(
+                    f"{local} is not the published file: its SHA-256 is not {source.sha256}. "
+                    f"Replace it by {source.address}"
+                )
+            return local
+    pooch.get_logger().setLevel("ERROR")  # a download is no news
+    try:
+        fetched = pooch.retrieve(
+            source.address, known_hash=f"sha256:{source.sha256}", path=pooch.os_cache("ctrlid"),
+            progressbar=False,
+        )  # fmt: skip
+    except Exception as reason:  # pooch hands on whatever its downloader raises
+        raise CtrlidError(
+            f"cannot fetch {source.address} ({type(reason).__name__}: {reason}). Connect to the "
+            f"network, or put the file into a folder as {source.file} and name that folder in the "
+            f"environment variable {FOLDER_VARIABLE}"
+        ) from None  # the text says all that a page of network frames would
+    return Path(fetched)

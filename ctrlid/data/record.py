@@ -1,0 +1,512 @@
+"""Record: one experiment in one loop, measured or simulated."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from numbers import Integral
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Literal, get_args
+
+import numpy as np
+from scipy import signal
+
+from .._base.errors import CtrlidError
+from .._base.text import Printed
+from . import csv_files as _csv
+from . import responses as _response
+from .field_checks import samples, seconds, words
+
+Hold = Literal["zoh", "foh"]
+SIGNALS = ("r", "u", "y")
+RESERVED = (*SIGNALS, "t", "time", "valid")  # columns of a CSV file
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Record(Printed):
+    """Reference, input and output of one experiment, sampled together.
+
+    At sample k the output ``y[k]`` is measured, then ``u[k]`` is computed and applied until sample
+    k+1: ``y[k]`` depends on ``u[k-1]`` and earlier. All values are absolute and in SI units, or
+    volts as logged. The arrays are copies and read-only.
+
+    Parameters
+    ----------
+    u, y : array_like, shape (n,)
+        Input and output [physical units].
+    dt : float
+        Sampling period [s].
+    r : array_like, shape (n,), optional
+        Reference [output unit], if it was logged.
+    hold : {"zoh", "foh"}, optional
+        How u runs between samples: held, as a digital controller does, or straight, as a smooth
+        analog signal nearly does.
+    extra : mapping of str to array_like, optional
+        Further measured channels [as in `units`], for instance a coil current.
+    valid : array_like of bool, shape (n,), optional
+        Which samples count in fits and comparisons; by default all.
+    names : mapping, optional
+        Names of the signals ``"r"``, ``"u"``, ``"y"``, for labels.
+    units : mapping, optional
+        Units of ``"r"``, ``"u"``, ``"y"`` and of the extra channels.
+    name : str, optional
+        Name of the experiment.
+    start : float, optional
+        Time of sample 0 [s].
+
+    Raises
+    ------
+    CtrlidError
+        If the data are not finite, not one-dimensional, of different lengths or too few, or a word
+        is unknown.
+
+    Examples
+    --------
+    >>> import ctrlid as cid
+    >>> record = cid.Record(r=[1, 1, 1], u=[0.5, 0.4, 0.4], y=[0, 0.3, 0.5], dt=0.1)
+    >>> record.duration, len(record[1:])
+    (0.30000000000000004, 2)
+    """
+
+    u: Any
+    y: Any
+    dt: float
+    r: Any = None
+    hold: Hold = "zoh"
+    extra: Mapping[str, Any] = field(default_factory=dict)
+    valid: Any = None
+    names: Mapping[str, str] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)
+    name: str = ""
+    start: float = 0.0
+
+    def __post_init__(self) -> None:
+        given = {k: getattr(self, k) for k in SIGNALS}
+        for key in ("u", "y"):
+            if given[key] is None:
+                raise CtrlidError(f"a record needs u and y; {key} is None")
+        signals = {k: samples(k, v) for k, v in given.items() if v is not None}
+        if not isinstance(self.extra, Mapping):
+            raise CtrlidError(f"extra maps names to channels, as in {{'current': i}}; given "
+                              f"{type(self.extra).__name__}")  # fmt: skip
+        clash = [k for k in self.extra if not isinstance(k, str) or not k or k in RESERVED]
+        if clash:
+            raise CtrlidError(f"extra channels need names other than {', '.join(RESERVED)}; given "
+                              f"{clash}")  # fmt: skip
+        extra = {k: samples(f"extra[{k!r}]", v) for k, v in self.extra.items()}
+        sizes = {k: v.size for k, v in (*signals.items(), *extra.items())}
+        if len(set(sizes.values())) > 1:
+            lengths = ", ".join(f"{k}: {n}" for k, n in sizes.items())
+            raise CtrlidError(f"all signals must be equally long; given {lengths}. Cut them to the "
+                              "samples they have in common")  # fmt: skip
+        n = signals["y"].size
+        if n < 2:
+            raise CtrlidError(f"a record needs at least 2 samples; given {n}")
+        dt = seconds("dt is the sampling period", self.dt)
+        if dt <= 0:
+            raise CtrlidError(f"dt is the sampling period in seconds, > 0; given {self.dt!r}")
+        if self.hold not in get_args(Hold):
+            raise CtrlidError(f"hold must be 'zoh' (held between samples) or 'foh' (straight); "
+                              f"given {self.hold!r}")  # fmt: skip
+        valid = np.ones(n, dtype=bool) if self.valid is None else np.array(self.valid)
+        if valid.dtype != bool or valid.shape != (n,):
+            raise CtrlidError(
+                f"valid must be {n} booleans, one per sample; given {valid.dtype} of shape "
+                f"{valid.shape}. A comparison makes booleans, as in y > 0"
+            )
+        if not isinstance(self.name, str):
+            raise CtrlidError(f"name is the experiment's name in words; given {self.name!r}")
+        valid.setflags(write=False)
+        for key, value in {
+            **signals, "extra": MappingProxyType(extra), "valid": valid, "dt": dt,
+            "start": seconds("start is the time of sample 0", self.start),
+            "names": words("names", self.names, SIGNALS),
+            "units": words("units", self.units, (*SIGNALS, *extra)),
+        }.items():  # fmt: skip
+            object.__setattr__(self, key, value)
+
+    def __len__(self) -> int:
+        return int(self.y.size)
+
+    def __reduce__(self) -> Any:
+        # A mapping proxy cannot be pickled.
+        fields = {k: getattr(self, k) for k in self.__dataclass_fields__}
+        plain = {k: dict(v) if isinstance(v, MappingProxyType) else v for k, v in fields.items()}
+        return _rebuild, (plain,)
+
+    @property
+    def n(self) -> int:
+        """Number of samples."""
+        return len(self)
+
+    @property
+    def t(self) -> Any:
+        """Time of each sample [s]."""
+        return self.start + self.dt * np.arange(len(self))
+
+    @property
+    def duration(self) -> float:
+        """Number of samples times the sampling period [s]."""
+        return len(self) * self.dt
+
+    def _map(self, change: Any, **fields: Any) -> "Record":
+        """Apply a change to every channel."""
+        return replace(
+            self,
+            **{k: change(getattr(self, k)) for k in SIGNALS if getattr(self, k) is not None},
+            extra={k: change(v) for k, v in self.extra.items()},
+            **fields,
+        )
+
+    def __getitem__(self, index: slice) -> "Record":
+        if not isinstance(index, slice):
+            raise CtrlidError(f"a record is sliced by samples, record[100:2000]; given {index!r}. "
+                              "Single values are in record.y and the other arrays")  # fmt: skip
+        if index.step not in (None, 1):
+            raise CtrlidError(f"a step of {index.step} would alias; use record.decimate(q), with "
+                              "antialias=False if that is what you want")  # fmt: skip
+        if not all(k is None or isinstance(k, Integral) for k in (index.start, index.stop)):
+            raise CtrlidError(f"a record is sliced by whole sample numbers; given {index}. By "
+                              "seconds it is cut with record.between(t0, t1)")  # fmt: skip
+        start, stop, _ = index.indices(len(self))
+        if stop - start < 2:
+            raise CtrlidError(f"a record needs at least 2 samples; the slice {start}:{stop} of "
+                              f"{len(self)} leaves {max(stop - start, 0)}")  # fmt: skip
+        return self._map(lambda s: s[start:stop], valid=self.valid[start:stop],
+                         start=self.start + start * self.dt)  # fmt: skip
+
+    def between(self, t0: float, t1: float) -> "Record":
+        """Return the samples with ``t0 <= t < t1``.
+
+        Parameters
+        ----------
+        t0, t1 : float
+            Times on the record's own clock [s]; ``np.inf`` means to the end.
+
+        Returns
+        -------
+        Record
+            The part.
+
+        Raises
+        ------
+        CtrlidError
+            If fewer than 2 samples lie between.
+        """
+        if not t0 < t1:
+            raise CtrlidError(f"between needs t0 < t1 in seconds; given {t0!r} and {t1!r}")
+        # A sample that round-off puts a hair before t0 belongs to it.
+        slack = 1e-6 + 4 * float(np.spacing(abs(self.start) + self.duration)) / self.dt
+        first, last = (
+            int(np.ceil(np.clip((t - self.start) / self.dt - slack, 0, len(self))))
+            for t in (t0, t1)
+        )
+        if last - first < 2:
+            raise CtrlidError(
+                f"fewer than 2 samples lie between {t0:g} and {t1:g} s; the record runs from "
+                f"{self.start:g} to {self.start + self.duration:g} s"
+            )
+        return self[first:last]
+
+    def split(self, *fractions: float) -> tuple["Record", ...]:
+        """Cut the record in time order, by default into halves.
+
+        Parameters
+        ----------
+        *fractions : float
+            Where to cut, as increasing fractions of the length between 0 and 1.
+
+        Returns
+        -------
+        tuple of Record
+            One part more than there are fractions.
+
+        Raises
+        ------
+        CtrlidError
+            If the fractions are not increasing between 0 and 1.
+        """
+        cuts = fractions or (0.5,)
+        edges = np.array([0.0, *cuts, 1.0])
+        if not np.all(np.diff(edges) > 0):
+            raise CtrlidError(f"split takes increasing fractions between 0 and 1; given {cuts}")
+        at = np.round(edges * len(self)).astype(int)
+        return tuple(self[a:b] for a, b in pairwise(at))
+
+    def decimate(self, q: int, antialias: bool = True) -> "Record":
+        """Return the record at q times the sampling period.
+
+        Every channel passes the same zero-phase FIR filter, so that the channels keep their
+        relation. It passes what is below two thirds of the new Nyquist frequency and takes 50 dB
+        off what is above the new Nyquist frequency. A sample counts only where all 20 q + 1
+        samples under the filter count, which costs 10 slow samples at either end. An input that
+        was held is smooth afterwards, so `hold` becomes ``"foh"``.
+
+        Parameters
+        ----------
+        q : int
+            Factor.
+        antialias : bool, optional
+            False takes every q-th sample: what a slower recorder would have logged. What u did in
+            between is lost, and `hold` is no longer true of it.
+
+        Returns
+        -------
+        Record
+            The slower record.
+
+        Raises
+        ------
+        CtrlidError
+            If q is no positive integer or leaves too few samples.
+
+        Examples
+        --------
+        >>> import ctrlid as cid
+        >>> record = cid.Record(u=[0.0] * 100, y=[1.0] * 100, dt=0.001)
+        >>> slow = record.decimate(4)
+        >>> len(slow), slow.dt, float(slow.y[0]), slow.segments()
+        (25, 0.004, 1.0, [(10, 15)])
+        """
+        if not isinstance(q, Integral) or not 1 <= q <= len(self) // 2:
+            raise CtrlidError(f"decimate needs a whole factor from 1 to {len(self) // 2} for "
+                              f"{len(self)} samples; given {q!r}")  # fmt: skip
+        q = int(q)
+        if q == 1:
+            return self
+        if not antialias:
+            return self._map(lambda s: s[::q], valid=self.valid[::q], dt=self.dt * q)
+        half = 10 * q
+        count = np.cumsum(np.pad(~self.valid, (half + 1, half), constant_values=True))
+        valid = (count[2 * half + 1 :] == count[: -2 * half - 1])[::q]
+        if not valid.any():
+            longest = max((b - a for a, b in self.segments()), default=0)
+            raise CtrlidError(
+                f"decimate({q}) would leave no sample that counts: its filter spans {2 * half + 1} "
+                f"samples and the longest valid stretch has {longest}. Use a smaller factor, or "
+                "antialias=False"
+            )
+        # The transition band of a Hamming window of this length is a third of the new Nyquist band.
+        taps = signal.firwin(2 * half + 1, (1 - 1 / 6) / q, window="hamming")
+
+        def filtered(s: Any) -> Any:
+            # Filtering the deviation keeps constants exact; odd reflection continues slopes.
+            around = np.pad(s - s[0], half, mode="reflect", reflect_type="odd")
+            return s[0] + signal.fftconvolve(around, taps, "valid")[::q]
+
+        return self._map(filtered, valid=valid, dt=self.dt * q, hold="foh")
+
+    def with_input(self, channel: str) -> "Record":
+        """Return the record with an extra channel as input; the old input becomes an extra one.
+
+        Parameters
+        ----------
+        channel : str
+            Name of the extra channel, for instance ``"current"``.
+
+        Returns
+        -------
+        Record
+            The same experiment.
+
+        Raises
+        ------
+        CtrlidError
+            If there is no such channel.
+        """
+        return self._swap("u", channel)
+
+    def with_output(self, channel: str) -> "Record":
+        """Return the record with an extra channel as output; the old output becomes an extra one.
+
+        Parameters
+        ----------
+        channel : str
+            Name of the extra channel.
+
+        Returns
+        -------
+        Record
+            The same experiment.
+
+        Raises
+        ------
+        CtrlidError
+            If there is no such channel.
+        """
+        return self._swap("y", channel)
+
+    def _swap(self, key: str, channel: str) -> "Record":
+        if channel not in self.extra:
+            raise CtrlidError(f"the record has no extra channel {channel!r}; it has "
+                              f"{', '.join(self.extra) or 'none'}")  # fmt: skip
+        old = self.names.get(key, key)
+        if old == key:
+            old = {"u": "input", "y": "output"}[key]
+        extra = {k: v for k, v in self.extra.items() if k != channel}
+        if old in (*extra, *RESERVED):
+            raise CtrlidError(
+                f"the old {key} would move to the extra channels as {old!r}, but that name is "
+                f"taken; name it otherwise with names={{{key!r}: ...}}"
+            )
+        units = {k: v for k, v in self.units.items() if k not in (key, channel)}
+        if key in self.units:
+            units[old] = self.units[key]
+        if channel in self.units:
+            units[key] = self.units[channel]
+        return replace(self, **{key: self.extra[channel]}, extra={old: getattr(self, key), **extra},
+                       units=units, names={**self.names, key: channel})  # fmt: skip
+
+    def segments(self) -> list[tuple[int, int]]:
+        """Return the (start, stop) sample indices of the stretches that count.
+
+        Returns
+        -------
+        list of (int, int)
+            Half-open index pairs in time order.
+        """
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], self.valid.astype(int), [0]])))
+        return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+    @classmethod
+    def from_csv(
+        cls, path: str | Path, *, r: str | None = None, u: str = "u", y: str = "y",
+        time: str | None = None, dt: float | None = None, extra: Sequence[str] | None = None,
+        units: Mapping[str, str] | None = None, hold: Hold | None = None, name: str | None = None,
+        gaps: Literal["error", "mask"] = "error",
+    ) -> "Record":  # fmt: skip
+        """Read a record from a CSV file with a header line.
+
+        Columns are separated by commas, semicolons or tabs; units are read from headers such as
+        ``u [V]`` or ``u (V)``. A column called valid tells which samples count.
+
+        Parameters
+        ----------
+        path : str or path
+            The file.
+        r, u, y : str, optional
+            Names of the columns; r by default if there is a column so called.
+        time : str, optional
+            Name of the time column; by default one called t, time, timestamp or seconds. Its unit
+            is s unless the header says ms, us, min or h.
+        dt : float, optional
+            Sampling period [s]; by default that of the time column.
+        extra : sequence of str, optional
+            Further columns to keep; by default all others of a file that `to_csv` wrote, else none.
+        units : mapping, optional
+            Units, by signal, instead of those in the header.
+        hold, name : str, optional
+            As in `Record`; by default what `to_csv` wrote, else ``"zoh"`` and the file's name.
+        gaps : {"error", "mask"}, optional
+            Whether missing samples are refused, or filled with the last values and marked as not
+            valid.
+
+        Returns
+        -------
+        Record
+            The record.
+
+        Warns
+        -----
+        CtrlidWarning
+            If the times jitter by more than 1 % of the period.
+
+        Raises
+        ------
+        CtrlidError
+            If the file is no table of numbers, a column is missing, the time does not increase or
+            samples are missing.
+        """
+        return cls(**_csv.read_csv(
+            Path(path), {"r": r, "u": u, "y": y}, time, dt, extra, units, hold, name, gaps
+        ))  # fmt: skip
+
+    def to_csv(self, path: str | Path) -> None:
+        """Write the record to a CSV file that `from_csv` reads back exactly.
+
+        A comment line at the top holds what a table cannot: name, dt, hold and signal names.
+
+        Parameters
+        ----------
+        path : str or path
+            The file.
+
+        Raises
+        ------
+        CtrlidError
+            If a channel's name or unit cannot stand in a header line.
+        """
+        _csv.write_csv(Path(path), self)
+
+    @classmethod
+    def from_response(
+        cls, response: Any, *, r: str | None = None, u: str | None = None, y: str | None = None,
+        **fields: Any,
+    ) -> "Record":  # fmt: skip
+        """Make a record of a `control.TimeResponseData`.
+
+        Parameters
+        ----------
+        response : control.TimeResponseData
+            A single response, uniformly sampled.
+        r, u, y : str, optional
+            Labels of the reference, input and output among the response's inputs and outputs. By
+            default the signals so labelled, else the only other input as u and the only other
+            output as y.
+        **fields
+            Further fields of the record, such as ``hold``, ``names``, ``units``.
+
+        Returns
+        -------
+        Record
+            The record.
+
+        Raises
+        ------
+        CtrlidError
+            If a signal is not there, the time is not uniform or there are several traces.
+
+        Examples
+        --------
+        >>> import control as ct
+        >>> import ctrlid as cid
+        >>> plant = ct.tf([1], [1, 1], inputs="force", outputs="speed")
+        >>> response = ct.step_response(plant, timepts=[0, 0.5, 1.0])
+        >>> cid.Record.from_response(response, units={"y": "m/s"})
+        Record 3 samples at 0.5 s (1.5 s, zoh)
+          u (force)  1 .. 1
+          y (speed)  0 .. 0.632121 m/s
+        """
+        return cls(**{**_response.read_response(response, {"r": r, "u": u, "y": y}), **fields})
+
+    def to_response(self) -> Any:
+        """Return a `control.TimeResponseData` with output y and inputs u and, if any, r.
+
+        The labels are the names with their units, as in ``position [m]``, or r, u and y. Extra
+        channels, `valid` and `hold` have no place in a response.
+
+        Returns
+        -------
+        control.TimeResponseData
+            The same samples.
+        """
+        return _response.write_response(self)
+
+    def __repr__(self) -> str:
+        rows = [f"Record {self.name + ': ' if self.name else ''}{len(self)} samples at "
+                f"{self.dt:g} s ({self.duration:.4g} s, {self.hold})"]  # fmt: skip
+        if not self.valid.all():
+            rows[0] += f", {100 * self.valid.mean():.1f} % valid"
+        channels = {k: getattr(self, k) for k in SIGNALS if getattr(self, k) is not None}
+        channels |= self.extra
+        labels = {k: f"{k} ({v})" if (v := self.names.get(k, k)) != k else k for k in channels}
+        width = max(map(len, labels.values()))
+        for key, values in channels.items():
+            unit = self.units.get(key, "")
+            rows.append(f"  {labels[key]:<{width}}  {values.min():.6g} .. {values.max():.6g} "
+                        f"{'' if unit == '1' else unit}".rstrip())  # fmt: skip
+        return "\n".join(rows)
+
+
+def _rebuild(fields: dict[str, Any]) -> Record:
+    return Record(**fields)

@@ -1,0 +1,91 @@
+"""Records as python-control's time responses, and back."""
+
+from typing import Any
+
+import control as ct
+import numpy as np
+
+from .._base.errors import CtrlidError
+from .._base.text import shortest, split_unit, with_unit
+
+
+def read_response(response: Any, chosen: dict[str, str | None]) -> dict[str, Any]:
+    """Return the fields of a record from a response; `chosen` maps r, u, y to labels or None."""
+    if not isinstance(response, ct.TimeResponseData):
+        raise CtrlidError(
+            "from_response takes a control.TimeResponseData, as forced_response and "
+            f"input_output_response return; given {type(response).__name__}"
+        )
+    if response.ntraces > 1:
+        raise CtrlidError(f"a record is one experiment; the response has {response.ntraces} "
+                          "traces. Compute it for one input at a time")  # fmt: skip
+    n = len(response.time)
+    inputs = _channels("u", response.input_labels, response.u, n)
+    outputs = _channels("y", response.output_labels, response.y, n)
+    for label in inputs.keys() & outputs.keys():
+        if not np.array_equal(inputs[label], outputs[label]):
+            raise CtrlidError(f"the response has an input and an output called {label!r} that "
+                              "differ; rename one of them in the system")  # fmt: skip
+    table = {**inputs, **outputs}
+    plain = {split_unit(label)[0]: label for label in table}
+
+    def label_of(key: str) -> str | None:
+        given = chosen[key]
+        if given is not None:
+            return given if given in table else plain.get(given)
+        if key in plain or key == "r":
+            return plain.get(key)
+        # A signal that is the reference or the other one is no candidate.
+        taken = {chosen[k] or k for k in ("r", "u", "y") if k != key}
+        others = [c for c in (inputs if key == "u" else outputs)
+                  if c not in taken and split_unit(c)[0] not in taken]  # fmt: skip
+        return others[0] if len(others) == 1 else None
+
+    labels = {key: label_of(key) for key in ("r", "u", "y")}
+    for key, wanted in labels.items():
+        if wanted is None and (key != "r" or chosen[key] is not None):
+            raise CtrlidError(
+                f"say which signal is {key}: given {chosen[key]!r}; the response has the inputs "
+                f"{list(inputs)} and the outputs {list(outputs)}"
+            )
+    stamps = np.asarray(response.time, dtype=float)
+    if len(stamps) < 2:
+        raise CtrlidError(f"a record needs at least 2 samples; the response has {len(stamps)}")
+    steps = np.diff(stamps)
+    mean = float(stamps[-1] - stamps[0]) / len(steps)
+    dt = shortest(mean, 4 * float(np.spacing(np.abs(stamps).max())))
+    if np.any(np.abs(steps - dt) > 1e-6 * dt):
+        raise CtrlidError(
+            f"a record is sampled uniformly; the times of the response step by {steps.min():.4g} "
+            f"to {steps.max():.4g} s. Compute it at np.arange(n) * dt"
+        )
+    found = {key: split_unit(label) for key, label in labels.items() if label is not None}
+    return {
+        **{key: table[label] for key, label in labels.items() if label is not None},
+        "dt": dt, "start": float(stamps[0]),
+        "names": {key: name for key, (name, _) in found.items() if name != key},
+        "units": {key: unit for key, (_, unit) in found.items() if unit},
+    }  # fmt: skip
+
+
+def write_response(record: Any) -> Any:
+    """Return a record as a response with output y and inputs u and, if any, r."""
+    keys = [key for key in ("y", "u", "r") if getattr(record, key) is not None]
+    names = [record.names.get(key, key) for key in keys]
+    labels = [
+        with_unit(name if names.count(name) == 1 else key, record.units.get(key, ""))
+        for key, name in zip(keys, names, strict=True)
+    ]
+    return ct.TimeResponseData(
+        record.t, np.array(record.y)[None, :],
+        inputs=np.array([getattr(record, key) for key in keys[1:]]), output_labels=labels[:1],
+        input_labels=labels[1:], sysname=record.name or None,
+    )  # fmt: skip
+
+
+def _channels(kind: str, labels: Any, values: Any, n: int) -> dict[str, Any]:
+    if values is None:
+        return {}
+    rows = np.reshape(values, (-1, n))
+    names = labels or ([kind] if len(rows) == 1 else [f"{kind}[{k}]" for k in range(len(rows))])
+    return dict(zip(names, rows, strict=True))

@@ -1,0 +1,108 @@
+"""Several records used together: checked to be of one kind, all at once or as they pass."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import chain, islice
+from typing import Any
+
+import numpy as np
+
+from .._base.errors import CtrlidError
+from .record import Record
+
+VISIBLE_MOTION = 0.1  # of its spread a period: an input that moves more is not held
+
+
+def as_records(data: Any) -> tuple[Record, ...]:
+    """Return one or several records as a tuple, checked to be of one kind.
+
+    Parameters
+    ----------
+    data : Record or sequence of Record
+        The experiments.
+
+    Returns
+    -------
+    tuple of Record
+        The same records.
+
+    Raises
+    ------
+    CtrlidError
+        If something else is among them, or sampling period or hold differ.
+    """
+    records = (data,) if isinstance(data, Record) else data
+    if not isinstance(records, list | tuple):
+        raise CtrlidError(f"a Record or a list of Records is needed; given {type(data).__name__}. "
+                          "Make one with Record(u=, y=, dt=) or Record.from_csv(path)")  # fmt: skip
+    strangers = [type(item).__name__ for item in records if not isinstance(item, Record)]
+    if strangers or not records:
+        what = f"has {', '.join(strangers)}" if strangers else "is empty"
+        raise CtrlidError(f"a Record or a list of Records is needed; the list given {what}")
+    for record in records[1:]:
+        _same_kind(records[0], record)
+    return tuple(records)
+
+
+def stream_records(data: Any) -> tuple[Record, Iterable[Record]]:
+    """Return the first record and all of them, checked to be of one kind as they pass.
+
+    Parameters
+    ----------
+    data : Record or iterable of Record
+        The experiments; an iterator is read once.
+
+    Returns
+    -------
+    first : Record
+        The first record.
+    records : iterable of Record
+        All records, the first one too.
+
+    Raises
+    ------
+    CtrlidError
+        As `as_records`, for what an iterator yields when it yields it.
+    """
+    if not isinstance(data, Iterator):
+        records = as_records(data)
+        return records[0], records
+    first = as_records(list(islice(data, 1)))[0]
+    return first, chain([first], _checked(first, data))
+
+
+def _checked(first: Record, rest: Iterator[Any]) -> Iterator[Record]:
+    for record in rest:
+        as_records([record])
+        _same_kind(first, record)
+        yield record
+
+
+def _same_kind(first: Record, record: Record) -> None:
+    # Periods read from printed times differ by their last digits.
+    if abs(record.dt - first.dt) > 1e-6 * first.dt or record.hold != first.hold:
+        raise CtrlidError(
+            "records used together need one sampling period and one hold; given "
+            f"{first.dt:g} s {first.hold} and {record.dt:g} s {record.hold}. Decimate the "
+            "faster one, or give both the hold that is nearer the truth"
+        )
+
+
+def input_motion(records: Sequence[Record]) -> float:
+    """Return how far u moves from sample to sample where it is not held, as share of its spread.
+
+    Parameters
+    ----------
+    records : sequence of Record
+        The experiments.
+
+    Returns
+    -------
+    float
+        Zero for held inputs; above `VISIBLE_MOTION` a hold assumption shows in the poles.
+    """
+    shares = [0.0]
+    for record in records:
+        spread = float(np.std(record.u))
+        if record.hold == "foh" and spread:
+            shares.append(float(np.std(np.diff(record.u))) / spread)
+    return max(shares)

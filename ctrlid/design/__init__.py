@@ -1,0 +1,1 @@
+"""Margins, lead compensators, and a controller redesigned on a model."""

@@ -1,0 +1,321 @@
+"""redesign(): a controller designed on an identified model, and what it does on the physics."""
+
+import math
+from dataclasses import dataclass, replace
+from numbers import Real
+from typing import Any
+
+import control as ct
+import numpy as np
+
+from .._base.errors import CtrlidError
+from .._base.text import Printed, polynomial, quantity
+from ..estimation.identified_model import IdentifiedModel
+from ..loop.loop import Loop
+from ..loop.period_map import growth_rate
+from ..loop.simulation import SimulationStopped, simulate
+from ..physics.equations import Array
+from ..physics.trace import timebase
+from .lead import design_lead
+from .margins import loop_margins, nu_gap, robust_margin
+
+SETTLED = 0.02  # band around the final value
+LOST = 20  # times the promised response: no longer under control
+CLOSE = 0.25  # share of a promised phase margin whose loss is worth a word
+
+
+@dataclass(frozen=True)
+class Performance:
+    """What a controller promises on a model, or achieves on the physics.
+
+    A number that does not exist is NaN.
+
+    Parameters
+    ----------
+    stable : bool
+        Whether the closed loop is stable.
+    phase_margin : float
+        Smallest phase margin [deg]; NaN for an unstable loop.
+    gain_margin : float
+        Factor by which the gain may grow; infinite if any may.
+    gain_reduction_margin : float
+        Factor to which the gain may fall, below one: an unstable plant needs its loop gain.
+    crossover : float
+        Gain crossover [rad/s].
+    overshoot : float
+        Of a reference step, in percent of the final value. On the physics the step has a height.
+    settling_time : float
+        Until the step response stays within 2 % of its final value [s]; infinite if it never does.
+    final_value : float
+        Of the output per unit of reference: a lead alone leaves a steady error.
+    """
+
+    stable: bool
+    phase_margin: float
+    gain_margin: float
+    gain_reduction_margin: float
+    crossover: float
+    overshoot: float
+    settling_time: float
+    final_value: float
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Redesign(Printed):
+    """A controller designed on a model, with the promise and what came of it.
+
+    Parameters
+    ----------
+    controller : control.TransferFunction
+        The lead compensator, in the time base of the model.
+    promised, achieved : Performance
+        On the model, and on the nonlinear physics of the loop.
+    nu_gap : float
+        Distance [1] between the model and the linearized physics (0 the same, 1 worlds apart).
+    robust_margin : float
+        Nu-gap [1] that the design is sure to survive.
+    loop : Loop
+        The physics with the new controller.
+    time : ndarray
+        Time of the step responses [s].
+    promised_step, achieved_step : ndarray
+        Responses to a step of the reference by 1 [output unit per output unit]; what was achieved
+        ends early where the simulation broke off.
+    step : float
+        Height of the reference step that was tried on the physics [output unit].
+    failure : str
+        Why the physics was not kept stable, or empty.
+    """
+
+    controller: Any
+    promised: Performance
+    achieved: Performance
+    nu_gap: float
+    robust_margin: float
+    loop: Loop
+    time: Array
+    promised_step: Array
+    achieved_step: Array
+    step: float
+    failure: str = ""
+
+    @property
+    def stable(self) -> bool:
+        """Whether the controller keeps the physics stable."""
+        return self.achieved.stable
+
+    @property
+    def verdict(self) -> str:
+        """The outcome in words."""
+        p, a = self.promised, self.achieved
+        if not a.stable and not np.isfinite(a.phase_margin):
+            return (
+                "The controller DOES NOT KEEP THE PHYSICS STABLE: the model is too far from it. "
+                + self.failure
+            )
+        text = (f"Promised {p.phase_margin:.1f} deg at {p.crossover:.4g} rad/s, achieved "
+                f"{a.phase_margin:.1f} deg at {a.crossover:.4g} rad/s on the physics")  # fmt: skip
+        loss = p.phase_margin - a.phase_margin
+        shift = a.crossover / p.crossover - 1
+        if loss > CLOSE * p.phase_margin:
+            text += f": {loss:.1f} DEGREES OF THE PROMISE ARE LOST."
+        elif abs(shift) > CLOSE:
+            text += f": the margin holds, but THE CROSSOVER IS OFF BY {100 * shift:+.0f} %."
+        else:
+            worst = max(loss / p.phase_margin, abs(shift))
+            text += f": the promise holds within {max(math.ceil(100 * worst), 1)} %."
+        if not a.stable:
+            text += (f" That is for small signals: A STEP OF {self.step:.3g} LOSES CONTROL. "
+                     f"{self.failure}")  # fmt: skip
+        elif np.isfinite(p.settling_time) and not np.isfinite(a.settling_time):
+            text += (f" That is for small signals: A STEP OF {self.step:.3g} DOES NOT SETTLE, it "
+                     "meets limits or leaves the nearly linear range.")  # fmt: skip
+        sure = "guaranteed" if self.nu_gap < self.robust_margin else "not guaranteed"
+        return (
+            f"{text} Stability near the operating point is {sure} by the nu-gap "
+            f"({self.nu_gap:.3f} against a robust margin of {self.robust_margin:.3f})."
+        )
+
+    @property
+    def rows(self) -> tuple[tuple[str, str, str], ...]:
+        """Return quantity, promised and achieved value as printed, row by row."""
+        made = []
+        for label, name, form in (
+            ("phase margin [deg]", "phase_margin", ".2f"),
+            ("gain margin [factor]", "gain_margin", ".3f"),
+            ("gain reduction margin [factor]", "gain_reduction_margin", ".3f"),
+            ("crossover [rad/s]", "crossover", ".2f"),
+            ("final value per step", "final_value", ".3f"),
+            ("overshoot [%]", "overshoot", ".2f"),
+            ("settling time [s]", "settling_time", ".4f"),
+        ):
+            promised, achieved = (
+                "-" if np.isnan(v) else f"{v:{form}}"
+                for v in (getattr(self.promised, name), getattr(self.achieved, name))
+            )
+            made.append((label, promised, achieved))
+        return tuple(made)
+
+    def __str__(self) -> str:
+        rows = [
+            f"  {a:<32}{b:>12}{c:>12}" for a, b, c in (("", "promised", "achieved"), *self.rows)
+        ]
+        variable = "z" if self.controller.dt else "s"
+        num, den = (polynomial(p[0][0], variable)
+                    for p in (self.controller.num, self.controller.den))  # fmt: skip
+        loop = self.loop
+        unit = getattr(loop.plant, "units", {}).get(loop.equations().outputs[0], "")
+        step = (f"  The last three were achieved with a step of {quantity(self.step, unit)} on the "
+                "nonlinear physics; a smaller step= comes nearer to the promise.")  # fmt: skip
+        return "\n".join([f"controller: ({num}) / ({den})", *rows, step, "  " + self.verdict])
+
+
+def redesign(
+    G: Any, loop: Loop, crossover: float, phase_margin: float, *, step: float | None = None
+) -> Redesign:
+    """Design a lead on a model and try it on the physics of a loop.
+
+    The controller is `design_lead` on `G`. Its promise is that of the linear loop with `G`. What it
+    achieves is measured on the loop's own plant: margins on the plant linearized at the
+    operating point (and sampled, for a digital controller), step response on the nonlinear
+    equations, within the loop's input limits.
+
+    Parameters
+    ----------
+    G : control.TransferFunction
+        The model, for instance an `IdentifiedModel`. A model in discrete time gives a digital
+        controller at its sampling period, a continuous one an analog controller.
+    loop : Loop
+        The physics and its operating point; its own controller is not used.
+    crossover : float
+        Gain crossover to design for [rad/s].
+    phase_margin : float
+        Phase margin to design for [deg].
+    step : float, optional
+        Height of the reference step [output unit]; by default 1 % of the output at the operating
+        point.
+
+    Returns
+    -------
+    Redesign
+        Controller, promise, achievement and a verdict in words as its text.
+
+    Raises
+    ------
+    CtrlidError
+        If one lead cannot do it on this model, or the arguments do not fit.
+
+    References
+    ----------
+    Vinnicombe, "Frequency domain uncertainty and the graph topology", IEEE Transactions on
+    Automatic Control 38 (1993) 1371-1383.
+
+    Examples
+    --------
+    >>> import ctrlid as cid
+    >>> plant = cid.plants.maglev(m=0.0213, K=3.34e-6)
+    >>> op = cid.operating_point(plant, output=0.012)
+    >>> loop = cid.Loop(plant, None, dt=0.001, at=op)
+    >>> outcome = cid.redesign(cid.linearize(plant, op), loop, crossover=100, phase_margin=50)
+    >>> outcome.stable, round(outcome.achieved.phase_margin, 6)
+    (True, 50.0)
+    """
+    if not isinstance(G, ct.TransferFunction | ct.StateSpace):
+        raise CtrlidError("redesign needs a linear model (a TransferFunction, as the fits return); "
+                          f"given {type(G).__name__}")  # fmt: skip
+    if not isinstance(loop, Loop):
+        raise CtrlidError(f"redesign tries the controller on a Loop; given {type(loop).__name__}")
+    # A plain transfer function, whatever the fit carried along, but its delay.
+    G = G.with_delay() if isinstance(G, IdentifiedModel) else ct.tf(G)
+    C = design_lead(G, crossover=crossover, phase_margin=phase_margin)
+    dt = timebase(G)
+    trial = replace(loop, controller=C, dt=dt or loop.dt)
+    P = loop.linearize()
+    if dt and not timebase(P):
+        P = _sampled(P, dt)
+    height = _height(loop, step)
+    # Long enough for the slowest promised pole, at the resolution of the loop.
+    length = int(np.clip(60 / (crossover * trial.dt), 20, 50_000))
+    time: Array = np.arange(length, dtype=float) * trial.dt
+    promised_step = _linear_step(G, C, time)
+    achieved_step, failure = _physical_step(trial, height, promised_step)
+    promised = _performance(loop_margins(G * C), time, promised_step)
+    margins = loop_margins(P * C)
+    growth = growth_rate(trial)
+    if growth >= 0 or not margins.stable:
+        achieved = Performance(False, *(float("nan"),) * 7)
+        if "deviations grow" not in failure:
+            # Dry friction holds what is at rest; the loop around it may be unstable all the same.
+            why = (f"Small deviations grow at {growth:.3g} 1/s." if growth >= 0 else
+                   "Friction aside, the loop is unstable.")  # fmt: skip
+            failure = f"{why} {failure}".strip()
+    else:
+        achieved = _performance(margins, time, np.empty(0) if failure else achieved_step)
+        achieved = replace(achieved, stable=not failure)
+    # The model has gain 1 at the crossover, so that volts per metre do not matter.
+    omega = np.exp(1j * crossover * dt) if dt else 1j * crossover
+    unit = float(np.abs(G(omega)))
+    return Redesign(C, promised, achieved, nu_gap(G / unit, P / unit),
+                    robust_margin(G / unit, C * unit), trial, time, promised_step, achieved_step,
+                    height, failure)  # fmt: skip
+
+
+def _sampled(P: Any, dt: float) -> Any:
+    """Return the zero-order-hold equivalent; through state space, which leaves no dust."""
+    return ct.tf(ct.sample_system(ct.ss(ct.tf(P.num, P.den)), dt, "zoh"))
+
+
+def _height(loop: Loop, step: float | None) -> float:
+    if step is None:
+        return 0.01 * abs(loop.point.output) or 0.01
+    if not isinstance(step, Real) or not np.isfinite(float(step)) or step == 0:
+        raise CtrlidError(f"step is the height of the reference step in output units, not zero; "
+                          f"given {step!r}")  # fmt: skip
+    return float(step)
+
+
+def _linear_step(G: Any, C: Any, time: Array) -> Array:
+    closed = ct.feedback(G * C, 1)
+    return np.asarray(ct.forced_response(ct.ss(closed), time, np.ones(len(time))).outputs, float)
+
+
+def _physical_step(loop: Loop, height: float, promised: Array) -> tuple[Array, str]:
+    """Return the response to a step less that to no step, per unit of reference."""
+    rest: Array = np.full(len(promised), loop.point.output)
+    try:
+        still = simulate(loop, rest)
+    except CtrlidError as reason:
+        return np.empty(0), _sentence(reason)
+    try:
+        moved = simulate(loop, rest + height)
+    except SimulationStopped as reason:
+        return (reason.y - still.y[: len(reason.y)]) / height, _sentence(reason)
+    response: Array = np.asarray((moved.y - still.y) / height, dtype=float)
+    far = np.abs(response) > LOST * np.max(np.abs(promised))
+    if not far.any():
+        return response, ""
+    k = int(np.argmax(far))
+    text = f"After {k * loop.dt:.4g} s {moved.names['y']} had run away to {moved.y[k]:.4g}"
+    lower, upper = loop.input_limits
+    if np.any(moved.u[: k + 1] <= lower) or np.any(moved.u[: k + 1] >= upper):
+        text += f", with {moved.names['u']} at its limit ({lower:g}..{upper:g})"
+    return response[: k + 1], text + "."
+
+
+def _sentence(reason: CtrlidError) -> str:
+    text = str(reason)
+    return text[0].upper() + text[1:] + "."
+
+
+def _performance(margins: Any, time: Array, response: Array) -> Performance:
+    overshoot = settling = final = float("nan")
+    if margins.stable and response.size:
+        final = float(np.mean(response[-max(len(response) // 20, 1) :]))
+        if final:
+            overshoot = max(0.0, 100 * (float(np.max(response / final)) - 1))
+            outside = np.flatnonzero(np.abs(response / final - 1) > SETTLED)
+            last = int(outside[-1]) + 1 if outside.size else 0
+            settling = float(time[last]) if last < len(time) else float("inf")
+    return Performance(margins.stable, margins.phase_margin, margins.gain_margin,
+                       margins.gain_reduction_margin, margins.crossover, overshoot, settling,
+                       final)  # fmt: skip

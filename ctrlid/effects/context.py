@@ -1,0 +1,168 @@
+"""What the formula of an effect sees: the signals of the loop at one moment."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import casadi
+import numpy as np
+
+from .._base.errors import CtrlidError
+from ..physics.equations import Equations
+from ..physics.linearization import OperatingPoint
+from ..physics.symbols import Symbol
+
+SHARPEST = 1e-12  # of a velocity unit (or whatever has the kink): keeps derivatives finite
+INSTANT = 1e-6  # of a sampling period: a shorter lag is none
+FARTHEST = 1e30  # stands for an infinite distance to a limit
+
+
+@dataclass(frozen=True)
+class Follow:
+    """The rate of a state that follows `target` as a first-order lag."""
+
+    target: Any
+    time_constant: Any
+    shortest: float
+
+
+def motion(e: Equations) -> tuple[int, int] | None:
+    """Return the indices of the position and the velocity that forces act on, None without any.
+
+    Of several moving masses it is the one whose position the output shows, else the first.
+    """
+    if e.dt:
+        return None
+    shown = casadi.jacobian(e.output, e.x).sparsity().get_col()
+    own = len(e.states) - len(e.rest)
+    pairs = [
+        (i, j)
+        for j in e.velocities
+        for i in range(own)
+        if i != j and casadi.is_equal(casadi.simplify(e.rhs[i]), e.x[j], 2)
+    ]
+    return min(pairs, key=lambda pair: (pair[0] not in shown, pair), default=None)
+
+
+class Moment:
+    """The signals of a loop at one moment, as symbols that understand arithmetic and numpy.
+
+    Attributes
+    ----------
+    t : Symbol
+        Time [s].
+    dt : float
+        Sampling period [s].
+    u, y : Symbol
+        Input and output, as they are before this effect.
+    states : dict of str to Symbol
+        Every state by its name.
+    own : dict of str to Symbol
+        The effect's own states.
+    parameters : dict of str to Symbol
+        Every parameter of the plant by its name.
+    at : OperatingPoint
+        Where deviations are counted from.
+    """
+
+    def __init__(self, e: Equations, at: OperatingPoint, dt: float, own: dict[str, Any]) -> None:
+        self._e = e
+        self.at, self.dt, self.own = at, dt, own
+        self.t: Any = Symbol(e.t)
+        self.u: Any = Symbol(e.u)
+        self.y: Any = Symbol(e.output)
+        self.states: dict[str, Any] = {s: Symbol(e.x[k]) for k, s in enumerate(e.states)}
+        self.parameters: dict[str, Any] = {s: Symbol(e.p[k]) for k, s in enumerate(e.parameters)}
+
+    def _motion(self) -> tuple[int, int]:
+        found = motion(self._e)
+        if found is None:
+            raise CtrlidError(f"{self._e.name} has no moving mass: no state is the rate of another")
+        return found
+
+    @property
+    def position_name(self) -> str:
+        """Name of the state that is the position of the moving mass."""
+        return self._e.states[self._motion()[0]]
+
+    @property
+    def position(self) -> Any:
+        """Position of the moving mass."""
+        return Symbol(self._e.x[self._motion()[0]])
+
+    @property
+    def velocity(self) -> Any:
+        """Velocity of the moving mass."""
+        return Symbol(self._e.x[self._motion()[1]])
+
+    @property
+    def acceleration(self) -> Any:
+        """Acceleration of the moving mass without this effect."""
+        return Symbol(self._e.rhs[self._motion()[1]])
+
+    @property
+    def deviation(self) -> Any:
+        """Position of the moving mass, counted from where it is at the operating point."""
+        index = self._motion()[0]
+        return Symbol(self._e.x[index] - self.at.states[index])
+
+    def plant_parameter(self, name: str) -> Any:
+        """Return a parameter of the plant, or refuse."""
+        if name not in self.parameters:
+            raise CtrlidError(f"{self._e.name} has no numeric parameter {name!r}; it has "
+                              f"{list(self.parameters)}")  # fmt: skip
+        return self.parameters[name]
+
+    def _variance(self, value: Any, width: Any) -> Any:
+        """Variance of an expression when each state is uncertain by its spread."""
+        slopes = casadi.jacobian(value.sx, self._e.x)
+        width = width.sx if isinstance(width, Symbol) else casadi.SX(float(width))
+        doubt = casadi.mtimes(slopes**2, self._e.spread**2)
+        return doubt + width**2 + SHARPEST**2
+
+    def sign(self, v: Any, width: Any = 0.0) -> Any:
+        r"""Return the sign of an expression, averaged over what a filter does not know of it.
+
+        .. math:: E[\mathrm{sign}(v)] = \mathrm{erf}\left(v / \sqrt{2 (s^2 + w^2)}\right)
+
+        Parameters
+        ----------
+        v : Symbol
+            The expression, usually a velocity. Its standard deviation s follows from those of the
+            states and is zero in a simulation.
+        width : Symbol or float, optional
+            Width w over which the jump is spread in any case [unit of v]. Finer than what happens
+            within one sample anyway it cannot matter.
+
+        Returns
+        -------
+        Symbol
+            Between -1 and 1.
+        """
+        return Symbol(casadi.erf(v.sx / casadi.sqrt(2 * self._variance(v, width))))
+
+    def moving(self, v: Any, width: Any = 0.0) -> Any:
+        r"""Return one where something moves and zero at rest, averaged as in `sign`.
+
+        .. math:: 1 - \frac{w}{\sqrt{s^2 + w^2}}\, e^{-v^2 / 2 (s^2 + w^2)}
+
+        The square of an average would be no average: what turns back and forth moves all the time.
+        """
+        rest, both = self._variance(Symbol(casadi.SX(0.0)), width), self._variance(v, width)
+        share = casadi.sqrt(rest / both) * casadi.exp(-(v.sx**2) / (2 * both))
+        return Symbol(1 - share)
+
+    def abs(self, v: Any, width: Any = 0.0) -> Any:
+        """Return the absolute value of an expression, averaged as in `sign`."""
+        return 2 * self.above(v, width) - v
+
+    def above(self, v: Any, width: Any = 0.0) -> Any:
+        """Return ``max(v, 0)``, averaged as in `sign`."""
+        s = casadi.sqrt(self._variance(v, width))
+        z = casadi.fmax(v.sx, -FARTHEST) / s
+        share = (1 + casadi.erf(z / np.sqrt(2))) / 2
+        density = casadi.exp(-(z**2) / 2) / np.sqrt(2 * np.pi)
+        return Symbol(s * (z * share + density))
+
+    def follow(self, target: Any, time_constant: Any) -> Follow:
+        """Return the rate of a state that is a first-order lag behind `target`."""
+        return Follow(target, time_constant, INSTANT * self.dt)

@@ -1,0 +1,159 @@
+"""Between the controller and the plant: what comes late."""
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any, ClassVar, Self, final
+
+import casadi
+import numpy as np
+
+from .._base.errors import CtrlidError
+from ..physics.equations import Equations, Play
+from ..physics.linearization import OperatingPoint
+from .context import Moment
+from .kinds import InputEffect
+from .parameters import parameter
+from .symbolic import expression
+
+
+@final
+@dataclass(frozen=True)
+class ActuatorLag(InputEffect):
+    r"""The plant's input follows the computed one as a first-order lag.
+
+    .. math:: \tau \dot u_a = u - u_a
+
+    The current in a coil (tau = L/R), an amplifier of finite bandwidth.
+
+    Parameters
+    ----------
+    tau : float
+        Time constant [s].
+
+    Examples
+    --------
+    >>> import ctrlid as cid
+    >>> print(cid.effects.ActuatorLag(tau=0.002))
+    ActuatorLag: tau = 0.002 s
+    """
+
+    tau: float = parameter("s", lower=0.0, neutral=0.0)
+
+    stage: ClassVar[int] = 4
+    states: ClassVar[tuple[str, ...]] = ("input",)
+    look_alikes: ClassVar[tuple[str, ...]] = ("InputDelay", "SensorLag")
+    sentence: ClassVar[str] = "The actuator reaches the commanded value only after a while."
+    experiment: ClassVar[str] = (
+        "large jumps of the input: a lag of the actuator acts ahead of the plant's curves, a lag "
+        "of the sensor behind them, and a delay has no tail"
+    )
+
+    @classmethod
+    def candidates(cls, loop: Any, record: Any = None) -> tuple[Self, ...]:
+        """Return a lag of one sampling period: at zero there is no derivative to go by."""
+        del record
+        return cls._applicable(loop, cls(tau=loop.dt))
+
+    def rates(self, m: Moment) -> tuple[Any, ...]:
+        """Return the lag."""
+        return (m.follow(m.u, self.tau),)
+
+    def rest(self, at: OperatingPoint) -> tuple[float, ...]:
+        """Return the input at rest."""
+        return (at.input,)
+
+    def input(self, m: Moment) -> Any:
+        """Return the lagging input."""
+        return m.own["input"]
+
+
+@final
+@dataclass(frozen=True)
+class InputDelay(InputEffect):
+    r"""The computed input arrives late.
+
+    .. math:: u_a(t) = u(t - \theta)
+
+    Computation time, a bus, a conversion. A delay of the output cannot be told from it.
+
+    Parameters
+    ----------
+    delay : float
+        The delay [s], on top of the one that a sampled loop has anyway; any fraction of a period.
+
+    Examples
+    --------
+    >>> import ctrlid as cid
+    >>> cid.effects.InputDelay(delay=0.0005).neutral
+    False
+    """
+
+    delay: float = parameter("s", lower=0.0, neutral=0.0)
+
+    stage: ClassVar[int] = 6
+    look_alikes: ClassVar[tuple[str, ...]] = ("SensorLag", "ActuatorLag", "ViscousFriction")
+    sentence: ClassVar[str] = "The input takes effect a fixed time after it was computed."
+    experiment: ClassVar[str] = (
+        "fast excitation: the phase of a delay goes on falling with frequency where that of a lag "
+        "levels off"
+    )
+
+    @classmethod
+    def candidates(cls, loop: Any, record: Any = None) -> tuple[Self, ...]:
+        """Return a delay of half a period: at zero the derivative has one side only."""
+        del record
+        return cls._applicable(loop, cls(delay=0.5 * loop.dt))
+
+    def build(self, e: Equations, m: Moment) -> Equations:
+        """Return the equations with this delay on top of what there is."""
+        delay = expression(self.delay)
+        return dataclasses.replace(e, delay=delay if e.delay is None else e.delay + delay)
+
+
+@final
+@dataclass(frozen=True)
+class InputBacklash(InputEffect):
+    r"""Play between the actuator and the plant.
+
+    .. math:: m_{k} = \min(\max(m_{k-1}, u_k - w/2), u_k + w/2), \quad u_a = m_k
+
+    The applied input moves only once the computed one has crossed the gap.
+
+    Parameters
+    ----------
+    width : float
+        Full width w of the gap [input unit].
+
+    Examples
+    --------
+    >>> import ctrlid as cid
+    >>> cid.effects.InputBacklash(width=0.2).place
+    'input'
+    """
+
+    width: float = parameter("{u}", lower=0.0, neutral=0.0)
+
+    stage: ClassVar[int] = 7
+    in_linear_model: ClassVar[bool] = False
+    look_alikes: ClassVar[tuple[str, ...]] = ("InputDeadZone", "InputDelay", "CoulombFriction")
+    sentence: ClassVar[str] = "When the input turns round, it first has to cross a gap."
+    experiment: ClassVar[str] = (
+        "slow triangles of several sizes: play opens a loop of constant width whatever the size"
+    )
+
+    @classmethod
+    def candidates(cls, loop: Any, record: Any = None) -> tuple[Self, ...]:
+        """Return a gap of a tenth of the range of the recorded input."""
+        reach = 0.1 * max(abs(loop.point.input), 1.0)
+        if record is not None:
+            reach = 0.1 * float(np.ptp(record.u))
+        return cls._applicable(loop, cls(width=reach))
+
+    def build(self, e: Equations, m: Moment) -> Equations:
+        """Return the equations with the play ahead of them."""
+        if e.play is not None:
+            raise CtrlidError("there is a backlash already; one loop takes a single InputBacklash")
+        memory, u = casadi.SX.sym("m"), casadi.SX.sym("u")
+        half = expression(self.width) / 2
+        after = casadi.fmin(casadi.fmax(memory, u - half), u + half)
+        return dataclasses.replace(e, play=Play(memory, u, after, after, u, half))

@@ -1,0 +1,110 @@
+"""Where an effect acts: one base class a place, each with one method to write."""
+
+import dataclasses
+from typing import Any, ClassVar
+
+import casadi
+
+from .._base.errors import CtrlidError
+from ..physics.equations import Equations
+from ..physics.symbols import Symbol
+from .base import AbstractEffect, Place, require_motion
+from .context import Moment
+from .symbolic import expression, substituted, traced
+
+
+class LawEffect(AbstractEffect):
+    """A change inside the plant's own law: a parameter or a state is seen differently."""
+
+    place: ClassVar[Place] = "law"
+    stage: ClassVar[int] = 0
+
+    def law(self, m: Moment) -> dict[str, Any]:
+        """Return what the plant sees in place of parameters or states, by their names."""
+        raise NotImplementedError
+
+    def build(self, e: Equations, m: Moment) -> Equations:
+        """Return the equations with the law's parameters and states replaced.
+
+        A state is seen differently by the rates only: the output still shows what it is.
+        """
+        seen = traced(self.law)(m)
+        known = {**m.states, **m.parameters}
+        unknown = [name for name in seen if name not in known]
+        if unknown:
+            raise CtrlidError(
+                f"{type(self).__name__} changes {unknown[0]!r}, but {e.name} has the states "
+                f"{list(e.states)} and the numeric parameters {list(e.parameters)}"
+            )
+        for name, value in seen.items():
+            old, new = known[name].sx, expression(value)
+            output = e.output if name in m.states else casadi.substitute(e.output, old, new)
+            e = dataclasses.replace(substituted(e, old, new), output=output)
+        return e
+
+
+class ForceEffect(AbstractEffect):
+    """A force on the moving mass, as the acceleration that it causes."""
+
+    place: ClassVar[Place] = "force"
+    stage: ClassVar[int] = 1
+
+    def force(self, m: Moment) -> Any:
+        """Return the acceleration of the moving mass [output unit/s^2]."""
+        raise NotImplementedError
+
+    def build(self, e: Equations, m: Moment) -> Equations:
+        """Return the equations with the force added to the rate of the velocity."""
+        _, j = require_motion(self, e)
+        rhs = casadi.SX(e.rhs)
+        rhs[j] = rhs[j] + expression(traced(self.force)(m))
+        return dataclasses.replace(e, rhs=rhs)
+
+
+class InputEffect(AbstractEffect):
+    """Something between the computed input and what reaches the plant."""
+
+    place: ClassVar[Place] = "input"
+    stage: ClassVar[int] = 5
+
+    def input(self, m: Moment) -> Any:
+        """Return the input that is applied [input unit]."""
+        raise NotImplementedError
+
+    def build(self, e: Equations, m: Moment) -> Equations:
+        """Return the equations with the applied input in place of the computed one."""
+        return substituted(e, e.u, expression(traced(self.input)(m)))
+
+
+class OutputEffect(AbstractEffect):
+    """Something between the plant's output and the sensor's noise."""
+
+    place: ClassVar[Place] = "output"
+    stage: ClassVar[int] = 8
+
+    def output(self, m: Moment) -> Any:
+        """Return the output that the sensor shows [output unit]."""
+        raise NotImplementedError
+
+    def build(self, e: Equations, m: Moment) -> Equations:
+        """Return the equations with the new output."""
+        return dataclasses.replace(e, output=expression(traced(self.output)(m)))
+
+
+class ReadingEffect(AbstractEffect):
+    """What happens to a reading after the sensor's noise is in it."""
+
+    place: ClassVar[Place] = "output"
+    stage: ClassVar[int] = 9
+
+    def read(self, m: Moment) -> Any:
+        """Return what is recorded of the noisy reading ``m.y`` [output unit]."""
+        raise NotImplementedError
+
+    def build(self, e: Equations, m: Moment) -> Equations:
+        """Return the equations with the readout appended to what there is."""
+        reading = casadi.SX.sym("reading") if e.reading is None else e.reading
+        m.y = Symbol(reading if e.readout is None else e.readout)
+        return dataclasses.replace(
+            e, reading=reading, readout=expression(traced(self.read)(m))
+        )  # fmt: skip

@@ -1,0 +1,1 @@
+"""Models from records: what a fit returns, and the estimators."""

@@ -1,0 +1,437 @@
+"""What a fit returns: a python-control transfer function that knows how well it is known."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import control
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import binom
+from scipy.stats import t as student_t
+
+from .._base import text as _text
+from .._base.errors import CtrlidError
+
+FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+PAIRS = ("ReciprocalPoles", "SymmetricPoles")  # constraints that say that a plant is unstable
+
+
+@dataclass(frozen=True)
+class Structure:
+    """Orders of a transfer function and the names of its coefficients.
+
+    ``domain="z"``: ``A(z) = z^na + a1 z^(na-1) + ... + a_na``, and
+    ``b1 z^-nk + ... + b_nb z^-(nk+nb-1)`` over ``1 + a1 z^-1 + ... + a_na z^-na``.
+
+    ``domain="s"``: ``b1 s^(nb-1) + ... + b_nb`` over ``s^na + a1 s^(na-1) + ... + a_na``; ``nk``
+    plays no part.
+
+    Parameters
+    ----------
+    na, nb : int
+        Number of denominator and of numerator coefficients.
+    nk : int
+        Delay from input to output in samples.
+    domain : {"z", "s"}
+        Sampled or continuous time.
+
+    Examples
+    --------
+    >>> Structure(na=2, nb=2).names
+    ('a1', 'a2', 'b1', 'b2')
+    """
+
+    na: int
+    nb: int
+    nk: int = 1
+    domain: Literal["z", "s"] = "z"
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the coefficients, in the order of the vector theta of the paper's (7)."""
+        a = (f"a{i}" for i in range(1, self.na + 1))
+        b = (f"b{i}" for i in range(1, self.nb + 1))
+        return (*a, *b)
+
+    def vector(self, weights: Mapping[str, float], who: str = "A constraint") -> FloatArray:
+        """Weights by coefficient name as a ``(na + nb,)`` vector; unknown names are refused."""
+        row = np.zeros(len(self.names))
+        for name, weight in weights.items():
+            if name not in self.names:
+                raise CtrlidError(
+                    f"{who} speaks of {name!r}, but this model has no such coefficient: "
+                    f"it has {', '.join(self.names)}."
+                )
+            row[self.names.index(name)] = weight
+        return row
+
+    def fraction(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Numerator and denominator in falling powers of z (or s)."""
+        denominator = np.concatenate([[1.0], theta[: self.na]])
+        numerator = np.asarray(theta[self.na :], dtype=float)
+        if self.domain == "s":
+            return numerator, denominator
+        # Both polynomials in z^-1 are multiplied by the same z^m.
+        m = max(self.na, self.nk + self.nb - 1)
+        numerator = np.concatenate([numerator, np.zeros(m - self.nk - self.nb + 1)])
+        return numerator, np.concatenate([denominator, np.zeros(m - self.na)])
+
+
+@dataclass(frozen=True)
+class ActiveBound:
+    """An inequality on which the estimate sits.
+
+    Parameters
+    ----------
+    row : str
+        The inequality, for instance ``"a1 <= -2"``.
+    constraint : str
+        The constraint it comes from, as the user wrote it.
+    quantity : str
+        What is bounded, for instance ``"a1"``.
+    bound : float
+        The value it is held at.
+    free : float
+        The value it would take if no inequality held it back; NaN where that is not known.
+    """
+
+    row: str
+    constraint: str
+    quantity: str
+    bound: float
+    free: float
+
+    def __str__(self) -> str:
+        return f"{self.row} [{self.constraint}]"
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
+class Estimate(_text.Printed):
+    """Coefficients of a fitted model, their uncertainty, and how they were found.
+
+    The covariance is ``sigma^2 Z (Z' R'R Z)^-1 Z'`` with ``Z`` the directions that the constraints
+    leave free, and R what the estimator of `method` regresses on. Those of `fit_arx` hold only if
+    the equation error is white (uncorrelated from sample to sample): in closed loop with sensor
+    noise it is not, the coefficients are biased as well, and the standard errors are too small.
+    Those of `fit_iv` and `fit_continuous` hold under feedback.
+
+    Parameters
+    ----------
+    structure : Structure
+        Orders and names of the coefficients.
+    values : (p,) array
+        The coefficients ``a1 .. a_na, b1 .. b_nb``.
+    covariance : (p, p) array
+        Their covariance, in products of their units; zero for what a constraint or an active bound
+        fixes.
+    intercepts : (records,) array
+        The constant of each record, in units of the output.
+    rss, residual_variance : float
+        Sum of squared equation errors, and that divided by the degrees of freedom.
+    n_samples, degrees_of_freedom : int
+        Rows used, and rows less what was estimated.
+    active_bounds : tuple of ActiveBound
+        The inequalities on which the estimate sits.
+    branch : str
+        Which alternative won where a constraint has several, for instance ``"a1 <= -2"``.
+    method, solver : str
+        What was minimised, and by which road the minimum was found and checked.
+    dt : float
+        Sampling period in seconds; 0 for a continuous model, as in python-control.
+    condition : float
+        Condition number of the scaled regression that was solved.
+    notes : tuple of str
+        What the user should know before believing the numbers.
+    """
+
+    structure: Structure
+    values: FloatArray
+    covariance: FloatArray
+    intercepts: FloatArray
+    rss: float
+    residual_variance: float
+    n_samples: int
+    degrees_of_freedom: int
+    active_bounds: tuple[ActiveBound, ...] = ()
+    branch: str = ""
+    method: str
+    solver: str
+    dt: float
+    condition: float
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        for field in ("values", "covariance", "intercepts"):
+            array = np.array(getattr(self, field), dtype=float)
+            array.setflags(write=False)
+            object.__setattr__(self, field, array)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the coefficients."""
+        return self.structure.names
+
+    @property
+    def active(self) -> tuple[str, ...]:
+        """The inequalities on which the estimate sits, by name."""
+        return tuple(str(bound) for bound in self.active_bounds)
+
+    @property
+    def standard_errors(self) -> FloatArray:
+        """Standard errors of the coefficients, valid for white equation error only."""
+        return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+
+    def __getitem__(self, name: str) -> float:
+        return float(self.values[self._index(name)])
+
+    def _index(self, name: str) -> int:
+        if name not in self.names:
+            raise CtrlidError(f"No coefficient {name!r}: this model has {', '.join(self.names)}.")
+        return self.names.index(name)
+
+    def confidence_interval(self, name: str, level: float = 0.95) -> tuple[float, float]:
+        """Interval that covers a coefficient with the given probability (Student's t).
+
+        Parameters
+        ----------
+        name : str
+            Coefficient, for instance ``"a1"``.
+        level : float
+            Probability, between 0 and 1.
+
+        Returns
+        -------
+        lower, upper : float
+            Both equal to the value where a constraint fixes the coefficient.
+        """
+        if not 0.0 < level < 1.0:
+            raise CtrlidError(f"A confidence level lies between 0 and 1; given {level!r}.")
+        i = self._index(name)
+        half = float(student_t.ppf(0.5 + level / 2, self.degrees_of_freedom))
+        half *= float(self.standard_errors[i])
+        return self[name] - half, self[name] + half
+
+    @property
+    def _shifted_poles(self) -> ComplexArray:
+        """Roots of A(1 + x): poles near z = 1, where fast sampling puts them, stay accurate."""
+        _, a = self.structure.fraction(self.values)
+        a = a[: self.structure.na + 1]
+        if self.structure.domain == "s":
+            return np.roots(a).astype(complex)
+        n = self.structure.na
+        power = np.arange(n + 1)
+        # Column i of the Taylor shift holds the coefficients of (1 + x)^i.
+        shifted = binom(power[None, :], power[:, None]) @ a[::-1]
+        return np.roots(shifted[::-1]).astype(complex)
+
+    @property
+    def poles(self) -> ComplexArray:
+        """The na roots of A, in z for a sampled model and in s for a continuous one."""
+        return self._shifted_poles + (1.0 if self.structure.domain == "z" else 0.0)
+
+    @property
+    def poles_s(self) -> ComplexArray:
+        """The poles in the s-plane, ``log(z) / dt`` for a sampled model, in rad/s."""
+        if self.structure.domain == "s":
+            return self.poles
+        with np.errstate(divide="ignore"):
+            return np.asarray(np.log1p(self._shifted_poles) / self.dt, dtype=complex)
+
+    @property
+    def poles_standard_errors(self) -> FloatArray:
+        """Standard errors of ``poles`` by the delta method.
+
+        ``dz/da_i = -z^(na-i) / A'(z)``. For a complex pole it is the root of the summed variances
+        of its two parts. Where poles coincide there is no first-order answer: infinite, unless
+        the denominator is fixed.
+        """
+        na = self.structure.na
+        return root_errors(self.poles, self.covariance[:na, :na])
+
+    @property
+    def poles_s_standard_errors(self) -> FloatArray:
+        """Standard errors of ``poles_s`` by the delta method, in rad/s."""
+        if self.structure.domain == "s":
+            return self.poles_standard_errors
+        with np.errstate(divide="ignore", invalid="ignore"):
+            errors: FloatArray = self.poles_standard_errors / (np.abs(self.poles) * self.dt)
+        return errors
+
+    def __str__(self) -> str:
+        return _report(self)
+
+
+def root_errors(roots: ComplexArray, covariance: FloatArray) -> FloatArray:
+    """Return the standard errors of the roots of a monic polynomial, by the delta method.
+
+    Parameters
+    ----------
+    roots : (n,) array
+        Its roots.
+    covariance : (n, n) array
+        Covariance of its coefficients after the leading 1, in falling powers.
+
+    Returns
+    -------
+    (n,) array
+        Standard errors; infinite where roots coincide, unless all coefficients are fixed.
+    """
+    n = len(roots)
+    if not covariance.any():
+        return np.zeros(n)
+    errors = np.empty(n)
+    for k in range(n):
+        slope = np.prod(roots[k] - np.delete(roots, k))
+        if slope == 0:
+            errors[k] = np.inf
+            continue
+        gradient = -(roots[k] ** np.arange(n - 1, -1, -1)) / slope
+        errors[k] = np.sqrt(max(float((gradient.conj() @ covariance @ gradient).real), 0.0))
+    return errors
+
+
+def _report(e: Estimate) -> str:
+    """Lines of text: normal facts in normal case, bad news in capitals."""
+    held = {bound.quantity for bound in e.active_bounds}
+    lines = [f"{e.method}: {e.n_samples} rows" + (f", dt = {e.dt:g} s" if e.dt else "")]
+    for name, value, error in zip(e.names, e.values, e.standard_errors, strict=True):
+        if name in held:
+            lines.append(f"  {name} = {value:.10g} (on its bound)")
+        elif error == 0:
+            lines.append(f"  {name} = {value:.10g} (fixed)")
+        else:
+            lines.append(f"  {name} = {_text.with_error(value, error)}")
+    if e.branch:
+        lines.append(f"  branch: {e.branch}")
+    pairs = zip(e.poles, e.poles_standard_errors, e.poles_s, e.poles_s_standard_errors, strict=True)
+    for z, dz, s, ds in pairs:
+        pole = f"  pole at s = {_text.with_error(s, ds)} rad/s"
+        if e.structure.domain == "z":
+            pole = f"  pole at z = {_text.with_error(z, dz)}, s = {_text.with_error(s, ds)} rad/s"
+        lines.append(pole)
+    # Least squares minimises the error of the difference equation, the others that of a prediction.
+    what = "equation error" if "ARX" in e.method else "prediction error"
+    lines.append(f"  {what}: standard deviation {np.sqrt(e.residual_variance):.3g}")
+    lines.append(f"  solved by {e.solver}")
+    lines.append("  active bounds: " + (", ".join(e.active) or "none"))
+    return "\n".join([*lines, *_bad_news(e)])
+
+
+def _bad_news(e: Estimate) -> list[str]:
+    news = [f"  {note}" for note in e.notes]
+    for bound in e.active_bounds:
+        free = f": without {bound.constraint} the data would take it to {bound.free:.7g}"
+        news.append(
+            f"  {bound.quantity} SITS ON ITS BOUND {bound.bound:.10g}"
+            f"{free if np.isfinite(bound.free) else ''}. An active bound is a symptom, not a "
+            "cure: look for noise fed back through the controller, a sampling period that is "
+            "too short, or a constraint that does not hold."
+        )
+    z = e.poles
+    merged = [
+        f"  TWO POLES MERGE at {e.structure.domain} = {_text.number(z[k])}."
+        for k in range(len(z) - 1)
+        if e.active_bounds and np.any(np.abs(z[k + 1 :] - z[k]) < 1e-6)
+    ]
+    news += merged
+    # A merged pair at the edge is known to half the digits only.
+    unstable = np.abs(z) > 1 + 1e-9 if e.structure.domain == "z" else z.real > 0
+    if not unstable.any():
+        edge = "outside the unit circle" if e.structure.domain == "z" else "in the right half plane"
+        if _said_unstable(e):
+            news.append(f"  NO POLE {edge.upper()}.")
+        else:
+            news.append(f"  no pole {edge}: the model is stable.")
+    return news
+
+
+def _said_unstable(e: Estimate) -> bool:
+    """Whether a constraint said that the plant is unstable: a pair ±p has one unstable pole."""
+    return any(bound.constraint.startswith(PAIRS) for bound in e.active_bounds)
+
+
+def delay_of(model: Any) -> float:
+    """Return the delay [s] that an identified model has beside its polynomials, 0 for others."""
+    return model.delay if isinstance(model, IdentifiedModel) else 0.0
+
+
+class IdentifiedModel(control.TransferFunction):
+    """A fitted transfer function that carries its ``.estimate``.
+
+    It is a `control.TransferFunction` and goes wherever one goes (`control.margin`,
+    `control.feedback`, ...). Arithmetic gives plain transfer functions: a product of two fits has
+    no estimate. Copies and pickles keep it.
+
+    Parameters
+    ----------
+    estimate : Estimate
+        Coefficients with their uncertainty.
+    inputs, outputs : str
+        Signal names.
+    name : str
+        Name of the system.
+
+    Attributes
+    ----------
+    delay : float
+        Delay of the input that `fit_continuous` was given or found [s]. A rational function cannot
+        hold it: `compare`, `redesign`, `diagnose` and Bode plots add it, `with_delay` does for
+        everything else.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> estimate = Estimate(
+    ...     structure=Structure(1, 1), values=np.array([-1.1, 0.5]), covariance=np.zeros((2, 2)),
+    ...     intercepts=np.zeros(1), rss=0.0, residual_variance=0.0, n_samples=10,
+    ...     degrees_of_freedom=8, method="by hand", solver="nothing", dt=0.1, condition=1.0)
+    >>> G = IdentifiedModel(estimate)
+    >>> G.estimate["a1"]
+    -1.1
+    >>> type(2 * G).__name__
+    'TransferFunction'
+    """
+
+    estimate: Estimate
+    delay: float = 0.0
+
+    def __init__(
+        self, estimate: Estimate, *, inputs: str = "u", outputs: str = "y", name: str = "identified"
+    ) -> None:
+        num, den = estimate.structure.fraction(estimate.values)
+        super().__init__(num, den, estimate.dt, inputs=inputs, outputs=outputs, name=name)
+        self.estimate = estimate
+
+    def with_delay(self, order: int = 3) -> control.TransferFunction:
+        r"""Return the model with its delay, as a rational function.
+
+        .. math:: G(s)\, e^{-s\tau} \approx G(s)\, P(s)
+
+        with Padé's approximation P, whose phase at the order n is right to a degree up to
+        :math:`\omega \tau \approx n`.
+
+        Parameters
+        ----------
+        order : int, optional
+            Order of the approximation.
+
+        Returns
+        -------
+        control.TransferFunction
+            A plain transfer function; the model itself if it has no delay.
+        """
+        plain = control.tf(self.num, self.den, self.dt)
+        return plain * control.tf(*control.pade(self.delay, order)) if self.delay else plain
+
+    def __str__(self) -> str:
+        text: Any = super().__str__()
+        return f"{text}\n\n{self.estimate}"
+
+    def _repr_html_(self, var: str | None = None) -> str:
+        formula: Any = super()._repr_html_(var)  # as python-control shows every transfer function
+        return f"{formula}\n{_text.html_lines(str(self.estimate))}"

@@ -1,0 +1,1 @@
+"""Physical parameters by maximum likelihood, with an extended Kalman filter."""

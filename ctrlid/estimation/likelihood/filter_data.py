@@ -1,0 +1,102 @@
+"""Records made ready for the filter of a loop: signals, and where it starts and starts anew."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ..._base.errors import CtrlidError
+from ...data.record import Record
+from ...loop.loop import Loop
+from ...physics.equations import Array, Equations
+from ...physics.linearization import state_matrices
+
+FEWEST = 10  # valid samples, to say anything
+BRIDGE = 20  # samples that do not count and are bridged by the model; then it starts afresh
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """A record made ready: signals, and where the filter starts and starts anew."""
+
+    record: Record
+    table: Array  # rows t, u, r, y
+    valid: Any
+    afresh: Any
+    doubt: Array
+    start: Array
+    spread: Array
+    scale: float  # of the sensor noise, roughly
+
+
+def make_track(loop: Loop, record: Record, begin: float = 0.0) -> Track:
+    """Make a record ready for the filter of a loop; `begin` is the time of its first sample.
+
+    Raises
+    ------
+    CtrlidError
+        If the sampling periods differ or too few samples are valid.
+    """
+    if abs(loop.dt - record.dt) > 1e-9 * loop.dt:
+        raise CtrlidError(f"the loop is sampled at {loop.dt:g} s, the record at {record.dt:g} s; "
+                          "give both the same period")  # fmt: skip
+    valid = np.array(record.valid)  # writable as any other: the compiled loop is compiled once
+    if np.count_nonzero(valid) < FEWEST:
+        raise CtrlidError(f"a prediction needs at least {FEWEST} valid samples; the record has "
+                          f"{np.count_nonzero(valid)} of {len(record)}")  # fmt: skip
+    last = np.maximum.accumulate(np.where(valid, np.arange(len(record)), 0))
+    y, u = np.asarray(record.y)[last], np.asarray(record.u)[last]
+    r = y if record.r is None else np.asarray(record.r)[last]
+    start, spread, scale = _start(loop, record)
+    doubt = np.where(valid, 0.0, (np.std(record.u[valid]) / scale) ** 2)
+    return Track(record, np.vstack([begin + record.t - record.start, u, r, y]), valid,
+                 fresh_starts(loop, record), doubt, start, spread, scale)  # fmt: skip
+
+
+def retracked(track: Track, loop: Loop) -> Track:
+    """Return a track made ready for another model of the same loop; the signals are shared."""
+    start, spread, _ = _start(loop, track.record)
+    return replace(track, afresh=fresh_starts(loop, track.record), start=start, spread=spread)
+
+
+def fresh_starts(loop: Loop, record: Record) -> Any:
+    """Return at which samples the filter begins anew: at the start and in long gaps."""
+    e = loop.equations()
+    poles = np.linalg.eigvals(state_matrices(e, loop.point)[0])
+    fastest = np.max(np.abs(poles) if e.dt else np.exp(poles.real * loop.dt), initial=0.0)
+    # An unstable model may bridge as long as its errors grow by less than half.
+    bridge = BRIDGE if fastest <= 1 else min(BRIDGE, int(np.log(1.5) / np.log(fastest)))
+    afresh = np.zeros(len(record), dtype=bool)
+    last = -BRIDGE - 1
+    for first, stop in record.segments():
+        if first - last > bridge:
+            afresh[max(last, 0) : first + 1] = True
+        last = stop
+    if len(record) - last > bridge:
+        afresh[last:] = True
+    return afresh
+
+
+def _start(loop: Loop, record: Record) -> tuple[Array, Array, float]:
+    """Return a state at the operating point that the first samples may overrule.
+
+    With its covariance relative to the sensor noise, and the size of that noise, roughly.
+    """
+    e, at = loop.equations(keep=True), loop.point
+    y = record.y[record.valid]
+    reach = float(np.std(y)) + abs(float(np.mean(y)) - at.output)
+    # Third differences leave little of a smooth output.
+    noise = float(np.std(np.diff(y, 3))) / np.sqrt(20)
+    noise = max(noise, 1e-9 * max(abs(at.output), reach), 1e-300)
+    speed = max(float(np.std(np.diff(y))) / record.dt, noise / record.dt)
+    rest = state_at_rest(loop, e)
+    wide = [max(0.1 * abs(v), reach, noise) for v in rest]
+    for j in e.velocities:
+        wide[j] = speed
+    return np.array(rest), np.diag((np.array(wide) / noise) ** 2), noise
+
+
+def state_at_rest(loop: Loop, e: Equations) -> tuple[float, ...]:
+    """Return the state at rest, with effects at their neutral values taking part."""
+    own = len(e.states) - len(e.rest)  # those of effects stand behind, in an order of their own
+    return (*loop.point.states[:own], *e.rest)

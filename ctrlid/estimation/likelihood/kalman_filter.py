@@ -1,0 +1,167 @@
+"""The filter run along a record, on the plant linearized.
+
+The extended Kalman filter linearizes about its own estimate. Here all samples are linearized at
+once about the estimate of the pass before, which is the same thing when the two agree; they do
+after two or three passes, and between the passes parameters and noise may move as well.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import casadi
+import numpy as np
+
+from ..._base.errors import CtrlidError
+from ...physics.block_evaluation import Vectorized
+from ...physics.equations import Array
+from .filter_data import Track
+from .kalman_recursion import filter_pass
+from .sampled_plant import Linearized, Machine, Trajectory
+
+SETTLED = 4.0  # times the usual variance: above, the start still dominates the prediction
+NEWTON = 6  # steps that unbend the curve of a sensor
+PASSES = 12  # at most, to let the trajectory settle
+STILL = 1e-3  # of the standard deviations: a trajectory that moves less has settled
+
+
+@dataclass(frozen=True)
+class Noise:
+    """The noise of a loop, as variances relative to that of the sensor.
+
+    Parameters
+    ----------
+    force : tuple of float
+        Variances of the white forces that are held over each period.
+    memory : float
+        Correlation of the coloured force from one sample to the next.
+    drift : float
+        Variance of the steps of the coloured force; zero: there is none.
+    """
+
+    force: tuple[float, ...]
+    memory: float = 0.0
+    drift: float = 0.0
+
+    @property
+    def coloured(self) -> float:
+        """Variance of the coloured force."""
+        return self.drift / (1 - self.memory**2)
+
+
+@dataclass(frozen=True, eq=False)
+class Filtered:
+    """What one pass of the filter gives; variances are relative to the sensor noise's."""
+
+    innovations: Array
+    variance: Array
+    trajectory: Trajectory
+    slopes: Array
+    disturbance: Array
+
+
+def run(
+    m: Machine, track: Track, lin: Linearized, noise: Noise, sensitive: bool = True,
+    columns: int | None = None,
+) -> Filtered:  # fmt: skip
+    """Run the filter along a linearized plant, with sensitivities to its first columns."""
+    p = len(m.index) if columns is None else columns
+    p = p if sensitive else 0
+    out = filter_pass(
+        lin.step, lin.a, lin.b, lin.du, np.ascontiguousarray(lin.dp[:, :, :p]), lin.height,
+        lin.c, np.ascontiguousarray(lin.hp[:, :p]), lin.trajectory.predicted,
+        lin.trajectory.filtered, track.table[3], track.valid, track.afresh, lin.doubt,
+        lin.start, lin.spread, 1.0,
+        np.asarray(noise.force, dtype=float), noise.memory, noise.drift, (0,) * m.size,
+        (0,) * (m.size + bool(noise.drift > 0)),
+    )  # fmt: skip
+    error, variance, before, after, wide, slopes, disturbance = out
+    counts = track.valid & ~track.afresh
+    with np.errstate(all="ignore"):  # a filter that lost the record says so later
+        sensor = np.sqrt(np.mean(error[counts] ** 2 / variance[counts]))
+    return Filtered(error, variance, Trajectory(before, after, wide * sensor), slopes,
+                    disturbance)  # fmt: skip
+
+
+def first_guess(m: Machine, track: Track) -> Trajectory:
+    """Return a trajectory to begin with: at rest, states that are measured as measured."""
+    n, e = len(track.record), m.e
+    rest = np.tile(m.padded(track.start), (n, 1))
+    seen, values = e.output, track.table[3]
+    for _ in range(1 + len(e.lags)):  # behind a lag of the sensor is what it follows, nearly
+        columns = casadi.jacobian(seen, e.x).sparsity().get_col()
+        if len(columns) != 1 or casadi.depends_on(seen, casadi.vertcat(e.t, e.u)):
+            break
+        j = columns[0]
+        rest[:, j] = values = _unbent(m, seen, e.x[j], float(rest[0, j]), values)
+        behind = [lag.target for lag in e.lags if lag.state == j]
+        if not behind:
+            break
+        seen = behind[0]
+    for lag in e.lags:
+        if casadi.is_equal(lag.target, e.u, 2):
+            rest[:, lag.state] = track.table[1]
+    spread = np.sqrt(np.diag(m.padded(track.spread)))
+    quiet = np.minimum(spread, 1.0) * track.scale
+    return Trajectory(rest, rest.copy(), np.tile(quiet, (n, 1)))
+
+
+def _unbent(m: Machine, seen: Any, x: Any, at: float, values: Array) -> Array:
+    """Return the state x that is seen as given values, by Newton's rule; else at rest."""
+    if casadi.is_equal(seen, x, 2):
+        return values
+    f = Vectorized(casadi.Function("seen", [x, m.e.p], [seen, casadi.jacobian(seen, x)]))
+    found = np.full(len(values), at)
+    first = np.abs(f(found, m.e.values)[0].ravel() - values)
+    with np.errstate(all="ignore"):
+        for _ in range(NEWTON):
+            height, slope = (part.ravel() for part in f(found, m.e.values))
+            found = found + (values - height) / slope
+        left = np.abs(f(found, m.e.values)[0].ravel() - values)
+    return np.where(left <= first, found, at)  # also where it is no number
+
+
+def settle(
+    m: Machine, track: Track, theta: Array, noise: Noise, at: Trajectory, passes: int = PASSES
+) -> tuple[Linearized, Filtered]:
+    """Linearize and filter until the trajectory no longer moves.
+
+    Raises
+    ------
+    CtrlidError
+        If the filter cannot follow the record with this model.
+    """
+    for count in range(passes):
+        at, lin = _inside(m, track, theta, at)
+        out = run(m, track, lin, noise, sensitive=False)
+        moved = np.abs(out.trajectory.filtered - at.filtered)
+        if not np.isfinite(out.innovations).all() or not np.isfinite(moved).all():
+            k = int(np.argmin(np.isfinite(out.innovations)))
+            raise CtrlidError(
+                f"the predictor of {m.e.name} lost the record at sample {k} "
+                f"(t = {track.record.t[k]:.4g} s): the model cannot follow these data there; "
+                "check units, signs and the operating point, or mark the stretch as not valid"
+            )
+        size = np.maximum(np.std(out.trajectory.filtered, axis=0), 1e-300)
+        still = bool((np.sqrt(np.mean(moved**2, axis=0)) <= STILL * size).all())
+        at = out.trajectory
+        if still and count:
+            break
+    return lin, out
+
+
+def _inside(
+    m: Machine, track: Track, theta: Array, at: Trajectory
+) -> tuple[Trajectory, Linearized]:
+    """Linearize, with samples at which the plant is not defined pulled back to rest."""
+    bad: Any = ~(np.isfinite(at.filtered) & np.isfinite(at.predicted)).all(axis=1)
+    if not bad.any():
+        lin = m.linearize(track, theta, at)
+        bad = ~(np.isfinite(lin.step).all(axis=1) & np.isfinite(lin.a).all(axis=(1, 2))
+                & np.isfinite(lin.height) & np.isfinite(lin.c).all(axis=1))  # fmt: skip
+        if not bad.any():
+            return at, lin
+    rest = first_guess(m, track)
+    at = Trajectory(*(np.where(bad[:, None], old, new) for new, old in (
+        (at.predicted, rest.predicted), (at.filtered, rest.filtered),
+        (at.spread, rest.spread))))  # fmt: skip
+    return at, m.linearize(track, theta, at)

@@ -1,0 +1,166 @@
+"""The likelihood of a loop's parameters and noise, from the innovations of its filter."""
+
+import functools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ...physics.equations import Array
+from .filter_data import Track
+from .kalman_filter import Filtered, Noise, run
+from .sampled_plant import Linearized, Machine, Trajectory
+
+QUIET = 1e-14  # of the output's size, squared: the least variance of the sensor noise
+SINGULAR = 1e-10  # relative eigenvalue below which a direction is not in the data
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """Noise that is known beforehand.
+
+    Ratios, and the variance of each record's sensor noise; None: what the model leaves.
+    """
+
+    noise: Noise
+    sensor: Array | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """What is fitted to what.
+
+    Parameters
+    ----------
+    machine : Machine
+        The plant, with the free parameters as its names.
+    tracks : tuple of Track
+        The records.
+    lower, upper : ndarray, shape (p,)
+        Bounds of the parameters.
+    counts : tuple of ndarray of bool
+        Samples of each record that enter the likelihood.
+    known : Known, optional
+        The noise, where it is not to be searched.
+    periods : tuple of int
+        For each record, after how many samples it repeats itself: then only the differences
+        between the repeats count, which no wrong model can have made.
+    """
+
+    machine: Machine
+    tracks: tuple[Track, ...]
+    lower: Array
+    upper: Array
+    counts: tuple[Any, ...] = ()
+    known: Known | None = None
+    periods: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A point of the likelihood, with all that was computed there.
+
+    `sensor` holds the variance of each record's sensor noise, `linearized` and `filtered` the last
+    pass, `normal` the held-gain Fisher information of `theta` and its score.
+    """
+
+    problem: Problem
+    theta: Array
+    noise: Noise
+    value: float
+    sensor: Array
+    linearized: tuple[Linearized, ...]
+    filtered: tuple[Filtered, ...]
+
+    @property
+    def size(self) -> int:
+        """Number of samples that count."""
+        return int(sum(np.count_nonzero(c) for c in self.problem.counts))
+
+    @functools.cached_property
+    def normal(self) -> tuple[Array, Array]:
+        """The held-gain information matrix and score of the parameters."""
+        p = len(self.theta)
+        matrix, score = np.zeros((p, p)), np.zeros(p)
+        for out, keep, r in zip(self.filtered, self.problem.counts, self.sensor, strict=True):
+            slopes, s = out.slopes[keep], out.variance[keep] * r
+            matrix += (slopes / s[:, None]).T @ slopes
+            score += slopes.T @ (out.innovations[keep] / s)
+        return matrix, score
+
+    @property
+    def standard_errors(self) -> Array:
+        """Standard errors of the parameters, the noise held."""
+        return np.sqrt(np.maximum(np.diag(pseudo_inverse(self.normal[0])), 0.0))
+
+    @property
+    def standardized(self) -> list[Array]:
+        """The innovations divided by their standard deviations; NaN where they do not count."""
+        return [
+            np.where(keep, out.innovations / np.sqrt(out.variance * r), np.nan)
+            for out, keep, r in zip(self.filtered, self.problem.counts, self.sensor, strict=True)
+        ]
+
+
+def evaluate(problem: Problem, theta: Array, noise: Noise, at: Sequence[Trajectory]) -> Fit:
+    """Return the likelihood of parameters and noise, linearized along given trajectories."""
+    m = problem.machine
+    lins = tuple(m.linearize(t, theta, a) for t, a in zip(problem.tracks, at, strict=True))
+    return measure(problem, theta, noise, lins)
+
+
+def relinearized(fit: Fit) -> Fit:
+    """Return the likelihood of the same values, the plant linearized along its last trajectory."""
+    along = [out.trajectory for out in fit.filtered]
+    return evaluate(fit.problem, fit.theta, fit.noise, along)
+
+
+def measure(
+    problem: Problem, theta: Array, noise: Noise, lins: Sequence[Linearized], sensitive: bool = True
+) -> Fit:
+    """Return the likelihood of parameters and noise, the plant linearized before."""
+    m = problem.machine
+    outs = tuple(
+        run(m, t, lin, noise, sensitive) for t, lin in zip(problem.tracks, lins, strict=True)
+    )
+    value, sensors = 0.0, []
+    for k, (track, out, keep) in enumerate(zip(problem.tracks, outs, problem.counts, strict=True)):
+        e, s = out.innovations[keep], out.variance[keep]
+        if problem.periods:
+            e, s = _between_repeats(out, keep, problem.periods[k])
+        if not (np.isfinite(e).all() and np.isfinite(s).all() and (s > 0).all()):
+            value, e, s = -math.inf, np.ones(1), np.ones(1)
+        mean = float(np.mean(e**2 / s))
+        if problem.known is not None and problem.known.sensor is not None:
+            r = float(problem.known.sensor[k])
+        else:
+            least = QUIET * float(np.var(track.table[3][keep]) + np.mean(track.table[3][keep]) ** 2)
+            r = max(mean, least, 1e-300)
+        value -= 0.5 * (len(e) * (math.log(2 * math.pi * r) + mean / r) + np.sum(np.log(s)))
+        sensors.append(r)
+    return Fit(problem, theta, noise, float(value), np.array(sensors), tuple(lins), outs)
+
+
+def _between_repeats(out: Filtered, keep: Any, period: int) -> tuple[Array, Array]:
+    """Return what differs between repeats of the innovations, as large as they are, and variances.
+
+    Counted from the end: whatever dies out at the start does not repeat.
+    """
+    first = len(keep) % period
+    e, use = out.innovations[first:].reshape(-1, period), keep[first:].reshape(-1, period)
+    count = use.sum(axis=0)
+    mean = np.sum(np.where(use, e, 0.0), axis=0) / np.maximum(count, 1)
+    use = use & (count > 1)
+    size = np.sqrt(count / np.maximum(count - 1, 1))
+    return ((e - mean) * size)[use], out.variance[first:].reshape(-1, period)[use]
+
+
+def pseudo_inverse(matrix: Array) -> Array:
+    """Invert an information matrix, leaving out directions that are not in the data."""
+    size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    values, vectors = np.linalg.eigh(matrix / np.outer(size, size))
+    keep = values > SINGULAR * values.max()
+    inverse = (vectors[:, keep] / values[keep]) @ vectors[:, keep].T
+    return np.asarray(inverse / np.outer(size, size), dtype=float)

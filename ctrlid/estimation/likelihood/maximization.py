@@ -1,0 +1,305 @@
+"""The maximum of the likelihood: where a fit begins, how it climbs, and what is known there."""
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from ..._base.errors import CtrlidError
+from ...physics.equations import Array
+from .filter_data import Track
+from .kalman_filter import SETTLED, Filtered, Noise, first_guess, settle
+from .likelihood import Fit, Problem, evaluate, pseudo_inverse, relinearized
+from .noise_fit import LOG_STEP, logs_of, noise_of, tune, unit_of
+from .sampled_plant import Machine
+
+ROUNDS = 25  # Gauss-Newton steps at most
+FAR = 3.0  # standard errors: after a longer step the trajectory is settled anew
+CLOSE = 0.02  # standard errors: a smaller step ends the search
+SHARES = tuple(3.0**-k for k in range(6))  # of a step, until the likelihood grows
+CURVED = 2  # of them, from where a second step may lead higher than the first began
+BEND = 30.0  # of log-likelihood: of steps that promise less, hardly a second one leads higher
+ELSEWHERE = 2.0  # of log-likelihood, that a noise far away must gain to go on from there
+NOTHING = 1e-3  # of log-likelihood: a step that promises less is not worth taking
+
+
+def begin(problem: Problem, theta: Array, noise: Noise | None) -> Fit:
+    """Return the likelihood at a starting point, with settled trajectories.
+
+    Parameters
+    ----------
+    problem : Problem
+        What is fitted; without `counts` the samples that count are chosen here.
+    theta : ndarray, shape (p,)
+        Parameter values.
+    noise : Noise, optional
+        The noise; by default searched.
+
+    Returns
+    -------
+    Fit
+        The starting point.
+    """
+    m = problem.machine
+    noise = problem.known.noise if problem.known else noise
+    first = noise or Noise((unit_of(m) ** 2 * 1e-2,) * m.channels)
+    settled = []
+    for track in problem.tracks:
+        at = first_guess(m, track)
+        if noise is None:
+            at = settle(m, track, theta, first, at, passes=2)[1].trajectory
+        settled.append((track, at))
+    if noise is None:
+        lins = tuple(m.linearize(t, theta, at) for t, at in settled)
+        counts = tuple(t.valid & ~t.afresh for t in problem.tracks)
+        first = tune(replace(problem, counts=counts), theta, lins, first, wide=True).noise
+    results = [settle(m, track, theta, first, at) for track, at in settled]
+    if not problem.counts:
+        problem = replace(problem, counts=tuple(
+            _settled(track, out) for track, (_, out) in zip(problem.tracks, results, strict=True)
+        ))  # fmt: skip
+    return evaluate(problem, theta, first, [out.trajectory for _, out in results])
+
+
+def _settled(track: Track, out: Filtered) -> Any:
+    known = track.valid & np.isfinite(out.variance)
+    usual = np.median(out.variance[known])
+    return known & ~track.afresh & (out.variance <= SETTLED * usual)
+
+
+def climb(fit: Fit, rounds: int = ROUNDS, exact: bool = True) -> Fit:
+    """Climb to the maximum of the likelihood over parameters and noise.
+
+    Gauss-Newton steps on the innovations with the filter's gain held fixed, the noise tuned between
+    them, and at the end Newton steps on the likelihood itself, whose derivative knows that the
+    gain moves as well.
+
+    Parameters
+    ----------
+    fit : Fit
+        Where to begin.
+    rounds : int, optional
+        Steps at most.
+    exact : bool, optional
+        Whether to end with steps on the likelihood itself.
+
+    Returns
+    -------
+    Fit
+        The maximum, or the best point found.
+    """
+    tuned, far, enough = -math.inf, True, 0.02 if exact else 0.3
+    for _ in range(rounds):
+        # A short step was already evaluated along the trajectory of the pass before.
+        moved = relinearized(fit) if far else fit
+        fit = moved if np.isfinite(moved.value) else fit
+        if fit.value > tuned + 2.0:
+            fit = tune(fit.problem, fit.theta, fit.linearized, fit.noise, enough=enough)
+            tuned = fit.value
+        fit, length = _ascend(fit, *fit.normal)
+        far = bool(length > FAR)
+        if length < (CLOSE if exact else 5 * CLOSE):
+            if fit.value <= tuned + 2.5 * enough:
+                break
+            fit = tune(fit.problem, fit.theta, fit.linearized, fit.noise, enough=enough)
+            tuned = fit.value
+    return polish(fit) if exact else fit
+
+
+def retuned(fit: Fit) -> Fit:
+    """Return the fit climbed on from a noise sought over its whole range, if that is far better.
+
+    A random force that stood for a wrong parameter at the start may have left no noise to the
+    sensor, from where small changes lead nowhere.
+    """
+    plain = Noise(fit.noise.force)
+    other = tune(fit.problem, fit.theta, fit.linearized, plain, wide=True)
+    return climb(other) if other.value > fit.value + ELSEWHERE else fit
+
+
+def promised(fit: Fit) -> float:
+    """Return the gain that a Gauss-Newton step within the bounds expects."""
+    matrix, score = fit.normal
+    return 0.5 * float(score @ bounded_step(fit, matrix, score)[0])
+
+
+def bounded_step(fit: Fit, matrix: Array, score: Array) -> tuple[Array, Array]:
+    """Return the Newton step and the standard errors; bounds hold what pushes outwards."""
+    p, problem = len(fit.theta), fit.problem
+    step, error = np.zeros(p), np.full(p, np.inf)
+    moving = np.diag(matrix) > 0
+    for _ in range(p + 1):
+        rows = np.flatnonzero(moving)
+        if not len(rows):
+            break
+        inverse = pseudo_inverse(matrix[np.ix_(rows, rows)])
+        step[:] = 0.0
+        step[rows] = inverse @ score[rows]
+        error[rows] = np.sqrt(np.maximum(np.diag(inverse), 1e-300))
+        stuck = ((fit.theta <= problem.lower) & (step < 0)) | (
+            (fit.theta >= problem.upper) & (step > 0)
+        )
+        if not (stuck & moving).any():
+            break
+        moving &= ~stuck
+    step[~moving] = 0.0
+    return step, error
+
+
+def _ascend(fit: Fit, matrix: Array, score: Array) -> tuple[Fit, float]:
+    """Take a Gauss-Newton step, or as much of it as makes the likelihood grow.
+
+    Returns
+    -------
+    fit : Fit
+        A better point, or the same.
+    length : float
+        Length of the step in standard errors; zero if none is better.
+    """
+    problem = fit.problem
+    whole, error = bounded_step(fit, matrix, score)
+    promise = 0.5 * float(score @ whole)
+    if not np.isfinite(whole).all() or promise < NOTHING:
+        return fit, 0.0
+    for k, step in enumerate(share * whole for share in SHARES):
+        theta = np.clip(fit.theta + step, problem.lower, problem.upper)
+        try:
+            if not problem.machine.fits(theta):
+                problem, fit = _rebuilt(fit, theta)
+            trial = evaluate(problem, theta, fit.noise, [o.trajectory for o in fit.filtered])
+            worse = not trial.value >= fit.value - 1e-6
+            if worse and k < CURVED and promise > BEND and np.isfinite(trial.value):
+                trial = _second_step(trial)
+                worse = not trial.value > fit.value + NOTHING
+        except CtrlidError:  # too far: what moves so fast is no longer followed
+            continue
+        if np.isfinite(trial.value) and not worse:
+            return trial, float(np.max(np.abs(trial.theta - fit.theta) / error, initial=0.0))
+    return fit, 0.0
+
+
+def _second_step(fit: Fit) -> Fit:
+    """Return where a whole Gauss-Newton step leads from a point that may lie beside the ridge.
+
+    Where a product of two parameters is all that the record knows, the ridge is curved: along its
+    tangent only short steps climb, but a long one and a second from there come back to it.
+    """
+    there, problem = relinearized(fit), fit.problem
+    step, _ = bounded_step(there, *there.normal)
+    theta = np.clip(there.theta + step, problem.lower, problem.upper)
+    if not problem.machine.fits(theta):
+        return fit
+    return evaluate(problem, theta, there.noise, [o.trajectory for o in there.filtered])
+
+
+def _rebuilt(fit: Fit, theta: Array) -> tuple[Problem, Fit]:
+    """Return the problem with a machine for the delay that `theta` has."""
+    m = fit.problem.machine
+    loop = m.loop.with_parameters(dict(zip(m.names, theta.tolist(), strict=True)))
+    problem = replace(fit.problem, machine=Machine(loop, m.names, m.hold, m.law is not None))
+    return problem, replace(fit, problem=problem)
+
+
+def polish(fit: Fit, rounds: int = 2) -> Fit:
+    """Take Newton steps on the likelihood itself, by differences over half a standard error."""
+    for _ in range(rounds):
+        matrix, _ = fit.normal
+        _, error = bounded_step(fit, *fit.normal)
+        score, known = np.zeros(len(fit.theta)), np.isfinite(error)
+        at = [out.trajectory for out in fit.filtered]
+        fit = evaluate(fit.problem, fit.theta, fit.noise, at)
+        for k in np.flatnonzero(known):
+            values = []
+            ends = np.clip(
+                fit.theta[k] + np.array([-0.5, 0.5]) * error[k],
+                fit.problem.lower[k], fit.problem.upper[k],
+            )  # fmt: skip
+            for end in ends:
+                theta = fit.theta.copy()
+                theta[k] = end
+                values.append(evaluate(fit.problem, theta, fit.noise, at).value)
+            if ends[1] > ends[0] and np.isfinite(values).all():
+                score[k] = (values[1] - values[0]) / (ends[1] - ends[0])
+        if not known.any():
+            return fit
+        fit, length = _ascend(fit, matrix, score)
+        if length < 0.05:
+            break
+    tuned = tune(fit.problem, fit.theta, fit.linearized, fit.noise)
+    return tuned if tuned.value > fit.value else fit
+
+
+def information(fit: Fit) -> tuple[Array, Array]:
+    r"""Return the exact Fisher information of parameters and noise, and the score.
+
+    .. math:: I = \sum_k \frac{1}{s_k} \frac{\partial e_k}{\partial\eta}
+        \frac{\partial e_k}{\partial\eta}^T + \frac{1}{2 s_k^2}
+        \frac{\partial s_k}{\partial\eta} \frac{\partial s_k}{\partial\eta}^T
+
+    over parameters, logarithms of the noise ratios and of each record's sensor variance, with the
+    gain of the filter moving with them.
+
+    Parameters
+    ----------
+    fit : Fit
+        The maximum of the likelihood.
+
+    Returns
+    -------
+    matrix : ndarray
+        Information of the parameters first, then of the noise.
+    score : ndarray
+        Derivative of the log-likelihood.
+
+    References
+    ----------
+    Åström, "Maximum likelihood and prediction error methods", Automatica 16 (1980).
+    """
+    problem, m = fit.problem, fit.problem.machine
+    dt, p = m.loop.dt, len(fit.theta)
+    at = [out.trajectory for out in fit.filtered]
+    _, error = bounded_step(fit, *fit.normal)
+    logs = logs_of(fit.noise, dt) if problem.known is None else np.zeros(0)
+
+    def innovations(theta: Array, noise: Noise) -> Any:
+        out = evaluate(problem, theta, noise, at).filtered
+        return [(o.innovations[c], np.log(o.variance[c]))
+                for o, c in zip(out, problem.counts, strict=True)]  # fmt: skip
+
+    columns: list[Any] = []
+    for k in range(p):
+        h = error[k] if np.isfinite(error[k]) else 0.0
+        ends = np.clip(fit.theta[k] + np.array([-0.5, 0.5]) * h, problem.lower[k], problem.upper[k])
+        pair = []
+        for end in ends:
+            theta = fit.theta.copy()
+            theta[k] = end
+            pair.append(innovations(theta, fit.noise))
+        columns.append(_difference(pair, float(ends[1] - ends[0])))
+    for k in range(len(logs)):
+        pair = []
+        for h in (-LOG_STEP, LOG_STEP):
+            moved = logs.copy()
+            moved[k] += h
+            pair.append(innovations(fit.theta, noise_of(moved, m.channels, dt)))
+        columns.append(_difference(pair, 2 * LOG_STEP))
+    count, records = len(columns), len(problem.tracks) if problem.known is None else 0
+    matrix = np.zeros((count + records, count + records))
+    score = np.zeros(count + records)
+    for k, (out, keep, r) in enumerate(zip(fit.filtered, problem.counts, fit.sensor, strict=True)):
+        s, e = out.variance[keep] * r, out.innovations[keep]
+        size = np.zeros((len(e), records))
+        size[:, k : k + 1] = 1.0
+        slopes = np.column_stack([c[k][0] for c in columns] + [np.zeros_like(size)])
+        widths = np.column_stack([c[k][1] for c in columns] + [size])
+        matrix += (slopes / s[:, None]).T @ slopes + 0.5 * widths.T @ widths
+        score += -slopes.T @ (e / s) + 0.5 * widths.T @ (e**2 / s - 1)
+    return matrix, score
+
+
+def _difference(pair: Any, width: float) -> list[tuple[Array, Array]]:
+    if width <= 0:
+        return [(np.zeros_like(e), np.zeros_like(s)) for e, s in pair[0]]
+    return [((e1 - e0) / width, (s1 - s0) / width)
+            for (e0, s0), (e1, s1) in zip(*pair, strict=True)]  # fmt: skip

@@ -1,0 +1,189 @@
+"""The most likely noise of a loop whose parameters are as they are."""
+
+import itertools
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ..._base.errors import CtrlidError
+from ..._base.jobs import side_by_side
+from ...physics.equations import Array
+from .kalman_filter import Noise
+from .likelihood import Fit, Known, Problem, measure
+from .sampled_plant import Linearized, Machine
+
+LEAST = -24.0  # logarithm of the least force noise: below, only the start of the record counts
+MOST = 14.0  # and of the largest: above, the sensor is exact
+SLOWEST = 0.05  # of the longest record: the time constant of a coloured force
+LOG_STEP = 0.2  # of log variances, for derivatives
+BOWL = 0.05  # second derivative by a log variance above which a parabola tells how far it is
+
+
+def tune(
+    problem: Problem, theta: Array, lins: Sequence[Linearized], noise: Noise, wide: bool = False,
+    enough: float = 0.02,
+) -> Fit:  # fmt: skip
+    """Return the most likely noise for parameters as they are."""
+    m, dt = problem.machine, problem.machine.loop.dt
+    if problem.known is not None:
+        return measure(problem, theta, problem.known.noise, lins)
+
+    def at(logs: Array) -> Noise:
+        return noise_of(logs, m.channels, dt)
+
+    def cost(logs: Array) -> float:
+        value = measure(problem, theta, at(np.atleast_1d(logs)), lins, sensitive=False).value
+        return -value if np.isfinite(value) else 1e15
+
+    start = logs_of(noise, dt)
+    longest = max(len(t.record) for t in problem.tracks)
+    low, high = _limits(m, len(start) > m.channels, longest)
+    start = np.clip(start, low, high)
+    if wide:
+        grid = np.linspace(low[0], high[0], 20)
+        best = grid[int(np.argmin(_costs(cost, [np.full(m.channels, g) for g in grid])))]
+        start[: m.channels] = best
+    return measure(problem, theta, at(_newton(cost, start, low, high, enough)), lins)
+
+
+def unit_of(machine: Machine) -> float:
+    """Return a ratio of force to sensor noise from which others are counted."""
+    return 1.0 / machine.loop.dt ** (2 if machine.e.velocities else 1)
+
+
+def logs_of(noise: Noise, dt: float) -> Array:
+    """Return the logarithms that are searched: of variances, and of the coloured force's time."""
+    logs = list(np.log(noise.force))
+    if noise.drift:
+        logs += [math.log(noise.coloured), math.log(-dt / math.log(noise.memory))]
+    return np.array(logs)
+
+
+def noise_of(logs: Array, channels: int, dt: float) -> Noise:
+    """Return the noise that has such logarithms."""
+    force = tuple(np.exp(np.clip(logs[:channels], -300, 300)).tolist())
+    if len(logs) == channels:
+        return Noise(force)
+    memory = math.exp(-dt / math.exp(min(max(logs[channels + 1], -50), 50)))
+    memory = min(max(memory, 1e-6), 1 - 1e-9)
+    return Noise(force, memory, math.exp(min(max(logs[channels], -300), 300)) * (1 - memory**2))
+
+
+def _limits(m: Machine, coloured: bool, longest: int) -> tuple[Array, Array]:
+    """Return bounds of the logarithms of the noise variances.
+
+    A force that hardly changes during a record is an offset, not noise.
+    """
+    unit, dt = 2 * math.log(unit_of(m)), m.loop.dt
+    low, high = [unit + LEAST] * m.channels, [unit + MOST] * m.channels
+    if coloured:
+        low += [unit + LEAST, math.log(2 * dt)]
+        high += [unit + MOST, math.log(max(min(SLOWEST * longest, 2e4), 4.0) * dt)]
+    return np.array(low), np.array(high)
+
+
+def _costs(cost: Callable[[Array], float], points: Iterable[Array]) -> Array:
+    """Return the cost at each point, computed side by side: the filter leaves Python alone."""
+    return np.array(side_by_side(cost, points))
+
+
+def _newton(
+    cost: Callable[[Array], float], x: Array, low: Array, high: Array, enough: float
+) -> Array:  # fmt: skip
+    """Minimise a smooth function of a few logarithms by damped Newton steps with differences.
+
+    Where a step gained what the parabola g^2/2h foresaw but for e, a function with a third
+    derivative has e^2 / (g^2/2h) * 9/4 left to gain: on a line that tells the end. With more
+    directions the errors of several may cancel.
+    """
+    n, h = len(x), LOG_STEP
+    pairs = list(itertools.combinations(range(n), 2))
+    unit = np.eye(n)
+    around = np.vstack([unit, -unit, *(unit[i] + unit[j] for i, j in pairs)])
+    here, damping = cost(x), 0.1
+    for _ in range(12):
+        costs = _costs(cost, np.clip(x + h * around, low, high))
+        ups, downs, both = np.split(costs, [n, 2 * n])
+        slope = (ups - downs) / (2 * h)
+        hessian = np.diag((ups + downs - 2 * here) / h**2)
+        for (i, j), value in zip(pairs, both, strict=True):
+            hessian[i, j] = hessian[j, i] = (value - ups[i] - ups[j] + here) / h**2
+        values, vectors = np.linalg.eigh(hessian)
+        bowl = n == 1 and values[0] > BOWL
+        values, turned = np.maximum(np.abs(values), 1e-3), vectors.T @ slope
+        while True:
+            step = -vectors @ (turned / (values + damping))
+            step *= min(1.0, 2.5 / max(float(np.abs(step).max()), 1e-300))
+            trial = np.clip(x + step, low, high)
+            moved = vectors.T @ (trial - x)
+            foreseen = -float((turned + 0.5 * values * moved) @ moved)
+            if bowl and foreseen < 0.1 * enough:
+                return x
+            there = cost(trial)
+            if there <= here or damping > 1e6:
+                break
+            damping = max(10 * damping, 1.0)
+        gain = here - there
+        if gain <= 0:
+            break
+        x, here, damping = trial, there, damping / 10
+        if gain < enough:
+            break
+        if bowl:
+            pull = turned + values * moved  # that the parabola leaves after this step
+            left = 0.5 * float(pull @ (pull / values)) + 2.25 * (gain - foreseen) ** 2 / foreseen
+            if left < 0.5 * enough:
+                break
+    return x
+
+
+def with_coloured_force(fit: Fit) -> Fit:
+    """Return the fit with a coloured force added, whether it pays or not."""
+    m, dt = fit.problem.machine, fit.problem.machine.loop.dt
+    best: Fit | None = None
+    sizes = np.array([1e-2, 1.0]) * sum(fit.noise.force)
+    for time in (3 * dt, 30 * dt, 300 * dt):
+        for size in sizes:
+            memory = math.exp(-dt / time)
+            force = tuple(0.5 * v for v in fit.noise.force)
+            noise = Noise(force, memory, size * (1 - memory**2))
+            trial = measure(fit.problem, fit.theta, noise, fit.linearized, sensitive=False)
+            if best is None or trial.value > best.value:
+                best = trial
+    assert best is not None
+    if not np.isfinite(best.value):
+        raise CtrlidError(f"no coloured force can be fitted to {m.e.name}")
+    return tune(fit.problem, fit.theta, fit.linearized, best.noise)
+
+
+def known_from_repeats(fit: Fit, periods: Sequence[int]) -> Known:
+    r"""Return the noise that differs between repeats of the same experiment.
+
+    .. math:: d_k^p = \sqrt{\tfrac{P}{P-1}} \Bigl( e_k^p - \tfrac{1}{P} \sum_q e_k^q \Bigr)
+
+    What a wrong model leaves in the innovations e is the same in each of the P periods; what
+    differs is noise. A coloured force takes part if the Bayesian criterion wants it.
+
+    Parameters
+    ----------
+    fit : Fit
+        A fit of any model that follows the records.
+    periods : sequence of int
+        For each record, after how many samples it repeats itself.
+
+    Returns
+    -------
+    Known
+        The noise.
+
+    References
+    ----------
+    Pintelon and Schoukens, *System Identification: A Frequency Domain Approach*, section 4.3.
+    """
+    problem = replace(fit.problem, known=None, periods=tuple(periods))
+    plain = tune(problem, fit.theta, fit.linearized, Noise(fit.noise.force), wide=True)
+    richer = with_coloured_force(plain)
+    best = richer if richer.value > plain.value + math.log(fit.size) else plain
+    return Known(best.noise, best.sensor)

@@ -1,0 +1,182 @@
+"""What `fit_loop` returns: physical parameters, how well they are known, and the loop with them."""
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ..._base.errors import CtrlidError
+from ..._base.text import Printed, number
+from ...loop.loop import Loop
+from ...physics.equations import Array
+from ...physics.linearization import operating_point
+from ..identified_model import root_errors
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class LoopEstimate(Printed):
+    """Physical parameters, their uncertainty and the noise that was found with them.
+
+    Parameters
+    ----------
+    names : tuple of str
+        The parameters that were fitted.
+    values : ndarray, shape (p,)
+        Their values [unit of each parameter].
+    covariance : ndarray, shape (p, p)
+        Their covariance [products of units], from the exact information matrix; infinite for what
+        is not in the data.
+    sensor_noise : tuple of float
+        Standard deviation of the white sensor noise in each record [output unit].
+    force_noise : float
+        Standard deviation of the white acceleration that is held over each period
+        [output unit/s^2]; for a plant without a moving mass, of the noise on the states' rates.
+    coloured_force : float
+        Standard deviation of the coloured acceleration [output unit/s^2]; zero: none was needed.
+    force_time : float
+        Time constant of the coloured acceleration [s]; NaN without one.
+    log_likelihood : float
+        Logarithm of the likelihood.
+    n_samples : int
+        Samples that count.
+    bounds : tuple of str
+        The parameters that sit on a bound.
+    notes : tuple of str
+        What the user should know before believing the numbers.
+    """
+
+    names: tuple[str, ...]
+    values: Array
+    covariance: Array
+    sensor_noise: tuple[float, ...]
+    force_noise: float
+    coloured_force: float
+    force_time: float
+    log_likelihood: float
+    n_samples: int
+    bounds: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    @property
+    def standard_errors(self) -> Array:
+        """Standard errors of the parameters."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)), dtype=float)
+
+    @property
+    def bic(self) -> float:
+        """Bayesian information criterion, smaller is better."""
+        extra = len(self.names) + 2 * (self.coloured_force > 0)
+        return -2 * self.log_likelihood + extra * math.log(self.n_samples)
+
+    def __getitem__(self, name: str) -> float:
+        if name not in self.names:
+            raise CtrlidError(f"{name!r} was not fitted; fitted were {', '.join(self.names)}")
+        return float(self.values[self.names.index(name)])
+
+    def interval(self, name: str, share: float = 0.95) -> tuple[float, float]:
+        """Return the interval that covers the true value of a parameter with a probability.
+
+        Parameters
+        ----------
+        name : str
+            A fitted parameter.
+        share : float, optional
+            The probability, for normally distributed errors.
+
+        Returns
+        -------
+        tuple of float
+            Lower and upper end [unit of the parameter].
+        """
+        from scipy.stats import norm
+
+        middle = self[name]
+        half = float(norm.ppf((1 + share) / 2)) * self.standard_errors[self.names.index(name)]
+        return float(middle - half), float(middle + half)
+
+    def __str__(self) -> str:
+        rows = [f"maximum likelihood, {self.n_samples} samples, log-likelihood "
+                f"{self.log_likelihood:.1f}"]  # fmt: skip
+        width = max((len(name) for name in self.names), default=0)
+        for name, value, error in zip(self.names, self.values, self.standard_errors, strict=True):
+            mark = "  (on its bound)" if name in self.bounds else ""
+            rows.append(f"  {name:<{width}} = {_with_error(value, error)}{mark}")
+        noise = ", ".join(number(v, 3) for v in self.sensor_noise)
+        rows.append(f"  sensor noise {noise}, white force noise {number(self.force_noise, 3)}")
+        if self.coloured_force:
+            rows.append(f"  coloured force {number(self.coloured_force, 3)} with a time constant "
+                        f"of {number(self.force_time, 3)} s")  # fmt: skip
+        return "\n".join([*rows, *(f"  note: {note}" for note in self.notes)])
+
+
+def _with_error(value: float, error: float) -> str:
+    if not np.isfinite(error):
+        return f"{number(value, 6)} (not in the data)"
+    digits = 6
+    if error > 0 and value:
+        digits = max(2, min(12, 2 + math.ceil(math.log10(abs(value) / error + 1e-300))))
+    return f"{number(value, digits)} ± {number(error, 2)}"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class LoopFit(Printed):
+    """What `fit_loop` returns.
+
+    Parameters
+    ----------
+    loop : Loop
+        The loop with the fitted values.
+    estimate : LoopEstimate
+        Values, standard errors and noise.
+    """
+
+    loop: Loop
+    estimate: LoopEstimate
+
+    @property
+    def model(self) -> Any:
+        """Return the plant with its effects, linearized where it rests at the loop's output."""
+        return _at_rest(self.loop)
+
+    @property
+    def poles(self) -> Any:
+        """Return the poles of `model`, in rad/s (in z for a plant in discrete time)."""
+        return np.roots(self.model.den[0][0]).astype(complex)
+
+    @property
+    def poles_standard_errors(self) -> Array:
+        """Return the standard errors of `poles`, by the delta method.
+
+        The denominator is differenced along each fitted parameter; the operating point moves with
+        it. Infinite where a pole depends on a parameter that the data do not determine.
+        """
+        estimate, values = self.estimate, self.estimate.values
+        slopes = []
+        for name, value, error in zip(
+            estimate.names, values, estimate.standard_errors, strict=True
+        ):
+            h = 1e-4 * abs(value) or 1e-2 * (error if np.isfinite(error) else 1.0)
+            if name in estimate.bounds or h == 0:
+                slopes.append(np.zeros(len(self.poles)))
+                continue
+            ends = [_at_rest(self.loop.with_parameters({name: value + d})) for d in (h, -h)]
+            slopes.append((ends[0].den[0][0] - ends[1].den[0][0])[1:] / (2 * h))
+        slope = np.column_stack(slopes)
+        lost = ~np.isfinite(estimate.standard_errors)
+        if np.any(slope[:, lost] != 0):
+            return np.full(len(slope), np.inf)
+        covariance = np.where(np.outer(~lost, ~lost), estimate.covariance, 0.0)
+        return root_errors(self.poles, slope @ covariance @ slope.T)
+
+    def __str__(self) -> str:
+        return f"{self.loop!r}\n{self.estimate}"
+
+
+def _at_rest(loop: Loop) -> Any:
+    """Return the linear model at the loop's output, with input and states solved for anew."""
+    if not loop.linear_plant:
+        assert loop.at is not None
+        at = operating_point(loop.plant, output=loop.at.output, guess=loop.at)
+        loop = replace(loop, at=at)
+    return loop.linearize()

@@ -1,0 +1,209 @@
+"""fit_loop(): the physical parameters of a loop's plant, by maximum likelihood."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ..._base.errors import CtrlidError
+from ...data.record import Record
+from ...data.several_records import as_records
+from ...loop.loop import Loop
+from ...physics.equations import Array
+from .filter_data import make_track
+from .likelihood import Fit, Problem, pseudo_inverse
+from .maximization import begin, climb, information, retuned
+from .noise_fit import with_coloured_force
+from .physics_estimate import LoopEstimate, LoopFit
+from .sampled_plant import machine_for
+
+UNSEEN = 1e-9  # relative eigenvalue of the information below which a direction is not in the data
+
+
+def fit_loop(
+    loop: Loop,
+    record: Record | Sequence[Record],
+    *,
+    free: Sequence[str] | None = None,
+    coloured: bool | None = None,
+) -> LoopFit:
+    r"""Fit the uncertain physical parameters of a loop's plant to one or several records.
+
+    .. math:: \max_{\theta, \eta} \; -\tfrac12 \sum_k \Bigl( \ln 2\pi s_k +
+        \frac{e_k^2}{s_k} \Bigr), \quad e_k = y_k - \hat y_{k|k-1}(\theta, \eta)
+
+    The innovations e of an extended Kalman filter on the plant's own equations, with variances s,
+    make the likelihood; noise of the sensor and of the force is estimated with the parameters. The
+    filter uses the measured input only: feedback does not bias the estimate, and neither reference
+    nor controller is needed. Sensitivities are exact derivatives of the traced equations.
+
+    Parameters
+    ----------
+    loop : Loop
+        Plant with the names of its uncertain parameters in `free`; its values are the start.
+        Effects in the loop are fitted with them.
+    record : Record or sequence of Record
+        The data; several records share the parameters and the force noise.
+    free : sequence of str, optional
+        Parameters to fit; by default those of `loop.free` and those of the effects.
+    coloured : bool, optional
+        Whether a coloured (Ornstein-Uhlenbeck) random force takes part; by default if it pays by
+        the Bayesian information criterion.
+
+    Returns
+    -------
+    LoopFit
+        The loop with the fitted values, and the estimate with standard errors.
+
+    Raises
+    ------
+    CtrlidError
+        If nothing is free, the records do not fit the loop, or the filter loses them.
+
+    References
+    ----------
+    Åström, "Maximum likelihood and prediction error methods", Automatica 16 (1980) 551-574;
+    Ljung, *System Identification*, sections 7.4 and 9.
+
+    Examples
+    --------
+    >>> import ctrlid as cid
+    >>> plant = cid.plants.maglev(m=0.0213, K=3.34e-6)
+    >>> op = cid.operating_point(plant, output=0.012)
+    >>> C = cid.design_lead(cid.linearize(plant, op), crossover=100, phase_margin=50)
+    >>> loop = cid.Loop(plant, C.sample(0.001, "tustin"), dt=0.001, at=op, free=("K",))
+    >>> r = cid.random_binary(3000, amplitude=1e-4, hold=20, around=op.output, seed=1)
+    >>> record = cid.simulate(loop, r, sensor_noise=2e-6, seed=2)
+    >>> fitted = cid.fit_loop(loop.with_parameters({"K": 3.1e-6}), record)
+    >>> low, high = fitted.estimate.interval("K", share=0.999)
+    >>> low < 3.34e-6 < high
+    True
+    """
+    records = as_records(record)
+    names = _free_names(loop, free)
+    start = begin(make_problem(loop, names, records), start_values(loop, names), None)
+    fit = retuned(climb(start))
+    if coloured or coloured is None:
+        fit = choose_noise(fit, always=bool(coloured))
+    return summary(loop, fit)
+
+
+def _free_names(loop: Loop, free: Sequence[str] | None) -> tuple[str, ...]:
+    if not isinstance(loop, Loop):
+        raise CtrlidError(f"fit_loop needs a Loop(plant, ..., dt=...); given {type(loop).__name__}")
+    known = list(loop.equations(keep=True).parameters)
+    if free is None:
+        names = tuple(dict.fromkeys([*loop.free, *effect_bounds(loop)]))
+    else:
+        names = (free,) if isinstance(free, str) else tuple(free)
+    unknown = [name for name in names if name not in known]
+    if unknown or not names:
+        what = f"given {unknown}" if unknown else "none was given"
+        raise CtrlidError(f"fit_loop needs the names of free parameters, {what}; put them into "
+                          f"free= of the loop or of fit_loop. Known are {known}")  # fmt: skip
+    return names
+
+
+def start_values(loop: Loop, names: Sequence[str]) -> Array:
+    """Return the values of parameters as the loop has them."""
+    parameters = loop.equations(keep=True).parameters
+    return np.array([parameters[name] for name in names], dtype=float)
+
+
+def make_problem(
+    loop: Loop, names: Sequence[str], records: Sequence[Record], begins: Sequence[float] = ()
+) -> Problem:
+    """Return the likelihood problem of a loop on records that begin at given times."""
+    m = machine_for(loop, tuple(names), records[0])
+    lower, upper = bounds_of(loop, names)
+    begins = begins or [0.0] * len(records)
+    tracks = [make_track(loop, r, b) for r, b in zip(records, begins, strict=True)]
+    return Problem(m, tuple(tracks), lower, upper)
+
+
+def effect_bounds(loop: Loop) -> dict[str, tuple[float, float]]:
+    """Return the bounds of the parameters of a loop's effects, by name."""
+    return {
+        f"{label}.{p.name}": (p.lower, p.upper)
+        for label, effect in loop.labelled.items()
+        for p in effect.parameters()
+    }
+
+
+def bounds_of(loop: Loop, names: Sequence[str]) -> tuple[Array, Array]:
+    """Return the bounds of parameters: those of effects, and none that changes a sign."""
+    known = effect_bounds(loop)
+    parameters = loop.equations(keep=True).parameters
+    lower, upper = [], []
+    for name in names:
+        if name in known:
+            low, high = known[name]
+        else:
+            # A mass or a gain may be far off, but not of the other sign.
+            value = parameters[name]
+            low = 1e-3 * value if value > 0 else -math.inf
+            high = 1e-3 * value if value < 0 else math.inf
+        lower.append(low)
+        upper.append(high)
+    return np.array(lower), np.array(upper)
+
+
+def choose_noise(fit: Fit, always: bool = False) -> Fit:
+    """Add a coloured force if the Bayesian information criterion wants it."""
+    if fit.problem.known is not None:
+        return fit
+    try:
+        richer = with_coloured_force(fit)
+    except CtrlidError:
+        if always:
+            raise
+        return fit
+    # Two parameters more: worth trying out in full only if it gains at all.
+    if not always and richer.value < fit.value + 0.5 * math.log(fit.size):
+        return fit
+    richer = climb(richer)
+    return richer if always or richer.value > fit.value + math.log(fit.size) else fit
+
+
+def summary(loop: Loop, fit: Fit) -> LoopFit:
+    """Return a maximum of the likelihood as a loop and an estimate."""
+    m, p = fit.problem.machine, len(fit.theta)
+    names = m.names
+    matrix, _ = information(fit)
+    on_bound = (fit.theta <= fit.problem.lower) | (fit.theta >= fit.problem.upper)
+    inside = np.concatenate([~on_bound, np.ones(len(matrix) - p, dtype=bool)])
+    covariance = np.zeros((p, p))
+    rows = np.flatnonzero(inside & (np.diag(matrix) > 0))
+    inverse = pseudo_inverse(matrix[np.ix_(rows, rows)])
+    kept = rows[rows < p]
+    covariance[np.ix_(kept, kept)] = inverse[: len(kept), : len(kept)]
+    notes = []
+    lost = [k for k in range(p) if inside[k] and (matrix[k, k] <= 0 or _unseen(matrix, rows, k))]
+    for k in lost:
+        covariance[k, :] = covariance[:, k] = 0.0
+        covariance[k, k] = math.inf
+    if lost:
+        notes.append("the data do not determine " + ", ".join(names[k] for k in lost)
+                     + " (other parameters do the same)")  # fmt: skip
+    noise, scale = fit.noise, float(np.mean(fit.sensor))
+    time = -loop.dt / math.log(noise.memory) if noise.drift else math.nan
+    estimate = LoopEstimate(
+        names, fit.theta, covariance, tuple(np.sqrt(fit.sensor).tolist()),
+        math.sqrt(scale * float(np.mean(noise.force))),
+        math.sqrt(scale * noise.coloured) if noise.drift else 0.0, time, fit.value, fit.size,
+        tuple(n for n, b in zip(names, on_bound, strict=True) if b), tuple(notes),
+    )  # fmt: skip
+    fitted = loop.with_parameters(dict(zip(names, fit.theta.tolist(), strict=True)))
+    return LoopFit(fitted, estimate)
+
+
+def _unseen(matrix: Array, rows: Any, k: int) -> bool:
+    """Whether a parameter takes part in a direction that is not in the data."""
+    if k not in rows:
+        return False
+    part = matrix[np.ix_(rows, rows)]
+    size = np.sqrt(np.diag(part))
+    values, vectors = np.linalg.eigh(part / np.outer(size, size))
+    weak = vectors[list(rows).index(k), values < UNSEEN * values.max()]
+    return bool(np.any(np.abs(weak) > 0.1))

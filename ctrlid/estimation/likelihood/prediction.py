@@ -1,0 +1,217 @@
+"""Predicting a record from its own past: an extended Kalman filter on the plant's equations.
+
+The filter needs u and y only. It never simulates an unstable plant open loop: every sample pulls
+the state back, so it works on plants that no open-loop simulation survives.
+"""
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ..._base.errors import CtrlidError
+from ...data.record import Record
+from ...loop.loop import Loop
+from ...physics.equations import Array
+from .filter_data import make_track
+from .kalman_filter import Noise
+from .likelihood import Problem
+from .maximization import begin, climb
+from .sampled_plant import machine_for
+
+EMPTY: Array = np.empty(0)
+LEAD = 4  # horizons in which a filter's covariance settles
+STARTS = 300  # predictions whose spread is computed
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """One-step predictions of a record.
+
+    Parameters
+    ----------
+    y : ndarray, shape (n,)
+        Prediction of each output sample from the samples before it [output unit].
+    innovations : ndarray, shape (n,)
+        Measured minus predicted output [output unit], zero where the record is not valid.
+    settled : ndarray of bool, shape (n,)
+        Where the record is valid and the prediction no longer depends on the guess of the state
+        at the start, or after a long stretch that does not count.
+    spread : ndarray, shape (n,)
+        Standard deviation of the innovations that the filter expects [output unit].
+    states : ndarray, shape (n, states)
+        State at each sample [units of the states], given the outputs up to and including it.
+    circuit : ndarray, shape (n, controller states)
+        State of a known analog controller at each sample [units of the controller], else empty.
+    sensor_noise, force_noise : float
+        Standard deviations of the noise model [output unit, and unit of the acceleration].
+    """
+
+    y: Array
+    innovations: Array
+    settled: Any
+    spread: Array
+    states: Array
+    circuit: Array
+    sensor_noise: float
+    force_noise: float
+
+
+def predict(loop: Loop, record: Record, force_noise: float | None = None) -> Prediction:
+    r"""Predict each output sample of a record from the samples before it.
+
+    .. math:: \hat y_k = h(\hat x_{k|k-1}), \quad
+        \hat x_{k|k} = \hat x_{k|k-1} + K_k (y_k - \hat y_k)
+
+    An extended Kalman filter on the plant's equations, driven by the measured input. Only the ratio
+    of force noise to sensor noise matters for the prediction; it is chosen by maximum
+    likelihood unless given.
+
+    Parameters
+    ----------
+    loop : Loop
+        The model; its controller is not used.
+    record : Record
+        The data.
+    force_noise : float, optional
+        Ratio of force noise to sensor noise, as standard deviations [1/s^2].
+
+    Returns
+    -------
+    Prediction
+        Predictions, innovations and filtered states.
+
+    Raises
+    ------
+    CtrlidError
+        If the sampling periods differ, too few samples are valid, or the filter loses the record.
+
+    References
+    ----------
+    Anderson and Moore, *Optimal Filtering*, chapter 8.
+
+    Examples
+    --------
+    >>> import ctrlid as cid
+    >>> plant = cid.plants.servo(m=1.0, c=2.0, k=3.0)
+    >>> loop = cid.Loop(plant, 5.0, dt=0.01)
+    >>> r = cid.random_binary(500, amplitude=0.1, hold=50, seed=1)
+    >>> record = cid.simulate(loop, r, sensor_noise=1e-3, seed=2)
+    >>> bool(cid.predict(loop, record).innovations.std() < 1.3e-3)
+    True
+    """
+    if not (isinstance(loop, Loop) and isinstance(record, Record)):
+        raise CtrlidError("predict needs the Loop first, then the Record; given "
+                          f"{type(loop).__name__} and {type(record).__name__}")  # fmt: skip
+    if force_noise is not None and not (np.isfinite(force_noise) and force_noise >= 0):
+        raise CtrlidError(f"force_noise is a ratio >= 0; given {force_noise!r}")
+    track, m = make_track(loop, record), machine_for(loop, (), record)
+    problem = Problem(m, (track,), EMPTY, EMPTY)
+    if force_noise is None:
+        fit = climb(begin(problem, EMPTY, None))
+    else:
+        fit = begin(problem, EMPTY, Noise((max(force_noise, 1e-150) ** 2,) * m.channels))
+    out, sensor = fit.filtered[0], float(np.sqrt(fit.sensor[0]))
+    states = out.trajectory.filtered
+    own = [m.e.states.index(name) for name in loop.equations().states]  # of neutral effects none
+    return Prediction(
+        record.y - out.innovations, out.innovations, fit.problem.counts[0],
+        sensor * np.sqrt(out.variance), states[:, own], states[:, m.n :], sensor,
+        sensor * float(np.sqrt(fit.noise.force[0])),
+    )  # fmt: skip
+
+
+def predict_ahead(
+    loop: Loop, record: Record, prediction: Prediction, horizon: int
+) -> tuple[Any, Array]:  # fmt: skip
+    """Predict several samples ahead from the filtered states and the measured input.
+
+    Parameters
+    ----------
+    loop : Loop
+        The model.
+    record : Record
+        The data.
+    prediction : Prediction
+        What `predict` returned for them.
+    horizon : int
+        Number of samples to look ahead.
+
+    Returns
+    -------
+    index : ndarray of int
+        Samples that are predicted.
+    y : ndarray
+        Their predictions.
+    """
+    every = max(1, horizon // 4)
+    starts = np.arange(0, len(record) - horizon, every)
+    bad = np.concatenate([[0], np.cumsum(~record.valid)])
+    starts = starts[(bad[starts + horizon + 1] == bad[starts]) & prediction.settled[starts]]
+    if not len(starts):
+        return starts, np.empty(0)
+    m, track = machine_for(loop, (), record), make_track(loop, record)
+    x = np.hstack([prediction.states, prediction.circuit])[starts]
+    for j in range(horizon):
+        # The outputs after the start are not known to the prediction.
+        x = m.advance(track, x, starts + j, known=j == 0)
+    k = starts + horizon
+    return k, m.height(track, x, k)
+
+
+def spread_ahead(
+    loop: Loop, record: Record, prediction: Prediction, horizon: int
+) -> tuple[float, float]:  # fmt: skip
+    r"""Return the standard deviation that noise gives predictions several samples ahead.
+
+    .. math:: P_{k+1} = A_k P_k A_k^T + Q, \quad \sigma^2 = h P_{k+j} h^T + R
+
+    from the covariance P of the filtered states, with the plant linearized along the record, and
+    averaged over it. Dry friction, which holds still what rests, damps nothing that moves: at one
+    operating point there is no such average.
+
+    Parameters
+    ----------
+    loop : Loop
+        The model.
+    record : Record
+        The data.
+    prediction : Prediction
+        What `predict` returned.
+    horizon : int
+        Number of samples ahead.
+
+    Returns
+    -------
+    both, sensor : float
+        Standard deviations by all noise, and by the sensor's alone [output unit]; NaN where no
+        stretch is long enough.
+    """
+    plain = replace(loop, controller=None)
+    track, m = make_track(plain, record), machine_for(plain, (), record)
+    r, force = prediction.sensor_noise**2, prediction.force_noise**2
+    ratio = max(force / r, 1e-300) if r else 1.0
+    plant = begin(
+        Problem(m, (track,), EMPTY, EMPTY), EMPTY, Noise((ratio,) * m.channels)
+    ).linearized[0]
+    lead = int(np.clip(LEAD * horizon, 50, 500))
+    starts = np.arange(0, len(record) - lead - horizon, max(1, len(record) // STARTS))
+    bad = np.concatenate([[0], np.cumsum(~record.valid)])
+    starts = starts[bad[starts + lead + horizon + 1] == bad[starts]]
+    if not len(starts):
+        return math.nan, math.nan
+    found = []
+    for variance in (force, 0.0):
+        p = np.broadcast_to(r * np.eye(plant.a.shape[1]), (len(starts), *plant.a.shape[1:]))
+        for j in range(lead + horizon):
+            k = starts + j
+            if j <= lead:
+                h = plant.c[k][:, None, :]
+                seen = p @ h.transpose(0, 2, 1)
+                p = p - seen @ seen.transpose(0, 2, 1) / np.maximum(h @ seen + r, 1e-300)
+            a, b = plant.a[k], plant.b[k]
+            p = a @ p @ a.transpose(0, 2, 1) + variance * (b @ b.transpose(0, 2, 1))
+        h = plant.c[starts + lead + horizon][:, None, :]
+        found.append(math.sqrt(float(np.mean(h @ p @ h.transpose(0, 2, 1))) + r))
+    return found[0], found[1]

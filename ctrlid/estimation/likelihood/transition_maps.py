@@ -1,0 +1,206 @@
+"""Maps of a plant over one sampling period with their derivatives, built once per structure."""
+
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import casadi
+
+from ...loop.controllers import ControlLaw
+from ...physics.block_evaluation import Vectorized
+from ...physics.equations import Equations
+from ...physics.integration import Scheme, advance, input_pieces, integrate
+
+BUILT = 64  # structures whose maps are kept
+LONG = 3000  # instructions
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is to be built; plans that differ in the values of parameters only are equal.
+
+    Parameters
+    ----------
+    equations : Equations
+        The plant with its effects, neutral ones as well.
+    law : ControlLaw or None
+        A known analog controller that moves the input between samples.
+    dt : float
+        Sampling period [s].
+    hold : {"zoh", "foh"}
+        How the input runs between samples otherwise.
+    scheme : Scheme
+        How a period is integrated.
+    forces : tuple of int
+        States that random forces act on.
+    channels : int
+        Number of these forces; a single one acts on all.
+    index : tuple of int
+        Places of the free parameters.
+    late : int
+        Whole periods by which the input comes late.
+    """
+
+    equations: Equations = field(compare=False)
+    law: ControlLaw | None = field(compare=False)
+    dt: float
+    hold: str
+    scheme: Scheme
+    forces: tuple[int, ...]
+    channels: int
+    index: tuple[int, ...]
+    late: int
+    structure: tuple[Any, ...] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        e, law = self.equations, self.law
+        spread = e.smoothed.sx_in(4) if e.spread is None else e.spread
+        given, found = [e.t, e.x, e.u, e.p, spread], [e.rhs, e.output]
+        found += [part for lag in e.lags for part in (lag.time_constant, lag.target)]
+        found += [] if e.delay is None else [e.delay]
+        if e.play is not None:
+            given += [e.play.m, e.play.u]
+            found += [e.play.after, e.play.applied, e.play.start]
+        if law is not None:
+            state, r, y = casadi.SX.sym("c", len(law.rest)), casadi.SX.sym("r"), casadi.SX.sym("y")
+            given += [state, r, y]
+            found += law.apply(e.t, state, r, y)
+        every = casadi.Function("every", given, [casadi.SX(part) for part in found])
+        lags = tuple(lag.state for lag in e.lags)
+        text = every.serialize()
+        object.__setattr__(self, "structure", (text, e.dt, len(e.rest), lags, law is not None))
+
+    @property
+    def size(self) -> int:
+        """Number of states, those of the controller among them."""
+        return len(self.equations.states) + (len(self.law.rest) if self.law else 0)
+
+
+@dataclass(frozen=True, eq=False)
+class Maps:
+    """What is built from expressions: a period in stages, each in equal parts, and the sensor."""
+
+    functions: tuple[casadi.Function, ...]
+    stages: tuple[Vectorized, ...]
+    parts: int
+    sensor_function: casadi.Function
+    sensor: Vectorized
+
+    @property
+    def carries(self) -> bool:
+        """Whether state and derivatives go from one map to the next."""
+        return len(self.functions) * self.parts > 1
+
+
+@functools.lru_cache(maxsize=BUILT)
+def maps_of(plan: Plan) -> Maps:
+    """Return the maps, built once: that takes the time of several passes."""
+    x, ends, given, by, parts = _period(plan)
+    # Behind a play, the input itself depends on the free parameters.
+    own = ("force", "free") if plan.equations.play is None else ("force", "free", "path")
+    functions = _chained(x, ends, parts, given, [by[key] for key in own])
+    height = by["height"]
+    outputs = [height, casadi.jacobian(height, x), casadi.jacobian(height, by["free"])]
+    sensor = casadi.Function("sensor", [x, *given[:3]], outputs, {"cse": True})
+    stages = tuple(Vectorized(f) for f in functions)
+    return Maps(functions, stages, parts, sensor, Vectorized(sensor))
+
+
+def _period(plan: Plan) -> tuple[Any, list[Any], list[Any], dict[str, Any], int]:
+    """Return the state, its value after each stage, what is given, symbols, and the parts."""
+    e, n, dt = plan.equations, len(plan.equations.states), plan.dt
+    x, p, s = (casadi.SX.sym(k, m) for k, m in (("x", plan.size), ("p", e.p.shape[0]),
+                                                ("s", n)))  # fmt: skip
+    t, before, now, ahead, r, y = w = [casadi.SX.sym(k) for k in "tbnary"]
+    force = casadi.SX.sym("f", plan.channels)
+    kick = casadi.SX.zeros(n, 1)
+    for k, j in enumerate(plan.forces):
+        kick[j] = force[k if plan.channels > 1 else 0]
+    # A fit repeats the map often; a single prediction can afford to be exact.
+    scheme = plan.scheme if plan.index else _exact(plan.scheme, e.kinked)
+    part = casadi.SX.sym("i")
+    if plan.law is None:
+        pieces = [
+            tuple(casadi.substitute(casadi.SX(value), e.p, p) for value in piece)
+            for piece in input_pieces(e, dt, (before, now, ahead), plan.hold)
+        ]
+        ends, parts = _stages_of(plan, t, x, pieces, p, s, kick, scheme, part)
+    else:
+        ends = [_followed(plan, t, x, p, s, kick, now, r, y, max(scheme.steps, 2))]
+        parts = 1
+    free = casadi.vertcat(*(p[k] for k in plan.index)) if plan.index else casadi.SX(0, 1)
+    by = {"force": force, "free": free, "path": casadi.vertcat(before, now, ahead),
+          "height": e.smoothed(t, x[:n], now, p, s)[1]}  # fmt: skip
+    return x, ends, [casadi.vertcat(*w), p, s, force, part], by, parts
+
+
+def _exact(scheme: Scheme, kinked: bool) -> Scheme:
+    """Return a scheme of order eight throughout."""
+    steps = scheme.steps if kinked or scheme.order == 8 else 1
+    return Scheme(8, steps, (8, steps) if scheme.sharp else None)
+
+
+def _stages_of(plan: Plan, t: Any, x: Any, pieces: Any, p: Any, s: Any, kick: Any, scheme: Scheme,
+               part: Any) -> tuple[list[Any], int]:  # fmt: skip
+    """Return the maps that make up a period, and how many equal parts each of them has.
+
+    Several steps of one kind are one short expression that is gone through several times.
+    """
+    e, steps = plan.equations, scheme.steps
+    if e.dt or scheme.sharp or steps == 1:
+        return [advance(e, t, x, pieces, p, s, kick, scheme=scheme)[0]], 1
+    ends, begin, one = [], t, Scheme(scheme.order, 1)
+    for duration, level, slope in pieces:
+        h = duration / steps
+        piece = (h, level + slope * part * h, slope)
+        after = advance(e, begin + part * h, x, [piece], p, s, kick, scheme=one)[0]
+        ends.append(after)
+        begin = begin + duration
+    return ends, steps
+
+
+def _followed(plan: Plan, t: Any, x: Any, p: Any, s: Any, kick: Any, u: Any, r: Any, y: Any,
+              substeps: int) -> Any:  # fmt: skip
+    """Advance plant and analog controller together, u being the measured one at the start."""
+    e, law, n = plan.equations, plan.law, len(plan.equations.states)
+    assert law is not None
+    noise = y - e.smoothed(t, x[:n], u, p, s)[1]
+    offset = u - law.apply(t, x[n:], r, y)[0]  # bias, injected signals, what xc does not know
+
+    def rate(tau: Any, z: Any) -> Any:
+        seen = e.smoothed(t + tau, z[:n], u, p, s)[1] + noise
+        computed, slope = law.apply(t + tau, z[n:], r, seen)
+        moved = e.smoothed(t + tau, z[:n], computed + offset, p, s)[0] + kick
+        return casadi.vertcat(moved, slope)
+
+    return integrate(rate, x, plan.dt, substeps)[0]
+
+
+def _chained(
+    x: Any, ends: Sequence[Any], parts: int, given: Sequence[Any], by: Sequence[Any]
+) -> tuple[casadi.Function, ...]:
+    """Return maps that carry the state and its derivatives, by itself first, along.
+
+    Kinks have no slope at the kink itself; everything else is exact.
+    """
+    n = x.shape[0]
+    before = [casadi.SX.eye(n), *(casadi.SX(n, v.shape[0]) for v in by)]
+    carried = []
+    if len(ends) * parts > 1:
+        before = carried = [casadi.SX.sym("s", *value.shape) for value in before]
+    functions = []
+    for end in ends:
+        a, *own = (casadi.jacobian(end, v) for v in (x, *by))
+        own = [casadi.SX(n, n), *own]
+        outputs = [casadi.mtimes(a, s) + d for s, d in zip(before, own, strict=True)]
+        functions.append(_function([x, *carried, *given], [end, *outputs]))
+    return tuple(functions)
+
+
+def _function(inputs: Sequence[Any], outputs: Sequence[Any]) -> casadi.Function:
+    """Return a function, common parts found once where that pays: long ones have few."""
+    plain = casadi.Function("step", inputs, outputs)
+    if plain.n_instructions() > LONG:
+        return plain
+    return casadi.Function("step", inputs, outputs, {"cse": True})

@@ -1,0 +1,190 @@
+"""fit_arx(): the paper's estimator, least squares on a difference equation under constraints."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..._base import text as _text
+from ..._base.errors import CtrlidError
+from ..._base.jobs import check_jobs
+from ...data.record import Record
+from ...data.several_records import VISIBLE_MOTION, input_motion, stream_records
+from ..constraints import AbstractConstraint, check_constraints
+from ..constraints.constrained_minimum import Found, minimize
+from ..constraints.quadratic_program import Cost, NotExcited
+from ..identified_model import Estimate, IdentifiedModel, Structure
+from .regression import Regression, arx_regression, check_orders, from_differences
+
+FloatArray = NDArray[np.float64]
+
+
+def fit_arx(
+    record: Record | Iterable[Record],
+    na: int,
+    nb: int,
+    nk: int = 1,
+    constraints: AbstractConstraint | Sequence[AbstractConstraint] = (),
+    intercept: bool = True,
+    jobs: int | None = None,
+) -> IdentifiedModel:
+    """Fit a difference equation by least squares under constraints, equations (5) and (7) of [1]_.
+
+    ``y(k) + a1 y(k-1) + ... + a_na y(k-na) = b1 u(k-nk) + ... + b_nb u(k-nk-nb+1) + c + e(k)``
+
+    minimises the sum of squares of e, subject to whatever is known about the coefficients. Exact
+    without noise. With noise it is unbiased only if e is white; sensor noise, above all in closed
+    loop and at short sampling periods, biases it, and a constraint alone does not cure that.
+
+    Parameters
+    ----------
+    record : Record or iterable of Record
+        Data; of several records each has its own intercept, since set-points differ. Rows that
+        touch a sample marked not valid are left out. An iterator, such as a generator that cuts a
+        memory-mapped log into records, is read once and in constant memory.
+    na : int
+        Number of poles.
+    nb : int
+        Number of numerator coefficients.
+    nk : int
+        Samples from u to y: 1 where ``u[k]`` is applied after ``y[k]`` is measured.
+    constraints : AbstractConstraint or sequence of them
+        What is known: `ReciprocalPoles`, `PoleAt`, `Integrator`, `StaticGain`, `Fixed`, `Bounds`,
+        `Equal`, `Linear`, `Nonlinear`, ...
+    intercept : bool
+        Estimate the constant c. Signals are absolute and the operating point is never known
+        exactly, so leave it on unless the signals are deviations from a true equilibrium.
+    jobs : int, optional
+        Jobs among which the records are shared, through joblib; by default one, or what
+        ``joblib.parallel_config`` says. The answer does not depend on it.
+
+    Returns
+    -------
+    IdentifiedModel
+        A `control.TransferFunction` with ``.estimate``.
+
+    Raises
+    ------
+    CtrlidError
+        If orders or constraints are unusable or contradict each other, if there are too few
+        samples, or if the data do not excite what is to be estimated.
+
+    References
+    ----------
+    .. [1] "Identification of a class of unstable processes", section IV.
+
+    Examples
+    --------
+    An unstable plant with poles 1.25 and 0.8 under feedback:
+
+    >>> import numpy as np
+    >>> import ctrlid as cid
+    >>> r = np.random.default_rng(1).choice([-1.0, 1.0], 200)
+    >>> y, u = np.zeros(200), np.zeros(200)
+    >>> for k in range(200):
+    ...     if k > 1:
+    ...         y[k] = 2.05 * y[k-1] - y[k-2] + 0.1 * u[k-1] + 0.1 * u[k-2]
+    ...     u[k] = 12.0 * (r[k] - y[k]) - 8.0 * (r[k-1] - y[k-1])
+    >>> record = cid.Record(r=r, u=u, y=y, dt=0.01)
+    >>> G = cid.fit_arx(record, na=2, nb=2, constraints=[cid.ReciprocalPoles()])
+    >>> G.estimate["a2"]
+    1.0
+    >>> G.estimate.poles.real.round(6)
+    array([1.25, 0.8 ])
+    """
+    structure = check_orders(na, nb, nk)
+    known = check_constraints(constraints)
+    first, records = stream_records(record)
+    motions: list[float] = []
+    watched = records if first.hold == "zoh" else _watched(records, motions)
+    regression = arx_regression(watched, structure, intercept, check_jobs(jobs))
+    unknowns = na + nb + len(regression.intercept_rows)
+    if regression.rows <= unknowns:
+        raise CtrlidError(
+            f"Too few samples: {regression.rows} usable rows for {unknowns} unknowns. A row needs "
+            f"{max(na, nk + nb - 1) + 1} valid samples in succession. Record longer or lower the "
+            "orders."
+        )
+    try:
+        found = minimize(arx_cost(regression), known, structure)
+    except NotExcited as trouble:
+        message = _not_excited(regression, trouble.direction)
+        raise CtrlidError(message) from None
+    estimate = _estimate(regression, found, constrained=bool(known), dt=first.dt)
+    share = max(motions, default=0.0)
+    if share > VISIBLE_MOTION:
+        note = (
+            f"u MOVES BETWEEN THE SAMPLES (hold='foh', by {100 * share:.0f} % of its spread a "
+            "period), but a difference equation takes it as held: the poles are off. "
+            "Sample faster, or use fit_continuous with the controller."
+        )
+        estimate = replace(estimate, notes=(note,))
+    names = first.names
+    return IdentifiedModel(estimate, inputs=names.get("u", "u"), outputs=names.get("y", "y"))
+
+
+def _watched(records: Iterable[Record], motions: list[float]) -> Iterator[Record]:
+    """Pass records on, and note of each how far its input moves between samples."""
+    for record in records:
+        motions.append(input_motion([record]))
+        yield record
+
+
+def arx_cost(regression: Regression) -> Cost:
+    """Return the regression as a quadratic cost; columns that are only rounding errors are zero."""
+    size = np.linalg.norm(regression.R, axis=0)
+    excited = size > 10 * regression.floor
+    noise = regression.floor[excited] / size[excited]
+    basis, origin = from_differences(regression.structure)
+    floor = max(1e-11, 10 * float(np.linalg.norm(noise)))
+    return Cost(np.where(excited, regression.R, 0.0), regression.d, basis, origin, floor)
+
+
+def _estimate(regression: Regression, found: Found, constrained: bool, dt: float) -> Estimate:
+    constants = len(regression.intercept_rows)
+    degrees = regression.rows - found.free - constants
+    rss = regression.rss + found.cost
+    return Estimate(
+        structure=regression.structure,
+        values=found.theta,
+        covariance=found.spread * rss / degrees,
+        intercepts=regression.intercepts(found.theta),
+        rss=rss,
+        residual_variance=rss / degrees,
+        n_samples=regression.rows,
+        degrees_of_freedom=degrees,
+        active_bounds=found.active_bounds,
+        branch=found.branch,
+        method=("constrained " if constrained else "") + "least squares (ARX)",
+        solver=found.solver,
+        dt=dt,
+        condition=found.condition,
+    )
+
+
+def _not_excited(regression: Regression, direction: FloatArray) -> str:
+    """Say which signal is constant, or which coefficients the data cannot tell apart."""
+    structure: Structure = regression.structure
+    na = structure.na
+    size = np.linalg.norm(regression.R, axis=0)
+    still = size <= 10 * regression.floor
+    head = "The data do not determine the coefficients: "
+    for signal, column in (("u", na), ("y", 0)):
+        if still[column]:
+            return (
+                f"{head}{signal} is constant wherever the record counts. Excite the loop: vary "
+                "the reference (random_binary) or add a signal to u."
+            )
+    # Weighted by the size of the signals: what the coefficients do to a prediction.
+    effect = np.abs(direction) * np.r_[np.full(na, size[0]), np.full(structure.nb, size[na])]
+    involved = [n for n, e in zip(structure.names, effect, strict=True) if e > 1e-3 * effect.max()]
+    weights = direction / np.abs(direction).max()
+    moves = ", ".join(f"{n} by {weights[structure.names.index(n)]:.3g}" for n in involved)
+    return (
+        f"{head}{_text.listing(involved)} can move together ({moves}) and no prediction changes. "
+        "Either nothing but the controller moves u (vary the reference, or add a signal to u), "
+        "or the orders are higher than the plant's (lower na or nb), or a constraint is missing."
+    )

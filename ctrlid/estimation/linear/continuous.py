@@ -1,0 +1,195 @@
+"""fit_continuous(): a continuous-time transfer function straight from samples."""
+
+import warnings
+from collections.abc import Sequence
+from typing import Any
+
+import control as ct
+import numpy as np
+
+from ..._base.errors import CtrlidError, CtrlidWarning
+from ..._base.text import listing
+from ...data.record import Record
+from ...data.several_records import VISIBLE_MOTION, as_records, input_motion
+from ...loop.controllers import PID
+from ..constraints import AbstractConstraint, check_constraints
+from ..identified_model import Estimate, IdentifiedModel, Structure
+from .prediction_error import Piece, Task, best_fit
+from .sampled_motion import Circuit
+
+FAST_CIRCUIT = 0.1  # dt times the fastest controller pole, above which u moves between samples
+
+
+def fit_continuous(
+    record: Record | Sequence[Record],
+    poles: int,
+    zeros: int = 0,
+    constraints: Sequence[AbstractConstraint] = (),
+    controller: Any = None,
+    delay: float | None = 0.0,
+) -> IdentifiedModel:
+    r"""Fit a continuous-time transfer function to sampled data, in open or closed loop.
+
+    .. math:: G(s) = \frac{b_1 s^{m} + \dots + b_{m+1}}{s^n + a_1 s^{n-1} + \dots + a_n}, \quad
+        \min_{\theta, K} \sum_k \bigl(y_k - \hat y_{k|k-1}(\theta, K)\bigr)^2
+
+    The prediction moves the model exactly over each period, so nothing is lost at fast sampling,
+    and corrects its state with an observer gain K that is estimated along. Since K takes whatever
+    mixture of sensor noise and force noise the data hold, the estimate is right under feedback,
+    without the reference and without knowing the controller; with white Gaussian noises it is
+    maximum likelihood. Initial state and operating point are estimated for each valid stretch.
+
+    Parameters
+    ----------
+    record : Record or sequence of Record
+        The data; several records share the model.
+    poles, zeros : int
+        Number of poles n and of zeros m < n.
+    constraints : sequence of constraints, optional
+        What is known: `SymmetricPoles`, `Integrator`, `StaticGain`, `Fixed`, `Bounds`, ...
+    controller : control.TransferFunction or control.StateSpace, optional
+        The analog controller of r - y, if one moves u between the samples: then u is
+        reconstructed there. A digital controller holds u and need not be given.
+    delay : float or None, optional
+        Time from u to the plant [s], for a held input; None estimates it.
+
+    Returns
+    -------
+    IdentifiedModel
+        The transfer function in s, with `.estimate`. A delay is in the attribute
+        `delay`, and counts wherever ctrlid looks at the model.
+
+    Raises
+    ------
+    CtrlidError
+        If orders, constraints or controller are unusable, the data are too few or do not excite
+        what is to be estimated.
+
+    Warns
+    -----
+    CtrlidWarning
+        If an analog controller is at work (the record's hold is ``"foh"``) that is not known and
+        moves u visibly within a period.
+
+    References
+    ----------
+    .. [1] Ljung, *System Identification*, 2nd edition, sections 7.4 and 13.4.
+    .. [2] Garnier and Wang (eds.), *Identification of Continuous-time Models from Sampled Data*.
+
+    Examples
+    --------
+    >>> import control as ct
+    >>> import ctrlid as cid
+    >>> plant = ct.tf([-6.5], [1, 0, -1600])
+    >>> C = cid.design_lead(plant, crossover=100, phase_margin=50)
+    >>> C = ct.sample_system(ct.ss(C), 0.001, "tustin")
+    >>> loop = cid.Loop(plant, C, dt=0.001)
+    >>> r = cid.random_binary(3000, amplitude=1e-4, hold=20, seed=1)
+    >>> record = cid.simulate(loop, r, sensor_noise=1e-6, seed=2)
+    >>> G = cid.fit_continuous(record, poles=2, constraints=[cid.SymmetricPoles()])
+    >>> G.estimate["a1"], round(G.estimate.poles.real.max())
+    (0.0, 40)
+    """
+    structure = _check_orders(poles, zeros)
+    known = check_constraints(constraints)
+    records = as_records(record)
+    circuit = _circuit(controller, records)
+    pieces = _pieces(records, structure.na)
+    needed = 4 * (len(structure.names) + structure.na + 2)
+    total = sum(p.n for p in pieces)
+    if total < needed:
+        raise CtrlidError(
+            f"Too few samples: {total} valid ones for {len(structure.names)} coefficients and the "
+            f"noise model; at least {needed} are needed. Record longer or lower the orders."
+        )
+    if delay is not None and not (np.isfinite(delay) and delay >= 0):
+        raise CtrlidError(f"delay is a time >= 0 s, or None to estimate it; given {delay!r}")
+    if (delay is None or delay) and (circuit or records[0].hold != "zoh"):
+        raise CtrlidError("a delay is modelled for a held input only; give delay=0")
+    task = Task(structure, pieces, records[0].dt, records[0].hold, circuit, delay is None, 1.0)
+    point, found, rss, used = best_fit(task, known, delay or 0.0)
+    degrees = used - found.free - structure.na - int(task.free_delay)
+    late = f", delay {point.delay:.6g} s" if task.free_delay else ""
+    estimate = Estimate(
+        structure=structure, values=found.theta, covariance=found.spread * rss / degrees,
+        intercepts=np.zeros(0), rss=rss, residual_variance=rss / degrees, n_samples=total,
+        degrees_of_freedom=degrees, active_bounds=found.active_bounds, branch=found.branch,
+        method=("constrained " if known else "") + "prediction error (continuous time)",
+        solver=f"Gauss-Newton, {found.solver}{late}", dt=0.0, condition=found.condition,
+    )  # fmt: skip
+    names = records[0].names
+    model = IdentifiedModel(estimate, inputs=names.get("u", "u"), outputs=names.get("y", "y"))
+    model.delay = point.delay
+    return model
+
+
+def _check_orders(poles: Any, zeros: Any) -> Structure:
+    for name, value, least in (("poles", poles, 1), ("zeros", zeros, 0)):
+        if not isinstance(value, int | np.integer) or value < least:
+            raise CtrlidError(f"{name} must be an integer of at least {least}; given {value!r}")
+    if zeros >= poles:
+        raise CtrlidError(
+            f"a plant has fewer zeros than poles; given {zeros} zeros and {poles} poles"
+        )
+    return Structure(na=int(poles), nb=int(zeros) + 1, domain="s")
+
+
+def _circuit(controller: Any, records: Sequence[Record]) -> Circuit | None:
+    if isinstance(controller, PID) or (
+        isinstance(controller, ct.InputOutputSystem) and controller.dt not in (0, None)
+    ):
+        return None  # digital: u is held and known
+    if controller is None:
+        moves = input_motion(records)
+        if moves > VISIBLE_MOTION:
+            warnings.warn(
+                f"the input of an analog controller moves by {100 * moves:.0f} % of its spread "
+                "from sample to sample and is taken as straight between them; give controller= "
+                "(and record the reference) so that it can be reconstructed, or sample faster",
+                CtrlidWarning, stacklevel=3,
+            )  # fmt: skip
+        return None
+    if not isinstance(controller, ct.TransferFunction | ct.StateSpace) or (
+        controller.ninputs != 1 or controller.noutputs != 1
+    ):
+        raise CtrlidError(
+            "controller= takes the analog controller of r - y as a TransferFunction or StateSpace "
+            f"with one input and one output; given {type(controller).__name__}"
+        )
+    space = ct.ss(controller)
+    circuit = Circuit(space.A, space.B[:, 0], space.C[0], float(space.D[0, 0]))
+    if any(r.r is None for r in records):
+        if records[0].dt * circuit.fastest > FAST_CIRCUIT:
+            warnings.warn(
+                f"without a recorded reference the input between the samples is taken as straight, "
+                f"but the controller's fastest pole times dt is "
+                f"{records[0].dt * circuit.fastest:.2g}; record the reference or sample faster",
+                CtrlidWarning, stacklevel=3,
+            )  # fmt: skip
+        return None
+    return circuit
+
+
+def _pieces(records: Sequence[Record], order: int) -> tuple[Piece, ...]:
+    pieces = []
+    for record in records:
+        y0, u0 = (float(np.mean(s[record.valid])) if record.valid.any() else 0.0
+                  for s in (record.y, record.u))  # fmt: skip
+        for start, stop in record.segments():
+            if stop - start < 4 * (order + 2):
+                continue
+            part = {"y": record.y[start:stop] - y0, "u": record.u[start:stop] - u0}
+            if record.r is not None:
+                part["r"] = record.r[start:stop] - y0  # r - y keeps its absolute value
+            pieces.append(Piece(part, stop - start))
+    if not pieces:
+        raise CtrlidError("the record has no valid stretch long enough to predict anything; "
+                          f"a stretch needs {4 * (order + 2)} samples")  # fmt: skip
+    flat = [name for name in ("u", "y") if all(np.ptp(p.signals[name]) == 0 for p in pieces)]
+    if flat:
+        raise CtrlidError(
+            f"The data do not determine the coefficients: {listing(flat)} is constant wherever the "
+            "record counts. Excite the loop: vary the reference (random_binary) or add a signal "
+            "to u."
+        )
+    return tuple(pieces)

@@ -1,0 +1,198 @@
+"""Signals from outside the loop, and what their past explains of y and u: first instruments."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..._base import text as _text
+from ..._base.errors import CtrlidError
+from ...data.record import Record
+from .regression import block_qr, merge
+
+FloatArray = NDArray[np.float64]
+Signals = list[tuple[FloatArray, FloatArray]]
+
+_LONGEST = 8192  # samples of the past that delayed references reach back to
+
+
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """A stretch of valid samples of one record, levels taken off.
+
+    ``y`` and ``u`` are ``(n,)``, ``w`` is ``(signals, n)`` with the external signals; ``owner`` is
+    the number of the record and ``levels`` what was taken off y and u.
+    """
+
+    owner: int
+    y: FloatArray
+    u: FloatArray
+    w: FloatArray
+    levels: tuple[float, float]
+
+
+def cut(records: Sequence[Record], names: Sequence[str], intercept: bool, shortest: int) -> Any:
+    """Cut records into valid stretches.
+
+    Parameters
+    ----------
+    records : sequence of Record
+        Experiments.
+    names : sequence of str
+        External signals: ``"r"`` or channels of ``extra``.
+    intercept : bool
+        Take off the means, since a constant is estimated anyway.
+    shortest : int
+        Stretches of fewer samples are left out.
+
+    Returns
+    -------
+    list of Piece
+        In order.
+    """
+    pieces = []
+    for owner, record in enumerate(records):
+        w = np.array([record.r if name == "r" else record.extra[name] for name in names])
+        y0 = u0 = 0.0
+        if intercept and record.valid.any():
+            y0, u0 = float(record.y[record.valid].mean()), float(record.u[record.valid].mean())
+            w = w - w[:, record.valid].mean(axis=1, keepdims=True)
+        for i, j in record.segments():
+            if j - i >= shortest:
+                y, u = record.y[i:j] - y0, record.u[i:j] - u0
+                pieces.append(Piece(owner, y, u, w[:, i:j], (y0, u0)))
+    return pieces
+
+
+def two_stage(pieces: Sequence[Piece]) -> Signals:
+    r"""Project y and u on the past of the external signals: the first of two least squares.
+
+    .. math:: \hat y(k) = \sum_i g_i \sum_{l \in I_i} w(k - l)
+
+    The delays l run in windows I that widen geometrically, 0, 1, 2, 3, 4-5, 6-7, 8-11, ..., so that
+    few coefficients follow a response fast or slow.
+
+    Parameters
+    ----------
+    pieces : sequence of Piece
+        Data.
+
+    Returns
+    -------
+    list of (array, array)
+        Of each piece what of y and u the external signals explain.
+
+    References
+    ----------
+    Van den Hof and Schrama, "An indirect method for transfer function estimation from closed loop
+    data", Automatica 29 (1993).
+    """
+    longest = max(len(piece.y) for piece in pieces)
+    edges = _windows(min(_LONGEST, longest // 8))
+    m = (len(edges) - 1) * len(pieces[0].w)
+    factors = []
+    for piece in pieces:
+        sums = [_sums(w, edges[-1]) for w in piece.w]
+
+        def fill(out: FloatArray, start: int, stop: int, p: Piece = piece, s: Any = sums) -> None:
+            out[:, 0] = 1.0
+            out[:, 1 : m + 1] = _delayed(s, edges, start, stop)
+            out[:, m + 1], out[:, m + 2] = p.y[start:stop], p.u[start:stop]
+
+        factors.append(block_qr(fill, len(piece.y), m + 3)[1:, 1:])
+    total = merge(factors)
+    scale = np.linalg.norm(total[:, :m], axis=0)
+    scale[scale == 0] = 1.0
+    g = np.linalg.lstsq(total[:, :m] / scale, total[:, m:], rcond=1e-8)[0] / scale[:, None]
+    found = []
+    for piece in pieces:
+        sums, n = [_sums(w, edges[-1]) for w in piece.w], len(piece.y)
+        blocks = [_delayed(sums, edges, i, min(i + 4096, n)) @ g for i in range(0, n, 4096)]
+        both = np.vstack(blocks)
+        found.append((both[:, 0].copy(), both[:, 1].copy()))
+    return found
+
+
+def _windows(reach: int) -> list[int]:
+    edges = [0, 1, 2, 3, 4]
+    while edges[-1] < reach:
+        edges.append(edges[-1] + max(1, 1 << (edges[-1].bit_length() - 2)))
+    return edges
+
+
+def _sums(w: FloatArray, reach: int) -> FloatArray:
+    """Return running sums; the signal waits at its first value before the first sample."""
+    return np.concatenate([[0.0], np.cumsum(np.concatenate([np.full(reach, w[0]), w]))])
+
+
+def _delayed(sums: Sequence[FloatArray], edges: list[int], start: int, stop: int) -> FloatArray:
+    columns = []
+    at = edges[-1] + 1 + np.arange(start, stop)
+    for s in sums:
+        for near, far in itertools.pairwise(edges):
+            columns.append((s[at - near] - s[at - far]) / (far - near))
+    return np.column_stack(columns)
+
+
+def check_instruments(records: Sequence[Record], instruments: Any) -> tuple[str, ...]:
+    """Names of the external signals, refused in words where they cannot serve.
+
+    Parameters
+    ----------
+    records : sequence of Record
+        Experiments.
+    instruments : str or sequence of str
+        ``"r"`` or names of extra channels.
+
+    Returns
+    -------
+    tuple of str
+        The names.
+
+    Raises
+    ------
+    CtrlidError
+        If a signal is missing, constant, or is u or y itself.
+    """
+    names = (instruments,) if isinstance(instruments, str) else tuple(instruments)
+    if not names or not all(isinstance(name, str) for name in names):
+        raise CtrlidError(
+            f"instruments names external signals, 'r' or channels of extra; given {instruments!r}."
+        )
+    for number, record in enumerate(records, start=1):
+        where = f"Record {number} of {len(records)}" if len(records) > 1 else "The record"
+        for name in names:
+            if name in ("u", "y"):
+                raise CtrlidError(
+                    f"{name} cannot be an instrument: the feedback carries the noise into it. Name "
+                    "a signal from outside the loop, 'r' or an injected one in extra."
+                )
+            channel = record.r if name == "r" else record.extra.get(name)
+            if channel is None:
+                raise CtrlidError(_missing(where, name, record))
+            counted = channel[record.valid]
+            if counted.size and np.ptp(counted) == 0:
+                raise CtrlidError(
+                    f"{where} has a constant {name}: nothing from outside moves the loop, so there "
+                    "is no instrument. Vary the reference (random_binary), or name an injected "
+                    "signal with instruments=. Without either use fit_loop, which needs u and y "
+                    "only."
+                )
+    return names
+
+
+def _missing(where: str, name: str, record: Record) -> str:
+    has = _text.listing([repr(key) for key in record.extra])
+    if name != "r":
+        return f"{where} has no extra channel {name!r}; it has {has or 'none'}."
+    return (
+        f"{where} has no reference r. Instruments must come from outside the loop: log the "
+        "reference, or, if a dither or pulses were added to u, put them into extra and name them, "
+        "instruments='dither'" + (f" (there is {has})" if has else "") + ". Without either use "
+        "fit_loop, which needs u and y only."
+    )

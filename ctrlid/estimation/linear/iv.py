@@ -1,0 +1,422 @@
+"""fit_iv(): instrumental variables, consistent in closed loop whatever the colour of the noise."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from ..._base import text as _text
+from ..._base.errors import CtrlidError, CtrlidWarning
+from ...data.record import Record
+from ...data.several_records import as_records
+from ..constraints import AbstractConstraint, check_constraints
+from ..constraints.constrained_minimum import Found, minimize
+from ..constraints.quadratic_program import NotExcited
+from ..identified_model import Estimate, IdentifiedModel, Structure
+from .controller_model import Law, found_law, given_law, loop_signals
+from .instruments import Signals, check_instruments
+from .iv_equations import Moments, Residuals, Task, compute_moments, curved_force, separate
+from .prefilter import View, autoregression, stable_factor
+from .regression import check_orders, to_differences
+
+FloatArray = NDArray[np.float64]
+
+_MOST = 40  # iterations for one noise model
+_DEGREE = 3  # products of signals up to this degree
+_PATIENCE = 8  # of them in full steps
+_STARTS = 0.5 ** np.arange(1, 10)  # distance of the first prefilters' poles from z = 1
+
+
+def fit_iv(
+    record: Record | Sequence[Record],
+    na: int,
+    nb: int,
+    nk: int = 1,
+    constraints: AbstractConstraint | Sequence[AbstractConstraint] = (),
+    controller: Any = None,
+    intercept: bool = True,
+    instruments: str | Sequence[str] = "r",
+) -> IdentifiedModel:
+    r"""Fit a difference equation by refined instrumental variables under constraints.
+
+    ``y(k) + a1 y(k-1) + ... + a_na y(k-na) = b1 u(k-nk) + ... + b_nb u(k-nk-nb+1) + c + A v(k)``
+
+    with v the sensor noise, which the controller feeds back into u. Least squares minimises the
+    equation error; here it only has to be uncorrelated with instruments Z, signals that come from
+    outside the loop and that v does not reach:
+
+    .. math:: \min_\theta \| (Z^T Z)^{-1/2} Z^T F (y - \Phi \theta) \|^2
+
+    subject to what is known about the coefficients. The answer is right on average whatever the
+    colour of the noise. Z and the prefilter F decide how precise it is, and are refined in turn:
+
+    1. First Z is what delayed references explain of y and u.
+    2. F whitens the equation error: 1 / A with the poles outside the unit circle reflected into it,
+       times an autoregression of the residuals where v is coloured.
+    3. Z becomes y and u of the noise-free simulated loop of the last model and the controller. If
+       that loop is not stable, or no controller is found, step 1 serves on.
+    4. Where the residuals show that the plant is curved, squares and the product of y and u are
+       estimated too: they are small, but slow, and would drown the static gain.
+
+    Repeated until the coefficients move by less than a thousandth of their standard errors.
+
+    Parameters
+    ----------
+    record : Record or sequence of Record
+        Data with a held input; of several records each has its own intercept. Stretches of valid
+        samples are used each on their own.
+    na : int
+        Number of poles.
+    nb : int
+        Number of numerator coefficients.
+    nk : int
+        Samples from u to y: 1 where ``u[k]`` is applied after ``y[k]`` is measured.
+    constraints : AbstractConstraint or sequence of them
+        What is known, as in `fit_arx`.
+    controller : control.TransferFunction or control.StateSpace, optional
+        The controller in discrete time, of r - y or of (r, y); signals named in `instruments`
+        other than r are added to its output. By default it is found in the record by a regression
+        of u on r and y. An inexact one costs precision only.
+    intercept : bool
+        Estimate the constant c; see `fit_arx`.
+    instruments : str or sequence of str
+        The signals from outside the loop: ``"r"``, or channels of ``record.extra``, for instance a
+        dither that was added to u.
+
+    Returns
+    -------
+    IdentifiedModel
+        A `control.TransferFunction` with ``.estimate``. Its residual variance is that of the
+        whitened equation error: without plant noise, that of the one-step prediction. Its
+        standard errors hold for noise of any colour: where correlations of the residuals
+        contradict the noise model, they are computed from those instead, and ``notes`` say so.
+
+    Raises
+    ------
+    CtrlidError
+        If there is no signal from outside the loop, if it is too weak, if u is not held between
+        samples, if there are too few samples, or for constraints as in `fit_arx`.
+
+    Warns
+    -----
+    CtrlidWarning
+        If the iterations do not settle.
+
+    References
+    ----------
+    .. [1] Söderström and Stoica, *System Identification*, chapter 8.
+    .. [2] Gilson and Van den Hof, "Instrumental variable methods for closed-loop system
+       identification", Automatica 41 (2005).
+    .. [3] Gilson, Garnier, Young and Van den Hof, "Optimal instrumental variable method for
+       closed-loop identification", IET Control Theory and Applications 5 (2011).
+    .. [4] Young, *Recursive Estimation and Time-Series Analysis*, 2nd ed., chapters 7 and 9.
+    .. [5] Forssell and Ljung, "Identification of unstable systems using output error and
+       Box-Jenkins model structures", IEEE Transactions on Automatic Control 45 (2000): the
+       reflected poles.
+
+    Examples
+    --------
+    An unstable plant with poles 1.05 and 1/1.05 under feedback, its sensor noisy:
+
+    >>> import numpy as np
+    >>> import ctrlid as cid
+    >>> rng = np.random.default_rng(1)
+    >>> r, v = np.repeat(rng.choice([-1.0, 1.0], 400), 20), 0.2 * rng.standard_normal(8000)
+    >>> x, y, u = np.zeros(8000), np.zeros(8000), np.zeros(8000)
+    >>> for k in range(8000):
+    ...     if k > 1:
+    ...         x[k] = (1.05 + 1/1.05) * x[k-1] - x[k-2] + 0.00125 * (u[k-1] + u[k-2])
+    ...     y[k] = x[k] + v[k]
+    ...     u[k] = 60.0 * (r[k] - y[k]) - 55.0 * (r[k-1] - y[k-1])
+    >>> record = cid.Record(r=r, u=u, y=y, dt=0.01)
+    >>> known = [cid.ReciprocalPoles(), cid.Equal("b1", "b2")]
+    >>> cid.fit_arx(record, 2, 2, constraints=known).estimate.poles.real.round(2)
+    array([1., 1.])
+    >>> cid.fit_iv(record, 2, 2, constraints=known).estimate.poles.real.round(2)
+    array([1.05, 0.95])
+    """
+    structure = check_orders(na, nb, nk)
+    known = check_constraints(constraints)
+    records = as_records(record)
+    _check_hold(records)
+    names = check_instruments(records, instruments)
+    task = Task.prepare(records, structure, names, intercept)
+    law = found_law(task.pieces, names) if controller is None else None
+    if controller is not None:
+        law = given_law(controller, names, records[0].dt)
+    try:
+        fit = _refine(task, known, law)
+    except NotExcited as trouble:
+        raise CtrlidError(_not_excited(structure, names, trouble.direction)) from None
+    estimate = _estimate(task, fit, constrained=bool(known), dt=records[0].dt)
+    _check_strength(estimate, names)
+    if not fit.settled:
+        warnings.warn(_NOT_SETTLED, CtrlidWarning, stacklevel=2)
+    labels = records[0].names
+    return IdentifiedModel(estimate, inputs=labels.get("u", "u"), outputs=labels.get("y", "y"))
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """The last step of the iterations."""
+
+    found: Found
+    moments: Moments
+    view: View
+    hats: Signals
+    source: str
+    iterations: int
+    settled: bool = True
+
+
+def _refine(task: Task, known: Sequence[AbstractConstraint], law: Law | None) -> _Fit:
+    """Iterate: with white noise and a linear plant first, then with what the residuals ask for."""
+    theta = _start(task, known)
+    view, count = View(np.ones(1), np.ones(1)), 0
+    for _ in range(6):
+        fit = _iterate(task, known, law, theta, view, count)
+        count, theta, view = fit.iterations, fit.found.theta, fit.view
+        if fit.moments.rss(theta) <= 1e-20 * fit.moments.size**2:
+            break  # nothing but rounding errors is left: there is no noise to model
+        # From white again, so that the order can fall as well as rise.
+        plain = replace(view, num=np.ones(1))
+        better = autoregression([part.e for part in separate(task, theta, fit.hats, plain)])
+        if view.degree < _DEGREE and _is_curved(task, fit, replace(view, num=better)):
+            view = replace(view, degree=view.degree + 1, bend=())
+            continue
+        if len(better) == len(view.num) and np.allclose(better, view.num, atol=0.02):
+            break
+        view = replace(view, num=better)
+    return fit
+
+
+def _start(task: Task, known: Sequence[AbstractConstraint]) -> FloatArray:
+    """First coefficients: delayed references, under prefilters from wide to narrow.
+
+    The candidate with the least one-step prediction error wins.
+    """
+    best: tuple[float, FloatArray | None] = (np.inf, None)
+    trouble: NotExcited | None = None
+    for distance in _STARTS:
+        if distance * task.longest < 20:
+            break
+        den = np.poly(np.full(task.structure.na, 1 - distance))
+        view = View(np.ones(1), np.asarray(den, dtype=float))
+        try:
+            theta = minimize(
+                compute_moments(task, task.delayed, view).cost, known, task.structure
+            ).theta
+        except NotExcited as problem:
+            trouble = problem
+            continue
+        moments = compute_moments(task, task.delayed, _through(task, theta, view))
+        merit = moments.rss(theta)
+        if merit < best[0]:
+            best = (merit, theta)
+    if best[1] is None:
+        assert trouble is not None
+        raise trouble
+    return best[1]
+
+
+def _is_curved(task: Task, fit: _Fit, view: View) -> bool:
+    """Whether products of a higher degree explain more than Schwarz' criterion asks of them."""
+    theta = fit.found.theta
+    straight = compute_moments(task, fit.hats, view)
+    curved = compute_moments(task, fit.hats, replace(view, degree=view.degree + 1, bend=()))
+    gain = straight.rows * np.log(straight.rss(theta) / curved.rss(theta))
+    return bool(gain > (curved.nuisances - straight.nuisances) * np.log(straight.rows))
+
+
+def _bent(task: Task, fit: _Fit) -> View:
+    """Return the view with the curvature and the equilibria that this step found."""
+    residuals = separate(task, fit.found.theta, fit.hats, fit.view)
+    gain = float(fit.found.theta[task.structure.na :].sum())
+    shift: tuple[float, ...] = ()
+    if task.intercept and gain != 0.0:
+        # At the equilibrium of the mean output: 0 = B(1) shift + c.
+        reach = max(float(np.abs(hat[1]).max()) for hat in fit.hats)
+        constants = _by_record(task, [part.constant for part in residuals])
+        shift = tuple(float(x) for x in np.clip(-constants / gain, -reach, reach))
+    return replace(fit.view, bend=tuple(part.bend for part in residuals), shift=shift)
+
+
+def _by_record(task: Task, values: Sequence[float]) -> FloatArray:
+    """Mean of what each stretch says, over the samples of each record."""
+    owners = [piece.owner for piece in task.pieces]
+    sizes = [len(piece.y) for piece in task.pieces]
+    total = np.bincount(owners, np.multiply(values, sizes), task.records)
+    return np.asarray(total / np.bincount(owners, sizes, task.records), dtype=float)
+
+
+def _through(task: Task, theta: FloatArray, view: View) -> View:
+    """Return the same view through the denominator of another model."""
+    return replace(view, den=stable_factor(task.structure, theta, task.longest))
+
+
+def _iterate(
+    task: Task,
+    known: Sequence[AbstractConstraint],
+    law: Law | None,
+    theta: FloatArray,
+    view: View,
+    count: int,
+) -> _Fit:
+    """Repeat with filters and instruments of the last model until it no longer moves."""
+    best, least = theta, np.inf
+    hats = task.delayed
+    for step in range(_MOST):
+        view = _through(task, theta, view)
+        simulated = None
+        if law is not None:
+            kicks = curved_force(task, hats, view)
+            simulated = loop_signals(task.pieces, law, task.structure, theta, kicks)
+        if simulated is None and step >= _PATIENCE:
+            law = None  # the simulated loop comes and goes: stay without it
+        hats = task.delayed if simulated is None else simulated
+        source = "delayed references" if simulated is None or law is None else law.source
+        moments = compute_moments(task, hats, view)
+        cost = moments.cost
+        found = minimize(cost, known, task.structure)
+        merit = moments.rss(theta)
+        if merit < least:
+            best, least = theta, merit
+        fit = _Fit(found, moments, view, hats, source, count + step + 1)
+        move = to_differences(task.structure, found.theta) - to_differences(task.structure, theta)
+        moved = float(np.linalg.norm(cost.R @ move))
+        noise = np.sqrt(moments.rss(found.theta) / moments.rows)
+        settled = moved <= 1e-3 * noise or moved <= 1e-10 * moments.size
+        if settled and (view.degree == 1 or step > 1):
+            return fit
+        if view.degree > 1:
+            view = _bent(task, fit)
+        # Full steps first; where they swing to and fro, half of them.
+        share = 1.0 if step < _PATIENCE else 0.5
+        theta = theta + share * (found.theta - theta)
+    view = _through(task, best, view)
+    moments = compute_moments(task, fit.hats, view)
+    found = minimize(moments.cost, known, task.structure)
+    return replace(fit, found=found, moments=moments, view=view, settled=False)
+
+
+def _estimate(task: Task, fit: _Fit, constrained: bool, dt: float) -> Estimate:
+    s, found, moments = task.structure, fit.found, fit.moments
+    rss = moments.rss(found.theta)
+    degrees = moments.rows - moments.nuisances - found.free
+    residuals = separate(task, found.theta, fit.hats, fit.view)
+    covariance = found.spread * rss / degrees
+    sandwich = _sandwich(moments, found, residuals)
+    words = [f"{fit.iterations} iterations", f"instruments from {fit.source}"]
+    notes = [] if fit.settled else [_NOT_SETTLED]
+    if fit.view.degree > 1:
+        notes.append(_CURVED.format(degree=fit.view.degree))
+    if len(fit.view.num) > 1:
+        words.append(f"sensor noise of order {len(fit.view.num) - 1}")
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = np.nanmax(np.diag(sandwich) / np.diag(covariance), initial=0.0)
+    if ratio > 2.0 and rss > 1e-20 * moments.size**2:
+        covariance = sandwich
+        notes.append(_CORRELATED)
+    delta = to_differences(s, found.theta)
+    # A(1) = -delta_0 and B(1) = beta_0 return the levels that were taken off.
+    constants = [
+        part.constant - delta[0] * piece.levels[0] - delta[s.na] * piece.levels[1]
+        for piece, part in zip(task.pieces, residuals, strict=True)
+    ]
+    return Estimate(
+        structure=s,
+        values=found.theta,
+        covariance=covariance,
+        intercepts=_by_record(task, constants) if task.intercept else np.zeros(0),
+        rss=rss,
+        residual_variance=rss / degrees,
+        n_samples=moments.rows,
+        degrees_of_freedom=degrees,
+        active_bounds=found.active_bounds,
+        branch=found.branch,
+        method=("constrained " if constrained else "") + "refined instrumental variables",
+        solver=f"{found.solver}; {', '.join(words)}",
+        dt=dt,
+        condition=found.condition,
+        notes=tuple(notes),
+    )
+
+
+def _sandwich(moments: Moments, found: Found, residuals: Sequence[Residuals]) -> FloatArray:
+    """Covariance without a noise model, from the correlations of ``z e`` (Newey and West)."""
+    p = len(moments.structure.names)
+    upper = moments.factor[:p, :p]
+    cost = moments.cost
+    slope = np.linalg.solve(cost.basis.T, cost.R.T).T  # R in the coefficients themselves
+    middle = np.zeros((p, p))
+    for part in residuals:
+        g = np.linalg.lstsq(upper.T, (part.z * part.e[:, None]).T, rcond=None)[0].T
+        lags = int(np.ceil(1.5 * len(g) ** (1 / 3)))
+        for lag in range(lags + 1):
+            both = g[lag:].T @ g[: len(g) - lag] * (1 - lag / (lags + 1))
+            middle += both if lag == 0 else both + both.T
+    bread = found.spread @ slope.T
+    return np.asarray(bread @ middle @ bread.T)
+
+
+# -- words ---------------------------------------------------------------------------------------
+
+_NOT_SETTLED = (
+    f"THE ITERATIONS DID NOT SETTLE in {_MOST} steps: these are the coefficients with the least "
+    "prediction error among them. The orders may be too high, or the reference too weak."
+)
+_CURVED = (
+    "THE PLANT IS CURVED over the range of this record: products of y and u to degree {degree} "
+    "were estimated too, and the coefficients are those at the equilibrium. Smaller signals, or "
+    "fit_loop with the physics, tell more."
+)
+_CORRELATED = (
+    "THE NOISE MODEL DOES NOT HOLD: the standard errors come from the residuals' own "
+    "correlations. Compare residuals with the reference and look for missing physics."
+)
+
+
+def _check_hold(records: Sequence[Record]) -> None:
+    if records[0].hold != "zoh":
+        raise CtrlidError(
+            "fit_iv needs an input that is held between samples, but this record has "
+            f"hold={records[0].hold!r}: u of an analog controller moves meanwhile, and a "
+            "difference equation that knows it at the samples only is biased. Use fit_continuous "
+            "with controller=, or fit_loop. Where u is held in truth, or reference and u are "
+            "smooth and dt short, say so with dataclasses.replace(record, hold='zoh')."
+        )
+
+
+def _not_excited(structure: Structure, names: tuple[str, ...], direction: FloatArray) -> str:
+    size = np.abs(direction)
+    involved = [n for n, d in zip(structure.names, size, strict=True) if d > 1e-3 * size.max()]
+    return (
+        f"The instruments do not determine the coefficients: {_text.listing(involved)} can move "
+        f"together and nothing that {_text.listing(names)} causes would change. Excite the loop "
+        "with more frequencies (random_binary), lower na or nb, or add what is known as a "
+        "constraint."
+    )
+
+
+def _check_strength(estimate: Estimate, names: tuple[str, ...]) -> None:
+    """Refuse where no effect of u on y is seen: the instruments then have nothing to do with it."""
+    na = estimate.structure.na
+    values, covariance = estimate.values[na:], estimate.covariance[na:, na:]
+    free = np.diag(covariance) > 0
+    if not free.any() or (~free & (values != 0)).any():
+        return
+    values, covariance = values[free], covariance[np.ix_(free, free)]
+    wald = float(values @ np.linalg.pinv(covariance, hermitian=True) @ values)
+    rank = int(np.linalg.matrix_rank(covariance, hermitian=True))
+    if wald < stats.chi2.ppf(0.999, rank):
+        raise CtrlidError(
+            f"The instruments are too weak: with what {_text.listing(names)} causes, b is not "
+            "distinguishable from zero. Check that it is the signal that drives this loop and is "
+            "logged at the right time; else move it further or longer."
+        )

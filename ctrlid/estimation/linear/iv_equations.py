@@ -1,0 +1,333 @@
+"""Passes over the data: instruments against regressors, nuisances eliminated, in blocks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..._base.errors import CtrlidError
+from ...data.record import Record
+from ..constraints.quadratic_program import Cost
+from ..identified_model import Structure
+from .instruments import Piece, Signals, cut, two_stage
+from .prefilter import MOST_COLOURED, View
+from .regression import block_qr, from_differences, merge, to_differences
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """What stays the same through all iterations.
+
+    Parameters
+    ----------
+    structure : Structure
+        Orders of the model.
+    pieces : list of Piece
+        The valid stretches.
+    delayed : list of (array, array)
+        What delayed external signals explain of y and u, stretch by stretch.
+    records : int
+        Number of records, each with its own constant.
+    intercept : bool
+        Whether there is a constant.
+    """
+
+    structure: Structure
+    pieces: list[Piece]
+    delayed: Signals
+    records: int
+    intercept: bool
+
+    @classmethod
+    def prepare(
+        cls,
+        records: Sequence[Record],
+        structure: Structure,
+        names: tuple[str, ...],
+        intercept: bool,
+    ) -> Task:
+        """Cut the records and project them on the delayed external signals.
+
+        Parameters
+        ----------
+        records : sequence of Record
+            Experiments.
+        structure : Structure
+            Orders of the model.
+        names : tuple of str
+            External signals.
+        intercept : bool
+            Whether to estimate a constant.
+
+        Returns
+        -------
+        Task
+            The data as all passes use them.
+
+        Raises
+        ------
+        CtrlidError
+            If there are too few samples, or too few in succession.
+        """
+        na, span = structure.na, max(structure.na, structure.nk + structure.nb - 1) + 1
+        shortest = span + na + 2 * MOST_COLOURED
+        pieces = cut(records, names, intercept, shortest)
+        for number, one in enumerate(records):
+            if not any(piece.owner == number for piece in pieces):
+                longest = max((j - i for i, j in one.segments()), default=0)
+                raise CtrlidError(
+                    f"Record {number + 1} of {len(records)} has no stretch of {shortest} valid "
+                    f"samples in succession, the longest has {longest}. Record longer, leave it "
+                    "out or lower the orders."
+                )
+        unknowns = na + structure.nb + len(records) + na * len(pieces)
+        total = sum(len(piece.y) for piece in pieces)
+        if total < 10 * unknowns:
+            raise CtrlidError(
+                f"Too few samples: {total} valid ones for {unknowns} unknowns. Instrumental "
+                f"variables need at least {10 * unknowns}; record longer or lower the orders."
+            )
+        return cls(structure, pieces, two_stage(pieces), len(records), intercept)
+
+    @property
+    def longest(self) -> int:
+        """Samples of the longest stretch."""
+        return max(len(piece.y) for piece in self.pieces)
+
+
+@dataclass(frozen=True, eq=False)
+class Moments:
+    """Triangular factor of ``[instruments | regressors | target]``, nuisances eliminated.
+
+    Parameters
+    ----------
+    factor : (2 p + 1, 2 p + 1) array
+        Upper triangular, p the number of coefficients, in the differenced basis.
+    rows, nuisances : int
+        Rows used, and unknowns eliminated.
+    structure : Structure
+        Orders of the model.
+    floor : (p,) array
+        Size of the rounding errors in each regressor, as far as instruments pick them up.
+    """
+
+    factor: FloatArray
+    rows: int
+    nuisances: int
+    structure: Structure
+    floor: FloatArray
+
+    @property
+    def cost(self) -> Cost:
+        """``|| (Z'Z)^(-1/2) Z' (y - Phi theta) ||^2`` in the differenced basis."""
+        p = len(self.structure.names)
+        upper = self.factor[:p, p : 2 * p]
+        size = np.linalg.norm(upper, axis=0)
+        excited = size > 10 * self.floor
+        noise = np.linalg.norm(self.floor[excited] / size[excited])
+        basis, origin = from_differences(self.structure)
+        rest = max(1e-11, 10 * float(noise))
+        return Cost(np.where(excited, upper, 0.0), self.factor[:p, -1], basis, origin, rest)
+
+    def rss(self, theta: FloatArray) -> float:
+        """Sum of squares of the filtered equation error."""
+        p = len(self.structure.names)
+        delta = to_differences(self.structure, theta)
+        return float(np.sum((self.factor[:, -1] - self.factor[:, p : 2 * p] @ delta) ** 2))
+
+    @property
+    def size(self) -> float:
+        """Norm of the target."""
+        return float(np.linalg.norm(self.factor[:, -1]))
+
+
+def _differences(signal: FloatArray, start: int, n: int, count: int) -> list[FloatArray]:
+    """Return ``s, D s, D^2 s, ..``, each ``(n,)`` from sample ``start`` on."""
+    return [np.diff(signal, k)[start : start + n] for k in range(count)]
+
+
+def _products(piece: Piece, hats: tuple[FloatArray, FloatArray], view: View) -> list[FloatArray]:
+    """Return squares and products of what the external signals cause, up to a degree, size one.
+
+    Near an equilibrium every smooth plant is linear but for these.
+    """
+    if view.degree == 1:
+        return []
+    y = hats[0] / np.abs(hats[0]).max()
+    u = hats[1] - (view.shift[piece.owner] if view.shift else 0.0)
+    u = u / np.abs(u).max()
+    degrees = range(2, view.degree + 1)
+    return [u ** (total - i) * y**i for total in degrees for i in range(total + 1)]
+
+
+def curved_force(task: Task, hats: Signals, view: View) -> list[FloatArray] | None:
+    """Return the force of the products, in the units of the difference equation.
+
+    Parameters
+    ----------
+    task : Task
+        The data.
+    hats : list of (array, array)
+        y and u as the external signals cause them.
+    view : View
+        With the coefficients of the products.
+
+    Returns
+    -------
+    list of arrays or None
+        For each stretch, mean taken off; None without such coefficients.
+    """
+    if not view.bend:
+        return None
+    s = task.structure
+    first = s.nk + s.nb - 1
+    found = []
+    for piece, hat, bend in zip(task.pieces, hats, view.bend, strict=True):
+        n = len(piece.y) - first
+        columns = [
+            column
+            for product in _products(piece, hat, view)
+            for column in _differences(product, 0, n, s.nb)
+        ]
+        force = np.column_stack(columns) @ bend
+        found.append(np.concatenate([np.zeros(first), force - force.mean()]))
+    return found
+
+
+def _table(
+    task: Task, piece: Piece, hats: tuple[FloatArray, FloatArray], view: View
+) -> tuple[list[FloatArray], int]:
+    """Columns ``nuisances | 1 | instruments | regressors | target``; the number of the first.
+
+    Nuisances are what the prefilter's initial state leaves behind, and products of y and u.
+    """
+    s = task.structure
+    first = max(s.na, s.nk + s.nb - 1) + len(view.num) - 1
+    n = len(piece.y) - first
+    i, j = first - s.na, first - s.nk - s.nb + 1
+    columns = list(view.decays(len(piece.y))[first:].T)
+    for product in _products(piece, hats, view):
+        columns += _differences(view(product), j, n, s.nb)
+    nuisances = len(columns)
+    columns.append(view(np.ones(len(piece.y)))[first:] if task.intercept else np.zeros(n))
+    for y, u in (hats, (piece.y, piece.u)):
+        ys = _differences(view(y), i, n, s.na + 1)
+        columns += [*ys[:-1], *_differences(view(u), j, n, s.nb)]
+    return [*columns, ys[-1]], nuisances
+
+
+def compute_moments(task: Task, hats: Signals, view: View) -> Moments:
+    """Pass over the data with given instruments and prefilter.
+
+    Parameters
+    ----------
+    task : Task
+        The data.
+    hats : list of (array, array)
+        Instruments: y and u as the external signals cause them.
+    view : View
+        The prefilter.
+
+    Returns
+    -------
+    Moments
+        All that the coefficients need, whatever the length of the records.
+    """
+    s = task.structure
+    owned: list[list[FloatArray]] = [[] for _ in range(task.records)]
+    rows, nuisances = 0, task.records * task.intercept
+    for piece, hat in zip(task.pieces, hats, strict=True):
+        columns, skip = _table(task, piece, hat, view)
+
+        def fill(out: FloatArray, i: int, j: int, columns: Any = columns) -> None:
+            for k, column in enumerate(columns):
+                out[:, k] = column[i:j]
+
+        n, width = len(columns[0]), len(columns)
+        factor = block_qr(fill, n, width)
+        owned[piece.owner].append(factor[skip:, skip:])
+        rows += n
+        nuisances += min(skip, n)
+    whole = merge([merge(factors)[1:, 1:] for factors in owned])
+    return Moments(whole, rows, nuisances, s, _rounding(task, view))
+
+
+def _rounding(task: Task, view: View) -> FloatArray:
+    """Return the rounding errors of the data in each column, as far as instruments pick them up."""
+    s = task.structure
+    impulse = np.zeros(task.longest)
+    impulse[0] = 1.0
+    h = view(impulse)
+    gains = [
+        np.sqrt(np.sum(np.diff(h, k, prepend=np.zeros(k)) ** 2)) for k in range(max(s.na, s.nb))
+    ]
+    eps = float(np.finfo(float).eps) * np.sqrt(len(s.names))
+    y = max(abs(piece.levels[0]) + float(np.abs(piece.y).max()) for piece in task.pieces)
+    u = max(abs(piece.levels[1]) + float(np.abs(piece.u).max()) for piece in task.pieces)
+    sizes = [y * gain for gain in gains[: s.na]] + [u * gain for gain in gains[: s.nb]]
+    return np.asarray(eps * np.array(sizes, dtype=float))
+
+
+@dataclass(frozen=True, eq=False)
+class Residuals:
+    """One stretch with nuisances taken out.
+
+    Parameters
+    ----------
+    z : (n, p) array
+        Instruments.
+    e : (n,) array
+        Whitened equation errors.
+    bend : array
+        Coefficients of the products of signals.
+    constant : float
+        Constant of the equation.
+    """
+
+    z: FloatArray
+    e: FloatArray
+    bend: FloatArray
+    constant: float
+
+
+def separate(task: Task, theta: FloatArray, hats: Signals, view: View) -> list[Residuals]:
+    """Separate nuisances from instruments and equation errors.
+
+    Parameters
+    ----------
+    task : Task
+        The data.
+    theta : (p,) array
+        Coefficients of the model.
+    hats : list of (array, array)
+        Instruments: y and u as the external signals cause them.
+    view : View
+        The prefilter.
+
+    Returns
+    -------
+    list of Residuals
+        One for each stretch.
+    """
+    s = task.structure
+    p = len(s.names)
+    delta = to_differences(s, theta)
+    found = []
+    for piece, hat in zip(task.pieces, hats, strict=True):
+        columns, skip = _table(task, piece, hat, view)
+        table, skip = np.column_stack(columns), skip + 1
+        nuisance, z = table[:, :skip], table[:, skip : skip + p]
+        error = table[:, -1] - table[:, skip + p : -1] @ delta
+        size = np.linalg.norm(nuisance, axis=0)
+        size[size == 0] = 1.0
+        both = np.column_stack([z, error])
+        x = np.linalg.lstsq(nuisance / size, both, rcond=1e-12)[0] / size[:, None]
+        both -= nuisance @ x
+        found.append(Residuals(both[:, :-1], both[:, -1], x[s.na : skip - 1, -1], x[skip - 1, -1]))
+    return found

@@ -1,0 +1,138 @@
+"""The view that whitens: reflected poles, coloured noise, and the degree of a curved plant."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import signal
+
+from ..identified_model import Structure
+from .regression import to_differences
+
+FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+MOST_COLOURED = 10
+"""Largest order of the autoregression that describes the colour of the noise."""
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """How the data are looked at: through ``num / den``, and curved up to some degree.
+
+    ``bend`` holds of each stretch the coefficients of the products, and ``shift`` how far the
+    equilibrium of each record lies from the mean of u: a curved plant rectifies what moves it.
+
+    Parameters
+    ----------
+    num, den : arrays
+        Prefilter in powers of the delay.
+    degree : int
+        Degree of the products of y and u that are estimated with the model; 1 for none.
+    bend : tuple of arrays
+        Coefficients of the products on each stretch, once known.
+    shift : tuple of float
+        For each record the input at the equilibrium, less the mean input.
+    """
+
+    num: FloatArray
+    den: FloatArray
+    degree: int = 1
+    bend: tuple[FloatArray, ...] = ()
+    shift: tuple[float, ...] = ()
+
+    def __call__(self, s: FloatArray) -> FloatArray:
+        """Filter a signal, from rest."""
+        return np.asarray(signal.lfilter(self.num, self.den, s), dtype=float)
+
+    def decays(self, n: int) -> FloatArray:
+        """All ways in which the filter's unknown initial state decays, ``(n, order)``.
+
+        Estimated with the model they make the start of each stretch exact: else the filter would
+        need several of its time constants to forget it.
+        """
+        order = len(self.den) - 1
+        impulse = np.zeros(n + order)
+        impulse[0] = 1.0
+        h = np.asarray(signal.lfilter([1.0], self.den, impulse), dtype=float)
+        h[np.abs(h) < 1e-30 * np.abs(h).max()] = 0.0
+        return np.column_stack([h[order - i : order - i + n] for i in range(1, order + 1)])
+
+
+def stable_factor(structure: Structure, theta: FloatArray, n: int) -> FloatArray:
+    """Denominator with the poles outside the unit circle reflected into it.
+
+    ``A(q)`` over it is an all-pass: it whitens the equation error ``A v`` of white sensor noise v.
+    Poles within 5/n of the circle are drawn in by that much, beyond what n samples resolve.
+
+    Parameters
+    ----------
+    structure : Structure
+        Orders.
+    theta : (p,) array
+        Coefficients of the model.
+    n : int
+        Samples.
+
+    Returns
+    -------
+    (na + 1,) array
+        Monic, in powers of the delay.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> stable_factor(Structure(2, 1), np.array([-2.5, 1.0, 0.3]), 10_000)
+    array([ 1.  , -1.  ,  0.25])
+    """
+    delta = to_differences(structure, theta)[: structure.na]
+    roots = 1.0 + np.roots(np.concatenate([[1.0], -delta[::-1]])).astype(complex)
+    z: ComplexArray = np.where(np.abs(roots) > 1, 1 / roots.conj(), roots)
+    size = np.maximum(np.abs(z), 1e-300)
+    z = z * np.minimum(1.0, (1 - 5 / max(n, 10)) / size)
+    return np.asarray(np.poly(z).real, dtype=float)
+
+
+def autoregression(residuals: Sequence[FloatArray], highest: int = MOST_COLOURED) -> FloatArray:
+    """Autoregressive whitening filter of residuals, its order by Schwarz' criterion.
+
+    Parameters
+    ----------
+    residuals : sequence of arrays
+        Pieces of one noise.
+    highest : int
+        Largest order.
+
+    Returns
+    -------
+    (order + 1,) array
+        Monic; ``[1]`` for white residuals. Always minimum phase.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from scipy.signal import lfilter
+    >>> white = np.random.default_rng(0).standard_normal(20_000)
+    >>> autoregression([white])
+    array([1.])
+    >>> autoregression([lfilter([1.0], [1.0, -0.8], white)]).round(1)
+    array([ 1. , -0.8])
+    """
+    rows = sum(len(e) for e in residuals)
+    r = np.zeros(highest + 1)
+    for e in residuals:
+        for lag in range(min(highest, len(e) - 1) + 1):
+            r[lag] += float(e[lag:] @ e[: len(e) - lag])
+    filters = [np.ones(1)]
+    d, power = np.ones(1), r[0]
+    merits = [rows * np.log(power)]
+    for order in range(1, highest + 1):  # Levinson and Durbin
+        reflection = -float(d @ r[order:0:-1]) / power
+        d = np.concatenate([d, [0.0]]) + reflection * np.concatenate([[0.0], d[::-1]])
+        power *= 1 - reflection**2
+        filters.append(d)
+        merits.append(rows * np.log(power) + order * np.log(rows))
+    return filters[int(np.argmin(merits))]

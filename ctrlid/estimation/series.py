@@ -1,0 +1,235 @@
+"""fit_each(): one model per record, and how its poles move from set-point to set-point."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from .._base import text as _text
+from .._base.errors import CtrlidError
+from .._base.jobs import check_jobs, spread
+from ..data.record import Record
+from .identified_model import IdentifiedModel
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class PoleTrend:
+    """A straight line through the rightmost poles of several fits.
+
+    Attributes
+    ----------
+    level : float
+        Mean output of the records [output unit], weighted as the line is.
+    pole, pole_error : float
+        The line there and its standard error [rad/s].
+    slope, slope_error : float
+        Change of the pole with the output and its standard error [rad/s per output unit].
+    exponent, exponent_error : float
+        ``slope level / pole`` [1]: the pole goes as the output to this power, minus one half for a
+        ball in a field that falls with the square of the gap. NaN where output or pole change sign.
+    p_value : float
+        Chance that the standard errors explain the distances from the line; NaN for two records.
+    """
+
+    level: float
+    pole: float
+    pole_error: float
+    slope: float
+    slope_error: float
+    exponent: float
+    exponent_error: float
+    p_value: float
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class FitSeries(_text.Printed):
+    """Models of several records, as `fit_each` returns them.
+
+    Attributes
+    ----------
+    models : tuple of IdentifiedModel
+        One for each record, in the order given.
+    names : tuple of str
+        The records' names, or their numbers.
+    levels : (n,) array
+        Mean output of each record where it counts [output unit].
+    unit : str
+        Unit of the output, "" if it is not known.
+    """
+
+    models: tuple[IdentifiedModel, ...]
+    names: tuple[str, ...]
+    levels: FloatArray
+    unit: str
+
+    @property
+    def rates(self) -> FloatArray:
+        """Real part of the rightmost pole of each model [rad/s]: that of an unstable plant."""
+        return np.array([self._poles(k)[0].real for k in range(len(self.models))])
+
+    @property
+    def rate_errors(self) -> FloatArray:
+        """Standard errors of `rates` [rad/s]."""
+        return np.array([self._errors(k)[0] for k in range(len(self.models))])
+
+    def _order(self, k: int) -> Any:
+        s = self.models[k].estimate.poles_s
+        return np.argsort(-np.where(np.isfinite(s.real), s.real, -np.inf), kind="stable")
+
+    def _poles(self, k: int) -> Any:
+        return self.models[k].estimate.poles_s[self._order(k)]
+
+    def _errors(self, k: int) -> FloatArray:
+        errors: FloatArray = self.models[k].estimate.poles_s_standard_errors[self._order(k)]
+        return errors
+
+    @property
+    def trend(self) -> PoleTrend:
+        r"""Return the line ``p = pole + slope (y - level)`` through the rightmost poles.
+
+        .. math:: \min \sum_k \frac{(p_k - \bar p - s (y_k - \bar y))^2}{\sigma_k^2}
+
+        Weights are the standard errors of the fits; if these do not explain the distances from the
+        line, those of the line are scaled up to the scatter.
+        """
+        y, p, sigma = self.levels, self.rates, self.rate_errors
+        if len(np.unique(y)) < 2:
+            raise CtrlidError(
+                f"a trend needs records at two different outputs at least; given {len(y)} at "
+                f"{', '.join(_text.number(v, 4) for v in y)}"
+            )
+        if not (np.isfinite(sigma).all() and np.isfinite(p).all()):
+            raise CtrlidError("a trend needs poles with finite standard errors: two of them merge")
+        exact = not (sigma > 0).all()
+        weight = np.ones(len(y)) if exact else sigma**-2
+        level = float(weight @ y / weight.sum())
+        pole = float(weight @ p / weight.sum())
+        width = float(weight @ (y - level) ** 2)
+        slope = float(weight @ ((y - level) * (p - pole)) / width)
+        square = float(weight @ (p - pole - slope * (y - level)) ** 2)
+        degrees = len(y) - 2
+        scale = square / degrees if degrees else 1.0
+        scale = scale if exact else max(scale, 1.0)
+        chance = float(chi2.sf(square, degrees)) if degrees and not exact else float("nan")
+        slope_error = float(np.sqrt(scale / width))
+        one_sign = bool((y * y[0] > 0).all() and (p * p[0] > 0).all())
+        exponent = level / pole if one_sign else float("nan")
+        return PoleTrend(
+            level, pole, float(np.sqrt(scale / weight.sum())), slope, slope_error,
+            slope * exponent, slope_error * abs(exponent), chance,
+        )  # fmt: skip
+
+    def __str__(self) -> str:
+        unit = f" [{self.unit}]" if self.unit else ""
+        width = max(len(name) for name in (*self.names, "record"))
+        rows = [f"{'record':<{width}}  {'output' + unit:>12}  poles [rad/s]"]
+        for k, (name, level) in enumerate(zip(self.names, self.levels, strict=True)):
+            poles = ", ".join(
+                _text.with_error(s, e) for s, e in zip(self._poles(k), self._errors(k), strict=True)
+            )
+            on = f"   ON A BOUND: {', '.join(a)}" if (a := self.models[k].estimate.active) else ""
+            rows.append(f"{name:<{width}}  {level:>12.6g}  {poles}{on}")
+        if len(np.unique(self.levels)) > 1 and np.isfinite(self.rate_errors).all():
+            rows.append(_trend_words(self.trend, self.unit))
+        return "\n".join(rows)
+
+
+def _trend_words(line: PoleTrend, unit: str) -> str:
+    text = (
+        f"rightmost pole {_text.with_error(line.pole, line.pole_error)} rad/s at "
+        f"{line.level:.4g} {unit}".rstrip()
+        + f", slope {_text.with_error(line.slope, line.slope_error)} rad/s per {unit or 'unit'}"
+    )
+    if np.isfinite(line.exponent):
+        power = _text.with_error(line.exponent, line.exponent_error)
+        text += f": as the output to the power {power}"
+    if np.isfinite(line.p_value):
+        verb = "EXCEED" if line.p_value < 0.01 else "are within"
+        text += f". Distances from the line {verb} the standard errors "
+        text += f"({_text.chance(line.p_value)})"
+    return text + "."
+
+
+def fit_each(
+    fit: Callable[..., IdentifiedModel],
+    records: Iterable[Record],
+    *,
+    jobs: int | None = None,
+    **options: Any,
+) -> FitSeries:
+    """Fit every record on its own: one model per set-point, with the trend of its poles.
+
+    The other way, one model of all records, is ``fit(records, ...)`` itself: the poles are then
+    taken as the same at all set-points.
+
+    Parameters
+    ----------
+    fit : callable
+        `fit_iv`, `fit_continuous`, `fit_arx`, or a function of yours from a record and the options
+        to an `IdentifiedModel`.
+    records : iterable of Record
+        One experiment each.
+    jobs : int, optional
+        Fits at the same time, through joblib (-1: one for each processor); by default one, or what
+        ``joblib.parallel_config`` says, which may name a dask cluster.
+    **options
+        What `fit` takes besides the record.
+
+    Returns
+    -------
+    FitSeries
+        The models and their poles; print it, or draw it with `plot.trend`.
+
+    Raises
+    ------
+    CtrlidError
+        If there is no record, or a fit is refused; the words say which record it was.
+
+    Examples
+    --------
+    A levitated ball at three gaps. Physics says ``p = sqrt(2 g/x0)``: power minus one half.
+
+    >>> import ctrlid as cid
+    >>> plant, records = cid.plants.maglev(m=0.0213, K=3.34e-6), []
+    >>> for gap in (0.008, 0.012, 0.018):
+    ...     at = cid.operating_point(plant, output=gap)
+    ...     C = cid.design_lead(cid.linearize(plant, at), crossover=100, phase_margin=50)
+    ...     loop = cid.Loop(plant, C.sample(0.002, "tustin"), dt=0.002, at=at)
+    ...     r = cid.random_binary(4000, amplitude=5e-5, hold=10, around=gap, seed=1)
+    ...     records.append(cid.simulate(loop, r, sensor_noise=1e-6, seed=2))
+    >>> series = cid.fit_each(cid.fit_iv, records, na=2, nb=2, constraints=[cid.ReciprocalPoles()])
+    >>> series.rates.round().tolist()
+    [50.0, 40.0, 33.0]
+    >>> abs(series.trend.exponent + 0.5) < 0.05
+    True
+    """
+    if not callable(fit):
+        raise CtrlidError(f"fit_each needs a function such as fit_iv; given {type(fit).__name__}")
+    records = (records,) if isinstance(records, Record) else records
+    done = list(spread(partial(_one, fit, options), enumerate(records, 1), check_jobs(jobs)))
+    if not done:
+        raise CtrlidError("fit_each needs one record at least; the list given is empty")
+    models, names, levels, units = zip(*done, strict=True)
+    return FitSeries(models, names, np.array(levels), units[0])
+
+
+def _one(
+    fit: Callable[..., IdentifiedModel], options: dict[str, Any], item: tuple[int, Record]
+) -> tuple[IdentifiedModel, str, float, str]:
+    number, record = item
+    if not isinstance(record, Record):
+        raise CtrlidError(f"fit_each needs Records; number {number} is a {type(record).__name__}")
+    name = record.name or f"record {number}"
+    try:
+        model = fit(record, **options)
+    except CtrlidError as reason:
+        raise CtrlidError(f"{name} (number {number}): {reason}") from reason
+    return model, name, float(np.mean(record.y[record.valid])), record.units.get("y", "")

@@ -1,0 +1,144 @@
+"""What a loop's controller computes from signals that are already there."""
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import casadi
+import numpy as np
+
+from .._base.errors import CtrlidError
+from ..data.record import Record
+from ..physics.equations import Array
+from .loop import Loop
+
+
+def _controller_run(loop: Loop, y: Array, r: Array | None) -> tuple[Any, Array]:
+    """Return the controller over all samples as a function of its initial state, and its rest."""
+    law = loop.law()
+    if law is None or law.dt == 0.0:
+        kind = "no controller" if law is None else "an analog one"
+        raise CtrlidError(
+            f"only a digital controller computes its output from the samples alone; this loop has "
+            f"{kind}"
+        )
+    x, w = casadi.SX.sym("x", len(law.rest)), casadi.SX.sym("w", 3)
+    u, after = law.apply(w[0], x, w[1], w[2])
+    lower, upper = loop.input_limits
+    u = casadi.fmin(casadi.fmax(u, lower), upper)
+    step = casadi.Function("controller", [x, w], [casadi.vertcat(after), u])
+    reference = np.full(len(y), loop.point.output) if r is None else np.asarray(r)
+    table = casadi.DM(np.vstack([np.arange(len(y)) * loop.dt, reference, y]))
+    start = casadi.MX.sym("start", len(law.rest))
+    outputs = step.mapaccum("run", len(y))(start, table)[1]
+    return casadi.Function("outputs", [start], [outputs.T]), np.array(law.rest, dtype=float)
+
+
+def controller_output(loop: Loop, y: Array, r: Array | None = None) -> Array:
+    """Return what a digital controller, at rest before, computes from a reference and an output.
+
+    Parameters
+    ----------
+    loop : Loop
+        The loop whose controller runs.
+    y : ndarray, shape (n,)
+        Measured output.
+    r : ndarray, shape (n,), optional
+        Reference; by default constant at the operating point.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        The input, within the limits of the loop.
+
+    Raises
+    ------
+    CtrlidError
+        If the loop has no controller, or an analog one.
+    """
+    run, rest = _controller_run(loop, y, r)
+    return np.asarray(run(rest), float).ravel()
+
+
+def replay_controller(loop: Loop, record: Record) -> Array:
+    """Return the input that the controller of a loop computes from a record's own r and y.
+
+    The controller's initial state is not in the record; it is chosen to reproduce the logged u
+    best. What then remains between the result and ``record.u`` is not the controller's: injected
+    pulses or dither, a channel logged late, another controller.
+
+    Parameters
+    ----------
+    loop : Loop
+        Loop with a digital controller.
+    record : Record
+        Record with a reference.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        Input at each sample [input unit].
+
+    Raises
+    ------
+    CtrlidError
+        If there is no digital controller, no reference, or the sampling periods differ.
+
+    Examples
+    --------
+    >>> import ctrlid as cid
+    >>> plant = cid.plants.servo(m=1.0, c=2.0, k=3.0)
+    >>> loop = cid.Loop(plant, cid.PID(kp=5.0, kd=0.1), dt=0.01)
+    >>> record = cid.simulate(loop, cid.random_binary(500, amplitude=0.1, hold=50, seed=1))
+    >>> bool(abs(cid.replay_controller(loop, record) - record.u).max() < 1e-12)
+    True
+    """
+    return replay_from_best_state(loop, record)[0]
+
+
+def replay_from_best_state(loop: Loop, record: Record) -> tuple[Array, Array]:
+    """Return what `replay_controller` does, and the controller's initial state that it chose."""
+    if abs(loop.dt - record.dt) > 1e-9 * loop.dt:
+        raise CtrlidError(f"the loop is sampled at {loop.dt:g} s, the record at {record.dt:g} s")
+    if record.r is None:
+        raise CtrlidError("the record has no reference r, which the controller needs")
+    run, start = _controller_run(loop, record.y, record.r)
+    replayed, best = _compared(run, start, record)
+    if start.size and np.isfinite(loop.input_limits).any():
+        # From the wrong state all may be cut off, and the state is then nowhere to be seen.
+        unlimited = replace(loop, input_limits=(-math.inf, math.inf))
+        inside = (record.u > loop.input_limits[0]) & (record.u < loop.input_limits[1])
+        free, _ = _controller_run(unlimited, record.y, record.r)
+        moved = _stepped(free, _slope(free, start.size), start, record.u, inside)
+        trial, cost = _compared(run, moved, record)
+        if cost < best:
+            start, replayed, best = moved, trial, cost
+    # Gauss-Newton: one step where the law is linear in its state, a few more around limits.
+    slope, every = _slope(run, start.size), np.full(len(record), True)
+    for _ in range(10 if start.size else 0):
+        moved = _stepped(run, slope, start, record.u, every)
+        trial, cost = _compared(run, moved, record)
+        if not cost < best:
+            break
+        start, replayed, best = moved, trial, cost
+    return replayed, start
+
+
+def _compared(run: Any, start: Array, record: Record) -> tuple[Array, float]:
+    """Return what a controller computes from a state, and how far the logged input is from it."""
+    replayed = np.asarray(run(start), float).ravel()
+    return replayed, float(np.sum((replayed - record.u) ** 2))
+
+
+def _slope(run: Any, size: int) -> Any:
+    """Return how the outputs of a controller depend on its initial state, as a function of it."""
+    state = casadi.MX.sym("state", size)
+    return casadi.Function("slope", [state], [casadi.jacobian(run(state), state)])
+
+
+def _stepped(run: Any, slope: Any, start: Array, u: Array, use: Any) -> Array:
+    """Return a state by one Gauss-Newton step towards a logged input, on the samples to use."""
+    jacobian = np.asarray(slope(start).full(), float)
+    left = u - np.asarray(run(start), float).ravel()
+    step = np.linalg.lstsq(jacobian[use], left[use], rcond=1e-12)[0]
+    return np.asarray(start + step)

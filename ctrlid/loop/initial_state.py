@@ -1,0 +1,143 @@
+"""Where a simulation starts: the state from which it follows the first samples of a record."""
+
+from typing import Any
+
+import casadi
+import numpy as np
+from scipy import optimize
+
+from .._base.errors import CtrlidError
+from ..data.record import Record
+from ..effects.context import motion
+from ..physics.equations import Array
+from ..physics.linearization import state_matrices
+from .simulation import Simulator
+
+FASTEST = 20.0  # standard deviations of the measured speed: no start is faster
+NEAR = 3.0  # times the largest step between the first samples: the start is where it is seen
+FEW = 8  # samples that tell where a record starts, and how fast
+NARROW = 1e-6  # of the scale: a search begins so far within its bounds
+
+
+def best_start(
+    simulator: Simulator, part: Record, r: Any, d: Array, guess: Array, fitted: int
+) -> Array:
+    """Return the initial state whose first entries fit the first samples best.
+
+    Parameters
+    ----------
+    simulator : Simulator
+        The loop.
+    part : Record
+        The record, without gaps.
+    r : ndarray or None
+        Its reference.
+    d : ndarray
+        What is added to the controller's output.
+    guess : ndarray
+        A state of plant, controller and input path.
+    fitted : int
+        How many of its first entries are sought; the others are kept.
+
+    Returns
+    -------
+    ndarray
+        The state: where it is measured, no faster than the record moves, and with lags of the
+        input within what they follow.
+    """
+    spread = max(float(np.std(part.y)), 1e-12 * float(np.abs(part.y).max()), 1e-300)
+    scale = np.maximum(0.01 * np.abs(guess[:fitted]), spread)
+    e = simulator.loop.equations()
+    for j in e.velocities:
+        scale[j] = max(float(np.std(np.diff(part.y))) / part.dt, 1e-300)
+    seen = _as_measured(simulator, part, guess)
+    low, high = _limits(simulator, part, seen)
+    for lag in _following(simulator, fitted):
+        scale[lag] = max(float(np.std(part.u)), 1e-300)
+
+    def misfit(z: Array, count: int) -> Array | None:
+        try:
+            y = simulator.run(z, None if r is None else r[:count], d[:count])[0]
+        except CtrlidError:
+            return None
+        return np.asarray((y - part.y[:count]) / spread, dtype=float)
+
+    def moved(start: Array, point: Array) -> Array:
+        z = start.copy()
+        z[:fitted] += scale * (point - 1)
+        return z
+
+    def nearby(start: Array, count: int) -> Array:
+        def residual(point: Array) -> Array:
+            found = misfit(moved(start, point), count)
+            return np.full(count, 1e3) if found is None else found
+
+        # A force that acts from the first sample on is not to be paid for by an absurd start.
+        lower, upper = (1 + (v[:fitted] - start[:fitted]) / scale for v in (low, high))
+        upper = np.maximum(upper, lower + 4 * NARROW)
+        # Around 1, so that the differences have the relative size that is asked for.
+        best = optimize.least_squares(
+            residual, np.clip(np.ones(fitted), lower + NARROW, upper - NARROW),
+            bounds=(lower, upper), diff_step=[1e-4], max_nfev=20,
+        )  # fmt: skip
+        return moved(start, best.x)
+
+    # From rest a short search does not find a start that is far away.
+    count = min(len(part), 400)
+    there, here = misfit(seen, count), misfit(guess, count)
+    if there is None and here is None:
+        # An unstable plant is lost soon from a start that is only nearly right.
+        for few in (10, 30, 100):
+            seen = nearby(seen, min(few, count))
+        return nearby(seen, count)
+    if there is not None and (here is None or there @ there < here @ here):
+        guess = seen
+    return nearby(guess, count)
+
+
+def _as_measured(simulator: Simulator, part: Record, guess: Array) -> Array:
+    """Return a guess moved to where the first samples see the plant, and how fast."""
+    loop, start = simulator.loop, guess.copy()
+    e = loop.equations()
+    n = len(e.states)
+    few = min(len(part), FEW)
+    slope, first = np.polyfit(np.arange(few) * part.dt, part.y[:few], 1)
+    c = _seen(simulator)
+    off = first - float(e.evaluate(guess[:n], loop.point.input, 0.0)[1][0])
+    seen = np.array([0.0 if j in e.velocities else c[j] for j in range(n)])
+    if seen.any():
+        start[:n] += seen * off / (seen @ seen)
+    moving = motion(e)
+    if moving is not None and c[moving[0]]:
+        start[moving[1]] = slope / c[moving[0]]
+    return start
+
+
+def _limits(simulator: Simulator, part: Record, seen: Array) -> tuple[Array, Array]:
+    """Return between what values the state of the plant may start, around where it is seen."""
+    e = simulator.loop.equations()
+    low, high = np.full(len(seen), -np.inf), np.full(len(seen), np.inf)
+    moving, c = motion(e), _seen(simulator)
+    if moving is not None and c[moving[0]]:
+        where, speed = moving
+        steps = np.diff(part.y)
+        high[speed] = FASTEST * float(np.std(steps)) / part.dt / abs(c[where])
+        low[speed] = -high[speed]
+        if not casadi.depends_on(casadi.jacobian(e.output, e.x), e.x):
+            off = NEAR * float(np.abs(steps[:FEW]).max()) / abs(c[where])
+            low[where], high[where] = seen[where] - off, seen[where] + off
+    for lag in _following(simulator, len(seen)):
+        low[lag], high[lag] = float(part.u.min()), float(part.u.max())
+    return low, high
+
+
+def _following(simulator: Simulator, fitted: int) -> list[int]:
+    """Return the states that are lags of the input."""
+    e = simulator.loop.equations()
+    return [x.state for x in e.lags if x.state < fitted and casadi.is_equal(x.target, e.u, 2)]
+
+
+def _seen(simulator: Simulator) -> Array:
+    """Return how the output depends on the states, at rest."""
+    loop = simulator.loop
+    return np.asarray(state_matrices(loop.equations(), loop.point, spread=1e6)[2][0])

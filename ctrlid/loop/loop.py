@@ -1,0 +1,375 @@
+"""The loop: a plant under control, in absolute physical units."""
+
+import copy
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import casadi
+import control as ct
+import numpy as np
+
+from .._base.errors import CtrlidError
+from ..effects import AbstractEffect
+from ..effects.composition import compose, labels
+from ..effects.python_control import as_system, linear_model
+from ..physics.equations import Equations, require_siso
+from ..physics.linearization import OperatingPoint, linearize
+from ..physics.trace import trace, with_parameters
+from .controllers import ControlLaw, control_law
+
+
+@dataclass(frozen=True, eq=False)
+class Loop:
+    """A plant, its controller and the point around which they work.
+
+    .. math:: u = u_0 + C(r - y)
+
+    with all signals in absolute physical units and ``u0 = at.input``, the bias that the real
+    controller adds. A linear plant acts on deviations: ``y = at.output + G (u - at.input)``.
+
+    Parameters
+    ----------
+    plant : control.NonlinearIOSystem, control.StateSpace or control.TransferFunction
+        Plant with one input and one output, continuous or with the sampling period `dt`.
+    controller : TransferFunction, StateSpace, NonlinearIOSystem or PID, optional
+        One input (r - y), or two inputs (r, y). A controller in discrete time and a `PID` hold
+        their output between samples, a continuous one is an analog circuit. None: the loop is
+        open, or the controller is unknown.
+    dt : float
+        Sampling period of the record [s].
+    at : OperatingPoint, optional
+        Operating point; by default all zero, which a plant must be defined at.
+    free : sequence of str, optional
+        Names of the plant parameters that are uncertain.
+    input_limits : (float, float), optional
+        Limits of the actuator [input unit]; the logged u is the limited one.
+    effects : sequence of effects, optional
+        Physics that the plant lacks, from `ctrlid.effects`; `with_effect` adds one. Each is known
+        by its class name, a second one of a class by name and number: "ViscousFriction2".
+
+    Raises
+    ------
+    CtrlidError
+        If a part does not fit: the message says which and what is needed.
+
+    Examples
+    --------
+    >>> import ctrlid as cid
+    >>> plant = cid.plants.maglev(m=0.0213, K=3.34e-6)
+    >>> op = cid.operating_point(plant, output=0.012)
+    >>> C = cid.design_lead(cid.linearize(plant, op), crossover=100, phase_margin=50)
+    >>> cid.Loop(plant, C, dt=0.001, at=op, free=("K",))
+    Loop(maglev, analog controller, dt=0.001 s, at x = 0.012, V = 3.00146, free: K)
+    """
+
+    plant: Any
+    controller: Any = None
+    dt: float = 0.0
+    at: OperatingPoint | None = None
+    free: tuple[str, ...] = ()
+    input_limits: tuple[float, float] = (-math.inf, math.inf)
+    effects: tuple[AbstractEffect, ...] = field(default=(), kw_only=True)
+    _traced: Equations = field(init=False, repr=False)
+    _active: Equations = field(init=False, repr=False)
+    _kept: Equations = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        if not (isinstance(self.dt, int | float | np.number) and 0 < self.dt < math.inf):
+            raise CtrlidError(f"a loop needs its sampling period dt > 0 s; given dt={self.dt!r}")
+        equations = trace(self.plant)
+        # A loop is a value: its equations are those of the plant at the time it was made.
+        object.__setattr__(self, "_traced", equations)
+        require_siso(equations)
+        if equations.dt and self.plant.dt is not True and abs(equations.dt - self.dt) > 1e-9:
+            raise CtrlidError(f"the plant is sampled at {equations.dt:g} s, the loop at "
+                              f"{self.dt:g} s; give dt={equations.dt:g}")  # fmt: skip
+        n = len(equations.states)
+        if self.at is None and not np.isfinite(equations.evaluate(np.zeros(n), 0.0)[0]).all():
+            raise CtrlidError(f"{equations.name} is not defined where all its signals are zero; "
+                              "give at=operating_point(plant, output=...)")  # fmt: skip
+        at = self.at or OperatingPoint((0.0,) * n, 0.0, 0.0)
+        if not isinstance(at, OperatingPoint):
+            raise CtrlidError(
+                "at= needs an OperatingPoint, from operating_point(plant, output=...) or given as "
+                f"OperatingPoint(states=, input=, output=); given {type(at).__name__}"
+            )
+        if not self.linear_plant and len(at.states) != n:
+            raise CtrlidError(f"at= has {len(at.states)} states, {equations.name} has {n}: "
+                              f"{', '.join(equations.states)}")  # fmt: skip
+        try:
+            lower, upper = (float(v) for v in self.input_limits)
+        except (TypeError, ValueError) as reason:
+            raise CtrlidError("input_limits is a pair (lower, upper) in input units; given "
+                              f"{self.input_limits!r}") from reason  # fmt: skip
+        if not lower < upper:
+            raise CtrlidError(f"input_limits needs lower < upper; given ({lower:g}, {upper:g})")
+        object.__setattr__(self, "dt", float(self.dt))
+        object.__setattr__(self, "at", at)
+        object.__setattr__(self, "input_limits", (lower, upper))
+        self._settle()
+        law = self.law()
+        if law and law.dt == 0.0 and equations.dt:
+            raise CtrlidError("an analog controller cannot act on a plant in discrete time; give "
+                              "the plant in continuous time or sample the controller")  # fmt: skip
+
+    def _settle(self) -> None:
+        """Put the effects into the equations and see that the free parameters exist."""
+        effects = (self.effects,) if isinstance(self.effects, AbstractEffect) else self.effects
+        effects = tuple(effects)
+        strangers = [e for e in effects if not isinstance(e, AbstractEffect)]
+        if strangers:
+            raise CtrlidError(
+                "effects are instances of the classes in ctrlid.effects, such as "
+                f"CoulombFriction(fc=0.1); given {strangers[0]!r}"
+            )
+        object.__setattr__(self, "effects", effects)
+        plant, at = self._absolute(), self._bare_point
+        kept = compose(plant, self.labelled, at, self.dt)
+        active = {label: e for label, e in self.labelled.items() if not e.neutral}
+        object.__setattr__(self, "_kept", kept)
+        changed = kept if len(active) == len(effects) else compose(plant, active, at, self.dt)
+        object.__setattr__(self, "_active", changed)
+        free = (self.free,) if isinstance(self.free, str) else tuple(dict.fromkeys(self.free))
+        unknown = [name for name in free if name not in kept.parameters]
+        if unknown:
+            raise CtrlidError(
+                f"free= names {unknown}, but the numeric parameters of {kept.name} are "
+                f"{list(kept.parameters)}; give parameters to ct.nlsys with params={{...}}"
+            )
+        object.__setattr__(self, "free", free)
+        if self.controller is not None and self._active.feedthrough:
+            raise CtrlidError(
+                f"{kept.name} passes its input to its output without delay, so the loop with "
+                "a controller is algebraic; add the sensor's or actuator's lag to the plant. If "
+                "this is the controller, the order is Loop(plant, controller, ...)"
+            )
+
+    @property
+    def linear_plant(self) -> bool:
+        """Whether the plant is a linear system and so acts on deviations from `at`."""
+        return isinstance(self.plant, ct.TransferFunction | ct.StateSpace)
+
+    @property
+    def labelled(self) -> dict[str, AbstractEffect]:
+        """The effects by name: that of the class, numbered from the second of a class on."""
+        return labels(self.effects)
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """Values of the plant's numeric parameters and of those of the effects."""
+        return dict(self._kept.parameters)
+
+    def equations(self, keep: bool = False) -> Equations:
+        """Return the traced equations of the plant with its effects, in absolute physical units.
+
+        Parameters
+        ----------
+        keep : bool, optional
+            Keep effects that are neutral in the formulas, as a fit needs that asks which way they
+            would help. By default they are left out, so that not one sample changes.
+
+        Returns
+        -------
+        Equations
+            The equations.
+        """
+        return self._kept if keep else self._active
+
+    def _absolute(self) -> Equations:
+        e = self._traced
+        if not self.linear_plant:
+            return e
+        at = self._bare_point
+        rhs = casadi.substitute(e.rhs, e.u, e.u - at.input)
+        output = casadi.substitute(e.output, e.u, e.u - at.input) + at.output
+        return replace(e, rhs=rhs, output=output)
+
+    @property
+    def _bare_point(self) -> OperatingPoint:
+        assert self.at is not None
+        if not self.linear_plant:
+            return self.at
+        n = len(self._traced.states)
+        return OperatingPoint((0.0,) * n, self.at.input, self.at.output)
+
+    @property
+    def point(self) -> OperatingPoint:
+        """The operating point with the states of this very plant and of its effects."""
+        at = self._bare_point
+        return replace(at, states=(*at.states, *self._active.rest))
+
+    def with_effect(self, effect: AbstractEffect) -> "Loop":
+        """Return the loop with one more effect.
+
+        Parameters
+        ----------
+        effect : AbstractEffect
+            An effect of `ctrlid.effects` or of your own.
+
+        Returns
+        -------
+        Loop
+            A new loop.
+
+        Raises
+        ------
+        CtrlidError
+            If the effect makes no sense for this plant.
+
+        Examples
+        --------
+        >>> import ctrlid as cid
+        >>> loop = cid.Loop(cid.plants.servo(m=2.0, c=1.0, k=3.0), dt=0.01)
+        >>> loop.with_effect(cid.effects.CoulombFriction(fc=0.2)).parameters
+        {'m': 2.0, 'c': 1.0, 'k': 3.0, 'CoulombFriction.fc': 0.2}
+        """
+        return self._revised(effects=(*self.effects, effect))
+
+    def without_effect(self, effect: str | AbstractEffect) -> "Loop":
+        """Return the loop without one of its effects.
+
+        Parameters
+        ----------
+        effect : str or AbstractEffect
+            Its name, as in `labelled`, or the effect itself.
+
+        Returns
+        -------
+        Loop
+            A new loop, in which the parameters of the effect are no longer free.
+
+        Raises
+        ------
+        CtrlidError
+            If the loop has no such effect.
+        """
+        known = self.labelled
+        label = next((key for key, e in known.items() if key == effect or e is effect), None)
+        label = label or next((key for key, e in known.items() if e == effect), None)
+        if label is None:
+            raise CtrlidError(f"the loop has no effect {effect}; it has {list(known) or 'none'}")
+        rest = tuple(e for key, e in known.items() if key != label)
+        free = tuple(name for name in self.free if not name.startswith(f"{label}."))
+        return self._revised(effects=rest, free=free)
+
+    def with_parameters(self, values: Mapping[str, float]) -> "Loop":
+        """Return the loop with other values of plant or effect parameters.
+
+        Parameters
+        ----------
+        values : mapping of str to float
+            New values by name as in `parameters`, each in its unit:
+            ``{"K": 3e-6, "CoulombFriction.fc": 0.2}``.
+
+        Returns
+        -------
+        Loop
+            A new loop with a copy of the plant; the given plant stays as it is.
+
+        Raises
+        ------
+        CtrlidError
+            If there is no such parameter or the value is out of its bounds.
+        """
+        unknown = [name for name in values if name not in self.parameters]
+        if unknown:
+            raise CtrlidError(
+                f"the loop has no parameter {unknown[0]!r}; it has {list(self.parameters)}"
+            )
+        of_plant = {k: float(v) for k, v in values.items() if k in self._traced.parameters}
+        if not np.isfinite(list(of_plant.values())).all():
+            raise CtrlidError(f"plant parameters are finite numbers; given {of_plant}")
+        effects = [
+            replace(e, **{name: values[f"{label}.{name}"] for name in e.values()
+                          if f"{label}.{name}" in values})
+            for label, e in self.labelled.items()
+        ]  # fmt: skip
+        if not of_plant:
+            return self._revised(effects=tuple(effects))
+        traced = replace(self._traced, parameters={**self._traced.parameters, **of_plant})
+        return self._revised(
+            plant=with_parameters(self.plant, of_plant), _traced=traced, effects=tuple(effects)
+        )
+
+    def _revised(self, **changes: Any) -> "Loop":
+        """Return a copy with other fields, without tracing the plant again."""
+        new = copy.copy(self)
+        for name, value in changes.items():
+            object.__setattr__(new, name, value)
+        new._settle()
+        return new
+
+    def law(self) -> ControlLaw | None:
+        """Return the controller as equations, None where there is none."""
+        if self.controller is None:
+            return None
+        assert self.at is not None
+        return control_law(self.controller, self.at, self.dt)
+
+    @property
+    def analog(self) -> bool:
+        """Whether the controller is an analog circuit, so that u moves between samples."""
+        law = self.law()
+        return law is not None and law.dt == 0.0
+
+    def system(self) -> Any:
+        """Return the plant with its effects, in absolute physical units.
+
+        A delay becomes its Padé approximation of order two; kinks are as sharp as in a simulation.
+
+        Returns
+        -------
+        control.NonlinearIOSystem
+            The plant as given, or with its effects and, if it is linear, its operating point. Its
+            parameters are those of the loop.
+
+        Raises
+        ------
+        CtrlidError
+            If there is a backlash, whose memory is no state of a continuous system.
+        """
+        if not self.linear_plant and self._active is self._traced:
+            return self.plant
+        return as_system(self._active, self._bare_point, getattr(self.plant, "units", {}))
+
+    def linearize(self) -> Any:
+        """Return the plant with its effects, linearized at the operating point.
+
+        The point keeps its output; with effects, its states and input are solved for anew.
+        Friction is taken as in motion that is fast against its jump, where it has no slope; dead
+        zones, backlash, steps of a converter and vibrations are left out; a delay is its Padé
+        approximation of order two; what drifts has its value at time zero.
+
+        Returns
+        -------
+        control.TransferFunction
+            From deviations of the input to deviations of the output.
+
+        Raises
+        ------
+        CtrlidError
+            If the plant with its effects has no equilibrium at this output.
+        """
+        active = {k: e for k, e in self.labelled.items() if not e.neutral and e.in_linear_model}
+        if not active:
+            if isinstance(self.plant, ct.TransferFunction):
+                return self.plant
+            return linearize(self.plant, self.point)
+        return linear_model(self._absolute(), active, self._bare_point, self.dt)
+
+    def __repr__(self) -> str:
+        e = self._traced
+        assert self.at is not None
+        kind = "no controller" if self.controller is None else (
+            "analog controller" if self.analog else "digital controller")  # fmt: skip
+        text = (f"Loop({e.name}, {kind}, dt={self.dt:g} s, at {e.outputs[0]} = "
+                f"{self.at.output:g}, {e.inputs[0]} = {self.at.input:g}")  # fmt: skip
+        if np.isfinite(self.input_limits).any():
+            text += f", {e.inputs[0]} within {self.input_limits[0]:g}..{self.input_limits[1]:g}"
+        if self.free:
+            text += f", free: {', '.join(self.free)}"
+        if self.effects:
+            text += f", effects: {', '.join(self.labelled)}"
+        return text + ")"

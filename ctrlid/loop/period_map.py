@@ -1,0 +1,193 @@
+"""A plant or a loop over one sampling period, as exact equations: the map that is repeated."""
+
+import functools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import casadi
+import numpy as np
+
+from .._base.errors import CtrlidError
+from ..physics.equations import Array, Equations
+from ..physics.integration import Piece, Scheme, advance, input_pieces, integrate, whole_delay
+from .loop import Loop
+
+
+@dataclass(frozen=True, eq=False)
+class Stepper:
+    """The loop over one sampling period as a CasADi function.
+
+    ``step(z, w) -> (next z, y, u, local error)``; z stacks plant and controller states, then what
+    the input's path remembers; w is ``(t, r, d, sensor noise, force noise)``, all held over the
+    period. ``rate(z, w)`` is the derivative of z for a loop with an analog controller, else None.
+    """
+
+    plant_states: tuple[str, ...]
+    rest: tuple[float, ...]
+    step: Any
+    rate: Any = None
+
+
+def stepper(loop: Loop, substeps: int) -> Stepper:
+    """Build the map of a loop over one sampling period.
+
+    Parameters
+    ----------
+    loop : Loop
+        The loop.
+    substeps : int
+        Integration steps in a period.
+
+    Returns
+    -------
+    Stepper
+        The map.
+
+    Raises
+    ------
+    CtrlidError
+        If an analog controller acts through a delay or through play, which need a sampled input.
+    """
+    e, law = loop.equations(), loop.law()
+    n, nc = len(e.states), len(law.rest) if law else 0
+    late = whole_delay(e, loop.dt)
+    # What the path remembers: the play, then the inputs of the last samples.
+    kept = 0 if e.delay is None else late + 1
+    size = n + nc + (e.play is not None) + kept
+    z, w = casadi.SX.sym("z", size), casadi.SX.sym("w", 5)
+    t0, r, d, sensor, force = casadi.vertsplit(w)
+    kick = casadi.SX.zeros(n, 1)
+    for j in e.velocities or (range(n) if e.dt == 0 else ()):
+        kick[j] = force
+    at, (lower, upper) = loop.point, loop.input_limits
+    p = e.values
+
+    def act(t: Any, z: Any, y: Any) -> tuple[Any, Any]:
+        wish, moved = law.apply(t, z[n:], r, y) if law else (at.input, casadi.SX(0, 1))
+        u = wish + d
+        if math.isfinite(lower):
+            u = casadi.fmax(u, lower)
+        if math.isfinite(upper):
+            u = casadi.fmin(u, upper)
+        return u, moved
+
+    def measured(t: Any, z: Any, u: Any) -> Any:
+        y = e.function(t, z[:n], u, p)[1] + sensor
+        return y if e.reader is None else e.reader(y, p)
+
+    slope = None
+    y = measured(t0, z, at.input)
+    u, moved = act(t0, z[: n + nc], y)
+    if law is None:
+        y = measured(t0, z, u)
+    if loop.analog:
+        if kept or e.play is not None:
+            raise CtrlidError(
+                "a delay or a play acts on the samples of a digital controller; this loop has an "
+                "analog one: sample it (redesign does so for a sampled model, ct.sample_system(G, "
+                "dt)), or put the delay into the plant as a Padé approximation (control.pade)"
+            )
+
+        # A jump of the reference is a jump of the circuit's input: the period is smooth.
+        def rate(tau: Any, z: Any) -> Any:
+            u, charge = act(t0 + tau, z, measured(t0 + tau, z, at.input))
+            return casadi.vertcat(e.function(t0 + tau, z[:n], u, p)[0] + kick, charge)
+
+        slope = casadi.Function("rate", [z, w], [rate(0.0, z)])
+        after, error = integrate(rate, z, loop.dt, substeps)
+    else:
+        applied, memory = through_play(e, z[n + nc] if e.play is not None else None, u, p)
+        past = [z[k] for k in range(size - kept, size)]
+        path = (past[kept - 1] if kept else applied, past[late - 1] if late else applied, applied)
+        pieces = _numbers(e, input_pieces(e, loop.dt, path, "zoh"), p)
+        scheme = Scheme(8, substeps, sharp=(8, substeps))
+        x, error = advance(e, t0, z[:n], pieces, p, None, kick, scheme=scheme)
+        after = casadi.vertcat(x, moved, memory)
+        if kept:
+            after = casadi.vertcat(after, applied, *past[: kept - 1])
+        error = casadi.vertcat(error, casadi.SX.zeros(size - n, 1))
+    rest = [*at.states, *(law.rest if law else ())]
+    settled, memory = at.input, []
+    if e.play is not None:
+        start = casadi.substitute(casadi.vertcat(e.play.start), casadi.vertcat(e.play.u, e.p),
+                                  casadi.vertcat(at.input, p))  # fmt: skip
+        memory = [float(casadi.evalf(start))]
+        settled = float(casadi.evalf(casadi.SX(through_play(e, memory[0], at.input, p)[0])))
+    rest += [*memory, *([settled] * kept)]
+    step = casadi.Function("step", [z, w], [after, y, u, error])
+    return Stepper(e.states, tuple(rest), step, slope)
+
+
+def through_play(e: Equations, m: Any, u: Any, p: Any) -> tuple[Any, Any]:
+    """Return the input behind the play and the play's next memory; without one, u and nothing."""
+    if e.play is None:
+        return u, casadi.SX(0, 1)
+    given = casadi.vertcat(e.play.m, e.play.u, e.p)
+    both = casadi.substitute(
+        casadi.vertcat(e.play.applied, e.play.after), given, casadi.vertcat(m, u, p)
+    )
+    return both[0], both[1]
+
+
+def _numbers(e: Equations, pieces: Sequence[Piece], p: Any) -> list[Piece]:
+    """Put parameter values into the durations of pieces."""
+    values = casadi.SX(casadi.DM(p))
+    return [
+        tuple(casadi.substitute(casadi.SX(part), e.p, values) for part in piece)  # type: ignore[misc]
+        for piece in pieces
+    ]
+
+
+def sensitivity(s: Stepper, reference: float, function: Any) -> tuple[Array, Array]:
+    """Return how a function (step, rate) depends on the state and signals at rest."""
+    z, w = casadi.SX.sym("z", len(s.rest)), casadi.SX.sym("w", 5)
+    first = function.call([z, w])[0]
+    both = casadi.Function("j", [z, w], [casadi.jacobian(first, z), casadi.jacobian(first, w)])
+    a, b = both(s.rest, [0.0, reference, 0.0, 0.0, 0.0])
+    return np.asarray(a, float), np.asarray(b, float)
+
+
+def growth_rate(loop: Loop) -> float:
+    r"""Return the growth rate of small deviations in the closed loop [1/s].
+
+    .. math:: \max_i \ln|\lambda_i| / T
+
+    over the eigenvalues of the linearized map over one sampling period T, with the controller as it
+    runs; with an analog controller the largest real part of the loop's poles. Negative: stable.
+
+    Parameters
+    ----------
+    loop : Loop
+        The loop.
+
+    Returns
+    -------
+    float
+        The rate; minus infinity for a loop that is at rest after one period.
+
+    Raises
+    ------
+    CtrlidError
+        If the plant has no derivative at the operating point.
+    """
+    s = stepper(loop, 8)
+    function = s.step if s.rate is None else s.rate
+    matrix, _ = sensitivity(s, loop.point.output, function)
+    if not np.isfinite(matrix).all():
+        raise CtrlidError(
+            f"{loop.equations().name} has no derivative at its operating point {loop.point}; "
+            "give at=operating_point(plant, output=...)"
+        )
+    poles = np.linalg.eigvals(matrix)
+    if s.rate is not None:  # no step of an integration stands between a stiff circuit and its poles
+        return float(np.max(poles.real, initial=-math.inf))
+    largest = np.max(np.abs(poles), initial=0.0)
+    return float(np.log(largest) / loop.dt) if largest > 0 else -math.inf
+
+
+@functools.lru_cache(maxsize=32)
+def comes_to_rest(loop: Loop) -> bool:
+    """Whether small deviations die out in a loop; without a controller, in the plant itself."""
+    return growth_rate(loop) < -1e-6 / loop.dt

@@ -1,0 +1,316 @@
+"""Simulating a loop: sampled or analog controller, held signals, noise, and failures in words."""
+
+import math
+import warnings
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from .._base.errors import CtrlidError, CtrlidWarning
+from ..data.record import Record
+from ..physics.equations import Array
+from .loop import Loop
+from .period_map import growth_rate, sensitivity, stepper
+
+TOLERANCE = 1e-9  # local error of one integration step, relative to the excursion of each state
+COARSE = 1e-5  # above this, what could not be refined further is worth a warning
+MOST_SUBSTEPS = 128
+CHUNK = 2048  # samples run at once
+RUNAWAY = 1e3  # an output this many times further out than anything asked for has left
+
+
+class SimulationStopped(CtrlidError):
+    """A loop that left the range in which it can be simulated; `y` is its output until then."""
+
+    y: Array = np.empty(0)
+
+
+def simulate(
+    loop: Loop,
+    r: Any = None,
+    *,
+    sensor_noise: float = 0.0,
+    force_noise: float = 0.0,
+    d: Any = None,
+    initial: Sequence[float] | None = None,
+    seed: int | None = None,
+) -> Record:
+    """Simulate a loop and return the record that its data logger would write.
+
+    At sample k the output is measured, ``y[k] = h(x(kT)) + noise``, the controller computes
+    ``u[k]`` from it, and a digital one holds u until the next sample; a continuous controller is
+    integrated together with the plant. The reference, the injected signal and the noise are held
+    over each period. Steps are of order eight, as many per period as an error of 1e-9 of each
+    state's excursion needs.
+
+    Parameters
+    ----------
+    loop : Loop
+        The loop; without a controller, ``u = at.input + d``.
+    r : array_like, shape (n,), optional
+        Reference [output unit]; needed if the loop has a controller.
+    sensor_noise : float, optional
+        Standard deviation of white noise on the measured output [output unit].
+    force_noise : float, optional
+        Standard deviation of a white acceleration, held over each period [output unit/s^2].
+    d : array_like, shape (n,), optional
+        Signal added to the controller's output, ahead of the limits [input unit]: dither, pulses.
+    initial : sequence of float, optional
+        Initial plant states, or plant and controller states [their units]; by default those at
+        rest.
+    seed : int, optional
+        Seed of the noise.
+
+    Returns
+    -------
+    Record
+        `r`, the applied input `u` and the measured output `y`.
+
+    Raises
+    ------
+    CtrlidError
+        If the loop diverges (it says when, where and why) or an argument does not fit.
+
+    Examples
+    --------
+    >>> import ctrlid as cid
+    >>> plant = cid.plants.maglev(m=0.0213, K=3.34e-6)
+    >>> op = cid.operating_point(plant, output=0.012)
+    >>> C = cid.design_lead(cid.linearize(plant, op), crossover=100, phase_margin=50)
+    >>> loop = cid.Loop(plant, C, dt=0.001, at=op)
+    >>> r = cid.random_binary(2000, amplitude=1e-4, hold=20, around=op.output, seed=1)
+    >>> len(cid.simulate(loop, r, sensor_noise=2e-6, seed=2))
+    2000
+    """
+    if not isinstance(loop, Loop):
+        raise CtrlidError(
+            f"simulate needs a Loop(plant, controller, dt=..., at=...); given {type(loop).__name__}"
+        )
+    r, d = _signals(loop, r, d)
+    noise = _noise(loop, d.size, sensor_noise, force_noise, seed)
+    simulator = Simulator(loop)
+    y, u = simulator.run(simulator.start(initial), r, d, noise)
+    e = loop.equations()
+    signals = {"r": e.outputs[0], "u": e.inputs[0], "y": e.outputs[0]}
+    known = getattr(loop.plant, "units", {})
+    units = {key: known[name] for key, name in signals.items() if name in known}
+    return Record(
+        r=r, u=u, y=y, dt=loop.dt, hold="foh" if loop.analog else "zoh",
+        names={"u": e.inputs[0], "y": e.outputs[0]}, name=e.name,
+        units={k: unit for k, unit in units.items() if k != "r" or r is not None},
+    )  # fmt: skip
+
+
+def _signals(loop: Loop, r: Any, d: Any) -> tuple[Array | None, Array]:
+    arrays = {}
+    for name, value in (("r", r), ("d", d)):
+        if value is None:
+            continue
+        try:
+            array = np.asarray(value, dtype=float)
+        except (TypeError, ValueError) as reason:
+            raise CtrlidError(f"simulate needs {name} as an array of numbers; {reason}") from reason
+        if array.ndim != 1 or array.size < 2 or not np.isfinite(array).all():
+            raise CtrlidError(
+                f"simulate needs {name} as a one-dimensional array of at least 2 finite numbers, "
+                f"one per sample; given shape {array.shape} with "
+                f"{np.count_nonzero(~np.isfinite(array))} not finite"
+            )
+        arrays[name] = array
+    if loop.controller is not None and "r" not in arrays:
+        raise CtrlidError("simulate needs the reference r: the loop has a controller; to hold it "
+                          f"at rest give np.full(n, {loop.point.output:g})")  # fmt: skip
+    if not arrays:
+        raise CtrlidError("simulate needs r or d to know how many samples to run; an open loop "
+                          "is driven by d (u = at.input + d)")  # fmt: skip
+    sizes = {name: array.size for name, array in arrays.items()}
+    if len(set(sizes.values())) > 1:
+        raise CtrlidError(f"r and d must be equally long; given {sizes}")
+    size = next(iter(sizes.values()))
+    return arrays.get("r"), arrays.get("d", np.zeros(size))
+
+
+def _noise(loop: Loop, n: int, sensor: float, force: float, seed: int | None) -> list[Array]:
+    for name, value in (("sensor_noise", sensor), ("force_noise", force)):
+        number = isinstance(value, int | float | np.number)
+        if not (number and np.isfinite(value) and value >= 0):
+            raise CtrlidError(f"{name} is a standard deviation >= 0; given {value!r}")
+    if force and not loop.equations().velocities:
+        raise CtrlidError(
+            f"force_noise needs a plant with a moving mass, that is a state whose rate is another "
+            f"state; {loop.equations().name} has none. Use d= for a disturbance of the input"
+        )
+    # Separate streams: switching one noise on does not change the other.
+    streams = np.random.default_rng(seed).spawn(2)
+    return [s.standard_normal(n) * v for s, v in zip(streams, (sensor, force), strict=True)]
+
+
+class Simulator:
+    """A loop made ready to run many times.
+
+    Parameters
+    ----------
+    loop : Loop
+        The loop.
+    tolerance : float, optional
+        Local error of a step, relative to the excursion of each state.
+    most : int, optional
+        Integration steps per period at most.
+    """
+
+    def __init__(
+        self, loop: Loop, tolerance: float = TOLERANCE, most: int = MOST_SUBSTEPS
+    ) -> None:  # fmt: skip
+        self.loop, self.tolerance, self.most = loop, tolerance, most
+        first = stepper(loop, 1)
+        self.plant_states = first.plant_states
+        self.rest: Array = np.array(first.rest, dtype=float)
+        self._steps: dict[int, Any] = {1: first.step}
+        self._runners: dict[tuple[int, int], Any] = {}
+        e = loop.equations()
+        if not np.isfinite(e.evaluate(first.rest[: len(e.states)], loop.point.input)[0]).all():
+            raise CtrlidError(
+                f"{e.name} is not defined at the operating point {loop.point}; give "
+                "at=operating_point(plant, output=...)"
+            )
+        # An undamped plant neither grows nor decays; round-off must not decide which.
+        self._unstable = loop.controller is None and growth_rate(loop) * loop.dt > 1e-6
+        # What a millionth of the operating values does to each state: smaller motion is rest.
+        a, b = (np.nan_to_num(np.abs(m)) for m in sensitivity(first, loop.point.output, first.step))
+        self._floor = 1e-6 * (a @ np.abs(self.rest) + b[:, 2] * abs(loop.point.input))
+
+    def start(self, initial: Sequence[float] | None) -> Array:
+        """Return the state to start from: at rest, or with the given values."""
+        z, n = self.rest.copy(), len(self.plant_states)
+        if initial is not None:
+            given = np.atleast_1d(np.asarray(initial, dtype=float))
+            if given.size not in (n, z.size) or not np.isfinite(given).all():
+                raise CtrlidError(
+                    f"initial needs {n} plant states ({', '.join(self.plant_states)}) or these and "
+                    f"{z.size - n} controller states, all finite; given {given.tolist()}"
+                )
+            z[: given.size] = given
+        return z
+
+    def _runner(self, substeps: int, size: int) -> Any:
+        key = (substeps, size)
+        if key not in self._runners:
+            if substeps not in self._steps:
+                self._steps[substeps] = stepper(self.loop, substeps).step
+            self._runners[key] = self._steps[substeps].mapaccum("run", size)
+        return self._runners[key]
+
+    def run(
+        self, z: Array, r: Array | None, d: Array, noise: Sequence[Array] | None = None,
+        begin: float = 0.0,
+    ) -> tuple[Array, Array]:  # fmt: skip
+        """Return measured output and applied input, from state `z` and time `begin` on.
+
+        Runs chunk by chunk; the steps of a chunk are halved until its local errors are small.
+        """
+        loop, n = self.loop, d.size
+        quiet = np.zeros(n)
+        w = np.vstack([begin + np.arange(n) * loop.dt, quiet if r is None else r, d,
+                       *(noise or (quiet, quiet))])  # fmt: skip
+        y, u = np.empty(n), np.empty(n)
+        start, reach = z, self._floor
+        substeps, size = 1, min(CHUNK, n)
+        worst, where = 0.0, 0
+        for first in range(0, n, size):
+            count = min(size, n - first)
+            # The last chunk is filled up with its last column, so that one function serves all.
+            block = w[:, np.minimum(np.arange(first, first + size), n - 1)]
+            previous_stop: int | None = None
+            while True:
+                results = self._runner(substeps, size)(z, block)
+                states, ys, us, errors = (np.asarray(a, float)[:, :count] for a in results)
+                stop = _first_bad(loop, self._unstable, states, ys, us, w)
+                good = count if stop is None else max(stop - 1, 0)
+                travel = np.max(np.abs(states[:, :good] - start[:, None]), axis=1, initial=0.0)
+                moved = np.maximum(reach, travel)
+                largest = np.max(errors[:, :good], axis=1, initial=0.0)
+                with np.errstate(all="ignore"):
+                    error = float(np.max(np.where(largest > 0, largest / moved, 0.0)))
+                if (stop is None and error <= self.tolerance) or substeps >= self.most:
+                    break
+                if stop is not None and stop == previous_stop and good and error <= COARSE:
+                    break  # accurate until then, and finer steps leave at the same sample
+                previous_stop = stop
+                substeps *= 2
+            if stop is not None:
+                inside = bool(np.isfinite(states[:, stop]).all())
+                stopped = SimulationStopped(
+                    _why_left(loop, first + stop, inside, ys[:, : stop + 1], us[:, : stop + 1], w)
+                )
+                stopped.y = np.concatenate([y[:first], ys[0, :stop]])
+                raise stopped
+            if error > worst:
+                worst, where = error, first
+            y[first : first + count], u[first : first + count] = ys[0], us[0]
+            z, reach = states[:, -1], moved
+            if error < self.tolerance / 1e4 and substeps > 1:
+                substeps //= 2
+        if worst > COARSE and self.most == MOST_SUBSTEPS:
+            warnings.warn(
+                f"the simulation is only good to about {worst:.0e} of the signals near t = "
+                f"{where * loop.dt:.4g} s: the plant or the controller is too sharp or too fast "
+                f"for {MOST_SUBSTEPS} steps in {loop.dt:g} s; simulate with a smaller dt",
+                CtrlidWarning, stacklevel=3,
+            )  # fmt: skip
+        return y, u
+
+
+def _first_bad(
+    loop: Loop, unstable: bool, states: Array, ys: Array, us: Array, w: Array
+) -> int | None:
+    """Index of the first sample at which the loop is no longer where it can be."""
+    bad = ~(np.isfinite(states).all(axis=0) & np.isfinite(ys[0]) & np.isfinite(us[0]))
+    rest = loop.point.output
+    asked = abs(rest)
+    if loop.controller is not None:
+        asked = max(asked, *np.max(np.abs([w[1] - rest, w[3]]), axis=1), 1e-300)
+    # An open loop may travel far, an integrator must; only an unstable plant runs away from rest.
+    if loop.controller is not None or (asked and unstable):
+        bad |= np.abs(ys[0] - rest) > RUNAWAY * asked
+    return int(np.argmax(bad)) if bad.any() else None
+
+
+def _why_left(loop: Loop, at: int, inside: bool, ys: Array, us: Array, w: Array) -> str:
+    """Say when and why a simulation broke off."""
+    e, op = loop.equations(), loop.point
+    output, inp = e.outputs[0], e.inputs[0]
+    k = ys.shape[1] - 1
+    good = max(k - 1, 0)
+    text = f"the simulation stops at t = {at * loop.dt:.5g} s (sample {at}): "
+    if inside:
+        text += f"{output} ran away to {ys[0, k]:.4g}"
+    else:
+        text += f"{output} left the range where the plant is defined, last at {ys[0, good]:.4g}"
+    text += f", with {inp} = {us[0, good]:.4g}."
+    try:
+        growth = growth_rate(loop)
+    except CtrlidError:
+        growth = math.nan
+    lower, upper = loop.input_limits
+    recent = us[0, max(0, good - 20) : good + 1]
+    if loop.controller is None:
+        return (
+            text + " The loop is open: an unstable plant cannot be simulated without its controller"
+        )
+    if growth > 0:
+        return (
+            f"{text} The closed loop is unstable: small deviations grow at {growth:.3g} 1/s. Check "
+            "the sign and the gain of the controller and the operating point"
+        )
+    if np.any(recent <= lower) or np.any(recent >= upper):
+        text += f" {inp} was at its limit ({lower:g}..{upper:g}) when control was lost."
+    swing = np.max(np.abs(us[0, : good + 1] - op.input)) if good else 0.0
+    text += (f" Near the operating point the loop is stable, so the signals are too large for it: "
+             f"{inp} moved {swing:.3g} away from {op.input:.4g}")  # fmt: skip
+    asked = float(np.max(np.abs(w[1] - op.output)))
+    text += f", {output} was asked to move by {asked:.3g}."
+    if np.max(np.abs(w[1])) < abs(op.output) / 2:
+        return (f"{text} If r was meant as a deviation from the operating point, add "
+                f"{op.output:.6g}: signals are absolute")  # fmt: skip
+    return f"{text} Use a smaller reference or less noise"

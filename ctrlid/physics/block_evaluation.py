@@ -1,0 +1,206 @@
+"""CasADi expressions evaluated over many samples at once.
+
+CasADi's own interpreter walks through an expression once per sample. Walking through it once per
+block of samples, with a loop over the block at each instruction, gives the same numbers many times
+faster and costs no compilation per expression.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import casadi
+import numba
+import numpy as np
+
+from .._base.errors import CtrlidError
+from .._base.jobs import processors, side_by_side
+from .equations import Array
+from .interpreter import BINARY, UNARY, sweep
+
+BLOCK = 512  # samples at once: long enough that a loop costs little, short enough for the cache
+BLOCKS = 64  # at most that a thread takes at a time: their inputs are copied
+
+
+class Vectorized:
+    """A CasADi function of scalars and columns, evaluated over many samples at once.
+
+    Parameters
+    ----------
+    function : casadi.Function
+        Function of SX expressions.
+
+    Raises
+    ------
+    CtrlidError
+        If an operation of the function is not known here.
+    """
+
+    def __init__(self, function: Any) -> None:
+        # Rows of each argument; first row, rows and columns of each output.
+        self.sizes = [function.numel_in(k) for k in range(function.n_in())]
+        shapes = [(function.size1_out(k), function.size2_out(k)) for k in range(function.n_out())]
+        ends = np.cumsum([0, *(rows * columns for rows, columns in shapes)])
+        self.tables = np.array([(at, *s) for at, s in zip(ends, shapes, strict=False)])
+        self.rows_out = int(ends[-1])
+        steps, self.constants = _instructions(function)
+        self.program, self.registers = _allocated(steps)
+
+    def __call__(self, *arguments: Any) -> list[Array]:
+        """Evaluate; arguments are numbers or arrays of shape (rows,) or (rows, n).
+
+        Returns
+        -------
+        list of ndarray
+            Each output with shape (n, rows, columns).
+        """
+        return through([self], [], arguments)
+
+
+def _instructions(function: Any) -> tuple[Any, Array]:
+    """Return the instructions of a function as CasADi has them, and its numbers.
+
+    Each as operation, register of the result, operands; for inputs, outputs and constants the row
+    of their table stands in place of a register. The elements of inputs and outputs stand one
+    column after another, one table after another.
+    """
+    into, out = [], []
+    first = 0
+    for k in range(function.n_in()):
+        into.append([first + i for i in function.sparsity_in(k).find()])
+        first += function.numel_in(k)
+    first = 0
+    for k in range(function.n_out()):
+        out.append([first + i for i in function.sparsity_out(k).find()])
+        first += function.numel_out(k)
+    steps: list[tuple[int, int, int, int]] = []
+    constants: list[float] = []
+    for k in range(function.n_instructions()):
+        op = function.instruction_id(k)
+        to, a = function.instruction_output(k), function.instruction_input(k)
+        if op == casadi.OP_CONST:
+            steps.append((op, to[0], len(constants), 0))
+            constants.append(function.instruction_constant(k))
+        elif op == casadi.OP_INPUT:
+            steps.append((op, to[0], into[a[0]][a[1]], 0))
+        elif op == casadi.OP_OUTPUT:
+            steps.append((op, out[to[0]][to[1]], a[0], a[0]))
+        elif op in UNARY:
+            steps.append((op, to[0], a[0], a[0]))
+        elif op in BINARY:
+            steps.append((op, to[0], a[0], a[1]))
+        else:
+            raise CtrlidError(
+                f"the equations use an operation (CasADi's number {op}) that cannot be "
+                "evaluated over many samples; write it with ordinary numpy functions"
+            )
+    return np.array(steps, dtype=np.int64).reshape(-1, 4), np.array(constants, dtype=float)
+
+
+@numba.njit(cache=True)
+def _allocated(steps: Any) -> tuple[Any, int]:  # pragma: no cover - compiled
+    """Return the program with registers of its own, and their number.
+
+    CasADi lets a result overwrite an operand. Here it never does: a loop in place is no vector.
+    """
+    count = len(steps)
+    most = steps.max() + 1 if count else 1
+    holds = np.zeros(most, np.int64)  # which instruction's result CasADi's register holds
+    operands = np.full((count, 2), -1)
+    last = np.arange(count)  # where each result is used for the last time
+    for k in range(count):
+        op = steps[k, 0]
+        if op != casadi.OP_CONST and op != casadi.OP_INPUT:
+            for j in range(2):
+                operands[k, j] = holds[steps[k, 2 + j]]
+                last[operands[k, j]] = k
+        if op != casadi.OP_OUTPUT:
+            holds[steps[k, 1]] = k
+    program = steps.copy()
+    place = np.zeros(count, np.int64)
+    free = np.zeros(count, np.int64)
+    spare = registers = 0
+    for k in range(count):
+        if steps[k, 0] != casadi.OP_OUTPUT:
+            if not spare:
+                free[0], spare = registers, 1
+                registers += 1
+            spare -= 1
+            place[k] = program[k, 1] = free[spare]
+        read = operands[k]
+        for j in range(2):
+            if read[j] >= 0:
+                program[k, 2 + j] = place[read[j]]
+        for j in range(2):
+            if read[j] >= 0 and last[read[j]] == k and not (j and read[0] == read[1]):
+                free[spare] = place[read[j]]
+                spare += 1
+        if steps[k, 0] != casadi.OP_OUTPUT and last[k] == k:  # a result that nothing uses
+            free[spare] = place[k]
+            spare += 1
+    return program, registers
+
+
+def through(
+    stages: Sequence[Vectorized], carried: Sequence[Any], given: Sequence[Any], parts: int = 1
+) -> list[Array]:
+    """Evaluate functions one after another, each fed with what the one before it returned.
+
+    Parameters
+    ----------
+    stages : sequence of Vectorized
+        The functions, of the carried values, the given ones and, last, the number of the part;
+        or a single one of the given values alone.
+    carried : sequence of array_like
+        Columns (rows, n) or (rows,) that the first function begins with.
+    given : sequence of array_like
+        Columns that all of them see.
+    parts : int, optional
+        How often in turn each function is gone through.
+
+    Returns
+    -------
+    list of ndarray
+        The outputs of the last one, each with shape (n, rows, columns).
+    """
+    alone = not carried
+    numbers = [np.asarray(value, dtype=float) for value in (*carried, *given)]
+    tables = [t.reshape(rows, -1 if rows else 1)
+              for t, rows in zip(numbers, stages[0].sizes, strict=alone)]  # fmt: skip
+    n = max([1, *(t.shape[1] for t in tables)])
+    rows = [row for t in tables for row in t]
+    still = np.array([row[0] for row in rows] + ([] if alone else [0.0]))
+    moving = [k for k, row in enumerate(rows) if len(row) > 1]
+    again = sum(len(t) for t in tables[: len(carried)])
+    program, starts, constants = _joined(stages)
+    room, places = max(s.registers for s in stages), np.array(moving, dtype=np.int64)
+    last = stages[-1]
+    out = np.empty(n * last.rows_out)
+    blocks = -(-n // BLOCK)
+    stretch = BLOCK * min(-(-blocks // processors()), BLOCKS)
+
+    def work(first: int) -> None:
+        columns = [rows[k][first : first + stretch] for k in moving]
+        values = np.array(columns).reshape(len(moving), min(stretch, n - first))
+        sweep(program, starts, constants, parts, again, still, places, values, room, last.tables,
+              out, n, first, min(n, BLOCK))  # fmt: skip
+
+    firsts = range(0, n, stretch)
+    if len(firsts) == 1:
+        work(0)
+    else:
+        side_by_side(work, firsts)
+    return [
+        out[n * at : n * (at + r * c)].reshape(n, r, c) for at, r, c in last.tables.tolist()
+    ]  # fmt: skip
+
+
+def _joined(stages: Sequence[Vectorized]) -> tuple[Any, Any, Array]:
+    """Return the programs one below the other, where each begins, and all their numbers."""
+    programs, count = [], 0
+    for stage in stages:
+        program = stage.program.copy()
+        program[program[:, 0] == casadi.OP_CONST, 2] += count
+        programs.append(program)
+        count += len(stage.constants)
+    starts = np.cumsum([0, *map(len, programs)])
+    return np.concatenate(programs), starts, np.concatenate([s.constants for s in stages])

@@ -1,0 +1,180 @@
+"""The equations of a plant as expressions, with what effects have added to them."""
+
+import functools
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import casadi
+import numpy as np
+
+from .._base.errors import CtrlidError
+
+Array = np.ndarray[Any, np.dtype[np.float64]]
+
+
+@dataclass(frozen=True, eq=False)
+class Lag:
+    """A state that follows `target` as a first-order lag, ``T dx/dt = target - x``.
+
+    Its rate is part of `Equations.rhs` as well; knowing that it is a lag allows it to be advanced
+    by its exact exponential however short T is.
+    """
+
+    state: int
+    time_constant: Any
+    target: Any
+
+
+@dataclass(frozen=True, eq=False)
+class Play:
+    """What an input passes through once per sample before it reaches the plant, with memory.
+
+    ``(next m, applied u)`` as expressions of the memory `m`, the computed input `u` and the
+    parameters; `start` is the memory that belongs to a resting input, an expression of `u`, and
+    `reach` how far from it the memory may be where nobody knows what went before.
+    """
+
+    m: Any
+    u: Any
+    after: Any
+    applied: Any
+    start: Any
+    reach: Any
+
+
+def _put_away(value: Any, found: list[Any]) -> Any:
+    """Return nested values in which each expression is replaced by its place in the list."""
+    if isinstance(value, casadi.SX):
+        found.append(value)
+        return "expression", len(found) - 1
+    if isinstance(value, Lag | Play):
+        return type(value), [_put_away(v, found) for v in vars(value).values()]
+    if isinstance(value, tuple):
+        return "tuple", [_put_away(v, found) for v in value]
+    return "value", value
+
+
+def _take_out(packed: Any, found: list[Any]) -> Any:
+    """Return what `_put_away` put away."""
+    kind, content = packed
+    if kind == "expression":
+        return found[content]
+    if kind == "value":
+        return content
+    parts = [_take_out(part, found) for part in content]
+    return tuple(parts) if kind == "tuple" else kind(*parts)
+
+
+def _unpacked(fields: list[Any], package: str) -> "Equations":
+    found = casadi.StringDeserializer(package).unpack()
+    return Equations(*(_take_out(field, found) for field in fields))
+
+
+@dataclass(frozen=True, eq=False)
+class Equations:
+    """The equations of one plant: ``dx/dt = rhs(t, x, u, p)``, ``y = output(t, x, u, p)``.
+
+    For a discrete-time plant (`dt` > 0) `rhs` is the next state. The members `t`, `x`, `u`, `p`,
+    `rhs` and `output` are CasADi expressions; `parameters` holds the value of each entry of `p`.
+
+    Effects (`with_effect`) may add more: `spread` are symbols for the standard deviations of the
+    states, zero in a simulation, by which a filter smooths kinks; `lags` lists states that are
+    plain first-order lags; `play` is a memory between controller and plant; `delay` an expression
+    of `p` for the time by which the input comes late; `readout` what becomes of the noisy
+    `reading`; `rest` the values at rest of states that were added to the plant's own.
+    """
+
+    name: str
+    states: tuple[str, ...]
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    parameters: Mapping[str, float]
+    dt: float
+    t: Any
+    x: Any
+    u: Any
+    p: Any
+    rhs: Any
+    output: Any
+    spread: Any = None
+    lags: tuple[Lag, ...] = ()
+    play: Play | None = None
+    delay: Any = None
+    reading: Any = None
+    readout: Any = None
+    rest: tuple[float, ...] = ()
+
+    def __reduce__(self) -> Any:
+        # CasADi pickles no expression alone: all go into one package, which keeps the symbols that
+        # they share.
+        found: list[Any] = []
+        fields = [_put_away(getattr(self, name), found) for name in self.__dataclass_fields__]
+        package = casadi.StringSerializer()
+        package.pack(found)
+        return _unpacked, (fields, package.encode())
+
+    @property
+    def values(self) -> Array:
+        """The parameter values in the order of `p`."""
+        return np.array(list(self.parameters.values()), dtype=float)
+
+    @functools.cached_property
+    def velocities(self) -> tuple[int, ...]:
+        """Indices of the plant's own states that are another one's rate: forces act on them."""
+        rates = [casadi.simplify(self.rhs[i]) for i in range(len(self.states) - len(self.rest))]
+        return tuple(
+            j
+            for j in range(len(rates))
+            if any(casadi.is_equal(rates[i], self.x[j], 2) for i in range(len(rates)) if i != j)
+        )
+
+    @functools.cached_property
+    def feedthrough(self) -> bool:
+        """Whether the output depends on the input without delay."""
+        return bool(casadi.which_depends(self.output, self.u, 1, False)[0])
+
+    @functools.cached_property
+    def kinked(self) -> bool:
+        """Whether the motion has kinks that a filter smooths, such as dry friction at rest."""
+        return self.spread is not None and bool(casadi.depends_on(self.rhs, self.spread))
+
+    @functools.cached_property
+    def function(self) -> Any:
+        """The CasADi function ``(t, x, u, p) -> (rhs, output)``."""
+        both = casadi.vertcat(self.rhs, self.output)
+        if self.spread is not None:
+            both = casadi.substitute(both, self.spread, casadi.SX.zeros(*self.spread.shape))
+        n = len(self.states)
+        return casadi.Function("plant", [self.t, self.x, self.u, self.p], [both[:n], both[n:]])
+
+    @functools.cached_property
+    def smoothed(self) -> Any:
+        """The CasADi function ``(t, x, u, p, spread) -> (rhs, output)``."""
+        spread = casadi.SX.sym("s", len(self.states)) if self.spread is None else self.spread
+        return casadi.Function(
+            "smoothed", [self.t, self.x, self.u, self.p, spread], [self.rhs, self.output]
+        )  # fmt: skip
+
+    @functools.cached_property
+    def reader(self) -> Any:
+        """The CasADi function ``(noisy output, p) -> reading``, or None."""
+        if self.readout is None:
+            return None
+        return casadi.Function("reader", [self.reading, self.p], [self.readout])
+
+    def evaluate(self, x: Any, u: Any, t: float = 0.0, p: Any = None) -> tuple[Array, Array]:
+        """Return the numbers ``rhs`` and ``output`` at one point."""
+        p = self.values if p is None else p
+        rhs, output = self.function(t, x, u, p)
+        return np.asarray(rhs, float).ravel(), np.asarray(output, float).ravel()
+
+
+def require_siso(equations: Equations) -> None:
+    """Refuse a plant that has not exactly one input and one output."""
+    if len(equations.inputs) != 1 or len(equations.outputs) != 1:
+        raise CtrlidError(
+            f"the plant {equations.name} has inputs {list(equations.inputs)} and outputs "
+            f"{list(equations.outputs)}; ctrlid works with one input and one output: give ct.nlsys "
+            "an output function that returns the measured signal alone"
+        )

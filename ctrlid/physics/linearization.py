@@ -1,0 +1,363 @@
+"""Operating points and exact linear models of a plant."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Any
+
+import casadi
+import control as ct
+import numpy as np
+from scipy import linalg
+
+from .._base.errors import CtrlidError
+from .equations import Array, Equations, require_siso
+from .trace import trace
+
+UNREACHABLE = 1e-12  # relative coupling below which a state is only round-off away from the input
+EQUILIBRIUM = 1e-9  # relative residual of an accepted equilibrium
+STARTS = 60  # starting points of the search for equilibria
+
+
+@dataclass(frozen=True)
+class OperatingPoint:
+    """Where a plant rests: its states, input and output in physical units.
+
+    Parameters
+    ----------
+    states : sequence of float
+        State values in the order of the plant's states [their units].
+    input : float
+        The input there [its unit], which is also the bias that a one-input controller adds.
+    output : float
+        The output there [its unit].
+
+    Raises
+    ------
+    CtrlidError
+        If a value is not a finite number.
+
+    Examples
+    --------
+    >>> import ctrlid as cid
+    >>> cid.OperatingPoint(states=(0.012, 0.0), input=3.0, output=0.012).input
+    3.0
+    """
+
+    states: tuple[float, ...]
+    input: float
+    output: float
+
+    def __post_init__(self) -> None:
+        try:
+            states = tuple(float(s) for s in np.atleast_1d(np.asarray(self.states, dtype=float)))
+            point = (float(self.input), float(self.output))
+        except (TypeError, ValueError) as reason:
+            raise CtrlidError(
+                "an operating point is given by numbers: states=(...), input=, output="
+            ) from reason
+        if not np.isfinite([*states, *point]).all():
+            raise CtrlidError(f"an operating point must be finite; given states={states}, "
+                              f"input={point[0]}, output={point[1]}")  # fmt: skip
+        object.__setattr__(self, "states", states)
+        object.__setattr__(self, "input", point[0])
+        object.__setattr__(self, "output", point[1])
+
+
+def operating_point(
+    plant: Any, *, output: float, guess: Sequence[float] | OperatingPoint | None = None
+) -> OperatingPoint:
+    r"""Return the equilibrium of a plant at a given output.
+
+    .. math:: f(x_0, u_0) = 0, \quad h(x_0, u_0) = y_0
+
+    States and input are solved together by Newton's method with the exact derivatives of the traced
+    equations, from many starting points, and the equations are evaluated at the result. Of several
+    equilibria the one with the smallest non-negative input is returned (a magnet pulls with
+    either sign of the voltage), and without any such the one with the smallest input.
+
+    Parameters
+    ----------
+    plant : control.NonlinearIOSystem, control.StateSpace or control.TransferFunction
+        Plant with one input and one output.
+    output : float
+        The output to rest at [output unit].
+    guess : sequence of float or OperatingPoint, optional
+        States near which to look first [their units]; then the equilibrium found from there is
+        returned.
+
+    Returns
+    -------
+    OperatingPoint
+        With floats `.input` and `.output` and the tuple `.states`.
+
+    Raises
+    ------
+    CtrlidError
+        If there is no such equilibrium, or the plant cannot be traced.
+
+    Examples
+    --------
+    >>> import ctrlid as cid
+    >>> plant = cid.plants.maglev(m=0.0213, K=3.34e-6, g=9.81)
+    >>> op = cid.operating_point(plant, output=0.012)
+    >>> op.states, round(op.input, 6)
+    ((0.012, 0.0), 3.001458)
+    """
+    equations = trace(plant)
+    require_siso(equations)
+    if not (isinstance(output, int | float | np.number) and np.isfinite(output)):
+        raise CtrlidError(f"output must be a finite number; given {output!r}")
+    target = float(output)
+    n = len(equations.states)
+    residual = equations.rhs - equations.x if equations.dt else equations.rhs
+    z = casadi.vertcat(equations.x, equations.u)
+    goal = casadi.vertcat(residual, equations.output - target)
+    both = casadi.Function("equilibrium", [z, equations.p], [goal, casadi.jacobian(goal, z)])
+    values = equations.values
+
+    def evaluate(point: Array) -> tuple[Array, Array]:
+        f, jac = both(point, values)
+        return np.asarray(f, float).ravel(), np.asarray(jac, float)
+
+    found: list[Array] = []
+    repeats = 0
+    closest: tuple[float, Array] | None = None
+    for trial, start in enumerate(_starts(n, target, guess)):
+        solution, error = _solve_equilibrium(evaluate, start, damped=trial % 3 == 2)
+        if solution is None:
+            continue
+        if error < EQUILIBRIUM:
+            known = any(np.allclose(solution, f, rtol=1e-6, atol=1e-9) for f in found)
+            repeats = repeats + 1 if known else 0
+            found.append(solution)
+            if guess is not None or repeats >= 15:  # the starts begin with the guess
+                break
+        elif closest is None or error < closest[0]:
+            closest = (error, solution)
+    if not found:
+        hint = ""
+        if closest is not None:
+            near = ", ".join(f"{s}={v:.4g}" for s, v in zip(
+                (*equations.states, *equations.inputs), closest[1], strict=True))  # fmt: skip
+            hint = f" The nearest miss is {near}, which does not rest there."
+        raise CtrlidError(
+            f"{equations.name} has no equilibrium with {equations.outputs[0]} = {target:g}: no "
+            f"states and input {equations.inputs[0]} hold it there ({STARTS} starting points)."
+            f"{hint} Choose an output inside the plant's range, or give guess= near one"
+        )
+    best = min(found, key=lambda s: (s[n] < -1e-12 * abs(s).max(), abs(s[n])))
+    return OperatingPoint(tuple(best[:n].tolist()), float(best[n]) + 0.0, target)
+
+
+def _starts(n: int, target: float, guess: Any) -> list[Array]:
+    rng = np.random.default_rng(1)
+    starts = []
+    if isinstance(guess, OperatingPoint):
+        starts.append(np.array([*guess.states, guess.input]))
+    elif guess is not None:
+        states = np.atleast_1d(np.asarray(guess, dtype=float))
+        if states.shape != (n,):
+            raise CtrlidError(f"guess needs {n} states; given {states.size}")
+        starts += [np.append(states, s * 10.0**k) for k in range(-2, 3) for s in (1, -1)]
+    for trial in range(STARTS):
+        size = 10.0 ** rng.uniform(-3, 2, n + 1)
+        start = rng.choice([-1.0, 1.0], n + 1) * size
+        # The output is often a state, and the other states are often at rest.
+        start[:n] = np.where(rng.random(n) < 0.6, target, start[:n])
+        start[1:n] *= rng.random(max(n - 1, 0)) < (0.3 if trial % 2 else 1.0)
+        if trial % 3:
+            start[n] = abs(start[n])
+        starts.append(start)
+    return starts
+
+
+def _solve_equilibrium(
+    evaluate: Any, start: Array, damped: bool
+) -> tuple[Array | None, float]:  # fmt: skip
+    """Newton's method: a root near the start, and its residual relative to what cancels there.
+
+    Full steps solve the rows that are linear at once (the output is often a state) and are the
+    best choice for products and powers; damped ones (Deuflhard's natural monotonicity test, which
+    does not depend on the units of the equations) for the rest.
+    """
+    z = start
+    f, jac = evaluate(z)
+    for _ in range(50):
+        if not (np.isfinite(f).all() and np.isfinite(jac).all()):
+            return None, np.inf
+        step = np.linalg.lstsq(jac, f, rcond=None)[0]
+        scale = np.maximum(np.abs(z), 1e-9 + 1e-3 * np.abs(z).max())
+        size = np.abs(step / scale).max()
+        if size < 1e-15:
+            break
+        for damping in (1.0, 0.5, 0.25, 0.1, 0.03):
+            f, next_jac = evaluate(z - damping * step)
+            if np.isfinite(f).all():
+                if not damped or size < 1e-10:
+                    break
+                correction = np.linalg.lstsq(jac, f, rcond=None)[0]
+                if np.abs(correction / scale).max() <= (1 - damping / 4) * size:
+                    break
+        z, jac = z - damping * step, next_jac
+    z = np.where(
+        np.abs(z) < max(1e-12 * np.abs(z).max(), 1e-20), 0.0, z
+    )  # what is at rest is at rest exactly
+    f, jac = evaluate(z)
+    if not np.isfinite(f).all():
+        return None, np.inf
+    terms = np.abs(jac) @ np.abs(z) + np.abs(f)
+    return z, float(np.max(np.where(f == 0, 0.0, np.abs(f) / np.where(terms > 0, terms, 1.0))))
+
+
+def state_matrices(
+    equations: Equations, at: OperatingPoint, spread: float = 0.0
+) -> tuple[Array, Array, Array, Array]:
+    """Return the exact Jacobians (A, B, C, D) of the traced equations at a point.
+
+    With a `spread` the kinks of effects are smoothed as if each state had that standard deviation.
+    """
+    e = equations
+    if len(at.states) != len(e.states):
+        raise CtrlidError(
+            f"the operating point has {len(at.states)} states {at.states}, but {e.name} has "
+            f"{len(e.states)}: {', '.join(e.states)}"
+        )
+    parts = [casadi.jacobian(f, z) for f in (e.rhs, e.output) for z in (e.x, e.u)]
+    if e.spread is not None:
+        level = casadi.SX.ones(*e.spread.shape) * spread
+        parts = [casadi.substitute(part, e.spread, level) for part in parts]
+    jacobians = casadi.Function("jacobians", [e.t, e.x, e.u, e.p], parts)
+    a, b, c, d = (np.asarray(casadi.DM(m), float) for m in
+                  jacobians(0.0, list(at.states), at.input, e.values))  # fmt: skip
+    if not all(np.isfinite(m).all() for m in (a, b, c, d)):
+        raise CtrlidError(
+            f"{e.name} has no derivative at states {at.states}, input {at.input:g}: the point is "
+            "outside its domain or on a corner; choose another operating point"
+        )
+    return a, b, c, d
+
+
+def linearize(plant: Any, at: OperatingPoint) -> Any:
+    r"""Return the transfer function of a plant for small deviations from an operating point.
+
+    .. math:: G(s) = C (s I - A)^{-1} B + D, \quad A = \partial f/\partial x, \;
+        B = \partial f/\partial u, \; C = \partial h/\partial x
+
+    The derivatives are those of the traced equations, without differencing, and the polynomials are
+    formed in rational arithmetic, so that no dust coefficients appear: the levitated ball gives
+    exactly ``-beta/(s^2 - alpha)``. States are removed only where the input does not reach
+    them or the output does not show them.
+
+    Parameters
+    ----------
+    plant : control.NonlinearIOSystem, control.StateSpace or control.TransferFunction
+        Plant with one input and one output; discrete plants give discrete transfer functions.
+    at : OperatingPoint
+        The point, from `operating_point` or given directly.
+
+    Returns
+    -------
+    control.TransferFunction
+        From the deviation of the input to the deviation of the output.
+
+    Raises
+    ------
+    CtrlidError
+        If the plant cannot be traced, or has no derivative at the point.
+
+    Notes
+    -----
+    "Identification of a class of unstable processes" goes from ``-beta`` in equation (2) to
+    ``beta/(s^2 - alpha)`` in (3), and from (1) to (2) without the mass. With both kept,
+    ``alpha = 2 K V0^2/(m x0^3) = 2 g/x0``, ``beta = 2 K V0/(m x0^2) = 2 g/V0``, and
+    the gain is negative: more voltage lifts the ball, which shortens the gap.
+
+    Examples
+    --------
+    >>> import ctrlid as cid
+    >>> plant = cid.plants.maglev(m=0.0213, K=3.34e-6, g=9.81)
+    >>> P = cid.linearize(plant, cid.operating_point(plant, output=0.012))
+    >>> P.den[0][0].round(6).tolist()
+    [1.0, 0.0, -1635.0]
+    """
+    if not isinstance(at, OperatingPoint):
+        raise CtrlidError(
+            f"linearize needs an OperatingPoint, as operating_point() returns; given "
+            f"{type(at).__name__}"
+        )
+    equations = trace(plant)
+    require_siso(equations)
+    num, den = _polynomials(*_minimal(*state_matrices(equations, at)))
+    return ct.tf(num, den, equations.dt if equations.dt else 0, name=f"{equations.name}_linear",
+                 inputs=list(equations.inputs), outputs=list(equations.outputs))  # fmt: skip
+
+
+def _minimal(a: Array, b: Array, c: Array, d: Array) -> tuple[Array, Array, Array, Array]:
+    """Keep the states that the input reaches and the output shows."""
+    keep = _connected(a, b) & _connected(a.T, c.T)
+    a, b, c = a[np.ix_(keep, keep)], b[keep], c[:, keep]
+    if not a.size:
+        return a, b, c, d
+    scale = linalg.matrix_balance(
+        np.block([[a, b], [c, np.zeros((1, 1))]]), permute=False, separate=True
+    )[1][0][:-1]
+    balanced = (a * scale / scale[:, None], b / scale[:, None], c * scale)
+    q = _staircase(balanced[0], balanced[1])
+    qa, qb, qc = q.T @ balanced[0] @ q, q.T @ balanced[1], balanced[2] @ q
+    w = _staircase(qa.T, qc.T)
+    if w.shape[1] == len(a):
+        return a, b, c, d
+    return w.T @ qa @ w, w.T @ qb, qc @ w, d
+
+
+def _connected(a: Array, b: Array) -> Any:
+    """Which states a signal entering through `b` reaches along the non-zero couplings."""
+    reached = np.any(b != 0, axis=1)
+    for _ in range(len(a)):
+        reached = reached | np.any((a != 0) & reached[None, :], axis=1)
+    return reached
+
+
+def _staircase(a: Array, b: Array) -> Array:
+    """Return an orthonormal basis of the reachable subspace."""
+    n = len(a)
+    basis = np.empty((n, 0))
+    block = b / max(float(np.linalg.norm(b)), np.finfo(float).tiny)
+    size = max(float(np.linalg.norm(a)), np.finfo(float).tiny)
+    while basis.shape[1] < n:
+        for _ in range(2):  # twice is enough (Kahan, Parlett)
+            block = block - basis @ (basis.T @ block)
+        left, gains, _ = np.linalg.svd(block, full_matrices=False)
+        new = left[:, gains > UNREACHABLE]
+        if not new.shape[1]:
+            break
+        basis = np.hstack([basis, new])
+        block = a @ new / size
+    return basis if basis.shape[1] < n else np.eye(n)
+
+
+def _polynomials(a: Array, b: Array, c: Array, d: Array) -> tuple[list[float], list[float]]:
+    """Return numerator and denominator by the Faddeev-LeVerrier recursion, without rounding."""
+    n = len(a)
+    exact_a = [[Fraction(v) for v in row] for row in a.tolist()]
+    exact_b = [Fraction(v) for v in b.ravel().tolist()]
+    exact_c = [Fraction(v) for v in c.ravel().tolist()]
+    feed = Fraction(float(d.ravel()[0]))
+    den = [Fraction(1)]
+    num = [feed]
+    m = [[Fraction(0)] * n for _ in range(n)]
+    for k in range(1, n + 1):
+        m = [
+            [sum((exact_a[i][h] * m[h][j] for h in range(n)), den[-1] if i == j else Fraction(0))
+             for j in range(n)]
+            for i in range(n)
+        ]  # fmt: skip
+        trace_am = sum((exact_a[i][h] * m[h][i] for i in range(n) for h in range(n)), Fraction(0))
+        den.append(-trace_am / k)
+        gain = sum((exact_c[i] * m[i][j] * exact_b[j] for i in range(n) for j in range(n)),
+                   Fraction(0))  # fmt: skip
+        num.append(gain + feed * den[-1])
+    while len(num) > 1 and num[0] == 0:
+        num.pop(0)
+    return [float(v) for v in num], [float(v) for v in den]

@@ -1,0 +1,184 @@
+"""Records, models and controllers as a command line names them."""
+
+import argparse
+import dataclasses
+import importlib
+import importlib.util
+import inspect
+import math
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import control as ct
+import numpy as np
+
+from ..._base.errors import CtrlidError
+from ...data.record import Record
+from ...loop.controllers import PID
+from ...loop.loop import Loop
+from ...physics import plants
+from ...physics.linearization import OperatingPoint, operating_point
+from ...physics.trace import trace, with_parameters
+
+PLANTS = {"maglev": ("K",), "servo": ("c", "k"), "tank": ("outlet", "k"), "pendulum": ("m",)}
+CHANNELS = ("r", "u", "y", "time")
+SYSTEMS = (ct.NonlinearIOSystem, ct.StateSpace, ct.TransferFunction)
+
+
+def spoken_record(path: Path, args: argparse.Namespace) -> Record:
+    """Return the record in a file, or say in the words of the command line what is wrong."""
+    unknown = [key for key in args.columns if key not in CHANNELS]
+    if unknown:
+        raise CtrlidError(f"--columns names {', '.join(CHANNELS)}, as in --columns u=volt,y=gap; "
+                          f"given {unknown[0]}")  # fmt: skip
+    try:
+        return Record.from_csv(path, dt=args.dt, hold=args.hold, gaps=args.gaps, **args.columns)
+    except CtrlidError as reason:
+        text = str(reason)
+        for key in CHANNELS:
+            text = text.replace(f"with {key}=", f"with --columns {key}=NAME")
+        text = text.replace("Give time= or dt=", "Give --columns time=NAME or --dt")
+        text = text.replace("gaps='mask'", "--gaps mask")
+        raise CtrlidError(text) from reason
+
+
+def spoken_loop(args: argparse.Namespace, record: Record) -> Loop:
+    """Return the loop that the command line describes."""
+    values = dict(args.param)
+    model = plant(args.model, values)
+    if isinstance(model, Loop):
+        given = {"--at-output": args.at_output, "--input-bias": args.input_bias,
+                 "--controller": args.controller}  # fmt: skip
+        clash = [name for name, value in given.items() if value is not None]
+        if clash:
+            raise CtrlidError(f"{args.model} is a whole loop and has its own operating point and "
+                              f"controller: leave out {', '.join(clash)}")  # fmt: skip
+        if abs(model.dt - record.dt) > 1e-6 * record.dt:
+            advice = "give both the same period"
+            if abs(1000 * model.dt - record.dt) < 0.01 * record.dt:
+                advice = "if the times are milliseconds, head their column t [ms]"
+            raise CtrlidError(f"{args.model} is sampled at {model.dt:g} s, the record at "
+                              f"{record.dt:g} s; {advice}")  # fmt: skip
+        free = model.free if args.free is None else tuple(args.free)
+        _known(args.model, list(model.parameters), [*values, *free])
+        return dataclasses.replace(model.with_parameters(values), free=free)
+    free = PLANTS.get(args.model, ()) if args.free is None else tuple(args.free)
+    _known(args.model, list(trace(model).parameters), [*values, *free])
+    model = with_parameters(model, values) if values else model
+    output = float(np.mean(record.y[record.valid])) if args.at_output is None else args.at_output
+    if isinstance(model, ct.TransferFunction | ct.StateSpace):  # it acts on deviations
+        at = OperatingPoint((), float(np.mean(record.u[record.valid])), output)
+    else:
+        at = operating_point(model, output=output)
+    if args.input_bias is not None:
+        at = dataclasses.replace(at, input=args.input_bias)
+    law = None if args.controller is None else controller(args.controller)
+    return Loop(model, law, dt=record.dt, at=at, free=free)
+
+
+def plant(text: str, values: dict[str, float]) -> Any:
+    """Return the system or loop that ``--model`` names; values that made it are taken out."""
+    made = getattr(plants, text) if text in PLANTS else imported("--model", text)
+    if isinstance(made, (Loop, *SYSTEMS)):
+        return made
+    if not inspect.isfunction(made):
+        raise CtrlidError(f"--model {text} is a {type(made).__name__}; needed is a control system, "
+                          "a ctrlid.Loop, or a function that returns one")  # fmt: skip
+    known = inspect.signature(made).parameters
+    _known(text, list(known), list(values))
+    lacking = [k for k, p in known.items() if p.default is p.empty and k not in values]
+    if lacking:
+        raise CtrlidError(f"the model {text} needs {', '.join(lacking)}; give them in SI units, as "
+                          f"in --param {' '.join(f'{k}=...' for k in lacking)}")  # fmt: skip
+    system = made(**values)
+    values.clear()
+    if not isinstance(system, (Loop, *SYSTEMS)):
+        raise CtrlidError(f"--model {text} returns a {type(system).__name__}; needed is a control "
+                          "system or a ctrlid.Loop")  # fmt: skip
+    return system
+
+
+def controller(text: str) -> Any:
+    """Return the controller that ``--controller`` describes."""
+    if "=" not in text:
+        return imported("--controller", text)
+    types = {f.name: f.type for f in dataclasses.fields(PID)}
+    values: dict[str, Any] = {}
+    try:
+        given = assignments(text)
+    except argparse.ArgumentTypeError as reason:
+        raise CtrlidError(f"--controller {reason}") from reason
+    for key, value in given.items():
+        _known("a PID", list(types), [key])
+        words = types[key] not in (float, float | None)
+        values[key] = value if words else _number(f"--controller {key}=", value)
+    if "kp" not in values:
+        raise CtrlidError(f"a PID needs kp, as in --controller kp=2,ki=1; given {text}")
+    return PID(**values)
+
+
+def imported(option: str, text: str) -> Any:
+    """Return an object given as ``module:object`` or ``file.py:object``."""
+    module, colon, name = text.rpartition(":")
+    if not colon or not module or not name:
+        known = f"one of {', '.join(PLANTS)}, " if option == "--model" else ""
+        raise CtrlidError(f"{option} is {known}MODULE:NAME or FILE.py:NAME; given {text}")
+    try:
+        if module.endswith(".py"):
+            spec = importlib.util.spec_from_file_location(Path(module).stem, module)
+            assert spec is not None
+            assert spec.loader is not None
+            found = importlib.util.module_from_spec(spec)
+            spec.loader.exec_module(found)
+        else:
+            if not {"", os.getcwd()} & set(sys.path):
+                sys.path.insert(0, os.getcwd())
+            found = importlib.import_module(module)
+    except (ModuleNotFoundError, FileNotFoundError) as reason:
+        raise CtrlidError(
+            f"{option} {text}: {module} cannot be imported: {reason}. Give a file, as in "
+            "plant.py:ball, or a module that Python finds from here"
+        ) from reason
+    if not hasattr(found, name):
+        systems = [k for k, v in vars(found).items() if isinstance(v, (Loop, *SYSTEMS))]
+        raise CtrlidError(f"{option} {text}: {module} has no {name}; its control systems and loops "
+                          f"are {', '.join(systems) or 'none'}")  # fmt: skip
+    return getattr(found, name)
+
+
+def _known(what: str, known: Sequence[str], names: Sequence[str]) -> None:
+    for name in names:
+        if name not in known:
+            raise CtrlidError(f"{what} has no parameter {name!r}; it has {', '.join(known)}")
+
+
+def assignment(text: str) -> tuple[str, float]:
+    """Read NAME=VALUE with a number."""
+    name, equal, value = text.partition("=")
+    if not (name.strip() and equal):
+        raise argparse.ArgumentTypeError(f"needs NAME=VALUE, as in K=3.3e-6; given {text}")
+    try:
+        return name.strip(), _number(f"{name}=", value)
+    except CtrlidError as reason:
+        raise argparse.ArgumentTypeError(str(reason)) from reason
+
+
+def assignments(text: str) -> dict[str, str]:
+    """Read NAME=VALUE,NAME=VALUE."""
+    pairs = [part.partition("=") for part in text.split(",") if part.strip()]
+    if not pairs or not all(key.strip() and equal and value for key, equal, value in pairs):
+        raise argparse.ArgumentTypeError(f"needs NAME=VALUE,NAME=VALUE; given {text}")
+    return {key.strip(): value.strip() for key, _, value in pairs}
+
+
+def _number(what: str, text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if math.isnan(value):
+        raise CtrlidError(f"{what} needs a number; given {text}")
+    return value

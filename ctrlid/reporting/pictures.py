@@ -1,0 +1,197 @@
+"""What the pictures show, apart from the drawing: units, windows, poles and frequency grids."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import control as ct
+import numpy as np
+
+from .._base import text as _text
+from .._base.errors import CtrlidError
+from ..diagnosis.result import Candidate, Diagnosis, Gap, Place
+from ..physics.equations import Array
+from ..physics.trace import timebase
+from ..validation.comparison import Comparison
+
+WINDOW = 250  # samples of a comparison that can be told apart on a page
+BARS = 7  # candidates of a round that are drawn
+LEAST = -20.0  # evidence below which a bar says no more
+
+
+def scale(signals: Sequence[Array], unit: str) -> tuple[float, str]:
+    """Return a factor and the unit it leads to: millimetres rather than 0.03 m."""
+    if not unit:
+        return 1.0, "unit not given"
+    return _text.prefix(max(float(np.abs(s).max()) for s in signals), unit)
+
+
+def telling(comparison: Comparison) -> int:
+    """Return the first sample of a lively window with a usual error."""
+    whole = comparison.record
+    n, width = len(whole), min(WINDOW, len(whole))
+    if n == width or not comparison.curves:
+        return 0
+    curve = comparison.curves[-1].y
+    known = whole.valid & np.isfinite(curve)
+    starts = np.arange(0, n - width + 1, max(width // 5, 1))
+
+    def means(values: Array) -> Array:
+        total = np.concatenate([[0.0], np.cumsum(np.where(known, values, 0.0))])
+        mean: Array = (total[starts + width] - total[starts]) / width
+        return mean
+
+    y = whole.y - np.mean(whole.y)
+    full = means(np.ones(n))
+    movement = means(y**2) - means(y) ** 2
+    movement[full < 0.95 * full.max()] = -np.inf
+    error = means((np.where(known, curve, whole.y) - whole.y) ** 2)
+    lively = movement >= np.median(movement[np.isfinite(movement)])
+    usual = np.abs(error - np.median(error[lively]))
+    return int(starts[np.argmin(np.where(lively, usual, np.inf))])
+
+
+def checked_models(models: Any, who: str) -> dict[str, Any]:
+    """Return models by label, a single one by its name, or refuse in the name of a picture."""
+    if isinstance(models, ct.TransferFunction | ct.StateSpace):
+        models = {models.name: models}
+    if not isinstance(models, Mapping) or not models:
+        raise CtrlidError(f"{who} takes a mapping from labels to models, {{'fitted': G}}, with at "
+                          f"least one model; given {type(models).__name__}")  # fmt: skip
+    for label, model in models.items():
+        if not isinstance(model, ct.TransferFunction | ct.StateSpace):
+            raise CtrlidError(f"{who}: {label!r} must be a TransferFunction or StateSpace; given "
+                              f"{type(model).__name__}")  # fmt: skip
+        if model.ninputs != 1 or model.noutputs != 1:
+            raise CtrlidError(f"{who}: {label!r} must have one input and one output")
+    return {str(k): m for k, m in models.items()}
+
+
+def period(models: Mapping[str, Any]) -> float:
+    """Return the one sampling period among the models, 0 if all are continuous."""
+    periods = {k: timebase(m) for k, m in models.items() if timebase(m)}
+    if len({round(p, 12) for p in periods.values()}) > 1:
+        listed = ", ".join(f"{k}: {p:g} s" for k, p in periods.items())
+        raise CtrlidError(f"poles at different sampling periods do not compare ({listed}); draw "
+                          "each period on its own axes")  # fmt: skip
+    return next(iter(periods.values()), 0.0)
+
+
+def places(model: Any, dt: float) -> Any:
+    """Return the poles in the z-plane of period dt (in the s-plane for 0), the outermost first."""
+    # The fit knows its poles more accurately than the roots of its coefficients.
+    estimate = getattr(model, "estimate", None)
+    poles = np.asarray(model.poles() if estimate is None else estimate.poles, dtype=complex)
+    poles = np.exp(poles * dt) if dt and not timebase(model) else poles
+    poles = np.where(np.abs(poles.imag) < 1e-9 * np.maximum(np.abs(poles), 1.0), poles.real, poles)
+    return poles[np.lexsort((-poles.imag, -poles.real))]
+
+
+def frequencies(models: Mapping[str, Any]) -> Any:
+    """Return a grid from well below the slowest to well above the fastest pole or zero."""
+    corners, limits = [], []
+    for model in models.values():
+        dt = timebase(model)
+        places = np.concatenate([np.atleast_1d(model.poles()), np.atleast_1d(model.zeros())])
+        places = places[np.isfinite(places) & (np.abs(places) > 1e-12)].astype(complex)
+        if dt:
+            places = np.log(places) / dt
+            limits.append(np.pi / dt)
+        corners += [c for c in np.abs(places) if c > 1e-6 and (not dt or c < np.pi / dt)]
+    corners = corners or [min(limits, default=1.0)]
+    top = max(limits) if limits else 10 * max(corners)
+    return np.geomspace(min(0.1 * min(corners), 0.01 * top), top, 600)
+
+
+def largest_gap(gap: Gap) -> slice:
+    """Return the stretch of the samples kept back in which the model errs most."""
+    n = len(gap.time)
+    width = min(WINDOW, n)
+    if n == width:
+        return slice(0, n)
+    error = np.nan_to_num((gap.measured - gap.simulated_before) ** 2, posinf=0.0)
+    step = np.diff(gap.time)
+    # A window over a break in time shows none of its two sides.
+    broken = np.abs(step - np.median(step)) > 0.5 * np.median(step)
+    error[1:][broken] = -np.inf
+    with np.errstate(invalid="ignore"):
+        sums = np.convolve(np.where(np.isinf(error), -1e9 * (1 + error[error > 0].sum()), error),
+                           np.ones(width), "valid")  # fmt: skip
+    first = int(np.argmax(sums))
+    return slice(first, first + width)
+
+
+def two_places(found: Diagnosis) -> list[Place]:
+    """Return the two most telling places."""
+    return sorted(found.where, key=lambda place: place.p_before)[:2]
+
+
+Kind = Literal["found", "not told apart", "refitted", "not refitted"]
+
+
+@dataclass(frozen=True)
+class Bar:
+    """One candidate of a ranking.
+
+    Parameters
+    ----------
+    label : str
+        Its name.
+    evidence : float
+        Twice its gain of log-likelihood less the penalty, the difference in the Bayesian criterion.
+    kind : {"found", "not told apart", "refitted", "not refitted"}
+        What became of it; of one that was not refitted the evidence is what its first step
+        promises.
+    """
+
+    label: str
+    evidence: float
+    kind: Kind
+
+
+def ranking(found: Diagnosis) -> dict[int, list[Bar]]:
+    """Return the best candidates of each round as bars, the best first."""
+    value = {id(c): _evidence(c) for c in found.ranking}
+    kinds: dict[int, Kind] = {}
+    for finding in found.findings:
+        own = [c for c in found.ranking
+               if type(c.effect).__name__ == finding.name and value[id(c)] > 0]  # fmt: skip
+        if not own:  # read off the record itself, such as the steps of a converter
+            continue
+        best = max(own, key=lambda c: value[id(c)])
+        kinds[id(best)] = "found"
+        for c in found.ranking:
+            if c.round == best.round and type(c.effect).__name__ in (
+                *finding.names[1:], *finding.equivalents
+            ):  # fmt: skip
+                kinds.setdefault(id(c), "not told apart")
+    rounds: dict[int, list[Bar]] = {}
+    for number in sorted({c.round for c in found.ranking}):
+        tried = sorted((c for c in found.ranking if c.round == number),
+                       key=lambda c: (id(c) not in kinds, -value[id(c)]))  # fmt: skip
+        shown = sorted(tried[:BARS], key=lambda c: -value[id(c)])
+        rounds[number] = [
+            Bar(type(c.effect).__name__, value[id(c)],
+                kinds.get(id(c), "refitted" if math.isfinite(c.gain) else "not refitted"))
+            for c in shown
+        ]  # fmt: skip
+    return rounds
+
+
+def _evidence(c: Candidate) -> float:
+    gain = c.gain if math.isfinite(c.gain) else c.score
+    return max(2 * (gain - c.penalty), LEAST) if math.isfinite(gain) else LEAST
+
+
+def bin_labels(place: Place) -> tuple[list[str], str]:
+    """Return the edges of the bins of a place as labels, and the title of the axis."""
+    known = place.edges[np.isfinite(place.edges)]
+    factor, unit = scale([known], place.unit) if known.size else (1.0, place.unit)
+    digits = next((d for d in (2, 3, 4) if len({_text.number(e, d) for e in known}) == known.size),
+                  5)  # fmt: skip
+    labels = [_text.number(factor * e, digits) if np.isfinite(e) else "" for e in place.edges]
+    widths = np.diff(known)
+    even = widths.size == 0 or float(np.ptp(widths)) < 0.01 * float(np.max(widths))
+    title = f"{place.axis} [{unit if place.unit else '1'}]"
+    return labels, title if even else f"{title}, at the edges of the bins"

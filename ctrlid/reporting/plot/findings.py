@@ -1,0 +1,173 @@
+"""What a diagnosis found."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from ...diagnosis.result import Diagnosis, Place
+from ...physics.equations import Array
+from .. import pictures as _pictures
+from .axes import COLOURS, MEASURED, finish, new_figure, require, take_axes
+
+BEFORE = {"color": COLOURS[1], "linestyle": "--", "linewidth": 1.4}
+AFTER = {"color": COLOURS[0], "linestyle": "-", "linewidth": 1.4}
+FILLS: dict[str, dict[str, Any]] = {
+    "found": {"facecolor": COLOURS[0], "edgecolor": "k"},
+    "not told apart": {"facecolor": COLOURS[5], "edgecolor": "k", "hatch": "////"},
+    "refitted": {"facecolor": "0.75", "edgecolor": "0.3"},
+    "not refitted": {"facecolor": "w", "edgecolor": "0.3", "linestyle": "--"},
+}
+GATE = 10.0  # difference in the Bayesian criterion that is strong evidence
+
+
+def diagnosis(found: Diagnosis, axes: Any = None) -> Any:
+    """Draw what a diagnosis found: the gap before and after, where it sits, and the ranking.
+
+    From top to bottom: the measured output against the model before and after, on those samples
+    kept back on which it erred most; the errors against the noise floor; RMS one-step errors along
+    the two most telling quantities, in units of noise; and the evidence for each candidate, by
+    rounds of the search.
+
+    Parameters
+    ----------
+    found : Diagnosis
+        From `diagnose`.
+    axes : sequence of five matplotlib Axes, optional
+        By default those of a new figure.
+
+    Returns
+    -------
+    numpy.ndarray of matplotlib Axes
+        The axes of the outputs, the errors, the two places and the ranking.
+
+    Raises
+    ------
+    CtrlidError
+        If something else than a diagnosis is given, or the number of axes differs.
+    """
+    require(found, Diagnosis, "plot.diagnosis draws a Diagnosis, as diagnose() returns")
+    rounds = _pictures.ranking(found)
+    if axes is None:
+        rows = max(sum(len(bars) + 1 for bars in rounds.values()), 3)
+        height = 0.21 * rows + 0.9
+        layout = [["output"] * 2, ["error"] * 2, ["first", "second"], ["ranking"] * 2]
+        heights = [2.5, 1.9, 2.2, height]
+        made = new_figure((8.0, sum(heights))).subplot_mosaic(
+            layout, gridspec_kw={"height_ratios": heights}
+        )
+        axes = list(made.values())
+    axes = take_axes(axes, 5)
+    _gap(axes[0], axes[1], found)
+    places = _pictures.two_places(found)
+    for ax, place in zip(axes[2:4], [*places, None, None][:2], strict=True):
+        _where(ax, place, found)
+    _ranking(axes[4], rounds)
+    return axes
+
+
+def _gap(above: Any, below: Any, found: Diagnosis) -> None:
+    """Draw the measured output against the model before and after, and the errors below."""
+    gap, part = found.gap, _pictures.largest_gap(found.gap)
+    t, y = gap.time[part], gap.measured[part]
+    scale, unit = _pictures.scale([y], gap.unit)
+    above.plot(t, scale * y, label="measured", **MEASURED)
+    names = " and ".join(f.name for f in found.findings[:2])
+    names += f" and {len(found.findings) - 2} more" if len(found.findings) > 2 else ""
+    cases = [("before" if names else "recalibrated", gap.simulated_before, gap.before,
+              BEFORE if names else AFTER)]  # fmt: skip
+    if names:
+        cases.append(("after", gap.simulated_after, gap.after, AFTER))
+    errors = [y - values[part] for _, values, _, _ in cases]
+    known = [e[np.isfinite(e)] for e in errors if np.isfinite(e).any()] or [np.zeros(1)]
+    floored = np.isfinite(gap.floor) and gap.floor > 0
+    fine, small = _pictures.scale([np.full(1, gap.floor)] if floored else known, gap.unit)
+    short = f" {small}" if gap.unit else ""  # that it is not given stands at the axis
+    if floored:
+        below.axhspan(-2 * fine * gap.floor, 2 * fine * gap.floor, color="0.87", zorder=0,
+                      label=f"±2 x noise floor, {fine * gap.floor:.3g}{short}")  # fmt: skip
+    below.axhline(0, color="0.3", linewidth=0.8)
+    for (label, values, size, style), error in zip(cases, errors, strict=True):
+        rms = "none" if np.isnan(size) else f"RMS {fine * size:.3g}{short}"
+        long = {"before": "recalibrated model", "after": f"with {names}"}.get(label, label)
+        # A long prediction is made at some of the samples only.
+        made = np.isfinite(error) if gap.kind.endswith("prediction") else slice(None)
+        shown = scale * values[part]
+        above.plot(t[made], shown[made], label=f"{gap.kind}, {long}", **style)
+        below.plot(t[made], fine * error[made], label=f"{label}: {rms}", **style)
+    _limit(above, scale * y)
+    above.set_ylabel(f"output [{unit}]")
+    below.set_ylabel(f"error [{small}]")
+    below.set_xlabel(f"time [s], where the gap is largest among {len(gap.time)} samples kept back")
+    for ax in (above, below):
+        ax.set_xlim(t[0], t[-1])
+        finish(ax, columns=1 if ax is above else 3, size="small")
+
+
+def _limit(ax: Any, y: Array) -> None:
+    """Keep what was measured readable, wherever a wrong model goes."""
+    span = float(np.ptp(y)) or 1.0
+    low, high = ax.get_ylim()
+    ax.set_ylim(max(low, y.min() - 0.8 * span), min(high, y.max() + 0.8 * span))
+
+
+def _where(ax: Any, place: Place | None, found: Diagnosis) -> None:
+    """Draw the RMS of the one-step errors along one quantity, before and after."""
+    if place is None:
+        ax.text(0.5, 0.5, "no place is known", ha="center", va="center", transform=ax.transAxes)
+        ax.set_axis_off()
+        return
+    at, before, after = np.arange(len(place.before)), np.sqrt(place.before), np.sqrt(place.after)
+    both = bool(found.findings)
+    solid = {"facecolor": COLOURS[0], "edgecolor": COLOURS[0], "linewidth": 0.8}
+    if both:
+        ax.bar(at + 0.3, before, 0.4, label="before", facecolor="w", edgecolor=COLOURS[1],
+               hatch="//////", linewidth=0.8)  # fmt: skip
+        ax.bar(at + 0.7, after, 0.4, label="after", **solid)
+    else:
+        ax.bar(at + 0.5, before, 0.8, label="recalibrated", **solid)
+    ax.axhline(1, color="k", linewidth=1.2, linestyle=":", label="noise")
+    labels, title = _pictures.bin_labels(place)
+    every = -(-len(at) // 5)
+    ax.set_xlim(0, len(at))
+    ax.set_xlabel(title)
+    ax.set_ylabel("one-step RMS error /\nthat of noise [1]")
+    top = float(np.nanmax([*before, *after, 1.0]))
+    finish(ax, columns=3, size="small")
+    if top > 10:
+        ax.set_yscale("log")
+    else:
+        ax.set_ylim(0, 1.1 * top)
+    ax.set_xticks(np.arange(len(labels))[::every], labels[::every])
+
+
+def _ranking(ax: Any, rounds: Mapping[int, Sequence[_pictures.Bar]]) -> None:
+    """Draw the evidence for each candidate as bars, round below round."""
+    labels, row, drawn = [], 0, set()
+    top = max((bar.evidence for bars in rounds.values() for bar in bars), default=0.0)
+    for number, bars in rounds.items():
+        ax.text(0.0, row, f" round {number}", ha="left", va="center", style="italic",
+                fontsize="small", transform=ax.get_yaxis_transform())  # fmt: skip
+        labels.append("")
+        row += 1
+        for bar in bars:
+            ax.barh(row, bar.evidence, 0.72, linewidth=0.7, **FILLS[bar.kind],
+                    label=None if bar.kind in drawn else bar.kind)  # fmt: skip
+            ax.annotate(f"{bar.evidence:.0f}", (max(bar.evidence, 0.0), row), (3, 0), va="center",
+                        textcoords="offset points", fontsize="x-small")  # fmt: skip
+            drawn.add(bar.kind)
+            labels.append(bar.label)
+            row += 1
+    if not rounds:
+        ax.text(0.5, 0.5, "no candidate was tried", ha="center", transform=ax.transAxes)
+    ax.axvline(GATE, color="k", linewidth=1, linestyle="--", label="strong")
+    ax.axvline(0, color="0.3", linewidth=0.8)
+    ax.set_xscale("symlog", linthresh=GATE)
+    ax.xaxis.set_major_formatter("{x:g}")
+    ax.set_xlim(_pictures.LEAST, 3 * max(top, 2 * GATE))
+    ax.set_yticks(range(row), labels, fontsize="small")
+    ax.tick_params(axis="y", length=0)
+    ax.set_ylim(row - 0.4, -0.6)
+    ax.set_xlabel("gain by the Bayesian criterion (BIC), twice the evidence less the penalty [1]")
+    finish(ax, columns=5, size="small")
+    ax.grid(False, axis="y")

@@ -1,0 +1,255 @@
+"""Models: poles, frequency responses, and their trend over set-points."""
+
+from typing import Any
+
+import numpy as np
+from matplotlib.ticker import MultipleLocator
+
+from ..._base import text as _text
+from ..._base.errors import CtrlidError
+from ...estimation.confidence_band import response_band
+from ...estimation.identified_model import IdentifiedModel, delay_of
+from ...estimation.series import FitSeries
+from ...physics.equations import Array
+from ...physics.trace import timebase
+from .. import pictures as _pictures
+from .axes import COLOURS, MARKERS, finish, line_style, require, take_axes
+
+
+def poles(models: Any, ax: Any = None, *, truth: Any = None) -> Any:
+    """Draw the poles of models against the border of stability.
+
+    If one of the models is sampled, all are drawn in the z-plane (continuous ones at
+    ``exp(s dt)``) with the unit circle, else in the s-plane with the imaginary axis. The view holds
+    all poles and the point z = 1 (s = 0), where the slow ones are.
+
+    Parameters
+    ----------
+    models : mapping of str to control.TransferFunction or control.StateSpace
+        The models by label, or one model.
+    ax : matplotlib Axes, optional
+        By default that of a new figure.
+    truth : control.TransferFunction or control.StateSpace, optional
+        The physics, drawn as a reference.
+
+    Returns
+    -------
+    matplotlib Axes
+        The axes; the legend lists the poles.
+
+    Raises
+    ------
+    CtrlidError
+        If there is nothing to draw, or the sampling periods differ.
+
+    Examples
+    --------
+    >>> import control as ct, ctrlid as cid
+    >>> ax = cid.plot.poles({"guess": ct.tf(1, [1, -1.9, 1], 0.1)}, truth=ct.tf(1, [1, 0, -1]))
+    >>> ax.get_xlabel()
+    'real part of z [1]'
+    """
+    models = _pictures.checked_models(models, "plot.poles")
+    physics = (
+        _pictures.checked_models({"physics": truth}, "plot.poles") if truth is not None else {}
+    )
+    dt = _pictures.period({**models, **physics})
+    found = {k: _pictures.places(m, dt) for k, m in (*models.items(), *physics.items())}
+    if not any(p.size for p in found.values()):
+        raise CtrlidError("plot.poles has nothing to draw: none of the models has a pole")
+    ax = take_axes(ax, 1, size=(6.4, 3.6))[0]
+    if dt:
+        angle = np.linspace(0, 2 * np.pi, 721)
+        ax.plot(np.cos(angle), np.sin(angle), color="0.5", linewidth=1)
+        ax.axhline(0, color="0.85", linewidth=0.8, zorder=0)
+    else:
+        ax.axvline(0, color="0.5", linewidth=1)
+        ax.axhline(0, color="0.85", linewidth=0.8, zorder=0)
+    for i, (label, places) in enumerate(found.items()):
+        style: dict[str, Any] = {"color": "k", "marker": "+", "markersize": 15, "zorder": 4}
+        if label in models:
+            style = {"color": COLOURS[i % len(COLOURS)], "marker": MARKERS[i % len(MARKERS)],
+                     "markersize": 8, "markerfacecolor": "none", "zorder": 3}  # fmt: skip
+        listed = ", ".join(_text.number(p, 4) for p in places) or "none"
+        ax.plot(places.real, places.imag, linestyle="none", markeredgewidth=1.8,
+                label=f"{label}: {listed}", **style)  # fmt: skip
+    _view(ax, np.concatenate([*found.values(), [1.0 if dt else 0.0]]))
+    plane, unit = ("z", "1") if dt else ("s", "rad/s")
+    ax.set_xlabel(f"real part of {plane} [{unit}]")
+    ax.set_ylabel(f"imaginary part of {plane} [{unit}]")
+    return finish(ax, columns=1)
+
+
+def bode(models: Any, axes: Any = None, *, omega: Any = None, level: float | None = 0.95) -> Any:
+    """Draw the frequency responses of models, magnitude above phase, of fits with their bands.
+
+    Parameters
+    ----------
+    models : mapping of str to control.TransferFunction or control.StateSpace
+        The models by label, or one model. Sampled ones end at their Nyquist frequency, which is
+        marked.
+    axes : sequence of two matplotlib Axes, optional
+        By default those of a new figure.
+    omega : array_like, optional
+        Frequencies [rad/s]; by default around all poles and zeros.
+    level : float or None, optional
+        Probability of the confidence bands of fitted models, as in `response_band`; None leaves
+        them out.
+
+    Returns
+    -------
+    numpy.ndarray of matplotlib Axes
+        Magnitude and phase. Phases run on without jumps of 360 degrees, and those of different
+        models are drawn on the same sheet.
+
+    Raises
+    ------
+    CtrlidError
+        If there is nothing to draw, a frequency is not positive, or the level is not between 0 and
+        1.
+
+    Examples
+    --------
+    >>> import control as ct, ctrlid as cid
+    >>> magnitude, phase = cid.plot.bode({"levitation": ct.tf(-2, [1, 0, -1600])})
+    >>> phase.get_ylabel(), phase.get_xlabel()
+    ('phase [deg]', 'frequency [rad/s]')
+    """
+    models = _pictures.checked_models(models, "plot.bode")
+    grid = (
+        _pictures.frequencies(models)
+        if omega is None
+        else np.sort(np.atleast_1d(np.asarray(omega, float)))
+    )
+    if not (np.isfinite(grid).all() and grid.size > 1 and (grid > 0).all()):
+        raise CtrlidError("omega needs at least two positive frequencies in rad/s")
+    axes = take_axes(axes, 2, sharex=True)
+    sheet: float | None = None
+    limits = []
+    for i, (label, model) in enumerate(models.items()):
+        dt = timebase(model)
+        # At the Nyquist frequency itself a response is real and its phase says nothing.
+        w = grid[grid < 0.999 * np.pi / dt] if dt else grid
+        if dt:
+            limits.append(np.pi / dt)
+        if not w.size:
+            continue
+        values = np.atleast_1d(model(np.exp(1j * w * dt) if dt else 1j * w))
+        values = values * np.exp(-1j * w * delay_of(model))
+        phase = np.degrees(np.unwrap(np.angle(values)))
+        # On the sheet of the first model; that one starts within (-270, 90].
+        turn = (
+            np.floor((phase[0] + 270) / 360)
+            if sheet is None
+            else np.round((phase[0] - sheet) / 360)
+        )
+        if sheet is None and phase[0] - 360 * turn == -270:
+            turn -= 1
+        phase = phase - 360 * turn
+        sheet = float(phase[0]) if sheet is None else sheet
+        axes[0].semilogx(w, 20 * np.log10(np.abs(values)), label=label, **line_style(i))
+        axes[1].semilogx(w, phase, **line_style(i))
+        if level is not None and isinstance(model, IdentifiedModel):
+            _band(axes, model, w, level, phase, line_style(i)["color"], label)
+    for limit in sorted(set(np.round(limits, 9))):
+        for ax in axes:
+            ax.axvline(limit, color="0.5", linewidth=1, linestyle=":",
+                       label="Nyquist frequency" if ax is axes[0] else None)  # fmt: skip
+    _degrees(axes[1])
+    axes[0].set_ylabel("magnitude [dB]")
+    axes[1].set_ylabel("phase [deg]")
+    axes[1].set_xlabel("frequency [rad/s]")
+    finish(axes[0])
+    finish(axes[1], legend=False)
+    return axes
+
+
+def _band(
+    axes: Any, model: IdentifiedModel, w: Array, level: float, phase: Array, color: str, label: str
+) -> None:
+    """Shade where the response of a fit lies, without letting a wide band set the view."""
+    band = response_band(model, w, level)
+    if not model.estimate.covariance.any():
+        return
+    shift = phase - band.phase
+    sides = [
+        (20 * np.log10(band.magnitude_low), 20 * np.log10(band.magnitude_high)),
+        (band.phase_low + shift, band.phase_high + shift),
+    ]
+    for ax, (low, high) in zip(axes, sides, strict=True):
+        view = ax.get_ylim()
+        name = f"{label}: {100 * level:g} % confidence" if ax is axes[0] else None
+        ax.fill_between(w, low, high, color=color, alpha=0.22, linewidth=0.6, label=name)
+        reach = 0.5 * (view[1] - view[0])
+        ax.set_ylim(
+            max(min(view[0], low.min()), view[0] - reach),
+            min(max(view[1], high.max()), view[1] + reach),
+        )
+        ax.autoscale(True, axis="x")
+
+
+def trend(series: FitSeries, ax: Any = None, *, truth: Any = None) -> Any:
+    """Draw the rightmost pole of each record against its mean output, and the line through them.
+
+    Parameters
+    ----------
+    series : FitSeries
+        From `fit_each`.
+    ax : matplotlib Axes, optional
+        By default that of a new figure.
+    truth : callable, optional
+        What physics says: from an array of outputs [output unit] to poles [rad/s].
+
+    Returns
+    -------
+    matplotlib Axes
+        The axes; bars are 95 % intervals.
+
+    Raises
+    ------
+    CtrlidError
+        If something else is given, or the records do not allow a line.
+
+    Examples
+    --------
+    >>> import control as ct, ctrlid as cid
+    >>> loop = cid.Loop(cid.plants.servo(m=1.0, c=2.0, k=3.0), ct.tf(5, 1, 0.05), dt=0.05)
+    >>> runs = [cid.simulate(loop, cid.random_binary(500, amplitude=0.1, hold=9, around=at, seed=1),
+    ...                      sensor_noise=1e-3, seed=2) for at in (0, 1)]
+    >>> cid.plot.trend(cid.fit_each(cid.fit_iv, runs, na=2, nb=2)).get_ylabel()
+    'rightmost pole [rad/s]'
+    """
+    require(series, FitSeries, "plot.trend draws a FitSeries, as fit_each() returns")
+    line = series.trend
+    ax = take_axes(ax, 1)[0]
+    scale, unit = _pictures.scale([series.levels], series.unit)
+    y = np.linspace(series.levels.min(), series.levels.max(), 101)
+    ax.plot(scale * y, line.pole + line.slope * (y - line.level), label="line through the fits",
+            **line_style(0))  # fmt: skip
+    if truth is not None:
+        ax.plot(scale * y, truth(y), label="physics", **line_style(1))
+    ax.errorbar(scale * series.levels, series.rates, 1.96 * series.rate_errors, fmt=MARKERS[0],
+                color="k", capsize=4, label="fits, 95 % intervals")  # fmt: skip
+    ax.set_xlabel(f"mean output [{unit}]")
+    ax.set_ylabel("rightmost pole [rad/s]")
+    return finish(ax, columns=3)
+
+
+def _view(ax: Any, places: Any) -> None:
+    """Choose limits that hold all places, of the same scale in both directions."""
+    low, high = places.real.min(), places.real.max()
+    tall = np.abs(places.imag).max()
+    pad = 0.15 * max(high - low, tall, 0.1 * max(abs(high), abs(low)))
+    half = max(tall + pad, 0.25 * (high - low + 2 * pad))
+    width = max(high - low + 2 * pad, 4 * half)
+    middle = 0.5 * (low + high)
+    ax.set_xlim(middle - width / 2, middle + width / 2)
+    ax.set_ylim(-half, half)
+    ax.set_aspect("equal", adjustable="box")
+
+
+def _degrees(ax: Any) -> None:
+    """Put the ticks of a phase at parts of a right angle."""
+    low, high = ax.get_ylim()
+    step = next((s for s in (1, 5, 15, 30, 45, 90) if high - low <= 7 * s), 180)
+    ax.yaxis.set_major_locator(MultipleLocator(step))

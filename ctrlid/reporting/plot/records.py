@@ -1,0 +1,235 @@
+"""Experiments, and models against them."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ..._base import text as _text
+from ..._base.errors import CtrlidError
+from ...data.record import Record
+from ...physics.equations import Array
+from ...validation.comparison import Comparison
+from .. import pictures as _pictures
+from .axes import BINS, COLOURS, DASHES, MEASURED, finish, line_style, require, take_axes
+
+
+def record(record: Record, axes: Any = None, *, extra: Sequence[str] = ()) -> Any:
+    """Draw an experiment: reference and output, the input below, and extra channels on request.
+
+    Stretches that do not count are shaded. A long record is drawn as the band between the smallest
+    and the largest value of neighbouring samples, so that no peak is lost.
+
+    Parameters
+    ----------
+    record : Record
+        The experiment; draw a part with ``record.between(t0, t1)``.
+    axes : sequence of matplotlib Axes, optional
+        Two, and one more for each extra channel; by default those of a new figure.
+    extra : sequence of str, optional
+        Names of extra channels.
+
+    Returns
+    -------
+    numpy.ndarray of matplotlib Axes
+        The axes, from top to bottom.
+
+    Raises
+    ------
+    CtrlidError
+        If something else than a record is given, or the axes or channels do not fit.
+
+    Examples
+    --------
+    >>> import ctrlid as cid
+    >>> r = cid.random_binary(500, amplitude=1, hold=20, seed=1)
+    >>> axes = cid.plot.record(cid.Record(r=r, u=-r, y=0.9 * r, dt=0.01, units={"y": "mm"}))
+    >>> [ax.get_ylabel() for ax in axes]
+    ['y [mm]', 'u [unit not given]']
+    """
+    require(record, Record, "plot.record draws a Record")
+    extra = (extra,) if isinstance(extra, str) else tuple(extra)
+    unknown = [name for name in extra if name not in record.extra]
+    if unknown:
+        raise CtrlidError(f"the record has no extra channel {unknown}; it has {list(record.extra)}")
+    axes = take_axes(axes, 2 + len(extra), sharex=True)
+    both = [record.y] if record.r is None else [record.y, record.r]
+    scale, unit = _pictures.scale(both, record.units.get("y", ""))
+    name = record.names.get("y", "y")
+    _trace(axes[0], record, scale * record.y, 0, f"measured {name}")
+    if record.r is not None:
+        _trace(axes[0], record, scale * record.r, 1, f"reference {record.names.get('r', '')}", True)
+    axes[0].set_ylabel(f"{name} [{unit}]")
+    panels = [(record.names.get("u", "u"), record.u, "u", record.hold == "zoh")]
+    panels += [(key, record.extra[key], key, False) for key in extra]
+    for i, (ax, (name, values, key, held)) in enumerate(zip(axes[1:], panels, strict=True)):
+        scale, unit = _pictures.scale([values], record.units.get(key, ""))
+        label = name if i else f"input {name}"
+        _trace(ax, record, scale * values, (2 + i) % len(COLOURS), label, held)
+        ax.set_ylabel(f"{name} [{unit}]")
+    for ax in axes:
+        _shade(ax, record)
+        finish(ax)
+    axes[-1].set_xlabel("time [s]")
+    return axes
+
+
+def comparison(
+    comparison: Comparison, ax: Any = None, *, window: tuple[float, float] | None = None
+) -> Any:
+    """Draw the measured output against each prediction and simulation.
+
+    Parameters
+    ----------
+    comparison : Comparison
+        From `compare`.
+    ax : matplotlib Axes, optional
+        By default that of a new figure.
+    window : (float, float), optional
+        From when to when [s]; by default a stretch with a lively output in which the error of the
+        last curve is as large as it usually is, neither the best nor the worst one.
+
+    Returns
+    -------
+    matplotlib Axes
+        The axes; the legend says of every curve what it is and its fit over the whole record.
+
+    Raises
+    ------
+    CtrlidError
+        If something else than a comparison is given, or the window is outside the record.
+
+    Examples
+    --------
+    >>> import ctrlid as cid
+    >>> loop = cid.Loop(cid.plants.servo(m=1.0, c=2.0, k=3.0), 5.0, dt=0.01)
+    >>> r = cid.random_binary(1000, amplitude=0.1, hold=50, seed=1)
+    >>> found = cid.compare(cid.simulate(loop, r, sensor_noise=1e-3, seed=2), loop)
+    >>> ax = cid.plot.comparison(found, window=(0, 5))
+    >>> ax.get_xlabel()
+    'time [s], 0 to 5 s of a record from 0 to 10 s'
+    """
+    require(comparison, Comparison, "plot.comparison draws a Comparison, as compare() returns")
+    whole = comparison.record
+    if window is None:
+        first = _pictures.telling(comparison)
+        stop = min(first + _pictures.WINDOW, len(whole))
+    else:
+        part = whole.between(*window)
+        first = round((part.start - whole.start) / whole.dt)
+        stop = first + len(part)
+    ax = take_axes(ax, 1)[0]
+    t, shown = whole.t[first:stop], slice(first, stop)
+    scale, unit = _pictures.scale([whole.y[shown]], whole.units.get("y", ""))
+    y = scale * whole.y[shown]
+    ax.plot(t, y, label=f"measured {whole.names.get('y', 'y')}", **MEASURED)
+    for i, curve in enumerate(comparison.curves):
+        values = scale * curve.y[shown]
+        # Long predictions are made from every few samples only; breaks are where nothing counts.
+        kept = np.isfinite(values) | ~whole.valid[shown]
+        label = f"{curve.label}: fit {curve.fit:.1f} %"
+        ax.plot(t[kept], values[kept], label=label, **line_style(i))
+    # A prediction of a wrong model can be anywhere; what was measured must stay readable.
+    span = float(np.ptp(y)) or 1.0
+    low, high = ax.get_ylim()
+    low, high = max(low, y.min() - 0.8 * span), min(high, y.max() + 0.8 * span)
+    ax.set_ylim(low, high)
+    for line, curve in zip(
+        ax.get_lines()[-len(comparison.curves) :], comparison.curves, strict=True
+    ):
+        values = scale * curve.y[shown]
+        if not np.any((low < values) & (values < high)):
+            line.set_label(f"{line.get_label()}, outside this picture")
+    _shade(ax, whole[first:stop])
+    ax.set_ylabel(f"{whole.names.get('y', 'y')} [{unit}]")
+    ends = [f"{a:.4g} to {a + n * whole.dt:.4g} s" for a, n in
+            ((t[0], len(t)), (whole.start, len(whole)))]  # fmt: skip
+    ax.set_xlabel(f"time [s], {ends[0]} of a record from {ends[1]}")
+    return finish(ax)
+
+
+def residuals(comparison: Comparison, axes: Any = None) -> Any:
+    """Draw the correlations of the one-step errors with their 99 % bands.
+
+    Parameters
+    ----------
+    comparison : Comparison
+        From `compare`.
+    axes : sequence of matplotlib Axes, optional
+        One for each of `comparison.tests`; by default those of a new figure.
+
+    Returns
+    -------
+    numpy.ndarray of matplotlib Axes
+        The axes, from top to bottom.
+
+    Raises
+    ------
+    CtrlidError
+        If something else than a comparison with tests is given, or the number of axes differs.
+
+    Examples
+    --------
+    >>> import ctrlid as cid
+    >>> loop = cid.Loop(cid.plants.servo(m=1.0, c=2.0, k=3.0), 5.0, dt=0.01)
+    >>> r = cid.random_binary(1000, amplitude=0.1, hold=50, seed=1)
+    >>> found = cid.compare(cid.simulate(loop, r, sensor_noise=1e-3, seed=2), loop)
+    >>> len(cid.plot.residuals(found))
+    3
+    """
+    require(comparison, Comparison, "plot.residuals draws a Comparison, as compare() returns")
+    if not comparison.tests:
+        raise CtrlidError("plot.residuals has nothing to draw: the one-step errors of this record "
+                          "were not tested, they are round-off or too few")  # fmt: skip
+    axes = take_axes(axes, len(comparison.tests), sharex=True)
+    for ax, test in zip(axes, comparison.tests, strict=True):
+        inside = np.abs(test.values) <= test.band
+        if np.isfinite(test.band):
+            ax.axhspan(-test.band, test.band, color="0.85", label="99 % band of chance")
+        ax.axhline(0, color="0.3", linewidth=0.8)
+        ax.vlines(test.lags, 0, test.values, color="0.5", linewidth=1)
+        for which, marker, colour, label in (
+            (inside, "o", COLOURS[0], "within"), (~inside, "s", COLOURS[1], "outside"),
+        ):  # fmt: skip
+            if which.any():
+                ax.plot(test.lags[which], test.values[which], marker, color=colour, markersize=4,
+                        label=label)  # fmt: skip
+        verdict = "chance explains it" if test.passed else "NOT CHANCE"
+        title = f"{test.name}: {verdict} ({_text.chance(test.p_value)})"
+        ax.set_title(title, loc="left", fontsize="medium")
+        reach = 1.15 * max(float(np.abs(test.values).max()), min(test.band, 1.0))
+        ax.set_ylim(-reach, reach)
+        ax.set_ylabel("correlation [1]")
+        finish(ax, legend=False)
+    axes[0].legend(loc="lower right", bbox_to_anchor=(1, 1.12), ncols=3, frameon=False, borderpad=0)
+    axes[-1].set_xlabel("lag [samples]")
+    return axes
+
+
+def _trace(ax: Any, record: Record, values: Array, i: int, label: str, held: bool = False) -> None:
+    """Draw one signal over time, or the band it fills where there are more samples than pixels."""
+    n = len(record)
+    if n <= 2 * BINS:
+        where = "steps-post" if held else "default"
+        # Two signals share the first axes only.
+        style = {**line_style(i), "linestyle": DASHES[i == 1]}
+        ax.plot(record.t, values, drawstyle=where, label=label.strip(), **style)
+        return
+    bounded = held and i == 1  # of the reference the border alone, so that the output shows through
+    edges = np.linspace(0, n, (BINS // 15 if bounded else BINS) + 1).astype(int)[:-1]
+    low, high = np.minimum.reduceat(values, edges), np.maximum.reduceat(values, edges)
+    t, label = record.t[edges], f"{label.strip()}, range"
+    if bounded:
+        ax.step(t, high, where="post", label=label, **line_style(i))
+        ax.step(t, low, where="post", **line_style(i))
+        return
+    ax.fill_between(t, low, high, color=COLOURS[i], alpha=0.55, linewidth=0.4, label=label)
+
+
+def _shade(ax: Any, record: Record) -> None:
+    """Shade the stretches that do not count."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], ~record.valid, [0]]).astype(int)))
+    for k, (start, stop) in enumerate(zip(edges[::2], edges[1::2], strict=True)):
+        t0, t1 = (record.start + i * record.dt for i in (start, stop))
+        ax.axvspan(t0, t1, facecolor="0.88", hatch="///", edgecolor="0.6", linewidth=0, zorder=0,
+                   label=None if k else "does not count")  # fmt: skip

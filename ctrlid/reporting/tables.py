@@ -1,0 +1,268 @@
+"""Results as tables and sentences, for any page that shows them."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from .._base import text as _text
+from .._base.errors import CtrlidError
+from ..data.record import SIGNALS, Record
+from ..design.redesigning import Redesign
+from ..diagnosis import words
+from ..diagnosis.result import Diagnosis
+from ..estimation.identified_model import Estimate, IdentifiedModel
+from ..estimation.likelihood.physics_estimate import LoopFit
+from ..physics.trace import timebase
+from ..validation.comparison import Comparison
+
+
+@dataclass(frozen=True, repr=False)
+class Table(_text.Printed):
+    """Numbers in rows, the first column of which says what they are.
+
+    Parameters
+    ----------
+    head : tuple of str
+        Titles of the columns.
+    rows : tuple of tuple of str
+        The rows, as wide as the head.
+    caption : str, optional
+        What the table shows.
+
+    Raises
+    ------
+    CtrlidError
+        If a row is not as wide as the head.
+
+    Examples
+    --------
+    >>> print(Table(("pole", "rad/s"), (("unstable", "25.6"), ("stable", "-25.6"))))
+    pole        rad/s
+    unstable     25.6
+    stable      -25.6
+    """
+
+    head: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    caption: str = ""
+
+    def __post_init__(self) -> None:
+        wrong = [row for row in self.rows if len(row) != len(self.head)]
+        if wrong:
+            raise CtrlidError(
+                f"each row of this table needs {len(self.head)} cells; given {wrong[0]}"
+            )
+
+    def __str__(self) -> str:
+        lines = (self.head, *self.rows)
+        widths = [max(len(line[i]) for line in lines) for i in range(len(self.head))]
+        text = "\n".join(
+            "   ".join([line[0].ljust(widths[0]), *(c.rjust(w) for c, w in
+                       zip(line[1:], widths[1:], strict=True))]).rstrip() for line in lines
+        )  # fmt: skip
+        return f"{self.caption}\n{text}" if self.caption else text
+
+
+@dataclass(frozen=True)
+class Title:
+    """A heading within the page of a result.
+
+    Parameters
+    ----------
+    text : str
+        The heading.
+    """
+
+    text: str
+
+
+Block = Table | Title | str
+
+
+def heading(result: Any) -> str:
+    """Return a title for a result, or refuse what cannot be shown."""
+    match result:
+        case Record():
+            return f"Record {result.name}".strip()
+        case IdentifiedModel():
+            return f"Model by {result.estimate.method}"
+        case LoopFit():
+            return f"Physical parameters of {result.loop.plant.name}"
+        case Comparison():
+            return f"{result.what.split('(')[0]} against the record {result.record.name}".strip()
+        case Redesign():
+            return "Redesign: promised against achieved"
+        case Diagnosis():
+            return f"Diagnosis of {result.record or 'a record'}"
+        case Table():
+            return result.caption or "Table"
+    raise CtrlidError(
+        "a report shows a Record, IdentifiedModel, LoopFit, Comparison, Redesign, Diagnosis, Table "
+        f"or Section, or a sequence of them; given {type(result).__name__}"
+    )
+
+
+def blocks(result: Any) -> list[Block]:
+    """Return a result as tables, headings and sentences."""
+    match result:
+        case Table():
+            return [result]
+        case Record():
+            return [_record_table(result)]
+        case IdentifiedModel():
+            return _estimate_blocks(result.estimate)
+        case LoopFit():
+            return _loop_fit_blocks(result)
+        case Comparison():
+            return [*_comparison_tables(result), *result.notes, result.verdict]
+        case Redesign():
+            return _redesign_blocks(result)
+        case Diagnosis():
+            return _diagnosis_blocks(result)
+    heading(result)  # refuses what has no page
+    return []
+
+
+def _record_table(record: Record) -> Table:
+    channels = [(record.names.get(k, k), record.units.get(k, ""), getattr(record, k))
+                for k in SIGNALS if getattr(record, k) is not None]  # fmt: skip
+    channels += [(k, record.units.get(k, ""), v) for k, v in record.extra.items()]
+    rows = tuple(
+        (name, unit or "not given", *(f"{f(v):.6g}" for f in (np.min, np.mean, np.max, np.std)))
+        for name, unit, v in channels
+    )
+    valid = "" if record.valid.all() else f", {100 * record.valid.mean():.1f} % of them count"
+    between = "held" if record.hold == "zoh" else "straight"
+    caption = (
+        f"{len(record)} samples at {record.dt:g} s, {record.duration:.4g} s in all{valid}; "
+        f"u is {between} between samples."
+    )
+    head = ("signal", "unit", "smallest", "mean", "largest", "standard deviation")
+    return Table(head, rows, caption)
+
+
+def _estimate_blocks(e: Estimate) -> list[Block]:
+    held = {bound.quantity for bound in e.active_bounds}
+    rows = []
+    for name, value, error in zip(e.names, e.values, e.standard_errors, strict=True):
+        known = "on its bound" if name in held else "fixed" if error == 0 else f"{error:.2g}"
+        rows.append((name, f"{value:.7g}", known))
+    sampled = e.structure.domain == "z"
+    poles = tuple(
+        (*((_text.number(z, 5),) if sampled else ()), _text.number(s, 5), f"{ds:.2g}")
+        for z, s, ds in zip(e.poles, e.poles_s, e.poles_s_standard_errors, strict=True)
+    )
+    head = (*(("pole in z",) if sampled else ()), "pole in s [rad/s]", "standard error [rad/s]")
+    text = str(e).splitlines()
+    news = text[1 + next(i for i, line in enumerate(text) if "active bounds:" in line) :]
+    period = f", dt = {e.dt:g} s" if e.dt else ""
+    white = " Standard errors hold for white errors only." if "ARX" in e.method else ""
+    caption = f"{_upper(e.method)}, {e.n_samples} rows{period}.{white}"
+    return [
+        Table(("coefficient", "value", "standard error"), tuple(rows), caption),
+        Table(head, poles),
+        *(line.strip() for line in news),
+    ]
+
+
+def _comparison_tables(c: Comparison) -> list[Table]:
+    unit = c.record.units.get("y", "unit of y")
+    curves = tuple(
+        (q.label, f"{q.fit:.2f} %", f"{q.rms:.3g}", f"{100 * q.noise_share:.1f} %")
+        for q in c.curves
+    )
+    tests = tuple(
+        (t.name, "chance" if t.passed else "NOT CHANCE", f"{np.abs(t.values).max():.3f}",
+         f"{t.band:.3f}", _text.chance(t.p_value)) for t in c.tests
+    )  # fmt: skip
+    tables = [
+        Table(("curve", "fit", f"RMS error [{unit}]", "noise explains"), curves, f"{c.what}.")
+    ]
+    if tests:
+        head = ("correlation", "verdict", "largest", "99 % band", "by chance")
+        tables.append(Table(head, tests, "One-step errors."))
+    return tables
+
+
+def _loop_fit_blocks(fit: LoopFit) -> list[Block]:
+    e = fit.estimate
+    errors = ("on its bound" if name in e.bounds else
+              f"{error:.2g}" if np.isfinite(error) else "not in the data"
+              for name, error in zip(e.names, e.standard_errors, strict=True))  # fmt: skip
+    rows = tuple(zip(e.names, (f"{v:.7g}" for v in e.values), errors, strict=True))
+    first, *rest = str(e).splitlines()
+    return [
+        Table(("parameter", "value", "standard error"), rows, f"{_upper(first)}."),
+        *(_upper(line.strip()) + "." for line in rest[len(e.names) :]),
+        f"{fit.loop!r}.",
+    ]
+
+
+def _redesign_blocks(r: Redesign) -> list[Block]:
+    z = "z" if timebase(r.controller) else "s"
+    return [
+        Table(("", "promised on the model", "achieved on the physics"), r.rows),
+        r.verdict,
+        f"{_upper(str(r).splitlines()[0])}, coefficients in falling powers of {z}.",
+    ]
+
+
+def _diagnosis_blocks(found: Diagnosis) -> list[Block]:
+    caption = f"{found.gap.kind.capitalize()} of {len(found.gap.time)} samples kept back."
+    gap = Table(("", "RMS error", "against the noise floor"), tuple(words.gap_rows(found.gap)),
+                caption)  # fmt: skip
+    made: list[Block] = [words.headline(found), gap, words.shrinking(found.gap)]
+    if found.findings:
+        made.append(Title("What is missing"))
+    for k, finding in enumerate(found.findings, 1):
+        sure = words.certainty(found, finding)
+        made += [f"{k}. {words.named(finding)}. {words.sized(found, finding)}.", f"{_upper(sure)}."]
+        made += [f"{_upper(doubt)}." for doubt in words.doubts(found, finding)]
+    if found.findings:
+        made.append(words.EVIDENCE)
+    if found.where:
+        made.append(Title("Where it sits"))
+    made += [f"Along {p.axis}: {words.place_words(p)}." for p in words.telling(found)]
+    sides = 2 if found.findings else 1
+    places = tuple(
+        (p.axis, *(_text.number(words.worst(v), 3) for v in (p.before, p.after)[:sides]),
+         *(_text.chance(v) for v in (p.p_before, p.p_after)[:sides]))
+        for p in found.where
+    )  # fmt: skip
+    if places:
+        columns = (
+            "along",
+            *("before", "after")[:sides],
+            *("chance before", "chance after")[:sides],
+        )
+        made.append(Table(columns, places, "RMS of the one-step errors at worst; 1 is noise."))
+    if found.verdict == "nothing missing" and found.sensitivity:
+        made.append(Table(("effect", "smallest size that would have been seen"),
+                          tuple(words.sensitivity_rows(found))))  # fmt: skip
+    made.append(Title("Parameters, noise and remarks"))
+    parameters = tuple(
+        (c.name, f"{c.given:.6g}", f"{c.before:.6g}", f"{c.after:.6g}",
+         f"{c.standard_error:.2g}" if np.isfinite(c.standard_error) else "not in the data")
+        for c in found.calibrated
+    )  # fmt: skip
+    if parameters:
+        titles = ("parameter", "given", "recalibrated", "final", "standard error")
+        made.append(Table(titles, parameters, "The model's own parameters."))
+    made += [f"{_upper(line)}." for line in (words.disturbance(found), words.remains(found))]
+    made += [f"About the record: {remark.rstrip('.')}." for remark in found.audit]
+    made += [f"Note: {remark.rstrip('.')}." for remark in found.notes]
+    tried = tuple(
+        (type(c.effect).__name__, str(c.round), f"{c.gain:.1f}", f"{c.penalty:.1f}", c.remark)
+        for c in found.ranking if np.isfinite(c.gain)
+    )  # fmt: skip
+    if tried:
+        width = 5 if any(row[-1] for row in tried) else 4  # remarks are rare
+        heads = ("candidate", "round", "evidence", "penalty", "remark")[:width]
+        rows = tuple(row[:width] for row in tried)
+        made += [Title("What was tried"), Table(heads, rows, "The candidates that were refitted.")]
+    return [block for block in made if block]
+
+
+def _upper(text: str) -> str:
+    return text[:1].upper() + text[1:]

@@ -1,0 +1,1 @@
+"""What a record is fit for, and how far a model and a record are apart."""

@@ -1,0 +1,375 @@
+"""compare(): how well a model or a loop reproduces a record, every curve labelled."""
+
+import warnings
+from collections.abc import Sequence
+from numbers import Integral
+from typing import Any
+
+import control as ct
+import numpy as np
+from scipy import signal
+
+from .._base.errors import CtrlidError, CtrlidWarning
+from .._base.text import number
+from ..data.record import Record
+from ..estimation.identified_model import IdentifiedModel, delay_of
+from ..estimation.likelihood.filter_data import FEWEST
+from ..estimation.likelihood.prediction import Prediction, predict, predict_ahead, spread_ahead
+from ..estimation.linear.sampled_motion import flow
+from ..loop.controller_replay import controller_output, replay_from_best_state
+from ..loop.controllers import PID
+from ..loop.initial_state import best_start
+from ..loop.loop import Loop
+from ..loop.period_map import growth_rate
+from ..loop.simulation import Simulator
+from ..physics.equations import Array
+from ..physics.linearization import state_matrices
+from ..physics.trace import timebase
+from .comparison import EXACT, Comparison, Curve
+from .noise_model import noise_polynomial, whiten
+from .residual_tests import Correlation, autocorrelation, cross_correlation, explained_share
+
+MEANINGFUL = 1e-6  # of the input's size: below, an injected signal is round-off
+
+
+def compare(record: Record, model_or_loop: Any, *, horizon: int | None = None) -> Comparison:
+    """Compare a record with a model or a loop.
+
+    A prediction uses the measured output up to some samples before; a simulation uses none of it.
+    A loop with a controller is simulated closed loop; a stable plant without one is simulated
+    from the measured input. An unstable plant is never simulated open loop: any difference
+    would grow without bound and say nothing. What the controller's own law leaves of the measured
+    u (injected pulses, dither) is injected in the simulation as well; initial states are
+    estimated for each valid stretch.
+
+    Parameters
+    ----------
+    record : Record
+        The data.
+    model_or_loop : Loop, IdentifiedModel or control.TransferFunction
+        What to compare with them. A transfer function predicts as the ARX equation does, with the
+        constant part fitted to this record.
+    horizon : int, optional
+        Samples to predict ahead; by default about one time constant of the slowest unstable, or
+        else the slowest stable, pole.
+
+    Returns
+    -------
+    Comparison
+        Curves with fit and error, and tests of the one-step errors.
+
+    Raises
+    ------
+    CtrlidError
+        If record and model do not fit together.
+
+    Examples
+    --------
+    >>> import ctrlid as cid
+    >>> plant = cid.plants.servo(m=1.0, c=2.0, k=3.0)
+    >>> loop = cid.Loop(plant, 5.0, dt=0.01)
+    >>> r = cid.random_binary(1000, amplitude=0.1, hold=50, seed=1)
+    >>> record = cid.simulate(loop, r, sensor_noise=1e-3, seed=2)
+    >>> [curve.label for curve in cid.compare(record, loop).curves]
+    ['one-step prediction', '50-step prediction', 'closed-loop simulation']
+    """
+    if not isinstance(record, Record):
+        raise CtrlidError(
+            f"compare needs a Record first, then the model; given {type(record).__name__}"
+        )
+    if horizon is not None and not (isinstance(horizon, Integral) and 1 <= horizon < len(record)):
+        raise CtrlidError(
+            f"horizon must be between 1 and {len(record) - 1} samples; given {horizon}"
+        )
+    if isinstance(model_or_loop, Loop):
+        return _compare_loop(record, model_or_loop, horizon)
+    if isinstance(model_or_loop, ct.TransferFunction):
+        return _compare_model(record, model_or_loop, horizon)
+    raise CtrlidError(
+        "compare needs a Loop, or a transfer function such as the fits return; given "
+        f"{type(model_or_loop).__name__}. Put a nonlinear plant into a Loop(plant, controller, "
+        "dt=..., at=...)"
+    )
+
+
+def _compare_loop(record: Record, loop: Loop, horizon: int | None) -> Comparison:
+    prediction = predict(loop, record)
+    residuals = np.where(prediction.settled, prediction.innovations, np.nan)
+    one_step = np.where(prediction.settled, prediction.y, np.nan)
+    curves = [_curve("one-step prediction", record, one_step, _known_before(record, 1))]
+    notes = []
+    e = loop.equations()
+    steps = horizon or time_constant(moving_poles(loop), e.dt, record)
+    if steps > 1:
+        index, values = predict_ahead(loop, record, prediction, steps)
+        ahead = np.full(len(record), np.nan)
+        ahead[index] = values
+        curves.append(_curve(f"{steps}-step prediction", record, ahead,
+                             _known_before(record, steps),
+                             spread_ahead(loop, record, prediction, steps)[0]))  # fmt: skip
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", CtrlidWarning)
+        try:
+            curves.append(_simulated(record, loop, prediction))
+        except CtrlidError as reason:
+            notes.append(f"no simulation: {reason}")
+    notes += sorted({str(w.message) for w in caught})[-1:]
+    return _comparison(repr(loop), record, curves, residuals, notes)
+
+
+def _known_before(record: Record, steps: int) -> list[tuple[Array, int]]:
+    """Return the signals that an error `steps` after the last known output should not follow.
+
+    The reference, if there is one: the input carries the noise itself round the loop. Without a
+    reference the input as it was known then.
+    """
+    if record.r is None:
+        return [(np.asarray(record.u), steps)]
+    return [(np.asarray(record.r), 1)]
+
+
+def _comparison(
+    what: str, record: Record, curves: list[Curve], residuals: Array, notes: list[str]
+) -> Comparison:
+    known = tuple(c for c in curves if np.isfinite(c.rms))
+    notes += [f"no {c.label}: no valid stretch is long enough" for c in curves if c not in known]
+    exact = known[0].fit > EXACT
+    tests = () if exact else _tests(record, residuals)
+    return Comparison(what, record, known, residuals, tests, tuple(notes))
+
+
+def moving_poles(loop: Loop) -> Any:
+    """Return the poles of a plant in motion, where dry friction does not damp it as at rest."""
+    return np.linalg.eigvals(state_matrices(loop.equations(), loop.point, spread=1e6)[0])
+
+
+def time_constant(poles: Any, dt: float, record: Record) -> int:
+    """Return the slowest unstable, or else the slowest stable, time constant in samples."""
+    with np.errstate(divide="ignore", invalid="ignore"):  # a pole at z = 0 is infinitely fast
+        rates = (np.log(poles.astype(complex)) / dt if dt else poles).real
+    fast = rates[rates > 1e-6] if np.any(rates > 1e-6) else -rates[rates < -1e-6]
+    slowest = float(np.min(fast)) if fast.size else 10 / record.duration
+    return int(np.clip(round(1 / (slowest * record.dt)), 1, max(len(record) // 10, 1)))
+
+
+def _simulated(record: Record, loop: Loop, prediction: Prediction) -> Curve:
+    """Simulate a record, stretch by stretch, each from its own best initial state.
+
+    Once more with noise of the size found in the one-step errors, to see what it makes of it.
+    """
+    r: Any = record.r
+    if loop.controller is None:
+        if growth_rate(loop) > -1e-9:
+            raise CtrlidError(
+                "the plant is not stable and the controller is unknown; an open-loop simulation "
+                "would drift without bound. Give the loop its controller"
+            )
+        label = "open-loop simulation"
+    elif loop.analog and r is None:
+        raise CtrlidError("an analog loop is simulated from its reference, but the record has none")
+    else:
+        label = "closed-loop simulation"
+        pid = loop.controller
+        if r is None and isinstance(pid, PID) and np.isfinite([pid.lower, pid.upper]).any():
+            raise CtrlidError("a PID with limits is simulated from its reference, but the record "
+                              "has none; give it r=, a constant for a fixed set-point")  # fmt: skip
+    y, injected = np.full(len(record), np.nan), np.zeros(len(record))
+    noisy = np.zeros(len(record))
+    simulator = Simulator(loop)
+    n = len(simulator.plant_states)
+    for start, stop in record.segments():
+        if stop - start < FEWEST:
+            continue
+        part = record[start:stop]
+        reference = r[start:stop] if r is not None else None
+        guess = simulator.rest.copy()
+        guess[:n] = prediction.states[start]
+        if loop.controller is None:
+            d = part.u - loop.point.input
+        elif loop.analog:
+            d = np.zeros(len(part))
+        elif reference is None:
+            reference = np.full(len(part), loop.point.output)
+            d = part.u - controller_output(loop, part.y, reference)
+        else:
+            replayed, guess[n:] = replay_from_best_state(loop, part)
+            d = part.u - replayed
+        fitted = guess.size if loop.analog else n
+        z = best_start(simulator, part, reference, d, guess, fitted)
+        y[start:stop] = simulator.run(z, reference, d)[0]
+        injected[start:stop] = d
+        noisy[start:stop] = _noise_effect(simulator, z, reference, d, prediction) - y[start:stop]
+    driven = [] if record.r is None else [(np.asarray(record.r), 1)]
+    if np.std(injected) > MEANINGFUL * np.std(record.u) and not (driven and not loop.controller):
+        driven.append((injected, 1))
+    # Through a curved law noise moves the mean as well, and that is its doing too.
+    by_noise = float(np.sqrt(np.mean(noisy[np.isfinite(y)] ** 2)))
+    return _curve(label, record, y, driven, by_noise)
+
+
+def _noise_effect(
+    simulator: Simulator, z: Array, r: Any, d: Array, prediction: Prediction
+) -> Array:  # fmt: skip
+    """Return the output of one run with the noise of a prediction, NaN where that cannot be."""
+    unknown = np.full(len(d), np.nan)
+    if not simulator.loop.equations().velocities:
+        return unknown  # the simulation has no place for the noise of the prediction
+    streams = np.random.default_rng(0).standard_normal((2, len(d)))
+    noise = [streams[0] * prediction.sensor_noise, streams[1] * prediction.force_noise]
+    try:
+        return simulator.run(z, r, d, noise)[0]
+    except CtrlidError:
+        return unknown
+
+
+def _sampled(model: Any, record: Record, delay: float) -> tuple[Array, Array]:
+    """Return the polynomials in z of a continuous model, its input held and late."""
+    if delay and record.hold != "zoh":
+        model, delay = model.with_delay(), 0.0
+    plant = ct.ss(ct.tf(model.num, model.den))
+    direct = float(plant.D[0, 0])
+    motion = flow(plant.A, plant.B[:, 0], plant.C[0], record.dt, record.hold, delay)
+    den = np.real(np.poly(motion.f))
+    late = max(lag for _, lag, _ in motion.inputs)
+    num = direct * den
+    for _, lag, b in motion.inputs:
+        path = np.real(np.poly(motion.f - np.outer(b, motion.c))) - den
+        num = np.polyadd(num, np.append(path[1:], np.zeros(late - lag)))
+    return num, np.append(den, np.zeros(late))
+
+
+def _compare_model(record: Record, model: Any, horizon: int | None) -> Comparison:
+    if model.ninputs != 1 or model.noutputs != 1:
+        raise CtrlidError("compare needs a model with one input and one output")
+    dt = record.dt if model.dt is True else timebase(model)
+    if dt and abs(dt - record.dt) > 1e-9 * dt:
+        raise CtrlidError(
+            f"the model is sampled at {dt:g} s, the record at {record.dt:g} s; fit or sample the "
+            "model at the record's period"
+        )
+    poles = ", ".join(number(p, 4) for p in model.poles())
+    what = f"{model.name}: poles {poles or 'none'}"
+    delay = delay_of(model)
+    if delay:
+        what += f", delay {number(delay, 4)} s"
+    if not dt:
+        num, den = _sampled(model, record, delay)
+    else:
+        num, den = (np.asarray(p[0][0], float) for p in (model.num, model.den))
+    num = np.concatenate([np.zeros(len(den) - len(num)), num]) / den[0]
+    den = den / den[0]
+    order = len(den) - 1
+    valid = np.asarray(record.valid)
+    usable = np.zeros(len(record), dtype=bool)
+    if len(record) > order:
+        windows = np.lib.stride_tricks.sliding_window_view(valid, order + 1)
+        usable[order:] = windows.all(axis=1)
+    if np.count_nonzero(usable) < FEWEST:
+        raise CtrlidError(f"a model of order {order} needs {FEWEST + order} valid samples in "
+                          f"succession; the record has {np.count_nonzero(valid)} valid samples of "
+                          f"{len(record)}")  # fmt: skip
+    y0, u0 = float(np.mean(record.y[valid])), float(np.mean(record.u[valid]))
+    y, u = record.y - y0, record.u - u0
+    moved = np.convolve(u, num)[: len(u)]
+    error = np.convolve(y, den)[: len(y)] - moved
+    constant = float(np.mean(error[usable]))
+    error = np.where(usable, error - constant, 0.0)
+    stretches = [(a + order, b) for a, b in record.segments() if b - a > order]
+    noise = np.eye(1, order + 1)[0]
+    if not (isinstance(model, IdentifiedModel) and "ARX" in model.estimate.method):
+        noise = noise_polynomial(error, stretches, den)
+    white_errors = whiten(error, stretches, noise)
+    residuals = np.where(usable, white_errors, np.nan)
+    curves = [_curve("one-step prediction", record, record.y - residuals, _known_before(record, 1))]
+    roots = np.roots(den)
+    # White one-step errors pass through C/A.
+    white = float(np.std(residuals[usable]))
+    with np.errstate(over="ignore"):
+        impulse = signal.lfilter(noise, den, np.eye(1, len(record))[0])
+        grown = np.sqrt(np.cumsum(impulse**2))
+    steps = horizon or time_constant(roots, record.dt, record)
+    if steps > 1:
+        ahead = y0 + _ahead(y, moved + constant, den, noise, white_errors, steps, usable)
+        known = _known_before(record, steps)
+        curves.append(
+            _curve(f"{steps}-step prediction", record, ahead, known, white * grown[steps - 1])
+        )
+    notes = []
+    if np.all(np.abs(roots) < 1 - 1e-9):
+        free = y0 + _arx_free(record, y, moved + constant, den)
+        outside = _known_before(record, 1)
+        curves.append(_curve("open-loop simulation", record, free, outside, white * grown[-1]))
+    else:
+        notes.append("an unstable model is not simulated open loop; put it into a Loop with the "
+                     "controller")  # fmt: skip
+    return _comparison(what, record, curves, residuals, notes)
+
+
+def _arx_free(record: Record, y: Array, driven: Array, den: Array) -> Array:
+    """Iterate the ARX equation over each valid stretch from its first measured outputs."""
+    order = len(den) - 1
+    free = np.full(len(y), np.nan)
+    for start, stop in record.segments():
+        if stop - start > order:
+            state = signal.lfiltic([1.0], den, y[start : start + order][::-1])
+            free[start + order : stop] = signal.lfilter(
+                [1.0], den, driven[start + order : stop], zi=state
+            )[0]
+    return free
+
+
+def _ahead(
+    y: Array, driven: Array, den: Array, noise: Array, white: Array, steps: int, usable: Any
+) -> Array:  # fmt: skip
+    """Iterate ``A y = B u + C e`` `steps` times, with the predictions and errors made before."""
+    order, n = len(den) - 1, len(y)
+    # past[i] holds, for each origin k, the (predicted or measured) output at k + j - i.
+    past = [np.concatenate([np.zeros(i), y[: n - i]]) for i in range(order)]
+    for j in range(1, steps + 1):
+        drive = np.concatenate([driven[j:], np.full(j, np.nan)])
+        new = drive - sum((a * p for a, p in zip(den[1:], past, strict=True)), np.zeros(n))
+        for i in range(j, order + 1):  # errors after the origin are not known: their mean is zero
+            new += noise[i] * np.concatenate([np.zeros(i - j), white[: n - (i - j)]])
+        past = [new, *past][:order]
+    ahead = np.full(n, np.nan)
+    ahead[steps:] = new[: n - steps]
+    window = steps + order
+    if n > window:
+        whole = np.lib.stride_tricks.sliding_window_view(usable, steps).all(axis=1)
+        ok = np.zeros(n, dtype=bool)
+        ok[steps - 1 :] = whole
+        ahead[~ok] = np.nan
+    ahead[:window] = np.nan
+    return ahead
+
+
+def _curve(
+    label: str, record: Record, y: Array, signals: Sequence[tuple[Array, int]],
+    noise: float = float("nan"),
+) -> Curve:  # fmt: skip
+    """Judge a reproduction; `noise` is the error that noise alone makes, NaN if not known."""
+    known = np.asarray(record.valid) & np.isfinite(y)
+    if not known.any():
+        nan = float("nan")
+        return Curve(label, y, nan, nan, nan, nan)
+    error = np.where(known, record.y - y, 0.0)
+    measured = record.y[known]
+    size = float(np.linalg.norm(measured - measured.mean()))
+    fit = 100 * (1 - float(np.linalg.norm(error[known])) / size) if size else float("nan")
+    rms = float(np.sqrt(np.mean(error[known] ** 2)))
+    follows = 0.0 if fit > EXACT else explained_share(error, signals, known)
+    share = 1 - follows
+    if fit <= EXACT and np.isfinite(noise) and noise < rms:
+        share = min(share, (noise / rms) ** 2)
+    return Curve(label, np.where(known, y, np.nan), fit, rms, follows, share)
+
+
+def _tests(record: Record, residuals: Array) -> tuple[Correlation, ...]:
+    known = np.isfinite(residuals)
+    e = np.where(known, residuals, 0.0)
+    lags = int(min(25, max(known.sum() // 10, 1)))
+    tests = [autocorrelation(e, known, lags),
+             cross_correlation(e, np.asarray(record.u), known, "u", lags, 1)]  # fmt: skip
+    if record.r is not None:
+        tests.append(cross_correlation(e, np.asarray(record.r), known, "r", lags, 0))
+    return tuple(tests)

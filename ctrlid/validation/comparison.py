@@ -1,0 +1,157 @@
+"""What a comparison found, as a table and in words."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .._base.errors import CtrlidError
+from .._base.text import Printed
+from ..data.record import Record
+from ..physics.equations import Array
+from .residual_tests import Correlation
+
+SYSTEMATIC = 0.05  # share of an error that follows the signals and is worth a word
+EXACT = 100 * (1 - 1e-9)  # a fit in percent beyond which the rest is round-off
+ENOUGH = 0.75  # of an error's variance: noise is not known better than this
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """One reproduction of the measured output.
+
+    Parameters
+    ----------
+    label : str
+        What it is: a prediction (uses measured outputs) or a simulation (does not).
+    y : ndarray, shape (n,)
+        Reproduced output [output unit]; NaN where there is none.
+    fit : float
+        Fit in percent, ``100 (1 - |y - yhat| / |y - mean(y)|)``.
+    rms : float
+        Root mean square of the error [output unit].
+    follows : float
+        Share of the error's variance that follows the past of reference and input, as no noise
+        does.
+    noise_share : float
+        Share of the error's variance that noise explains: not more than what follows no signal,
+        and not more than noise of the size found in the one-step errors makes of it.
+    """
+
+    label: str
+    y: Array
+    fit: float
+    rms: float
+    follows: float
+    noise_share: float
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Comparison(Printed):
+    """What `compare` found.
+
+    Parameters
+    ----------
+    what : str
+        The model or loop that was compared.
+    record : Record
+        The data.
+    curves : tuple of Curve
+        Predictions and simulations.
+    residuals : ndarray, shape (n,)
+        One-step prediction errors [output unit]; NaN where there are none.
+    tests : tuple of Correlation
+        Residuals with their own past, with past u and with past r.
+    notes : tuple of str
+        What could not be computed, and why.
+    """
+
+    what: str
+    record: Record
+    curves: tuple[Curve, ...]
+    residuals: Array
+    tests: tuple[Correlation, ...]
+    notes: tuple[str, ...] = ()
+
+    def __getitem__(self, label: str) -> Curve:
+        for curve in self.curves:
+            if label in curve.label:
+                return curve
+        raise CtrlidError(f"no curve is called {label!r}; there are "
+                          f"{', '.join(c.label for c in self.curves)}")  # fmt: skip
+
+    @property
+    def fit(self) -> dict[str, float]:
+        """Fit in percent by curve label."""
+        return {curve.label: curve.fit for curve in self.curves}
+
+    @property
+    def verdict(self) -> str:
+        """The comparison in words: the last curve, then the one-step errors."""
+        last = self.curves[-1]
+        what = self.record.name or "the record"
+        text = f"The {last.label} reproduces {what} with a fit of {_fit(last.fit)}"
+        if last.fit <= 0:
+            text = f"The {last.label} does not reproduce {what}: it errs by more than y moves"
+        if last.fit > EXACT:
+            return text + ": nothing is left to explain."
+        failed = [t for t in self.tests if not t.passed]
+        large = [t for t in failed if t.share >= SYSTEMATIC]
+        if last.follows >= SYSTEMATIC:
+            text += (f". SOMETHING IS MISSING in the model: {_percent(last.follows)} of the "
+                     "error's variance follows reference or input, as noise does not.")  # fmt: skip
+        elif last.noise_share < ENOUGH:
+            text += (". SOMETHING IS MISSING in the model: noise of the size of the one-step "
+                     f"errors explains {_percent(last.noise_share)} of the error's variance; an "
+                     "offset, a drift or a nonlinearity looks like this.")  # fmt: skip
+        elif large:
+            text += ". SOMETHING IS MISSING in the model, or its noise is not white."
+        else:
+            text += f". Noise explains {_percent(last.noise_share)} of the error's variance."
+        if large:
+            return text + f" The one-step errors are NOT NOISE ALONE: {_accounts(large)}."
+        if failed:
+            return text + (" The one-step errors are nearly noise alone; what correlates is "
+                           f"certain but small: {_accounts(failed)}.")  # fmt: skip
+        if self.tests:
+            text += " The one-step errors are white and independent of the signals."
+        return text
+
+    def __str__(self) -> str:
+        unit = self.record.units.get("y", "")
+        rows = [f"{self.what} against {self.record.name or 'record'} ({len(self.record)} samples, "
+                f"{np.count_nonzero(self.record.valid)} valid)"]  # fmt: skip
+        size = f"RMS error [{unit}]" if unit else "RMS error"
+        rows.append(f"  {'curve':<34}{'fit':>10}{size:>18}{'noise explains':>18}")
+        rows += [
+            f"  {c.label:<34}{_fit(c.fit):>10}{c.rms:>18.3e}{_percent(c.noise_share):>18}"
+            for c in self.curves
+        ]
+        if self.tests:
+            rows.append(f"  {'one-step errors':<34}{'chance?':>10}{'largest':>18}"
+                        f"{'of variance':>18}")  # fmt: skip
+        for t in self.tests:
+            worst = int(np.argmax(np.abs(t.values)))
+            largest = f"{t.values[worst]:+.3f} at lag {t.lags[worst]}"
+            share = "" if t.passed else _percent(t.share)
+            rows.append(f"  {t.name:<34}{'yes' if t.passed else 'NO':>10}{largest:>18}{share:>18}")
+        rows += [f"  note: {note}" for note in self.notes]
+        return "\n".join([*rows, "  " + self.verdict])
+
+
+def _percent(share: float) -> str:
+    """Write a share with the digits that say something: 0.3 %, 12 %, 99.7 %."""
+    value = 100 * share
+    if 99 < value < 99.95:
+        return f"{value:.1f} %"
+    return f"{value:.0f} %" if value >= 9.5 or value < 1e-3 else f"{value:.1g} %"
+
+
+def _fit(fit: float) -> str:
+    if fit > EXACT:
+        return "100 %"
+    return f"{fit:.2f} %" if fit < 99.9 else f"{fit:.4f} %"
+
+
+def _accounts(tests: list[Correlation]) -> str:
+    """Say how much of the variance each failed test stands for."""
+    return ", ".join(f"{t.name}, {_percent(t.share)} of the variance" for t in tests)

@@ -1,0 +1,282 @@
+"""check_feedback(): whether a record was taken in closed loop."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy import linalg, stats
+
+from .._base.errors import CtrlidError
+from .._base.text import Printed
+from ..data.record import Record
+from .residual_tests import Correlation, cross_correlation
+
+FloatArray = npt.NDArray[np.float64]
+
+LEVEL = 1e-3  # chance of calling an open loop closed
+ORDER = 20  # most past samples of each signal
+LAGS = 8  # samples within which a controller shows itself
+MOST = 50_000  # rows of a regression
+NOTHING = 1e-7  # of a signal's spread: a remainder of rounding in a short regression
+ROUNDING = 1e-11  # of a signal's spread: what a long regression leaves of a signal without noise
+LAW = 6  # most past samples in an exact law
+TELLING = 0.01  # of what r and past u leave of u: if y takes all but this away, u is made from y
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class FeedbackCheck(Printed):
+    """What `check_feedback` found.
+
+    Parameters
+    ----------
+    closed_loop : bool
+        Whether u reacts to y.
+    p_value : float
+        Probability of correlations as large as these if it does not; 0 or 1 where an exact law
+        decided.
+    lags : ndarray of int
+        Lags in samples: at lag tau, u is compared with what was new in y tau samples before.
+    correlation : ndarray
+        Correlation coefficients; empty where an exact law decided.
+    text : str
+        The finding in words.
+    """
+
+    closed_loop: bool
+    p_value: float
+    lags: Any
+    correlation: FloatArray
+    text: str
+
+    def __str__(self) -> str:
+        return self.text
+
+
+def check_feedback(record: Record) -> FeedbackCheck:
+    r"""Check whether u was computed from y, from the record alone.
+
+    .. math:: e_k = y_k - \hat E(y_k \mid y, u \text{ before } k), \quad
+        w_k = u_k - \hat E(u_k \mid u \text{ before } k, \; r), \quad
+        \operatorname{E} w_k e_{k-\tau} = 0 \text{ for } \tau \ge 0 \text{ in open loop}
+
+    Both expectations are long linear regressions. What is new in y, sensor noise and disturbances,
+    cannot show in an input that was made without looking at y; a controller cannot help showing
+    it. The test is of all lags together, with the covariance that the colours of e and w give.
+    Without any noise e is nothing, and the law itself is looked for: with fewer past samples u is
+    an exact function of r and y than of r alone, or the plant is unstable and y stays bounded all
+    the same.
+
+    Parameters
+    ----------
+    record : Record
+        The record, with the reference if there is one.
+
+    Returns
+    -------
+    FeedbackCheck
+        The answer, its probability of being chance, and the correlations.
+
+    Raises
+    ------
+    CtrlidError
+        If u or y is constant, or there are fewer than 60 valid samples in succession.
+
+    References
+    ----------
+    Caines and Chan, "Feedback between stationary stochastic processes", IEEE Transactions on
+    Automatic Control 20 (1975); Granger, Econometrica 37 (1969).
+
+    Examples
+    --------
+    >>> import ctrlid as cid
+    >>> plant = cid.plants.servo(m=1.0, c=2.0, k=3.0)
+    >>> r = cid.random_binary(2000, amplitude=0.1, hold=50, seed=1)
+    >>> closed = cid.simulate(cid.Loop(plant, cid.PID(kp=5.0), dt=0.01), r, sensor_noise=1e-3)
+    >>> opened = cid.simulate(cid.Loop(plant, dt=0.01), d=r, sensor_noise=1e-3, seed=1)
+    >>> cid.check_feedback(closed).closed_loop, cid.check_feedback(opened).closed_loop
+    (True, False)
+    """
+    if not isinstance(record, Record):
+        raise CtrlidError(f"check_feedback needs a Record; given {type(record).__name__}")
+    longest = max((b - a for a, b in record.segments()), default=0)
+    if longest < 60:
+        raise CtrlidError(f"check_feedback needs 60 valid samples in succession; the longest "
+                          f"stretch has {longest}. Record longer")  # fmt: skip
+    for key in ("u", "y"):
+        if np.ptp(getattr(record, key)[record.valid]) == 0:
+            raise CtrlidError(f"{key} is constant, so nothing tells whether there is feedback")
+    order = int(np.clip(longest // 20, 2, ORDER))
+    signals = {"u": record.u, "y": record.y}
+    if record.r is not None and np.ptp(record.r[record.valid]) > 0:
+        same = np.corrcoef(record.r[record.valid], record.u[record.valid])[0, 1] ** 2
+        if same < 1 - NOTHING:
+            signals["r"] = record.r
+    if "r" in signals and (said := _law(signals, record.valid, order, record.hold == "zoh")):
+        return said
+    e, rows = _left(signals, record.valid, "y", {"y": (1, order), "u": (1, order)})
+    if np.std(e[rows]) <= ROUNDING * np.std(record.y[rows]):
+        return _exact(signals, record.valid, int(record.hold == "zoh"))
+    past = {"u": (1, order + LAGS)} | ({"r": (0, order)} if "r" in signals else {})
+    w, rows = _left(signals, record.valid, "u", past, robust=True)
+    good = np.zeros(record.n, dtype=bool)
+    good[rows] = True
+    if np.std(w[rows]) <= NOTHING * np.std(record.u[rows]):
+        return FeedbackCheck(False, 1.0, np.zeros(0, int), np.zeros(0),
+                             "No feedback found: u follows from its own past alone.")  # fmt: skip
+    test = cross_correlation(w, e, good, "y", lags=LAGS, first=0)
+    p = _chance(test)
+    if record.hold == "foh":
+        later = _chance(cross_correlation(w, e, good, "y", lags=LAGS, first=1))
+        p = later if _at_once(signals, record.valid, w, e, order) else min(1.0, 2 * min(p, later))
+    closed = p < LEVEL
+    if closed:
+        worst = int(np.argmax(np.abs(test.values)))
+        text = (f"Closed loop: u reacts to what is new in y (correlation {test.values[worst]:+.2g} "
+                f"after {test.lags[worst]} samples, chance {p:.1g}). Use estimators that hold "
+                "under feedback: fit_iv or fit_continuous.")  # fmt: skip
+    else:
+        text = (f"No feedback found: what is new in y does not show in u (chance {p:.2g}), as in "
+                "open loop, or with feedback too weak to be seen.")  # fmt: skip
+    return FeedbackCheck(closed, p, test.lags, test.values, text)
+
+
+def _chance(test: Correlation) -> float:
+    """Return the chance of all correlations together, and not less than that of the largest."""
+    largest = float(np.max(np.abs(test.values))) / test.band * stats.norm.ppf(0.995)
+    return float(max(test.p_value, min(1.0, 2 * len(test.lags) * stats.norm.sf(largest))))
+
+
+def _law(
+    signals: dict[str, FloatArray], valid: Any, order: int, held: bool
+) -> FeedbackCheck | None:
+    """Return the answer if a short law of r and y gives u, and none of r alone comes near.
+
+    A held input is no function of y up to now if it was made without it, so there an exact law
+    need only be shorter than any of r alone.
+    """
+
+    def rest(keys: str, n: int) -> float:
+        past = {k: (int(k == "u"), n) for k in keys if n or k != "u"}
+        left, rows = _left(signals, valid, "u", past)
+        return float(np.std(left[rows]))
+
+    least, size = rest("ur", order), float(np.std(signals["u"][valid]))
+    for n in range(LAW // 2 + 1):
+        left = rest("uyr", n)
+        shorter = held and left <= min(NOTHING * size, TELLING * rest("ur", n))
+        if shorter or (least > NOTHING * size and left <= TELLING * least):
+            return FeedbackCheck(
+                True, 0.0, np.zeros(0, int), np.zeros(0),
+                f"Closed loop: r and y, now and {n} samples back, give u nearly exactly, while r "
+                "and past u do not. Use estimators that hold under feedback: fit_iv or "
+                "fit_continuous.",
+            )  # fmt: skip
+    return None
+
+
+def _at_once(
+    signals: dict[str, FloatArray], valid: Any, w: FloatArray, e: FloatArray, order: int
+) -> bool:
+    """Return whether the plant, and not a controller, may tie u to y of the same sample.
+
+    An input that runs straight between the samples moves y within its own period, but a plant
+    goes on in the same direction and further in the next.
+    """
+    ahead = {"y": (2, order + 1), "u": (2, order + 1)}
+    next_e, rows = _left(signals, valid, "y", ahead)
+    now = float(np.mean(w[rows] * e[rows]))
+    next_ = float(np.mean(w[rows - 1] * next_e[rows]))
+    return now * next_ > 0 and abs(next_) > abs(now)
+
+
+def _left(
+    signals: dict[str, FloatArray],
+    valid: Any,
+    target: str,
+    past: dict[str, tuple[int, int]],
+    robust: bool = False,
+) -> tuple[FloatArray, Any]:
+    """Return what a regression on past samples leaves of a signal, and the rows that count.
+
+    Robust means that jumps, of an unknown reference for instance, neither bend the regression nor
+    weigh more in what it leaves than three times the usual remainder.
+    """
+    reach = max(last for _, last in past.values())
+    bad = np.concatenate([[0], np.cumsum(~valid)])
+    rows = np.arange(reach, len(valid))
+    rows = rows[bad[rows + 1] == bad[rows - reach]][:MOST]
+    mean = {k: float(np.mean(v[rows])) for k, v in signals.items()}
+    columns = [np.ones(len(rows))]
+    for key, (first, last) in past.items():
+        columns += [signals[key][rows - k] - mean[key] for k in range(first, last + 1)]
+    table = np.column_stack(columns)
+    size = np.linalg.norm(table, axis=0)
+    table = table[:, size > 0] / size[size > 0]
+    goal = signals[target][rows] - mean[target]
+    left = goal - table @ _solve(table, goal)
+    for _ in range(4 if robust else 0):
+        usual = 3 * 1.4826 * float(np.median(np.abs(left)))
+        if usual <= NOTHING * float(np.std(goal)):
+            break
+        weight = np.sqrt(usual / np.maximum(np.abs(left), usual))
+        beta = _solve(table * weight[:, None], goal * weight)
+        left = goal - table @ beta
+        goal = table @ beta + np.clip(left, -usual, usual)
+    if robust:  # clipped, it is no longer free of the past
+        left = goal - table @ _solve(table, goal)
+    out = np.zeros(len(valid))
+    out[rows] = left
+    return out, rows
+
+
+def _solve(table: FloatArray, goal: FloatArray) -> FloatArray:
+    return np.asarray(linalg.lstsq(table, goal, cond=1e-13, lapack_driver="gelsy")[0], dtype=float)
+
+
+def _order(signals: dict[str, FloatArray], valid: Any, keys: str, target: str, now: int) -> int:
+    """Return how many past samples make a signal an exact function, or a number beyond `LAW`."""
+    for order in range(LAW + 1):
+        past = {k: (now if k == target or target == "y" else 0, order) for k in keys}
+        past = {k: (1 if k == target else first, last) for k, (first, last) in past.items()}
+        left, rows = _left(signals, valid, target, past)
+        if np.std(left[rows]) <= NOTHING * np.std(signals[target][rows]):
+            return order
+    return LAW + 1
+
+
+def _exact(signals: dict[str, FloatArray], valid: Any, now: int) -> FeedbackCheck:
+    """Decide without noise, by the laws that hold exactly."""
+
+    def answer(closed: bool, text: str) -> FeedbackCheck:
+        return FeedbackCheck(closed, 0.0 if closed else 1.0, np.zeros(0, int), np.zeros(0), text)
+
+    if "r" in signals:
+        with_y = _order(signals, valid, "uyr", "u", now)
+        without = _order(signals, valid, "ur", "u", now)
+        if with_y < without:
+            return answer(True, "Closed loop: there is no noise, and u is an exact function of y "
+                          f"and r with {with_y} past samples, while r alone does not give it as "
+                          "simply.")  # fmt: skip
+    order = _order(signals, valid, "yu", "y", now)
+    if 0 < order <= LAW and _unstable(signals, valid, order, now):
+        return answer(True, "Closed loop: there is no noise, and the plant is unstable, yet y "
+                      "stays bounded.")  # fmt: skip
+    return answer(False, "No feedback found: there is no noise in y that could show in u, and no "
+                  "law that needs y. Without noise this is no proof of an open loop.")  # fmt: skip
+
+
+def _unstable(signals: dict[str, FloatArray], valid: Any, order: int, now: int) -> bool:
+    """Return whether the exact difference equation has a pole clearly outside the unit circle."""
+    reach = order
+    bad = np.concatenate([[0], np.cumsum(~valid)])
+    rows = np.arange(reach, len(valid))
+    rows = rows[bad[rows + 1] == bad[rows - reach]][:MOST]
+    y, u = signals["y"], signals["u"]
+    columns = [y[rows - k] - y[rows[0]] for k in range(1, order + 1)]
+    columns += [u[rows - k] - u[rows[0]] for k in range(now, order + 1)]
+    table = np.column_stack([*columns, np.ones(len(rows))])
+    size = np.linalg.norm(table, axis=0)
+    beta = _solve(table / size, y[rows] - y[rows[0]]) / size
+    poles = np.roots(np.concatenate([[1.0], -beta[:order]]))
+    return bool(np.max(np.abs(poles)) > 1 + 1e-4)

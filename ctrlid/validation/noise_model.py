@@ -1,0 +1,85 @@
+"""The noise of a model that carries none: which colour its equation errors have."""
+
+import numpy as np
+from scipy import optimize, signal
+
+from ..physics.equations import Array
+
+SAMPLES = 20_000  # enough to tell the colour
+
+
+def whiten(equation_errors: Array, segments: list[tuple[int, int]], noise: Array) -> Array:
+    r"""Return white errors from equation errors of a known colour.
+
+    .. math:: \varepsilon = \frac{A(q) y - B(q) u}{C(q)}
+
+    Parameters
+    ----------
+    equation_errors : ndarray, shape (n,)
+        ``A y - B u``, less its mean.
+    segments : list of (int, int)
+        Stretches over which the filter runs, each from rest.
+    noise : ndarray
+        Monic polynomial C in falling powers of q, with its roots inside the unit circle.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        The errors; zero outside the segments.
+    """
+    white = np.zeros(len(equation_errors))
+    for start, stop in segments:
+        white[start:stop] = signal.lfilter([1.0], noise, equation_errors[start:stop])
+    return white
+
+
+def noise_polynomial(
+    equation_errors: Array, segments: list[tuple[int, int]], den: Array
+) -> Array:  # fmt: skip
+    """Return the polynomial C of a model's order that leaves the smallest one-step errors.
+
+    Noise of the sensor alone makes C the denominator A with its unstable roots reflected into the
+    unit circle, white equation errors make it one; the search starts from there.
+
+    Parameters
+    ----------
+    equation_errors : ndarray, shape (n,)
+        ``A y - B u``, less its mean.
+    segments : list of (int, int)
+        Stretches that count.
+    den : ndarray
+        Monic denominator A in falling powers of q.
+
+    Returns
+    -------
+    ndarray
+        C, monic and of the same degree.
+
+    References
+    ----------
+    Åström, *Introduction to Stochastic Control Theory*, chapter 4 (spectral factorization).
+    """
+    order = len(den) - 1
+    if order == 0:
+        return np.ones(1)
+    head = [(a, min(b, a + SAMPLES)) for a, b in segments][:10]
+    size = max(float(np.std(equation_errors)), 1e-300)
+
+    def errors(tail: Array) -> Array:
+        white = whiten(equation_errors, head, _stable(np.concatenate([[1.0], tail])))
+        return np.asarray(np.concatenate([white[a:b] for a, b in head]) / size, dtype=float)
+
+    starts = [_stable(den), np.eye(1, order + 1)[0]]
+    best = min(starts, key=lambda c: float(np.sum(errors(c[1:]) ** 2)))
+    found = optimize.least_squares(errors, best[1:], x_scale="jac", max_nfev=40)
+    return _stable(np.concatenate([[1.0], found.x]))
+
+
+def _stable(polynomial: Array) -> Array:
+    """Reflect roots into the unit circle, and keep a hair's breadth from it."""
+    roots = np.roots(polynomial).astype(complex)
+    outside = np.abs(roots) > 1
+    roots[outside] = 1 / roots[outside].conj()
+    edge = np.abs(roots) > 0.9995
+    roots[edge] *= 0.9995 / np.abs(roots[edge])
+    return np.asarray(np.real(np.poly(roots)), dtype=float)

@@ -1,0 +1,307 @@
+"""select_order(): poles, numerator coefficients and delay, held against one long regression."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from numbers import Integral
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy import linalg, stats
+
+from .._base.errors import CtrlidError
+from .._base.text import Printed
+from ..data.record import Record
+
+FloatArray = npt.NDArray[np.float64]
+
+LONGEST = 60  # lags of the long regression
+ROWS = 30_000  # that it uses at most
+SHARE = 2 / 3  # of the record that is fitted; the rest judges
+ITERATIONS = 20
+COSTS = 0.1  # of the one-step error: a difference that says something is wrong
+WHISPER = 1e-6  # of y's spread, added as noise: without any, a long regression has no one answer
+
+
+@dataclass(frozen=True, eq=False)
+class OrderRow:
+    """One structure and how it fares.
+
+    Parameters
+    ----------
+    na, nb, nk : int
+        Poles, numerator coefficients, delay in samples.
+    misfit : float
+        Chi-square distance to the long regression [1].
+    p_value : float
+        Probability of such a distance by chance if the structure is right.
+    bic : float
+        Misfit plus a price for each coefficient; the smallest is best.
+    held_out : float
+        Ratio: one-step error on the part of the record that was not fitted, over that of the long
+        regression there.
+    values : ndarray
+        Coefficients ``a1 .. a_na, b1 .. b_nb``.
+    """
+
+    na: int
+    nb: int
+    nk: int
+    misfit: float
+    p_value: float
+    bic: float
+    held_out: float
+    values: FloatArray
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class OrderChoice(Printed):
+    """What `select_order` found.
+
+    Parameters
+    ----------
+    na, nb, nk : int
+        The structure chosen, as `fit_arx` and `fit_iv` take it.
+    rows : tuple of OrderRow
+        All structures, best first.
+    length : int
+        Lags of the long regression.
+    text : str
+        The choice in words.
+    """
+
+    na: int
+    nb: int
+    nk: int
+    rows: tuple[OrderRow, ...]
+    length: int
+    text: str
+
+    def __str__(self) -> str:
+        lines = ["   na  nb  nk      misfit   chance         BIC   held-out error"]
+        lines += [
+            f"  {row.na:>3} {row.nb:>3} {row.nk:>3} {row.misfit:>11.4g} {row.p_value:>8.2g} "
+            f"{row.bic:>11.5g} {row.held_out:>16.4f}"
+            for row in self.rows[:12]
+        ]
+        if len(self.rows) > 12:
+            lines.append(f"  ... and {len(self.rows) - 12} more")
+        return "\n".join([*lines, self.text])
+
+
+def select_order(
+    record: Record,
+    na: Iterable[int] = range(1, 5),
+    nb: Iterable[int] = range(1, 4),
+    nk: Iterable[int] = range(1, 4),
+) -> OrderChoice:
+    r"""Choose the orders of a difference equation, in open or closed loop, whatever the noise.
+
+    .. math:: \hat A_n y = \hat B_n u + e, \qquad
+        \min_{A, B} \; r^T (T P T^T)^{-1} r, \quad r = A \hat B_n - B \hat A_n
+
+    Comparing the residuals of short least-squares fits goes wrong here: with sensor noise they ask
+    for ever more coefficients, which describe the noise. So one long regression takes plant and
+    noise together; it is right under feedback too. Then each structure B / A is held against it:
+    r is zero where both have the same transfer function, whatever the noise model, and the
+    covariance P of the long regression says how much of r is chance. The criterion is that
+    distance plus log N for each coefficient, where a distance that even the richest structure
+    cannot bring down to chance (a plant that is not quite linear) counts as the unit. The last
+    third of the record is not fitted and shows what each structure costs in prediction.
+
+    Parameters
+    ----------
+    record : Record
+        The record; no reference is needed.
+    na, nb, nk : iterable of int, optional
+        Numbers of poles, of numerator coefficients and delays to try.
+
+    Returns
+    -------
+    OrderChoice
+        The structure, the table and words.
+
+    Raises
+    ------
+    CtrlidError
+        If orders are not positive, the record is too short for them, or u or y is constant.
+
+    References
+    ----------
+    Galrinho, Rojas and Hjalmarsson, "Parametric identification using weighted null-space fitting",
+    IEEE Transactions on Automatic Control 64 (2019); Schwarz, Annals of Statistics 6 (1978).
+
+    Examples
+    --------
+    >>> import control as ct
+    >>> import ctrlid as cid
+    >>> P = ct.tf([-6.5], [1, 0, -1600])
+    >>> C = cid.design_lead(P, crossover=100, phase_margin=50)
+    >>> C = ct.sample_system(ct.ss(C), 0.004, "tustin")
+    >>> r = cid.random_binary(8000, amplitude=1e-4, hold=8, seed=1)
+    >>> record = cid.simulate(cid.Loop(P, C, dt=0.004), r, sensor_noise=2e-6, seed=2)
+    >>> choice = cid.select_order(record)
+    >>> choice.na, choice.nb, choice.nk
+    (2, 2, 1)
+    """
+    if not isinstance(record, Record):
+        raise CtrlidError(f"select_order needs a Record; given {type(record).__name__}")
+    grids = [_whole(name, values) for name, values in (("na", na), ("nb", nb), ("nk", nk))]
+    most = max(grids[0]) + max(grids[1]) + max(grids[2])
+    cut = int(SHARE * record.n)
+    if record.valid.any():
+        for key in ("u", "y"):
+            if np.ptp(getattr(record, key)[record.valid]) == 0:
+                raise CtrlidError(f"{key} is constant: no structure shows. Excite the loop")
+    length = _length(record, cut, most)
+    long = _regress(record, 0, cut, length)
+    judge = _rows(record, cut, record.n, length)
+    table, goal = _table(record, judge, length)
+    reference = float(np.std(goal - table @ long.eta)) if len(judge) > 10 else np.nan
+    found = []
+    for a in grids[0]:
+        for b in grids[1]:
+            for d in grids[2]:
+                theta, misfit, eta = _reduce(long, a, b, d)
+                left = goal - table[:, :-1] @ eta
+                error = float(np.std(left)) / reference if len(judge) > 10 else np.nan
+                found.append((a, b, d, misfit, length - a - b, error, theta))
+    unit = max(1.0, min(misfit / free for *_, misfit, free, _, _ in found))
+    rows = sorted(
+        (OrderRow(a, b, d, misfit, float(stats.chi2.sf(misfit / unit, free)),
+                  misfit / unit + (a + b) * np.log(long.rows), error, theta)
+         for a, b, d, misfit, free, error, theta in found),
+        key=lambda row: row.bic,
+    )  # fmt: skip
+    best = rows[0]
+    return OrderChoice(best.na, best.nb, best.nk, tuple(rows), length,
+                       _words(rows, unit, length))  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class _Long:
+    """The long regression: coefficients of A, then of B, then a constant; covariance without it."""
+
+    eta: FloatArray
+    covariance: FloatArray
+    variance: float
+    rows: int
+    length: int
+
+
+def _whole(name: str, values: Any) -> list[int]:
+    listed = list(values) if isinstance(values, Iterable) else [values]
+    if not listed or not all(isinstance(v, Integral) and int(v) >= 1 for v in listed):
+        raise CtrlidError(f"{name} takes whole numbers from 1, as range(1, 5); given {listed}")
+    return sorted({int(v) for v in listed})
+
+
+def _rows(record: Record, start: int, stop: int, length: int) -> Any:
+    """Return the samples whose past counts, not more than are needed."""
+    bad = np.concatenate([[0], np.cumsum(~record.valid)])
+    rows = np.arange(start + length, stop)
+    return rows[bad[rows + 1] == bad[rows - length]][:ROWS]
+
+
+def _table(record: Record, rows: Any, length: int) -> tuple[FloatArray, FloatArray]:
+    y, u = (s - np.mean(s[record.valid]) for s in (record.y, record.u))
+    spread = float(np.std(y[record.valid]))
+    y = y + WHISPER * spread * np.random.default_rng(1).standard_normal(len(y))
+    past = [-y[rows - k] for k in range(1, length + 1)] + [
+        u[rows - k] for k in range(1, length + 1)
+    ]
+    return np.column_stack([*past, np.ones(len(rows))]), y[rows]
+
+
+def _regress(record: Record, start: int, stop: int, length: int, reach: int = 0) -> _Long:
+    rows = _rows(record, start, stop, max(length, reach))
+    if len(rows) < 4 * length + 20:
+        raise CtrlidError(f"select_order needs {4 * length + 20} rows for {length} lags; the first "
+                          f"two thirds have {len(rows)}. Record longer, or try fewer "
+                          "orders")  # fmt: skip
+    table, goal = _table(record, rows, length)
+    size = np.maximum(np.linalg.norm(table, axis=0), 1e-300)
+    _, values, vt = np.linalg.svd(np.linalg.qr(table / size, mode="r"))
+    values = np.maximum(values, 1e-13 * values[0])
+    inverse = (vt.T / values**2) @ vt / np.outer(size, size)
+    eta = inverse @ (table.T @ goal)
+    eta = eta + inverse @ (table.T @ (goal - table @ eta))  # once refined
+    left = goal - table @ eta
+    variance = float(left @ left) / (len(rows) - table.shape[1])
+    return _Long(eta, variance * inverse[:-1, :-1], variance, len(rows), length)
+
+
+def _length(record: Record, cut: int, most: int) -> int:
+    """Choose the lags of the long regression by the Bayesian criterion, with room to spare."""
+    room = len(_rows(record, 0, cut, 1))
+    longest = min(LONGEST, room // 12)
+    if longest < most + 2:
+        raise CtrlidError(f"select_order needs about {12 * (most + 2) * 3 // 2} samples in "
+                          f"succession for these orders; given {record.n}")  # fmt: skip
+    scores = {}
+    for n in sorted({most + 2, 10, 15, 20, 30, 40, longest}):
+        if most + 2 <= n <= longest:
+            long = _regress(record, 0, cut, n, reach=longest)  # all on the same rows
+            scores[n] = long.rows * np.log(long.variance) + 2 * n * np.log(long.rows)
+    best = min(scores, key=lambda n: scores[n])
+    return min(longest, max(best + 5, most + 4))
+
+
+def _shift(p: FloatArray, k: int, length: int) -> FloatArray:
+    """Return coefficients of lags 1 to length of a polynomial from lag 0, delayed by k."""
+    out = np.zeros(length + 1)
+    out[k : length + 1] = p[: max(length + 1 - k, 0)]
+    return out[1:]
+
+
+def _reduce(long: _Long, na: int, nb: int, nk: int) -> tuple[FloatArray, float, FloatArray]:
+    """Return the coefficients of a structure, its distance, and the long regression bent to it."""
+    n = long.length
+    A = np.concatenate([[1.0], long.eta[:n]])
+    B = np.concatenate([[0.0], long.eta[n : 2 * n]])
+    Q = np.column_stack([_shift(B, i, n) for i in range(1, na + 1)]
+                        + [-_shift(A, nk + j, n) for j in range(nb)])  # fmt: skip
+    start = _shift(B, 0, n)
+    theta, misfit, bent = np.zeros(na + nb), np.inf, long.eta[: 2 * n]
+    scale = np.sqrt(np.diag(long.covariance))
+    half = np.linalg.cholesky(long.covariance / np.outer(scale, scale) + 1e-12 * np.eye(2 * n))
+    half = scale[:, None] * half
+    for _ in range(ITERATIONS):
+        a = np.concatenate([[1.0], theta[:na], np.zeros(n - na)])
+        b = np.concatenate([np.zeros(nk), theta[na:], np.zeros(max(n + 1 - nk - nb, 0))])
+        slope = np.hstack([linalg.toeplitz(np.concatenate([[0.0], -b[1:n]]), np.zeros(n)),
+                           linalg.toeplitz(a[:n], np.zeros(n))])  # fmt: skip
+        root = np.asarray(np.linalg.qr((slope @ half).T, mode="r"), dtype=float).T
+        weighted = linalg.solve_triangular(root, np.column_stack([Q, start]), lower=True)
+        size = np.maximum(np.linalg.norm(weighted[:, :-1], axis=0), 1e-300)
+        new = -np.linalg.lstsq(weighted[:, :-1] / size, weighted[:, -1], rcond=1e-12)[0] / size
+        rest = weighted[:, -1] + weighted[:, :-1] @ new
+        change = float(np.max(np.abs(new - theta) * size))
+        theta, misfit = new, float(rest @ rest)
+        bent = long.eta[: 2 * n] - half @ (
+            (slope @ half).T @ linalg.solve_triangular(root, rest, lower=True, trans="T")
+        )
+        if change < 1e-3:
+            break
+    return theta, misfit, bent
+
+
+def _words(rows: list[OrderRow], unit: float, length: int) -> str:
+    best = rows[0]
+    text = (f"Chosen: na={best.na}, nb={best.nb}, nk={best.nk}, held against {length} lags of "
+            f"y and u; its one-step error on the last third is {best.held_out:.3f} times that of "
+            "the long regression.")  # fmt: skip
+    if len(rows) > 1:
+        ahead = rows[1].bic - best.bic
+        text += (f" Next: na={rows[1].na}, nb={rows[1].nb}, nk={rows[1].nk}, behind by {ahead:.3g}"
+                 f"{', NOT A CLEAR DECISION' if ahead < 6 else ''}.")  # fmt: skip
+    if best.held_out < 1 - COSTS:
+        text += (" THE RECORD DECIDES LITTLE: the long regression predicts worse than the short "
+                 "one, so u is too poor or too smooth, or the record too short. Trust no order "
+                 "here.")  # fmt: skip
+    elif best.held_out > 1 + COSTS:
+        text += " THE STRUCTURE COSTS PREDICTION: try higher orders or longer delays."
+    if unit > 2:
+        text += (f" NO STRUCTURE FITS TO CHANCE (misfit {unit:.2g} times what noise leaves): more "
+                 "poles, a nonlinearity, or changes during the record.")  # fmt: skip
+    return text

@@ -1,0 +1,394 @@
+"""audit(): what a colleague would say about a record before anything is fitted to it."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from .._base.errors import CtrlidError
+from .._base.text import Printed
+from ..data.record import SIGNALS, Record
+from ..loop.loop import Loop
+from . import signal_defects as defects
+from .controller_check import check_controller
+
+FEW = 50  # valid samples below which no fit says much
+STRETCH = 20  # in succession
+COARSE = 0.3  # quantisation step over spread that a fit of y would notice
+FEW_CHANGES = 4
+SURE = 2e-4  # chance of a drift that is still chance
+OWN = 0.01  # of u's variance that does not come from y: above, something is added to u
+ELSEWHERE = 100.0  # times where the loop rests, and y is something else or in other units
+LINE = 1e-5  # of the largest spectral line, above which there is another one
+
+
+@dataclass(frozen=True)
+class AuditFinding:
+    """One thing to know about a record.
+
+    Parameters
+    ----------
+    kind : str
+        ``"saturation"``, ``"quantization"``, ``"repeats"``, ``"dropped samples"``, ``"outliers"``,
+        ``"drift"``, ``"offset"``, ``"too little excitation"``, ``"constant signal"``,
+        ``"too few samples"``, ``"controller"`` or ``"operating point"``.
+    channel : str
+        ``"r"``, ``"u"`` or ``"y"``; empty where it concerns the whole record.
+    text : str
+        The finding in words, with what to do about it.
+    size : float
+        How large it is: a share of the samples (saturation, dropped samples, outliers), a ratio to
+        the signal's spread (quantization, drift, offset), a number (repeats, changes, samples), the
+        share of u that the controller does not explain, or the ratio of y to where the loop rests.
+    where : (int, int)
+        First sample concerned and the one after the last.
+    harmful : bool
+        Whether a fit or a diagnosis goes wrong if nothing is done.
+    """
+
+    kind: str
+    channel: str
+    text: str
+    size: float
+    where: tuple[int, int]
+    harmful: bool = False
+
+
+@dataclass(frozen=True, repr=False)
+class Audit(Printed):
+    """What `audit` found.
+
+    Parameters
+    ----------
+    findings : tuple of AuditFinding
+        Harmful ones first.
+    quantum : mapping of str to float
+        Quantisation step by signal [its unit], 0 where there is none.
+    repeats : (int, int)
+        Period of the reference in samples and number of whole periods; (0, 0) if it has none.
+    saturated : mapping of str to (float, float, float, float)
+        By signal: share of the samples at its lower and at its upper limit, and the two limits.
+    """
+
+    findings: tuple[AuditFinding, ...]
+    quantum: Mapping[str, float]
+    repeats: tuple[int, int]
+    saturated: Mapping[str, tuple[float, float, float, float]]
+
+    @property
+    def harmful(self) -> tuple[AuditFinding, ...]:
+        """The findings that need something done."""
+        return tuple(f for f in self.findings if f.harmful)
+
+    def __getitem__(self, kind: str) -> tuple[AuditFinding, ...]:
+        return tuple(f for f in self.findings if f.kind == kind)
+
+    def __str__(self) -> str:
+        if not self.findings:
+            return "Audit: nothing to say against this record."
+        bad = len(self.harmful)
+        rows = [f"Audit: {_count(len(self.findings))}, {bad or 'none'} harmful"]
+        for f in self.findings:
+            kind = f.kind.upper() if f.harmful else f.kind
+            rows.append(f"  {kind}{f' of {f.channel}' if f.channel else ''}: {f.text}")
+        return "\n".join(rows)
+
+
+def audit(record: Record, loop: Loop | None = None) -> Audit:
+    """Look a record over before any fit: limits, steps, repeats, gaps, spikes, drift, excitation.
+
+    Nothing is assumed about the plant. Samples that are marked as not valid are left out, and a
+    bound is always one of chance for a record of this length, or a ratio to the signal's own
+    size.
+
+    Parameters
+    ----------
+    record : Record
+        The record.
+    loop : Loop, optional
+        The loop it comes from. If its controller is digital and r was logged, it is also checked
+        whether the logged u is what this controller computes, and if not, why.
+
+    Returns
+    -------
+    Audit
+        The findings, as data and as text.
+
+    Raises
+    ------
+    CtrlidError
+        If something other than a record and a loop is given.
+
+    References
+    ----------
+    Ljung, *System Identification*, 2nd edition, chapter 14 (preprocessing data).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import ctrlid as cid
+    >>> plant = cid.plants.servo(m=1.0, c=2.0, k=3.0)
+    >>> loop = cid.Loop(plant, cid.PID(kp=5.0, kd=0.1), dt=0.01)
+    >>> r = cid.random_binary(2000, amplitude=0.1, hold=50, seed=1)
+    >>> record = cid.simulate(loop, r, sensor_noise=1e-4, seed=2)
+    >>> print(cid.audit(record, loop))
+    Audit: 1 finding, none harmful
+      controller of u: the logged u is what the stated controller computes from r and y.
+    >>> stuck = cid.Record(r=r, u=record.u, y=np.minimum(record.y, 0.08), dt=0.01)
+    >>> [f.kind for f in cid.audit(stuck).harmful]
+    ['saturation']
+    """
+    if not isinstance(record, Record) or not (loop is None or isinstance(loop, Loop)):
+        raise CtrlidError(
+            "audit needs a Record and, if you like, its Loop; given "
+            f"{type(record).__name__} and {type(loop).__name__}. Audit several records one by one"
+        )
+    count = int(np.count_nonzero(record.valid))
+    if count < 2:
+        few = AuditFinding("too few samples", "", f"{count} samples count", count, (0, record.n),
+                           harmful=True)  # fmt: skip
+        still = dict.fromkeys(SIGNALS, (0.0, 0.0, 0.0, 0.0))
+        return Audit((few,), MappingProxyType(dict.fromkeys(SIGNALS, 0.0)), (0, 0),
+                     MappingProxyType(still))  # fmt: skip
+    look = _Look(record, () if loop is None else loop.input_limits)
+    findings = [
+        *look.length(), *look.constant(), *look.limits(), *look.steps(), *look.gaps(),
+        *look.outliers(), *look.wander(), *look.repetition(),
+    ]  # fmt: skip
+    injected = False
+    if loop is not None:
+        findings += look.place(loop)
+        for kind, text, size, harmful in check_controller(loop, record):
+            injected = injected or kind == "injected"
+            findings.append(AuditFinding("controller", "u", text, size, look.whole, harmful))
+    findings += look.excitation(injected)
+    findings.sort(key=lambda f: not f.harmful)
+    return Audit(tuple(findings), MappingProxyType(look.quantum), look.repeats,
+                 MappingProxyType(look.saturated))  # fmt: skip
+
+
+class _Look:
+    """The looks at one record; what one finds, the next ones use."""
+
+    def __init__(self, record: Record, limits: tuple[float, ...]) -> None:
+        self.record, self.valid, self.stated = record, record.valid, limits
+        self.signals = {k: v for k in SIGNALS if (v := getattr(record, k)) is not None}
+        self.whole = (0, record.n)
+        self.quantum = dict.fromkeys(SIGNALS, 0.0) | {
+            k: defects.grid_step(v[self.valid])
+            for k, v in self.signals.items()
+            if k == "y" or not defects.held(v[self.valid])
+        }
+        self.saturated = dict.fromkeys(SIGNALS, (0.0, 0.0, 0.0, 0.0))
+        self.at_limit = self.repeated = np.zeros(record.n, dtype=bool)
+        self.repeats = (0, 0)
+
+    def show(self, key: str, value: float) -> str:
+        """Write a value of a signal with its unit."""
+        unit = self.record.units.get(key, "")
+        return f"{value:.4g}{'' if unit in ('', '1') else ' ' + unit}"
+
+    def spread(self, key: str) -> float:
+        return float(np.std(self.signals[key][self.valid]))
+
+    def length(self) -> list[AuditFinding]:
+        count = int(np.count_nonzero(self.valid))
+        longest = max(b - a for a, b in self.record.segments())
+        if count >= FEW and longest >= STRETCH:
+            return []
+        text = (f"{count} samples count, at most {longest} in succession; a fit of a few "
+                f"coefficients needs {FEW} and more. Record longer.")  # fmt: skip
+        return [AuditFinding("too few samples", "", text, count, self.whole, harmful=True)]
+
+    def constant(self) -> list[AuditFinding]:
+        out = []
+        driver = self.signals.get("r", self.signals["u"])[self.valid]
+        for key in ("u", "y"):
+            v = self.signals[key][self.valid]
+            value, long = float(v[0]), ""
+            if np.ptp(v) > defects.hair(v):
+                share, value = defects.stuck(v, driver) if key == "y" else (0.0, 0.0)
+                if not share:
+                    continue
+                long = f" for {100 * share:.4g} % of the samples, whatever moves it"
+            text = f"{key} stays at {self.show(key, value)}{long}: nothing can be learnt from it."
+            kind = "constant signal"
+            out.append(AuditFinding(kind, key, text, 0.0, self.whole, harmful=True))
+        return out
+
+    def limits(self) -> list[AuditFinding]:
+        out = []
+        for key in ("u", "y"):
+            v = self.signals[key]
+            others = [s for k, s in self.signals.items() if k != key]
+            shares, values, mask = [], [], np.zeros(len(v), dtype=bool)
+            for side in (-1, 1):
+                at, limit = defects.clipped(v, self.valid, others, self.quantum[key], side,
+                                            self.record.r if key == "y" else None)  # fmt: skip
+                mask |= at
+                shares.append(float(np.mean(at[self.valid])))
+                values.append(limit)
+            self.saturated[key] = (shares[0], shares[1], values[0], values[1])
+            if not mask.any():
+                continue
+            ends = " and ".join(
+                f"{self.show(key, value)} for {100 * share:.2g} % of the samples"
+                for share, value in zip(shares, values, strict=True)
+                if share
+            )
+            if key == "y":
+                self.at_limit = mask
+                cure = ("the sensor, or a stop, hides what y does there. Mark these samples "
+                        "with valid=, with some before and after.")  # fmt: skip
+            else:
+                reached = [v for share, v in zip(shares, values, strict=True) if share]
+                known = all(np.isclose(v, self.stated, rtol=1e-3).any() for v in reached)
+                tell = "its limits are known" if known else "tell the loop with input_limits="
+                cure = ("a limiter at work. Fits from u to y stand if the logged u is the "
+                        f"limited one; {tell}.")  # fmt: skip
+            where = np.flatnonzero(mask)
+            out.append(AuditFinding("saturation", key, f"{key} sits exactly at {ends}: {cure}",
+                                    float(np.mean(mask[self.valid])),
+                                    (int(where[0]), int(where[-1]) + 1), key == "y"))  # fmt: skip
+        return out
+
+    def steps(self) -> list[AuditFinding]:
+        out = []
+        for key in ("u", "y"):
+            step, spread = self.quantum[key], self.spread(key)
+            # Rounding far below everything else is how numbers are written, and no news.
+            if step < 1e-3 * spread or not spread:
+                continue
+            ratio = step / spread
+            text = (
+                f"{key} moves in steps of {self.show(key, step)}, {100 * ratio:.2g} % of its spread"
+            )
+            bad = key == "y" and ratio > COARSE
+            text += ": too coarse to follow the motion. Excite more strongly." if bad else "."
+            out.append(AuditFinding("quantization", key, text, ratio, self.whole, bad))
+        return out
+
+    def gaps(self) -> list[AuditFinding]:
+        y, u = self.record.y, self.record.u
+        mask = defects.repeated(y, self.valid, self.quantum["y"], self.at_limit)
+        self.repeated = mask
+        if not mask.any():
+            return []
+        first, stop = defects.runs(mask)
+        share = float(np.mean(mask[self.valid]))
+        with_u = np.mean([np.ptp(u[a - 1 : b]) == 0 for a, b in zip(first, stop, strict=True)])
+        also = with_u > 0.8 and np.mean(np.diff(u) == 0) < 0.5
+        what = "y and u repeat their" if also else "y repeats its"
+        text = (f"{what} last value for {mask.sum()} samples in {len(first)} places, though "
+                "the neighbours move: ")  # fmt: skip
+        every = np.diff(first)
+        usual = int(np.median(every)) if len(every) > 10 else 0
+        if share > 0.3 and np.mean(every == usual) > 0.9:
+            text += (f"y is refreshed every {usual} samples only. Decimate by {usual} with "
+                     "antialias=False.")  # fmt: skip
+        else:
+            text += "samples were lost and filled in. Mark them with valid=."
+        return [AuditFinding("dropped samples", "y", text, share,
+                             (int(first[0]), int(stop[-1])), harmful=True)]  # fmt: skip
+
+    def outliers(self) -> list[AuditFinding]:
+        height = defects.spikes(self.record.y, self.valid, self.quantum["y"])
+        at = np.flatnonzero(np.where(self.repeated, 0.0, height))
+        if not at.size:
+            return []
+        worst = at[np.argmax(np.abs(height[at]))]
+        text = (f"{at.size} isolated spikes of y, the largest {self.show('y', height[worst])} at "
+                f"sample {worst}: no plant moves there and back within a sample. Mark them with "
+                "valid=.")  # fmt: skip
+        return [AuditFinding("outliers", "y", text, at.size / self.record.n,
+                             (int(at[0]), int(at[-1]) + 1), harmful=True)]  # fmt: skip
+
+    def wander(self) -> list[AuditFinding]:
+        y, u = self.record.y[self.valid], self.record.u[self.valid]
+        r = None if self.record.r is None else self.record.r[self.valid]
+        causes = [u, np.cumsum(u - np.mean(u))] if r is None else [r]
+        change, scatter, p = defects.drift(y, causes)
+        out = []
+        if p < SURE and change > scatter > 0:
+            ratio = change / scatter
+            text = (f"y drifts by {self.show('y', change)} over the record, {ratio:.2g} times its "
+                    f"scatter, and {'u' if r is None else 'r'} does not explain it. Cut the record "
+                    "into parts and give them as a list: each has its own intercept.")  # fmt: skip
+            out.append(AuditFinding("drift", "y", text, ratio, self.whole, ratio > 2))
+        if r is not None:
+            mean, sd = float(np.mean(y - r)), float(np.std(y - r))
+            if abs(mean) > 0.5 * sd and abs(mean) > 1e-9 * float(np.max(np.abs(y))):
+                text = f"y is on average {self.show('y', mean)} away from r; no integral action?"
+                out.append(AuditFinding("offset", "y", text, abs(mean) / max(sd, 1e-300),
+                                        self.whole))  # fmt: skip
+        return out
+
+    def place(self, loop: Loop) -> list[AuditFinding]:
+        assert loop.at is not None
+        y, rest = np.abs(self.signals["y"][self.valid]), abs(loop.at.output)
+        ratio = float(np.median(y)) / rest if rest else 0.0
+        if ratio < ELSEWHERE or y.min() < math.sqrt(ELSEWHERE) * rest:
+            return []
+        text = (f"y is {ratio:.3g} times as large as where the loop rests, {loop.at.output:.4g}: "
+                "logged in other units than the plant counts in, or u and y swapped? Scale or swap "
+                "the channels, or give the loop the operating point of this record.")  # fmt: skip
+        return [AuditFinding("operating point", "y", text, ratio, self.whole, harmful=True)]
+
+    def repetition(self) -> list[AuditFinding]:
+        r = self.record.r
+        found = defects.period(r) if r is not None else 0
+        if not found:
+            return []
+        times = self.record.n // found
+        self.repeats = (found, times)
+        text = (f"the reference repeats itself every {found} samples, "
+                f"{self.record.n / found:.3g} times in all: averaging "
+                "over the periods separates noise from response.")  # fmt: skip
+        return [AuditFinding("repeats", "r", text, times, self.whole)]
+
+    def excitation(self, injected: bool) -> list[AuditFinding]:
+        key = "u" if self.record.r is None else "r"
+        v = self.signals[key]
+        moves = (np.abs(np.diff(v)) > defects.hair(v)) & self.valid[1:] & self.valid[:-1]
+        changes = int(np.count_nonzero(moves))
+        kind, size = "too little excitation", float(changes)
+        if changes == 0:
+            if injected or key == "u":  # a constant u is said already
+                return []
+            text = "r does not change while the record counts, and "
+            share = defects.beyond_law(self.record.u, self.record.y, self.valid)
+            if share > OWN:
+                text += (f"{100 * share:.2g} % of u is no linear function of y: a signal added to "
+                         "u, or noise of the input, is all that excites the loop.")  # fmt: skip
+            else:
+                text += ("u follows from y: there is noise only, of which no fit can learn the "
+                         "plant. Vary the reference (random_binary) or add a signal to "
+                         "u.")  # fmt: skip
+            return [AuditFinding(kind, key, text, size, self.whole, share <= OWN)]
+        if changes < FEW_CHANGES:
+            text = (f"{key} changes {('once', 'twice', 'three times')[changes - 1]} only: little "
+                    "to average over. Use many steps, as random_binary gives.")  # fmt: skip
+            return [AuditFinding(kind, key, text, size, self.whole)]
+        a, b = max(self.record.segments(), key=lambda part: part[1] - part[0])
+        if changes > 0.5 * self.record.n and _lines(v[a:b]) == 1 and not injected:
+            text = (f"{key} is a single sine, which determines two coefficients and no more. Use "
+                    "several frequencies, as multisine gives.")  # fmt: skip
+            return [AuditFinding(kind, key, text, 2.0, self.whole, harmful=True)]
+        return []
+
+
+def _count(n: int) -> str:
+    return f"{n} finding{'s' if n != 1 else ''}"
+
+
+def _lines(v: Any) -> int:
+    """Return the number of separate spectral lines of a signal, or 0 if it has a broad spectrum."""
+    if len(v) < FEW:
+        return 0
+    window = np.blackman(len(v))
+    power = np.abs(np.fft.rfft((v - np.average(v, weights=window)) * window)) ** 2
+    first, stop = defects.runs(power > LINE * power.max())
+    return len(first) if np.all(stop - first <= 10) else 0

@@ -1,0 +1,139 @@
+"""What a sweep over sampling periods found, as a table and in words."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from .._base.errors import CtrlidError
+from .._base.text import Printed, listing, number
+from ..data.record import Record
+
+FloatArray = npt.NDArray[np.float64]
+
+FAR = 10.0  # a disagreement beyond which it no longer matters how large it is
+
+
+@dataclass(frozen=True, eq=False)
+class SamplingRow:
+    """One estimator at one sampling period.
+
+    Parameters
+    ----------
+    estimator : str
+        Its name.
+    factor : int
+        Whole factor by which the record was slowed down.
+    period : float
+        Sampling period [s].
+    n : int
+        Samples that counted.
+    input_between : str
+        What became of u between the slow samples: ``"as recorded"``, ``"filtered"`` or ``"mean"``.
+    poles : ndarray of complex
+        Poles of the plant in s, by rising real part [rad/s]; empty if the fit failed.
+    standard_errors : ndarray
+        Their standard errors [rad/s], as the estimator states them.
+    white : bool or None
+        Whether the one-step errors are white, or less than a twentieth of their variance is not;
+        None if that could not be tested.
+    independent : bool or None
+        The same for their independence of past u and r.
+    active : tuple of str
+        Inequalities on which the estimate sits.
+    deviation : float
+        Ratio: largest distance of a pole to that of the whole table, over the largest of those,
+        printed as "differs".
+    failure : str
+        Why there is no fit; empty if there is one.
+    notes : tuple of str
+        What the estimator warned of.
+    """
+
+    estimator: str
+    factor: int
+    period: float
+    n: int
+    input_between: str
+    poles: Any
+    standard_errors: FloatArray
+    white: bool | None = None
+    independent: bool | None = None
+    active: tuple[str, ...] = ()
+    deviation: float = np.inf
+    failure: str = ""
+    notes: tuple[str, ...] = ()
+
+    @property
+    def pole_times_period(self) -> FloatArray:
+        """The poles' absolute values times the sampling period."""
+        return np.asarray(np.abs(self.poles) * self.period, dtype=float)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class SamplingSweep(Printed):
+    """What `sweep_sampling_period` found.
+
+    Parameters
+    ----------
+    record : Record
+        The record as given.
+    table : tuple of SamplingRow
+        One row for each period and estimator, shortest period first.
+    poles : ndarray of complex
+        The poles on which most rows agree [rad/s], of those whose one-step errors are independent
+        of u and r where there are any.
+    recommended : float
+        The sampling period at which the estimators differ least [s].
+    reason : str
+        Why, in words.
+    warning : str
+        What slowing this record down does to its input; empty if nothing was slowed down.
+    """
+
+    record: Record
+    table: tuple[SamplingRow, ...]
+    poles: Any
+    recommended: float
+    reason: str
+    warning: str = ""
+
+    def __getitem__(self, estimator: str) -> tuple[SamplingRow, ...]:
+        """Return the rows of one estimator, shortest period first."""
+        rows = tuple(row for row in self.table if row.estimator == estimator)
+        if not rows:
+            known = dict.fromkeys(row.estimator for row in self.table)
+            raise CtrlidError(f"the sweep has no estimator {estimator!r}; it has "
+                              f"{listing(tuple(known))}")  # fmt: skip
+        return rows
+
+    def __str__(self) -> str:
+        largest = float(np.max(np.abs(self.poles))) if len(self.poles) else np.nan
+        lines = [f"Sampling period of {self.record.name or 'the record'}: {self.record.n} samples "
+                 f"at {self.record.dt:g} s",
+                 f"  {'Ts [s]':>9} {'p Ts':>7}  {'estimator':<15}{'samples':>8}  "
+                 f"{'poles [rad/s]':<34}{'differs':>8}  one-step errors"]  # fmt: skip
+        for row in self.table:
+            head = (f"  {row.period:>9.4g} {largest * row.period:>7.3g}  {row.estimator:<15}"
+                    f"{row.n:>8}  ")  # fmt: skip
+            lines.append(head + (f"FAILED: {_short(row.failure)}" if row.failure else _result(row)))
+        lines += [f"  {self.reason}", *([f"  {self.warning}"] if self.warning else [])]
+        return "\n".join(lines)
+
+
+def _short(failure: str) -> str:
+    """Return the head of a refusal; the whole of it is in the row."""
+    head = failure.split(". ")[0]
+    return head if len(head) <= 80 else head[:77].rsplit(" ", 1)[0] + " ..."
+
+
+def _result(row: SamplingRow) -> str:
+    pairs = zip(row.poles, row.standard_errors, strict=True)
+    poles = ", ".join(f"{number(p, 4)}±{s:.1g}" for p, s in pairs)
+    off = "far" if row.deviation >= FAR else f"{100 * row.deviation:.2g} %"
+    judged = {True: "white", False: "NOT WHITE", None: "not tested"}[row.white]
+    if row.independent is not None:
+        judged += ", independent" if row.independent else ", FOLLOW u OR r"
+    bound = f"; ON ITS BOUND: {listing(row.active)}" if row.active else ""
+    return f"{poles:<34}{off:>8}  {judged}{bound}"
