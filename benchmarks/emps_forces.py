@@ -12,9 +12,10 @@ from scipy import signal
 
 import ctrlid as cid
 from ctrlid import effects
-from ctrlid.diagnosis.fitted import base_model
-from ctrlid.diagnosis.fresh import fresh_data
-from ctrlid.diagnosis.gap import FEW_STEPS, ROUGH, drive
+from ctrlid.diagnosis.fresh_data import fresh_data
+from ctrlid.diagnosis.gap import drive
+from ctrlid.diagnosis.recalibration import base_model
+from ctrlid.diagnosis.thresholds import THRESHOLD
 from ctrlid.loop.simulation import Simulator
 
 GAIN = 35.15065  # N/V, of the EMPS drive
@@ -23,7 +24,7 @@ BAND = 50.0  # Hz, in which its forces are compared
 
 def force_error(loop: cid.Loop, record: cid.Record) -> float:
     """Return the relative RMS error of the simulated drive force, in per cent, below 50 Hz."""
-    simulator = Simulator(loop, ROUGH, FEW_STEPS)
+    simulator = Simulator(loop, THRESHOLD.gap_integration_error, THRESHOLD.gap_steps)
     z, r, d = drive(simulator, record)
     u = simulator.run(z, r, d)[1]
     b, a = signal.butter(4, 2 * BAND * record.dt)

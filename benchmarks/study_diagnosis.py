@@ -50,8 +50,9 @@ from _random_loops import (
 
 import ctrlid as cid
 from ctrlid import effects
-from ctrlid.diagnosis.fitted import Model, base_model
-from ctrlid.diagnosis.trial import contains
+from ctrlid.diagnosis.candidates import contains
+from ctrlid.diagnosis.fitted_model import Model
+from ctrlid.diagnosis.recalibration import base_model
 from ctrlid.effects import CATALOGUE, AbstractEffect, equivalents
 
 KINDS = ("named", "none", "outside", "two", "three", "lookalike", "inside")

@@ -6,8 +6,8 @@ import numpy as np
 import ctrlid as cid
 from ctrlid import effects as E
 from ctrlid.diagnosis.constancy import bin_edges
-from ctrlid.diagnosis.fitted import base_model
-from ctrlid.diagnosis.omnibus import omnibus
+from ctrlid.diagnosis.noise_tests import omnibus
+from ctrlid.diagnosis.recalibration import base_model
 
 OF_INNOVATIONS = ("whiteness", "independence of past signals", "heavy tails", "isolated events")
 

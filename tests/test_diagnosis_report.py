@@ -12,20 +12,15 @@ import ctrlid as cid
 from ctrlid import effects as E
 from ctrlid import plot
 from ctrlid.diagnosis import gap as gap_of
-from ctrlid.diagnosis import words
-from ctrlid.diagnosis.closing import stands_out
-from ctrlid.diagnosis.fitted import base_model
-from ctrlid.diagnosis.omnibus import ALPHA, alarm_level
-from ctrlid.diagnosis.result import (
-    Calibrated,
-    Candidate,
-    Diagnosis,
-    Disturbance,
-    Finding,
-    Gap,
-    Place,
-)
-from ctrlid.diagnosis.saving import SavedLoop, load_diagnosis
+from ctrlid.diagnosis import wording
+from ctrlid.diagnosis.findings import Calibrated, Candidate, Disturbance, Finding, Gap, Place
+from ctrlid.diagnosis.loading import load_diagnosis
+from ctrlid.diagnosis.noise_tests import alarm_level
+from ctrlid.diagnosis.recalibration import base_model
+from ctrlid.diagnosis.result import Diagnosis
+from ctrlid.diagnosis.saving import SavedLoop
+from ctrlid.diagnosis.thresholds import THRESHOLD
+from ctrlid.diagnosis.verdict import stands_out
 from ctrlid.loop.simulation import Simulator
 from ctrlid.reporting import pictures as _pictures
 
@@ -191,8 +186,8 @@ def test_an_alarm_of_many_effects_is_told(found):
 
 
 def test_the_more_effects_the_sooner_an_alarm():
-    assert alarm_level(0) == alarm_level(1) == ALPHA
-    assert alarm_level(3) == pytest.approx(3 * ALPHA)
+    assert alarm_level(0) == alarm_level(1) == THRESHOLD.false_alarm
+    assert alarm_level(3) == pytest.approx(3 * THRESHOLD.false_alarm)
 
 
 def test_bad_news_is_in_capitals(found):
@@ -480,7 +475,7 @@ def test_page(found, verdict, tmp_path):
 def test_a_gap_where_only_the_given_model_can_be_simulated():
     nothing = np.zeros(3)
     gap = Gap("closed-loop simulation", 2.7e-3, math.inf, math.inf, math.nan, "m", *[nothing] * 4)
-    rows = {label: size for label, size, _ in words.gap_rows(gap)}
+    rows = {label: size for label, size, _ in wording.gap_rows(gap)}
     assert rows["the model as given"] == "2.70 mm"
     assert rows["recalibrated"] == "RUNS AWAY"
 
@@ -512,7 +507,7 @@ def test_an_unknown_force_is_not_paid_for_by_an_absurd_start():
     r = cid.random_binary(600, amplitude=0.03, hold=60, seed=3)
     force = 0.6 * np.sin(np.arange(600) / 40)
     record = cid.simulate(loop, r, sensor_noise=1e-6, d=force, seed=1)
-    simulator = Simulator(loop, gap_of.ROUGH, gap_of.FEW_STEPS)
+    simulator = Simulator(loop, THRESHOLD.gap_integration_error, THRESHOLD.gap_steps)
     x, v, lag = gap_of.drive(simulator, replace(record, u=record.u - force))[0][:3]
     assert abs(x) < 5e-3
     assert abs(v) < 0.5
@@ -532,7 +527,7 @@ def test_noise_that_parts_a_loop_from_itself_explains_a_gap():
     windows, fitted = [gap_of.whole(record)], base_model(rough, [record], ("k",)).fit
     kind = "closed-loop simulation"
     floors = [
-        gap_of.floor_of([loop], fitted, windows, kind, gap_of.MORE_RUNS) for loop in (rough, calm)
+        gap_of.floor_of([loop], fitted, windows, kind, THRESHOLD.floor_more_runs) for loop in (rough, calm)
     ]
     assert floors[0].widest > 2 * floors[0].both
     assert floors[1].widest < 1.2 * floors[1].both
@@ -540,6 +535,6 @@ def test_noise_that_parts_a_loop_from_itself_explains_a_gap():
         left = 2 * floor.both
         gap = Gap(kind, 1.0, 1.0, left, floor.both, "m", *[np.zeros(3)] * 4, floor.widest)
         assert stands_out(gap, fitted) == (loop is calm)
-        assert ("differ in noise alone" in words.shrinking(replace(gap, before=0.9))) == (
+        assert ("differ in noise alone" in wording.shrinking(replace(gap, before=0.9))) == (
             loop is rough
         )

@@ -12,24 +12,23 @@ from scipy import signal, stats
 
 import ctrlid as cid
 from ctrlid import effects as E
-from ctrlid.diagnosis import replica as replicas
-from ctrlid.diagnosis import rounds, settling
-from ctrlid.diagnosis.attempts import attempt, attempt_at, refit, under
-from ctrlid.diagnosis.closing import wider
-from ctrlid.diagnosis.decide import GATE, HINT, doubt_of_all, rivals
+from ctrlid.diagnosis import removal, replicas, selection
+from ctrlid.diagnosis.candidates import _there, contains
 from ctrlid.diagnosis.experiment import _survives, separating_experiment
-from ctrlid.diagnosis.fitted import Model, base_model, spared, whole
-from ctrlid.diagnosis.instants import timed
-from ctrlid.diagnosis.omnibus import Omnibus, _shape, omnibus
-from ctrlid.diagnosis.ordering import reordered
-from ctrlid.diagnosis.replica import replica
-from ctrlid.diagnosis.result import Disturbance, Finding, Gap
-from ctrlid.diagnosis.rounds import Step, one_round, plainer
-from ctrlid.diagnosis.scan import scanned
-from ctrlid.diagnosis.search import _foreseen, _stands_in, _there, search, without_worst
-from ctrlid.diagnosis.sentences import conclusion
-from ctrlid.diagnosis.settling import _close, cut, fused
-from ctrlid.diagnosis.trial import contains
+from ctrlid.diagnosis.findings import Disturbance, Finding, Gap
+from ctrlid.diagnosis.fitted_model import Model, spared, whole
+from ctrlid.diagnosis.growth import _foreseen, _stands_in, search, without_worst
+from ctrlid.diagnosis.noise_tests import Omnibus, _shape, omnibus
+from ctrlid.diagnosis.recalibration import base_model
+from ctrlid.diagnosis.refitting import refit, timed, under
+from ctrlid.diagnosis.removal import cut, fused, reordered
+from ctrlid.diagnosis.replicas import replica
+from ctrlid.diagnosis.rivals import _close, rivals
+from ctrlid.diagnosis.scans import scanned
+from ctrlid.diagnosis.screening import attempt, attempt_at
+from ctrlid.diagnosis.selection import Step, one_round, plainer
+from ctrlid.diagnosis.thresholds import THRESHOLD
+from ctrlid.diagnosis.verdict import conclusion, doubt_of_all, wider
 from ctrlid.estimation.likelihood.filter_data import make_track
 from ctrlid.estimation.likelihood.kalman_filter import first_guess
 from ctrlid.estimation.likelihood.likelihood import relinearized
@@ -103,8 +102,8 @@ def test_a_gain_too_small_to_prove_anything_is_still_compared(
     """Beyond what the filter's approximations gain, it has to be paid for, or stays possible."""
     base, plain, rich = one_level
     rich = replace(rich, gain=plain.gain + 10.0)
-    monkeypatch.setattr(rounds, "more_than_simple", lambda *_: more)
-    trials = rounds._simplest(base, [rich, plain])
+    monkeypatch.setattr(selection, "more_than_simple", lambda *_: more)
+    trials = selection._simplest(base, [rich, plain])
     assert trials[0].name == (plain.name, rich.name)[first]
     assert all(np.isfinite(t.merit) for t in trials) == left
 
@@ -120,7 +119,7 @@ def test_the_simple_effect_of_a_replica_climbs_from_where_the_richer_one_does(
     assert stuck.fit.value < copy.fit.value - 100.0
     monkeypatch.setattr(replicas, "replica", lambda model: stuck)
     won = replicas.more_than_simple(base, rich, plain)
-    assert won == pytest.approx(rich.gain - plain.gain, abs=2 * HINT)
+    assert won == pytest.approx(rich.gain - plain.gain, abs=2 * THRESHOLD.hint)
 
 
 def test_candidates_are_compared_under_the_same_random_force():
@@ -129,14 +128,14 @@ def test_candidates_are_compared_under_the_same_random_force():
     record = record_of(loop, E.LinearStiffness(120.0), 2e-4, 2e-6, 9210)
     base = base_model(loop, [record], loop.free)
     right = refit(base, attempt(base, E.LinearStiffness(0.0)))
-    assert rounds._apart(right, right) is False
+    assert selection._apart(right, right) is False
     good = right.model.fit.noise
     slow = replace(good, memory=0.999, drift=1e6)
     wrong = replace(right.model, fit=replace(right.model.fit, noise=slow))
     wrong = replace(wrong, fit=relinearized(wrong.fit))
     lost = replace(right, model=wrong, gain=wrong.fit.value - base.fit.value)
     assert lost.gain < right.gain - 10.0
-    assert rounds._apart(lost, right)
+    assert selection._apart(lost, right)
     assert under(base, lost, good).gain == pytest.approx(right.gain, abs=0.5)
     assert under(base, right, slow).gain >= right.gain  # never lower
 
@@ -150,7 +149,7 @@ def test_what_the_record_excludes_does_not():
     assert plain.gain > 100
     assert rivals(plain, [more]) == ()
     # One record in five gains so much by a difference that is none: here it is below a fifth.
-    by_chance = replace(more, gain=plain.gain + 2 * HINT)
+    by_chance = replace(more, gain=plain.gain + 2 * THRESHOLD.hint)
     assert rivals(plain, [by_chance]) == ()
 
 
@@ -672,7 +671,7 @@ def test_what_is_put_back_and_stuck_keeps_its_evidence(two_found, monkeypatch):
     model = two_found.final
     right = cut(model, 0)[1]
     assert right.gain > 100
-    monkeypatch.setattr(settling, "refit", lambda base, trial: replace(trial, gain=-10.0))
+    monkeypatch.setattr(removal, "refit", lambda base, trial: replace(trial, gain=-10.0))
     smaller, kept = cut(model, 0)
     assert kept.gain == model.fit.value - smaller.fit.value
     assert kept.gain == pytest.approx(right.gain, rel=0.01)
@@ -706,7 +705,7 @@ def test_an_effect_without_which_nothing_follows_stays():
     smaller, back = cut(model, 1)
     assert smaller.fit.value == -np.inf
     assert np.isfinite(back.merit)
-    assert back.merit > 10 * GATE
+    assert back.merit > 10 * THRESHOLD.gate
     assert back.fitted.saturation == pytest.approx(0.036, rel=1e-2)
     fit = whole(smaller).fit
     assert choose_noise(fit) is fit

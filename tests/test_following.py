@@ -8,11 +8,10 @@ import pytest
 
 import ctrlid as cid
 from ctrlid import effects as E
-from ctrlid.diagnosis.fitted import base_model
-from ctrlid.diagnosis.following import following
-from ctrlid.diagnosis.omnibus import omnibus
-from ctrlid.diagnosis.replica import artefact, replica
-from ctrlid.diagnosis.rounds import one_round
+from ctrlid.diagnosis.noise_tests import omnibus
+from ctrlid.diagnosis.recalibration import base_model
+from ctrlid.diagnosis.replicas import artefact, following, replica
+from ctrlid.diagnosis.selection import one_round
 from ctrlid.loop.period_map import comes_to_rest
 
 DT = 0.001

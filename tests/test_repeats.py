@@ -7,9 +7,11 @@ import pytest
 
 import ctrlid as cid
 from ctrlid import effects as E
-from ctrlid.diagnosis.attempts import attempt_at, refit
-from ctrlid.diagnosis.fitted import Model, base_model, weighted_by_repeats
-from ctrlid.diagnosis.fresh import Fresh, fresh_data
+from ctrlid.diagnosis.fitted_model import Model
+from ctrlid.diagnosis.fresh_data import Fresh, fresh_data
+from ctrlid.diagnosis.recalibration import base_model, weighted_by_repeats
+from ctrlid.diagnosis.refitting import refit
+from ctrlid.diagnosis.screening import attempt_at
 from ctrlid.estimation.likelihood.likelihood import evaluate
 from ctrlid.estimation.likelihood.maximization import climb
 from ctrlid.estimation.likelihood.noise_fit import known_from_repeats

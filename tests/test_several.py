@@ -4,7 +4,7 @@ import pytest
 
 import ctrlid as cid
 from ctrlid import effects as E
-from ctrlid.diagnosis.several import presence
+from ctrlid.diagnosis.several_records import presence
 
 FEW = (E.ViscousFriction, E.CoulombFriction, E.InputDelay, E.LinearStiffness)
 

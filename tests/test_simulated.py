@@ -6,12 +6,12 @@ import pytest
 
 import ctrlid as cid
 from ctrlid import effects as E
-from ctrlid.diagnosis.fitted import base_model
-from ctrlid.diagnosis.fresh import fresh_data
-from ctrlid.diagnosis.omnibus import omnibus
-from ctrlid.diagnosis.search import Search
-from ctrlid.diagnosis.simulated import Simulation
-from ctrlid.diagnosis.simulated_search import search_by_simulation
+from ctrlid.diagnosis.fresh_data import fresh_data
+from ctrlid.diagnosis.growth import Search
+from ctrlid.diagnosis.noise_tests import omnibus
+from ctrlid.diagnosis.open_loop_fit import Simulation
+from ctrlid.diagnosis.open_loop_search import search_by_simulation
+from ctrlid.diagnosis.recalibration import base_model
 
 TRUE = {"k1": 0.05, "k3": 0.06, "k4": 0.05}
 

@@ -7,11 +7,7 @@ from scipy import stats
 
 from ..estimation.likelihood.likelihood import Fit
 from ..physics.equations import Array
-
-BINS = 12
-FEWEST = 40  # samples in a bin
-ROUNDING = 1e-9  # of the range of a quantity
-SLOW = 0.05  # of Nyquist's frequency: up to there a periodic change is looked for
+from .thresholds import THRESHOLD
 
 
 def constancy(fit: Fit, axes: Mapping[str, Array]) -> dict[str, float]:
@@ -61,7 +57,7 @@ def constancy(fit: Fit, axes: Mapping[str, Array]) -> dict[str, float]:
         count = np.bincount(index)
         for j, name in enumerate(names):
             score, size = (np.bincount(index, v[:, j]) for v in (scores, told))
-            use = (count >= FEWEST) & (size > 0)
+            use = (count >= THRESHOLD.fewest_in_bin) & (size > 0)
             if use.sum() > 1:
                 p_values[f"constancy of {name} over {axis}"] = float(
                     stats.chi2.sf(np.sum(score[use] ** 2 / size[use]), use.sum())
@@ -79,7 +75,7 @@ def _slow_line(score: Array, size: float, keep: Array) -> float:
     filled = np.zeros(len(keep))
     filled[keep] = score
     power = np.abs(np.fft.rfft(filled)) ** 2 / size
-    return line_chance(power[1 : max(int(SLOW * len(power)), 2)])
+    return line_chance(power[1 : max(int(THRESHOLD.slow_rhythm * len(power)), 2)])
 
 
 def line_chance(power: Array) -> float:
@@ -87,10 +83,12 @@ def line_chance(power: Array) -> float:
     return float(-np.expm1(len(power) * np.log1p(-np.exp(-power.max(initial=0.0)))))
 
 
-def bin_edges(values: Array, bins: int = BINS) -> Array:
+def bin_edges(values: Array, bins: int = THRESHOLD.bins) -> Array:
     """Return edges of bins that hold equally many samples; what rounding left of zero is zero."""
     edges = np.quantile(values, np.linspace(0, 1, bins + 1))
-    edges = np.unique(np.where(np.abs(edges) < ROUNDING * np.ptp(values), 0.0, edges))
+    edges = np.unique(
+        np.where(np.abs(edges) < THRESHOLD.edge_rounding * np.ptp(values), 0.0, edges)
+    )
     return edges if len(edges) > 2 else np.array([values.min(), values.mean(), values.max()])
 
 

@@ -1,4 +1,4 @@
-"""Which experiment would tell apart what a record cannot."""
+"""Step 8: the experiment that would tell an effect from its rivals."""
 
 import math
 from collections.abc import Sequence
@@ -14,18 +14,8 @@ from ..estimation.likelihood.maximization import begin, promised
 from ..estimation.likelihood.physics_fit import make_problem
 from ..loop.simulation import Simulator
 from ..physics.equations import Array
-from .gap import FEW_STEPS, ROUGH
-from .trial import Trial
-
-LONGEST = 20_000  # samples of a recommended experiment
-TRIED = 5000  # samples on which references are compared
-LEVELS = (-1.0, 1.0, -0.5, 0.5, 0.0)  # set-points it visits, in units of its reach
-WORTH = 1.5  # times the distance of the record itself: below, no experiment worth the name
-ENOUGH = 60.0  # squared distance in noise, at which Vuong's statistic is near four on average
-SAFE = 1.2  # times its amplitude that the loop must survive
-FOLLOWS = 3.0  # times the range of reference or record: an output that goes further is lost
-MANY = 1000.0  # times as much: the record itself says nothing
-RAMP = 0.1  # share of each level that is spent on the way to it
+from .candidates import Trial
+from .thresholds import THRESHOLD
 
 
 def separating_experiment(
@@ -62,14 +52,18 @@ def separating_experiment(
     if loop.controller is None or record.r is None:
         return words, None
     try:
-        simulators = [Simulator(t.model.fitted, ROUGH, FEW_STEPS) for t in (best, *others)]
+        simulators = [
+            Simulator(t.model.fitted, THRESHOLD.gap_integration_error, THRESHOLD.gap_steps)
+            for t in (best, *others)
+        ]
     except CtrlidError:
         return words, None
     simulator = simulators[0]
     able = [
         (d, text, r)
         for text, r in _references(record)
-        if (d := _distance(simulator, best, others, r[:TRIED], record)) is not None
+        if (d := _distance(simulator, best, others, r[: THRESHOLD.experiment_tried], record))
+        is not None
     ]
     chosen = _clearest(able)
     while chosen is not None and not all(_survives(s, chosen[2], record) for s in simulators):
@@ -77,13 +71,18 @@ def separating_experiment(
         chosen = _clearest(able)
     if chosen is None:
         return words, None
-    own = _distance(simulator, best, others, np.asarray(record.r)[:TRIED], record) or 0.0
-    if chosen[0] * len(chosen[2]) < ENOUGH:
+    own = (
+        _distance(
+            simulator, best, others, np.asarray(record.r)[: THRESHOLD.experiment_tried], record
+        )
+        or 0.0
+    )
+    if chosen[0] * len(chosen[2]) < THRESHOLD.experiment_distance:
         return (f"{words}. No steps of the reference that the loop is sure to survive would tell, "
                 f"within {len(chosen[2])} samples"), None  # fmt: skip
-    if chosen[0] < WORTH * own:
+    if chosen[0] < THRESHOLD.experiment_worth * own:
         return words, None
-    if own <= 0 or chosen[0] > MANY * own:
+    if own <= 0 or chosen[0] > THRESHOLD.experiment_gain * own:
         return f"{words}. Recommended: {chosen[1]}.", chosen[2]
     times = chosen[0] / own
     text = (f"{words}. Recommended: {chosen[1]}; there the candidates differ {times:.1f} times as "
@@ -106,20 +105,22 @@ def _survives(simulator: Simulator, r: Array, record: Record) -> bool:
     Behind limits of the input, a loop that has lost its plant may yet stay bounded.
     """
     middle = float(np.mean(r))
-    reach = FOLLOWS * max(float(np.ptp(r)), float(np.ptp(record.y[record.valid])))
-    bold = middle + SAFE * (r - middle)
+    reach = THRESHOLD.experiment_reach * max(
+        float(np.ptp(r)), float(np.ptp(record.y[record.valid]))
+    )
+    bold = middle + THRESHOLD.experiment_margin * (r - middle)
     try:
         y = simulator.run(simulator.start(None), bold, np.zeros(len(r)))[0]
     except CtrlidError:
         return False
-    return bool(np.ptp(y) <= SAFE * reach)
+    return bool(np.ptp(y) <= THRESHOLD.experiment_margin * reach)
 
 
 def _references(record: Record) -> list[tuple[str, Array]]:
     """Return references of several kinds, from the record's own to bolder ones."""
     assert record.r is not None
     r = np.asarray(record.r)[record.valid]
-    middle, n = float(np.mean(r)), min(max(len(r), 5000), LONGEST)
+    middle, n = float(np.mean(r)), min(max(len(r), 5000), THRESHOLD.experiment_samples)
     reach = float(np.max(np.abs(r - middle)))
     moves = np.abs(np.diff(r))
     step = float(np.median(moves[moves > 0])) / 2 if (moves > 0).any() else reach
@@ -148,10 +149,10 @@ def _references(record: Record) -> list[tuple[str, Array]]:
 
 def _levels(n: int, reach: float) -> Array:
     """Return a walk over set-points with ramps between them, starting from the middle."""
-    size = n / len(LEVELS)
+    size = n / len(THRESHOLD.experiment_levels)
     times, values = [0.0], [0.0]
-    for k, level in enumerate(LEVELS):
-        times += [(k + RAMP) * size, (k + 1) * size]
+    for k, level in enumerate(THRESHOLD.experiment_levels):
+        times += [(k + THRESHOLD.experiment_ramp) * size, (k + 1) * size]
         values += [level * reach, level * reach]
     return np.asarray(np.interp(np.arange(n), times, values), dtype=float)
 

@@ -1,4 +1,4 @@
-"""How far a model is from data that it was not fitted to, and what noise alone would leave."""
+"""Step 9: how far a model is from data it was not fitted to, and what noise alone would leave."""
 
 import math
 from collections.abc import Sequence
@@ -20,14 +20,7 @@ from ..loop.period_map import comes_to_rest
 from ..loop.simulation import Simulator
 from ..physics.equations import Array
 from ..validation.comparing import moving_poles, time_constant
-
-ROUGH = 1e-5  # local error of the integration, far below any gap worth a word
-FEW_STEPS = 8  # of the integration in a period; sharp friction would ask for many more
-RUNS = 3  # simulations with noise for the floor
-MORE_RUNS = 8  # where a gap stands out: loops that hunt differ much from run to run
-MOST_HELD = 30_000  # samples that are simulated for the comparison
-HELD = 0.25  # share of a record that is kept back for the comparison
-START = 0.02  # share of a stretch in which the guess of the initial state may still show
+from .thresholds import THRESHOLD
 
 
 def way_to_compare(loop: Loop, record: Record) -> str:
@@ -55,7 +48,10 @@ class Window:
 def held_out(record: Record) -> tuple[Window, Record]:
     """Return the last quarter of what counts, and the record before it."""
     valid = np.flatnonzero(record.valid)
-    first = max(int(valid[int((1 - HELD) * len(valid))]), len(record) - MOST_HELD)
+    first = max(
+        int(valid[int((1 - THRESHOLD.held_out) * len(valid))]),
+        len(record) - THRESHOLD.held_out_samples,
+    )
     start = max(first - max((len(record) - first) // 5, 200), 0)
     part = record[start:]
     mask = np.asarray(part.valid) & (np.arange(len(part)) >= first - start)
@@ -65,7 +61,7 @@ def held_out(record: Record) -> tuple[Window, Record]:
 def whole(record: Record) -> Window:
     """Return a record of which all but the very start is compared."""
     mask = np.asarray(record.valid).copy()
-    mask[: max(int(START * len(mask)), 1)] = False
+    mask[: max(int(THRESHOLD.start_left_out * len(mask)), 1)] = False
     return Window(record, 0.0, mask)
 
 
@@ -105,7 +101,7 @@ def output(loop: Loop, window: Window, kind: str) -> Array:
             index, values = predict_ahead(loop, record, predict(loop, record), _steps(kind))
             y[index] = values
             return y
-        simulator = Simulator(loop, ROUGH, FEW_STEPS)
+        simulator = Simulator(loop, THRESHOLD.gap_integration_error, THRESHOLD.gap_steps)
     except CtrlidError:
         return y
     for start, stop in record.segments():
@@ -164,7 +160,11 @@ class Floor:
 
 
 def floor_of(
-    loops: Sequence[Loop], fit: Fit, windows: Sequence[Window], kind: str, runs: int = RUNS
+    loops: Sequence[Loop],
+    fit: Fit,
+    windows: Sequence[Window],
+    kind: str,
+    runs: int = THRESHOLD.floor_runs,
 ) -> Floor:
     """Return the RMS error that noise leaves through a loop.
 
@@ -208,7 +208,7 @@ def _squares(
     if kind.endswith("prediction"):
         known = np.array(spread_ahead(loop, record, predict(loop, record), _steps(kind)))
         return np.tile(size * known**2, (runs, 1))
-    simulator = Simulator(loop, ROUGH, FEW_STEPS)
+    simulator = Simulator(loop, THRESHOLD.gap_integration_error, THRESHOLD.gap_steps)
     squares, count = np.zeros((runs, 2)), 0
     for start, stop in record.segments():
         use = window.mask[start:stop]

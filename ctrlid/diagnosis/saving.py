@@ -1,4 +1,6 @@
-"""A diagnosis as a file that a person can read, and back."""
+"""A diagnosis as a file that a person can read."""
+
+from __future__ import annotations
 
 import dataclasses
 import json
@@ -6,7 +8,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,8 +16,9 @@ from .._base.errors import CtrlidError
 from ..effects import AbstractEffect
 from ..loop.loop import Loop
 from ..physics.linearization import OperatingPoint
-from .readable import numbers, readable
-from .result import Calibrated, Candidate, Diagnosis, Disturbance, Finding, Gap, Place
+
+if TYPE_CHECKING:
+    from .result import Diagnosis
 
 FORMAT = "ctrlid diagnosis 1"
 
@@ -77,7 +80,8 @@ def units_of(loop: Loop | SavedLoop, effect: AbstractEffect) -> dict[str, str]:
 
 def save(found: Diagnosis, path: str | Path) -> Path:
     """Write a diagnosis to a file; see `Diagnosis.save`."""
-    fields = dict(_plain(found))
+    fields = {f.name: _plain(getattr(found, f.name))
+              for f in dataclasses.fields(found) if f.name != "extra"}  # fmt: skip
     loop = {**fields.pop("loop"), "units": _units(found)}
     extra, left = {}, []
     for key, value in found.extra.items():
@@ -97,120 +101,6 @@ def save(found: Diagnosis, path: str | Path) -> Path:
             "folder that exists and may be written to"
         ) from reason
     return path
-
-
-def load_diagnosis(path: str | Path, loop: Loop | None = None) -> Diagnosis:
-    """Read a diagnosis that `Diagnosis.save` wrote.
-
-    Parameters
-    ----------
-    path : str or Path
-        The file.
-    loop : Loop, optional
-        The loop that was diagnosed, or one like it: its plant and controller are taken, the
-        fitted parameters and the effects come from the file. Without it ``found.loop`` shows the
-        values and cannot simulate, since a plant is Python code and not in the file.
-
-    Returns
-    -------
-    Diagnosis
-        The diagnosis.
-
-    Raises
-    ------
-    CtrlidError
-        If the file is none of these, an effect is of an unknown class, or the loop does not fit.
-    """
-    try:
-        data = json.loads(Path(path).read_text("utf-8"))
-    except OSError as reason:
-        raise CtrlidError(f"cannot read {path}: {reason.strerror}") from reason
-    except ValueError as reason:
-        raise CtrlidError(f"{path} is not a saved diagnosis: {reason}. Give a file that "
-                          "found.save(file) wrote") from reason  # fmt: skip
-    if not isinstance(data, dict) or data.get("format") != FORMAT:
-        given = data.get("format") if isinstance(data, dict) else type(data).__name__
-        raise CtrlidError(f"{path} is not a saved diagnosis: it has the format {given!r}, not "
-                          f"{FORMAT!r}. Give a file that found.save(file) wrote")  # fmt: skip
-    try:
-        return _diagnosis(data, loop)
-    except (KeyError, TypeError) as reason:
-        raise CtrlidError(f"the saved diagnosis {path} is damaged: {reason}") from reason
-
-
-def _diagnosis(data: Mapping[str, Any], loop: Loop | None) -> Diagnosis:
-    saved = _loop(data["loop"])
-    return Diagnosis(
-        verdict=data["verdict"], sentence=data["sentence"],
-        findings=tuple(_made(Finding, f) for f in data["findings"]),
-        loop=saved if loop is None else _rebuilt(loop, saved),  # type: ignore[arg-type]
-        gap=_made(Gap, data["gap"]), where=tuple(_made(Place, p) for p in data["where"]),
-        ranking=tuple(_made(Candidate, c) for c in data["ranking"]),
-        disturbance=_made(Disturbance, data["disturbance"]),
-        calibrated=tuple(_made(Calibrated, c) for c in data["calibrated"]),
-        sensitivity=numbers(data["sensitivity"]), tests=numbers(data["tests"]),
-        audit=tuple(data["audit"]), notes=tuple(data["notes"]), record=data["record"],
-        seconds=numbers(data["seconds"]), extra=numbers(data["extra"]),
-    )  # fmt: skip
-
-
-def _rebuilt(loop: Loop, saved: SavedLoop) -> Loop:
-    """Return the user's loop with the saved parameters and effects."""
-    if not isinstance(loop, Loop):
-        raise CtrlidError(f"loop= needs the Loop that was diagnosed; given {type(loop).__name__}")
-    name = loop.equations().name
-    if name != saved.plant_name:
-        raise CtrlidError(f"the saved diagnosis is of the plant {saved.plant_name!r}; the loop "
-                          f"given has {name!r}. Give the loop that was diagnosed")  # fmt: skip
-    changed = dataclasses.replace(loop, dt=saved.dt, at=saved.at, free=(), effects=saved.effects,
-                                  input_limits=saved.input_limits)  # fmt: skip
-    return dataclasses.replace(changed.with_parameters(saved.parameters), free=saved.free)
-
-
-def _loop(data: Mapping[str, Any]) -> SavedLoop:
-    at = numbers(data["at"])
-    return SavedLoop(
-        plant_name=data["plant"], controller_text=data["controller"], dt=numbers(data["dt"]),
-        at=OperatingPoint(tuple(at["states"]), at["input"], at["output"]),
-        free=tuple(data["free"]), input_limits=tuple(numbers(data["input_limits"])),
-        effects=tuple(_effect(e) for e in data["effects"]),
-        parameters=numbers(data["parameters"]), units=data["units"],
-    )  # fmt: skip
-
-
-def _effect(data: Mapping[str, Any]) -> AbstractEffect:
-    """Return an effect by the name of its class."""
-    name, values = data["name"], {k: numbers(v) for k, v in data["parameters"].items()}
-    classes, known = [AbstractEffect], []
-    for cls in classes:
-        classes += cls.__subclasses__()
-        known += [cls] if cls.__name__ == name else []
-    module = data.get("module")
-    known = [cls for cls in known if cls.__module__ == module] or known
-    if not known:
-        where = f"; import it first, it was defined in {module}" if module else ""
-        raise CtrlidError(f"the saved diagnosis has an effect {name!r}, but no effect of this name "
-                          f"is defined{where}")  # fmt: skip
-    return known[-1](**values)
-
-
-def _made(kind: Any, data: Mapping[str, Any]) -> Any:
-    """Return one of the values of a diagnosis from its fields."""
-    made: dict[str, Any] = {}
-    for field in dataclasses.fields(kind):
-        value = data[field.name]
-        match field.name:
-            case "effect":
-                made[field.name] = _effect(value)
-            case "alternatives":
-                made[field.name] = tuple(_effect(e) for e in value)
-            case "equivalents":
-                made[field.name] = tuple(value)
-            case _:
-                made[field.name] = value if field.type in (str, "str") else numbers(value)
-                if isinstance(value, list):
-                    made[field.name] = np.asarray(made[field.name], dtype=float)
-    return kind(**made)
 
 
 def _plain(value: Any) -> Any:
@@ -235,8 +125,7 @@ def _plain(value: Any) -> Any:
         case Mapping():
             return {str(k): _plain(v) for k, v in value.items()}
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value)
-                if not (isinstance(value, Diagnosis) and f.name == "extra")}  # fmt: skip
+        return {f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
     raise CtrlidError(f"a {type(value).__name__} cannot be saved as text")
 
 
@@ -259,3 +148,37 @@ def _units(found: Diagnosis) -> dict[str, dict[str, str]]:
     spoken = [*found.loop.effects, *(c.effect for c in found.ranking)]
     spoken += [e for f in found.findings for e in (f.effect, *f.alternatives)]
     return {type(e).__name__: units_of(found.loop, e) for e in spoken}
+
+
+SPECIAL = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}  # written as texts
+
+
+IN_A_LINE = 8  # numbers of an array
+
+
+def numbers(data: Any) -> Any:
+    """Return numbers that JSON does not have from their names, and all else as it is."""
+    match data:
+        case str():
+            return SPECIAL.get(data, data)
+        case list():
+            return [numbers(v) for v in data]
+        case dict():
+            return {k: numbers(v) for k, v in data.items()}
+    return data
+
+
+def readable(value: Any, indent: int = 0) -> str:
+    """Write JSON with an entry a line and the numbers of an array several in a line."""
+    inner, outer = " " * (indent + 2), " " * indent
+    if isinstance(value, dict) and value:
+        rows = [f"{json.dumps(k, ensure_ascii=False)}: {readable(v, indent + 2)}"
+                for k, v in value.items()]  # fmt: skip
+        return "{\n" + ",\n".join(inner + row for row in rows) + f"\n{outer}}}"
+    if isinstance(value, list) and value and any(isinstance(v, dict | list) for v in value):
+        return "[\n" + ",\n".join(inner + readable(v, indent + 2) for v in value) + f"\n{outer}]"
+    if isinstance(value, list) and len(value) > IN_A_LINE:
+        rows = [json.dumps(value[k : k + IN_A_LINE], ensure_ascii=False)[1:-1]
+                for k in range(0, len(value), IN_A_LINE)]  # fmt: skip
+        return "[\n" + ",\n".join(inner + row for row in rows) + f"\n{outer}]"
+    return json.dumps(value, ensure_ascii=False)

@@ -10,7 +10,8 @@ import numpy as np
 
 from .._base import text as _text
 from .._base.errors import CtrlidError
-from ..diagnosis.result import Candidate, Diagnosis, Gap, Place
+from ..diagnosis.findings import Candidate, Gap, Place
+from ..diagnosis.result import Diagnosis
 from ..physics.equations import Array
 from ..physics.trace import timebase
 from ..validation.comparison import Comparison

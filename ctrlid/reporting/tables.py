@@ -9,7 +9,7 @@ from .._base import text as _text
 from .._base.errors import CtrlidError
 from ..data.record import SIGNALS, Record
 from ..design.redesigning import Redesign
-from ..diagnosis import words
+from ..diagnosis import wording
 from ..diagnosis.result import Diagnosis
 from ..estimation.identified_model import Estimate, IdentifiedModel
 from ..estimation.likelihood.physics_estimate import LoopFit
@@ -210,23 +210,26 @@ def _redesign_blocks(r: Redesign) -> list[Block]:
 
 def _diagnosis_blocks(found: Diagnosis) -> list[Block]:
     caption = f"{found.gap.kind.capitalize()} of {len(found.gap.time)} samples kept back."
-    gap = Table(("", "RMS error", "against the noise floor"), tuple(words.gap_rows(found.gap)),
+    gap = Table(("", "RMS error", "against the noise floor"), tuple(wording.gap_rows(found.gap)),
                 caption)  # fmt: skip
-    made: list[Block] = [words.headline(found), gap, words.shrinking(found.gap)]
+    made: list[Block] = [wording.headline(found), gap, wording.shrinking(found.gap)]
     if found.findings:
         made.append(Title("What is missing"))
     for k, finding in enumerate(found.findings, 1):
-        sure = words.certainty(found, finding)
-        made += [f"{k}. {words.named(finding)}. {words.sized(found, finding)}.", f"{_upper(sure)}."]
-        made += [f"{_upper(doubt)}." for doubt in words.doubts(found, finding)]
+        sure = wording.certainty(found, finding)
+        made += [
+            f"{k}. {wording.named(finding)}. {wording.sized(found, finding)}.",
+            f"{_upper(sure)}.",
+        ]
+        made += [f"{_upper(doubt)}." for doubt in wording.doubts(found, finding)]
     if found.findings:
-        made.append(words.EVIDENCE)
+        made.append(wording.EVIDENCE)
     if found.where:
         made.append(Title("Where it sits"))
-    made += [f"Along {p.axis}: {words.place_words(p)}." for p in words.telling(found)]
+    made += [f"Along {p.axis}: {wording.place_words(p)}." for p in wording.telling(found)]
     sides = 2 if found.findings else 1
     places = tuple(
-        (p.axis, *(_text.number(words.worst(v), 3) for v in (p.before, p.after)[:sides]),
+        (p.axis, *(_text.number(wording.worst(v), 3) for v in (p.before, p.after)[:sides]),
          *(_text.chance(v) for v in (p.p_before, p.p_after)[:sides]))
         for p in found.where
     )  # fmt: skip
@@ -239,7 +242,7 @@ def _diagnosis_blocks(found: Diagnosis) -> list[Block]:
         made.append(Table(columns, places, "RMS of the one-step errors at worst; 1 is noise."))
     if found.verdict == "nothing missing" and found.sensitivity:
         made.append(Table(("effect", "smallest size that would have been seen"),
-                          tuple(words.sensitivity_rows(found))))  # fmt: skip
+                          tuple(wording.sensitivity_rows(found))))  # fmt: skip
     made.append(Title("Parameters, noise and remarks"))
     parameters = tuple(
         (c.name, f"{c.given:.6g}", f"{c.before:.6g}", f"{c.after:.6g}",
@@ -249,7 +252,7 @@ def _diagnosis_blocks(found: Diagnosis) -> list[Block]:
     if parameters:
         titles = ("parameter", "given", "recalibrated", "final", "standard error")
         made.append(Table(titles, parameters, "The model's own parameters."))
-    made += [f"{_upper(line)}." for line in (words.disturbance(found), words.remains(found))]
+    made += [f"{_upper(line)}." for line in (wording.disturbance(found), wording.remains(found))]
     made += [f"About the record: {remark.rstrip('.')}." for remark in found.audit]
     made += [f"Note: {remark.rstrip('.')}." for remark in found.notes]
     tried = tuple(

@@ -11,7 +11,7 @@ from ...data.references import random_binary
 from ...design.lead import design_lead
 from ...diagnosis import diagnose
 from ...diagnosis.result import Diagnosis
-from ...diagnosis.words import percent
+from ...diagnosis.wording import percent
 from ...effects import (
     AbstractEffect,
     ActuatorLag,

@@ -5,7 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from ...diagnosis.result import Diagnosis, Place
+from ...diagnosis.findings import Place
+from ...diagnosis.result import Diagnosis
 from ...physics.equations import Array
 from .. import pictures as _pictures
 from .axes import COLOURS, MEASURED, finish, new_figure, require, take_axes

@@ -1,4 +1,4 @@
-"""Where along a frequency, a length or the time an effect would have to sit."""
+"""Step 4: where along a frequency, a length or the time an effect would have to sit."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -20,19 +20,29 @@ from ..effects import (
 from ..estimation.likelihood.kalman_filter import run
 from ..estimation.likelihood.likelihood import pseudo_inverse
 from ..physics.equations import Array
-from .attempts import attempt, attempt_best
-from .fitted import Model
-from .trial import Trial
+from .candidates import Trial
+from .fitted_model import Model
+from .screening import attempt, attempt_best
+from .thresholds import THRESHOLD
 
-COLUMNS = 500_000  # numbers in a block of shapes at once
-NEARLY = 0.7  # of the best promise: another wave that may be the right one
-PEAKS = 4  # such waves at most
 LENGTHS = 150  # wavelengths that are looked for in the travel
+
+
 UNHURRIED = 0.25  # of the samples: a wave that these can follow is looked for
+
+
 EDGE = 0.05  # of the record, at either end
+
+
 TIMES = 40  # instants at which a parameter might have stepped
+
+
 LIMITS = (0.999, 0.998, 0.995, 0.99, 0.98, 0.95, 0.9, 0.8)  # quantiles that may be cut off
+
+
 DEPTHS = (0.5, 0.25)  # of the range of the input, to which it may have been limited
+
+
 MODES = 7  # frequencies at which a flexible mode is tried
 
 
@@ -68,7 +78,7 @@ def promises(
     fit = model.fit
     m, count = fit.problem.machine, shapes[0].shape[1]
     samples = max(len(s) for s in shapes)
-    step = max(width, COLUMNS // (samples * (m.size + 1)) // width * width)
+    step = max(width, THRESHOLD.scan_block // (samples * (m.size + 1)) // width * width)
     gains, sizes = [], []
     p = len(fit.theta)
     for first in range(0, count, step):
@@ -206,7 +216,7 @@ def _ripple(model: Model, effect: PositionRipple) -> Trial:
     finest, price = 0.25 / travel, math.log(max((1.0 / shortest - 1.0 / travel) * travel, 1))
 
     def gains_of(waves: Array) -> tuple[Array, Array]:
-        block = max(1, COLUMNS // (2 * (m.size + 1) * max(len(w) for w in ways)))
+        block = max(1, THRESHOLD.scan_block // (2 * (m.size + 1) * max(len(w) for w in ways)))
         parts = []
         for k in range(0, len(waves), block):
             angles = [2 * np.pi * np.outer(w, waves[k : k + block]) for w in ways]
@@ -218,7 +228,7 @@ def _ripple(model: Model, effect: PositionRipple) -> Trial:
     waves = np.arange(1.0 / travel, 1.0 / shortest, 2 * finest)
     gains, sizes = gains_of(waves)
     # A peak is about one over the travel wide: only those that may be the highest are seen finely.
-    tops = _peaks(gains, NEARLY**2, 2 * PEAKS)
+    tops = _peaks(gains, THRESHOLD.wave_near_best**2, 2 * THRESHOLD.waves_kept)
     between = np.concatenate([waves[tops] - finest, waves[tops] + finest])
     between = np.unique(between[between > 0])
     more, theirs = gains_of(between)
@@ -229,7 +239,7 @@ def _ripple(model: Model, effect: PositionRipple) -> Trial:
         amplitude, phase = _wave(sizes[k])
         return replace(effect, amplitude=amplitude, period=float(1 / waves[k]), phase=phase)
 
-    best, *others = map(at, _peaks(gains, NEARLY, PEAKS))
+    best, *others = map(at, _peaks(gains, THRESHOLD.wave_near_best, THRESHOLD.waves_kept))
     # Motion between a few levels sees several waves nearly alike: only fits tell them apart.
     return replace(attempt(model, best, price), others=tuple(others))
 

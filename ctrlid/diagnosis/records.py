@@ -1,7 +1,8 @@
-"""What a diagnosis begins with: the model as a loop, and the records looked over."""
+"""Step 1: records looked over, and what their readout shows by itself."""
 
+import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import control as ct
@@ -9,14 +10,15 @@ import numpy as np
 
 from .._base.errors import CtrlidError
 from ..data.record import Record
-from ..effects import InputDelay, InputOffset
+from ..effects import AbstractEffect, InputDelay, InputOffset, Quantization, SensorSaturation
 from ..estimation.identified_model import delay_of
+from ..estimation.likelihood.likelihood import Fit
 from ..loop.loop import Loop
 from ..physics.linearization import OperatingPoint
 from ..validation.record_audit import Audit, audit
+from .thresholds import THRESHOLD
 
 HOPELESS = ("too few samples", "constant signal", "operating point")
-REPEATS = 3  # of an experiment, from which its noise is taken
 
 
 def as_loop(loop: Any, record: Record) -> Loop:
@@ -77,4 +79,67 @@ def repeat_periods(parts: Sequence[Record], audits: Sequence[Audit]) -> list[int
         return []
     periods = [a.repeats[0] for a in audits]
     whole = [p and len(part) // p for p, part in zip(periods, parts, strict=True)]
-    return periods if min(whole) >= REPEATS else []
+    return periods if min(whole) >= THRESHOLD.repeats else []
+
+
+@dataclass(frozen=True)
+class Readout:
+    """An effect of the readout with the evidence for it and the uncertainty of its parameters."""
+
+    effect: AbstractEffect
+    evidence: float
+    errors: dict[str, float]
+
+
+def clipping(
+    records: Sequence[Record], audits: Sequence[Audit], catalogue: Sequence[type[AbstractEffect]]
+) -> Readout | None:
+    r"""Return the limits of the sensor if samples sit on them.
+
+    A sensor without limits is above a value as often as below it, so that n samples exactly on
+    the largest value, and none beyond, have a chance of :math:`2^{-n}`.
+    """
+    if SensorSaturation not in catalogue:
+        return None
+    low = high = 0.0
+    lower, upper = -math.inf, math.inf
+    for record, found in zip(records, audits, strict=True):
+        if "y" not in found.saturated:
+            continue
+        size = int(np.count_nonzero(record.valid))
+        share_low, share_high, at_low, at_high = found.saturated["y"]
+        if share_low > THRESHOLD.clipped:
+            low, lower = low + share_low * size, max(lower, at_low)
+        if share_high > THRESHOLD.clipped:
+            high, upper = high + share_high * size, min(upper, at_high)
+    if not low + high:
+        return None
+    effect = SensorSaturation(lower, upper)
+    return Readout(effect, (low + high) * math.log(2), {
+        k: 0.0 for k, v in effect.values().items() if math.isfinite(v)})  # fmt: skip
+
+
+def censored(record: Record, effect: AbstractEffect) -> Record:
+    """Return a record in which samples on a limit of the sensor do not count."""
+    assert isinstance(effect, SensorSaturation)
+    slack = 1e-9 * float(np.ptp(record.y))
+    y = np.asarray(record.y)
+    free = (y > effect.lower + slack) & (y < effect.upper - slack)
+    return replace(record, valid=np.asarray(record.valid) & free)
+
+
+def steps(
+    fit: Fit, audits: Sequence[Audit], catalogue: Sequence[type[AbstractEffect]]
+) -> Readout | None:
+    r"""Return the step of the sensor if it makes a good part of its noise.
+
+    Rounding to steps q adds a variance of :math:`q^2/12`; knowing it, the likelihood gains
+    :math:`\tfrac{n}{2} \ln r / (r - q^2/12)`.
+    """
+    step = max((float(a.quantum.get("y", 0.0)) for a in audits), default=0.0)
+    noise = float(np.mean(fit.sensor))
+    share = step**2 / 12 / noise if noise > 0 else 0.0
+    if Quantization not in catalogue or share < THRESHOLD.coarse_steps:
+        return None
+    gain = -0.5 * fit.size * math.log(max(1 - share, 1e-3))
+    return Readout(Quantization(step), gain, {"step": 0.0})

@@ -1,4 +1,4 @@
-"""What effects close of the gap, on data that no parameter was fitted to."""
+"""Step 9: the gap before and after, and what each effect closes of it."""
 
 import functools
 import math
@@ -9,13 +9,12 @@ import numpy as np
 from ..estimation.likelihood.likelihood import Fit
 from ..loop.loop import Loop
 from . import gap as gaps
-from .fitted import Model
-from .fresh import Fresh
-from .result import EXCESS, Disturbance, Gap
-from .search import Search
-from .settling import Found
-
-HELPS = 0.05  # of what is left without an effect, on fresh data
+from .findings import Disturbance, Gap
+from .fitted_model import Model
+from .fresh_data import Fresh
+from .growth import Search
+from .removal import Found
+from .thresholds import THRESHOLD
 
 
 def gaps_of(loop: Loop, found: Search, fresh: Fresh) -> tuple[Gap, dict[int, float], Disturbance]:
@@ -28,8 +27,8 @@ def gaps_of(loop: Loop, found: Search, fresh: Fresh) -> tuple[Gap, dict[int, flo
     sizes = [gaps.root_mean_square(windows, y) for y in results]
     fit = found.final.fit
     floor = gaps.floor_of(after, fit, windows, kind)
-    if sizes[2] > EXCESS * floor.both:
-        floor = gaps.floor_of(after, fit, windows, kind, gaps.MORE_RUNS)
+    if sizes[2] > THRESHOLD.excess * floor.both:
+        floor = gaps.floor_of(after, fit, windows, kind, THRESHOLD.floor_more_runs)
     shares: dict[int, float] = {}
     for f in found.found:
         error = sizes[1]
@@ -47,26 +46,6 @@ def gaps_of(loop: Loop, found: Search, fresh: Fresh) -> tuple[Gap, dict[int, flo
     return gap, shares, _disturbance(fit, loop, floor)
 
 
-def stands_out(gap: Gap, fit: Fit) -> bool:
-    """Whether the gap with the effects is wider than noise, as a fit knows it, accounts for.
-
-    A loop that hunts leaves a narrow gap in one run and a wide one in another; the record is but
-    one more run, so the widest of several counts.
-    """
-    noise = max(gap.floor, gap.widest)
-    return math.isfinite(noise) and gap.after > EXCESS * (2 if fit.noise.drift else 1) * noise
-
-
-def wider(gap: Gap, disturbance: Disturbance) -> bool:
-    """Whether effects leave a wider gap than sensor noise does, by itself, in a loop with them.
-
-    With friction and play a loop hunts, and no simulation follows it for long. Two gaps below the
-    floor differ by chance.
-    """
-    by_noise = not disturbance.large and gap.after <= EXCESS * gap.floor
-    return max(gap.before, gap.floor) < gap.after and not by_noise
-
-
 def helps_on(fresh: Fresh) -> Callable[[Found, Model], bool]:
     """Return whether an effect closes a fair part of what is left without it, on fresh data.
 
@@ -78,11 +57,11 @@ def helps_on(fresh: Fresh) -> Callable[[Found, Model], bool]:
         with_it, without = loops(model), loops(f.base)
         if model.fit.problem.known is not None:
             left = fresh.excess(without, model.fit)
-            if left - fresh.excess(with_it, model.fit) > HELPS * left:
+            if left - fresh.excess(with_it, model.fit) > THRESHOLD.helps * left:
                 return True
         floor = gaps.floor_of(with_it, model.fit, fresh.windows, fresh.kind).both
         gap, before = fresh.gap(with_it), fresh.gap(without)
-        return _share(before**2 - gap**2, before, floor) > HELPS
+        return _share(before**2 - gap**2, before, floor) > THRESHOLD.helps
 
     return helps
 

@@ -1,4 +1,4 @@
-"""The search for missing effects: screen, refit, decide, add, drop, and again."""
+"""Step 7: the search: add, drop, look back, and again."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -7,25 +7,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from .._base.errors import CtrlidError
-from ..effects import AbstractEffect, PeriodicForce, PositionRipple
+from ..effects import AbstractEffect
 from ..estimation.likelihood.likelihood import Fit
-from .attempts import refit
-from .decide import CLOSE, GATE, MANY
-from .fitted import Model, anchor, simulable, spared, whole
-from .omnibus import Omnibus, alarm_level, omnibus
-from .ordering import reordered
-from .replica import forgiven, replica
-from .rounds import NEXT, Step, Work, candidates, one_round
-from .scan import SCANS, scanned
-from .settling import Found, compared, cut, renoised, settled, without_superfluous
-from .trial import Trial, contains, same_kind
-
-NEARLY = 0.7  # of the best merit: what comes so close may be the better half of a pair
-FORESEEN = 2  # of them
-WAVES = (PeriodicForce, PositionRipple)  # of which there may be several
-MINOR = 0.15  # of the whole gain: less, beside something unknown, is a stand-in
-SMALL = 0.6  # of what the tests say is missing: what gains less beside other effects is a stand-in
-LITTLE = 0.1  # of what known noise does not explain: less, beside so much, is a stand-in
+from .candidates import Trial, contains, missing_candidates
+from .fitted_model import Model, simulable, spared, whole
+from .noise_tests import Omnibus, alarm_level, omnibus
+from .recalibration import anchor
+from .refitting import refit
+from .removal import Found, cut, renoised, reordered, settled, without_superfluous
+from .replicas import forgiven, replica
+from .rivals import compared
+from .scans import SCANS, scanned
+from .selection import Step, Work, one_round
+from .thresholds import THRESHOLD
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,10 +73,13 @@ def search(
             tell(f"round {len(steps)}: {steps[-1].best.name}")
             model = renoised(reordered(steps[-1].best.model, given))
             model = whole(without_superfluous(model, given))
-        if len(model.loop.effects) - given >= MANY or len(steps) >= MANY + 2:
+        if (
+            len(model.loop.effects) - given >= THRESHOLD.many_effects
+            or len(steps) >= THRESHOLD.many_effects + 2
+        ):
             break
         tell(f"round {len(steps) + 1}: screening")
-        pool = _pool(model, catalogue)
+        pool = missing_candidates(model, catalogue)
         step = one_round(model, pool, work, None if steps else anchor(base))
         step = replace(step, base=Model(model.loop, spared(model.fit)))
         if step.best is not None and _stands_in(step.best, model, beside=bool(steps)):
@@ -123,12 +120,15 @@ def _stands_in(best: Trial, model: Model, beside: bool) -> bool:
     beside : bool
         Whether an effect was found before; the best of several unknown ones may gain little.
     """
-    if best.gain < LITTLE * excess(model.fit):
+    if best.gain < THRESHOLD.little_of_known * excess(model.fit):
         return True
-    if not (beside and simulable(model)) or best.gain >= SMALL * omnibus(model.fit).told:
+    if (
+        not (beside and simulable(model))
+        or best.gain >= THRESHOLD.small_gain * omnibus(model.fit).told
+    ):
         return False
     # The tests may be alarmed by the filter itself: replicas, which take their time, forgive that.
-    return best.gain < SMALL * judged(model).told
+    return best.gain < THRESHOLD.small_gain * judged(model).told
 
 
 def _foreseen(
@@ -146,22 +146,22 @@ def _foreseen(
     best = last.best
     assert best is not None
     ties = step.best is None or not omnibus(step.best.model.fit).passed
-    near = [t for t in last.trials[1:NEXT] if _nearly(t, best, ties)]
+    near = [t for t in last.trials[1 : THRESHOLD.looked_at] if _nearly(t, best, ties)]
     # What promised little beside the best is not scanned again, which takes most of the time.
     ranked = sorted(step.trials, key=lambda t: -t.promise)
-    likely = {t.name for t in (ranked if step.best is None else ranked[:NEXT])}
+    likely = {t.name for t in (ranked if step.best is None else ranked[: THRESHOLD.looked_at])}
     pairs: list[tuple[float, int]] = []
-    for k, trial in enumerate(near[:FORESEEN]):
+    for k, trial in enumerate(near[: THRESHOLD.looked_back]):
         model = whole(trial.model)
-        pool = [c for c in _pool(model, catalogue)
+        pool = [c for c in missing_candidates(model, catalogue)
                 if type(c) not in SCANS or type(c).__name__ in likely]  # fmt: skip
         tried: list[Trial] = work(lambda effect, model=model: scanned(model, effect), pool)
         tried = sorted(tried, key=lambda t: t.price - t.promise)[:2]
         done = work(lambda t, model=model: refit(model, t), tried)
         pairs.append((trial.merit + max((t.merit for t in done), default=-math.inf), k))
     total, k = max(pairs, default=(-math.inf, 0))
-    own = best.merit + (step.best.merit if step.best is not None else GATE)
-    return near[k] if total > own + GATE else None
+    own = best.merit + (step.best.merit if step.best is not None else THRESHOLD.gate)
+    return near[k] if total > own + THRESHOLD.gate else None
 
 
 def _nearly(trial: Trial, best: Trial, ties: bool) -> bool:
@@ -171,10 +171,10 @@ def _nearly(trial: Trial, best: Trial, ties: bool) -> bool:
     """
     if contains(trial.effect, best.effect) or contains(best.effect, trial.effect):
         return False
-    if not NEARLY * best.merit < trial.merit:
+    if not THRESHOLD.look_back * best.merit < trial.merit:
         return False
     mine, its = ({t.name, *type(t.effect).look_alikes} for t in (best, trial))
-    return ties or (bool(mine & its) and trial.merit < best.merit - CLOSE)
+    return ties or (bool(mine & its) and trial.merit < best.merit - THRESHOLD.close)
 
 
 def excess(fit: Fit) -> float:
@@ -213,12 +213,12 @@ def main_ones(found: Search, helps: Callable[[Found, Model], bool]) -> Search:
         Without those that do not.
     """
     total = found.final.fit.value - found.base.fit.value
-    complete = found.after.passed and len(found.found) < MANY
+    complete = found.after.passed and len(found.found) < THRESHOLD.many_effects
     if complete or len(found.found) < 2:
         return found
     model = found.final
     for f in sorted(found.found, key=lambda f: -f.position):
-        if f.trial.gain < MINOR * total and not helps(f, found.final):
+        if f.trial.gain < THRESHOLD.minor * total and not helps(f, found.final):
             model = cut(model, f.position)[0]
     if model is found.final:
         return found
@@ -231,14 +231,3 @@ def without_worst(found: Search, gap: Callable[[Model], float]) -> Search:
     worst = min(found.found, key=lambda f: gap(f.base))
     model, left = settled(worst.base, len(found.base.loop.effects), found.steps)
     return replace(found, final=model, found=left, after=judged(model))
-
-
-def _pool(model: Model, catalogue: Sequence[type[AbstractEffect]]) -> list[AbstractEffect]:
-    """Return the candidates that a model does not have yet."""
-    record = model.fit.problem.tracks[0].record
-    return [c for c in candidates(catalogue, model.fitted, record) if not _there(model, c)]
-
-
-def _there(model: Model, effect: AbstractEffect) -> bool:
-    """Whether the model has this effect already; there may be several waves."""
-    return not isinstance(effect, WAVES) and any(same_kind(e, effect) for e in model.loop.effects)

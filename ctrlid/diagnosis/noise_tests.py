@@ -1,4 +1,4 @@
-"""Whether innovations are noise: tests that name nothing but miss little."""
+"""Step 3: whether innovations are noise: tests that name nothing but miss little."""
 
 import math
 from collections.abc import Mapping
@@ -10,15 +10,10 @@ from scipy import stats
 from ..estimation.likelihood.likelihood import Fit
 from ..physics.equations import Array
 from ..validation.residual_tests import remembered
-from .constancy import FEWEST, bin_edges, bin_index, constancy, line_chance
-from .result import Place
+from .constancy import bin_edges, bin_index, constancy, line_chance
+from .thresholds import THRESHOLD
 
-LAGS = 25
-SETTLING = 0.05  # of a record, in which a force is still being found
-INDEPENDENT = 40  # samples of a force, from which its distribution shows
 OF_NOISE = ("size", "heavy", "isolated", "shape")  # tests of what no effect explains
-LEAST = 1e-300  # probability
-ALPHA = 2e-3  # chance of one false alarm over all tests together
 
 
 def alarm_level(effects: int) -> float:
@@ -26,7 +21,7 @@ def alarm_level(effects: int) -> float:
 
     The more effects an explanation takes, the likelier it stands in for something else.
     """
-    return ALPHA * max(effects, 1)
+    return THRESHOLD.false_alarm * max(effects, 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +34,7 @@ class Omnibus:
     p_values: Mapping[str, float]
     z: Array
     axes: Mapping[str, Array]
-    alpha: float = ALPHA
+    alpha: float = THRESHOLD.false_alarm
 
     @property
     def worst(self) -> tuple[str, float]:
@@ -54,7 +49,7 @@ class Omnibus:
         That is what an effect that is still missing would gain, about, or more.
         """
         means = [p for name, p in self.p_values.items() if not name.startswith(OF_NOISE)]
-        return -math.log(max(min(means), LEAST))
+        return -math.log(max(min(means), THRESHOLD.least_probability))
 
     @property
     def passed(self) -> bool:
@@ -96,16 +91,18 @@ def omnibus(fit: Fit) -> Omnibus:
         keep = np.isfinite(z)
         filled = np.where(keep, z, 0.0)
         n = int(keep.sum())
-        rho = np.array([filled[k:] @ filled[: len(z) - k] for k in range(1, LAGS + 1)]) / n
+        rho = (
+            np.array([filled[k:] @ filled[: len(z) - k] for k in range(1, THRESHOLD.lags + 1)]) / n
+        )
         white += n * float(np.sum(rho**2))
-        white_df += LAGS
+        white_df += THRESHOLD.lags
         value, df = _cross(filled, keep, track.table[1], track.table[2])
         cross += value
         cross_df += df
         lines.append(_line(filled, n))
         tails.append(z[keep])
         if fit.noise.drift:
-            shapes += _shape(out.disturbance[int(SETTLING * len(z)) :])
+            shapes += _shape(out.disturbance[int(THRESHOLD.force_settling * len(z)) :])
         for name, values in _axes(fit, out, track).items():
             parts.setdefault(name, []).append(values[keep])
     z = np.concatenate(tails)
@@ -170,12 +167,12 @@ def _shape(force: Array) -> list[float]:
     moment; by the transformations of D'Agostino and of Anscombe and Glynn, which hold for few.
     """
     x = force - force.mean()
-    if len(x) < FEWEST or not np.ptp(x) > 0:
+    if len(x) < THRESHOLD.fewest_in_bin or not np.ptp(x) > 0:
         return []
     rho = remembered(x)
     skew, kurtosis = stats.skew(x), stats.kurtosis(x, fisher=False)
     n, m = (len(x) / float(1 + 2 * np.sum(rho**k)) for k in (3, 4))
-    if n < INDEPENDENT:
+    if n < THRESHOLD.independent_force:
         return []
     y = skew * math.sqrt((n + 1) * (n + 3) / (6 * (n - 2)))
     beta = 3 * (n**2 + 27 * n - 70) * (n + 1) * (n + 3) / ((n - 2) * (n + 5) * (n + 7) * (n + 9))
@@ -215,7 +212,7 @@ def _binned(z: Array, values: Array) -> tuple[float, float]:
     edges = bin_edges(values)
     index = bin_index(values, edges)
     count = np.bincount(index, minlength=len(edges) - 1)
-    use = count >= FEWEST
+    use = count >= THRESHOLD.fewest_in_bin
     if use.sum() < 2:
         return 1.0, 1.0
     mean = np.bincount(index, z, minlength=len(count))[use] / count[use]
@@ -228,38 +225,3 @@ def _binned(z: Array, values: Array) -> tuple[float, float]:
         float(stats.chi2.sf(chi_mean, use.sum())),
         float(stats.chi2.sf(chi_square, use.sum() - 1)),
     )
-
-
-def places(before: Omnibus, after: Omnibus, units: Mapping[str, str]) -> tuple[Place, ...]:
-    """Return where the innovations are not noise, before and after; most telling first."""
-    found: list[Place] = []
-    for name, values in before.axes.items():
-        if name not in after.axes or len(after.axes[name]) != len(values):
-            continue
-        edges = bin_edges(values)
-        index = bin_index(values, edges)
-        count = np.maximum(np.bincount(index, minlength=len(edges) - 1), 1)
-        was, now = (np.bincount(index, o.z**2, minlength=len(count)) / count
-                    for o in (before, after))  # fmt: skip
-        p_was, p_now = (
-            min(1.0, 2 * min(o.p_values[f"{what} by {name}"] for what in ("mean", "size")))
-            for o in (before, after)
-        )
-        unit = units.get(name, "")
-        words = _words(name, unit, edges, before.z, index, count)
-        found.append(Place(name, unit, edges, was, now, p_was, p_now, words))
-    return tuple(sorted(found, key=lambda place: place.p_before))
-
-
-def _words(name: str, unit: str, edges: Array, z: Array, index: Array, count: Array) -> str:
-    mean = np.bincount(index, z, minlength=len(count)) / count
-    square = np.bincount(index, z**2, minlength=len(count)) / count
-    strength = np.sqrt(count) * np.abs(mean)
-    spread = np.sqrt(count / 2) * np.abs(square - 1)
-    k = int(np.argmax(np.maximum(strength, spread)))
-    between = f"{name} {edges[k]:.4g} to {edges[k + 1]:.4g} {unit}".rstrip()
-    if strength[k] >= spread[k]:
-        way = "above" if mean[k] > 0 else "below"
-        return f"at {between} the output lies {way} its prediction, by {abs(mean[k]):.2g} sigma"
-    way = "larger" if square[k] > 1 else "smaller"
-    return f"at {between} the prediction errors are {way} than noise"

@@ -1,4 +1,4 @@
-"""Looking for missing effects by the error of an open-loop simulation.
+"""Missing effects looked for by the error of an open-loop simulation.
 
 A filter that may blame a random force for everything leaves nothing to be named. A stable plant can
 do without: simulated from its own initial state, what it lacks shows in full.
@@ -14,23 +14,16 @@ from .._base.errors import CtrlidError
 from ..effects import AbstractEffect, ParameterStep, PeriodicForce, StateLimit
 from ..estimation.likelihood.physics_fit import start_values
 from ..physics.equations import Array
-from .decide import CLOSE, GATE
-from .fitted import Model
-from .fresh import Fresh
-from .omnibus import omnibus
-from .rounds import Step, candidates
-from .scan import LIMITS
-from .search import Search
-from .settling import Found, taken_out
-from .simulated import Simulated, Simulation, as_fit
-from .trial import Trial, same_kind
-
-ROUNDS = 5
-REFITTED = 8  # candidates of a round
-EDGES = 12  # instants at which a parameter might have stepped
-CLOSES = 0.95  # of the error that must not remain when an effect is added
-ALIKE = 0.2  # of an effect's merit: what comes nearer is not told from it
-BETTER = 0.8  # of the gap of the other search that must not remain
+from .candidates import Trial, candidates, same_kind
+from .fitted_model import Model
+from .fresh_data import Fresh
+from .growth import Search
+from .noise_tests import omnibus
+from .open_loop_fit import Simulated, Simulation, as_fit
+from .removal import Found, taken_out
+from .scans import LIMITS
+from .selection import Step
+from .thresholds import THRESHOLD
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,20 +81,24 @@ def search_by_simulation(
     sensor, given = other.final.fit.sensor, len(loop.effects)
     before = _gap(base, fresh)
     rounds: list[tuple[Simulated, list[Tried], Tried | None]] = []
-    while len(rounds) < ROUNDS:
+    while len(rounds) < THRESHOLD.open_loop_rounds:
         tell(f"by simulation, round {len(rounds) + 1}")
         tried = _round(now, catalogue)
         best = tried[0] if tried and math.isfinite(tried[0].merit) else None
         new = best and best.found
         after = _gap(new, fresh) if new else math.inf
-        if not (new and new.square < CLOSES**2 * now.square and after < CLOSES * before):
+        if not (
+            new
+            and new.square < THRESHOLD.open_loop_closes**2 * now.square
+            and after < THRESHOLD.open_loop_closes * before
+        ):
             rounds.append((now, tried, None))
             break
         rounds.append((now, tried, best))
         now, before = new, after
     tell("by simulation, what is needed")
     now, smaller = _needed(_settled(now, given), given)
-    if len(now.loop.effects) == given or _gap(now, fresh) > BETTER * gap:
+    if len(now.loop.effects) == given or _gap(now, fresh) > THRESHOLD.open_loop_better * gap:
         return None
     first, final = (_model(s, sensor) for s in (base, now))
     steps = []
@@ -129,7 +126,7 @@ def _needed(now: Simulated, given: int) -> tuple[Simulated, list[Simulated]]:
     while True:
         smaller = [_without(now, k) for k in range(given, len(now.loop.effects))]
         merits = [_gain(s, now.square) - _cost(s, now) for s in smaller]
-        if min(merits, default=math.inf) > GATE:
+        if min(merits, default=math.inf) > THRESHOLD.gate:
             return now, smaller
         now = smaller[int(np.argmin(merits))]
 
@@ -164,18 +161,18 @@ def _found(
     gain, cost = _gain(smaller, now.square), _cost(smaller, now)
     base = _model(smaller, final.fit.sensor)
     mine = Trial(effect, label, final, gain, 0.0, gain, cost)
-    near = max(CLOSE, ALIKE * mine.merit)
+    near = max(THRESHOLD.close, THRESHOLD.open_loop_alike * mine.merit)
     close: list[Trial] = []
     for _, tried, best in rounds:
         if best is None or not same_kind(best.effect, effect):
             continue
         there = [*now.loop.effects]
-        for t in tried[:REFITTED]:
+        for t in tried[: THRESHOLD.open_loop_refitted]:
             if t.merit <= 0 or any(same_kind(t.effect, e) for e in there):
                 continue
             screened = _screened(smaller, t.effect)
             again = screened and _refitted(smaller, screened)
-            if again and mine.merit - again.merit < near and again.merit > GATE:
+            if again and mine.merit - again.merit < near and again.merit > THRESHOLD.gate:
                 close.append(_trial(again, base))
     return Found(mine, tuple(sorted(close, key=lambda t: -t.merit)), base, position)
 
@@ -187,8 +184,10 @@ def _round(now: Simulated, catalogue: Sequence[type[AbstractEffect]]) -> list[Tr
             if not any(same_kind(e, c) for e in loop.effects)]  # fmt: skip
     tried = [t for c in pool if (t := _screened(now, c)) is not None]
     tried.sort(key=lambda t: -t.promise)
-    done = [_refitted(now, t) for t in tried[:REFITTED]]
-    return sorted(done, key=lambda t: (-t.merit, -t.promise)) + tried[REFITTED:]
+    done = [_refitted(now, t) for t in tried[: THRESHOLD.open_loop_refitted]]
+    return (
+        sorted(done, key=lambda t: (-t.merit, -t.promise)) + tried[THRESHOLD.open_loop_refitted :]
+    )
 
 
 def _screened(now: Simulated, effect: AbstractEffect) -> Tried | None:
@@ -251,7 +250,7 @@ def _begun(now: Simulated, effect: AbstractEffect) -> list[AbstractEffect]:
         return [replace(effect, upper=float(v)) for v in levels]
     if isinstance(effect, ParameterStep):
         last = max(float(r.t[-1] - r.start) for r in now.task.records)
-        times = np.linspace(0, last, EDGES + 2)[1:-1]
+        times = np.linspace(0, last, THRESHOLD.open_loop_step_times + 2)[1:-1]
         return [replace(effect, time=float(t)) for t in times]
     if isinstance(effect, PeriodicForce):
         power = np.abs(np.fft.rfft(now.errors, 4 * len(now.errors))) ** 2

@@ -1,36 +1,23 @@
-"""One round of the search: every candidate screened, the promising refitted, the best checked."""
+"""Step 6: one round of the search: all screened, the promising refitted, the best checked."""
 
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
-
-from .._base.errors import CtrlidError
-from ..data.record import Record
-from ..effects import AbstractEffect, SensorOffset
+from ..effects import AbstractEffect
 from ..estimation.likelihood.maximization import promised
-from ..loop.loop import Loop
-from ..physics.linearization import state_matrices
-from .attempts import attempt_at, refit, under
-from .decide import GATE, HINT
-from .fitted import Model, quiet
-from .replica import DOUBTFUL, TWICE, artefact, kinked, more_than_simple, replica
-from .scan import elsewhere, scanned
-from .trial import Trial, comparable, contains, same_kind
-
-NEXT = 5  # candidates after the best that are looked at closely
-TOP = 5  # candidates refitted because of what they promise
-SHARE = 0.2  # of the best promise: what promises more is refitted as well
-FAINT = 0.5  # of what would earn a place: a fainter promise is not worth a refit
-OFFSETS = (SensorOffset,)
-NEAR = 0.5  # of the winner's merit: what came so close is asked again
-DIFFERENT = math.log(2.0)  # of time constants of two random forces
-SLIGHT = 30.0  # a merit below this, beside a kink, is compared with
-MANY = 4  # replicas
+from .candidates import Trial, comparable, contains, same_kind
+from .fitted_model import Model, quiet
+from .refitting import refit, under
+from .replicas import artefact, kinked, more_than_simple, replica
+from .scans import elsewhere, scanned
+from .screening import attempt_at
+from .thresholds import THRESHOLD
 
 Work = Callable[[Callable[..., Any], Iterable[Any]], list[Any]]
+
+
 Job = tuple[Trial, Trial | AbstractEffect, Model | None]  # whose fit, from where, near what
 
 
@@ -41,37 +28,6 @@ class Step:
     base: Model
     trials: tuple[Trial, ...]
     best: Trial | None
-
-
-def candidates(
-    catalogue: Sequence[type[AbstractEffect]], loop: Any, record: Record
-) -> list[AbstractEffect]:
-    """Return every effect of a catalogue that a plant can have, at its start."""
-    found: list[AbstractEffect] = []
-    for kind in catalogue:
-        if kind.place == "output" and kind in OFFSETS and not _place_matters(loop):
-            continue  # the initial position, of which nobody knows where it is counted from
-        found += kind.candidates(loop, record)
-    return found
-
-
-def check_catalogue(catalogue: Sequence[type[AbstractEffect]]) -> None:
-    """Refuse what is no class of effects, with what is needed."""
-    several = isinstance(catalogue, Sequence) and not isinstance(catalogue, str)
-    kinds = catalogue if several else [catalogue]
-    for kind in kinds:
-        if not (isinstance(kind, type) and issubclass(kind, AbstractEffect)):
-            raise CtrlidError("catalogue= is a list of classes of effects, such as "
-                              f"ctrlid.effects.CATALOGUE; given {kind!r}")  # fmt: skip
-    if kinds is not catalogue:
-        raise CtrlidError("catalogue= is a list of classes of effects; put the one given into "
-                          f"brackets: [{catalogue!r}]")  # fmt: skip
-
-
-def _place_matters(loop: Loop) -> bool:
-    """Whether the plant moves differently when its output is shifted."""
-    a, _, c, _ = state_matrices(loop.equations(), loop.point, spread=1e6)
-    return bool(np.any(np.abs(a[:, np.flatnonzero(c[0])]).sum(axis=0) > 0))
 
 
 def one_round(
@@ -103,8 +59,8 @@ def one_round(
         trials = [plain, *(t for t in trials if not same_kind(t.effect, plain.effect))]
         trials = _checked(base, trials, copies)
     best = trials[0]
-    trials = [*trials[:NEXT], *map(comparable, trials[NEXT:])]
-    return Step(base, tuple(trials), best if best.merit > GATE else None)
+    trials = [*trials[: THRESHOLD.looked_at], *map(comparable, trials[THRESHOLD.looked_at :])]
+    return Step(base, tuple(trials), best if best.merit > THRESHOLD.gate else None)
 
 
 def _refitted(
@@ -128,9 +84,15 @@ def _refitted(
         return max((*done.values(), *tried), key=lambda t: t.merit)
 
     leader = tried[0]
-    wanted = {t.name for t in tried[:TOP]} | set(type(leader.effect).look_alikes)
-    promising = [t for t in tried if t.promise > FAINT * (GATE + t.price)]
-    first = [t for t in promising if t.name in wanted or t.promise > SHARE * leader.promise]
+    wanted = {t.name for t in tried[: THRESHOLD.refitted_first]} | set(
+        type(leader.effect).look_alikes
+    )
+    promising = [t for t in tried if t.promise > THRESHOLD.faint * (THRESHOLD.gate + t.price)]
+    first = [
+        t
+        for t in promising
+        if t.name in wanted or t.promise > THRESHOLD.refitted_share * leader.promise
+    ]
     fit([(t, e, None) for t in first for e in t.others])
     best = fit([(t, t, None) for t in first])
     if math.isfinite(best.merit):
@@ -144,7 +106,11 @@ def _refitted(
         near = quiet(best.model)
         fit([(t, done[id(t)].fitted, near) for t in stuck])
         best = fit([(t, m, None) for t in stuck for m in more if m is not t and m.name == t.name])
-        apart = [k for k, t in done.items() if t.merit > NEAR * best.merit and _apart(t, best)]
+        apart = [
+            k
+            for k, t in done.items()
+            if t.merit > THRESHOLD.near_winner * best.merit and _apart(t, best)
+        ]
         noise = best.model.fit.noise
         again = work(lambda k: under(base, done[k], noise), apart)
         done |= dict(zip(apart, again, strict=True))
@@ -156,7 +122,7 @@ def _apart(one: Trial, other: Trial) -> bool:
     a, b = one.model.fit.noise, other.model.fit.noise
     if not (a.drift and b.drift):
         return bool(a.drift) != bool(b.drift)
-    return abs(math.log((1 - a.memory) / (1 - b.memory))) > DIFFERENT
+    return abs(math.log((1 - a.memory) / (1 - b.memory))) > math.log(THRESHOLD.different_force)
 
 
 def _maybe_stuck(best: Trial, tried: Sequence[Trial]) -> list[Trial]:
@@ -194,9 +160,9 @@ def _simplest(base: Model, trials: list[Trial]) -> list[Trial]:
     prove anything, and too large to exclude it: it is left to be compared.
     """
     best = trials[0]
-    for simple in trials[1:NEXT]:
+    for simple in trials[1 : THRESHOLD.looked_at]:
         fewer = len(simple.effect.parameters()) < len(best.effect.parameters())
-        if not fewer or simple.merit <= GATE:
+        if not fewer or simple.merit <= THRESHOLD.gate:
             continue
         if best.gain - simple.gain > 0.1 * best.gain or simple.name not in best.effect.look_alikes:
             continue
@@ -204,7 +170,7 @@ def _simplest(base: Model, trials: list[Trial]) -> list[Trial]:
         if more <= best.cost - simple.cost:
             out = (
                 replace(best, gain=simple.gain + more)
-                if more > HINT
+                if more > THRESHOLD.hint
                 else replace(best, remark=f"{simple.name} explains as much with fewer parameters")
             )
             return sorted([out, *trials[1:]], key=lambda t: (-t.merit, -t.promise))
@@ -216,15 +182,19 @@ def _checked(base: Model, trials: list[Trial], copies: list[Model | None]) -> li
 
     The `copies` are made when the first candidate needs them.
     """
-    for _ in range(NEXT):
+    for _ in range(THRESHOLD.looked_at):
         trials.sort(key=lambda t: (-t.merit, -t.promise))
         best = trials[0]
-        sure = best.gain > DOUBTFUL and not base.loop.effects
-        if best.merit <= GATE or sure:
+        sure = best.gain > THRESHOLD.no_artefact and not base.loop.effects
+        if best.merit <= THRESHOLD.gate or sure:
             break
-        enough = (MANY if best.merit < SLIGHT else 2) if kinked(base) else 1
+        enough = (
+            (THRESHOLD.replicas_beside_kink if best.merit < THRESHOLD.slight_beside_kink else 2)
+            if kinked(base)
+            else 1
+        )
         copies += [replica(base, seed) for seed in range(len(copies), enough)]
-        if best.merit - TWICE * artefact(copies, best) > GATE:
+        if best.merit - THRESHOLD.replica_weight * artefact(copies, best) > THRESHOLD.gate:
             break
         trials[0] = replace(
             best, remark="gains as much on a simulated record in which it is known not to be"

@@ -1,37 +1,52 @@
 """What a diagnosis found, phrase by phrase, for any report."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Iterable
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from .._base.text import chance, listing, number, prefix, quantity
 from ..effects import AbstractEffect, ReadingEffect
-from .omnibus import alarm_level
-from .result import COMPLETE, EXCESS, Diagnosis, Finding, Gap, Place
+from .findings import COMPLETE, Finding, Gap, Place
+from .noise_tests import alarm_level
 from .saving import units_of
+from .thresholds import THRESHOLD
 
-TELLING = 1e-3  # probability below which a place is not noise's doing
-NEAR = 1.2  # times the floor: a gap that noise explains
+if TYPE_CHECKING:
+    from .result import Diagnosis
+
 PLACES = 3
+
+
 LISTED = 4  # tests that fail
-STRONG, CERTAIN = 10.0, 30.0  # evidence
+
+
 HEADLINES = {
     "nothing missing": "Nothing missing",
     "explained": "Explained",
     "partly explained": "PARTLY EXPLAINED: SOMETHING IS STILL MISSING",
     "unknown": "UNKNOWN: SOMETHING IS MISSING that no candidate explains",
 }
+
+
 EVIDENCE = (
     "Evidence: the logarithm of how many times likelier the record is with the effect than "
     "without; chance reaches 2 or 3, 10 is strong."
 )
-WIDER = 1.05  # times the gap as given: recalibration is to be explained
+
+
 WIDENED = (
     "Recalibrating alone makes the one-step errors smaller and this gap larger: parameters cannot "
     "stand in for what is missing."
 )
+
+
 MASSES = ("m", "M", "mass")
+
+
 FORCES = {"m/s^2": "N", "1/s": "N s/m", "1/s^2": "N/m", "1/m": "kg/m"}  # per unit of mass, times it
 
 
@@ -75,12 +90,12 @@ def shrinking(gap: Gap) -> str:
     above = gap.before**2 - gap.floor**2
     if not math.isfinite(above):
         return ""
-    if EXCESS * gap.floor < gap.after < EXCESS * gap.widest:
+    if THRESHOLD.excess * gap.floor < gap.after < THRESHOLD.excess * gap.widest:
         widest = quantity(gap.widest, gap.unit)
         return (f"Two runs of the completed model that differ in noise alone end up as far as "
                 f"{widest} apart, so the gap shows little of what the effects close; the "
                 "one-step errors do.")  # fmt: skip
-    if above <= 0 and gap.after < NEAR * gap.floor:
+    if above <= 0 and gap.after < THRESHOLD.near_floor * gap.floor:
         return ("Noise alone moves two runs of the completed model apart by as much, so "
                 "the gap cannot show what the effects close; the one-step errors do.")  # fmt: skip
     if above <= 0 or gap.after >= gap.before:
@@ -88,7 +103,7 @@ def shrinking(gap: Gap) -> str:
     share = min((gap.before**2 - gap.after**2) / above, 1.0)
     closed = (f"On samples kept back the effects close {percent(share)} of the squared gap above "
               "the noise floor.")  # fmt: skip
-    return f"{closed} {WIDENED}" if gap.before > gap.given * WIDER else closed
+    return f"{closed} {WIDENED}" if gap.before > gap.given * THRESHOLD.widened else closed
 
 
 def percent(share: float) -> str:
@@ -100,7 +115,7 @@ def percent(share: float) -> str:
 
 def telling(found: Diagnosis) -> list[Place]:
     """Return the places where the disagreement sits, most telling first."""
-    return [p for p in found.where if p.p_before < TELLING][:PLACES]
+    return [p for p in found.where if p.p_before < THRESHOLD.telling][:PLACES]
 
 
 def worst(levels: Iterable[float]) -> float:
@@ -147,9 +162,11 @@ def newtons(found: Diagnosis, effect: AbstractEffect) -> str:
 
 def certainty(found: Diagnosis, finding: Finding) -> str:
     """Say how sure it is that something like this effect is there, and that it is this one."""
-    sure = ("WEAK" if finding.evidence < STRONG else
-            "strong" if finding.evidence < CERTAIN else "beyond doubt")  # fmt: skip
-    text = f"evidence {finding.evidence:.{0 if finding.evidence >= STRONG else 1}f}, {sure}"
+    sure = ("WEAK" if finding.evidence < THRESHOLD.strong else
+            "strong" if finding.evidence < THRESHOLD.certain else "beyond doubt")  # fmt: skip
+    text = (
+        f"evidence {finding.evidence:.{0 if finding.evidence >= THRESHOLD.strong else 1}f}, {sure}"
+    )
     if math.isfinite(finding.share) and len(found.findings) > 1:
         text += f"; closes {percent(finding.share)} of the squared gap above the floor"
     many = len(finding.names)
@@ -231,10 +248,10 @@ def remains(found: Diagnosis) -> str:
     together = min(1.0, count * p)
     if found.verdict in COMPLETE or together > alarm_level(len(found.findings)):
         doubt = f"{name}, {chance(p)}"
-        if p < TELLING:
+        if p < THRESHOLD.telling:
             doubt += f", among so many {chance(together)}"
         return f"what remains: noise, by {count} tests, the most doubtful of which is {doubt}"
-    failed = sorted((v, k) for k, v in found.tests.items() if v < TELLING) or [(p, name)]
+    failed = sorted((v, k) for k, v in found.tests.items() if v < THRESHOLD.telling) or [(p, name)]
     names = [name for _, name in failed[:LISTED]]
     if len(failed) > LISTED:
         names[-1] = f"{len(failed) - LISTED + 1} others"

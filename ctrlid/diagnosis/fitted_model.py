@@ -1,18 +1,95 @@
-"""Another model of a loop, begun where one is already fitted."""
+"""A loop fitted to records, and the same fit carried over to another loop."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from ..estimation.likelihood.filter_data import retracked
-from ..estimation.likelihood.kalman_filter import first_guess
-from ..estimation.likelihood.likelihood import Fit, evaluate
+from ..estimation.likelihood.kalman_filter import Noise, first_guess
+from ..estimation.likelihood.likelihood import Fit, evaluate, relinearized
 from ..estimation.likelihood.physics_fit import bounds_of, start_values
 from ..estimation.likelihood.sampled_plant import Machine, Trajectory
 from ..loop.loop import Loop
-from .fitted import Model
+from ..loop.period_map import comes_to_rest
+from ..physics.equations import Array
+from .thresholds import THRESHOLD
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A loop fitted to the records, the base that candidates are added to.
+
+    One that was fitted by another criterion, and without the data that it is compared on, has
+    standard `errors` of its own.
+    """
+
+    loop: Loop
+    fit: Fit
+    errors: Mapping[str, float] | None = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The parameters that were fitted."""
+        return self.fit.problem.machine.names
+
+    @property
+    def fitted(self) -> Loop:
+        """The loop with the fitted values."""
+        values = dict(zip(self.names, self.fit.theta.tolist(), strict=True))
+        return self.loop.with_parameters(values)
+
+
+def simulable(model: Model) -> bool:
+    """Whether the records can be simulated with this model."""
+    loop = model.loop
+    if loop.controller is None:
+        return comes_to_rest(loop)
+    return all(t.record.r is not None for t in model.fit.problem.tracks)
+
+
+def quiet(model: Model) -> Model:
+    """Return a model with hardly any random force, to begin a fit with; known noise is kept."""
+    noise = model.fit.noise
+    if model.fit.problem.known is not None:
+        return model
+    force = tuple(THRESHOLD.quiet_force * v for v in noise.force)
+    return replace(model, fit=replace(model.fit, noise=Noise(force)))
+
+
+def light(fit: Fit) -> Fit:
+    """Return a fit without its arrays: many candidates on a long record must fit into memory."""
+    return as_known(fit, replace(fit, linearized=(), filtered=()))
+
+
+def spared(fit: Fit) -> Fit:
+    """Return a fit without the plant along its trajectory, four fifths of its memory.
+
+    Whatever climbs on from it linearizes anew.
+    """
+    return as_known(fit, replace(fit, linearized=()))
+
+
+def as_known(fit: Fit, bare: Fit) -> Fit:
+    """Return a fit that lost its arrays with what had been computed from them."""
+    bare.__dict__["normal"] = fit.normal
+    return bare
+
+
+def whole(model: Model) -> Model:
+    """Return a model whose fit has the plant along its trajectory."""
+    return model if model.fit.linearized else replace(model, fit=relinearized(model.fit))
+
+
+def log_terms(fit: Fit) -> Array:
+    """Return each sample's share of the log-likelihood, records one after the other."""
+    parts: list[Any] = []
+    for out, keep, r in zip(fit.filtered, fit.problem.counts, fit.sensor, strict=True):
+        s = out.variance[keep] * r
+        parts.append(-0.5 * (np.log(2 * np.pi * s) + out.innovations[keep] ** 2 / s))
+    return np.concatenate(parts)
 
 
 def carried_over(base: Model, loop: Loop, names: Sequence[str]) -> Fit:

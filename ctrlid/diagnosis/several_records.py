@@ -1,4 +1,4 @@
-"""Several records that do not have the same in them: what each says alone, put together."""
+"""Several records without the same in them: what each says alone, put together."""
 
 import math
 from collections.abc import Sequence
@@ -10,10 +10,10 @@ from scipy import stats
 from .._base.text import listing, number, with_error
 from ..effects import AbstractEffect
 from ..loop.loop import Loop
-from .result import Calibrated, Candidate, Diagnosis, Finding, Gap
-from .trial import same_kind
-
-DIFFERENT = 1e-3  # chance that one value looks so different in several records
+from .candidates import same_kind
+from .findings import Calibrated, Candidate, Finding, Gap
+from .result import Diagnosis
+from .thresholds import THRESHOLD
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +152,7 @@ def _calibrated(parts: Sequence[Diagnosis]) -> tuple[tuple[Calibrated, ...], lis
             Calibrated(first.name, first.given, before, mean, float(weights.sum()) ** -0.5)
         )
         spread = float(weights @ (values - mean) ** 2)
-        if len(sure) > 1 and stats.chi2.sf(spread, len(sure) - 1) < DIFFERENT:
+        if len(sure) > 1 and stats.chi2.sf(spread, len(sure) - 1) < THRESHOLD.different_values:
             sizes = [f"{with_error(c.after, c.standard_error)} in record {k + 1}"
                      for k, c in enumerate(same)]  # fmt: skip
             differing.append(f"{first.name} = {listing(sizes)}")

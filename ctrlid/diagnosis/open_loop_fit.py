@@ -1,4 +1,4 @@
-"""Fitting a stable plant by the error of its open-loop simulation, with exact sensitivities."""
+"""A stable plant fitted by the error of its open-loop simulation, with exact sensitivities."""
 
 from __future__ import annotations
 
@@ -16,9 +16,7 @@ from ..estimation.likelihood.sampled_plant import Trajectory
 from ..loop.loop import Loop
 from ..physics.equations import Array
 from ..validation.residual_tests import remembered
-
-EVALUATIONS = 60  # of a refit
-LOST = 1e3  # times the output's spread: the error where a simulation leaves the plant's domain
+from .thresholds import THRESHOLD
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +124,7 @@ class Simulation:
             wide[:, :p] = -seen[1 : p + 1].T
             wide[:, p + n * k : p + n * (k + 1)] = -seen[p + 1 :].T
             lost = ~(np.isfinite(error) & np.isfinite(wide).all(axis=1))
-            error[lost], wide[lost] = LOST * float(np.std(y)), 0.0
+            error[lost], wide[lost] = THRESHOLD.lost_simulation * float(np.std(y)), 0.0
             errors.append(error[keep])
             slopes.append(wide[keep])
         return np.concatenate(errors), np.vstack(slopes), tuple(states)
@@ -138,7 +136,9 @@ class Simulation:
         starts = tuple(dict(zip(names, x.tolist(), strict=False)) for x in x0)
         return Simulated(self, theta, starts, errors, slopes, states)
 
-    def fit(self, theta: Array, x0: Array, evaluations: int = EVALUATIONS) -> Simulated:
+    def fit(
+        self, theta: Array, x0: Array, evaluations: int = THRESHOLD.open_loop_evaluations
+    ) -> Simulated:
         """Return the values and initial states with the smallest error nearby."""
         p, shape = len(theta), x0.shape
         free = np.full(x0.size, np.inf)

@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
 from tqdm import tqdm
 
 from .._base.errors import CtrlidError
@@ -17,26 +16,29 @@ from ..effects import CATALOGUE, AbstractEffect
 from ..estimation.likelihood.likelihood import Fit
 from ..loop.loop import Loop
 from ..validation.record_audit import Audit
-from .assembly import name_of, put_together
-from .closing import gaps_of, helps_on, wider
-from .decide import GATE
-from .fitted import Model, base_model, weighted_by_repeats
-from .fresh import Fresh, fresh_data, stretches
-from .intake import as_loop, look_over, repeat_periods
-from .readout import Readout, censored, clipping, steps
-from .replica import forgiven, replica
-from .result import COMPLETE, Diagnosis, Disturbance
-from .rounds import Work, check_catalogue
-from .search import Search, main_ones, named, search, without_worst
-from .several import merged
-from .simulated_search import search_by_simulation
+from .answer import name_of, put_together
+from .candidates import check_catalogue
+from .findings import COMPLETE, Disturbance
+from .fresh_data import Fresh, fresh_data
+from .gap_summary import gaps_of, helps_on
+from .growth import Search, main_ones, named, search, without_worst
+from .open_loop_search import search_by_simulation
+from .recalibration import base_model, stretches, weighted_by_repeats
+from .records import as_loop, censored, clipping, look_over, repeat_periods, steps
+from .replicas import forgiven, replica, with_rounding
+from .result import Diagnosis
+from .selection import Work
+from .several_records import merged
+from .thresholds import THRESHOLD
+from .verdict import wider
 
-MOST_SIMULATED = 12_000  # samples of a search by simulation
 BY_SIMULATION = (
     "with filters a random force took up what is missing; so effects were looked for by the error "
     "of an open-loop simulation, and sizes are those that simulate best. What is called one-step "
     "errors above are errors of that simulation; evidence counts as many samples as are independent"
 )
+
+
 STEPS = 6  # of the progress bar
 
 
@@ -164,7 +166,7 @@ def _diagnosed(
     tell("comparing on fresh data", 2)
     coarse = steps(found.final.fit, audits, catalogue)
     if coarse and not found.after.passed:
-        copies = [replica(_rounded(found.final, coarse), seed) for seed in (1, 2)]
+        copies = [replica(with_rounding(found.final, coarse), seed) for seed in (1, 2)]
         found = replace(found, after=forgiven(found.after, copies))
     tell("comparing names")
     found = named(main_ones(found, helps_on(fresh)), work)
@@ -193,7 +195,7 @@ def _diagnosed(
 def _worth_simulating(fresh: Fresh, records: Sequence[Record]) -> bool:
     """Whether a plant runs open loop, and records are short enough for hundreds of simulations."""
     open_loop = fresh.kind == "open-loop simulation"
-    return open_loop and sum(len(r) for r in records) <= MOST_SIMULATED
+    return open_loop and sum(len(r) for r in records) <= THRESHOLD.open_loop_samples
 
 
 def _alike(result: Diagnosis) -> bool:
@@ -222,28 +224,13 @@ def _one_by_one(
         won += _merit(found.final.fit)
         size += found.final.fit.size
     fit = together.final.fit
-    better = size != fit.size or won > _merit(fit) + GATE
+    better = size != fit.size or won > _merit(fit) + THRESHOLD.gate
     return merged(loop, parts) if better else None
 
 
 def _merit(fit: Fit) -> float:
     """Return the log-likelihood less half the Bayesian penalty."""
     return fit.value - 0.5 * len(fit.theta) * math.log(fit.size)
-
-
-def _rounded(model: Model, coarse: Readout) -> Model:
-    """Return the model with a rounding sensor, whose steps are then no part of its noise.
-
-    Rounding is no white noise: a record simulated with it says what it does to the tests.
-    """
-    fit = model.fit
-    step = coarse.effect.values()["step"]
-    sensor = np.maximum(fit.sensor - step**2 / 12, 0.05 * fit.sensor)
-    ratio = float(np.mean(fit.sensor) / np.mean(sensor))
-    force = tuple(v * ratio for v in fit.noise.force)
-    noise = replace(fit.noise, force=force, drift=fit.noise.drift * ratio)
-    loop = model.loop.with_effect(coarse.effect)
-    return Model(loop, replace(fit, sensor=sensor, noise=noise))
 
 
 def _worker(jobs: int | None) -> Work:

@@ -1,4 +1,4 @@
-"""The result of a diagnosis, put together from its search."""
+"""The answer, put together from the search."""
 
 import math
 from collections.abc import Sequence
@@ -10,22 +10,20 @@ from ..data.record import Record
 from ..effects import AbstractEffect, equivalents
 from ..estimation.likelihood.physics_fit import summary
 from ..loop.loop import Loop
-from .attempts import attempt_at, refit
-from .closing import stands_out
-from .decide import GATE, doubt_of_all
+from .candidates import Trial, same_kind
 from .experiment import separating_experiment
-from .fitted import base_model
-from .omnibus import places
-from .readout import Readout
-from .result import Calibrated, Candidate, Diagnosis, Disturbance, Finding, Gap, Verdict
-from .search import Search
-from .sentences import conclusion
-from .settling import Found
-from .several import presence
-from .trial import Trial, same_kind
-
-TIE = 0.02  # difference of log-likelihood between effects that are one and the same
-WORSE = 1.2  # times the gap of the model as given: above, the fit explains nothing
+from .findings import Calibrated, Candidate, Disturbance, Finding, Gap, Verdict
+from .growth import Search
+from .recalibration import base_model
+from .records import Readout
+from .refitting import refit
+from .removal import Found
+from .result import Diagnosis
+from .screening import attempt_at
+from .several_records import presence
+from .thresholds import THRESHOLD
+from .verdict import conclusion, doubt_of_all, stands_out
+from .where import places
 
 
 def put_together(
@@ -48,7 +46,7 @@ def put_together(
     left = stands_out(gap, found.final.fit)
     # A random force that may do anything explains everything, and nothing.
     blamed = disturbance.large or math.isnan(disturbance.share)
-    left = left or (blamed and gap.after > WORSE * gap.given)
+    left = left or (blamed and gap.after > THRESHOLD.worse_than_given * gap.given)
     total = found.final.fit.value - found.base.fit.value
     effects, gains = [f.trial.effect for f in found.found], [f.trial.gain for f in found.found]
     loose = doubt_of_all(effects, gains, total if math.isfinite(total) else 0.0)
@@ -106,7 +104,11 @@ def _finding(
     own = {n.partition(".")[2]: v for n, v in errors.items() if n.startswith(f"{label}.")}
     same = equivalents(effect, loop)
     # With the free parameters moving along, two effects may be one on every record.
-    ties = {t.name for t in f.rivals if abs(t.gain - f.trial.gain) < TIE and t.cost == f.trial.cost}
+    ties = {
+        t.name
+        for t in f.rivals
+        if abs(t.gain - f.trial.gain) < THRESHOLD.tie and t.cost == f.trial.cost
+    }
     same = (*same, *sorted(ties - set(same)))
     others = tuple(t.fitted for t in f.rivals)
     apart = [t for t in f.rivals if t.name not in same]
@@ -128,7 +130,7 @@ def _presence(f: Found, found: Search, records: Sequence[Record]) -> str:
             alone = base_model(f.base.fitted, [record], f.base.names)
         except CtrlidError:
             continue
-        if refit(alone, attempt_at(alone, f.trial.fitted)).merit > GATE:
+        if refit(alone, attempt_at(alone, f.trial.fitted)).merit > THRESHOLD.gate:
             seen.append(k)
     return presence(seen, len(records))
 
@@ -168,4 +170,4 @@ def _visible(t: Trial) -> float:
     k = t.model.names.index(f"{t.label}.{t.effect.parameters()[0].name}")
     if not fit.normal[0][k, k] > 0:
         return math.nan
-    return float(fit.standard_errors[k]) * math.sqrt(2 * (GATE + t.price))
+    return float(fit.standard_errors[k]) * math.sqrt(2 * (THRESHOLD.gate + t.price))

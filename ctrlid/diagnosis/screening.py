@@ -1,24 +1,17 @@
-"""Trying an effect: what it promises, and what it gives when everything is refitted."""
+"""Step 4: what a candidate promises, by the score test."""
 
 import math
 from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
-
 from .._base.errors import CtrlidError
 from ..effects import AbstractEffect
-from ..estimation.likelihood.kalman_filter import Noise
-from ..estimation.likelihood.likelihood import Fit, evaluate
-from ..estimation.likelihood.maximization import climb, promised
-from .carrying import carried_over
-from .fitted import Model, light, simulable, spared
-from .instants import timed
-from .trial import Trial
-from .weighing import doubled_by, objection, own_parameters
-
-SCREEN_ROUNDS = 14  # of a refit: a candidate that needs more is not the missing effect
-FAINTER = 3  # times that an effect which promises nothing is tried at a tenth of its size
+from ..estimation.likelihood.likelihood import evaluate
+from ..estimation.likelihood.maximization import promised
+from .candidates import Trial
+from .fitted_model import Model, carried_over, light
+from .information import doubled_by
+from .thresholds import THRESHOLD
 
 
 def attempt(base: Model, effect: AbstractEffect, scan: float = 0.0) -> Trial:
@@ -28,7 +21,7 @@ def attempt(base: Model, effect: AbstractEffect, scan: float = 0.0) -> Trial:
     arguments are those of `attempt_at`.
     """
     best = attempt_at(base, effect, scan)
-    for _ in range(FAINTER):
+    for _ in range(THRESHOLD.fainter_tries):
         if effect.neutral or best.promise > 0:
             break
         fainter = _fainter(best.effect)
@@ -110,77 +103,3 @@ def attempt_best(base: Model, effects: Sequence[AbstractEffect], scan: float) ->
             moved = loop.with_parameters(dict(zip(names, theta.tolist(), strict=True)))
             best = Trial(effect, label, Model(moved, light(fit)), promise, scan)
     return best
-
-
-def refit(base: Model, trial: Trial, near: Model | None = None) -> Trial:
-    """Refit a candidate together with the model and its noise.
-
-    Parameters
-    ----------
-    base : Model
-        The model without it.
-    trial : Trial
-        The candidate at its start.
-    near : Model, optional
-        A model from whose values and noise to start in place of those of `base`.
-
-    Returns
-    -------
-    Trial
-        With gain and cost, or with a remark that puts it out.
-    """
-    if trial.remark:
-        return trial
-    loop, names = trial.model.loop, trial.model.names
-    if near is not None:
-        known = dict(zip(near.names, near.fit.theta.tolist(), strict=True))
-        loop = loop.with_parameters({n: known[n] for n in names if n in known})
-    try:
-        start = carried_over(near or base, loop, names)
-        starts = [start]
-        if start.noise.drift and start.problem.known is None and simulable(base):
-            # A random force that was fitted while the effect was missing may never let it in.
-            # (Where no simulation can check it, the likelihood also leads to absurd values.)
-            starts.append(replace(start, noise=replace(start.noise, memory=0.0, drift=0.0)))
-        fits = [spared(timed(climb(s, rounds=SCREEN_ROUNDS, exact=False))) for s in starts]
-        fit = max(fits, key=lambda f: f.value)
-    except CtrlidError as reason:
-        return replace(trial, remark=str(reason))
-    return outcome(base, trial, fit)
-
-
-def under(base: Model, trial: Trial, noise: Noise) -> Trial:
-    """Return a refitted candidate, climbed on from another noise if that leads higher.
-
-    The likelihood of the noise has several maxima: a slow force that stood for what is missing may
-    stay beside one candidate and leave the next, which says nothing of the candidates.
-    """
-    try:
-        moved = replace(trial.model.fit, noise=noise)
-        fit = spared(climb(moved, rounds=SCREEN_ROUNDS, exact=False))
-    except CtrlidError:
-        return trial
-    return outcome(base, trial, fit) if fit.value > trial.model.fit.value else trial
-
-
-def outcome(base: Model, trial: Trial, fit: Fit) -> Trial:
-    """Return a trial with what a fit of it gained, what that cost, and what speaks against it."""
-    model = Model(trial.model.loop, fit)
-    own = own_parameters(trial, fit)
-    cost = 0.5 * own * math.log(fit.size) + trial.scan
-    before = base.fit.value if math.isfinite(base.fit.value) else _of_no_model(fit)
-    done = replace(trial, model=model, gain=fit.value - before, cost=cost)
-    try:
-        done = replace(done, remark=objection(done))
-    except CtrlidError as reason:  # values that do not go together, such as crossed limits
-        return replace(trial, remark=str(reason))
-    return done if done.merit > 0 else replace(done, model=Model(model.loop, light(fit)))
-
-
-def _of_no_model(fit: Fit) -> float:
-    """Return the likelihood of outputs that scatter about their mean, whatever drives them."""
-    value = 0.0
-    for track, keep in zip(fit.problem.tracks, fit.problem.counts, strict=True):
-        y = track.table[3][keep]
-        value -= 0.5 * len(y) * (math.log(2 * math.pi * float(np.var(y)) + 1e-300) + 1)
-    return value

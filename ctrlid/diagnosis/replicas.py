@@ -1,9 +1,11 @@
-"""Records that a fitted model would have given: what the method finds where nothing is hidden."""
+"""Step 6: records that a fitted model would have given, in which nothing more is hidden."""
 
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
+import control as ct
 import numpy as np
 
 from .._base.errors import CtrlidError
@@ -11,19 +13,17 @@ from ..data.record import Record
 from ..estimation.likelihood.likelihood import Fit, evaluate
 from ..estimation.likelihood.maximization import begin, climb
 from ..estimation.likelihood.physics_fit import make_problem
+from ..loop.loop import Loop
+from ..loop.period_map import comes_to_rest
 from ..loop.simulation import Simulator
-from .attempts import attempt_at, refit
-from .carrying import carried_over
-from .fitted import Model, simulable
-from .following import following
-from .gap import FEW_STEPS, ROUGH, drive, random_noise
-from .omnibus import ALPHA, Omnibus, omnibus
-from .trial import Trial
-
-DOUBTFUL = 400.0  # a gain above this is no artefact of the filter, if the model has no effect yet
-TWICE = 2.0  # what the replica gains counts this much against a candidate
-KINKED = 1e-4  # chance of a false alarm where the filter only nearly follows a kink
-BEYOND = 3.0  # logarithms of chance by which a test must fail more than on a replica
+from .candidates import Trial
+from .fitted_model import Model, carried_over, simulable
+from .gap import drive, random_noise
+from .noise_tests import Omnibus, omnibus
+from .records import Readout
+from .refitting import refit
+from .screening import attempt_at
+from .thresholds import THRESHOLD
 
 
 def replica(model: Model, seed: int = 0) -> Model | None:
@@ -69,7 +69,7 @@ def _simulated(model: Model, record: Record, first: float, sensor: float, seed: 
     loop = following(model.fitted, record) if follows else model.fitted
     if loop is None:
         raise CtrlidError("the record cannot be followed")
-    simulator = Simulator(loop, ROUGH, FEW_STEPS)
+    simulator = Simulator(loop, THRESHOLD.gap_integration_error, THRESHOLD.gap_steps)
     y, u = np.array(record.y), np.array(record.u)
     for start, stop in record.segments():
         if stop - start < 10:
@@ -143,7 +143,7 @@ def more_than_simple(base: Model, best: Trial, simple: Trial) -> float:
     again, plain = (refit(without, attempt_at(without, t.fitted)) for t in (best, simple))
     least = max(copy.fit.value, plain.model.fit.value)
     usual = again.model.fit.value - least if math.isfinite(again.gain) else 0.0
-    return best.gain - simple.gain - TWICE * max(usual, 0.0)
+    return best.gain - simple.gain - THRESHOLD.replica_weight * max(usual, 0.0)
 
 
 def forgiven(tests: Omnibus, copies: Sequence[Model | None]) -> Omnibus:
@@ -159,8 +159,71 @@ def forgiven(tests: Omnibus, copies: Sequence[Model | None]) -> Omnibus:
     p = {}
     for name, value in tests.p_values.items():
         usual = min(k.get(name, 1.0) for k in known)
-        failed = usual < ALPHA and math.log(max(value, 1e-300)) > BEYOND * math.log(
-            max(usual, 1e-300)
-        )
+        failed = usual < THRESHOLD.false_alarm and math.log(
+            max(value, 1e-300)
+        ) > THRESHOLD.beyond_replica * math.log(max(usual, 1e-300))
         p[name] = max(value, 0.5) if failed else value
-    return replace(tests, p_values=p, alpha=KINKED if bent else tests.alpha)
+    return replace(
+        tests, p_values=p, alpha=THRESHOLD.false_alarm_beside_kinks if bent else tests.alpha
+    )
+
+
+def following(loop: Loop, record: Record) -> Loop | None:
+    r"""Return a loop whose output follows that of a record, driven by its input.
+
+    .. math:: u = u_{record} + C (y_{record} - y)
+
+    With the recorded input alone an unstable plant leaves the record at once. C is the normalized
+    linear quadratic Gaussian controller of the linearized plant: input and output count by their
+    standard deviations in the record, and so do the noises at input and output.
+
+    Parameters
+    ----------
+    loop : Loop
+        The model, without a controller.
+    record : Record
+        What it follows.
+
+    Returns
+    -------
+    Loop or None
+        The loop with C; None where no such controller keeps it stable.
+
+    References
+    ----------
+    Jonckheere and Silverman, IEEE Transactions on Automatic Control 28 (1983) 953-964.
+    """
+    try:
+        plant = ct.ss(loop.linearize())
+        plant = plant if plant.dt else ct.sample_system(plant, loop.dt, "zoh")
+        u, y = (max(float(np.std(v[record.valid])), 1e-300) for v in (record.u, record.y))
+        made = replace(loop, controller=_normalized(plant, u, y))
+        return made if comes_to_rest(made) else None
+    except (CtrlidError, ValueError, np.linalg.LinAlgError):
+        return None
+
+
+def _normalized(plant: Any, u: float, y: float) -> Any:
+    """Return the controller for a plant in discrete time, by the sizes of its input and output."""
+    a, b, c = plant.A, plant.B * u, plant.C / y
+    feedback, _, _ = ct.dlqr(a, b, c.T @ c, np.eye(1))
+    gain, _, _ = ct.dlqe(a, np.eye(len(a)), c, b @ b.T, np.eye(1))
+    # The estimate is predicted: what is measured acts at the next sample.
+    through = a @ gain
+    matrix = a - b @ feedback - through @ c
+    return ct.ss(matrix, through / y, feedback * u, 0, plant.dt)
+
+
+def with_rounding(model: Model, coarse: Readout) -> Model:
+    """Return the model with a rounding sensor, whose steps are then no part of its noise.
+
+    Rounding is no white noise: a record simulated with it says what it does to the tests.
+    """
+    fit = model.fit
+    step = coarse.effect.values()["step"]
+    sensor = np.maximum(fit.sensor - step**2 / 12, 0.05 * fit.sensor)
+    ratio = float(np.mean(fit.sensor) / np.mean(sensor))
+    force = tuple(v * ratio for v in fit.noise.force)
+    noise = replace(fit.noise, force=force, drift=fit.noise.drift * ratio)
+    loop = model.loop.with_effect(coarse.effect)
+    return Model(loop, replace(fit, sensor=sensor, noise=noise))

@@ -1,4 +1,4 @@
-"""Models on data that they were not fitted to."""
+"""Step 9: models on data that they were not fitted to."""
 
 import math
 from collections.abc import Sequence
@@ -14,11 +14,9 @@ from ..estimation.likelihood.physics_fit import make_problem, start_values
 from ..loop.loop import Loop
 from ..physics.equations import Array
 from . import gap as gaps
-from .fitted import Model
-
-LONGEST = 40_000  # samples that are fitted; of longer records, even stretches
-STRETCHES = 12  # of a long record
-TURNS = 4  # phases from which a private phase is looked for
+from .fitted_model import Model
+from .recalibration import stretches
+from .thresholds import THRESHOLD
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,23 +104,6 @@ def fresh_data(
     return Fresh(windows, rest, gaps.way_to_compare(loop, windows[0].record))
 
 
-def stretches(records: Sequence[Record]) -> tuple[list[Record], list[float]]:
-    """Return records short enough to be fitted many times: even stretches of long ones."""
-    total = sum(len(r) for r in records)
-    if total <= LONGEST:
-        return list(records), [0.0] * len(records)
-    parts, begins = [], []
-    for record in records:
-        size = max(LONGEST * len(record) // total // STRETCHES, 1000)
-        firsts = np.linspace(0, max(len(record) - size, 0), STRETCHES).astype(int)
-        for first in dict.fromkeys(firsts.tolist()):
-            part = record[first : first + size]
-            if np.count_nonzero(part.valid) > size // 2:
-                parts.append(part)
-                begins.append(first * record.dt)
-    return parts, begins
-
-
 def _with_private_parts(model: Model, window: gaps.Window) -> Loop:
     """Return the loop with what is private to a record, such as a phase, fitted to this one."""
     loop, fit = model.fitted, model.fit
@@ -136,8 +117,8 @@ def _with_private_parts(model: Model, window: gaps.Window) -> Loop:
         start = begin(problem, start_values(loop, names), None)
         at = [out.trajectory for out in start.filtered]
         for k in range(len(names)):
-            turned = [start.theta + turn * np.eye(len(names))[k]
-                      for turn in np.arange(TURNS) * 2 * math.pi / TURNS]  # fmt: skip
+            turns = np.arange(THRESHOLD.phase_starts) * 2 * math.pi / THRESHOLD.phase_starts
+            turned = [start.theta + turn * np.eye(len(names))[k] for turn in turns]
             tried = [evaluate(start.problem, theta, fit.noise, at) for theta in turned]
             start = max(tried, key=lambda f: f.value)
         best = climb(start, exact=False)

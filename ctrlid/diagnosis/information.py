@@ -8,11 +8,9 @@ import numpy as np
 from ..effects import AbstractEffect
 from ..estimation.likelihood.likelihood import Fit
 from ..physics.equations import Array
-from .fitted import Model
-from .trial import Trial
-
-SIGNIFICANT = 2.0  # standard errors that a fitted effect must at least be large
-SEEN = 1e-7  # share of a parameter's information that others must leave to it
+from .candidates import Trial
+from .fitted_model import Model
+from .thresholds import THRESHOLD
 
 
 def left_to(matrix: Array, own: Sequence[int], others: Sequence[int]) -> Array:
@@ -23,7 +21,7 @@ def left_to(matrix: Array, own: Sequence[int], others: Sequence[int]) -> Array:
     if not len(others):
         return np.asarray(left)
     cross = scaled[np.ix_(own, others)]
-    inverse = np.linalg.pinv(scaled[np.ix_(others, others)], rcond=SEEN)
+    inverse = np.linalg.pinv(scaled[np.ix_(others, others)], rcond=THRESHOLD.seen)
     return np.asarray(left - cross @ inverse @ cross.T)
 
 
@@ -43,7 +41,7 @@ def doubled_by(fit: Fit, label: str, effect: AbstractEffect) -> dict[str, float]
     found = {}
     for name, value in deciding.items():
         k = names.index(name)
-        if matrix[k, k] > 0 and left_to(matrix, [k], others)[0, 0] < SEEN:
+        if matrix[k, k] > 0 and left_to(matrix, [k], others)[0, 0] < THRESHOLD.seen:
             found[name] = value
     return found if len(found) < len(deciding) else {}
 
@@ -53,7 +51,7 @@ def own_parameters(trial: Trial, fit: Fit) -> int:
     matrix, _ = fit.normal
     own = [k for k, n in enumerate(fit.problem.machine.names) if n.startswith(f"{trial.label}.")]
     left = left_to(matrix, own, [k for k in range(len(matrix)) if k not in own])
-    return max(1, int(np.sum(np.linalg.eigvalsh(left) > SEEN)))
+    return max(1, int(np.sum(np.linalg.eigvalsh(left) > THRESHOLD.seen)))
 
 
 def needed(model: Model, position: int) -> float:
@@ -111,5 +109,5 @@ def _insignificant(trial: Trial, effect: AbstractEffect) -> bool:
             continue
         k = names.index(key)
         away = math.inf if math.isinf(p.neutral) else abs(fit.theta[k] - p.neutral)
-        sure.append(away > SIGNIFICANT * error[k] and fit.normal[0][k, k] > 0)
+        sure.append(away > THRESHOLD.significant * error[k] and fit.normal[0][k, k] > 0)
     return not any(sure)

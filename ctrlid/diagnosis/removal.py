@@ -1,25 +1,20 @@
-"""When all effects are found: what is superfluous, and what could stand in the place of each."""
+"""Step 7: what the model does without: superfluous effects, two that are one, their order."""
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from ..estimation.likelihood.maximization import begin, climb, polish, retuned
 from ..estimation.likelihood.physics_fit import choose_noise
 from ..loop.loop import Loop
-from .attempts import attempt_at, outcome, refit
-from .carrying import carried_over
-from .decide import GATE, rivals
-from .fitted import Model, simulable, spared
-from .omnibus import omnibus
-from .ordering import moved, relabelled
-from .rounds import NEAR, NEXT, Step, Work, plainer
-from .trial import Trial, contains
-from .weighing import needed
-
-REGAINED = 0.1  # of what leaving an effect out loses: what promises less does not stand for it
-SURE = 100.0  # times the gate: an effect so significant is not asked whether it is needed
+from .candidates import Trial, contains
+from .fitted_model import Model, carried_over, simulable, spared
+from .information import needed
+from .refitting import outcome, refit
+from .screening import attempt_at
+from .selection import Step
+from .thresholds import THRESHOLD
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +41,7 @@ def settled(model: Model, given: int, steps: Sequence[Step]) -> tuple[Model, tup
     found: list[Found] = []
     for position in range(given, len(model.loop.effects)):
         smaller, mine = cut(model, position)
-        if mine.merit <= GATE:
+        if mine.merit <= THRESHOLD.gate:
             return settled(renoised(smaller), given, steps)
         found.append(Found(mine, (), smaller, position))
     found.sort(key=lambda f: -f.trial.gain)
@@ -55,37 +50,6 @@ def settled(model: Model, given: int, steps: Sequence[Step]) -> tuple[Model, tup
 
 def _drifts(model: Model) -> bool:
     return bool(model.fit.noise.drift)
-
-
-def compared(
-    model: Model, found: Sequence[Found], given: int, steps: Sequence[Step], work: Work
-) -> tuple[Model, tuple[Found, ...]]:
-    """Ask for each effect what else could stand in its place, all others being in the model."""
-    sure = omnibus(model.fit).passed
-    if len(found) == 1 and found[0].trial is steps[0].best:
-        best = found[0].trial
-        return model, (replace(found[0], rivals=rivals(best, steps[0].trials, sure)),)
-    done, now = [], model
-    for f in sorted(found, key=lambda f: f.position):
-        smaller, mine = (f.base, f.trial) if now is model else cut(now, f.position)
-        if mine.merit <= GATE:  # what took the place of another makes this one superfluous
-            fewer, left = settled(renoised(smaller), given, steps)
-            return compared(fewer, left, given, steps, work)
-        there = {type(e).__name__ for e in smaller.loop.effects}
-        rest = [t for t in _close(mine, steps) if t.name not in there]
-        again = work(lambda t, smaller=smaller: refit(smaller, attempt_at(smaller, t.fitted)), rest)
-        again = [t for t in again if _on_bounds(t.model) <= _on_bounds(mine.model)]
-        best = max([mine, *again], key=lambda t: t.merit)
-        if best.merit <= mine.merit + 1.0:
-            best = mine
-        best = plainer(smaller, best, [mine, *again])
-        if best is not mine:
-            now = moved(best.model, f.position)
-            now = replace(now, fit=climb(now.fit, rounds=4))
-        close = rivals(best, [t for t in [mine, *again] if t is not best], sure)
-        done.append(Found(best, close, smaller, f.position))
-    done.sort(key=lambda f: -f.trial.gain)
-    return now, tuple(done)
 
 
 def fused(model: Model, given: int, steps: Sequence[Step]) -> Model:
@@ -106,10 +70,10 @@ def fused(model: Model, given: int, steps: Sequence[Step]) -> Model:
             trial = attempt_at(smaller, replace(start, **effects[k].values()))
             lost = model.fit.value - without.fit.value
             regained = smaller.fit.value + trial.promise - without.fit.value
-            if regained < REGAINED * lost:
+            if regained < THRESHOLD.regained * lost:
                 continue
             trial = refit(smaller, trial, model)
-            if trial.merit > GATE and trial.model.fit.value + saved > model.fit.value:
+            if trial.merit > THRESHOLD.gate and trial.model.fit.value + saved > model.fit.value:
                 return trial.model
     return model
 
@@ -123,32 +87,6 @@ def _without(model: Model, positions: Sequence[int]) -> Model:
     if not math.isfinite(fit.value):  # with noise as small as that, it cannot follow the record
         fit = begin(fit.problem, fit.theta, None)
     return Model(loop, fit)
-
-
-def _on_bounds(model: Model) -> set[str]:
-    """Return the plant's own parameters that are as far from their given values as is allowed."""
-    problem, theta = model.fit.problem, model.fit.theta
-    ends = zip(model.names, theta, problem.lower, problem.upper, strict=True)
-    return {name for name, v, low, high in ends if "." not in name and v in (low, high)}
-
-
-def _close(mine: Trial, steps: Sequence[Step]) -> list[Trial]:
-    """Return the candidates that came close to an effect in the round that it won.
-
-    Or that one which resembles it won, whose place it took since.
-    """
-    alike = set(type(mine.effect).look_alikes)
-    won = [s for s in steps if s.best is not None and s.best.name == mine.name]
-    lost = [s for s in steps if s.best is not None and s.best.name in alike]
-    for step in [*won, *lost]:
-        assert step.best is not None
-        near = [
-            t for t in step.trials
-            if t.name != mine.name and t.merit > GATE
-            and (t.name in alike or t.merit > NEAR * step.best.merit)
-        ]  # fmt: skip
-        return near[:NEXT]
-    return []
 
 
 def taken_out(
@@ -195,9 +133,66 @@ def renoised(model: Model) -> Model:
 def without_superfluous(model: Model, given: int) -> Model:
     """Drop effects that the later ones made superfluous."""
     for position in range(given, len(model.loop.effects) - 1):
-        if needed(model, position) > SURE * GATE:
+        if needed(model, position) > THRESHOLD.surely_needed * THRESHOLD.gate:
             continue
         smaller, trial = cut(model, position)
-        if trial.merit <= GATE:
+        if trial.merit <= THRESHOLD.gate:
             return without_superfluous(smaller, given)
     return model
+
+
+ORDERED = ("input", "output")  # places with a signal through them; forces and laws only add up
+
+
+def reordered(model: Model, given: int) -> Model:
+    """Return the model with its last effect nearer to the plant, if it fits better there.
+
+    What is found last was found second, which says nothing of where it acts: a valve may have its
+    dead zone before the offset or behind it, and in the wrong order both end beside their values.
+
+    Parameters
+    ----------
+    model : Model
+        The model to which an effect was added last.
+    given : int
+        Effects that it had from the beginning, whose order is known.
+
+    Returns
+    -------
+    Model
+        The order that is likelier by more than 3 units, or the model as it is.
+    """
+    *others, last = model.fitted.effects
+    if last.place not in ORDERED:
+        return model
+    best = model
+    for k in range(given, len(others)):
+        if others[k].stage != last.stage:
+            continue
+        tried = moved(model, k)
+        if math.isfinite(tried.fit.value):
+            tried = replace(tried, fit=climb(tried.fit, rounds=10, exact=False))
+        best = max(best, tried, key=lambda m: m.fit.value)
+    return best if best.fit.value > model.fit.value + THRESHOLD.close else model
+
+
+def moved(model: Model, position: int) -> Model:
+    """Return the model with its last effect at another position among the effects, all else as is.
+
+    The likelihood is minus infinity if the filter cannot follow the record then.
+    """
+    fitted = model.fitted
+    last = len(fitted.effects) - 1
+    order = [*range(position), last, *range(position, last)]
+    labels = list(fitted.labelled)
+    loop = replace(fitted, effects=tuple(fitted.effects[k] for k in order), free=())
+    renamed = dict(zip([labels[k] for k in order], loop.labelled, strict=True))
+    loop = replace(loop, free=tuple(n for n in fitted.free if "." not in n))
+    names = relabelled(model.names, renamed)
+    return Model(loop, carried_over(model, loop, names))
+
+
+def relabelled(names: Sequence[str], labels: Mapping[str, str]) -> list[str]:
+    """Return names of parameters with the new labels of their effects."""
+    parts = [name.partition(".") for name in names]
+    return [f"{labels.get(head, head)}.{tail}" if dot else head for head, dot, tail in parts]

@@ -1,0 +1,131 @@
+"""What may be missing: the candidates of a catalogue, and one of them added to a model."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from .._base.errors import CtrlidError
+from ..data.record import Record
+from ..effects import AbstractEffect, PeriodicForce, PositionRipple, SensorOffset
+from ..estimation.likelihood.sampled_plant import Trajectory
+from ..loop.loop import Loop
+from ..physics.linearization import state_matrices
+from .fitted_model import Model, as_known
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """A candidate added to a model.
+
+    `promise` is the gain of log-likelihood that the first step expects, `gain` what the refit gave,
+    `cost` half the Bayesian penalty of its parameters and of what was scanned. `others` are starts
+    that promise nearly as much, which only a refit tells apart.
+    """
+
+    effect: AbstractEffect
+    label: str
+    model: Model
+    promise: float
+    scan: float = 0.0
+    gain: float = math.nan
+    cost: float = math.nan
+    remark: str = ""
+    others: tuple[AbstractEffect, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """The name of the effect; drifts and steps belong to a parameter."""
+        return type(self.effect).__name__
+
+    @property
+    def price(self) -> float:
+        """Half the Bayesian penalty if all its parameters count."""
+        size = self.model.fit.size
+        return 0.5 * len(self.effect.parameters()) * math.log(size) + self.scan
+
+    @property
+    def merit(self) -> float:
+        """Gain less penalty; minus infinity for what is out."""
+        if self.remark or not math.isfinite(self.gain):
+            return -math.inf
+        return self.gain - self.cost
+
+    @property
+    def fitted(self) -> AbstractEffect:
+        """The effect with its fitted parameters."""
+        return self.model.fitted.labelled[self.label]
+
+
+def same_kind(one: AbstractEffect, other: AbstractEffect) -> bool:
+    """Whether two effects differ in their values only: of one class, and of one state or name."""
+    return type(one) is type(other) and getattr(one, "name", "") == getattr(other, "name", "")
+
+
+def contains(effect: AbstractEffect, simple: AbstractEffect) -> bool:
+    """Whether one effect is another with further parameters, as asymmetric friction is friction."""
+    more = set(effect.values()) > set(simple.values())
+    return more and type(simple).__name__ in effect.look_alikes
+
+
+def comparable(trial: Trial) -> Trial:
+    """Return a trial with what a comparison of likelihoods needs, without what a refit would."""
+    fit, none = trial.model.fit, np.zeros((0, 0))
+    nowhere = Trajectory(none, none, none)
+    bare = tuple(
+        replace(out, trajectory=nowhere, slopes=none, disturbance=none) for out in fit.filtered
+    )
+    slim = as_known(fit, replace(fit, linearized=(), filtered=bare))
+    return replace(trial, model=replace(trial.model, fit=slim))
+
+
+OFFSETS = (SensorOffset,)
+
+
+def candidates(
+    catalogue: Sequence[type[AbstractEffect]], loop: Any, record: Record
+) -> list[AbstractEffect]:
+    """Return every effect of a catalogue that a plant can have, at its start."""
+    found: list[AbstractEffect] = []
+    for kind in catalogue:
+        if kind.place == "output" and kind in OFFSETS and not _place_matters(loop):
+            continue  # the initial position, of which nobody knows where it is counted from
+        found += kind.candidates(loop, record)
+    return found
+
+
+def check_catalogue(catalogue: Sequence[type[AbstractEffect]]) -> None:
+    """Refuse what is no class of effects, with what is needed."""
+    several = isinstance(catalogue, Sequence) and not isinstance(catalogue, str)
+    kinds = catalogue if several else [catalogue]
+    for kind in kinds:
+        if not (isinstance(kind, type) and issubclass(kind, AbstractEffect)):
+            raise CtrlidError("catalogue= is a list of classes of effects, such as "
+                              f"ctrlid.effects.CATALOGUE; given {kind!r}")  # fmt: skip
+    if kinds is not catalogue:
+        raise CtrlidError("catalogue= is a list of classes of effects; put the one given into "
+                          f"brackets: [{catalogue!r}]")  # fmt: skip
+
+
+def _place_matters(loop: Loop) -> bool:
+    """Whether the plant moves differently when its output is shifted."""
+    a, _, c, _ = state_matrices(loop.equations(), loop.point, spread=1e6)
+    return bool(np.any(np.abs(a[:, np.flatnonzero(c[0])]).sum(axis=0) > 0))
+
+
+WAVES = (PeriodicForce, PositionRipple)  # of which there may be several
+
+
+def missing_candidates(
+    model: Model, catalogue: Sequence[type[AbstractEffect]]
+) -> list[AbstractEffect]:
+    """Return the candidates that a model does not have yet."""
+    record = model.fit.problem.tracks[0].record
+    return [c for c in candidates(catalogue, model.fitted, record) if not _there(model, c)]
+
+
+def _there(model: Model, effect: AbstractEffect) -> bool:
+    """Whether the model has this effect already; there may be several waves."""
+    return not isinstance(effect, WAVES) and any(same_kind(e, effect) for e in model.loop.effects)

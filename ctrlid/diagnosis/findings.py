@@ -1,0 +1,208 @@
+"""What a diagnosis found, as values."""
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+from ..effects import AbstractEffect
+from ..physics.equations import Array
+from .thresholds import THRESHOLD
+
+Verdict = Literal["nothing missing", "explained", "partly explained", "unknown"]
+
+
+COMPLETE: tuple[Verdict, ...] = ("explained", "nothing missing")
+
+
+@dataclass(frozen=True, eq=False)
+class Gap:
+    """How far the model is from the data, on samples that no parameter was fitted to.
+
+    Parameters
+    ----------
+    kind : str
+        What was compared: ``"closed-loop simulation"``, ``"open-loop simulation"`` or, for
+        instance, ``"25-step prediction"``.
+    given, before, after : float
+        RMS error of the model as handed in, after recalibrating its free parameters, and with the
+        effects added [output unit]; infinite where the simulation leaves the plant's domain.
+    floor : float
+        RMS error that sensor and force noise alone leave through this very loop [output unit].
+    unit : str
+        Output unit; empty where the record has none.
+    time, measured : ndarray, shape (m,)
+        The held-out samples [s, output unit].
+    simulated_before, simulated_after : ndarray, shape (m,)
+        What the recalibrated model and the model with the effects make of them [output unit]; NaN
+        where there is nothing.
+    widest : float
+        RMS error of the widest of several simulations with noise [output unit]: far above the
+        floor where a loop hunts, which no simulation follows for long.
+    """
+
+    kind: str
+    given: float
+    before: float
+    after: float
+    floor: float
+    unit: str
+    time: Array
+    measured: Array
+    simulated_before: Array
+    simulated_after: Array
+    widest: float = math.nan
+
+
+@dataclass(frozen=True, eq=False)
+class Finding:
+    """An effect that was missing.
+
+    Parameters
+    ----------
+    effect : AbstractEffect
+        The effect with its fitted parameters.
+    standard_errors : dict of str to float
+        Standard errors of the parameters, by name [unit of each].
+    alternatives : tuple of AbstractEffect
+        Effects that this record cannot tell apart from it, each with its own fitted parameters.
+    equivalents : tuple of str
+        Effects that no record of u and y can tell apart from it, on this plant.
+    evidence : float
+        Gain of log-likelihood over the model without it; 10 is strong.
+    share : float
+        Share of the (squared) gap above the floor that it closes.
+    experiment : str
+        The experiment that would separate the effect from its alternatives; empty without any.
+    reference : ndarray or None
+        That experiment as a reference signal [output unit], ready to run.
+    note : str
+        What else should be known, such as the records in which it was present.
+    """
+
+    effect: AbstractEffect
+    standard_errors: dict[str, float]
+    alternatives: tuple[AbstractEffect, ...]
+    equivalents: tuple[str, ...]
+    evidence: float
+    share: float = float("nan")
+    experiment: str = ""
+    reference: Array | None = None
+    note: str = ""
+
+    @property
+    def name(self) -> str:
+        """The name of the effect."""
+        return type(self.effect).__name__
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The name of the effect and those of its alternatives."""
+        return (self.name, *(type(e).__name__ for e in self.alternatives))
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """One effect that was tried.
+
+    Parameters
+    ----------
+    round : int
+        In which round of the search, from 1.
+    effect : AbstractEffect
+        The effect with the parameters it was tried or fitted with.
+    score : float
+        Gain of log-likelihood that its first step promises, with the free parameters of the model
+        moving along.
+    gain : float
+        Gain of log-likelihood after refitting; NaN if it was not refitted.
+    penalty : float
+        Half of the Bayesian penalty for its parameters and for what was scanned.
+    remark : str
+        Why it is out, or what else was seen; empty if nothing.
+    """
+
+    round: int
+    effect: AbstractEffect
+    score: float
+    gain: float
+    penalty: float
+    remark: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """Where along one quantity the innovations are not noise.
+
+    Parameters
+    ----------
+    axis : str
+        ``"time"``, ``"frequency"``, ``"position"``, ``"velocity"``, ``"input"`` or
+        ``"reference"``.
+    unit : str
+        Unit of the axis.
+    edges : ndarray, shape (bins + 1,)
+        Bins of the axis [`unit`].
+    before, after : ndarray, shape (bins,)
+        Mean square of the innovations in each bin, in units of their expected variance: 1 is
+        noise. Before and after the effects were added.
+    p_before, p_after : float
+        Probability that noise alone looks like this or worse.
+    words : str
+        Where it sits, in words.
+    """
+
+    axis: str
+    unit: str
+    edges: Array
+    before: Array
+    after: Array
+    p_before: float
+    p_after: float
+    words: str
+
+
+@dataclass(frozen=True)
+class Disturbance:
+    """The random forces that were fitted along.
+
+    Parameters
+    ----------
+    white, coloured : float
+        Standard deviations of the white force, held over each period, and of the coloured force
+        [output unit/s^2]; zero where there is none.
+    time_constant : float
+        Time constant of the coloured force [s]; NaN without one.
+    share : float
+        Share of the floor's variance that these forces make; the rest is sensor noise.
+    """
+
+    white: float
+    coloured: float
+    time_constant: float
+    share: float
+
+    @property
+    def large(self) -> bool:
+        """Whether they make more than half of the floor's variance, and may hide something."""
+        return self.share > THRESHOLD.large_disturbance
+
+
+@dataclass(frozen=True)
+class Calibrated:
+    """A free parameter of the model before and after.
+
+    Parameters
+    ----------
+    name : str
+        The parameter.
+    given, before, after : float
+        Its value as handed in, recalibrated alone, and with the effects [its unit].
+    standard_error : float
+        Standard error of the last [its unit].
+    """
+
+    name: str
+    given: float
+    before: float
+    after: float
+    standard_error: float

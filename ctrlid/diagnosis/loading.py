@@ -1,0 +1,131 @@
+"""A diagnosis read back from its file."""
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .._base.errors import CtrlidError
+from ..effects import AbstractEffect
+from ..loop.loop import Loop
+from ..physics.linearization import OperatingPoint
+from .findings import Calibrated, Candidate, Disturbance, Finding, Gap, Place
+from .result import Diagnosis
+from .saving import FORMAT, SavedLoop, numbers
+
+
+def load_diagnosis(path: str | Path, loop: Loop | None = None) -> Diagnosis:
+    """Read a diagnosis that `Diagnosis.save` wrote.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file.
+    loop : Loop, optional
+        The loop that was diagnosed, or one like it: its plant and controller are taken, the
+        fitted parameters and the effects come from the file. Without it ``found.loop`` shows the
+        values and cannot simulate, since a plant is Python code and not in the file.
+
+    Returns
+    -------
+    Diagnosis
+        The diagnosis.
+
+    Raises
+    ------
+    CtrlidError
+        If the file is none of these, an effect is of an unknown class, or the loop does not fit.
+    """
+    try:
+        data = json.loads(Path(path).read_text("utf-8"))
+    except OSError as reason:
+        raise CtrlidError(f"cannot read {path}: {reason.strerror}") from reason
+    except ValueError as reason:
+        raise CtrlidError(f"{path} is not a saved diagnosis: {reason}. Give a file that "
+                          "found.save(file) wrote") from reason  # fmt: skip
+    if not isinstance(data, dict) or data.get("format") != FORMAT:
+        given = data.get("format") if isinstance(data, dict) else type(data).__name__
+        raise CtrlidError(f"{path} is not a saved diagnosis: it has the format {given!r}, not "
+                          f"{FORMAT!r}. Give a file that found.save(file) wrote")  # fmt: skip
+    try:
+        return _diagnosis(data, loop)
+    except (KeyError, TypeError) as reason:
+        raise CtrlidError(f"the saved diagnosis {path} is damaged: {reason}") from reason
+
+
+def _diagnosis(data: Mapping[str, Any], loop: Loop | None) -> Diagnosis:
+    saved = _loop(data["loop"])
+    return Diagnosis(
+        verdict=data["verdict"], sentence=data["sentence"],
+        findings=tuple(_made(Finding, f) for f in data["findings"]),
+        loop=saved if loop is None else _rebuilt(loop, saved),  # type: ignore[arg-type]
+        gap=_made(Gap, data["gap"]), where=tuple(_made(Place, p) for p in data["where"]),
+        ranking=tuple(_made(Candidate, c) for c in data["ranking"]),
+        disturbance=_made(Disturbance, data["disturbance"]),
+        calibrated=tuple(_made(Calibrated, c) for c in data["calibrated"]),
+        sensitivity=numbers(data["sensitivity"]), tests=numbers(data["tests"]),
+        audit=tuple(data["audit"]), notes=tuple(data["notes"]), record=data["record"],
+        seconds=numbers(data["seconds"]), extra=numbers(data["extra"]),
+    )  # fmt: skip
+
+
+def _rebuilt(loop: Loop, saved: SavedLoop) -> Loop:
+    """Return the user's loop with the saved parameters and effects."""
+    if not isinstance(loop, Loop):
+        raise CtrlidError(f"loop= needs the Loop that was diagnosed; given {type(loop).__name__}")
+    name = loop.equations().name
+    if name != saved.plant_name:
+        raise CtrlidError(f"the saved diagnosis is of the plant {saved.plant_name!r}; the loop "
+                          f"given has {name!r}. Give the loop that was diagnosed")  # fmt: skip
+    changed = dataclasses.replace(loop, dt=saved.dt, at=saved.at, free=(), effects=saved.effects,
+                                  input_limits=saved.input_limits)  # fmt: skip
+    return dataclasses.replace(changed.with_parameters(saved.parameters), free=saved.free)
+
+
+def _loop(data: Mapping[str, Any]) -> SavedLoop:
+    at = numbers(data["at"])
+    return SavedLoop(
+        plant_name=data["plant"], controller_text=data["controller"], dt=numbers(data["dt"]),
+        at=OperatingPoint(tuple(at["states"]), at["input"], at["output"]),
+        free=tuple(data["free"]), input_limits=tuple(numbers(data["input_limits"])),
+        effects=tuple(_effect(e) for e in data["effects"]),
+        parameters=numbers(data["parameters"]), units=data["units"],
+    )  # fmt: skip
+
+
+def _effect(data: Mapping[str, Any]) -> AbstractEffect:
+    """Return an effect by the name of its class."""
+    name, values = data["name"], {k: numbers(v) for k, v in data["parameters"].items()}
+    classes, known = [AbstractEffect], []
+    for cls in classes:
+        classes += cls.__subclasses__()
+        known += [cls] if cls.__name__ == name else []
+    module = data.get("module")
+    known = [cls for cls in known if cls.__module__ == module] or known
+    if not known:
+        where = f"; import it first, it was defined in {module}" if module else ""
+        raise CtrlidError(f"the saved diagnosis has an effect {name!r}, but no effect of this name "
+                          f"is defined{where}")  # fmt: skip
+    return known[-1](**values)
+
+
+def _made(kind: Any, data: Mapping[str, Any]) -> Any:
+    """Return one of the values of a diagnosis from its fields."""
+    made: dict[str, Any] = {}
+    for field in dataclasses.fields(kind):
+        value = data[field.name]
+        match field.name:
+            case "effect":
+                made[field.name] = _effect(value)
+            case "alternatives":
+                made[field.name] = tuple(_effect(e) for e in value)
+            case "equivalents":
+                made[field.name] = tuple(value)
+            case _:
+                made[field.name] = value if field.type in (str, "str") else numbers(value)
+                if isinstance(value, list):
+                    made[field.name] = np.asarray(made[field.name], dtype=float)
+    return kind(**made)

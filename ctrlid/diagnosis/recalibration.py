@@ -1,0 +1,81 @@
+"""Step 2: the model's own free parameters and the noise, fitted before anything is added."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from .._base.errors import CtrlidError
+from ..data.record import Record
+from ..estimation.likelihood.maximization import begin, climb, retuned
+from ..estimation.likelihood.noise_fit import known_from_repeats
+from ..estimation.likelihood.physics_fit import choose_noise, make_problem, start_values
+from ..loop.loop import Loop
+from ..physics.equations import Array
+from .fitted_model import Model
+from .thresholds import THRESHOLD
+
+
+def base_model(
+    loop: Loop, records: Sequence[Record], names: Sequence[str], begins: Sequence[float] = ()
+) -> Model:
+    """Fit the model as it is, with the noise that the data want."""
+    problem = make_problem(loop, names, records, begins)
+    lower, upper = _near(loop, names, problem.lower, problem.upper)
+    problem = replace(problem, lower=lower, upper=upper)
+    fit = retuned(climb(begin(problem, start_values(loop, names), None)))
+    return Model(loop, choose_noise(fit))
+
+
+def weighted_by_repeats(base: Model, periods: Sequence[int]) -> Model:
+    """Return the model fitted with the noise that differs between repeats.
+
+    A noise that is fitted to what a model leaves takes part of a missing effect for noise.
+    """
+    problem = replace(base.fit.problem, known=known_from_repeats(base.fit, periods))
+    return Model(base.loop, climb(begin(problem, base.fit.theta, None), exact=False))
+
+
+def anchor(base: Model) -> Model | None:
+    """Return the model at its given values if recalibration has led far away from them.
+
+    Where much is missing, the likelihood of the model alone may be largest at absurd values; the
+    missing effect shows at the given ones.
+    """
+    given = start_values(base.loop, base.names)
+    size = np.maximum(np.abs(given), 1e-300)
+    if not np.any(np.abs(base.fit.theta - given) > THRESHOLD.far_recalibration * size):
+        return None
+    try:
+        fit = begin(base.fit.problem, given, None)
+    except CtrlidError:
+        return None
+    return Model(base.loop, fit) if math.isfinite(fit.value) else None
+
+
+def _near(loop: Loop, names: Sequence[str], lower: Array, upper: Array) -> tuple[Array, Array]:
+    """Narrow the bounds of the plant's parameters: a model ten times off is another model."""
+    lower, upper = lower.copy(), upper.copy()
+    for k, (name, value) in enumerate(zip(names, start_values(loop, names), strict=True)):
+        if "." not in name and value:
+            ends = sorted((value / THRESHOLD.parameter_range, value * THRESHOLD.parameter_range))
+            lower[k], upper[k] = max(lower[k], ends[0]), min(upper[k], ends[1])
+    return lower, upper
+
+
+def stretches(records: Sequence[Record]) -> tuple[list[Record], list[float]]:
+    """Return records short enough to be fitted many times: even stretches of long ones."""
+    total = sum(len(r) for r in records)
+    if total <= THRESHOLD.fitted_samples:
+        return list(records), [0.0] * len(records)
+    parts, begins = [], []
+    for record in records:
+        size = max(THRESHOLD.fitted_samples * len(record) // total // THRESHOLD.stretches, 1000)
+        firsts = np.linspace(0, max(len(record) - size, 0), THRESHOLD.stretches).astype(int)
+        for first in dict.fromkeys(firsts.tolist()):
+            part = record[first : first + size]
+            if np.count_nonzero(part.valid) > size // 2:
+                parts.append(part)
+                begins.append(first * record.dt)
+    return parts, begins

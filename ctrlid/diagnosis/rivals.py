@@ -1,0 +1,186 @@
+"""Step 8: what the record cannot tell apart from an effect, by Vuong's test."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ..estimation.likelihood.maximization import climb
+from ..physics.equations import Array
+from .candidates import Trial, contains, same_kind
+from .fitted_model import Model, log_terms
+from .noise_tests import omnibus
+from .refitting import refit
+from .removal import Found, cut, moved, renoised, settled
+from .screening import attempt_at
+from .selection import Step, Work, plainer
+from .thresholds import THRESHOLD
+
+
+def vuong(best: Array, other: Array, penalty: float) -> float:
+    r"""Return Vuong's statistic of two models on the same samples.
+
+    .. math:: z = \frac{\sum_k d_k - \Delta}{\sqrt{\sum_b (D_b - \bar D)^2}}, \quad
+        d_k = \ell_k^{best} - \ell_k^{other}
+
+    with sums D over blocks, so that neighbours may be correlated.
+
+    Parameters
+    ----------
+    best, other : ndarray, shape (n,)
+        Terms of the log-likelihood.
+    penalty : float
+        What the better model pays more for its parameters.
+
+    Returns
+    -------
+    float
+        Large: the better one is really better.
+
+    References
+    ----------
+    Vuong, Econometrica 57 (1989) 307-333.
+    """
+    d = best - other
+    spread = _spread(d)
+    return float((d.sum() - penalty) / max(spread, 1e-12))
+
+
+def _spread(d: Array) -> float:
+    """Return the standard deviation of a sum whose terms may be correlated with neighbours."""
+    n = len(d) // THRESHOLD.block * THRESHOLD.block
+    sums = d[:n].reshape(-1, THRESHOLD.block).sum(axis=1) if n else d
+    return math.sqrt(float(np.sum((sums - sums.mean()) ** 2)))
+
+
+def _beyond(trial: Trial, simple: Trial) -> float:
+    """Return how large what an effect has beyond a simpler one may be, over what both have.
+
+    NaN where the two have nothing of one unit.
+    """
+    names = trial.model.names
+    errors = trial.model.fit.standard_errors
+    units = {p.name: p.unit for p in trial.effect.parameters() if p.neutral is not None}
+    shared, values, shares = simple.fitted.values(), trial.fitted.values(), []
+    for k in units.keys() - shared.keys():
+        size = max((abs(v) for i, v in shared.items() if units.get(i) == units[k]), default=0.0)
+        key = f"{trial.label}.{k}"
+        if key in names and size > 0:
+            shares.append((abs(values[k]) + THRESHOLD.vuong_z * errors[names.index(key)]) / size)
+    return max(shares, default=math.nan)
+
+
+def rivals(best: Trial, others: Sequence[Trial], sure: bool = True) -> tuple[Trial, ...]:
+    """Return the candidates that the record cannot tell apart from the best, best first.
+
+    Parameters
+    ----------
+    best : Trial
+        The refitted winner.
+    others : sequence of Trial
+        Refitted candidates, on the same samples and beside the same other effects.
+    sure : bool, optional
+        Whether what all of them leave is noise; if not, a difference of likelihood may come from
+        what is still missing.
+
+    Returns
+    -------
+    tuple of Trial
+        Those within 3 units of log-likelihood, or not rejected by Vuong's test at z = 2; unless
+        `sure`, also what is known to resemble the best and gains nearly as much.
+    """
+    mine = log_terms(best.model.fit)
+    found = []
+    for trial in others:
+        if same_kind(trial.effect, best.effect) or trial.merit <= THRESHOLD.gate:
+            continue
+        lost = best.merit - trial.merit
+        theirs = log_terms(trial.model.fit)
+        # A larger model that predicts the same contains the best one, and pays for nothing; but one
+        # that gains more may be right (a Stribeck curve hardly told from dry friction), and one
+        # whose further part may be large, for all the record says, cannot be excluded.
+        alike = trial.name in type(best.effect).look_alikes
+        nothing = (
+            trial.gain < best.gain + THRESHOLD.close
+            and _spread(mine - theirs) < THRESHOLD.same_predictions
+        )
+        if trial.cost > best.cost and nothing:
+            larger = contains(trial.effect, best.effect)
+            share = _beyond(trial, best) if larger else math.nan
+            hinted = (
+                alike
+                and trial.gain > best.gain + THRESHOLD.hint
+                and not share <= THRESHOLD.small_part
+            )
+            if share > THRESHOLD.small_part or hinted:
+                found.append(trial)
+            continue
+        z = vuong(mine, theirs, best.cost - trial.cost)
+        doubtful = not sure and alike and trial.merit > THRESHOLD.doubtful_rival * best.merit
+        if lost < THRESHOLD.close or z < THRESHOLD.vuong_z or doubtful:
+            found.append(trial)
+    found.sort(key=lambda t: -t.merit)
+    # One that was begun at several places is one.
+    return tuple(
+        t for k, t in enumerate(found) if not any(same_kind(t.effect, b.effect) for b in found[:k])
+    )
+
+
+def compared(
+    model: Model, found: Sequence[Found], given: int, steps: Sequence[Step], work: Work
+) -> tuple[Model, tuple[Found, ...]]:
+    """Ask for each effect what else could stand in its place, all others being in the model."""
+    sure = omnibus(model.fit).passed
+    if len(found) == 1 and found[0].trial is steps[0].best:
+        best = found[0].trial
+        return model, (replace(found[0], rivals=rivals(best, steps[0].trials, sure)),)
+    done, now = [], model
+    for f in sorted(found, key=lambda f: f.position):
+        smaller, mine = (f.base, f.trial) if now is model else cut(now, f.position)
+        if (
+            mine.merit <= THRESHOLD.gate
+        ):  # what took the place of another makes this one superfluous
+            fewer, left = settled(renoised(smaller), given, steps)
+            return compared(fewer, left, given, steps, work)
+        there = {type(e).__name__ for e in smaller.loop.effects}
+        rest = [t for t in _close(mine, steps) if t.name not in there]
+        again = work(lambda t, smaller=smaller: refit(smaller, attempt_at(smaller, t.fitted)), rest)
+        again = [t for t in again if _on_bounds(t.model) <= _on_bounds(mine.model)]
+        best = max([mine, *again], key=lambda t: t.merit)
+        if best.merit <= mine.merit + 1.0:
+            best = mine
+        best = plainer(smaller, best, [mine, *again])
+        if best is not mine:
+            now = moved(best.model, f.position)
+            now = replace(now, fit=climb(now.fit, rounds=4))
+        close = rivals(best, [t for t in [mine, *again] if t is not best], sure)
+        done.append(Found(best, close, smaller, f.position))
+    done.sort(key=lambda f: -f.trial.gain)
+    return now, tuple(done)
+
+
+def _on_bounds(model: Model) -> set[str]:
+    """Return the plant's own parameters that are as far from their given values as is allowed."""
+    problem, theta = model.fit.problem, model.fit.theta
+    ends = zip(model.names, theta, problem.lower, problem.upper, strict=True)
+    return {name for name, v, low, high in ends if "." not in name and v in (low, high)}
+
+
+def _close(mine: Trial, steps: Sequence[Step]) -> list[Trial]:
+    """Return the candidates that came close to an effect in the round that it won.
+
+    Or that one which resembles it won, whose place it took since.
+    """
+    alike = set(type(mine.effect).look_alikes)
+    won = [s for s in steps if s.best is not None and s.best.name == mine.name]
+    lost = [s for s in steps if s.best is not None and s.best.name in alike]
+    for step in [*won, *lost]:
+        assert step.best is not None
+        near = [
+            t for t in step.trials
+            if t.name != mine.name and t.merit > THRESHOLD.gate
+            and (t.name in alike or t.merit > THRESHOLD.near_winner * step.best.merit)
+        ]  # fmt: skip
+        return near[: THRESHOLD.looked_at]
+    return []

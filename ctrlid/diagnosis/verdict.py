@@ -1,0 +1,134 @@
+"""Step 10: the decision table, and the verdict in words."""
+
+import itertools
+import math
+from collections.abc import Sequence
+
+from .._base.text import chance, number
+from ..effects import AbstractEffect, PositionRipple
+from ..estimation.likelihood.likelihood import Fit
+from .findings import Disturbance, Finding, Gap, Place, Verdict
+from .noise_tests import Omnibus
+from .thresholds import THRESHOLD
+
+
+def doubt_of_all(effects: Sequence[AbstractEffect], gains: Sequence[float], total: float) -> str:
+    """Say why effects that explain a record together may yet be no explanation.
+
+    Parameters
+    ----------
+    effects : sequence of effects
+        Those that were found.
+    gains : sequence of float
+        What each gains of log-likelihood beside the others.
+    total : float
+        What they gain together.
+
+    Returns
+    -------
+    str
+        The reason, empty if there is none.
+    """
+    if len(effects) >= THRESHOLD.many_effects:
+        return "so many effects at once describe almost any error, and prove little"
+    if sum(isinstance(e, PositionRipple) for e in effects) > 1:
+        return "several ripples together describe any curve over the position, and prove little"
+    if len(effects) >= THRESHOLD.some_effects and min(gains) < THRESHOLD.slight_effect * max(gains):
+        return "the smallest of so many effects may only correct what a larger one gets wrong"
+    for one, other in itertools.combinations(range(len(effects)), 2):
+        alone = max(gains[one], gains[other]) < THRESHOLD.residue * total
+        if alone and _alike(effects[one], effects[other]):
+            names = [type(effects[k]).__name__ for k in (one, other)]
+            return (f"{names[0]} and {names[1]} resemble each other, and either alone explains "
+                    "nearly all of it: one effect of another kind may be behind both")  # fmt: skip
+    return ""
+
+
+def _alike(one: AbstractEffect, other: AbstractEffect) -> bool:
+    """Whether one of two effects is known to resemble the other."""
+    names = type(one).__name__, type(other).__name__
+    return names[1] in type(one).look_alikes or names[0] in type(other).look_alikes
+
+
+def stands_out(gap: Gap, fit: Fit) -> bool:
+    """Whether the gap with the effects is wider than noise, as a fit knows it, accounts for.
+
+    A loop that hunts leaves a narrow gap in one run and a wide one in another; the record is but
+    one more run, so the widest of several counts.
+    """
+    noise = max(gap.floor, gap.widest)
+    return (
+        math.isfinite(noise)
+        and gap.after > THRESHOLD.excess * (2 if fit.noise.drift else 1) * noise
+    )
+
+
+def wider(gap: Gap, disturbance: Disturbance) -> bool:
+    """Whether effects leave a wider gap than sensor noise does, by itself, in a loop with them.
+
+    With friction and play a loop hunts, and no simulation follows it for long. Two gaps below the
+    floor differ by chance.
+    """
+    by_noise = not disturbance.large and gap.after <= THRESHOLD.excess * gap.floor
+    return max(gap.before, gap.floor) < gap.after and not by_noise
+
+
+def conclusion(
+    verdict: Verdict, findings: Sequence[Finding], gap: Gap, disturbance: Disturbance,
+    after: Omnibus, where: Sequence[Place], loose: str = "",
+) -> str:  # fmt: skip
+    """Return the verdict with what it rests on.
+
+    Parameters
+    ----------
+    verdict : str
+        The verdict.
+    findings : sequence of Finding
+        The effects found.
+    gap : Gap
+        The gap.
+    disturbance : Disturbance
+        The random forces.
+    after : Omnibus
+        The tests of what is left.
+    where : sequence of Place
+        Where the disagreement sits.
+    loose : str, optional
+        Why effects that leave nothing but noise may yet be no explanation.
+
+    Returns
+    -------
+    str
+        One to three sentences.
+    """
+    names = " and ".join(" or ".join(f.names) for f in findings)
+    name, p = after.worst
+    why = f"the test of {name} fails ({chance(p)})"
+    if after.passed:
+        why = "on data kept back the gap stays well above the noise floor"
+        if gap.after > gap.given:
+            why = "on data kept back the gap is wider than that of the model as given"
+    were, them = ("were", "them") if len(findings) > 1 else ("was", "it")
+    if verdict == "nothing missing":
+        text = "At the sensitivity of this record, what is left is noise."
+    elif verdict == "explained":
+        text = f"Missing {were} {names}; with {them}, what is left is noise."
+    elif verdict == "partly explained" and after.passed and loose:
+        text = f"With {names} what is left is noise; but {loose}."
+    elif verdict == "partly explained":
+        verb = "explain" if len(findings) > 1 else "explains"
+        text = (f"{names} {verb} part of the gap. Something else remains that no known effect "
+                f"accounts for: {why}.")  # fmt: skip
+    else:
+        text = f"Something is missing, but none of the known effects accounts for it: {why}."
+    left = [w for w in where if w.p_after < 1e-4]
+    if left and verdict in ("partly explained", "unknown"):
+        text += f" It shows along {' and '.join(w.axis for w in left[:2])}."
+    if disturbance.large:
+        kind = "A random force"
+        if disturbance.coloured:
+            kind = (f"A slowly varying random force of {number(disturbance.coloured, 2)} with a "
+                    f"time constant of {number(disturbance.time_constant, 2)} s")  # fmt: skip
+        text += (f" {kind} makes {100 * disturbance.share:.0f} % of the noise floor's variance: "
+                 "it is counted as noise here, and may hide a cause of its own.")  # fmt: skip
+    return text

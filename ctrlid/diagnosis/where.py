@@ -1,0 +1,45 @@
+"""Step 3: where along time, frequency, position, velocity and input innovations are not noise."""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from ..physics.equations import Array
+from .constancy import bin_edges, bin_index
+from .findings import Place
+from .noise_tests import Omnibus
+
+
+def places(before: Omnibus, after: Omnibus, units: Mapping[str, str]) -> tuple[Place, ...]:
+    """Return where the innovations are not noise, before and after; most telling first."""
+    found: list[Place] = []
+    for name, values in before.axes.items():
+        if name not in after.axes or len(after.axes[name]) != len(values):
+            continue
+        edges = bin_edges(values)
+        index = bin_index(values, edges)
+        count = np.maximum(np.bincount(index, minlength=len(edges) - 1), 1)
+        was, now = (np.bincount(index, o.z**2, minlength=len(count)) / count
+                    for o in (before, after))  # fmt: skip
+        p_was, p_now = (
+            min(1.0, 2 * min(o.p_values[f"{what} by {name}"] for what in ("mean", "size")))
+            for o in (before, after)
+        )
+        unit = units.get(name, "")
+        words = _words(name, unit, edges, before.z, index, count)
+        found.append(Place(name, unit, edges, was, now, p_was, p_now, words))
+    return tuple(sorted(found, key=lambda place: place.p_before))
+
+
+def _words(name: str, unit: str, edges: Array, z: Array, index: Array, count: Array) -> str:
+    mean = np.bincount(index, z, minlength=len(count)) / count
+    square = np.bincount(index, z**2, minlength=len(count)) / count
+    strength = np.sqrt(count) * np.abs(mean)
+    spread = np.sqrt(count / 2) * np.abs(square - 1)
+    k = int(np.argmax(np.maximum(strength, spread)))
+    between = f"{name} {edges[k]:.4g} to {edges[k + 1]:.4g} {unit}".rstrip()
+    if strength[k] >= spread[k]:
+        way = "above" if mean[k] > 0 else "below"
+        return f"at {between} the output lies {way} its prediction, by {abs(mean[k]):.2g} sigma"
+    way = "larger" if square[k] > 1 else "smaller"
+    return f"at {between} the prediction errors are {way} than noise"
