@@ -12,9 +12,9 @@ from scipy import signal
 
 import ctrlid as cid
 from ctrlid import effects
-from ctrlid.diagnosis.fresh_data import fresh_data
-from ctrlid.diagnosis.gap import drive
-from ctrlid.diagnosis.recalibration import base_model
+from ctrlid.diagnosis.fresh_data import choose_fresh_data
+from ctrlid.diagnosis.gap import prepare_simulation
+from ctrlid.diagnosis.recalibration import fit_base_model
 from ctrlid.diagnosis.thresholds import THRESHOLD
 from ctrlid.loop.simulation import Simulator
 
@@ -25,7 +25,7 @@ BAND = 50.0  # Hz, in which its forces are compared
 def force_error(loop: cid.Loop, record: cid.Record) -> float:
     """Return the relative RMS error of the simulated drive force, in per cent, below 50 Hz."""
     simulator = Simulator(loop, THRESHOLD.gap_integration_error, THRESHOLD.gap_steps)
-    z, r, d = drive(simulator, record)
+    z, r, d = prepare_simulation(simulator, record)
     u = simulator.run(z, r, d)[1]
     b, a = signal.butter(4, 2 * BAND * record.dt)
     error, size = (signal.filtfilt(b, a, GAIN * v)[500:] for v in (record.u - u, record.u))
@@ -66,8 +66,8 @@ def main() -> None:
     for effect in (effects.CoulombFriction(20.39 / 95.11), effects.ConstantForce(3.16 / 95.11)):
         published = published.with_effect(effect)
     # The phase of a ripple is private to a record.
-    fitted = base_model(found.loop, [record], ())
-    (moved,) = fresh_data(model, [], [pulses]).loops(fitted)
+    fitted = fit_base_model(found.loop, [record], ())
+    (moved,) = choose_fresh_data(model, [], [pulses]).loops(fitted)
     print("\nforce error below 50 Hz [%]          estimation      pulses   inverse model")
     for name, there, here in (("published symmetric model", published, published),
                               ("with the effects", found.loop, moved)):  # fmt: skip

@@ -52,7 +52,7 @@ import ctrlid as cid
 from ctrlid import effects
 from ctrlid.diagnosis.candidates import contains
 from ctrlid.diagnosis.fitted_model import Model
-from ctrlid.diagnosis.recalibration import base_model
+from ctrlid.diagnosis.recalibration import fit_base_model
 from ctrlid.effects import CATALOGUE, AbstractEffect, equivalents
 
 KINDS = ("named", "none", "outside", "two", "three", "lookalike", "inside")
@@ -264,14 +264,14 @@ def knowing(one: Draw, hidden_ones: Sequence[AbstractEffect], record: cid.Record
         for p in e.parameters()
         if math.isfinite(getattr(e, p.name))
     ]
-    return base_model(loop, [record], (*loop.free, *own))
+    return fit_base_model(loop, [record], (*loop.free, *own))
 
 
 def worth(
     one: Draw, hidden_ones: Sequence[AbstractEffect], record: cid.Record
 ) -> tuple[float, Model]:
     """Return the gain of log-likelihood of a refit that knows, and that refit."""
-    base = base_model(one.believed, [record], one.believed.free)
+    base = fit_base_model(one.believed, [record], one.believed.free)
     truth = knowing(one, hidden_ones, record)
     return truth.fit.value - base.fit.value, truth
 
@@ -290,8 +290,8 @@ def lost(one: Draw, record: cid.Record, seed: int) -> tuple[float, Model]:
     has to describe what is hidden, such as a hysteresis with its kinks.
     """
     quiet = one.run(one.loop, seed)
-    clean = base_model(one.loop, [quiet], one.loop.free)
-    base = base_model(one.believed, [record], one.believed.free)
+    clean = fit_base_model(one.loop, [quiet], one.loop.free)
+    base = fit_base_model(one.believed, [record], one.believed.free)
     return clean.fit.value - base.fit.value, clean
 
 
@@ -675,7 +675,7 @@ def answered(found: Any, case: Case) -> float:
     ]  # fmt: skip
     if case.spread and not case.effects:
         return math.nan
-    mine = base_model(loop, [case.record], (*loop.free, *own))
+    mine = fit_base_model(loop, [case.record], (*loop.free, *own))
     return case.truth.fit.value - mine.fit.value
 
 

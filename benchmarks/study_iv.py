@@ -38,7 +38,7 @@ from scipy.signal import lfilter
 import ctrlid as cid
 from ctrlid.estimation.identified_model import Estimate
 from ctrlid.estimation.likelihood.likelihood import pseudo_inverse
-from ctrlid.estimation.likelihood.maximization import begin, information
+from ctrlid.estimation.likelihood.maximization import begin_fit, information
 from ctrlid.estimation.likelihood.physics_fit import choose_noise, make_problem, start_values
 
 STEPS = (0.5, 0.2, 0.1, 0.03, 0.01, 0.005)
@@ -140,11 +140,11 @@ def information_bound(loop: cid.Loop, record: cid.Record) -> np.ndarray:
     The noise is as it is found with these values.
     """
     names = loop.free
-    start = begin(make_problem(loop, names, [record]), start_values(loop, names), None)
+    start = begin_fit(make_problem(loop, names, [record]), start_values(loop, names), None)
     fit = choose_noise(start)
     if fit.theta is not start.theta:  # the choice of the noise may have moved the parameters
         at = [out.trajectory for out in fit.filtered]
-        fit = begin(start.problem, start.theta, fit.noise, at)
+        fit = begin_fit(start.problem, start.theta, fit.noise, at)
     inverse = pseudo_inverse(information(fit)[0])
     return np.sqrt(np.diag(inverse)[: len(names)])
 

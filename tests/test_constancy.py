@@ -5,9 +5,9 @@ import numpy as np
 
 import ctrlid as cid
 from ctrlid import effects as E
-from ctrlid.diagnosis.constancy import bin_edges
-from ctrlid.diagnosis.noise_tests import omnibus
-from ctrlid.diagnosis.recalibration import base_model
+from ctrlid.diagnosis.constancy import find_bin_edges
+from ctrlid.diagnosis.noise_tests import run_noise_tests
+from ctrlid.diagnosis.recalibration import fit_base_model
 
 OF_INNOVATIONS = ("whiteness", "independence of past signals", "heavy tails", "isolated events")
 
@@ -32,7 +32,7 @@ def record_of(loop, seed, n=6000, noise=1e-4):
 
 
 def seen_in(loop, record):
-    return omnibus(base_model(loop, [record], loop.free).fit).p_values
+    return run_noise_tests(fit_base_model(loop, [record], loop.free).fit).p_values
 
 
 def test_nothing_is_seen_where_a_parameter_is_one_number():
@@ -73,7 +73,7 @@ def test_a_diagnosis_is_not_clean_where_a_gain_breathes():
 
 def test_edges_of_bins_have_no_rounding_errors_in_place_of_zero():
     values = np.concatenate([np.full(300, 4.7e-13), np.linspace(-1.0, 1.0, 300)])
-    edges = bin_edges(values)
+    edges = find_bin_edges(values)
     assert 0.0 in edges
     assert np.abs(edges[edges != 0.0]).min() > 1e-4
-    assert bin_edges(1e-12 * values).max() == 1e-12
+    assert find_bin_edges(1e-12 * values).max() == 1e-12

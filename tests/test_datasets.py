@@ -63,7 +63,7 @@ def test_emps(load):
     record = load("emps")
     check(record, 24841, 1e-3, {"r": "m", "u": "V", "y": "m"})
     assert record.valid.all()
-    assert np.max(np.abs(record.r - record.y)) < 1.2e-3  # it tracks: the channels are in place
+    assert np.max(np.abs(record.r - record.y)) < 1.2e-3  # it prepared: the channels are in place
     # The published force equation, M q" = 35.15 u - Fv q' - Fc sign(q') - offset, holds.
     window = np.ones(41) / 41
     q = np.convolve(record.y, window, "same")

@@ -16,11 +16,11 @@ from ctrlid.diagnosis import wording
 from ctrlid.diagnosis.findings import Calibrated, Candidate, Disturbance, Finding, Gap, Place
 from ctrlid.diagnosis.loading import load_diagnosis
 from ctrlid.diagnosis.noise_tests import alarm_level
-from ctrlid.diagnosis.recalibration import base_model
+from ctrlid.diagnosis.recalibration import fit_base_model
 from ctrlid.diagnosis.result import Diagnosis
 from ctrlid.diagnosis.saving import SavedLoop
 from ctrlid.diagnosis.thresholds import THRESHOLD
-from ctrlid.diagnosis.verdict import stands_out
+from ctrlid.diagnosis.verdict import gap_stands_out
 from ctrlid.loop.simulation import Simulator
 from ctrlid.reporting import pictures as _pictures
 
@@ -348,9 +348,9 @@ def test_what_is_no_saved_diagnosis_is_refused(found, tmp_path):
 
 
 def test_what_is_no_text_is_left_out_and_said(found, tmp_path):
-    odd = replace(found["explained"], extra={"machine": object(), "n": 3})
+    odd = replace(found["explained"], extra={"plant": object(), "n": 3})
     path = odd.save(tmp_path / "f.json")
-    assert json.loads(path.read_text("utf-8"))["left out of extra"] == ["machine"]
+    assert json.loads(path.read_text("utf-8"))["left out of extra"] == ["plant"]
     assert load_diagnosis(path).extra == {"n": 3}
 
 
@@ -475,7 +475,7 @@ def test_page(found, verdict, tmp_path):
 def test_a_gap_where_only_the_given_model_can_be_simulated():
     nothing = np.zeros(3)
     gap = Gap("closed-loop simulation", 2.7e-3, math.inf, math.inf, math.nan, "m", *[nothing] * 4)
-    rows = {label: size for label, size, _ in wording.gap_rows(gap)}
+    rows = {label: size for label, size, _ in wording.list_gap_rows(gap)}
     assert rows["the model as given"] == "2.70 mm"
     assert rows["recalibrated"] == "RUNS AWAY"
 
@@ -491,9 +491,9 @@ def test_a_window_far_from_rest_finds_its_start():
     )
     record = cid.simulate(loop, r, sensor_noise=2e-6, seed=2)[3500:]
     assert abs(record.y[0] - op.output) > 4e-3
-    window = gap_of.whole(record)
+    window = gap_of.make_window(record)
     error = gap_of.root_mean_square(
-        [window], [gap_of.output(loop, window, "closed-loop simulation")]
+        [window], [gap_of.simulate_window(loop, window, "closed-loop simulation")]
     )
     assert error < 1e-5
 
@@ -508,12 +508,12 @@ def test_an_unknown_force_is_not_paid_for_by_an_absurd_start():
     force = 0.6 * np.sin(np.arange(600) / 40)
     record = cid.simulate(loop, r, sensor_noise=1e-6, d=force, seed=1)
     simulator = Simulator(loop, THRESHOLD.gap_integration_error, THRESHOLD.gap_steps)
-    x, v, lag = gap_of.drive(simulator, replace(record, u=record.u - force))[0][:3]
+    x, v, lag = gap_of.prepare_simulation(simulator, replace(record, u=record.u - force))[0][:3]
     assert abs(x) < 5e-3
     assert abs(v) < 0.5
     assert abs(lag) < 20
     still = replace(record, y=np.zeros(600), u=np.zeros(600), r=np.zeros(600))
-    assert np.allclose(gap_of.drive(simulator, still)[0], 0.0, atol=1e-6)
+    assert np.allclose(gap_of.prepare_simulation(simulator, still)[0], 0.0, atol=1e-6)
 
 
 def test_noise_that_parts_a_loop_from_itself_explains_a_gap():
@@ -524,17 +524,18 @@ def test_noise_that_parts_a_loop_from_itself_explains_a_gap():
     rough = calm.with_effect(E.PositionRipple(amplitude=0.25, period=0.01, phase=0.0))
     r = cid.random_binary(3000, amplitude=0.03, hold=90, seed=3)
     record = cid.simulate(rough, r, sensor_noise=1e-4, force_noise=0.005, seed=4)
-    windows, fitted = [gap_of.whole(record)], base_model(rough, [record], ("k",)).fit
+    windows, fitted = [gap_of.make_window(record)], fit_base_model(rough, [record], ("k",)).fit
     kind = "closed-loop simulation"
     floors = [
-        gap_of.floor_of([loop], fitted, windows, kind, THRESHOLD.floor_more_runs) for loop in (rough, calm)
+        gap_of.compute_floor([loop], fitted, windows, kind, THRESHOLD.floor_more_runs)
+        for loop in (rough, calm)
     ]
     assert floors[0].widest > 2 * floors[0].both
     assert floors[1].widest < 1.2 * floors[1].both
     for loop, floor in zip((rough, calm), floors, strict=True):
         left = 2 * floor.both
         gap = Gap(kind, 1.0, 1.0, left, floor.both, "m", *[np.zeros(3)] * 4, floor.widest)
-        assert stands_out(gap, fitted) == (loop is calm)
-        assert ("differ in noise alone" in wording.shrinking(replace(gap, before=0.9))) == (
-            loop is rough
-        )
+        assert gap_stands_out(gap, fitted) == (loop is calm)
+        assert (
+            "differ in noise alone" in wording.describe_shrinking(replace(gap, before=0.9))
+        ) == (loop is rough)

@@ -13,28 +13,28 @@ from scipy import signal, stats
 import ctrlid as cid
 from ctrlid import effects as E
 from ctrlid.diagnosis import removal, replicas, selection
-from ctrlid.diagnosis.candidates import _there, contains
-from ctrlid.diagnosis.experiment import _survives, separating_experiment
+from ctrlid.diagnosis.candidates import _has_effect, contains
+from ctrlid.diagnosis.experiment import _loop_survives, find_experiment
 from ctrlid.diagnosis.findings import Disturbance, Finding, Gap
-from ctrlid.diagnosis.fitted_model import Model, spared, whole
-from ctrlid.diagnosis.growth import _foreseen, _stands_in, search, without_worst
-from ctrlid.diagnosis.noise_tests import Omnibus, _shape, omnibus
-from ctrlid.diagnosis.recalibration import base_model
-from ctrlid.diagnosis.refitting import refit, timed, under
-from ctrlid.diagnosis.removal import cut, fused, reordered
-from ctrlid.diagnosis.replicas import replica
-from ctrlid.diagnosis.rivals import _close, rivals
-from ctrlid.diagnosis.scans import scanned
-from ctrlid.diagnosis.screening import attempt, attempt_at
-from ctrlid.diagnosis.selection import Step, one_round, plainer
+from ctrlid.diagnosis.fitted_model import Model, drop_linearization, with_linearization
+from ctrlid.diagnosis.growth import _is_stand_in, _look_back, drop_worst_effect, search_effects
+from ctrlid.diagnosis.noise_tests import NoiseTests, _deviates_of_force, run_noise_tests
+from ctrlid.diagnosis.recalibration import fit_base_model
+from ctrlid.diagnosis.refitting import place_instants, refit_candidate, refit_under_noise
+from ctrlid.diagnosis.removal import fuse_effects, order_last_effect, refit_without_effect
+from ctrlid.diagnosis.replicas import make_replica
+from ctrlid.diagnosis.rivals import _find_close, find_rivals
+from ctrlid.diagnosis.scans import scan_candidate
+from ctrlid.diagnosis.screening import screen_at, screen_candidate
+from ctrlid.diagnosis.selection import Round, prefer_plainer, run_round
 from ctrlid.diagnosis.thresholds import THRESHOLD
-from ctrlid.diagnosis.verdict import conclusion, doubt_of_all, wider
-from ctrlid.estimation.likelihood.filter_data import make_track
+from ctrlid.diagnosis.verdict import find_doubt, gap_is_wider, write_conclusion
+from ctrlid.estimation.likelihood.filter_data import make_filter_data
 from ctrlid.estimation.likelihood.kalman_filter import first_guess
-from ctrlid.estimation.likelihood.likelihood import relinearized
-from ctrlid.estimation.likelihood.maximization import begin, climb
+from ctrlid.estimation.likelihood.likelihood import linearize_again
+from ctrlid.estimation.likelihood.maximization import begin_fit, maximize
 from ctrlid.estimation.likelihood.physics_fit import choose_noise, make_problem, start_values
-from ctrlid.estimation.likelihood.sampled_plant import machine_for
+from ctrlid.estimation.likelihood.sampled_plant import sampled_plant_for
 from ctrlid.loop.simulation import Simulator
 
 
@@ -59,12 +59,14 @@ def record_of(loop, effect, swing, noise, seed, n=3000):
 
 def test_a_small_zone_is_found_from_a_large_start():
     loop = drive()
-    base = base_model(loop, [record_of(loop, E.InputDeadZone(0.004), 0.3, 1e-5, 9100)], loop.free)
+    base = fit_base_model(
+        loop, [record_of(loop, E.InputDeadZone(0.004), 0.3, 1e-5, 9100)], loop.free
+    )
     start = E.InputDeadZone(width=2.0)
-    assert attempt_at(base, start).promise < 0
-    trial = attempt(base, start)
-    assert trial.promise > 0
-    found = refit(base, trial)
+    assert screen_at(base, start).score < 0
+    trial = screen_candidate(base, start)
+    assert trial.score > 0
+    found = refit_candidate(base, trial)
     assert found.fitted.width == pytest.approx(0.004, rel=0.1)
 
 
@@ -81,16 +83,16 @@ def one_level():
     """A levitation at one height: a constant force does what its magnet constant does."""
     loop = levitation()
     record = record_of(loop, E.CoulombFriction(0.1), 1e-4, 1e-5, 9200)
-    base = base_model(loop, [record], loop.free)
-    plain, more = (refit(base, attempt(base, e)) for e in (
+    base = fit_base_model(loop, [record], loop.free)
+    plain, more = (refit_candidate(base, screen_candidate(base, e)) for e in (
         E.CoulombFriction(0.0), E.AsymmetricCoulombFriction(0.0, 0.0)))  # fmt: skip
     return base, plain, more
 
 
 def test_what_the_record_says_nothing_of_stays_possible(one_level):
     _, plain, more = one_level
-    assert plain.merit > more.merit
-    assert [t.name for t in rivals(plain, [more])] == ["AsymmetricCoulombFriction"]
+    assert plain.net_gain > more.net_gain
+    assert [t.name for t in find_rivals(plain, [more])] == ["AsymmetricCoulombFriction"]
 
 
 @pytest.mark.parametrize(
@@ -102,10 +104,10 @@ def test_a_gain_too_small_to_prove_anything_is_still_compared(
     """Beyond what the filter's approximations gain, it has to be paid for, or stays possible."""
     base, plain, rich = one_level
     rich = replace(rich, gain=plain.gain + 10.0)
-    monkeypatch.setattr(selection, "more_than_simple", lambda *_: more)
-    trials = selection._simplest(base, [rich, plain])
+    monkeypatch.setattr(selection, "gain_beyond_simple", lambda *_: more)
+    trials = selection._prefer_simplest(base, [rich, plain])
     assert trials[0].name == (plain.name, rich.name)[first]
-    assert all(np.isfinite(t.merit) for t in trials) == left
+    assert all(np.isfinite(t.net_gain) for t in trials) == left
 
 
 def test_the_simple_effect_of_a_replica_climbs_from_where_the_richer_one_does(
@@ -115,10 +117,10 @@ def test_the_simple_effect_of_a_replica_climbs_from_where_the_richer_one_does(
     base, plain, rich = one_level
     copy = plain.model
     stuck = replace(copy, fit=replace(copy.fit, theta=1.2 * copy.fit.theta))
-    stuck = replace(stuck, fit=relinearized(stuck.fit))
+    stuck = replace(stuck, fit=linearize_again(stuck.fit))
     assert stuck.fit.value < copy.fit.value - 100.0
-    monkeypatch.setattr(replicas, "replica", lambda model: stuck)
-    won = replicas.more_than_simple(base, rich, plain)
+    monkeypatch.setattr(replicas, "make_replica", lambda model: stuck)
+    won = replicas.gain_beyond_simple(base, rich, plain)
     assert won == pytest.approx(rich.gain - plain.gain, abs=2 * THRESHOLD.hint)
 
 
@@ -126,47 +128,49 @@ def test_candidates_are_compared_under_the_same_random_force():
     """A slow force that stood for the missing spring may stay beside one candidate only."""
     loop = levitation()
     record = record_of(loop, E.LinearStiffness(120.0), 2e-4, 2e-6, 9210)
-    base = base_model(loop, [record], loop.free)
-    right = refit(base, attempt(base, E.LinearStiffness(0.0)))
-    assert selection._apart(right, right) is False
+    base = fit_base_model(loop, [record], loop.free)
+    right = refit_candidate(base, screen_candidate(base, E.LinearStiffness(0.0)))
+    assert selection._forces_differ(right, right) is False
     good = right.model.fit.noise
     slow = replace(good, memory=0.999, drift=1e6)
     wrong = replace(right.model, fit=replace(right.model.fit, noise=slow))
-    wrong = replace(wrong, fit=relinearized(wrong.fit))
+    wrong = replace(wrong, fit=linearize_again(wrong.fit))
     lost = replace(right, model=wrong, gain=wrong.fit.value - base.fit.value)
     assert lost.gain < right.gain - 10.0
-    assert selection._apart(lost, right)
-    assert under(base, lost, good).gain == pytest.approx(right.gain, abs=0.5)
-    assert under(base, right, slow).gain >= right.gain  # never lower
+    assert selection._forces_differ(lost, right)
+    assert refit_under_noise(base, lost, good).gain == pytest.approx(right.gain, abs=0.5)
+    assert refit_under_noise(base, right, slow).gain >= right.gain  # never lower
 
 
 def test_what_the_record_excludes_does_not():
     loop = drive()
     record = record_of(loop, E.CoulombFriction(0.5), 0.3, 1e-4, 9300)
-    base = base_model(loop, [record], loop.free)
-    plain, more = (refit(base, attempt(base, e)) for e in (
+    base = fit_base_model(loop, [record], loop.free)
+    plain, more = (refit_candidate(base, screen_candidate(base, e)) for e in (
         E.CoulombFriction(0.0), E.AsymmetricCoulombFriction(0.0, 0.0)))  # fmt: skip
     assert plain.gain > 100
-    assert rivals(plain, [more]) == ()
+    assert find_rivals(plain, [more]) == ()
     # One record in five gains so much by a difference that is none: here it is below a fifth.
     by_chance = replace(more, gain=plain.gain + 2 * THRESHOLD.hint)
-    assert rivals(plain, [by_chance]) == ()
+    assert find_rivals(plain, [by_chance]) == ()
 
 
 def test_the_simple_effect_begins_where_the_larger_one_ended(one_level):
     base, plain, more = one_level
-    poor = attempt_at(base, E.CoulombFriction(5.0))  # from where no refit would find it
-    again = plainer(base, more, [poor])
+    poor = screen_at(base, E.CoulombFriction(5.0))  # from where no refit would find it
+    again = prefer_plainer(base, more, [poor])
     assert again.name == "CoulombFriction"
     assert again.gain == pytest.approx(plain.gain, abs=1.0)
-    assert np.isfinite(again.merit)
+    assert np.isfinite(again.net_gain)
 
 
 def test_the_shape_of_gaussian_noise_is_that_of_scipy():
     x = np.random.default_rng(1).standard_normal(5000)
     expected = [stats.skewtest(x).statistic, stats.kurtosistest(x).statistic]
-    np.testing.assert_allclose(_shape(x), expected, atol=0.02)  # but for a chance correlation
-    assert _shape(np.zeros(100)) == []
+    np.testing.assert_allclose(
+        _deviates_of_force(x), expected, atol=0.02
+    )  # but for a chance correlation
+    assert _deviates_of_force(np.zeros(100)) == []
 
 
 def test_the_shape_of_a_slow_gaussian_force_is_no_alarm():
@@ -174,7 +178,7 @@ def test_the_shape_of_a_slow_gaussian_force_is_no_alarm():
     sizes = []
     for _ in range(300):
         x = signal.lfilter([1.0], [1.0, -0.97], rng.standard_normal(5000))[1000:]
-        sizes.append(stats.chi2.sf(np.sum(np.square(_shape(x))), 2))
+        sizes.append(stats.chi2.sf(np.sum(np.square(_deviates_of_force(x))), 2))
     assert np.mean(np.array(sizes) < 0.1) == pytest.approx(0.1, abs=0.05)
     assert min(sizes) > 1e-5
 
@@ -199,9 +203,9 @@ def test_a_force_of_pulses_is_not_taken_for_a_random_one():
     for real, force in ((loop.with_effect(Pulses(0.15)), 0 * random), (loop, random)):
         d = -force * loop.point.input / (2 * 9.81)  # what the magnet pulls more or less, in volts
         record = cid.simulate(real, r, d=d, sensor_noise=1e-5, seed=9401)
-        fit = base_model(loop, [replace(record, u=record.u - d)], loop.free).fit
+        fit = fit_base_model(loop, [replace(record, u=record.u - d)], loop.free).fit
         assert fit.noise.drift > 0
-        tests.append(omnibus(fit).p_values["shape of the random force"])
+        tests.append(run_noise_tests(fit).p_values["shape of the random force"])
     assert tests[0] < 1e-5 < 1e-3 < tests[1]
 
 
@@ -209,26 +213,29 @@ def test_a_curve_that_gains_more_than_chance_stays_possible():
     loop = drive()
     record = record_of(loop, E.CoulombFriction(0.5), 0.3, 1e-3, 9310)
     plain, curve = refitted(loop, record, E.CoulombFriction(0.0), E.StribeckFriction(0.0, 5.0))
-    assert plain.merit > curve.merit
+    assert plain.net_gain > curve.net_gain
     by_chance, by_more = (replace(curve, gain=plain.gain + d) for d in (0.5, 2.0))
-    assert rivals(plain, [by_chance]) == ()
-    assert [t.name for t in rivals(plain, [by_more])] == ["StribeckFriction"]
+    assert find_rivals(plain, [by_chance]) == ()
+    assert [t.name for t in find_rivals(plain, [by_more])] == ["StribeckFriction"]
 
 
 def test_what_took_the_place_of_another_has_its_rivals():
     loop = levitation()
     record = record_of(loop, E.ActuatorLag(1e-3), 1e-4, 1e-5, 9320)
-    base = base_model(loop, [record], loop.free)
-    lag, late = (refit(base, attempt(base, e)) for e in (E.ActuatorLag(5e-4), E.InputDelay(0.0)))
-    step = Step(base, (lag, late), lag)
-    assert lag.merit > late.merit
-    assert [t.name for t in _close(lag, [step])] == ["InputDelay"]
-    assert [t.name for t in _close(late, [step])] == ["ActuatorLag"]
+    base = fit_base_model(loop, [record], loop.free)
+    lag, late = (
+        refit_candidate(base, screen_candidate(base, e))
+        for e in (E.ActuatorLag(5e-4), E.InputDelay(0.0))
+    )
+    step = Round(base, (lag, late), lag)
+    assert lag.net_gain > late.net_gain
+    assert [t.name for t in _find_close(lag, [step])] == ["InputDelay"]
+    assert [t.name for t in _find_close(late, [step])] == ["ActuatorLag"]
 
 
 def refitted(loop, record, *candidates):
-    base = base_model(loop, [record], loop.free)
-    return [refit(base, attempt(base, e)) for e in candidates]
+    base = fit_base_model(loop, [record], loop.free)
+    return [refit_candidate(base, screen_candidate(base, e)) for e in candidates]
 
 
 def test_an_experiment_is_recommended_that_tells():
@@ -236,12 +243,12 @@ def test_an_experiment_is_recommended_that_tells():
     loop = levitation()
     record = record_of(loop, E.ForceExponent(n=2.2), 1e-4, 2e-6, 9500)
     best, other = refitted(loop, record, E.ForceExponent(n=2.0), E.PositionOffset(0.0))
-    words, reference = separating_experiment(best, [other], record)
+    words, reference = find_experiment(best, [other], record)
     assert "Recommended: " in words
     real = loop.with_effect(E.ForceExponent(n=2.2))
     second = cid.simulate(real, reference, sensor_noise=2e-6, seed=9502)
     best, other = refitted(loop, second, E.ForceExponent(n=2.0), E.PositionOffset(0.0))
-    assert rivals(best, [other]) == ()
+    assert find_rivals(best, [other]) == ()
 
 
 def test_no_experiment_is_recommended_where_none_tells():
@@ -250,7 +257,7 @@ def test_no_experiment_is_recommended_where_none_tells():
     record = record_of(loop, E.InputDelay(2e-5), 1e-4, 2e-7, 9600)
     best, other = refitted(loop, record, E.InputDelay(1e-5), E.SensorLag(1e-5))
     assert abs(best.gain - other.gain) < 3 < best.gain
-    words, reference = separating_experiment(best, [other], record)
+    words, reference = find_experiment(best, [other], record)
     assert reference is None
     assert "No steps of the reference" in words
 
@@ -265,17 +272,17 @@ def test_an_experiment_under_which_the_plant_falls_is_not_recommended():
     r = cid.random_binary(6000, amplitude=0.02, hold=60, seed=3)
     record = cid.simulate(loop, r, sensor_noise=1e-4, seed=4)
     simulator = Simulator(loop, 1e-6, 8)
-    assert _survives(simulator, r, record)
+    assert _loop_survives(simulator, r, record)
     bold = cid.random_binary(6000, amplitude=0.4, hold=60, seed=3)
     assert np.ptp(simulator.run(simulator.start(None), bold, np.zeros(6000))[0]) > 3.0
-    assert not _survives(simulator, bold, record)
+    assert not _loop_survives(simulator, bold, record)
 
 
 def test_a_filter_that_lost_the_record_passes_no_test():
     loop = drive()
     record = record_of(loop, E.CoulombFriction(0.3), 0.3, 1e-4, 9701)
-    fit = base_model(loop, [record], loop.free).fit
-    assert omnibus(replace(fit, value=-np.inf)).worst == ("following the record", 0.0)
+    fit = fit_base_model(loop, [record], loop.free).fit
+    assert run_noise_tests(replace(fit, value=-np.inf)).worst == ("following the record", 0.0)
 
 
 def test_records_for_validation_are_sampled_as_the_loop_is():
@@ -288,14 +295,16 @@ def test_records_for_validation_are_sampled_as_the_loop_is():
 def test_a_model_without_its_arrays_can_be_searched_on():
     loop = drive()
     record = record_of(loop, E.CoulombFriction(0.3), 0.3, 1e-4, 9700)
-    base = base_model(loop, [record], loop.free)
-    lean = Model(base.loop, spared(base.fit))
+    base = fit_base_model(loop, [record], loop.free)
+    lean = Model(base.loop, drop_linearization(base.fit))
     assert not lean.fit.linearized
-    assert whole(base) is base
-    full = whole(lean)
+    assert with_linearization(base) is base
+    full = with_linearization(lean)
     assert full.fit.value == pytest.approx(base.fit.value, abs=0.1)
     effect = E.PeriodicForce(amplitude=0.0, frequency=1.0, phase=0.0)
-    assert scanned(full, effect).promise == pytest.approx(scanned(base, effect).promise, rel=0.05)
+    assert scan_candidate(full, effect).score == pytest.approx(
+        scan_candidate(base, effect).score, rel=0.05
+    )
 
 
 def test_a_motion_far_faster_than_the_samples_is_refused():
@@ -309,7 +318,7 @@ def test_a_motion_far_faster_than_the_samples_is_refused():
 def test_many_effects_at_once_are_no_explanation():
     gap = Gap("closed-loop simulation", 3.0, 2.0, 1.1, 1.0, "m", *[np.zeros(3)] * 4)
     quiet = Disturbance(0.0, 0.0, np.nan, 0.0)
-    tests = Omnibus({"whiteness": 0.5}, np.zeros(3), {})
+    tests = NoiseTests({"whiteness": 0.5}, np.zeros(3), {})
     kinds = (
         E.CoulombFriction(0.1),
         E.LinearStiffness(1.0),
@@ -317,8 +326,8 @@ def test_many_effects_at_once_are_no_explanation():
         E.QuadraticDrag(1.0),
     )
     findings = [Finding(e, {}, (), (), 50.0) for e in kinds]
-    loose = doubt_of_all(kinds, [50.0] * 4, 200.0)
-    text = conclusion("partly explained", findings, gap, quiet, tests, (), loose)
+    loose = find_doubt(kinds, [50.0] * 4, 200.0)
+    text = write_conclusion("partly explained", findings, gap, quiet, tests, (), loose)
     assert text.startswith("With CoulombFriction and LinearStiffness and")
     assert "so many effects at once describe almost any error" in text
 
@@ -353,9 +362,9 @@ def test_a_replica_is_fitted_from_its_own_trajectory():
     record = cid.simulate(loop.with_effect(hidden), r, sensor_noise=7.5e-6, seed=9801)
     real = loop.with_effect(hidden)
     names = ("K", "PositionRipple.amplitude", "PositionRipple.period", "PositionRipple.phase")
-    model = base_model(real, [record], names)
+    model = fit_base_model(real, [record], names)
     for seed in (0, 1):
-        copy = replica(model, seed)
+        copy = make_replica(model, seed)
         np.testing.assert_allclose(copy.fit.theta[1], model.fit.theta[1], rtol=0.05)
         assert copy.fit.value > model.fit.value - 300
 
@@ -381,10 +390,10 @@ def test_a_limit_is_found_behind_a_random_force_that_stood_for_it():
     r = cid.random_binary(12000, amplitude=0.045, hold=40, around=0.8, seed=9300)
     record = cid.simulate(real, r, sensor_noise=3e-3, seed=9301)
     believed = loop.with_parameters({"k": 6.1e-5, "outlet": 7.1e-5})
-    base = base_model(believed, [record], believed.free)
+    base = fit_base_model(believed, [record], believed.free)
     assert base.fit.noise.drift > 0  # there is none in the record
     (start,) = E.StateLimit.candidates(base.fitted, record)
-    trial = refit(base, scanned(base, start))
+    trial = refit_candidate(base, scan_candidate(base, start))
     assert trial.model.fit.noise.drift == 0
     assert trial.fitted.upper == pytest.approx(0.82, abs=2e-4)
     assert trial.model.fitted.parameters["k"] == pytest.approx(5.9e-5, rel=0.02)
@@ -401,11 +410,11 @@ def test_an_overflow_is_looked_for_from_above():
     loop = cid.Loop(plant, cid.PID(kp=0.5, ki=0.005), dt=4.0, at=at, free=("k",))
     full = at.states[0] * 1.3
     record = record_of(loop, E.StateLimit("h1", full, "h2", share=0.3), 1.5, 1e-2, 9320)
-    base = base_model(loop, [record], loop.free)
+    base = fit_base_model(loop, [record], loop.free)
     start, _ = E.StateLimit.candidates(base.fitted, record)
-    trial = scanned(base, start)
-    assert trial.promise > 20
-    fitted = refit(base, trial).fitted
+    trial = scan_candidate(base, start)
+    assert trial.score > 20
+    fitted = refit_candidate(base, trial).fitted
     assert (fitted.upper, fitted.share) == pytest.approx((full, 0.3), rel=0.1)
 
 
@@ -414,19 +423,19 @@ def test_friction_that_would_push_is_none():
     assert "push" in E.AsymmetricCoulombFriction(fc=0.1, difference=-0.25).doubt()
     loop = levitation()
     record = record_of(loop, E.ConstantForce(-0.5), 4e-4, 1e-6, 9330)
-    base = base_model(loop, [record], loop.free)
+    base = fit_base_model(loop, [record], loop.free)
     start = E.AsymmetricCoulombFriction(fc=0.0, difference=0.0)
-    assert "push" in refit(base, attempt_at(base, start)).remark
+    assert "push" in refit_candidate(base, screen_at(base, start)).remark
 
 
 def test_waves_that_two_levels_see_nearly_alike_are_fitted():
     loop = levitation()
     ripple = E.PositionRipple(amplitude=0.4, period=2.3e-4, phase=1.0)
     record = record_of(loop, ripple, 2.5e-4, 1e-6, 9340, n=6000)
-    base = base_model(loop, [record], loop.free)
+    base = fit_base_model(loop, [record], loop.free)
     (start,) = E.PositionRipple.candidates(base.fitted, record)
-    assert scanned(base, start).others
-    step = one_round(base, [start], lambda f, given: [f(x) for x in given])
+    assert scan_candidate(base, start).others
+    step = run_round(base, [start], lambda f, given: [f(x) for x in given])
     assert step.best is not None
     assert step.best.fitted.period == pytest.approx(2.3e-4, rel=0.005)
     assert step.best.fitted.amplitude == pytest.approx(0.4, rel=0.1)
@@ -437,37 +446,37 @@ def test_a_wave_that_half_the_samples_pass_in_a_hurry_is_found():
     record = record_of(loop, E.PositionRipple(amplitude=1.0, period=3e-4, phase=1.0), 4e-3, 4e-6,
                        9350, n=4000)  # fmt: skip
     assert 4 * np.median(np.abs(np.diff(record.y))) > 3e-4
-    base = base_model(loop, [record], loop.free)
+    base = fit_base_model(loop, [record], loop.free)
     (start,) = E.PositionRipple.candidates(base.fitted, record)
-    assert scanned(base, start).effect.period == pytest.approx(3e-4, rel=0.01)
+    assert scan_candidate(base, start).effect.period == pytest.approx(3e-4, rel=0.01)
 
 
 def test_a_limit_of_the_input_is_found_wherever_it_cuts():
     loop = levitation()
     record = record_of(loop, E.InputSaturation(-np.inf, 4.0), 6e-4, 1e-6, 9350)
-    base = base_model(loop, [record], loop.free)
+    base = fit_base_model(loop, [record], loop.free)
     (start,) = E.InputSaturation.candidates(base.fitted, record)
-    trial = refit(base, scanned(base, start))
+    trial = refit_candidate(base, scan_candidate(base, start))
     assert trial.fitted.upper == pytest.approx(4.0, abs=0.01)
     assert trial.gain > 1000
 
 
 def test_lists_that_prove_little():
     ripples = [E.PositionRipple(0.1, period, 0.0) for period in (1e-3, 2e-3)]
-    assert "several ripples" in doubt_of_all(ripples, [100.0, 90.0], 200.0)
+    assert "several ripples" in find_doubt(ripples, [100.0, 90.0], 200.0)
     three = [E.QuadraticDrag(1.0), E.LinearStiffness(1.0), E.EddyCurrentDamping(0.1)]
-    assert not doubt_of_all(three, [900.0, 300.0, 60.0], 1200.0)
-    assert "larger one gets wrong" in doubt_of_all(three, [900.0, 24.0, 11.0], 1000.0)
-    assert not doubt_of_all(three[:2], [900.0, 11.0], 1000.0)
+    assert not find_doubt(three, [900.0, 300.0, 60.0], 1200.0)
+    assert "larger one gets wrong" in find_doubt(three, [900.0, 24.0, 11.0], 1000.0)
+    assert not find_doubt(three[:2], [900.0, 11.0], 1000.0)
 
 
 def test_two_look_alikes_of_which_either_would_do_are_one_thing():
     """A limited rate is nearly a delay and nearly a lag; the rest is filled with the other."""
     both = [E.InputDelay(1e-3), E.ActuatorLag(1e-3)]
-    text = doubt_of_all(both, [80.0, 57.0], 2050.0)
+    text = find_doubt(both, [80.0, 57.0], 2050.0)
     assert "InputDelay and ActuatorLag resemble each other" in text
-    assert not doubt_of_all(both, [1240.0, 240.0], 4200.0)
-    assert not doubt_of_all([both[0], E.LinearStiffness(1.0)], [80.0, 57.0], 4100.0)
+    assert not find_doubt(both, [1240.0, 240.0], 4200.0)
+    assert not find_doubt([both[0], E.LinearStiffness(1.0)], [80.0, 57.0], 4100.0)
 
 
 def test_a_filter_begins_where_a_curved_sensor_points():
@@ -475,9 +484,9 @@ def test_a_filter_begins_where_a_curved_sensor_points():
     truth = np.linspace(0.010, 0.015, 500)
     y = truth + 20.0 * (truth - loop.point.output) ** 2
     record = cid.Record(r=y, u=np.full(500, loop.point.input), y=y, dt=2e-3)
-    machine = machine_for(loop, (), record)
-    begun = first_guess(machine, make_track(loop, record)).predicted
-    position = list(machine.e.states).index("x")
+    plant = sampled_plant_for(loop, (), record)
+    begun = first_guess(plant, make_filter_data(loop, record)).predicted
+    position = list(plant.e.states).index("x")
     np.testing.assert_allclose(begun[:, position], truth, rtol=1e-6)
 
 
@@ -496,14 +505,14 @@ def test_limits_far_inside_are_found_though_none_promises_anything():
     real, believed = (cid.Loop(ball(*p), C, dt=0.01, at=at, free=("c", "w"))
                       for p in ((9.37, 19.2), (8.66, 19.74)))  # fmt: skip
     record = record_of(real, E.InputSaturation(-3.4, 3.4), 0.05, 5e-4, 9700, 4000)
-    base = base_model(believed, [record], believed.free)
+    base = fit_base_model(believed, [record], believed.free)
     pool = [E.InputSaturatingGain(0.0), *E.InputSaturation.candidates(believed, record)]
-    step = one_round(base, pool, lambda f, given: [f(x) for x in given])
+    step = run_round(base, pool, lambda f, given: [f(x) for x in given])
     assert step.best is not None
     assert step.best.name == "InputSaturation"
     assert step.best.fitted.upper == pytest.approx(3.4, rel=1e-3)
-    first, _ = sorted(step.trials, key=lambda t: -t.merit)
-    assert first.merit > 1.5 * refit(base, scanned(base, pool[1])).merit
+    first, _ = sorted(step.trials, key=lambda t: -t.net_gain)
+    assert first.net_gain > 1.5 * refit_candidate(base, scan_candidate(base, pool[1])).net_gain
 
 
 def test_dry_friction_is_not_lost_to_a_curve_that_contains_it():
@@ -526,15 +535,15 @@ def test_dry_friction_is_not_lost_to_a_curve_that_contains_it():
     r = cid.random_binary(10_000, amplitude=3e-4, hold=40, around=0.01, seed=5)
     rig = real.with_effect(E.CoulombFriction(0.082))
     record = cid.simulate(rig, r, sensor_noise=5e-6, seed=6)
-    base = base_model(believed, [record], believed.free)
+    base = fit_base_model(believed, [record], believed.free)
     friction, curve = (kind.candidates(believed, record)[0]
                        for kind in (E.CoulombFriction, E.StribeckFriction))  # fmt: skip
-    alone, other = (refit(base, attempt(base, e)) for e in (friction, curve))
-    assert alone.merit < other.merit
-    step = one_round(base, [friction, curve], lambda f, given: [f(x) for x in given])
+    alone, other = (refit_candidate(base, screen_candidate(base, e)) for e in (friction, curve))
+    assert alone.net_gain < other.net_gain
+    step = run_round(base, [friction, curve], lambda f, given: [f(x) for x in given])
     assert step.best is not None
     assert step.best.name == "CoulombFriction"
-    assert step.best.merit > alone.merit + 50
+    assert step.best.net_gain > alone.net_gain + 50
 
 
 def test_one_asymmetric_friction_is_not_called_two_effects():
@@ -542,14 +551,14 @@ def test_one_asymmetric_friction_is_not_called_two_effects():
     record = record_of(loop, E.AsymmetricCoulombFriction(0.2, 0.15), 4e-4, 1e-6, 9400)
     pair = loop.with_effect(E.CoulombFriction(0.2)).with_effect(E.ConstantForce(0.05))
     names = ("K", "CoulombFriction.fc", "ConstantForce.bias")
-    model = base_model(pair, [record], names)
-    base = base_model(loop, [record], loop.free)
-    rounds = (Step(base, (attempt(base, E.AsymmetricCoulombFriction(0.1, 0.0)),), None),)
-    one = fused(model, 0, rounds)
+    model = fit_base_model(pair, [record], names)
+    base = fit_base_model(loop, [record], loop.free)
+    rounds = (Round(base, (screen_candidate(base, E.AsymmetricCoulombFriction(0.1, 0.0)),), None),)
+    one = fuse_effects(model, 0, rounds)
     assert [type(e).__name__ for e in one.loop.effects] == ["AsymmetricCoulombFriction"]
     assert one.fitted.effects[0].fc == pytest.approx(0.2, rel=0.02)
     assert one.fitted.effects[0].difference == pytest.approx(0.15, rel=0.05)
-    assert fused(model, 0, ()) is model
+    assert fuse_effects(model, 0, ()) is model
 
 
 def test_two_effects_that_are_two_stay_two():
@@ -557,10 +566,10 @@ def test_two_effects_that_are_two_stay_two():
     pair = loop.with_effect(E.CoulombFriction(0.2)).with_effect(E.LinearStiffness(300.0))
     record = record_of(pair, E.ConstantForce(0.0), 4e-4, 1e-6, 9410)
     names = ("K", "CoulombFriction.fc", "LinearStiffness.k1")
-    model = base_model(pair, [record], names)
-    base = base_model(loop, [record], loop.free)
-    rounds = (Step(base, (attempt(base, E.AsymmetricCoulombFriction(0.1, 0.0)),), None),)
-    assert fused(model, 0, rounds) is model
+    model = fit_base_model(pair, [record], names)
+    base = fit_base_model(loop, [record], loop.free)
+    rounds = (Round(base, (screen_candidate(base, E.AsymmetricCoulombFriction(0.1, 0.0)),), None),)
+    assert fuse_effects(model, 0, rounds) is model
 
 
 @dataclass(frozen=True)
@@ -576,16 +585,18 @@ class CubicDrag(E.ForceEffect):
 def test_what_gains_far_less_than_is_missing_only_stands_in_for_it():
     loop = levitation()
     record = record_of(loop, CubicDrag(3e5), 4e-4, 1e-6, 9420)
-    base = base_model(loop, [record], loop.free)
-    nearly = whole(refit(base, attempt(base, E.QuadraticDrag(10.0))).model)
-    right = refit(nearly, attempt(nearly, CubicDrag(1e4)))
+    base = fit_base_model(loop, [record], loop.free)
+    nearly = with_linearization(
+        refit_candidate(base, screen_candidate(base, E.QuadraticDrag(10.0))).model
+    )
+    right = refit_candidate(nearly, screen_candidate(nearly, CubicDrag(1e4)))
     assert right.gain > 1500
-    assert not _stands_in(right, nearly, beside=True)
+    assert not _is_stand_in(right, nearly, beside=True)
     (spring,) = E.LinearStiffness.candidates(loop, record)
-    little = refit(nearly, attempt(nearly, spring))
+    little = refit_candidate(nearly, screen_candidate(nearly, spring))
     assert 0 < little.gain < 50
-    assert _stands_in(little, nearly, beside=True)
-    assert not _stands_in(little, nearly, beside=False)
+    assert _is_stand_in(little, nearly, beside=True)
+    assert not _is_stand_in(little, nearly, beside=False)
 
 
 def test_where_nothing_follows_equals_of_the_best_are_asked():
@@ -600,13 +611,13 @@ def test_where_nothing_follows_equals_of_the_best_are_asked():
                     free=("s", "d"))  # fmt: skip
     spring, offset = E.CubicStiffness(8000.0), E.SensorOffset(-0.05)
     record = record_of(loop.with_effect(offset), spring, 0.05, 1e-5, 9430, 4000)
-    base = base_model(loop, [record], loop.free)
-    force, zero = (refit(base, attempt(base, *kind.candidates(loop, record)))
+    base = fit_base_model(loop, [record], loop.free)
+    force, zero = (refit_candidate(base, screen_candidate(base, *kind.candidates(loop, record)))
                    for kind in (E.ConstantForce, E.SensorOffset))  # fmt: skip
-    assert force.merit == pytest.approx(zero.merit, abs=0.1)
-    first = Step(base, (force, zero), force)
-    nothing = Step(whole(force.model), (), None)
-    other = _foreseen(first, nothing, [E.CubicStiffness], lambda f, given: [f(x) for x in given])
+    assert force.net_gain == pytest.approx(zero.net_gain, abs=0.1)
+    first = Round(base, (force, zero), force)
+    nothing = Round(with_linearization(force.model), (), None)
+    other = _look_back(first, nothing, [E.CubicStiffness], lambda f, given: [f(x) for x in given])
     assert other is zero
     assert E.equivalents(offset, loop.with_effect(spring)) == ()
 
@@ -614,11 +625,11 @@ def test_where_nothing_follows_equals_of_the_best_are_asked():
 def test_waves_may_be_several_and_modes_may_not():
     loop = levitation()
     mode, wave = E.FlexibleMode(40.0, 0.1, 0.2), E.PeriodicForce(0.1, 3.0, 0.0)
-    fit = base_model(loop, [record_of(loop, wave, 1e-4, 1e-5, 9440)], loop.free).fit
+    fit = fit_base_model(loop, [record_of(loop, wave, 1e-4, 1e-5, 9440)], loop.free).fit
     model = Model(loop.with_effect(mode).with_effect(wave), fit)
-    assert _there(model, E.FlexibleMode(9.0, 0.3, 0.1))
-    assert not _there(model, E.PeriodicForce(0.1, 5.0, 0.0))
-    assert not _there(model, E.CoulombFriction(0.1))
+    assert _has_effect(model, E.FlexibleMode(9.0, 0.3, 0.1))
+    assert not _has_effect(model, E.PeriodicForce(0.1, 5.0, 0.0))
+    assert not _has_effect(model, E.CoulombFriction(0.1))
 
 
 @pytest.mark.parametrize(("size", "alone"), [(1.0, False), (40.0, True)])
@@ -626,8 +637,8 @@ def test_a_parameter_at_its_bound_does_nothing_for_an_effect(size, alone):
     """The drive's own friction may grow to ten times its given value; the rest is the effect's."""
     loop = drive()
     hidden = E.AsymmetricViscousFriction(c=size, difference=-0.5 * size)
-    base = base_model(loop, [record_of(loop, hidden, 0.3, 1e-4, 9450, n=2000)], loop.free)
-    trial = attempt(base, E.AsymmetricViscousFriction(0.0, 0.0))
+    base = fit_base_model(loop, [record_of(loop, hidden, 0.3, 1e-4, 9450, n=2000)], loop.free)
+    trial = screen_candidate(base, E.AsymmetricViscousFriction(0.0, 0.0))
     assert (base.fit.theta[0] == pytest.approx(50.0)) == alone
     assert ("AsymmetricViscousFriction.c" in trial.model.names) == alone
 
@@ -653,26 +664,28 @@ def two_found():
     real = drive().with_effect(E.CoulombFriction(0.3)).with_effect(E.LinearStiffness(20.0))
     r = cid.random_binary(2000, amplitude=0.3, hold=60, seed=9470)
     record = cid.simulate(real, r, sensor_noise=1e-4, seed=9471)
-    base = base_model(loop, [record], loop.free)
+    base = fit_base_model(loop, [record], loop.free)
     kinds = (E.CoulombFriction, E.LinearStiffness)
-    return search(base, kinds, lambda f, items: [f(x) for x in items], lambda text: None)
+    return search_effects(base, kinds, lambda f, items: [f(x) for x in items], lambda text: None)
 
 
 def test_the_name_without_which_the_gap_is_narrowest_goes_first(two_found):
     names = {f.trial.name for f in two_found.found}
     assert names == {"CoulombFriction", "LinearStiffness"}
     for name in names:
-        left = without_worst(two_found, lambda model, name=name: float(name in model.loop.labelled))
+        left = drop_worst_effect(
+            two_found, lambda model, name=name: float(name in model.loop.labelled)
+        )
         assert {f.trial.name for f in left.found} == names - {name}
         assert list(left.final.loop.labelled) == [*names - {name}]
 
 
 def test_what_is_put_back_and_stuck_keeps_its_evidence(two_found, monkeypatch):
     model = two_found.final
-    right = cut(model, 0)[1]
+    right = refit_without_effect(model, 0)[1]
     assert right.gain > 100
-    monkeypatch.setattr(removal, "refit", lambda base, trial: replace(trial, gain=-10.0))
-    smaller, kept = cut(model, 0)
+    monkeypatch.setattr(removal, "refit_candidate", lambda base, trial: replace(trial, gain=-10.0))
+    smaller, kept = refit_without_effect(model, 0)
     assert kept.gain == model.fit.value - smaller.fit.value
     assert kept.gain == pytest.approx(right.gain, rel=0.01)
 
@@ -682,11 +695,11 @@ def test_a_loop_that_hunts_keeps_its_names():
         return Gap("closed-loop simulation", 9.0, 3.0, after, 4.0, "m", *[np.zeros(3)] * 4)
 
     sensor, force = Disturbance(0.1, 0.0, np.nan, 0.2), Disturbance(0.1, 0.0, np.nan, 0.9)
-    assert not wider(gap(2.9), force)
-    assert not wider(gap(3.9), force)  # above the gap before, and below the floor
-    assert not wider(gap(4.4), sensor)
-    assert wider(gap(4.4), force)
-    assert wider(gap(6.1), sensor)
+    assert not gap_is_wider(gap(2.9), force)
+    assert not gap_is_wider(gap(3.9), force)  # above the gap before, and below the floor
+    assert not gap_is_wider(gap(4.4), sensor)
+    assert gap_is_wider(gap(4.4), force)
+    assert gap_is_wider(gap(6.1), sensor)
 
 
 def test_an_effect_without_which_nothing_follows_stays():
@@ -701,13 +714,13 @@ def test_an_effect_without_which_nothing_follows_stays():
     r = cid.random_binary(2000, amplitude=1.7e-4, hold=40, around=op.output, seed=5)
     record = cid.simulate(real, r, sensor_noise=1e-5, force_noise=0.01, seed=2)
     names = ("K", "QuadraticDrag.c2", "InputSaturatingGain.saturation")
-    model = base_model(real, [record], names)
-    smaller, back = cut(model, 1)
+    model = fit_base_model(real, [record], names)
+    smaller, back = refit_without_effect(model, 1)
     assert smaller.fit.value == -np.inf
-    assert np.isfinite(back.merit)
-    assert back.merit > 10 * THRESHOLD.gate
+    assert np.isfinite(back.net_gain)
+    assert back.net_gain > 10 * THRESHOLD.gate
     assert back.fitted.saturation == pytest.approx(0.036, rel=1e-2)
-    fit = whole(smaller).fit
+    fit = with_linearization(smaller).fit
     assert choose_noise(fit) is fit
 
 
@@ -718,9 +731,9 @@ def test_values_of_two_effects_of_a_class_stay_with_their_own():
     record = cid.simulate(both, r, sensor_noise=2e-6, seed=4)
     names = ("K", *(f"{label}.c" for label in both.labelled))
     problem = make_problem(both, names, [record], ())
-    fit = begin(problem, start_values(both, names), None)
+    fit = begin_fit(problem, start_values(both, names), None)
     model = Model(both, fit)
-    smaller, back = cut(model, 0)
+    smaller, back = refit_without_effect(model, 0)
     assert len(smaller.loop.effects) == 1
     assert back.model.fit.value > fit.value - 1.0
 
@@ -734,12 +747,12 @@ def test_an_instant_that_is_dozens_of_samples_off_is_found(late):
     begun = loop.with_effect(E.ParameterStep("k", time=14.2 + late * 0.01, size=-0.1))
     names = ("c", "k", "ParameterStep.time", "ParameterStep.size")
     problem = make_problem(begun, names, [record], ())
-    climbed = climb(begin(problem, start_values(begun, names), None))
-    fit = timed(climbed)
+    climbed = maximize(begin_fit(problem, start_values(begun, names), None))
+    fit = place_instants(climbed)
     assert fit.value > climbed.value + 10.0
     assert fit.theta[2] == pytest.approx(14.2, abs=0.01)
     assert fit.theta[3] == pytest.approx(-0.15, abs=0.01)
-    assert timed(fit) is fit
+    assert place_instants(fit) is fit
 
 
 # --- in which order effects act
@@ -756,18 +769,18 @@ def test_effects_at_one_place_end_in_the_order_in_which_they_act(order):
     for found in (hidden, hidden[::-1]):
         both = loop.with_effect(found[0]).with_effect(found[1])
         own = ("InputDeadZone.width", "InputOffset.offset")
-        model = base_model(both, [record], (*loop.free, *own))
-        names = [type(e).__name__ for e in reordered(model, given=0).fitted.effects]
+        model = fit_base_model(both, [record], (*loop.free, *own))
+        names = [type(e).__name__ for e in order_last_effect(model, given=0).fitted.effects]
         assert names == [type(hidden[k]).__name__ for k in order]
 
 
 def test_an_order_that_makes_no_difference_is_kept():
     loop = drive()
     record = record_of(loop, E.CoulombFriction(0.1), 0.3, 1e-5, 9910)
-    model = base_model(loop, [record], loop.free)
+    model = fit_base_model(loop, [record], loop.free)
     for effect in (E.CoulombFriction(0.1), E.QuadraticDrag(0.1)):
-        model = refit(model, attempt_at(model, effect)).model
-    assert reordered(model, given=0) is model
-    one = base_model(loop.with_effect(E.InputOffset(0.1)), [record], loop.free)
-    two = refit(one, attempt_at(one, E.InputDeadZone(0.01))).model
-    assert reordered(two, given=1) is two  # whose place the user knows
+        model = refit_candidate(model, screen_at(model, effect)).model
+    assert order_last_effect(model, given=0) is model
+    one = fit_base_model(loop.with_effect(E.InputOffset(0.1)), [record], loop.free)
+    two = refit_candidate(one, screen_at(one, E.InputDeadZone(0.01))).model
+    assert order_last_effect(two, given=1) is two  # whose place the user knows

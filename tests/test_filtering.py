@@ -13,12 +13,12 @@ from scipy import integrate, linalg, signal
 
 import ctrlid as cid
 from ctrlid import effects as E
-from ctrlid.estimation.likelihood.filter_data import make_track, state_at_rest
-from ctrlid.estimation.likelihood.kalman_filter import Noise, first_guess, settle
+from ctrlid.estimation.likelihood.filter_data import make_filter_data, state_at_rest
+from ctrlid.estimation.likelihood.kalman_filter import Noise, first_guess, settle_covariance
 from ctrlid.estimation.likelihood.kalman_recursion import filter_pass
-from ctrlid.estimation.likelihood.maximization import begin
+from ctrlid.estimation.likelihood.maximization import begin_fit
 from ctrlid.estimation.likelihood.physics_fit import make_problem
-from ctrlid.estimation.likelihood.sampled_plant import Machine, Trajectory
+from ctrlid.estimation.likelihood.sampled_plant import SampledPlant, Trajectory
 from ctrlid.physics.integration import advance
 
 # --- one pass
@@ -181,9 +181,9 @@ def test_the_machines_derivatives_are_those_of_its_map(hidden, stages, parts):
                          for p in e.parameters()))  # fmt: skip
     r = cid.random_binary(200, amplitude=2e-4, hold=20, around=0.012, seed=1)
     record = cid.simulate(levitated(), r, sensor_noise=2e-6, seed=2)
-    m = Machine(loop, names, "zoh", False)
+    m = SampledPlant(loop, names, "zoh", False)
     assert (len(m.maps.stages), m.maps.parts) == (stages, parts)
-    track = make_track(loop, record)
+    track = make_filter_data(loop, record)
     rng = np.random.default_rng(5)
     guess = first_guess(m, track)
     x = guess.filtered * (1 + 0.01 * rng.standard_normal(guess.filtered.shape))
@@ -284,15 +284,15 @@ def linearized_at_rest(loop, record):
 
 
 def one_period(loop, x, u_before, u_now, free=()):
-    """The machine's map of states `x` (k, n) when the input goes from one value to the next."""
-    m = Machine(loop, free, "zoh", False)
+    """The plant's map of states `x` (k, n) when the input goes from one value to the next."""
+    m = SampledPlant(loop, free, "zoh", False)
     late = m.late
     k = late + 1  # the sample at which u_now is the one in force
     size = max(k + 3, 12)
     u = np.full(size, u_now)
     u[:1] = u_before
     record = cid.Record(u=u, y=np.linspace(0.01, 0.013, size), dt=loop.dt)
-    track = make_track(loop, record)
+    track = make_filter_data(loop, record)
     theta = [loop.parameters[name] for name in m.names]
     at = np.zeros((size, m.size))
     at[k] = x
@@ -345,7 +345,7 @@ def test_an_actuator_lag_behind_a_curve_of_the_input(effect, curve, hold, ratio)
     tau = ratio * DT
     loop = levitated(effect, E.ActuatorLag(tau=tau), dt=DT)
     e = loop.equations(keep=True)
-    scheme = Machine(loop, (), hold, False).scheme
+    scheme = SampledPlant(loop, (), hold, False).scheme
     rng = np.random.default_rng(8)
     for _ in range(3):
         x = np.array([rng.uniform(0.008, 0.016), 0.02 * rng.standard_normal(), 2.8])
@@ -420,8 +420,8 @@ def test_a_straight_input_with_a_delay():
     rng = np.random.default_rng(9)
     u = rng.standard_normal(30)
     record = cid.Record(u=u, y=rng.standard_normal(30), dt=dt, hold="foh")
-    m = Machine(loop, (), "foh", False)
-    track = make_track(loop, record)
+    m = SampledPlant(loop, (), "foh", False)
+    track = make_filter_data(loop, record)
     still = np.zeros((30, 2))
     step = m.linearize(track, np.empty(0), Trajectory(still, still, still)).step
     for k in range(5, 28):
@@ -450,14 +450,14 @@ def test_play_is_followed_with_its_derivative():
             out.append(m)
         return np.array(out)
 
-    m = Machine(loop, ("InputBacklash.width",), "zoh", False)
-    track = make_track(loop, record)
+    m = SampledPlant(loop, ("InputBacklash.width",), "zoh", False)
+    track = make_filter_data(loop, record)
     x = np.tile([0.012, 0.0], (n, 1))
     at = Trajectory(x, x, np.zeros((n, 2)))
     lin = m.linearize(track, np.array([width]), at)
-    plain = Machine(levitated(dt=DT), (), "zoh", False)
+    plain = SampledPlant(levitated(dt=DT), (), "zoh", False)
     applied = cid.Record(u=behind(width), y=record.y, dt=DT)
-    expected = plain.linearize(make_track(plain.loop, applied), np.empty(0), at).step
+    expected = plain.linearize(make_filter_data(plain.loop, applied), np.empty(0), at).step
     np.testing.assert_allclose(lin.step, expected, atol=1e-4 * np.std(expected[:, 1]))
     h = 1e-6
     ends = [m.linearize(track, np.array([width + s * h]), at).step for s in (1, -1)]
@@ -484,9 +484,9 @@ def test_nobody_knows_where_a_play_begins():
     loop, record = balanced(E.InputBacklash(0.2), 0.015, 3e-4)
     known = Noise((1e4,))
     for first in range(0, 40, 5):
-        track = make_track(loop, record[first:])
-        m = Machine(loop, ("InputBacklash.width",), "zoh", False)
-        lin, out = settle(m, track, np.array([0.2]), known, first_guess(m, track), 30)
+        track = make_filter_data(loop, record[first:])
+        m = SampledPlant(loop, ("InputBacklash.width",), "zoh", False)
+        lin, out = settle_covariance(m, track, np.array([0.2]), known, first_guess(m, track), 30)
         z = out.innovations / np.sqrt(out.variance) / 3e-4
         assert np.abs(z).max() < 5
         assert np.mean(z[:60] ** 2) < 1.6
@@ -499,9 +499,11 @@ def test_nobody_knows_where_a_play_begins():
 def test_nobody_knows_what_a_delay_brings_at_first():
     loop, record = balanced(E.InputDelay(0.016), 0.005, 1e-4)
     for first in range(0, 80, 10):
-        track = make_track(loop, record[first:])
-        m = Machine(loop, (), "zoh", False)
-        lin, out = settle(m, track, np.zeros(0), Noise((9e4,)), first_guess(m, track), 30)
+        track = make_filter_data(loop, record[first:])
+        m = SampledPlant(loop, (), "zoh", False)
+        lin, out = settle_covariance(
+            m, track, np.zeros(0), Noise((9e4,)), first_guess(m, track), 30
+        )
         z = out.innovations / np.sqrt(out.variance) / 1e-4
         assert np.abs(z).max() < 6
         relative = lin.doubt[:5] * track.scale**2 / np.var(track.record.u)
@@ -516,7 +518,7 @@ def test_a_sensor_lag_of_no_length_costs_nothing(effects):
     r = cid.random_binary(500, amplitude=1e-4, hold=30, around=op.output, seed=8)
     record = cid.simulate(loop, r, sensor_noise=1e-6, force_noise=0.01, seed=9)
     both = [
-        begin(make_problem(model, (), [record], [0.0]), np.zeros(0), Noise((1e4,))).value
+        begin_fit(make_problem(model, (), [record], [0.0]), np.zeros(0), Noise((1e4,))).value
         for model in (loop, loop.with_effect(E.SensorLag(1e-5 * dt)))
     ]
     assert both[1] == pytest.approx(both[0], abs=0.1)
@@ -527,13 +529,13 @@ def test_coulomb_friction_is_smoothed_by_the_uncertain_velocity():
     plant = ct.nlsys(lambda t, x, u, p: [x[1], u[0]], lambda t, x, u, p: x[0], name="mass",
                      inputs=["u"], outputs=["x"], states=["x", "v"])  # fmt: skip
     loop = cid.Loop(plant, None, dt=1e-6).with_effect(E.CoulombFriction(fc=2.0))
-    m = Machine(loop, (), "zoh", False)
+    m = SampledPlant(loop, (), "zoh", False)
     rng = np.random.default_rng(11)
     v, s = 0.1 * rng.standard_normal(40), np.exp(rng.uniform(-6, 0, 40))
     record = cid.Record(u=np.zeros(40), y=rng.standard_normal(40), dt=1e-6)
     x = np.column_stack([np.zeros(40), v])
     at = Trajectory(x, x, np.column_stack([np.zeros(40), s]))
-    step = m.linearize(make_track(loop, record), np.empty(0), at).step
+    step = m.linearize(make_filter_data(loop, record), np.empty(0), at).step
     deviates = np.linspace(-8, 8, 200_001)
     weight = np.exp(-0.5 * deviates**2)
     expected = [np.sum(weight * np.sign(a + b * deviates)) / weight.sum() for a, b in
@@ -550,14 +552,14 @@ def test_a_velocity_that_turns_within_a_period():
     plant = ct.nlsys(lambda t, x, u, p: [x[1], u[0]], lambda t, x, u, p: x[0], name="mass",
                      inputs=["u"], outputs=["x"], states=["x", "v"])  # fmt: skip
     loop = cid.Loop(plant, None, dt=dt).with_effect(E.CoulombFriction(fc=fc))
-    m = Machine(loop, ("CoulombFriction.fc",), "zoh", False)
+    m = SampledPlant(loop, ("CoulombFriction.fc",), "zoh", False)
     n = 60
     rng = np.random.default_rng(13)
     v, s = rng.uniform(-1.5, 0.5, n) * push * dt, 0.1 * push * dt
     record = cid.Record(u=np.full(n, push), y=rng.standard_normal(n), dt=dt)
     x = np.column_stack([np.zeros(n), v])
     at = Trajectory(x, x, np.column_stack([np.zeros(n), np.full(n, s)]))
-    step = m.linearize(make_track(loop, record), np.array([fc]), at).step
+    step = m.linearize(make_filter_data(loop, record), np.array([fc]), at).step
     error = []
     for k in range(n):
         turning = integrate.solve_ivp(
@@ -572,9 +574,9 @@ def test_an_analog_circuit_moves_the_input_between_samples():
     loop = levitated(analog=True, dt=2e-3)
     r = cid.random_binary(60, amplitude=1e-4, hold=5, around=0.012, seed=5)
     record = cid.simulate(loop, r)
-    m = Machine(loop, (), "foh", True)
-    track = make_track(loop, record)
-    fit = settle(m, track, np.empty(0), Noise((1e12,)), first_guess(m, track))[1]
+    m = SampledPlant(loop, (), "foh", True)
+    track = make_filter_data(loop, record)
+    fit = settle_covariance(m, track, np.empty(0), Noise((1e12,)), first_guess(m, track))[1]
     late = slice(15, None)
     assert np.abs(fit.innovations[late]).max() < 1e-4 * np.std(record.y)
 
@@ -647,16 +649,16 @@ def test_machines_share_what_values_do_not_change():
     plant = cid.plants.servo(m=1.0, c=2.0, k=3.0)
     loop = cid.Loop(plant, None, dt=0.01, free=("k",))
     friction = loop.with_effect(cid.effects.CoulombFriction(fc=0.1))
-    one = Machine(friction, ["k"], "zoh", False)
-    other = Machine(friction.with_parameters({"k": 4.0, "CoulombFriction.fc": 0.2}), ["k"], "zoh",
-                    False)  # fmt: skip
+    one = SampledPlant(friction, ["k"], "zoh", False)
+    changed = friction.with_parameters({"k": 4.0, "CoulombFriction.fc": 0.2})
+    other = SampledPlant(changed, ["k"], "zoh", False)  # fmt: skip
     assert one.maps is other.maps
     assert other.values(np.array([5.0])).tolist() == [1.0, 2.0, 5.0, 0.2]
     assert one.values(np.array([5.0])).tolist() == [1.0, 2.0, 5.0, 0.1]
     for different in (
-        Machine(friction, ["c"], "zoh", False), Machine(friction, ["k"], "foh", False),
-        Machine(loop, ["k"], "zoh", False),
-        Machine(loop.with_effect(cid.effects.CubicStiffness(k3=0.1)), ["k"], "zoh", False),
-        Machine(cid.Loop(plant, None, dt=0.02, free=("k",)), ["k"], "zoh", False),
+        SampledPlant(friction, ["c"], "zoh", False), SampledPlant(friction, ["k"], "foh", False),
+        SampledPlant(loop, ["k"], "zoh", False),
+        SampledPlant(loop.with_effect(cid.effects.CubicStiffness(k3=0.1)), ["k"], "zoh", False),
+        SampledPlant(cid.Loop(plant, None, dt=0.02, free=("k",)), ["k"], "zoh", False),
     ):  # fmt: skip
         assert different.maps is not one.maps

@@ -8,10 +8,10 @@ import pytest
 
 import ctrlid as cid
 from ctrlid import effects as E
-from ctrlid.diagnosis.noise_tests import omnibus
-from ctrlid.diagnosis.recalibration import base_model
-from ctrlid.diagnosis.replicas import artefact, following, replica
-from ctrlid.diagnosis.selection import one_round
+from ctrlid.diagnosis.noise_tests import run_noise_tests
+from ctrlid.diagnosis.recalibration import fit_base_model
+from ctrlid.diagnosis.replicas import follow_record, gain_on_replicas, make_replica
+from ctrlid.diagnosis.selection import run_round
 from ctrlid.loop.period_map import comes_to_rest
 
 DT = 0.001
@@ -52,7 +52,7 @@ def test_unstable_plants_are_held_to_what_was_recorded(seed):
         y.append(float((plant.C @ x)[0]))
         x = plant.A @ x + plant.B[:, 0] * u[-1]
     record = cid.Record(u=u, y=y, dt=dt)
-    loop = following(cid.Loop(P, None, dt=dt), record)
+    loop = follow_record(cid.Loop(P, None, dt=dt), record)
     assert comes_to_rest(loop)
     # As the plant itself, the loop that is driven by record and input gives the record again.
     again = cid.simulate(loop, record.y, d=record.u)
@@ -68,21 +68,21 @@ def test_what_cannot_be_held_is_left_alone():
     """An unstable mode that the input does not reach."""
     hidden = ct.ss([[1.0, 0.0], [0.0, -2.0]], [[0.0], [1.0]], [[1.0, 1.0]], 0)
     record = cid.Record(u=np.sin(np.arange(500)), y=np.cos(np.arange(500)), dt=0.01)
-    assert following(cid.Loop(hidden, None, dt=0.01), record) is None
+    assert follow_record(cid.Loop(hidden, None, dt=0.01), record) is None
 
 
 @pytest.mark.parametrize("fc", [0.0, 1.0])
 def test_a_replica_without_a_controller_is_like_the_record(fc):
     loop = levitation(fc)
     record = record_of(loop, 3)
-    model = base_model(replace(loop, controller=None), [record], ("K",))
-    copy = replica(model)
-    made = copy.fit.problem.tracks[0].record
+    model = fit_base_model(replace(loop, controller=None), [record], ("K",))
+    copy = make_replica(model)
+    made = copy.fit.problem.prepared[0].record
     assert not np.array_equal(made.y, record.y)
     assert np.std(made.y - record.y) < 0.3 * np.std(record.y)
     assert copy.fit.theta[0] == pytest.approx(model.fit.theta[0], rel=0.01)
     assert copy.fit.value == pytest.approx(model.fit.value, abs=300)
-    assert omnibus(copy.fit).passed
+    assert run_noise_tests(copy.fit).passed
 
 
 def test_friction_in_the_model_is_given_no_companion():
@@ -96,8 +96,8 @@ def test_friction_in_the_model_is_given_no_companion():
 def test_what_is_missing_is_found_beside_friction_all_the_same():
     loop = levitation(1.0)
     record = record_of(loop.with_effect(E.ActuatorLag(tau=0.002)), 3)
-    base = base_model(replace(loop, controller=None), [record], ("K",))
+    base = fit_base_model(replace(loop, controller=None), [record], ("K",))
     lag = E.ActuatorLag(tau=0.001)
-    best = one_round(base, [lag], lambda f, items: list(map(f, items))).best
+    best = run_round(base, [lag], lambda f, items: list(map(f, items))).best
     assert best is not None
-    assert artefact([replica(base)], best) < 0.1 * best.gain
+    assert gain_on_replicas([make_replica(base)], best) < 0.1 * best.gain

@@ -29,10 +29,10 @@ def hill(monkeypatch):
 
         problem = SimpleNamespace(
             lower=np.full(len(theta), lower), upper=np.full(len(theta), upper),
-            machine=SimpleNamespace(fits=lambda theta: True),
+            plant=SimpleNamespace(fits=lambda theta: True),
         )  # fmt: skip
         monkeypatch.setattr(maximum, "evaluate", evaluate)
-        monkeypatch.setattr(maximum, "relinearized", lambda fit: fit)
+        monkeypatch.setattr(maximum, "linearize_again", lambda fit: fit)
         return at(theta)
 
     fit_on.tried = tried
@@ -52,7 +52,7 @@ def normal(theta):
 
 
 def test_a_step_that_is_right_is_taken_whole(hill):
-    fit, length = maximum._ascend(
+    fit, length = maximum._take_step(
         hill(lambda t: -2 * t[0] ** 2, [3.0]), np.array([[4.0]]), np.array([-12.0])
     )
     assert fit.theta == pytest.approx([0.0])
@@ -64,7 +64,7 @@ def test_a_bent_valley_is_followed_to_its_end(hill):
     fit = hill(valley, [-1.2, 1.0])
     heights = [fit.value]
     for _ in range(60):
-        fit, length = maximum._ascend(fit, *normal(fit.theta))
+        fit, length = maximum._take_step(fit, *normal(fit.theta))
         heights.append(fit.value)
         if length < 1e-6:
             break
@@ -75,7 +75,7 @@ def test_a_bent_valley_is_followed_to_its_end(hill):
 def test_along_a_curved_ridge_a_second_step_saves_many_short_ones(hill):
     """Gauss and Newton's second step ends at the top of Rosenbrock's valley, wherever it began."""
     fit = hill(valley, [-1.2, 1.0], normal=normal)
-    top, length = maximum._ascend(fit, *normal(fit.theta))
+    top, length = maximum._take_step(fit, *normal(fit.theta))
     assert top.theta == pytest.approx([1.0, 1.0], abs=1e-9)
     assert length > 1
     assert len(hill.tried) == 2
@@ -83,7 +83,7 @@ def test_along_a_curved_ridge_a_second_step_saves_many_short_ones(hill):
 
 def test_a_step_that_is_too_long_is_shortened(hill):
     fit = hill(lambda t: -((t[0] - 1) ** 2), [0.0])
-    better, length = maximum._ascend(fit, np.array([[0.02]]), np.array([2.0]))
+    better, length = maximum._take_step(fit, np.array([[0.02]]), np.array([2.0]))
     assert better.value > fit.value
     assert 0 < length < 100 / np.sqrt(50)
     assert len(hill.tried) > 1
@@ -91,7 +91,7 @@ def test_a_step_that_is_too_long_is_shortened(hill):
 
 def test_a_wrong_slope_gives_up_where_it_is(hill):
     fit = hill(lambda t: -(t[0] ** 2), [0.0])
-    same, length = maximum._ascend(fit, np.array([[2.0]]), np.array([5.0]))
+    same, length = maximum._take_step(fit, np.array([[2.0]]), np.array([5.0]))
     assert same is fit
     assert length == 0.0
     assert len(hill.tried) == len(maximum.SHARES)  # and no second step, for so little
@@ -99,11 +99,11 @@ def test_a_wrong_slope_gives_up_where_it_is(hill):
 
 def test_what_promises_nothing_is_not_tried(hill):
     fit = hill(lambda t: 0.0, [0.0])
-    assert maximum._ascend(fit, np.array([[4.0]]), np.array([0.01]))[0] is fit
+    assert maximum._take_step(fit, np.array([[4.0]]), np.array([0.01]))[0] is fit
     assert not hill.tried
 
 
 def test_bounds_hold(hill):
     fit = hill(lambda t: -((t[0] - 3) ** 2) - (t[1] - 1) ** 2, [0.0, 0.0], upper=2.0)
-    top, _ = maximum._ascend(fit, 2 * np.eye(2), np.array([6.0, 2.0]))
+    top, _ = maximum._take_step(fit, 2 * np.eye(2), np.array([6.0, 2.0]))
     assert top.theta == pytest.approx([2.0, 1.0])

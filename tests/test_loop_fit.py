@@ -16,7 +16,7 @@ import ctrlid as cid
 from ctrlid import CtrlidError
 from ctrlid import effects as E
 from ctrlid.estimation.likelihood.likelihood import evaluate, pseudo_inverse
-from ctrlid.estimation.likelihood.maximization import begin, climb, information
+from ctrlid.estimation.likelihood.maximization import begin_fit, information, maximize
 from ctrlid.estimation.likelihood.physics_fit import make_problem, start_values
 from ctrlid.loop.simulation import Simulator
 
@@ -259,10 +259,10 @@ def test_the_start_does_not_matter():
 
 def point(loop, record, **noise):
     """The likelihood at its maximum, as `fit_loop` finds it."""
-    from ctrlid.estimation.likelihood.maximization import begin, climb
+    from ctrlid.estimation.likelihood.maximization import begin_fit, maximize
 
     problem = make_problem(loop, loop.free, [record])
-    return climb(begin(problem, start_values(loop, loop.free), None))
+    return maximize(begin_fit(problem, start_values(loop, loop.free), None))
 
 
 def moved(fit, theta):
@@ -314,8 +314,8 @@ def test_standard_errors_without_any_force_noise():
     draw = study["draw_analog"](np.random.default_rng([3, 0, 0]), 0.5, 0.01)
     loop, record = draw.loop, draw.record
     names = loop.free
-    start = begin(make_problem(loop, names, [record]), start_values(loop, names), None)
-    fit = climb(start)
+    start = begin_fit(make_problem(loop, names, [record]), start_values(loop, names), None)
+    fit = maximize(start)
     held = np.sqrt(np.diag(pseudo_inverse(fit.normal[0])))
     exact = np.sqrt(np.diag(pseudo_inverse(information(fit)[0])))[: len(names)]
     np.testing.assert_allclose(exact, held, rtol=0.05)

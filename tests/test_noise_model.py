@@ -6,7 +6,7 @@ import pytest
 from scipy import signal
 
 import ctrlid as cid
-from ctrlid.validation.noise_model import noise_polynomial, whiten
+from ctrlid.validation.noise_model import noise_polynomial, whiten_errors
 
 
 @pytest.mark.parametrize("colour", [[1.0, 0.0, 0.0], [1.0, -1.4, 0.5], [1.0, 0.6, 0.1]])
@@ -15,7 +15,7 @@ def test_recovers_a_known_colour_and_whitens(colour):
     errors = signal.lfilter(colour, [1.0], e)
     found = noise_polynomial(errors, [(0, len(e))], np.array([1.0, -2.04, 1.0]))
     np.testing.assert_allclose(found, colour, atol=0.03)
-    white = whiten(errors, [(0, len(e))], found)
+    white = whiten_errors(errors, [(0, len(e))], found)
     assert np.std(white) == pytest.approx(1.0, rel=0.02)
 
 

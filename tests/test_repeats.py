@@ -8,12 +8,12 @@ import pytest
 import ctrlid as cid
 from ctrlid import effects as E
 from ctrlid.diagnosis.fitted_model import Model
-from ctrlid.diagnosis.fresh_data import Fresh, fresh_data
-from ctrlid.diagnosis.recalibration import base_model, weighted_by_repeats
-from ctrlid.diagnosis.refitting import refit
-from ctrlid.diagnosis.screening import attempt_at
+from ctrlid.diagnosis.fresh_data import FreshData, choose_fresh_data
+from ctrlid.diagnosis.recalibration import fit_base_model, weigh_by_repeats
+from ctrlid.diagnosis.refitting import refit_candidate
+from ctrlid.diagnosis.screening import screen_at
 from ctrlid.estimation.likelihood.likelihood import evaluate
-from ctrlid.estimation.likelihood.maximization import climb
+from ctrlid.estimation.likelihood.maximization import maximize
 from ctrlid.estimation.likelihood.noise_fit import known_from_repeats
 
 PERIOD, TIMES = 800, 5
@@ -38,7 +38,7 @@ def test_the_noise_is_found_under_a_wrong_model():
     """Friction is missing from the model; the noise fitted to the residual takes it for noise."""
     loop = drive()
     record = repeated(loop.with_effect(E.CoulombFriction(fc=3.0)), seed=2)
-    fit = base_model(loop, [record], loop.free).fit
+    fit = fit_base_model(loop, [record], loop.free).fit
     known = known_from_repeats(fit, [PERIOD])
     assert np.sqrt(known.sensor[0]) == pytest.approx(SENSOR, rel=0.1)
     force = np.sqrt(known.sensor[0] * known.noise.force[0])
@@ -51,9 +51,9 @@ def test_what_is_left_is_counted_in_units_of_that_noise():
     """With the effect in the model chi squared is one, without it it is much more."""
     loop = drive()
     record = repeated(loop.with_effect(E.QuadraticDrag(c2=20.0)), seed=3)
-    base = weighted_by_repeats(base_model(loop, [record], loop.free), [PERIOD])
+    base = weigh_by_repeats(fit_base_model(loop, [record], loop.free), [PERIOD])
     assert np.nanmean(base.fit.standardized[0] ** 2) > 2
-    best = refit(base, attempt_at(base, E.QuadraticDrag(c2=10.0)))
+    best = refit_candidate(base, screen_at(base, E.QuadraticDrag(c2=10.0)))
     assert np.nanmean(best.model.fit.standardized[0] ** 2) == pytest.approx(1.0, abs=0.08)
     assert best.fitted.c2 == pytest.approx(20.0, rel=0.05)
 
@@ -61,9 +61,9 @@ def test_what_is_left_is_counted_in_units_of_that_noise():
 def test_known_noise_is_not_tuned():
     loop = drive()
     record = repeated(loop, seed=4)
-    base = weighted_by_repeats(base_model(loop, [record], loop.free), [PERIOD])
+    base = weigh_by_repeats(fit_base_model(loop, [record], loop.free), [PERIOD])
     known = base.fit.problem.known
-    again = climb(base.fit)
+    again = maximize(base.fit)
     assert again.noise == known.noise
     np.testing.assert_array_equal(again.sensor, known.sensor)
     # The likelihood is that of Gaussian noise of these variances.
@@ -98,9 +98,9 @@ def test_a_private_phase_is_fitted_to_the_fresh_record():
     loop = drive()
     ripple = E.PositionRipple(amplitude=4.0, period=0.05, phase=1.0)
     fresh_one = repeated(loop.with_effect(replace(ripple, phase=3.0)), seed=7, periods=2)
-    model = base_model(loop.with_effect(ripple), [repeated(loop.with_effect(ripple), seed=6)],
+    model = fit_base_model(loop.with_effect(ripple), [repeated(loop.with_effect(ripple), seed=6)],
                        ("m", "c"))  # fmt: skip
-    fresh = fresh_data(loop, [], [fresh_one])
+    fresh = choose_fresh_data(loop, [], [fresh_one])
     (moved,) = fresh.loops(model)
     turned = (moved.labelled["PositionRipple"].phase - 3.0 + np.pi) % (2 * np.pi) - np.pi
     assert abs(turned) < 0.05
@@ -111,8 +111,8 @@ def test_a_private_phase_is_fitted_to_the_fresh_record():
 def test_without_private_parts_the_loop_is_taken_as_it_is():
     loop = drive()
     record = repeated(loop, seed=8, periods=2)
-    model = base_model(loop, [record], ("m", "c"))
-    fresh = fresh_data(loop, [], [record])
-    assert isinstance(fresh, Fresh)
+    model = fit_base_model(loop, [record], ("m", "c"))
+    fresh = choose_fresh_data(loop, [], [record])
+    assert isinstance(fresh, FreshData)
     assert fresh.loops(model)[0].parameters == model.fitted.parameters
     assert isinstance(model, Model)

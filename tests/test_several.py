@@ -4,7 +4,7 @@ import pytest
 
 import ctrlid as cid
 from ctrlid import effects as E
-from ctrlid.diagnosis.several_records import presence
+from ctrlid.diagnosis.several_records import describe_presence
 
 FEW = (E.ViscousFriction, E.CoulombFriction, E.InputDelay, E.LinearStiffness)
 
@@ -66,6 +66,6 @@ def test_a_parameter_that_changed_between_the_records():
 
 
 def test_in_which_records():
-    assert presence([0, 1], 2) == "seen in every record"
-    assert presence([0, 2], 3) == "seen in records 1 and 3 of 3 only"
-    assert presence([], 2) == "seen in no record alone"
+    assert describe_presence([0, 1], 2) == "seen in every record"
+    assert describe_presence([0, 2], 3) == "seen in records 1 and 3 of 3 only"
+    assert describe_presence([], 2) == "seen in no record alone"

@@ -6,12 +6,12 @@ import pytest
 
 import ctrlid as cid
 from ctrlid import effects as E
-from ctrlid.diagnosis.fresh_data import fresh_data
+from ctrlid.diagnosis.fresh_data import choose_fresh_data
 from ctrlid.diagnosis.growth import Search
-from ctrlid.diagnosis.noise_tests import omnibus
+from ctrlid.diagnosis.noise_tests import run_noise_tests
 from ctrlid.diagnosis.open_loop_fit import Simulation
 from ctrlid.diagnosis.open_loop_search import search_by_simulation
-from ctrlid.diagnosis.recalibration import base_model
+from ctrlid.diagnosis.recalibration import fit_base_model
 
 TRUE = {"k1": 0.05, "k3": 0.06, "k4": 0.05}
 
@@ -84,9 +84,9 @@ def test_the_search_names_an_overflow_and_a_wrong_zero():
     real = real.with_effect(E.SensorOffset(0.6))
     record = record_of(real, n=900, noise=0.02, seed=5)
     loop = tanks(k1=0.055, k3=0.055, k4=0.052)
-    base = base_model(loop, [record], loop.free)
-    tests = omnibus(base.fit)
-    fresh = fresh_data(loop, [record], None)
+    base = fit_base_model(loop, [record], loop.free)
+    tests = run_noise_tests(base.fit)
+    fresh = choose_fresh_data(loop, [record], None)
     catalogue = (E.StateLimit, E.SensorOffset, E.InputNonlinearity, E.InputBacklash)
     found = search_by_simulation(Search(base, (), base, (), tests, tests), fresh, catalogue,
                                  lambda text: None, np.inf)  # fmt: skip
@@ -103,9 +103,9 @@ def test_the_search_names_an_overflow_and_a_wrong_zero():
 def test_nothing_is_found_where_nothing_is_missing():
     record = record_of(tanks(), noise=0.02)
     loop = tanks(k1=0.055)
-    base = base_model(loop, [record], loop.free)
-    tests = omnibus(base.fit)
+    base = fit_base_model(loop, [record], loop.free)
+    tests = run_noise_tests(base.fit)
     search = Search(base, (), base, (), tests, tests)
-    fresh = fresh_data(loop, [record], None)
+    fresh = choose_fresh_data(loop, [record], None)
     catalogue = (E.StateLimit, E.SensorOffset, E.InputNonlinearity)
     assert search_by_simulation(search, fresh, catalogue, lambda t: None, np.inf) is None

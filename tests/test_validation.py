@@ -12,7 +12,7 @@ import pytest
 
 import ctrlid as cid
 from ctrlid import CtrlidError
-from ctrlid.diagnosis.gap import output, way_to_compare, whole
+from ctrlid.diagnosis.gap import choose_comparison, make_window, simulate_window
 from ctrlid.estimation.likelihood.prediction import predict_ahead, spread_ahead
 from ctrlid.validation.comparison import Comparison, Curve
 from ctrlid.validation.residual_tests import Correlation
@@ -79,13 +79,15 @@ def test_a_run_is_followed_from_the_middle_of_a_fall():
     loop = loop.with_effect(cid.effects.InputOffset(2.9))
     r = cid.random_binary(3000, amplitude=7e-4, hold=56, around=0.0169, seed=5)
     record = cid.simulate(loop, r, sensor_noise=1e-5, seed=4)
-    way = way_to_compare(loop, record)
+    way = choose_comparison(loop, record)
     assert way == "closed-loop simulation"
     speed = np.diff(record.y)
     hardest = 500 + np.argsort(-np.abs(np.diff(speed)[500:2000]))[:10]
     for k in hardest.tolist():
         part = record[k:]
-        assert np.std(output(loop, whole(part), way) - part.y) < 4e-5  # its noise, through the loop
+        assert (
+            np.std(simulate_window(loop, make_window(part), way) - part.y) < 4e-5
+        )  # its noise, through the loop
 
 
 @pytest.mark.parametrize("fc", [0.05, 0.3])

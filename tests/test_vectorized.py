@@ -9,7 +9,14 @@ import pytest
 
 import ctrlid as cid
 from ctrlid import CtrlidError
-from ctrlid.physics.block_evaluation import BINARY, BLOCK, BLOCKS, UNARY, Vectorized, through
+from ctrlid.physics.block_evaluation import (
+    BINARY,
+    BLOCK,
+    BLOCKS,
+    UNARY,
+    BlockEvaluation,
+    evaluate_blocks,
+)
 
 EVERYWHERE = np.array([-np.inf, -1e200, -3.0, -1.0, -0.5, -0.0, 0.0, 1e-300, 0.5, 1.0, 2.0, 2.5,
                        1e200, np.inf, np.nan])  # fmt: skip
@@ -47,7 +54,7 @@ def one_by_one(function, *arguments):
 
 
 def same(function, *arguments, rtol=2e-14, atol=1e-300):
-    found = Vectorized(function)(*arguments)
+    found = BlockEvaluation(function)(*arguments)
     expected = one_by_one(function, *(np.asarray(a, dtype=float) for a in arguments))
     for ours, theirs in zip(found, expected, strict=True):
         full = np.broadcast_to(ours, theirs.shape) if len(ours) == 1 else ours
@@ -103,7 +110,7 @@ def test_a_branch_that_is_not_taken_may_be_nan():
     f = casadi.Function("f", [x], [root, nested])
     values = np.array([[-4.0, -1.0, -0.0, 0.0, 1.0, 9.0, np.nan]])
     same(f, values)
-    assert np.isfinite(Vectorized(f)(values)[0][:6]).all()
+    assert np.isfinite(BlockEvaluation(f)(values)[0][:6]).all()
 
 
 def test_comparisons_are_numbers():
@@ -135,19 +142,19 @@ def test_constants_and_numbers_in_place_of_arrays():
     rng = np.random.default_rng(4)
     x_, p_ = rng.standard_normal((2, 7)), rng.standard_normal((1, 7))
     same(f, x_, p_)
-    wide, constant, zero = Vectorized(f)(x_, 2.0)
+    wide, constant, zero = BlockEvaluation(f)(x_, 2.0)
     assert wide.shape == (7, 4, 1)
     np.testing.assert_array_equal(wide[:, 1, 0], 2 * x_[0])
     np.testing.assert_array_equal(constant, np.full((7, 1, 1), 2.0))
     np.testing.assert_array_equal(zero, np.zeros((7, 1, 1)))
     # A single sample given as plain numbers.
-    one = Vectorized(f)([1.0, 5.0], 2.0)[0]
+    one = BlockEvaluation(f)([1.0, 5.0], 2.0)[0]
     np.testing.assert_array_equal(one[0, :, 0], [3.5, 2.0, 0.0, 2.0])
 
 
 def test_the_arguments_are_left_alone_and_the_results_are_not_views():
     x = casadi.SX.sym("x", 2)
-    f = Vectorized(casadi.Function("f", [x], [x, x + 1, casadi.fabs(x)]))
+    f = BlockEvaluation(casadi.Function("f", [x], [x, x + 1, casadi.fabs(x)]))
     values = np.random.default_rng(5).standard_normal((2, 9))
     kept = values.copy()
     first = f(values)
@@ -195,7 +202,7 @@ def test_block_boundaries(n):
     f = casadi.Function("f", [x, p], [matrix, x[0] * p])
     rng = np.random.default_rng(7)
     x_, p_ = rng.standard_normal((2, n)), rng.standard_normal(n)
-    found, product = Vectorized(f)(x_, p_)
+    found, product = BlockEvaluation(f)(x_, p_)
     assert found.shape == (n, 2, 3)
     expected = np.zeros((n, 2, 3))
     expected[:, 0, 0], expected[:, 0, 2] = x_[0], p_
@@ -206,7 +213,7 @@ def test_block_boundaries(n):
 
 def test_blocks_do_not_remember_each_other():
     x, y = casadi.SX.sym("x"), casadi.SX.sym("y")
-    f = Vectorized(casadi.Function("f", [x, y], [casadi.if_else(x > 0, casadi.log(y), 0)]))
+    f = BlockEvaluation(casadi.Function("f", [x, y], [casadi.if_else(x > 0, casadi.log(y), 0)]))
     n = 3 * BLOCK
     x_ = np.where(np.arange(n) < BLOCK, 1.0, -1.0)
     y_ = np.where(np.arange(n) < BLOCK, np.nan, -1.0)
@@ -219,7 +226,7 @@ def test_sparse_inputs_and_empty_outputs():
     a = casadi.SX.sym("a", casadi.Sparsity.triplet(3, 1, [0, 2], [0, 0]))
     f = casadi.Function("f", [a, casadi.SX.sym("b", 0)], [a[0] + 10 * a[2], casadi.SX(2, 0)])
     values = np.arange(12.0).reshape(3, 4)
-    found, empty = Vectorized(f)(values, np.zeros(0))
+    found, empty = BlockEvaluation(f)(values, np.zeros(0))
     np.testing.assert_array_equal(found[:, 0, 0], values[0] + 10 * values[2])
     assert empty.shape == (4, 2, 0)
 
@@ -252,7 +259,9 @@ def test_stages_feed_each_other_over_several_blocks():
     n = BLOCK + 5
     rng = np.random.default_rng(5)
     first, given = rng.standard_normal((2, n)), rng.standard_normal((1, n))
-    values, slopes = through([Vectorized(f) for f in stages], [first, [1.0, 0.0]], [given], parts=2)
+    values, slopes = evaluate_blocks(
+        [BlockEvaluation(f) for f in stages], [first, [1.0, 0.0]], [given], parts=2
+    )
     for k in (0, BLOCK - 1, BLOCK, n - 1):
         x_, s_ = first[:, k], [1.0, 0.0]
         for f in stages:
@@ -269,10 +278,10 @@ def test_an_unknown_operation_is_refused():
     a = casadi.SX.sym("a")
     f = casadi.Function("f", [a], [casadi.erfinv(a)])
     with pytest.raises(CtrlidError, match=r"operation \(CasADi's number \d+\) that cannot be"):
-        Vectorized(f)
+        BlockEvaluation(f)
 
 
 def test_the_number_of_arguments_counts():
-    f = Vectorized(casadi.Function("f", [casadi.SX.sym("a"), casadi.SX.sym("b")], [1.0]))
+    f = BlockEvaluation(casadi.Function("f", [casadi.SX.sym("a"), casadi.SX.sym("b")], [1.0]))
     with pytest.raises(ValueError, match="argument"):
         f(1.0)

@@ -8,48 +8,50 @@ import numpy as np
 from .._base.errors import CtrlidError
 from ..data.record import Record
 from ..effects import AbstractEffect, equivalents
-from ..estimation.likelihood.physics_fit import summary
+from ..estimation.likelihood.physics_fit import summarize_fit
 from ..loop.loop import Loop
 from .candidates import Trial, same_kind
-from .experiment import separating_experiment
+from .experiment import find_experiment
 from .findings import Calibrated, Candidate, Disturbance, Finding, Gap, Verdict
 from .growth import Search
-from .recalibration import base_model
+from .recalibration import fit_base_model
 from .records import Readout
-from .refitting import refit
-from .removal import Found
+from .refitting import refit_candidate
+from .removal import Weighed
 from .result import Diagnosis
-from .screening import attempt_at
-from .several_records import presence
+from .screening import screen_at
+from .several_records import describe_presence
 from .thresholds import THRESHOLD
-from .verdict import conclusion, doubt_of_all, stands_out
-from .where import places
+from .verdict import find_doubt, gap_stands_out, write_conclusion
+from .where import locate_errors
 
 
-def put_together(
+def assemble_answer(
     loop: Loop, records: Sequence[Record], found: Search, gap: Gap, shares: dict[int, float],
     disturbance: Disturbance, read: Sequence[Readout],
 ) -> Diagnosis:  # fmt: skip
     """Return verdict, findings, gap and whatever else a diagnosis tells."""
-    fitted = summary(found.final.loop, found.final.fit)
+    fitted = summarize_fit(found.final.loop, found.final.fit)
     names, known = fitted.estimate.names, found.final.errors
     errors = dict(known or zip(names, fitted.estimate.standard_errors.tolist(), strict=True))
-    findings = tuple(_finding(f, fitted.loop, errors, shares, found, records) for f in found.found)
+    findings = tuple(
+        _make_finding(f, fitted.loop, errors, shares, found, records) for f in found.found
+    )
     findings += tuple(Finding(r.effect, r.errors, (), (), r.evidence) for r in read)
     findings = tuple(sorted(findings, key=lambda f: -f.evidence))
     final = fitted.loop
     for r in read:
         final = final if r.effect in final.effects else final.with_effect(r.effect)
-    units = _units(loop, records[0])
-    where = places(found.before, found.after, units)
+    units = _find_units(loop, records[0])
+    where = locate_errors(found.before, found.after, units)
     verdict: Verdict
-    left = stands_out(gap, found.final.fit)
+    left = gap_stands_out(gap, found.final.fit)
     # A random force that may do anything explains everything, and nothing.
     blamed = disturbance.large or math.isnan(disturbance.share)
     left = left or (blamed and gap.after > THRESHOLD.worse_than_given * gap.given)
     total = found.final.fit.value - found.base.fit.value
     effects, gains = [f.trial.effect for f in found.found], [f.trial.gain for f in found.found]
-    loose = doubt_of_all(effects, gains, total if math.isfinite(total) else 0.0)
+    loose = find_doubt(effects, gains, total if math.isfinite(total) else 0.0)
     if found.after.passed and not left and not loose:
         verdict = "explained" if findings else "nothing missing"
     else:
@@ -69,16 +71,16 @@ def put_together(
         for name in loop.free
     )  # fmt: skip
     tests = dict(found.after.p_values)
-    sentence = conclusion(
+    sentence = write_conclusion(
         verdict, findings, gap, disturbance, found.after, where, "" if left else loose
     )
     return Diagnosis(
-        verdict, sentence, findings, final, gap, where, _ranking(found), disturbance, calibrated,
-        _sensitivity(found), tests, notes=tuple(notes),
+        verdict, sentence, findings, final, gap, where, _rank_candidates(found), disturbance,
+        calibrated, _find_sensitivity(found), tests, notes=tuple(notes),
     )  # fmt: skip
 
 
-def name_of(records: Sequence[Record]) -> str:
+def name_records(records: Sequence[Record]) -> str:
     """Return what the records are called, with their size."""
     names = ", ".join(dict.fromkeys(r.name or "record" for r in records))
     size = sum(int(np.count_nonzero(r.valid)) for r in records)
@@ -86,7 +88,7 @@ def name_of(records: Sequence[Record]) -> str:
     return f"{names} ({many}{size} samples, dt = {records[0].dt:g} s)"
 
 
-def _units(loop: Loop, record: Record) -> dict[str, str]:
+def _find_units(loop: Loop, record: Record) -> dict[str, str]:
     e = loop.equations()
     known = dict(getattr(loop.plant, "units", {}))
     y = record.units.get("y", known.get(e.outputs[0], ""))
@@ -96,8 +98,8 @@ def _units(loop: Loop, record: Record) -> dict[str, str]:
     return {**known, **units}
 
 
-def _finding(
-    f: Found, loop: Loop, errors: dict[str, float], shares: dict[int, float], found: Search,
+def _make_finding(
+    f: Weighed, loop: Loop, errors: dict[str, float], shares: dict[int, float], found: Search,
     records: Sequence[Record],
 ) -> Finding:  # fmt: skip
     label, effect = list(loop.labelled.items())[f.position]
@@ -107,35 +109,35 @@ def _finding(
     ties = {
         t.name
         for t in f.rivals
-        if abs(t.gain - f.trial.gain) < THRESHOLD.tie and t.cost == f.trial.cost
+        if abs(t.gain - f.trial.gain) < THRESHOLD.tie and t.penalty == f.trial.penalty
     }
     same = (*same, *sorted(ties - set(same)))
     others = tuple(t.fitted for t in f.rivals)
     apart = [t for t in f.rivals if t.name not in same]
     words, reference = "", None
     if apart:
-        words, reference = separating_experiment(f.trial, apart, records[0])
+        words, reference = find_experiment(f.trial, apart, records[0])
     return Finding(effect, own, others, same, f.trial.gain, shares.get(f.position, math.nan),
-                   words, reference, _presence(f, found, records))  # fmt: skip
+                   words, reference, _find_presence(f, found, records))  # fmt: skip
 
 
-def _presence(f: Found, found: Search, records: Sequence[Record]) -> str:
+def _find_presence(f: Weighed, found: Search, records: Sequence[Record]) -> str:
     """Say in which of several records an effect is seen when each is fitted alone."""
-    several = len(records) > 1 and len(found.final.fit.problem.tracks) == len(records)
+    several = len(records) > 1 and len(found.final.fit.problem.prepared) == len(records)
     if not several or found.final.errors is not None:
         return ""
     seen = []
     for k, record in enumerate(records):
         try:
-            alone = base_model(f.base.fitted, [record], f.base.names)
+            alone = fit_base_model(f.base.fitted, [record], f.base.names)
         except CtrlidError:
             continue
-        if refit(alone, attempt_at(alone, f.trial.fitted)).merit > THRESHOLD.gate:
+        if refit_candidate(alone, screen_at(alone, f.trial.fitted)).net_gain > THRESHOLD.gate:
             seen.append(k)
-    return presence(seen, len(records))
+    return describe_presence(seen, len(records))
 
 
-def _ranking(found: Search) -> tuple[Candidate, ...]:
+def _rank_candidates(found: Search) -> tuple[Candidate, ...]:
     rows = []
     for k, step in enumerate(found.steps):
         begun: list[AbstractEffect] = []  # the same effect, begun elsewhere, is shown once
@@ -145,29 +147,29 @@ def _ranking(found: Search) -> tuple[Candidate, ...]:
             begun.append(t.effect)
             refitted = math.isfinite(t.gain)
             effect = t.fitted if refitted else t.effect
-            price = t.cost if refitted else t.price
-            rows.append(Candidate(k + 1, effect, t.promise, t.gain, price, t.remark))
+            full_penalty = t.penalty if refitted else t.full_penalty
+            rows.append(Candidate(k + 1, effect, t.score, t.gain, full_penalty, t.remark))
     return tuple(rows)
 
 
-def _sensitivity(found: Search) -> dict[str, float]:
+def _find_sensitivity(found: Search) -> dict[str, float]:
     """Return the size of each one-parameter effect that would have earned a place."""
     sizes: dict[str, float] = {}
     if not found.steps:
         return sizes
     for t in found.steps[-1].trials:
-        size = _visible(t)
+        size = _smallest_visible(t)
         key = f"{t.name}.{t.effect.parameters()[0].name}" if t.effect.parameters() else t.name
         if math.isfinite(size) and key not in sizes:
             sizes[key] = size
     return sizes
 
 
-def _visible(t: Trial) -> float:
-    if len(t.effect.parameters()) != 1 or not t.label or not math.isfinite(t.promise):
+def _smallest_visible(t: Trial) -> float:
+    if len(t.effect.parameters()) != 1 or not t.label or not math.isfinite(t.score):
         return math.nan
     fit = t.model.fit
     k = t.model.names.index(f"{t.label}.{t.effect.parameters()[0].name}")
     if not fit.normal[0][k, k] > 0:
         return math.nan
-    return float(fit.standard_errors[k]) * math.sqrt(2 * (THRESHOLD.gate + t.price))
+    return float(fit.standard_errors[k]) * math.sqrt(2 * (THRESHOLD.gate + t.full_penalty))

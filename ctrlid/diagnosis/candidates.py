@@ -13,25 +13,25 @@ from ..effects import AbstractEffect, PeriodicForce, PositionRipple, SensorOffse
 from ..estimation.likelihood.sampled_plant import Trajectory
 from ..loop.loop import Loop
 from ..physics.linearization import state_matrices
-from .fitted_model import Model, as_known
+from .fitted_model import Model, keep_information
 
 
 @dataclass(frozen=True, eq=False)
 class Trial:
     """A candidate added to a model.
 
-    `promise` is the gain of log-likelihood that the first step expects, `gain` what the refit gave,
-    `cost` half the Bayesian penalty of its parameters and of what was scanned. `others` are starts
-    that promise nearly as much, which only a refit tells apart.
+    `score` is the gain of log-likelihood that the first step expects, `gain` what the refit gave,
+    `penalty` half the Bayesian penalty of its parameters and of what was scanned. `others` are
+    starts with nearly the same score, which only a refit tells apart.
     """
 
     effect: AbstractEffect
     label: str
     model: Model
-    promise: float
-    scan: float = 0.0
+    score: float
+    scan_penalty: float = 0.0
     gain: float = math.nan
-    cost: float = math.nan
+    penalty: float = math.nan
     remark: str = ""
     others: tuple[AbstractEffect, ...] = ()
 
@@ -41,17 +41,17 @@ class Trial:
         return type(self.effect).__name__
 
     @property
-    def price(self) -> float:
+    def full_penalty(self) -> float:
         """Half the Bayesian penalty if all its parameters count."""
         size = self.model.fit.size
-        return 0.5 * len(self.effect.parameters()) * math.log(size) + self.scan
+        return 0.5 * len(self.effect.parameters()) * math.log(size) + self.scan_penalty
 
     @property
-    def merit(self) -> float:
+    def net_gain(self) -> float:
         """Gain less penalty; minus infinity for what is out."""
         if self.remark or not math.isfinite(self.gain):
             return -math.inf
-        return self.gain - self.cost
+        return self.gain - self.penalty
 
     @property
     def fitted(self) -> AbstractEffect:
@@ -70,21 +70,21 @@ def contains(effect: AbstractEffect, simple: AbstractEffect) -> bool:
     return more and type(simple).__name__ in effect.look_alikes
 
 
-def comparable(trial: Trial) -> Trial:
+def keep_for_comparison(trial: Trial) -> Trial:
     """Return a trial with what a comparison of likelihoods needs, without what a refit would."""
     fit, none = trial.model.fit, np.zeros((0, 0))
     nowhere = Trajectory(none, none, none)
     bare = tuple(
         replace(out, trajectory=nowhere, slopes=none, disturbance=none) for out in fit.filtered
     )
-    slim = as_known(fit, replace(fit, linearized=(), filtered=bare))
+    slim = keep_information(fit, replace(fit, linearized=(), filtered=bare))
     return replace(trial, model=replace(trial.model, fit=slim))
 
 
 OFFSETS = (SensorOffset,)
 
 
-def candidates(
+def list_candidates(
     catalogue: Sequence[type[AbstractEffect]], loop: Any, record: Record
 ) -> list[AbstractEffect]:
     """Return every effect of a catalogue that a plant can have, at its start."""
@@ -118,14 +118,16 @@ def _place_matters(loop: Loop) -> bool:
 WAVES = (PeriodicForce, PositionRipple)  # of which there may be several
 
 
-def missing_candidates(
+def list_missing_candidates(
     model: Model, catalogue: Sequence[type[AbstractEffect]]
 ) -> list[AbstractEffect]:
     """Return the candidates that a model does not have yet."""
-    record = model.fit.problem.tracks[0].record
-    return [c for c in candidates(catalogue, model.fitted, record) if not _there(model, c)]
+    record = model.fit.problem.prepared[0].record
+    return [
+        c for c in list_candidates(catalogue, model.fitted, record) if not _has_effect(model, c)
+    ]
 
 
-def _there(model: Model, effect: AbstractEffect) -> bool:
+def _has_effect(model: Model, effect: AbstractEffect) -> bool:
     """Whether the model has this effect already; there may be several waves."""
     return not isinstance(effect, WAVES) and any(same_kind(e, effect) for e in model.loop.effects)

@@ -10,7 +10,7 @@ from ..physics.equations import Array
 from .thresholds import THRESHOLD
 
 
-def constancy(fit: Fit, axes: Mapping[str, Array]) -> dict[str, float]:
+def run_constancy_tests(fit: Fit, axes: Mapping[str, Array]) -> dict[str, float]:
     r"""Test that the fitted parameters do not depend on anything.
 
     With the innovations :math:`e_k` of variance :math:`S_k` and their slope :math:`x_k` in a
@@ -42,7 +42,7 @@ def constancy(fit: Fit, axes: Mapping[str, Array]) -> dict[str, float]:
     Nyblom, Journal of the American Statistical Association 84 (1989) 223-230 (constancy of
     parameters from scores).
     """
-    names = fit.problem.machine.names
+    names = fit.problem.plant.names
     parts = [
         (out.slopes[keep], out.innovations[keep], out.variance[keep] * r, keep)
         for out, r, keep in zip(
@@ -53,7 +53,7 @@ def constancy(fit: Fit, axes: Mapping[str, Array]) -> dict[str, float]:
     told = np.concatenate([x**2 / s[:, None] for x, _, s, _ in parts])
     p_values = {}
     for axis, values in axes.items():
-        index = bin_index(values, bin_edges(values))
+        index = find_bins(values, find_bin_edges(values))
         count = np.bincount(index)
         for j, name in enumerate(names):
             score, size = (np.bincount(index, v[:, j]) for v in (scores, told))
@@ -63,27 +63,27 @@ def constancy(fit: Fit, axes: Mapping[str, Array]) -> dict[str, float]:
                     stats.chi2.sf(np.sum(score[use] ** 2 / size[use]), use.sum())
                 )
     for j, name in enumerate(names):
-        lines = [_slow_line(x[:, j] * e / s, whole, keep) for x, e, s, keep in parts
+        lines = [_test_slow_line(x[:, j] * e / s, whole, keep) for x, e, s, keep in parts
                  if (whole := float(np.sum(x[:, j] ** 2 / s))) > 0]  # fmt: skip
         if lines:
             p_values[f"rhythm of {name}"] = min(1.0, min(lines) * len(lines))
     return p_values
 
 
-def _slow_line(score: Array, size: float, keep: Array) -> float:
+def _test_slow_line(score: Array, size: float, keep: Array) -> float:
     """Return the probability that the score of a constant has as strong a slow line."""
     filled = np.zeros(len(keep))
     filled[keep] = score
     power = np.abs(np.fft.rfft(filled)) ** 2 / size
-    return line_chance(power[1 : max(int(THRESHOLD.slow_rhythm * len(power)), 2)])
+    return chance_of_line(power[1 : max(int(THRESHOLD.slow_rhythm * len(power)), 2)])
 
 
-def line_chance(power: Array) -> float:
+def chance_of_line(power: Array) -> float:
     """Return the probability that noise, of mean power one, has as strong a line somewhere."""
     return float(-np.expm1(len(power) * np.log1p(-np.exp(-power.max(initial=0.0)))))
 
 
-def bin_edges(values: Array, bins: int = THRESHOLD.bins) -> Array:
+def find_bin_edges(values: Array, bins: int = THRESHOLD.bins) -> Array:
     """Return edges of bins that hold equally many samples; what rounding left of zero is zero."""
     edges = np.quantile(values, np.linspace(0, 1, bins + 1))
     edges = np.unique(
@@ -92,6 +92,6 @@ def bin_edges(values: Array, bins: int = THRESHOLD.bins) -> Array:
     return edges if len(edges) > 2 else np.array([values.min(), values.mean(), values.max()])
 
 
-def bin_index(values: Array, edges: Array) -> Array:
+def find_bins(values: Array, edges: Array) -> Array:
     """Return the bin of each value."""
     return np.clip(np.searchsorted(edges, values, side="right") - 1, 0, len(edges) - 2)

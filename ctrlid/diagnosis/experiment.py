@@ -10,7 +10,7 @@ from .._base.errors import CtrlidError
 from ..data.record import Record
 from ..data.references import random_binary
 from ..estimation.likelihood.likelihood import Known
-from ..estimation.likelihood.maximization import begin, promised
+from ..estimation.likelihood.maximization import begin_fit, expected_gain
 from ..estimation.likelihood.physics_fit import make_problem
 from ..loop.simulation import Simulator
 from ..physics.equations import Array
@@ -18,7 +18,7 @@ from .candidates import Trial
 from .thresholds import THRESHOLD
 
 
-def separating_experiment(
+def find_experiment(
     best: Trial, others: Sequence[Trial], record: Record
 ) -> tuple[str, Array | None]:
     r"""Return the experiment that separates a finding from its rivals best.
@@ -61,18 +61,18 @@ def separating_experiment(
     simulator = simulators[0]
     able = [
         (d, text, r)
-        for text, r in _references(record)
-        if (d := _distance(simulator, best, others, r[: THRESHOLD.experiment_tried], record))
+        for text, r in _list_references(record)
+        if (d := _least_distance(simulator, best, others, r[: THRESHOLD.experiment_tried], record))
         is not None
     ]
-    chosen = _clearest(able)
-    while chosen is not None and not all(_survives(s, chosen[2], record) for s in simulators):
+    chosen = _choose_clearest(able)
+    while chosen is not None and not all(_loop_survives(s, chosen[2], record) for s in simulators):
         able = [a for a in able if a is not chosen]
-        chosen = _clearest(able)
+        chosen = _choose_clearest(able)
     if chosen is None:
         return words, None
     own = (
-        _distance(
+        _least_distance(
             simulator, best, others, np.asarray(record.r)[: THRESHOLD.experiment_tried], record
         )
         or 0.0
@@ -90,7 +90,7 @@ def separating_experiment(
     return text, chosen[2]
 
 
-def _clearest(able: Sequence[tuple[float, str, Array]]) -> tuple[float, str, Array] | None:
+def _choose_clearest(able: Sequence[tuple[float, str, Array]]) -> tuple[float, str, Array] | None:
     """Return the experiment with the largest distance; a bolder one has to be clearly better."""
     chosen = None
     for one in able:
@@ -99,7 +99,7 @@ def _clearest(able: Sequence[tuple[float, str, Array]]) -> tuple[float, str, Arr
     return chosen
 
 
-def _survives(simulator: Simulator, r: Array, record: Record) -> bool:
+def _loop_survives(simulator: Simulator, r: Array, record: Record) -> bool:
     """Whether a loop follows a reference somewhat larger than this one.
 
     Behind limits of the input, a loop that has lost its plant may yet stay bounded.
@@ -116,7 +116,7 @@ def _survives(simulator: Simulator, r: Array, record: Record) -> bool:
     return bool(np.ptp(y) <= THRESHOLD.experiment_margin * reach)
 
 
-def _references(record: Record) -> list[tuple[str, Array]]:
+def _list_references(record: Record) -> list[tuple[str, Array]]:
     """Return references of several kinds, from the record's own to bolder ones."""
     assert record.r is not None
     r = np.asarray(record.r)[record.valid]
@@ -143,11 +143,11 @@ def _references(record: Record) -> list[tuple[str, Array]]:
         ("steps four times as large that change every other sample", 4 * step, 2, 0.0),
     ):  # fmt: skip
         signal = random_binary(n, amplitude=amplitude, hold=width, around=middle, seed=0)
-        found.append((label, signal + _levels(n, levels)))
+        found.append((label, signal + _visit_levels(n, levels)))
     return found
 
 
-def _levels(n: int, reach: float) -> Array:
+def _visit_levels(n: int, reach: float) -> Array:
     """Return a walk over set-points with ramps between them, starting from the middle."""
     size = n / len(THRESHOLD.experiment_levels)
     times, values = [0.0], [0.0]
@@ -157,30 +157,30 @@ def _levels(n: int, reach: float) -> Array:
     return np.asarray(np.interp(np.arange(n), times, values), dtype=float)
 
 
-def _distance(
+def _least_distance(
     simulator: Simulator, best: Trial, others: Sequence[Trial], r: Array, record: Record
 ) -> float | None:
     """Return the least distance of a finding from its rivals, per sample."""
-    if not _survives(simulator, r, record):
+    if not _loop_survives(simulator, r, record):
         return None
     try:
         y, u = simulator.run(simulator.start(None), r, np.zeros(len(r)))
     except CtrlidError:
         return None
     made = Record(u=u, y=y, r=r, dt=record.dt, hold=record.hold)
-    sizes = [d for t in others if (d := _unlike(t, best, made)) is not None]
+    sizes = [d for t in others if (d := _unpredicted(t, best, made)) is not None]
     return min(sizes) / len(r) if sizes else None
 
 
-def _unlike(rival: Trial, best: Trial, record: Record) -> float | None:
+def _unpredicted(rival: Trial, best: Trial, record: Record) -> float | None:
     """Return what a rival cannot predict of a record that the finding made."""
     model = rival.model
     known = Known(best.model.fit.noise, np.full(1, float(np.mean(best.model.fit.sensor))))
     try:
         problem = replace(make_problem(model.fitted, model.names, [record]), known=known)
-        fit = begin(problem, model.fit.theta, None)
+        fit = begin_fit(problem, model.fit.theta, None)
     except CtrlidError:
         return None
     errors = sum(float(np.nansum(z**2)) for z in fit.standardized)
-    left = errors - 2 * promised(fit)
+    left = errors - 2 * expected_gain(fit)
     return max(left, 0.0) if math.isfinite(left) else None

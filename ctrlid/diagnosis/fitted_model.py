@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from ..estimation.likelihood.filter_data import retracked
+from ..estimation.likelihood.filter_data import prepare_for_loop
 from ..estimation.likelihood.kalman_filter import Noise, first_guess
-from ..estimation.likelihood.likelihood import Fit, evaluate, relinearized
-from ..estimation.likelihood.physics_fit import bounds_of, start_values
-from ..estimation.likelihood.sampled_plant import Machine, Trajectory
+from ..estimation.likelihood.likelihood import Fit, evaluate, linearize_again
+from ..estimation.likelihood.physics_fit import parameter_bounds, start_values
+from ..estimation.likelihood.sampled_plant import SampledPlant, Trajectory
 from ..loop.loop import Loop
 from ..loop.period_map import comes_to_rest
 from ..physics.equations import Array
@@ -33,7 +33,7 @@ class Model:
     @property
     def names(self) -> tuple[str, ...]:
         """The parameters that were fitted."""
-        return self.fit.problem.machine.names
+        return self.fit.problem.plant.names
 
     @property
     def fitted(self) -> Loop:
@@ -42,15 +42,15 @@ class Model:
         return self.loop.with_parameters(values)
 
 
-def simulable(model: Model) -> bool:
+def can_simulate(model: Model) -> bool:
     """Whether the records can be simulated with this model."""
     loop = model.loop
     if loop.controller is None:
         return comes_to_rest(loop)
-    return all(t.record.r is not None for t in model.fit.problem.tracks)
+    return all(t.record.r is not None for t in model.fit.problem.prepared)
 
 
-def quiet(model: Model) -> Model:
+def without_random_force(model: Model) -> Model:
     """Return a model with hardly any random force, to begin a fit with; known noise is kept."""
     noise = model.fit.noise
     if model.fit.problem.known is not None:
@@ -59,28 +59,28 @@ def quiet(model: Model) -> Model:
     return replace(model, fit=replace(model.fit, noise=Noise(force)))
 
 
-def light(fit: Fit) -> Fit:
+def drop_arrays(fit: Fit) -> Fit:
     """Return a fit without its arrays: many candidates on a long record must fit into memory."""
-    return as_known(fit, replace(fit, linearized=(), filtered=()))
+    return keep_information(fit, replace(fit, linearized=(), filtered=()))
 
 
-def spared(fit: Fit) -> Fit:
+def drop_linearization(fit: Fit) -> Fit:
     """Return a fit without the plant along its trajectory, four fifths of its memory.
 
     Whatever climbs on from it linearizes anew.
     """
-    return as_known(fit, replace(fit, linearized=()))
+    return keep_information(fit, replace(fit, linearized=()))
 
 
-def as_known(fit: Fit, bare: Fit) -> Fit:
+def keep_information(fit: Fit, bare: Fit) -> Fit:
     """Return a fit that lost its arrays with what had been computed from them."""
     bare.__dict__["normal"] = fit.normal
     return bare
 
 
-def whole(model: Model) -> Model:
+def with_linearization(model: Model) -> Model:
     """Return a model whose fit has the plant along its trajectory."""
-    return model if model.fit.linearized else replace(model, fit=relinearized(model.fit))
+    return model if model.fit.linearized else replace(model, fit=linearize_again(model.fit))
 
 
 def log_terms(fit: Fit) -> Array:
@@ -92,21 +92,21 @@ def log_terms(fit: Fit) -> Array:
     return np.concatenate(parts)
 
 
-def carried_over(base: Model, loop: Loop, names: Sequence[str]) -> Fit:
+def carry_over(base: Model, loop: Loop, names: Sequence[str]) -> Fit:
     """Return the likelihood of a larger or smaller model, along the trajectory of the base."""
     old = base.fit.problem
-    m = Machine(loop, names, old.machine.hold, old.machine.law is not None)
-    tracks = tuple(retracked(track, loop) for track in old.tracks)
+    m = SampledPlant(loop, names, old.plant.hold, old.plant.law is not None)
+    prepared = tuple(prepare_for_loop(track, loop) for track in old.prepared)
     at = [
-        _carried(old.machine, m, out.trajectory, first_guess(m, track))
-        for out, track in zip(base.fit.filtered, tracks, strict=True)
+        _carry_trajectory(old.plant, m, out.trajectory, first_guess(m, track))
+        for out, track in zip(base.fit.filtered, prepared, strict=True)
     ]
-    lower, upper = bounds_of(loop, names)
+    lower, upper = parameter_bounds(loop, names)
     for k, name in enumerate(names):
         if name in base.names:
             i = base.names.index(name)
             lower[k], upper[k] = old.lower[i], old.upper[i]
-    longest = max(len(t.record) for t in tracks) * loop.dt
+    longest = max(len(t.record) for t in prepared) * loop.dt
     for k, name in enumerate(names):
         if name.endswith(".frequency"):  # what samples show: below Nyquist's, above one period
             lower[k], upper[k] = max(lower[k], 1.0 / longest), min(upper[k], 0.4 / loop.dt)
@@ -116,23 +116,25 @@ def carried_over(base: Model, loop: Loop, names: Sequence[str]) -> Fit:
             way = max(float(np.ptp(a.filtered[:, m.position])) for a in at)
             upper[k] = max(min(upper[k], way), lower[k])
         if name.endswith(".vs"):  # of the speeds that there are
-            fastest = max(_speed(m, a) for a in at)
+            fastest = max(_largest_speed(m, a) for a in at)
             lower[k], upper[k] = max(lower[k], 1e-3 * fastest), min(upper[k], 3.0 * fastest)
-    problem = replace(old, machine=m, tracks=tracks, lower=lower, upper=upper)
+    problem = replace(old, plant=m, prepared=prepared, lower=lower, upper=upper)
     theta = np.clip(start_values(loop, names), lower, upper)
     fit = evaluate(problem, theta, base.fit.noise, at)
-    if math.isfinite(fit.value) and m.n > old.machine.n:
+    if math.isfinite(fit.value) and m.n > old.plant.n:
         fit = evaluate(problem, theta, base.fit.noise, [o.trajectory for o in fit.filtered])
     return fit
 
 
-def _speed(m: Machine, at: Trajectory) -> float:
+def _largest_speed(m: SampledPlant, at: Trajectory) -> float:
     """Return the largest usual speed along a trajectory."""
     fastest = [float(np.quantile(np.abs(at.filtered[:, j]), 0.99)) for j in m.e.velocities]
     return max(fastest, default=1.0) or 1.0
 
 
-def _carried(old: Machine, new: Machine, known: Trajectory, guess: Trajectory) -> Trajectory:
+def _carry_trajectory(
+    old: SampledPlant, new: SampledPlant, known: Trajectory, guess: Trajectory
+) -> Trajectory:
     """Take states that both have from the old trajectory, and guess the others."""
     mine = list(new.e.states)
     columns = [(mine.index(s), k) for k, s in enumerate(old.e.states) if s in mine]

@@ -9,18 +9,18 @@ import numpy as np
 from .._base.errors import CtrlidError
 from ..data.record import Record
 from ..estimation.likelihood.likelihood import Fit, Known, evaluate
-from ..estimation.likelihood.maximization import begin, climb
+from ..estimation.likelihood.maximization import begin_fit, maximize
 from ..estimation.likelihood.physics_fit import make_problem, start_values
 from ..loop.loop import Loop
 from ..physics.equations import Array
 from . import gap as gaps
 from .fitted_model import Model
-from .recalibration import stretches
+from .recalibration import cut_stretches
 from .thresholds import THRESHOLD
 
 
 @dataclass(frozen=True, eq=False)
-class Fresh:
+class FreshData:
     """What models are compared on.
 
     `rest` holds the records without the windows, which the parameters are fitted to for the
@@ -36,7 +36,7 @@ class Fresh:
         if model.errors is not None:
             return (model.fitted,) * len(self.windows)
         if self.rest is None:
-            return tuple(_with_private_parts(model, w) for w in self.windows)
+            return tuple(_fit_private_parameters(model, w) for w in self.windows)
         return (self._trained(model, self.rest),) * len(self.windows)
 
     def without_windows(self, records: Sequence[Record]) -> list[Record]:
@@ -50,17 +50,19 @@ class Fresh:
         fit = model.fit
         if not model.names:
             return model.fitted
-        parts, begins = stretches(records)
+        parts, begins = cut_stretches(records)
         problem = make_problem(model.fitted, model.names, parts, begins)
         known = fit.problem.known
         if known is not None and (known.sensor is None or len(parts) == len(known.sensor)):
             problem = replace(problem, known=known)
-        return Model(model.loop, climb(begin(problem, fit.theta, fit.noise), exact=False)).fitted
+        return Model(
+            model.loop, maximize(begin_fit(problem, fit.theta, fit.noise), exact=False)
+        ).fitted
 
     def outputs(self, loops: Sequence[Loop]) -> tuple[Array, ...]:
         """Return what each loop makes of its window."""
         pairs = zip(loops, self.windows, strict=True)
-        return tuple(gaps.output(loop, w, self.kind) for loop, w in pairs)
+        return tuple(gaps.simulate_window(loop, w, self.kind) for loop, w in pairs)
 
     def gap(self, loops: Sequence[Loop]) -> float:
         """Return the RMS error of loops [output unit]."""
@@ -76,15 +78,15 @@ class Fresh:
         total = 0.0
         for loop, window in zip(loops, self.windows, strict=True):
             problem = make_problem(loop, (), [window.record], [window.begin])
-            here = begin(replace(problem, known=known), np.zeros(0), None)
+            here = begin_fit(replace(problem, known=known), np.zeros(0), None)
             z = here.standardized[0][window.mask]
             total += 0.5 * float(np.nansum(z**2 - 1))
         return max(total, 0.0)
 
 
-def fresh_data(
+def choose_fresh_data(
     loop: Loop, records: Sequence[Record], validation: Sequence[Record] | None
-) -> Fresh:  # fmt: skip
+) -> FreshData:  # fmt: skip
     """Return the records given for validation, or the last quarter of each record.
 
     Raises
@@ -98,13 +100,13 @@ def fresh_data(
                               "give both the same period")  # fmt: skip
     rest: tuple[Record, ...] | None = None
     if validation is None:
-        windows, rest = zip(*(gaps.held_out(r) for r in records), strict=True)
+        windows, rest = zip(*(gaps.hold_out(r) for r in records), strict=True)
     else:
-        windows = tuple(gaps.whole(r) for r in validation)
-    return Fresh(windows, rest, gaps.way_to_compare(loop, windows[0].record))
+        windows = tuple(gaps.make_window(r) for r in validation)
+    return FreshData(windows, rest, gaps.choose_comparison(loop, windows[0].record))
 
 
-def _with_private_parts(model: Model, window: gaps.Window) -> Loop:
+def _fit_private_parameters(model: Model, window: gaps.Window) -> Loop:
     """Return the loop with what is private to a record, such as a phase, fitted to this one."""
     loop, fit = model.fitted, model.fit
     names = [f"{label}.{k}" for label, e in loop.labelled.items() for k in e.private]
@@ -114,14 +116,14 @@ def _with_private_parts(model: Model, window: gaps.Window) -> Loop:
     try:
         problem = make_problem(loop, names, [window.record], [window.begin])
         problem = replace(problem, known=Known(fit.noise, sensor))
-        start = begin(problem, start_values(loop, names), None)
+        start = begin_fit(problem, start_values(loop, names), None)
         at = [out.trajectory for out in start.filtered]
         for k in range(len(names)):
             turns = np.arange(THRESHOLD.phase_starts) * 2 * math.pi / THRESHOLD.phase_starts
             turned = [start.theta + turn * np.eye(len(names))[k] for turn in turns]
             tried = [evaluate(start.problem, theta, fit.noise, at) for theta in turned]
             start = max(tried, key=lambda f: f.value)
-        best = climb(start, exact=False)
+        best = maximize(start, exact=False)
     except CtrlidError:
         return loop
     return loop.with_parameters(dict(zip(names, best.theta.tolist(), strict=True)))

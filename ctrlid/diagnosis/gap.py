@@ -23,7 +23,7 @@ from ..validation.comparing import moving_poles, time_constant
 from .thresholds import THRESHOLD
 
 
-def way_to_compare(loop: Loop, record: Record) -> str:
+def choose_comparison(loop: Loop, record: Record) -> str:
     """Return how a loop is compared with a record: the most telling way there is."""
     if loop.controller is not None and record.r is not None:
         return "closed-loop simulation"
@@ -45,7 +45,7 @@ class Window:
     mask: Any
 
 
-def held_out(record: Record) -> tuple[Window, Record]:
+def hold_out(record: Record) -> tuple[Window, Record]:
     """Return the last quarter of what counts, and the record before it."""
     valid = np.flatnonzero(record.valid)
     first = max(
@@ -58,7 +58,7 @@ def held_out(record: Record) -> tuple[Window, Record]:
     return Window(part, start * record.dt, mask), record[:first]
 
 
-def whole(record: Record) -> Window:
+def make_window(record: Record) -> Window:
     """Return a record of which all but the very start is compared."""
     mask = np.asarray(record.valid).copy()
     mask[: max(int(THRESHOLD.start_left_out * len(mask)), 1)] = False
@@ -77,7 +77,7 @@ def root_mean_square(windows: Sequence[Window], results: Sequence[Array]) -> flo
     return math.sqrt(squares / max(count, 1))
 
 
-def output(loop: Loop, window: Window, kind: str) -> Array:
+def simulate_window(loop: Loop, window: Window, kind: str) -> Array:
     """Return what a loop makes of a window, without any of its measured outputs but the first.
 
     Parameters
@@ -87,7 +87,7 @@ def output(loop: Loop, window: Window, kind: str) -> Array:
     window : Window
         The data.
     kind : str
-        As `way_to_compare` says it.
+        As `choose_comparison` says it.
 
     Returns
     -------
@@ -98,7 +98,7 @@ def output(loop: Loop, window: Window, kind: str) -> Array:
     y = np.full(len(record), np.nan)
     try:
         if kind.endswith("prediction"):
-            index, values = predict_ahead(loop, record, predict(loop, record), _steps(kind))
+            index, values = predict_ahead(loop, record, predict(loop, record), _count_steps(kind))
             y[index] = values
             return y
         simulator = Simulator(loop, THRESHOLD.gap_integration_error, THRESHOLD.gap_steps)
@@ -109,7 +109,7 @@ def output(loop: Loop, window: Window, kind: str) -> Array:
             continue
         try:
             part = record[start:stop]
-            z, r, d = drive(simulator, part)
+            z, r, d = prepare_simulation(simulator, part)
             begin = first + float(record.t[start] - record.start)
             y[start:stop] = simulator.run(z, r, d, None, begin)[0]
         except CtrlidError:
@@ -117,11 +117,11 @@ def output(loop: Loop, window: Window, kind: str) -> Array:
     return y
 
 
-def _steps(kind: str) -> int:
+def _count_steps(kind: str) -> int:
     return int(kind.partition("-")[0])
 
 
-def drive(
+def prepare_simulation(
     simulator: Simulator, part: Record, follows: bool = False
 ) -> tuple[Array, Array | None, Array]:
     """Return initial state, reference and injected signal for one stretch.
@@ -159,7 +159,7 @@ class Floor:
     widest: float
 
 
-def floor_of(
+def compute_floor(
     loops: Sequence[Loop],
     fit: Fit,
     windows: Sequence[Window],
@@ -177,7 +177,7 @@ def floor_of(
     windows : sequence of Window
         The data.
     kind : str
-        As `way_to_compare` says it.
+        As `choose_comparison` says it.
     runs : int
         Simulations with noise.
 
@@ -190,7 +190,7 @@ def floor_of(
     for k, (loop, window) in enumerate(zip(loops, windows, strict=True)):
         noise = float(fit.sensor[min(k, len(fit.sensor) - 1)])
         try:
-            squares += _squares(loop, fit, noise, window, kind, runs)
+            squares += _simulate_noise(loop, fit, noise, window, kind, runs)
         except CtrlidError:
             return Floor(math.nan, math.nan, math.nan)
         count += int(np.count_nonzero(window.mask))
@@ -199,14 +199,14 @@ def floor_of(
     return Floor(both, sensor, float(np.max(errors[:, 0])))
 
 
-def _squares(
+def _simulate_noise(
     loop: Loop, fit: Fit, sensor: float, window: Window, kind: str, runs: int
 ) -> Array:  # fmt: skip
     """Return what noise leaves in a window, squared and summed over its samples, for each run."""
     record = window.record
     size = int(np.count_nonzero(window.mask))
     if kind.endswith("prediction"):
-        known = np.array(spread_ahead(loop, record, predict(loop, record), _steps(kind)))
+        known = np.array(spread_ahead(loop, record, predict(loop, record), _count_steps(kind)))
         return np.tile(size * known**2, (runs, 1))
     simulator = Simulator(loop, THRESHOLD.gap_integration_error, THRESHOLD.gap_steps)
     squares, count = np.zeros((runs, 2)), 0
@@ -216,10 +216,10 @@ def _squares(
             continue
         part = record[start:stop]
         begin = window.begin + float(record.t[start] - record.start)
-        z, r, d = drive(simulator, part)
+        z, r, d = prepare_simulation(simulator, part)
         rest = simulator.run(z, r, d, None, begin)[0]
         for seed in range(runs):
-            noise = random_noise(fit, sensor, len(part), seed)
+            noise = draw_noise(fit, sensor, len(part), seed)
             for k, both in enumerate((noise, [noise[0], 0 * noise[1]])):
                 moved = simulator.run(z, r, d, both, begin)[0] - rest
                 squares[seed, k] += float(np.sum(moved[use] ** 2))
@@ -229,7 +229,7 @@ def _squares(
     return squares * (size / count)
 
 
-def random_noise(fit: Fit, sensor: float, n: int, seed: int) -> list[Array]:
+def draw_noise(fit: Fit, sensor: float, n: int, seed: int) -> list[Array]:
     """Return sensor noise and force noise as a fit found them."""
     noise, streams = fit.noise, np.random.default_rng(seed).standard_normal((3, n))
     force = streams[1] * math.sqrt(sensor * float(np.mean(noise.force)))

@@ -11,13 +11,15 @@ from ..loop.loop import Loop
 from . import gap as gaps
 from .findings import Disturbance, Gap
 from .fitted_model import Model
-from .fresh_data import Fresh
+from .fresh_data import FreshData
 from .growth import Search
-from .removal import Found
+from .removal import Weighed
 from .thresholds import THRESHOLD
 
 
-def gaps_of(loop: Loop, found: Search, fresh: Fresh) -> tuple[Gap, dict[int, float], Disturbance]:
+def summarize_gap(
+    loop: Loop, found: Search, fresh: FreshData
+) -> tuple[Gap, dict[int, float], Disturbance]:
     """Return the gap on data that no parameter was fitted to, and what each finding closes."""
     windows, kind = fresh.windows, fresh.kind
     before, after = (fresh.loops(m) for m in (found.base, found.final))
@@ -26,16 +28,16 @@ def gaps_of(loop: Loop, found: Search, fresh: Fresh) -> tuple[Gap, dict[int, flo
     results = [fresh.outputs(x) for x in ((loop,) * len(windows), before, after)]
     sizes = [gaps.root_mean_square(windows, y) for y in results]
     fit = found.final.fit
-    floor = gaps.floor_of(after, fit, windows, kind)
+    floor = gaps.compute_floor(after, fit, windows, kind)
     if sizes[2] > THRESHOLD.excess * floor.both:
-        floor = gaps.floor_of(after, fit, windows, kind, THRESHOLD.floor_more_runs)
+        floor = gaps.compute_floor(after, fit, windows, kind, THRESHOLD.floor_more_runs)
     shares: dict[int, float] = {}
     for f in found.found:
         error = sizes[1]
         if len(found.found) > 1:
             label = list(after[0].labelled)[f.position]
             error = fresh.gap([x.without_effect(label) for x in after])
-        shares[f.position] = _share(error**2 - sizes[2] ** 2, sizes[1], floor.both)
+        shares[f.position] = _share_closed(error**2 - sizes[2] ** 2, sizes[1], floor.both)
     first = windows[0]
     gap = Gap(
         kind, sizes[0], sizes[1], sizes[2], floor.both, first.record.units.get("y", ""),
@@ -43,37 +45,37 @@ def gaps_of(loop: Loop, found: Search, fresh: Fresh) -> tuple[Gap, dict[int, flo
         np.asarray(first.record.y)[first.mask], results[1][0][first.mask],
         results[2][0][first.mask], floor.widest,
     )  # fmt: skip
-    return gap, shares, _disturbance(fit, loop, floor)
+    return gap, shares, _measure_disturbance(fit, loop, floor)
 
 
-def helps_on(fresh: Fresh) -> Callable[[Found, Model], bool]:
+def helps_on_fresh_data(fresh: FreshData) -> Callable[[Weighed, Model], bool]:
     """Return whether an effect closes a fair part of what is left without it, on fresh data.
 
     Of the gap, or, where noise is known, of the one-step errors: a small fast force is seen there.
     """
     loops = functools.cache(fresh.loops)
 
-    def helps(f: Found, model: Model) -> bool:
+    def helps(f: Weighed, model: Model) -> bool:
         with_it, without = loops(model), loops(f.base)
         if model.fit.problem.known is not None:
             left = fresh.excess(without, model.fit)
             if left - fresh.excess(with_it, model.fit) > THRESHOLD.helps * left:
                 return True
-        floor = gaps.floor_of(with_it, model.fit, fresh.windows, fresh.kind).both
+        floor = gaps.compute_floor(with_it, model.fit, fresh.windows, fresh.kind).both
         gap, before = fresh.gap(with_it), fresh.gap(without)
-        return _share(before**2 - gap**2, before, floor) > THRESHOLD.helps
+        return _share_closed(before**2 - gap**2, before, floor) > THRESHOLD.helps
 
     return helps
 
 
-def _share(closed: float, before: float, floor: float) -> float:
+def _share_closed(closed: float, before: float, floor: float) -> float:
     above = before**2 - (floor**2 if math.isfinite(floor) else 0.0)
     if not (math.isfinite(closed) and math.isfinite(above)) or above <= 0:
         return math.nan
     return float(min(max(closed / above, 0.0), 1.0))
 
 
-def _disturbance(fit: Fit, loop: Loop, floor: gaps.Floor) -> Disturbance:
+def _measure_disturbance(fit: Fit, loop: Loop, floor: gaps.Floor) -> Disturbance:
     noise, scale = fit.noise, float(np.mean(fit.sensor))
     time_constant = -loop.dt / math.log(noise.memory) if noise.drift else math.nan
     share = 1 - (floor.sensor / floor.both) ** 2 if floor.both > 0 else math.nan

@@ -9,16 +9,23 @@ import numpy as np
 from .._base.errors import CtrlidError
 from ..effects import AbstractEffect
 from ..estimation.likelihood.likelihood import Fit
-from .candidates import Trial, contains, missing_candidates
-from .fitted_model import Model, simulable, spared, whole
-from .noise_tests import Omnibus, alarm_level, omnibus
-from .recalibration import anchor
-from .refitting import refit
-from .removal import Found, cut, renoised, reordered, settled, without_superfluous
-from .replicas import forgiven, replica
-from .rivals import compared
-from .scans import SCANS, scanned
-from .selection import Step, Work, one_round
+from .candidates import Trial, contains, list_missing_candidates
+from .fitted_model import Model, can_simulate, drop_linearization, with_linearization
+from .noise_tests import NoiseTests, alarm_level, run_noise_tests
+from .recalibration import model_at_given_values
+from .refitting import refit_candidate
+from .removal import (
+    Weighed,
+    drop_superfluous,
+    order_last_effect,
+    refit_noise,
+    refit_without_effect,
+    weigh_effects,
+)
+from .replicas import forgive_filter, make_replica
+from .rivals import compare_effects
+from .scans import SCANS, scan_candidate
+from .selection import Round, Work, run_round
 from .thresholds import THRESHOLD
 
 
@@ -31,17 +38,17 @@ class Search:
     """
 
     base: Model
-    steps: tuple[Step, ...]
+    steps: tuple[Round, ...]
     final: Model
-    found: tuple[Found, ...]
-    before: Omnibus
-    after: Omnibus
-    other: tuple[Step, ...] = ()
+    found: tuple[Weighed, ...]
+    before: NoiseTests
+    after: NoiseTests
+    other: tuple[Round, ...] = ()
 
 
-def search(
+def search_effects(
     base: Model, catalogue: Sequence[type[AbstractEffect]], work: Work,
-    tell: Callable[[str], None], first: Sequence[Step] = (),
+    tell: Callable[[str], None], first: Sequence[Round] = (),
 ) -> Search:  # fmt: skip
     """Add effects to a base model until nothing more earns a place, and drop what is superfluous.
 
@@ -66,26 +73,26 @@ def search(
     """
     given = len(base.loop.effects)
     steps = list(first)
-    model = whole(first[-1].base) if first else base
-    changed, left = False, tuple[Step, ...]()
+    model = with_linearization(first[-1].base) if first else base
+    changed, left = False, tuple[Round, ...]()
     while not steps or steps[-1].best is not None:
         if steps and steps[-1].best is not None:
             tell(f"round {len(steps)}: {steps[-1].best.name}")
-            model = renoised(reordered(steps[-1].best.model, given))
-            model = whole(without_superfluous(model, given))
+            model = refit_noise(order_last_effect(steps[-1].best.model, given))
+            model = with_linearization(drop_superfluous(model, given))
         if (
             len(model.loop.effects) - given >= THRESHOLD.many_effects
             or len(steps) >= THRESHOLD.many_effects + 2
         ):
             break
         tell(f"round {len(steps) + 1}: screening")
-        pool = missing_candidates(model, catalogue)
-        step = one_round(model, pool, work, None if steps else anchor(base))
-        step = replace(step, base=Model(model.loop, spared(model.fit)))
-        if step.best is not None and _stands_in(step.best, model, beside=bool(steps)):
+        pool = list_missing_candidates(model, catalogue)
+        step = run_round(model, pool, work, None if steps else model_at_given_values(base))
+        step = replace(step, base=Model(model.loop, drop_linearization(model.fit)))
+        if step.best is not None and _is_stand_in(step.best, model, beside=bool(steps)):
             step = replace(step, best=None)
         asked = steps and not first and not changed
-        better = _foreseen(steps[-1], step, catalogue, work) if asked else None
+        better = _look_back(steps[-1], step, catalogue, work) if asked else None
         changed = better is not None
         if changed:
             left = left or (*steps, step)
@@ -93,22 +100,22 @@ def search(
         else:
             steps.append(step)
     try:
-        model, found = settled(model, given, steps)
+        model, found = weigh_effects(model, given, steps)
     except CtrlidError:  # what cannot be taken out again cannot be weighed, and explains nothing
         model, found = base, ()
-    tests = omnibus(base.fit), judged(model)
+    tests = run_noise_tests(base.fit), retest_with_replicas(model)
     return Search(base, tuple(steps), model, found, *tests, left)
 
 
-def named(found: Search, work: Work) -> Search:
+def compare_names(found: Search, work: Work) -> Search:
     """Return the search with what could stand in the place of each effect."""
     given = len(found.base.loop.effects)
-    model, each = compared(found.final, found.found, given, found.steps, work)
-    after = found.after if model is found.final else judged(model)
+    model, each = compare_effects(found.final, found.found, given, found.steps, work)
+    after = found.after if model is found.final else retest_with_replicas(model)
     return replace(found, final=model, found=each, after=after)
 
 
-def _stands_in(best: Trial, model: Model, beside: bool) -> bool:
+def _is_stand_in(best: Trial, model: Model, beside: bool) -> bool:
     """Whether an effect gains so much less than what is missing that it can only stand in for it.
 
     Parameters
@@ -120,19 +127,19 @@ def _stands_in(best: Trial, model: Model, beside: bool) -> bool:
     beside : bool
         Whether an effect was found before; the best of several unknown ones may gain little.
     """
-    if best.gain < THRESHOLD.little_of_known * excess(model.fit):
+    if best.gain < THRESHOLD.little_of_known * unexplained_likelihood(model.fit):
         return True
     if (
-        not (beside and simulable(model))
-        or best.gain >= THRESHOLD.small_gain * omnibus(model.fit).told
+        not (beside and can_simulate(model))
+        or best.gain >= THRESHOLD.small_gain * run_noise_tests(model.fit).told
     ):
         return False
     # The tests may be alarmed by the filter itself: replicas, which take their time, forgive that.
-    return best.gain < THRESHOLD.small_gain * judged(model).told
+    return best.gain < THRESHOLD.small_gain * retest_with_replicas(model).told
 
 
-def _foreseen(
-    last: Step, step: Step, catalogue: Sequence[type[AbstractEffect]], work: Work
+def _look_back(
+    last: Round, step: Round, catalogue: Sequence[type[AbstractEffect]], work: Work
 ) -> Trial | None:  # fmt: skip
     """Return what would have been the better choice of the last round, now that more is found.
 
@@ -141,43 +148,43 @@ def _foreseen(
     Where nothing follows on the best that leaves noise alone, those that did as well are asked: an
     offset of the sensor moves the middle of a spring, and a constant force does not.
     """
-    if step.best is None and omnibus(step.base.fit).passed:
+    if step.best is None and run_noise_tests(step.base.fit).passed:
         return None
     best = last.best
     assert best is not None
-    ties = step.best is None or not omnibus(step.best.model.fit).passed
-    near = [t for t in last.trials[1 : THRESHOLD.looked_at] if _nearly(t, best, ties)]
+    ties = step.best is None or not run_noise_tests(step.best.model.fit).passed
+    near = [t for t in last.trials[1 : THRESHOLD.looked_at] if _came_close(t, best, ties)]
     # What promised little beside the best is not scanned again, which takes most of the time.
-    ranked = sorted(step.trials, key=lambda t: -t.promise)
+    ranked = sorted(step.trials, key=lambda t: -t.score)
     likely = {t.name for t in (ranked if step.best is None else ranked[: THRESHOLD.looked_at])}
     pairs: list[tuple[float, int]] = []
     for k, trial in enumerate(near[: THRESHOLD.looked_back]):
-        model = whole(trial.model)
-        pool = [c for c in missing_candidates(model, catalogue)
+        model = with_linearization(trial.model)
+        pool = [c for c in list_missing_candidates(model, catalogue)
                 if type(c) not in SCANS or type(c).__name__ in likely]  # fmt: skip
-        tried: list[Trial] = work(lambda effect, model=model: scanned(model, effect), pool)
-        tried = sorted(tried, key=lambda t: t.price - t.promise)[:2]
-        done = work(lambda t, model=model: refit(model, t), tried)
-        pairs.append((trial.merit + max((t.merit for t in done), default=-math.inf), k))
+        tried: list[Trial] = work(lambda effect, model=model: scan_candidate(model, effect), pool)
+        tried = sorted(tried, key=lambda t: t.full_penalty - t.score)[:2]
+        done = work(lambda t, model=model: refit_candidate(model, t), tried)
+        pairs.append((trial.net_gain + max((t.net_gain for t in done), default=-math.inf), k))
     total, k = max(pairs, default=(-math.inf, 0))
-    own = best.merit + (step.best.merit if step.best is not None else THRESHOLD.gate)
+    own = best.net_gain + (step.best.net_gain if step.best is not None else THRESHOLD.gate)
     return near[k] if total > own + THRESHOLD.gate else None
 
 
-def _nearly(trial: Trial, best: Trial, ties: bool) -> bool:
+def _came_close(trial: Trial, best: Trial, ties: bool) -> bool:
     """Whether a candidate did nearly as well as one that resembles it, and is another.
 
     One that did as well is asked for `ties` only: it is another name for the same, as a rule.
     """
     if contains(trial.effect, best.effect) or contains(best.effect, trial.effect):
         return False
-    if not THRESHOLD.look_back * best.merit < trial.merit:
+    if not THRESHOLD.look_back * best.net_gain < trial.net_gain:
         return False
     mine, its = ({t.name, *type(t.effect).look_alikes} for t in (best, trial))
-    return ties or (bool(mine & its) and trial.merit < best.merit - THRESHOLD.close)
+    return ties or (bool(mine & its) and trial.net_gain < best.net_gain - THRESHOLD.close)
 
 
-def excess(fit: Fit) -> float:
+def unexplained_likelihood(fit: Fit) -> float:
     """Return the log-likelihood above that of noise which is known; zero where none is known."""
     if fit.problem.known is None:
         return 0.0
@@ -185,16 +192,16 @@ def excess(fit: Fit) -> float:
     return max(0.0, 0.5 * float(np.nansum(z**2 - 1)))
 
 
-def judged(model: Model) -> Omnibus:
+def retest_with_replicas(model: Model) -> NoiseTests:
     """Return the tests of what a model leaves, without the alarms of the filter itself."""
-    after = replace(omnibus(model.fit), alpha=alarm_level(len(model.loop.effects)))
+    after = replace(run_noise_tests(model.fit), alpha=alarm_level(len(model.loop.effects)))
     if not after.passed:
-        copies = [replica(model, seed) for seed in (1, 2)]
-        after = forgiven(after, copies)
+        copies = [make_replica(model, seed) for seed in (1, 2)]
+        after = forgive_filter(after, copies)
     return after
 
 
-def main_ones(found: Search, helps: Callable[[Found, Model], bool]) -> Search:
+def keep_main_effects(found: Search, helps: Callable[[Weighed, Model], bool]) -> Search:
     """Keep the effects that carry the explanation where something unknown remains.
 
     Small effects beside something unknown are stand-ins for it, and a wrong name is worse than
@@ -219,15 +226,15 @@ def main_ones(found: Search, helps: Callable[[Found, Model], bool]) -> Search:
     model = found.final
     for f in sorted(found.found, key=lambda f: -f.position):
         if f.trial.gain < THRESHOLD.minor * total and not helps(f, found.final):
-            model = cut(model, f.position)[0]
+            model = refit_without_effect(model, f.position)[0]
     if model is found.final:
         return found
-    model, left = settled(model, len(found.base.loop.effects), found.steps)
-    return replace(found, final=model, found=left, after=judged(model))
+    model, left = weigh_effects(model, len(found.base.loop.effects), found.steps)
+    return replace(found, final=model, found=left, after=retest_with_replicas(model))
 
 
-def without_worst(found: Search, gap: Callable[[Model], float]) -> Search:
+def drop_worst_effect(found: Search, gap: Callable[[Model], float]) -> Search:
     """Take back the effect without which a model leaves the narrowest gap."""
     worst = min(found.found, key=lambda f: gap(f.base))
-    model, left = settled(worst.base, len(found.base.loop.effects), found.steps)
-    return replace(found, final=model, found=left, after=judged(model))
+    model, left = weigh_effects(worst.base, len(found.base.loop.effects), found.steps)
+    return replace(found, final=model, found=left, after=retest_with_replicas(model))

@@ -13,7 +13,7 @@ from .fitted_model import Model
 from .thresholds import THRESHOLD
 
 
-def left_to(matrix: Array, own: Sequence[int], others: Sequence[int]) -> Array:
+def remaining_information(matrix: Array, own: Sequence[int], others: Sequence[int]) -> Array:
     """Return the scaled information of parameters that others leave to them."""
     size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
     scaled = matrix / np.outer(size, size)
@@ -25,13 +25,13 @@ def left_to(matrix: Array, own: Sequence[int], others: Sequence[int]) -> Array:
     return np.asarray(left - cross @ inverse @ cross.T)
 
 
-def doubled_by(fit: Fit, label: str, effect: AbstractEffect) -> dict[str, float]:
+def find_doubles(fit: Fit, label: str, effect: AbstractEffect) -> dict[str, float]:
     """Return the neutral values of an effect's parameters that do what the model's own do.
 
     The viscous part of an asymmetric friction is one, beside a viscous friction in the model. What
     has come to a bound of its own can do no more.
     """
-    names, matrix, problem = fit.problem.machine.names, fit.normal[0], fit.problem
+    names, matrix, problem = fit.problem.plant.names, fit.normal[0], fit.problem
     moving = (fit.theta > problem.lower) & (fit.theta < problem.upper)
     neutral = {f"{label}.{p.name}": p.neutral for p in effect.parameters()}
     deciding = {n: v for n, v in neutral.items() if n in names and v is not None}
@@ -41,20 +41,20 @@ def doubled_by(fit: Fit, label: str, effect: AbstractEffect) -> dict[str, float]
     found = {}
     for name, value in deciding.items():
         k = names.index(name)
-        if matrix[k, k] > 0 and left_to(matrix, [k], others)[0, 0] < THRESHOLD.seen:
+        if matrix[k, k] > 0 and remaining_information(matrix, [k], others)[0, 0] < THRESHOLD.seen:
             found[name] = value
     return found if len(found) < len(deciding) else {}
 
 
-def own_parameters(trial: Trial, fit: Fit) -> int:
+def count_own_parameters(trial: Trial, fit: Fit) -> int:
     """Count the parameters of the effect that the record determines."""
     matrix, _ = fit.normal
-    own = [k for k, n in enumerate(fit.problem.machine.names) if n.startswith(f"{trial.label}.")]
-    left = left_to(matrix, own, [k for k in range(len(matrix)) if k not in own])
+    own = [k for k, n in enumerate(fit.problem.plant.names) if n.startswith(f"{trial.label}.")]
+    left = remaining_information(matrix, own, [k for k in range(len(matrix)) if k not in own])
     return max(1, int(np.sum(np.linalg.eigvalsh(left) > THRESHOLD.seen)))
 
 
-def needed(model: Model, position: int) -> float:
+def estimate_need(model: Model, position: int) -> float:
     """Return what a model would lose of log-likelihood without an effect, less its penalty.
 
     In the quadratic approximation around the fitted values, all other parameters and the size of
@@ -71,13 +71,13 @@ def needed(model: Model, position: int) -> float:
         return 0.0
     every = [k for k, n in enumerate(names) if n.startswith(f"{label}.")]
     size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-    left = left_to(matrix, own, [k for k in range(len(matrix)) if k not in every])
+    left = remaining_information(matrix, own, [k for k in range(len(matrix)) if k not in every])
     d = np.array([away[names[k]] for k in own]) * size[own]
     gain = 0.5 * fit.size * math.log1p(float(d @ left @ d) / fit.size)
     return gain - 0.5 * len(every) * math.log(fit.size)
 
 
-def objection(trial: Trial) -> str:
+def find_objection(trial: Trial) -> str:
     """Say why a fitted effect cannot be what is missing, if so."""
     effect = trial.fitted
     if effect.neutral:
@@ -92,13 +92,13 @@ def objection(trial: Trial) -> str:
         scanned = about.name in ("frequency", "period")
         if on_bound and (scanned or about.neutral not in (None, low, high)):
             return f"{about.name} ends on its bound {fit.theta[k]:g}"
-    if _insignificant(trial, effect):
+    if _is_insignificant(trial, effect):
         return "no larger than its uncertainty"
     every = all(f"{trial.label}.{p.name}" in names for p in effect.parameters())
     return effect.doubt() if every else ""  # what is held still, another effect has
 
 
-def _insignificant(trial: Trial, effect: AbstractEffect) -> bool:
+def _is_insignificant(trial: Trial, effect: AbstractEffect) -> bool:
     """Whether every parameter that decides about an effect may as well be neutral."""
     fit, names = trial.model.fit, trial.model.names
     error = fit.standard_errors

@@ -14,7 +14,7 @@ from ..loop.loop import Loop
 from ..physics.linearization import OperatingPoint
 from .findings import Calibrated, Candidate, Disturbance, Finding, Gap, Place
 from .result import Diagnosis
-from .saving import FORMAT, SavedLoop, numbers
+from .saving import FORMAT, SavedLoop, read_numbers
 
 
 def load_diagnosis(path: str | Path, loop: Loop | None = None) -> Diagnosis:
@@ -51,28 +51,28 @@ def load_diagnosis(path: str | Path, loop: Loop | None = None) -> Diagnosis:
         raise CtrlidError(f"{path} is not a saved diagnosis: it has the format {given!r}, not "
                           f"{FORMAT!r}. Give a file that found.save(file) wrote")  # fmt: skip
     try:
-        return _diagnosis(data, loop)
+        return _decode_diagnosis(data, loop)
     except (KeyError, TypeError) as reason:
         raise CtrlidError(f"the saved diagnosis {path} is damaged: {reason}") from reason
 
 
-def _diagnosis(data: Mapping[str, Any], loop: Loop | None) -> Diagnosis:
-    saved = _loop(data["loop"])
+def _decode_diagnosis(data: Mapping[str, Any], loop: Loop | None) -> Diagnosis:
+    saved = _decode_loop(data["loop"])
     return Diagnosis(
         verdict=data["verdict"], sentence=data["sentence"],
-        findings=tuple(_made(Finding, f) for f in data["findings"]),
-        loop=saved if loop is None else _rebuilt(loop, saved),  # type: ignore[arg-type]
-        gap=_made(Gap, data["gap"]), where=tuple(_made(Place, p) for p in data["where"]),
-        ranking=tuple(_made(Candidate, c) for c in data["ranking"]),
-        disturbance=_made(Disturbance, data["disturbance"]),
-        calibrated=tuple(_made(Calibrated, c) for c in data["calibrated"]),
-        sensitivity=numbers(data["sensitivity"]), tests=numbers(data["tests"]),
+        findings=tuple(_decode(Finding, f) for f in data["findings"]),
+        loop=saved if loop is None else _rebuild_loop(loop, saved),  # type: ignore[arg-type]
+        gap=_decode(Gap, data["gap"]), where=tuple(_decode(Place, p) for p in data["where"]),
+        ranking=tuple(_decode(Candidate, c) for c in data["ranking"]),
+        disturbance=_decode(Disturbance, data["disturbance"]),
+        calibrated=tuple(_decode(Calibrated, c) for c in data["calibrated"]),
+        sensitivity=read_numbers(data["sensitivity"]), tests=read_numbers(data["tests"]),
         audit=tuple(data["audit"]), notes=tuple(data["notes"]), record=data["record"],
-        seconds=numbers(data["seconds"]), extra=numbers(data["extra"]),
+        seconds=read_numbers(data["seconds"]), extra=read_numbers(data["extra"]),
     )  # fmt: skip
 
 
-def _rebuilt(loop: Loop, saved: SavedLoop) -> Loop:
+def _rebuild_loop(loop: Loop, saved: SavedLoop) -> Loop:
     """Return the user's loop with the saved parameters and effects."""
     if not isinstance(loop, Loop):
         raise CtrlidError(f"loop= needs the Loop that was diagnosed; given {type(loop).__name__}")
@@ -85,20 +85,20 @@ def _rebuilt(loop: Loop, saved: SavedLoop) -> Loop:
     return dataclasses.replace(changed.with_parameters(saved.parameters), free=saved.free)
 
 
-def _loop(data: Mapping[str, Any]) -> SavedLoop:
-    at = numbers(data["at"])
+def _decode_loop(data: Mapping[str, Any]) -> SavedLoop:
+    at = read_numbers(data["at"])
     return SavedLoop(
-        plant_name=data["plant"], controller_text=data["controller"], dt=numbers(data["dt"]),
+        plant_name=data["plant"], controller_text=data["controller"], dt=read_numbers(data["dt"]),
         at=OperatingPoint(tuple(at["states"]), at["input"], at["output"]),
-        free=tuple(data["free"]), input_limits=tuple(numbers(data["input_limits"])),
-        effects=tuple(_effect(e) for e in data["effects"]),
-        parameters=numbers(data["parameters"]), units=data["units"],
+        free=tuple(data["free"]), input_limits=tuple(read_numbers(data["input_limits"])),
+        effects=tuple(_decode_effect(e) for e in data["effects"]),
+        parameters=read_numbers(data["parameters"]), units=data["units"],
     )  # fmt: skip
 
 
-def _effect(data: Mapping[str, Any]) -> AbstractEffect:
+def _decode_effect(data: Mapping[str, Any]) -> AbstractEffect:
     """Return an effect by the name of its class."""
-    name, values = data["name"], {k: numbers(v) for k, v in data["parameters"].items()}
+    name, values = data["name"], {k: read_numbers(v) for k, v in data["parameters"].items()}
     classes, known = [AbstractEffect], []
     for cls in classes:
         classes += cls.__subclasses__()
@@ -112,20 +112,20 @@ def _effect(data: Mapping[str, Any]) -> AbstractEffect:
     return known[-1](**values)
 
 
-def _made(kind: Any, data: Mapping[str, Any]) -> Any:
+def _decode(kind: Any, data: Mapping[str, Any]) -> Any:
     """Return one of the values of a diagnosis from its fields."""
     made: dict[str, Any] = {}
     for field in dataclasses.fields(kind):
         value = data[field.name]
         match field.name:
             case "effect":
-                made[field.name] = _effect(value)
+                made[field.name] = _decode_effect(value)
             case "alternatives":
-                made[field.name] = tuple(_effect(e) for e in value)
+                made[field.name] = tuple(_decode_effect(e) for e in value)
             case "equivalents":
                 made[field.name] = tuple(value)
             case _:
-                made[field.name] = value if field.type in (str, "str") else numbers(value)
+                made[field.name] = value if field.type in (str, "str") else read_numbers(value)
                 if isinstance(value, list):
                     made[field.name] = np.asarray(made[field.name], dtype=float)
     return kind(**made)

@@ -10,7 +10,7 @@ from scipy import stats
 from ..estimation.likelihood.likelihood import Fit
 from ..physics.equations import Array
 from ..validation.residual_tests import remembered
-from .constancy import bin_edges, bin_index, constancy, line_chance
+from .constancy import chance_of_line, find_bin_edges, find_bins, run_constancy_tests
 from .thresholds import THRESHOLD
 
 OF_NOISE = ("size", "heavy", "isolated", "shape")  # tests of what no effect explains
@@ -25,7 +25,7 @@ def alarm_level(effects: int) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class Omnibus:
+class NoiseTests:
     """Probabilities that the innovations are noise, by test, and where they are not.
 
     `axes` holds for each quantity its values at the samples that count.
@@ -57,7 +57,7 @@ class Omnibus:
         return self.worst[1] > self.alpha
 
 
-def omnibus(fit: Fit) -> Omnibus:
+def run_noise_tests(fit: Fit) -> NoiseTests:
     """Test the innovations of a fit.
 
     Whiteness, independence of past input and reference, one line in the spectrum, heavy tails and
@@ -81,13 +81,13 @@ def omnibus(fit: Fit) -> Omnibus:
     (1929) 54-59; Lobato and Velasco, Econometric Theory 20 (2004) 671-689.
     """
     if not math.isfinite(fit.value):
-        return Omnibus({"following the record": 0.0}, np.zeros(0), {})
+        return NoiseTests({"following the record": 0.0}, np.zeros(0), {})
     parts: dict[str, list[Array]] = {}
     white = cross = 0.0
     white_df = cross_df = 0
     lines, tails, shapes = [], [], []
     p = len(fit.theta)
-    for z, out, track in zip(fit.standardized, fit.filtered, fit.problem.tracks, strict=True):
+    for z, out, track in zip(fit.standardized, fit.filtered, fit.problem.prepared, strict=True):
         keep = np.isfinite(z)
         filled = np.where(keep, z, 0.0)
         n = int(keep.sum())
@@ -96,14 +96,14 @@ def omnibus(fit: Fit) -> Omnibus:
         )
         white += n * float(np.sum(rho**2))
         white_df += THRESHOLD.lags
-        value, df = _cross(filled, keep, track.table[1], track.table[2])
+        value, df = _regress_on_past(filled, keep, track.table[1], track.table[2])
         cross += value
         cross_df += df
-        lines.append(_line(filled, n))
+        lines.append(_test_line(filled, n))
         tails.append(z[keep])
         if fit.noise.drift:
-            shapes += _shape(out.disturbance[int(THRESHOLD.force_settling * len(z)) :])
-        for name, values in _axes(fit, out, track).items():
+            shapes += _deviates_of_force(out.disturbance[int(THRESHOLD.force_settling * len(z)) :])
+        for name, values in _find_axes(fit, out, track).items():
             parts.setdefault(name, []).append(values[keep])
     z = np.concatenate(tails)
     axes = {name: np.concatenate(v) for name, v in parts.items()}
@@ -111,21 +111,21 @@ def omnibus(fit: Fit) -> Omnibus:
         "whiteness": float(stats.chi2.sf(white, max(white_df - p, 1))),
         "independence of past signals": float(stats.chi2.sf(cross, max(cross_df - p, 1))),
         "a single line in the spectrum": min(1.0, min(lines) * len(lines)),
-        **_tails(z),
+        **_test_tails(z),
     }
     if shapes:
         p_values["shape of the random force"] = float(
             stats.chi2.sf(sum(v**2 for v in shapes), len(shapes))
         )
     for name, values in axes.items():
-        mean, square = _binned(z, values)
+        mean, square = _test_bins(z, values)
         p_values[f"mean by {name}"] = mean
         p_values[f"size by {name}"] = square
-    p_values |= constancy(fit, axes)
-    return Omnibus(p_values, z, axes)
+    p_values |= run_constancy_tests(fit, axes)
+    return NoiseTests(p_values, z, axes)
 
 
-def _cross(z: Array, keep: Array, u: Array, r: Array) -> tuple[float, int]:
+def _regress_on_past(z: Array, keep: Array, u: Array, r: Array) -> tuple[float, int]:
     """Return the gain of regressing innovations on past input and reference, and its freedom."""
     columns = []
     for signal in (u, r):
@@ -145,12 +145,12 @@ def _cross(z: Array, keep: Array, u: Array, r: Array) -> tuple[float, int]:
     return float(np.sum((q[:, good].T @ target) ** 2)), int(good.sum())
 
 
-def _line(z: Array, n: int) -> float:
+def _test_line(z: Array, n: int) -> float:
     """Return the probability that noise has as strong a line, of Fisher's test."""
-    return line_chance(np.abs(np.fft.rfft(z))[1:-1] ** 2 / n)
+    return chance_of_line(np.abs(np.fft.rfft(z))[1:-1] ** 2 / n)
 
 
-def _tails(z: Array) -> dict[str, float]:
+def _test_tails(z: Array) -> dict[str, float]:
     n = len(z)
     excess = float(np.mean(z**4) / np.mean(z**2) ** 2 - 3.0)
     largest = float(np.max(np.abs(z)))
@@ -160,7 +160,7 @@ def _tails(z: Array) -> dict[str, float]:
     }
 
 
-def _shape(force: Array) -> list[float]:
+def _deviates_of_force(force: Array) -> list[float]:
     """Return how far skewness and kurtosis of a correlated force are from those of a Gaussian one.
 
     As standard normal deviates, for as many samples as are independent in the third and fourth
@@ -189,8 +189,8 @@ def _shape(force: Array) -> list[float]:
     return [float(first), float(second)]
 
 
-def _axes(fit: Fit, out: object, track: object) -> dict[str, Array]:
-    e = fit.problem.machine.e
+def _find_axes(fit: Fit, out: object, track: object) -> dict[str, Array]:
+    e = fit.problem.plant.e
     states = out.trajectory.predicted  # type: ignore[attr-defined]
     table = track.table  # type: ignore[attr-defined]
     # The input of the same sample is computed from the very output that is predicted.
@@ -207,10 +207,10 @@ def _axes(fit: Fit, out: object, track: object) -> dict[str, Array]:
     return {name: v for name, v in axes.items() if np.ptp(v) > 0}
 
 
-def _binned(z: Array, values: Array) -> tuple[float, float]:
+def _test_bins(z: Array, values: Array) -> tuple[float, float]:
     """Return the probabilities that mean and mean square in bins are those of noise."""
-    edges = bin_edges(values)
-    index = bin_index(values, edges)
+    edges = find_bin_edges(values)
+    index = find_bins(values, edges)
     count = np.bincount(index, minlength=len(edges) - 1)
     use = count >= THRESHOLD.fewest_in_bin
     if use.sum() < 2:

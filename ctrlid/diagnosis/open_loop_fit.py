@@ -91,9 +91,9 @@ class Simulation:
         self.loop, self.names = loop, tuple(names)
         self.records, self.begins = tuple(records), tuple(begins)
         self.problem = make_problem(loop, self.names, records, begins)
-        m = self.machine = self.problem.machine
+        m = self.plant = self.problem.plant
         step = m.with_slopes()
-        self.runs = [step.mapaccum("run", len(t.record)) for t in self.problem.tracks]
+        self.runs = [step.mapaccum("run", len(t.record)) for t in self.problem.prepared]
 
     def of(self, loop: Loop, names: Sequence[str]) -> Simulation:
         """Return the same records, simulated by another loop."""
@@ -101,8 +101,8 @@ class Simulation:
 
     def states_from(self, starts: Sequence[Mapping[str, float]]) -> Array:
         """Return initial states, shape (records, states); what is not known begins at rest."""
-        m = self.machine
-        rest = [np.resize(t.start, m.size) for t in self.problem.tracks]
+        m = self.plant
+        rest = [np.resize(t.start, m.size) for t in self.problem.prepared]
         for x, known in zip(rest, starts, strict=True):
             for k, name in enumerate(m.e.states):
                 x[k] = known.get(name, x[k])
@@ -110,10 +110,10 @@ class Simulation:
 
     def run(self, theta: Array, x0: Array) -> tuple[Array, Array, tuple[Array, ...]]:
         """Return errors, their derivatives and the states, for all records."""
-        m, p = self.machine, len(self.names)
+        m, p = self.plant, len(self.names)
         n, count = m.size, len(self.runs)
         values, errors, slopes, states = m.values(theta), [], [], []
-        for k, (track, run) in enumerate(zip(self.problem.tracks, self.runs, strict=True)):
+        for k, (track, run) in enumerate(zip(self.problem.prepared, self.runs, strict=True)):
             z = np.concatenate([x0[k], np.zeros(n * p), np.eye(n).ravel()])
             after, seen = (np.asarray(out, float) for out in
                            run(z, m.inputs(track, theta), values))  # fmt: skip
@@ -132,7 +132,7 @@ class Simulation:
     def at(self, theta: Array, x0: Array) -> Simulated:
         """Return the simulation of given values."""
         errors, slopes, states = self.run(theta, x0)
-        names = self.machine.e.states
+        names = self.plant.e.states
         starts = tuple(dict(zip(names, x.tolist(), strict=False)) for x in x0)
         return Simulated(self, theta, starts, errors, slopes, states)
 
@@ -167,7 +167,7 @@ class Simulation:
         return self.at(found.x[:p], found.x[p:].reshape(shape))
 
 
-def as_fit(found: Simulated, sensor: Array) -> Fit:
+def make_fit(found: Simulated, sensor: Array) -> Fit:
     """Return a simulation as a point of the likelihood that knows no random force.
 
     Parameters
@@ -183,11 +183,11 @@ def as_fit(found: Simulated, sensor: Array) -> Fit:
         Its innovations are the errors of the simulation.
     """
     task = found.task
-    silent = Noise((0.0,) * task.machine.channels)
-    problem = replace(task.problem, known=Known(silent, sensor), tracks=tuple(
+    silent = Noise((0.0,) * task.plant.channels)
+    problem = replace(task.problem, known=Known(silent, sensor), prepared=tuple(
         replace(t, start=x[0], spread=np.zeros_like(t.spread), doubt=np.zeros(len(x)),
                 afresh=np.arange(len(x)) == 0)
-        for t, x in zip(task.problem.tracks, found.states, strict=True)
-    ), counts=tuple(t.valid for t in task.problem.tracks))  # fmt: skip
+        for t, x in zip(task.problem.prepared, found.states, strict=True)
+    ), counts=tuple(t.valid for t in task.problem.prepared))  # fmt: skip
     at = [Trajectory(x, x.copy(), np.zeros_like(x)) for x in found.states]
     return evaluate(problem, found.theta, silent, at)

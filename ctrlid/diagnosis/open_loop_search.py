@@ -14,15 +14,15 @@ from .._base.errors import CtrlidError
 from ..effects import AbstractEffect, ParameterStep, PeriodicForce, StateLimit
 from ..estimation.likelihood.physics_fit import start_values
 from ..physics.equations import Array
-from .candidates import Trial, candidates, same_kind
+from .candidates import Trial, list_candidates, same_kind
 from .fitted_model import Model
-from .fresh_data import Fresh
+from .fresh_data import FreshData
 from .growth import Search
-from .noise_tests import omnibus
-from .open_loop_fit import Simulated, Simulation, as_fit
-from .removal import Found, taken_out
+from .noise_tests import run_noise_tests
+from .open_loop_fit import Simulated, Simulation, make_fit
+from .removal import Weighed, take_out_effect
 from .scans import LIMITS
-from .selection import Step
+from .selection import Round
 from .thresholds import THRESHOLD
 
 
@@ -32,23 +32,25 @@ class Tried:
 
     effect: AbstractEffect
     label: str
-    promise: float
+    score: float
     task: Simulation
     theta: Array
     x0: Array
     found: Simulated | None = None
     gain: float = math.nan
-    cost: float = math.nan
+    penalty: float = math.nan
     remark: str = ""
 
     @property
-    def merit(self) -> float:
+    def net_gain(self) -> float:
         """Gain less penalty; minus infinity for what is out."""
-        return -math.inf if self.remark or not math.isfinite(self.gain) else self.gain - self.cost
+        return (
+            -math.inf if self.remark or not math.isfinite(self.gain) else self.gain - self.penalty
+        )
 
 
 def search_by_simulation(
-    other: Search, fresh: Fresh, catalogue: Sequence[type[AbstractEffect]],
+    other: Search, fresh: FreshData, catalogue: Sequence[type[AbstractEffect]],
     tell: Callable[[str], None], gap: float,
 ) -> Search | None:  # fmt: skip
     """Look for effects again where a random force had taken up what is missing.
@@ -73,20 +75,20 @@ def search_by_simulation(
         if no effect was found or the gap is hardly smaller.
     """
     loop, names = other.base.loop, other.base.names
-    records = fresh.without_windows([t.record for t in other.base.fit.problem.tracks])
+    records = fresh.without_windows([t.record for t in other.base.fit.problem.prepared])
     task = Simulation(loop, names, records, [0.0] * len(records))
     x0 = task.states_from([{} for _ in records])
     begun = [task.fit(t, x0) for t in (start_values(loop, names), other.base.fit.theta)]
     base = now = min(begun, key=lambda s: s.square)
     sensor, given = other.final.fit.sensor, len(loop.effects)
-    before = _gap(base, fresh)
+    before = _gap_of(base, fresh)
     rounds: list[tuple[Simulated, list[Tried], Tried | None]] = []
     while len(rounds) < THRESHOLD.open_loop_rounds:
         tell(f"by simulation, round {len(rounds) + 1}")
-        tried = _round(now, catalogue)
-        best = tried[0] if tried and math.isfinite(tried[0].merit) else None
+        tried = _run_round(now, catalogue)
+        best = tried[0] if tried and math.isfinite(tried[0].net_gain) else None
         new = best and best.found
-        after = _gap(new, fresh) if new else math.inf
+        after = _gap_of(new, fresh) if new else math.inf
         if not (
             new
             and new.square < THRESHOLD.open_loop_closes**2 * now.square
@@ -97,47 +99,54 @@ def search_by_simulation(
         rounds.append((now, tried, best))
         now, before = new, after
     tell("by simulation, what is needed")
-    now, smaller = _needed(_settled(now, given), given)
-    if len(now.loop.effects) == given or _gap(now, fresh) > THRESHOLD.open_loop_better * gap:
+    now, smaller = _drop_superfluous(_refit_each(now, given), given)
+    if len(now.loop.effects) == given or _gap_of(now, fresh) > THRESHOLD.open_loop_better * gap:
         return None
-    first, final = (_model(s, sensor) for s in (base, now))
+    first, final = (_make_model(s, sensor) for s in (base, now))
     steps = []
     for s, tried, best in rounds:
-        model = _model(s, sensor)
-        done = {id(t): _trial(t, model) for t in tried}
-        steps.append(Step(model, tuple(done.values()), None if best is None else done[id(best)]))
-    found = [_found(final, now, given + k, s, rounds) for k, s in enumerate(smaller)]
+        model = _make_model(s, sensor)
+        done = {id(t): _make_trial(t, model) for t in tried}
+        steps.append(Round(model, tuple(done.values()), None if best is None else done[id(best)]))
+    found = [_weigh_effect(final, now, given + k, s, rounds) for k, s in enumerate(smaller)]
     found.sort(key=lambda f: -f.trial.gain)
-    return Search(first, tuple(steps), final, tuple(found), omnibus(first.fit), omnibus(final.fit))
+    return Search(
+        first,
+        tuple(steps),
+        final,
+        tuple(found),
+        run_noise_tests(first.fit),
+        run_noise_tests(final.fit),
+    )
 
 
-def _gap(s: Simulated, fresh: Fresh) -> float:
+def _gap_of(s: Simulated, fresh: FreshData) -> float:
     return fresh.gap((s.fitted,) * len(fresh.windows))
 
 
-def _model(s: Simulated, sensor: Array) -> Model:
+def _make_model(s: Simulated, sensor: Array) -> Model:
     """Return a simulated loop as a model of the filter, without random forces."""
-    fit = as_fit(s, np.resize(sensor, len(s.task.records)))
+    fit = make_fit(s, np.resize(sensor, len(s.task.records)))
     return Model(s.loop, fit, s.standard_errors)
 
 
-def _needed(now: Simulated, given: int) -> tuple[Simulated, list[Simulated]]:
+def _drop_superfluous(now: Simulated, given: int) -> tuple[Simulated, list[Simulated]]:
     """Take effects out until each is worth its parameters; return also the loops without each."""
     while True:
-        smaller = [_without(now, k) for k in range(given, len(now.loop.effects))]
-        merits = [_gain(s, now.square) - _cost(s, now) for s in smaller]
-        if min(merits, default=math.inf) > THRESHOLD.gate:
+        smaller = [_refit_without(now, k) for k in range(given, len(now.loop.effects))]
+        net_gains = [_gain_over(s, now.square) - _penalty_over(s, now) for s in smaller]
+        if min(net_gains, default=math.inf) > THRESHOLD.gate:
             return now, smaller
-        now = smaller[int(np.argmin(merits))]
+        now = smaller[int(np.argmin(net_gains))]
 
 
-def _settled(now: Simulated, given: int) -> Simulated:
+def _refit_each(now: Simulated, given: int) -> Simulated:
     """Return a simulation in which each effect was looked for once more beside all others."""
     position = given
     for _ in range(given, len(now.loop.effects)):
-        smaller = _without(now, position)
-        screened = _screened(smaller, now.fitted.effects[position])
-        again = screened and _refitted(smaller, screened).found
+        smaller = _refit_without(now, position)
+        screened = _screen(smaller, now.fitted.effects[position])
+        again = screened and _refit(smaller, screened).found
         if again and again.square < now.square:
             now = again  # the effect stands last now, and the next one in its place
         else:
@@ -145,56 +154,56 @@ def _settled(now: Simulated, given: int) -> Simulated:
     return now
 
 
-def _without(now: Simulated, position: int) -> Simulated:
+def _refit_without(now: Simulated, position: int) -> Simulated:
     """Return the loop without one of its effects, fitted again."""
-    loop, names = taken_out(now.fitted, position, now.names)
+    loop, names = take_out_effect(now.fitted, position, now.names)
     task = now.task.of(loop, names)
     return task.fit(np.array(start_values(loop, names)), task.states_from(now.starts))
 
 
-def _found(
+def _weigh_effect(
     final: Model, now: Simulated, position: int, smaller: Simulated,
     rounds: Sequence[tuple[Simulated, list[Tried], Tried | None]],
-) -> Found:  # fmt: skip
+) -> Weighed:  # fmt: skip
     """Return an effect with what closes nearly as much of the error in its place."""
     label, effect = list(now.fitted.labelled.items())[position]
-    gain, cost = _gain(smaller, now.square), _cost(smaller, now)
-    base = _model(smaller, final.fit.sensor)
-    mine = Trial(effect, label, final, gain, 0.0, gain, cost)
-    near = max(THRESHOLD.close, THRESHOLD.open_loop_alike * mine.merit)
+    gain, penalty = _gain_over(smaller, now.square), _penalty_over(smaller, now)
+    base = _make_model(smaller, final.fit.sensor)
+    mine = Trial(effect, label, final, gain, 0.0, gain, penalty)
+    near = max(THRESHOLD.close, THRESHOLD.open_loop_alike * mine.net_gain)
     close: list[Trial] = []
     for _, tried, best in rounds:
         if best is None or not same_kind(best.effect, effect):
             continue
         there = [*now.loop.effects]
         for t in tried[: THRESHOLD.open_loop_refitted]:
-            if t.merit <= 0 or any(same_kind(t.effect, e) for e in there):
+            if t.net_gain <= 0 or any(same_kind(t.effect, e) for e in there):
                 continue
-            screened = _screened(smaller, t.effect)
-            again = screened and _refitted(smaller, screened)
-            if again and mine.merit - again.merit < near and again.merit > THRESHOLD.gate:
-                close.append(_trial(again, base))
-    return Found(mine, tuple(sorted(close, key=lambda t: -t.merit)), base, position)
+            screened = _screen(smaller, t.effect)
+            again = screened and _refit(smaller, screened)
+            if again and mine.net_gain - again.net_gain < near and again.net_gain > THRESHOLD.gate:
+                close.append(_make_trial(again, base))
+    return Weighed(mine, tuple(sorted(close, key=lambda t: -t.net_gain)), base, position)
 
 
-def _round(now: Simulated, catalogue: Sequence[type[AbstractEffect]]) -> list[Tried]:
+def _run_round(now: Simulated, catalogue: Sequence[type[AbstractEffect]]) -> list[Tried]:
     """Screen all candidates, refit the promising, best first."""
     loop = now.fitted
-    pool = [c for c in candidates(catalogue, loop, now.task.records[0])
+    pool = [c for c in list_candidates(catalogue, loop, now.task.records[0])
             if not any(same_kind(e, c) for e in loop.effects)]  # fmt: skip
-    tried = [t for c in pool if (t := _screened(now, c)) is not None]
-    tried.sort(key=lambda t: -t.promise)
-    done = [_refitted(now, t) for t in tried[: THRESHOLD.open_loop_refitted]]
+    tried = [t for c in pool if (t := _screen(now, c)) is not None]
+    tried.sort(key=lambda t: -t.score)
+    done = [_refit(now, t) for t in tried[: THRESHOLD.open_loop_refitted]]
     return (
-        sorted(done, key=lambda t: (-t.merit, -t.promise)) + tried[THRESHOLD.open_loop_refitted :]
+        sorted(done, key=lambda t: (-t.net_gain, -t.score)) + tried[THRESHOLD.open_loop_refitted :]
     )
 
 
-def _screened(now: Simulated, effect: AbstractEffect) -> Tried | None:
+def _screen(now: Simulated, effect: AbstractEffect) -> Tried | None:
     """Return an effect at the start from which a first step promises most."""
     best: Tried | None = None
     task: Simulation | None = None
-    for one in _begun(now, effect):
+    for one in _list_starts(now, effect):
         try:
             loop = now.fitted.with_effect(one)
             label = next(k for k in loop.labelled if k not in now.loop.labelled)
@@ -202,7 +211,7 @@ def _screened(now: Simulated, effect: AbstractEffect) -> Tried | None:
             names = (*now.names, *own)
             if task is None:
                 task = now.task.of(loop, names)
-            if task.machine.e.play is not None:  # its sensitivities need another recursion
+            if task.plant.e.play is not None:  # its sensitivities need another recursion
                 return None
             theta = np.array([*now.theta, *own.values()])
             theta = np.clip(theta, task.problem.lower, task.problem.upper)
@@ -212,37 +221,37 @@ def _screened(now: Simulated, effect: AbstractEffect) -> Tried | None:
             continue
         step = np.linalg.lstsq(slopes, -errors, rcond=1e-10)[0]
         left = float(np.mean((errors + slopes @ step) ** 2))
-        promise = _gain(now, min(left, float(np.mean(errors**2))))
-        if best is None or promise > best.promise:
-            best = Tried(one, label, promise, task, theta, x0)
+        score = _gain_over(now, min(left, float(np.mean(errors**2))))
+        if best is None or score > best.score:
+            best = Tried(one, label, score, task, theta, x0)
     return best
 
 
-def _gain(now: Simulated, square: float) -> float:
+def _gain_over(now: Simulated, square: float) -> float:
     """Return what a smaller error is worth, for as many samples as are independent."""
     count = len(now.errors) / now.correlated
     return 0.5 * count * math.log(now.square / max(square, 1e-300))
 
 
-def _cost(smaller: Simulated, larger: Simulated) -> float:
+def _penalty_over(smaller: Simulated, larger: Simulated) -> float:
     """Return half the Bayesian penalty of the further parameters."""
     free = len(larger.names) - len(smaller.names)
     return 0.5 * free * math.log(max(len(smaller.errors) / smaller.correlated, math.e))
 
 
-def _refitted(now: Simulated, t: Tried) -> Tried:
+def _refit(now: Simulated, t: Tried) -> Tried:
     try:
         found = t.task.fit(t.theta, t.x0)
     except (CtrlidError, ValueError, np.linalg.LinAlgError) as reason:
         return replace(t, remark=str(reason))
-    gain = _gain(now, found.square)
-    cost = _cost(now, found)
+    gain = _gain_over(now, found.square)
+    penalty = _penalty_over(now, found)
     effect = found.fitted.labelled[t.label]
-    return replace(t, found=found, gain=gain, cost=cost,
+    return replace(t, found=found, gain=gain, penalty=penalty,
                    remark="vanishes when refitted" if effect.neutral else "")  # fmt: skip
 
 
-def _begun(now: Simulated, effect: AbstractEffect) -> list[AbstractEffect]:
+def _list_starts(now: Simulated, effect: AbstractEffect) -> list[AbstractEffect]:
     """Return an effect at the places where it may be: limits, instants, frequencies."""
     if isinstance(effect, StateLimit) and effect.name in now.starts[0]:
         k = list(now.starts[0]).index(effect.name)
@@ -260,9 +269,9 @@ def _begun(now: Simulated, effect: AbstractEffect) -> list[AbstractEffect]:
     return [effect]
 
 
-def _trial(t: Tried, base: Model) -> Trial:
+def _make_trial(t: Tried, base: Model) -> Trial:
     """Return what was tried in the words of the other search."""
     model, label = base, ""
     if t.found is not None:
-        model, label = _model(t.found, base.fit.sensor), t.label
-    return Trial(t.effect, label, model, t.promise, 0.0, t.gain, t.cost, t.remark)
+        model, label = _make_model(t.found, base.fit.sensor), t.label
+    return Trial(t.effect, label, model, t.score, 0.0, t.gain, t.penalty, t.remark)

@@ -16,21 +16,28 @@ from ..effects import CATALOGUE, AbstractEffect
 from ..estimation.likelihood.likelihood import Fit
 from ..loop.loop import Loop
 from ..validation.record_audit import Audit
-from .answer import name_of, put_together
+from .answer import assemble_answer, name_records
 from .candidates import check_catalogue
 from .findings import COMPLETE, Disturbance
-from .fresh_data import Fresh, fresh_data
-from .gap_summary import gaps_of, helps_on
-from .growth import Search, main_ones, named, search, without_worst
+from .fresh_data import FreshData, choose_fresh_data
+from .gap_summary import helps_on_fresh_data, summarize_gap
+from .growth import Search, compare_names, drop_worst_effect, keep_main_effects, search_effects
 from .open_loop_search import search_by_simulation
-from .recalibration import base_model, stretches, weighted_by_repeats
-from .records import as_loop, censored, clipping, look_over, repeat_periods, steps
-from .replicas import forgiven, replica, with_rounding
+from .recalibration import cut_stretches, fit_base_model, weigh_by_repeats
+from .records import (
+    censor_record,
+    find_repeat_periods,
+    look_over_records,
+    make_loop,
+    read_clipping,
+    read_steps,
+)
+from .replicas import forgive_filter, make_replica, with_rounding
 from .result import Diagnosis
 from .selection import Work
-from .several_records import merged
+from .several_records import merge_diagnoses
 from .thresholds import THRESHOLD
-from .verdict import wider
+from .verdict import gap_is_wider
 
 BY_SIMULATION = (
     "with filters a random force took up what is missing; so effects were looked for by the error "
@@ -120,8 +127,8 @@ def diagnose(
     if isinstance(loop, Record) or (isinstance(loop, list | tuple) and isinstance(record, Loop)):
         raise CtrlidError("the loop comes first: diagnose(loop, record)")
     records = as_records(record)
-    loop = as_loop(loop, records[0])
-    fresh = fresh_data(loop, records, None if validation is None else as_records(validation))
+    loop = make_loop(loop, records[0])
+    fresh = choose_fresh_data(loop, records, None if validation is None else as_records(validation))
     bar = tqdm(total=STEPS, disable=not progress, leave=False, desc="diagnose")
 
     def tell(text: str, step: int = 0) -> None:
@@ -129,82 +136,82 @@ def diagnose(
         bar.update(step)
 
     tell("looking the records over", 1)
-    audits, remarks = look_over(loop, records)
-    options = catalogue, _worker(check_jobs(jobs)), tell
-    result, found = _diagnosed(loop, records, audits, fresh, *options)
-    if len(records) > 1 and not _alike(result):
-        result = _one_by_one(loop, records, audits, found, *options) or result
+    audits, remarks = look_over_records(loop, records)
+    options = catalogue, _make_worker(check_jobs(jobs)), tell
+    result, found = _diagnose_together(loop, records, audits, fresh, *options)
+    if len(records) > 1 and not _have_same(result):
+        result = _diagnose_each(loop, records, audits, found, *options) or result
     bar.close()
-    return replace(result, audit=remarks, record=name_of(records),
+    return replace(result, audit=remarks, record=name_records(records),
                    seconds=time.perf_counter() - started)  # fmt: skip
 
 
-def _diagnosed(
-    loop: Loop, records: Sequence[Record], audits: Sequence[Audit], fresh: Fresh,
+def _diagnose_together(
+    loop: Loop, records: Sequence[Record], audits: Sequence[Audit], fresh: FreshData,
     catalogue: Sequence[type[AbstractEffect]], work: Work, tell: Callable[..., None],
 ) -> tuple[Diagnosis, Search]:  # fmt: skip
     """Diagnose records together."""
     given = loop
-    read = [r for r in (clipping(records, audits, catalogue),) if r is not None]
+    read = [r for r in (read_clipping(records, audits, catalogue),) if r is not None]
     used = tuple(records)
     for r in read:
         loop = loop.with_effect(r.effect)
-        used = tuple(censored(record, r.effect) for record in records)
+        used = tuple(censor_record(record, r.effect) for record in records)
     tell("recalibrating", 1)
-    parts, begins = stretches(used)
-    base = base_model(loop, parts, loop.free, begins)
-    periods = repeat_periods(parts, audits)
+    parts, begins = cut_stretches(used)
+    base = fit_base_model(loop, parts, loop.free, begins)
+    periods = find_repeat_periods(parts, audits)
     if periods:
-        base = weighted_by_repeats(base, periods)
-    found = search(base, catalogue, work, tell)
+        base = weigh_by_repeats(base, periods)
+    found = search_effects(base, catalogue, work, tell)
     if found.other and not found.after.passed:
         # Neither way explains the record, perhaps: fresh data tell which leads further.
         tell("another way")
-        greedy = search(base, catalogue, work, tell, found.other)
-        ways = [main_ones(s, helps_on(fresh)) for s in (found, greedy)]
+        greedy = search_effects(base, catalogue, work, tell, found.other)
+        ways = [keep_main_effects(s, helps_on_fresh_data(fresh)) for s in (found, greedy)]
         found = min(ways, key=lambda s: (not s.after.passed, fresh.gap(fresh.loops(s.final))))
     tell("comparing on fresh data", 2)
-    coarse = steps(found.final.fit, audits, catalogue)
+    coarse = read_steps(found.final.fit, audits, catalogue)
     if coarse and not found.after.passed:
-        copies = [replica(with_rounding(found.final, coarse), seed) for seed in (1, 2)]
-        found = replace(found, after=forgiven(found.after, copies))
+        copies = [make_replica(with_rounding(found.final, coarse), seed) for seed in (1, 2)]
+        found = replace(found, after=forgive_filter(found.after, copies))
     tell("comparing names")
-    found = named(main_ones(found, helps_on(fresh)), work)
-    gap, shares, disturbance = gaps_of(given, found, fresh)
+    found = compare_names(keep_main_effects(found, helps_on_fresh_data(fresh)), work)
+    gap, shares, disturbance = summarize_gap(given, found, fresh)
     # What names something and leaves more unexplained than before has a wrong name among its
     # names. An effect of one record only may widen the gap in others.
     alone = len(records) == 1
-    while alone and found.found and not found.after.passed and wider(gap, disturbance):
-        found = without_worst(found, lambda model: fresh.gap(fresh.loops(model)))
-        gap, shares, disturbance = gaps_of(given, found, fresh)
+    while alone and found.found and not found.after.passed and gap_is_wider(gap, disturbance):
+        found = drop_worst_effect(found, lambda model: fresh.gap(fresh.loops(model)))
+        gap, shares, disturbance = summarize_gap(given, found, fresh)
     tell("writing down", 1)
     read += [coarse] if coarse else []
-    result = put_together(given, records, found, gap, shares, disturbance, read)
-    if result.verdict not in COMPLETE and _worth_simulating(fresh, parts):
+    result = assemble_answer(given, records, found, gap, shares, disturbance, read)
+    if result.verdict not in COMPLETE and _is_worth_simulating(fresh, parts):
         # What a random force explains nobody names: a stable plant can do without one.
         smallest = min(gap.given, gap.before, gap.after)
         other = search_by_simulation(found, fresh, catalogue, tell, smallest)
         if other is not None:
-            gap, shares, _ = gaps_of(given, other, fresh)
+            gap, shares, _ = summarize_gap(given, other, fresh)
             quiet = Disturbance(0.0, 0.0, math.nan, 0.0)
-            again = put_together(given, records, other, gap, shares, quiet, read)
+            again = assemble_answer(given, records, other, gap, shares, quiet, read)
             return replace(again, notes=(*again.notes, BY_SIMULATION)), other
     return result, found
 
 
-def _worth_simulating(fresh: Fresh, records: Sequence[Record]) -> bool:
+def _is_worth_simulating(fresh: FreshData, records: Sequence[Record]) -> bool:
     """Whether a plant runs open loop, and records are short enough for hundreds of simulations."""
     open_loop = fresh.kind == "open-loop simulation"
     return open_loop and sum(len(r) for r in records) <= THRESHOLD.open_loop_samples
 
 
-def _alike(result: Diagnosis) -> bool:
+def _have_same(result: Diagnosis) -> bool:
     """Whether records that were diagnosed together seem to have the same in them."""
     whole = result.verdict in COMPLETE
     return whole and not any(f.note.endswith(" only") for f in result.findings)
 
 
-def _one_by_one(
+def _diagnose_each(
     loop: Loop, records: Sequence[Record], audits: Sequence[Audit], together: Search,
     catalogue: Sequence[type[AbstractEffect]], work: Work, tell: Callable[..., None],
 ) -> Diagnosis | None:  # fmt: skip
@@ -213,25 +220,27 @@ def _one_by_one(
     won = size = 0.0
     for record, looked in zip(records, audits, strict=True):
         tell(f"record {len(parts) + 1} alone")
-        fresh = fresh_data(loop, [record], None)
+        fresh = choose_fresh_data(loop, [record], None)
         try:
-            result, found = _diagnosed(loop, [record], [looked], fresh, catalogue, work, tell)
+            result, found = _diagnose_together(
+                loop, [record], [looked], fresh, catalogue, work, tell
+            )
         except CtrlidError:  # one that says too little when it stands alone
             return None
         if result.verdict not in COMPLETE:
             return None
         parts.append(result)
-        won += _merit(found.final.fit)
+        won += _penalized_likelihood(found.final.fit)
         size += found.final.fit.size
     fit = together.final.fit
-    better = size != fit.size or won > _merit(fit) + THRESHOLD.gate
-    return merged(loop, parts) if better else None
+    better = size != fit.size or won > _penalized_likelihood(fit) + THRESHOLD.gate
+    return merge_diagnoses(loop, parts) if better else None
 
 
-def _merit(fit: Fit) -> float:
+def _penalized_likelihood(fit: Fit) -> float:
     """Return the log-likelihood less half the Bayesian penalty."""
     return fit.value - 0.5 * len(fit.theta) * math.log(fit.size)
 
 
-def _worker(jobs: int | None) -> Work:
+def _make_worker(jobs: int | None) -> Work:
     return lambda function, items: list(spread(function, items, jobs))

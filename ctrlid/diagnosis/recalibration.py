@@ -8,7 +8,7 @@ import numpy as np
 
 from .._base.errors import CtrlidError
 from ..data.record import Record
-from ..estimation.likelihood.maximization import begin, climb, retuned
+from ..estimation.likelihood.maximization import begin_fit, maximize, refit_noise_size
 from ..estimation.likelihood.noise_fit import known_from_repeats
 from ..estimation.likelihood.physics_fit import choose_noise, make_problem, start_values
 from ..loop.loop import Loop
@@ -17,27 +17,27 @@ from .fitted_model import Model
 from .thresholds import THRESHOLD
 
 
-def base_model(
+def fit_base_model(
     loop: Loop, records: Sequence[Record], names: Sequence[str], begins: Sequence[float] = ()
 ) -> Model:
     """Fit the model as it is, with the noise that the data want."""
     problem = make_problem(loop, names, records, begins)
-    lower, upper = _near(loop, names, problem.lower, problem.upper)
+    lower, upper = _narrow_bounds(loop, names, problem.lower, problem.upper)
     problem = replace(problem, lower=lower, upper=upper)
-    fit = retuned(climb(begin(problem, start_values(loop, names), None)))
+    fit = refit_noise_size(maximize(begin_fit(problem, start_values(loop, names), None)))
     return Model(loop, choose_noise(fit))
 
 
-def weighted_by_repeats(base: Model, periods: Sequence[int]) -> Model:
+def weigh_by_repeats(base: Model, periods: Sequence[int]) -> Model:
     """Return the model fitted with the noise that differs between repeats.
 
     A noise that is fitted to what a model leaves takes part of a missing effect for noise.
     """
     problem = replace(base.fit.problem, known=known_from_repeats(base.fit, periods))
-    return Model(base.loop, climb(begin(problem, base.fit.theta, None), exact=False))
+    return Model(base.loop, maximize(begin_fit(problem, base.fit.theta, None), exact=False))
 
 
-def anchor(base: Model) -> Model | None:
+def model_at_given_values(base: Model) -> Model | None:
     """Return the model at its given values if recalibration has led far away from them.
 
     Where much is missing, the likelihood of the model alone may be largest at absurd values; the
@@ -48,13 +48,15 @@ def anchor(base: Model) -> Model | None:
     if not np.any(np.abs(base.fit.theta - given) > THRESHOLD.far_recalibration * size):
         return None
     try:
-        fit = begin(base.fit.problem, given, None)
+        fit = begin_fit(base.fit.problem, given, None)
     except CtrlidError:
         return None
     return Model(base.loop, fit) if math.isfinite(fit.value) else None
 
 
-def _near(loop: Loop, names: Sequence[str], lower: Array, upper: Array) -> tuple[Array, Array]:
+def _narrow_bounds(
+    loop: Loop, names: Sequence[str], lower: Array, upper: Array
+) -> tuple[Array, Array]:
     """Narrow the bounds of the plant's parameters: a model ten times off is another model."""
     lower, upper = lower.copy(), upper.copy()
     for k, (name, value) in enumerate(zip(names, start_values(loop, names), strict=True)):
@@ -64,7 +66,7 @@ def _near(loop: Loop, names: Sequence[str], lower: Array, upper: Array) -> tuple
     return lower, upper
 
 
-def stretches(records: Sequence[Record]) -> tuple[list[Record], list[float]]:
+def cut_stretches(records: Sequence[Record]) -> tuple[list[Record], list[float]]:
     """Return records short enough to be fitted many times: even stretches of long ones."""
     total = sum(len(r) for r in records)
     if total <= THRESHOLD.fitted_samples:

@@ -21,7 +21,7 @@ from .thresholds import THRESHOLD
 HOPELESS = ("too few samples", "constant signal", "operating point")
 
 
-def as_loop(loop: Any, record: Record) -> Loop:
+def make_loop(loop: Any, record: Record) -> Loop:
     """Return the loop; a transfer function becomes one around the means of the record."""
     if isinstance(loop, Loop):
         return loop
@@ -40,11 +40,11 @@ def as_loop(loop: Any, record: Record) -> Loop:
     return linear.with_effect(InputDelay(delay)) if delay else linear
 
 
-def look_over(
+def look_over_records(
     loop: Loop, records: Sequence[Record]
 ) -> tuple[tuple[Audit, ...], tuple[str, ...]]:  # fmt: skip
     """Return what is remarkable about the records; refuse those that carry nothing."""
-    audits, remarks = [], _foreign_units(loop, records[0])
+    audits, remarks = [], _name_foreign_units(loop, records[0])
     for k, record in enumerate(records):
         found = audit(record, loop)
         audits.append(found)
@@ -58,7 +58,7 @@ def look_over(
     return tuple(audits), tuple(remarks)
 
 
-def _foreign_units(loop: Loop, record: Record) -> list[str]:
+def _name_foreign_units(loop: Loop, record: Record) -> list[str]:
     """Say where a record counts in other units than the plant, whose words sizes are written in."""
     e, known = loop.equations(), getattr(loop.plant, "units", {})
     remarks = []
@@ -73,7 +73,7 @@ def _foreign_units(loop: Loop, record: Record) -> list[str]:
     return remarks
 
 
-def repeat_periods(parts: Sequence[Record], audits: Sequence[Audit]) -> list[int]:
+def find_repeat_periods(parts: Sequence[Record], audits: Sequence[Audit]) -> list[int]:
     """Return after how many samples each record repeats itself; empty if one does not."""
     if len(parts) != len(audits):
         return []
@@ -91,7 +91,7 @@ class Readout:
     errors: dict[str, float]
 
 
-def clipping(
+def read_clipping(
     records: Sequence[Record], audits: Sequence[Audit], catalogue: Sequence[type[AbstractEffect]]
 ) -> Readout | None:
     r"""Return the limits of the sensor if samples sit on them.
@@ -119,7 +119,7 @@ def clipping(
         k: 0.0 for k, v in effect.values().items() if math.isfinite(v)})  # fmt: skip
 
 
-def censored(record: Record, effect: AbstractEffect) -> Record:
+def censor_record(record: Record, effect: AbstractEffect) -> Record:
     """Return a record in which samples on a limit of the sensor do not count."""
     assert isinstance(effect, SensorSaturation)
     slack = 1e-9 * float(np.ptp(record.y))
@@ -128,7 +128,7 @@ def censored(record: Record, effect: AbstractEffect) -> Record:
     return replace(record, valid=np.asarray(record.valid) & free)
 
 
-def steps(
+def read_steps(
     fit: Fit, audits: Sequence[Audit], catalogue: Sequence[type[AbstractEffect]]
 ) -> Readout | None:
     r"""Return the step of the sensor if it makes a good part of its noise.

@@ -5,20 +5,20 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from ..estimation.likelihood.maximization import begin, climb, polish, retuned
+from ..estimation.likelihood.maximization import begin_fit, maximize, polish, refit_noise_size
 from ..estimation.likelihood.physics_fit import choose_noise
 from ..loop.loop import Loop
 from .candidates import Trial, contains
-from .fitted_model import Model, carried_over, simulable, spared
-from .information import needed
-from .refitting import outcome, refit
-from .screening import attempt_at
-from .selection import Step
+from .fitted_model import Model, can_simulate, carry_over, drop_linearization
+from .information import estimate_need
+from .refitting import refit_candidate, weigh_refit
+from .screening import screen_at
+from .selection import Round
 from .thresholds import THRESHOLD
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class Weighed:
     """An effect that earned its place, and what cannot be told apart from it."""
 
     trial: Trial
@@ -27,32 +27,34 @@ class Found:
     position: int  # among the effects of the final loop
 
 
-def settled(model: Model, given: int, steps: Sequence[Step]) -> tuple[Model, tuple[Found, ...]]:
+def weigh_effects(
+    model: Model, given: int, steps: Sequence[Round]
+) -> tuple[Model, tuple[Weighed, ...]]:
     """Return the model without what is superfluous, and each effect on top of all the others."""
     if len(model.loop.effects) == given:
         return model, ()
     best = steps[0].best
     alone = len(model.loop.effects) == given + 1 and len(steps) <= 2
-    if alone and best is not None and _drifts(best.model) == _drifts(model):
-        return model, (Found(best, (), steps[0].base, given),)
-    one = fused(model, given, steps)
+    if alone and best is not None and _has_coloured_force(best.model) == _has_coloured_force(model):
+        return model, (Weighed(best, (), steps[0].base, given),)
+    one = fuse_effects(model, given, steps)
     if one is not model:
-        return settled(renoised(one), given, steps)
-    found: list[Found] = []
+        return weigh_effects(refit_noise(one), given, steps)
+    found: list[Weighed] = []
     for position in range(given, len(model.loop.effects)):
-        smaller, mine = cut(model, position)
-        if mine.merit <= THRESHOLD.gate:
-            return settled(renoised(smaller), given, steps)
-        found.append(Found(mine, (), smaller, position))
+        smaller, mine = refit_without_effect(model, position)
+        if mine.net_gain <= THRESHOLD.gate:
+            return weigh_effects(refit_noise(smaller), given, steps)
+        found.append(Weighed(mine, (), smaller, position))
     found.sort(key=lambda f: -f.trial.gain)
     return model, tuple(found)
 
 
-def _drifts(model: Model) -> bool:
+def _has_coloured_force(model: Model) -> bool:
     return bool(model.fit.noise.drift)
 
 
-def fused(model: Model, given: int, steps: Sequence[Step]) -> Model:
+def fuse_effects(model: Model, given: int, steps: Sequence[Round]) -> Model:
     """Return a model in which one effect stands for two, if it explains as much with as few.
 
     Dry friction found first and a constant force after it may be one asymmetric friction.
@@ -65,31 +67,31 @@ def fused(model: Model, given: int, steps: Sequence[Step]) -> Model:
                 continue
             more = len(effects[k].parameters()) + len(effects[other].parameters())
             saved = 0.5 * (more - len(start.parameters())) * math.log(model.fit.size)
-            without = _without(model, [other])
-            smaller = _without(model, [k, other])
-            trial = attempt_at(smaller, replace(start, **effects[k].values()))
+            without = _drop_effects(model, [other])
+            smaller = _drop_effects(model, [k, other])
+            trial = screen_at(smaller, replace(start, **effects[k].values()))
             lost = model.fit.value - without.fit.value
-            regained = smaller.fit.value + trial.promise - without.fit.value
+            regained = smaller.fit.value + trial.score - without.fit.value
             if regained < THRESHOLD.regained * lost:
                 continue
-            trial = refit(smaller, trial, model)
-            if trial.merit > THRESHOLD.gate and trial.model.fit.value + saved > model.fit.value:
+            trial = refit_candidate(smaller, trial, model)
+            if trial.net_gain > THRESHOLD.gate and trial.model.fit.value + saved > model.fit.value:
                 return trial.model
     return model
 
 
-def _without(model: Model, positions: Sequence[int]) -> Model:
+def _drop_effects(model: Model, positions: Sequence[int]) -> Model:
     """Return the model without some of its effects, all else as it is."""
     loop, names = model.fitted, model.names
     for position in sorted(positions, reverse=True):
-        loop, names = taken_out(loop, position, names)
-    fit = carried_over(model, loop, names)
+        loop, names = take_out_effect(loop, position, names)
+    fit = carry_over(model, loop, names)
     if not math.isfinite(fit.value):  # with noise as small as that, it cannot follow the record
-        fit = begin(fit.problem, fit.theta, None)
+        fit = begin_fit(fit.problem, fit.theta, None)
     return Model(loop, fit)
 
 
-def taken_out(
+def take_out_effect(
     loop: Loop, position: int, names: Sequence[str]
 ) -> tuple[Loop, tuple[str, ...]]:  # fmt: skip
     """Return a loop without one of its effects, and the names of what is free then."""
@@ -97,31 +99,31 @@ def taken_out(
     label, less = labels[position], loop.without_effect(labels[position])
     renamed = dict(zip(labels[:position] + labels[position + 1 :], less.labelled, strict=True))
     left = [n for n in names if not n.startswith(f"{label}.")]
-    return less, tuple(relabelled(left, renamed))
+    return less, tuple(rename_labels(left, renamed))
 
 
-def cut(model: Model, position: int) -> tuple[Model, Trial]:
+def refit_without_effect(model: Model, position: int) -> tuple[Model, Trial]:
     """Return the model without one effect, refitted, and the effect as a trial on top of it."""
-    bare = _without(model, [position])
-    smaller = replace(bare, fit=spared(climb(bare.fit, rounds=10)))
+    bare = _drop_effects(model, [position])
+    smaller = replace(bare, fit=drop_linearization(maximize(bare.fit, rounds=10)))
     effect = model.fitted.effects[position]
     # Put back anew, it would come last; and all else may have gone too far astray without it.
     label = list(model.loop.labelled)[position]
-    known = outcome(smaller, Trial(effect, label, model, -math.inf), model.fit)
-    if simulable(model):
+    known = weigh_refit(smaller, Trial(effect, label, model, -math.inf), model.fit)
+    if can_simulate(model):
         return smaller, known
     # Where no simulation can check it, a likelihood may be that of absurd values.
-    again = refit(smaller, attempt_at(smaller, effect))
+    again = refit_candidate(smaller, screen_at(smaller, effect))
     return smaller, again if again.gain > 0 else known  # below nothing it was stuck
 
 
-def renoised(model: Model) -> Model:
+def refit_noise(model: Model) -> Model:
     """Ask again whether the data want a coloured force, now that an effect is in the model."""
-    fit = retuned(polish(model.fit))
+    fit = refit_noise_size(polish(model.fit))
     if fit.problem.known is not None:
         return Model(model.loop, fit)
     if fit.noise.drift:
-        plain = climb(replace(fit, noise=replace(fit.noise, memory=0.0, drift=0.0)))
+        plain = maximize(replace(fit, noise=replace(fit.noise, memory=0.0, drift=0.0)))
         if plain.value > fit.value - math.log(fit.size):
             return Model(model.loop, plain)
         # The force that stood for the effect may be far from the one that is left.
@@ -130,21 +132,21 @@ def renoised(model: Model) -> Model:
     return Model(model.loop, choose_noise(fit))
 
 
-def without_superfluous(model: Model, given: int) -> Model:
+def drop_superfluous(model: Model, given: int) -> Model:
     """Drop effects that the later ones made superfluous."""
     for position in range(given, len(model.loop.effects) - 1):
-        if needed(model, position) > THRESHOLD.surely_needed * THRESHOLD.gate:
+        if estimate_need(model, position) > THRESHOLD.surely_needed * THRESHOLD.gate:
             continue
-        smaller, trial = cut(model, position)
-        if trial.merit <= THRESHOLD.gate:
-            return without_superfluous(smaller, given)
+        smaller, trial = refit_without_effect(model, position)
+        if trial.net_gain <= THRESHOLD.gate:
+            return drop_superfluous(smaller, given)
     return model
 
 
 ORDERED = ("input", "output")  # places with a signal through them; forces and laws only add up
 
 
-def reordered(model: Model, given: int) -> Model:
+def order_last_effect(model: Model, given: int) -> Model:
     """Return the model with its last effect nearer to the plant, if it fits better there.
 
     What is found last was found second, which says nothing of where it acts: a valve may have its
@@ -169,14 +171,14 @@ def reordered(model: Model, given: int) -> Model:
     for k in range(given, len(others)):
         if others[k].stage != last.stage:
             continue
-        tried = moved(model, k)
+        tried = move_last_effect(model, k)
         if math.isfinite(tried.fit.value):
-            tried = replace(tried, fit=climb(tried.fit, rounds=10, exact=False))
+            tried = replace(tried, fit=maximize(tried.fit, rounds=10, exact=False))
         best = max(best, tried, key=lambda m: m.fit.value)
     return best if best.fit.value > model.fit.value + THRESHOLD.close else model
 
 
-def moved(model: Model, position: int) -> Model:
+def move_last_effect(model: Model, position: int) -> Model:
     """Return the model with its last effect at another position among the effects, all else as is.
 
     The likelihood is minus infinity if the filter cannot follow the record then.
@@ -188,11 +190,11 @@ def moved(model: Model, position: int) -> Model:
     loop = replace(fitted, effects=tuple(fitted.effects[k] for k in order), free=())
     renamed = dict(zip([labels[k] for k in order], loop.labelled, strict=True))
     loop = replace(loop, free=tuple(n for n in fitted.free if "." not in n))
-    names = relabelled(model.names, renamed)
-    return Model(loop, carried_over(model, loop, names))
+    names = rename_labels(model.names, renamed)
+    return Model(loop, carry_over(model, loop, names))
 
 
-def relabelled(names: Sequence[str], labels: Mapping[str, str]) -> list[str]:
+def rename_labels(names: Sequence[str], labels: Mapping[str, str]) -> list[str]:
     """Return names of parameters with the new labels of their effects."""
     parts = [name.partition(".") for name in names]
     return [f"{labels.get(head, head)}.{tail}" if dot else head for head, dot, tail in parts]

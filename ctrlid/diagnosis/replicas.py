@@ -11,22 +11,22 @@ import numpy as np
 from .._base.errors import CtrlidError
 from ..data.record import Record
 from ..estimation.likelihood.likelihood import Fit, evaluate
-from ..estimation.likelihood.maximization import begin, climb
+from ..estimation.likelihood.maximization import begin_fit, maximize
 from ..estimation.likelihood.physics_fit import make_problem
 from ..loop.loop import Loop
 from ..loop.period_map import comes_to_rest
 from ..loop.simulation import Simulator
 from .candidates import Trial
-from .fitted_model import Model, carried_over, simulable
-from .gap import drive, random_noise
-from .noise_tests import Omnibus, omnibus
+from .fitted_model import Model, can_simulate, carry_over
+from .gap import draw_noise, prepare_simulation
+from .noise_tests import NoiseTests, run_noise_tests
 from .records import Readout
-from .refitting import refit
-from .screening import attempt_at
+from .refitting import refit_candidate
+from .screening import screen_at
 from .thresholds import THRESHOLD
 
 
-def replica(model: Model, seed: int = 0) -> Model | None:
+def make_replica(model: Model, seed: int = 0) -> Model | None:
     """Simulate the records with a fitted model and its noise, and fit the model to them.
 
     Parameters
@@ -45,16 +45,16 @@ def replica(model: Model, seed: int = 0) -> Model | None:
     loop, fit = model.fitted, model.fit
     try:
         records = [
-            _simulated(model, t.record, float(t.table[0, 0]), float(r), seed + 101 * k)
-            for k, (t, r) in enumerate(zip(fit.problem.tracks, fit.sensor, strict=True))
+            _simulate_record(model, t.record, float(t.table[0, 0]), float(r), seed + 101 * k)
+            for k, (t, r) in enumerate(zip(fit.problem.prepared, fit.sensor, strict=True))
         ]
-        begins = [float(t.table[0, 0]) for t in fit.problem.tracks]
+        begins = [float(t.table[0, 0]) for t in fit.problem.prepared]
         problem = make_problem(loop, model.names, records, begins)
         problem = replace(problem, counts=fit.problem.counts, known=fit.problem.known)
         # With other noise a loop may take another path; or the first guess of one may lead astray.
         along = evaluate(problem, fit.theta, fit.noise, [o.trajectory for o in fit.filtered])
-        starts = along, begin(problem, fit.theta, fit.noise)
-        again = climb(max(starts, key=_likely), rounds=8, exact=False)
+        starts = along, begin_fit(problem, fit.theta, fit.noise)
+        again = maximize(max(starts, key=_likely), rounds=8, exact=False)
     except CtrlidError:
         return None
     return Model(loop, again) if math.isfinite(again.value) else None
@@ -64,9 +64,11 @@ def _likely(fit: Fit) -> float:
     return fit.value if math.isfinite(fit.value) else -math.inf
 
 
-def _simulated(model: Model, record: Record, first: float, sensor: float, seed: int) -> Record:
-    follows = not simulable(model)
-    loop = following(model.fitted, record) if follows else model.fitted
+def _simulate_record(
+    model: Model, record: Record, first: float, sensor: float, seed: int
+) -> Record:
+    follows = not can_simulate(model)
+    loop = follow_record(model.fitted, record) if follows else model.fitted
     if loop is None:
         raise CtrlidError("the record cannot be followed")
     simulator = Simulator(loop, THRESHOLD.gap_integration_error, THRESHOLD.gap_steps)
@@ -75,19 +77,19 @@ def _simulated(model: Model, record: Record, first: float, sensor: float, seed: 
         if stop - start < 10:
             continue
         part = record[start:stop]
-        z, r, d = drive(simulator, part, follows)
-        noise = random_noise(model.fit, sensor, len(part), seed + start)
+        z, r, d = prepare_simulation(simulator, part, follows)
+        noise = draw_noise(model.fit, sensor, len(part), seed + start)
         begin = first + float(record.t[start] - record.start)
         y[start:stop], u[start:stop] = simulator.run(z, r, d, noise, begin)
     return replace(record, y=y, u=u)
 
 
-def kinked(model: Model) -> bool:
+def has_kinks(model: Model) -> bool:
     """Whether a model has kinks in its states, such as dry friction."""
-    return model.fit.problem.machine.e.kinked
+    return model.fit.problem.plant.e.kinked
 
 
-def artefact(copies: Sequence[Model | None], trial: Trial) -> float:
+def gain_on_replicas(copies: Sequence[Model | None], trial: Trial) -> float:
     """Return what a candidate gains on records in which it is known not to be.
 
     Parameters
@@ -106,14 +108,14 @@ def artefact(copies: Sequence[Model | None], trial: Trial) -> float:
     for copy in copies:
         if copy is None:
             continue
-        again = refit(copy, attempt_at(copy, trial.fitted, trial.scan))
+        again = refit_candidate(copy, screen_at(copy, trial.fitted, trial.scan_penalty))
         if not again.gain > 0:  # from there dry friction may have led it another way
-            again = refit(copy, attempt_at(copy, trial.effect, trial.scan))
+            again = refit_candidate(copy, screen_at(copy, trial.effect, trial.scan_penalty))
         gains.append(again.gain if math.isfinite(again.gain) else 0.0)
     return max(gains)
 
 
-def more_than_simple(base: Model, best: Trial, simple: Trial) -> float:
+def gain_beyond_simple(base: Model, best: Trial, simple: Trial) -> float:
     """Return what the further parameters of an effect gain over a simpler one.
 
     What the further parameters gain on a record simulated with the simpler effect, they gain
@@ -131,29 +133,29 @@ def more_than_simple(base: Model, best: Trial, simple: Trial) -> float:
     float
         Gain of log-likelihood; infinite where no record can be simulated.
     """
-    copy = replica(simple.model)
+    copy = make_replica(simple.model)
     if copy is None:
         return math.inf
     try:
-        under = carried_over(copy, base.fitted, base.names)
+        under = carry_over(copy, base.fitted, base.names)
     except CtrlidError:
         return math.inf
     # Both climb from the same start: where the replica was fitted, the simple one may be stuck.
     without = Model(base.fitted, under)
-    again, plain = (refit(without, attempt_at(without, t.fitted)) for t in (best, simple))
+    again, plain = (refit_candidate(without, screen_at(without, t.fitted)) for t in (best, simple))
     least = max(copy.fit.value, plain.model.fit.value)
     usual = again.model.fit.value - least if math.isfinite(again.gain) else 0.0
     return best.gain - simple.gain - THRESHOLD.replica_weight * max(usual, 0.0)
 
 
-def forgiven(tests: Omnibus, copies: Sequence[Model | None]) -> Omnibus:
+def forgive_filter(tests: NoiseTests, copies: Sequence[Model | None]) -> NoiseTests:
     """Return the tests without alarms that the filter's own approximation raises.
 
     A test that fails on the record, and on records simulated with the very model, says nothing
     against the model.
     """
-    bent = any(copy is not None and copy.loop.effects and kinked(copy) for copy in copies)
-    known = [omnibus(copy.fit).p_values for copy in copies if copy is not None]
+    bent = any(copy is not None and copy.loop.effects and has_kinks(copy) for copy in copies)
+    known = [run_noise_tests(copy.fit).p_values for copy in copies if copy is not None]
     if not known:
         return tests
     p = {}
@@ -168,7 +170,7 @@ def forgiven(tests: Omnibus, copies: Sequence[Model | None]) -> Omnibus:
     )
 
 
-def following(loop: Loop, record: Record) -> Loop | None:
+def follow_record(loop: Loop, record: Record) -> Loop | None:
     r"""Return a loop whose output follows that of a record, driven by its input.
 
     .. math:: u = u_{record} + C (y_{record} - y)
@@ -197,13 +199,13 @@ def following(loop: Loop, record: Record) -> Loop | None:
         plant = ct.ss(loop.linearize())
         plant = plant if plant.dt else ct.sample_system(plant, loop.dt, "zoh")
         u, y = (max(float(np.std(v[record.valid])), 1e-300) for v in (record.u, record.y))
-        made = replace(loop, controller=_normalized(plant, u, y))
+        made = replace(loop, controller=_normalized_controller(plant, u, y))
         return made if comes_to_rest(made) else None
     except (CtrlidError, ValueError, np.linalg.LinAlgError):
         return None
 
 
-def _normalized(plant: Any, u: float, y: float) -> Any:
+def _normalized_controller(plant: Any, u: float, y: float) -> Any:
     """Return the controller for a plant in discrete time, by the sizes of its input and output."""
     a, b, c = plant.A, plant.B * u, plant.C / y
     feedback, _, _ = ct.dlqr(a, b, c.T @ c, np.eye(1))

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 WIDTH = 100
 
 
-def report(found: Diagnosis) -> str:
+def write_report_text(found: Diagnosis) -> str:
     """Return a diagnosis in plain words.
 
     Parameters
@@ -29,26 +29,26 @@ def report(found: Diagnosis) -> str:
     str
         Lines of at most 100 columns. Bad news is in capitals.
     """
-    lines = [f"Diagnosis of {found.record or 'a record'}", *_wrapped(wording.headline(found), 2)]
+    lines = [f"Diagnosis of {found.record or 'a record'}", *_wrap(wording.write_headline(found), 2)]
     lines += ["", *gap_lines(found.gap), "", *_where(found)]
     if found.findings:
         lines += ["", "  what is missing"]
         for k, finding in enumerate(found.findings, 1):
             lines += _finding(found, finding, f"{k}. ")
-        lines += _wrapped(wording.EVIDENCE, 4)
+        lines += _wrap(wording.EVIDENCE, 4)
     elif found.verdict == "nothing missing" and found.sensitivity:
         lines += ["", *_sensitivity(found)]
     lines += ["", *_parameters(found)]
-    lines += _wrapped(wording.disturbance(found), 2, hang=4)
-    lines += _wrapped(wording.remains(found), 2, hang=4)
+    lines += _wrap(wording.describe_disturbance(found), 2, hang=4)
+    lines += _wrap(wording.describe_remains(found), 2, hang=4)
     for title, remarks in (("about the record", found.audit), ("note", found.notes)):
         for remark in remarks:
-            lines += _wrapped(f"{title}: {remark}", 2, hang=4)
+            lines += _wrap(f"{title}: {remark}", 2, hang=4)
     lines.append(f"  {found.seconds:.1f} s")
     return "\n".join(line.rstrip() for line in lines)
 
 
-def _wrapped(text: str, indent: int, hang: int | None = None) -> list[str]:
+def _wrap(text: str, indent: int, hang: int | None = None) -> list[str]:
     later = " " * (indent if hang is None else hang)
     for sign in ("=", "±"):  # no line ends beside them
         text = text.replace(f" {sign} ", f"\xa0{sign}\xa0")
@@ -59,14 +59,14 @@ def _wrapped(text: str, indent: int, hang: int | None = None) -> list[str]:
 
 def gap_lines(gap: Gap) -> list[str]:
     """Return the sizes of the gap as aligned lines."""
-    rows = wording.gap_rows(gap)
+    rows = wording.list_gap_rows(gap)
     head = f"  how far apart: {gap.kind} of {len(gap.time)} samples kept back, RMS error"
     return [head, *(f"    {label:<20}{size:>12}   {times}" for label, size, times in rows),
-            *_wrapped(wording.shrinking(gap), 4)]  # fmt: skip
+            *_wrap(wording.describe_shrinking(gap), 4)]  # fmt: skip
 
 
 def _where(found: Diagnosis) -> list[str]:
-    places = wording.telling(found)
+    places = wording.list_telling_places(found)
     if not places:
         axes = listing([p.axis for p in found.where])
         return ["  where it sits: " + (f"nowhere; noise looks like this along {axes}" if axes else
@@ -75,25 +75,25 @@ def _where(found: Diagnosis) -> list[str]:
     head = "  where it sits: RMS of the one-step errors, 1 is noise"
     rows = [f"{head:<79}{'worst' if same else 'before':>10}{'' if same else 'after':>10}"]
     for place in places:
-        first, *more = textwrap.wrap(wording.place_words(place), 60) or [""]
-        after = "" if same else number(wording.worst(place.after), 3)
-        rows.append(f"    {place.axis:<12} {first:<62}{number(wording.worst(place.before), 3):>10}"
-                    f"{after:>10}")  # fmt: skip
+        first, *more = textwrap.wrap(wording.describe_place(place), 60) or [""]
+        before, after = (number(wording.highest_rms(v), 3) for v in (place.before, place.after))
+        after = "" if same else after
+        rows.append(f"    {place.axis:<12} {first:<62}{before:>10}{after:>10}")
         rows += [f"{'':<17}{line}" for line in more]
     return rows
 
 
 def _finding(found: Diagnosis, finding: Finding, label: str) -> list[str]:
-    lines = _wrapped(f"{label}{wording.named(finding)}", 4, hang=7)
-    lines += _wrapped(wording.sized(found, finding), 7, hang=9)
-    for text in (wording.certainty(found, finding), *wording.doubts(found, finding)):
-        lines += _wrapped(text, 7, hang=9)
+    lines = _wrap(f"{label}{wording.name_finding(finding)}", 4, hang=7)
+    lines += _wrap(wording.describe_size(found, finding), 7, hang=9)
+    for text in (wording.describe_certainty(found, finding), *wording.list_doubts(found, finding)):
+        lines += _wrap(text, 7, hang=9)
     return lines
 
 
 def _sensitivity(found: Diagnosis) -> list[str]:
     rows = [f"{key:<{max(46 - len(size), len(key) + 1)}}{size}"
-            for key, size in wording.sensitivity_rows(found)]  # fmt: skip
+            for key, size in wording.list_sensitivity_rows(found)]  # fmt: skip
     half = (len(rows) + 1) // 2
     right = [*rows[half:], ""][:half]
     head = "  the smallest effects that this record would have shown"

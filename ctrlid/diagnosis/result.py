@@ -8,8 +8,8 @@ from .._base.text import Printed
 from ..effects import AbstractEffect
 from ..loop.loop import Loop
 from .findings import Calibrated, Candidate, Disturbance, Finding, Gap, Place, Verdict
-from .report_text import report
-from .saving import save
+from .report_text import write_report_text
+from .saving import save_diagnosis
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +76,7 @@ class Diagnosis(Printed):
         return tuple(f.effect for f in self.findings)
 
     def __str__(self) -> str:
-        return report(self)
+        return write_report_text(self)
 
     def __repr__(self) -> str:
         names = ": " + ", ".join(f.name for f in self.findings) if self.findings else ""
@@ -105,4 +105,4 @@ class Diagnosis(Printed):
         CtrlidError
             If the file cannot be written.
         """
-        return save(self, path)
+        return save_diagnosis(self, path)

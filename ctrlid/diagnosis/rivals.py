@@ -6,19 +6,19 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..estimation.likelihood.maximization import climb
+from ..estimation.likelihood.maximization import maximize
 from ..physics.equations import Array
 from .candidates import Trial, contains, same_kind
 from .fitted_model import Model, log_terms
-from .noise_tests import omnibus
-from .refitting import refit
-from .removal import Found, cut, moved, renoised, settled
-from .screening import attempt_at
-from .selection import Step, Work, plainer
+from .noise_tests import run_noise_tests
+from .refitting import refit_candidate
+from .removal import Weighed, move_last_effect, refit_noise, refit_without_effect, weigh_effects
+from .screening import screen_at
+from .selection import Round, Work, prefer_plainer
 from .thresholds import THRESHOLD
 
 
-def vuong(best: Array, other: Array, penalty: float) -> float:
+def vuong_statistic(best: Array, other: Array, penalty: float) -> float:
     r"""Return Vuong's statistic of two models on the same samples.
 
     .. math:: z = \frac{\sum_k d_k - \Delta}{\sqrt{\sum_b (D_b - \bar D)^2}}, \quad
@@ -43,18 +43,18 @@ def vuong(best: Array, other: Array, penalty: float) -> float:
     Vuong, Econometrica 57 (1989) 307-333.
     """
     d = best - other
-    spread = _spread(d)
+    spread = _spread_of_sum(d)
     return float((d.sum() - penalty) / max(spread, 1e-12))
 
 
-def _spread(d: Array) -> float:
+def _spread_of_sum(d: Array) -> float:
     """Return the standard deviation of a sum whose terms may be correlated with neighbours."""
     n = len(d) // THRESHOLD.block * THRESHOLD.block
     sums = d[:n].reshape(-1, THRESHOLD.block).sum(axis=1) if n else d
     return math.sqrt(float(np.sum((sums - sums.mean()) ** 2)))
 
 
-def _beyond(trial: Trial, simple: Trial) -> float:
+def _share_beyond(trial: Trial, simple: Trial) -> float:
     """Return how large what an effect has beyond a simpler one may be, over what both have.
 
     NaN where the two have nothing of one unit.
@@ -71,7 +71,7 @@ def _beyond(trial: Trial, simple: Trial) -> float:
     return max(shares, default=math.nan)
 
 
-def rivals(best: Trial, others: Sequence[Trial], sure: bool = True) -> tuple[Trial, ...]:
+def find_rivals(best: Trial, others: Sequence[Trial], sure: bool = True) -> tuple[Trial, ...]:
     """Return the candidates that the record cannot tell apart from the best, best first.
 
     Parameters
@@ -93,9 +93,9 @@ def rivals(best: Trial, others: Sequence[Trial], sure: bool = True) -> tuple[Tri
     mine = log_terms(best.model.fit)
     found = []
     for trial in others:
-        if same_kind(trial.effect, best.effect) or trial.merit <= THRESHOLD.gate:
+        if same_kind(trial.effect, best.effect) or trial.net_gain <= THRESHOLD.gate:
             continue
-        lost = best.merit - trial.merit
+        lost = best.net_gain - trial.net_gain
         theirs = log_terms(trial.model.fit)
         # A larger model that predicts the same contains the best one, and pays for nothing; but one
         # that gains more may be right (a Stribeck curve hardly told from dry friction), and one
@@ -103,11 +103,11 @@ def rivals(best: Trial, others: Sequence[Trial], sure: bool = True) -> tuple[Tri
         alike = trial.name in type(best.effect).look_alikes
         nothing = (
             trial.gain < best.gain + THRESHOLD.close
-            and _spread(mine - theirs) < THRESHOLD.same_predictions
+            and _spread_of_sum(mine - theirs) < THRESHOLD.same_predictions
         )
-        if trial.cost > best.cost and nothing:
+        if trial.penalty > best.penalty and nothing:
             larger = contains(trial.effect, best.effect)
-            share = _beyond(trial, best) if larger else math.nan
+            share = _share_beyond(trial, best) if larger else math.nan
             hinted = (
                 alike
                 and trial.gain > best.gain + THRESHOLD.hint
@@ -116,58 +116,60 @@ def rivals(best: Trial, others: Sequence[Trial], sure: bool = True) -> tuple[Tri
             if share > THRESHOLD.small_part or hinted:
                 found.append(trial)
             continue
-        z = vuong(mine, theirs, best.cost - trial.cost)
-        doubtful = not sure and alike and trial.merit > THRESHOLD.doubtful_rival * best.merit
+        z = vuong_statistic(mine, theirs, best.penalty - trial.penalty)
+        doubtful = not sure and alike and trial.net_gain > THRESHOLD.doubtful_rival * best.net_gain
         if lost < THRESHOLD.close or z < THRESHOLD.vuong_z or doubtful:
             found.append(trial)
-    found.sort(key=lambda t: -t.merit)
+    found.sort(key=lambda t: -t.net_gain)
     # One that was begun at several places is one.
     return tuple(
         t for k, t in enumerate(found) if not any(same_kind(t.effect, b.effect) for b in found[:k])
     )
 
 
-def compared(
-    model: Model, found: Sequence[Found], given: int, steps: Sequence[Step], work: Work
-) -> tuple[Model, tuple[Found, ...]]:
+def compare_effects(
+    model: Model, found: Sequence[Weighed], given: int, steps: Sequence[Round], work: Work
+) -> tuple[Model, tuple[Weighed, ...]]:
     """Ask for each effect what else could stand in its place, all others being in the model."""
-    sure = omnibus(model.fit).passed
+    sure = run_noise_tests(model.fit).passed
     if len(found) == 1 and found[0].trial is steps[0].best:
         best = found[0].trial
-        return model, (replace(found[0], rivals=rivals(best, steps[0].trials, sure)),)
+        return model, (replace(found[0], rivals=find_rivals(best, steps[0].trials, sure)),)
     done, now = [], model
     for f in sorted(found, key=lambda f: f.position):
-        smaller, mine = (f.base, f.trial) if now is model else cut(now, f.position)
+        smaller, mine = (f.base, f.trial) if now is model else refit_without_effect(now, f.position)
         if (
-            mine.merit <= THRESHOLD.gate
+            mine.net_gain <= THRESHOLD.gate
         ):  # what took the place of another makes this one superfluous
-            fewer, left = settled(renoised(smaller), given, steps)
-            return compared(fewer, left, given, steps, work)
+            fewer, left = weigh_effects(refit_noise(smaller), given, steps)
+            return compare_effects(fewer, left, given, steps, work)
         there = {type(e).__name__ for e in smaller.loop.effects}
-        rest = [t for t in _close(mine, steps) if t.name not in there]
-        again = work(lambda t, smaller=smaller: refit(smaller, attempt_at(smaller, t.fitted)), rest)
-        again = [t for t in again if _on_bounds(t.model) <= _on_bounds(mine.model)]
-        best = max([mine, *again], key=lambda t: t.merit)
-        if best.merit <= mine.merit + 1.0:
+        rest = [t for t in _find_close(mine, steps) if t.name not in there]
+        again = work(
+            lambda t, smaller=smaller: refit_candidate(smaller, screen_at(smaller, t.fitted)), rest
+        )
+        again = [t for t in again if _find_on_bounds(t.model) <= _find_on_bounds(mine.model)]
+        best = max([mine, *again], key=lambda t: t.net_gain)
+        if best.net_gain <= mine.net_gain + 1.0:
             best = mine
-        best = plainer(smaller, best, [mine, *again])
+        best = prefer_plainer(smaller, best, [mine, *again])
         if best is not mine:
-            now = moved(best.model, f.position)
-            now = replace(now, fit=climb(now.fit, rounds=4))
-        close = rivals(best, [t for t in [mine, *again] if t is not best], sure)
-        done.append(Found(best, close, smaller, f.position))
+            now = move_last_effect(best.model, f.position)
+            now = replace(now, fit=maximize(now.fit, rounds=4))
+        close = find_rivals(best, [t for t in [mine, *again] if t is not best], sure)
+        done.append(Weighed(best, close, smaller, f.position))
     done.sort(key=lambda f: -f.trial.gain)
     return now, tuple(done)
 
 
-def _on_bounds(model: Model) -> set[str]:
+def _find_on_bounds(model: Model) -> set[str]:
     """Return the plant's own parameters that are as far from their given values as is allowed."""
     problem, theta = model.fit.problem, model.fit.theta
     ends = zip(model.names, theta, problem.lower, problem.upper, strict=True)
     return {name for name, v, low, high in ends if "." not in name and v in (low, high)}
 
 
-def _close(mine: Trial, steps: Sequence[Step]) -> list[Trial]:
+def _find_close(mine: Trial, steps: Sequence[Round]) -> list[Trial]:
     """Return the candidates that came close to an effect in the round that it won.
 
     Or that one which resembles it won, whose place it took since.
@@ -179,8 +181,8 @@ def _close(mine: Trial, steps: Sequence[Step]) -> list[Trial]:
         assert step.best is not None
         near = [
             t for t in step.trials
-            if t.name != mine.name and t.merit > THRESHOLD.gate
-            and (t.name in alike or t.merit > THRESHOLD.near_winner * step.best.merit)
+            if t.name != mine.name and t.net_gain > THRESHOLD.gate
+            and (t.name in alike or t.net_gain > THRESHOLD.near_winner * step.best.net_gain)
         ]  # fmt: skip
         return near[: THRESHOLD.looked_at]
     return []

@@ -78,20 +78,20 @@ def units_of(loop: Loop | SavedLoop, effect: AbstractEffect) -> dict[str, str]:
     return effect.units(loop)
 
 
-def save(found: Diagnosis, path: str | Path) -> Path:
+def save_diagnosis(found: Diagnosis, path: str | Path) -> Path:
     """Write a diagnosis to a file; see `Diagnosis.save`."""
-    fields = {f.name: _plain(getattr(found, f.name))
+    fields = {f.name: _encode(getattr(found, f.name))
               for f in dataclasses.fields(found) if f.name != "extra"}  # fmt: skip
-    loop = {**fields.pop("loop"), "units": _units(found)}
+    loop = {**fields.pop("loop"), "units": _units_of_effects(found)}
     extra, left = {}, []
     for key, value in found.extra.items():
         try:
-            extra[str(key)] = _plain(value)
+            extra[str(key)] = _encode(value)
         except CtrlidError:
             left.append(str(key))
     fields |= {"extra": extra, **({"left out of extra": left} if left else {})}
     arrays = fields.pop("gap")  # long: last
-    text = readable({"format": FORMAT, **fields, "loop": loop, "gap": arrays})
+    text = write_readable_json({"format": FORMAT, **fields, "loop": loop, "gap": arrays})
     path = Path(path)
     try:
         path.write_text(text + "\n", encoding="utf-8")
@@ -103,7 +103,7 @@ def save(found: Diagnosis, path: str | Path) -> Path:
     return path
 
 
-def _plain(value: Any) -> Any:
+def _encode(value: Any) -> Any:
     """Return a value as what JSON has: texts, numbers, lists and mappings."""
     match value:
         case None | bool() | str():
@@ -116,34 +116,36 @@ def _plain(value: Any) -> Any:
         case AbstractEffect():
             own = {} if type(value).__module__.startswith("ctrlid.") else {
                 "module": type(value).__module__}  # fmt: skip
-            fields = {f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+            fields = {f.name: _encode(getattr(value, f.name)) for f in dataclasses.fields(value)}
             return {"name": type(value).__name__, **own, "parameters": fields}
         case Loop() | SavedLoop():
-            return _plain_loop(value)
+            return _encode_loop(value)
         case np.ndarray() | list() | tuple():
-            return [_plain(v) for v in (value.tolist() if isinstance(value, np.ndarray) else value)]
+            return [
+                _encode(v) for v in (value.tolist() if isinstance(value, np.ndarray) else value)
+            ]
         case Mapping():
-            return {str(k): _plain(v) for k, v in value.items()}
+            return {str(k): _encode(v) for k, v in value.items()}
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+        return {f.name: _encode(getattr(value, f.name)) for f in dataclasses.fields(value)}
     raise CtrlidError(f"a {type(value).__name__} cannot be saved as text")
 
 
-def _plain_loop(loop: Loop | SavedLoop) -> dict[str, Any]:
+def _encode_loop(loop: Loop | SavedLoop) -> dict[str, Any]:
     at = loop.at
     assert at is not None
     name, law = ((loop.plant_name, loop.controller_text) if isinstance(loop, SavedLoop) else
                  (loop.equations().name, " ".join(str(loop.controller).split())))  # fmt: skip
     return {
         "plant": name,
-        "parameters": _plain(loop.parameters), "free": list(loop.free), "dt": _plain(loop.dt),
-        "at": _plain(at), "input_limits": _plain(loop.input_limits),
+        "parameters": _encode(loop.parameters), "free": list(loop.free), "dt": _encode(loop.dt),
+        "at": _encode(at), "input_limits": _encode(loop.input_limits),
         "controller": law,
-        "effects": [_plain(e) for e in loop.effects],
+        "effects": [_encode(e) for e in loop.effects],
     }  # fmt: skip
 
 
-def _units(found: Diagnosis) -> dict[str, dict[str, str]]:
+def _units_of_effects(found: Diagnosis) -> dict[str, dict[str, str]]:
     """Return the units of all effects that a diagnosis speaks of, by class name."""
     spoken = [*found.loop.effects, *(c.effect for c in found.ranking)]
     spoken += [e for f in found.findings for e in (f.effect, *f.alternatives)]
@@ -156,27 +158,31 @@ SPECIAL = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}  # written as te
 IN_A_LINE = 8  # numbers of an array
 
 
-def numbers(data: Any) -> Any:
+def read_numbers(data: Any) -> Any:
     """Return numbers that JSON does not have from their names, and all else as it is."""
     match data:
         case str():
             return SPECIAL.get(data, data)
         case list():
-            return [numbers(v) for v in data]
+            return [read_numbers(v) for v in data]
         case dict():
-            return {k: numbers(v) for k, v in data.items()}
+            return {k: read_numbers(v) for k, v in data.items()}
     return data
 
 
-def readable(value: Any, indent: int = 0) -> str:
+def write_readable_json(value: Any, indent: int = 0) -> str:
     """Write JSON with an entry a line and the numbers of an array several in a line."""
     inner, outer = " " * (indent + 2), " " * indent
     if isinstance(value, dict) and value:
-        rows = [f"{json.dumps(k, ensure_ascii=False)}: {readable(v, indent + 2)}"
+        rows = [f"{json.dumps(k, ensure_ascii=False)}: {write_readable_json(v, indent + 2)}"
                 for k, v in value.items()]  # fmt: skip
         return "{\n" + ",\n".join(inner + row for row in rows) + f"\n{outer}}}"
     if isinstance(value, list) and value and any(isinstance(v, dict | list) for v in value):
-        return "[\n" + ",\n".join(inner + readable(v, indent + 2) for v in value) + f"\n{outer}]"
+        return (
+            "[\n"
+            + ",\n".join(inner + write_readable_json(v, indent + 2) for v in value)
+            + f"\n{outer}]"
+        )
     if isinstance(value, list) and len(value) > IN_A_LINE:
         rows = [json.dumps(value[k : k + IN_A_LINE], ensure_ascii=False)[1:-1]
                 for k in range(0, len(value), IN_A_LINE)]  # fmt: skip

@@ -1,4 +1,4 @@
-"""Step 4: what a candidate promises, by the score test."""
+"""Step 4: the score of a candidate, which is the gain that its first step expects."""
 
 import math
 from collections.abc import Sequence
@@ -7,31 +7,31 @@ from dataclasses import replace
 from .._base.errors import CtrlidError
 from ..effects import AbstractEffect
 from ..estimation.likelihood.likelihood import evaluate
-from ..estimation.likelihood.maximization import promised
+from ..estimation.likelihood.maximization import expected_gain
 from .candidates import Trial
-from .fitted_model import Model, carried_over, light
-from .information import doubled_by
+from .fitted_model import Model, carry_over, drop_arrays
+from .information import find_doubles
 from .thresholds import THRESHOLD
 
 
-def attempt(base: Model, effect: AbstractEffect, scan: float = 0.0) -> Trial:
+def screen_candidate(base: Model, effect: AbstractEffect, scan_penalty: float = 0.0) -> Trial:
     """Add an effect, as it is or nearer to nothing, and ask what a first step would gain.
 
-    An effect that is faint is tried faint: far from there the first step promises nothing. The
-    arguments are those of `attempt_at`.
+    An effect that is faint is tried faint: far from there its score is zero. The
+    arguments are those of `screen_at`.
     """
-    best = attempt_at(base, effect, scan)
+    best = screen_at(base, effect, scan_penalty)
     for _ in range(THRESHOLD.fainter_tries):
-        if effect.neutral or best.promise > 0:
+        if effect.neutral or best.score > 0:
             break
-        fainter = _fainter(best.effect)
+        fainter = _make_fainter(best.effect)
         if fainter is None:
             break
-        best = max(best, attempt_at(base, fainter, scan), key=lambda t: t.promise)
+        best = max(best, screen_at(base, fainter, scan_penalty), key=lambda t: t.score)
     return best
 
 
-def _fainter(effect: AbstractEffect) -> AbstractEffect | None:
+def _make_fainter(effect: AbstractEffect) -> AbstractEffect | None:
     """Return an effect with a tenth of its size; None where that has no meaning."""
     sizes = {
         p.name: p.neutral + 0.1 * (getattr(effect, p.name) - p.neutral)
@@ -41,7 +41,7 @@ def _fainter(effect: AbstractEffect) -> AbstractEffect | None:
     return replace(effect, **sizes) if sizes else None
 
 
-def attempt_at(base: Model, effect: AbstractEffect, scan: float = 0.0) -> Trial:
+def screen_at(base: Model, effect: AbstractEffect, scan_penalty: float = 0.0) -> Trial:
     """Add an effect as it is to a model and ask what the first step would gain.
 
     Parameters
@@ -50,44 +50,46 @@ def attempt_at(base: Model, effect: AbstractEffect, scan: float = 0.0) -> Trial:
         The fitted model.
     effect : AbstractEffect
         The candidate at its start.
-    scan : float, optional
+    scan_penalty : float, optional
         Logarithm of the number of places at which it was looked for before.
 
     Returns
     -------
     Trial
-        With `promise`; a `remark` if the filter cannot follow the record with it.
+        With `score`; a `remark` if the filter cannot follow the record with it.
     """
     try:
         loop = base.fitted.with_effect(effect)
     except CtrlidError as reason:
-        return Trial(effect, "", base, -math.inf, scan, remark=str(reason))
+        return Trial(effect, "", base, -math.inf, scan_penalty, remark=str(reason))
     label = next(k for k in loop.labelled if k not in base.loop.labelled)
     own = [f"{label}.{k}" for k, v in effect.values().items() if math.isfinite(v)]
     names = (*base.names, *own)
     try:
-        fit = carried_over(base, loop, names)
+        fit = carry_over(base, loop, names)
     except CtrlidError as reason:
-        return Trial(effect, label, base, -math.inf, scan, remark=str(reason))
-    doubled = doubled_by(fit, label, effect)
+        return Trial(effect, label, base, -math.inf, scan_penalty, remark=str(reason))
+    doubled = find_doubles(fit, label, effect)
     if doubled:
         loop = loop.with_parameters(doubled)
         names = tuple(n for n in names if n not in doubled)
-        fit = carried_over(base, loop, names)
+        fit = carry_over(base, loop, names)
     model = Model(loop, fit)
     if not math.isfinite(fit.value):
-        return Trial(effect, label, model, -math.inf, scan, remark="cannot follow the record")
-    promise = fit.value - base.fit.value + promised(fit)
-    return Trial(effect, label, Model(loop, light(fit)), promise, scan)
+        return Trial(
+            effect, label, model, -math.inf, scan_penalty, remark="cannot follow the record"
+        )
+    score = fit.value - base.fit.value + expected_gain(fit)
+    return Trial(effect, label, Model(loop, drop_arrays(fit)), score, scan_penalty)
 
 
-def attempt_best(base: Model, effects: Sequence[AbstractEffect], scan: float) -> Trial:
-    """Try effects that differ in their values only, and return the one that promises most."""
-    best = attempt_at(base, effects[0], scan)
+def screen_starts(base: Model, effects: Sequence[AbstractEffect], scan_penalty: float) -> Trial:
+    """Try effects that differ in their values only, and return the one with the largest score."""
+    best = screen_at(base, effects[0], scan_penalty)
     if best.remark:
         return best
     label, loop, names = best.label, best.model.loop, best.model.names
-    start = carried_over(base, loop, names)
+    start = carry_over(base, loop, names)
     for effect in effects[1:]:
         theta = start.theta.copy()
         for field, value in effect.values().items():
@@ -98,8 +100,8 @@ def attempt_best(base: Model, effects: Sequence[AbstractEffect], scan: float) ->
             fit = evaluate(start.problem, theta, start.noise, [o.trajectory for o in fit.filtered])
         if not math.isfinite(fit.value):
             continue
-        promise = fit.value - base.fit.value + promised(fit)
-        if promise > best.promise:
+        score = fit.value - base.fit.value + expected_gain(fit)
+        if score > best.score:
             moved = loop.with_parameters(dict(zip(names, theta.tolist(), strict=True)))
-            best = Trial(effect, label, Model(moved, light(fit)), promise, scan)
+            best = Trial(effect, label, Model(moved, drop_arrays(fit)), score, scan_penalty)
     return best

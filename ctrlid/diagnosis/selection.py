@@ -6,13 +6,13 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from ..effects import AbstractEffect
-from ..estimation.likelihood.maximization import promised
-from .candidates import Trial, comparable, contains, same_kind
-from .fitted_model import Model, quiet
-from .refitting import refit, under
-from .replicas import artefact, kinked, more_than_simple, replica
-from .scans import elsewhere, scanned
-from .screening import attempt_at
+from ..estimation.likelihood.maximization import expected_gain
+from .candidates import Trial, contains, keep_for_comparison, same_kind
+from .fitted_model import Model, without_random_force
+from .refitting import refit_candidate, refit_under_noise
+from .replicas import gain_beyond_simple, gain_on_replicas, has_kinks, make_replica
+from .scans import other_starts, scan_candidate
+from .screening import screen_at
 from .thresholds import THRESHOLD
 
 Work = Callable[[Callable[..., Any], Iterable[Any]], list[Any]]
@@ -22,7 +22,7 @@ Job = tuple[Trial, Trial | AbstractEffect, Model | None]  # whose fit, from wher
 
 
 @dataclass(frozen=True, eq=False)
-class Step:
+class Round:
     """One round: the model it started from, what was tried, and what won."""
 
     base: Model
@@ -30,40 +30,43 @@ class Step:
     best: Trial | None
 
 
-def one_round(
+def run_round(
     base: Model, pool: Sequence[AbstractEffect], work: Work, other: Model | None = None
-) -> Step:
+) -> Round:
     """Screen all candidates, refit the promising, and return the best that earns its place.
 
     They are added to the base, and to the `other` model in its place if one is given.
     """
-    tried: list[Trial] = work(lambda effect: scanned(base, effect), pool)
+    tried: list[Trial] = work(lambda effect: scan_candidate(base, effect), pool)
     more: list[Trial] = []
     if other is not None:
-        # What the model alone would regain from there is no merit of a candidate.
+        # What the model alone would regain from there is no net_gain of a candidate.
         lost = other.fit.value - base.fit.value
-        lost -= max(0.0, lost + promised(other.fit))
-        more = work(lambda effect: scanned(other, effect), pool)
-        more = [replace(t, promise=t.promise + lost) for t in more]
+        lost -= max(0.0, lost + expected_gain(other.fit))
+        more = work(lambda effect: scan_candidate(other, effect), pool)
+        more = [replace(t, score=t.score + lost) for t in more]
         pairs = zip(tried, more, strict=True)
-        tried = [a if a.promise > 0 or a.promise >= b.promise else b for a, b in pairs]
-        tried += [b for b in more if b.promise > 0 and all(b is not t for t in tried)]
-    tried.sort(key=lambda t: -t.promise)
-    if not tried or not math.isfinite(tried[0].promise):
-        return Step(base, tuple(tried), None)
+        tried = [a if a.score > 0 or a.score >= b.score else b for a, b in pairs]
+        tried += [b for b in more if b.score > 0 and all(b is not t for t in tried)]
+    tried.sort(key=lambda t: -t.score)
+    if not tried or not math.isfinite(tried[0].score):
+        return Round(base, tuple(tried), None)
     copies: list[Model | None] = []
-    trials = _checked(base, _refitted(base, tried, more, work), copies)
-    trials = _simplest(base, trials)
-    plain = plainer(base, trials[0], trials[1:])
+    trials = _check_on_replicas(base, _refit_promising(base, tried, more, work), copies)
+    trials = _prefer_simplest(base, trials)
+    plain = prefer_plainer(base, trials[0], trials[1:])
     if plain is not trials[0]:
         trials = [plain, *(t for t in trials if not same_kind(t.effect, plain.effect))]
-        trials = _checked(base, trials, copies)
+        trials = _check_on_replicas(base, trials, copies)
     best = trials[0]
-    trials = [*trials[: THRESHOLD.looked_at], *map(comparable, trials[THRESHOLD.looked_at :])]
-    return Step(base, tuple(trials), best if best.merit > THRESHOLD.gate else None)
+    trials = [
+        *trials[: THRESHOLD.looked_at],
+        *map(keep_for_comparison, trials[THRESHOLD.looked_at :]),
+    ]
+    return Round(base, tuple(trials), best if best.net_gain > THRESHOLD.gate else None)
 
 
-def _refitted(
+def _refit_promising(
     base: Model, tried: Sequence[Trial], more: Sequence[Trial], work: Work
 ) -> list[Trial]:
     """Return the trials, the promising and what resembles the best refitted.
@@ -75,49 +78,49 @@ def _refitted(
     def one(job: Job) -> Trial:
         trial, start, near = job
         if isinstance(start, AbstractEffect):
-            start = attempt_at(base, start, trial.scan)
-        return refit(base, start, near)
+            start = screen_at(base, start, trial.scan_penalty)
+        return refit_candidate(base, start, near)
 
     def fit(jobs: Sequence[Job]) -> Trial:
         for (t, _, _), r in zip(jobs, work(one, jobs), strict=True):
-            done[id(t)] = max(done.get(id(t), r), r, key=lambda t: t.merit)
-        return max((*done.values(), *tried), key=lambda t: t.merit)
+            done[id(t)] = max(done.get(id(t), r), r, key=lambda t: t.net_gain)
+        return max((*done.values(), *tried), key=lambda t: t.net_gain)
 
     leader = tried[0]
     wanted = {t.name for t in tried[: THRESHOLD.refitted_first]} | set(
         type(leader.effect).look_alikes
     )
-    promising = [t for t in tried if t.promise > THRESHOLD.faint * (THRESHOLD.gate + t.price)]
+    promising = [t for t in tried if t.score > THRESHOLD.faint * (THRESHOLD.gate + t.full_penalty)]
     first = [
         t
         for t in promising
-        if t.name in wanted or t.promise > THRESHOLD.refitted_share * leader.promise
+        if t.name in wanted or t.score > THRESHOLD.refitted_share * leader.score
     ]
     fit([(t, e, None) for t in first for e in t.others])
     best = fit([(t, t, None) for t in first])
-    if math.isfinite(best.merit):
+    if math.isfinite(best.net_gain):
         alike = set(type(best.effect).look_alikes)
         fit([(t, t, None) for t in tried
-             if id(t) not in done and t.name in alike and t.promise > -math.inf])  # fmt: skip
+             if id(t) not in done and t.name in alike and t.score > -math.inf])  # fmt: skip
         best = fit([(t, e, None) for t in tried
                     if id(t) in done and t.name in {best.name, *alike}
-                    for e in elsewhere(base, t.effect)])  # fmt: skip
-        stuck = [t for t in _maybe_stuck(best, tried) if id(t) in done]
-        near = quiet(best.model)
+                    for e in other_starts(base, t.effect)])  # fmt: skip
+        stuck = [t for t in _find_stuck(best, tried) if id(t) in done]
+        near = without_random_force(best.model)
         fit([(t, done[id(t)].fitted, near) for t in stuck])
         best = fit([(t, m, None) for t in stuck for m in more if m is not t and m.name == t.name])
         apart = [
             k
             for k, t in done.items()
-            if t.merit > THRESHOLD.near_winner * best.merit and _apart(t, best)
+            if t.net_gain > THRESHOLD.near_winner * best.net_gain and _forces_differ(t, best)
         ]
         noise = best.model.fit.noise
-        again = work(lambda k: under(base, done[k], noise), apart)
+        again = work(lambda k: refit_under_noise(base, done[k], noise), apart)
         done |= dict(zip(apart, again, strict=True))
     return [done.get(id(t), t) for t in tried]
 
 
-def _apart(one: Trial, other: Trial) -> bool:
+def _forces_differ(one: Trial, other: Trial) -> bool:
     """Whether the random forces that two fits ended with are not the same."""
     a, b = one.model.fit.noise, other.model.fit.noise
     if not (a.drift and b.drift):
@@ -125,36 +128,36 @@ def _apart(one: Trial, other: Trial) -> bool:
     return abs(math.log((1 - a.memory) / (1 - b.memory))) > math.log(THRESHOLD.different_force)
 
 
-def _maybe_stuck(best: Trial, tried: Sequence[Trial]) -> list[Trial]:
+def _find_stuck(best: Trial, tried: Sequence[Trial]) -> list[Trial]:
     """Return what may have lost only because its likelihood is rugged, as dry friction's is.
 
     Where a large random force smooths the kink away, a fit stays there. It is climbed on with
     hardly any such force: from its own values, which are near; from its first ones that is chance.
     """
-    if not best.merit > 0:
+    if not best.net_gain > 0:
         return []
     own = [t for t in tried if t.name == best.name or contains(best.effect, t.effect)]
     kin = {name for t in own for name in type(t.effect).look_alikes} - {best.name}
     most = len(best.effect.parameters())
     plain = [t for t in tried if t.name in kin and len(t.effect.parameters()) <= most]
-    return [t for t in plain if kinked(t.model)]
+    return [t for t in plain if has_kinks(t.model)]
 
 
-def plainer(base: Model, best: Trial, others: Sequence[Trial]) -> Trial:
+def prefer_plainer(base: Model, best: Trial, others: Sequence[Trial]) -> Trial:
     """Return an effect that the best one contains, if it does as well when it starts from there."""
     for t in others:
-        if not best.merit > 0 or not contains(best.effect, t.effect):
+        if not best.net_gain > 0 or not contains(best.effect, t.effect):
             continue
         values = best.fitted.values()
         start = replace(t.effect, **{k: values[k] for k in t.effect.values()})
-        again = refit(base, attempt_at(base, start, t.scan), best.model)
-        if again.merit >= best.merit:
+        again = refit_candidate(base, screen_at(base, start, t.scan_penalty), best.model)
+        if again.net_gain >= best.net_gain:
             return again
     return best
 
 
-def _simplest(base: Model, trials: list[Trial]) -> list[Trial]:
-    """Put a winner behind what it contains if its further parameters do not earn their price.
+def _prefer_simplest(base: Model, trials: list[Trial]) -> list[Trial]:
+    """Put a winner behind what it contains if its further parameters do not earn their penalty.
 
     What the filter's approximations gain counts for nothing. A gain beyond that is too small to
     prove anything, and too large to exclude it: it is left to be compared.
@@ -162,39 +165,42 @@ def _simplest(base: Model, trials: list[Trial]) -> list[Trial]:
     best = trials[0]
     for simple in trials[1 : THRESHOLD.looked_at]:
         fewer = len(simple.effect.parameters()) < len(best.effect.parameters())
-        if not fewer or simple.merit <= THRESHOLD.gate:
+        if not fewer or simple.net_gain <= THRESHOLD.gate:
             continue
         if best.gain - simple.gain > 0.1 * best.gain or simple.name not in best.effect.look_alikes:
             continue
-        more = more_than_simple(base, best, simple)
-        if more <= best.cost - simple.cost:
+        more = gain_beyond_simple(base, best, simple)
+        if more <= best.penalty - simple.penalty:
             out = (
                 replace(best, gain=simple.gain + more)
                 if more > THRESHOLD.hint
                 else replace(best, remark=f"{simple.name} explains as much with fewer parameters")
             )
-            return sorted([out, *trials[1:]], key=lambda t: (-t.merit, -t.promise))
+            return sorted([out, *trials[1:]], key=lambda t: (-t.net_gain, -t.score))
     return trials
 
 
-def _checked(base: Model, trials: list[Trial], copies: list[Model | None]) -> list[Trial]:
+def _check_on_replicas(base: Model, trials: list[Trial], copies: list[Model | None]) -> list[Trial]:
     """Put out what gains as much on records in which it is known not to be.
 
     The `copies` are made when the first candidate needs them.
     """
     for _ in range(THRESHOLD.looked_at):
-        trials.sort(key=lambda t: (-t.merit, -t.promise))
+        trials.sort(key=lambda t: (-t.net_gain, -t.score))
         best = trials[0]
         sure = best.gain > THRESHOLD.no_artefact and not base.loop.effects
-        if best.merit <= THRESHOLD.gate or sure:
+        if best.net_gain <= THRESHOLD.gate or sure:
             break
         enough = (
-            (THRESHOLD.replicas_beside_kink if best.merit < THRESHOLD.slight_beside_kink else 2)
-            if kinked(base)
+            (THRESHOLD.replicas_beside_kink if best.net_gain < THRESHOLD.slight_beside_kink else 2)
+            if has_kinks(base)
             else 1
         )
-        copies += [replica(base, seed) for seed in range(len(copies), enough)]
-        if best.merit - THRESHOLD.replica_weight * artefact(copies, best) > THRESHOLD.gate:
+        copies += [make_replica(base, seed) for seed in range(len(copies), enough)]
+        if (
+            best.net_gain - THRESHOLD.replica_weight * gain_on_replicas(copies, best)
+            > THRESHOLD.gate
+        ):
             break
         trials[0] = replace(
             best, remark="gains as much on a simulated record in which it is known not to be"

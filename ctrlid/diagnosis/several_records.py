@@ -24,7 +24,7 @@ class Shared:
     seen: dict[int, Finding]
 
 
-def merged(loop: Loop, parts: Sequence[Diagnosis]) -> Diagnosis:
+def merge_diagnoses(loop: Loop, parts: Sequence[Diagnosis]) -> Diagnosis:
     """Return one diagnosis of several records, each of which was diagnosed alone.
 
     Parameters
@@ -41,9 +41,9 @@ def merged(loop: Loop, parts: Sequence[Diagnosis]) -> Diagnosis:
         parameter of the model tells the records apart, the verdict is ``"unknown"``.
     """
     lead = max(parts, key=lambda p: max((f.evidence for f in p.findings), default=0.0))
-    findings = tuple(sorted((_finding(s, len(parts)) for s in _shared(parts)),
+    findings = tuple(sorted((_merge_findings(s, len(parts)) for s in _match_findings(parts)),
                             key=lambda f: -f.evidence))  # fmt: skip
-    calibrated, differing = _calibrated(parts)
+    calibrated, differing = _merge_calibrated(parts)
     complete = loop.with_parameters({c.name: c.after for c in calibrated})
     for f in findings:
         if not any(same_kind(f.effect, e) for e in complete.effects):
@@ -54,7 +54,7 @@ def merged(loop: Loop, parts: Sequence[Diagnosis]) -> Diagnosis:
         "all, on the last quarter of each; axes and curves are those of record "
         f"{parts.index(lead) + 1}"
     )
-    verdict, sentence = lead.verdict, _sentence(findings, len(parts))
+    verdict, sentence = lead.verdict, _write_sentence(findings, len(parts))
     if differing:
         words = "; ".join(differing)
         notes.append(f"the model's own parameters differ between the records: {words}")
@@ -64,13 +64,13 @@ def merged(loop: Loop, parts: Sequence[Diagnosis]) -> Diagnosis:
                     "What changed between the records is not in it.")  # fmt: skip
     return replace(
         lead, verdict=verdict, sentence=sentence, findings=findings, loop=complete,
-        gap=_gap(lead, parts), ranking=_ranking(parts), calibrated=calibrated,
+        gap=_merge_gaps(lead, parts), ranking=_merge_rankings(parts), calibrated=calibrated,
         tests={name: min(p.tests.get(name, 1.0) for p in parts) for name in lead.tests},
         notes=tuple(notes),
     )  # fmt: skip
 
 
-def _shared(parts: Sequence[Diagnosis]) -> list[Shared]:
+def _match_findings(parts: Sequence[Diagnosis]) -> list[Shared]:
     """Put findings of different records together that may be one and the same effect."""
     every = [(k, f) for k, p in enumerate(parts) for f in p.findings]
     found: list[Shared] = []
@@ -86,7 +86,7 @@ def _shared(parts: Sequence[Diagnosis]) -> list[Shared]:
     return found
 
 
-def presence(seen: Sequence[int], records: int) -> str:
+def describe_presence(seen: Sequence[int], records: int) -> str:
     """Say in which of several records an effect was seen.
 
     Parameters
@@ -109,22 +109,24 @@ def presence(seen: Sequence[int], records: int) -> str:
     return f"seen in record{'s' if len(seen) > 1 else ''} {which} of {records} only"
 
 
-def _values(effect: AbstractEffect) -> str:
+def _write_values(effect: AbstractEffect) -> str:
     return ", ".join(f"{k} = {number(v, 4)}" for k, v in effect.values().items())
 
 
-def _as(kind: AbstractEffect, f: Finding) -> AbstractEffect:
+def _find_kind(kind: AbstractEffect, f: Finding) -> AbstractEffect:
     return next(e for e in (f.effect, *f.alternatives) if same_kind(kind, e))
 
 
-def _finding(s: Shared, records: int) -> Finding:
+def _merge_findings(s: Shared, records: int) -> Finding:
     """Return what several records say of an effect; the clearest gives the values."""
     best = max(s.seen.values(), key=lambda f: f.evidence)
-    chosen, *others = (_as(kind, best) for kind in s.kinds)
+    chosen, *others = (_find_kind(kind, best) for kind in s.kinds)
     numbers = sorted(s.seen)
-    note = presence(numbers, records)
+    note = describe_presence(numbers, records)
     if len(numbers) > 1:
-        sizes = [f"{_values(_as(chosen, s.seen[k]))} in record {k + 1}" for k in numbers]
+        sizes = [
+            f"{_write_values(_find_kind(chosen, s.seen[k]))} in record {k + 1}" for k in numbers
+        ]
         note += f"; each has its own size: {listing(sizes)}"
     sure = same_kind(chosen, best.effect)
     return replace(
@@ -135,7 +137,7 @@ def _finding(s: Shared, records: int) -> Finding:
     )  # fmt: skip
 
 
-def _calibrated(parts: Sequence[Diagnosis]) -> tuple[tuple[Calibrated, ...], list[str]]:
+def _merge_calibrated(parts: Sequence[Diagnosis]) -> tuple[tuple[Calibrated, ...], list[str]]:
     """Return the parameters' weighted means, and those that no single value explains."""
     means, differing = [], []
     for same in zip(*(p.calibrated for p in parts), strict=True):
@@ -159,7 +161,7 @@ def _calibrated(parts: Sequence[Diagnosis]) -> tuple[tuple[Calibrated, ...], lis
     return tuple(means), differing
 
 
-def _sentence(findings: Sequence[Finding], records: int) -> str:
+def _write_sentence(findings: Sequence[Finding], records: int) -> str:
     if not findings:
         return "At the sensitivity of these records, what is left is noise."
     names = " and ".join(f"{' or '.join(f.names)} ({f.note.partition(';')[0]})" for f in findings)
@@ -167,7 +169,7 @@ def _sentence(findings: Sequence[Finding], records: int) -> str:
     return f"Missing {were} {names}; with {them}, what is left is noise."
 
 
-def _gap(lead: Diagnosis, parts: Sequence[Diagnosis]) -> Gap:
+def _merge_gaps(lead: Diagnosis, parts: Sequence[Diagnosis]) -> Gap:
     """Return the RMS over all records; the curves are those of one."""
     weights = np.array([len(p.gap.time) for p in parts], dtype=float)
 
@@ -179,7 +181,7 @@ def _gap(lead: Diagnosis, parts: Sequence[Diagnosis]) -> Gap:
     return replace(lead.gap, given=given, before=before, after=after, floor=floor)
 
 
-def _ranking(parts: Sequence[Diagnosis]) -> tuple[Candidate, ...]:
+def _merge_rankings(parts: Sequence[Diagnosis]) -> tuple[Candidate, ...]:
     rows: list[Candidate] = []
     for p in parts:
         done = max((c.round for c in rows), default=0)

@@ -8,11 +8,11 @@ from .._base.text import chance, number
 from ..effects import AbstractEffect, PositionRipple
 from ..estimation.likelihood.likelihood import Fit
 from .findings import Disturbance, Finding, Gap, Place, Verdict
-from .noise_tests import Omnibus
+from .noise_tests import NoiseTests
 from .thresholds import THRESHOLD
 
 
-def doubt_of_all(effects: Sequence[AbstractEffect], gains: Sequence[float], total: float) -> str:
+def find_doubt(effects: Sequence[AbstractEffect], gains: Sequence[float], total: float) -> str:
     """Say why effects that explain a record together may yet be no explanation.
 
     Parameters
@@ -37,20 +37,20 @@ def doubt_of_all(effects: Sequence[AbstractEffect], gains: Sequence[float], tota
         return "the smallest of so many effects may only correct what a larger one gets wrong"
     for one, other in itertools.combinations(range(len(effects)), 2):
         alone = max(gains[one], gains[other]) < THRESHOLD.residue * total
-        if alone and _alike(effects[one], effects[other]):
+        if alone and _are_look_alikes(effects[one], effects[other]):
             names = [type(effects[k]).__name__ for k in (one, other)]
             return (f"{names[0]} and {names[1]} resemble each other, and either alone explains "
                     "nearly all of it: one effect of another kind may be behind both")  # fmt: skip
     return ""
 
 
-def _alike(one: AbstractEffect, other: AbstractEffect) -> bool:
+def _are_look_alikes(one: AbstractEffect, other: AbstractEffect) -> bool:
     """Whether one of two effects is known to resemble the other."""
     names = type(one).__name__, type(other).__name__
     return names[1] in type(one).look_alikes or names[0] in type(other).look_alikes
 
 
-def stands_out(gap: Gap, fit: Fit) -> bool:
+def gap_stands_out(gap: Gap, fit: Fit) -> bool:
     """Whether the gap with the effects is wider than noise, as a fit knows it, accounts for.
 
     A loop that hunts leaves a narrow gap in one run and a wide one in another; the record is but
@@ -63,7 +63,7 @@ def stands_out(gap: Gap, fit: Fit) -> bool:
     )
 
 
-def wider(gap: Gap, disturbance: Disturbance) -> bool:
+def gap_is_wider(gap: Gap, disturbance: Disturbance) -> bool:
     """Whether effects leave a wider gap than sensor noise does, by itself, in a loop with them.
 
     With friction and play a loop hunts, and no simulation follows it for long. Two gaps below the
@@ -73,9 +73,9 @@ def wider(gap: Gap, disturbance: Disturbance) -> bool:
     return max(gap.before, gap.floor) < gap.after and not by_noise
 
 
-def conclusion(
+def write_conclusion(
     verdict: Verdict, findings: Sequence[Finding], gap: Gap, disturbance: Disturbance,
-    after: Omnibus, where: Sequence[Place], loose: str = "",
+    after: NoiseTests, where: Sequence[Place], loose: str = "",
 ) -> str:  # fmt: skip
     """Return the verdict with what it rests on.
 

@@ -5,19 +5,21 @@ from collections.abc import Mapping
 import numpy as np
 
 from ..physics.equations import Array
-from .constancy import bin_edges, bin_index
+from .constancy import find_bin_edges, find_bins
 from .findings import Place
-from .noise_tests import Omnibus
+from .noise_tests import NoiseTests
 
 
-def places(before: Omnibus, after: Omnibus, units: Mapping[str, str]) -> tuple[Place, ...]:
+def locate_errors(
+    before: NoiseTests, after: NoiseTests, units: Mapping[str, str]
+) -> tuple[Place, ...]:
     """Return where the innovations are not noise, before and after; most telling first."""
     found: list[Place] = []
     for name, values in before.axes.items():
         if name not in after.axes or len(after.axes[name]) != len(values):
             continue
-        edges = bin_edges(values)
-        index = bin_index(values, edges)
+        edges = find_bin_edges(values)
+        index = find_bins(values, edges)
         count = np.maximum(np.bincount(index, minlength=len(edges) - 1), 1)
         was, now = (np.bincount(index, o.z**2, minlength=len(count)) / count
                     for o in (before, after))  # fmt: skip
@@ -26,12 +28,14 @@ def places(before: Omnibus, after: Omnibus, units: Mapping[str, str]) -> tuple[P
             for o in (before, after)
         )
         unit = units.get(name, "")
-        words = _words(name, unit, edges, before.z, index, count)
+        words = _describe_place(name, unit, edges, before.z, index, count)
         found.append(Place(name, unit, edges, was, now, p_was, p_now, words))
     return tuple(sorted(found, key=lambda place: place.p_before))
 
 
-def _words(name: str, unit: str, edges: Array, z: Array, index: Array, count: Array) -> str:
+def _describe_place(
+    name: str, unit: str, edges: Array, z: Array, index: Array, count: Array
+) -> str:
     mean = np.bincount(index, z, minlength=len(count)) / count
     square = np.bincount(index, z**2, minlength=len(count)) / count
     strength = np.sqrt(count) * np.abs(mean)

@@ -50,12 +50,12 @@ MASSES = ("m", "M", "mass")
 FORCES = {"m/s^2": "N", "1/s": "N s/m", "1/s^2": "N/m", "1/m": "kg/m"}  # per unit of mass, times it
 
 
-def headline(found: Diagnosis) -> str:
+def write_headline(found: Diagnosis) -> str:
     """Return the verdict with its sentence."""
     return f"{HEADLINES[found.verdict]}. {found.sentence}"
 
 
-def gap_rows(gap: Gap) -> list[tuple[str, str, str]]:
+def list_gap_rows(gap: Gap) -> list[tuple[str, str, str]]:
     """Return what the gap is, how large, and how many times the noise floor, row by row."""
     known = [v for v in (gap.floor, gap.after, gap.before) if 0 < v < math.inf]
     known = known or [v for v in (gap.given,) if 0 < v < math.inf]
@@ -83,7 +83,7 @@ def gap_rows(gap: Gap) -> list[tuple[str, str, str]]:
     return [*rows, ("noise floor", size(gap.floor), "what noise and random force leave")]
 
 
-def shrinking(gap: Gap) -> str:
+def describe_shrinking(gap: Gap) -> str:
     """Say how much of the gap above the noise floor the effects close; empty if they do not."""
     if gap.before == gap.after:
         return ""
@@ -101,30 +101,30 @@ def shrinking(gap: Gap) -> str:
     if above <= 0 or gap.after >= gap.before:
         return "On samples kept back the effects do NOT MAKE THE GAP SMALLER."
     share = min((gap.before**2 - gap.after**2) / above, 1.0)
-    closed = (f"On samples kept back the effects close {percent(share)} of the squared gap above "
-              "the noise floor.")  # fmt: skip
+    closed = (f"On samples kept back the effects close {write_percent(share)} of the squared gap "
+              "above the noise floor.")  # fmt: skip
     return f"{closed} {WIDENED}" if gap.before > gap.given * THRESHOLD.widened else closed
 
 
-def percent(share: float) -> str:
+def write_percent(share: float) -> str:
     """Write a share in percent, with more digits near the whole."""
     if 0 < share < 0.005:
         return "under 1 %"
     return f"{100 * share:.1f} %" if 0.99 < share < 0.9995 else f"{100 * share:.0f} %"
 
 
-def telling(found: Diagnosis) -> list[Place]:
+def list_telling_places(found: Diagnosis) -> list[Place]:
     """Return the places where the disagreement sits, most telling first."""
     return [p for p in found.where if p.p_before < THRESHOLD.telling][:PLACES]
 
 
-def worst(levels: Iterable[float]) -> float:
+def highest_rms(levels: Iterable[float]) -> float:
     """Return the highest RMS among the bins that hold something, from mean squares; NaN without."""
     known = [v for v in levels if math.isfinite(v)]
     return math.sqrt(max(known, default=math.nan))
 
 
-def place_words(place: Place) -> str:
+def describe_place(place: Place) -> str:
     """Say where along its axis a place sits."""
     if place.words:
         return place.words.removeprefix(f"at {place.axis} ")
@@ -135,7 +135,9 @@ def place_words(place: Place) -> str:
     return f"between {low} and {high} {place.unit}".strip()
 
 
-def sizes(found: Diagnosis, effect: AbstractEffect, errors: dict[str, float] | None = None) -> str:
+def describe_parameters(
+    found: Diagnosis, effect: AbstractEffect, errors: dict[str, float] | None = None
+) -> str:
     """Write the parameters of an effect with units and standard errors, if they are given."""
     units = units_of(found.loop, effect)
     words = []
@@ -148,7 +150,7 @@ def sizes(found: Diagnosis, effect: AbstractEffect, errors: dict[str, float] | N
     return ", ".join(words)
 
 
-def newtons(found: Diagnosis, effect: AbstractEffect) -> str:
+def describe_forces(found: Diagnosis, effect: AbstractEffect) -> str:
     """Write the accelerations among the parameters as forces, where the mass is a parameter."""
     known = found.loop.parameters
     mass = next((name for name in MASSES if name in known), None)
@@ -160,7 +162,7 @@ def newtons(found: Diagnosis, effect: AbstractEffect) -> str:
     return f"{listing(words)} at {mass} = {quantity(known[mass], 'kg')}" if words else ""
 
 
-def certainty(found: Diagnosis, finding: Finding) -> str:
+def describe_certainty(found: Diagnosis, finding: Finding) -> str:
     """Say how sure it is that something like this effect is there, and that it is this one."""
     sure = ("WEAK" if finding.evidence < THRESHOLD.strong else
             "strong" if finding.evidence < THRESHOLD.certain else "beyond doubt")  # fmt: skip
@@ -168,7 +170,7 @@ def certainty(found: Diagnosis, finding: Finding) -> str:
         f"evidence {finding.evidence:.{0 if finding.evidence >= THRESHOLD.strong else 1}f}, {sure}"
     )
     if math.isfinite(finding.share) and len(found.findings) > 1:
-        text += f"; closes {percent(finding.share)} of the squared gap above the floor"
+        text += f"; closes {write_percent(finding.share)} of the squared gap above the floor"
     many = len(finding.names)
     if many > 1:
         text += f"; ONE OF {many} that explain the record"
@@ -179,12 +181,12 @@ def certainty(found: Diagnosis, finding: Finding) -> str:
     return text
 
 
-def doubts(found: Diagnosis, finding: Finding) -> list[str]:
+def list_doubts(found: Diagnosis, finding: Finding) -> list[str]:
     """Say what else it could be, and which experiment would tell."""
     lines = []
     apart = [e for e in finding.alternatives if type(e).__name__ not in finding.equivalents]
     if apart:
-        others = [f"{type(e).__name__} ({sizes(found, e)})" for e in apart]
+        others = [f"{type(e).__name__} ({describe_parameters(found, e)})" for e in apart]
         lines.append(f"this record does not tell it from {listing(others)}")
     if finding.equivalents:
         lines.append(f"no record of u and y tells it from {listing(finding.equivalents)}: on this "
@@ -196,20 +198,20 @@ def doubts(found: Diagnosis, finding: Finding) -> list[str]:
     return [*lines, *([finding.note] if finding.note else [])]
 
 
-def named(finding: Finding) -> str:
+def name_finding(finding: Finding) -> str:
     """Name the effect of a finding and say what it is."""
     what = finding.effect.sentence.rstrip(".")
     return f"{finding.name}: {what[:1].lower()}{what[1:]}" if what else finding.name
 
 
-def sized(found: Diagnosis, finding: Finding) -> str:
+def describe_size(found: Diagnosis, finding: Finding) -> str:
     """Write the fitted parameters of a finding, and its accelerations as forces if they are one."""
-    force = newtons(found, finding.effect)
-    size = sizes(found, finding.effect, finding.standard_errors)
+    force = describe_forces(found, finding.effect)
+    size = describe_parameters(found, finding.effect, finding.standard_errors)
     return f"{size} ({force})" if force else size
 
 
-def sensitivity_rows(found: Diagnosis) -> list[tuple[str, str]]:
+def list_sensitivity_rows(found: Diagnosis) -> list[tuple[str, str]]:
     """Return the smallest visible size of each effect."""
     tried = {type(c.effect).__name__: c.effect for c in found.ranking}
     rows = []
@@ -221,7 +223,7 @@ def sensitivity_rows(found: Diagnosis) -> list[tuple[str, str]]:
     return rows
 
 
-def disturbance(found: Diagnosis) -> str:
+def describe_disturbance(found: Diagnosis) -> str:
     """Say how large the random force is, and in capitals if it may hide something."""
     d, unit = found.disturbance, f"{found.gap.unit}/s^2" if found.gap.unit else ""
     parts = [f"white {quantity(d.white, unit)}"] if d.white else []
@@ -232,14 +234,14 @@ def disturbance(found: Diagnosis) -> str:
         return "random force: none; the noise floor is sensor noise"
     words = " and ".join(parts)
     if math.isfinite(d.share):
-        words += f", {percent(d.share)} of the noise floor's variance"
+        words += f", {write_percent(d.share)} of the noise floor's variance"
     if not d.large:
         return f"random force: {words}"
     return (f"A LARGE RANDOM FORCE: {words}. Effects that it hides cannot be seen; the verdict "
             "holds above it only")  # fmt: skip
 
 
-def remains(found: Diagnosis) -> str:
+def describe_remains(found: Diagnosis) -> str:
     """Say whether what is left is noise, by the tests of the final one-step errors."""
     if not found.tests:
         return "what remains: not tested"

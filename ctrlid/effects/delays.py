@@ -8,7 +8,7 @@ import casadi
 import numpy as np
 
 from .._base.errors import CtrlidError
-from ..physics.equations import Equations, Play
+from ..physics.equations import Backlash, Equations
 from ..physics.linearization import OperatingPoint
 from .context import Moment
 from .kinds import InputEffect
@@ -156,4 +156,4 @@ class InputBacklash(InputEffect):
         memory, u = casadi.SX.sym("m"), casadi.SX.sym("u")
         half = expression(self.width) / 2
         after = casadi.fmin(casadi.fmax(memory, u - half), u + half)
-        return dataclasses.replace(e, play=Play(memory, u, after, after, u, half))
+        return dataclasses.replace(e, play=Backlash(memory, u, after, after, u, half))

@@ -103,28 +103,28 @@ def replay_from_best_state(loop: Loop, record: Record) -> tuple[Array, Array]:
     if record.r is None:
         raise CtrlidError("the record has no reference r, which the controller needs")
     run, start = _controller_run(loop, record.y, record.r)
-    replayed, best = _compared(run, start, record)
+    replayed, best = _compare(run, start, record)
     if start.size and np.isfinite(loop.input_limits).any():
         # From the wrong state all may be cut off, and the state is then nowhere to be seen.
         unlimited = replace(loop, input_limits=(-math.inf, math.inf))
         inside = (record.u > loop.input_limits[0]) & (record.u < loop.input_limits[1])
         free, _ = _controller_run(unlimited, record.y, record.r)
-        moved = _stepped(free, _slope(free, start.size), start, record.u, inside)
-        trial, cost = _compared(run, moved, record)
+        moved = _step(free, _slope(free, start.size), start, record.u, inside)
+        trial, cost = _compare(run, moved, record)
         if cost < best:
             start, replayed, best = moved, trial, cost
     # Gauss-Newton: one step where the law is linear in its state, a few more around limits.
     slope, every = _slope(run, start.size), np.full(len(record), True)
     for _ in range(10 if start.size else 0):
-        moved = _stepped(run, slope, start, record.u, every)
-        trial, cost = _compared(run, moved, record)
+        moved = _step(run, slope, start, record.u, every)
+        trial, cost = _compare(run, moved, record)
         if not cost < best:
             break
         start, replayed, best = moved, trial, cost
     return replayed, start
 
 
-def _compared(run: Any, start: Array, record: Record) -> tuple[Array, float]:
+def _compare(run: Any, start: Array, record: Record) -> tuple[Array, float]:
     """Return what a controller computes from a state, and how far the logged input is from it."""
     replayed = np.asarray(run(start), float).ravel()
     return replayed, float(np.sum((replayed - record.u) ** 2))
@@ -136,7 +136,7 @@ def _slope(run: Any, size: int) -> Any:
     return casadi.Function("slope", [state], [casadi.jacobian(run(state), state)])
 
 
-def _stepped(run: Any, slope: Any, start: Array, u: Array, use: Any) -> Array:
+def _step(run: Any, slope: Any, start: Array, u: Array, use: Any) -> Array:
     """Return a state by one Gauss-Newton step towards a logged input, on the samples to use."""
     jacobian = np.asarray(slope(start).full(), float)
     left = u - np.asarray(run(start), float).ravel()

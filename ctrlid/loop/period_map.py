@@ -16,7 +16,7 @@ from .loop import Loop
 
 
 @dataclass(frozen=True, eq=False)
-class Stepper:
+class PeriodMap:
     """The loop over one sampling period as a CasADi function.
 
     ``step(z, w) -> (next z, y, u, local error)``; z stacks plant and controller states, then what
@@ -30,7 +30,7 @@ class Stepper:
     rate: Any = None
 
 
-def stepper(loop: Loop, substeps: int) -> Stepper:
+def make_period_map(loop: Loop, substeps: int) -> PeriodMap:
     """Build the map of a loop over one sampling period.
 
     Parameters
@@ -98,7 +98,7 @@ def stepper(loop: Loop, substeps: int) -> Stepper:
         slope = casadi.Function("rate", [z, w], [rate(0.0, z)])
         after, error = integrate(rate, z, loop.dt, substeps)
     else:
-        applied, memory = through_play(e, z[n + nc] if e.play is not None else None, u, p)
+        applied, memory = apply_backlash(e, z[n + nc] if e.play is not None else None, u, p)
         past = [z[k] for k in range(size - kept, size)]
         path = (past[kept - 1] if kept else applied, past[late - 1] if late else applied, applied)
         pieces = _numbers(e, input_pieces(e, loop.dt, path, "zoh"), p)
@@ -114,13 +114,13 @@ def stepper(loop: Loop, substeps: int) -> Stepper:
         start = casadi.substitute(casadi.vertcat(e.play.start), casadi.vertcat(e.play.u, e.p),
                                   casadi.vertcat(at.input, p))  # fmt: skip
         memory = [float(casadi.evalf(start))]
-        settled = float(casadi.evalf(casadi.SX(through_play(e, memory[0], at.input, p)[0])))
+        settled = float(casadi.evalf(casadi.SX(apply_backlash(e, memory[0], at.input, p)[0])))
     rest += [*memory, *([settled] * kept)]
     step = casadi.Function("step", [z, w], [after, y, u, error])
-    return Stepper(e.states, tuple(rest), step, slope)
+    return PeriodMap(e.states, tuple(rest), step, slope)
 
 
-def through_play(e: Equations, m: Any, u: Any, p: Any) -> tuple[Any, Any]:
+def apply_backlash(e: Equations, m: Any, u: Any, p: Any) -> tuple[Any, Any]:
     """Return the input behind the play and the play's next memory; without one, u and nothing."""
     if e.play is None:
         return u, casadi.SX(0, 1)
@@ -140,7 +140,7 @@ def _numbers(e: Equations, pieces: Sequence[Piece], p: Any) -> list[Piece]:
     ]
 
 
-def sensitivity(s: Stepper, reference: float, function: Any) -> tuple[Array, Array]:
+def sensitivity(s: PeriodMap, reference: float, function: Any) -> tuple[Array, Array]:
     """Return how a function (step, rate) depends on the state and signals at rest."""
     z, w = casadi.SX.sym("z", len(s.rest)), casadi.SX.sym("w", 5)
     first = function.call([z, w])[0]
@@ -172,7 +172,7 @@ def growth_rate(loop: Loop) -> float:
     CtrlidError
         If the plant has no derivative at the operating point.
     """
-    s = stepper(loop, 8)
+    s = make_period_map(loop, 8)
     function = s.step if s.rate is None else s.rate
     matrix, _ = sensitivity(s, loop.point.output, function)
     if not np.isfinite(matrix).all():

@@ -11,7 +11,7 @@ from .._base.errors import CtrlidError, CtrlidWarning
 from ..data.record import Record
 from ..physics.equations import Array
 from .loop import Loop
-from .period_map import growth_rate, sensitivity, stepper
+from .period_map import growth_rate, make_period_map, sensitivity
 
 TOLERANCE = 1e-9  # local error of one integration step, relative to the excursion of each state
 COARSE = 1e-5  # above this, what could not be refined further is worth a warning
@@ -163,7 +163,7 @@ class Simulator:
         self, loop: Loop, tolerance: float = TOLERANCE, most: int = MOST_SUBSTEPS
     ) -> None:  # fmt: skip
         self.loop, self.tolerance, self.most = loop, tolerance, most
-        first = stepper(loop, 1)
+        first = make_period_map(loop, 1)
         self.plant_states = first.plant_states
         self.rest: Array = np.array(first.rest, dtype=float)
         self._steps: dict[int, Any] = {1: first.step}
@@ -197,7 +197,7 @@ class Simulator:
         key = (substeps, size)
         if key not in self._runners:
             if substeps not in self._steps:
-                self._steps[substeps] = stepper(self.loop, substeps).step
+                self._steps[substeps] = make_period_map(self.loop, substeps).step
             self._runners[key] = self._steps[substeps].mapaccum("run", size)
         return self._runners[key]
 

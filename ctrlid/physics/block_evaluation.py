@@ -21,7 +21,7 @@ BLOCK = 512  # samples at once: long enough that a loop costs little, short enou
 BLOCKS = 64  # at most that a thread takes at a time: their inputs are copied
 
 
-class Vectorized:
+class BlockEvaluation:
     """A CasADi function of scalars and columns, evaluated over many samples at once.
 
     Parameters
@@ -43,7 +43,7 @@ class Vectorized:
         self.tables = np.array([(at, *s) for at, s in zip(ends, shapes, strict=False)])
         self.rows_out = int(ends[-1])
         steps, self.constants = _instructions(function)
-        self.program, self.registers = _allocated(steps)
+        self.program, self.registers = _allocate_registers(steps)
 
     def __call__(self, *arguments: Any) -> list[Array]:
         """Evaluate; arguments are numbers or arrays of shape (rows,) or (rows, n).
@@ -53,7 +53,7 @@ class Vectorized:
         list of ndarray
             Each output with shape (n, rows, columns).
         """
-        return through([self], [], arguments)
+        return evaluate_blocks([self], [], arguments)
 
 
 def _instructions(function: Any) -> tuple[Any, Array]:
@@ -97,7 +97,7 @@ def _instructions(function: Any) -> tuple[Any, Array]:
 
 
 @numba.njit(cache=True)
-def _allocated(steps: Any) -> tuple[Any, int]:  # pragma: no cover - compiled
+def _allocate_registers(steps: Any) -> tuple[Any, int]:  # pragma: no cover - compiled
     """Return the program with registers of its own, and their number.
 
     CasADi lets a result overwrite an operand. Here it never does: a loop in place is no vector.
@@ -140,8 +140,8 @@ def _allocated(steps: Any) -> tuple[Any, int]:  # pragma: no cover - compiled
     return program, registers
 
 
-def through(
-    stages: Sequence[Vectorized], carried: Sequence[Any], given: Sequence[Any], parts: int = 1
+def evaluate_blocks(
+    stages: Sequence[BlockEvaluation], carried: Sequence[Any], given: Sequence[Any], parts: int = 1
 ) -> list[Array]:
     """Evaluate functions one after another, each fed with what the one before it returned.
 
@@ -171,7 +171,7 @@ def through(
     still = np.array([row[0] for row in rows] + ([] if alone else [0.0]))
     moving = [k for k, row in enumerate(rows) if len(row) > 1]
     again = sum(len(t) for t in tables[: len(carried)])
-    program, starts, constants = _joined(stages)
+    program, starts, constants = _join(stages)
     room, places = max(s.registers for s in stages), np.array(moving, dtype=np.int64)
     last = stages[-1]
     out = np.empty(n * last.rows_out)
@@ -194,7 +194,7 @@ def through(
     ]  # fmt: skip
 
 
-def _joined(stages: Sequence[Vectorized]) -> tuple[Any, Any, Array]:
+def _join(stages: Sequence[BlockEvaluation]) -> tuple[Any, Any, Array]:
     """Return the programs one below the other, where each begins, and all their numbers."""
     programs, count = [], 0
     for stage in stages:

@@ -27,7 +27,7 @@ class Lag:
 
 
 @dataclass(frozen=True, eq=False)
-class Play:
+class Backlash:
     """What an input passes through once per sample before it reaches the plant, with memory.
 
     ``(next m, applied u)`` as expressions of the memory `m`, the computed input `u` and the
@@ -48,7 +48,7 @@ def _put_away(value: Any, found: list[Any]) -> Any:
     if isinstance(value, casadi.SX):
         found.append(value)
         return "expression", len(found) - 1
-    if isinstance(value, Lag | Play):
+    if isinstance(value, Lag | Backlash):
         return type(value), [_put_away(v, found) for v in vars(value).values()]
     if isinstance(value, tuple):
         return "tuple", [_put_away(v, found) for v in value]
@@ -99,7 +99,7 @@ class Equations:
     output: Any
     spread: Any = None
     lags: tuple[Lag, ...] = ()
-    play: Play | None = None
+    play: Backlash | None = None
     delay: Any = None
     reading: Any = None
     readout: Any = None

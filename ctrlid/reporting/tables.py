@@ -210,26 +210,28 @@ def _redesign_blocks(r: Redesign) -> list[Block]:
 
 def _diagnosis_blocks(found: Diagnosis) -> list[Block]:
     caption = f"{found.gap.kind.capitalize()} of {len(found.gap.time)} samples kept back."
-    gap = Table(("", "RMS error", "against the noise floor"), tuple(wording.gap_rows(found.gap)),
-                caption)  # fmt: skip
-    made: list[Block] = [wording.headline(found), gap, wording.shrinking(found.gap)]
+    sizes = tuple(wording.list_gap_rows(found.gap))
+    gap = Table(("", "RMS error", "against the noise floor"), sizes, caption)
+    made: list[Block] = [wording.write_headline(found), gap, wording.describe_shrinking(found.gap)]
     if found.findings:
         made.append(Title("What is missing"))
     for k, finding in enumerate(found.findings, 1):
-        sure = wording.certainty(found, finding)
+        sure = wording.describe_certainty(found, finding)
         made += [
-            f"{k}. {wording.named(finding)}. {wording.sized(found, finding)}.",
+            f"{k}. {wording.name_finding(finding)}. {wording.describe_size(found, finding)}.",
             f"{_upper(sure)}.",
         ]
-        made += [f"{_upper(doubt)}." for doubt in wording.doubts(found, finding)]
+        made += [f"{_upper(doubt)}." for doubt in wording.list_doubts(found, finding)]
     if found.findings:
         made.append(wording.EVIDENCE)
     if found.where:
         made.append(Title("Where it sits"))
-    made += [f"Along {p.axis}: {wording.place_words(p)}." for p in wording.telling(found)]
+    made += [
+        f"Along {p.axis}: {wording.describe_place(p)}." for p in wording.list_telling_places(found)
+    ]
     sides = 2 if found.findings else 1
     places = tuple(
-        (p.axis, *(_text.number(wording.worst(v), 3) for v in (p.before, p.after)[:sides]),
+        (p.axis, *(_text.number(wording.highest_rms(v), 3) for v in (p.before, p.after)[:sides]),
          *(_text.chance(v) for v in (p.p_before, p.p_after)[:sides]))
         for p in found.where
     )  # fmt: skip
@@ -242,7 +244,7 @@ def _diagnosis_blocks(found: Diagnosis) -> list[Block]:
         made.append(Table(columns, places, "RMS of the one-step errors at worst; 1 is noise."))
     if found.verdict == "nothing missing" and found.sensitivity:
         made.append(Table(("effect", "smallest size that would have been seen"),
-                          tuple(wording.sensitivity_rows(found))))  # fmt: skip
+                          tuple(wording.list_sensitivity_rows(found))))  # fmt: skip
     made.append(Title("Parameters, noise and remarks"))
     parameters = tuple(
         (c.name, f"{c.given:.6g}", f"{c.before:.6g}", f"{c.after:.6g}",
@@ -252,7 +254,10 @@ def _diagnosis_blocks(found: Diagnosis) -> list[Block]:
     if parameters:
         titles = ("parameter", "given", "recalibrated", "final", "standard error")
         made.append(Table(titles, parameters, "The model's own parameters."))
-    made += [f"{_upper(line)}." for line in (wording.disturbance(found), wording.remains(found))]
+    made += [
+        f"{_upper(line)}."
+        for line in (wording.describe_disturbance(found), wording.describe_remains(found))
+    ]
     made += [f"About the record: {remark.rstrip('.')}." for remark in found.audit]
     made += [f"Note: {remark.rstrip('.')}." for remark in found.notes]
     tried = tuple(

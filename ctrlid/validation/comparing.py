@@ -26,7 +26,7 @@ from ..physics.equations import Array
 from ..physics.linearization import state_matrices
 from ..physics.trace import timebase
 from .comparison import EXACT, Comparison, Curve
-from .noise_model import noise_polynomial, whiten
+from .noise_model import noise_polynomial, whiten_errors
 from .residual_tests import Correlation, autocorrelation, cross_correlation, explained_share
 
 MEANINGFUL = 1e-6  # of the input's size: below, an injected signal is round-off
@@ -278,7 +278,7 @@ def _compare_model(record: Record, model: Any, horizon: int | None) -> Compariso
     noise = np.eye(1, order + 1)[0]
     if not (isinstance(model, IdentifiedModel) and "ARX" in model.estimate.method):
         noise = noise_polynomial(error, stretches, den)
-    white_errors = whiten(error, stretches, noise)
+    white_errors = whiten_errors(error, stretches, noise)
     residuals = np.where(usable, white_errors, np.nan)
     curves = [_curve("one-step prediction", record, record.y - residuals, _known_before(record, 1))]
     roots = np.roots(den)

@@ -8,7 +8,7 @@ from ..physics.equations import Array
 SAMPLES = 20_000  # enough to tell the colour
 
 
-def whiten(equation_errors: Array, segments: list[tuple[int, int]], noise: Array) -> Array:
+def whiten_errors(equation_errors: Array, segments: list[tuple[int, int]], noise: Array) -> Array:
     r"""Return white errors from equation errors of a known colour.
 
     .. math:: \varepsilon = \frac{A(q) y - B(q) u}{C(q)}
@@ -66,7 +66,7 @@ def noise_polynomial(
     size = max(float(np.std(equation_errors)), 1e-300)
 
     def errors(tail: Array) -> Array:
-        white = whiten(equation_errors, head, _stable(np.concatenate([[1.0], tail])))
+        white = whiten_errors(equation_errors, head, _stable(np.concatenate([[1.0], tail])))
         return np.asarray(np.concatenate([white[a:b] for a, b in head]) / size, dtype=float)
 
     starts = [_stable(den), np.eye(1, order + 1)[0]]

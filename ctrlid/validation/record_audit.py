@@ -180,7 +180,7 @@ class _Look:
         self.quantum = dict.fromkeys(SIGNALS, 0.0) | {
             k: defects.grid_step(v[self.valid])
             for k, v in self.signals.items()
-            if k == "y" or not defects.held(v[self.valid])
+            if k == "y" or not defects.find_held(v[self.valid])
         }
         self.saturated = dict.fromkeys(SIGNALS, (0.0, 0.0, 0.0, 0.0))
         self.at_limit = self.repeated = np.zeros(record.n, dtype=bool)
@@ -209,8 +209,8 @@ class _Look:
         for key in ("u", "y"):
             v = self.signals[key][self.valid]
             value, long = float(v[0]), ""
-            if np.ptp(v) > defects.hair(v):
-                share, value = defects.stuck(v, driver) if key == "y" else (0.0, 0.0)
+            if np.ptp(v) > defects.rounding_of(v):
+                share, value = defects.find_stuck(v, driver) if key == "y" else (0.0, 0.0)
                 if not share:
                     continue
                 long = f" for {100 * share:.4g} % of the samples, whatever moves it"
@@ -226,7 +226,7 @@ class _Look:
             others = [s for k, s in self.signals.items() if k != key]
             shares, values, mask = [], [], np.zeros(len(v), dtype=bool)
             for side in (-1, 1):
-                at, limit = defects.clipped(v, self.valid, others, self.quantum[key], side,
+                at, limit = defects.find_clipped(v, self.valid, others, self.quantum[key], side,
                                             self.record.r if key == "y" else None)  # fmt: skip
                 mask |= at
                 shares.append(float(np.mean(at[self.valid])))
@@ -273,11 +273,11 @@ class _Look:
 
     def gaps(self) -> list[AuditFinding]:
         y, u = self.record.y, self.record.u
-        mask = defects.repeated(y, self.valid, self.quantum["y"], self.at_limit)
+        mask = defects.find_repeats(y, self.valid, self.quantum["y"], self.at_limit)
         self.repeated = mask
         if not mask.any():
             return []
-        first, stop = defects.runs(mask)
+        first, stop = defects.find_runs(mask)
         share = float(np.mean(mask[self.valid]))
         with_u = np.mean([np.ptp(u[a - 1 : b]) == 0 for a, b in zip(first, stop, strict=True)])
         also = with_u > 0.8 and np.mean(np.diff(u) == 0) < 0.5
@@ -295,7 +295,7 @@ class _Look:
                              (int(first[0]), int(stop[-1])), harmful=True)]  # fmt: skip
 
     def outliers(self) -> list[AuditFinding]:
-        height = defects.spikes(self.record.y, self.valid, self.quantum["y"])
+        height = defects.find_spikes(self.record.y, self.valid, self.quantum["y"])
         at = np.flatnonzero(np.where(self.repeated, 0.0, height))
         if not at.size:
             return []
@@ -310,7 +310,7 @@ class _Look:
         y, u = self.record.y[self.valid], self.record.u[self.valid]
         r = None if self.record.r is None else self.record.r[self.valid]
         causes = [u, np.cumsum(u - np.mean(u))] if r is None else [r]
-        change, scatter, p = defects.drift(y, causes)
+        change, scatter, p = defects.find_drift(y, causes)
         out = []
         if p < SURE and change > scatter > 0:
             ratio = change / scatter
@@ -352,14 +352,14 @@ class _Look:
     def excitation(self, injected: bool) -> list[AuditFinding]:
         key = "u" if self.record.r is None else "r"
         v = self.signals[key]
-        moves = (np.abs(np.diff(v)) > defects.hair(v)) & self.valid[1:] & self.valid[:-1]
+        moves = (np.abs(np.diff(v)) > defects.rounding_of(v)) & self.valid[1:] & self.valid[:-1]
         changes = int(np.count_nonzero(moves))
         kind, size = "too little excitation", float(changes)
         if changes == 0:
             if injected or key == "u":  # a constant u is said already
                 return []
             text = "r does not change while the record counts, and "
-            share = defects.beyond_law(self.record.u, self.record.y, self.valid)
+            share = defects.find_beyond_law(self.record.u, self.record.y, self.valid)
             if share > OWN:
                 text += (f"{100 * share:.2g} % of u is no linear function of y: a signal added to "
                          "u, or noise of the input, is all that excites the loop.")  # fmt: skip
@@ -390,5 +390,5 @@ def _lines(v: Any) -> int:
         return 0
     window = np.blackman(len(v))
     power = np.abs(np.fft.rfft((v - np.average(v, weights=window)) * window)) ** 2
-    first, stop = defects.runs(power > LINE * power.max())
+    first, stop = defects.find_runs(power > LINE * power.max())
     return len(first) if np.all(stop - first <= 10) else 0

@@ -22,25 +22,25 @@ BLOCKS = 40  # of which the means show a drift
 PLENTY = 100_000  # samples that tell how large a drift is; of longer records every k-th
 
 
-def runs(mask: Any) -> tuple[Any, Any]:
+def find_runs(mask: Any) -> tuple[Any, Any]:
     """Return first indices and ends (exclusive) of the stretches where a mask is true."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], np.asarray(mask, dtype=np.int8), [0]])))
     return edges[::2], edges[1::2]
 
 
-def hair(v: FloatArray) -> float:
+def rounding_of(v: FloatArray) -> float:
     """Return the difference up to which two values of a signal are the same number."""
     return 4 * float(np.spacing(np.max(np.abs(v))))
 
 
-def distinct(v: FloatArray) -> tuple[FloatArray, Any]:
+def count_distinct(v: FloatArray) -> tuple[FloatArray, Any]:
     """Return the values of a signal in rising order and how often each occurs."""
     values, counts = np.unique(v, return_counts=True)
-    first = np.flatnonzero(np.concatenate([[True], np.diff(values) > hair(v)]))
+    first = np.flatnonzero(np.concatenate([[True], np.diff(values) > rounding_of(v)]))
     return values[first], np.add.reduceat(counts, first)
 
 
-def held(v: FloatArray) -> bool:
+def find_held(v: FloatArray) -> bool:
     """Return whether a signal is a staircase of few levels, as a program gives it out."""
     if len(np.unique(v[:ENOUGH])) > LEVELS or len(np.unique(v)) > LEVELS:
         return False
@@ -68,7 +68,7 @@ def grid_step(v: FloatArray) -> float:
     float
         The step [signal unit]; 0 for a signal of full floating-point resolution.
     """
-    values, counts = distinct(v[:ENOUGH])
+    values, counts = count_distinct(v[:ENOUGH])
     if len(values) < 3:
         return 0.0
     if len(values) > LEVELS:
@@ -76,7 +76,7 @@ def grid_step(v: FloatArray) -> float:
     again = counts > 1
     if np.count_nonzero(again) > 2 and counts[again].sum() >= 0.9 * counts.sum():
         values, again = values[again], again[again]
-    finest = 250 * hair(v)
+    finest = 250 * rounding_of(v)
     gaps = np.diff(values)
     step = float(gaps.min())
     # Levels that all recur but are unevenly spaced: a converter behind a calibration curve.
@@ -101,21 +101,21 @@ def grid_step(v: FloatArray) -> float:
     return step
 
 
-def stuck(v: FloatArray, driver: FloatArray) -> tuple[float, float]:
+def find_stuck(v: FloatArray, driver: FloatArray) -> tuple[float, float]:
     """Return the share of the samples at which a signal sits on its extreme, and that value.
 
     Zero unless it is nearly all of them, and the signal leaves the value far less often than what
     drives it changes: one that rests between moves is not stuck.
     """
-    changes = np.count_nonzero(np.abs(np.diff(driver)) > hair(driver))
+    changes = np.count_nonzero(np.abs(np.diff(driver)) > rounding_of(driver))
     for value in (float(v.min()), float(v.max())):
-        at = np.abs(v - value) <= hair(v)
-        if np.mean(at) > STUCK and len(runs(at)[0]) < (1 - STUCK) * changes:
+        at = np.abs(v - value) <= rounding_of(v)
+        if np.mean(at) > STUCK and len(find_runs(at)[0]) < (1 - STUCK) * changes:
             return float(np.mean(at)), value
     return 0.0, 0.0
 
 
-def clipped(
+def find_clipped(
     v: FloatArray, valid: Any, others: Sequence[FloatArray], step: float, side: int,
     reference: FloatArray | None = None,
 ) -> tuple[Any, float]:  # fmt: skip
@@ -149,12 +149,12 @@ def clipped(
         The extreme value.
     """
     w = side * v
-    tol, limit = hair(v), float(np.max(w[valid]))
+    tol, limit = rounding_of(v), float(np.max(w[valid]))
     at = valid & (w >= limit - tol)
     none = np.zeros(len(v), dtype=bool)
-    if np.count_nonzero(at) < SOME or limit - np.min(w[valid]) <= tol or held(v[valid]):
+    if np.count_nonzero(at) < SOME or limit - np.min(w[valid]) <= tol or find_held(v[valid]):
         return none, side * limit
-    first, stop = runs(at)
+    first, stop = find_runs(at)
     gentle = 1.5 * step if step else 1e-3 * float(np.ptp(v[valid]))
     before = np.maximum(first - 1, 0)
     starts = (first == 0) | ~valid[before]
@@ -172,16 +172,16 @@ def clipped(
     rest = still & (starts | (slope <= gentle))
     for a, b in zip(first[rest], stop[rest], strict=True):
         at[a:b] = False
-    values, counts = distinct(w[valid])
+    values, counts = count_distinct(w[valid])
     near = counts[-4:-1]
     levels = max(len(near), round((limit - values[-len(near) - 1]) / step) if step else 0)
     usual = near.sum() / levels if step else near.mean() - 1
-    least = SOME if len(runs(at)[0]) > 1 else 2 * SOME
+    least = SOME if len(find_runs(at)[0]) > 1 else 2 * SOME
     enough = np.count_nonzero(at) >= least + SOME * max(usual, 0.0)
     return (at if enough else none), side * limit
 
 
-def repeated(v: FloatArray, valid: Any, step: float, ignore: Any) -> Any:
+def find_repeats(v: FloatArray, valid: Any, step: float, ignore: Any) -> Any:
     """Return where a signal repeats its last value although it moves just before and after.
 
     A quantised signal that moves by many steps a sample passes through a difference of nought as
@@ -212,7 +212,7 @@ def repeated(v: FloatArray, valid: Any, step: float, ignore: Any) -> Any:
         return none
     fast = 3.5 * step if step else 1e-3 * float(np.median(moved))
     padded = np.concatenate([[0.0], size, [0.0]])
-    first, stop = runs(good & (size <= hair(v)))
+    first, stop = find_runs(good & (size <= rounding_of(v)))
     among = (padded[first] > fast) & (padded[stop + 1] > fast)
     usual = 0.0
     if step:
@@ -225,7 +225,7 @@ def repeated(v: FloatArray, valid: Any, step: float, ignore: Any) -> Any:
     return none
 
 
-def spikes(v: FloatArray, valid: Any, step: float) -> FloatArray:
+def find_spikes(v: FloatArray, valid: Any, step: float) -> FloatArray:
     r"""Return the height of isolated spikes, 0 where there is none.
 
     A spike is off the line through the two samples before it, off the line through the two after
@@ -273,7 +273,7 @@ def spikes(v: FloatArray, valid: Any, step: float) -> FloatArray:
     return height
 
 
-def drift(y: FloatArray, causes: Sequence[FloatArray]) -> tuple[float, float, float]:
+def find_drift(y: FloatArray, causes: Sequence[FloatArray]) -> tuple[float, float, float]:
     r"""Return how far a signal drifts over the record, next to what its causes explain.
 
     .. math:: \bar y_i = c + \sum_j g_j \bar w_{ij} + d_1 t_i + d_2 t_i^2 + d_3 t_i^3 + e_i
@@ -335,7 +335,7 @@ def drift(y: FloatArray, causes: Sequence[FloatArray]) -> tuple[float, float, fl
     return change, scatter, float(stats.f.sf(f, 3, free))
 
 
-def beyond_law(u: FloatArray, y: FloatArray, valid: Any) -> float:
+def find_beyond_law(u: FloatArray, y: FloatArray, valid: Any) -> float:
     """Return the share of u's variance that no linear law of y and past u gives, at most ten back.
 
     Parameters
@@ -386,7 +386,7 @@ def period(r: FloatArray) -> int:
     """
     n, v = len(r), r - np.mean(r)
     variance = float(np.mean(v**2))
-    if n < 8 or variance <= hair(r) ** 2:
+    if n < 8 or variance <= rounding_of(r) ** 2:
         return 0
     size = 1 << (2 * n - 1).bit_length()
     spectrum = np.fft.rfft(v, size)
@@ -396,7 +396,7 @@ def period(r: FloatArray) -> int:
     D = (power[n - lags] + power[n] - power[lags] - 2 * products) / (n - lags)
     near = min(4e-4 * variance, 0.25 * float(D[1])) > D
     near[:2] = False
-    first, stop = runs(near)
+    first, stop = find_runs(near)
     if not first.size:
         return 0
     best = int(first[0] + np.argmin(D[first[0] : stop[0]]))

@@ -8,23 +8,23 @@ import casadi
 import numba
 import numpy as np
 
-from ...loop.period_map import through_play
-from ...physics.block_evaluation import Vectorized
+from ...loop.period_map import apply_backlash
+from ...physics.block_evaluation import BlockEvaluation
 from ...physics.equations import Array
 from ...physics.interpreter import follow
-from .transition_maps import Plan
+from .transition_maps import PeriodPlan
 
 
 @dataclass(frozen=True, eq=False)
-class Path:
+class BacklashPath:
     """What an input passes through once per sample, as functions of memory, input, parameters.
 
     `after` is the next memory; `slopes` returns the applied input and how it and the next memory
     depend on the memory and on the free parameters.
     """
 
-    after: Vectorized
-    slopes: Vectorized
+    after: BlockEvaluation
+    slopes: BlockEvaluation
 
     def memories(self, first: float, u: Array, p: Array) -> Array:
         """Return the memory before each of n samples and after the last, shape (n + 1,)."""
@@ -42,24 +42,26 @@ class Path:
         memories = self.memories(first, u, p)[:-1]
         applied, *slopes = self.slopes(memories[None, :], u[None, :], p)
         seen, moved = (np.broadcast_to(v, (len(u), *v.shape[1:]))[:, 0, :] for v in slopes)
-        by_memory = _carried(moved[:, 0], moved[:, 1:])
+        by_memory = _carry_gap(moved[:, 0], moved[:, 1:])
         return applied[:, 0, 0], seen[:, :1] * by_memory + seen[:, 1:]
 
 
 @functools.lru_cache(maxsize=64)
-def path_of(plan: Plan) -> Path:
+def follow_backlash(plan: PeriodPlan) -> BacklashPath:
     """Return the play of a plan, built once."""
     e = plan.equations
     assert e.play is not None
     m, u, p = casadi.SX.sym("m"), casadi.SX.sym("u"), casadi.SX.sym("p", e.p.shape[0])
-    applied, after = through_play(e, m, u, p)
+    applied, after = apply_backlash(e, m, u, p)
     by = casadi.vertcat(m, *(p[k] for k in plan.index))
     slopes = [applied, casadi.jacobian(applied, by), casadi.jacobian(after, by)]
-    return Path(*(Vectorized(casadi.Function("play", [m, u, p], out)) for out in ([after], slopes)))
+    return BacklashPath(
+        *(BlockEvaluation(casadi.Function("play", [m, u, p], out)) for out in ([after], slopes))
+    )
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _carried(gain: Any, push: Any) -> Any:  # pragma: no cover - compiled
+def _carry_gap(gain: Any, push: Any) -> Any:  # pragma: no cover - compiled
     """Return what obeys ``s[k + 1] = gain[k] s[k] + push[k]`` and begins at zero."""
     out = np.zeros(push.shape)
     for k in range(len(push) - 1):

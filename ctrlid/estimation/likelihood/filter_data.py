@@ -16,7 +16,7 @@ BRIDGE = 20  # samples that do not count and are bridged by the model; then it s
 
 
 @dataclass(frozen=True, eq=False)
-class Track:
+class FilterData:
     """A record made ready: signals, and where the filter starts and starts anew."""
 
     record: Record
@@ -29,7 +29,7 @@ class Track:
     scale: float  # of the sensor noise, roughly
 
 
-def make_track(loop: Loop, record: Record, begin: float = 0.0) -> Track:
+def make_filter_data(loop: Loop, record: Record, begin: float = 0.0) -> FilterData:
     """Make a record ready for the filter of a loop; `begin` is the time of its first sample.
 
     Raises
@@ -49,17 +49,19 @@ def make_track(loop: Loop, record: Record, begin: float = 0.0) -> Track:
     r = y if record.r is None else np.asarray(record.r)[last]
     start, spread, scale = _start(loop, record)
     doubt = np.where(valid, 0.0, (np.std(record.u[valid]) / scale) ** 2)
-    return Track(record, np.vstack([begin + record.t - record.start, u, r, y]), valid,
-                 fresh_starts(loop, record), doubt, start, spread, scale)  # fmt: skip
+    return FilterData(record, np.vstack([begin + record.t - record.start, u, r, y]), valid,
+                 find_segment_starts(loop, record), doubt, start, spread, scale)  # fmt: skip
 
 
-def retracked(track: Track, loop: Loop) -> Track:
+def prepare_for_loop(track: FilterData, loop: Loop) -> FilterData:
     """Return a track made ready for another model of the same loop; the signals are shared."""
     start, spread, _ = _start(loop, track.record)
-    return replace(track, afresh=fresh_starts(loop, track.record), start=start, spread=spread)
+    return replace(
+        track, afresh=find_segment_starts(loop, track.record), start=start, spread=spread
+    )
 
 
-def fresh_starts(loop: Loop, record: Record) -> Any:
+def find_segment_starts(loop: Loop, record: Record) -> Any:
     """Return at which samples the filter begins anew: at the start and in long gaps."""
     e = loop.equations()
     poles = np.linalg.eigvals(state_matrices(e, loop.point)[0])

@@ -5,26 +5,26 @@ from typing import Any
 import casadi
 import numpy as np
 
-from ...physics.block_evaluation import Vectorized
+from ...physics.block_evaluation import BlockEvaluation
 from ...physics.equations import Array, Equations
 from ...physics.integration import delay_of
-from .backlash import path_of
-from .filter_data import Track
-from .transition_maps import Plan
+from .backlash import follow_backlash
+from .filter_data import FilterData
+from .transition_maps import PeriodPlan
 
 FORGOTTEN = 200  # samples after which one looks whether a play has forgotten how it began
 LASTING = 10  # samples: an error that stays moves the plant as far as noise of so many variances
 NEARLY = 0.01  # of the sensor's variance: how well what a lag shows is known where it is short
 
 
-class Onset:
+class InitialConditions:
     """How the record of a plan's plant begins.
 
     A lag begins near what it follows. A play may lie anywhere in its gap, and what a delay still
     holds is unknown: until it has passed, the input is uncertain.
     """
 
-    def __init__(self, plan: Plan) -> None:
+    def __init__(self, plan: PeriodPlan) -> None:
         self.plan = plan
         self.lags = _lags(plan.equations)
 
@@ -54,9 +54,9 @@ class Onset:
         """
         e, variance = self.plan.equations, np.zeros(len(u))
         if e.play is not None:
-            variance = shifted(self._forgetting(u, p), self.plan.late)
+            variance = shift_signal(self._forgetting(u, p), self.plan.late)
         if e.delay is not None:
-            late = delay(e, p) / self.plan.dt - np.arange(len(u))
+            late = delay_signal(e, p) / self.plan.dt - np.arange(len(u))
             variance = variance + np.clip(late, 0.0, 1.0) ** 2 * np.var(u)
         return variance
 
@@ -64,7 +64,7 @@ class Onset:
         """Return the variance of the input behind the play, until it forgets how it began."""
         variance = np.zeros(len(u))
         middle, reach = self.memory(float(u[0]), p)
-        ends, path = [middle - reach, middle + reach], path_of(self.plan)
+        ends, path = [middle - reach, middle + reach], follow_backlash(self.plan)
         for first in range(0, len(u), FORGOTTEN):
             some = u[first : first + FORGOTTEN]
             memories = [path.memories(z, some, p) for z in ends]
@@ -75,7 +75,7 @@ class Onset:
             ends = [float(m[-1]) for m in memories]
         return variance
 
-    def start(self, track: Track, p: Array) -> tuple[Array, Array]:
+    def start(self, track: FilterData, p: Array) -> tuple[Array, Array]:
         """Return state and covariance at the start of a record, for parameter values `p`."""
         start, spread = track.start.copy(), track.spread.copy()
         _, u, _, y = track.table
@@ -98,7 +98,7 @@ class Onset:
         return start, spread
 
 
-def _lags(e: Equations) -> list[tuple[int, bool, Vectorized]]:
+def _lags(e: Equations) -> list[tuple[int, bool, BlockEvaluation]]:
     """Lags behind the input, or behind what the plant shows: whether so, time and target."""
     found = []
     for lag in e.lags:
@@ -108,16 +108,16 @@ def _lags(e: Equations) -> list[tuple[int, bool, Vectorized]]:
             near = casadi.densify(casadi.jacobian(lag.target, e.x))
             parts = [casadi.SX(lag.time_constant), lag.target, near]
             function = casadi.Function("lag", [e.x if shown else e.u, e.p], parts)
-            found.append((lag.state, shown, Vectorized(function)))
+            found.append((lag.state, shown, BlockEvaluation(function)))
     return found
 
 
-def delay(e: Equations, p: Any) -> float:
+def delay_signal(e: Equations, p: Any) -> float:
     """Return the delay of the input [s] for parameter values `p`."""
     return float(casadi.evalf(delay_of(e, p)))
 
 
-def shifted(values: Array, late: int) -> Array:
+def shift_signal(values: Array, late: int) -> Array:
     """Return values so many samples later, or earlier if `late` is negative; the ends are held."""
     first = np.repeat(values[:1], max(late, 0), axis=0)
     last = np.repeat(values[-1:], max(-late, 0), axis=0)

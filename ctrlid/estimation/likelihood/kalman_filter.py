@@ -12,11 +12,11 @@ import casadi
 import numpy as np
 
 from ..._base.errors import CtrlidError
-from ...physics.block_evaluation import Vectorized
+from ...physics.block_evaluation import BlockEvaluation
 from ...physics.equations import Array
-from .filter_data import Track
+from .filter_data import FilterData
 from .kalman_recursion import filter_pass
-from .sampled_plant import Linearized, Machine, Trajectory
+from .sampled_plant import Linearized, SampledPlant, Trajectory
 
 SETTLED = 4.0  # times the usual variance: above, the start still dominates the prediction
 NEWTON = 6  # steps that unbend the curve of a sensor
@@ -59,8 +59,8 @@ class Filtered:
     disturbance: Array
 
 
-def run(
-    m: Machine, track: Track, lin: Linearized, noise: Noise, sensitive: bool = True,
+def run_filter(
+    m: SampledPlant, track: FilterData, lin: Linearized, noise: Noise, sensitive: bool = True,
     columns: int | None = None,
 ) -> Filtered:  # fmt: skip
     """Run the filter along a linearized plant, with sensitivities to its first columns."""
@@ -82,7 +82,7 @@ def run(
                     disturbance)  # fmt: skip
 
 
-def first_guess(m: Machine, track: Track) -> Trajectory:
+def first_guess(m: SampledPlant, track: FilterData) -> Trajectory:
     """Return a trajectory to begin with: at rest, states that are measured as measured."""
     n, e = len(track.record), m.e
     rest = np.tile(m.padded(track.start), (n, 1))
@@ -92,7 +92,7 @@ def first_guess(m: Machine, track: Track) -> Trajectory:
         if len(columns) != 1 or casadi.depends_on(seen, casadi.vertcat(e.t, e.u)):
             break
         j = columns[0]
-        rest[:, j] = values = _unbent(m, seen, e.x[j], float(rest[0, j]), values)
+        rest[:, j] = values = _without_bend(m, seen, e.x[j], float(rest[0, j]), values)
         behind = [lag.target for lag in e.lags if lag.state == j]
         if not behind:
             break
@@ -105,11 +105,11 @@ def first_guess(m: Machine, track: Track) -> Trajectory:
     return Trajectory(rest, rest.copy(), np.tile(quiet, (n, 1)))
 
 
-def _unbent(m: Machine, seen: Any, x: Any, at: float, values: Array) -> Array:
+def _without_bend(m: SampledPlant, seen: Any, x: Any, at: float, values: Array) -> Array:
     """Return the state x that is seen as given values, by Newton's rule; else at rest."""
     if casadi.is_equal(seen, x, 2):
         return values
-    f = Vectorized(casadi.Function("seen", [x, m.e.p], [seen, casadi.jacobian(seen, x)]))
+    f = BlockEvaluation(casadi.Function("seen", [x, m.e.p], [seen, casadi.jacobian(seen, x)]))
     found = np.full(len(values), at)
     first = np.abs(f(found, m.e.values)[0].ravel() - values)
     with np.errstate(all="ignore"):
@@ -120,8 +120,13 @@ def _unbent(m: Machine, seen: Any, x: Any, at: float, values: Array) -> Array:
     return np.where(left <= first, found, at)  # also where it is no number
 
 
-def settle(
-    m: Machine, track: Track, theta: Array, noise: Noise, at: Trajectory, passes: int = PASSES
+def settle_covariance(
+    m: SampledPlant,
+    track: FilterData,
+    theta: Array,
+    noise: Noise,
+    at: Trajectory,
+    passes: int = PASSES,
 ) -> tuple[Linearized, Filtered]:
     """Linearize and filter until the trajectory no longer moves.
 
@@ -131,8 +136,8 @@ def settle(
         If the filter cannot follow the record with this model.
     """
     for count in range(passes):
-        at, lin = _inside(m, track, theta, at)
-        out = run(m, track, lin, noise, sensitive=False)
+        at, lin = _keep_inside(m, track, theta, at)
+        out = run_filter(m, track, lin, noise, sensitive=False)
         moved = np.abs(out.trajectory.filtered - at.filtered)
         if not np.isfinite(out.innovations).all() or not np.isfinite(moved).all():
             k = int(np.argmin(np.isfinite(out.innovations)))
@@ -149,8 +154,8 @@ def settle(
     return lin, out
 
 
-def _inside(
-    m: Machine, track: Track, theta: Array, at: Trajectory
+def _keep_inside(
+    m: SampledPlant, track: FilterData, theta: Array, at: Trajectory
 ) -> tuple[Trajectory, Linearized]:
     """Linearize, with samples at which the plant is not defined pulled back to rest."""
     bad: Any = ~(np.isfinite(at.filtered) & np.isfinite(at.predicted)).all(axis=1)

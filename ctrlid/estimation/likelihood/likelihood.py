@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from ...physics.equations import Array
-from .filter_data import Track
-from .kalman_filter import Filtered, Noise, run
-from .sampled_plant import Linearized, Machine, Trajectory
+from .filter_data import FilterData
+from .kalman_filter import Filtered, Noise, run_filter
+from .sampled_plant import Linearized, SampledPlant, Trajectory
 
 QUIET = 1e-14  # of the output's size, squared: the least variance of the sensor noise
 SINGULAR = 1e-10  # relative eigenvalue below which a direction is not in the data
@@ -34,9 +34,9 @@ class Problem:
 
     Parameters
     ----------
-    machine : Machine
+    plant : Machine
         The plant, with the free parameters as its names.
-    tracks : tuple of Track
+    prepared : tuple of Track
         The records.
     lower, upper : ndarray, shape (p,)
         Bounds of the parameters.
@@ -49,8 +49,8 @@ class Problem:
         between the repeats count, which no wrong model can have made.
     """
 
-    machine: Machine
-    tracks: tuple[Track, ...]
+    plant: SampledPlant
+    prepared: tuple[FilterData, ...]
     lower: Array
     upper: Array
     counts: tuple[Any, ...] = ()
@@ -106,27 +106,30 @@ class Fit:
 
 def evaluate(problem: Problem, theta: Array, noise: Noise, at: Sequence[Trajectory]) -> Fit:
     """Return the likelihood of parameters and noise, linearized along given trajectories."""
-    m = problem.machine
-    lins = tuple(m.linearize(t, theta, a) for t, a in zip(problem.tracks, at, strict=True))
-    return measure(problem, theta, noise, lins)
+    m = problem.plant
+    lins = tuple(m.linearize(t, theta, a) for t, a in zip(problem.prepared, at, strict=True))
+    return measure_noise(problem, theta, noise, lins)
 
 
-def relinearized(fit: Fit) -> Fit:
+def linearize_again(fit: Fit) -> Fit:
     """Return the likelihood of the same values, the plant linearized along its last trajectory."""
     along = [out.trajectory for out in fit.filtered]
     return evaluate(fit.problem, fit.theta, fit.noise, along)
 
 
-def measure(
+def measure_noise(
     problem: Problem, theta: Array, noise: Noise, lins: Sequence[Linearized], sensitive: bool = True
 ) -> Fit:
     """Return the likelihood of parameters and noise, the plant linearized before."""
-    m = problem.machine
+    m = problem.plant
     outs = tuple(
-        run(m, t, lin, noise, sensitive) for t, lin in zip(problem.tracks, lins, strict=True)
+        run_filter(m, t, lin, noise, sensitive)
+        for t, lin in zip(problem.prepared, lins, strict=True)
     )
     value, sensors = 0.0, []
-    for k, (track, out, keep) in enumerate(zip(problem.tracks, outs, problem.counts, strict=True)):
+    for k, (track, out, keep) in enumerate(
+        zip(problem.prepared, outs, problem.counts, strict=True)
+    ):
         e, s = out.innovations[keep], out.variance[keep]
         if problem.periods:
             e, s = _between_repeats(out, keep, problem.periods[k])

@@ -8,11 +8,11 @@ import numpy as np
 
 from ..._base.errors import CtrlidError
 from ...physics.equations import Array
-from .filter_data import Track
-from .kalman_filter import SETTLED, Filtered, Noise, first_guess, settle
-from .likelihood import Fit, Problem, evaluate, pseudo_inverse, relinearized
-from .noise_fit import LOG_STEP, logs_of, noise_of, tune, unit_of
-from .sampled_plant import Machine
+from .filter_data import FilterData
+from .kalman_filter import SETTLED, Filtered, Noise, first_guess, settle_covariance
+from .likelihood import Fit, Problem, evaluate, linearize_again, pseudo_inverse
+from .noise_fit import LOG_STEP, choose_units, fit_noise, make_noise, take_logs
+from .sampled_plant import SampledPlant
 
 ROUNDS = 25  # Gauss-Newton steps at most
 FAR = 3.0  # standard errors: after a longer step the trajectory is settled anew
@@ -24,7 +24,7 @@ ELSEWHERE = 2.0  # of log-likelihood, that a noise far away must gain to go on f
 NOTHING = 1e-3  # of log-likelihood: a step that promises less is not worth taking
 
 
-def begin(problem: Problem, theta: Array, noise: Noise | None) -> Fit:
+def begin_fit(problem: Problem, theta: Array, noise: Noise | None) -> Fit:
     """Return the likelihood at a starting point, with settled trajectories.
 
     Parameters
@@ -41,34 +41,34 @@ def begin(problem: Problem, theta: Array, noise: Noise | None) -> Fit:
     Fit
         The starting point.
     """
-    m = problem.machine
+    m = problem.plant
     noise = problem.known.noise if problem.known else noise
-    first = noise or Noise((unit_of(m) ** 2 * 1e-2,) * m.channels)
+    first = noise or Noise((choose_units(m) ** 2 * 1e-2,) * m.channels)
     settled = []
-    for track in problem.tracks:
+    for track in problem.prepared:
         at = first_guess(m, track)
         if noise is None:
-            at = settle(m, track, theta, first, at, passes=2)[1].trajectory
+            at = settle_covariance(m, track, theta, first, at, passes=2)[1].trajectory
         settled.append((track, at))
     if noise is None:
         lins = tuple(m.linearize(t, theta, at) for t, at in settled)
-        counts = tuple(t.valid & ~t.afresh for t in problem.tracks)
-        first = tune(replace(problem, counts=counts), theta, lins, first, wide=True).noise
-    results = [settle(m, track, theta, first, at) for track, at in settled]
+        counts = tuple(t.valid & ~t.afresh for t in problem.prepared)
+        first = fit_noise(replace(problem, counts=counts), theta, lins, first, wide=True).noise
+    results = [settle_covariance(m, track, theta, first, at) for track, at in settled]
     if not problem.counts:
         problem = replace(problem, counts=tuple(
-            _settled(track, out) for track, (_, out) in zip(problem.tracks, results, strict=True)
+            _settle(track, out) for track, (_, out) in zip(problem.prepared, results, strict=True)
         ))  # fmt: skip
     return evaluate(problem, theta, first, [out.trajectory for _, out in results])
 
 
-def _settled(track: Track, out: Filtered) -> Any:
+def _settle(track: FilterData, out: Filtered) -> Any:
     known = track.valid & np.isfinite(out.variance)
     usual = np.median(out.variance[known])
     return known & ~track.afresh & (out.variance <= SETTLED * usual)
 
 
-def climb(fit: Fit, rounds: int = ROUNDS, exact: bool = True) -> Fit:
+def maximize(fit: Fit, rounds: int = ROUNDS, exact: bool = True) -> Fit:
     """Climb to the maximum of the likelihood over parameters and noise.
 
     Gauss-Newton steps on the innovations with the filter's gain held fixed, the noise tuned between
@@ -92,33 +92,33 @@ def climb(fit: Fit, rounds: int = ROUNDS, exact: bool = True) -> Fit:
     tuned, far, enough = -math.inf, True, 0.02 if exact else 0.3
     for _ in range(rounds):
         # A short step was already evaluated along the trajectory of the pass before.
-        moved = relinearized(fit) if far else fit
+        moved = linearize_again(fit) if far else fit
         fit = moved if np.isfinite(moved.value) else fit
         if fit.value > tuned + 2.0:
-            fit = tune(fit.problem, fit.theta, fit.linearized, fit.noise, enough=enough)
+            fit = fit_noise(fit.problem, fit.theta, fit.linearized, fit.noise, enough=enough)
             tuned = fit.value
-        fit, length = _ascend(fit, *fit.normal)
+        fit, length = _take_step(fit, *fit.normal)
         far = bool(length > FAR)
         if length < (CLOSE if exact else 5 * CLOSE):
             if fit.value <= tuned + 2.5 * enough:
                 break
-            fit = tune(fit.problem, fit.theta, fit.linearized, fit.noise, enough=enough)
+            fit = fit_noise(fit.problem, fit.theta, fit.linearized, fit.noise, enough=enough)
             tuned = fit.value
     return polish(fit) if exact else fit
 
 
-def retuned(fit: Fit) -> Fit:
+def refit_noise_size(fit: Fit) -> Fit:
     """Return the fit climbed on from a noise sought over its whole range, if that is far better.
 
     A random force that stood for a wrong parameter at the start may have left no noise to the
     sensor, from where small changes lead nowhere.
     """
     plain = Noise(fit.noise.force)
-    other = tune(fit.problem, fit.theta, fit.linearized, plain, wide=True)
-    return climb(other) if other.value > fit.value + ELSEWHERE else fit
+    other = fit_noise(fit.problem, fit.theta, fit.linearized, plain, wide=True)
+    return maximize(other) if other.value > fit.value + ELSEWHERE else fit
 
 
-def promised(fit: Fit) -> float:
+def expected_gain(fit: Fit) -> float:
     """Return the gain that a Gauss-Newton step within the bounds expects."""
     matrix, score = fit.normal
     return 0.5 * float(score @ bounded_step(fit, matrix, score)[0])
@@ -147,7 +147,7 @@ def bounded_step(fit: Fit, matrix: Array, score: Array) -> tuple[Array, Array]:
     return step, error
 
 
-def _ascend(fit: Fit, matrix: Array, score: Array) -> tuple[Fit, float]:
+def _take_step(fit: Fit, matrix: Array, score: Array) -> tuple[Fit, float]:
     """Take a Gauss-Newton step, or as much of it as makes the likelihood grow.
 
     Returns
@@ -165,12 +165,12 @@ def _ascend(fit: Fit, matrix: Array, score: Array) -> tuple[Fit, float]:
     for k, step in enumerate(share * whole for share in SHARES):
         theta = np.clip(fit.theta + step, problem.lower, problem.upper)
         try:
-            if not problem.machine.fits(theta):
-                problem, fit = _rebuilt(fit, theta)
+            if not problem.plant.fits(theta):
+                problem, fit = _rebuild(fit, theta)
             trial = evaluate(problem, theta, fit.noise, [o.trajectory for o in fit.filtered])
             worse = not trial.value >= fit.value - 1e-6
             if worse and k < CURVED and promise > BEND and np.isfinite(trial.value):
-                trial = _second_step(trial)
+                trial = _take_second_step(trial)
                 worse = not trial.value > fit.value + NOTHING
         except CtrlidError:  # too far: what moves so fast is no longer followed
             continue
@@ -179,25 +179,25 @@ def _ascend(fit: Fit, matrix: Array, score: Array) -> tuple[Fit, float]:
     return fit, 0.0
 
 
-def _second_step(fit: Fit) -> Fit:
+def _take_second_step(fit: Fit) -> Fit:
     """Return where a whole Gauss-Newton step leads from a point that may lie beside the ridge.
 
     Where a product of two parameters is all that the record knows, the ridge is curved: along its
     tangent only short steps climb, but a long one and a second from there come back to it.
     """
-    there, problem = relinearized(fit), fit.problem
+    there, problem = linearize_again(fit), fit.problem
     step, _ = bounded_step(there, *there.normal)
     theta = np.clip(there.theta + step, problem.lower, problem.upper)
-    if not problem.machine.fits(theta):
+    if not problem.plant.fits(theta):
         return fit
     return evaluate(problem, theta, there.noise, [o.trajectory for o in there.filtered])
 
 
-def _rebuilt(fit: Fit, theta: Array) -> tuple[Problem, Fit]:
-    """Return the problem with a machine for the delay that `theta` has."""
-    m = fit.problem.machine
+def _rebuild(fit: Fit, theta: Array) -> tuple[Problem, Fit]:
+    """Return the problem with a plant for the delay that `theta` has."""
+    m = fit.problem.plant
     loop = m.loop.with_parameters(dict(zip(m.names, theta.tolist(), strict=True)))
-    problem = replace(fit.problem, machine=Machine(loop, m.names, m.hold, m.law is not None))
+    problem = replace(fit.problem, plant=SampledPlant(loop, m.names, m.hold, m.law is not None))
     return problem, replace(fit, problem=problem)
 
 
@@ -223,10 +223,10 @@ def polish(fit: Fit, rounds: int = 2) -> Fit:
                 score[k] = (values[1] - values[0]) / (ends[1] - ends[0])
         if not known.any():
             return fit
-        fit, length = _ascend(fit, matrix, score)
+        fit, length = _take_step(fit, matrix, score)
         if length < 0.05:
             break
-    tuned = tune(fit.problem, fit.theta, fit.linearized, fit.noise)
+    tuned = fit_noise(fit.problem, fit.theta, fit.linearized, fit.noise)
     return tuned if tuned.value > fit.value else fit
 
 
@@ -256,11 +256,11 @@ def information(fit: Fit) -> tuple[Array, Array]:
     ----------
     Åström, "Maximum likelihood and prediction error methods", Automatica 16 (1980).
     """
-    problem, m = fit.problem, fit.problem.machine
+    problem, m = fit.problem, fit.problem.plant
     dt, p = m.loop.dt, len(fit.theta)
     at = [out.trajectory for out in fit.filtered]
     _, error = bounded_step(fit, *fit.normal)
-    logs = logs_of(fit.noise, dt) if problem.known is None else np.zeros(0)
+    logs = take_logs(fit.noise, dt) if problem.known is None else np.zeros(0)
 
     def innovations(theta: Array, noise: Noise) -> Any:
         out = evaluate(problem, theta, noise, at).filtered
@@ -282,9 +282,9 @@ def information(fit: Fit) -> tuple[Array, Array]:
         for h in (-LOG_STEP, LOG_STEP):
             moved = logs.copy()
             moved[k] += h
-            pair.append(innovations(fit.theta, noise_of(moved, m.channels, dt)))
+            pair.append(innovations(fit.theta, make_noise(moved, m.channels, dt)))
         columns.append(_difference(pair, 2 * LOG_STEP))
-    count, records = len(columns), len(problem.tracks) if problem.known is None else 0
+    count, records = len(columns), len(problem.prepared) if problem.known is None else 0
     matrix = np.zeros((count + records, count + records))
     score = np.zeros(count + records)
     for k, (out, keep, r) in enumerate(zip(fit.filtered, problem.counts, fit.sensor, strict=True)):

@@ -11,8 +11,8 @@ from ..._base.errors import CtrlidError
 from ..._base.jobs import side_by_side
 from ...physics.equations import Array
 from .kalman_filter import Noise
-from .likelihood import Fit, Known, Problem, measure
-from .sampled_plant import Linearized, Machine
+from .likelihood import Fit, Known, Problem, measure_noise
+from .sampled_plant import Linearized, SampledPlant
 
 LEAST = -24.0  # logarithm of the least force noise: below, only the start of the record counts
 MOST = 14.0  # and of the largest: above, the sensor is exact
@@ -21,39 +21,39 @@ LOG_STEP = 0.2  # of log variances, for derivatives
 BOWL = 0.05  # second derivative by a log variance above which a parabola tells how far it is
 
 
-def tune(
+def fit_noise(
     problem: Problem, theta: Array, lins: Sequence[Linearized], noise: Noise, wide: bool = False,
     enough: float = 0.02,
 ) -> Fit:  # fmt: skip
     """Return the most likely noise for parameters as they are."""
-    m, dt = problem.machine, problem.machine.loop.dt
+    m, dt = problem.plant, problem.plant.loop.dt
     if problem.known is not None:
-        return measure(problem, theta, problem.known.noise, lins)
+        return measure_noise(problem, theta, problem.known.noise, lins)
 
     def at(logs: Array) -> Noise:
-        return noise_of(logs, m.channels, dt)
+        return make_noise(logs, m.channels, dt)
 
     def cost(logs: Array) -> float:
-        value = measure(problem, theta, at(np.atleast_1d(logs)), lins, sensitive=False).value
+        value = measure_noise(problem, theta, at(np.atleast_1d(logs)), lins, sensitive=False).value
         return -value if np.isfinite(value) else 1e15
 
-    start = logs_of(noise, dt)
-    longest = max(len(t.record) for t in problem.tracks)
+    start = take_logs(noise, dt)
+    longest = max(len(t.record) for t in problem.prepared)
     low, high = _limits(m, len(start) > m.channels, longest)
     start = np.clip(start, low, high)
     if wide:
         grid = np.linspace(low[0], high[0], 20)
         best = grid[int(np.argmin(_costs(cost, [np.full(m.channels, g) for g in grid])))]
         start[: m.channels] = best
-    return measure(problem, theta, at(_newton(cost, start, low, high, enough)), lins)
+    return measure_noise(problem, theta, at(_newton(cost, start, low, high, enough)), lins)
 
 
-def unit_of(machine: Machine) -> float:
+def choose_units(plant: SampledPlant) -> float:
     """Return a ratio of force to sensor noise from which others are counted."""
-    return 1.0 / machine.loop.dt ** (2 if machine.e.velocities else 1)
+    return 1.0 / plant.loop.dt ** (2 if plant.e.velocities else 1)
 
 
-def logs_of(noise: Noise, dt: float) -> Array:
+def take_logs(noise: Noise, dt: float) -> Array:
     """Return the logarithms that are searched: of variances, and of the coloured force's time."""
     logs = list(np.log(noise.force))
     if noise.drift:
@@ -61,7 +61,7 @@ def logs_of(noise: Noise, dt: float) -> Array:
     return np.array(logs)
 
 
-def noise_of(logs: Array, channels: int, dt: float) -> Noise:
+def make_noise(logs: Array, channels: int, dt: float) -> Noise:
     """Return the noise that has such logarithms."""
     force = tuple(np.exp(np.clip(logs[:channels], -300, 300)).tolist())
     if len(logs) == channels:
@@ -71,12 +71,12 @@ def noise_of(logs: Array, channels: int, dt: float) -> Noise:
     return Noise(force, memory, math.exp(min(max(logs[channels], -300), 300)) * (1 - memory**2))
 
 
-def _limits(m: Machine, coloured: bool, longest: int) -> tuple[Array, Array]:
+def _limits(m: SampledPlant, coloured: bool, longest: int) -> tuple[Array, Array]:
     """Return bounds of the logarithms of the noise variances.
 
     A force that hardly changes during a record is an offset, not noise.
     """
-    unit, dt = 2 * math.log(unit_of(m)), m.loop.dt
+    unit, dt = 2 * math.log(choose_units(m)), m.loop.dt
     low, high = [unit + LEAST] * m.channels, [unit + MOST] * m.channels
     if coloured:
         low += [unit + LEAST, math.log(2 * dt)]
@@ -139,9 +139,9 @@ def _newton(
     return x
 
 
-def with_coloured_force(fit: Fit) -> Fit:
+def try_coloured_force(fit: Fit) -> Fit:
     """Return the fit with a coloured force added, whether it pays or not."""
-    m, dt = fit.problem.machine, fit.problem.machine.loop.dt
+    m, dt = fit.problem.plant, fit.problem.plant.loop.dt
     best: Fit | None = None
     sizes = np.array([1e-2, 1.0]) * sum(fit.noise.force)
     for time in (3 * dt, 30 * dt, 300 * dt):
@@ -149,13 +149,13 @@ def with_coloured_force(fit: Fit) -> Fit:
             memory = math.exp(-dt / time)
             force = tuple(0.5 * v for v in fit.noise.force)
             noise = Noise(force, memory, size * (1 - memory**2))
-            trial = measure(fit.problem, fit.theta, noise, fit.linearized, sensitive=False)
+            trial = measure_noise(fit.problem, fit.theta, noise, fit.linearized, sensitive=False)
             if best is None or trial.value > best.value:
                 best = trial
     assert best is not None
     if not np.isfinite(best.value):
         raise CtrlidError(f"no coloured force can be fitted to {m.e.name}")
-    return tune(fit.problem, fit.theta, fit.linearized, best.noise)
+    return fit_noise(fit.problem, fit.theta, fit.linearized, best.noise)
 
 
 def known_from_repeats(fit: Fit, periods: Sequence[int]) -> Known:
@@ -183,7 +183,7 @@ def known_from_repeats(fit: Fit, periods: Sequence[int]) -> Known:
     Pintelon and Schoukens, *System Identification: A Frequency Domain Approach*, section 4.3.
     """
     problem = replace(fit.problem, known=None, periods=tuple(periods))
-    plain = tune(problem, fit.theta, fit.linearized, Noise(fit.noise.force), wide=True)
-    richer = with_coloured_force(plain)
+    plain = fit_noise(problem, fit.theta, fit.linearized, Noise(fit.noise.force), wide=True)
+    richer = try_coloured_force(plain)
     best = richer if richer.value > plain.value + math.log(fit.size) else plain
     return Known(best.noise, best.sensor)

@@ -11,12 +11,12 @@ from ...data.record import Record
 from ...data.several_records import as_records
 from ...loop.loop import Loop
 from ...physics.equations import Array
-from .filter_data import make_track
+from .filter_data import make_filter_data
 from .likelihood import Fit, Problem, pseudo_inverse
-from .maximization import begin, climb, information, retuned
-from .noise_fit import with_coloured_force
+from .maximization import begin_fit, information, maximize, refit_noise_size
+from .noise_fit import try_coloured_force
 from .physics_estimate import LoopEstimate, LoopFit
-from .sampled_plant import machine_for
+from .sampled_plant import sampled_plant_for
 
 UNSEEN = 1e-9  # relative eigenvalue of the information below which a direction is not in the data
 
@@ -82,11 +82,11 @@ def fit_loop(
     """
     records = as_records(record)
     names = _free_names(loop, free)
-    start = begin(make_problem(loop, names, records), start_values(loop, names), None)
-    fit = retuned(climb(start))
+    start = begin_fit(make_problem(loop, names, records), start_values(loop, names), None)
+    fit = refit_noise_size(maximize(start))
     if coloured or coloured is None:
         fit = choose_noise(fit, always=bool(coloured))
-    return summary(loop, fit)
+    return summarize_fit(loop, fit)
 
 
 def _free_names(loop: Loop, free: Sequence[str] | None) -> tuple[str, ...]:
@@ -115,11 +115,11 @@ def make_problem(
     loop: Loop, names: Sequence[str], records: Sequence[Record], begins: Sequence[float] = ()
 ) -> Problem:
     """Return the likelihood problem of a loop on records that begin at given times."""
-    m = machine_for(loop, tuple(names), records[0])
-    lower, upper = bounds_of(loop, names)
+    m = sampled_plant_for(loop, tuple(names), records[0])
+    lower, upper = parameter_bounds(loop, names)
     begins = begins or [0.0] * len(records)
-    tracks = [make_track(loop, r, b) for r, b in zip(records, begins, strict=True)]
-    return Problem(m, tuple(tracks), lower, upper)
+    prepared = [make_filter_data(loop, r, b) for r, b in zip(records, begins, strict=True)]
+    return Problem(m, tuple(prepared), lower, upper)
 
 
 def effect_bounds(loop: Loop) -> dict[str, tuple[float, float]]:
@@ -131,7 +131,7 @@ def effect_bounds(loop: Loop) -> dict[str, tuple[float, float]]:
     }
 
 
-def bounds_of(loop: Loop, names: Sequence[str]) -> tuple[Array, Array]:
+def parameter_bounds(loop: Loop, names: Sequence[str]) -> tuple[Array, Array]:
     """Return the bounds of parameters: those of effects, and none that changes a sign."""
     known = effect_bounds(loop)
     parameters = loop.equations(keep=True).parameters
@@ -154,7 +154,7 @@ def choose_noise(fit: Fit, always: bool = False) -> Fit:
     if fit.problem.known is not None:
         return fit
     try:
-        richer = with_coloured_force(fit)
+        richer = try_coloured_force(fit)
     except CtrlidError:
         if always:
             raise
@@ -162,13 +162,13 @@ def choose_noise(fit: Fit, always: bool = False) -> Fit:
     # Two parameters more: worth trying out in full only if it gains at all.
     if not always and richer.value < fit.value + 0.5 * math.log(fit.size):
         return fit
-    richer = climb(richer)
+    richer = maximize(richer)
     return richer if always or richer.value > fit.value + math.log(fit.size) else fit
 
 
-def summary(loop: Loop, fit: Fit) -> LoopFit:
+def summarize_fit(loop: Loop, fit: Fit) -> LoopFit:
     """Return a maximum of the likelihood as a loop and an estimate."""
-    m, p = fit.problem.machine, len(fit.theta)
+    m, p = fit.problem.plant, len(fit.theta)
     names = m.names
     matrix, _ = information(fit)
     on_bound = (fit.theta <= fit.problem.lower) | (fit.theta >= fit.problem.upper)

@@ -14,11 +14,11 @@ from ..._base.errors import CtrlidError
 from ...data.record import Record
 from ...loop.loop import Loop
 from ...physics.equations import Array
-from .filter_data import make_track
+from .filter_data import make_filter_data
 from .kalman_filter import Noise
 from .likelihood import Problem
-from .maximization import begin, climb
-from .sampled_plant import machine_for
+from .maximization import begin_fit, maximize
+from .sampled_plant import sampled_plant_for
 
 EMPTY: Array = np.empty(0)
 LEAD = 4  # horizons in which a filter's covariance settles
@@ -106,12 +106,12 @@ def predict(loop: Loop, record: Record, force_noise: float | None = None) -> Pre
                           f"{type(loop).__name__} and {type(record).__name__}")  # fmt: skip
     if force_noise is not None and not (np.isfinite(force_noise) and force_noise >= 0):
         raise CtrlidError(f"force_noise is a ratio >= 0; given {force_noise!r}")
-    track, m = make_track(loop, record), machine_for(loop, (), record)
+    track, m = make_filter_data(loop, record), sampled_plant_for(loop, (), record)
     problem = Problem(m, (track,), EMPTY, EMPTY)
     if force_noise is None:
-        fit = climb(begin(problem, EMPTY, None))
+        fit = maximize(begin_fit(problem, EMPTY, None))
     else:
-        fit = begin(problem, EMPTY, Noise((max(force_noise, 1e-150) ** 2,) * m.channels))
+        fit = begin_fit(problem, EMPTY, Noise((max(force_noise, 1e-150) ** 2,) * m.channels))
     out, sensor = fit.filtered[0], float(np.sqrt(fit.sensor[0]))
     states = out.trajectory.filtered
     own = [m.e.states.index(name) for name in loop.equations().states]  # of neutral effects none
@@ -151,7 +151,7 @@ def predict_ahead(
     starts = starts[(bad[starts + horizon + 1] == bad[starts]) & prediction.settled[starts]]
     if not len(starts):
         return starts, np.empty(0)
-    m, track = machine_for(loop, (), record), make_track(loop, record)
+    m, track = sampled_plant_for(loop, (), record), make_filter_data(loop, record)
     x = np.hstack([prediction.states, prediction.circuit])[starts]
     for j in range(horizon):
         # The outputs after the start are not known to the prediction.
@@ -189,10 +189,10 @@ def spread_ahead(
         stretch is long enough.
     """
     plain = replace(loop, controller=None)
-    track, m = make_track(plain, record), machine_for(plain, (), record)
+    track, m = make_filter_data(plain, record), sampled_plant_for(plain, (), record)
     r, force = prediction.sensor_noise**2, prediction.force_noise**2
     ratio = max(force / r, 1e-300) if r else 1.0
-    plant = begin(
+    plant = begin_fit(
         Problem(m, (track,), EMPTY, EMPTY), EMPTY, Noise((ratio,) * m.channels)
     ).linearized[0]
     lead = int(np.clip(LEAD * horizon, 50, 500))

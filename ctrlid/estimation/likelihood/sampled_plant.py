@@ -13,14 +13,14 @@ import numpy as np
 from ..._base.errors import CtrlidError
 from ...data.record import Record
 from ...loop.loop import Loop
-from ...physics.block_evaluation import Vectorized, through
+from ...physics.block_evaluation import BlockEvaluation, evaluate_blocks
 from ...physics.equations import Array, Equations
 from ...physics.integration import Scheme, known_lags, whole_delay
 from ...physics.linearization import state_matrices
-from .backlash import path_of
-from .filter_data import Track, state_at_rest
-from .initial_conditions import Onset, delay, shifted
-from .transition_maps import Plan, maps_of
+from .backlash import follow_backlash
+from .filter_data import FilterData, state_at_rest
+from .initial_conditions import InitialConditions, delay_signal, shift_signal
+from .transition_maps import PeriodPlan, build_maps
 
 SLOW = 0.35  # rate times step up to which a step of order four is exact enough
 MOST_STEPS = 100  # of order eight in a period: more make an expression that takes minutes to build
@@ -58,7 +58,7 @@ class Linearized:
     trajectory: Trajectory
 
 
-class Machine:
+class SampledPlant:
     """The equations of a loop's plant made ready to be filtered along records.
 
     Machines whose equations differ in the values of their parameters only share their maps.
@@ -89,19 +89,19 @@ class Machine:
         # One force on all velocities; without any, each state has a noise of its own.
         self.channels = 1 if e.velocities else len(self.forces)
         self.scheme = _scheme(e, loop)
-        self.plan = Plan(e, self.law, loop.dt, hold, self.scheme, self.forces, self.channels,
+        self.plan = PeriodPlan(e, self.law, loop.dt, hold, self.scheme, self.forces, self.channels,
                          tuple(self.index), self.late)  # fmt: skip
-        self.maps = maps_of(self.plan)
-        self.onset = Onset(self.plan)
+        self.maps = build_maps(self.plan)
+        self.onset = InitialConditions(self.plan)
 
-    def _period(self, stages: Sequence[Vectorized], x: Array, *given: Any) -> list[Array]:
+    def _period(self, stages: Sequence[BlockEvaluation], x: Array, *given: Any) -> list[Array]:
         """Go through a period; return the state after it and its derivatives, by itself first."""
         if not self.maps.carries:
-            return through(stages, [], [x, *given, 0])
+            return evaluate_blocks(stages, [], [x, *given, 0])
         n = self.size
         widths = [size // n for size in stages[0].sizes[2 : -len(given) - 1]]
         still = [np.eye(n).ravel(), *(np.zeros(n * k) for k in widths)]
-        return through(stages, [x, *still], given, self.maps.parts)
+        return evaluate_blocks(stages, [x, *still], given, self.maps.parts)
 
     @property
     def position(self) -> int:
@@ -122,7 +122,7 @@ class Machine:
         e, dt = self.e, self.loop.dt
         p = casadi.SX(casadi.DM(self.values(theta)))
         if e.delay is not None:
-            late = delay(e, p) / dt + 1e-9
+            late = delay_signal(e, p) / dt + 1e-9
             if not self.late <= late <= self.late + 1 + 1e-6:
                 return False
         time, scheme = _shortest(e, p), self.scheme
@@ -130,7 +130,7 @@ class Machine:
             return time < dt / 4
         return time > (dt / scheme.steps / (2 * _brisk(e)) if scheme.order == 4 else dt / 16)
 
-    def linearize(self, track: Track, theta: Array, at: Trajectory) -> Linearized:
+    def linearize(self, track: FilterData, theta: Array, at: Trajectory) -> Linearized:
         """Return the plant along a trajectory, for parameter values `theta`."""
         p = self.values(theta)
         u = track.table[1]
@@ -148,7 +148,7 @@ class Machine:
             du = dw.sum(axis=2)
             dp = _full(dp, len(u)).copy()
             for k in (-1, 0, 1):
-                dp += dw[:, :, k + 1, None] * shifted(slopes, self.late - k)[:, None, :]
+                dp += dw[:, :, k + 1, None] * shift_signal(slopes, self.late - k)[:, None, :]
         elif len(rows):
             du[rows] = self._moved(rows, given, 1e-3 * float(np.std(u[track.valid])))
         start, wide = self.onset.start(track, p)
@@ -177,7 +177,7 @@ class Machine:
         """Return the input behind the play, and how it depends on the free parameters."""
         if self.e.play is None:
             return u, None
-        return path_of(self.plan).along(self.onset.memory(float(u[0]), p)[0], u, p)
+        return follow_backlash(self.plan).along(self.onset.memory(float(u[0]), p)[0], u, p)
 
     def with_slopes(self) -> casadi.Function:
         """Return one period of the plant, as it is, together with that of its sensitivities.
@@ -203,11 +203,11 @@ class Machine:
             [casadi.vertcat(after, casadi.vec(moved)), casadi.vertcat(y, seen.T)], {"cse": True},
         )  # fmt: skip
 
-    def inputs(self, track: Track, theta: Array) -> Array:
+    def inputs(self, track: FilterData, theta: Array) -> Array:
         """Return the rows over which the map is evaluated, shape (6, n), behind any play."""
         return self._inputs(track, self._through_play(track.table[1], self.values(theta))[0])
 
-    def advance(self, track: Track, x: Array, rows: Any, known: bool = True) -> Array:
+    def advance(self, track: FilterData, x: Array, rows: Any, known: bool = True) -> Array:
         """Return states (k, n) one period after the samples `rows`, with the loop's parameters."""
         p = self.e.values
         w = self._inputs(track, self._through_play(track.table[1], p)[0])[:, rows]
@@ -216,16 +216,16 @@ class Machine:
         quiet = np.zeros((self.n, 1))
         return self._period(self.maps.stages, x.T, w, p, quiet, np.zeros(self.channels))[0][:, :, 0]
 
-    def height(self, track: Track, x: Array, rows: Any) -> Array:
+    def height(self, track: FilterData, x: Array, rows: Any) -> Array:
         """Return the outputs at states (k, n) and the samples `rows`."""
         p = self.e.values
         w = self._inputs(track, self._through_play(track.table[1], p)[0])[:, rows]
         return self.maps.sensor(x.T, w, p, np.zeros((self.n, 1)))[0][:, 0, 0]
 
-    def _inputs(self, track: Track, applied: Array) -> Array:
+    def _inputs(self, track: FilterData, applied: Array) -> Array:
         """Return the rows (t, input before, now, ahead, r, y) over which the map is evaluated."""
         t, _, r, y = track.table
-        moved = [shifted(applied, self.late - k) for k in (-1, 0, 1)]
+        moved = [shift_signal(applied, self.late - k) for k in (-1, 0, 1)]
         return np.vstack([t, *moved, r, y])
 
     def padded(self, values: Array) -> Array:
@@ -287,12 +287,12 @@ def _shortest(e: Equations, p: Any) -> float:
 
 
 @functools.lru_cache(maxsize=8)
-def machine(loop: Loop, names: tuple[str, ...], hold: str, follow: bool) -> Machine:
-    """Return the machine of a loop, made once."""
-    return Machine(loop, names, hold, follow)
+def make_sampled_plant(loop: Loop, names: tuple[str, ...], hold: str, follow: bool) -> SampledPlant:
+    """Return the plant of a loop, made once."""
+    return SampledPlant(loop, names, hold, follow)
 
 
-def machine_for(loop: Loop, names: Sequence[str], record: Record) -> Machine:
-    """Return the machine of a loop for records of one kind."""
+def sampled_plant_for(loop: Loop, names: Sequence[str], record: Record) -> SampledPlant:
+    """Return the plant of a loop for records of one kind."""
     follow = record.r is not None and loop.analog
-    return machine(loop, tuple(names), record.hold, follow)
+    return make_sampled_plant(loop, tuple(names), record.hold, follow)

@@ -8,7 +8,7 @@ from typing import Any
 import casadi
 
 from ...loop.controllers import ControlLaw
-from ...physics.block_evaluation import Vectorized
+from ...physics.block_evaluation import BlockEvaluation
 from ...physics.equations import Equations
 from ...physics.integration import Scheme, advance, input_pieces, integrate
 
@@ -17,7 +17,7 @@ LONG = 3000  # instructions
 
 
 @dataclass(frozen=True)
-class Plan:
+class PeriodPlan:
     """What is to be built; plans that differ in the values of parameters only are equal.
 
     Parameters
@@ -78,14 +78,14 @@ class Plan:
 
 
 @dataclass(frozen=True, eq=False)
-class Maps:
+class TransitionMaps:
     """What is built from expressions: a period in stages, each in equal parts, and the sensor."""
 
     functions: tuple[casadi.Function, ...]
-    stages: tuple[Vectorized, ...]
+    stages: tuple[BlockEvaluation, ...]
     parts: int
     sensor_function: casadi.Function
-    sensor: Vectorized
+    sensor: BlockEvaluation
 
     @property
     def carries(self) -> bool:
@@ -94,7 +94,7 @@ class Maps:
 
 
 @functools.lru_cache(maxsize=BUILT)
-def maps_of(plan: Plan) -> Maps:
+def build_maps(plan: PeriodPlan) -> TransitionMaps:
     """Return the maps, built once: that takes the time of several passes."""
     x, ends, given, by, parts = _period(plan)
     # Behind a play, the input itself depends on the free parameters.
@@ -103,11 +103,11 @@ def maps_of(plan: Plan) -> Maps:
     height = by["height"]
     outputs = [height, casadi.jacobian(height, x), casadi.jacobian(height, by["free"])]
     sensor = casadi.Function("sensor", [x, *given[:3]], outputs, {"cse": True})
-    stages = tuple(Vectorized(f) for f in functions)
-    return Maps(functions, stages, parts, sensor, Vectorized(sensor))
+    stages = tuple(BlockEvaluation(f) for f in functions)
+    return TransitionMaps(functions, stages, parts, sensor, BlockEvaluation(sensor))
 
 
-def _period(plan: Plan) -> tuple[Any, list[Any], list[Any], dict[str, Any], int]:
+def _period(plan: PeriodPlan) -> tuple[Any, list[Any], list[Any], dict[str, Any], int]:
     """Return the state, its value after each stage, what is given, symbols, and the parts."""
     e, n, dt = plan.equations, len(plan.equations.states), plan.dt
     x, p, s = (casadi.SX.sym(k, m) for k, m in (("x", plan.size), ("p", e.p.shape[0]),
@@ -141,8 +141,10 @@ def _exact(scheme: Scheme, kinked: bool) -> Scheme:
     return Scheme(8, steps, (8, steps) if scheme.sharp else None)
 
 
-def _stages_of(plan: Plan, t: Any, x: Any, pieces: Any, p: Any, s: Any, kick: Any, scheme: Scheme,
-               part: Any) -> tuple[list[Any], int]:  # fmt: skip
+def _stages_of(
+    plan: PeriodPlan, t: Any, x: Any, pieces: Any, p: Any, s: Any, kick: Any, scheme: Scheme,
+    part: Any,
+) -> tuple[list[Any], int]:  # fmt: skip
     """Return the maps that make up a period, and how many equal parts each of them has.
 
     Several steps of one kind are one short expression that is gone through several times.
@@ -160,7 +162,7 @@ def _stages_of(plan: Plan, t: Any, x: Any, pieces: Any, p: Any, s: Any, kick: An
     return ends, steps
 
 
-def _followed(plan: Plan, t: Any, x: Any, p: Any, s: Any, kick: Any, u: Any, r: Any, y: Any,
+def _followed(plan: PeriodPlan, t: Any, x: Any, p: Any, s: Any, kick: Any, u: Any, r: Any, y: Any,
               substeps: int) -> Any:  # fmt: skip
     """Advance plant and analog controller together, u being the measured one at the start."""
     e, law, n = plan.equations, plan.law, len(plan.equations.states)

@@ -11,7 +11,7 @@ from ...data.references import random_binary
 from ...design.lead import design_lead
 from ...diagnosis import diagnose
 from ...diagnosis.result import Diagnosis
-from ...diagnosis.wording import percent
+from ...diagnosis.wording import write_percent
 from ...effects import (
     AbstractEffect,
     ActuatorLag,
@@ -150,9 +150,9 @@ def reveal(found: Diagnosis, effect: AbstractEffect, loop: Loop) -> str:
         before, after, floor = (
             _text.quantity(v, gap.unit) for v in (gap.before, gap.after, gap.floor)
         )
+        closed = write_percent(1 - gap.after / gap.before)
         text += (f" On samples that no parameter was fitted to the gap of the {gap.kind} shrank "
-                 f"from {before} to {after}, by {percent(1 - gap.after / gap.before)}; noise alone "
-                 f"leaves {floor}.")  # fmt: skip
+                 f"from {before} to {after}, by {closed}; noise alone leaves {floor}.")  # fmt: skip
     return text
 
 
