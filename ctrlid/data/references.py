@@ -8,9 +8,8 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
+from .._base.arrays import Array
 from .._base.errors import CtrlidError
-
-FloatArray = npt.NDArray[np.float64]
 
 # Feedback taps of maximum-length shift registers, by number of stages (XAPP 052 of Xilinx).
 _TAPS = {
@@ -38,7 +37,7 @@ _TAPS = {
 
 def random_binary(
     n: int, *, amplitude: float, hold: int = 1, around: float = 0.0, seed: int | None = None
-) -> FloatArray:
+) -> Array:
     r"""Return a random binary signal: a coin is tossed every `hold` samples.
 
     .. math:: r_k = r_0 \pm a, \quad \text{the sign new at } k = 0, h, 2h, \dots
@@ -85,7 +84,7 @@ def random_binary(
     return np.repeat(np.where(tosses == 1, around + amplitude, around - amplitude), hold)[:n]
 
 
-def steps(n: int, *, levels: Sequence[float] | npt.ArrayLike, hold: int) -> FloatArray:
+def steps(n: int, *, levels: Sequence[float] | npt.ArrayLike, hold: int) -> Array:
     """Return a staircase: each level for `hold` samples, over and over.
 
     Parameters
@@ -132,7 +131,7 @@ def multisine(
     phases: Literal["schroeder", "random"] = "schroeder",
     around: float = 0.0,
     seed: int | None = None,
-) -> FloatArray:
+) -> Array:
     r"""Return a periodic sum of sines, equally strong on all lines of a frequency band.
 
     .. math:: r_k = r_0 + c \sum_{i \in \text{band}} \cos(2 \pi i k / N + \varphi_i)
@@ -221,7 +220,7 @@ def multisine(
 
 def prbs(
     n: int, *, amplitude: float, order: int, hold: int = 1, around: float = 0.0, seed: int = 1
-) -> FloatArray:
+) -> Array:
     r"""Return a pseudo-random binary sequence of maximum length.
 
     .. math:: b_k = b_{k - i_1} \oplus b_{k - i_2} \oplus \cdots, \quad

@@ -6,9 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from .._base.arrays import Array, ComplexArray
 from .rational import (
-    ComplexArray,
-    FloatArray,
     Rational,
     closed_loop,
     crossings,
@@ -125,7 +124,7 @@ def loop_margins(L: Any) -> Margins:
 def gain_crossovers(loop: Rational) -> list[tuple[float, float]]:
     """Return all (frequency, angle from -1 in radians) where the loop gain is 1."""
 
-    def log_gain(omega: FloatArray) -> FloatArray:
+    def log_gain(omega: Array) -> Array:
         num, den = loop.parts(omega)
         tiny = np.finfo(float).tiny
         return np.log(np.abs(num) + tiny) - np.log(np.abs(den) + tiny)
@@ -139,7 +138,7 @@ def gain_crossovers(loop: Rational) -> list[tuple[float, float]]:
 def _critical_factors(loop: Rational) -> list[float]:
     """Return the factors k for which k L passes through -1."""
 
-    def sine_of_phase(omega: FloatArray) -> FloatArray:
+    def sine_of_phase(omega: Array) -> Array:
         num, den = loop.parts(omega)
         return (num * den.conj()).imag / (np.abs(num) * np.abs(den) + np.finfo(float).tiny)
 
@@ -154,7 +153,7 @@ def _critical_factors(loop: Rational) -> list[float]:
 def modulus_margin(loop: Rational) -> float:
     """Return the smallest distance of L from -1."""
 
-    def distance(omega: FloatArray) -> FloatArray:
+    def distance(omega: Array) -> Array:
         num, den = loop.parts(omega)
         with np.errstate(divide="ignore"):
             return np.abs(num + den) / np.abs(den)
@@ -162,7 +161,7 @@ def modulus_margin(loop: Rational) -> float:
     return smallest(distance, _grid(loop), (0.0, loop.nyquist))[1]
 
 
-def _grid(loop: Rational, *candidates: FloatArray) -> FloatArray:
+def _grid(loop: Rational, *candidates: Array) -> Array:
     total = np.polyadd(loop.num, loop.den)
     return frequencies(loop.dt, [loop.num, loop.den, total], candidates)
 
@@ -227,7 +226,7 @@ def nu_gap(P1: Any, P2: Any) -> float:
     if len(inside) != first.order:
         return 1.0
 
-    def closeness(omega: FloatArray) -> FloatArray:
+    def closeness(omega: Array) -> Array:
         (a1, b1), (a2, b2) = first.parts(omega), second.parts(omega)
         return -np.abs(a1 * b2 - a2 * b1) / (_length(a1, b1) * _length(a2, b2))
 
@@ -285,7 +284,7 @@ def robust_margin(P: Any, C: Any) -> float:
     if poles is None or not is_stable(poles, loop.dt):
         return 0.0
 
-    def margin(omega: FloatArray) -> FloatArray:
+    def margin(omega: Array) -> Array:
         (a1, b1), (a2, b2) = plant.parts(omega), controller.parts(omega)
         return np.abs(a1 * a2 + b1 * b2) / (_length(a1, b1) * _length(a2, b2))
 
@@ -294,11 +293,11 @@ def robust_margin(P: Any, C: Any) -> float:
     return smallest(margin, grid, (0.0, loop.nyquist))[1]
 
 
-def _length(num: ComplexArray, den: ComplexArray) -> FloatArray:
+def _length(num: ComplexArray, den: ComplexArray) -> Array:
     return np.asarray(np.hypot(np.abs(num), np.abs(den)), dtype=float)
 
 
-def _spectra(*systems: Rational) -> list[FloatArray]:
+def _spectra(*systems: Rational) -> list[Array]:
     """Return n* n + d* d of each system: where its size against 1 changes."""
     return [
         np.polyadd(np.polymul(x.num, x.flipped(x.num)), np.polymul(x.den, x.flipped(x.den)))

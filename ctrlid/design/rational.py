@@ -10,11 +10,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import brentq, minimize_scalar
 
+from .._base.arrays import Array, ComplexArray
 from .._base.errors import CtrlidError
 
-FloatArray = npt.NDArray[np.float64]
-ComplexArray = npt.NDArray[np.complex128]
-Function = Callable[[FloatArray], FloatArray]
+Function = Callable[[Array], Array]
 
 # A closed-loop pole closer to the stability limit than this share of its size counts as unstable.
 AXIS_TOLERANCE = 1e-9
@@ -33,8 +32,8 @@ class Rational:
         Sampling period in seconds, 0 for continuous time.
     """
 
-    num: FloatArray
-    den: FloatArray
+    num: Array
+    den: Array
     dt: float
 
     def __mul__(self, other: "Rational") -> "Rational":
@@ -94,7 +93,7 @@ class Rational:
         """Return the roots of den."""
         return roots(self.den)
 
-    def flipped(self, coefficients: FloatArray) -> FloatArray:
+    def flipped(self, coefficients: Array) -> Array:
         """Return coefficients of c(-s), or of z**order c(1/z): the conjugate on the boundary."""
         if self.dt:
             return np.concatenate([np.zeros(len(self.den) - len(coefficients)), coefficients])[::-1]
@@ -163,7 +162,7 @@ def rational(system: Any, name: str) -> Rational:
     return Rational(num, den, dt)
 
 
-def _state_space_polynomials(system: Any) -> tuple[FloatArray, FloatArray]:
+def _state_space_polynomials(system: Any) -> tuple[Array, Array]:
     """Return num and den from the impulse response, whose exact zeros leave no dust."""
     den = np.atleast_1d(np.real(np.poly(system.A))) if system.nstates else np.ones(1)
     impulse, x = [float(system.D[0, 0])], system.B
@@ -173,7 +172,7 @@ def _state_space_polynomials(system: Any) -> tuple[FloatArray, FloatArray]:
     return np.convolve(den, impulse)[: len(den)], den
 
 
-def _without_dust(num: FloatArray, den: FloatArray, dt: float) -> tuple[FloatArray, FloatArray]:
+def _without_dust(num: Array, den: Array, dt: float) -> tuple[Array, Array]:
     """Drop leading coefficients that are rounding errors of a conversion."""
     den = np.trim_zeros(den, "f")
     scale = 1.0 if dt else float(max(np.abs(roots(den)), default=1.0) or 1.0)
@@ -191,7 +190,7 @@ def same_time_base(first: Rational, second: Rational, names: str) -> None:
         )
 
 
-def product(first: FloatArray, second: FloatArray) -> FloatArray:
+def product(first: Array, second: Array) -> Array:
     """Return the product of two polynomials."""
     return np.convolve(first, second)
 
@@ -201,7 +200,7 @@ def roots(polynomial: npt.ArrayLike) -> ComplexArray:
     return np.asarray(np.roots(np.asarray(polynomial)), dtype=complex)
 
 
-def real_polynomial(zeros: Iterable[complex]) -> FloatArray:
+def real_polynomial(zeros: Iterable[complex]) -> Array:
     """Return the monic real polynomial with these roots."""
     return np.atleast_1d(np.real(np.poly(np.array(list(zeros), dtype=complex)))).astype(float)
 
@@ -236,7 +235,7 @@ def closed_loop(loop: Rational) -> ComplexArray | None:
 
 def frequencies(
     dt: float, acting: Iterable[npt.ArrayLike], special: Iterable[npt.ArrayLike] = ()
-) -> FloatArray:
+) -> Array:
     """Return a grid in rad/s, dense wherever the roots of the `acting` polynomials act.
 
     A resonance at |Im s| is as narrow as |Re s|, so each root brings its own points. Roots of the
@@ -256,7 +255,7 @@ def frequencies(
     return np.unique(grid[(grid >= bottom) & (grid <= top)])
 
 
-def smallest(function: Function, grid: FloatArray, ends: tuple[float, ...]) -> tuple[float, float]:
+def smallest(function: Function, grid: Array, ends: tuple[float, ...]) -> tuple[float, float]:
     """Return (frequency, value) of the minimum over grid and ends, refined between grid points."""
     values = function(grid)
     dips = [
@@ -279,7 +278,7 @@ def smallest(function: Function, grid: FloatArray, ends: tuple[float, ...]) -> t
     return min(found, key=lambda pair: pair[1])
 
 
-def crossings(function: Function, grid: FloatArray) -> list[float]:
+def crossings(function: Function, grid: Array) -> list[float]:
     """Return the frequencies where the function changes sign or touches zero."""
     values = function(grid)
     values[np.abs(values) < 1e-13] = 0.0

@@ -8,13 +8,13 @@ from typing import Any
 import control as ct
 import numpy as np
 
+from .._base.arrays import Array
 from .._base.errors import CtrlidError
 from .._base.text import Printed, polynomial, quantity
 from ..estimation.identified_model import IdentifiedModel
 from ..loop.loop import Loop
 from ..loop.period_map import growth_rate
 from ..loop.simulation import SimulationStopped, simulate
-from ..physics.equations import Array
 from ..physics.trace import timebase
 from .lead import design_lead
 from .margins import loop_margins, nu_gap, robust_margin

@@ -5,8 +5,8 @@ from collections.abc import Mapping
 import numpy as np
 from scipy import stats
 
+from .._base.arrays import Array
 from ..estimation.likelihood.likelihood import Fit
-from ..physics.equations import Array
 from .thresholds import THRESHOLD
 
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from .._base.arrays import Array
 from .._base.errors import CtrlidError
 from ..data.record import Record
 from ..data.references import random_binary
@@ -13,7 +14,6 @@ from ..estimation.likelihood.likelihood import Known
 from ..estimation.likelihood.maximization import begin_fit, expected_gain
 from ..estimation.likelihood.physics_fit import make_problem
 from ..loop.simulation import Simulator
-from ..physics.equations import Array
 from .candidates import Trial
 from .thresholds import THRESHOLD
 

@@ -4,8 +4,8 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
+from .._base.arrays import Array
 from ..effects import AbstractEffect
-from ..physics.equations import Array
 from .thresholds import THRESHOLD
 
 Verdict = Literal["nothing missing", "explained", "partly explained", "unknown"]

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from .._base.arrays import Array
 from ..estimation.likelihood.filter_data import prepare_for_loop
 from ..estimation.likelihood.kalman_filter import Noise, first_guess
 from ..estimation.likelihood.likelihood import Fit, evaluate, linearize_again
@@ -14,7 +15,6 @@ from ..estimation.likelihood.physics_fit import parameter_bounds, start_values
 from ..estimation.likelihood.sampled_plant import SampledPlant, Trajectory
 from ..loop.loop import Loop
 from ..loop.period_map import comes_to_rest
-from ..physics.equations import Array
 from .thresholds import THRESHOLD
 
 

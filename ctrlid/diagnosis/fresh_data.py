@@ -6,13 +6,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from .._base.arrays import Array
 from .._base.errors import CtrlidError
 from ..data.record import Record
 from ..estimation.likelihood.likelihood import Fit, Known, evaluate
 from ..estimation.likelihood.maximization import begin_fit, maximize
 from ..estimation.likelihood.physics_fit import make_problem, start_values
 from ..loop.loop import Loop
-from ..physics.equations import Array
 from . import gap as gaps
 from .fitted_model import Model
 from .recalibration import cut_stretches

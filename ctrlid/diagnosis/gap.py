@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from scipy import signal
 
+from .._base.arrays import Array
 from .._base.errors import CtrlidError
 from ..data.record import Record
 from ..estimation.likelihood.filter_data import FEWEST
@@ -18,7 +19,6 @@ from ..loop.initial_state import best_start
 from ..loop.loop import Loop
 from ..loop.period_map import comes_to_rest
 from ..loop.simulation import Simulator
-from ..physics.equations import Array
 from ..validation.comparing import moving_poles, time_constant
 from .thresholds import THRESHOLD
 

@@ -5,9 +5,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from .._base.arrays import Array
 from ..effects import AbstractEffect
 from ..estimation.likelihood.likelihood import Fit
-from ..physics.equations import Array
 from .candidates import Trial
 from .fitted_model import Model
 from .thresholds import THRESHOLD

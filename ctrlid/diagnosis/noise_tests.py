@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
+from .._base.arrays import Array
 from ..estimation.likelihood.likelihood import Fit
-from ..physics.equations import Array
 from ..validation.residual_tests import remembered
 from .constancy import chance_of_line, find_bin_edges, find_bins, run_constancy_tests
 from .thresholds import THRESHOLD

@@ -8,13 +8,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import optimize
 
+from .._base.arrays import Array
 from ..data.record import Record
 from ..estimation.likelihood.kalman_filter import Noise
 from ..estimation.likelihood.likelihood import Fit, Known, evaluate, pseudo_inverse
 from ..estimation.likelihood.physics_fit import make_problem
 from ..estimation.likelihood.sampled_plant import Trajectory
 from ..loop.loop import Loop
-from ..physics.equations import Array
 from ..validation.residual_tests import remembered
 from .thresholds import THRESHOLD
 

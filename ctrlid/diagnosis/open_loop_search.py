@@ -10,10 +10,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from .._base.arrays import Array
 from .._base.errors import CtrlidError
 from ..effects import AbstractEffect, ParameterStep, PeriodicForce, StateLimit
 from ..estimation.likelihood.physics_fit import start_values
-from ..physics.equations import Array
 from .candidates import Trial, list_candidates, same_kind
 from .fitted_model import Model
 from .fresh_data import FreshData

@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from .._base.arrays import Array
 from .._base.errors import CtrlidError
 from ..data.record import Record
 from ..estimation.likelihood.maximization import begin_fit, maximize, refit_noise_size
 from ..estimation.likelihood.noise_fit import known_from_repeats
 from ..estimation.likelihood.physics_fit import choose_noise, make_problem, start_values
 from ..loop.loop import Loop
-from ..physics.equations import Array
 from .fitted_model import Model
 from .thresholds import THRESHOLD
 

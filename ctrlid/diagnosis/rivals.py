@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from .._base.arrays import Array
 from ..estimation.likelihood.maximization import maximize
-from ..physics.equations import Array
 from .candidates import Trial, contains, same_kind
 from .fitted_model import Model, log_terms
 from .noise_tests import run_noise_tests

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from .._base.arrays import Array
 from .._base.errors import CtrlidError
 from ..effects import (
     AbstractEffect,
@@ -19,7 +20,6 @@ from ..effects import (
 )
 from ..estimation.likelihood.kalman_filter import run_filter
 from ..estimation.likelihood.likelihood import pseudo_inverse
-from ..physics.equations import Array
 from .candidates import Trial
 from .fitted_model import Model
 from .screening import screen_candidate, screen_starts

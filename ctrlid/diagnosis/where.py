@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ..physics.equations import Array
+from .._base.arrays import Array
 from .constancy import find_bin_edges, find_bins
 from .findings import Place
 from .noise_tests import NoiseTests

@@ -7,8 +7,9 @@ from typing import Any
 import casadi
 import numpy as np
 
+from .._base.arrays import Array
 from .._base.errors import CtrlidError
-from ..physics.equations import Array, Equations
+from ..physics.equations import Equations
 from .base import AbstractEffect
 from .catalogue import CATALOGUE
 from .context import motion

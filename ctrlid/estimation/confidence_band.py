@@ -6,13 +6,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import t as student_t
 
+from .._base.arrays import Array
 from .._base.errors import CtrlidError
 from .identified_model import IdentifiedModel
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,13 +29,13 @@ class ResponseBand:
         Probability with which the limits hold at one frequency.
     """
 
-    omega: FloatArray
-    magnitude: FloatArray
-    magnitude_low: FloatArray
-    magnitude_high: FloatArray
-    phase: FloatArray
-    phase_low: FloatArray
-    phase_high: FloatArray
+    omega: Array
+    magnitude: Array
+    magnitude_low: Array
+    magnitude_high: Array
+    phase: Array
+    phase_low: Array
+    phase_high: Array
     level: float
 
 

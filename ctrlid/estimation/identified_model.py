@@ -8,15 +8,12 @@ from typing import Any, Literal
 
 import control
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import binom
 from scipy.stats import t as student_t
 
 from .._base import text as _text
+from .._base.arrays import Array, ComplexArray
 from .._base.errors import CtrlidError
-
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 PAIRS = ("ReciprocalPoles", "SymmetricPoles")  # constraints that say that a plant is unstable
 
@@ -58,7 +55,7 @@ class Structure:
         b = (f"b{i}" for i in range(1, self.nb + 1))
         return (*a, *b)
 
-    def vector(self, weights: Mapping[str, float], who: str = "A constraint") -> FloatArray:
+    def vector(self, weights: Mapping[str, float], who: str = "A constraint") -> Array:
         """Weights by coefficient name as a ``(na + nb,)`` vector; unknown names are refused."""
         row = np.zeros(len(self.names))
         for name, weight in weights.items():
@@ -70,7 +67,7 @@ class Structure:
             row[self.names.index(name)] = weight
         return row
 
-    def fraction(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def fraction(self, theta: Array) -> tuple[Array, Array]:
         """Numerator and denominator in falling powers of z (or s)."""
         denominator = np.concatenate([[1.0], theta[: self.na]])
         numerator = np.asarray(theta[self.na :], dtype=float)
@@ -150,9 +147,9 @@ class Estimate(_text.Printed):
     """
 
     structure: Structure
-    values: FloatArray
-    covariance: FloatArray
-    intercepts: FloatArray
+    values: Array
+    covariance: Array
+    intercepts: Array
     rss: float
     residual_variance: float
     n_samples: int
@@ -182,7 +179,7 @@ class Estimate(_text.Printed):
         return tuple(str(bound) for bound in self.active_bounds)
 
     @property
-    def standard_errors(self) -> FloatArray:
+    def standard_errors(self) -> Array:
         """Standard errors of the coefficients, valid for white equation error only."""
         return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
 
@@ -243,7 +240,7 @@ class Estimate(_text.Printed):
             return np.asarray(np.log1p(self._shifted_poles) / self.dt, dtype=complex)
 
     @property
-    def poles_standard_errors(self) -> FloatArray:
+    def poles_standard_errors(self) -> Array:
         """Standard errors of ``poles`` by the delta method.
 
         ``dz/da_i = -z^(na-i) / A'(z)``. For a complex pole it is the root of the summed variances
@@ -254,19 +251,19 @@ class Estimate(_text.Printed):
         return root_errors(self.poles, self.covariance[:na, :na])
 
     @property
-    def poles_s_standard_errors(self) -> FloatArray:
+    def poles_s_standard_errors(self) -> Array:
         """Standard errors of ``poles_s`` by the delta method, in rad/s."""
         if self.structure.domain == "s":
             return self.poles_standard_errors
         with np.errstate(divide="ignore", invalid="ignore"):
-            errors: FloatArray = self.poles_standard_errors / (np.abs(self.poles) * self.dt)
+            errors: Array = self.poles_standard_errors / (np.abs(self.poles) * self.dt)
         return errors
 
     def __str__(self) -> str:
         return _report(self)
 
 
-def root_errors(roots: ComplexArray, covariance: FloatArray) -> FloatArray:
+def root_errors(roots: ComplexArray, covariance: Array) -> Array:
     """Return the standard errors of the roots of a monic polynomial, by the delta method.
 
     Parameters

@@ -8,16 +8,14 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from .._base import text as _text
+from .._base.arrays import Array
 from .._base.errors import CtrlidError
 from .._base.jobs import check_jobs, spread
 from ..data.record import Record
 from .identified_model import IdentifiedModel
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,16 +65,16 @@ class FitSeries(_text.Printed):
 
     models: tuple[IdentifiedModel, ...]
     names: tuple[str, ...]
-    levels: FloatArray
+    levels: Array
     unit: str
 
     @property
-    def rates(self) -> FloatArray:
+    def rates(self) -> Array:
         """Real part of the rightmost pole of each model [rad/s]: that of an unstable plant."""
         return np.array([self._poles(k)[0].real for k in range(len(self.models))])
 
     @property
-    def rate_errors(self) -> FloatArray:
+    def rate_errors(self) -> Array:
         """Standard errors of `rates` [rad/s]."""
         return np.array([self._errors(k)[0] for k in range(len(self.models))])
 
@@ -87,8 +85,8 @@ class FitSeries(_text.Printed):
     def _poles(self, k: int) -> Any:
         return self.models[k].estimate.poles_s[self._order(k)]
 
-    def _errors(self, k: int) -> FloatArray:
-        errors: FloatArray = self.models[k].estimate.poles_s_standard_errors[self._order(k)]
+    def _errors(self, k: int) -> Array:
+        errors: Array = self.models[k].estimate.poles_s_standard_errors[self._order(k)]
         return errors
 
     @property

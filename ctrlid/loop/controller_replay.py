@@ -7,9 +7,9 @@ from typing import Any
 import casadi
 import numpy as np
 
+from .._base.arrays import Array
 from .._base.errors import CtrlidError
 from ..data.record import Record
-from ..physics.equations import Array
 from .loop import Loop
 
 

@@ -6,10 +6,10 @@ import casadi
 import numpy as np
 from scipy import optimize
 
+from .._base.arrays import Array
 from .._base.errors import CtrlidError
 from ..data.record import Record
 from ..effects.context import motion
-from ..physics.equations import Array
 from ..physics.linearization import state_matrices
 from .simulation import Simulator
 

@@ -9,8 +9,9 @@ from typing import Any
 import casadi
 import numpy as np
 
+from .._base.arrays import Array
 from .._base.errors import CtrlidError
-from ..physics.equations import Array, Equations
+from ..physics.equations import Equations
 from ..physics.integration import Piece, Scheme, advance, input_pieces, integrate, whole_delay
 from .loop import Loop
 

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from .._base.arrays import Array
 from .._base.errors import CtrlidError, CtrlidWarning
 from ..data.record import Record
-from ..physics.equations import Array
 from .loop import Loop
 from .period_map import growth_rate, make_period_map, sensitivity
 

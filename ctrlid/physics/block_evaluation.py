@@ -12,9 +12,9 @@ import casadi
 import numba
 import numpy as np
 
+from .._base.arrays import Array
 from .._base.errors import CtrlidError
 from .._base.jobs import processors, side_by_side
-from .equations import Array
 from .interpreter import BINARY, UNARY, sweep
 
 BLOCK = 512  # samples at once: long enough that a loop costs little, short enough for the cache

@@ -8,9 +8,8 @@ from typing import Any
 import casadi
 import numpy as np
 
+from .._base.arrays import Array
 from .._base.errors import CtrlidError
-
-Array = np.ndarray[Any, np.dtype[np.float64]]
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,8 +10,9 @@ import control as ct
 import numpy as np
 from scipy import linalg
 
+from .._base.arrays import Array
 from .._base.errors import CtrlidError
-from .equations import Array, Equations, require_siso
+from .equations import Equations, require_siso
 from .trace import trace
 
 UNREACHABLE = 1e-12  # relative coupling below which a state is only round-off away from the input

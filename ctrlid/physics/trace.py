@@ -11,9 +11,10 @@ import control as ct
 import numpy as np
 from control.nlsys import InterconnectedSystem
 
+from .._base.arrays import Array
 from .._base.errors import CtrlidError
 from . import canonical
-from .equations import Array, Equations
+from .equations import Equations
 from .symbols import Symbol, Symbols, TracingError, lift
 from .tracing import rebind
 

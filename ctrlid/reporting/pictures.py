@@ -9,10 +9,10 @@ import control as ct
 import numpy as np
 
 from .._base import text as _text
+from .._base.arrays import Array
 from .._base.errors import CtrlidError
 from ..diagnosis.findings import Candidate, Gap, Place
 from ..diagnosis.result import Diagnosis
-from ..physics.equations import Array
 from ..physics.trace import timebase
 from ..validation.comparison import Comparison
 

@@ -9,6 +9,7 @@ import control as ct
 import numpy as np
 from scipy import signal
 
+from .._base.arrays import Array
 from .._base.errors import CtrlidError, CtrlidWarning
 from .._base.text import number
 from ..data.record import Record
@@ -22,7 +23,6 @@ from ..loop.initial_state import best_start
 from ..loop.loop import Loop
 from ..loop.period_map import growth_rate
 from ..loop.simulation import Simulator
-from ..physics.equations import Array
 from ..physics.linearization import state_matrices
 from ..physics.trace import timebase
 from .comparison import EXACT, Comparison, Curve

@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .._base.arrays import Array
 from .._base.errors import CtrlidError
 from .._base.text import Printed
 from ..data.record import Record
-from ..physics.equations import Array
 from .residual_tests import Correlation
 
 SYSTEMATIC = 0.05  # share of an error that follows the signals and is worth a word

@@ -4,15 +4,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy import linalg, stats
 
+from .._base.arrays import Array
 from .._base.errors import CtrlidError
 from .._base.text import Printed
 from ..data.record import Record
 from .residual_tests import Correlation, cross_correlation
-
-FloatArray = npt.NDArray[np.float64]
 
 LEVEL = 1e-3  # chance of calling an open loop closed
 ORDER = 20  # most past samples of each signal
@@ -46,7 +44,7 @@ class FeedbackCheck(Printed):
     closed_loop: bool
     p_value: float
     lags: Any
-    correlation: FloatArray
+    correlation: Array
     text: str
 
     def __str__(self) -> str:
@@ -147,9 +145,7 @@ def _chance(test: Correlation) -> float:
     return float(max(test.p_value, min(1.0, 2 * len(test.lags) * stats.norm.sf(largest))))
 
 
-def _law(
-    signals: dict[str, FloatArray], valid: Any, order: int, held: bool
-) -> FeedbackCheck | None:
+def _law(signals: dict[str, Array], valid: Any, order: int, held: bool) -> FeedbackCheck | None:
     """Return the answer if a short law of r and y gives u, and none of r alone comes near.
 
     A held input is no function of y up to now if it was made without it, so there an exact law
@@ -175,9 +171,7 @@ def _law(
     return None
 
 
-def _at_once(
-    signals: dict[str, FloatArray], valid: Any, w: FloatArray, e: FloatArray, order: int
-) -> bool:
+def _at_once(signals: dict[str, Array], valid: Any, w: Array, e: Array, order: int) -> bool:
     """Return whether the plant, and not a controller, may tie u to y of the same sample.
 
     An input that runs straight between the samples moves y within its own period, but a plant
@@ -191,12 +185,12 @@ def _at_once(
 
 
 def _left(
-    signals: dict[str, FloatArray],
+    signals: dict[str, Array],
     valid: Any,
     target: str,
     past: dict[str, tuple[int, int]],
     robust: bool = False,
-) -> tuple[FloatArray, Any]:
+) -> tuple[Array, Any]:
     """Return what a regression on past samples leaves of a signal, and the rows that count.
 
     Robust means that jumps, of an unknown reference for instance, neither bend the regression nor
@@ -230,11 +224,11 @@ def _left(
     return out, rows
 
 
-def _solve(table: FloatArray, goal: FloatArray) -> FloatArray:
+def _solve(table: Array, goal: Array) -> Array:
     return np.asarray(linalg.lstsq(table, goal, cond=1e-13, lapack_driver="gelsy")[0], dtype=float)
 
 
-def _order(signals: dict[str, FloatArray], valid: Any, keys: str, target: str, now: int) -> int:
+def _order(signals: dict[str, Array], valid: Any, keys: str, target: str, now: int) -> int:
     """Return how many past samples make a signal an exact function, or a number beyond `LAW`."""
     for order in range(LAW + 1):
         past = {k: (now if k == target or target == "y" else 0, order) for k in keys}
@@ -245,7 +239,7 @@ def _order(signals: dict[str, FloatArray], valid: Any, keys: str, target: str, n
     return LAW + 1
 
 
-def _exact(signals: dict[str, FloatArray], valid: Any, now: int) -> FeedbackCheck:
+def _exact(signals: dict[str, Array], valid: Any, now: int) -> FeedbackCheck:
     """Decide without noise, by the laws that hold exactly."""
 
     def answer(closed: bool, text: str) -> FeedbackCheck:
@@ -266,7 +260,7 @@ def _exact(signals: dict[str, FloatArray], valid: Any, now: int) -> FeedbackChec
                   "law that needs y. Without noise this is no proof of an open loop.")  # fmt: skip
 
 
-def _unstable(signals: dict[str, FloatArray], valid: Any, order: int, now: int) -> bool:
+def _unstable(signals: dict[str, Array], valid: Any, order: int, now: int) -> bool:
     """Return whether the exact difference equation has a pole clearly outside the unit circle."""
     reach = order
     bad = np.concatenate([[0], np.cumsum(~valid)])

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy import optimize, signal
 
-from ..physics.equations import Array
+from .._base.arrays import Array
 
 SAMPLES = 20_000  # enough to tell the colour
 

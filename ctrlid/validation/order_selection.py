@@ -6,14 +6,12 @@ from numbers import Integral
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy import linalg, stats
 
+from .._base.arrays import Array
 from .._base.errors import CtrlidError
 from .._base.text import Printed
 from ..data.record import Record
-
-FloatArray = npt.NDArray[np.float64]
 
 LONGEST = 60  # lags of the long regression
 ROWS = 30_000  # that it uses at most
@@ -51,7 +49,7 @@ class OrderRow:
     p_value: float
     bic: float
     held_out: float
-    values: FloatArray
+    values: Array
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -182,8 +180,8 @@ def select_order(
 class _Long:
     """The long regression: coefficients of A, then of B, then a constant; covariance without it."""
 
-    eta: FloatArray
-    covariance: FloatArray
+    eta: Array
+    covariance: Array
     variance: float
     rows: int
     length: int
@@ -203,7 +201,7 @@ def _rows(record: Record, start: int, stop: int, length: int) -> Any:
     return rows[bad[rows + 1] == bad[rows - length]][:ROWS]
 
 
-def _table(record: Record, rows: Any, length: int) -> tuple[FloatArray, FloatArray]:
+def _table(record: Record, rows: Any, length: int) -> tuple[Array, Array]:
     y, u = (s - np.mean(s[record.valid]) for s in (record.y, record.u))
     spread = float(np.std(y[record.valid]))
     y = y + WHISPER * spread * np.random.default_rng(1).standard_normal(len(y))
@@ -247,14 +245,14 @@ def _length(record: Record, cut: int, most: int) -> int:
     return min(longest, max(best + 5, most + 4))
 
 
-def _shift(p: FloatArray, k: int, length: int) -> FloatArray:
+def _shift(p: Array, k: int, length: int) -> Array:
     """Return coefficients of lags 1 to length of a polynomial from lag 0, delayed by k."""
     out = np.zeros(length + 1)
     out[k : length + 1] = p[: max(length + 1 - k, 0)]
     return out[1:]
 
 
-def _reduce(long: _Long, na: int, nb: int, nk: int) -> tuple[FloatArray, float, FloatArray]:
+def _reduce(long: _Long, na: int, nb: int, nk: int) -> tuple[Array, float, Array]:
     """Return the coefficients of a structure, its distance, and the long regression bent to it."""
     n = long.length
     A = np.concatenate([[1.0], long.eta[:n]])

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy import linalg, signal, stats
 
-from ..physics.equations import Array
+from .._base.arrays import Array
 
 LEVEL = 0.99  # of the drawn bands and of the tests
 MEMORY = 1000  # longest correlation of residuals that is looked for [samples]

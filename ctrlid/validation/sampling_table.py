@@ -4,13 +4,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from .._base.arrays import Array
 from .._base.errors import CtrlidError
 from .._base.text import Printed, listing, number
 from ..data.record import Record
-
-FloatArray = npt.NDArray[np.float64]
 
 FAR = 10.0  # a disagreement beyond which it no longer matters how large it is
 
@@ -57,7 +55,7 @@ class SamplingRow:
     n: int
     input_between: str
     poles: Any
-    standard_errors: FloatArray
+    standard_errors: Array
     white: bool | None = None
     independent: bool | None = None
     active: tuple[str, ...] = ()
@@ -66,7 +64,7 @@ class SamplingRow:
     notes: tuple[str, ...] = ()
 
     @property
-    def pole_times_period(self) -> FloatArray:
+    def pole_times_period(self) -> Array:
         """The poles' absolute values times the sampling period."""
         return np.asarray(np.abs(self.poles) * self.period, dtype=float)
 

@@ -8,10 +8,9 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy import ndimage, stats
 
-FloatArray = npt.NDArray[np.float64]
+from .._base.arrays import Array
 
 ENOUGH = 20_000  # samples from which a grid is read
 LEVELS = 12  # distinct values up to which a signal may be a staircase
@@ -28,26 +27,26 @@ def find_runs(mask: Any) -> tuple[Any, Any]:
     return edges[::2], edges[1::2]
 
 
-def rounding_of(v: FloatArray) -> float:
+def rounding_of(v: Array) -> float:
     """Return the difference up to which two values of a signal are the same number."""
     return 4 * float(np.spacing(np.max(np.abs(v))))
 
 
-def count_distinct(v: FloatArray) -> tuple[FloatArray, Any]:
+def count_distinct(v: Array) -> tuple[Array, Any]:
     """Return the values of a signal in rising order and how often each occurs."""
     values, counts = np.unique(v, return_counts=True)
     first = np.flatnonzero(np.concatenate([[True], np.diff(values) > rounding_of(v)]))
     return values[first], np.add.reduceat(counts, first)
 
 
-def find_held(v: FloatArray) -> bool:
+def find_held(v: Array) -> bool:
     """Return whether a signal is a staircase of few levels, as a program gives it out."""
     if len(np.unique(v[:ENOUGH])) > LEVELS or len(np.unique(v)) > LEVELS:
         return False
     return float(np.mean(np.diff(v) != 0)) < 0.2
 
 
-def grid_step(v: FloatArray) -> float:
+def grid_step(v: Array) -> float:
     r"""Return the step of the grid on which all values of a signal lie, or 0.
 
     .. math:: v_k = v_0 + q \, i_k, \quad i_k \text{ whole}
@@ -101,7 +100,7 @@ def grid_step(v: FloatArray) -> float:
     return step
 
 
-def find_stuck(v: FloatArray, driver: FloatArray) -> tuple[float, float]:
+def find_stuck(v: Array, driver: Array) -> tuple[float, float]:
     """Return the share of the samples at which a signal sits on its extreme, and that value.
 
     Zero unless it is nearly all of them, and the signal leaves the value far less often than what
@@ -116,8 +115,8 @@ def find_stuck(v: FloatArray, driver: FloatArray) -> tuple[float, float]:
 
 
 def find_clipped(
-    v: FloatArray, valid: Any, others: Sequence[FloatArray], step: float, side: int,
-    reference: FloatArray | None = None,
+    v: Array, valid: Any, others: Sequence[Array], step: float, side: int,
+    reference: Array | None = None,
 ) -> tuple[Any, float]:  # fmt: skip
     """Return where a signal sits on its extreme value too often, and that value.
 
@@ -181,7 +180,7 @@ def find_clipped(
     return (at if enough else none), side * limit
 
 
-def find_repeats(v: FloatArray, valid: Any, step: float, ignore: Any) -> Any:
+def find_repeats(v: Array, valid: Any, step: float, ignore: Any) -> Any:
     """Return where a signal repeats its last value although it moves just before and after.
 
     A quantised signal that moves by many steps a sample passes through a difference of nought as
@@ -225,7 +224,7 @@ def find_repeats(v: FloatArray, valid: Any, step: float, ignore: Any) -> Any:
     return none
 
 
-def find_spikes(v: FloatArray, valid: Any, step: float) -> FloatArray:
+def find_spikes(v: Array, valid: Any, step: float) -> Array:
     r"""Return the height of isolated spikes, 0 where there is none.
 
     A spike is off the line through the two samples before it, off the line through the two after
@@ -273,7 +272,7 @@ def find_spikes(v: FloatArray, valid: Any, step: float) -> FloatArray:
     return height
 
 
-def find_drift(y: FloatArray, causes: Sequence[FloatArray]) -> tuple[float, float, float]:
+def find_drift(y: Array, causes: Sequence[Array]) -> tuple[float, float, float]:
     r"""Return how far a signal drifts over the record, next to what its causes explain.
 
     .. math:: \bar y_i = c + \sum_j g_j \bar w_{ij} + d_1 t_i + d_2 t_i^2 + d_3 t_i^3 + e_i
@@ -304,16 +303,16 @@ def find_drift(y: FloatArray, causes: Sequence[FloatArray]) -> tuple[float, floa
     edges = np.linspace(0, n, m + 1).astype(int)[:-1]
     size = np.diff(np.append(edges, n))
 
-    def columns(signals: Sequence[FloatArray], t: FloatArray) -> FloatArray:
+    def columns(signals: Sequence[Array], t: Array) -> Array:
         scaled = [(w - np.mean(w)) / s for w in signals if (s := float(np.std(w))) > 0]
         return np.column_stack([np.ones(len(t)), *scaled, t, t**2, t**3])
 
-    def split(target: FloatArray, table: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def split(target: Array, table: Array) -> tuple[Array, Array]:
         beta = np.asarray(np.linalg.lstsq(table, target, rcond=1e-9)[0], dtype=float)
         return beta, target - table @ beta
 
-    def means(s: FloatArray) -> FloatArray:
-        out: FloatArray = np.add.reduceat(s, edges) / size
+    def means(s: Array) -> Array:
+        out: Array = np.add.reduceat(s, edges) / size
         return out
 
     y = y - y[0]
@@ -335,7 +334,7 @@ def find_drift(y: FloatArray, causes: Sequence[FloatArray]) -> tuple[float, floa
     return change, scatter, float(stats.f.sf(f, 3, free))
 
 
-def find_beyond_law(u: FloatArray, y: FloatArray, valid: Any) -> float:
+def find_beyond_law(u: Array, y: Array, valid: Any) -> float:
     """Return the share of u's variance that no linear law of y and past u gives, at most ten back.
 
     Parameters
@@ -366,7 +365,7 @@ def find_beyond_law(u: FloatArray, y: FloatArray, valid: Any) -> float:
     return float(left @ left / max(target @ target, 1e-300))
 
 
-def period(r: FloatArray) -> int:
+def period(r: Array) -> int:
     r"""Return after how many samples a signal repeats itself, at least once, or 0.
 
     .. math:: D(P) = \operatorname{mean}_k (r_{k+P} - r_k)^2

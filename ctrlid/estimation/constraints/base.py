@@ -10,13 +10,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
 from ..identified_model import Structure
 
-FloatArray = NDArray[np.float64]
-Function = Callable[[FloatArray], Any]
+Function = Callable[[Array], Any]
 
 
 @dataclass(frozen=True, repr=False)
@@ -148,6 +147,6 @@ def need_poles(constraint: AbstractConstraint, structure: Structure, needed: int
         )
 
 
-def denominator(values: Sequence[float] | FloatArray, na: int) -> dict[str, float]:
+def denominator(values: Sequence[float] | Array, na: int) -> dict[str, float]:
     """Return the weights of a row on the denominator's coefficients."""
     return {f"a{i}": float(values[i - 1]) for i in range(1, na + 1)}

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from scipy.optimize import linprog
 
 from ..._base import text as _text
+from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
 from ..identified_model import Structure
 from . import AbstractConstraint, Branch, Row
 
-FloatArray = NDArray[np.float64]
 _MOST_CASES = 256
 
 
@@ -32,9 +32,9 @@ class Rows:
     as the user wrote them.
     """
 
-    weights: FloatArray
-    lower: FloatArray
-    upper: FloatArray
+    weights: Array
+    lower: Array
+    upper: Array
     rows: tuple[Row, ...]
     owners: tuple[str, ...]
 
@@ -130,21 +130,21 @@ class Elimination:
     Fixed coefficients have zero directions, so they come out exactly as given.
     """
 
-    offset: FloatArray
-    directions: FloatArray
+    offset: Array
+    directions: Array
     pivots: NDArray[np.intp]
     free: NDArray[np.intp]
-    weights: FloatArray
-    values: FloatArray
+    weights: Array
+    values: Array
 
-    def snap(self, theta: FloatArray) -> FloatArray:
+    def snap(self, theta: Array) -> Array:
         """Recompute the dependent coefficients from the free ones."""
-        snapped: FloatArray = theta.copy()
+        snapped: Array = theta.copy()
         snapped[self.pivots] = (self.offset + self.directions @ theta[self.free])[self.pivots]
         return snapped
 
 
-def eliminate(weights: FloatArray, values: FloatArray) -> Elimination:
+def eliminate(weights: Array, values: Array) -> Elimination:
     """Reduced row echelon form of ``weights @ theta = values``; `Infeasible` if they contradict."""
     work = np.column_stack([weights, values])
     return _eliminate(work.shape, work.tobytes())
@@ -189,7 +189,7 @@ def _eliminate(shape: tuple[int, int], numbers: bytes) -> Elimination:
     return Elimination(*arrays)
 
 
-def one_sided(rows: Rows) -> tuple[FloatArray, FloatArray, NDArray[np.intp], FloatArray]:
+def one_sided(rows: Rows) -> tuple[Array, Array, NDArray[np.intp], Array]:
     """Inequalities as ``G theta <= h``, the row each comes from, and its sign in it."""
     below = np.flatnonzero(~rows.equality & (rows.upper < np.inf))
     above = np.flatnonzero(~rows.equality & (rows.lower > -np.inf))

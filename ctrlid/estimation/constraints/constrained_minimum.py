@@ -6,18 +6,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from ..._base import text as _text
+from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
 from ..identified_model import ActiveBound, Structure
 from . import AbstractConstraint
 from .branches import Case, Infeasible, Rows, cases, eliminate, explain_conflict, forced, possible
 from .nonlinear import solve_nonlinear
 from .quadratic_program import Cost, Solution, solve, spread
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,9 +26,9 @@ class Found:
     left free; both count an active bound as fixed.
     """
 
-    theta: FloatArray
+    theta: Array
     cost: float
-    spread: FloatArray
+    spread: Array
     free: int
     condition: float
     active_bounds: tuple[ActiveBound, ...]
@@ -43,7 +41,7 @@ class _Candidate:
     """Minimum of one case, the directions it cannot move in, its label, and an end it sits on."""
 
     solution: Solution
-    normals: FloatArray
+    normals: Array
     label: str
     edge: tuple[ActiveBound, ...] = ()
 
@@ -147,7 +145,7 @@ def _ends(case: Case) -> tuple[float, float]:
     return float(case.grid[0]), float(case.grid[-1])
 
 
-def _search(cost: Cost, case: Case) -> tuple[float, Solution, FloatArray]:
+def _search(cost: Cost, case: Case) -> tuple[float, Solution, Array]:
     """Best member of a family: scan, refine in the brackets, finish by Newton steps."""
 
     def value(x: float) -> float:
@@ -176,7 +174,7 @@ def _search(cost: Cost, case: Case) -> tuple[float, Solution, FloatArray]:
     return _finish(cost, case, best_x)
 
 
-def _finish(cost: Cost, case: Case, x: float) -> tuple[float, Solution, FloatArray]:
+def _finish(cost: Cost, case: Case, x: float) -> tuple[float, Solution, Array]:
     """Newton steps on coefficients and the family's number together.
 
     A line search in x stops at half the digits of x. To first order the family lets its rows move
@@ -222,12 +220,12 @@ def _finish(cost: Cost, case: Case, x: float) -> tuple[float, Solution, FloatArr
     return x, solution, np.vstack([loose.weights[loose.equality], active])
 
 
-def _gap(rows: Rows, theta: FloatArray) -> FloatArray:
-    gap: FloatArray = rows.weights @ theta - np.where(rows.equality, rows.lower, 0.0)
+def _gap(rows: Rows, theta: Array) -> Array:
+    gap: Array = rows.weights @ theta - np.where(rows.equality, rows.lower, 0.0)
     return gap
 
 
-def _loosen(rows: Rows, fixed: int, slope: FloatArray) -> Rows:
+def _loosen(rows: Rows, fixed: int, slope: Array) -> Rows:
     """Replace the family's rows by their combinations at right angles to the slope."""
     q = np.linalg.qr(slope[:, None], mode="complete")[0][:, 1:]
     weights, values = q.T @ rows.weights[fixed:], q.T @ rows.lower[fixed:]

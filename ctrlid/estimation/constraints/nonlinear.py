@@ -6,14 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
 from . import Branch, Row
 from .branches import Infeasible, Rows
 from .quadratic_program import Cost, Solution, solve
-
-FloatArray = NDArray[np.float64]
 
 _STARTS = 12
 _ITERATIONS = 80
@@ -25,11 +23,11 @@ class _Functions:
     """All nonlinear functions as one vector ``c(theta)``: equalities first."""
 
     functions: tuple[tuple[str, Branch], ...]
-    typical: FloatArray  # sizes of the coefficients, for the difference steps
+    typical: Array  # sizes of the coefficients, for the difference steps
 
-    def parts(self, theta: FloatArray) -> tuple[FloatArray, int, list[tuple[str, str]]]:
+    def parts(self, theta: Array) -> tuple[Array, int, list[tuple[str, str]]]:
         """Values, the number of equalities, and for each its owner and its words."""
-        values: list[FloatArray] = []
+        values: list[Array] = []
         words: list[tuple[str, str]] = []
         count = 0
         for kind in ("equality", "inequality"):
@@ -45,11 +43,11 @@ class _Functions:
                 count += len(value) * (kind == "equality")
         return np.concatenate(values), count, words
 
-    def __call__(self, theta: FloatArray) -> FloatArray:
+    def __call__(self, theta: Array) -> Array:
         """Values of all functions."""
         return self.parts(theta)[0]
 
-    def jacobian(self, theta: FloatArray) -> FloatArray:
+    def jacobian(self, theta: Array) -> Array:
         """Central differences, ``(functions, p)``."""
         columns = []
         for i, h in enumerate(6e-6 * np.maximum(np.abs(theta), self.typical)):
@@ -58,7 +56,7 @@ class _Functions:
             columns.append((self(theta + e) - self(theta - e)) / (2 * h))
         return np.column_stack(columns)
 
-    def curvature(self, theta: FloatArray, multipliers: FloatArray) -> FloatArray:
+    def curvature(self, theta: Array, multipliers: Array) -> Array:
         """Hessian of ``multipliers @ c`` by central differences, ``(p, p)``."""
         p = len(theta)
         steps = np.diag(2e-4 * np.maximum(np.abs(theta), self.typical))
@@ -78,7 +76,7 @@ class _Functions:
 
 def solve_nonlinear(
     cost: Cost, rows: Rows, functions: tuple[tuple[str, Branch], ...]
-) -> tuple[Solution, FloatArray]:
+) -> tuple[Solution, Array]:
     """Minimise a quadratic cost under rows and nonlinear functions.
 
     Parameters
@@ -131,7 +129,7 @@ def solve_nonlinear(
     return best, best.normals
 
 
-def _check(c: _Functions, theta: FloatArray) -> None:
+def _check(c: _Functions, theta: Array) -> None:
     for owner, branch in c.functions:
         for function in (branch.equality, branch.inequality):
             if function is None:
@@ -150,25 +148,25 @@ def _check(c: _Functions, theta: FloatArray) -> None:
                 )
 
 
-def _violation(c: FloatArray, equalities: int) -> FloatArray:
-    v: FloatArray = np.concatenate([np.abs(c[:equalities]), np.maximum(-c[equalities:], 0.0)])
+def _violation(c: Array, equalities: int) -> Array:
+    v: Array = np.concatenate([np.abs(c[:equalities]), np.maximum(-c[equalities:], 0.0)])
     return v
 
 
-def _linear_violation(rows: Rows, theta: FloatArray) -> float:
+def _linear_violation(rows: Rows, theta: Array) -> float:
     value = rows.weights @ theta
     return float(np.sum(np.maximum(rows.lower - value, 0) + np.maximum(value - rows.upper, 0)))
 
 
-def _descend(cost: Cost, rows: Rows, c: _Functions, theta: FloatArray, reach: float) -> Solution:
+def _descend(cost: Cost, rows: Rows, c: _Functions, theta: Array, reach: float) -> Solution:
     """One sequence: linearise the functions, solve the QP, shorten the step by an l1 merit."""
     inverse = np.linalg.inv(cost.basis)
     hessian = cost.R.T @ cost.R
 
-    def cost_at(x: FloatArray) -> float:
+    def cost_at(x: Array) -> float:
         return float(np.sum((cost.R @ (inverse @ (x - cost.origin)) - cost.d) ** 2))
 
-    def merit(x: FloatArray, size: FloatArray, penalty: float) -> float:
+    def merit(x: Array, size: Array, penalty: float) -> float:
         values, equalities, _ = c.parts(x)
         if not np.isfinite(values).all():
             return np.inf
@@ -206,19 +204,19 @@ def _descend(cost: Cost, rows: Rows, c: _Functions, theta: FloatArray, reach: fl
     return _arrived(cost, rows, c, theta, reach, cost_at(theta))
 
 
-def _size(slopes: FloatArray, cost: Cost, reach: float) -> FloatArray:
+def _size(slopes: Array, cost: Cost, reach: float) -> Array:
     """Size of each function: what moving all coefficients by their reach would do to it."""
-    size: FloatArray = np.maximum(np.linalg.norm(slopes @ cost.basis, axis=1) * reach, 1e-300)
+    size: Array = np.maximum(np.linalg.norm(slopes @ cost.basis, axis=1) * reach, 1e-300)
     return size
 
 
 def _step(
     model: Cost,
     rows: Rows,
-    slopes: FloatArray,
-    values: FloatArray,
+    slopes: Array,
+    values: Array,
     equalities: int,
-    theta: FloatArray,
+    theta: Array,
     words: list[tuple[str, str]],
 ) -> Solution:
     """Solve the linearised problem; where that has no solution, ask for part of the way."""
@@ -231,7 +229,7 @@ def _step(
 
 
 def _arrived(
-    cost: Cost, rows: Rows, c: _Functions, theta: FloatArray, reach: float, value: float
+    cost: Cost, rows: Rows, c: _Functions, theta: Array, reach: float, value: float
 ) -> Solution:
     """Check that the end point holds; describe what it rests on."""
     values, equalities, words = c.parts(theta)
@@ -255,10 +253,10 @@ def _arrived(
 
 
 def _lines(
-    slopes: FloatArray,
-    values: FloatArray,
+    slopes: Array,
+    values: Array,
     equalities: int,
-    theta: FloatArray,
+    theta: Array,
     words: list[tuple[str, str]],
     fraction: float,
 ) -> Rows:
@@ -274,9 +272,7 @@ def _lines(
     return Rows(slopes, right, upper, names, tuple(owner for owner, _ in words))
 
 
-def _assign(
-    held: FloatArray, rows: Rows, equalities: int, active: Sequence[int], count: int
-) -> FloatArray:
+def _assign(held: Array, rows: Rows, equalities: int, active: Sequence[int], count: int) -> Array:
     """Multipliers of the functions, in their own order, from those of the rows held."""
     first = int(rows.equality.sum())
     multipliers = np.zeros(count)
@@ -289,11 +285,11 @@ def _assign(
 
 def _curved(
     cost: Cost,
-    s: FloatArray,
-    hessian: FloatArray,
+    s: Array,
+    hessian: Array,
     c: _Functions,
-    theta: FloatArray,
-    multipliers: FloatArray,
+    theta: Array,
+    multipliers: Array,
 ) -> Cost:
     """Return the quadratic model with the curvature of the functions, kept convex."""
     if not multipliers.any():

@@ -9,10 +9,10 @@ import qpsolvers
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
+from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
 from .branches import Elimination, Infeasible, Rows, eliminate, feasible, one_sided
 
-FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.intp]
 
 TOLERANCE = 1e-10
@@ -25,7 +25,7 @@ _ROUNDS = 10  # exchanges of rows per row before the active set is given up
 class NotExcited(Exception):
     """The data leave a combination of coefficients free; carries that direction in theta."""
 
-    def __init__(self, direction: FloatArray) -> None:
+    def __init__(self, direction: Array) -> None:
         super().__init__("the regression has no unique solution")
         self.direction = direction
 
@@ -53,16 +53,16 @@ class Cost:
         Singular values of R with unit columns below this are rounding errors.
     """
 
-    R: FloatArray
-    d: FloatArray
-    basis: FloatArray
-    origin: FloatArray
+    R: Array
+    d: Array
+    basis: Array
+    origin: Array
     floor: float = 1e-11
 
     @property
-    def scale(self) -> FloatArray:
+    def scale(self) -> Array:
         """Column norms of R."""
-        norms: FloatArray = np.linalg.norm(self.R, axis=0)
+        norms: Array = np.linalg.norm(self.R, axis=0)
         return np.where(norms > 0, norms, 1.0)
 
     def scaled(self) -> Cost:
@@ -79,12 +79,12 @@ class Solution:
     of the inequalities among them, ``free_theta`` the minimum under the equalities alone.
     """
 
-    theta: FloatArray
+    theta: Array
     cost: float
     rows: Rows
-    normals: FloatArray
+    normals: Array
     active: tuple[int, ...]
-    free_theta: FloatArray
+    free_theta: Array
     solver: str
 
 
@@ -93,13 +93,13 @@ class _Reduced:
     """Under equalities: ``s = s0 + step @ (u0 + u)`` and ``cost = | u |^2`` plus a constant."""
 
     elimination: Elimination
-    s0: FloatArray
-    step: FloatArray
-    u0: FloatArray
-    singular: FloatArray
+    s0: Array
+    step: Array
+    u0: Array
+    singular: Array
 
 
-def _reduce(cost: Cost, weights: FloatArray, values: FloatArray) -> _Reduced:
+def _reduce(cost: Cost, weights: Array, values: Array) -> _Reduced:
     """Minimise a scaled cost under equalities by an orthogonal null-space method."""
     e = eliminate(weights, values)
     p, rank = len(cost.origin), len(e.pivots)
@@ -120,7 +120,7 @@ def _reduce(cost: Cost, weights: FloatArray, values: FloatArray) -> _Reduced:
     return _Reduced(e, s0, step, left.T @ (cost.d - cost.R @ s0), singular)
 
 
-def _point(cost: Cost, reduced: _Reduced) -> tuple[FloatArray, float]:
+def _point(cost: Cost, reduced: _Reduced) -> tuple[Array, float]:
     s = reduced.s0 + reduced.step @ reduced.u0
     theta = reduced.elimination.snap(cost.origin + cost.basis @ s)
     return theta, float(np.sum((cost.R @ s - cost.d) ** 2))
@@ -188,7 +188,7 @@ def solve(cost: Cost, rows: Rows, below: float = np.inf) -> Solution:
     return Solution(theta, at_bound, rows, normals, tuple(map(int, active)), free_theta, text)
 
 
-def _active_set(slope: FloatArray, room: FloatArray, rows: Rows) -> IndexArray:
+def _active_set(slope: Array, room: Array, rows: Rows) -> IndexArray:
     """Rows held with equality at the point of ``slope @ u <= room`` nearest to zero.
 
     ProxQP proposes; then rows with a multiplier of the wrong sign leave and violated rows enter
@@ -216,7 +216,7 @@ def _active_set(slope: FloatArray, room: FloatArray, rows: Rows) -> IndexArray:
     )
 
 
-def _exchange(slope: FloatArray, room: FloatArray, start: IndexArray) -> IndexArray | None:
+def _exchange(slope: Array, room: Array, start: IndexArray) -> IndexArray | None:
     held = [int(i) for i in start]
     for _ in range(_ROUNDS * (1 + len(room))):
         u = np.zeros(slope.shape[1])
@@ -237,7 +237,7 @@ def _exchange(slope: FloatArray, room: FloatArray, start: IndexArray) -> IndexAr
     return None
 
 
-def spread(cost: Cost, normals: FloatArray) -> tuple[FloatArray, float]:
+def spread(cost: Cost, normals: Array) -> tuple[Array, float]:
     """How equation errors of variance one scatter the coefficients.
 
     Parameters

@@ -8,9 +8,9 @@ import casadi
 import numba
 import numpy as np
 
+from ..._base.arrays import Array
 from ...loop.period_map import apply_backlash
 from ...physics.block_evaluation import BlockEvaluation
-from ...physics.equations import Array
 from ...physics.interpreter import follow
 from .transition_maps import PeriodPlan
 

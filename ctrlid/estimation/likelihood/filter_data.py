@@ -5,10 +5,11 @@ from typing import Any
 
 import numpy as np
 
+from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
 from ...data.record import Record
 from ...loop.loop import Loop
-from ...physics.equations import Array, Equations
+from ...physics.equations import Equations
 from ...physics.linearization import state_matrices
 
 FEWEST = 10  # valid samples, to say anything

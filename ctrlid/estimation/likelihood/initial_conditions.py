@@ -5,8 +5,9 @@ from typing import Any
 import casadi
 import numpy as np
 
+from ..._base.arrays import Array
 from ...physics.block_evaluation import BlockEvaluation
-from ...physics.equations import Array, Equations
+from ...physics.equations import Equations
 from ...physics.integration import delay_of
 from .backlash import follow_backlash
 from .filter_data import FilterData

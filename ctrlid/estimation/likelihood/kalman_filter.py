@@ -11,9 +11,9 @@ from typing import Any
 import casadi
 import numpy as np
 
+from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
 from ...physics.block_evaluation import BlockEvaluation
-from ...physics.equations import Array
 from .filter_data import FilterData
 from .kalman_recursion import filter_pass
 from .sampled_plant import Linearized, SampledPlant, Trajectory

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ...physics.equations import Array
+from ..._base.arrays import Array
 from .filter_data import FilterData
 from .kalman_filter import Filtered, Noise, run_filter
 from .sampled_plant import Linearized, SampledPlant, Trajectory

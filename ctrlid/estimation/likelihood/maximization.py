@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
-from ...physics.equations import Array
 from .filter_data import FilterData
 from .kalman_filter import SETTLED, Filtered, Noise, first_guess, settle_covariance
 from .likelihood import Fit, Problem, evaluate, linearize_again, pseudo_inverse

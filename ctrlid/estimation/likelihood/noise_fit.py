@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
 from ..._base.jobs import side_by_side
-from ...physics.equations import Array
 from .kalman_filter import Noise
 from .likelihood import Fit, Known, Problem, measure_noise
 from .sampled_plant import Linearized, SampledPlant

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
+from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
 from ..._base.text import Printed, number
 from ...loop.loop import Loop
-from ...physics.equations import Array
 from ...physics.linearization import operating_point
 from ..identified_model import root_errors
 

@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
+from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
 from ...data.record import Record
 from ...data.several_records import as_records
 from ...loop.loop import Loop
-from ...physics.equations import Array
 from .filter_data import make_filter_data
 from .likelihood import Fit, Problem, pseudo_inverse
 from .maximization import begin_fit, information, maximize, refit_noise_size

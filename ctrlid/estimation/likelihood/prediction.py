@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
 from ...data.record import Record
 from ...loop.loop import Loop
-from ...physics.equations import Array
 from .filter_data import make_filter_data
 from .kalman_filter import Noise
 from .likelihood import Problem

@@ -10,11 +10,12 @@ from typing import Any
 import casadi
 import numpy as np
 
+from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
 from ...data.record import Record
 from ...loop.loop import Loop
 from ...physics.block_evaluation import BlockEvaluation, evaluate_blocks
-from ...physics.equations import Array, Equations
+from ...physics.equations import Equations
 from ...physics.integration import Scheme, known_lags, whole_delay
 from ...physics.linearization import state_matrices
 from .backlash import follow_backlash

@@ -6,9 +6,9 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..._base import text as _text
+from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
 from ..._base.jobs import check_jobs
 from ...data.record import Record
@@ -18,8 +18,6 @@ from ..constraints.constrained_minimum import Found, minimize
 from ..constraints.quadratic_program import Cost, NotExcited
 from ..identified_model import Estimate, IdentifiedModel, Structure
 from .regression import Regression, arx_regression, check_orders, from_differences
-
-FloatArray = NDArray[np.float64]
 
 
 def fit_arx(
@@ -165,7 +163,7 @@ def _estimate(regression: Regression, found: Found, constrained: bool, dt: float
     )
 
 
-def _not_excited(regression: Regression, direction: FloatArray) -> str:
+def _not_excited(regression: Regression, direction: Array) -> str:
     """Say which signal is constant, or which coefficients the data cannot tell apart."""
     structure: Structure = regression.structure
     na = structure.na

@@ -8,15 +8,13 @@ from typing import Any
 
 import control
 import numpy as np
-from numpy.typing import NDArray
 from scipy import signal
 
+from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
 from ..identified_model import Structure
 from .instruments import Piece, Signals
 from .regression import merge
-
-FloatArray = NDArray[np.float64]
 
 _HIGHEST = 4  # order up to which a controller is sought in the record
 
@@ -28,9 +26,9 @@ class Law:
     ``source`` says where it comes from.
     """
 
-    den: FloatArray
-    external: tuple[FloatArray, ...]
-    feedback: FloatArray
+    den: Array
+    external: tuple[Array, ...]
+    feedback: Array
     source: str
 
 
@@ -88,7 +86,7 @@ def given_law(controller: Any, names: Sequence[str], dt: float) -> Law:
     return Law(den, external, feedback, "the given controller")
 
 
-def _fractions(controller: Any) -> tuple[list[FloatArray], FloatArray]:
+def _fractions(controller: Any) -> tuple[list[Array], Array]:
     """Numerators over one denominator, all of one length, in powers of the delay."""
     inputs = range(controller.ninputs)
     if isinstance(controller, control.StateSpace):
@@ -162,8 +160,8 @@ def loop_signals(
     pieces: Sequence[Piece],
     law: Law,
     structure: Structure,
-    theta: FloatArray,
-    kicks: Sequence[FloatArray] | None = None,
+    theta: Array,
+    kicks: Sequence[Array] | None = None,
 ) -> Signals | None:
     r"""Simulate model and controller without noise, driven by the external signals.
 

@@ -8,15 +8,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..._base import text as _text
+from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
 from ...data.record import Record
 from .regression import block_qr, merge
 
-FloatArray = NDArray[np.float64]
-Signals = list[tuple[FloatArray, FloatArray]]
+Signals = list[tuple[Array, Array]]
 
 _LONGEST = 8192  # samples of the past that delayed references reach back to
 
@@ -30,9 +29,9 @@ class Piece:
     """
 
     owner: int
-    y: FloatArray
-    u: FloatArray
-    w: FloatArray
+    y: Array
+    u: Array
+    w: Array
     levels: tuple[float, float]
 
 
@@ -99,7 +98,7 @@ def two_stage(pieces: Sequence[Piece]) -> Signals:
     for piece in pieces:
         sums = [_sums(w, edges[-1]) for w in piece.w]
 
-        def fill(out: FloatArray, start: int, stop: int, p: Piece = piece, s: Any = sums) -> None:
+        def fill(out: Array, start: int, stop: int, p: Piece = piece, s: Any = sums) -> None:
             out[:, 0] = 1.0
             out[:, 1 : m + 1] = _delayed(s, edges, start, stop)
             out[:, m + 1], out[:, m + 2] = p.y[start:stop], p.u[start:stop]
@@ -125,12 +124,12 @@ def _windows(reach: int) -> list[int]:
     return edges
 
 
-def _sums(w: FloatArray, reach: int) -> FloatArray:
+def _sums(w: Array, reach: int) -> Array:
     """Return running sums; the signal waits at its first value before the first sample."""
     return np.concatenate([[0.0], np.cumsum(np.concatenate([np.full(reach, w[0]), w]))])
 
 
-def _delayed(sums: Sequence[FloatArray], edges: list[int], start: int, stop: int) -> FloatArray:
+def _delayed(sums: Sequence[Array], edges: list[int], start: int, stop: int) -> Array:
     columns = []
     at = edges[-1] + 1 + np.arange(start, stop)
     for s in sums:

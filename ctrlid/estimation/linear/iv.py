@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
 from ..._base import text as _text
+from ..._base.arrays import Array
 from ..._base.errors import CtrlidError, CtrlidWarning
 from ...data.record import Record
 from ...data.several_records import as_records
@@ -24,8 +24,6 @@ from .instruments import Signals, check_instruments
 from .iv_equations import Moments, Residuals, Task, compute_moments, curved_force, separate
 from .prefilter import View, autoregression, stable_factor
 from .regression import check_orders, to_differences
-
-FloatArray = NDArray[np.float64]
 
 _MOST = 40  # iterations for one noise model
 _DEGREE = 3  # products of signals up to this degree
@@ -196,12 +194,12 @@ def _refine(task: Task, known: Sequence[AbstractConstraint], law: Law | None) ->
     return fit
 
 
-def _start(task: Task, known: Sequence[AbstractConstraint]) -> FloatArray:
+def _start(task: Task, known: Sequence[AbstractConstraint]) -> Array:
     """First coefficients: delayed references, under prefilters from wide to narrow.
 
     The candidate with the least one-step prediction error wins.
     """
-    best: tuple[float, FloatArray | None] = (np.inf, None)
+    best: tuple[float, Array | None] = (np.inf, None)
     trouble: NotExcited | None = None
     for distance in _STARTS:
         if distance * task.longest < 20:
@@ -247,7 +245,7 @@ def _bent(task: Task, fit: _Fit) -> View:
     return replace(fit.view, bend=tuple(part.bend for part in residuals), shift=shift)
 
 
-def _by_record(task: Task, values: Sequence[float]) -> FloatArray:
+def _by_record(task: Task, values: Sequence[float]) -> Array:
     """Mean of what each stretch says, over the samples of each record."""
     owners = [piece.owner for piece in task.pieces]
     sizes = [len(piece.y) for piece in task.pieces]
@@ -255,7 +253,7 @@ def _by_record(task: Task, values: Sequence[float]) -> FloatArray:
     return np.asarray(total / np.bincount(owners, sizes, task.records), dtype=float)
 
 
-def _through(task: Task, theta: FloatArray, view: View) -> View:
+def _through(task: Task, theta: Array, view: View) -> View:
     """Return the same view through the denominator of another model."""
     return replace(view, den=stable_factor(task.structure, theta, task.longest))
 
@@ -264,7 +262,7 @@ def _iterate(
     task: Task,
     known: Sequence[AbstractConstraint],
     law: Law | None,
-    theta: FloatArray,
+    theta: Array,
     view: View,
     count: int,
 ) -> _Fit:
@@ -348,7 +346,7 @@ def _estimate(task: Task, fit: _Fit, constrained: bool, dt: float) -> Estimate:
     )
 
 
-def _sandwich(moments: Moments, found: Found, residuals: Sequence[Residuals]) -> FloatArray:
+def _sandwich(moments: Moments, found: Found, residuals: Sequence[Residuals]) -> Array:
     """Covariance without a noise model, from the correlations of ``z e`` (Newey and West)."""
     p = len(moments.structure.names)
     upper = moments.factor[:p, :p]
@@ -393,7 +391,7 @@ def _check_hold(records: Sequence[Record]) -> None:
         )
 
 
-def _not_excited(structure: Structure, names: tuple[str, ...], direction: FloatArray) -> str:
+def _not_excited(structure: Structure, names: tuple[str, ...], direction: Array) -> str:
     size = np.abs(direction)
     involved = [n for n, d in zip(structure.names, size, strict=True) if d > 1e-3 * size.max()]
     return (

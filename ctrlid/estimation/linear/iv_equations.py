@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
 from ...data.record import Record
 from ..constraints.quadratic_program import Cost
@@ -16,8 +16,6 @@ from ..identified_model import Structure
 from .instruments import Piece, Signals, cut, two_stage
 from .prefilter import MOST_COLOURED, View
 from .regression import block_qr, from_differences, merge, to_differences
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,11 +115,11 @@ class Moments:
         Size of the rounding errors in each regressor, as far as instruments pick them up.
     """
 
-    factor: FloatArray
+    factor: Array
     rows: int
     nuisances: int
     structure: Structure
-    floor: FloatArray
+    floor: Array
 
     @property
     def cost(self) -> Cost:
@@ -135,7 +133,7 @@ class Moments:
         rest = max(1e-11, 10 * float(noise))
         return Cost(np.where(excited, upper, 0.0), self.factor[:p, -1], basis, origin, rest)
 
-    def rss(self, theta: FloatArray) -> float:
+    def rss(self, theta: Array) -> float:
         """Sum of squares of the filtered equation error."""
         p = len(self.structure.names)
         delta = to_differences(self.structure, theta)
@@ -147,12 +145,12 @@ class Moments:
         return float(np.linalg.norm(self.factor[:, -1]))
 
 
-def _differences(signal: FloatArray, start: int, n: int, count: int) -> list[FloatArray]:
+def _differences(signal: Array, start: int, n: int, count: int) -> list[Array]:
     """Return ``s, D s, D^2 s, ..``, each ``(n,)`` from sample ``start`` on."""
     return [np.diff(signal, k)[start : start + n] for k in range(count)]
 
 
-def _products(piece: Piece, hats: tuple[FloatArray, FloatArray], view: View) -> list[FloatArray]:
+def _products(piece: Piece, hats: tuple[Array, Array], view: View) -> list[Array]:
     """Return squares and products of what the external signals cause, up to a degree, size one.
 
     Near an equilibrium every smooth plant is linear but for these.
@@ -166,7 +164,7 @@ def _products(piece: Piece, hats: tuple[FloatArray, FloatArray], view: View) -> 
     return [u ** (total - i) * y**i for total in degrees for i in range(total + 1)]
 
 
-def curved_force(task: Task, hats: Signals, view: View) -> list[FloatArray] | None:
+def curved_force(task: Task, hats: Signals, view: View) -> list[Array] | None:
     """Return the force of the products, in the units of the difference equation.
 
     Parameters
@@ -201,8 +199,8 @@ def curved_force(task: Task, hats: Signals, view: View) -> list[FloatArray] | No
 
 
 def _table(
-    task: Task, piece: Piece, hats: tuple[FloatArray, FloatArray], view: View
-) -> tuple[list[FloatArray], int]:
+    task: Task, piece: Piece, hats: tuple[Array, Array], view: View
+) -> tuple[list[Array], int]:
     """Columns ``nuisances | 1 | instruments | regressors | target``; the number of the first.
 
     Nuisances are what the prefilter's initial state leaves behind, and products of y and u.
@@ -240,12 +238,12 @@ def compute_moments(task: Task, hats: Signals, view: View) -> Moments:
         All that the coefficients need, whatever the length of the records.
     """
     s = task.structure
-    owned: list[list[FloatArray]] = [[] for _ in range(task.records)]
+    owned: list[list[Array]] = [[] for _ in range(task.records)]
     rows, nuisances = 0, task.records * task.intercept
     for piece, hat in zip(task.pieces, hats, strict=True):
         columns, skip = _table(task, piece, hat, view)
 
-        def fill(out: FloatArray, i: int, j: int, columns: Any = columns) -> None:
+        def fill(out: Array, i: int, j: int, columns: Any = columns) -> None:
             for k, column in enumerate(columns):
                 out[:, k] = column[i:j]
 
@@ -258,7 +256,7 @@ def compute_moments(task: Task, hats: Signals, view: View) -> Moments:
     return Moments(whole, rows, nuisances, s, _rounding(task, view))
 
 
-def _rounding(task: Task, view: View) -> FloatArray:
+def _rounding(task: Task, view: View) -> Array:
     """Return the rounding errors of the data in each column, as far as instruments pick them up."""
     s = task.structure
     impulse = np.zeros(task.longest)
@@ -290,13 +288,13 @@ class Residuals:
         Constant of the equation.
     """
 
-    z: FloatArray
-    e: FloatArray
-    bend: FloatArray
+    z: Array
+    e: Array
+    bend: Array
     constant: float
 
 
-def separate(task: Task, theta: FloatArray, hats: Signals, view: View) -> list[Residuals]:
+def separate(task: Task, theta: Array, hats: Signals, view: View) -> list[Residuals]:
     """Separate nuisances from instruments and equation errors.
 
     Parameters

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
 from ..._base.text import listing
-from ...physics.equations import Array
 from ..constraints import AbstractConstraint
 from ..constraints.constrained_minimum import Found, minimize
 from ..constraints.quadratic_program import Cost, NotExcited

@@ -6,14 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import signal
 
+from ..._base.arrays import Array, ComplexArray
 from ..identified_model import Structure
 from .regression import to_differences
-
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 MOST_COLOURED = 10
 """Largest order of the autoregression that describes the colour of the noise."""
@@ -38,17 +35,17 @@ class View:
         For each record the input at the equilibrium, less the mean input.
     """
 
-    num: FloatArray
-    den: FloatArray
+    num: Array
+    den: Array
     degree: int = 1
-    bend: tuple[FloatArray, ...] = ()
+    bend: tuple[Array, ...] = ()
     shift: tuple[float, ...] = ()
 
-    def __call__(self, s: FloatArray) -> FloatArray:
+    def __call__(self, s: Array) -> Array:
         """Filter a signal, from rest."""
         return np.asarray(signal.lfilter(self.num, self.den, s), dtype=float)
 
-    def decays(self, n: int) -> FloatArray:
+    def decays(self, n: int) -> Array:
         """All ways in which the filter's unknown initial state decays, ``(n, order)``.
 
         Estimated with the model they make the start of each stretch exact: else the filter would
@@ -62,7 +59,7 @@ class View:
         return np.column_stack([h[order - i : order - i + n] for i in range(1, order + 1)])
 
 
-def stable_factor(structure: Structure, theta: FloatArray, n: int) -> FloatArray:
+def stable_factor(structure: Structure, theta: Array, n: int) -> Array:
     """Denominator with the poles outside the unit circle reflected into it.
 
     ``A(q)`` over it is an all-pass: it whitens the equation error ``A v`` of white sensor noise v.
@@ -96,7 +93,7 @@ def stable_factor(structure: Structure, theta: FloatArray, n: int) -> FloatArray
     return np.asarray(np.poly(z).real, dtype=float)
 
 
-def autoregression(residuals: Sequence[FloatArray], highest: int = MOST_COLOURED) -> FloatArray:
+def autoregression(residuals: Sequence[Array], highest: int = MOST_COLOURED) -> Array:
     """Autoregressive whitening filter of residuals, its order by Schwarz' criterion.
 
     Parameters

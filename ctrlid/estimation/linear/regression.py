@@ -7,17 +7,16 @@ from dataclasses import dataclass
 from functools import lru_cache, partial
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import invpascal, pascal
 from scipy.linalg.lapack import dgeqrf, dgeqrf_lwork
 
+from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
 from ..._base.jobs import spread
 from ...data.record import Record
 from ..identified_model import Structure
 
-FloatArray = NDArray[np.float64]
-Fill = Callable[[FloatArray, int, int], None]
+Fill = Callable[[Array, int, int], None]
 
 BLOCK = 8000
 """Numbers of the regression held in memory at a time.
@@ -27,7 +26,7 @@ for matrices this narrow, waking others costs more than it gives, up to tenfold 
 """
 
 
-def block_qr(fill: Fill, rows: int, columns: int, block: int = BLOCK) -> FloatArray:
+def block_qr(fill: Fill, rows: int, columns: int, block: int = BLOCK) -> Array:
     """Triangular factor R of a tall matrix that is never held as a whole.
 
     ``R'R = A'A``: each chunk of rows is put under the factor so far and both are triangularised
@@ -69,7 +68,7 @@ def block_qr(fill: Fill, rows: int, columns: int, block: int = BLOCK) -> FloatAr
     return np.array(buffer[:columns])
 
 
-def merge(factors: Sequence[FloatArray]) -> FloatArray:
+def merge(factors: Sequence[Array]) -> Array:
     """Triangular factor of matrices stacked on each other, from the factor of each."""
     if len(factors) == 1:
         return factors[0]
@@ -77,7 +76,7 @@ def merge(factors: Sequence[FloatArray]) -> FloatArray:
 
 
 @lru_cache(maxsize=64)
-def from_differences(structure: Structure) -> tuple[FloatArray, FloatArray]:
+def from_differences(structure: Structure) -> tuple[Array, Array]:
     """Coefficients as ``theta = origin + basis @ delta``, delta in the differenced basis.
 
     With the forward difference ``D = q - 1`` the model reads ``D^na y = delta_0 y + delta_1 D y +
@@ -109,7 +108,7 @@ def from_differences(structure: Structure) -> tuple[FloatArray, FloatArray]:
     return basis, origin
 
 
-def to_differences(structure: Structure, theta: FloatArray) -> FloatArray:
+def to_differences(structure: Structure, theta: Array) -> Array:
     """Inverse of `from_differences`, without solving anything."""
     na, nb = structure.na, structure.nb
     _, origin = from_differences(structure)
@@ -140,14 +139,14 @@ class Regression:
     """
 
     structure: Structure
-    R: FloatArray
-    d: FloatArray
+    R: Array
+    d: Array
     rss: float
     rows: int
-    floor: FloatArray
-    intercept_rows: tuple[tuple[FloatArray, float, float], ...]
+    floor: Array
+    intercept_rows: tuple[tuple[Array, float, float], ...]
 
-    def intercepts(self, theta: FloatArray) -> FloatArray:
+    def intercepts(self, theta: Array) -> Array:
         """Return c of each record in ``y(k) + a1 y(k-1) + ... = b1 u(k-nk) + ... + c``."""
         delta = to_differences(self.structure, theta)
         na = self.structure.na
@@ -167,7 +166,7 @@ class Part:
     shared among processes, and a record can be forgotten once it is reduced.
     """
 
-    factor: FloatArray
+    factor: Array
     rows: int
     levels: tuple[float, float]
     samples: int
@@ -254,7 +253,7 @@ def _levels(record: Record) -> tuple[float, float]:
 
 def _factor(
     record: Record, structure: Structure, y0: float, u0: float, intercept: bool
-) -> tuple[FloatArray, int]:
+) -> tuple[Array, int]:
     """Triangular factor of ``[1 | y D y ... | u D u ... | D^na y]`` and the rows that count."""
     na, nb, nk = structure.na, structure.nb, structure.nk
     y, u, valid = record.y, record.u, record.valid
@@ -264,7 +263,7 @@ def _factor(
     lead = 1 if intercept else 0
     used = 0
 
-    def fill(out: FloatArray, start: int, stop: int) -> None:
+    def fill(out: Array, start: int, stop: int) -> None:
         nonlocal used
         i, j = first + start, first + stop
         if intercept:
@@ -286,7 +285,7 @@ def _factor(
     return factor, used
 
 
-def _differences(signal: FloatArray, columns: Sequence[FloatArray]) -> None:
+def _differences(signal: Array, columns: Sequence[Array]) -> None:
     """Write the signal and its forward differences, all at the oldest sample, into columns."""
     n = len(columns[0])
     for k, column in enumerate(columns):
@@ -295,9 +294,7 @@ def _differences(signal: FloatArray, columns: Sequence[FloatArray]) -> None:
         column[:] = signal[:n]
 
 
-def _rounding(
-    factor: FloatArray, structure: Structure, y0: float, u0: float, rows: int
-) -> FloatArray:
+def _rounding(factor: Array, structure: Structure, y0: float, u0: float, rows: int) -> Array:
     """Size of the rounding errors of the data in each differenced column."""
     na, nb = structure.na, structure.nb
     eps = float(np.finfo(float).eps)

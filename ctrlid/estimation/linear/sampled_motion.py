@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from scipy import signal
 
-from ...physics.equations import Array
+from ..._base.arrays import Array
 
 
 @dataclass(frozen=True, eq=False)

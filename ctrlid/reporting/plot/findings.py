@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
+from ..._base.arrays import Array
 from ...diagnosis.findings import Place
 from ...diagnosis.result import Diagnosis
-from ...physics.equations import Array
 from .. import pictures as _pictures
 from .axes import COLOURS, MEASURED, finish, new_figure, require, take_axes
 

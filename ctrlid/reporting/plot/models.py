@@ -6,11 +6,11 @@ import numpy as np
 from matplotlib.ticker import MultipleLocator
 
 from ..._base import text as _text
+from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
 from ...estimation.confidence_band import response_band
 from ...estimation.identified_model import IdentifiedModel, delay_of
 from ...estimation.series import FitSeries
-from ...physics.equations import Array
 from ...physics.trace import timebase
 from .. import pictures as _pictures
 from .axes import COLOURS, MARKERS, finish, line_style, require, take_axes

@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 
 from ..._base import text as _text
+from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
 from ...data.record import Record
-from ...physics.equations import Array
 from ...validation.comparison import Comparison
 from .. import pictures as _pictures
 from .axes import BINS, COLOURS, DASHES, MEASURED, finish, line_style, require, take_axes
