@@ -11,7 +11,7 @@ from tqdm import tqdm
 from .._base.errors import CtrlidError
 from .._base.jobs import check_jobs, spread
 from ..data.record import Record
-from ..data.several_records import as_records
+from ..data.several_records import as_records, model_and_data
 from ..effects import CATALOGUE, AbstractEffect
 from ..estimation.likelihood.likelihood import Fit
 from ..loop.loop import Loop
@@ -82,7 +82,7 @@ def diagnose(
         samples ahead, or of an open-loop simulation if the plant is stable. A transfer function
         stands for a linear plant without a known controller.
     record : Record or sequence of Record
-        The data; several records are diagnosed together.
+        The data; several records are diagnosed together. Loop and record may change places.
     catalogue : sequence of effect classes, optional
         What may be missing: ``[*cid.effects.CATALOGUE, Mine]``.
     validation : Record or sequence of Record, optional
@@ -124,8 +124,7 @@ def diagnose(
     """
     started = time.perf_counter()
     check_catalogue(catalogue)
-    if isinstance(loop, Record) or (isinstance(loop, list | tuple) and isinstance(record, Loop)):
-        raise CtrlidError("the loop comes first: diagnose(loop, record)")
+    loop, record = model_and_data(loop, record)
     records = as_records(record)
     loop = make_loop(loop, records[0])
     fresh = choose_fresh_data(loop, records, None if validation is None else as_records(validation))
