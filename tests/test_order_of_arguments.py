@@ -48,7 +48,9 @@ def test_several_records_and_models_of_any_kind(pair):
 
 def test_two_of_a_kind_are_refused_as_they_were_given(pair):
     loop, record = pair
-    with pytest.raises(CtrlidError, match="compare needs a Loop, or a transfer function such as .* given Record"):
+    with pytest.raises(
+        CtrlidError, match=r"compare needs a Loop, or a transfer function such as .* given Record"
+    ):
         cid.compare(record, record)
     with pytest.raises(CtrlidError, match="a Record or a list of Records is needed; given Loop"):
         cid.fit_loop(loop, loop)

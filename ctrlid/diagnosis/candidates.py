@@ -122,7 +122,7 @@ def list_missing_candidates(
     model: Model, catalogue: Sequence[type[AbstractEffect]]
 ) -> list[AbstractEffect]:
     """Return the candidates that a model does not have yet."""
-    record = model.fit.problem.prepared[0].record
+    record = model.records[0]
     return [
         c for c in list_candidates(catalogue, model.fitted, record) if not _has_effect(model, c)
     ]

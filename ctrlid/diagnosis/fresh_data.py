@@ -68,6 +68,10 @@ class FreshData:
         """Return the RMS error of loops [output unit]."""
         return gaps.root_mean_square(self.windows, self.outputs(loops))
 
+    def gap_of(self, model: Model) -> float:
+        """Return the RMS error of a model, made ready for each window [output unit]."""
+        return self.gap(self.loops(model))
+
     def excess(self, loops: Sequence[Loop], fit: Fit) -> float:
         r"""Return what noise, as a fit knows it, leaves unexplained of the innovations.
 

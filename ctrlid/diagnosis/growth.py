@@ -107,6 +107,25 @@ def search_effects(
     return Search(base, tuple(steps), model, found, *tests, left)
 
 
+def choose_way(
+    one: Search, other: Search, helps: Callable[[Weighed, Model], bool],
+    gap: Callable[[Model], float],
+) -> Search:  # fmt: skip
+    """Return the end of that way of a search which leaves noise alone, or else the narrower gap.
+
+    Parameters
+    ----------
+    one, other : Search
+        The ends of two ways, of which the second took nothing back.
+    helps : callable
+        As in `keep_main_effects`.
+    gap : callable
+        ``gap(model)``: the RMS error of a model on fresh data [output unit].
+    """
+    ways = [keep_main_effects(search, helps) for search in (one, other)]
+    return min(ways, key=lambda search: (not search.after.passed, gap(search.final)))
+
+
 def compare_names(found: Search, work: Work) -> Search:
     """Return the search with what could stand in the place of each effect."""
     given = len(found.base.loop.effects)

@@ -75,7 +75,7 @@ def search_by_simulation(
         if no effect was found or the gap is hardly smaller.
     """
     loop, names = other.base.loop, other.base.names
-    records = fresh.without_windows([t.record for t in other.base.fit.problem.prepared])
+    records = fresh.without_windows(other.base.records)
     task = Simulation(loop, names, records, [0.0] * len(records))
     x0 = task.states_from([{} for _ in records])
     begun = [task.fit(t, x0) for t in (start_values(loop, names), other.base.fit.theta)]

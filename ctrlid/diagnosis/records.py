@@ -91,6 +91,27 @@ class Readout:
     errors: dict[str, float]
 
 
+@dataclass(frozen=True, eq=False)
+class ReadLimits:
+    """Loop and records after the limits of the sensor were read off, and what was found so."""
+
+    loop: Loop
+    records: tuple[Record, ...]
+    found: tuple[Readout, ...]
+
+
+def read_limits(
+    loop: Loop, records: Sequence[Record], audits: Sequence[Audit],
+    catalogue: Sequence[type[AbstractEffect]],
+) -> ReadLimits:  # fmt: skip
+    """Return the loop with the sensor's limits and the records without samples that sit on them."""
+    found = read_clipping(records, audits, catalogue)
+    if found is None:
+        return ReadLimits(loop, tuple(records), ())
+    used = tuple(censor_record(record, found.effect) for record in records)
+    return ReadLimits(loop.with_effect(found.effect), used, (found,))
+
+
 def read_clipping(
     records: Sequence[Record], audits: Sequence[Audit], catalogue: Sequence[type[AbstractEffect]]
 ) -> Readout | None:

@@ -216,6 +216,12 @@ def _normalized_controller(plant: Any, u: float, y: float) -> Any:
     return ct.ss(matrix, through / y, feedback * u, 0, plant.dt)
 
 
+def forgive_rounding(tests: NoiseTests, model: Model, steps: Readout) -> NoiseTests:
+    """Return the tests without alarms that a rounding sensor raises on replicas as well."""
+    rounding = with_rounding(model, steps)
+    return forgive_filter(tests, [make_replica(rounding, seed) for seed in (1, 2)])
+
+
 def with_rounding(model: Model, coarse: Readout) -> Model:
     """Return the model with a rounding sensor, whose steps are then no part of its noise.
 

@@ -12,6 +12,41 @@ from .noise_tests import NoiseTests
 from .thresholds import THRESHOLD
 
 
+def choose_verdict(complete: bool, named: bool) -> Verdict:
+    """Return the verdict by the decision table.
+
+    ==========================  =================  =====================
+    what is left                something named    nothing named
+    ==========================  =================  =====================
+    noise, on fresh data too    explained          nothing missing
+    more, or the names are      partly explained   unknown
+    doubtful together
+    ==========================  =================  =====================
+
+    Parameters
+    ----------
+    complete : bool
+        Whether the tests pass, the gap on fresh data is that of noise, and the names together are
+        above doubt.
+    named : bool
+        Whether any effect was named.
+    """
+    if complete:
+        return "explained" if named else "nothing missing"
+    return "partly explained" if named else "unknown"
+
+
+def gap_is_left(gap: Gap, disturbance: Disturbance, fit: Fit) -> bool:
+    """Whether the gap with the effects shows that something is left.
+
+    A random force that may do anything explains everything, and nothing: beside one, a gap wider
+    than that of the model as given is no explanation.
+    """
+    blamed = disturbance.large or math.isnan(disturbance.share)
+    worse = gap.after > THRESHOLD.worse_than_given * gap.given
+    return gap_stands_out(gap, fit) or (blamed and worse)
+
+
 def find_doubt(effects: Sequence[AbstractEffect], gains: Sequence[float], total: float) -> str:
     """Say why effects that explain a record together may yet be no explanation.
 

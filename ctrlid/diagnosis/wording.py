@@ -19,34 +19,22 @@ if TYPE_CHECKING:
     from .result import Diagnosis
 
 PLACES = 3
-
-
 LISTED = 4  # tests that fail
-
-
 HEADLINES = {
     "nothing missing": "Nothing missing",
     "explained": "Explained",
     "partly explained": "PARTLY EXPLAINED: SOMETHING IS STILL MISSING",
     "unknown": "UNKNOWN: SOMETHING IS MISSING that no candidate explains",
 }
-
-
 EVIDENCE = (
     "Evidence: the logarithm of how many times likelier the record is with the effect than "
     "without; chance reaches 2 or 3, 10 is strong."
 )
-
-
 WIDENED = (
     "Recalibrating alone makes the one-step errors smaller and this gap larger: parameters cannot "
     "stand in for what is missing."
 )
-
-
 MASSES = ("m", "M", "mass")
-
-
 FORCES = {"m/s^2": "N", "1/s": "N s/m", "1/s^2": "N/m", "1/m": "kg/m"}  # per unit of mass, times it
 
 
