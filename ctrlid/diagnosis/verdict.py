@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from .._base.text import chance, number
 from ..effects import AbstractEffect, PositionRipple
 from ..estimation.likelihood.likelihood import Fit
-from .findings import Disturbance, Finding, Gap, Place, Verdict
+from .findings import BinnedErrors, Disturbance, Finding, Gap, Verdict
 from .noise_tests import NoiseTests
 from .thresholds import THRESHOLD
 
@@ -110,7 +110,7 @@ def gap_is_wider(gap: Gap, disturbance: Disturbance) -> bool:
 
 def write_conclusion(
     verdict: Verdict, findings: Sequence[Finding], gap: Gap, disturbance: Disturbance,
-    after: NoiseTests, where: Sequence[Place], loose: str = "",
+    after: NoiseTests, where: Sequence[BinnedErrors], loose: str = "",
 ) -> str:  # fmt: skip
     """Return the verdict with what it rests on.
 
@@ -126,7 +126,7 @@ def write_conclusion(
         The random forces.
     after : Omnibus
         The tests of what is left.
-    where : sequence of Place
+    where : sequence of BinnedErrors
         Where the disagreement sits.
     loose : str, optional
         Why effects that leave nothing but noise may yet be no explanation.

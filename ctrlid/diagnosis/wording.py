@@ -10,7 +10,7 @@ import numpy as np
 
 from .._base.text import chance, listing, number, prefix, quantity
 from ..effects import AbstractEffect, ReadingEffect
-from .findings import COMPLETE, Finding, Gap, Place
+from .findings import COMPLETE, BinnedErrors, Finding, Gap
 from .noise_tests import alarm_level
 from .saving import units_of
 from .thresholds import THRESHOLD
@@ -101,7 +101,7 @@ def write_percent(share: float) -> str:
     return f"{100 * share:.1f} %" if 0.99 < share < 0.9995 else f"{100 * share:.0f} %"
 
 
-def list_telling_places(found: Diagnosis) -> list[Place]:
+def list_telling_places(found: Diagnosis) -> list[BinnedErrors]:
     """Return the places where the disagreement sits, most telling first."""
     return [p for p in found.where if p.p_before < THRESHOLD.telling][:PLACES]
 
@@ -112,7 +112,7 @@ def highest_rms(levels: Iterable[float]) -> float:
     return math.sqrt(max(known, default=math.nan))
 
 
-def describe_place(place: Place) -> str:
+def describe_place(place: BinnedErrors) -> str:
     """Say where along its axis a place sits."""
     if place.words:
         return place.words.removeprefix(f"at {place.axis} ")
