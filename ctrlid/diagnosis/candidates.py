@@ -14,6 +14,7 @@ from ..estimation.likelihood.sampled_plant import Trajectory
 from ..loop.loop import Loop
 from ..physics.linearization import state_matrices
 from .fitted_model import Model, keep_information
+from .thresholds import THRESHOLD
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +112,7 @@ def check_catalogue(catalogue: Sequence[type[AbstractEffect]]) -> None:
 
 def _place_matters(loop: Loop) -> bool:
     """Whether the plant moves differently when its output is shifted."""
-    a, _, c, _ = state_matrices(loop.equations(), loop.point, spread=1e6)
+    a, _, c, _ = state_matrices(loop.equations(), loop.point, spread=THRESHOLD.shifted_far)
     return bool(np.any(np.abs(a[:, np.flatnonzero(c[0])]).sum(axis=0) > 0))
 
 

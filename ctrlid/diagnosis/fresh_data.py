@@ -99,7 +99,7 @@ def choose_fresh_data(
         If a record for validation is sampled in another way than the loop.
     """
     for r in validation or ():
-        if abs(r.dt - loop.dt) > 1e-9 * loop.dt:
+        if abs(r.dt - loop.dt) > THRESHOLD.same_period * loop.dt:
             raise CtrlidError(f"validation= is sampled at {r.dt:g} s, the loop at {loop.dt:g} s; "
                               "give both the same period")  # fmt: skip
     rest: tuple[Record, ...] | None = None

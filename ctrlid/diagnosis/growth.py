@@ -82,7 +82,7 @@ def search_effects(
             model = with_linearization(drop_superfluous(model, given))
         if (
             len(model.loop.effects) - given >= THRESHOLD.many_effects
-            or len(steps) >= THRESHOLD.many_effects + 2
+            or len(steps) >= THRESHOLD.many_effects + THRESHOLD.more_rounds
         ):
             break
         tell(f"round {len(steps) + 1}: screening")

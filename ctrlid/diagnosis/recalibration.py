@@ -72,7 +72,7 @@ def model_at_given_values(base: Model) -> Model | None:
     missing effect shows at the given ones.
     """
     given = start_values(base.loop, base.names)
-    size = np.maximum(np.abs(given), 1e-300)
+    size = np.maximum(np.abs(given), THRESHOLD.tiny)
     if not np.any(np.abs(base.fit.theta - given) > THRESHOLD.far_recalibration * size):
         return None
     try:
@@ -101,7 +101,10 @@ def cut_stretches(records: Sequence[Record]) -> tuple[list[Record], list[float]]
         return list(records), [0.0] * len(records)
     parts, begins = [], []
     for record in records:
-        size = max(THRESHOLD.fitted_samples * len(record) // total // THRESHOLD.stretches, 1000)
+        size = max(
+            THRESHOLD.fitted_samples * len(record) // total // THRESHOLD.stretches,
+            THRESHOLD.shortest_stretch,
+        )
         firsts = np.linspace(0, max(len(record) - size, 0), THRESHOLD.stretches).astype(int)
         for first in dict.fromkeys(firsts.tolist()):
             part = record[first : first + size]

@@ -18,6 +18,7 @@ from ..physics.linearization import OperatingPoint
 from ..validation.record_audit import Audit, audit
 from .thresholds import THRESHOLD
 
+ROUNDING = 12  # Rounding to steps q adds a variance of q^2 / 12.
 HOPELESS = ("too few samples", "constant signal", "operating point")
 
 
@@ -143,7 +144,7 @@ def read_clipping(
 def censor_record(record: Record, effect: AbstractEffect) -> Record:
     """Return a record in which samples on a limit of the sensor do not count."""
     assert isinstance(effect, SensorSaturation)
-    slack = 1e-9 * float(np.ptp(record.y))
+    slack = THRESHOLD.on_limit * float(np.ptp(record.y))
     y = np.asarray(record.y)
     free = (y > effect.lower + slack) & (y < effect.upper - slack)
     return replace(record, valid=np.asarray(record.valid) & free)
@@ -159,8 +160,8 @@ def read_steps(
     """
     step = max((float(a.quantum.get("y", 0.0)) for a in audits), default=0.0)
     noise = float(np.mean(fit.sensor))
-    share = step**2 / 12 / noise if noise > 0 else 0.0
+    share = step**2 / ROUNDING / noise if noise > 0 else 0.0
     if Quantization not in catalogue or share < THRESHOLD.coarse_steps:
         return None
-    gain = -0.5 * fit.size * math.log(max(1 - share, 1e-3))
+    gain = -0.5 * fit.size * math.log(max(1 - share, THRESHOLD.noise_beside_steps))
     return Readout(Quantization(step), gain, {"step": 0.0})

@@ -156,7 +156,7 @@ def write_conclusion(
                 f"accounts for: {why}.")  # fmt: skip
     else:
         text = f"Something is missing, but none of the known effects accounts for it: {why}."
-    left = [w for w in where if w.p_after < 1e-4]
+    left = [w for w in where if w.p_after < THRESHOLD.surely_left]
     if left and verdict in ("partly explained", "unknown"):
         text += f" It shows along {' and '.join(w.axis for w in left[:2])}."
     if disturbance.large:
