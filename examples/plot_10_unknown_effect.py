@@ -30,7 +30,7 @@ class Push(cid.effects.ForceEffect):
     """Somebody leaned on the table."""
 
     strength: float = cid.effects.parameter("{y}/s^2", neutral=0.0)
-    time: float = cid.effects.parameter("s")
+    time: float = cid.effects.parameter("s", instant=True)
 
     def force(self, m):
         """Return the acceleration."""

@@ -51,8 +51,6 @@ def numbers_in(source, stem):
 
 @pytest.mark.parametrize("path", [p for p in FILES if p.stem not in LAYOUT], ids=lambda p: p.stem)
 def test_no_number_stands_outside_the_table(path):
-    if path.stem in ("scans", "fitted_model"):
-        pytest.skip("what effects own moves to them")
     assert numbers_in(path.read_text("utf-8"), path.stem) == []
 
 

@@ -9,12 +9,9 @@ import numpy as np
 
 from .._base.errors import CtrlidError
 from ..data.record import Record
-from ..effects import AbstractEffect, PeriodicForce, PositionRipple, SensorOffset
+from ..effects import AbstractEffect
 from ..estimation.likelihood.sampled_plant import Trajectory
-from ..loop.loop import Loop
-from ..physics.linearization import state_matrices
 from .fitted_model import Model, keep_information
-from .thresholds import THRESHOLD
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,17 +79,12 @@ def keep_for_comparison(trial: Trial) -> Trial:
     return replace(trial, model=replace(trial.model, fit=slim))
 
 
-OFFSETS = (SensorOffset,)
-
-
 def list_candidates(
     catalogue: Sequence[type[AbstractEffect]], loop: Any, record: Record
 ) -> list[AbstractEffect]:
     """Return every effect of a catalogue that a plant can have, at its start."""
     found: list[AbstractEffect] = []
     for kind in catalogue:
-        if kind.place == "output" and kind in OFFSETS and not _place_matters(loop):
-            continue  # the initial position, of which nobody knows where it is counted from
         found += kind.candidates(loop, record)
     return found
 
@@ -110,15 +102,6 @@ def check_catalogue(catalogue: Sequence[type[AbstractEffect]]) -> None:
                           f"brackets: [{catalogue!r}]")  # fmt: skip
 
 
-def _place_matters(loop: Loop) -> bool:
-    """Whether the plant moves differently when its output is shifted."""
-    a, _, c, _ = state_matrices(loop.equations(), loop.point, spread=THRESHOLD.shifted_far)
-    return bool(np.any(np.abs(a[:, np.flatnonzero(c[0])]).sum(axis=0) > 0))
-
-
-WAVES = (PeriodicForce, PositionRipple)  # of which there may be several
-
-
 def list_missing_candidates(
     model: Model, catalogue: Sequence[type[AbstractEffect]]
 ) -> list[AbstractEffect]:
@@ -130,5 +113,5 @@ def list_missing_candidates(
 
 
 def _has_effect(model: Model, effect: AbstractEffect) -> bool:
-    """Whether the model has this effect already; there may be several waves."""
-    return not isinstance(effect, WAVES) and any(same_kind(e, effect) for e in model.loop.effects)
+    """Whether the model has this effect already, and a plant can have it only once."""
+    return not effect.repeatable and any(same_kind(e, effect) for e in model.loop.effects)

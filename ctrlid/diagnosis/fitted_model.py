@@ -112,18 +112,13 @@ def carry_over(base: Model, loop: Loop, names: Sequence[str]) -> Fit:
         if name in base.names:
             i = base.names.index(name)
             lower[k], upper[k] = old.lower[i], old.upper[i]
-    longest = max(len(t.record) for t in prepared) * loop.dt
-    for k, name in enumerate(names):
-        if name.endswith(".frequency"):  # what samples show: below Nyquist's, above one period
-            lower[k], upper[k] = max(lower[k], 1.0 / longest), min(upper[k], 0.4 / loop.dt)
-        if name.endswith(".damping"):
-            upper[k] = min(upper[k], 1.0)
-        if name.endswith(".period") and m.e.velocities:  # what repeats has to repeat
-            way = max(float(np.ptp(a.filtered[:, m.position])) for a in at)
-            upper[k] = max(min(upper[k], way), lower[k])
-        if name.endswith(".vs"):  # of the speeds that there are
-            fastest = max(_largest_speed(m, a) for a in at)
-            lower[k], upper[k] = max(lower[k], 1e-3 * fastest), min(upper[k], 3.0 * fastest)
+    seen = RecordRange(m, max(len(data.record) for data in prepared) * loop.dt, tuple(at))
+    for label, effect in loop.labelled.items():
+        for key, (low, high) in effect.limits(seen).items():
+            if f"{label}.{key}" in names:
+                k = list(names).index(f"{label}.{key}")
+                lower[k] = max(lower[k], low)
+                upper[k] = max(min(upper[k], high), lower[k])
     problem = replace(old, plant=m, prepared=prepared, lower=lower, upper=upper)
     theta = np.clip(start_values(loop, names), lower, upper)
     fit = evaluate(problem, theta, base.fit.noise, at)
@@ -132,10 +127,35 @@ def carry_over(base: Model, loop: Loop, names: Sequence[str]) -> Fit:
     return fit
 
 
-def _largest_speed(m: SampledPlant, at: Trajectory) -> float:
-    """Return the largest usual speed along a trajectory."""
-    fastest = [float(np.quantile(np.abs(at.filtered[:, j]), 0.99)) for j in m.e.velocities]
-    return max(fastest, default=1.0) or 1.0
+@dataclass(frozen=True, eq=False)
+class RecordRange:
+    """What records cover along the trajectories of a plant; see `ctrlid.effects.scanning.Range`."""
+
+    plant: SampledPlant
+    duration: float
+    at: tuple[Trajectory, ...]
+
+    @property
+    def dt(self) -> float:
+        """Sampling period [s]."""
+        return self.plant.loop.dt
+
+    @property
+    def travel(self) -> float:
+        """How far the position moves [output unit]; infinite without a moving mass."""
+        if not self.plant.e.velocities:
+            return math.inf
+        return max(float(np.ptp(a.filtered[:, self.plant.position])) for a in self.at)
+
+    @property
+    def fastest(self) -> float:
+        """The largest usual speed [output unit/s]; 1 where nothing moves."""
+        return max(self._usual_speed(a) for a in self.at)
+
+    def _usual_speed(self, at: Trajectory) -> float:
+        speeds = [np.abs(at.filtered[:, j]) for j in self.plant.e.velocities]
+        usual = (float(np.quantile(v, THRESHOLD.usual_speed)) for v in speeds)
+        return max(usual, default=1.0) or 1.0
 
 
 def _carry_trajectory(

@@ -24,7 +24,7 @@ from .removal import (
 )
 from .replicas import forgive_filter, make_replica
 from .rivals import compare_effects
-from .scans import SCANS, scan_candidate
+from .scans import scan_candidate
 from .selection import Round, Work, run_round
 from .thresholds import THRESHOLD
 
@@ -180,7 +180,7 @@ def _look_back(
     for k, trial in enumerate(near[: THRESHOLD.looked_back]):
         model = with_linearization(trial.model)
         pool = [c for c in list_missing_candidates(model, catalogue)
-                if type(c) not in SCANS or type(c).__name__ in likely]  # fmt: skip
+                if not c.is_scanned() or type(c).__name__ in likely]  # fmt: skip
         tried: list[Trial] = work(lambda effect, model=model: scan_candidate(model, effect), pool)
         tried = sorted(tried, key=lambda t: t.full_penalty - t.score)[:2]
         done = work(lambda t, model=model: refit_candidate(model, t), tried)

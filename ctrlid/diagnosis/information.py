@@ -89,8 +89,7 @@ def find_objection(trial: Trial) -> str:
         low, high = fit.problem.lower[k], fit.problem.upper[k]
         about = next(p for p in effect.parameters() if p.name == name.partition(".")[2])
         on_bound = fit.theta[k] in (low, high)
-        scanned = about.name in ("frequency", "period")
-        if on_bound and (scanned or about.neutral not in (None, low, high)):
+        if on_bound and (about.searched or about.neutral not in (None, low, high)):
             return f"{about.name} ends on its bound {fit.theta[k]:g}"
     if _is_insignificant(trial, effect):
         return "no larger than its uncertainty"

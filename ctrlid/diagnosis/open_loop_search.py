@@ -12,7 +12,7 @@ import numpy as np
 
 from .._base.arrays import Array
 from .._base.errors import CtrlidError
-from ..effects import AbstractEffect, ParameterStep, PeriodicForce, StateLimit
+from ..effects import AbstractEffect
 from ..estimation.likelihood.physics_fit import start_values
 from .candidates import Trial, list_candidates, same_kind
 from .fitted_model import Model
@@ -21,7 +21,7 @@ from .growth import Search
 from .noise_tests import run_noise_tests
 from .open_loop_fit import Simulated, Simulation, make_fit
 from .removal import Weighed, take_out_effect
-from .scans import LIMITS
+from .scans import find_strongest_line
 from .selection import Round
 from .thresholds import THRESHOLD
 
@@ -203,7 +203,7 @@ def _screen(now: Simulated, effect: AbstractEffect) -> Tried | None:
     """Return an effect at the start from which a first step promises most."""
     best: Tried | None = None
     task: Simulation | None = None
-    for one in _list_starts(now, effect):
+    for one in effect.spread_starts(SimulationSight(now)):
         try:
             loop = now.fitted.with_effect(one)
             label = next(k for k in loop.labelled if k not in now.loop.labelled)
@@ -251,23 +251,27 @@ def _refit(now: Simulated, t: Tried) -> Tried:
                    remark="vanishes when refitted" if effect.neutral else "")  # fmt: skip
 
 
-def _list_starts(now: Simulated, effect: AbstractEffect) -> list[AbstractEffect]:
-    """Return an effect at the places where it may be: limits, instants, frequencies."""
-    if isinstance(effect, StateLimit) and effect.name in now.starts[0]:
-        k = list(now.starts[0]).index(effect.name)
-        levels = np.quantile(np.concatenate([x[:, k] for x in now.states]), LIMITS)
-        return [replace(effect, upper=float(v)) for v in levels]
-    if isinstance(effect, ParameterStep):
-        last = max(float(r.t[-1] - r.start) for r in now.task.records)
-        times = np.linspace(0, last, THRESHOLD.open_loop_step_times + 2)[1:-1]
-        return [replace(effect, time=float(t)) for t in times]
-    if isinstance(effect, PeriodicForce):
-        size = THRESHOLD.line_padding * len(now.errors)
-        power = np.abs(np.fft.rfft(now.errors, size)) ** 2
-        power[: THRESHOLD.slowest_line] = 0.0
-        line = int(np.argmax(power)) / (size * now.task.records[0].dt)
-        return [replace(effect, frequency=line, phase=p) for p in (0.0, np.pi / 2)]
-    return [effect]
+@dataclass(frozen=True, eq=False)
+class SimulationSight:
+    """What a simulated loop sees of its records, in place of what a filter sees."""
+
+    simulated: Simulated
+
+    @property
+    def times(self) -> tuple[Array, ...]:
+        """Times of the samples since the start of each record [s]."""
+        return tuple(record.t - record.start for record in self.simulated.task.records)
+
+    def state(self, name: str) -> tuple[Array, ...] | None:
+        """Return a simulated state along each record, or None if the plant has no such state."""
+        names = list(self.simulated.starts[0])
+        if name not in names:
+            return None
+        return tuple(x[:, names.index(name)] for x in self.simulated.states)
+
+    def strongest_line(self) -> float:
+        """Return the frequency of the strongest line in the errors of the simulation [Hz]."""
+        return find_strongest_line(self.simulated.errors, self.simulated.task.records[0].dt)
 
 
 def _make_trial(t: Tried, base: Model) -> Trial:

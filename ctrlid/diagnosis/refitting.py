@@ -112,8 +112,12 @@ def place_instants(fit: Fit) -> Fit:
     """
     plant = fit.problem.plant
     best = fit
+    instants = {
+        f"{label}.{p.name}" for label, e in plant.loop.labelled.items()
+        for p in e.parameters() if p.instant
+    }  # fmt: skip
     for k, name in enumerate(plant.names):
-        while name.endswith(".time"):
+        while name in instants:
             reach = 2.0 ** np.arange(THRESHOLD.instant_doublings)
             there = max(
                 (_move_instant(best, k, s * r) for r in reach for s in (-1, 1)), key=_likelihood_of

@@ -145,9 +145,6 @@ def drop_superfluous(model: Model, given: int) -> Model:
     return model
 
 
-ORDERED = ("input", "output")  # places with a signal through them; forces and laws only add up
-
-
 def order_last_effect(model: Model, given: int) -> Model:
     """Return the model with its last effect nearer to the plant, if it fits better there.
 
@@ -167,7 +164,7 @@ def order_last_effect(model: Model, given: int) -> Model:
         The order that is likelier by more than 3 units, or the model as it is.
     """
     *others, last = model.fitted.effects
-    if last.place not in ORDERED:
+    if not last.ordered:
         return model
     best = model
     for k in range(given, len(others)):

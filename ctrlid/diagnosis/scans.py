@@ -1,37 +1,20 @@
 """Step 4: where along a frequency, a length or the time an effect would have to sit."""
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import replace
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from .._base.arrays import Array
 from .._base.errors import CtrlidError
-from ..effects import (
-    AbstractEffect,
-    FlexibleMode,
-    InputSaturation,
-    ParameterStep,
-    PeriodicForce,
-    PositionRipple,
-    StateLimit,
-)
+from ..effects import AbstractEffect
 from ..estimation.likelihood.kalman_filter import run_filter
 from ..estimation.likelihood.likelihood import pseudo_inverse
 from .candidates import Trial
 from .fitted_model import Model
 from .screening import screen_candidate, screen_starts
 from .thresholds import THRESHOLD
-
-LENGTHS = 150  # wavelengths that are looked for in the travel
-UNHURRIED = 0.25  # of the samples: a wave that these can follow is looked for
-EDGE = 0.05  # of the record, at either end
-TIMES = 40  # instants at which a parameter might have stepped
-LIMITS = (0.999, 0.998, 0.995, 0.99, 0.98, 0.95, 0.9, 0.8)  # quantiles that may be cut off
-DEPTHS = (0.5, 0.25)  # of the range of the input, to which it may have been limited
-MODES = 7  # frequencies at which a flexible mode is tried
 
 
 def score_shapes(
@@ -106,6 +89,83 @@ def score_shapes(
     return np.array(gains), np.array(sizes)
 
 
+@dataclass(frozen=True, eq=False)
+class ModelSight:
+    """What a fitted model sees of its records, for effects that look for their place."""
+
+    model: Model
+
+    @property
+    def dt(self) -> float:
+        """Sampling period [s]."""
+        return self.model.loop.dt
+
+    @property
+    def times(self) -> tuple[Array, ...]:
+        """Times of the samples since the start of the experiment [s], by record."""
+        return tuple(data.table[0] for data in self.model.fit.problem.prepared)
+
+    @property
+    def inputs(self) -> Array:
+        """The recorded inputs that count, one record after the other [input unit]."""
+        prepared = self.model.fit.problem.prepared
+        return np.concatenate([data.table[1][data.valid] for data in prepared])
+
+    @property
+    def outputs(self) -> tuple[Array, ...]:
+        """The recorded outputs, by record [output unit]."""
+        return tuple(record.y for record in self.model.records)
+
+    @property
+    def travel(self) -> float:
+        """How far the position moves on samples that count [output unit]."""
+        ways, counts = self.positions(), self.model.fit.problem.counts
+        return max(float(np.ptp(way[keep])) for way, keep in zip(ways, counts, strict=True))
+
+    @property
+    def block(self) -> int:
+        """How many waves over all samples fit into memory at once."""
+        longest = max(len(t) for t in self.times)
+        states = self.model.fit.problem.plant.size
+        return max(1, THRESHOLD.scan_block // (2 * (states + 1) * longest))
+
+    def state(self, name: str) -> tuple[Array, ...] | None:
+        """Return a filtered state along each record, or None if the plant has no such state."""
+        states = list(self.model.fit.problem.plant.e.states)
+        return self._filtered(states.index(name)) if name in states else None
+
+    def positions(self) -> tuple[Array, ...]:
+        """Return the filtered position along each record [output unit]."""
+        return self._filtered(self.model.fit.problem.plant.position)
+
+    def _filtered(self, k: int) -> tuple[Array, ...]:
+        return tuple(out.trajectory.filtered[:, k] for out in self.model.fit.filtered)
+
+    def parameter(self, name: str) -> float | None:
+        """Return the fitted value of a free parameter of the plant, or None if it is not free."""
+        names = self.model.names
+        return float(self.model.fit.theta[names.index(name)]) if name in names else None
+
+    def strongest_line(self) -> float:
+        """Return the frequency of the strongest line in the innovations [Hz]."""
+        z = max(self.model.fit.standardized, key=len)
+        return find_strongest_line(np.nan_to_num(z), self.dt)
+
+    def score_shapes(
+        self, shapes: Sequence[Array], parameter: str | None = None, width: int = 1
+    ) -> tuple[Array, Array]:
+        """Return what forces of given shapes would gain, and the sizes that gain it."""
+        return score_shapes(self.model, shapes, parameter, width)
+
+
+def find_strongest_line(errors: Array, dt: float) -> float:
+    """Return the frequency of the strongest line [Hz], drifts left out."""
+    size = THRESHOLD.line_padding * len(errors)
+    power = np.abs(np.fft.rfft(errors, size)) ** 2
+    power[: THRESHOLD.slowest_line] = 0.0
+    return int(np.argmax(power)) / (size * dt)
+
+
 def scan_candidate(model: Model, effect: AbstractEffect) -> Trial:
     """Return the trial of an effect at the place where its score is largest.
 
@@ -114,184 +174,25 @@ def scan_candidate(model: Model, effect: AbstractEffect) -> Trial:
     model : Model
         The fitted model.
     effect : AbstractEffect
-        An effect with a frequency, a period or a time to be looked for; others are tried as
-        they are.
+        An effect, which may have a frequency, a period or a time to be looked for.
 
     Returns
     -------
     Trial
         The best place, which has paid for the search.
     """
-    search = SCANS.get(type(effect), screen_candidate)
     try:
-        return search(model, effect)
+        scan = effect.scan(ModelSight(model))
+        if scan is None:
+            return screen_candidate(model, effect)
+        if not scan.starts:
+            return Trial(effect, "", model, -math.inf, remark=scan.remark)
+        penalty = math.log(scan.places)
+        if len(scan.starts) == len(scan.starts[0]) == 1:
+            best = screen_candidate(model, scan.starts[0][0], penalty)
+        else:
+            tried = (screen_starts(model, group, penalty) for group in scan.starts)
+            best = max(tried, key=lambda t: t.score)
+        return replace(best, others=scan.others)
     except CtrlidError as reason:  # a place that the effect cannot have
         return Trial(effect, "", model, -math.inf, remark=str(reason))
-
-
-def _amplitude_and_phase(size: Array) -> tuple[float, float]:
-    """Return amplitude and phase of ``size[0] sin + size[1] cos``."""
-    return float(np.hypot(*size)), float(np.arctan2(size[1], size[0]))
-
-
-def _find_strongest_line(model: Model) -> tuple[float, int]:
-    """Return the frequency of the strongest line in the innovations [Hz], and their number."""
-    z = max(model.fit.standardized, key=len)
-    n, dt = len(z), model.loop.dt
-    power = np.abs(np.fft.rfft(np.nan_to_num(z), 4 * n)) ** 2
-    power[:8] = 0.0  # slower than two periods: a drift, not a vibration
-    return int(np.argmax(power)) / (4 * n * dt), n
-
-
-def _limit(model: Model, effect: StateLimit) -> Trial:
-    states = list(model.fit.problem.plant.e.states)
-    if effect.name not in states:
-        return screen_candidate(model, effect)
-    k = states.index(effect.name)
-    values = np.concatenate([out.trajectory.filtered[:, k] for out in model.fit.filtered])
-    # From the highest down: where it cuts off little, the trajectory of the model still holds.
-    limits = [float(v) for v in np.quantile(values, LIMITS)]
-    return screen_starts(model, [replace(effect, upper=v) for v in limits], math.log(len(limits)))
-
-
-def _valid_inputs(model: Model) -> Array:
-    """Return the recorded inputs that count, one record after the other."""
-    return np.concatenate([t.table[1][t.valid] for t in model.fit.problem.prepared])
-
-
-def _saturation(model: Model, effect: InputSaturation) -> Trial:
-    u = _valid_inputs(model)
-    upper = [replace(effect, upper=float(v)) for v in np.quantile(u, LIMITS)]
-    lower = [replace(effect, lower=float(v)) for v in np.quantile(u, 1 - np.array(LIMITS))]
-    sides = [[e for e in side if e.lower < e.upper] for side in ([effect], upper, lower)]
-    full_penalty = math.log(sum(len(side) for side in sides))
-    return max((screen_starts(model, side, full_penalty) for side in sides if side),
-               key=lambda t: t.score)  # fmt: skip
-
-
-def other_starts(model: Model, effect: AbstractEffect) -> list[AbstractEffect]:
-    """Return other starts of an effect whose likelihood has maxima far apart.
-
-    An input that is limited nearly always has made the model's parameters fit the limited one: no
-    limit promises anything then, and a fit from the edge of the range stays there.
-    """
-    if not isinstance(effect, InputSaturation):
-        return []
-    u = _valid_inputs(model)
-    middle, low, high = float(np.median(u)), float(np.min(u)), float(np.max(u))
-    if not low < middle < high:
-        return []
-    return [InputSaturation(middle - d * (middle - low), middle + d * (high - middle))
-            for d in DEPTHS]  # fmt: skip
-
-
-def _periodic(model: Model, effect: PeriodicForce) -> Trial:
-    frequency, n = _find_strongest_line(model)
-    shapes = []
-    for track in model.fit.problem.prepared:
-        angle = 2 * np.pi * frequency * track.table[0]
-        shapes.append(np.column_stack([np.sin(angle), np.cos(angle)]))
-    _, sizes = score_shapes(model, shapes, width=2)
-    amplitude, phase = _amplitude_and_phase(sizes[0])
-    start = replace(effect, amplitude=amplitude, frequency=frequency, phase=phase)
-    return screen_candidate(model, start, math.log(n / 2))
-
-
-def _ripple(model: Model, effect: PositionRipple) -> Trial:
-    m = model.fit.problem.plant
-    ways = [out.trajectory.filtered[:, m.position] for out in model.fit.filtered]
-    travel = max(float(np.ptp(w[k])) for w, k in zip(ways, model.fit.problem.counts, strict=True))
-    step = max(float(np.quantile(np.abs(np.diff(w)), UNHURRIED)) for w in ways)
-    grain = max(_grain(track.record.y) for track in model.fit.problem.prepared)
-    shortest = max(travel / LENGTHS, 4 * step, 4 * grain)
-    if not travel > 2 * shortest:
-        return Trial(effect, "", model, -math.inf, remark="the travel is too short to see a ripple")
-    finest, full_penalty = 0.25 / travel, math.log(max((1.0 / shortest - 1.0 / travel) * travel, 1))
-
-    def gains_of(waves: Array) -> tuple[Array, Array]:
-        block = max(1, THRESHOLD.scan_block // (2 * (m.size + 1) * max(len(w) for w in ways)))
-        parts = []
-        for k in range(0, len(waves), block):
-            angles = [2 * np.pi * np.outer(w, waves[k : k + block]) for w in ways]
-            shapes = [np.stack([np.sin(a), np.cos(a)], axis=2).reshape(len(a), -1) for a in angles]
-            parts.append(score_shapes(model, shapes, width=2))
-        gains, sizes = zip(*parts, strict=True)
-        return np.concatenate(gains), np.concatenate(sizes)
-
-    waves = np.arange(1.0 / travel, 1.0 / shortest, 2 * finest)
-    gains, sizes = gains_of(waves)
-    # A peak is about one over the travel wide: only those that may be the highest are seen finely.
-    tops = _peaks(gains, THRESHOLD.wave_near_best**2, 2 * THRESHOLD.waves_kept)
-    between = np.concatenate([waves[tops] - finest, waves[tops] + finest])
-    between = np.unique(between[between > 0])
-    more, theirs = gains_of(between)
-    waves, first = np.unique(np.concatenate([waves, between]), return_index=True)
-    gains, sizes = (np.concatenate(x)[first] for x in ((gains, more), (sizes, theirs)))
-
-    def at(k: int) -> PositionRipple:
-        amplitude, phase = _amplitude_and_phase(sizes[k])
-        return replace(effect, amplitude=amplitude, period=float(1 / waves[k]), phase=phase)
-
-    best, *others = map(at, _peaks(gains, THRESHOLD.wave_near_best, THRESHOLD.waves_kept))
-    # Motion between a few levels sees several waves nearly alike: only fits tell them apart.
-    return replace(screen_candidate(model, best, full_penalty), others=tuple(others))
-
-
-def _peaks(gains: Array, nearly: float, most: int) -> list[int]:
-    """Return the highest peaks: those that are nearly as high as the best, at most so many."""
-    padded = np.concatenate([[-np.inf], gains, [-np.inf]])
-    tops = np.flatnonzero((gains >= padded[:-2]) & (gains > padded[2:]))
-    tops = tops[gains[tops] > nearly * gains.max()]
-    return [int(k) for k in tops[np.argsort(-gains[tops])][:most]] or [int(np.argmax(gains))]
-
-
-def _grain(y: Array) -> float:
-    """Return the step of a coarsely quantised sensor, whose rounding repeats along the way."""
-    values = np.unique(y)
-    return float(np.min(np.diff(values))) if 1 < len(values) < len(y) / 8 else 0.0
-
-
-def _step(model: Model, effect: ParameterStep) -> Trial:
-    if effect.name not in model.names:
-        return screen_candidate(model, effect)
-    records = [t.record for t in model.fit.problem.prepared]
-    last = float(max(t.table[0, -1] for t in model.fit.problem.prepared))
-    # At the very ends a step is only another name for the initial state.
-    low, high = EDGE * last, (1 - EDGE) * last
-    # The likelihood is rugged in the time of a step: the scan must come within a sample of it.
-    while True:
-        times = np.linspace(low, high, TIMES + 2)[1:-1]
-        shapes = [t.table[0][:, None] >= times for t in model.fit.problem.prepared]
-        gains, sizes = score_shapes(model, shapes, effect.name)
-        best = int(np.argmax(gains))
-        width = times[1] - times[0]
-        if width < 0.5 * records[0].dt:
-            break
-        low, high = max(times[best] - 2 * width, low), min(times[best] + 2 * width, high)
-    value = float(model.fit.theta[model.names.index(effect.name)])
-    size = float(sizes[best, 0]) / value if value else 0.0
-    start = replace(effect, time=float(times[best]), size=min(max(size, -0.9), 10.0))
-    return screen_candidate(model, start, math.log(len(records[0])))
-
-
-def _mode(model: Model, effect: FlexibleMode) -> Trial:
-    record = model.fit.problem.prepared[0].record
-    slowest = 5.0 / (len(record) * record.dt)
-    grid = np.geomspace(max(slowest, 1e-2 / record.dt / 10), 0.35 / record.dt, MODES)
-    modes = [replace(effect, frequency=float(f), damping=0.1, coupling=0.0) for f in grid]
-    # A lightly damped mode is a line in the innovations, too narrow for any grid.
-    line = min(
-        max(_find_strongest_line(model)[0], 2.0 / (len(record) * record.dt)), 0.35 / record.dt
-    )
-    modes += [replace(effect, frequency=line, damping=0.03, coupling=c) for c in (0.0, 0.05)]
-    return screen_starts(model, modes, math.log(MODES))
-
-
-SCANS: dict[type, Callable[[Model, Any], Trial]] = {
-    PeriodicForce: _periodic,
-    PositionRipple: _ripple,
-    ParameterStep: _step,
-    FlexibleMode: _mode,
-    StateLimit: _limit,
-    InputSaturation: _saturation,
-}

@@ -11,7 +11,7 @@ from .candidates import Trial, contains, keep_for_comparison, same_kind
 from .fitted_model import Model, without_random_force
 from .refitting import refit_candidate, refit_under_noise
 from .replicas import gain_beyond_simple, gain_on_replicas, has_kinks, make_replica
-from .scans import other_starts, scan_candidate
+from .scans import ModelSight, scan_candidate
 from .screening import screen_at
 from .thresholds import THRESHOLD
 
@@ -104,7 +104,7 @@ def _refit_promising(
              if id(t) not in done and t.name in alike and t.score > -math.inf])  # fmt: skip
         best = fit([(t, e, None) for t in tried
                     if id(t) in done and t.name in {best.name, *alike}
-                    for e in other_starts(base, t.effect)])  # fmt: skip
+                    for e in t.effect.other_starts(ModelSight(base))])  # fmt: skip
         stuck = [t for t in _find_stuck(best, tried) if id(t) in done]
         near = without_random_force(best.model)
         fit([(t, done[id(t)].fitted, near) for t in stuck])

@@ -161,13 +161,12 @@ class Thresholds:
     )  # fmt: skip
 
     # Step 4: screening.
+    usual_speed: float = value(
+        0.99, convention="the largest usual speed is this quantile", unit="of the samples"
+    )
     seen: float = value(
         1e-7, cost="a parameter of which others leave less is not told from them in double "
         "precision", unit="of its information",
-    )  # fmt: skip
-    shifted_far: float = value(
-        1e6, cost="a plant that moves alike wherever its output is counted from has no place",
-        unit="times the output",
     )  # fmt: skip
     fainter_tries: int = value(
         3, cost="how often an effect that promises nothing is tried at a tenth of its size",
@@ -175,11 +174,6 @@ class Thresholds:
     )  # fmt: skip
     fainter: float = value(0.1, cost="by that an effect is made fainter", unit="of its size")
     scan_block: int = value(500_000, cost="shapes are scanned in blocks", unit="numbers")
-    wave_near_best: float = value(
-        0.7, study="another wave that promises so much is refitted as well",
-        unit="of the best wave's score",
-    )  # fmt: skip
-    waves_kept: int = value(4, cost="at most", unit="waves")
 
     # Step 5: refit.
     refit_rounds: int = value(
@@ -235,7 +229,7 @@ class Thresholds:
         30.0, study="beside a kink, a smaller net gain is compared with more replicas",
         unit="of log-likelihood",
     )  # fmt: skip
-    replicas_beside_kink: int = value(4, cost="those replicas", unit="replicas")
+    replicas_beside_kink: int = value(4, cost="so many of those replicas", unit="replicas")
     replica_rounds: int = value(8, cost="of a model fitted to its replica",
                                 unit="steps of the climb")  # fmt: skip
     shortest_segment: int = value(10, cost="shorter ones are not simulated anew", unit="samples")
@@ -456,8 +450,6 @@ class Thresholds:
         8, convention="a slower line of the padded spectrum is a drift, not a vibration",
         unit="bins of the padded spectrum",
     )  # fmt: skip
-    open_loop_step_times: int = value(12, cost="at which a parameter might have stepped",
-                                      unit="instants")  # fmt: skip
     open_loop_closes: float = value(
         0.95, study="an effect stays if no more is left", unit="of the error before it"
     )

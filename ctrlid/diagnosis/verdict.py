@@ -2,10 +2,11 @@
 
 import itertools
 import math
+from collections import Counter
 from collections.abc import Sequence
 
 from .._base.text import chance, number
-from ..effects import AbstractEffect, PositionRipple
+from ..effects import AbstractEffect
 from ..estimation.likelihood.likelihood import Fit
 from .findings import BinnedErrors, Disturbance, Finding, Gap, Verdict
 from .noise_tests import NoiseTests
@@ -66,8 +67,9 @@ def find_doubt(effects: Sequence[AbstractEffect], gains: Sequence[float], total:
     """
     if len(effects) >= THRESHOLD.many_effects:
         return "so many effects at once describe almost any error, and prove little"
-    if sum(isinstance(e, PositionRipple) for e in effects) > 1:
-        return "several ripples together describe any curve over the position, and prove little"
+    for kind, count in Counter(type(e) for e in effects).items():
+        if count > 1 and kind.doubt_of_several:
+            return str(kind.doubt_of_several)
     if len(effects) >= THRESHOLD.some_effects and min(gains) < THRESHOLD.slight_effect * max(gains):
         return "the smallest of so many effects may only correct what a larger one gets wrong"
     for one, other in itertools.combinations(range(len(effects)), 2):

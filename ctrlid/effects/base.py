@@ -16,6 +16,7 @@ from ..physics.linearization import OperatingPoint
 from ..physics.symbols import Symbol
 from .context import Moment, motion
 from .parameters import Parameter, filled
+from .scanning import Overview, Range, Scan, Sight
 from .symbolic import spread_of, traced, with_states
 
 Place = Literal["input", "force", "law", "output"]
@@ -39,6 +40,11 @@ class AbstractEffect:
     states: ClassVar[tuple[str, ...]] = ()
     private: ClassVar[tuple[str, ...]] = ()  # parameters that another record has otherwise
     in_linear_model: ClassVar[bool] = True  # False: no part of small deviations from rest
+    ordered: ClassVar[bool] = (
+        False  # True: a signal passes it, so that its turn among others counts
+    )
+    repeatable: ClassVar[bool] = False  # True: a plant may have several of it at once
+    doubt_of_several: ClassVar[str] = ""  # why several of it at once prove little
 
     def __post_init__(self) -> None:
         kind = type(self).__name__
@@ -64,6 +70,68 @@ class AbstractEffect:
     def doubt(self) -> str:
         """Say why values that were fitted cannot be this effect; nothing by default."""
         return ""
+
+    def limits(self, seen: Range) -> dict[str, tuple[float, float]]:
+        """Return what a record limits parameters to, beyond their own bounds; nothing by default.
+
+        Parameters
+        ----------
+        seen : Range
+            What the record covers: period, duration, travel, speed.
+
+        Returns
+        -------
+        dict of str to (float, float)
+            Lower and upper limit by the name of the parameter.
+        """
+        del seen
+        return {}
+
+    def scan(self, sight: Sight) -> Scan | None:
+        """Return the places at which the effect was looked for; None to screen it as it is.
+
+        An effect whose likelihood has many maxima, over a frequency, a length or a time, says here
+        where a fit may start.
+
+        Parameters
+        ----------
+        sight : Sight
+            What a fitted model sees of the records.
+
+        Returns
+        -------
+        Scan or None
+            Starts, the number of places, and what else may be it.
+        """
+        del sight
+        return None
+
+    @classmethod
+    def is_scanned(cls) -> bool:
+        """Whether the effect looks for its place in a record, which takes time."""
+        return cls.scan is not AbstractEffect.scan
+
+    def other_starts(self, sight: Sight) -> tuple[Self, ...]:
+        """Return starts far from this one, for a likelihood with maxima far apart; none by default.
+
+        Parameters
+        ----------
+        sight : Sight
+            As in `scan`.
+        """
+        del sight
+        return ()
+
+    def spread_starts(self, sight: Overview) -> tuple[Self, ...]:
+        """Return starts of a fit by simulation, where no score tells them apart; itself by default.
+
+        Parameters
+        ----------
+        sight : Overview
+            What the simulation sees of the records: times, states, and the strongest line.
+        """
+        del sight
+        return (self,)
 
     @classmethod
     def parameters(cls) -> tuple[Parameter, ...]:

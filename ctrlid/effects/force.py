@@ -1,20 +1,61 @@
 """Forces that depend on place or time, as accelerations of the moving mass."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Self, final
 
 import numpy as np
 
+from .._base.arrays import Array
 from .context import Moment
 from .kinds import ForceEffect
 from .parameters import parameter
+from .scanning import Overview, Range, Scan, Sight
+
+VISIBLE = 0.4  # Of the sampling frequency: what is faster, samples fold.
+LENGTHS = 150  # Wavelengths in the travel: shorter ones are not looked for, for want of time.
+UNHURRIED = 0.25  # Of the samples: a wave is looked for if the motion is slow enough on so many.
+NEARLY = 0.7  # Of the largest gain: another wave that gains so much may be the right one.
+PEAKS = 4  # Waves that are refitted, at most, for want of time.
+MODES = 7  # Frequencies at which a flexible mode is looked for, for want of time.
+SLOWEST_MODE = 5.0  # Periods in the record: a slower mode is no vibration.
+FASTEST_MODE = 0.35  # Of the sampling frequency: a faster one does not show.
 
 
 def middle_frequency(loop: Any, record: Any) -> float:
     """Return a frequency [Hz] halfway, on a logarithmic scale, of what a record can show."""
     samples = 1000 if record is None else len(record)
     return math.sqrt(0.5 / samples) / float(loop.dt)
+
+
+def visible_frequencies(seen: Range) -> tuple[float, float]:
+    """Return the frequencies that samples show [Hz]: one period in the record, below Nyquist's."""
+    return 1.0 / seen.duration, VISIBLE / seen.dt
+
+
+def waves(angles: Array) -> Array:
+    """Return sine and cosine of each column of angles, side by side."""
+    both = np.stack([np.sin(angles), np.cos(angles)], axis=2)
+    return both.reshape(len(angles), -1)
+
+
+def amplitude_and_phase(size: Array) -> tuple[float, float]:
+    """Return amplitude and phase of ``size[0] sin + size[1] cos``."""
+    return float(np.hypot(*size)), float(np.arctan2(size[1], size[0]))
+
+
+def _peaks(gains: Array, nearly: float, most: int) -> list[int]:
+    """Return the highest peaks: those that are nearly as high as the best, at most so many."""
+    padded = np.concatenate([[-np.inf], gains, [-np.inf]])
+    tops = np.flatnonzero((gains >= padded[:-2]) & (gains > padded[2:]))
+    tops = tops[gains[tops] > nearly * gains.max()]
+    return [int(k) for k in tops[np.argsort(-gains[tops])][:most]] or [int(np.argmax(gains))]
+
+
+def _grain(y: Array) -> float:
+    """Return the step of a coarsely quantised sensor, whose rounding repeats along the way."""
+    values = np.unique(y)
+    return float(np.min(np.diff(values))) if 1 < len(values) < len(y) / 8 else 0.0
 
 
 @final
@@ -145,11 +186,12 @@ class PeriodicForce(ForceEffect):
     """
 
     amplitude: float = parameter("{y}/s^2", lower=0.0, neutral=0.0)
-    frequency: float = parameter("Hz", lower=1e-9)
+    frequency: float = parameter("Hz", lower=1e-9, searched=True)
     phase: float = parameter("rad", default=0.0)
 
     private: ClassVar[tuple[str, ...]] = ("phase",)
     in_linear_model: ClassVar[bool] = False
+    repeatable: ClassVar[bool] = True
     look_alikes: ClassVar[tuple[str, ...]] = ("PositionRipple", "FlexibleMode")
     sentence: ClassVar[str] = "Something shakes the plant at a fixed frequency."
     experiment: ClassVar[str] = (
@@ -161,6 +203,24 @@ class PeriodicForce(ForceEffect):
     def candidates(cls, loop: Any, record: Any = None) -> tuple[Self, ...]:
         """Return a vibration of no amplitude; its frequency is to be scanned."""
         return cls._applicable(loop, cls(0.0, middle_frequency(loop, record)))
+
+    def limits(self, seen: Range) -> dict[str, tuple[float, float]]:
+        """Keep the frequency where samples show it."""
+        return {"frequency": visible_frequencies(seen)}
+
+    def scan(self, sight: Sight) -> Scan:
+        """Look at the strongest line of the prediction errors."""
+        frequency = sight.strongest_line()
+        angles = [2 * np.pi * frequency * t for t in sight.times]
+        _, sizes = sight.score_shapes([waves(a[:, None]) for a in angles], width=2)
+        amplitude, phase = amplitude_and_phase(sizes[0])
+        start = replace(self, amplitude=amplitude, frequency=frequency, phase=phase)
+        return Scan(((start,),), places=max(map(len, angles)) / 2)
+
+    def spread_starts(self, sight: Overview) -> tuple[Self, ...]:
+        """Return the strongest line in two phases."""
+        line = sight.strongest_line()
+        return tuple(replace(self, frequency=line, phase=p) for p in (0.0, np.pi / 2))
 
     def force(self, m: Moment) -> Any:
         """Return the acceleration."""
@@ -193,10 +253,14 @@ class PositionRipple(ForceEffect):
     """
 
     amplitude: float = parameter("{y}/s^2", lower=0.0, neutral=0.0)
-    period: float = parameter("{y}", lower=1e-12)
+    period: float = parameter("{y}", lower=1e-12, searched=True)
     phase: float = parameter("rad", default=0.0)
 
     private: ClassVar[tuple[str, ...]] = ("phase",)
+    repeatable: ClassVar[bool] = True
+    doubt_of_several: ClassVar[str] = (
+        "several ripples together describe any curve over the position, and prove little"
+    )
     look_alikes: ClassVar[tuple[str, ...]] = ("PeriodicForce", "SensorNonlinearity")
     sentence: ClassVar[str] = "A force that repeats with the position, as of a screw or a gear."
     experiment: ClassVar[str] = "the same way at two speeds: the ripple stays where it is"
@@ -206,6 +270,48 @@ class PositionRipple(ForceEffect):
         """Return a ripple of no amplitude; its period is to be scanned."""
         way = 0.0 if record is None else float(np.ptp(record.y))
         return cls._applicable(loop, cls(0.0, way / 10 if way > 0 else 0.1))
+
+    def limits(self, seen: Range) -> dict[str, tuple[float, float]]:
+        """Keep the period within the travel: what repeats has to repeat."""
+        return {"period": (-math.inf, seen.travel)}
+
+    def scan(self, sight: Sight) -> Scan:
+        """Look at all wavelengths that the travel can show, and then finely at the best of them."""
+        ways, travel = sight.positions(), sight.travel
+        step = max(float(np.quantile(np.abs(np.diff(w)), UNHURRIED)) for w in ways)
+        grain = max(_grain(y) for y in sight.outputs)
+        shortest = max(travel / LENGTHS, 4 * step, 4 * grain)
+        if not travel > 2 * shortest:
+            return Scan((), remark="the travel is too short to see a ripple")
+        finest = 0.25 / travel
+        places = max((1.0 / shortest - 1.0 / travel) * travel, 1)
+
+        def gains_of(numbers: Array) -> tuple[Array, Array]:
+            parts = []
+            for k in range(0, len(numbers), sight.block):
+                angles = [2 * np.pi * np.outer(w, numbers[k : k + sight.block]) for w in ways]
+                parts.append(sight.score_shapes([waves(a) for a in angles], width=2))
+            gains, sizes = zip(*parts, strict=True)
+            return np.concatenate(gains), np.concatenate(sizes)
+
+        numbers = np.arange(1.0 / travel, 1.0 / shortest, 2 * finest)
+        gains, sizes = gains_of(numbers)
+        # A peak is about one over the travel wide: only those that may be the highest are seen
+        # finely.
+        tops = _peaks(gains, NEARLY**2, 2 * PEAKS)
+        between = np.concatenate([numbers[tops] - finest, numbers[tops] + finest])
+        between = np.unique(between[between > 0])
+        more, theirs = gains_of(between)
+        numbers, first = np.unique(np.concatenate([numbers, between]), return_index=True)
+        gains, sizes = (np.concatenate(x)[first] for x in ((gains, more), (sizes, theirs)))
+
+        def at(k: int) -> PositionRipple:
+            amplitude, phase = amplitude_and_phase(sizes[k])
+            return replace(self, amplitude=amplitude, period=float(1 / numbers[k]), phase=phase)
+
+        best, *others = map(at, _peaks(gains, NEARLY, PEAKS))
+        # Motion between a few levels sees several waves nearly alike: only fits tell them apart.
+        return Scan(((best,),), places, tuple(others))
 
     def force(self, m: Moment) -> Any:
         """Return the acceleration."""
@@ -239,7 +345,7 @@ class FlexibleMode(ForceEffect):
     ('deflection', 'speed')
     """
 
-    frequency: float = parameter("Hz", lower=1e-9)
+    frequency: float = parameter("Hz", lower=1e-9, searched=True)
     damping: float = parameter("", lower=0.0)
     coupling: float = parameter("", lower=0.0, upper=0.95, neutral=0.0)
 
@@ -253,6 +359,21 @@ class FlexibleMode(ForceEffect):
     def candidates(cls, loop: Any, record: Any = None) -> tuple[Self, ...]:
         """Return a mode of no mass; its frequency is to be scanned."""
         return cls._applicable(loop, cls(middle_frequency(loop, record), 0.05, 0.0))
+
+    def limits(self, seen: Range) -> dict[str, tuple[float, float]]:
+        """Keep the frequency where samples show it; what is damped more is no mode."""
+        return {"frequency": visible_frequencies(seen), "damping": (0.0, 1.0)}
+
+    def scan(self, sight: Sight) -> Scan:
+        """Look at a few frequencies, and at the strongest line of the prediction errors."""
+        duration, fastest = len(sight.times[0]) * sight.dt, FASTEST_MODE / sight.dt
+        slowest = max(SLOWEST_MODE / duration, 1e-2 / sight.dt / 10)
+        modes = [replace(self, frequency=float(f), damping=0.1, coupling=0.0)
+                 for f in np.geomspace(slowest, fastest, MODES)]  # fmt: skip
+        # A lightly damped mode is a line in the innovations, too narrow for any grid.
+        line = min(max(sight.strongest_line(), 2.0 / duration), fastest)
+        modes += [replace(self, frequency=line, damping=0.03, coupling=c) for c in (0.0, 0.05)]
+        return Scan((tuple(modes),), places=MODES)
 
     def pull(self, m: Moment) -> Any:
         """Return the spring's force over the small mass."""

@@ -11,9 +11,11 @@ import numpy as np
 from .context import Moment
 from .kinds import ForceEffect
 from .parameters import parameter
+from .scanning import Range
 
 # Within one sample friction changes the velocity by fc*dt: samples cannot show how it sticks.
 STICKING = 0.25
+SLOWEST, FASTEST = 1e-3, 3.0  # Of the largest usual speed: where the curve of Stribeck may bend.
 PUSHING = 1.5  # half the difference over the mean: with some room for their uncertainty
 
 
@@ -208,6 +210,10 @@ class StribeckFriction(ForceEffect):
         if record is not None:
             speed = 0.1 * float(np.std(np.gradient(record.y, record.dt))) or speed
         return cls._applicable(loop, cls(fs=0.0, vs=speed))
+
+    def limits(self, seen: Range) -> dict[str, tuple[float, float]]:
+        """Keep the velocity among those that there are."""
+        return {"vs": (SLOWEST * seen.fastest, FASTEST * seen.fastest)}
 
     def force(self, m: Moment) -> Any:
         """Return the acceleration."""

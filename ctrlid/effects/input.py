@@ -5,7 +5,7 @@ first), then lags, then the curves of the plant's own input.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Self, final
 
 import numpy as np
@@ -14,6 +14,9 @@ from .._base.errors import CtrlidError
 from .context import Moment
 from .kinds import InputEffect
 from .parameters import parameter
+from .scanning import CUT_OFF, Scan, Sight
+
+DEPTHS = (0.5, 0.25)  # Of the range of the input, to which it may have been limited nearly always.
 
 
 def extremes(values: Any, around: float) -> tuple[float, float]:
@@ -62,6 +65,29 @@ class InputSaturation(InputEffect):
         """Return limits just inside the range of the recorded input."""
         low, high = extremes(None if record is None else record.u, loop.point.input)
         return cls._applicable(loop, cls(low, high)) if low < high else ()
+
+    def scan(self, sight: Sight) -> Scan:
+        """Look at limits on either side, over the range that the input has visited."""
+        upper = [replace(self, upper=float(v)) for v in np.quantile(sight.inputs, CUT_OFF)]
+        lower = [replace(self, lower=float(v))
+                 for v in np.quantile(sight.inputs, 1 - np.array(CUT_OFF))]  # fmt: skip
+        sides = tuple(tuple(e for e in side if e.lower < e.upper)
+                      for side in ([self], upper, lower))  # fmt: skip
+        return Scan(tuple(side for side in sides if side), places=sum(map(len, sides)))
+
+    def other_starts(self, sight: Sight) -> tuple[Self, ...]:
+        """Return limits well inside the range of the input.
+
+        An input that is limited nearly always has made the model's parameters fit the limited one:
+        no limit has a score then, and a fit from the edge of the range stays there.
+        """
+        u = sight.inputs
+        middle, low, high = float(np.median(u)), float(np.min(u)), float(np.max(u))
+        if not low < middle < high:
+            return ()
+        return tuple(
+            type(self)(middle - d * (middle - low), middle + d * (high - middle)) for d in DEPTHS
+        )
 
     def input(self, m: Moment) -> Any:
         """Return the limited input."""

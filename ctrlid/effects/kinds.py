@@ -66,6 +66,7 @@ class InputEffect(AbstractEffect):
 
     place: ClassVar[Place] = "input"
     stage: ClassVar[int] = 5
+    ordered: ClassVar[bool] = True
 
     def input(self, m: Moment) -> Any:
         """Return the input that is applied [input unit]."""
@@ -81,6 +82,7 @@ class OutputEffect(AbstractEffect):
 
     place: ClassVar[Place] = "output"
     stage: ClassVar[int] = 8
+    ordered: ClassVar[bool] = True
 
     def output(self, m: Moment) -> Any:
         """Return the output that the sensor shows [output unit]."""
@@ -96,6 +98,7 @@ class ReadingEffect(AbstractEffect):
 
     place: ClassVar[Place] = "output"
     stage: ClassVar[int] = 9
+    ordered: ClassVar[bool] = True
 
     def read(self, m: Moment) -> Any:
         """Return what is recorded of the noisy reading ``m.y`` [output unit]."""

@@ -7,11 +7,13 @@ from typing import Any, ClassVar, Self, final
 import numpy as np
 
 from .._base.errors import CtrlidError
-from ..physics.linearization import OperatingPoint
+from ..physics.linearization import OperatingPoint, state_matrices
 from .context import Moment
 from .input import extremes
 from .kinds import OutputEffect, ReadingEffect
 from .parameters import parameter
+
+SHIFTED_FAR = 1e6  # Times the output: a plant that moves alike so far away has no place.
 
 
 @final
@@ -118,6 +120,18 @@ class SensorOffset(OutputEffect):
     look_alikes: ClassVar[tuple[str, ...]] = ("PositionOffset", "InputOffset", "ConstantForce")
     sentence: ClassVar[str] = "The sensor's zero is wrong."
     experiment: ClassVar[str] = "a gauge at a known position; from input and output alone, none"
+
+    @classmethod
+    def candidates(cls, loop: Any, record: Any = None) -> tuple[Self, ...]:
+        """Return no offset, where the plant moves otherwise when its output is shifted.
+
+        Elsewhere the offset is the initial position, of which nobody knows where it is counted
+        from.
+        """
+        del record
+        a, _, c, _ = state_matrices(loop.equations(), loop.point, spread=SHIFTED_FAR)
+        matters = np.any(np.abs(a[:, np.flatnonzero(c[0])]).sum(axis=0) > 0)
+        return cls._applicable(loop, cls(0.0)) if matters else ()
 
     def output(self, m: Moment) -> Any:
         """Return the shifted reading."""

@@ -13,7 +13,9 @@ class Parameter:
 
     `unit` is a template in which ``{u}``, ``{y}`` and ``{x}`` stand for the units of the input, the
     output and the state that the effect names. `neutral` is the value at which the effect vanishes,
-    None for a parameter that does not decide this, such as the frequency of a vibration.
+    None for a parameter that does not decide this, such as the frequency of a vibration. `instant`
+    says that it is a moment in time, `searched` that it is looked for over a range, on whose edge
+    nothing was found.
     """
 
     name: str
@@ -21,6 +23,8 @@ class Parameter:
     lower: float
     upper: float
     neutral: float | None
+    instant: bool = False
+    searched: bool = False
 
 
 def parameter(
@@ -30,6 +34,8 @@ def parameter(
     upper: float = math.inf,
     neutral: float | None = None,
     default: Any = dataclasses.MISSING,
+    instant: bool = False,
+    searched: bool = False,
 ) -> Any:
     """Declare a numeric field of an effect.
 
@@ -43,13 +49,20 @@ def parameter(
         The value at which the effect vanishes; none if this parameter does not decide it.
     default : float, optional
         Value of the field if it is not given.
+    instant : bool, optional
+        Whether it is a moment in time [s], at which the likelihood is too rugged for a fit by
+        slopes; a fit then also tries moments nearby.
+    searched : bool, optional
+        Whether it is looked for over a range that the record sets, such as a frequency; an effect
+        that ends on the edge of this range was not found.
 
     Returns
     -------
     dataclasses.Field
         The field.
     """
-    about = {"unit": unit, "lower": lower, "upper": upper, "neutral": neutral}
+    about = {"unit": unit, "lower": lower, "upper": upper, "neutral": neutral,
+             "instant": instant, "searched": searched}  # fmt: skip
     if default is dataclasses.MISSING:
         return dataclasses.field(metadata={"parameter": about})
     return dataclasses.field(default=default, metadata={"parameter": about})

@@ -15,6 +15,7 @@ from ..physics.linearization import state_matrices
 from .context import Moment
 from .kinds import LawEffect
 from .parameters import parameter
+from .scanning import CUT_OFF, Overview, Scan, Sight
 from .symbolic import expression
 
 RIM = 0.25  # of a sampling period: how fast what exceeds a limit runs off
@@ -74,6 +75,21 @@ class StateLimit(LawEffect):
             to, share = (e.states[fed[0]], 0.5) if fed else ("", 1.0)
             found.append(cls(e.states[i], upper, to, share))
         return cls._applicable(loop, *found)
+
+    def spread_starts(self, sight: Overview) -> tuple[Self, ...]:
+        """Return limits from the highest down: where one cuts off little, the model still holds."""
+        values = sight.state(self.name)
+        if values is None:
+            return (self,)
+        levels = np.quantile(np.concatenate(values), CUT_OFF)
+        return tuple(dataclasses.replace(self, upper=float(v)) for v in levels)
+
+    def scan(self, sight: Sight) -> Scan | None:
+        """Look at limits over the range that the state has visited."""
+        if sight.state(self.name) is None:
+            return None
+        starts = self.spread_starts(sight)
+        return Scan((starts,), places=len(starts))
 
     def build(self, e: Equations, m: Moment) -> Equations:
         """Return the equations with the overflow."""

@@ -1,11 +1,19 @@
 """Parameters of the plant that do not stay what they were."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Self, final
+
+import numpy as np
 
 from .context import Moment
 from .kinds import LawEffect
 from .parameters import parameter
+from .scanning import Overview, Scan, Sight
+
+EDGE = 0.05  # Of the record at either end, in which a step is not looked for.
+TIMES = 40  # Instants at which a step is looked for at once.
+SPREAD_TIMES = 12  # Instants from which a fit by simulation starts, each of which takes its time.
+SMALLEST, LARGEST = -0.9, 10.0  # Relative changes from which a fit starts.
 
 
 def _of_plant(loop: Any) -> list[str]:
@@ -80,7 +88,7 @@ class ParameterStep(LawEffect):
     """
 
     name: str
-    time: float = parameter("s")
+    time: float = parameter("s", instant=True)
     size: float = parameter("", neutral=0.0)
 
     look_alikes: ClassVar[tuple[str, ...]] = ("ParameterDrift", "ConstantForce")
@@ -92,6 +100,34 @@ class ParameterStep(LawEffect):
         """Return one of no size for each free parameter; its time is to be scanned."""
         half = 500 * loop.dt if record is None else record.duration / 2
         return cls._applicable(loop, *(cls(name, half, 0.0) for name in _of_plant(loop)))
+
+    def scan(self, sight: Sight) -> Scan | None:
+        """Look at instants over the record, ever closer around the best, down to one sample."""
+        value = sight.parameter(self.name)
+        if value is None:
+            return None
+        last = float(max(t[-1] for t in sight.times))
+        # At the very ends a step is only another name for the initial state.
+        low, high = EDGE * last, (1 - EDGE) * last
+        # The likelihood is rugged in the time of a step: the scan must come within a sample of it.
+        while True:
+            times = np.linspace(low, high, TIMES + 2)[1:-1]
+            gains, sizes = sight.score_shapes(
+                [(t[:, None] >= times).astype(float) for t in sight.times], self.name
+            )
+            best = int(np.argmax(gains))
+            width = times[1] - times[0]
+            if width < 0.5 * sight.dt:
+                break
+            low, high = max(times[best] - 2 * width, low), min(times[best] + 2 * width, high)
+        size = float(sizes[best, 0]) / value if value else 0.0
+        start = replace(self, time=float(times[best]), size=min(max(size, SMALLEST), LARGEST))
+        return Scan(((start,),), places=len(sight.times[0]))
+
+    def spread_starts(self, sight: Overview) -> tuple[Self, ...]:
+        """Return a step at several instants of the record."""
+        times = np.linspace(0, max(float(t[-1]) for t in sight.times), SPREAD_TIMES + 2)[1:-1]
+        return tuple(replace(self, time=float(t)) for t in times)
 
     def law(self, m: Moment) -> dict[str, Any]:
         """Return the parameter before and after."""
