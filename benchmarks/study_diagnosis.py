@@ -11,6 +11,8 @@ kinds are
 - ``outside``: something that the catalogue does not have, or a member taken out of it;
 - ``lookalike``: a set of names, and then the recommended experiment.
 
+``--vary look_back=0.5,0.9`` diagnoses the same draws with other values of a number of the table
+in ``ctrlid/diagnosis/thresholds.py``, beside its own, and prints the tables one after the other.
 With ``--unknown`` the diagnosis is not told the controller.
 ``--out FILE`` keeps the runs as lines of JSON, and ``--report FILE...`` prints their tables again.
 Each run draws plant, controller, reference, noise and effect from its own seed; a third have a
@@ -27,9 +29,10 @@ import signal
 import time
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import joblib
@@ -53,6 +56,7 @@ from ctrlid import effects
 from ctrlid.diagnosis.candidates import contains
 from ctrlid.diagnosis.fitted_model import Model
 from ctrlid.diagnosis.recalibration import fit_base_model
+from ctrlid.diagnosis.thresholds import THRESHOLD, varied
 from ctrlid.effects import CATALOGUE, AbstractEffect, equivalents
 
 KINDS = ("named", "none", "outside", "two", "three", "lookalike", "inside")
@@ -686,8 +690,13 @@ def _too_long(*_: Any) -> None:
 def run(
     kind: str, band_name: str, seed: int, index: int, classes: Sequence[Any] = CATALOGUE,
     limit: int = 0, samples: int = SAMPLES, known: bool = True,
+    numbers: Mapping[str, float] = MappingProxyType({}),
 ) -> Row:  # fmt: skip
-    """Draw, simulate, diagnose and judge once, with the controller known or not."""
+    """Draw, simulate, diagnose and judge once, with the controller known or not.
+
+    `numbers` are other values of the table of numbers, by name; they hold for the diagnosis only,
+    so that the draw is the same with all of them.
+    """
     warnings.simplefilter("ignore")
     row = Row(kind, band_name, seed, index)
     band = WORTH.get(band_name, (WORTH["moderate"][0], WORTH["ordinary"][1]))
@@ -704,7 +713,8 @@ def run(
         if limit:
             signal.signal(signal.SIGALRM, _too_long)
             signal.alarm(limit)
-        found = cid.diagnose(believed, case.record, catalogue=case.catalogue, progress=False)
+        with varied(**numbers):
+            found = cid.diagnose(believed, case.record, catalogue=case.catalogue, progress=False)
         signal.alarm(0)
         row.seconds = time.perf_counter() - started
         judge(row, found, case)
@@ -925,6 +935,28 @@ def read(paths: Iterable[str]) -> list[Row]:
     return list(rows.values())
 
 
+def parse_vary(text: str) -> list[dict[str, float]]:
+    """Return the settings of ``look_back=0.5,0.9``: first the table's own value, then the others.
+
+    >>> parse_vary("gate=4,6")
+    [{'gate': 5.0}, {'gate': 4.0}, {'gate': 6.0}]
+    """
+    name, _, values = text.partition("=")
+    known = {t.name: t.value for t in THRESHOLD.table()}
+    if name not in known or isinstance(known[name], tuple):
+        raise argparse.ArgumentTypeError(
+            f"needs a number of ctrlid/diagnosis/thresholds.py; given {name!r}"
+        )
+    kind = type(known[name])
+    try:
+        others = [kind(v) for v in values.split(",")]
+    except ValueError:
+        raise argparse.ArgumentTypeError(
+            f"needs values such as {name}={known[name]:g},{2 * known[name]:g}; given {text!r}"
+        ) from None
+    return [{name: v} for v in (known[name], *others)]
+
+
 def main() -> None:
     """Run the study, or print the tables of one that was run."""
     parser = argparse.ArgumentParser(
@@ -940,6 +972,8 @@ def main() -> None:
     parser.add_argument("--limit", type=int, default=0, help="seconds for a diagnosis; 0: none")
     parser.add_argument("--only", nargs="+", type=int, help="numbers of runs")
     parser.add_argument("--unknown", action="store_true", help="diagnose without the controller")
+    parser.add_argument("--vary", type=parse_vary, metavar="NUMBER=V1,V2", default=[{}],
+                        help="diagnose with other values of a number that decides")  # fmt: skip
     parser.add_argument("--out", help="a file to which each run is appended as a line of JSON")
     parser.add_argument("--report", nargs="+", metavar="FILE", help="print the tables of files")
     options = parser.parse_args()
@@ -953,28 +987,24 @@ def main() -> None:
     if options.kind == "lookalike":
         classes = [getattr(effects, name) for name in CONFUSED]
     work = joblib.Parallel(n_jobs=options.jobs, return_as="generator")
-    rows = []
-    for row in work(
-        joblib.delayed(run)(
-            options.kind,
-            band,
-            options.seed,
-            k,
-            classes,
-            options.limit,
-            options.samples,
-            not options.unknown,
-        )
-        for k in numbers
-    ):
-        rows.append(row)
-        print(row.text() if not row.extra.get("skipped") else
-              f"{row.index:4d} {row.kind} {', '.join(row.truth)}: no draw carries it",
-              flush=True)  # fmt: skip
-        if options.out:
-            with Path(options.out).open("a") as file:
-                file.write(json.dumps(vars(row)) + "\n")
-    report(rows)
+    for setting in options.vary:
+        if setting:
+            print(f"\n{', '.join(f'{name} = {v:g}' for name, v in setting.items())}")
+        rows = []
+        for row in work(
+            joblib.delayed(run)(options.kind, band, options.seed, k, classes, options.limit,
+                                options.samples, not options.unknown, setting)
+            for k in numbers
+        ):  # fmt: skip
+            row.extra |= setting
+            rows.append(row)
+            print(row.text() if not row.extra.get("skipped") else
+                  f"{row.index:4d} {row.kind} {', '.join(row.truth)}: no draw carries it",
+                  flush=True)  # fmt: skip
+            if options.out:
+                with Path(options.out).open("a") as file:
+                    file.write(json.dumps(vars(row)) + "\n")
+        report(rows)
 
 
 if __name__ == "__main__":

@@ -6,18 +6,18 @@ from . import effects
 from ._base.errors import CtrlidError, CtrlidWarning
 from .data import datasets
 from .data.record import Record
-from .data.references import multisine, prbs, random_binary, steps
+from .data.references import multisine, prbs, random_binary, staircase
 from .design.lead import design_lead
 from .design.margins import Margins, loop_margins, nu_gap, robust_margin
 from .design.redesigning import Performance, Redesign, redesign
 from .diagnosis import (
+    BinnedErrors,
     Calibrated,
     Candidate,
     Diagnosis,
     Disturbance,
     Finding,
     Gap,
-    Place,
     diagnose,
     load_diagnosis,
 )
@@ -65,6 +65,7 @@ __all__ = [
     "PID",
     "Audit",
     "AuditFinding",
+    "BinnedErrors",
     "Bounds",
     "Calibrated",
     "Candidate",
@@ -94,7 +95,6 @@ __all__ = [
     "OrderChoice",
     "OrderRow",
     "Performance",
-    "Place",
     "PoleAt",
     "PoleTrend",
     "Prediction",
@@ -137,7 +137,7 @@ __all__ = [
     "robust_margin",
     "select_order",
     "simulate",
-    "steps",
+    "staircase",
     "sweep_sampling_period",
     "write_report",
 ]

@@ -14,6 +14,8 @@ warnings.filterwarnings("error", category=ctrlid.CtrlidWarning)
 os.environ.setdefault("SOURCE_DATE_EPOCH", "0")
 sys.path.insert(0, os.path.dirname(__file__))
 
+from thresholds_table import list_substitutions  # noqa: E402
+
 project = "ctrlid"
 author = "the ctrlid authors"
 copyright = "the ctrlid authors"
@@ -26,12 +28,14 @@ extensions = [
     "sphinx.ext.mathjax",
     "numpydoc",
     "sphinx_gallery.gen_gallery",
+    "thresholds_table",
 ]
 templates_path = ["_templates"]
 exclude_patterns = ["_build", "**/GALLERY_HEADER.rst"]
 nitpicky = False
 default_role = "py:obj"  # `name` is a link to the API where there is one, else code
 rst_prolog = ".. currentmodule:: ctrlid\n\n"
+rst_epilog = list_substitutions()
 highlight_language = "python"
 pygments_style = "friendly"
 

@@ -39,7 +39,7 @@ for noise in noises:
     for name, fit in fits.items():
         rates[name].append(float(np.max(fit(record).estimate.poles_s.real)))
 
-mpl.rcParams.update(cid.plot.STYLE)
+mpl.rcParams.update(cid.plot.style())
 figure = Figure(figsize=(7.2, 4.0), layout="constrained", dpi=160)
 FigureCanvasAgg(figure)
 axes = figure.add_subplot()

@@ -71,7 +71,7 @@ linear = ct.forced_response(ct.ss(ct.feedback(C * P, 1)), physics.t, np.full(n, 
 
 omega = np.geomspace(5, 2000, 400)
 L = (C * P)(1j * omega)
-plt.rcParams.update(cid.plot.STYLE)
+plt.rcParams.update(cid.plot.style())
 fig, ((gain, step), (phase, volts)) = plt.subplots(
     2, 2, figsize=(9, 5.2), sharex="col", layout="constrained"
 )

@@ -132,7 +132,7 @@ print(comparison)
 # In one picture
 # --------------
 
-plt.rcParams.update(cid.plot.STYLE)
+plt.rcParams.update(cid.plot.style())
 fig, (left, right) = plt.subplots(1, 2, figsize=(9, 3.8), layout="constrained")
 start = slice(0, 900)
 left.semilogy(1e3 * record.t[start], 1e3 * error[start], color="0.6", lw=0.8,

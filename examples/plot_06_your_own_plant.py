@@ -64,7 +64,7 @@ print("by hand:      ", np.round([-parameters["R"] / parameters["L"], -spring, s
 
 C = cid.design_lead(P, crossover=900.0, phase_margin=40.0)
 loop = cid.Loop(plant, C, dt=2e-4, at=op)
-r = cid.steps(600, levels=[0.0, 2e-5, -2e-5], hold=200)
+r = cid.staircase(600, levels=[0.0, 2e-5, -2e-5], hold=200)
 record = cid.simulate(loop, r)
 
 # %%
@@ -94,7 +94,7 @@ independent = np.concatenate(positions)
 worst = np.abs(record.y - independent).max() / np.ptp(independent)
 print(f"largest difference: {worst:.1e} of the motion")
 
-plt.rcParams.update(cid.plot.STYLE)
+plt.rcParams.update(cid.plot.style())
 fig, (above, below) = plt.subplots(2, 1, figsize=(8, 4.4), sharex=True, layout="constrained")
 milliseconds = 1e3 * record.t
 above.plot(milliseconds, 1e6 * record.y, "k", label="simulation, ctrlid")

@@ -306,8 +306,6 @@ def test_refusals():
     refuse("cannot be diagnosed: u stays at 3", loop, dead)
     for bad in (3, None, "record", [], [record, 3]):
         refuse("a Record or a list of Records is needed", loop, bad)
-    refuse(r"the loop comes first: diagnose\(loop, record\)", record, loop)
-    refuse(r"the loop comes first", [record, record], loop)
     refuse(r"put the one given into brackets", loop, record, catalogue=E.ViscousFriction)
     refuse("needs a Loop.* or a transfer function.*given NonlinearIOSystem", loop.plant, record)
     for bad in (E.ViscousFriction(c=1.0), int, "ViscousFriction"):

@@ -13,7 +13,7 @@ from ctrlid import effects as E
 from ctrlid import plot
 from ctrlid.diagnosis import gap as gap_of
 from ctrlid.diagnosis import wording
-from ctrlid.diagnosis.findings import Calibrated, Candidate, Disturbance, Finding, Gap, Place
+from ctrlid.diagnosis.findings import BinnedErrors, Calibrated, Candidate, Disturbance, Finding, Gap
 from ctrlid.diagnosis.loading import load_diagnosis
 from ctrlid.diagnosis.noise_tests import alarm_level
 from ctrlid.diagnosis.recalibration import fit_base_model
@@ -84,10 +84,11 @@ def found(experiment):
         levels = (FLAT if good else BAD, FLAT if good or verdict == "explained" else BAD)
         chances = tuple(0.4 if v is FLAT else 1e-30 for v in levels)
         where = (
-            Place("velocity", "m/s", np.linspace(-0.04, 0.04, 9), *levels, *chances,
-                  "where the motion turns"),
-            Place("position", "m", np.linspace(0.0113, 0.0127, 9), *levels, *chances, ""),
-            Place("time", "s", np.linspace(0, 4, 9), FLAT, FLAT, 0.3, 0.4, "all the time alike"),
+            BinnedErrors("velocity", "m/s", np.linspace(-0.04, 0.04, 9), *levels, *chances,
+                         "where the motion turns"),
+            BinnedErrors("position", "m", np.linspace(0.0113, 0.0127, 9), *levels, *chances, ""),
+            BinnedErrors("time", "s", np.linspace(0, 4, 9), FLAT, FLAT, 0.3, 0.4,
+                         "all the time alike"),
         )  # fmt: skip
         findings = (finding,) if "explained" in verdict else ()
         made[verdict] = Diagnosis(
@@ -364,7 +365,13 @@ def test_picture_of_an_explanation(found):
     assert [ax.get_xlabel() for ax in (first, second)] == ["velocity [mm/s]", "position [mm]"]
     assert set(legend(first)) == {"before", "after", "noise"}
     assert len(first.patches) == 16
-    assert set(legend(ranking)) == {"strong", "found", "not told apart", "refitted", "not refitted"}
+    assert set(legend(ranking)) == {
+        "earns a place",
+        "found",
+        "not told apart",
+        "refitted",
+        "not refitted",
+    }
     names = [tick.get_text() for tick in ranking.get_yticklabels()]
     assert names == ["", "CoulombFriction", "StribeckFriction", "ViscousFriction", "ActuatorLag",
                      "CubicStiffness", "", "InputDelay", "InputSaturation"]  # fmt: skip

@@ -1,5 +1,6 @@
 """A slice of the study of diagnose(): random loops, hidden effects, their names."""
 
+import argparse
 import json
 import re
 
@@ -7,7 +8,8 @@ import numpy as np
 import pytest
 
 import ctrlid as cid
-from ctrlid import effects
+from ctrlid import CtrlidError, effects
+from ctrlid.diagnosis.thresholds import THRESHOLD
 from problems import load_script
 
 study = load_script("benchmarks", "study_diagnosis")
@@ -112,6 +114,28 @@ def test_tables_count_what_the_rows_say(capsys):
                  "needless unknown .* 100.0 % of 1", "unknown or partly .* 100.0 % of 1",
                  "raised .* 1$", "SensorLag .*0/1  1 InputDelay"):  # fmt: skip
         assert re.search(line, text, re.MULTILINE), line
+
+
+def test_numbers_of_the_table_are_varied_on_the_same_draws(monkeypatch):
+    assert study.parse_vary("look_back=0.5,0.9") == [
+        {"look_back": 0.7}, {"look_back": 0.5}, {"look_back": 0.9}]  # fmt: skip
+    assert study.parse_vary("looked_at=3") == [{"looked_at": 5}, {"looked_at": 3}]
+    for wrong in ("nonsense=1", "gate=much", "experiment_levels=1", "gate"):
+        with pytest.raises(argparse.ArgumentTypeError, match="needs"):
+            study.parse_vary(wrong)
+    seen = []
+
+    def diagnose(loop, record, **options):
+        seen.append((THRESHOLD.gate, record.y[:3].tolist()))
+        raise CtrlidError("far enough")
+
+    monkeypatch.setattr(study.cid, "diagnose", diagnose)
+    for setting in study.parse_vary("gate=7"):
+        row = study.run("none", "", SEED, 3, samples=2000, numbers=setting)
+        assert "far enough" in row.error
+    assert [gate for gate, _ in seen] == [5.0, 7.0]
+    assert seen[0][1] == seen[1][1]
+    assert THRESHOLD.gate == 5.0
 
 
 def test_rows_survive_their_file(tmp_path):

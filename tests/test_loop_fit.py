@@ -127,7 +127,7 @@ def test_intervals_cover(name):
         record = experiment(loop, swing, hold, n=3000, seed=90_000 + seed, sensor_noise=sensor)
         found = cid.fit_loop(astray(loop, seed), record).estimate
         for key in found.names:
-            low, high = found.interval(key)
+            low, high = found.confidence_interval(key)
             inside += low < loop.parameters[key] < high
     assert stats.binomtest(inside, runs * len(loop.free), 0.95).pvalue > 1e-3
 
@@ -304,7 +304,7 @@ def test_the_covariance_is_the_inverse_of_the_information():
     again = point(loop, record)
     inverse = np.linalg.inv(information(again)[0])[:2, :2]
     np.testing.assert_allclose(fitted.estimate.covariance, inverse, rtol=1e-2)
-    low, high = fitted.estimate.interval("c", 0.68269)
+    low, high = fitted.estimate.confidence_interval("c", 0.68269)
     assert (high - low) / 2 == pytest.approx(fitted.estimate.standard_errors[0], rel=1e-4)
     assert (high + low) / 2 == pytest.approx(fitted.estimate["c"])
 
@@ -366,7 +366,7 @@ def test_a_parameter_on_its_bound_is_said_to_be():
     driven = cid.Loop(plant, loop.controller, dt=loop.dt, at=loop.at)
     record = experiment(driven, 1e-4, 15, sensor_noise=2e-6)
     found = cid.fit_loop(real, record, coloured=False).estimate
-    assert found.bounds == ("ViscousFriction.c",)
+    assert found.active == ("ViscousFriction.c",)
     assert found["ViscousFriction.c"] == 0.0
     assert "(on its bound)" in str(found)
 
@@ -459,7 +459,7 @@ def test_texts():
     with pytest.raises(CtrlidError, match="'m' was not fitted; fitted were K"):
         fitted.estimate["m"]
     with pytest.raises(CtrlidError, match="'g' was not fitted"):
-        fitted.estimate.interval("g")
+        fitted.estimate.confidence_interval("g")
     assert fitted.loop.free == ("K",)
     assert loop.parameters["K"] == 3.34e-6
 

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 import ctrlid as cid
 from ctrlid import plot
 from ctrlid.reporting import pictures as _pictures
+from ctrlid.reporting.plot.axes import COLOURS
 from problems import legend, record_of, redesigned_levitation, servo
 
 DT = 0.01
@@ -142,10 +143,10 @@ def test_given_axes_are_drawn_on_and_returned(record, comparison):
 
 
 def test_axes_of_ones_own_in_the_same_style():
-    with mpl.rc_context(plot.STYLE):
+    with mpl.rc_context(plot.style()):
         ax = plot.figure()[0, 0]
-        lines = [ax.plot([0, 1], [k, k])[0] for k in range(len(plot.COLOURS))]
-    assert tuple(line.get_color() for line in lines) == plot.COLOURS
+        lines = [ax.plot([0, 1], [k, k])[0] for k in range(len(COLOURS))]
+    assert tuple(line.get_color() for line in lines) == COLOURS
     assert len({str(line._dash_pattern) for line in lines}) == len(lines)
     assert not ax.spines["top"].get_visible()
 

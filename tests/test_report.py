@@ -163,7 +163,7 @@ def test_page_of_physical_parameters(record, tmp_path):
     assert {"k", f"{fitted.estimate['k']:.7g}", "standard error"} <= set(page.cells)
     assert any(text.startswith("Sensor noise") for text in page.paragraphs)
     assert any("servo, " in text for text in page.paragraphs)
-    lost = replace(fitted.estimate, covariance=np.diag([np.inf, 1e-6]), bounds=("c",))
+    lost = replace(fitted.estimate, covariance=np.diag([np.inf, 1e-6]), active=("c",))
     cells = read(cid.write_report(replace(fitted, estimate=lost), tmp_path / "l.html")).cells
     assert "not in the data" in cells
     assert "on its bound" in cells

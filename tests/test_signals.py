@@ -29,7 +29,7 @@ def test_random_binary_length_need_not_divide_by_hold() -> None:
 
 
 def test_steps_repeat_their_levels() -> None:
-    r = cid.steps(9, levels=(1.0, 2.0), hold=3)
+    r = cid.staircase(9, levels=(1.0, 2.0), hold=3)
     np.testing.assert_array_equal(r, [1, 1, 1, 2, 2, 2, 1, 1, 1])
 
 
@@ -100,9 +100,9 @@ def test_prbs_hold_levels_and_seed() -> None:
         ),
         (lambda: cid.random_binary(5, amplitude=1, seed=-1), "seed is -1"),
         (lambda: cid.random_binary(5, amplitude=1, seed=0.5), "seed is 0.5"),
-        (lambda: cid.steps(5, levels=[], hold=1), r"levels is \[\]; needed is a list"),
-        (lambda: cid.steps(5, levels=[1, np.nan], hold=1), "levels is"),
-        (lambda: cid.steps(5, levels="ab", hold=1), "levels is 'ab'"),
+        (lambda: cid.staircase(5, levels=[], hold=1), r"levels is \[\]; needed is a list"),
+        (lambda: cid.staircase(5, levels=[1, np.nan], hold=1), "levels is"),
+        (lambda: cid.staircase(5, levels="ab", hold=1), "levels is 'ab'"),
         (lambda: cid.multisine(50, amplitude=1, band=(0.5, 0.2)), r"band is \(0.5, 0.2\)"),
         (lambda: cid.multisine(50, amplitude=1, band=0.5), "band is 0.5; needed are two shares"),
         (lambda: cid.multisine(50, amplitude=1, band=(0.001, 0.002)), "no line of a period of 50"),

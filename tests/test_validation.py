@@ -388,7 +388,7 @@ SHORT = cid.Record(u=np.arange(30.0), y=np.arange(30.0), dt=DT)
 @pytest.mark.parametrize(
     ("call", "words"),
     [
-        (lambda: cid.compare([1, 2], loop_with(DIGITAL)), "a Record first, .* model; given list"),
+        (lambda: cid.compare([1, 2], loop_with(DIGITAL)), "a Record and a model; given list"),
         (lambda: cid.compare(SHORT, PLANT), "compare needs a Loop, or a transfer function such as"),
         (lambda: cid.compare(SHORT, loop_with(DIGITAL), horizon=0), "between 1 and 29 samples; g"),
         (lambda: cid.compare(SHORT, loop_with(DIGITAL), horizon=30), "samples; given 30"),

@@ -84,7 +84,7 @@ def random_binary(
     return np.repeat(np.where(tosses == 1, around + amplitude, around - amplitude), hold)[:n]
 
 
-def steps(n: int, *, levels: Sequence[float] | npt.ArrayLike, hold: int) -> Array:
+def staircase(n: int, *, levels: Sequence[float] | npt.ArrayLike, hold: int) -> Array:
     """Return a staircase: each level for `hold` samples, over and over.
 
     Parameters
@@ -109,7 +109,7 @@ def steps(n: int, *, levels: Sequence[float] | npt.ArrayLike, hold: int) -> Arra
     Examples
     --------
     >>> import ctrlid as cid
-    >>> cid.steps(7, levels=[0.0, 1.0, 0.5], hold=2)
+    >>> cid.staircase(7, levels=[0.0, 1.0, 0.5], hold=2)
     array([0. , 0. , 1. , 1. , 0.5, 0.5, 0. ])
     """
     n, hold = _count(n, "n"), _count(hold, "hold")

@@ -43,6 +43,29 @@ def as_records(data: Any) -> tuple[Record, ...]:
     return tuple(records)
 
 
+def model_and_data(first: Any, second: Any) -> tuple[Any, Any]:
+    """Return the model and then the data of two arguments, whichever of them came first.
+
+    A model and a record differ in type, so that nobody has to remember an order.
+
+    Parameters
+    ----------
+    first, second : object
+        One of them may be a Record or a sequence of Records.
+
+    Returns
+    -------
+    model, data : object
+        The two, swapped if only the first of them is data.
+    """
+
+    def is_data(given: Any) -> bool:
+        several = isinstance(given, list | tuple) and any(isinstance(x, Record) for x in given)
+        return isinstance(given, Record) or several
+
+    return (second, first) if is_data(first) and not is_data(second) else (first, second)
+
+
 def stream_records(data: Any) -> tuple[Record, Iterable[Record]]:
     """Return the first record and all of them, checked to be of one kind as they pass.
 

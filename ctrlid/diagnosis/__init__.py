@@ -1,18 +1,18 @@
 """diagnose(): where simulation and data disagree, which effect is missing, and what it closes."""
 
-from .findings import Calibrated, Candidate, Disturbance, Finding, Gap, Place
+from .findings import BinnedErrors, Calibrated, Candidate, Disturbance, Finding, Gap
 from .loading import load_diagnosis
 from .procedure import diagnose
 from .result import Diagnosis
 
 __all__ = [
+    "BinnedErrors",
     "Calibrated",
     "Candidate",
     "Diagnosis",
     "Disturbance",
     "Finding",
     "Gap",
-    "Place",
     "diagnose",
     "load_diagnosis",
 ]

@@ -1,7 +1,7 @@
 """The answer, put together from the search."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -12,7 +12,8 @@ from ..estimation.likelihood.physics_fit import summarize_fit
 from ..loop.loop import Loop
 from .candidates import Trial, same_kind
 from .experiment import find_experiment
-from .findings import Calibrated, Candidate, Disturbance, Finding, Gap, Verdict
+from .findings import Calibrated, Candidate, Finding
+from .gap_summary import GapSummary
 from .growth import Search
 from .recalibration import fit_base_model
 from .records import Readout
@@ -22,20 +23,21 @@ from .result import Diagnosis
 from .screening import screen_at
 from .several_records import describe_presence
 from .thresholds import THRESHOLD
-from .verdict import find_doubt, gap_stands_out, write_conclusion
+from .verdict import choose_verdict, find_doubt, gap_is_left, write_conclusion
 from .where import locate_errors
 
 
 def assemble_answer(
-    loop: Loop, records: Sequence[Record], found: Search, gap: Gap, shares: dict[int, float],
-    disturbance: Disturbance, read: Sequence[Readout],
+    loop: Loop, records: Sequence[Record], found: Search, summary: GapSummary,
+    read: Sequence[Readout],
 ) -> Diagnosis:  # fmt: skip
     """Return verdict, findings, gap and whatever else a diagnosis tells."""
+    gap, disturbance = summary.gap, summary.disturbance
     fitted = summarize_fit(found.final.loop, found.final.fit)
     names, known = fitted.estimate.names, found.final.errors
     errors = dict(known or zip(names, fitted.estimate.standard_errors.tolist(), strict=True))
     findings = tuple(
-        _make_finding(f, fitted.loop, errors, shares, found, records) for f in found.found
+        _make_finding(f, fitted.loop, errors, summary.shares, found, records) for f in found.found
     )
     findings += tuple(Finding(r.effect, r.errors, (), (), r.evidence) for r in read)
     findings = tuple(sorted(findings, key=lambda f: -f.evidence))
@@ -44,18 +46,12 @@ def assemble_answer(
         final = final if r.effect in final.effects else final.with_effect(r.effect)
     units = _find_units(loop, records[0])
     where = locate_errors(found.before, found.after, units)
-    verdict: Verdict
-    left = gap_stands_out(gap, found.final.fit)
-    # A random force that may do anything explains everything, and nothing.
-    blamed = disturbance.large or math.isnan(disturbance.share)
-    left = left or (blamed and gap.after > THRESHOLD.worse_than_given * gap.given)
+    left = gap_is_left(gap, disturbance, found.final.fit)
     total = found.final.fit.value - found.base.fit.value
     effects, gains = [f.trial.effect for f in found.found], [f.trial.gain for f in found.found]
     loose = find_doubt(effects, gains, total if math.isfinite(total) else 0.0)
-    if found.after.passed and not left and not loose:
-        verdict = "explained" if findings else "nothing missing"
-    else:
-        verdict = "partly explained" if findings else "unknown"
+    complete = found.after.passed and not left and not loose
+    verdict = choose_verdict(complete, named=bool(findings))
     notes = list(fitted.estimate.notes)
     if not loop.free:
         notes.append("no parameter of the model was free: a wrong value counts as a missing effect")
@@ -99,7 +95,7 @@ def _find_units(loop: Loop, record: Record) -> dict[str, str]:
 
 
 def _make_finding(
-    f: Weighed, loop: Loop, errors: dict[str, float], shares: dict[int, float], found: Search,
+    f: Weighed, loop: Loop, errors: dict[str, float], shares: Mapping[int, float], found: Search,
     records: Sequence[Record],
 ) -> Finding:  # fmt: skip
     label, effect = list(loop.labelled.items())[f.position]
@@ -123,7 +119,7 @@ def _make_finding(
 
 def _find_presence(f: Weighed, found: Search, records: Sequence[Record]) -> str:
     """Say in which of several records an effect is seen when each is fitted alone."""
-    several = len(records) > 1 and len(found.final.fit.problem.prepared) == len(records)
+    several = len(records) > 1 and len(found.final.records) == len(records)
     if not several or found.final.errors is not None:
         return ""
     seen = []

@@ -14,6 +14,7 @@ from ..estimation.likelihood.sampled_plant import Trajectory
 from ..loop.loop import Loop
 from ..physics.linearization import state_matrices
 from .fitted_model import Model, keep_information
+from .thresholds import THRESHOLD
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +112,7 @@ def check_catalogue(catalogue: Sequence[type[AbstractEffect]]) -> None:
 
 def _place_matters(loop: Loop) -> bool:
     """Whether the plant moves differently when its output is shifted."""
-    a, _, c, _ = state_matrices(loop.equations(), loop.point, spread=1e6)
+    a, _, c, _ = state_matrices(loop.equations(), loop.point, spread=THRESHOLD.shifted_far)
     return bool(np.any(np.abs(a[:, np.flatnonzero(c[0])]).sum(axis=0) > 0))
 
 
@@ -122,7 +123,7 @@ def list_missing_candidates(
     model: Model, catalogue: Sequence[type[AbstractEffect]]
 ) -> list[AbstractEffect]:
     """Return the candidates that a model does not have yet."""
-    record = model.fit.problem.prepared[0].record
+    record = model.records[0]
     return [
         c for c in list_candidates(catalogue, model.fitted, record) if not _has_effect(model, c)
     ]

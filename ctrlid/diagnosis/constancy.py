@@ -83,9 +83,9 @@ def chance_of_line(power: Array) -> float:
     return float(-np.expm1(len(power) * np.log1p(-np.exp(-power.max(initial=0.0)))))
 
 
-def find_bin_edges(values: Array, bins: int = THRESHOLD.bins) -> Array:
+def find_bin_edges(values: Array, bins: int | None = None) -> Array:
     """Return edges of bins that hold equally many samples; what rounding left of zero is zero."""
-    edges = np.quantile(values, np.linspace(0, 1, bins + 1))
+    edges = np.quantile(values, np.linspace(0, 1, (bins or THRESHOLD.bins) + 1))
     edges = np.unique(
         np.where(np.abs(edges) < THRESHOLD.edge_rounding * np.ptp(values), 0.0, edges)
     )

@@ -94,7 +94,7 @@ def _choose_clearest(able: Sequence[tuple[float, str, Array]]) -> tuple[float, s
     """Return the experiment with the largest distance; a bolder one has to be clearly better."""
     chosen = None
     for one in able:
-        if chosen is None or one[0] > 1.2 * chosen[0]:
+        if chosen is None or one[0] > THRESHOLD.experiment_bolder * chosen[0]:
             chosen = one
     return chosen
 
@@ -120,27 +120,30 @@ def _list_references(record: Record) -> list[tuple[str, Array]]:
     """Return references of several kinds, from the record's own to bolder ones."""
     assert record.r is not None
     r = np.asarray(record.r)[record.valid]
-    middle, n = float(np.mean(r)), min(max(len(r), 5000), THRESHOLD.experiment_samples)
+    middle, n = (
+        float(np.mean(r)),
+        min(max(len(r), THRESHOLD.experiment_shortest), THRESHOLD.experiment_samples),
+    )
     reach = float(np.max(np.abs(r - middle)))
     moves = np.abs(np.diff(r))
     step = float(np.median(moves[moves > 0])) / 2 if (moves > 0).any() else reach
-    step = min(max(step, 0.1 * reach), reach) or 1e-3
+    step = min(max(step, THRESHOLD.experiment_smallest * reach), reach) or THRESHOLD.experiment_step
     hold = max(2, round(len(r) / max(int(np.count_nonzero(moves)), 1)))
-    found = []
+    times, found = THRESHOLD.experiment_times, []
     for label, amplitude, width, levels in (
         ("the reference's kind of steps, around one set-point", step, hold, 0.0),
         ("steps on several set-points over the range visited so far", step, hold, reach),
         ("steps on several set-points over twice that range", step, hold, 2 * reach),
         ("steps twice as large, around one set-point", 2 * step, hold, 0.0),
         ("steps twice as large on several set-points over the range so far", 2 * step, hold, reach),
-        ("steps four times as large, around one set-point", 4 * step, hold, 0.0),
-        ("steps that change four times as often", step, max(2, hold // 4), 0.0),
-        ("steps that change four times as often on several set-points", step, max(2, hold // 4),
+        ("steps four times as large, around one set-point", times * step, hold, 0.0),
+        ("steps that change four times as often", step, max(2, hold // times), 0.0),
+        ("steps that change four times as often on several set-points", step, max(2, hold // times),
          reach),
-        ("slow steps, four times as long, on several set-points", step, 4 * hold, reach),
-        ("steps four times as large that change four times as often", 4 * step, max(2, hold // 4),
-         0.0),
-        ("steps four times as large that change every other sample", 4 * step, 2, 0.0),
+        ("slow steps, four times as long, on several set-points", step, times * hold, reach),
+        ("steps four times as large that change four times as often", times * step,
+         max(2, hold // times), 0.0),
+        ("steps four times as large that change every other sample", times * step, 2, 0.0),
     ):  # fmt: skip
         signal = random_binary(n, amplitude=amplitude, hold=width, around=middle, seed=0)
         found.append((label, signal + _visit_levels(n, levels)))

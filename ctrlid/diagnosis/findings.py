@@ -130,7 +130,7 @@ class Candidate:
 
 
 @dataclass(frozen=True, eq=False)
-class Place:
+class BinnedErrors:
     """Where along one quantity the innovations are not noise.
 
     Parameters

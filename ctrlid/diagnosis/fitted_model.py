@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from .._base.arrays import Array
+from ..data.record import Record
 from ..estimation.likelihood.filter_data import prepare_for_loop
 from ..estimation.likelihood.kalman_filter import Noise, first_guess
 from ..estimation.likelihood.likelihood import Fit, evaluate, linearize_again
@@ -36,6 +37,11 @@ class Model:
         return self.fit.problem.plant.names
 
     @property
+    def records(self) -> tuple[Record, ...]:
+        """The records that it was fitted to."""
+        return tuple(data.record for data in self.fit.problem.prepared)
+
+    @property
     def fitted(self) -> Loop:
         """The loop with the fitted values."""
         values = dict(zip(self.names, self.fit.theta.tolist(), strict=True))
@@ -47,7 +53,7 @@ def can_simulate(model: Model) -> bool:
     loop = model.loop
     if loop.controller is None:
         return comes_to_rest(loop)
-    return all(t.record.r is not None for t in model.fit.problem.prepared)
+    return all(record.r is not None for record in model.records)
 
 
 def without_random_force(model: Model) -> Model:

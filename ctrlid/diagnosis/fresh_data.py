@@ -68,6 +68,10 @@ class FreshData:
         """Return the RMS error of loops [output unit]."""
         return gaps.root_mean_square(self.windows, self.outputs(loops))
 
+    def gap_of(self, model: Model) -> float:
+        """Return the RMS error of a model, made ready for each window [output unit]."""
+        return self.gap(self.loops(model))
+
     def excess(self, loops: Sequence[Loop], fit: Fit) -> float:
         r"""Return what noise, as a fit knows it, leaves unexplained of the innovations.
 
@@ -95,7 +99,7 @@ def choose_fresh_data(
         If a record for validation is sampled in another way than the loop.
     """
     for r in validation or ():
-        if abs(r.dt - loop.dt) > 1e-9 * loop.dt:
+        if abs(r.dt - loop.dt) > THRESHOLD.same_period * loop.dt:
             raise CtrlidError(f"validation= is sampled at {r.dt:g} s, the loop at {loop.dt:g} s; "
                               "give both the same period")  # fmt: skip
     rest: tuple[Record, ...] | None = None

@@ -52,7 +52,7 @@ def hold_out(record: Record) -> tuple[Window, Record]:
         int(valid[int((1 - THRESHOLD.held_out) * len(valid))]),
         len(record) - THRESHOLD.held_out_samples,
     )
-    start = max(first - max((len(record) - first) // 5, 200), 0)
+    start = max(first - max((len(record) - first) // THRESHOLD.lead, THRESHOLD.shortest_lead), 0)
     part = record[start:]
     mask = np.asarray(part.valid) & (np.arange(len(part)) >= first - start)
     return Window(part, start * record.dt, mask), record[:first]
@@ -164,7 +164,7 @@ def compute_floor(
     fit: Fit,
     windows: Sequence[Window],
     kind: str,
-    runs: int = THRESHOLD.floor_runs,
+    runs: int | None = None,
 ) -> Floor:
     """Return the RMS error that noise leaves through a loop.
 
@@ -186,6 +186,7 @@ def compute_floor(
     Floor
         RMS errors [output unit]; NaN where they cannot be computed.
     """
+    runs = runs or THRESHOLD.floor_runs
     squares, count = np.zeros((runs, 2)), 0
     for k, (loop, window) in enumerate(zip(loops, windows, strict=True)):
         noise = float(fit.sensor[min(k, len(fit.sensor) - 1)])

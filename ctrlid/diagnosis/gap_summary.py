@@ -2,7 +2,8 @@
 
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -12,14 +13,22 @@ from . import gap as gaps
 from .findings import Disturbance, Gap
 from .fitted_model import Model
 from .fresh_data import FreshData
-from .growth import Search
+from .growth import Search, drop_worst_effect
 from .removal import Weighed
 from .thresholds import THRESHOLD
+from .verdict import gap_is_wider
 
 
-def summarize_gap(
-    loop: Loop, found: Search, fresh: FreshData
-) -> tuple[Gap, dict[int, float], Disturbance]:
+@dataclass(frozen=True, eq=False)
+class GapSummary:
+    """The gap, what each effect closes of it by its position in the loop, and the random force."""
+
+    gap: Gap
+    shares: Mapping[int, float]
+    disturbance: Disturbance
+
+
+def summarize_gap(loop: Loop, found: Search, fresh: FreshData) -> GapSummary:
     """Return the gap on data that no parameter was fitted to, and what each finding closes."""
     windows, kind = fresh.windows, fresh.kind
     before, after = (fresh.loops(m) for m in (found.base, found.final))
@@ -45,7 +54,20 @@ def summarize_gap(
         np.asarray(first.record.y)[first.mask], results[1][0][first.mask],
         results[2][0][first.mask], floor.widest,
     )  # fmt: skip
-    return gap, shares, _measure_disturbance(fit, loop, floor)
+    return GapSummary(gap, shares, _measure_disturbance(fit, loop, floor))
+
+
+def take_back_widening(
+    loop: Loop, found: Search, summary: GapSummary, fresh: FreshData
+) -> tuple[Search, GapSummary]:
+    """Take effects back, the worst first, while they leave the gap wider than it was.
+
+    What names something and leaves more unexplained than before has a wrong name among its names.
+    """
+    while found.found and not found.after.passed and gap_is_wider(summary.gap, summary.disturbance):
+        found = drop_worst_effect(found, fresh.gap_of)
+        summary = summarize_gap(loop, found, fresh)
+    return found, summary
 
 
 def helps_on_fresh_data(fresh: FreshData) -> Callable[[Weighed, Model], bool]:

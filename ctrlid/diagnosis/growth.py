@@ -82,7 +82,7 @@ def search_effects(
             model = with_linearization(drop_superfluous(model, given))
         if (
             len(model.loop.effects) - given >= THRESHOLD.many_effects
-            or len(steps) >= THRESHOLD.many_effects + 2
+            or len(steps) >= THRESHOLD.many_effects + THRESHOLD.more_rounds
         ):
             break
         tell(f"round {len(steps) + 1}: screening")
@@ -105,6 +105,25 @@ def search_effects(
         model, found = base, ()
     tests = run_noise_tests(base.fit), retest_with_replicas(model)
     return Search(base, tuple(steps), model, found, *tests, left)
+
+
+def choose_way(
+    one: Search, other: Search, helps: Callable[[Weighed, Model], bool],
+    gap: Callable[[Model], float],
+) -> Search:  # fmt: skip
+    """Return the end of that way of a search which leaves noise alone, or else the narrower gap.
+
+    Parameters
+    ----------
+    one, other : Search
+        The ends of two ways, of which the second took nothing back.
+    helps : callable
+        As in `keep_main_effects`.
+    gap : callable
+        ``gap(model)``: the RMS error of a model on fresh data [output unit].
+    """
+    ways = [keep_main_effects(search, helps) for search in (one, other)]
+    return min(ways, key=lambda search: (not search.after.passed, gap(search.final)))
 
 
 def compare_names(found: Search, work: Work) -> Search:

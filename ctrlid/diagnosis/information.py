@@ -15,7 +15,7 @@ from .thresholds import THRESHOLD
 
 def remaining_information(matrix: Array, own: Sequence[int], others: Sequence[int]) -> Array:
     """Return the scaled information of parameters that others leave to them."""
-    size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    size = np.sqrt(np.maximum(np.diag(matrix), THRESHOLD.tiny))
     scaled = matrix / np.outer(size, size)
     left = scaled[np.ix_(own, own)]
     if not len(others):
@@ -70,7 +70,7 @@ def estimate_need(model: Model, position: int) -> float:
     if not own or len(own) < len(away) or not np.isfinite(matrix).all():
         return 0.0
     every = [k for k, n in enumerate(names) if n.startswith(f"{label}.")]
-    size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    size = np.sqrt(np.maximum(np.diag(matrix), THRESHOLD.tiny))
     left = remaining_information(matrix, own, [k for k in range(len(matrix)) if k not in every])
     d = np.array([away[names[k]] for k in own]) * size[own]
     gain = 0.5 * fit.size * math.log1p(float(d @ left @ d) / fit.size)

@@ -12,7 +12,7 @@ from .._base.errors import CtrlidError
 from ..effects import AbstractEffect
 from ..loop.loop import Loop
 from ..physics.linearization import OperatingPoint
-from .findings import Calibrated, Candidate, Disturbance, Finding, Gap, Place
+from .findings import BinnedErrors, Calibrated, Candidate, Disturbance, Finding, Gap
 from .result import Diagnosis
 from .saving import FORMAT, SavedLoop, read_numbers
 
@@ -62,7 +62,7 @@ def _decode_diagnosis(data: Mapping[str, Any], loop: Loop | None) -> Diagnosis:
         verdict=data["verdict"], sentence=data["sentence"],
         findings=tuple(_decode(Finding, f) for f in data["findings"]),
         loop=saved if loop is None else _rebuild_loop(loop, saved),  # type: ignore[arg-type]
-        gap=_decode(Gap, data["gap"]), where=tuple(_decode(Place, p) for p in data["where"]),
+        gap=_decode(Gap, data["gap"]), where=tuple(_decode(BinnedErrors, p) for p in data["where"]),
         ranking=tuple(_decode(Candidate, c) for c in data["ranking"]),
         disturbance=_decode(Disturbance, data["disturbance"]),
         calibrated=tuple(_decode(Calibrated, c) for c in data["calibrated"]),

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy import stats
@@ -34,7 +34,7 @@ class NoiseTests:
     p_values: Mapping[str, float]
     z: Array
     axes: Mapping[str, Array]
-    alpha: float = THRESHOLD.false_alarm
+    alpha: float = field(default_factory=lambda: THRESHOLD.false_alarm)
 
     @property
     def worst(self) -> tuple[str, float]:
@@ -131,17 +131,20 @@ def _regress_on_past(z: Array, keep: Array, u: Array, r: Array) -> tuple[float, 
     for signal in (u, r):
         moved = np.diff(signal, prepend=signal[0])
         if np.std(moved) > 0:
-            columns += [np.roll(moved, k) for k in (1, 2, 3, 4, 6, 9, 14)]
+            columns += [np.roll(moved, k) for k in THRESHOLD.past_lags]
             columns.append(np.roll(signal, 1) - np.mean(signal))
     if not columns:
         return 0.0, 0
-    x = np.column_stack(columns)[20:][keep[20:]]
+    first = THRESHOLD.past_left_out
+    x = np.column_stack(columns)[first:][keep[first:]]
     x = x - x.mean(axis=0)
     size = np.sqrt(np.mean(x**2, axis=0))
     x = x[:, size > 0] / size[size > 0]
-    target = z[20:][keep[20:]]
+    target = z[first:][keep[first:]]
     q, triangle = np.linalg.qr(x)
-    good = np.abs(np.diag(triangle)) > 1e-6 * np.abs(np.diag(triangle)).max(initial=0.0)
+    good = np.abs(np.diag(triangle)) > THRESHOLD.past_rank * np.abs(np.diag(triangle)).max(
+        initial=0.0
+    )
     return float(np.sum((q[:, good].T @ target) ** 2)), int(good.sum())
 
 

@@ -136,15 +136,13 @@ class Simulation:
         starts = tuple(dict(zip(names, x.tolist(), strict=False)) for x in x0)
         return Simulated(self, theta, starts, errors, slopes, states)
 
-    def fit(
-        self, theta: Array, x0: Array, evaluations: int = THRESHOLD.open_loop_evaluations
-    ) -> Simulated:
+    def fit(self, theta: Array, x0: Array, evaluations: int | None = None) -> Simulated:
         """Return the values and initial states with the smallest error nearby."""
         p, shape = len(theta), x0.shape
         free = np.full(x0.size, np.inf)
         lower = np.concatenate([self.problem.lower, -free])
         upper = np.concatenate([self.problem.upper, free])
-        inside = 1e-9 * (1.0 + np.abs(np.concatenate([theta, x0.ravel()])))
+        inside = THRESHOLD.inside_bounds * (1.0 + np.abs(np.concatenate([theta, x0.ravel()])))
         start = np.clip(np.concatenate([theta, x0.ravel()]),
                         np.where(np.isfinite(lower), lower + inside, lower),
                         np.where(np.isfinite(upper), upper - inside, upper))  # fmt: skip
@@ -162,8 +160,9 @@ class Simulation:
         def slope(v: Array) -> Array:
             return both(v)[1]
 
+        most = evaluations or THRESHOLD.open_loop_evaluations
         found = optimize.least_squares(error, start, slope, bounds=(lower, upper), x_scale="jac",
-                                       max_nfev=evaluations)  # fmt: skip
+                                       max_nfev=most)  # fmt: skip
         return self.at(found.x[:p], found.x[p:].reshape(shape))
 
 

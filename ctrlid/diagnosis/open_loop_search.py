@@ -75,7 +75,7 @@ def search_by_simulation(
         if no effect was found or the gap is hardly smaller.
     """
     loop, names = other.base.loop, other.base.names
-    records = fresh.without_windows([t.record for t in other.base.fit.problem.prepared])
+    records = fresh.without_windows(other.base.records)
     task = Simulation(loop, names, records, [0.0] * len(records))
     x0 = task.states_from([{} for _ in records])
     begun = [task.fit(t, x0) for t in (start_values(loop, names), other.base.fit.theta)]
@@ -219,7 +219,7 @@ def _screen(now: Simulated, effect: AbstractEffect) -> Tried | None:
             errors, slopes, _ = task.run(theta, x0)
         except CtrlidError:
             continue
-        step = np.linalg.lstsq(slopes, -errors, rcond=1e-10)[0]
+        step = np.linalg.lstsq(slopes, -errors, rcond=THRESHOLD.open_loop_rank)[0]
         left = float(np.mean((errors + slopes @ step) ** 2))
         score = _gain_over(now, min(left, float(np.mean(errors**2))))
         if best is None or score > best.score:
@@ -230,7 +230,7 @@ def _screen(now: Simulated, effect: AbstractEffect) -> Tried | None:
 def _gain_over(now: Simulated, square: float) -> float:
     """Return what a smaller error is worth, for as many samples as are independent."""
     count = len(now.errors) / now.correlated
-    return 0.5 * count * math.log(now.square / max(square, 1e-300))
+    return 0.5 * count * math.log(now.square / max(square, THRESHOLD.tiny))
 
 
 def _penalty_over(smaller: Simulated, larger: Simulated) -> float:
@@ -262,9 +262,10 @@ def _list_starts(now: Simulated, effect: AbstractEffect) -> list[AbstractEffect]
         times = np.linspace(0, last, THRESHOLD.open_loop_step_times + 2)[1:-1]
         return [replace(effect, time=float(t)) for t in times]
     if isinstance(effect, PeriodicForce):
-        power = np.abs(np.fft.rfft(now.errors, 4 * len(now.errors))) ** 2
-        power[:8] = 0.0
-        line = int(np.argmax(power)) / (4 * len(now.errors) * now.task.records[0].dt)
+        size = THRESHOLD.line_padding * len(now.errors)
+        power = np.abs(np.fft.rfft(now.errors, size)) ** 2
+        power[: THRESHOLD.slowest_line] = 0.0
+        line = int(np.argmax(power)) / (size * now.task.records[0].dt)
         return [replace(effect, frequency=line, phase=p) for p in (0.0, np.pi / 2)]
     return [effect]
 

@@ -1,9 +1,9 @@
-"""diagnose(): from the audit of the record to the verdict."""
+"""diagnose(): the steps of docs/theory/diagnosis.rst in their order, from record to verdict."""
 
 import math
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 from tqdm import tqdm
@@ -11,42 +11,49 @@ from tqdm import tqdm
 from .._base.errors import CtrlidError
 from .._base.jobs import check_jobs, spread
 from ..data.record import Record
-from ..data.several_records import as_records
+from ..data.several_records import as_records, model_and_data
 from ..effects import CATALOGUE, AbstractEffect
 from ..estimation.likelihood.likelihood import Fit
 from ..loop.loop import Loop
 from ..validation.record_audit import Audit
 from .answer import assemble_answer, name_records
 from .candidates import check_catalogue
-from .findings import COMPLETE, Disturbance
+from .findings import COMPLETE, Disturbance, Gap
 from .fresh_data import FreshData, choose_fresh_data
-from .gap_summary import helps_on_fresh_data, summarize_gap
-from .growth import Search, compare_names, drop_worst_effect, keep_main_effects, search_effects
+from .gap_summary import helps_on_fresh_data, summarize_gap, take_back_widening
+from .growth import Search, choose_way, compare_names, keep_main_effects, search_effects
 from .open_loop_search import search_by_simulation
-from .recalibration import cut_stretches, fit_base_model, weigh_by_repeats
-from .records import (
-    censor_record,
-    find_repeat_periods,
-    look_over_records,
-    make_loop,
-    read_clipping,
-    read_steps,
-)
-from .replicas import forgive_filter, make_replica, with_rounding
+from .recalibration import recalibrate
+from .records import Readout, look_over_records, make_loop, read_limits, read_steps
+from .replicas import forgive_rounding
 from .result import Diagnosis
 from .selection import Work
 from .several_records import merge_diagnoses
 from .thresholds import THRESHOLD
-from .verdict import gap_is_wider
 
 BY_SIMULATION = (
     "with filters a random force took up what is missing; so effects were looked for by the error "
     "of an open-loop simulation, and sizes are those that simulate best. What is called one-step "
     "errors above are errors of that simulation; evidence counts as many samples as are independent"
 )
+PROGRESS = 6  # The bar moves by so many steps, of which the comparison on fresh data makes two.
 
 
-STEPS = 6  # of the progress bar
+@dataclass(frozen=True, eq=False)
+class Question:
+    """What is asked: a model, records of which much is known already, and the means to answer.
+
+    `fresh` is what models are compared on, `audits` what the records show by themselves, `work` a
+    map that may run in parallel, and `tell` is told what is being done.
+    """
+
+    loop: Loop
+    records: tuple[Record, ...]
+    audits: tuple[Audit, ...]
+    fresh: FreshData
+    catalogue: Sequence[type[AbstractEffect]]
+    work: Work
+    tell: Callable[..., None]
 
 
 def diagnose(
@@ -82,7 +89,7 @@ def diagnose(
         samples ahead, or of an open-loop simulation if the plant is stable. A transfer function
         stands for a linear plant without a known controller.
     record : Record or sequence of Record
-        The data; several records are diagnosed together.
+        The data; several records are diagnosed together. Loop and record may change places.
     catalogue : sequence of effect classes, optional
         What may be missing: ``[*cid.effects.CATALOGUE, Mine]``.
     validation : Record or sequence of Record, optional
@@ -124,79 +131,79 @@ def diagnose(
     """
     started = time.perf_counter()
     check_catalogue(catalogue)
-    if isinstance(loop, Record) or (isinstance(loop, list | tuple) and isinstance(record, Loop)):
-        raise CtrlidError("the loop comes first: diagnose(loop, record)")
+    loop, record = model_and_data(loop, record)
     records = as_records(record)
     loop = make_loop(loop, records[0])
     fresh = choose_fresh_data(loop, records, None if validation is None else as_records(validation))
-    bar = tqdm(total=STEPS, disable=not progress, leave=False, desc="diagnose")
+    jobs = check_jobs(jobs)
+    bar = tqdm(total=PROGRESS, disable=not progress, leave=False, desc="diagnose")
 
     def tell(text: str, step: int = 0) -> None:
         bar.set_description(f"diagnose: {text}")
         bar.update(step)
 
+    def work(function: Callable[..., Any], items: Iterable[Any]) -> list[Any]:
+        return list(spread(function, items, jobs))
+
     tell("looking the records over", 1)
     audits, remarks = look_over_records(loop, records)
-    options = catalogue, _make_worker(check_jobs(jobs)), tell
-    result, found = _diagnose_together(loop, records, audits, fresh, *options)
+    question = Question(loop, records, audits, fresh, catalogue, work, tell)
+    result, search = _answer(question)
     if len(records) > 1 and not _have_same(result):
-        result = _diagnose_each(loop, records, audits, found, *options) or result
+        result = _answer_each(question, search) or result
     bar.close()
     return replace(result, audit=remarks, record=name_records(records),
                    seconds=time.perf_counter() - started)  # fmt: skip
 
 
-def _diagnose_together(
-    loop: Loop, records: Sequence[Record], audits: Sequence[Audit], fresh: FreshData,
-    catalogue: Sequence[type[AbstractEffect]], work: Work, tell: Callable[..., None],
-) -> tuple[Diagnosis, Search]:  # fmt: skip
-    """Diagnose records together."""
-    given = loop
-    read = [r for r in (read_clipping(records, audits, catalogue),) if r is not None]
-    used = tuple(records)
-    for r in read:
-        loop = loop.with_effect(r.effect)
-        used = tuple(censor_record(record, r.effect) for record in records)
-    tell("recalibrating", 1)
-    parts, begins = cut_stretches(used)
-    base = fit_base_model(loop, parts, loop.free, begins)
-    periods = find_repeat_periods(parts, audits)
-    if periods:
-        base = weigh_by_repeats(base, periods)
-    found = search_effects(base, catalogue, work, tell)
-    if found.other and not found.after.passed:
+def _answer(q: Question) -> tuple[Diagnosis, Search]:
+    """Take the steps of the theory page, for records that are diagnosed together."""
+    # Step 1: what the readout of the sensor shows by itself is no candidate.
+    readout = read_limits(q.loop, q.records, q.audits, q.catalogue)
+    # Step 2: a wrong value of a parameter is no missing effect.
+    q.tell("recalibrating", 1)
+    base = recalibrate(readout.loop, readout.records, q.audits)
+    # Steps 3 to 7: effects are screened, refitted, decided upon, added and dropped.
+    search = search_effects(base, q.catalogue, q.work, q.tell)
+    helps = helps_on_fresh_data(q.fresh)
+    if search.other and not search.after.passed:
         # Neither way explains the record, perhaps: fresh data tell which leads further.
-        tell("another way")
-        greedy = search_effects(base, catalogue, work, tell, found.other)
-        ways = [keep_main_effects(s, helps_on_fresh_data(fresh)) for s in (found, greedy)]
-        found = min(ways, key=lambda s: (not s.after.passed, fresh.gap(fresh.loops(s.final))))
-    tell("comparing on fresh data", 2)
-    coarse = read_steps(found.final.fit, audits, catalogue)
-    if coarse and not found.after.passed:
-        copies = [make_replica(with_rounding(found.final, coarse), seed) for seed in (1, 2)]
-        found = replace(found, after=forgive_filter(found.after, copies))
-    tell("comparing names")
-    found = compare_names(keep_main_effects(found, helps_on_fresh_data(fresh)), work)
-    gap, shares, disturbance = summarize_gap(given, found, fresh)
-    # What names something and leaves more unexplained than before has a wrong name among its
-    # names. An effect of one record only may widen the gap in others.
-    alone = len(records) == 1
-    while alone and found.found and not found.after.passed and gap_is_wider(gap, disturbance):
-        found = drop_worst_effect(found, lambda model: fresh.gap(fresh.loops(model)))
-        gap, shares, disturbance = summarize_gap(given, found, fresh)
-    tell("writing down", 1)
-    read += [coarse] if coarse else []
-    result = assemble_answer(given, records, found, gap, shares, disturbance, read)
-    if result.verdict not in COMPLETE and _is_worth_simulating(fresh, parts):
-        # What a random force explains nobody names: a stable plant can do without one.
-        smallest = min(gap.given, gap.before, gap.after)
-        other = search_by_simulation(found, fresh, catalogue, tell, smallest)
-        if other is not None:
-            gap, shares, _ = summarize_gap(given, other, fresh)
-            quiet = Disturbance(0.0, 0.0, math.nan, 0.0)
-            again = assemble_answer(given, records, other, gap, shares, quiet, read)
-            return replace(again, notes=(*again.notes, BY_SIMULATION)), other
-    return result, found
+        q.tell("another way")
+        other = search_effects(base, q.catalogue, q.work, q.tell, search.other)
+        search = choose_way(search, other, helps, q.fresh.gap_of)
+    # Step 3 again: what is left is tested with the steps of the converter in the replicas.
+    q.tell("comparing on fresh data", 2)
+    steps = read_steps(search.final.fit, q.audits, q.catalogue)
+    if steps and not search.after.passed:
+        search = replace(search, after=forgive_rounding(search.after, search.final, steps))
+    # Step 8: what else would do in the place of each effect.
+    q.tell("comparing names")
+    search = compare_names(keep_main_effects(search, helps), q.work)
+    # Step 9: the gap before and after. An effect of one of several records may widen the others'.
+    summary = summarize_gap(q.loop, search, q.fresh)
+    if len(q.records) == 1:
+        search, summary = take_back_widening(q.loop, search, summary, q.fresh)
+    # Step 10: the decision table.
+    q.tell("writing down", 1)
+    read = (*readout.found, *([steps] if steps else []))
+    result = assemble_answer(q.loop, q.records, search, summary, read)
+    if result.verdict not in COMPLETE and _is_worth_simulating(q.fresh, base.records):
+        return _answer_by_simulation(q, search, summary.gap, read) or (result, search)
+    return result, search
+
+
+def _answer_by_simulation(
+    q: Question, search: Search, gap: Gap, read: Sequence[Readout]
+) -> tuple[Diagnosis, Search] | None:
+    """Answer by open-loop simulation: a random force that explains everything names nothing."""
+    smallest = min(gap.given, gap.before, gap.after)
+    other = search_by_simulation(search, q.fresh, q.catalogue, q.tell, smallest)
+    if other is None:
+        return None
+    summary = summarize_gap(q.loop, other, q.fresh)
+    summary = replace(summary, disturbance=Disturbance(0.0, 0.0, math.nan, 0.0))
+    result = assemble_answer(q.loop, q.records, other, summary, read)
+    return replace(result, notes=(*result.notes, BY_SIMULATION)), other
 
 
 def _is_worth_simulating(fresh: FreshData, records: Sequence[Record]) -> bool:
@@ -211,36 +218,27 @@ def _have_same(result: Diagnosis) -> bool:
     return whole and not any(f.note.endswith(" only") for f in result.findings)
 
 
-def _diagnose_each(
-    loop: Loop, records: Sequence[Record], audits: Sequence[Audit], together: Search,
-    catalogue: Sequence[type[AbstractEffect]], work: Work, tell: Callable[..., None],
-) -> Diagnosis | None:  # fmt: skip
+def _answer_each(q: Question, together: Search) -> Diagnosis | None:
     """Diagnose each record alone; None where that does not explain all of them, and better."""
     parts: list[Diagnosis] = []
-    won = size = 0.0
-    for record, looked in zip(records, audits, strict=True):
-        tell(f"record {len(parts) + 1} alone")
-        fresh = choose_fresh_data(loop, [record], None)
+    gained = size = 0.0
+    for record, audit in zip(q.records, q.audits, strict=True):
+        q.tell(f"record {len(parts) + 1} alone")
+        fresh = choose_fresh_data(q.loop, [record], None)
         try:
-            result, found = _diagnose_together(
-                loop, [record], [looked], fresh, catalogue, work, tell
-            )
-        except CtrlidError:  # one that says too little when it stands alone
+            result, search = _answer(replace(q, records=(record,), audits=(audit,), fresh=fresh))
+        except CtrlidError:  # The record says too little when it stands alone.
             return None
         if result.verdict not in COMPLETE:
             return None
         parts.append(result)
-        won += _penalized_likelihood(found.final.fit)
-        size += found.final.fit.size
+        gained += _penalized_likelihood(search.final.fit)
+        size += search.final.fit.size
     fit = together.final.fit
-    better = size != fit.size or won > _penalized_likelihood(fit) + THRESHOLD.gate
-    return merge_diagnoses(loop, parts) if better else None
+    better = size != fit.size or gained > _penalized_likelihood(fit) + THRESHOLD.gate
+    return merge_diagnoses(q.loop, parts) if better else None
 
 
 def _penalized_likelihood(fit: Fit) -> float:
-    """Return the log-likelihood less half the Bayesian penalty."""
+    """Return the log-likelihood less half the penalty of the Bayesian information criterion."""
     return fit.value - 0.5 * len(fit.theta) * math.log(fit.size)
-
-
-def _make_worker(jobs: int | None) -> Work:
-    return lambda function, items: list(spread(function, items, jobs))

@@ -13,8 +13,36 @@ from ..estimation.likelihood.maximization import begin_fit, maximize, refit_nois
 from ..estimation.likelihood.noise_fit import known_from_repeats
 from ..estimation.likelihood.physics_fit import choose_noise, make_problem, start_values
 from ..loop.loop import Loop
+from ..validation.record_audit import Audit
 from .fitted_model import Model
+from .records import find_repeat_periods
 from .thresholds import THRESHOLD
+
+
+def recalibrate(loop: Loop, records: Sequence[Record], audits: Sequence[Audit]) -> Model:
+    """Return the model with its free parameters and the noise fitted, before anything is added.
+
+    Where an experiment repeats itself often enough, what differs between its repeats is noise
+    whatever the model, and the model is fitted with that.
+
+    Parameters
+    ----------
+    loop : Loop
+        The model as given.
+    records : sequence of Record
+        The data.
+    audits : sequence of Audit
+        What the records show by themselves, their repeats among it.
+
+    Returns
+    -------
+    Model
+        The base to which effects are added.
+    """
+    parts, begins = cut_stretches(records)
+    base = fit_base_model(loop, parts, loop.free, begins)
+    periods = find_repeat_periods(parts, audits)
+    return weigh_by_repeats(base, periods) if periods else base
 
 
 def fit_base_model(
@@ -44,7 +72,7 @@ def model_at_given_values(base: Model) -> Model | None:
     missing effect shows at the given ones.
     """
     given = start_values(base.loop, base.names)
-    size = np.maximum(np.abs(given), 1e-300)
+    size = np.maximum(np.abs(given), THRESHOLD.tiny)
     if not np.any(np.abs(base.fit.theta - given) > THRESHOLD.far_recalibration * size):
         return None
     try:
@@ -73,7 +101,10 @@ def cut_stretches(records: Sequence[Record]) -> tuple[list[Record], list[float]]
         return list(records), [0.0] * len(records)
     parts, begins = [], []
     for record in records:
-        size = max(THRESHOLD.fitted_samples * len(record) // total // THRESHOLD.stretches, 1000)
+        size = max(
+            THRESHOLD.fitted_samples * len(record) // total // THRESHOLD.stretches,
+            THRESHOLD.shortest_stretch,
+        )
         firsts = np.linspace(0, max(len(record) - size, 0), THRESHOLD.stretches).astype(int)
         for first in dict.fromkeys(firsts.tolist()):
             part = record[first : first + size]

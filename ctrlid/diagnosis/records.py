@@ -18,6 +18,7 @@ from ..physics.linearization import OperatingPoint
 from ..validation.record_audit import Audit, audit
 from .thresholds import THRESHOLD
 
+ROUNDING = 12  # Rounding to steps q adds a variance of q^2 / 12.
 HOPELESS = ("too few samples", "constant signal", "operating point")
 
 
@@ -91,6 +92,27 @@ class Readout:
     errors: dict[str, float]
 
 
+@dataclass(frozen=True, eq=False)
+class ReadLimits:
+    """Loop and records after the limits of the sensor were read off, and what was found so."""
+
+    loop: Loop
+    records: tuple[Record, ...]
+    found: tuple[Readout, ...]
+
+
+def read_limits(
+    loop: Loop, records: Sequence[Record], audits: Sequence[Audit],
+    catalogue: Sequence[type[AbstractEffect]],
+) -> ReadLimits:  # fmt: skip
+    """Return the loop with the sensor's limits and the records without samples that sit on them."""
+    found = read_clipping(records, audits, catalogue)
+    if found is None:
+        return ReadLimits(loop, tuple(records), ())
+    used = tuple(censor_record(record, found.effect) for record in records)
+    return ReadLimits(loop.with_effect(found.effect), used, (found,))
+
+
 def read_clipping(
     records: Sequence[Record], audits: Sequence[Audit], catalogue: Sequence[type[AbstractEffect]]
 ) -> Readout | None:
@@ -122,7 +144,7 @@ def read_clipping(
 def censor_record(record: Record, effect: AbstractEffect) -> Record:
     """Return a record in which samples on a limit of the sensor do not count."""
     assert isinstance(effect, SensorSaturation)
-    slack = 1e-9 * float(np.ptp(record.y))
+    slack = THRESHOLD.on_limit * float(np.ptp(record.y))
     y = np.asarray(record.y)
     free = (y > effect.lower + slack) & (y < effect.upper - slack)
     return replace(record, valid=np.asarray(record.valid) & free)
@@ -138,8 +160,8 @@ def read_steps(
     """
     step = max((float(a.quantum.get("y", 0.0)) for a in audits), default=0.0)
     noise = float(np.mean(fit.sensor))
-    share = step**2 / 12 / noise if noise > 0 else 0.0
+    share = step**2 / ROUNDING / noise if noise > 0 else 0.0
     if Quantization not in catalogue or share < THRESHOLD.coarse_steps:
         return None
-    gain = -0.5 * fit.size * math.log(max(1 - share, 1e-3))
+    gain = -0.5 * fit.size * math.log(max(1 - share, THRESHOLD.noise_beside_steps))
     return Readout(Quantization(step), gain, {"step": 0.0})

@@ -90,7 +90,7 @@ def _likelihood_of_no_model(fit: Fit) -> float:
     value = 0.0
     for track, keep in zip(fit.problem.prepared, fit.problem.counts, strict=True):
         y = track.table[3][keep]
-        value -= 0.5 * len(y) * (math.log(2 * math.pi * float(np.var(y)) + 1e-300) + 1)
+        value -= 0.5 * len(y) * (math.log(2 * math.pi * float(np.var(y)) + THRESHOLD.tiny) + 1)
     return value
 
 
@@ -120,7 +120,7 @@ def place_instants(fit: Fit) -> Fit:
             )
             if not there.value > best.value + ELSEWHERE:
                 break
-            best = maximize(there, rounds=4, exact=False)
+            best = maximize(there, rounds=THRESHOLD.instant_rounds, exact=False)
     return best
 
 

@@ -105,7 +105,9 @@ def take_out_effect(
 def refit_without_effect(model: Model, position: int) -> tuple[Model, Trial]:
     """Return the model without one effect, refitted, and the effect as a trial on top of it."""
     bare = _drop_effects(model, [position])
-    smaller = replace(bare, fit=drop_linearization(maximize(bare.fit, rounds=10)))
+    smaller = replace(
+        bare, fit=drop_linearization(maximize(bare.fit, rounds=THRESHOLD.removal_rounds))
+    )
     effect = model.fitted.effects[position]
     # Put back anew, it would come last; and all else may have gone too far astray without it.
     label = list(model.loop.labelled)[position]
@@ -173,7 +175,9 @@ def order_last_effect(model: Model, given: int) -> Model:
             continue
         tried = move_last_effect(model, k)
         if math.isfinite(tried.fit.value):
-            tried = replace(tried, fit=maximize(tried.fit, rounds=10, exact=False))
+            tried = replace(
+                tried, fit=maximize(tried.fit, rounds=THRESHOLD.removal_rounds, exact=False)
+            )
         best = max(best, tried, key=lambda m: m.fit.value)
     return best if best.fit.value > model.fit.value + THRESHOLD.close else model
 

@@ -20,10 +20,12 @@ from .candidates import Trial
 from .fitted_model import Model, can_simulate, carry_over
 from .gap import draw_noise, prepare_simulation
 from .noise_tests import NoiseTests, run_noise_tests
-from .records import Readout
+from .records import ROUNDING, Readout
 from .refitting import refit_candidate
 from .screening import screen_at
 from .thresholds import THRESHOLD
+
+SEEDS = 101  # The seeds of two records are so far apart that no two segments share one.
 
 
 def make_replica(model: Model, seed: int = 0) -> Model | None:
@@ -45,7 +47,7 @@ def make_replica(model: Model, seed: int = 0) -> Model | None:
     loop, fit = model.fitted, model.fit
     try:
         records = [
-            _simulate_record(model, t.record, float(t.table[0, 0]), float(r), seed + 101 * k)
+            _simulate_record(model, t.record, float(t.table[0, 0]), float(r), seed + SEEDS * k)
             for k, (t, r) in enumerate(zip(fit.problem.prepared, fit.sensor, strict=True))
         ]
         begins = [float(t.table[0, 0]) for t in fit.problem.prepared]
@@ -54,7 +56,7 @@ def make_replica(model: Model, seed: int = 0) -> Model | None:
         # With other noise a loop may take another path; or the first guess of one may lead astray.
         along = evaluate(problem, fit.theta, fit.noise, [o.trajectory for o in fit.filtered])
         starts = along, begin_fit(problem, fit.theta, fit.noise)
-        again = maximize(max(starts, key=_likely), rounds=8, exact=False)
+        again = maximize(max(starts, key=_likely), rounds=THRESHOLD.replica_rounds, exact=False)
     except CtrlidError:
         return None
     return Model(loop, again) if math.isfinite(again.value) else None
@@ -74,7 +76,7 @@ def _simulate_record(
     simulator = Simulator(loop, THRESHOLD.gap_integration_error, THRESHOLD.gap_steps)
     y, u = np.array(record.y), np.array(record.u)
     for start, stop in record.segments():
-        if stop - start < 10:
+        if stop - start < THRESHOLD.shortest_segment:
             continue
         part = record[start:stop]
         z, r, d = prepare_simulation(simulator, part, follows)
@@ -162,8 +164,8 @@ def forgive_filter(tests: NoiseTests, copies: Sequence[Model | None]) -> NoiseTe
     for name, value in tests.p_values.items():
         usual = min(k.get(name, 1.0) for k in known)
         failed = usual < THRESHOLD.false_alarm and math.log(
-            max(value, 1e-300)
-        ) > THRESHOLD.beyond_replica * math.log(max(usual, 1e-300))
+            max(value, THRESHOLD.least_probability)
+        ) > THRESHOLD.beyond_replica * math.log(max(usual, THRESHOLD.least_probability))
         p[name] = max(value, 0.5) if failed else value
     return replace(
         tests, p_values=p, alpha=THRESHOLD.false_alarm_beside_kinks if bent else tests.alpha
@@ -198,7 +200,7 @@ def follow_record(loop: Loop, record: Record) -> Loop | None:
     try:
         plant = ct.ss(loop.linearize())
         plant = plant if plant.dt else ct.sample_system(plant, loop.dt, "zoh")
-        u, y = (max(float(np.std(v[record.valid])), 1e-300) for v in (record.u, record.y))
+        u, y = (max(float(np.std(v[record.valid])), THRESHOLD.tiny) for v in (record.u, record.y))
         made = replace(loop, controller=_normalized_controller(plant, u, y))
         return made if comes_to_rest(made) else None
     except (CtrlidError, ValueError, np.linalg.LinAlgError):
@@ -216,6 +218,12 @@ def _normalized_controller(plant: Any, u: float, y: float) -> Any:
     return ct.ss(matrix, through / y, feedback * u, 0, plant.dt)
 
 
+def forgive_rounding(tests: NoiseTests, model: Model, steps: Readout) -> NoiseTests:
+    """Return the tests without alarms that a rounding sensor raises on replicas as well."""
+    rounding = with_rounding(model, steps)
+    return forgive_filter(tests, [make_replica(rounding, seed) for seed in (1, 2)])
+
+
 def with_rounding(model: Model, coarse: Readout) -> Model:
     """Return the model with a rounding sensor, whose steps are then no part of its noise.
 
@@ -223,7 +231,7 @@ def with_rounding(model: Model, coarse: Readout) -> Model:
     """
     fit = model.fit
     step = coarse.effect.values()["step"]
-    sensor = np.maximum(fit.sensor - step**2 / 12, 0.05 * fit.sensor)
+    sensor = np.maximum(fit.sensor - step**2 / ROUNDING, THRESHOLD.sensor_beside_steps * fit.sensor)
     ratio = float(np.mean(fit.sensor) / np.mean(sensor))
     force = tuple(v * ratio for v in fit.noise.force)
     noise = replace(fit.noise, force=force, drift=fit.noise.drift * ratio)

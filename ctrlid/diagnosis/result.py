@@ -7,7 +7,7 @@ from typing import Any
 from .._base.text import Printed
 from ..effects import AbstractEffect
 from ..loop.loop import Loop
-from .findings import Calibrated, Candidate, Disturbance, Finding, Gap, Place, Verdict
+from .findings import BinnedErrors, Calibrated, Candidate, Disturbance, Finding, Gap, Verdict
 from .report_text import write_report_text
 from .saving import save_diagnosis
 
@@ -28,7 +28,7 @@ class Diagnosis(Printed):
         The model with the effects added and everything refitted.
     gap : Gap
         How far model and data are apart, before and after.
-    where : tuple of Place
+    where : tuple of BinnedErrors
         Where the disagreement sits, before and after; most telling first.
     ranking : tuple of Candidate
         Every candidate's evidence, round by round, best first.
@@ -58,7 +58,7 @@ class Diagnosis(Printed):
     findings: tuple[Finding, ...]
     loop: Loop
     gap: Gap
-    where: tuple[Place, ...]
+    where: tuple[BinnedErrors, ...]
     ranking: tuple[Candidate, ...]
     disturbance: Disturbance
     calibrated: tuple[Calibrated, ...]

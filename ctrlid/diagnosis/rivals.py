@@ -44,7 +44,7 @@ def vuong_statistic(best: Array, other: Array, penalty: float) -> float:
     """
     d = best - other
     spread = _spread_of_sum(d)
-    return float((d.sum() - penalty) / max(spread, 1e-12))
+    return float((d.sum() - penalty) / max(spread, THRESHOLD.least_spread))
 
 
 def _spread_of_sum(d: Array) -> float:
@@ -150,12 +150,12 @@ def compare_effects(
         )
         again = [t for t in again if _find_on_bounds(t.model) <= _find_on_bounds(mine.model)]
         best = max([mine, *again], key=lambda t: t.net_gain)
-        if best.net_gain <= mine.net_gain + 1.0:
+        if best.net_gain <= mine.net_gain + THRESHOLD.taken_by_better:
             best = mine
         best = prefer_plainer(smaller, best, [mine, *again])
         if best is not mine:
             now = move_last_effect(best.model, f.position)
-            now = replace(now, fit=maximize(now.fit, rounds=4))
+            now = replace(now, fit=maximize(now.fit, rounds=THRESHOLD.rival_rounds))
         close = find_rivals(best, [t for t in [mine, *again] if t is not best], sure)
         done.append(Weighed(best, close, smaller, f.position))
     done.sort(key=lambda f: -f.trial.gain)

@@ -153,8 +153,6 @@ def _units_of_effects(found: Diagnosis) -> dict[str, dict[str, str]]:
 
 
 SPECIAL = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}  # written as texts
-
-
 IN_A_LINE = 8  # numbers of an array
 
 

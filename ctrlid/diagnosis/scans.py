@@ -26,23 +26,11 @@ from .screening import screen_candidate, screen_starts
 from .thresholds import THRESHOLD
 
 LENGTHS = 150  # wavelengths that are looked for in the travel
-
-
 UNHURRIED = 0.25  # of the samples: a wave that these can follow is looked for
-
-
 EDGE = 0.05  # of the record, at either end
-
-
 TIMES = 40  # instants at which a parameter might have stepped
-
-
 LIMITS = (0.999, 0.998, 0.995, 0.99, 0.98, 0.95, 0.9, 0.8)  # quantiles that may be cut off
-
-
 DEPTHS = (0.5, 0.25)  # of the range of the input, to which it may have been limited
-
-
 MODES = 7  # frequencies at which a flexible mode is tried
 
 

@@ -34,7 +34,7 @@ def screen_candidate(base: Model, effect: AbstractEffect, scan_penalty: float = 
 def _make_fainter(effect: AbstractEffect) -> AbstractEffect | None:
     """Return an effect with a tenth of its size; None where that has no meaning."""
     sizes = {
-        p.name: p.neutral + 0.1 * (getattr(effect, p.name) - p.neutral)
+        p.name: p.neutral + THRESHOLD.fainter * (getattr(effect, p.name) - p.neutral)
         for p in effect.parameters()
         if p.neutral is not None and math.isfinite(p.neutral)
     }

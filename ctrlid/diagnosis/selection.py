@@ -167,7 +167,10 @@ def _prefer_simplest(base: Model, trials: list[Trial]) -> list[Trial]:
         fewer = len(simple.effect.parameters()) < len(best.effect.parameters())
         if not fewer or simple.net_gain <= THRESHOLD.gate:
             continue
-        if best.gain - simple.gain > 0.1 * best.gain or simple.name not in best.effect.look_alikes:
+        if (
+            best.gain - simple.gain > THRESHOLD.simpler_nearly * best.gain
+            or simple.name not in best.effect.look_alikes
+        ):
             continue
         more = gain_beyond_simple(base, best, simple)
         if more <= best.penalty - simple.penalty:

@@ -30,7 +30,12 @@ def value(
         Where the number comes from.
     """
     reasons = {"law": law, "convention": convention, "study": study, "cost": cost}
-    (kind,) = [k for k, reason in reasons.items() if reason]
+    given = [k for k, reason in reasons.items() if reason]
+    if len(given) != 1:
+        raise ValueError(
+            f"a number needs exactly one reason, given {' and '.join(given) or 'none'}"
+        )
+    kind = given[0]
     about = {"kind": kind, "reason": reasons[kind], "unit": unit, "source": source}
     return field(default=default, metadata=about)
 
@@ -68,6 +73,17 @@ class Thresholds:
         0.25, study="the steps of the converter are worth a name if they make so much of the noise",
         unit="of the sensor noise's variance",
     )  # fmt: skip
+    noise_beside_steps: float = value(
+        1e-3, cost="so much of the noise at least is left beside the steps of a converter",
+        unit="of the sensor noise's variance",
+    )  # fmt: skip
+    on_limit: float = value(
+        1e-9, cost="a sample so near to a limit of the sensor sits on it", unit="of the range of y"
+    )
+    same_period: float = value(
+        1e-9, cost="periods that differ by less are the same", unit="of the sampling period"
+    )
+    tiny: float = value(1e-300, cost="keeps logarithms and quotients of zero finite")
 
     # Step 2: recalibration.
     parameter_range: float = value(
@@ -87,11 +103,11 @@ class Thresholds:
     # Step 3: is it noise, and where not.
     false_alarm: float = value(
         2e-3, convention="chance that all tests together raise a false alarm, for each effect in "
-        "the model and once without any",
+        "the model and once without any", unit="probability",
     )  # fmt: skip
     false_alarm_beside_kinks: float = value(
         1e-4, study="the same where the model has kinks such as dry friction, which the filter "
-        "follows only nearly",
+        "follows only nearly", unit="probability",
     )  # fmt: skip
     beyond_replica: float = value(
         3.0, study="a test that fails on replicas of the model speaks against the model only if it "
@@ -100,6 +116,17 @@ class Thresholds:
     lags: int = value(
         25, convention="as usual in residual analysis", unit="samples",
         source="Ljung, System Identification, section 16.6",
+    )  # fmt: skip
+    past_lags: tuple[int, ...] = value(
+        (1, 2, 3, 4, 6, 9, 14), convention="past changes of input and reference on which "
+        "innovations are regressed, denser where plants answer", unit="samples",
+    )  # fmt: skip
+    past_left_out: int = value(
+        20, cost="samples at the beginning, whose past is not whole", unit="samples"
+    )
+    past_rank: float = value(
+        1e-6, cost="a column that others explain to so much says nothing of its own",
+        unit="of the largest",
     )  # fmt: skip
     force_settling: float = value(
         0.05, study="so much at the beginning the estimate of a force is still being found",
@@ -138,10 +165,15 @@ class Thresholds:
         1e-7, cost="a parameter of which others leave less is not told from them in double "
         "precision", unit="of its information",
     )  # fmt: skip
+    shifted_far: float = value(
+        1e6, cost="a plant that moves alike wherever its output is counted from has no place",
+        unit="times the output",
+    )  # fmt: skip
     fainter_tries: int = value(
         3, cost="how often an effect that promises nothing is tried at a tenth of its size",
         unit="times",
     )  # fmt: skip
+    fainter: float = value(0.1, cost="by that an effect is made fainter", unit="of its size")
     scan_block: int = value(500_000, cost="shapes are scanned in blocks", unit="numbers")
     wave_near_best: float = value(
         0.7, study="another wave that promises so much is refitted as well",
@@ -181,6 +213,8 @@ class Thresholds:
     instant_doublings: int = value(
         11, cost="an instant is moved by 1, 2, 4, ... samples, so many times", unit="doublings"
     )
+    instant_rounds: int = value(4, cost="of the climb from a better instant",
+                                unit="steps of the climb")  # fmt: skip
 
     # Step 6: decide.
     gate: float = value(
@@ -202,6 +236,13 @@ class Thresholds:
         unit="of log-likelihood",
     )  # fmt: skip
     replicas_beside_kink: int = value(4, cost="those replicas", unit="replicas")
+    replica_rounds: int = value(8, cost="of a model fitted to its replica",
+                                unit="steps of the climb")  # fmt: skip
+    shortest_segment: int = value(10, cost="shorter ones are not simulated anew", unit="samples")
+    sensor_beside_steps: float = value(
+        0.05, cost="so much sensor noise at least is simulated beside the steps of a converter",
+        unit="of the sensor noise's variance",
+    )  # fmt: skip
     simpler_nearly: float = value(
         0.1, study="a simpler effect takes the place of a richer one only if it loses less",
         unit="of the richer one's gain",
@@ -216,6 +257,10 @@ class Thresholds:
         4, study="so many effects describe almost any error, and explain none", unit="effects"
     )
     some_effects: int = value(3, study="of so many effects none may be slight", unit="effects")
+    more_rounds: int = value(
+        2, cost="the search ends after so many rounds more than effects may be found",
+        unit="rounds",
+    )  # fmt: skip
     slight_effect: float = value(
         0.02, study="what corrects so little beside others may correct their wrong law",
         unit="of the largest gain",
@@ -248,6 +293,10 @@ class Thresholds:
         100.0, cost="an effect so significant is not asked whether it is needed",
         unit="times the gate",
     )  # fmt: skip
+    removal_rounds: int = value(
+        10, cost="of a model from which an effect is taken, or whose order is changed",
+        unit="steps of the climb",
+    )  # fmt: skip
 
     # Step 8: what else would do, and which experiment tells.
     close: float = value(
@@ -278,17 +327,37 @@ class Thresholds:
         1.0, study="another effect takes the place of one that was found if it gains so much more",
         unit="of log-likelihood",
     )  # fmt: skip
+    rival_rounds: int = value(4, cost="of a model in which a rival took an effect's place",
+                              unit="steps of the climb")  # fmt: skip
+    least_spread: float = value(
+        1e-12, cost="keeps Vuong's statistic finite where two models predict the same",
+        unit="of log-likelihood",
+    )  # fmt: skip
     tie: float = value(
         0.02, cost="gains that differ by less are those of one and the same effect on every record",
         unit="of log-likelihood",
     )  # fmt: skip
     experiment_samples: int = value(20_000, cost="of a recommended experiment, at most",
                                     unit="samples")  # fmt: skip
+    experiment_shortest: int = value(5000, cost="of a recommended experiment, at least",
+                                     unit="samples")  # fmt: skip
     experiment_tried: int = value(5000, cost="on which references are compared", unit="samples")
     experiment_levels: tuple[float, ...] = value(
         (-1.0, 1.0, -0.5, 0.5, 0.0), convention="set-points that a reference visits",
         unit="of its reach",
     )  # fmt: skip
+    experiment_times: int = value(
+        4, convention="how much larger, faster or slower a bolder reference is", unit="times"
+    )
+    experiment_smallest: float = value(
+        0.1, convention="the jumps of a reference are at least so large", unit="of its reach"
+    )
+    experiment_step: float = value(
+        1e-3, convention="its jumps where the record's reference never moved", unit="of y"
+    )
+    experiment_bolder: float = value(
+        1.2, convention="a bolder experiment is chosen if it tells so much more", unit="times"
+    )
     experiment_ramp: float = value(0.1, convention="spent on the way to a set-point",
                                    unit="of its duration")  # fmt: skip
     experiment_worth: float = value(
@@ -314,6 +383,11 @@ class Thresholds:
     held_out: float = value(0.25, convention="kept back for the comparison",
                             unit="of the valid samples")  # fmt: skip
     held_out_samples: int = value(30_000, cost="of those, at most", unit="samples")
+    lead: int = value(
+        5, convention="one in so many of the samples kept back are added before them, in which the "
+        "start may still show", unit="samples",
+    )  # fmt: skip
+    shortest_lead: int = value(200, convention="the same, at least", unit="samples")
     start_left_out: float = value(
         0.02, convention="the guess of the initial state may still show there",
         unit="of a validation record",
@@ -370,6 +444,18 @@ class Thresholds:
     open_loop_rounds: int = value(5, cost="of the search", unit="rounds")
     open_loop_refitted: int = value(8, cost="of a round", unit="candidates")
     open_loop_evaluations: int = value(60, cost="of a refit", unit="simulations")
+    open_loop_rank: float = value(
+        1e-10, cost="directions in which the error changes less are left out",
+        unit="of the largest singular value",
+    )  # fmt: skip
+    inside_bounds: float = value(
+        1e-9, cost="a search begins so far inside its bounds", unit="of the value"
+    )
+    line_padding: int = value(4, cost="zeros that make the spectrum finer", unit="times the record")
+    slowest_line: int = value(
+        8, convention="a slower line of the padded spectrum is a drift, not a vibration",
+        unit="bins of the padded spectrum",
+    )  # fmt: skip
     open_loop_step_times: int = value(12, cost="at which a parameter might have stepped",
                                       unit="instants")  # fmt: skip
     open_loop_closes: float = value(

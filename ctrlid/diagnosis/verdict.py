@@ -7,9 +7,44 @@ from collections.abc import Sequence
 from .._base.text import chance, number
 from ..effects import AbstractEffect, PositionRipple
 from ..estimation.likelihood.likelihood import Fit
-from .findings import Disturbance, Finding, Gap, Place, Verdict
+from .findings import BinnedErrors, Disturbance, Finding, Gap, Verdict
 from .noise_tests import NoiseTests
 from .thresholds import THRESHOLD
+
+
+def choose_verdict(complete: bool, named: bool) -> Verdict:
+    """Return the verdict by the decision table.
+
+    ==========================  =================  =====================
+    what is left                something named    nothing named
+    ==========================  =================  =====================
+    noise, on fresh data too    explained          nothing missing
+    more, or the names are      partly explained   unknown
+    doubtful together
+    ==========================  =================  =====================
+
+    Parameters
+    ----------
+    complete : bool
+        Whether the tests pass, the gap on fresh data is that of noise, and the names together are
+        above doubt.
+    named : bool
+        Whether any effect was named.
+    """
+    if complete:
+        return "explained" if named else "nothing missing"
+    return "partly explained" if named else "unknown"
+
+
+def gap_is_left(gap: Gap, disturbance: Disturbance, fit: Fit) -> bool:
+    """Whether the gap with the effects shows that something is left.
+
+    A random force that may do anything explains everything, and nothing: beside one, a gap wider
+    than that of the model as given is no explanation.
+    """
+    blamed = disturbance.large or math.isnan(disturbance.share)
+    worse = gap.after > THRESHOLD.worse_than_given * gap.given
+    return gap_stands_out(gap, fit) or (blamed and worse)
 
 
 def find_doubt(effects: Sequence[AbstractEffect], gains: Sequence[float], total: float) -> str:
@@ -75,7 +110,7 @@ def gap_is_wider(gap: Gap, disturbance: Disturbance) -> bool:
 
 def write_conclusion(
     verdict: Verdict, findings: Sequence[Finding], gap: Gap, disturbance: Disturbance,
-    after: NoiseTests, where: Sequence[Place], loose: str = "",
+    after: NoiseTests, where: Sequence[BinnedErrors], loose: str = "",
 ) -> str:  # fmt: skip
     """Return the verdict with what it rests on.
 
@@ -91,7 +126,7 @@ def write_conclusion(
         The random forces.
     after : Omnibus
         The tests of what is left.
-    where : sequence of Place
+    where : sequence of BinnedErrors
         Where the disagreement sits.
     loose : str, optional
         Why effects that leave nothing but noise may yet be no explanation.
@@ -121,7 +156,7 @@ def write_conclusion(
                 f"accounts for: {why}.")  # fmt: skip
     else:
         text = f"Something is missing, but none of the known effects accounts for it: {why}."
-    left = [w for w in where if w.p_after < 1e-4]
+    left = [w for w in where if w.p_after < THRESHOLD.surely_left]
     if left and verdict in ("partly explained", "unknown"):
         text += f" It shows along {' and '.join(w.axis for w in left[:2])}."
     if disturbance.large:

@@ -6,15 +6,15 @@ import numpy as np
 
 from .._base.arrays import Array
 from .constancy import find_bin_edges, find_bins
-from .findings import Place
+from .findings import BinnedErrors
 from .noise_tests import NoiseTests
 
 
 def locate_errors(
     before: NoiseTests, after: NoiseTests, units: Mapping[str, str]
-) -> tuple[Place, ...]:
+) -> tuple[BinnedErrors, ...]:
     """Return where the innovations are not noise, before and after; most telling first."""
-    found: list[Place] = []
+    found: list[BinnedErrors] = []
     for name, values in before.axes.items():
         if name not in after.axes or len(after.axes[name]) != len(values):
             continue
@@ -29,7 +29,7 @@ def locate_errors(
         )
         unit = units.get(name, "")
         words = _describe_place(name, unit, edges, before.z, index, count)
-        found.append(Place(name, unit, edges, was, now, p_was, p_now, words))
+        found.append(BinnedErrors(name, unit, edges, was, now, p_was, p_now, words))
     return tuple(sorted(found, key=lambda place: place.p_before))
 
 

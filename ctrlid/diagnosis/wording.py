@@ -10,7 +10,7 @@ import numpy as np
 
 from .._base.text import chance, listing, number, prefix, quantity
 from ..effects import AbstractEffect, ReadingEffect
-from .findings import COMPLETE, Finding, Gap, Place
+from .findings import COMPLETE, BinnedErrors, Finding, Gap
 from .noise_tests import alarm_level
 from .saving import units_of
 from .thresholds import THRESHOLD
@@ -19,34 +19,22 @@ if TYPE_CHECKING:
     from .result import Diagnosis
 
 PLACES = 3
-
-
 LISTED = 4  # tests that fail
-
-
 HEADLINES = {
     "nothing missing": "Nothing missing",
     "explained": "Explained",
     "partly explained": "PARTLY EXPLAINED: SOMETHING IS STILL MISSING",
     "unknown": "UNKNOWN: SOMETHING IS MISSING that no candidate explains",
 }
-
-
 EVIDENCE = (
     "Evidence: the logarithm of how many times likelier the record is with the effect than "
     "without; chance reaches 2 or 3, 10 is strong."
 )
-
-
 WIDENED = (
     "Recalibrating alone makes the one-step errors smaller and this gap larger: parameters cannot "
     "stand in for what is missing."
 )
-
-
 MASSES = ("m", "M", "mass")
-
-
 FORCES = {"m/s^2": "N", "1/s": "N s/m", "1/s^2": "N/m", "1/m": "kg/m"}  # per unit of mass, times it
 
 
@@ -113,7 +101,7 @@ def write_percent(share: float) -> str:
     return f"{100 * share:.1f} %" if 0.99 < share < 0.9995 else f"{100 * share:.0f} %"
 
 
-def list_telling_places(found: Diagnosis) -> list[Place]:
+def list_telling_places(found: Diagnosis) -> list[BinnedErrors]:
     """Return the places where the disagreement sits, most telling first."""
     return [p for p in found.where if p.p_before < THRESHOLD.telling][:PLACES]
 
@@ -124,7 +112,7 @@ def highest_rms(levels: Iterable[float]) -> float:
     return math.sqrt(max(known, default=math.nan))
 
 
-def describe_place(place: Place) -> str:
+def describe_place(place: BinnedErrors) -> str:
     """Say where along its axis a place sits."""
     if place.words:
         return place.words.removeprefix(f"at {place.axis} ")

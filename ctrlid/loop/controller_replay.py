@@ -10,6 +10,7 @@ import numpy as np
 from .._base.arrays import Array
 from .._base.errors import CtrlidError
 from ..data.record import Record
+from ..data.several_records import model_and_data
 from .loop import Loop
 
 
@@ -93,7 +94,7 @@ def replay_controller(loop: Loop, record: Record) -> Array:
     >>> bool(abs(cid.replay_controller(loop, record) - record.u).max() < 1e-12)
     True
     """
-    return replay_from_best_state(loop, record)[0]
+    return replay_from_best_state(*model_and_data(loop, record))[0]
 
 
 def replay_from_best_state(loop: Loop, record: Record) -> tuple[Array, Array]:

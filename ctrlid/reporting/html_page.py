@@ -16,6 +16,7 @@ from ..estimation.identified_model import IdentifiedModel
 from ..estimation.likelihood.physics_estimate import LoopFit
 from ..validation.comparison import Comparison
 from . import plot
+from .plot.axes import BINS
 from .tables import Table, Title, blocks, heading
 
 STYLE = """
@@ -171,7 +172,7 @@ def _pictures(result: Any) -> dict[str, Any]:
     match result:
         case Record():
             made = {"The experiment.": plot.record(result)}
-            if len(result) > 2 * plot.BINS:
+            if len(result) > 2 * BINS:
                 middle = len(result) // 2
                 part = result[middle : middle + CLOSE]
                 made["A part of it."] = plot.record(part)

@@ -11,14 +11,14 @@ import numpy as np
 from .._base import text as _text
 from .._base.arrays import Array
 from .._base.errors import CtrlidError
-from ..diagnosis.findings import Candidate, Gap, Place
+from ..diagnosis.findings import BinnedErrors, Candidate, Gap
 from ..diagnosis.result import Diagnosis
 from ..physics.trace import timebase
 from ..validation.comparison import Comparison
 
 WINDOW = 250  # samples of a comparison that can be told apart on a page
 BARS = 7  # candidates of a round that are drawn
-LEAST = -20.0  # evidence below which a bar says no more
+LEAST = -10.0  # A net gain below says no more than this one.
 
 
 def scale(signals: Sequence[Array], unit: str) -> tuple[float, str]:
@@ -123,7 +123,7 @@ def largest_gap(gap: Gap) -> slice:
     return slice(first, first + width)
 
 
-def two_places(found: Diagnosis) -> list[Place]:
+def two_most_telling(found: Diagnosis) -> list[BinnedErrors]:
     """Return the two most telling places."""
     return sorted(found.where, key=lambda place: place.p_before)[:2]
 
@@ -139,21 +139,21 @@ class Bar:
     ----------
     label : str
         Its name.
-    evidence : float
-        Twice its gain of log-likelihood less the penalty, the difference in the Bayesian criterion.
+    net_gain : float
+        Its gain of log-likelihood less the penalty of the Bayesian criterion.
     kind : {"found", "not told apart", "refitted", "not refitted"}
-        What became of it; of one that was not refitted the evidence is what its first step
-        promises.
+        What became of it; of one that was not refitted the gain is the score, which its first
+        step expects.
     """
 
     label: str
-    evidence: float
+    net_gain: float
     kind: Kind
 
 
 def ranking(found: Diagnosis) -> dict[int, list[Bar]]:
     """Return the best candidates of each round as bars, the best first."""
-    value = {id(c): _evidence(c) for c in found.ranking}
+    value = {id(c): _net_gain(c) for c in found.ranking}
     kinds: dict[int, Kind] = {}
     for finding in found.findings:
         own = [c for c in found.ranking
@@ -180,12 +180,12 @@ def ranking(found: Diagnosis) -> dict[int, list[Bar]]:
     return rounds
 
 
-def _evidence(c: Candidate) -> float:
+def _net_gain(c: Candidate) -> float:
     gain = c.gain if math.isfinite(c.gain) else c.score
-    return max(2 * (gain - c.penalty), LEAST) if math.isfinite(gain) else LEAST
+    return max(gain - c.penalty, LEAST) if math.isfinite(gain) else LEAST
 
 
-def bin_labels(place: Place) -> tuple[list[str], str]:
+def bin_labels(place: BinnedErrors) -> tuple[list[str], str]:
     """Return the edges of the bins of a place as labels, and the title of the axis."""
     known = place.edges[np.isfinite(place.edges)]
     factor, unit = scale([known], place.unit) if known.size else (1.0, place.unit)

@@ -187,7 +187,7 @@ def _comparison_tables(c: Comparison) -> list[Table]:
 
 def _loop_fit_blocks(fit: LoopFit) -> list[Block]:
     e = fit.estimate
-    errors = ("on its bound" if name in e.bounds else
+    errors = ("on its bound" if name in e.active else
               f"{error:.2g}" if np.isfinite(error) else "not in the data"
               for name, error in zip(e.names, e.standard_errors, strict=True))  # fmt: skip
     rows = tuple(zip(e.names, (f"{v:.7g}" for v in e.values), errors, strict=True))

@@ -13,6 +13,7 @@ from .._base.arrays import Array
 from .._base.errors import CtrlidError, CtrlidWarning
 from .._base.text import number
 from ..data.record import Record
+from ..data.several_records import model_and_data
 from ..estimation.identified_model import IdentifiedModel, delay_of
 from ..estimation.likelihood.filter_data import FEWEST
 from ..estimation.likelihood.prediction import Prediction, predict, predict_ahead, spread_ahead
@@ -45,7 +46,7 @@ def compare(record: Record, model_or_loop: Any, *, horizon: int | None = None) -
     Parameters
     ----------
     record : Record
-        The data.
+        The data. Record and model may change places.
     model_or_loop : Loop, IdentifiedModel or control.TransferFunction
         What to compare with them. A transfer function predicts as the ARX equation does, with the
         constant part fitted to this record.
@@ -73,9 +74,11 @@ def compare(record: Record, model_or_loop: Any, *, horizon: int | None = None) -
     >>> [curve.label for curve in cid.compare(record, loop).curves]
     ['one-step prediction', '50-step prediction', 'closed-loop simulation']
     """
+    model_or_loop, record = model_and_data(model_or_loop, record)
     if not isinstance(record, Record):
         raise CtrlidError(
-            f"compare needs a Record first, then the model; given {type(record).__name__}"
+            "compare needs a Record and a model; given "
+            f"{type(record).__name__} and {type(model_or_loop).__name__}"
         )
     if horizon is not None and not (isinstance(horizon, Integral) and 1 <= horizon < len(record)):
         raise CtrlidError(

@@ -11,6 +11,7 @@ import numpy as np
 from .._base.errors import CtrlidError
 from .._base.text import Printed
 from ..data.record import SIGNALS, Record
+from ..data.several_records import model_and_data
 from ..loop.loop import Loop
 from . import signal_defects as defects
 from .controller_check import check_controller
@@ -107,7 +108,7 @@ def audit(record: Record, loop: Loop | None = None) -> Audit:
     Parameters
     ----------
     record : Record
-        The record.
+        The record. Record and loop may change places.
     loop : Loop, optional
         The loop it comes from. If its controller is digital and r was logged, it is also checked
         whether the logged u is what this controller computes, and if not, why.
@@ -141,6 +142,7 @@ def audit(record: Record, loop: Loop | None = None) -> Audit:
     >>> [f.kind for f in cid.audit(stuck).harmful]
     ['saturation']
     """
+    loop, record = model_and_data(loop, record)
     if not isinstance(record, Record) or not (loop is None or isinstance(loop, Loop)):
         raise CtrlidError(
             "audit needs a Record and, if you like, its Loop; given "

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from .._base.errors import CtrlidError, CtrlidWarning
-from .._base.jobs import spread
+from .._base.jobs import check_jobs, spread
 from .._base.text import listing
 from ..data.record import Record
 from ..estimation.constraints import AbstractConstraint
@@ -34,7 +34,7 @@ def sweep_sampling_period(
     poles: int = 2,
     zeros: int = 0,
     controller: Any = None,
-    jobs: int = 1,
+    jobs: int | None = None,
 ) -> SamplingSweep:
     r"""Fit a record at several sampling periods and say which one to use, and what to distrust.
 
@@ -77,8 +77,8 @@ def sweep_sampling_period(
         As in `fit_iv` and `fit_continuous`; used at the record's own period, since a slower record
         has no controller of this form.
     jobs : int, optional
-        Processes that share the fits, through joblib; with ``joblib.parallel_config`` it can be
-        another backend, such as a dask cluster.
+        Processes that share the fits, through joblib; by default one, or what
+        ``joblib.parallel_config`` says, which can be another backend such as a dask cluster.
 
     Returns
     -------
@@ -117,8 +117,6 @@ def sweep_sampling_period(
     unknown = [name for name in names if name not in ESTIMATORS]
     if unknown or not names:
         raise CtrlidError(f"estimators are of {listing(ESTIMATORS)}; given {names}")
-    if not isinstance(jobs, int) or jobs < 1:
-        raise CtrlidError(f"jobs is a number of processes, at least 1; given {jobs!r}")
     known = {
         name: tuple(constraints.get(name, ())) if isinstance(constraints, Mapping)
         else tuple(_listed(constraints)) for name in names
@@ -128,7 +126,7 @@ def sweep_sampling_period(
         for factor in factors
         for name in names
     ]
-    rows = list(spread(_fit, tasks, jobs))
+    rows = list(spread(_fit, tasks, check_jobs(jobs)))
     done = [row for row in rows if not row.failure]
     if not done:
         raise CtrlidError(f"no fit succeeded at any period; the first one: {rows[0].failure}")

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy.stats import norm
 
 from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
@@ -40,7 +41,7 @@ class LoopEstimate(Printed):
         Logarithm of the likelihood.
     n_samples : int
         Samples that count.
-    bounds : tuple of str
+    active : tuple of str
         The parameters that sit on a bound.
     notes : tuple of str
         What the user should know before believing the numbers.
@@ -55,7 +56,7 @@ class LoopEstimate(Printed):
     force_time: float
     log_likelihood: float
     n_samples: int
-    bounds: tuple[str, ...] = ()
+    active: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
 
     @property
@@ -74,25 +75,30 @@ class LoopEstimate(Printed):
             raise CtrlidError(f"{name!r} was not fitted; fitted were {', '.join(self.names)}")
         return float(self.values[self.names.index(name)])
 
-    def interval(self, name: str, share: float = 0.95) -> tuple[float, float]:
+    def confidence_interval(self, name: str, level: float = 0.95) -> tuple[float, float]:
         """Return the interval that covers the true value of a parameter with a probability.
 
         Parameters
         ----------
         name : str
             A fitted parameter.
-        share : float, optional
-            The probability, for normally distributed errors.
+        level : float, optional
+            The probability, between 0 and 1, for normally distributed errors.
 
         Returns
         -------
-        tuple of float
+        lower, upper : float
             Lower and upper end [unit of the parameter].
-        """
-        from scipy.stats import norm
 
+        Raises
+        ------
+        CtrlidError
+            If the parameter was not fitted or the level is no probability.
+        """
+        if not 0.0 < level < 1.0:
+            raise CtrlidError(f"A confidence level lies between 0 and 1; given {level!r}.")
         middle = self[name]
-        half = float(norm.ppf((1 + share) / 2)) * self.standard_errors[self.names.index(name)]
+        half = float(norm.ppf((1 + level) / 2)) * self.standard_errors[self.names.index(name)]
         return float(middle - half), float(middle + half)
 
     def __str__(self) -> str:
@@ -100,7 +106,7 @@ class LoopEstimate(Printed):
                 f"{self.log_likelihood:.1f}"]  # fmt: skip
         width = max((len(name) for name in self.names), default=0)
         for name, value, error in zip(self.names, self.values, self.standard_errors, strict=True):
-            mark = "  (on its bound)" if name in self.bounds else ""
+            mark = "  (on its bound)" if name in self.active else ""
             rows.append(f"  {name:<{width}} = {_with_error(value, error)}{mark}")
         noise = ", ".join(number(v, 3) for v in self.sensor_noise)
         rows.append(f"  sensor noise {noise}, white force noise {number(self.force_noise, 3)}")
@@ -157,7 +163,7 @@ class LoopFit(Printed):
             estimate.names, values, estimate.standard_errors, strict=True
         ):
             h = 1e-4 * abs(value) or 1e-2 * (error if np.isfinite(error) else 1.0)
-            if name in estimate.bounds or h == 0:
+            if name in estimate.active or h == 0:
                 slopes.append(np.zeros(len(self.poles)))
                 continue
             ends = [_at_rest(self.loop.with_parameters({name: value + d})) for d in (h, -h)]

@@ -9,7 +9,7 @@ import numpy as np
 from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
 from ...data.record import Record
-from ...data.several_records import as_records
+from ...data.several_records import as_records, model_and_data
 from ...loop.loop import Loop
 from .filter_data import make_filter_data
 from .likelihood import Fit, Problem, pseudo_inverse
@@ -76,10 +76,11 @@ def fit_loop(
     >>> r = cid.random_binary(3000, amplitude=1e-4, hold=20, around=op.output, seed=1)
     >>> record = cid.simulate(loop, r, sensor_noise=2e-6, seed=2)
     >>> fitted = cid.fit_loop(loop.with_parameters({"K": 3.1e-6}), record)
-    >>> low, high = fitted.estimate.interval("K", share=0.999)
+    >>> low, high = fitted.estimate.confidence_interval("K", level=0.999)
     >>> low < 3.34e-6 < high
     True
     """
+    loop, record = model_and_data(loop, record)
     records = as_records(record)
     names = _free_names(loop, free)
     start = begin_fit(make_problem(loop, names, records), start_values(loop, names), None)

@@ -13,6 +13,7 @@ import numpy as np
 from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
 from ...data.record import Record
+from ...data.several_records import model_and_data
 from ...loop.loop import Loop
 from .filter_data import make_filter_data
 from .kalman_filter import Noise
@@ -101,8 +102,9 @@ def predict(loop: Loop, record: Record, force_noise: float | None = None) -> Pre
     >>> bool(cid.predict(loop, record).innovations.std() < 1.3e-3)
     True
     """
+    loop, record = model_and_data(loop, record)
     if not (isinstance(loop, Loop) and isinstance(record, Record)):
-        raise CtrlidError("predict needs the Loop first, then the Record; given "
+        raise CtrlidError("predict needs a Loop and a Record; given "
                           f"{type(loop).__name__} and {type(record).__name__}")  # fmt: skip
     if force_noise is not None and not (np.isfinite(force_noise) and force_noise >= 0):
         raise CtrlidError(f"force_noise is a ratio >= 0; given {force_noise!r}")

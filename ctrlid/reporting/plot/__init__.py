@@ -6,19 +6,13 @@ figures. Save it with ``axes.figure.savefig(...)`` or turn it into bytes with `p
 that is global is changed.
 """
 
-from .axes import BINS, COLOURS, DASHES, MARKERS, MEASURED, STYLE, figure, png
+from .axes import figure, png, style
 from .findings import diagnosis
 from .models import bode, poles, trend
 from .records import comparison, record, residuals
 from .redesigns import step
 
 __all__ = [
-    "BINS",
-    "COLOURS",
-    "DASHES",
-    "MARKERS",
-    "MEASURED",
-    "STYLE",
     "bode",
     "comparison",
     "diagnosis",
@@ -28,5 +22,6 @@ __all__ = [
     "record",
     "residuals",
     "step",
+    "style",
     "trend",
 ]

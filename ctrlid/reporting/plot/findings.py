@@ -6,8 +6,9 @@ from typing import Any
 import numpy as np
 
 from ..._base.arrays import Array
-from ...diagnosis.findings import Place
+from ...diagnosis.findings import BinnedErrors
 from ...diagnosis.result import Diagnosis
+from ...diagnosis.thresholds import THRESHOLD
 from .. import pictures as _pictures
 from .axes import COLOURS, MEASURED, finish, new_figure, require, take_axes
 
@@ -19,7 +20,6 @@ FILLS: dict[str, dict[str, Any]] = {
     "refitted": {"facecolor": "0.75", "edgecolor": "0.3"},
     "not refitted": {"facecolor": "w", "edgecolor": "0.3", "linestyle": "--"},
 }
-GATE = 10.0  # difference in the Bayesian criterion that is strong evidence
 
 
 def diagnosis(found: Diagnosis, axes: Any = None) -> Any:
@@ -60,7 +60,7 @@ def diagnosis(found: Diagnosis, axes: Any = None) -> Any:
         axes = list(made.values())
     axes = take_axes(axes, 5)
     _gap(axes[0], axes[1], found)
-    places = _pictures.two_places(found)
+    places = _pictures.two_most_telling(found)
     for ax, place in zip(axes[2:4], [*places, None, None][:2], strict=True):
         _where(ax, place, found)
     _ranking(axes[4], rounds)
@@ -112,7 +112,7 @@ def _limit(ax: Any, y: Array) -> None:
     ax.set_ylim(max(low, y.min() - 0.8 * span), min(high, y.max() + 0.8 * span))
 
 
-def _where(ax: Any, place: Place | None, found: Diagnosis) -> None:
+def _where(ax: Any, place: BinnedErrors | None, found: Diagnosis) -> None:
     """Draw the RMS of the one-step errors along one quantity, before and after."""
     if place is None:
         ax.text(0.5, 0.5, "no place is known", ha="center", va="center", transform=ax.transAxes)
@@ -143,32 +143,33 @@ def _where(ax: Any, place: Place | None, found: Diagnosis) -> None:
 
 
 def _ranking(ax: Any, rounds: Mapping[int, Sequence[_pictures.Bar]]) -> None:
-    """Draw the evidence for each candidate as bars, round below round."""
+    """Draw the net gain of each candidate as bars, round below round."""
     labels, row, drawn = [], 0, set()
-    top = max((bar.evidence for bars in rounds.values() for bar in bars), default=0.0)
+    top = max((bar.net_gain for bars in rounds.values() for bar in bars), default=0.0)
     for number, bars in rounds.items():
         ax.text(0.0, row, f" round {number}", ha="left", va="center", style="italic",
                 fontsize="small", transform=ax.get_yaxis_transform())  # fmt: skip
         labels.append("")
         row += 1
         for bar in bars:
-            ax.barh(row, bar.evidence, 0.72, linewidth=0.7, **FILLS[bar.kind],
+            ax.barh(row, bar.net_gain, 0.72, linewidth=0.7, **FILLS[bar.kind],
                     label=None if bar.kind in drawn else bar.kind)  # fmt: skip
-            ax.annotate(f"{bar.evidence:.0f}", (max(bar.evidence, 0.0), row), (3, 0), va="center",
+            ax.annotate(f"{bar.net_gain:.0f}", (max(bar.net_gain, 0.0), row), (3, 0), va="center",
                         textcoords="offset points", fontsize="x-small")  # fmt: skip
             drawn.add(bar.kind)
             labels.append(bar.label)
             row += 1
     if not rounds:
         ax.text(0.5, 0.5, "no candidate was tried", ha="center", transform=ax.transAxes)
-    ax.axvline(GATE, color="k", linewidth=1, linestyle="--", label="strong")
+    gate = THRESHOLD.gate
+    ax.axvline(gate, color="k", linewidth=1, linestyle="--", label="earns a place")
     ax.axvline(0, color="0.3", linewidth=0.8)
-    ax.set_xscale("symlog", linthresh=GATE)
+    ax.set_xscale("symlog", linthresh=2 * gate)
     ax.xaxis.set_major_formatter("{x:g}")
-    ax.set_xlim(_pictures.LEAST, 3 * max(top, 2 * GATE))
+    ax.set_xlim(_pictures.LEAST, 3 * max(top, 2 * gate))
     ax.set_yticks(range(row), labels, fontsize="small")
     ax.tick_params(axis="y", length=0)
     ax.set_ylim(row - 0.4, -0.6)
-    ax.set_xlabel("gain by the Bayesian criterion (BIC), twice the evidence less the penalty [1]")
+    ax.set_xlabel("net gain: evidence less the Bayesian penalty (BIC) [log-likelihood]")
     finish(ax, columns=5, size="small")
     ax.grid(False, axis="y")

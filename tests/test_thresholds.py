@@ -1,0 +1,116 @@
+"""One place for every number that decides a name: its table, its reasons, and what uses it."""
+
+import ast
+import re
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+
+from ctrlid.diagnosis.thresholds import KINDS, THRESHOLD, Thresholds, value, varied
+
+ROOT = Path(__file__).resolve().parents[1]
+FILES = sorted(
+    path for path in (ROOT / "ctrlid" / "diagnosis").glob("*.py") if path.stem != "thresholds"
+)
+LAYOUT = {"wording", "report_text", "saving", "several_records"}  # columns and digits of texts
+PLAIN = {0, 1, 2, 0.5}
+# Coefficients of published formulas, and numbers that belong to nobody's judgement.
+FORMULAS = {
+    ("noise_tests", "_deviates_of_force"),  # D'Agostino; Anscombe and Glynn
+    ("noise_tests", "_test_tails"),  # kurtosis of a Gaussian, and its variance 24 / n
+    ("noise_tests", "_test_bins"),  # fourth moment
+    ("gap", "draw_noise"),  # three streams of random numbers
+    ("verdict", "write_conclusion"),  # per cent
+}
+CONSTANTS = {("procedure", "PROGRESS"), ("records", "ROUNDING"), ("replicas", "SEEDS")}
+
+
+def numbers_in(source, stem):
+    """Numbers of a file that stand outside the table, as (place, number)."""
+    tree = ast.parse(source)
+    found = []
+    for node in tree.body:
+        targets = [t.id for t in getattr(node, "targets", ()) if isinstance(t, ast.Name)]
+        name = getattr(node, "name", "") or (targets[0] if targets else "")
+        if (stem, name) in FORMULAS | CONSTANTS:
+            continue
+        inside = {getattr(n, "name", "") for n in ast.walk(node)}
+        if any((stem, n) in FORMULAS for n in inside):
+            continue
+        # The column of a table of signals and the formats of texts are no judgement.
+        indexed = {id(n.slice) for n in ast.walk(node) if isinstance(n, ast.Subscript)}
+        texts = {id(c) for n in ast.walk(node) if isinstance(n, ast.JoinedStr) for c in ast.walk(n)}
+        for n in ast.walk(node):
+            if isinstance(n, ast.Constant) and type(n.value) in (int, float):
+                plain = abs(n.value) in PLAIN and not name.isupper()
+                if not plain and id(n) not in indexed | texts:
+                    found.append((name, n.value))
+    return found
+
+
+@pytest.mark.parametrize("path", [p for p in FILES if p.stem not in LAYOUT], ids=lambda p: p.stem)
+def test_no_number_stands_outside_the_table(path):
+    if path.stem in ("scans", "fitted_model"):
+        pytest.skip("what effects own moves to them")
+    assert numbers_in(path.read_text("utf-8"), path.stem) == []
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["NEARLY = 0.7  # of the best", "def f(gain):\n    return gain > 3.7", "LIMITS = (0.9, 0.8)",
+     "MANY = 2", "def f(fit, rounds=14):\n    return fit"],
+)  # fmt: skip
+def test_a_number_outside_the_table_is_found(line):
+    assert numbers_in(line, "growth")
+
+
+def test_every_number_has_one_kind_a_reason_and_a_unit():
+    for t in THRESHOLD.table():
+        assert t.kind in KINDS
+        assert len(t.reason.split()) >= 3, t.name
+        assert not re.search(rf"(?<![\w.]){re.escape(str(t.value))}(?![\w.])", t.reason), t.name
+        assert t.unit or "chance" in t.reason or "probability" in t.reason or t.kind == "cost"
+    laws = [t for t in THRESHOLD.table() if t.kind == "law"]
+    assert laws
+    assert THRESHOLD.gate == 5.0
+
+
+def test_a_number_without_a_reason_or_with_two_is_refused():
+    with pytest.raises(ValueError, match="exactly one reason, given none"):
+        value(1.0)
+    with pytest.raises(ValueError, match="given law and study"):
+        value(1.0, law="so it is", study="and so it was chosen")
+
+
+def test_every_number_is_used():
+    text = "\n".join(
+        path.read_text("utf-8") for folder in ("diagnosis", "reporting")
+        for path in (ROOT / "ctrlid" / folder).rglob("*.py") if path.stem != "thresholds"
+    )  # fmt: skip
+    unused = [f.name for f in fields(Thresholds)
+              if not re.search(rf"THRESHOLD\.{f.name}\b", text)]  # fmt: skip
+    assert unused == []
+
+
+def test_numbers_are_varied_within_a_block_and_come_back():
+    known = THRESHOLD.gate
+    with varied(gate=7.0, look_back=0.5):
+        assert (THRESHOLD.gate, THRESHOLD.look_back) == (7.0, 0.5)
+    assert THRESHOLD.gate == known
+
+    def fail():
+        with varied(gate=9.0):
+            assert THRESHOLD.gate == 9.0
+            raise RuntimeError("stopped")
+
+    with pytest.raises(RuntimeError, match="stopped"):
+        fail()
+    assert THRESHOLD.gate == known
+    with pytest.raises(AttributeError, match="no_such"), varied(no_such=1.0):
+        pass
+
+
+def test_the_theory_page_prints_this_table():
+    page = (ROOT / "docs" / "theory" / "diagnosis.rst").read_text("utf-8")
+    assert ".. thresholds::" in page
