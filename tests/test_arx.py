@@ -77,7 +77,7 @@ def binary(n, step, seed):
     return np.repeat(levels, hold)[:n]
 
 
-def levitation(step, n=4000, seed=0, sensor_noise=0.0, offset=(0.0, 0.0)):
+def sampled_levitation(step, n=4000, seed=0, sensor_noise=0.0, offset=(0.0, 0.0)):
     """Record of a maglev under a digital lead; a random binary reference."""
     theta = maglev(step)
     lead = place(np.r_[1.0, theta[:2]], theta[2:], np.exp(-1.2 * step))
@@ -121,7 +121,7 @@ def matrix(record, na=2, nb=2, intercept=True):
     ids=["free", "reciprocal", "zoh"],
 )
 def test_recovers_the_plant_exactly_without_noise(step, offset, constraints):
-    theta, record = levitation(step, offset=offset)
+    theta, record = sampled_levitation(step, offset=offset)
     estimate = fit_arx(record, na=2, nb=2, constraints=constraints).estimate
     np.testing.assert_allclose(estimate.values, theta, rtol=1e-8)
     p = step / DT
@@ -175,7 +175,7 @@ def test_recovers_a_reciprocal_pair_among_three_poles(step):
 
 def test_condition_number_is_small_at_every_sampling_period():
     conditions = [
-        fit_arx(levitation(step)[1], na=2, nb=2).estimate.condition
+        fit_arx(sampled_levitation(step)[1], na=2, nb=2).estimate.condition
         for step in (0.5, 0.22, 0.044, 0.005)
     ]
     assert max(conditions) < 10
@@ -184,7 +184,7 @@ def test_condition_number_is_small_at_every_sampling_period():
 @settings(max_examples=20, deadline=None)
 @given(y=st.sampled_from([1e-6, 1e-4, 1e-2, 1e3]), u=st.sampled_from([1e-5, 1.0, 1e4]))
 def test_units_change_nothing_but_units(y, u):
-    _, record = levitation(0.1, n=600, sensor_noise=0.02)
+    _, record = sampled_levitation(0.1, n=600, sensor_noise=0.02)
     scaled = replace(record, y=record.y * y, u=record.u * u, r=None)
     constraints = [ReciprocalPoles(), Bounds("b1", upper=0.0)]
     one = fit_arx(record, na=2, nb=2, constraints=constraints).estimate
@@ -214,7 +214,7 @@ def test_delay_and_direct_feedthrough():
 
 @pytest.mark.parametrize("step", [0.5, 0.1, 0.044])
 def test_least_squares_agrees_with_lstsq(step):
-    _, record = levitation(step, sensor_noise=0.1)
+    _, record = sampled_levitation(step, sensor_noise=0.1)
     estimate = fit_arx(record, na=2, nb=2).estimate
     a, b = matrix(record)
     wanted, rss, _, _ = np.linalg.lstsq(a, b, rcond=None)
@@ -227,7 +227,7 @@ def test_least_squares_agrees_with_lstsq(step):
 
 
 def test_equalities_agree_with_direct_elimination():
-    _, record = levitation(0.22, sensor_noise=0.1)
+    _, record = sampled_levitation(0.22, sensor_noise=0.1)
     estimate = fit_arx(
         record, na=2, nb=2, constraints=[Fixed("a2", 1.0), Equal("b1", "b2")]
     ).estimate
@@ -281,7 +281,7 @@ def test_the_cheaper_branch_wins():
 
 
 def test_active_bound_is_exact_and_in_capitals():
-    _, record = levitation(0.044, sensor_noise=0.1)
+    _, record = sampled_levitation(0.044, sensor_noise=0.1)
     plain = fit_arx(record, na=2, nb=2)
     assert np.all(np.abs(plain.estimate.poles) < 1)
     assert "no pole outside the unit circle: the model is stable" in str(plain)
@@ -317,7 +317,7 @@ def test_active_bound_is_exact_and_in_capitals():
     ],
 )
 def test_nonlinear_agrees_with_linear_where_it_is_linear(constraint, linear):
-    _, record = levitation(0.22, sensor_noise=0.1)
+    _, record = sampled_levitation(0.22, sensor_noise=0.1)
     one = fit_arx(record, 2, 2, constraints=[constraint]).estimate
     other = fit_arx(record, 2, 2, constraints=[linear]).estimate
     np.testing.assert_allclose(one.values, other.values, rtol=1e-6, atol=1e-9)
@@ -327,7 +327,7 @@ def test_nonlinear_agrees_with_linear_where_it_is_linear(constraint, linear):
 
 def test_nonlinear_curved_constraint_is_optimal():
     """On the circle a1^2 + a2^2 = c the gradient of the cost is radial."""
-    _, record = levitation(0.22, sensor_noise=0.1)
+    _, record = sampled_levitation(0.22, sensor_noise=0.1)
     radius2 = 4.9
     known = Nonlinear(equality=lambda t: t[0] ** 2 + t[1] ** 2 - radius2)
     estimate = fit_arx(record, 2, 2, constraints=[known]).estimate
@@ -355,7 +355,7 @@ def test_a_constraint_of_ones_own():
         def branches(self, structure):
             return [Branch([equals({"b1": 1.0, "b2": -2.0}, 0.0)], label="half")]
 
-    _, record = levitation(0.22)
+    _, record = sampled_levitation(0.22)
     estimate = fit_arx(record, 2, 2, constraints=[HalfGain()]).estimate
     assert estimate["b1"] == 2 * estimate["b2"]
     assert estimate.branch == "half"
@@ -380,7 +380,7 @@ def test_known_facts_hold_in_the_model():
 
 
 def test_invalid_samples_leave_no_trace():
-    _, record = levitation(0.1, n=1500, sensor_noise=0.05)
+    _, record = sampled_levitation(0.1, n=1500, sensor_noise=0.05)
     y, u = record.y.copy(), record.u.copy()
     valid = np.ones(len(y), dtype=bool)
     for hole in (slice(100, 130), slice(700, 701), slice(1490, 1500)):
@@ -397,8 +397,8 @@ def test_invalid_samples_leave_no_trace():
 
 
 def test_several_records_share_coefficients_but_not_intercepts():
-    theta, one = levitation(0.1, n=900, offset=(5.0, 2.0))
-    _, two = levitation(0.1, n=700, seed=7, offset=(-3.0, 40.0))
+    theta, one = sampled_levitation(0.1, n=900, offset=(5.0, 2.0))
+    _, two = sampled_levitation(0.1, n=700, seed=7, offset=(-3.0, 40.0))
     estimate = fit_arx([one, two], 2, 2).estimate
     np.testing.assert_allclose(estimate.values, theta, rtol=1e-8)
     # c = A(1) y0 - B(1) u0
@@ -411,17 +411,17 @@ def test_several_records_share_coefficients_but_not_intercepts():
 
 
 def test_without_intercept():
-    theta, record = levitation(0.22)
+    theta, record = sampled_levitation(0.22)
     estimate = fit_arx(record, 2, 2, intercept=False).estimate
     np.testing.assert_allclose(estimate.values, theta, rtol=1e-9)
     assert estimate.intercepts.shape == (0,)
-    _, biased = levitation(0.22, offset=(1.0, 0.0))
+    _, biased = sampled_levitation(0.22, offset=(1.0, 0.0))
     wrong = fit_arx(biased, 2, 2, intercept=False).estimate
     assert np.max(np.abs(wrong.values / theta - 1)) > 1e-3
 
 
 def test_names_come_from_the_record():
-    _, record = levitation(0.22)
+    _, record = sampled_levitation(0.22)
     model = fit_arx(record, 2, 2)
     assert (model.input_labels, model.output_labels) == (["u"], ["y"])
     model = fit_arx(replace(record, names={"u": "V", "y": "gap"}), 2, 2)
@@ -499,16 +499,16 @@ def test_pole_errors_follow_from_coefficients():
     ],
 )
 def test_bad_orders_are_refused(orders, words):
-    _, record = levitation(0.22, n=50)
+    _, record = sampled_levitation(0.22, n=50)
     with pytest.raises(CtrlidError, match=words):
         fit_arx(record, *orders)
 
 
 def test_too_few_samples_are_refused():
-    _, record = levitation(0.22, n=7)
+    _, record = sampled_levitation(0.22, n=7)
     with pytest.raises(CtrlidError, match="Too few samples: 5 usable rows for 5 unknowns"):
         fit_arx(record, 2, 2)
-    _, short = levitation(0.22, n=3)
+    _, short = sampled_levitation(0.22, n=3)
     with pytest.raises(CtrlidError, match="Record 2 of 2 has no usable row"):
         fit_arx([record, short], 2, 3)
     nothing = replace(record, valid=np.zeros(7, dtype=bool))
@@ -517,7 +517,7 @@ def test_too_few_samples_are_refused():
 
 
 def test_different_sampling_periods_are_refused():
-    _, record = levitation(0.22, n=100)
+    _, record = sampled_levitation(0.22, n=100)
     with pytest.raises(CtrlidError, match="need one sampling period"):
         fit_arx([record, replace(record, dt=0.002)], 2, 2)
 
@@ -532,7 +532,7 @@ def test_different_sampling_periods_are_refused():
     ids=["u", "y", "static feedback"],
 )
 def test_what_is_not_excited_is_named(u, y, words):
-    _, record = levitation(0.22, n=500, sensor_noise=0.1)
+    _, record = sampled_levitation(0.22, n=500, sensor_noise=0.1)
     still = replace(record, u=u(record.u, record.y), y=y(record.u, record.y), r=None)
     with pytest.raises(CtrlidError, match=words) as refusal:
         fit_arx(still, 2, 2)
@@ -541,7 +541,7 @@ def test_what_is_not_excited_is_named(u, y, words):
 
 
 def test_orders_beyond_the_plant_are_not_excited_without_noise():
-    _, record = levitation(0.22)
+    _, record = sampled_levitation(0.22)
     with pytest.raises(CtrlidError, match="orders are higher than the plant's"):
         fit_arx(record, 3, 3)
 
@@ -559,13 +559,13 @@ def test_orders_beyond_the_plant_are_not_excited_without_noise():
     ],
 )
 def test_unusable_constraints_are_refused_by_name(constraints, words):
-    _, record = levitation(0.22, n=200)
+    _, record = sampled_levitation(0.22, n=200)
     with pytest.raises(CtrlidError, match=words):
         fit_arx(record, 2, 2, constraints=constraints)
 
 
 def test_a_constraint_can_stand_in_for_excitation():
-    _, record = levitation(0.22, n=500, sensor_noise=0.1)
+    _, record = sampled_levitation(0.22, n=500, sensor_noise=0.1)
     still = replace(record, u=np.full(500, 3.3), r=None)
     estimate = fit_arx(still, 2, 2, constraints=[Fixed("b1", 0.0), Fixed("b2", 0.0)]).estimate
     assert estimate["b1"] == estimate["b2"] == 0.0

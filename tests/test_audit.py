@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import ctrlid as cid
+import problems
 from ctrlid import CtrlidError
 from ctrlid.validation import signal_defects as defects
 
@@ -21,12 +22,9 @@ def reference(rng, n, amplitude, around):
         hold = int(rng.integers(n // 20, n // 6))
         return around + amplitude * np.repeat(rng.uniform(-1, 1, n // hold + 1), hold)[:n]
     if kind == "prbs":
-        period = np.repeat(rng.choice([-1.0, 1.0], 127), int(rng.integers(1, 9)))
-        return around + amplitude * np.tile(period, n)[:n]
+        return around + amplitude * problems.repeated_bits(rng, n)
     if kind == "multisine":
-        waves = [np.sin(2 * np.pi * (f * np.arange(n) + rng.uniform()))
-                 for f in rng.uniform(1 / 400, 0.1, 12)]  # fmt: skip
-        return around + amplitude * sum(waves) / 5
+        return around + amplitude * problems.twelve_waves(rng, n)
     return around + amplitude * np.repeat(rng.standard_normal(n), 5)[:n]
 
 
@@ -35,34 +33,22 @@ def random_loop(rng):
     plant = rng.choice(["maglev", "servo", "tank", "lag"])
     digital = bool(rng.random() < 0.6)
     if plant == "maglev":
-        x0 = rng.uniform(0.008, 0.02)
-        P = cid.plants.maglev(m=rng.uniform(0.01, 0.1), K=10 ** rng.uniform(-6, -4))
-        op = cid.operating_point(P, output=x0)
-        L = cid.linearize(P, op)
-        p = float(np.max(np.abs(L.poles())))
-        dt = float(f"{10 ** rng.uniform(-2, -1.3) / p:.3g}")
-        C = cid.design_lead(L, crossover=2.5 * p, phase_margin=45)
-        C = ct.sample_system(ct.ss(C), dt, "tustin") if digital else C
-        return cid.Loop(P, C, dt=dt, at=op), x0 * 10 ** rng.uniform(-2.5, -1.9)
+        loop, gap = problems.random_levitation(rng, digital)
+        return loop, gap * 10 ** rng.uniform(-2.5, -1.9)
     if plant == "servo":
-        m, w = 10 ** rng.uniform(-1, 1), 10 ** rng.uniform(0, 1.5)
-        P = cid.plants.servo(m=m, c=m * w * rng.uniform(0.2, 3), k=m * w**2)
+        P, m, w = problems.random_servo(rng)
         dt = float(f"{0.03 / w:.3g}")
         kp = m * w**2 * rng.uniform(0.5, 4)
         C = cid.PID(kp, ki=rng.choice([0, 0.3 * m * w**3]), kd=m * w, filter_time=3 * dt)
         C = C if digital else ct.tf([m * w**2], [1])
         return cid.Loop(P, C, dt=dt), 10 ** rng.uniform(-3, 1)
     if plant == "tank":
-        P = cid.plants.tank(area=rng.uniform(0.5, 2), outlet=0.02, k=0.05)
+        P = problems.random_tank(rng)
         level = rng.uniform(0.5, 2)
         C = cid.PID(rng.uniform(1, 5), ki=rng.choice([0, 0.01])) if digital else ct.tf([2.0], [1])
         op = cid.operating_point(P, output=level)
         return cid.Loop(P, C, dt=2.0, at=op), 0.03 * level
-    lag = 10 ** rng.uniform(-2, 2)
-    gain = rng.uniform(0.5, 4)
-    C = cid.PID(gain, ki=rng.uniform(0.1, 2) / lag) if digital else ct.tf([gain], [1])
-    at = cid.OperatingPoint((0.0,), 1.0, 3.0)
-    return cid.Loop(ct.tf([2.0], [lag, 1]), C, dt=0.05 * lag, at=at), 1.0
+    return problems.random_lag(rng, digital), 1.0
 
 
 def random_records(count, seed):
@@ -212,8 +198,7 @@ def test_a_channel_logged_late_or_early(healthy, lag, channel):
 
 @pytest.fixture
 def servo():
-    plant = cid.plants.servo(m=1.0, c=2.0, k=3.0)
-    loop = cid.Loop(plant, cid.PID(kp=20.0, kd=0.5), dt=0.01)
+    loop = problems.servo(cid.PID(kp=20.0, kd=0.5))
     return loop, cid.random_binary(4000, amplitude=0.1, hold=50, seed=1)
 
 
@@ -405,10 +390,7 @@ def test_measured_records(data_dir, name, kinds):
 
 
 def test_an_output_in_other_units_than_the_loop():
-    plant = cid.plants.maglev(m=0.0213, K=3.34e-6)
-    at = cid.operating_point(plant, output=0.012)
-    lead = cid.design_lead(cid.linearize(plant, at), crossover=100, phase_margin=50)
-    loop = cid.Loop(plant, lead.sample(2e-3, "tustin"), dt=2e-3, at=at)
+    loop = problems.levitation()
     r = cid.random_binary(1000, amplitude=2e-4, hold=50, around=0.012, seed=1)
     record = cid.simulate(loop, r, sensor_noise=1e-6, seed=2)
     assert not cid.audit(record, loop)["operating point"]
@@ -418,6 +400,6 @@ def test_an_output_in_other_units_than_the_loop():
         assert "times as large as where the loop rests, 0.012" in finding.text
         with pytest.raises(CtrlidError, match="other units than the plant counts in"):
             cid.diagnose(loop, wrong, progress=False)
-    servo = cid.Loop(cid.plants.servo(m=1.0, c=2.0, k=3.0), cid.PID(kp=5.0), dt=0.01)
+    servo = problems.servo(cid.PID(kp=5.0))
     far = cid.simulate(servo, 5.0 + cid.random_binary(1000, amplitude=0.1, hold=50, seed=3))
     assert not cid.audit(far, servo)["operating point"]  # which rests at zero: nobody knows

@@ -8,14 +8,14 @@ from scipy import stats
 import ctrlid as cid
 from ctrlid import plot
 from ctrlid.estimation.identified_model import Estimate, IdentifiedModel, Structure
+from problems import LINEAR_LEVITATION as PLANT
+from problems import legend, under_lead
 
 RARE = 1e-5  # chance at which a test of chance may fail a right program
-PLANT = ct.tf([-6.5], [1, 0, -1600])
 
 
-def loop(dt=0.005):
-    C = cid.design_lead(ct.sample_system(PLANT, dt), crossover=90, phase_margin=40)
-    return cid.Loop(PLANT, C, dt=dt)
+def loop():
+    return under_lead(PLANT, 0.005, crossover=90, phase_margin=40, sampled=True)
 
 
 def fitted(structure, values, covariance, dt):
@@ -105,7 +105,7 @@ def test_symmetric_poles_leave_no_doubt_about_the_phase():
 def test_bode_shades_the_band_of_a_fit():
     model = fitted(Structure(2, 2), [-2.04, 1.0, -0.3, -0.28], np.diag([1e-6, 0, 1e-4, 0]), 0.005)
     magnitude, phase = plot.bode({"fit": model, "physics": PLANT})
-    assert "fit: 95 % confidence" in [t.get_text() for t in magnitude.get_legend().get_texts()]
+    assert "fit: 95 % confidence" in legend(magnitude)
     assert (len(magnitude.collections), len(phase.collections)) == (1, 1)
     band = cid.response_band(model, magnitude.get_lines()[0].get_xdata(), 0.5)
     magnitude, _ = plot.bode({"fit": model}, level=0.5)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import ctrlid as cid
+from problems import levitation, record_of
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 BROWSER = next(filter(None, map(shutil.which, NAMES)), None)
@@ -66,14 +67,10 @@ def contrast(one, other):
 @pytest.fixture(scope="module")
 def page(tmp_path_factory):
     """A report with every kind of chapter and bad news in it."""
-    plant = cid.plants.maglev(m=0.0213, K=3.34e-6)
-    at = cid.operating_point(plant, output=0.012)
-    C = cid.design_lead(cid.linearize(plant, at), crossover=100, phase_margin=50)
-    loop = cid.Loop(plant, C.sample(0.002, "tustin"), dt=0.002, at=at)
-    r = cid.random_binary(2000, amplitude=1e-4, hold=20, around=at.output, seed=1)
-    record = cid.simulate(loop, r, sensor_noise=1e-5, seed=2)
+    loop = levitation(free=())
+    record = record_of(loop, swing=1e-4, hold=20, n=2000, seed=1, sensor_noise=1e-5)
     forced = cid.fit_arx(record, na=2, nb=2, constraints=[cid.Bounds("a1", -1.2, 0.0)])
-    outcome = cid.redesign(cid.linearize(plant, at), replace(loop, controller=None), 100, 50)
+    outcome = cid.redesign(loop.linearize(), replace(loop, controller=None), 100, 50)
     results = [record, forced, cid.compare(record, loop), outcome]
     return cid.write_report(results, tmp_path_factory.mktemp("page") / "report.html")
 

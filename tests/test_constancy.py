@@ -4,6 +4,7 @@ import control as ct
 import numpy as np
 
 import ctrlid as cid
+import problems
 from ctrlid import effects as E
 from ctrlid.diagnosis.constancy import find_bin_edges
 from ctrlid.diagnosis.noise_tests import run_noise_tests
@@ -12,8 +13,8 @@ from ctrlid.diagnosis.recalibration import fit_base_model
 OF_INNOVATIONS = ("whiteness", "independence of past signals", "heavy tails", "isolated events")
 
 
-def drive(rhythm=0.0):
-    """A servo whose gain may breathe at 0.15 Hz; the model has a gain that does not."""
+def breathing(rhythm=0.0):
+    """A drive whose gain may breathe at 0.15 Hz; the model has a gain that does not."""
 
     def rates(t, x, u, p):
         gain = 30.0 * (1 + rhythm * np.sin(0.3 * np.pi * t)) if rhythm else p["k"]
@@ -21,14 +22,11 @@ def drive(rhythm=0.0):
 
     plant = ct.nlsys(rates, lambda t, x, u, p: x[0], inputs=["u"], outputs=["y"],
                      states=["x", "v"], params={"k": 30.0}, name="drive")  # fmt: skip
-    C = cid.PID(kp=6.0, ki=4.0, kd=0.4, filter_time=0.02)
-    at = cid.OperatingPoint((0.0, 0.0), 0.0, 0.0)
-    return cid.Loop(plant, C, dt=0.01, at=at, free=("k",))
+    return problems.drive(("k",), plant)
 
 
-def record_of(loop, seed, n=6000, noise=1e-4):
-    r = cid.random_binary(n, amplitude=0.3, hold=60, seed=seed)
-    return cid.simulate(loop, r, sensor_noise=noise, seed=seed + 1)
+def record_of(loop, seed):
+    return problems.record_of(loop, swing=0.3, hold=60, n=6000, seed=seed, sensor_noise=1e-4)
 
 
 def seen_in(loop, record):
@@ -36,7 +34,7 @@ def seen_in(loop, record):
 
 
 def test_nothing_is_seen_where_a_parameter_is_one_number():
-    loop = drive()
+    loop = breathing()
     found = [seen_in(loop, record_of(loop, seed)) for seed in range(9700, 9716)]
     names = [k for k in found[0] if k.startswith("constancy of k over ") or k == "rhythm of k"]
     assert len(names) == 7  # time, input, its change, position, velocity, reference; a rhythm
@@ -48,14 +46,14 @@ def test_nothing_is_seen_where_a_parameter_is_one_number():
 
 
 def test_a_rhythm_of_a_parameter_shows_where_the_innovations_look_like_noise():
-    record = record_of(drive(rhythm=0.0007), 9720)
-    p = seen_in(drive(), record)
+    record = record_of(breathing(rhythm=0.0007), 9720)
+    p = seen_in(breathing(), record)
     assert p["rhythm of k"] < 1e-8
     assert min(p[k] for k in OF_INNOVATIONS) > 1e-5
 
 
 def test_a_force_law_that_is_only_nearly_right_shows_in_its_parameter():
-    loop = drive()
+    loop = breathing()
     real = loop.with_effect(E.CubicStiffness(300.0))
     record = record_of(real, 9730)
     named = loop.with_effect(E.LinearStiffness(20.0))
@@ -65,7 +63,7 @@ def test_a_force_law_that_is_only_nearly_right_shows_in_its_parameter():
 
 
 def test_a_diagnosis_is_not_clean_where_a_gain_breathes():
-    found = cid.diagnose(drive(), record_of(drive(rhythm=0.03), 9740), progress=False,
+    found = cid.diagnose(breathing(), record_of(breathing(rhythm=0.03), 9740), progress=False,
                          catalogue=[E.CoulombFriction, E.ActuatorLag])  # fmt: skip
     assert found.verdict == "unknown"
     assert "rhythm of k" in str(found)

@@ -13,6 +13,7 @@ from ctrlid import __main__ as command
 from ctrlid import effects as E
 from ctrlid.reporting.cli import arguments as _spoken
 from ctrlid.reporting.cli import diagnose_command as _command
+from problems import servo
 
 DT = 0.01
 SERVO = ("--model", "servo", "--param", "m=1", "c=2", "k=3")
@@ -22,7 +23,7 @@ COLUMNS = ("--columns", "r=ref,u=volt,y=angle")
 @pytest.fixture(scope="module")
 def record():
     """A servo with a drag that its model lacks."""
-    loop = cid.Loop(cid.plants.servo(m=1.0, c=2.0, k=3.0), cid.PID(kp=20.0, kd=1.0), dt=DT)
+    loop = servo(cid.PID(kp=20.0, kd=1.0), dt=DT)
     r = cid.random_binary(2000, amplitude=0.1, hold=50, seed=3)
     real = loop.with_effect(E.QuadraticDrag(c2=3.0))
     return cid.simulate(real, r, sensor_noise=1e-4, seed=2)

@@ -6,13 +6,13 @@ outside the catalogue; refusals.
 
 from dataclasses import dataclass, replace
 
-import control as ct
 import numpy as np
 import pytest
 
 import ctrlid as cid
 from ctrlid import CtrlidError
 from ctrlid import effects as E
+from problems import astray, beam, drive, levitation, record_of, walk
 
 N = 4000
 SOME = (
@@ -23,54 +23,8 @@ FEW = (E.ViscousFriction, E.CoulombFriction, E.LinearStiffness, E.SensorNonlinea
        E.InputDelay, E.EddyCurrentDamping)  # fmt: skip
 
 
-def levitation(analog=False, dt=2e-3, free=("K",)):
-    plant = cid.plants.maglev(m=0.0213, K=3.34e-6)
-    op = cid.operating_point(plant, output=0.012)
-    C = cid.design_lead(cid.linearize(plant, op), crossover=100, phase_margin=50)
-    return cid.Loop(plant, C if analog else C.sample(dt, "tustin"), dt=dt, at=op, free=free)
-
-
-def drive():
-    plant = cid.plants.servo(m=2.0, c=5.0, k=30.0)
-    C = cid.PID(kp=6.0, ki=4.0, kd=0.4, filter_time=0.02)
-    at = cid.OperatingPoint((0.0, 0.0), 0.0, 0.0)
-    return cid.Loop(plant, C, dt=0.01, at=at, free=("c", "k"))
-
-
-def beam(controller=True):
-    """A plant as a user writes it: a mass on a spring, one of its states an angle."""
-
-    def update(t, x, u, params):
-        angle, rate = x
-        return np.array([rate, params["k"] * u[0] - params["s"] * np.sin(angle)
-                         - params["d"] * rate])  # fmt: skip
-
-    plant = ct.nlsys(
-        update, lambda t, x, u, params: x[0], name="beam", inputs=["M"], outputs=["angle"],
-        states=["angle", "rate"], params={"k": 20.0, "s": 100.0, "d": 3.0},
-    )  # fmt: skip
-    at = cid.operating_point(plant, output=0.1)
-    C = cid.PID(kp=8.0, ki=20.0, kd=0.6, bias=at.input, filter_time=0.01) if controller else None
-    return cid.Loop(plant, C, dt=0.01, at=at, free=("k", "s"))
-
-
-def walk(n, levels, seed, hold=400):
-    """Set-points visited one after the other, reached by short ramps."""
-    rng = np.random.default_rng(seed)
-    steps = np.repeat(rng.uniform(-levels, levels, -(-n // hold)), hold)[:n]
-    return np.convolve(np.pad(steps, (20, 0), mode="edge"), np.ones(21) / 21, "valid")
-
-
-def experiment(loop, seed, swing, levels=0.0, n=N, hold=20, **noise):
-    r = cid.random_binary(n, amplitude=swing, hold=hold, around=loop.point.output, seed=seed)
-    r = r + walk(n, levels, seed + 1) if levels else r
-    return cid.simulate(loop, r, seed=seed + 2, **noise)
-
-
-def astray(loop, seed):
-    rng = np.random.default_rng(seed)
-    known = loop.parameters
-    return loop.with_parameters({k: known[k] * (1 + rng.uniform(-0.1, 0.1)) for k in loop.free})
+def experiment(loop, seed, swing, n=4000, hold=20, **options):
+    return record_of(loop, swing=swing, hold=hold, n=n, seed=seed, noise_seed=seed + 2, **options)
 
 
 def diagnose(loop, record, seed=0, **options):
@@ -156,7 +110,7 @@ def test_two_effects():
 
 @pytest.mark.parametrize(("analog", "seed"), [(False, 7600), (True, 7610)])
 def test_nothing_is_missing(analog, seed):
-    loop = levitation(analog)
+    loop = levitation(analog=analog)
     record = experiment(loop, seed, 1e-4, levels=5e-4, sensor_noise=2e-6, force_noise=0.02)
     kept = {k: getattr(record, k).copy() for k in ("r", "u", "y", "valid")}
     # An analog circuit leaves no room for a delay or a play: those are not candidates.

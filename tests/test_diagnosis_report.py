@@ -23,6 +23,7 @@ from ctrlid.diagnosis.thresholds import THRESHOLD
 from ctrlid.diagnosis.verdict import gap_stands_out
 from ctrlid.loop.simulation import Simulator
 from ctrlid.reporting import pictures as _pictures
+from problems import drive, legend, levitation, record_of, servo
 
 DT, N = 0.002, 3000
 VERDICTS = ("nothing missing", "explained", "partly explained", "unknown")
@@ -39,14 +40,10 @@ SENTENCES = {
 @pytest.fixture(scope="module")
 def experiment():
     """The loop, the record of one with friction, and simulations without and with it."""
-    plant = cid.plants.maglev(m=0.0213, K=3.34e-6)
-    op = cid.operating_point(plant, output=0.012)
-    C = cid.design_lead(cid.linearize(plant, op), crossover=100, phase_margin=50)
-    loop = cid.Loop(plant, C.sample(DT, "tustin"), dt=DT, at=op, free=("K",))
+    loop = levitation(dt=DT)
     true = loop.with_effect(E.CoulombFriction(fc=0.4))
-    r = cid.random_binary(N, amplitude=3e-4, hold=100, around=op.output, seed=1)
-    record = cid.simulate(true, r, sensor_noise=1e-5, force_noise=0.03, seed=2)
-    return loop, record, cid.simulate(loop, r), cid.simulate(true, r)
+    record = record_of(true, swing=3e-4, hold=100, n=N, seed=1, sensor_noise=1e-5, force_noise=0.03)
+    return loop, record, cid.simulate(loop, record.r), cid.simulate(true, record.r)
 
 
 def rms(error):
@@ -309,9 +306,8 @@ def test_a_loop_without_its_plant_says_what_to_do(found, tmp_path):
 
 def test_a_loop_that_does_not_fit_is_refused(found, tmp_path):
     path = found["explained"].save(tmp_path / "f.json")
-    servo = cid.Loop(cid.plants.servo(m=1.0, c=2.0, k=3.0), dt=DT)
     with pytest.raises(cid.CtrlidError, match=r"of the plant 'maglev'; the loop given has 'servo'"):
-        load_diagnosis(path, loop=servo)
+        load_diagnosis(path, loop=servo())
     with pytest.raises(cid.CtrlidError, match=r"loop= needs the Loop .* given int"):
         load_diagnosis(path, loop=3)
 
@@ -353,10 +349,6 @@ def test_what_is_no_text_is_left_out_and_said(found, tmp_path):
     path = odd.save(tmp_path / "f.json")
     assert json.loads(path.read_text("utf-8"))["left out of extra"] == ["plant"]
     assert load_diagnosis(path).extra == {"n": 3}
-
-
-def legend(ax):
-    return [entry.get_text() for entry in ax.get_legend().get_texts()]
 
 
 def test_picture_of_an_explanation(found):
@@ -489,15 +481,12 @@ def test_a_gap_where_only_the_given_model_can_be_simulated():
 
 def test_a_window_far_from_rest_finds_its_start():
     """In a stretch that begins far away, the operating point is no place to begin from."""
-    plant = cid.plants.maglev(m=0.0213, K=3.34e-6)
-    op = cid.operating_point(plant, output=0.013)
-    C = cid.design_lead(cid.linearize(plant, op), crossover=100, phase_margin=50)
-    loop = cid.Loop(plant, C.sample(DT, "tustin"), dt=DT, at=op, input_limits=(0.0, 4.5))
-    r = np.linspace(op.output, 0.006, 4000) + cid.random_binary(
+    loop = levitation(dt=DT, gap=0.013, free=(), input_limits=(0.0, 4.5))
+    r = np.linspace(loop.at.output, 0.006, 4000) + cid.random_binary(
         4000, amplitude=1e-4, hold=50, seed=1
     )
     record = cid.simulate(loop, r, sensor_noise=2e-6, seed=2)[3500:]
-    assert abs(record.y[0] - op.output) > 4e-3
+    assert abs(record.y[0] - loop.at.output) > 4e-3
     window = gap_of.make_window(record)
     error = gap_of.root_mean_square(
         [window], [gap_of.simulate_window(loop, window, "closed-loop simulation")]
@@ -507,9 +496,7 @@ def test_a_window_far_from_rest_finds_its_start():
 
 def test_an_unknown_force_is_not_paid_for_by_an_absurd_start():
     """Behind a lag, a huge input that dies at once could stand for a kick, and did: 700 V."""
-    plant = cid.plants.servo(m=1.0, c=4.0, k=1.0)
-    at = cid.OperatingPoint(states=(0.0, 0.0), input=0.0, output=0.0)
-    loop = cid.Loop(plant, cid.PID(kp=20.0, kd=3.0), dt=0.01, at=at)
+    loop = drive((), cid.plants.servo(m=1.0, c=4.0, k=1.0), cid.PID(kp=20.0, kd=3.0))
     loop = loop.with_effect(E.ActuatorLag(0.006))
     r = cid.random_binary(600, amplitude=0.03, hold=60, seed=3)
     force = 0.6 * np.sin(np.arange(600) / 40)
@@ -525,12 +512,10 @@ def test_an_unknown_force_is_not_paid_for_by_an_absurd_start():
 
 def test_noise_that_parts_a_loop_from_itself_explains_a_gap():
     """A drive that rests in one hollow of its ripple or in the next, as noise will have it."""
-    plant = cid.plants.servo(m=1.0, c=4.0, k=1.0)
-    at = cid.OperatingPoint(states=(0.0, 0.0), input=0.0, output=0.0)
-    calm = cid.Loop(plant, cid.PID(kp=20.0, kd=3.0), dt=0.01, at=at, free=("k",))
+    calm = drive(("k",), cid.plants.servo(m=1.0, c=4.0, k=1.0), cid.PID(kp=20.0, kd=3.0))
     rough = calm.with_effect(E.PositionRipple(amplitude=0.25, period=0.01, phase=0.0))
-    r = cid.random_binary(3000, amplitude=0.03, hold=90, seed=3)
-    record = cid.simulate(rough, r, sensor_noise=1e-4, force_noise=0.005, seed=4)
+    record = record_of(rough, swing=0.03, hold=90, n=3000, seed=3, sensor_noise=1e-4,
+                       force_noise=0.005)  # fmt: skip
     windows, fitted = [gap_of.make_window(record)], fit_base_model(rough, [record], ("k",)).fit
     kind = "closed-loop simulation"
     floors = [

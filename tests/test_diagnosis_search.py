@@ -11,6 +11,7 @@ import pytest
 from scipy import signal, stats
 
 import ctrlid as cid
+import problems
 from ctrlid import effects as E
 from ctrlid.diagnosis import removal, replicas, selection
 from ctrlid.diagnosis.candidates import _has_effect, contains
@@ -36,25 +37,12 @@ from ctrlid.estimation.likelihood.maximization import begin_fit, maximize
 from ctrlid.estimation.likelihood.physics_fit import choose_noise, make_problem, start_values
 from ctrlid.estimation.likelihood.sampled_plant import sampled_plant_for
 from ctrlid.loop.simulation import Simulator
-
-
-def levitation():
-    plant = cid.plants.maglev(m=0.0213, K=3.34e-6)
-    op = cid.operating_point(plant, output=0.012)
-    C = cid.design_lead(cid.linearize(plant, op), crossover=100, phase_margin=50)
-    return cid.Loop(plant, C.sample(2e-3, "tustin"), dt=2e-3, at=op, free=("K",))
-
-
-def drive():
-    plant = cid.plants.servo(m=2.0, c=5.0, k=30.0)
-    C = cid.PID(kp=6.0, ki=4.0, kd=0.4, filter_time=0.02)
-    at = cid.OperatingPoint((0.0, 0.0), 0.0, 0.0)
-    return cid.Loop(plant, C, dt=0.01, at=at, free=("c", "k"))
+from problems import drive, levitation, pendulum, tanks, under_lead
 
 
 def record_of(loop, effect, swing, noise, seed, n=3000):
-    r = cid.random_binary(n, amplitude=swing, hold=60, around=loop.point.output, seed=seed)
-    return cid.simulate(loop.with_effect(effect), r, sensor_noise=noise, seed=seed + 1)
+    real = loop.with_effect(effect)
+    return problems.record_of(real, swing=swing, hold=60, n=n, seed=seed, sensor_noise=noise)
 
 
 def test_a_small_zone_is_found_from_a_large_start():
@@ -264,15 +252,10 @@ def test_no_experiment_is_recommended_where_none_tells():
 
 def test_an_experiment_under_which_the_plant_falls_is_not_recommended():
     """Behind limits of the input a pendulum that has fallen stays bounded: no simulation fails."""
-    plant = cid.plants.pendulum(m=0.12, length=0.25, c=0.013)
-    at = cid.OperatingPoint(states=(0.0, 0.0), input=0.0, output=0.0)
-    lead = cid.design_lead(cid.linearize(plant, at), crossover=15, phase_margin=50)
-    loop = cid.Loop(plant, lead.sample(0.005, "tustin"), dt=0.005, at=at)
-    loop = loop.with_effect(E.InputSaturation(-0.1, 0.1))
-    r = cid.random_binary(6000, amplitude=0.02, hold=60, seed=3)
-    record = cid.simulate(loop, r, sensor_noise=1e-4, seed=4)
+    loop = pendulum(E.InputSaturation(-0.1, 0.1))
+    record = problems.record_of(loop, swing=0.02, hold=60, n=6000, seed=3, sensor_noise=1e-4)
     simulator = Simulator(loop, 1e-6, 8)
-    assert _loop_survives(simulator, r, record)
+    assert _loop_survives(simulator, record.r, record)
     bold = cid.random_binary(6000, amplitude=0.4, hold=60, seed=3)
     assert np.ptp(simulator.run(simulator.start(None), bold, np.zeros(6000))[0]) > 3.0
     assert not _loop_survives(simulator, bold, record)
@@ -308,8 +291,7 @@ def test_a_model_without_its_arrays_can_be_searched_on():
 
 
 def test_a_motion_far_faster_than_the_samples_is_refused():
-    plant = cid.plants.servo(m=1e-6, c=1.0, k=1.0)
-    loop = cid.Loop(plant, cid.PID(kp=1.0), dt=0.01, at=drive().point, free=("k",))
+    loop = drive(("k",), cid.plants.servo(m=1e-6, c=1.0, k=1.0), cid.PID(kp=1.0))
     still = record_of(drive(), E.CoulombFriction(0.3), 0.3, 1e-4, 9800)
     with pytest.raises(cid.CtrlidError, match="times faster than it is sampled"):
         cid.fit_loop(loop, still)
@@ -355,8 +337,7 @@ def test_a_replica_is_fitted_from_its_own_trajectory():
     """Another noise, and the ball moves a quarter of a ripple elsewhere: the record is no guide."""
     plant = cid.plants.maglev(m=0.0307, K=4.21e-6)
     at = cid.operating_point(plant, output=0.00762)
-    C = cid.design_lead(cid.linearize(plant, at), crossover=130, phase_margin=45)
-    loop = cid.Loop(plant, C.sample(6.6e-4, "tustin"), dt=6.6e-4, at=at, free=("K",))
+    loop = under_lead(plant, 6.6e-4, at, crossover=130, phase_margin=45, free=("K",))
     hidden = E.PositionRipple(amplitude=0.8, period=1.6e-4, phase=1.0)
     r = cid.random_binary(4000, amplitude=1e-4, hold=70, around=at.output, seed=9800)
     record = cid.simulate(loop.with_effect(hidden), r, sensor_noise=7.5e-6, seed=9801)
@@ -400,15 +381,8 @@ def test_a_limit_is_found_behind_a_random_force_that_stood_for_it():
 
 
 def test_an_overflow_is_looked_for_from_above():
-    def rates(t, x, u, p):
-        upper, lower = np.sqrt(np.maximum(x, 1e-6))
-        return np.array([p["k"] * u[0] - 0.05 * upper, 0.05 * upper - 0.06 * lower])
-
-    plant = ct.nlsys(rates, lambda t, x, u, p: x[1], inputs=["u"], outputs=["y"],
-                     states=["h1", "h2"], params={"k": 0.05}, name="two tanks")  # fmt: skip
-    at = cid.operating_point(plant, output=6.0)
-    loop = cid.Loop(plant, cid.PID(kp=0.5, ki=0.005), dt=4.0, at=at, free=("k",))
-    full = at.states[0] * 1.3
+    loop = tanks(cid.PID(kp=0.5, ki=0.005), free=("k4",))
+    full = loop.at.states[0] * 1.3
     record = record_of(loop, E.StateLimit("h1", full, "h2", share=0.3), 1.5, 1e-2, 9320)
     base = fit_base_model(loop, [record], loop.free)
     start, _ = E.StateLimit.candidates(base.fitted, record)
@@ -606,9 +580,7 @@ def test_where_nothing_follows_equals_of_the_best_are_asked():
         lambda t, x, u, p: x[0], inputs=["u"], outputs=["x"], states=["x", "v"],
         params={"k": 2.0, "s": 40.0, "d": 4.0}, name="spring",
     )  # fmt: skip
-    at = cid.OperatingPoint((0.0, 0.0), 0.0, 0.0)
-    loop = cid.Loop(plant, cid.PID(kp=20.0, ki=30.0, kd=2.0, filter_time=0.02), dt=0.01, at=at,
-                    free=("s", "d"))  # fmt: skip
+    loop = drive(("s", "d"), plant, cid.PID(kp=20.0, ki=30.0, kd=2.0, filter_time=0.02))
     spring, offset = E.CubicStiffness(8000.0), E.SensorOffset(-0.05)
     record = record_of(loop.with_effect(offset), spring, 0.05, 1e-5, 9430, 4000)
     base = fit_base_model(loop, [record], loop.free)
@@ -706,9 +678,7 @@ def test_an_effect_without_which_nothing_follows_stays():
     # The saturating gain lets the ball fall: a filter without it cannot follow, however noisy.
     plant = cid.plants.maglev(m=0.037, K=3.8264e-5)
     op = cid.operating_point(plant, output=0.0154)
-    C = cid.design_lead(cid.linearize(plant, op), crossover=55, phase_margin=50)
-    loop = cid.Loop(plant, C.sample(3e-3, "tustin"), dt=3e-3, at=op, input_limits=(0, 3.76),
-                    free=("K",))  # fmt: skip
+    loop = under_lead(plant, 3e-3, op, crossover=55, input_limits=(0, 3.76), free=("K",))
     real = loop.with_effect(E.QuadraticDrag(c2=7725.0))
     real = real.with_effect(E.InputSaturatingGain(saturation=0.036))
     r = cid.random_binary(2000, amplitude=1.7e-4, hold=40, around=op.output, seed=5)

@@ -1,11 +1,8 @@
 """A slice of the study of diagnose(): random loops, hidden effects, their names."""
 
 import argparse
-import importlib
 import json
 import re
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,19 +10,9 @@ import pytest
 import ctrlid as cid
 from ctrlid import CtrlidError, effects
 from ctrlid.diagnosis.thresholds import THRESHOLD
+from problems import load_script
 
-BENCHMARKS = str(Path(__file__).parents[1] / "benchmarks")
-
-
-def _load_study():
-    sys.path.insert(0, BENCHMARKS)
-    try:
-        return importlib.import_module("study_diagnosis")
-    finally:
-        sys.path.remove(BENCHMARKS)
-
-
-study = _load_study()
+study = load_script("benchmarks", "study_diagnosis")
 
 SEED = 90_210  # none of the study
 

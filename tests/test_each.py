@@ -15,20 +15,16 @@ import ctrlid as cid
 from ctrlid import plot
 from ctrlid.estimation.identified_model import Structure
 from ctrlid.estimation.linear.regression import reduce_record
+from problems import legend, levitation, record_of
 
 KNOWN = (cid.ReciprocalPoles(), cid.Equal("b1", "b2"))
 GAPS = (0.008, 0.010, 0.012, 0.015)
 
 
 def levitations(gaps=GAPS, n=3000, noise=2e-6):
-    plant, records = cid.plants.maglev(m=0.0213, K=3.34e-6), []
-    for k, gap in enumerate(gaps):
-        at = cid.operating_point(plant, output=gap)
-        C = cid.design_lead(cid.linearize(plant, at), crossover=100, phase_margin=50)
-        loop = cid.Loop(plant, C.sample(0.002, "tustin"), dt=0.002, at=at)
-        r = cid.random_binary(n, amplitude=5e-5, hold=10, around=gap, seed=k)
-        records.append(replace(cid.simulate(loop, r, sensor_noise=noise, seed=k), name=f"gap {k}"))
-    return records
+    records = [record_of(levitation(gap=gap), swing=5e-5, hold=10, n=n, seed=k, noise_seed=k,
+                         sensor_noise=noise) for k, gap in enumerate(gaps)]  # fmt: skip
+    return [replace(record, name=f"gap {k}") for k, record in enumerate(records)]
 
 
 @pytest.fixture(scope="module")
@@ -75,8 +71,7 @@ def test_trend_in_words_and_as_a_picture(series):
     assert "as the output to the power -0." in text
     ax = plot.trend(series, truth=lambda y: np.sqrt(2 * 9.81 / y))
     assert ax.get_xlabel() == "mean output [mm]" or "unit" in ax.get_xlabel()
-    labels = [t.get_text() for t in ax.get_legend().get_texts()]
-    assert labels == ["line through the fits", "physics", "fits, 95 % intervals"]
+    assert legend(ax) == ["line through the fits", "physics", "fits, 95 % intervals"]
 
 
 def test_noise_free_fits_have_a_trend_too():
@@ -221,16 +216,11 @@ def test_what_a_generator_yields_is_checked(records):
 
 def test_a_loop_travels_to_other_processes():
     """Plant, effects and equations survive cloudpickle, which joblib and dask send work with."""
-    plant = cid.plants.maglev(m=0.0213, K=3.34e-6)
-    at = cid.operating_point(plant, output=0.012)
-    lead = cid.design_lead(cid.linearize(plant, at), crossover=100, phase_margin=50)
-    loop = cid.Loop(plant, lead.sample(0.002, "tustin"), dt=0.002, at=at, free=("K",))
-    for effect in (
+    loop = levitation(
         cid.effects.ActuatorLag(2e-3), cid.effects.InputDelay(1e-3),
         cid.effects.InputBacklash(0.01), cid.effects.CoulombFriction(0.1),
         cid.effects.Quantization(1e-6),
-    ):  # fmt: skip
-        loop = loop.with_effect(effect)
+    )  # fmt: skip
     again = cloudpickle.loads(cloudpickle.dumps(loop))
     assert repr(again) == repr(loop)
     r = cid.random_binary(300, amplitude=1e-4, hold=15, around=0.012, seed=1)
@@ -240,13 +230,9 @@ def test_a_loop_travels_to_other_processes():
 
 
 def test_a_diagnosis_on_a_dask_cluster_finds_the_same():
-    plant = cid.plants.maglev(m=0.0213, K=3.34e-6)
-    at = cid.operating_point(plant, output=0.012)
-    lead = cid.design_lead(cid.linearize(plant, at), crossover=100, phase_margin=50)
-    model = cid.Loop(plant, lead.sample(0.002, "tustin"), dt=0.002, at=at, free=("K",))
+    model = levitation()
     rig = model.with_effect(cid.effects.ActuatorLag(tau=0.002))
-    r = cid.random_binary(1000, amplitude=2e-4, hold=20, around=at.output, seed=1)
-    record = cid.simulate(rig, r, sensor_noise=5e-6, seed=2)
+    record = record_of(rig, swing=2e-4, hold=20, n=1000, seed=1, sensor_noise=5e-6)
     few = {"catalogue": (cid.effects.ActuatorLag, cid.effects.CoulombFriction), "progress": False}
     with local_cluster(), joblib.parallel_config(backend="dask"):
         spread = cid.diagnose(model, record, jobs=2, **few)

@@ -15,25 +15,19 @@ import pytest
 import ctrlid as cid
 from ctrlid import effects
 from ctrlid.effects import CATALOGUE
+from problems import levitation, tank, tanks, under_lead
 
 SAMPLES = 300
 
 
-def digital(plant, op, dt, crossover):
-    P = ct.sample_system(cid.linearize(plant, op), dt)
-    return cid.design_lead(P, crossover=crossover, phase_margin=50)
-
-
 def levitated():
-    plant = cid.plants.maglev(m=0.0213, K=3.34e-6)
-    op = cid.operating_point(plant, output=0.012)
-    return cid.Loop(plant, digital(plant, op, 0.002, 100), dt=0.002, at=op, free=("K",)), 2e-4
+    return levitation(sampled=True), 2e-4
 
 
 def driven():
     plant = cid.plants.servo(m=2.0, c=3.0, k=4.0)
     op = cid.operating_point(plant, output=0.1)
-    return cid.Loop(plant, digital(plant, op, 0.01, 20), dt=0.01, at=op, free=("c", "k")), 0.02
+    return under_lead(plant, 0.01, op, crossover=20, sampled=True, free=("c", "k")), 0.02
 
 
 def swinging():
@@ -45,24 +39,16 @@ def swinging():
                      outputs=["theta"], states=["theta", "omega"],
                      params={"w": 4.0, "k": 2.0})  # fmt: skip
     op = cid.operating_point(plant, output=0.2)
-    return cid.Loop(plant, digital(plant, op, 0.01, 15), dt=0.01, at=op, free=("k",)), 0.05
+    return under_lead(plant, 0.01, op, crossover=15, sampled=True, free=("k",)), 0.05
 
 
 def cascaded():
-    def update(t, x, u, params):
-        upper, lower = np.sqrt(np.maximum(x[0], 0.0)), np.sqrt(np.maximum(x[1], 0.0))
-        return np.array([params["k"] * u[0] - params["a"] * upper, params["a"] * (upper - lower)])
-
-    plant = ct.nlsys(update, lambda t, x, u, params: x[1], name="tanks", inputs=["V"],
-                     outputs=["h2"], states=["h1", "h2"], params={"k": 0.1, "a": 0.2})  # fmt: skip
-    op = cid.operating_point(plant, output=4.0)
-    return cid.Loop(plant, ct.tf([1.0], [1.0], 1.0), dt=1.0, at=op, free=("k",)), 1.0
+    gain = ct.tf([1.0], [1.0], 1.0)
+    return tanks(gain, level=4.0, dt=1.0, free=("k4",), k1=0.2, k3=0.2, k4=0.1), 1.0
 
 
 def single():
-    plant = cid.plants.tank(area=0.01, outlet=1e-5, k=1e-5)
-    op = cid.operating_point(plant, output=0.2)
-    return cid.Loop(plant, ct.tf([20.0], [1.0], 2.0), dt=2.0, at=op), 0.05
+    return tank(ct.tf([20.0], [1.0], 2.0), dt=2.0), 0.05
 
 
 PLANTS = {f.__name__: f() for f in (levitated, driven, swinging, cascaded, single)}

@@ -1,12 +1,13 @@
 """The examples keep their promises: the paper's claims, and the two real levitations."""
 
-import importlib.util
 import runpy
 from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
 import pytest
+
+from problems import load_script
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
@@ -47,10 +48,7 @@ def test_the_papers_experiment(capsys):
 @pytest.fixture
 def levitations(data_dir):
     del data_dir
-    spec = importlib.util.spec_from_file_location("levitations", EXAMPLES / "real_levitations.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return load_script("examples", "real_levitations")
 
 
 def test_inteco_needs_the_current(levitations, capsys):
@@ -83,19 +81,10 @@ def test_magnetoshield_is_as_fast_at_every_gap(levitations, capsys):
     assert "one model of all five: p = 50.0 ± 0.3" in capsys.readouterr().out
 
 
-def load_benchmark(name):
-    spec = importlib.util.spec_from_file_location(
-        name, EXAMPLES.parent / "benchmarks" / f"{name}.py"
-    )
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 def test_real_records_and_their_physics(data_dir, capsys):
     """What statics say, from gaps and currents at rest, is what the fits find in the motion."""
     del data_dir
-    rigs = load_benchmark("real_records")
+    rigs = load_script("benchmarks", "real_records")
     series, statics = rigs.magnetoshield()
     assert np.abs(series.rates / statics - 1).max() < 0.06
     for level, poles, errors in rigs.inteco():
@@ -107,7 +96,7 @@ def test_real_records_and_their_physics(data_dir, capsys):
 
 def test_a_long_log_is_fitted_in_blocks(capsys, monkeypatch):
     monkeypatch.setattr("sys.argv", ["bench_long.py", "--samples", "1200000"])
-    load_benchmark("bench_long").main()
+    load_script("benchmarks", "bench_long").main()
     assert "1199998 rows" in capsys.readouterr().out
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import ctrlid as cid
+import problems
 
 
 def excitation(rng, n, amplitude, around=0.0):
@@ -14,12 +15,9 @@ def excitation(rng, n, amplitude, around=0.0):
     if kind == "noise":
         return around + amplitude * rng.standard_normal(n)
     if kind == "multisine":
-        waves = [np.sin(2 * np.pi * (f * np.arange(n) + rng.uniform()))
-                 for f in rng.uniform(1 / 400, 0.1, 12)]  # fmt: skip
-        return around + amplitude * sum(waves) / 5
+        return around + amplitude * problems.twelve_waves(rng, n)
     if kind == "prbs":
-        period = np.repeat(rng.choice([-1.0, 1.0], 127), int(rng.integers(1, 9)))
-        return around + amplitude * np.tile(period, n)[:n]
+        return around + amplitude * problems.repeated_bits(rng, n)
     hold, seed = int(rng.integers(1, 40)), int(rng.integers(1_000_000))
     return cid.random_binary(n, amplitude=amplitude, hold=hold, around=around, seed=seed)
 
@@ -28,11 +26,10 @@ def open_record(rng, noisy=True):
     n = int(10 ** rng.uniform(2.5, 3.8))
     kind, at, amplitude = rng.choice(["servo", "tank", "lag"]), None, 1.0
     if kind == "servo":
-        m, w = 10 ** rng.uniform(-1, 1), 10 ** rng.uniform(0, 1.5)
-        plant = cid.plants.servo(m=m, c=m * w * rng.uniform(0.2, 3), k=m * w**2)
+        plant, _, w = problems.random_servo(rng)
         dt = 10 ** rng.uniform(-2, -0.3) / w
     elif kind == "tank":
-        plant = cid.plants.tank(area=rng.uniform(0.5, 2), outlet=0.02, k=0.05)
+        plant = problems.random_tank(rng)
         at = cid.operating_point(plant, output=rng.uniform(1, 2))
         dt, amplitude = rng.choice([1.0, 2.0, 5.0]), 0.1 * at.input
     else:
@@ -47,22 +44,12 @@ def closed_record(rng, noisy=True):
     n = int(10 ** rng.uniform(2.5, 3.8))
     digital = bool(rng.random() < 0.6)
     if rng.random() < 0.5:
-        x0 = rng.uniform(0.008, 0.02)
-        plant = cid.plants.maglev(m=rng.uniform(0.01, 0.1), K=10 ** rng.uniform(-6, -4))
-        at = cid.operating_point(plant, output=x0)
-        P = cid.linearize(plant, at)
-        p = float(np.max(np.abs(P.poles())))
-        dt, amplitude = float(f"{10 ** rng.uniform(-2, -1.3) / p:.3g}"), 0.004 * x0
-        C = cid.design_lead(P, crossover=2.5 * p, phase_margin=45)
-        C = ct.sample_system(ct.ss(C), dt, "tustin") if digital else C
+        loop, gap = problems.random_levitation(rng, digital)
+        amplitude = 0.004 * gap
     else:
-        lag, gain = 10 ** rng.uniform(-2, 2), rng.uniform(0.5, 4)
-        plant, at = ct.tf([2.0], [lag, 1]), cid.OperatingPoint((0.0,), 1.0, 3.0)
-        dt, amplitude = 0.05 * lag, 1.0
-        C = cid.PID(gain, ki=rng.uniform(0.1, 2) / lag) if digital else ct.tf([gain], [1])
-    r = excitation(rng, n, amplitude, at.output)
+        loop, amplitude = problems.random_lag(rng, digital), 1.0
+    r = excitation(rng, n, amplitude, loop.point.output)
     noise = amplitude * 10 ** rng.uniform(-2, -0.7) if noisy else 0.0
-    loop = cid.Loop(plant, C, dt=dt, at=at)
     return cid.simulate(loop, r, sensor_noise=noise, seed=int(rng.integers(1_000_000)))
 
 
@@ -110,10 +97,9 @@ def test_rates_over_many_records(capsys):
 
 
 def test_unstable_plant_without_noise_or_reference():
-    P = ct.tf([-6.5], [1, 0, -1600])
-    C = ct.sample_system(ct.ss(cid.design_lead(P, crossover=100, phase_margin=50)), 1e-3, "tustin")
-    r = cid.random_binary(2000, amplitude=1e-4, hold=20, seed=1)
-    record = replace(cid.simulate(cid.Loop(P, C, dt=1e-3), r), r=None)
+    loop = problems.under_lead(problems.LINEAR_LEVITATION, 1e-3)
+    record = problems.record_of(loop, swing=1e-4, hold=20, n=2000, seed=1)
+    record = replace(record, r=None)
     found = cid.check_feedback(record)
     assert found.closed_loop
     assert "unstable" in str(found)

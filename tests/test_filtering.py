@@ -4,9 +4,10 @@ Groups: one pass; sensitivities; the extended filter; maps over one period; long
 """
 
 import math
+from dataclasses import replace
+from functools import partial
 
 import casadi
-import control as ct
 import numpy as np
 import pytest
 from scipy import integrate, linalg, signal
@@ -20,6 +21,7 @@ from ctrlid.estimation.likelihood.maximization import begin_fit
 from ctrlid.estimation.likelihood.physics_fit import make_problem
 from ctrlid.estimation.likelihood.sampled_plant import SampledPlant, Trajectory
 from ctrlid.physics.integration import advance
+from problems import levitation, mass, pendulum, record_of, servo
 
 # --- one pass
 
@@ -159,14 +161,7 @@ def test_sensitivities_are_derivatives_at_a_held_gain(seed):
         np.testing.assert_allclose(found[5][valid, q] / scale, slope[valid] / scale, atol=1e-9)
 
 
-def levitated(*effects, dt=1e-3, free=(), analog=False):
-    plant = cid.plants.maglev(m=0.0213, K=3.34e-6)
-    op = cid.operating_point(plant, output=0.012)
-    C = cid.design_lead(cid.linearize(plant, op), crossover=100, phase_margin=50)
-    loop = cid.Loop(plant, C if analog else C.sample(dt, "tustin"), dt=dt, at=op)
-    for effect in effects:
-        loop = loop.with_effect(effect)
-    return loop
+levitated = partial(levitation, dt=1e-3, free=())
 
 
 @pytest.mark.parametrize(
@@ -252,11 +247,8 @@ def sequential(record, q, sensor, m, K, steps=40):
 
 
 def test_the_fixed_point_is_the_extended_kalman_filter():
-    loop = levitated(dt=4e-3)
     r = cid.random_binary(500, amplitude=1e-3, hold=15, around=0.012, seed=3)
-    with_less = cid.Loop(loop.plant, cid.design_lead(
-        ct.sample_system(cid.linearize(loop.plant, loop.at), 4e-3), 90, 45
-    ), dt=4e-3, at=loop.at)  # fmt: skip
+    with_less = levitated(dt=4e-3, crossover=90, phase_margin=45, sampled=True)
     record = cid.simulate(with_less, 0.012 + 0.4 * (r - 0.012), sensor_noise=2e-5, force_noise=0.3,
                           seed=4)  # fmt: skip
     expected, s, states = sequential(record, 0.3, 2e-5, 0.0213, 3.34e-6)
@@ -413,10 +405,8 @@ def test_a_delay_of_any_length(delay):
 
 def test_a_straight_input_with_a_delay():
     """First-order hold, late by 1.3 samples: the plant is two integrators, in closed form."""
-    plant = ct.nlsys(lambda t, x, u, p: [x[1], u[0]], lambda t, x, u, p: x[0], name="mass",
-                     inputs=["u"], outputs=["x"], states=["x", "v"])  # fmt: skip
     dt, late = 0.1, 1.3
-    loop = cid.Loop(plant, None, dt=dt).with_effect(E.InputDelay(delay=late * dt))
+    loop = cid.Loop(mass(), None, dt=dt).with_effect(E.InputDelay(delay=late * dt))
     rng = np.random.default_rng(9)
     u = rng.standard_normal(30)
     record = cid.Record(u=u, y=rng.standard_normal(30), dt=dt, hold="foh")
@@ -469,14 +459,9 @@ def test_play_is_followed_with_its_derivative():
 
 def balanced(effect, dt, sensor_noise):
     """Return the loop of a pendulum that stands on its head, and a record of it."""
-    plant = cid.plants.pendulum(m=0.12, length=0.25, c=0.013)
-    at = cid.OperatingPoint(states=(0.0, 0.0), input=0.0, output=0.0)
-    lead = cid.design_lead(cid.linearize(plant, at), crossover=15, phase_margin=50)
-    loop = cid.Loop(plant, lead.sample(dt, "tustin"), dt=dt, at=at)
-    loop = loop.with_effect(effect)
-    r = cid.random_binary(2000, amplitude=0.1, hold=40, seed=1)
-    record = cid.simulate(loop, r, sensor_noise=sensor_noise, force_noise=0.03, seed=2)
-    return loop, record
+    loop = pendulum(effect, dt=dt)
+    return loop, record_of(loop, swing=0.1, hold=40, n=2000, seed=1, sensor_noise=sensor_noise,
+                           force_noise=0.03)  # fmt: skip
 
 
 def test_nobody_knows_where_a_play_begins():
@@ -526,9 +511,7 @@ def test_a_sensor_lag_of_no_length_costs_nothing(effects):
 
 def test_coulomb_friction_is_smoothed_by_the_uncertain_velocity():
     """Expected sign of a normal velocity: erf(v / (sqrt(2) s))."""
-    plant = ct.nlsys(lambda t, x, u, p: [x[1], u[0]], lambda t, x, u, p: x[0], name="mass",
-                     inputs=["u"], outputs=["x"], states=["x", "v"])  # fmt: skip
-    loop = cid.Loop(plant, None, dt=1e-6).with_effect(E.CoulombFriction(fc=2.0))
+    loop = cid.Loop(mass(), None, dt=1e-6).with_effect(E.CoulombFriction(fc=2.0))
     m = SampledPlant(loop, (), "zoh", False)
     rng = np.random.default_rng(11)
     v, s = 0.1 * rng.standard_normal(40), np.exp(rng.uniform(-6, 0, 40))
@@ -549,9 +532,7 @@ def test_a_velocity_that_turns_within_a_period():
     What is lost here is what makes a fitted fc 2 % too large, several standard errors.
     """
     dt, push, fc = 2e-3, 1.0, 0.05
-    plant = ct.nlsys(lambda t, x, u, p: [x[1], u[0]], lambda t, x, u, p: x[0], name="mass",
-                     inputs=["u"], outputs=["x"], states=["x", "v"])  # fmt: skip
-    loop = cid.Loop(plant, None, dt=dt).with_effect(E.CoulombFriction(fc=fc))
+    loop = cid.Loop(mass(), None, dt=dt).with_effect(E.CoulombFriction(fc=fc))
     m = SampledPlant(loop, ("CoulombFriction.fc",), "zoh", False)
     n = 60
     rng = np.random.default_rng(13)
@@ -624,20 +605,16 @@ def test_a_million_samples_of_an_unstable_plant_stay_positive():
 
 def test_a_neutral_effect_rests_in_the_place_of_its_own_states():
     # A mode acts on the plant before an actuator's lag does, and its states stand before the lag's.
-    plant = cid.plants.maglev(m=0.0213, K=3.34e-6)
-    at = cid.operating_point(plant, output=0.012)
-    loop = cid.Loop(plant, None, dt=1e-3, at=at, effects=(E.ActuatorLag(tau=2e-3),))
+    driven = levitated(E.ActuatorLag(tau=2e-3))
+    loop = replace(driven, controller=None)
     mode = E.FlexibleMode(frequency=28.0, damping=0.03, coupling=0.0)
     both = loop.with_effect(mode)
     resting = dict(zip(both.equations(keep=True).states,
                        state_at_rest(both, both.equations(keep=True)), strict=True))  # fmt: skip
     assert resting == {"x": 0.012, "v": 0.0, "FlexibleMode.deflection": 0.0,
-                       "FlexibleMode.speed": 0.0, "ActuatorLag.input": at.input}  # fmt: skip
+                       "FlexibleMode.speed": 0.0, "ActuatorLag.input": loop.at.input}  # fmt: skip
     # So nothing moves the mode at the start, and the filter is that with next to nothing of it.
-    lead = cid.design_lead(cid.linearize(plant, at), crossover=100, phase_margin=50)
-    driven = cid.Loop(plant, lead.sample(1e-3, "tustin"), dt=1e-3, at=at, effects=loop.effects)
-    r = cid.random_binary(400, amplitude=1e-4, hold=20, around=0.012, seed=1)
-    record = cid.simulate(driven, r, sensor_noise=1e-5, seed=2)
+    record = record_of(driven, swing=1e-4, hold=20, n=400, seed=1, sensor_noise=1e-5)
     slight = loop.with_effect(E.FlexibleMode(frequency=28.0, damping=0.03, coupling=1e-9))
     still, moved = (cid.predict(x, record, force_noise=0.1) for x in (both, slight))
     assert still.circuit.shape == moved.circuit.shape == (400, 0)
@@ -646,8 +623,7 @@ def test_a_neutral_effect_rests_in_the_place_of_its_own_states():
 
 def test_machines_share_what_values_do_not_change():
     """Other values share the maps; other free parameters, holds or constants do not."""
-    plant = cid.plants.servo(m=1.0, c=2.0, k=3.0)
-    loop = cid.Loop(plant, None, dt=0.01, free=("k",))
+    loop = servo(None, free=("k",))
     friction = loop.with_effect(cid.effects.CoulombFriction(fc=0.1))
     one = SampledPlant(friction, ["k"], "zoh", False)
     changed = friction.with_parameters({"k": 4.0, "CoulombFriction.fc": 0.2})
@@ -659,6 +635,6 @@ def test_machines_share_what_values_do_not_change():
         SampledPlant(friction, ["c"], "zoh", False), SampledPlant(friction, ["k"], "foh", False),
         SampledPlant(loop, ["k"], "zoh", False),
         SampledPlant(loop.with_effect(cid.effects.CubicStiffness(k3=0.1)), ["k"], "zoh", False),
-        SampledPlant(cid.Loop(plant, None, dt=0.02, free=("k",)), ["k"], "zoh", False),
+        SampledPlant(servo(None, dt=0.02, free=("k",)), ["k"], "zoh", False),
     ):  # fmt: skip
         assert different.maps is not one.maps

@@ -7,27 +7,24 @@ import numpy as np
 import pytest
 
 import ctrlid as cid
+import problems
 from ctrlid import effects as E
 from ctrlid.diagnosis.noise_tests import run_noise_tests
 from ctrlid.diagnosis.recalibration import fit_base_model
 from ctrlid.diagnosis.replicas import follow_record, gain_on_replicas, make_replica
 from ctrlid.diagnosis.selection import run_round
 from ctrlid.loop.period_map import comes_to_rest
-
-DT = 0.001
-
-
-def levitation(fc):
-    plant = cid.plants.maglev(m=0.0213, K=3.34e-6)
-    at = cid.operating_point(plant, output=0.012)
-    C = cid.design_lead(cid.linearize(plant, at), crossover=100, phase_margin=50)
-    loop = cid.Loop(plant, C.sample(DT, "tustin"), dt=DT, at=at, free=("K",))
-    return loop.with_effect(E.CoulombFriction(fc=fc)) if fc else loop
+from problems import levitation
 
 
-def record_of(loop, seed, n=3000):
-    r = cid.random_binary(n, amplitude=3e-4, hold=30, around=loop.point.output, seed=seed)
-    return cid.simulate(loop, r, sensor_noise=4e-6, force_noise=0.01, seed=seed + 1)
+def rubbing(fc):
+    """A levitated ball with dry friction [m/s^2], or with none at all."""
+    return levitation(*([E.CoulombFriction(fc=fc)] if fc else []), dt=0.001)
+
+
+def record_of(loop, seed):
+    return problems.record_of(loop, swing=3e-4, hold=30, n=3000, seed=seed, sensor_noise=4e-6,
+                              force_noise=0.01)  # fmt: skip
 
 
 def random_plant(rng):
@@ -73,7 +70,7 @@ def test_what_cannot_be_held_is_left_alone():
 
 @pytest.mark.parametrize("fc", [0.0, 1.0])
 def test_a_replica_without_a_controller_is_like_the_record(fc):
-    loop = levitation(fc)
+    loop = rubbing(fc)
     record = record_of(loop, 3)
     model = fit_base_model(replace(loop, controller=None), [record], ("K",))
     copy = make_replica(model)
@@ -87,14 +84,14 @@ def test_a_replica_without_a_controller_is_like_the_record(fc):
 
 def test_friction_in_the_model_is_given_no_companion():
     """What the filter does wrong with sharp friction had been an actuator's lag."""
-    loop = levitation(1.0)
+    loop = rubbing(1.0)
     model = replace(loop, controller=None).with_parameters({"K": 3.4e-6})
     found = cid.diagnose(model, record_of(loop, 3), progress=False)
     assert (found.verdict, found.findings) == ("nothing missing", ())
 
 
 def test_what_is_missing_is_found_beside_friction_all_the_same():
-    loop = levitation(1.0)
+    loop = rubbing(1.0)
     record = record_of(loop.with_effect(E.ActuatorLag(tau=0.002)), 3)
     base = fit_base_model(replace(loop, controller=None), [record], ("K",))
     lag = E.ActuatorLag(tau=0.001)

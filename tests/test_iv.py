@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import control as ct
 import numpy as np
@@ -19,23 +16,17 @@ from ctrlid.estimation.linear.controller_model import found_law, given_law, loop
 from ctrlid.estimation.linear.instruments import cut, two_stage
 from ctrlid.estimation.linear.iv import fit_iv
 from ctrlid.estimation.linear.prefilter import autoregression, stable_factor
+from problems import load_script
 
 KNOWN = [cid.ReciprocalPoles(), cid.Equal("b1", "b2")]
 
 
-def _load_study():
-    path = Path(__file__).parents[1] / "benchmarks" / "study_iv.py"
-    spec = importlib.util.spec_from_file_location("study_iv", path)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["study_iv"] = module
-    spec.loader.exec_module(module)
-    return module
+study = load_script("benchmarks", "study_iv")
 
 
-study = _load_study()
-
-
-def levitation(step, n=6000, noise=0.0, seed=0, offset=(0.0, 0.0), dither=0.0, colour=(1.0,)):
+def sampled_levitation(
+    step, n=6000, noise=0.0, seed=0, offset=(0.0, 0.0), dither=0.0, colour=(1.0,)
+):
     """Coefficients, record and lead of a levitation at p*Ts = step; the reference is +-1."""
     rng = np.random.default_rng(seed)
     p, dt = 40.0, step / 40.0
@@ -62,7 +53,7 @@ def levitation(step, n=6000, noise=0.0, seed=0, offset=(0.0, 0.0), dither=0.0, c
 @pytest.mark.parametrize("known", [[], KNOWN], ids=["free", "constrained"])
 @pytest.mark.parametrize("offset", [(0.0, 0.0), (100.0, 1000.0)], ids=["deviations", "offset"])
 def test_recovers_the_plant_exactly_without_noise(step, known, offset):
-    theta, record, _ = levitation(step, offset=offset)
+    theta, record, _ = sampled_levitation(step, offset=offset)
     estimate = fit_iv(record, 2, 2, constraints=known).estimate
     np.testing.assert_allclose(estimate.values, theta, rtol=1e-7)
     np.testing.assert_allclose(np.sort(estimate.poles_s.real), [-40.0, 40.0], rtol=1e-6)
@@ -72,7 +63,7 @@ def test_recovers_the_plant_exactly_without_noise(step, known, offset):
 
 
 def test_without_intercept():
-    theta, record, _ = levitation(0.1)
+    theta, record, _ = sampled_levitation(0.1)
     estimate = fit_iv(record, 2, 2, intercept=False).estimate
     np.testing.assert_allclose(estimate.values, theta, rtol=1e-8)
     assert estimate.intercepts.shape == (0,)
@@ -96,7 +87,7 @@ def test_delay_and_higher_order():
 
 @pytest.mark.parametrize("step", [0.2, 0.03, 0.005])
 def test_consistent_where_least_squares_is_biased(step):
-    theta, record, _ = levitation(step, n=20_000, noise=0.1, seed=1)
+    theta, record, _ = sampled_levitation(step, n=20_000, noise=0.1, seed=1)
     free = cid.fit_arx(record, 2, 2).estimate
     assert np.abs(free.poles).max() < 1.0 + 0.7 * step  # the unstable pole drifts to the origin
     estimate = fit_iv(record, 2, 2, constraints=KNOWN).estimate
@@ -112,7 +103,9 @@ def test_consistent_where_least_squares_is_biased(step):
 def test_coloured_noise_does_not_bias_and_is_modelled():
     z = []
     for seed in range(16):
-        theta, record, _ = levitation(0.1, n=5000, noise=0.05, seed=seed, colour=(1.0, -0.9))
+        theta, record, _ = sampled_levitation(
+            0.1, n=5000, noise=0.05, seed=seed, colour=(1.0, -0.9)
+        )
         estimate = fit_iv(record, 2, 2).estimate
         assert "sensor noise of order" in estimate.solver
         z.append((estimate.values - theta) / estimate.standard_errors)
@@ -151,7 +144,7 @@ def test_the_curvature_of_the_plant_is_taken_out():
 
 
 def test_active_bounds_are_exact():
-    theta, record, _ = levitation(0.2, n=8000, noise=0.02)
+    theta, record, _ = sampled_levitation(0.2, n=8000, noise=0.02)
     bound = theta[0] - 0.01
     estimate = fit_iv(
         record, 2, 2, constraints=[cid.ReciprocalPoles(), cid.Bounds("a1", upper=bound)]
@@ -178,7 +171,7 @@ def test_an_integrator_on_the_unit_circle():
 
 
 def test_nonlinear_constraints_agree_with_linear_ones():
-    _, record, _ = levitation(0.2, noise=0.05)
+    _, record, _ = sampled_levitation(0.2, noise=0.05)
     linear = fit_iv(record, 2, 2, constraints=[cid.Fixed("a2", 1.0)]).estimate
     curved = fit_iv(record, 2, 2, constraints=[cid.Nonlinear(equality=lambda t: t[1] - 1)]).estimate
     np.testing.assert_allclose(curved.values, linear.values, rtol=1e-6)
@@ -188,7 +181,7 @@ def test_nonlinear_constraints_agree_with_linear_ones():
 
 
 def test_given_and_found_controllers_agree():
-    _, record, lead = levitation(0.1, noise=0.05)
+    _, record, lead = sampled_levitation(0.1, noise=0.05)
     found = fit_iv(record, 2, 2).estimate
     num, den = lead.num[0][0], lead.den[0][0]
     two = ct.tf([[num, -num]], [[den, den]], lead.dt)
@@ -204,7 +197,7 @@ def test_given_and_found_controllers_agree():
 
 
 def test_a_controller_that_does_not_stabilise_is_done_without():
-    theta, record, lead = levitation(0.1, noise=0.05)
+    theta, record, lead = sampled_levitation(0.1, noise=0.05)
     estimate = fit_iv(record, 2, 2, controller=-lead, constraints=KNOWN).estimate
     assert "instruments from delayed references" in estimate.solver
     error = (estimate.values - theta)[[0, 2]] / estimate.standard_errors[[0, 2]]
@@ -212,7 +205,7 @@ def test_a_controller_that_does_not_stabilise_is_done_without():
 
 
 def test_found_law_is_the_controller_and_the_loop_repeats_the_record():
-    theta, record, lead = levitation(0.1)
+    theta, record, lead = sampled_levitation(0.1)
     pieces = cut([record], ("r",), True, 30)
     law = found_law(pieces, ("r",))
     np.testing.assert_allclose(law.den, lead.den[0][0], atol=1e-6)
@@ -228,7 +221,7 @@ def test_found_law_is_the_controller_and_the_loop_repeats_the_record():
 
 @pytest.mark.parametrize("given", [False, True])
 def test_a_dither_serves_where_the_reference_does_not(given):
-    theta, record, lead = levitation(0.1, n=12_000, noise=0.02, dither=2.0)
+    theta, record, lead = sampled_levitation(0.1, n=12_000, noise=0.02, dither=2.0)
     record = replace(record, r=None)
     controller = lead if given else None
     estimate = fit_iv(
@@ -240,14 +233,14 @@ def test_a_dither_serves_where_the_reference_does_not(given):
 
 
 def test_two_signals_tell_more_than_one():
-    _, record, lead = levitation(0.1, noise=0.05, dither=20.0)
+    _, record, lead = sampled_levitation(0.1, noise=0.05, dither=20.0)
     one = fit_iv(record, 2, 2, controller=lead).estimate
     both = fit_iv(record, 2, 2, controller=lead, instruments=("r", "dither")).estimate
     assert np.all(both.standard_errors < one.standard_errors)
 
 
 def test_what_does_not_settle_warns_and_says_so(monkeypatch):
-    _, record, _ = levitation(0.1, noise=0.2)
+    _, record, _ = sampled_levitation(0.1, noise=0.2)
     monkeypatch.setattr("ctrlid.estimation.linear.iv._MOST", 1)
     with pytest.warns(cid.CtrlidWarning, match="DID NOT SETTLE"):
         model = fit_iv(record, 2, 2)
@@ -258,7 +251,7 @@ def test_noise_that_grows_with_the_signal_shows_in_the_standard_errors():
     """The sandwich takes over where the noise depends on what the reference does."""
     z = []
     for seed in range(12):
-        theta, record, _ = levitation(0.1, n=8000, seed=seed)
+        theta, record, _ = sampled_levitation(0.1, n=8000, seed=seed)
         rng = np.random.default_rng(seed + 100)
         loud = np.abs(np.gradient(record.y)) > np.quantile(np.abs(np.gradient(record.y)), 0.9)
         y = record.y + 0.2 * loud * rng.standard_normal(8000)
@@ -271,7 +264,7 @@ def test_noise_that_grows_with_the_signal_shows_in_the_standard_errors():
 
 
 def test_invalid_samples_leave_no_trace():
-    theta, record, _ = levitation(0.1, n=9000, noise=0.02)
+    theta, record, _ = sampled_levitation(0.1, n=9000, noise=0.02)
     y, u, valid = record.y.copy(), record.u.copy(), np.ones(9000, dtype=bool)
     for hole in (slice(2000, 2100), slice(6000, 6001), slice(8980, 9000)):
         valid[hole] = False
@@ -285,8 +278,8 @@ def test_invalid_samples_leave_no_trace():
 
 
 def test_several_records_share_coefficients_but_not_intercepts():
-    theta, one, _ = levitation(0.1, n=3000, offset=(5.0, 2.0))
-    _, two, _ = levitation(0.1, n=2000, seed=7, offset=(-3.0, 40.0))
+    theta, one, _ = sampled_levitation(0.1, n=3000, offset=(5.0, 2.0))
+    _, two, _ = sampled_levitation(0.1, n=2000, seed=7, offset=(-3.0, 40.0))
     estimate = fit_iv([one, two], 2, 2).estimate
     np.testing.assert_allclose(estimate.values, theta, rtol=1e-7)
     a1, b1 = 1 + theta[:2].sum(), theta[2:].sum()
@@ -296,7 +289,7 @@ def test_several_records_share_coefficients_but_not_intercepts():
 
 
 def test_halves_tell_as_much_as_the_whole():
-    _, record, _ = levitation(0.1, n=10_000, noise=0.05)
+    _, record, _ = sampled_levitation(0.1, n=10_000, noise=0.05)
     whole = fit_iv(record, 2, 2, constraints=KNOWN).estimate
     halves = fit_iv(list(record.split()), 2, 2, constraints=KNOWN).estimate
     free = [0, 2]
@@ -307,7 +300,7 @@ def test_halves_tell_as_much_as_the_whole():
 
 @pytest.mark.parametrize(("y", "u"), [(1e-6, 1.0), (1e3, 1e-4)])
 def test_units_change_nothing_but_units(y, u):
-    _, record, _ = levitation(0.1, noise=0.05)
+    _, record, _ = sampled_levitation(0.1, noise=0.05)
     scaled = replace(record, r=record.r * y, y=record.y * y, u=record.u * u)
     one = fit_iv(record, 2, 2, constraints=KNOWN).estimate
     other = fit_iv(scaled, 2, 2, constraints=KNOWN).estimate
@@ -316,7 +309,7 @@ def test_units_change_nothing_but_units(y, u):
 
 
 def test_names_come_from_the_record():
-    _, record, _ = levitation(0.1)
+    _, record, _ = sampled_levitation(0.1)
     model = fit_iv(replace(record, names={"u": "V", "y": "gap"}), 2, 2)
     assert (model.input_labels, model.output_labels) == (["V"], ["gap"])
     assert "refined instrumental variables" in str(model)
@@ -351,7 +344,7 @@ def refused(record, words, **options):
 
 
 def test_without_a_signal_from_outside_it_says_what_can_serve():
-    _, record, _ = levitation(0.1, dither=2.0)
+    _, record, _ = sampled_levitation(0.1, dither=2.0)
     refused(replace(record, r=None), r"no reference r.*instruments='dither' \(there is 'dither'\)")
     refused(replace(record, r=None, extra={}), "no reference r.*fit_loop")
     refused(replace(record, r=0 * record.r), "constant r: nothing from outside.*fit_loop")
@@ -363,7 +356,7 @@ def test_without_a_signal_from_outside_it_says_what_can_serve():
 
 
 def test_unusable_records_are_refused():
-    _, record, _ = levitation(0.1, n=200)
+    _, record, _ = sampled_levitation(0.1, n=200)
     refused(replace(record, hold="foh"), "held between samples.*hold='foh'.*fit_continuous")
     refused(record[:40], "Too few samples: 40 valid ones for 7 unknowns")
     gaps = np.arange(200) % 20 > 0
@@ -372,7 +365,7 @@ def test_unusable_records_are_refused():
 
 
 def test_a_signal_of_another_loop_is_too_weak():
-    _, record, _ = levitation(0.1, noise=0.2)
+    _, record, _ = sampled_levitation(0.1, noise=0.2)
     other = cid.random_binary(6000, amplitude=1.0, hold=7, seed=99)
     with pytest.raises(CtrlidError, match=r"too weak: .* b is not\s+distinguishable"):
         fit_iv(replace(record, r=other), 2, 2)
@@ -397,12 +390,12 @@ def test_a_poor_reference_is_named():
     ],
 )
 def test_unusable_controllers_are_refused(controller, words):
-    _, record, _ = levitation(0.1, n=500)
+    _, record, _ = sampled_levitation(0.1, n=500)
     refused(record, words, controller=controller)
 
 
 def test_orders_and_constraints_are_refused_as_in_fit_arx():
-    _, record, _ = levitation(0.1, n=500)
+    _, record, _ = sampled_levitation(0.1, n=500)
     with pytest.raises(CtrlidError, match="na must be an integer of at least 1"):
         fit_iv(record, 0, 2)
     refused(record, "contradict each other", constraints=[cid.Integrator(), cid.StaticGain(1.0)])

@@ -6,6 +6,7 @@ import pytest
 
 import ctrlid as cid
 from ctrlid import CtrlidError
+from problems import held_ball, tank
 
 RNG = np.random.default_rng(11)
 MAGLEVS = [
@@ -13,13 +14,9 @@ MAGLEVS = [
 ]
 
 
-def maglev(mass, gap, voltage):
-    return cid.plants.maglev(m=mass, K=mass * 9.81 * gap**2 / voltage**2)
-
-
 @pytest.mark.parametrize(("mass", "gap", "voltage"), MAGLEVS)
 def test_maglev_operating_point_and_poles(mass, gap, voltage):
-    plant = maglev(mass, gap, voltage)
+    plant = held_ball(mass, gap, voltage)
     op = cid.operating_point(plant, output=gap)
     assert op.input == pytest.approx(voltage, rel=1e-13)
     assert op.states == (pytest.approx(gap, rel=1e-15), 0.0)
@@ -42,10 +39,9 @@ def test_linearize_equals_finite_differences_of_python_control():
 
 
 def test_tank_has_its_time_constant():
-    plant = cid.plants.tank(area=0.01, outlet=1e-5, k=1e-5)
-    op = cid.operating_point(plant, output=0.2)
-    assert op.input == pytest.approx(np.sqrt(2 * 9.81 * 0.2))
-    pole = cid.linearize(plant, op).poles()[0].real
+    loop = tank()
+    assert loop.at.input == pytest.approx(np.sqrt(2 * 9.81 * 0.2))
+    pole = cid.linearize(loop.plant, loop.at).poles()[0].real
     assert pole == pytest.approx(-1e-5 / 0.01 * np.sqrt(9.81 / (2 * 0.2)))
 
 
@@ -61,7 +57,7 @@ def test_servo_keeps_its_pole_at_the_origin():
     [
         (cid.plants.maglev(m=0.02, K=3e-6), -0.01, "maglev has no equilibrium with x = -0.01"),
         (cid.plants.maglev(m=0.02, K=3e-6), 0.0, "no states and input V hold it there"),
-        (cid.plants.tank(area=0.01, outlet=1e-5, k=1e-5), -0.2, "inside the plant's range"),
+        (tank().plant, -0.2, "inside the plant's range"),
         (cid.plants.maglev(m=0.02, K=3e-6), np.nan, "output must be a finite number"),
         (cid.plants.maglev(m=0.02, K=3e-6), "high", "output must be a finite number; given 'high'"),
     ],

@@ -1,6 +1,7 @@
 """A loop with effects: its interface, and each effect against a closed form or formula."""
 
 import math
+from functools import partial
 
 import control as ct
 import numpy as np
@@ -10,27 +11,15 @@ from scipy import special
 import ctrlid as cid
 from ctrlid import effects as E
 from ctrlid.physics.trace import trace
-
-
-def first(t, x, u, params):
-    return x[0]
-
-
-def mass(update=lambda t, x, u, params: np.array([x[1], u[0]]), **params):
-    return ct.nlsys(update, first, name="mass", inputs=["u"], outputs=["x"], states=["x", "v"],
-                    params=params)  # fmt: skip
+from problems import first_state, levitation, mass
 
 
 def integrator():
-    return ct.nlsys(lambda t, x, u, params: np.array([u[0]]), first, name="tub", inputs=["u"],
+    return ct.nlsys(lambda t, x, u, params: np.array([u[0]]), first_state, name="tub", inputs=["u"],
                     outputs=["x"], states=["x"])  # fmt: skip
 
 
-def levitated(**options):
-    plant = cid.plants.maglev(m=0.0213, K=3.34e-6)
-    op = cid.operating_point(plant, output=0.012)
-    C = cid.design_lead(ct.sample_system(cid.linearize(plant, op), 0.002), 100, 50)
-    return cid.Loop(plant, C, dt=0.002, at=op, **options)
+levitated = partial(levitation, sampled=True, free=())
 
 
 def free_run(plant, *effects, u, dt=0.01, initial=None):
@@ -93,10 +82,10 @@ def test_other_parameters_are_another_loop():
 
 
 def test_parameters_of_an_interconnection():
-    drive = ct.nlsys(lambda t, x, u, params: -x / params["T"] + u / params["T"], first,
+    drive = ct.nlsys(lambda t, x, u, params: -x / params["T"] + u / params["T"], first_state,
                      name="drive", inputs=["e"], outputs=["f"], states=["f"],
                      params={"T": 0.1})  # fmt: skip
-    cart = ct.nlsys(lambda t, x, u, params: np.array([x[1], u[0] / params["m"]]), first,
+    cart = ct.nlsys(lambda t, x, u, params: np.array([x[1], u[0] / params["m"]]), first_state,
                     name="cart", inputs=["f"], outputs=["x"], states=["x", "v"],
                     params={"m": 2.0})  # fmt: skip
     both = ct.interconnect([drive, cart], inputs=["e"], outputs=["x"], name="both",
@@ -400,10 +389,9 @@ def test_a_full_tank_runs_over():
     spill = E.StateLimit("h1", upper=2.0, spill_to="h2", share=0.4)
     loop = cid.Loop(tanks, None, dt=DT).with_effect(spill)
     n = 1501
-    full = cid.Loop(
-        ct.nlsys(update, first, name="tanks", inputs=["q"], outputs=["h1"], states=["h1", "h2"]),
-        None, dt=DT,
-    ).with_effect(spill)  # fmt: skip
+    above = ct.nlsys(update, first_state, name="tanks", inputs=["q"], outputs=["h1"],
+                     states=["h1", "h2"])  # fmt: skip
+    full = cid.Loop(above, None, dt=DT).with_effect(spill)
     h1, h2 = cid.simulate(full, d=np.ones(n)).y, cid.simulate(loop, d=np.ones(n)).y
     t = np.arange(n) * DT
     brim = -10 * math.log(0.8)  # 10 (1 - exp(-t/10)) = 2

@@ -3,9 +3,7 @@
 Groups: without noise; scatter; what is fitted with what; information; noise; limits; refusals.
 """
 
-import runpy
 from dataclasses import replace
-from pathlib import Path
 
 import control as ct
 import numpy as np
@@ -19,23 +17,9 @@ from ctrlid.estimation.likelihood.likelihood import evaluate, pseudo_inverse
 from ctrlid.estimation.likelihood.maximization import begin_fit, information, maximize
 from ctrlid.estimation.likelihood.physics_fit import make_problem, start_values
 from ctrlid.loop.simulation import Simulator
+from problems import astray, drive, levitation, load_script, record_of, tanks
 
 RARE = 1e-5  # chance at which a test of chance may fail a right program
-
-
-def levitation(dt=2e-3, analog=False, free=("K",), **options):
-    plant = cid.plants.maglev(m=0.0213, K=3.34e-6)
-    op = cid.operating_point(plant, output=0.012)
-    C = cid.design_lead(cid.linearize(plant, op), crossover=100, phase_margin=50)
-    C = C if analog else C.sample(dt, "tustin")
-    return cid.Loop(plant, C, dt=dt, at=op, free=free, **options)
-
-
-def drive(free=("c", "k")):
-    plant = cid.plants.servo(m=2.0, c=5.0, k=30.0)
-    C = cid.PID(kp=6.0, ki=4.0, kd=0.4, filter_time=0.02)
-    at = cid.OperatingPoint((0.0, 0.0), 0.0, 0.0)
-    return cid.Loop(plant, C, dt=0.01, at=at, free=free)
 
 
 def sampled(free=("gain", "pole")):
@@ -59,15 +43,7 @@ LOOPS = {
 
 
 def experiment(loop, swing, hold, n=3000, seed=1, **noise):
-    r = cid.random_binary(n, amplitude=swing, hold=hold, around=loop.point.output, seed=seed)
-    return cid.simulate(loop, r, seed=seed + 1000, **noise)
-
-
-def astray(loop, seed):
-    """The loop with its free parameters up to 10 % off."""
-    rng = np.random.default_rng(seed)
-    known = loop.parameters
-    return loop.with_parameters({k: known[k] * (1 + rng.uniform(-0.1, 0.1)) for k in loop.free})
+    return record_of(loop, swing=swing, hold=hold, n=n, seed=seed, noise_seed=seed + 1000, **noise)
 
 
 def shaken(loop, r, seed, sensor, force=0.0, coloured=0.0, time=1.0):
@@ -105,7 +81,6 @@ def test_without_noise_the_truth_is_found(name):
 
 @pytest.mark.parametrize("hold", ["zoh", "foh"])
 def test_a_straight_or_held_input(hold):
-    plant = cid.plants.servo(m=2.0, c=5.0, k=30.0)
     t = 0.02 * np.arange(1500)
     u = np.sin(3 * t) + 0.4 * np.sin(11 * t + 1)
     if hold == "foh":
@@ -113,7 +88,7 @@ def test_a_straight_or_held_input(hold):
     else:
         G = ct.sample_system(ct.tf([30.0], [2.0, 5.0, 0.0]), 0.02)
         y = np.ravel(ct.forced_response(G, t, u).outputs)
-    loop = cid.Loop(plant, None, dt=0.02, free=("c", "k"))
+    loop = cid.Loop(drive().plant, None, dt=0.02, free=("c", "k"))
     record = cid.Record(u=u, y=y, dt=0.02, hold=hold)
     found = cid.fit_loop(astray(loop, 1), record).estimate
     assert found["c"] == pytest.approx(5.0, rel=1e-6)
@@ -310,8 +285,9 @@ def test_standard_errors_without_any_force_noise():
     With the gain of the filter held, the information is that of the slopes; the exact one is nearly
     the same, as what the noise tells of the parameters is little.
     """
-    study = runpy.run_path(str(Path(__file__).parents[1] / "benchmarks" / "study_iv.py"))
-    draw = study["draw_analog"](np.random.default_rng([3, 0, 0]), 0.5, 0.01)
+    draw = load_script("benchmarks", "study_iv").draw_analog(
+        np.random.default_rng([3, 0, 0]), 0.5, 0.01
+    )
     loop, record = draw.loop, draw.record
     names = loop.free
     start = begin_fit(make_problem(loop, names, [record]), start_values(loop, names), None)
@@ -521,18 +497,8 @@ def test_poles_include_effects_and_say_what_is_not_in_the_data():
 
 def test_a_wrong_gain_at_the_start_does_not_take_the_noise_from_the_sensor():
     """Two tanks, the lower level measured: at first a random force explains what the gain does."""
-
-    def tanks(k):
-        def update(t, x, u, p):
-            upper, lower = np.sqrt(np.maximum(x[0], 0.0)), np.sqrt(np.maximum(x[1], 0.0))
-            return [p["k"] * u[0] - p["a"] * upper, p["a"] * upper - p["b"] * lower]
-
-        return ct.nlsys(update, lambda t, x, u, p: x[1], inputs=["V"], outputs=["h2"],
-                        states=["h1", "h2"], params={"k": k, "a": 0.0708, "b": 0.068})  # fmt: skip
-
-    at = cid.operating_point(tanks(0.0463), output=4.37)
-    real, believed = (cid.Loop(tanks(k), None, dt=8.0, at=at, free=("k",))
-                      for k in (0.0463, 0.0495))  # fmt: skip
+    real = tanks(level=4.37, dt=8.0, free=("k4",), k1=0.0708, k3=0.068, k4=0.0463)
+    believed = real.with_parameters({"k4": 0.0495})
     d = cid.random_binary(3000, amplitude=0.6, hold=60, around=0.0, seed=1)
     record = cid.simulate(real, d=d, sensor_noise=0.011, seed=2)
     estimate = cid.fit_loop(believed, record).estimate

@@ -1,12 +1,12 @@
 """The colour of a model's equation errors: found where the model carries none."""
 
-import control as ct
 import numpy as np
 import pytest
 from scipy import signal
 
 import ctrlid as cid
 from ctrlid.validation.noise_model import noise_polynomial, whiten_errors
+from problems import levitation, record_of
 
 
 @pytest.mark.parametrize("colour", [[1.0, 0.0, 0.0], [1.0, -1.4, 0.5], [1.0, 0.6, 0.1]])
@@ -28,13 +28,9 @@ def test_sensor_noise_on_an_unstable_plant_reflects_its_poles():
 
 
 def test_a_right_model_without_a_noise_model_gets_a_clean_bill():
-    plant = cid.plants.maglev(m=0.0213, K=3.34e-6)
-    at = cid.operating_point(plant, output=0.012)
-    P = cid.linearize(plant, at)
-    C = cid.design_lead(ct.sample_system(ct.ss(P), 0.005), crossover=85, phase_margin=45)
-    loop = cid.Loop(plant, C, dt=0.005, at=at)
-    r = cid.random_binary(8000, amplitude=1e-4, hold=4, around=at.output, seed=1)
-    record = cid.simulate(loop, r, sensor_noise=1e-5, seed=2)
+    loop = levitation(dt=0.005, crossover=85, phase_margin=45, sampled=True)
+    P = loop.linearize()
+    record = record_of(loop, swing=1e-4, hold=4, n=8000, seed=1, sensor_noise=1e-5)
     right = cid.compare(record, P)
     assert "SOMETHING IS MISSING" not in right.verdict
     assert right.curves[-1].noise_share > 0.95

@@ -14,6 +14,7 @@ import pytest
 import ctrlid as cid
 from ctrlid._base.text import Printed, html_lines
 from ctrlid.reporting.tables import Table
+from problems import REST, record_of, servo
 
 ROOT = Path(__file__).resolve().parents[1]
 NOTEBOOK = ROOT / "examples" / "ten_lines.ipynb"
@@ -30,15 +31,12 @@ def read(page):
 
 @pytest.fixture(scope="module")
 def loop():
-    at = cid.OperatingPoint(states=(0.0, 0.0), input=0.0, output=0.0)
-    plant = cid.plants.servo(m=1.0, c=2.0, k=3.0)
-    return cid.Loop(plant, cid.PID(kp=20.0, kd=1.0), dt=0.01, at=at, free=("k",))
+    return servo(cid.PID(kp=20.0, kd=1.0), at=REST, free=("k",))
 
 
 @pytest.fixture(scope="module")
 def record(loop):
-    r = cid.random_binary(1000, amplitude=0.1, hold=50, seed=1)
-    return cid.simulate(loop, r, sensor_noise=1e-3, seed=2)
+    return record_of(loop, swing=0.1, hold=50, n=1000, seed=1, sensor_noise=1e-3)
 
 
 @pytest.fixture(scope="module")

@@ -6,15 +6,13 @@ import pytest
 import ctrlid as cid
 from ctrlid import CtrlidError
 from ctrlid.data.several_records import model_and_data
+from problems import REST, record_of, servo
 
 
 @pytest.fixture(scope="module")
 def pair():
-    plant = cid.plants.servo(m=1.0, c=2.0, k=3.0)
-    rest = cid.OperatingPoint((0.0, 0.0), 0.0, 0.0)
-    loop = cid.Loop(plant, cid.PID(kp=20.0, kd=1.0), dt=0.01, at=rest, free=("k",))
-    r = cid.random_binary(600, amplitude=0.1, hold=50, seed=1)
-    return loop, cid.simulate(loop, r, sensor_noise=1e-4, seed=2)
+    loop = servo(cid.PID(kp=20.0, kd=1.0), at=REST, free=("k",))
+    return loop, record_of(loop, swing=0.1, hold=50, n=600, seed=1, sensor_noise=1e-4)
 
 
 CALLS = {

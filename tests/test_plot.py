@@ -12,19 +12,19 @@ import ctrlid as cid
 from ctrlid import plot
 from ctrlid.reporting import pictures as _pictures
 from ctrlid.reporting.plot.axes import COLOURS
+from problems import legend, record_of, redesigned_levitation, servo
 
 DT = 0.01
 
 
 @pytest.fixture(scope="module")
 def loop():
-    return cid.Loop(cid.plants.servo(m=1.0, c=2.0, k=3.0), 5.0, dt=DT)
+    return servo(dt=DT)
 
 
 @pytest.fixture(scope="module")
 def record(loop):
-    r = cid.random_binary(1000, amplitude=0.1, hold=50, seed=1)
-    made = cid.simulate(loop, r, sensor_noise=2e-3, seed=2)
+    made = record_of(loop, swing=0.1, hold=50, n=1000, seed=1, sensor_noise=2e-3)
     return replace(made, units={"r": "m", "u": "V", "y": "m"})
 
 
@@ -35,14 +35,7 @@ def comparison(record, loop):
 
 @pytest.fixture(scope="module")
 def outcome():
-    plant = cid.plants.maglev(m=0.0213, K=3.34e-6)
-    op = cid.operating_point(plant, output=0.012)
-    base = cid.Loop(plant, None, dt=0.001, at=op)
-    return cid.redesign(cid.linearize(plant, op), base, crossover=100, phase_margin=50)
-
-
-def legend(ax):
-    return [text.get_text() for text in ax.get_legend().get_texts()]
+    return redesigned_levitation()
 
 
 def labels(ax):

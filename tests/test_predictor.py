@@ -3,6 +3,8 @@
 Groups: linear plants; simulated records; stretches that do not count; several steps; refusals.
 """
 
+from functools import partial
+
 import control as ct
 import numpy as np
 import pytest
@@ -12,20 +14,17 @@ import ctrlid as cid
 from ctrlid import CtrlidError
 from ctrlid.estimation.likelihood.prediction import predict_ahead
 from ctrlid.validation.residual_tests import autocorrelation, cross_correlation
+from problems import levitation, record_of, servo
 
 SENSOR, FORCE = 2e-6, 0.02
 
 
-def maglev(analog=False, dt=1e-3):
-    plant = cid.plants.maglev(m=0.0213, K=3.34e-6)
-    op = cid.operating_point(plant, output=0.012)
-    C = cid.design_lead(cid.linearize(plant, op), crossover=100, phase_margin=50)
-    return cid.Loop(plant, C if analog else ct.sample_system(C, dt, "tustin"), dt=dt, at=op)
+levitated = partial(levitation, dt=1e-3, free=())
 
 
 def experiment(loop, n=6000, seed=1, **noise):
-    r = cid.random_binary(n, amplitude=1e-4, hold=20, around=loop.at.output, seed=seed)
-    return cid.simulate(loop, r, seed=seed + 10, **{"sensor_noise": SENSOR, **noise})
+    return record_of(loop, swing=1e-4, hold=20, n=n, seed=seed, noise_seed=seed + 10,
+                     **{"sensor_noise": SENSOR, **noise})  # fmt: skip
 
 
 def kalman(a, b, c, f, u, y, ratio):
@@ -96,7 +95,7 @@ def test_a_plant_in_discrete_time():
 
 @pytest.mark.parametrize("analog", [False, True])
 def test_innovations_are_white_and_of_the_expected_size(analog):
-    loop = maglev(analog)
+    loop = levitated(analog=analog)
     record = experiment(loop, force_noise=FORCE)
     prediction = cid.predict(loop, record, force_noise=FORCE / SENSOR)
     assert prediction.sensor_noise == pytest.approx(SENSOR, rel=0.05)
@@ -114,7 +113,7 @@ def test_innovations_are_white_and_of_the_expected_size(analog):
 
 
 def test_the_noise_ratio_is_found():
-    loop = maglev()
+    loop = levitated()
     for force in (0.005, 0.05):
         prediction = cid.predict(loop, experiment(loop, force_noise=force))
         assert prediction.sensor_noise == pytest.approx(SENSOR, rel=0.1)
@@ -122,7 +121,7 @@ def test_the_noise_ratio_is_found():
 
 
 def test_a_noise_free_record_is_predicted_to_integration_accuracy():
-    loop = maglev()
+    loop = levitated()
     record = experiment(loop, sensor_noise=0.0)
     error = cid.predict(loop, record).innovations
     assert np.abs(error).max() < 1e-6 * record.y.std()
@@ -130,7 +129,7 @@ def test_a_noise_free_record_is_predicted_to_integration_accuracy():
 
 def test_a_known_analog_circuit_is_followed_between_samples():
     """A straight line between the samples of u misses what the circuit did at each switch."""
-    loop = maglev(analog=True)
+    loop = levitated(analog=True)
     record = experiment(loop, sensor_noise=0.0)
     known = cid.predict(loop, record, force_noise=1e3).innovations
     alone = cid.Loop(loop.plant, None, dt=loop.dt, at=loop.at)
@@ -139,11 +138,10 @@ def test_a_known_analog_circuit_is_followed_between_samples():
 
 
 def test_a_smooth_input_is_followed_as_a_straight_line():
-    plant = cid.plants.servo(m=1.0, c=2.0, k=3.0)
     t = 0.05 * np.arange(400)
     response = ct.forced_response(ct.tf([3.0], [1.0, 2.0, 0.0]), t, np.sin(2 * t))
     record = cid.Record(u=np.sin(2 * t), y=np.ravel(response.outputs), dt=0.05, hold="foh")
-    loop = cid.Loop(plant, None, dt=0.05)
+    loop = servo(None, dt=0.05)
     assert np.abs(cid.predict(loop, record).innovations).max() < 1e-8
     held = cid.Record(u=record.u, y=record.y, dt=0.05, hold="zoh")
     assert np.abs(cid.predict(loop, held).innovations).max() > 1e-4
@@ -151,7 +149,7 @@ def test_a_smooth_input_is_followed_as_a_straight_line():
 
 @pytest.mark.parametrize("n", [100_000, pytest.param(1_000_000, marks=pytest.mark.slow)])
 def test_long_records_of_an_unstable_plant_stay_finite(n):
-    loop = maglev()
+    loop = levitated()
     record = experiment(loop, n=n)
     prediction = cid.predict(loop, record)
     assert np.isfinite(prediction.innovations).all()
@@ -163,7 +161,7 @@ def test_long_records_of_an_unstable_plant_stay_finite(n):
 
 
 def test_what_is_not_valid_is_not_looked_at():
-    loop = maglev()
+    loop = levitated()
     record = experiment(loop, n=3000)
     valid = np.ones(3000, dtype=bool)
     valid[:700] = valid[1500:1505] = valid[2000:2400] = False
@@ -186,7 +184,7 @@ def test_what_is_not_valid_is_not_looked_at():
 
 
 def test_a_record_that_starts_elsewhere_is_caught():
-    loop = maglev()
+    loop = levitated()
     r = np.full(2000, 0.0115)
     record = cid.simulate(loop, r, sensor_noise=SENSOR, initial=(0.0118, 0.003), seed=1)
     prediction = cid.predict(loop, record)
@@ -198,7 +196,7 @@ def test_a_record_that_starts_elsewhere_is_caught():
 
 
 def test_several_steps_equal_a_simulation_from_the_filtered_state():
-    loop = maglev()
+    loop = levitated()
     record = experiment(loop, n=400)
     prediction = cid.predict(loop, record)
     index, y = predict_ahead(loop, record, prediction, 12)
@@ -211,7 +209,7 @@ def test_several_steps_equal_a_simulation_from_the_filtered_state():
 
 
 def test_several_steps_need_as_many_valid_samples():
-    loop = maglev()
+    loop = levitated()
     record = experiment(loop, n=400)
     prediction = cid.predict(loop, record)
     valid = np.ones(400, dtype=bool)
@@ -228,7 +226,7 @@ def test_several_steps_need_as_many_valid_samples():
 
 
 def test_refusals():
-    loop = maglev()
+    loop = levitated()
     record = experiment(loop, n=200)
     with pytest.raises(CtrlidError, match=r"the Loop first, .*; given Record and Loop"):
         cid.predict(record, loop)

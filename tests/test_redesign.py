@@ -12,12 +12,12 @@ import pytest
 
 import ctrlid as cid
 from ctrlid import CtrlidError
+from problems import levitation
 
-PLANT = cid.plants.maglev(m=0.0213, K=3.34e-6)
-AT = cid.operating_point(PLANT, output=0.012)
-P = cid.linearize(PLANT, AT)
 DT = 1e-3
-LOOP = cid.Loop(PLANT, None, dt=DT, at=AT)
+LOOP = replace(levitation(dt=DT, free=()), controller=None)
+PLANT, AT = LOOP.plant, LOOP.at
+P = cid.linearize(PLANT, AT)
 SAMPLED = ct.tf(ct.sample_system(ct.ss(ct.tf(P.num, P.den)), DT))
 NUMBERS = ("phase_margin", "gain_margin", "gain_reduction_margin", "crossover", "final_value",
            "overshoot", "settling_time")  # fmt: skip

@@ -1,11 +1,13 @@
 """Noise from repeats: what differs between periods is noise, whatever the model."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 
 import ctrlid as cid
+import problems
 from ctrlid import effects as E
 from ctrlid.diagnosis.fitted_model import Model
 from ctrlid.diagnosis.fresh_data import FreshData, choose_fresh_data
@@ -20,11 +22,7 @@ PERIOD, TIMES = 800, 5
 SENSOR, FORCE = 1e-4, 0.3
 
 
-def drive(free=("m", "c")):
-    plant = cid.plants.servo(m=2.0, c=5.0, k=30.0)
-    C = cid.PID(kp=40.0, kd=2.0)
-    at = cid.OperatingPoint((0.0, 0.0), 0.0, 0.0)
-    return cid.Loop(plant, C, dt=0.01, at=at, free=free)
+drive = partial(problems.drive, ("m", "c"), controller=cid.PID(kp=40.0, kd=2.0))
 
 
 def repeated(real, seed, periods=TIMES):

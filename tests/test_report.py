@@ -12,6 +12,7 @@ import pytest
 import ctrlid as cid
 from ctrlid import plot
 from ctrlid.reporting.tables import Table
+from problems import record_of, redesigned_levitation, servo
 
 VOID = {"meta", "img", "br", "hr", "link", "input"}
 
@@ -85,18 +86,14 @@ def read(path):
 
 @pytest.fixture(scope="module")
 def record():
-    loop = cid.Loop(cid.plants.servo(m=1.0, c=2.0, k=3.0), 5.0, dt=0.01)
-    r = cid.random_binary(800, amplitude=0.1, hold=50, seed=1)
-    made = cid.simulate(loop, r, sensor_noise=2e-3, seed=2)
+    loop = servo()
+    made = record_of(loop, swing=0.1, hold=50, n=800, seed=1, sensor_noise=2e-3)
     return loop, replace(made, units={"r": "m", "u": "V", "y": "m"})
 
 
 @pytest.fixture(scope="module")
 def outcome():
-    plant = cid.plants.maglev(m=0.0213, K=3.34e-6)
-    op = cid.operating_point(plant, output=0.012)
-    base = cid.Loop(plant, None, dt=0.001, at=op)
-    return cid.redesign(cid.linearize(plant, op), base, crossover=100, phase_margin=50)
+    return redesigned_levitation()
 
 
 def test_page_of_a_record(record, tmp_path):

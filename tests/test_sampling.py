@@ -2,27 +2,22 @@
 
 from dataclasses import replace
 
-import control as ct
 import numpy as np
 import pytest
 
 import ctrlid as cid
 from ctrlid.validation.sampling_sweep import averaged
+from problems import levitation, record_of
 
 POLE = 40.435  # rad/s
 
 
 def levitated(pole_times_period, n, noise=2e-6, digital=True, seed=1):
     """A maglev loop sampled so fast; the reference switches every 0.6 / pole."""
-    plant = cid.plants.maglev(m=0.0213, K=3.34e-6)
-    at = cid.operating_point(plant, output=0.012)
-    P = cid.linearize(plant, at)
-    dt = pole_times_period / POLE
-    C = cid.design_lead(P, crossover=100, phase_margin=50)
-    C = ct.sample_system(ct.ss(C), dt, "tustin") if digital else C
+    loop = levitation(dt=pole_times_period / POLE, analog=not digital)
     hold = max(1, round(0.6 / pole_times_period))
-    r = cid.random_binary(n, amplitude=1e-4, hold=hold, around=at.output, seed=seed)
-    return cid.simulate(cid.Loop(plant, C, dt=dt, at=at), r, sensor_noise=noise, seed=seed)
+    return record_of(loop, swing=1e-4, hold=hold, n=n, seed=seed, noise_seed=seed,
+                     sensor_noise=noise)  # fmt: skip
 
 
 @pytest.fixture(scope="module")

@@ -5,24 +5,14 @@ import pytest
 import ctrlid as cid
 from ctrlid import effects as E
 from ctrlid.diagnosis.several_records import describe_presence
+from problems import drive, record_of
 
 FEW = (E.ViscousFriction, E.CoulombFriction, E.InputDelay, E.LinearStiffness)
 
 
-def drive():
-    plant = cid.plants.servo(m=2.0, c=5.0, k=30.0)
-    C = cid.PID(kp=6.0, ki=4.0, kd=0.4, filter_time=0.02)
-    at = cid.OperatingPoint((0.0, 0.0), 0.0, 0.0)
-    return cid.Loop(plant, C, dt=0.01, at=at, free=("c", "k"))
-
-
-def record_of(real, seed, n=1200):
-    r = cid.random_binary(n, amplitude=0.3, hold=60, seed=seed)
-    return cid.simulate(real, r, sensor_noise=1e-3, seed=seed + 1)
-
-
 def diagnosed(*reals, seed, catalogue=FEW):
-    records = [record_of(real, seed + 10 * k) for k, real in enumerate(reals)]
+    records = [record_of(real, swing=0.3, hold=60, n=1200, seed=seed + 10 * k, sensor_noise=1e-3)
+               for k, real in enumerate(reals)]  # fmt: skip
     return cid.diagnose(drive(), records, catalogue=catalogue, progress=False)
 
 

@@ -1,6 +1,5 @@
 """Fits and searches by the error of an open-loop simulation."""
 
-import control as ct
 import numpy as np
 import pytest
 
@@ -12,21 +11,7 @@ from ctrlid.diagnosis.noise_tests import run_noise_tests
 from ctrlid.diagnosis.open_loop_fit import Simulation
 from ctrlid.diagnosis.open_loop_search import search_by_simulation
 from ctrlid.diagnosis.recalibration import fit_base_model
-
-TRUE = {"k1": 0.05, "k3": 0.06, "k4": 0.05}
-
-
-def tanks(**values):
-    """Two tanks, the upper running into the lower."""
-
-    def rates(t, x, u, p):
-        upper, lower = np.sqrt(np.maximum(x, 1e-6))
-        return np.array([p["k4"] * u[0] - p["k1"] * upper, p["k1"] * upper - p["k3"] * lower])
-
-    plant = ct.nlsys(rates, lambda t, x, u, p: x[1], inputs=["u"], outputs=["y"],
-                     states=["h1", "h2"], params=TRUE | values, name="two tanks")  # fmt: skip
-    return cid.Loop(plant, None, dt=4.0, at=cid.operating_point(plant, output=6.0),
-                    free=("k1", "k3", "k4"))  # fmt: skip
+from problems import TANKS, tanks
 
 
 def record_of(loop, n=600, noise=1e-3, seed=1):
@@ -64,7 +49,7 @@ def test_a_record_without_noise_gives_the_parameters_back():
     record = record_of(tanks(), noise=0.0)
     task, x0 = simulation_of(tanks(k1=0.06, k3=0.05, k4=0.06), record)
     found = task.fit(np.array([0.06, 0.05, 0.06]), x0 + 0.5)
-    np.testing.assert_allclose(found.theta, list(TRUE.values()), rtol=1e-5)
+    np.testing.assert_allclose(found.theta, list(TANKS.values()), rtol=1e-5)
     assert found.square < 1e-10
     starts = [found.starts[0][k] for k in ("h1", "h2")]
     np.testing.assert_allclose(starts, tanks().point.states, rtol=1e-4)
@@ -72,11 +57,11 @@ def test_a_record_without_noise_gives_the_parameters_back():
 
 def test_standard_errors_are_those_of_white_noise():
     task, x0 = simulation_of(tanks(), record_of(tanks(), noise=0.05))
-    found = task.fit(np.array(list(TRUE.values())), x0)
+    found = task.fit(np.array(list(TANKS.values())), x0)
     assert found.correlated == pytest.approx(1.0, abs=0.5)
     for name, value in zip(found.names, found.theta, strict=True):
         error = found.standard_errors[name]
-        assert abs(value - TRUE[name]) < 4.5 * error < 0.2 * TRUE[name]
+        assert abs(value - TANKS[name]) < 4.5 * error < 0.2 * TANKS[name]
 
 
 def test_the_search_names_an_overflow_and_a_wrong_zero():

@@ -14,6 +14,7 @@ from scipy.integrate import solve_ivp
 import ctrlid as cid
 from ctrlid import CtrlidError
 from ctrlid.loop.period_map import growth_rate
+from problems import REST, drive, held_ball, rough_mass, servo, tank, under_lead
 
 RNG = np.random.default_rng(5)
 CASES = [
@@ -25,14 +26,10 @@ CASES = [
 
 def make(mass, gap, voltage, share=0.05, analog=False, **kwargs):
     """Levitate a ball with a lead at 2.5 times its unstable pole p and p*dt = share."""
-    plant = cid.plants.maglev(m=mass, K=mass * 9.81 * gap**2 / voltage**2)
+    plant = held_ball(mass, gap, voltage)
     op = cid.operating_point(plant, output=gap)
     p = np.sqrt(2 * 9.81 / gap)
-    C = cid.design_lead(cid.linearize(plant, op), crossover=2.5 * p, phase_margin=50)
-    dt = share / p
-    if not analog:
-        C = ct.sample_system(C, dt, "tustin")
-    return cid.Loop(plant, C, dt=dt, at=op, **kwargs), op
+    return under_lead(plant, share / p, op, crossover=2.5 * p, analog=analog, **kwargs), op
 
 
 def reference(loop, r):
@@ -150,13 +147,11 @@ def test_initial_states_of_plant_and_controller():
 
 
 def test_open_loop_runs_from_d():
-    plant = cid.plants.tank(area=0.01, outlet=1e-5, k=1e-5)
-    op = cid.operating_point(plant, output=0.2)
-    loop = cid.Loop(plant, None, dt=5.0, at=op)
+    loop = tank()
     record = cid.simulate(loop, d=np.full(4000, 0.1))
     assert record.r is None
-    assert record.u[0] == pytest.approx(op.input + 0.1)
-    level = (op.input + 0.1) ** 2 / (2 * 9.81)
+    assert record.u[0] == pytest.approx(loop.at.input + 0.1)
+    level = (loop.at.input + 0.1) ** 2 / (2 * 9.81)
     assert record.y[-1] == pytest.approx(level, rel=1e-6)
 
 
@@ -188,12 +183,11 @@ def test_an_unstable_loop_says_so():
 
 
 def test_the_growth_of_a_loop_with_an_analog_controller_is_that_of_its_poles():
-    plant = cid.plants.servo(m=2.0, c=5.0, k=30.0)
     for filter_time in (1e-2, 1e-7):  # the second is far faster than any step of an integration
         num = [6.0 * filter_time + 0.4, 6.0]
         C = ct.tf(num, [filter_time, 1.0])
         closed = np.polyadd(np.polymul([2.0, 5.0, 0.0], [filter_time, 1.0]), 30.0 * np.array(num))
-        loop = cid.Loop(plant, C, dt=0.01, at=cid.OperatingPoint((0.0, 0.0), 0.0, 0.0))
+        loop = drive((), controller=C)
         assert loop.analog
         assert growth_rate(loop) == pytest.approx(np.roots(closed).real.max(), rel=1e-6)
 
@@ -213,16 +207,9 @@ def test_an_unstable_plant_is_not_simulated_without_its_controller():
 
 
 def test_a_plant_too_sharp_to_integrate_warns():
-    plant = ct.nlsys(
-        lambda t, x, u, p: [x[1], u[0] - 50 * np.sign(x[1]) - 2 * x[1]], lambda t, x, u, p: x[0],
-        inputs=["u"], outputs=["y"], states=["x", "v"], name="rough",
-    )  # fmt: skip
-    loop = cid.Loop(plant, None, dt=0.05)
+    loop = cid.Loop(rough_mass(50), None, dt=0.05)
     with pytest.warns(cid.CtrlidWarning, match="simulate with a smaller dt"):
         cid.simulate(loop, d=60 * np.sin(np.arange(100)))
-
-
-NOWHERE = cid.OperatingPoint(states=(0.0, 0.0), input=0.0, output=0.0)
 
 
 @pytest.mark.parametrize(
@@ -240,11 +227,11 @@ NOWHERE = cid.OperatingPoint(states=(0.0, 0.0), input=0.0, output=0.0)
             "needs a Loop.*given NonlinearIOSystem",
         ),
         (
-            lambda loop: cid.simulate(cid.Loop(loop.plant, 1.0, dt=1.0, at=NOWHERE), np.ones(5)),
+            lambda loop: cid.simulate(cid.Loop(loop.plant, 1.0, dt=1.0, at=REST), np.ones(5)),
             "not defined at the operating point",
         ),
         (
-            lambda loop: growth_rate(cid.Loop(loop.plant, 1.0, dt=1.0, at=NOWHERE)),
+            lambda loop: growth_rate(cid.Loop(loop.plant, 1.0, dt=1.0, at=REST)),
             "no derivative at its",
         ),
         (lambda loop: cid.simulate(cid.Loop(loop.plant, None, dt=1.0, at=loop.at)), "needs r or d"),
@@ -256,10 +243,8 @@ def test_simulate_refuses_bad_signals(call, words):
 
 
 def test_force_noise_needs_a_moving_mass():
-    plant = cid.plants.tank(area=0.01, outlet=1e-5, k=1e-5)
-    loop = cid.Loop(plant, None, dt=1.0, at=cid.operating_point(plant, output=0.2))
     with pytest.raises(CtrlidError, match="a state whose rate is another state; tank has none"):
-        cid.simulate(loop, d=np.zeros(10), force_noise=1.0)
+        cid.simulate(tank(dt=1.0), d=np.zeros(10), force_noise=1.0)
 
 
 MAGLEV = cid.plants.maglev(m=0.02, K=3e-6)
@@ -352,8 +337,9 @@ def test_records_of_textbook_plants_have_units_and_an_open_fall_is_noticed():
     alone = cid.Loop(loop.plant, None, dt=loop.dt, at=op)
     with pytest.raises(CtrlidError, match=r"x ran away to .* The loop is open"):
         cid.simulate(alone, d=np.full(5000, -0.01))
-    servo = cid.Loop(cid.plants.servo(m=1.0, c=2.0, k=3.0), None, dt=0.1)
-    assert cid.simulate(servo, d=np.ones(4500)).y[-1] > 600  # an integrator may travel far
+    assert (
+        cid.simulate(servo(None, dt=0.1), d=np.ones(4500)).y[-1] > 600
+    )  # an integrator may travel far
 
 
 def test_an_undamped_plant_swings_for_ever():

@@ -8,6 +8,7 @@ import pytest
 
 import ctrlid as cid
 from ctrlid.validation.order_selection import _reduce, _regress
+from problems import LINEAR_LEVITATION, record_of, under_lead
 
 
 def random_record(rng, n=6000):
@@ -30,12 +31,9 @@ def random_record(rng, n=6000):
 
 
 def levitated(pole_times_period, noise, n=8000):
-    P = ct.tf([-6.5], [1, 0, -1600])
-    dt = pole_times_period / 40
-    C = ct.sample_system(ct.ss(cid.design_lead(P, crossover=100, phase_margin=50)), dt, "tustin")
+    loop = under_lead(LINEAR_LEVITATION, pole_times_period / 40)
     hold = max(1, round(0.6 / pole_times_period))
-    r = cid.random_binary(n, amplitude=1e-4, hold=hold, seed=1)
-    return cid.simulate(cid.Loop(P, C, dt=dt), r, sensor_noise=noise, seed=2)
+    return record_of(loop, swing=1e-4, hold=hold, n=n, seed=1, sensor_noise=noise)
 
 
 @pytest.mark.slow

@@ -16,12 +16,12 @@ from ctrlid.diagnosis.gap import choose_comparison, make_window, simulate_window
 from ctrlid.estimation.likelihood.prediction import predict_ahead, spread_ahead
 from ctrlid.validation.comparison import Comparison, Curve
 from ctrlid.validation.residual_tests import Correlation
+from problems import held_ball, levitation, rough_mass, tank
 
-PLANT = cid.plants.maglev(m=0.0213, K=3.34e-6)
-AT = cid.operating_point(PLANT, output=0.012)
-LEAD = cid.design_lead(cid.linearize(PLANT, AT), crossover=100, phase_margin=50)
 DT = 1e-3
-DIGITAL = ct.sample_system(LEAD, DT, "tustin")
+LEAD = levitation(dt=DT, analog=True).controller
+DIGITAL = levitation(dt=DT).controller
+PLANT, AT = levitation().plant, levitation().at
 PID = cid.PID(kp=-700.0, ki=-1500.0, kd=-13.0, filter_time=2e-3, lower=0.0, upper=6.0)
 
 
@@ -116,9 +116,7 @@ def test_injected_signals_are_found_and_injected_again():
 
 
 def test_an_open_loop_of_a_stable_plant_is_simulated_from_its_input():
-    plant = cid.plants.tank(area=0.01, outlet=1e-5, k=1e-5)
-    op = cid.operating_point(plant, output=0.2)
-    loop = cid.Loop(plant, None, dt=5.0, at=op)
+    loop = tank()
     d = cid.random_binary(600, amplitude=0.1, hold=40, seed=1)
     record = cid.simulate(loop, d=d, sensor_noise=1e-5, initial=(0.21,), seed=3)
     found = cid.compare(record, loop)
@@ -342,14 +340,10 @@ def test_a_stretch_too_short_for_the_horizon():
 
 
 def test_a_sharp_plant_gets_a_note_instead_of_a_warning():
-    plant = ct.nlsys(
-        lambda t, x, u, p: [x[1], u[0] - 5 * np.sign(x[1]) - 2 * x[1]], lambda t, x, u, p: x[0],
-        inputs=["u"], outputs=["y"], states=["x", "v"], name="rough",
-    )  # fmt: skip
     t = 0.05 * np.arange(60)
     smooth = cid.simulate(cid.Loop(cid.plants.servo(m=1.0, c=2.0, k=1.0), 20.0, dt=0.05),
                           0.5 * np.sin(t), sensor_noise=1e-4, seed=1)  # fmt: skip
-    found = cid.compare(smooth, cid.Loop(plant, 20.0, dt=0.05))
+    found = cid.compare(smooth, cid.Loop(rough_mass(5), 20.0, dt=0.05))
     assert any("the simulation is only good to about" in note for note in found.notes)
 
 
@@ -439,7 +433,7 @@ def test_emps_with_and_without_its_friction(data_dir):
 def test_inteco_log_is_predicted_over_its_valid_stretches(data_dir):
     record = cid.datasets.load("inteco_pid_step")
     at = cid.OperatingPoint((0.012, 0.0), 0.5, 0.012)
-    plant = cid.plants.maglev(m=0.058, K=0.058 * 9.81 * 0.012**2 / 0.5**2)
+    plant = held_ball(0.058, 0.012, 0.5)
     found = cid.compare(record, cid.Loop(plant, None, dt=1e-3, at=at))
     assert found["one-step"].fit > 98
     assert "SOMETHING IS MISSING" in found.verdict  # the coil
