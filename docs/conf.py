@@ -86,6 +86,6 @@ html_theme_options = {
     "header_links_before_dropdown": 9,
 }
 WITHOUT_SECTIONS = (
-    "index", "failure", "which_one_when", "paper", "extend", "effects", "gallery/**",
+    "index", "failure", "which_one_when", "paper", "measured", "extend", "effects", "gallery/**",
 )  # fmt: skip
 html_sidebars = {page: [] for page in WITHOUT_SECTIONS}
