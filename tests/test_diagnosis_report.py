@@ -416,7 +416,7 @@ def test_picture_of_rare_cases(found):
 def test_predictions_at_some_samples_only_are_drawn_as_lines(found):
     base = found["explained"]
     sparse = np.where(np.arange(len(base.gap.time)) % 3 == 0, base.gap.simulated_after, np.nan)
-    gap = replace(base.gap, kind="12-step prediction", simulated_after=sparse)
+    gap = replace(base.gap, kind="12-step prediction", horizon=12, simulated_after=sparse)
     output, error, *_ = plot.diagnosis(replace(base, gap=gap))
     for ax in (output, error):
         drawn = [line.get_ydata() for line in ax.get_lines() if "after" in line.get_label()
@@ -489,7 +489,7 @@ def test_a_window_far_from_rest_finds_its_start():
     assert abs(record.y[0] - loop.at.output) > 4e-3
     window = gap_of.make_window(record)
     error = gap_of.root_mean_square(
-        [window], [gap_of.simulate_window(loop, window, "closed-loop simulation")]
+        [window], [gap_of.simulate_window(loop, window, gap_of.Way("closed-loop simulation"))]
     )
     assert error < 1e-5
 
@@ -517,16 +517,16 @@ def test_noise_that_parts_a_loop_from_itself_explains_a_gap():
     record = record_of(rough, swing=0.03, hold=90, n=3000, seed=3, sensor_noise=1e-4,
                        force_noise=0.005)  # fmt: skip
     windows, fitted = [gap_of.make_window(record)], fit_base_model(rough, [record], ("k",)).fit
-    kind = "closed-loop simulation"
+    way = gap_of.Way("closed-loop simulation")
     floors = [
-        gap_of.compute_floor([loop], fitted, windows, kind, THRESHOLD.floor_more_runs)
+        gap_of.compute_floor([loop], fitted, windows, way, THRESHOLD.floor_more_runs)
         for loop in (rough, calm)
     ]
     assert floors[0].widest > 2 * floors[0].both
     assert floors[1].widest < 1.2 * floors[1].both
     for loop, floor in zip((rough, calm), floors, strict=True):
         left = 2 * floor.both
-        gap = Gap(kind, 1.0, 1.0, left, floor.both, "m", *[np.zeros(3)] * 4, floor.widest)
+        gap = Gap(str(way), 1.0, 1.0, left, floor.both, "m", *[np.zeros(3)] * 4, floor.widest)
         assert gap_stands_out(gap, fitted) == (loop is calm)
         assert (
             "differ in noise alone" in wording.describe_shrinking(replace(gap, before=0.9))

@@ -178,6 +178,7 @@ def test_report_in_full():
         [-2.0, 1.0, 2e-5, 0.1],
         np.diag([0.0, 0.0, 1e-14, 1e-4]),
         method="constrained least squares (ARX)",
+        errors="equation error",
         branch="a1 <= -2",
         active_bounds=(bound,),
     )

@@ -80,7 +80,8 @@ def test_a_run_is_followed_from_the_middle_of_a_fall():
     r = cid.random_binary(3000, amplitude=7e-4, hold=56, around=0.0169, seed=5)
     record = cid.simulate(loop, r, sensor_noise=1e-5, seed=4)
     way = choose_comparison(loop, record)
-    assert way == "closed-loop simulation"
+    assert str(way) == "closed-loop simulation"
+    assert way.horizon == 0
     speed = np.diff(record.y)
     hardest = 500 + np.argsort(-np.abs(np.diff(speed)[500:2000]))[:10]
     for k in hardest.tolist():

@@ -113,15 +113,17 @@ def _make_finding(
     words, reference = "", None
     if apart:
         words, reference = find_experiment(f.trial, apart, records[0])
+    seen = _find_presence(f, found, records)
+    note = "" if seen is None else describe_presence(seen, len(records))
     return Finding(effect, own, others, same, f.trial.gain, shares.get(f.position, math.nan),
-                   words, reference, _find_presence(f, found, records))  # fmt: skip
+                   words, reference, note, tuple(k + 1 for k in seen or ()))  # fmt: skip
 
 
-def _find_presence(f: Weighed, found: Search, records: Sequence[Record]) -> str:
-    """Say in which of several records an effect is seen when each is fitted alone."""
+def _find_presence(f: Weighed, found: Search, records: Sequence[Record]) -> list[int] | None:
+    """Return in which of several records an effect is seen when each is fitted alone, from 0."""
     several = len(records) > 1 and len(found.final.records) == len(records)
     if not several or found.final.errors is not None:
-        return ""
+        return None
     seen = []
     for k, record in enumerate(records):
         try:
@@ -130,7 +132,7 @@ def _find_presence(f: Weighed, found: Search, records: Sequence[Record]) -> str:
             continue
         if refit_candidate(alone, screen_at(alone, f.trial.fitted)).net_gain > THRESHOLD.gate:
             seen.append(k)
-    return describe_presence(seen, len(records))
+    return seen
 
 
 def _rank_candidates(found: Search) -> tuple[Candidate, ...]:

@@ -38,6 +38,8 @@ class Gap:
     widest : float
         RMS error of the widest of several simulations with noise [output unit]: far above the
         floor where a loop hunts, which no simulation follows for long.
+    horizon : int
+        How many samples ahead a prediction looks; 0 for a simulation.
     """
 
     kind: str
@@ -51,6 +53,7 @@ class Gap:
     simulated_before: Array
     simulated_after: Array
     widest: float = math.nan
+    horizon: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,6 +80,9 @@ class Finding:
         That experiment as a reference signal [output unit], ready to run.
     note : str
         What else should be known, such as the records in which it was present.
+    records : tuple of int
+        Numbers of the records, from 1, in which it is seen when each of several is fitted alone;
+        empty for one record.
     """
 
     effect: AbstractEffect
@@ -88,6 +94,7 @@ class Finding:
     experiment: str = ""
     reference: Array | None = None
     note: str = ""
+    records: tuple[int, ...] = ()
 
     @property
     def name(self) -> str:

@@ -29,7 +29,7 @@ class FreshData:
 
     windows: tuple[gaps.Window, ...]
     rest: tuple[Record, ...] | None
-    kind: str
+    way: gaps.Way
 
     def loops(self, model: Model) -> tuple[Loop, ...]:
         """Return the loop of a model for each window, ready to be compared there."""
@@ -62,7 +62,7 @@ class FreshData:
     def outputs(self, loops: Sequence[Loop]) -> tuple[Array, ...]:
         """Return what each loop makes of its window."""
         pairs = zip(loops, self.windows, strict=True)
-        return tuple(gaps.simulate_window(loop, w, self.kind) for loop, w in pairs)
+        return tuple(gaps.simulate_window(loop, w, self.way) for loop, w in pairs)
 
     def gap(self, loops: Sequence[Loop]) -> float:
         """Return the RMS error of loops [output unit]."""

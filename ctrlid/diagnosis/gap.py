@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from scipy import signal
@@ -22,15 +22,28 @@ from ..loop.simulation import Simulator
 from ..validation.comparing import moving_poles, time_constant
 from .thresholds import THRESHOLD
 
+Name = Literal["closed-loop simulation", "open-loop simulation", "prediction"]
 
-def choose_comparison(loop: Loop, record: Record) -> str:
+
+@dataclass(frozen=True)
+class Way:
+    """How a loop is compared with data: simulated, or predicted `horizon` samples ahead."""
+
+    name: Name
+    horizon: int = 0
+
+    def __str__(self) -> str:
+        return f"{self.horizon}-step {self.name}" if self.horizon else self.name
+
+
+def choose_comparison(loop: Loop, record: Record) -> Way:
     """Return how a loop is compared with a record: the most telling way there is."""
     if loop.controller is not None and record.r is not None:
-        return "closed-loop simulation"
+        return Way("closed-loop simulation")
     if loop.controller is None and comes_to_rest(loop):
-        return "open-loop simulation"
+        return Way("open-loop simulation")
     steps = time_constant(moving_poles(loop), loop.equations().dt, record)
-    return f"{steps}-step prediction"
+    return Way("prediction", steps)
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +90,7 @@ def root_mean_square(windows: Sequence[Window], results: Sequence[Array]) -> flo
     return math.sqrt(squares / max(count, 1))
 
 
-def simulate_window(loop: Loop, window: Window, kind: str) -> Array:
+def simulate_window(loop: Loop, window: Window, way: Way) -> Array:
     """Return what a loop makes of a window, without any of its measured outputs but the first.
 
     Parameters
@@ -86,7 +99,7 @@ def simulate_window(loop: Loop, window: Window, kind: str) -> Array:
         The model.
     window : Window
         The data.
-    kind : str
+    way : Way
         As `choose_comparison` says it.
 
     Returns
@@ -97,8 +110,8 @@ def simulate_window(loop: Loop, window: Window, kind: str) -> Array:
     record, first = window.record, window.begin
     y = np.full(len(record), np.nan)
     try:
-        if kind.endswith("prediction"):
-            index, values = predict_ahead(loop, record, predict(loop, record), _count_steps(kind))
+        if way.horizon:
+            index, values = predict_ahead(loop, record, predict(loop, record), way.horizon)
             y[index] = values
             return y
         simulator = Simulator(loop, THRESHOLD.gap_integration_error, THRESHOLD.gap_steps)
@@ -115,10 +128,6 @@ def simulate_window(loop: Loop, window: Window, kind: str) -> Array:
         except CtrlidError:
             continue
     return y
-
-
-def _count_steps(kind: str) -> int:
-    return int(kind.partition("-")[0])
 
 
 def prepare_simulation(
@@ -163,7 +172,7 @@ def compute_floor(
     loops: Sequence[Loop],
     fit: Fit,
     windows: Sequence[Window],
-    kind: str,
+    way: Way,
     runs: int | None = None,
 ) -> Floor:
     """Return the RMS error that noise leaves through a loop.
@@ -176,7 +185,7 @@ def compute_floor(
         Its fit, for the noise.
     windows : sequence of Window
         The data.
-    kind : str
+    way : Way
         As `choose_comparison` says it.
     runs : int
         Simulations with noise.
@@ -191,7 +200,7 @@ def compute_floor(
     for k, (loop, window) in enumerate(zip(loops, windows, strict=True)):
         noise = float(fit.sensor[min(k, len(fit.sensor) - 1)])
         try:
-            squares += _simulate_noise(loop, fit, noise, window, kind, runs)
+            squares += _simulate_noise(loop, fit, noise, window, way, runs)
         except CtrlidError:
             return Floor(math.nan, math.nan, math.nan)
         count += int(np.count_nonzero(window.mask))
@@ -201,13 +210,13 @@ def compute_floor(
 
 
 def _simulate_noise(
-    loop: Loop, fit: Fit, sensor: float, window: Window, kind: str, runs: int
+    loop: Loop, fit: Fit, sensor: float, window: Window, way: Way, runs: int
 ) -> Array:  # fmt: skip
     """Return what noise leaves in a window, squared and summed over its samples, for each run."""
     record = window.record
     size = int(np.count_nonzero(window.mask))
-    if kind.endswith("prediction"):
-        known = np.array(spread_ahead(loop, record, predict(loop, record), _count_steps(kind)))
+    if way.horizon:
+        known = np.array(spread_ahead(loop, record, predict(loop, record), way.horizon))
         return np.tile(size * known**2, (runs, 1))
     simulator = Simulator(loop, THRESHOLD.gap_integration_error, THRESHOLD.gap_steps)
     squares, count = np.zeros((runs, 2)), 0

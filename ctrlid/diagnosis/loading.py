@@ -116,13 +116,15 @@ def _decode(kind: Any, data: Mapping[str, Any]) -> Any:
     """Return one of the values of a diagnosis from its fields."""
     made: dict[str, Any] = {}
     for field in dataclasses.fields(kind):
+        if field.name not in data and field.default is not dataclasses.MISSING:
+            continue  # The file was written before there was this field.
         value = data[field.name]
         match field.name:
             case "effect":
                 made[field.name] = _decode_effect(value)
             case "alternatives":
                 made[field.name] = tuple(_decode_effect(e) for e in value)
-            case "equivalents":
+            case "equivalents" | "records":
                 made[field.name] = tuple(value)
             case _:
                 made[field.name] = value if field.type in (str, "str") else read_numbers(value)

@@ -13,8 +13,6 @@ from ..validation.residual_tests import remembered
 from .constancy import chance_of_line, find_bin_edges, find_bins, run_constancy_tests
 from .thresholds import THRESHOLD
 
-OF_NOISE = ("size", "heavy", "isolated", "shape")  # tests of what no effect explains
-
 
 def alarm_level(effects: int) -> float:
     """Return the chance of a false alarm that a model with so many effects is given.
@@ -28,12 +26,14 @@ def alarm_level(effects: int) -> float:
 class NoiseTests:
     """Probabilities that the innovations are noise, by test, and where they are not.
 
-    `axes` holds for each quantity its values at the samples that count.
+    `axes` holds for each quantity its values at the samples that count, `of_noise` names the tests
+    of what no effect explains, such as heavy tails.
     """
 
     p_values: Mapping[str, float]
     z: Array
     axes: Mapping[str, Array]
+    of_noise: frozenset[str] = frozenset()
     alpha: float = field(default_factory=lambda: THRESHOLD.false_alarm)
 
     @property
@@ -48,7 +48,7 @@ class NoiseTests:
 
         That is what an effect that is still missing would gain, about, or more.
         """
-        means = [p for name, p in self.p_values.items() if not name.startswith(OF_NOISE)]
+        means = [p for name, p in self.p_values.items() if name not in self.of_noise]
         return -math.log(max(min(means), THRESHOLD.least_probability))
 
     @property
@@ -107,22 +107,25 @@ def run_noise_tests(fit: Fit) -> NoiseTests:
             parts.setdefault(name, []).append(values[keep])
     z = np.concatenate(tails)
     axes = {name: np.concatenate(v) for name, v in parts.items()}
+    tails_and_events = _test_tails(z)
+    of_noise = {*tails_and_events}
     p_values = {
         "whiteness": float(stats.chi2.sf(white, max(white_df - p, 1))),
         "independence of past signals": float(stats.chi2.sf(cross, max(cross_df - p, 1))),
         "a single line in the spectrum": min(1.0, min(lines) * len(lines)),
-        **_test_tails(z),
+        **tails_and_events,
     }
     if shapes:
-        p_values["shape of the random force"] = float(
-            stats.chi2.sf(sum(v**2 for v in shapes), len(shapes))
-        )
+        shape = float(stats.chi2.sf(sum(v**2 for v in shapes), len(shapes)))
+        p_values["shape of the random force"] = shape
+        of_noise.add("shape of the random force")
     for name, values in axes.items():
         mean, square = _test_bins(z, values)
         p_values[f"mean by {name}"] = mean
         p_values[f"size by {name}"] = square
+        of_noise.add(f"size by {name}")
     p_values |= run_constancy_tests(fit, axes)
-    return NoiseTests(p_values, z, axes)
+    return NoiseTests(p_values, z, axes, frozenset(of_noise))
 
 
 def _regress_on_past(z: Array, keep: Array, u: Array, r: Array) -> tuple[float, int]:

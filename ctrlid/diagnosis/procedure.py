@@ -149,7 +149,7 @@ def diagnose(
     audits, remarks = look_over_records(loop, records)
     question = Question(loop, records, audits, fresh, catalogue, work, tell)
     result, search = _answer(question)
-    if len(records) > 1 and not _have_same(result):
+    if len(records) > 1 and not _have_same(result, len(records)):
         result = _answer_each(question, search) or result
     bar.close()
     return replace(result, audit=remarks, record=name_records(records),
@@ -208,14 +208,14 @@ def _answer_by_simulation(
 
 def _is_worth_simulating(fresh: FreshData, records: Sequence[Record]) -> bool:
     """Whether a plant runs open loop, and records are short enough for hundreds of simulations."""
-    open_loop = fresh.kind == "open-loop simulation"
+    open_loop = fresh.way.name == "open-loop simulation"
     return open_loop and sum(len(r) for r in records) <= THRESHOLD.open_loop_samples
 
 
-def _have_same(result: Diagnosis) -> bool:
+def _have_same(result: Diagnosis, records: int) -> bool:
     """Whether records that were diagnosed together seem to have the same in them."""
-    whole = result.verdict in COMPLETE
-    return whole and not any(f.note.endswith(" only") for f in result.findings)
+    some_only = any(0 < len(f.records) < records for f in result.findings)
+    return result.verdict in COMPLETE and not some_only
 
 
 def _answer_each(q: Question, together: Search) -> Diagnosis | None:

@@ -133,6 +133,7 @@ def _merge_findings(s: Shared, records: int) -> Finding:
         best, effect=chosen, alternatives=tuple(others),
         standard_errors=best.standard_errors if sure else {},
         evidence=sum(f.evidence for f in s.seen.values()), note=note,
+        records=tuple(k + 1 for k in numbers),
         experiment=best.experiment if others else "", reference=best.reference if others else None,
     )  # fmt: skip
 

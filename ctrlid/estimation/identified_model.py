@@ -144,6 +144,8 @@ class Estimate(_text.Printed):
         Condition number of the scaled regression that was solved.
     notes : tuple of str
         What the user should know before believing the numbers.
+    errors : {"equation error", "prediction error"}
+        What the residuals are: those of the ARX equation, or of the output's prediction.
     """
 
     structure: Structure
@@ -161,6 +163,7 @@ class Estimate(_text.Printed):
     dt: float
     condition: float
     notes: tuple[str, ...] = ()
+    errors: Literal["equation error", "prediction error"] = "prediction error"
 
     def __post_init__(self) -> None:
         for field in ("values", "covariance", "intercepts"):
@@ -312,7 +315,7 @@ def _report(e: Estimate) -> str:
             pole = f"  pole at z = {_text.with_error(z, dz)}, s = {_text.with_error(s, ds)} rad/s"
         lines.append(pole)
     # Least squares minimises the error of the difference equation, the others that of a prediction.
-    what = "equation error" if "ARX" in e.method else "prediction error"
+    what = e.errors
     lines.append(f"  {what}: standard deviation {np.sqrt(e.residual_variance):.3g}")
     lines.append(f"  solved by {e.solver}")
     lines.append("  active bounds: " + (", ".join(e.active) or "none"))

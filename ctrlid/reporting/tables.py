@@ -157,7 +157,7 @@ def _estimate_blocks(e: Estimate) -> list[Block]:
     text = str(e).splitlines()
     news = text[1 + next(i for i, line in enumerate(text) if "active bounds:" in line) :]
     period = f", dt = {e.dt:g} s" if e.dt else ""
-    white = " Standard errors hold for white errors only." if "ARX" in e.method else ""
+    white = " Standard errors hold for white errors only." if e.errors == "equation error" else ""
     caption = f"{_upper(e.method)}, {e.n_samples} rows{period}.{white}"
     return [
         Table(("coefficient", "value", "standard error"), tuple(rows), caption),

@@ -279,7 +279,7 @@ def _compare_model(record: Record, model: Any, horizon: int | None) -> Compariso
     error = np.where(usable, error - constant, 0.0)
     stretches = [(a + order, b) for a, b in record.segments() if b - a > order]
     noise = np.eye(1, order + 1)[0]
-    if not (isinstance(model, IdentifiedModel) and "ARX" in model.estimate.method):
+    if not (isinstance(model, IdentifiedModel) and model.estimate.errors == "equation error"):
         noise = noise_polynomial(error, stretches, den)
     white_errors = whiten_errors(error, stretches, noise)
     residuals = np.where(usable, white_errors, np.nan)

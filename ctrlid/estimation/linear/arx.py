@@ -157,6 +157,7 @@ def _estimate(regression: Regression, found: Found, constrained: bool, dt: float
         active_bounds=found.active_bounds,
         branch=found.branch,
         method=("constrained " if constrained else "") + "least squares (ARX)",
+        errors="equation error",
         solver=found.solver,
         dt=dt,
         condition=found.condition,

@@ -92,7 +92,7 @@ def _gap(above: Any, below: Any, found: Diagnosis) -> None:
         rms = "none" if np.isnan(size) else f"RMS {fine * size:.3g}{short}"
         long = {"before": "recalibrated model", "after": f"with {names}"}.get(label, label)
         # A long prediction is made at some of the samples only.
-        made = np.isfinite(error) if gap.kind.endswith("prediction") else slice(None)
+        made = np.isfinite(error) if gap.horizon else slice(None)
         shown = scale * values[part]
         above.plot(t[made], shown[made], label=f"{gap.kind}, {long}", **style)
         below.plot(t[made], fine * error[made], label=f"{label}: {rms}", **style)
