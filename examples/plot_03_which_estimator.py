@@ -72,7 +72,7 @@ for what, errors in (("unstable pole", pole), ("gain b1 + b2", gain)):
 # - Instruments remove the bias, since sensor noise never reaches the reference.
 # - Instruments and constraint together scatter least.
 
-plt.rcParams.update(cid.plot.STYLE)
+plt.rcParams.update(cid.plot.style())
 fig, axes = plt.subplots(1, 2, figsize=(9, 4.2), layout="constrained", sharex=True)
 styles = dict(zip(ways, ("k^:", "ks--", "ko-.", "kD-"), strict=True))
 for ax, errors, title in zip(axes, (pole, gain), ("Unstable pole", "Gain b1 + b2"), strict=True):

@@ -50,7 +50,7 @@ for name, model in models.items():
 # All promise the same. What differs is what they achieve, and the nu-gap says why: it is the
 # distance between the model and the linearized physics, in the units in which a loop cares.
 
-plt.rcParams.update(cid.plot.STYLE)
+plt.rcParams.update(cid.plot.style())
 fig, axes = plt.subplots(1, 3, figsize=(11, 3.8), layout="constrained", sharey=True)
 for ax, (name, result) in zip(axes, outcome.items(), strict=True):
     time = 1e3 * result.time

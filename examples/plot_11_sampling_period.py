@@ -38,7 +38,7 @@ print(sweep)
 # as the period grows. The other two are there from the start, and lose it at long periods, where u
 # moves between the samples that are left.
 
-plt.rcParams.update(cid.plot.STYLE)
+plt.rcParams.update(cid.plot.style())
 fig, ax = plt.subplots(figsize=(8, 3.8), layout="constrained")
 pole = {}
 for name, marker in (("fit_arx", "o"), ("fit_iv", "s"), ("fit_continuous", "^")):

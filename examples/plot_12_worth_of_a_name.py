@@ -62,7 +62,7 @@ for name, G in models.items():
 # In one picture
 # --------------
 
-plt.rcParams.update(cid.plot.STYLE)
+plt.rcParams.update(cid.plot.style())
 fig, ax = plt.subplots(figsize=(7.2, 4.0), layout="constrained")
 ax.axhline(45, color="k", ls=":", lw=1.2, label="promised by both")
 ax.plot(crossovers, achieved["with the lag"], "o-",

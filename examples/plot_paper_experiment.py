@@ -118,7 +118,7 @@ print(in_log[2]["tied"].estimate)
 # The drift of the pole towards the origin, as in section II.C of the paper, and what is left of it
 # when the samples are read at the best period.
 
-plt.rcParams.update(cid.plot.STYLE)
+plt.rcParams.update(cid.plot.style())
 figure, axes = plt.subplots(figsize=(6.4, 3.6), layout="constrained")
 milliseconds = [1e3 * T for T in PERIODS]
 axes.axhline(pole, color="black", linewidth=1)
