@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from .._base.criterion import bayesian_penalty
 from .._base.errors import CtrlidError
 from ..data.record import Record
 from ..effects import AbstractEffect
@@ -42,7 +43,7 @@ class Trial:
     def full_penalty(self) -> float:
         """Half the Bayesian penalty if all its parameters count."""
         size = self.model.fit.size
-        return 0.5 * len(self.effect.parameters()) * math.log(size) + self.scan_penalty
+        return bayesian_penalty(len(self.effect.parameters()), size) + self.scan_penalty
 
     @property
     def net_gain(self) -> float:

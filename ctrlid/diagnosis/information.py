@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from .._base.arrays import Array
+from .._base.criterion import bayesian_penalty
 from ..effects import AbstractEffect
 from ..estimation.likelihood.likelihood import Fit
 from .candidates import Trial
@@ -74,7 +75,7 @@ def estimate_need(model: Model, position: int) -> float:
     left = remaining_information(matrix, own, [k for k in range(len(matrix)) if k not in every])
     d = np.array([away[names[k]] for k in own]) * size[own]
     gain = 0.5 * fit.size * math.log1p(float(d @ left @ d) / fit.size)
-    return gain - 0.5 * len(every) * math.log(fit.size)
+    return gain - bayesian_penalty(len(every), fit.size)
 
 
 def find_objection(trial: Trial) -> str:

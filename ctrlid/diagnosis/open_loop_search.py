@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from .._base.arrays import Array
+from .._base.criterion import bayesian_penalty
 from .._base.errors import CtrlidError
 from ..effects import AbstractEffect
 from ..estimation.likelihood.physics_fit import start_values
@@ -236,7 +237,7 @@ def _gain_over(now: Simulated, square: float) -> float:
 def _penalty_over(smaller: Simulated, larger: Simulated) -> float:
     """Return half the Bayesian penalty of the further parameters."""
     free = len(larger.names) - len(smaller.names)
-    return 0.5 * free * math.log(max(len(smaller.errors) / smaller.correlated, math.e))
+    return bayesian_penalty(free, max(len(smaller.errors) / smaller.correlated, math.e))
 
 
 def _refit(now: Simulated, t: Tried) -> Tried:

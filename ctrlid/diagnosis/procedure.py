@@ -8,6 +8,7 @@ from typing import Any
 
 from tqdm import tqdm
 
+from .._base.criterion import bayesian_penalty
 from .._base.errors import CtrlidError
 from .._base.jobs import check_jobs, spread
 from ..data.record import Record
@@ -241,4 +242,4 @@ def _answer_each(q: Question, together: Search) -> Diagnosis | None:
 
 def _penalized_likelihood(fit: Fit) -> float:
     """Return the log-likelihood less half the penalty of the Bayesian information criterion."""
-    return fit.value - 0.5 * len(fit.theta) * math.log(fit.size)
+    return fit.value - bayesian_penalty(len(fit.theta), fit.size)

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from .._base.criterion import bayesian_penalty
 from .._base.errors import CtrlidError
 from ..estimation.likelihood.kalman_filter import Noise
 from ..estimation.likelihood.likelihood import Fit, evaluate
@@ -75,7 +76,7 @@ def weigh_refit(base: Model, trial: Trial, fit: Fit) -> Trial:
     """Return a trial with what a fit of it gained, its penalty, and what speaks against it."""
     model = Model(trial.model.loop, fit)
     own = count_own_parameters(trial, fit)
-    penalty = 0.5 * own * math.log(fit.size) + trial.scan_penalty
+    penalty = bayesian_penalty(own, fit.size) + trial.scan_penalty
     before = base.fit.value if math.isfinite(base.fit.value) else _likelihood_of_no_model(fit)
     done = replace(trial, model=model, gain=fit.value - before, penalty=penalty)
     try:

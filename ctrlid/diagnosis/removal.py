@@ -5,6 +5,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
+from .._base.criterion import bayesian_penalty
 from ..estimation.likelihood.maximization import begin_fit, maximize, polish, refit_noise_size
 from ..estimation.likelihood.physics_fit import choose_noise
 from ..loop.loop import Loop
@@ -66,7 +67,7 @@ def fuse_effects(model: Model, given: int, steps: Sequence[Round]) -> Model:
             if not contains(start, effects[k]):
                 continue
             more = len(effects[k].parameters()) + len(effects[other].parameters())
-            saved = 0.5 * (more - len(start.parameters())) * math.log(model.fit.size)
+            saved = bayesian_penalty(more - len(start.parameters()), model.fit.size)
             without = _drop_effects(model, [other])
             smaller = _drop_effects(model, [k, other])
             trial = screen_at(smaller, replace(start, **effects[k].values()))
@@ -126,7 +127,7 @@ def refit_noise(model: Model) -> Model:
         return Model(model.loop, fit)
     if fit.noise.drift:
         plain = maximize(replace(fit, noise=replace(fit.noise, memory=0.0, drift=0.0)))
-        if plain.value > fit.value - math.log(fit.size):
+        if plain.value > fit.value - bayesian_penalty(2, fit.size):
             return Model(model.loop, plain)
         # The force that stood for the effect may be far from the one that is left.
         anew = choose_noise(plain)

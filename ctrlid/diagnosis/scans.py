@@ -8,9 +8,9 @@ import numpy as np
 
 from .._base.arrays import Array
 from .._base.errors import CtrlidError
+from .._base.statistics import pseudo_inverse
 from ..effects import AbstractEffect
 from ..estimation.likelihood.kalman_filter import run_filter
-from ..estimation.likelihood.likelihood import pseudo_inverse
 from .candidates import Trial
 from .fitted_model import Model
 from .screening import screen_candidate, screen_starts

@@ -8,6 +8,7 @@ import numpy as np
 from scipy import linalg, signal, stats
 
 from .._base.arrays import Array
+from .._base.criterion import bayesian_penalty
 
 LEVEL = 0.99  # of the drawn bands and of the tests
 MEMORY = 1000  # longest correlation of residuals that is looked for [samples]
@@ -132,7 +133,7 @@ def _smoothed(e: Array, n: int, memory: int) -> Array:
         variance *= 1 - reflection**2
         if variance <= 0:
             break
-        score = n * np.log(variance) + p * np.log(n)
+        score = n * np.log(variance) + 2 * bayesian_penalty(p, n)
         if score < best:
             best, chosen = score, a
     p = len(chosen) - 1

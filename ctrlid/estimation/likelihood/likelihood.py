@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 
 from ..._base.arrays import Array
+from ..._base.statistics import pseudo_inverse
 from .filter_data import FilterData
 from .kalman_filter import Filtered, Noise, run_filter
 from .sampled_plant import Linearized, SampledPlant, Trajectory
 
 QUIET = 1e-14  # of the output's size, squared: the least variance of the sensor noise
-SINGULAR = 1e-10  # relative eigenvalue below which a direction is not in the data
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,12 +158,3 @@ def _between_repeats(out: Filtered, keep: Any, period: int) -> tuple[Array, Arra
     use = use & (count > 1)
     size = np.sqrt(count / np.maximum(count - 1, 1))
     return ((e - mean) * size)[use], out.variance[first:].reshape(-1, period)[use]
-
-
-def pseudo_inverse(matrix: Array) -> Array:
-    """Invert an information matrix, leaving out directions that are not in the data."""
-    size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-    values, vectors = np.linalg.eigh(matrix / np.outer(size, size))
-    keep = values > SINGULAR * values.max()
-    inverse = (vectors[:, keep] / values[keep]) @ vectors[:, keep].T
-    return np.asarray(inverse / np.outer(size, size), dtype=float)

@@ -8,9 +8,10 @@ import numpy as np
 
 from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
+from ..._base.statistics import pseudo_inverse
 from .filter_data import FilterData
 from .kalman_filter import SETTLED, Filtered, Noise, first_guess, settle_covariance
-from .likelihood import Fit, Problem, evaluate, linearize_again, pseudo_inverse
+from .likelihood import Fit, Problem, evaluate, linearize_again
 from .noise_fit import LOG_STEP, choose_units, fit_noise, make_noise, take_logs
 from .sampled_plant import SampledPlant
 

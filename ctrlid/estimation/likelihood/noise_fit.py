@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..._base.arrays import Array
+from ..._base.criterion import bayesian_penalty
 from ..._base.errors import CtrlidError
 from ..._base.jobs import side_by_side
 from .kalman_filter import Noise
@@ -185,5 +186,5 @@ def known_from_repeats(fit: Fit, periods: Sequence[int]) -> Known:
     problem = replace(fit.problem, known=None, periods=tuple(periods))
     plain = fit_noise(problem, fit.theta, fit.linearized, Noise(fit.noise.force), wide=True)
     richer = try_coloured_force(plain)
-    best = richer if richer.value > plain.value + math.log(fit.size) else plain
+    best = richer if richer.value > plain.value + bayesian_penalty(2, fit.size) else plain
     return Known(best.noise, best.sensor)

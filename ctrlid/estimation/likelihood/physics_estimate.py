@@ -8,6 +8,7 @@ import numpy as np
 from scipy.stats import norm
 
 from ..._base.arrays import Array
+from ..._base.criterion import bayesian_penalty
 from ..._base.errors import CtrlidError
 from ..._base.text import Printed, number
 from ...loop.loop import Loop
@@ -68,7 +69,7 @@ class LoopEstimate(Printed):
     def bic(self) -> float:
         """Bayesian information criterion, smaller is better."""
         extra = len(self.names) + 2 * (self.coloured_force > 0)
-        return -2 * self.log_likelihood + extra * math.log(self.n_samples)
+        return -2 * self.log_likelihood + 2 * bayesian_penalty(extra, self.n_samples)
 
     def __getitem__(self, name: str) -> float:
         if name not in self.names:

@@ -7,12 +7,14 @@ from typing import Any
 import numpy as np
 
 from ..._base.arrays import Array
+from ..._base.criterion import bayesian_penalty
 from ..._base.errors import CtrlidError
+from ..._base.statistics import pseudo_inverse
 from ...data.record import Record
 from ...data.several_records import as_records, model_and_data
 from ...loop.loop import Loop
 from .filter_data import make_filter_data
-from .likelihood import Fit, Problem, pseudo_inverse
+from .likelihood import Fit, Problem
 from .maximization import begin_fit, information, maximize, refit_noise_size
 from .noise_fit import try_coloured_force
 from .physics_estimate import LoopEstimate, LoopFit
@@ -161,10 +163,10 @@ def choose_noise(fit: Fit, always: bool = False) -> Fit:
             raise
         return fit
     # Two parameters more: worth trying out in full only if it gains at all.
-    if not always and richer.value < fit.value + 0.5 * math.log(fit.size):
+    if not always and richer.value < fit.value + bayesian_penalty(1, fit.size):
         return fit
     richer = maximize(richer)
-    return richer if always or richer.value > fit.value + math.log(fit.size) else fit
+    return richer if always or richer.value > fit.value + bayesian_penalty(2, fit.size) else fit
 
 
 def summarize_fit(loop: Loop, fit: Fit) -> LoopFit:

@@ -11,6 +11,7 @@ import numpy as np
 from scipy import signal
 
 from ..._base.arrays import Array
+from ..._base.criterion import bayesian_penalty
 from ..._base.errors import CtrlidError
 from ..identified_model import Structure
 from .instruments import Piece, Signals
@@ -144,7 +145,7 @@ def found_law(pieces: Sequence[Piece], names: Sequence[str]) -> Law | None:
         scale[scale == 0] = 1.0
         x = np.linalg.lstsq(total[:, :-1] / scale, total[:, -1], rcond=1e-11)[0] / scale
         left = float(np.sum((total[:, -1] - total[:, :-1] @ x) ** 2))
-        merit = rows * np.log(max(left, 1e-18 * swing)) + len(x) * np.log(rows)
+        merit = rows * np.log(max(left, 1e-18 * swing)) + 2 * bayesian_penalty(len(x), rows)
         if merit < best[0] - 1e-9 * abs(best[0]) or best[1] is None:
             taps = x[m:].reshape(len(names) + 1, m + 1)
             den = np.concatenate([[1.0], -x[:m]])

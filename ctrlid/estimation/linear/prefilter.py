@@ -9,6 +9,7 @@ import numpy as np
 from scipy import signal
 
 from ..._base.arrays import Array, ComplexArray
+from ..._base.criterion import bayesian_penalty
 from ..identified_model import Structure
 from .regression import to_differences
 
@@ -131,5 +132,5 @@ def autoregression(residuals: Sequence[Array], highest: int = MOST_COLOURED) -> 
         d = np.concatenate([d, [0.0]]) + reflection * np.concatenate([[0.0], d[::-1]])
         power *= 1 - reflection**2
         filters.append(d)
-        merits.append(rows * np.log(power) + order * np.log(rows))
+        merits.append(rows * np.log(power) + 2 * bayesian_penalty(order, rows))
     return filters[int(np.argmin(merits))]
