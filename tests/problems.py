@@ -59,7 +59,7 @@ def held_ball(mass, gap, voltage):
 def pendulum(*effects, dt=0.005):
     """A pendulum of 0.12 kg and 0.25 m that a torque [N m] and a lead hold on its head.
 
-    Output: angle [rad]; unstable with a pole of 6.3 rad/s; the lead crosses over at 15 rad/s.
+    Output: angle [rad]; unstable with a pole of 5.5 rad/s; the lead crosses over at 15 rad/s.
     """
     plant = cid.plants.pendulum(m=0.12, length=0.25, c=0.013)
     loop = under_lead(plant, dt, REST, crossover=15)
@@ -83,7 +83,7 @@ def drive(free=("c", "k"), plant=None, controller=None):
 
 
 def servo(controller=5.0, dt=0.01, **options):
-    """A servo with round numbers, 1 kg, 2 N s/m and 3 N/V, under a gain of 5 V/m.
+    """A servo with round numbers, 1 kg, 2 N s/m and 3 N/V, under an analog gain of 5 V/m.
 
     Output: position [m]; samples every 10 ms. Where it rests is not said.
     """
@@ -166,7 +166,7 @@ def rough_mass(friction):
 
 
 def random_levitation(rng, digital):
-    """A levitated ball of any size under a lead at 2.5 times its pole, 5 to 100 samples a time
+    """A levitated ball of any size under a lead at 2.5 times its pole, 20 to 100 samples a time
     constant; and the gap [m] at which it rests."""
     gap = rng.uniform(0.008, 0.02)
     plant = cid.plants.maglev(m=rng.uniform(0.01, 0.1), K=10 ** rng.uniform(-6, -4))
