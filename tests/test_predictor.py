@@ -228,8 +228,8 @@ def test_several_steps_need_as_many_valid_samples():
 def test_refusals():
     loop = levitated()
     record = experiment(loop, n=200)
-    with pytest.raises(CtrlidError, match=r"the Loop first, .*; given Record and Loop"):
-        cid.predict(record, loop)
+    with pytest.raises(CtrlidError, match="a Loop and a Record; given Record and Record"):
+        cid.predict(record, record)
     with pytest.raises(CtrlidError, match=r"the loop is sampled at 0.001 s, the record at 0.002 s"):
         cid.predict(loop, record.decimate(2, antialias=False))
     for bad in (-1.0, np.nan, np.inf):
