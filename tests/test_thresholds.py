@@ -131,3 +131,55 @@ def test_the_theory_page_takes_its_numbers_from_the_table():
     assert len(used) > 25
     assert set(numbers_of(page)) <= MEASURED
     assert numbers_of(page.replace("|gate|", "7")) != numbers_of(page)
+
+
+# --- statements in words, wherever they stand
+
+WORDS = {"ten": 10, "a tenth": 0.1, "a quarter": 0.25, "quarter": 0.25, "half": 0.5}
+NUMBER = rf"(\d[\d ]*\d|\d+(?:\.\d+)?|{'|'.join(WORDS)})"
+# What a page or a docstring may say of a number, N, with what it then has to say.
+STATEMENTS = {
+    "N in units of the Bayesian": lambda t: 2 * t.gate,
+    "between N and ten times its given value": lambda t: 1 / t.parameter_range,
+    "between a tenth and N times its given value": lambda t: t.parameter_range,
+    "the last N of (?:each|what counts|every)": lambda t: t.held_out,
+    "N is strong": lambda t: t.strong,
+    "more than N of the floor's variance": lambda t: t.large_disturbance,
+    "within N units of log-likelihood": lambda t: t.close,
+    "Vuong's test at z = N": lambda t: t.vuong_z,
+    "[Bb]eyond N samples even stretches": lambda t: t.fitted_samples,
+}
+
+
+def texts():
+    """Pages, the README, and what the package says of itself and prints, one line each."""
+    pages = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.rst"), *(ROOT / "examples").glob("*.py"),
+             *(ROOT / "ctrlid").rglob("*.py")]  # fmt: skip
+    kept = (p for p in pages if p.name != "CHANGELOG.md" and "_build" not in p.parts)
+    return {str(p.relative_to(ROOT)): " ".join(p.read_text("utf-8").split()) for p in kept}
+
+
+def disagreements(pages):
+    """Statements that say another number than the table, as (page, pattern, what it says)."""
+    wrong = []
+    for page, text in pages.items():
+        for pattern, number in STATEMENTS.items():
+            for said in re.findall(pattern.replace("N", NUMBER), text):
+                known = WORDS.get(said) or float(said.replace(" ", ""))
+                if known != pytest.approx(number(THRESHOLD)):
+                    wrong.append((page, pattern, said))
+    return wrong
+
+
+def test_no_page_states_another_number_than_the_table():
+    pages = texts()
+    assert disagreements(pages) == []
+    said = "\n".join(pages.values())
+    assert [p for p in STATEMENTS if not re.search(p.replace("N", NUMBER), said)] == []
+
+
+def test_a_page_that_states_another_number_is_found():
+    with varied(gate=7.0, held_out=0.2, fitted_samples=50_000):
+        found = {page for page, _, _ in disagreements(texts())}
+    assert "ctrlid/diagnosis/procedure.py" in found
+    assert "docs/theory/naming_study.rst" in found
