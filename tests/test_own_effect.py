@@ -4,11 +4,13 @@ The names of the parameters are those of effects in the catalogue, which must no
 """
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import pytest
 
 import ctrlid as cid
+import problems
 from ctrlid import effects as E
 from ctrlid.diagnosis.candidates import same_kind
 from ctrlid.diagnosis.fitted_model import carry_over
@@ -19,18 +21,12 @@ from ctrlid.diagnosis.scans import ModelSight, scan_candidate
 from ctrlid.effects.scanning import Scan
 
 N, DT = 1500, 0.01
-
-
-def drive():
-    """A position drive under a PID controller, 10 ms."""
-    plant = cid.plants.servo(m=2.0, c=5.0, k=30.0)
-    law = cid.PID(kp=6.0, ki=4.0, kd=0.4, filter_time=0.02)
-    return cid.Loop(plant, law, dt=DT, at=cid.OperatingPoint((0.0, 0.0), 0.0, 0.0), free=("k",))
+drive = partial(problems.drive, free=("k",))
 
 
 def record_of(effect, seed=1, n=N):
-    r = cid.random_binary(n, amplitude=0.3, hold=60, seed=seed)
-    return cid.simulate(drive().with_effect(effect), r, sensor_noise=1e-3, seed=seed + 1)
+    loop = drive().with_effect(effect)
+    return problems.record_of(loop, swing=0.3, hold=60, n=n, seed=seed, sensor_noise=1e-3)
 
 
 @dataclass(frozen=True)
