@@ -9,7 +9,7 @@ import control as ct
 import numpy as np
 
 from .._base.arrays import Array
-from .._base.errors import CtrlidError
+from .._base.errors import CtrlidError, EffectDoesNotApply, ModelCannotRun
 from .._base.text import Printed, polynomial, quantity
 from ..estimation.identified_model import IdentifiedModel
 from ..loop.loop import Loop
@@ -284,7 +284,7 @@ def _physical_step(loop: Loop, height: float, promised: Array) -> tuple[Array, s
     rest: Array = np.full(len(promised), loop.point.output)
     try:
         still = simulate(loop, rest)
-    except CtrlidError as reason:
+    except (ModelCannotRun, EffectDoesNotApply) as reason:
         return np.empty(0), _sentence(reason)
     try:
         moved = simulate(loop, rest + height)

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from .._base.errors import CtrlidError
+from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from ..data.record import Record
 from ..effects import AbstractEffect, equivalents
 from ..estimation.likelihood.physics_fit import summarize_fit
@@ -128,7 +128,7 @@ def _find_presence(f: Weighed, found: Search, records: Sequence[Record]) -> list
     for k, record in enumerate(records):
         try:
             alone = fit_base_model(f.base.fitted, [record], f.base.names)
-        except CtrlidError:
+        except (ModelCannotRun, EffectDoesNotApply):
             continue
         if refit_candidate(alone, screen_at(alone, f.trial.fitted)).net_gain > THRESHOLD.gate:
             seen.append(k)

@@ -12,7 +12,7 @@ import numpy as np
 
 from .._base.arrays import Array
 from .._base.criterion import bayesian_penalty
-from .._base.errors import CtrlidError
+from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from ..effects import AbstractEffect
 from ..estimation.likelihood.physics_fit import start_values
 from .candidates import Trial, list_candidates, same_kind
@@ -218,7 +218,7 @@ def _screen(now: Simulated, effect: AbstractEffect) -> Tried | None:
             theta = np.clip(theta, task.problem.lower, task.problem.upper)
             x0 = task.states_from(now.starts)
             errors, slopes, _ = task.run(theta, x0)
-        except CtrlidError:
+        except (ModelCannotRun, EffectDoesNotApply):
             continue
         step = np.linalg.lstsq(slopes, -errors, rcond=THRESHOLD.open_loop_rank)[0]
         left = float(np.mean((errors + slopes @ step) ** 2))
@@ -243,11 +243,11 @@ def _penalty_over(smaller: Simulated, larger: Simulated) -> float:
 def _refit(now: Simulated, t: Tried) -> Tried:
     try:
         found = t.task.fit(t.theta, t.x0)
-    except (CtrlidError, ValueError, np.linalg.LinAlgError) as reason:
+        effect = found.fitted.labelled[t.label]
+    except (ModelCannotRun, EffectDoesNotApply) as reason:
         return replace(t, remark=str(reason))
     gain = _gain_over(now, found.square)
     penalty = _penalty_over(now, found)
-    effect = found.fitted.labelled[t.label]
     return replace(t, found=found, gain=gain, penalty=penalty,
                    remark="vanishes when refitted" if effect.neutral else "")  # fmt: skip
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from .._base.criterion import bayesian_penalty
-from .._base.errors import CtrlidError
+from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from ..estimation.likelihood.kalman_filter import Noise
 from ..estimation.likelihood.likelihood import Fit, evaluate
 from ..estimation.likelihood.maximization import ELSEWHERE, maximize
@@ -53,7 +53,7 @@ def refit_candidate(base: Model, trial: Trial, near: Model | None = None) -> Tri
             for s in starts
         ]
         fit = max(fits, key=lambda f: f.value)
-    except CtrlidError as reason:
+    except (ModelCannotRun, EffectDoesNotApply) as reason:
         return replace(trial, remark=str(reason))
     return weigh_refit(base, trial, fit)
 
@@ -64,11 +64,8 @@ def refit_under_noise(base: Model, trial: Trial, noise: Noise) -> Trial:
     The likelihood of the noise has several maxima: a slow force that stood for what is missing may
     stay beside one candidate and leave the next, which says nothing of the candidates.
     """
-    try:
-        moved = replace(trial.model.fit, noise=noise)
-        fit = drop_linearization(maximize(moved, rounds=THRESHOLD.refit_rounds, exact=False))
-    except CtrlidError:
-        return trial
+    moved = replace(trial.model.fit, noise=noise)
+    fit = drop_linearization(maximize(moved, rounds=THRESHOLD.refit_rounds, exact=False))
     return weigh_refit(base, trial, fit) if fit.value > trial.model.fit.value else trial
 
 
@@ -81,7 +78,7 @@ def weigh_refit(base: Model, trial: Trial, fit: Fit) -> Trial:
     done = replace(trial, model=model, gain=fit.value - before, penalty=penalty)
     try:
         done = replace(done, remark=find_objection(done))
-    except CtrlidError as reason:  # values that do not go together, such as crossed limits
+    except EffectDoesNotApply as reason:  # values that do not go together, such as crossed limits
         return replace(trial, remark=str(reason))
     return done if done.net_gain > 0 else replace(done, model=Model(model.loop, drop_arrays(fit)))
 
@@ -134,10 +131,7 @@ def _move_instant(fit: Fit, k: int, samples: float) -> Fit:
     problem, theta = fit.problem, fit.theta.copy()
     theta[k] = np.clip(theta[k] + samples * problem.plant.loop.dt, problem.lower[k],
                        problem.upper[k])  # fmt: skip
-    try:
-        return evaluate(problem, theta, fit.noise, [o.trajectory for o in fit.filtered])
-    except CtrlidError:  # no such instant in this record
-        return replace(fit, value=-np.inf)
+    return evaluate(problem, theta, fit.noise, [o.trajectory for o in fit.filtered])
 
 
 def _likelihood_of(fit: Fit) -> float:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from .._base.arrays import Array
-from .._base.errors import CtrlidError
+from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from .._base.statistics import pseudo_inverse
 from ..effects import AbstractEffect
 from ..estimation.likelihood.kalman_filter import run_filter
@@ -194,5 +194,5 @@ def scan_candidate(model: Model, effect: AbstractEffect) -> Trial:
             tried = (screen_starts(model, group, penalty) for group in scan.starts)
             best = max(tried, key=lambda t: t.score)
         return replace(best, others=scan.others)
-    except CtrlidError as reason:  # a place that the effect cannot have
+    except (ModelCannotRun, EffectDoesNotApply) as reason:  # a place that the effect cannot have
         return Trial(effect, "", model, -math.inf, remark=str(reason))

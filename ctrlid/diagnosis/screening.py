@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
-from .._base.errors import CtrlidError
+from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from ..effects import AbstractEffect
 from ..estimation.likelihood.likelihood import evaluate
 from ..estimation.likelihood.maximization import expected_gain
@@ -60,14 +60,14 @@ def screen_at(base: Model, effect: AbstractEffect, scan_penalty: float = 0.0) ->
     """
     try:
         loop = base.fitted.with_effect(effect)
-    except CtrlidError as reason:
+    except EffectDoesNotApply as reason:
         return Trial(effect, "", base, -math.inf, scan_penalty, remark=str(reason))
     label = next(k for k in loop.labelled if k not in base.loop.labelled)
     own = [f"{label}.{k}" for k, v in effect.values().items() if math.isfinite(v)]
     names = (*base.names, *own)
     try:
         fit = carry_over(base, loop, names)
-    except CtrlidError as reason:
+    except ModelCannotRun as reason:
         return Trial(effect, label, base, -math.inf, scan_penalty, remark=str(reason))
     doubled = find_doubles(fit, label, effect)
     if doubled:

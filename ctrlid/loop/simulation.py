@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from .._base.arrays import Array
-from .._base.errors import CtrlidError, CtrlidWarning
+from .._base.errors import CtrlidError, CtrlidWarning, ModelCannotRun
 from ..data.record import Record
 from .loop import Loop
 from .period_map import growth_rate, make_period_map, sensitivity
@@ -20,7 +20,7 @@ CHUNK = 2048  # samples run at once
 RUNAWAY = 1e3  # an output this many times further out than anything asked for has left
 
 
-class SimulationStopped(CtrlidError):
+class SimulationStopped(ModelCannotRun):
     """A loop that left the range in which it can be simulated; `y` is its output until then."""
 
     y: Array = np.empty(0)
@@ -170,7 +170,7 @@ class Simulator:
         self._runners: dict[tuple[int, int], Any] = {}
         e = loop.equations()
         if not np.isfinite(e.evaluate(first.rest[: len(e.states)], loop.point.input)[0]).all():
-            raise CtrlidError(
+            raise ModelCannotRun(
                 f"{e.name} is not defined at the operating point {loop.point}; give "
                 "at=operating_point(plant, output=...)"
             )
@@ -290,7 +290,7 @@ def _why_left(loop: Loop, at: int, inside: bool, ys: Array, us: Array, w: Array)
     text += f", with {inp} = {us[0, good]:.4g}."
     try:
         growth = growth_rate(loop)
-    except CtrlidError:
+    except ModelCannotRun:
         growth = math.nan
     lower, upper = loop.input_limits
     recent = us[0, max(0, good - 20) : good + 1]

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from .._base.errors import CtrlidError, CtrlidWarning
+from .._base.errors import CtrlidError, CtrlidWarning, ModelCannotRun
 from .._base.jobs import check_jobs, spread
 from .._base.text import listing
 from ..data.record import Record
@@ -215,7 +215,7 @@ def _fit(task: Any) -> SamplingRow:
             else:
                 model = fit_arx(slow, poles, poles + 1, 0, known)
             white, independent = _tests(slow, model)
-        except (CtrlidError, np.linalg.LinAlgError) as reason:
+        except (CtrlidError, np.linalg.LinAlgError) as reason:  # The table prints a refusal.
             empty = np.zeros(0)
             return SamplingRow(name, factor, period, count, between, empty, empty,
                                failure=str(reason))  # fmt: skip
@@ -231,7 +231,7 @@ def _tests(record: Record, model: Any) -> tuple[bool | None, bool | None]:
     """Return whether the one-step errors are white and independent of u and r."""
     try:
         tests = compare(record, model).tests
-    except CtrlidError:
+    except ModelCannotRun:
         return None, None
     fine = [t.passed or t.share < SYSTEMATIC for t in tests]
     return (fine[0], all(fine[1:])) if fine else (None, None)
