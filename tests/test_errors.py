@@ -1,7 +1,7 @@
-"""What a refusal decides: two narrow kinds put a candidate out, and no other is swallowed."""
+"""What decides: two narrow refusals put a candidate out, no other is swallowed, no text does."""
 
 import ast
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import control as ct
 import numpy as np
@@ -11,6 +11,7 @@ import ctrlid as cid
 from ctrlid import effects as E
 from ctrlid._base.errors import CtrlidError, EffectDoesNotApply, ModelCannotRun
 from ctrlid.diagnosis import growth, refitting, replicas, scans
+from ctrlid.diagnosis.candidates import Objection, Trial
 from ctrlid.diagnosis.recalibration import fit_base_model
 from ctrlid.diagnosis.replicas import follow_record, make_replica
 from ctrlid.loop.period_map import growth_rate
@@ -67,6 +68,70 @@ def test_what_tries_candidates_out_catches_no_refusal_as_a_value_error():
         f for f in handlers("ValueError", "Exception", "BaseException") if f.startswith(TRYING)
     }
     assert found == OF_OTHERS
+
+
+# --- no decision on prose
+
+WORDS = {"doubt", "doubt_of_several", "experiment", "failure", "loose", "message", "note", "notes",
+         "refusal", "remark", "sentence", "why", "words"}  # fmt: skip
+READING = {"startswith", "endswith", "find", "index", "count", "partition", "split", "search",
+           "match", "fullmatch", "removeprefix", "removesuffix"}  # fmt: skip
+# They leave out what is empty, and shorten.
+REPORTS = ("__main__.py", "reporting/", "diagnosis/wording.py", "diagnosis/report_text.py",
+           "validation/sampling_table.py")  # fmt: skip
+
+
+def prose(node):
+    """Whether an expression is the text of a result, or that of a refusal."""
+    if isinstance(node, ast.Call):
+        refused = getattr(node.func, "id", "") == "str" and prose_of_refusal(node.args[0])
+        return prose(node.func) or refused
+    return getattr(node, "attr", getattr(node, "id", "")) in WORDS
+
+
+def prose_of_refusal(node):
+    return getattr(node, "id", "") in {"error", "reason", "refusal", "trouble"}
+
+
+def truths(node):
+    """Return the expressions that are taken for true or false."""
+    if isinstance(node, ast.BoolOp):
+        return [part for value in node.values for part in truths(value)]
+    if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.Not):
+        return truths(node.operand)
+    return [node]
+
+
+def test_no_text_decides():
+    found = set()
+    for path in (ROOT / "ctrlid").rglob("*.py"):
+        place = str(path.relative_to(ROOT / "ctrlid"))
+        if place.startswith(REPORTS):
+            continue
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            asked = []
+            if isinstance(node, ast.If | ast.IfExp | ast.While | ast.Assert):
+                asked = truths(node.test)
+            elif isinstance(node, ast.comprehension):
+                asked = [part for test in node.ifs for part in truths(test)]
+            elif isinstance(node, ast.BoolOp):
+                asked = truths(node)
+            elif isinstance(node, ast.Compare) and not isinstance(node.ops[0], ast.Is | ast.IsNot):
+                asked = [node.left, *node.comparators]
+            elif isinstance(node, ast.Call) and getattr(node.func, "attr", "") in READING:
+                asked = [node.func.value, *node.args]
+            if any(map(prose, asked)):
+                found.add(f"{place}: {ast.unparse(node)[:60]}")
+    assert sorted(found) == []
+
+
+def test_an_objection_puts_a_candidate_out_whatever_its_words():
+    trial = Trial(E.CoulombFriction(0.1), "CoulombFriction", None, 20.0, gain=20.0, penalty=3.0)
+    assert trial.net_gain == 17.0
+    assert replace(trial, out=Objection("artefact", "")).net_gain == -np.inf
+    for refusal, ground in ((ModelCannotRun("lost"), "cannot run"),
+                            (EffectDoesNotApply("no mass"), "does not apply")):  # fmt: skip
+        assert Objection.of(refusal) == Objection(ground, str(refusal))
 
 
 # --- where the narrow ones are raised

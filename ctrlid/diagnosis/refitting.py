@@ -10,7 +10,7 @@ from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from ..estimation.likelihood.kalman_filter import Noise
 from ..estimation.likelihood.likelihood import Fit, evaluate
 from ..estimation.likelihood.maximization import ELSEWHERE, maximize
-from .candidates import Trial
+from .candidates import Objection, Trial
 from .fitted_model import Model, can_simulate, carry_over, drop_arrays, drop_linearization
 from .information import count_own_parameters, find_objection
 from .thresholds import THRESHOLD
@@ -31,9 +31,9 @@ def refit_candidate(base: Model, trial: Trial, near: Model | None = None) -> Tri
     Returns
     -------
     Trial
-        With gain and penalty, or with a remark that puts it out.
+        With gain and penalty, or with what puts it out.
     """
-    if trial.remark:
+    if trial.out is not None:
         return trial
     loop, names = trial.model.loop, trial.model.names
     if near is not None:
@@ -54,7 +54,7 @@ def refit_candidate(base: Model, trial: Trial, near: Model | None = None) -> Tri
         ]
         fit = max(fits, key=lambda f: f.value)
     except (ModelCannotRun, EffectDoesNotApply) as reason:
-        return replace(trial, remark=str(reason))
+        return replace(trial, out=Objection.of(reason))
     return weigh_refit(base, trial, fit)
 
 
@@ -77,9 +77,9 @@ def weigh_refit(base: Model, trial: Trial, fit: Fit) -> Trial:
     before = base.fit.value if math.isfinite(base.fit.value) else _likelihood_of_no_model(fit)
     done = replace(trial, model=model, gain=fit.value - before, penalty=penalty)
     try:
-        done = replace(done, remark=find_objection(done))
+        done = replace(done, out=find_objection(done))
     except EffectDoesNotApply as reason:  # values that do not go together, such as crossed limits
-        return replace(trial, remark=str(reason))
+        return replace(trial, out=Objection.of(reason))
     return done if done.net_gain > 0 else replace(done, model=Model(model.loop, drop_arrays(fit)))
 
 

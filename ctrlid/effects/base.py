@@ -44,7 +44,7 @@ class AbstractEffect:
         False  # True: a signal passes it, so that its turn among others counts
     )
     repeatable: ClassVar[bool] = False  # True: a plant may have several of it at once
-    doubt_of_several: ClassVar[str] = ""  # why several of it at once prove little
+    doubt_of_several: ClassVar[str | None] = None  # why several of it at once prove little
 
     def __post_init__(self) -> None:
         kind = type(self).__name__
@@ -69,9 +69,9 @@ class AbstractEffect:
     def check(self) -> None:
         """Refuse values that do not fit together by `EffectDoesNotApply`; nothing by default."""
 
-    def doubt(self) -> str:
-        """Say why values that were fitted cannot be this effect; nothing by default."""
-        return ""
+    def doubt(self) -> str | None:
+        """Say why values that were fitted cannot be this effect; by default None, for they can."""
+        return None
 
     def limits(self, seen: Range) -> dict[str, tuple[float, float]]:
         """Return what a record limits parameters to, beyond their own bounds; nothing by default.

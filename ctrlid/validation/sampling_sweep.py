@@ -127,7 +127,7 @@ def sweep_sampling_period(
         for name in names
     ]
     rows = list(spread(_fit, tasks, check_jobs(jobs)))
-    done = [row for row in rows if not row.failure]
+    done = [row for row in rows if not row.failed]
     if not done:
         raise CtrlidError(f"no fit succeeded at any period; the first one: {rows[0].failure}")
     # A fit whose one-step errors follow u or r leaves dynamics out, and has no vote.
@@ -251,7 +251,7 @@ def _middle(p: Any, rows: Sequence[SamplingRow]) -> float:
 
 
 def _rated(row: SamplingRow, centre: Any) -> SamplingRow:
-    if row.failure:
+    if row.failed:
         return row
     return replace(row, deviation=_distance(row.poles, centre))
 
