@@ -47,7 +47,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         code: int = args.run(args)
         sys.stdout.flush()
-    except CtrlidError as refusal:
+    except CtrlidError as refusal:  # The command says any refusal in one line.
         print(f"ctrlid: {' '.join(str(refusal).split())}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:

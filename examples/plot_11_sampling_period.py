@@ -42,7 +42,7 @@ plt.rcParams.update(cid.plot.style())
 fig, ax = plt.subplots(figsize=(8, 3.8), layout="constrained")
 pole = {}
 for name, marker in (("fit_arx", "o"), ("fit_iv", "s"), ("fit_continuous", "^")):
-    rows = [row for row in sweep[name] if not row.failure]
+    rows = [row for row in sweep[name] if not row.failed]
     pole[name] = np.array([row.poles.real.max() for row in rows])
     ax.semilogx(
         [1e3 * row.period for row in rows], pole[name], marker=marker, mfc="none", label=name

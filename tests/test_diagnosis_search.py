@@ -399,7 +399,7 @@ def test_friction_that_would_push_is_none():
     record = record_of(loop, E.ConstantForce(-0.5), 4e-4, 1e-6, 9330)
     base = fit_base_model(loop, [record], loop.free)
     start = E.AsymmetricCoulombFriction(fc=0.0, difference=0.0)
-    assert "push" in refit_candidate(base, screen_at(base, start)).remark
+    assert "push" in refit_candidate(base, screen_at(base, start)).out.words
 
 
 def test_waves_that_two_levels_see_nearly_alike_are_fitted():

@@ -173,7 +173,7 @@ a sampling period that is too short, or a constraint that does not hold.
 
 
 def test_report_in_full():
-    bound = ActiveBound("a1 <= -2", "ReciprocalPoles()", "a1", -2.0, -1.95)
+    bound = ActiveBound("a1 <= -2", "ReciprocalPoles()", "a1", -2.0, -1.95, unstable=True)
     e = estimate(
         [-2.0, 1.0, 2e-5, 0.1],
         np.diag([0.0, 0.0, 1e-14, 1e-4]),

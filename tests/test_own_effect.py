@@ -12,7 +12,7 @@ import pytest
 import ctrlid as cid
 import problems
 from ctrlid import effects as E
-from ctrlid.diagnosis.candidates import same_kind
+from ctrlid.diagnosis.candidates import Objection, same_kind
 from ctrlid.diagnosis.fitted_model import carry_over
 from ctrlid.diagnosis.information import find_objection
 from ctrlid.diagnosis.recalibration import fit_base_model
@@ -139,7 +139,7 @@ def test_frequency_and_period_have_the_bounds_that_they_declare():
 def test_a_period_longer_than_the_way_is_found():
     record = record_of(Waves(0.8, 6.0))
     _, trial = refitted(Waves(0.1, 6.3), record)
-    assert not trial.remark
+    assert trial.out is None
     assert trial.fitted.period == pytest.approx(6.0, rel=0.02)
 
 
@@ -173,11 +173,12 @@ def test_an_edge_speaks_against_what_was_searched_only():
     class NarrowSearched(Narrow):
         period: float = E.parameter("s", lower=0.1, upper=5.5, searched=True)
 
-    for kind, words in ((Narrow, ""), (NarrowSearched, "period ends on its bound 5.5")):
+    edge = Objection("on a bound", "period ends on its bound 5.5")
+    for kind, objection in ((Narrow, None), (NarrowSearched, edge)):
         base = fit_base_model(drive(), [record], ("k",))
         trial = refit_candidate(base, scan_candidate(base, kind(0.5, 5.4)))
         assert trial.fitted.period == 5.5
-        assert find_objection(trial) == words
+        assert find_objection(trial) == objection
 
 
 def test_a_time_is_an_instant_only_if_it_is_declared():

@@ -9,5 +9,13 @@ class CtrlidError(ValueError):
     """
 
 
+class ModelCannotRun(CtrlidError):
+    """A model cannot be run along a record: it is lost, stops, moves too fast, or has no rest."""
+
+
+class EffectDoesNotApply(CtrlidError):
+    """An effect has no place in this plant, or no meaning at such values."""
+
+
 class CtrlidWarning(UserWarning):
     """A result that stands, but on ground the user should look at first."""

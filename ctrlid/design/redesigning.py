@@ -9,7 +9,7 @@ import control as ct
 import numpy as np
 
 from .._base.arrays import Array
-from .._base.errors import CtrlidError
+from .._base.errors import CtrlidError, EffectDoesNotApply, ModelCannotRun
 from .._base.text import Printed, polynomial, quantity
 from ..estimation.identified_model import IdentifiedModel
 from ..loop.loop import Loop
@@ -238,26 +238,26 @@ def redesign(
     length = int(np.clip(60 / (crossover * trial.dt), 20, 50_000))
     time: Array = np.arange(length, dtype=float) * trial.dt
     promised_step = _linear_step(G, C, time)
-    achieved_step, failure = _physical_step(trial, height, promised_step)
+    achieved_step, failure, told = _physical_step(trial, height, promised_step)
     promised = _performance(loop_margins(G * C), time, promised_step)
     margins = loop_margins(P * C)
     growth = growth_rate(trial)
     if growth >= 0 or not margins.stable:
         achieved = Performance(False, *(float("nan"),) * 7)
-        if "deviations grow" not in failure:
+        if not told:
             # Dry friction holds what is at rest; the loop around it may be unstable all the same.
             why = (f"Small deviations grow at {growth:.3g} 1/s." if growth >= 0 else
                    "Friction aside, the loop is unstable.")  # fmt: skip
-            failure = f"{why} {failure}".strip()
+            failure = why if failure is None else f"{why} {failure}"
     else:
-        achieved = _performance(margins, time, np.empty(0) if failure else achieved_step)
-        achieved = replace(achieved, stable=not failure)
+        achieved = _performance(margins, time, achieved_step if failure is None else np.empty(0))
+        achieved = replace(achieved, stable=failure is None)
     # The model has gain 1 at the crossover, so that volts per metre do not matter.
     omega = np.exp(1j * crossover * dt) if dt else 1j * crossover
     unit = float(np.abs(G(omega)))
     return Redesign(C, promised, achieved, nu_gap(G / unit, P / unit),
                     robust_margin(G / unit, C * unit), trial, time, promised_step, achieved_step,
-                    height, failure)  # fmt: skip
+                    height, "" if failure is None else failure)  # fmt: skip
 
 
 def _sampled(P: Any, dt: float) -> Any:
@@ -279,27 +279,33 @@ def _linear_step(G: Any, C: Any, time: Array) -> Array:
     return np.asarray(ct.forced_response(ct.ss(closed), time, np.ones(len(time))).outputs, float)
 
 
-def _physical_step(loop: Loop, height: float, promised: Array) -> tuple[Array, str]:
-    """Return the response to a step less that to no step, per unit of reference."""
+def _physical_step(loop: Loop, height: float, promised: Array) -> tuple[Array, str | None, bool]:
+    """Return the response to a step less that to no step, per unit of reference.
+
+    With why it broke off, None if it did not, and whether that says how fast deviations grow.
+    """
     rest: Array = np.full(len(promised), loop.point.output)
     try:
         still = simulate(loop, rest)
-    except CtrlidError as reason:
-        return np.empty(0), _sentence(reason)
+    except SimulationStopped as reason:
+        return np.empty(0), _sentence(reason), reason.unstable
+    except (ModelCannotRun, EffectDoesNotApply) as reason:
+        return np.empty(0), _sentence(reason), False
     try:
         moved = simulate(loop, rest + height)
     except SimulationStopped as reason:
-        return (reason.y - still.y[: len(reason.y)]) / height, _sentence(reason)
-    response: Array = np.asarray((moved.y - still.y) / height, dtype=float)
+        response = (reason.y - still.y[: len(reason.y)]) / height
+        return response, _sentence(reason), reason.unstable
+    response = np.asarray((moved.y - still.y) / height, dtype=float)
     far = np.abs(response) > LOST * np.max(np.abs(promised))
     if not far.any():
-        return response, ""
+        return response, None, False
     k = int(np.argmax(far))
     text = f"After {k * loop.dt:.4g} s {moved.names['y']} had run away to {moved.y[k]:.4g}"
     lower, upper = loop.input_limits
     if np.any(moved.u[: k + 1] <= lower) or np.any(moved.u[: k + 1] >= upper):
         text += f", with {moved.names['u']} at its limit ({lower:g}..{upper:g})"
-    return response[: k + 1], text + "."
+    return response[: k + 1], text + ".", False
 
 
 def _sentence(reason: CtrlidError) -> str:

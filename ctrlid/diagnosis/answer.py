@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from .._base.errors import CtrlidError
+from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from ..data.record import Record
 from ..effects import AbstractEffect, equivalents
 from ..estimation.likelihood.physics_fit import summarize_fit
@@ -50,7 +50,7 @@ def assemble_answer(
     total = found.final.fit.value - found.base.fit.value
     effects, gains = [f.trial.effect for f in found.found], [f.trial.gain for f in found.found]
     loose = find_doubt(effects, gains, total if math.isfinite(total) else 0.0)
-    complete = found.after.passed and not left and not loose
+    complete = found.after.passed and not left and loose is None
     verdict = choose_verdict(complete, named=bool(findings))
     notes = list(fitted.estimate.notes)
     if not loop.free:
@@ -68,7 +68,7 @@ def assemble_answer(
     )  # fmt: skip
     tests = dict(found.after.p_values)
     sentence = write_conclusion(
-        verdict, findings, gap, disturbance, found.after, where, "" if left else loose
+        verdict, findings, gap, disturbance, found.after, where, None if left else loose
     )
     return Diagnosis(
         verdict, sentence, findings, final, gap, where, _rank_candidates(found), disturbance,
@@ -128,7 +128,7 @@ def _find_presence(f: Weighed, found: Search, records: Sequence[Record]) -> list
     for k, record in enumerate(records):
         try:
             alone = fit_base_model(f.base.fitted, [record], f.base.names)
-        except CtrlidError:
+        except (ModelCannotRun, EffectDoesNotApply):
             continue
         if refit_candidate(alone, screen_at(alone, f.trial.fitted)).net_gain > THRESHOLD.gate:
             seen.append(k)
@@ -146,7 +146,8 @@ def _rank_candidates(found: Search) -> tuple[Candidate, ...]:
             refitted = math.isfinite(t.gain)
             effect = t.fitted if refitted else t.effect
             full_penalty = t.penalty if refitted else t.full_penalty
-            rows.append(Candidate(k + 1, effect, t.score, t.gain, full_penalty, t.remark))
+            remark = "" if t.out is None else t.out.words
+            rows.append(Candidate(k + 1, effect, t.score, t.gain, full_penalty, remark))
     return tuple(rows)
 
 

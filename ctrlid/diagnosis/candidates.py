@@ -3,16 +3,38 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal, Self
 
 import numpy as np
 
 from .._base.criterion import bayesian_penalty
-from .._base.errors import CtrlidError
+from .._base.errors import CtrlidError, EffectDoesNotApply, ModelCannotRun
 from ..data.record import Record
 from ..effects import AbstractEffect
 from ..estimation.likelihood.sampled_plant import Trajectory
 from .fitted_model import Model, keep_information
+
+Ground = Literal[
+    "does not apply", "cannot run", "not seen", "vanishes", "on a bound", "insignificant",
+    "doubtful", "artefact", "not the simplest",
+]  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Objection:
+    """What puts a candidate out: the ground, and the words of the ranking, which decide nothing."""
+
+    ground: Ground
+    words: str
+
+    @classmethod
+    def of(cls, refusal: EffectDoesNotApply | ModelCannotRun) -> Self:
+        """Return the objection that a refusal is."""
+        unfit = isinstance(refusal, EffectDoesNotApply)
+        return cls("does not apply" if unfit else "cannot run", str(refusal))
+
+
+VANISHES = Objection("vanishes", "vanishes when refitted")
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,8 +42,8 @@ class Trial:
     """A candidate added to a model.
 
     `score` is the gain of log-likelihood that the first step expects, `gain` what the refit gave,
-    `penalty` half the Bayesian penalty of its parameters and of what was scanned. `others` are
-    starts with nearly the same score, which only a refit tells apart.
+    `penalty` half the Bayesian penalty of its parameters and of what was scanned, `out` what puts
+    it out. `others` are starts with nearly the same score, which only a refit tells apart.
     """
 
     effect: AbstractEffect
@@ -31,7 +53,7 @@ class Trial:
     scan_penalty: float = 0.0
     gain: float = math.nan
     penalty: float = math.nan
-    remark: str = ""
+    out: Objection | None = None
     others: tuple[AbstractEffect, ...] = ()
 
     @property
@@ -48,7 +70,7 @@ class Trial:
     @property
     def net_gain(self) -> float:
         """Gain less penalty; minus infinity for what is out."""
-        if self.remark or not math.isfinite(self.gain):
+        if self.out is not None or not math.isfinite(self.gain):
             return -math.inf
         return self.gain - self.penalty
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from .._base.arrays import Array
-from .._base.errors import CtrlidError
+from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from ..data.record import Record
 from ..data.references import random_binary
 from ..estimation.likelihood.likelihood import Known
@@ -56,7 +56,7 @@ def find_experiment(
             Simulator(t.model.fitted, THRESHOLD.gap_integration_error, THRESHOLD.gap_steps)
             for t in (best, *others)
         ]
-    except CtrlidError:
+    except (ModelCannotRun, EffectDoesNotApply):
         return words, None
     simulator = simulators[0]
     able = [
@@ -111,7 +111,7 @@ def _loop_survives(simulator: Simulator, r: Array, record: Record) -> bool:
     bold = middle + THRESHOLD.experiment_margin * (r - middle)
     try:
         y = simulator.run(simulator.start(None), bold, np.zeros(len(r)))[0]
-    except CtrlidError:
+    except ModelCannotRun:
         return False
     return bool(np.ptp(y) <= THRESHOLD.experiment_margin * reach)
 
@@ -168,7 +168,7 @@ def _least_distance(
         return None
     try:
         y, u = simulator.run(simulator.start(None), r, np.zeros(len(r)))
-    except CtrlidError:
+    except ModelCannotRun:
         return None
     made = Record(u=u, y=y, r=r, dt=record.dt, hold=record.hold)
     sizes = [d for t in others if (d := _unpredicted(t, best, made)) is not None]
@@ -182,7 +182,7 @@ def _unpredicted(rival: Trial, best: Trial, record: Record) -> float | None:
     try:
         problem = replace(make_problem(model.fitted, model.names, [record]), known=known)
         fit = begin_fit(problem, model.fit.theta, None)
-    except CtrlidError:
+    except (ModelCannotRun, EffectDoesNotApply):
         return None
     errors = sum(float(np.nansum(z**2)) for z in fit.standardized)
     left = errors - 2 * expected_gain(fit)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from .._base.arrays import Array
-from .._base.errors import CtrlidError
+from .._base.errors import CtrlidError, ModelCannotRun
 from ..data.record import Record
 from ..estimation.likelihood.likelihood import Fit, Known, evaluate
 from ..estimation.likelihood.maximization import begin_fit, maximize
@@ -128,6 +128,6 @@ def _fit_private_parameters(model: Model, window: gaps.Window) -> Loop:
             tried = [evaluate(start.problem, theta, fit.noise, at) for theta in turned]
             start = max(tried, key=lambda f: f.value)
         best = maximize(start, exact=False)
-    except CtrlidError:
+    except ModelCannotRun:
         return loop
     return loop.with_parameters(dict(zip(names, best.theta.tolist(), strict=True)))

@@ -9,7 +9,7 @@ import numpy as np
 from scipy import signal
 
 from .._base.arrays import Array
-from .._base.errors import CtrlidError
+from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from ..data.record import Record
 from ..estimation.likelihood.filter_data import FEWEST
 from ..estimation.likelihood.likelihood import Fit
@@ -115,7 +115,7 @@ def simulate_window(loop: Loop, window: Window, way: Way) -> Array:
             y[index] = values
             return y
         simulator = Simulator(loop, THRESHOLD.gap_integration_error, THRESHOLD.gap_steps)
-    except CtrlidError:
+    except (ModelCannotRun, EffectDoesNotApply):
         return y
     for start, stop in record.segments():
         if stop - start < FEWEST:
@@ -125,7 +125,7 @@ def simulate_window(loop: Loop, window: Window, way: Way) -> Array:
             z, r, d = prepare_simulation(simulator, part)
             begin = first + float(record.t[start] - record.start)
             y[start:stop] = simulator.run(z, r, d, None, begin)[0]
-        except CtrlidError:
+        except ModelCannotRun:
             continue
     return y
 
@@ -201,7 +201,7 @@ def compute_floor(
         noise = float(fit.sensor[min(k, len(fit.sensor) - 1)])
         try:
             squares += _simulate_noise(loop, fit, noise, window, way, runs)
-        except CtrlidError:
+        except (ModelCannotRun, EffectDoesNotApply):
             return Floor(math.nan, math.nan, math.nan)
         count += int(np.count_nonzero(window.mask))
     errors = np.sqrt(squares / max(count, 1))
@@ -235,7 +235,7 @@ def _simulate_noise(
                 squares[seed, k] += float(np.sum(moved[use] ** 2))
         count += int(use.sum())
     if not count:
-        raise CtrlidError("no stretch is long enough to be simulated")
+        raise ModelCannotRun("no stretch is long enough to be simulated")
     return squares * (size / count)
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .._base.errors import CtrlidError
+from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from ..effects import AbstractEffect
 from ..estimation.likelihood.likelihood import Fit
 from .candidates import Trial, contains, list_missing_candidates
@@ -101,7 +101,8 @@ def search_effects(
             steps.append(step)
     try:
         model, found = weigh_effects(model, given, steps)
-    except CtrlidError:  # what cannot be taken out again cannot be weighed, and explains nothing
+    except (ModelCannotRun, EffectDoesNotApply):
+        # What cannot be taken out again cannot be weighed, and explains nothing.
         model, found = base, ()
     tests = run_noise_tests(base.fit), retest_with_replicas(model)
     return Search(base, tuple(steps), model, found, *tests, left)

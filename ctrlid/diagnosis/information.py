@@ -9,7 +9,7 @@ from .._base.arrays import Array
 from .._base.criterion import bayesian_penalty
 from ..effects import AbstractEffect
 from ..estimation.likelihood.likelihood import Fit
-from .candidates import Trial
+from .candidates import VANISHES, Objection, Trial
 from .fitted_model import Model
 from .thresholds import THRESHOLD
 
@@ -78,11 +78,11 @@ def estimate_need(model: Model, position: int) -> float:
     return gain - bayesian_penalty(len(every), fit.size)
 
 
-def find_objection(trial: Trial) -> str:
-    """Say why a fitted effect cannot be what is missing, if so."""
+def find_objection(trial: Trial) -> Objection | None:
+    """Return why a fitted effect cannot be what is missing, if so."""
     effect = trial.fitted
     if effect.neutral:
-        return "vanishes when refitted"
+        return VANISHES
     fit, names = trial.model.fit, trial.model.names
     for k, name in enumerate(names):
         if not name.startswith(f"{trial.label}."):
@@ -91,11 +91,14 @@ def find_objection(trial: Trial) -> str:
         about = next(p for p in effect.parameters() if p.name == name.partition(".")[2])
         on_bound = fit.theta[k] in (low, high)
         if on_bound and (about.searched or about.neutral not in (None, low, high)):
-            return f"{about.name} ends on its bound {fit.theta[k]:g}"
+            words = f"{about.name} ends on its bound {fit.theta[k]:g}"
+            return Objection("on a bound", words)
     if _is_insignificant(trial, effect):
-        return "no larger than its uncertainty"
-    every = all(f"{trial.label}.{p.name}" in names for p in effect.parameters())
-    return effect.doubt() if every else ""  # what is held still, another effect has
+        return Objection("insignificant", "no larger than its uncertainty")
+    if not all(f"{trial.label}.{p.name}" in names for p in effect.parameters()):
+        return None  # What is held still, another effect has.
+    doubt = effect.doubt()
+    return None if doubt is None else Objection("doubtful", doubt)
 
 
 def _is_insignificant(trial: Trial, effect: AbstractEffect) -> bool:

@@ -9,6 +9,7 @@ import numpy as np
 from scipy import optimize
 
 from .._base.arrays import Array
+from .._base.errors import CtrlidError, ModelCannotRun
 from .._base.statistics import pseudo_inverse
 from ..data.record import Record
 from ..estimation.likelihood.kalman_filter import Noise
@@ -162,8 +163,15 @@ class Simulation:
             return both(v)[1]
 
         most = evaluations or THRESHOLD.open_loop_evaluations
-        found = optimize.least_squares(error, start, slope, bounds=(lower, upper), x_scale="jac",
-                                       max_nfev=most)  # fmt: skip
+        try:
+            found = optimize.least_squares(
+                error, start, slope, bounds=(lower, upper), x_scale="jac", max_nfev=most
+            )
+        except ValueError as reason:
+            if isinstance(reason, CtrlidError):
+                raise
+            # SciPy's own: a start that is no number, a decomposition that does not converge.
+            raise ModelCannotRun(str(reason)) from reason
         return self.at(found.x[:p], found.x[p:].reshape(shape))
 
 

@@ -12,10 +12,10 @@ import numpy as np
 
 from .._base.arrays import Array
 from .._base.criterion import bayesian_penalty
-from .._base.errors import CtrlidError
+from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from ..effects import AbstractEffect
 from ..estimation.likelihood.physics_fit import start_values
-from .candidates import Trial, list_candidates, same_kind
+from .candidates import VANISHES, Objection, Trial, list_candidates, same_kind
 from .fitted_model import Model
 from .fresh_data import FreshData
 from .growth import Search
@@ -40,14 +40,14 @@ class Tried:
     found: Simulated | None = None
     gain: float = math.nan
     penalty: float = math.nan
-    remark: str = ""
+    out: Objection | None = None
 
     @property
     def net_gain(self) -> float:
         """Gain less penalty; minus infinity for what is out."""
-        return (
-            -math.inf if self.remark or not math.isfinite(self.gain) else self.gain - self.penalty
-        )
+        if self.out is not None or not math.isfinite(self.gain):
+            return -math.inf
+        return self.gain - self.penalty
 
 
 def search_by_simulation(
@@ -218,7 +218,7 @@ def _screen(now: Simulated, effect: AbstractEffect) -> Tried | None:
             theta = np.clip(theta, task.problem.lower, task.problem.upper)
             x0 = task.states_from(now.starts)
             errors, slopes, _ = task.run(theta, x0)
-        except CtrlidError:
+        except (ModelCannotRun, EffectDoesNotApply):
             continue
         step = np.linalg.lstsq(slopes, -errors, rcond=THRESHOLD.open_loop_rank)[0]
         left = float(np.mean((errors + slopes @ step) ** 2))
@@ -243,13 +243,13 @@ def _penalty_over(smaller: Simulated, larger: Simulated) -> float:
 def _refit(now: Simulated, t: Tried) -> Tried:
     try:
         found = t.task.fit(t.theta, t.x0)
-    except (CtrlidError, ValueError, np.linalg.LinAlgError) as reason:
-        return replace(t, remark=str(reason))
+        effect = found.fitted.labelled[t.label]
+    except (ModelCannotRun, EffectDoesNotApply) as reason:
+        return replace(t, out=Objection.of(reason))
     gain = _gain_over(now, found.square)
     penalty = _penalty_over(now, found)
-    effect = found.fitted.labelled[t.label]
-    return replace(t, found=found, gain=gain, penalty=penalty,
-                   remark="vanishes when refitted" if effect.neutral else "")  # fmt: skip
+    out = VANISHES if effect.neutral else None
+    return replace(t, found=found, gain=gain, penalty=penalty, out=out)
 
 
 @dataclass(frozen=True, eq=False)
@@ -280,4 +280,4 @@ def _make_trial(t: Tried, base: Model) -> Trial:
     model, label = base, ""
     if t.found is not None:
         model, label = _make_model(t.found, base.fit.sensor), t.label
-    return Trial(t.effect, label, model, t.score, 0.0, t.gain, t.penalty, t.remark)
+    return Trial(t.effect, label, model, t.score, 0.0, t.gain, t.penalty, t.out)

@@ -9,7 +9,7 @@ from typing import Any
 from tqdm import tqdm
 
 from .._base.criterion import bayesian_penalty
-from .._base.errors import CtrlidError
+from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from .._base.jobs import check_jobs, spread
 from ..data.record import Record
 from ..data.several_records import as_records, model_and_data
@@ -228,7 +228,8 @@ def _answer_each(q: Question, together: Search) -> Diagnosis | None:
         fresh = choose_fresh_data(q.loop, [record], None)
         try:
             result, search = _answer(replace(q, records=(record,), audits=(audit,), fresh=fresh))
-        except CtrlidError:  # The record says too little when it stands alone.
+        except (ModelCannotRun, EffectDoesNotApply):
+            # The record says too little when it stands alone.
             return None
         if result.verdict not in COMPLETE:
             return None

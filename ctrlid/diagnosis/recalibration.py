@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from .._base.arrays import Array
-from .._base.errors import CtrlidError
+from .._base.errors import ModelCannotRun
 from ..data.record import Record
 from ..estimation.likelihood.maximization import begin_fit, maximize, refit_noise_size
 from ..estimation.likelihood.noise_fit import known_from_repeats
@@ -77,7 +77,7 @@ def model_at_given_values(base: Model) -> Model | None:
         return None
     try:
         fit = begin_fit(base.fit.problem, given, None)
-    except CtrlidError:
+    except ModelCannotRun:
         return None
     return Model(base.loop, fit) if math.isfinite(fit.value) else None
 

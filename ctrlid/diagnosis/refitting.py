@@ -6,11 +6,11 @@ from dataclasses import replace
 import numpy as np
 
 from .._base.criterion import bayesian_penalty
-from .._base.errors import CtrlidError
+from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from ..estimation.likelihood.kalman_filter import Noise
 from ..estimation.likelihood.likelihood import Fit, evaluate
 from ..estimation.likelihood.maximization import ELSEWHERE, maximize
-from .candidates import Trial
+from .candidates import Objection, Trial
 from .fitted_model import Model, can_simulate, carry_over, drop_arrays, drop_linearization
 from .information import count_own_parameters, find_objection
 from .thresholds import THRESHOLD
@@ -31,9 +31,9 @@ def refit_candidate(base: Model, trial: Trial, near: Model | None = None) -> Tri
     Returns
     -------
     Trial
-        With gain and penalty, or with a remark that puts it out.
+        With gain and penalty, or with what puts it out.
     """
-    if trial.remark:
+    if trial.out is not None:
         return trial
     loop, names = trial.model.loop, trial.model.names
     if near is not None:
@@ -53,8 +53,8 @@ def refit_candidate(base: Model, trial: Trial, near: Model | None = None) -> Tri
             for s in starts
         ]
         fit = max(fits, key=lambda f: f.value)
-    except CtrlidError as reason:
-        return replace(trial, remark=str(reason))
+    except (ModelCannotRun, EffectDoesNotApply) as reason:
+        return replace(trial, out=Objection.of(reason))
     return weigh_refit(base, trial, fit)
 
 
@@ -64,11 +64,8 @@ def refit_under_noise(base: Model, trial: Trial, noise: Noise) -> Trial:
     The likelihood of the noise has several maxima: a slow force that stood for what is missing may
     stay beside one candidate and leave the next, which says nothing of the candidates.
     """
-    try:
-        moved = replace(trial.model.fit, noise=noise)
-        fit = drop_linearization(maximize(moved, rounds=THRESHOLD.refit_rounds, exact=False))
-    except CtrlidError:
-        return trial
+    moved = replace(trial.model.fit, noise=noise)
+    fit = drop_linearization(maximize(moved, rounds=THRESHOLD.refit_rounds, exact=False))
     return weigh_refit(base, trial, fit) if fit.value > trial.model.fit.value else trial
 
 
@@ -80,9 +77,9 @@ def weigh_refit(base: Model, trial: Trial, fit: Fit) -> Trial:
     before = base.fit.value if math.isfinite(base.fit.value) else _likelihood_of_no_model(fit)
     done = replace(trial, model=model, gain=fit.value - before, penalty=penalty)
     try:
-        done = replace(done, remark=find_objection(done))
-    except CtrlidError as reason:  # values that do not go together, such as crossed limits
-        return replace(trial, remark=str(reason))
+        done = replace(done, out=find_objection(done))
+    except EffectDoesNotApply as reason:  # values that do not go together, such as crossed limits
+        return replace(trial, out=Objection.of(reason))
     return done if done.net_gain > 0 else replace(done, model=Model(model.loop, drop_arrays(fit)))
 
 
@@ -134,10 +131,7 @@ def _move_instant(fit: Fit, k: int, samples: float) -> Fit:
     problem, theta = fit.problem, fit.theta.copy()
     theta[k] = np.clip(theta[k] + samples * problem.plant.loop.dt, problem.lower[k],
                        problem.upper[k])  # fmt: skip
-    try:
-        return evaluate(problem, theta, fit.noise, [o.trajectory for o in fit.filtered])
-    except CtrlidError:  # no such instant in this record
-        return replace(fit, value=-np.inf)
+    return evaluate(problem, theta, fit.noise, [o.trajectory for o in fit.filtered])
 
 
 def _likelihood_of(fit: Fit) -> float:

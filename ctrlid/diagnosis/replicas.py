@@ -8,7 +8,7 @@ from typing import Any
 import control as ct
 import numpy as np
 
-from .._base.errors import CtrlidError
+from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from ..data.record import Record
 from ..estimation.likelihood.likelihood import Fit, evaluate
 from ..estimation.likelihood.maximization import begin_fit, maximize
@@ -57,7 +57,7 @@ def make_replica(model: Model, seed: int = 0) -> Model | None:
         along = evaluate(problem, fit.theta, fit.noise, [o.trajectory for o in fit.filtered])
         starts = along, begin_fit(problem, fit.theta, fit.noise)
         again = maximize(max(starts, key=_likely), rounds=THRESHOLD.replica_rounds, exact=False)
-    except CtrlidError:
+    except (ModelCannotRun, EffectDoesNotApply):
         return None
     return Model(loop, again) if math.isfinite(again.value) else None
 
@@ -72,7 +72,7 @@ def _simulate_record(
     follows = not can_simulate(model)
     loop = follow_record(model.fitted, record) if follows else model.fitted
     if loop is None:
-        raise CtrlidError("the record cannot be followed")
+        raise ModelCannotRun("the record cannot be followed")
     simulator = Simulator(loop, THRESHOLD.gap_integration_error, THRESHOLD.gap_steps)
     y, u = np.array(record.y), np.array(record.u)
     for start, stop in record.segments():
@@ -140,7 +140,7 @@ def gain_beyond_simple(base: Model, best: Trial, simple: Trial) -> float:
         return math.inf
     try:
         under = carry_over(copy, base.fitted, base.names)
-    except CtrlidError:
+    except ModelCannotRun:
         return math.inf
     # Both climb from the same start: where the replica was fitted, the simple one may be stuck.
     without = Model(base.fitted, under)
@@ -197,21 +197,30 @@ def follow_record(loop: Loop, record: Record) -> Loop | None:
     ----------
     Jonckheere and Silverman, IEEE Transactions on Automatic Control 28 (1983) 953-964.
     """
+    if loop.equations().feedthrough:  # No controller acts around it without delay.
+        return None
+    u, y = (max(float(np.std(v[record.valid])), THRESHOLD.tiny) for v in (record.u, record.y))
     try:
-        plant = ct.ss(loop.linearize())
-        plant = plant if plant.dt else ct.sample_system(plant, loop.dt, "zoh")
-        u, y = (max(float(np.std(v[record.valid])), THRESHOLD.tiny) for v in (record.u, record.y))
-        made = replace(loop, controller=_normalized_controller(plant, u, y))
-        return made if comes_to_rest(made) else None
-    except (CtrlidError, ValueError, np.linalg.LinAlgError):
+        controller = _normalized_controller(loop.linearize(), loop.dt, u, y)
+        made = replace(loop, controller=controller)
+        return made if controller is not None and comes_to_rest(made) else None
+    except (ModelCannotRun, EffectDoesNotApply):
         return None
 
 
-def _normalized_controller(plant: Any, u: float, y: float) -> Any:
-    """Return the controller for a plant in discrete time, by the sizes of its input and output."""
-    a, b, c = plant.A, plant.B * u, plant.C / y
-    feedback, _, _ = ct.dlqr(a, b, c.T @ c, np.eye(1))
-    gain, _, _ = ct.dlqe(a, np.eye(len(a)), c, b @ b.T, np.eye(1))
+def _normalized_controller(model: Any, dt: float, u: float, y: float) -> Any:
+    """Return the controller for a linear model by the sizes of its input and output.
+
+    None where python-control finds no solution of the Riccati equations.
+    """
+    try:
+        plant = ct.ss(model)
+        plant = plant if plant.dt else ct.sample_system(plant, dt, "zoh")
+        a, b, c = plant.A, plant.B * u, plant.C / y
+        feedback, _, _ = ct.dlqr(a, b, c.T @ c, np.eye(1))
+        gain, _, _ = ct.dlqe(a, np.eye(len(a)), c, b @ b.T, np.eye(1))
+    except ValueError:
+        return None
     # The estimate is predicted: what is measured acts at the next sample.
     through = a @ gain
     matrix = a - b @ feedback - through @ c

@@ -87,7 +87,7 @@ def save_diagnosis(found: Diagnosis, path: str | Path) -> Path:
     for key, value in found.extra.items():
         try:
             extra[str(key)] = _encode(value)
-        except CtrlidError:
+        except _NoText:
             left.append(str(key))
     fields |= {"extra": extra, **({"left out of extra": left} if left else {})}
     arrays = fields.pop("gap")  # long: last
@@ -101,6 +101,10 @@ def save_diagnosis(found: Diagnosis, path: str | Path) -> Path:
             "folder that exists and may be written to"
         ) from reason
     return path
+
+
+class _NoText(CtrlidError):
+    """A value that has no form in a file that a person can read."""
 
 
 def _encode(value: Any) -> Any:
@@ -128,7 +132,7 @@ def _encode(value: Any) -> Any:
             return {str(k): _encode(v) for k, v in value.items()}
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {f.name: _encode(getattr(value, f.name)) for f in dataclasses.fields(value)}
-    raise CtrlidError(f"a {type(value).__name__} cannot be saved as text")
+    raise _NoText(f"a {type(value).__name__} cannot be saved as text")
 
 
 def _encode_loop(loop: Loop | SavedLoop) -> dict[str, Any]:

@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from .._base.arrays import Array
-from .._base.errors import CtrlidError
+from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from .._base.statistics import pseudo_inverse
 from ..effects import AbstractEffect
 from ..estimation.likelihood.kalman_filter import run_filter
-from .candidates import Trial
+from .candidates import Objection, Trial
 from .fitted_model import Model
 from .screening import screen_candidate, screen_starts
 from .thresholds import THRESHOLD
@@ -186,7 +186,7 @@ def scan_candidate(model: Model, effect: AbstractEffect) -> Trial:
         if scan is None:
             return screen_candidate(model, effect)
         if not scan.starts:
-            return Trial(effect, "", model, -math.inf, remark=scan.remark)
+            return Trial(effect, "", model, -math.inf, out=Objection("not seen", scan.remark))
         penalty = math.log(scan.places)
         if len(scan.starts) == len(scan.starts[0]) == 1:
             best = screen_candidate(model, scan.starts[0][0], penalty)
@@ -194,5 +194,5 @@ def scan_candidate(model: Model, effect: AbstractEffect) -> Trial:
             tried = (screen_starts(model, group, penalty) for group in scan.starts)
             best = max(tried, key=lambda t: t.score)
         return replace(best, others=scan.others)
-    except CtrlidError as reason:  # a place that the effect cannot have
-        return Trial(effect, "", model, -math.inf, remark=str(reason))
+    except (ModelCannotRun, EffectDoesNotApply) as reason:  # a place that the effect cannot have
+        return Trial(effect, "", model, -math.inf, out=Objection.of(reason))

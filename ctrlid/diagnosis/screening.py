@@ -4,11 +4,11 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
-from .._base.errors import CtrlidError
+from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from ..effects import AbstractEffect
 from ..estimation.likelihood.likelihood import evaluate
 from ..estimation.likelihood.maximization import expected_gain
-from .candidates import Trial
+from .candidates import Objection, Trial
 from .fitted_model import Model, carry_over, drop_arrays
 from .information import find_doubles
 from .thresholds import THRESHOLD
@@ -56,19 +56,19 @@ def screen_at(base: Model, effect: AbstractEffect, scan_penalty: float = 0.0) ->
     Returns
     -------
     Trial
-        With `score`; a `remark` if the filter cannot follow the record with it.
+        With `score`; `out` if the filter cannot follow the record with it.
     """
     try:
         loop = base.fitted.with_effect(effect)
-    except CtrlidError as reason:
-        return Trial(effect, "", base, -math.inf, scan_penalty, remark=str(reason))
+    except EffectDoesNotApply as reason:
+        return Trial(effect, "", base, -math.inf, scan_penalty, out=Objection.of(reason))
     label = next(k for k in loop.labelled if k not in base.loop.labelled)
     own = [f"{label}.{k}" for k, v in effect.values().items() if math.isfinite(v)]
     names = (*base.names, *own)
     try:
         fit = carry_over(base, loop, names)
-    except CtrlidError as reason:
-        return Trial(effect, label, base, -math.inf, scan_penalty, remark=str(reason))
+    except ModelCannotRun as reason:
+        return Trial(effect, label, base, -math.inf, scan_penalty, out=Objection.of(reason))
     doubled = find_doubles(fit, label, effect)
     if doubled:
         loop = loop.with_parameters(doubled)
@@ -76,9 +76,8 @@ def screen_at(base: Model, effect: AbstractEffect, scan_penalty: float = 0.0) ->
         fit = carry_over(base, loop, names)
     model = Model(loop, fit)
     if not math.isfinite(fit.value):
-        return Trial(
-            effect, label, model, -math.inf, scan_penalty, remark="cannot follow the record"
-        )
+        lost = Objection("cannot run", "cannot follow the record")
+        return Trial(effect, label, model, -math.inf, scan_penalty, out=lost)
     score = fit.value - base.fit.value + expected_gain(fit)
     return Trial(effect, label, Model(loop, drop_arrays(fit)), score, scan_penalty)
 
@@ -86,7 +85,7 @@ def screen_at(base: Model, effect: AbstractEffect, scan_penalty: float = 0.0) ->
 def screen_starts(base: Model, effects: Sequence[AbstractEffect], scan_penalty: float) -> Trial:
     """Try effects that differ in their values only, and return the one with the largest score."""
     best = screen_at(base, effects[0], scan_penalty)
-    if best.remark:
+    if best.out is not None:
         return best
     label, loop, names = best.label, best.model.loop, best.model.names
     start = carry_over(base, loop, names)

@@ -7,7 +7,7 @@ from typing import Any
 
 from ..effects import AbstractEffect
 from ..estimation.likelihood.maximization import expected_gain
-from .candidates import Trial, contains, keep_for_comparison, same_kind
+from .candidates import Objection, Trial, contains, keep_for_comparison, same_kind
 from .fitted_model import Model, without_random_force
 from .refitting import refit_candidate, refit_under_noise
 from .replicas import gain_beyond_simple, gain_on_replicas, has_kinks, make_replica
@@ -174,12 +174,13 @@ def _prefer_simplest(base: Model, trials: list[Trial]) -> list[Trial]:
             continue
         more = gain_beyond_simple(base, best, simple)
         if more <= best.penalty - simple.penalty:
-            out = (
+            words = f"{simple.name} explains as much with fewer parameters"
+            behind = (
                 replace(best, gain=simple.gain + more)
                 if more > THRESHOLD.hint
-                else replace(best, remark=f"{simple.name} explains as much with fewer parameters")
+                else replace(best, out=Objection("not the simplest", words))
             )
-            return sorted([out, *trials[1:]], key=lambda t: (-t.net_gain, -t.score))
+            return sorted([behind, *trials[1:]], key=lambda t: (-t.net_gain, -t.score))
     return trials
 
 
@@ -205,7 +206,6 @@ def _check_on_replicas(base: Model, trials: list[Trial], copies: list[Model | No
             > THRESHOLD.gate
         ):
             break
-        trials[0] = replace(
-            best, remark="gains as much on a simulated record in which it is known not to be"
-        )
+        words = "gains as much on a simulated record in which it is known not to be"
+        trials[0] = replace(best, out=Objection("artefact", words))
     return trials

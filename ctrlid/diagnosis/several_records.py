@@ -165,7 +165,10 @@ def _merge_calibrated(parts: Sequence[Diagnosis]) -> tuple[tuple[Calibrated, ...
 def _write_sentence(findings: Sequence[Finding], records: int) -> str:
     if not findings:
         return "At the sensitivity of these records, what is left is noise."
-    names = " and ".join(f"{' or '.join(f.names)} ({f.note.partition(';')[0]})" for f in findings)
+    seen = [describe_presence([k - 1 for k in f.records], records) for f in findings]
+    names = " and ".join(
+        f"{' or '.join(f.names)} ({where})" for f, where in zip(findings, seen, strict=True)
+    )
     were, them = ("were", "them") if len(findings) > 1 else ("was", "it")
     return f"Missing {were} {names}; with {them}, what is left is noise."
 

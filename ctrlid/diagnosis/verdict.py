@@ -48,7 +48,9 @@ def gap_is_left(gap: Gap, disturbance: Disturbance, fit: Fit) -> bool:
     return gap_stands_out(gap, fit) or (blamed and worse)
 
 
-def find_doubt(effects: Sequence[AbstractEffect], gains: Sequence[float], total: float) -> str:
+def find_doubt(
+    effects: Sequence[AbstractEffect], gains: Sequence[float], total: float
+) -> str | None:
     """Say why effects that explain a record together may yet be no explanation.
 
     Parameters
@@ -62,14 +64,14 @@ def find_doubt(effects: Sequence[AbstractEffect], gains: Sequence[float], total:
 
     Returns
     -------
-    str
-        The reason, empty if there is none.
+    str or None
+        The reason; None if there is none.
     """
     if len(effects) >= THRESHOLD.many_effects:
         return "so many effects at once describe almost any error, and prove little"
     for kind, count in Counter(type(e) for e in effects).items():
-        if count > 1 and kind.doubt_of_several:
-            return str(kind.doubt_of_several)
+        if count > 1 and kind.doubt_of_several is not None:
+            return kind.doubt_of_several
     if len(effects) >= THRESHOLD.some_effects and min(gains) < THRESHOLD.slight_effect * max(gains):
         return "the smallest of so many effects may only correct what a larger one gets wrong"
     for one, other in itertools.combinations(range(len(effects)), 2):
@@ -78,7 +80,7 @@ def find_doubt(effects: Sequence[AbstractEffect], gains: Sequence[float], total:
             names = [type(effects[k]).__name__ for k in (one, other)]
             return (f"{names[0]} and {names[1]} resemble each other, and either alone explains "
                     "nearly all of it: one effect of another kind may be behind both")  # fmt: skip
-    return ""
+    return None
 
 
 def _are_look_alikes(one: AbstractEffect, other: AbstractEffect) -> bool:
@@ -112,7 +114,7 @@ def gap_is_wider(gap: Gap, disturbance: Disturbance) -> bool:
 
 def write_conclusion(
     verdict: Verdict, findings: Sequence[Finding], gap: Gap, disturbance: Disturbance,
-    after: NoiseTests, where: Sequence[BinnedErrors], loose: str = "",
+    after: NoiseTests, where: Sequence[BinnedErrors], loose: str | None = None,
 ) -> str:  # fmt: skip
     """Return the verdict with what it rests on.
 
@@ -150,7 +152,7 @@ def write_conclusion(
         text = "At the sensitivity of this record, what is left is noise."
     elif verdict == "explained":
         text = f"Missing {were} {names}; with {them}, what is left is noise."
-    elif verdict == "partly explained" and after.passed and loose:
+    elif verdict == "partly explained" and after.passed and loose is not None:
         text = f"With {names} what is left is noise; but {loose}."
     elif verdict == "partly explained":
         verb = "explain" if len(findings) > 1 else "explains"

@@ -1,5 +1,6 @@
 """The catalogue of effects: what real plants have and models leave out."""
 
+from .._base.errors import EffectDoesNotApply
 from .base import AbstractEffect
 from .catalogue import CATALOGUE
 from .context import Moment
@@ -52,6 +53,7 @@ __all__ = [
     "CoulombFriction",
     "CubicStiffness",
     "EddyCurrentDamping",
+    "EffectDoesNotApply",
     "FlexibleMode",
     "ForceEffect",
     "ForceExponent",

@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Literal, Self
 import casadi
 import numpy as np
 
-from .._base.errors import CtrlidError
+from .._base.errors import CtrlidError, EffectDoesNotApply
 from ..physics.equations import Equations
 from ..physics.linearization import OperatingPoint
 from ..physics.symbols import Symbol
@@ -44,7 +44,7 @@ class AbstractEffect:
         False  # True: a signal passes it, so that its turn among others counts
     )
     repeatable: ClassVar[bool] = False  # True: a plant may have several of it at once
-    doubt_of_several: ClassVar[str] = ""  # why several of it at once prove little
+    doubt_of_several: ClassVar[str | None] = None  # why several of it at once prove little
 
     def __post_init__(self) -> None:
         kind = type(self).__name__
@@ -55,21 +55,23 @@ class AbstractEffect:
             value = float(value)
             # An infinite value is a limit that is never met.
             if math.isnan(value) or (math.isinf(value) and value not in (p.lower, p.upper)):
-                raise CtrlidError(f"{kind} needs a finite {p.name}; given {value!r}")
+                raise EffectDoesNotApply(f"{kind} needs a finite {p.name}; given {value!r}")
             if math.isinf(value) and (p.neutral is None or not math.isinf(p.neutral)):
-                raise CtrlidError(f"{kind} needs a finite {p.name}; given {value!r}")
+                raise EffectDoesNotApply(f"{kind} needs a finite {p.name}; given {value!r}")
             if not p.lower <= value <= p.upper:
-                raise CtrlidError(f"{kind} needs {p.name} between {p.lower:g} and {p.upper:g} "
-                                  f"[{filled(p.unit)}]; given {value:g}")  # fmt: skip
+                raise EffectDoesNotApply(
+                    f"{kind} needs {p.name} between {p.lower:g} and {p.upper:g} "
+                    f"[{filled(p.unit)}]; given {value:g}"
+                )
             object.__setattr__(self, p.name, value)
         self.check()
 
     def check(self) -> None:
-        """Refuse values that do not fit together; nothing by default."""
+        """Refuse values that do not fit together by `EffectDoesNotApply`; nothing by default."""
 
-    def doubt(self) -> str:
-        """Say why values that were fitted cannot be this effect; nothing by default."""
-        return ""
+    def doubt(self) -> str | None:
+        """Say why values that were fitted cannot be this effect; by default None, for they can."""
+        return None
 
     def limits(self, seen: Range) -> dict[str, tuple[float, float]]:
         """Return what a record limits parameters to, beyond their own bounds; nothing by default.
@@ -239,7 +241,7 @@ class AbstractEffect:
 
         Raises
         ------
-        CtrlidError
+        EffectDoesNotApply
             If the effect makes no sense for this plant.
         """
         symbolic = copy.copy(self)
@@ -249,7 +251,7 @@ class AbstractEffect:
             object.__setattr__(symbolic, p.name, Symbol(symbols[-1]))
         own = {name: casadi.SX.sym(f"{label}.{name}") for name in self.states}
         if own and equations.dt:
-            raise CtrlidError(
+            raise EffectDoesNotApply(
                 f"{type(self).__name__} is a motion in continuous time, but {equations.name} is "
                 f"sampled at {equations.dt:g} s; give the plant in continuous time"
             )
@@ -276,7 +278,7 @@ class AbstractEffect:
 def _takes(loop: Any, effect: AbstractEffect) -> bool:
     try:
         loop.with_effect(effect)
-    except CtrlidError:
+    except EffectDoesNotApply:
         return False
     return True
 
@@ -285,7 +287,7 @@ def require_motion(effect: AbstractEffect, e: Equations) -> tuple[int, int]:
     """Return the indices of position and velocity, or refuse."""
     found = motion(e)
     if found is None:
-        raise CtrlidError(
+        raise EffectDoesNotApply(
             f"{type(effect).__name__} acts on a moving mass, but no state of {e.name} is the rate "
             f"of another one ({', '.join(e.states)}); write the plant with position and velocity "
             "as states, dx/dt = v"

@@ -6,7 +6,7 @@ from typing import Any
 import casadi
 import numpy as np
 
-from .._base.errors import CtrlidError
+from .._base.errors import EffectDoesNotApply
 from ..physics.equations import Equations
 from ..physics.linearization import OperatingPoint
 from ..physics.symbols import Symbol
@@ -76,7 +76,9 @@ class Moment:
     def _motion(self) -> tuple[int, int]:
         found = motion(self._e)
         if found is None:
-            raise CtrlidError(f"{self._e.name} has no moving mass: no state is the rate of another")
+            raise EffectDoesNotApply(
+                f"{self._e.name} has no moving mass: no state is the rate of another"
+            )
         return found
 
     @property
@@ -108,8 +110,9 @@ class Moment:
     def plant_parameter(self, name: str) -> Any:
         """Return a parameter of the plant, or refuse."""
         if name not in self.parameters:
-            raise CtrlidError(f"{self._e.name} has no numeric parameter {name!r}; it has "
-                              f"{list(self.parameters)}")  # fmt: skip
+            raise EffectDoesNotApply(
+                f"{self._e.name} has no numeric parameter {name!r}; it has {list(self.parameters)}"
+            )
         return self.parameters[name]
 
     def _variance(self, value: Any, width: Any) -> Any:

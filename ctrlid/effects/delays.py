@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Self, final
 import casadi
 import numpy as np
 
-from .._base.errors import CtrlidError
+from .._base.errors import EffectDoesNotApply
 from ..physics.equations import Backlash, Equations
 from ..physics.linearization import OperatingPoint
 from .context import Moment
@@ -152,7 +152,9 @@ class InputBacklash(InputEffect):
     def build(self, e: Equations, m: Moment) -> Equations:
         """Return the equations with the play ahead of them."""
         if e.play is not None:
-            raise CtrlidError("there is a backlash already; one loop takes a single InputBacklash")
+            raise EffectDoesNotApply(
+                "there is a backlash already; one loop takes a single InputBacklash"
+            )
         memory, u = casadi.SX.sym("m"), casadi.SX.sym("u")
         half = expression(self.width) / 2
         after = casadi.fmin(casadi.fmax(memory, u - half), u + half)

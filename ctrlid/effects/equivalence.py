@@ -8,7 +8,7 @@ import casadi
 import numpy as np
 
 from .._base.arrays import Array
-from .._base.errors import CtrlidError
+from .._base.errors import EffectDoesNotApply
 from ..physics.equations import Equations
 from .base import AbstractEffect
 from .catalogue import CATALOGUE
@@ -106,7 +106,7 @@ def _law_is_all(loop: Any, i: int) -> bool:
     size = 1e-2 * (abs(loop.point.states[i]) or 1.0)
     try:
         changed = loop.with_effect(PositionOffset(size)).equations()
-    except CtrlidError:
+    except EffectDoesNotApply:
         return False
     e, shift = loop.equations(), np.zeros(len(loop.point.states))
     shift[i] = size
@@ -144,7 +144,7 @@ def _change(loop: Any, effect: AbstractEffect, size: float) -> Array | None:
         return None
     try:
         changed = loop.with_effect(replace(effect, **{parameter.name: parameter.neutral + size}))
-    except CtrlidError:
+    except EffectDoesNotApply:
         return None
     e = changed.equations(keep=True)
     if e.delay is not None or e.play is not None or e.readout is not None:

@@ -258,7 +258,7 @@ class PositionRipple(ForceEffect):
 
     private: ClassVar[tuple[str, ...]] = ("phase",)
     repeatable: ClassVar[bool] = True
-    doubt_of_several: ClassVar[str] = (
+    doubt_of_several: ClassVar[str | None] = (
         "several ripples together describe any curve over the position, and prove little"
     )
     look_alikes: ClassVar[tuple[str, ...]] = ("PeriodicForce", "SensorNonlinearity")

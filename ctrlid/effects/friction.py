@@ -161,11 +161,11 @@ class AsymmetricCoulombFriction(ForceEffect):
         "by one"
     )
 
-    def doubt(self) -> str:
+    def doubt(self) -> str | None:
         """Say so where it would push: friction is against the motion in both directions."""
         if abs(self.difference) > PUSHING * self.fc:
             return "in one direction it would push along, as a constant force does and no friction"
-        return ""
+        return None
 
     def force(self, m: Moment) -> Any:
         """Return the acceleration."""

@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Self, final
 
 import numpy as np
 
-from .._base.errors import CtrlidError
+from .._base.errors import EffectDoesNotApply
 from .context import Moment
 from .kinds import InputEffect
 from .parameters import parameter
@@ -57,8 +57,10 @@ class InputSaturation(InputEffect):
     def check(self) -> None:
         """Refuse limits in the wrong order."""
         if not self.lower < self.upper:
-            raise CtrlidError(f"InputSaturation needs lower < upper; given lower={self.lower:g}, "
-                              f"upper={self.upper:g}")  # fmt: skip
+            raise EffectDoesNotApply(
+                f"InputSaturation needs lower < upper; given lower={self.lower:g}, "
+                f"upper={self.upper:g}"
+            )
 
     @classmethod
     def candidates(cls, loop: Any, record: Any = None) -> tuple[Self, ...]:

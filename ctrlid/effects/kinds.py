@@ -5,7 +5,7 @@ from typing import Any, ClassVar
 
 import casadi
 
-from .._base.errors import CtrlidError
+from .._base.errors import EffectDoesNotApply
 from ..physics.equations import Equations
 from ..physics.symbols import Symbol
 from .base import AbstractEffect, Place, require_motion
@@ -32,7 +32,7 @@ class LawEffect(AbstractEffect):
         known = {**m.states, **m.parameters}
         unknown = [name for name in seen if name not in known]
         if unknown:
-            raise CtrlidError(
+            raise EffectDoesNotApply(
                 f"{type(self).__name__} changes {unknown[0]!r}, but {e.name} has the states "
                 f"{list(e.states)} and the numeric parameters {list(e.parameters)}"
             )

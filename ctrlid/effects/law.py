@@ -7,7 +7,7 @@ from typing import Any, ClassVar, final
 import casadi
 import numpy as np
 
-from .._base.errors import CtrlidError
+from .._base.errors import EffectDoesNotApply
 from ..physics.equations import Equations
 from .base import require_motion
 from .context import Moment
@@ -58,8 +58,10 @@ class PositionOffset(LawEffect):
         """Return the changed equations, if the force depends on the position at all."""
         i, j = require_motion(self, e)
         if not casadi.jacobian(e.rhs[j], e.x[i]).nnz():
-            raise CtrlidError(f"PositionOffset: the force in {e.name} does not depend on "
-                              f"{e.states[i]}: an offset of it changes nothing")  # fmt: skip
+            raise EffectDoesNotApply(
+                f"PositionOffset: the force in {e.name} does not depend on "
+                f"{e.states[i]}: an offset of it changes nothing"
+            )
         return super().build(e, m)
 
 
@@ -107,7 +109,7 @@ class ForceExponent(LawEffect):
             ratios.append(scale**2 * float(falling(0.0, states, m.at.input or 1.0, values)))
         off = np.ptp(ratios) / max(abs(ratios[1]), np.finfo(float).tiny)
         if not (rest > 0 and ratios[1] and off < INVERSE_SQUARE):
-            raise CtrlidError(
+            raise EffectDoesNotApply(
                 f"ForceExponent needs a force of the input that falls with the square of "
                 f"{e.states[i]} > 0; that of {e.name} does not"
             )

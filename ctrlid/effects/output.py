@@ -6,7 +6,7 @@ from typing import Any, ClassVar, Self, final
 
 import numpy as np
 
-from .._base.errors import CtrlidError
+from .._base.errors import EffectDoesNotApply
 from ..physics.linearization import OperatingPoint, state_matrices
 from .context import Moment
 from .input import extremes
@@ -167,8 +167,10 @@ class SensorSaturation(ReadingEffect):
     def check(self) -> None:
         """Refuse limits in the wrong order."""
         if not self.lower < self.upper:
-            raise CtrlidError(f"SensorSaturation needs lower < upper; given lower={self.lower:g}, "
-                              f"upper={self.upper:g}")  # fmt: skip
+            raise EffectDoesNotApply(
+                f"SensorSaturation needs lower < upper; given lower={self.lower:g}, "
+                f"upper={self.upper:g}"
+            )
 
     @classmethod
     def candidates(cls, loop: Any, record: Any = None) -> tuple[Self, ...]:

@@ -7,7 +7,7 @@ from typing import Any
 import casadi
 import control as ct
 
-from .._base.errors import CtrlidError
+from .._base.errors import EffectDoesNotApply
 from ..physics.equations import Equations
 from ..physics.linearization import OperatingPoint, linearize, operating_point
 from .base import AbstractEffect
@@ -120,7 +120,7 @@ def ordinary(e: Equations, at: OperatingPoint) -> Equations:
         of a plant in discrete time.
     """
     if e.play is not None:
-        raise CtrlidError(
+        raise EffectDoesNotApply(
             "InputBacklash has a memory that is no state of a continuous system; use "
             "loop.without_effect('InputBacklash') first"
         )
@@ -156,7 +156,7 @@ def with_spread(e: Equations, size: float) -> Equations:
 
 def _pade(e: Equations, at: OperatingPoint) -> Equations:
     if e.dt:
-        raise CtrlidError(
+        raise EffectDoesNotApply(
             f"{e.name} is in discrete time (dt = {e.dt:g} s): give the delay as poles at zero"
         )
     late, slope = casadi.SX.sym("late"), casadi.SX.sym("slope")

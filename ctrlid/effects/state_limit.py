@@ -9,7 +9,7 @@ import casadi
 import numpy as np
 from scipy import signal
 
-from .._base.errors import CtrlidError
+from .._base.errors import EffectDoesNotApply
 from ..physics.equations import Equations
 from ..physics.linearization import state_matrices
 from .context import Moment
@@ -95,11 +95,14 @@ class StateLimit(LawEffect):
         """Return the equations with the overflow."""
         unknown = [s for s in (self.name, self.spill_to or self.name) if s not in e.states]
         if unknown:
-            raise CtrlidError(f"StateLimit names the state {unknown[0]!r}; {e.name} has "
-                              f"{list(e.states)}")  # fmt: skip
+            raise EffectDoesNotApply(
+                f"StateLimit names the state {unknown[0]!r}; {e.name} has {list(e.states)}"
+            )
         if e.dt:
-            raise CtrlidError("StateLimit is a flow in continuous time; the plant "
-                              f"{e.name} is sampled at {e.dt:g} s")  # fmt: skip
+            raise EffectDoesNotApply(
+                "StateLimit is a flow in continuous time; the plant "
+                f"{e.name} is sampled at {e.dt:g} s"
+            )
         over = expression(m.above(m.states[self.name] - self.upper)) / (RIM * m.dt)
         rhs = casadi.SX(e.rhs)
         i = e.states.index(self.name)

@@ -15,8 +15,6 @@ from .._base import text as _text
 from .._base.arrays import Array, ComplexArray
 from .._base.errors import CtrlidError
 
-PAIRS = ("ReciprocalPoles", "SymmetricPoles")  # constraints that say that a plant is unstable
-
 
 @dataclass(frozen=True)
 class Structure:
@@ -95,6 +93,8 @@ class ActiveBound:
         The value it is held at.
     free : float
         The value it would take if no inequality held it back; NaN where that is not known.
+    unstable : bool
+        Whether the constraint says that the plant is unstable, as a pair of poles ±p does.
     """
 
     row: str
@@ -102,6 +102,7 @@ class ActiveBound:
     quantity: str
     bound: float
     free: float
+    unstable: bool = False
 
     def __str__(self) -> str:
         return f"{self.row} [{self.constraint}]"
@@ -343,16 +344,11 @@ def _bad_news(e: Estimate) -> list[str]:
     unstable = np.abs(z) > 1 + 1e-9 if e.structure.domain == "z" else z.real > 0
     if not unstable.any():
         edge = "outside the unit circle" if e.structure.domain == "z" else "in the right half plane"
-        if _said_unstable(e):
+        if any(bound.unstable for bound in e.active_bounds):
             news.append(f"  NO POLE {edge.upper()}.")
         else:
             news.append(f"  no pole {edge}: the model is stable.")
     return news
-
-
-def _said_unstable(e: Estimate) -> bool:
-    """Whether a constraint said that the plant is unstable: a pair ±p has one unstable pole."""
-    return any(bound.constraint.startswith(PAIRS) for bound in e.active_bounds)
 
 
 def delay_of(model: Any) -> float:

@@ -228,6 +228,6 @@ def _one(
     name = record.name or f"record {number}"
     try:
         model = fit(record, **options)
-    except CtrlidError as reason:
+    except CtrlidError as reason:  # Any refusal stays one, with the name of its record.
         raise CtrlidError(f"{name} (number {number}): {reason}") from reason
     return model, name, float(np.mean(record.y[record.valid])), record.units.get("y", "")

@@ -8,7 +8,7 @@ import casadi
 import numpy as np
 
 from .._base.arrays import Array
-from .._base.errors import CtrlidError
+from .._base.errors import CtrlidError, ModelCannotRun
 from ..data.record import Record
 from ..data.several_records import model_and_data
 from .loop import Loop
@@ -102,7 +102,7 @@ def replay_from_best_state(loop: Loop, record: Record) -> tuple[Array, Array]:
     if abs(loop.dt - record.dt) > 1e-9 * loop.dt:
         raise CtrlidError(f"the loop is sampled at {loop.dt:g} s, the record at {record.dt:g} s")
     if record.r is None:
-        raise CtrlidError("the record has no reference r, which the controller needs")
+        raise ModelCannotRun("the record has no reference r, which the controller needs")
     run, start = _controller_run(loop, record.y, record.r)
     replayed, best = _compare(run, start, record)
     if start.size and np.isfinite(loop.input_limits).any():

@@ -7,7 +7,7 @@ import numpy as np
 from scipy import optimize
 
 from .._base.arrays import Array
-from .._base.errors import CtrlidError
+from .._base.errors import ModelCannotRun
 from ..data.record import Record
 from ..effects.context import motion
 from ..physics.linearization import state_matrices
@@ -58,7 +58,7 @@ def best_start(
     def misfit(z: Array, count: int) -> Array | None:
         try:
             y = simulator.run(z, None if r is None else r[:count], d[:count])[0]
-        except CtrlidError:
+        except ModelCannotRun:
             return None
         return np.asarray((y - part.y[:count]) / spread, dtype=float)
 

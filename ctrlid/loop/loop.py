@@ -10,7 +10,7 @@ import casadi
 import control as ct
 import numpy as np
 
-from .._base.errors import CtrlidError
+from .._base.errors import CtrlidError, EffectDoesNotApply
 from ..effects import AbstractEffect
 from ..effects.composition import compose, labels
 from ..effects.python_control import as_system, linear_model
@@ -140,7 +140,9 @@ class Loop:
             )
         object.__setattr__(self, "free", free)
         if self.controller is not None and self._active.feedthrough:
-            raise CtrlidError(
+            # With effects it is they, or their values, that close the loop without delay.
+            refusal = EffectDoesNotApply if effects else CtrlidError
+            raise refusal(
                 f"{kept.name} passes its input to its output without delay, so the loop with "
                 "a controller is algebraic; add the sensor's or actuator's lag to the plant. If "
                 "this is the controller, the order is Loop(plant, controller, ...)"

@@ -10,7 +10,7 @@ import casadi
 import numpy as np
 
 from .._base.arrays import Array
-from .._base.errors import CtrlidError
+from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from ..physics.equations import Equations
 from ..physics.integration import Piece, Scheme, advance, input_pieces, integrate, whole_delay
 from .loop import Loop
@@ -85,7 +85,7 @@ def make_period_map(loop: Loop, substeps: int) -> PeriodMap:
         y = measured(t0, z, u)
     if loop.analog:
         if kept or e.play is not None:
-            raise CtrlidError(
+            raise EffectDoesNotApply(
                 "a delay or a play acts on the samples of a digital controller; this loop has an "
                 "analog one: sample it (redesign does so for a sampled model, ct.sample_system(G, "
                 "dt)), or put the delay into the plant as a Padé approximation (control.pade)"
@@ -177,7 +177,7 @@ def growth_rate(loop: Loop) -> float:
     function = s.step if s.rate is None else s.rate
     matrix, _ = sensitivity(s, loop.point.output, function)
     if not np.isfinite(matrix).all():
-        raise CtrlidError(
+        raise ModelCannotRun(
             f"{loop.equations().name} has no derivative at its operating point {loop.point}; "
             "give at=operating_point(plant, output=...)"
         )

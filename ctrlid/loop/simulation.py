@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from .._base.arrays import Array
-from .._base.errors import CtrlidError, CtrlidWarning
+from .._base.errors import CtrlidError, CtrlidWarning, ModelCannotRun
 from ..data.record import Record
 from .loop import Loop
 from .period_map import growth_rate, make_period_map, sensitivity
@@ -20,10 +20,14 @@ CHUNK = 2048  # samples run at once
 RUNAWAY = 1e3  # an output this many times further out than anything asked for has left
 
 
-class SimulationStopped(CtrlidError):
-    """A loop that left the range in which it can be simulated; `y` is its output until then."""
+class SimulationStopped(ModelCannotRun):
+    """A loop that left the range in which it can be simulated.
+
+    `y` is its output until then, `unstable` whether small deviations grow in it.
+    """
 
     y: Array = np.empty(0)
+    unstable: bool = False
 
 
 def simulate(
@@ -170,7 +174,7 @@ class Simulator:
         self._runners: dict[tuple[int, int], Any] = {}
         e = loop.equations()
         if not np.isfinite(e.evaluate(first.rest[: len(e.states)], loop.point.input)[0]).all():
-            raise CtrlidError(
+            raise ModelCannotRun(
                 f"{e.name} is not defined at the operating point {loop.point}; give "
                 "at=operating_point(plant, output=...)"
             )
@@ -240,9 +244,11 @@ class Simulator:
                 substeps *= 2
             if stop is not None:
                 inside = bool(np.isfinite(states[:, stop]).all())
+                growth, until = _known_growth(loop), slice(stop + 1)
                 stopped = SimulationStopped(
-                    _why_left(loop, first + stop, inside, ys[:, : stop + 1], us[:, : stop + 1], w)
+                    _why_left(loop, growth, first + stop, inside, ys[:, until], us[:, until], w)
                 )
+                stopped.unstable = growth > 0
                 stopped.y = np.concatenate([y[:first], ys[0, :stop]])
                 raise stopped
             if error > worst:
@@ -276,7 +282,17 @@ def _first_bad(
     return int(np.argmax(bad)) if bad.any() else None
 
 
-def _why_left(loop: Loop, at: int, inside: bool, ys: Array, us: Array, w: Array) -> str:
+def _known_growth(loop: Loop) -> float:
+    """Return how fast small deviations grow [1/s]; NaN where the loop has no derivative."""
+    try:
+        return growth_rate(loop)
+    except ModelCannotRun:
+        return math.nan
+
+
+def _why_left(
+    loop: Loop, growth: float, at: int, inside: bool, ys: Array, us: Array, w: Array
+) -> str:
     """Say when and why a simulation broke off."""
     e, op = loop.equations(), loop.point
     output, inp = e.outputs[0], e.inputs[0]
@@ -288,10 +304,6 @@ def _why_left(loop: Loop, at: int, inside: bool, ys: Array, us: Array, w: Array)
     else:
         text += f"{output} left the range where the plant is defined, last at {ys[0, good]:.4g}"
     text += f", with {inp} = {us[0, good]:.4g}."
-    try:
-        growth = growth_rate(loop)
-    except CtrlidError:
-        growth = math.nan
     lower, upper = loop.input_limits
     recent = us[0, max(0, good - 20) : good + 1]
     if loop.controller is None:

@@ -11,7 +11,7 @@ import numpy as np
 from scipy import linalg
 
 from .._base.arrays import Array
-from .._base.errors import CtrlidError
+from .._base.errors import CtrlidError, ModelCannotRun
 from .equations import Equations, require_siso
 from .trace import trace
 
@@ -58,8 +58,10 @@ class OperatingPoint:
                 "an operating point is given by numbers: states=(...), input=, output="
             ) from reason
         if not np.isfinite([*states, *point]).all():
-            raise CtrlidError(f"an operating point must be finite; given states={states}, "
-                              f"input={point[0]}, output={point[1]}")  # fmt: skip
+            raise ModelCannotRun(
+                f"an operating point must be finite; given states={states}, "
+                f"input={point[0]}, output={point[1]}"
+            )
         object.__setattr__(self, "states", states)
         object.__setattr__(self, "input", point[0])
         object.__setattr__(self, "output", point[1])
@@ -142,7 +144,7 @@ def operating_point(
             near = ", ".join(f"{s}={v:.4g}" for s, v in zip(
                 (*equations.states, *equations.inputs), closest[1], strict=True))  # fmt: skip
             hint = f" The nearest miss is {near}, which does not rest there."
-        raise CtrlidError(
+        raise ModelCannotRun(
             f"{equations.name} has no equilibrium with {equations.outputs[0]} = {target:g}: no "
             f"states and input {equations.inputs[0]} hold it there ({STARTS} starting points)."
             f"{hint} Choose an output inside the plant's range, or give guess= near one"
@@ -232,7 +234,7 @@ def state_matrices(
     a, b, c, d = (np.asarray(casadi.DM(m), float) for m in
                   jacobians(0.0, list(at.states), at.input, e.values))  # fmt: skip
     if not all(np.isfinite(m).all() for m in (a, b, c, d)):
-        raise CtrlidError(
+        raise ModelCannotRun(
             f"{e.name} has no derivative at states {at.states}, input {at.input:g}: the point is "
             "outside its domain or on a corner; choose another operating point"
         )

@@ -159,11 +159,11 @@ def trace(system: Any) -> Equations:
     fractional = {k: v for k, v in scalars.items() if not isinstance(system.params[k], int)}
     # An integer may be a count or an exponent and a parameter may decide an `if`: then the
     # equations are traced for its present value.
-    error: CtrlidError | None = None
+    error: TracingError | None = None
     for symbolic in (scalars, fractional, {}):
         try:
             return _checked(system, _trace(system, symbolic))
-        except CtrlidError as reason:
+        except TracingError as reason:
             error = error or reason
     assert error is not None
     raise error

@@ -10,7 +10,7 @@ import numpy as np
 from scipy import signal
 
 from .._base.arrays import Array
-from .._base.errors import CtrlidError, CtrlidWarning
+from .._base.errors import CtrlidError, CtrlidWarning, EffectDoesNotApply, ModelCannotRun
 from .._base.text import number
 from ..data.record import Record
 from ..data.several_records import model_and_data
@@ -114,7 +114,7 @@ def _compare_loop(record: Record, loop: Loop, horizon: int | None) -> Comparison
         warnings.simplefilter("always", CtrlidWarning)
         try:
             curves.append(_simulated(record, loop, prediction))
-        except CtrlidError as reason:
+        except (ModelCannotRun, EffectDoesNotApply) as reason:
             notes.append(f"no simulation: {reason}")
     notes += sorted({str(w.message) for w in caught})[-1:]
     return _comparison(repr(loop), record, curves, residuals, notes)
@@ -163,19 +163,23 @@ def _simulated(record: Record, loop: Loop, prediction: Prediction) -> Curve:
     r: Any = record.r
     if loop.controller is None:
         if growth_rate(loop) > -1e-9:
-            raise CtrlidError(
+            raise ModelCannotRun(
                 "the plant is not stable and the controller is unknown; an open-loop simulation "
                 "would drift without bound. Give the loop its controller"
             )
         label = "open-loop simulation"
     elif loop.analog and r is None:
-        raise CtrlidError("an analog loop is simulated from its reference, but the record has none")
+        raise ModelCannotRun(
+            "an analog loop is simulated from its reference, but the record has none"
+        )
     else:
         label = "closed-loop simulation"
         pid = loop.controller
         if r is None and isinstance(pid, PID) and np.isfinite([pid.lower, pid.upper]).any():
-            raise CtrlidError("a PID with limits is simulated from its reference, but the record "
-                              "has none; give it r=, a constant for a fixed set-point")  # fmt: skip
+            raise ModelCannotRun(
+                "a PID with limits is simulated from its reference, but the record "
+                "has none; give it r=, a constant for a fixed set-point"
+            )
     y, injected = np.full(len(record), np.nan), np.zeros(len(record))
     noisy = np.zeros(len(record))
     simulator = Simulator(loop)
@@ -221,7 +225,7 @@ def _noise_effect(
     noise = [streams[0] * prediction.sensor_noise, streams[1] * prediction.force_noise]
     try:
         return simulator.run(z, r, d, noise)[0]
-    except CtrlidError:
+    except ModelCannotRun:
         return unknown
 
 
@@ -268,9 +272,11 @@ def _compare_model(record: Record, model: Any, horizon: int | None) -> Compariso
         windows = np.lib.stride_tricks.sliding_window_view(valid, order + 1)
         usable[order:] = windows.all(axis=1)
     if np.count_nonzero(usable) < FEWEST:
-        raise CtrlidError(f"a model of order {order} needs {FEWEST + order} valid samples in "
-                          f"succession; the record has {np.count_nonzero(valid)} valid samples of "
-                          f"{len(record)}")  # fmt: skip
+        raise ModelCannotRun(
+            f"a model of order {order} needs {FEWEST + order} valid samples in "
+            f"succession; the record has {np.count_nonzero(valid)} valid samples of "
+            f"{len(record)}"
+        )
     y0, u0 = float(np.mean(record.y[valid])), float(np.mean(record.u[valid]))
     y, u = record.y - y0, record.u - u0
     moved = np.convolve(u, num)[: len(u)]

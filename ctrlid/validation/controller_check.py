@@ -56,7 +56,7 @@ def check_controller(loop: Loop, record: Record) -> list[Fact]:
         loop = replace(loop, input_limits=(-np.inf, np.inf))
     try:
         e, left = _left(loop, part)
-    except CtrlidError as reason:
+    except CtrlidError as reason:  # The audit prints a refusal among its facts.
         return [*facts, ("refused", f"the controller cannot be replayed: {reason}.", 1.0, True)]
     if left <= EXACT:
         return [*facts, ("exact", "the logged u is what the stated controller computes from r "

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from .._base.errors import CtrlidError, CtrlidWarning
+from .._base.errors import CtrlidError, CtrlidWarning, ModelCannotRun
 from .._base.jobs import check_jobs, spread
 from .._base.text import listing
 from ..data.record import Record
@@ -127,7 +127,7 @@ def sweep_sampling_period(
         for name in names
     ]
     rows = list(spread(_fit, tasks, check_jobs(jobs)))
-    done = [row for row in rows if not row.failure]
+    done = [row for row in rows if not row.failed]
     if not done:
         raise CtrlidError(f"no fit succeeded at any period; the first one: {rows[0].failure}")
     # A fit whose one-step errors follow u or r leaves dynamics out, and has no vote.
@@ -215,7 +215,7 @@ def _fit(task: Any) -> SamplingRow:
             else:
                 model = fit_arx(slow, poles, poles + 1, 0, known)
             white, independent = _tests(slow, model)
-        except (CtrlidError, np.linalg.LinAlgError) as reason:
+        except (CtrlidError, np.linalg.LinAlgError) as reason:  # The table prints a refusal.
             empty = np.zeros(0)
             return SamplingRow(name, factor, period, count, between, empty, empty,
                                failure=str(reason))  # fmt: skip
@@ -231,7 +231,7 @@ def _tests(record: Record, model: Any) -> tuple[bool | None, bool | None]:
     """Return whether the one-step errors are white and independent of u and r."""
     try:
         tests = compare(record, model).tests
-    except CtrlidError:
+    except ModelCannotRun:
         return None, None
     fine = [t.passed or t.share < SYSTEMATIC for t in tests]
     return (fine[0], all(fine[1:])) if fine else (None, None)
@@ -251,7 +251,7 @@ def _middle(p: Any, rows: Sequence[SamplingRow]) -> float:
 
 
 def _rated(row: SamplingRow, centre: Any) -> SamplingRow:
-    if row.failure:
+    if row.failed:
         return row
     return replace(row, deviation=_distance(row.poles, centre))
 

@@ -64,6 +64,11 @@ class SamplingRow:
     notes: tuple[str, ...] = ()
 
     @property
+    def failed(self) -> bool:
+        """Whether there is no fit."""
+        return not len(self.poles)
+
+    @property
     def pole_times_period(self) -> Array:
         """The poles' absolute values times the sampling period."""
         return np.asarray(np.abs(self.poles) * self.period, dtype=float)
@@ -115,7 +120,7 @@ class SamplingSweep(Printed):
         for row in self.table:
             head = (f"  {row.period:>9.4g} {largest * row.period:>7.3g}  {row.estimator:<15}"
                     f"{row.n:>8}  ")  # fmt: skip
-            lines.append(head + (f"FAILED: {_short(row.failure)}" if row.failure else _result(row)))
+            lines.append(head + (f"FAILED: {_short(row.failure)}" if row.failed else _result(row)))
         lines += [f"  {self.reason}", *([f"  {self.warning}"] if self.warning else [])]
         return "\n".join(lines)
 

@@ -7,7 +7,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -85,6 +85,8 @@ class Branch:
 
 class AbstractConstraint(ABC):
     """Something known about the coefficients; a subclass says which rows that gives."""
+
+    unstable: ClassVar[bool] = False  # True: it says that the plant has a pole that is unstable
 
     @abstractmethod
     def branches(self, structure: Structure) -> Sequence[Branch]:

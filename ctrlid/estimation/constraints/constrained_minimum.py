@@ -89,6 +89,8 @@ def minimize(cost: Cost, constraints: Sequence[AbstractConstraint], structure: S
     solution = best.solution
     covariance, condition = spread(cost, best.normals)
     bounds = tuple(_active_bound(solution, i) for i in solution.active) + best.edge
+    unstable = [repr(c) for c in constraints if c.unstable]
+    bounds = tuple(replace(b, unstable=b.constraint in unstable) for b in bounds)
     free = len(cost.origin) - len(eliminate(best.normals, np.zeros(len(best.normals))).pivots)
     return Found(
         solution.theta,

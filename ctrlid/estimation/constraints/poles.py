@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import final
+from typing import ClassVar, final
 
 import numpy as np
 from scipy.special import eval_chebyt, eval_chebyu
@@ -42,6 +42,8 @@ class ReciprocalPoles(Known):
     (a2 = 1, a1 <= -2)
     (a2 = 1, a1 >= 2)
     """
+
+    unstable: ClassVar[bool] = True
 
     def branches(self, structure: Structure) -> Sequence[Branch]:
         """See the base class."""
@@ -93,6 +95,8 @@ class SymmetricPoles(Known):
     >>> SymmetricPoles().branches(Structure(2, 1, domain="s"))[0].rows
     (a1 = 0, a2 <= 0)
     """
+
+    unstable: ClassVar[bool] = True
 
     def branches(self, structure: Structure) -> Sequence[Branch]:
         """See the base class."""

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from ..._base.arrays import Array
-from ..._base.errors import CtrlidError
+from ..._base.errors import CtrlidError, ModelCannotRun
 from ...data.record import Record
 from ...loop.loop import Loop
 from ...physics.equations import Equations
@@ -43,8 +43,10 @@ def make_filter_data(loop: Loop, record: Record, begin: float = 0.0) -> FilterDa
                           "give both the same period")  # fmt: skip
     valid = np.array(record.valid)  # writable as any other: the compiled loop is compiled once
     if np.count_nonzero(valid) < FEWEST:
-        raise CtrlidError(f"a prediction needs at least {FEWEST} valid samples; the record has "
-                          f"{np.count_nonzero(valid)} of {len(record)}")  # fmt: skip
+        raise ModelCannotRun(
+            f"a prediction needs at least {FEWEST} valid samples; the record has "
+            f"{np.count_nonzero(valid)} of {len(record)}"
+        )
     last = np.maximum.accumulate(np.where(valid, np.arange(len(record)), 0))
     y, u = np.asarray(record.y)[last], np.asarray(record.u)[last]
     r = y if record.r is None else np.asarray(record.r)[last]

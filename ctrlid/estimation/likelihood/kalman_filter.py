@@ -12,7 +12,7 @@ import casadi
 import numpy as np
 
 from ..._base.arrays import Array
-from ..._base.errors import CtrlidError
+from ..._base.errors import ModelCannotRun
 from ...physics.block_evaluation import BlockEvaluation
 from .filter_data import FilterData
 from .kalman_recursion import filter_pass
@@ -141,7 +141,7 @@ def settle_covariance(
         moved = np.abs(out.trajectory.filtered - at.filtered)
         if not np.isfinite(out.innovations).all() or not np.isfinite(moved).all():
             k = int(np.argmin(np.isfinite(out.innovations)))
-            raise CtrlidError(
+            raise ModelCannotRun(
                 f"the predictor of {m.e.name} lost the record at sample {k} "
                 f"(t = {track.record.t[k]:.4g} s): the model cannot follow these data there; "
                 "check units, signs and the operating point, or mark the stretch as not valid"

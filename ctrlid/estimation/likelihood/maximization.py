@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ..._base.arrays import Array
-from ..._base.errors import CtrlidError
+from ..._base.errors import EffectDoesNotApply, ModelCannotRun
 from ..._base.statistics import pseudo_inverse
 from .filter_data import FilterData
 from .kalman_filter import SETTLED, Filtered, Noise, first_guess, settle_covariance
@@ -173,7 +173,8 @@ def _take_step(fit: Fit, matrix: Array, score: Array) -> tuple[Fit, float]:
             if worse and k < CURVED and promise > BEND and np.isfinite(trial.value):
                 trial = _take_second_step(trial)
                 worse = not trial.value > fit.value + NOTHING
-        except CtrlidError:  # too far: what moves so fast is no longer followed
+        except (ModelCannotRun, EffectDoesNotApply):
+            # Too far: what moves so fast is no longer followed.
             continue
         if np.isfinite(trial.value) and not worse:
             return trial, float(np.max(np.abs(trial.theta - fit.theta) / error, initial=0.0))

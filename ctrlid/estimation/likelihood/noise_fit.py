@@ -9,7 +9,7 @@ import numpy as np
 
 from ..._base.arrays import Array
 from ..._base.criterion import bayesian_penalty
-from ..._base.errors import CtrlidError
+from ..._base.errors import ModelCannotRun
 from ..._base.jobs import side_by_side
 from .kalman_filter import Noise
 from .likelihood import Fit, Known, Problem, measure_noise
@@ -155,7 +155,7 @@ def try_coloured_force(fit: Fit) -> Fit:
                 best = trial
     assert best is not None
     if not np.isfinite(best.value):
-        raise CtrlidError(f"no coloured force can be fitted to {m.e.name}")
+        raise ModelCannotRun(f"no coloured force can be fitted to {m.e.name}")
     return fit_noise(fit.problem, fit.theta, fit.linearized, best.noise)
 
 

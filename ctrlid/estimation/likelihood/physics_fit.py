@@ -8,7 +8,7 @@ import numpy as np
 
 from ..._base.arrays import Array
 from ..._base.criterion import bayesian_penalty
-from ..._base.errors import CtrlidError
+from ..._base.errors import CtrlidError, ModelCannotRun
 from ..._base.statistics import pseudo_inverse
 from ...data.record import Record
 from ...data.several_records import as_records, model_and_data
@@ -158,7 +158,7 @@ def choose_noise(fit: Fit, always: bool = False) -> Fit:
         return fit
     try:
         richer = try_coloured_force(fit)
-    except CtrlidError:
+    except ModelCannotRun:
         if always:
             raise
         return fit

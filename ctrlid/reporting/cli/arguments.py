@@ -36,7 +36,7 @@ def spoken_record(path: Path, args: argparse.Namespace) -> Record:
                           f"given {unknown[0]}")  # fmt: skip
     try:
         return Record.from_csv(path, dt=args.dt, hold=args.hold, gaps=args.gaps, **args.columns)
-    except CtrlidError as reason:
+    except CtrlidError as reason:  # Any refusal stays one, in the words of the command line.
         text = str(reason)
         for key in CHANNELS:
             text = text.replace(f"with {key}=", f"with --columns {key}=NAME")
@@ -162,7 +162,7 @@ def assignment(text: str) -> tuple[str, float]:
         raise argparse.ArgumentTypeError(f"needs NAME=VALUE, as in K=3.3e-6; given {text}")
     try:
         return name.strip(), _number(f"{name}=", value)
-    except CtrlidError as reason:
+    except CtrlidError as reason:  # argparse prints what it is told in its own error alone.
         raise argparse.ArgumentTypeError(str(reason)) from reason
 
 

@@ -322,7 +322,7 @@ def _redesigns(bench: _Bench, models: Models) -> Section:
         try:
             outcome = redesign(model, bench.loop, crossover=crossover, phase_margin=margin,
                                step=2 * AMPLITUDE)  # fmt: skip
-        except CtrlidError as reason:
+        except CtrlidError as reason:  # The page prints a refusal in the place of a design.
             text += f"\n\n{label.capitalize()}: REFUSED. {reason}"
             continue
         text += f"\n\n{label.capitalize()}: {_verdict(outcome)}"
