@@ -15,6 +15,7 @@ from ..estimation.likelihood.maximization import begin_fit, expected_gain
 from ..estimation.likelihood.physics_fit import make_problem
 from ..loop.simulation import Simulator
 from .candidates import Trial
+from .gap import make_simulator
 from .thresholds import THRESHOLD
 
 
@@ -52,10 +53,7 @@ def find_experiment(
     if loop.controller is None or record.r is None:
         return words, None
     try:
-        simulators = [
-            Simulator(t.model.fitted, THRESHOLD.gap_integration_error, THRESHOLD.gap_steps)
-            for t in (best, *others)
-        ]
+        simulators = [make_simulator(t.model.fitted) for t in (best, *others)]
     except CtrlidError:
         return words, None
     simulator = simulators[0]

@@ -13,6 +13,7 @@ from ..estimation.likelihood.likelihood import Fit, Known, evaluate
 from ..estimation.likelihood.maximization import begin_fit, maximize
 from ..estimation.likelihood.physics_fit import make_problem, start_values
 from ..loop.loop import Loop
+from ..validation.reproduction import Reproduction, choose_reproduction
 from . import gap as gaps
 from .fitted_model import Model
 from .recalibration import cut_stretches
@@ -29,7 +30,7 @@ class FreshData:
 
     windows: tuple[gaps.Window, ...]
     rest: tuple[Record, ...] | None
-    way: gaps.Way
+    how: Reproduction
 
     def loops(self, model: Model) -> tuple[Loop, ...]:
         """Return the loop of a model for each window, ready to be compared there."""
@@ -62,7 +63,7 @@ class FreshData:
     def outputs(self, loops: Sequence[Loop]) -> tuple[Array, ...]:
         """Return what each loop makes of its window."""
         pairs = zip(loops, self.windows, strict=True)
-        return tuple(gaps.simulate_window(loop, w, self.way) for loop, w in pairs)
+        return tuple(gaps.simulate_window(loop, w, self.how) for loop, w in pairs)
 
     def gap(self, loops: Sequence[Loop]) -> float:
         """Return the RMS error of loops [output unit]."""
@@ -107,7 +108,7 @@ def choose_fresh_data(
         windows, rest = zip(*(gaps.hold_out(r) for r in records), strict=True)
     else:
         windows = tuple(gaps.make_window(r) for r in validation)
-    return FreshData(windows, rest, gaps.choose_comparison(loop, windows[0].record))
+    return FreshData(windows, rest, choose_reproduction(loop, windows[0].record))
 
 
 def _fit_private_parameters(model: Model, window: gaps.Window) -> Loop:

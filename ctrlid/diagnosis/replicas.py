@@ -15,10 +15,10 @@ from ..estimation.likelihood.maximization import begin_fit, maximize
 from ..estimation.likelihood.physics_fit import make_problem
 from ..loop.loop import Loop
 from ..loop.period_map import comes_to_rest
-from ..loop.simulation import Simulator
+from ..validation.record_simulation import long_stretches, prepare_stretch
 from .candidates import Trial
 from .fitted_model import Model, can_simulate, carry_over
-from .gap import draw_noise, prepare_simulation
+from .gap import draw_noise, make_simulator
 from .noise_tests import NoiseTests, run_noise_tests
 from .records import ROUNDING, Readout
 from .refitting import refit_candidate
@@ -73,16 +73,12 @@ def _simulate_record(
     loop = follow_record(model.fitted, record) if follows else model.fitted
     if loop is None:
         raise CtrlidError("the record cannot be followed")
-    simulator = Simulator(loop, THRESHOLD.gap_integration_error, THRESHOLD.gap_steps)
+    simulator = make_simulator(loop)
     y, u = np.array(record.y), np.array(record.u)
-    for start, stop in record.segments():
-        if stop - start < THRESHOLD.shortest_segment:
-            continue
-        part = record[start:stop]
-        z, r, d = prepare_simulation(simulator, part, follows)
-        noise = draw_noise(model.fit, sensor, len(part), seed + start)
-        begin = first + float(record.t[start] - record.start)
-        y[start:stop], u[start:stop] = simulator.run(z, r, d, noise, begin)
+    for part in long_stretches(record, THRESHOLD.shortest_segment):
+        stretch = prepare_stretch(simulator, record, part, begin=first, follow=follows)
+        noise = draw_noise(model.fit, sensor, len(stretch.d), seed + part.start)
+        y[part], u[part] = stretch.run(simulator, noise)
     return replace(record, y=y, u=u)
 
 
