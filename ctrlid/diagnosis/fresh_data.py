@@ -53,7 +53,7 @@ class FreshData:
             return model.fitted
         parts, begins = cut_stretches(records)
         problem = make_problem(model.fitted, model.names, parts, begins)
-        known = fit.problem.known
+        known = fit.known
         if known is not None and (known.sensor is None or len(parts) == len(known.sensor)):
             problem = replace(problem, known=known)
         return Model(
@@ -78,7 +78,7 @@ class FreshData:
 
         .. math:: \tfrac12 \sum_k (e_k^2 / s_k - 1)
         """
-        known = fit.problem.known or Known(fit.noise, fit.sensor)
+        known = fit.known or Known(fit.noise, fit.sensor)
         known = replace(known, sensor=np.full(1, float(np.mean(fit.sensor))))
         total = 0.0
         for loop, window in zip(loops, self.windows, strict=True):

@@ -79,7 +79,7 @@ def helps_on_fresh_data(fresh: FreshData) -> Callable[[Weighed, Model], bool]:
 
     def helps(f: Weighed, model: Model) -> bool:
         with_it, without = loops(model), loops(f.base)
-        if model.fit.problem.known is not None:
+        if model.fit.known is not None:
             left = fresh.excess(without, model.fit)
             if left - fresh.excess(with_it, model.fit) > THRESHOLD.helps * left:
                 return True

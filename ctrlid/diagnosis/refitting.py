@@ -89,8 +89,8 @@ def weigh_refit(base: Model, trial: Trial, fit: Fit) -> Trial:
 def _likelihood_of_no_model(fit: Fit) -> float:
     """Return the likelihood of outputs that scatter about their mean, whatever drives them."""
     value = 0.0
-    for track, keep in zip(fit.problem.prepared, fit.problem.counts, strict=True):
-        y = track.table[3][keep]
+    for data, keep in zip(fit.data, fit.counts, strict=True):
+        y = data.y[keep]
         value -= 0.5 * len(y) * (math.log(2 * math.pi * float(np.var(y)) + THRESHOLD.tiny) + 1)
     return value
 
@@ -111,7 +111,7 @@ def place_instants(fit: Fit) -> Fit:
     Fit
         The same, or one that is more likely.
     """
-    plant = fit.problem.plant
+    plant = fit.plant
     best = fit
     instants = {
         f"{label}.{p.name}" for label, e in plant.loop.labelled.items()

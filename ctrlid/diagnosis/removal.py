@@ -123,7 +123,7 @@ def refit_without_effect(model: Model, position: int) -> tuple[Model, Trial]:
 def refit_noise(model: Model) -> Model:
     """Ask again whether the data want a coloured force, now that an effect is in the model."""
     fit = refit_noise_size(polish(model.fit))
-    if fit.problem.known is not None:
+    if fit.known is not None:
         return Model(model.loop, fit)
     if fit.noise.drift:
         plain = maximize(replace(fit, noise=replace(fit.noise, memory=0.0, drift=0.0)))

@@ -46,13 +46,15 @@ def make_replica(model: Model, seed: int = 0) -> Model | None:
     """
     loop, fit = model.fitted, model.fit
     try:
+        begins = [float(data.t[0]) for data in fit.data]
         records = [
-            _simulate_record(model, t.record, float(t.table[0, 0]), float(r), seed + SEEDS * k)
-            for k, (t, r) in enumerate(zip(fit.problem.prepared, fit.sensor, strict=True))
+            _simulate_record(model, record, begin, float(r), seed + SEEDS * k)
+            for k, (record, begin, r) in enumerate(
+                zip(model.records, begins, fit.sensor, strict=True)
+            )
         ]
-        begins = [float(t.table[0, 0]) for t in fit.problem.prepared]
         problem = make_problem(loop, model.names, records, begins)
-        problem = replace(problem, counts=fit.problem.counts, known=fit.problem.known)
+        problem = replace(problem, counts=fit.counts, known=fit.known)
         # With other noise a loop may take another path; or the first guess of one may lead astray.
         along = evaluate(problem, fit.theta, fit.noise, [o.trajectory for o in fit.filtered])
         starts = along, begin_fit(problem, fit.theta, fit.noise)
@@ -84,7 +86,7 @@ def _simulate_record(
 
 def has_kinks(model: Model) -> bool:
     """Whether a model has kinks in its states, such as dry friction."""
-    return model.fit.problem.plant.e.kinked
+    return model.plant.e.kinked
 
 
 def gain_on_replicas(copies: Sequence[Model | None], trial: Trial) -> float:

@@ -76,18 +76,18 @@ class InitialConditions:
             ends = [float(m[-1]) for m in memories]
         return variance
 
-    def start(self, track: FilterData, p: Array) -> tuple[Array, Array]:
+    def start(self, data: FilterData, p: Array) -> tuple[Array, Array]:
         """Return state and covariance at the start of a record, for parameter values `p`."""
-        start, spread = track.start.copy(), track.spread.copy()
-        _, u, _, y = track.table
-        alone = not track.afresh[int(np.argmax(track.valid)) + 1 :].any()
+        start, spread = data.start.copy(), data.spread.copy()
+        u, y = data.u, data.y
+        alone = not data.afresh[int(np.argmax(data.valid)) + 1 :].any()
         for k, shown, function in self.lags:
             time, target, near = (v[:, 0] for v in function(start if shown else u[None, :], p))
             late = float(time[0, 0]) / self.plan.dt
             if shown:
                 spread[k] = spread[:, k] = near[0] @ spread
                 wide = near[0] @ spread @ near[0]
-                moved = late**2 * float(np.var(np.diff(y))) / track.scale**2
+                moved = late**2 * float(np.var(np.diff(y))) / data.scale**2
                 spread[k, k] = wide + min(moved, wide) + NEARLY
             else:
                 before = float(np.mean((target - start[k]) ** 2))
@@ -95,7 +95,7 @@ class InitialConditions:
                     start[k] = target[0, 0]
                     steps = float(np.var(np.diff(target[:, 0])))
                     before = min((1 + late / 2) * steps, 2 * float(np.var(target)))
-                spread[k, k] = before / track.scale**2 + NEARLY
+                spread[k, k] = before / data.scale**2 + NEARLY
         return start, spread
 
 

@@ -60,7 +60,7 @@ class Filtered:
 
 
 def run_filter(
-    m: SampledPlant, track: FilterData, lin: Linearized, noise: Noise, sensitive: bool = True,
+    m: SampledPlant, data: FilterData, lin: Linearized, noise: Noise, sensitive: bool = True,
     columns: int | None = None,
 ) -> Filtered:  # fmt: skip
     """Run the filter along a linearized plant, with sensitivities to its first columns."""
@@ -69,24 +69,24 @@ def run_filter(
     out = filter_pass(
         lin.step, lin.a, lin.b, lin.du, np.ascontiguousarray(lin.dp[:, :, :p]), lin.height,
         lin.c, np.ascontiguousarray(lin.hp[:, :p]), lin.trajectory.predicted,
-        lin.trajectory.filtered, track.table[3], track.valid, track.afresh, lin.doubt,
+        lin.trajectory.filtered, data.y, data.valid, data.afresh, lin.doubt,
         lin.start, lin.spread, 1.0,
         np.asarray(noise.force, dtype=float), noise.memory, noise.drift, (0,) * m.size,
         (0,) * (m.size + bool(noise.drift > 0)),
     )  # fmt: skip
     error, variance, before, after, wide, slopes, disturbance = out
-    counts = track.valid & ~track.afresh
+    counts = data.valid & ~data.afresh
     with np.errstate(all="ignore"):  # a filter that lost the record says so later
         sensor = np.sqrt(np.mean(error[counts] ** 2 / variance[counts]))
     return Filtered(error, variance, Trajectory(before, after, wide * sensor), slopes,
                     disturbance)  # fmt: skip
 
 
-def first_guess(m: SampledPlant, track: FilterData) -> Trajectory:
+def first_guess(m: SampledPlant, data: FilterData) -> Trajectory:
     """Return a trajectory to begin with: at rest, states that are measured as measured."""
-    n, e = len(track.record), m.e
-    rest = np.tile(m.padded(track.start), (n, 1))
-    seen, values = e.output, track.table[3]
+    n, e = len(data.record), m.e
+    rest = np.tile(m.padded(data.start), (n, 1))
+    seen, values = e.output, data.y
     for _ in range(1 + len(e.lags)):  # behind a lag of the sensor is what it follows, nearly
         columns = casadi.jacobian(seen, e.x).sparsity().get_col()
         if len(columns) != 1 or casadi.depends_on(seen, casadi.vertcat(e.t, e.u)):
@@ -99,9 +99,9 @@ def first_guess(m: SampledPlant, track: FilterData) -> Trajectory:
         seen = behind[0]
     for lag in e.lags:
         if casadi.is_equal(lag.target, e.u, 2):
-            rest[:, lag.state] = track.table[1]
-    spread = np.sqrt(np.diag(m.padded(track.spread)))
-    quiet = np.minimum(spread, 1.0) * track.scale
+            rest[:, lag.state] = data.u
+    spread = np.sqrt(np.diag(m.padded(data.spread)))
+    quiet = np.minimum(spread, 1.0) * data.scale
     return Trajectory(rest, rest.copy(), np.tile(quiet, (n, 1)))
 
 
@@ -122,7 +122,7 @@ def _without_bend(m: SampledPlant, seen: Any, x: Any, at: float, values: Array) 
 
 def settle_covariance(
     m: SampledPlant,
-    track: FilterData,
+    data: FilterData,
     theta: Array,
     noise: Noise,
     at: Trajectory,
@@ -136,14 +136,14 @@ def settle_covariance(
         If the filter cannot follow the record with this model.
     """
     for count in range(passes):
-        at, lin = _keep_inside(m, track, theta, at)
-        out = run_filter(m, track, lin, noise, sensitive=False)
+        at, lin = _keep_inside(m, data, theta, at)
+        out = run_filter(m, data, lin, noise, sensitive=False)
         moved = np.abs(out.trajectory.filtered - at.filtered)
         if not np.isfinite(out.innovations).all() or not np.isfinite(moved).all():
             k = int(np.argmin(np.isfinite(out.innovations)))
             raise CtrlidError(
                 f"the predictor of {m.e.name} lost the record at sample {k} "
-                f"(t = {track.record.t[k]:.4g} s): the model cannot follow these data there; "
+                f"(t = {data.record.t[k]:.4g} s): the model cannot follow these data there; "
                 "check units, signs and the operating point, or mark the stretch as not valid"
             )
         size = np.maximum(np.std(out.trajectory.filtered, axis=0), 1e-300)
@@ -155,18 +155,18 @@ def settle_covariance(
 
 
 def _keep_inside(
-    m: SampledPlant, track: FilterData, theta: Array, at: Trajectory
+    m: SampledPlant, data: FilterData, theta: Array, at: Trajectory
 ) -> tuple[Trajectory, Linearized]:
     """Linearize, with samples at which the plant is not defined pulled back to rest."""
     bad: Any = ~(np.isfinite(at.filtered) & np.isfinite(at.predicted)).all(axis=1)
     if not bad.any():
-        lin = m.linearize(track, theta, at)
+        lin = m.linearize(data, theta, at)
         bad = ~(np.isfinite(lin.step).all(axis=1) & np.isfinite(lin.a).all(axis=(1, 2))
                 & np.isfinite(lin.height) & np.isfinite(lin.c).all(axis=1))  # fmt: skip
         if not bad.any():
             return at, lin
-    rest = first_guess(m, track)
+    rest = first_guess(m, data)
     at = Trajectory(*(np.where(bad[:, None], old, new) for new, old in (
         (at.predicted, rest.predicted), (at.filtered, rest.filtered),
         (at.spread, rest.spread))))  # fmt: skip
-    return at, m.linearize(track, theta, at)
+    return at, m.linearize(data, theta, at)

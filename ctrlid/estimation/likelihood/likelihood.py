@@ -34,9 +34,9 @@ class Problem:
 
     Parameters
     ----------
-    plant : Machine
+    plant : SampledPlant
         The plant, with the free parameters as its names.
-    prepared : tuple of Track
+    data : tuple of FilterData
         The records.
     lower, upper : ndarray, shape (p,)
         Bounds of the parameters.
@@ -50,7 +50,7 @@ class Problem:
     """
 
     plant: SampledPlant
-    prepared: tuple[FilterData, ...]
+    data: tuple[FilterData, ...]
     lower: Array
     upper: Array
     counts: tuple[Any, ...] = ()
@@ -75,16 +75,36 @@ class Fit:
     filtered: tuple[Filtered, ...]
 
     @property
+    def plant(self) -> SampledPlant:
+        """The plant, with the free parameters as its names."""
+        return self.problem.plant
+
+    @property
+    def data(self) -> tuple[FilterData, ...]:
+        """The records, made ready for the filter."""
+        return self.problem.data
+
+    @property
+    def counts(self) -> tuple[Any, ...]:
+        """Samples of each record that enter the likelihood."""
+        return self.problem.counts
+
+    @property
+    def known(self) -> Known | None:
+        """The noise, where it is not searched."""
+        return self.problem.known
+
+    @property
     def size(self) -> int:
         """Number of samples that count."""
-        return int(sum(np.count_nonzero(c) for c in self.problem.counts))
+        return int(sum(np.count_nonzero(c) for c in self.counts))
 
     @functools.cached_property
     def normal(self) -> tuple[Array, Array]:
         """The held-gain information matrix and score of the parameters."""
         p = len(self.theta)
         matrix, score = np.zeros((p, p)), np.zeros(p)
-        for out, keep, r in zip(self.filtered, self.problem.counts, self.sensor, strict=True):
+        for out, keep, r in zip(self.filtered, self.counts, self.sensor, strict=True):
             slopes, s = out.slopes[keep], out.variance[keep] * r
             matrix += (slopes / s[:, None]).T @ slopes
             score += slopes.T @ (out.innovations[keep] / s)
@@ -100,14 +120,14 @@ class Fit:
         """The innovations divided by their standard deviations; NaN where they do not count."""
         return [
             np.where(keep, out.innovations / np.sqrt(out.variance * r), np.nan)
-            for out, keep, r in zip(self.filtered, self.problem.counts, self.sensor, strict=True)
+            for out, keep, r in zip(self.filtered, self.counts, self.sensor, strict=True)
         ]
 
 
 def evaluate(problem: Problem, theta: Array, noise: Noise, at: Sequence[Trajectory]) -> Fit:
     """Return the likelihood of parameters and noise, linearized along given trajectories."""
     m = problem.plant
-    lins = tuple(m.linearize(t, theta, a) for t, a in zip(problem.prepared, at, strict=True))
+    lins = tuple(m.linearize(t, theta, a) for t, a in zip(problem.data, at, strict=True))
     return measure_noise(problem, theta, noise, lins)
 
 
@@ -123,13 +143,10 @@ def measure_noise(
     """Return the likelihood of parameters and noise, the plant linearized before."""
     m = problem.plant
     outs = tuple(
-        run_filter(m, t, lin, noise, sensitive)
-        for t, lin in zip(problem.prepared, lins, strict=True)
+        run_filter(m, t, lin, noise, sensitive) for t, lin in zip(problem.data, lins, strict=True)
     )
     value, sensors = 0.0, []
-    for k, (track, out, keep) in enumerate(
-        zip(problem.prepared, outs, problem.counts, strict=True)
-    ):
+    for k, (data, out, keep) in enumerate(zip(problem.data, outs, problem.counts, strict=True)):
         e, s = out.innovations[keep], out.variance[keep]
         if problem.periods:
             e, s = _between_repeats(out, keep, problem.periods[k])
@@ -139,7 +156,7 @@ def measure_noise(
         if problem.known is not None and problem.known.sensor is not None:
             r = float(problem.known.sensor[k])
         else:
-            least = QUIET * float(np.var(track.table[3][keep]) + np.mean(track.table[3][keep]) ** 2)
+            least = QUIET * float(np.var(data.y[keep]) + np.mean(data.y[keep]) ** 2)
             r = max(mean, least, 1e-300)
         value -= 0.5 * (len(e) * (math.log(2 * math.pi * r) + mean / r) + np.sum(np.log(s)))
         sensors.append(r)

@@ -46,27 +46,27 @@ def begin_fit(problem: Problem, theta: Array, noise: Noise | None) -> Fit:
     noise = problem.known.noise if problem.known else noise
     first = noise or Noise((choose_units(m) ** 2 * 1e-2,) * m.channels)
     settled = []
-    for track in problem.prepared:
-        at = first_guess(m, track)
+    for data in problem.data:
+        at = first_guess(m, data)
         if noise is None:
-            at = settle_covariance(m, track, theta, first, at, passes=2)[1].trajectory
-        settled.append((track, at))
+            at = settle_covariance(m, data, theta, first, at, passes=2)[1].trajectory
+        settled.append((data, at))
     if noise is None:
         lins = tuple(m.linearize(t, theta, at) for t, at in settled)
-        counts = tuple(t.valid & ~t.afresh for t in problem.prepared)
+        counts = tuple(t.valid & ~t.afresh for t in problem.data)
         first = fit_noise(replace(problem, counts=counts), theta, lins, first, wide=True).noise
-    results = [settle_covariance(m, track, theta, first, at) for track, at in settled]
+    results = [settle_covariance(m, data, theta, first, at) for data, at in settled]
     if not problem.counts:
         problem = replace(problem, counts=tuple(
-            _settle(track, out) for track, (_, out) in zip(problem.prepared, results, strict=True)
+            _settle(data, out) for data, (_, out) in zip(problem.data, results, strict=True)
         ))  # fmt: skip
     return evaluate(problem, theta, first, [out.trajectory for _, out in results])
 
 
-def _settle(track: FilterData, out: Filtered) -> Any:
-    known = track.valid & np.isfinite(out.variance)
+def _settle(data: FilterData, out: Filtered) -> Any:
+    known = data.valid & np.isfinite(out.variance)
     usual = np.median(out.variance[known])
-    return known & ~track.afresh & (out.variance <= SETTLED * usual)
+    return known & ~data.afresh & (out.variance <= SETTLED * usual)
 
 
 def maximize(fit: Fit, rounds: int = ROUNDS, exact: bool = True) -> Fit:
@@ -285,7 +285,7 @@ def information(fit: Fit) -> tuple[Array, Array]:
             moved[k] += h
             pair.append(innovations(fit.theta, make_noise(moved, m.channels, dt)))
         columns.append(_difference(pair, 2 * LOG_STEP))
-    count, records = len(columns), len(problem.prepared) if problem.known is None else 0
+    count, records = len(columns), len(problem.data) if problem.known is None else 0
     matrix = np.zeros((count + records, count + records))
     score = np.zeros(count + records)
     for k, (out, keep, r) in enumerate(zip(fit.filtered, problem.counts, fit.sensor, strict=True)):

@@ -39,7 +39,7 @@ def fit_noise(
         return -value if np.isfinite(value) else 1e15
 
     start = take_logs(noise, dt)
-    longest = max(len(t.record) for t in problem.prepared)
+    longest = max(len(t.record) for t in problem.data)
     low, high = _limits(m, len(start) > m.channels, longest)
     start = np.clip(start, low, high)
     if wide:

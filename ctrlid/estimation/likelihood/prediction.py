@@ -108,8 +108,8 @@ def predict(loop: Loop, record: Record, force_noise: float | None = None) -> Pre
                           f"{type(loop).__name__} and {type(record).__name__}")  # fmt: skip
     if force_noise is not None and not (np.isfinite(force_noise) and force_noise >= 0):
         raise CtrlidError(f"force_noise is a ratio >= 0; given {force_noise!r}")
-    track, m = make_filter_data(loop, record), sampled_plant_for(loop, (), record)
-    problem = Problem(m, (track,), EMPTY, EMPTY)
+    data, m = make_filter_data(loop, record), sampled_plant_for(loop, (), record)
+    problem = Problem(m, (data,), EMPTY, EMPTY)
     if force_noise is None:
         fit = maximize(begin_fit(problem, EMPTY, None))
     else:
@@ -153,13 +153,13 @@ def predict_ahead(
     starts = starts[(bad[starts + horizon + 1] == bad[starts]) & prediction.settled[starts]]
     if not len(starts):
         return starts, np.empty(0)
-    m, track = sampled_plant_for(loop, (), record), make_filter_data(loop, record)
+    m, data = sampled_plant_for(loop, (), record), make_filter_data(loop, record)
     x = np.hstack([prediction.states, prediction.circuit])[starts]
     for j in range(horizon):
         # The outputs after the start are not known to the prediction.
-        x = m.advance(track, x, starts + j, known=j == 0)
+        x = m.advance(data, x, starts + j, known=j == 0)
     k = starts + horizon
-    return k, m.height(track, x, k)
+    return k, m.height(data, x, k)
 
 
 def spread_ahead(
@@ -191,11 +191,11 @@ def spread_ahead(
         stretch is long enough.
     """
     plain = replace(loop, controller=None)
-    track, m = make_filter_data(plain, record), sampled_plant_for(plain, (), record)
+    data, m = make_filter_data(plain, record), sampled_plant_for(plain, (), record)
     r, force = prediction.sensor_noise**2, prediction.force_noise**2
     ratio = max(force / r, 1e-300) if r else 1.0
     plant = begin_fit(
-        Problem(m, (track,), EMPTY, EMPTY), EMPTY, Noise((ratio,) * m.channels)
+        Problem(m, (data,), EMPTY, EMPTY), EMPTY, Noise((ratio,) * m.channels)
     ).linearized[0]
     lead = int(np.clip(LEAD * horizon, 50, 500))
     starts = np.arange(0, len(record) - lead - horizon, max(1, len(record) // STARTS))

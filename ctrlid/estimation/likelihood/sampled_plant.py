@@ -131,13 +131,13 @@ class SampledPlant:
             return time < dt / 4
         return time > (dt / scheme.steps / (2 * _brisk(e)) if scheme.order == 4 else dt / 16)
 
-    def linearize(self, track: FilterData, theta: Array, at: Trajectory) -> Linearized:
+    def linearize(self, data: FilterData, theta: Array, at: Trajectory) -> Linearized:
         """Return the plant along a trajectory, for parameter values `theta`."""
         p = self.values(theta)
-        u = track.table[1]
+        u = data.u
         applied, slopes = self._through_play(u, p)
-        doubt = track.doubt + self.onset.doubt(u, p) / track.scale**2
-        w = self._inputs(track, applied)
+        doubt = data.doubt + self.onset.doubt(u, p) / data.scale**2
+        w = self._inputs(data, applied)
         spread = at.spread[:, : self.n].T
         given = (at.filtered.T, w, p, spread, np.zeros(self.channels))
         step, a, b, dp, *moved = self._period(self.maps.stages, *given)
@@ -151,8 +151,8 @@ class SampledPlant:
             for k in (-1, 0, 1):
                 dp += dw[:, :, k + 1, None] * shift_signal(slopes, self.late - k)[:, None, :]
         elif len(rows):
-            du[rows] = self._moved(rows, given, 1e-3 * float(np.std(u[track.valid])))
-        start, wide = self.onset.start(track, p)
+            du[rows] = self._moved(rows, given, 1e-3 * float(np.std(u[data.valid])))
+        start, wide = self.onset.start(data, p)
         height, c, hp = self.maps.sensor(at.predicted.T, w, p, spread)
         return Linearized(
             _full(step, len(u))[:, :, 0], _full(a, len(u)), _full(b, len(u)),
@@ -204,28 +204,28 @@ class SampledPlant:
             [casadi.vertcat(after, casadi.vec(moved)), casadi.vertcat(y, seen.T)], {"cse": True},
         )  # fmt: skip
 
-    def inputs(self, track: FilterData, theta: Array) -> Array:
+    def inputs(self, data: FilterData, theta: Array) -> Array:
         """Return the rows over which the map is evaluated, shape (6, n), behind any play."""
-        return self._inputs(track, self._through_play(track.table[1], self.values(theta))[0])
+        return self._inputs(data, self._through_play(data.u, self.values(theta))[0])
 
-    def advance(self, track: FilterData, x: Array, rows: Any, known: bool = True) -> Array:
+    def advance(self, data: FilterData, x: Array, rows: Any, known: bool = True) -> Array:
         """Return states (k, n) one period after the samples `rows`, with the loop's parameters."""
         p = self.e.values
-        w = self._inputs(track, self._through_play(track.table[1], p)[0])[:, rows]
+        w = self._inputs(data, self._through_play(data.u, p)[0])[:, rows]
         if not known:
-            w[5] = self.height(track, x, rows)
+            w[5] = self.height(data, x, rows)
         quiet = np.zeros((self.n, 1))
         return self._period(self.maps.stages, x.T, w, p, quiet, np.zeros(self.channels))[0][:, :, 0]
 
-    def height(self, track: FilterData, x: Array, rows: Any) -> Array:
+    def height(self, data: FilterData, x: Array, rows: Any) -> Array:
         """Return the outputs at states (k, n) and the samples `rows`."""
         p = self.e.values
-        w = self._inputs(track, self._through_play(track.table[1], p)[0])[:, rows]
+        w = self._inputs(data, self._through_play(data.u, p)[0])[:, rows]
         return self.maps.sensor(x.T, w, p, np.zeros((self.n, 1)))[0][:, 0, 0]
 
-    def _inputs(self, track: FilterData, applied: Array) -> Array:
+    def _inputs(self, data: FilterData, applied: Array) -> Array:
         """Return the rows (t, input before, now, ahead, r, y) over which the map is evaluated."""
-        t, _, r, y = track.table
+        t, r, y = data.t, data.r, data.y
         moved = [shift_signal(applied, self.late - k) for k in (-1, 0, 1)]
         return np.vstack([t, *moved, r, y])
 
