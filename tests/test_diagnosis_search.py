@@ -30,12 +30,10 @@ from ctrlid.diagnosis.screening import screen_at, screen_candidate
 from ctrlid.diagnosis.selection import Round, prefer_plainer, run_round
 from ctrlid.diagnosis.thresholds import THRESHOLD
 from ctrlid.diagnosis.verdict import find_doubt, gap_is_wider, write_conclusion
-from ctrlid.estimation.likelihood.filter_data import make_filter_data
 from ctrlid.estimation.likelihood.kalman_filter import first_guess
-from ctrlid.estimation.likelihood.likelihood import linearize_again
+from ctrlid.estimation.likelihood.likelihood import linearize_again, make_problem, start_values
 from ctrlid.estimation.likelihood.maximization import begin_fit, maximize
-from ctrlid.estimation.likelihood.physics_fit import choose_noise, make_problem, start_values
-from ctrlid.estimation.likelihood.sampled_plant import sampled_plant_for
+from ctrlid.estimation.likelihood.physics_fit import choose_noise
 from ctrlid.loop.simulation import Simulator
 from problems import drive, levitation, pendulum, tanks, under_lead
 
@@ -458,9 +456,9 @@ def test_a_filter_begins_where_a_curved_sensor_points():
     truth = np.linspace(0.010, 0.015, 500)
     y = truth + 20.0 * (truth - loop.point.output) ** 2
     record = cid.Record(r=y, u=np.full(500, loop.point.input), y=y, dt=2e-3)
-    plant = sampled_plant_for(loop, (), record)
-    begun = first_guess(plant, make_filter_data(loop, record)).predicted
-    position = list(plant.e.states).index("x")
+    problem = make_problem(loop, (), [record])
+    begun = first_guess(problem.plant, problem.data[0]).predicted
+    position = list(problem.plant.e.states).index("x")
     np.testing.assert_allclose(begun[:, position], truth, rtol=1e-6)
 
 

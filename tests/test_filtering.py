@@ -17,8 +17,8 @@ from ctrlid import effects as E
 from ctrlid.estimation.likelihood.filter_data import make_filter_data, state_at_rest
 from ctrlid.estimation.likelihood.kalman_filter import Noise, first_guess, settle_covariance
 from ctrlid.estimation.likelihood.kalman_recursion import filter_pass
+from ctrlid.estimation.likelihood.likelihood import make_problem
 from ctrlid.estimation.likelihood.maximization import begin_fit
-from ctrlid.estimation.likelihood.physics_fit import make_problem
 from ctrlid.estimation.likelihood.sampled_plant import SampledPlant, Trajectory
 from ctrlid.physics.integration import advance
 from problems import levitation, mass, pendulum, record_of, servo

@@ -13,9 +13,13 @@ from scipy import stats
 import ctrlid as cid
 from ctrlid import CtrlidError
 from ctrlid import effects as E
-from ctrlid.estimation.likelihood.likelihood import evaluate, pseudo_inverse
+from ctrlid.estimation.likelihood.likelihood import (
+    evaluate,
+    make_problem,
+    pseudo_inverse,
+    start_values,
+)
 from ctrlid.estimation.likelihood.maximization import begin_fit, information, maximize
-from ctrlid.estimation.likelihood.physics_fit import make_problem, start_values
 from ctrlid.loop.simulation import Simulator
 from problems import astray, drive, levitation, load_script, record_of, tanks
 

@@ -10,9 +10,8 @@ from .._base.arrays import Array
 from .._base.errors import CtrlidError
 from ..data.record import Record
 from ..data.references import random_binary
-from ..estimation.likelihood.likelihood import Known
+from ..estimation.likelihood.likelihood import Known, make_problem
 from ..estimation.likelihood.maximization import begin_fit, expected_gain
-from ..estimation.likelihood.physics_fit import make_problem
 from ..loop.simulation import Simulator
 from .candidates import Trial
 from .gap import make_simulator

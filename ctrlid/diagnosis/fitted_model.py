@@ -11,8 +11,13 @@ from .._base.arrays import Array
 from ..data.record import Record
 from ..estimation.likelihood.filter_data import FilterData, prepare_for_loop
 from ..estimation.likelihood.kalman_filter import Noise, first_guess
-from ..estimation.likelihood.likelihood import Fit, evaluate, linearize_again
-from ..estimation.likelihood.physics_fit import parameter_bounds, start_values
+from ..estimation.likelihood.likelihood import (
+    Fit,
+    evaluate,
+    linearize_again,
+    parameter_bounds,
+    start_values,
+)
 from ..estimation.likelihood.sampled_plant import SampledPlant, Trajectory
 from ..loop.loop import Loop
 from ..loop.period_map import comes_to_rest

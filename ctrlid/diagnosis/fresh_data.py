@@ -9,9 +9,8 @@ import numpy as np
 from .._base.arrays import Array
 from .._base.errors import CtrlidError
 from ..data.record import Record
-from ..estimation.likelihood.likelihood import Fit, Known, evaluate
+from ..estimation.likelihood.likelihood import Fit, Known, evaluate, make_problem, start_values
 from ..estimation.likelihood.maximization import begin_fit, maximize
-from ..estimation.likelihood.physics_fit import make_problem, start_values
 from ..loop.loop import Loop
 from ..validation.reproduction import Reproduction, choose_reproduction
 from . import gap as gaps

@@ -12,8 +12,7 @@ from .._base.arrays import Array
 from .._base.statistics import pseudo_inverse
 from ..data.record import Record
 from ..estimation.likelihood.kalman_filter import Noise
-from ..estimation.likelihood.likelihood import Fit, Known, evaluate
-from ..estimation.likelihood.physics_fit import make_problem
+from ..estimation.likelihood.likelihood import Fit, Known, evaluate, make_problem
 from ..estimation.likelihood.sampled_plant import Trajectory
 from ..loop.loop import Loop
 from ..validation.residual_tests import remembered

@@ -10,9 +10,8 @@ import numpy as np
 
 from .._base.errors import CtrlidError
 from ..data.record import Record
-from ..estimation.likelihood.likelihood import Fit, evaluate
+from ..estimation.likelihood.likelihood import Fit, evaluate, make_problem
 from ..estimation.likelihood.maximization import begin_fit, maximize
-from ..estimation.likelihood.physics_fit import make_problem
 from ..loop.loop import Loop
 from ..loop.period_map import comes_to_rest
 from ..validation.record_simulation import long_stretches, prepare_stretch

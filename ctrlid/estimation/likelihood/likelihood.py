@@ -10,9 +10,11 @@ import numpy as np
 
 from ..._base.arrays import Array
 from ..._base.statistics import pseudo_inverse
-from .filter_data import FilterData
+from ...data.record import Record
+from ...loop.loop import Loop
+from .filter_data import FilterData, make_filter_data
 from .kalman_filter import Filtered, Noise, run_filter
-from .sampled_plant import Linearized, SampledPlant, Trajectory
+from .sampled_plant import Linearized, SampledPlant, Trajectory, make_sampled_plant
 
 QUIET = 1e-14  # of the output's size, squared: the least variance of the sensor noise
 
@@ -56,6 +58,56 @@ class Problem:
     counts: tuple[Any, ...] = ()
     known: Known | None = None
     periods: tuple[int, ...] = ()
+
+
+def make_problem(
+    loop: Loop, names: Sequence[str], records: Sequence[Record], begins: Sequence[float] = ()
+) -> Problem:
+    """Return the likelihood problem of a loop on records that begin at given times.
+
+    Raises
+    ------
+    CtrlidError
+        If the records do not fit the loop, or the plant moves too fast for its sampling period.
+    """
+    begins = begins or [0.0] * len(records)
+    data = tuple(make_filter_data(loop, r, b) for r, b in zip(records, begins, strict=True))
+    follow = records[0].r is not None and loop.analog
+    plant = make_sampled_plant(loop, tuple(names), records[0].hold, follow)
+    return Problem(plant, data, *parameter_bounds(loop, names))
+
+
+def effect_bounds(loop: Loop) -> dict[str, tuple[float, float]]:
+    """Return the bounds of the parameters of a loop's effects, by name."""
+    return {
+        f"{label}.{p.name}": (p.lower, p.upper)
+        for label, effect in loop.labelled.items()
+        for p in effect.parameters()
+    }
+
+
+def parameter_bounds(loop: Loop, names: Sequence[str]) -> tuple[Array, Array]:
+    """Return the bounds of parameters: those of effects, and none that changes a sign."""
+    known = effect_bounds(loop)
+    parameters = loop.equations(keep=True).parameters
+    lower, upper = [], []
+    for name in names:
+        if name in known:
+            low, high = known[name]
+        else:
+            # A mass or a gain may be far off, but not of the other sign.
+            value = parameters[name]
+            low = 1e-3 * value if value > 0 else -math.inf
+            high = 1e-3 * value if value < 0 else math.inf
+        lower.append(low)
+        upper.append(high)
+    return np.array(lower), np.array(upper)
+
+
+def start_values(loop: Loop, names: Sequence[str]) -> Array:
+    """Return the values of parameters as the loop has them."""
+    parameters = loop.equations(keep=True).parameters
+    return np.array([parameters[name] for name in names], dtype=float)
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,11 +15,9 @@ from ..._base.errors import CtrlidError
 from ...data.record import Record
 from ...data.several_records import model_and_data
 from ...loop.loop import Loop
-from .filter_data import make_filter_data
 from .kalman_filter import Noise
-from .likelihood import Problem
+from .likelihood import make_problem
 from .maximization import begin_fit, maximize
-from .sampled_plant import sampled_plant_for
 
 EMPTY: Array = np.empty(0)
 LEAD = 4  # horizons in which a filter's covariance settles
@@ -108,8 +106,8 @@ def predict(loop: Loop, record: Record, force_noise: float | None = None) -> Pre
                           f"{type(loop).__name__} and {type(record).__name__}")  # fmt: skip
     if force_noise is not None and not (np.isfinite(force_noise) and force_noise >= 0):
         raise CtrlidError(f"force_noise is a ratio >= 0; given {force_noise!r}")
-    data, m = make_filter_data(loop, record), sampled_plant_for(loop, (), record)
-    problem = Problem(m, (data,), EMPTY, EMPTY)
+    problem = make_problem(loop, (), [record])
+    m = problem.plant
     if force_noise is None:
         fit = maximize(begin_fit(problem, EMPTY, None))
     else:
@@ -118,7 +116,7 @@ def predict(loop: Loop, record: Record, force_noise: float | None = None) -> Pre
     states = out.trajectory.filtered
     own = [m.e.states.index(name) for name in loop.equations().states]  # of neutral effects none
     return Prediction(
-        record.y - out.innovations, out.innovations, fit.problem.counts[0],
+        record.y - out.innovations, out.innovations, fit.counts[0],
         sensor * np.sqrt(out.variance), states[:, own], states[:, m.n :], sensor,
         sensor * float(np.sqrt(fit.noise.force[0])),
     )  # fmt: skip
@@ -153,7 +151,8 @@ def predict_ahead(
     starts = starts[(bad[starts + horizon + 1] == bad[starts]) & prediction.settled[starts]]
     if not len(starts):
         return starts, np.empty(0)
-    m, data = sampled_plant_for(loop, (), record), make_filter_data(loop, record)
+    problem = make_problem(loop, (), [record])
+    m, data = problem.plant, problem.data[0]
     x = np.hstack([prediction.states, prediction.circuit])[starts]
     for j in range(horizon):
         # The outputs after the start are not known to the prediction.
@@ -191,12 +190,11 @@ def spread_ahead(
         stretch is long enough.
     """
     plain = replace(loop, controller=None)
-    data, m = make_filter_data(plain, record), sampled_plant_for(plain, (), record)
     r, force = prediction.sensor_noise**2, prediction.force_noise**2
     ratio = max(force / r, 1e-300) if r else 1.0
-    plant = begin_fit(
-        Problem(m, (data,), EMPTY, EMPTY), EMPTY, Noise((ratio,) * m.channels)
-    ).linearized[0]
+    problem = make_problem(plain, (), [record])
+    noise = Noise((ratio,) * problem.plant.channels)
+    plant = begin_fit(problem, EMPTY, noise).linearized[0]
     lead = int(np.clip(LEAD * horizon, 50, 500))
     starts = np.arange(0, len(record) - lead - horizon, max(1, len(record) // STARTS))
     bad = np.concatenate([[0], np.cumsum(~record.valid)])
