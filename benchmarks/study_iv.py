@@ -38,8 +38,7 @@ from scipy.signal import lfilter
 import ctrlid as cid
 from ctrlid.estimation.identified_model import Estimate
 from ctrlid.estimation.likelihood.likelihood import make_problem, pseudo_inverse, start_values
-from ctrlid.estimation.likelihood.maximization import begin_fit, information
-from ctrlid.estimation.likelihood.physics_fit import choose_noise
+from ctrlid.estimation.likelihood.maximization import begin_fit, choose_noise, information
 
 STEPS = (0.5, 0.2, 0.1, 0.03, 0.01, 0.005)
 NOISES = (0.01, 0.05, 0.2)

@@ -32,8 +32,7 @@ from ctrlid.diagnosis.thresholds import THRESHOLD
 from ctrlid.diagnosis.verdict import find_doubt, gap_is_wider, write_conclusion
 from ctrlid.estimation.likelihood.kalman_filter import first_guess
 from ctrlid.estimation.likelihood.likelihood import linearize_again, make_problem, start_values
-from ctrlid.estimation.likelihood.maximization import begin_fit, maximize
-from ctrlid.estimation.likelihood.physics_fit import choose_noise
+from ctrlid.estimation.likelihood.maximization import begin_fit, choose_noise, maximize
 from ctrlid.loop.simulation import Simulator
 from problems import drive, levitation, pendulum, tanks, under_lead
 

@@ -116,7 +116,7 @@ def log_terms(fit: Fit) -> Array:
 def carry_over(base: Model, loop: Loop, names: Sequence[str]) -> Fit:
     """Return the likelihood of a larger or smaller model, along the trajectory of the base."""
     old = base.fit.problem
-    m = SampledPlant(loop, names, old.plant.hold, old.plant.law is not None)
+    m = old.plant.of_loop(loop, names)
     data = tuple(prepare_for_loop(one, loop) for one in old.data)
     at = [
         _carry_trajectory(old.plant, m, out.trajectory, first_guess(m, one))
@@ -138,7 +138,7 @@ def carry_over(base: Model, loop: Loop, names: Sequence[str]) -> Fit:
     theta = np.clip(start_values(loop, names), lower, upper)
     fit = evaluate(problem, theta, base.fit.noise, at)
     if math.isfinite(fit.value) and m.n > old.plant.n:
-        fit = evaluate(problem, theta, base.fit.noise, [o.trajectory for o in fit.filtered])
+        fit = evaluate(problem, theta, base.fit.noise, fit.trajectories)
     return fit
 
 

@@ -121,7 +121,7 @@ def _fit_private_parameters(model: Model, window: gaps.Window) -> Loop:
         problem = make_problem(loop, names, [window.record], [window.begin])
         problem = replace(problem, known=Known(fit.noise, sensor))
         start = begin_fit(problem, start_values(loop, names), None)
-        at = [out.trajectory for out in start.filtered]
+        at = start.trajectories
         for k in range(len(names)):
             turns = np.arange(THRESHOLD.phase_starts) * 2 * math.pi / THRESHOLD.phase_starts
             turned = [start.theta + turn * np.eye(len(names))[k] for turn in turns]

@@ -10,9 +10,8 @@ from .._base.arrays import Array
 from .._base.errors import CtrlidError
 from ..data.record import Record
 from ..estimation.likelihood.likelihood import make_problem, start_values
-from ..estimation.likelihood.maximization import begin_fit, maximize, refit_noise_size
+from ..estimation.likelihood.maximization import begin_fit, choose_noise, maximize, refit_noise_size
 from ..estimation.likelihood.noise_fit import known_from_repeats
-from ..estimation.likelihood.physics_fit import choose_noise
 from ..loop.loop import Loop
 from ..validation.record_audit import Audit
 from .fitted_model import Model

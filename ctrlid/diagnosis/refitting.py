@@ -135,7 +135,7 @@ def _move_instant(fit: Fit, k: int, samples: float) -> Fit:
     theta[k] = np.clip(theta[k] + samples * problem.plant.loop.dt, problem.lower[k],
                        problem.upper[k])  # fmt: skip
     try:
-        return evaluate(problem, theta, fit.noise, [o.trajectory for o in fit.filtered])
+        return evaluate(problem, theta, fit.noise, fit.trajectories)
     except CtrlidError:  # no such instant in this record
         return replace(fit, value=-np.inf)
 

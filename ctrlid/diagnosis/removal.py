@@ -6,8 +6,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from .._base.criterion import bayesian_penalty
-from ..estimation.likelihood.maximization import begin_fit, maximize, polish, refit_noise_size
-from ..estimation.likelihood.physics_fit import choose_noise
+from ..estimation.likelihood.maximization import (
+    begin_fit,
+    choose_noise,
+    maximize,
+    polish,
+    refit_noise_size,
+)
 from ..loop.loop import Loop
 from .candidates import Trial, contains
 from .fitted_model import Model, can_simulate, carry_over, drop_linearization

@@ -55,7 +55,7 @@ def make_replica(model: Model, seed: int = 0) -> Model | None:
         problem = make_problem(loop, model.names, records, begins)
         problem = replace(problem, counts=fit.counts, known=fit.known)
         # With other noise a loop may take another path; or the first guess of one may lead astray.
-        along = evaluate(problem, fit.theta, fit.noise, [o.trajectory for o in fit.filtered])
+        along = evaluate(problem, fit.theta, fit.noise, fit.trajectories)
         starts = along, begin_fit(problem, fit.theta, fit.noise)
         again = maximize(max(starts, key=_likely), rounds=THRESHOLD.replica_rounds, exact=False)
     except CtrlidError:

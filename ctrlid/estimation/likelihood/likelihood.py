@@ -147,6 +147,11 @@ class Fit:
         return self.problem.known
 
     @property
+    def trajectories(self) -> list[Trajectory]:
+        """What a next pass is linearized along, for each record."""
+        return [out.trajectory for out in self.filtered]
+
+    @property
     def size(self) -> int:
         """Number of samples that count."""
         return int(sum(np.count_nonzero(c) for c in self.counts))
@@ -185,8 +190,7 @@ def evaluate(problem: Problem, theta: Array, noise: Noise, at: Sequence[Trajecto
 
 def linearize_again(fit: Fit) -> Fit:
     """Return the likelihood of the same values, the plant linearized along its last trajectory."""
-    along = [out.trajectory for out in fit.filtered]
-    return evaluate(fit.problem, fit.theta, fit.noise, along)
+    return evaluate(fit.problem, fit.theta, fit.noise, fit.trajectories)
 
 
 def measure_noise(

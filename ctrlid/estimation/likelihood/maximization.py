@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 
 from ..._base.arrays import Array
+from ..._base.criterion import bayesian_penalty
 from ..._base.errors import CtrlidError
 from ..._base.statistics import pseudo_inverse
 from .filter_data import FilterData
 from .kalman_filter import SETTLED, Filtered, Noise, first_guess, settle_covariance
 from .likelihood import Fit, Problem, evaluate, linearize_again
-from .noise_fit import LOG_STEP, choose_units, fit_noise, make_noise, take_logs
-from .sampled_plant import SampledPlant
+from .noise_fit import LOG_STEP, choose_units, fit_noise, make_noise, take_logs, try_coloured_force
 
 ROUNDS = 25  # Gauss-Newton steps at most
 FAR = 3.0  # standard errors: after a longer step the trajectory is settled anew
@@ -119,6 +119,23 @@ def refit_noise_size(fit: Fit) -> Fit:
     return maximize(other) if other.value > fit.value + ELSEWHERE else fit
 
 
+def choose_noise(fit: Fit, always: bool = False) -> Fit:
+    """Add a coloured force if the Bayesian information criterion wants it."""
+    if fit.known is not None:
+        return fit
+    try:
+        richer = try_coloured_force(fit)
+    except CtrlidError:
+        if always:
+            raise
+        return fit
+    # Two parameters more: worth trying out in full only if it gains at all.
+    if not always and richer.value < fit.value + bayesian_penalty(1, fit.size):
+        return fit
+    richer = maximize(richer)
+    return richer if always or richer.value > fit.value + bayesian_penalty(2, fit.size) else fit
+
+
 def expected_gain(fit: Fit) -> float:
     """Return the gain that a Gauss-Newton step within the bounds expects."""
     matrix, score = fit.normal
@@ -168,7 +185,7 @@ def _take_step(fit: Fit, matrix: Array, score: Array) -> tuple[Fit, float]:
         try:
             if not problem.plant.fits(theta):
                 problem, fit = _rebuild(fit, theta)
-            trial = evaluate(problem, theta, fit.noise, [o.trajectory for o in fit.filtered])
+            trial = evaluate(problem, theta, fit.noise, fit.trajectories)
             worse = not trial.value >= fit.value - 1e-6
             if worse and k < CURVED and promise > BEND and np.isfinite(trial.value):
                 trial = _take_second_step(trial)
@@ -191,14 +208,14 @@ def _take_second_step(fit: Fit) -> Fit:
     theta = np.clip(there.theta + step, problem.lower, problem.upper)
     if not problem.plant.fits(theta):
         return fit
-    return evaluate(problem, theta, there.noise, [o.trajectory for o in there.filtered])
+    return evaluate(problem, theta, there.noise, there.trajectories)
 
 
 def _rebuild(fit: Fit, theta: Array) -> tuple[Problem, Fit]:
     """Return the problem with a plant for the delay that `theta` has."""
-    m = fit.problem.plant
-    loop = m.loop.with_parameters(dict(zip(m.names, theta.tolist(), strict=True)))
-    problem = replace(fit.problem, plant=SampledPlant(loop, m.names, m.hold, m.law is not None))
+    names = fit.plant.names
+    loop = fit.plant.loop.with_parameters(dict(zip(names, theta.tolist(), strict=True)))
+    problem = replace(fit.problem, plant=fit.plant.of_loop(loop, names))
     return problem, replace(fit, problem=problem)
 
 
@@ -208,7 +225,7 @@ def polish(fit: Fit, rounds: int = 2) -> Fit:
         matrix, _ = fit.normal
         _, error = bounded_step(fit, *fit.normal)
         score, known = np.zeros(len(fit.theta)), np.isfinite(error)
-        at = [out.trajectory for out in fit.filtered]
+        at = fit.trajectories
         fit = evaluate(fit.problem, fit.theta, fit.noise, at)
         for k in np.flatnonzero(known):
             values = []
@@ -257,9 +274,9 @@ def information(fit: Fit) -> tuple[Array, Array]:
     ----------
     Åström, "Maximum likelihood and prediction error methods", Automatica 16 (1980).
     """
-    problem, m = fit.problem, fit.problem.plant
+    problem, m = fit.problem, fit.plant
     dt, p = m.loop.dt, len(fit.theta)
-    at = [out.trajectory for out in fit.filtered]
+    at = fit.trajectories
     _, error = bounded_step(fit, *fit.normal)
     logs = take_logs(fit.noise, dt) if problem.known is None else np.zeros(0)
 

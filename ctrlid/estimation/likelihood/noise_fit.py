@@ -142,7 +142,7 @@ def _newton(
 
 def try_coloured_force(fit: Fit) -> Fit:
     """Return the fit with a coloured force added, whether it pays or not."""
-    m, dt = fit.problem.plant, fit.problem.plant.loop.dt
+    m, dt = fit.plant, fit.plant.loop.dt
     best: Fit | None = None
     sizes = np.array([1e-2, 1.0]) * sum(fit.noise.force)
     for time in (3 * dt, 30 * dt, 300 * dt):

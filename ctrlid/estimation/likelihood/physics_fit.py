@@ -7,15 +7,13 @@ from typing import Any
 import numpy as np
 
 from ..._base.arrays import Array
-from ..._base.criterion import bayesian_penalty
 from ..._base.errors import CtrlidError
 from ..._base.statistics import pseudo_inverse
 from ...data.record import Record
 from ...data.several_records import as_records, model_and_data
 from ...loop.loop import Loop
 from .likelihood import Fit, effect_bounds, make_problem, start_values
-from .maximization import begin_fit, information, maximize, refit_noise_size
-from .noise_fit import try_coloured_force
+from .maximization import begin_fit, choose_noise, information, maximize, refit_noise_size
 from .physics_estimate import LoopEstimate, LoopFit
 
 UNSEEN = 1e-9  # relative eigenvalue of the information below which a direction is not in the data
@@ -106,27 +104,9 @@ def _free_names(loop: Loop, free: Sequence[str] | None) -> tuple[str, ...]:
     return names
 
 
-def choose_noise(fit: Fit, always: bool = False) -> Fit:
-    """Add a coloured force if the Bayesian information criterion wants it."""
-    if fit.problem.known is not None:
-        return fit
-    try:
-        richer = try_coloured_force(fit)
-    except CtrlidError:
-        if always:
-            raise
-        return fit
-    # Two parameters more: worth trying out in full only if it gains at all.
-    if not always and richer.value < fit.value + bayesian_penalty(1, fit.size):
-        return fit
-    richer = maximize(richer)
-    return richer if always or richer.value > fit.value + bayesian_penalty(2, fit.size) else fit
-
-
 def summarize_fit(loop: Loop, fit: Fit) -> LoopFit:
     """Return a maximum of the likelihood as a loop and an estimate."""
-    m, p = fit.problem.plant, len(fit.theta)
-    names = m.names
+    names, p = fit.plant.names, len(fit.theta)
     matrix, _ = information(fit)
     on_bound = (fit.theta <= fit.problem.lower) | (fit.theta >= fit.problem.upper)
     inside = np.concatenate([~on_bound, np.ones(len(matrix) - p, dtype=bool)])

@@ -1,5 +1,7 @@
 """A loop's plant along a record: its map over a period, with derivatives, and the sensor."""
 
+from __future__ import annotations
+
 import functools
 import itertools
 from collections.abc import Sequence
@@ -90,6 +92,10 @@ class SampledPlant:
                          tuple(self.index), self.late)  # fmt: skip
         self.maps = build_maps(self.plan)
         self.initial = InitialConditions(self.plan)
+
+    def of_loop(self, loop: Loop, names: Sequence[str]) -> SampledPlant:
+        """Return the plant of another loop, for the same kind of record."""
+        return SampledPlant(loop, names, self.hold, self.law is not None)
 
     def _period(self, stages: Sequence[BlockEvaluation], x: Array, *given: Any) -> list[Array]:
         """Go through a period; return the state after it and its derivatives, by itself first."""
