@@ -1,16 +1,22 @@
 """The way of a record through `fit_loop`: which functions it passes, and how often it turns back.
 
-Run it as ``python benchmarks/record_path.py``; ``--calls`` lists the calls that cross files. One
-small simulated record is fitted under a profiler. Counted are distinct functions of ctrlid that
-are entered, the files that they stand in, and distinct calls (from one function to another) that
-cross files. A call goes back up if what it calls stands higher than its caller in the layers that
-``[tool.importlinter]`` declares: no import does, but a callback or a method of an object that was
-handed down may. Returning does not count, nor do numpy's and Python's own frames in between.
+Run it as ``python benchmarks/record_path.py``; ``--list`` names the functions in the order in which
+they are entered first, as one would read them. One small simulated record is fitted under a
+profiler. Counted are
+
+- the distinct functions of ctrlid that are entered, and the files that they stand in;
+- along that order, how often the next function stands in another file, and how often in one
+  higher up in the layers that ``[tool.importlinter]`` declares: there a reader turns back;
+- the distinct calls from one function to another in another file, and how many of these go up:
+  no import does, but a callback or a method of an object that was handed down may.
+
+Numpy's and Python's own frames in between are passed over.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import re
 import sys
 import threading
@@ -62,9 +68,9 @@ def name_function(code: CodeType) -> Function | None:
     return ".".join(parts), name
 
 
-def trace_calls(run: Any) -> set[tuple[Function | None, Function]]:
-    """Return the distinct calls between functions of ctrlid while something runs."""
-    calls: set[tuple[Function | None, Function]] = set()
+def trace_calls(run: Any) -> list[tuple[Function | None, Function]]:
+    """Return the distinct calls between functions of ctrlid while something runs, in order."""
+    calls: dict[tuple[Function | None, Function], None] = {}
 
     def note(frame: FrameType, event: str, _: Any) -> None:
         callee = name_function(frame.f_code) if event == "call" else None
@@ -73,7 +79,7 @@ def trace_calls(run: Any) -> set[tuple[Function | None, Function]]:
         above, caller = frame.f_back, None
         while above is not None and caller is None:
             caller, above = name_function(above.f_code), above.f_back
-        calls.add((caller, callee))
+        calls[caller, callee] = None
 
     threading.setprofile(note)
     sys.setprofile(note)
@@ -82,14 +88,14 @@ def trace_calls(run: Any) -> set[tuple[Function | None, Function]]:
     finally:
         sys.setprofile(None)
         threading.setprofile(None)
-    return calls
+    return list(calls)
 
 
 def main() -> None:
     """Fit one record of a levitated ball and count."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--calls", action="store_true", help="list the calls that cross files")
-    listed = parser.parse_args().calls
+    parser.add_argument("--list", action="store_true", help="name the functions in their order")
+    listed = parser.parse_args().list
     plant = cid.plants.maglev(m=0.0213, K=3.34e-6)
     at = cid.operating_point(plant, output=0.012)
     lead = cid.design_lead(cid.linearize(plant, at), crossover=100, phase_margin=50)
@@ -98,19 +104,22 @@ def main() -> None:
     record = cid.simulate(loop, r, sensor_noise=2e-6, seed=2)
     start = loop.with_parameters({"K": 3.1e-6})
     calls = trace_calls(lambda: cid.fit_loop(start, record))
-    functions = {f for call in calls for f in call if f is not None}
-    across = sorted((a, b) for a, b in calls if a is not None and a[0] != b[0])
     ranks = read_layers()
-    up = [call for call in across if goes_up(call[0][0], call[1][0], ranks)]
+    functions = list(dict.fromkeys(callee for _, callee in calls))
+    turns = [(a, b) for (a, _), (b, _) in itertools.pairwise(functions) if a != b]
+    back = [pair for pair in turns if goes_up(*pair, ranks)]
+    across = [(a[0], b[0]) for a, b in calls if a is not None and a[0] != b[0]]
+    up = [pair for pair in across if goes_up(*pair, ranks)]
     if listed:
-        for (m1, f1), (m2, f2) in across:
-            mark = "UP " if ((m1, f1), (m2, f2)) in up else "   "
-            print(f"{mark}{m1}.{f1} -> {m2}.{f2}")
-    print(f"functions of ctrlid entered   {len(functions)}")
-    print(f"files that they stand in      {len({module for module, _ in functions})}")
-    print(f"calls                         {len([c for c in calls if c[0] is not None])}")
-    print(f"calls that cross files        {len(across)}")
-    print(f"of these, back up             {len(up)}")
+        for above, (module, name) in zip([("", ""), *functions], functions, strict=False):
+            mark = "back up to" if above[0] and goes_up(above[0], module, ranks) else ""
+            print(f"{mark:<11}{module}.{name}")
+    print(f"functions of ctrlid entered               {len(functions)}")
+    print(f"files that they stand in                  {len({m for m, _ in functions})}")
+    print(f"turns to another file, in reading order   {len(turns)}")
+    print(f"of these, back up                         {len(back)}")
+    print(f"calls that cross files                    {len(across)}")
+    print(f"of these, up                              {len(up)}")
 
 
 if __name__ == "__main__":

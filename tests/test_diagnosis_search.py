@@ -31,7 +31,7 @@ from ctrlid.diagnosis.selection import Round, prefer_plainer, run_round
 from ctrlid.diagnosis.thresholds import THRESHOLD
 from ctrlid.diagnosis.verdict import find_doubt, gap_is_wider, write_conclusion
 from ctrlid.estimation.likelihood.kalman_filter import first_guess
-from ctrlid.estimation.likelihood.likelihood import linearize_again, make_problem, start_values
+from ctrlid.estimation.likelihood.likelihood import linearize_again, make_problem
 from ctrlid.estimation.likelihood.maximization import begin_fit, choose_noise, maximize
 from ctrlid.loop.simulation import Simulator
 from problems import drive, levitation, pendulum, tanks, under_lead
@@ -698,7 +698,7 @@ def test_values_of_two_effects_of_a_class_stay_with_their_own():
     record = cid.simulate(both, r, sensor_noise=2e-6, seed=4)
     names = ("K", *(f"{label}.c" for label in both.labelled))
     problem = make_problem(both, names, [record], ())
-    fit = begin_fit(problem, start_values(both, names), None)
+    fit = begin_fit(problem)
     model = Model(both, fit)
     smaller, back = refit_without_effect(model, 0)
     assert len(smaller.loop.effects) == 1
@@ -714,7 +714,7 @@ def test_an_instant_that_is_dozens_of_samples_off_is_found(late):
     begun = loop.with_effect(E.ParameterStep("k", time=14.2 + late * 0.01, size=-0.1))
     names = ("c", "k", "ParameterStep.time", "ParameterStep.size")
     problem = make_problem(begun, names, [record], ())
-    climbed = maximize(begin_fit(problem, start_values(begun, names), None))
+    climbed = maximize(begin_fit(problem))
     fit = place_instants(climbed)
     assert fit.value > climbed.value + 10.0
     assert fit.theta[2] == pytest.approx(14.2, abs=0.01)

@@ -501,7 +501,7 @@ def test_a_sensor_lag_of_no_length_costs_nothing(effects):
     r = cid.random_binary(500, amplitude=1e-4, hold=30, around=op.output, seed=8)
     record = cid.simulate(loop, r, sensor_noise=1e-6, force_noise=0.01, seed=9)
     both = [
-        begin_fit(make_problem(model, (), [record], [0.0]), np.zeros(0), Noise((1e4,))).value
+        begin_fit(make_problem(model, (), [record]), noise=Noise((1e4,))).value
         for model in (loop, loop.with_effect(E.SensorLag(1e-5 * dt)))
     ]
     assert both[1] == pytest.approx(both[0], abs=0.1)

@@ -17,7 +17,6 @@ from ctrlid.estimation.likelihood.likelihood import (
     evaluate,
     make_problem,
     pseudo_inverse,
-    start_values,
 )
 from ctrlid.estimation.likelihood.maximization import begin_fit, information, maximize
 from ctrlid.loop.simulation import Simulator
@@ -241,7 +240,7 @@ def point(loop, record, **noise):
     from ctrlid.estimation.likelihood.maximization import begin_fit, maximize
 
     problem = make_problem(loop, loop.free, [record])
-    return maximize(begin_fit(problem, start_values(loop, loop.free), None))
+    return maximize(begin_fit(problem))
 
 
 def moved(fit, theta):
@@ -294,7 +293,7 @@ def test_standard_errors_without_any_force_noise():
     )
     loop, record = draw.loop, draw.record
     names = loop.free
-    start = begin_fit(make_problem(loop, names, [record]), start_values(loop, names), None)
+    start = begin_fit(make_problem(loop, names, [record]))
     fit = maximize(start)
     held = np.sqrt(np.diag(pseudo_inverse(fit.normal[0])))
     exact = np.sqrt(np.diag(pseudo_inverse(information(fit)[0])))[: len(names)]

@@ -178,7 +178,7 @@ def _unpredicted(rival: Trial, best: Trial, record: Record) -> float | None:
     known = Known(best.model.fit.noise, np.full(1, float(np.mean(best.model.fit.sensor))))
     try:
         problem = replace(make_problem(model.fitted, model.names, [record]), known=known)
-        fit = begin_fit(problem, model.fit.theta, None)
+        fit = begin_fit(problem, model.fit.theta)
     except CtrlidError:
         return None
     errors = sum(float(np.nansum(z**2)) for z in fit.standardized)

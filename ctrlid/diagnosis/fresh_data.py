@@ -9,7 +9,7 @@ import numpy as np
 from .._base.arrays import Array
 from .._base.errors import CtrlidError
 from ..data.record import Record
-from ..estimation.likelihood.likelihood import Fit, Known, evaluate, make_problem, start_values
+from ..estimation.likelihood.likelihood import Fit, Known, evaluate, make_problem
 from ..estimation.likelihood.maximization import begin_fit, maximize
 from ..loop.loop import Loop
 from ..validation.reproduction import Reproduction, choose_reproduction
@@ -82,7 +82,7 @@ class FreshData:
         total = 0.0
         for loop, window in zip(loops, self.windows, strict=True):
             problem = make_problem(loop, (), [window.record], [window.begin])
-            here = begin_fit(replace(problem, known=known), np.zeros(0), None)
+            here = begin_fit(replace(problem, known=known))
             z = here.standardized[0][window.mask]
             total += 0.5 * float(np.nansum(z**2 - 1))
         return max(total, 0.0)
@@ -120,7 +120,7 @@ def _fit_private_parameters(model: Model, window: gaps.Window) -> Loop:
     try:
         problem = make_problem(loop, names, [window.record], [window.begin])
         problem = replace(problem, known=Known(fit.noise, sensor))
-        start = begin_fit(problem, start_values(loop, names), None)
+        start = begin_fit(problem)
         at = start.trajectories
         for k in range(len(names)):
             turns = np.arange(THRESHOLD.phase_starts) * 2 * math.pi / THRESHOLD.phase_starts

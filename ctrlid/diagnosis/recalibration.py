@@ -52,7 +52,7 @@ def fit_base_model(
     problem = make_problem(loop, names, records, begins)
     lower, upper = _narrow_bounds(loop, names, problem.lower, problem.upper)
     problem = replace(problem, lower=lower, upper=upper)
-    fit = refit_noise_size(maximize(begin_fit(problem, start_values(loop, names), None)))
+    fit = refit_noise_size(maximize(begin_fit(problem)))
     return Model(loop, choose_noise(fit))
 
 
@@ -62,7 +62,7 @@ def weigh_by_repeats(base: Model, periods: Sequence[int]) -> Model:
     A noise that is fitted to what a model leaves takes part of a missing effect for noise.
     """
     problem = replace(base.fit.problem, known=known_from_repeats(base.fit, periods))
-    return Model(base.loop, maximize(begin_fit(problem, base.fit.theta, None), exact=False))
+    return Model(base.loop, maximize(begin_fit(problem, base.fit.theta), exact=False))
 
 
 def model_at_given_values(base: Model) -> Model | None:
@@ -76,7 +76,7 @@ def model_at_given_values(base: Model) -> Model | None:
     if not np.any(np.abs(base.fit.theta - given) > THRESHOLD.far_recalibration * size):
         return None
     try:
-        fit = begin_fit(base.fit.problem, given, None)
+        fit = begin_fit(base.fit.problem, given)
     except CtrlidError:
         return None
     return Model(base.loop, fit) if math.isfinite(fit.value) else None

@@ -93,7 +93,7 @@ def _drop_effects(model: Model, positions: Sequence[int]) -> Model:
         loop, names = take_out_effect(loop, position, names)
     fit = carry_over(model, loop, names)
     if not math.isfinite(fit.value):  # with noise as small as that, it cannot follow the record
-        fit = begin_fit(fit.problem, fit.theta, None)
+        fit = begin_fit(fit.problem, fit.theta)
     return Model(loop, fit)
 
 

@@ -70,11 +70,12 @@ def make_problem(
     CtrlidError
         If the records do not fit the loop, or the plant moves too fast for its sampling period.
     """
+    bounds = parameter_bounds(loop, names)
     begins = begins or [0.0] * len(records)
     data = tuple(make_filter_data(loop, r, b) for r, b in zip(records, begins, strict=True))
     follow = records[0].r is not None and loop.analog
     plant = make_sampled_plant(loop, tuple(names), records[0].hold, follow)
-    return Problem(plant, data, *parameter_bounds(loop, names))
+    return Problem(plant, data, *bounds)
 
 
 def effect_bounds(loop: Loop) -> dict[str, tuple[float, float]]:

@@ -12,7 +12,7 @@ from ..._base.errors import CtrlidError
 from ..._base.statistics import pseudo_inverse
 from .filter_data import FilterData
 from .kalman_filter import SETTLED, Filtered, Noise, first_guess, settle_covariance
-from .likelihood import Fit, Problem, evaluate, linearize_again
+from .likelihood import Fit, Problem, evaluate, linearize_again, start_values
 from .noise_fit import LOG_STEP, choose_units, fit_noise, make_noise, take_logs, try_coloured_force
 
 ROUNDS = 25  # Gauss-Newton steps at most
@@ -25,15 +25,15 @@ ELSEWHERE = 2.0  # of log-likelihood, that a noise far away must gain to go on f
 NOTHING = 1e-3  # of log-likelihood: a step that promises less is not worth taking
 
 
-def begin_fit(problem: Problem, theta: Array, noise: Noise | None) -> Fit:
+def begin_fit(problem: Problem, theta: Array | None = None, noise: Noise | None = None) -> Fit:
     """Return the likelihood at a starting point, with settled trajectories.
 
     Parameters
     ----------
     problem : Problem
         What is fitted; without `counts` the samples that count are chosen here.
-    theta : ndarray, shape (p,)
-        Parameter values.
+    theta : ndarray, shape (p,), optional
+        Parameter values; by default those of the loop.
     noise : Noise, optional
         The noise; by default searched.
 
@@ -43,6 +43,7 @@ def begin_fit(problem: Problem, theta: Array, noise: Noise | None) -> Fit:
         The starting point.
     """
     m = problem.plant
+    theta = start_values(m.loop, m.names) if theta is None else theta
     noise = problem.known.noise if problem.known else noise
     first = noise or Noise((choose_units(m) ** 2 * 1e-2,) * m.channels)
     settled = []

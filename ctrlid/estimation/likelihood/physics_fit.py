@@ -12,7 +12,7 @@ from ..._base.statistics import pseudo_inverse
 from ...data.record import Record
 from ...data.several_records import as_records, model_and_data
 from ...loop.loop import Loop
-from .likelihood import Fit, effect_bounds, make_problem, start_values
+from .likelihood import Fit, effect_bounds, make_problem
 from .maximization import begin_fit, choose_noise, information, maximize, refit_noise_size
 from .physics_estimate import LoopEstimate, LoopFit
 
@@ -81,8 +81,7 @@ def fit_loop(
     loop, record = model_and_data(loop, record)
     records = as_records(record)
     names = _free_names(loop, free)
-    start = begin_fit(make_problem(loop, names, records), start_values(loop, names), None)
-    fit = refit_noise_size(maximize(start))
+    fit = refit_noise_size(maximize(begin_fit(make_problem(loop, names, records))))
     if coloured or coloured is None:
         fit = choose_noise(fit, always=bool(coloured))
     return summarize_fit(loop, fit)

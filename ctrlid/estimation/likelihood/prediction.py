@@ -19,7 +19,6 @@ from .kalman_filter import Noise
 from .likelihood import make_problem
 from .maximization import begin_fit, maximize
 
-EMPTY: Array = np.empty(0)
 LEAD = 4  # horizons in which a filter's covariance settles
 STARTS = 300  # predictions whose spread is computed
 
@@ -109,9 +108,10 @@ def predict(loop: Loop, record: Record, force_noise: float | None = None) -> Pre
     problem = make_problem(loop, (), [record])
     m = problem.plant
     if force_noise is None:
-        fit = maximize(begin_fit(problem, EMPTY, None))
+        fit = maximize(begin_fit(problem))
     else:
-        fit = begin_fit(problem, EMPTY, Noise((max(force_noise, 1e-150) ** 2,) * m.channels))
+        noise = Noise((max(force_noise, 1e-150) ** 2,) * m.channels)
+        fit = begin_fit(problem, noise=noise)
     out, sensor = fit.filtered[0], float(np.sqrt(fit.sensor[0]))
     states = out.trajectory.filtered
     own = [m.e.states.index(name) for name in loop.equations().states]  # of neutral effects none
@@ -194,7 +194,7 @@ def spread_ahead(
     ratio = max(force / r, 1e-300) if r else 1.0
     problem = make_problem(plain, (), [record])
     noise = Noise((ratio,) * problem.plant.channels)
-    plant = begin_fit(problem, EMPTY, noise).linearized[0]
+    plant = begin_fit(problem, noise=noise).linearized[0]
     lead = int(np.clip(LEAD * horizon, 50, 500))
     starts = np.arange(0, len(record) - lead - horizon, max(1, len(record) // STARTS))
     bad = np.concatenate([[0], np.cumsum(~record.valid)])
