@@ -15,7 +15,7 @@ from scipy import integrate, linalg, signal
 import ctrlid as cid
 from ctrlid import effects as E
 from ctrlid.estimation.likelihood.filter_data import make_filter_data, state_at_rest
-from ctrlid.estimation.likelihood.kalman_filter import Noise, first_guess, settle_covariance
+from ctrlid.estimation.likelihood.kalman_filter import Noise, first_guess, settle_trajectory
 from ctrlid.estimation.likelihood.kalman_recursion import filter_pass
 from ctrlid.estimation.likelihood.likelihood import make_problem
 from ctrlid.estimation.likelihood.maximization import begin_fit
@@ -471,7 +471,7 @@ def test_nobody_knows_where_a_play_begins():
     for first in range(0, 40, 5):
         data = make_filter_data(loop, record[first:])
         m = SampledPlant(loop, ("InputBacklash.width",), "zoh", False)
-        lin, out = settle_covariance(m, data, np.array([0.2]), known, first_guess(m, data), 30)
+        lin, out = settle_trajectory(m, data, np.array([0.2]), known, first_guess(m, data), 30)
         z = out.innovations / np.sqrt(out.variance) / 3e-4
         assert np.abs(z).max() < 5
         assert np.mean(z[:60] ** 2) < 1.6
@@ -486,7 +486,7 @@ def test_nobody_knows_what_a_delay_brings_at_first():
     for first in range(0, 80, 10):
         data = make_filter_data(loop, record[first:])
         m = SampledPlant(loop, (), "zoh", False)
-        lin, out = settle_covariance(m, data, np.zeros(0), Noise((9e4,)), first_guess(m, data), 30)
+        lin, out = settle_trajectory(m, data, np.zeros(0), Noise((9e4,)), first_guess(m, data), 30)
         z = out.innovations / np.sqrt(out.variance) / 1e-4
         assert np.abs(z).max() < 6
         relative = lin.doubt[:5] * data.scale**2 / np.var(data.record.u)
@@ -555,7 +555,7 @@ def test_an_analog_circuit_moves_the_input_between_samples():
     record = cid.simulate(loop, r)
     m = SampledPlant(loop, (), "foh", True)
     data = make_filter_data(loop, record)
-    fit = settle_covariance(m, data, np.empty(0), Noise((1e12,)), first_guess(m, data))[1]
+    fit = settle_trajectory(m, data, np.empty(0), Noise((1e12,)), first_guess(m, data))[1]
     late = slice(15, None)
     assert np.abs(fit.innovations[late]).max() < 1e-4 * np.std(record.y)
 

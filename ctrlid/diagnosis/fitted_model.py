@@ -116,10 +116,10 @@ def log_terms(fit: Fit) -> Array:
 def carry_over(base: Model, loop: Loop, names: Sequence[str]) -> Fit:
     """Return the likelihood of a larger or smaller model, along the trajectory of the base."""
     old = base.fit.problem
-    m = old.plant.of_loop(loop, names)
+    plant = old.plant.of_loop(loop, names)
     data = tuple(prepare_for_loop(one, loop) for one in old.data)
     at = [
-        _carry_trajectory(old.plant, m, out.trajectory, first_guess(m, one))
+        _carry_trajectory(old.plant, plant, out.trajectory, first_guess(plant, one))
         for out, one in zip(base.fit.filtered, data, strict=True)
     ]
     lower, upper = parameter_bounds(loop, names)
@@ -127,17 +127,17 @@ def carry_over(base: Model, loop: Loop, names: Sequence[str]) -> Fit:
         if name in base.names:
             i = base.names.index(name)
             lower[k], upper[k] = old.lower[i], old.upper[i]
-    seen = RecordRange(m, max(len(one.record) for one in data) * loop.dt, tuple(at))
+    seen = RecordRange(plant, max(len(one.record) for one in data) * loop.dt, tuple(at))
     for label, effect in loop.labelled.items():
         for key, (low, high) in effect.limits(seen).items():
             if f"{label}.{key}" in names:
                 k = list(names).index(f"{label}.{key}")
                 lower[k] = max(lower[k], low)
                 upper[k] = max(min(upper[k], high), lower[k])
-    problem = replace(old, plant=m, data=data, lower=lower, upper=upper)
+    problem = replace(old, plant=plant, data=data, lower=lower, upper=upper)
     theta = np.clip(start_values(loop, names), lower, upper)
     fit = evaluate(problem, theta, base.fit.noise, at)
-    if math.isfinite(fit.value) and m.n > old.plant.n:
+    if math.isfinite(fit.value) and plant.n > old.plant.n:
         fit = evaluate(problem, theta, base.fit.noise, fit.trajectories)
     return fit
 

@@ -47,9 +47,9 @@ def score_shapes(
         The sizes that the first step gives them.
     """
     fit = model.fit
-    m, count = fit.plant, shapes[0].shape[1]
+    plant, count = fit.plant, shapes[0].shape[1]
     samples = max(len(s) for s in shapes)
-    step = max(width, THRESHOLD.scan_block // (samples * (m.size + 1)) // width * width)
+    step = max(width, THRESHOLD.scan_block // (samples * (plant.size + 1)) // width * width)
     gains, sizes = [], []
     p = len(fit.theta)
     for first in range(0, count, step):
@@ -67,12 +67,12 @@ def score_shapes(
             if parameter is None:
                 extra = lin.b.sum(axis=2)[:, :, None] * part
             else:
-                extra = lin.dp[:, :, m.names.index(parameter)][:, :, None] * part
+                extra = lin.dp[:, :, plant.names.index(parameter)][:, :, None] * part
             wide = replace(
                 lin, dp=np.concatenate([lin.dp, extra], axis=2),
                 hp=np.concatenate([lin.hp, np.zeros((len(shape), size))], axis=1),
             )  # fmt: skip
-            out = run_filter(m, data, wide, fit.noise, columns=p + size)
+            out = run_filter(plant, data, wide, fit.noise, columns=p + size)
             slopes, s = out.slopes[keep], out.variance[keep] * r
             weighted = slopes / s[:, None]
             matrix += weighted.T @ slopes

@@ -184,8 +184,8 @@ class Fit:
 
 def evaluate(problem: Problem, theta: Array, noise: Noise, at: Sequence[Trajectory]) -> Fit:
     """Return the likelihood of parameters and noise, linearized along given trajectories."""
-    m = problem.plant
-    lins = tuple(m.linearize(t, theta, a) for t, a in zip(problem.data, at, strict=True))
+    plant = problem.plant
+    lins = tuple(plant.linearize(one, theta, a) for one, a in zip(problem.data, at, strict=True))
     return measure_noise(problem, theta, noise, lins)
 
 
@@ -198,9 +198,10 @@ def measure_noise(
     problem: Problem, theta: Array, noise: Noise, lins: Sequence[Linearized], sensitive: bool = True
 ) -> Fit:
     """Return the likelihood of parameters and noise, the plant linearized before."""
-    m = problem.plant
+    plant = problem.plant
     outs = tuple(
-        run_filter(m, t, lin, noise, sensitive) for t, lin in zip(problem.data, lins, strict=True)
+        run_filter(plant, one, lin, noise, sensitive)
+        for one, lin in zip(problem.data, lins, strict=True)
     )
     value, sensors = 0.0, []
     for k, (data, out, keep) in enumerate(zip(problem.data, outs, problem.counts, strict=True)):

@@ -11,7 +11,7 @@ from ..._base.criterion import bayesian_penalty
 from ..._base.errors import CtrlidError
 from ..._base.statistics import pseudo_inverse
 from .filter_data import FilterData
-from .kalman_filter import SETTLED, Filtered, Noise, first_guess, settle_covariance
+from .kalman_filter import SETTLED, Filtered, Noise, first_guess, settle_trajectory
 from .likelihood import Fit, Problem, evaluate, linearize_again, start_values
 from .noise_fit import LOG_STEP, choose_units, fit_noise, make_noise, take_logs, try_coloured_force
 
@@ -42,21 +42,21 @@ def begin_fit(problem: Problem, theta: Array | None = None, noise: Noise | None 
     Fit
         The starting point.
     """
-    m = problem.plant
-    theta = start_values(m.loop, m.names) if theta is None else theta
+    plant = problem.plant
+    theta = start_values(plant.loop, plant.names) if theta is None else theta
     noise = problem.known.noise if problem.known else noise
-    first = noise or Noise((choose_units(m) ** 2 * 1e-2,) * m.channels)
+    first = noise or Noise((choose_units(plant) ** 2 * 1e-2,) * plant.channels)
     settled = []
     for data in problem.data:
-        at = first_guess(m, data)
+        at = first_guess(plant, data)
         if noise is None:
-            at = settle_covariance(m, data, theta, first, at, passes=2)[1].trajectory
+            at = settle_trajectory(plant, data, theta, first, at, passes=2)[1].trajectory
         settled.append((data, at))
     if noise is None:
-        lins = tuple(m.linearize(t, theta, at) for t, at in settled)
-        counts = tuple(t.valid & ~t.afresh for t in problem.data)
+        lins = tuple(plant.linearize(data, theta, at) for data, at in settled)
+        counts = tuple(data.valid & ~data.afresh for data in problem.data)
         first = fit_noise(replace(problem, counts=counts), theta, lins, first, wide=True).noise
-    results = [settle_covariance(m, data, theta, first, at) for data, at in settled]
+    results = [settle_trajectory(plant, data, theta, first, at) for data, at in settled]
     if not problem.counts:
         problem = replace(problem, counts=tuple(
             _settle(data, out) for data, (_, out) in zip(problem.data, results, strict=True)
@@ -275,8 +275,8 @@ def information(fit: Fit) -> tuple[Array, Array]:
     ----------
     Åström, "Maximum likelihood and prediction error methods", Automatica 16 (1980).
     """
-    problem, m = fit.problem, fit.plant
-    dt, p = m.loop.dt, len(fit.theta)
+    problem, plant = fit.problem, fit.plant
+    dt, p = plant.loop.dt, len(fit.theta)
     at = fit.trajectories
     _, error = bounded_step(fit, *fit.normal)
     logs = take_logs(fit.noise, dt) if problem.known is None else np.zeros(0)
@@ -301,7 +301,7 @@ def information(fit: Fit) -> tuple[Array, Array]:
         for h in (-LOG_STEP, LOG_STEP):
             moved = logs.copy()
             moved[k] += h
-            pair.append(innovations(fit.theta, make_noise(moved, m.channels, dt)))
+            pair.append(innovations(fit.theta, make_noise(moved, plant.channels, dt)))
         columns.append(_difference(pair, 2 * LOG_STEP))
     count, records = len(columns), len(problem.data) if problem.known is None else 0
     matrix = np.zeros((count + records, count + records))
