@@ -13,10 +13,9 @@ from scipy import signal
 import ctrlid as cid
 from ctrlid import effects
 from ctrlid.diagnosis.fresh_data import choose_fresh_data
-from ctrlid.diagnosis.gap import prepare_simulation
+from ctrlid.diagnosis.gap import make_simulator
 from ctrlid.diagnosis.recalibration import fit_base_model
-from ctrlid.diagnosis.thresholds import THRESHOLD
-from ctrlid.loop.simulation import Simulator
+from ctrlid.validation.record_simulation import prepare_stretch
 
 GAIN = 35.15065  # N/V, of the EMPS drive
 BAND = 50.0  # Hz, in which its forces are compared
@@ -24,9 +23,8 @@ BAND = 50.0  # Hz, in which its forces are compared
 
 def force_error(loop: cid.Loop, record: cid.Record) -> float:
     """Return the relative RMS error of the simulated drive force, in per cent, below 50 Hz."""
-    simulator = Simulator(loop, THRESHOLD.gap_integration_error, THRESHOLD.gap_steps)
-    z, r, d = prepare_simulation(simulator, record)
-    u = simulator.run(z, r, d)[1]
+    simulator = make_simulator(loop)
+    u = prepare_stretch(simulator, record, slice(0, len(record))).run(simulator)[1]
     b, a = signal.butter(4, 2 * BAND * record.dt)
     error, size = (signal.filtfilt(b, a, GAIN * v)[500:] for v in (record.u - u, record.u))
     return float(100 * np.sqrt(np.sum(error**2) / np.sum(size**2)))

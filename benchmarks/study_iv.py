@@ -37,9 +37,8 @@ from scipy.signal import lfilter
 
 import ctrlid as cid
 from ctrlid.estimation.identified_model import Estimate
-from ctrlid.estimation.likelihood.likelihood import pseudo_inverse
-from ctrlid.estimation.likelihood.maximization import begin_fit, information
-from ctrlid.estimation.likelihood.physics_fit import choose_noise, make_problem, start_values
+from ctrlid.estimation.likelihood.likelihood import evaluate, make_problem, pseudo_inverse
+from ctrlid.estimation.likelihood.maximization import begin_fit, choose_noise, information
 
 STEPS = (0.5, 0.2, 0.1, 0.03, 0.01, 0.005)
 NOISES = (0.01, 0.05, 0.2)
@@ -140,11 +139,10 @@ def information_bound(loop: cid.Loop, record: cid.Record) -> np.ndarray:
     The noise is as it is found with these values.
     """
     names = loop.free
-    start = begin_fit(make_problem(loop, names, [record]), start_values(loop, names), None)
+    start = begin_fit(make_problem(loop, names, [record]))
     fit = choose_noise(start)
     if fit.theta is not start.theta:  # the choice of the noise may have moved the parameters
-        at = [out.trajectory for out in fit.filtered]
-        fit = begin_fit(start.problem, start.theta, fit.noise, at)
+        fit = evaluate(start.problem, start.theta, fit.noise, fit.trajectories)
     inverse = pseudo_inverse(information(fit)[0])
     return np.sqrt(np.diag(inverse)[: len(names)])
 

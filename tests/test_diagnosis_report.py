@@ -21,8 +21,9 @@ from ctrlid.diagnosis.result import Diagnosis
 from ctrlid.diagnosis.saving import SavedLoop
 from ctrlid.diagnosis.thresholds import THRESHOLD
 from ctrlid.diagnosis.verdict import gap_stands_out
-from ctrlid.loop.simulation import Simulator
 from ctrlid.reporting import pictures as _pictures
+from ctrlid.validation.record_simulation import prepare_stretch
+from ctrlid.validation.reproduction import CLOSED_LOOP
 from problems import drive, legend, levitation, record_of, servo
 
 DT, N = 0.002, 3000
@@ -488,9 +489,7 @@ def test_a_window_far_from_rest_finds_its_start():
     record = cid.simulate(loop, r, sensor_noise=2e-6, seed=2)[3500:]
     assert abs(record.y[0] - loop.at.output) > 4e-3
     window = gap_of.make_window(record)
-    error = gap_of.root_mean_square(
-        [window], [gap_of.simulate_window(loop, window, gap_of.Way("closed-loop simulation"))]
-    )
+    error = gap_of.root_mean_square([window], [gap_of.simulate_window(loop, window, CLOSED_LOOP)])
     assert error < 1e-5
 
 
@@ -501,13 +500,14 @@ def test_an_unknown_force_is_not_paid_for_by_an_absurd_start():
     r = cid.random_binary(600, amplitude=0.03, hold=60, seed=3)
     force = 0.6 * np.sin(np.arange(600) / 40)
     record = cid.simulate(loop, r, sensor_noise=1e-6, d=force, seed=1)
-    simulator = Simulator(loop, THRESHOLD.gap_integration_error, THRESHOLD.gap_steps)
-    x, v, lag = gap_of.prepare_simulation(simulator, replace(record, u=record.u - force))[0][:3]
+    simulator, every = gap_of.make_simulator(loop), slice(0, 600)
+    calm = replace(record, u=record.u - force)
+    x, v, lag = prepare_stretch(simulator, calm, every).initial[:3]
     assert abs(x) < 5e-3
     assert abs(v) < 0.5
     assert abs(lag) < 20
     still = replace(record, y=np.zeros(600), u=np.zeros(600), r=np.zeros(600))
-    assert np.allclose(gap_of.prepare_simulation(simulator, still)[0], 0.0, atol=1e-6)
+    assert np.allclose(prepare_stretch(simulator, still, every).initial, 0.0, atol=1e-6)
 
 
 def test_noise_that_parts_a_loop_from_itself_explains_a_gap():
@@ -517,16 +517,17 @@ def test_noise_that_parts_a_loop_from_itself_explains_a_gap():
     record = record_of(rough, swing=0.03, hold=90, n=3000, seed=3, sensor_noise=1e-4,
                        force_noise=0.005)  # fmt: skip
     windows, fitted = [gap_of.make_window(record)], fit_base_model(rough, [record], ("k",)).fit
-    way = gap_of.Way("closed-loop simulation")
     floors = [
-        gap_of.compute_floor([loop], fitted, windows, way, THRESHOLD.floor_more_runs)
+        gap_of.compute_floor([loop], fitted, windows, CLOSED_LOOP, THRESHOLD.floor_more_runs)
         for loop in (rough, calm)
     ]
     assert floors[0].widest > 2 * floors[0].both
     assert floors[1].widest < 1.2 * floors[1].both
     for loop, floor in zip((rough, calm), floors, strict=True):
         left = 2 * floor.both
-        gap = Gap(str(way), 1.0, 1.0, left, floor.both, "m", *[np.zeros(3)] * 4, floor.widest)
+        gap = Gap(
+            str(CLOSED_LOOP), 1.0, 1.0, left, floor.both, "m", *[np.zeros(3)] * 4, floor.widest
+        )
         assert gap_stands_out(gap, fitted) == (loop is calm)
         assert (
             "differ in noise alone" in wording.describe_shrinking(replace(gap, before=0.9))

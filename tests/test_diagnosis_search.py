@@ -30,12 +30,9 @@ from ctrlid.diagnosis.screening import screen_at, screen_candidate
 from ctrlid.diagnosis.selection import Round, prefer_plainer, run_round
 from ctrlid.diagnosis.thresholds import THRESHOLD
 from ctrlid.diagnosis.verdict import find_doubt, gap_is_wider, write_conclusion
-from ctrlid.estimation.likelihood.filter_data import make_filter_data
 from ctrlid.estimation.likelihood.kalman_filter import first_guess
-from ctrlid.estimation.likelihood.likelihood import linearize_again
-from ctrlid.estimation.likelihood.maximization import begin_fit, maximize
-from ctrlid.estimation.likelihood.physics_fit import choose_noise, make_problem, start_values
-from ctrlid.estimation.likelihood.sampled_plant import sampled_plant_for
+from ctrlid.estimation.likelihood.likelihood import linearize_again, make_problem
+from ctrlid.estimation.likelihood.maximization import begin_fit, choose_noise, maximize
 from ctrlid.loop.simulation import Simulator
 from problems import drive, levitation, pendulum, tanks, under_lead
 
@@ -458,9 +455,9 @@ def test_a_filter_begins_where_a_curved_sensor_points():
     truth = np.linspace(0.010, 0.015, 500)
     y = truth + 20.0 * (truth - loop.point.output) ** 2
     record = cid.Record(r=y, u=np.full(500, loop.point.input), y=y, dt=2e-3)
-    plant = sampled_plant_for(loop, (), record)
-    begun = first_guess(plant, make_filter_data(loop, record)).predicted
-    position = list(plant.e.states).index("x")
+    problem = make_problem(loop, (), [record])
+    begun = first_guess(problem.plant, problem.data[0]).predicted
+    position = list(problem.plant.e.states).index("x")
     np.testing.assert_allclose(begun[:, position], truth, rtol=1e-6)
 
 
@@ -701,7 +698,7 @@ def test_values_of_two_effects_of_a_class_stay_with_their_own():
     record = cid.simulate(both, r, sensor_noise=2e-6, seed=4)
     names = ("K", *(f"{label}.c" for label in both.labelled))
     problem = make_problem(both, names, [record], ())
-    fit = begin_fit(problem, start_values(both, names), None)
+    fit = begin_fit(problem)
     model = Model(both, fit)
     smaller, back = refit_without_effect(model, 0)
     assert len(smaller.loop.effects) == 1
@@ -717,7 +714,7 @@ def test_an_instant_that_is_dozens_of_samples_off_is_found(late):
     begun = loop.with_effect(E.ParameterStep("k", time=14.2 + late * 0.01, size=-0.1))
     names = ("c", "k", "ParameterStep.time", "ParameterStep.size")
     problem = make_problem(begun, names, [record], ())
-    climbed = maximize(begin_fit(problem, start_values(begun, names), None))
+    climbed = maximize(begin_fit(problem))
     fit = place_instants(climbed)
     assert fit.value > climbed.value + 10.0
     assert fit.theta[2] == pytest.approx(14.2, abs=0.01)

@@ -15,10 +15,10 @@ from scipy import integrate, linalg, signal
 import ctrlid as cid
 from ctrlid import effects as E
 from ctrlid.estimation.likelihood.filter_data import make_filter_data, state_at_rest
-from ctrlid.estimation.likelihood.kalman_filter import Noise, first_guess, settle_covariance
+from ctrlid.estimation.likelihood.kalman_filter import Noise, first_guess, settle_trajectory
 from ctrlid.estimation.likelihood.kalman_recursion import filter_pass
+from ctrlid.estimation.likelihood.likelihood import make_problem
 from ctrlid.estimation.likelihood.maximization import begin_fit
-from ctrlid.estimation.likelihood.physics_fit import make_problem
 from ctrlid.estimation.likelihood.sampled_plant import SampledPlant, Trajectory
 from ctrlid.physics.integration import advance
 from problems import levitation, mass, pendulum, record_of, servo
@@ -178,17 +178,17 @@ def test_the_machines_derivatives_are_those_of_its_map(hidden, stages, parts):
     record = cid.simulate(levitated(), r, sensor_noise=2e-6, seed=2)
     m = SampledPlant(loop, names, "zoh", False)
     assert (len(m.maps.stages), m.maps.parts) == (stages, parts)
-    track = make_filter_data(loop, record)
+    data = make_filter_data(loop, record)
     rng = np.random.default_rng(5)
-    guess = first_guess(m, track)
+    guess = first_guess(m, data)
     x = guess.filtered * (1 + 0.01 * rng.standard_normal(guess.filtered.shape))
     x[:, 1] = 0.01 * rng.standard_normal(200)
     at = Trajectory(x, x.copy(), np.tile([1e-6, 2e-3, 1e-3, 1e-6][: m.n], (200, 1)))
     theta = np.array([loop.parameters[k] for k in names])
-    lin = m.linearize(track, theta, at)
+    lin = m.linearize(data, theta, at)
     for k in range(len(names)):
         h = 1e-5 * theta[k]
-        up, down = (m.linearize(track, theta + s * h * np.eye(len(names))[k], at) for s in (1, -1))
+        up, down = (m.linearize(data, theta + s * h * np.eye(len(names))[k], at) for s in (1, -1))
         for slope, ends in ((lin.dp[:, :, k], (up.step, down.step)),
                             (lin.hp[:, k], (up.height, down.height))):  # fmt: skip
             measured = (ends[0] - ends[1]) / (2 * h)
@@ -200,7 +200,7 @@ def test_the_machines_derivatives_are_those_of_its_map(hidden, stages, parts):
         for s in (1, -1):
             moved = x.copy()
             moved[:, j] += s * h
-            ends.append(m.linearize(track, theta, Trajectory(x, moved, at.spread)).step)
+            ends.append(m.linearize(data, theta, Trajectory(x, moved, at.spread)).step)
         measured = (ends[0] - ends[1]) / (2 * h)
         scale = np.abs(measured).max(axis=0) + 1e-12
         np.testing.assert_allclose(lin.a[:, :, j] / scale, measured / scale, atol=1e-5)
@@ -284,12 +284,12 @@ def one_period(loop, x, u_before, u_now, free=()):
     u = np.full(size, u_now)
     u[:1] = u_before
     record = cid.Record(u=u, y=np.linspace(0.01, 0.013, size), dt=loop.dt)
-    track = make_filter_data(loop, record)
+    data = make_filter_data(loop, record)
     theta = [loop.parameters[name] for name in m.names]
     at = np.zeros((size, m.size))
     at[k] = x
     wide = np.zeros((size, m.size))
-    return m.linearize(track, np.array(theta), Trajectory(at, at, wide)).step[k], m
+    return m.linearize(data, np.array(theta), Trajectory(at, at, wide)).step[k], m
 
 
 DT = 4e-3
@@ -411,9 +411,9 @@ def test_a_straight_input_with_a_delay():
     u = rng.standard_normal(30)
     record = cid.Record(u=u, y=rng.standard_normal(30), dt=dt, hold="foh")
     m = SampledPlant(loop, (), "foh", False)
-    track = make_filter_data(loop, record)
+    data = make_filter_data(loop, record)
     still = np.zeros((30, 2))
-    step = m.linearize(track, np.empty(0), Trajectory(still, still, still)).step
+    step = m.linearize(data, np.empty(0), Trajectory(still, still, still)).step
     for k in range(5, 28):
 
         def applied(t, k=k):
@@ -441,16 +441,16 @@ def test_play_is_followed_with_its_derivative():
         return np.array(out)
 
     m = SampledPlant(loop, ("InputBacklash.width",), "zoh", False)
-    track = make_filter_data(loop, record)
+    data = make_filter_data(loop, record)
     x = np.tile([0.012, 0.0], (n, 1))
     at = Trajectory(x, x, np.zeros((n, 2)))
-    lin = m.linearize(track, np.array([width]), at)
+    lin = m.linearize(data, np.array([width]), at)
     plain = SampledPlant(levitated(dt=DT), (), "zoh", False)
     applied = cid.Record(u=behind(width), y=record.y, dt=DT)
     expected = plain.linearize(make_filter_data(plain.loop, applied), np.empty(0), at).step
     np.testing.assert_allclose(lin.step, expected, atol=1e-4 * np.std(expected[:, 1]))
     h = 1e-6
-    ends = [m.linearize(track, np.array([width + s * h]), at).step for s in (1, -1)]
+    ends = [m.linearize(data, np.array([width + s * h]), at).step for s in (1, -1)]
     slope = (ends[0] - ends[1]) / (2 * h)
     close = np.abs(lin.dp[:, :, 0] - slope) < 1e-6 * np.abs(slope).max()
     assert close.all(axis=1).mean() > 0.99  # but where the step of the difference met a corner
@@ -469,29 +469,27 @@ def test_nobody_knows_where_a_play_begins():
     loop, record = balanced(E.InputBacklash(0.2), 0.015, 3e-4)
     known = Noise((1e4,))
     for first in range(0, 40, 5):
-        track = make_filter_data(loop, record[first:])
+        data = make_filter_data(loop, record[first:])
         m = SampledPlant(loop, ("InputBacklash.width",), "zoh", False)
-        lin, out = settle_covariance(m, track, np.array([0.2]), known, first_guess(m, track), 30)
+        lin, out = settle_trajectory(m, data, np.array([0.2]), known, first_guess(m, data), 30)
         z = out.innovations / np.sqrt(out.variance) / 3e-4
         assert np.abs(z).max() < 5
         assert np.mean(z[:60] ** 2) < 1.6
         u = record.u[first:]
         crossed = np.argmax(np.maximum.accumulate(u) - np.minimum.accumulate(u) >= 0.2)
         assert np.array_equal(np.flatnonzero(lin.doubt), np.arange(crossed))
-        assert lin.doubt[0] * track.scale**2 == pytest.approx(10 * 0.2**2 / 12)
+        assert lin.doubt[0] * data.scale**2 == pytest.approx(10 * 0.2**2 / 12)
 
 
 def test_nobody_knows_what_a_delay_brings_at_first():
     loop, record = balanced(E.InputDelay(0.016), 0.005, 1e-4)
     for first in range(0, 80, 10):
-        track = make_filter_data(loop, record[first:])
+        data = make_filter_data(loop, record[first:])
         m = SampledPlant(loop, (), "zoh", False)
-        lin, out = settle_covariance(
-            m, track, np.zeros(0), Noise((9e4,)), first_guess(m, track), 30
-        )
+        lin, out = settle_trajectory(m, data, np.zeros(0), Noise((9e4,)), first_guess(m, data), 30)
         z = out.innovations / np.sqrt(out.variance) / 1e-4
         assert np.abs(z).max() < 6
-        relative = lin.doubt[:5] * track.scale**2 / np.var(track.record.u)
+        relative = lin.doubt[:5] * data.scale**2 / np.var(data.record.u)
         assert relative == pytest.approx([1, 1, 1, 0.2**2, 0])
 
 
@@ -503,7 +501,7 @@ def test_a_sensor_lag_of_no_length_costs_nothing(effects):
     r = cid.random_binary(500, amplitude=1e-4, hold=30, around=op.output, seed=8)
     record = cid.simulate(loop, r, sensor_noise=1e-6, force_noise=0.01, seed=9)
     both = [
-        begin_fit(make_problem(model, (), [record], [0.0]), np.zeros(0), Noise((1e4,))).value
+        begin_fit(make_problem(model, (), [record]), noise=Noise((1e4,))).value
         for model in (loop, loop.with_effect(E.SensorLag(1e-5 * dt)))
     ]
     assert both[1] == pytest.approx(both[0], abs=0.1)
@@ -556,8 +554,8 @@ def test_an_analog_circuit_moves_the_input_between_samples():
     r = cid.random_binary(60, amplitude=1e-4, hold=5, around=0.012, seed=5)
     record = cid.simulate(loop, r)
     m = SampledPlant(loop, (), "foh", True)
-    track = make_filter_data(loop, record)
-    fit = settle_covariance(m, track, np.empty(0), Noise((1e12,)), first_guess(m, track))[1]
+    data = make_filter_data(loop, record)
+    fit = settle_trajectory(m, data, np.empty(0), Noise((1e12,)), first_guess(m, data))[1]
     late = slice(15, None)
     assert np.abs(fit.innovations[late]).max() < 1e-4 * np.std(record.y)
 

@@ -74,7 +74,7 @@ def test_a_replica_without_a_controller_is_like_the_record(fc):
     record = record_of(loop, 3)
     model = fit_base_model(replace(loop, controller=None), [record], ("K",))
     copy = make_replica(model)
-    made = copy.fit.problem.prepared[0].record
+    made = copy.fit.problem.data[0].record
     assert not np.array_equal(made.y, record.y)
     assert np.std(made.y - record.y) < 0.3 * np.std(record.y)
     assert copy.fit.theta[0] == pytest.approx(model.fit.theta[0], rel=0.01)

@@ -20,7 +20,7 @@ def hill(monkeypatch):
         def at(theta):
             nothing = np.zeros((len(theta), len(theta))), np.zeros(len(theta))
             return SimpleNamespace(value=value(theta), theta=np.asarray(theta, dtype=float),
-                                   noise=None, filtered=(), problem=problem,
+                                   noise=None, trajectories=[], problem=problem,
                                    normal=normal(theta) if normal else nothing)  # fmt: skip
 
         def evaluate(problem, theta, noise, along):

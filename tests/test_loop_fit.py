@@ -13,9 +13,12 @@ from scipy import stats
 import ctrlid as cid
 from ctrlid import CtrlidError
 from ctrlid import effects as E
-from ctrlid.estimation.likelihood.likelihood import evaluate, pseudo_inverse
+from ctrlid.estimation.likelihood.likelihood import (
+    evaluate,
+    make_problem,
+    pseudo_inverse,
+)
 from ctrlid.estimation.likelihood.maximization import begin_fit, information, maximize
-from ctrlid.estimation.likelihood.physics_fit import make_problem, start_values
 from ctrlid.loop.simulation import Simulator
 from problems import astray, drive, levitation, load_script, record_of, tanks
 
@@ -237,7 +240,7 @@ def point(loop, record, **noise):
     from ctrlid.estimation.likelihood.maximization import begin_fit, maximize
 
     problem = make_problem(loop, loop.free, [record])
-    return maximize(begin_fit(problem, start_values(loop, loop.free), None))
+    return maximize(begin_fit(problem))
 
 
 def moved(fit, theta):
@@ -290,7 +293,7 @@ def test_standard_errors_without_any_force_noise():
     )
     loop, record = draw.loop, draw.record
     names = loop.free
-    start = begin_fit(make_problem(loop, names, [record]), start_values(loop, names), None)
+    start = begin_fit(make_problem(loop, names, [record]))
     fit = maximize(start)
     held = np.sqrt(np.diag(pseudo_inverse(fit.normal[0])))
     exact = np.sqrt(np.diag(pseudo_inverse(information(fit)[0])))[: len(names)]

@@ -12,9 +12,10 @@ import pytest
 
 import ctrlid as cid
 from ctrlid import CtrlidError
-from ctrlid.diagnosis.gap import choose_comparison, make_window, simulate_window
+from ctrlid.diagnosis.gap import make_window, simulate_window
 from ctrlid.estimation.likelihood.prediction import predict_ahead, spread_ahead
 from ctrlid.validation.comparison import Comparison, Curve
+from ctrlid.validation.reproduction import choose_reproduction
 from ctrlid.validation.residual_tests import Correlation
 from problems import held_ball, levitation, rough_mass, tank
 
@@ -68,6 +69,14 @@ def test_a_record_cut_out_of_a_run_starts_from_its_own_states():
     assert cid.compare(part, analog)["closed-loop"].fit > 99.99
 
 
+@pytest.mark.parametrize(
+    "effect", [cid.effects.InputDelay(7e-4), cid.effects.InputBacklash(0.01)], ids=str
+)
+def test_what_the_input_remembers_is_no_state_of_the_controller(effect):
+    loop = loop_with(PID).with_effect(effect)
+    assert cid.compare(cid.simulate(loop, reference()), loop)["closed-loop"].fit > 99.9
+
+
 def test_a_run_is_followed_from_the_middle_of_a_fall():
     # So much acceleration that the speed over a few samples is none to begin with: from there, and
     # from rest, the simulated ball is lost within 400 samples.
@@ -79,15 +88,15 @@ def test_a_run_is_followed_from_the_middle_of_a_fall():
     loop = loop.with_effect(cid.effects.InputOffset(2.9))
     r = cid.random_binary(3000, amplitude=7e-4, hold=56, around=0.0169, seed=5)
     record = cid.simulate(loop, r, sensor_noise=1e-5, seed=4)
-    way = choose_comparison(loop, record)
-    assert str(way) == "closed-loop simulation"
-    assert way.horizon == 0
+    how = choose_reproduction(loop, record)
+    assert str(how) == "closed-loop simulation"
+    assert how.horizon == 0
     speed = np.diff(record.y)
     hardest = 500 + np.argsort(-np.abs(np.diff(speed)[500:2000]))[:10]
     for k in hardest.tolist():
         part = record[k:]
         assert (
-            np.std(simulate_window(loop, make_window(part), way) - part.y) < 4e-5
+            np.std(simulate_window(loop, make_window(part), how) - part.y) < 4e-5
         )  # its noise, through the loop
 
 

@@ -42,7 +42,7 @@ def run_constancy_tests(fit: Fit, axes: Mapping[str, Array]) -> dict[str, float]
     Nyblom, Journal of the American Statistical Association 84 (1989) 223-230 (constancy of
     parameters from scores).
     """
-    names = fit.problem.plant.names
+    names = fit.plant.names
     parts = [
         (out.slopes[keep], out.innovations[keep], out.variance[keep] * r, keep)
         for out, r, keep in zip(

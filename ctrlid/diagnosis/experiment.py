@@ -10,11 +10,11 @@ from .._base.arrays import Array
 from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from ..data.record import Record
 from ..data.references import random_binary
-from ..estimation.likelihood.likelihood import Known
+from ..estimation.likelihood.likelihood import Known, make_problem
 from ..estimation.likelihood.maximization import begin_fit, expected_gain
-from ..estimation.likelihood.physics_fit import make_problem
 from ..loop.simulation import Simulator
 from .candidates import Trial
+from .gap import make_simulator
 from .thresholds import THRESHOLD
 
 
@@ -52,11 +52,8 @@ def find_experiment(
     if loop.controller is None or record.r is None:
         return words, None
     try:
-        simulators = [
-            Simulator(t.model.fitted, THRESHOLD.gap_integration_error, THRESHOLD.gap_steps)
-            for t in (best, *others)
-        ]
-    except (ModelCannotRun, EffectDoesNotApply):
+        simulators = [make_simulator(t.model.fitted) for t in (best, *others)]
+    except CtrlidError:
         return words, None
     simulator = simulators[0]
     able = [
@@ -181,8 +178,8 @@ def _unpredicted(rival: Trial, best: Trial, record: Record) -> float | None:
     known = Known(best.model.fit.noise, np.full(1, float(np.mean(best.model.fit.sensor))))
     try:
         problem = replace(make_problem(model.fitted, model.names, [record]), known=known)
-        fit = begin_fit(problem, model.fit.theta, None)
-    except (ModelCannotRun, EffectDoesNotApply):
+        fit = begin_fit(problem, model.fit.theta)
+    except CtrlidError:
         return None
     errors = sum(float(np.nansum(z**2)) for z in fit.standardized)
     left = errors - 2 * expected_gain(fit)

@@ -9,10 +9,15 @@ import numpy as np
 
 from .._base.arrays import Array
 from ..data.record import Record
-from ..estimation.likelihood.filter_data import prepare_for_loop
+from ..estimation.likelihood.filter_data import FilterData, prepare_for_loop
 from ..estimation.likelihood.kalman_filter import Noise, first_guess
-from ..estimation.likelihood.likelihood import Fit, evaluate, linearize_again
-from ..estimation.likelihood.physics_fit import parameter_bounds, start_values
+from ..estimation.likelihood.likelihood import (
+    Fit,
+    evaluate,
+    linearize_again,
+    parameter_bounds,
+    start_values,
+)
 from ..estimation.likelihood.sampled_plant import SampledPlant, Trajectory
 from ..loop.loop import Loop
 from ..loop.period_map import comes_to_rest
@@ -34,12 +39,22 @@ class Model:
     @property
     def names(self) -> tuple[str, ...]:
         """The parameters that were fitted."""
-        return self.fit.problem.plant.names
+        return self.plant.names
+
+    @property
+    def plant(self) -> SampledPlant:
+        """The plant that was fitted, made ready to be filtered."""
+        return self.fit.plant
+
+    @property
+    def data(self) -> tuple[FilterData, ...]:
+        """The records that it was fitted to, made ready for the filter."""
+        return self.fit.data
 
     @property
     def records(self) -> tuple[Record, ...]:
         """The records that it was fitted to."""
-        return tuple(data.record for data in self.fit.problem.prepared)
+        return tuple(one.record for one in self.data)
 
     @property
     def fitted(self) -> Loop:
@@ -59,7 +74,7 @@ def can_simulate(model: Model) -> bool:
 def without_random_force(model: Model) -> Model:
     """Return a model with hardly any random force, to begin a fit with; known noise is kept."""
     noise = model.fit.noise
-    if model.fit.problem.known is not None:
+    if model.fit.known is not None:
         return model
     force = tuple(THRESHOLD.quiet_force * v for v in noise.force)
     return replace(model, fit=replace(model.fit, noise=Noise(force)))
@@ -92,7 +107,7 @@ def with_linearization(model: Model) -> Model:
 def log_terms(fit: Fit) -> Array:
     """Return each sample's share of the log-likelihood, records one after the other."""
     parts: list[Any] = []
-    for out, keep, r in zip(fit.filtered, fit.problem.counts, fit.sensor, strict=True):
+    for out, keep, r in zip(fit.filtered, fit.counts, fit.sensor, strict=True):
         s = out.variance[keep] * r
         parts.append(-0.5 * (np.log(2 * np.pi * s) + out.innovations[keep] ** 2 / s))
     return np.concatenate(parts)
@@ -101,29 +116,29 @@ def log_terms(fit: Fit) -> Array:
 def carry_over(base: Model, loop: Loop, names: Sequence[str]) -> Fit:
     """Return the likelihood of a larger or smaller model, along the trajectory of the base."""
     old = base.fit.problem
-    m = SampledPlant(loop, names, old.plant.hold, old.plant.law is not None)
-    prepared = tuple(prepare_for_loop(track, loop) for track in old.prepared)
+    plant = old.plant.of_loop(loop, names)
+    data = tuple(prepare_for_loop(one, loop) for one in old.data)
     at = [
-        _carry_trajectory(old.plant, m, out.trajectory, first_guess(m, track))
-        for out, track in zip(base.fit.filtered, prepared, strict=True)
+        _carry_trajectory(old.plant, plant, out.trajectory, first_guess(plant, one))
+        for out, one in zip(base.fit.filtered, data, strict=True)
     ]
     lower, upper = parameter_bounds(loop, names)
     for k, name in enumerate(names):
         if name in base.names:
             i = base.names.index(name)
             lower[k], upper[k] = old.lower[i], old.upper[i]
-    seen = RecordRange(m, max(len(data.record) for data in prepared) * loop.dt, tuple(at))
+    seen = RecordRange(plant, max(len(one.record) for one in data) * loop.dt, tuple(at))
     for label, effect in loop.labelled.items():
         for key, (low, high) in effect.limits(seen).items():
             if f"{label}.{key}" in names:
                 k = list(names).index(f"{label}.{key}")
                 lower[k] = max(lower[k], low)
                 upper[k] = max(min(upper[k], high), lower[k])
-    problem = replace(old, plant=m, prepared=prepared, lower=lower, upper=upper)
+    problem = replace(old, plant=plant, data=data, lower=lower, upper=upper)
     theta = np.clip(start_values(loop, names), lower, upper)
     fit = evaluate(problem, theta, base.fit.noise, at)
-    if math.isfinite(fit.value) and m.n > old.plant.n:
-        fit = evaluate(problem, theta, base.fit.noise, [o.trajectory for o in fit.filtered])
+    if math.isfinite(fit.value) and plant.n > old.plant.n:
+        fit = evaluate(problem, theta, base.fit.noise, fit.trajectories)
     return fit
 
 

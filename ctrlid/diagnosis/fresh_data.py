@@ -9,10 +9,10 @@ import numpy as np
 from .._base.arrays import Array
 from .._base.errors import CtrlidError, ModelCannotRun
 from ..data.record import Record
-from ..estimation.likelihood.likelihood import Fit, Known, evaluate
+from ..estimation.likelihood.likelihood import Fit, Known, evaluate, make_problem
 from ..estimation.likelihood.maximization import begin_fit, maximize
-from ..estimation.likelihood.physics_fit import make_problem, start_values
 from ..loop.loop import Loop
+from ..validation.reproduction import Reproduction, choose_reproduction
 from . import gap as gaps
 from .fitted_model import Model
 from .recalibration import cut_stretches
@@ -29,7 +29,7 @@ class FreshData:
 
     windows: tuple[gaps.Window, ...]
     rest: tuple[Record, ...] | None
-    way: gaps.Way
+    how: Reproduction
 
     def loops(self, model: Model) -> tuple[Loop, ...]:
         """Return the loop of a model for each window, ready to be compared there."""
@@ -52,7 +52,7 @@ class FreshData:
             return model.fitted
         parts, begins = cut_stretches(records)
         problem = make_problem(model.fitted, model.names, parts, begins)
-        known = fit.problem.known
+        known = fit.known
         if known is not None and (known.sensor is None or len(parts) == len(known.sensor)):
             problem = replace(problem, known=known)
         return Model(
@@ -62,7 +62,7 @@ class FreshData:
     def outputs(self, loops: Sequence[Loop]) -> tuple[Array, ...]:
         """Return what each loop makes of its window."""
         pairs = zip(loops, self.windows, strict=True)
-        return tuple(gaps.simulate_window(loop, w, self.way) for loop, w in pairs)
+        return tuple(gaps.simulate_window(loop, w, self.how) for loop, w in pairs)
 
     def gap(self, loops: Sequence[Loop]) -> float:
         """Return the RMS error of loops [output unit]."""
@@ -77,12 +77,12 @@ class FreshData:
 
         .. math:: \tfrac12 \sum_k (e_k^2 / s_k - 1)
         """
-        known = fit.problem.known or Known(fit.noise, fit.sensor)
+        known = fit.known or Known(fit.noise, fit.sensor)
         known = replace(known, sensor=np.full(1, float(np.mean(fit.sensor))))
         total = 0.0
         for loop, window in zip(loops, self.windows, strict=True):
             problem = make_problem(loop, (), [window.record], [window.begin])
-            here = begin_fit(replace(problem, known=known), np.zeros(0), None)
+            here = begin_fit(replace(problem, known=known))
             z = here.standardized[0][window.mask]
             total += 0.5 * float(np.nansum(z**2 - 1))
         return max(total, 0.0)
@@ -107,7 +107,7 @@ def choose_fresh_data(
         windows, rest = zip(*(gaps.hold_out(r) for r in records), strict=True)
     else:
         windows = tuple(gaps.make_window(r) for r in validation)
-    return FreshData(windows, rest, gaps.choose_comparison(loop, windows[0].record))
+    return FreshData(windows, rest, choose_reproduction(loop, windows[0].record))
 
 
 def _fit_private_parameters(model: Model, window: gaps.Window) -> Loop:
@@ -120,8 +120,8 @@ def _fit_private_parameters(model: Model, window: gaps.Window) -> Loop:
     try:
         problem = make_problem(loop, names, [window.record], [window.begin])
         problem = replace(problem, known=Known(fit.noise, sensor))
-        start = begin_fit(problem, start_values(loop, names), None)
-        at = [out.trajectory for out in start.filtered]
+        start = begin_fit(problem)
+        at = start.trajectories
         for k in range(len(names)):
             turns = np.arange(THRESHOLD.phase_starts) * 2 * math.pi / THRESHOLD.phase_starts
             turned = [start.theta + turn * np.eye(len(names))[k] for turn in turns]

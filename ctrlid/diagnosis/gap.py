@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from scipy import signal
@@ -11,39 +11,13 @@ from scipy import signal
 from .._base.arrays import Array
 from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from ..data.record import Record
-from ..estimation.likelihood.filter_data import FEWEST
 from ..estimation.likelihood.likelihood import Fit
 from ..estimation.likelihood.prediction import predict, predict_ahead, spread_ahead
-from ..loop.controller_replay import replay_from_best_state
-from ..loop.initial_state import best_start
 from ..loop.loop import Loop
-from ..loop.period_map import comes_to_rest
 from ..loop.simulation import Simulator
-from ..validation.comparing import moving_poles, time_constant
+from ..validation.record_simulation import long_stretches, prepare_stretch
+from ..validation.reproduction import Reproduction
 from .thresholds import THRESHOLD
-
-Name = Literal["closed-loop simulation", "open-loop simulation", "prediction"]
-
-
-@dataclass(frozen=True)
-class Way:
-    """How a loop is compared with data: simulated, or predicted `horizon` samples ahead."""
-
-    name: Name
-    horizon: int = 0
-
-    def __str__(self) -> str:
-        return f"{self.horizon}-step {self.name}" if self.horizon else self.name
-
-
-def choose_comparison(loop: Loop, record: Record) -> Way:
-    """Return how a loop is compared with a record: the most telling way there is."""
-    if loop.controller is not None and record.r is not None:
-        return Way("closed-loop simulation")
-    if loop.controller is None and comes_to_rest(loop):
-        return Way("open-loop simulation")
-    steps = time_constant(moving_poles(loop), loop.equations().dt, record)
-    return Way("prediction", steps)
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +64,7 @@ def root_mean_square(windows: Sequence[Window], results: Sequence[Array]) -> flo
     return math.sqrt(squares / max(count, 1))
 
 
-def simulate_window(loop: Loop, window: Window, way: Way) -> Array:
+def simulate_window(loop: Loop, window: Window, how: Reproduction) -> Array:
     """Return what a loop makes of a window, without any of its measured outputs but the first.
 
     Parameters
@@ -99,60 +73,36 @@ def simulate_window(loop: Loop, window: Window, way: Way) -> Array:
         The model.
     window : Window
         The data.
-    way : Way
-        As `choose_comparison` says it.
+    how : Reproduction
+        As `choose_reproduction` says it.
 
     Returns
     -------
     ndarray
         Outputs; NaN where there are none.
     """
-    record, first = window.record, window.begin
+    record = window.record
     y = np.full(len(record), np.nan)
     try:
-        if way.horizon:
-            index, values = predict_ahead(loop, record, predict(loop, record), way.horizon)
+        if how.horizon:
+            index, values = predict_ahead(loop, record, predict(loop, record), how.horizon)
             y[index] = values
             return y
-        simulator = Simulator(loop, THRESHOLD.gap_integration_error, THRESHOLD.gap_steps)
-    except (ModelCannotRun, EffectDoesNotApply):
+        simulator = make_simulator(loop)
+    except CtrlidError:
         return y
-    for start, stop in record.segments():
-        if stop - start < FEWEST:
-            continue
+    for part in long_stretches(record):
         try:
-            part = record[start:stop]
-            z, r, d = prepare_simulation(simulator, part)
-            begin = first + float(record.t[start] - record.start)
-            y[start:stop] = simulator.run(z, r, d, None, begin)[0]
-        except ModelCannotRun:
+            stretch = prepare_stretch(simulator, record, part, begin=window.begin)
+            y[part] = stretch.run(simulator)[0]
+        except CtrlidError:
             continue
     return y
 
 
-def prepare_simulation(
-    simulator: Simulator, part: Record, follows: bool = False
-) -> tuple[Array, Array | None, Array]:
-    """Return initial state, reference and injected signal for one stretch.
-
-    Where the controller `follows` the record, the reference is its output.
-    """
-    loop = simulator.loop
-    n = len(simulator.plant_states)
-    guess = simulator.rest.copy()
-    guess[: len(loop.point.states)] = loop.point.states
-    if loop.controller is None:
-        r, d = None, part.u - loop.point.input
-    elif follows:
-        r, d = np.asarray(part.y), part.u - loop.point.input
-    elif loop.analog:
-        r, d = np.asarray(part.r), np.zeros(len(part))
-    else:
-        r = np.asarray(part.r)
-        replayed, state = replay_from_best_state(loop, part)
-        guess[n : n + len(state)] = state
-        d = part.u - replayed
-    return best_start(simulator, part, r, d, guess, n), r, d
+def make_simulator(loop: Loop) -> Simulator:
+    """Return a loop made ready to be simulated many times, as exactly as a gap needs."""
+    return Simulator(loop, THRESHOLD.gap_integration_error, THRESHOLD.gap_steps)
 
 
 @dataclass(frozen=True)
@@ -172,7 +122,7 @@ def compute_floor(
     loops: Sequence[Loop],
     fit: Fit,
     windows: Sequence[Window],
-    way: Way,
+    how: Reproduction,
     runs: int | None = None,
 ) -> Floor:
     """Return the RMS error that noise leaves through a loop.
@@ -185,8 +135,8 @@ def compute_floor(
         Its fit, for the noise.
     windows : sequence of Window
         The data.
-    way : Way
-        As `choose_comparison` says it.
+    how : Reproduction
+        As `choose_reproduction` says it.
     runs : int
         Simulations with noise.
 
@@ -200,8 +150,8 @@ def compute_floor(
     for k, (loop, window) in enumerate(zip(loops, windows, strict=True)):
         noise = float(fit.sensor[min(k, len(fit.sensor) - 1)])
         try:
-            squares += _simulate_noise(loop, fit, noise, window, way, runs)
-        except (ModelCannotRun, EffectDoesNotApply):
+            squares += _simulate_noise(loop, fit, noise, window, how, runs)
+        except CtrlidError:
             return Floor(math.nan, math.nan, math.nan)
         count += int(np.count_nonzero(window.mask))
     errors = np.sqrt(squares / max(count, 1))
@@ -210,28 +160,26 @@ def compute_floor(
 
 
 def _simulate_noise(
-    loop: Loop, fit: Fit, sensor: float, window: Window, way: Way, runs: int
+    loop: Loop, fit: Fit, sensor: float, window: Window, how: Reproduction, runs: int
 ) -> Array:  # fmt: skip
     """Return what noise leaves in a window, squared and summed over its samples, for each run."""
     record = window.record
     size = int(np.count_nonzero(window.mask))
-    if way.horizon:
-        known = np.array(spread_ahead(loop, record, predict(loop, record), way.horizon))
+    if how.horizon:
+        known = np.array(spread_ahead(loop, record, predict(loop, record), how.horizon))
         return np.tile(size * known**2, (runs, 1))
-    simulator = Simulator(loop, THRESHOLD.gap_integration_error, THRESHOLD.gap_steps)
+    simulator = make_simulator(loop)
     squares, count = np.zeros((runs, 2)), 0
-    for start, stop in record.segments():
-        use = window.mask[start:stop]
-        if stop - start < FEWEST or not use.any():
+    for part in long_stretches(record):
+        use = window.mask[part]
+        if not use.any():
             continue
-        part = record[start:stop]
-        begin = window.begin + float(record.t[start] - record.start)
-        z, r, d = prepare_simulation(simulator, part)
-        rest = simulator.run(z, r, d, None, begin)[0]
+        stretch = prepare_stretch(simulator, record, part, begin=window.begin)
+        rest = stretch.run(simulator)[0]
         for seed in range(runs):
-            noise = draw_noise(fit, sensor, len(part), seed)
+            noise = draw_noise(fit, sensor, len(rest), seed)
             for k, both in enumerate((noise, [noise[0], 0 * noise[1]])):
-                moved = simulator.run(z, r, d, both, begin)[0] - rest
+                moved = stretch.run(simulator, both)[0] - rest
                 squares[seed, k] += float(np.sum(moved[use] ** 2))
         count += int(use.sum())
     if not count:

@@ -30,16 +30,16 @@ class GapSummary:
 
 def summarize_gap(loop: Loop, found: Search, fresh: FreshData) -> GapSummary:
     """Return the gap on data that no parameter was fitted to, and what each finding closes."""
-    windows, way = fresh.windows, fresh.way
+    windows, how = fresh.windows, fresh.how
     before, after = (fresh.loops(m) for m in (found.base, found.final))
     for effect in found.base.loop.effects[len(loop.effects) :]:
         before = tuple(x.without_effect(type(effect).__name__) for x in before)
     results = [fresh.outputs(x) for x in ((loop,) * len(windows), before, after)]
     sizes = [gaps.root_mean_square(windows, y) for y in results]
     fit = found.final.fit
-    floor = gaps.compute_floor(after, fit, windows, way)
+    floor = gaps.compute_floor(after, fit, windows, how)
     if sizes[2] > THRESHOLD.excess * floor.both:
-        floor = gaps.compute_floor(after, fit, windows, way, THRESHOLD.floor_more_runs)
+        floor = gaps.compute_floor(after, fit, windows, how, THRESHOLD.floor_more_runs)
     shares: dict[int, float] = {}
     for f in found.found:
         error = sizes[1]
@@ -49,10 +49,10 @@ def summarize_gap(loop: Loop, found: Search, fresh: FreshData) -> GapSummary:
         shares[f.position] = _share_closed(error**2 - sizes[2] ** 2, sizes[1], floor.both)
     first = windows[0]
     gap = Gap(
-        str(way), sizes[0], sizes[1], sizes[2], floor.both, first.record.units.get("y", ""),
+        str(how), sizes[0], sizes[1], sizes[2], floor.both, first.record.units.get("y", ""),
         first.begin + np.asarray(first.record.t - first.record.start)[first.mask],
         np.asarray(first.record.y)[first.mask], results[1][0][first.mask],
-        results[2][0][first.mask], floor.widest, way.horizon,
+        results[2][0][first.mask], floor.widest, how.horizon,
     )  # fmt: skip
     return GapSummary(gap, shares, _measure_disturbance(fit, loop, floor))
 
@@ -79,11 +79,11 @@ def helps_on_fresh_data(fresh: FreshData) -> Callable[[Weighed, Model], bool]:
 
     def helps(f: Weighed, model: Model) -> bool:
         with_it, without = loops(model), loops(f.base)
-        if model.fit.problem.known is not None:
+        if model.fit.known is not None:
             left = fresh.excess(without, model.fit)
             if left - fresh.excess(with_it, model.fit) > THRESHOLD.helps * left:
                 return True
-        floor = gaps.compute_floor(with_it, model.fit, fresh.windows, fresh.way).both
+        floor = gaps.compute_floor(with_it, model.fit, fresh.windows, fresh.how).both
         gap, before = fresh.gap(with_it), fresh.gap(without)
         return _share_closed(before**2 - gap**2, before, floor) > THRESHOLD.helps
 

@@ -206,7 +206,7 @@ def _came_close(trial: Trial, best: Trial, ties: bool) -> bool:
 
 def unexplained_likelihood(fit: Fit) -> float:
     """Return the log-likelihood above that of noise which is known; zero where none is known."""
-    if fit.problem.known is None:
+    if fit.known is None:
         return 0.0
     z = np.concatenate(fit.standardized)
     return max(0.0, 0.5 * float(np.nansum(z**2 - 1)))

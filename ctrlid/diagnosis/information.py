@@ -32,7 +32,7 @@ def find_doubles(fit: Fit, label: str, effect: AbstractEffect) -> dict[str, floa
     The viscous part of an asymmetric friction is one, beside a viscous friction in the model. What
     has come to a bound of its own can do no more.
     """
-    names, matrix, problem = fit.problem.plant.names, fit.normal[0], fit.problem
+    names, matrix, problem = fit.plant.names, fit.normal[0], fit.problem
     moving = (fit.theta > problem.lower) & (fit.theta < problem.upper)
     neutral = {f"{label}.{p.name}": p.neutral for p in effect.parameters()}
     deciding = {n: v for n, v in neutral.items() if n in names and v is not None}
@@ -50,7 +50,7 @@ def find_doubles(fit: Fit, label: str, effect: AbstractEffect) -> dict[str, floa
 def count_own_parameters(trial: Trial, fit: Fit) -> int:
     """Count the parameters of the effect that the record determines."""
     matrix, _ = fit.normal
-    own = [k for k, n in enumerate(fit.problem.plant.names) if n.startswith(f"{trial.label}.")]
+    own = [k for k, n in enumerate(fit.plant.names) if n.startswith(f"{trial.label}.")]
     left = remaining_information(matrix, own, [k for k in range(len(matrix)) if k not in own])
     return max(1, int(np.sum(np.linalg.eigvalsh(left) > THRESHOLD.seen)))
 

@@ -8,6 +8,8 @@ import numpy as np
 from scipy import stats
 
 from .._base.arrays import Array
+from ..estimation.likelihood.filter_data import FilterData
+from ..estimation.likelihood.kalman_filter import Filtered
 from ..estimation.likelihood.likelihood import Fit
 from ..validation.residual_tests import remembered
 from .constancy import chance_of_line, find_bin_edges, find_bins, run_constancy_tests
@@ -72,7 +74,7 @@ def run_noise_tests(fit: Fit) -> NoiseTests:
 
     Returns
     -------
-    Omnibus
+    NoiseTests
         The probabilities.
 
     References
@@ -87,7 +89,7 @@ def run_noise_tests(fit: Fit) -> NoiseTests:
     white_df = cross_df = 0
     lines, tails, shapes = [], [], []
     p = len(fit.theta)
-    for z, out, track in zip(fit.standardized, fit.filtered, fit.problem.prepared, strict=True):
+    for z, out, data in zip(fit.standardized, fit.filtered, fit.data, strict=True):
         keep = np.isfinite(z)
         filled = np.where(keep, z, 0.0)
         n = int(keep.sum())
@@ -96,14 +98,14 @@ def run_noise_tests(fit: Fit) -> NoiseTests:
         )
         white += n * float(np.sum(rho**2))
         white_df += THRESHOLD.lags
-        value, df = _regress_on_past(filled, keep, track.table[1], track.table[2])
+        value, df = _regress_on_past(filled, keep, data.u, data.r)
         cross += value
         cross_df += df
         lines.append(_test_line(filled, n))
         tails.append(z[keep])
         if fit.noise.drift:
             shapes += _deviates_of_force(out.disturbance[int(THRESHOLD.force_settling * len(z)) :])
-        for name, values in _find_axes(fit, out, track).items():
+        for name, values in _find_axes(fit, out, data).items():
             parts.setdefault(name, []).append(values[keep])
     z = np.concatenate(tails)
     axes = {name: np.concatenate(v) for name, v in parts.items()}
@@ -195,21 +197,20 @@ def _deviates_of_force(force: Array) -> list[float]:
     return [float(first), float(second)]
 
 
-def _find_axes(fit: Fit, out: object, track: object) -> dict[str, Array]:
-    e = fit.problem.plant.e
-    states = out.trajectory.predicted  # type: ignore[attr-defined]
-    table = track.table  # type: ignore[attr-defined]
+def _find_axes(fit: Fit, out: Filtered, data: FilterData) -> dict[str, Array]:
+    """Return the quantities in whose bins the innovations are looked at, by name."""
+    e = fit.plant.e
+    states = out.trajectory.predicted
     # The input of the same sample is computed from the very output that is predicted.
-    u = table[1]
-    axes = {"time": table[0], "input": np.concatenate([u[:1], u[:-1]])}
+    axes = {"time": data.t, "input": np.concatenate([data.u[:1], data.u[:-1]])}
     axes["input change"] = np.diff(axes["input"], prepend=axes["input"][0])
     moving = [k for k in range(len(e.states) - len(e.rest)) if k not in e.velocities]
     for k in moving:
         axes["position" if e.velocities and len(moving) == 1 else e.states[k]] = states[:, k]
     for k in e.velocities:
         axes["velocity" if len(e.velocities) == 1 else e.states[k]] = states[:, k]
-    if track.record.r is not None:  # type: ignore[attr-defined]
-        axes["reference"] = table[2]
+    if data.record.r is not None:
+        axes["reference"] = data.r
     return {name: v for name, v in axes.items() if np.ptp(v) > 0}
 
 

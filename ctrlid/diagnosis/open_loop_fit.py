@@ -13,8 +13,7 @@ from .._base.errors import CtrlidError, ModelCannotRun
 from .._base.statistics import pseudo_inverse
 from ..data.record import Record
 from ..estimation.likelihood.kalman_filter import Noise
-from ..estimation.likelihood.likelihood import Fit, Known, evaluate
-from ..estimation.likelihood.physics_fit import make_problem
+from ..estimation.likelihood.likelihood import Fit, Known, evaluate, make_problem
 from ..estimation.likelihood.sampled_plant import Trajectory
 from ..loop.loop import Loop
 from ..validation.residual_tests import remembered
@@ -93,9 +92,9 @@ class Simulation:
         self.loop, self.names = loop, tuple(names)
         self.records, self.begins = tuple(records), tuple(begins)
         self.problem = make_problem(loop, self.names, records, begins)
-        m = self.plant = self.problem.plant
-        step = m.with_slopes()
-        self.runs = [step.mapaccum("run", len(t.record)) for t in self.problem.prepared]
+        plant = self.plant = self.problem.plant
+        step = plant.with_slopes()
+        self.runs = [step.mapaccum("run", len(data.record)) for data in self.problem.data]
 
     def of(self, loop: Loop, names: Sequence[str]) -> Simulation:
         """Return the same records, simulated by another loop."""
@@ -103,24 +102,24 @@ class Simulation:
 
     def states_from(self, starts: Sequence[Mapping[str, float]]) -> Array:
         """Return initial states, shape (records, states); what is not known begins at rest."""
-        m = self.plant
-        rest = [np.resize(t.start, m.size) for t in self.problem.prepared]
+        plant = self.plant
+        rest = [np.resize(data.start, plant.size) for data in self.problem.data]
         for x, known in zip(rest, starts, strict=True):
-            for k, name in enumerate(m.e.states):
+            for k, name in enumerate(plant.e.states):
                 x[k] = known.get(name, x[k])
         return np.array(rest)
 
     def run(self, theta: Array, x0: Array) -> tuple[Array, Array, tuple[Array, ...]]:
         """Return errors, their derivatives and the states, for all records."""
-        m, p = self.plant, len(self.names)
-        n, count = m.size, len(self.runs)
-        values, errors, slopes, states = m.values(theta), [], [], []
-        for k, (track, run) in enumerate(zip(self.problem.prepared, self.runs, strict=True)):
+        plant, p = self.plant, len(self.names)
+        n, count = plant.size, len(self.runs)
+        values, errors, slopes, states = plant.values(theta), [], [], []
+        for k, (data, run) in enumerate(zip(self.problem.data, self.runs, strict=True)):
             z = np.concatenate([x0[k], np.zeros(n * p), np.eye(n).ravel()])
             after, seen = (np.asarray(out, float) for out in
-                           run(z, m.inputs(track, theta), values))  # fmt: skip
+                           run(z, plant.inputs(data, theta), values))  # fmt: skip
             states.append(np.vstack([x0[k], after[:n, :-1].T]))
-            y, keep = track.table[3], track.valid
+            y, keep = data.y, data.valid
             error = y - seen[0]
             wide = np.zeros((len(y), p + n * count))
             wide[:, :p] = -seen[1 : p + 1].T
@@ -192,10 +191,10 @@ def make_fit(found: Simulated, sensor: Array) -> Fit:
     """
     task = found.task
     silent = Noise((0.0,) * task.plant.channels)
-    problem = replace(task.problem, known=Known(silent, sensor), prepared=tuple(
-        replace(t, start=x[0], spread=np.zeros_like(t.spread), doubt=np.zeros(len(x)),
+    problem = replace(task.problem, known=Known(silent, sensor), data=tuple(
+        replace(data, start=x[0], spread=np.zeros_like(data.spread), doubt=np.zeros(len(x)),
                 afresh=np.arange(len(x)) == 0)
-        for t, x in zip(task.problem.prepared, found.states, strict=True)
-    ), counts=tuple(t.valid for t in task.problem.prepared))  # fmt: skip
+        for data, x in zip(task.problem.data, found.states, strict=True)
+    ), counts=tuple(data.valid for data in task.problem.data))  # fmt: skip
     at = [Trajectory(x, x.copy(), np.zeros_like(x)) for x in found.states]
     return evaluate(problem, found.theta, silent, at)

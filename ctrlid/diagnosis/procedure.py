@@ -17,6 +17,7 @@ from ..effects import CATALOGUE, AbstractEffect
 from ..estimation.likelihood.likelihood import Fit
 from ..loop.loop import Loop
 from ..validation.record_audit import Audit
+from ..validation.reproduction import OPEN_LOOP
 from .answer import assemble_answer, name_records
 from .candidates import check_catalogue
 from .findings import COMPLETE, Disturbance, Gap
@@ -209,8 +210,8 @@ def _answer_by_simulation(
 
 def _is_worth_simulating(fresh: FreshData, records: Sequence[Record]) -> bool:
     """Whether a plant runs open loop, and records are short enough for hundreds of simulations."""
-    open_loop = fresh.way.name == "open-loop simulation"
-    return open_loop and sum(len(r) for r in records) <= THRESHOLD.open_loop_samples
+    short = sum(len(r) for r in records) <= THRESHOLD.open_loop_samples
+    return short and fresh.how == OPEN_LOOP
 
 
 def _have_same(result: Diagnosis, records: int) -> bool:

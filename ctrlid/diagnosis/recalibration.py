@@ -9,9 +9,9 @@ import numpy as np
 from .._base.arrays import Array
 from .._base.errors import ModelCannotRun
 from ..data.record import Record
-from ..estimation.likelihood.maximization import begin_fit, maximize, refit_noise_size
+from ..estimation.likelihood.likelihood import make_problem, start_values
+from ..estimation.likelihood.maximization import begin_fit, choose_noise, maximize, refit_noise_size
 from ..estimation.likelihood.noise_fit import known_from_repeats
-from ..estimation.likelihood.physics_fit import choose_noise, make_problem, start_values
 from ..loop.loop import Loop
 from ..validation.record_audit import Audit
 from .fitted_model import Model
@@ -52,7 +52,7 @@ def fit_base_model(
     problem = make_problem(loop, names, records, begins)
     lower, upper = _narrow_bounds(loop, names, problem.lower, problem.upper)
     problem = replace(problem, lower=lower, upper=upper)
-    fit = refit_noise_size(maximize(begin_fit(problem, start_values(loop, names), None)))
+    fit = refit_noise_size(maximize(begin_fit(problem)))
     return Model(loop, choose_noise(fit))
 
 
@@ -62,7 +62,7 @@ def weigh_by_repeats(base: Model, periods: Sequence[int]) -> Model:
     A noise that is fitted to what a model leaves takes part of a missing effect for noise.
     """
     problem = replace(base.fit.problem, known=known_from_repeats(base.fit, periods))
-    return Model(base.loop, maximize(begin_fit(problem, base.fit.theta, None), exact=False))
+    return Model(base.loop, maximize(begin_fit(problem, base.fit.theta), exact=False))
 
 
 def model_at_given_values(base: Model) -> Model | None:
@@ -76,8 +76,8 @@ def model_at_given_values(base: Model) -> Model | None:
     if not np.any(np.abs(base.fit.theta - given) > THRESHOLD.far_recalibration * size):
         return None
     try:
-        fit = begin_fit(base.fit.problem, given, None)
-    except ModelCannotRun:
+        fit = begin_fit(base.fit.problem, given)
+    except CtrlidError:
         return None
     return Model(base.loop, fit) if math.isfinite(fit.value) else None
 

@@ -86,8 +86,8 @@ def weigh_refit(base: Model, trial: Trial, fit: Fit) -> Trial:
 def _likelihood_of_no_model(fit: Fit) -> float:
     """Return the likelihood of outputs that scatter about their mean, whatever drives them."""
     value = 0.0
-    for track, keep in zip(fit.problem.prepared, fit.problem.counts, strict=True):
-        y = track.table[3][keep]
+    for data, keep in zip(fit.data, fit.counts, strict=True):
+        y = data.y[keep]
         value -= 0.5 * len(y) * (math.log(2 * math.pi * float(np.var(y)) + THRESHOLD.tiny) + 1)
     return value
 
@@ -108,7 +108,7 @@ def place_instants(fit: Fit) -> Fit:
     Fit
         The same, or one that is more likely.
     """
-    plant = fit.problem.plant
+    plant = fit.plant
     best = fit
     instants = {
         f"{label}.{p.name}" for label, e in plant.loop.labelled.items()
@@ -131,7 +131,10 @@ def _move_instant(fit: Fit, k: int, samples: float) -> Fit:
     problem, theta = fit.problem, fit.theta.copy()
     theta[k] = np.clip(theta[k] + samples * problem.plant.loop.dt, problem.lower[k],
                        problem.upper[k])  # fmt: skip
-    return evaluate(problem, theta, fit.noise, [o.trajectory for o in fit.filtered])
+    try:
+        return evaluate(problem, theta, fit.noise, fit.trajectories)
+    except CtrlidError:  # no such instant in this record
+        return replace(fit, value=-np.inf)
 
 
 def _likelihood_of(fit: Fit) -> float:

@@ -6,8 +6,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from .._base.criterion import bayesian_penalty
-from ..estimation.likelihood.maximization import begin_fit, maximize, polish, refit_noise_size
-from ..estimation.likelihood.physics_fit import choose_noise
+from ..estimation.likelihood.maximization import (
+    begin_fit,
+    choose_noise,
+    maximize,
+    polish,
+    refit_noise_size,
+)
 from ..loop.loop import Loop
 from .candidates import Trial, contains
 from .fitted_model import Model, can_simulate, carry_over, drop_linearization
@@ -88,7 +93,7 @@ def _drop_effects(model: Model, positions: Sequence[int]) -> Model:
         loop, names = take_out_effect(loop, position, names)
     fit = carry_over(model, loop, names)
     if not math.isfinite(fit.value):  # with noise as small as that, it cannot follow the record
-        fit = begin_fit(fit.problem, fit.theta, None)
+        fit = begin_fit(fit.problem, fit.theta)
     return Model(loop, fit)
 
 
@@ -123,7 +128,7 @@ def refit_without_effect(model: Model, position: int) -> tuple[Model, Trial]:
 def refit_noise(model: Model) -> Model:
     """Ask again whether the data want a coloured force, now that an effect is in the model."""
     fit = refit_noise_size(polish(model.fit))
-    if fit.problem.known is not None:
+    if fit.known is not None:
         return Model(model.loop, fit)
     if fit.noise.drift:
         plain = maximize(replace(fit, noise=replace(fit.noise, memory=0.0, drift=0.0)))

@@ -10,15 +10,14 @@ import numpy as np
 
 from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from ..data.record import Record
-from ..estimation.likelihood.likelihood import Fit, evaluate
+from ..estimation.likelihood.likelihood import Fit, evaluate, make_problem
 from ..estimation.likelihood.maximization import begin_fit, maximize
-from ..estimation.likelihood.physics_fit import make_problem
 from ..loop.loop import Loop
 from ..loop.period_map import comes_to_rest
-from ..loop.simulation import Simulator
+from ..validation.record_simulation import long_stretches, prepare_stretch
 from .candidates import Trial
 from .fitted_model import Model, can_simulate, carry_over
-from .gap import draw_noise, prepare_simulation
+from .gap import draw_noise, make_simulator
 from .noise_tests import NoiseTests, run_noise_tests
 from .records import ROUNDING, Readout
 from .refitting import refit_candidate
@@ -46,15 +45,17 @@ def make_replica(model: Model, seed: int = 0) -> Model | None:
     """
     loop, fit = model.fitted, model.fit
     try:
+        begins = [float(data.t[0]) for data in fit.data]
         records = [
-            _simulate_record(model, t.record, float(t.table[0, 0]), float(r), seed + SEEDS * k)
-            for k, (t, r) in enumerate(zip(fit.problem.prepared, fit.sensor, strict=True))
+            _simulate_record(model, record, begin, float(r), seed + SEEDS * k)
+            for k, (record, begin, r) in enumerate(
+                zip(model.records, begins, fit.sensor, strict=True)
+            )
         ]
-        begins = [float(t.table[0, 0]) for t in fit.problem.prepared]
         problem = make_problem(loop, model.names, records, begins)
-        problem = replace(problem, counts=fit.problem.counts, known=fit.problem.known)
+        problem = replace(problem, counts=fit.counts, known=fit.known)
         # With other noise a loop may take another path; or the first guess of one may lead astray.
-        along = evaluate(problem, fit.theta, fit.noise, [o.trajectory for o in fit.filtered])
+        along = evaluate(problem, fit.theta, fit.noise, fit.trajectories)
         starts = along, begin_fit(problem, fit.theta, fit.noise)
         again = maximize(max(starts, key=_likely), rounds=THRESHOLD.replica_rounds, exact=False)
     except (ModelCannotRun, EffectDoesNotApply):
@@ -72,23 +73,19 @@ def _simulate_record(
     follows = not can_simulate(model)
     loop = follow_record(model.fitted, record) if follows else model.fitted
     if loop is None:
-        raise ModelCannotRun("the record cannot be followed")
-    simulator = Simulator(loop, THRESHOLD.gap_integration_error, THRESHOLD.gap_steps)
+        raise CtrlidError("the record cannot be followed")
+    simulator = make_simulator(loop)
     y, u = np.array(record.y), np.array(record.u)
-    for start, stop in record.segments():
-        if stop - start < THRESHOLD.shortest_segment:
-            continue
-        part = record[start:stop]
-        z, r, d = prepare_simulation(simulator, part, follows)
-        noise = draw_noise(model.fit, sensor, len(part), seed + start)
-        begin = first + float(record.t[start] - record.start)
-        y[start:stop], u[start:stop] = simulator.run(z, r, d, noise, begin)
+    for part in long_stretches(record, THRESHOLD.shortest_segment):
+        stretch = prepare_stretch(simulator, record, part, begin=first, follow=follows)
+        noise = draw_noise(model.fit, sensor, len(stretch.d), seed + part.start)
+        y[part], u[part] = stretch.run(simulator, noise)
     return replace(record, y=y, u=u)
 
 
 def has_kinks(model: Model) -> bool:
     """Whether a model has kinks in its states, such as dry friction."""
-    return model.fit.problem.plant.e.kinked
+    return model.plant.e.kinked
 
 
 def gain_on_replicas(copies: Sequence[Model | None], trial: Trial) -> float:

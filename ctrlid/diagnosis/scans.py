@@ -47,18 +47,18 @@ def score_shapes(
         The sizes that the first step gives them.
     """
     fit = model.fit
-    m, count = fit.problem.plant, shapes[0].shape[1]
+    plant, count = fit.plant, shapes[0].shape[1]
     samples = max(len(s) for s in shapes)
-    step = max(width, THRESHOLD.scan_block // (samples * (m.size + 1)) // width * width)
+    step = max(width, THRESHOLD.scan_block // (samples * (plant.size + 1)) // width * width)
     gains, sizes = [], []
     p = len(fit.theta)
     for first in range(0, count, step):
         size = min(step, count - first)
         matrix, score = np.zeros((p + size, p + size)), np.zeros(p + size)
-        for track, lin, keep, r, shape in zip(
-            fit.problem.prepared,
+        for data, lin, keep, r, shape in zip(
+            fit.data,
             fit.linearized,
-            fit.problem.counts,
+            fit.counts,
             fit.sensor,
             shapes,
             strict=True,
@@ -67,12 +67,12 @@ def score_shapes(
             if parameter is None:
                 extra = lin.b.sum(axis=2)[:, :, None] * part
             else:
-                extra = lin.dp[:, :, m.names.index(parameter)][:, :, None] * part
+                extra = lin.dp[:, :, plant.names.index(parameter)][:, :, None] * part
             wide = replace(
                 lin, dp=np.concatenate([lin.dp, extra], axis=2),
                 hp=np.concatenate([lin.hp, np.zeros((len(shape), size))], axis=1),
             )  # fmt: skip
-            out = run_filter(m, track, wide, fit.noise, columns=p + size)
+            out = run_filter(plant, data, wide, fit.noise, columns=p + size)
             slopes, s = out.slopes[keep], out.variance[keep] * r
             weighted = slopes / s[:, None]
             matrix += weighted.T @ slopes
@@ -103,13 +103,12 @@ class ModelSight:
     @property
     def times(self) -> tuple[Array, ...]:
         """Times of the samples since the start of the experiment [s], by record."""
-        return tuple(data.table[0] for data in self.model.fit.problem.prepared)
+        return tuple(data.t for data in self.model.data)
 
     @property
     def inputs(self) -> Array:
         """The recorded inputs that count, one record after the other [input unit]."""
-        prepared = self.model.fit.problem.prepared
-        return np.concatenate([data.table[1][data.valid] for data in prepared])
+        return np.concatenate([data.u[data.valid] for data in self.model.data])
 
     @property
     def outputs(self) -> tuple[Array, ...]:
@@ -119,24 +118,24 @@ class ModelSight:
     @property
     def travel(self) -> float:
         """How far the position moves on samples that count [output unit]."""
-        ways, counts = self.positions(), self.model.fit.problem.counts
+        ways, counts = self.positions(), self.model.fit.counts
         return max(float(np.ptp(way[keep])) for way, keep in zip(ways, counts, strict=True))
 
     @property
     def block(self) -> int:
         """How many waves over all samples fit into memory at once."""
         longest = max(len(t) for t in self.times)
-        states = self.model.fit.problem.plant.size
+        states = self.model.plant.size
         return max(1, THRESHOLD.scan_block // (2 * (states + 1) * longest))
 
     def state(self, name: str) -> tuple[Array, ...] | None:
         """Return a filtered state along each record, or None if the plant has no such state."""
-        states = list(self.model.fit.problem.plant.e.states)
+        states = list(self.model.plant.e.states)
         return self._filtered(states.index(name)) if name in states else None
 
     def positions(self) -> tuple[Array, ...]:
         """Return the filtered position along each record [output unit]."""
-        return self._filtered(self.model.fit.problem.plant.position)
+        return self._filtered(self.model.plant.position)
 
     def _filtered(self, k: int) -> tuple[Array, ...]:
         return tuple(out.trajectory.filtered[:, k] for out in self.model.fit.filtered)

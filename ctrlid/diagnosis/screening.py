@@ -96,7 +96,7 @@ def screen_starts(base: Model, effects: Sequence[AbstractEffect], scan_penalty: 
                 theta[names.index(f"{label}.{field}")] = value
         fit = start
         for _ in range(2):  # the second time along its own states
-            fit = evaluate(start.problem, theta, start.noise, [o.trajectory for o in fit.filtered])
+            fit = evaluate(start.problem, theta, start.noise, fit.trajectories)
         if not math.isfinite(fit.value):
             continue
         score = fit.value - base.fit.value + expected_gain(fit)

@@ -35,7 +35,7 @@ def best_start(
     d : ndarray
         What is added to the controller's output.
     guess : ndarray
-        A state of plant, controller and input path.
+        A state of plant, controller and input.
     fitted : int
         How many of its first entries are sought; the others are kept.
 

@@ -21,7 +21,7 @@ class PeriodMap:
     """The loop over one sampling period as a CasADi function.
 
     ``step(z, w) -> (next z, y, u, local error)``; z stacks plant and controller states, then what
-    the input's path remembers; w is ``(t, r, d, sensor noise, force noise)``, all held over the
+    the input remembers; w is ``(t, r, d, sensor noise, force noise)``, all held over the
     period. ``rate(z, w)`` is the derivative of z for a loop with an analog controller, else None.
     """
 
@@ -43,18 +43,18 @@ def make_period_map(loop: Loop, substeps: int) -> PeriodMap:
 
     Returns
     -------
-    Stepper
+    PeriodMap
         The map.
 
     Raises
     ------
     CtrlidError
-        If an analog controller acts through a delay or through play, which need a sampled input.
+        If an analog controller acts through a delay or a backlash, which need a sampled input.
     """
     e, law = loop.equations(), loop.law()
     n, nc = len(e.states), len(law.rest) if law else 0
     late = whole_delay(e, loop.dt)
-    # What the path remembers: the play, then the inputs of the last samples.
+    # What the input remembers: the backlash, then the inputs of the last samples.
     kept = 0 if e.delay is None else late + 1
     size = n + nc + (e.play is not None) + kept
     z, w = casadi.SX.sym("z", size), casadi.SX.sym("w", 5)
@@ -122,7 +122,7 @@ def make_period_map(loop: Loop, substeps: int) -> PeriodMap:
 
 
 def apply_backlash(e: Equations, m: Any, u: Any, p: Any) -> tuple[Any, Any]:
-    """Return the input behind the play and the play's next memory; without one, u and nothing."""
+    """Return the input behind the backlash and its next memory; without one, u and nothing."""
     if e.play is None:
         return u, casadi.SX(0, 1)
     given = casadi.vertcat(e.play.m, e.play.u, e.p)

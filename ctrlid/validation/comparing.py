@@ -18,16 +18,21 @@ from ..estimation.identified_model import IdentifiedModel, delay_of
 from ..estimation.likelihood.filter_data import FEWEST
 from ..estimation.likelihood.prediction import Prediction, predict, predict_ahead, spread_ahead
 from ..estimation.linear.sampled_motion import flow
-from ..loop.controller_replay import controller_output, replay_from_best_state
-from ..loop.controllers import PID
-from ..loop.initial_state import best_start
 from ..loop.loop import Loop
 from ..loop.period_map import growth_rate
 from ..loop.simulation import Simulator
-from ..physics.linearization import state_matrices
 from ..physics.trace import timebase
 from .comparison import EXACT, Comparison, Curve
 from .noise_model import noise_polynomial, whiten_errors
+from .record_simulation import Stretch, long_stretches, prepare_stretch
+from .reproduction import (
+    CLOSED_LOOP,
+    ONE_STEP,
+    OPEN_LOOP,
+    Reproduction,
+    moving_poles,
+    time_constant,
+)
 from .residual_tests import Correlation, autocorrelation, cross_correlation, explained_share
 
 MEANINGFUL = 1e-6  # of the input's size: below, an injected signal is round-off
@@ -99,7 +104,7 @@ def _compare_loop(record: Record, loop: Loop, horizon: int | None) -> Comparison
     prediction = predict(loop, record)
     residuals = np.where(prediction.settled, prediction.innovations, np.nan)
     one_step = np.where(prediction.settled, prediction.y, np.nan)
-    curves = [_curve("one-step prediction", record, one_step, _known_before(record, 1))]
+    curves = [_curve(ONE_STEP, record, one_step, _known_before(record, 1))]
     notes = []
     e = loop.equations()
     steps = horizon or time_constant(moving_poles(loop), e.dt, record)
@@ -107,14 +112,14 @@ def _compare_loop(record: Record, loop: Loop, horizon: int | None) -> Comparison
         index, values = predict_ahead(loop, record, prediction, steps)
         ahead = np.full(len(record), np.nan)
         ahead[index] = values
-        curves.append(_curve(f"{steps}-step prediction", record, ahead,
+        curves.append(_curve(Reproduction("prediction", steps), record, ahead,
                              _known_before(record, steps),
                              spread_ahead(loop, record, prediction, steps)[0]))  # fmt: skip
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", CtrlidWarning)
         try:
-            curves.append(_simulated(record, loop, prediction))
-        except (ModelCannotRun, EffectDoesNotApply) as reason:
+            curves.append(_simulate(record, loop, prediction))
+        except CtrlidError as reason:
             notes.append(f"no simulation: {reason}")
     notes += sorted({str(w.message) for w in caught})[-1:]
     return _comparison(repr(loop), record, curves, residuals, notes)
@@ -141,91 +146,43 @@ def _comparison(
     return Comparison(what, record, known, residuals, tests, tuple(notes))
 
 
-def moving_poles(loop: Loop) -> Any:
-    """Return the poles of a plant in motion, where dry friction does not damp it as at rest."""
-    return np.linalg.eigvals(state_matrices(loop.equations(), loop.point, spread=1e6)[0])
-
-
-def time_constant(poles: Any, dt: float, record: Record) -> int:
-    """Return the slowest unstable, or else the slowest stable, time constant in samples."""
-    with np.errstate(divide="ignore", invalid="ignore"):  # a pole at z = 0 is infinitely fast
-        rates = (np.log(poles.astype(complex)) / dt if dt else poles).real
-    fast = rates[rates > 1e-6] if np.any(rates > 1e-6) else -rates[rates < -1e-6]
-    slowest = float(np.min(fast)) if fast.size else 10 / record.duration
-    return int(np.clip(round(1 / (slowest * record.dt)), 1, max(len(record) // 10, 1)))
-
-
-def _simulated(record: Record, loop: Loop, prediction: Prediction) -> Curve:
+def _simulate(record: Record, loop: Loop, prediction: Prediction) -> Curve:
     """Simulate a record, stretch by stretch, each from its own best initial state.
 
     Once more with noise of the size found in the one-step errors, to see what it makes of it.
     """
-    r: Any = record.r
-    if loop.controller is None:
-        if growth_rate(loop) > -1e-9:
-            raise ModelCannotRun(
-                "the plant is not stable and the controller is unknown; an open-loop simulation "
-                "would drift without bound. Give the loop its controller"
-            )
-        label = "open-loop simulation"
-    elif loop.analog and r is None:
-        raise ModelCannotRun(
-            "an analog loop is simulated from its reference, but the record has none"
+    if loop.controller is None and growth_rate(loop) > -1e-9:
+        raise CtrlidError(
+            "the plant is not stable and the controller is unknown; an open-loop simulation "
+            "would drift without bound. Give the loop its controller"
         )
-    else:
-        label = "closed-loop simulation"
-        pid = loop.controller
-        if r is None and isinstance(pid, PID) and np.isfinite([pid.lower, pid.upper]).any():
-            raise ModelCannotRun(
-                "a PID with limits is simulated from its reference, but the record "
-                "has none; give it r=, a constant for a fixed set-point"
-            )
-    y, injected = np.full(len(record), np.nan), np.zeros(len(record))
-    noisy = np.zeros(len(record))
+    y, injected, noisy = np.full(len(record), np.nan), np.zeros(len(record)), np.zeros(len(record))
     simulator = Simulator(loop)
-    n = len(simulator.plant_states)
-    for start, stop in record.segments():
-        if stop - start < FEWEST:
-            continue
-        part = record[start:stop]
-        reference = r[start:stop] if r is not None else None
-        guess = simulator.rest.copy()
-        guess[:n] = prediction.states[start]
-        if loop.controller is None:
-            d = part.u - loop.point.input
-        elif loop.analog:
-            d = np.zeros(len(part))
-        elif reference is None:
-            reference = np.full(len(part), loop.point.output)
-            d = part.u - controller_output(loop, part.y, reference)
-        else:
-            replayed, guess[n:] = replay_from_best_state(loop, part)
-            d = part.u - replayed
-        fitted = guess.size if loop.analog else n
-        z = best_start(simulator, part, reference, d, guess, fitted)
-        y[start:stop] = simulator.run(z, reference, d)[0]
-        injected[start:stop] = d
-        noisy[start:stop] = _noise_effect(simulator, z, reference, d, prediction) - y[start:stop]
+    for part in long_stretches(record):
+        stretch = prepare_stretch(
+            simulator, record, part, guess=prediction.states[part.start], seek_controller=True,
+            set_point=True,
+        )  # fmt: skip
+        y[part], injected[part] = stretch.run(simulator)[0], stretch.d
+        noisy[part] = _run_with_noise(simulator, stretch, prediction) - y[part]
     driven = [] if record.r is None else [(np.asarray(record.r), 1)]
     if np.std(injected) > MEANINGFUL * np.std(record.u) and not (driven and not loop.controller):
         driven.append((injected, 1))
     # Through a curved law noise moves the mean as well, and that is its doing too.
     by_noise = float(np.sqrt(np.mean(noisy[np.isfinite(y)] ** 2)))
-    return _curve(label, record, y, driven, by_noise)
+    return _curve(CLOSED_LOOP if loop.controller else OPEN_LOOP, record, y, driven, by_noise)
 
 
-def _noise_effect(
-    simulator: Simulator, z: Array, r: Any, d: Array, prediction: Prediction
-) -> Array:  # fmt: skip
+def _run_with_noise(simulator: Simulator, stretch: Stretch, prediction: Prediction) -> Array:
     """Return the output of one run with the noise of a prediction, NaN where that cannot be."""
-    unknown = np.full(len(d), np.nan)
+    unknown = np.full(len(stretch.d), np.nan)
     if not simulator.loop.equations().velocities:
         return unknown  # the simulation has no place for the noise of the prediction
-    streams = np.random.default_rng(0).standard_normal((2, len(d)))
+    streams = np.random.default_rng(0).standard_normal((2, len(stretch.d)))
     noise = [streams[0] * prediction.sensor_noise, streams[1] * prediction.force_noise]
     try:
-        return simulator.run(z, r, d, noise)[0]
-    except ModelCannotRun:
+        return stretch.run(simulator, noise)[0]
+    except CtrlidError:
         return unknown
 
 
@@ -289,7 +246,7 @@ def _compare_model(record: Record, model: Any, horizon: int | None) -> Compariso
         noise = noise_polynomial(error, stretches, den)
     white_errors = whiten_errors(error, stretches, noise)
     residuals = np.where(usable, white_errors, np.nan)
-    curves = [_curve("one-step prediction", record, record.y - residuals, _known_before(record, 1))]
+    curves = [_curve(ONE_STEP, record, record.y - residuals, _known_before(record, 1))]
     roots = np.roots(den)
     # White one-step errors pass through C/A.
     white = float(np.std(residuals[usable]))
@@ -301,13 +258,15 @@ def _compare_model(record: Record, model: Any, horizon: int | None) -> Compariso
         ahead = y0 + _ahead(y, moved + constant, den, noise, white_errors, steps, usable)
         known = _known_before(record, steps)
         curves.append(
-            _curve(f"{steps}-step prediction", record, ahead, known, white * grown[steps - 1])
+            _curve(
+                Reproduction("prediction", steps), record, ahead, known, white * grown[steps - 1]
+            )
         )
     notes = []
     if np.all(np.abs(roots) < 1 - 1e-9):
         free = y0 + _arx_free(record, y, moved + constant, den)
         outside = _known_before(record, 1)
-        curves.append(_curve("open-loop simulation", record, free, outside, white * grown[-1]))
+        curves.append(_curve(OPEN_LOOP, record, free, outside, white * grown[-1]))
     else:
         notes.append("an unstable model is not simulated open loop; put it into a Loop with the "
                      "controller")  # fmt: skip
@@ -353,14 +312,14 @@ def _ahead(
 
 
 def _curve(
-    label: str, record: Record, y: Array, signals: Sequence[tuple[Array, int]],
+    how: Reproduction, record: Record, y: Array, signals: Sequence[tuple[Array, int]],
     noise: float = float("nan"),
 ) -> Curve:  # fmt: skip
     """Judge a reproduction; `noise` is the error that noise alone makes, NaN if not known."""
     known = np.asarray(record.valid) & np.isfinite(y)
     if not known.any():
         nan = float("nan")
-        return Curve(label, y, nan, nan, nan, nan)
+        return Curve(str(how), y, nan, nan, nan, nan)
     error = np.where(known, record.y - y, 0.0)
     measured = record.y[known]
     size = float(np.linalg.norm(measured - measured.mean()))
@@ -370,7 +329,7 @@ def _curve(
     share = 1 - follows
     if fit <= EXACT and np.isfinite(noise) and noise < rms:
         share = min(share, (noise / rms) ** 2)
-    return Curve(label, np.where(known, y, np.nan), fit, rms, follows, share)
+    return Curve(str(how), np.where(known, y, np.nan), fit, rms, follows, share)
 
 
 def _tests(record: Record, residuals: Array) -> tuple[Correlation, ...]:

@@ -18,16 +18,36 @@ BRIDGE = 20  # samples that do not count and are bridged by the model; then it s
 
 @dataclass(frozen=True, eq=False)
 class FilterData:
-    """A record made ready: signals, and where the filter starts and starts anew."""
+    """A record made ready: signals, and where the filter starts and starts anew.
+
+    Parameters
+    ----------
+    record : Record
+        The record.
+    t, u, r, y : ndarray, shape (n,)
+        Time since the start of the experiment [s], input, reference (without one the output) and
+        output, each held where the record is not valid.
+    valid, afresh : ndarray of bool, shape (n,)
+        Samples that are valid; samples at which the filter starts anew.
+    doubt : ndarray, shape (n,)
+        Variance of the input, relative to that of the sensor noise.
+    start, spread : ndarray, shapes (states,), (states, states)
+        State at a start, and its covariance relative to the variance of the sensor noise.
+    scale : float
+        Standard deviation of the sensor noise, roughly [output unit].
+    """
 
     record: Record
-    table: Array  # rows t, u, r, y
+    t: Array
+    u: Array
+    r: Array
+    y: Array
     valid: Any
     afresh: Any
     doubt: Array
     start: Array
     spread: Array
-    scale: float  # of the sensor noise, roughly
+    scale: float
 
 
 def make_filter_data(loop: Loop, record: Record, begin: float = 0.0) -> FilterData:
@@ -52,16 +72,16 @@ def make_filter_data(loop: Loop, record: Record, begin: float = 0.0) -> FilterDa
     r = y if record.r is None else np.asarray(record.r)[last]
     start, spread, scale = _start(loop, record)
     doubt = np.where(valid, 0.0, (np.std(record.u[valid]) / scale) ** 2)
-    return FilterData(record, np.vstack([begin + record.t - record.start, u, r, y]), valid,
-                 find_segment_starts(loop, record), doubt, start, spread, scale)  # fmt: skip
-
-
-def prepare_for_loop(track: FilterData, loop: Loop) -> FilterData:
-    """Return a track made ready for another model of the same loop; the signals are shared."""
-    start, spread, _ = _start(loop, track.record)
-    return replace(
-        track, afresh=find_segment_starts(loop, track.record), start=start, spread=spread
+    t = begin + record.t - record.start
+    return FilterData(
+        record, t, u, r, y, valid, find_segment_starts(loop, record), doubt, start, spread, scale
     )
+
+
+def prepare_for_loop(data: FilterData, loop: Loop) -> FilterData:
+    """Return data made ready for another model of the same loop; the signals are shared."""
+    start, spread, _ = _start(loop, data.record)
+    return replace(data, afresh=find_segment_starts(loop, data.record), start=start, spread=spread)
 
 
 def find_segment_starts(loop: Loop, record: Record) -> Any:

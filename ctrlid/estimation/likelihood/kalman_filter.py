@@ -60,69 +60,69 @@ class Filtered:
 
 
 def run_filter(
-    m: SampledPlant, track: FilterData, lin: Linearized, noise: Noise, sensitive: bool = True,
+    plant: SampledPlant, data: FilterData, lin: Linearized, noise: Noise, sensitive: bool = True,
     columns: int | None = None,
 ) -> Filtered:  # fmt: skip
     """Run the filter along a linearized plant, with sensitivities to its first columns."""
-    p = len(m.index) if columns is None else columns
+    p = len(plant.index) if columns is None else columns
     p = p if sensitive else 0
     out = filter_pass(
         lin.step, lin.a, lin.b, lin.du, np.ascontiguousarray(lin.dp[:, :, :p]), lin.height,
         lin.c, np.ascontiguousarray(lin.hp[:, :p]), lin.trajectory.predicted,
-        lin.trajectory.filtered, track.table[3], track.valid, track.afresh, lin.doubt,
+        lin.trajectory.filtered, data.y, data.valid, data.afresh, lin.doubt,
         lin.start, lin.spread, 1.0,
-        np.asarray(noise.force, dtype=float), noise.memory, noise.drift, (0,) * m.size,
-        (0,) * (m.size + bool(noise.drift > 0)),
+        np.asarray(noise.force, dtype=float), noise.memory, noise.drift, (0,) * plant.size,
+        (0,) * (plant.size + bool(noise.drift > 0)),
     )  # fmt: skip
     error, variance, before, after, wide, slopes, disturbance = out
-    counts = track.valid & ~track.afresh
+    counts = data.valid & ~data.afresh
     with np.errstate(all="ignore"):  # a filter that lost the record says so later
         sensor = np.sqrt(np.mean(error[counts] ** 2 / variance[counts]))
     return Filtered(error, variance, Trajectory(before, after, wide * sensor), slopes,
                     disturbance)  # fmt: skip
 
 
-def first_guess(m: SampledPlant, track: FilterData) -> Trajectory:
+def first_guess(plant: SampledPlant, data: FilterData) -> Trajectory:
     """Return a trajectory to begin with: at rest, states that are measured as measured."""
-    n, e = len(track.record), m.e
-    rest = np.tile(m.padded(track.start), (n, 1))
-    seen, values = e.output, track.table[3]
+    n, e = len(data.record), plant.e
+    rest = np.tile(plant.padded(data.start), (n, 1))
+    seen, values = e.output, data.y
     for _ in range(1 + len(e.lags)):  # behind a lag of the sensor is what it follows, nearly
         columns = casadi.jacobian(seen, e.x).sparsity().get_col()
         if len(columns) != 1 or casadi.depends_on(seen, casadi.vertcat(e.t, e.u)):
             break
         j = columns[0]
-        rest[:, j] = values = _without_bend(m, seen, e.x[j], float(rest[0, j]), values)
+        rest[:, j] = values = _without_bend(plant, seen, e.x[j], float(rest[0, j]), values)
         behind = [lag.target for lag in e.lags if lag.state == j]
         if not behind:
             break
         seen = behind[0]
     for lag in e.lags:
         if casadi.is_equal(lag.target, e.u, 2):
-            rest[:, lag.state] = track.table[1]
-    spread = np.sqrt(np.diag(m.padded(track.spread)))
-    quiet = np.minimum(spread, 1.0) * track.scale
+            rest[:, lag.state] = data.u
+    spread = np.sqrt(np.diag(plant.padded(data.spread)))
+    quiet = np.minimum(spread, 1.0) * data.scale
     return Trajectory(rest, rest.copy(), np.tile(quiet, (n, 1)))
 
 
-def _without_bend(m: SampledPlant, seen: Any, x: Any, at: float, values: Array) -> Array:
+def _without_bend(plant: SampledPlant, seen: Any, x: Any, at: float, values: Array) -> Array:
     """Return the state x that is seen as given values, by Newton's rule; else at rest."""
     if casadi.is_equal(seen, x, 2):
         return values
-    f = BlockEvaluation(casadi.Function("seen", [x, m.e.p], [seen, casadi.jacobian(seen, x)]))
+    f = BlockEvaluation(casadi.Function("seen", [x, plant.e.p], [seen, casadi.jacobian(seen, x)]))
     found = np.full(len(values), at)
-    first = np.abs(f(found, m.e.values)[0].ravel() - values)
+    first = np.abs(f(found, plant.e.values)[0].ravel() - values)
     with np.errstate(all="ignore"):
         for _ in range(NEWTON):
-            height, slope = (part.ravel() for part in f(found, m.e.values))
+            height, slope = (part.ravel() for part in f(found, plant.e.values))
             found = found + (values - height) / slope
-        left = np.abs(f(found, m.e.values)[0].ravel() - values)
+        left = np.abs(f(found, plant.e.values)[0].ravel() - values)
     return np.where(left <= first, found, at)  # also where it is no number
 
 
-def settle_covariance(
-    m: SampledPlant,
-    track: FilterData,
+def settle_trajectory(
+    plant: SampledPlant,
+    data: FilterData,
     theta: Array,
     noise: Noise,
     at: Trajectory,
@@ -136,14 +136,14 @@ def settle_covariance(
         If the filter cannot follow the record with this model.
     """
     for count in range(passes):
-        at, lin = _keep_inside(m, track, theta, at)
-        out = run_filter(m, track, lin, noise, sensitive=False)
+        at, lin = _keep_inside(plant, data, theta, at)
+        out = run_filter(plant, data, lin, noise, sensitive=False)
         moved = np.abs(out.trajectory.filtered - at.filtered)
         if not np.isfinite(out.innovations).all() or not np.isfinite(moved).all():
             k = int(np.argmin(np.isfinite(out.innovations)))
-            raise ModelCannotRun(
-                f"the predictor of {m.e.name} lost the record at sample {k} "
-                f"(t = {track.record.t[k]:.4g} s): the model cannot follow these data there; "
+            raise CtrlidError(
+                f"the predictor of {plant.e.name} lost the record at sample {k} "
+                f"(t = {data.record.t[k]:.4g} s): the model cannot follow these data there; "
                 "check units, signs and the operating point, or mark the stretch as not valid"
             )
         size = np.maximum(np.std(out.trajectory.filtered, axis=0), 1e-300)
@@ -155,18 +155,18 @@ def settle_covariance(
 
 
 def _keep_inside(
-    m: SampledPlant, track: FilterData, theta: Array, at: Trajectory
+    plant: SampledPlant, data: FilterData, theta: Array, at: Trajectory
 ) -> tuple[Trajectory, Linearized]:
     """Linearize, with samples at which the plant is not defined pulled back to rest."""
     bad: Any = ~(np.isfinite(at.filtered) & np.isfinite(at.predicted)).all(axis=1)
     if not bad.any():
-        lin = m.linearize(track, theta, at)
+        lin = plant.linearize(data, theta, at)
         bad = ~(np.isfinite(lin.step).all(axis=1) & np.isfinite(lin.a).all(axis=(1, 2))
                 & np.isfinite(lin.height) & np.isfinite(lin.c).all(axis=1))  # fmt: skip
         if not bad.any():
             return at, lin
-    rest = first_guess(m, track)
+    rest = first_guess(plant, data)
     at = Trajectory(*(np.where(bad[:, None], old, new) for new, old in (
         (at.predicted, rest.predicted), (at.filtered, rest.filtered),
         (at.spread, rest.spread))))  # fmt: skip
-    return at, m.linearize(track, theta, at)
+    return at, plant.linearize(data, theta, at)

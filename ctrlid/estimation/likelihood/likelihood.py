@@ -10,9 +10,11 @@ import numpy as np
 
 from ..._base.arrays import Array
 from ..._base.statistics import pseudo_inverse
-from .filter_data import FilterData
+from ...data.record import Record
+from ...loop.loop import Loop
+from .filter_data import FilterData, make_filter_data
 from .kalman_filter import Filtered, Noise, run_filter
-from .sampled_plant import Linearized, SampledPlant, Trajectory
+from .sampled_plant import Linearized, SampledPlant, Trajectory, make_sampled_plant
 
 QUIET = 1e-14  # of the output's size, squared: the least variance of the sensor noise
 
@@ -34,9 +36,9 @@ class Problem:
 
     Parameters
     ----------
-    plant : Machine
+    plant : SampledPlant
         The plant, with the free parameters as its names.
-    prepared : tuple of Track
+    data : tuple of FilterData
         The records.
     lower, upper : ndarray, shape (p,)
         Bounds of the parameters.
@@ -50,12 +52,63 @@ class Problem:
     """
 
     plant: SampledPlant
-    prepared: tuple[FilterData, ...]
+    data: tuple[FilterData, ...]
     lower: Array
     upper: Array
     counts: tuple[Any, ...] = ()
     known: Known | None = None
     periods: tuple[int, ...] = ()
+
+
+def make_problem(
+    loop: Loop, names: Sequence[str], records: Sequence[Record], begins: Sequence[float] = ()
+) -> Problem:
+    """Return the likelihood problem of a loop on records that begin at given times.
+
+    Raises
+    ------
+    CtrlidError
+        If the records do not fit the loop, or the plant moves too fast for its sampling period.
+    """
+    bounds = parameter_bounds(loop, names)
+    begins = begins or [0.0] * len(records)
+    data = tuple(make_filter_data(loop, r, b) for r, b in zip(records, begins, strict=True))
+    follow = records[0].r is not None and loop.analog
+    plant = make_sampled_plant(loop, tuple(names), records[0].hold, follow)
+    return Problem(plant, data, *bounds)
+
+
+def effect_bounds(loop: Loop) -> dict[str, tuple[float, float]]:
+    """Return the bounds of the parameters of a loop's effects, by name."""
+    return {
+        f"{label}.{p.name}": (p.lower, p.upper)
+        for label, effect in loop.labelled.items()
+        for p in effect.parameters()
+    }
+
+
+def parameter_bounds(loop: Loop, names: Sequence[str]) -> tuple[Array, Array]:
+    """Return the bounds of parameters: those of effects, and none that changes a sign."""
+    known = effect_bounds(loop)
+    parameters = loop.equations(keep=True).parameters
+    lower, upper = [], []
+    for name in names:
+        if name in known:
+            low, high = known[name]
+        else:
+            # A mass or a gain may be far off, but not of the other sign.
+            value = parameters[name]
+            low = 1e-3 * value if value > 0 else -math.inf
+            high = 1e-3 * value if value < 0 else math.inf
+        lower.append(low)
+        upper.append(high)
+    return np.array(lower), np.array(upper)
+
+
+def start_values(loop: Loop, names: Sequence[str]) -> Array:
+    """Return the values of parameters as the loop has them."""
+    parameters = loop.equations(keep=True).parameters
+    return np.array([parameters[name] for name in names], dtype=float)
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,16 +128,41 @@ class Fit:
     filtered: tuple[Filtered, ...]
 
     @property
+    def plant(self) -> SampledPlant:
+        """The plant, with the free parameters as its names."""
+        return self.problem.plant
+
+    @property
+    def data(self) -> tuple[FilterData, ...]:
+        """The records, made ready for the filter."""
+        return self.problem.data
+
+    @property
+    def counts(self) -> tuple[Any, ...]:
+        """Samples of each record that enter the likelihood."""
+        return self.problem.counts
+
+    @property
+    def known(self) -> Known | None:
+        """The noise, where it is not searched."""
+        return self.problem.known
+
+    @property
+    def trajectories(self) -> list[Trajectory]:
+        """What a next pass is linearized along, for each record."""
+        return [out.trajectory for out in self.filtered]
+
+    @property
     def size(self) -> int:
         """Number of samples that count."""
-        return int(sum(np.count_nonzero(c) for c in self.problem.counts))
+        return int(sum(np.count_nonzero(c) for c in self.counts))
 
     @functools.cached_property
     def normal(self) -> tuple[Array, Array]:
         """The held-gain information matrix and score of the parameters."""
         p = len(self.theta)
         matrix, score = np.zeros((p, p)), np.zeros(p)
-        for out, keep, r in zip(self.filtered, self.problem.counts, self.sensor, strict=True):
+        for out, keep, r in zip(self.filtered, self.counts, self.sensor, strict=True):
             slopes, s = out.slopes[keep], out.variance[keep] * r
             matrix += (slopes / s[:, None]).T @ slopes
             score += slopes.T @ (out.innovations[keep] / s)
@@ -100,36 +178,33 @@ class Fit:
         """The innovations divided by their standard deviations; NaN where they do not count."""
         return [
             np.where(keep, out.innovations / np.sqrt(out.variance * r), np.nan)
-            for out, keep, r in zip(self.filtered, self.problem.counts, self.sensor, strict=True)
+            for out, keep, r in zip(self.filtered, self.counts, self.sensor, strict=True)
         ]
 
 
 def evaluate(problem: Problem, theta: Array, noise: Noise, at: Sequence[Trajectory]) -> Fit:
     """Return the likelihood of parameters and noise, linearized along given trajectories."""
-    m = problem.plant
-    lins = tuple(m.linearize(t, theta, a) for t, a in zip(problem.prepared, at, strict=True))
+    plant = problem.plant
+    lins = tuple(plant.linearize(one, theta, a) for one, a in zip(problem.data, at, strict=True))
     return measure_noise(problem, theta, noise, lins)
 
 
 def linearize_again(fit: Fit) -> Fit:
     """Return the likelihood of the same values, the plant linearized along its last trajectory."""
-    along = [out.trajectory for out in fit.filtered]
-    return evaluate(fit.problem, fit.theta, fit.noise, along)
+    return evaluate(fit.problem, fit.theta, fit.noise, fit.trajectories)
 
 
 def measure_noise(
     problem: Problem, theta: Array, noise: Noise, lins: Sequence[Linearized], sensitive: bool = True
 ) -> Fit:
     """Return the likelihood of parameters and noise, the plant linearized before."""
-    m = problem.plant
+    plant = problem.plant
     outs = tuple(
-        run_filter(m, t, lin, noise, sensitive)
-        for t, lin in zip(problem.prepared, lins, strict=True)
+        run_filter(plant, one, lin, noise, sensitive)
+        for one, lin in zip(problem.data, lins, strict=True)
     )
     value, sensors = 0.0, []
-    for k, (track, out, keep) in enumerate(
-        zip(problem.prepared, outs, problem.counts, strict=True)
-    ):
+    for k, (data, out, keep) in enumerate(zip(problem.data, outs, problem.counts, strict=True)):
         e, s = out.innovations[keep], out.variance[keep]
         if problem.periods:
             e, s = _between_repeats(out, keep, problem.periods[k])
@@ -139,7 +214,7 @@ def measure_noise(
         if problem.known is not None and problem.known.sensor is not None:
             r = float(problem.known.sensor[k])
         else:
-            least = QUIET * float(np.var(track.table[3][keep]) + np.mean(track.table[3][keep]) ** 2)
+            least = QUIET * float(np.var(data.y[keep]) + np.mean(data.y[keep]) ** 2)
             r = max(mean, least, 1e-300)
         value -= 0.5 * (len(e) * (math.log(2 * math.pi * r) + mean / r) + np.sum(np.log(s)))
         sensors.append(r)

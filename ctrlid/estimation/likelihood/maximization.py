@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 
 from ..._base.arrays import Array
-from ..._base.errors import EffectDoesNotApply, ModelCannotRun
+from ..._base.criterion import bayesian_penalty
+from ..._base.errors import CtrlidError
 from ..._base.statistics import pseudo_inverse
 from .filter_data import FilterData
-from .kalman_filter import SETTLED, Filtered, Noise, first_guess, settle_covariance
-from .likelihood import Fit, Problem, evaluate, linearize_again
-from .noise_fit import LOG_STEP, choose_units, fit_noise, make_noise, take_logs
-from .sampled_plant import SampledPlant
+from .kalman_filter import SETTLED, Filtered, Noise, first_guess, settle_trajectory
+from .likelihood import Fit, Problem, evaluate, linearize_again, start_values
+from .noise_fit import LOG_STEP, choose_units, fit_noise, make_noise, take_logs, try_coloured_force
 
 ROUNDS = 25  # Gauss-Newton steps at most
 FAR = 3.0  # standard errors: after a longer step the trajectory is settled anew
@@ -25,15 +25,15 @@ ELSEWHERE = 2.0  # of log-likelihood, that a noise far away must gain to go on f
 NOTHING = 1e-3  # of log-likelihood: a step that promises less is not worth taking
 
 
-def begin_fit(problem: Problem, theta: Array, noise: Noise | None) -> Fit:
+def begin_fit(problem: Problem, theta: Array | None = None, noise: Noise | None = None) -> Fit:
     """Return the likelihood at a starting point, with settled trajectories.
 
     Parameters
     ----------
     problem : Problem
         What is fitted; without `counts` the samples that count are chosen here.
-    theta : ndarray, shape (p,)
-        Parameter values.
+    theta : ndarray, shape (p,), optional
+        Parameter values; by default those of the loop.
     noise : Noise, optional
         The noise; by default searched.
 
@@ -42,31 +42,32 @@ def begin_fit(problem: Problem, theta: Array, noise: Noise | None) -> Fit:
     Fit
         The starting point.
     """
-    m = problem.plant
+    plant = problem.plant
+    theta = start_values(plant.loop, plant.names) if theta is None else theta
     noise = problem.known.noise if problem.known else noise
-    first = noise or Noise((choose_units(m) ** 2 * 1e-2,) * m.channels)
+    first = noise or Noise((choose_units(plant) ** 2 * 1e-2,) * plant.channels)
     settled = []
-    for track in problem.prepared:
-        at = first_guess(m, track)
+    for data in problem.data:
+        at = first_guess(plant, data)
         if noise is None:
-            at = settle_covariance(m, track, theta, first, at, passes=2)[1].trajectory
-        settled.append((track, at))
+            at = settle_trajectory(plant, data, theta, first, at, passes=2)[1].trajectory
+        settled.append((data, at))
     if noise is None:
-        lins = tuple(m.linearize(t, theta, at) for t, at in settled)
-        counts = tuple(t.valid & ~t.afresh for t in problem.prepared)
+        lins = tuple(plant.linearize(data, theta, at) for data, at in settled)
+        counts = tuple(data.valid & ~data.afresh for data in problem.data)
         first = fit_noise(replace(problem, counts=counts), theta, lins, first, wide=True).noise
-    results = [settle_covariance(m, track, theta, first, at) for track, at in settled]
+    results = [settle_trajectory(plant, data, theta, first, at) for data, at in settled]
     if not problem.counts:
         problem = replace(problem, counts=tuple(
-            _settle(track, out) for track, (_, out) in zip(problem.prepared, results, strict=True)
+            _settle(data, out) for data, (_, out) in zip(problem.data, results, strict=True)
         ))  # fmt: skip
     return evaluate(problem, theta, first, [out.trajectory for _, out in results])
 
 
-def _settle(track: FilterData, out: Filtered) -> Any:
-    known = track.valid & np.isfinite(out.variance)
+def _settle(data: FilterData, out: Filtered) -> Any:
+    known = data.valid & np.isfinite(out.variance)
     usual = np.median(out.variance[known])
-    return known & ~track.afresh & (out.variance <= SETTLED * usual)
+    return known & ~data.afresh & (out.variance <= SETTLED * usual)
 
 
 def maximize(fit: Fit, rounds: int = ROUNDS, exact: bool = True) -> Fit:
@@ -119,6 +120,23 @@ def refit_noise_size(fit: Fit) -> Fit:
     return maximize(other) if other.value > fit.value + ELSEWHERE else fit
 
 
+def choose_noise(fit: Fit, always: bool = False) -> Fit:
+    """Add a coloured force if the Bayesian information criterion wants it."""
+    if fit.known is not None:
+        return fit
+    try:
+        richer = try_coloured_force(fit)
+    except CtrlidError:
+        if always:
+            raise
+        return fit
+    # Two parameters more: worth trying out in full only if it gains at all.
+    if not always and richer.value < fit.value + bayesian_penalty(1, fit.size):
+        return fit
+    richer = maximize(richer)
+    return richer if always or richer.value > fit.value + bayesian_penalty(2, fit.size) else fit
+
+
 def expected_gain(fit: Fit) -> float:
     """Return the gain that a Gauss-Newton step within the bounds expects."""
     matrix, score = fit.normal
@@ -168,7 +186,7 @@ def _take_step(fit: Fit, matrix: Array, score: Array) -> tuple[Fit, float]:
         try:
             if not problem.plant.fits(theta):
                 problem, fit = _rebuild(fit, theta)
-            trial = evaluate(problem, theta, fit.noise, [o.trajectory for o in fit.filtered])
+            trial = evaluate(problem, theta, fit.noise, fit.trajectories)
             worse = not trial.value >= fit.value - 1e-6
             if worse and k < CURVED and promise > BEND and np.isfinite(trial.value):
                 trial = _take_second_step(trial)
@@ -192,14 +210,14 @@ def _take_second_step(fit: Fit) -> Fit:
     theta = np.clip(there.theta + step, problem.lower, problem.upper)
     if not problem.plant.fits(theta):
         return fit
-    return evaluate(problem, theta, there.noise, [o.trajectory for o in there.filtered])
+    return evaluate(problem, theta, there.noise, there.trajectories)
 
 
 def _rebuild(fit: Fit, theta: Array) -> tuple[Problem, Fit]:
     """Return the problem with a plant for the delay that `theta` has."""
-    m = fit.problem.plant
-    loop = m.loop.with_parameters(dict(zip(m.names, theta.tolist(), strict=True)))
-    problem = replace(fit.problem, plant=SampledPlant(loop, m.names, m.hold, m.law is not None))
+    names = fit.plant.names
+    loop = fit.plant.loop.with_parameters(dict(zip(names, theta.tolist(), strict=True)))
+    problem = replace(fit.problem, plant=fit.plant.of_loop(loop, names))
     return problem, replace(fit, problem=problem)
 
 
@@ -209,7 +227,7 @@ def polish(fit: Fit, rounds: int = 2) -> Fit:
         matrix, _ = fit.normal
         _, error = bounded_step(fit, *fit.normal)
         score, known = np.zeros(len(fit.theta)), np.isfinite(error)
-        at = [out.trajectory for out in fit.filtered]
+        at = fit.trajectories
         fit = evaluate(fit.problem, fit.theta, fit.noise, at)
         for k in np.flatnonzero(known):
             values = []
@@ -258,9 +276,9 @@ def information(fit: Fit) -> tuple[Array, Array]:
     ----------
     Åström, "Maximum likelihood and prediction error methods", Automatica 16 (1980).
     """
-    problem, m = fit.problem, fit.problem.plant
-    dt, p = m.loop.dt, len(fit.theta)
-    at = [out.trajectory for out in fit.filtered]
+    problem, plant = fit.problem, fit.plant
+    dt, p = plant.loop.dt, len(fit.theta)
+    at = fit.trajectories
     _, error = bounded_step(fit, *fit.normal)
     logs = take_logs(fit.noise, dt) if problem.known is None else np.zeros(0)
 
@@ -284,9 +302,9 @@ def information(fit: Fit) -> tuple[Array, Array]:
         for h in (-LOG_STEP, LOG_STEP):
             moved = logs.copy()
             moved[k] += h
-            pair.append(innovations(fit.theta, make_noise(moved, m.channels, dt)))
+            pair.append(innovations(fit.theta, make_noise(moved, plant.channels, dt)))
         columns.append(_difference(pair, 2 * LOG_STEP))
-    count, records = len(columns), len(problem.prepared) if problem.known is None else 0
+    count, records = len(columns), len(problem.data) if problem.known is None else 0
     matrix = np.zeros((count + records, count + records))
     score = np.zeros(count + records)
     for k, (out, keep, r) in enumerate(zip(fit.filtered, problem.counts, fit.sensor, strict=True)):

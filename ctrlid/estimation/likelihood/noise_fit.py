@@ -27,25 +27,25 @@ def fit_noise(
     enough: float = 0.02,
 ) -> Fit:  # fmt: skip
     """Return the most likely noise for parameters as they are."""
-    m, dt = problem.plant, problem.plant.loop.dt
+    plant, dt = problem.plant, problem.plant.loop.dt
     if problem.known is not None:
         return measure_noise(problem, theta, problem.known.noise, lins)
 
     def at(logs: Array) -> Noise:
-        return make_noise(logs, m.channels, dt)
+        return make_noise(logs, plant.channels, dt)
 
     def cost(logs: Array) -> float:
         value = measure_noise(problem, theta, at(np.atleast_1d(logs)), lins, sensitive=False).value
         return -value if np.isfinite(value) else 1e15
 
     start = take_logs(noise, dt)
-    longest = max(len(t.record) for t in problem.prepared)
-    low, high = _limits(m, len(start) > m.channels, longest)
+    longest = max(len(data.record) for data in problem.data)
+    low, high = _limits(plant, len(start) > plant.channels, longest)
     start = np.clip(start, low, high)
     if wide:
         grid = np.linspace(low[0], high[0], 20)
-        best = grid[int(np.argmin(_costs(cost, [np.full(m.channels, g) for g in grid])))]
-        start[: m.channels] = best
+        best = grid[int(np.argmin(_costs(cost, [np.full(plant.channels, g) for g in grid])))]
+        start[: plant.channels] = best
     return measure_noise(problem, theta, at(_newton(cost, start, low, high, enough)), lins)
 
 
@@ -72,13 +72,13 @@ def make_noise(logs: Array, channels: int, dt: float) -> Noise:
     return Noise(force, memory, math.exp(min(max(logs[channels], -300), 300)) * (1 - memory**2))
 
 
-def _limits(m: SampledPlant, coloured: bool, longest: int) -> tuple[Array, Array]:
+def _limits(plant: SampledPlant, coloured: bool, longest: int) -> tuple[Array, Array]:
     """Return bounds of the logarithms of the noise variances.
 
     A force that hardly changes during a record is an offset, not noise.
     """
-    unit, dt = 2 * math.log(choose_units(m)), m.loop.dt
-    low, high = [unit + LEAST] * m.channels, [unit + MOST] * m.channels
+    unit, dt = 2 * math.log(choose_units(plant)), plant.loop.dt
+    low, high = [unit + LEAST] * plant.channels, [unit + MOST] * plant.channels
     if coloured:
         low += [unit + LEAST, math.log(2 * dt)]
         high += [unit + MOST, math.log(max(min(SLOWEST * longest, 2e4), 4.0) * dt)]
@@ -142,7 +142,7 @@ def _newton(
 
 def try_coloured_force(fit: Fit) -> Fit:
     """Return the fit with a coloured force added, whether it pays or not."""
-    m, dt = fit.problem.plant, fit.problem.plant.loop.dt
+    plant, dt = fit.plant, fit.plant.loop.dt
     best: Fit | None = None
     sizes = np.array([1e-2, 1.0]) * sum(fit.noise.force)
     for time in (3 * dt, 30 * dt, 300 * dt):
@@ -155,7 +155,7 @@ def try_coloured_force(fit: Fit) -> Fit:
                 best = trial
     assert best is not None
     if not np.isfinite(best.value):
-        raise ModelCannotRun(f"no coloured force can be fitted to {m.e.name}")
+        raise CtrlidError(f"no coloured force can be fitted to {plant.e.name}")
     return fit_noise(fit.problem, fit.theta, fit.linearized, best.noise)
 
 

@@ -7,18 +7,14 @@ from typing import Any
 import numpy as np
 
 from ..._base.arrays import Array
-from ..._base.criterion import bayesian_penalty
-from ..._base.errors import CtrlidError, ModelCannotRun
+from ..._base.errors import CtrlidError
 from ..._base.statistics import pseudo_inverse
 from ...data.record import Record
 from ...data.several_records import as_records, model_and_data
 from ...loop.loop import Loop
-from .filter_data import make_filter_data
-from .likelihood import Fit, Problem
-from .maximization import begin_fit, information, maximize, refit_noise_size
-from .noise_fit import try_coloured_force
+from .likelihood import Fit, effect_bounds, make_problem
+from .maximization import begin_fit, choose_noise, information, maximize, refit_noise_size
 from .physics_estimate import LoopEstimate, LoopFit
-from .sampled_plant import sampled_plant_for
 
 UNSEEN = 1e-9  # relative eigenvalue of the information below which a direction is not in the data
 
@@ -85,8 +81,7 @@ def fit_loop(
     loop, record = model_and_data(loop, record)
     records = as_records(record)
     names = _free_names(loop, free)
-    start = begin_fit(make_problem(loop, names, records), start_values(loop, names), None)
-    fit = refit_noise_size(maximize(start))
+    fit = refit_noise_size(maximize(begin_fit(make_problem(loop, names, records))))
     if coloured or coloured is None:
         fit = choose_noise(fit, always=bool(coloured))
     return summarize_fit(loop, fit)
@@ -108,71 +103,9 @@ def _free_names(loop: Loop, free: Sequence[str] | None) -> tuple[str, ...]:
     return names
 
 
-def start_values(loop: Loop, names: Sequence[str]) -> Array:
-    """Return the values of parameters as the loop has them."""
-    parameters = loop.equations(keep=True).parameters
-    return np.array([parameters[name] for name in names], dtype=float)
-
-
-def make_problem(
-    loop: Loop, names: Sequence[str], records: Sequence[Record], begins: Sequence[float] = ()
-) -> Problem:
-    """Return the likelihood problem of a loop on records that begin at given times."""
-    m = sampled_plant_for(loop, tuple(names), records[0])
-    lower, upper = parameter_bounds(loop, names)
-    begins = begins or [0.0] * len(records)
-    prepared = [make_filter_data(loop, r, b) for r, b in zip(records, begins, strict=True)]
-    return Problem(m, tuple(prepared), lower, upper)
-
-
-def effect_bounds(loop: Loop) -> dict[str, tuple[float, float]]:
-    """Return the bounds of the parameters of a loop's effects, by name."""
-    return {
-        f"{label}.{p.name}": (p.lower, p.upper)
-        for label, effect in loop.labelled.items()
-        for p in effect.parameters()
-    }
-
-
-def parameter_bounds(loop: Loop, names: Sequence[str]) -> tuple[Array, Array]:
-    """Return the bounds of parameters: those of effects, and none that changes a sign."""
-    known = effect_bounds(loop)
-    parameters = loop.equations(keep=True).parameters
-    lower, upper = [], []
-    for name in names:
-        if name in known:
-            low, high = known[name]
-        else:
-            # A mass or a gain may be far off, but not of the other sign.
-            value = parameters[name]
-            low = 1e-3 * value if value > 0 else -math.inf
-            high = 1e-3 * value if value < 0 else math.inf
-        lower.append(low)
-        upper.append(high)
-    return np.array(lower), np.array(upper)
-
-
-def choose_noise(fit: Fit, always: bool = False) -> Fit:
-    """Add a coloured force if the Bayesian information criterion wants it."""
-    if fit.problem.known is not None:
-        return fit
-    try:
-        richer = try_coloured_force(fit)
-    except ModelCannotRun:
-        if always:
-            raise
-        return fit
-    # Two parameters more: worth trying out in full only if it gains at all.
-    if not always and richer.value < fit.value + bayesian_penalty(1, fit.size):
-        return fit
-    richer = maximize(richer)
-    return richer if always or richer.value > fit.value + bayesian_penalty(2, fit.size) else fit
-
-
 def summarize_fit(loop: Loop, fit: Fit) -> LoopFit:
     """Return a maximum of the likelihood as a loop and an estimate."""
-    m, p = fit.problem.plant, len(fit.theta)
-    names = m.names
+    names, p = fit.plant.names, len(fit.theta)
     matrix, _ = information(fit)
     on_bound = (fit.theta <= fit.problem.lower) | (fit.theta >= fit.problem.upper)
     inside = np.concatenate([~on_bound, np.ones(len(matrix) - p, dtype=bool)])

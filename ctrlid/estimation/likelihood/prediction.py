@@ -15,13 +15,10 @@ from ..._base.errors import CtrlidError
 from ...data.record import Record
 from ...data.several_records import model_and_data
 from ...loop.loop import Loop
-from .filter_data import make_filter_data
 from .kalman_filter import Noise
-from .likelihood import Problem
+from .likelihood import make_problem
 from .maximization import begin_fit, maximize
-from .sampled_plant import sampled_plant_for
 
-EMPTY: Array = np.empty(0)
 LEAD = 4  # horizons in which a filter's covariance settles
 STARTS = 300  # predictions whose spread is computed
 
@@ -108,18 +105,20 @@ def predict(loop: Loop, record: Record, force_noise: float | None = None) -> Pre
                           f"{type(loop).__name__} and {type(record).__name__}")  # fmt: skip
     if force_noise is not None and not (np.isfinite(force_noise) and force_noise >= 0):
         raise CtrlidError(f"force_noise is a ratio >= 0; given {force_noise!r}")
-    track, m = make_filter_data(loop, record), sampled_plant_for(loop, (), record)
-    problem = Problem(m, (track,), EMPTY, EMPTY)
+    problem = make_problem(loop, (), [record])
+    plant = problem.plant
     if force_noise is None:
-        fit = maximize(begin_fit(problem, EMPTY, None))
+        fit = maximize(begin_fit(problem))
     else:
-        fit = begin_fit(problem, EMPTY, Noise((max(force_noise, 1e-150) ** 2,) * m.channels))
+        noise = Noise((max(force_noise, 1e-150) ** 2,) * plant.channels)
+        fit = begin_fit(problem, noise=noise)
     out, sensor = fit.filtered[0], float(np.sqrt(fit.sensor[0]))
     states = out.trajectory.filtered
-    own = [m.e.states.index(name) for name in loop.equations().states]  # of neutral effects none
+    # An effect at its neutral values has a state in the filter, but none in the loop.
+    own = [plant.e.states.index(name) for name in loop.equations().states]
     return Prediction(
-        record.y - out.innovations, out.innovations, fit.problem.counts[0],
-        sensor * np.sqrt(out.variance), states[:, own], states[:, m.n :], sensor,
+        record.y - out.innovations, out.innovations, fit.counts[0],
+        sensor * np.sqrt(out.variance), states[:, own], states[:, plant.n :], sensor,
         sensor * float(np.sqrt(fit.noise.force[0])),
     )  # fmt: skip
 
@@ -153,13 +152,14 @@ def predict_ahead(
     starts = starts[(bad[starts + horizon + 1] == bad[starts]) & prediction.settled[starts]]
     if not len(starts):
         return starts, np.empty(0)
-    m, track = sampled_plant_for(loop, (), record), make_filter_data(loop, record)
+    problem = make_problem(loop, (), [record])
+    plant, data = problem.plant, problem.data[0]
     x = np.hstack([prediction.states, prediction.circuit])[starts]
     for j in range(horizon):
         # The outputs after the start are not known to the prediction.
-        x = m.advance(track, x, starts + j, known=j == 0)
+        x = plant.advance(data, x, starts + j, known=j == 0)
     k = starts + horizon
-    return k, m.height(track, x, k)
+    return k, plant.height(data, x, k)
 
 
 def spread_ahead(
@@ -191,12 +191,11 @@ def spread_ahead(
         stretch is long enough.
     """
     plain = replace(loop, controller=None)
-    track, m = make_filter_data(plain, record), sampled_plant_for(plain, (), record)
     r, force = prediction.sensor_noise**2, prediction.force_noise**2
     ratio = max(force / r, 1e-300) if r else 1.0
-    plant = begin_fit(
-        Problem(m, (track,), EMPTY, EMPTY), EMPTY, Noise((ratio,) * m.channels)
-    ).linearized[0]
+    problem = make_problem(plain, (), [record])
+    noise = Noise((ratio,) * problem.plant.channels)
+    lin = begin_fit(problem, noise=noise).linearized[0]
     lead = int(np.clip(LEAD * horizon, 50, 500))
     starts = np.arange(0, len(record) - lead - horizon, max(1, len(record) // STARTS))
     bad = np.concatenate([[0], np.cumsum(~record.valid)])
@@ -205,15 +204,15 @@ def spread_ahead(
         return math.nan, math.nan
     found = []
     for variance in (force, 0.0):
-        p = np.broadcast_to(r * np.eye(plant.a.shape[1]), (len(starts), *plant.a.shape[1:]))
+        p = np.broadcast_to(r * np.eye(lin.a.shape[1]), (len(starts), *lin.a.shape[1:]))
         for j in range(lead + horizon):
             k = starts + j
             if j <= lead:
-                h = plant.c[k][:, None, :]
+                h = lin.c[k][:, None, :]
                 seen = p @ h.transpose(0, 2, 1)
                 p = p - seen @ seen.transpose(0, 2, 1) / np.maximum(h @ seen + r, 1e-300)
-            a, b = plant.a[k], plant.b[k]
+            a, b = lin.a[k], lin.b[k]
             p = a @ p @ a.transpose(0, 2, 1) + variance * (b @ b.transpose(0, 2, 1))
-        h = plant.c[starts + lead + horizon][:, None, :]
+        h = lin.c[starts + lead + horizon][:, None, :]
         found.append(math.sqrt(float(np.mean(h @ p @ h.transpose(0, 2, 1))) + r))
     return found[0], found[1]

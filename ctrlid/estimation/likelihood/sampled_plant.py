@@ -1,35 +1,33 @@
 """A loop's plant along a record: its map over a period, with derivatives, and the sensor."""
 
+from __future__ import annotations
+
 import functools
 import itertools
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import casadi
 import numpy as np
 
 from ..._base.arrays import Array
-from ..._base.errors import ModelCannotRun
-from ...data.record import Record
 from ...loop.loop import Loop
 from ...physics.block_evaluation import BlockEvaluation, evaluate_blocks
 from ...physics.equations import Equations
-from ...physics.integration import Scheme, known_lags, whole_delay
-from ...physics.linearization import state_matrices
-from .backlash import follow_backlash
-from .filter_data import FilterData, state_at_rest
-from .initial_conditions import InitialConditions, delay_signal, shift_signal
-from .transition_maps import PeriodPlan, build_maps
+from ...physics.integration import delay_of, whole_delay
+from .filter_data import FilterData
+from .transition_maps import (
+    PeriodPlan,
+    build_backlash,
+    build_maps,
+    choose_scheme,
+    scheme_suits,
+)
 
-SLOW = 0.35  # rate times step up to which a step of order four is exact enough
-MOST_STEPS = 100  # of order eight in a period: more make an expression that takes minutes to build
-BRISK = 0.35  # of a lag's time constant: a step of order four that follows it exactly enough
-ROUGH = 0.7  # the same beside the kink of friction, where no formula is more exact
-FEW_STEPS = 3  # of order four, which cost less than one of order eight
-SHARP_STEPS = 6  # of order four in the transient of a short lag, where friction has a kink
-KINK_STEPS = 4  # of order four in a period where friction has a kink; twice as many beside a lag
+FORGOTTEN = 200  # samples after which one looks whether backlash has forgotten how it began
+LASTING = 10  # samples: an error that stays moves the plant as far as noise of so many variances
+NEARLY = 0.01  # of the sensor's variance: how well what a lag shows is known where it is short
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +41,7 @@ class Trajectory:
 
 @dataclass(frozen=True, eq=False)
 class Linearized:
-    """The plant along a trajectory, as `kalman.filter_pass` takes it."""
+    """The plant along a trajectory, as `kalman_recursion.filter_pass` takes it."""
 
     step: Array
     a: Array
@@ -62,7 +60,7 @@ class Linearized:
 class SampledPlant:
     """The equations of a loop's plant made ready to be filtered along records.
 
-    Machines whose equations differ in the values of their parameters only share their maps.
+    Sampled plants whose equations differ in the values of their parameters only share their maps.
 
     Parameters
     ----------
@@ -89,11 +87,15 @@ class SampledPlant:
         self.forces = e.velocities or tuple(range(self.n - len(e.rest)))
         # One force on all velocities; without any, each state has a noise of its own.
         self.channels = 1 if e.velocities else len(self.forces)
-        self.scheme = _scheme(e, loop)
+        self.scheme = choose_scheme(e, loop)
         self.plan = PeriodPlan(e, self.law, loop.dt, hold, self.scheme, self.forces, self.channels,
                          tuple(self.index), self.late)  # fmt: skip
         self.maps = build_maps(self.plan)
-        self.onset = InitialConditions(self.plan)
+        self.initial = InitialConditions(self.plan)
+
+    def of_loop(self, loop: Loop, names: Sequence[str]) -> SampledPlant:
+        """Return the plant of another loop, for the same kind of record."""
+        return SampledPlant(loop, names, self.hold, self.law is not None)
 
     def _period(self, stages: Sequence[BlockEvaluation], x: Array, *given: Any) -> list[Array]:
         """Go through a period; return the state after it and its derivatives, by itself first."""
@@ -120,24 +122,20 @@ class SampledPlant:
 
     def fits(self, theta: Array) -> bool:
         """Whether the map was built for such values of a delay or of a lag."""
-        e, dt = self.e, self.loop.dt
-        p = casadi.SX(casadi.DM(self.values(theta)))
+        e, dt, p = self.e, self.loop.dt, self.values(theta)
         if e.delay is not None:
-            late = delay_signal(e, p) / dt + 1e-9
+            late = delay_time(e, p) / dt + 1e-9
             if not self.late <= late <= self.late + 1 + 1e-6:
                 return False
-        time, scheme = _shortest(e, p), self.scheme
-        if scheme.sharp:
-            return time < dt / 4
-        return time > (dt / scheme.steps / (2 * _brisk(e)) if scheme.order == 4 else dt / 16)
+        return scheme_suits(self.scheme, e, p, dt)
 
-    def linearize(self, track: FilterData, theta: Array, at: Trajectory) -> Linearized:
+    def linearize(self, data: FilterData, theta: Array, at: Trajectory) -> Linearized:
         """Return the plant along a trajectory, for parameter values `theta`."""
         p = self.values(theta)
-        u = track.table[1]
-        applied, slopes = self._through_play(u, p)
-        doubt = track.doubt + self.onset.doubt(u, p) / track.scale**2
-        w = self._inputs(track, applied)
+        u = data.u
+        applied, slopes = self._through_backlash(u, p)
+        doubt = data.doubt + self.initial.doubt(u, p) / data.scale**2
+        w = self._inputs(data, applied)
         spread = at.spread[:, : self.n].T
         given = (at.filtered.T, w, p, spread, np.zeros(self.channels))
         step, a, b, dp, *moved = self._period(self.maps.stages, *given)
@@ -151,8 +149,8 @@ class SampledPlant:
             for k in (-1, 0, 1):
                 dp += dw[:, :, k + 1, None] * shift_signal(slopes, self.late - k)[:, None, :]
         elif len(rows):
-            du[rows] = self._moved(rows, given, 1e-3 * float(np.std(u[track.valid])))
-        start, wide = self.onset.start(track, p)
+            du[rows] = self._moved(rows, given, 1e-3 * float(np.std(u[data.valid])))
+        start, wide = self.initial.start(data, p)
         height, c, hp = self.maps.sensor(at.predicted.T, w, p, spread)
         return Linearized(
             _full(step, len(u))[:, :, 0], _full(a, len(u)), _full(b, len(u)),
@@ -164,21 +162,21 @@ class SampledPlant:
     def _moved(self, rows: Any, given: Sequence[Array], h: float) -> Array:
         """Return by differences how the state after the samples `rows` depends on the input."""
         x, w, p, spread, force = given
-        path = np.array([0.0, 1.0, 1.0, 1.0, 0.0, 0.0])[:, None]
+        held = np.array([0.0, 1.0, 1.0, 1.0, 0.0, 0.0])[:, None]
         above, below = (
             self._period(
-                self.maps.stages, x[:, rows], w[:, rows] + s * h * path, p, spread[:, rows], force
+                self.maps.stages, x[:, rows], w[:, rows] + s * h * held, p, spread[:, rows], force
             )[0]
             for s in (1, -1)
         )
         slope: Array = (above - below)[:, :, 0] / (2 * h)
         return slope
 
-    def _through_play(self, u: Array, p: Array) -> tuple[Array, Array | None]:
-        """Return the input behind the play, and how it depends on the free parameters."""
+    def _through_backlash(self, u: Array, p: Array) -> tuple[Array, Array | None]:
+        """Return the input behind the backlash, and how it depends on the free parameters."""
         if self.e.play is None:
             return u, None
-        return follow_backlash(self.plan).along(self.onset.memory(float(u[0]), p)[0], u, p)
+        return build_backlash(self.plan).along(self.initial.memory(float(u[0]), p)[0], u, p)
 
     def with_slopes(self) -> casadi.Function:
         """Return one period of the plant, as it is, together with that of its sensitivities.
@@ -204,28 +202,28 @@ class SampledPlant:
             [casadi.vertcat(after, casadi.vec(moved)), casadi.vertcat(y, seen.T)], {"cse": True},
         )  # fmt: skip
 
-    def inputs(self, track: FilterData, theta: Array) -> Array:
-        """Return the rows over which the map is evaluated, shape (6, n), behind any play."""
-        return self._inputs(track, self._through_play(track.table[1], self.values(theta))[0])
+    def inputs(self, data: FilterData, theta: Array) -> Array:
+        """Return the rows over which the map is evaluated, shape (6, n), behind any backlash."""
+        return self._inputs(data, self._through_backlash(data.u, self.values(theta))[0])
 
-    def advance(self, track: FilterData, x: Array, rows: Any, known: bool = True) -> Array:
+    def advance(self, data: FilterData, x: Array, rows: Any, known: bool = True) -> Array:
         """Return states (k, n) one period after the samples `rows`, with the loop's parameters."""
         p = self.e.values
-        w = self._inputs(track, self._through_play(track.table[1], p)[0])[:, rows]
+        w = self._inputs(data, self._through_backlash(data.u, p)[0])[:, rows]
         if not known:
-            w[5] = self.height(track, x, rows)
+            w[5] = self.height(data, x, rows)
         quiet = np.zeros((self.n, 1))
         return self._period(self.maps.stages, x.T, w, p, quiet, np.zeros(self.channels))[0][:, :, 0]
 
-    def height(self, track: FilterData, x: Array, rows: Any) -> Array:
+    def height(self, data: FilterData, x: Array, rows: Any) -> Array:
         """Return the outputs at states (k, n) and the samples `rows`."""
         p = self.e.values
-        w = self._inputs(track, self._through_play(track.table[1], p)[0])[:, rows]
+        w = self._inputs(data, self._through_backlash(data.u, p)[0])[:, rows]
         return self.maps.sensor(x.T, w, p, np.zeros((self.n, 1)))[0][:, 0, 0]
 
-    def _inputs(self, track: FilterData, applied: Array) -> Array:
+    def _inputs(self, data: FilterData, applied: Array) -> Array:
         """Return the rows (t, input before, now, ahead, r, y) over which the map is evaluated."""
-        t, _, r, y = track.table
+        t, r, y = data.t, data.r, data.y
         moved = [shift_signal(applied, self.late - k) for k in (-1, 0, 1)]
         return np.vstack([t, *moved, r, y])
 
@@ -240,60 +238,116 @@ def _full(values: Array, n: int) -> Array:
     return values if values.shape[0] == n else np.repeat(values, n, axis=0)
 
 
-def _scheme(e: Equations, loop: Loop) -> Scheme:
-    """Return how a period is integrated: as cheaply as the plant and its lags allow."""
-    if e.dt:
-        return Scheme(4, 1)
-    hidden = [lag.state for lags in known_lags(e) for lag in lags]
-    plain = [k for k in range(len(e.states)) if k not in hidden]
-    time = _shortest(e, casadi.SX(casadi.DM(e.values)))
-    driven, cut = np.isfinite(time), bool(time < loop.dt / 8)
-    # The filter's own uncertainty smooths kinks; sharp friction does not make the plant stiff.
-    try:
-        point = replace(loop.point, states=state_at_rest(loop, e))
-        a = state_matrices(e, point, spread=1e6)[0][np.ix_(plain, plain)]
-    except ModelCannotRun:
-        return Scheme(8, 2, (8, 2) if cut else None)
-    rate = float(np.max(np.abs(np.linalg.eigvals(a)), initial=0.0)) * loop.dt
-    if rate <= 3 * SLOW:
-        # A velocity that turns within a period crosses the kink of friction there.
-        few = max(KINK_STEPS if e.kinked else 1, math.ceil(rate / SLOW))
-        if not driven:
-            return Scheme(4, few)
-        if cut and e.kinked:  # no order is high enough for a kink
-            return Scheme(4, few, (4, SHARP_STEPS))
-        # What a lag of the input does is known exactly; the plant has to follow it.
-        few = max(2 * few if e.kinked else few, 2, math.ceil(loop.dt / time / _brisk(e)))
-        if e.kinked or few <= FEW_STEPS:
-            return Scheme(4, few)
-    steps = max(2 if e.kinked else 1, math.ceil(rate / 1.5))
-    if steps > MOST_STEPS:
-        raise ModelCannotRun(
-            f"{e.name} moves at {rate / loop.dt:.3g} rad/s, {rate:.3g} times faster than it is "
-            "sampled; what settles within a sample is a constant for the filter: leave that motion "
-            "out of the plant, or sample faster"
-        )
-    return Scheme(8, steps, (8, steps) if cut else None)
+class InitialConditions:
+    """How the record of a plan's plant begins.
+
+    A lag begins near what it follows. A backlash may lie anywhere in its gap, and what a delay
+    still holds is unknown: until it has passed, the input is uncertain.
+    """
+
+    def __init__(self, plan: PeriodPlan) -> None:
+        self.plan = plan
+        self.lags = _lags(plan.equations)
+
+    def memory(self, u: float, p: Array) -> tuple[float, float]:
+        """Return the memory of the backlash at the start, and how far off it may be."""
+        e = self.plan.equations
+        assert e.play is not None
+        given = casadi.vertcat(e.play.u, e.p), casadi.vertcat(u, p)
+        found = casadi.substitute(casadi.vertcat(e.play.start, e.play.reach), *given)
+        start, reach = np.asarray(casadi.evalf(found), float).ravel().tolist()
+        return start, reach
+
+    def doubt(self, u: Array, p: Array) -> Array:
+        """Return the variance of the input, as far as it is older than the record.
+
+        Parameters
+        ----------
+        u : ndarray, shape (n,)
+            The input.
+        p : ndarray
+            Values of all parameters.
+
+        Returns
+        -------
+        ndarray, shape (n,)
+            Variances, by the sample at which the input was computed.
+        """
+        e, variance = self.plan.equations, np.zeros(len(u))
+        if e.play is not None:
+            variance = shift_signal(self._forgetting(u, p), self.plan.late)
+        if e.delay is not None:
+            late = delay_time(e, p) / self.plan.dt - np.arange(len(u))
+            variance = variance + np.clip(late, 0.0, 1.0) ** 2 * np.var(u)
+        return variance
+
+    def _forgetting(self, u: Array, p: Array) -> Array:
+        """Return the variance of the input behind the backlash, until it forgets how it began."""
+        variance = np.zeros(len(u))
+        middle, reach = self.memory(float(u[0]), p)
+        ends, backlash = [middle - reach, middle + reach], build_backlash(self.plan)
+        for first in range(0, len(u), FORGOTTEN):
+            some = u[first : first + FORGOTTEN]
+            memories = [backlash.memories(z, some, p) for z in ends]
+            low, high = (
+                backlash.slopes(m[None, :-1], some[None, :], p)[0][:, 0, 0] for m in memories
+            )
+            variance[first : first + FORGOTTEN] = LASTING * (high - low) ** 2 / 12
+            if high[-1] == low[-1]:
+                break
+            ends = [float(m[-1]) for m in memories]
+        return variance
+
+    def start(self, data: FilterData, p: Array) -> tuple[Array, Array]:
+        """Return state and covariance at the start of a record, for parameter values `p`."""
+        start, spread = data.start.copy(), data.spread.copy()
+        u, y = data.u, data.y
+        alone = not data.afresh[int(np.argmax(data.valid)) + 1 :].any()
+        for k, shown, function in self.lags:
+            time, target, near = (v[:, 0] for v in function(start if shown else u[None, :], p))
+            late = float(time[0, 0]) / self.plan.dt
+            if shown:
+                spread[k] = spread[:, k] = near[0] @ spread
+                wide = near[0] @ spread @ near[0]
+                moved = late**2 * float(np.var(np.diff(y))) / data.scale**2
+                spread[k, k] = wide + min(moved, wide) + NEARLY
+            else:
+                before = float(np.mean((target - start[k]) ** 2))
+                if alone:  # as far as the input moves within the lag's time, if it does not return
+                    start[k] = target[0, 0]
+                    steps = float(np.var(np.diff(target[:, 0])))
+                    before = min((1 + late / 2) * steps, 2 * float(np.var(target)))
+                spread[k, k] = before / data.scale**2 + NEARLY
+        return start, spread
 
 
-def _brisk(e: Equations) -> float:
-    return ROUGH if e.kinked else BRISK
+def _lags(e: Equations) -> list[tuple[int, bool, BlockEvaluation]]:
+    """Lags behind the input, or behind what the plant shows: whether so, time and target."""
+    found = []
+    for lag in e.lags:
+        shown = not casadi.depends_on(lag.target, casadi.vertcat(e.t, e.u))
+        driven = not casadi.depends_on(lag.target, casadi.vertcat(e.t, e.x))
+        if shown != driven:
+            near = casadi.densify(casadi.jacobian(lag.target, e.x))
+            parts = [casadi.SX(lag.time_constant), lag.target, near]
+            function = casadi.Function("lag", [e.x if shown else e.u, e.p], parts)
+            found.append((lag.state, shown, BlockEvaluation(function)))
+    return found
 
 
-def _shortest(e: Equations, p: Any) -> float:
-    """Return the time constant of the lag that follows the input; infinite without one."""
-    for lag in known_lags(e)[0]:
-        return float(casadi.evalf(casadi.substitute(casadi.SX(lag.time_constant), e.p, p)))
-    return math.inf
+def delay_time(e: Equations, p: Array) -> float:
+    """Return the delay of the input [s] for parameter values `p`."""
+    return float(casadi.evalf(delay_of(e, p)))
+
+
+def shift_signal(values: Array, late: int) -> Array:
+    """Return values so many samples later, or earlier if `late` is negative; the ends are held."""
+    first = np.repeat(values[:1], max(late, 0), axis=0)
+    last = np.repeat(values[-1:], max(-late, 0), axis=0)
+    return np.concatenate([first, values[max(-late, 0) :], last])[: len(values)]
 
 
 @functools.lru_cache(maxsize=8)
 def make_sampled_plant(loop: Loop, names: tuple[str, ...], hold: str, follow: bool) -> SampledPlant:
     """Return the plant of a loop, made once."""
     return SampledPlant(loop, names, hold, follow)
-
-
-def sampled_plant_for(loop: Loop, names: Sequence[str], record: Record) -> SampledPlant:
-    """Return the plant of a loop for records of one kind."""
-    follow = record.r is not None and loop.analog
-    return make_sampled_plant(loop, tuple(names), record.hold, follow)

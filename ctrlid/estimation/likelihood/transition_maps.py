@@ -1,19 +1,36 @@
 """Maps of a plant over one sampling period with their derivatives, built once per structure."""
 
 import functools
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import casadi
+import numba
+import numpy as np
 
+from ..._base.arrays import Array
+from ..._base.errors import CtrlidError
 from ...loop.controllers import ControlLaw
+from ...loop.loop import Loop
+from ...loop.period_map import apply_backlash
 from ...physics.block_evaluation import BlockEvaluation
 from ...physics.equations import Equations
-from ...physics.integration import Scheme, advance, input_pieces, integrate
+from ...physics.integration import Scheme, advance, input_pieces, integrate, known_lags
+from ...physics.interpreter import follow
+from ...physics.linearization import state_matrices
+from .filter_data import state_at_rest
 
 BUILT = 64  # structures whose maps are kept
 LONG = 3000  # instructions
+SLOW = 0.35  # rate times step up to which a step of order four is exact enough
+MOST_STEPS = 100  # of order eight in a period: more make an expression that takes minutes to build
+BRISK = 0.35  # of a lag's time constant: a step of order four that follows it exactly enough
+ROUGH = 0.7  # the same beside the kink of friction, where no formula is more exact
+FEW_STEPS = 3  # of order four, which cost less than one of order eight
+SHARP_STEPS = 6  # of order four in the transient of a short lag, where friction has a kink
+KINK_STEPS = 4  # of order four in a period where friction has a kink; twice as many beside a lag
 
 
 @dataclass(frozen=True)
@@ -77,6 +94,67 @@ class PeriodPlan:
         return len(self.equations.states) + (len(self.law.rest) if self.law else 0)
 
 
+def choose_scheme(e: Equations, loop: Loop) -> Scheme:
+    """Return how a period is integrated: as cheaply as the plant and its lags allow."""
+    if e.dt:
+        return Scheme(4, 1)
+    hidden = [lag.state for lags in known_lags(e) for lag in lags]
+    plain = [k for k in range(len(e.states)) if k not in hidden]
+    time = _shortest(e, e.values)
+    driven, cut = np.isfinite(time), bool(time < loop.dt / 8)
+    # The filter's own uncertainty smooths kinks; sharp friction does not make the plant stiff.
+    try:
+        point = replace(loop.point, states=state_at_rest(loop, e))
+        a = state_matrices(e, point, spread=1e6)[0][np.ix_(plain, plain)]
+    except CtrlidError:
+        return Scheme(8, 2, (8, 2) if cut else None)
+    rate = float(np.max(np.abs(np.linalg.eigvals(a)), initial=0.0)) * loop.dt
+    if rate <= 3 * SLOW:
+        # A velocity that turns within a period crosses the kink of friction there.
+        few = max(KINK_STEPS if e.kinked else 1, math.ceil(rate / SLOW))
+        if not driven:
+            return Scheme(4, few)
+        if cut and e.kinked:  # no order is high enough for a kink
+            return Scheme(4, few, (4, SHARP_STEPS))
+        # What a lag of the input does is known exactly; the plant has to follow it.
+        few = max(
+            2 * few if e.kinked else few,
+            2,
+            math.ceil(loop.dt / time / _brisk(e)),
+        )
+        if e.kinked or few <= FEW_STEPS:
+            return Scheme(4, few)
+    steps = max(2 if e.kinked else 1, math.ceil(rate / 1.5))
+    if steps > MOST_STEPS:
+        raise CtrlidError(
+            f"{e.name} moves at {rate / loop.dt:.3g} rad/s, {rate:.3g} times faster than it is "
+            "sampled; what settles within a sample is a constant for the filter: leave that motion "
+            "out of the plant, or sample faster"
+        )
+    return Scheme(8, steps, (8, steps) if cut else None)
+
+
+def _brisk(e: Equations) -> float:
+    """Return the step of order four that follows a lag, as a share of its time constant."""
+    return ROUGH if e.kinked else BRISK
+
+
+def scheme_suits(scheme: Scheme, e: Equations, p: Array, dt: float) -> bool:
+    """Whether a period is integrated well enough for the lag that parameter values `p` have."""
+    time = _shortest(e, p)
+    if scheme.sharp:
+        return time < dt / 4
+    return time > (dt / scheme.steps / (2 * _brisk(e)) if scheme.order == 4 else dt / 16)
+
+
+def _shortest(e: Equations, p: Array) -> float:
+    """Return the time constant of the lag that follows the input; infinite without one."""
+    for lag in known_lags(e)[0]:
+        values = casadi.SX(casadi.DM(p))
+        return float(casadi.evalf(casadi.substitute(casadi.SX(lag.time_constant), e.p, values)))
+    return math.inf
+
+
 @dataclass(frozen=True, eq=False)
 class TransitionMaps:
     """What is built from expressions: a period in stages, each in equal parts, and the sensor."""
@@ -97,8 +175,8 @@ class TransitionMaps:
 def build_maps(plan: PeriodPlan) -> TransitionMaps:
     """Return the maps, built once: that takes the time of several passes."""
     x, ends, given, by, parts = _period(plan)
-    # Behind a play, the input itself depends on the free parameters.
-    own = ("force", "free") if plan.equations.play is None else ("force", "free", "path")
+    # Behind backlash, the input itself depends on the free parameters.
+    own = ("force", "free") if plan.equations.play is None else ("force", "free", "input")
     functions = _chained(x, ends, parts, given, [by[key] for key in own])
     height = by["height"]
     outputs = [height, casadi.jacobian(height, x), casadi.jacobian(height, by["free"])]
@@ -130,7 +208,7 @@ def _period(plan: PeriodPlan) -> tuple[Any, list[Any], list[Any], dict[str, Any]
         ends = [_followed(plan, t, x, p, s, kick, now, r, y, max(scheme.steps, 2))]
         parts = 1
     free = casadi.vertcat(*(p[k] for k in plan.index)) if plan.index else casadi.SX(0, 1)
-    by = {"force": force, "free": free, "path": casadi.vertcat(before, now, ahead),
+    by = {"force": force, "free": free, "input": casadi.vertcat(before, now, ahead),
           "height": e.smoothed(t, x[:n], now, p, s)[1]}  # fmt: skip
     return x, ends, [casadi.vertcat(*w), p, s, force, part], by, parts
 
@@ -206,3 +284,58 @@ def _function(inputs: Sequence[Any], outputs: Sequence[Any]) -> casadi.Function:
     if plain.n_instructions() > LONG:
         return plain
     return casadi.Function("step", inputs, outputs, {"cse": True})
+
+
+@dataclass(frozen=True, eq=False)
+class BacklashMap:
+    """The backlash of an input over one sample, as functions of memory, input and parameters.
+
+    `after` is the next memory; `slopes` returns the applied input and how it and the next memory
+    depend on the memory and on the free parameters.
+    """
+
+    after: BlockEvaluation
+    slopes: BlockEvaluation
+
+    def memories(self, first: float, u: Array, p: Array) -> Array:
+        """Return the memory before each of n samples and after the last, shape (n + 1,)."""
+        after = self.after
+        inputs = np.concatenate([[first, 0.0], p])[:, None]
+        room = np.empty((after.registers, 1)), np.zeros((after.rows_out, 1))
+        found: Array = follow(after.program, after.constants, inputs, *room, u)
+        return found
+
+    def along(self, first: float, u: Array, p: Array) -> tuple[Array, Array]:
+        """Return the applied input, shape (n,), and its derivatives by the free parameters.
+
+        Those have shape (n, free); the first memory is held.
+        """
+        memories = self.memories(first, u, p)[:-1]
+        applied, *slopes = self.slopes(memories[None, :], u[None, :], p)
+        seen, moved = (np.broadcast_to(v, (len(u), *v.shape[1:]))[:, 0, :] for v in slopes)
+        by_memory = _carry_gap(moved[:, 0], moved[:, 1:])
+        return applied[:, 0, 0], seen[:, :1] * by_memory + seen[:, 1:]
+
+
+@functools.lru_cache(maxsize=64)
+def build_backlash(plan: PeriodPlan) -> BacklashMap:
+    """Return the backlash of a plan, built once."""
+    e = plan.equations
+    assert e.play is not None
+    m, u, p = casadi.SX.sym("m"), casadi.SX.sym("u"), casadi.SX.sym("p", e.p.shape[0])
+    applied, after = apply_backlash(e, m, u, p)
+    by = casadi.vertcat(m, *(p[k] for k in plan.index))
+    slopes = [applied, casadi.jacobian(applied, by), casadi.jacobian(after, by)]
+    return BacklashMap(
+        *(BlockEvaluation(casadi.Function("backlash", [m, u, p], out)) for out in ([after], slopes))
+    )
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _carry_gap(gain: Any, push: Any) -> Any:  # pragma: no cover - compiled
+    """Return what obeys ``s[k + 1] = gain[k] s[k] + push[k]`` and begins at zero."""
+    out = np.zeros(push.shape)
+    for k in range(len(push) - 1):
+        for j in range(push.shape[1]):
+            out[k + 1, j] = gain[k] * out[k, j] + push[k, j]
+    return out

@@ -1,0 +1,131 @@
+"""Simulating a loop along a record: what drives it, and from where, in each valid stretch."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from .._base.arrays import Array
+from .._base.errors import CtrlidError
+from ..data.record import Record
+from ..estimation.likelihood.filter_data import FEWEST
+from ..loop.controller_replay import controller_output, replay_from_best_state
+from ..loop.controllers import PID
+from ..loop.initial_state import best_start
+from ..loop.simulation import Simulator
+
+
+@dataclass(frozen=True, eq=False)
+class Stretch:
+    """A valid stretch of a record, ready to be simulated.
+
+    Parameters
+    ----------
+    initial : ndarray
+        States of plant, controller and input at its first sample.
+    r : ndarray or None
+        Reference [output unit]; None without a controller.
+    d : ndarray
+        What is added to the controller's output [input unit].
+    begin : float
+        Time of the first sample since the start of the experiment [s].
+    """
+
+    initial: Array
+    r: Array | None
+    d: Array
+    begin: float
+
+    def run(
+        self, simulator: Simulator, noise: Sequence[Array] | None = None
+    ) -> tuple[Array, Array]:  # fmt: skip
+        """Return simulated output and input, with given sensor and force noise.
+
+        Raises
+        ------
+        CtrlidError
+            If the loop leaves the range in which it can be simulated.
+        """
+        return simulator.run(self.initial, self.r, self.d, noise, self.begin)
+
+
+def long_stretches(record: Record, shortest: int = FEWEST) -> list[slice]:
+    """Return the valid stretches of a record that have at least so many samples."""
+    return [slice(a, b) for a, b in record.segments() if b - a >= shortest]
+
+
+def prepare_stretch(
+    simulator: Simulator, record: Record, samples: slice, *, begin: float | None = None,
+    guess: Array | None = None, seek_controller: bool = False, set_point: bool = False,
+    follow: bool = False,
+) -> Stretch:  # fmt: skip
+    r"""Return what a stretch of a record is simulated with.
+
+    .. math:: d = u - C(r, y)
+
+    is injected: what a digital controller C leaves of the measured input (pulses, dither), or the
+    input about the operating point where no controller is known. The initial state of the plant is
+    the one from which the simulation follows the first samples best, that of a digital controller
+    the one from which it reproduces u best.
+
+    Parameters
+    ----------
+    simulator : Simulator
+        The loop, with the error that its integration may make.
+    record : Record
+        The data.
+    samples : slice
+        One of its `long_stretches`.
+    begin : float, optional
+        Time of the record's first sample since the start of the experiment [s]; by default each
+        stretch is an experiment of its own.
+    guess : ndarray, optional
+        State of the plant from which its initial state is sought; by default rest.
+    seek_controller : bool, optional
+        Whether the states of an analog controller are sought with the plant's; else it is at rest.
+    set_point : bool, optional
+        Whether a digital controller without a reference in the record holds the operating point.
+    follow : bool, optional
+        Whether the record's output is the reference, and its input acts besides the controller.
+
+    Returns
+    -------
+    Stretch
+        Initial state, reference, injected signal and time.
+
+    Raises
+    ------
+    CtrlidError
+        If the controller needs a reference that the record has not.
+    """
+    loop, part = simulator.loop, record[samples]
+    initial, fitted = simulator.rest.copy(), len(simulator.plant_states)
+    if guess is not None:
+        initial[:fitted] = guess
+    r = None if part.r is None else np.asarray(part.r)
+    d = part.u - loop.point.input
+    if loop.controller is None:
+        r = None
+    elif follow:
+        r = np.asarray(part.y)
+    elif loop.analog:
+        if r is None:
+            raise CtrlidError(
+                "an analog loop is simulated from its reference, but the record has none"
+            )
+        d = np.zeros(len(part))
+        fitted = len(initial) if seek_controller else fitted
+    elif r is None and set_point:
+        pid = loop.controller
+        if isinstance(pid, PID) and np.isfinite([pid.lower, pid.upper]).any():
+            raise CtrlidError("a PID with limits is simulated from its reference, but the record "
+                              "has none; give it r=, a constant for a fixed set-point")  # fmt: skip
+        r = np.full(len(part), loop.point.output)
+        d = part.u - controller_output(loop, part.y, r)
+    else:
+        replayed, state = replay_from_best_state(loop, part)
+        # Behind the controller's states stand those of the input: backlash, delayed samples.
+        initial[fitted : fitted + len(state)] = state
+        d = part.u - replayed
+    time = 0.0 if begin is None else begin + float(record.t[samples.start] - record.start)
+    return Stretch(best_start(simulator, part, r, d, initial, fitted), r, d, time)

@@ -1,0 +1,59 @@
+"""How a record is reproduced: predicted some samples ahead, or simulated open or closed loop."""
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from ..data.record import Record
+from ..loop.loop import Loop
+from ..loop.period_map import comes_to_rest
+from ..physics.linearization import state_matrices
+
+Name = Literal["closed-loop simulation", "open-loop simulation", "prediction"]
+
+
+@dataclass(frozen=True)
+class Reproduction:
+    """What is made of a record: a simulation, or a prediction `horizon` samples ahead.
+
+    A prediction uses the measured output up to `horizon` samples before; a simulation uses none.
+    """
+
+    name: Name
+    horizon: int = 0
+
+    def __str__(self) -> str:
+        if not self.horizon:
+            return self.name
+        return f"{'one' if self.horizon == 1 else self.horizon}-step {self.name}"
+
+
+ONE_STEP = Reproduction("prediction", 1)
+OPEN_LOOP = Reproduction("open-loop simulation")
+CLOSED_LOOP = Reproduction("closed-loop simulation")
+
+
+def choose_reproduction(loop: Loop, record: Record) -> Reproduction:
+    """Return the most telling reproduction that there is: a simulation where one is possible."""
+    if loop.controller is not None and record.r is not None:
+        return CLOSED_LOOP
+    if loop.controller is None and comes_to_rest(loop):
+        return OPEN_LOOP
+    return Reproduction(
+        "prediction", time_constant(moving_poles(loop), loop.equations().dt, record)
+    )
+
+
+def moving_poles(loop: Loop) -> Any:
+    """Return the poles of a plant in motion, where dry friction does not damp it as at rest."""
+    return np.linalg.eigvals(state_matrices(loop.equations(), loop.point, spread=1e6)[0])
+
+
+def time_constant(poles: Any, dt: float, record: Record) -> int:
+    """Return the slowest unstable, or else the slowest stable, time constant in samples."""
+    with np.errstate(divide="ignore", invalid="ignore"):  # a pole at z = 0 is infinitely fast
+        rates = (np.log(poles.astype(complex)) / dt if dt else poles).real
+    fast = rates[rates > 1e-6] if np.any(rates > 1e-6) else -rates[rates < -1e-6]
+    slowest = float(np.min(fast)) if fast.size else 10 / record.duration
+    return int(np.clip(round(1 / (slowest * record.dt)), 1, max(len(record) // 10, 1)))
