@@ -53,7 +53,7 @@ def find_experiment(
         return words, None
     try:
         simulators = [make_simulator(t.model.fitted) for t in (best, *others)]
-    except CtrlidError:
+    except (ModelCannotRun, EffectDoesNotApply):
         return words, None
     simulator = simulators[0]
     able = [
@@ -179,7 +179,7 @@ def _unpredicted(rival: Trial, best: Trial, record: Record) -> float | None:
     try:
         problem = replace(make_problem(model.fitted, model.names, [record]), known=known)
         fit = begin_fit(problem, model.fit.theta)
-    except CtrlidError:
+    except (ModelCannotRun, EffectDoesNotApply):
         return None
     errors = sum(float(np.nansum(z**2)) for z in fit.standardized)
     left = errors - 2 * expected_gain(fit)

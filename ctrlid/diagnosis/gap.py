@@ -89,13 +89,13 @@ def simulate_window(loop: Loop, window: Window, how: Reproduction) -> Array:
             y[index] = values
             return y
         simulator = make_simulator(loop)
-    except CtrlidError:
+    except (ModelCannotRun, EffectDoesNotApply):
         return y
     for part in long_stretches(record):
         try:
             stretch = prepare_stretch(simulator, record, part, begin=window.begin)
             y[part] = stretch.run(simulator)[0]
-        except CtrlidError:
+        except ModelCannotRun:
             continue
     return y
 
@@ -151,7 +151,7 @@ def compute_floor(
         noise = float(fit.sensor[min(k, len(fit.sensor) - 1)])
         try:
             squares += _simulate_noise(loop, fit, noise, window, how, runs)
-        except CtrlidError:
+        except (ModelCannotRun, EffectDoesNotApply):
             return Floor(math.nan, math.nan, math.nan)
         count += int(np.count_nonzero(window.mask))
     errors = np.sqrt(squares / max(count, 1))

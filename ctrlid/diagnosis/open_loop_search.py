@@ -15,7 +15,7 @@ from .._base.criterion import bayesian_penalty
 from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from ..effects import AbstractEffect
 from ..estimation.likelihood.likelihood import start_values
-from .candidates import Trial, list_candidates, same_kind
+from .candidates import VANISHES, Objection, Trial, list_candidates, same_kind
 from .fitted_model import Model
 from .fresh_data import FreshData
 from .growth import Search

@@ -77,7 +77,7 @@ def model_at_given_values(base: Model) -> Model | None:
         return None
     try:
         fit = begin_fit(base.fit.problem, given)
-    except CtrlidError:
+    except ModelCannotRun:
         return None
     return Model(base.loop, fit) if math.isfinite(fit.value) else None
 

@@ -131,10 +131,7 @@ def _move_instant(fit: Fit, k: int, samples: float) -> Fit:
     problem, theta = fit.problem, fit.theta.copy()
     theta[k] = np.clip(theta[k] + samples * problem.plant.loop.dt, problem.lower[k],
                        problem.upper[k])  # fmt: skip
-    try:
-        return evaluate(problem, theta, fit.noise, fit.trajectories)
-    except CtrlidError:  # no such instant in this record
-        return replace(fit, value=-np.inf)
+    return evaluate(problem, theta, fit.noise, fit.trajectories)
 
 
 def _likelihood_of(fit: Fit) -> float:

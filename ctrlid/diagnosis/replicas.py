@@ -73,7 +73,7 @@ def _simulate_record(
     follows = not can_simulate(model)
     loop = follow_record(model.fitted, record) if follows else model.fitted
     if loop is None:
-        raise CtrlidError("the record cannot be followed")
+        raise ModelCannotRun("the record cannot be followed")
     simulator = make_simulator(loop)
     y, u = np.array(record.y), np.array(record.u)
     for part in long_stretches(record, THRESHOLD.shortest_segment):

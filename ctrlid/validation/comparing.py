@@ -119,7 +119,7 @@ def _compare_loop(record: Record, loop: Loop, horizon: int | None) -> Comparison
         warnings.simplefilter("always", CtrlidWarning)
         try:
             curves.append(_simulate(record, loop, prediction))
-        except CtrlidError as reason:
+        except (ModelCannotRun, EffectDoesNotApply) as reason:
             notes.append(f"no simulation: {reason}")
     notes += sorted({str(w.message) for w in caught})[-1:]
     return _comparison(repr(loop), record, curves, residuals, notes)
@@ -152,7 +152,7 @@ def _simulate(record: Record, loop: Loop, prediction: Prediction) -> Curve:
     Once more with noise of the size found in the one-step errors, to see what it makes of it.
     """
     if loop.controller is None and growth_rate(loop) > -1e-9:
-        raise CtrlidError(
+        raise ModelCannotRun(
             "the plant is not stable and the controller is unknown; an open-loop simulation "
             "would drift without bound. Give the loop its controller"
         )
@@ -182,7 +182,7 @@ def _run_with_noise(simulator: Simulator, stretch: Stretch, prediction: Predicti
     noise = [streams[0] * prediction.sensor_noise, streams[1] * prediction.force_noise]
     try:
         return stretch.run(simulator, noise)[0]
-    except CtrlidError:
+    except ModelCannotRun:
         return unknown
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .._base.arrays import Array
-from .._base.errors import CtrlidError
+from .._base.errors import ModelCannotRun
 from ..data.record import Record
 from ..estimation.likelihood.filter_data import FEWEST
 from ..loop.controller_replay import controller_output, replay_from_best_state
@@ -110,7 +110,7 @@ def prepare_stretch(
         r = np.asarray(part.y)
     elif loop.analog:
         if r is None:
-            raise CtrlidError(
+            raise ModelCannotRun(
                 "an analog loop is simulated from its reference, but the record has none"
             )
         d = np.zeros(len(part))
@@ -118,8 +118,10 @@ def prepare_stretch(
     elif r is None and set_point:
         pid = loop.controller
         if isinstance(pid, PID) and np.isfinite([pid.lower, pid.upper]).any():
-            raise CtrlidError("a PID with limits is simulated from its reference, but the record "
-                              "has none; give it r=, a constant for a fixed set-point")  # fmt: skip
+            raise ModelCannotRun(
+                "a PID with limits is simulated from its reference, but the record "
+                "has none; give it r=, a constant for a fixed set-point"
+            )
         r = np.full(len(part), loop.point.output)
         d = part.u - controller_output(loop, part.y, r)
     else:

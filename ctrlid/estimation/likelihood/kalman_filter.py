@@ -141,7 +141,7 @@ def settle_trajectory(
         moved = np.abs(out.trajectory.filtered - at.filtered)
         if not np.isfinite(out.innovations).all() or not np.isfinite(moved).all():
             k = int(np.argmin(np.isfinite(out.innovations)))
-            raise CtrlidError(
+            raise ModelCannotRun(
                 f"the predictor of {plant.e.name} lost the record at sample {k} "
                 f"(t = {data.record.t[k]:.4g} s): the model cannot follow these data there; "
                 "check units, signs and the operating point, or mark the stretch as not valid"

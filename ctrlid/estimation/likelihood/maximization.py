@@ -8,7 +8,7 @@ import numpy as np
 
 from ..._base.arrays import Array
 from ..._base.criterion import bayesian_penalty
-from ..._base.errors import CtrlidError
+from ..._base.errors import EffectDoesNotApply, ModelCannotRun
 from ..._base.statistics import pseudo_inverse
 from .filter_data import FilterData
 from .kalman_filter import SETTLED, Filtered, Noise, first_guess, settle_trajectory
@@ -126,7 +126,7 @@ def choose_noise(fit: Fit, always: bool = False) -> Fit:
         return fit
     try:
         richer = try_coloured_force(fit)
-    except CtrlidError:
+    except ModelCannotRun:
         if always:
             raise
         return fit

@@ -155,7 +155,7 @@ def try_coloured_force(fit: Fit) -> Fit:
                 best = trial
     assert best is not None
     if not np.isfinite(best.value):
-        raise CtrlidError(f"no coloured force can be fitted to {plant.e.name}")
+        raise ModelCannotRun(f"no coloured force can be fitted to {plant.e.name}")
     return fit_noise(fit.problem, fit.theta, fit.linearized, best.noise)
 
 

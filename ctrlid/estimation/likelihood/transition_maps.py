@@ -11,7 +11,7 @@ import numba
 import numpy as np
 
 from ..._base.arrays import Array
-from ..._base.errors import CtrlidError
+from ..._base.errors import ModelCannotRun
 from ...loop.controllers import ControlLaw
 from ...loop.loop import Loop
 from ...loop.period_map import apply_backlash
@@ -106,7 +106,7 @@ def choose_scheme(e: Equations, loop: Loop) -> Scheme:
     try:
         point = replace(loop.point, states=state_at_rest(loop, e))
         a = state_matrices(e, point, spread=1e6)[0][np.ix_(plain, plain)]
-    except CtrlidError:
+    except ModelCannotRun:
         return Scheme(8, 2, (8, 2) if cut else None)
     rate = float(np.max(np.abs(np.linalg.eigvals(a)), initial=0.0)) * loop.dt
     if rate <= 3 * SLOW:
@@ -126,7 +126,7 @@ def choose_scheme(e: Equations, loop: Loop) -> Scheme:
             return Scheme(4, few)
     steps = max(2 if e.kinked else 1, math.ceil(rate / 1.5))
     if steps > MOST_STEPS:
-        raise CtrlidError(
+        raise ModelCannotRun(
             f"{e.name} moves at {rate / loop.dt:.3g} rad/s, {rate:.3g} times faster than it is "
             "sampled; what settles within a sample is a constant for the filter: leave that motion "
             "out of the plant, or sample faster"
