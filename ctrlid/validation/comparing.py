@@ -14,6 +14,7 @@ from .._base.errors import CtrlidError, CtrlidWarning
 from .._base.text import number
 from ..data.record import Record
 from ..data.several_records import model_and_data
+from ..data.validity import whole_past
 from ..estimation.identified_model import IdentifiedModel, delay_of
 from ..estimation.likelihood.filter_data import FEWEST
 from ..estimation.likelihood.prediction import Prediction, predict, predict_ahead, spread_ahead
@@ -263,10 +264,7 @@ def _compare_model(record: Record, model: Any, horizon: int | None) -> Compariso
     den = den / den[0]
     order = len(den) - 1
     valid = np.asarray(record.valid)
-    usable = np.zeros(len(record), dtype=bool)
-    if len(record) > order:
-        windows = np.lib.stride_tricks.sliding_window_view(valid, order + 1)
-        usable[order:] = windows.all(axis=1)
+    usable = whole_past(valid, order)
     if np.count_nonzero(usable) < FEWEST:
         raise CtrlidError(f"a model of order {order} needs {FEWEST + order} valid samples in "
                           f"succession; the record has {np.count_nonzero(valid)} valid samples of "
@@ -336,13 +334,8 @@ def _ahead(
         past = [new, *past][:order]
     ahead = np.full(n, np.nan)
     ahead[steps:] = new[: n - steps]
-    window = steps + order
-    if n > window:
-        whole = np.lib.stride_tricks.sliding_window_view(usable, steps).all(axis=1)
-        ok = np.zeros(n, dtype=bool)
-        ok[steps - 1 :] = whole
-        ahead[~ok] = np.nan
-    ahead[:window] = np.nan
+    ahead[~whole_past(usable, steps - 1)] = np.nan
+    ahead[: steps + order] = np.nan
     return ahead
 
 

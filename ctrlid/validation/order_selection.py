@@ -12,6 +12,7 @@ from .._base.arrays import Array
 from .._base.errors import CtrlidError
 from .._base.text import Printed
 from ..data.record import Record
+from ..data.validity import whole_past
 
 LONGEST = 60  # lags of the long regression
 ROWS = 30_000  # that it uses at most
@@ -196,9 +197,7 @@ def _whole(name: str, values: Any) -> list[int]:
 
 def _rows(record: Record, start: int, stop: int, length: int) -> Any:
     """Return the samples whose past counts, not more than are needed."""
-    bad = np.concatenate([[0], np.cumsum(~record.valid)])
-    rows = np.arange(start + length, stop)
-    return rows[bad[rows + 1] == bad[rows - length]][:ROWS]
+    return start + np.flatnonzero(whole_past(record.valid[start:stop], length))[:ROWS]
 
 
 def _table(record: Record, rows: Any, length: int) -> tuple[Array, Array]:

@@ -9,6 +9,7 @@ from scipy import linalg, signal, stats
 
 from .._base.arrays import Array
 from .._base.criterion import bayesian_penalty
+from ..data.validity import whole_past
 
 LEVEL = 0.99  # of the drawn bands and of the tests
 MEMORY = 1000  # longest correlation of residuals that is looked for [samples]
@@ -253,8 +254,7 @@ def explained_share(
     lags = max(1, min(lags, len(e) // (10 * max(len(signals), 1))))
     first = max((delay for _, delay in signals), default=0) + lags - 1
     rows = np.arange(first, len(e), max(1, -(-len(e) // ROWS)))
-    bad = np.concatenate([[0], np.cumsum(~valid)])
-    rows = rows[bad[rows + 1] == bad[rows - first]]
+    rows = rows[whole_past(valid, first)[rows]]
     if not signals or len(rows) < 3 * lags * len(signals):
         return 0.0
     target = e[rows] - np.mean(e[rows])

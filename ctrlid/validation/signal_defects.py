@@ -11,6 +11,7 @@ import numpy as np
 from scipy import ndimage, stats
 
 from .._base.arrays import Array
+from ..data.validity import find_runs, whole_past
 
 ENOUGH = 20_000  # samples from which a grid is read
 LEVELS = 12  # distinct values up to which a signal may be a staircase
@@ -19,12 +20,6 @@ SOME = 4  # equal extreme values that no continuous distribution gives
 QUIET = 8  # samples to either side that tell whether a spike stands alone
 BLOCKS = 40  # of which the means show a drift
 PLENTY = 100_000  # samples that tell how large a drift is; of longer records every k-th
-
-
-def find_runs(mask: Any) -> tuple[Any, Any]:
-    """Return first indices and ends (exclusive) of the stretches where a mask is true."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], np.asarray(mask, dtype=np.int8), [0]])))
-    return edges[::2], edges[1::2]
 
 
 def rounding_of(v: Array) -> float:
@@ -350,9 +345,7 @@ def find_beyond_law(u: Array, y: Array, valid: Any) -> float:
         0 where a linear controller of a constant reference computes u; 1 with too few samples.
     """
     order = 10
-    bad = np.concatenate([[0], np.cumsum(~valid)])
-    rows = np.arange(order, len(u))
-    rows = rows[bad[rows + 1] == bad[rows - order]][:ENOUGH]
+    rows = np.flatnonzero(whole_past(valid, order))[:ENOUGH]
     if len(rows) < 4 * order:
         return 1.0
     law = np.column_stack([
