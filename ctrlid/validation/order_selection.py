@@ -9,6 +9,7 @@ import numpy as np
 from scipy import linalg, stats
 
 from .._base.arrays import Array
+from .._base.criterion import bayesian_penalty
 from .._base.errors import CtrlidError
 from .._base.text import Printed
 from ..data.record import Record
@@ -168,7 +169,7 @@ def select_order(
     unit = max(1.0, min(misfit / free for *_, misfit, free, _, _ in found))
     rows = sorted(
         (OrderRow(a, b, d, misfit, float(stats.chi2.sf(misfit / unit, free)),
-                  misfit / unit + (a + b) * np.log(long.rows), error, theta)
+                  misfit / unit + 2 * bayesian_penalty(a + b, long.rows), error, theta)
          for a, b, d, misfit, free, error, theta in found),
         key=lambda row: row.bic,
     )  # fmt: skip
@@ -239,7 +240,7 @@ def _length(record: Record, cut: int, most: int) -> int:
     for n in sorted({most + 2, 10, 15, 20, 30, 40, longest}):
         if most + 2 <= n <= longest:
             long = _regress(record, 0, cut, n, reach=longest)  # all on the same rows
-            scores[n] = long.rows * np.log(long.variance) + 2 * n * np.log(long.rows)
+            scores[n] = long.rows * np.log(long.variance) + 2 * bayesian_penalty(2 * n, long.rows)
     best = min(scores, key=lambda n: scores[n])
     return min(longest, max(best + 5, most + 4))
 
