@@ -9,14 +9,13 @@ import numpy as np
 from scipy import optimize
 
 from .._base.arrays import Array
-from .._base.statistics import pseudo_inverse
+from .._base.statistics import autocorrelation_time, pseudo_inverse
 from ..data.record import Record
 from ..estimation.likelihood.kalman_filter import Noise
 from ..estimation.likelihood.likelihood import Fit, Known, evaluate
 from ..estimation.likelihood.physics_fit import make_problem
 from ..estimation.likelihood.sampled_plant import Trajectory
 from ..loop.loop import Loop
-from ..validation.residual_tests import remembered
 from .thresholds import THRESHOLD
 
 
@@ -68,7 +67,7 @@ class Simulated:
     @property
     def correlated(self) -> float:
         """How many neighbouring errors say no more than one that is independent."""
-        return float(1 + 2 * np.sum(remembered(self.errors)))
+        return autocorrelation_time(self.errors)
 
 
 class Simulation:

@@ -11,6 +11,7 @@ import numpy as np
 from scipy import ndimage, stats
 
 from .._base.arrays import Array
+from .._base.statistics import lagged_products
 from ..data.validity import find_runs, whole_past
 
 ENOUGH = 20_000  # samples from which a grid is read
@@ -380,10 +381,8 @@ def period(r: Array) -> int:
     variance = float(np.mean(v**2))
     if n < 8 or variance <= rounding_of(r) ** 2:
         return 0
-    size = 1 << (2 * n - 1).bit_length()
-    spectrum = np.fft.rfft(v, size)
     lags = np.arange(n // 2 + 1)
-    products = np.fft.irfft(np.abs(spectrum) ** 2, size)[: len(lags)]
+    products = lagged_products(v, v, n // 2)
     power = np.concatenate([[0.0], np.cumsum(v**2)])
     D = (power[n - lags] + power[n] - power[lags] - 2 * products) / (n - lags)
     near = min(4e-4 * variance, 0.25 * float(D[1])) > D
