@@ -25,6 +25,7 @@ from ..loop.initial_state import best_start
 from ..loop.loop import Loop
 from ..loop.period_map import growth_rate
 from ..loop.simulation import Simulator
+from ..physics.conversions import to_polynomials, to_state_matrices
 from ..physics.linearization import state_matrices
 from ..physics.trace import timebase
 from .comparison import EXACT, Comparison, Curve
@@ -230,15 +231,14 @@ def _sampled(model: Any, record: Record, delay: float) -> tuple[Array, Array]:
     """Return the polynomials in z of a continuous model, its input held and late."""
     if delay and record.hold != "zoh":
         model, delay = model.with_delay(), 0.0
-    plant = ct.ss(ct.tf(model.num, model.den))
-    direct = float(plant.D[0, 0])
-    motion = flow(plant.A, plant.B[:, 0], plant.C[0], record.dt, record.hold, delay)
-    den = np.real(np.poly(motion.f))
+    a, b, c, d = to_state_matrices(model)
+    motion = flow(a, b[:, 0], c[0], record.dt, record.hold, delay)
+    columns = np.column_stack([column for *_, column in motion.inputs])
+    paths, den = to_polynomials(motion.f, columns, motion.c[None], np.zeros((1, columns.shape[1])))
     late = max(lag for _, lag, _ in motion.inputs)
-    num = direct * den
-    for _, lag, b in motion.inputs:
-        path = np.real(np.poly(motion.f - np.outer(b, motion.c))) - den
-        num = np.polyadd(num, np.append(path[1:], np.zeros(late - lag)))
+    num: Array = float(d[0, 0]) * den
+    for (_, lag, _), path in zip(motion.inputs, paths, strict=True):
+        num = np.asarray(np.polyadd(num, np.append(path[1:], np.zeros(late - lag))), dtype=float)
     return num, np.append(den, np.zeros(late))
 
 

@@ -13,6 +13,7 @@ from scipy import signal
 from ..._base.arrays import Array
 from ..._base.criterion import bayesian_penalty
 from ..._base.errors import CtrlidError
+from ...physics.conversions import to_polynomials
 from ..identified_model import Structure
 from .instruments import Piece, Signals
 from .regression import merge
@@ -89,16 +90,11 @@ def given_law(controller: Any, names: Sequence[str], dt: float) -> Law:
 
 def _fractions(controller: Any) -> tuple[list[Array], Array]:
     """Numerators over one denominator, all of one length, in powers of the delay."""
-    inputs = range(controller.ninputs)
     if isinstance(controller, control.StateSpace):
-        matrices = (controller.A, controller.B, controller.C, controller.D)
-        if not controller.nstates:
-            return [np.array([controller.D[0, i]]) for i in inputs], np.ones(1)
-        pairs = [signal.ss2tf(*matrices, input=i) for i in inputs]
-        return [num[0] for num, _ in pairs], np.asarray(pairs[0][1])
+        return to_polynomials(controller.A, controller.B, controller.C, controller.D)
     parts = [
         (np.trim_zeros(np.asarray(controller.num[0][i], dtype=float), "f"), controller.den[0][i])
-        for i in inputs
+        for i in range(controller.ninputs)
     ]
     den = np.asarray(parts[0][1], dtype=float)
     if any(len(d) != len(den) or not np.allclose(d, den, rtol=1e-12, atol=0) for _, d in parts):
