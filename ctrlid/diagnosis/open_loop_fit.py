@@ -142,10 +142,9 @@ class Simulation:
         free = np.full(x0.size, np.inf)
         lower = np.concatenate([self.problem.lower, -free])
         upper = np.concatenate([self.problem.upper, free])
-        inside = THRESHOLD.inside_bounds * (1.0 + np.abs(np.concatenate([theta, x0.ravel()])))
-        start = np.clip(np.concatenate([theta, x0.ravel()]),
-                        np.where(np.isfinite(lower), lower + inside, lower),
-                        np.where(np.isfinite(upper), upper - inside, upper))  # fmt: skip
+        start = np.concatenate([theta, x0.ravel()])
+        inside = THRESHOLD.inside_bounds * (1.0 + np.abs(start))
+        start = np.clip(start, lower + inside, upper - inside)
         last: dict[bytes, tuple[Array, Array]] = {}
 
         def both(v: Array) -> tuple[Array, Array]:
