@@ -18,6 +18,7 @@ from ctrlid._base.statistics import (
     portmanteau,
     pseudo_inverse,
     reflect_into_circle,
+    regress,
 )
 
 
@@ -123,3 +124,15 @@ def test_directions_below_a_given_size_are_left_out():
     for smallest in (1e-10, 1e-2):
         expected = np.linalg.pinv(scaled, rcond=smallest)
         np.testing.assert_allclose(pseudo_inverse(scaled, smallest), expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("q", [(), (2,)])
+def test_a_regression_does_not_depend_on_the_units_of_its_columns(q):
+    rng = np.random.default_rng(9)
+    table, goal = rng.standard_normal((40, 4)), rng.standard_normal((40, *q))
+    units = np.array([1e-12, 1.0, 1e8, 1e3])
+    plain = regress(table, goal, 1e-10)
+    np.testing.assert_allclose(plain, np.linalg.lstsq(table, goal)[0], rtol=1e-11)
+    np.testing.assert_allclose((regress(table * units, goal, 1e-10).T * units).T, plain, rtol=1e-11)
+    table[:, 2] = 0.0
+    assert np.all(regress(table, goal, 1e-10)[2] == 0)

@@ -206,6 +206,39 @@ def reflect_into_circle(roots: ArrayLike, largest: float) -> ComplexArray:
     return z
 
 
+def regress(table: Array, goal: Array, smallest: float) -> Array:
+    r"""Return the coefficients of a regression on columns of any size.
+
+    .. math:: \min_\theta \| y - X \theta \|
+
+    The columns are brought to size one before it is judged which directions they determine.
+
+    Parameters
+    ----------
+    table : ndarray, shape (n, p)
+        Regressors X, a column each.
+    goal : ndarray, shape (n,) or (n, q)
+        What they should give, y.
+    smallest : float
+        Directions with a smaller singular value, relative to the largest one, are left out.
+
+    Returns
+    -------
+    ndarray, shape (p,) or (p, q)
+        The coefficients; zero for a column of zeros.
+
+    Examples
+    --------
+    >>> table = np.array([[1.0, 0.0], [1.0, 1e-20], [1.0, 2e-20]])
+    >>> regress(table, np.array([1.0, 3.0, 5.0]), 1e-12)
+    array([1.e+00, 2.e+20])
+    """
+    size = np.linalg.norm(table, axis=0)
+    size[size == 0] = 1.0
+    scaled = np.linalg.lstsq(table / size, goal, rcond=smallest)[0]
+    return np.asarray((scaled.T / size).T, dtype=float)
+
+
 def pseudo_inverse(matrix: Array, smallest: float = SINGULAR) -> Array:
     """Invert an information matrix, leaving out directions that are not in the data.
 

@@ -11,6 +11,7 @@ from scipy import linalg, stats
 from .._base.arrays import Array
 from .._base.criterion import bayesian_penalty
 from .._base.errors import CtrlidError
+from .._base.statistics import regress
 from .._base.text import Printed
 from ..data.record import Record
 from ..data.validity import whole_past
@@ -271,8 +272,8 @@ def _reduce(long: _Long, na: int, nb: int, nk: int) -> tuple[Array, float, Array
                            linalg.toeplitz(a[:n], np.zeros(n))])  # fmt: skip
         root = np.asarray(np.linalg.qr((slope @ half).T, mode="r"), dtype=float).T
         weighted = linalg.solve_triangular(root, np.column_stack([Q, start]), lower=True)
-        size = np.maximum(np.linalg.norm(weighted[:, :-1], axis=0), 1e-300)
-        new = -np.linalg.lstsq(weighted[:, :-1] / size, weighted[:, -1], rcond=1e-12)[0] / size
+        size = np.linalg.norm(weighted[:, :-1], axis=0)
+        new = -regress(weighted[:, :-1], weighted[:, -1], 1e-12)
         rest = weighted[:, -1] + weighted[:, :-1] @ new
         change = float(np.max(np.abs(new - theta) * size))
         theta, misfit = new, float(rest @ rest)

@@ -11,7 +11,7 @@ import numpy as np
 from scipy import ndimage, stats
 
 from .._base.arrays import Array
-from .._base.statistics import lagged_products
+from .._base.statistics import lagged_products, regress
 from ..data.validity import find_runs, whole_past
 
 ENOUGH = 20_000  # samples from which a grid is read
@@ -353,10 +353,9 @@ def find_beyond_law(u: Array, y: Array, valid: Any) -> float:
         np.ones(len(rows)), *(y[rows - k] - y[0] for k in range(order + 1)),
         *(u[rows - k] - u[0] for k in range(1, order + 1)),
     ])  # fmt: skip
-    law /= np.maximum(np.linalg.norm(law, axis=0), 1e-300)
     target = u[rows] - np.mean(u[rows])
-    left = target - law @ np.linalg.lstsq(law, target, rcond=1e-12)[0]
-    return float(left @ left / max(target @ target, 1e-300))
+    left = target - law @ regress(law, target, 1e-12)
+    return float(left @ left) / max(float(target @ target), 1e-300)
 
 
 def period(r: Array) -> int:

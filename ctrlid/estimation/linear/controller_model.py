@@ -13,6 +13,7 @@ from scipy import signal
 from ..._base.arrays import Array
 from ..._base.criterion import bayesian_penalty
 from ..._base.errors import CtrlidError
+from ..._base.statistics import regress
 from ...physics.conversions import to_polynomials
 from ..identified_model import Structure
 from .instruments import Piece, Signals
@@ -137,9 +138,7 @@ def found_law(pieces: Sequence[Piece], names: Sequence[str]) -> Law | None:
             factor = np.asarray(np.linalg.qr(table, mode="r"), dtype=float)
             factors.append(factor[1:, 1:])
         total = merge(factors)
-        scale = np.linalg.norm(total[:, :-1], axis=0)
-        scale[scale == 0] = 1.0
-        x = np.linalg.lstsq(total[:, :-1] / scale, total[:, -1], rcond=1e-11)[0] / scale
+        x = regress(total[:, :-1], total[:, -1], 1e-11)
         left = float(np.sum((total[:, -1] - total[:, :-1] @ x) ** 2))
         merit = rows * np.log(max(left, 1e-18 * swing)) + 2 * bayesian_penalty(len(x), rows)
         if merit < best[0] - 1e-9 * abs(best[0]) or best[1] is None:
