@@ -7,6 +7,7 @@ import pytest
 
 import ctrlid as cid
 from ctrlid.validation.sampling_sweep import averaged
+from ctrlid.validation.sampling_table import SamplingRow, SamplingSweep
 from problems import levitation, record_of
 
 POLE = 40.435  # rad/s
@@ -177,3 +178,18 @@ def test_nothing_to_fit_is_refused_with_the_reason():
 def test_unknown_estimator_in_the_table(fast):
     with pytest.raises(cid.CtrlidError, match="has no estimator"):
         fast["fit_loop"]
+
+
+def test_poles_are_written_as_everywhere_and_stay_in_their_column():
+    def row(pole, error):
+        return SamplingRow("fit_arx", 1, 0.01, 100, "as recorded", np.array([pole, -pole]),
+                           np.full(2, error), white=True, deviation=0.01)  # fmt: skip
+
+    record = cid.Record(u=np.zeros(9), y=np.zeros(9), dt=0.01)
+    table = (row(40.123456, 0.31), row(40.123456, 3.1e-7), row(40 + 30j, 0.2))
+    sweep = SamplingSweep(record, table, np.array([-40.0, 40.0]), 0.01, "why")
+    _, head, *lines = str(sweep).splitlines()[:5]
+    assert "  40.12 ± 0.31, -40.12 ± 0.31  " in lines[0]
+    assert "  40.12345600 ± 0.00000031, -40.12345600 ± 0.00000031  " in lines[1]
+    assert "40.00+30.00j ± 0.20" in lines[2]
+    assert {line.index(" 1 %") for line in lines} == {head.index("differs") + 3}

@@ -16,6 +16,7 @@ from .._base.text import Printed
 from . import csv_files as _csv
 from . import responses as _response
 from .field_checks import samples, seconds, words
+from .validity import find_runs, whole_past
 
 Hold = Literal["zoh", "foh"]
 SIGNALS = ("r", "u", "y")
@@ -277,8 +278,7 @@ class Record(Printed):
         if not antialias:
             return self._map(lambda s: s[::q], valid=self.valid[::q], dt=self.dt * q)
         half = 10 * q
-        count = np.cumsum(np.pad(~self.valid, (half + 1, half), constant_values=True))
-        valid = (count[2 * half + 1 :] == count[: -2 * half - 1])[::q]
+        valid = whole_past(np.pad(self.valid, half), 2 * half)[2 * half :: q]
         if not valid.any():
             longest = max((b - a for a, b in self.segments()), default=0)
             raise CtrlidError(
@@ -365,8 +365,7 @@ class Record(Printed):
         list of (int, int)
             Half-open index pairs in time order.
         """
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], self.valid.astype(int), [0]])))
-        return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+        return [(int(a), int(b)) for a, b in zip(*find_runs(self.valid), strict=True)]
 
     @classmethod
     def from_csv(

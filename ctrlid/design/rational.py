@@ -12,6 +12,7 @@ from scipy.optimize import brentq, minimize_scalar
 
 from .._base.arrays import Array, ComplexArray
 from .._base.errors import CtrlidError
+from ..physics.conversions import to_polynomials
 
 Function = Callable[[Array], Array]
 
@@ -145,7 +146,7 @@ def rational(system: Any, name: str) -> Rational:
         )
     dt = float(system.dt or 0.0)
     if isinstance(system, ct.StateSpace):
-        num, den = _state_space_polynomials(system)
+        (num,), den = to_polynomials(system.A, system.B, system.C, system.D)
     else:
         num, den = (np.array(part[0][0]) for part in (system.num, system.den))
     num, den = num.astype(float), den.astype(float)
@@ -160,16 +161,6 @@ def rational(system: Any, name: str) -> Rational:
             f"with an impulse; needed are at least as many poles as zeros."
         )
     return Rational(num, den, dt)
-
-
-def _state_space_polynomials(system: Any) -> tuple[Array, Array]:
-    """Return num and den from the impulse response, whose exact zeros leave no dust."""
-    den = np.atleast_1d(np.real(np.poly(system.A))) if system.nstates else np.ones(1)
-    impulse, x = [float(system.D[0, 0])], system.B
-    for _ in range(system.nstates):
-        impulse.append(float((system.C @ x)[0, 0]))
-        x = system.A @ x
-    return np.convolve(den, impulse)[: len(den)], den
 
 
 def _without_dust(num: Array, den: Array, dt: float) -> tuple[Array, Array]:

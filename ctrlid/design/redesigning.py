@@ -15,6 +15,7 @@ from ..estimation.identified_model import IdentifiedModel
 from ..loop.loop import Loop
 from ..loop.period_map import growth_rate
 from ..loop.simulation import SimulationStopped, simulate
+from ..physics.conversions import sample_held, to_transfer_function
 from ..physics.trace import timebase
 from .lead import design_lead
 from .margins import loop_margins, nu_gap, robust_margin
@@ -226,13 +227,13 @@ def redesign(
     if not isinstance(loop, Loop):
         raise CtrlidError(f"redesign tries the controller on a Loop; given {type(loop).__name__}")
     # A plain transfer function, whatever the fit carried along, but its delay.
-    G = G.with_delay() if isinstance(G, IdentifiedModel) else ct.tf(G)
+    G = G.with_delay() if isinstance(G, IdentifiedModel) else to_transfer_function(G)
     C = design_lead(G, crossover=crossover, phase_margin=phase_margin)
     dt = timebase(G)
     trial = replace(loop, controller=C, dt=dt or loop.dt)
     P = loop.linearize()
     if dt and not timebase(P):
-        P = _sampled(P, dt)
+        P = sample_held(P, dt)
     height = _height(loop, step)
     # Long enough for the slowest promised pole, at the resolution of the loop.
     length = int(np.clip(60 / (crossover * trial.dt), 20, 50_000))
@@ -260,11 +261,6 @@ def redesign(
                     height, "" if failure is None else failure)  # fmt: skip
 
 
-def _sampled(P: Any, dt: float) -> Any:
-    """Return the zero-order-hold equivalent; through state space, which leaves no dust."""
-    return ct.tf(ct.sample_system(ct.ss(ct.tf(P.num, P.den)), dt, "zoh"))
-
-
 def _height(loop: Loop, step: float | None) -> float:
     if step is None:
         return 0.01 * abs(loop.point.output) or 0.01
@@ -276,7 +272,7 @@ def _height(loop: Loop, step: float | None) -> float:
 
 def _linear_step(G: Any, C: Any, time: Array) -> Array:
     closed = ct.feedback(G * C, 1)
-    return np.asarray(ct.forced_response(ct.ss(closed), time, np.ones(len(time))).outputs, float)
+    return np.asarray(ct.forced_response(closed, time, np.ones(len(time))).outputs, float)
 
 
 def _physical_step(loop: Loop, height: float, promised: Array) -> tuple[Array, str | None, bool]:

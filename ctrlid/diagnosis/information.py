@@ -7,6 +7,7 @@ import numpy as np
 
 from .._base.arrays import Array
 from .._base.criterion import bayesian_penalty
+from .._base.statistics import pseudo_inverse
 from ..effects import AbstractEffect
 from ..estimation.likelihood.likelihood import Fit
 from .candidates import VANISHES, Objection, Trial
@@ -22,7 +23,7 @@ def remaining_information(matrix: Array, own: Sequence[int], others: Sequence[in
     if not len(others):
         return np.asarray(left)
     cross = scaled[np.ix_(own, others)]
-    inverse = np.linalg.pinv(scaled[np.ix_(others, others)], rcond=THRESHOLD.seen)
+    inverse = pseudo_inverse(scaled[np.ix_(others, others)], THRESHOLD.seen)
     return np.asarray(left - cross @ inverse @ cross.T)
 
 

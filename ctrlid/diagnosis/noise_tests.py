@@ -8,10 +8,10 @@ import numpy as np
 from scipy import stats
 
 from .._base.arrays import Array
+from .._base.statistics import autocorrelation_time, lagged_products, portmanteau
 from ..estimation.likelihood.filter_data import FilterData
 from ..estimation.likelihood.kalman_filter import Filtered
 from ..estimation.likelihood.likelihood import Fit
-from ..validation.residual_tests import remembered
 from .constancy import chance_of_line, find_bin_edges, find_bins, run_constancy_tests
 from .thresholds import THRESHOLD
 
@@ -79,8 +79,9 @@ def run_noise_tests(fit: Fit) -> NoiseTests:
 
     References
     ----------
-    Ljung and Box, Biometrika 65 (1978) 297-303; Fisher, Proceedings of the Royal Society A 125
-    (1929) 54-59; Lobato and Velasco, Econometric Theory 20 (2004) 671-689.
+    Box and Pierce, Journal of the American Statistical Association 65 (1970) 1509-1526; Fisher,
+    Proceedings of the Royal Society A 125 (1929) 54-59; Lobato and Velasco, Econometric Theory 20
+    (2004) 671-689.
     """
     if not math.isfinite(fit.value):
         return NoiseTests({"following the record": 0.0}, np.zeros(0), {})
@@ -93,10 +94,9 @@ def run_noise_tests(fit: Fit) -> NoiseTests:
         keep = np.isfinite(z)
         filled = np.where(keep, z, 0.0)
         n = int(keep.sum())
-        rho = (
-            np.array([filled[k:] @ filled[: len(z) - k] for k in range(1, THRESHOLD.lags + 1)]) / n
-        )
-        white += n * float(np.sum(rho**2))
+        rho = lagged_products(filled, filled, THRESHOLD.lags)[1:] / n  # of variance one
+        # Without weights for short records: names and verdicts were studied with this statistic.
+        white += portmanteau(rho, n, short=False)
         white_df += THRESHOLD.lags
         value, df = _regress_on_past(filled, keep, data.u, data.r)
         cross += value
@@ -158,9 +158,14 @@ def _test_line(z: Array, n: int) -> float:
     return chance_of_line(np.abs(np.fft.rfft(z))[1:-1] ** 2 / n)
 
 
+def _fourth_moment(z: Array) -> float:
+    """Return the mean fourth power over the squared mean square: 3 for Gaussian innovations."""
+    return float(np.mean(z**4) / np.mean(z**2) ** 2)
+
+
 def _test_tails(z: Array) -> dict[str, float]:
     n = len(z)
-    excess = float(np.mean(z**4) / np.mean(z**2) ** 2 - 3.0)
+    excess = _fourth_moment(z) - 3.0
     largest = float(np.max(np.abs(z)))
     return {
         "heavy tails": float(2 * stats.norm.sf(abs(excess) / math.sqrt(24.0 / n))),
@@ -177,9 +182,8 @@ def _deviates_of_force(force: Array) -> list[float]:
     x = force - force.mean()
     if len(x) < THRESHOLD.fewest_in_bin or not np.ptp(x) > 0:
         return []
-    rho = remembered(x)
     skew, kurtosis = stats.skew(x), stats.kurtosis(x, fisher=False)
-    n, m = (len(x) / float(1 + 2 * np.sum(rho**k)) for k in (3, 4))
+    n, m = (len(x) / autocorrelation_time(x, k) for k in (3, 4))
     if n < THRESHOLD.independent_force:
         return []
     y = skew * math.sqrt((n + 1) * (n + 3) / (6 * (n - 2)))
@@ -224,7 +228,7 @@ def _test_bins(z: Array, values: Array) -> tuple[float, float]:
         return 1.0, 1.0
     mean = np.bincount(index, z, minlength=len(count))[use] / count[use]
     square = np.bincount(index, z**2, minlength=len(count))[use] / count[use]
-    flat = float(np.mean(z**4) / np.mean(z**2) ** 2 - 1.0)
+    flat = _fourth_moment(z) - 1.0
     level = float(np.average(square, weights=count[use]))
     chi_mean = float(np.sum(count[use] * mean**2))
     chi_square = float(np.sum(count[use] * (square - level) ** 2) / max(flat, 0.5))

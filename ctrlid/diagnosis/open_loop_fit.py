@@ -10,13 +10,12 @@ from scipy import optimize
 
 from .._base.arrays import Array
 from .._base.errors import CtrlidError, ModelCannotRun
-from .._base.statistics import pseudo_inverse
+from .._base.statistics import autocorrelation_time, pseudo_inverse
 from ..data.record import Record
 from ..estimation.likelihood.kalman_filter import Noise
 from ..estimation.likelihood.likelihood import Fit, Known, evaluate, make_problem
 from ..estimation.likelihood.sampled_plant import Trajectory
 from ..loop.loop import Loop
-from ..validation.residual_tests import remembered
 from .thresholds import THRESHOLD
 
 
@@ -68,7 +67,7 @@ class Simulated:
     @property
     def correlated(self) -> float:
         """How many neighbouring errors say no more than one that is independent."""
-        return float(1 + 2 * np.sum(remembered(self.errors)))
+        return autocorrelation_time(self.errors)
 
 
 class Simulation:
@@ -143,10 +142,9 @@ class Simulation:
         free = np.full(x0.size, np.inf)
         lower = np.concatenate([self.problem.lower, -free])
         upper = np.concatenate([self.problem.upper, free])
-        inside = THRESHOLD.inside_bounds * (1.0 + np.abs(np.concatenate([theta, x0.ravel()])))
-        start = np.clip(np.concatenate([theta, x0.ravel()]),
-                        np.where(np.isfinite(lower), lower + inside, lower),
-                        np.where(np.isfinite(upper), upper - inside, upper))  # fmt: skip
+        start = np.concatenate([theta, x0.ravel()])
+        inside = THRESHOLD.inside_bounds * (1.0 + np.abs(start))
+        start = np.clip(start, lower + inside, upper - inside)
         last: dict[bytes, tuple[Array, Array]] = {}
 
         def both(v: Array) -> tuple[Array, Array]:

@@ -14,6 +14,7 @@ from ..effects import AbstractEffect, InputDelay, InputOffset, Quantization, Sen
 from ..estimation.identified_model import delay_of
 from ..estimation.likelihood.likelihood import Fit
 from ..loop.loop import Loop
+from ..physics.conversions import to_transfer_function
 from ..physics.linearization import OperatingPoint
 from ..validation.record_audit import Audit, audit
 from .thresholds import THRESHOLD
@@ -33,8 +34,7 @@ def make_loop(loop: Any, record: Record) -> Loop:
         )
     valid = record.valid
     u, y = float(np.mean(record.u[valid])), float(np.mean(record.y[valid]))
-    plain = ct.tf(loop.num, loop.den, loop.dt)
-    linear = Loop(plain, None, dt=record.dt, at=OperatingPoint((), u, y))
+    linear = Loop(to_transfer_function(loop), None, dt=record.dt, at=OperatingPoint((), u, y))
     delay = delay_of(loop)
     linear = linear.with_effect(InputOffset(0.0))  # where it rests, the means only guess
     linear = replace(linear, free=tuple(linear.parameters))

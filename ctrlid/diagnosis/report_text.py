@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import math
 import textwrap
 from typing import TYPE_CHECKING
 
-from .._base.text import listing, number, with_error
+from .._base.text import listing, number, quantity
 from . import wording
 from .findings import Finding, Gap
 
@@ -106,10 +105,9 @@ def _parameters(found: Diagnosis) -> list[str]:
     last = "with the effects" if found.findings else "fitted"
     rows = [("the model's own parameters", "given", "recalibrated", last)]
     for c in found.calibrated:
-        fitted = f"{number(c.after, 4)} (not in the data)"
-        if math.isfinite(c.standard_error):
-            fitted = (with_error(c.after, c.standard_error) if c.standard_error > 0
-                      else f"{number(c.after, 4)} (AT ITS LIMIT)")  # fmt: skip
+        fitted = quantity(c.after, error=c.standard_error, digits=4)
+        if c.standard_error == 0:
+            fitted = f"{number(c.after, 4)} (AT ITS LIMIT)"
         rows.append((f"  {c.name}", number(c.given, 4), number(c.before, 4), fitted))
     if not found.findings:
         rows = [(a, b, "", d) for a, b, _, d in rows]

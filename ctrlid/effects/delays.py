@@ -5,13 +5,12 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Self, final
 
 import casadi
-import numpy as np
 
 from .._base.errors import EffectDoesNotApply
 from ..physics.equations import Backlash, Equations
 from ..physics.linearization import OperatingPoint
 from .context import Moment
-from .kinds import InputEffect
+from .kinds import InputEffect, first_width
 from .parameters import parameter
 from .symbolic import expression
 
@@ -144,10 +143,7 @@ class InputBacklash(InputEffect):
     @classmethod
     def candidates(cls, loop: Any, record: Any = None) -> tuple[Self, ...]:
         """Return a gap of a tenth of the range of the recorded input."""
-        reach = 0.1 * max(abs(loop.point.input), 1.0)
-        if record is not None:
-            reach = 0.1 * float(np.ptp(record.u))
-        return cls._applicable(loop, cls(width=reach))
+        return cls._applicable(loop, cls(width=first_width(loop, record)))
 
     def build(self, e: Equations, m: Moment) -> Equations:
         """Return the equations with the play ahead of them."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from .._base.errors import EffectDoesNotApply
 from .context import Moment
-from .kinds import InputEffect
+from .kinds import InputEffect, first_width
 from .parameters import parameter
 from .scanning import CUT_OFF, Scan, Sight
 
@@ -131,10 +131,7 @@ class InputDeadZone(InputEffect):
     @classmethod
     def candidates(cls, loop: Any, record: Any = None) -> tuple[Self, ...]:
         """Return a zone of a tenth of the range of the recorded input."""
-        reach = 0.1 * max(abs(loop.point.input), 1.0)
-        if record is not None:
-            reach = 0.1 * float(np.ptp(record.u))
-        return cls._applicable(loop, cls(width=reach))
+        return cls._applicable(loop, cls(width=first_width(loop, record)))
 
     def input(self, m: Moment) -> Any:
         """Return the input without what the zone swallows."""

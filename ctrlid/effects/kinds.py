@@ -4,6 +4,7 @@ import dataclasses
 from typing import Any, ClassVar
 
 import casadi
+import numpy as np
 
 from .._base.errors import EffectDoesNotApply
 from ..physics.equations import Equations
@@ -75,6 +76,13 @@ class InputEffect(AbstractEffect):
     def build(self, e: Equations, m: Moment) -> Equations:
         """Return the equations with the applied input in place of the computed one."""
         return substituted(e, e.u, expression(traced(self.input)(m)))
+
+
+def first_width(loop: Any, record: Any) -> float:
+    """Return the width of a gap or a zone to start from: a tenth of the recorded input's range."""
+    if record is None:
+        return 0.1 * max(abs(float(loop.point.input)), 1.0)
+    return 0.1 * float(np.ptp(record.u))
 
 
 class OutputEffect(AbstractEffect):

@@ -14,6 +14,7 @@ from scipy.stats import t as student_t
 from .._base import text as _text
 from .._base.arrays import Array, ComplexArray
 from .._base.errors import CtrlidError
+from ..physics.conversions import to_transfer_function
 
 
 @dataclass(frozen=True)
@@ -421,7 +422,7 @@ class IdentifiedModel(control.TransferFunction):
         control.TransferFunction
             A plain transfer function; the model itself if it has no delay.
         """
-        plain = control.tf(self.num, self.den, self.dt)
+        plain = to_transfer_function(self)
         return plain * control.tf(*control.pade(self.delay, order)) if self.delay else plain
 
     def __str__(self) -> str:

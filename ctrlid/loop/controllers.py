@@ -14,9 +14,9 @@ from typing import Any, Literal, get_args
 import casadi
 import control as ct
 import numpy as np
-from scipy import linalg
 
 from .._base.errors import CtrlidError
+from ..physics.conversions import to_state_matrices
 from ..physics.linearization import OperatingPoint
 from ..physics.trace import timebase, trace
 
@@ -186,30 +186,21 @@ def control_law(controller: Any, at: OperatingPoint, dt: float) -> ControlLaw:
     swap = controller.ninputs == 2 and list(controller.input_labels) == ["y", "r"]
     order = (1, 0) if swap else (0, 1)
     if isinstance(controller, ct.TransferFunction | ct.StateSpace):
-        a, b, c, d = _realize(controller)
+        if isinstance(controller, ct.TransferFunction):
+            _require_proper(controller)
+        a, b, c, d = to_state_matrices(controller)
         b, d = (m[:, order] if controller.ninputs == 2 else m for m in (b, d))
         return _linear_law(a, b, c, d, at, dt if sampled else 0.0)
     return _traced_law(controller, at, dt if sampled else 0.0, order)
 
 
-def _realize(controller: Any) -> tuple[Any, Any, Any, Any]:
-    """Return state-space matrices of a linear controller, input by input."""
-    if isinstance(controller, ct.StateSpace):
-        return controller.A, controller.B, controller.C, controller.D
-    blocks = []
+def _require_proper(controller: Any) -> None:
     for num, den in zip(controller.num[0], controller.den[0], strict=True):
-        num, den = np.trim_zeros(num, "f"), np.trim_zeros(den, "f")
         if len(num) > len(den):
             raise CtrlidError(
                 f"the controller has {len(num) - 1} zeros but {len(den) - 1} poles: no circuit and "
                 "no program differentiates without delay; add a filter pole"
             )
-        blocks.append(
-            ct.ss(ct.tf(num, den, controller.dt)) if len(num) else ct.ss([], [], [], [[0]])
-        )
-    a = linalg.block_diag(*(s.A for s in blocks))
-    b = linalg.block_diag(*(s.B for s in blocks))
-    return a, b, np.hstack([s.C for s in blocks]), np.hstack([s.D for s in blocks])
 
 
 def _linear_law(a: Any, b: Any, c: Any, d: Any, at: OperatingPoint, dt: float) -> ControlLaw:

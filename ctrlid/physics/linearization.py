@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from fractions import Fraction
 from typing import Any
 
 import casadi
@@ -12,6 +11,7 @@ from scipy import linalg
 
 from .._base.arrays import Array
 from .._base.errors import CtrlidError, ModelCannotRun
+from .conversions import to_polynomials
 from .equations import Equations, require_siso
 from .trace import trace
 
@@ -291,7 +291,7 @@ def linearize(plant: Any, at: OperatingPoint) -> Any:
         )
     equations = trace(plant)
     require_siso(equations)
-    num, den = _polynomials(*_minimal(*state_matrices(equations, at)))
+    (num,), den = to_polynomials(*_minimal(*state_matrices(equations, at)))
     return ct.tf(num, den, equations.dt if equations.dt else 0, name=f"{equations.name}_linear",
                  inputs=list(equations.inputs), outputs=list(equations.outputs))  # fmt: skip
 
@@ -338,29 +338,3 @@ def _staircase(a: Array, b: Array) -> Array:
         basis = np.hstack([basis, new])
         block = a @ new / size
     return basis if basis.shape[1] < n else np.eye(n)
-
-
-def _polynomials(a: Array, b: Array, c: Array, d: Array) -> tuple[list[float], list[float]]:
-    """Return numerator and denominator by the Faddeev-LeVerrier recursion, without rounding."""
-    n = len(a)
-    exact_a = [[Fraction(v) for v in row] for row in a.tolist()]
-    exact_b = [Fraction(v) for v in b.ravel().tolist()]
-    exact_c = [Fraction(v) for v in c.ravel().tolist()]
-    feed = Fraction(float(d.ravel()[0]))
-    den = [Fraction(1)]
-    num = [feed]
-    m = [[Fraction(0)] * n for _ in range(n)]
-    for k in range(1, n + 1):
-        m = [
-            [sum((exact_a[i][h] * m[h][j] for h in range(n)), den[-1] if i == j else Fraction(0))
-             for j in range(n)]
-            for i in range(n)
-        ]  # fmt: skip
-        trace_am = sum((exact_a[i][h] * m[h][i] for i in range(n) for h in range(n)), Fraction(0))
-        den.append(-trace_am / k)
-        gain = sum((exact_c[i] * m[i][j] * exact_b[j] for i in range(n) for j in range(n)),
-                   Fraction(0))  # fmt: skip
-        num.append(gain + feed * den[-1])
-    while len(num) > 1 and num[0] == 0:
-        num.pop(0)
-    return [float(v) for v in num], [float(v) for v in den]

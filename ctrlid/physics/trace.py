@@ -27,11 +27,6 @@ def timebase(system: Any) -> float:
     return 0.0 if system.dt is None or system.dt == 0 else float(system.dt)
 
 
-def _linear_matrices(system: Any) -> tuple[Array, Array, Array, Array]:
-    space = system if isinstance(system, ct.StateSpace) else ct.ss(system)
-    return tuple(np.asarray(m, float) for m in (space.A, space.B, space.C, space.D))  # type: ignore[return-value]
-
-
 def _array(symbols: Any) -> Symbols:
     box = np.empty(symbols.shape[0], dtype=object)
     for k in range(box.size):
@@ -57,7 +52,8 @@ def _run(system: Any, t: Any, x: Any, u: Any, p: Mapping[str, Any]) -> tuple[Any
         rhs, out = function(t, x, u, casadi.vertcat(*values) if values else casadi.SX(0, 1))
         return rhs, out
     if isinstance(system, ct.StateSpace):  # also a linear interconnection
-        a, b, c, d = (casadi.sparsify(casadi.DM(m)) for m in _linear_matrices(system))
+        a, b, c, d = (casadi.sparsify(casadi.DM(m)) for m in
+                      (system.A, system.B, system.C, system.D))  # fmt: skip
         return (
             casadi.mtimes(casadi.SX(a), x) + casadi.mtimes(casadi.SX(b), u),
             casadi.mtimes(casadi.SX(c), x) + casadi.mtimes(casadi.SX(d), u),

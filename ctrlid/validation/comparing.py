@@ -14,6 +14,7 @@ from .._base.errors import CtrlidError, CtrlidWarning, EffectDoesNotApply, Model
 from .._base.text import number
 from ..data.record import Record
 from ..data.several_records import model_and_data
+from ..data.validity import whole_past
 from ..estimation.identified_model import IdentifiedModel, delay_of
 from ..estimation.likelihood.filter_data import FEWEST
 from ..estimation.likelihood.prediction import Prediction, predict, predict_ahead, spread_ahead
@@ -21,6 +22,7 @@ from ..estimation.linear.sampled_motion import flow
 from ..loop.loop import Loop
 from ..loop.period_map import growth_rate
 from ..loop.simulation import Simulator
+from ..physics.conversions import to_polynomials, to_state_matrices
 from ..physics.trace import timebase
 from .comparison import EXACT, Comparison, Curve
 from .noise_model import noise_polynomial, whiten_errors
@@ -190,15 +192,14 @@ def _sampled(model: Any, record: Record, delay: float) -> tuple[Array, Array]:
     """Return the polynomials in z of a continuous model, its input held and late."""
     if delay and record.hold != "zoh":
         model, delay = model.with_delay(), 0.0
-    plant = ct.ss(ct.tf(model.num, model.den))
-    direct = float(plant.D[0, 0])
-    motion = flow(plant.A, plant.B[:, 0], plant.C[0], record.dt, record.hold, delay)
-    den = np.real(np.poly(motion.f))
+    a, b, c, d = to_state_matrices(model)
+    motion = flow(a, b[:, 0], c[0], record.dt, record.hold, delay)
+    columns = np.column_stack([column for *_, column in motion.inputs])
+    paths, den = to_polynomials(motion.f, columns, motion.c[None], np.zeros((1, columns.shape[1])))
     late = max(lag for _, lag, _ in motion.inputs)
-    num = direct * den
-    for _, lag, b in motion.inputs:
-        path = np.real(np.poly(motion.f - np.outer(b, motion.c))) - den
-        num = np.polyadd(num, np.append(path[1:], np.zeros(late - lag)))
+    num: Array = float(d[0, 0]) * den
+    for (_, lag, _), path in zip(motion.inputs, paths, strict=True):
+        num = np.asarray(np.polyadd(num, np.append(path[1:], np.zeros(late - lag))), dtype=float)
     return num, np.append(den, np.zeros(late))
 
 
@@ -224,10 +225,7 @@ def _compare_model(record: Record, model: Any, horizon: int | None) -> Compariso
     den = den / den[0]
     order = len(den) - 1
     valid = np.asarray(record.valid)
-    usable = np.zeros(len(record), dtype=bool)
-    if len(record) > order:
-        windows = np.lib.stride_tricks.sliding_window_view(valid, order + 1)
-        usable[order:] = windows.all(axis=1)
+    usable = whole_past(valid, order)
     if np.count_nonzero(usable) < FEWEST:
         raise ModelCannotRun(
             f"a model of order {order} needs {FEWEST + order} valid samples in "
@@ -301,13 +299,8 @@ def _ahead(
         past = [new, *past][:order]
     ahead = np.full(n, np.nan)
     ahead[steps:] = new[: n - steps]
-    window = steps + order
-    if n > window:
-        whole = np.lib.stride_tricks.sliding_window_view(usable, steps).all(axis=1)
-        ok = np.zeros(n, dtype=bool)
-        ok[steps - 1 :] = whole
-        ahead[~ok] = np.nan
-    ahead[:window] = np.nan
+    ahead[~whole_past(usable, steps - 1)] = np.nan
+    ahead[: steps + order] = np.nan
     return ahead
 
 

@@ -10,6 +10,7 @@ from .._base.arrays import Array
 from .._base.errors import CtrlidError
 from .._base.text import Printed
 from ..data.record import Record
+from ..data.validity import whole_past
 from .residual_tests import Correlation, cross_correlation
 
 LEVEL = 1e-3  # chance of calling an open loop closed
@@ -197,9 +198,7 @@ def _left(
     weigh more in what it leaves than three times the usual remainder.
     """
     reach = max(last for _, last in past.values())
-    bad = np.concatenate([[0], np.cumsum(~valid)])
-    rows = np.arange(reach, len(valid))
-    rows = rows[bad[rows + 1] == bad[rows - reach]][:MOST]
+    rows = np.flatnonzero(whole_past(valid, reach))[:MOST]
     mean = {k: float(np.mean(v[rows])) for k, v in signals.items()}
     columns = [np.ones(len(rows))]
     for key, (first, last) in past.items():
@@ -262,10 +261,7 @@ def _exact(signals: dict[str, Array], valid: Any, now: int) -> FeedbackCheck:
 
 def _unstable(signals: dict[str, Array], valid: Any, order: int, now: int) -> bool:
     """Return whether the exact difference equation has a pole clearly outside the unit circle."""
-    reach = order
-    bad = np.concatenate([[0], np.cumsum(~valid)])
-    rows = np.arange(reach, len(valid))
-    rows = rows[bad[rows + 1] == bad[rows - reach]][:MOST]
+    rows = np.flatnonzero(whole_past(valid, order))[:MOST]
     y, u = signals["y"], signals["u"]
     columns = [y[rows - k] - y[rows[0]] for k in range(1, order + 1)]
     columns += [u[rows - k] - u[rows[0]] for k in range(now, order + 1)]

@@ -4,6 +4,7 @@ import numpy as np
 from scipy import optimize, signal
 
 from .._base.arrays import Array
+from .._base.statistics import reflect_into_circle
 
 SAMPLES = 20_000  # enough to tell the colour
 
@@ -77,9 +78,5 @@ def noise_polynomial(
 
 def _stable(polynomial: Array) -> Array:
     """Reflect roots into the unit circle, and keep a hair's breadth from it."""
-    roots = np.roots(polynomial).astype(complex)
-    outside = np.abs(roots) > 1
-    roots[outside] = 1 / roots[outside].conj()
-    edge = np.abs(roots) > 0.9995
-    roots[edge] *= 0.9995 / np.abs(roots[edge])
+    roots = reflect_into_circle(np.roots(polynomial), 0.9995)
     return np.asarray(np.real(np.poly(roots)), dtype=float)

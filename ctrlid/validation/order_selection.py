@@ -9,9 +9,12 @@ import numpy as np
 from scipy import linalg, stats
 
 from .._base.arrays import Array
+from .._base.criterion import bayesian_penalty
 from .._base.errors import CtrlidError
+from .._base.statistics import regress
 from .._base.text import Printed
 from ..data.record import Record
+from ..data.validity import whole_past
 
 LONGEST = 60  # lags of the long regression
 ROWS = 30_000  # that it uses at most
@@ -167,7 +170,7 @@ def select_order(
     unit = max(1.0, min(misfit / free for *_, misfit, free, _, _ in found))
     rows = sorted(
         (OrderRow(a, b, d, misfit, float(stats.chi2.sf(misfit / unit, free)),
-                  misfit / unit + (a + b) * np.log(long.rows), error, theta)
+                  misfit / unit + 2 * bayesian_penalty(a + b, long.rows), error, theta)
          for a, b, d, misfit, free, error, theta in found),
         key=lambda row: row.bic,
     )  # fmt: skip
@@ -196,9 +199,7 @@ def _whole(name: str, values: Any) -> list[int]:
 
 def _rows(record: Record, start: int, stop: int, length: int) -> Any:
     """Return the samples whose past counts, not more than are needed."""
-    bad = np.concatenate([[0], np.cumsum(~record.valid)])
-    rows = np.arange(start + length, stop)
-    return rows[bad[rows + 1] == bad[rows - length]][:ROWS]
+    return start + np.flatnonzero(whole_past(record.valid[start:stop], length))[:ROWS]
 
 
 def _table(record: Record, rows: Any, length: int) -> tuple[Array, Array]:
@@ -240,7 +241,7 @@ def _length(record: Record, cut: int, most: int) -> int:
     for n in sorted({most + 2, 10, 15, 20, 30, 40, longest}):
         if most + 2 <= n <= longest:
             long = _regress(record, 0, cut, n, reach=longest)  # all on the same rows
-            scores[n] = long.rows * np.log(long.variance) + 2 * n * np.log(long.rows)
+            scores[n] = long.rows * np.log(long.variance) + 2 * bayesian_penalty(2 * n, long.rows)
     best = min(scores, key=lambda n: scores[n])
     return min(longest, max(best + 5, most + 4))
 
@@ -271,8 +272,8 @@ def _reduce(long: _Long, na: int, nb: int, nk: int) -> tuple[Array, float, Array
                            linalg.toeplitz(a[:n], np.zeros(n))])  # fmt: skip
         root = np.asarray(np.linalg.qr((slope @ half).T, mode="r"), dtype=float).T
         weighted = linalg.solve_triangular(root, np.column_stack([Q, start]), lower=True)
-        size = np.maximum(np.linalg.norm(weighted[:, :-1], axis=0), 1e-300)
-        new = -np.linalg.lstsq(weighted[:, :-1] / size, weighted[:, -1], rcond=1e-12)[0] / size
+        size = np.linalg.norm(weighted[:, :-1], axis=0)
+        new = -regress(weighted[:, :-1], weighted[:, -1], 1e-12)
         rest = weighted[:, -1] + weighted[:, :-1] @ new
         change = float(np.max(np.abs(new - theta) * size))
         theta, misfit = new, float(rest @ rest)

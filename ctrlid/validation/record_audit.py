@@ -12,6 +12,7 @@ from .._base.errors import CtrlidError
 from .._base.text import Printed
 from ..data.record import SIGNALS, Record
 from ..data.several_records import model_and_data
+from ..data.validity import find_runs
 from ..loop.loop import Loop
 from . import signal_defects as defects
 from .controller_check import check_controller
@@ -279,7 +280,7 @@ class _Look:
         self.repeated = mask
         if not mask.any():
             return []
-        first, stop = defects.find_runs(mask)
+        first, stop = find_runs(mask)
         share = float(np.mean(mask[self.valid]))
         with_u = np.mean([np.ptp(u[a - 1 : b]) == 0 for a, b in zip(first, stop, strict=True)])
         also = with_u > 0.8 and np.mean(np.diff(u) == 0) < 0.5
@@ -392,5 +393,5 @@ def _lines(v: Any) -> int:
         return 0
     window = np.blackman(len(v))
     power = np.abs(np.fft.rfft((v - np.average(v, weights=window)) * window)) ** 2
-    first, stop = defects.find_runs(power > LINE * power.max())
+    first, stop = find_runs(power > LINE * power.max())
     return len(first) if np.all(stop - first <= 10) else 0

@@ -8,7 +8,8 @@ import numpy as np
 from scipy import linalg, signal, stats
 
 from .._base.arrays import Array
-from .._base.criterion import bayesian_penalty
+from .._base.statistics import fit_autoregression, lagged_products, portmanteau
+from ..data.validity import whole_past
 
 LEVEL = 0.99  # of the drawn bands and of the tests
 MEMORY = 1000  # longest correlation of residuals that is looked for [samples]
@@ -51,13 +52,6 @@ class Correlation:
         return self.p_value >= 1 - LEVEL
 
 
-def _covariance(a: Array, b: Array, lags: int) -> Array:
-    """Return ``mean(a[k] b[k - tau])`` for tau = 0..lags, by FFT."""
-    full = signal.fftconvolve(a, b[::-1])
-    middle = len(b) - 1
-    return np.asarray(full[middle : middle + lags + 1] / len(a), dtype=float)
-
-
 def autocorrelation(e: Array, valid: Any, lags: int = 25, fitted: int = 0) -> Correlation:
     r"""Test whether residuals are white.
 
@@ -88,27 +82,17 @@ def autocorrelation(e: Array, valid: Any, lags: int = 25, fitted: int = 0) -> Co
     Ljung and Box, Biometrika 65 (1978) 297-303.
     """
     e, n = _centred(e, valid)
-    c = _covariance(e, e, lags)
+    c = lagged_products(e, e, lags)
     rho = c[1:] / c[0] if c[0] > 0 else np.zeros(lags)
     tau = np.arange(1, lags + 1)
-    q = n * (n + 2) * np.sum(rho**2 / np.maximum(n - tau, 1))
     band = float(stats.norm.ppf(0.5 + LEVEL / 2) / np.sqrt(n))
-    p = float(stats.chi2.sf(q, max(lags - fitted, 1)))
+    p = float(stats.chi2.sf(portmanteau(rho, n, short=True), max(lags - fitted, 1)))
     share = 0.0
     if c[0] > 0:
         # What the best prediction from this many past residuals would take away.
         whole = linalg.toeplitz(np.concatenate([[1.0], rho[:-1]])) + 1e-12 * np.eye(lags)
         share = _beyond_chance(float(rho @ np.linalg.solve(whole, rho)), lags / n)
     return Correlation("residual with its own past", tau, rho, band, p, share)
-
-
-def remembered(e: Array) -> Array:
-    """Return the autocorrelation of a signal from lag 1 on, as far as it stays positive."""
-    n = 1 << (2 * len(e) - 1).bit_length()
-    acf = np.fft.irfft(np.abs(np.fft.rfft(e, n)) ** 2)[: len(e) // 4]
-    rho = acf / max(acf[0], 1e-300)
-    ends = np.flatnonzero(rho <= 0)
-    return np.asarray(rho[1 : ends[0] if len(ends) else len(rho)])
 
 
 def _beyond_chance(raw: float, chance: float) -> float:
@@ -122,25 +106,13 @@ def _smoothed(e: Array, n: int, memory: int) -> Array:
     The order is chosen by the Bayesian information criterion: white residuals stay white.
     """
     order = min(MOST_ORDER, n // 20, memory)
-    r = _covariance(e, e, max(order, 1))
-    if r[0] <= 0:
-        return np.zeros(memory + 1)
-    a, variance = np.ones(1), 1.0
-    best, chosen = 0.0, a
-    for p in range(1, order + 1):  # Levinson and Durbin
-        reflection = -float(a @ r[p:0:-1]) / (variance * r[0])
-        a = np.append(a, 0.0) + reflection * np.append(a, 0.0)[::-1]
-        variance *= 1 - reflection**2
-        if variance <= 0:
-            break
-        score = n * np.log(variance) + 2 * bayesian_penalty(p, n)
-        if score < best:
-            best, chosen = score, a
-    p = len(chosen) - 1
+    r = lagged_products(e, e, order) / len(e)
+    a = fit_autoregression(r, n)
+    p = len(a) - 1
     out = np.zeros(memory + 1)
     out[: p + 1] = r[: p + 1]
     for k in range(p + 1, memory + 1 if p else 0):
-        out[k] = -float(chosen[1:] @ out[k - 1 : k - p - 1 : -1])
+        out[k] = -float(a[1:] @ out[k - 1 : k - p - 1 : -1])
     return out
 
 
@@ -179,9 +151,9 @@ def cross_correlation(
     e, n = _centred(e, valid)
     s, _ = _centred(s, valid)
     tau = np.arange(first, first + lags)
-    r = _covariance(e, s, int(tau[-1]))[tau]
+    r = lagged_products(e, s, int(tau[-1]))[tau] / len(e)
     memory = min(n // 10, MEMORY)
-    re, rs = _smoothed(e, n, memory), _covariance(s, s, memory + lags)
+    re, rs = _smoothed(e, n, memory), lagged_products(s, s, memory + lags) / len(s)
     scale = np.sqrt(re[0] * rs[0])
     if scale <= 0:
         return Correlation(f"residual with past {name}", tau, np.zeros(lags), np.inf, 1.0)
@@ -193,19 +165,25 @@ def cross_correlation(
     row[0] = max(row[0], 1e-300)
     band = float(stats.norm.ppf(0.5 + LEVEL / 2) * np.sqrt(row[0] / n) / scale)
     # Signals that move slowly make neighbouring lags nearly the same number.
-    values, vectors = linalg.eigh(linalg.toeplitz(row))
-    keep = values > 1e-6 * values.max()
-    z = vectors[:, keep].T @ r / np.sqrt(values[keep] / n)
-    p = float(stats.chi2.sf(float(z @ z), int(keep.sum())))
+    z = _whitening(linalg.toeplitz(row), 1e-6).T @ r * np.sqrt(n)
+    p = float(stats.chi2.sf(float(z @ z), len(z)))
     share = _share(r, rs[:lags], re[0], linalg.toeplitz(row) / n)
     return Correlation(f"residual with past {name}", tau, r / scale, band, p, share)
 
 
+def _whitening(covariance: Array, smallest: float) -> Array:
+    """Return directions in which signals of this covariance are independent and of size one.
+
+    Directions with a smaller eigenvalue, relative to the largest one, are rounding errors.
+    """
+    values, vectors = linalg.eigh(covariance)
+    keep = values > smallest * max(values.max(), 1e-300)
+    return np.asarray(vectors[:, keep] / np.sqrt(values[keep]), dtype=float)
+
+
 def _share(r: Array, rs: Array, variance: float, covariance: Array) -> float:
     """Return the share of the variance that a regression on the lagged signal would explain."""
-    values, vectors = linalg.eigh(linalg.toeplitz(rs))
-    keep = values > 1e-6 * values.max()
-    basis = vectors[:, keep] / np.sqrt(values[keep])
+    basis = _whitening(linalg.toeplitz(rs), 1e-6)
     raw = float(np.sum((basis.T @ r) ** 2)) / variance
     chance = float(np.trace(basis.T @ covariance @ basis)) / variance
     return _beyond_chance(raw, chance)
@@ -253,8 +231,7 @@ def explained_share(
     lags = max(1, min(lags, len(e) // (10 * max(len(signals), 1))))
     first = max((delay for _, delay in signals), default=0) + lags - 1
     rows = np.arange(first, len(e), max(1, -(-len(e) // ROWS)))
-    bad = np.concatenate([[0], np.cumsum(~valid)])
-    rows = rows[bad[rows + 1] == bad[rows - first]]
+    rows = rows[whole_past(valid, first)[rows]]
     if not signals or len(rows) < 3 * lags * len(signals):
         return 0.0
     target = e[rows] - np.mean(e[rows])
@@ -268,9 +245,7 @@ def explained_share(
     scale = np.linalg.norm(past, axis=0)
     past /= np.where(scale > 0, scale, 1.0)
     # Through the normal matrix: the share needs few digits, the matrix is small.
-    values, vectors = linalg.eigh(past.T @ past)
-    keep = values > 1e-9 * max(values.max(), 1e-300)
-    basis = past @ (vectors[:, keep] / np.sqrt(values[keep]))
+    basis = past @ _whitening(past.T @ past, 1e-9)
     along = basis.T @ target
     left = target - basis @ along
     n = len(rows)

@@ -7,7 +7,7 @@ import numpy as np
 
 from .._base.arrays import Array
 from .._base.errors import CtrlidError
-from .._base.text import Printed, listing, number
+from .._base.text import Printed, listing, with_error
 from ..data.record import Record
 
 FAR = 10.0  # a disagreement beyond which it no longer matters how large it is
@@ -113,14 +113,16 @@ class SamplingSweep(Printed):
 
     def __str__(self) -> str:
         largest = float(np.max(np.abs(self.poles))) if len(self.poles) else np.nan
+        width = 2 + max([len("poles [rad/s]"), *(len(_poles(row)) for row in self.table)])
         lines = [f"Sampling period of {self.record.name or 'the record'}: {self.record.n} samples "
                  f"at {self.record.dt:g} s",
                  f"  {'Ts [s]':>9} {'p Ts':>7}  {'estimator':<15}{'samples':>8}  "
-                 f"{'poles [rad/s]':<34}{'differs':>8}  one-step errors"]  # fmt: skip
+                 f"{'poles [rad/s]':<{width}}{'differs':>8}  one-step errors"]  # fmt: skip
         for row in self.table:
             head = (f"  {row.period:>9.4g} {largest * row.period:>7.3g}  {row.estimator:<15}"
                     f"{row.n:>8}  ")  # fmt: skip
-            lines.append(head + (f"FAILED: {_short(row.failure)}" if row.failed else _result(row)))
+            words = f"FAILED: {_short(row.failure)}" if row.failed else _result(row, width)
+            lines.append(head + words)
         lines += [f"  {self.reason}", *([f"  {self.warning}"] if self.warning else [])]
         return "\n".join(lines)
 
@@ -131,12 +133,15 @@ def _short(failure: str) -> str:
     return head if len(head) <= 80 else head[:77].rsplit(" ", 1)[0] + " ..."
 
 
-def _result(row: SamplingRow) -> str:
+def _poles(row: SamplingRow) -> str:
     pairs = zip(row.poles, row.standard_errors, strict=True)
-    poles = ", ".join(f"{number(p, 4)}±{s:.1g}" for p, s in pairs)
+    return ", ".join(with_error(p, s) for p, s in pairs)
+
+
+def _result(row: SamplingRow, width: int) -> str:
     off = "far" if row.deviation >= FAR else f"{100 * row.deviation:.2g} %"
     judged = {True: "white", False: "NOT WHITE", None: "not tested"}[row.white]
     if row.independent is not None:
         judged += ", independent" if row.independent else ", FOLLOW u OR r"
     bound = f"; ON ITS BOUND: {listing(row.active)}" if row.active else ""
-    return f"{poles:<34}{off:>8}  {judged}{bound}"
+    return f"{_poles(row):<{width}}{off:>8}  {judged}{bound}"

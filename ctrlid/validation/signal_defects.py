@@ -11,6 +11,8 @@ import numpy as np
 from scipy import ndimage, stats
 
 from .._base.arrays import Array
+from .._base.statistics import lagged_products, regress
+from ..data.validity import find_runs, whole_past
 
 ENOUGH = 20_000  # samples from which a grid is read
 LEVELS = 12  # distinct values up to which a signal may be a staircase
@@ -19,12 +21,6 @@ SOME = 4  # equal extreme values that no continuous distribution gives
 QUIET = 8  # samples to either side that tell whether a spike stands alone
 BLOCKS = 40  # of which the means show a drift
 PLENTY = 100_000  # samples that tell how large a drift is; of longer records every k-th
-
-
-def find_runs(mask: Any) -> tuple[Any, Any]:
-    """Return first indices and ends (exclusive) of the stretches where a mask is true."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], np.asarray(mask, dtype=np.int8), [0]])))
-    return edges[::2], edges[1::2]
 
 
 def rounding_of(v: Array) -> float:
@@ -350,19 +346,16 @@ def find_beyond_law(u: Array, y: Array, valid: Any) -> float:
         0 where a linear controller of a constant reference computes u; 1 with too few samples.
     """
     order = 10
-    bad = np.concatenate([[0], np.cumsum(~valid)])
-    rows = np.arange(order, len(u))
-    rows = rows[bad[rows + 1] == bad[rows - order]][:ENOUGH]
+    rows = np.flatnonzero(whole_past(valid, order))[:ENOUGH]
     if len(rows) < 4 * order:
         return 1.0
     law = np.column_stack([
         np.ones(len(rows)), *(y[rows - k] - y[0] for k in range(order + 1)),
         *(u[rows - k] - u[0] for k in range(1, order + 1)),
     ])  # fmt: skip
-    law /= np.maximum(np.linalg.norm(law, axis=0), 1e-300)
     target = u[rows] - np.mean(u[rows])
-    left = target - law @ np.linalg.lstsq(law, target, rcond=1e-12)[0]
-    return float(left @ left / max(target @ target, 1e-300))
+    left = target - law @ regress(law, target, 1e-12)
+    return float(left @ left) / max(float(target @ target), 1e-300)
 
 
 def period(r: Array) -> int:
@@ -387,10 +380,8 @@ def period(r: Array) -> int:
     variance = float(np.mean(v**2))
     if n < 8 or variance <= rounding_of(r) ** 2:
         return 0
-    size = 1 << (2 * n - 1).bit_length()
-    spectrum = np.fft.rfft(v, size)
     lags = np.arange(n // 2 + 1)
-    products = np.fft.irfft(np.abs(spectrum) ** 2, size)[: len(lags)]
+    products = lagged_products(v, v, n // 2)
     power = np.concatenate([[0.0], np.cumsum(v**2)])
     D = (power[n - lags] + power[n] - power[lags] - 2 * products) / (n - lags)
     near = min(4e-4 * variance, 0.25 * float(D[1])) > D

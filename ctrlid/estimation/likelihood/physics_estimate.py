@@ -1,6 +1,5 @@
 """What `fit_loop` returns: physical parameters, how well they are known, and the loop with them."""
 
-import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,7 +9,7 @@ from scipy.stats import norm
 from ..._base.arrays import Array
 from ..._base.criterion import bayesian_penalty
 from ..._base.errors import CtrlidError
-from ..._base.text import Printed, number
+from ..._base.text import Printed, number, quantity
 from ...loop.loop import Loop
 from ...physics.linearization import operating_point
 from ..identified_model import root_errors
@@ -107,23 +106,15 @@ class LoopEstimate(Printed):
                 f"{self.log_likelihood:.1f}"]  # fmt: skip
         width = max((len(name) for name in self.names), default=0)
         for name, value, error in zip(self.names, self.values, self.standard_errors, strict=True):
-            mark = "  (on its bound)" if name in self.active else ""
-            rows.append(f"  {name:<{width}} = {_with_error(value, error)}{mark}")
+            bound = name in self.active
+            shown = number(value, 6) if bound else quantity(value, error=error, digits=6)
+            rows.append(f"  {name:<{width}} = {shown}{' (on its bound)' if bound else ''}")
         noise = ", ".join(number(v, 3) for v in self.sensor_noise)
         rows.append(f"  sensor noise {noise}, white force noise {number(self.force_noise, 3)}")
         if self.coloured_force:
             rows.append(f"  coloured force {number(self.coloured_force, 3)} with a time constant "
                         f"of {number(self.force_time, 3)} s")  # fmt: skip
         return "\n".join([*rows, *(f"  note: {note}" for note in self.notes)])
-
-
-def _with_error(value: float, error: float) -> str:
-    if not np.isfinite(error):
-        return f"{number(value, 6)} (not in the data)"
-    digits = 6
-    if error > 0 and value:
-        digits = max(2, min(12, 2 + math.ceil(math.log10(abs(value) / error + 1e-300))))
-    return f"{number(value, digits)} ± {number(error, 2)}"
 
 
 @dataclass(frozen=True, eq=False, repr=False)

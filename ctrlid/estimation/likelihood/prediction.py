@@ -14,6 +14,7 @@ from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
 from ...data.record import Record
 from ...data.several_records import model_and_data
+from ...data.validity import whole_past
 from ...loop.loop import Loop
 from .kalman_filter import Noise
 from .likelihood import make_problem
@@ -148,8 +149,8 @@ def predict_ahead(
     """
     every = max(1, horizon // 4)
     starts = np.arange(0, len(record) - horizon, every)
-    bad = np.concatenate([[0], np.cumsum(~record.valid)])
-    starts = starts[(bad[starts + horizon + 1] == bad[starts]) & prediction.settled[starts]]
+    known = whole_past(record.valid, horizon)[starts + horizon]
+    starts = starts[known & prediction.settled[starts]]
     if not len(starts):
         return starts, np.empty(0)
     problem = make_problem(loop, (), [record])
@@ -198,8 +199,7 @@ def spread_ahead(
     lin = begin_fit(problem, noise=noise).linearized[0]
     lead = int(np.clip(LEAD * horizon, 50, 500))
     starts = np.arange(0, len(record) - lead - horizon, max(1, len(record) // STARTS))
-    bad = np.concatenate([[0], np.cumsum(~record.valid)])
-    starts = starts[bad[starts + lead + horizon + 1] == bad[starts]]
+    starts = starts[whole_past(record.valid, lead + horizon)[starts + lead + horizon]]
     if not len(starts):
         return math.nan, math.nan
     found = []

@@ -12,6 +12,7 @@ from ..._base.text import listing
 from ...data.record import Record
 from ...data.several_records import VISIBLE_MOTION, as_records, input_motion
 from ...loop.controllers import PID
+from ...physics.conversions import to_state_matrices
 from ..constraints import AbstractConstraint, check_constraints
 from ..identified_model import Estimate, IdentifiedModel, Structure
 from .prediction_error import Piece, Task, best_fit
@@ -156,8 +157,8 @@ def _circuit(controller: Any, records: Sequence[Record]) -> Circuit | None:
             "controller= takes the analog controller of r - y as a TransferFunction or StateSpace "
             f"with one input and one output; given {type(controller).__name__}"
         )
-    space = ct.ss(controller)
-    circuit = Circuit(space.A, space.B[:, 0], space.C[0], float(space.D[0, 0]))
+    a, b, c, d = to_state_matrices(controller)
+    circuit = Circuit(a, b[:, 0], c[0], float(d[0, 0]))
     if any(r.r is None for r in records):
         if records[0].dt * circuit.fastest > FAST_CIRCUIT:
             warnings.warn(

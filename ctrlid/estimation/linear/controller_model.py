@@ -13,6 +13,8 @@ from scipy import signal
 from ..._base.arrays import Array
 from ..._base.criterion import bayesian_penalty
 from ..._base.errors import CtrlidError
+from ..._base.statistics import regress
+from ...physics.conversions import to_polynomials
 from ..identified_model import Structure
 from .instruments import Piece, Signals
 from .regression import merge
@@ -89,16 +91,11 @@ def given_law(controller: Any, names: Sequence[str], dt: float) -> Law:
 
 def _fractions(controller: Any) -> tuple[list[Array], Array]:
     """Numerators over one denominator, all of one length, in powers of the delay."""
-    inputs = range(controller.ninputs)
     if isinstance(controller, control.StateSpace):
-        matrices = (controller.A, controller.B, controller.C, controller.D)
-        if not controller.nstates:
-            return [np.array([controller.D[0, i]]) for i in inputs], np.ones(1)
-        pairs = [signal.ss2tf(*matrices, input=i) for i in inputs]
-        return [num[0] for num, _ in pairs], np.asarray(pairs[0][1])
+        return to_polynomials(controller.A, controller.B, controller.C, controller.D)
     parts = [
         (np.trim_zeros(np.asarray(controller.num[0][i], dtype=float), "f"), controller.den[0][i])
-        for i in inputs
+        for i in range(controller.ninputs)
     ]
     den = np.asarray(parts[0][1], dtype=float)
     if any(len(d) != len(den) or not np.allclose(d, den, rtol=1e-12, atol=0) for _, d in parts):
@@ -141,9 +138,7 @@ def found_law(pieces: Sequence[Piece], names: Sequence[str]) -> Law | None:
             factor = np.asarray(np.linalg.qr(table, mode="r"), dtype=float)
             factors.append(factor[1:, 1:])
         total = merge(factors)
-        scale = np.linalg.norm(total[:, :-1], axis=0)
-        scale[scale == 0] = 1.0
-        x = np.linalg.lstsq(total[:, :-1] / scale, total[:, -1], rcond=1e-11)[0] / scale
+        x = regress(total[:, :-1], total[:, -1], 1e-11)
         left = float(np.sum((total[:, -1] - total[:, :-1] @ x) ** 2))
         merit = rows * np.log(max(left, 1e-18 * swing)) + 2 * bayesian_penalty(len(x), rows)
         if merit < best[0] - 1e-9 * abs(best[0]) or best[1] is None:

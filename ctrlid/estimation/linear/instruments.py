@@ -12,6 +12,7 @@ import numpy as np
 from ..._base import text as _text
 from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
+from ..._base.statistics import regress
 from ...data.record import Record
 from .regression import block_qr, merge
 
@@ -105,9 +106,7 @@ def two_stage(pieces: Sequence[Piece]) -> Signals:
 
         factors.append(block_qr(fill, len(piece.y), m + 3)[1:, 1:])
     total = merge(factors)
-    scale = np.linalg.norm(total[:, :m], axis=0)
-    scale[scale == 0] = 1.0
-    g = np.linalg.lstsq(total[:, :m] / scale, total[:, m:], rcond=1e-8)[0] / scale[:, None]
+    g = regress(total[:, :m], total[:, m:], 1e-8)
     found = []
     for piece in pieces:
         sums, n = [_sums(w, edges[-1]) for w in piece.w], len(piece.y)

@@ -12,6 +12,7 @@ from scipy import stats
 
 from ..._base import text as _text
 from ..._base.arrays import Array
+from ..._base.criterion import bayesian_penalty
 from ..._base.errors import CtrlidError, CtrlidWarning
 from ...data.record import Record
 from ...data.several_records import as_records
@@ -229,7 +230,7 @@ def _is_curved(task: Task, fit: _Fit, view: View) -> bool:
     straight = compute_moments(task, fit.hats, view)
     curved = compute_moments(task, fit.hats, replace(view, degree=view.degree + 1, bend=()))
     gain = straight.rows * np.log(straight.rss(theta) / curved.rss(theta))
-    return bool(gain > (curved.nuisances - straight.nuisances) * np.log(straight.rows))
+    return bool(gain > 2 * bayesian_penalty(curved.nuisances - straight.nuisances, straight.rows))
 
 
 def _bent(task: Task, fit: _Fit) -> View:

@@ -10,6 +10,7 @@ import numpy as np
 
 from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
+from ..._base.statistics import regress
 from ...data.record import Record
 from ..constraints.quadratic_program import Cost
 from ..identified_model import Structure
@@ -322,10 +323,8 @@ def separate(task: Task, theta: Array, hats: Signals, view: View) -> list[Residu
         table, skip = np.column_stack(columns), skip + 1
         nuisance, z = table[:, :skip], table[:, skip : skip + p]
         error = table[:, -1] - table[:, skip + p : -1] @ delta
-        size = np.linalg.norm(nuisance, axis=0)
-        size[size == 0] = 1.0
         both = np.column_stack([z, error])
-        x = np.linalg.lstsq(nuisance / size, both, rcond=1e-12)[0] / size[:, None]
+        x = regress(nuisance, both, 1e-12)
         both -= nuisance @ x
         found.append(Residuals(both[:, :-1], both[:, -1], x[s.na : skip - 1, -1], x[skip - 1, -1]))
     return found

@@ -9,6 +9,7 @@ import numpy as np
 
 from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
+from ..._base.statistics import regress
 from ..._base.text import listing
 from ..constraints import AbstractConstraint
 from ..constraints.constrained_minimum import Found, minimize
@@ -346,10 +347,10 @@ def _linear_start(
             return None, np.inf
         blocks.append(_triangle(whole)[table.shape[1] - 1 :, table.shape[1] - 1 :])
     factor = merge(blocks)
-    size = np.linalg.norm(factor[: s.nb, : s.nb], axis=0)
-    if not np.all(size > 0):
+    columns = factor[: s.nb, : s.nb]
+    if not np.all(np.linalg.norm(columns, axis=0) > 0):
         return None, np.inf
-    b = -np.linalg.lstsq(factor[: s.nb, : s.nb] / size, factor[: s.nb, -1], rcond=1e-12)[0] / size
+    b = -regress(columns, factor[: s.nb, -1], 1e-12)
     theta = np.concatenate([den[1:], b])
     return Point(theta, gain, delay), float(np.sum(factor[s.nb :, -1] ** 2))
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import signal
 
-from ..._base.arrays import Array, ComplexArray
-from ..._base.criterion import bayesian_penalty
+from ..._base.arrays import Array
+from ..._base.statistics import fit_autoregression, lagged_products, reflect_into_circle
 from ..identified_model import Structure
 from .regression import to_differences
 
@@ -88,10 +88,8 @@ def stable_factor(structure: Structure, theta: Array, n: int) -> Array:
     """
     delta = to_differences(structure, theta)[: structure.na]
     roots = 1.0 + np.roots(np.concatenate([[1.0], -delta[::-1]])).astype(complex)
-    z: ComplexArray = np.where(np.abs(roots) > 1, 1 / roots.conj(), roots)
-    size = np.maximum(np.abs(z), 1e-300)
-    z = z * np.minimum(1.0, (1 - 5 / max(n, 10)) / size)
-    return np.asarray(np.poly(z).real, dtype=float)
+    inside = reflect_into_circle(roots, 1 - 5 / max(n, 10))
+    return np.asarray(np.poly(inside).real, dtype=float)
 
 
 def autoregression(residuals: Sequence[Array], highest: int = MOST_COLOURED) -> Array:
@@ -119,18 +117,5 @@ def autoregression(residuals: Sequence[Array], highest: int = MOST_COLOURED) -> 
     >>> autoregression([lfilter([1.0], [1.0, -0.8], white)]).round(1)
     array([ 1. , -0.8])
     """
-    rows = sum(len(e) for e in residuals)
-    r = np.zeros(highest + 1)
-    for e in residuals:
-        for lag in range(min(highest, len(e) - 1) + 1):
-            r[lag] += float(e[lag:] @ e[: len(e) - lag])
-    filters = [np.ones(1)]
-    d, power = np.ones(1), r[0]
-    merits = [rows * np.log(power)]
-    for order in range(1, highest + 1):  # Levinson and Durbin
-        reflection = -float(d @ r[order:0:-1]) / power
-        d = np.concatenate([d, [0.0]]) + reflection * np.concatenate([[0.0], d[::-1]])
-        power *= 1 - reflection**2
-        filters.append(d)
-        merits.append(rows * np.log(power) + 2 * bayesian_penalty(order, rows))
-    return filters[int(np.argmin(merits))]
+    products = np.sum([lagged_products(e, e, highest) for e in residuals], axis=0)
+    return fit_autoregression(products, sum(len(e) for e in residuals))

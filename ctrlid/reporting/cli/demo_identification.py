@@ -21,6 +21,7 @@ from ...estimation.linear.arx import fit_arx
 from ...estimation.linear.iv import fit_iv
 from ...loop.loop import Loop
 from ...loop.simulation import simulate
+from ...physics.conversions import sample_held
 from ...physics.linearization import OperatingPoint, linearize, operating_point
 from ...physics.plants import maglev
 from ...validation.comparing import compare
@@ -125,7 +126,7 @@ def _bench() -> _Bench:
     plant = maglev(m=BALL, K=MAGNET, g=GRAVITY)
     op = operating_point(plant, output=GAP)
     P = linearize(plant, op)
-    sampled = ct.tf(ct.sample_system(ct.ss(P), PERIOD, "zoh"))
+    sampled = sample_held(P, PERIOD)
     C = design_lead(sampled, crossover=CROSSOVER, phase_margin=PHASE_MARGIN)
     return _Bench(plant, op, P, sampled, Loop(plant, C, dt=PERIOD, at=op))
 

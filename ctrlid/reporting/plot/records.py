@@ -9,6 +9,7 @@ from ..._base import text as _text
 from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
 from ...data.record import Record
+from ...data.validity import find_runs
 from ...validation.comparison import Comparison
 from .. import pictures as _pictures
 from .axes import BINS, COLOURS, DASHES, MEASURED, finish, line_style, require, take_axes
@@ -228,8 +229,7 @@ def _trace(ax: Any, record: Record, values: Array, i: int, label: str, held: boo
 
 def _shade(ax: Any, record: Record) -> None:
     """Shade the stretches that do not count."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], ~record.valid, [0]]).astype(int)))
-    for k, (start, stop) in enumerate(zip(edges[::2], edges[1::2], strict=True)):
+    for k, (start, stop) in enumerate(zip(*find_runs(~record.valid), strict=True)):
         t0, t1 = (record.start + i * record.dt for i in (start, stop))
         ax.axvspan(t0, t1, facecolor="0.88", hatch="///", edgecolor="0.6", linewidth=0, zorder=0,
                    label=None if k else "does not count")  # fmt: skip

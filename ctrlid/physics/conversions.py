@@ -1,0 +1,146 @@
+"""Linear systems as polynomials, as state matrices and at the samples, without dust.
+
+`canonical` is the other way to states: symbols whose coefficients are named parameters.
+"""
+
+from fractions import Fraction
+from typing import Any
+
+import control as ct
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy import linalg
+
+from .._base.arrays import Array
+
+
+def to_polynomials(
+    a: ArrayLike, b: ArrayLike, c: ArrayLike, d: ArrayLike
+) -> tuple[list[Array], Array]:
+    r"""Return the polynomials of state equations with one output.
+
+    .. math:: \frac{b_j(s)}{a(s)} = C (s I - A)^{-1} B_j + D_j, \quad
+        M_k = A M_{k-1} + a_{k-1} I, \quad a_k = -\tfrac1k \operatorname{tr} A M_k
+
+    The recursion of Faddeev and LeVerrier on whole numbers, which all entries are but for a power
+    of two: every coefficient is rounded once, at the end. What is exactly zero stays zero, and the
+    small numerators of fast sampling keep their digits.
+
+    Parameters
+    ----------
+    a, b, c, d : array_like
+        State matrices, of shapes (n, n), (n, inputs), (1, n) and (1, inputs).
+
+    Returns
+    -------
+    numerators : list of ndarray, shape (n + 1,)
+        One for each input, in falling powers.
+    denominator : ndarray, shape (n + 1,)
+        Monic, the same for all inputs. All coefficients are NaN if an entry is NaN or infinite.
+
+    References
+    ----------
+    Gantmacher, *The Theory of Matrices*, volume 1, chapter IV, section 5.
+
+    Examples
+    --------
+    >>> to_polynomials([[0.0, 1.0], [-6.0, -5.0]], [[0.0], [1.0]], [[2.0, 0.0]], [[0.0]])
+    ([array([0., 0., 2.])], array([1., 5., 6.]))
+    """
+    if not all(np.isfinite(np.asarray(m, dtype=float)).all() for m in (a, b, c, d)):
+        unknown = np.full(np.shape(a)[0] + 1, np.nan)
+        return [unknown.copy() for _ in range(np.shape(b)[1])], unknown
+    (A, p), (B, q), (C, r) = _whole_numbers(a), _whole_numbers(b), _whole_numbers(c)
+    direct = [Fraction(v) for v in np.asarray(d, dtype=float).ravel().tolist()]
+    n = len(A)
+    den = [Fraction(1)]
+    numerators = [[v] for v in direct]
+    m, last = np.zeros((n, n), dtype=object), 1
+    for k in range(1, n + 1):
+        m = A @ m + last * np.eye(n, dtype=int).astype(object)
+        last = -int(np.trace(A @ m)) // k  # which divides it
+        den.append(Fraction(last, p**k))
+        for num, v, gain in zip(numerators, direct, (C @ m @ B).ravel(), strict=True):
+            num.append(Fraction(int(gain), p ** (k - 1) * q * r) + v * den[-1])
+    return [np.array(num, dtype=float) for num in numerators], np.array(den, dtype=float)
+
+
+def _whole_numbers(matrix: ArrayLike) -> tuple[Any, int]:
+    """Return a matrix times the smallest power of two that makes it whole, and that power."""
+    entries = np.asarray(matrix, dtype=float)
+    ratios = [v.as_integer_ratio() for v in entries.ravel().tolist()]
+    power = max((under for _, under in ratios), default=1)
+    whole = np.array([over * (power // under) for over, under in ratios], dtype=object)
+    return whole.reshape(entries.shape), power
+
+
+def to_transfer_function(system: Any) -> Any:
+    """Return a linear system of one input and one output as a transfer function and nothing else.
+
+    Parameters
+    ----------
+    system : control.TransferFunction or control.StateSpace
+        The system; what a fit carries along is left behind.
+
+    Returns
+    -------
+    control.TransferFunction
+        With the sampling period of the system.
+
+    Examples
+    --------
+    >>> G = to_transfer_function(ct.ss([[-2.0]], [[3.0]], [[1.0]], [[0.0]]))
+    >>> G.num[0][0].tolist(), G.den[0][0].tolist()
+    ([3.0], [1.0, 2.0])
+    """
+    if isinstance(system, ct.TransferFunction):
+        return ct.tf(system.num, system.den, system.dt)
+    (num,), den = to_polynomials(system.A, system.B, system.C, system.D)
+    return ct.tf(num, den, system.dt)
+
+
+def to_state_matrices(system: Any) -> tuple[Array, Array, Array, Array]:
+    """Return state matrices of a linear system with one output; each input has states of its own.
+
+    Parameters
+    ----------
+    system : control.StateSpace or control.TransferFunction
+        The system, with no more zeros than poles.
+
+    Returns
+    -------
+    a, b, c, d : ndarray
+        Of shapes (n, n), (n, inputs), (1, n) and (1, inputs); those of a state space as they are.
+    """
+    if isinstance(system, ct.StateSpace):
+        return system.A, system.B, system.C, system.D
+    parts = []
+    for num, den in zip(system.num[0], system.den[0], strict=True):
+        zero = not np.any(num)
+        parts.append(ct.ss([], [], [], [[0]]) if zero else ct.ss(ct.tf(num, den, system.dt)))
+    a, b = (linalg.block_diag(*m) for m in ([s.A for s in parts], [s.B for s in parts]))
+    return a, b, np.hstack([s.C for s in parts]), np.hstack([s.D for s in parts])
+
+
+def sample_held(system: Any, dt: float) -> Any:
+    """Return what a system in continuous time is at the samples, its input held between them.
+
+    Parameters
+    ----------
+    system : control.TransferFunction or control.StateSpace
+        The system, of one input and one output.
+    dt : float
+        Sampling period [s].
+
+    Returns
+    -------
+    control.TransferFunction
+        In discrete time.
+
+    Examples
+    --------
+    >>> G = sample_held(ct.tf([1.0], [1.0, 0.0, 0.0]), 0.1)
+    >>> G.num[0][0].round(12).tolist(), G.den[0][0].tolist()
+    ([0.005, 0.005], [1.0, -2.0, 1.0])
+    """
+    return to_transfer_function(ct.sample_system(ct.ss(*to_state_matrices(system)), dt, "zoh"))
