@@ -1,7 +1,8 @@
 """Loops, controllers, references, noise and hidden effects drawn at random, for studies.
 
-A draw has a real loop and a believed one, whose free parameters are up to 10 % off, and can be run
-as often as one likes, each time with other noise. Sampling is scaled with the plant's speed.
+A draw has the true loop and the model of it, whose free parameters are up to 10 % off. It can be
+simulated any number of times, each time with other noise. The sampling period is proportional to
+the time constant of the plant.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
 """Time and memory of diagnose() against the length of the record.
 
-Run it as ``python benchmarks/bench_diagnose.py`` (a levitation with viscous friction and with
-nothing missing, the whole catalogue, 5 000 to 80 000 samples); ``--samples 1000000`` for another
-length. Each run is a process of its own, so that peak memory is that of one record.
+Run it as ``python benchmarks/bench_diagnose.py``. It diagnoses a levitation with the whole
+catalogue, once with viscous friction missing and once with nothing missing, for 5 000 to 80 000
+samples; ``--samples 1000000`` gives another length. Each run is a process of its own, so that the
+peak memory is that of one record.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """fit_arx against one numpy.linalg.lstsq of the same regression, matrix building included.
 
-Run it as ``python benchmarks/bench_fit_arx.py``. The two are timed in turns, so that whatever else
-the machine does hits both; the ratio of the medians is what counts.
+Run it as ``python benchmarks/bench_fit_arx.py``. The two are timed in turns, so that other work of
+the machine slows both alike. The result is the ratio of the medians.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """A log longer than the memory: fit_arx on a memory-mapped file, block by block.
 
 Run it as ``python benchmarks/bench_long.py --samples 100000000``. It writes the log (two columns of
-doubles, 1.6 GB for 1e8 samples) to a temporary file, then fits it through a generator of Records.
-Printed are the time, the coefficients and the peak of what Python allocated during the fit;
-``--jobs 2`` shares the blocks among processes.
+doubles, 1.6 GB for 1e8 samples) to a temporary file, and fits it from a generator of Records. It
+prints the time, the coefficients and the peak of the memory that Python allocated during the fit.
+With ``--jobs 2`` the blocks are distributed over processes.
 """
 
 from __future__ import annotations

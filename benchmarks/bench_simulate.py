@@ -1,22 +1,22 @@
-"""cid.simulate against python-control's input_output_response on one analog levitation loop.
+"""Compare cid.simulate with python-control's input_output_response on one analog levitation loop.
 
 Run it as ``python benchmarks/bench_simulate.py``; it takes a minute or two. Both simulate the same
 45 000 samples: a lead at 100 rad/s on the nonlinear plant, a random binary reference held over each
 period.
 
-python-control interpolates its input linearly between samples, so a held reference is made for it
-as a block that looks the sample up by time. Its integrator meets the jumps wherever it happens to
-step; `max_step` at one period keeps it from passing over one. Three ways of using it:
+python-control interpolates its input linearly between samples. So the held reference is a block
+that looks the sample up by time. The steps of the integrator do not coincide with the jumps of the
+reference; `max_step` of one period prevents it from missing a jump. It is used in three ways:
 
-- interconnected: plant, lead, bias and difference joined by `ct.interconnect`, as one writes it;
-- by hand: the same equations written out as one update function, which spares the interconnection;
-- from jump to jump: those equations again, one call for every stretch of constant reference, so
-  that the integrator meets no jump at all. This is not the same simulation any more, since it
-  needs to know where the reference jumps; it shows how far one can get by hand.
+- interconnected: plant, lead, bias and difference are joined by `ct.interconnect`;
+- by hand: the same equations are written as one update function, without the interconnection;
+- from jump to jump: the same equations, with one call for every stretch of constant reference, so
+  that there is no jump within a call. This simulation needs to know where the reference jumps; it
+  shows what can be achieved by hand.
 
-For each the loosest rtol in steps of ten is taken that is within 1e-6. Errors are relative to the
-standard deviation of the output, against a reference integrated period by period with SciPy's
-DOP853 at rtol 1e-12, on a shorter piece.
+Each way uses the largest rtol, in powers of ten, with an error below 1e-6. Errors are relative to
+the standard deviation of the output. The exact solution is integrated period by period with SciPy's
+DOP853 at rtol 1e-12, for a part of the record.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Forces of the EMPS drive: the model that `diagnose` completes, beside the published one.
 
-Run it as ``python benchmarks/emps_forces.py``; it prints the diagnosis of the story
-``examples/real_emps.py`` first, about two minutes. The records are fetched once, or read from the
-folder named by CTRLID_DATA_DIR.
+Run it as ``python benchmarks/emps_forces.py``. It first prints the diagnosis of the story
+``examples/real_emps.py``, which takes about two minutes. The records are downloaded once, or read
+from the folder that the environment variable CTRLID_DATA_DIR names.
 """
 
 from __future__ import annotations

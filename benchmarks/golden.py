@@ -1,16 +1,16 @@
-"""Fourteen diagnoses and all that the stories print, kept to be compared with later versions.
+"""Keep diagnoses and the printed text of the stories, to compare two versions of ctrlid.
 
-Write them with one version, compare them with another, on one machine::
+Write the files with each version, on one machine, and compare them::
 
     python benchmarks/golden.py write before
     python benchmarks/golden.py write after
     python benchmarks/golden.py compare before after
 
-``--only NAME`` takes some of the cases, ``--jobs 2`` runs two at a time, each in a process with
-one thread. A report is kept as the text that a user reads, its numbers with all their digits, and
-the signals of the gap as a checksum, so that no measured sample is written down. `compare` says
-which files are the same byte for byte and, where a diagnosis is not, whether verdict and names
-are the same and by how many standard errors its parameters differ at most.
+``--only NAME`` selects some of the cases, and ``--jobs 2`` runs two at a time, each in a process
+with one thread. For each case the text of the report and its numbers with all digits are written.
+The signals of the gap are written as a checksum only, so that no measured sample is stored.
+`compare` says which files are the same byte for byte. Where a diagnosis differs, it says whether
+verdict and names are the same, and by how many standard errors the parameters differ at most.
 """
 
 from __future__ import annotations

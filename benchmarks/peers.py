@@ -1,17 +1,18 @@
 """Other identification packages on the same record of an unstable plant in closed loop.
 
-Run it as ``python benchmarks/peers.py``, in an environment that has some of them (``pip install
-pysib sippy_unipi sysidentpy archimedes``); those that are not installed are left out. ``--seed``,
-``--noise`` and ``--step`` (unstable pole times sampling period) choose the record.
+Run it as ``python benchmarks/peers.py``, in an environment that has some of them
+(``pip install pysib sippy_unipi sysidentpy archimedes``). Packages that are not installed are left
+out. ``--seed``, ``--noise`` and ``--step`` (unstable pole times sampling period) choose the record.
 
-All get the same levitation, drawn as in study_iv.py: a digital lead, a random binary reference,
-white sensor noise. Sought are alpha and beta of -beta/(s^2 - alpha). Each package does what its
-documentation offers for the task, with the orders known; what is known besides (reciprocal poles,
-b1 = b2, the law) goes to those that can take it. Signals are given as deviations from their means
-and divided by their spread, since most packages estimate no constant and scale nothing. Times are
-those of a second call, the first one loads and compiles; beyond ten seconds there is no second one.
-Left out is what cannot have a pole outside the unit circle (output error, Box-Jenkins) and what
-needs a second experiment with the same input (pysib iv).
+All packages get the same levitation, drawn as in study_iv.py: a digital lead, a random binary
+reference and white sensor noise. They estimate alpha and beta of -beta/(s^2 - alpha). Each package
+is used as its documentation says, with the true orders. Further knowledge (reciprocal poles, b1 =
+b2, the physical equations) is given to those that can use it. The signals are given as deviations
+from their means, divided by their standard deviations, since most packages estimate no constant and
+do not scale. The times are those of a second call, because the first one loads and compiles; if it
+takes more than ten seconds, there is no second call. Methods that cannot have a pole outside the
+unit circle (output error, Box-Jenkins) are left out, and so is one that needs a second experiment
+with the same input (pysib iv).
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
-"""Four real rigs, each by the estimator that fits it, with uncertainties and what physics says.
+"""Fit four real rigs, each with a suitable estimator, and compare with the values of physics.
 
-Run it as ``python benchmarks/real_records.py`` (``magnetoshield``, ``inteco``, ``emps``, ``servo``
-for some of them). The records are fetched once, or read from the folder named by CTRLID_DATA_DIR.
+Run it as ``python benchmarks/real_records.py``; ``magnetoshield``, ``inteco``, ``emps`` and
+``servo`` select some of them. The records are downloaded once, or read from the folder that the
+environment variable CTRLID_DATA_DIR names.
 """
 
 from __future__ import annotations

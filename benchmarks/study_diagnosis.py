@@ -1,22 +1,27 @@
-"""diagnose() on loops drawn at random, each with something hidden in it.
+"""Measure how often diagnose() finds the right name, on loops drawn at random.
 
-Run it as ``python benchmarks/study_diagnosis.py --kind named --worth ordinary --runs 62``; the
+Run it as ``python benchmarks/study_diagnosis.py --kind named --worth ordinary --runs 62``. The
 kinds are
 
-- ``named``: one effect of the catalogue, every class in turn, of a size drawn by what it is worth:
-  the gain of log-likelihood of a refit that knows what is hidden (``--worth faint``, 50 to 300,
-  ``moderate``, 300 to 3 000, ``ordinary``, 3 000 to 30 000);
-- ``none``: nothing is hidden; ``inside``: nothing either, and the model has an effect, every class
-  in turn, at its true values; ``two``, ``three``: several effects at once;
-- ``outside``: something that the catalogue does not have, or a member taken out of it;
-- ``lookalike``: a set of names, and then the recommended experiment.
+- ``named``: one effect of the catalogue is hidden, every class in turn. Its size is drawn by its
+  worth, the log-likelihood ratio of the fits with and without it (``--worth faint``: 50 to 300,
+  ``moderate``: 300 to 3 000, ``ordinary``: 3 000 to 30 000);
+- ``none``: nothing is hidden;
+- ``inside``: nothing is hidden, and the model already has an effect, every class in turn, at its
+  true values;
+- ``two``, ``three``: several effects are hidden at once;
+- ``outside``: the hidden effect is not in the catalogue, or was removed from it;
+- ``lookalike``: where the answer has several names, the recommended experiment is simulated and
+  diagnosed.
 
-``--vary look_back=0.5,0.9`` diagnoses the same draws with other values of a number of the table
-in ``ctrlid/diagnosis/thresholds.py``, beside its own, and prints the tables one after the other.
-With ``--unknown`` the diagnosis is not told the controller.
-``--out FILE`` keeps the runs as lines of JSON, and ``--report FILE...`` prints their tables again.
+``--vary look_back=0.5,0.9`` diagnoses the same draws also with other values of a number of the
+table in ``ctrlid/diagnosis/thresholds.py``, and prints the tables one after the other. With
+``--unknown`` the diagnosis does not get the controller. ``--out FILE`` writes the runs as lines of
+JSON, and ``--report FILE...`` prints their tables again.
+
 Each run draws plant, controller, reference, noise and effect from its own seed; a third have a
-coloured random force. Free parameters are believed up to 10 % off. Seeds of tests are others.
+coloured random force. The free parameters of the model are up to 10 % off. The seeds differ from
+those of the tests.
 """
 
 from __future__ import annotations

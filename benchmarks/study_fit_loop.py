@@ -1,18 +1,21 @@
-"""fit_loop on loops drawn at random: coverage of its intervals, bias and efficiency.
+"""Measure coverage, bias and efficiency of fit_loop, on loops drawn at random.
 
-Run it as ``python benchmarks/study_fit_loop.py --runs 300 --jobs 2`` (``--long`` for records of
-10 000 to 45 000 samples in place of 2 000 to 8 000, ``--only maglev`` for one kind of loop).
+Run it as ``python benchmarks/study_fit_loop.py --runs 300 --jobs 2``. ``--long`` draws records of
+10 000 to 45 000 samples in place of 2 000 to 8 000, and ``--only maglev`` one kind of loop.
 
 Each run draws a levitation (gap 5-20 mm, voltage 1-10 V, unstable pole times period 0.5 to 0.005,
 digital or known analog lead) or a drive with an integrator, a reference, sensor noise of 1-20 % of
-the reference, no force noise, a white or a coloured one, and which parameters are free; these are
-believed up to 10 % off. Printed for each parameter and for groups of runs:
+the reference, no force noise or a white or coloured one, and which parameters are free. The initial
+values of these are up to 10 % off. For each parameter and for groups of runs it prints
 
-- covered: share of nominal 95 % intervals that hold the truth, with its own 95 % interval;
-- bias: mean of error / standard error; size: root of the mean square of the same, 1 is right;
-- efficiency: mean square of error / Cramér-Rao bound, from the exact information at the true
-  parameters with the noise as fitted there; 1 is the best an unbiased estimator can do;
-- error: median size of the error in percent.
+- covered: the share of nominal 95 % intervals that contain the true value, with its own 95 %
+  interval;
+- bias: the mean of error / standard error; size: the root mean square of the same, which should
+  be 1;
+- efficiency: the mean square of the error divided by the Cramér-Rao bound, which is computed from
+  the exact information at the true parameters with the noise fitted there. It is 1 for an
+  efficient estimator;
+- error: the median of the absolute error in percent.
 """
 
 from __future__ import annotations

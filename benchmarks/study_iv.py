@@ -1,25 +1,27 @@
-"""All estimators on levitations drawn at random, against least squares and the Cramér-Rao bound.
+"""Compare all estimators with the Cramér-Rao bound, on levitations drawn at random.
 
-Run it as ``python benchmarks/study_iv.py --runs 40 --jobs 2`` (``--analog`` for analog leads that
-are known, ``--only fit_iv fit_loop`` for some estimators, ``--free`` for fit_iv without
-constraints, ``--given`` with the controller given to it instead of found in the record,
-``--physics 0.01`` for the nonlinear levitation with the voltage scattering by at most 1 %: the
-linear range; ``--physics 1`` with the reference as drawn, where it is left).
+Run it as ``python benchmarks/study_iv.py --runs 40 --jobs 2``. The options are ``--analog`` for
+known analog leads, ``--only fit_iv fit_loop`` for some of the estimators, ``--free`` for fit_iv
+without constraints, and ``--given`` for fit_iv with the true controller instead of one estimated
+from the record. ``--physics 0.01`` simulates the nonlinear levitation with a standard deviation of
+the voltage of at most 1 %, which is in the linear range; ``--physics 1`` takes the reference as
+drawn, which is not.
 
 Each run draws a gap of 5-20 mm, a voltage of 1-10 V, a lead (crossover 2-3 times the unstable pole
 p, 40-55 degrees; less demanding where such a loop would hardly be stable, at p*Ts = 0.5), a random
-binary reference of 1-2 % of the gap, and 10 000-45 000 samples. Two numbers are sought, alpha and
-beta of -beta/(s^2 - alpha). For each estimator and each of them:
+binary reference of 1-2 % of the gap, and 10 000-45 000 samples. The estimators estimate alpha and
+beta of -beta/(s^2 - alpha). For each estimator and each of the two it prints
 
-- median size of the error in percent;
-- bias: mean of error / standard error;
-- covered: share of nominal 95 % intervals that hold the truth;
-- efficiency: mean square of error / Cramér-Rao bound; 1 is the best an unbiased estimator can do.
-  The bound is that of two unknowns, alpha and beta, so ``--free`` with four stays above 1.
+- the median of the absolute error in percent;
+- bias: the mean of error / standard error;
+- covered: the share of nominal 95 % intervals that contain the true value;
+- efficiency: the mean square of the error divided by the Cramér-Rao bound, which is 1 for an
+  efficient estimator. The bound is that of two unknowns, so ``--free`` with four stays above 1.
 
-What is known goes to each in its own language: reciprocal poles and b1 = b2, or symmetric poles,
-or the law itself with its point of rest for fit_loop, which starts 5 % off in both parameters. A
-difference equation takes u as held; under an analog lead that is wrong, and fit_iv refuses.
+The structure is given to each estimator in its own way: as reciprocal poles and b1 = b2, as
+symmetric poles, or, for fit_loop, as the physical equations with their operating point; fit_loop
+starts 5 % off in both parameters. A difference equation assumes a held input, which is wrong under
+an analog lead, so fit_iv refuses such records.
 """
 
 from __future__ import annotations

@@ -2,9 +2,9 @@ r"""
 A lead compensator for a levitated ball
 =======================================
 
-A steel ball hangs 12 mm below an electromagnet. Left alone it falls, or jumps to the magnet. A
-lead compensator holds it. This story goes from the physics to the controller, and checks the
-margins that were asked for.
+A steel ball hangs 12 mm below an electromagnet. Without control it falls, or jumps to the magnet. A
+lead compensator stabilizes it. This story goes from the physics to the controller, and checks that
+the loop has the margins that were asked for.
 """
 
 import control as ct
@@ -27,7 +27,7 @@ print(P)
 
 # %%
 # The poles lie symmetrically about the imaginary axis, at plus and minus the square root of 2 g /
-# x0. Note the minus sign of the gain: more voltage lifts the ball, and the gap x gets smaller.
+# x0, where x0 is the gap. The gain is negative: more voltage lifts the ball, and the gap decreases.
 
 print("poles [rad/s]:", P.poles().real.round(3))
 print("sqrt(2 g/x0): ", round(float(np.sqrt(2 * 9.81 / 0.012)), 3))
@@ -35,8 +35,8 @@ print("sqrt(2 g/x0): ", round(float(np.sqrt(2 * 9.81 / 0.012)), 3))
 # %%
 # The compensator
 # ---------------
-# `design_lead` takes the gain crossover in rad/s and the phase margin in degrees, and gives the
-# lead that has exactly these. It finds the sign of the gain by itself.
+# `design_lead` takes the gain crossover in rad/s and the phase margin in degrees, and returns a
+# lead whose loop has exactly these. It chooses the sign of the gain itself.
 
 C = cid.design_lead(P, crossover=100.0, phase_margin=50.0)
 print(C)
@@ -46,10 +46,10 @@ low, high = margins.gain_reduction_margin, margins.gain_margin
 print(f"stable with the loop gain times {low:.3f} to {high}")
 
 # %%
-# The last line matters for an unstable plant: the loop fails when its gain becomes too *small*,
-# too.
+# The last line matters for an unstable plant: the loop also becomes unstable when its gain becomes
+# too *small*.
 #
-# Not every wish can be granted. A refusal says why, and what is possible instead.
+# Not every specification can be met. Then the error says why, and what is possible instead.
 
 try:
     cid.design_lead(P, crossover=20.0, phase_margin=85.0)
@@ -59,9 +59,9 @@ except cid.CtrlidError as refusal:
 # %%
 # The loop on the nonlinear physics
 # ---------------------------------
-# A step of the reference by 0.2 mm, once by the linear model and once on the equations of the
-# physics. The compensator has no integrator, and the plant's gain at rest is finite: the ball
-# moves farther than it was asked to. Both say so.
+# The reference is stepped by 0.2 mm, once with the linear model and once with the nonlinear
+# equations. The compensator has no integrator, and the static gain of the plant is finite. So the
+# ball moves farther than the reference, in both simulations.
 
 loop = cid.Loop(plant, C, dt=0.0005, at=op)
 n, height = 200, 2e-4
@@ -102,7 +102,7 @@ volts.set(xlabel="time [ms]", ylabel="magnet voltage [V]")
 plt.show()
 
 # %%
-# What this story asserts: the compensator has the crossover and the margin that were asked for.
+# This story asserts that the loop has the crossover and the margin that were asked for.
 
 assert abs(margins.crossover - 100) < 1e-6
 assert abs(margins.phase_margin - 50) < 1e-6

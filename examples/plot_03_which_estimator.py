@@ -1,10 +1,10 @@
 r"""
-Constrained against free, least squares against instruments
+Least squares or instruments, with and without a constraint
 ===========================================================
 
-How much does it help to say that the poles are +p and -p? And how much does it help to use the
-logged reference? The same experiment is repeated with more and more sensor noise, six times at
-each level, and fitted in four ways.
+How much does the constraint help that the poles are +p and -p? And how much does it help to use the
+logged reference as an instrument? The same experiment is repeated with increasing sensor noise, six
+times at each level, and fitted in four ways.
 """
 
 import control as ct
@@ -16,9 +16,9 @@ import ctrlid as cid
 # %%
 # The experiment
 # --------------
-# The levitated ball with a digital lead compensator at 5 ms, so that the unstable pole times the
-# sampling period is 0.2. The linearized physics, sampled with a zero-order hold, is what a perfect
-# fit would find.
+# The plant is the levitated ball with a digital lead compensator at 5 ms, so that the unstable pole
+# times the sampling period is 0.2. A perfect fit would find the linearized physics, sampled with a
+# zero-order hold.
 
 plant = cid.plants.maglev(m=0.0213, K=3.34e-6, g=9.81)
 op = cid.operating_point(plant, output=0.012)
@@ -32,7 +32,7 @@ loop = cid.Loop(plant, C, dt=dt, at=op)
 print(f"p T = {true_pole * dt:.3f}")
 
 # %%
-# Six records of 45 s at each noise level, four fits of each.
+# There are six records of 45 s at each noise level, and four fits of each record.
 
 ways = {
     "least squares": (cid.fit_arx, []),
@@ -63,14 +63,14 @@ for what, errors in (("unstable pole", pole), ("gain b1 + b2", gain)):
 # %%
 # Bias and scatter
 # ----------------
-# Marks are means over six records, bars are two standard deviations of a single record.
+# The marks are means over six records, the bars are two standard deviations of a single record.
 #
-# - Plain least squares loses the unstable pole with a noise of a tenth of the reference. All six
-#   records err in the same direction: more data do not help.
-# - The constraint takes away the direction in which the free fit drifts. The pole is nearly right,
-#   the gain is not: in closed loop the noise also reaches the input.
+# - Plain least squares loses the unstable pole when the noise is a tenth of the reference. All six
+#   records have an error of the same sign: this is a bias, and more data do not help.
+# - The constraint excludes the direction in which the free fit is biased. The pole is then nearly
+#   right. The gain is not, because in closed loop the noise also reaches the input.
 # - Instruments remove the bias, since sensor noise never reaches the reference.
-# - Instruments and constraint together scatter least.
+# - Instruments with the constraint have the smallest scatter.
 
 plt.rcParams.update(cid.plot.style())
 fig, axes = plt.subplots(1, 2, figsize=(9, 4.2), layout="constrained", sharex=True)
@@ -90,9 +90,9 @@ fig.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", nco
 plt.show()
 
 # %%
-# What this story asserts: at 10 micrometres plain least squares has the pole wrong by more than a
-# third, the constraint brings that below 3 % but leaves the gain wrong by more than 5 %, and
-# instruments with the constraint have both right to 1 %.
+# This story asserts that at 10 micrometres the pole of plain least squares is wrong by more than a
+# third, that the constraint reduces this error below 3 % but leaves an error of the gain of more
+# than 5 %, and that both errors are below 1 % for instruments with the constraint.
 
 at = int(np.argmin(np.abs(noises - 1e-5)))
 assert np.abs(pole["least squares"][at]).min() > 1 / 3

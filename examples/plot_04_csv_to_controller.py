@@ -2,10 +2,10 @@ r"""
 Tutorial: from a CSV log to a redesigned controller
 ===================================================
 
-You have a levitation rig that works, a CSV file that its data logger wrote, and the wish for a
-faster controller. This tutorial goes all the way: read the log, look it over, write down what you
-believe, fit, find out that the belief lacks something, have it named, redesign, and see what the
-new controller achieves with the name and without it.
+You have a levitation rig that works and a CSV file from its data logger, and you want a faster
+controller. This tutorial shows all steps: read the log, check it, write down the model that you
+believe, fit, find out that the model lacks something, let `diagnose` name it, redesign the
+controller, and see what the new controller achieves with and without the named effect.
 """
 
 import tempfile
@@ -21,9 +21,9 @@ import ctrlid as cid
 # Before we start: making the log
 # -------------------------------
 # This manual has no rig. So we simulate one and write the file as a data logger would, rounded to
-# 0.1 micrometre and a tenth of a millivolt. The rig differs in two ways from what its papers say:
-# its magnet is 4 % stronger, and its converter holds every voltage back for 2 ms. From here on
-# the file is all we have. Skip this block if you have a log of your own.
+# 0.1 micrometre and a tenth of a millivolt. The rig differs in two ways from its data sheet: its
+# magnet is 4 % stronger, and its converter delays the voltage by 2 ms. After this block only the
+# file is used. Skip this block if you have a log of your own.
 
 folder = Path(tempfile.mkdtemp())
 path = folder / "levitation.csv"
@@ -57,20 +57,19 @@ print("\n".join(path.read_text().splitlines()[:4]))
 # 1. Read the log
 # ---------------
 # `Record.from_csv` needs the names of the columns. It finds the sampling period from the time
-# column and would complain about gaps, jitter or a clock that runs backwards. Units in brackets
-# are kept.
+# column, and would refuse gaps, jitter or a clock that runs backwards. Units in brackets are kept.
 
 record = cid.Record.from_csv(path, r="setpoint", u="voltage", y="gap", time="time")
 print(record)
 
 # %%
-# All values are absolute: metres and volts as logged, no means removed. ctrlid needs it that way,
-# since an operating point is a matter of absolute values.
+# All values are absolute: metres and volts as logged, without removing means. ctrlid needs absolute
+# values, because they determine the operating point.
 #
-# 2. Look it over
-# ---------------
-# `audit` assumes nothing about the plant: limits, steps, repeats, spikes, drift. `check_feedback`
-# asks whether u was computed from y, since then plain least squares is not to be trusted.
+# 2. Check the record
+# -------------------
+# `audit` looks for limits, quantization, repeats, outliers and drift, without assumptions on the
+# plant. `check_feedback` tests whether u was computed from y, because then least squares is biased.
 
 print(cid.audit(record))
 print(cid.check_feedback(record))
@@ -79,13 +78,14 @@ plt.show()
 
 # %%
 # The gap stays within a fraction of a millimetre of 12 mm, so a linear model is a fair
-# description. And the reference moves all the time; without that, nothing could be learnt in
-# closed loop.
+# description. And the reference excites the loop all the time. Without that excitation the plant
+# could not be identified in closed loop.
 #
-# 3. Write down what you believe
-# ------------------------------
-# The papers of the rig give the mass of the ball and the constant K of the magnet; of K we are
-# not sure, so it is `free`. The loop is plant, controller, sampling period and operating point.
+# 3. Write down the model that you believe
+# ----------------------------------------
+# The data sheet of the rig gives the mass of the ball and the constant K of the magnet. We are not
+# sure of K, so it is `free`. A loop consists of plant, controller, sampling period and operating
+# point.
 
 plant = cid.plants.maglev(m=0.0213, K=3.34e-6)
 at = cid.operating_point(plant, output=0.012)
@@ -94,34 +94,35 @@ pole = float(np.sqrt(2 * 9.81 / record.y.mean()))  # where the ball hung in the 
 print(f"unstable pole {pole:.2f} rad/s, times the sampling period {pole * record.dt:.2f}")
 
 # %%
-# Is this the controller that runs? `replay_controller` computes u from the logged r and y.
+# To check that this is the controller of the rig, `replay_controller` computes u from the logged r
+# and y.
 
 replayed = cid.replay_controller(believed, record)
 print(f"replayed u: off by {1e3 * np.abs(replayed - record.u).max():.2f} mV at most")
 
 # %%
-# It is, to the digits of the file.
+# It is, within the rounding of the file.
 #
 # 4. Fit
 # ------
-# The first three quarters are for fitting, the rest for validation. That there is one pole at +p
-# and one at -p is certain: the constraint `ReciprocalPoles`; see :doc:`/which_one_when` for other
-# plants. The reference is in the log, so `fit_iv` can use it as an instrument.
+# The first three quarters are for fitting, the rest for validation. It is certain that there is one
+# pole at +p and one at -p, which is the constraint `ReciprocalPoles` (see :doc:`/which_one_when`
+# for other plants). The reference is in the log, so `fit_iv` can use it as an instrument.
 
 fitting, validation = record.split(0.75)
 G = cid.fit_iv(fitting, na=2, nb=2, constraints=[cid.ReciprocalPoles()])
 print(G.estimate)
 
 # %%
-# What to look for in such a report: a pole outside the unit circle; no active bound; poles where
-# physics has them. The last is nearly so, but physics says 41.1 rad/s, from the gap alone, and
-# the standard error is far too small for the difference. (The line in capitals says that a
-# levitation is no linear plant even within a tenth of a millimetre, and that it was allowed for.)
+# A good report has a pole outside the unit circle, no active bound, and poles that agree with
+# physics. Here they nearly agree, but physics gives 41.1 rad/s from the gap alone, and the
+# difference is many standard errors. (The line in capitals says that the levitation is visibly
+# nonlinear even within a tenth of a millimetre, and that the fit allowed for it.)
 #
 # 5. Validate
 # -----------
-# `compare` predicts, simulates the closed loop from the reference, and tests what is left over.
-# The physics of the papers first, with K fitted to the log so that it has every chance:
+# `compare` predicts, simulates the closed loop from the reference, and tests the residuals. We
+# first compare the physics of the data sheet, with K fitted to the log:
 
 fit = cid.fit_loop(believed, fitting)
 print(fit)
@@ -132,28 +133,28 @@ cid.plot.comparison(comparison)
 plt.show()
 
 # %%
-# A fit above 80 % may look good. But noise explains little of the simulation's error, and the
-# one-step errors depend on the past of u and r: the model lacks something. What, the tests do not
-# say.
+# A fit above 80 % may look good. But noise explains only a small part of the error of the
+# simulation, and the one-step errors depend on the past of u and r. So the model lacks something,
+# but the tests do not say what.
 #
 # 6. Diagnose
 # -----------
-# `diagnose` recalibrates the free parameters, tries its catalogue of effects, and names what pays
-# for itself on the record.
+# `diagnose` recalibrates the free parameters, tries its catalogue of effects, and names those for
+# which the record has strong evidence.
 
 found = cid.diagnose(believed, record, progress=False)
 print(found)
 
 # %%
-# A delay of the input, with its size, and with what this record cannot tell from it. K comes
-# right with it. The picture shows the gap before and after, where the errors sat, and the
-# candidates:
+# The missing effect is a delay of the input. The report gives its size, and with the delay the
+# estimate of K is right as well. The figure shows the gap before and after, where the errors were,
+# and the candidates:
 
 cid.plot.diagnosis(found)
 plt.show()
 
 # %%
-# The same without a script, with the controller in a file ``rig.py``:
+# The same diagnosis on the command line, with the controller in a file ``rig.py``:
 #
 # .. code-block:: bash
 #
@@ -163,9 +164,9 @@ plt.show()
 #
 # 7. Redesign
 # -----------
-# `found.loop` is the completed model. `redesign` designs a lead on a linear model, a digital one
-# if the model is sampled, and tries it on the physics of a loop. First the margins of the old
-# controller:
+# `found.loop` is the completed model. `redesign` designs a lead on a linear model (a digital lead
+# if the model is sampled) and tries it on the physics of a loop. The old controller has these
+# margins:
 
 
 def sampled(loop):
@@ -177,9 +178,9 @@ old = cid.loop_margins(lead_on_the_rig * sampled(found.loop))
 print(f"phase margin {old.phase_margin:.1f} deg at {old.crossover:.1f} rad/s")
 
 # %%
-# A faster loop is wanted, as well damped as the old one: 130 rad/s and 45 degrees. Once the
-# design does not know the delay, once it does. Both are tried on the completed model, the best
-# that we have:
+# We want a faster loop that is as well damped as the old one: 130 rad/s and 45 degrees. One design
+# uses the model without the delay, the other the model with it. Both are tried on the completed
+# model, which is the best that we have:
 
 without = cid.redesign(sampled(calibrated), found.loop, crossover=130, phase_margin=45)
 result = cid.redesign(sampled(found.loop), found.loop, crossover=130, phase_margin=45)
@@ -192,7 +193,7 @@ plt.show()
 # %%
 # 8. Keep the evidence
 # --------------------
-# One page with all tables and figures, to send to a colleague:
+# `write_report` puts all tables and figures on one page, to be sent to a colleague:
 
 page = cid.write_report([record, G, comparison, found, result], folder / "report.html")
 print(f"{page.name}: {page.stat().st_size / 1e6:.1f} MB")
@@ -200,8 +201,8 @@ print(f"{page.name}: {page.stat().st_size / 1e6:.1f} MB")
 # %%
 # 9. On the rig
 # -------------
-# Only now back to the rig. Here it is a simulation, so both controllers can be tried without
-# breaking anything:
+# Only now the controllers go to the rig. Here the rig is simulated, so both can be tried without
+# damage:
 
 on_rig = {}
 for name, loop in (("without the delay", calibrated), ("with the delay", found.loop)):
@@ -209,9 +210,10 @@ for name, loop in (("without the delay", calibrated), ("with the delay", found.l
     print(f"{name}: {on_rig[name].verdict}")
 
 # %%
-# What this story asserts: the delay and nothing else is named and its size is right to three
-# standard errors, the gap shrinks to the noise floor, and the promise is kept on the rig, to
-# within a degree, only with the delay.
+# This story asserts that the delay and nothing else is named, that its size is right within three
+# standard errors, and that the gap decreases to the noise floor. On the rig, the promised phase
+# margin is achieved to within a degree with the delay, and missed by more than ten degrees without
+# it.
 
 delay = found.findings[0]
 assert [finding.names for finding in found.findings] == [("InputDelay",)]

@@ -1,10 +1,10 @@
 r"""
-Redesign: promised against achieved
-===================================
+Redesign: promised and achieved margins
+=======================================
 
-A controller designed on a model keeps its promise on the model. Whether it does so on the plant is
-another matter. `redesign` shows both, side by side: margins and step response on the model, and on
-the nonlinear physics. Here three models of the same record are put to that test.
+A controller designed on a model has the specified margins on that model, but not necessarily on the
+plant. `redesign` shows both side by side: margins and step response on the model (promised), and on
+the nonlinear physics (achieved). This story does so for three models of the same record.
 """
 
 import control as ct
@@ -15,7 +15,8 @@ import ctrlid as cid
 # %%
 # One record, three models
 # ------------------------
-# The levitated ball under a digital lead compensator at 5 ms, with 10 micrometres of sensor noise.
+# The record is that of the levitated ball under a digital lead compensator at 5 ms, with 10
+# micrometres of sensor noise.
 
 plant = cid.plants.maglev(m=0.0213, K=3.34e-6, g=9.81)
 op = cid.operating_point(plant, output=0.012)
@@ -37,9 +38,9 @@ for name, model in models.items():
     print(f"{name:28} poles [rad/s]: {model.estimate.poles_s.real.round(2)}")
 
 # %%
-# The same wish on all
-# --------------------
-# A faster loop than the one that made the record: 120 rad/s with a phase margin of 40 degrees.
+# The same specification for each model
+# -------------------------------------
+# The new loop is to be faster than that of the record: 120 rad/s with a phase margin of 40 degrees.
 
 outcome = {}
 for name, model in models.items():
@@ -47,8 +48,8 @@ for name, model in models.items():
     print(f"--- {name}\n{outcome[name]}\n")
 
 # %%
-# All promise the same. What differs is what they achieve, and the nu-gap says why: it is the
-# distance between the model and the linearized physics, in the units in which a loop cares.
+# The promised margins are the same, the achieved ones differ. The nu-gap says why: it measures how
+# different the model and the linearized physics are under feedback.
 
 plt.rcParams.update(cid.plot.style())
 fig, axes = plt.subplots(1, 3, figsize=(11, 3.8), layout="constrained", sharey=True)
@@ -66,8 +67,9 @@ fig.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", nco
 plt.show()
 
 # %%
-# What this story asserts: the design on the free model loses a third of its phase margin, the one
-# on the constrained model a tenth, and with instruments it holds to one degree.
+# This story asserts that the design on the free model loses more than a third of the promised phase
+# margin, that on the constrained model less than 6 degrees, and that with instruments the achieved
+# margin is within one degree of the promised one.
 
 lost = {name: o.promised.phase_margin - o.achieved.phase_margin for name, o in outcome.items()}
 assert lost["least squares"] > 40 / 3

@@ -2,10 +2,10 @@ r"""
 Your own plant: written in numpy, traced, linearized, simulated
 ===============================================================
 
-There is no plant class to learn. A plant is a python-control update function, written as you
-would write it anyway. ctrlid traces it: it calls the function once with symbols and so gets the
-exact equations. Here an active magnetic bearing, with a loop over its two magnets, a ``math``
-function and an array filled line by line.
+There is no plant class to learn. A plant is a python-control system with an ordinary update
+function. ctrlid traces the function: it calls it once with symbols and so gets the exact equations.
+The example is an active magnetic bearing, with a loop over its two magnets, a ``math`` function and
+an array filled line by line.
 """
 
 import math
@@ -20,8 +20,8 @@ import ctrlid as cid
 # %%
 # The plant
 # ---------
-# A rotor between two magnets, each with a bias current. The control voltage raises the current of
-# one and lowers that of the other, through the resistance and inductance of the coils.
+# A rotor is held between two magnets, each with a bias current. The control voltage raises the
+# current of one and lowers that of the other, through the resistance and inductance of the coils.
 
 
 def bearing(t, x, u, params):
@@ -47,8 +47,9 @@ plant = ct.nlsys(
 # %%
 # Linearized
 # ----------
-# Without the coils' lag the rotor has poles at plus and minus 2 i0 sqrt(k / (m s0^3)): the magnets
-# act like a spring that pushes away from the middle. The coils add a pole at -R/L.
+# Without the lag of the coils the rotor has poles at plus and minus 2 i0 sqrt(k / (m s0^3)), with
+# the bias current i0 and the air gap s0: the magnets act like a spring of negative stiffness. The
+# coils add a pole at -R/L.
 
 op = cid.operating_point(plant, output=0.0)
 P = cid.linearize(plant, op)
@@ -60,7 +61,8 @@ print("by hand:      ", np.round([-parameters["R"] / parameters["L"], -spring, s
 # %%
 # Controlled and simulated
 # ------------------------
-# A lead at 900 rad/s, run as the analog circuit it is. The reference is a staircase.
+# The controller is a lead with its crossover at 900 rad/s, simulated as an analog circuit. The
+# reference is a staircase.
 
 C = cid.design_lead(P, crossover=900.0, phase_margin=40.0)
 loop = cid.Loop(plant, C, dt=2e-4, at=op)
@@ -68,8 +70,8 @@ r = cid.staircase(600, levels=[0.0, 2e-5, -2e-5], hold=200)
 record = cid.simulate(loop, r)
 
 # %%
-# Is the simulation right? We solve the whole loop again, plant and circuit, with
-# scipy at a tight tolerance: the Python function itself, not the traced one.
+# To check the simulation, we solve the equations of the whole loop, plant and circuit, with scipy
+# at a tight tolerance. This uses the Python function itself, not the traced one.
 
 circuit = ct.ss(C)
 
@@ -110,8 +112,8 @@ plt.show()
 # %%
 # What cannot be traced
 # ---------------------
-# A Python ``if`` on a state takes one way or the other; symbols have no value to decide by. ctrlid
-# refuses, names the line and says what to write instead.
+# A Python ``if`` on a state needs the value of the state, and a symbol has none. ctrlid raises an
+# error that names the line and says what to write instead.
 
 
 def with_stop(t, x, u, params):
@@ -130,7 +132,7 @@ except cid.CtrlidError as refusal:
     print(message[message.index("a Python 'if'") :])
 
 # %%
-# What this story asserts: the poles are those of the formula, and the simulation agrees with an
+# This story asserts that the poles are those of the formula, and that the simulation agrees with an
 # independent one to better than a millionth.
 
 assert abs(P.poles().real.max() / spring - 1) < 1e-9

@@ -2,10 +2,10 @@ r"""
 Two hidden effects in one record
 ================================
 
-A servo has dry friction in its bearings and a delay in its bus. Each would be easy to guess alone.
+A servo has dry friction in its bearings and a delay in its bus. Each would be easy to find alone.
 Together they hide each other: fitted to such a record, the gain and the viscous friction of the
-model settle at wrong values that are good for nothing. `diagnose` names one, then the other, and
-the parameters come right.
+model take wrong values. `diagnose` names one effect and then the other, and with both in the model
+the parameters are right.
 """
 
 import matplotlib.pyplot as plt
@@ -15,9 +15,9 @@ import ctrlid as cid
 # %%
 # The model and the rig
 # ---------------------
-# A mass with viscous friction under a digital PD controller at 5 ms; gain k and friction c are
-# believed 5 % too low. The rig has Coulomb friction, and a delay that is no whole number of
-# samples.
+# The model is a mass with viscous friction under a digital PD controller at 5 ms. Its gain k and
+# friction c are 5 % too low. The rig also has Coulomb friction, and a delay that is not a multiple
+# of the sampling period.
 
 FRICTION, DELAY = 0.8, 0.006
 plant = cid.plants.servo(m=1.0, c=2.0, k=3.0)
@@ -32,9 +32,9 @@ record = cid.simulate(rig, r, sensor_noise=2e-4, seed=2)
 # %%
 # Named one after the other
 # -------------------------
-# The second round of the search starts from the model with the first effect in it, and everything
-# is refitted. The delay of the input stands for one of the output as well: on this plant no record
-# tells them apart, and the report says so.
+# The second round of the search starts from the model with the first effect in it, and all
+# parameters are refitted. The delay of the input may also be one of the output: on this plant no
+# record can tell them apart.
 
 found = cid.diagnose(model, record, progress=False)
 print(found)
@@ -42,10 +42,10 @@ cid.plot.diagnosis(found)
 plt.show()
 
 # %%
-# What it costs to leave out one
-# ------------------------------
-# The same record once more, explained with one of the two effects only: what the physical
-# parameters become then.
+# If one effect is left out
+# -------------------------
+# The same record is fitted with only one of the two effects in the model. The physical parameters
+# are then wrong:
 
 for name in [finding.name for finding in found.findings]:
     partial = cid.fit_loop(found.loop.without_effect(name), record)
@@ -53,8 +53,9 @@ for name in [finding.name for finding in found.findings]:
     print(f"without {name}: k = {values['k']:.3f}, c = {values['c']:.3f}; true 3.15 and 2.1")
 
 # %%
-# What this story asserts: two names and no third, both sizes and both parameters right within half
-# a percent, and a gap that shrinks from sixty times the noise to the noise.
+# This story asserts that these two effects and no third are named, that both sizes and both
+# parameters are right within half a percent, and that the gap decreases from more than twenty times
+# the noise floor to the noise floor.
 
 print(f"gap {1e3 * found.gap.before:.2f} mm before, {1e3 * found.gap.after:.3f} mm after, "
       f"floor {1e3 * found.gap.floor:.3f} mm")  # fmt: skip

@@ -1,10 +1,10 @@
 r"""
-Nothing is missing, and how small it would have had to be
-=========================================================
+Nothing is missing, and what the record would have shown
+========================================================
 
-The best answer a diagnosis can give is that the model is right. "Nothing missing" alone means
-little: a short or noisy record shows nothing either. So the report adds how large each effect would
-have had to be in order to be seen in this very record.
+The best verdict of a diagnosis is that the model is right. "Nothing missing" alone means little,
+because a short or noisy record shows nothing either. So the report adds how large each effect would
+have to be in order to be seen in this record.
 """
 
 import control as ct
@@ -15,8 +15,8 @@ import ctrlid as cid
 # %%
 # A model with a wrong parameter
 # ------------------------------
-# The levitated ball again, K known to 5 %. The rig differs from the model in K and in nothing else;
-# a random force shakes the table, and the sensor is noisy.
+# The plant is the levitated ball, with K known to 5 %. The rig differs from the model in K only. A
+# random force acts on the ball, and the sensor is noisy.
 
 plant = cid.plants.maglev(m=0.0213, K=3.34e-6, g=9.81)
 at = cid.operating_point(plant, output=0.012)
@@ -30,8 +30,8 @@ record = cid.simulate(rig, r, sensor_noise=5e-6, force_noise=0.05, seed=6)
 # %%
 # The verdict
 # -----------
-# As given, the model misses the record. One fitted parameter later it misses by what noise leaves,
-# and a wrong K is not reported as missing physics.
+# The model as given does not explain the record. With K fitted, its gap is the noise floor. A wrong
+# value of K is not reported as a missing effect.
 
 found = cid.diagnose(model, record, progress=False)
 print(found)
@@ -39,10 +39,10 @@ cid.plot.diagnosis(found)
 plt.show()
 
 # %%
-# How small is small?
-# -------------------
-# Take one number of the table at its word. Would a lag of the actuator really have shown? Its
-# smallest visible time constant is hidden in a new record, three times over.
+# A check of one number
+# ---------------------
+# Would the record really have shown a lag of the actuator? To check this, a lag with three times
+# the smallest visible time constant is hidden in a new record.
 
 smallest = found.sensitivity["ActuatorLag.tau"]
 lagging = rig.with_effect(cid.effects.ActuatorLag(tau=3 * smallest))
@@ -51,8 +51,8 @@ caught = cid.diagnose(model, again, catalogue=[cid.effects.ActuatorLag], progres
 print(f"visible from {1e6 * smallest:.0f} us; hidden {3e6 * smallest:.0f} us; found {caught}")
 
 # %%
-# What this story asserts: nothing is named, K is found, the gap is the noise floor, and a lag three
-# times as large as the smallest visible one is seen.
+# This story asserts that nothing is named, that K is right, that the gap is the noise floor, and
+# that a lag three times as large as the smallest visible one is found.
 
 K = found.calibrated[0]
 print(f"gap {1e6 * found.gap.after:.2f} um, floor {1e6 * found.gap.floor:.2f} um")

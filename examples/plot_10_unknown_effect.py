@@ -2,9 +2,9 @@ r"""
 An effect that no catalogue has
 ===============================
 
-A catalogue never has everything. What matters then is that the diagnosis says so, instead of
-blaming the nearest name it knows. Here somebody leans on the table for a moment during the
-recording. The report does not know what it was, but it says when, and that is enough to write the
+No catalogue contains every effect. If the missing effect is not in it, the diagnosis has to say so,
+and not name the most similar one. In this story somebody leans on the table for a moment during the
+experiment. The report cannot say what it was, but it says when, and that is enough to write the
 missing effect in ten lines.
 """
 
@@ -19,8 +19,9 @@ import ctrlid as cid
 # %%
 # The push
 # --------
-# A force that swells and fades. A user's own effect is a frozen dataclass with one formula;
-# `candidates` says where a fit may start, and is filled in below, when the report has said where.
+# The effect is a force that rises and falls. A user's own effect is a frozen dataclass with one
+# formula. `candidates` gives the values from which a fit may start; the list `WHEN` is filled
+# below, once the report has said at which time.
 
 WHEN = [0.0]
 
@@ -45,7 +46,7 @@ class Push(cid.effects.ForceEffect):
 # %%
 # The record
 # ----------
-# A levitated ball, 2 ms, with a push of 1.5 m/s^2 after 4.3 s.
+# The record is that of a levitated ball, sampled at 2 ms, with a push of 1.5 m/s^2 after 4.3 s.
 
 plant = cid.plants.maglev(m=0.0213, K=3.34e-6, g=9.81)
 at = cid.operating_point(plant, output=0.012)
@@ -59,9 +60,10 @@ record = cid.simulate(rig, r, sensor_noise=5e-6, seed=2)
 # %%
 # With the catalogue as it is
 # ---------------------------
-# The search reaches for the next best name, or for a large random force. It does not sell them as
-# the answer: something is still missing, and what is named "may stand in for what is still
-# missing". Above, before and after hardly differ.
+# The search finds the most similar effect, or a large random force. The report does not present
+# them as the answer: it says that something is still missing, and that an effect which is named
+# "may stand in for what is still missing". In the upper part of the figure, the simulations before
+# and after hardly differ.
 
 first = cid.diagnose(model, record, progress=False)
 print(first)
@@ -69,9 +71,9 @@ cid.plot.diagnosis(first)
 plt.show()
 
 # %%
-# With one effect more
-# --------------------
-# `where` has the errors along each quantity. Along time they stand out in one bin.
+# With the effect added to the catalogue
+# --------------------------------------
+# `where` has the one-step errors along each quantity. Along time they are large in one bin.
 
 time = next(place for place in first.where if place.axis == "time")
 worst = int(np.argmax(time.before))
@@ -83,7 +85,8 @@ cid.plot.diagnosis(second)
 plt.show()
 
 # %%
-# What this story asserts: the catalogue does not pretend, and the push alone explains the record.
+# This story asserts that the verdict without the push in the catalogue is "unknown" or "partly
+# explained", and that with it the push alone explains the record.
 
 print(first.verdict, "->", second.verdict)
 assert first.verdict in ("unknown", "partly explained")

@@ -1,10 +1,10 @@
 r"""
-Which sampling period
-=====================
+Which sampling period?
+======================
 
-A fast logger seems to be a gift. Plain least squares disagrees: from one sample to the next the
-output hardly moves, the noise does, and the unstable pole is lost. The paper found its period by
-trial and error. `sweep_sampling_period` makes the trials and says which one to use.
+Fast sampling gives more data, but it harms plain least squares: from one sample to the next the
+output changes less than the noise, and the unstable pole is lost. The paper found its sampling
+period by trial and error. `sweep_sampling_period` makes these trials and recommends a period.
 """
 
 import control as ct
@@ -16,7 +16,7 @@ import ctrlid as cid
 # %%
 # A fast log
 # ----------
-# A levitation with its pole at 40 rad/s, sampled every half millisecond.
+# The plant is a levitation with its unstable pole at 40 rad/s, sampled every half millisecond.
 
 P = ct.tf([-6.5], [1, 0, -1600])
 lead = cid.design_lead(P, crossover=100, phase_margin=50)
@@ -27,16 +27,17 @@ record = cid.simulate(cid.Loop(P, C, dt=5e-4), r, sensor_noise=3e-6, seed=2)
 # %%
 # The sweep
 # ---------
-# Three estimators at eight periods, without any constraint: poles in the s-plane do not depend on
-# the period if they are right.
+# Three estimators are compared at eight periods, without any constraint. If the poles in the
+# s-plane are right, they do not depend on the period.
 
 sweep = cid.sweep_sampling_period(record, [5e-4 * q for q in (1, 2, 3, 5, 7, 10, 15, 20)])
 print(sweep)
 
 # %%
-# The unstable pole against the period. Least squares begins near the origin and rises to the truth
-# as the period grows. The other two are there from the start, and lose it at long periods, where u
-# moves between the samples that are left.
+# The figure shows the unstable pole against the period. The pole of least squares is near the
+# origin at short periods, and approaches the true value as the period grows. The other two
+# estimators are right at short periods, and become wrong at long ones, where u changes between the
+# samples that are kept.
 
 plt.rcParams.update(cid.plot.style())
 fig, ax = plt.subplots(figsize=(8, 3.8), layout="constrained")
@@ -57,8 +58,8 @@ ax.legend(loc="lower center", ncols=4)
 plt.show()
 
 # %%
-# What this story asserts: at the logger's period least squares loses more than half of the pole, at
-# the recommended one all three are within five percent of it.
+# This story asserts that at the period of the logger the pole of least squares is less than half of
+# the true one, and that at the recommended period all three are within five percent of it.
 
 at_best = {row.estimator: row.poles.real.max() for row in sweep.table
            if row.period == sweep.recommended}  # fmt: skip

@@ -2,10 +2,10 @@ r"""
 Redesign with and without the named effect
 ==========================================
 
-What is it worth to know the name of what was missing? An inverted pendulum is to be made faster,
-step by step. At every crossover two leads are designed, one on the model that was recalibrated
-without the effect, one on the model with the effect that `diagnose` named. Both are tried on the
-rig.
+What is the benefit of knowing the missing effect? The loop of an inverted pendulum is to be made
+faster, step by step. At every crossover two leads are designed: one on the model that was
+recalibrated without the effect, and one on the model with the effect that `diagnose` named. Both
+are tried on the rig.
 """
 
 import control as ct
@@ -17,9 +17,9 @@ import ctrlid as cid
 # %%
 # A pendulum whose motor lags
 # ---------------------------
-# A mass of 0.2 kg on a rod of 0.5 m, held upright by a torque at its pivot; the unstable pole is
-# at 4.4 rad/s. The model knows the length of the rod to a few per cent only, and not that the
-# torque needs 15 ms to build up.
+# A mass of 0.2 kg on a rod of 0.5 m is held upright by a torque at its pivot; the unstable pole is
+# at 4.4 rad/s. The length of the rod in the model is wrong by a few per cent, and the model does
+# not have the lag of the torque, whose time constant is 15 ms.
 
 LAG = 0.015
 plant = cid.plants.pendulum(m=0.2, length=0.5)
@@ -32,20 +32,20 @@ r = cid.random_binary(6000, amplitude=0.02, hold=30, seed=1)
 record = cid.simulate(rig, r, sensor_noise=5e-4, seed=2)
 
 # %%
-# The name
-# --------
+# The diagnosis
+# -------------
 
 found = cid.diagnose(model, record, progress=False)
 print(found)
 
 # %%
-# A lag, of the motor or of the sensor: small motions about one angle do not tell them apart, and
-# the report says so. For a linear design the one is as good as the other.
+# The missing effect is a lag, of the motor or of the sensor: small motions about one angle do not
+# tell them apart, and the report says so. For a linear design both are equivalent.
 #
-# One wish, two designs
-# ---------------------
-# 45 degrees are asked for at every crossover, and every lead promises them on the model that it
-# was designed on.
+# One specification, two designs
+# ------------------------------
+# The specification is a phase margin of 45 degrees at every crossover. Every lead has it on the
+# model that it was designed on.
 
 recalibrated = model.with_parameters({c.name: c.before for c in found.calibrated})
 models = {"without the lag": recalibrated.linearize(), "with the lag": found.loop.linearize()}
@@ -59,8 +59,8 @@ for name, G in models.items():
     print(f"{'':16}", outcomes[-1].verdict)
 
 # %%
-# In one picture
-# --------------
+# The achieved phase margins
+# --------------------------
 
 plt.rcParams.update(cid.plot.style())
 fig, ax = plt.subplots(figsize=(7.2, 4.0), layout="constrained")
@@ -74,11 +74,13 @@ ax.legend(loc="lower left")
 plt.show()
 
 # %%
-# The slowest loop loses ten degrees, and every step towards a faster one costs more; nothing in the
-# design tells. With the name the promise holds over the whole range.
+# Without the lag in the model, the slowest loop loses ten degrees, and a faster loop loses more.
+# The design itself gives no sign of this. With the lag in the model, the promised margin is
+# achieved over the whole range.
 #
-# What this story asserts: one effect is named, the lag first; with it every design keeps its
-# promise to within one degree; without it the fastest loses more than half of its margin.
+# This story asserts that one effect is named, with the lag of the actuator first; that with it
+# every design achieves its phase margin to within one degree; and that without it the fastest loop
+# loses more than half of its margin.
 
 assert len(found.findings) == 1
 assert found.findings[0].names[0] == "ActuatorLag"

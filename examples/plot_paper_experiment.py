@@ -2,19 +2,21 @@
 The paper's experiment
 ======================
 
-"Identification of a class of unstable processes" levitates a ball with an analog lead compensator,
-excites the reference with a random binary sequence, logs 45 000 samples and finds that
+In "Identification of a Class of Unstable Processes" a ball is levitated with an analog lead
+compensator. The reference is a random binary sequence, and 45 000 samples are logged. The paper
+finds that
 
 * plain least squares has no pole outside the unit circle (its equation (6)),
 * with the constraint ``a2 = 1, |a1| > 2`` the poles are reciprocal and nearly the same for
   different portions of the data (its equation (8): ``1 - 2 z^-1 + z^-2``),
 * 5 ms is the best of the sampling periods tried, and faster sampling is worse.
 
-Here the experiment is repeated on the paper's equation (1), where the truth is known, with two
-kinds of noise: noise of the sensor, which goes round the loop, and noise of the data logger, which
-the controller never sees. All three findings come back. And one more shows: the equation (8) of the
-paper sits exactly on the bound ``|a1| = 2``, a double pole at z = 1. That is where the constrained
-fit ends when the data would rather leave the constraint: a symptom to report, not a result.
+This story repeats the experiment in simulation with equation (1) of the paper, so that the true
+poles are known. There are two kinds of noise: noise of the sensor, which the controller feeds back,
+and noise of the data logger, which does not reach the controller. All three findings are
+reproduced. In addition, equation (8) of the paper lies exactly on the bound ``|a1| = 2``, with a
+double pole at z = 1. The constrained fit ends there when the minimum without the constraint is
+outside it. This is a symptom of bias that should be reported, not a result.
 """
 
 from dataclasses import replace
@@ -25,8 +27,8 @@ import numpy as np
 import ctrlid as cid
 
 # %%
-# The rig: a ball of 21 g, 20 mm below the magnet at 3 V, and a lead with its crossover at 2.5 times
-# the unstable pole. The reference switches at most every 50 ms, by 1 % of the gap.
+# The rig is a ball of 21 g, 20 mm below the magnet at 3 V, with a lead whose crossover is at 2.5
+# times the unstable pole. The reference switches at most every 50 ms, by 1 % of the gap.
 
 GAP, VOLTAGE, MASS = 0.020, 3.0, 0.0213
 AMPLITUDE = 0.01 * GAP
@@ -39,8 +41,8 @@ print(f"unstable pole of the physics: {pole:.2f} rad/s")
 
 
 # %%
-# One experiment: 45 000 samples at a chosen period, sensor noise and logger noise as shares of the
-# reference's amplitude.
+# An experiment has 45 000 samples at a chosen period. Sensor noise and logger noise are given as
+# shares of the amplitude of the reference.
 
 
 def experiment(period, sensor=0.0, logger=0.0, seed=1, samples=45_000):
@@ -95,9 +97,9 @@ PERIODS = (0.001, 0.002, 0.005, 0.010)
 # %%
 # Sensor noise of 10 %, inside the loop
 # -------------------------------------
-# The constrained fit keeps a reciprocal pair, the portions agree, 5 ms is the best period and
-# faster sampling pulls the poles to z = 1. Plain least squares does find a pole outside the unit
-# circle here, at a third of the true rate.
+# The constrained fit has a reciprocal pair of poles, the portions agree, and 5 ms is the best
+# period. With faster sampling the poles move towards z = 1. Plain least squares does find a pole
+# outside the unit circle here, but at a third of the true rate.
 
 in_loop = [row(T, experiment(T, sensor=0.10)) for T in PERIODS]
 table("sensor noise 10 %", in_loop)
@@ -105,9 +107,9 @@ table("sensor noise 10 %", in_loop)
 # %%
 # Logger noise of 30 %, outside the loop
 # --------------------------------------
-# Equations (6) and (8) of the paper, to the letter: no unstable pole at 5 ms and below, and the
-# constrained poles at z = 1 for every portion of the data. They agree because they all sit on the
-# bound.
+# The results are those of equations (6) and (8) of the paper: no unstable pole at 5 ms and below,
+# and constrained poles at z = 1 for every portion of the data. The portions agree because each
+# estimate lies on the bound.
 
 in_log = [row(T, experiment(T, logger=0.30)) for T in PERIODS]
 table("logger noise 30 %", in_log)
@@ -115,8 +117,8 @@ print()
 print(in_log[2]["tied"].estimate)
 
 # %%
-# The drift of the pole towards the origin, as in section II.C of the paper, and what is left of it
-# when the samples are read at the best period.
+# The figure shows how the pole moves towards the origin with faster sampling, as in section II.C of
+# the paper.
 
 plt.rcParams.update(cid.plot.style())
 figure, axes = plt.subplots(figsize=(6.4, 3.6), layout="constrained")
@@ -149,7 +151,7 @@ axes.set_ylabel("rate of the largest pole [rad/s]")
 axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2)
 
 # %%
-# What the story asserts.
+# This story asserts the findings of the paper.
 
 errors = [abs(rate(line["tied"]) - pole) for line in in_loop]
 assert PERIODS[int(np.argmin(errors))] == 0.005

@@ -2,15 +2,15 @@ r"""
 EMPS: a carriage on a screw, and what its model lacks
 =====================================================
 
-A public record of a positioning drive (Janot, Gautier and Brunot, *Data Set and Reference Models
-of EMPS*, 2019): a carriage on a ball screw under PD control, whose reference repeats four times.
-Given is the simplest model there is, mass and viscous friction. The authors published Coulomb
-friction, and found in a separate study that the viscous friction is stronger in one direction;
-nobody tells `diagnose` either. A second record, in which pulses are added to the drive's input,
-serves for the comparison only.
+The data are a public record of a positioning drive (Janot, Gautier and Brunot, *Data Set and
+Reference Models of EMPS*, 2019): a carriage on a ball screw under PD control, whose reference has
+four equal periods. The given model is the simplest one, mass and viscous friction. The authors
+published Coulomb friction, and found in a separate study that the viscous friction is stronger in
+one direction; `diagnose` is told neither. A second record, in which pulses are added to the input
+of the drive, is used for the comparison only.
 
-The records are not part of ctrlid; they are fetched once, or read from the folder named by
-CTRLID_DATA_DIR.
+The records are not part of ctrlid. They are downloaded once, or read from the folder that the
+environment variable CTRLID_DATA_DIR names.
 """
 
 import matplotlib.pyplot as plt
@@ -26,8 +26,8 @@ pulses = cid.datasets.load("emps_pulses")
 # %%
 # The model as given
 # ------------------
-# ``m x" = k V - c x'``, both parameters uncertain. The controller was read off the records: a gain
-# on the error of position and one on the measured velocity.
+# The model is ``m x" = k V - c x'``, with the uncertain parameters m and c. The controller was
+# identified from the records: it has a gain on the position error and one on the measured velocity.
 
 plant = cid.plants.servo(m=95.0, c=200.0, k=GAIN)
 rest = cid.OperatingPoint(states=(0.0, 0.0), input=0.0, output=0.0)
@@ -37,16 +37,16 @@ model = cid.Loop(plant, C, dt=record.dt, at=rest, free=("m", "c"))
 # %%
 # What is missing?
 # ----------------
-# Because the reference repeats, what differs between the repeats is noise, whatever the model.
-# Weighed by this noise, the effects come out in the order of what they are worth; a noise fitted to
-# the residual would have swallowed the slow ones.
+# Because the reference is periodic, the differences between the periods are noise, whatever the
+# model. With the variance of this noise, the effects are found in the order of their evidence. With
+# noise fitted to the residuals, the slow effects would be taken for noise.
 
 found = cid.diagnose(model, record, validation=pulses, progress=False)
 print(found)
 
 # %%
-# In newtons, beside what was published. The 2.5 mm ripple is not in the report of the benchmark: it
-# is the force of something that turns or rolls along with the screw.
+# The table has the fitted values in newtons beside the published ones. The ripple of 2.5 mm is not
+# in the report of the benchmark. It is the force of a part that turns or rolls with the screw.
 
 fitted, errors = found.loop.parameters, {f.name: f.standard_errors for f in found.findings}
 m = fitted["m"]
@@ -63,11 +63,11 @@ print(f"{'ripple [N]':34}{m * ripple.effect.amplitude:10.2f}{'-':>12}")
 print(f"{'period of the ripple [mm]':34}{1e3 * ripple.effect.period:10.3f}{'-':>12}")
 
 # %%
-# The first name is dry friction. Its size is 13 % below the published one and the viscous friction
-# is larger in turn: what is still missing pulls at both, and the innovations weigh fast motion more
-# than the least squares of the publication did. The verdict is honest: partly explained. On the
-# record with pulses, which no parameter was fitted to, the gap of the closed-loop simulation
-# shrinks to a tenth.
+# The first finding is Coulomb friction. It is 13 % below the published value, and the viscous
+# friction is correspondingly larger. There are two reasons: what is still missing biases both, and
+# the likelihood weights fast motion more than the least squares of the publication did. The verdict
+# is therefore "partly explained". On the record with pulses, which was not used for the fit, the
+# gap of the closed-loop simulation decreases to a tenth.
 
 cid.plot.diagnosis(found)
 gap = found.gap

@@ -2,13 +2,14 @@ r"""
 INTECO: a levitated ball whose coil lags
 ========================================
 
-A public record of a magnetic levitation rig (steel ball, PID on a PC): reference, duty of the
-amplifier, and the distance of the ball. Given is ``m x" = m g - K V^2/x^2`` with the duty in the
-place of V, as if the coil obeyed at once. Its authors state a lag of 24.9 ms between duty and
-current, and the current was logged as well: the diagnosis does not see it.
+The data are a public record of a magnetic levitation rig (a steel ball, a PID on a PC): reference,
+duty cycle of the amplifier, and distance of the ball. The given model is ``m x" = m g - K V^2/x^2``
+with the duty cycle in the place of V, as if the coil had no lag. The authors of the rig state a lag
+of 24.9 ms between duty cycle and current. The current was logged as well, but the diagnosis does
+not get it.
 
-The records are not part of ctrlid; they are fetched once, or read from the folder named by
-CTRLID_DATA_DIR.
+The records are not part of ctrlid. They are downloaded once, or read from the folder that the
+environment variable CTRLID_DATA_DIR names.
 """
 
 from dataclasses import replace
@@ -24,10 +25,11 @@ from ctrlid.validation.sampling_sweep import averaged
 # %%
 # What to use of the record
 # -------------------------
-# For two seconds the ball is caught. Then it rests, swings far out at the step to 12 mm, and rests
-# again: 16 seconds. A line at 100 Hz, as of a lamp or of the mains behind a rectifier, is larger
-# than all other fast noise; with one sample in 10 ms it stands still, and the unstable pole near
-# 40 rad/s is still slow.
+# In the first two seconds the controller catches the ball. In the following 16 seconds the ball
+# rests, oscillates with a large amplitude after the step to 12 mm, and rests again; these are used.
+# The largest fast noise is a line at 100 Hz, as of a lamp or of rectified mains. With a sampling
+# period of 10 ms the line is constant, and this period is still short for the unstable pole near 40
+# rad/s.
 
 raw = cid.datasets.load("inteco_pid_step")
 stretch = replace(raw, valid=np.ones(len(raw), dtype=bool)).between(2.0, 18.0)
@@ -40,9 +42,10 @@ model = cid.Loop(plant, None, dt=record.dt, at=at, free=("K",))
 # %%
 # What is missing?
 # ----------------
-# A lag between the duty and what the sensor shows, of the actuator or of the sensor, which one
-# swing does not tell apart; and the law of the force in the gap, which has another zero. A small
-# friction, in air, and a bent scale are named beside them, and may stand in for what is left.
+# `diagnose` names a lag between the duty cycle and the reading of the sensor. It may be one of the
+# actuator or of the sensor, which a single oscillation does not tell apart. It also names an offset
+# of the gap in the law of the force. A small friction, although the ball moves in air, and a
+# nonlinear sensor are named as well, and may stand in for what is left.
 
 found = cid.diagnose(model, record, progress=False)
 print(found)
@@ -50,8 +53,8 @@ print(found)
 # %%
 # The coil alone
 # --------------
-# In another record the ball rests on the coil while the duty jumps from 0 to 1: the current shows
-# the lag by itself.
+# In another record the ball rests on the coil while the duty cycle is stepped from 0 to 1, so that
+# the current shows the lag of the coil alone.
 
 coil = cid.datasets.load("inteco_coil_step")
 up = int(np.argmax(coil.u > 0.5))
@@ -75,8 +78,8 @@ cid.plot.diagnosis(found)
 plt.show()
 
 # %%
-# How large the lag comes out depends on what stands beside it, since the law of the force is only
-# nearly right. With another zero of the law alone, and no friction:
+# The estimate of the lag depends on the other effects in the model, since the law of the force is
+# only approximately right. With an offset of the gap alone, and no friction:
 
 beside = model.with_effect(cid.effects.ActuatorLag(tau=mine.tau))
 beside = beside.with_effect(cid.effects.PositionOffset(offset=0.002))
@@ -87,9 +90,9 @@ print(f"lag beside another zero of the law {1e3 * beside_zero:.1f} ms")
 # %%
 # What the name is worth
 # ----------------------
-# A lead with a crossover of 50 rad/s and a phase margin of 20 degrees, at 1 ms: designed once on
-# the model as given, once on the diagnosed one, and both tried on the diagnosed physics. A single
-# lead cannot promise much more: the lag has taken the phase.
+# A lead with a crossover of 50 rad/s and a phase margin of 20 degrees, sampled at 1 ms, is designed
+# on the model as given and on the diagnosed model. Both are tried on the diagnosed physics. A
+# single lead cannot have a much larger margin, because of the phase of the lag.
 
 given = cid.Loop(plant, None, dt=0.001, at=at)
 physics = given.with_parameters({"K": found.loop.parameters["K"]})

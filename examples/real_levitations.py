@@ -2,13 +2,14 @@
 Two real levitated balls
 ========================
 
-The constrained fit on two public records of magnetic levitation in closed loop: the INTECO rig (a
-steel ball, PID on a PC) and the MagnetoShield R3 (a permanent magnet, PID on a microcontroller with
-dither). The records are not part of ctrlid; they are fetched once, or read from the folder named by
-CTRLID_DATA_DIR. Run it with ``python examples/real_levitations.py``.
+The constrained fit is applied to two public records of magnetic levitation in closed loop: the
+INTECO rig (a steel ball, a PID on a PC) and the MagnetoShield R3 (a permanent magnet, a PID on a
+microcontroller with dither). The records are not part of ctrlid. They are downloaded once, or read
+from the folder that the environment variable CTRLID_DATA_DIR names. Run the script with ``python
+examples/real_levitations.py``.
 
-What to expect if ``m x" = m g - K V^2/x^2`` held: poles p at plus and minus ``sqrt(2 g/x0)``, so
-that ``p^2 x0/g`` is 2.
+If ``m x" = m g - K V^2/x^2`` held, the poles would be at plus and minus p = ``sqrt(2 g/x0)``, so
+that ``p^2 x0/g`` would be 2.
 """
 
 from dataclasses import replace

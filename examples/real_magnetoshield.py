@@ -1,14 +1,15 @@
 r"""
-MagnetoShield: a magnet that iron attracts, and what the name is worth
-======================================================================
+MagnetoShield: a magnet that iron attracts, and the benefit in a redesign
+=========================================================================
 
-A public record of a small levitation rig: a permanent magnet hangs below a solenoid, a program
-holds it at five set-points and adds noise to the voltage. Given is the law of a ball of iron,
-``m x" = m g - K V^2/x^2``, which is visibly wrong here: the magnet is drawn to the iron core
-without any current, and every voltage acts one sample late. Neither is told.
+The data are public records of a small levitation rig: a permanent magnet hangs below a solenoid,
+and a digital controller holds it at five set-points and adds noise to the voltage. The given model
+is that of a ball of iron, ``m x" = m g - K V^2/x^2``. It lacks two effects here: the iron core
+attracts the magnet even without current, and the voltage acts one sample late. `diagnose` is told
+neither.
 
-The records are not part of ctrlid; they are fetched once, or read from the folder named by
-CTRLID_DATA_DIR.
+The records are not part of ctrlid. They are downloaded once, or read from the folder that the
+environment variable CTRLID_DATA_DIR names.
 """
 
 from dataclasses import replace
@@ -22,7 +23,8 @@ import ctrlid as cid
 # What is missing?
 # ----------------
 # The reference was not logged, so the gap is that of a prediction eight samples ahead. The
-# parameters are fitted at 14 mm; the gap is that at 15 mm, a set-point which the fit never saw.
+# parameters are fitted at 14 mm, and the gap is measured at 15 mm, a set-point that was not used
+# for the fit.
 
 records = cid.datasets.load("magnetoshield_r3")
 plant = cid.plants.maglev(m=0.000945, K=0.000945 * 9.81 * 0.014**2 / 5.0**2)
@@ -37,8 +39,9 @@ plt.show()
 # %%
 # The voltage at rest
 # -------------------
-# The law of a ball of iron asks for a voltage that grows in proportion to the distance. The
-# completed model, fitted at 14 mm only, says what the other set-points really need.
+# For a ball of iron, the equilibrium voltage is proportional to the distance. The table compares
+# the measured voltages with those of the model as given and of the completed model, which was
+# fitted at 14 mm only.
 
 given = cid.Loop(plant, None, dt=records[0].dt, at=at)
 physics = given.with_parameters({"K": found.loop.parameters["K"]})
@@ -55,7 +58,7 @@ for record in sorted(records, key=lambda r: r.y.mean()):
 # %%
 # What the names are worth
 # ------------------------
-# A lead is designed once on the model as given and once on the completed one, and both are tried on
+# A lead is designed on the model as given and another one on the completed model. Both are tried on
 # the completed physics.
 
 rest = cid.operating_point(physics.system(), output=0.014).input

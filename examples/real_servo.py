@@ -1,13 +1,14 @@
 r"""
-A servo with dry friction and an offset: two records, one drive
-===============================================================
+A servo with dry friction and an offset
+=======================================
 
-A public record of the drive of a ball-and-beam rig in closed loop (an integrator, 1 kHz, everything
-in volts): a swept sine, and random steps. Given is ``y" = -a y' + b u``, all friction viscous.
-Others have found dry friction of 0.15 to 0.46 V and an offset of the input of 0.75 V.
+The data are two public records of the drive of a ball-and-beam rig in closed loop, with a swept
+sine and with random steps. The plant is an integrator, the sampling rate is 1 kHz, and all signals
+are in volts. The given model is ``y" = -a y' + b u``, with viscous friction only. Publications
+report dry friction of 0.15 to 0.46 V and an offset of the input of 0.75 V.
 
-The records are not part of ctrlid; they are fetched once, or read from the folder named by
-CTRLID_DATA_DIR.
+The records are not part of ctrlid. They are downloaded once, or read from the folder that the
+environment variable CTRLID_DATA_DIR names.
 """
 
 import control as ct
@@ -18,10 +19,10 @@ import ctrlid as cid
 from ctrlid.validation.sampling_sweep import averaged
 
 # %%
-# The mains in the sensor
+# Mains hum in the sensor
 # -----------------------
-# A line at 60 Hz is the largest fast noise of the sensor. It gets every tenth sample and the mean
-# of the input between; there the line counts for less.
+# A line at 60 Hz is the largest fast noise of the sensor. So `diagnose` is given every tenth
+# sample, with the mean of the input in between, where the line matters less.
 
 record, other = (
     averaged(cid.datasets.load(f"servo_{k}"), 10) for k in ("swept_sine", "random_steps")
@@ -41,10 +42,11 @@ model = cid.Loop(plant, None, dt=record.dt, at=rest, free=("a", "b"))
 # %%
 # What is missing?
 # ----------------
-# Dry friction, more of it in one direction: the same, on this plant, as dry friction and a
-# constant force, and no record of u and y could tell the two apart. What it leaves is not noise,
-# and the report says so: the friction may stand in for a part of it. The gap is that of a
-# prediction four samples ahead on the random steps, which no parameter was fitted to.
+# `diagnose` names dry friction that is stronger in one direction. On this plant that is the same as
+# symmetric dry friction with a constant force, and no record of u and y can tell them apart. The
+# residuals are not noise. The report says so, and that the friction may stand in for a part of what
+# is missing. The gap is that of a prediction four samples ahead on the random steps, which were not
+# used for the fit.
 
 found = cid.diagnose(model, record, validation=other, progress=False)
 print(found)

@@ -1,17 +1,18 @@
 r"""
-Cascaded tanks: what runs over, and what is clipped
-===================================================
+Cascaded tanks: an overflow and a saturated sensor
+==================================================
 
-A public benchmark of nonlinear identification: a pump fills an upper tank, which runs out into a
-lower one, whose level is logged. Given are two tanks with outflow by Torricelli's law,
+The data are a public benchmark of nonlinear identification: a pump fills an upper tank, which
+empties into a lower one, whose level is logged. The given model is two tanks with outflow by
+Torricelli's law,
 
 .. math:: \dot h_1 = k_4 u - k_1 \sqrt{h_1}, \qquad \dot h_2 = k_1 \sqrt{h_1} - k_3 \sqrt{h_2}
 
-and parameters that are a guess. In the experiment the tanks sometimes ran over, part of the upper
-tank's water into the lower one. Nobody tells the diagnosis.
+with guessed parameters. In the experiment the tanks sometimes overflowed, and a part of the water
+from the upper tank went into the lower one. `diagnose` is not told of this.
 
-The records are not part of ctrlid; they are fetched once, or read from the folder named by
-CTRLID_DATA_DIR.
+The records are not part of ctrlid. They are downloaded once, or read from the folder that the
+environment variable CTRLID_DATA_DIR names.
 """
 
 import control as ct
@@ -41,10 +42,10 @@ model = cid.Loop(plant, None, dt=record.dt, at=cid.operating_point(plant, output
 # %%
 # What is missing?
 # ----------------
-# No controller is at work and the plant is stable, so the gap is that of a simulation from the
-# pump voltage alone, on the record that was kept back. A filter could blame a random force for
-# nearly everything here; effects are looked for by the error of the simulation instead, and a
-# note says so.
+# There is no controller and the plant is stable, so the gap is that of a simulation from the pump
+# voltage alone, on the record that was kept back. A Kalman filter could attribute almost any error
+# to a random force here. So the effects are found by the error of the simulation instead, and a
+# note in the report says so.
 
 found = cid.diagnose(model, record, validation=other, progress=False)
 print(found)
@@ -55,11 +56,11 @@ plt.show()
 # %%
 # Against the literature
 # ----------------------
-# On the same record a grey box that knows of the overflow leaves 0.18 V (Rogers et al., 2017), a
-# neural network 0.33 V (Forgione and Piga, 2021), and a model that knows of the clipping alone
-# 0.63 V. The clipping and the overflow of the upper tank into the lower one are named. What is
-# named beside them, a limit of the lower tank, the zero and the curve of the sensor, may stand in
-# for the law of the outflow, and the report says that something is left.
+# On the same record a grey-box model with the overflow has an error of 0.18 V (Rogers et al.,
+# 2017), a neural network 0.33 V (Forgione and Piga, 2021), and a model with the saturation alone
+# 0.63 V. `diagnose` names the saturation and the overflow of the upper tank into the lower one. The
+# other findings, a limit of the lower tank and an offset and a curvature of the sensor, may stand
+# in for an error in the law of the outflow. The report says that something is still missing.
 
 print(f"gap on the validation record: {found.gap.given:.2f} V as given, "
       f"{found.gap.after:.3f} V with the effects")  # fmt: skip
