@@ -14,9 +14,9 @@ finds that
 This story repeats the experiment in simulation with equation (1) of the paper, so that the true
 poles are known. There are two kinds of noise: noise of the sensor, which the controller feeds back,
 and noise of the data logger, which does not reach the controller. All three findings are
-reproduced. In addition, equation (8) of the paper lies exactly on the bound ``|a1| = 2``, with a
-double pole at z = 1. The constrained fit ends there when the minimum without the constraint is
-outside it. This is a symptom of bias that should be reported, not a result.
+reproduced. The story also shows that equation (8) of the paper lies exactly on the bound
+``|a1| = 2``, with a double pole at z = 1. The constrained fit ends there when the minimum without
+the constraint is outside it. This is a symptom of bias that should be reported, not a result.
 """
 
 from dataclasses import replace
