@@ -14,6 +14,7 @@ from ctrlid._base.criterion import bayesian_penalty
 from ctrlid._base.statistics import (
     autocorrelation_time,
     fit_autoregression,
+    kurtosis_about_zero,
     lagged_products,
     portmanteau,
     pseudo_inverse,
@@ -79,6 +80,13 @@ def test_both_statistics_of_whiteness_agree_in_long_records():
     short = portmanteau(rho, 1_000_000, short=True)
     assert short == pytest.approx(1e6 * np.sum(weights * rho**2), rel=1e-13)
     assert portmanteau(rho, 1_000_000, short=False) == pytest.approx(short, rel=1e-4)
+
+
+def test_a_gaussian_signal_has_kurtosis_three():
+    z = np.random.default_rng(10).standard_normal(400_000)
+    assert kurtosis_about_zero(2.5 * z) == pytest.approx(3.0, abs=0.04)
+    about = np.mean((z + 1) ** 4) / np.mean((z + 1) ** 2) ** 2
+    assert kurtosis_about_zero(z + 1) == pytest.approx(about, rel=1e-14)
 
 
 # --- autoregressions

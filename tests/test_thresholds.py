@@ -19,7 +19,6 @@ PLAIN = {0, 1, 2, 0.5}
 FORMULAS = {
     ("noise_tests", "_deviates_of_force"),  # D'Agostino; Anscombe and Glynn
     ("noise_tests", "_test_tails"),  # kurtosis of a Gaussian, and its variance 24 / n
-    ("noise_tests", "_test_bins"),  # fourth moment
     ("gap", "draw_noise"),  # three streams of random numbers
     ("verdict", "write_conclusion"),  # per cent
 }

@@ -82,6 +82,29 @@ def autocorrelation_time(e: Array, power: int = 1) -> float:
     return float(1 + 2 * np.sum(rho[1 : ends[0] if len(ends) else len(rho)] ** power))
 
 
+def kurtosis_about_zero(z: Array) -> float:
+    r"""Return how heavy the tails of a signal are that has mean zero by law.
+
+    .. math:: \overline{z^4} / \bigl(\overline{z^2}\bigr)^2
+
+    Parameters
+    ----------
+    z : ndarray, shape (n,)
+        Signal.
+
+    Returns
+    -------
+    float
+        The ratio: 3 for a Gaussian signal, 1 for one of constant size.
+
+    Examples
+    --------
+    >>> kurtosis_about_zero(np.array([1.0, -1.0, 1.0, 1.0]))
+    1.0
+    """
+    return float(np.mean(z**4) / np.mean(z**2) ** 2)
+
+
 def portmanteau(rho: Array, samples: int, short: bool) -> float:
     r"""Return how large autocorrelations are together.
 

@@ -8,7 +8,12 @@ import numpy as np
 from scipy import stats
 
 from .._base.arrays import Array
-from .._base.statistics import autocorrelation_time, lagged_products, portmanteau
+from .._base.statistics import (
+    autocorrelation_time,
+    kurtosis_about_zero,
+    lagged_products,
+    portmanteau,
+)
 from ..estimation.likelihood.filter_data import FilterData
 from ..estimation.likelihood.kalman_filter import Filtered
 from ..estimation.likelihood.likelihood import Fit
@@ -158,14 +163,9 @@ def _test_line(z: Array, n: int) -> float:
     return chance_of_line(np.abs(np.fft.rfft(z))[1:-1] ** 2 / n)
 
 
-def _fourth_moment(z: Array) -> float:
-    """Return the mean fourth power over the squared mean square: 3 for Gaussian innovations."""
-    return float(np.mean(z**4) / np.mean(z**2) ** 2)
-
-
 def _test_tails(z: Array) -> dict[str, float]:
     n = len(z)
-    excess = _fourth_moment(z) - 3.0
+    excess = kurtosis_about_zero(z) - 3.0
     largest = float(np.max(np.abs(z)))
     return {
         "heavy tails": float(2 * stats.norm.sf(abs(excess) / math.sqrt(24.0 / n))),
@@ -228,7 +228,7 @@ def _test_bins(z: Array, values: Array) -> tuple[float, float]:
         return 1.0, 1.0
     mean = np.bincount(index, z, minlength=len(count))[use] / count[use]
     square = np.bincount(index, z**2, minlength=len(count))[use] / count[use]
-    flat = _fourth_moment(z) - 1.0
+    flat = kurtosis_about_zero(z) - 1.0
     level = float(np.average(square, weights=count[use]))
     chi_mean = float(np.sum(count[use] * mean**2))
     chi_square = float(np.sum(count[use] * (square - level) ** 2) / max(flat, 0.5))
