@@ -4,7 +4,8 @@ Run it as ``python benchmarks/record_path.py``; ``--list`` names the functions i
 they are entered first, as one would read them. One small simulated record is fitted under a
 profiler. Counted are
 
-- the distinct functions of ctrlid that are entered, and the files that they stand in;
+- the distinct functions of ctrlid that are entered, and the files that they stand in; and of
+  these the ones that are handed the record itself, or what is made of it for the filter;
 - along that order, how often the next function stands in another file, and how often in one
   higher up in the layers that ``[tool.importlinter]`` declares: there a reader turns back;
 - the distinct calls from one function to another in another file, and how many of these go up:
@@ -28,6 +29,7 @@ from typing import Any
 import ctrlid as cid
 
 PACKAGE = Path(cid.__file__).parent
+RECORDS = {"Record", "FilterData"}  # types of a record along its way
 Function = tuple[str, str]  # module below ctrlid, qualified name
 
 
@@ -68,9 +70,22 @@ def name_function(code: CodeType) -> Function | None:
     return ".".join(parts), name
 
 
-def trace_calls(run: Any) -> list[tuple[Function | None, Function]]:
-    """Return the distinct calls between functions of ctrlid while something runs, in order."""
+def gets_record(frame: FrameType) -> bool:
+    """Whether a record, or a sequence of records, is among the arguments of a call."""
+    code = frame.f_code
+    names = code.co_varnames[: code.co_argcount + code.co_kwonlyargcount]
+    given = [frame.f_locals.get(name) for name in names]
+    parts = [part for v in given if isinstance(v, list | tuple) for part in v[:1]]
+    return any(type(v).__name__ in RECORDS for v in (*given, *parts))
+
+
+def trace_calls(run: Any) -> tuple[list[tuple[Function | None, Function]], list[Function]]:
+    """Return the calls between functions of ctrlid while something runs, and who gets a record.
+
+    Each once, in the order in which they come first.
+    """
     calls: dict[tuple[Function | None, Function], None] = {}
+    handed: dict[Function, None] = {}
 
     def note(frame: FrameType, event: str, _: Any) -> None:
         callee = name_function(frame.f_code) if event == "call" else None
@@ -80,6 +95,8 @@ def trace_calls(run: Any) -> list[tuple[Function | None, Function]]:
         while above is not None and caller is None:
             caller, above = name_function(above.f_code), above.f_back
         calls[caller, callee] = None
+        if gets_record(frame):
+            handed[callee] = None
 
     threading.setprofile(note)
     sys.setprofile(note)
@@ -88,7 +105,7 @@ def trace_calls(run: Any) -> list[tuple[Function | None, Function]]:
     finally:
         sys.setprofile(None)
         threading.setprofile(None)
-    return list(calls)
+    return list(calls), list(handed)
 
 
 def main() -> None:
@@ -103,23 +120,25 @@ def main() -> None:
     r = cid.random_binary(1000, amplitude=1e-4, hold=20, around=at.output, seed=1)
     record = cid.simulate(loop, r, sensor_noise=2e-6, seed=2)
     start = loop.with_parameters({"K": 3.1e-6})
-    calls = trace_calls(lambda: cid.fit_loop(start, record))
+    calls, handed = trace_calls(lambda: cid.fit_loop(start, record))
     ranks = read_layers()
     functions = list(dict.fromkeys(callee for _, callee in calls))
-    turns = [(a, b) for (a, _), (b, _) in itertools.pairwise(functions) if a != b]
-    back = [pair for pair in turns if goes_up(*pair, ranks)]
     across = [(a[0], b[0]) for a, b in calls if a is not None and a[0] != b[0]]
     up = [pair for pair in across if goes_up(*pair, ranks)]
     if listed:
-        for above, (module, name) in zip([("", ""), *functions], functions, strict=False):
-            mark = "back up to" if above[0] and goes_up(above[0], module, ranks) else ""
-            print(f"{mark:<11}{module}.{name}")
-    print(f"functions of ctrlid entered               {len(functions)}")
-    print(f"files that they stand in                  {len({m for m, _ in functions})}")
-    print(f"turns to another file, in reading order   {len(turns)}")
-    print(f"of these, back up                         {len(back)}")
-    print(f"calls that cross files                    {len(across)}")
-    print(f"of these, up                              {len(up)}")
+        for above, here in itertools.pairwise([functions[0], *functions]):
+            mark = "back up to" if goes_up(above[0], here[0], ranks) else ""
+            print(f"{mark:<11}{'.'.join(here)}{' (record)' if here in handed else ''}")
+    for label, way in (("functions of ctrlid entered", functions),
+                       ("functions handed the record", handed)):  # fmt: skip
+        turns = [(a, b) for (a, _), (b, _) in itertools.pairwise(way) if a != b]
+        back = [pair for pair in turns if goes_up(*pair, ranks)]
+        print(f"{label:<42}{len(way):>4}")
+        print(f"  files that they stand in                {len({m for m, _ in way}):>4}")
+        print(f"  turns to another file, in reading order {len(turns):>4}")
+        print(f"  of these, back up                       {len(back):>4}")
+    print(f"calls that cross files                    {len(across):>4}")
+    print(f"  of these, up                            {len(up):>4}")
 
 
 if __name__ == "__main__":

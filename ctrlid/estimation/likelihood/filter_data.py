@@ -49,6 +49,11 @@ class FilterData:
     spread: Array
     scale: float
 
+    @property
+    def usable(self) -> Any:
+        """Samples that are valid and no start."""
+        return self.valid & ~self.afresh
+
 
 def make_filter_data(loop: Loop, record: Record, begin: float = 0.0) -> FilterData:
     """Make a record ready for the filter of a loop; `begin` is the time of its first sample.

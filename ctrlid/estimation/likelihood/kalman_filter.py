@@ -75,11 +75,17 @@ def run_filter(
         (0,) * (plant.size + bool(noise.drift > 0)),
     )  # fmt: skip
     error, variance, before, after, wide, slopes, disturbance = out
-    counts = data.valid & ~data.afresh
+    counts = data.usable
     with np.errstate(all="ignore"):  # a filter that lost the record says so later
         sensor = np.sqrt(np.mean(error[counts] ** 2 / variance[counts]))
     return Filtered(error, variance, Trajectory(before, after, wide * sensor), slopes,
                     disturbance)  # fmt: skip
+
+
+def settled_samples(data: FilterData, out: Filtered) -> Any:
+    """Return the usable samples whose prediction does not depend on the start."""
+    known = data.valid & np.isfinite(out.variance)
+    return known & data.usable & (out.variance <= SETTLED * np.median(out.variance[known]))
 
 
 def first_guess(plant: SampledPlant, data: FilterData) -> Trajectory:

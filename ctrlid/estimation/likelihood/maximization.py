@@ -10,8 +10,7 @@ from ..._base.arrays import Array
 from ..._base.criterion import bayesian_penalty
 from ..._base.errors import EffectDoesNotApply, ModelCannotRun
 from ..._base.statistics import pseudo_inverse
-from .filter_data import FilterData
-from .kalman_filter import SETTLED, Filtered, Noise, first_guess, settle_trajectory
+from .kalman_filter import Noise, first_guess, settle_trajectory, settled_samples
 from .likelihood import Fit, Problem, evaluate, linearize_again, start_values
 from .noise_fit import LOG_STEP, choose_units, fit_noise, make_noise, take_logs, try_coloured_force
 
@@ -54,20 +53,14 @@ def begin_fit(problem: Problem, theta: Array | None = None, noise: Noise | None 
         settled.append((data, at))
     if noise is None:
         lins = tuple(plant.linearize(data, theta, at) for data, at in settled)
-        counts = tuple(data.valid & ~data.afresh for data in problem.data)
+        counts = tuple(data.usable for data in problem.data)
         first = fit_noise(replace(problem, counts=counts), theta, lins, first, wide=True).noise
     results = [settle_trajectory(plant, data, theta, first, at) for data, at in settled]
     if not problem.counts:
         problem = replace(problem, counts=tuple(
-            _settle(data, out) for data, (_, out) in zip(problem.data, results, strict=True)
+            settled_samples(data, out) for data, (_, out) in zip(problem.data, results, strict=True)
         ))  # fmt: skip
     return evaluate(problem, theta, first, [out.trajectory for _, out in results])
-
-
-def _settle(data: FilterData, out: Filtered) -> Any:
-    known = data.valid & np.isfinite(out.variance)
-    usual = np.median(out.variance[known])
-    return known & ~data.afresh & (out.variance <= SETTLED * usual)
 
 
 def maximize(fit: Fit, rounds: int = ROUNDS, exact: bool = True) -> Fit:
