@@ -1,4 +1,4 @@
-"""The command ``ctrlid``, also ``python -m ctrlid``: the main job, told on an embedded default."""
+"""The command ``ctrlid``, also ``python -m ctrlid``: demonstrations and ``diagnose``."""
 
 import argparse
 import itertools
@@ -25,7 +25,9 @@ from .reporting.html_page import Section, write_report
 from .reporting.tables import Table
 
 FOLDER = "ctrlid-report"
-FEWEST = 500  # samples with which the story can be told
+# The story can be told with at least so many samples.
+FEWEST = 500
+# Paragraphs are wrapped at so many characters.
 WIDTH = 88
 
 
@@ -53,7 +55,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("ctrlid: interrupted", file=sys.stderr)
         return 130
-    except BrokenPipeError:  # the reader, such as `head`, has seen enough
+    # The reader of the output, such as `head`, has seen enough.
+    except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     return code
@@ -119,7 +122,7 @@ def _tell(args: argparse.Namespace) -> int:
     chapters = itertools.chain(first, second_act(samples=args.samples, seed=args.seed))
     titles = (*TITLES, *SECOND)
     try:
-        # disable=None: silent where stderr is no terminal.
+        # With disable=None the bar is silent where stderr is no terminal.
         with tqdm(total=len(titles), disable=args.quiet or None, leave=False, unit="step") as bar:
             for number, title in enumerate(titles, 1):
                 bar.set_description(title)

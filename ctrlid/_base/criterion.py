@@ -4,7 +4,7 @@ import math
 
 
 def bayesian_penalty(parameters: float, samples: float) -> float:
-    r"""Return what a model pays for its parameters.
+    r"""Return the penalty for the parameters of a model.
 
     .. math:: \tfrac12\, n \ln N
 

@@ -1,4 +1,4 @@
-"""What ctrlid says when it refuses or is in doubt."""
+"""The error with which ctrlid refuses, and the warning with which it doubts."""
 
 
 class CtrlidError(ValueError):

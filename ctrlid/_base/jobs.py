@@ -17,7 +17,8 @@ from .errors import CtrlidError
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-BATCH = 16  # items that are in work at a time
+# So many items are in work at a time, which bounds memory.
+BATCH = 16
 
 
 def check_jobs(jobs: Any) -> int | None:
@@ -94,14 +95,17 @@ def side_by_side(function: Callable[[Item], Result], items: Iterable[Item]) -> l
         while waiting:
             try:
                 k = waiting.popleft()
-            except IndexError:  # another thread was faster
+            # Another thread may have taken the last item.
+            except IndexError:
                 return
             results[k] = function(given[k])
 
     helpers = [_threads().submit(take) for _ in range(min(processors(), len(given)) - 1)]
-    take()  # at once, while the others wake up
+    # The calling thread works too, while the others start.
+    take()
     for helper in helpers:
-        if not helper.cancel():  # one that never woke up is not needed
+        # A thread that has not started yet is not needed any more.
+        if not helper.cancel():
             helper.result()
     return [results[k] for k in range(len(given))]
 
@@ -118,5 +122,6 @@ def _threads() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(processors())
 
 
-if hasattr(os, "register_at_fork"):  # a forked process has none of its parent's threads
+# A forked process has none of its parent's threads.
+if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_threads.cache_clear)

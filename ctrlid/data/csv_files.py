@@ -18,9 +18,12 @@ TIME = ("t", "time", "timestamp", "seconds")
 SECONDS = {"": 1.0, "s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6,
            "min": 60.0, "h": 3600.0}  # fmt: skip
 MARK = "# ctrlid "
-JITTER = 0.01  # of the period: what a good clock never shows
-GAP = 1.5  # periods: samples are missing
-CHUNK = 20_000  # rows written at once: bounds the memory that text takes
+# A good clock never jitters by more than this share of the period.
+JITTER = 0.01
+# A step of more periods between two time stamps says that samples are missing.
+GAP = 1.5
+# So many rows are written at once, which bounds the memory that their text takes.
+CHUNK = 20_000
 
 
 def write_csv(path: Path, record: Any) -> None:
@@ -44,7 +47,7 @@ def write_csv(path: Path, record: Any) -> None:
         file.write(f"{MARK}{json.dumps(fields, ensure_ascii=False)}\n{line.getvalue()}\n")
         for first in range(0, len(record), CHUNK):
             rows = np.column_stack([c[first : first + CHUNK] for c in channels.values()])
-            # The shortest decimals that give the same number back.
+            # Each number is written with the fewest digits that give it back.
             file.writelines(",".join(map(repr, row)) + "\n" for row in rows.tolist())
 
 
@@ -127,7 +130,8 @@ def _read_table(path: Path) -> tuple[dict[str, Any], list[str], Any]:
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError:
-        text = data.decode("cp1252", errors="replace")  # what older Windows tools write
+        # Older Windows tools write this encoding.
+        text = data.decode("cp1252", errors="replace")
     own: dict[str, Any] = {}
     comment, at = "", 0
     while True:
@@ -158,7 +162,8 @@ def _read_table(path: Path) -> tuple[dict[str, Any], list[str], Any]:
     if not body.strip():
         raise CtrlidError(f"{path} has no rows of numbers below its header")
     if separator != ",":
-        body = body.replace(",", ".")  # decimal commas
+        # Where commas do not separate columns, they are decimal commas.
+        body = body.replace(",", ".")
     try:
         table = np.loadtxt(io.StringIO(body), delimiter=separator, ndmin=2, quotechar='"')
     except ValueError:
@@ -272,7 +277,7 @@ def _even_period(stamps: Any, rounding: float, dt: float | None) -> float | None
     slope = float(np.polyfit(k / n, stamps - stamps[0], 1)[0]) / n
     if not fits(slope, 1.25):
         return None
-    # Of the periods that the stamps leave open, the one with the fewest digits.
+    # Of the periods that the stamps allow, the one with the fewest digits is taken.
     short = (float(f"{slope:.{digits}g}") for digits in range(1, 16))
     return next((p for p in short if fits(p) and abs(p - slope) <= rounding / n), slope)
 

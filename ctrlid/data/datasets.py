@@ -20,10 +20,12 @@ FOLDER_VARIABLE = "CTRLID_DATA_DIR"
 class Source:
     """Where a public file comes from, and on what terms."""
 
-    file: str  # in the local folder
+    # Path of the file in the local folder.
+    file: str
     repository: str
     commit: str
-    path: str  # in the repository
+    # Path of the file in the repository.
+    path: str
     sha256: str
     terms: str
 
@@ -127,11 +129,13 @@ def _inteco_coil(table: Any) -> Record:
 
 def _magnetoshield(table: Any) -> list[Record]:
     whole = np.asarray(table["result"], dtype=float)
-    set_points = (14.0, 13.5, 14.5, 15.0, 14.5)  # not logged; where the magnet settles [mm]
+    # The set-points were not logged; the magnet settles at these gaps [mm].
+    set_points = (14.0, 13.5, 14.5, 15.0, 14.5)
     return [
         Record(
             u=part[:, 1], y=part[:, 0] * 1e-3, dt=3.25e-3, extra={"current": part[:, 2] * 1e-3},
-            valid=part[:, 0] < 15.6,  # the magnet lies on the floor until it is lifted
+            # The magnet lies on the floor until it is lifted.
+            valid=part[:, 0] < 15.6,
             units={"u": "V", "y": "m", "current": "A"},
             names={"u": "solenoid voltage", "y": "gap"}, name=f"set-point {k + 1}, {level:g} mm",
         )
@@ -301,13 +305,15 @@ def _path(source: Source) -> Path:
                     f"Replace it by {source.address}"
                 )
             return local
-    pooch.get_logger().setLevel("ERROR")  # a download is no news
+    # A download is not reported, since it is no news to the user.
+    pooch.get_logger().setLevel("ERROR")
     try:
         fetched = pooch.retrieve(
             source.address, known_hash=f"sha256:{source.sha256}", path=pooch.os_cache("ctrlid"),
             progressbar=False,
         )  # fmt: skip
-    except Exception as reason:  # pooch hands on whatever its downloader raises
+    # Pooch hands on whatever its downloader raises.
+    except Exception as reason:
         raise CtrlidError(
             f"cannot fetch {source.address} ({type(reason).__name__}: {reason}). Connect to the "
             f"network, or put the file into a folder as {source.file} and name that folder in the "

@@ -1,4 +1,4 @@
-"""What a record is made of, checked: samples, words and seconds."""
+"""Checks of the fields of a record: samples, words and seconds."""
 
 from collections.abc import Mapping, Sequence
 from numbers import Real

@@ -20,7 +20,8 @@ from .validity import find_runs, whole_past
 
 Hold = Literal["zoh", "foh"]
 SIGNALS = ("r", "u", "y")
-RESERVED = (*SIGNALS, "t", "time", "valid")  # columns of a CSV file
+# Columns of a CSV file have these names, so that no extra channel may.
+RESERVED = (*SIGNALS, "t", "time", "valid")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

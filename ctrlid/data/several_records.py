@@ -1,4 +1,4 @@
-"""Several records used together: checked to be of one kind, all at once or as they pass."""
+"""Several records used together, checked to have one sampling period and one hold."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain, islice
@@ -9,7 +9,8 @@ import numpy as np
 from .._base.errors import CtrlidError
 from .record import Record
 
-VISIBLE_MOTION = 0.1  # of its spread a period: an input that moves more is not held
+# An input that moves by more than this share of its standard deviation in a period is not held.
+VISIBLE_MOTION = 0.1
 
 
 def as_records(data: Any) -> tuple[Record, ...]:

@@ -279,7 +279,8 @@ def _why_not_the_phase(task: _Task, signs: tuple[int, ...]) -> str:
         return 0 < margin < 180 and _works(replace(task, phase_margin=margin), sign)
 
     needed = {sign: math.degrees(task.needed(sign)) for sign in signs}
-    plain = {sign: task.phase_margin - needed[sign] for sign in needed}  # what a pure gain gives
+    # This is the phase margin that a pure gain gives.
+    plain = {sign: task.phase_margin - needed[sign] for sign in needed}
     grid = [1e-6, *np.arange(3.0, 90.0, 3.0), 90 - 1e-3]
     allowed = {sign: [phi for phi in grid if works(phi, sign)] for sign in needed}
     # Speak of the sign of K that can work at all, else of the one with less phase amiss.

@@ -20,9 +20,12 @@ from ..physics.trace import timebase
 from .lead import design_lead
 from .margins import loop_margins, nu_gap, robust_margin
 
-SETTLED = 0.02  # band around the final value
-LOST = 20  # times the promised response: no longer under control
-CLOSE = 0.25  # share of a promised phase margin whose loss is worth a word
+# A response has settled when it stays within this share of its final value.
+SETTLED = 0.02
+# A response so many times the promised one is no longer under control.
+LOST = 20
+# The loss of more than this share of a promised phase margin is reported.
+CLOSE = 0.25
 
 
 @dataclass(frozen=True)
@@ -226,7 +229,7 @@ def redesign(
                           f"given {type(G).__name__}")  # fmt: skip
     if not isinstance(loop, Loop):
         raise CtrlidError(f"redesign tries the controller on a Loop; given {type(loop).__name__}")
-    # A plain transfer function, whatever the fit carried along, but its delay.
+    # The design needs a plain transfer function with the delay of the fit in it.
     G = G.with_delay() if isinstance(G, IdentifiedModel) else to_transfer_function(G)
     C = design_lead(G, crossover=crossover, phase_margin=phase_margin)
     dt = timebase(G)
@@ -235,7 +238,7 @@ def redesign(
     if dt and not timebase(P):
         P = sample_held(P, dt)
     height = _height(loop, step)
-    # Long enough for the slowest promised pole, at the resolution of the loop.
+    # The response is long enough for the slowest promised pole, at the sampling period of the loop.
     length = int(np.clip(60 / (crossover * trial.dt), 20, 50_000))
     time: Array = np.arange(length, dtype=float) * trial.dt
     promised_step = _linear_step(G, C, time)

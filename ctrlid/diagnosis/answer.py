@@ -1,4 +1,4 @@
-"""The answer, put together from the search."""
+"""The answer of a diagnosis: its findings, gap and verdict put together from the search."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -138,7 +138,8 @@ def _find_presence(f: Weighed, found: Search, records: Sequence[Record]) -> list
 def _rank_candidates(found: Search) -> tuple[Candidate, ...]:
     rows = []
     for k, step in enumerate(found.steps):
-        begun: list[AbstractEffect] = []  # the same effect, begun elsewhere, is shown once
+        # An effect that was started from several values is shown once.
+        begun: list[AbstractEffect] = []
         for t in step.trials:
             if any(same_kind(t.effect, b) for b in begun):
                 continue

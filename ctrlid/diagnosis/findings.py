@@ -118,7 +118,7 @@ class Candidate:
     effect : AbstractEffect
         The effect with the parameters it was tried or fitted with.
     score : float
-        Gain of log-likelihood that its first step promises, with the free parameters of the model
+        Gain of log-likelihood that its first step expects, with the free parameters of the model
         moving along.
     gain : float
         Gain of log-likelihood after refitting; NaN if it was not refitted.

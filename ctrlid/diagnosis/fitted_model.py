@@ -88,7 +88,7 @@ def drop_arrays(fit: Fit) -> Fit:
 def drop_linearization(fit: Fit) -> Fit:
     """Return a fit without the plant along its trajectory, four fifths of its memory.
 
-    Whatever climbs on from it linearizes anew.
+    A fit that continues from it linearizes again.
     """
     return keep_information(fit, replace(fit, linearized=()))
 
@@ -179,7 +179,8 @@ def _carry_trajectory(
     """Take states that both have from the old trajectory, and guess the others."""
     mine = list(new.e.states)
     columns = [(mine.index(s), k) for k, s in enumerate(old.e.states) if s in mine]
-    if new.size - new.n == old.size - old.n:  # a delay keeps a known circuit from being followed
+    # A delay keeps a known analog controller from being followed, so both plants need its states.
+    if new.size - new.n == old.size - old.n:
         columns += [(new.n + k, old.n + k) for k in range(old.size - old.n)]
     result = []
     for start, theirs in ((guess.predicted, known.predicted), (guess.filtered, known.filtered),

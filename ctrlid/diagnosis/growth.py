@@ -1,4 +1,4 @@
-"""Step 7: the search: add, drop, look back, and again."""
+"""Step 7: the search adds effects, drops superfluous ones and looks back, round by round."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -62,7 +62,7 @@ def search_effects(
         ``work(function, items)``, a map that may run in parallel.
     tell : callable
         Told what is being done.
-    first : sequence of Step, optional
+    first : sequence of Round, optional
         The rounds of a way that another search has left. This one goes on from there and takes
         nothing back.
 
@@ -174,7 +174,7 @@ def _look_back(
     assert best is not None
     ties = step.best is None or not run_noise_tests(step.best.model.fit).passed
     near = [t for t in last.trials[1 : THRESHOLD.looked_at] if _came_close(t, best, ties)]
-    # What promised little beside the best is not scanned again, which takes most of the time.
+    # Effects with a small score beside the best are not scanned again, since scans take longest.
     ranked = sorted(step.trials, key=lambda t: -t.score)
     likely = {t.name for t in (ranked if step.best is None else ranked[: THRESHOLD.looked_at])}
     pairs: list[tuple[float, int]] = []

@@ -45,7 +45,7 @@ class NoiseTests:
 
     @property
     def worst(self) -> tuple[str, float]:
-        """The most telling test, and its probability after paying for the number of tests."""
+        """The most telling test, and its probability corrected for the number of tests."""
         name = min(self.p_values, key=lambda k: self.p_values[k])
         return name, min(1.0, self.p_values[name] * len(self.p_values))
 

@@ -60,7 +60,7 @@ def search_by_simulation(
     ----------
     other : Search
         The search with filters, which left something unexplained.
-    fresh : Fresh
+    fresh : FreshData
         What models are compared on; nothing is fitted to it.
     catalogue : sequence of effect classes
         What may be missing.
@@ -149,7 +149,8 @@ def _refit_each(now: Simulated, given: int) -> Simulated:
         screened = _screen(smaller, now.fitted.effects[position])
         again = screened and _refit(smaller, screened).found
         if again and again.square < now.square:
-            now = again  # the effect stands last now, and the next one in its place
+            # The refitted effect stands last now, so that the next one is at this position.
+            now = again
         else:
             position += 1
     return now
@@ -201,7 +202,7 @@ def _run_round(now: Simulated, catalogue: Sequence[type[AbstractEffect]]) -> lis
 
 
 def _screen(now: Simulated, effect: AbstractEffect) -> Tried | None:
-    """Return an effect at the start from which a first step promises most."""
+    """Return an effect at the start with the largest score."""
     best: Tried | None = None
     task: Simulation | None = None
     for one in effect.spread_starts(SimulationSight(now)):
@@ -212,7 +213,8 @@ def _screen(now: Simulated, effect: AbstractEffect) -> Tried | None:
             names = (*now.names, *own)
             if task is None:
                 task = now.task.of(loop, names)
-            if task.plant.e.play is not None:  # its sensitivities need another recursion
+            # The sensitivities of a backlash need another recursion than that of the states.
+            if task.plant.e.play is not None:
                 return None
             theta = np.array([*now.theta, *own.values()])
             theta = np.clip(theta, task.problem.lower, task.problem.upper)

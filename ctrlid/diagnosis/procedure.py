@@ -169,7 +169,7 @@ def _answer(q: Question) -> tuple[Diagnosis, Search]:
     search = search_effects(base, q.catalogue, q.work, q.tell)
     helps = helps_on_fresh_data(q.fresh)
     if search.other and not search.after.passed:
-        # Neither way explains the record, perhaps: fresh data tell which leads further.
+        # Perhaps neither search explains the record; fresh data tell which of them leads further.
         q.tell("another way")
         other = search_effects(base, q.catalogue, q.work, q.tell, search.other)
         search = choose_way(search, other, helps, q.fresh.gap_of)

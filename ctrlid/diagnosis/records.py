@@ -36,7 +36,8 @@ def make_loop(loop: Any, record: Record) -> Loop:
     u, y = float(np.mean(record.u[valid])), float(np.mean(record.y[valid]))
     linear = Loop(to_transfer_function(loop), None, dt=record.dt, at=OperatingPoint((), u, y))
     delay = delay_of(loop)
-    linear = linear.with_effect(InputOffset(0.0))  # where it rests, the means only guess
+    # The means of the record only estimate the input at rest, so that its offset stays free.
+    linear = linear.with_effect(InputOffset(0.0))
     linear = replace(linear, free=tuple(linear.parameters))
     return linear.with_effect(InputDelay(delay)) if delay else linear
 

@@ -30,7 +30,8 @@ class Weighed:
     trial: Trial
     rivals: tuple[Trial, ...]
     base: Model
-    position: int  # among the effects of the final loop
+    # This is the position of the effect among those of the final loop.
+    position: int
 
 
 def weigh_effects(
@@ -92,7 +93,8 @@ def _drop_effects(model: Model, positions: Sequence[int]) -> Model:
     for position in sorted(positions, reverse=True):
         loop, names = take_out_effect(loop, position, names)
     fit = carry_over(model, loop, names)
-    if not math.isfinite(fit.value):  # with noise as small as that, it cannot follow the record
+    # With the small noise of the full model, the smaller one may lose the record.
+    if not math.isfinite(fit.value):
         fit = begin_fit(fit.problem, fit.theta)
     return Model(loop, fit)
 
@@ -122,7 +124,8 @@ def refit_without_effect(model: Model, position: int) -> tuple[Model, Trial]:
         return smaller, known
     # Where no simulation can check it, a likelihood may be that of absurd values.
     again = refit_candidate(smaller, screen_at(smaller, effect))
-    return smaller, again if again.gain > 0 else known  # below nothing it was stuck
+    # A negative gain says that the refit ended in a wrong maximum.
+    return smaller, again if again.gain > 0 else known
 
 
 def refit_noise(model: Model) -> Model:
@@ -134,7 +137,7 @@ def refit_noise(model: Model) -> Model:
         plain = maximize(replace(fit, noise=replace(fit.noise, memory=0.0, drift=0.0)))
         if plain.value > fit.value - bayesian_penalty(2, fit.size):
             return Model(model.loop, plain)
-        # The force that stood for the effect may be far from the one that is left.
+        # The coloured force that stood in for the effect may be far from the one that remains.
         anew = choose_noise(plain)
         return Model(model.loop, max(fit, anew, key=lambda f: f.value))
     return Model(model.loop, choose_noise(fit))

@@ -54,7 +54,8 @@ def make_replica(model: Model, seed: int = 0) -> Model | None:
         ]
         problem = make_problem(loop, model.names, records, begins)
         problem = replace(problem, counts=fit.counts, known=fit.known)
-        # With other noise a loop may take another path; or the first guess of one may lead astray.
+        # With other noise a loop may take another path, so both the old path and a new guess are
+        # tried.
         along = evaluate(problem, fit.theta, fit.noise, fit.trajectories)
         starts = along, begin_fit(problem, fit.theta, fit.noise)
         again = maximize(max(starts, key=_likely), rounds=THRESHOLD.replica_rounds, exact=False)
@@ -108,7 +109,8 @@ def gain_on_replicas(copies: Sequence[Model | None], trial: Trial) -> float:
         if copy is None:
             continue
         again = refit_candidate(copy, screen_at(copy, trial.fitted, trial.scan_penalty))
-        if not again.gain > 0:  # from there dry friction may have led it another way
+        # From the fitted values dry friction may have led the refit to a wrong maximum.
+        if not again.gain > 0:
             again = refit_candidate(copy, screen_at(copy, trial.effect, trial.scan_penalty))
         gains.append(again.gain if math.isfinite(again.gain) else 0.0)
     return max(gains)

@@ -12,6 +12,7 @@ from .findings import Finding, Gap
 if TYPE_CHECKING:
     from .result import Diagnosis
 
+# Lines of the report have at most so many characters, which fits a terminal.
 WIDTH = 100
 
 
@@ -49,7 +50,8 @@ def write_report_text(found: Diagnosis) -> str:
 
 def _wrap(text: str, indent: int, hang: int | None = None) -> list[str]:
     later = " " * (indent if hang is None else hang)
-    for sign in ("=", "±"):  # no line ends beside them
+    # No line may be broken beside these signs.
+    for sign in ("=", "±"):
         text = text.replace(f" {sign} ", f"\xa0{sign}\xa0")
     lines = textwrap.wrap(text, WIDTH, initial_indent=" " * indent, subsequent_indent=later,
                           break_on_hyphens=False)  # fmt: skip

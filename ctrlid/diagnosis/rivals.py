@@ -31,7 +31,7 @@ def vuong_statistic(best: Array, other: Array, penalty: float) -> float:
     best, other : ndarray, shape (n,)
         Terms of the log-likelihood.
     penalty : float
-        What the better model pays more for its parameters.
+        How much larger the penalty of the better model is.
 
     Returns
     -------
@@ -121,7 +121,7 @@ def find_rivals(best: Trial, others: Sequence[Trial], sure: bool = True) -> tupl
         if lost < THRESHOLD.close or z < THRESHOLD.vuong_z or doubtful:
             found.append(trial)
     found.sort(key=lambda t: -t.net_gain)
-    # One that was begun at several places is one.
+    # An effect that was started from several values is one rival.
     return tuple(
         t for k, t in enumerate(found) if not any(same_kind(t.effect, b.effect) for b in found[:k])
     )
@@ -138,9 +138,8 @@ def compare_effects(
     done, now = [], model
     for f in sorted(found, key=lambda f: f.position):
         smaller, mine = (f.base, f.trial) if now is model else refit_without_effect(now, f.position)
-        if (
-            mine.net_gain <= THRESHOLD.gate
-        ):  # what took the place of another makes this one superfluous
+        # An effect that took the place of another may have made this one superfluous.
+        if mine.net_gain <= THRESHOLD.gate:
             fewer, left = weigh_effects(refit_noise(smaller), given, steps)
             return compare_effects(fewer, left, given, steps, work)
         there = {type(e).__name__ for e in smaller.loop.effects}

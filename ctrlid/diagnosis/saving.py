@@ -90,7 +90,8 @@ def save_diagnosis(found: Diagnosis, path: str | Path) -> Path:
         except _NoText:
             left.append(str(key))
     fields |= {"extra": extra, **({"left out of extra": left} if left else {})}
-    arrays = fields.pop("gap")  # long: last
+    # The gap holds long arrays, so that it is written last.
+    arrays = fields.pop("gap")
     text = write_readable_json({"format": FORMAT, **fields, "loop": loop, "gap": arrays})
     path = Path(path)
     try:
@@ -156,8 +157,10 @@ def _units_of_effects(found: Diagnosis) -> dict[str, dict[str, str]]:
     return {type(e).__name__: units_of(found.loop, e) for e in spoken}
 
 
-SPECIAL = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}  # written as texts
-IN_A_LINE = 8  # numbers of an array
+# JSON has no such numbers, so that they are written as texts.
+SPECIAL = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
+# So many numbers of an array are written in one line, which a person can still read.
+IN_A_LINE = 8
 
 
 def read_numbers(data: Any) -> Any:

@@ -178,7 +178,7 @@ def scan_candidate(model: Model, effect: AbstractEffect) -> Trial:
     Returns
     -------
     Trial
-        The best place, which has paid for the search.
+        The best place; the penalty of the scan is in `scan_penalty`.
     """
     try:
         scan = effect.scan(ModelSight(model))

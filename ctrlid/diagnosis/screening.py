@@ -92,10 +92,12 @@ def screen_starts(base: Model, effects: Sequence[AbstractEffect], scan_penalty: 
     for effect in effects[1:]:
         theta = start.theta.copy()
         for field, value in effect.values().items():
-            if f"{label}.{field}" in names:  # and not one that the model's own double
+            # A parameter that the model's own parameters duplicate is not free.
+            if f"{label}.{field}" in names:
                 theta[names.index(f"{label}.{field}")] = value
         fit = start
-        for _ in range(2):  # the second time along its own states
+        # The second pass linearizes along the states that the first one found.
+        for _ in range(2):
             fit = evaluate(start.problem, theta, start.noise, fit.trajectories)
         if not math.isfinite(fit.value):
             continue

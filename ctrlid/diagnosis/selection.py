@@ -18,7 +18,8 @@ from .thresholds import THRESHOLD
 Work = Callable[[Callable[..., Any], Iterable[Any]], list[Any]]
 
 
-Job = tuple[Trial, Trial | AbstractEffect, Model | None]  # whose fit, from where, near what
+# A job is the trial that is refitted, the start, and the model near whose values it starts.
+Job = tuple[Trial, Trial | AbstractEffect, Model | None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +41,7 @@ def run_round(
     tried: list[Trial] = work(lambda effect: scan_candidate(base, effect), pool)
     more: list[Trial] = []
     if other is not None:
-        # What the model alone would regain from there is no net_gain of a candidate.
+        # What the model alone would regain from these values is no gain of a candidate.
         lost = other.fit.value - base.fit.value
         lost -= max(0.0, lost + expected_gain(other.fit))
         more = work(lambda effect: scan_candidate(other, effect), pool)

@@ -1,4 +1,4 @@
-"""Several records without the same in them: what each says alone, put together."""
+"""Several records that differ in their effects: one diagnosis made of one for each record."""
 
 import math
 from collections.abc import Sequence

@@ -128,7 +128,7 @@ def write_conclusion(
         The gap.
     disturbance : Disturbance
         The random forces.
-    after : Omnibus
+    after : NoiseTests
         The tests of what is left.
     where : sequence of BinnedErrors
         Where the disagreement sits.

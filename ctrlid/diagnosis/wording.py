@@ -18,8 +18,10 @@ from .thresholds import THRESHOLD
 if TYPE_CHECKING:
     from .result import Diagnosis
 
+# The report shows so many quantities along which the errors are not noise.
 PLACES = 3
-LISTED = 4  # tests that fail
+# So many failed tests are named, which still makes one sentence.
+LISTED = 4
 HEADLINES = {
     "nothing missing": "Nothing missing",
     "explained": "Explained",
@@ -35,7 +37,8 @@ WIDENED = (
     "stand in for what is missing."
 )
 MASSES = ("m", "M", "mass")
-FORCES = {"m/s^2": "N", "1/s": "N s/m", "1/s^2": "N/m", "1/m": "kg/m"}  # per unit of mass, times it
+# Units of a force parameter times a mass in kg, by its unit per unit of mass.
+FORCES = {"m/s^2": "N", "1/s": "N s/m", "1/s^2": "N/m", "1/m": "kg/m"}
 
 
 def write_headline(found: Diagnosis) -> str:

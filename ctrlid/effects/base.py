@@ -33,17 +33,21 @@ class AbstractEffect:
     """
 
     place: ClassVar[Place]
-    stage: ClassVar[int]  # effects are applied from the plant's law outwards
+    # Effects are applied in this order, from the plant's equations outwards.
+    stage: ClassVar[int]
     look_alikes: ClassVar[tuple[str, ...]] = ()
     sentence: ClassVar[str] = ""
     experiment: ClassVar[str] = ""
     states: ClassVar[tuple[str, ...]] = ()
-    private: ClassVar[tuple[str, ...]] = ()  # parameters that another record has otherwise
-    in_linear_model: ClassVar[bool] = True  # False: no part of small deviations from rest
+    # These parameters have other values in another record.
+    private: ClassVar[tuple[str, ...]] = ()
+    # False says that the effect has no part in small deviations from rest.
+    in_linear_model: ClassVar[bool] = True
     ordered: ClassVar[bool] = (
         False  # True: a signal passes it, so that its turn among others counts
     )
-    repeatable: ClassVar[bool] = False  # True: a plant may have several of it at once
+    # True says that a plant may have several effects of this class at once.
+    repeatable: ClassVar[bool] = False
     doubt_of_several: ClassVar[str | None] = None  # why several of it at once prove little
 
     def __post_init__(self) -> None:

@@ -64,7 +64,8 @@ def _at_rest(e: Equations, at: OperatingPoint) -> tuple[float, ...]:
     rest = list(e.rest)
     targets = casadi.Function("targets", [e.t, e.x, e.u, e.p, e.spread],
                               [lag.target for lag in e.lags])  # fmt: skip
-    for _ in e.lags:  # of lags in a row each waits for the one before
+    # Of lags in series each needs the value at rest of the one before.
+    for _ in e.lags:
         point = [*at.states, *rest]
         values = targets.call([0.0, point, at.input, e.values, np.zeros(len(point))])
         for lag, value in zip(e.lags, values, strict=True):

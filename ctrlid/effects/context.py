@@ -11,9 +11,13 @@ from ..physics.equations import Equations
 from ..physics.linearization import OperatingPoint
 from ..physics.symbols import Symbol
 
-SHARPEST = 1e-12  # of a velocity unit (or whatever has the kink): keeps derivatives finite
-INSTANT = 1e-6  # of a sampling period: a shorter lag is none
-FARTHEST = 1e30  # stands for an infinite distance to a limit
+# A kink has at least this width, in units of what has it, so that derivatives stay finite.
+SHARPEST = 1e-12
+# A lag shorter than this share of a sampling period is treated as that long, so that its rate stays
+# finite.
+INSTANT = 1e-6
+# This number stands for an infinite distance to a limit, with which CasADi cannot compute.
+FARTHEST = 1e30
 
 
 @dataclass(frozen=True)

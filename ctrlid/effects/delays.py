@@ -1,4 +1,4 @@
-"""Between the controller and the plant: what comes late."""
+"""Lag, delay and backlash between the controller and the plant."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -146,7 +146,7 @@ class InputBacklash(InputEffect):
         return cls._applicable(loop, cls(width=first_width(loop, record)))
 
     def build(self, e: Equations, m: Moment) -> Equations:
-        """Return the equations with the play ahead of them."""
+        """Return the equations with the backlash ahead of them."""
         if e.play is not None:
             raise EffectDoesNotApply(
                 "there is a backlash already; one loop takes a single InputBacklash"

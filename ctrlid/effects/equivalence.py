@@ -15,9 +15,12 @@ from .catalogue import CATALOGUE
 from .context import motion
 from .law import PositionOffset
 
-POINTS = 24  # random states and inputs at which two changes are compared
-SAME = 1e-6  # relative difference of changes that are one and the same
-SIZES = (1e-4, 1e-2)  # of a parameter: two, since a change must be the same at every size
+# Two changes are compared at so many random states and inputs.
+POINTS = 24
+# Changes that differ by less than this share are the same.
+SAME = 1e-6
+# Changes are compared at two sizes of a parameter, since equal ones agree at every size.
+SIZES = (1e-4, 1e-2)
 
 
 def equivalents(
@@ -65,7 +68,8 @@ def equivalents(
     found = {name: effect}
     words: set[str] = set()
     todo = [name]
-    while todo:  # what equals an equal is equal
+    # What is equivalent to an equivalent effect is equivalent.
+    while todo:
         known = todo.pop()
         shifted = _by_shift(known, base)
         equal = [e for e in others if type(e).__name__ in shifted or _same(base, found[known], e)]

@@ -12,14 +12,22 @@ from .kinds import ForceEffect
 from .parameters import parameter
 from .scanning import Overview, Range, Scan, Sight
 
-VISIBLE = 0.4  # Of the sampling frequency: what is faster, samples fold.
-LENGTHS = 150  # Wavelengths in the travel: shorter ones are not looked for, for want of time.
-UNHURRIED = 0.25  # Of the samples: a wave is looked for if the motion is slow enough on so many.
-NEARLY = 0.7  # Of the largest gain: another wave that gains so much may be the right one.
-PEAKS = 4  # Waves that are refitted, at most, for want of time.
-MODES = 7  # Frequencies at which a flexible mode is looked for, for want of time.
-SLOWEST_MODE = 5.0  # Periods in the record: a slower mode is no vibration.
-FASTEST_MODE = 0.35  # Of the sampling frequency: a faster one does not show.
+# Vibrations above this share of the sampling frequency are aliased.
+VISIBLE = 0.4
+# Wavelengths shorter than the travel over this number are not scanned, to save time.
+LENGTHS = 150
+# A wave is scanned if the motion is slow enough for it at this share of the samples.
+UNHURRIED = 0.25
+# A wave that gains this share of the largest gain may be the right one.
+NEARLY = 0.7
+# At most so many waves are refitted, to save time.
+PEAKS = 4
+# A flexible mode is scanned at so many frequencies, to save time.
+MODES = 7
+# A mode with fewer periods in the record is no vibration.
+SLOWEST_MODE = 5.0
+# A mode above this share of the sampling frequency does not show.
+FASTEST_MODE = 0.35
 
 
 def middle_frequency(loop: Any, record: Any) -> float:

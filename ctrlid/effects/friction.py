@@ -15,8 +15,11 @@ from .scanning import Range
 
 # Within one sample friction changes the velocity by fc*dt: samples cannot show how it sticks.
 STICKING = 0.25
-SLOWEST, FASTEST = 1e-3, 3.0  # Of the largest usual speed: where the curve of Stribeck may bend.
-PUSHING = 1.5  # half the difference over the mean: with some room for their uncertainty
+# Stribeck's velocity lies between these shares of the largest usual speed.
+SLOWEST, FASTEST = 1e-3, 3.0
+# Half the difference over the mean friction is at most 1 for friction; the rest is left to the
+# uncertainty of both.
+PUSHING = 1.5
 
 
 @final

@@ -16,7 +16,8 @@ from .kinds import InputEffect, first_width
 from .parameters import parameter
 from .scanning import CUT_OFF, Scan, Sight
 
-DEPTHS = (0.5, 0.25)  # Of the range of the input, to which it may have been limited nearly always.
+# An input that was limited nearly always may have been limited to these shares of its range.
+DEPTHS = (0.5, 0.25)
 
 
 def extremes(values: Any, around: float) -> tuple[float, float]:

@@ -1,4 +1,4 @@
-"""Where an effect acts: one base class a place, each with one method to write."""
+"""Base classes of effects, one for each place in the loop, each with one method to write."""
 
 import dataclasses
 from typing import Any, ClassVar

@@ -15,7 +15,8 @@ from .kinds import LawEffect
 from .parameters import parameter
 from .symbolic import expression
 
-INVERSE_SQUARE = 1e-9  # relative agreement with a force that falls with the distance squared
+# A force agrees with the inverse square of the distance up to this relative error.
+INVERSE_SQUARE = 1e-9
 
 
 @final
@@ -88,7 +89,8 @@ class ForceExponent(LawEffect):
 
     n: float = parameter("", lower=0.5, upper=6.0, neutral=2.0)
 
-    stage: ClassVar[int] = -1  # of the law as it is written, before offsets and curves
+    # It changes the force as the plant's equations have it, before offsets and curves.
+    stage: ClassVar[int] = -1
     look_alikes: ClassVar[tuple[str, ...]] = (
         "PositionOffset", "LinearStiffness", "CubicStiffness", "SensorNonlinearity",
     )  # fmt: skip

@@ -13,7 +13,8 @@ from .input import extremes
 from .kinds import OutputEffect, ReadingEffect
 from .parameters import parameter
 
-SHIFTED_FAR = 1e6  # Times the output: a plant that moves alike so far away has no place.
+# At a spread so many times the output every kink is smooth.
+SHIFTED_FAR = 1e6
 
 
 @final

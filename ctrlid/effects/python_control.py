@@ -14,7 +14,8 @@ from .base import AbstractEffect
 from .composition import compose
 from .symbolic import substituted
 
-FAR = 1e12  # a spread that is large against every kink
+# A standard deviation this large is wide against every kink.
+FAR = 1e12
 
 
 def as_system(e: Equations, at: OperatingPoint, units: Mapping[str, str]) -> Any:
@@ -50,10 +51,12 @@ def as_system(e: Equations, at: OperatingPoint, units: Mapping[str, str]) -> Any
     def output(t: float, x: Any, u: Any, params: Mapping[str, Any]) -> Any:
         return e.evaluate(x, u, t, values(params))[1]
 
-    names = [name.replace(".", "_") for name in e.states]  # python-control forbids dots
+    # Python-control forbids dots in names.
+    names = [name.replace(".", "_") for name in e.states]
     system = ct.nlsys(update, output, inputs=list(e.inputs), outputs=list(e.outputs), states=names,
                       dt=e.dt, name=e.name, params=dict(e.parameters))  # fmt: skip
-    system.equations = e  # the way back for whoever traces the system again
+    # Whoever traces the system again takes its equations from here.
+    system.equations = e
     system.units = units
     return system
 

@@ -1,4 +1,4 @@
-"""What a record offers to the search for an effect, and the places at which an effect may sit."""
+"""What an effect sees of a record in a scan, and the starts that a scan returns."""
 
 from __future__ import annotations
 

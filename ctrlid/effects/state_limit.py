@@ -18,7 +18,8 @@ from .parameters import parameter
 from .scanning import CUT_OFF, Overview, Scan, Sight
 from .symbolic import expression
 
-RIM = 0.25  # of a sampling period: how fast what exceeds a limit runs off
+# What exceeds a limit runs off with a time constant of this share of a sampling period.
+RIM = 0.25
 
 
 @final
@@ -123,7 +124,8 @@ def _high(loop: Any, record: Any, i: int) -> float:
     e, at = loop.equations(), loop.point
     if record is not None and casadi.is_equal(e.output[0], e.x[i], 2):
         return float(np.quantile(record.y, 0.9))
-    if record is not None:  # by the linear model, from the recorded input
+    # The linear model tells the range of the state from the recorded input.
+    if record is not None:
         a, b, _, _ = state_matrices(e, at)
         if np.linalg.eigvals(a).real.max() < 0:
             n = len(a)

@@ -1,4 +1,4 @@
-"""Working on traced equations: hooks on symbols, substitution, further states."""
+"""Operations on traced equations: formulas of effects, substitution, further states."""
 
 import dataclasses
 import inspect

@@ -1,4 +1,4 @@
-"""Parameters of the plant that do not stay what they were."""
+"""Parameters of the plant that drift or step during a record."""
 
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Self, final
@@ -10,10 +10,14 @@ from .kinds import LawEffect
 from .parameters import parameter
 from .scanning import Overview, Scan, Sight
 
-EDGE = 0.05  # Of the record at either end, in which a step is not looked for.
-TIMES = 40  # Instants at which a step is looked for at once.
-SPREAD_TIMES = 12  # Instants from which a fit by simulation starts, each of which takes its time.
-SMALLEST, LARGEST = -0.9, 10.0  # Relative changes from which a fit starts.
+# A step is not looked for in this share of the record at either end.
+EDGE = 0.05
+# A scan looks for a step at so many instants at once.
+TIMES = 40
+# A fit by simulation starts from so many instants, since each takes its time.
+SPREAD_TIMES = 12
+# A fit starts from a relative change between these two.
+SMALLEST, LARGEST = -0.9, 10.0
 
 
 def _of_plant(loop: Any) -> list[str]:

@@ -430,5 +430,6 @@ class IdentifiedModel(control.TransferFunction):
         return f"{text}\n\n{self.estimate}"
 
     def _repr_html_(self, var: str | None = None) -> str:
-        formula: Any = super()._repr_html_(var)  # as python-control shows every transfer function
+        # The formula looks as python-control shows every transfer function.
+        formula: Any = super()._repr_html_(var)
         return f"{formula}\n{_text.html_lines(str(self.estimate))}"

@@ -1,4 +1,4 @@
-"""What a loop's controller computes from signals that are already there."""
+"""The input that a loop's controller computes from recorded signals."""
 
 import math
 from dataclasses import replace

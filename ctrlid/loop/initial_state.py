@@ -13,10 +13,14 @@ from ..effects.context import motion
 from ..physics.linearization import state_matrices
 from .simulation import Simulator
 
-FASTEST = 20.0  # standard deviations of the measured speed: no start is faster
-NEAR = 3.0  # times the largest step between the first samples: the start is where it is seen
-FEW = 8  # samples that tell where a record starts, and how fast
-NARROW = 1e-6  # of the scale: a search begins so far within its bounds
+# The initial velocity is at most so many standard deviations of the measured velocity.
+FASTEST = 20.0
+# The start is at most so many times the largest step of the first samples from where it is seen.
+NEAR = 3.0
+# So many samples tell where a record starts and how fast.
+FEW = 8
+# A search starts by this share of the scale inside its bounds, as its solver demands.
+NARROW = 1e-6
 
 
 def best_start(
@@ -72,10 +76,11 @@ def best_start(
             found = misfit(moved(start, point), count)
             return np.full(count, 1e3) if found is None else found
 
-        # A force that acts from the first sample on is not to be paid for by an absurd start.
+        # Bounds keep an absurd start from standing in for a force that acts from the first sample
+        # on.
         lower, upper = (1 + (v[:fitted] - start[:fitted]) / scale for v in (low, high))
         upper = np.maximum(upper, lower + 4 * NARROW)
-        # Around 1, so that the differences have the relative size that is asked for.
+        # The search is around 1, so that its differences have the relative size that is asked for.
         best = optimize.least_squares(
             residual, np.clip(np.ones(fitted), lower + NARROW, upper - NARROW),
             bounds=(lower, upper), diff_step=[1e-4], max_nfev=20,
@@ -86,7 +91,7 @@ def best_start(
     count = min(len(part), 400)
     there, here = misfit(seen, count), misfit(guess, count)
     if there is None and here is None:
-        # An unstable plant is lost soon from a start that is only nearly right.
+        # From a rough start an unstable plant diverges soon, so that few samples are fitted first.
         for few in (10, 30, 100):
             seen = nearby(seen, min(few, count))
         return nearby(seen, count)

@@ -1,4 +1,4 @@
-"""A plant or a loop over one sampling period, as exact equations: the map that is repeated."""
+"""The map of a loop over one sampling period, as exact equations."""
 
 import functools
 import math
@@ -91,7 +91,7 @@ def make_period_map(loop: Loop, substeps: int) -> PeriodMap:
                 "dt)), or put the delay into the plant as a Padé approximation (control.pade)"
             )
 
-        # A jump of the reference is a jump of the circuit's input: the period is smooth.
+        # The reference jumps only at the samples, so that the motion within a period is smooth.
         def rate(tau: Any, z: Any) -> Any:
             u, charge = act(t0 + tau, z, measured(t0 + tau, z, at.input))
             return casadi.vertcat(e.function(t0 + tau, z[:n], u, p)[0] + kick, charge)
@@ -142,7 +142,7 @@ def _numbers(e: Equations, pieces: Sequence[Piece], p: Any) -> list[Piece]:
 
 
 def sensitivity(s: PeriodMap, reference: float, function: Any) -> tuple[Array, Array]:
-    """Return how a function (step, rate) depends on the state and signals at rest."""
+    """Return the derivatives of a function (step, rate) by state and signals at rest."""
     z, w = casadi.SX.sym("z", len(s.rest)), casadi.SX.sym("w", 5)
     first = function.call([z, w])[0]
     both = casadi.Function("j", [z, w], [casadi.jacobian(first, z), casadi.jacobian(first, w)])
@@ -182,7 +182,8 @@ def growth_rate(loop: Loop) -> float:
             "give at=operating_point(plant, output=...)"
         )
     poles = np.linalg.eigvals(matrix)
-    if s.rate is not None:  # no step of an integration stands between a stiff circuit and its poles
+    # The rates give the poles of a stiff circuit without the error of an integration step.
+    if s.rate is not None:
         return float(np.max(poles.real, initial=-math.inf))
     largest = np.max(np.abs(poles), initial=0.0)
     return float(np.log(largest) / loop.dt) if largest > 0 else -math.inf

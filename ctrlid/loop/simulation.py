@@ -13,11 +13,16 @@ from ..data.record import Record
 from .loop import Loop
 from .period_map import growth_rate, make_period_map, sensitivity
 
-TOLERANCE = 1e-9  # local error of one integration step, relative to the excursion of each state
-COARSE = 1e-5  # above this, what could not be refined further is worth a warning
+# Steps are refined until their local error is below this share of each state's excursion.
+TOLERANCE = 1e-9
+# A local error above this share, which could not be refined further, causes a warning.
+COARSE = 1e-5
+# A period has at most so many integration steps, which bounds the time of a simulation.
 MOST_SUBSTEPS = 128
-CHUNK = 2048  # samples run at once
-RUNAWAY = 1e3  # an output this many times further out than anything asked for has left
+# So many samples run at once, so that one compiled function serves records of any length.
+CHUNK = 2048
+# An output so many times further from rest than anything that was asked for has run away.
+RUNAWAY = 1e3
 
 
 class SimulationStopped(ModelCannotRun):
@@ -145,7 +150,7 @@ def _noise(loop: Loop, n: int, sensor: float, force: float, seed: int | None) ->
             f"force_noise needs a plant with a moving mass, that is a state whose rate is another "
             f"state; {loop.equations().name} has none. Use d= for a disturbance of the input"
         )
-    # Separate streams: switching one noise on does not change the other.
+    # Each noise has its own stream, so that switching one on does not change the other.
     streams = np.random.default_rng(seed).spawn(2)
     return [s.standard_normal(n) * v for s, v in zip(streams, (sensor, force), strict=True)]
 
@@ -239,7 +244,9 @@ class Simulator:
                 if (stop is None and error <= self.tolerance) or substeps >= self.most:
                     break
                 if stop is not None and stop == previous_stop and good and error <= COARSE:
-                    break  # accurate until then, and finer steps leave at the same sample
+                    # The steps were accurate until then, and finer ones leave the domain at the
+                    # same sample.
+                    break
                 previous_stop = stop
                 substeps *= 2
             if stop is not None:

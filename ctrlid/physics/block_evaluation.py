@@ -17,8 +17,10 @@ from .._base.errors import CtrlidError
 from .._base.jobs import processors, side_by_side
 from .interpreter import BINARY, UNARY, sweep
 
-BLOCK = 512  # samples at once: long enough that a loop costs little, short enough for the cache
-BLOCKS = 64  # at most that a thread takes at a time: their inputs are copied
+# A block of so many samples is long enough to hide the cost of its loop and fits into the cache.
+BLOCK = 512
+# A thread takes at most so many blocks at a time, since their inputs are copied.
+BLOCKS = 64
 
 
 class BlockEvaluation:
@@ -36,7 +38,8 @@ class BlockEvaluation:
     """
 
     def __init__(self, function: Any) -> None:
-        # Rows of each argument; first row, rows and columns of each output.
+        # `sizes` are the rows of each argument, `tables` first row, rows and columns of each
+        # output.
         self.sizes = [function.numel_in(k) for k in range(function.n_in())]
         shapes = [(function.size1_out(k), function.size2_out(k)) for k in range(function.n_out())]
         ends = np.cumsum([0, *(rows * columns for rows, columns in shapes)])
@@ -104,9 +107,11 @@ def _allocate_registers(steps: Any) -> tuple[Any, int]:  # pragma: no cover - co
     """
     count = len(steps)
     most = steps.max() + 1 if count else 1
-    holds = np.zeros(most, np.int64)  # which instruction's result CasADi's register holds
+    # For each of CasADi's registers, the instruction whose result it holds.
+    holds = np.zeros(most, np.int64)
     operands = np.full((count, 2), -1)
-    last = np.arange(count)  # where each result is used for the last time
+    # For each result, the instruction that uses it last.
+    last = np.arange(count)
     for k in range(count):
         op = steps[k, 0]
         if op != casadi.OP_CONST and op != casadi.OP_INPUT:
@@ -134,7 +139,8 @@ def _allocate_registers(steps: Any) -> tuple[Any, int]:  # pragma: no cover - co
             if read[j] >= 0 and last[read[j]] == k and not (j and read[0] == read[1]):
                 free[spare] = place[read[j]]
                 spare += 1
-        if steps[k, 0] != casadi.OP_OUTPUT and last[k] == k:  # a result that nothing uses
+        # A result that nothing uses frees its register at once.
+        if steps[k, 0] != casadi.OP_OUTPUT and last[k] == k:
             free[spare] = place[k]
             spare += 1
     return program, registers
@@ -147,7 +153,7 @@ def evaluate_blocks(
 
     Parameters
     ----------
-    stages : sequence of Vectorized
+    stages : sequence of BlockEvaluation
         The functions, of the carried values, the given ones and, last, the number of the part;
         or a single one of the given values alone.
     carried : sequence of array_like

@@ -78,7 +78,7 @@ def state_equations(
         for k in range(n):
             last = last - a[n - 1 - k] * x[k]
         return [*x[1:], last], x[0]
-    # Aligned with the powers of the denominator, the direct term first.
+    # The numerator is aligned with the powers of the denominator, the direct term first.
     b = [0.0] * (n + 1 - len(b)) + b
     y = (x[0] if n else 0.0) + b[0] * u
     after = [*x[1:], 0.0]

@@ -10,8 +10,10 @@ from scipy.integrate import DOP853
 
 from .equations import Equations, Lag
 
-Piece = tuple[Any, Any, Any]  # duration, input at its start, slope of the input
-SHARP = 8.0  # time constants after which the transient of a lag is over
+# A piece is its duration [s], the input at its start and the slope of the input.
+Piece = tuple[Any, Any, Any]
+# The transient of a lag is over after so many time constants.
+SHARP = 8.0
 
 
 @dataclass(frozen=True)

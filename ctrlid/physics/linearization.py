@@ -15,9 +15,12 @@ from .conversions import to_polynomials
 from .equations import Equations, require_siso
 from .trace import trace
 
-UNREACHABLE = 1e-12  # relative coupling below which a state is only round-off away from the input
-EQUILIBRIUM = 1e-9  # relative residual of an accepted equilibrium
-STARTS = 60  # starting points of the search for equilibria
+# A state with a smaller relative coupling is reached by rounding errors only.
+UNREACHABLE = 1e-12
+# An equilibrium is accepted if its residual is below this share of the terms that cancel there.
+EQUILIBRIUM = 1e-9
+# The search for equilibria starts from so many random points.
+STARTS = 60
 
 
 @dataclass(frozen=True)
@@ -134,7 +137,8 @@ def operating_point(
             known = any(np.allclose(solution, f, rtol=1e-6, atol=1e-9) for f in found)
             repeats = repeats + 1 if known else 0
             found.append(solution)
-            if guess is not None or repeats >= 15:  # the starts begin with the guess
+            # With a guess the first equilibrium is the wanted one, since the starts begin with it.
+            if guess is not None or repeats >= 15:
                 break
         elif closest is None or error < closest[0]:
             closest = (error, solution)
@@ -203,9 +207,8 @@ def _solve_equilibrium(
                 if np.abs(correction / scale).max() <= (1 - damping / 4) * size:
                     break
         z, jac = z - damping * step, next_jac
-    z = np.where(
-        np.abs(z) < max(1e-12 * np.abs(z).max(), 1e-20), 0.0, z
-    )  # what is at rest is at rest exactly
+    # A state that is at rest up to rounding is set to zero.
+    z = np.where(np.abs(z) < max(1e-12 * np.abs(z).max(), 1e-20), 0.0, z)
     f, jac = evaluate(z)
     if not np.isfinite(f).all():
         return None, np.inf
@@ -329,7 +332,8 @@ def _staircase(a: Array, b: Array) -> Array:
     block = b / max(float(np.linalg.norm(b)), np.finfo(float).tiny)
     size = max(float(np.linalg.norm(a)), np.finfo(float).tiny)
     while basis.shape[1] < n:
-        for _ in range(2):  # twice is enough (Kahan, Parlett)
+        # Orthogonalizing twice is enough (Kahan, Parlett).
+        for _ in range(2):
             block = block - basis @ (basis.T @ block)
         left, gains, _ = np.linalg.svd(block, full_matrices=False)
         new = left[:, gains > UNREACHABLE]

@@ -77,7 +77,7 @@ def _floor_mod(a: Any, b: Any) -> Any:
 
 
 def _round(a: Any, digits: int = 0) -> Any:
-    # Half to even, as Python and numpy round.
+    # Halves are rounded to even, as Python and numpy do.
     scaled = a * 10.0**digits
     low = casadi.floor(scaled)
     even = casadi.if_else(_floor_mod(low, 2) == 0, low, low + 1)
@@ -117,7 +117,8 @@ _DUNDERS = {
 def _binary(op: Function, swapped: bool) -> Function:
     def method(self: Symbol, other: Any) -> Any:
         if isinstance(other, np.ndarray):
-            return NotImplemented  # numpy's own loop comes back element by element
+            # Numpy's own loop then calls this method element by element.
+            return NotImplemented
         pair = (lift(other), self.sx) if swapped else (self.sx, lift(other))
         try:
             return Symbol(op(*pair))
@@ -194,7 +195,8 @@ def elementwise(op: Function) -> Function:
         out = np.empty(math.prod(shape), dtype=object)
         for k in range(out.size):
             out[k] = Symbol(op(*(lift(a[k]) for a in flat), **named))
-        if target is not None:  # x += 1 and np.sin(x, out=y)
+        # Operations in place, such as x += 1 and np.sin(x, out=y), name a target.
+        if target is not None:
             target[...] = out.reshape(shape)
             return target
         return out.reshape(shape).view(Symbols) if shape else out[0]

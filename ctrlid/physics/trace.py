@@ -18,8 +18,10 @@ from .equations import Equations
 from .symbols import Symbol, Symbols, TracingError, lift
 from .tracing import rebind
 
-CHECKS = 40  # random points at which the traced equations must agree with the Python function
-AGREEMENT = 1e-9  # relative; round-off apart the two are the same formula
+# Traced equations are compared with the Python function at so many random points.
+CHECKS = 40
+# A smaller relative difference is rounding; the two are the same formula.
+AGREEMENT = 1e-9
 
 
 def timebase(system: Any) -> float:
@@ -45,13 +47,15 @@ def _expressions(result: Any, rows: int, what: str) -> Any:
 def _run(system: Any, t: Any, x: Any, u: Any, p: Mapping[str, Any]) -> tuple[Any, Any]:
     """Trace one system: its (rhs, output) as CasADi columns for symbolic t, x, u."""
     known = getattr(system, "equations", None)
-    if isinstance(known, Equations):  # a plant with its effects, from Loop.system()
+    # A plant with its effects, from Loop.system(), brings its equations along.
+    if isinstance(known, Equations):
         values = [lift(p[name]) for name in known.parameters]
         function = casadi.Function("known", [known.t, known.x, known.u, known.p],
                                    [known.rhs, known.output])  # fmt: skip
         rhs, out = function(t, x, u, casadi.vertcat(*values) if values else casadi.SX(0, 1))
         return rhs, out
-    if isinstance(system, ct.StateSpace):  # also a linear interconnection
+    # A linear interconnection is a StateSpace as well.
+    if isinstance(system, ct.StateSpace):
         a, b, c, d = (casadi.sparsify(casadi.DM(m)) for m in
                       (system.A, system.B, system.C, system.D))  # fmt: skip
         return (
@@ -283,7 +287,8 @@ def _python_values(system: Any, t: float, x: Array, u: Array, params: Any) -> Ar
             out = system.output(t, x, u, *given)
         values = np.concatenate([np.ravel(rhs), np.ravel(out)])
     except (ArithmeticError, ValueError) as reason:
-        return str(reason)  # outside the domain, as math.sqrt says it
+        # Functions such as math.sqrt refuse values outside their domain.
+        return str(reason)
     if np.iscomplexobj(values):
         return "the values are complex"
     return np.asarray(values, dtype=float)

@@ -193,7 +193,8 @@ def _replace(obj: Any, memo: dict[int, Any]) -> Any:
         return _BUILTINS["float"]
     if isinstance(obj, types.FunctionType | types.MethodType | functools.partial):
         return rebind(obj, memo)
-    if hasattr(obj, "py_func"):  # a function compiled by numba keeps its source here
+    # A function compiled by numba keeps its Python function in this attribute.
+    if hasattr(obj, "py_func"):
         return rebind(obj.py_func, memo)
     return obj
 

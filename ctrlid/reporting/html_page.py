@@ -58,7 +58,8 @@ footer { margin-top: 3rem; color: var(--faint); font-size: 0.85rem; }
 """
 
 
-CLOSE = 600  # samples of a long record that are drawn one by one
+# So many samples of a long record are also drawn one by one.
+CLOSE = 600
 DIAGNOSIS = (
     "Output and errors where the gap is largest; RMS of the one-step errors along the two most "
     "telling quantities; the candidates by rounds of the search."

@@ -16,8 +16,10 @@ from ..diagnosis.result import Diagnosis
 from ..physics.trace import timebase
 from ..validation.comparison import Comparison
 
-WINDOW = 250  # samples of a comparison that can be told apart on a page
-BARS = 7  # candidates of a round that are drawn
+# So many samples of a comparison can be told apart on a page.
+WINDOW = 250
+# So many candidates of a round are drawn.
+BARS = 7
 LEAST = -10.0  # A net gain below says no more than this one.
 
 
@@ -158,7 +160,9 @@ def ranking(found: Diagnosis) -> dict[int, list[Bar]]:
     for finding in found.findings:
         own = [c for c in found.ranking
                if type(c.effect).__name__ == finding.name and value[id(c)] > 0]  # fmt: skip
-        if not own:  # read off the record itself, such as the steps of a converter
+        # An effect that was read off the record itself, such as the steps of a converter, has no
+        # bar.
+        if not own:
             continue
         best = max(own, key=lambda c: value[id(c)])
         kinds[id(best)] = "found"

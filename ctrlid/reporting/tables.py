@@ -120,7 +120,8 @@ def blocks(result: Any) -> list[Block]:
             return _redesign_blocks(result)
         case Diagnosis():
             return _diagnosis_blocks(result)
-    heading(result)  # refuses what has no page
+    # This refuses a result that no page can show.
+    heading(result)
     return []
 
 
@@ -265,7 +266,8 @@ def _diagnosis_blocks(found: Diagnosis) -> list[Block]:
         for c in found.ranking if np.isfinite(c.gain)
     )  # fmt: skip
     if tried:
-        width = 5 if any(row[-1] for row in tried) else 4  # remarks are rare
+        # The column of remarks is shown only where there are any.
+        width = 5 if any(row[-1] for row in tried) else 4
         heads = ("candidate", "round", "evidence", "penalty", "remark")[:width]
         rows = tuple(row[:width] for row in tried)
         made += [Title("What was tried"), Table(heads, rows, "The candidates that were refitted.")]

@@ -37,7 +37,8 @@ from .reproduction import (
 )
 from .residual_tests import Correlation, autocorrelation, cross_correlation, explained_share
 
-MEANINGFUL = 1e-6  # of the input's size: below, an injected signal is round-off
+# An injected signal below this share of the input's standard deviation is rounding.
+MEANINGFUL = 1e-6
 
 
 def compare(record: Record, model_or_loop: Any, *, horizon: int | None = None) -> Comparison:
@@ -179,7 +180,8 @@ def _run_with_noise(simulator: Simulator, stretch: Stretch, prediction: Predicti
     """Return the output of one run with the noise of a prediction, NaN where that cannot be."""
     unknown = np.full(len(stretch.d), np.nan)
     if not simulator.loop.equations().velocities:
-        return unknown  # the simulation has no place for the noise of the prediction
+        # A plant without a moving mass has no place for the force noise of the prediction.
+        return unknown
     streams = np.random.default_rng(0).standard_normal((2, len(stretch.d)))
     noise = [streams[0] * prediction.sensor_noise, streams[1] * prediction.force_noise]
     try:
@@ -294,7 +296,8 @@ def _ahead(
     for j in range(1, steps + 1):
         drive = np.concatenate([driven[j:], np.full(j, np.nan)])
         new = drive - sum((a * p for a, p in zip(den[1:], past, strict=True)), np.zeros(n))
-        for i in range(j, order + 1):  # errors after the origin are not known: their mean is zero
+        # Errors after the origin are not known, so that their mean, zero, stands for them.
+        for i in range(j, order + 1):
             new += noise[i] * np.concatenate([np.zeros(i - j), white[: n - (i - j)]])
         past = [new, *past][:order]
     ahead = np.full(n, np.nan)

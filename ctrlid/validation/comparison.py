@@ -10,9 +10,13 @@ from .._base.text import Printed
 from ..data.record import Record
 from .residual_tests import Correlation
 
-SYSTEMATIC = 0.05  # share of an error that follows the signals and is worth a word
-EXACT = 100 * (1 - 1e-9)  # a fit in percent beyond which the rest is round-off
-ENOUGH = 0.75  # of an error's variance: noise is not known better than this
+# A share of the error's variance that follows the signals is reported from here on.
+SYSTEMATIC = 0.05
+# Beyond this fit in percent the rest is rounding.
+EXACT = 100 * (1 - 1e-9)
+# If noise explains so much of an error's variance nothing is missing, since its size is known no
+# better.
+ENOUGH = 0.75
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,15 +11,23 @@ from ..loop.controller_replay import replay_controller
 from ..loop.loop import Loop
 from .residual_tests import explained_share
 
-MOST = 20_000  # samples that are replayed
-TRIAL = 4000  # samples replayed for each shift that is tried
-FEWEST = 20  # samples
-STEPS = (1, -1, 2, -2, 3, -3)  # samples by which a channel may be late
-EXACT = 1e-6  # share of u's variance that rounding and printing leave
-CLEARLY = 0.1  # of the unexplained share: a shift that leaves less is believed
-FOLLOWS = 0.2  # of what is left: above, it comes from r and y, so the law is another one
+# At most so many samples are replayed, which tell enough and take seconds.
+MOST = 20_000
+# Each shift of a channel is tried on so many samples only, to save time.
+TRIAL = 4000
+# Fewer samples do not tell whether a controller computed the input.
+FEWEST = 20
+# A channel may have been logged so many samples late, or early if negative.
+STEPS = (1, -1, 2, -2, 3, -3)
+# Rounding and printing leave at most this share of u's variance.
+EXACT = 1e-6
+# A shift is believed if it leaves less than this share of what was unexplained.
+CLEARLY = 0.1
+# If a larger share of what is left follows r and y, the controller is another one.
+FOLLOWS = 0.2
 
-Fact = tuple[str, str, float, bool]  # kind, words, unexplained share, harmful
+# A fact is its kind, its words, the unexplained share of u's variance, and whether it is harmful.
+Fact = tuple[str, str, float, bool]
 
 
 def check_controller(loop: Loop, record: Record) -> list[Fact]:

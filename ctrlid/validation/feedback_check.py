@@ -13,14 +13,22 @@ from ..data.record import Record
 from ..data.validity import whole_past
 from .residual_tests import Correlation, cross_correlation
 
-LEVEL = 1e-3  # chance of calling an open loop closed
-ORDER = 20  # most past samples of each signal
-LAGS = 8  # samples within which a controller shows itself
-MOST = 50_000  # rows of a regression
-NOTHING = 1e-7  # of a signal's spread: a remainder of rounding in a short regression
-ROUNDING = 1e-11  # of a signal's spread: what a long regression leaves of a signal without noise
-LAW = 6  # most past samples in an exact law
-TELLING = 0.01  # of what r and past u leave of u: if y takes all but this away, u is made from y
+# This is the probability of calling an open loop closed.
+LEVEL = 1e-3
+# Regressions use at most so many past samples of each signal.
+ORDER = 20
+# A controller shows itself within so many samples.
+LAGS = 8
+# More rows do not change what a regression says.
+MOST = 50_000
+# A remainder below this share of a signal's standard deviation is rounding of a short regression.
+NOTHING = 1e-7
+# A long regression leaves this share of the standard deviation of a signal without noise.
+ROUNDING = 1e-11
+# An exact controller is sought with at most so many past samples.
+LAW = 6
+# If y takes away all but this share of what r and past u leave of u, u is computed from y.
+TELLING = 0.01
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -216,7 +224,8 @@ def _left(
         beta = _solve(table * weight[:, None], goal * weight)
         left = goal - table @ beta
         goal = table @ beta + np.clip(left, -usual, usual)
-    if robust:  # clipped, it is no longer free of the past
+    # A clipped signal is no longer uncorrelated with the past, so that it is regressed once more.
+    if robust:
         left = goal - table @ _solve(table, goal)
     out = np.zeros(len(valid))
     out[rows] = left

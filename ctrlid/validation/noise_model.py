@@ -1,4 +1,4 @@
-"""The noise of a model that carries none: which colour its equation errors have."""
+"""A noise model fitted to the equation errors of a model that has none."""
 
 import numpy as np
 from scipy import optimize, signal
@@ -6,7 +6,8 @@ from scipy import optimize, signal
 from .._base.arrays import Array
 from .._base.statistics import reflect_into_circle
 
-SAMPLES = 20_000  # enough to tell the colour
+# So many samples of each stretch are enough to tell the colour of its noise.
+SAMPLES = 20_000
 
 
 def whiten_errors(equation_errors: Array, segments: list[tuple[int, int]], noise: Array) -> Array:

@@ -16,12 +16,19 @@ from .._base.text import Printed
 from ..data.record import Record
 from ..data.validity import whole_past
 
-LONGEST = 60  # lags of the long regression
-ROWS = 30_000  # that it uses at most
-SHARE = 2 / 3  # of the record that is fitted; the rest judges
+# The long regression has at most so many lags.
+LONGEST = 60
+# The long regression uses at most so many rows, which determine it well.
+ROWS = 30_000
+# This share of the record is fitted, and the rest judges.
+SHARE = 2 / 3
+# A weighted fit that needs more iterations does not converge.
 ITERATIONS = 20
-COSTS = 0.1  # of the one-step error: a difference that says something is wrong
-WHISPER = 1e-6  # of y's spread, added as noise: without any, a long regression has no one answer
+# A one-step error that differs by more than this share says that the choice is wrong.
+COSTS = 0.1
+# Noise of this share of y's standard deviation is added, since a long regression on noise-free
+# signals has no unique answer.
+WHISPER = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +44,7 @@ class OrderRow:
     p_value : float
         Probability of such a distance by chance if the structure is right.
     bic : float
-        Misfit plus a price for each coefficient; the smallest is best.
+        Misfit plus a penalty for each coefficient; the smallest is best.
     held_out : float
         Ratio: one-step error on the part of the record that was not fitted, over that of the long
         regression there.
@@ -224,7 +231,8 @@ def _regress(record: Record, start: int, stop: int, length: int, reach: int = 0)
     values = np.maximum(values, 1e-13 * values[0])
     inverse = (vt.T / values**2) @ vt / np.outer(size, size)
     eta = inverse @ (table.T @ goal)
-    eta = eta + inverse @ (table.T @ (goal - table @ eta))  # once refined
+    # One step of iterative refinement removes the rounding of the inverse.
+    eta = eta + inverse @ (table.T @ (goal - table @ eta))
     left = goal - table @ eta
     variance = float(left @ left) / (len(rows) - table.shape[1])
     return _Long(eta, variance * inverse[:-1, :-1], variance, len(rows), length)
@@ -240,7 +248,8 @@ def _length(record: Record, cut: int, most: int) -> int:
     scores = {}
     for n in sorted({most + 2, 10, 15, 20, 30, 40, longest}):
         if most + 2 <= n <= longest:
-            long = _regress(record, 0, cut, n, reach=longest)  # all on the same rows
+            # All lengths are compared on the same rows.
+            long = _regress(record, 0, cut, n, reach=longest)
             scores[n] = long.rows * np.log(long.variance) + 2 * bayesian_penalty(2 * n, long.rows)
     best = min(scores, key=lambda n: scores[n])
     return min(longest, max(best + 5, most + 4))

@@ -1,4 +1,4 @@
-"""audit(): what a colleague would say about a record before anything is fitted to it."""
+"""audit(): defects of a record, found before anything is fitted to it."""
 
 import math
 from collections.abc import Mapping
@@ -17,14 +17,22 @@ from ..loop.loop import Loop
 from . import signal_defects as defects
 from .controller_check import check_controller
 
-FEW = 50  # valid samples below which no fit says much
-STRETCH = 20  # in succession
-COARSE = 0.3  # quantisation step over spread that a fit of y would notice
+# With fewer valid samples no fit says much.
+FEW = 50
+# A fit needs at least so many valid samples in succession.
+STRETCH = 20
+# A quantization step above this share of y's standard deviation disturbs a fit.
+COARSE = 0.3
+# With fewer changes of the excitation there is little to average over.
 FEW_CHANGES = 4
-SURE = 2e-4  # chance of a drift that is still chance
-OWN = 0.01  # of u's variance that does not come from y: above, something is added to u
-ELSEWHERE = 100.0  # times where the loop rests, and y is something else or in other units
-LINE = 1e-5  # of the largest spectral line, above which there is another one
+# A drift that chance produces with a smaller probability is reported.
+SURE = 2e-4
+# If y does not explain more than this share of u's variance, something is added to u.
+OWN = 0.01
+# If y is so many times its value at rest, it is another signal or in other units.
+ELSEWHERE = 100.0
+# A spectral line counts if its power is above this share of the largest one's.
+LINE = 1e-5
 
 
 @dataclass(frozen=True)
@@ -174,7 +182,7 @@ def audit(record: Record, loop: Loop | None = None) -> Audit:
 
 
 class _Look:
-    """The looks at one record; what one finds, the next ones use."""
+    """The checks of one record; later ones use what earlier ones found."""
 
     def __init__(self, record: Record, limits: tuple[float, ...]) -> None:
         self.record, self.valid, self.stated = record, record.valid, limits
@@ -359,7 +367,8 @@ class _Look:
         changes = int(np.count_nonzero(moves))
         kind, size = "too little excitation", float(changes)
         if changes == 0:
-            if injected or key == "u":  # a constant u is said already
+            # A constant u is reported by the check for constant signals.
+            if injected or key == "u":
                 return []
             text = "r does not change while the record counts, and "
             share = defects.find_beyond_law(self.record.u, self.record.y, self.valid)

@@ -52,7 +52,8 @@ def moving_poles(loop: Loop) -> Any:
 
 def time_constant(poles: Any, dt: float, record: Record) -> int:
     """Return the slowest unstable, or else the slowest stable, time constant in samples."""
-    with np.errstate(divide="ignore", invalid="ignore"):  # a pole at z = 0 is infinitely fast
+    # A pole at z = 0 is infinitely fast, so that its logarithm is minus infinity.
+    with np.errstate(divide="ignore", invalid="ignore"):
         rates = (np.log(poles.astype(complex)) / dt if dt else poles).real
     fast = rates[rates > 1e-6] if np.any(rates > 1e-6) else -rates[rates < -1e-6]
     slowest = float(np.min(fast)) if fast.size else 10 / record.duration

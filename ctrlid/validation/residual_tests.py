@@ -11,10 +11,14 @@ from .._base.arrays import Array
 from .._base.statistics import fit_autoregression, lagged_products, portmanteau
 from ..data.validity import whole_past
 
-LEVEL = 0.99  # of the drawn bands and of the tests
-MEMORY = 1000  # longest correlation of residuals that is looked for [samples]
-MOST_ORDER = 40  # of the autoregression that describes their colour
-ROWS = 50_000  # of a regression: more add nothing to the few digits of a share
+# The bands and tests have this probability of covering what chance does.
+LEVEL = 0.99
+# Correlations of residuals are computed over at most so many samples.
+MEMORY = 1000
+# The autoregression that describes the colour of residuals has at most this order.
+MOST_ORDER = 40
+# More rows of a regression add nothing to the few digits of a share.
+ROWS = 50_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,7 +248,7 @@ def explained_share(
     past -= past.mean(axis=0)
     scale = np.linalg.norm(past, axis=0)
     past /= np.where(scale > 0, scale, 1.0)
-    # Through the normal matrix: the share needs few digits, the matrix is small.
+    # The share needs few digits, so that the small normal matrix is accurate enough.
     basis = past @ _whitening(past.T @ past, 1e-9)
     along = basis.T @ target
     left = target - basis @ along

@@ -20,9 +20,12 @@ from .comparison import SYSTEMATIC
 from .sampling_table import FAR, SamplingRow, SamplingSweep
 
 ESTIMATORS = ("fit_arx", "fit_iv", "fit_continuous")
+# By default a record is slowed down by these factors, evenly on a logarithmic scale.
 FACTORS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 50, 70, 100)
-FEWEST = 150  # samples that a decimated record keeps by default
-AGREES = 0.1  # of the largest pole: poles nearer than this are said to agree
+# By default a slower record keeps at least so many samples.
+FEWEST = 150
+# Poles agree if they are nearer than this share of the largest pole.
+AGREES = 0.1
 
 
 def sweep_sampling_period(

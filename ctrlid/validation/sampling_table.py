@@ -10,7 +10,8 @@ from .._base.errors import CtrlidError
 from .._base.text import Printed, listing, with_error
 from ..data.record import Record
 
-FAR = 10.0  # a disagreement beyond which it no longer matters how large it is
+# A relative difference beyond this is not told apart from a larger one.
+FAR = 10.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,13 +14,20 @@ from .._base.arrays import Array
 from .._base.statistics import lagged_products, regress
 from ..data.validity import find_runs, whole_past
 
-ENOUGH = 20_000  # samples from which a grid is read
-LEVELS = 12  # distinct values up to which a signal may be a staircase
-STUCK = 0.9  # of the samples on one value: whatever moves the signal is not seen
-SOME = 4  # equal extreme values that no continuous distribution gives
-QUIET = 8  # samples to either side that tell whether a spike stands alone
-BLOCKS = 40  # of which the means show a drift
-PLENTY = 100_000  # samples that tell how large a drift is; of longer records every k-th
+# So many samples are enough to find the grid of a quantized signal.
+ENOUGH = 20_000
+# A signal with at most so many distinct values may be a staircase.
+LEVELS = 12
+# A signal with more than this share of its samples on one value does not show what moves it.
+STUCK = 0.9
+# A continuous distribution does not give so many equal extreme values.
+SOME = 4
+# So many samples on either side tell whether a spike stands alone.
+QUIET = 8
+# A drift is tested on the means of at most so many blocks.
+BLOCKS = 40
+# So many samples tell how large a drift is; of longer records every k-th is used.
+PLENTY = 100_000
 
 
 def rounding_of(v: Array) -> float:
@@ -74,7 +81,7 @@ def grid_step(v: Array) -> float:
     finest = 250 * rounding_of(v)
     gaps = np.diff(values)
     step = float(gaps.min())
-    # Levels that all recur but are unevenly spaced: a converter behind a calibration curve.
+    # Levels that all recur but are unevenly spaced come from a converter with a calibration curve.
     uneven = float(np.median(gaps)) if len(values) < 0.1 * len(v) and again.all() else 0.0
     for _ in range(40):
         if step < finest:

@@ -17,6 +17,7 @@ from ..._base.errors import CtrlidError
 from ..identified_model import Structure
 from . import AbstractConstraint, Branch, Row
 
+# More combinations of branches are refused, since each is a quadratic program of its own.
 _MOST_CASES = 256
 
 
@@ -181,7 +182,8 @@ def _eliminate(shape: tuple[int, int], numbers: bytes) -> Elimination:
     offset[pivots] = work[:rank, p]
     directions[pivots] = -work[:rank][:, free]
     directions[free, np.arange(len(free))] = 1.0
-    directions += 0.0  # no negative zeros in what is printed
+    # Adding zero turns negative zeros, which would be printed, into zeros.
+    directions += 0.0
     index = np.array(pivots, dtype=np.intp)
     arrays = (offset, directions, index, free, work[:rank, :p], work[:rank, p])
     for array in arrays:

@@ -13,9 +13,12 @@ from . import Branch, Row
 from .branches import Infeasible, Rows
 from .quadratic_program import Cost, Solution, solve
 
+# Each sequence ends in a local minimum, so that so many random starts are tried.
 _STARTS = 12
+# A sequence that needs more quadratic programs does not converge.
 _ITERATIONS = 80
-_FEASIBLE = 1e-8  # relative to the size of the coefficients' own terms
+# A function or row holds if it is violated by less than this share of its own terms.
+_FEASIBLE = 1e-8
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,7 +26,8 @@ class _Functions:
     """All nonlinear functions as one vector ``c(theta)``: equalities first."""
 
     functions: tuple[tuple[str, Branch], ...]
-    typical: Array  # sizes of the coefficients, for the difference steps
+    # Sizes of the coefficients, by which the steps of the differences are scaled.
+    typical: Array
 
     def parts(self, theta: Array) -> tuple[Array, int, list[tuple[str, str]]]:
         """Values, the number of equalities, and for each its owner and its words."""

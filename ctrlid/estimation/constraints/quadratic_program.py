@@ -19,7 +19,8 @@ TOLERANCE = 1e-10
 """Absolute tolerance handed to the solver, in units where the largest violation is one."""
 
 
-_ROUNDS = 10  # exchanges of rows per row before the active set is given up
+# After so many exchanges for each row the search for the active set is given up.
+_ROUNDS = 10
 
 
 class NotExcited(Exception):

@@ -1,4 +1,4 @@
-"""Records made ready for the filter of a loop: signals, and where it starts and starts anew."""
+"""Records prepared for the filter of a loop: signals, initial state, and where it restarts."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -12,8 +12,10 @@ from ...loop.loop import Loop
 from ...physics.equations import Equations
 from ...physics.linearization import state_matrices
 
-FEWEST = 10  # valid samples, to say anything
-BRIDGE = 20  # samples that do not count and are bridged by the model; then it starts afresh
+# A record needs at least so many valid samples, or its noise cannot be estimated.
+FEWEST = 10
+# The model predicts across gaps of at most so many samples; after longer ones the filter restarts.
+BRIDGE = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +68,8 @@ def make_filter_data(loop: Loop, record: Record, begin: float = 0.0) -> FilterDa
     if abs(loop.dt - record.dt) > 1e-9 * loop.dt:
         raise CtrlidError(f"the loop is sampled at {loop.dt:g} s, the record at {record.dt:g} s; "
                           "give both the same period")  # fmt: skip
-    valid = np.array(record.valid)  # writable as any other: the compiled loop is compiled once
+    # The copy is writable as all other arrays are, so that the filter is compiled only once.
+    valid = np.array(record.valid)
     if np.count_nonzero(valid) < FEWEST:
         raise ModelCannotRun(
             f"a prediction needs at least {FEWEST} valid samples; the record has "
@@ -90,7 +93,7 @@ def prepare_for_loop(data: FilterData, loop: Loop) -> FilterData:
 
 
 def find_segment_starts(loop: Loop, record: Record) -> Any:
-    """Return at which samples the filter begins anew: at the start and in long gaps."""
+    """Return the samples at which the filter restarts: the first ones and those after long gaps."""
     e = loop.equations()
     poles = np.linalg.eigvals(state_matrices(e, loop.point)[0])
     fastest = np.max(np.abs(poles) if e.dt else np.exp(poles.real * loop.dt), initial=0.0)
@@ -108,9 +111,9 @@ def find_segment_starts(loop: Loop, record: Record) -> Any:
 
 
 def _start(loop: Loop, record: Record) -> tuple[Array, Array, float]:
-    """Return a state at the operating point that the first samples may overrule.
+    """Return an initial state at the operating point, uncertain enough for any record.
 
-    With its covariance relative to the sensor noise, and the size of that noise, roughly.
+    Its covariance is relative to the sensor noise, whose rough standard deviation comes last.
     """
     e, at = loop.equations(keep=True), loop.point
     y = record.y[record.valid]
@@ -128,5 +131,6 @@ def _start(loop: Loop, record: Record) -> tuple[Array, Array, float]:
 
 def state_at_rest(loop: Loop, e: Equations) -> tuple[float, ...]:
     """Return the state at rest, with effects at their neutral values taking part."""
-    own = len(e.states) - len(e.rest)  # those of effects stand behind, in an order of their own
+    # States of effects follow those of the plant and have their own values at rest.
+    own = len(e.states) - len(e.rest)
     return (*loop.point.states[:own], *e.rest)

@@ -18,10 +18,14 @@ from .filter_data import FilterData
 from .kalman_recursion import filter_pass
 from .sampled_plant import Linearized, SampledPlant, Trajectory
 
-SETTLED = 4.0  # times the usual variance: above, the start still dominates the prediction
-NEWTON = 6  # steps that unbend the curve of a sensor
-PASSES = 12  # at most, to let the trajectory settle
-STILL = 1e-3  # of the standard deviations: a trajectory that moves less has settled
+# While its variance exceeds so many times the median, a prediction depends on the initial state.
+SETTLED = 4.0
+# So many Newton steps invert the curve of a sensor.
+NEWTON = 6
+# A trajectory converges in two or three passes; after so many it is taken as it is.
+PASSES = 12
+# A trajectory that moves by less than this share of its standard deviation has converged.
+STILL = 1e-3
 
 
 @dataclass(frozen=True)
@@ -76,7 +80,8 @@ def run_filter(
     )  # fmt: skip
     error, variance, before, after, wide, slopes, disturbance = out
     counts = data.usable
-    with np.errstate(all="ignore"):  # a filter that lost the record says so later
+    # The caller reports a filter that lost the record, so that no warning is needed here.
+    with np.errstate(all="ignore"):
         sensor = np.sqrt(np.mean(error[counts] ** 2 / variance[counts]))
     return Filtered(error, variance, Trajectory(before, after, wide * sensor), slopes,
                     disturbance)  # fmt: skip
@@ -93,7 +98,8 @@ def first_guess(plant: SampledPlant, data: FilterData) -> Trajectory:
     n, e = len(data.record), plant.e
     rest = np.tile(plant.padded(data.start), (n, 1))
     seen, values = e.output, data.y
-    for _ in range(1 + len(e.lags)):  # behind a lag of the sensor is what it follows, nearly
+    # The state of a sensor's lag is nearly equal to what it follows.
+    for _ in range(1 + len(e.lags)):
         columns = casadi.jacobian(seen, e.x).sparsity().get_col()
         if len(columns) != 1 or casadi.depends_on(seen, casadi.vertcat(e.t, e.u)):
             break
@@ -112,7 +118,7 @@ def first_guess(plant: SampledPlant, data: FilterData) -> Trajectory:
 
 
 def _without_bend(plant: SampledPlant, seen: Any, x: Any, at: float, values: Array) -> Array:
-    """Return the state x that is seen as given values, by Newton's rule; else at rest."""
+    """Return the state x at which the output has given values, by Newton's method; else rest."""
     if casadi.is_equal(seen, x, 2):
         return values
     f = BlockEvaluation(casadi.Function("seen", [x, plant.e.p], [seen, casadi.jacobian(seen, x)]))
@@ -123,7 +129,8 @@ def _without_bend(plant: SampledPlant, seen: Any, x: Any, at: float, values: Arr
             height, slope = (part.ravel() for part in f(found, plant.e.values))
             found = found + (values - height) / slope
         left = np.abs(f(found, plant.e.values)[0].ravel() - values)
-    return np.where(left <= first, found, at)  # also where it is no number
+    # A comparison with NaN is false, so that failed samples keep the state at rest.
+    return np.where(left <= first, found, at)
 
 
 def settle_trajectory(
@@ -134,7 +141,7 @@ def settle_trajectory(
     at: Trajectory,
     passes: int = PASSES,
 ) -> tuple[Linearized, Filtered]:
-    """Linearize and filter until the trajectory no longer moves.
+    """Linearize and filter in turn until the trajectory has converged.
 
     Raises
     ------
@@ -163,7 +170,7 @@ def settle_trajectory(
 def _keep_inside(
     plant: SampledPlant, data: FilterData, theta: Array, at: Trajectory
 ) -> tuple[Trajectory, Linearized]:
-    """Linearize, with samples at which the plant is not defined pulled back to rest."""
+    """Linearize; samples at which the plant is not defined are set to the state at rest."""
     bad: Any = ~(np.isfinite(at.filtered) & np.isfinite(at.predicted)).all(axis=1)
     if not bad.any():
         lin = plant.linearize(data, theta, at)

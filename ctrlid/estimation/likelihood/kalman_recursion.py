@@ -10,6 +10,7 @@ from typing import Any
 import numba
 import numpy as np
 
+# A state beyond this size has lost the record, and its square would soon overflow.
 LARGE = 1e150
 
 
@@ -135,7 +136,7 @@ def filter_pass(
             wide[k, i] = np.sqrt(max(cov[i, i], 0.0))
         if coloured:
             disturbance[k] = x[n]
-        # Over one period.
+        # Estimate and covariance are carried over one period.
         for i in range(n):
             total = step[k, i]
             for j in range(n):

@@ -16,7 +16,9 @@ from .filter_data import FilterData, make_filter_data
 from .kalman_filter import Filtered, Noise, run_filter
 from .sampled_plant import Linearized, SampledPlant, Trajectory, make_sampled_plant
 
-QUIET = 1e-14  # of the output's size, squared: the least variance of the sensor noise
+# The sensor's variance is at least this share of the output's mean square, which keeps the
+# likelihood of a noise-free record finite.
+QUIET = 1e-14
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""The maximum of the likelihood: where a fit begins, how it climbs, and what is known there."""
+"""The maximum of the likelihood by Gauss-Newton steps, and the information matrix there."""
 
 import math
 from dataclasses import replace
@@ -14,18 +14,27 @@ from .kalman_filter import Noise, first_guess, settle_trajectory, settled_sample
 from .likelihood import Fit, Problem, evaluate, linearize_again, start_values
 from .noise_fit import LOG_STEP, choose_units, fit_noise, make_noise, take_logs, try_coloured_force
 
-ROUNDS = 25  # Gauss-Newton steps at most
-FAR = 3.0  # standard errors: after a longer step the trajectory is settled anew
-CLOSE = 0.02  # standard errors: a smaller step ends the search
-SHARES = tuple(3.0**-k for k in range(6))  # of a step, until the likelihood grows
-CURVED = 2  # of them, from where a second step may lead higher than the first began
-BEND = 30.0  # of log-likelihood: of steps that promise less, hardly a second one leads higher
-ELSEWHERE = 2.0  # of log-likelihood, that a noise far away must gain to go on from there
-NOTHING = 1e-3  # of log-likelihood: a step that promises less is not worth taking
+# A climb ends after at most so many Gauss-Newton steps.
+ROUNDS = 25
+# After a step of more standard errors the plant is linearized again along the new trajectory.
+FAR = 3.0
+# A climb has converged when its step is shorter than so many standard errors.
+CLOSE = 0.02
+# These shares of a step are tried in turn until the likelihood grows.
+SHARES = tuple(3.0**-k for k in range(6))
+# From so many of the longest shares a second step may lead higher along a curved ridge.
+CURVED = 2
+# A second step is tried only where the first one is expected to gain so much log-likelihood, since
+# it hardly ever helps elsewhere.
+BEND = 30.0
+# Noise found far away must gain so much log-likelihood before the climb goes on from there.
+ELSEWHERE = 2.0
+# A step that is expected to gain less log-likelihood is not worth its evaluation.
+NOTHING = 1e-3
 
 
 def begin_fit(problem: Problem, theta: Array | None = None, noise: Noise | None = None) -> Fit:
-    """Return the likelihood at a starting point, with settled trajectories.
+    """Return the likelihood at a starting point, along converged trajectories.
 
     Parameters
     ----------
@@ -103,7 +112,7 @@ def maximize(fit: Fit, rounds: int = ROUNDS, exact: bool = True) -> Fit:
 
 
 def refit_noise_size(fit: Fit) -> Fit:
-    """Return the fit climbed on from a noise sought over its whole range, if that is far better.
+    """Return the fit continued from the best noise of the whole range, if that is far better.
 
     A random force that stood for a wrong parameter at the start may have left no noise to the
     sensor, from where small changes lead nowhere.
@@ -123,7 +132,8 @@ def choose_noise(fit: Fit, always: bool = False) -> Fit:
         if always:
             raise
         return fit
-    # Two parameters more: worth trying out in full only if it gains at all.
+    # A coloured force has two parameters and is refitted only if it gains half their penalty at
+    # once.
     if not always and richer.value < fit.value + bayesian_penalty(1, fit.size):
         return fit
     richer = maximize(richer)

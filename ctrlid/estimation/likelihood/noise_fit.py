@@ -15,11 +15,16 @@ from .kalman_filter import Noise
 from .likelihood import Fit, Known, Problem, measure_noise
 from .sampled_plant import Linearized, SampledPlant
 
-LEAST = -24.0  # logarithm of the least force noise: below, only the start of the record counts
-MOST = 14.0  # and of the largest: above, the sensor is exact
-SLOWEST = 0.05  # of the longest record: the time constant of a coloured force
-LOG_STEP = 0.2  # of log variances, for derivatives
-BOWL = 0.05  # second derivative by a log variance above which a parabola tells how far it is
+# Logarithm of the least variance of a force, below which it affects only the start of a record.
+LEAST = -24.0
+# Logarithm of the largest variance of a force, above which the sensor counts as exact.
+MOST = 14.0
+# A coloured force with a time constant above this share of the record would be an offset.
+SLOWEST = 0.05
+# Derivatives by the logarithm of a variance are differences over this step.
+LOG_STEP = 0.2
+# Above this second derivative by a log variance, a parabola tells how far the minimum is.
+BOWL = 0.05
 
 
 def fit_noise(
@@ -50,7 +55,7 @@ def fit_noise(
 
 
 def choose_units(plant: SampledPlant) -> float:
-    """Return a ratio of force to sensor noise from which others are counted."""
+    """Return the reference ratio of force noise to sensor noise, by the sampling period."""
     return 1.0 / plant.loop.dt ** (2 if plant.e.velocities else 1)
 
 
@@ -133,7 +138,8 @@ def _newton(
         if gain < enough:
             break
         if bowl:
-            pull = turned + values * moved  # that the parabola leaves after this step
+            # This slope of the quadratic model is left after the step.
+            pull = turned + values * moved
             left = 0.5 * float(pull @ (pull / values)) + 2.25 * (gain - foreseen) ** 2 / foreseen
             if left < 0.5 * enough:
                 break
@@ -141,7 +147,7 @@ def _newton(
 
 
 def try_coloured_force(fit: Fit) -> Fit:
-    """Return the fit with a coloured force added, whether it pays or not."""
+    """Return the fit with a coloured force added, whether or not the BIC prefers it."""
     plant, dt = fit.plant, fit.plant.loop.dt
     best: Fit | None = None
     sizes = np.array([1e-2, 1.0]) * sum(fit.noise.force)

@@ -16,7 +16,8 @@ from .likelihood import Fit, effect_bounds, make_problem
 from .maximization import begin_fit, choose_noise, information, maximize, refit_noise_size
 from .physics_estimate import LoopEstimate, LoopFit
 
-UNSEEN = 1e-9  # relative eigenvalue of the information below which a direction is not in the data
+# A direction of which the scaled information has a smaller relative eigenvalue is not in the data.
+UNSEEN = 1e-9
 
 
 def fit_loop(

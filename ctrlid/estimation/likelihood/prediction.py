@@ -20,8 +20,10 @@ from .kalman_filter import Noise
 from .likelihood import make_problem
 from .maximization import begin_fit, maximize
 
-LEAD = 4  # horizons in which a filter's covariance settles
-STARTS = 300  # predictions whose spread is computed
+# The covariance of the filter has converged after so many horizons.
+LEAD = 4
+# The spread is averaged over about so many predictions, evenly over the record.
+STARTS = 300
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,8 +26,10 @@ from .transition_maps import (
 )
 
 FORGOTTEN = 200  # samples after which one looks whether backlash has forgotten how it began
-LASTING = 10  # samples: an error that stays moves the plant as far as noise of so many variances
-NEARLY = 0.01  # of the sensor's variance: how well what a lag shows is known where it is short
+# A lasting error of the input moves the plant as far as white noise of so many times its variance.
+LASTING = 10
+# What a short lag follows is known within this share of the sensor's variance.
+NEARLY = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,9 +53,11 @@ class Linearized:
     height: Array
     c: Array
     hp: Array
-    doubt: Array  # variance of the input, relative to the sensor's
+    # Variance of the input at each sample, relative to that of the sensor noise.
+    doubt: Array
     start: Array
-    spread: Array  # of the start: its covariance, relative to the sensor's variance
+    # Covariance of the initial state, relative to the variance of the sensor noise.
+    spread: Array
     trajectory: Trajectory
 
 
@@ -98,7 +102,7 @@ class SampledPlant:
         return SampledPlant(loop, names, self.hold, self.law is not None)
 
     def _period(self, stages: Sequence[BlockEvaluation], x: Array, *given: Any) -> list[Array]:
-        """Go through a period; return the state after it and its derivatives, by itself first."""
+        """Return the state after a period and its derivatives, those by the state first."""
         if not self.maps.carries:
             return evaluate_blocks(stages, [], [x, *given, 0])
         n = self.size
@@ -234,12 +238,12 @@ class SampledPlant:
 
 
 def _full(values: Array, n: int) -> Array:
-    """Repeat what does not depend on the sample."""
+    """Repeat values that are the same at all samples, so that there are n of them."""
     return values if values.shape[0] == n else np.repeat(values, n, axis=0)
 
 
 class InitialConditions:
-    """How the record of a plan's plant begins.
+    """The initial conditions of a plant at the start of a record.
 
     A lag begins near what it follows. A backlash may lie anywhere in its gap, and what a delay
     still holds is unknown: until it has passed, the input is uncertain.
@@ -313,7 +317,9 @@ class InitialConditions:
                 spread[k, k] = wide + min(moved, wide) + NEARLY
             else:
                 before = float(np.mean((target - start[k]) ** 2))
-                if alone:  # as far as the input moves within the lag's time, if it does not return
+                # Without restarts a lag is as far from its target as this moves within the time
+                # constant.
+                if alone:
                     start[k] = target[0, 0]
                     steps = float(np.var(np.diff(target[:, 0])))
                     before = min((1 + late / 2) * steps, 2 * float(np.var(target)))

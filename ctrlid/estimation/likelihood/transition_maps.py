@@ -22,15 +22,24 @@ from ...physics.interpreter import follow
 from ...physics.linearization import state_matrices
 from .filter_data import state_at_rest
 
-BUILT = 64  # structures whose maps are kept
-LONG = 3000  # instructions
-SLOW = 0.35  # rate times step up to which a step of order four is exact enough
-MOST_STEPS = 100  # of order eight in a period: more make an expression that takes minutes to build
-BRISK = 0.35  # of a lag's time constant: a step of order four that follows it exactly enough
-ROUGH = 0.7  # the same beside the kink of friction, where no formula is more exact
-FEW_STEPS = 3  # of order four, which cost less than one of order eight
-SHARP_STEPS = 6  # of order four in the transient of a short lag, where friction has a kink
-KINK_STEPS = 4  # of order four in a period where friction has a kink; twice as many beside a lag
+# The maps of so many structures are kept, which bounds memory.
+BUILT = 64
+# In an expression of more instructions the search for common parts costs more than it saves.
+LONG = 3000
+# A step of order four is accurate enough up to this product of step and fastest rate.
+SLOW = 0.35
+# More steps of order eight in a period make an expression that takes minutes to build.
+MOST_STEPS = 100
+# A step of order four follows a lag accurately if it is this share of its time constant.
+BRISK = 0.35
+# Beside the kink of friction this share is enough, since no formula is more accurate there.
+ROUGH = 0.7
+# So many steps of order four cost less than one of order eight.
+FEW_STEPS = 3
+# So many steps of order four resolve the transient of a short lag where friction has a kink.
+SHARP_STEPS = 6
+# So many steps of order four resolve the kink of friction in a period; a lag doubles them.
+KINK_STEPS = 4
 
 
 @dataclass(frozen=True)
@@ -95,7 +104,7 @@ class PeriodPlan:
 
 
 def choose_scheme(e: Equations, loop: Loop) -> Scheme:
-    """Return how a period is integrated: as cheaply as the plant and its lags allow."""
+    """Return the cheapest scheme that integrates a period of the plant accurately enough."""
     if e.dt:
         return Scheme(4, 1)
     hidden = [lag.state for lags in known_lags(e) for lag in lags]
@@ -114,7 +123,8 @@ def choose_scheme(e: Equations, loop: Loop) -> Scheme:
         few = max(KINK_STEPS if e.kinked else 1, math.ceil(rate / SLOW))
         if not driven:
             return Scheme(4, few)
-        if cut and e.kinked:  # no order is high enough for a kink
+        # A higher order does not help beside a kink.
+        if cut and e.kinked:
             return Scheme(4, few, (4, SHARP_STEPS))
         # What a lag of the input does is known exactly; the plant has to follow it.
         few = max(
@@ -246,7 +256,9 @@ def _followed(plan: PeriodPlan, t: Any, x: Any, p: Any, s: Any, kick: Any, u: An
     e, law, n = plan.equations, plan.law, len(plan.equations.states)
     assert law is not None
     noise = y - e.smoothed(t, x[:n], u, p, s)[1]
-    offset = u - law.apply(t, x[n:], r, y)[0]  # bias, injected signals, what xc does not know
+    # The offset holds the bias, injected signals and what the controller's state leaves
+    # unexplained.
+    offset = u - law.apply(t, x[n:], r, y)[0]
 
     def rate(tau: Any, z: Any) -> Any:
         seen = e.smoothed(t + tau, z[:n], u, p, s)[1] + noise

@@ -18,7 +18,8 @@ from ..identified_model import Estimate, IdentifiedModel, Structure
 from .prediction_error import Piece, Task, best_fit
 from .sampled_motion import Circuit
 
-FAST_CIRCUIT = 0.1  # dt times the fastest controller pole, above which u moves between samples
+# Above this product of dt and the controller's fastest pole, u moves visibly between samples.
+FAST_CIRCUIT = 0.1
 
 
 def fit_continuous(
@@ -139,7 +140,8 @@ def _circuit(controller: Any, records: Sequence[Record]) -> Circuit | None:
     if isinstance(controller, PID) or (
         isinstance(controller, ct.InputOutputSystem) and controller.dt not in (0, None)
     ):
-        return None  # digital: u is held and known
+        # A digital controller holds u, which is therefore known between the samples.
+        return None
     if controller is None:
         moves = input_motion(records)
         if moves > VISIBLE_MOTION:
@@ -181,7 +183,8 @@ def _pieces(records: Sequence[Record], order: int) -> tuple[Piece, ...]:
                 continue
             part = {"y": record.y[start:stop] - y0, "u": record.u[start:stop] - u0}
             if record.r is not None:
-                part["r"] = record.r[start:stop] - y0  # r - y keeps its absolute value
+                # The same level is taken off r and y, so that r - y keeps its value.
+                part["r"] = record.r[start:stop] - y0
             pieces.append(Piece(part, stop - start))
     if not pieces:
         raise CtrlidError("the record has no valid stretch long enough to predict anything; "

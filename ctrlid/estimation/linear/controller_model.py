@@ -19,7 +19,8 @@ from ..identified_model import Structure
 from .instruments import Piece, Signals
 from .regression import merge
 
-_HIGHEST = 4  # order up to which a controller is sought in the record
+# A controller is sought in the record up to this order.
+_HIGHEST = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,7 +193,7 @@ def loop_signals(
         return None
     found = []
     for i, piece in enumerate(pieces):
-        # From rest at the levels: what came before a stretch is not known.
+        # What came before a stretch is not known, so that it starts from rest at the mean levels.
         y, u = np.zeros_like(piece.y), np.zeros_like(piece.u)
         for n, w in zip(law.external, piece.w, strict=True):
             y += signal.lfilter(np.convolve(n, b), both, w)

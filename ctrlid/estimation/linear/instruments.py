@@ -18,7 +18,8 @@ from .regression import block_qr, merge
 
 Signals = list[tuple[Array, Array]]
 
-_LONGEST = 8192  # samples of the past that delayed references reach back to
+# Delayed references reach back by at most so many samples, which bounds the regression.
+_LONGEST = 8192
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,10 +26,14 @@ from .iv_equations import Moments, Residuals, Task, compute_moments, curved_forc
 from .prefilter import View, autoregression, stable_factor
 from .regression import check_orders, to_differences
 
-_MOST = 40  # iterations for one noise model
-_DEGREE = 3  # products of signals up to this degree
-_PATIENCE = 8  # of them in full steps
-_STARTS = 0.5 ** np.arange(1, 10)  # distance of the first prefilters' poles from z = 1
+# At most so many iterations are made for one noise model.
+_MOST = 40
+# Products of signals are estimated up to this degree, as a smooth plant near its equilibrium needs.
+_DEGREE = 3
+# So many iterations take full steps; later ones take half steps, since full ones may oscillate.
+_PATIENCE = 8
+# Distances from z = 1 of the poles of the first prefilters, from the widest band down.
+_STARTS = 0.5 ** np.arange(1, 10)
 
 
 def fit_iv(
@@ -182,8 +186,9 @@ def _refine(task: Task, known: Sequence[AbstractConstraint], law: Law | None) ->
         fit = _iterate(task, known, law, theta, view, count)
         count, theta, view = fit.iterations, fit.found.theta, fit.view
         if fit.moments.rss(theta) <= 1e-20 * fit.moments.size**2:
-            break  # nothing but rounding errors is left: there is no noise to model
-        # From white again, so that the order can fall as well as rise.
+            # Only rounding errors are left, so that there is no noise to model.
+            break
+        # The noise model starts from white again, so that its order can fall as well as rise.
         plain = replace(view, num=np.ones(1))
         better = autoregression([part.e for part in separate(task, theta, fit.hats, plain)])
         if view.degree < _DEGREE and _is_curved(task, fit, replace(view, num=better)):
@@ -277,7 +282,8 @@ def _iterate(
             kicks = curved_force(task, hats, view)
             simulated = loop_signals(task.pieces, law, task.structure, theta, kicks)
         if simulated is None and step >= _PATIENCE:
-            law = None  # the simulated loop comes and goes: stay without it
+            # The simulated loop is stable in some iterations only, so that it is given up for good.
+            law = None
         hats = task.delayed if simulated is None else simulated
         source = "delayed references" if simulated is None or law is None else law.source
         moments = compute_moments(task, hats, view)
@@ -295,7 +301,7 @@ def _iterate(
             return fit
         if view.degree > 1:
             view = _bent(task, fit)
-        # Full steps first; where they swing to and fro, half of them.
+        # The first iterations take full steps; where these oscillate, half of them converge.
         share = 1.0 if step < _PATIENCE else 0.5
         theta = theta + share * (found.theta - theta)
     view = _through(task, best, view)
@@ -352,7 +358,8 @@ def _sandwich(moments: Moments, found: Found, residuals: Sequence[Residuals]) ->
     p = len(moments.structure.names)
     upper = moments.factor[:p, :p]
     cost = moments.cost
-    slope = np.linalg.solve(cost.basis.T, cost.R.T).T  # R in the coefficients themselves
+    # This is R in the coefficients instead of the differenced basis.
+    slope = np.linalg.solve(cost.basis.T, cost.R.T).T
     middle = np.zeros((p, p))
     for part in residuals:
         g = np.linalg.lstsq(upper.T, (part.z * part.e[:, None]).T, rcond=None)[0].T

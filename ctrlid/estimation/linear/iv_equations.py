@@ -1,4 +1,4 @@
-"""Passes over the data: instruments against regressors, nuisances eliminated, in blocks."""
+"""The equations of instrumental variables from passes over the data, nuisances eliminated."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from .regression import block_qr, from_differences, merge, to_differences
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """What stays the same through all iterations.
+    """The data and orders of a fit, which stay the same through all iterations.
 
     Parameters
     ----------

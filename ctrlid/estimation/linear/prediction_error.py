@@ -18,9 +18,13 @@ from ..identified_model import Structure
 from .regression import block_qr, merge
 from .sampled_motion import Circuit, Flow, flow, prediction_errors, realize
 
-ROUNDS = 40  # Gauss-Newton steps
-CONVERGED = 1e-7  # of a standard error
-SLOWEST = 3  # over the samples of a stretch: how far inside the border an observer begins
+# A search ends after at most so many Gauss-Newton steps.
+ROUNDS = 40
+# A search has converged when a full step gains less than this share of the residual variance.
+CONVERGED = 1e-7
+# Observer poles stay so many over the samples of a stretch inside the unit circle, since the data
+# resolve no slower ones.
+SLOWEST = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,7 +184,7 @@ def _refine(
             delay = max(point.delay + (step[-1] if task.free_delay else 0.0), 0.0)
             trial = Point(point.theta + share * move, point.gain + step[: task.structure.na], delay)
             new, new_tables = _cost(task, trial)
-            # The first step may have to pay for the constraints.
+            # The first step may raise the cost, since it has to meet the constraints.
             if new < rss or (share == 1.0 and _violated(task, point, known) and np.isfinite(new)):
                 break
         else:

@@ -1,4 +1,4 @@
-"""The view that whitens: reflected poles, coloured noise, and the degree of a curved plant."""
+"""The prefilter that whitens residuals: reflected poles, coloured noise, curvature."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ class Circuit:
 
 @dataclass(frozen=True, eq=False)
 class Flow:
-    """The model over one period: ``x+ = f x + b0 u_k + b1 u_(k-1) + ...``, and ``y = c x``.
+    """The discretized model: ``x+ = f x + b0 u_k + b1 u_(k-1) + ...``, and ``y = c x``.
 
     With a circuit, x stacks plant and controller states and two more inputs follow those of u:
     the measured output and the reference.
@@ -83,7 +83,8 @@ def _exponential(matrix: Array) -> Array:
     squarings = max(0, int(np.ceil(np.log2(max(norm, 1e-300)))) + 2)
     scaled = matrix / 2.0**squarings
     total = term = np.eye(len(matrix))
-    for k in range(1, 15):  # 0.25^15/15! is below 1e-21
+    # The terms left out are below 0.25^15/15!, which is less than 1e-21.
+    for k in range(1, 15):
         term = term @ scaled / k
         total = total + term
     with np.errstate(over="ignore", invalid="ignore"):

@@ -1,1 +1,1 @@
-"""The parts of the command line: the story in two acts, and the diagnosis of a CSV file."""
+"""The parts of the command line: two demonstrations, and the diagnosis of a CSV file."""

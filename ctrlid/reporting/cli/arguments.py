@@ -69,7 +69,8 @@ def spoken_loop(args: argparse.Namespace, record: Record) -> Loop:
     _known(args.model, list(trace(model).parameters), [*values, *free])
     model = with_parameters(model, values) if values else model
     output = float(np.mean(record.y[record.valid])) if args.at_output is None else args.at_output
-    if isinstance(model, ct.TransferFunction | ct.StateSpace):  # it acts on deviations
+    # A linear model acts on deviations from the means of the record.
+    if isinstance(model, ct.TransferFunction | ct.StateSpace):
         at = OperatingPoint((), float(np.mean(record.u[record.valid])), output)
     else:
         at = operating_point(model, output=output)

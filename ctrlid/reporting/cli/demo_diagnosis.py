@@ -1,4 +1,4 @@
-"""The second act of the story: something is hidden in a record and found without being told."""
+"""The demonstration of a diagnosis: a hidden effect is found in a simulated record."""
 
 import math
 from collections.abc import Iterator
@@ -29,15 +29,23 @@ from ..html_page import Section
 from ..tables import Table
 
 TITLES = ("Something is hidden", "What is missing", "What it was")
-BALL, MAGNET = 0.0213, 3.34e-6  # kg, N m^2/V^2
-GAP, AMPLITUDE = 0.012, 3e-4  # m
-PERIOD = 0.002  # s
-HOLD = 50  # samples between tosses of the reference
-SENSOR_NOISE, FORCE_NOISE = 1e-5, 0.03  # m, m/s^2
-CROSSOVER, PHASE_MARGIN = 100.0, 50.0  # rad/s, deg
-LONGEST = 10_000  # samples: a diagnosis in seconds
-BELIEVED = 0.05  # how far off the magnet's constant is believed, relative
-# Ordinary sizes: what a student's apparatus has and a textbook leaves out.
+# Mass of the ball [kg] and constant of the magnet [N m^2/V^2], as in the paper.
+BALL, MAGNET = 0.0213, 3.34e-6
+# Gap at rest and size of the jumps of the reference [m].
+GAP, AMPLITUDE = 0.012, 3e-4
+# Sampling period [s].
+PERIOD = 0.002
+# The reference is tossed every so many samples.
+HOLD = 50
+# Standard deviations of the sensor noise [m] and of the random force [m/s^2].
+SENSOR_NOISE, FORCE_NOISE = 1e-5, 0.03
+# Demands on the lead: crossover [rad/s] and phase margin [deg].
+CROSSOVER, PHASE_MARGIN = 100.0, 50.0
+# A record of at most so many samples is diagnosed in seconds.
+LONGEST = 10_000
+# The magnet's constant is believed with this relative error.
+BELIEVED = 0.05
+# The sizes are ordinary ones, which a student's apparatus has and a textbook leaves out.
 HIDDEN: tuple[tuple[type[AbstractEffect], dict[str, tuple[float, float]]], ...] = (
     (CoulombFriction, {"fc": (0.1, 0.2)}),
     (ViscousFriction, {"c": (3.0, 8.0)}),

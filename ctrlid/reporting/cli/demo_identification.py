@@ -1,4 +1,4 @@
-"""The main job as a story on an embedded default: from physics to a redesign, with its failures."""
+"""The demonstration of identification: from physics to a redesign on a simulated ball."""
 
 import math
 import warnings
@@ -41,17 +41,26 @@ TITLES = (
     "What the noise explains",
     "A new controller from the model",
 )
-BALL, MAGNET, GRAVITY = 0.0213, 3.34e-6, 9.81  # kg, N m^2/V^2, m/s^2
-GAP = 0.03  # m
-PERIOD = 0.005  # s, the sampling period that the paper settled on
-CROSSOVER, PHASE_MARGIN = 130.0, 60.0  # of the controller in the experiment: rad/s, deg
-# Small enough that the magnet's square law stays out of the story, in which noise is the villain.
-AMPLITUDE = 5e-6  # m
-HOLD = 25  # samples between tosses: what a closed loop passes on is slow
-CLOSE = 5.0  # % of fit, by which two curves lie close together
-COMPARED = 15_000  # samples: more would cost seconds and say the same
-WANTED = (120.0, 50.0)  # of the redesign: rad/s, deg
-WORTH_A_WORD = 0.02  # relative error that is more than round-off and chance
+# Mass [kg], constant of the magnet [N m^2/V^2] and gravity [m/s^2] of the paper's apparatus.
+BALL, MAGNET, GRAVITY = 0.0213, 3.34e-6, 9.81
+# Gap at rest [m].
+GAP = 0.03
+# The paper settled on this sampling period [s].
+PERIOD = 0.005
+# Demands on the controller of the experiment: crossover [rad/s] and phase margin [deg].
+CROSSOVER, PHASE_MARGIN = 130.0, 60.0
+# The jumps of the reference [m] are so small that the magnet's square law does not matter.
+AMPLITUDE = 5e-6
+# The reference is tossed every so many samples, since a closed loop passes on slow motion only.
+HOLD = 25
+# Two curves lie close together if their fits differ by less than so many percent.
+CLOSE = 5.0
+# More samples would cost seconds and say the same.
+COMPARED = 15_000
+# Demands on the redesign: crossover [rad/s] and phase margin [deg].
+WANTED = (120.0, 50.0)
+# A relative error above this is more than rounding and chance.
+WORTH_A_WORD = 0.02
 
 Models = dict[str, IdentifiedModel]
 

@@ -1,4 +1,4 @@
-"""Figures, axes and the look that all pictures share."""
+"""Figures, axes and the style that all pictures share."""
 
 import io
 import sys
@@ -15,8 +15,10 @@ from ..._base.errors import CtrlidError
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 DASHES = ("-", "--", "-.", (0, (1, 1)), (0, (5, 1, 1, 1, 1, 1)), (0, (8, 3)))
 MARKERS = ("o", "s", "^", "D", "v", "P")
-MEASURED = {"color": "0.72", "linewidth": 3.2}  # broad and pale: what lies on it stays visible
-BINS = 1500  # a record is drawn as an envelope when it has more than twice as many samples
+# The measured curve is broad and pale, so that what lies on it stays visible.
+MEASURED = {"color": "0.72", "linewidth": 3.2}
+# A record of more than twice so many samples is drawn as an envelope of so many bins.
+BINS = 1500
 STYLE = {
     "axes.prop_cycle": cycler(color=COLOURS) + cycler(linestyle=DASHES),
     "axes.spines.top": False, "axes.spines.right": False, "axes.axisbelow": True,

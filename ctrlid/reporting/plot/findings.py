@@ -1,4 +1,4 @@
-"""What a diagnosis found."""
+"""The picture of a diagnosis: the gap, where the errors are, and the candidates."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -83,7 +83,8 @@ def _gap(above: Any, below: Any, found: Diagnosis) -> None:
     known = [e[np.isfinite(e)] for e in errors if np.isfinite(e).any()] or [np.zeros(1)]
     floored = np.isfinite(gap.floor) and gap.floor > 0
     fine, small = _pictures.scale([np.full(1, gap.floor)] if floored else known, gap.unit)
-    short = f" {small}" if gap.unit else ""  # that it is not given stands at the axis
+    # Where the unit is not known, only the label of the axis says so.
+    short = f" {small}" if gap.unit else ""
     if floored:
         below.axhspan(-2 * fine * gap.floor, 2 * fine * gap.floor, color="0.87", zorder=0,
                       label=f"±2 x noise floor, {fine * gap.floor:.3g}{short}")  # fmt: skip

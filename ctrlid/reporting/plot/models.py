@@ -137,7 +137,7 @@ def bode(models: Any, axes: Any = None, *, omega: Any = None, level: float | Non
         values = np.atleast_1d(model(np.exp(1j * w * dt) if dt else 1j * w))
         values = values * np.exp(-1j * w * delay_of(model))
         phase = np.degrees(np.unwrap(np.angle(values)))
-        # On the sheet of the first model; that one starts within (-270, 90].
+        # All phases are on the sheet of the first model, which starts within (-270, 90] degrees.
         turn = (
             np.floor((phase[0] + 270) / 360)
             if sheet is None

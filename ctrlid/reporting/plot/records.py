@@ -1,4 +1,4 @@
-"""Experiments, and models against them."""
+"""Pictures of a record, of a comparison with it, and of residual correlations."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -216,7 +216,8 @@ def _trace(ax: Any, record: Record, values: Array, i: int, label: str, held: boo
         style = {**line_style(i), "linestyle": DASHES[i == 1]}
         ax.plot(record.t, values, drawstyle=where, label=label.strip(), **style)
         return
-    bounded = held and i == 1  # of the reference the border alone, so that the output shows through
+    # Only the border of a reference is drawn, so that the output shows through.
+    bounded = held and i == 1
     edges = np.linspace(0, n, (BINS // 15 if bounded else BINS) + 1).astype(int)[:-1]
     low, high = np.minimum.reduceat(values, edges), np.maximum.reduceat(values, edges)
     t, label = record.t[edges], f"{label.strip()}, range"

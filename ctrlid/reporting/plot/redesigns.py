@@ -90,5 +90,5 @@ def _step(ax: Any, redesign: Redesign) -> float:
     ax.set_ylabel("output per step\nof the reference [1]")
     finish(ax, columns=1)
     last = float(redesign.time[-1])
-    # Long enough to see the promise kept or broken, short enough to see how.
+    # The axis is long enough to see whether the promise is kept and short enough to see how.
     return min(last, max(3 * max(settled), 20 * redesign.loop.dt)) if settled else last
