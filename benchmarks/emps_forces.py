@@ -65,7 +65,7 @@ def main() -> None:
         published = published.with_effect(effect)
     # The phase of a ripple is private to a record.
     fitted = fit_base_model(found.loop, [record], ())
-    (moved,) = choose_fresh_data(model, [], [pulses]).loops(fitted)
+    (moved,) = choose_fresh_data(model, [], [pulses]).prepare_loops(fitted)
     print("\nforce error below 50 Hz [%]          estimation      pulses   inverse model")
     for name, there, here in (("published symmetric model", published, published),
                               ("with the effects", found.loop, moved)):  # fmt: skip

@@ -232,7 +232,7 @@ def emps():
 def averaged(record, factor):
     """Return a record with the means of blocks of its samples, whatever the version calls it."""
     try:
-        from ctrlid.validation.sampling_sweep import averaged as means
+        from ctrlid.validation.sampling_sweep import average_input as means
     except ImportError:
         from ctrlid.sampling import averaged as means
     return means(record, factor)

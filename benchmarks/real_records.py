@@ -16,7 +16,7 @@ import numpy as np
 
 import ctrlid as cid
 from ctrlid import effects
-from ctrlid.validation.sampling_sweep import averaged
+from ctrlid.validation.sampling_sweep import average_input
 
 G = 9.81  # m/s^2
 LEVELS = (0.008, 0.010, 0.012, 0.014)  # of the swings of the INTECO ball [m]
@@ -199,7 +199,7 @@ def servo() -> list[cid.LoopFit]:
         e = cid.fit_continuous(record, 2, constraints=[cid.Integrator()]).estimate
         line(f"{label}, linear", pm(e["a1"], e.standard_errors[0]),
              pm(e["b1"], e.standard_errors[2]), free, widths=(30, 16, 16, 18, 14, 14))  # fmt: skip
-        record = averaged(record, 10)
+        record = average_input(record, 10)
         loop = cid.Loop(
             cid.plants.servo(m=1.0, c=30.0, k=180.0), None, dt=record.dt, free=("c", "k"),
             at=cid.OperatingPoint((0.0, 0.0), 0.0, 0.0),

@@ -61,7 +61,7 @@ from ctrlid import effects
 from ctrlid.diagnosis.candidates import contains
 from ctrlid.diagnosis.fitted_model import Model
 from ctrlid.diagnosis.recalibration import fit_base_model
-from ctrlid.diagnosis.thresholds import THRESHOLD, varied
+from ctrlid.diagnosis.thresholds import THRESHOLD, vary_numbers
 from ctrlid.effects import CATALOGUE, AbstractEffect, equivalents
 
 KINDS = ("named", "none", "outside", "two", "three", "lookalike", "inside")
@@ -718,7 +718,7 @@ def run(
         if limit:
             signal.signal(signal.SIGALRM, _too_long)
             signal.alarm(limit)
-        with varied(**numbers):
+        with vary_numbers(**numbers):
             found = cid.diagnose(believed, case.record, catalogue=case.catalogue, progress=False)
         signal.alarm(0)
         row.seconds = time.perf_counter() - started

@@ -39,8 +39,12 @@ from scipy.signal import lfilter
 
 import ctrlid as cid
 from ctrlid.estimation.identified_model import Estimate
-from ctrlid.estimation.likelihood.likelihood import evaluate, make_problem, pseudo_inverse
-from ctrlid.estimation.likelihood.maximization import begin_fit, choose_noise, information
+from ctrlid.estimation.likelihood.likelihood import (
+    evaluate_likelihood,
+    make_problem,
+    pseudo_inverse,
+)
+from ctrlid.estimation.likelihood.maximization import begin_fit, choose_noise, compute_information
 
 STEPS = (0.5, 0.2, 0.1, 0.03, 0.01, 0.005)
 NOISES = (0.01, 0.05, 0.2)
@@ -144,8 +148,8 @@ def information_bound(loop: cid.Loop, record: cid.Record) -> np.ndarray:
     start = begin_fit(make_problem(loop, names, [record]))
     fit = choose_noise(start)
     if fit.theta is not start.theta:  # the choice of the noise may have moved the parameters
-        fit = evaluate(start.problem, start.theta, fit.noise, fit.trajectories)
-    inverse = pseudo_inverse(information(fit)[0])
+        fit = evaluate_likelihood(start.problem, start.theta, fit.noise, fit.trajectories)
+    inverse = pseudo_inverse(compute_information(fit)[0])
     return np.sqrt(np.diag(inverse)[: len(names)])
 
 

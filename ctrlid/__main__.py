@@ -18,9 +18,9 @@ from ._base.errors import CtrlidError
 from .diagnosis import Diagnosis
 from .reporting import plot
 from .reporting.cli.demo_diagnosis import TITLES as SECOND
-from .reporting.cli.demo_diagnosis import second_act
-from .reporting.cli.demo_identification import TITLES, story
-from .reporting.cli.diagnose_command import add_parser, new_folder
+from .reporting.cli.demo_diagnosis import tell_diagnosis
+from .reporting.cli.demo_identification import TITLES, tell_identification
+from .reporting.cli.diagnose_command import add_parser, make_folder
 from .reporting.html_page import Section, write_report
 from .reporting.tables import Table
 
@@ -45,7 +45,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         0; 1 after a refusal, which is on stderr in one line; 130 after Ctrl-C. A wrong usage exits
         with 2.
     """
-    args = _parser().parse_args(arguments)
+    args = _make_parser().parse_args(arguments)
     try:
         code: int = args.run(args)
         sys.stdout.flush()
@@ -62,7 +62,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return code
 
 
-def _parser() -> argparse.ArgumentParser:
+def _make_parser() -> argparse.ArgumentParser:
     """Return the parser; without a command the story is told."""
     parser = argparse.ArgumentParser(
         prog="ctrlid",
@@ -75,13 +75,13 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"ctrlid {__version__}")
     parser.add_argument(
         "--seed",
-        type=_natural,
+        type=_parse_natural,
         default=1,
         help="of reference, noise and what is hidden (%(default)s)",
     )
-    parser.add_argument("--samples", type=_samples, default=45_000, metavar="N",
+    parser.add_argument("--samples", type=_parse_samples, default=45_000, metavar="N",
                         help="length of the experiment (%(default)s)")  # fmt: skip
-    parser.add_argument("--noise", type=_share, default=0.1, metavar="SHARE",
+    parser.add_argument("--noise", type=_parse_share, default=0.1, metavar="SHARE",
                         help="standard deviation of the sensor noise, as a share of the jump "
                         "of the reference (%(default)s)")  # fmt: skip
     parser.add_argument("--output", type=Path, metavar="DIR",
@@ -89,23 +89,23 @@ def _parser() -> argparse.ArgumentParser:
                         "where that exists")  # fmt: skip
     parser.add_argument("--quiet", action="store_true", help="no progress on the terminal")
     add_parser(parser.add_subparsers(title="commands", metavar="COMMAND"))
-    parser.set_defaults(run=_tell)
+    parser.set_defaults(run=_tell_stories)
     return parser
 
 
-def _natural(text: str) -> int:
+def _parse_natural(text: str) -> int:
     if not text.isdecimal():
         raise argparse.ArgumentTypeError(f"needs a whole number from 0; given {text}")
     return int(text)
 
 
-def _samples(text: str) -> int:
+def _parse_samples(text: str) -> int:
     if not text.isdecimal() or int(text) < FEWEST:
         raise argparse.ArgumentTypeError(f"needs at least {FEWEST} samples; given {text}")
     return int(text)
 
 
-def _share(text: str) -> float:
+def _parse_share(text: str) -> float:
     try:
         value = float(text)
     except ValueError:
@@ -115,21 +115,21 @@ def _share(text: str) -> float:
     return value
 
 
-def _tell(args: argparse.Namespace) -> int:
-    folder = new_folder(args.output, "--output", FOLDER)
+def _tell_stories(args: argparse.Namespace) -> int:
+    folder = make_folder(args.output, "--output", FOLDER)
     sections = []
-    first = story(samples=args.samples, noise=args.noise, seed=args.seed)
-    chapters = itertools.chain(first, second_act(samples=args.samples, seed=args.seed))
+    first = tell_identification(samples=args.samples, noise=args.noise, seed=args.seed)
+    chapters = itertools.chain(first, tell_diagnosis(samples=args.samples, seed=args.seed))
     titles = (*TITLES, *SECOND)
     try:
         # With disable=None the bar is silent where stderr is no terminal.
         with tqdm(total=len(titles), disable=args.quiet or None, leave=False, unit="step") as bar:
             for number, title in enumerate(titles, 1):
                 bar.set_description(title)
-                section = _saved(next(chapters), number, folder)
+                section = _save_figures(next(chapters), number, folder)
                 sections.append(section)
                 with tqdm.external_write_mode():
-                    print(_text(section, number))
+                    print(_write_text(section, number))
                 bar.update()
         title = "An unstable plant, identified and diagnosed in closed loop"
         report = write_report(sections, folder / "report.html", title=title)
@@ -142,7 +142,7 @@ def _tell(args: argparse.Namespace) -> int:
     return 0
 
 
-def _saved(section: Section, number: int, folder: Path) -> Section:
+def _save_figures(section: Section, number: int, folder: Path) -> Section:
     """Write the figures of a section as files; the section keeps their bytes for the report."""
     figures = {caption: plot.png(figure) for caption, figure in section.figures.items()}
     several = len(figures) > 1
@@ -153,7 +153,7 @@ def _saved(section: Section, number: int, folder: Path) -> Section:
     return replace(section, figure=figures)
 
 
-def _text(section: Section, number: int) -> str:
+def _write_text(section: Section, number: int) -> str:
     lines = [f"{number}. {section.title}"]
     for paragraph in filter(None, section.text.split("\n\n")):
         lines += [textwrap.fill(paragraph, WIDTH, break_on_hyphens=False), ""]

@@ -20,7 +20,7 @@ import numpy as np
 from scipy import optimize
 
 import ctrlid as cid
-from ctrlid.validation.sampling_sweep import averaged
+from ctrlid.validation.sampling_sweep import average_input
 
 # %%
 # What to use of the record
@@ -33,7 +33,7 @@ from ctrlid.validation.sampling_sweep import averaged
 
 raw = cid.datasets.load("inteco_pid_step")
 stretch = replace(raw, valid=np.ones(len(raw), dtype=bool)).between(2.0, 18.0)
-record = averaged(stretch, 10)
+record = average_input(stretch, 10)
 
 plant = cid.plants.maglev(m=0.058, K=0.058 * 9.81 * 0.012**2 / 0.42**2)
 at = cid.operating_point(plant, output=0.012)

@@ -16,7 +16,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import ctrlid as cid
-from ctrlid.validation.sampling_sweep import averaged
+from ctrlid.validation.sampling_sweep import average_input
 
 # %%
 # Mains hum in the sensor
@@ -25,7 +25,7 @@ from ctrlid.validation.sampling_sweep import averaged
 # sample, with the mean of the input in between, where the line matters less.
 
 record, other = (
-    averaged(cid.datasets.load(f"servo_{k}"), 10) for k in ("swept_sine", "random_steps")
+    average_input(cid.datasets.load(f"servo_{k}"), 10) for k in ("swept_sine", "random_steps")
 )
 
 

@@ -180,7 +180,7 @@ def test_printed_digits_are_a_step_but_no_news():
 def test_levels_of_a_calibrated_converter():
     raw = np.round(np.random.default_rng(5).standard_normal(5000) * 30)
     y = np.exp(raw / 500)  # evenly spaced in counts, not in units
-    assert defects.grid_step(y) == pytest.approx(1 / 500, rel=0.1)
+    assert defects.find_grid_step(y) == pytest.approx(1 / 500, rel=0.1)
 
 
 @pytest.mark.parametrize("lag", [1, 2, -1, -2])
@@ -269,11 +269,11 @@ def test_repeats():
         n, times = int(rng.integers(20, 2000)), int(rng.integers(2, 6))
         r = np.tile(np.cumsum(rng.standard_normal(n)), times)
         r = np.append(r, r[: n // 3]) + 3e-4 * np.std(r) * rng.standard_normal(len(r) + n // 3)
-        assert defects.period(r) == n
+        assert defects.find_period(r) == n
     for _ in range(100):
         n = int(rng.integers(50, 5000))
-        assert defects.period(np.cumsum(rng.standard_normal(n))) == 0
-        assert defects.period(np.repeat(rng.standard_normal(n // 10 + 1), 10)[:n]) == 0
+        assert defects.find_period(np.cumsum(rng.standard_normal(n))) == 0
+        assert defects.find_period(np.repeat(rng.standard_normal(n // 10 + 1), 10)[:n]) == 0
 
 
 def test_excitation():

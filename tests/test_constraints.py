@@ -16,10 +16,10 @@ from ctrlid.estimation.constraints import (
 )
 from ctrlid.estimation.constraints.branches import (
     Infeasible,
-    cases,
-    eliminate,
+    eliminate_equalities,
     explain_conflict,
-    possible,
+    is_possible,
+    list_cases,
 )
 from ctrlid.estimation.identified_model import Structure
 
@@ -130,16 +130,18 @@ def test_row_in_words_without_weights():
 
 
 def test_elimination_is_exact_in_small_integers():
-    e = eliminate(np.array([[0, 1.0, 0, 0], [1, 1, 0, 0], [0, 0, 1, -1]]), np.array([1.0, -1, 0]))
+    e = eliminate_equalities(
+        np.array([[0, 1.0, 0, 0], [1, 1, 0, 0], [0, 0, 1, -1]]), np.array([1.0, -1, 0])
+    )
     theta = e.snap(np.array([0.1, 0.2, 0.3, 0.7]))
     np.testing.assert_array_equal(theta, [-2.0, 1.0, 0.7, 0.7])
 
 
 def test_elimination_drops_repetitions_and_finds_contradictions():
     row = np.array([[1.0, 2.0], [2.0, 4.0]])
-    assert len(eliminate(row, np.array([1.0, 2.0])).pivots) == 1
+    assert len(eliminate_equalities(row, np.array([1.0, 2.0])).pivots) == 1
     with pytest.raises(Infeasible):
-        eliminate(row, np.array([1.0, 3.0]))
+        eliminate_equalities(row, np.array([1.0, 3.0]))
 
 
 # -- contradictions ------------------------------------------------------------------------------
@@ -181,7 +183,7 @@ def test_elimination_drops_repetitions_and_finds_contradictions():
     ],
 )
 def test_a_smallest_contradicting_set_is_named(constraints, core):
-    assert not possible(constraints, Z2)
+    assert not is_possible(constraints, Z2)
     text = explain_conflict(constraints, Z2)
     assert text.startswith(f"These constraints contradict each other: {core}")
     assert "Drop one of them or loosen it." in text
@@ -206,8 +208,8 @@ def test_a_constraint_that_contradicts_itself():
 
 def test_bounds_that_just_touch_are_possible():
     constraints = [cid.Bounds("a1", upper=-2.0), cid.Linear({"a1": 3.0}, lower=-6.0)]
-    assert possible(constraints, Z2)
-    assert not possible([*constraints, cid.Fixed("a1", -2.000001)], Z2)
+    assert is_possible(constraints, Z2)
+    assert not is_possible([*constraints, cid.Fixed("a1", -2.000001)], Z2)
 
 
 # -- refusals ------------------------------------------------------------------------------------
@@ -255,7 +257,7 @@ def test_bad_arguments_are_refused(make, words):
 )
 def test_constraints_that_do_not_fit_the_model_are_refused(constraint, structure, words):
     with pytest.raises(CtrlidError, match=words):
-        cases([constraint], structure)
+        list_cases([constraint], structure)
 
 
 @pytest.mark.parametrize(
@@ -282,9 +284,9 @@ def test_two_searches_at_a_time_are_refused():
     with pytest.raises(
         CtrlidError, match=r"ReciprocalPoles\(\) and SymmetricPoles\(\) each search"
     ):
-        cases([cid.ReciprocalPoles(), cid.SymmetricPoles()], Z3)
+        list_cases([cid.ReciprocalPoles(), cid.SymmetricPoles()], Z3)
     # With two poles nothing is searched for, and both say the same.
-    assert possible([cid.ReciprocalPoles(), cid.SymmetricPoles()], Z2)
+    assert is_possible([cid.ReciprocalPoles(), cid.SymmetricPoles()], Z2)
 
 
 def test_too_many_branches_are_refused():
@@ -293,4 +295,4 @@ def test_too_many_branches_are_refused():
             return [Branch([Row({"a1": 1.0}, upper=0.0)])] * 20
 
     with pytest.raises(CtrlidError, match="branch into more than 256 quadratic programs"):
-        cases([Either(), Either()], Z2)
+        list_cases([Either(), Either()], Z2)

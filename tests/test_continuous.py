@@ -17,9 +17,9 @@ from ctrlid import CtrlidError, plot
 from ctrlid.estimation.linear.sampled_motion import (
     Circuit,
     _exponential,
-    flow,
-    prediction_errors,
-    realize,
+    compute_prediction_errors,
+    discretize_model,
+    realize_model,
 )
 
 ALPHA, BETA = 1635.0, 6.54
@@ -93,13 +93,15 @@ def test_the_search_reaches_the_minimum_at_short_periods():
     """A search that slides along the border of unstable observers stops up to 3 errors short."""
     dt = 0.005 / POLE
     loop = loop_at(dt)
-    motion = flow(*realize(np.array([1.0, 0.0, -ALPHA]), np.array([-BETA]), POLE), dt, "zoh")
+    motion = discretize_model(
+        *realize_model(np.array([1.0, 0.0, -ALPHA]), np.array([-BETA]), POLE), dt, "zoh"
+    )
     poles = np.exp([-POLE * dt, -POLE * dt * 1.001])  # the observer of pure sensor noise
     gain = signal.place_poles(motion.f.T, motion.c[:, None], poles).gain_matrix[0]
     for seed in (1, 2):
         record = experiment(loop, n=15_000, seed=seed, hold=0.01, sensor_noise=5e-6)
         e = cid.fit_continuous(record, 2, constraints=SYMMETRIC).estimate
-        truth, _ = prediction_errors(motion, gain, {"u": record.u, "y": record.y})
+        truth, _ = compute_prediction_errors(motion, gain, {"u": record.u, "y": record.y})
         assert e.rss < float(np.sum(truth**2))
 
 
@@ -282,12 +284,14 @@ def test_the_matrix_exponential_equals_scipys():
 
 def test_an_absurd_trial_of_the_search_is_no_warning():
     """A step that makes the plant explode within a period has no prediction, and says nothing."""
-    a, b, c = realize(np.array([1.0, -1e16, 0.0]), np.array([1.0]), 1.0)
+    a, b, c = realize_model(np.array([1.0, -1e16, 0.0]), np.array([1.0]), 1.0)
     for motion in (
-        flow(a, b, c, 0.1, "zoh"),
-        flow(a, b, c, 0.1, "foh"),
-        flow(a, b, c, 0.1, "zoh", 0.03),
-        flow(a, b, c, 0.1, "zoh", 0.0, Circuit(np.array([[-1.0]]), np.ones(1), np.ones(1), 2.0)),
+        discretize_model(a, b, c, 0.1, "zoh"),
+        discretize_model(a, b, c, 0.1, "foh"),
+        discretize_model(a, b, c, 0.1, "zoh", 0.03),
+        discretize_model(
+            a, b, c, 0.1, "zoh", 0.0, Circuit(np.array([[-1.0]]), np.ones(1), np.ones(1), 2.0)
+        ),
     ):
         signals = {name: np.zeros(50) for name in "yur"}
-        assert prediction_errors(motion, np.zeros(2), signals)[0] is None
+        assert compute_prediction_errors(motion, np.zeros(2), signals)[0] is None

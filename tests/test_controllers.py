@@ -13,7 +13,7 @@ from scipy import signal
 
 import ctrlid as cid
 from ctrlid import PID, CtrlidError
-from ctrlid.loop.controllers import control_law
+from ctrlid.loop.controllers import make_control_law
 
 AT = cid.OperatingPoint((0.0,), 2.0, 1.0)
 DT = 0.5
@@ -21,7 +21,7 @@ DT = 0.5
 
 def run(controller, r, y, at=AT, dt=DT):
     """Step a controller through sequences of reference and output, from rest."""
-    law = control_law(controller, at, dt)
+    law = make_control_law(controller, at, dt)
     x, w = casadi.SX.sym("x", len(law.rest)), casadi.SX.sym("w", 3)
     u, after = law.apply(w[0], x, w[1], w[2])
     step = casadi.Function("step", [x, w], [casadi.vertcat(after), u])
@@ -212,8 +212,8 @@ def test_numbers_and_unspecified_periods():
     np.testing.assert_allclose(run(4, R, YR), 2 + 4 * (R - YR))
     open_period = ct.tf([2.0, -1.4], [1.0, -0.3], True)
     np.testing.assert_allclose(run(open_period, R, YR), lead_by_hand(R, YR))
-    assert control_law(open_period, AT, DT).dt == DT
-    assert control_law(ct.tf([1], [1, 1]), AT, DT).dt == 0.0
+    assert make_control_law(open_period, AT, DT).dt == DT
+    assert make_control_law(ct.tf([1], [1, 1]), AT, DT).dt == 0.0
 
 
 def test_leading_zeros_do_not_make_a_controller_improper():
@@ -261,7 +261,7 @@ def test_pid_refuses(fields, words):
 )
 def test_control_law_refuses(controller, words):
     with pytest.raises(CtrlidError, match=words):
-        control_law(controller, AT, DT)
+        make_control_law(controller, AT, DT)
 
 
 REPLAY = cid.Loop(ct.tf([1], [1, 1]), cid.PID(kp=2.0, ki=1.0), dt=DT)

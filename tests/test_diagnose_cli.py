@@ -141,7 +141,7 @@ def test_every_textbook_plant_has_its_uncertain_parameters():
         needed = {"maglev": {"m": 1.0, "K": 1.0}, "servo": {"m": 1.0, "c": 1.0, "k": 1.0},
                   "tank": {"area": 1.0, "outlet": 1.0, "k": 1.0},
                   "pendulum": {"m": 1.0, "length": 1.0}}[name]  # fmt: skip
-        plant = _spoken.plant(name, dict(needed))
+        plant = _spoken.read_plant(name, dict(needed))
         assert set(free) <= set(plant.params)
 
 
@@ -266,7 +266,7 @@ def test_help_has_a_worked_example(capsys):
     _command.add_parser(parser.add_subparsers())
     args = parser.parse_args(example.replace("\\\n", " ").split()[1:])
     assert args.param == [("m", 0.0213), ("K", 3.3e-6)]
-    assert _spoken.controller(args.controller) == cid.PID(kp=-1200.0, kd=-20.0, bias=3.0)
+    assert _spoken.read_controller(args.controller) == cid.PID(kp=-1200.0, kd=-20.0, bias=3.0)
 
 
 def test_a_failed_diagnosis_leaves_no_folder(folder, capsys, monkeypatch):
@@ -285,6 +285,6 @@ def test_a_failed_diagnosis_leaves_no_folder(folder, capsys, monkeypatch):
 
 
 def test_numbers_that_are_none():
-    assert math.isinf(_spoken._number("x", "inf"))
+    assert math.isinf(_spoken._parse_number("x", "inf"))
     with pytest.raises(cid.CtrlidError, match="x needs a number; given nan"):
-        _spoken._number("x", "nan")
+        _spoken._parse_number("x", "nan")

@@ -15,7 +15,7 @@ from ctrlid.diagnosis import gap as gap_of
 from ctrlid.diagnosis import wording
 from ctrlid.diagnosis.findings import BinnedErrors, Calibrated, Candidate, Disturbance, Finding, Gap
 from ctrlid.diagnosis.loading import load_diagnosis
-from ctrlid.diagnosis.noise_tests import alarm_level
+from ctrlid.diagnosis.noise_tests import choose_alarm_level
 from ctrlid.diagnosis.recalibration import fit_base_model
 from ctrlid.diagnosis.result import Diagnosis
 from ctrlid.diagnosis.saving import SavedLoop
@@ -185,8 +185,8 @@ def test_an_alarm_of_many_effects_is_told(found):
 
 
 def test_the_more_effects_the_sooner_an_alarm():
-    assert alarm_level(0) == alarm_level(1) == THRESHOLD.false_alarm
-    assert alarm_level(3) == pytest.approx(3 * THRESHOLD.false_alarm)
+    assert choose_alarm_level(0) == choose_alarm_level(1) == THRESHOLD.false_alarm
+    assert choose_alarm_level(3) == pytest.approx(3 * THRESHOLD.false_alarm)
 
 
 def test_bad_news_is_in_capitals(found):
@@ -393,7 +393,9 @@ def test_a_candidate_that_no_round_took_is_not_drawn_as_found(found):
     # What is found by other means than a round of the search, such as a converter's steps.
     base = found["explained"]
     lost = tuple(replace(c, gain=-5.0) for c in base.ranking)
-    bars = [bar for bars in _pictures.ranking(replace(base, ranking=lost)).values() for bar in bars]
+    bars = [
+        bar for bars in _pictures.make_ranking(replace(base, ranking=lost)).values() for bar in bars
+    ]
     assert bars
     assert "found" not in {bar.kind for bar in bars}
 
@@ -442,15 +444,15 @@ def test_the_stretch_drawn_has_the_largest_gap_and_no_break():
     error = np.zeros(n)
     error[600:700] = 1.0
     gap = Gap("simulation", 1.0, 1.0, 1.0, 0.1, "m", time, error, np.zeros(n), np.zeros(n))
-    part = _pictures.largest_gap(gap)
+    part = _pictures.find_largest_gap(gap)
     assert part.start <= 600
     assert part.stop >= 700
     broken = np.where(np.arange(n) < 650, time, time + 5.0)
-    part = _pictures.largest_gap(replace(gap, time=broken))
+    part = _pictures.find_largest_gap(replace(gap, time=broken))
     assert part.start >= 650 or part.stop <= 650
     fields = ("time", "measured", "simulated_before", "simulated_after")
     short = replace(gap, **{k: getattr(gap, k)[:40] for k in fields})
-    assert _pictures.largest_gap(short) == slice(0, 40)
+    assert _pictures.find_largest_gap(short) == slice(0, 40)
 
 
 @pytest.mark.parametrize("verdict", VERDICTS)

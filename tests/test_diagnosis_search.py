@@ -15,11 +15,11 @@ import problems
 from ctrlid import effects as E
 from ctrlid.diagnosis import removal, replicas, selection
 from ctrlid.diagnosis.candidates import _has_effect, contains
-from ctrlid.diagnosis.experiment import _loop_survives, find_experiment
+from ctrlid.diagnosis.experiment import _can_survive, find_experiment
 from ctrlid.diagnosis.findings import Disturbance, Finding, Gap
 from ctrlid.diagnosis.fitted_model import Model, drop_linearization, with_linearization
 from ctrlid.diagnosis.growth import _is_stand_in, _look_back, drop_worst_effect, search_effects
-from ctrlid.diagnosis.noise_tests import NoiseTests, _deviates_of_force, run_noise_tests
+from ctrlid.diagnosis.noise_tests import NoiseTests, _compute_force_deviates, run_noise_tests
 from ctrlid.diagnosis.recalibration import fit_base_model
 from ctrlid.diagnosis.refitting import place_instants, refit_candidate, refit_under_noise
 from ctrlid.diagnosis.removal import fuse_effects, order_last_effect, refit_without_effect
@@ -30,8 +30,8 @@ from ctrlid.diagnosis.screening import screen_at, screen_candidate
 from ctrlid.diagnosis.selection import Round, prefer_plainer, run_round
 from ctrlid.diagnosis.thresholds import THRESHOLD
 from ctrlid.diagnosis.verdict import find_doubt, gap_is_wider, write_conclusion
-from ctrlid.estimation.likelihood.kalman_filter import first_guess
-from ctrlid.estimation.likelihood.likelihood import linearize_again, make_problem
+from ctrlid.estimation.likelihood.kalman_filter import guess_trajectory
+from ctrlid.estimation.likelihood.likelihood import make_problem, relinearize_fit
 from ctrlid.estimation.likelihood.maximization import begin_fit, choose_noise, maximize
 from ctrlid.loop.simulation import Simulator
 from problems import drive, levitation, pendulum, tanks, under_lead
@@ -89,7 +89,7 @@ def test_a_gain_too_small_to_prove_anything_is_still_compared(
     """Beyond what the filter's approximations gain, it has to be paid for, or stays possible."""
     base, plain, rich = one_level
     rich = replace(rich, gain=plain.gain + 10.0)
-    monkeypatch.setattr(selection, "gain_beyond_simple", lambda *_: more)
+    monkeypatch.setattr(selection, "measure_gain_beyond_simple", lambda *_: more)
     trials = selection._prefer_simplest(base, [rich, plain])
     assert trials[0].name == (plain.name, rich.name)[first]
     assert all(np.isfinite(t.net_gain) for t in trials) == left
@@ -102,10 +102,10 @@ def test_the_simple_effect_of_a_replica_climbs_from_where_the_richer_one_does(
     base, plain, rich = one_level
     copy = plain.model
     stuck = replace(copy, fit=replace(copy.fit, theta=1.2 * copy.fit.theta))
-    stuck = replace(stuck, fit=linearize_again(stuck.fit))
+    stuck = replace(stuck, fit=relinearize_fit(stuck.fit))
     assert stuck.fit.value < copy.fit.value - 100.0
     monkeypatch.setattr(replicas, "make_replica", lambda model: stuck)
-    won = replicas.gain_beyond_simple(base, rich, plain)
+    won = replicas.measure_gain_beyond_simple(base, rich, plain)
     assert won == pytest.approx(rich.gain - plain.gain, abs=2 * THRESHOLD.hint)
 
 
@@ -119,7 +119,7 @@ def test_candidates_are_compared_under_the_same_random_force():
     good = right.model.fit.noise
     slow = replace(good, memory=0.999, drift=1e6)
     wrong = replace(right.model, fit=replace(right.model.fit, noise=slow))
-    wrong = replace(wrong, fit=linearize_again(wrong.fit))
+    wrong = replace(wrong, fit=relinearize_fit(wrong.fit))
     lost = replace(right, model=wrong, gain=wrong.fit.value - base.fit.value)
     assert lost.gain < right.gain - 10.0
     assert selection._forces_differ(lost, right)
@@ -153,9 +153,9 @@ def test_the_shape_of_gaussian_noise_is_that_of_scipy():
     x = np.random.default_rng(1).standard_normal(5000)
     expected = [stats.skewtest(x).statistic, stats.kurtosistest(x).statistic]
     np.testing.assert_allclose(
-        _deviates_of_force(x), expected, atol=0.02
+        _compute_force_deviates(x), expected, atol=0.02
     )  # but for a chance correlation
-    assert _deviates_of_force(np.zeros(100)) == []
+    assert _compute_force_deviates(np.zeros(100)) == []
 
 
 def test_the_shape_of_a_slow_gaussian_force_is_no_alarm():
@@ -163,7 +163,7 @@ def test_the_shape_of_a_slow_gaussian_force_is_no_alarm():
     sizes = []
     for _ in range(300):
         x = signal.lfilter([1.0], [1.0, -0.97], rng.standard_normal(5000))[1000:]
-        sizes.append(stats.chi2.sf(np.sum(np.square(_deviates_of_force(x))), 2))
+        sizes.append(stats.chi2.sf(np.sum(np.square(_compute_force_deviates(x))), 2))
     assert np.mean(np.array(sizes) < 0.1) == pytest.approx(0.1, abs=0.05)
     assert min(sizes) > 1e-5
 
@@ -252,10 +252,10 @@ def test_an_experiment_under_which_the_plant_falls_is_not_recommended():
     loop = pendulum(E.InputSaturation(-0.1, 0.1))
     record = problems.record_of(loop, swing=0.02, hold=60, n=6000, seed=3, sensor_noise=1e-4)
     simulator = Simulator(loop, 1e-6, 8)
-    assert _loop_survives(simulator, record.r, record)
+    assert _can_survive(simulator, record.r, record)
     bold = cid.random_binary(6000, amplitude=0.4, hold=60, seed=3)
     assert np.ptp(simulator.run(simulator.start(None), bold, np.zeros(6000))[0]) > 3.0
-    assert not _loop_survives(simulator, bold, record)
+    assert not _can_survive(simulator, bold, record)
 
 
 def test_a_filter_that_lost_the_record_passes_no_test():
@@ -456,7 +456,7 @@ def test_a_filter_begins_where_a_curved_sensor_points():
     y = truth + 20.0 * (truth - loop.point.output) ** 2
     record = cid.Record(r=y, u=np.full(500, loop.point.input), y=y, dt=2e-3)
     problem = make_problem(loop, (), [record])
-    begun = first_guess(problem.plant, problem.data[0]).predicted
+    begun = guess_trajectory(problem.plant, problem.data[0]).predicted
     position = list(problem.plant.e.states).index("x")
     np.testing.assert_allclose(begun[:, position], truth, rtol=1e-6)
 

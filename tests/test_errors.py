@@ -14,7 +14,7 @@ from ctrlid.diagnosis import growth, refitting, replicas, scans
 from ctrlid.diagnosis.candidates import Objection, Trial
 from ctrlid.diagnosis.recalibration import fit_base_model
 from ctrlid.diagnosis.replicas import follow_record, make_replica
-from ctrlid.loop.period_map import growth_rate
+from ctrlid.loop.period_map import compute_growth_rate
 from ctrlid.loop.simulation import SimulationStopped
 from problems import ROOT, drive, levitation, tank
 
@@ -167,7 +167,7 @@ MODELS = {
     "a simulation stops": lambda: cid.simulate(levitation(), np.full(200, 0.1)),
     "too fast": lambda: cid.predict(fast_mass(), record_of(drive())),
     "no equilibrium": lambda: cid.operating_point(cid.plants.maglev(m=0.02, K=3e-6), output=-1.0),
-    "no derivative": lambda: growth_rate(root()),
+    "no derivative": lambda: compute_growth_rate(root()),
     "no state at rest": lambda: cid.OperatingPoint((np.nan,), 0.0, 0.0),
     "too few samples": lambda: cid.predict(drive(), record_of(drive())[:5]),
     "no reference": lambda: cid.replay_controller(
@@ -186,7 +186,7 @@ EFFECTS = {
     "two of one": lambda: drive().with_effect(E.InputBacklash(0.1)).with_effect(
         E.InputBacklash(0.1)
     ),
-    "a delay ahead of a circuit": lambda: growth_rate(
+    "a delay ahead of a circuit": lambda: compute_growth_rate(
         levitation(analog=True).with_effect(E.InputDelay(0.001))
     ),
 }  # fmt: skip

@@ -14,8 +14,8 @@ from scipy import integrate, linalg, signal
 
 import ctrlid as cid
 from ctrlid import effects as E
-from ctrlid.estimation.likelihood.filter_data import make_filter_data, state_at_rest
-from ctrlid.estimation.likelihood.kalman_filter import Noise, first_guess, settle_trajectory
+from ctrlid.estimation.likelihood.filter_data import find_rest_state, make_filter_data
+from ctrlid.estimation.likelihood.kalman_filter import Noise, guess_trajectory, settle_trajectory
 from ctrlid.estimation.likelihood.kalman_recursion import filter_pass
 from ctrlid.estimation.likelihood.likelihood import make_problem
 from ctrlid.estimation.likelihood.maximization import begin_fit
@@ -43,22 +43,22 @@ def system(rng, size, n, m, p, varying):
     }  # fmt: skip
 
 
-def run(s, valid=None, afresh=None, doubt=None, start=None, spread=None, sensor=0.3,
+def run(s, valid=None, restart=None, input_variance=None, start=None, spread=None, sensor=0.3,
         force=None, memory=0.0, drift=0.0):  # fmt: skip
     size, n = s["step"].shape
     m = s["b"].shape[2]
     valid = np.ones(size, dtype=bool) if valid is None else valid
-    if afresh is None:
-        afresh = np.arange(size) == 0
+    if restart is None:
+        restart = np.arange(size) == 0
     return filter_pass(
-        *s.values(), valid, afresh, np.zeros(size) if doubt is None else doubt,
+        *s.values(), valid, restart, np.zeros(size) if input_variance is None else input_variance,
         np.zeros(n) if start is None else start, 2.0 * np.eye(n) if spread is None else spread,
         sensor, np.full(m, 0.2) if force is None else force, memory, drift,
         (0,) * n, (0,) * (n + bool(drift)),
     )  # fmt: skip
 
 
-def textbook(s, valid, afresh, doubt, start, spread, sensor, force, memory, drift):
+def textbook(s, valid, restart, input_variance, start, spread, sensor, force, memory, drift):
     """The Kalman filter of the augmented plant, as in a lecture; returns e, s, P, x and force."""
     size, n = s["step"].shape
     wide = n + 1 if drift else n
@@ -69,7 +69,7 @@ def textbook(s, valid, afresh, doubt, start, spread, sensor, force, memory, drif
     x, p = np.append(start, 0.0)[:wide], first
     rows = []
     for k in range(size):
-        if afresh[k]:
+        if restart[k]:
             x, p = np.append(start, 0.0)[:wide], first
         c = np.append(s["c"][k], 0.0)[:wide]
         y = s["height"][k] + s["c"][k] @ (x[:n] - s["predicted"][k])
@@ -84,7 +84,7 @@ def textbook(s, valid, afresh, doubt, start, spread, sensor, force, memory, drif
         full[:n, :n] = s["a"][k]
         noise = np.zeros((wide, wide))
         unsure = np.outer(s["du"][k], s["du"][k])
-        noise[:n, :n] = (s["b"][k] * force) @ s["b"][k].T + doubt[k] * unsure
+        noise[:n, :n] = (s["b"][k] * force) @ s["b"][k].T + input_variance[k] * unsure
         moved = s["step"][k] + s["a"][k] @ (x[:n] - s["filtered"][k])
         if drift:
             full[:n, n], full[n, n], noise[n, n] = s["b"][k].sum(axis=1), memory, drift
@@ -99,15 +99,21 @@ def test_a_pass_is_the_textbook_filter(seed):
     size, n, m = 150, int(rng.integers(1, 6)), int(rng.integers(1, 3))
     s = system(rng, size, n, m, 0, varying=bool(seed % 2))
     valid = rng.uniform(size=size) > (0.3 if seed % 3 == 0 else 0.0)
-    afresh = np.arange(size) == 0
+    restart = np.arange(size) == 0
     if seed % 4 == 0:
-        afresh[[60, 61, 90]] = True
+        restart[[60, 61, 90]] = True
     root = rng.standard_normal((n, n))
     options = {
-        "valid": valid, "afresh": afresh, "doubt": np.where(valid, 0.0, rng.uniform(0, 2)),
-        "start": rng.standard_normal(n), "spread": root @ root.T, "sensor": rng.uniform(0.05, 2),
-        "force": rng.uniform(0, 1, m), "memory": 0.0, "drift": 0.0,
-    }  # fmt: skip
+        "valid": valid,
+        "restart": restart,
+        "input_variance": np.where(valid, 0.0, rng.uniform(0, 2)),
+        "start": rng.standard_normal(n),
+        "spread": root @ root.T,
+        "sensor": rng.uniform(0.05, 2),
+        "force": rng.uniform(0, 1, m),
+        "memory": 0.0,
+        "drift": 0.0,
+    }
     if seed % 2:
         options |= {"memory": rng.uniform(-0.5, 0.99), "drift": rng.uniform(0.01, 1)}
     found = run(s, **options)
@@ -180,7 +186,7 @@ def test_the_machines_derivatives_are_those_of_its_map(hidden, stages, parts):
     assert (len(m.maps.stages), m.maps.parts) == (stages, parts)
     data = make_filter_data(loop, record)
     rng = np.random.default_rng(5)
-    guess = first_guess(m, data)
+    guess = guess_trajectory(m, data)
     x = guess.filtered * (1 + 0.01 * rng.standard_normal(guess.filtered.shape))
     x[:, 1] = 0.01 * rng.standard_normal(200)
     at = Trajectory(x, x.copy(), np.tile([1e-6, 2e-3, 1e-3, 1e-6][: m.n], (200, 1)))
@@ -190,7 +196,7 @@ def test_the_machines_derivatives_are_those_of_its_map(hidden, stages, parts):
         h = 1e-5 * theta[k]
         up, down = (m.linearize(data, theta + s * h * np.eye(len(names))[k], at) for s in (1, -1))
         for slope, ends in ((lin.dp[:, :, k], (up.step, down.step)),
-                            (lin.hp[:, k], (up.height, down.height))):  # fmt: skip
+                            (lin.hp[:, k], (up.output, down.output))):  # fmt: skip
             measured = (ends[0] - ends[1]) / (2 * h)
             scale = np.abs(measured).max() + 1e-9 * np.abs(ends[0]).max() / abs(theta[k])
             np.testing.assert_allclose(slope / scale, measured / scale, atol=2e-5)
@@ -278,7 +284,7 @@ def linearized_at_rest(loop, record):
 def one_period(loop, x, u_before, u_now, free=()):
     """The plant's map of states `x` (k, n) when the input goes from one value to the next."""
     m = SampledPlant(loop, free, "zoh", False)
-    late = m.late
+    late = m.delay_samples
     k = late + 1  # the sample at which u_now is the one in force
     size = max(k + 3, 12)
     u = np.full(size, u_now)
@@ -390,7 +396,7 @@ def test_a_delay_of_any_length(delay):
     x = np.array([0.011, 0.015])
     before, now = rng.uniform(2, 4, 2)
     found, m = one_period(loop, x, before, now, ("InputDelay.delay",))
-    assert m.late == math.floor(delay)
+    assert m.delay_samples == math.floor(delay)
     z, part = x, delay - math.floor(delay)
 
     def rate(t, z, u):
@@ -471,14 +477,14 @@ def test_nobody_knows_where_a_play_begins():
     for first in range(0, 40, 5):
         data = make_filter_data(loop, record[first:])
         m = SampledPlant(loop, ("InputBacklash.width",), "zoh", False)
-        lin, out = settle_trajectory(m, data, np.array([0.2]), known, first_guess(m, data), 30)
+        lin, out = settle_trajectory(m, data, np.array([0.2]), known, guess_trajectory(m, data), 30)
         z = out.innovations / np.sqrt(out.variance) / 3e-4
         assert np.abs(z).max() < 5
         assert np.mean(z[:60] ** 2) < 1.6
         u = record.u[first:]
         crossed = np.argmax(np.maximum.accumulate(u) - np.minimum.accumulate(u) >= 0.2)
-        assert np.array_equal(np.flatnonzero(lin.doubt), np.arange(crossed))
-        assert lin.doubt[0] * data.scale**2 == pytest.approx(10 * 0.2**2 / 12)
+        assert np.array_equal(np.flatnonzero(lin.input_variance), np.arange(crossed))
+        assert lin.input_variance[0] * data.scale**2 == pytest.approx(10 * 0.2**2 / 12)
 
 
 def test_nobody_knows_what_a_delay_brings_at_first():
@@ -486,10 +492,12 @@ def test_nobody_knows_what_a_delay_brings_at_first():
     for first in range(0, 80, 10):
         data = make_filter_data(loop, record[first:])
         m = SampledPlant(loop, (), "zoh", False)
-        lin, out = settle_trajectory(m, data, np.zeros(0), Noise((9e4,)), first_guess(m, data), 30)
+        lin, out = settle_trajectory(
+            m, data, np.zeros(0), Noise((9e4,)), guess_trajectory(m, data), 30
+        )
         z = out.innovations / np.sqrt(out.variance) / 1e-4
         assert np.abs(z).max() < 6
-        relative = lin.doubt[:5] * data.scale**2 / np.var(data.record.u)
+        relative = lin.input_variance[:5] * data.scale**2 / np.var(data.record.u)
         assert relative == pytest.approx([1, 1, 1, 0.2**2, 0])
 
 
@@ -555,7 +563,7 @@ def test_an_analog_circuit_moves_the_input_between_samples():
     record = cid.simulate(loop, r)
     m = SampledPlant(loop, (), "foh", True)
     data = make_filter_data(loop, record)
-    fit = settle_trajectory(m, data, np.empty(0), Noise((1e12,)), first_guess(m, data))[1]
+    fit = settle_trajectory(m, data, np.empty(0), Noise((1e12,)), guess_trajectory(m, data))[1]
     late = slice(15, None)
     assert np.abs(fit.innovations[late]).max() < 1e-4 * np.std(record.y)
 
@@ -608,7 +616,7 @@ def test_a_neutral_effect_rests_in_the_place_of_its_own_states():
     mode = E.FlexibleMode(frequency=28.0, damping=0.03, coupling=0.0)
     both = loop.with_effect(mode)
     resting = dict(zip(both.equations(keep=True).states,
-                       state_at_rest(both, both.equations(keep=True)), strict=True))  # fmt: skip
+                       find_rest_state(both, both.equations(keep=True)), strict=True))  # fmt: skip
     assert resting == {"x": 0.012, "v": 0.0, "FlexibleMode.deflection": 0.0,
                        "FlexibleMode.speed": 0.0, "ActuatorLag.input": loop.at.input}  # fmt: skip
     # So nothing moves the mode at the start, and the filter is that with next to nothing of it.

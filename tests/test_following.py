@@ -11,7 +11,7 @@ import problems
 from ctrlid import effects as E
 from ctrlid.diagnosis.noise_tests import run_noise_tests
 from ctrlid.diagnosis.recalibration import fit_base_model
-from ctrlid.diagnosis.replicas import follow_record, gain_on_replicas, make_replica
+from ctrlid.diagnosis.replicas import follow_record, make_replica, measure_gain_on_replicas
 from ctrlid.diagnosis.selection import run_round
 from ctrlid.loop.period_map import comes_to_rest
 from problems import levitation
@@ -97,4 +97,4 @@ def test_what_is_missing_is_found_beside_friction_all_the_same():
     lag = E.ActuatorLag(tau=0.001)
     best = run_round(base, [lag], lambda f, items: list(map(f, items))).best
     assert best is not None
-    assert gain_on_replicas([make_replica(base)], best) < 0.1 * best.gain
+    assert measure_gain_on_replicas([make_replica(base)], best) < 0.1 * best.gain

@@ -12,10 +12,14 @@ from scipy.signal import lfilter
 import ctrlid as cid
 from ctrlid._base.errors import CtrlidError
 from ctrlid.estimation.identified_model import Structure
-from ctrlid.estimation.linear.controller_model import found_law, given_law, loop_signals
-from ctrlid.estimation.linear.instruments import cut, two_stage
+from ctrlid.estimation.linear.controller_model import (
+    convert_controller,
+    identify_controller,
+    simulate_noise_free_loop,
+)
+from ctrlid.estimation.linear.instruments import cut_pieces, project_on_references
 from ctrlid.estimation.linear.iv import fit_iv
-from ctrlid.estimation.linear.prefilter import autoregression, stable_factor
+from ctrlid.estimation.linear.prefilter import autoregression, reflect_poles
 from problems import load_script
 
 KNOWN = [cid.ReciprocalPoles(), cid.Equal("b1", "b2")]
@@ -206,15 +210,15 @@ def test_a_controller_that_does_not_stabilise_is_done_without():
 
 def test_found_law_is_the_controller_and_the_loop_repeats_the_record():
     theta, record, lead = sampled_levitation(0.1)
-    pieces = cut([record], ("r",), True, 30)
-    law = found_law(pieces, ("r",))
+    pieces = cut_pieces([record], ("r",), True, 30)
+    law = identify_controller(pieces, ("r",))
     np.testing.assert_allclose(law.den, lead.den[0][0], atol=1e-6)
     np.testing.assert_allclose(law.external[0], lead.num[0][0], rtol=1e-6)
     np.testing.assert_allclose(law.feedback, -lead.num[0][0], rtol=1e-6)
-    given = given_law(lead, ("r",), record.dt)
-    y, u = loop_signals(pieces, given, Structure(2, 2), theta)[0]
+    given = convert_controller(lead, ("r",), record.dt)
+    y, u = simulate_noise_free_loop(pieces, given, Structure(2, 2), theta)[0]
     np.testing.assert_allclose(y[1000:] - y[1000:].mean(), pieces[0].y[1000:], atol=0.05)
-    delayed = two_stage(pieces)[0]
+    delayed = project_on_references(pieces)[0]
     assert np.corrcoef(delayed[0], pieces[0].y)[0, 1] > 0.99
     assert np.corrcoef(delayed[1], u)[0, 1] > 0.97
 
@@ -320,11 +324,11 @@ def test_names_come_from_the_record():
 
 def test_the_prefilter_makes_an_all_pass():
     theta = np.array([-2 * np.cosh(0.1), 1.0, 0.1, 0.1])
-    den = stable_factor(Structure(2, 2), theta, 10_000)
+    den = reflect_poles(Structure(2, 2), theta, 10_000)
     w = np.exp(1j * np.linspace(0.01, 3, 50))
     size = np.abs(np.polyval(np.r_[1, theta[:2]], w) / np.polyval(den, w))
     np.testing.assert_allclose(size, np.exp(0.1), rtol=1e-9)
-    on_circle = stable_factor(Structure(1, 1), np.array([-1.0, 0.1]), 1000)
+    on_circle = reflect_poles(Structure(1, 1), np.array([-1.0, 0.1]), 1000)
     np.testing.assert_allclose(on_circle, [1.0, -0.995], rtol=1e-12)
 
 

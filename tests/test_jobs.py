@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from ctrlid._base.jobs import processors, side_by_side
+from ctrlid._base.jobs import count_processors, run_side_by_side
 
 
 def test_results_are_in_the_order_of_the_items():
@@ -14,12 +14,12 @@ def test_results_are_in_the_order_of_the_items():
         time.sleep(0.002 * (5 - k) if k < 5 else 0.0)
         return k * k
 
-    assert side_by_side(slow_at_first, range(40)) == [k * k for k in range(40)]
-    assert side_by_side(abs, iter([-3])) == [3]
-    assert side_by_side(abs, ()) == []
+    assert run_side_by_side(slow_at_first, range(40)) == [k * k for k in range(40)]
+    assert run_side_by_side(abs, iter([-3])) == [3]
+    assert run_side_by_side(abs, ()) == []
 
 
-@pytest.mark.skipif(processors() < 2, reason="one processor does one thing at a time")
+@pytest.mark.skipif(count_processors() < 2, reason="one processor does one thing at a time")
 def test_two_items_are_in_work_at_a_time():
     both = threading.Barrier(2)
 
@@ -27,29 +27,29 @@ def test_two_items_are_in_work_at_a_time():
         both.wait(timeout=20)  # broken, were one done after the other
         return k
 
-    assert side_by_side(meet, (1, 2)) == [1, 2]
+    assert run_side_by_side(meet, (1, 2)) == [1, 2]
 
 
 def test_an_error_is_raised():
     for bad in (0, 7):
         with pytest.raises(ZeroDivisionError):
-            side_by_side(lambda k, bad=bad: 1 / (k - bad), range(8))
+            run_side_by_side(lambda k, bad=bad: 1 / (k - bad), range(8))
 
 
 def test_work_within_work_ends():
     def sum_of(n):
-        return sum(side_by_side(lambda k: k, range(n)))
+        return sum(run_side_by_side(lambda k: k, range(n)))
 
-    assert side_by_side(sum_of, range(30)) == [n * (n - 1) // 2 for n in range(30)]
+    assert run_side_by_side(sum_of, range(30)) == [n * (n - 1) // 2 for n in range(30)]
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are not forked here")
 @pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
 def test_a_forked_process_starts_threads_of_its_own():
-    side_by_side(abs, range(4))  # the threads of this process, which the other does not have
+    run_side_by_side(abs, range(4))  # the threads of this process, which the other does not have
     child = os.fork()
     if child == 0:
-        os._exit(0 if side_by_side(abs, (-1, -2, -3)) == [1, 2, 3] else 1)
+        os._exit(0 if run_side_by_side(abs, (-1, -2, -3)) == [1, 2, 3] else 1)
     until = time.monotonic() + 30
     while (ended := os.waitpid(child, os.WNOHANG)) == (0, 0) and time.monotonic() < until:
         time.sleep(0.01)

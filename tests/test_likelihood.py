@@ -31,8 +31,8 @@ def hill(monkeypatch):
             lower=np.full(len(theta), lower), upper=np.full(len(theta), upper),
             plant=SimpleNamespace(fits=lambda theta: True),
         )  # fmt: skip
-        monkeypatch.setattr(maximum, "evaluate", evaluate)
-        monkeypatch.setattr(maximum, "linearize_again", lambda fit: fit)
+        monkeypatch.setattr(maximum, "evaluate_likelihood", evaluate)
+        monkeypatch.setattr(maximum, "relinearize_fit", lambda fit: fit)
         return at(theta)
 
     fit_on.tried = tried

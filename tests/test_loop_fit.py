@@ -14,8 +14,12 @@ import ctrlid as cid
 from ctrlid import CtrlidError
 from ctrlid import effects as E
 from ctrlid._base.text import with_error
-from ctrlid.estimation.likelihood.likelihood import evaluate, make_problem, pseudo_inverse
-from ctrlid.estimation.likelihood.maximization import begin_fit, information, maximize
+from ctrlid.estimation.likelihood.likelihood import (
+    evaluate_likelihood,
+    make_problem,
+    pseudo_inverse,
+)
+from ctrlid.estimation.likelihood.maximization import begin_fit, compute_information, maximize
 from ctrlid.loop.simulation import Simulator
 from problems import astray, drive, levitation, load_script, record_of, tanks
 
@@ -243,7 +247,7 @@ def point(loop, record, **noise):
 def moved(fit, theta):
     at = [out.trajectory for out in fit.filtered]
     for _ in range(3):  # the trajectory follows the parameters
-        there = evaluate(fit.problem, theta, fit.noise, at)
+        there = evaluate_likelihood(fit.problem, theta, fit.noise, at)
         at = [out.trajectory for out in there.filtered]
     return there.value
 
@@ -256,7 +260,7 @@ def test_the_information_is_the_curvature_of_the_likelihood(name):
     record = experiment(loop, swing, hold, n=6000, seed=21, sensor_noise=sensor,
                         force_noise=0.3 if "lev" in name else 1.0)  # fmt: skip
     fit = point(loop, record)
-    matrix, score = information(fit)
+    matrix, score = compute_information(fit)
     p = len(fit.theta)
     assert len(matrix) == p + 2  # force ratio and sensor variance beside them
     np.testing.assert_allclose(matrix, matrix.T, rtol=1e-10)
@@ -293,7 +297,7 @@ def test_standard_errors_without_any_force_noise():
     start = begin_fit(make_problem(loop, names, [record]))
     fit = maximize(start)
     held = np.sqrt(np.diag(pseudo_inverse(fit.normal[0])))
-    exact = np.sqrt(np.diag(pseudo_inverse(information(fit)[0])))[: len(names)]
+    exact = np.sqrt(np.diag(pseudo_inverse(compute_information(fit)[0])))[: len(names)]
     np.testing.assert_allclose(exact, held, rtol=0.05)
 
 
@@ -302,7 +306,7 @@ def test_the_covariance_is_the_inverse_of_the_information():
     record = experiment(loop, 0.05, 40, n=2000, sensor_noise=2e-3, force_noise=1.0)
     fitted = cid.fit_loop(loop, record, coloured=False)
     again = point(loop, record)
-    inverse = np.linalg.inv(information(again)[0])[:2, :2]
+    inverse = np.linalg.inv(compute_information(again)[0])[:2, :2]
     np.testing.assert_allclose(fitted.estimate.covariance, inverse, rtol=1e-2)
     low, high = fitted.estimate.confidence_interval("c", 0.68269)
     assert (high - low) / 2 == pytest.approx(fitted.estimate.standard_errors[0], rel=1e-4)

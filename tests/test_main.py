@@ -99,8 +99,8 @@ def short(monkeypatch):
         for title in act.TITLES:
             yield cid.Section(title, "Words.")
 
-    monkeypatch.setattr(command, "story", one)
-    monkeypatch.setattr(command, "second_act", two)
+    monkeypatch.setattr(command, "tell_identification", one)
+    monkeypatch.setattr(command, "tell_diagnosis", two)
 
 
 @pytest.mark.parametrize(
@@ -142,7 +142,7 @@ def test_a_refusal_is_one_line_and_leaves_nothing(folder, capsys, monkeypatch):
         raise cid.CtrlidError("the ball\nis lost")
         yield
 
-    monkeypatch.setattr(command, "story", refuse)
+    monkeypatch.setattr(command, "tell_identification", refuse)
     assert run() == 1
     assert capsys.readouterr() == ("", "ctrlid: the ball is lost\n")
     assert list(folder.iterdir()) == []
@@ -160,7 +160,7 @@ def test_ctrl_c(folder, capsys, monkeypatch):
         raise KeyboardInterrupt
         yield
 
-    monkeypatch.setattr(command, "story", interrupted)
+    monkeypatch.setattr(command, "tell_identification", interrupted)
     assert run() == 130
     assert capsys.readouterr().err == "ctrlid: interrupted\n"
     assert list(folder.iterdir()) == []
@@ -181,26 +181,28 @@ def test_as_a_module_into_a_closed_pipe(folder):
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_the_plain_fit_fails_whatever_the_seed(seed):
     """Equation (6) of the paper is typical of this experiment and no lucky draw."""
-    bench = told._bench()
-    record, perfect = told._records(bench, 45_000, 0.1, seed)
+    bench = told._make_bench()
+    record, perfect = told._simulate_records(bench, 45_000, 0.1, seed)
     plain = cid.fit_arx(record, na=2, nb=2)
-    assert told._unstable(plain) is None
+    assert told._find_unstable_pole(plain) is None
     # Five standard deviations of this number, over eight seeds, are 0.001.
     assert np.abs(plain.estimate.poles).max() < 0.999
     # What the square law of the magnet leaves of the linear model at this amplitude.
-    assert told._unstable(cid.fit_arx(perfect, na=2, nb=2)) == pytest.approx(bench.pole, rel=5e-3)
+    assert told._find_unstable_pole(cid.fit_arx(perfect, na=2, nb=2)) == pytest.approx(
+        bench.pole, rel=5e-3
+    )
     known = cid.fit_arx(record, na=2, nb=2, constraints=[cid.ReciprocalPoles()])
     assert known.estimate["a2"] == 1.0
-    assert 0.7 < told._unstable(known) / bench.pole < 0.9
+    assert 0.7 < told._find_unstable_pole(known) / bench.pole < 0.9
     cured = cid.fit_iv(record, na=2, nb=2, constraints=[cid.ReciprocalPoles()])
-    assert told._unstable(cured) == pytest.approx(bench.pole, rel=0.01)
-    assert np.abs(told._gain_errors(bench, cured.estimate)).max() < 0.03
+    assert told._find_unstable_pole(cured) == pytest.approx(bench.pole, rel=0.01)
+    assert np.abs(told._compute_gain_errors(bench, cured.estimate)).max() < 0.03
 
 
 def chapters(last=told.TITLES[-1], **settings):
     """Tell the story up to a title."""
     told_so_far = {}
-    for section in told.story(samples=2000, **settings):
+    for section in told.tell_identification(samples=2000, **settings):
         told_so_far[section.title] = section
         if section.title == last:
             break
@@ -242,10 +244,10 @@ def test_a_refused_redesign_is_reported(monkeypatch):
 
 
 def test_the_second_act_hides_what_the_seed_draws():
-    drawn = {type(act.hide(seed)[0]).__name__ for seed in range(40)}
+    drawn = {type(act.hide_effect(seed)[0]).__name__ for seed in range(40)}
     assert drawn == {kind.__name__ for kind, _ in act.HIDDEN}
     for seed in range(40):
-        effect, factor = act.hide(seed)
+        effect, factor = act.hide_effect(seed)
         ranges = next(ranges for kind, ranges in act.HIDDEN if kind is type(effect))
         for name, value in effect.values().items():
             assert ranges[name][0] <= value <= ranges[name][1]
@@ -255,8 +257,8 @@ def test_the_second_act_hides_what_the_seed_draws():
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", [kind for kind, _ in act.HIDDEN])
 def test_the_second_act_names_it(kind):
-    seed = next(s for s in range(50) if type(act.hide(s)[0]) is kind)
-    first, second, third = act.second_act(seed=seed)
+    seed = next(s for s in range(50) if type(act.hide_effect(s)[0]) is kind)
+    first, second, third = act.tell_diagnosis(seed=seed)
     assert "It is not told what was hidden." in first.text
     assert second.result.findings[0].name == kind.__name__
     assert f"Hidden was {kind.__name__}" in third.text
@@ -265,10 +267,10 @@ def test_the_second_act_names_it(kind):
 
 
 def test_the_second_act_admits_what_it_missed():
-    sections = list(act.second_act(samples=4000, seed=2))
-    found, effect, loop = sections[1].result, act.hide(2)[0], None
+    sections = list(act.tell_diagnosis(samples=4000, seed=2))
+    found, effect, loop = sections[1].result, act.hide_effect(2)[0], None
     assert "It was found and named alone." in sections[2].text
     stranger = cid.effects.Quantization(step=1.0)
-    assert "IT WAS NOT NAMED: the verdict is " in act.reveal(found, stranger, loop)
+    assert "IT WAS NOT NAMED: the verdict is " in act.reveal_effect(found, stranger, loop)
     two = replace(found, findings=found.findings * 2)
-    assert "It is among what was named." in act.reveal(two, effect, loop)
+    assert "It is among what was named." in act.reveal_effect(two, effect, loop)

@@ -211,11 +211,11 @@ def test_numbers_have_the_digits_their_error_allows(value, error, text):
 
 
 def test_complex_numbers():
-    assert _text.number(1 - 0.5j) == "1-0.5j"
-    assert _text.number(2.0) == "2"
+    assert _text.write_number(1 - 0.5j) == "1-0.5j"
+    assert _text.write_number(2.0) == "2"
 
 
 def test_listing():
-    assert [_text.listing(x) for x in ([], ["a"], ["a", "b"], ["a", "b", "c"])] == [
+    assert [_text.write_list(x) for x in ([], ["a"], ["a", "b"], ["a", "b", "c"])] == [
         "", "a", "a and b", "a, b and c",
     ]  # fmt: skip

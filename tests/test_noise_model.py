@@ -5,7 +5,7 @@ import pytest
 from scipy import signal
 
 import ctrlid as cid
-from ctrlid.validation.noise_model import noise_polynomial, whiten_errors
+from ctrlid.validation.noise_model import fit_noise_polynomial, whiten_errors
 from problems import levitation, record_of
 
 
@@ -13,7 +13,7 @@ from problems import levitation, record_of
 def test_recovers_a_known_colour_and_whitens(colour):
     e = np.random.default_rng(1).standard_normal(20_000)
     errors = signal.lfilter(colour, [1.0], e)
-    found = noise_polynomial(errors, [(0, len(e))], np.array([1.0, -2.04, 1.0]))
+    found = fit_noise_polynomial(errors, [(0, len(e))], np.array([1.0, -2.04, 1.0]))
     np.testing.assert_allclose(found, colour, atol=0.03)
     white = whiten_errors(errors, [(0, len(e))], found)
     assert np.std(white) == pytest.approx(1.0, rel=0.02)
@@ -23,7 +23,7 @@ def test_sensor_noise_on_an_unstable_plant_reflects_its_poles():
     """A e with roots outside the unit circle looks like C e with the roots inside."""
     den = np.poly([1.25, 0.7])
     e = np.random.default_rng(2).standard_normal(20_000)
-    found = noise_polynomial(signal.lfilter(den, [1.0], e), [(0, len(e))], den)
+    found = fit_noise_polynomial(signal.lfilter(den, [1.0], e), [(0, len(e))], den)
     np.testing.assert_allclose(np.sort(np.roots(found).real), [0.7, 0.8], atol=0.03)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import ctrlid as cid
-from ctrlid._base.text import Printed, html_lines
+from ctrlid._base.text import Printed, write_html
 from ctrlid.reporting.tables import Table
 from problems import REST, record_of, servo
 
@@ -93,7 +93,7 @@ def test_bad_news_is_bold_and_names_are_escaped(record):
 
 def test_sentences_are_wrapped_and_tables_are_not():
     sentence, table = "  " + 40 * "word ", "a" + 40 * "  1.0"
-    lines = read(html_lines(f"{sentence}\n\n{table}")).splitlines()
+    lines = read(write_html(f"{sentence}\n\n{table}")).splitlines()
     assert max(map(len, lines[:2])) <= 100
     assert all(line.startswith("  word") for line in lines[:-2])
     assert lines[-2:] == ["", table]
@@ -101,8 +101,8 @@ def test_sentences_are_wrapped_and_tables_are_not():
 
 def test_the_block_suits_light_and_dark():
     """No colour of its own: text and background are those of the notebook."""
-    assert "color" not in html_lines("NO POLE OUTSIDE")
-    assert "background" not in html_lines("NO POLE OUTSIDE")
+    assert "color" not in write_html("NO POLE OUTSIDE")
+    assert "background" not in write_html("NO POLE OUTSIDE")
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,7 @@ import pytest
 
 import ctrlid as cid
 from ctrlid import CtrlidError
-from ctrlid.data.several_records import model_and_data
+from ctrlid.data.several_records import order_model_and_data
 from problems import REST, record_of, servo
 
 
@@ -37,11 +37,11 @@ def test_either_order_gives_the_same(pair, name):
 
 def test_several_records_and_models_of_any_kind(pair):
     loop, record = pair
-    assert model_and_data([record, record], loop) == (loop, [record, record])
-    assert model_and_data(None, record) == (None, record)
-    assert model_and_data(record, None) == (None, record)
+    assert order_model_and_data([record, record], loop) == (loop, [record, record])
+    assert order_model_and_data(None, record) == (None, record)
+    assert order_model_and_data(record, None) == (None, record)
     model = cid.linearize(loop.plant, loop.at)
-    assert model_and_data(record, model) == (model, record)
+    assert order_model_and_data(record, model) == (model, record)
 
 
 def test_two_of_a_kind_are_refused_as_they_were_given(pair):

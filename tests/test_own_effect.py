@@ -12,8 +12,8 @@ import pytest
 import ctrlid as cid
 import problems
 from ctrlid import effects as E
-from ctrlid.diagnosis.candidates import Objection, same_kind
-from ctrlid.diagnosis.fitted_model import carry_over
+from ctrlid.diagnosis.candidates import Objection, is_same_kind
+from ctrlid.diagnosis.fitted_model import carry_over_fit
 from ctrlid.diagnosis.information import find_objection
 from ctrlid.diagnosis.recalibration import fit_base_model
 from ctrlid.diagnosis.refitting import place_instants, refit_candidate
@@ -111,7 +111,7 @@ def bounds_of(effect, record):
     loop = base.fitted.with_effect(effect)
     label = next(iter(loop.labelled))
     names = [*base.names, *(f"{label}.{k}" for k in effect.values())]
-    problem = carry_over(base, loop, names).problem
+    problem = carry_over_fit(base, loop, names).problem
     return dict(zip(names, zip(problem.lower, problem.upper, strict=True), strict=True))
 
 
@@ -154,7 +154,7 @@ def test_an_effect_is_scanned_if_it_says_so_and_not_otherwise():
     assert found.scan_penalty == pytest.approx(np.log(400))
     assert alone.scan_penalty == 0.0
     assert found.net_gain > alone.net_gain + 100
-    assert same_kind(scan_candidate(base, plain).effect, plain)
+    assert is_same_kind(scan_candidate(base, plain).effect, plain)
     sight = ModelSight(base)
     assert sight.strongest_line() == pytest.approx(317.0 / 60, abs=0.1)
     assert sight.parameter("c") is None
@@ -187,7 +187,7 @@ def test_a_time_is_an_instant_only_if_it_is_declared():
     for kind, moved in ((Knock, False), (TimedKnock, True)):
         loop = base.fitted.with_effect(kind(40.0, 6.36))
         label = kind.__name__
-        fit = carry_over(base, loop, ("k", f"{label}.time"))
+        fit = carry_over_fit(base, loop, ("k", f"{label}.time"))
         there = place_instants(fit)
         assert (there.value > fit.value + 100) == moved
         assert (abs(there.theta[1] - 7.0) < 0.02) == moved

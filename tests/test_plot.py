@@ -88,7 +88,7 @@ def test_record_says_where_no_unit_is_known(record):
      (3e-9, "A", (1e9, "nA")), (0.03, "rad", (1, "rad")), (0.0, "m", (1, "m"))],
 )  # fmt: skip
 def test_units_get_the_prefix_people_use(size, unit, expected):
-    factor, text = _pictures.scale([np.array([-size, 0.0])], unit)
+    factor, text = _pictures.choose_scale([np.array([-size, 0.0])], unit)
     assert (pytest.approx(factor), text) == expected
 
 
@@ -176,9 +176,9 @@ def test_default_window_is_lively_and_usual(comparison):
     y = np.array(comparison.record.y)
     y[:700] = y[0]
     moved = replace(comparison, record=replace(comparison.record, y=y))
-    assert _pictures.telling(moved) > 400
+    assert _pictures.find_telling_window(moved) > 400
     short = replace(comparison, record=comparison.record[:100])
-    assert _pictures.telling(short) == 0
+    assert _pictures.find_telling_window(short) == 0
 
 
 def test_a_curve_far_away_leaves_the_measurement_readable(comparison):

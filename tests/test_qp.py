@@ -12,9 +12,14 @@ import ctrlid as cid
 from ctrlid._base.errors import CtrlidError
 from ctrlid.estimation.constraints import Row
 from ctrlid.estimation.constraints import quadratic_program as qp
-from ctrlid.estimation.constraints.branches import Infeasible, Rows, cases
+from ctrlid.estimation.constraints.branches import Infeasible, Rows, list_cases
 from ctrlid.estimation.constraints.constrained_minimum import minimize
-from ctrlid.estimation.constraints.quadratic_program import Cost, NotExcited, solve, spread
+from ctrlid.estimation.constraints.quadratic_program import (
+    Cost,
+    NotExcited,
+    compute_covariance,
+    solve_program,
+)
 from ctrlid.estimation.identified_model import Structure
 
 Z2 = Structure(2, 2)
@@ -66,7 +71,7 @@ def test_optimal_feasible_and_as_daqp_says(seed, count, equalities):
         rows.weights[e] if e.any() else None, rows.lower[e] if e.any() else None, solver="daqp",
     )  # fmt: skip
     try:
-        found = solve(cost, rows)
+        found = solve_program(cost, rows)
     except Infeasible:
         assert wanted is None
         return
@@ -84,14 +89,16 @@ def test_a_general_quadratic_cost_comes_in_by_its_cholesky_factor():
     hessian, linear = half @ half.T + np.eye(4), rng.standard_normal(4)
     upper = np.linalg.cholesky(hessian).T
     cost = Cost(upper, np.linalg.solve(upper.T, linear), np.eye(4), np.zeros(4))
-    np.testing.assert_allclose(solve(cost, rows_of()).theta, np.linalg.solve(hessian, linear))
+    np.testing.assert_allclose(
+        solve_program(cost, rows_of()).theta, np.linalg.solve(hessian, linear)
+    )
 
 
 def test_degenerate_vertices_and_repeated_rows():
     cost = Cost(np.eye(4), np.array([1.0, 1.0, 0.0, 0.0]), np.eye(4), np.zeros(4))
     upper = [Row({"a1": 1.0}, upper=0.0), Row({"a2": 1.0}, upper=0.0)]
     more = [Row({"a1": 1.0, "a2": 1.0}, upper=0.0), Row({"a1": 2.0}, upper=0.0), upper[0]]
-    found = solve(cost, rows_of(*upper, *more))
+    found = solve_program(cost, rows_of(*upper, *more))
     np.testing.assert_array_equal(found.theta, [0.0, 0.0, 0.0, 0.0])
     assert found.cost == pytest.approx(2.0)
 
@@ -105,21 +112,21 @@ def test_impossible_rows_are_found_out_although_the_solver_returns_numbers():
     assert not answer.found
     assert answer.x is not None
     with pytest.raises(Infeasible):
-        solve(problem(0), rows)
+        solve_program(problem(0), rows)
     with pytest.raises(Infeasible):
-        solve(problem(0), rows_of(Row({"a1": 1.0}, 1.0, 1.0), Row({"a1": 2.0}, upper=1.0)))
+        solve_program(problem(0), rows_of(Row({"a1": 1.0}, 1.0, 1.0), Row({"a1": 2.0}, upper=1.0)))
 
 
 def test_a_failing_solver_is_not_believed(monkeypatch):
     """Whatever the solver proposes, the optimality conditions decide."""
     cost, rows = problem(3), rows_of(*random_rows(4, 4))
-    wanted = solve(cost, rows).theta
+    wanted = solve_program(cost, rows).theta
 
     def silly(problem, **options):
         return qpsolvers.Solution(problem, found=True, x=np.ones(4), z=np.ones(len(problem.h)))
 
     monkeypatch.setattr(qp.qpsolvers, "solve_problem", silly)
-    np.testing.assert_allclose(solve(cost, rows).theta, wanted, atol=1e-10)
+    np.testing.assert_allclose(solve_program(cost, rows).theta, wanted, atol=1e-10)
 
 
 def test_a_solver_that_gives_up_is_replaced(monkeypatch):
@@ -127,7 +134,7 @@ def test_a_solver_that_gives_up_is_replaced(monkeypatch):
     wanted = []
     for cost, rows in problems:
         try:
-            wanted.append(solve(cost, rows).theta)
+            wanted.append(solve_program(cost, rows).theta)
         except Infeasible:
             wanted.append(None)
     assert sum(w is not None for w in wanted) > 8
@@ -139,23 +146,23 @@ def test_a_solver_that_gives_up_is_replaced(monkeypatch):
     for (cost, rows), theta in zip(problems, wanted, strict=True):
         if theta is None:
             with pytest.raises(Infeasible):
-                solve(cost, rows)
+                solve_program(cost, rows)
         else:
-            np.testing.assert_allclose(solve(cost, rows).theta, theta, atol=1e-10)
+            np.testing.assert_allclose(solve_program(cost, rows).theta, theta, atol=1e-10)
 
 
 def test_a_problem_nobody_solves_is_an_error_with_its_rows(monkeypatch):
     monkeypatch.setattr(qp, "_ROUNDS", 0)
     rows = rows_of(Row({"a1": 1.0}, upper=-5.0))
     with pytest.raises(CtrlidError, match=r"could not be solved .* its rows are a1 <= -5"):
-        solve(problem(3), rows)
+        solve_program(problem(3), rows)
 
 
 def test_what_cannot_come_below_is_not_sought():
     cost = problem(1)
-    best = solve(cost, rows_of())
+    best = solve_program(cost, rows_of())
     with pytest.raises(Infeasible):
-        solve(cost, rows_of(), below=best.cost * 0.99)
+        solve_program(cost, rows_of(), below=best.cost * 0.99)
 
 
 def test_a_free_direction_is_reported():
@@ -164,25 +171,25 @@ def test_a_free_direction_is_reported():
     r[:, 3] = 2 * r[:, 2]
     flat = Cost(r, cost.d, cost.basis, cost.origin)
     with pytest.raises(NotExcited) as trouble:
-        solve(flat, rows_of())
+        solve_program(flat, rows_of())
     direction = trouble.value.direction
     np.testing.assert_allclose(direction / direction[2], [0, 0, 1, -0.5], atol=1e-10)
     # An equality that settles it is enough.
-    theta = solve(flat, rows_of(Row({"b1": 1.0, "b2": -1.0}, 0.0, 0.0))).theta
+    theta = solve_program(flat, rows_of(Row({"b1": 1.0, "b2": -1.0}, 0.0, 0.0))).theta
     assert theta[2] == theta[3]
 
 
 def test_spread_in_the_free_directions():
     cost = problem(5)
-    everything, condition = spread(cost, np.zeros((0, 4)))
+    everything, condition = compute_covariance(cost, np.zeros((0, 4)))
     np.testing.assert_allclose(everything, np.linalg.inv(cost.R.T @ cost.R), rtol=1e-9)
     assert condition == pytest.approx(np.linalg.cond(cost.R / np.linalg.norm(cost.R, axis=0)))
-    fixed, _ = spread(cost, np.array([[0, 1.0, 0, 0]]))
+    fixed, _ = compute_covariance(cost, np.array([[0, 1.0, 0, 0]]))
     keep = [0, 2, 3]
     r = cost.R[:, keep]
     np.testing.assert_allclose(fixed[np.ix_(keep, keep)], np.linalg.inv(r.T @ r), rtol=1e-9)
     assert not fixed[1].any()
-    nothing, condition = spread(cost, np.eye(4))
+    nothing, condition = compute_covariance(cost, np.eye(4))
     assert not nothing.any()
     assert condition == 1.0
 
@@ -194,7 +201,7 @@ def test_symmetric_poles_in_continuous_time():
     structure = Structure(2, 1, domain="s")
     target = np.array([0.3, -400.0, 5.0])
     cost = Cost(np.diag([1.0, 0.01, 2.0]), np.array([0.3, -4.0, 10.0]), np.eye(3), np.zeros(3))
-    np.testing.assert_allclose(solve(cost, Rows.build(structure, [])).theta, target)
+    np.testing.assert_allclose(solve_program(cost, Rows.build(structure, [])).theta, target)
     found = minimize(cost, [cid.SymmetricPoles()], structure)
     np.testing.assert_array_equal(found.theta, [0.0, -400.0, 5.0])
     assert found.free == 2
@@ -225,7 +232,7 @@ def test_a_family_at_its_end_sits_on_a_bound():
     branch = cid.ReciprocalPoles().branches(structure)[0]
     for z in (1.01, 1.1, 2.0):
         rows = Rows.build(structure, [("", row) for row in branch.family(z)])
-        assert solve(cost, rows).cost > found.cost
+        assert solve_program(cost, rows).cost > found.cost
 
 
 def test_a_family_finds_the_best_of_a_dense_scan():
@@ -236,8 +243,8 @@ def test_a_family_finds_the_best_of_a_dense_scan():
     d = r @ theta + 0.05 * rng.standard_normal(20)
     cost = Cost(r, d, np.eye(4), np.zeros(4))
     found = minimize(cost, [cid.ReciprocalPoles(), cid.Bounds("b1", upper=0.99)], structure)
-    (case, _) = cases([cid.ReciprocalPoles(), cid.Bounds("b1", upper=0.99)], structure)
-    scan = [solve(cost, case.at(z)).cost for z in np.linspace(1.2, 1.7, 2001)]
+    (case, _) = list_cases([cid.ReciprocalPoles(), cid.Bounds("b1", upper=0.99)], structure)
+    scan = [solve_program(cost, case.at(z)).cost for z in np.linspace(1.2, 1.7, 2001)]
     assert found.cost <= min(scan)
     assert found.cost == pytest.approx(min(scan), rel=1e-6)
     assert found.theta[3] <= 0.99

@@ -14,9 +14,9 @@ from ctrlid.diagnosis.fresh_data import FreshData, choose_fresh_data
 from ctrlid.diagnosis.recalibration import fit_base_model, weigh_by_repeats
 from ctrlid.diagnosis.refitting import refit_candidate
 from ctrlid.diagnosis.screening import screen_at
-from ctrlid.estimation.likelihood.likelihood import evaluate
+from ctrlid.estimation.likelihood.likelihood import evaluate_likelihood
 from ctrlid.estimation.likelihood.maximization import maximize
-from ctrlid.estimation.likelihood.noise_fit import known_from_repeats
+from ctrlid.estimation.likelihood.noise_fit import estimate_noise_from_repeats
 
 PERIOD, TIMES = 800, 5
 SENSOR, FORCE = 1e-4, 0.3
@@ -37,7 +37,7 @@ def test_the_noise_is_found_under_a_wrong_model():
     loop = drive()
     record = repeated(loop.with_effect(E.CoulombFriction(fc=3.0)), seed=2)
     fit = fit_base_model(loop, [record], loop.free).fit
-    known = known_from_repeats(fit, [PERIOD])
+    known = estimate_noise_from_repeats(fit, [PERIOD])
     assert np.sqrt(known.sensor[0]) == pytest.approx(SENSOR, rel=0.1)
     force = np.sqrt(known.sensor[0] * known.noise.force[0])
     assert force == pytest.approx(FORCE, rel=0.15)
@@ -66,7 +66,7 @@ def test_known_noise_is_not_tuned():
     np.testing.assert_array_equal(again.sensor, known.sensor)
     # The likelihood is that of Gaussian noise of these variances.
     at = [out.trajectory for out in again.filtered]
-    here = evaluate(again.problem, again.theta, again.noise, at)
+    here = evaluate_likelihood(again.problem, again.theta, again.noise, at)
     out, keep = here.filtered[0], here.problem.counts[0]
     s = out.variance[keep] * known.sensor[0]
     expected = -0.5 * np.sum(np.log(2 * np.pi * s) + out.innovations[keep] ** 2 / s)
@@ -99,11 +99,13 @@ def test_a_private_phase_is_fitted_to_the_fresh_record():
     model = fit_base_model(loop.with_effect(ripple), [repeated(loop.with_effect(ripple), seed=6)],
                        ("m", "c"))  # fmt: skip
     fresh = choose_fresh_data(loop, [], [fresh_one])
-    (moved,) = fresh.loops(model)
+    (moved,) = fresh.prepare_loops(model)
     turned = (moved.labelled["PositionRipple"].phase - 3.0 + np.pi) % (2 * np.pi) - np.pi
     assert abs(turned) < 0.05
-    assert fresh.gap((moved,)) < 0.5 * fresh.gap((model.fitted,))
-    assert fresh.excess((moved,), model.fit) < 0.1 * fresh.excess((model.fitted,), model.fit)
+    assert fresh.measure_gap((moved,)) < 0.5 * fresh.measure_gap((model.fitted,))
+    assert fresh.measure_excess((moved,), model.fit) < 0.1 * fresh.measure_excess(
+        (model.fitted,), model.fit
+    )
 
 
 def test_without_private_parts_the_loop_is_taken_as_it_is():
@@ -112,5 +114,5 @@ def test_without_private_parts_the_loop_is_taken_as_it_is():
     model = fit_base_model(loop, [record], ("m", "c"))
     fresh = choose_fresh_data(loop, [], [record])
     assert isinstance(fresh, FreshData)
-    assert fresh.loops(model)[0].parameters == model.fitted.parameters
+    assert fresh.prepare_loops(model)[0].parameters == model.fitted.parameters
     assert isinstance(model, Model)

@@ -4,7 +4,11 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from ctrlid.validation.residual_tests import autocorrelation, cross_correlation, explained_share
+from ctrlid.validation.residual_tests import (
+    autocorrelation,
+    compute_explained_share,
+    cross_correlation,
+)
 
 N, DRAWS = 1000, 1000
 ALL = np.ones(N, dtype=bool)
@@ -99,7 +103,7 @@ def test_samples_that_do_not_count_add_nothing():
         one, two = test(e, s), test(soiled, other)
         np.testing.assert_array_equal(one.values, two.values)
         assert one.p_value == two.p_value > 0.001
-    assert explained_share(soiled, [(other, 1)], valid) == 0.0
+    assert compute_explained_share(soiled, [(other, 1)], valid) == 0.0
 
 
 def test_signals_that_do_not_move():
@@ -109,9 +113,9 @@ def test_signals_that_do_not_move():
     assert still.passed
     assert still.band == np.inf
     assert autocorrelation(np.full(N, 2.0), ALL).share == 0
-    assert explained_share(np.full(N, 2.0), [(e, 1)], ALL) == 0
-    assert explained_share(e, [], ALL) == 0
-    assert explained_share(e[:20], [(e[:20], 1)], ALL[:20]) == 0
+    assert compute_explained_share(np.full(N, 2.0), [(e, 1)], ALL) == 0
+    assert compute_explained_share(e, [], ALL) == 0
+    assert compute_explained_share(e[:20], [(e[:20], 1)], ALL[:20]) == 0
     assert autocorrelation(e, np.zeros(N, dtype=bool)).passed
 
 
@@ -122,7 +126,7 @@ def test_independent_signals_explain_nothing(colour, s):
     n = 3000
     every = np.ones(n, dtype=bool)
     shares = [
-        explained_share(colour(rng, n), [(s(rng, n), 1), (white(rng, n), 3)], every)
+        compute_explained_share(colour(rng, n), [(s(rng, n), 1), (white(rng, n), 3)], every)
         for _ in range(40)
     ]
     assert np.mean(np.array(shares) > 0.05) <= 0.05
@@ -137,12 +141,12 @@ def test_the_share_that_follows_a_signal_is_measured(share, n):
     moved = signal.lfilter([0, 0, 1.0, -0.4], [1.0], s)
     e = np.sqrt(share) * moved / moved.std() + np.sqrt(1 - share) * noise / noise.std() + 7.0
     every = np.ones(n, dtype=bool)
-    assert explained_share(e, [(s, 1)], every) == pytest.approx(share, abs=0.02)
+    assert compute_explained_share(e, [(s, 1)], every) == pytest.approx(share, abs=0.02)
     # From the eleventh sample before on, less of it can be known.
-    assert explained_share(e, [(s, 11)], every) < 0.6 * share
+    assert compute_explained_share(e, [(s, 11)], every) < 0.6 * share
 
 
 def test_an_exact_relation_is_the_whole_share():
     rng = np.random.default_rng(9)
     s = rng.standard_normal(N)
-    assert explained_share(np.r_[0, s[:-1]], [(s, 1)], ALL) == pytest.approx(1.0, abs=1e-9)
+    assert compute_explained_share(np.r_[0, s[:-1]], [(s, 1)], ALL) == pytest.approx(1.0, abs=1e-9)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import ctrlid as cid
-from ctrlid.validation.sampling_sweep import averaged
+from ctrlid.validation.sampling_sweep import average_input
 from ctrlid.validation.sampling_table import SamplingRow, SamplingSweep
 from problems import levitation, record_of
 
@@ -114,7 +114,7 @@ def test_mean_input_is_exact_for_an_integrator():
     rng = np.random.default_rng(5)
     u = rng.standard_normal(3000)
     y = np.concatenate([[0.0], np.cumsum(u)[:-1]]) * 0.01
-    slow = averaged(cid.Record(u=u, y=y, dt=0.01), 7)
+    slow = average_input(cid.Record(u=u, y=y, dt=0.01), 7)
     assert np.diff(slow.y) == pytest.approx(slow.u[:-1] * slow.dt, abs=1e-12)
     sweep = cid.sweep_sampling_period(
         cid.Record(u=u, y=y, dt=0.01), [0.01, 0.07], estimators=["fit_continuous"], poles=1
@@ -126,7 +126,7 @@ def test_gaps_stay_gaps():
     record = levitated(0.05, 3000)
     valid = np.ones(record.n, bool)
     valid[1001] = False
-    slow = averaged(replace(record, valid=valid), 5)
+    slow = average_input(replace(record, valid=valid), 5)
     assert np.flatnonzero(~slow.valid).tolist() == [200]
 
 

@@ -22,7 +22,7 @@ def record_of(loop, n=600, noise=1e-3, seed=1):
 
 def simulation_of(loop, record, names=None):
     task = Simulation(loop, names or loop.free, [record], [0.0])
-    return task, task.states_from([{}])
+    return task, task.make_initial_states([{}])
 
 
 def test_sensitivities_are_the_derivatives():
@@ -81,7 +81,7 @@ def test_the_search_names_an_overflow_and_a_wrong_zero():
     for name, size in (("StateLimit.upper", 8.0), ("SensorOffset.offset", 0.6)):
         fitted = found.final.fitted.parameters[name]
         assert abs(fitted - size) < 4.5 * found.final.errors[name]
-    assert fresh.gap(fresh.loops(found.final)) < 0.025
+    assert fresh.measure_gap(fresh.prepare_loops(found.final)) < 0.025
     assert found.after.passed
 
 

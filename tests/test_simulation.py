@@ -13,7 +13,7 @@ from scipy.integrate import solve_ivp
 
 import ctrlid as cid
 from ctrlid import CtrlidError
-from ctrlid.loop.period_map import growth_rate
+from ctrlid.loop.period_map import compute_growth_rate
 from problems import REST, drive, held_ball, rough_mass, servo, tank, under_lead
 
 RNG = np.random.default_rng(5)
@@ -179,7 +179,7 @@ def test_an_unstable_loop_says_so():
     weak = cid.Loop(loop.plant, 0.1 * loop.controller, dt=loop.dt, at=op)
     with pytest.raises(CtrlidError, match=r"closed loop is unstable: small deviations grow at"):
         cid.simulate(weak, np.full(4000, op.output * 1.001))
-    assert growth_rate(weak) > 0 > growth_rate(loop)
+    assert compute_growth_rate(weak) > 0 > compute_growth_rate(loop)
 
 
 def test_the_growth_of_a_loop_with_an_analog_controller_is_that_of_its_poles():
@@ -189,7 +189,7 @@ def test_the_growth_of_a_loop_with_an_analog_controller_is_that_of_its_poles():
         closed = np.polyadd(np.polymul([2.0, 5.0, 0.0], [filter_time, 1.0]), 30.0 * np.array(num))
         loop = drive((), controller=C)
         assert loop.analog
-        assert growth_rate(loop) == pytest.approx(np.roots(closed).real.max(), rel=1e-6)
+        assert compute_growth_rate(loop) == pytest.approx(np.roots(closed).real.max(), rel=1e-6)
 
 
 def test_a_saturated_loop_says_so():
@@ -231,7 +231,7 @@ def test_a_plant_too_sharp_to_integrate_warns():
             "not defined at the operating point",
         ),
         (
-            lambda loop: growth_rate(cid.Loop(loop.plant, 1.0, dt=1.0, at=REST)),
+            lambda loop: compute_growth_rate(cid.Loop(loop.plant, 1.0, dt=1.0, at=REST)),
             "no derivative at its",
         ),
         (lambda loop: cid.simulate(cid.Loop(loop.plant, None, dt=1.0, at=loop.at)), "needs r or d"),

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import ctrlid as cid
-from ctrlid.validation.order_selection import _reduce, _regress
+from ctrlid.validation.order_selection import _fit_long_regression, _fit_structure
 from problems import LINEAR_LEVITATION, record_of, under_lead
 
 
@@ -78,7 +78,7 @@ def test_the_right_structure_is_at_chance_distance():
         for k in range(2, 3000):
             x[k] = 1.5 * x[k - 1] - 0.7 * x[k - 2] + u[k - 1] + 0.5 * u[k - 2]
         record = cid.Record(u=u, y=x + e, dt=1.0)
-        theta, misfit, _ = _reduce(_regress(record, 0, 3000, 24), 2, 2, 1)
+        theta, misfit, _ = _fit_structure(_fit_long_regression(record, 0, 3000, 24), 2, 2, 1)
         assert theta == pytest.approx([-1.5, 0.7, 1.0, 0.5], abs=0.02)
         misfits.append(misfit)
     assert np.mean(misfits) == pytest.approx(20, abs=3)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from ctrlid.diagnosis.thresholds import KINDS, THRESHOLD, Thresholds, value, varied
+from ctrlid.diagnosis.thresholds import KINDS, THRESHOLD, Thresholds, declare_number, vary_numbers
 
 ROOT = Path(__file__).resolve().parents[1]
 FILES = sorted(
@@ -75,9 +75,9 @@ def test_every_number_has_one_kind_a_reason_and_a_unit():
 
 def test_a_number_without_a_reason_or_with_two_is_refused():
     with pytest.raises(ValueError, match="exactly one reason, given none"):
-        value(1.0)
+        declare_number(1.0)
     with pytest.raises(ValueError, match="given law and study"):
-        value(1.0, law="so it is", study="and so it was chosen")
+        declare_number(1.0, law="so it is", study="and so it was chosen")
 
 
 def test_every_number_is_used():
@@ -92,19 +92,19 @@ def test_every_number_is_used():
 
 def test_numbers_are_varied_within_a_block_and_come_back():
     known = THRESHOLD.gate
-    with varied(gate=7.0, look_back=0.5):
+    with vary_numbers(gate=7.0, look_back=0.5):
         assert (THRESHOLD.gate, THRESHOLD.look_back) == (7.0, 0.5)
     assert THRESHOLD.gate == known
 
     def fail():
-        with varied(gate=9.0):
+        with vary_numbers(gate=9.0):
             assert THRESHOLD.gate == 9.0
             raise RuntimeError("stopped")
 
     with pytest.raises(RuntimeError, match="stopped"):
         fail()
     assert THRESHOLD.gate == known
-    with pytest.raises(AttributeError, match="no_such"), varied(no_such=1.0):
+    with pytest.raises(AttributeError, match="no_such"), vary_numbers(no_such=1.0):
         pass
 
 
@@ -178,7 +178,7 @@ def test_no_page_states_another_number_than_the_table():
 
 
 def test_a_page_that_states_another_number_is_found():
-    with varied(gate=7.0, held_out=0.2, fitted_samples=50_000):
+    with vary_numbers(gate=7.0, held_out=0.2, fitted_samples=50_000):
         found = {page for page, _, _ in disagreements(texts())}
     assert "ctrlid/diagnosis/procedure.py" in found
     assert "docs/theory/naming_study.rst" in found

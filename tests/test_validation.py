@@ -13,7 +13,7 @@ import pytest
 import ctrlid as cid
 from ctrlid import CtrlidError
 from ctrlid.diagnosis.gap import make_window, simulate_window
-from ctrlid.estimation.likelihood.prediction import predict_ahead, spread_ahead
+from ctrlid.estimation.likelihood.prediction import predict_ahead, predict_spread
 from ctrlid.validation.comparison import Comparison, Curve
 from ctrlid.validation.reproduction import choose_reproduction
 from ctrlid.validation.residual_tests import Correlation
@@ -110,7 +110,7 @@ def test_dry_friction_damps_no_prediction_of_what_moves(fc):
     found = cid.compare(record, replace(loop, controller=None))
     assert [c.label for c in found.curves[:2]] == ["one-step prediction", "25-step prediction"]
     prediction = cid.predict(loop, record)
-    both, sensor = spread_ahead(loop, record, prediction, 25)
+    both, sensor = predict_spread(loop, record, prediction, 25)
     assert 0.9 * prediction.sensor_noise < sensor <= both
     index, y = predict_ahead(loop, record, prediction, 25)
     assert 0.4 < np.std(record.y[index] - y) / both < 1.2
@@ -385,9 +385,9 @@ def test_the_table_reads_as_it_should():
      (0.99999, "100 %"), (1.0, "100 %")],
 )  # fmt: skip
 def test_percentages(share, words):
-    from ctrlid.validation.comparison import _percent
+    from ctrlid.validation.comparison import _write_percent
 
-    assert _percent(share) == words
+    assert _write_percent(share) == words
 
 
 # --- refusals

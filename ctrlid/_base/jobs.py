@@ -31,7 +31,7 @@ def check_jobs(jobs: Any) -> int | None:
     )
 
 
-def spread(
+def share_out(
     function: Callable[[Item], Result], items: Iterable[Item], jobs: int | None
 ) -> Iterator[Result]:
     """Apply a function to each item, in order, with at most `BATCH` items in memory.
@@ -65,7 +65,7 @@ def spread(
             yield from run(joblib.delayed(function)(item) for item in batch)
 
 
-def side_by_side(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
+def run_side_by_side(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
     """Apply a function to each item in threads, one for each processor, in order.
 
     For work whose loops are compiled and leave Python alone meanwhile. Nothing in it may build or
@@ -100,7 +100,9 @@ def side_by_side(function: Callable[[Item], Result], items: Iterable[Item]) -> l
                 return
             results[k] = function(given[k])
 
-    helpers = [_threads().submit(take) for _ in range(min(processors(), len(given)) - 1)]
+    helpers = [
+        _start_threads().submit(take) for _ in range(min(count_processors(), len(given)) - 1)
+    ]
     # The calling thread works too, while the others start.
     take()
     for helper in helpers:
@@ -111,17 +113,17 @@ def side_by_side(function: Callable[[Item], Result], items: Iterable[Item]) -> l
 
 
 @functools.cache
-def processors() -> int:
+def count_processors() -> int:
     """Return the number of processors that this process may use."""
     return int(joblib.cpu_count())
 
 
 @functools.cache
-def _threads() -> ThreadPoolExecutor:
+def _start_threads() -> ThreadPoolExecutor:
     """Return the threads, started once: that takes as long as a short job."""
-    return ThreadPoolExecutor(processors())
+    return ThreadPoolExecutor(count_processors())
 
 
 # A forked process has none of its parent's threads.
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_threads.cache_clear)
+    os.register_at_fork(after_in_child=_start_threads.cache_clear)

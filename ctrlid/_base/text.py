@@ -12,7 +12,7 @@ PREFIXES = ((1e-1, 1.0, ""), (1e-4, 1e-3, "m"), (1e-7, 1e-6, "µ"), (0.0, 1e-9, 
 PREFIXED = ("m", "V", "A", "N", "m/s", "m/s^2", "N s/m", "s")
 
 
-def number(value: complex, digits: int = 7) -> str:
+def write_number(value: complex, digits: int = 7) -> str:
     """Shortest usual form of a real or complex number."""
     value = complex(value)
     if value.imag == 0:
@@ -46,9 +46,9 @@ def with_error(value: complex, error: float) -> str:
     """
     value = complex(value)
     if error == 0:
-        return f"{number(value)} (fixed)"
+        return f"{write_number(value)} (fixed)"
     if not math.isfinite(error) or not math.isfinite(abs(value)):
-        return f"{number(value)} ± {error:g}"
+        return f"{write_number(value)} ± {error:g}"
     size = max(abs(value), error)
     exponent = math.floor(math.log10(size))
     if -4 <= exponent <= 5:
@@ -64,12 +64,12 @@ def with_error(value: complex, error: float) -> str:
     return f"({text})e{exponent:+03d}" if exponent else text
 
 
-def chance(p: float) -> str:
+def write_p_value(p: float) -> str:
     """Return a p-value in words; of the very small ones the size says nothing."""
     return f"p = {p:.2g}" if p >= 1e-4 else "p < 0.0001"
 
 
-def prefix(size: float, unit: str) -> tuple[float, str]:
+def choose_prefix(size: float, unit: str) -> tuple[float, str]:
     """Return a factor and the unit it leads to: millimetres rather than 0.03 m.
 
     Parameters
@@ -95,7 +95,9 @@ def prefix(size: float, unit: str) -> tuple[float, str]:
     return 1 / factor, letter + unit
 
 
-def quantity(value: float, unit: str = "", error: float | None = None, digits: int = 3) -> str:
+def write_quantity(
+    value: float, unit: str = "", error: float | None = None, digits: int = 3
+) -> str:
     """Write a value with its unit, and its standard error if one is given.
 
     Parameters
@@ -119,14 +121,14 @@ def quantity(value: float, unit: str = "", error: float | None = None, digits: i
     >>> quantity(6.1234e-4, "s", 3e-6), quantity(1.23456e-5, "m")
     ('0.6123 ± 0.0030 ms', '12.3 µm')
     """
-    factor, unit = prefix(value, unit)
+    factor, unit = choose_prefix(value, unit)
     if error is None or error == 0 or not math.isfinite(error):
         known = "" if error is None else " (fixed)" if error == 0 else " (not in the data)"
-        return f"{number(factor * value, digits)} {unit}".strip() + known
+        return f"{write_number(factor * value, digits)} {unit}".strip() + known
     return f"{with_error(factor * value, factor * error)} {unit}".strip()
 
 
-def shortest(value: float, error: float) -> float:
+def drop_roundoff(value: float, error: float) -> float:
     """Return the number without the digits that only round-off gave it.
 
     Parameters
@@ -150,7 +152,7 @@ def shortest(value: float, error: float) -> float:
     return short if abs(short - value) <= error else value
 
 
-def polynomial(coefficients: Sequence[float], variable: str, digits: int = 6) -> str:
+def write_polynomial(coefficients: Sequence[float], variable: str, digits: int = 6) -> str:
     """Write a polynomial by falling powers.
 
     Parameters
@@ -184,7 +186,7 @@ def polynomial(coefficients: Sequence[float], variable: str, digits: int = 6) ->
     return text or "0"
 
 
-def listing(items: list[str] | tuple[str, ...]) -> str:
+def write_list(items: list[str] | tuple[str, ...]) -> str:
     """Join items as in ``a, b and c``."""
     items = list(items)
     if len(items) < 2:
@@ -263,7 +265,7 @@ def is_bad_news(text: str) -> bool:
     return any(all(loud[i : i + 3]) for i in range(len(words) - 2))
 
 
-def html_lines(text: str, width: int = 100) -> str:
+def write_html(text: str, width: int = 100) -> str:
     r"""Return a printed report as HTML for a notebook.
 
     The block has no colours of its own and so suits a light and a dark notebook. Columns stay
@@ -307,4 +309,4 @@ class Printed:
         return str(self)
 
     def _repr_html_(self) -> str:
-        return html_lines(str(self))
+        return write_html(str(self))

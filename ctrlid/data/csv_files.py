@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from .._base.errors import CtrlidError, CtrlidWarning
-from .._base.text import shortest, split_unit, with_unit
+from .._base.text import drop_roundoff, split_unit, with_unit
 
 TIME = ("t", "time", "timestamp", "seconds")
 SECONDS = {"": 1.0, "s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6,
@@ -38,7 +38,10 @@ def write_csv(path: Path, record: Any) -> None:
     header = [with_unit(k, units.get(k, "")) for k in channels]
     csv.writer(line, lineterminator="").writerow(header)
     expected = [(k, units.get(k, "")) for k in channels]
-    if "\n" in line.getvalue() or [split_unit(c) for c in _cells(line.getvalue(), ",")] != expected:
+    if (
+        "\n" in line.getvalue()
+        or [split_unit(c) for c in _split_cells(line.getvalue(), ",")] != expected
+    ):
         raise CtrlidError(f"the header {header} would not be read back as it is: remove brackets, "
                           "outer spaces and line breaks from names and units")  # fmt: skip
     fields = {key: getattr(record, key) for key in ("name", "dt", "hold")}
@@ -89,7 +92,7 @@ def read_csv(
     valid = np.ones(len(table), dtype=bool)
     if "valid" in names:
         valid = table[:, place("valid", "valid")] > 0.5
-    table, valid = _bridged(table, places, valid, gaps, path)
+    table, valid = _fill_gaps(table, places, valid, gaps, path)
     start, rows = 0.0, None
     period_given = own.get("dt") if dt is None else dt
     if clock is None:
@@ -104,7 +107,7 @@ def read_csv(
                               f"{', '.join(filter(None, SECONDS))}. Convert it, or remove the "
                               "column and give dt=")  # fmt: skip
         stamps = table[:, clock] * SECONDS[unit]
-        dt, rows = _uniform(stamps, period_given, gaps, path)
+        dt, rows = _make_uniform(stamps, period_given, gaps, path)
         start = float(stamps[0])
     if rows is not None and len(rows) != len(table):
         valid = valid[rows] & (np.diff(rows, prepend=-1) > 0)
@@ -150,10 +153,10 @@ def _read_table(path: Path) -> tuple[dict[str, Any], list[str], Any]:
             comment = line.lstrip("# ")
         at = stop
     separator = max(",;\t", key=line.count)
-    header = _cells(line, separator)
+    header = _split_cells(line, separator)
     if all(_is_number(cell) for cell in header):
         # numpy.savetxt writes its header as a comment.
-        header = _cells(comment, separator)
+        header = _split_cells(comment, separator)
         stop = at
         if not comment or any(_is_number(cell) for cell in header):
             raise CtrlidError(f"{path} has no header line: its first line is {line!r}. Add one "
@@ -167,14 +170,14 @@ def _read_table(path: Path) -> tuple[dict[str, Any], list[str], Any]:
     try:
         table = np.loadtxt(io.StringIO(body), delimiter=separator, ndmin=2, quotechar='"')
     except ValueError:
-        table = _with_blanks(path, body, separator, text.count("\n", 0, stop))
+        table = _read_with_blanks(path, body, separator, text.count("\n", 0, stop))
     if table.shape[1] != len(header):
         raise CtrlidError(f"the header of {path} names {len(header)} columns, its rows have "
                           f"{table.shape[1]}; give every column a name")  # fmt: skip
     return own, header, table
 
 
-def _with_blanks(path: Path, body: str, separator: str, above: int) -> Any:
+def _read_with_blanks(path: Path, body: str, separator: str, above: int) -> Any:
     """Read a table with blank cells, which are NaN, below so many lines."""
     rows = []
     for k, cells in enumerate(csv.reader(io.StringIO(body), delimiter=separator)):
@@ -196,7 +199,7 @@ def _with_blanks(path: Path, body: str, separator: str, above: int) -> Any:
     return np.array(rows)
 
 
-def _bridged(
+def _fill_gaps(
     table: Any, places: Mapping[str, int], valid: Any, gaps: str, path: Path
 ) -> tuple[Any, Any]:
     """Return table and validity with the last values where numbers are missing."""
@@ -222,7 +225,7 @@ def _bridged(
     return table, valid & ~missing.any(axis=1)
 
 
-def _cells(line: str, separator: str) -> list[str]:
+def _split_cells(line: str, separator: str) -> list[str]:
     rows = list(csv.reader([line], delimiter=separator, skipinitialspace=True))
     return [cell.strip() for cell in rows[0]] if rows else [""]
 
@@ -235,7 +238,7 @@ def _is_number(cell: str) -> bool:
     return True
 
 
-def _resolution(stamps: Any) -> float:
+def _find_resolution(stamps: Any) -> float:
     """Return the last decimal place that time stamps use, at least their round-off."""
     finest = 4 * float(np.spacing(np.abs(stamps).max()))
     for digits in range(13):
@@ -247,7 +250,7 @@ def _resolution(stamps: Any) -> float:
     return finest
 
 
-def _even_period(stamps: Any, rounding: float, dt: float | None) -> float | None:
+def _find_even_period(stamps: Any, rounding: float, dt: float | None) -> float | None:
     """Return the period of which stamps are rounded multiples, None if they are not.
 
     A clock of 3.25 ms printed in whole milliseconds steps by 3 and 4 ms, and is regular.
@@ -261,7 +264,7 @@ def _even_period(stamps: Any, rounding: float, dt: float | None) -> float | None
     finest = 4 * float(np.spacing(np.abs(stamps).max()))
     mean = float(stamps[-1] - stamps[0]) / (n - 1)
     if dt is None and mean > 0 and float(np.ptp(stamps - k * mean)) <= finest:
-        return period(stamps)
+        return estimate_period(stamps)
     steps = np.diff(stamps)
     base = float(np.median(steps)) if dt is None else dt
     if not rounding <= mean or base <= 0:
@@ -282,18 +285,18 @@ def _even_period(stamps: Any, rounding: float, dt: float | None) -> float | None
     return next((p for p in short if fits(p) and abs(p - slope) <= rounding / n), slope)
 
 
-def period(stamps: Any) -> float:
+def estimate_period(stamps: Any) -> float:
     """Return the mean period of time stamps, with no digits that only round-off gave it."""
     mean = float(stamps[-1] - stamps[0]) / (len(stamps) - 1)
-    return shortest(mean, 4 * float(np.spacing(np.abs(stamps).max())))
+    return drop_roundoff(mean, 4 * float(np.spacing(np.abs(stamps).max())))
 
 
-def _uniform(stamps: Any, dt: float | None, gaps: str, path: Path) -> tuple[float, Any]:
+def _make_uniform(stamps: Any, dt: float | None, gaps: str, path: Path) -> tuple[float, Any]:
     """Return the period of time stamps and, for each uniform sample, its row."""
     if len(stamps) < 2 or not np.isfinite(stamps).all():
         raise CtrlidError(f"the time column of {path} needs at least 2 values, all finite")
-    rounding = _resolution(stamps)
-    even = _even_period(stamps, rounding, dt)
+    rounding = _find_resolution(stamps)
+    even = _find_even_period(stamps, rounding, dt)
     if even is not None:
         return even, np.arange(len(stamps))
     steps = np.diff(stamps)
@@ -311,7 +314,7 @@ def _uniform(stamps: Any, dt: float | None, gaps: str, path: Path) -> tuple[floa
         raise CtrlidError(f"the time column of {path} steps by {usual:.4g} s, but dt is {dt:g} s. "
                           "Leave dt= out, or remove the column")  # fmt: skip
     if dt is None:
-        dt = period(stamps) if len(regular) == len(steps) else usual
+        dt = estimate_period(stamps) if len(regular) == len(steps) else usual
     missing = np.where(steps < GAP * dt, 0, np.round(steps / dt).astype(int) - 1)
     where = np.flatnonzero(missing)
     if where.size and gaps == "error":

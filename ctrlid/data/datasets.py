@@ -35,7 +35,7 @@ class Source:
         return f"https://raw.githubusercontent.com/{self.repository}/{self.commit}/{self.path}"
 
 
-def _emps_source(file: str, sha256: str) -> Source:
+def _make_emps_source(file: str, sha256: str) -> Source:
     return Source(
         f"emps/{file}", "forgi86/sysid-neural-continuous",
         "956aa7ecd73061b0321c6f6098d74c9e4a7ce67a", f"examples/EMPS/data/{file}", sha256,
@@ -44,30 +44,30 @@ def _emps_source(file: str, sha256: str) -> Source:
     )  # fmt: skip
 
 
-def _inteco_source(file: str, sha256: str) -> Source:
+def _make_inteco_source(file: str, sha256: str) -> Source:
     return Source(
         f"inteco/{file}", "MPKowalczyk/Magnetic_levitation",
         "2fe9575ce557f9e2e9461efeca98d189162c28c4", f"Matlab/{file}", sha256, "no licence stated",
     )  # fmt: skip
 
 
-def _servo_source(file: str, sha256: str) -> Source:
+def _make_servo_source(file: str, sha256: str) -> Source:
     return Source(
         f"servo/{file}", "helonayala/bab_datasets", "584399a037c9a8f2793b51cca76ce7cd9823c2d0",
         f"data/{file}", sha256, "no licence stated",
     )  # fmt: skip
 
 
-EMPS = _emps_source(
+EMPS = _make_emps_source(
     "DATA_EMPS.mat", "6cf6814ae14618795da0101aae2bb97ff0c6351b0501b5492751b02b07facf7e"
 )
-EMPS_PULSES = _emps_source(
+EMPS_PULSES = _make_emps_source(
     "DATA_EMPS_PULSES.mat", "0eab75bb1f6b16228ee78791343a88bf9bfd9a51036ac9807d7b5fc11c0e1704"
 )
-INTECO_PID = _inteco_source(
+INTECO_PID = _make_inteco_source(
     "data_PID_step.mat", "88ea9852dbb14d5f7ff9d3dda3476ff50f5bff34de2748238ce3e92967cf86b4"
 )
-INTECO_COIL = _inteco_source(
+INTECO_COIL = _make_inteco_source(
     "data_stepcon.mat", "18e19ab2dd1b198603d2f8052fa169f9b2eb6e9692536f582a24c6a3891e018f"
 )
 MAGNETOSHIELD = Source(
@@ -76,10 +76,10 @@ MAGNETOSHIELD = Source(
     "matlab/examples/MagnetoShield/MagnetoShield_ID_Data.mat",
     "0d268ef80702641b7e7c125b447dab4bd7e797e89ea62880a2f5eb437e895cb7", "CC BY-NC-ND 4.0",
 )  # fmt: skip
-SERVO_STEPS = _servo_source(
+SERVO_STEPS = _make_servo_source(
     "03_random_steps_01.mat", "c7c104e0e9406f22b9567beb73f914085991a3628e4b7ede422507b7a65b32bd"
 )
-SERVO_SINE = _servo_source(
+SERVO_SINE = _make_servo_source(
     "04_swept_sine.mat", "9b4c7e08602acaa8b72ff1fbfdf38d08bf9e0466fd7bea7102916b1f8f6d3fac"
 )
 TANKS = Source(
@@ -91,43 +91,47 @@ TANKS = Source(
 )  # fmt: skip
 
 
-def _channel(table: Any, key: str, column: int = 0) -> Any:
+def _read_channel(table: Any, key: str, column: int = 0) -> Any:
     values = np.asarray(table[key], dtype=float)
     return values.ravel() if 1 in values.shape else values[:, column]
 
 
-def _emps(table: Any) -> Record:
-    extra = {"pulses": _channel(table, "pulses_N")} if "pulses_N" in table else {}
+def _read_emps(table: Any) -> Record:
+    extra = {"pulses": _read_channel(table, "pulses_N")} if "pulses_N" in table else {}
     return Record(
-        r=_channel(table, "qg"), u=_channel(table, "vir"), y=_channel(table, "qm"), dt=1e-3,
-        extra=extra, units={"r": "m", "u": "V", "y": "m", **dict.fromkeys(extra, "V")},
+        r=_read_channel(table, "qg"),
+        u=_read_channel(table, "vir"),
+        y=_read_channel(table, "qm"),
+        dt=1e-3,
+        extra=extra,
+        units={"r": "m", "u": "V", "y": "m", **dict.fromkeys(extra, "V")},
         names={"r": "reference", "u": "drive voltage", "y": "position"},
-    )  # fmt: skip
+    )
 
 
-def _inteco_pid(table: Any) -> Record:
-    time = _channel(table, "sim_time")
+def _read_inteco_pid(table: Any) -> Record:
+    time = _read_channel(table, "sim_time")
     # The ball hits both stops at first; after each step it swings far out of the linear range.
     valid = (time >= 2.0) & ~((time >= 10.0) & (time < 12.0)) & ~((time >= 18.0) & (time < 20.0))
     return Record(
-        r=_channel(table, "sim_pos", 0), u=_channel(table, "sim_con"),
-        y=_channel(table, "sim_pos", 1), dt=1e-3, valid=valid, start=float(time[0]),
-        extra={"current": _channel(table, "sim_cur")},
+        r=_read_channel(table, "sim_pos", 0), u=_read_channel(table, "sim_con"),
+        y=_read_channel(table, "sim_pos", 1), dt=1e-3, valid=valid, start=float(time[0]),
+        extra={"current": _read_channel(table, "sim_cur")},
         units={"r": "m", "u": "1", "y": "m", "current": "A"},
         names={"r": "reference", "u": "duty", "y": "distance"},
     )  # fmt: skip
 
 
-def _inteco_coil(table: Any) -> Record:
+def _read_inteco_coil(table: Any) -> Record:
     return Record(
-        u=_channel(table, "sim_con"), y=_channel(table, "sim_cur"), dt=1e-3,
-        extra={"distance": _channel(table, "sim_pos", 1)},
+        u=_read_channel(table, "sim_con"), y=_read_channel(table, "sim_cur"), dt=1e-3,
+        extra={"distance": _read_channel(table, "sim_pos", 1)},
         units={"u": "1", "y": "A", "distance": "m"},
         names={"u": "duty", "y": "current"},
     )  # fmt: skip
 
 
-def _magnetoshield(table: Any) -> list[Record]:
+def _read_magnetoshield(table: Any) -> list[Record]:
     whole = np.asarray(table["result"], dtype=float)
     # The set-points were not logged; the magnet settles at these gaps [mm].
     set_points = (14.0, 13.5, 14.5, 15.0, 14.5)
@@ -143,20 +147,23 @@ def _magnetoshield(table: Any) -> list[Record]:
     ]  # fmt: skip
 
 
-def _servo(table: Any) -> Record:
+def _read_servo(table: Any) -> Record:
     return Record(
-        r=_channel(table, "ref"), u=_channel(table, "u"), y=_channel(table, "y"), dt=1e-3,
-        extra={"filtered": _channel(table, "yf")},
+        r=_read_channel(table, "ref"),
+        u=_read_channel(table, "u"),
+        y=_read_channel(table, "y"),
+        dt=1e-3,
+        extra={"filtered": _read_channel(table, "yf")},
         units={"r": "V", "u": "V", "y": "V", "filtered": "V"},
         names={"r": "reference", "u": "drive voltage", "y": "angle"},
-    )  # fmt: skip
+    )
 
 
-def _tanks(which: str) -> Callable[[Any], Record]:
+def _choose_tanks_reader(which: str) -> Callable[[Any], Record]:
     def read(table: Any) -> Record:
         return Record(
-            u=_channel(table, "u" + which), y=_channel(table, "y" + which),
-            dt=float(_channel(table, "Ts")[0]), units={"u": "V", "y": "V"},
+            u=_read_channel(table, "u" + which), y=_read_channel(table, "y" + which),
+            dt=float(_read_channel(table, "Ts")[0]), units={"u": "V", "y": "V"},
             names={"u": "pump voltage", "y": "level sensor"},
         )  # fmt: skip
 
@@ -178,35 +185,35 @@ _TANKS_TEXT = (
 )
 
 _CATALOGUE: dict[str, tuple[Source, Callable[[Any], Any], str]] = {
-    "emps": (EMPS, _emps, _EMPS_TEXT),
+    "emps": (EMPS, _read_emps, _EMPS_TEXT),
     "emps_pulses": (
-        EMPS_PULSES, _emps,
+        EMPS_PULSES, _read_emps,
         _EMPS_TEXT + ". With pulses added to the drive: u contains them, and extra['pulses'] is "
         "their signal as logged, 0 or 5 V, which moves u by 5.1 to 5.3 V",
     ),
     "inteco_pid_step": (
-        INTECO_PID, _inteco_pid,
+        INTECO_PID, _read_inteco_pid,
         "INTECO magnetic levitation under PID control, unstable, steps of the reference from 10 to "
         "12 and 8 mm. 24343 samples at 1 ms; r and y distance from the coil [m], u PWM duty from 0 "
         "to 1, extra['current'] of the coil [A]. Not valid: the first 2 s, where the ball hits "
         "both stops, and 2 s from each step, where it swings to 16.8 and 2.6 mm",
     ),
     "inteco_coil_step": (
-        INTECO_COIL, _inteco_coil,
+        INTECO_COIL, _read_inteco_coil,
         "Coil of the INTECO magnetic levitation alone, the ball at rest: a step of the duty from 0 "
         "to 1 at 5 s. 10764 samples at 1 ms; u duty, y coil current [A]",
     ),
     "magnetoshield_r3": (
-        MAGNETOSHIELD, _magnetoshield,
+        MAGNETOSHIELD, _read_magnetoshield,
         "MagnetoShield R3, a levitated permanent magnet under PID control with noise of 2 V peak "
         "to peak added to u, unstable: a list of five records, one per set-point. 1500 samples "
         "each at 3.25 ms; u solenoid voltage [V], y gap [m], extra['current'] of the coil [A], "
         "read after u is applied. Not valid: the magnet on the floor at the start of the first",
     ),
-    "servo_random_steps": (SERVO_STEPS, _servo, _SERVO_TEXT.format("random steps", 59802)),
-    "servo_swept_sine": (SERVO_SINE, _servo, _SERVO_TEXT.format("swept sine", 60001)),
-    "tanks_estimation": (TANKS, _tanks("Est"), _TANKS_TEXT.format("estimation")),
-    "tanks_validation": (TANKS, _tanks("Val"), _TANKS_TEXT.format("validation")),
+    "servo_random_steps": (SERVO_STEPS, _read_servo, _SERVO_TEXT.format("random steps", 59802)),
+    "servo_swept_sine": (SERVO_SINE, _read_servo, _SERVO_TEXT.format("swept sine", 60001)),
+    "tanks_estimation": (TANKS, _choose_tanks_reader("Est"), _TANKS_TEXT.format("estimation")),
+    "tanks_validation": (TANKS, _choose_tanks_reader("Val"), _TANKS_TEXT.format("validation")),
 }  # fmt: skip
 
 
@@ -227,7 +234,7 @@ def names() -> tuple[str, ...]:
     return tuple(_CATALOGUE)
 
 
-def _entry(name: str) -> tuple[Source, Callable[[Any], Any], str]:
+def _find_entry(name: str) -> tuple[Source, Callable[[Any], Any], str]:
     if name not in _CATALOGUE:
         raise CtrlidError(f"there is no dataset {name!r}; there are {', '.join(_CATALOGUE)}")
     return _CATALOGUE[name]
@@ -259,7 +266,7 @@ def describe(name: str) -> str:
     Source: https://raw.githubusercontent.com/forgi86/sysid-neural-unc/...
     Terms: public benchmark; cite Schoukens, Mattson, Wigren, Noël (2016)
     """
-    source, _, text = _entry(name)
+    source, _, text = _find_entry(name)
     return f"{text}.\nSource: {source.address}\nTerms: {source.terms}"
 
 
@@ -286,15 +293,15 @@ def load(name: str) -> Any:
     CtrlidError
         If there is no such record, the file cannot be fetched or is not the published one.
     """
-    source, read, _ = _entry(name)
-    table = io.loadmat(_path(source))
+    source, read, _ = _find_entry(name)
+    table = io.loadmat(_find_file(source))
     loaded = read(table)
     if isinstance(loaded, list):
         return [replace(record, name=f"{name} {record.name}") for record in loaded]
     return replace(loaded, name=name)
 
 
-def _path(source: Source) -> Path:
+def _find_file(source: Source) -> Path:
     folder = os.environ.get(FOLDER_VARIABLE)
     if folder:
         local = Path(folder) / source.file

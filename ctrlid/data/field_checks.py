@@ -10,7 +10,7 @@ import numpy as np
 from .._base.errors import CtrlidError
 
 
-def samples(name: str, values: Any) -> Any:
+def check_samples(name: str, values: Any) -> Any:
     """Copy a signal to a read-only (n,) float array, or say what is wrong with it."""
     if np.ma.is_masked(values):
         raise CtrlidError(
@@ -41,7 +41,7 @@ def samples(name: str, values: Any) -> Any:
     return array
 
 
-def words(what: str, given: Any, known: Sequence[str]) -> Mapping[str, str]:
+def check_words(what: str, given: Any, known: Sequence[str]) -> Mapping[str, str]:
     """Copy names or units to a read-only mapping of known signals to words."""
     if not isinstance(given, Mapping) or not all(isinstance(v, str) for v in given.values()):
         raise CtrlidError(f"{what} maps signals to words, as in {{'y': 'm'}}; given {given!r}")
@@ -51,7 +51,7 @@ def words(what: str, given: Any, known: Sequence[str]) -> Mapping[str, str]:
     return MappingProxyType(dict(given))
 
 
-def seconds(what: str, value: Any) -> float:
+def check_seconds(what: str, value: Any) -> float:
     """Return a time as float, or say what it is and that it must be a finite number."""
     if isinstance(value, bool) or not isinstance(value, Real) or not np.isfinite(float(value)):
         raise CtrlidError(f"{what} in seconds, a finite number; given {value!r}")

@@ -15,7 +15,7 @@ from .._base.errors import CtrlidError
 from .._base.text import Printed
 from . import csv_files as _csv
 from . import responses as _response
-from .field_checks import samples, seconds, words
+from .field_checks import check_samples, check_seconds, check_words
 from .validity import find_runs, whole_past
 
 Hold = Literal["zoh", "foh"]
@@ -87,7 +87,7 @@ class Record(Printed):
         for key in ("u", "y"):
             if given[key] is None:
                 raise CtrlidError(f"a record needs u and y; {key} is None")
-        signals = {k: samples(k, v) for k, v in given.items() if v is not None}
+        signals = {k: check_samples(k, v) for k, v in given.items() if v is not None}
         if not isinstance(self.extra, Mapping):
             raise CtrlidError(f"extra maps names to channels, as in {{'current': i}}; given "
                               f"{type(self.extra).__name__}")  # fmt: skip
@@ -95,7 +95,7 @@ class Record(Printed):
         if clash:
             raise CtrlidError(f"extra channels need names other than {', '.join(RESERVED)}; given "
                               f"{clash}")  # fmt: skip
-        extra = {k: samples(f"extra[{k!r}]", v) for k, v in self.extra.items()}
+        extra = {k: check_samples(f"extra[{k!r}]", v) for k, v in self.extra.items()}
         sizes = {k: v.size for k, v in (*signals.items(), *extra.items())}
         if len(set(sizes.values())) > 1:
             lengths = ", ".join(f"{k}: {n}" for k, n in sizes.items())
@@ -104,7 +104,7 @@ class Record(Printed):
         n = signals["y"].size
         if n < 2:
             raise CtrlidError(f"a record needs at least 2 samples; given {n}")
-        dt = seconds("dt is the sampling period", self.dt)
+        dt = check_seconds("dt is the sampling period", self.dt)
         if dt <= 0:
             raise CtrlidError(f"dt is the sampling period in seconds, > 0; given {self.dt!r}")
         if self.hold not in get_args(Hold):
@@ -121,9 +121,9 @@ class Record(Printed):
         valid.setflags(write=False)
         for key, value in {
             **signals, "extra": MappingProxyType(extra), "valid": valid, "dt": dt,
-            "start": seconds("start is the time of sample 0", self.start),
-            "names": words("names", self.names, SIGNALS),
-            "units": words("units", self.units, (*SIGNALS, *extra)),
+            "start": check_seconds("start is the time of sample 0", self.start),
+            "names": check_words("names", self.names, SIGNALS),
+            "units": check_words("units", self.units, (*SIGNALS, *extra)),
         }.items():  # fmt: skip
             object.__setattr__(self, key, value)
 
@@ -151,7 +151,7 @@ class Record(Printed):
         """Number of samples times the sampling period [s]."""
         return len(self) * self.dt
 
-    def _map(self, change: Any, **fields: Any) -> "Record":
+    def _change_channels(self, change: Any, **fields: Any) -> "Record":
         """Apply a change to every channel."""
         return replace(
             self,
@@ -174,7 +174,7 @@ class Record(Printed):
         if stop - start < 2:
             raise CtrlidError(f"a record needs at least 2 samples; the slice {start}:{stop} of "
                               f"{len(self)} leaves {max(stop - start, 0)}")  # fmt: skip
-        return self._map(lambda s: s[start:stop], valid=self.valid[start:stop],
+        return self._change_channels(lambda s: s[start:stop], valid=self.valid[start:stop],
                          start=self.start + start * self.dt)  # fmt: skip
 
     def between(self, t0: float, t1: float) -> "Record":
@@ -277,7 +277,7 @@ class Record(Printed):
         if q == 1:
             return self
         if not antialias:
-            return self._map(lambda s: s[::q], valid=self.valid[::q], dt=self.dt * q)
+            return self._change_channels(lambda s: s[::q], valid=self.valid[::q], dt=self.dt * q)
         half = 10 * q
         valid = whole_past(np.pad(self.valid, half), 2 * half)[2 * half :: q]
         if not valid.any():
@@ -295,7 +295,7 @@ class Record(Printed):
             around = np.pad(s - s[0], half, mode="reflect", reflect_type="odd")
             return s[0] + signal.fftconvolve(around, taps, "valid")[::q]
 
-        return self._map(filtered, valid=valid, dt=self.dt * q, hold="foh")
+        return self._change_channels(filtered, valid=valid, dt=self.dt * q, hold="foh")
 
     def with_input(self, channel: str) -> "Record":
         """Return the record with an extra channel as input; the old input becomes an extra one.
@@ -315,7 +315,7 @@ class Record(Printed):
         CtrlidError
             If there is no such channel.
         """
-        return self._swap("u", channel)
+        return self._swap_channels("u", channel)
 
     def with_output(self, channel: str) -> "Record":
         """Return the record with an extra channel as output; the old output becomes an extra one.
@@ -335,9 +335,9 @@ class Record(Printed):
         CtrlidError
             If there is no such channel.
         """
-        return self._swap("y", channel)
+        return self._swap_channels("y", channel)
 
-    def _swap(self, key: str, channel: str) -> "Record":
+    def _swap_channels(self, key: str, channel: str) -> "Record":
         if channel not in self.extra:
             raise CtrlidError(f"the record has no extra channel {channel!r}; it has "
                               f"{', '.join(self.extra) or 'none'}")  # fmt: skip

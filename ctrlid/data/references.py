@@ -78,9 +78,9 @@ def random_binary(
     >>> cid.random_binary(8, amplitude=0.5, hold=2, around=3.0, seed=1)
     array([2.5, 2.5, 3.5, 3.5, 3.5, 3.5, 3.5, 3.5])
     """
-    n, hold = _count(n, "n"), _count(hold, "hold")
-    amplitude, around = _positive(amplitude, "amplitude"), _level(around, "around")
-    tosses = _generator(seed).integers(0, 2, size=-(-n // hold))
+    n, hold = _check_count(n, "n"), _check_count(hold, "hold")
+    amplitude, around = _check_positive(amplitude, "amplitude"), _check_level(around, "around")
+    tosses = _make_generator(seed).integers(0, 2, size=-(-n // hold))
     return np.repeat(np.where(tosses == 1, around + amplitude, around - amplitude), hold)[:n]
 
 
@@ -112,7 +112,7 @@ def staircase(n: int, *, levels: Sequence[float] | npt.ArrayLike, hold: int) -> 
     >>> cid.staircase(7, levels=[0.0, 1.0, 0.5], hold=2)
     array([0. , 0. , 1. , 1. , 0.5, 0.5, 0. ])
     """
-    n, hold = _count(n, "n"), _count(hold, "hold")
+    n, hold = _check_count(n, "n"), _check_count(hold, "hold")
     try:
         values = np.array(levels, dtype=float)
     except (TypeError, ValueError):
@@ -182,10 +182,10 @@ def multisine(
     >>> bool(abs(r[:100] - r[100:200]).max() == 0.0), float(abs(r).max().round(12))
     (True, 1.0)
     """
-    n = _count(n, "n")
-    period = n if period is None else _count(period, "period")
-    amplitude, around = _positive(amplitude, "amplitude"), _level(around, "around")
-    generator = _generator(seed)
+    n = _check_count(n, "n")
+    period = n if period is None else _check_count(period, "period")
+    amplitude, around = _check_positive(amplitude, "amplitude"), _check_level(around, "around")
+    generator = _make_generator(seed)
     try:
         low, high = (float(edge) for edge in band)
     except (TypeError, ValueError):
@@ -265,12 +265,12 @@ def prbs(
     >>> cid.prbs(7, amplitude=1.0, order=3)
     array([ 1., -1., -1.,  1., -1.,  1.,  1.])
     """
-    n, order, hold = _count(n, "n"), _count(order, "order"), _count(hold, "hold")
-    amplitude, around = _positive(amplitude, "amplitude"), _level(around, "around")
+    n, order, hold = _check_count(n, "n"), _check_count(order, "order"), _check_count(hold, "hold")
+    amplitude, around = _check_positive(amplitude, "amplitude"), _check_level(around, "around")
     if order not in _TAPS:
         raise CtrlidError(f"order is {order}; needed is a number of stages from 2 to 20.")
     length = 2**order - 1
-    state = _count(seed, "seed")
+    state = _check_count(seed, "seed")
     if state > length:
         raise CtrlidError(f"seed is {seed}; needed for order {order} is one from 1 to {length}.")
     bits = np.empty(min(-(-n // hold), length))
@@ -284,7 +284,7 @@ def prbs(
     return np.asarray(levels[(np.arange(n) // hold) % length], dtype=float)
 
 
-def _count(value: Any, name: str) -> int:
+def _check_count(value: Any, name: str) -> int:
     try:
         number = operator.index(value)
     except TypeError:
@@ -294,7 +294,7 @@ def _count(value: Any, name: str) -> int:
     return number
 
 
-def _level(value: Any, name: str) -> float:
+def _check_level(value: Any, name: str) -> float:
     try:
         number = float(value)
     except (TypeError, ValueError):
@@ -304,14 +304,14 @@ def _level(value: Any, name: str) -> float:
     return number
 
 
-def _positive(value: Any, name: str) -> float:
-    number = _level(value, name)
+def _check_positive(value: Any, name: str) -> float:
+    number = _check_level(value, name)
     if number <= 0:
         raise CtrlidError(f"{name} is {value!r}; needed is a number above 0.")
     return number
 
 
-def _generator(seed: Any) -> np.random.Generator:
+def _make_generator(seed: Any) -> np.random.Generator:
     try:
         return np.random.default_rng(seed)
     except (TypeError, ValueError):

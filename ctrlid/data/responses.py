@@ -6,7 +6,7 @@ import control as ct
 import numpy as np
 
 from .._base.errors import CtrlidError
-from .._base.text import shortest, split_unit, with_unit
+from .._base.text import drop_roundoff, split_unit, with_unit
 
 
 def read_response(response: Any, chosen: dict[str, str | None]) -> dict[str, Any]:
@@ -20,8 +20,8 @@ def read_response(response: Any, chosen: dict[str, str | None]) -> dict[str, Any
         raise CtrlidError(f"a record is one experiment; the response has {response.ntraces} "
                           "traces. Compute it for one input at a time")  # fmt: skip
     n = len(response.time)
-    inputs = _channels("u", response.input_labels, response.u, n)
-    outputs = _channels("y", response.output_labels, response.y, n)
+    inputs = _list_channels("u", response.input_labels, response.u, n)
+    outputs = _list_channels("y", response.output_labels, response.y, n)
     for label in inputs.keys() & outputs.keys():
         if not np.array_equal(inputs[label], outputs[label]):
             raise CtrlidError(f"the response has an input and an output called {label!r} that "
@@ -29,7 +29,7 @@ def read_response(response: Any, chosen: dict[str, str | None]) -> dict[str, Any
     table = {**inputs, **outputs}
     plain = {split_unit(label)[0]: label for label in table}
 
-    def label_of(key: str) -> str | None:
+    def find_label(key: str) -> str | None:
         given = chosen[key]
         if given is not None:
             return given if given in table else plain.get(given)
@@ -41,7 +41,7 @@ def read_response(response: Any, chosen: dict[str, str | None]) -> dict[str, Any
                   if c not in taken and split_unit(c)[0] not in taken]  # fmt: skip
         return others[0] if len(others) == 1 else None
 
-    labels = {key: label_of(key) for key in ("r", "u", "y")}
+    labels = {key: find_label(key) for key in ("r", "u", "y")}
     for key, wanted in labels.items():
         if wanted is None and (key != "r" or chosen[key] is not None):
             raise CtrlidError(
@@ -53,7 +53,7 @@ def read_response(response: Any, chosen: dict[str, str | None]) -> dict[str, Any
         raise CtrlidError(f"a record needs at least 2 samples; the response has {len(stamps)}")
     steps = np.diff(stamps)
     mean = float(stamps[-1] - stamps[0]) / len(steps)
-    dt = shortest(mean, 4 * float(np.spacing(np.abs(stamps).max())))
+    dt = drop_roundoff(mean, 4 * float(np.spacing(np.abs(stamps).max())))
     if np.any(np.abs(steps - dt) > 1e-6 * dt):
         raise CtrlidError(
             f"a record is sampled uniformly; the times of the response step by {steps.min():.4g} "
@@ -83,7 +83,7 @@ def write_response(record: Any) -> Any:
     )  # fmt: skip
 
 
-def _channels(kind: str, labels: Any, values: Any, n: int) -> dict[str, Any]:
+def _list_channels(kind: str, labels: Any, values: Any, n: int) -> dict[str, Any]:
     if values is None:
         return {}
     rows = np.reshape(values, (-1, n))

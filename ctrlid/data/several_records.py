@@ -40,11 +40,11 @@ def as_records(data: Any) -> tuple[Record, ...]:
         what = f"has {', '.join(strangers)}" if strangers else "is empty"
         raise CtrlidError(f"a Record or a list of Records is needed; the list given {what}")
     for record in records[1:]:
-        _same_kind(records[0], record)
+        _require_same_kind(records[0], record)
     return tuple(records)
 
 
-def model_and_data(first: Any, second: Any) -> tuple[Any, Any]:
+def order_model_and_data(first: Any, second: Any) -> tuple[Any, Any]:
     """Return the model and then the data of two arguments, whichever of them came first.
 
     A model and a record differ in type, so that nobody has to remember an order.
@@ -91,17 +91,17 @@ def stream_records(data: Any) -> tuple[Record, Iterable[Record]]:
         records = as_records(data)
         return records[0], records
     first = as_records(list(islice(data, 1)))[0]
-    return first, chain([first], _checked(first, data))
+    return first, chain([first], _check_each(first, data))
 
 
-def _checked(first: Record, rest: Iterator[Any]) -> Iterator[Record]:
+def _check_each(first: Record, rest: Iterator[Any]) -> Iterator[Record]:
     for record in rest:
         as_records([record])
-        _same_kind(first, record)
+        _require_same_kind(first, record)
         yield record
 
 
-def _same_kind(first: Record, record: Record) -> None:
+def _require_same_kind(first: Record, record: Record) -> None:
     # Periods read from printed times differ by their last digits.
     if abs(record.dt - first.dt) > 1e-6 * first.dt or record.hold != first.hold:
         raise CtrlidError(
@@ -111,7 +111,7 @@ def _same_kind(first: Record, record: Record) -> None:
         )
 
 
-def input_motion(records: Sequence[Record]) -> float:
+def measure_input_motion(records: Sequence[Record]) -> float:
     """Return how far u moves from sample to sample where it is not held, as share of its spread.
 
     Parameters

@@ -11,8 +11,8 @@ import control as ct
 import numpy as np
 
 from .._base.errors import CtrlidError, CtrlidWarning
-from .margins import gain_crossovers, modulus_margin
-from .rational import Rational, closed_loop, is_stable, rational, resolved, to_s
+from .margins import find_gain_crossovers, modulus_margin
+from .rational import Rational, are_resolved, find_closed_loop_poles, is_stable, to_rational, to_s
 
 # Less phase than this (radians) is none: the answer is a pure gain.
 NO_PHASE = 1e-10
@@ -75,12 +75,12 @@ class _Task:
 
     def stabilised(self, controller: Rational) -> bool:
         """Tell whether all closed-loop poles, hidden ones included, are stable."""
-        poles = closed_loop(controller * self.plant)
+        poles = find_closed_loop_poles(controller * self.plant)
         return poles is not None and is_stable(poles, self.plant.dt)
 
     def weakest(self, controller: Rational) -> tuple[float, float]:
         """Return the crossover with the smallest margin, rad/s, and that margin in degrees."""
-        found = gain_crossovers(controller * self.plant)
+        found = find_gain_crossovers(controller * self.plant)
         omega, angle = min(found, key=lambda pair: abs(pair[1]), default=(math.nan, math.nan))
         return omega, math.degrees(abs(angle))
 
@@ -161,9 +161,9 @@ def design_lead(P: Any, crossover: float, phase_margin: float) -> Any:
     >>> margins.stable, round(margins.crossover, 6), round(margins.phase_margin, 6)
     (True, 100.0, 50.0)
     """
-    plant = rational(P, "P")
-    crossover = _number(crossover, "crossover", "rad/s")
-    phase_margin = _number(phase_margin, "phase_margin", "degrees")
+    plant = to_rational(P, "P")
+    crossover = _check_number(crossover, "crossover", "rad/s")
+    phase_margin = _check_number(phase_margin, "phase_margin", "degrees")
     if crossover <= 0:
         raise CtrlidError(f"crossover is {crossover:g} rad/s; needed is a frequency above 0.")
     if crossover >= plant.nyquist * (1 - 1e-9):
@@ -184,17 +184,17 @@ def design_lead(P: Any, crossover: float, phase_margin: float) -> Any:
 
     task = _Task(plant, crossover, phase_margin)
     sign = task.sign()
-    found = _why_not_the_phase(task, (1, -1)) if sign is None else _best(task, sign)
+    found = _explain_phase(task, (1, -1)) if sign is None else _find_best(task, sign)
     if isinstance(found, str) and sign is not None:
-        other = _why_not_the_phase(task, (-sign,))
+        other = _explain_phase(task, (-sign,))
         if LOST not in other:
             found = f"{found} With a gain of the other sign: {other}"
     if isinstance(found, str):
-        raise CtrlidError(f"{found} {_which_crossovers(task)}")
+        raise CtrlidError(f"{found} {_explain_crossovers(task)}")
     return ct.tf(found.num, found.den, plant.dt, name="lead", inputs=["e"], outputs=["u"])
 
 
-def _number(value: Any, name: str, unit: str) -> float:
+def _check_number(value: Any, name: str, unit: str) -> float:
     try:
         number = float(value)
     except (TypeError, ValueError):
@@ -209,7 +209,7 @@ def _check_plant(plant: Rational, crossover: float) -> None:
     for pole in plant.hidden():
         if not is_stable(np.array([pole]), plant.dt):
             raise CtrlidError(
-                f"P has a hidden mode at {_root(pole)} that is not stable: a pole there is "
+                f"P has a hidden mode at {_write_root(pole)} that is not stable: a pole there is "
                 f"cancelled by a zero, so no controller can reach it; if both are rounding "
                 f"errors, remove them, for example with P.minreal()."
             )
@@ -224,11 +224,11 @@ def _check_plant(plant: Rational, crossover: float) -> None:
             )
 
 
-def _root(value: complex) -> str:
+def _write_root(value: complex) -> str:
     return f"{value.real:.4g}" if abs(value.imag) <= 1e-9 * abs(value) else f"{value:.4g}"
 
 
-def _stabilising(task: _Task, sign: int, shares: tuple[float, ...]) -> Iterator[Rational]:
+def _list_stabilising(task: _Task, sign: int, shares: tuple[float, ...]) -> Iterator[Rational]:
     """Yield the compensators of these shares whose loop is stable."""
     for share in shares[:1] if abs(task.needed(sign)) <= NO_PHASE else shares:
         controller = task.compensator(sign, share)
@@ -236,21 +236,21 @@ def _stabilising(task: _Task, sign: int, shares: tuple[float, ...]) -> Iterator[
             yield controller
 
 
-def _works(task: _Task, sign: int) -> bool:
+def _can_do(task: _Task, sign: int) -> bool:
     """Tell whether some lead, of the centred and a few more, does the task."""
     return any(
         task.holds(*task.weakest(controller))
-        for controller in _stabilising(task, sign, COARSE_FAMILY)
+        for controller in _list_stabilising(task, sign, COARSE_FAMILY)
     )
 
 
-def _best(task: _Task, sign: int) -> Rational | str:
+def _find_best(task: _Task, sign: int) -> Rational | str:
     """Return the compensator, or why there is none."""
-    for controller in _stabilising(task, sign, (0.5,)):
+    for controller in _list_stabilising(task, sign, (0.5,)):
         if task.holds(*task.weakest(controller)):
             return controller
     best, reach, worst = None, 0.0, (math.nan, 0.0)
-    for controller in _stabilising(task, sign, FAMILY):
+    for controller in _list_stabilising(task, sign, FAMILY):
         weakest = task.weakest(controller)
         if not task.holds(*weakest):
             worst = max(worst, weakest, key=lambda pair: pair[1])
@@ -271,12 +271,12 @@ def _best(task: _Task, sign: int) -> Rational | str:
     return f"The closed loop is unstable with every lead that has {asked}."
 
 
-def _why_not_the_phase(task: _Task, signs: tuple[int, ...]) -> str:
+def _explain_phase(task: _Task, signs: tuple[int, ...]) -> str:
     """Say how much phase is missing or too much, and which margins this crossover allows."""
 
     def works(phi: float, sign: int) -> bool:
         margin = plain[sign] + phi
-        return 0 < margin < 180 and _works(replace(task, phase_margin=margin), sign)
+        return 0 < margin < 180 and _can_do(replace(task, phase_margin=margin), sign)
 
     needed = {sign: math.degrees(task.needed(sign)) for sign in signs}
     # This is the phase margin that a pure gain gives.
@@ -301,14 +301,14 @@ def _why_not_the_phase(task: _Task, signs: tuple[int, ...]) -> str:
     if high == grid[-1] or plain[sign] + high > 176.9:
         largest = f"just under {min(plain[sign] + 90, 180):.1f}"
     else:
-        high = _edge(grid[grid.index(high) + 1], high, lambda phi: works(phi, sign))
+        high = _find_edge(grid[grid.index(high) + 1], high, lambda phi: works(phi, sign))
         largest = f"about {plain[sign] + high:.1f}"
     if needed[sign] > 0:
         return f"{text}; the largest phase margin at this crossover is {largest} degrees."
     return f"{text}; possible at this crossover are {plain[sign] + low:.1f} to {largest} degrees."
 
 
-def _edge(outside: float, inside: float, works: Callable[[float], bool]) -> float:
+def _find_edge(outside: float, inside: float, works: Callable[[float], bool]) -> float:
     """Return the last value that works, by halving the ratio."""
     for _ in range(12):
         middle = math.sqrt(outside * inside)
@@ -316,16 +316,16 @@ def _edge(outside: float, inside: float, works: Callable[[float], bool]) -> floa
     return inside
 
 
-def _which_crossovers(task: _Task) -> str:
+def _explain_crossovers(task: _Task) -> str:
     """Say at which crossovers one lead does give the phase margin, by trying them."""
     plant = task.plant
 
     def works(omega: float) -> bool:
         trial = replace(task, crossover=omega)
-        return (sign := trial.sign()) is not None and _works(trial, sign)
+        return (sign := trial.sign()) is not None and _can_do(trial, sign)
 
     s = to_s(np.concatenate([plant.poles(), plant.zeros()]), plant.dt)
-    sizes = np.concatenate([np.abs(s[resolved(s, plant.dt)]), [task.crossover]])
+    sizes = np.concatenate([np.abs(s[are_resolved(s, plant.dt)]), [task.crossover]])
     top = min(30 * float(max(sizes)), 0.999 * plant.nyquist)
     grid = np.geomspace(min(float(min(sizes)), top) / 30, top, 61).tolist()
     # At fast sampling the coefficients do not tell the plant at low frequencies.
@@ -341,11 +341,11 @@ def _which_crossovers(task: _Task) -> str:
     starts = [k for k in range(last + 1) if good[k] and (k == 0 or not good[k - 1])]
     for start in starts:
         stop = next((k for k in range(start, last + 1) if not good[k]), last + 1) - 1
-        low = _edge(grid[start - 1], grid[start], works) if start else grid[0]
+        low = _find_edge(grid[start - 1], grid[start], works) if start else grid[0]
         if stop == last:
             ranges.append(f"from about {low:.3g} rad/s upwards")
         else:
-            high = _edge(grid[stop + 1], grid[stop], works)
+            high = _find_edge(grid[stop + 1], grid[stop], works)
             begin = f"from about {low:.3g}" if start else "up"
             ranges.append(f"{begin} to about {high:.3g} rad/s")
     return f"With {task.phase_margin:g} degrees, crossovers are possible {', '.join(ranges)}."

@@ -9,14 +9,14 @@ import numpy as np
 from .._base.arrays import Array, ComplexArray
 from .rational import (
     Rational,
-    closed_loop,
-    crossings,
-    frequencies,
+    find_closed_loop_poles,
+    find_crossings,
+    find_roots,
+    find_smallest,
     is_stable,
-    rational,
-    roots,
-    same_time_base,
-    smallest,
+    make_frequency_grid,
+    require_same_time_base,
+    to_rational,
 )
 
 
@@ -99,17 +99,17 @@ def loop_margins(L: Any) -> Margins:
     >>> round(margins.phase_margin, 3), round(margins.crossover, 3)
     (60.0, 1.732)
     """
-    loop = rational(L, "L")
-    poles = closed_loop(loop)
+    loop = to_rational(L, "L")
+    poles = find_closed_loop_poles(loop)
     nan = math.nan
     if poles is None or not is_stable(poles, loop.dt):
         return Margins(False, nan, nan, nan, nan, nan, nan)
-    gain = gain_crossovers(loop)
+    gain = find_gain_crossovers(loop)
     worst, angle = min(gain, key=lambda pair: abs(pair[1]), default=(nan, math.inf))
     delays = [(angle % (2 * math.pi)) / omega for omega, angle in gain]
     if not loop.dt and abs(loop.at(math.inf)) >= 1:
         delays.append(0.0)
-    factors = _critical_factors(loop)
+    factors = _find_critical_factors(loop)
     return Margins(
         stable=True,
         crossover=worst,
@@ -121,7 +121,7 @@ def loop_margins(L: Any) -> Margins:
     )
 
 
-def gain_crossovers(loop: Rational) -> list[tuple[float, float]]:
+def find_gain_crossovers(loop: Rational) -> list[tuple[float, float]]:
     """Return all (frequency, angle from -1 in radians) where the loop gain is 1."""
 
     def log_gain(omega: Array) -> Array:
@@ -131,11 +131,11 @@ def gain_crossovers(loop: Rational) -> list[tuple[float, float]]:
 
     num, den = loop.num, loop.den
     candidates = np.polysub(np.polymul(num, loop.flipped(num)), np.polymul(den, loop.flipped(den)))
-    found = crossings(log_gain, _grid(loop, candidates))
+    found = find_crossings(log_gain, _make_grid(loop, candidates))
     return [(omega, float(np.angle(-loop.at(omega)))) for omega in found]
 
 
-def _critical_factors(loop: Rational) -> list[float]:
+def _find_critical_factors(loop: Rational) -> list[float]:
     """Return the factors k for which k L passes through -1."""
 
     def sine_of_phase(omega: Array) -> Array:
@@ -144,7 +144,7 @@ def _critical_factors(loop: Rational) -> list[float]:
 
     num, den = loop.num, loop.den
     candidates = np.polysub(np.polymul(num, loop.flipped(den)), np.polymul(loop.flipped(num), den))
-    found = crossings(sine_of_phase, _grid(loop, candidates))
+    found = find_crossings(sine_of_phase, _make_grid(loop, candidates))
     response = [complex(loop.at(omega)) for omega in (*found, 0.0, loop.nyquist)]
     # Beyond these sizes the "crossing" is a zero or a pole on the axis.
     return [-1 / x.real for x in response if -1e9 < x.real < -1e-9]
@@ -158,12 +158,12 @@ def modulus_margin(loop: Rational) -> float:
         with np.errstate(divide="ignore"):
             return np.abs(num + den) / np.abs(den)
 
-    return smallest(distance, _grid(loop), (0.0, loop.nyquist))[1]
+    return find_smallest(distance, _make_grid(loop), (0.0, loop.nyquist))[1]
 
 
-def _grid(loop: Rational, *candidates: Array) -> Array:
+def _make_grid(loop: Rational, *candidates: Array) -> Array:
     total = np.polyadd(loop.num, loop.den)
-    return frequencies(loop.dt, [loop.num, loop.den, total], candidates)
+    return make_frequency_grid(loop.dt, [loop.num, loop.den, total], candidates)
 
 
 def nu_gap(P1: Any, P2: Any) -> float:
@@ -213,26 +213,26 @@ def nu_gap(P1: Any, P2: Any) -> float:
     >>> cid.nu_gap(ct.tf([1], [1, 1]), ct.tf([-1], [1, 1]))
     1.0
     """
-    first, second = rational(P1, "P1").reduced(), rational(P2, "P2").reduced()
-    same_time_base(first, second, "P1 and P2")
+    first, second = to_rational(P1, "P1").reduced(), to_rational(P2, "P2").reduced()
+    require_same_time_base(first, second, "P1 and P2")
     n1, d1, n2, d2 = first.num, first.den, second.num, second.den
     n2_, d2_ = second.flipped(n2), second.flipped(d2)
     total = np.polyadd(np.polymul(d2_, d1), np.polymul(n2_, n1))
     difference = np.polysub(np.polymul(n1, d2), np.polymul(n2, d1))
     if not difference.any():
         return 0.0
-    inside = roots(total)
+    inside = find_roots(total)
     inside = inside[np.abs(inside) < 1] if first.dt else inside[inside.real < 0]
     if len(inside) != first.order:
         return 1.0
 
     def closeness(omega: Array) -> Array:
         (a1, b1), (a2, b2) = first.parts(omega), second.parts(omega)
-        return -np.abs(a1 * b2 - a2 * b1) / (_length(a1, b1) * _length(a2, b2))
+        return -np.abs(a1 * b2 - a2 * b1) / (_compute_length(a1, b1) * _compute_length(a2, b2))
 
-    spectra = _spectra(first, second)
-    grid = frequencies(first.dt, [n1, d1, n2, d2, *spectra], [total, difference])
-    return min(1.0, -smallest(closeness, grid, (0.0, first.nyquist))[1])
+    spectra = _compute_spectra(first, second)
+    grid = make_frequency_grid(first.dt, [n1, d1, n2, d2, *spectra], [total, difference])
+    return min(1.0, -find_smallest(closeness, grid, (0.0, first.nyquist))[1])
 
 
 def robust_margin(P: Any, C: Any) -> float:
@@ -272,32 +272,34 @@ def robust_margin(P: Any, C: Any) -> float:
     >>> cid.robust_margin(ct.tf([1], [1, 0]), -1)
     0.0
     """
-    plant, controller = rational(P, "P"), rational(C, "C")
+    plant, controller = to_rational(P, "P"), to_rational(C, "C")
     # A pure gain runs on any clock.
     if controller.order == 0:
         controller = Rational(controller.num, controller.den, plant.dt)
     if plant.order == 0:
         plant = Rational(plant.num, plant.den, controller.dt)
-    same_time_base(plant, controller, "P and C")
+    require_same_time_base(plant, controller, "P and C")
     loop = plant * controller
-    poles = closed_loop(loop)
+    poles = find_closed_loop_poles(loop)
     if poles is None or not is_stable(poles, loop.dt):
         return 0.0
 
     def margin(omega: Array) -> Array:
         (a1, b1), (a2, b2) = plant.parts(omega), controller.parts(omega)
-        return np.abs(a1 * a2 + b1 * b2) / (_length(a1, b1) * _length(a2, b2))
+        return np.abs(a1 * a2 + b1 * b2) / (_compute_length(a1, b1) * _compute_length(a2, b2))
 
     total = np.polyadd(loop.num, loop.den)
-    grid = frequencies(loop.dt, [loop.num, loop.den, total, *_spectra(plant, controller)])
-    return smallest(margin, grid, (0.0, loop.nyquist))[1]
+    grid = make_frequency_grid(
+        loop.dt, [loop.num, loop.den, total, *_compute_spectra(plant, controller)]
+    )
+    return find_smallest(margin, grid, (0.0, loop.nyquist))[1]
 
 
-def _length(num: ComplexArray, den: ComplexArray) -> Array:
+def _compute_length(num: ComplexArray, den: ComplexArray) -> Array:
     return np.asarray(np.hypot(np.abs(num), np.abs(den)), dtype=float)
 
 
-def _spectra(*systems: Rational) -> list[Array]:
+def _compute_spectra(*systems: Rational) -> list[Array]:
     """Return n* n + d* d of each system: where its size against 1 changes."""
     return [
         np.polyadd(np.polymul(x.num, x.flipped(x.num)), np.polymul(x.den, x.flipped(x.den)))

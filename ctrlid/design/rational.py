@@ -38,7 +38,11 @@ class Rational:
     dt: float
 
     def __mul__(self, other: "Rational") -> "Rational":
-        return Rational(product(self.num, other.num), product(self.den, other.den), self.dt)
+        return Rational(
+            multiply_polynomials(self.num, other.num),
+            multiply_polynomials(self.den, other.den),
+            self.dt,
+        )
 
     @property
     def order(self) -> int:
@@ -88,11 +92,11 @@ class Rational:
 
     def zeros(self) -> ComplexArray:
         """Return the roots of num."""
-        return roots(self.num)
+        return find_roots(self.num)
 
     def poles(self) -> ComplexArray:
         """Return the roots of den."""
-        return roots(self.den)
+        return find_roots(self.den)
 
     def flipped(self, coefficients: Array) -> Array:
         """Return coefficients of c(-s), or of z**order c(1/z): the conjugate on the boundary."""
@@ -119,12 +123,12 @@ class Rational:
         """Return the same transfer function without its hidden modes."""
         if not (hidden := self.hidden()):
             return self
-        part = real_polynomial(hidden)
+        part = make_real_polynomial(hidden)
         num, den = (np.polydiv(c, part)[0].astype(float) for c in (self.num, self.den))
         return Rational(num, den, self.dt)
 
 
-def rational(system: Any, name: str) -> Rational:
+def to_rational(system: Any, name: str) -> Rational:
     """Return `system` as polynomials, or refuse and say what `name` has to be."""
     if isinstance(system, int | float | np.number):
         system = ct.tf([float(system)], [1.0], 0)
@@ -154,7 +158,7 @@ def rational(system: Any, name: str) -> Rational:
         raise CtrlidError(
             f"{name} has coefficients that are NaN or infinite: num {num}, den {den}."
         )
-    num, den = _without_dust(num, den, dt)
+    num, den = _drop_dust(num, den, dt)
     if len(num) > len(den):
         raise CtrlidError(
             f"{name} is improper (degree {len(num) - 1} over {len(den) - 1}), so it answers a step "
@@ -163,16 +167,16 @@ def rational(system: Any, name: str) -> Rational:
     return Rational(num, den, dt)
 
 
-def _without_dust(num: Array, den: Array, dt: float) -> tuple[Array, Array]:
+def _drop_dust(num: Array, den: Array, dt: float) -> tuple[Array, Array]:
     """Drop leading coefficients that are rounding errors of a conversion."""
     den = np.trim_zeros(den, "f")
-    scale = 1.0 if dt else float(max(np.abs(roots(den)), default=1.0) or 1.0)
+    scale = 1.0 if dt else float(max(np.abs(find_roots(den)), default=1.0) or 1.0)
     weights = np.abs(num) * scale ** np.arange(len(num), dtype=float)[::-1]
     keep = np.flatnonzero(weights > 1e-13 * max(weights))
     return (num[keep[0] :] if len(keep) else np.zeros(1)), den
 
 
-def same_time_base(first: Rational, second: Rational, names: str) -> None:
+def require_same_time_base(first: Rational, second: Rational, names: str) -> None:
     """Refuse systems that do not run on the same clock."""
     if not math.isclose(first.dt, second.dt, rel_tol=1e-9):
         raise CtrlidError(
@@ -181,17 +185,17 @@ def same_time_base(first: Rational, second: Rational, names: str) -> None:
         )
 
 
-def product(first: Array, second: Array) -> Array:
+def multiply_polynomials(first: Array, second: Array) -> Array:
     """Return the product of two polynomials."""
     return np.convolve(first, second)
 
 
-def roots(polynomial: npt.ArrayLike) -> ComplexArray:
+def find_roots(polynomial: npt.ArrayLike) -> ComplexArray:
     """Return the roots of a polynomial, none for a constant."""
     return np.asarray(np.roots(np.asarray(polynomial)), dtype=complex)
 
 
-def real_polynomial(zeros: Iterable[complex]) -> Array:
+def make_real_polynomial(zeros: Iterable[complex]) -> Array:
     """Return the monic real polynomial with these roots."""
     return np.atleast_1d(np.real(np.poly(np.array(list(zeros), dtype=complex)))).astype(float)
 
@@ -203,7 +207,7 @@ def to_s(points: ComplexArray, dt: float) -> ComplexArray:
     return np.asarray(np.log(points[np.abs(points) > 1e-12]) / dt, dtype=complex)
 
 
-def resolved(s: ComplexArray, dt: float) -> npt.NDArray[np.bool_]:
+def are_resolved(s: ComplexArray, dt: float) -> npt.NDArray[np.bool_]:
     """Tell which roots set a time scale, and are not integrators but for rounding errors."""
     sizes = np.where(np.isfinite(s), np.abs(s), 0.0)
     return np.asarray(sizes > 1e-7 * (1 / dt if dt else max(sizes, default=0.0)))
@@ -216,15 +220,15 @@ def is_stable(points: ComplexArray, dt: float) -> bool:
     return bool(np.all(points.real < -AXIS_TOLERANCE * np.abs(points)))
 
 
-def closed_loop(loop: Rational) -> ComplexArray | None:
+def find_closed_loop_poles(loop: Rational) -> ComplexArray | None:
     """Return the roots of num + den, hidden modes included; None where the loop is ill-posed."""
     total = np.polyadd(loop.num, loop.den)
     if abs(total[0]) <= 1e-12 * abs(loop.den[0]) or len(total) < len(loop.den):
         return None
-    return roots(total)
+    return find_roots(total)
 
 
-def frequencies(
+def make_frequency_grid(
     dt: float, acting: Iterable[npt.ArrayLike], special: Iterable[npt.ArrayLike] = ()
 ) -> Array:
     """Return a grid in rad/s, dense wherever the roots of the `acting` polynomials act.
@@ -232,21 +236,21 @@ def frequencies(
     A resonance at |Im s| is as narrow as |Re s|, so each root brings its own points. Roots of the
     `special` polynomials are single points; they may be far off, so they do not set the range.
     """
-    s = np.concatenate([to_s(roots(p), dt) for p in acting])
-    s = s[resolved(s, dt)]
+    s = np.concatenate([to_s(find_roots(p), dt) for p in acting])
+    s = s[are_resolved(s, dt)]
     sizes = np.abs(s) if len(s) else np.array([1.0 / dt if dt else 1.0])
     top = math.pi / dt if dt else 1e3 * float(max(sizes))
     bottom = 1e-3 * min(float(min(sizes)), top)
     offsets = np.concatenate([[0.0], np.geomspace(0.01, 30.0, 25)])
     offsets = np.concatenate([-offsets, offsets])
     near = (np.abs(s.imag)[:, None] + np.abs(s.real)[:, None] * offsets).ravel()
-    points = [np.abs(to_s(roots(p), dt).imag) for p in special]
+    points = [np.abs(to_s(find_roots(p), dt).imag) for p in special]
     count = 30 * math.ceil(math.log10(top / bottom)) + 1
     grid = np.concatenate([np.geomspace(bottom, top, count), near, sizes, *points])
     return np.unique(grid[(grid >= bottom) & (grid <= top)])
 
 
-def smallest(function: Function, grid: Array, ends: tuple[float, ...]) -> tuple[float, float]:
+def find_smallest(function: Function, grid: Array, ends: tuple[float, ...]) -> tuple[float, float]:
     """Return (frequency, value) of the minimum over grid and ends, refined between grid points."""
     values = function(grid)
     dips = [
@@ -269,7 +273,7 @@ def smallest(function: Function, grid: Array, ends: tuple[float, ...]) -> tuple[
     return min(found, key=lambda pair: pair[1])
 
 
-def crossings(function: Function, grid: Array) -> list[float]:
+def find_crossings(function: Function, grid: Array) -> list[float]:
     """Return the frequencies where the function changes sign or touches zero."""
     values = function(grid)
     values[np.abs(values) < 1e-13] = 0.0

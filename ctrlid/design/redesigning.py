@@ -10,10 +10,10 @@ import numpy as np
 
 from .._base.arrays import Array
 from .._base.errors import CtrlidError, EffectDoesNotApply, ModelCannotRun
-from .._base.text import Printed, polynomial, quantity
+from .._base.text import Printed, write_polynomial, write_quantity
 from ..estimation.identified_model import IdentifiedModel
 from ..loop.loop import Loop
-from ..loop.period_map import growth_rate
+from ..loop.period_map import compute_growth_rate
 from ..loop.simulation import SimulationStopped, simulate
 from ..physics.conversions import sample_held, to_transfer_function
 from ..physics.trace import timebase
@@ -165,12 +165,14 @@ class Redesign(Printed):
             f"  {a:<32}{b:>12}{c:>12}" for a, b, c in (("", "promised", "achieved"), *self.rows)
         ]
         variable = "z" if self.controller.dt else "s"
-        num, den = (polynomial(p[0][0], variable)
+        num, den = (write_polynomial(p[0][0], variable)
                     for p in (self.controller.num, self.controller.den))  # fmt: skip
         loop = self.loop
         unit = getattr(loop.plant, "units", {}).get(loop.equations().outputs[0], "")
-        step = (f"  The last three were achieved with a step of {quantity(self.step, unit)} on the "
-                "nonlinear physics; a smaller step= comes nearer to the promise.")  # fmt: skip
+        step = (
+            f"  The last three were achieved with a step of {write_quantity(self.step, unit)} on "
+            "the nonlinear physics; a smaller step= comes nearer to the promise."
+        )
         return "\n".join([f"controller: ({num}) / ({den})", *rows, step, "  " + self.verdict])
 
 
@@ -237,15 +239,15 @@ def redesign(
     P = loop.linearize()
     if dt and not timebase(P):
         P = sample_held(P, dt)
-    height = _height(loop, step)
+    height = _choose_height(loop, step)
     # The response is long enough for the slowest promised pole, at the sampling period of the loop.
     length = int(np.clip(60 / (crossover * trial.dt), 20, 50_000))
     time: Array = np.arange(length, dtype=float) * trial.dt
-    promised_step = _linear_step(G, C, time)
-    achieved_step, failure, told = _physical_step(trial, height, promised_step)
-    promised = _performance(loop_margins(G * C), time, promised_step)
+    promised_step = _simulate_linear_step(G, C, time)
+    achieved_step, failure, told = _simulate_physical_step(trial, height, promised_step)
+    promised = _measure_performance(loop_margins(G * C), time, promised_step)
     margins = loop_margins(P * C)
-    growth = growth_rate(trial)
+    growth = compute_growth_rate(trial)
     if growth >= 0 or not margins.stable:
         achieved = Performance(False, *(float("nan"),) * 7)
         if not told:
@@ -254,7 +256,9 @@ def redesign(
                    "Friction aside, the loop is unstable.")  # fmt: skip
             failure = why if failure is None else f"{why} {failure}"
     else:
-        achieved = _performance(margins, time, achieved_step if failure is None else np.empty(0))
+        achieved = _measure_performance(
+            margins, time, achieved_step if failure is None else np.empty(0)
+        )
         achieved = replace(achieved, stable=failure is None)
     # The model has gain 1 at the crossover, so that volts per metre do not matter.
     omega = np.exp(1j * crossover * dt) if dt else 1j * crossover
@@ -264,7 +268,7 @@ def redesign(
                     height, "" if failure is None else failure)  # fmt: skip
 
 
-def _height(loop: Loop, step: float | None) -> float:
+def _choose_height(loop: Loop, step: float | None) -> float:
     if step is None:
         return 0.01 * abs(loop.point.output) or 0.01
     if not isinstance(step, Real) or not np.isfinite(float(step)) or step == 0:
@@ -273,12 +277,14 @@ def _height(loop: Loop, step: float | None) -> float:
     return float(step)
 
 
-def _linear_step(G: Any, C: Any, time: Array) -> Array:
+def _simulate_linear_step(G: Any, C: Any, time: Array) -> Array:
     closed = ct.feedback(G * C, 1)
     return np.asarray(ct.forced_response(closed, time, np.ones(len(time))).outputs, float)
 
 
-def _physical_step(loop: Loop, height: float, promised: Array) -> tuple[Array, str | None, bool]:
+def _simulate_physical_step(
+    loop: Loop, height: float, promised: Array
+) -> tuple[Array, str | None, bool]:
     """Return the response to a step less that to no step, per unit of reference.
 
     With why it broke off, None if it did not, and whether that says how fast deviations grow.
@@ -287,14 +293,14 @@ def _physical_step(loop: Loop, height: float, promised: Array) -> tuple[Array, s
     try:
         still = simulate(loop, rest)
     except SimulationStopped as reason:
-        return np.empty(0), _sentence(reason), reason.unstable
+        return np.empty(0), _write_sentence(reason), reason.unstable
     except (ModelCannotRun, EffectDoesNotApply) as reason:
-        return np.empty(0), _sentence(reason), False
+        return np.empty(0), _write_sentence(reason), False
     try:
         moved = simulate(loop, rest + height)
     except SimulationStopped as reason:
         response = (reason.y - still.y[: len(reason.y)]) / height
-        return response, _sentence(reason), reason.unstable
+        return response, _write_sentence(reason), reason.unstable
     response = np.asarray((moved.y - still.y) / height, dtype=float)
     far = np.abs(response) > LOST * np.max(np.abs(promised))
     if not far.any():
@@ -307,12 +313,12 @@ def _physical_step(loop: Loop, height: float, promised: Array) -> tuple[Array, s
     return response[: k + 1], text + ".", False
 
 
-def _sentence(reason: CtrlidError) -> str:
+def _write_sentence(reason: CtrlidError) -> str:
     text = str(reason)
     return text[0].upper() + text[1:] + "."
 
 
-def _performance(margins: Any, time: Array, response: Array) -> Performance:
+def _measure_performance(margins: Any, time: Array, response: Array) -> Performance:
     overshoot = settling = final = float("nan")
     if margins.stable and response.size:
         final = float(np.mean(response[-max(len(response) // 20, 1) :]))

@@ -10,7 +10,7 @@ from ..data.record import Record
 from ..effects import AbstractEffect, equivalents
 from ..estimation.likelihood.physics_fit import summarize_fit
 from ..loop.loop import Loop
-from .candidates import Trial, same_kind
+from .candidates import Trial, is_same_kind
 from .experiment import find_experiment
 from .findings import Calibrated, Candidate, Finding
 from .gap_summary import GapSummary
@@ -49,8 +49,8 @@ def assemble_answer(
     left = gap_is_left(gap, disturbance, found.final.fit)
     total = found.final.fit.value - found.base.fit.value
     effects, gains = [f.trial.effect for f in found.found], [f.trial.gain for f in found.found]
-    loose = find_doubt(effects, gains, total if math.isfinite(total) else 0.0)
-    complete = found.after.passed and not left and loose is None
+    objection = find_doubt(effects, gains, total if math.isfinite(total) else 0.0)
+    complete = found.after.passed and not left and objection is None
     verdict = choose_verdict(complete, named=bool(findings))
     notes = list(fitted.estimate.notes)
     if not loop.free:
@@ -68,7 +68,7 @@ def assemble_answer(
     )  # fmt: skip
     tests = dict(found.after.p_values)
     sentence = write_conclusion(
-        verdict, findings, gap, disturbance, found.after, where, None if left else loose
+        verdict, findings, gap, disturbance, found.after, where, None if left else objection
     )
     return Diagnosis(
         verdict, sentence, findings, final, gap, where, _rank_candidates(found), disturbance,
@@ -139,11 +139,11 @@ def _rank_candidates(found: Search) -> tuple[Candidate, ...]:
     rows = []
     for k, step in enumerate(found.steps):
         # An effect that was started from several values is shown once.
-        begun: list[AbstractEffect] = []
+        shown: list[AbstractEffect] = []
         for t in step.trials:
-            if any(same_kind(t.effect, b) for b in begun):
+            if any(is_same_kind(t.effect, b) for b in shown):
                 continue
-            begun.append(t.effect)
+            shown.append(t.effect)
             refitted = math.isfinite(t.gain)
             effect = t.fitted if refitted else t.effect
             full_penalty = t.penalty if refitted else t.full_penalty
@@ -158,14 +158,14 @@ def _find_sensitivity(found: Search) -> dict[str, float]:
     if not found.steps:
         return sizes
     for t in found.steps[-1].trials:
-        size = _smallest_visible(t)
+        size = _find_smallest_visible(t)
         key = f"{t.name}.{t.effect.parameters()[0].name}" if t.effect.parameters() else t.name
         if math.isfinite(size) and key not in sizes:
             sizes[key] = size
     return sizes
 
 
-def _smallest_visible(t: Trial) -> float:
+def _find_smallest_visible(t: Trial) -> float:
     if len(t.effect.parameters()) != 1 or not t.label or not math.isfinite(t.score):
         return math.nan
     fit = t.model.fit

@@ -80,7 +80,7 @@ class Trial:
         return self.model.fitted.labelled[self.label]
 
 
-def same_kind(one: AbstractEffect, other: AbstractEffect) -> bool:
+def is_same_kind(one: AbstractEffect, other: AbstractEffect) -> bool:
     """Whether two effects differ in their values only: of one class, and of one state or name."""
     return type(one) is type(other) and getattr(one, "name", "") == getattr(other, "name", "")
 
@@ -137,4 +137,4 @@ def list_missing_candidates(
 
 def _has_effect(model: Model, effect: AbstractEffect) -> bool:
     """Whether the model has this effect already, and a plant can have it only once."""
-    return not effect.repeatable and any(same_kind(e, effect) for e in model.loop.effects)
+    return not effect.repeatable and any(is_same_kind(e, effect) for e in model.loop.effects)

@@ -50,13 +50,13 @@ def run_constancy_tests(fit: Fit, axes: Mapping[str, Array]) -> dict[str, float]
         )
     ]
     scores = np.concatenate([x * (e / s)[:, None] for x, e, s, _ in parts])
-    told = np.concatenate([x**2 / s[:, None] for x, _, s, _ in parts])
+    information = np.concatenate([x**2 / s[:, None] for x, _, s, _ in parts])
     p_values = {}
     for axis, values in axes.items():
         index = find_bins(values, find_bin_edges(values))
         count = np.bincount(index)
         for j, name in enumerate(names):
-            score, size = (np.bincount(index, v[:, j]) for v in (scores, told))
+            score, size = (np.bincount(index, v[:, j]) for v in (scores, information))
             use = (count >= THRESHOLD.fewest_in_bin) & (size > 0)
             if use.sum() > 1:
                 p_values[f"constancy of {name} over {axis}"] = float(
@@ -75,10 +75,10 @@ def _test_slow_line(score: Array, size: float, keep: Array) -> float:
     filled = np.zeros(len(keep))
     filled[keep] = score
     power = np.abs(np.fft.rfft(filled)) ** 2 / size
-    return chance_of_line(power[1 : max(int(THRESHOLD.slow_rhythm * len(power)), 2)])
+    return compute_line_probability(power[1 : max(int(THRESHOLD.slow_rhythm * len(power)), 2)])
 
 
-def chance_of_line(power: Array) -> float:
+def compute_line_probability(power: Array) -> float:
     """Return the probability that noise, of mean power one, has as strong a line somewhere."""
     return float(-np.expm1(len(power) * np.log1p(-np.exp(-power.max(initial=0.0)))))
 

@@ -11,7 +11,7 @@ from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from ..data.record import Record
 from ..data.references import random_binary
 from ..estimation.likelihood.likelihood import Known, make_problem
-from ..estimation.likelihood.maximization import begin_fit, expected_gain
+from ..estimation.likelihood.maximization import begin_fit, compute_expected_gain
 from ..loop.simulation import Simulator
 from .candidates import Trial
 from .gap import make_simulator
@@ -59,17 +59,21 @@ def find_experiment(
     able = [
         (d, text, r)
         for text, r in _list_references(record)
-        if (d := _least_distance(simulator, best, others, r[: THRESHOLD.experiment_tried], record))
+        if (
+            d := _find_least_distance(
+                simulator, best, others, r[: THRESHOLD.experiment_tried], record
+            )
+        )
         is not None
     ]
     chosen = _choose_clearest(able)
-    while chosen is not None and not all(_loop_survives(s, chosen[2], record) for s in simulators):
+    while chosen is not None and not all(_can_survive(s, chosen[2], record) for s in simulators):
         able = [a for a in able if a is not chosen]
         chosen = _choose_clearest(able)
     if chosen is None:
         return words, None
     own = (
-        _least_distance(
+        _find_least_distance(
             simulator, best, others, np.asarray(record.r)[: THRESHOLD.experiment_tried], record
         )
         or 0.0
@@ -96,7 +100,7 @@ def _choose_clearest(able: Sequence[tuple[float, str, Array]]) -> tuple[float, s
     return chosen
 
 
-def _loop_survives(simulator: Simulator, r: Array, record: Record) -> bool:
+def _can_survive(simulator: Simulator, r: Array, record: Record) -> bool:
     """Whether a loop follows a reference somewhat larger than this one.
 
     Behind limits of the input, a loop that has lost its plant may yet stay bounded.
@@ -157,22 +161,22 @@ def _visit_levels(n: int, reach: float) -> Array:
     return np.asarray(np.interp(np.arange(n), times, values), dtype=float)
 
 
-def _least_distance(
+def _find_least_distance(
     simulator: Simulator, best: Trial, others: Sequence[Trial], r: Array, record: Record
 ) -> float | None:
     """Return the least distance of a finding from its rivals, per sample."""
-    if not _loop_survives(simulator, r, record):
+    if not _can_survive(simulator, r, record):
         return None
     try:
         y, u = simulator.run(simulator.start(None), r, np.zeros(len(r)))
     except ModelCannotRun:
         return None
     made = Record(u=u, y=y, r=r, dt=record.dt, hold=record.hold)
-    sizes = [d for t in others if (d := _unpredicted(t, best, made)) is not None]
+    sizes = [d for t in others if (d := _measure_unpredicted(t, best, made)) is not None]
     return min(sizes) / len(r) if sizes else None
 
 
-def _unpredicted(rival: Trial, best: Trial, record: Record) -> float | None:
+def _measure_unpredicted(rival: Trial, best: Trial, record: Record) -> float | None:
     """Return what a rival cannot predict of a record that the finding made."""
     model = rival.model
     known = Known(best.model.fit.noise, np.full(1, float(np.mean(best.model.fit.sensor))))
@@ -182,5 +186,5 @@ def _unpredicted(rival: Trial, best: Trial, record: Record) -> float | None:
     except (ModelCannotRun, EffectDoesNotApply):
         return None
     errors = sum(float(np.nansum(z**2)) for z in fit.standardized)
-    left = errors - 2 * expected_gain(fit)
+    left = errors - 2 * compute_expected_gain(fit)
     return max(left, 0.0) if math.isfinite(left) else None

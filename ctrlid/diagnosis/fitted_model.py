@@ -10,13 +10,13 @@ import numpy as np
 from .._base.arrays import Array
 from ..data.record import Record
 from ..estimation.likelihood.filter_data import FilterData, prepare_for_loop
-from ..estimation.likelihood.kalman_filter import Noise, first_guess
+from ..estimation.likelihood.kalman_filter import Noise, guess_trajectory
 from ..estimation.likelihood.likelihood import (
     Fit,
-    evaluate,
-    linearize_again,
-    parameter_bounds,
-    start_values,
+    evaluate_likelihood,
+    list_parameter_bounds,
+    list_start_values,
+    relinearize_fit,
 )
 from ..estimation.likelihood.sampled_plant import SampledPlant, Trajectory
 from ..loop.loop import Loop
@@ -101,10 +101,10 @@ def keep_information(fit: Fit, bare: Fit) -> Fit:
 
 def with_linearization(model: Model) -> Model:
     """Return a model whose fit has the plant along its trajectory."""
-    return model if model.fit.linearized else replace(model, fit=linearize_again(model.fit))
+    return model if model.fit.linearized else replace(model, fit=relinearize_fit(model.fit))
 
 
-def log_terms(fit: Fit) -> Array:
+def compute_log_terms(fit: Fit) -> Array:
     """Return each sample's share of the log-likelihood, records one after the other."""
     parts: list[Any] = []
     for out, keep, r in zip(fit.filtered, fit.counts, fit.sensor, strict=True):
@@ -113,16 +113,16 @@ def log_terms(fit: Fit) -> Array:
     return np.concatenate(parts)
 
 
-def carry_over(base: Model, loop: Loop, names: Sequence[str]) -> Fit:
+def carry_over_fit(base: Model, loop: Loop, names: Sequence[str]) -> Fit:
     """Return the likelihood of a larger or smaller model, along the trajectory of the base."""
     old = base.fit.problem
     plant = old.plant.of_loop(loop, names)
     data = tuple(prepare_for_loop(one, loop) for one in old.data)
     at = [
-        _carry_trajectory(old.plant, plant, out.trajectory, first_guess(plant, one))
+        _carry_trajectory(old.plant, plant, out.trajectory, guess_trajectory(plant, one))
         for out, one in zip(base.fit.filtered, data, strict=True)
     ]
-    lower, upper = parameter_bounds(loop, names)
+    lower, upper = list_parameter_bounds(loop, names)
     for k, name in enumerate(names):
         if name in base.names:
             i = base.names.index(name)
@@ -135,10 +135,10 @@ def carry_over(base: Model, loop: Loop, names: Sequence[str]) -> Fit:
                 lower[k] = max(lower[k], low)
                 upper[k] = max(min(upper[k], high), lower[k])
     problem = replace(old, plant=plant, data=data, lower=lower, upper=upper)
-    theta = np.clip(start_values(loop, names), lower, upper)
-    fit = evaluate(problem, theta, base.fit.noise, at)
+    theta = np.clip(list_start_values(loop, names), lower, upper)
+    fit = evaluate_likelihood(problem, theta, base.fit.noise, at)
     if math.isfinite(fit.value) and plant.n > old.plant.n:
-        fit = evaluate(problem, theta, base.fit.noise, fit.trajectories)
+        fit = evaluate_likelihood(problem, theta, base.fit.noise, fit.trajectories)
     return fit
 
 
@@ -165,9 +165,9 @@ class RecordRange:
     @property
     def fastest(self) -> float:
         """The largest usual speed [output unit/s]; 1 where nothing moves."""
-        return max(self._usual_speed(a) for a in self.at)
+        return max(self._find_usual_speed(a) for a in self.at)
 
-    def _usual_speed(self, at: Trajectory) -> float:
+    def _find_usual_speed(self, at: Trajectory) -> float:
         speeds = [np.abs(at.filtered[:, j]) for j in self.plant.e.velocities]
         usual = (float(np.quantile(v, THRESHOLD.usual_speed)) for v in speeds)
         return max(usual, default=1.0) or 1.0

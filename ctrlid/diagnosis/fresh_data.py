@@ -9,7 +9,7 @@ import numpy as np
 from .._base.arrays import Array
 from .._base.errors import CtrlidError, ModelCannotRun
 from ..data.record import Record
-from ..estimation.likelihood.likelihood import Fit, Known, evaluate, make_problem
+from ..estimation.likelihood.likelihood import Fit, Known, evaluate_likelihood, make_problem
 from ..estimation.likelihood.maximization import begin_fit, maximize
 from ..loop.loop import Loop
 from ..validation.reproduction import Reproduction, choose_reproduction
@@ -31,13 +31,13 @@ class FreshData:
     rest: tuple[Record, ...] | None
     how: Reproduction
 
-    def loops(self, model: Model) -> tuple[Loop, ...]:
+    def prepare_loops(self, model: Model) -> tuple[Loop, ...]:
         """Return the loop of a model for each window, ready to be compared there."""
         if model.errors is not None:
             return (model.fitted,) * len(self.windows)
         if self.rest is None:
             return tuple(_fit_private_parameters(model, w) for w in self.windows)
-        return (self._trained(model, self.rest),) * len(self.windows)
+        return (self._fit_loop(model, self.rest),) * len(self.windows)
 
     def without_windows(self, records: Sequence[Record]) -> list[Record]:
         """Return of the diagnosed records what may be fitted without touching the windows."""
@@ -45,13 +45,13 @@ class FreshData:
             return list(records)
         return [r[: len(rest)] for r, rest in zip(records, self.rest, strict=True)]
 
-    def _trained(self, model: Model, records: Sequence[Record]) -> Loop:
+    def _fit_loop(self, model: Model, records: Sequence[Record]) -> Loop:
         """Return a model's loop with its parameters fitted to other records."""
         fit = model.fit
         if not model.names:
             return model.fitted
-        parts, begins = cut_stretches(records)
-        problem = make_problem(model.fitted, model.names, parts, begins)
+        parts, start_times = cut_stretches(records)
+        problem = make_problem(model.fitted, model.names, parts, start_times)
         known = fit.known
         if known is not None and (known.sensor is None or len(parts) == len(known.sensor)):
             problem = replace(problem, known=known)
@@ -59,20 +59,20 @@ class FreshData:
             model.loop, maximize(begin_fit(problem, fit.theta, fit.noise), exact=False)
         ).fitted
 
-    def outputs(self, loops: Sequence[Loop]) -> tuple[Array, ...]:
+    def simulate_outputs(self, loops: Sequence[Loop]) -> tuple[Array, ...]:
         """Return what each loop makes of its window."""
         pairs = zip(loops, self.windows, strict=True)
         return tuple(gaps.simulate_window(loop, w, self.how) for loop, w in pairs)
 
-    def gap(self, loops: Sequence[Loop]) -> float:
+    def measure_gap(self, loops: Sequence[Loop]) -> float:
         """Return the RMS error of loops [output unit]."""
-        return gaps.root_mean_square(self.windows, self.outputs(loops))
+        return gaps.root_mean_square(self.windows, self.simulate_outputs(loops))
 
     def gap_of(self, model: Model) -> float:
         """Return the RMS error of a model, made ready for each window [output unit]."""
-        return self.gap(self.loops(model))
+        return self.measure_gap(self.prepare_loops(model))
 
-    def excess(self, loops: Sequence[Loop], fit: Fit) -> float:
+    def measure_excess(self, loops: Sequence[Loop], fit: Fit) -> float:
         r"""Return what noise, as a fit knows it, leaves unexplained of the innovations.
 
         .. math:: \tfrac12 \sum_k (e_k^2 / s_k - 1)
@@ -81,7 +81,7 @@ class FreshData:
         known = replace(known, sensor=np.full(1, float(np.mean(fit.sensor))))
         total = 0.0
         for loop, window in zip(loops, self.windows, strict=True):
-            problem = make_problem(loop, (), [window.record], [window.begin])
+            problem = make_problem(loop, (), [window.record], [window.start_time])
             here = begin_fit(replace(problem, known=known))
             z = here.standardized[0][window.mask]
             total += 0.5 * float(np.nansum(z**2 - 1))
@@ -118,14 +118,14 @@ def _fit_private_parameters(model: Model, window: gaps.Window) -> Loop:
         return loop
     sensor = np.full(1, float(np.mean(fit.sensor)))
     try:
-        problem = make_problem(loop, names, [window.record], [window.begin])
+        problem = make_problem(loop, names, [window.record], [window.start_time])
         problem = replace(problem, known=Known(fit.noise, sensor))
         start = begin_fit(problem)
         at = start.trajectories
         for k in range(len(names)):
             turns = np.arange(THRESHOLD.phase_starts) * 2 * math.pi / THRESHOLD.phase_starts
             turned = [start.theta + turn * np.eye(len(names))[k] for turn in turns]
-            tried = [evaluate(start.problem, theta, fit.noise, at) for theta in turned]
+            tried = [evaluate_likelihood(start.problem, theta, fit.noise, at) for theta in turned]
             start = max(tried, key=lambda f: f.value)
         best = maximize(start, exact=False)
     except ModelCannotRun:

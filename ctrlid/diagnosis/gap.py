@@ -12,7 +12,7 @@ from .._base.arrays import Array
 from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from ..data.record import Record
 from ..estimation.likelihood.likelihood import Fit
-from ..estimation.likelihood.prediction import predict, predict_ahead, spread_ahead
+from ..estimation.likelihood.prediction import predict, predict_ahead, predict_spread
 from ..loop.loop import Loop
 from ..loop.simulation import Simulator
 from ..validation.record_simulation import long_stretches, prepare_stretch
@@ -24,11 +24,12 @@ from .thresholds import THRESHOLD
 class Window:
     """A stretch of a record that is compared, with a lead in which the start may still show.
 
-    `begin` is the time of its first sample since the start of the record, `mask` what is compared.
+    `start_time` is the time of its first sample since the start of the record, `mask` what is
+    compared.
     """
 
     record: Record
-    begin: float
+    start_time: float
     mask: Any
 
 
@@ -93,7 +94,7 @@ def simulate_window(loop: Loop, window: Window, how: Reproduction) -> Array:
         return y
     for part in long_stretches(record):
         try:
-            stretch = prepare_stretch(simulator, record, part, begin=window.begin)
+            stretch = prepare_stretch(simulator, record, part, start_time=window.start_time)
             y[part] = stretch.run(simulator)[0]
         except ModelCannotRun:
             continue
@@ -166,7 +167,7 @@ def _simulate_noise(
     record = window.record
     size = int(np.count_nonzero(window.mask))
     if how.horizon:
-        known = np.array(spread_ahead(loop, record, predict(loop, record), how.horizon))
+        known = np.array(predict_spread(loop, record, predict(loop, record), how.horizon))
         return np.tile(size * known**2, (runs, 1))
     simulator = make_simulator(loop)
     squares, count = np.zeros((runs, 2)), 0
@@ -174,7 +175,7 @@ def _simulate_noise(
         use = window.mask[part]
         if not use.any():
             continue
-        stretch = prepare_stretch(simulator, record, part, begin=window.begin)
+        stretch = prepare_stretch(simulator, record, part, start_time=window.start_time)
         rest = stretch.run(simulator)[0]
         for seed in range(runs):
             noise = draw_noise(fit, sensor, len(rest), seed)

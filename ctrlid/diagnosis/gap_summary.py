@@ -31,10 +31,10 @@ class GapSummary:
 def summarize_gap(loop: Loop, found: Search, fresh: FreshData) -> GapSummary:
     """Return the gap on data that no parameter was fitted to, and what each finding closes."""
     windows, how = fresh.windows, fresh.how
-    before, after = (fresh.loops(m) for m in (found.base, found.final))
+    before, after = (fresh.prepare_loops(m) for m in (found.base, found.final))
     for effect in found.base.loop.effects[len(loop.effects) :]:
         before = tuple(x.without_effect(type(effect).__name__) for x in before)
-    results = [fresh.outputs(x) for x in ((loop,) * len(windows), before, after)]
+    results = [fresh.simulate_outputs(x) for x in ((loop,) * len(windows), before, after)]
     sizes = [gaps.root_mean_square(windows, y) for y in results]
     fit = found.final.fit
     floor = gaps.compute_floor(after, fit, windows, how)
@@ -45,12 +45,12 @@ def summarize_gap(loop: Loop, found: Search, fresh: FreshData) -> GapSummary:
         error = sizes[1]
         if len(found.found) > 1:
             label = list(after[0].labelled)[f.position]
-            error = fresh.gap([x.without_effect(label) for x in after])
-        shares[f.position] = _share_closed(error**2 - sizes[2] ** 2, sizes[1], floor.both)
+            error = fresh.measure_gap([x.without_effect(label) for x in after])
+        shares[f.position] = _compute_share_closed(error**2 - sizes[2] ** 2, sizes[1], floor.both)
     first = windows[0]
     gap = Gap(
         str(how), sizes[0], sizes[1], sizes[2], floor.both, first.record.units.get("y", ""),
-        first.begin + np.asarray(first.record.t - first.record.start)[first.mask],
+        first.start_time + np.asarray(first.record.t - first.record.start)[first.mask],
         np.asarray(first.record.y)[first.mask], results[1][0][first.mask],
         results[2][0][first.mask], floor.widest, how.horizon,
     )  # fmt: skip
@@ -70,27 +70,27 @@ def take_back_widening(
     return found, summary
 
 
-def helps_on_fresh_data(fresh: FreshData) -> Callable[[Weighed, Model], bool]:
+def make_fresh_data_test(fresh: FreshData) -> Callable[[Weighed, Model], bool]:
     """Return whether an effect closes a fair part of what is left without it, on fresh data.
 
     Of the gap, or, where noise is known, of the one-step errors: a small fast force is seen there.
     """
-    loops = functools.cache(fresh.loops)
+    loops = functools.cache(fresh.prepare_loops)
 
     def helps(f: Weighed, model: Model) -> bool:
         with_it, without = loops(model), loops(f.base)
         if model.fit.known is not None:
-            left = fresh.excess(without, model.fit)
-            if left - fresh.excess(with_it, model.fit) > THRESHOLD.helps * left:
+            left = fresh.measure_excess(without, model.fit)
+            if left - fresh.measure_excess(with_it, model.fit) > THRESHOLD.helps * left:
                 return True
         floor = gaps.compute_floor(with_it, model.fit, fresh.windows, fresh.how).both
-        gap, before = fresh.gap(with_it), fresh.gap(without)
-        return _share_closed(before**2 - gap**2, before, floor) > THRESHOLD.helps
+        gap, before = fresh.measure_gap(with_it), fresh.measure_gap(without)
+        return _compute_share_closed(before**2 - gap**2, before, floor) > THRESHOLD.helps
 
     return helps
 
 
-def _share_closed(closed: float, before: float, floor: float) -> float:
+def _compute_share_closed(closed: float, before: float, floor: float) -> float:
     above = before**2 - (floor**2 if math.isfinite(floor) else 0.0)
     if not (math.isfinite(closed) and math.isfinite(above)) or above <= 0:
         return math.nan

@@ -11,8 +11,8 @@ from ..effects import AbstractEffect
 from ..estimation.likelihood.likelihood import Fit
 from .candidates import Trial, contains, list_missing_candidates
 from .fitted_model import Model, can_simulate, drop_linearization, with_linearization
-from .noise_tests import NoiseTests, alarm_level, run_noise_tests
-from .recalibration import model_at_given_values
+from .noise_tests import NoiseTests, choose_alarm_level, run_noise_tests
+from .recalibration import restore_given_values
 from .refitting import refit_candidate
 from .removal import (
     Weighed,
@@ -87,7 +87,7 @@ def search_effects(
             break
         tell(f"round {len(steps) + 1}: screening")
         pool = list_missing_candidates(model, catalogue)
-        step = run_round(model, pool, work, None if steps else model_at_given_values(base))
+        step = run_round(model, pool, work, None if steps else restore_given_values(base))
         step = replace(step, base=Model(model.loop, drop_linearization(model.fit)))
         if step.best is not None and _is_stand_in(step.best, model, beside=bool(steps)):
             step = replace(step, best=None)
@@ -108,7 +108,7 @@ def search_effects(
     return Search(base, tuple(steps), model, found, *tests, left)
 
 
-def choose_way(
+def choose_search(
     one: Search, other: Search, helps: Callable[[Weighed, Model], bool],
     gap: Callable[[Model], float],
 ) -> Search:  # fmt: skip
@@ -147,15 +147,15 @@ def _is_stand_in(best: Trial, model: Model, beside: bool) -> bool:
     beside : bool
         Whether an effect was found before; the best of several unknown ones may gain little.
     """
-    if best.gain < THRESHOLD.little_of_known * unexplained_likelihood(model.fit):
+    if best.gain < THRESHOLD.little_of_known * measure_unexplained_likelihood(model.fit):
         return True
     if (
         not (beside and can_simulate(model))
-        or best.gain >= THRESHOLD.small_gain * run_noise_tests(model.fit).told
+        or best.gain >= THRESHOLD.small_gain * run_noise_tests(model.fit).evidence
     ):
         return False
     # The tests may be alarmed by the filter itself: replicas, which take their time, forgive that.
-    return best.gain < THRESHOLD.small_gain * retest_with_replicas(model).told
+    return best.gain < THRESHOLD.small_gain * retest_with_replicas(model).evidence
 
 
 def _look_back(
@@ -173,7 +173,7 @@ def _look_back(
     best = last.best
     assert best is not None
     ties = step.best is None or not run_noise_tests(step.best.model.fit).passed
-    near = [t for t in last.trials[1 : THRESHOLD.looked_at] if _came_close(t, best, ties)]
+    near = [t for t in last.trials[1 : THRESHOLD.looked_at] if _is_close_rival(t, best, ties)]
     # Effects with a small score beside the best are not scanned again, since scans take longest.
     ranked = sorted(step.trials, key=lambda t: -t.score)
     likely = {t.name for t in (ranked if step.best is None else ranked[: THRESHOLD.looked_at])}
@@ -191,7 +191,7 @@ def _look_back(
     return near[k] if total > own + THRESHOLD.gate else None
 
 
-def _came_close(trial: Trial, best: Trial, ties: bool) -> bool:
+def _is_close_rival(trial: Trial, best: Trial, ties: bool) -> bool:
     """Whether a candidate did nearly as well as one that resembles it, and is another.
 
     One that did as well is asked for `ties` only: it is another name for the same, as a rule.
@@ -204,7 +204,7 @@ def _came_close(trial: Trial, best: Trial, ties: bool) -> bool:
     return ties or (bool(mine & its) and trial.net_gain < best.net_gain - THRESHOLD.close)
 
 
-def unexplained_likelihood(fit: Fit) -> float:
+def measure_unexplained_likelihood(fit: Fit) -> float:
     """Return the log-likelihood above that of noise which is known; zero where none is known."""
     if fit.known is None:
         return 0.0
@@ -214,7 +214,7 @@ def unexplained_likelihood(fit: Fit) -> float:
 
 def retest_with_replicas(model: Model) -> NoiseTests:
     """Return the tests of what a model leaves, without the alarms of the filter itself."""
-    after = replace(run_noise_tests(model.fit), alpha=alarm_level(len(model.loop.effects)))
+    after = replace(run_noise_tests(model.fit), alpha=choose_alarm_level(len(model.loop.effects)))
     if not after.passed:
         copies = [make_replica(model, seed) for seed in (1, 2)]
         after = forgive_filter(after, copies)

@@ -15,7 +15,9 @@ from .fitted_model import Model
 from .thresholds import THRESHOLD
 
 
-def remaining_information(matrix: Array, own: Sequence[int], others: Sequence[int]) -> Array:
+def compute_remaining_information(
+    matrix: Array, own: Sequence[int], others: Sequence[int]
+) -> Array:
     """Return the scaled information of parameters that others leave to them."""
     size = np.sqrt(np.maximum(np.diag(matrix), THRESHOLD.tiny))
     scaled = matrix / np.outer(size, size)
@@ -43,7 +45,10 @@ def find_doubles(fit: Fit, label: str, effect: AbstractEffect) -> dict[str, floa
     found = {}
     for name, value in deciding.items():
         k = names.index(name)
-        if matrix[k, k] > 0 and remaining_information(matrix, [k], others)[0, 0] < THRESHOLD.seen:
+        if (
+            matrix[k, k] > 0
+            and compute_remaining_information(matrix, [k], others)[0, 0] < THRESHOLD.seen
+        ):
             found[name] = value
     return found if len(found) < len(deciding) else {}
 
@@ -52,7 +57,9 @@ def count_own_parameters(trial: Trial, fit: Fit) -> int:
     """Count the parameters of the effect that the record determines."""
     matrix, _ = fit.normal
     own = [k for k, n in enumerate(fit.plant.names) if n.startswith(f"{trial.label}.")]
-    left = remaining_information(matrix, own, [k for k in range(len(matrix)) if k not in own])
+    left = compute_remaining_information(
+        matrix, own, [k for k in range(len(matrix)) if k not in own]
+    )
     return max(1, int(np.sum(np.linalg.eigvalsh(left) > THRESHOLD.seen)))
 
 
@@ -73,7 +80,9 @@ def estimate_need(model: Model, position: int) -> float:
         return 0.0
     every = [k for k, n in enumerate(names) if n.startswith(f"{label}.")]
     size = np.sqrt(np.maximum(np.diag(matrix), THRESHOLD.tiny))
-    left = remaining_information(matrix, own, [k for k in range(len(matrix)) if k not in every])
+    left = compute_remaining_information(
+        matrix, own, [k for k in range(len(matrix)) if k not in every]
+    )
     d = np.array([away[names[k]] for k in own]) * size[own]
     gain = 0.5 * fit.size * math.log1p(float(d @ left @ d) / fit.size)
     return gain - bayesian_penalty(len(every), fit.size)

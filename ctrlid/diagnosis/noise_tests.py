@@ -17,11 +17,11 @@ from .._base.statistics import (
 from ..estimation.likelihood.filter_data import FilterData
 from ..estimation.likelihood.kalman_filter import Filtered
 from ..estimation.likelihood.likelihood import Fit
-from .constancy import chance_of_line, find_bin_edges, find_bins, run_constancy_tests
+from .constancy import compute_line_probability, find_bin_edges, find_bins, run_constancy_tests
 from .thresholds import THRESHOLD
 
 
-def alarm_level(effects: int) -> float:
+def choose_alarm_level(effects: int) -> float:
     """Return the chance of a false alarm that a model with so many effects is given.
 
     The more effects an explanation takes, the likelier it stands in for something else.
@@ -50,7 +50,7 @@ class NoiseTests:
         return name, min(1.0, self.p_values[name] * len(self.p_values))
 
     @property
-    def told(self) -> float:
+    def evidence(self) -> float:
         """What the most telling test of means says [log-likelihood].
 
         That is what an effect that is still missing would gain, about, or more.
@@ -109,7 +109,9 @@ def run_noise_tests(fit: Fit) -> NoiseTests:
         lines.append(_test_line(filled, n))
         tails.append(z[keep])
         if fit.noise.drift:
-            shapes += _deviates_of_force(out.disturbance[int(THRESHOLD.force_settling * len(z)) :])
+            shapes += _compute_force_deviates(
+                out.disturbance[int(THRESHOLD.force_settling * len(z)) :]
+            )
         for name, values in _find_axes(fit, out, data).items():
             parts.setdefault(name, []).append(values[keep])
     z = np.concatenate(tails)
@@ -160,7 +162,7 @@ def _regress_on_past(z: Array, keep: Array, u: Array, r: Array) -> tuple[float, 
 
 def _test_line(z: Array, n: int) -> float:
     """Return the probability that noise has as strong a line, of Fisher's test."""
-    return chance_of_line(np.abs(np.fft.rfft(z))[1:-1] ** 2 / n)
+    return compute_line_probability(np.abs(np.fft.rfft(z))[1:-1] ** 2 / n)
 
 
 def _test_tails(z: Array) -> dict[str, float]:
@@ -173,7 +175,7 @@ def _test_tails(z: Array) -> dict[str, float]:
     }
 
 
-def _deviates_of_force(force: Array) -> list[float]:
+def _compute_force_deviates(force: Array) -> list[float]:
     """Return how far skewness and kurtosis of a correlated force are from those of a Gaussian one.
 
     As standard normal deviates, for as many samples as are independent in the third and fourth

@@ -13,7 +13,7 @@ from .._base.errors import CtrlidError, ModelCannotRun
 from .._base.statistics import autocorrelation_time, pseudo_inverse
 from ..data.record import Record
 from ..estimation.likelihood.kalman_filter import Noise
-from ..estimation.likelihood.likelihood import Fit, Known, evaluate, make_problem
+from ..estimation.likelihood.likelihood import Fit, Known, evaluate_likelihood, make_problem
 from ..estimation.likelihood.sampled_plant import Trajectory
 from ..loop.loop import Loop
 from .thresholds import THRESHOLD
@@ -81,25 +81,29 @@ class Simulation:
         The free parameters.
     records : sequence of Record
         The data, of one sampling period and hold.
-    begins : sequence of float
+    start_times : sequence of float
         Times of their first samples since the start of the experiment [s].
     """
 
     def __init__(
-        self, loop: Loop, names: Sequence[str], records: Sequence[Record], begins: Sequence[float]
+        self,
+        loop: Loop,
+        names: Sequence[str],
+        records: Sequence[Record],
+        start_times: Sequence[float],
     ) -> None:
         self.loop, self.names = loop, tuple(names)
-        self.records, self.begins = tuple(records), tuple(begins)
-        self.problem = make_problem(loop, self.names, records, begins)
+        self.records, self.start_times = tuple(records), tuple(start_times)
+        self.problem = make_problem(loop, self.names, records, start_times)
         plant = self.plant = self.problem.plant
-        step = plant.with_slopes()
+        step = plant.build_sensitivity_map()
         self.runs = [step.mapaccum("run", len(data.record)) for data in self.problem.data]
 
-    def of(self, loop: Loop, names: Sequence[str]) -> Simulation:
+    def with_loop(self, loop: Loop, names: Sequence[str]) -> Simulation:
         """Return the same records, simulated by another loop."""
-        return Simulation(loop, names, self.records, self.begins)
+        return Simulation(loop, names, self.records, self.start_times)
 
-    def states_from(self, starts: Sequence[Mapping[str, float]]) -> Array:
+    def make_initial_states(self, starts: Sequence[Mapping[str, float]]) -> Array:
         """Return initial states, shape (records, states); what is not known begins at rest."""
         plant = self.plant
         rest = [np.resize(data.start, plant.size) for data in self.problem.data]
@@ -112,11 +116,11 @@ class Simulation:
         """Return errors, their derivatives and the states, for all records."""
         plant, p = self.plant, len(self.names)
         n, count = plant.size, len(self.runs)
-        values, errors, slopes, states = plant.values(theta), [], [], []
+        values, errors, slopes, states = plant.insert_free_values(theta), [], [], []
         for k, (data, run) in enumerate(zip(self.problem.data, self.runs, strict=True)):
             z = np.concatenate([x0[k], np.zeros(n * p), np.eye(n).ravel()])
             after, seen = (np.asarray(out, float) for out in
-                           run(z, plant.inputs(data, theta), values))  # fmt: skip
+                           run(z, plant.stack_inputs(data, theta), values))  # fmt: skip
             states.append(np.vstack([x0[k], after[:n, :-1].T]))
             y, keep = data.y, data.valid
             error = y - seen[0]
@@ -189,10 +193,20 @@ def make_fit(found: Simulated, sensor: Array) -> Fit:
     """
     task = found.task
     silent = Noise((0.0,) * task.plant.channels)
-    problem = replace(task.problem, known=Known(silent, sensor), data=tuple(
-        replace(data, start=x[0], spread=np.zeros_like(data.spread), doubt=np.zeros(len(x)),
-                afresh=np.arange(len(x)) == 0)
-        for data, x in zip(task.problem.data, found.states, strict=True)
-    ), counts=tuple(data.valid for data in task.problem.data))  # fmt: skip
+    problem = replace(
+        task.problem,
+        known=Known(silent, sensor),
+        data=tuple(
+            replace(
+                data,
+                start=x[0],
+                spread=np.zeros_like(data.spread),
+                input_variance=np.zeros(len(x)),
+                restart=np.arange(len(x)) == 0,
+            )
+            for data, x in zip(task.problem.data, found.states, strict=True)
+        ),
+        counts=tuple(data.valid for data in task.problem.data),
+    )
     at = [Trajectory(x, x.copy(), np.zeros_like(x)) for x in found.states]
-    return evaluate(problem, found.theta, silent, at)
+    return evaluate_likelihood(problem, found.theta, silent, at)

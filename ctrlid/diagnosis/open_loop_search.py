@@ -14,8 +14,8 @@ from .._base.arrays import Array
 from .._base.criterion import bayesian_penalty
 from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from ..effects import AbstractEffect
-from ..estimation.likelihood.likelihood import start_values
-from .candidates import VANISHES, Objection, Trial, list_candidates, same_kind
+from ..estimation.likelihood.likelihood import list_start_values
+from .candidates import VANISHES, Objection, Trial, is_same_kind, list_candidates
 from .fitted_model import Model
 from .fresh_data import FreshData
 from .growth import Search
@@ -78,18 +78,18 @@ def search_by_simulation(
     loop, names = other.base.loop, other.base.names
     records = fresh.without_windows(other.base.records)
     task = Simulation(loop, names, records, [0.0] * len(records))
-    x0 = task.states_from([{} for _ in records])
-    begun = [task.fit(t, x0) for t in (start_values(loop, names), other.base.fit.theta)]
-    base = now = min(begun, key=lambda s: s.square)
+    x0 = task.make_initial_states([{} for _ in records])
+    started = [task.fit(t, x0) for t in (list_start_values(loop, names), other.base.fit.theta)]
+    base = now = min(started, key=lambda s: s.square)
     sensor, given = other.final.fit.sensor, len(loop.effects)
-    before = _gap_of(base, fresh)
+    before = _measure_gap(base, fresh)
     rounds: list[tuple[Simulated, list[Tried], Tried | None]] = []
     while len(rounds) < THRESHOLD.open_loop_rounds:
         tell(f"by simulation, round {len(rounds) + 1}")
         tried = _run_round(now, catalogue)
         best = tried[0] if tried and math.isfinite(tried[0].net_gain) else None
         new = best and best.found
-        after = _gap_of(new, fresh) if new else math.inf
+        after = _measure_gap(new, fresh) if new else math.inf
         if not (
             new
             and new.square < THRESHOLD.open_loop_closes**2 * now.square
@@ -101,7 +101,10 @@ def search_by_simulation(
         now, before = new, after
     tell("by simulation, what is needed")
     now, smaller = _drop_superfluous(_refit_each(now, given), given)
-    if len(now.loop.effects) == given or _gap_of(now, fresh) > THRESHOLD.open_loop_better * gap:
+    if (
+        len(now.loop.effects) == given
+        or _measure_gap(now, fresh) > THRESHOLD.open_loop_better * gap
+    ):
         return None
     first, final = (_make_model(s, sensor) for s in (base, now))
     steps = []
@@ -121,8 +124,8 @@ def search_by_simulation(
     )
 
 
-def _gap_of(s: Simulated, fresh: FreshData) -> float:
-    return fresh.gap((s.fitted,) * len(fresh.windows))
+def _measure_gap(s: Simulated, fresh: FreshData) -> float:
+    return fresh.measure_gap((s.fitted,) * len(fresh.windows))
 
 
 def _make_model(s: Simulated, sensor: Array) -> Model:
@@ -135,7 +138,7 @@ def _drop_superfluous(now: Simulated, given: int) -> tuple[Simulated, list[Simul
     """Take effects out until each is worth its parameters; return also the loops without each."""
     while True:
         smaller = [_refit_without(now, k) for k in range(given, len(now.loop.effects))]
-        net_gains = [_gain_over(s, now.square) - _penalty_over(s, now) for s in smaller]
+        net_gains = [_compute_gain(s, now.square) - _compute_penalty(s, now) for s in smaller]
         if min(net_gains, default=math.inf) > THRESHOLD.gate:
             return now, smaller
         now = smaller[int(np.argmin(net_gains))]
@@ -146,8 +149,8 @@ def _refit_each(now: Simulated, given: int) -> Simulated:
     position = given
     for _ in range(given, len(now.loop.effects)):
         smaller = _refit_without(now, position)
-        screened = _screen(smaller, now.fitted.effects[position])
-        again = screened and _refit(smaller, screened).found
+        screened = _screen_effect(smaller, now.fitted.effects[position])
+        again = screened and _refit_trial(smaller, screened).found
         if again and again.square < now.square:
             # The refitted effect stands last now, so that the next one is at this position.
             now = again
@@ -159,8 +162,8 @@ def _refit_each(now: Simulated, given: int) -> Simulated:
 def _refit_without(now: Simulated, position: int) -> Simulated:
     """Return the loop without one of its effects, fitted again."""
     loop, names = take_out_effect(now.fitted, position, now.names)
-    task = now.task.of(loop, names)
-    return task.fit(np.array(start_values(loop, names)), task.states_from(now.starts))
+    task = now.task.with_loop(loop, names)
+    return task.fit(np.array(list_start_values(loop, names)), task.make_initial_states(now.starts))
 
 
 def _weigh_effect(
@@ -169,20 +172,20 @@ def _weigh_effect(
 ) -> Weighed:  # fmt: skip
     """Return an effect with what closes nearly as much of the error in its place."""
     label, effect = list(now.fitted.labelled.items())[position]
-    gain, penalty = _gain_over(smaller, now.square), _penalty_over(smaller, now)
+    gain, penalty = _compute_gain(smaller, now.square), _compute_penalty(smaller, now)
     base = _make_model(smaller, final.fit.sensor)
     mine = Trial(effect, label, final, gain, 0.0, gain, penalty)
     near = max(THRESHOLD.close, THRESHOLD.open_loop_alike * mine.net_gain)
     close: list[Trial] = []
     for _, tried, best in rounds:
-        if best is None or not same_kind(best.effect, effect):
+        if best is None or not is_same_kind(best.effect, effect):
             continue
         there = [*now.loop.effects]
         for t in tried[: THRESHOLD.open_loop_refitted]:
-            if t.net_gain <= 0 or any(same_kind(t.effect, e) for e in there):
+            if t.net_gain <= 0 or any(is_same_kind(t.effect, e) for e in there):
                 continue
-            screened = _screen(smaller, t.effect)
-            again = screened and _refit(smaller, screened)
+            screened = _screen_effect(smaller, t.effect)
+            again = screened and _refit_trial(smaller, screened)
             if again and mine.net_gain - again.net_gain < near and again.net_gain > THRESHOLD.gate:
                 close.append(_make_trial(again, base))
     return Weighed(mine, tuple(sorted(close, key=lambda t: -t.net_gain)), base, position)
@@ -192,16 +195,16 @@ def _run_round(now: Simulated, catalogue: Sequence[type[AbstractEffect]]) -> lis
     """Screen all candidates, refit the promising, best first."""
     loop = now.fitted
     pool = [c for c in list_candidates(catalogue, loop, now.task.records[0])
-            if not any(same_kind(e, c) for e in loop.effects)]  # fmt: skip
-    tried = [t for c in pool if (t := _screen(now, c)) is not None]
+            if not any(is_same_kind(e, c) for e in loop.effects)]  # fmt: skip
+    tried = [t for c in pool if (t := _screen_effect(now, c)) is not None]
     tried.sort(key=lambda t: -t.score)
-    done = [_refit(now, t) for t in tried[: THRESHOLD.open_loop_refitted]]
+    done = [_refit_trial(now, t) for t in tried[: THRESHOLD.open_loop_refitted]]
     return (
         sorted(done, key=lambda t: (-t.net_gain, -t.score)) + tried[THRESHOLD.open_loop_refitted :]
     )
 
 
-def _screen(now: Simulated, effect: AbstractEffect) -> Tried | None:
+def _screen_effect(now: Simulated, effect: AbstractEffect) -> Tried | None:
     """Return an effect at the start with the largest score."""
     best: Tried | None = None
     task: Simulation | None = None
@@ -212,44 +215,44 @@ def _screen(now: Simulated, effect: AbstractEffect) -> Tried | None:
             own = {f"{label}.{k}": v for k, v in one.values().items() if math.isfinite(v)}
             names = (*now.names, *own)
             if task is None:
-                task = now.task.of(loop, names)
+                task = now.task.with_loop(loop, names)
             # The sensitivities of a backlash need another recursion than that of the states.
             if task.plant.e.play is not None:
                 return None
             theta = np.array([*now.theta, *own.values()])
             theta = np.clip(theta, task.problem.lower, task.problem.upper)
-            x0 = task.states_from(now.starts)
+            x0 = task.make_initial_states(now.starts)
             errors, slopes, _ = task.run(theta, x0)
         except (ModelCannotRun, EffectDoesNotApply):
             continue
         step = np.linalg.lstsq(slopes, -errors, rcond=THRESHOLD.open_loop_rank)[0]
         left = float(np.mean((errors + slopes @ step) ** 2))
-        score = _gain_over(now, min(left, float(np.mean(errors**2))))
+        score = _compute_gain(now, min(left, float(np.mean(errors**2))))
         if best is None or score > best.score:
             best = Tried(one, label, score, task, theta, x0)
     return best
 
 
-def _gain_over(now: Simulated, square: float) -> float:
+def _compute_gain(now: Simulated, square: float) -> float:
     """Return what a smaller error is worth, for as many samples as are independent."""
     count = len(now.errors) / now.correlated
     return 0.5 * count * math.log(now.square / max(square, THRESHOLD.tiny))
 
 
-def _penalty_over(smaller: Simulated, larger: Simulated) -> float:
+def _compute_penalty(smaller: Simulated, larger: Simulated) -> float:
     """Return half the Bayesian penalty of the further parameters."""
     free = len(larger.names) - len(smaller.names)
     return bayesian_penalty(free, max(len(smaller.errors) / smaller.correlated, math.e))
 
 
-def _refit(now: Simulated, t: Tried) -> Tried:
+def _refit_trial(now: Simulated, t: Tried) -> Tried:
     try:
         found = t.task.fit(t.theta, t.x0)
         effect = found.fitted.labelled[t.label]
     except (ModelCannotRun, EffectDoesNotApply) as reason:
         return replace(t, out=Objection.of(reason))
-    gain = _gain_over(now, found.square)
-    penalty = _penalty_over(now, found)
+    gain = _compute_gain(now, found.square)
+    penalty = _compute_penalty(now, found)
     out = VANISHES if effect.neutral else None
     return replace(t, found=found, gain=gain, penalty=penalty, out=out)
 

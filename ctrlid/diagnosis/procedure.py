@@ -10,9 +10,9 @@ from tqdm import tqdm
 
 from .._base.criterion import bayesian_penalty
 from .._base.errors import EffectDoesNotApply, ModelCannotRun
-from .._base.jobs import check_jobs, spread
+from .._base.jobs import check_jobs, share_out
 from ..data.record import Record
-from ..data.several_records import as_records, model_and_data
+from ..data.several_records import as_records, order_model_and_data
 from ..effects import CATALOGUE, AbstractEffect
 from ..estimation.likelihood.likelihood import Fit
 from ..loop.loop import Loop
@@ -22,8 +22,8 @@ from .answer import assemble_answer, name_records
 from .candidates import check_catalogue
 from .findings import COMPLETE, Disturbance, Gap
 from .fresh_data import FreshData, choose_fresh_data
-from .gap_summary import helps_on_fresh_data, summarize_gap, take_back_widening
-from .growth import Search, choose_way, compare_names, keep_main_effects, search_effects
+from .gap_summary import make_fresh_data_test, summarize_gap, take_back_widening
+from .growth import Search, choose_search, compare_names, keep_main_effects, search_effects
 from .open_loop_search import search_by_simulation
 from .recalibration import recalibrate
 from .records import Readout, look_over_records, make_loop, read_limits, read_steps
@@ -133,7 +133,7 @@ def diagnose(
     """
     started = time.perf_counter()
     check_catalogue(catalogue)
-    loop, record = model_and_data(loop, record)
+    loop, record = order_model_and_data(loop, record)
     records = as_records(record)
     loop = make_loop(loop, records[0])
     fresh = choose_fresh_data(loop, records, None if validation is None else as_records(validation))
@@ -145,20 +145,20 @@ def diagnose(
         bar.update(step)
 
     def work(function: Callable[..., Any], items: Iterable[Any]) -> list[Any]:
-        return list(spread(function, items, jobs))
+        return list(share_out(function, items, jobs))
 
     tell("looking the records over", 1)
     audits, remarks = look_over_records(loop, records)
     question = Question(loop, records, audits, fresh, catalogue, work, tell)
-    result, search = _answer(question)
-    if len(records) > 1 and not _have_same(result, len(records)):
-        result = _answer_each(question, search) or result
+    result, search = _answer_question(question)
+    if len(records) > 1 and not _have_same_effects(result, len(records)):
+        result = _answer_each_record(question, search) or result
     bar.close()
     return replace(result, audit=remarks, record=name_records(records),
                    seconds=time.perf_counter() - started)  # fmt: skip
 
 
-def _answer(q: Question) -> tuple[Diagnosis, Search]:
+def _answer_question(q: Question) -> tuple[Diagnosis, Search]:
     """Take the steps of the theory page, for records that are diagnosed together."""
     # Step 1: what the readout of the sensor shows by itself is no candidate.
     readout = read_limits(q.loop, q.records, q.audits, q.catalogue)
@@ -167,12 +167,12 @@ def _answer(q: Question) -> tuple[Diagnosis, Search]:
     base = recalibrate(readout.loop, readout.records, q.audits)
     # Steps 3 to 7: effects are screened, refitted, decided upon, added and dropped.
     search = search_effects(base, q.catalogue, q.work, q.tell)
-    helps = helps_on_fresh_data(q.fresh)
+    helps = make_fresh_data_test(q.fresh)
     if search.other and not search.after.passed:
         # Perhaps neither search explains the record; fresh data tell which of them leads further.
         q.tell("another way")
         other = search_effects(base, q.catalogue, q.work, q.tell, search.other)
-        search = choose_way(search, other, helps, q.fresh.gap_of)
+        search = choose_search(search, other, helps, q.fresh.gap_of)
     # Step 3 again: what is left is tested with the steps of the converter in the replicas.
     q.tell("comparing on fresh data", 2)
     steps = read_steps(search.final.fit, q.audits, q.catalogue)
@@ -214,13 +214,13 @@ def _is_worth_simulating(fresh: FreshData, records: Sequence[Record]) -> bool:
     return short and fresh.how == OPEN_LOOP
 
 
-def _have_same(result: Diagnosis, records: int) -> bool:
+def _have_same_effects(result: Diagnosis, records: int) -> bool:
     """Whether records that were diagnosed together seem to have the same in them."""
     some_only = any(0 < len(f.records) < records for f in result.findings)
     return result.verdict in COMPLETE and not some_only
 
 
-def _answer_each(q: Question, together: Search) -> Diagnosis | None:
+def _answer_each_record(q: Question, together: Search) -> Diagnosis | None:
     """Diagnose each record alone; None where that does not explain all of them, and better."""
     parts: list[Diagnosis] = []
     gained = size = 0.0
@@ -228,20 +228,22 @@ def _answer_each(q: Question, together: Search) -> Diagnosis | None:
         q.tell(f"record {len(parts) + 1} alone")
         fresh = choose_fresh_data(q.loop, [record], None)
         try:
-            result, search = _answer(replace(q, records=(record,), audits=(audit,), fresh=fresh))
+            result, search = _answer_question(
+                replace(q, records=(record,), audits=(audit,), fresh=fresh)
+            )
         except (ModelCannotRun, EffectDoesNotApply):
             # The record says too little when it stands alone.
             return None
         if result.verdict not in COMPLETE:
             return None
         parts.append(result)
-        gained += _penalized_likelihood(search.final.fit)
+        gained += _compute_penalized_likelihood(search.final.fit)
         size += search.final.fit.size
     fit = together.final.fit
-    better = size != fit.size or gained > _penalized_likelihood(fit) + THRESHOLD.gate
+    better = size != fit.size or gained > _compute_penalized_likelihood(fit) + THRESHOLD.gate
     return merge_diagnoses(q.loop, parts) if better else None
 
 
-def _penalized_likelihood(fit: Fit) -> float:
+def _compute_penalized_likelihood(fit: Fit) -> float:
     """Return the log-likelihood less half the penalty of the Bayesian information criterion."""
     return fit.value - bayesian_penalty(len(fit.theta), fit.size)

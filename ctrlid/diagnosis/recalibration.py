@@ -9,9 +9,9 @@ import numpy as np
 from .._base.arrays import Array
 from .._base.errors import ModelCannotRun
 from ..data.record import Record
-from ..estimation.likelihood.likelihood import make_problem, start_values
+from ..estimation.likelihood.likelihood import list_start_values, make_problem
 from ..estimation.likelihood.maximization import begin_fit, choose_noise, maximize, refit_noise_size
-from ..estimation.likelihood.noise_fit import known_from_repeats
+from ..estimation.likelihood.noise_fit import estimate_noise_from_repeats
 from ..loop.loop import Loop
 from ..validation.record_audit import Audit
 from .fitted_model import Model
@@ -39,17 +39,17 @@ def recalibrate(loop: Loop, records: Sequence[Record], audits: Sequence[Audit]) 
     Model
         The base to which effects are added.
     """
-    parts, begins = cut_stretches(records)
-    base = fit_base_model(loop, parts, loop.free, begins)
+    parts, start_times = cut_stretches(records)
+    base = fit_base_model(loop, parts, loop.free, start_times)
     periods = find_repeat_periods(parts, audits)
     return weigh_by_repeats(base, periods) if periods else base
 
 
 def fit_base_model(
-    loop: Loop, records: Sequence[Record], names: Sequence[str], begins: Sequence[float] = ()
+    loop: Loop, records: Sequence[Record], names: Sequence[str], start_times: Sequence[float] = ()
 ) -> Model:
     """Fit the model as it is, with the noise that the data want."""
-    problem = make_problem(loop, names, records, begins)
+    problem = make_problem(loop, names, records, start_times)
     lower, upper = _narrow_bounds(loop, names, problem.lower, problem.upper)
     problem = replace(problem, lower=lower, upper=upper)
     fit = refit_noise_size(maximize(begin_fit(problem)))
@@ -61,17 +61,17 @@ def weigh_by_repeats(base: Model, periods: Sequence[int]) -> Model:
 
     A noise that is fitted to what a model leaves takes part of a missing effect for noise.
     """
-    problem = replace(base.fit.problem, known=known_from_repeats(base.fit, periods))
+    problem = replace(base.fit.problem, known=estimate_noise_from_repeats(base.fit, periods))
     return Model(base.loop, maximize(begin_fit(problem, base.fit.theta), exact=False))
 
 
-def model_at_given_values(base: Model) -> Model | None:
+def restore_given_values(base: Model) -> Model | None:
     """Return the model at its given values if recalibration has led far away from them.
 
     Where much is missing, the likelihood of the model alone may be largest at absurd values; the
     missing effect shows at the given ones.
     """
-    given = start_values(base.loop, base.names)
+    given = list_start_values(base.loop, base.names)
     size = np.maximum(np.abs(given), THRESHOLD.tiny)
     if not np.any(np.abs(base.fit.theta - given) > THRESHOLD.far_recalibration * size):
         return None
@@ -87,7 +87,7 @@ def _narrow_bounds(
 ) -> tuple[Array, Array]:
     """Narrow the bounds of the plant's parameters: a model ten times off is another model."""
     lower, upper = lower.copy(), upper.copy()
-    for k, (name, value) in enumerate(zip(names, start_values(loop, names), strict=True)):
+    for k, (name, value) in enumerate(zip(names, list_start_values(loop, names), strict=True)):
         if "." not in name and value:
             ends = sorted((value / THRESHOLD.parameter_range, value * THRESHOLD.parameter_range))
             lower[k], upper[k] = max(lower[k], ends[0]), min(upper[k], ends[1])
@@ -99,7 +99,7 @@ def cut_stretches(records: Sequence[Record]) -> tuple[list[Record], list[float]]
     total = sum(len(r) for r in records)
     if total <= THRESHOLD.fitted_samples:
         return list(records), [0.0] * len(records)
-    parts, begins = [], []
+    parts, start_times = [], []
     for record in records:
         size = max(
             THRESHOLD.fitted_samples * len(record) // total // THRESHOLD.stretches,
@@ -110,5 +110,5 @@ def cut_stretches(records: Sequence[Record]) -> tuple[list[Record], list[float]]
             part = record[first : first + size]
             if np.count_nonzero(part.valid) > size // 2:
                 parts.append(part)
-                begins.append(first * record.dt)
-    return parts, begins
+                start_times.append(first * record.dt)
+    return parts, start_times

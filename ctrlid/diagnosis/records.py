@@ -11,7 +11,7 @@ import numpy as np
 from .._base.errors import CtrlidError
 from ..data.record import Record
 from ..effects import AbstractEffect, InputDelay, InputOffset, Quantization, SensorSaturation
-from ..estimation.identified_model import delay_of
+from ..estimation.identified_model import read_delay
 from ..estimation.likelihood.likelihood import Fit
 from ..loop.loop import Loop
 from ..physics.conversions import to_transfer_function
@@ -35,7 +35,7 @@ def make_loop(loop: Any, record: Record) -> Loop:
     valid = record.valid
     u, y = float(np.mean(record.u[valid])), float(np.mean(record.y[valid]))
     linear = Loop(to_transfer_function(loop), None, dt=record.dt, at=OperatingPoint((), u, y))
-    delay = delay_of(loop)
+    delay = read_delay(loop)
     # The means of the record only estimate the input at rest, so that its offset stays free.
     linear = linear.with_effect(InputOffset(0.0))
     linear = replace(linear, free=tuple(linear.parameters))

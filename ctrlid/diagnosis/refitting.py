@@ -8,10 +8,10 @@ import numpy as np
 from .._base.criterion import bayesian_penalty
 from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from ..estimation.likelihood.kalman_filter import Noise
-from ..estimation.likelihood.likelihood import Fit, evaluate
-from ..estimation.likelihood.maximization import ELSEWHERE, maximize
+from ..estimation.likelihood.likelihood import Fit, evaluate_likelihood
+from ..estimation.likelihood.maximization import OTHER_NOISE_GAIN, maximize
 from .candidates import Objection, Trial
-from .fitted_model import Model, can_simulate, carry_over, drop_arrays, drop_linearization
+from .fitted_model import Model, can_simulate, carry_over_fit, drop_arrays, drop_linearization
 from .information import count_own_parameters, find_objection
 from .thresholds import THRESHOLD
 
@@ -40,7 +40,7 @@ def refit_candidate(base: Model, trial: Trial, near: Model | None = None) -> Tri
         known = dict(zip(near.names, near.fit.theta.tolist(), strict=True))
         loop = loop.with_parameters({n: known[n] for n in names if n in known})
     try:
-        start = carry_over(near or base, loop, names)
+        start = carry_over_fit(near or base, loop, names)
         starts = [start]
         if start.noise.drift and start.problem.known is None and can_simulate(base):
             # A random force that was fitted while the effect was missing may never let it in.
@@ -74,7 +74,7 @@ def weigh_refit(base: Model, trial: Trial, fit: Fit) -> Trial:
     model = Model(trial.model.loop, fit)
     own = count_own_parameters(trial, fit)
     penalty = bayesian_penalty(own, fit.size) + trial.scan_penalty
-    before = base.fit.value if math.isfinite(base.fit.value) else _likelihood_of_no_model(fit)
+    before = base.fit.value if math.isfinite(base.fit.value) else _compute_null_likelihood(fit)
     done = replace(trial, model=model, gain=fit.value - before, penalty=penalty)
     try:
         done = replace(done, out=find_objection(done))
@@ -83,7 +83,7 @@ def weigh_refit(base: Model, trial: Trial, fit: Fit) -> Trial:
     return done if done.net_gain > 0 else replace(done, model=Model(model.loop, drop_arrays(fit)))
 
 
-def _likelihood_of_no_model(fit: Fit) -> float:
+def _compute_null_likelihood(fit: Fit) -> float:
     """Return the likelihood of outputs that scatter about their mean, whatever drives them."""
     value = 0.0
     for data, keep in zip(fit.data, fit.counts, strict=True):
@@ -118,9 +118,10 @@ def place_instants(fit: Fit) -> Fit:
         while name in instants:
             reach = 2.0 ** np.arange(THRESHOLD.instant_doublings)
             there = max(
-                (_move_instant(best, k, s * r) for r in reach for s in (-1, 1)), key=_likelihood_of
+                (_move_instant(best, k, s * r) for r in reach for s in (-1, 1)),
+                key=_replace_nan_likelihood,
             )
-            if not there.value > best.value + ELSEWHERE:
+            if not there.value > best.value + OTHER_NOISE_GAIN:
                 break
             best = maximize(there, rounds=THRESHOLD.instant_rounds, exact=False)
     return best
@@ -131,8 +132,8 @@ def _move_instant(fit: Fit, k: int, samples: float) -> Fit:
     problem, theta = fit.problem, fit.theta.copy()
     theta[k] = np.clip(theta[k] + samples * problem.plant.loop.dt, problem.lower[k],
                        problem.upper[k])  # fmt: skip
-    return evaluate(problem, theta, fit.noise, fit.trajectories)
+    return evaluate_likelihood(problem, theta, fit.noise, fit.trajectories)
 
 
-def _likelihood_of(fit: Fit) -> float:
+def _replace_nan_likelihood(fit: Fit) -> float:
     return fit.value if np.isfinite(fit.value) else -np.inf

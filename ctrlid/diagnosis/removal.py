@@ -10,12 +10,12 @@ from ..estimation.likelihood.maximization import (
     begin_fit,
     choose_noise,
     maximize,
-    polish,
+    polish_fit,
     refit_noise_size,
 )
 from ..loop.loop import Loop
 from .candidates import Trial, contains
-from .fitted_model import Model, can_simulate, carry_over, drop_linearization
+from .fitted_model import Model, can_simulate, carry_over_fit, drop_linearization
 from .information import estimate_need
 from .refitting import refit_candidate, weigh_refit
 from .screening import screen_at
@@ -92,7 +92,7 @@ def _drop_effects(model: Model, positions: Sequence[int]) -> Model:
     loop, names = model.fitted, model.names
     for position in sorted(positions, reverse=True):
         loop, names = take_out_effect(loop, position, names)
-    fit = carry_over(model, loop, names)
+    fit = carry_over_fit(model, loop, names)
     # With the small noise of the full model, the smaller one may lose the record.
     if not math.isfinite(fit.value):
         fit = begin_fit(fit.problem, fit.theta)
@@ -130,7 +130,7 @@ def refit_without_effect(model: Model, position: int) -> tuple[Model, Trial]:
 
 def refit_noise(model: Model) -> Model:
     """Ask again whether the data want a coloured force, now that an effect is in the model."""
-    fit = refit_noise_size(polish(model.fit))
+    fit = refit_noise_size(polish_fit(model.fit))
     if fit.known is not None:
         return Model(model.loop, fit)
     if fit.noise.drift:
@@ -201,7 +201,7 @@ def move_last_effect(model: Model, position: int) -> Model:
     renamed = dict(zip([labels[k] for k in order], loop.labelled, strict=True))
     loop = replace(loop, free=tuple(n for n in fitted.free if "." not in n))
     names = rename_labels(model.names, renamed)
-    return Model(loop, carry_over(model, loop, names))
+    return Model(loop, carry_over_fit(model, loop, names))
 
 
 def rename_labels(names: Sequence[str], labels: Mapping[str, str]) -> list[str]:

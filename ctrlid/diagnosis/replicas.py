@@ -10,13 +10,13 @@ import numpy as np
 
 from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from ..data.record import Record
-from ..estimation.likelihood.likelihood import Fit, evaluate, make_problem
+from ..estimation.likelihood.likelihood import Fit, evaluate_likelihood, make_problem
 from ..estimation.likelihood.maximization import begin_fit, maximize
 from ..loop.loop import Loop
 from ..loop.period_map import comes_to_rest
 from ..validation.record_simulation import long_stretches, prepare_stretch
 from .candidates import Trial
-from .fitted_model import Model, can_simulate, carry_over
+from .fitted_model import Model, can_simulate, carry_over_fit
 from .gap import draw_noise, make_simulator
 from .noise_tests import NoiseTests, run_noise_tests
 from .records import ROUNDING, Readout
@@ -45,26 +45,28 @@ def make_replica(model: Model, seed: int = 0) -> Model | None:
     """
     loop, fit = model.fitted, model.fit
     try:
-        begins = [float(data.t[0]) for data in fit.data]
+        start_times = [float(data.t[0]) for data in fit.data]
         records = [
-            _simulate_record(model, record, begin, float(r), seed + SEEDS * k)
-            for k, (record, begin, r) in enumerate(
-                zip(model.records, begins, fit.sensor, strict=True)
+            _simulate_record(model, record, start_time, float(r), seed + SEEDS * k)
+            for k, (record, start_time, r) in enumerate(
+                zip(model.records, start_times, fit.sensor, strict=True)
             )
         ]
-        problem = make_problem(loop, model.names, records, begins)
+        problem = make_problem(loop, model.names, records, start_times)
         problem = replace(problem, counts=fit.counts, known=fit.known)
         # With other noise a loop may take another path, so both the old path and a new guess are
         # tried.
-        along = evaluate(problem, fit.theta, fit.noise, fit.trajectories)
+        along = evaluate_likelihood(problem, fit.theta, fit.noise, fit.trajectories)
         starts = along, begin_fit(problem, fit.theta, fit.noise)
-        again = maximize(max(starts, key=_likely), rounds=THRESHOLD.replica_rounds, exact=False)
+        again = maximize(
+            max(starts, key=_replace_nan_likelihood), rounds=THRESHOLD.replica_rounds, exact=False
+        )
     except (ModelCannotRun, EffectDoesNotApply):
         return None
     return Model(loop, again) if math.isfinite(again.value) else None
 
 
-def _likely(fit: Fit) -> float:
+def _replace_nan_likelihood(fit: Fit) -> float:
     return fit.value if math.isfinite(fit.value) else -math.inf
 
 
@@ -78,7 +80,7 @@ def _simulate_record(
     simulator = make_simulator(loop)
     y, u = np.array(record.y), np.array(record.u)
     for part in long_stretches(record, THRESHOLD.shortest_segment):
-        stretch = prepare_stretch(simulator, record, part, begin=first, follow=follows)
+        stretch = prepare_stretch(simulator, record, part, start_time=first, follow=follows)
         noise = draw_noise(model.fit, sensor, len(stretch.d), seed + part.start)
         y[part], u[part] = stretch.run(simulator, noise)
     return replace(record, y=y, u=u)
@@ -89,7 +91,7 @@ def has_kinks(model: Model) -> bool:
     return model.plant.e.kinked
 
 
-def gain_on_replicas(copies: Sequence[Model | None], trial: Trial) -> float:
+def measure_gain_on_replicas(copies: Sequence[Model | None], trial: Trial) -> float:
     """Return what a candidate gains on records in which it is known not to be.
 
     Parameters
@@ -116,7 +118,7 @@ def gain_on_replicas(copies: Sequence[Model | None], trial: Trial) -> float:
     return max(gains)
 
 
-def gain_beyond_simple(base: Model, best: Trial, simple: Trial) -> float:
+def measure_gain_beyond_simple(base: Model, best: Trial, simple: Trial) -> float:
     """Return what the further parameters of an effect gain over a simpler one.
 
     What the further parameters gain on a record simulated with the simpler effect, they gain
@@ -138,7 +140,7 @@ def gain_beyond_simple(base: Model, best: Trial, simple: Trial) -> float:
     if copy is None:
         return math.inf
     try:
-        under = carry_over(copy, base.fitted, base.names)
+        under = carry_over_fit(copy, base.fitted, base.names)
     except ModelCannotRun:
         return math.inf
     # Both climb from the same start: where the replica was fitted, the simple one may be stuck.
@@ -200,14 +202,14 @@ def follow_record(loop: Loop, record: Record) -> Loop | None:
         return None
     u, y = (max(float(np.std(v[record.valid])), THRESHOLD.tiny) for v in (record.u, record.y))
     try:
-        controller = _normalized_controller(loop.linearize(), loop.dt, u, y)
+        controller = _design_normalized_controller(loop.linearize(), loop.dt, u, y)
         made = replace(loop, controller=controller)
         return made if controller is not None and comes_to_rest(made) else None
     except (ModelCannotRun, EffectDoesNotApply):
         return None
 
 
-def _normalized_controller(model: Any, dt: float, u: float, y: float) -> Any:
+def _design_normalized_controller(model: Any, dt: float, u: float, y: float) -> Any:
     """Return the controller for a linear model by the sizes of its input and output.
 
     None where python-control finds no solution of the Riccati equations.

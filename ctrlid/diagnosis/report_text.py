@@ -5,7 +5,7 @@ from __future__ import annotations
 import textwrap
 from typing import TYPE_CHECKING
 
-from .._base.text import listing, number, quantity
+from .._base.text import write_list, write_number, write_quantity
 from . import wording
 from .findings import Finding, Gap
 
@@ -29,26 +29,29 @@ def write_report_text(found: Diagnosis) -> str:
     str
         Lines of at most 100 columns. Bad news is in capitals.
     """
-    lines = [f"Diagnosis of {found.record or 'a record'}", *_wrap(wording.write_headline(found), 2)]
-    lines += ["", *gap_lines(found.gap), "", *_where(found)]
+    lines = [
+        f"Diagnosis of {found.record or 'a record'}",
+        *_wrap_text(wording.write_headline(found), 2),
+    ]
+    lines += ["", *write_gap_lines(found.gap), "", *_write_where(found)]
     if found.findings:
         lines += ["", "  what is missing"]
         for k, finding in enumerate(found.findings, 1):
-            lines += _finding(found, finding, f"{k}. ")
-        lines += _wrap(wording.EVIDENCE, 4)
+            lines += _write_finding(found, finding, f"{k}. ")
+        lines += _wrap_text(wording.EVIDENCE, 4)
     elif found.verdict == "nothing missing" and found.sensitivity:
-        lines += ["", *_sensitivity(found)]
-    lines += ["", *_parameters(found)]
-    lines += _wrap(wording.describe_disturbance(found), 2, hang=4)
-    lines += _wrap(wording.describe_remains(found), 2, hang=4)
+        lines += ["", *_write_sensitivity(found)]
+    lines += ["", *_write_parameters(found)]
+    lines += _wrap_text(wording.describe_disturbance(found), 2, hang=4)
+    lines += _wrap_text(wording.describe_remains(found), 2, hang=4)
     for title, remarks in (("about the record", found.audit), ("note", found.notes)):
         for remark in remarks:
-            lines += _wrap(f"{title}: {remark}", 2, hang=4)
+            lines += _wrap_text(f"{title}: {remark}", 2, hang=4)
     lines.append(f"  {found.seconds:.1f} s")
     return "\n".join(line.rstrip() for line in lines)
 
 
-def _wrap(text: str, indent: int, hang: int | None = None) -> list[str]:
+def _wrap_text(text: str, indent: int, hang: int | None = None) -> list[str]:
     later = " " * (indent if hang is None else hang)
     # No line may be broken beside these signs.
     for sign in ("=", "±"):
@@ -58,18 +61,18 @@ def _wrap(text: str, indent: int, hang: int | None = None) -> list[str]:
     return [line.replace("\xa0", " ") for line in lines]
 
 
-def gap_lines(gap: Gap) -> list[str]:
+def write_gap_lines(gap: Gap) -> list[str]:
     """Return the sizes of the gap as aligned lines."""
     rows = wording.list_gap_rows(gap)
     head = f"  how far apart: {gap.kind} of {len(gap.time)} samples kept back, RMS error"
     return [head, *(f"    {label:<20}{size:>12}   {times}" for label, size, times in rows),
-            *_wrap(wording.describe_shrinking(gap), 4)]  # fmt: skip
+            *_wrap_text(wording.describe_shrinking(gap), 4)]  # fmt: skip
 
 
-def _where(found: Diagnosis) -> list[str]:
+def _write_where(found: Diagnosis) -> list[str]:
     places = wording.list_telling_places(found)
     if not places:
-        axes = listing([p.axis for p in found.where])
+        axes = write_list([p.axis for p in found.where])
         return ["  where it sits: " + (f"nowhere; noise looks like this along {axes}" if axes else
                                        "not known")]  # fmt: skip
     same = not found.findings
@@ -77,22 +80,24 @@ def _where(found: Diagnosis) -> list[str]:
     rows = [f"{head:<79}{'worst' if same else 'before':>10}{'' if same else 'after':>10}"]
     for place in places:
         first, *more = textwrap.wrap(wording.describe_place(place), 60) or [""]
-        before, after = (number(wording.highest_rms(v), 3) for v in (place.before, place.after))
+        before, after = (
+            write_number(wording.find_highest_rms(v), 3) for v in (place.before, place.after)
+        )
         after = "" if same else after
         rows.append(f"    {place.axis:<12} {first:<62}{before:>10}{after:>10}")
         rows += [f"{'':<17}{line}" for line in more]
     return rows
 
 
-def _finding(found: Diagnosis, finding: Finding, label: str) -> list[str]:
-    lines = _wrap(f"{label}{wording.name_finding(finding)}", 4, hang=7)
-    lines += _wrap(wording.describe_size(found, finding), 7, hang=9)
+def _write_finding(found: Diagnosis, finding: Finding, label: str) -> list[str]:
+    lines = _wrap_text(f"{label}{wording.name_finding(finding)}", 4, hang=7)
+    lines += _wrap_text(wording.describe_size(found, finding), 7, hang=9)
     for text in (wording.describe_certainty(found, finding), *wording.list_doubts(found, finding)):
-        lines += _wrap(text, 7, hang=9)
+        lines += _wrap_text(text, 7, hang=9)
     return lines
 
 
-def _sensitivity(found: Diagnosis) -> list[str]:
+def _write_sensitivity(found: Diagnosis) -> list[str]:
     rows = [f"{key:<{max(46 - len(size), len(key) + 1)}}{size}"
             for key, size in wording.list_sensitivity_rows(found)]  # fmt: skip
     half = (len(rows) + 1) // 2
@@ -101,16 +106,16 @@ def _sensitivity(found: Diagnosis) -> list[str]:
     return [head, *(f"    {a}    {b}" for a, b in zip(rows[:half], right, strict=True))]
 
 
-def _parameters(found: Diagnosis) -> list[str]:
+def _write_parameters(found: Diagnosis) -> list[str]:
     if not found.calibrated:
         return ["  the model has no free parameters"]
     last = "with the effects" if found.findings else "fitted"
     rows = [("the model's own parameters", "given", "recalibrated", last)]
     for c in found.calibrated:
-        fitted = quantity(c.after, error=c.standard_error, digits=4)
+        fitted = write_quantity(c.after, error=c.standard_error, digits=4)
         if c.standard_error == 0:
-            fitted = f"{number(c.after, 4)} (AT ITS LIMIT)"
-        rows.append((f"  {c.name}", number(c.given, 4), number(c.before, 4), fitted))
+            fitted = f"{write_number(c.after, 4)} (AT ITS LIMIT)"
+        rows.append((f"  {c.name}", write_number(c.given, 4), write_number(c.before, 4), fitted))
     if not found.findings:
         rows = [(a, b, "", d) for a, b, _, d in rows]
     return [f"  {a:<26}{b:>12}{c:>14}  {d:>28}" for a, b, c, d in rows]

@@ -8,8 +8,8 @@ import numpy as np
 
 from .._base.arrays import Array
 from ..estimation.likelihood.maximization import maximize
-from .candidates import Trial, contains, same_kind
-from .fitted_model import Model, log_terms
+from .candidates import Trial, contains, is_same_kind
+from .fitted_model import Model, compute_log_terms
 from .noise_tests import run_noise_tests
 from .refitting import refit_candidate
 from .removal import Weighed, move_last_effect, refit_noise, refit_without_effect, weigh_effects
@@ -43,18 +43,18 @@ def vuong_statistic(best: Array, other: Array, penalty: float) -> float:
     Vuong, Econometrica 57 (1989) 307-333.
     """
     d = best - other
-    spread = _spread_of_sum(d)
+    spread = _compute_spread_of_sum(d)
     return float((d.sum() - penalty) / max(spread, THRESHOLD.least_spread))
 
 
-def _spread_of_sum(d: Array) -> float:
+def _compute_spread_of_sum(d: Array) -> float:
     """Return the standard deviation of a sum whose terms may be correlated with neighbours."""
     n = len(d) // THRESHOLD.block * THRESHOLD.block
     sums = d[:n].reshape(-1, THRESHOLD.block).sum(axis=1) if n else d
     return math.sqrt(float(np.sum((sums - sums.mean()) ** 2)))
 
 
-def _share_beyond(trial: Trial, simple: Trial) -> float:
+def _compute_share_beyond(trial: Trial, simple: Trial) -> float:
     """Return how large what an effect has beyond a simpler one may be, over what both have.
 
     NaN where the two have nothing of one unit.
@@ -90,24 +90,24 @@ def find_rivals(best: Trial, others: Sequence[Trial], sure: bool = True) -> tupl
         Those within 3 units of log-likelihood, or not rejected by Vuong's test at z = 2; unless
         `sure`, also what is known to resemble the best and gains nearly as much.
     """
-    mine = log_terms(best.model.fit)
+    mine = compute_log_terms(best.model.fit)
     found = []
     for trial in others:
-        if same_kind(trial.effect, best.effect) or trial.net_gain <= THRESHOLD.gate:
+        if is_same_kind(trial.effect, best.effect) or trial.net_gain <= THRESHOLD.gate:
             continue
         lost = best.net_gain - trial.net_gain
-        theirs = log_terms(trial.model.fit)
+        theirs = compute_log_terms(trial.model.fit)
         # A larger model that predicts the same contains the best one, and pays for nothing; but one
         # that gains more may be right (a Stribeck curve hardly told from dry friction), and one
         # whose further part may be large, for all the record says, cannot be excluded.
         alike = trial.name in type(best.effect).look_alikes
         nothing = (
             trial.gain < best.gain + THRESHOLD.close
-            and _spread_of_sum(mine - theirs) < THRESHOLD.same_predictions
+            and _compute_spread_of_sum(mine - theirs) < THRESHOLD.same_predictions
         )
         if trial.penalty > best.penalty and nothing:
             larger = contains(trial.effect, best.effect)
-            share = _share_beyond(trial, best) if larger else math.nan
+            share = _compute_share_beyond(trial, best) if larger else math.nan
             hinted = (
                 alike
                 and trial.gain > best.gain + THRESHOLD.hint
@@ -123,7 +123,9 @@ def find_rivals(best: Trial, others: Sequence[Trial], sure: bool = True) -> tupl
     found.sort(key=lambda t: -t.net_gain)
     # An effect that was started from several values is one rival.
     return tuple(
-        t for k, t in enumerate(found) if not any(same_kind(t.effect, b.effect) for b in found[:k])
+        t
+        for k, t in enumerate(found)
+        if not any(is_same_kind(t.effect, b.effect) for b in found[:k])
     )
 
 

@@ -71,7 +71,7 @@ class SavedLoop:
         )
 
 
-def units_of(loop: Loop | SavedLoop, effect: AbstractEffect) -> dict[str, str]:
+def list_units(loop: Loop | SavedLoop, effect: AbstractEffect) -> dict[str, str]:
     """Return the unit of each parameter of an effect, by a loop or by what was saved of it."""
     if isinstance(loop, SavedLoop):
         return loop.units.get(type(effect).__name__, effect.units())
@@ -82,7 +82,7 @@ def save_diagnosis(found: Diagnosis, path: str | Path) -> Path:
     """Write a diagnosis to a file; see `Diagnosis.save`."""
     fields = {f.name: _encode(getattr(found, f.name))
               for f in dataclasses.fields(found) if f.name != "extra"}  # fmt: skip
-    loop = {**fields.pop("loop"), "units": _units_of_effects(found)}
+    loop = {**fields.pop("loop"), "units": _list_effect_units(found)}
     extra, left = {}, []
     for key, value in found.extra.items():
         try:
@@ -139,22 +139,22 @@ def _encode(value: Any) -> Any:
 def _encode_loop(loop: Loop | SavedLoop) -> dict[str, Any]:
     at = loop.at
     assert at is not None
-    name, law = ((loop.plant_name, loop.controller_text) if isinstance(loop, SavedLoop) else
+    name, controller = ((loop.plant_name, loop.controller_text) if isinstance(loop, SavedLoop) else
                  (loop.equations().name, " ".join(str(loop.controller).split())))  # fmt: skip
     return {
         "plant": name,
         "parameters": _encode(loop.parameters), "free": list(loop.free), "dt": _encode(loop.dt),
         "at": _encode(at), "input_limits": _encode(loop.input_limits),
-        "controller": law,
+        "controller": controller,
         "effects": [_encode(e) for e in loop.effects],
     }  # fmt: skip
 
 
-def _units_of_effects(found: Diagnosis) -> dict[str, dict[str, str]]:
+def _list_effect_units(found: Diagnosis) -> dict[str, dict[str, str]]:
     """Return the units of all effects that a diagnosis speaks of, by class name."""
     spoken = [*found.loop.effects, *(c.effect for c in found.ranking)]
     spoken += [e for f in found.findings for e in (f.effect, *f.alternatives)]
-    return {type(e).__name__: units_of(found.loop, e) for e in spoken}
+    return {type(e).__name__: list_units(found.loop, e) for e in spoken}
 
 
 # JSON has no such numbers, so that they are written as texts.

@@ -80,11 +80,11 @@ def score_shapes(
         own = pseudo_inverse(matrix[:p, :p]) if p else np.zeros((0, 0))
         through = matrix[p:, :p] @ own
         left = matrix[p:, p:] - through @ matrix[:p, p:]
-        push = score[p:] - through @ score[:p]
+        remaining_score = score[p:] - through @ score[:p]
         for k in range(0, size, width):
             rows = slice(k, k + width)
-            amount = pseudo_inverse(left[rows, rows]) @ push[rows]
-            gains.append(0.5 * float(push[rows] @ amount))
+            amount = pseudo_inverse(left[rows, rows]) @ remaining_score[rows]
+            gains.append(0.5 * float(remaining_score[rows] @ amount))
             sizes.append(amount)
     return np.array(gains), np.array(sizes)
 

@@ -6,10 +6,10 @@ from dataclasses import replace
 
 from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from ..effects import AbstractEffect
-from ..estimation.likelihood.likelihood import evaluate
-from ..estimation.likelihood.maximization import expected_gain
+from ..estimation.likelihood.likelihood import evaluate_likelihood
+from ..estimation.likelihood.maximization import compute_expected_gain
 from .candidates import Objection, Trial
-from .fitted_model import Model, carry_over, drop_arrays
+from .fitted_model import Model, carry_over_fit, drop_arrays
 from .information import find_doubles
 from .thresholds import THRESHOLD
 
@@ -66,19 +66,19 @@ def screen_at(base: Model, effect: AbstractEffect, scan_penalty: float = 0.0) ->
     own = [f"{label}.{k}" for k, v in effect.values().items() if math.isfinite(v)]
     names = (*base.names, *own)
     try:
-        fit = carry_over(base, loop, names)
+        fit = carry_over_fit(base, loop, names)
     except ModelCannotRun as reason:
         return Trial(effect, label, base, -math.inf, scan_penalty, out=Objection.of(reason))
     doubled = find_doubles(fit, label, effect)
     if doubled:
         loop = loop.with_parameters(doubled)
         names = tuple(n for n in names if n not in doubled)
-        fit = carry_over(base, loop, names)
+        fit = carry_over_fit(base, loop, names)
     model = Model(loop, fit)
     if not math.isfinite(fit.value):
         lost = Objection("cannot run", "cannot follow the record")
         return Trial(effect, label, model, -math.inf, scan_penalty, out=lost)
-    score = fit.value - base.fit.value + expected_gain(fit)
+    score = fit.value - base.fit.value + compute_expected_gain(fit)
     return Trial(effect, label, Model(loop, drop_arrays(fit)), score, scan_penalty)
 
 
@@ -88,7 +88,7 @@ def screen_starts(base: Model, effects: Sequence[AbstractEffect], scan_penalty: 
     if best.out is not None:
         return best
     label, loop, names = best.label, best.model.loop, best.model.names
-    start = carry_over(base, loop, names)
+    start = carry_over_fit(base, loop, names)
     for effect in effects[1:]:
         theta = start.theta.copy()
         for field, value in effect.values().items():
@@ -98,10 +98,10 @@ def screen_starts(base: Model, effects: Sequence[AbstractEffect], scan_penalty: 
         fit = start
         # The second pass linearizes along the states that the first one found.
         for _ in range(2):
-            fit = evaluate(start.problem, theta, start.noise, fit.trajectories)
+            fit = evaluate_likelihood(start.problem, theta, start.noise, fit.trajectories)
         if not math.isfinite(fit.value):
             continue
-        score = fit.value - base.fit.value + expected_gain(fit)
+        score = fit.value - base.fit.value + compute_expected_gain(fit)
         if score > best.score:
             moved = loop.with_parameters(dict(zip(names, theta.tolist(), strict=True)))
             best = Trial(effect, label, Model(moved, drop_arrays(fit)), score, scan_penalty)

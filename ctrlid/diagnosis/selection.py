@@ -6,11 +6,11 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from ..effects import AbstractEffect
-from ..estimation.likelihood.maximization import expected_gain
-from .candidates import Objection, Trial, contains, keep_for_comparison, same_kind
+from ..estimation.likelihood.maximization import compute_expected_gain
+from .candidates import Objection, Trial, contains, is_same_kind, keep_for_comparison
 from .fitted_model import Model, without_random_force
 from .refitting import refit_candidate, refit_under_noise
-from .replicas import gain_beyond_simple, gain_on_replicas, has_kinks, make_replica
+from .replicas import has_kinks, make_replica, measure_gain_beyond_simple, measure_gain_on_replicas
 from .scans import ModelSight, scan_candidate
 from .screening import screen_at
 from .thresholds import THRESHOLD
@@ -43,7 +43,7 @@ def run_round(
     if other is not None:
         # What the model alone would regain from these values is no gain of a candidate.
         lost = other.fit.value - base.fit.value
-        lost -= max(0.0, lost + expected_gain(other.fit))
+        lost -= max(0.0, lost + compute_expected_gain(other.fit))
         more = work(lambda effect: scan_candidate(other, effect), pool)
         more = [replace(t, score=t.score + lost) for t in more]
         pairs = zip(tried, more, strict=True)
@@ -57,7 +57,7 @@ def run_round(
     trials = _prefer_simplest(base, trials)
     plain = prefer_plainer(base, trials[0], trials[1:])
     if plain is not trials[0]:
-        trials = [plain, *(t for t in trials if not same_kind(t.effect, plain.effect))]
+        trials = [plain, *(t for t in trials if not is_same_kind(t.effect, plain.effect))]
         trials = _check_on_replicas(base, trials, copies)
     best = trials[0]
     trials = [
@@ -173,7 +173,7 @@ def _prefer_simplest(base: Model, trials: list[Trial]) -> list[Trial]:
             or simple.name not in best.effect.look_alikes
         ):
             continue
-        more = gain_beyond_simple(base, best, simple)
+        more = measure_gain_beyond_simple(base, best, simple)
         if more <= best.penalty - simple.penalty:
             words = f"{simple.name} explains as much with fewer parameters"
             behind = (
@@ -203,7 +203,7 @@ def _check_on_replicas(base: Model, trials: list[Trial], copies: list[Model | No
         )
         copies += [make_replica(base, seed) for seed in range(len(copies), enough)]
         if (
-            best.net_gain - THRESHOLD.replica_weight * gain_on_replicas(copies, best)
+            best.net_gain - THRESHOLD.replica_weight * measure_gain_on_replicas(copies, best)
             > THRESHOLD.gate
         ):
             break

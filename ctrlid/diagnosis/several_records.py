@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import stats
 
-from .._base.text import listing, number, with_error
+from .._base.text import with_error, write_list, write_number
 from ..effects import AbstractEffect
 from ..loop.loop import Loop
-from .candidates import same_kind
+from .candidates import is_same_kind
 from .findings import Calibrated, Candidate, Finding, Gap
 from .result import Diagnosis
 from .thresholds import THRESHOLD
@@ -46,7 +46,7 @@ def merge_diagnoses(loop: Loop, parts: Sequence[Diagnosis]) -> Diagnosis:
     calibrated, differing = _merge_calibrated(parts)
     complete = loop.with_parameters({c.name: c.after for c in calibrated})
     for f in findings:
-        if not any(same_kind(f.effect, e) for e in complete.effects):
+        if not any(is_same_kind(f.effect, e) for e in complete.effects):
             complete = complete.with_effect(f.effect)
     notes = list(dict.fromkeys(n for p in parts for n in p.notes))
     notes.append(
@@ -77,7 +77,7 @@ def _match_findings(parts: Sequence[Diagnosis]) -> list[Shared]:
     for k, f in sorted(every, key=lambda pair: -pair[1].evidence):
         mine = (f.effect, *f.alternatives)
         for i, s in enumerate(found):
-            common = tuple(e for e in s.kinds if any(same_kind(e, other) for other in mine))
+            common = tuple(e for e in s.kinds if any(is_same_kind(e, other) for other in mine))
             if common and k not in s.seen:
                 found[i] = Shared(common, {**s.seen, k: f})
                 break
@@ -105,16 +105,16 @@ def describe_presence(seen: Sequence[int], records: int) -> str:
         return "seen in every record"
     if not seen:
         return "seen in no record alone"
-    which = listing([str(k + 1) for k in seen])
+    which = write_list([str(k + 1) for k in seen])
     return f"seen in record{'s' if len(seen) > 1 else ''} {which} of {records} only"
 
 
 def _write_values(effect: AbstractEffect) -> str:
-    return ", ".join(f"{k} = {number(v, 4)}" for k, v in effect.values().items())
+    return ", ".join(f"{k} = {write_number(v, 4)}" for k, v in effect.values().items())
 
 
 def _find_kind(kind: AbstractEffect, f: Finding) -> AbstractEffect:
-    return next(e for e in (f.effect, *f.alternatives) if same_kind(kind, e))
+    return next(e for e in (f.effect, *f.alternatives) if is_same_kind(kind, e))
 
 
 def _merge_findings(s: Shared, records: int) -> Finding:
@@ -127,8 +127,8 @@ def _merge_findings(s: Shared, records: int) -> Finding:
         sizes = [
             f"{_write_values(_find_kind(chosen, s.seen[k]))} in record {k + 1}" for k in numbers
         ]
-        note += f"; each has its own size: {listing(sizes)}"
-    sure = same_kind(chosen, best.effect)
+        note += f"; each has its own size: {write_list(sizes)}"
+    sure = is_same_kind(chosen, best.effect)
     return replace(
         best, effect=chosen, alternatives=tuple(others),
         standard_errors=best.standard_errors if sure else {},
@@ -158,7 +158,7 @@ def _merge_calibrated(parts: Sequence[Diagnosis]) -> tuple[tuple[Calibrated, ...
         if len(sure) > 1 and stats.chi2.sf(spread, len(sure) - 1) < THRESHOLD.different_values:
             sizes = [f"{with_error(c.after, c.standard_error)} in record {k + 1}"
                      for k, c in enumerate(same)]  # fmt: skip
-            differing.append(f"{first.name} = {listing(sizes)}")
+            differing.append(f"{first.name} = {write_list(sizes)}")
     return tuple(means), differing
 
 

@@ -5,7 +5,7 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 
-from .._base.text import chance, number
+from .._base.text import write_number, write_p_value
 from ..effects import AbstractEffect
 from ..estimation.likelihood.likelihood import Fit
 from .findings import BinnedErrors, Disturbance, Finding, Gap, Verdict
@@ -114,7 +114,7 @@ def gap_is_wider(gap: Gap, disturbance: Disturbance) -> bool:
 
 def write_conclusion(
     verdict: Verdict, findings: Sequence[Finding], gap: Gap, disturbance: Disturbance,
-    after: NoiseTests, where: Sequence[BinnedErrors], loose: str | None = None,
+    after: NoiseTests, where: Sequence[BinnedErrors], objection: str | None = None,
 ) -> str:  # fmt: skip
     """Return the verdict with what it rests on.
 
@@ -132,7 +132,7 @@ def write_conclusion(
         The tests of what is left.
     where : sequence of BinnedErrors
         Where the disagreement sits.
-    loose : str, optional
+    objection : str, optional
         Why effects that leave nothing but noise may yet be no explanation.
 
     Returns
@@ -142,7 +142,7 @@ def write_conclusion(
     """
     names = " and ".join(" or ".join(f.names) for f in findings)
     name, p = after.worst
-    why = f"the test of {name} fails ({chance(p)})"
+    why = f"the test of {name} fails ({write_p_value(p)})"
     if after.passed:
         why = "on data kept back the gap stays well above the noise floor"
         if gap.after > gap.given:
@@ -152,8 +152,8 @@ def write_conclusion(
         text = "At the sensitivity of this record, what is left is noise."
     elif verdict == "explained":
         text = f"Missing {were} {names}; with {them}, what is left is noise."
-    elif verdict == "partly explained" and after.passed and loose is not None:
-        text = f"With {names} what is left is noise; but {loose}."
+    elif verdict == "partly explained" and after.passed and objection is not None:
+        text = f"With {names} what is left is noise; but {objection}."
     elif verdict == "partly explained":
         verb = "explain" if len(findings) > 1 else "explains"
         text = (f"{names} {verb} part of the gap. Something else remains that no known effect "
@@ -166,8 +166,10 @@ def write_conclusion(
     if disturbance.large:
         kind = "A random force"
         if disturbance.coloured:
-            kind = (f"A slowly varying random force of {number(disturbance.coloured, 2)} with a "
-                    f"time constant of {number(disturbance.time_constant, 2)} s")  # fmt: skip
+            kind = (
+                f"A slowly varying random force of {write_number(disturbance.coloured, 2)} with a "
+                f"time constant of {write_number(disturbance.time_constant, 2)} s"
+            )
         text += (f" {kind} makes {100 * disturbance.share:.0f} % of the noise floor's variance: "
                  "it is counted as noise here, and may hide a cause of its own.")  # fmt: skip
     return text

@@ -43,7 +43,7 @@ def _describe_place(
     k = int(np.argmax(np.maximum(strength, spread)))
     between = f"{name} {edges[k]:.4g} to {edges[k + 1]:.4g} {unit}".rstrip()
     if strength[k] >= spread[k]:
-        way = "above" if mean[k] > 0 else "below"
-        return f"at {between} the output lies {way} its prediction, by {abs(mean[k]):.2g} sigma"
-    way = "larger" if square[k] > 1 else "smaller"
-    return f"at {between} the prediction errors are {way} than noise"
+        side = "above" if mean[k] > 0 else "below"
+        return f"at {between} the output lies {side} its prediction, by {abs(mean[k]):.2g} sigma"
+    side = "larger" if square[k] > 1 else "smaller"
+    return f"at {between} the prediction errors are {side} than noise"

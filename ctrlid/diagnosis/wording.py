@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .._base.text import chance, listing, number, prefix, quantity
+from .._base.text import choose_prefix, write_list, write_number, write_p_value, write_quantity
 from ..effects import AbstractEffect, ReadingEffect
 from .findings import COMPLETE, BinnedErrors, Finding, Gap
-from .noise_tests import alarm_level
-from .saving import units_of
+from .noise_tests import choose_alarm_level
+from .saving import list_units
 from .thresholds import THRESHOLD
 
 if TYPE_CHECKING:
@@ -51,14 +51,14 @@ def list_gap_rows(gap: Gap) -> list[tuple[str, str, str]]:
     known = [v for v in (gap.floor, gap.after, gap.before) if 0 < v < math.inf]
     known = known or [v for v in (gap.given,) if 0 < v < math.inf]
     middle = math.exp(sum(map(math.log, known)) / len(known)) if known else 0.0
-    factor, unit = prefix(middle, gap.unit)
+    factor, unit = choose_prefix(middle, gap.unit)
     places = 2 - math.floor(math.log10(factor * min(known))) if known else 0
 
     def size(value: float) -> str:
         if math.isfinite(value) and places <= 6:
             return f"{factor * value:.{max(places, 0)}f} {unit}".strip()
         if math.isfinite(value):
-            return f"{number(factor * value, 3)} {unit}".strip()
+            return f"{write_number(factor * value, 3)} {unit}".strip()
         return "none" if math.isnan(value) else "RUNS AWAY"
 
     def times(value: float) -> str:
@@ -82,7 +82,7 @@ def describe_shrinking(gap: Gap) -> str:
     if not math.isfinite(above):
         return ""
     if THRESHOLD.excess * gap.floor < gap.after < THRESHOLD.excess * gap.widest:
-        widest = quantity(gap.widest, gap.unit)
+        widest = write_quantity(gap.widest, gap.unit)
         return (f"Two runs of the completed model that differ in noise alone end up as far as "
                 f"{widest} apart, so the gap shows little of what the effects close; the "
                 "one-step errors do.")  # fmt: skip
@@ -109,7 +109,7 @@ def list_telling_places(found: Diagnosis) -> list[BinnedErrors]:
     return [p for p in found.where if p.p_before < THRESHOLD.telling][:PLACES]
 
 
-def highest_rms(levels: Iterable[float]) -> float:
+def find_highest_rms(levels: Iterable[float]) -> float:
     """Return the highest RMS among the bins that hold something, from mean squares; NaN without."""
     known = [v for v in levels if math.isfinite(v)]
     return math.sqrt(max(known, default=math.nan))
@@ -122,7 +122,7 @@ def describe_place(place: BinnedErrors) -> str:
     if not np.isfinite(place.before).any():
         return "nowhere"
     k = int(np.nanargmax(place.before))
-    low, high = (number(v, 3) for v in place.edges[k : k + 2])
+    low, high = (write_number(v, 3) for v in place.edges[k : k + 2])
     return f"between {low} and {high} {place.unit}".strip()
 
 
@@ -130,14 +130,14 @@ def describe_parameters(
     found: Diagnosis, effect: AbstractEffect, errors: dict[str, float] | None = None
 ) -> str:
     """Write the parameters of an effect with units and standard errors, if they are given."""
-    units = units_of(found.loop, effect)
+    units = list_units(found.loop, effect)
     words = []
     for name, value in vars(effect).items():
         if name not in units:
             words += [f"{name} = {value}"] if value != "" else []
             continue
         error = None if errors is None else errors.get(name)
-        words.append(f"{name} = {quantity(value, units[name], error)}")
+        words.append(f"{name} = {write_quantity(value, units[name], error)}")
     return ", ".join(words)
 
 
@@ -147,10 +147,10 @@ def describe_forces(found: Diagnosis, effect: AbstractEffect) -> str:
     mass = next((name for name in MASSES if name in known), None)
     if effect.place != "force" or mass is None:
         return ""
-    units = units_of(found.loop, effect)
-    words = [quantity(known[mass] * value, FORCES[units[name]])
+    units = list_units(found.loop, effect)
+    words = [write_quantity(known[mass] * value, FORCES[units[name]])
              for name, value in effect.values().items() if units[name] in FORCES]  # fmt: skip
-    return f"{listing(words)} at {mass} = {quantity(known[mass], 'kg')}" if words else ""
+    return f"{write_list(words)} at {mass} = {write_quantity(known[mass], 'kg')}" if words else ""
 
 
 def describe_certainty(found: Diagnosis, finding: Finding) -> str:
@@ -178,10 +178,12 @@ def list_doubts(found: Diagnosis, finding: Finding) -> list[str]:
     apart = [e for e in finding.alternatives if type(e).__name__ not in finding.equivalents]
     if apart:
         others = [f"{type(e).__name__} ({describe_parameters(found, e)})" for e in apart]
-        lines.append(f"this record does not tell it from {listing(others)}")
+        lines.append(f"this record does not tell it from {write_list(others)}")
     if finding.equivalents:
-        lines.append(f"no record of u and y tells it from {listing(finding.equivalents)}: on this "
-                     "plant they are the same")  # fmt: skip
+        lines.append(
+            f"no record of u and y tells it from {write_list(finding.equivalents)}: on this "
+            "plant they are the same"
+        )
     if finding.experiment:
         lines.append(f"what would tell: {finding.experiment}")
     if finding.reference is not None:
@@ -209,18 +211,18 @@ def list_sensitivity_rows(found: Diagnosis) -> list[tuple[str, str]]:
     for key, size in found.sensitivity.items():
         label, _, name = key.partition(".")
         effect = tried.get(label)
-        unit = "" if effect is None else units_of(found.loop, effect).get(name, "")
-        rows.append((key, quantity(size, unit) if math.isfinite(size) else "not visible"))
+        unit = "" if effect is None else list_units(found.loop, effect).get(name, "")
+        rows.append((key, write_quantity(size, unit) if math.isfinite(size) else "not visible"))
     return rows
 
 
 def describe_disturbance(found: Diagnosis) -> str:
     """Say how large the random force is, and in capitals if it may hide something."""
     d, unit = found.disturbance, f"{found.gap.unit}/s^2" if found.gap.unit else ""
-    parts = [f"white {quantity(d.white, unit)}"] if d.white else []
+    parts = [f"white {write_quantity(d.white, unit)}"] if d.white else []
     if d.coloured:
-        parts.append(f"coloured {quantity(d.coloured, unit)} with a time constant of "
-                     f"{quantity(d.time_constant, 's')}")  # fmt: skip
+        parts.append(f"coloured {write_quantity(d.coloured, unit)} with a time constant of "
+                     f"{write_quantity(d.time_constant, 's')}")  # fmt: skip
     if not parts:
         return "random force: none; the noise floor is sensor noise"
     words = " and ".join(parts)
@@ -239,14 +241,14 @@ def describe_remains(found: Diagnosis) -> str:
     count = len(found.tests)
     name, p = min(found.tests.items(), key=lambda item: item[1])
     together = min(1.0, count * p)
-    if found.verdict in COMPLETE or together > alarm_level(len(found.findings)):
-        doubt = f"{name}, {chance(p)}"
+    if found.verdict in COMPLETE or together > choose_alarm_level(len(found.findings)):
+        doubt = f"{name}, {write_p_value(p)}"
         if p < THRESHOLD.telling:
-            doubt += f", among so many {chance(together)}"
+            doubt += f", among so many {write_p_value(together)}"
         return f"what remains: noise, by {count} tests, the most doubtful of which is {doubt}"
     failed = sorted((v, k) for k, v in found.tests.items() if v < THRESHOLD.telling) or [(p, name)]
     names = [name for _, name in failed[:LISTED]]
     if len(failed) > LISTED:
         names[-1] = f"{len(failed) - LISTED + 1} others"
     return (f"what remains: NOT NOISE ALONE, by {len(failed)} of {count} tests: "
-            f"{listing(names)} ({chance(failed[0][0])})")  # fmt: skip
+            f"{write_list(names)} ({write_p_value(failed[0][0])})")  # fmt: skip

@@ -14,10 +14,10 @@ from .._base.errors import CtrlidError, EffectDoesNotApply
 from ..physics.equations import Equations
 from ..physics.linearization import OperatingPoint
 from ..physics.symbols import Symbol
-from .context import Moment, motion
-from .parameters import Parameter, filled
+from .context import Moment, find_motion
+from .parameters import Parameter, fill_unit
 from .scanning import Overview, Range, Scan, Sight
-from .symbolic import spread_of, traced, with_states
+from .symbolic import append_states, find_spread, trace_hook
 
 Place = Literal["input", "force", "law", "output"]
 
@@ -65,7 +65,7 @@ class AbstractEffect:
             if not p.lower <= value <= p.upper:
                 raise EffectDoesNotApply(
                     f"{kind} needs {p.name} between {p.lower:g} and {p.upper:g} "
-                    f"[{filled(p.unit)}]; given {value:g}"
+                    f"[{fill_unit(p.unit)}]; given {value:g}"
                 )
             object.__setattr__(self, p.name, value)
         self.check()
@@ -166,7 +166,7 @@ class AbstractEffect:
             e = loop.equations()
             names = {"u": e.inputs[0], "y": e.outputs[0], "x": getattr(self, "name", "")}
             signals = {key: known[name] for key, name in names.items() if name in known}
-        return {p.name: filled(p.unit, signals) for p in self.parameters()}
+        return {p.name: fill_unit(p.unit, signals) for p in self.parameters()}
 
     def text(self, loop: Any = None) -> str:
         """Return the effect in words, with the units of a loop's plant if one is given."""
@@ -208,7 +208,7 @@ class AbstractEffect:
     @classmethod
     def _applicable(cls, loop: Any, *effects: Any) -> tuple[Any, ...]:
         """Keep those that the loop's plant takes."""
-        return tuple(e for e in effects if _takes(loop, e))
+        return tuple(e for e in effects if _can_take(loop, e))
 
     def rates(self, m: Moment) -> Sequence[Any]:
         """Return the rates of the effect's own `states`; `m.own` holds their symbols."""
@@ -268,18 +268,18 @@ class AbstractEffect:
             equations,
             p=casadi.vertcat(equations.p, *symbols),
             parameters={**equations.parameters, **values},
-            spread=spread_of(equations),
+            spread=find_spread(equations),
         )
         m = Moment(e, at, dt, {name: Symbol(s) for name, s in own.items()})
-        rates = tuple(traced(symbolic.rates)(m))
+        rates = tuple(trace_hook(symbolic.rates)(m))
         if len(rates) != len(own):
             raise CtrlidError(f"{type(self).__name__}.rates returned {len(rates)} rates for the "
                               f"states {self.states}")  # fmt: skip
         changed = type(self).build(symbolic, e, m)
-        return with_states(changed, label, own, rates, self.rest(at))
+        return append_states(changed, label, own, rates, self.rest(at))
 
 
-def _takes(loop: Any, effect: AbstractEffect) -> bool:
+def _can_take(loop: Any, effect: AbstractEffect) -> bool:
     try:
         loop.with_effect(effect)
     except EffectDoesNotApply:
@@ -289,7 +289,7 @@ def _takes(loop: Any, effect: AbstractEffect) -> bool:
 
 def require_motion(effect: AbstractEffect, e: Equations) -> tuple[int, int]:
     """Return the indices of position and velocity, or refuse."""
-    found = motion(e)
+    found = find_motion(e)
     if found is None:
         raise EffectDoesNotApply(
             f"{type(effect).__name__} acts on a moving mass, but no state of {e.name} is the rate "

@@ -11,7 +11,7 @@ from ..physics.linearization import OperatingPoint
 from .base import AbstractEffect
 
 
-def labels(effects: tuple[AbstractEffect, ...]) -> dict[str, AbstractEffect]:
+def label_effects(effects: tuple[AbstractEffect, ...]) -> dict[str, AbstractEffect]:
     """Return effects by name: that of the class, numbered from the second of a class on.
 
     Parameters
@@ -32,7 +32,7 @@ def labels(effects: tuple[AbstractEffect, ...]) -> dict[str, AbstractEffect]:
     return found
 
 
-def compose(
+def compose_effects(
     e: Equations, effects: Mapping[str, AbstractEffect], at: OperatingPoint, dt: float
 ) -> Equations:
     """Return equations with effects in them, from the plant's law outwards.
@@ -56,10 +56,10 @@ def compose(
     """
     for label, effect in sorted(effects.items(), key=lambda pair: pair[1].stage):
         e = effect.apply(e, at, dt, label)
-    return dataclasses.replace(e, rest=_at_rest(e, at)) if e.lags else e
+    return dataclasses.replace(e, rest=_find_rest(e, at)) if e.lags else e
 
 
-def _at_rest(e: Equations, at: OperatingPoint) -> tuple[float, ...]:
+def _find_rest(e: Equations, at: OperatingPoint) -> tuple[float, ...]:
     own = len(e.states) - len(e.rest)
     rest = list(e.rest)
     targets = casadi.Function("targets", [e.t, e.x, e.u, e.p, e.spread],

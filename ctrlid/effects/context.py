@@ -29,7 +29,7 @@ class Follow:
     shortest: float
 
 
-def motion(e: Equations) -> tuple[int, int] | None:
+def find_motion(e: Equations) -> tuple[int, int] | None:
     """Return the indices of the position and the velocity that forces act on, None without any.
 
     Of several moving masses it is the one whose position the output shows, else the first.
@@ -77,8 +77,8 @@ class Moment:
         self.states: dict[str, Any] = {s: Symbol(e.x[k]) for k, s in enumerate(e.states)}
         self.parameters: dict[str, Any] = {s: Symbol(e.p[k]) for k, s in enumerate(e.parameters)}
 
-    def _motion(self) -> tuple[int, int]:
-        found = motion(self._e)
+    def _require_motion(self) -> tuple[int, int]:
+        found = find_motion(self._e)
         if found is None:
             raise EffectDoesNotApply(
                 f"{self._e.name} has no moving mass: no state is the rate of another"
@@ -88,27 +88,27 @@ class Moment:
     @property
     def position_name(self) -> str:
         """Name of the state that is the position of the moving mass."""
-        return self._e.states[self._motion()[0]]
+        return self._e.states[self._require_motion()[0]]
 
     @property
     def position(self) -> Any:
         """Position of the moving mass."""
-        return Symbol(self._e.x[self._motion()[0]])
+        return Symbol(self._e.x[self._require_motion()[0]])
 
     @property
     def velocity(self) -> Any:
         """Velocity of the moving mass."""
-        return Symbol(self._e.x[self._motion()[1]])
+        return Symbol(self._e.x[self._require_motion()[1]])
 
     @property
     def acceleration(self) -> Any:
         """Acceleration of the moving mass without this effect."""
-        return Symbol(self._e.rhs[self._motion()[1]])
+        return Symbol(self._e.rhs[self._require_motion()[1]])
 
     @property
     def deviation(self) -> Any:
         """Position of the moving mass, counted from where it is at the operating point."""
-        index = self._motion()[0]
+        index = self._require_motion()[0]
         return Symbol(self._e.x[index] - self.at.states[index])
 
     def plant_parameter(self, name: str) -> Any:

@@ -12,7 +12,7 @@ from ..physics.linearization import OperatingPoint
 from .context import Moment
 from .kinds import InputEffect, first_width
 from .parameters import parameter
-from .symbolic import expression
+from .symbolic import to_expression
 
 
 @final
@@ -105,7 +105,7 @@ class InputDelay(InputEffect):
 
     def build(self, e: Equations, m: Moment) -> Equations:
         """Return the equations with this delay on top of what there is."""
-        delay = expression(self.delay)
+        delay = to_expression(self.delay)
         return dataclasses.replace(e, delay=delay if e.delay is None else e.delay + delay)
 
 
@@ -152,6 +152,6 @@ class InputBacklash(InputEffect):
                 "there is a backlash already; one loop takes a single InputBacklash"
             )
         memory, u = casadi.SX.sym("m"), casadi.SX.sym("u")
-        half = expression(self.width) / 2
+        half = to_expression(self.width) / 2
         after = casadi.fmin(casadi.fmax(memory, u - half), u + half)
         return dataclasses.replace(e, play=Backlash(memory, u, after, after, u, half))

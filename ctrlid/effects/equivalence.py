@@ -12,7 +12,7 @@ from .._base.errors import EffectDoesNotApply
 from ..physics.equations import Equations
 from .base import AbstractEffect
 from .catalogue import CATALOGUE
-from .context import motion
+from .context import find_motion
 from .law import PositionOffset
 
 # Two changes are compared at so many random states and inputs.
@@ -63,19 +63,26 @@ def equivalents(
     if name == "AsymmetricCoulombFriction":
         return ("CoulombFriction with a constant force",)
     if name in LAGS:
-        return tuple(k for k in LAGS if k != name) if _linear(base.equations()) else ()
-    others = [e for e in (_member(cls, base) for cls in catalogue) if e is not None]
+        return tuple(k for k in LAGS if k != name) if _is_linear(base.equations()) else ()
+    others = [e for e in (_make_member(cls, base) for cls in catalogue) if e is not None]
     found = {name: effect}
     words: set[str] = set()
     todo = [name]
     # What is equivalent to an equivalent effect is equivalent.
     while todo:
         known = todo.pop()
-        shifted = _by_shift(known, base)
-        equal = [e for e in others if type(e).__name__ in shifted or _same(base, found[known], e)]
+        shifted = _find_shifted_offsets(known, base)
+        equal = [
+            e
+            for e in others
+            if type(e).__name__ in shifted or _is_same_change(base, found[known], e)
+        ]
         words |= {word for word in shifted if word not in OFFSETS}
-        words |= {f"parameter {key}" for key in base.equations().parameters
-                  if "." not in key and _same_as_parameter(base, found[known], key)}  # fmt: skip
+        words |= {
+            f"parameter {key}"
+            for key in base.equations().parameters
+            if "." not in key and _is_change_of_parameter(base, found[known], key)
+        }
         new = {type(e).__name__: e for e in equal if type(e).__name__ not in found}
         found |= new
         todo += new
@@ -86,10 +93,10 @@ LAGS = ("ActuatorLag", "SensorLag")
 OFFSETS = ("PositionOffset", "SensorOffset")
 
 
-def _by_shift(name: str, loop: Any) -> set[str]:
+def _find_shifted_offsets(name: str, loop: Any) -> set[str]:
     """Offsets that become one another when the position is counted from another zero."""
     e = loop.equations()
-    found = motion(e)
+    found = find_motion(e)
     if name not in OFFSETS or found is None:
         return set()
     i, j = found
@@ -102,10 +109,10 @@ def _by_shift(name: str, loop: Any) -> set[str]:
         return set()
     if not casadi.jacobian(e.rhs[j], e.x[i]).nnz():
         return {"the initial position"}
-    return set(OFFSETS) if _law_is_all(loop, i) else set()
+    return set(OFFSETS) if _is_seen_by_law_alone(loop, i) else set()
 
 
-def _law_is_all(loop: Any, i: int) -> bool:
+def _is_seen_by_law_alone(loop: Any, i: int) -> bool:
     """Whether the law of the plant alone sees the position, state i, and no spring beside it."""
     size = 1e-2 * (abs(loop.point.states[i]) or 1.0)
     try:
@@ -116,13 +123,13 @@ def _law_is_all(loop: Any, i: int) -> bool:
     shift[i] = size
     rates = [
         (changed.evaluate(x, u, t)[0], e.evaluate(x + shift, u, t)[0], e.evaluate(x, u, t)[0])
-        for t, (x, u) in enumerate(_points(loop.point))
+        for t, (x, u) in enumerate(_draw_points(loop.point))
     ]
     offset, elsewhere, here = (np.concatenate(part) for part in zip(*rates, strict=True))
-    return _equal(elsewhere - here, offset - here)
+    return _are_equal(elsewhere - here, offset - here)
 
 
-def _linear(e: Equations) -> bool:
+def _is_linear(e: Equations) -> bool:
     """Whether rates and output are straight lines in states and input, the same at all times."""
     if e.dt:
         return False
@@ -132,14 +139,14 @@ def _linear(e: Equations) -> bool:
     return not bent and not any(casadi.which_depends(both, e.t, 1, True))
 
 
-def _member(cls: type[AbstractEffect], loop: Any) -> AbstractEffect | None:
+def _make_member(cls: type[AbstractEffect], loop: Any) -> AbstractEffect | None:
     """Return an instance of a class that has a single parameter and no states, else None."""
     if len(cls.parameters()) != 1 or cls.states or cls.parameters()[0].neutral is None:
         return None
     return next(iter(cls.candidates(loop)), None)
 
 
-def _change(loop: Any, effect: AbstractEffect, size: float) -> Array | None:
+def _compute_change(loop: Any, effect: AbstractEffect, size: float) -> Array | None:
     """Return how rates and output change at random points, None where the effect is not static."""
     if effect.states or len(effect.parameters()) != 1:
         return None
@@ -153,15 +160,17 @@ def _change(loop: Any, effect: AbstractEffect, size: float) -> Array | None:
     e = changed.equations(keep=True)
     if e.delay is not None or e.play is not None or e.readout is not None:
         return None
-    return _sampled(e, loop.point) - _sampled(loop.equations(), loop.point)
+    return _evaluate_at_points(e, loop.point) - _evaluate_at_points(loop.equations(), loop.point)
 
 
-def _sampled(e: Equations, at: Any, values: Array | None = None) -> Array:
-    rows = [np.concatenate(e.evaluate(x, u, t, values)) for t, (x, u) in enumerate(_points(at))]
+def _evaluate_at_points(e: Equations, at: Any, values: Array | None = None) -> Array:
+    rows = [
+        np.concatenate(e.evaluate(x, u, t, values)) for t, (x, u) in enumerate(_draw_points(at))
+    ]
     return np.concatenate(rows)
 
 
-def _points(at: Any) -> list[tuple[Array, float]]:
+def _draw_points(at: Any) -> list[tuple[Array, float]]:
     """Return random states and inputs around rest."""
     rng = np.random.default_rng(3)
     rest = np.array([*at.states, at.input])
@@ -170,7 +179,7 @@ def _points(at: Any) -> list[tuple[Array, float]]:
     return [(z[:-1], float(z[-1])) for z in points]
 
 
-def _match(first: Array | None, second: Array | None) -> float | None:
+def _find_factor(first: Array | None, second: Array | None) -> float | None:
     """Return the factor by which the second change is to be taken, None if it is another one."""
     if first is None or second is None:
         return None
@@ -183,7 +192,7 @@ def _match(first: Array | None, second: Array | None) -> float | None:
     return factor if near else None
 
 
-def _equal(first: Array | None, second: Array | None) -> bool:
+def _are_equal(first: Array | None, second: Array | None) -> bool:
     if first is None or second is None:
         return False
     good = np.isfinite(first) & np.isfinite(second)
@@ -191,30 +200,30 @@ def _equal(first: Array | None, second: Array | None) -> bool:
     return off <= SAME * float(np.linalg.norm(first[good]))
 
 
-def _same(loop: Any, first: AbstractEffect, second: AbstractEffect) -> bool:
+def _is_same_change(loop: Any, first: AbstractEffect, second: AbstractEffect) -> bool:
     if type(first) is type(second):
         return False
     for size in SIZES:
-        one = _change(loop, first, size)
-        factor = _match(one, _change(loop, second, size))
-        if factor is None or not _equal(one, _change(loop, second, factor * size)):
+        one = _compute_change(loop, first, size)
+        factor = _find_factor(one, _compute_change(loop, second, size))
+        if factor is None or not _are_equal(one, _compute_change(loop, second, factor * size)):
             return False
     return True
 
 
-def _same_as_parameter(loop: Any, effect: Any, name: str) -> bool:
+def _is_change_of_parameter(loop: Any, effect: Any, name: str) -> bool:
     e, at = loop.equations(), loop.point
     k = list(e.parameters).index(name)
 
     def change(size: float) -> Array:
         values = e.values
         values[k] += size
-        return _sampled(e, at, values) - _sampled(e, at)
+        return _evaluate_at_points(e, at, values) - _evaluate_at_points(e, at)
 
     for size in SIZES:
-        one = None if effect is None else _change(loop, effect, size)
+        one = None if effect is None else _compute_change(loop, effect, size)
         step = 1e-3 * (abs(e.values[k]) or 1.0)
-        factor = _match(one, change(step))
-        if factor is None or not _equal(one, change(factor * step)):
+        factor = _find_factor(one, change(step))
+        if factor is None or not _are_equal(one, change(factor * step)):
             return False
     return True

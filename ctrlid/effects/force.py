@@ -17,7 +17,7 @@ VISIBLE = 0.4
 # Wavelengths shorter than the travel over this number are not scanned, to save time.
 LENGTHS = 150
 # A wave is scanned if the motion is slow enough for it at this share of the samples.
-UNHURRIED = 0.25
+SLOW_SHARE = 0.25
 # A wave that gains this share of the largest gain may be the right one.
 NEARLY = 0.7
 # At most so many waves are refitted, to save time.
@@ -30,29 +30,29 @@ SLOWEST_MODE = 5.0
 FASTEST_MODE = 0.35
 
 
-def middle_frequency(loop: Any, record: Any) -> float:
+def choose_middle_frequency(loop: Any, record: Any) -> float:
     """Return a frequency [Hz] halfway, on a logarithmic scale, of what a record can show."""
     samples = 1000 if record is None else len(record)
     return math.sqrt(0.5 / samples) / float(loop.dt)
 
 
-def visible_frequencies(seen: Range) -> tuple[float, float]:
+def find_visible_frequencies(seen: Range) -> tuple[float, float]:
     """Return the frequencies that samples show [Hz]: one period in the record, below Nyquist's."""
     return 1.0 / seen.duration, VISIBLE / seen.dt
 
 
-def waves(angles: Array) -> Array:
+def make_waves(angles: Array) -> Array:
     """Return sine and cosine of each column of angles, side by side."""
     both = np.stack([np.sin(angles), np.cos(angles)], axis=2)
     return both.reshape(len(angles), -1)
 
 
-def amplitude_and_phase(size: Array) -> tuple[float, float]:
+def compute_amplitude_and_phase(size: Array) -> tuple[float, float]:
     """Return amplitude and phase of ``size[0] sin + size[1] cos``."""
     return float(np.hypot(*size)), float(np.arctan2(size[1], size[0]))
 
 
-def _peaks(gains: Array, nearly: float, most: int) -> list[int]:
+def _find_peaks(gains: Array, nearly: float, most: int) -> list[int]:
     """Return the highest peaks: those that are nearly as high as the best, at most so many."""
     padded = np.concatenate([[-np.inf], gains, [-np.inf]])
     tops = np.flatnonzero((gains >= padded[:-2]) & (gains > padded[2:]))
@@ -60,7 +60,7 @@ def _peaks(gains: Array, nearly: float, most: int) -> list[int]:
     return [int(k) for k in tops[np.argsort(-gains[tops])][:most]] or [int(np.argmax(gains))]
 
 
-def _grain(y: Array) -> float:
+def _find_quantization_step(y: Array) -> float:
     """Return the step of a coarsely quantised sensor, whose rounding repeats along the way."""
     values = np.unique(y)
     return float(np.min(np.diff(values))) if 1 < len(values) < len(y) / 8 else 0.0
@@ -210,18 +210,18 @@ class PeriodicForce(ForceEffect):
     @classmethod
     def candidates(cls, loop: Any, record: Any = None) -> tuple[Self, ...]:
         """Return a vibration of no amplitude; its frequency is to be scanned."""
-        return cls._applicable(loop, cls(0.0, middle_frequency(loop, record)))
+        return cls._applicable(loop, cls(0.0, choose_middle_frequency(loop, record)))
 
     def limits(self, seen: Range) -> dict[str, tuple[float, float]]:
         """Keep the frequency where samples show it."""
-        return {"frequency": visible_frequencies(seen)}
+        return {"frequency": find_visible_frequencies(seen)}
 
     def scan(self, sight: Sight) -> Scan:
         """Look at the strongest line of the prediction errors."""
         frequency = sight.strongest_line()
         angles = [2 * np.pi * frequency * t for t in sight.times]
-        _, sizes = sight.score_shapes([waves(a[:, None]) for a in angles], width=2)
-        amplitude, phase = amplitude_and_phase(sizes[0])
+        _, sizes = sight.score_shapes([make_waves(a[:, None]) for a in angles], width=2)
+        amplitude, phase = compute_amplitude_and_phase(sizes[0])
         start = replace(self, amplitude=amplitude, frequency=frequency, phase=phase)
         return Scan(((start,),), places=max(map(len, angles)) / 2)
 
@@ -276,8 +276,8 @@ class PositionRipple(ForceEffect):
     @classmethod
     def candidates(cls, loop: Any, record: Any = None) -> tuple[Self, ...]:
         """Return a ripple of no amplitude; its period is to be scanned."""
-        way = 0.0 if record is None else float(np.ptp(record.y))
-        return cls._applicable(loop, cls(0.0, way / 10 if way > 0 else 0.1))
+        travel = 0.0 if record is None else float(np.ptp(record.y))
+        return cls._applicable(loop, cls(0.0, travel / 10 if travel > 0 else 0.1))
 
     def limits(self, seen: Range) -> dict[str, tuple[float, float]]:
         """Keep the period within the travel: what repeats has to repeat."""
@@ -285,9 +285,9 @@ class PositionRipple(ForceEffect):
 
     def scan(self, sight: Sight) -> Scan:
         """Look at all wavelengths that the travel can show, and then finely at the best of them."""
-        ways, travel = sight.positions(), sight.travel
-        step = max(float(np.quantile(np.abs(np.diff(w)), UNHURRIED)) for w in ways)
-        grain = max(_grain(y) for y in sight.outputs)
+        positions, travel = sight.positions(), sight.travel
+        step = max(float(np.quantile(np.abs(np.diff(w)), SLOW_SHARE)) for w in positions)
+        grain = max(_find_quantization_step(y) for y in sight.outputs)
         shortest = max(travel / LENGTHS, 4 * step, 4 * grain)
         if not travel > 2 * shortest:
             return Scan((), remark="the travel is too short to see a ripple")
@@ -297,8 +297,8 @@ class PositionRipple(ForceEffect):
         def gains_of(numbers: Array) -> tuple[Array, Array]:
             parts = []
             for k in range(0, len(numbers), sight.block):
-                angles = [2 * np.pi * np.outer(w, numbers[k : k + sight.block]) for w in ways]
-                parts.append(sight.score_shapes([waves(a) for a in angles], width=2))
+                angles = [2 * np.pi * np.outer(w, numbers[k : k + sight.block]) for w in positions]
+                parts.append(sight.score_shapes([make_waves(a) for a in angles], width=2))
             gains, sizes = zip(*parts, strict=True)
             return np.concatenate(gains), np.concatenate(sizes)
 
@@ -306,7 +306,7 @@ class PositionRipple(ForceEffect):
         gains, sizes = gains_of(numbers)
         # A peak is about one over the travel wide: only those that may be the highest are seen
         # finely.
-        tops = _peaks(gains, NEARLY**2, 2 * PEAKS)
+        tops = _find_peaks(gains, NEARLY**2, 2 * PEAKS)
         between = np.concatenate([numbers[tops] - finest, numbers[tops] + finest])
         between = np.unique(between[between > 0])
         more, theirs = gains_of(between)
@@ -314,10 +314,10 @@ class PositionRipple(ForceEffect):
         gains, sizes = (np.concatenate(x)[first] for x in ((gains, more), (sizes, theirs)))
 
         def at(k: int) -> PositionRipple:
-            amplitude, phase = amplitude_and_phase(sizes[k])
+            amplitude, phase = compute_amplitude_and_phase(sizes[k])
             return replace(self, amplitude=amplitude, period=float(1 / numbers[k]), phase=phase)
 
-        best, *others = map(at, _peaks(gains, NEARLY, PEAKS))
+        best, *others = map(at, _find_peaks(gains, NEARLY, PEAKS))
         # Motion between a few levels sees several waves nearly alike: only fits tell them apart.
         return Scan(((best,),), places, tuple(others))
 
@@ -366,11 +366,11 @@ class FlexibleMode(ForceEffect):
     @classmethod
     def candidates(cls, loop: Any, record: Any = None) -> tuple[Self, ...]:
         """Return a mode of no mass; its frequency is to be scanned."""
-        return cls._applicable(loop, cls(middle_frequency(loop, record), 0.05, 0.0))
+        return cls._applicable(loop, cls(choose_middle_frequency(loop, record), 0.05, 0.0))
 
     def limits(self, seen: Range) -> dict[str, tuple[float, float]]:
         """Keep the frequency where samples show it; what is damped more is no mode."""
-        return {"frequency": visible_frequencies(seen), "damping": (0.0, 1.0)}
+        return {"frequency": find_visible_frequencies(seen), "damping": (0.0, 1.0)}
 
     def scan(self, sight: Sight) -> Scan:
         """Look at a few frequencies, and at the strongest line of the prediction errors."""

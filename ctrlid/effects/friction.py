@@ -19,7 +19,7 @@ STICKING = 0.25
 SLOWEST, FASTEST = 1e-3, 3.0
 # Half the difference over the mean friction is at most 1 for friction; the rest is left to the
 # uncertainty of both.
-PUSHING = 1.5
+LARGEST_ASYMMETRY = 1.5
 
 
 @final
@@ -166,7 +166,7 @@ class AsymmetricCoulombFriction(ForceEffect):
 
     def doubt(self) -> str | None:
         """Say so where it would push: friction is against the motion in both directions."""
-        if abs(self.difference) > PUSHING * self.fc:
+        if abs(self.difference) > LARGEST_ASYMMETRY * self.fc:
             return "in one direction it would push along, as a constant force does and no friction"
         return None
 

@@ -20,7 +20,7 @@ from .scanning import CUT_OFF, Scan, Sight
 DEPTHS = (0.5, 0.25)
 
 
-def extremes(values: Any, around: float) -> tuple[float, float]:
+def find_range(values: Any, around: float) -> tuple[float, float]:
     """Return a range a little inside that of a signal, or one around its value at rest."""
     if values is None:
         reach = max(abs(around), 1.0)
@@ -66,7 +66,7 @@ class InputSaturation(InputEffect):
     @classmethod
     def candidates(cls, loop: Any, record: Any = None) -> tuple[Self, ...]:
         """Return limits just inside the range of the recorded input."""
-        low, high = extremes(None if record is None else record.u, loop.point.input)
+        low, high = find_range(None if record is None else record.u, loop.point.input)
         return cls._applicable(loop, cls(low, high)) if low < high else ()
 
     def scan(self, sight: Sight) -> Scan:

@@ -11,7 +11,7 @@ from ..physics.equations import Equations
 from ..physics.symbols import Symbol
 from .base import AbstractEffect, Place, require_motion
 from .context import Moment
-from .symbolic import expression, substituted, traced
+from .symbolic import substitute_symbol, to_expression, trace_hook
 
 
 class LawEffect(AbstractEffect):
@@ -29,7 +29,7 @@ class LawEffect(AbstractEffect):
 
         A state is seen differently by the rates only: the output still shows what it is.
         """
-        seen = traced(self.law)(m)
+        seen = trace_hook(self.law)(m)
         known = {**m.states, **m.parameters}
         unknown = [name for name in seen if name not in known]
         if unknown:
@@ -38,9 +38,9 @@ class LawEffect(AbstractEffect):
                 f"{list(e.states)} and the numeric parameters {list(e.parameters)}"
             )
         for name, value in seen.items():
-            old, new = known[name].sx, expression(value)
+            old, new = known[name].sx, to_expression(value)
             output = e.output if name in m.states else casadi.substitute(e.output, old, new)
-            e = dataclasses.replace(substituted(e, old, new), output=output)
+            e = dataclasses.replace(substitute_symbol(e, old, new), output=output)
         return e
 
 
@@ -58,7 +58,7 @@ class ForceEffect(AbstractEffect):
         """Return the equations with the force added to the rate of the velocity."""
         _, j = require_motion(self, e)
         rhs = casadi.SX(e.rhs)
-        rhs[j] = rhs[j] + expression(traced(self.force)(m))
+        rhs[j] = rhs[j] + to_expression(trace_hook(self.force)(m))
         return dataclasses.replace(e, rhs=rhs)
 
 
@@ -75,7 +75,7 @@ class InputEffect(AbstractEffect):
 
     def build(self, e: Equations, m: Moment) -> Equations:
         """Return the equations with the applied input in place of the computed one."""
-        return substituted(e, e.u, expression(traced(self.input)(m)))
+        return substitute_symbol(e, e.u, to_expression(trace_hook(self.input)(m)))
 
 
 def first_width(loop: Any, record: Any) -> float:
@@ -98,7 +98,7 @@ class OutputEffect(AbstractEffect):
 
     def build(self, e: Equations, m: Moment) -> Equations:
         """Return the equations with the new output."""
-        return dataclasses.replace(e, output=expression(traced(self.output)(m)))
+        return dataclasses.replace(e, output=to_expression(trace_hook(self.output)(m)))
 
 
 class ReadingEffect(AbstractEffect):
@@ -117,5 +117,5 @@ class ReadingEffect(AbstractEffect):
         reading = casadi.SX.sym("reading") if e.reading is None else e.reading
         m.y = Symbol(reading if e.readout is None else e.readout)
         return dataclasses.replace(
-            e, reading=reading, readout=expression(traced(self.read)(m))
+            e, reading=reading, readout=to_expression(trace_hook(self.read)(m))
         )  # fmt: skip

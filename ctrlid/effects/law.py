@@ -13,7 +13,7 @@ from .base import require_motion
 from .context import Moment
 from .kinds import LawEffect
 from .parameters import parameter
-from .symbolic import expression
+from .symbolic import to_expression
 
 # A force agrees with the inverse square of the distance up to this relative error.
 INVERSE_SQUARE = 1e-9
@@ -115,7 +115,7 @@ class ForceExponent(LawEffect):
                 f"ForceExponent needs a force of the input that falls with the square of "
                 f"{e.states[i]} > 0; that of {e.name} does not"
             )
-        factor = (e.x[i] / rest) ** (2 - expression(self.n))
+        factor = (e.x[i] / rest) ** (2 - to_expression(self.n))
         rhs = casadi.SX(e.rhs)
         rhs[j] = rhs[j] + pull * (factor - 1)
         return dataclasses.replace(e, rhs=rhs)

@@ -7,9 +7,9 @@ from typing import Any, ClassVar, Self, final
 import numpy as np
 
 from .._base.errors import EffectDoesNotApply
-from ..physics.linearization import OperatingPoint, state_matrices
+from ..physics.linearization import OperatingPoint, compute_state_matrices
 from .context import Moment
-from .input import extremes
+from .input import find_range
 from .kinds import OutputEffect, ReadingEffect
 from .parameters import parameter
 
@@ -130,7 +130,7 @@ class SensorOffset(OutputEffect):
         from.
         """
         del record
-        a, _, c, _ = state_matrices(loop.equations(), loop.point, spread=SHIFTED_FAR)
+        a, _, c, _ = compute_state_matrices(loop.equations(), loop.point, spread=SHIFTED_FAR)
         matters = np.any(np.abs(a[:, np.flatnonzero(c[0])]).sum(axis=0) > 0)
         return cls._applicable(loop, cls(0.0)) if matters else ()
 
@@ -176,7 +176,7 @@ class SensorSaturation(ReadingEffect):
     @classmethod
     def candidates(cls, loop: Any, record: Any = None) -> tuple[Self, ...]:
         """Return limits just inside the range of the recorded output."""
-        low, high = extremes(None if record is None else record.y, loop.point.output)
+        low, high = find_range(None if record is None else record.y, loop.point.output)
         return cls._applicable(loop, cls(low, high)) if low < high else ()
 
     def read(self, m: Moment) -> Any:

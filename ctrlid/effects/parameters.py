@@ -68,7 +68,7 @@ def parameter(
     return dataclasses.field(default=default, metadata={"parameter": about})
 
 
-def filled(unit: str, signals: Mapping[str, str] | None = None) -> str:
+def fill_unit(unit: str, signals: Mapping[str, str] | None = None) -> str:
     """Return a unit with the units of signals in it, or with [u] and [y] where they are unknown."""
     known = {"u": "[u]", "y": "[y]", "x": "[state]", **(signals or {})}
     return unit.format(**known)

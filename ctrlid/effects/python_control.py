@@ -11,8 +11,8 @@ from .._base.errors import EffectDoesNotApply
 from ..physics.equations import Equations
 from ..physics.linearization import OperatingPoint, linearize, operating_point
 from .base import AbstractEffect
-from .composition import compose
-from .symbolic import substituted
+from .composition import compose_effects
+from .symbolic import substitute_symbol
 
 # A standard deviation this large is wide against every kink.
 FAR = 1e12
@@ -38,9 +38,9 @@ def as_system(e: Equations, at: OperatingPoint, units: Mapping[str, str]) -> Any
     Raises
     ------
     CtrlidError
-        As `ordinary`.
+        As `make_ordinary`.
     """
-    e = ordinary(e, at)
+    e = make_ordinary(e, at)
 
     def values(params: Mapping[str, Any]) -> list[float]:
         return [float(params[name]) for name in e.parameters]
@@ -61,7 +61,7 @@ def as_system(e: Equations, at: OperatingPoint, units: Mapping[str, str]) -> Any
     return system
 
 
-def linear_model(
+def linearize_with_effects(
     e: Equations, effects: Mapping[str, AbstractEffect], at: OperatingPoint, dt: float
 ) -> Any:
     """Return the transfer function of a plant with effects, at the equilibrium with its output.
@@ -87,15 +87,15 @@ def linear_model(
     CtrlidError
         If there is no equilibrium at this output.
     """
-    changed = compose(e, effects, at, dt)
-    changed = substituted(changed, changed.t, casadi.SX(0.0))
-    resting = ordinary(changed, at)
+    changed = compose_effects(e, effects, at, dt)
+    changed = substitute_symbol(changed, changed.t, casadi.SX(0.0))
+    resting = make_ordinary(changed, at)
     guess = OperatingPoint((*at.states, *resting.rest), at.input, at.output)
     point = operating_point(resting, output=at.output, guess=guess)
-    return linearize(ordinary(with_spread(changed, FAR), at), point)
+    return linearize(make_ordinary(with_spread(changed, FAR), at), point)
 
 
-def ordinary(e: Equations, at: OperatingPoint) -> Equations:
+def make_ordinary(e: Equations, at: OperatingPoint) -> Equations:
     r"""Return equations without a delay, a memory, a readout or a spread.
 
     .. math:: e^{-\theta s} \approx
@@ -128,7 +128,7 @@ def ordinary(e: Equations, at: OperatingPoint) -> Equations:
             "loop.without_effect('InputBacklash') first"
         )
     if e.delay is not None:
-        e = _pade(e, at)
+        e = _apply_pade(e, at)
     output = e.output
     if e.readout is not None:
         output = casadi.substitute(e.readout, e.reading, output)
@@ -154,17 +154,17 @@ def with_spread(e: Equations, size: float) -> Equations:
     if e.spread is None:
         return e
     known = casadi.DM.ones(*e.spread.shape) * size
-    return dataclasses.replace(substituted(e, e.spread, known), spread=None)
+    return dataclasses.replace(substitute_symbol(e, e.spread, known), spread=None)
 
 
-def _pade(e: Equations, at: OperatingPoint) -> Equations:
+def _apply_pade(e: Equations, at: OperatingPoint) -> Equations:
     if e.dt:
         raise EffectDoesNotApply(
             f"{e.name} is in discrete time (dt = {e.dt:g} s): give the delay as poles at zero"
         )
     late, slope = casadi.SX.sym("late"), casadi.SX.sym("slope")
     rates = casadi.vertcat(slope, 12 * (e.u - late) - 6 * slope) / e.delay
-    e_late = substituted(e, e.u, e.u - slope)
+    e_late = substitute_symbol(e, e.u, e.u - slope)
     spread = None if e.spread is None else casadi.vertcat(e.spread, casadi.SX.sym("s", 2))
     return dataclasses.replace(
         e_late,

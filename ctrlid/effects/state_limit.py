@@ -11,15 +11,15 @@ from scipy import signal
 
 from .._base.errors import EffectDoesNotApply
 from ..physics.equations import Equations
-from ..physics.linearization import state_matrices
+from ..physics.linearization import compute_state_matrices
 from .context import Moment
 from .kinds import LawEffect
 from .parameters import parameter
 from .scanning import CUT_OFF, Overview, Scan, Sight
-from .symbolic import expression
+from .symbolic import to_expression
 
 # What exceeds a limit runs off with a time constant of this share of a sampling period.
-RIM = 0.25
+OVERFLOW_TIME = 0.25
 
 
 @final
@@ -72,7 +72,7 @@ class StateLimit(LawEffect):
             if i in moving:
                 continue
             fed = [k for k in own if k != i and casadi.jacobian(e.rhs[k], e.x[i]).nnz()]
-            upper = _high(loop, record, i)
+            upper = _find_high_value(loop, record, i)
             to, share = (e.states[fed[0]], 0.5) if fed else ("", 1.0)
             found.append(cls(e.states[i], upper, to, share))
         return cls._applicable(loop, *found)
@@ -104,13 +104,13 @@ class StateLimit(LawEffect):
                 "StateLimit is a flow in continuous time; the plant "
                 f"{e.name} is sampled at {e.dt:g} s"
             )
-        over = expression(m.above(m.states[self.name] - self.upper)) / (RIM * m.dt)
+        over = to_expression(m.above(m.states[self.name] - self.upper)) / (OVERFLOW_TIME * m.dt)
         rhs = casadi.SX(e.rhs)
         i = e.states.index(self.name)
         rhs[i] = rhs[i] - over
         if self.spill_to:
             k = e.states.index(self.spill_to)
-            rhs[k] = rhs[k] + expression(self.share) * over
+            rhs[k] = rhs[k] + to_expression(self.share) * over
         return dataclasses.replace(e, rhs=rhs)
 
 
@@ -119,14 +119,14 @@ def _rate_is_state(e: Equations, i: int) -> bool:
     return any(casadi.is_equal(rate, e.x[k], 2) for k in range(len(e.states)) if k != i)
 
 
-def _high(loop: Any, record: Any, i: int) -> float:
+def _find_high_value(loop: Any, record: Any, i: int) -> float:
     """Return a value that a state exceeds now and then, as far as a record tells."""
     e, at = loop.equations(), loop.point
     if record is not None and casadi.is_equal(e.output[0], e.x[i], 2):
         return float(np.quantile(record.y, 0.9))
     # The linear model tells the range of the state from the recorded input.
     if record is not None:
-        a, b, _, _ = state_matrices(e, at)
+        a, b, _, _ = compute_state_matrices(e, at)
         if np.linalg.eigvals(a).real.max() < 0:
             n = len(a)
             sampled = signal.cont2discrete((a, b, np.eye(n), np.zeros((n, 1))), record.dt)

@@ -14,19 +14,19 @@ from ..physics.tracing import rebind
 from .context import Follow
 
 
-def traced(hook: Any) -> Any:
+def trace_hook(hook: Any) -> Any:
     """Return a hook that computes with symbols where it says numpy or math."""
     return rebind(hook) if inspect.ismethod(hook) else hook
 
 
-def expression(value: Any) -> Any:
+def to_expression(value: Any) -> Any:
     """Return what a hook returned as a CasADi expression."""
     if isinstance(value, np.ndarray) and value.size == 1:
         value = value.reshape(-1)[0]
     return value.sx if isinstance(value, Symbol) else casadi.SX(float(value))
 
 
-def substituted(e: Equations, old: Any, new: Any) -> Equations:
+def substitute_symbol(e: Equations, old: Any, new: Any) -> Equations:
     """Return the equations with an expression in place of a symbol, wherever the plant has it."""
     rhs, output = (casadi.substitute(f, old, new) for f in (e.rhs, e.output))
     lags = tuple(
@@ -36,12 +36,12 @@ def substituted(e: Equations, old: Any, new: Any) -> Equations:
     return dataclasses.replace(e, rhs=rhs, output=output, lags=lags)
 
 
-def spread_of(e: Equations) -> Any:
+def find_spread(e: Equations) -> Any:
     """Return the symbols for how uncertain each state is, new ones where there are none."""
     return casadi.SX.sym("s", len(e.states)) if e.spread is None else e.spread
 
 
-def with_states(
+def append_states(
     e: Equations, label: str, own: Mapping[str, Any], rates: Sequence[Any], rest: Sequence[float]
 ) -> Equations:
     """Append an effect's own states to the equations."""
@@ -50,12 +50,12 @@ def with_states(
     n, lags, columns = len(e.states), list(e.lags), []
     for k, rate in enumerate(rates):
         if isinstance(rate, Follow):
-            tau, target = expression(rate.time_constant), expression(rate.target)
+            tau, target = to_expression(rate.time_constant), to_expression(rate.target)
             tau = casadi.fmax(tau, rate.shortest)
             lags.append(Lag(n + k, tau, target))
             columns.append((target - list(own.values())[k]) / tau)
         else:
-            columns.append(expression(rate))
+            columns.append(to_expression(rate))
     return dataclasses.replace(
         e,
         states=(*e.states, *(f"{label}.{name}" for name in own)),

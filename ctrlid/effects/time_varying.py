@@ -20,7 +20,7 @@ SPREAD_TIMES = 12
 SMALLEST, LARGEST = -0.9, 10.0
 
 
-def _of_plant(loop: Any) -> list[str]:
+def _list_plant_parameters(loop: Any) -> list[str]:
     """Return the free parameters that are the plant's own."""
     return [name for name in loop.free if name.partition(".")[0] not in loop.labelled]
 
@@ -59,7 +59,7 @@ class ParameterDrift(LawEffect):
     def candidates(cls, loop: Any, record: Any = None) -> tuple[Self, ...]:
         """Return one for each free parameter of the plant."""
         del record
-        return cls._applicable(loop, *(cls(name, 0.0) for name in _of_plant(loop)))
+        return cls._applicable(loop, *(cls(name, 0.0) for name in _list_plant_parameters(loop)))
 
     def law(self, m: Moment) -> dict[str, Any]:
         """Return the drifting parameter."""
@@ -103,7 +103,9 @@ class ParameterStep(LawEffect):
     def candidates(cls, loop: Any, record: Any = None) -> tuple[Self, ...]:
         """Return one of no size for each free parameter; its time is to be scanned."""
         half = 500 * loop.dt if record is None else record.duration / 2
-        return cls._applicable(loop, *(cls(name, half, 0.0) for name in _of_plant(loop)))
+        return cls._applicable(
+            loop, *(cls(name, half, 0.0) for name in _list_plant_parameters(loop))
+        )
 
     def scan(self, sight: Sight) -> Scan | None:
         """Look at instants over the record, ever closer around the best, down to one sample."""

@@ -189,9 +189,9 @@ class Estimate(_text.Printed):
         return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
 
     def __getitem__(self, name: str) -> float:
-        return float(self.values[self._index(name)])
+        return float(self.values[self._find_index(name)])
 
-    def _index(self, name: str) -> int:
+    def _find_index(self, name: str) -> int:
         if name not in self.names:
             raise CtrlidError(f"No coefficient {name!r}: this model has {', '.join(self.names)}.")
         return self.names.index(name)
@@ -213,7 +213,7 @@ class Estimate(_text.Printed):
         """
         if not 0.0 < level < 1.0:
             raise CtrlidError(f"A confidence level lies between 0 and 1; given {level!r}.")
-        i = self._index(name)
+        i = self._find_index(name)
         half = float(student_t.ppf(0.5 + level / 2, self.degrees_of_freedom))
         half *= float(self.standard_errors[i])
         return self[name] - half, self[name] + half
@@ -253,7 +253,7 @@ class Estimate(_text.Printed):
         the denominator is fixed.
         """
         na = self.structure.na
-        return root_errors(self.poles, self.covariance[:na, :na])
+        return compute_root_errors(self.poles, self.covariance[:na, :na])
 
     @property
     def poles_s_standard_errors(self) -> Array:
@@ -265,10 +265,10 @@ class Estimate(_text.Printed):
         return errors
 
     def __str__(self) -> str:
-        return _report(self)
+        return _write_report(self)
 
 
-def root_errors(roots: ComplexArray, covariance: Array) -> Array:
+def compute_root_errors(roots: ComplexArray, covariance: Array) -> Array:
     """Return the standard errors of the roots of a monic polynomial, by the delta method.
 
     Parameters
@@ -297,7 +297,7 @@ def root_errors(roots: ComplexArray, covariance: Array) -> Array:
     return errors
 
 
-def _report(e: Estimate) -> str:
+def _write_report(e: Estimate) -> str:
     """Lines of text: normal facts in normal case, bad news in capitals."""
     held = {bound.quantity for bound in e.active_bounds}
     lines = [f"{e.method}: {e.n_samples} rows" + (f", dt = {e.dt:g} s" if e.dt else "")]
@@ -321,10 +321,10 @@ def _report(e: Estimate) -> str:
     lines.append(f"  {what}: standard deviation {np.sqrt(e.residual_variance):.3g}")
     lines.append(f"  solved by {e.solver}")
     lines.append("  active bounds: " + (", ".join(e.active) or "none"))
-    return "\n".join([*lines, *_bad_news(e)])
+    return "\n".join([*lines, *_list_bad_news(e)])
 
 
-def _bad_news(e: Estimate) -> list[str]:
+def _list_bad_news(e: Estimate) -> list[str]:
     news = [f"  {note}" for note in e.notes]
     for bound in e.active_bounds:
         free = f": without {bound.constraint} the data would take it to {bound.free:.7g}"
@@ -336,7 +336,7 @@ def _bad_news(e: Estimate) -> list[str]:
         )
     z = e.poles
     merged = [
-        f"  TWO POLES MERGE at {e.structure.domain} = {_text.number(z[k])}."
+        f"  TWO POLES MERGE at {e.structure.domain} = {_text.write_number(z[k])}."
         for k in range(len(z) - 1)
         if e.active_bounds and np.any(np.abs(z[k + 1 :] - z[k]) < 1e-6)
     ]
@@ -352,7 +352,7 @@ def _bad_news(e: Estimate) -> list[str]:
     return news
 
 
-def delay_of(model: Any) -> float:
+def read_delay(model: Any) -> float:
     """Return the delay [s] that an identified model has beside its polynomials, 0 for others."""
     return model.delay if isinstance(model, IdentifiedModel) else 0.0
 
@@ -432,4 +432,4 @@ class IdentifiedModel(control.TransferFunction):
     def _repr_html_(self, var: str | None = None) -> str:
         # The formula looks as python-control shows every transfer function.
         formula: Any = super()._repr_html_(var)
-        return f"{formula}\n{_text.html_lines(str(self.estimate))}"
+        return f"{formula}\n{_text.write_html(str(self.estimate))}"

@@ -13,7 +13,7 @@ from scipy.stats import chi2
 from .._base import text as _text
 from .._base.arrays import Array
 from .._base.errors import CtrlidError
-from .._base.jobs import check_jobs, spread
+from .._base.jobs import check_jobs, share_out
 from ..data.record import Record
 from .identified_model import IdentifiedModel
 
@@ -71,22 +71,22 @@ class FitSeries(_text.Printed):
     @property
     def rates(self) -> Array:
         """Real part of the rightmost pole of each model [rad/s]: that of an unstable plant."""
-        return np.array([self._poles(k)[0].real for k in range(len(self.models))])
+        return np.array([self._list_poles(k)[0].real for k in range(len(self.models))])
 
     @property
     def rate_errors(self) -> Array:
         """Standard errors of `rates` [rad/s]."""
-        return np.array([self._errors(k)[0] for k in range(len(self.models))])
+        return np.array([self._list_errors(k)[0] for k in range(len(self.models))])
 
-    def _order(self, k: int) -> Any:
+    def _sort_poles(self, k: int) -> Any:
         s = self.models[k].estimate.poles_s
         return np.argsort(-np.where(np.isfinite(s.real), s.real, -np.inf), kind="stable")
 
-    def _poles(self, k: int) -> Any:
-        return self.models[k].estimate.poles_s[self._order(k)]
+    def _list_poles(self, k: int) -> Any:
+        return self.models[k].estimate.poles_s[self._sort_poles(k)]
 
-    def _errors(self, k: int) -> Array:
-        errors: Array = self.models[k].estimate.poles_s_standard_errors[self._order(k)]
+    def _list_errors(self, k: int) -> Array:
+        errors: Array = self.models[k].estimate.poles_s_standard_errors[self._sort_poles(k)]
         return errors
 
     @property
@@ -102,7 +102,7 @@ class FitSeries(_text.Printed):
         if len(np.unique(y)) < 2:
             raise CtrlidError(
                 f"a trend needs records at two different outputs at least; given {len(y)} at "
-                f"{', '.join(_text.number(v, 4) for v in y)}"
+                f"{', '.join(_text.write_number(v, 4) for v in y)}"
             )
         if not (np.isfinite(sigma).all() and np.isfinite(p).all()):
             raise CtrlidError("a trend needs poles with finite standard errors: two of them merge")
@@ -131,16 +131,17 @@ class FitSeries(_text.Printed):
         rows = [f"{'record':<{width}}  {'output' + unit:>12}  poles [rad/s]"]
         for k, (name, level) in enumerate(zip(self.names, self.levels, strict=True)):
             poles = ", ".join(
-                _text.with_error(s, e) for s, e in zip(self._poles(k), self._errors(k), strict=True)
+                _text.with_error(s, e)
+                for s, e in zip(self._list_poles(k), self._list_errors(k), strict=True)
             )
             on = f"   ON A BOUND: {', '.join(a)}" if (a := self.models[k].estimate.active) else ""
             rows.append(f"{name:<{width}}  {level:>12.6g}  {poles}{on}")
         if len(np.unique(self.levels)) > 1 and np.isfinite(self.rate_errors).all():
-            rows.append(_trend_words(self.trend, self.unit))
+            rows.append(_write_trend(self.trend, self.unit))
         return "\n".join(rows)
 
 
-def _trend_words(line: PoleTrend, unit: str) -> str:
+def _write_trend(line: PoleTrend, unit: str) -> str:
     text = (
         f"rightmost pole {_text.with_error(line.pole, line.pole_error)} rad/s at "
         f"{line.level:.4g} {unit}".rstrip()
@@ -152,7 +153,7 @@ def _trend_words(line: PoleTrend, unit: str) -> str:
     if np.isfinite(line.p_value):
         verb = "EXCEED" if line.p_value < 0.01 else "are within"
         text += f". Distances from the line {verb} the standard errors "
-        text += f"({_text.chance(line.p_value)})"
+        text += f"({_text.write_p_value(line.p_value)})"
     return text + "."
 
 
@@ -212,14 +213,14 @@ def fit_each(
     if not callable(fit):
         raise CtrlidError(f"fit_each needs a function such as fit_iv; given {type(fit).__name__}")
     records = (records,) if isinstance(records, Record) else records
-    done = list(spread(partial(_one, fit, options), enumerate(records, 1), check_jobs(jobs)))
+    done = list(share_out(partial(_fit_one, fit, options), enumerate(records, 1), check_jobs(jobs)))
     if not done:
         raise CtrlidError("fit_each needs one record at least; the list given is empty")
     models, names, levels, units = zip(*done, strict=True)
     return FitSeries(models, names, np.array(levels), units[0])
 
 
-def _one(
+def _fit_one(
     fit: Callable[..., IdentifiedModel], options: dict[str, Any], item: tuple[int, Record]
 ) -> tuple[IdentifiedModel, str, float, str]:
     number, record = item

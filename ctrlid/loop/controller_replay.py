@@ -10,11 +10,11 @@ import numpy as np
 from .._base.arrays import Array
 from .._base.errors import CtrlidError, ModelCannotRun
 from ..data.record import Record
-from ..data.several_records import model_and_data
+from ..data.several_records import order_model_and_data
 from .loop import Loop
 
 
-def _controller_run(loop: Loop, y: Array, r: Array | None) -> tuple[Any, Array]:
+def _build_controller_run(loop: Loop, y: Array, r: Array | None) -> tuple[Any, Array]:
     """Return the controller over all samples as a function of its initial state, and its rest."""
     law = loop.law()
     if law is None or law.dt == 0.0:
@@ -35,7 +35,7 @@ def _controller_run(loop: Loop, y: Array, r: Array | None) -> tuple[Any, Array]:
     return casadi.Function("outputs", [start], [outputs.T]), np.array(law.rest, dtype=float)
 
 
-def controller_output(loop: Loop, y: Array, r: Array | None = None) -> Array:
+def run_controller(loop: Loop, y: Array, r: Array | None = None) -> Array:
     """Return what a digital controller, at rest before, computes from a reference and an output.
 
     Parameters
@@ -57,7 +57,7 @@ def controller_output(loop: Loop, y: Array, r: Array | None = None) -> Array:
     CtrlidError
         If the loop has no controller, or an analog one.
     """
-    run, rest = _controller_run(loop, y, r)
+    run, rest = _build_controller_run(loop, y, r)
     return np.asarray(run(rest), float).ravel()
 
 
@@ -94,7 +94,7 @@ def replay_controller(loop: Loop, record: Record) -> Array:
     >>> bool(abs(cid.replay_controller(loop, record) - record.u).max() < 1e-12)
     True
     """
-    return replay_from_best_state(*model_and_data(loop, record))[0]
+    return replay_from_best_state(*order_model_and_data(loop, record))[0]
 
 
 def replay_from_best_state(loop: Loop, record: Record) -> tuple[Array, Array]:
@@ -103,41 +103,43 @@ def replay_from_best_state(loop: Loop, record: Record) -> tuple[Array, Array]:
         raise CtrlidError(f"the loop is sampled at {loop.dt:g} s, the record at {record.dt:g} s")
     if record.r is None:
         raise ModelCannotRun("the record has no reference r, which the controller needs")
-    run, start = _controller_run(loop, record.y, record.r)
-    replayed, best = _compare(run, start, record)
+    run, start = _build_controller_run(loop, record.y, record.r)
+    replayed, best = _compare_inputs(run, start, record)
     if start.size and np.isfinite(loop.input_limits).any():
         # From the wrong state all may be cut off, and the state is then nowhere to be seen.
         unlimited = replace(loop, input_limits=(-math.inf, math.inf))
         inside = (record.u > loop.input_limits[0]) & (record.u < loop.input_limits[1])
-        free, _ = _controller_run(unlimited, record.y, record.r)
-        moved = _step(free, _slope(free, start.size), start, record.u, inside)
-        trial, cost = _compare(run, moved, record)
+        free, _ = _build_controller_run(unlimited, record.y, record.r)
+        moved = _take_gauss_newton_step(
+            free, _differentiate_outputs(free, start.size), start, record.u, inside
+        )
+        trial, cost = _compare_inputs(run, moved, record)
         if cost < best:
             start, replayed, best = moved, trial, cost
     # Gauss-Newton: one step where the law is linear in its state, a few more around limits.
-    slope, every = _slope(run, start.size), np.full(len(record), True)
+    slope, every = _differentiate_outputs(run, start.size), np.full(len(record), True)
     for _ in range(10 if start.size else 0):
-        moved = _step(run, slope, start, record.u, every)
-        trial, cost = _compare(run, moved, record)
+        moved = _take_gauss_newton_step(run, slope, start, record.u, every)
+        trial, cost = _compare_inputs(run, moved, record)
         if not cost < best:
             break
         start, replayed, best = moved, trial, cost
     return replayed, start
 
 
-def _compare(run: Any, start: Array, record: Record) -> tuple[Array, float]:
+def _compare_inputs(run: Any, start: Array, record: Record) -> tuple[Array, float]:
     """Return what a controller computes from a state, and how far the logged input is from it."""
     replayed = np.asarray(run(start), float).ravel()
     return replayed, float(np.sum((replayed - record.u) ** 2))
 
 
-def _slope(run: Any, size: int) -> Any:
+def _differentiate_outputs(run: Any, size: int) -> Any:
     """Return how the outputs of a controller depend on its initial state, as a function of it."""
     state = casadi.MX.sym("state", size)
     return casadi.Function("slope", [state], [casadi.jacobian(run(state), state)])
 
 
-def _step(run: Any, slope: Any, start: Array, u: Array, use: Any) -> Array:
+def _take_gauss_newton_step(run: Any, slope: Any, start: Array, u: Array, use: Any) -> Array:
     """Return a state by one Gauss-Newton step towards a logged input, on the samples to use."""
     jacobian = np.asarray(slope(start).full(), float)
     left = u - np.asarray(run(start), float).ravel()

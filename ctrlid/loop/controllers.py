@@ -1,8 +1,9 @@
 """Controllers as real loops have them, and their laws as equations.
 
 `PID` is the sampled controller of practice; transfer functions, state-space systems and
-python-control functions are taken as they are. `control_law` turns any of them into one form: a
-state, a rule for its next value (or its rate) and the input it applies, in absolute physical units.
+python-control functions are taken as they are. `make_control_law` turns any of them into one form:
+a state, a rule for its next value (or its rate) and the input it applies, in absolute physical
+units.
 """
 
 import math
@@ -138,7 +139,7 @@ class ControlLaw:
     apply: Callable[[Any, Any, Any, Any], tuple[Any, Any]]
 
 
-def control_law(controller: Any, at: OperatingPoint, dt: float) -> ControlLaw:
+def make_control_law(controller: Any, at: OperatingPoint, dt: float) -> ControlLaw:
     """Return the law of a controller in absolute physical units.
 
     A linear controller of one input acts as ``u = at.input + C(r - y)``, one of two inputs as
@@ -166,7 +167,7 @@ def control_law(controller: Any, at: OperatingPoint, dt: float) -> ControlLaw:
         loop, or is improper.
     """
     if isinstance(controller, PID):
-        return _pid_law(controller, at, dt)
+        return _make_pid_law(controller, at, dt)
     if isinstance(controller, int | float | np.number):
         controller = ct.tf([float(controller)], [1.0])
     if not isinstance(controller, ct.TransferFunction | ct.NonlinearIOSystem):
@@ -190,8 +191,8 @@ def control_law(controller: Any, at: OperatingPoint, dt: float) -> ControlLaw:
             _require_proper(controller)
         a, b, c, d = to_state_matrices(controller)
         b, d = (m[:, order] if controller.ninputs == 2 else m for m in (b, d))
-        return _linear_law(a, b, c, d, at, dt if sampled else 0.0)
-    return _traced_law(controller, at, dt if sampled else 0.0, order)
+        return _make_linear_law(a, b, c, d, at, dt if sampled else 0.0)
+    return _make_traced_law(controller, at, dt if sampled else 0.0, order)
 
 
 def _require_proper(controller: Any) -> None:
@@ -203,7 +204,7 @@ def _require_proper(controller: Any) -> None:
             )
 
 
-def _linear_law(a: Any, b: Any, c: Any, d: Any, at: OperatingPoint, dt: float) -> ControlLaw:
+def _make_linear_law(a: Any, b: Any, c: Any, d: Any, at: OperatingPoint, dt: float) -> ControlLaw:
     a, b, c, d = (casadi.sparsify(casadi.DM(np.atleast_2d(m))) for m in (a, b, c, d))
 
     def apply(t: Any, x: Any, r: Any, y: Any) -> tuple[Any, Any]:
@@ -218,7 +219,7 @@ def _linear_law(a: Any, b: Any, c: Any, d: Any, at: OperatingPoint, dt: float) -
     return ControlLaw(dt, (0.0,) * a.shape[0], apply)
 
 
-def _traced_law(
+def _make_traced_law(
     controller: Any, at: OperatingPoint, dt: float, order: tuple[int, int]
 ) -> ControlLaw:  # fmt: skip
     equations = trace(controller)
@@ -232,7 +233,7 @@ def _traced_law(
     return ControlLaw(dt, (0.0,) * len(equations.states), apply)
 
 
-def _pid_law(pid: PID, at: OperatingPoint, dt: float) -> ControlLaw:
+def _make_pid_law(pid: PID, at: OperatingPoint, dt: float) -> ControlLaw:
     bias = at.input if pid.bias is None else pid.bias
     c = 0.0 if pid.derivative == "measurement" else pid.c
 

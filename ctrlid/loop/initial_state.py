@@ -9,8 +9,8 @@ from scipy import optimize
 from .._base.arrays import Array
 from .._base.errors import ModelCannotRun
 from ..data.record import Record
-from ..effects.context import motion
-from ..physics.linearization import state_matrices
+from ..effects.context import find_motion
+from ..physics.linearization import compute_state_matrices
 from .simulation import Simulator
 
 # The initial velocity is at most so many standard deviations of the measured velocity.
@@ -23,7 +23,7 @@ FEW = 8
 NARROW = 1e-6
 
 
-def best_start(
+def find_initial_state(
     simulator: Simulator, part: Record, r: Any, d: Array, guess: Array, fitted: int
 ) -> Array:
     """Return the initial state whose first entries fit the first samples best.
@@ -54,26 +54,26 @@ def best_start(
     e = simulator.loop.equations()
     for j in e.velocities:
         scale[j] = max(float(np.std(np.diff(part.y))) / part.dt, 1e-300)
-    seen = _as_measured(simulator, part, guess)
-    low, high = _limits(simulator, part, seen)
-    for lag in _following(simulator, fitted):
+    seen = _set_measured_state(simulator, part, guess)
+    low, high = _bound_initial_state(simulator, part, seen)
+    for lag in _find_input_lags(simulator, fitted):
         scale[lag] = max(float(np.std(part.u)), 1e-300)
 
-    def misfit(z: Array, count: int) -> Array | None:
+    def compute_misfit(z: Array, count: int) -> Array | None:
         try:
             y = simulator.run(z, None if r is None else r[:count], d[:count])[0]
         except ModelCannotRun:
             return None
         return np.asarray((y - part.y[:count]) / spread, dtype=float)
 
-    def moved(start: Array, point: Array) -> Array:
+    def move_state(start: Array, point: Array) -> Array:
         z = start.copy()
         z[:fitted] += scale * (point - 1)
         return z
 
-    def nearby(start: Array, count: int) -> Array:
+    def search_nearby(start: Array, count: int) -> Array:
         def residual(point: Array) -> Array:
-            found = misfit(moved(start, point), count)
+            found = compute_misfit(move_state(start, point), count)
             return np.full(count, 1e3) if found is None else found
 
         # Bounds keep an absurd start from standing in for a force that acts from the first sample
@@ -85,44 +85,44 @@ def best_start(
             residual, np.clip(np.ones(fitted), lower + NARROW, upper - NARROW),
             bounds=(lower, upper), diff_step=[1e-4], max_nfev=20,
         )  # fmt: skip
-        return moved(start, best.x)
+        return move_state(start, best.x)
 
     # From rest a short search does not find a start that is far away.
     count = min(len(part), 400)
-    there, here = misfit(seen, count), misfit(guess, count)
+    there, here = compute_misfit(seen, count), compute_misfit(guess, count)
     if there is None and here is None:
         # From a rough start an unstable plant diverges soon, so that few samples are fitted first.
         for few in (10, 30, 100):
-            seen = nearby(seen, min(few, count))
-        return nearby(seen, count)
+            seen = search_nearby(seen, min(few, count))
+        return search_nearby(seen, count)
     if there is not None and (here is None or there @ there < here @ here):
         guess = seen
-    return nearby(guess, count)
+    return search_nearby(guess, count)
 
 
-def _as_measured(simulator: Simulator, part: Record, guess: Array) -> Array:
+def _set_measured_state(simulator: Simulator, part: Record, guess: Array) -> Array:
     """Return a guess moved to where the first samples see the plant, and how fast."""
     loop, start = simulator.loop, guess.copy()
     e = loop.equations()
     n = len(e.states)
     few = min(len(part), FEW)
     slope, first = np.polyfit(np.arange(few) * part.dt, part.y[:few], 1)
-    c = _seen(simulator)
+    c = _differentiate_output(simulator)
     off = first - float(e.evaluate(guess[:n], loop.point.input, 0.0)[1][0])
     seen = np.array([0.0 if j in e.velocities else c[j] for j in range(n)])
     if seen.any():
         start[:n] += seen * off / (seen @ seen)
-    moving = motion(e)
+    moving = find_motion(e)
     if moving is not None and c[moving[0]]:
         start[moving[1]] = slope / c[moving[0]]
     return start
 
 
-def _limits(simulator: Simulator, part: Record, seen: Array) -> tuple[Array, Array]:
+def _bound_initial_state(simulator: Simulator, part: Record, seen: Array) -> tuple[Array, Array]:
     """Return between what values the state of the plant may start, around where it is seen."""
     e = simulator.loop.equations()
     low, high = np.full(len(seen), -np.inf), np.full(len(seen), np.inf)
-    moving, c = motion(e), _seen(simulator)
+    moving, c = find_motion(e), _differentiate_output(simulator)
     if moving is not None and c[moving[0]]:
         where, speed = moving
         steps = np.diff(part.y)
@@ -131,18 +131,18 @@ def _limits(simulator: Simulator, part: Record, seen: Array) -> tuple[Array, Arr
         if not casadi.depends_on(casadi.jacobian(e.output, e.x), e.x):
             off = NEAR * float(np.abs(steps[:FEW]).max()) / abs(c[where])
             low[where], high[where] = seen[where] - off, seen[where] + off
-    for lag in _following(simulator, len(seen)):
+    for lag in _find_input_lags(simulator, len(seen)):
         low[lag], high[lag] = float(part.u.min()), float(part.u.max())
     return low, high
 
 
-def _following(simulator: Simulator, fitted: int) -> list[int]:
+def _find_input_lags(simulator: Simulator, fitted: int) -> list[int]:
     """Return the states that are lags of the input."""
     e = simulator.loop.equations()
     return [x.state for x in e.lags if x.state < fitted and casadi.is_equal(x.target, e.u, 2)]
 
 
-def _seen(simulator: Simulator) -> Array:
+def _differentiate_output(simulator: Simulator) -> Array:
     """Return how the output depends on the states, at rest."""
     loop = simulator.loop
-    return np.asarray(state_matrices(loop.equations(), loop.point, spread=1e6)[2][0])
+    return np.asarray(compute_state_matrices(loop.equations(), loop.point, spread=1e6)[2][0])

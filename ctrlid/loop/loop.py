@@ -12,12 +12,12 @@ import numpy as np
 
 from .._base.errors import CtrlidError, EffectDoesNotApply
 from ..effects import AbstractEffect
-from ..effects.composition import compose, labels
-from ..effects.python_control import as_system, linear_model
+from ..effects.composition import compose_effects, label_effects
+from ..effects.python_control import as_system, linearize_with_effects
 from ..physics.equations import Equations, require_siso
 from ..physics.linearization import OperatingPoint, linearize
 from ..physics.trace import trace, with_parameters
-from .controllers import ControlLaw, control_law
+from .controllers import ControlLaw, make_control_law
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,13 +108,13 @@ class Loop:
         object.__setattr__(self, "dt", float(self.dt))
         object.__setattr__(self, "at", at)
         object.__setattr__(self, "input_limits", (lower, upper))
-        self._settle()
+        self._apply_effects()
         law = self.law()
         if law and law.dt == 0.0 and equations.dt:
             raise CtrlidError("an analog controller cannot act on a plant in discrete time; give "
                               "the plant in continuous time or sample the controller")  # fmt: skip
 
-    def _settle(self) -> None:
+    def _apply_effects(self) -> None:
         """Put the effects into the equations and see that the free parameters exist."""
         effects = (self.effects,) if isinstance(self.effects, AbstractEffect) else self.effects
         effects = tuple(effects)
@@ -125,11 +125,13 @@ class Loop:
                 f"CoulombFriction(fc=0.1); given {strangers[0]!r}"
             )
         object.__setattr__(self, "effects", effects)
-        plant, at = self._absolute(), self._bare_point
-        kept = compose(plant, self.labelled, at, self.dt)
+        plant, at = self._shift_to_absolute(), self._bare_point
+        kept = compose_effects(plant, self.labelled, at, self.dt)
         active = {label: e for label, e in self.labelled.items() if not e.neutral}
         object.__setattr__(self, "_kept", kept)
-        changed = kept if len(active) == len(effects) else compose(plant, active, at, self.dt)
+        changed = (
+            kept if len(active) == len(effects) else compose_effects(plant, active, at, self.dt)
+        )
         object.__setattr__(self, "_active", changed)
         free = (self.free,) if isinstance(self.free, str) else tuple(dict.fromkeys(self.free))
         unknown = [name for name in free if name not in kept.parameters]
@@ -156,7 +158,7 @@ class Loop:
     @property
     def labelled(self) -> dict[str, AbstractEffect]:
         """The effects by name: that of the class, numbered from the second of a class on."""
-        return labels(self.effects)
+        return label_effects(self.effects)
 
     @property
     def parameters(self) -> dict[str, float]:
@@ -179,7 +181,7 @@ class Loop:
         """
         return self._kept if keep else self._active
 
-    def _absolute(self) -> Equations:
+    def _shift_to_absolute(self) -> Equations:
         e = self._traced
         if not self.linear_plant:
             return e
@@ -227,7 +229,7 @@ class Loop:
         >>> loop.with_effect(cid.effects.CoulombFriction(fc=0.2)).parameters
         {'m': 2.0, 'c': 1.0, 'k': 3.0, 'CoulombFriction.fc': 0.2}
         """
-        return self._revised(effects=(*self.effects, effect))
+        return self._replace_fields(effects=(*self.effects, effect))
 
     def without_effect(self, effect: str | AbstractEffect) -> "Loop":
         """Return the loop without one of its effects.
@@ -254,7 +256,7 @@ class Loop:
             raise CtrlidError(f"the loop has no effect {effect}; it has {list(known) or 'none'}")
         rest = tuple(e for key, e in known.items() if key != label)
         free = tuple(name for name in self.free if not name.startswith(f"{label}."))
-        return self._revised(effects=rest, free=free)
+        return self._replace_fields(effects=rest, free=free)
 
     def with_parameters(self, values: Mapping[str, float]) -> "Loop":
         """Return the loop with other values of plant or effect parameters.
@@ -289,18 +291,18 @@ class Loop:
             for label, e in self.labelled.items()
         ]  # fmt: skip
         if not of_plant:
-            return self._revised(effects=tuple(effects))
+            return self._replace_fields(effects=tuple(effects))
         traced = replace(self._traced, parameters={**self._traced.parameters, **of_plant})
-        return self._revised(
+        return self._replace_fields(
             plant=with_parameters(self.plant, of_plant), _traced=traced, effects=tuple(effects)
         )
 
-    def _revised(self, **changes: Any) -> "Loop":
+    def _replace_fields(self, **changes: Any) -> "Loop":
         """Return a copy with other fields, without tracing the plant again."""
         new = copy.copy(self)
         for name, value in changes.items():
             object.__setattr__(new, name, value)
-        new._settle()
+        new._apply_effects()
         return new
 
     def law(self) -> ControlLaw | None:
@@ -308,7 +310,7 @@ class Loop:
         if self.controller is None:
             return None
         assert self.at is not None
-        return control_law(self.controller, self.at, self.dt)
+        return make_control_law(self.controller, self.at, self.dt)
 
     @property
     def analog(self) -> bool:
@@ -359,7 +361,7 @@ class Loop:
             if isinstance(self.plant, ct.TransferFunction):
                 return self.plant
             return linearize(self.plant, self.point)
-        return linear_model(self._absolute(), active, self._bare_point, self.dt)
+        return linearize_with_effects(self._shift_to_absolute(), active, self._bare_point, self.dt)
 
     def __repr__(self) -> str:
         e = self._traced

@@ -12,7 +12,7 @@ import numpy as np
 from .._base.arrays import Array
 from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from ..physics.equations import Equations
-from ..physics.integration import Piece, Scheme, advance, input_pieces, integrate, whole_delay
+from ..physics.integration import Piece, Scheme, advance, count_delay_samples, cut_input, integrate
 from .loop import Loop
 
 
@@ -53,19 +53,19 @@ def make_period_map(loop: Loop, substeps: int) -> PeriodMap:
     """
     e, law = loop.equations(), loop.law()
     n, nc = len(e.states), len(law.rest) if law else 0
-    late = whole_delay(e, loop.dt)
+    late = count_delay_samples(e, loop.dt)
     # What the input remembers: the backlash, then the inputs of the last samples.
     kept = 0 if e.delay is None else late + 1
     size = n + nc + (e.play is not None) + kept
     z, w = casadi.SX.sym("z", size), casadi.SX.sym("w", 5)
     t0, r, d, sensor, force = casadi.vertsplit(w)
-    kick = casadi.SX.zeros(n, 1)
+    held_rate = casadi.SX.zeros(n, 1)
     for j in e.velocities or (range(n) if e.dt == 0 else ()):
-        kick[j] = force
+        held_rate[j] = force
     at, (lower, upper) = loop.point, loop.input_limits
     p = e.values
 
-    def act(t: Any, z: Any, y: Any) -> tuple[Any, Any]:
+    def compute_input(t: Any, z: Any, y: Any) -> tuple[Any, Any]:
         wish, moved = law.apply(t, z[n:], r, y) if law else (at.input, casadi.SX(0, 1))
         u = wish + d
         if math.isfinite(lower):
@@ -74,15 +74,15 @@ def make_period_map(loop: Loop, substeps: int) -> PeriodMap:
             u = casadi.fmin(u, upper)
         return u, moved
 
-    def measured(t: Any, z: Any, u: Any) -> Any:
+    def measure_output(t: Any, z: Any, u: Any) -> Any:
         y = e.function(t, z[:n], u, p)[1] + sensor
         return y if e.reader is None else e.reader(y, p)
 
     slope = None
-    y = measured(t0, z, at.input)
-    u, moved = act(t0, z[: n + nc], y)
+    y = measure_output(t0, z, at.input)
+    u, moved = compute_input(t0, z[: n + nc], y)
     if law is None:
-        y = measured(t0, z, u)
+        y = measure_output(t0, z, u)
     if loop.analog:
         if kept or e.play is not None:
             raise EffectDoesNotApply(
@@ -93,8 +93,8 @@ def make_period_map(loop: Loop, substeps: int) -> PeriodMap:
 
         # The reference jumps only at the samples, so that the motion within a period is smooth.
         def rate(tau: Any, z: Any) -> Any:
-            u, charge = act(t0 + tau, z, measured(t0 + tau, z, at.input))
-            return casadi.vertcat(e.function(t0 + tau, z[:n], u, p)[0] + kick, charge)
+            u, charge = compute_input(t0 + tau, z, measure_output(t0 + tau, z, at.input))
+            return casadi.vertcat(e.function(t0 + tau, z[:n], u, p)[0] + held_rate, charge)
 
         slope = casadi.Function("rate", [z, w], [rate(0.0, z)])
         after, error = integrate(rate, z, loop.dt, substeps)
@@ -102,21 +102,21 @@ def make_period_map(loop: Loop, substeps: int) -> PeriodMap:
         applied, memory = apply_backlash(e, z[n + nc] if e.play is not None else None, u, p)
         past = [z[k] for k in range(size - kept, size)]
         path = (past[kept - 1] if kept else applied, past[late - 1] if late else applied, applied)
-        pieces = _numbers(e, input_pieces(e, loop.dt, path, "zoh"), p)
+        pieces = _insert_values(e, cut_input(e, loop.dt, path, "zoh"), p)
         scheme = Scheme(8, substeps, sharp=(8, substeps))
-        x, error = advance(e, t0, z[:n], pieces, p, None, kick, scheme=scheme)
+        x, error = advance(e, t0, z[:n], pieces, p, None, held_rate, scheme=scheme)
         after = casadi.vertcat(x, moved, memory)
         if kept:
             after = casadi.vertcat(after, applied, *past[: kept - 1])
         error = casadi.vertcat(error, casadi.SX.zeros(size - n, 1))
     rest = [*at.states, *(law.rest if law else ())]
-    settled, memory = at.input, []
+    input_at_rest, memory = at.input, []
     if e.play is not None:
         start = casadi.substitute(casadi.vertcat(e.play.start), casadi.vertcat(e.play.u, e.p),
                                   casadi.vertcat(at.input, p))  # fmt: skip
         memory = [float(casadi.evalf(start))]
-        settled = float(casadi.evalf(casadi.SX(apply_backlash(e, memory[0], at.input, p)[0])))
-    rest += [*memory, *([settled] * kept)]
+        input_at_rest = float(casadi.evalf(casadi.SX(apply_backlash(e, memory[0], at.input, p)[0])))
+    rest += [*memory, *([input_at_rest] * kept)]
     step = casadi.Function("step", [z, w], [after, y, u, error])
     return PeriodMap(e.states, tuple(rest), step, slope)
 
@@ -132,7 +132,7 @@ def apply_backlash(e: Equations, m: Any, u: Any, p: Any) -> tuple[Any, Any]:
     return both[0], both[1]
 
 
-def _numbers(e: Equations, pieces: Sequence[Piece], p: Any) -> list[Piece]:
+def _insert_values(e: Equations, pieces: Sequence[Piece], p: Any) -> list[Piece]:
     """Put parameter values into the durations of pieces."""
     values = casadi.SX(casadi.DM(p))
     return [
@@ -141,7 +141,7 @@ def _numbers(e: Equations, pieces: Sequence[Piece], p: Any) -> list[Piece]:
     ]
 
 
-def sensitivity(s: PeriodMap, reference: float, function: Any) -> tuple[Array, Array]:
+def linearize_at_rest(s: PeriodMap, reference: float, function: Any) -> tuple[Array, Array]:
     """Return the derivatives of a function (step, rate) by state and signals at rest."""
     z, w = casadi.SX.sym("z", len(s.rest)), casadi.SX.sym("w", 5)
     first = function.call([z, w])[0]
@@ -150,7 +150,7 @@ def sensitivity(s: PeriodMap, reference: float, function: Any) -> tuple[Array, A
     return np.asarray(a, float), np.asarray(b, float)
 
 
-def growth_rate(loop: Loop) -> float:
+def compute_growth_rate(loop: Loop) -> float:
     r"""Return the growth rate of small deviations in the closed loop [1/s].
 
     .. math:: \max_i \ln|\lambda_i| / T
@@ -175,7 +175,7 @@ def growth_rate(loop: Loop) -> float:
     """
     s = make_period_map(loop, 8)
     function = s.step if s.rate is None else s.rate
-    matrix, _ = sensitivity(s, loop.point.output, function)
+    matrix, _ = linearize_at_rest(s, loop.point.output, function)
     if not np.isfinite(matrix).all():
         raise ModelCannotRun(
             f"{loop.equations().name} has no derivative at its operating point {loop.point}; "
@@ -192,4 +192,4 @@ def growth_rate(loop: Loop) -> float:
 @functools.lru_cache(maxsize=32)
 def comes_to_rest(loop: Loop) -> bool:
     """Whether small deviations die out in a loop; without a controller, in the plant itself."""
-    return growth_rate(loop) < -1e-6 / loop.dt
+    return compute_growth_rate(loop) < -1e-6 / loop.dt

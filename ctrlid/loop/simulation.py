@@ -11,7 +11,7 @@ from .._base.arrays import Array
 from .._base.errors import CtrlidError, CtrlidWarning, ModelCannotRun
 from ..data.record import Record
 from .loop import Loop
-from .period_map import growth_rate, make_period_map, sensitivity
+from .period_map import compute_growth_rate, linearize_at_rest, make_period_map
 
 # Steps are refined until their local error is below this share of each state's excursion.
 TOLERANCE = 1e-9
@@ -96,8 +96,8 @@ def simulate(
         raise CtrlidError(
             f"simulate needs a Loop(plant, controller, dt=..., at=...); given {type(loop).__name__}"
         )
-    r, d = _signals(loop, r, d)
-    noise = _noise(loop, d.size, sensor_noise, force_noise, seed)
+    r, d = _check_signals(loop, r, d)
+    noise = _draw_noise(loop, d.size, sensor_noise, force_noise, seed)
     simulator = Simulator(loop)
     y, u = simulator.run(simulator.start(initial), r, d, noise)
     e = loop.equations()
@@ -111,7 +111,7 @@ def simulate(
     )  # fmt: skip
 
 
-def _signals(loop: Loop, r: Any, d: Any) -> tuple[Array | None, Array]:
+def _check_signals(loop: Loop, r: Any, d: Any) -> tuple[Array | None, Array]:
     arrays = {}
     for name, value in (("r", r), ("d", d)):
         if value is None:
@@ -140,7 +140,7 @@ def _signals(loop: Loop, r: Any, d: Any) -> tuple[Array | None, Array]:
     return arrays.get("r"), arrays.get("d", np.zeros(size))
 
 
-def _noise(loop: Loop, n: int, sensor: float, force: float, seed: int | None) -> list[Array]:
+def _draw_noise(loop: Loop, n: int, sensor: float, force: float, seed: int | None) -> list[Array]:
     for name, value in (("sensor_noise", sensor), ("force_noise", force)):
         number = isinstance(value, int | float | np.number)
         if not (number and np.isfinite(value) and value >= 0):
@@ -184,9 +184,12 @@ class Simulator:
                 "at=operating_point(plant, output=...)"
             )
         # An undamped plant neither grows nor decays; round-off must not decide which.
-        self._unstable = loop.controller is None and growth_rate(loop) * loop.dt > 1e-6
+        self._unstable = loop.controller is None and compute_growth_rate(loop) * loop.dt > 1e-6
         # What a millionth of the operating values does to each state: smaller motion is rest.
-        a, b = (np.nan_to_num(np.abs(m)) for m in sensitivity(first, loop.point.output, first.step))
+        a, b = (
+            np.nan_to_num(np.abs(m))
+            for m in linearize_at_rest(first, loop.point.output, first.step)
+        )
         self._floor = 1e-6 * (a @ np.abs(self.rest) + b[:, 2] * abs(loop.point.input))
 
     def start(self, initial: Sequence[float] | None) -> Array:
@@ -202,7 +205,7 @@ class Simulator:
             z[: given.size] = given
         return z
 
-    def _runner(self, substeps: int, size: int) -> Any:
+    def _build_runner(self, substeps: int, size: int) -> Any:
         key = (substeps, size)
         if key not in self._runners:
             if substeps not in self._steps:
@@ -212,15 +215,15 @@ class Simulator:
 
     def run(
         self, z: Array, r: Array | None, d: Array, noise: Sequence[Array] | None = None,
-        begin: float = 0.0,
+        start_time: float = 0.0,
     ) -> tuple[Array, Array]:  # fmt: skip
-        """Return measured output and applied input, from state `z` and time `begin` on.
+        """Return measured output and applied input, from state `z` and time `start_time` on.
 
         Runs chunk by chunk; the steps of a chunk are halved until its local errors are small.
         """
         loop, n = self.loop, d.size
         quiet = np.zeros(n)
-        w = np.vstack([begin + np.arange(n) * loop.dt, quiet if r is None else r, d,
+        w = np.vstack([start_time + np.arange(n) * loop.dt, quiet if r is None else r, d,
                        *(noise or (quiet, quiet))])  # fmt: skip
         y, u = np.empty(n), np.empty(n)
         start, reach = z, self._floor
@@ -232,9 +235,9 @@ class Simulator:
             block = w[:, np.minimum(np.arange(first, first + size), n - 1)]
             previous_stop: int | None = None
             while True:
-                results = self._runner(substeps, size)(z, block)
+                results = self._build_runner(substeps, size)(z, block)
                 states, ys, us, errors = (np.asarray(a, float)[:, :count] for a in results)
-                stop = _first_bad(loop, self._unstable, states, ys, us, w)
+                stop = _find_first_bad(loop, self._unstable, states, ys, us, w)
                 good = count if stop is None else max(stop - 1, 0)
                 travel = np.max(np.abs(states[:, :good] - start[:, None]), axis=1, initial=0.0)
                 moved = np.maximum(reach, travel)
@@ -253,7 +256,7 @@ class Simulator:
                 inside = bool(np.isfinite(states[:, stop]).all())
                 growth, until = _known_growth(loop), slice(stop + 1)
                 stopped = SimulationStopped(
-                    _why_left(loop, growth, first + stop, inside, ys[:, until], us[:, until], w)
+                    _explain_stop(loop, growth, first + stop, inside, ys[:, until], us[:, until], w)
                 )
                 stopped.unstable = growth > 0
                 stopped.y = np.concatenate([y[:first], ys[0, :stop]])
@@ -274,7 +277,7 @@ class Simulator:
         return y, u
 
 
-def _first_bad(
+def _find_first_bad(
     loop: Loop, unstable: bool, states: Array, ys: Array, us: Array, w: Array
 ) -> int | None:
     """Index of the first sample at which the loop is no longer where it can be."""
@@ -292,12 +295,12 @@ def _first_bad(
 def _known_growth(loop: Loop) -> float:
     """Return how fast small deviations grow [1/s]; NaN where the loop has no derivative."""
     try:
-        return growth_rate(loop)
+        return compute_growth_rate(loop)
     except ModelCannotRun:
         return math.nan
 
 
-def _why_left(
+def _explain_stop(
     loop: Loop, growth: float, at: int, inside: bool, ys: Array, us: Array, w: Array
 ) -> str:
     """Say when and why a simulation broke off."""

@@ -14,8 +14,8 @@ import numpy as np
 
 from .._base.arrays import Array
 from .._base.errors import CtrlidError
-from .._base.jobs import processors, side_by_side
-from .interpreter import BINARY, UNARY, sweep
+from .._base.jobs import count_processors, run_side_by_side
+from .interpreter import BINARY, UNARY, run_programs
 
 # A block of so many samples is long enough to hide the cost of its loop and fits into the cache.
 BLOCK = 512
@@ -45,7 +45,7 @@ class BlockEvaluation:
         ends = np.cumsum([0, *(rows * columns for rows, columns in shapes)])
         self.tables = np.array([(at, *s) for at, s in zip(ends, shapes, strict=False)])
         self.rows_out = int(ends[-1])
-        steps, self.constants = _instructions(function)
+        steps, self.constants = _list_instructions(function)
         self.program, self.registers = _allocate_registers(steps)
 
     def __call__(self, *arguments: Any) -> list[Array]:
@@ -59,7 +59,7 @@ class BlockEvaluation:
         return evaluate_blocks([self], [], arguments)
 
 
-def _instructions(function: Any) -> tuple[Any, Array]:
+def _list_instructions(function: Any) -> tuple[Any, Array]:
     """Return the instructions of a function as CasADi has them, and its numbers.
 
     Each as operation, register of the result, operands; for inputs, outputs and constants the row
@@ -177,30 +177,44 @@ def evaluate_blocks(
     still = np.array([row[0] for row in rows] + ([] if alone else [0.0]))
     moving = [k for k, row in enumerate(rows) if len(row) > 1]
     again = sum(len(t) for t in tables[: len(carried)])
-    program, starts, constants = _join(stages)
+    program, starts, constants = _join_programs(stages)
     room, places = max(s.registers for s in stages), np.array(moving, dtype=np.int64)
     last = stages[-1]
     out = np.empty(n * last.rows_out)
     blocks = -(-n // BLOCK)
-    stretch = BLOCK * min(-(-blocks // processors()), BLOCKS)
+    stretch = BLOCK * min(-(-blocks // count_processors()), BLOCKS)
 
     def work(first: int) -> None:
         columns = [rows[k][first : first + stretch] for k in moving]
         values = np.array(columns).reshape(len(moving), min(stretch, n - first))
-        sweep(program, starts, constants, parts, again, still, places, values, room, last.tables,
-              out, n, first, min(n, BLOCK))  # fmt: skip
+        run_programs(
+            program,
+            starts,
+            constants,
+            parts,
+            again,
+            still,
+            places,
+            values,
+            room,
+            last.tables,
+            out,
+            n,
+            first,
+            min(n, BLOCK),
+        )
 
     firsts = range(0, n, stretch)
     if len(firsts) == 1:
         work(0)
     else:
-        side_by_side(work, firsts)
+        run_side_by_side(work, firsts)
     return [
         out[n * at : n * (at + r * c)].reshape(n, r, c) for at, r, c in last.tables.tolist()
     ]  # fmt: skip
 
 
-def _join(stages: Sequence[BlockEvaluation]) -> tuple[Any, Any, Array]:
+def _join_programs(stages: Sequence[BlockEvaluation]) -> tuple[Any, Any, Array]:
     """Return the programs one below the other, where each begins, and all their numbers."""
     programs, count = [], 0
     for stage in stages:

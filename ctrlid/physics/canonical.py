@@ -7,7 +7,7 @@ import control as ct
 import numpy as np
 
 
-def coefficients(system: Any) -> dict[str, float]:
+def list_coefficients(system: Any) -> dict[str, float]:
     """Return the coefficients of a transfer function with a monic denominator.
 
     ``a1 ... an`` follow the leading one in falling powers; ``b1, b2, ...`` are those of the
@@ -37,12 +37,12 @@ def coefficients(system: Any) -> dict[str, float]:
     }
 
 
-def order(names: Sequence[str]) -> int:
+def count_poles(names: Sequence[str]) -> int:
     """Return the number of poles behind the names of the coefficients."""
     return sum(name.startswith("a") for name in names)
 
 
-def state_equations(
+def make_state_equations(
     values: Mapping[str, Any], x: Sequence[Any], u: Any, continuous: bool
 ) -> tuple[list[Any], Any]:
     r"""Return the rates (or next values) of the states, and the output.
@@ -85,7 +85,7 @@ def state_equations(
     return [after[k] - a[k] * y + b[k + 1] * u for k in range(n)], y
 
 
-def rebuilt(system: Any, values: Mapping[str, float]) -> Any:
+def replace_coefficients(system: Any, values: Mapping[str, float]) -> Any:
     """Return a transfer function with other coefficients.
 
     Parameters
@@ -100,7 +100,7 @@ def rebuilt(system: Any, values: Mapping[str, float]) -> Any:
     control.TransferFunction
         With a monic denominator, and the names and sampling period of the original.
     """
-    new = {**coefficients(system), **values}
+    new = {**list_coefficients(system), **values}
     a = [value for name, value in new.items() if name.startswith("a")]
     b = [value for name, value in new.items() if name.startswith("b")]
     return ct.tf(b, [1.0, *a], system.dt, name=system.name, inputs=system.input_labels,

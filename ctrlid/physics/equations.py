@@ -42,32 +42,32 @@ class Backlash:
     reach: Any
 
 
-def _put_away(value: Any, found: list[Any]) -> Any:
+def _pack_value(value: Any, found: list[Any]) -> Any:
     """Return nested values in which each expression is replaced by its place in the list."""
     if isinstance(value, casadi.SX):
         found.append(value)
         return "expression", len(found) - 1
     if isinstance(value, Lag | Backlash):
-        return type(value), [_put_away(v, found) for v in vars(value).values()]
+        return type(value), [_pack_value(v, found) for v in vars(value).values()]
     if isinstance(value, tuple):
-        return "tuple", [_put_away(v, found) for v in value]
+        return "tuple", [_pack_value(v, found) for v in value]
     return "value", value
 
 
-def _take_out(packed: Any, found: list[Any]) -> Any:
-    """Return what `_put_away` put away."""
+def _unpack_value(packed: Any, found: list[Any]) -> Any:
+    """Return what `_pack_value` put away."""
     kind, content = packed
     if kind == "expression":
         return found[content]
     if kind == "value":
         return content
-    parts = [_take_out(part, found) for part in content]
+    parts = [_unpack_value(part, found) for part in content]
     return tuple(parts) if kind == "tuple" else kind(*parts)
 
 
-def _unpacked(fields: list[Any], package: str) -> "Equations":
+def _rebuild_equations(fields: list[Any], package: str) -> "Equations":
     found = casadi.StringDeserializer(package).unpack()
-    return Equations(*(_take_out(field, found) for field in fields))
+    return Equations(*(_unpack_value(field, found) for field in fields))
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,10 +108,10 @@ class Equations:
         # CasADi pickles no expression alone: all go into one package, which keeps the symbols that
         # they share.
         found: list[Any] = []
-        fields = [_put_away(getattr(self, name), found) for name in self.__dataclass_fields__]
+        fields = [_pack_value(getattr(self, name), found) for name in self.__dataclass_fields__]
         package = casadi.StringSerializer()
         package.pack(found)
-        return _unpacked, (fields, package.encode())
+        return _rebuild_equations, (fields, package.encode())
 
     @property
     def values(self) -> Array:

@@ -80,7 +80,7 @@ def integrate(rate: Any, z: Any, dt: Any, substeps: int) -> tuple[Any, Any]:
         return [z + h * total, error]
 
     worst = casadi.SX.zeros(z.shape[0], 1)
-    step = _repeated(one, z.shape[0], substeps)
+    step = _build_once(one, z.shape[0], substeps)
     for k in range(substeps):
         z, error = step(k * h, z)
         worst = casadi.fmax(worst, error)
@@ -98,13 +98,13 @@ def integrate_fast(rate: Any, z: Any, dt: Any, substeps: int) -> Any:
         fourth = rate(start + h, z + h * third)
         return [z + h / 6 * (first + 2 * second + 2 * third + fourth)]
 
-    step = _repeated(one, z.shape[0], substeps)
+    step = _build_once(one, z.shape[0], substeps)
     for k in range(substeps):
         (z,) = step(k * h, z)
     return z
 
 
-def _repeated(one: Any, size: int, count: int) -> Any:
+def _build_once(one: Any, size: int, count: int) -> Any:
     """Return ``one(start, z)`` made ready to be called many times: its expression is built once."""
     if count == 1:
         return one
@@ -117,7 +117,7 @@ def _repeated(one: Any, size: int, count: int) -> Any:
     return lambda start, z: made.call([start, z, *others])
 
 
-def input_pieces(e: Equations, dt: float, path: Sequence[Any], hold: str) -> list[Piece]:
+def cut_input(e: Equations, dt: float, path: Sequence[Any], hold: str) -> list[Piece]:
     r"""Return the input of the plant over one period as straight pieces.
 
     .. math:: u(t - d), \quad d = (l + \varphi) T
@@ -144,46 +144,46 @@ def input_pieces(e: Equations, dt: float, path: Sequence[Any], hold: str) -> lis
     slopes = [(now - before) / dt, (ahead - now) / dt] if hold == "foh" else [0.0, 0.0]
     if e.delay is None:
         return [(dt, now, slopes[1])]
-    late = delay_of(e, e.p) / dt - whole_delay(e, dt)
+    late = substitute_delay(e, e.p) / dt - count_delay_samples(e, dt)
     return [
         (late * dt, before + slopes[0] * (1 - late) * dt, slopes[0]),
         ((1 - late) * dt, now, slopes[1]),
     ]
 
 
-def delay_of(e: Equations, p: Any) -> Any:
+def substitute_delay(e: Equations, p: Any) -> Any:
     """Return the delay of the input [s] for parameter values `p`."""
     return casadi.substitute(casadi.SX(e.delay), e.p, casadi.SX(p))
 
 
-def whole_delay(e: Equations, dt: float) -> int:
+def count_delay_samples(e: Equations, dt: float) -> int:
     """Return by how many whole samples the input comes late, with the parameters as they are."""
     if e.delay is None:
         return 0
-    seconds = float(casadi.evalf(delay_of(e, casadi.DM(e.values))))
+    seconds = float(casadi.evalf(substitute_delay(e, casadi.DM(e.values))))
     # A delay of whole samples belongs to the interval above it: only there can it grow and fall.
     return max(math.floor(seconds / dt + 1e-9), 0)
 
 
-def known_lags(e: Equations) -> tuple[list[Lag], list[Lag]]:
+def find_lags(e: Equations) -> tuple[list[Lag], list[Lag]]:
     """Return the lags that follow the input or a curve of it, and those that only outputs see."""
     driven, seen = [], []
     for lag in e.lags:
         others = casadi.vertcat(*(e.rhs[i] for i in range(len(e.states)) if i != lag.state))
-        if not casadi.depends_on(lag.target, casadi.vertcat(e.t, e.x, *_spreads(e))):
+        if not casadi.depends_on(lag.target, casadi.vertcat(e.t, e.x, *_list_spreads(e))):
             driven.append(lag)
         elif not casadi.depends_on(others, e.x[lag.state]) and not e.dt:
             seen.append(lag)
     return driven, seen
 
 
-def _spreads(e: Equations) -> list[Any]:
+def _list_spreads(e: Equations) -> list[Any]:
     return [] if e.spread is None else [e.spread]
 
 
 def advance(
     e: Equations, t: Any, x: Any, pieces: Sequence[Piece], p: Any, spread: Any = None,
-    kick: Any = None, *, scheme: Scheme,
+    held_rate: Any = None, *, scheme: Scheme,
 ) -> tuple[Any, Any]:  # fmt: skip
     """Return the state of a plant after the pieces of its input, and the local error.
 
@@ -199,12 +199,12 @@ def advance(
     x : expression, shape (states,)
         State at the start.
     pieces : sequence of tuple
-        Duration, input at the start and slope, as `input_pieces` returns them.
+        Duration, input at the start and slope, as `cut_input` returns them.
     p : expression or ndarray
         Parameter values.
     spread : expression, optional
         Standard deviations of the states, which smooth kinks; zero by default.
-    kick : expression, optional
+    held_rate : expression, optional
         Constant added to the rates: a force held over the period.
     scheme : Scheme
         Order and number of the steps.
@@ -218,19 +218,19 @@ def advance(
     """
     n = len(e.states)
     spread = casadi.SX.zeros(n, 1) if spread is None else spread
-    kick = casadi.SX.zeros(n, 1) if kick is None else kick
+    held_rate = casadi.SX.zeros(n, 1) if held_rate is None else held_rate
     worst = casadi.SX.zeros(n, 1)
-    driven, seen = known_lags(e)
+    driven, seen = find_lags(e)
     hidden = [lag.state for lag in (*driven, *seen)]
     if e.dt:
-        return e.smoothed(t, x, pieces[-1][1], p, spread)[0] + kick, worst
+        return e.smoothed(t, x, pieces[-1][1], p, spread)[0] + held_rate, worst
     times = {
         lag.state: casadi.substitute(casadi.SX(lag.time_constant), e.p, casadi.SX(p))
         for lag in e.lags
     }
     short = [times[lag.state] for lag in driven[:1] if scheme.sharp]
-    for sharp, (duration, level, slope) in _split(pieces, short):
-        followed = [_straight(e, lag.target, duration, level, slope, p) for lag in driven]
+    for sharp, (duration, level, slope) in _cut_transients(pieces, short):
+        followed = [_map_piece(e, lag.target, duration, level, slope, p) for lag in driven]
 
         def filled(tau: Any, z: Any, x: Any = x, followed: Any = followed) -> Any:
             z = casadi.SX(z)
@@ -249,7 +249,9 @@ def advance(
             filled: Any = filled,
             t: Any = t,
         ) -> Any:
-            rates = e.smoothed(t + tau, filled(tau, z), level + slope * tau, p, spread)[0] + kick
+            rates = (
+                e.smoothed(t + tau, filled(tau, z), level + slope * tau, p, spread)[0] + held_rate
+            )
             for k in hidden:
                 rates[k] = 0
             return rates
@@ -263,15 +265,15 @@ def advance(
         after = filled(duration, after)
         for lag in seen:
             ends = [
-                _followed(e, lag, t + tau, z, level + slope * tau, p, spread)
+                _evaluate_target(e, lag, t + tau, z, level + slope * tau, p, spread)
                 for tau, z in ((0.0, x), (duration, after))
             ]
-            after[lag.state] = _trail(x[lag.state], times[lag.state], duration, *ends)
+            after[lag.state] = _advance_lag(x[lag.state], times[lag.state], duration, *ends)
         x, t = after, t + duration
     return x, worst
 
 
-def _split(pieces: Sequence[Piece], times: Sequence[Any]) -> list[tuple[bool, Piece]]:
+def _cut_transients(pieces: Sequence[Piece], times: Sequence[Any]) -> list[tuple[bool, Piece]]:
     """Cut pieces where the transient of the first lag is over; say which parts hold one."""
     parts: list[tuple[bool, Piece]] = []
     for duration, level, slope in pieces:
@@ -284,7 +286,7 @@ def _split(pieces: Sequence[Piece], times: Sequence[Any]) -> list[tuple[bool, Pi
     return parts
 
 
-def _straight(
+def _map_piece(
     e: Equations, target: Any, duration: Any, level: Any, slope: Any, p: Any
 ) -> tuple[Any, Any]:
     """Return start and slope of a curve of the input over a piece of it, straight as well."""
@@ -297,15 +299,15 @@ def _straight(
     return first, (curve(level + slope * duration, p) - first) / duration
 
 
-def _followed(e: Equations, lag: Lag, t: Any, x: Any, u: Any, p: Any, spread: Any) -> Any:
+def _evaluate_target(e: Equations, lag: Lag, t: Any, x: Any, u: Any, p: Any, spread: Any) -> Any:
     """Return what a lag follows, and its rate, at one point."""
     velocity = casadi.jtimes(lag.target, e.x, e.rhs) + casadi.jacobian(lag.target, e.t)
-    symbols = [e.t, e.x, e.u, e.p, *_spreads(e)]
+    symbols = [e.t, e.x, e.u, e.p, *_list_spreads(e)]
     function = casadi.Function("followed", symbols, [lag.target, velocity])
     return function(*[t, x, u, p, spread][: len(symbols)])
 
 
-def _trail(start: Any, time: Any, duration: Any, begin: Any, end: Any) -> Any:
+def _advance_lag(start: Any, time: Any, duration: Any, begin: Any, end: Any) -> Any:
     """Advance a lag that follows the cubic through two values and two slopes."""
     a = duration / time
     decay = casadi.exp(-a)

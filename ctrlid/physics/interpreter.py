@@ -26,7 +26,7 @@ BINARY = {
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def run(
+def run_program(
     program: Any, constants: Any, inputs: Any, work: Any, outputs: Any, size: int
 ) -> None:  # pragma: no cover - compiled
     """Carry out a program over the first `size` samples of a block.
@@ -207,7 +207,7 @@ def run(
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def follow(
+def iterate_program(
     program: Any, constants: Any, inputs: Any, work: Any, outputs: Any, signal: Any
 ) -> Any:  # pragma: no cover - compiled
     """Carry out a program once per sample, its result the first input of the next sample.
@@ -215,7 +215,7 @@ def follow(
     Parameters
     ----------
     program, constants, work, outputs
-        As `run` takes them, in blocks of one sample.
+        As `run_program` takes them, in blocks of one sample.
     inputs : ndarray, shape (rows, 1)
         Arguments: the first value of what is carried, room for the signal, and others.
     signal : ndarray, shape (n,)
@@ -230,13 +230,13 @@ def follow(
     carried[0] = inputs[0, 0]
     for k in range(len(signal)):
         inputs[0, 0], inputs[1, 0] = carried[k], signal[k]
-        run(program, constants, inputs, work, outputs, 1)
+        run_program(program, constants, inputs, work, outputs, 1)
         carried[k + 1] = outputs[0, 0]
     return carried
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def sweep(
+def run_programs(
     program: Any,
     starts: Any,
     constants: Any,
@@ -257,7 +257,7 @@ def sweep(
     Parameters
     ----------
     program : ndarray of int, shape (instructions, 4)
-        The programs as `run` takes them, one below the other.
+        The programs as `run_program` takes them, one below the other.
     starts : ndarray of int, shape (programs + 1,)
         Where each begins, and the end.
     constants : ndarray, shape (constants,)
@@ -306,7 +306,9 @@ def sweep(
                 if carried:
                     for k in range(samples):
                         inputs[len(still) - 1, k] = part
-                run(program[starts[s] : starts[s + 1]], constants, inputs, work, results, samples)
+                run_program(
+                    program[starts[s] : starts[s + 1]], constants, inputs, work, results, samples
+                )
                 for row in range(carried):
                     for k in range(samples):
                         inputs[row, k] = results[row, k]

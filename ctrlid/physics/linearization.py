@@ -129,7 +129,7 @@ def operating_point(
     found: list[Array] = []
     repeats = 0
     closest: tuple[float, Array] | None = None
-    for trial, start in enumerate(_starts(n, target, guess)):
+    for trial, start in enumerate(_draw_starts(n, target, guess)):
         solution, error = _solve_equilibrium(evaluate, start, damped=trial % 3 == 2)
         if solution is None:
             continue
@@ -157,7 +157,7 @@ def operating_point(
     return OperatingPoint(tuple(best[:n].tolist()), float(best[n]) + 0.0, target)
 
 
-def _starts(n: int, target: float, guess: Any) -> list[Array]:
+def _draw_starts(n: int, target: float, guess: Any) -> list[Array]:
     rng = np.random.default_rng(1)
     starts = []
     if isinstance(guess, OperatingPoint):
@@ -216,7 +216,7 @@ def _solve_equilibrium(
     return z, float(np.max(np.where(f == 0, 0.0, np.abs(f) / np.where(terms > 0, terms, 1.0))))
 
 
-def state_matrices(
+def compute_state_matrices(
     equations: Equations, at: OperatingPoint, spread: float = 0.0
 ) -> tuple[Array, Array, Array, Array]:
     """Return the exact Jacobians (A, B, C, D) of the traced equations at a point.
@@ -294,14 +294,14 @@ def linearize(plant: Any, at: OperatingPoint) -> Any:
         )
     equations = trace(plant)
     require_siso(equations)
-    (num,), den = to_polynomials(*_minimal(*state_matrices(equations, at)))
+    (num,), den = to_polynomials(*_reduce_to_minimal(*compute_state_matrices(equations, at)))
     return ct.tf(num, den, equations.dt if equations.dt else 0, name=f"{equations.name}_linear",
                  inputs=list(equations.inputs), outputs=list(equations.outputs))  # fmt: skip
 
 
-def _minimal(a: Array, b: Array, c: Array, d: Array) -> tuple[Array, Array, Array, Array]:
+def _reduce_to_minimal(a: Array, b: Array, c: Array, d: Array) -> tuple[Array, Array, Array, Array]:
     """Keep the states that the input reaches and the output shows."""
-    keep = _connected(a, b) & _connected(a.T, c.T)
+    keep = _find_reached_states(a, b) & _find_reached_states(a.T, c.T)
     a, b, c = a[np.ix_(keep, keep)], b[keep], c[:, keep]
     if not a.size:
         return a, b, c, d
@@ -309,15 +309,15 @@ def _minimal(a: Array, b: Array, c: Array, d: Array) -> tuple[Array, Array, Arra
         np.block([[a, b], [c, np.zeros((1, 1))]]), permute=False, separate=True
     )[1][0][:-1]
     balanced = (a * scale / scale[:, None], b / scale[:, None], c * scale)
-    q = _staircase(balanced[0], balanced[1])
+    q = _find_reachable_basis(balanced[0], balanced[1])
     qa, qb, qc = q.T @ balanced[0] @ q, q.T @ balanced[1], balanced[2] @ q
-    w = _staircase(qa.T, qc.T)
+    w = _find_reachable_basis(qa.T, qc.T)
     if w.shape[1] == len(a):
         return a, b, c, d
     return w.T @ qa @ w, w.T @ qb, qc @ w, d
 
 
-def _connected(a: Array, b: Array) -> Any:
+def _find_reached_states(a: Array, b: Array) -> Any:
     """Which states a signal entering through `b` reaches along the non-zero couplings."""
     reached = np.any(b != 0, axis=1)
     for _ in range(len(a)):
@@ -325,7 +325,7 @@ def _connected(a: Array, b: Array) -> Any:
     return reached
 
 
-def _staircase(a: Array, b: Array) -> Array:
+def _find_reachable_basis(a: Array, b: Array) -> Array:
     """Return an orthonormal basis of the reachable subspace."""
     n = len(a)
     basis = np.empty((n, 0))

@@ -18,7 +18,7 @@ def _require_positive(plant: str, **parameters: float) -> None:
             raise CtrlidError(f"{plant} needs {name} > 0 in SI units; given {name}={value!r}")
 
 
-def _plant(
+def _make_plant(
     name: str, update: Any, inputs: list[str], outputs: list[str], states: list[str],
     parameters: dict[str, float], units: dict[str, str],
 ) -> Any:  # fmt: skip
@@ -78,7 +78,7 @@ def maglev(m: float, K: float, g: float = 9.81) -> Any:
         pull = params["K"] * u[0] ** 2 / gap**2
         return np.array([speed, params["g"] - pull / params["m"]])
 
-    return _plant(
+    return _make_plant(
         "maglev", update, ["V"], ["x"], ["x", "v"], {"m": m, "K": K, "g": g}, {"V": "V", "x": "m"}
     )
 
@@ -121,7 +121,7 @@ def servo(m: float, c: float, k: float) -> Any:
     def update(t: float, x: Any, u: Any, params: Any) -> Any:
         return np.array([x[1], (params["k"] * u[0] - params["c"] * x[1]) / params["m"]])
 
-    return _plant(
+    return _make_plant(
         "servo", update, ["V"], ["x"], ["x", "v"], {"m": m, "c": c, "k": k}, {"V": "V", "x": "m"}
     )
 
@@ -167,7 +167,7 @@ def tank(area: float, outlet: float, k: float, g: float = 9.81) -> Any:
         return np.array([(params["k"] * u[0] - drain) / params["area"]])
 
     parameters = {"area": area, "outlet": outlet, "k": k, "g": g}
-    return _plant("tank", update, ["V"], ["h"], ["h"], parameters, {"V": "V", "h": "m"})
+    return _make_plant("tank", update, ["V"], ["h"], ["h"], parameters, {"V": "V", "h": "m"})
 
 
 def pendulum(m: float, length: float, c: float = 0.0, g: float = 9.81) -> Any:
@@ -215,4 +215,6 @@ def pendulum(m: float, length: float, c: float = 0.0, g: float = 9.81) -> Any:
 
     parameters = {"m": m, "length": length, "c": c, "g": g}
     units = {"tau": "N m", "theta": "rad"}
-    return _plant("pendulum", update, ["tau"], ["theta"], ["theta", "omega"], parameters, units)
+    return _make_plant(
+        "pendulum", update, ["tau"], ["theta"], ["theta", "omega"], parameters, units
+    )

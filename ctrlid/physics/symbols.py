@@ -114,7 +114,7 @@ _DUNDERS = {
 }  # fmt: skip
 
 
-def _binary(op: Function, swapped: bool) -> Function:
+def _make_operator(op: Function, swapped: bool) -> Function:
     def method(self: Symbol, other: Any) -> Any:
         if isinstance(other, np.ndarray):
             # Numpy's own loop then calls this method element by element.
@@ -129,8 +129,8 @@ def _binary(op: Function, swapped: bool) -> Function:
 
 
 for _dunder, _ufunc in _DUNDERS.items():
-    setattr(Symbol, f"__{_dunder}__", _binary(OPERATORS[_ufunc], swapped=False))
-    setattr(Symbol, f"__r{_dunder}__", _binary(OPERATORS[_ufunc], swapped=True))
+    setattr(Symbol, f"__{_dunder}__", _make_operator(OPERATORS[_ufunc], swapped=False))
+    setattr(Symbol, f"__r{_dunder}__", _make_operator(OPERATORS[_ufunc], swapped=True))
 
 
 def _clip(a: Any, low: Any = None, high: Any = None) -> Any:

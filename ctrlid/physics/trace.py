@@ -29,14 +29,14 @@ def timebase(system: Any) -> float:
     return 0.0 if system.dt is None or system.dt == 0 else float(system.dt)
 
 
-def _array(symbols: Any) -> Symbols:
+def _make_symbol_array(symbols: Any) -> Symbols:
     box = np.empty(symbols.shape[0], dtype=object)
     for k in range(box.size):
         box[k] = Symbol(symbols[k])
     return box.view(Symbols)
 
 
-def _expressions(result: Any, rows: int, what: str) -> Any:
+def _stack_expressions(result: Any, rows: int, what: str) -> Any:
     """Turn what a traced function returned into a CasADi column of known height."""
     flat = np.asarray(result, dtype=object).reshape(-1)
     if flat.size != rows:
@@ -44,7 +44,7 @@ def _expressions(result: Any, rows: int, what: str) -> Any:
     return casadi.SX(casadi.vertcat(*(lift(v) for v in flat)))
 
 
-def _run(system: Any, t: Any, x: Any, u: Any, p: Mapping[str, Any]) -> tuple[Any, Any]:
+def _trace_system(system: Any, t: Any, x: Any, u: Any, p: Mapping[str, Any]) -> tuple[Any, Any]:
     """Trace one system: its (rhs, output) as CasADi columns for symbolic t, x, u."""
     known = getattr(system, "equations", None)
     # A plant with its effects, from Loop.system(), brings its equations along.
@@ -63,19 +63,21 @@ def _run(system: Any, t: Any, x: Any, u: Any, p: Mapping[str, Any]) -> tuple[Any
             casadi.mtimes(casadi.SX(c), x) + casadi.mtimes(casadi.SX(d), u),
         )
     if isinstance(system, InterconnectedSystem):
-        rhs, out = _run_interconnected(system, t, x, u, p)
+        rhs, out = _trace_interconnected(system, t, x, u, p)
         return rhs, out
-    arguments = (Symbol(t), _array(x), _array(u), dict(p))
+    arguments = (Symbol(t), _make_symbol_array(x), _make_symbol_array(u), dict(p))
     rhs = casadi.SX(0, 1)
     if system.nstates:
-        rhs = _expressions(rebind(system.updfcn)(*arguments), system.nstates, "the update function")
+        rhs = _stack_expressions(
+            rebind(system.updfcn)(*arguments), system.nstates, "the update function"
+        )
     if system.outfcn is None:
         return rhs, x
-    out = rebind(system.outfcn)(Symbol(t), _array(x), _array(u), dict(p))
-    return rhs, _expressions(out, system.noutputs, "the output function")
+    out = rebind(system.outfcn)(Symbol(t), _make_symbol_array(x), _make_symbol_array(u), dict(p))
+    return rhs, _stack_expressions(out, system.noutputs, "the output function")
 
 
-def _run_interconnected(system: Any, t: Any, x: Any, u: Any, p: Mapping[str, Any]) -> Any:
+def _trace_interconnected(system: Any, t: Any, x: Any, u: Any, p: Mapping[str, Any]) -> Any:
     parts, offsets = system.syslist, np.cumsum([0] + [s.nstates or 0 for s in system.syslist])
     ins = np.cumsum([0] + [s.ninputs for s in parts])
     # A symbol for every internal input; outputs that depend on them are substituted until none
@@ -84,7 +86,7 @@ def _run_interconnected(system: Any, t: Any, x: Any, u: Any, p: Mapping[str, Any
     rhs, outs = [], []
     for k, part in enumerate(parts):
         local = {**part.params, **system.params, **p}
-        fk, hk = _run(part, t, x[int(offsets[k]):int(offsets[k + 1])],
+        fk, hk = _trace_system(part, t, x[int(offsets[k]):int(offsets[k + 1])],
                       wires[int(ins[k]):int(ins[k + 1])], local)  # fmt: skip
         rhs.append(fk)
         outs.append(hk)
@@ -138,8 +140,8 @@ def trace(system: Any) -> Equations:
     """
     if isinstance(system, Equations):
         return system
-    if isinstance(system, ct.TransferFunction) and system.issiso() and _proper(system):
-        return _canonical(system)
+    if isinstance(system, ct.TransferFunction) and system.issiso() and _is_proper(system):
+        return _trace_transfer_function(system)
     if isinstance(system, ct.TransferFunction):
         system = ct.ss(system, name=system.name, inputs=system.input_labels,
                        outputs=system.output_labels)  # fmt: skip
@@ -162,24 +164,29 @@ def trace(system: Any) -> Equations:
     error: TracingError | None = None
     for symbolic in (scalars, fractional, {}):
         try:
-            return _checked(system, _trace(system, symbolic))
+            return _check_equations(system, _trace_functions(system, symbolic))
         except TracingError as reason:
             error = error or reason
     assert error is not None
     raise error
 
 
-def _proper(system: Any) -> bool:
-    names = canonical.coefficients(system)
-    return len(names) <= 2 * canonical.order(list(names)) + 1
+def _is_proper(system: Any) -> bool:
+    names = canonical.list_coefficients(system)
+    return len(names) <= 2 * canonical.count_poles(list(names)) + 1
 
 
-def _canonical(system: Any) -> Equations:
-    values = canonical.coefficients(system)
-    n, dt = canonical.order(list(values)), timebase(system)
-    t, x, u, p = casadi.SX.sym("t"), _vector("x", n), _vector("u", 1), _vector("p", len(values))
+def _trace_transfer_function(system: Any) -> Equations:
+    values = canonical.list_coefficients(system)
+    n, dt = canonical.count_poles(list(values)), timebase(system)
+    t, x, u, p = (
+        casadi.SX.sym("t"),
+        _make_vector("x", n),
+        _make_vector("u", 1),
+        _make_vector("p", len(values)),
+    )
     named = {name: p[k] for k, name in enumerate(values)}
-    rates, output = canonical.state_equations(named, [x[k] for k in range(n)], u, dt == 0)
+    rates, output = canonical.make_state_equations(named, [x[k] for k in range(n)], u, dt == 0)
     return Equations(
         system.name, tuple(f"x[{k}]" for k in range(n)), tuple(system.input_labels),
         tuple(system.output_labels), values, dt, t, x, u, p,
@@ -187,29 +194,29 @@ def _canonical(system: Any) -> Equations:
     )  # fmt: skip
 
 
-def _trace(system: Any, symbolic: Mapping[str, float]) -> Equations:
+def _trace_functions(system: Any, symbolic: Mapping[str, float]) -> Equations:
     t = casadi.SX.sym("t")
-    x = _vector("x", system.nstates)
-    u = _vector("u", system.ninputs)
-    p = _vector("p", len(symbolic))
+    x = _make_vector("x", system.nstates)
+    u = _make_vector("u", system.ninputs)
+    p = _make_vector("p", len(symbolic))
     params = {**system.params, **{key: Symbol(p[k]) for k, key in enumerate(symbolic)}}
     try:
-        rhs, output = _run(system, t, x, u, params)
+        rhs, output = _trace_system(system, t, x, u, params)
     except Exception as reason:
-        raise TracingError(_explain(system, reason)) from reason
+        raise TracingError(_explain_failure(system, reason)) from reason
     return Equations(
         system.name, tuple(system.state_labels), tuple(system.input_labels),
         tuple(system.output_labels), dict(symbolic), timebase(system), t, x, u, p, rhs, output,
     )  # fmt: skip
 
 
-def _vector(name: str, size: int) -> Any:
+def _make_vector(name: str, size: int) -> Any:
     return casadi.vertcat(*(casadi.SX.sym(f"{name}{k}") for k in range(size))) if size else (
         casadi.SX(0, 1)
     )  # fmt: skip
 
 
-def _explain(system: Any, reason: Exception) -> str:
+def _explain_failure(system: Any, reason: Exception) -> str:
     here = __file__.rpartition("/")[0]
     user = [f for f in traceback.extract_tb(reason.__traceback__)
             if not f.filename.startswith(here) and "site-packages" not in f.filename]  # fmt: skip
@@ -229,7 +236,7 @@ def _explain(system: Any, reason: Exception) -> str:
     return f"the equations of {system.name} cannot be traced{where}: {cure}"
 
 
-def _checked(system: Any, equations: Equations) -> Equations:
+def _check_equations(system: Any, equations: Equations) -> Equations:
     """Compare the traced equations with the Python functions at random points."""
     rng = np.random.default_rng(20090317)
     n, m = len(equations.states), len(equations.inputs)
@@ -245,14 +252,14 @@ def _checked(system: Any, equations: Equations) -> Equations:
         x, u, t = z[:n], z[n : n + m], abs(z[-1])
         values = equations.values * rng.uniform(0.8, 1.25, len(equations.parameters))
         params = dict(zip(equations.parameters, values.tolist(), strict=True))
-        expected = _python_values(system, t, x, u, params)
+        expected = _evaluate_functions(system, t, x, u, params)
         if isinstance(expected, str):
             failure = f" (it says: {expected})"
             continue
         traced = np.concatenate(equations.evaluate(x, u, t, values))
         good = np.isfinite(expected)
         found += bool(good.all())
-        scale = AGREEMENT * (np.abs(expected[good]) + _size(expected[good]))
+        scale = AGREEMENT * (np.abs(expected[good]) + _estimate_size(expected[good]))
         wrong = np.isfinite(traced) != good
         wrong[good] |= ~(np.abs(traced[good] - expected[good]) <= scale)
         if wrong.any():
@@ -275,11 +282,11 @@ def _checked(system: Any, equations: Equations) -> Equations:
     return equations
 
 
-def _size(values: Array) -> float:
+def _estimate_size(values: Array) -> float:
     return float(np.max(np.abs(values), initial=0.0)) * 1e-3
 
 
-def _python_values(system: Any, t: float, x: Array, u: Array, params: Any) -> Array | str:
+def _evaluate_functions(system: Any, t: float, x: Array, u: Array, params: Any) -> Array | str:
     try:
         with np.errstate(all="ignore"):
             given = () if isinstance(system, ct.StateSpace) else (params,)
@@ -310,7 +317,7 @@ def with_parameters(system: Any, values: Mapping[str, float]) -> Any:
         A shallow copy, or the transfer function with the new coefficients.
     """
     if isinstance(system, ct.TransferFunction):
-        return canonical.rebuilt(system, values)
+        return canonical.replace_coefficients(system, values)
     changed = copy.copy(system)
     changed.params = {**system.params, **values}
     return changed

@@ -32,7 +32,7 @@ from .symbols import (
 )  # fmt: skip
 
 
-def _or_original(symbolic: Function, original: Function) -> Function:
+def _dispatch_on_symbols(symbolic: Function, original: Function) -> Function:
     """Choose the symbolic version where a symbol is among the arguments, else the original."""
 
     @functools.wraps(original, updated=())
@@ -43,7 +43,7 @@ def _or_original(symbolic: Function, original: Function) -> Function:
     return call
 
 
-def _object_array(make: Function) -> Function:
+def _allow_symbols(make: Function) -> Function:
     """Numpy's constructor with room for symbols, whatever number type was asked for."""
 
     @functools.wraps(make, updated=())
@@ -56,7 +56,7 @@ def _object_array(make: Function) -> Function:
     return build
 
 
-def _casadi_matrix(array: Any) -> Any:
+def _to_casadi(array: Any) -> Any:
     rows = np.atleast_2d(np.asarray(array, dtype=object))
     return casadi.vertcat(*(casadi.horzcat(*(lift(v) for v in row)) for row in rows))
 
@@ -70,17 +70,17 @@ def _from_casadi(matrix: Any, shape: tuple[int, ...]) -> Any:
 
 def _solve(a: Any, b: Any) -> Any:
     b = np.asarray(b, dtype=object)
-    right = _casadi_matrix(b.reshape(len(b), -1))
-    return _from_casadi(casadi.mtimes(casadi.inv(casadi.SX(_casadi_matrix(a))), right), b.shape)
+    right = _to_casadi(b.reshape(len(b), -1))
+    return _from_casadi(casadi.mtimes(casadi.inv(casadi.SX(_to_casadi(a))), right), b.shape)
 
 
 LINALG: dict[str, Function] = {
-    "solve": _or_original(_solve, np.linalg.solve),
-    "inv": _or_original(
-        lambda a: _from_casadi(casadi.inv(_casadi_matrix(a)), np.shape(a)), np.linalg.inv
+    "solve": _dispatch_on_symbols(_solve, np.linalg.solve),
+    "inv": _dispatch_on_symbols(
+        lambda a: _from_casadi(casadi.inv(_to_casadi(a)), np.shape(a)), np.linalg.inv
     ),
-    "det": _or_original(lambda a: Symbol(casadi.det(_casadi_matrix(a))), np.linalg.det),
-    "norm": _or_original(
+    "det": _dispatch_on_symbols(lambda a: Symbol(casadi.det(_to_casadi(a))), np.linalg.det),
+    "norm": _dispatch_on_symbols(
         lambda a: Symbol(casadi.sqrt(sum(lift(v) ** 2 for v in np.ravel(a)))), np.linalg.norm
     ),
 }
@@ -97,11 +97,11 @@ class _Module:
             return self._table[name]
         found = getattr(self._module, name)
         if self._module is np and inspect.isroutine(found):
-            return _keeping_symbols(found)
-        return _replace(found, {})
+            return _keep_symbols(found)
+        return _replace_object(found, {})
 
 
-def _keeping_symbols(function: Function) -> Function:
+def _keep_symbols(function: Function) -> Function:
     """Numpy's function, whose arrays of symbols stay arrays of symbols (hstack, diff, ...)."""
 
     @functools.wraps(function, updated=())
@@ -119,7 +119,7 @@ class _Instance:
         object.__setattr__(self, "_instance", instance)
 
     def __getattr__(self, name: str) -> Any:
-        return _replace(getattr(self._instance, name), {})
+        return _replace_object(getattr(self._instance, name), {})
 
     def __setattr__(self, name: str, value: Any) -> None:
         raise TracingError(
@@ -132,28 +132,28 @@ def _identity(value: Any = 0.0) -> Any:
     return value
 
 
-def _numpy_table() -> dict[str, Any]:
+def _build_numpy_table() -> dict[str, Any]:
     table: dict[str, Any] = {
-        name: _or_original(elementwise(op), getattr(np, name))
+        name: _dispatch_on_symbols(elementwise(op), getattr(np, name))
         for name, op in ELEMENTWISE.items()
         if hasattr(np, name)
     }
     for make in (np.zeros, np.ones, np.empty, np.full, np.array, np.asarray, np.zeros_like,
                  np.ones_like, np.empty_like, np.full_like, np.asanyarray):  # fmt: skip
-        table[str(getattr(make, "__name__"))] = _object_array(make)  # noqa: B009
+        table[str(getattr(make, "__name__"))] = _allow_symbols(make)  # noqa: B009
     for number in ("float64", "float32", "double"):
-        table[number] = _or_original(_identity, getattr(np, number))
-    table["interp"] = _or_original(
+        table[number] = _dispatch_on_symbols(_identity, getattr(np, number))
+    table["interp"] = _dispatch_on_symbols(
         lambda a, xp, fp: elementwise(lambda s: interp(s, xp, fp))(a), np.interp
     )
     table["linalg"] = _Module(np.linalg, LINALG)
     return table
 
 
-_NUMPY = _Module(np, _numpy_table())
+_NUMPY = _Module(np, _build_numpy_table())
 _MATH = _Module(
     math,
-    {n: _or_original(elementwise(op), getattr(math, n)) for n, op in ELEMENTWISE.items()
+    {n: _dispatch_on_symbols(elementwise(op), getattr(math, n)) for n, op in ELEMENTWISE.items()
      if hasattr(math, n)},
 )  # fmt: skip
 _MODULES: dict[str, Any] = {"numpy": _NUMPY, "math": _MATH}
@@ -165,23 +165,23 @@ _BY_IDENTITY = {
 
 
 def _import(name: str, *args: Any, **kwargs: Any) -> Any:
-    return _replace(builtins.__import__(name, *args, **kwargs), {})
+    return _replace_object(builtins.__import__(name, *args, **kwargs), {})
 
 
 _BUILTINS = {
     **vars(builtins),
-    "float": _or_original(_identity, float),
-    "max": _or_original(
+    "float": _dispatch_on_symbols(_identity, float),
+    "max": _dispatch_on_symbols(
         lambda *a: functools.reduce(elementwise(casadi.fmax), a if len(a) > 1 else a[0]), max
     ),
-    "min": _or_original(
+    "min": _dispatch_on_symbols(
         lambda *a: functools.reduce(elementwise(casadi.fmin), a if len(a) > 1 else a[0]), min
     ),
     "__import__": _import,
 }
 
 
-def _replace(obj: Any, memo: dict[int, Any]) -> Any:
+def _replace_object(obj: Any, memo: dict[int, Any]) -> Any:
     if id(obj) in _BY_IDENTITY:
         return _BY_IDENTITY[id(obj)]
     if isinstance(obj, types.ModuleType):
@@ -199,9 +199,9 @@ def _replace(obj: Any, memo: dict[int, Any]) -> Any:
     return obj
 
 
-def _names(code: types.CodeType) -> set[str]:
+def _collect_names(code: types.CodeType) -> set[str]:
     nested = (c for c in code.co_consts if isinstance(c, types.CodeType))
-    return set(code.co_names).union(*(_names(c) for c in nested))
+    return set(code.co_names).union(*(_collect_names(c) for c in nested))
 
 
 def rebind(function: Any, memo: dict[int, Any] | None = None) -> Any:
@@ -245,10 +245,10 @@ def rebind(function: Any, memo: dict[int, Any] | None = None) -> Any:
     )
     copy.__kwdefaults__ = function.__kwdefaults__
     memo[id(function)] = copy
-    for name in _names(function.__code__) & function.__globals__.keys():
-        scope[name] = _replace(function.__globals__[name], memo)
+    for name in _collect_names(function.__code__) & function.__globals__.keys():
+        scope[name] = _replace_object(function.__globals__[name], memo)
     for new, old in zip(cells, function.__closure__ or (), strict=True):
-        new.cell_contents = _replace(old.cell_contents, memo)
+        new.cell_contents = _replace_object(old.cell_contents, memo)
     if function.__defaults__:
-        copy.__defaults__ = tuple(_replace(v, memo) for v in function.__defaults__)
+        copy.__defaults__ = tuple(_replace_object(v, memo) for v in function.__defaults__)
     return copy

@@ -17,7 +17,7 @@ from ..estimation.likelihood.physics_estimate import LoopFit
 from ..validation.comparison import Comparison
 from . import plot
 from .plot.axes import BINS
-from .tables import Table, Title, blocks, heading
+from .tables import Table, Title, make_blocks, write_heading
 
 STYLE = """
 :root { color-scheme: light dark; --ink: #1c1e21; --paper: #ffffff; --faint: #5b6168;
@@ -98,7 +98,7 @@ class Section:
     def figures(self) -> dict[str, Any]:
         """The figures by caption."""
         if self.figure is None:
-            return {k: f for r in _several(self.result) for k, f in _pictures(r).items()}
+            return {k: f for r in _as_tuple(self.result) for k, f in _draw_pictures(r).items()}
         if isinstance(self.figure, Mapping):
             return dict(self.figure)
         return {"": self.figure}
@@ -143,9 +143,11 @@ def write_report(result: Any, path: str | Path, *, title: str = "") -> Path:
     )
     if not given:
         raise CtrlidError("write_report needs at least one result; given an empty sequence")
-    sections = [r if isinstance(r, Section) else Section(heading(r), "", r) for r in given]
+    sections = [r if isinstance(r, Section) else Section(write_heading(r), "", r) for r in given]
     title = title or (sections[0].title if len(sections) == 1 else "ctrlid report")
-    body = "\n".join(_section(s, alone=len(sections) == 1 and s.title == title) for s in sections)
+    body = "\n".join(
+        _write_section(s, alone=len(sections) == 1 and s.title == title) for s in sections
+    )
     page = (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
@@ -162,13 +164,13 @@ def write_report(result: Any, path: str | Path, *, title: str = "") -> Path:
     return path
 
 
-def _several(result: Any) -> tuple[Any, ...]:
+def _as_tuple(result: Any) -> tuple[Any, ...]:
     if result is None:
         return ()
     return tuple(result) if isinstance(result, tuple | list) else (result,)
 
 
-def _pictures(result: Any) -> dict[str, Any]:
+def _draw_pictures(result: Any) -> dict[str, Any]:
     """Draw what belongs to a result."""
     match result:
         case Record():
@@ -196,16 +198,16 @@ def _pictures(result: Any) -> dict[str, Any]:
     return {}
 
 
-def _section(section: Section, alone: bool) -> str:
+def _write_section(section: Section, alone: bool) -> str:
     parts = ["<section>"]
     if not alone:
         parts.append(f"<h2>{html.escape(section.title)}</h2>")
-    parts += [_paragraph(p) for p in section.text.split("\n\n") if p.strip()]
-    for result in _several(section.result):
-        for block in blocks(result):
-            parts.append(_html(block))
+    parts += [_write_paragraph(p) for p in section.text.split("\n\n") if p.strip()]
+    for result in _as_tuple(section.result):
+        for block in make_blocks(result):
+            parts.append(_write_block(block))
     for caption, picture in section.figures.items():
-        data = base64.b64encode(_bytes(picture)).decode("ascii")
+        data = base64.b64encode(_make_png(picture)).decode("ascii")
         words = html.escape(caption, quote=True)
         below = f"<figcaption>{words}</figcaption>" if caption else ""
         alt = words or html.escape(section.title, quote=True)
@@ -215,22 +217,22 @@ def _section(section: Section, alone: bool) -> str:
     return "\n".join([*parts, "</section>"])
 
 
-def _bytes(picture: Any) -> bytes:
+def _make_png(picture: Any) -> bytes:
     return picture if isinstance(picture, bytes) else plot.png(picture)
 
 
-def _html(block: Table | Title | str) -> str:
+def _write_block(block: Table | Title | str) -> str:
     if isinstance(block, Title):
         return f"<h3>{html.escape(block.text)}</h3>"
-    return _html_table(block) if isinstance(block, Table) else _paragraph(block)
+    return _write_table(block) if isinstance(block, Table) else _write_paragraph(block)
 
 
-def _paragraph(text: str) -> str:
+def _write_paragraph(text: str) -> str:
     kind = ' class="bad"' if is_bad_news(text) else ""
     return f"<p{kind}>{html.escape(' '.join(text.split()))}</p>"
 
 
-def _html_table(table: Table) -> str:
+def _write_table(table: Table) -> str:
     def row(cells: tuple[str, ...], tag: str) -> str:
         first = f'<th scope="{"col" if tag == "th" else "row"}">{html.escape(cells[0])}</th>'
         kind = ' scope="col"' if tag == "th" else ""

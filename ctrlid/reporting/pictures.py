@@ -23,14 +23,14 @@ BARS = 7
 LEAST = -10.0  # A net gain below says no more than this one.
 
 
-def scale(signals: Sequence[Array], unit: str) -> tuple[float, str]:
+def choose_scale(signals: Sequence[Array], unit: str) -> tuple[float, str]:
     """Return a factor and the unit it leads to: millimetres rather than 0.03 m."""
     if not unit:
         return 1.0, "unit not given"
-    return _text.prefix(max(float(np.abs(s).max()) for s in signals), unit)
+    return _text.choose_prefix(max(float(np.abs(s).max()) for s in signals), unit)
 
 
-def telling(comparison: Comparison) -> int:
+def find_telling_window(comparison: Comparison) -> int:
     """Return the first sample of a lively window with a usual error."""
     whole = comparison.record
     n, width = len(whole), min(WINDOW, len(whole))
@@ -55,7 +55,7 @@ def telling(comparison: Comparison) -> int:
     return int(starts[np.argmin(np.where(lively, usual, np.inf))])
 
 
-def checked_models(models: Any, who: str) -> dict[str, Any]:
+def check_models(models: Any, who: str) -> dict[str, Any]:
     """Return models by label, a single one by its name, or refuse in the name of a picture."""
     if isinstance(models, ct.TransferFunction | ct.StateSpace):
         models = {models.name: models}
@@ -71,7 +71,7 @@ def checked_models(models: Any, who: str) -> dict[str, Any]:
     return {str(k): m for k, m in models.items()}
 
 
-def period(models: Mapping[str, Any]) -> float:
+def find_period(models: Mapping[str, Any]) -> float:
     """Return the one sampling period among the models, 0 if all are continuous."""
     periods = {k: timebase(m) for k, m in models.items() if timebase(m)}
     if len({round(p, 12) for p in periods.values()}) > 1:
@@ -81,7 +81,7 @@ def period(models: Mapping[str, Any]) -> float:
     return next(iter(periods.values()), 0.0)
 
 
-def places(model: Any, dt: float) -> Any:
+def find_poles(model: Any, dt: float) -> Any:
     """Return the poles in the z-plane of period dt (in the s-plane for 0), the outermost first."""
     # The fit knows its poles more accurately than the roots of its coefficients.
     estimate = getattr(model, "estimate", None)
@@ -91,7 +91,7 @@ def places(model: Any, dt: float) -> Any:
     return poles[np.lexsort((-poles.imag, -poles.real))]
 
 
-def frequencies(models: Mapping[str, Any]) -> Any:
+def make_frequency_grid(models: Mapping[str, Any]) -> Any:
     """Return a grid from well below the slowest to well above the fastest pole or zero."""
     corners, limits = [], []
     for model in models.values():
@@ -107,7 +107,7 @@ def frequencies(models: Mapping[str, Any]) -> Any:
     return np.geomspace(min(0.1 * min(corners), 0.01 * top), top, 600)
 
 
-def largest_gap(gap: Gap) -> slice:
+def find_largest_gap(gap: Gap) -> slice:
     """Return the stretch of the samples kept back in which the model errs most."""
     n = len(gap.time)
     width = min(WINDOW, n)
@@ -125,7 +125,7 @@ def largest_gap(gap: Gap) -> slice:
     return slice(first, first + width)
 
 
-def two_most_telling(found: Diagnosis) -> list[BinnedErrors]:
+def choose_two_most_telling(found: Diagnosis) -> list[BinnedErrors]:
     """Return the two most telling places."""
     return sorted(found.where, key=lambda place: place.p_before)[:2]
 
@@ -153,9 +153,9 @@ class Bar:
     kind: Kind
 
 
-def ranking(found: Diagnosis) -> dict[int, list[Bar]]:
+def make_ranking(found: Diagnosis) -> dict[int, list[Bar]]:
     """Return the best candidates of each round as bars, the best first."""
-    value = {id(c): _net_gain(c) for c in found.ranking}
+    value = {id(c): _compute_net_gain(c) for c in found.ranking}
     kinds: dict[int, Kind] = {}
     for finding in found.findings:
         own = [c for c in found.ranking
@@ -184,18 +184,19 @@ def ranking(found: Diagnosis) -> dict[int, list[Bar]]:
     return rounds
 
 
-def _net_gain(c: Candidate) -> float:
+def _compute_net_gain(c: Candidate) -> float:
     gain = c.gain if math.isfinite(c.gain) else c.score
     return max(gain - c.penalty, LEAST) if math.isfinite(gain) else LEAST
 
 
-def bin_labels(place: BinnedErrors) -> tuple[list[str], str]:
+def write_bin_labels(place: BinnedErrors) -> tuple[list[str], str]:
     """Return the edges of the bins of a place as labels, and the title of the axis."""
     known = place.edges[np.isfinite(place.edges)]
-    factor, unit = scale([known], place.unit) if known.size else (1.0, place.unit)
-    digits = next((d for d in (2, 3, 4) if len({_text.number(e, d) for e in known}) == known.size),
-                  5)  # fmt: skip
-    labels = [_text.number(factor * e, digits) if np.isfinite(e) else "" for e in place.edges]
+    factor, unit = choose_scale([known], place.unit) if known.size else (1.0, place.unit)
+    digits = next(
+        (d for d in (2, 3, 4) if len({_text.write_number(e, d) for e in known}) == known.size), 5
+    )
+    labels = [_text.write_number(factor * e, digits) if np.isfinite(e) else "" for e in place.edges]
     widths = np.diff(known)
     even = widths.size == 0 or float(np.ptp(widths)) < 0.01 * float(np.max(widths))
     title = f"{place.axis} [{unit if place.unit else '1'}]"

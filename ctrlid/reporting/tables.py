@@ -80,7 +80,7 @@ class Title:
 Block = Table | Title | str
 
 
-def heading(result: Any) -> str:
+def write_heading(result: Any) -> str:
     """Return a title for a result, or refuse what cannot be shown."""
     match result:
         case Record():
@@ -103,29 +103,29 @@ def heading(result: Any) -> str:
     )
 
 
-def blocks(result: Any) -> list[Block]:
+def make_blocks(result: Any) -> list[Block]:
     """Return a result as tables, headings and sentences."""
     match result:
         case Table():
             return [result]
         case Record():
-            return [_record_table(result)]
+            return [_make_record_table(result)]
         case IdentifiedModel():
-            return _estimate_blocks(result.estimate)
+            return _make_estimate_blocks(result.estimate)
         case LoopFit():
-            return _loop_fit_blocks(result)
+            return _make_loop_fit_blocks(result)
         case Comparison():
-            return [*_comparison_tables(result), *result.notes, result.verdict]
+            return [*_make_comparison_tables(result), *result.notes, result.verdict]
         case Redesign():
-            return _redesign_blocks(result)
+            return _make_redesign_blocks(result)
         case Diagnosis():
-            return _diagnosis_blocks(result)
+            return _make_diagnosis_blocks(result)
     # This refuses a result that no page can show.
-    heading(result)
+    write_heading(result)
     return []
 
 
-def _record_table(record: Record) -> Table:
+def _make_record_table(record: Record) -> Table:
     channels = [(record.names.get(k, k), record.units.get(k, ""), getattr(record, k))
                 for k in SIGNALS if getattr(record, k) is not None]  # fmt: skip
     channels += [(k, record.units.get(k, ""), v) for k, v in record.extra.items()]
@@ -143,7 +143,7 @@ def _record_table(record: Record) -> Table:
     return Table(head, rows, caption)
 
 
-def _estimate_blocks(e: Estimate) -> list[Block]:
+def _make_estimate_blocks(e: Estimate) -> list[Block]:
     held = {bound.quantity for bound in e.active_bounds}
     rows = []
     for name, value, error in zip(e.names, e.values, e.standard_errors, strict=True):
@@ -151,7 +151,7 @@ def _estimate_blocks(e: Estimate) -> list[Block]:
         rows.append((name, f"{value:.7g}", known))
     sampled = e.structure.domain == "z"
     poles = tuple(
-        (*((_text.number(z, 5),) if sampled else ()), _text.number(s, 5), f"{ds:.2g}")
+        (*((_text.write_number(z, 5),) if sampled else ()), _text.write_number(s, 5), f"{ds:.2g}")
         for z, s, ds in zip(e.poles, e.poles_s, e.poles_s_standard_errors, strict=True)
     )
     head = (*(("pole in z",) if sampled else ()), "pole in s [rad/s]", "standard error [rad/s]")
@@ -167,7 +167,7 @@ def _estimate_blocks(e: Estimate) -> list[Block]:
     ]
 
 
-def _comparison_tables(c: Comparison) -> list[Table]:
+def _make_comparison_tables(c: Comparison) -> list[Table]:
     unit = c.record.units.get("y", "unit of y")
     curves = tuple(
         (q.label, f"{q.fit:.2f} %", f"{q.rms:.3g}", f"{100 * q.noise_share:.1f} %")
@@ -175,7 +175,7 @@ def _comparison_tables(c: Comparison) -> list[Table]:
     )
     tests = tuple(
         (t.name, "chance" if t.passed else "NOT CHANCE", f"{np.abs(t.values).max():.3f}",
-         f"{t.band:.3f}", _text.chance(t.p_value)) for t in c.tests
+         f"{t.band:.3f}", _text.write_p_value(t.p_value)) for t in c.tests
     )  # fmt: skip
     tables = [
         Table(("curve", "fit", f"RMS error [{unit}]", "noise explains"), curves, f"{c.what}.")
@@ -186,7 +186,7 @@ def _comparison_tables(c: Comparison) -> list[Table]:
     return tables
 
 
-def _loop_fit_blocks(fit: LoopFit) -> list[Block]:
+def _make_loop_fit_blocks(fit: LoopFit) -> list[Block]:
     e = fit.estimate
     errors = ("on its bound" if name in e.active else
               f"{error:.2g}" if np.isfinite(error) else "not in the data"
@@ -200,7 +200,7 @@ def _loop_fit_blocks(fit: LoopFit) -> list[Block]:
     ]
 
 
-def _redesign_blocks(r: Redesign) -> list[Block]:
+def _make_redesign_blocks(r: Redesign) -> list[Block]:
     z = "z" if timebase(r.controller) else "s"
     return [
         Table(("", "promised on the model", "achieved on the physics"), r.rows),
@@ -209,7 +209,7 @@ def _redesign_blocks(r: Redesign) -> list[Block]:
     ]
 
 
-def _diagnosis_blocks(found: Diagnosis) -> list[Block]:
+def _make_diagnosis_blocks(found: Diagnosis) -> list[Block]:
     caption = f"{found.gap.kind.capitalize()} of {len(found.gap.time)} samples kept back."
     sizes = tuple(wording.list_gap_rows(found.gap))
     gap = Table(("", "RMS error", "against the noise floor"), sizes, caption)
@@ -232,10 +232,16 @@ def _diagnosis_blocks(found: Diagnosis) -> list[Block]:
     ]
     sides = 2 if found.findings else 1
     places = tuple(
-        (p.axis, *(_text.number(wording.highest_rms(v), 3) for v in (p.before, p.after)[:sides]),
-         *(_text.chance(v) for v in (p.p_before, p.p_after)[:sides]))
+        (
+            p.axis,
+            *(
+                _text.write_number(wording.find_highest_rms(v), 3)
+                for v in (p.before, p.after)[:sides]
+            ),
+            *(_text.write_p_value(v) for v in (p.p_before, p.p_after)[:sides]),
+        )
         for p in found.where
-    )  # fmt: skip
+    )
     if places:
         columns = (
             "along",

@@ -11,31 +11,31 @@ from scipy import signal
 
 from .._base.arrays import Array
 from .._base.errors import CtrlidError, CtrlidWarning, EffectDoesNotApply, ModelCannotRun
-from .._base.text import number
+from .._base.text import write_number
 from ..data.record import Record
-from ..data.several_records import model_and_data
+from ..data.several_records import order_model_and_data
 from ..data.validity import whole_past
-from ..estimation.identified_model import IdentifiedModel, delay_of
+from ..estimation.identified_model import IdentifiedModel, read_delay
 from ..estimation.likelihood.filter_data import FEWEST
-from ..estimation.likelihood.prediction import Prediction, predict, predict_ahead, spread_ahead
-from ..estimation.linear.sampled_motion import flow
+from ..estimation.likelihood.prediction import Prediction, predict, predict_ahead, predict_spread
+from ..estimation.linear.sampled_motion import discretize_model
 from ..loop.loop import Loop
-from ..loop.period_map import growth_rate
+from ..loop.period_map import compute_growth_rate
 from ..loop.simulation import Simulator
 from ..physics.conversions import to_polynomials, to_state_matrices
 from ..physics.trace import timebase
 from .comparison import EXACT, Comparison, Curve
-from .noise_model import noise_polynomial, whiten_errors
+from .noise_model import fit_noise_polynomial, whiten_errors
 from .record_simulation import Stretch, long_stretches, prepare_stretch
 from .reproduction import (
     CLOSED_LOOP,
     ONE_STEP,
     OPEN_LOOP,
     Reproduction,
-    moving_poles,
-    time_constant,
+    compute_moving_poles,
+    find_time_constant,
 )
-from .residual_tests import Correlation, autocorrelation, cross_correlation, explained_share
+from .residual_tests import Correlation, autocorrelation, compute_explained_share, cross_correlation
 
 # An injected signal below this share of the input's standard deviation is rounding.
 MEANINGFUL = 1e-6
@@ -82,7 +82,7 @@ def compare(record: Record, model_or_loop: Any, *, horizon: int | None = None) -
     >>> [curve.label for curve in cid.compare(record, loop).curves]
     ['one-step prediction', '50-step prediction', 'closed-loop simulation']
     """
-    model_or_loop, record = model_and_data(model_or_loop, record)
+    model_or_loop, record = order_model_and_data(model_or_loop, record)
     if not isinstance(record, Record):
         raise CtrlidError(
             "compare needs a Record and a model; given "
@@ -107,17 +107,17 @@ def _compare_loop(record: Record, loop: Loop, horizon: int | None) -> Comparison
     prediction = predict(loop, record)
     residuals = np.where(prediction.settled, prediction.innovations, np.nan)
     one_step = np.where(prediction.settled, prediction.y, np.nan)
-    curves = [_curve(ONE_STEP, record, one_step, _known_before(record, 1))]
+    curves = [_judge_curve(ONE_STEP, record, one_step, _list_known_signals(record, 1))]
     notes = []
     e = loop.equations()
-    steps = horizon or time_constant(moving_poles(loop), e.dt, record)
+    steps = horizon or find_time_constant(compute_moving_poles(loop), e.dt, record)
     if steps > 1:
         index, values = predict_ahead(loop, record, prediction, steps)
         ahead = np.full(len(record), np.nan)
         ahead[index] = values
-        curves.append(_curve(Reproduction("prediction", steps), record, ahead,
-                             _known_before(record, steps),
-                             spread_ahead(loop, record, prediction, steps)[0]))  # fmt: skip
+        curves.append(_judge_curve(Reproduction("prediction", steps), record, ahead,
+                             _list_known_signals(record, steps),
+                             predict_spread(loop, record, prediction, steps)[0]))  # fmt: skip
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", CtrlidWarning)
         try:
@@ -125,10 +125,10 @@ def _compare_loop(record: Record, loop: Loop, horizon: int | None) -> Comparison
         except (ModelCannotRun, EffectDoesNotApply) as reason:
             notes.append(f"no simulation: {reason}")
     notes += sorted({str(w.message) for w in caught})[-1:]
-    return _comparison(repr(loop), record, curves, residuals, notes)
+    return _make_comparison(repr(loop), record, curves, residuals, notes)
 
 
-def _known_before(record: Record, steps: int) -> list[tuple[Array, int]]:
+def _list_known_signals(record: Record, steps: int) -> list[tuple[Array, int]]:
     """Return the signals that an error `steps` after the last known output should not follow.
 
     The reference, if there is one: the input carries the noise itself round the loop. Without a
@@ -139,13 +139,13 @@ def _known_before(record: Record, steps: int) -> list[tuple[Array, int]]:
     return [(np.asarray(record.r), 1)]
 
 
-def _comparison(
+def _make_comparison(
     what: str, record: Record, curves: list[Curve], residuals: Array, notes: list[str]
 ) -> Comparison:
     known = tuple(c for c in curves if np.isfinite(c.rms))
     notes += [f"no {c.label}: no valid stretch is long enough" for c in curves if c not in known]
     exact = known[0].fit > EXACT
-    tests = () if exact else _tests(record, residuals)
+    tests = () if exact else _test_residuals(record, residuals)
     return Comparison(what, record, known, residuals, tests, tuple(notes))
 
 
@@ -154,7 +154,7 @@ def _simulate(record: Record, loop: Loop, prediction: Prediction) -> Curve:
 
     Once more with noise of the size found in the one-step errors, to see what it makes of it.
     """
-    if loop.controller is None and growth_rate(loop) > -1e-9:
+    if loop.controller is None and compute_growth_rate(loop) > -1e-9:
         raise ModelCannotRun(
             "the plant is not stable and the controller is unknown; an open-loop simulation "
             "would drift without bound. Give the loop its controller"
@@ -173,7 +173,7 @@ def _simulate(record: Record, loop: Loop, prediction: Prediction) -> Curve:
         driven.append((injected, 1))
     # Through a curved law noise moves the mean as well, and that is its doing too.
     by_noise = float(np.sqrt(np.mean(noisy[np.isfinite(y)] ** 2)))
-    return _curve(CLOSED_LOOP if loop.controller else OPEN_LOOP, record, y, driven, by_noise)
+    return _judge_curve(CLOSED_LOOP if loop.controller else OPEN_LOOP, record, y, driven, by_noise)
 
 
 def _run_with_noise(simulator: Simulator, stretch: Stretch, prediction: Prediction) -> Array:
@@ -190,12 +190,12 @@ def _run_with_noise(simulator: Simulator, stretch: Stretch, prediction: Predicti
         return unknown
 
 
-def _sampled(model: Any, record: Record, delay: float) -> tuple[Array, Array]:
+def _sample_model(model: Any, record: Record, delay: float) -> tuple[Array, Array]:
     """Return the polynomials in z of a continuous model, its input held and late."""
     if delay and record.hold != "zoh":
         model, delay = model.with_delay(), 0.0
     a, b, c, d = to_state_matrices(model)
-    motion = flow(a, b[:, 0], c[0], record.dt, record.hold, delay)
+    motion = discretize_model(a, b[:, 0], c[0], record.dt, record.hold, delay)
     columns = np.column_stack([column for *_, column in motion.inputs])
     paths, den = to_polynomials(motion.f, columns, motion.c[None], np.zeros((1, columns.shape[1])))
     late = max(lag for _, lag, _ in motion.inputs)
@@ -214,13 +214,13 @@ def _compare_model(record: Record, model: Any, horizon: int | None) -> Compariso
             f"the model is sampled at {dt:g} s, the record at {record.dt:g} s; fit or sample the "
             "model at the record's period"
         )
-    poles = ", ".join(number(p, 4) for p in model.poles())
+    poles = ", ".join(write_number(p, 4) for p in model.poles())
     what = f"{model.name}: poles {poles or 'none'}"
-    delay = delay_of(model)
+    delay = read_delay(model)
     if delay:
-        what += f", delay {number(delay, 4)} s"
+        what += f", delay {write_number(delay, 4)} s"
     if not dt:
-        num, den = _sampled(model, record, delay)
+        num, den = _sample_model(model, record, delay)
     else:
         num, den = (np.asarray(p[0][0], float) for p in (model.num, model.den))
     num = np.concatenate([np.zeros(len(den) - len(num)), num]) / den[0]
@@ -243,37 +243,39 @@ def _compare_model(record: Record, model: Any, horizon: int | None) -> Compariso
     stretches = [(a + order, b) for a, b in record.segments() if b - a > order]
     noise = np.eye(1, order + 1)[0]
     if not (isinstance(model, IdentifiedModel) and model.estimate.errors == "equation error"):
-        noise = noise_polynomial(error, stretches, den)
+        noise = fit_noise_polynomial(error, stretches, den)
     white_errors = whiten_errors(error, stretches, noise)
     residuals = np.where(usable, white_errors, np.nan)
-    curves = [_curve(ONE_STEP, record, record.y - residuals, _known_before(record, 1))]
+    curves = [_judge_curve(ONE_STEP, record, record.y - residuals, _list_known_signals(record, 1))]
     roots = np.roots(den)
     # White one-step errors pass through C/A.
     white = float(np.std(residuals[usable]))
     with np.errstate(over="ignore"):
         impulse = signal.lfilter(noise, den, np.eye(1, len(record))[0])
         grown = np.sqrt(np.cumsum(impulse**2))
-    steps = horizon or time_constant(roots, record.dt, record)
+    steps = horizon or find_time_constant(roots, record.dt, record)
     if steps > 1:
-        ahead = y0 + _ahead(y, moved + constant, den, noise, white_errors, steps, usable)
-        known = _known_before(record, steps)
+        ahead = y0 + _predict_arx_ahead(
+            y, moved + constant, den, noise, white_errors, steps, usable
+        )
+        known = _list_known_signals(record, steps)
         curves.append(
-            _curve(
+            _judge_curve(
                 Reproduction("prediction", steps), record, ahead, known, white * grown[steps - 1]
             )
         )
     notes = []
     if np.all(np.abs(roots) < 1 - 1e-9):
-        free = y0 + _arx_free(record, y, moved + constant, den)
-        outside = _known_before(record, 1)
-        curves.append(_curve(OPEN_LOOP, record, free, outside, white * grown[-1]))
+        free = y0 + _simulate_arx(record, y, moved + constant, den)
+        outside = _list_known_signals(record, 1)
+        curves.append(_judge_curve(OPEN_LOOP, record, free, outside, white * grown[-1]))
     else:
         notes.append("an unstable model is not simulated open loop; put it into a Loop with the "
                      "controller")  # fmt: skip
-    return _comparison(what, record, curves, residuals, notes)
+    return _make_comparison(what, record, curves, residuals, notes)
 
 
-def _arx_free(record: Record, y: Array, driven: Array, den: Array) -> Array:
+def _simulate_arx(record: Record, y: Array, driven: Array, den: Array) -> Array:
     """Iterate the ARX equation over each valid stretch from its first measured outputs."""
     order = len(den) - 1
     free = np.full(len(y), np.nan)
@@ -286,7 +288,7 @@ def _arx_free(record: Record, y: Array, driven: Array, den: Array) -> Array:
     return free
 
 
-def _ahead(
+def _predict_arx_ahead(
     y: Array, driven: Array, den: Array, noise: Array, white: Array, steps: int, usable: Any
 ) -> Array:  # fmt: skip
     """Iterate ``A y = B u + C e`` `steps` times, with the predictions and errors made before."""
@@ -307,7 +309,7 @@ def _ahead(
     return ahead
 
 
-def _curve(
+def _judge_curve(
     how: Reproduction, record: Record, y: Array, signals: Sequence[tuple[Array, int]],
     noise: float = float("nan"),
 ) -> Curve:  # fmt: skip
@@ -321,14 +323,14 @@ def _curve(
     size = float(np.linalg.norm(measured - measured.mean()))
     fit = 100 * (1 - float(np.linalg.norm(error[known])) / size) if size else float("nan")
     rms = float(np.sqrt(np.mean(error[known] ** 2)))
-    follows = 0.0 if fit > EXACT else explained_share(error, signals, known)
+    follows = 0.0 if fit > EXACT else compute_explained_share(error, signals, known)
     share = 1 - follows
     if fit <= EXACT and np.isfinite(noise) and noise < rms:
         share = min(share, (noise / rms) ** 2)
     return Curve(str(how), np.where(known, y, np.nan), fit, rms, follows, share)
 
 
-def _tests(record: Record, residuals: Array) -> tuple[Correlation, ...]:
+def _test_residuals(record: Record, residuals: Array) -> tuple[Correlation, ...]:
     known = np.isfinite(residuals)
     e = np.where(known, residuals, 0.0)
     lags = int(min(25, max(known.sum() // 10, 1)))

@@ -93,7 +93,7 @@ class Comparison(Printed):
         """The comparison in words: the last curve, then the one-step errors."""
         last = self.curves[-1]
         what = self.record.name or "the record"
-        text = f"The {last.label} reproduces {what} with a fit of {_fit(last.fit)}"
+        text = f"The {last.label} reproduces {what} with a fit of {_write_fit(last.fit)}"
         if last.fit <= 0:
             text = f"The {last.label} does not reproduce {what}: it errs by more than y moves"
         if last.fit > EXACT:
@@ -101,21 +101,23 @@ class Comparison(Printed):
         failed = [t for t in self.tests if not t.passed]
         large = [t for t in failed if t.share >= SYSTEMATIC]
         if last.follows >= SYSTEMATIC:
-            text += (f". SOMETHING IS MISSING in the model: {_percent(last.follows)} of the "
+            text += (f". SOMETHING IS MISSING in the model: {_write_percent(last.follows)} of the "
                      "error's variance follows reference or input, as noise does not.")  # fmt: skip
         elif last.noise_share < ENOUGH:
-            text += (". SOMETHING IS MISSING in the model: noise of the size of the one-step "
-                     f"errors explains {_percent(last.noise_share)} of the error's variance; an "
-                     "offset, a drift or a nonlinearity looks like this.")  # fmt: skip
+            text += (
+                ". SOMETHING IS MISSING in the model: noise of the size of the one-step "
+                f"errors explains {_write_percent(last.noise_share)} of the error's variance; an "
+                "offset, a drift or a nonlinearity looks like this."
+            )
         elif large:
             text += ". SOMETHING IS MISSING in the model, or its noise is not white."
         else:
-            text += f". Noise explains {_percent(last.noise_share)} of the error's variance."
+            text += f". Noise explains {_write_percent(last.noise_share)} of the error's variance."
         if large:
-            return text + f" The one-step errors are NOT NOISE ALONE: {_accounts(large)}."
+            return text + f" The one-step errors are NOT NOISE ALONE: {_write_shares(large)}."
         if failed:
             return text + (" The one-step errors are nearly noise alone; what correlates is "
-                           f"certain but small: {_accounts(failed)}.")  # fmt: skip
+                           f"certain but small: {_write_shares(failed)}.")  # fmt: skip
         if self.tests:
             text += " The one-step errors are white and independent of the signals."
         return text
@@ -127,7 +129,8 @@ class Comparison(Printed):
         size = f"RMS error [{unit}]" if unit else "RMS error"
         rows.append(f"  {'curve':<34}{'fit':>10}{size:>18}{'noise explains':>18}")
         rows += [
-            f"  {c.label:<34}{_fit(c.fit):>10}{c.rms:>18.3e}{_percent(c.noise_share):>18}"
+            f"  {c.label:<34}{_write_fit(c.fit):>10}{c.rms:>18.3e}"
+            f"{_write_percent(c.noise_share):>18}"
             for c in self.curves
         ]
         if self.tests:
@@ -136,13 +139,13 @@ class Comparison(Printed):
         for t in self.tests:
             worst = int(np.argmax(np.abs(t.values)))
             largest = f"{t.values[worst]:+.3f} at lag {t.lags[worst]}"
-            share = "" if t.passed else _percent(t.share)
+            share = "" if t.passed else _write_percent(t.share)
             rows.append(f"  {t.name:<34}{'yes' if t.passed else 'NO':>10}{largest:>18}{share:>18}")
         rows += [f"  note: {note}" for note in self.notes]
         return "\n".join([*rows, "  " + self.verdict])
 
 
-def _percent(share: float) -> str:
+def _write_percent(share: float) -> str:
     """Write a share with the digits that say something: 0.3 %, 12 %, 99.7 %."""
     value = 100 * share
     if 99 < value < 99.95:
@@ -150,12 +153,12 @@ def _percent(share: float) -> str:
     return f"{value:.0f} %" if value >= 9.5 or value < 1e-3 else f"{value:.1g} %"
 
 
-def _fit(fit: float) -> str:
+def _write_fit(fit: float) -> str:
     if fit > EXACT:
         return "100 %"
     return f"{fit:.2f} %" if fit < 99.9 else f"{fit:.4f} %"
 
 
-def _accounts(tests: list[Correlation]) -> str:
+def _write_shares(tests: list[Correlation]) -> str:
     """Say how much of the variance each failed test stands for."""
-    return ", ".join(f"{t.name}, {_percent(t.share)} of the variance" for t in tests)
+    return ", ".join(f"{t.name}, {_write_percent(t.share)} of the variance" for t in tests)

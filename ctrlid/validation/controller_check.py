@@ -9,7 +9,7 @@ from .._base.errors import CtrlidError
 from ..data.record import Record
 from ..loop.controller_replay import replay_controller
 from ..loop.loop import Loop
-from .residual_tests import explained_share
+from .residual_tests import compute_explained_share
 
 # At most so many samples are replayed, which tell enough and take seconds.
 MOST = 20_000
@@ -63,27 +63,27 @@ def check_controller(loop: Loop, record: Record) -> list[Fact]:
                       "Limit it before fitting, or correct the limits.", beyond, True))  # fmt: skip
         loop = replace(loop, input_limits=(-np.inf, np.inf))
     try:
-        e, left = _left(loop, part)
+        e, left = _compute_remainder(loop, part)
     except CtrlidError as reason:  # The audit prints a refusal among its facts.
         return [*facts, ("refused", f"the controller cannot be replayed: {reason}.", 1.0, True)]
     if left <= EXACT:
         return [*facts, ("exact", "the logged u is what the stated controller computes from r "
                          "and y.", left, False)]  # fmt: skip
-    shift = _shift(loop, part, left)
+    shift = _find_shift(loop, part, left)
     if shift is not None:
         words, moved, remains = shift
         facts.append(("late", f"{words}: so shifted, the controller explains "
                       f"{100 * (1 - remains):.4g} % of u, as logged {100 * (1 - left):.4g} %. "
                       "Shift the channel back before fitting.", left, True))  # fmt: skip
         part = moved
-        e, left = _left(loop, part)
+        e, left = _compute_remainder(loop, part)
         if left <= EXACT:
             return facts
-    facts.append(_remainder(e, left, part))
+    facts.append(_explain_remainder(e, left, part))
     return facts
 
 
-def _left(loop: Loop, record: Record) -> tuple[Any, float]:
+def _compute_remainder(loop: Loop, record: Record) -> tuple[Any, float]:
     """Return what the controller leaves of u, and its share of the variance."""
     e = record.u - replay_controller(loop, record)
     counts = record.valid if record.valid.sum() > 1 else np.ones(record.n, bool)
@@ -91,7 +91,7 @@ def _left(loop: Loop, record: Record) -> tuple[Any, float]:
     return e, float(np.mean(e[counts] ** 2)) / max(spread, 1e-300)
 
 
-def _moved(record: Record, u: int, y: int) -> Record:
+def _shift_channels(record: Record, u: int, y: int) -> Record:
     """Return the record with u and y taken so many samples later than r."""
     a, b = max(0, -u, -y), record.n - max(0, u, y)
     cut = record[a:b]
@@ -99,35 +99,35 @@ def _moved(record: Record, u: int, y: int) -> Record:
                    valid=record.valid[a + u : b + u] & record.valid[a + y : b + y])  # fmt: skip
 
 
-def _shift(loop: Loop, record: Record, left: float) -> tuple[str, Record, float] | None:
+def _find_shift(loop: Loop, record: Record, left: float) -> tuple[str, Record, float] | None:
     """Try u and y earlier and later; return the shift that explains far more, in words."""
     trial = record[:TRIAL]
-    _, base = _left(loop, trial)
+    _, base = _compute_remainder(loop, trial)
     shifts = [(k, 0) for k in STEPS] + [(0, k) for k in STEPS] + [(k, k) for k in STEPS]
-    tried = [(_left(loop, _moved(trial, u, y))[1], u, y) for u, y in shifts]
+    tried = [(_compute_remainder(loop, _shift_channels(trial, u, y))[1], u, y) for u, y in shifts]
     best = min(left_over for left_over, _, _ in tried)
     if best > CLEARLY * min(base, left):
         return None
     # Around a constant reference a late u and an early y are the same; u is the likelier one.
     alike = [(u, y) for left_over, u, y in tried if left_over <= 2 * best + EXACT]
     u, y = alike[0]
-    words = " or ".join(_late(*shift) for shift in alike)
-    return words, _moved(record, u, y), best
+    words = " or ".join(_describe_shift(*shift) for shift in alike)
+    return words, _shift_channels(record, u, y), best
 
 
-def _late(u: int, y: int) -> str:
+def _describe_shift(u: int, y: int) -> str:
     """Say which channel is late."""
     k, late = abs(u or y), "late" if (u or y) > 0 else "early"
     if u and y:
-        return f"r is logged {_count(k)} {'early' if late == 'late' else 'late'}"
-    return f"{'u' if u else 'y'} is logged {_count(k)} {late}"
+        return f"r is logged {_write_count(k)} {'early' if late == 'late' else 'late'}"
+    return f"{'u' if u else 'y'} is logged {_write_count(k)} {late}"
 
 
-def _count(k: int) -> str:
+def _write_count(k: int) -> str:
     return f"{('one', 'two', 'three')[k - 1]} sample{'s' if k > 1 else ''}"
 
 
-def _remainder(e: Any, left: float, record: Record) -> Fact:
+def _explain_remainder(e: Any, left: float, record: Record) -> Fact:
     """Say what the part of u is that does not come from the controller."""
     assert record.r is not None
     unit = record.units.get("u", "")
@@ -141,7 +141,7 @@ def _remainder(e: Any, left: float, record: Record) -> Fact:
             return ("injected", f"besides the controller's part, u contains an injected signal of "
                     f"RMS {rms} that runs like the channel {name!r}.", left, False)  # fmt: skip
     moving = [(s, 0) for s in (record.y, record.r) if np.ptp(s[record.valid]) > 0]
-    follows = explained_share(e, moving, record.valid, lags=10)
+    follows = compute_explained_share(e, moving, record.valid, lags=10)
     if follows > FOLLOWS:
         return ("other", f"the stated controller leaves {100 * left:.3g} % of u unexplained (RMS "
                 f"{rms}), and {100 * follows:.2g} % of that follows r and y: gains or structure "

@@ -26,7 +26,7 @@ NOTHING = 1e-7
 # A long regression leaves this share of the standard deviation of a signal without noise.
 ROUNDING = 1e-11
 # An exact controller is sought with at most so many past samples.
-LAW = 6
+EXACT_LAGS = 6
 # If y takes away all but this share of what r and past u leave of u, u is computed from y.
 TELLING = 0.01
 
@@ -119,23 +119,29 @@ def check_feedback(record: Record) -> FeedbackCheck:
         same = np.corrcoef(record.r[record.valid], record.u[record.valid])[0, 1] ** 2
         if same < 1 - NOTHING:
             signals["r"] = record.r
-    if "r" in signals and (said := _law(signals, record.valid, order, record.hold == "zoh")):
+    if "r" in signals and (
+        said := _test_short_law(signals, record.valid, order, record.hold == "zoh")
+    ):
         return said
-    e, rows = _left(signals, record.valid, "y", {"y": (1, order), "u": (1, order)})
+    e, rows = _compute_residual(signals, record.valid, "y", {"y": (1, order), "u": (1, order)})
     if np.std(e[rows]) <= ROUNDING * np.std(record.y[rows]):
-        return _exact(signals, record.valid, int(record.hold == "zoh"))
+        return _decide_without_noise(signals, record.valid, int(record.hold == "zoh"))
     past = {"u": (1, order + LAGS)} | ({"r": (0, order)} if "r" in signals else {})
-    w, rows = _left(signals, record.valid, "u", past, robust=True)
+    w, rows = _compute_residual(signals, record.valid, "u", past, robust=True)
     good = np.zeros(record.n, dtype=bool)
     good[rows] = True
     if np.std(w[rows]) <= NOTHING * np.std(record.u[rows]):
         return FeedbackCheck(False, 1.0, np.zeros(0, int), np.zeros(0),
                              "No feedback found: u follows from its own past alone.")  # fmt: skip
     test = cross_correlation(w, e, good, "y", lags=LAGS, first=0)
-    p = _chance(test)
+    p = _compute_p_value(test)
     if record.hold == "foh":
-        later = _chance(cross_correlation(w, e, good, "y", lags=LAGS, first=1))
-        p = later if _at_once(signals, record.valid, w, e, order) else min(1.0, 2 * min(p, later))
+        later = _compute_p_value(cross_correlation(w, e, good, "y", lags=LAGS, first=1))
+        p = (
+            later
+            if _is_tie_of_plant(signals, record.valid, w, e, order)
+            else min(1.0, 2 * min(p, later))
+        )
     closed = p < LEVEL
     if closed:
         worst = int(np.argmax(np.abs(test.values)))
@@ -148,13 +154,15 @@ def check_feedback(record: Record) -> FeedbackCheck:
     return FeedbackCheck(closed, p, test.lags, test.values, text)
 
 
-def _chance(test: Correlation) -> float:
+def _compute_p_value(test: Correlation) -> float:
     """Return the chance of all correlations together, and not less than that of the largest."""
     largest = float(np.max(np.abs(test.values))) / test.band * stats.norm.ppf(0.995)
     return float(max(test.p_value, min(1.0, 2 * len(test.lags) * stats.norm.sf(largest))))
 
 
-def _law(signals: dict[str, Array], valid: Any, order: int, held: bool) -> FeedbackCheck | None:
+def _test_short_law(
+    signals: dict[str, Array], valid: Any, order: int, held: bool
+) -> FeedbackCheck | None:
     """Return the answer if a short law of r and y gives u, and none of r alone comes near.
 
     A held input is no function of y up to now if it was made without it, so there an exact law
@@ -163,11 +171,11 @@ def _law(signals: dict[str, Array], valid: Any, order: int, held: bool) -> Feedb
 
     def rest(keys: str, n: int) -> float:
         past = {k: (int(k == "u"), n) for k in keys if n or k != "u"}
-        left, rows = _left(signals, valid, "u", past)
+        left, rows = _compute_residual(signals, valid, "u", past)
         return float(np.std(left[rows]))
 
     least, size = rest("ur", order), float(np.std(signals["u"][valid]))
-    for n in range(LAW // 2 + 1):
+    for n in range(EXACT_LAGS // 2 + 1):
         left = rest("uyr", n)
         shorter = held and left <= min(NOTHING * size, TELLING * rest("ur", n))
         if shorter or (least > NOTHING * size and left <= TELLING * least):
@@ -180,20 +188,20 @@ def _law(signals: dict[str, Array], valid: Any, order: int, held: bool) -> Feedb
     return None
 
 
-def _at_once(signals: dict[str, Array], valid: Any, w: Array, e: Array, order: int) -> bool:
+def _is_tie_of_plant(signals: dict[str, Array], valid: Any, w: Array, e: Array, order: int) -> bool:
     """Return whether the plant, and not a controller, may tie u to y of the same sample.
 
     An input that runs straight between the samples moves y within its own period, but a plant
     goes on in the same direction and further in the next.
     """
     ahead = {"y": (2, order + 1), "u": (2, order + 1)}
-    next_e, rows = _left(signals, valid, "y", ahead)
+    next_e, rows = _compute_residual(signals, valid, "y", ahead)
     now = float(np.mean(w[rows] * e[rows]))
     next_ = float(np.mean(w[rows - 1] * next_e[rows]))
     return now * next_ > 0 and abs(next_) > abs(now)
 
 
-def _left(
+def _compute_residual(
     signals: dict[str, Array],
     valid: Any,
     target: str,
@@ -215,60 +223,62 @@ def _left(
     size = np.linalg.norm(table, axis=0)
     table = table[:, size > 0] / size[size > 0]
     goal = signals[target][rows] - mean[target]
-    left = goal - table @ _solve(table, goal)
+    left = goal - table @ _solve_least_squares(table, goal)
     for _ in range(4 if robust else 0):
         usual = 3 * 1.4826 * float(np.median(np.abs(left)))
         if usual <= NOTHING * float(np.std(goal)):
             break
         weight = np.sqrt(usual / np.maximum(np.abs(left), usual))
-        beta = _solve(table * weight[:, None], goal * weight)
+        beta = _solve_least_squares(table * weight[:, None], goal * weight)
         left = goal - table @ beta
         goal = table @ beta + np.clip(left, -usual, usual)
     # A clipped signal is no longer uncorrelated with the past, so that it is regressed once more.
     if robust:
-        left = goal - table @ _solve(table, goal)
+        left = goal - table @ _solve_least_squares(table, goal)
     out = np.zeros(len(valid))
     out[rows] = left
     return out, rows
 
 
-def _solve(table: Array, goal: Array) -> Array:
+def _solve_least_squares(table: Array, goal: Array) -> Array:
     return np.asarray(linalg.lstsq(table, goal, cond=1e-13, lapack_driver="gelsy")[0], dtype=float)
 
 
-def _order(signals: dict[str, Array], valid: Any, keys: str, target: str, now: int) -> int:
-    """Return how many past samples make a signal an exact function, or a number beyond `LAW`."""
-    for order in range(LAW + 1):
+def _find_exact_order(
+    signals: dict[str, Array], valid: Any, keys: str, target: str, now: int
+) -> int:
+    """Return how many past samples make a signal an exact function; beyond `EXACT_LAGS`: none."""
+    for order in range(EXACT_LAGS + 1):
         past = {k: (now if k == target or target == "y" else 0, order) for k in keys}
         past = {k: (1 if k == target else first, last) for k, (first, last) in past.items()}
-        left, rows = _left(signals, valid, target, past)
+        left, rows = _compute_residual(signals, valid, target, past)
         if np.std(left[rows]) <= NOTHING * np.std(signals[target][rows]):
             return order
-    return LAW + 1
+    return EXACT_LAGS + 1
 
 
-def _exact(signals: dict[str, Array], valid: Any, now: int) -> FeedbackCheck:
+def _decide_without_noise(signals: dict[str, Array], valid: Any, now: int) -> FeedbackCheck:
     """Decide without noise, by the laws that hold exactly."""
 
     def answer(closed: bool, text: str) -> FeedbackCheck:
         return FeedbackCheck(closed, 0.0 if closed else 1.0, np.zeros(0, int), np.zeros(0), text)
 
     if "r" in signals:
-        with_y = _order(signals, valid, "uyr", "u", now)
-        without = _order(signals, valid, "ur", "u", now)
+        with_y = _find_exact_order(signals, valid, "uyr", "u", now)
+        without = _find_exact_order(signals, valid, "ur", "u", now)
         if with_y < without:
             return answer(True, "Closed loop: there is no noise, and u is an exact function of y "
                           f"and r with {with_y} past samples, while r alone does not give it as "
                           "simply.")  # fmt: skip
-    order = _order(signals, valid, "yu", "y", now)
-    if 0 < order <= LAW and _unstable(signals, valid, order, now):
+    order = _find_exact_order(signals, valid, "yu", "y", now)
+    if 0 < order <= EXACT_LAGS and _is_unstable(signals, valid, order, now):
         return answer(True, "Closed loop: there is no noise, and the plant is unstable, yet y "
                       "stays bounded.")  # fmt: skip
     return answer(False, "No feedback found: there is no noise in y that could show in u, and no "
                   "law that needs y. Without noise this is no proof of an open loop.")  # fmt: skip
 
 
-def _unstable(signals: dict[str, Array], valid: Any, order: int, now: int) -> bool:
+def _is_unstable(signals: dict[str, Array], valid: Any, order: int, now: int) -> bool:
     """Return whether the exact difference equation has a pole clearly outside the unit circle."""
     rows = np.flatnonzero(whole_past(valid, order))[:MOST]
     y, u = signals["y"], signals["u"]
@@ -276,6 +286,6 @@ def _unstable(signals: dict[str, Array], valid: Any, order: int, now: int) -> bo
     columns += [u[rows - k] - u[rows[0]] for k in range(now, order + 1)]
     table = np.column_stack([*columns, np.ones(len(rows))])
     size = np.linalg.norm(table, axis=0)
-    beta = _solve(table / size, y[rows] - y[rows[0]]) / size
+    beta = _solve_least_squares(table / size, y[rows] - y[rows[0]]) / size
     poles = np.roots(np.concatenate([[1.0], -beta[:order]]))
     return bool(np.max(np.abs(poles)) > 1 + 1e-4)

@@ -35,7 +35,7 @@ def whiten_errors(equation_errors: Array, segments: list[tuple[int, int]], noise
     return white
 
 
-def noise_polynomial(
+def fit_noise_polynomial(
     equation_errors: Array, segments: list[tuple[int, int]], den: Array
 ) -> Array:  # fmt: skip
     """Return the polynomial C of a model's order that leaves the smallest one-step errors.
@@ -68,16 +68,16 @@ def noise_polynomial(
     size = max(float(np.std(equation_errors)), 1e-300)
 
     def errors(tail: Array) -> Array:
-        white = whiten_errors(equation_errors, head, _stable(np.concatenate([[1.0], tail])))
+        white = whiten_errors(equation_errors, head, _reflect_roots(np.concatenate([[1.0], tail])))
         return np.asarray(np.concatenate([white[a:b] for a, b in head]) / size, dtype=float)
 
-    starts = [_stable(den), np.eye(1, order + 1)[0]]
+    starts = [_reflect_roots(den), np.eye(1, order + 1)[0]]
     best = min(starts, key=lambda c: float(np.sum(errors(c[1:]) ** 2)))
     found = optimize.least_squares(errors, best[1:], x_scale="jac", max_nfev=40)
-    return _stable(np.concatenate([[1.0], found.x]))
+    return _reflect_roots(np.concatenate([[1.0], found.x]))
 
 
-def _stable(polynomial: Array) -> Array:
+def _reflect_roots(polynomial: Array) -> Array:
     """Reflect roots into the unit circle, and keep a hair's breadth from it."""
     roots = reflect_into_circle(np.roots(polynomial), 0.9995)
     return np.asarray(np.real(np.poly(roots)), dtype=float)

@@ -28,7 +28,7 @@ ITERATIONS = 20
 COSTS = 0.1
 # Noise of this share of y's standard deviation is added, since a long regression on noise-free
 # signals has no unique answer.
-WHISPER = 1e-6
+ADDED_NOISE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,23 +154,25 @@ def select_order(
     """
     if not isinstance(record, Record):
         raise CtrlidError(f"select_order needs a Record; given {type(record).__name__}")
-    grids = [_whole(name, values) for name, values in (("na", na), ("nb", nb), ("nk", nk))]
+    grids = [
+        _check_whole_numbers(name, values) for name, values in (("na", na), ("nb", nb), ("nk", nk))
+    ]
     most = max(grids[0]) + max(grids[1]) + max(grids[2])
     cut = int(SHARE * record.n)
     if record.valid.any():
         for key in ("u", "y"):
             if np.ptp(getattr(record, key)[record.valid]) == 0:
                 raise CtrlidError(f"{key} is constant: no structure shows. Excite the loop")
-    length = _length(record, cut, most)
-    long = _regress(record, 0, cut, length)
-    judge = _rows(record, cut, record.n, length)
-    table, goal = _table(record, judge, length)
+    length = _choose_length(record, cut, most)
+    long = _fit_long_regression(record, 0, cut, length)
+    judge = _find_rows(record, cut, record.n, length)
+    table, goal = _make_table(record, judge, length)
     reference = float(np.std(goal - table @ long.eta)) if len(judge) > 10 else np.nan
     found = []
     for a in grids[0]:
         for b in grids[1]:
             for d in grids[2]:
-                theta, misfit, eta = _reduce(long, a, b, d)
+                theta, misfit, eta = _fit_structure(long, a, b, d)
                 left = goal - table[:, :-1] @ eta
                 error = float(np.std(left)) / reference if len(judge) > 10 else np.nan
                 found.append((a, b, d, misfit, length - a - b, error, theta))
@@ -183,7 +185,7 @@ def select_order(
     )  # fmt: skip
     best = rows[0]
     return OrderChoice(best.na, best.nb, best.nk, tuple(rows), length,
-                       _words(rows, unit, length))  # fmt: skip
+                       _write_choice(rows, unit, length))  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,35 +199,37 @@ class _Long:
     length: int
 
 
-def _whole(name: str, values: Any) -> list[int]:
+def _check_whole_numbers(name: str, values: Any) -> list[int]:
     listed = list(values) if isinstance(values, Iterable) else [values]
     if not listed or not all(isinstance(v, Integral) and int(v) >= 1 for v in listed):
         raise CtrlidError(f"{name} takes whole numbers from 1, as range(1, 5); given {listed}")
     return sorted({int(v) for v in listed})
 
 
-def _rows(record: Record, start: int, stop: int, length: int) -> Any:
+def _find_rows(record: Record, start: int, stop: int, length: int) -> Any:
     """Return the samples whose past counts, not more than are needed."""
     return start + np.flatnonzero(whole_past(record.valid[start:stop], length))[:ROWS]
 
 
-def _table(record: Record, rows: Any, length: int) -> tuple[Array, Array]:
+def _make_table(record: Record, rows: Any, length: int) -> tuple[Array, Array]:
     y, u = (s - np.mean(s[record.valid]) for s in (record.y, record.u))
     spread = float(np.std(y[record.valid]))
-    y = y + WHISPER * spread * np.random.default_rng(1).standard_normal(len(y))
+    y = y + ADDED_NOISE * spread * np.random.default_rng(1).standard_normal(len(y))
     past = [-y[rows - k] for k in range(1, length + 1)] + [
         u[rows - k] for k in range(1, length + 1)
     ]
     return np.column_stack([*past, np.ones(len(rows))]), y[rows]
 
 
-def _regress(record: Record, start: int, stop: int, length: int, reach: int = 0) -> _Long:
-    rows = _rows(record, start, stop, max(length, reach))
+def _fit_long_regression(
+    record: Record, start: int, stop: int, length: int, reach: int = 0
+) -> _Long:
+    rows = _find_rows(record, start, stop, max(length, reach))
     if len(rows) < 4 * length + 20:
         raise CtrlidError(f"select_order needs {4 * length + 20} rows for {length} lags; the first "
                           f"two thirds have {len(rows)}. Record longer, or try fewer "
                           "orders")  # fmt: skip
-    table, goal = _table(record, rows, length)
+    table, goal = _make_table(record, rows, length)
     size = np.maximum(np.linalg.norm(table, axis=0), 1e-300)
     _, values, vt = np.linalg.svd(np.linalg.qr(table / size, mode="r"))
     values = np.maximum(values, 1e-13 * values[0])
@@ -238,9 +242,9 @@ def _regress(record: Record, start: int, stop: int, length: int, reach: int = 0)
     return _Long(eta, variance * inverse[:-1, :-1], variance, len(rows), length)
 
 
-def _length(record: Record, cut: int, most: int) -> int:
+def _choose_length(record: Record, cut: int, most: int) -> int:
     """Choose the lags of the long regression by the Bayesian criterion, with room to spare."""
-    room = len(_rows(record, 0, cut, 1))
+    room = len(_find_rows(record, 0, cut, 1))
     longest = min(LONGEST, room // 12)
     if longest < most + 2:
         raise CtrlidError(f"select_order needs about {12 * (most + 2) * 3 // 2} samples in "
@@ -249,27 +253,27 @@ def _length(record: Record, cut: int, most: int) -> int:
     for n in sorted({most + 2, 10, 15, 20, 30, 40, longest}):
         if most + 2 <= n <= longest:
             # All lengths are compared on the same rows.
-            long = _regress(record, 0, cut, n, reach=longest)
+            long = _fit_long_regression(record, 0, cut, n, reach=longest)
             scores[n] = long.rows * np.log(long.variance) + 2 * bayesian_penalty(2 * n, long.rows)
     best = min(scores, key=lambda n: scores[n])
     return min(longest, max(best + 5, most + 4))
 
 
-def _shift(p: Array, k: int, length: int) -> Array:
+def _delay_polynomial(p: Array, k: int, length: int) -> Array:
     """Return coefficients of lags 1 to length of a polynomial from lag 0, delayed by k."""
     out = np.zeros(length + 1)
     out[k : length + 1] = p[: max(length + 1 - k, 0)]
     return out[1:]
 
 
-def _reduce(long: _Long, na: int, nb: int, nk: int) -> tuple[Array, float, Array]:
+def _fit_structure(long: _Long, na: int, nb: int, nk: int) -> tuple[Array, float, Array]:
     """Return the coefficients of a structure, its distance, and the long regression bent to it."""
     n = long.length
     A = np.concatenate([[1.0], long.eta[:n]])
     B = np.concatenate([[0.0], long.eta[n : 2 * n]])
-    Q = np.column_stack([_shift(B, i, n) for i in range(1, na + 1)]
-                        + [-_shift(A, nk + j, n) for j in range(nb)])  # fmt: skip
-    start = _shift(B, 0, n)
+    Q = np.column_stack([_delay_polynomial(B, i, n) for i in range(1, na + 1)]
+                        + [-_delay_polynomial(A, nk + j, n) for j in range(nb)])  # fmt: skip
+    start = _delay_polynomial(B, 0, n)
     theta, misfit, bent = np.zeros(na + nb), np.inf, long.eta[: 2 * n]
     scale = np.sqrt(np.diag(long.covariance))
     half = np.linalg.cholesky(long.covariance / np.outer(scale, scale) + 1e-12 * np.eye(2 * n))
@@ -294,7 +298,7 @@ def _reduce(long: _Long, na: int, nb: int, nk: int) -> tuple[Array, float, Array
     return theta, misfit, bent
 
 
-def _words(rows: list[OrderRow], unit: float, length: int) -> str:
+def _write_choice(rows: list[OrderRow], unit: float, length: int) -> str:
     best = rows[0]
     text = (f"Chosen: na={best.na}, nb={best.nb}, nk={best.nk}, held against {length} lags of "
             f"y and u; its one-step error on the last third is {best.held_out:.3f} times that of "

@@ -11,7 +11,7 @@ import numpy as np
 from .._base.errors import CtrlidError
 from .._base.text import Printed
 from ..data.record import SIGNALS, Record
-from ..data.several_records import model_and_data
+from ..data.several_records import order_model_and_data
 from ..data.validity import find_runs
 from ..loop.loop import Loop
 from . import signal_defects as defects
@@ -100,7 +100,7 @@ class Audit(Printed):
         if not self.findings:
             return "Audit: nothing to say against this record."
         bad = len(self.harmful)
-        rows = [f"Audit: {_count(len(self.findings))}, {bad or 'none'} harmful"]
+        rows = [f"Audit: {_write_count(len(self.findings))}, {bad or 'none'} harmful"]
         for f in self.findings:
             kind = f.kind.upper() if f.harmful else f.kind
             rows.append(f"  {kind}{f' of {f.channel}' if f.channel else ''}: {f.text}")
@@ -151,7 +151,7 @@ def audit(record: Record, loop: Loop | None = None) -> Audit:
     >>> [f.kind for f in cid.audit(stuck).harmful]
     ['saturation']
     """
-    loop, record = model_and_data(loop, record)
+    loop, record = order_model_and_data(loop, record)
     if not isinstance(record, Record) or not (loop is None or isinstance(loop, Loop)):
         raise CtrlidError(
             "audit needs a Record and, if you like, its Loop; given "
@@ -164,24 +164,30 @@ def audit(record: Record, loop: Loop | None = None) -> Audit:
         still = dict.fromkeys(SIGNALS, (0.0, 0.0, 0.0, 0.0))
         return Audit((few,), MappingProxyType(dict.fromkeys(SIGNALS, 0.0)), (0, 0),
                      MappingProxyType(still))  # fmt: skip
-    look = _Look(record, () if loop is None else loop.input_limits)
+    checks = _RecordChecks(record, () if loop is None else loop.input_limits)
     findings = [
-        *look.length(), *look.constant(), *look.limits(), *look.steps(), *look.gaps(),
-        *look.outliers(), *look.wander(), *look.repetition(),
-    ]  # fmt: skip
+        *checks.check_length(),
+        *checks.find_constant(),
+        *checks.find_limits(),
+        *checks.find_steps(),
+        *checks.find_gaps(),
+        *checks.find_outliers(),
+        *checks.find_drift(),
+        *checks.find_repetition(),
+    ]
     injected = False
     if loop is not None:
-        findings += look.place(loop)
+        findings += checks.check_operating_point(loop)
         for kind, text, size, harmful in check_controller(loop, record):
             injected = injected or kind == "injected"
-            findings.append(AuditFinding("controller", "u", text, size, look.whole, harmful))
-    findings += look.excitation(injected)
+            findings.append(AuditFinding("controller", "u", text, size, checks.whole, harmful))
+    findings += checks.check_excitation(injected)
     findings.sort(key=lambda f: not f.harmful)
-    return Audit(tuple(findings), MappingProxyType(look.quantum), look.repeats,
-                 MappingProxyType(look.saturated))  # fmt: skip
+    return Audit(tuple(findings), MappingProxyType(checks.quantum), checks.repeats,
+                 MappingProxyType(checks.saturated))  # fmt: skip
 
 
-class _Look:
+class _RecordChecks:
     """The checks of one record; later ones use what earlier ones found."""
 
     def __init__(self, record: Record, limits: tuple[float, ...]) -> None:
@@ -189,23 +195,23 @@ class _Look:
         self.signals = {k: v for k in SIGNALS if (v := getattr(record, k)) is not None}
         self.whole = (0, record.n)
         self.quantum = dict.fromkeys(SIGNALS, 0.0) | {
-            k: defects.grid_step(v[self.valid])
+            k: defects.find_grid_step(v[self.valid])
             for k, v in self.signals.items()
-            if k == "y" or not defects.find_held(v[self.valid])
+            if k == "y" or not defects.is_held(v[self.valid])
         }
         self.saturated = dict.fromkeys(SIGNALS, (0.0, 0.0, 0.0, 0.0))
         self.at_limit = self.repeated = np.zeros(record.n, dtype=bool)
         self.repeats = (0, 0)
 
-    def show(self, key: str, value: float) -> str:
+    def write_value(self, key: str, value: float) -> str:
         """Write a value of a signal with its unit."""
         unit = self.record.units.get(key, "")
         return f"{value:.4g}{'' if unit in ('', '1') else ' ' + unit}"
 
-    def spread(self, key: str) -> float:
+    def compute_spread(self, key: str) -> float:
         return float(np.std(self.signals[key][self.valid]))
 
-    def length(self) -> list[AuditFinding]:
+    def check_length(self) -> list[AuditFinding]:
         count = int(np.count_nonzero(self.valid))
         longest = max(b - a for a, b in self.record.segments())
         if count >= FEW and longest >= STRETCH:
@@ -214,23 +220,26 @@ class _Look:
                 f"coefficients needs {FEW} and more. Record longer.")  # fmt: skip
         return [AuditFinding("too few samples", "", text, count, self.whole, harmful=True)]
 
-    def constant(self) -> list[AuditFinding]:
+    def find_constant(self) -> list[AuditFinding]:
         out = []
         driver = self.signals.get("r", self.signals["u"])[self.valid]
         for key in ("u", "y"):
             v = self.signals[key][self.valid]
             value, long = float(v[0]), ""
-            if np.ptp(v) > defects.rounding_of(v):
+            if np.ptp(v) > defects.estimate_rounding(v):
                 share, value = defects.find_stuck(v, driver) if key == "y" else (0.0, 0.0)
                 if not share:
                     continue
                 long = f" for {100 * share:.4g} % of the samples, whatever moves it"
-            text = f"{key} stays at {self.show(key, value)}{long}: nothing can be learnt from it."
+            text = (
+                f"{key} stays at {self.write_value(key, value)}{long}: nothing can be learnt "
+                "from it."
+            )
             kind = "constant signal"
             out.append(AuditFinding(kind, key, text, 0.0, self.whole, harmful=True))
         return out
 
-    def limits(self) -> list[AuditFinding]:
+    def find_limits(self) -> list[AuditFinding]:
         out = []
         for key in ("u", "y"):
             v = self.signals[key]
@@ -246,7 +255,7 @@ class _Look:
             if not mask.any():
                 continue
             ends = " and ".join(
-                f"{self.show(key, value)} for {100 * share:.2g} % of the samples"
+                f"{self.write_value(key, value)} for {100 * share:.2g} % of the samples"
                 for share, value in zip(shares, values, strict=True)
                 if share
             )
@@ -266,23 +275,22 @@ class _Look:
                                     (int(where[0]), int(where[-1]) + 1), key == "y"))  # fmt: skip
         return out
 
-    def steps(self) -> list[AuditFinding]:
+    def find_steps(self) -> list[AuditFinding]:
         out = []
         for key in ("u", "y"):
-            step, spread = self.quantum[key], self.spread(key)
+            step, spread = self.quantum[key], self.compute_spread(key)
             # Rounding far below everything else is how numbers are written, and no news.
             if step < 1e-3 * spread or not spread:
                 continue
             ratio = step / spread
-            text = (
-                f"{key} moves in steps of {self.show(key, step)}, {100 * ratio:.2g} % of its spread"
-            )
+            size = self.write_value(key, step)
+            text = f"{key} moves in steps of {size}, {100 * ratio:.2g} % of its spread"
             bad = key == "y" and ratio > COARSE
             text += ": too coarse to follow the motion. Excite more strongly." if bad else "."
             out.append(AuditFinding("quantization", key, text, ratio, self.whole, bad))
         return out
 
-    def gaps(self) -> list[AuditFinding]:
+    def find_gaps(self) -> list[AuditFinding]:
         y, u = self.record.y, self.record.u
         mask = defects.find_repeats(y, self.valid, self.quantum["y"], self.at_limit)
         self.repeated = mask
@@ -305,19 +313,21 @@ class _Look:
         return [AuditFinding("dropped samples", "y", text, share,
                              (int(first[0]), int(stop[-1])), harmful=True)]  # fmt: skip
 
-    def outliers(self) -> list[AuditFinding]:
+    def find_outliers(self) -> list[AuditFinding]:
         height = defects.find_spikes(self.record.y, self.valid, self.quantum["y"])
         at = np.flatnonzero(np.where(self.repeated, 0.0, height))
         if not at.size:
             return []
         worst = at[np.argmax(np.abs(height[at]))]
-        text = (f"{at.size} isolated spikes of y, the largest {self.show('y', height[worst])} at "
-                f"sample {worst}: no plant moves there and back within a sample. Mark them with "
-                "valid=.")  # fmt: skip
+        text = (
+            f"{at.size} isolated spikes of y, the largest {self.write_value('y', height[worst])} "
+            f"at sample {worst}: no plant moves there and back within a sample. Mark them with "
+            "valid=."
+        )
         return [AuditFinding("outliers", "y", text, at.size / self.record.n,
                              (int(at[0]), int(at[-1]) + 1), harmful=True)]  # fmt: skip
 
-    def wander(self) -> list[AuditFinding]:
+    def find_drift(self) -> list[AuditFinding]:
         y, u = self.record.y[self.valid], self.record.u[self.valid]
         r = None if self.record.r is None else self.record.r[self.valid]
         causes = [u, np.cumsum(u - np.mean(u))] if r is None else [r]
@@ -325,19 +335,22 @@ class _Look:
         out = []
         if p < SURE and change > scatter > 0:
             ratio = change / scatter
-            text = (f"y drifts by {self.show('y', change)} over the record, {ratio:.2g} times its "
-                    f"scatter, and {'u' if r is None else 'r'} does not explain it. Cut the record "
-                    "into parts and give them as a list: each has its own intercept.")  # fmt: skip
+            text = (
+                f"y drifts by {self.write_value('y', change)} over the record, {ratio:.2g} times "
+                f"its scatter, and {'u' if r is None else 'r'} does not explain it. Cut the record "
+                "into parts and give them as a list: each has its own intercept."
+            )
             out.append(AuditFinding("drift", "y", text, ratio, self.whole, ratio > 2))
         if r is not None:
             mean, sd = float(np.mean(y - r)), float(np.std(y - r))
             if abs(mean) > 0.5 * sd and abs(mean) > 1e-9 * float(np.max(np.abs(y))):
-                text = f"y is on average {self.show('y', mean)} away from r; no integral action?"
+                away = self.write_value("y", mean)
+                text = f"y is on average {away} away from r; no integral action?"
                 out.append(AuditFinding("offset", "y", text, abs(mean) / max(sd, 1e-300),
                                         self.whole))  # fmt: skip
         return out
 
-    def place(self, loop: Loop) -> list[AuditFinding]:
+    def check_operating_point(self, loop: Loop) -> list[AuditFinding]:
         assert loop.at is not None
         y, rest = np.abs(self.signals["y"][self.valid]), abs(loop.at.output)
         ratio = float(np.median(y)) / rest if rest else 0.0
@@ -348,9 +361,9 @@ class _Look:
                 "the channels, or give the loop the operating point of this record.")  # fmt: skip
         return [AuditFinding("operating point", "y", text, ratio, self.whole, harmful=True)]
 
-    def repetition(self) -> list[AuditFinding]:
+    def find_repetition(self) -> list[AuditFinding]:
         r = self.record.r
-        found = defects.period(r) if r is not None else 0
+        found = defects.find_period(r) if r is not None else 0
         if not found:
             return []
         times = self.record.n // found
@@ -360,10 +373,12 @@ class _Look:
                 "over the periods separates noise from response.")  # fmt: skip
         return [AuditFinding("repeats", "r", text, times, self.whole)]
 
-    def excitation(self, injected: bool) -> list[AuditFinding]:
+    def check_excitation(self, injected: bool) -> list[AuditFinding]:
         key = "u" if self.record.r is None else "r"
         v = self.signals[key]
-        moves = (np.abs(np.diff(v)) > defects.rounding_of(v)) & self.valid[1:] & self.valid[:-1]
+        moves = (
+            (np.abs(np.diff(v)) > defects.estimate_rounding(v)) & self.valid[1:] & self.valid[:-1]
+        )
         changes = int(np.count_nonzero(moves))
         kind, size = "too little excitation", float(changes)
         if changes == 0:
@@ -371,7 +386,7 @@ class _Look:
             if injected or key == "u":
                 return []
             text = "r does not change while the record counts, and "
-            share = defects.find_beyond_law(self.record.u, self.record.y, self.valid)
+            share = defects.find_share_beyond_controller(self.record.u, self.record.y, self.valid)
             if share > OWN:
                 text += (f"{100 * share:.2g} % of u is no linear function of y: a signal added to "
                          "u, or noise of the input, is all that excites the loop.")  # fmt: skip
@@ -385,18 +400,18 @@ class _Look:
                     "to average over. Use many steps, as random_binary gives.")  # fmt: skip
             return [AuditFinding(kind, key, text, size, self.whole)]
         a, b = max(self.record.segments(), key=lambda part: part[1] - part[0])
-        if changes > 0.5 * self.record.n and _lines(v[a:b]) == 1 and not injected:
+        if changes > 0.5 * self.record.n and _count_lines(v[a:b]) == 1 and not injected:
             text = (f"{key} is a single sine, which determines two coefficients and no more. Use "
                     "several frequencies, as multisine gives.")  # fmt: skip
             return [AuditFinding(kind, key, text, 2.0, self.whole, harmful=True)]
         return []
 
 
-def _count(n: int) -> str:
+def _write_count(n: int) -> str:
     return f"{n} finding{'s' if n != 1 else ''}"
 
 
-def _lines(v: Any) -> int:
+def _count_lines(v: Any) -> int:
     """Return the number of separate spectral lines of a signal, or 0 if it has a broad spectrum."""
     if len(v) < FEW:
         return 0

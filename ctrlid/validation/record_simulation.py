@@ -9,9 +9,9 @@ from .._base.arrays import Array
 from .._base.errors import ModelCannotRun
 from ..data.record import Record
 from ..estimation.likelihood.filter_data import FEWEST
-from ..loop.controller_replay import controller_output, replay_from_best_state
+from ..loop.controller_replay import replay_from_best_state, run_controller
 from ..loop.controllers import PID
-from ..loop.initial_state import best_start
+from ..loop.initial_state import find_initial_state
 from ..loop.simulation import Simulator
 
 
@@ -27,14 +27,14 @@ class Stretch:
         Reference [output unit]; None without a controller.
     d : ndarray
         What is added to the controller's output [input unit].
-    begin : float
+    start_time : float
         Time of the first sample since the start of the experiment [s].
     """
 
     initial: Array
     r: Array | None
     d: Array
-    begin: float
+    start_time: float
 
     def run(
         self, simulator: Simulator, noise: Sequence[Array] | None = None
@@ -46,7 +46,7 @@ class Stretch:
         CtrlidError
             If the loop leaves the range in which it can be simulated.
         """
-        return simulator.run(self.initial, self.r, self.d, noise, self.begin)
+        return simulator.run(self.initial, self.r, self.d, noise, self.start_time)
 
 
 def long_stretches(record: Record, shortest: int = FEWEST) -> list[slice]:
@@ -55,7 +55,7 @@ def long_stretches(record: Record, shortest: int = FEWEST) -> list[slice]:
 
 
 def prepare_stretch(
-    simulator: Simulator, record: Record, samples: slice, *, begin: float | None = None,
+    simulator: Simulator, record: Record, samples: slice, *, start_time: float | None = None,
     guess: Array | None = None, seek_controller: bool = False, set_point: bool = False,
     follow: bool = False,
 ) -> Stretch:  # fmt: skip
@@ -76,7 +76,7 @@ def prepare_stretch(
         The data.
     samples : slice
         One of its `long_stretches`.
-    begin : float, optional
+    start_time : float, optional
         Time of the record's first sample since the start of the experiment [s]; by default each
         stretch is an experiment of its own.
     guess : ndarray, optional
@@ -123,11 +123,11 @@ def prepare_stretch(
                 "has none; give it r=, a constant for a fixed set-point"
             )
         r = np.full(len(part), loop.point.output)
-        d = part.u - controller_output(loop, part.y, r)
+        d = part.u - run_controller(loop, part.y, r)
     else:
         replayed, state = replay_from_best_state(loop, part)
         # Behind the controller's states stand those of the input: backlash, delayed samples.
         initial[fitted : fitted + len(state)] = state
         d = part.u - replayed
-    time = 0.0 if begin is None else begin + float(record.t[samples.start] - record.start)
-    return Stretch(best_start(simulator, part, r, d, initial, fitted), r, d, time)
+    time = 0.0 if start_time is None else start_time + float(record.t[samples.start] - record.start)
+    return Stretch(find_initial_state(simulator, part, r, d, initial, fitted), r, d, time)

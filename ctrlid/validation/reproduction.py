@@ -8,7 +8,7 @@ import numpy as np
 from ..data.record import Record
 from ..loop.loop import Loop
 from ..loop.period_map import comes_to_rest
-from ..physics.linearization import state_matrices
+from ..physics.linearization import compute_state_matrices
 
 Name = Literal["closed-loop simulation", "open-loop simulation", "prediction"]
 
@@ -41,16 +41,16 @@ def choose_reproduction(loop: Loop, record: Record) -> Reproduction:
     if loop.controller is None and comes_to_rest(loop):
         return OPEN_LOOP
     return Reproduction(
-        "prediction", time_constant(moving_poles(loop), loop.equations().dt, record)
+        "prediction", find_time_constant(compute_moving_poles(loop), loop.equations().dt, record)
     )
 
 
-def moving_poles(loop: Loop) -> Any:
+def compute_moving_poles(loop: Loop) -> Any:
     """Return the poles of a plant in motion, where dry friction does not damp it as at rest."""
-    return np.linalg.eigvals(state_matrices(loop.equations(), loop.point, spread=1e6)[0])
+    return np.linalg.eigvals(compute_state_matrices(loop.equations(), loop.point, spread=1e6)[0])
 
 
-def time_constant(poles: Any, dt: float, record: Record) -> int:
+def find_time_constant(poles: Any, dt: float, record: Record) -> int:
     """Return the slowest unstable, or else the slowest stable, time constant in samples."""
     # A pole at z = 0 is infinitely fast, so that its logarithm is minus infinity.
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -85,7 +85,7 @@ def autocorrelation(e: Array, valid: Any, lags: int = 25, fitted: int = 0) -> Co
     ----------
     Ljung and Box, Biometrika 65 (1978) 297-303.
     """
-    e, n = _centred(e, valid)
+    e, n = _remove_mean(e, valid)
     c = lagged_products(e, e, lags)
     rho = c[1:] / c[0] if c[0] > 0 else np.zeros(lags)
     tau = np.arange(1, lags + 1)
@@ -95,16 +95,16 @@ def autocorrelation(e: Array, valid: Any, lags: int = 25, fitted: int = 0) -> Co
     if c[0] > 0:
         # What the best prediction from this many past residuals would take away.
         whole = linalg.toeplitz(np.concatenate([[1.0], rho[:-1]])) + 1e-12 * np.eye(lags)
-        share = _beyond_chance(float(rho @ np.linalg.solve(whole, rho)), lags / n)
+        share = _subtract_chance(float(rho @ np.linalg.solve(whole, rho)), lags / n)
     return Correlation("residual with its own past", tau, rho, band, p, share)
 
 
-def _beyond_chance(raw: float, chance: float) -> float:
+def _subtract_chance(raw: float, chance: float) -> float:
     """Return a share of variance less what a fit to independent signals takes by chance."""
     return float(np.clip((raw - chance) / max(1 - chance, 1e-12), 0.0, 1.0))
 
 
-def _smoothed(e: Array, n: int, memory: int) -> Array:
+def _smooth_autocovariance(e: Array, n: int, memory: int) -> Array:
     """Return the autocovariance of residuals up to a lag, as an autoregression continues it.
 
     The order is chosen by the Bayesian information criterion: white residuals stay white.
@@ -152,12 +152,12 @@ def cross_correlation(
     ----------
     Ljung, *System Identification*, 2nd edition, section 16.6.
     """
-    e, n = _centred(e, valid)
-    s, _ = _centred(s, valid)
+    e, n = _remove_mean(e, valid)
+    s, _ = _remove_mean(s, valid)
     tau = np.arange(first, first + lags)
     r = lagged_products(e, s, int(tau[-1]))[tau] / len(e)
     memory = min(n // 10, MEMORY)
-    re, rs = _smoothed(e, n, memory), lagged_products(s, s, memory + lags) / len(s)
+    re, rs = _smooth_autocovariance(e, n, memory), lagged_products(s, s, memory + lags) / len(s)
     scale = np.sqrt(re[0] * rs[0])
     if scale <= 0:
         return Correlation(f"residual with past {name}", tau, np.zeros(lags), np.inf, 1.0)
@@ -171,7 +171,7 @@ def cross_correlation(
     # Signals that move slowly make neighbouring lags nearly the same number.
     z = _whitening(linalg.toeplitz(row), 1e-6).T @ r * np.sqrt(n)
     p = float(stats.chi2.sf(float(z @ z), len(z)))
-    share = _share(r, rs[:lags], re[0], linalg.toeplitz(row) / n)
+    share = _compute_share(r, rs[:lags], re[0], linalg.toeplitz(row) / n)
     return Correlation(f"residual with past {name}", tau, r / scale, band, p, share)
 
 
@@ -185,22 +185,22 @@ def _whitening(covariance: Array, smallest: float) -> Array:
     return np.asarray(vectors[:, keep] / np.sqrt(values[keep]), dtype=float)
 
 
-def _share(r: Array, rs: Array, variance: float, covariance: Array) -> float:
+def _compute_share(r: Array, rs: Array, variance: float, covariance: Array) -> float:
     """Return the share of the variance that a regression on the lagged signal would explain."""
     basis = _whitening(linalg.toeplitz(rs), 1e-6)
     raw = float(np.sum((basis.T @ r) ** 2)) / variance
     chance = float(np.trace(basis.T @ covariance @ basis)) / variance
-    return _beyond_chance(raw, chance)
+    return _subtract_chance(raw, chance)
 
 
-def _centred(e: Array, valid: Any) -> tuple[Array, int]:
+def _remove_mean(e: Array, valid: Any) -> tuple[Array, int]:
     """Remove the mean; samples that do not count become zero and so add nothing to any sum."""
     n = int(np.count_nonzero(valid))
     centred = np.where(valid, e - np.mean(e[valid]), 0.0) if n else np.zeros(len(e))
     return centred, max(n, 1)
 
 
-def explained_share(
+def compute_explained_share(
     e: Array, signals: Sequence[tuple[Array, int]], valid: Any, lags: int = 30
 ) -> float:
     r"""Return the share of the residuals' variance that follows the past of some signals.
@@ -253,7 +253,7 @@ def explained_share(
     along = basis.T @ target
     left = target - basis @ along
     n = len(rows)
-    rho = _smoothed(left, n, min(n // 10, MEMORY))
+    rho = _smooth_autocovariance(left, n, min(n // 10, MEMORY))
     if rho[0] <= 0:
         return 1.0
     # Under independence the squared components along the basis are this matrix on average.
@@ -264,4 +264,4 @@ def explained_share(
     raw = float(along @ along) / total
     if raw < chance + 3 * np.sqrt(2 * np.sum(spread**2)):
         return 0.0
-    return _beyond_chance(raw, min(max(chance, 0.0), 0.9))
+    return _subtract_chance(raw, min(max(chance, 0.0), 0.9))

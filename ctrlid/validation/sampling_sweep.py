@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from .._base.errors import CtrlidError, CtrlidWarning, ModelCannotRun
-from .._base.jobs import check_jobs, spread
-from .._base.text import listing
+from .._base.jobs import check_jobs, share_out
+from .._base.text import write_list
 from ..data.record import Record
 from ..estimation.constraints import AbstractConstraint
 from ..estimation.linear.arx import fit_arx
@@ -115,29 +115,29 @@ def sweep_sampling_period(
     >>> sweep.recommended
     0.005
     """
-    factors = _factors(record, periods)
+    factors = _choose_factors(record, periods)
     names = tuple(estimators)
     unknown = [name for name in names if name not in ESTIMATORS]
     if unknown or not names:
-        raise CtrlidError(f"estimators are of {listing(ESTIMATORS)}; given {names}")
+        raise CtrlidError(f"estimators are of {write_list(ESTIMATORS)}; given {names}")
     known = {
         name: tuple(constraints.get(name, ())) if isinstance(constraints, Mapping)
-        else tuple(_listed(constraints)) for name in names
+        else tuple(_as_list(constraints)) for name in names
     }  # fmt: skip
     tasks = [
         (record, factor, name, known[name], poles, zeros, controller if factor == 1 else None)
         for factor in factors
         for name in names
     ]
-    rows = list(spread(_fit, tasks, check_jobs(jobs)))
+    rows = list(share_out(_fit_row, tasks, check_jobs(jobs)))
     done = [row for row in rows if not row.failed]
     if not done:
         raise CtrlidError(f"no fit succeeded at any period; the first one: {rows[0].failure}")
     # A fit whose one-step errors follow u or r leaves dynamics out, and has no vote.
     sound = [row for row in done if row.independent]
     voters = sound or done
-    centre = min(voters, key=lambda row: _middle(row.poles, voters)).poles
-    rows = [_rated(row, centre) for row in rows]
+    centre = min(voters, key=lambda row: _measure_median_distance(row.poles, voters)).poles
+    rows = [_rate_row(row, centre) for row in rows]
     best, reason = _recommend(rows, names, "sound rows" if sound else "rows")
     reason += (" Sound are those whose one-step errors are independent of u and r." if sound else
                " In no row are the one-step errors known to be independent of u and r: MOST ROWS "
@@ -152,11 +152,11 @@ def sweep_sampling_period(
     return SamplingSweep(record, tuple(rows), centre, best, reason, warning)
 
 
-def _listed(constraints: Any) -> Sequence[AbstractConstraint]:
+def _as_list(constraints: Any) -> Sequence[AbstractConstraint]:
     return (constraints,) if isinstance(constraints, AbstractConstraint) else constraints
 
 
-def _factors(record: Any, periods: Sequence[float] | None) -> list[int]:
+def _choose_factors(record: Any, periods: Sequence[float] | None) -> list[int]:
     if not isinstance(record, Record):
         raise CtrlidError(f"sweep_sampling_period needs one Record; given {type(record).__name__}")
     if periods is None:
@@ -169,7 +169,7 @@ def _factors(record: Any, periods: Sequence[float] | None) -> list[int]:
     return sorted({int(q) for q in whole})
 
 
-def averaged(record: Record, factor: int) -> Record:
+def average_input(record: Record, factor: int) -> Record:
     """Return every q-th sample, with u as its mean over each slow period.
 
     Parameters
@@ -199,7 +199,7 @@ def averaged(record: Record, factor: int) -> Record:
     )  # fmt: skip
 
 
-def _fit(task: Any) -> SamplingRow:
+def _fit_row(task: Any) -> SamplingRow:
     record, factor, name, known, poles, zeros, controller = task
     between = "as recorded" if factor == 1 else "filtered" if name == "fit_arx" else "mean"
     period = record.dt * factor
@@ -207,7 +207,7 @@ def _fit(task: Any) -> SamplingRow:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", CtrlidWarning)
         try:
-            slow = record.decimate(factor) if name == "fit_arx" else averaged(record, factor)
+            slow = record.decimate(factor) if name == "fit_arx" else average_input(record, factor)
             count = int(np.count_nonzero(slow.valid))
             if name == "fit_continuous":
                 model = fit_continuous(slow, poles, zeros, known, controller=controller)
@@ -217,7 +217,7 @@ def _fit(task: Any) -> SamplingRow:
                 model = fit_arx(slow, poles, poles, 1, known)
             else:
                 model = fit_arx(slow, poles, poles + 1, 0, known)
-            white, independent = _tests(slow, model)
+            white, independent = _test_errors(slow, model)
         except (CtrlidError, np.linalg.LinAlgError) as reason:  # The table prints a refusal.
             empty = np.zeros(0)
             return SamplingRow(name, factor, period, count, between, empty, empty,
@@ -230,7 +230,7 @@ def _fit(task: Any) -> SamplingRow:
     )  # fmt: skip
 
 
-def _tests(record: Record, model: Any) -> tuple[bool | None, bool | None]:
+def _test_errors(record: Record, model: Any) -> tuple[bool | None, bool | None]:
     """Return whether the one-step errors are white and independent of u and r."""
     try:
         tests = compare(record, model).tests
@@ -240,7 +240,7 @@ def _tests(record: Record, model: Any) -> tuple[bool | None, bool | None]:
     return (fine[0], all(fine[1:])) if fine else (None, None)
 
 
-def _distance(p: Any, q: Any) -> float:
+def _measure_distance(p: Any, q: Any) -> float:
     """Return how far poles are from others, over the largest of those."""
     size = float(np.max(np.abs(q)))
     if not np.all(np.isfinite(p)) or not np.isfinite(size):
@@ -248,15 +248,15 @@ def _distance(p: Any, q: Any) -> float:
     return min(float(np.max(np.abs(p - q))) / max(size, 1e-300), FAR)
 
 
-def _middle(p: Any, rows: Sequence[SamplingRow]) -> float:
+def _measure_median_distance(p: Any, rows: Sequence[SamplingRow]) -> float:
     """Return how far the poles of half of the rows are from these at most."""
-    return float(np.median([_distance(row.poles, p) for row in rows]))
+    return float(np.median([_measure_distance(row.poles, p) for row in rows]))
 
 
-def _rated(row: SamplingRow, centre: Any) -> SamplingRow:
+def _rate_row(row: SamplingRow, centre: Any) -> SamplingRow:
     if row.failed:
         return row
-    return replace(row, deviation=_distance(row.poles, centre))
+    return replace(row, deviation=_measure_distance(row.poles, centre))
 
 
 def _recommend(rows: Sequence[SamplingRow], names: Sequence[str], voters: str) -> tuple[float, str]:

@@ -7,7 +7,7 @@ import numpy as np
 
 from .._base.arrays import Array
 from .._base.errors import CtrlidError
-from .._base.text import Printed, listing, with_error
+from .._base.text import Printed, with_error, write_list
 from ..data.record import Record
 
 # A relative difference beyond this is not told apart from a larger one.
@@ -109,7 +109,7 @@ class SamplingSweep(Printed):
         if not rows:
             known = dict.fromkeys(row.estimator for row in self.table)
             raise CtrlidError(f"the sweep has no estimator {estimator!r}; it has "
-                              f"{listing(tuple(known))}")  # fmt: skip
+                              f"{write_list(tuple(known))}")  # fmt: skip
         return rows
 
     def __str__(self) -> str:
@@ -122,13 +122,17 @@ class SamplingSweep(Printed):
         for row in self.table:
             head = (f"  {row.period:>9.4g} {largest * row.period:>7.3g}  {row.estimator:<15}"
                     f"{row.n:>8}  ")  # fmt: skip
-            words = f"FAILED: {_short(row.failure)}" if row.failed else _result(row, width)
+            words = (
+                f"FAILED: {_shorten_refusal(row.failure)}"
+                if row.failed
+                else _write_result(row, width)
+            )
             lines.append(head + words)
         lines += [f"  {self.reason}", *([f"  {self.warning}"] if self.warning else [])]
         return "\n".join(lines)
 
 
-def _short(failure: str) -> str:
+def _shorten_refusal(failure: str) -> str:
     """Return the head of a refusal; the whole of it is in the row."""
     head = failure.split(". ")[0]
     return head if len(head) <= 80 else head[:77].rsplit(" ", 1)[0] + " ..."
@@ -139,10 +143,10 @@ def _poles(row: SamplingRow) -> str:
     return ", ".join(with_error(p, s) for p, s in pairs)
 
 
-def _result(row: SamplingRow, width: int) -> str:
+def _write_result(row: SamplingRow, width: int) -> str:
     off = "far" if row.deviation >= FAR else f"{100 * row.deviation:.2g} %"
     judged = {True: "white", False: "NOT WHITE", None: "not tested"}[row.white]
     if row.independent is not None:
         judged += ", independent" if row.independent else ", FOLLOW u OR r"
-    bound = f"; ON ITS BOUND: {listing(row.active)}" if row.active else ""
+    bound = f"; ON ITS BOUND: {write_list(row.active)}" if row.active else ""
     return f"{_poles(row):<{width}}{off:>8}  {judged}{bound}"

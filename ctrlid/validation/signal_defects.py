@@ -30,7 +30,7 @@ BLOCKS = 40
 PLENTY = 100_000
 
 
-def rounding_of(v: Array) -> float:
+def estimate_rounding(v: Array) -> float:
     """Return the difference up to which two values of a signal are the same number."""
     return 4 * float(np.spacing(np.max(np.abs(v))))
 
@@ -38,18 +38,18 @@ def rounding_of(v: Array) -> float:
 def count_distinct(v: Array) -> tuple[Array, Any]:
     """Return the values of a signal in rising order and how often each occurs."""
     values, counts = np.unique(v, return_counts=True)
-    first = np.flatnonzero(np.concatenate([[True], np.diff(values) > rounding_of(v)]))
+    first = np.flatnonzero(np.concatenate([[True], np.diff(values) > estimate_rounding(v)]))
     return values[first], np.add.reduceat(counts, first)
 
 
-def find_held(v: Array) -> bool:
+def is_held(v: Array) -> bool:
     """Return whether a signal is a staircase of few levels, as a program gives it out."""
     if len(np.unique(v[:ENOUGH])) > LEVELS or len(np.unique(v)) > LEVELS:
         return False
     return float(np.mean(np.diff(v) != 0)) < 0.2
 
 
-def grid_step(v: Array) -> float:
+def find_grid_step(v: Array) -> float:
     r"""Return the step of the grid on which all values of a signal lie, or 0.
 
     .. math:: v_k = v_0 + q \, i_k, \quad i_k \text{ whole}
@@ -78,7 +78,7 @@ def grid_step(v: Array) -> float:
     again = counts > 1
     if np.count_nonzero(again) > 2 and counts[again].sum() >= 0.9 * counts.sum():
         values, again = values[again], again[again]
-    finest = 250 * rounding_of(v)
+    finest = 250 * estimate_rounding(v)
     gaps = np.diff(values)
     step = float(gaps.min())
     # Levels that all recur but are unevenly spaced come from a converter with a calibration curve.
@@ -109,9 +109,9 @@ def find_stuck(v: Array, driver: Array) -> tuple[float, float]:
     Zero unless it is nearly all of them, and the signal leaves the value far less often than what
     drives it changes: one that rests between moves is not stuck.
     """
-    changes = np.count_nonzero(np.abs(np.diff(driver)) > rounding_of(driver))
+    changes = np.count_nonzero(np.abs(np.diff(driver)) > estimate_rounding(driver))
     for value in (float(v.min()), float(v.max())):
-        at = np.abs(v - value) <= rounding_of(v)
+        at = np.abs(v - value) <= estimate_rounding(v)
         if np.mean(at) > STUCK and len(find_runs(at)[0]) < (1 - STUCK) * changes:
             return float(np.mean(at)), value
     return 0.0, 0.0
@@ -151,10 +151,10 @@ def find_clipped(
         The extreme value.
     """
     w = side * v
-    tol, limit = rounding_of(v), float(np.max(w[valid]))
+    tol, limit = estimate_rounding(v), float(np.max(w[valid]))
     at = valid & (w >= limit - tol)
     none = np.zeros(len(v), dtype=bool)
-    if np.count_nonzero(at) < SOME or limit - np.min(w[valid]) <= tol or find_held(v[valid]):
+    if np.count_nonzero(at) < SOME or limit - np.min(w[valid]) <= tol or is_held(v[valid]):
         return none, side * limit
     first, stop = find_runs(at)
     gentle = 1.5 * step if step else 1e-3 * float(np.ptp(v[valid]))
@@ -214,7 +214,7 @@ def find_repeats(v: Array, valid: Any, step: float, ignore: Any) -> Any:
         return none
     fast = 3.5 * step if step else 1e-3 * float(np.median(moved))
     padded = np.concatenate([[0.0], size, [0.0]])
-    first, stop = find_runs(good & (size <= rounding_of(v)))
+    first, stop = find_runs(good & (size <= estimate_rounding(v)))
     among = (padded[first] > fast) & (padded[stop + 1] > fast)
     usual = 0.0
     if step:
@@ -259,14 +259,14 @@ def find_spikes(v: Array, valid: Any, step: float) -> Array:
     small = np.min(np.abs(off), axis=0)
     small[np.abs(np.sign(off).sum(axis=0)) < 3] = 0.0
     clear = ndimage.minimum_filter1d(valid.astype(np.int8), 5)[2:-2] > 0
-    bend = np.where(ndimage.minimum_filter1d(valid.astype(np.int8), 3)[1:-1] > 0,
+    curvature = np.where(ndimage.minimum_filter1d(valid.astype(np.int8), 3)[1:-1] > 0,
                     np.abs(np.diff(v, 2)), 0.0)  # fmt: skip
     if not clear.any():
         return height
     noise = max(1.4826 * float(np.median(np.abs(off[2][clear]))), step, 1e-9 * float(np.ptp(v)))
     bound = 1.5 * float(stats.norm.isf(0.0005 / len(v))) * noise
     # Curvature centred 3 to 8 samples away on either side does not touch the spike.
-    wide, reach = np.pad(bend, QUIET + 1), QUIET - 2
+    wide, reach = np.pad(curvature, QUIET + 1), QUIET - 2
     most = ndimage.maximum_filter1d(wide, reach, origin=-(reach // 2))
     at = np.arange(2, len(v) - 2)
     around = np.maximum(most[at], most[at + QUIET + 3])
@@ -337,7 +337,7 @@ def find_drift(y: Array, causes: Sequence[Array]) -> tuple[float, float, float]:
     return change, scatter, float(stats.f.sf(f, 3, free))
 
 
-def find_beyond_law(u: Array, y: Array, valid: Any) -> float:
+def find_share_beyond_controller(u: Array, y: Array, valid: Any) -> float:
     """Return the share of u's variance that no linear law of y and past u gives, at most ten back.
 
     Parameters
@@ -365,7 +365,7 @@ def find_beyond_law(u: Array, y: Array, valid: Any) -> float:
     return float(left @ left) / max(float(target @ target), 1e-300)
 
 
-def period(r: Array) -> int:
+def find_period(r: Array) -> int:
     r"""Return after how many samples a signal repeats itself, at least once, or 0.
 
     .. math:: D(P) = \operatorname{mean}_k (r_{k+P} - r_k)^2
@@ -385,7 +385,7 @@ def period(r: Array) -> int:
     """
     n, v = len(r), r - np.mean(r)
     variance = float(np.mean(v**2))
-    if n < 8 or variance <= rounding_of(r) ** 2:
+    if n < 8 or variance <= estimate_rounding(r) ** 2:
         return 0
     lags = np.arange(n // 2 + 1)
     products = lagged_products(v, v, n // 2)

@@ -110,7 +110,7 @@ class Known(AbstractConstraint):
         return f"{type(self).__name__}({', '.join(parts)})"
 
 
-def finite(value: Any, what: str) -> float:
+def check_finite(value: Any, what: str) -> float:
     """Return a number as float, or say that it must be a finite one."""
     try:
         number = float(value)
@@ -121,9 +121,9 @@ def finite(value: Any, what: str) -> float:
     return number
 
 
-def interval(lower: Any, upper: Any, what: str) -> tuple[float, float]:
+def check_interval(lower: Any, upper: Any, what: str) -> tuple[float, float]:
     """Both bounds as floats; -inf and inf stand for "no bound"."""
-    low, high = (float(v) if _is_infinite(v) else finite(v, what) for v in (lower, upper))
+    low, high = (float(v) if _is_infinite(v) else check_finite(v, what) for v in (lower, upper))
     if low == math.inf or high == -math.inf:
         raise CtrlidError(f"{what}: lower={lower!r}, upper={upper!r} leave no room at all.")
     if low > high:
@@ -140,7 +140,7 @@ def _is_infinite(value: Any) -> bool:
     return isinstance(value, float | np.floating) and math.isinf(value)
 
 
-def need_poles(constraint: AbstractConstraint, structure: Structure, needed: int) -> None:
+def require_poles(constraint: AbstractConstraint, structure: Structure, needed: int) -> None:
     """Refuse a model with fewer poles than a constraint speaks of."""
     if structure.na < needed:
         raise CtrlidError(
@@ -149,6 +149,6 @@ def need_poles(constraint: AbstractConstraint, structure: Structure, needed: int
         )
 
 
-def denominator(values: Sequence[float] | Array, na: int) -> dict[str, float]:
+def make_denominator_weights(values: Sequence[float] | Array, na: int) -> dict[str, float]:
     """Return the weights of a row on the denominator's coefficients."""
     return {f"a{i}": float(values[i - 1]) for i in range(1, na + 1)}

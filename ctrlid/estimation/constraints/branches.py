@@ -94,7 +94,7 @@ class Case:
         return (0.0,) if self.family is None else tuple(self.family[2].grid)
 
 
-def cases(constraints: Sequence[AbstractConstraint], structure: Structure) -> list[Case]:
+def list_cases(constraints: Sequence[AbstractConstraint], structure: Structure) -> list[Case]:
     """All combinations of the branches of the constraints."""
     choices = [[(repr(c), b) for b in c.branches(structure)] for c in constraints]
     if np.prod([float(len(c)) for c in choices]) > _MOST_CASES:
@@ -106,7 +106,7 @@ def cases(constraints: Sequence[AbstractConstraint], structure: Structure) -> li
     for choice in itertools.product(*choices):
         families = [(owner, b.family, b) for owner, b in choice if b.family is not None]
         if len(families) > 1:
-            names = _text.listing([owner for owner, _, _ in families])
+            names = _text.write_list([owner for owner, _, _ in families])
             raise CtrlidError(
                 f"{names} each search for a free number in a model with {structure.na} poles; only "
                 "one constraint of that kind can be used at a time."
@@ -145,14 +145,14 @@ class Elimination:
         return snapped
 
 
-def eliminate(weights: Array, values: Array) -> Elimination:
+def eliminate_equalities(weights: Array, values: Array) -> Elimination:
     """Reduced row echelon form of ``weights @ theta = values``; `Infeasible` if they contradict."""
     work = np.column_stack([weights, values])
-    return _eliminate(work.shape, work.tobytes())
+    return _eliminate_cached(work.shape, work.tobytes())
 
 
 @lru_cache(maxsize=64)
-def _eliminate(shape: tuple[int, int], numbers: bytes) -> Elimination:
+def _eliminate_cached(shape: tuple[int, int], numbers: bytes) -> Elimination:
     # One fit asks for the same few rows several times, and a study for them in every fit.
     work = np.frombuffer(numbers).reshape(shape).copy()
     m, p = shape[0], shape[1] - 1
@@ -191,7 +191,7 @@ def _eliminate(shape: tuple[int, int], numbers: bytes) -> Elimination:
     return Elimination(*arrays)
 
 
-def one_sided(rows: Rows) -> tuple[Array, Array, NDArray[np.intp], Array]:
+def split_inequalities(rows: Rows) -> tuple[Array, Array, NDArray[np.intp], Array]:
     """Inequalities as ``G theta <= h``, the row each comes from, and its sign in it."""
     below = np.flatnonzero(~rows.equality & (rows.upper < np.inf))
     above = np.flatnonzero(~rows.equality & (rows.lower > -np.inf))
@@ -201,25 +201,25 @@ def one_sided(rows: Rows) -> tuple[Array, Array, NDArray[np.intp], Array]:
     return sign[:, None] * rows.weights[origin], h, origin, sign
 
 
-def forced(rows: Rows, nonzero: Rows) -> bool:
+def is_forced(rows: Rows, nonzero: Rows) -> bool:
     """Whether the equalities force a sum to the very value it must differ from."""
     if not len(nonzero.lower):
         return False
-    e = eliminate(rows.weights[rows.equality], rows.lower[rows.equality])
+    e = eliminate_equalities(rows.weights[rows.equality], rows.lower[rows.equality])
     slack = np.abs(nonzero.weights @ e.directions).sum(axis=1)
     gap = np.abs(nonzero.weights @ e.offset - nonzero.lower)
     return bool(np.any((slack < 1e-9) & (gap < 1e-9)))
 
 
-def feasible(rows: Rows, nonzero: Rows) -> bool:
+def is_feasible(rows: Rows, nonzero: Rows) -> bool:
     """Whether any coefficients satisfy the rows, by linear programming."""
     try:
-        e = eliminate(rows.weights[rows.equality], rows.lower[rows.equality])
-        if forced(rows, nonzero):
+        e = eliminate_equalities(rows.weights[rows.equality], rows.lower[rows.equality])
+        if is_forced(rows, nonzero):
             return False
     except Infeasible:
         return False
-    g, h, _, _ = one_sided(rows)
+    g, h, _, _ = split_inequalities(rows)
     if not len(h):
         return True
     reduced, room = g @ e.directions, h - g @ e.offset
@@ -243,11 +243,11 @@ def feasible(rows: Rows, nonzero: Rows) -> bool:
     return bool(best.x is not None and best.x[-1] >= -1e-10)
 
 
-def possible(constraints: Sequence[AbstractConstraint], structure: Structure) -> bool:
+def is_possible(constraints: Sequence[AbstractConstraint], structure: Structure) -> bool:
     """Whether the linear rows of some case can be met together."""
     return any(
-        feasible(case.at(x), case.nonzero)
-        for case in cases(constraints, structure)
+        is_feasible(case.at(x), case.nonzero)
+        for case in list_cases(constraints, structure)
         for x in case.grid
     )
 
@@ -257,7 +257,7 @@ def explain_conflict(constraints: Sequence[AbstractConstraint], structure: Struc
     core = list(constraints)
     for constraint in constraints:
         rest = [c for c in core if c is not constraint]
-        if not possible(rest, structure):
+        if not is_possible(rest, structure):
             core = rest
     names = [repr(c) for c in core]
     if len(core) == 1:
@@ -266,6 +266,6 @@ def explain_conflict(constraints: Sequence[AbstractConstraint], structure: Struc
             f"{', '.join(structure.names)}. Drop it or change the orders."
         )
     return (
-        f"These constraints contradict each other: {_text.listing(names)}. No coefficients "
+        f"These constraints contradict each other: {_text.write_list(names)}. No coefficients "
         f"{', '.join(structure.names)} satisfy them together. Drop one of them or loosen it."
     )

@@ -15,9 +15,9 @@ from .base import (
     Function,
     Known,
     Row,
+    check_finite,
+    check_interval,
     equals,
-    finite,
-    interval,
 )
 
 
@@ -43,7 +43,7 @@ class StaticGain(Known):
     gain: float
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "gain", finite(self.gain, "StaticGain"))
+        object.__setattr__(self, "gain", check_finite(self.gain, "StaticGain"))
 
     def branches(self, structure: Structure) -> Sequence[Branch]:
         """See the base class."""
@@ -80,7 +80,7 @@ class Fixed(Known):
     value: float
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "value", finite(self.value, f"Fixed({self.name!r}, ...)"))
+        object.__setattr__(self, "value", check_finite(self.value, f"Fixed({self.name!r}, ...)"))
 
     def branches(self, structure: Structure) -> Sequence[Branch]:
         """See the base class."""
@@ -110,7 +110,7 @@ class Bounds(Known):
     upper: float = math.inf
 
     def __post_init__(self) -> None:
-        low, high = interval(self.lower, self.upper, f"Bounds({self.name!r}, ...)")
+        low, high = check_interval(self.lower, self.upper, f"Bounds({self.name!r}, ...)")
         object.__setattr__(self, "lower", low)
         object.__setattr__(self, "upper", high)
 
@@ -180,18 +180,20 @@ class Linear(Known):
                 'Linear needs the weights by coefficient, for instance Linear({"a1": 1, "b1": -2}, '
                 f"upper=0); given {self.weights!r}."
             )
-        weights = {n: finite(w, f"Linear: the weight of {n}") for n, w in self.weights.items()}
+        weights = {
+            n: check_finite(w, f"Linear: the weight of {n}") for n, w in self.weights.items()
+        }
         if not any(weights.values()):
             raise CtrlidError(f"Linear: all weights are zero in {weights!r}: nothing is bounded.")
         object.__setattr__(self, "weights", weights)
         if self.equals is None:
-            low, high = interval(self.lower, self.upper, "Linear")
+            low, high = check_interval(self.lower, self.upper, "Linear")
             object.__setattr__(self, "lower", low)
             object.__setattr__(self, "upper", high)
         elif self.lower > -math.inf or self.upper < math.inf:
             raise CtrlidError("Linear takes equals= or bounds (lower=, upper=), not both.")
         else:
-            object.__setattr__(self, "equals", finite(self.equals, "Linear: equals"))
+            object.__setattr__(self, "equals", check_finite(self.equals, "Linear: equals"))
 
     def branches(self, structure: Structure) -> Sequence[Branch]:
         """See the base class."""

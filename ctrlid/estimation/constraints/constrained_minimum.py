@@ -13,9 +13,18 @@ from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
 from ..identified_model import ActiveBound, Structure
 from . import AbstractConstraint
-from .branches import Case, Infeasible, Rows, cases, eliminate, explain_conflict, forced, possible
+from .branches import (
+    Case,
+    Infeasible,
+    Rows,
+    eliminate_equalities,
+    explain_conflict,
+    is_forced,
+    is_possible,
+    list_cases,
+)
 from .nonlinear import solve_nonlinear
-from .quadratic_program import Cost, Solution, solve, spread
+from .quadratic_program import Cost, Solution, compute_covariance, solve_program
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,9 +83,9 @@ def minimize(cost: Cost, constraints: Sequence[AbstractConstraint], structure: S
         If data and constraints together leave a combination of coefficients free.
     """
     best: _Candidate | None = None
-    for case in cases(constraints, structure):
+    for case in list_cases(constraints, structure):
         try:
-            if forced(case.rows, case.nonzero):
+            if is_forced(case.rows, case.nonzero):
                 continue
             limit = np.inf if best is None else best.solution.cost
             candidate = _solve_case(cost, case, limit)
@@ -85,13 +94,15 @@ def minimize(cost: Cost, constraints: Sequence[AbstractConstraint], structure: S
         if candidate.solution.cost < limit:
             best = candidate
     if best is None:
-        raise CtrlidError(_why_none(constraints, structure))
+        raise CtrlidError(_explain_failure(constraints, structure))
     solution = best.solution
-    covariance, condition = spread(cost, best.normals)
-    bounds = tuple(_active_bound(solution, i) for i in solution.active) + best.edge
+    covariance, condition = compute_covariance(cost, best.normals)
+    bounds = tuple(_make_active_bound(solution, i) for i in solution.active) + best.edge
     unstable = [repr(c) for c in constraints if c.unstable]
     bounds = tuple(replace(b, unstable=b.constraint in unstable) for b in bounds)
-    free = len(cost.origin) - len(eliminate(best.normals, np.zeros(len(best.normals))).pivots)
+    free = len(cost.origin) - len(
+        eliminate_equalities(best.normals, np.zeros(len(best.normals))).pivots
+    )
     return Found(
         solution.theta,
         solution.cost,
@@ -104,17 +115,17 @@ def minimize(cost: Cost, constraints: Sequence[AbstractConstraint], structure: S
     )
 
 
-def _why_none(constraints: Sequence[AbstractConstraint], structure: Structure) -> str:
-    if not possible(constraints, structure):
+def _explain_failure(constraints: Sequence[AbstractConstraint], structure: Structure) -> str:
+    if not is_possible(constraints, structure):
         return explain_conflict(constraints, structure)
-    names = _text.listing([repr(c) for c in constraints])
+    names = _text.write_list([repr(c) for c in constraints])
     return (
         f"No coefficients that satisfy {names} were found from any start. Check the functions at "
         "coefficients where you know they hold, or loosen the other constraints."
     )
 
 
-def _active_bound(solution: Solution, i: int) -> ActiveBound:
+def _make_active_bound(solution: Solution, i: int) -> ActiveBound:
     row, weights = solution.rows.rows[i], solution.rows.weights[i]
     value = float(weights @ solution.theta)
     above = abs(value - solution.rows.upper[i]) <= abs(value - solution.rows.lower[i])
@@ -129,7 +140,7 @@ def _solve_case(cost: Cost, case: Case, limit: float) -> _Candidate:
     if case.family is None:
         if case.functions:
             return _Candidate(*solve_nonlinear(cost, case.rows, case.functions), label)
-        solution = solve(cost, case.rows, below=limit)
+        solution = solve_program(cost, case.rows, below=limit)
         return _Candidate(solution, solution.normals, label)
     owner, _, branch = case.family
     if case.functions:
@@ -137,22 +148,22 @@ def _solve_case(cost: Cost, case: Case, limit: float) -> _Candidate:
             f"{owner} searches for a free number in this model and cannot be combined with "
             f"{case.functions[0][0]}: write both as functions of one Nonlinear."
         )
-    x, solution, normals = _search(cost, case)
+    x, solution, normals = _search_family(cost, case)
     end = f"{branch.label} = {x:.7g}"
-    edge = (ActiveBound(end, owner, branch.label, x, np.nan),) if x in _ends(case) else ()
+    edge = (ActiveBound(end, owner, branch.label, x, np.nan),) if x in _find_ends(case) else ()
     return _Candidate(solution, normals, ", ".join(filter(None, [label, end])), edge)
 
 
-def _ends(case: Case) -> tuple[float, float]:
+def _find_ends(case: Case) -> tuple[float, float]:
     return float(case.grid[0]), float(case.grid[-1])
 
 
-def _search(cost: Cost, case: Case) -> tuple[float, Solution, Array]:
+def _search_family(cost: Cost, case: Case) -> tuple[float, Solution, Array]:
     """Best member of a family: scan, refine in the brackets, finish by Newton steps."""
 
     def value(x: float) -> float:
         try:
-            return solve(cost, case.at(x)).cost
+            return solve_program(cost, case.at(x)).cost
         except Infeasible:
             return np.inf
 
@@ -173,61 +184,62 @@ def _search(cost: Cost, case: Case) -> tuple[float, Solution, Array]:
             x, at_x = float(inside.x), float(inside.fun)
         if at_x < best_value:
             best_x, best_value = x, at_x
-    return _finish(cost, case, best_x)
+    return _refine_family(cost, case, best_x)
 
 
-def _finish(cost: Cost, case: Case, x: float) -> tuple[float, Solution, Array]:
+def _refine_family(cost: Cost, case: Case, x: float) -> tuple[float, Solution, Array]:
     """Newton steps on coefficients and the family's number together.
 
     A line search in x stops at half the digits of x. To first order the family lets its rows move
     along ``slope`` when x moves, so the rows at right angles to the slope are what truly holds:
     they give the next coefficients, and the rest the next x.
     """
-    solution = solve(cost, case.at(x))
+    solution = solve_program(cost, case.at(x))
     fixed = len(case.rows.lower)
-    ends = _ends(case)
+    ends = _find_ends(case)
     for _ in range(8):
         rows = case.at(x)
         step = 1e-6 * max(abs(x), 1e-3)
         ahead, behind = case.at(min(x + step, ends[1])), case.at(max(x - step, ends[0]))
         width = min(x + step, ends[1]) - max(x - step, ends[0])
         theta = solution.theta
-        slope = (_gap(ahead, theta) - _gap(behind, theta))[fixed:] / width
+        slope = (_compute_gap(ahead, theta) - _compute_gap(behind, theta))[fixed:] / width
         length = float(slope @ slope)
         if length == 0:
             break
-        loose = _loosen(rows, fixed, slope)
+        loose = _loosen_rows(rows, fixed, slope)
         try:
-            moved = solve(cost, loose)
+            moved = solve_program(cost, loose)
         except Infeasible:
             break
-        new_x = x - float(slope @ _gap(rows, moved.theta)[fixed:]) / length
+        new_x = x - float(slope @ _compute_gap(rows, moved.theta)[fixed:]) / length
         if not ends[0] <= new_x <= ends[1] or abs(new_x - x) > 1e-3 * max(abs(x), 1e-3):
             break
         done = abs(new_x - x) <= 4e-16 * abs(x)
         x = new_x
-        solution = solve(cost, case.at(x))
+        solution = solve_program(cost, case.at(x))
         if done:
             break
     rows = case.at(x)
     if x in ends:
         return x, solution, solution.normals
     step = 1e-6 * max(abs(x), 1e-3)
-    slope = (_gap(case.at(x + step), solution.theta) - _gap(case.at(x - step), solution.theta))[
-        fixed:
-    ]
-    loose = _loosen(rows, fixed, slope)
-    solution = replace(solution, free_theta=solve(cost, loose).free_theta)
+    slope = (
+        _compute_gap(case.at(x + step), solution.theta)
+        - _compute_gap(case.at(x - step), solution.theta)
+    )[fixed:]
+    loose = _loosen_rows(rows, fixed, slope)
+    solution = replace(solution, free_theta=solve_program(cost, loose).free_theta)
     active = rows.weights[list(solution.active)]
     return x, solution, np.vstack([loose.weights[loose.equality], active])
 
 
-def _gap(rows: Rows, theta: Array) -> Array:
+def _compute_gap(rows: Rows, theta: Array) -> Array:
     gap: Array = rows.weights @ theta - np.where(rows.equality, rows.lower, 0.0)
     return gap
 
 
-def _loosen(rows: Rows, fixed: int, slope: Array) -> Rows:
+def _loosen_rows(rows: Rows, fixed: int, slope: Array) -> Rows:
     """Replace the family's rows by their combinations at right angles to the slope."""
     q = np.linalg.qr(slope[:, None], mode="complete")[0][:, 1:]
     weights, values = q.T @ rows.weights[fixed:], q.T @ rows.lower[fixed:]

@@ -11,7 +11,7 @@ from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
 from . import Branch, Row
 from .branches import Infeasible, Rows
-from .quadratic_program import Cost, Solution, solve
+from .quadratic_program import Cost, Solution, solve_program
 
 # Each sequence ends in a local minimum, so that so many random starts are tried.
 _STARTS = 12
@@ -29,7 +29,7 @@ class _Functions:
     # Sizes of the coefficients, by which the steps of the differences are scaled.
     typical: Array
 
-    def parts(self, theta: Array) -> tuple[Array, int, list[tuple[str, str]]]:
+    def evaluate_parts(self, theta: Array) -> tuple[Array, int, list[tuple[str, str]]]:
         """Values, the number of equalities, and for each its owner and its words."""
         values: list[Array] = []
         words: list[tuple[str, str]] = []
@@ -49,7 +49,7 @@ class _Functions:
 
     def __call__(self, theta: Array) -> Array:
         """Values of all functions."""
-        return self.parts(theta)[0]
+        return self.evaluate_parts(theta)[0]
 
     def jacobian(self, theta: Array) -> Array:
         """Central differences, ``(functions, p)``."""
@@ -105,12 +105,12 @@ def solve_nonlinear(
         If no start leads to coefficients that satisfy everything.
     """
     cost = cost.scaled()
-    start = solve(cost, rows)
+    start = solve_program(cost, rows)
     s = np.linalg.lstsq(cost.basis, start.theta - cost.origin, rcond=None)[0]
     typical = np.maximum(np.abs(start.theta), np.abs(cost.basis) @ np.abs(s))
     typical = np.where(typical > 0, typical, 1.0)
     c = _Functions(functions, typical)
-    _check(c, start.theta)
+    _check_functions(c, start.theta)
     rng = np.random.default_rng(0)
     reach = max(float(np.linalg.norm(s)), float(np.linalg.norm(cost.d)))
     starts = [start.theta]
@@ -121,7 +121,7 @@ def solve_nonlinear(
     best: Solution | None = None
     for theta in starts:
         try:
-            found = _descend(cost, rows, c, theta, reach)
+            found = _run_sequence(cost, rows, c, theta, reach)
         except Infeasible:
             continue
         if best is None or found.cost < best.cost:
@@ -133,7 +133,7 @@ def solve_nonlinear(
     return best, best.normals
 
 
-def _check(c: _Functions, theta: Array) -> None:
+def _check_functions(c: _Functions, theta: Array) -> None:
     for owner, branch in c.functions:
         for function in (branch.equality, branch.inequality):
             if function is None:
@@ -152,17 +152,17 @@ def _check(c: _Functions, theta: Array) -> None:
                 )
 
 
-def _violation(c: Array, equalities: int) -> Array:
+def _compute_violation(c: Array, equalities: int) -> Array:
     v: Array = np.concatenate([np.abs(c[:equalities]), np.maximum(-c[equalities:], 0.0)])
     return v
 
 
-def _linear_violation(rows: Rows, theta: Array) -> float:
+def _compute_linear_violation(rows: Rows, theta: Array) -> float:
     value = rows.weights @ theta
     return float(np.sum(np.maximum(rows.lower - value, 0) + np.maximum(value - rows.upper, 0)))
 
 
-def _descend(cost: Cost, rows: Rows, c: _Functions, theta: Array, reach: float) -> Solution:
+def _run_sequence(cost: Cost, rows: Rows, c: _Functions, theta: Array, reach: float) -> Solution:
     """One sequence: linearise the functions, solve the QP, shorten the step by an l1 merit."""
     inverse = np.linalg.inv(cost.basis)
     hessian = cost.R.T @ cost.R
@@ -171,28 +171,32 @@ def _descend(cost: Cost, rows: Rows, c: _Functions, theta: Array, reach: float) 
         return float(np.sum((cost.R @ (inverse @ (x - cost.origin)) - cost.d) ** 2))
 
     def merit(x: Array, size: Array, penalty: float) -> float:
-        values, equalities, _ = c.parts(x)
+        values, equalities, _ = c.evaluate_parts(x)
         if not np.isfinite(values).all():
             return np.inf
-        broken = float(np.sum(_violation(values, equalities) / size)) + _linear_violation(rows, x)
+        broken = float(
+            np.sum(_compute_violation(values, equalities) / size)
+        ) + _compute_linear_violation(rows, x)
         return cost_at(x) + penalty * broken
 
     penalty = 0.0
     multipliers = np.zeros(len(c(theta)))
     for _ in range(_ITERATIONS):
-        values, equalities, words = c.parts(theta)
+        values, equalities, words = c.evaluate_parts(theta)
         slopes = c.jacobian(theta)
         if not (np.isfinite(values).all() and np.isfinite(slopes).all()):
             raise Infeasible
-        size = _size(slopes, cost, reach)
-        model = _curved(cost, inverse @ (theta - cost.origin), hessian, c, theta, multipliers)
-        step = _step(model, rows, slopes, values, equalities, theta, words)
+        size = _estimate_sizes(slopes, cost, reach)
+        model = _add_curvature(
+            cost, inverse @ (theta - cost.origin), hessian, c, theta, multipliers
+        )
+        step = _solve_linearized(model, rows, slopes, values, equalities, theta, words)
         direction = step.theta - theta
         # Multipliers by least squares on what the step holds with equality.
         gradient = 2 * model.R.T @ (model.R @ inverse @ (step.theta - cost.origin) - model.d)
         normals = step.normals @ cost.basis
         held = np.asarray(np.linalg.lstsq(normals.T, gradient, rcond=None)[0], dtype=float)
-        multipliers = _assign(held, rows, equalities, step.active, len(values))
+        multipliers = _assign_multipliers(held, rows, equalities, step.active, len(values))
         largest = float(np.max(np.abs(multipliers) * size, initial=0.0))
         penalty = max(penalty, 2 * largest, 1e-3 * cost_at(theta))
         before = merit(theta, size, penalty)
@@ -205,16 +209,16 @@ def _descend(cost: Cost, rows: Rows, c: _Functions, theta: Array, reach: float) 
         theta = step.theta if length == 1.0 else theta + length * direction
         if length <= 1e-6 or length * np.linalg.norm(inverse @ direction) <= 1e-11 * reach:
             break
-    return _arrived(cost, rows, c, theta, reach, cost_at(theta))
+    return _check_end_point(cost, rows, c, theta, reach, cost_at(theta))
 
 
-def _size(slopes: Array, cost: Cost, reach: float) -> Array:
+def _estimate_sizes(slopes: Array, cost: Cost, reach: float) -> Array:
     """Size of each function: what moving all coefficients by their reach would do to it."""
     size: Array = np.maximum(np.linalg.norm(slopes @ cost.basis, axis=1) * reach, 1e-300)
     return size
 
 
-def _step(
+def _solve_linearized(
     model: Cost,
     rows: Rows,
     slopes: Array,
@@ -226,27 +230,30 @@ def _step(
     """Solve the linearised problem; where that has no solution, ask for part of the way."""
     for fraction in (1.0, 0.5, 0.1, 0.01):
         try:
-            return solve(model, rows + _lines(slopes, values, equalities, theta, words, fraction))
+            return solve_program(
+                model,
+                rows + _linearize_functions(slopes, values, equalities, theta, words, fraction),
+            )
         except Infeasible:
             continue
     raise Infeasible
 
 
-def _arrived(
+def _check_end_point(
     cost: Cost, rows: Rows, c: _Functions, theta: Array, reach: float, value: float
 ) -> Solution:
     """Check that the end point holds; describe what it rests on."""
-    values, equalities, words = c.parts(theta)
+    values, equalities, words = c.evaluate_parts(theta)
     slopes = c.jacobian(theta)
-    size = _size(slopes, cost, reach)
-    if np.any(_violation(values, equalities) > _FEASIBLE * size):
+    size = _estimate_sizes(slopes, cost, reach)
+    if np.any(_compute_violation(values, equalities) > _FEASIBLE * size):
         raise Infeasible
     linear = np.abs(rows.weights) @ np.abs(theta) + 1e-300
     reached = rows.weights @ theta
     below, above = rows.lower - reached, reached - rows.upper
     if np.any(np.maximum(below, above) > _FEASIBLE * linear):
         raise Infeasible
-    lines = _lines(slopes, values, equalities, theta, words, 1.0)
+    lines = _linearize_functions(slopes, values, equalities, theta, words, 1.0)
     everything = rows + lines
     size = np.concatenate([linear, size])
     tight = np.minimum(np.abs(below), np.abs(above)) <= _FEASIBLE * linear
@@ -256,7 +263,7 @@ def _arrived(
     return Solution(theta, value, everything, normals, tuple(map(int, active)), theta, "")
 
 
-def _lines(
+def _linearize_functions(
     slopes: Array,
     values: Array,
     equalities: int,
@@ -276,7 +283,9 @@ def _lines(
     return Rows(slopes, right, upper, names, tuple(owner for owner, _ in words))
 
 
-def _assign(held: Array, rows: Rows, equalities: int, active: Sequence[int], count: int) -> Array:
+def _assign_multipliers(
+    held: Array, rows: Rows, equalities: int, active: Sequence[int], count: int
+) -> Array:
     """Multipliers of the functions, in their own order, from those of the rows held."""
     first = int(rows.equality.sum())
     multipliers = np.zeros(count)
@@ -287,7 +296,7 @@ def _assign(held: Array, rows: Rows, equalities: int, active: Sequence[int], cou
     return multipliers
 
 
-def _curved(
+def _add_curvature(
     cost: Cost,
     s: Array,
     hessian: Array,
@@ -298,11 +307,11 @@ def _curved(
     """Return the quadratic model with the curvature of the functions, kept convex."""
     if not multipliers.any():
         return cost
-    bend = cost.basis.T @ c.curvature(theta, multipliers) @ cost.basis
-    if not np.isfinite(bend).all():
+    curved = cost.basis.T @ c.curvature(theta, multipliers) @ cost.basis
+    if not np.isfinite(curved).all():
         return cost
     # cost = s' H s - ...: twice the Hessian of the model is 2 H - bend.
-    values, vectors = np.linalg.eigh(hessian - bend / 2)
+    values, vectors = np.linalg.eigh(hessian - curved / 2)
     least = 1e-3 * float(np.linalg.eigvalsh(hessian)[0])
     root = np.sqrt(np.maximum(np.abs(values), least))
     upper = root[:, None] * vectors.T

@@ -12,17 +12,17 @@ from scipy.special import eval_chebyt, eval_chebyu
 
 from ..._base.errors import CtrlidError
 from ..identified_model import Structure
-from .base import Branch, Known, Row, denominator, equals, need_poles
+from .base import Branch, Known, Row, equals, make_denominator_weights, require_poles
 
 
-def _pole_rows(structure: Structure, pole: complex) -> list[Row]:
+def _write_pole_rows(structure: Structure, pole: complex) -> list[Row]:
     """``A(pole) = 0``; both parts of it if the pole is complex."""
     # Products, unlike powers of complex numbers, are exact for poles such as 1j.
     powers = np.cumprod([1.0, *[complex(pole)] * structure.na])[::-1]
     # Beyond the unit circle the powers grow: divided by the largest, the row stays of size one.
     powers = powers / max(1.0, abs(powers[0]))
     parts = [powers.real] if complex(pole).imag == 0 else [powers.real, powers.imag]
-    return [equals(denominator(p[1:], structure.na), 0.0 - float(p[0])) for p in parts]
+    return [equals(make_denominator_weights(p[1:], structure.na), 0.0 - float(p[0])) for p in parts]
 
 
 @final
@@ -52,7 +52,7 @@ class ReciprocalPoles(Known):
                 "ReciprocalPoles() speaks of sampled poles z and 1/z, but this model is in "
                 "continuous time: write SymmetricPoles() for poles at s = ±p."
             )
-        need_poles(self, structure, 2)
+        require_poles(self, structure, 2)
         na = structure.na
         if na == 2:
             reciprocal = equals({"a2": 1.0}, 1.0)
@@ -68,7 +68,7 @@ class ReciprocalPoles(Known):
             even = eval_chebyt(np.arange(na, -1, -1), c)
             odd = np.append(eval_chebyu(np.arange(na - 1, -1, -1), c), 0.0)
             return [
-                equals(denominator(v[1:] / abs(v[0]), na), -float(v[0] / abs(v[0])))
+                equals(make_denominator_weights(v[1:] / abs(v[0]), na), -float(v[0] / abs(v[0])))
                 for v in (even, odd)
             ]
 
@@ -100,7 +100,7 @@ class SymmetricPoles(Known):
 
     def branches(self, structure: Structure) -> Sequence[Branch]:
         """See the base class."""
-        need_poles(self, structure, 2)
+        require_poles(self, structure, 2)
         if structure.domain == "z":
             # exp(p dt) is positive: the alternative at negative z is no sampled real pole.
             return ReciprocalPoles().branches(structure)[:1]
@@ -115,7 +115,7 @@ class SymmetricPoles(Known):
             for parity in (0, 1):
                 part = np.where(power % 2 == parity, float(p) ** np.maximum(power - parity, 0), 0.0)
                 part = part / part.max()
-                rows.append(equals(denominator(part[1:], na), 0.0 - float(part[0])))
+                rows.append(equals(make_denominator_weights(part[1:], na), 0.0 - float(part[0])))
             return rows
 
         grid = tuple(np.concatenate([[0.0], np.geomspace(1e-3, 1e5, 160)]))
@@ -150,8 +150,8 @@ class PoleAt(Known):
 
     def branches(self, structure: Structure) -> Sequence[Branch]:
         """See the base class."""
-        need_poles(self, structure, 1 if complex(self.pole).imag == 0 else 2)
-        return (Branch(tuple(_pole_rows(structure, self.pole))),)
+        require_poles(self, structure, 1 if complex(self.pole).imag == 0 else 2)
+        return (Branch(tuple(_write_pole_rows(structure, self.pole))),)
 
 
 @final
@@ -167,6 +167,6 @@ class Integrator(Known):
 
     def branches(self, structure: Structure) -> Sequence[Branch]:
         """See the base class."""
-        need_poles(self, structure, 1)
+        require_poles(self, structure, 1)
         pole = 1.0 if structure.domain == "z" else 0.0
-        return (Branch(tuple(_pole_rows(structure, pole))),)
+        return (Branch(tuple(_write_pole_rows(structure, pole))),)

@@ -11,7 +11,14 @@ from scipy.optimize import nnls
 
 from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
-from .branches import Elimination, Infeasible, Rows, eliminate, feasible, one_sided
+from .branches import (
+    Elimination,
+    Infeasible,
+    Rows,
+    eliminate_equalities,
+    is_feasible,
+    split_inequalities,
+)
 
 IndexArray = NDArray[np.intp]
 
@@ -100,9 +107,9 @@ class _Reduced:
     singular: Array
 
 
-def _reduce(cost: Cost, weights: Array, values: Array) -> _Reduced:
+def _reduce_cost(cost: Cost, weights: Array, values: Array) -> _Reduced:
     """Minimise a scaled cost under equalities by an orthogonal null-space method."""
-    e = eliminate(weights, values)
+    e = eliminate_equalities(weights, values)
     p, rank = len(cost.origin), len(e.pivots)
     s0, null = np.zeros(p), np.eye(p)
     if rank:
@@ -121,13 +128,13 @@ def _reduce(cost: Cost, weights: Array, values: Array) -> _Reduced:
     return _Reduced(e, s0, step, left.T @ (cost.d - cost.R @ s0), singular)
 
 
-def _point(cost: Cost, reduced: _Reduced) -> tuple[Array, float]:
+def _find_minimum(cost: Cost, reduced: _Reduced) -> tuple[Array, float]:
     s = reduced.s0 + reduced.step @ reduced.u0
     theta = reduced.elimination.snap(cost.origin + cost.basis @ s)
     return theta, float(np.sum((cost.R @ s - cost.d) ** 2))
 
 
-def solve(cost: Cost, rows: Rows, below: float = np.inf) -> Solution:
+def solve_program(cost: Cost, rows: Rows, below: float = np.inf) -> Solution:
     """Minimise a quadratic cost under linear equalities and inequalities.
 
     Equalities are eliminated, the rest becomes the projection of a point on a polyhedron, which
@@ -160,11 +167,11 @@ def solve(cost: Cost, rows: Rows, below: float = np.inf) -> Solution:
     cost = cost.scaled()
     equality = rows.equality
     weights, values = rows.weights[equality], rows.lower[equality]
-    free = _reduce(cost, weights, values)
-    free_theta, free_cost = _point(cost, free)
+    free = _reduce_cost(cost, weights, values)
+    free_theta, free_cost = _find_minimum(cost, free)
     if free_cost >= below:
         raise Infeasible
-    g, h, origin, sign = one_sided(rows)
+    g, h, origin, sign = split_inequalities(rows)
     full = g @ cost.basis
     slope = full @ free.step
     room = h - g @ cost.origin - full @ (free.s0 + free.step @ free.u0)
@@ -180,16 +187,16 @@ def solve(cost: Cost, rows: Rows, below: float = np.inf) -> Solution:
     if worst <= 1e-13 * float(np.linalg.norm(cost.d)):
         text = "orthogonal least squares" + (", equalities eliminated" if len(values) else "")
         return Solution(free_theta, free_cost, rows, weights, (), free_theta, text)
-    held = _active_set(slope, room / worst, rows)
+    held = _find_active_set(slope, room / worst, rows)
     active = origin[held]
     normals = np.vstack([weights, rows.weights[active]])
-    bound = _reduce(cost, normals, np.concatenate([values, on_bound[held]]))
-    theta, at_bound = _point(cost, bound)
+    bound = _reduce_cost(cost, normals, np.concatenate([values, on_bound[held]]))
+    theta, at_bound = _find_minimum(cost, bound)
     text = "ProxQP, then exact least squares on the active set"
     return Solution(theta, at_bound, rows, normals, tuple(map(int, active)), free_theta, text)
 
 
-def _active_set(slope: Array, room: Array, rows: Rows) -> IndexArray:
+def _find_active_set(slope: Array, room: Array, rows: Rows) -> IndexArray:
     """Rows held with equality at the point of ``slope @ u <= room`` nearest to zero.
 
     ProxQP proposes; then rows with a multiplier of the wrong sign leave and violated rows enter
@@ -200,14 +207,14 @@ def _active_set(slope: Array, room: Array, rows: Rows) -> IndexArray:
     proposal = qpsolvers.solve_problem(problem, solver="proxqp", eps_abs=TOLERANCE, eps_rel=0.0)
     # An infeasible problem leaves numbers in x all the same: only `found` and our own check count.
     if proposal.found and proposal.z is not None:
-        held = _exchange(slope, room, np.flatnonzero(proposal.z > 1e-6))
+        held = _exchange_rows(slope, room, np.flatnonzero(proposal.z > 1e-6))
         if held is not None:
             return held
-    if not feasible(rows, rows.none()):
+    if not is_feasible(rows, rows.none()):
         raise Infeasible
     # Slower, but sure to end: the nearest point as a non-negative least-squares problem.
     dual = nnls(np.vstack([-slope.T, -room]), np.r_[np.zeros(n), 1.0])[0]
-    held = _exchange(slope, room, np.flatnonzero(dual > 1e-12))
+    held = _exchange_rows(slope, room, np.flatnonzero(dual > 1e-12))
     if held is not None:
         return held
     raise CtrlidError(
@@ -217,7 +224,7 @@ def _active_set(slope: Array, room: Array, rows: Rows) -> IndexArray:
     )
 
 
-def _exchange(slope: Array, room: Array, start: IndexArray) -> IndexArray | None:
+def _exchange_rows(slope: Array, room: Array, start: IndexArray) -> IndexArray | None:
     held = [int(i) for i in start]
     for _ in range(_ROUNDS * (1 + len(room))):
         u = np.zeros(slope.shape[1])
@@ -238,7 +245,7 @@ def _exchange(slope: Array, room: Array, start: IndexArray) -> IndexArray | None
     return None
 
 
-def spread(cost: Cost, normals: Array) -> tuple[Array, float]:
+def compute_covariance(cost: Cost, normals: Array) -> tuple[Array, float]:
     """How equation errors of variance one scatter the coefficients.
 
     Parameters
@@ -256,7 +263,7 @@ def spread(cost: Cost, normals: Array) -> tuple[Array, float]:
         Condition number of the scaled regression in the free directions.
     """
     cost = cost.scaled()
-    reduced = _reduce(cost, normals, np.zeros(len(normals)))
+    reduced = _reduce_cost(cost, normals, np.zeros(len(normals)))
     half = cost.basis @ reduced.step
     half[~reduced.elimination.directions.any(axis=1)] = 0.0
     condition = float(reduced.singular[0] / reduced.singular[-1])

@@ -10,7 +10,7 @@ from ..._base.errors import CtrlidError, ModelCannotRun
 from ...data.record import Record
 from ...loop.loop import Loop
 from ...physics.equations import Equations
-from ...physics.linearization import state_matrices
+from ...physics.linearization import compute_state_matrices
 
 # A record needs at least so many valid samples, or its noise cannot be estimated.
 FEWEST = 10
@@ -29,9 +29,9 @@ class FilterData:
     t, u, r, y : ndarray, shape (n,)
         Time since the start of the experiment [s], input, reference (without one the output) and
         output, each held where the record is not valid.
-    valid, afresh : ndarray of bool, shape (n,)
+    valid, restart : ndarray of bool, shape (n,)
         Samples that are valid; samples at which the filter starts anew.
-    doubt : ndarray, shape (n,)
+    input_variance : ndarray, shape (n,)
         Variance of the input, relative to that of the sensor noise.
     start, spread : ndarray, shapes (states,), (states, states)
         State at a start, and its covariance relative to the variance of the sensor noise.
@@ -45,8 +45,8 @@ class FilterData:
     r: Array
     y: Array
     valid: Any
-    afresh: Any
-    doubt: Array
+    restart: Any
+    input_variance: Array
     start: Array
     spread: Array
     scale: float
@@ -54,11 +54,11 @@ class FilterData:
     @property
     def usable(self) -> Any:
         """Samples that are valid and no start."""
-        return self.valid & ~self.afresh
+        return self.valid & ~self.restart
 
 
-def make_filter_data(loop: Loop, record: Record, begin: float = 0.0) -> FilterData:
-    """Make a record ready for the filter of a loop; `begin` is the time of its first sample.
+def make_filter_data(loop: Loop, record: Record, start_time: float = 0.0) -> FilterData:
+    """Make a record ready for the filter of a loop; `start_time` is the time of its first sample.
 
     Raises
     ------
@@ -78,39 +78,49 @@ def make_filter_data(loop: Loop, record: Record, begin: float = 0.0) -> FilterDa
     last = np.maximum.accumulate(np.where(valid, np.arange(len(record)), 0))
     y, u = np.asarray(record.y)[last], np.asarray(record.u)[last]
     r = y if record.r is None else np.asarray(record.r)[last]
-    start, spread, scale = _start(loop, record)
-    doubt = np.where(valid, 0.0, (np.std(record.u[valid]) / scale) ** 2)
-    t = begin + record.t - record.start
+    start, spread, scale = _guess_initial_state(loop, record)
+    input_variance = np.where(valid, 0.0, (np.std(record.u[valid]) / scale) ** 2)
+    t = start_time + record.t - record.start
     return FilterData(
-        record, t, u, r, y, valid, find_segment_starts(loop, record), doubt, start, spread, scale
+        record,
+        t,
+        u,
+        r,
+        y,
+        valid,
+        find_segment_starts(loop, record),
+        input_variance,
+        start,
+        spread,
+        scale,
     )
 
 
 def prepare_for_loop(data: FilterData, loop: Loop) -> FilterData:
     """Return data made ready for another model of the same loop; the signals are shared."""
-    start, spread, _ = _start(loop, data.record)
-    return replace(data, afresh=find_segment_starts(loop, data.record), start=start, spread=spread)
+    start, spread, _ = _guess_initial_state(loop, data.record)
+    return replace(data, restart=find_segment_starts(loop, data.record), start=start, spread=spread)
 
 
 def find_segment_starts(loop: Loop, record: Record) -> Any:
     """Return the samples at which the filter restarts: the first ones and those after long gaps."""
     e = loop.equations()
-    poles = np.linalg.eigvals(state_matrices(e, loop.point)[0])
+    poles = np.linalg.eigvals(compute_state_matrices(e, loop.point)[0])
     fastest = np.max(np.abs(poles) if e.dt else np.exp(poles.real * loop.dt), initial=0.0)
     # An unstable model may bridge as long as its errors grow by less than half.
     bridge = BRIDGE if fastest <= 1 else min(BRIDGE, int(np.log(1.5) / np.log(fastest)))
-    afresh = np.zeros(len(record), dtype=bool)
+    restart = np.zeros(len(record), dtype=bool)
     last = -BRIDGE - 1
     for first, stop in record.segments():
         if first - last > bridge:
-            afresh[max(last, 0) : first + 1] = True
+            restart[max(last, 0) : first + 1] = True
         last = stop
     if len(record) - last > bridge:
-        afresh[last:] = True
-    return afresh
+        restart[last:] = True
+    return restart
 
 
-def _start(loop: Loop, record: Record) -> tuple[Array, Array, float]:
+def _guess_initial_state(loop: Loop, record: Record) -> tuple[Array, Array, float]:
     """Return an initial state at the operating point, uncertain enough for any record.
 
     Its covariance is relative to the sensor noise, whose rough standard deviation comes last.
@@ -122,14 +132,14 @@ def _start(loop: Loop, record: Record) -> tuple[Array, Array, float]:
     noise = float(np.std(np.diff(y, 3))) / np.sqrt(20)
     noise = max(noise, 1e-9 * max(abs(at.output), reach), 1e-300)
     speed = max(float(np.std(np.diff(y))) / record.dt, noise / record.dt)
-    rest = state_at_rest(loop, e)
+    rest = find_rest_state(loop, e)
     wide = [max(0.1 * abs(v), reach, noise) for v in rest]
     for j in e.velocities:
         wide[j] = speed
     return np.array(rest), np.diag((np.array(wide) / noise) ** 2), noise
 
 
-def state_at_rest(loop: Loop, e: Equations) -> tuple[float, ...]:
+def find_rest_state(loop: Loop, e: Equations) -> tuple[float, ...]:
     """Return the state at rest, with effects at their neutral values taking part."""
     # States of effects follow those of the plant and have their own values at rest.
     own = len(e.states) - len(e.rest)

@@ -19,13 +19,13 @@ from .kalman_recursion import filter_pass
 from .sampled_plant import Linearized, SampledPlant, Trajectory
 
 # While its variance exceeds so many times the median, a prediction depends on the initial state.
-SETTLED = 4.0
+INITIAL_VARIANCE_RATIO = 4.0
 # So many Newton steps invert the curve of a sensor.
 NEWTON = 6
 # A trajectory converges in two or three passes; after so many it is taken as it is.
 PASSES = 12
 # A trajectory that moves by less than this share of its standard deviation has converged.
-STILL = 1e-3
+CONVERGED_MOTION = 1e-3
 
 
 @dataclass(frozen=True)
@@ -71,9 +71,9 @@ def run_filter(
     p = len(plant.index) if columns is None else columns
     p = p if sensitive else 0
     out = filter_pass(
-        lin.step, lin.a, lin.b, lin.du, np.ascontiguousarray(lin.dp[:, :, :p]), lin.height,
+        lin.step, lin.a, lin.b, lin.du, np.ascontiguousarray(lin.dp[:, :, :p]), lin.output,
         lin.c, np.ascontiguousarray(lin.hp[:, :p]), lin.trajectory.predicted,
-        lin.trajectory.filtered, data.y, data.valid, data.afresh, lin.doubt,
+        lin.trajectory.filtered, data.y, data.valid, data.restart, lin.input_variance,
         lin.start, lin.spread, 1.0,
         np.asarray(noise.force, dtype=float), noise.memory, noise.drift, (0,) * plant.size,
         (0,) * (plant.size + bool(noise.drift > 0)),
@@ -90,13 +90,17 @@ def run_filter(
 def settled_samples(data: FilterData, out: Filtered) -> Any:
     """Return the usable samples whose prediction does not depend on the start."""
     known = data.valid & np.isfinite(out.variance)
-    return known & data.usable & (out.variance <= SETTLED * np.median(out.variance[known]))
+    return (
+        known
+        & data.usable
+        & (out.variance <= INITIAL_VARIANCE_RATIO * np.median(out.variance[known]))
+    )
 
 
-def first_guess(plant: SampledPlant, data: FilterData) -> Trajectory:
+def guess_trajectory(plant: SampledPlant, data: FilterData) -> Trajectory:
     """Return a trajectory to begin with: at rest, states that are measured as measured."""
     n, e = len(data.record), plant.e
-    rest = np.tile(plant.padded(data.start), (n, 1))
+    rest = np.tile(plant.pad_controller_states(data.start), (n, 1))
     seen, values = e.output, data.y
     # The state of a sensor's lag is nearly equal to what it follows.
     for _ in range(1 + len(e.lags)):
@@ -104,7 +108,7 @@ def first_guess(plant: SampledPlant, data: FilterData) -> Trajectory:
         if len(columns) != 1 or casadi.depends_on(seen, casadi.vertcat(e.t, e.u)):
             break
         j = columns[0]
-        rest[:, j] = values = _without_bend(plant, seen, e.x[j], float(rest[0, j]), values)
+        rest[:, j] = values = _invert_sensor(plant, seen, e.x[j], float(rest[0, j]), values)
         behind = [lag.target for lag in e.lags if lag.state == j]
         if not behind:
             break
@@ -112,12 +116,12 @@ def first_guess(plant: SampledPlant, data: FilterData) -> Trajectory:
     for lag in e.lags:
         if casadi.is_equal(lag.target, e.u, 2):
             rest[:, lag.state] = data.u
-    spread = np.sqrt(np.diag(plant.padded(data.spread)))
+    spread = np.sqrt(np.diag(plant.pad_controller_states(data.spread)))
     quiet = np.minimum(spread, 1.0) * data.scale
     return Trajectory(rest, rest.copy(), np.tile(quiet, (n, 1)))
 
 
-def _without_bend(plant: SampledPlant, seen: Any, x: Any, at: float, values: Array) -> Array:
+def _invert_sensor(plant: SampledPlant, seen: Any, x: Any, at: float, values: Array) -> Array:
     """Return the state x at which the output has given values, by Newton's method; else rest."""
     if casadi.is_equal(seen, x, 2):
         return values
@@ -126,8 +130,8 @@ def _without_bend(plant: SampledPlant, seen: Any, x: Any, at: float, values: Arr
     first = np.abs(f(found, plant.e.values)[0].ravel() - values)
     with np.errstate(all="ignore"):
         for _ in range(NEWTON):
-            height, slope = (part.ravel() for part in f(found, plant.e.values))
-            found = found + (values - height) / slope
+            output, slope = (part.ravel() for part in f(found, plant.e.values))
+            found = found + (values - output) / slope
         left = np.abs(f(found, plant.e.values)[0].ravel() - values)
     # A comparison with NaN is false, so that failed samples keep the state at rest.
     return np.where(left <= first, found, at)
@@ -149,7 +153,7 @@ def settle_trajectory(
         If the filter cannot follow the record with this model.
     """
     for count in range(passes):
-        at, lin = _keep_inside(plant, data, theta, at)
+        at, lin = _linearize_inside_domain(plant, data, theta, at)
         out = run_filter(plant, data, lin, noise, sensitive=False)
         moved = np.abs(out.trajectory.filtered - at.filtered)
         if not np.isfinite(out.innovations).all() or not np.isfinite(moved).all():
@@ -160,14 +164,14 @@ def settle_trajectory(
                 "check units, signs and the operating point, or mark the stretch as not valid"
             )
         size = np.maximum(np.std(out.trajectory.filtered, axis=0), 1e-300)
-        still = bool((np.sqrt(np.mean(moved**2, axis=0)) <= STILL * size).all())
+        still = bool((np.sqrt(np.mean(moved**2, axis=0)) <= CONVERGED_MOTION * size).all())
         at = out.trajectory
         if still and count:
             break
     return lin, out
 
 
-def _keep_inside(
+def _linearize_inside_domain(
     plant: SampledPlant, data: FilterData, theta: Array, at: Trajectory
 ) -> tuple[Trajectory, Linearized]:
     """Linearize; samples at which the plant is not defined are set to the state at rest."""
@@ -175,10 +179,10 @@ def _keep_inside(
     if not bad.any():
         lin = plant.linearize(data, theta, at)
         bad = ~(np.isfinite(lin.step).all(axis=1) & np.isfinite(lin.a).all(axis=(1, 2))
-                & np.isfinite(lin.height) & np.isfinite(lin.c).all(axis=1))  # fmt: skip
+                & np.isfinite(lin.output) & np.isfinite(lin.c).all(axis=1))  # fmt: skip
         if not bad.any():
             return at, lin
-    rest = first_guess(plant, data)
+    rest = guess_trajectory(plant, data)
     at = Trajectory(*(np.where(bad[:, None], old, new) for new, old in (
         (at.predicted, rest.predicted), (at.filtered, rest.filtered),
         (at.spread, rest.spread))))  # fmt: skip

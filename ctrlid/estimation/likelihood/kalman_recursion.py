@@ -16,8 +16,8 @@ LARGE = 1e150
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def filter_pass(
-    step: Any, a: Any, b: Any, du: Any, dp: Any, height: Any, c: Any, hp: Any, predicted: Any,
-    filtered: Any, y: Any, valid: Any, afresh: Any, doubt: Any, start: Any, spread: Any,
+    step: Any, a: Any, b: Any, du: Any, dp: Any, output: Any, c: Any, hp: Any, predicted: Any,
+    filtered: Any, y: Any, valid: Any, restart: Any, input_variance: Any, start: Any, spread: Any,
     sensor: Any, force: Any, memory: Any, drift: Any, states: Any, widths: Any,
 ) -> Any:  # fmt: skip  # pragma: no cover - compiled
     r"""Run the filter over a record, linearized along a nominal trajectory.
@@ -37,11 +37,11 @@ def filter_pass(
     step, a, b, du, dp : ndarray, shapes (N, n), (N, n, n), (N, n, m), (N, n), (N, n, p)
         Next state from the nominal filtered state; its derivatives by state, force, input and
         parameters.
-    height, c, hp : ndarray, shapes (N,), (N, n), (N, p)
+    output, c, hp : ndarray, shapes (N,), (N, n), (N, p)
         Output at the nominal predicted state and its derivatives.
     predicted, filtered : ndarray, shape (N, n)
         Nominal trajectory before and after each measurement.
-    y, valid, afresh, doubt : ndarray, shape (N,)
+    y, valid, restart, input_variance : ndarray, shape (N,)
         Measured output; whether it counts; whether the filter starts anew; variance of the input.
     start, spread : ndarray, shapes (n,), (n, n)
         State and covariance at a start.
@@ -77,7 +77,7 @@ def filter_pass(
     full, late = np.zeros((w, w)), np.zeros((w, p))
     ph, along = np.zeros(w), np.zeros(w)
     for k in range(size):
-        if afresh[k] or k == 0:
+        if restart[k] or k == 0:
             for i in range(w):
                 x[i] = start[i] if i < n else 0.0
                 for j in range(w):
@@ -88,7 +88,7 @@ def filter_pass(
                 cov[n, n] = drift / (1.0 - memory * memory)
         for i in range(n):
             before[k, i] = x[i]
-        expected = height[k]
+        expected = output[k]
         for i in range(n):
             row[i] = c[k, i]
             expected += c[k, i] * (x[i] - predicted[k, i])
@@ -170,8 +170,8 @@ def filter_pass(
                 if i < n and j < n:
                     for l in range(m):
                         total += force[l] * b[k, i, l] * b[k, j, l]
-                    if doubt[k] > 0.0:
-                        total += doubt[k] * du[k, i] * du[k, j]
+                    if input_variance[k] > 0.0:
+                        total += input_variance[k] * du[k, i] * du[k, j]
                 elif i == n and j == n:
                     total += drift
                 cov[i, j] = total

@@ -18,7 +18,7 @@ from .sampled_plant import Linearized, SampledPlant, Trajectory, make_sampled_pl
 
 # The sensor's variance is at least this share of the output's mean square, which keeps the
 # likelihood of a noise-free record finite.
-QUIET = 1e-14
+LEAST_SENSOR_SHARE = 1e-14
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +72,7 @@ def make_problem(
     CtrlidError
         If the records do not fit the loop, or the plant moves too fast for its sampling period.
     """
-    bounds = parameter_bounds(loop, names)
+    bounds = list_parameter_bounds(loop, names)
     begins = begins or [0.0] * len(records)
     data = tuple(make_filter_data(loop, r, b) for r, b in zip(records, begins, strict=True))
     follow = records[0].r is not None and loop.analog
@@ -80,7 +80,7 @@ def make_problem(
     return Problem(plant, data, *bounds)
 
 
-def effect_bounds(loop: Loop) -> dict[str, tuple[float, float]]:
+def list_effect_bounds(loop: Loop) -> dict[str, tuple[float, float]]:
     """Return the bounds of the parameters of a loop's effects, by name."""
     return {
         f"{label}.{p.name}": (p.lower, p.upper)
@@ -89,9 +89,9 @@ def effect_bounds(loop: Loop) -> dict[str, tuple[float, float]]:
     }
 
 
-def parameter_bounds(loop: Loop, names: Sequence[str]) -> tuple[Array, Array]:
+def list_parameter_bounds(loop: Loop, names: Sequence[str]) -> tuple[Array, Array]:
     """Return the bounds of parameters: those of effects, and none that changes a sign."""
-    known = effect_bounds(loop)
+    known = list_effect_bounds(loop)
     parameters = loop.equations(keep=True).parameters
     lower, upper = [], []
     for name in names:
@@ -107,7 +107,7 @@ def parameter_bounds(loop: Loop, names: Sequence[str]) -> tuple[Array, Array]:
     return np.array(lower), np.array(upper)
 
 
-def start_values(loop: Loop, names: Sequence[str]) -> Array:
+def list_start_values(loop: Loop, names: Sequence[str]) -> Array:
     """Return the values of parameters as the loop has them."""
     parameters = loop.equations(keep=True).parameters
     return np.array([parameters[name] for name in names], dtype=float)
@@ -184,19 +184,21 @@ class Fit:
         ]
 
 
-def evaluate(problem: Problem, theta: Array, noise: Noise, at: Sequence[Trajectory]) -> Fit:
+def evaluate_likelihood(
+    problem: Problem, theta: Array, noise: Noise, at: Sequence[Trajectory]
+) -> Fit:
     """Return the likelihood of parameters and noise, linearized along given trajectories."""
     plant = problem.plant
     lins = tuple(plant.linearize(one, theta, a) for one, a in zip(problem.data, at, strict=True))
-    return measure_noise(problem, theta, noise, lins)
+    return evaluate_linearized(problem, theta, noise, lins)
 
 
-def linearize_again(fit: Fit) -> Fit:
+def relinearize_fit(fit: Fit) -> Fit:
     """Return the likelihood of the same values, the plant linearized along its last trajectory."""
-    return evaluate(fit.problem, fit.theta, fit.noise, fit.trajectories)
+    return evaluate_likelihood(fit.problem, fit.theta, fit.noise, fit.trajectories)
 
 
-def measure_noise(
+def evaluate_linearized(
     problem: Problem, theta: Array, noise: Noise, lins: Sequence[Linearized], sensitive: bool = True
 ) -> Fit:
     """Return the likelihood of parameters and noise, the plant linearized before."""
@@ -209,21 +211,21 @@ def measure_noise(
     for k, (data, out, keep) in enumerate(zip(problem.data, outs, problem.counts, strict=True)):
         e, s = out.innovations[keep], out.variance[keep]
         if problem.periods:
-            e, s = _between_repeats(out, keep, problem.periods[k])
+            e, s = _subtract_repeat_mean(out, keep, problem.periods[k])
         if not (np.isfinite(e).all() and np.isfinite(s).all() and (s > 0).all()):
             value, e, s = -math.inf, np.ones(1), np.ones(1)
         mean = float(np.mean(e**2 / s))
         if problem.known is not None and problem.known.sensor is not None:
             r = float(problem.known.sensor[k])
         else:
-            least = QUIET * float(np.var(data.y[keep]) + np.mean(data.y[keep]) ** 2)
+            least = LEAST_SENSOR_SHARE * float(np.var(data.y[keep]) + np.mean(data.y[keep]) ** 2)
             r = max(mean, least, 1e-300)
         value -= 0.5 * (len(e) * (math.log(2 * math.pi * r) + mean / r) + np.sum(np.log(s)))
         sensors.append(r)
     return Fit(problem, theta, noise, float(value), np.array(sensors), tuple(lins), outs)
 
 
-def _between_repeats(out: Filtered, keep: Any, period: int) -> tuple[Array, Array]:
+def _subtract_repeat_mean(out: Filtered, keep: Any, period: int) -> tuple[Array, Array]:
     """Return what differs between repeats of the innovations, as large as they are, and variances.
 
     Counted from the end: whatever dies out at the start does not repeat.

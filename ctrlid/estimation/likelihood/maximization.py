@@ -10,27 +10,34 @@ from ..._base.arrays import Array
 from ..._base.criterion import bayesian_penalty
 from ..._base.errors import EffectDoesNotApply, ModelCannotRun
 from ..._base.statistics import pseudo_inverse
-from .kalman_filter import Noise, first_guess, settle_trajectory, settled_samples
-from .likelihood import Fit, Problem, evaluate, linearize_again, start_values
-from .noise_fit import LOG_STEP, choose_units, fit_noise, make_noise, take_logs, try_coloured_force
+from .kalman_filter import Noise, guess_trajectory, settle_trajectory, settled_samples
+from .likelihood import Fit, Problem, evaluate_likelihood, list_start_values, relinearize_fit
+from .noise_fit import (
+    LOG_STEP,
+    choose_noise_ratio,
+    compute_noise_logs,
+    fit_noise,
+    make_noise,
+    try_coloured_force,
+)
 
 # A climb ends after at most so many Gauss-Newton steps.
 ROUNDS = 25
 # After a step of more standard errors the plant is linearized again along the new trajectory.
-FAR = 3.0
+RELINEARIZED_BEYOND = 3.0
 # A climb has converged when its step is shorter than so many standard errors.
-CLOSE = 0.02
+CONVERGED_STEP = 0.02
 # These shares of a step are tried in turn until the likelihood grows.
 SHARES = tuple(3.0**-k for k in range(6))
 # From so many of the longest shares a second step may lead higher along a curved ridge.
-CURVED = 2
+SECOND_STEP_SHARES = 2
 # A second step is tried only where the first one is expected to gain so much log-likelihood, since
 # it hardly ever helps elsewhere.
-BEND = 30.0
+SECOND_STEP_GAIN = 30.0
 # Noise found far away must gain so much log-likelihood before the climb goes on from there.
-ELSEWHERE = 2.0
+OTHER_NOISE_GAIN = 2.0
 # A step that is expected to gain less log-likelihood is not worth its evaluation.
-NOTHING = 1e-3
+LEAST_STEP_GAIN = 1e-3
 
 
 def begin_fit(problem: Problem, theta: Array | None = None, noise: Noise | None = None) -> Fit:
@@ -51,25 +58,25 @@ def begin_fit(problem: Problem, theta: Array | None = None, noise: Noise | None 
         The starting point.
     """
     plant = problem.plant
-    theta = start_values(plant.loop, plant.names) if theta is None else theta
+    theta = list_start_values(plant.loop, plant.names) if theta is None else theta
     noise = problem.known.noise if problem.known else noise
-    first = noise or Noise((choose_units(plant) ** 2 * 1e-2,) * plant.channels)
-    settled = []
+    first = noise or Noise((choose_noise_ratio(plant) ** 2 * 1e-2,) * plant.channels)
+    guessed = []
     for data in problem.data:
-        at = first_guess(plant, data)
+        at = guess_trajectory(plant, data)
         if noise is None:
             at = settle_trajectory(plant, data, theta, first, at, passes=2)[1].trajectory
-        settled.append((data, at))
+        guessed.append((data, at))
     if noise is None:
-        lins = tuple(plant.linearize(data, theta, at) for data, at in settled)
+        lins = tuple(plant.linearize(data, theta, at) for data, at in guessed)
         counts = tuple(data.usable for data in problem.data)
         first = fit_noise(replace(problem, counts=counts), theta, lins, first, wide=True).noise
-    results = [settle_trajectory(plant, data, theta, first, at) for data, at in settled]
+    results = [settle_trajectory(plant, data, theta, first, at) for data, at in guessed]
     if not problem.counts:
         problem = replace(problem, counts=tuple(
             settled_samples(data, out) for data, (_, out) in zip(problem.data, results, strict=True)
         ))  # fmt: skip
-    return evaluate(problem, theta, first, [out.trajectory for _, out in results])
+    return evaluate_likelihood(problem, theta, first, [out.trajectory for _, out in results])
 
 
 def maximize(fit: Fit, rounds: int = ROUNDS, exact: bool = True) -> Fit:
@@ -96,19 +103,19 @@ def maximize(fit: Fit, rounds: int = ROUNDS, exact: bool = True) -> Fit:
     tuned, far, enough = -math.inf, True, 0.02 if exact else 0.3
     for _ in range(rounds):
         # A short step was already evaluated along the trajectory of the pass before.
-        moved = linearize_again(fit) if far else fit
+        moved = relinearize_fit(fit) if far else fit
         fit = moved if np.isfinite(moved.value) else fit
         if fit.value > tuned + 2.0:
             fit = fit_noise(fit.problem, fit.theta, fit.linearized, fit.noise, enough=enough)
             tuned = fit.value
         fit, length = _take_step(fit, *fit.normal)
-        far = bool(length > FAR)
-        if length < (CLOSE if exact else 5 * CLOSE):
+        far = bool(length > RELINEARIZED_BEYOND)
+        if length < (CONVERGED_STEP if exact else 5 * CONVERGED_STEP):
             if fit.value <= tuned + 2.5 * enough:
                 break
             fit = fit_noise(fit.problem, fit.theta, fit.linearized, fit.noise, enough=enough)
             tuned = fit.value
-    return polish(fit) if exact else fit
+    return polish_fit(fit) if exact else fit
 
 
 def refit_noise_size(fit: Fit) -> Fit:
@@ -119,7 +126,7 @@ def refit_noise_size(fit: Fit) -> Fit:
     """
     plain = Noise(fit.noise.force)
     other = fit_noise(fit.problem, fit.theta, fit.linearized, plain, wide=True)
-    return maximize(other) if other.value > fit.value + ELSEWHERE else fit
+    return maximize(other) if other.value > fit.value + OTHER_NOISE_GAIN else fit
 
 
 def choose_noise(fit: Fit, always: bool = False) -> Fit:
@@ -140,13 +147,13 @@ def choose_noise(fit: Fit, always: bool = False) -> Fit:
     return richer if always or richer.value > fit.value + bayesian_penalty(2, fit.size) else fit
 
 
-def expected_gain(fit: Fit) -> float:
+def compute_expected_gain(fit: Fit) -> float:
     """Return the gain that a Gauss-Newton step within the bounds expects."""
     matrix, score = fit.normal
-    return 0.5 * float(score @ bounded_step(fit, matrix, score)[0])
+    return 0.5 * float(score @ compute_bounded_step(fit, matrix, score)[0])
 
 
-def bounded_step(fit: Fit, matrix: Array, score: Array) -> tuple[Array, Array]:
+def compute_bounded_step(fit: Fit, matrix: Array, score: Array) -> tuple[Array, Array]:
     """Return the Newton step and the standard errors; bounds hold what pushes outwards."""
     p, problem = len(fit.theta), fit.problem
     step, error = np.zeros(p), np.full(p, np.inf)
@@ -180,20 +187,25 @@ def _take_step(fit: Fit, matrix: Array, score: Array) -> tuple[Fit, float]:
         Length of the step in standard errors; zero if none is better.
     """
     problem = fit.problem
-    whole, error = bounded_step(fit, matrix, score)
-    promise = 0.5 * float(score @ whole)
-    if not np.isfinite(whole).all() or promise < NOTHING:
+    whole, error = compute_bounded_step(fit, matrix, score)
+    expected = 0.5 * float(score @ whole)
+    if not np.isfinite(whole).all() or expected < LEAST_STEP_GAIN:
         return fit, 0.0
     for k, step in enumerate(share * whole for share in SHARES):
         theta = np.clip(fit.theta + step, problem.lower, problem.upper)
         try:
-            if not problem.plant.fits(theta):
-                problem, fit = _rebuild(fit, theta)
-            trial = evaluate(problem, theta, fit.noise, fit.trajectories)
+            if not problem.plant.is_built_for(theta):
+                problem, fit = _rebuild_plant(fit, theta)
+            trial = evaluate_likelihood(problem, theta, fit.noise, fit.trajectories)
             worse = not trial.value >= fit.value - 1e-6
-            if worse and k < CURVED and promise > BEND and np.isfinite(trial.value):
+            if (
+                worse
+                and k < SECOND_STEP_SHARES
+                and expected > SECOND_STEP_GAIN
+                and np.isfinite(trial.value)
+            ):
                 trial = _take_second_step(trial)
-                worse = not trial.value > fit.value + NOTHING
+                worse = not trial.value > fit.value + LEAST_STEP_GAIN
         except (ModelCannotRun, EffectDoesNotApply):
             # Too far: what moves so fast is no longer followed.
             continue
@@ -208,15 +220,15 @@ def _take_second_step(fit: Fit) -> Fit:
     Where a product of two parameters is all that the record knows, the ridge is curved: along its
     tangent only short steps climb, but a long one and a second from there come back to it.
     """
-    there, problem = linearize_again(fit), fit.problem
-    step, _ = bounded_step(there, *there.normal)
+    there, problem = relinearize_fit(fit), fit.problem
+    step, _ = compute_bounded_step(there, *there.normal)
     theta = np.clip(there.theta + step, problem.lower, problem.upper)
-    if not problem.plant.fits(theta):
+    if not problem.plant.is_built_for(theta):
         return fit
-    return evaluate(problem, theta, there.noise, there.trajectories)
+    return evaluate_likelihood(problem, theta, there.noise, there.trajectories)
 
 
-def _rebuild(fit: Fit, theta: Array) -> tuple[Problem, Fit]:
+def _rebuild_plant(fit: Fit, theta: Array) -> tuple[Problem, Fit]:
     """Return the problem with a plant for the delay that `theta` has."""
     names = fit.plant.names
     loop = fit.plant.loop.with_parameters(dict(zip(names, theta.tolist(), strict=True)))
@@ -224,14 +236,14 @@ def _rebuild(fit: Fit, theta: Array) -> tuple[Problem, Fit]:
     return problem, replace(fit, problem=problem)
 
 
-def polish(fit: Fit, rounds: int = 2) -> Fit:
+def polish_fit(fit: Fit, rounds: int = 2) -> Fit:
     """Take Newton steps on the likelihood itself, by differences over half a standard error."""
     for _ in range(rounds):
         matrix, _ = fit.normal
-        _, error = bounded_step(fit, *fit.normal)
+        _, error = compute_bounded_step(fit, *fit.normal)
         score, known = np.zeros(len(fit.theta)), np.isfinite(error)
         at = fit.trajectories
-        fit = evaluate(fit.problem, fit.theta, fit.noise, at)
+        fit = evaluate_likelihood(fit.problem, fit.theta, fit.noise, at)
         for k in np.flatnonzero(known):
             values = []
             ends = np.clip(
@@ -241,7 +253,7 @@ def polish(fit: Fit, rounds: int = 2) -> Fit:
             for end in ends:
                 theta = fit.theta.copy()
                 theta[k] = end
-                values.append(evaluate(fit.problem, theta, fit.noise, at).value)
+                values.append(evaluate_likelihood(fit.problem, theta, fit.noise, at).value)
             if ends[1] > ends[0] and np.isfinite(values).all():
                 score[k] = (values[1] - values[0]) / (ends[1] - ends[0])
         if not known.any():
@@ -253,7 +265,7 @@ def polish(fit: Fit, rounds: int = 2) -> Fit:
     return tuned if tuned.value > fit.value else fit
 
 
-def information(fit: Fit) -> tuple[Array, Array]:
+def compute_information(fit: Fit) -> tuple[Array, Array]:
     r"""Return the exact Fisher information of parameters and noise, and the score.
 
     .. math:: I = \sum_k \frac{1}{s_k} \frac{\partial e_k}{\partial\eta}
@@ -282,11 +294,11 @@ def information(fit: Fit) -> tuple[Array, Array]:
     problem, plant = fit.problem, fit.plant
     dt, p = plant.loop.dt, len(fit.theta)
     at = fit.trajectories
-    _, error = bounded_step(fit, *fit.normal)
-    logs = take_logs(fit.noise, dt) if problem.known is None else np.zeros(0)
+    _, error = compute_bounded_step(fit, *fit.normal)
+    logs = compute_noise_logs(fit.noise, dt) if problem.known is None else np.zeros(0)
 
-    def innovations(theta: Array, noise: Noise) -> Any:
-        out = evaluate(problem, theta, noise, at).filtered
+    def compute_innovations(theta: Array, noise: Noise) -> Any:
+        out = evaluate_likelihood(problem, theta, noise, at).filtered
         return [(o.innovations[c], np.log(o.variance[c]))
                 for o, c in zip(out, problem.counts, strict=True)]  # fmt: skip
 
@@ -298,15 +310,15 @@ def information(fit: Fit) -> tuple[Array, Array]:
         for end in ends:
             theta = fit.theta.copy()
             theta[k] = end
-            pair.append(innovations(theta, fit.noise))
-        columns.append(_difference(pair, float(ends[1] - ends[0])))
+            pair.append(compute_innovations(theta, fit.noise))
+        columns.append(_divide_difference(pair, float(ends[1] - ends[0])))
     for k in range(len(logs)):
         pair = []
         for h in (-LOG_STEP, LOG_STEP):
             moved = logs.copy()
             moved[k] += h
-            pair.append(innovations(fit.theta, make_noise(moved, plant.channels, dt)))
-        columns.append(_difference(pair, 2 * LOG_STEP))
+            pair.append(compute_innovations(fit.theta, make_noise(moved, plant.channels, dt)))
+        columns.append(_divide_difference(pair, 2 * LOG_STEP))
     count, records = len(columns), len(problem.data) if problem.known is None else 0
     matrix = np.zeros((count + records, count + records))
     score = np.zeros(count + records)
@@ -321,7 +333,7 @@ def information(fit: Fit) -> tuple[Array, Array]:
     return matrix, score
 
 
-def _difference(pair: Any, width: float) -> list[tuple[Array, Array]]:
+def _divide_difference(pair: Any, width: float) -> list[tuple[Array, Array]]:
     if width <= 0:
         return [(np.zeros_like(e), np.zeros_like(s)) for e, s in pair[0]]
     return [((e1 - e0) / width, (s1 - s0) / width)

@@ -10,9 +10,9 @@ import numpy as np
 from ..._base.arrays import Array
 from ..._base.criterion import bayesian_penalty
 from ..._base.errors import ModelCannotRun
-from ..._base.jobs import side_by_side
+from ..._base.jobs import run_side_by_side
 from .kalman_filter import Noise
-from .likelihood import Fit, Known, Problem, measure_noise
+from .likelihood import Fit, Known, Problem, evaluate_linearized
 from .sampled_plant import Linearized, SampledPlant
 
 # Logarithm of the least variance of a force, below which it affects only the start of a record.
@@ -24,7 +24,7 @@ SLOWEST = 0.05
 # Derivatives by the logarithm of a variance are differences over this step.
 LOG_STEP = 0.2
 # Above this second derivative by a log variance, a parabola tells how far the minimum is.
-BOWL = 0.05
+CONVEX = 0.05
 
 
 def fit_noise(
@@ -34,32 +34,38 @@ def fit_noise(
     """Return the most likely noise for parameters as they are."""
     plant, dt = problem.plant, problem.plant.loop.dt
     if problem.known is not None:
-        return measure_noise(problem, theta, problem.known.noise, lins)
+        return evaluate_linearized(problem, theta, problem.known.noise, lins)
 
     def at(logs: Array) -> Noise:
         return make_noise(logs, plant.channels, dt)
 
     def cost(logs: Array) -> float:
-        value = measure_noise(problem, theta, at(np.atleast_1d(logs)), lins, sensitive=False).value
+        value = evaluate_linearized(
+            problem, theta, at(np.atleast_1d(logs)), lins, sensitive=False
+        ).value
         return -value if np.isfinite(value) else 1e15
 
-    start = take_logs(noise, dt)
+    start = compute_noise_logs(noise, dt)
     longest = max(len(data.record) for data in problem.data)
-    low, high = _limits(plant, len(start) > plant.channels, longest)
+    low, high = _bound_logs(plant, len(start) > plant.channels, longest)
     start = np.clip(start, low, high)
     if wide:
         grid = np.linspace(low[0], high[0], 20)
-        best = grid[int(np.argmin(_costs(cost, [np.full(plant.channels, g) for g in grid])))]
+        best = grid[
+            int(np.argmin(_evaluate_costs(cost, [np.full(plant.channels, g) for g in grid])))
+        ]
         start[: plant.channels] = best
-    return measure_noise(problem, theta, at(_newton(cost, start, low, high, enough)), lins)
+    return evaluate_linearized(
+        problem, theta, at(_minimize_by_newton(cost, start, low, high, enough)), lins
+    )
 
 
-def choose_units(plant: SampledPlant) -> float:
+def choose_noise_ratio(plant: SampledPlant) -> float:
     """Return the reference ratio of force noise to sensor noise, by the sampling period."""
     return 1.0 / plant.loop.dt ** (2 if plant.e.velocities else 1)
 
 
-def take_logs(noise: Noise, dt: float) -> Array:
+def compute_noise_logs(noise: Noise, dt: float) -> Array:
     """Return the logarithms that are searched: of variances, and of the coloured force's time."""
     logs = list(np.log(noise.force))
     if noise.drift:
@@ -77,12 +83,12 @@ def make_noise(logs: Array, channels: int, dt: float) -> Noise:
     return Noise(force, memory, math.exp(min(max(logs[channels], -300), 300)) * (1 - memory**2))
 
 
-def _limits(plant: SampledPlant, coloured: bool, longest: int) -> tuple[Array, Array]:
+def _bound_logs(plant: SampledPlant, coloured: bool, longest: int) -> tuple[Array, Array]:
     """Return bounds of the logarithms of the noise variances.
 
     A force that hardly changes during a record is an offset, not noise.
     """
-    unit, dt = 2 * math.log(choose_units(plant)), plant.loop.dt
+    unit, dt = 2 * math.log(choose_noise_ratio(plant)), plant.loop.dt
     low, high = [unit + LEAST] * plant.channels, [unit + MOST] * plant.channels
     if coloured:
         low += [unit + LEAST, math.log(2 * dt)]
@@ -90,12 +96,12 @@ def _limits(plant: SampledPlant, coloured: bool, longest: int) -> tuple[Array, A
     return np.array(low), np.array(high)
 
 
-def _costs(cost: Callable[[Array], float], points: Iterable[Array]) -> Array:
+def _evaluate_costs(cost: Callable[[Array], float], points: Iterable[Array]) -> Array:
     """Return the cost at each point, computed side by side: the filter leaves Python alone."""
-    return np.array(side_by_side(cost, points))
+    return np.array(run_side_by_side(cost, points))
 
 
-def _newton(
+def _minimize_by_newton(
     cost: Callable[[Array], float], x: Array, low: Array, high: Array, enough: float
 ) -> Array:  # fmt: skip
     """Minimise a smooth function of a few logarithms by damped Newton steps with differences.
@@ -110,14 +116,14 @@ def _newton(
     around = np.vstack([unit, -unit, *(unit[i] + unit[j] for i, j in pairs)])
     here, damping = cost(x), 0.1
     for _ in range(12):
-        costs = _costs(cost, np.clip(x + h * around, low, high))
+        costs = _evaluate_costs(cost, np.clip(x + h * around, low, high))
         ups, downs, both = np.split(costs, [n, 2 * n])
         slope = (ups - downs) / (2 * h)
         hessian = np.diag((ups + downs - 2 * here) / h**2)
         for (i, j), value in zip(pairs, both, strict=True):
             hessian[i, j] = hessian[j, i] = (value - ups[i] - ups[j] + here) / h**2
         values, vectors = np.linalg.eigh(hessian)
-        bowl = n == 1 and values[0] > BOWL
+        convex = n == 1 and values[0] > CONVEX
         values, turned = np.maximum(np.abs(values), 1e-3), vectors.T @ slope
         while True:
             step = -vectors @ (turned / (values + damping))
@@ -125,7 +131,7 @@ def _newton(
             trial = np.clip(x + step, low, high)
             moved = vectors.T @ (trial - x)
             foreseen = -float((turned + 0.5 * values * moved) @ moved)
-            if bowl and foreseen < 0.1 * enough:
+            if convex and foreseen < 0.1 * enough:
                 return x
             there = cost(trial)
             if there <= here or damping > 1e6:
@@ -137,10 +143,13 @@ def _newton(
         x, here, damping = trial, there, damping / 10
         if gain < enough:
             break
-        if bowl:
+        if convex:
             # This slope of the quadratic model is left after the step.
-            pull = turned + values * moved
-            left = 0.5 * float(pull @ (pull / values)) + 2.25 * (gain - foreseen) ** 2 / foreseen
+            slope_left = turned + values * moved
+            left = (
+                0.5 * float(slope_left @ (slope_left / values))
+                + 2.25 * (gain - foreseen) ** 2 / foreseen
+            )
             if left < 0.5 * enough:
                 break
     return x
@@ -156,7 +165,9 @@ def try_coloured_force(fit: Fit) -> Fit:
             memory = math.exp(-dt / time)
             force = tuple(0.5 * v for v in fit.noise.force)
             noise = Noise(force, memory, size * (1 - memory**2))
-            trial = measure_noise(fit.problem, fit.theta, noise, fit.linearized, sensitive=False)
+            trial = evaluate_linearized(
+                fit.problem, fit.theta, noise, fit.linearized, sensitive=False
+            )
             if best is None or trial.value > best.value:
                 best = trial
     assert best is not None
@@ -165,7 +176,7 @@ def try_coloured_force(fit: Fit) -> Fit:
     return fit_noise(fit.problem, fit.theta, fit.linearized, best.noise)
 
 
-def known_from_repeats(fit: Fit, periods: Sequence[int]) -> Known:
+def estimate_noise_from_repeats(fit: Fit, periods: Sequence[int]) -> Known:
     r"""Return the noise that differs between repeats of the same experiment.
 
     .. math:: d_k^p = \sqrt{\tfrac{P}{P-1}} \Bigl( e_k^p - \tfrac{1}{P} \sum_q e_k^q \Bigr)

@@ -9,10 +9,10 @@ from scipy.stats import norm
 from ..._base.arrays import Array
 from ..._base.criterion import bayesian_penalty
 from ..._base.errors import CtrlidError
-from ..._base.text import Printed, number, quantity
+from ..._base.text import Printed, write_number, write_quantity
 from ...loop.loop import Loop
 from ...physics.linearization import operating_point
-from ..identified_model import root_errors
+from ..identified_model import compute_root_errors
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -107,13 +107,19 @@ class LoopEstimate(Printed):
         width = max((len(name) for name in self.names), default=0)
         for name, value, error in zip(self.names, self.values, self.standard_errors, strict=True):
             bound = name in self.active
-            shown = number(value, 6) if bound else quantity(value, error=error, digits=6)
+            shown = (
+                write_number(value, 6) if bound else write_quantity(value, error=error, digits=6)
+            )
             rows.append(f"  {name:<{width}} = {shown}{' (on its bound)' if bound else ''}")
-        noise = ", ".join(number(v, 3) for v in self.sensor_noise)
-        rows.append(f"  sensor noise {noise}, white force noise {number(self.force_noise, 3)}")
+        noise = ", ".join(write_number(v, 3) for v in self.sensor_noise)
+        rows.append(
+            f"  sensor noise {noise}, white force noise {write_number(self.force_noise, 3)}"
+        )
         if self.coloured_force:
-            rows.append(f"  coloured force {number(self.coloured_force, 3)} with a time constant "
-                        f"of {number(self.force_time, 3)} s")  # fmt: skip
+            rows.append(
+                f"  coloured force {write_number(self.coloured_force, 3)} with a time constant "
+                f"of {write_number(self.force_time, 3)} s"
+            )
         return "\n".join([*rows, *(f"  note: {note}" for note in self.notes)])
 
 
@@ -135,7 +141,7 @@ class LoopFit(Printed):
     @property
     def model(self) -> Any:
         """Return the plant with its effects, linearized where it rests at the loop's output."""
-        return _at_rest(self.loop)
+        return _linearize_at_rest(self.loop)
 
     @property
     def poles(self) -> Any:
@@ -158,20 +164,22 @@ class LoopFit(Printed):
             if name in estimate.active or h == 0:
                 slopes.append(np.zeros(len(self.poles)))
                 continue
-            ends = [_at_rest(self.loop.with_parameters({name: value + d})) for d in (h, -h)]
+            ends = [
+                _linearize_at_rest(self.loop.with_parameters({name: value + d})) for d in (h, -h)
+            ]
             slopes.append((ends[0].den[0][0] - ends[1].den[0][0])[1:] / (2 * h))
         slope = np.column_stack(slopes)
         lost = ~np.isfinite(estimate.standard_errors)
         if np.any(slope[:, lost] != 0):
             return np.full(len(slope), np.inf)
         covariance = np.where(np.outer(~lost, ~lost), estimate.covariance, 0.0)
-        return root_errors(self.poles, slope @ covariance @ slope.T)
+        return compute_root_errors(self.poles, slope @ covariance @ slope.T)
 
     def __str__(self) -> str:
         return f"{self.loop!r}\n{self.estimate}"
 
 
-def _at_rest(loop: Loop) -> Any:
+def _linearize_at_rest(loop: Loop) -> Any:
     """Return the linear model at the loop's output, with input and states solved for anew."""
     if not loop.linear_plant:
         assert loop.at is not None

@@ -10,10 +10,10 @@ from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
 from ..._base.statistics import pseudo_inverse
 from ...data.record import Record
-from ...data.several_records import as_records, model_and_data
+from ...data.several_records import as_records, order_model_and_data
 from ...loop.loop import Loop
-from .likelihood import Fit, effect_bounds, make_problem
-from .maximization import begin_fit, choose_noise, information, maximize, refit_noise_size
+from .likelihood import Fit, list_effect_bounds, make_problem
+from .maximization import begin_fit, choose_noise, compute_information, maximize, refit_noise_size
 from .physics_estimate import LoopEstimate, LoopFit
 
 # A direction of which the scaled information has a smaller relative eigenvalue is not in the data.
@@ -79,21 +79,21 @@ def fit_loop(
     >>> low < 3.34e-6 < high
     True
     """
-    loop, record = model_and_data(loop, record)
+    loop, record = order_model_and_data(loop, record)
     records = as_records(record)
-    names = _free_names(loop, free)
+    names = _choose_free_names(loop, free)
     fit = refit_noise_size(maximize(begin_fit(make_problem(loop, names, records))))
     if coloured or coloured is None:
         fit = choose_noise(fit, always=bool(coloured))
     return summarize_fit(loop, fit)
 
 
-def _free_names(loop: Loop, free: Sequence[str] | None) -> tuple[str, ...]:
+def _choose_free_names(loop: Loop, free: Sequence[str] | None) -> tuple[str, ...]:
     if not isinstance(loop, Loop):
         raise CtrlidError(f"fit_loop needs a Loop(plant, ..., dt=...); given {type(loop).__name__}")
     known = list(loop.equations(keep=True).parameters)
     if free is None:
-        names = tuple(dict.fromkeys([*loop.free, *effect_bounds(loop)]))
+        names = tuple(dict.fromkeys([*loop.free, *list_effect_bounds(loop)]))
     else:
         names = (free,) if isinstance(free, str) else tuple(free)
     unknown = [name for name in names if name not in known]
@@ -107,7 +107,7 @@ def _free_names(loop: Loop, free: Sequence[str] | None) -> tuple[str, ...]:
 def summarize_fit(loop: Loop, fit: Fit) -> LoopFit:
     """Return a maximum of the likelihood as a loop and an estimate."""
     names, p = fit.plant.names, len(fit.theta)
-    matrix, _ = information(fit)
+    matrix, _ = compute_information(fit)
     on_bound = (fit.theta <= fit.problem.lower) | (fit.theta >= fit.problem.upper)
     inside = np.concatenate([~on_bound, np.ones(len(matrix) - p, dtype=bool)])
     covariance = np.zeros((p, p))
@@ -116,7 +116,7 @@ def summarize_fit(loop: Loop, fit: Fit) -> LoopFit:
     kept = rows[rows < p]
     covariance[np.ix_(kept, kept)] = inverse[: len(kept), : len(kept)]
     notes = []
-    lost = [k for k in range(p) if inside[k] and (matrix[k, k] <= 0 or _unseen(matrix, rows, k))]
+    lost = [k for k in range(p) if inside[k] and (matrix[k, k] <= 0 or _is_unseen(matrix, rows, k))]
     for k in lost:
         covariance[k, :] = covariance[:, k] = 0.0
         covariance[k, k] = math.inf
@@ -135,7 +135,7 @@ def summarize_fit(loop: Loop, fit: Fit) -> LoopFit:
     return LoopFit(fitted, estimate)
 
 
-def _unseen(matrix: Array, rows: Any, k: int) -> bool:
+def _is_unseen(matrix: Array, rows: Any, k: int) -> bool:
     """Whether a parameter takes part in a direction that is not in the data."""
     if k not in rows:
         return False

@@ -13,7 +13,7 @@ import numpy as np
 from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
 from ...data.record import Record
-from ...data.several_records import model_and_data
+from ...data.several_records import order_model_and_data
 from ...data.validity import whole_past
 from ...loop.loop import Loop
 from .kalman_filter import Noise
@@ -102,7 +102,7 @@ def predict(loop: Loop, record: Record, force_noise: float | None = None) -> Pre
     >>> bool(cid.predict(loop, record).innovations.std() < 1.3e-3)
     True
     """
-    loop, record = model_and_data(loop, record)
+    loop, record = order_model_and_data(loop, record)
     if not (isinstance(loop, Loop) and isinstance(record, Record)):
         raise CtrlidError("predict needs a Loop and a Record; given "
                           f"{type(loop).__name__} and {type(record).__name__}")  # fmt: skip
@@ -162,10 +162,10 @@ def predict_ahead(
         # The outputs after the start are not known to the prediction.
         x = plant.advance(data, x, starts + j, known=j == 0)
     k = starts + horizon
-    return k, plant.height(data, x, k)
+    return k, plant.evaluate_output(data, x, k)
 
 
-def spread_ahead(
+def predict_spread(
     loop: Loop, record: Record, prediction: Prediction, horizon: int
 ) -> tuple[float, float]:  # fmt: skip
     r"""Return the standard deviation that noise gives predictions several samples ahead.

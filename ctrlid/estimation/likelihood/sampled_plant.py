@@ -15,7 +15,7 @@ from ..._base.arrays import Array
 from ...loop.loop import Loop
 from ...physics.block_evaluation import BlockEvaluation, evaluate_blocks
 from ...physics.equations import Equations
-from ...physics.integration import delay_of, whole_delay
+from ...physics.integration import count_delay_samples, substitute_delay
 from .filter_data import FilterData
 from .transition_maps import (
     PeriodPlan,
@@ -25,7 +25,8 @@ from .transition_maps import (
     scheme_suits,
 )
 
-FORGOTTEN = 200  # samples after which one looks whether backlash has forgotten how it began
+# After each so many samples it is checked whether the backlash has forgotten where it began.
+FORGOTTEN = 200
 # A lasting error of the input moves the plant as far as white noise of so many times its variance.
 LASTING = 10
 # What a short lag follows is known within this share of the sensor's variance.
@@ -50,11 +51,11 @@ class Linearized:
     b: Array
     du: Array
     dp: Array
-    height: Array
+    output: Array
     c: Array
     hp: Array
     # Variance of the input at each sample, relative to that of the sensor noise.
-    doubt: Array
+    input_variance: Array
     start: Array
     # Covariance of the initial state, relative to the variance of the sensor noise.
     spread: Array
@@ -87,21 +88,23 @@ class SampledPlant:
         self.law = law if law is not None and law.dt == 0.0 else None
         self.n = len(e.states)
         self.size = self.n + (len(self.law.rest) if self.law else 0)
-        self.late = whole_delay(e, loop.dt)
+        self.delay_samples = count_delay_samples(e, loop.dt)
         self.forces = e.velocities or tuple(range(self.n - len(e.rest)))
         # One force on all velocities; without any, each state has a noise of its own.
         self.channels = 1 if e.velocities else len(self.forces)
         self.scheme = choose_scheme(e, loop)
         self.plan = PeriodPlan(e, self.law, loop.dt, hold, self.scheme, self.forces, self.channels,
-                         tuple(self.index), self.late)  # fmt: skip
+                         tuple(self.index), self.delay_samples)  # fmt: skip
         self.maps = build_maps(self.plan)
-        self.initial = InitialConditions(self.plan)
+        self.initial_conditions = InitialConditions(self.plan)
 
     def of_loop(self, loop: Loop, names: Sequence[str]) -> SampledPlant:
         """Return the plant of another loop, for the same kind of record."""
         return SampledPlant(loop, names, self.hold, self.law is not None)
 
-    def _period(self, stages: Sequence[BlockEvaluation], x: Array, *given: Any) -> list[Array]:
+    def _evaluate_transition(
+        self, stages: Sequence[BlockEvaluation], x: Array, *given: Any
+    ) -> list[Array]:
         """Return the state after a period and its derivatives, those by the state first."""
         if not self.maps.carries:
             return evaluate_blocks(stages, [], [x, *given, 0])
@@ -118,57 +121,71 @@ class SampledPlant:
         found = [casadi.is_equal(rate, e.x[v], 2) for rate in rates]
         return [k for k in range(self.n) if k != v][found.index(True)]
 
-    def values(self, theta: Any) -> Array:
+    def insert_free_values(self, theta: Any) -> Array:
         """Return all parameter values with `theta` in the places of the free ones."""
         p = self.e.values.copy()
         p[self.index] = theta
         return p
 
-    def fits(self, theta: Array) -> bool:
+    def is_built_for(self, theta: Array) -> bool:
         """Whether the map was built for such values of a delay or of a lag."""
-        e, dt, p = self.e, self.loop.dt, self.values(theta)
+        e, dt, p = self.e, self.loop.dt, self.insert_free_values(theta)
         if e.delay is not None:
-            late = delay_time(e, p) / dt + 1e-9
-            if not self.late <= late <= self.late + 1 + 1e-6:
+            late = evaluate_delay(e, p) / dt + 1e-9
+            if not self.delay_samples <= late <= self.delay_samples + 1 + 1e-6:
                 return False
         return scheme_suits(self.scheme, e, p, dt)
 
     def linearize(self, data: FilterData, theta: Array, at: Trajectory) -> Linearized:
         """Return the plant along a trajectory, for parameter values `theta`."""
-        p = self.values(theta)
+        p = self.insert_free_values(theta)
         u = data.u
         applied, slopes = self._through_backlash(u, p)
-        doubt = data.doubt + self.initial.doubt(u, p) / data.scale**2
-        w = self._inputs(data, applied)
+        input_variance = (
+            data.input_variance + self.initial_conditions.find_input_variance(u, p) / data.scale**2
+        )
+        w = self._stack_applied_inputs(data, applied)
         spread = at.spread[:, : self.n].T
         given = (at.filtered.T, w, p, spread, np.zeros(self.channels))
-        step, a, b, dp, *moved = self._period(self.maps.stages, *given)
+        step, a, b, dp, *moved = self._evaluate_transition(self.maps.stages, *given)
         # How the input moves the state matters only where the input is not what was measured.
         du = np.zeros((len(u), self.size))
-        rows = np.flatnonzero(doubt)
+        rows = np.flatnonzero(input_variance)
         if slopes is not None:
-            dw = _full(moved[0], len(u))
+            dw = _repeat_over_samples(moved[0], len(u))
             du = dw.sum(axis=2)
-            dp = _full(dp, len(u)).copy()
+            dp = _repeat_over_samples(dp, len(u)).copy()
             for k in (-1, 0, 1):
-                dp += dw[:, :, k + 1, None] * shift_signal(slopes, self.late - k)[:, None, :]
+                dp += (
+                    dw[:, :, k + 1, None] * shift_signal(slopes, self.delay_samples - k)[:, None, :]
+                )
         elif len(rows):
-            du[rows] = self._moved(rows, given, 1e-3 * float(np.std(u[data.valid])))
-        start, wide = self.initial.start(data, p)
-        height, c, hp = self.maps.sensor(at.predicted.T, w, p, spread)
+            du[rows] = self._differentiate_by_input(
+                rows, given, 1e-3 * float(np.std(u[data.valid]))
+            )
+        start, wide = self.initial_conditions.find_initial_state(data, p)
+        output, c, hp = self.maps.sensor(at.predicted.T, w, p, spread)
         return Linearized(
-            _full(step, len(u))[:, :, 0], _full(a, len(u)), _full(b, len(u)),
-            du, _full(dp, len(u)), _full(height, len(u))[:, 0, 0],
-            _full(c, len(u))[:, 0, :], _full(hp, len(u))[:, 0, :], doubt,
-            self.padded(start), self.padded(wide), at,
-        )  # fmt: skip
+            _repeat_over_samples(step, len(u))[:, :, 0],
+            _repeat_over_samples(a, len(u)),
+            _repeat_over_samples(b, len(u)),
+            du,
+            _repeat_over_samples(dp, len(u)),
+            _repeat_over_samples(output, len(u))[:, 0, 0],
+            _repeat_over_samples(c, len(u))[:, 0, :],
+            _repeat_over_samples(hp, len(u))[:, 0, :],
+            input_variance,
+            self.pad_controller_states(start),
+            self.pad_controller_states(wide),
+            at,
+        )
 
-    def _moved(self, rows: Any, given: Sequence[Array], h: float) -> Array:
+    def _differentiate_by_input(self, rows: Any, given: Sequence[Array], h: float) -> Array:
         """Return by differences how the state after the samples `rows` depends on the input."""
         x, w, p, spread, force = given
         held = np.array([0.0, 1.0, 1.0, 1.0, 0.0, 0.0])[:, None]
         above, below = (
-            self._period(
+            self._evaluate_transition(
                 self.maps.stages, x[:, rows], w[:, rows] + s * h * held, p, spread[:, rows], force
             )[0]
             for s in (1, -1)
@@ -180,9 +197,11 @@ class SampledPlant:
         """Return the input behind the backlash, and how it depends on the free parameters."""
         if self.e.play is None:
             return u, None
-        return build_backlash(self.plan).along(self.initial.memory(float(u[0]), p)[0], u, p)
+        return build_backlash(self.plan).compute_input(
+            self.initial_conditions.find_memory(float(u[0]), p)[0], u, p
+        )
 
-    def with_slopes(self) -> casadi.Function:
+    def build_sensitivity_map(self) -> casadi.Function:
         """Return one period of the plant, as it is, together with that of its sensitivities.
 
         ``f(z, w, p) -> (next z, y and its slopes)``; z stacks the state and its derivatives by the
@@ -206,38 +225,42 @@ class SampledPlant:
             [casadi.vertcat(after, casadi.vec(moved)), casadi.vertcat(y, seen.T)], {"cse": True},
         )  # fmt: skip
 
-    def inputs(self, data: FilterData, theta: Array) -> Array:
+    def stack_inputs(self, data: FilterData, theta: Array) -> Array:
         """Return the rows over which the map is evaluated, shape (6, n), behind any backlash."""
-        return self._inputs(data, self._through_backlash(data.u, self.values(theta))[0])
+        return self._stack_applied_inputs(
+            data, self._through_backlash(data.u, self.insert_free_values(theta))[0]
+        )
 
     def advance(self, data: FilterData, x: Array, rows: Any, known: bool = True) -> Array:
         """Return states (k, n) one period after the samples `rows`, with the loop's parameters."""
         p = self.e.values
-        w = self._inputs(data, self._through_backlash(data.u, p)[0])[:, rows]
+        w = self._stack_applied_inputs(data, self._through_backlash(data.u, p)[0])[:, rows]
         if not known:
-            w[5] = self.height(data, x, rows)
+            w[5] = self.evaluate_output(data, x, rows)
         quiet = np.zeros((self.n, 1))
-        return self._period(self.maps.stages, x.T, w, p, quiet, np.zeros(self.channels))[0][:, :, 0]
+        return self._evaluate_transition(
+            self.maps.stages, x.T, w, p, quiet, np.zeros(self.channels)
+        )[0][:, :, 0]
 
-    def height(self, data: FilterData, x: Array, rows: Any) -> Array:
+    def evaluate_output(self, data: FilterData, x: Array, rows: Any) -> Array:
         """Return the outputs at states (k, n) and the samples `rows`."""
         p = self.e.values
-        w = self._inputs(data, self._through_backlash(data.u, p)[0])[:, rows]
+        w = self._stack_applied_inputs(data, self._through_backlash(data.u, p)[0])[:, rows]
         return self.maps.sensor(x.T, w, p, np.zeros((self.n, 1)))[0][:, 0, 0]
 
-    def _inputs(self, data: FilterData, applied: Array) -> Array:
+    def _stack_applied_inputs(self, data: FilterData, applied: Array) -> Array:
         """Return the rows (t, input before, now, ahead, r, y) over which the map is evaluated."""
         t, r, y = data.t, data.r, data.y
-        moved = [shift_signal(applied, self.late - k) for k in (-1, 0, 1)]
+        moved = [shift_signal(applied, self.delay_samples - k) for k in (-1, 0, 1)]
         return np.vstack([t, *moved, r, y])
 
-    def padded(self, values: Array) -> Array:
+    def pad_controller_states(self, values: Array) -> Array:
         """Add the states of a known analog controller, at rest, to a start."""
         extra = self.size - values.shape[0]
         return np.pad(values, [(0, extra)] * values.ndim)
 
 
-def _full(values: Array, n: int) -> Array:
+def _repeat_over_samples(values: Array, n: int) -> Array:
     """Repeat values that are the same at all samples, so that there are n of them."""
     return values if values.shape[0] == n else np.repeat(values, n, axis=0)
 
@@ -251,9 +274,9 @@ class InitialConditions:
 
     def __init__(self, plan: PeriodPlan) -> None:
         self.plan = plan
-        self.lags = _lags(plan.equations)
+        self.lags = _find_lags(plan.equations)
 
-    def memory(self, u: float, p: Array) -> tuple[float, float]:
+    def find_memory(self, u: float, p: Array) -> tuple[float, float]:
         """Return the memory of the backlash at the start, and how far off it may be."""
         e = self.plan.equations
         assert e.play is not None
@@ -262,7 +285,7 @@ class InitialConditions:
         start, reach = np.asarray(casadi.evalf(found), float).ravel().tolist()
         return start, reach
 
-    def doubt(self, u: Array, p: Array) -> Array:
+    def find_input_variance(self, u: Array, p: Array) -> Array:
         """Return the variance of the input, as far as it is older than the record.
 
         Parameters
@@ -279,20 +302,20 @@ class InitialConditions:
         """
         e, variance = self.plan.equations, np.zeros(len(u))
         if e.play is not None:
-            variance = shift_signal(self._forgetting(u, p), self.plan.late)
+            variance = shift_signal(self._find_backlash_variance(u, p), self.plan.delay_samples)
         if e.delay is not None:
-            late = delay_time(e, p) / self.plan.dt - np.arange(len(u))
+            late = evaluate_delay(e, p) / self.plan.dt - np.arange(len(u))
             variance = variance + np.clip(late, 0.0, 1.0) ** 2 * np.var(u)
         return variance
 
-    def _forgetting(self, u: Array, p: Array) -> Array:
+    def _find_backlash_variance(self, u: Array, p: Array) -> Array:
         """Return the variance of the input behind the backlash, until it forgets how it began."""
         variance = np.zeros(len(u))
-        middle, reach = self.memory(float(u[0]), p)
+        middle, reach = self.find_memory(float(u[0]), p)
         ends, backlash = [middle - reach, middle + reach], build_backlash(self.plan)
         for first in range(0, len(u), FORGOTTEN):
             some = u[first : first + FORGOTTEN]
-            memories = [backlash.memories(z, some, p) for z in ends]
+            memories = [backlash.compute_memories(z, some, p) for z in ends]
             low, high = (
                 backlash.slopes(m[None, :-1], some[None, :], p)[0][:, 0, 0] for m in memories
             )
@@ -302,11 +325,11 @@ class InitialConditions:
             ends = [float(m[-1]) for m in memories]
         return variance
 
-    def start(self, data: FilterData, p: Array) -> tuple[Array, Array]:
+    def find_initial_state(self, data: FilterData, p: Array) -> tuple[Array, Array]:
         """Return state and covariance at the start of a record, for parameter values `p`."""
         start, spread = data.start.copy(), data.spread.copy()
         u, y = data.u, data.y
-        alone = not data.afresh[int(np.argmax(data.valid)) + 1 :].any()
+        alone = not data.restart[int(np.argmax(data.valid)) + 1 :].any()
         for k, shown, function in self.lags:
             time, target, near = (v[:, 0] for v in function(start if shown else u[None, :], p))
             late = float(time[0, 0]) / self.plan.dt
@@ -327,7 +350,7 @@ class InitialConditions:
         return start, spread
 
 
-def _lags(e: Equations) -> list[tuple[int, bool, BlockEvaluation]]:
+def _find_lags(e: Equations) -> list[tuple[int, bool, BlockEvaluation]]:
     """Lags behind the input, or behind what the plant shows: whether so, time and target."""
     found = []
     for lag in e.lags:
@@ -341,9 +364,9 @@ def _lags(e: Equations) -> list[tuple[int, bool, BlockEvaluation]]:
     return found
 
 
-def delay_time(e: Equations, p: Array) -> float:
+def evaluate_delay(e: Equations, p: Array) -> float:
     """Return the delay of the input [s] for parameter values `p`."""
-    return float(casadi.evalf(delay_of(e, p)))
+    return float(casadi.evalf(substitute_delay(e, p)))
 
 
 def shift_signal(values: Array, late: int) -> Array:

@@ -17,10 +17,10 @@ from ...loop.loop import Loop
 from ...loop.period_map import apply_backlash
 from ...physics.block_evaluation import BlockEvaluation
 from ...physics.equations import Equations
-from ...physics.integration import Scheme, advance, input_pieces, integrate, known_lags
-from ...physics.interpreter import follow
-from ...physics.linearization import state_matrices
-from .filter_data import state_at_rest
+from ...physics.integration import Scheme, advance, cut_input, find_lags, integrate
+from ...physics.interpreter import iterate_program
+from ...physics.linearization import compute_state_matrices
+from .filter_data import find_rest_state
 
 # The maps of so many structures are kept, which bounds memory.
 BUILT = 64
@@ -31,9 +31,9 @@ SLOW = 0.35
 # More steps of order eight in a period make an expression that takes minutes to build.
 MOST_STEPS = 100
 # A step of order four follows a lag accurately if it is this share of its time constant.
-BRISK = 0.35
+LAG_STEP = 0.35
 # Beside the kink of friction this share is enough, since no formula is more accurate there.
-ROUGH = 0.7
+LAG_STEP_AT_KINK = 0.7
 # So many steps of order four cost less than one of order eight.
 FEW_STEPS = 3
 # So many steps of order four resolve the transient of a short lag where friction has a kink.
@@ -76,7 +76,7 @@ class PeriodPlan:
     forces: tuple[int, ...]
     channels: int
     index: tuple[int, ...]
-    late: int
+    delay_samples: int
     structure: tuple[Any, ...] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -107,14 +107,14 @@ def choose_scheme(e: Equations, loop: Loop) -> Scheme:
     """Return the cheapest scheme that integrates a period of the plant accurately enough."""
     if e.dt:
         return Scheme(4, 1)
-    hidden = [lag.state for lags in known_lags(e) for lag in lags]
+    hidden = [lag.state for lags in find_lags(e) for lag in lags]
     plain = [k for k in range(len(e.states)) if k not in hidden]
-    time = _shortest(e, e.values)
+    time = _find_input_lag_time(e, e.values)
     driven, cut = np.isfinite(time), bool(time < loop.dt / 8)
     # The filter's own uncertainty smooths kinks; sharp friction does not make the plant stiff.
     try:
-        point = replace(loop.point, states=state_at_rest(loop, e))
-        a = state_matrices(e, point, spread=1e6)[0][np.ix_(plain, plain)]
+        point = replace(loop.point, states=find_rest_state(loop, e))
+        a = compute_state_matrices(e, point, spread=1e6)[0][np.ix_(plain, plain)]
     except ModelCannotRun:
         return Scheme(8, 2, (8, 2) if cut else None)
     rate = float(np.max(np.abs(np.linalg.eigvals(a)), initial=0.0)) * loop.dt
@@ -130,7 +130,7 @@ def choose_scheme(e: Equations, loop: Loop) -> Scheme:
         few = max(
             2 * few if e.kinked else few,
             2,
-            math.ceil(loop.dt / time / _brisk(e)),
+            math.ceil(loop.dt / time / _choose_lag_step(e)),
         )
         if e.kinked or few <= FEW_STEPS:
             return Scheme(4, few)
@@ -144,22 +144,22 @@ def choose_scheme(e: Equations, loop: Loop) -> Scheme:
     return Scheme(8, steps, (8, steps) if cut else None)
 
 
-def _brisk(e: Equations) -> float:
+def _choose_lag_step(e: Equations) -> float:
     """Return the step of order four that follows a lag, as a share of its time constant."""
-    return ROUGH if e.kinked else BRISK
+    return LAG_STEP_AT_KINK if e.kinked else LAG_STEP
 
 
 def scheme_suits(scheme: Scheme, e: Equations, p: Array, dt: float) -> bool:
     """Whether a period is integrated well enough for the lag that parameter values `p` have."""
-    time = _shortest(e, p)
+    time = _find_input_lag_time(e, p)
     if scheme.sharp:
         return time < dt / 4
-    return time > (dt / scheme.steps / (2 * _brisk(e)) if scheme.order == 4 else dt / 16)
+    return time > (dt / scheme.steps / (2 * _choose_lag_step(e)) if scheme.order == 4 else dt / 16)
 
 
-def _shortest(e: Equations, p: Array) -> float:
+def _find_input_lag_time(e: Equations, p: Array) -> float:
     """Return the time constant of the lag that follows the input; infinite without one."""
-    for lag in known_lags(e)[0]:
+    for lag in find_lags(e)[0]:
         values = casadi.SX(casadi.DM(p))
         return float(casadi.evalf(casadi.substitute(casadi.SX(lag.time_constant), e.p, values)))
     return math.inf
@@ -184,10 +184,10 @@ class TransitionMaps:
 @functools.lru_cache(maxsize=BUILT)
 def build_maps(plan: PeriodPlan) -> TransitionMaps:
     """Return the maps, built once: that takes the time of several passes."""
-    x, ends, given, by, parts = _period(plan)
+    x, ends, given, by, parts = _build_period(plan)
     # Behind backlash, the input itself depends on the free parameters.
     own = ("force", "free") if plan.equations.play is None else ("force", "free", "input")
-    functions = _chained(x, ends, parts, given, [by[key] for key in own])
+    functions = _chain_maps(x, ends, parts, given, [by[key] for key in own])
     height = by["height"]
     outputs = [height, casadi.jacobian(height, x), casadi.jacobian(height, by["free"])]
     sensor = casadi.Function("sensor", [x, *given[:3]], outputs, {"cse": True})
@@ -195,27 +195,29 @@ def build_maps(plan: PeriodPlan) -> TransitionMaps:
     return TransitionMaps(functions, stages, parts, sensor, BlockEvaluation(sensor))
 
 
-def _period(plan: PeriodPlan) -> tuple[Any, list[Any], list[Any], dict[str, Any], int]:
+def _build_period(plan: PeriodPlan) -> tuple[Any, list[Any], list[Any], dict[str, Any], int]:
     """Return the state, its value after each stage, what is given, symbols, and the parts."""
     e, n, dt = plan.equations, len(plan.equations.states), plan.dt
     x, p, s = (casadi.SX.sym(k, m) for k, m in (("x", plan.size), ("p", e.p.shape[0]),
                                                 ("s", n)))  # fmt: skip
     t, before, now, ahead, r, y = w = [casadi.SX.sym(k) for k in "tbnary"]
     force = casadi.SX.sym("f", plan.channels)
-    kick = casadi.SX.zeros(n, 1)
+    held_rate = casadi.SX.zeros(n, 1)
     for k, j in enumerate(plan.forces):
-        kick[j] = force[k if plan.channels > 1 else 0]
+        held_rate[j] = force[k if plan.channels > 1 else 0]
     # A fit repeats the map often; a single prediction can afford to be exact.
-    scheme = plan.scheme if plan.index else _exact(plan.scheme, e.kinked)
+    scheme = plan.scheme if plan.index else _raise_order(plan.scheme, e.kinked)
     part = casadi.SX.sym("i")
     if plan.law is None:
         pieces = [
             tuple(casadi.substitute(casadi.SX(value), e.p, p) for value in piece)
-            for piece in input_pieces(e, dt, (before, now, ahead), plan.hold)
+            for piece in cut_input(e, dt, (before, now, ahead), plan.hold)
         ]
-        ends, parts = _stages_of(plan, t, x, pieces, p, s, kick, scheme, part)
+        ends, parts = _build_stages(plan, t, x, pieces, p, s, held_rate, scheme, part)
     else:
-        ends = [_followed(plan, t, x, p, s, kick, now, r, y, max(scheme.steps, 2))]
+        ends = [
+            _integrate_with_controller(plan, t, x, p, s, held_rate, now, r, y, max(scheme.steps, 2))
+        ]
         parts = 1
     free = casadi.vertcat(*(p[k] for k in plan.index)) if plan.index else casadi.SX(0, 1)
     by = {"force": force, "free": free, "input": casadi.vertcat(before, now, ahead),
@@ -223,14 +225,14 @@ def _period(plan: PeriodPlan) -> tuple[Any, list[Any], list[Any], dict[str, Any]
     return x, ends, [casadi.vertcat(*w), p, s, force, part], by, parts
 
 
-def _exact(scheme: Scheme, kinked: bool) -> Scheme:
+def _raise_order(scheme: Scheme, kinked: bool) -> Scheme:
     """Return a scheme of order eight throughout."""
     steps = scheme.steps if kinked or scheme.order == 8 else 1
     return Scheme(8, steps, (8, steps) if scheme.sharp else None)
 
 
-def _stages_of(
-    plan: PeriodPlan, t: Any, x: Any, pieces: Any, p: Any, s: Any, kick: Any, scheme: Scheme,
+def _build_stages(
+    plan: PeriodPlan, t: Any, x: Any, pieces: Any, p: Any, s: Any, held_rate: Any, scheme: Scheme,
     part: Any,
 ) -> tuple[list[Any], int]:  # fmt: skip
     """Return the maps that make up a period, and how many equal parts each of them has.
@@ -239,19 +241,29 @@ def _stages_of(
     """
     e, steps = plan.equations, scheme.steps
     if e.dt or scheme.sharp or steps == 1:
-        return [advance(e, t, x, pieces, p, s, kick, scheme=scheme)[0]], 1
+        return [advance(e, t, x, pieces, p, s, held_rate, scheme=scheme)[0]], 1
     ends, begin, one = [], t, Scheme(scheme.order, 1)
     for duration, level, slope in pieces:
         h = duration / steps
         piece = (h, level + slope * part * h, slope)
-        after = advance(e, begin + part * h, x, [piece], p, s, kick, scheme=one)[0]
+        after = advance(e, begin + part * h, x, [piece], p, s, held_rate, scheme=one)[0]
         ends.append(after)
         begin = begin + duration
     return ends, steps
 
 
-def _followed(plan: PeriodPlan, t: Any, x: Any, p: Any, s: Any, kick: Any, u: Any, r: Any, y: Any,
-              substeps: int) -> Any:  # fmt: skip
+def _integrate_with_controller(
+    plan: PeriodPlan,
+    t: Any,
+    x: Any,
+    p: Any,
+    s: Any,
+    held_rate: Any,
+    u: Any,
+    r: Any,
+    y: Any,
+    substeps: int,
+) -> Any:
     """Advance plant and analog controller together, u being the measured one at the start."""
     e, law, n = plan.equations, plan.law, len(plan.equations.states)
     assert law is not None
@@ -263,13 +275,13 @@ def _followed(plan: PeriodPlan, t: Any, x: Any, p: Any, s: Any, kick: Any, u: An
     def rate(tau: Any, z: Any) -> Any:
         seen = e.smoothed(t + tau, z[:n], u, p, s)[1] + noise
         computed, slope = law.apply(t + tau, z[n:], r, seen)
-        moved = e.smoothed(t + tau, z[:n], computed + offset, p, s)[0] + kick
+        moved = e.smoothed(t + tau, z[:n], computed + offset, p, s)[0] + held_rate
         return casadi.vertcat(moved, slope)
 
     return integrate(rate, x, plan.dt, substeps)[0]
 
 
-def _chained(
+def _chain_maps(
     x: Any, ends: Sequence[Any], parts: int, given: Sequence[Any], by: Sequence[Any]
 ) -> tuple[casadi.Function, ...]:
     """Return maps that carry the state and its derivatives, by itself first, along.
@@ -286,11 +298,11 @@ def _chained(
         a, *own = (casadi.jacobian(end, v) for v in (x, *by))
         own = [casadi.SX(n, n), *own]
         outputs = [casadi.mtimes(a, s) + d for s, d in zip(before, own, strict=True)]
-        functions.append(_function([x, *carried, *given], [end, *outputs]))
+        functions.append(_make_function([x, *carried, *given], [end, *outputs]))
     return tuple(functions)
 
 
-def _function(inputs: Sequence[Any], outputs: Sequence[Any]) -> casadi.Function:
+def _make_function(inputs: Sequence[Any], outputs: Sequence[Any]) -> casadi.Function:
     """Return a function, common parts found once where that pays: long ones have few."""
     plain = casadi.Function("step", inputs, outputs)
     if plain.n_instructions() > LONG:
@@ -309,23 +321,23 @@ class BacklashMap:
     after: BlockEvaluation
     slopes: BlockEvaluation
 
-    def memories(self, first: float, u: Array, p: Array) -> Array:
+    def compute_memories(self, first: float, u: Array, p: Array) -> Array:
         """Return the memory before each of n samples and after the last, shape (n + 1,)."""
         after = self.after
         inputs = np.concatenate([[first, 0.0], p])[:, None]
         room = np.empty((after.registers, 1)), np.zeros((after.rows_out, 1))
-        found: Array = follow(after.program, after.constants, inputs, *room, u)
+        found: Array = iterate_program(after.program, after.constants, inputs, *room, u)
         return found
 
-    def along(self, first: float, u: Array, p: Array) -> tuple[Array, Array]:
+    def compute_input(self, first: float, u: Array, p: Array) -> tuple[Array, Array]:
         """Return the applied input, shape (n,), and its derivatives by the free parameters.
 
         Those have shape (n, free); the first memory is held.
         """
-        memories = self.memories(first, u, p)[:-1]
+        memories = self.compute_memories(first, u, p)[:-1]
         applied, *slopes = self.slopes(memories[None, :], u[None, :], p)
         seen, moved = (np.broadcast_to(v, (len(u), *v.shape[1:]))[:, 0, :] for v in slopes)
-        by_memory = _carry_gap(moved[:, 0], moved[:, 1:])
+        by_memory = _carry_sensitivity(moved[:, 0], moved[:, 1:])
         return applied[:, 0, 0], seen[:, :1] * by_memory + seen[:, 1:]
 
 
@@ -344,7 +356,7 @@ def build_backlash(plan: PeriodPlan) -> BacklashMap:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _carry_gap(gain: Any, push: Any) -> Any:  # pragma: no cover - compiled
+def _carry_sensitivity(gain: Any, push: Any) -> Any:  # pragma: no cover - compiled
     """Return what obeys ``s[k + 1] = gain[k] s[k] + push[k]`` and begins at zero."""
     out = np.zeros(push.shape)
     for k in range(len(push) - 1):

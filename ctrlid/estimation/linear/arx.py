@@ -12,12 +12,12 @@ from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
 from ..._base.jobs import check_jobs
 from ...data.record import Record
-from ...data.several_records import VISIBLE_MOTION, input_motion, stream_records
+from ...data.several_records import VISIBLE_MOTION, measure_input_motion, stream_records
 from ..constraints import AbstractConstraint, check_constraints
 from ..constraints.constrained_minimum import Found, minimize
 from ..constraints.quadratic_program import Cost, NotExcited
 from ..identified_model import Estimate, IdentifiedModel, Structure
-from .regression import Regression, arx_regression, check_orders, from_differences
+from .regression import Regression, build_arx_regression, check_orders, from_differences
 
 
 def fit_arx(
@@ -97,8 +97,8 @@ def fit_arx(
     known = check_constraints(constraints)
     first, records = stream_records(record)
     motions: list[float] = []
-    watched = records if first.hold == "zoh" else _watched(records, motions)
-    regression = arx_regression(watched, structure, intercept, check_jobs(jobs))
+    watched = records if first.hold == "zoh" else _note_motion(records, motions)
+    regression = build_arx_regression(watched, structure, intercept, check_jobs(jobs))
     unknowns = na + nb + len(regression.intercept_rows)
     if regression.rows <= unknowns:
         raise CtrlidError(
@@ -107,11 +107,11 @@ def fit_arx(
             "orders."
         )
     try:
-        found = minimize(arx_cost(regression), known, structure)
+        found = minimize(make_arx_cost(regression), known, structure)
     except NotExcited as trouble:
-        message = _not_excited(regression, trouble.direction)
+        message = _explain_no_excitation(regression, trouble.direction)
         raise CtrlidError(message) from None
-    estimate = _estimate(regression, found, constrained=bool(known), dt=first.dt)
+    estimate = _make_estimate(regression, found, constrained=bool(known), dt=first.dt)
     share = max(motions, default=0.0)
     if share > VISIBLE_MOTION:
         note = (
@@ -124,14 +124,14 @@ def fit_arx(
     return IdentifiedModel(estimate, inputs=names.get("u", "u"), outputs=names.get("y", "y"))
 
 
-def _watched(records: Iterable[Record], motions: list[float]) -> Iterator[Record]:
+def _note_motion(records: Iterable[Record], motions: list[float]) -> Iterator[Record]:
     """Pass records on, and note of each how far its input moves between samples."""
     for record in records:
-        motions.append(input_motion([record]))
+        motions.append(measure_input_motion([record]))
         yield record
 
 
-def arx_cost(regression: Regression) -> Cost:
+def make_arx_cost(regression: Regression) -> Cost:
     """Return the regression as a quadratic cost; columns that are only rounding errors are zero."""
     size = np.linalg.norm(regression.R, axis=0)
     excited = size > 10 * regression.floor
@@ -141,7 +141,7 @@ def arx_cost(regression: Regression) -> Cost:
     return Cost(np.where(excited, regression.R, 0.0), regression.d, basis, origin, floor)
 
 
-def _estimate(regression: Regression, found: Found, constrained: bool, dt: float) -> Estimate:
+def _make_estimate(regression: Regression, found: Found, constrained: bool, dt: float) -> Estimate:
     constants = len(regression.intercept_rows)
     degrees = regression.rows - found.free - constants
     rss = regression.rss + found.cost
@@ -164,7 +164,7 @@ def _estimate(regression: Regression, found: Found, constrained: bool, dt: float
     )
 
 
-def _not_excited(regression: Regression, direction: Array) -> str:
+def _explain_no_excitation(regression: Regression, direction: Array) -> str:
     """Say which signal is constant, or which coefficients the data cannot tell apart."""
     structure: Structure = regression.structure
     na = structure.na
@@ -183,7 +183,8 @@ def _not_excited(regression: Regression, direction: Array) -> str:
     weights = direction / np.abs(direction).max()
     moves = ", ".join(f"{n} by {weights[structure.names.index(n)]:.3g}" for n in involved)
     return (
-        f"{head}{_text.listing(involved)} can move together ({moves}) and no prediction changes. "
-        "Either nothing but the controller moves u (vary the reference, or add a signal to u), "
+        f"{head}{_text.write_list(involved)} can move together ({moves}) and no prediction "
+        "changes. Either nothing but the controller moves u (vary the reference, or add a signal "
+        "to u), "
         "or the orders are higher than the plant's (lower na or nb), or a constraint is missing."
     )

@@ -8,14 +8,14 @@ import control as ct
 import numpy as np
 
 from ..._base.errors import CtrlidError, CtrlidWarning
-from ..._base.text import listing
+from ..._base.text import write_list
 from ...data.record import Record
-from ...data.several_records import VISIBLE_MOTION, as_records, input_motion
+from ...data.several_records import VISIBLE_MOTION, as_records, measure_input_motion
 from ...loop.controllers import PID
 from ...physics.conversions import to_state_matrices
 from ..constraints import AbstractConstraint, check_constraints
 from ..identified_model import Estimate, IdentifiedModel, Structure
-from .prediction_error import Piece, Task, best_fit
+from .prediction_error import Piece, Task, find_best_fit
 from .sampled_motion import Circuit
 
 # Above this product of dt and the controller's fastest pole, u moves visibly between samples.
@@ -95,8 +95,8 @@ def fit_continuous(
     structure = _check_orders(poles, zeros)
     known = check_constraints(constraints)
     records = as_records(record)
-    circuit = _circuit(controller, records)
-    pieces = _pieces(records, structure.na)
+    circuit = _make_circuit(controller, records)
+    pieces = _cut_pieces(records, structure.na)
     needed = 4 * (len(structure.names) + structure.na + 2)
     total = sum(p.n for p in pieces)
     if total < needed:
@@ -109,7 +109,7 @@ def fit_continuous(
     if (delay is None or delay) and (circuit or records[0].hold != "zoh"):
         raise CtrlidError("a delay is modelled for a held input only; give delay=0")
     task = Task(structure, pieces, records[0].dt, records[0].hold, circuit, delay is None, 1.0)
-    point, found, rss, used = best_fit(task, known, delay or 0.0)
+    point, found, rss, used = find_best_fit(task, known, delay or 0.0)
     degrees = used - found.free - structure.na - int(task.free_delay)
     late = f", delay {point.delay:.6g} s" if task.free_delay else ""
     estimate = Estimate(
@@ -136,14 +136,14 @@ def _check_orders(poles: Any, zeros: Any) -> Structure:
     return Structure(na=int(poles), nb=int(zeros) + 1, domain="s")
 
 
-def _circuit(controller: Any, records: Sequence[Record]) -> Circuit | None:
+def _make_circuit(controller: Any, records: Sequence[Record]) -> Circuit | None:
     if isinstance(controller, PID) or (
         isinstance(controller, ct.InputOutputSystem) and controller.dt not in (0, None)
     ):
         # A digital controller holds u, which is therefore known between the samples.
         return None
     if controller is None:
-        moves = input_motion(records)
+        moves = measure_input_motion(records)
         if moves > VISIBLE_MOTION:
             warnings.warn(
                 f"the input of an analog controller moves by {100 * moves:.0f} % of its spread "
@@ -173,7 +173,7 @@ def _circuit(controller: Any, records: Sequence[Record]) -> Circuit | None:
     return circuit
 
 
-def _pieces(records: Sequence[Record], order: int) -> tuple[Piece, ...]:
+def _cut_pieces(records: Sequence[Record], order: int) -> tuple[Piece, ...]:
     pieces = []
     for record in records:
         y0, u0 = (float(np.mean(s[record.valid])) if record.valid.any() else 0.0
@@ -192,8 +192,8 @@ def _pieces(records: Sequence[Record], order: int) -> tuple[Piece, ...]:
     flat = [name for name in ("u", "y") if all(np.ptp(p.signals[name]) == 0 for p in pieces)]
     if flat:
         raise CtrlidError(
-            f"The data do not determine the coefficients: {listing(flat)} is constant wherever the "
-            "record counts. Excite the loop: vary the reference (random_binary) or add a signal "
-            "to u."
+            f"The data do not determine the coefficients: {write_list(flat)} is constant wherever "
+            "the record counts. Excite the loop: vary the reference (random_binary) or add a "
+            "signal to u."
         )
     return tuple(pieces)

@@ -17,14 +17,14 @@ from ..._base.statistics import regress
 from ...physics.conversions import to_polynomials
 from ..identified_model import Structure
 from .instruments import Piece, Signals
-from .regression import merge
+from .regression import merge_factors
 
 # A controller is sought in the record up to this order.
 _HIGHEST = 4
 
 
 @dataclass(frozen=True, eq=False)
-class Law:
+class LinearController:
     """A linear controller ``D u = sum of N_i w_i + M y`` in powers of the delay.
 
     ``source`` says where it comes from.
@@ -36,7 +36,7 @@ class Law:
     source: str
 
 
-def given_law(controller: Any, names: Sequence[str], dt: float) -> Law:
+def convert_controller(controller: Any, names: Sequence[str], dt: float) -> LinearController:
     """Turn a controller of r - y or of (r, y) into a law; further signals are added to u.
 
     Parameters
@@ -82,15 +82,15 @@ def given_law(controller: Any, names: Sequence[str], dt: float) -> Law:
             f"The controller runs at {controller.dt:g} s, the record at {dt:g} s. Convert it to "
             "the period of the record."
         )
-    numerators, den = _fractions(controller)
+    numerators, den = _expand_fractions(controller)
     if controller.ninputs == 2 and list(controller.input_labels) == ["y", "r"]:
         numerators = numerators[::-1]
     feedback = numerators[1] if len(numerators) == 2 else -numerators[0]
     external = tuple(numerators[0] if name == "r" else den for name in names)
-    return Law(den, external, feedback, "the given controller")
+    return LinearController(den, external, feedback, "the given controller")
 
 
-def _fractions(controller: Any) -> tuple[list[Array], Array]:
+def _expand_fractions(controller: Any) -> tuple[list[Array], Array]:
     """Numerators over one denominator, all of one length, in powers of the delay."""
     if isinstance(controller, control.StateSpace):
         return to_polynomials(controller.A, controller.B, controller.C, controller.D)
@@ -108,7 +108,7 @@ def _fractions(controller: Any) -> tuple[list[Array], Array]:
     return [num / den[0] for num in padded], den / den[0]
 
 
-def found_law(pieces: Sequence[Piece], names: Sequence[str]) -> Law | None:
+def identify_controller(pieces: Sequence[Piece], names: Sequence[str]) -> LinearController | None:
     """Find the controller in the record: u is what it computes from past u, w and y.
 
     The lowest order wins that leaves nothing, or else the one that Schwarz' criterion prefers. It
@@ -126,7 +126,7 @@ def found_law(pieces: Sequence[Piece], names: Sequence[str]) -> Law | None:
     Law or None
         None where u does not depend on the external signals.
     """
-    best: tuple[float, Law | None] = (np.inf, None)
+    best: tuple[float, LinearController | None] = (np.inf, None)
     swing = sum(float(np.sum(piece.u**2)) for piece in pieces)
     for m in range(_HIGHEST + 1):
         factors, rows = [], 0
@@ -138,27 +138,27 @@ def found_law(pieces: Sequence[Piece], names: Sequence[str]) -> Law | None:
             rows += len(table)
             factor = np.asarray(np.linalg.qr(table, mode="r"), dtype=float)
             factors.append(factor[1:, 1:])
-        total = merge(factors)
+        total = merge_factors(factors)
         x = regress(total[:, :-1], total[:, -1], 1e-11)
         left = float(np.sum((total[:, -1] - total[:, :-1] @ x) ** 2))
-        merit = rows * np.log(max(left, 1e-18 * swing)) + 2 * bayesian_penalty(len(x), rows)
-        if merit < best[0] - 1e-9 * abs(best[0]) or best[1] is None:
+        criterion = rows * np.log(max(left, 1e-18 * swing)) + 2 * bayesian_penalty(len(x), rows)
+        if criterion < best[0] - 1e-9 * abs(best[0]) or best[1] is None:
             taps = x[m:].reshape(len(names) + 1, m + 1)
             den = np.concatenate([[1.0], -x[:m]])
             source = f"a controller of order {m} found in the record"
-            best = (merit, Law(den, tuple(taps[:-1]), taps[-1], source))
+            best = (criterion, LinearController(den, tuple(taps[:-1]), taps[-1], source))
         if left <= 1e-16 * swing:
             break
     law = best[1]
     return law if law is not None and any(np.any(taps != 0) for taps in law.external) else None
 
 
-def loop_signals(
+def simulate_noise_free_loop(
     pieces: Sequence[Piece],
-    law: Law,
+    law: LinearController,
     structure: Structure,
     theta: Array,
-    kicks: Sequence[Array] | None = None,
+    forces: Sequence[Array] | None = None,
 ) -> Signals | None:
     r"""Simulate model and controller without noise, driven by the external signals.
 
@@ -175,7 +175,7 @@ def loop_signals(
         Orders of the model.
     theta : (p,) array
         Its coefficients.
-    kicks : sequence of arrays, optional
+    forces : sequence of arrays, optional
         A force q on each piece, ``A y = B u + q``.
 
     Returns
@@ -198,8 +198,8 @@ def loop_signals(
         for n, w in zip(law.external, piece.w, strict=True):
             y += signal.lfilter(np.convolve(n, b), both, w)
             u += signal.lfilter(np.convolve(n, a), both, w)
-        if kicks is not None:
-            y += signal.lfilter(law.den, both, kicks[i])
-            u += signal.lfilter(law.feedback, both, kicks[i])
+        if forces is not None:
+            y += signal.lfilter(law.den, both, forces[i])
+            u += signal.lfilter(law.feedback, both, forces[i])
         found.append((y, u))
     return found

@@ -14,7 +14,7 @@ from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
 from ..._base.statistics import regress
 from ...data.record import Record
-from .regression import block_qr, merge
+from .regression import block_qr, merge_factors
 
 Signals = list[tuple[Array, Array]]
 
@@ -37,7 +37,9 @@ class Piece:
     levels: tuple[float, float]
 
 
-def cut(records: Sequence[Record], names: Sequence[str], intercept: bool, shortest: int) -> Any:
+def cut_pieces(
+    records: Sequence[Record], names: Sequence[str], intercept: bool, shortest: int
+) -> Any:
     """Cut records into valid stretches.
 
     Parameters
@@ -70,7 +72,7 @@ def cut(records: Sequence[Record], names: Sequence[str], intercept: bool, shorte
     return pieces
 
 
-def two_stage(pieces: Sequence[Piece]) -> Signals:
+def project_on_references(pieces: Sequence[Piece]) -> Signals:
     r"""Project y and u on the past of the external signals: the first of two least squares.
 
     .. math:: \hat y(k) = \sum_i g_i \sum_{l \in I_i} w(k - l)
@@ -94,42 +96,42 @@ def two_stage(pieces: Sequence[Piece]) -> Signals:
     data", Automatica 29 (1993).
     """
     longest = max(len(piece.y) for piece in pieces)
-    edges = _windows(min(_LONGEST, longest // 8))
+    edges = _choose_windows(min(_LONGEST, longest // 8))
     m = (len(edges) - 1) * len(pieces[0].w)
     factors = []
     for piece in pieces:
-        sums = [_sums(w, edges[-1]) for w in piece.w]
+        sums = [_compute_running_sums(w, edges[-1]) for w in piece.w]
 
         def fill(out: Array, start: int, stop: int, p: Piece = piece, s: Any = sums) -> None:
             out[:, 0] = 1.0
-            out[:, 1 : m + 1] = _delayed(s, edges, start, stop)
+            out[:, 1 : m + 1] = _average_delays(s, edges, start, stop)
             out[:, m + 1], out[:, m + 2] = p.y[start:stop], p.u[start:stop]
 
         factors.append(block_qr(fill, len(piece.y), m + 3)[1:, 1:])
-    total = merge(factors)
+    total = merge_factors(factors)
     g = regress(total[:, :m], total[:, m:], 1e-8)
     found = []
     for piece in pieces:
-        sums, n = [_sums(w, edges[-1]) for w in piece.w], len(piece.y)
-        blocks = [_delayed(sums, edges, i, min(i + 4096, n)) @ g for i in range(0, n, 4096)]
+        sums, n = [_compute_running_sums(w, edges[-1]) for w in piece.w], len(piece.y)
+        blocks = [_average_delays(sums, edges, i, min(i + 4096, n)) @ g for i in range(0, n, 4096)]
         both = np.vstack(blocks)
         found.append((both[:, 0].copy(), both[:, 1].copy()))
     return found
 
 
-def _windows(reach: int) -> list[int]:
+def _choose_windows(reach: int) -> list[int]:
     edges = [0, 1, 2, 3, 4]
     while edges[-1] < reach:
         edges.append(edges[-1] + max(1, 1 << (edges[-1].bit_length() - 2)))
     return edges
 
 
-def _sums(w: Array, reach: int) -> Array:
+def _compute_running_sums(w: Array, reach: int) -> Array:
     """Return running sums; the signal waits at its first value before the first sample."""
     return np.concatenate([[0.0], np.cumsum(np.concatenate([np.full(reach, w[0]), w]))])
 
 
-def _delayed(sums: Sequence[Array], edges: list[int], start: int, stop: int) -> Array:
+def _average_delays(sums: Sequence[Array], edges: list[int], start: int, stop: int) -> Array:
     columns = []
     at = edges[-1] + 1 + np.arange(start, stop)
     for s in sums:
@@ -173,7 +175,7 @@ def check_instruments(records: Sequence[Record], instruments: Any) -> tuple[str,
                 )
             channel = record.r if name == "r" else record.extra.get(name)
             if channel is None:
-                raise CtrlidError(_missing(where, name, record))
+                raise CtrlidError(_explain_missing(where, name, record))
             counted = channel[record.valid]
             if counted.size and np.ptp(counted) == 0:
                 raise CtrlidError(
@@ -185,8 +187,8 @@ def check_instruments(records: Sequence[Record], instruments: Any) -> tuple[str,
     return names
 
 
-def _missing(where: str, name: str, record: Record) -> str:
-    has = _text.listing([repr(key) for key in record.extra])
+def _explain_missing(where: str, name: str, record: Record) -> str:
+    has = _text.write_list([repr(key) for key in record.extra])
     if name != "r":
         return f"{where} has no extra channel {name!r}; it has {has or 'none'}."
     return (

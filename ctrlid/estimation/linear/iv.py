@@ -20,10 +20,22 @@ from ..constraints import AbstractConstraint, check_constraints
 from ..constraints.constrained_minimum import Found, minimize
 from ..constraints.quadratic_program import NotExcited
 from ..identified_model import Estimate, IdentifiedModel, Structure
-from .controller_model import Law, found_law, given_law, loop_signals
+from .controller_model import (
+    LinearController,
+    convert_controller,
+    identify_controller,
+    simulate_noise_free_loop,
+)
 from .instruments import Signals, check_instruments
-from .iv_equations import Moments, Residuals, Task, compute_moments, curved_force, separate
-from .prefilter import View, autoregression, stable_factor
+from .iv_equations import (
+    Moments,
+    Residuals,
+    Task,
+    compute_curved_force,
+    compute_moments,
+    separate_nuisances,
+)
+from .prefilter import View, autoregression, reflect_poles
 from .regression import check_orders, to_differences
 
 # At most so many iterations are made for one noise model.
@@ -150,16 +162,16 @@ def fit_iv(
     _check_hold(records)
     names = check_instruments(records, instruments)
     task = Task.prepare(records, structure, names, intercept)
-    law = found_law(task.pieces, names) if controller is None else None
+    law = identify_controller(task.pieces, names) if controller is None else None
     if controller is not None:
-        law = given_law(controller, names, records[0].dt)
+        law = convert_controller(controller, names, records[0].dt)
     try:
-        fit = _refine(task, known, law)
+        fit = _refine_noise_model(task, known, law)
     except NotExcited as trouble:
-        raise CtrlidError(_not_excited(structure, names, trouble.direction)) from None
-    estimate = _estimate(task, fit, constrained=bool(known), dt=records[0].dt)
+        raise CtrlidError(_explain_no_excitation(structure, names, trouble.direction)) from None
+    estimate = _make_estimate(task, fit, constrained=bool(known), dt=records[0].dt)
     _check_strength(estimate, names)
-    if not fit.settled:
+    if not fit.converged:
         warnings.warn(_NOT_SETTLED, CtrlidWarning, stacklevel=2)
     labels = records[0].names
     return IdentifiedModel(estimate, inputs=labels.get("u", "u"), outputs=labels.get("y", "y"))
@@ -175,24 +187,28 @@ class _Fit:
     hats: Signals
     source: str
     iterations: int
-    settled: bool = True
+    converged: bool = True
 
 
-def _refine(task: Task, known: Sequence[AbstractConstraint], law: Law | None) -> _Fit:
+def _refine_noise_model(
+    task: Task, known: Sequence[AbstractConstraint], law: LinearController | None
+) -> _Fit:
     """Iterate: with white noise and a linear plant first, then with what the residuals ask for."""
-    theta = _start(task, known)
+    theta = _find_start(task, known)
     view, count = View(np.ones(1), np.ones(1)), 0
     for _ in range(6):
-        fit = _iterate(task, known, law, theta, view, count)
+        fit = _iterate_instruments(task, known, law, theta, view, count)
         count, theta, view = fit.iterations, fit.found.theta, fit.view
         if fit.moments.rss(theta) <= 1e-20 * fit.moments.size**2:
             # Only rounding errors are left, so that there is no noise to model.
             break
         # The noise model starts from white again, so that its order can fall as well as rise.
         plain = replace(view, num=np.ones(1))
-        better = autoregression([part.e for part in separate(task, theta, fit.hats, plain)])
+        better = autoregression(
+            [part.e for part in separate_nuisances(task, theta, fit.hats, plain)]
+        )
         if view.degree < _DEGREE and _is_curved(task, fit, replace(view, num=better)):
-            view = replace(view, degree=view.degree + 1, bend=())
+            view = replace(view, degree=view.degree + 1, curvature=())
             continue
         if len(better) == len(view.num) and np.allclose(better, view.num, atol=0.02):
             break
@@ -200,7 +216,7 @@ def _refine(task: Task, known: Sequence[AbstractConstraint], law: Law | None) ->
     return fit
 
 
-def _start(task: Task, known: Sequence[AbstractConstraint]) -> Array:
+def _find_start(task: Task, known: Sequence[AbstractConstraint]) -> Array:
     """First coefficients: delayed references, under prefilters from wide to narrow.
 
     The candidate with the least one-step prediction error wins.
@@ -219,10 +235,10 @@ def _start(task: Task, known: Sequence[AbstractConstraint]) -> Array:
         except NotExcited as problem:
             trouble = problem
             continue
-        moments = compute_moments(task, task.delayed, _through(task, theta, view))
-        merit = moments.rss(theta)
-        if merit < best[0]:
-            best = (merit, theta)
+        moments = compute_moments(task, task.delayed, _update_prefilter(task, theta, view))
+        square_sum = moments.rss(theta)
+        if square_sum < best[0]:
+            best = (square_sum, theta)
     if best[1] is None:
         assert trouble is not None
         raise trouble
@@ -233,25 +249,25 @@ def _is_curved(task: Task, fit: _Fit, view: View) -> bool:
     """Whether products of a higher degree explain more than Schwarz' criterion asks of them."""
     theta = fit.found.theta
     straight = compute_moments(task, fit.hats, view)
-    curved = compute_moments(task, fit.hats, replace(view, degree=view.degree + 1, bend=()))
+    curved = compute_moments(task, fit.hats, replace(view, degree=view.degree + 1, curvature=()))
     gain = straight.rows * np.log(straight.rss(theta) / curved.rss(theta))
     return bool(gain > 2 * bayesian_penalty(curved.nuisances - straight.nuisances, straight.rows))
 
 
-def _bent(task: Task, fit: _Fit) -> View:
+def _update_curvature(task: Task, fit: _Fit) -> View:
     """Return the view with the curvature and the equilibria that this step found."""
-    residuals = separate(task, fit.found.theta, fit.hats, fit.view)
+    residuals = separate_nuisances(task, fit.found.theta, fit.hats, fit.view)
     gain = float(fit.found.theta[task.structure.na :].sum())
     shift: tuple[float, ...] = ()
     if task.intercept and gain != 0.0:
         # At the equilibrium of the mean output: 0 = B(1) shift + c.
         reach = max(float(np.abs(hat[1]).max()) for hat in fit.hats)
-        constants = _by_record(task, [part.constant for part in residuals])
+        constants = _average_by_record(task, [part.constant for part in residuals])
         shift = tuple(float(x) for x in np.clip(-constants / gain, -reach, reach))
-    return replace(fit.view, bend=tuple(part.bend for part in residuals), shift=shift)
+    return replace(fit.view, curvature=tuple(part.curvature for part in residuals), shift=shift)
 
 
-def _by_record(task: Task, values: Sequence[float]) -> Array:
+def _average_by_record(task: Task, values: Sequence[float]) -> Array:
     """Mean of what each stretch says, over the samples of each record."""
     owners = [piece.owner for piece in task.pieces]
     sizes = [len(piece.y) for piece in task.pieces]
@@ -259,15 +275,15 @@ def _by_record(task: Task, values: Sequence[float]) -> Array:
     return np.asarray(total / np.bincount(owners, sizes, task.records), dtype=float)
 
 
-def _through(task: Task, theta: Array, view: View) -> View:
+def _update_prefilter(task: Task, theta: Array, view: View) -> View:
     """Return the same view through the denominator of another model."""
-    return replace(view, den=stable_factor(task.structure, theta, task.longest))
+    return replace(view, den=reflect_poles(task.structure, theta, task.longest))
 
 
-def _iterate(
+def _iterate_instruments(
     task: Task,
     known: Sequence[AbstractConstraint],
-    law: Law | None,
+    law: LinearController | None,
     theta: Array,
     view: View,
     count: int,
@@ -276,11 +292,11 @@ def _iterate(
     best, least = theta, np.inf
     hats = task.delayed
     for step in range(_MOST):
-        view = _through(task, theta, view)
+        view = _update_prefilter(task, theta, view)
         simulated = None
         if law is not None:
-            kicks = curved_force(task, hats, view)
-            simulated = loop_signals(task.pieces, law, task.structure, theta, kicks)
+            forces = compute_curved_force(task, hats, view)
+            simulated = simulate_noise_free_loop(task.pieces, law, task.structure, theta, forces)
         if simulated is None and step >= _PATIENCE:
             # The simulated loop is stable in some iterations only, so that it is given up for good.
             law = None
@@ -289,36 +305,36 @@ def _iterate(
         moments = compute_moments(task, hats, view)
         cost = moments.cost
         found = minimize(cost, known, task.structure)
-        merit = moments.rss(theta)
-        if merit < least:
-            best, least = theta, merit
+        square_sum = moments.rss(theta)
+        if square_sum < least:
+            best, least = theta, square_sum
         fit = _Fit(found, moments, view, hats, source, count + step + 1)
         move = to_differences(task.structure, found.theta) - to_differences(task.structure, theta)
         moved = float(np.linalg.norm(cost.R @ move))
         noise = np.sqrt(moments.rss(found.theta) / moments.rows)
-        settled = moved <= 1e-3 * noise or moved <= 1e-10 * moments.size
-        if settled and (view.degree == 1 or step > 1):
+        converged = moved <= 1e-3 * noise or moved <= 1e-10 * moments.size
+        if converged and (view.degree == 1 or step > 1):
             return fit
         if view.degree > 1:
-            view = _bent(task, fit)
+            view = _update_curvature(task, fit)
         # The first iterations take full steps; where these oscillate, half of them converge.
         share = 1.0 if step < _PATIENCE else 0.5
         theta = theta + share * (found.theta - theta)
-    view = _through(task, best, view)
+    view = _update_prefilter(task, best, view)
     moments = compute_moments(task, fit.hats, view)
     found = minimize(moments.cost, known, task.structure)
-    return replace(fit, found=found, moments=moments, view=view, settled=False)
+    return replace(fit, found=found, moments=moments, view=view, converged=False)
 
 
-def _estimate(task: Task, fit: _Fit, constrained: bool, dt: float) -> Estimate:
+def _make_estimate(task: Task, fit: _Fit, constrained: bool, dt: float) -> Estimate:
     s, found, moments = task.structure, fit.found, fit.moments
     rss = moments.rss(found.theta)
     degrees = moments.rows - moments.nuisances - found.free
-    residuals = separate(task, found.theta, fit.hats, fit.view)
+    residuals = separate_nuisances(task, found.theta, fit.hats, fit.view)
     covariance = found.spread * rss / degrees
-    sandwich = _sandwich(moments, found, residuals)
+    sandwich = _compute_sandwich(moments, found, residuals)
     words = [f"{fit.iterations} iterations", f"instruments from {fit.source}"]
-    notes = [] if fit.settled else [_NOT_SETTLED]
+    notes = [] if fit.converged else [_NOT_SETTLED]
     if fit.view.degree > 1:
         notes.append(_CURVED.format(degree=fit.view.degree))
     if len(fit.view.num) > 1:
@@ -338,7 +354,7 @@ def _estimate(task: Task, fit: _Fit, constrained: bool, dt: float) -> Estimate:
         structure=s,
         values=found.theta,
         covariance=covariance,
-        intercepts=_by_record(task, constants) if task.intercept else np.zeros(0),
+        intercepts=_average_by_record(task, constants) if task.intercept else np.zeros(0),
         rss=rss,
         residual_variance=rss / degrees,
         n_samples=moments.rows,
@@ -353,7 +369,7 @@ def _estimate(task: Task, fit: _Fit, constrained: bool, dt: float) -> Estimate:
     )
 
 
-def _sandwich(moments: Moments, found: Found, residuals: Sequence[Residuals]) -> Array:
+def _compute_sandwich(moments: Moments, found: Found, residuals: Sequence[Residuals]) -> Array:
     """Covariance without a noise model, from the correlations of ``z e`` (Newey and West)."""
     p = len(moments.structure.names)
     upper = moments.factor[:p, :p]
@@ -399,12 +415,12 @@ def _check_hold(records: Sequence[Record]) -> None:
         )
 
 
-def _not_excited(structure: Structure, names: tuple[str, ...], direction: Array) -> str:
+def _explain_no_excitation(structure: Structure, names: tuple[str, ...], direction: Array) -> str:
     size = np.abs(direction)
     involved = [n for n, d in zip(structure.names, size, strict=True) if d > 1e-3 * size.max()]
     return (
-        f"The instruments do not determine the coefficients: {_text.listing(involved)} can move "
-        f"together and nothing that {_text.listing(names)} causes would change. Excite the loop "
+        f"The instruments do not determine the coefficients: {_text.write_list(involved)} can move "
+        f"together and nothing that {_text.write_list(names)} causes would change. Excite the loop "
         "with more frequencies (random_binary), lower na or nb, or add what is known as a "
         "constraint."
     )
@@ -422,7 +438,7 @@ def _check_strength(estimate: Estimate, names: tuple[str, ...]) -> None:
     rank = int(np.linalg.matrix_rank(covariance, hermitian=True))
     if wald < stats.chi2.ppf(0.999, rank):
         raise CtrlidError(
-            f"The instruments are too weak: with what {_text.listing(names)} causes, b is not "
+            f"The instruments are too weak: with what {_text.write_list(names)} causes, b is not "
             "distinguishable from zero. Check that it is the signal that drives this loop and is "
             "logged at the right time; else move it further or longer."
         )

@@ -14,9 +14,9 @@ from ..._base.statistics import regress
 from ...data.record import Record
 from ..constraints.quadratic_program import Cost
 from ..identified_model import Structure
-from .instruments import Piece, Signals, cut, two_stage
+from .instruments import Piece, Signals, cut_pieces, project_on_references
 from .prefilter import MOST_COLOURED, View
-from .regression import block_qr, from_differences, merge, to_differences
+from .regression import block_qr, from_differences, merge_factors, to_differences
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +76,7 @@ class Task:
         """
         na, span = structure.na, max(structure.na, structure.nk + structure.nb - 1) + 1
         shortest = span + na + 2 * MOST_COLOURED
-        pieces = cut(records, names, intercept, shortest)
+        pieces = cut_pieces(records, names, intercept, shortest)
         for number, one in enumerate(records):
             if not any(piece.owner == number for piece in pieces):
                 longest = max((j - i for i, j in one.segments()), default=0)
@@ -92,7 +92,7 @@ class Task:
                 f"Too few samples: {total} valid ones for {unknowns} unknowns. Instrumental "
                 f"variables need at least {10 * unknowns}; record longer or lower the orders."
             )
-        return cls(structure, pieces, two_stage(pieces), len(records), intercept)
+        return cls(structure, pieces, project_on_references(pieces), len(records), intercept)
 
     @property
     def longest(self) -> int:
@@ -146,12 +146,12 @@ class Moments:
         return float(np.linalg.norm(self.factor[:, -1]))
 
 
-def _differences(signal: Array, start: int, n: int, count: int) -> list[Array]:
+def _compute_differences(signal: Array, start: int, n: int, count: int) -> list[Array]:
     """Return ``s, D s, D^2 s, ..``, each ``(n,)`` from sample ``start`` on."""
     return [np.diff(signal, k)[start : start + n] for k in range(count)]
 
 
-def _products(piece: Piece, hats: tuple[Array, Array], view: View) -> list[Array]:
+def _multiply_signals(piece: Piece, hats: tuple[Array, Array], view: View) -> list[Array]:
     """Return squares and products of what the external signals cause, up to a degree, size one.
 
     Near an equilibrium every smooth plant is linear but for these.
@@ -165,7 +165,7 @@ def _products(piece: Piece, hats: tuple[Array, Array], view: View) -> list[Array
     return [u ** (total - i) * y**i for total in degrees for i in range(total + 1)]
 
 
-def curved_force(task: Task, hats: Signals, view: View) -> list[Array] | None:
+def compute_curved_force(task: Task, hats: Signals, view: View) -> list[Array] | None:
     """Return the force of the products, in the units of the difference equation.
 
     Parameters
@@ -182,24 +182,24 @@ def curved_force(task: Task, hats: Signals, view: View) -> list[Array] | None:
     list of arrays or None
         For each stretch, mean taken off; None without such coefficients.
     """
-    if not view.bend:
+    if not view.curvature:
         return None
     s = task.structure
     first = s.nk + s.nb - 1
     found = []
-    for piece, hat, bend in zip(task.pieces, hats, view.bend, strict=True):
+    for piece, hat, curvature in zip(task.pieces, hats, view.curvature, strict=True):
         n = len(piece.y) - first
         columns = [
             column
-            for product in _products(piece, hat, view)
-            for column in _differences(product, 0, n, s.nb)
+            for product in _multiply_signals(piece, hat, view)
+            for column in _compute_differences(product, 0, n, s.nb)
         ]
-        force = np.column_stack(columns) @ bend
+        force = np.column_stack(columns) @ curvature
         found.append(np.concatenate([np.zeros(first), force - force.mean()]))
     return found
 
 
-def _table(
+def _make_table(
     task: Task, piece: Piece, hats: tuple[Array, Array], view: View
 ) -> tuple[list[Array], int]:
     """Columns ``nuisances | 1 | instruments | regressors | target``; the number of the first.
@@ -210,14 +210,14 @@ def _table(
     first = max(s.na, s.nk + s.nb - 1) + len(view.num) - 1
     n = len(piece.y) - first
     i, j = first - s.na, first - s.nk - s.nb + 1
-    columns = list(view.decays(len(piece.y))[first:].T)
-    for product in _products(piece, hats, view):
-        columns += _differences(view(product), j, n, s.nb)
+    columns = list(view.list_decays(len(piece.y))[first:].T)
+    for product in _multiply_signals(piece, hats, view):
+        columns += _compute_differences(view(product), j, n, s.nb)
     nuisances = len(columns)
     columns.append(view(np.ones(len(piece.y)))[first:] if task.intercept else np.zeros(n))
     for y, u in (hats, (piece.y, piece.u)):
-        ys = _differences(view(y), i, n, s.na + 1)
-        columns += [*ys[:-1], *_differences(view(u), j, n, s.nb)]
+        ys = _compute_differences(view(y), i, n, s.na + 1)
+        columns += [*ys[:-1], *_compute_differences(view(u), j, n, s.nb)]
     return [*columns, ys[-1]], nuisances
 
 
@@ -242,7 +242,7 @@ def compute_moments(task: Task, hats: Signals, view: View) -> Moments:
     owned: list[list[Array]] = [[] for _ in range(task.records)]
     rows, nuisances = 0, task.records * task.intercept
     for piece, hat in zip(task.pieces, hats, strict=True):
-        columns, skip = _table(task, piece, hat, view)
+        columns, skip = _make_table(task, piece, hat, view)
 
         def fill(out: Array, i: int, j: int, columns: Any = columns) -> None:
             for k, column in enumerate(columns):
@@ -253,11 +253,11 @@ def compute_moments(task: Task, hats: Signals, view: View) -> Moments:
         owned[piece.owner].append(factor[skip:, skip:])
         rows += n
         nuisances += min(skip, n)
-    whole = merge([merge(factors)[1:, 1:] for factors in owned])
-    return Moments(whole, rows, nuisances, s, _rounding(task, view))
+    whole = merge_factors([merge_factors(factors)[1:, 1:] for factors in owned])
+    return Moments(whole, rows, nuisances, s, _estimate_rounding(task, view))
 
 
-def _rounding(task: Task, view: View) -> Array:
+def _estimate_rounding(task: Task, view: View) -> Array:
     """Return the rounding errors of the data in each column, as far as instruments pick them up."""
     s = task.structure
     impulse = np.zeros(task.longest)
@@ -283,7 +283,7 @@ class Residuals:
         Instruments.
     e : (n,) array
         Whitened equation errors.
-    bend : array
+    curvature : array
         Coefficients of the products of signals.
     constant : float
         Constant of the equation.
@@ -291,11 +291,11 @@ class Residuals:
 
     z: Array
     e: Array
-    bend: Array
+    curvature: Array
     constant: float
 
 
-def separate(task: Task, theta: Array, hats: Signals, view: View) -> list[Residuals]:
+def separate_nuisances(task: Task, theta: Array, hats: Signals, view: View) -> list[Residuals]:
     """Separate nuisances from instruments and equation errors.
 
     Parameters
@@ -319,7 +319,7 @@ def separate(task: Task, theta: Array, hats: Signals, view: View) -> list[Residu
     delta = to_differences(s, theta)
     found = []
     for piece, hat in zip(task.pieces, hats, strict=True):
-        columns, skip = _table(task, piece, hat, view)
+        columns, skip = _make_table(task, piece, hat, view)
         table, skip = np.column_stack(columns), skip + 1
         nuisance, z = table[:, :skip], table[:, skip : skip + p]
         error = table[:, -1] - table[:, skip + p : -1] @ delta

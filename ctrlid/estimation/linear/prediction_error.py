@@ -10,13 +10,19 @@ import numpy as np
 from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
 from ..._base.statistics import regress
-from ..._base.text import listing
+from ..._base.text import write_list
 from ..constraints import AbstractConstraint
 from ..constraints.constrained_minimum import Found, minimize
 from ..constraints.quadratic_program import Cost, NotExcited
 from ..identified_model import Structure
-from .regression import block_qr, merge
-from .sampled_motion import Circuit, Flow, flow, prediction_errors, realize
+from .regression import block_qr, merge_factors
+from .sampled_motion import (
+    Circuit,
+    DiscreteModel,
+    compute_prediction_errors,
+    discretize_model,
+    realize_model,
+)
 
 # A search ends after at most so many Gauss-Newton steps.
 ROUNDS = 40
@@ -56,16 +62,18 @@ class Task:
     free_delay: bool
     speed: float
 
-    def motion(self, theta: Array, delay: float) -> Flow:
+    def discretize(self, theta: Array, delay: float) -> DiscreteModel:
         """Return the model over one period."""
         num, den = self.structure.fraction(theta)
-        return flow(*realize(den, num, self.speed), self.dt, self.hold, delay, self.circuit)
+        return discretize_model(
+            *realize_model(den, num, self.speed), self.dt, self.hold, delay, self.circuit
+        )
 
 
-def _columns(task: Task, point: Point, piece: Piece) -> Array | None:
+def _compute_columns(task: Task, point: Point, piece: Piece) -> Array | None:
     """Return the prediction errors and what initial state and operating point add to them."""
-    motion = task.motion(point.theta, point.delay)
-    errors, _ = prediction_errors(motion, point.gain, piece.signals)
+    motion = task.discretize(point.theta, point.delay)
+    errors, _ = compute_prediction_errors(motion, point.gain, piece.signals)
     if errors is None:
         return None
     size, n = len(motion.f), piece.n
@@ -81,40 +89,40 @@ def _columns(task: Task, point: Point, piece: Piece) -> Array | None:
         free[filled : filled + more] = free[:more] @ power
         power, filled = power @ power, filled + more
     ones = {name: np.zeros(n) for name in piece.signals} | {"u": np.ones(n)}
-    rest, _ = prediction_errors(motion, point.gain, ones)
+    rest, _ = compute_prediction_errors(motion, point.gain, ones)
     return np.column_stack([free, rest, errors])
 
 
-def _triangle(table: Array) -> Array:
+def _triangularize(table: Array) -> Array:
     """Return the triangular factor of a tall table."""
     return block_qr(lambda out, i, j: np.copyto(out, table[i:j]), *table.shape)
 
 
-def _cost(task: Task, point: Point) -> tuple[float, list[Array]]:
+def _evaluate_cost(task: Task, point: Point) -> tuple[float, list[Array]]:
     """Return the sum of squared errors with initial states and offsets at their best."""
     total, columns = 0.0, []
     for piece in task.pieces:
-        table = _columns(task, point, piece)
+        table = _compute_columns(task, point, piece)
         if table is None or not np.isfinite(table).all():
             return np.inf, []
-        r = _triangle(table)
+        r = _triangularize(table)
         total += float(r[-1, -1] ** 2)
         columns.append(table)
     return total, columns
 
 
-def _errors(task: Task, point: Point, piece: Piece) -> Array | None:
-    motion = task.motion(point.theta, max(point.delay, 0.0))
-    errors: Array | None = prediction_errors(motion, point.gain, piece.signals)[0]
+def _compute_errors(task: Task, point: Point, piece: Piece) -> Array | None:
+    motion = task.discretize(point.theta, max(point.delay, 0.0))
+    errors: Array | None = compute_prediction_errors(motion, point.gain, piece.signals)[0]
     return errors
 
 
-def _slope(
+def _differentiate_errors(
     task: Task, piece: Piece, here: Array, h: float, move: Callable[[float], Point]
 ) -> Array:
     """Difference the errors; one-sided or with shorter steps where the observer turns unstable."""
     for _ in range(8):
-        up, down = (_errors(task, move(step), piece) for step in (h, -h))
+        up, down = (_compute_errors(task, move(step), piece) for step in (h, -h))
         if up is not None and down is not None:
             return (up - down) / (2 * h)
         if up is not None:
@@ -125,7 +133,7 @@ def _slope(
     return np.zeros_like(here)
 
 
-def _jacobian(task: Task, point: Point, tables: list[Array]) -> Array:
+def _compute_jacobian(task: Task, point: Point, tables: list[Array]) -> Array:
     """Return the triangular factor of ``[gain, delay, theta, errors]``, nuisance projected out."""
     s = task.structure
     speeds = task.speed ** np.arange(1.0, s.na + 1)
@@ -143,28 +151,28 @@ def _jacobian(task: Task, point: Point, tables: list[Array]) -> Array:
     for piece, table in zip(task.pieces, tables, strict=True):
         slopes = []
         for h, move in steps:
-            slopes.append(_slope(task, piece, table[:, -1], h, move))
+            slopes.append(_differentiate_errors(task, piece, table[:, -1], h, move))
         nuisance = table.shape[1] - 1
         whole = np.column_stack([table[:, :nuisance], *slopes, table[:, -1]])
-        factors.append(_triangle(whole)[nuisance:, nuisance:])
-    return merge(factors)
+        factors.append(_triangularize(whole)[nuisance:, nuisance:])
+    return merge_factors(factors)
 
 
-def _unit(n: int, i: int) -> Array:
+def _make_unit_vector(n: int, i: int) -> Array:
     e = np.zeros(n)
     e[i] = 1.0
     return e
 
 
-def _refine(
+def _minimize_errors(
     task: Task, point: Point, known: Sequence[AbstractConstraint], rounds: int = ROUNDS
 ) -> tuple[Point, Found, float]:
     """Gauss-Newton with the constraints in each step; halved until the errors shrink."""
     extra = task.structure.na + int(task.free_delay)
-    rss, tables = _cost(task, point)
+    rss, tables = _evaluate_cost(task, point)
     found: Found | None = None
     for _ in range(rounds):
-        factor = _jacobian(task, point, tables)
+        factor = _compute_jacobian(task, point, tables)
         p = extra + len(task.structure.names)
         inner, right = factor[extra:p, extra:p], factor[extra:p, p]
         size = np.linalg.norm(inner, axis=0)
@@ -175,7 +183,7 @@ def _refine(
         others = np.linalg.lstsq(
             factor[:extra, :extra], -factor[:extra, p] - factor[:extra, extra:p] @ move, rcond=None
         )[0]
-        promised = (
+        predicted = (
             rss - float(np.sum((inner @ move + right) ** 2)) - float(factor[p:, p] @ factor[p:, p])
         )
         for k in range(12):
@@ -183,21 +191,23 @@ def _refine(
             step = share * others
             delay = max(point.delay + (step[-1] if task.free_delay else 0.0), 0.0)
             trial = Point(point.theta + share * move, point.gain + step[: task.structure.na], delay)
-            new, new_tables = _cost(task, trial)
+            new, new_tables = _evaluate_cost(task, trial)
             # The first step may raise the cost, since it has to meet the constraints.
-            if new < rss or (share == 1.0 and _violated(task, point, known) and np.isfinite(new)):
+            if new < rss or (
+                share == 1.0 and _is_violated(task, point, known) and np.isfinite(new)
+            ):
                 break
         else:
             break
         gained, rss, point, tables = rss - new, new, trial, new_tables
         degrees = max(sum(q.n for q in task.pieces) - p, 1)
-        if share == 1.0 and abs(gained) < CONVERGED * rss / degrees and promised < rss / degrees:
+        if share == 1.0 and abs(gained) < CONVERGED * rss / degrees and predicted < rss / degrees:
             break
     assert found is not None
     return point, found, rss
 
 
-def _violated(task: Task, point: Point, known: Sequence[AbstractConstraint]) -> bool:
+def _is_violated(task: Task, point: Point, known: Sequence[AbstractConstraint]) -> bool:
     if not known:
         return False
     eye = np.eye(len(point.theta)) / np.maximum(np.abs(point.theta), 1e-12)
@@ -206,17 +216,17 @@ def _violated(task: Task, point: Point, known: Sequence[AbstractConstraint]) -> 
     return bool(np.any(np.abs(nearest - point.theta) > 1e-9 * (np.abs(point.theta) + 1e-12)))
 
 
-def best_fit(
+def find_best_fit(
     task: Task, known: Sequence[AbstractConstraint], delay: float
 ) -> tuple[Point, Found, float, int]:  # fmt: skip
     """Search from the most promising starts; return the best minimum."""
-    starts = _starts(task, delay)
-    short = replace(task, pieces=_head(task.pieces))
+    starts = _rank_starts(task, delay)
+    short = replace(task, pieces=_take_head(task.pieces))
     ranked: list[tuple[float, float, Point]] = []
     for speed, point in starts[:6]:
-        local = _with_speed(short, speed)
+        local = _change_speed(short, speed)
         try:
-            refined, _, rss = _refine(local, point, known, rounds=12)
+            refined, _, rss = _minimize_errors(local, point, known, rounds=12)
         except NotExcited:
             continue
         ranked.append((rss, speed, refined))
@@ -228,12 +238,13 @@ def best_fit(
     ranked.sort(key=lambda r: r[0])
     _, speed, point = ranked[0]
     try:
-        best, found, rss = _refined_twice(_with_speed(task, speed), point, known)
+        best, found, rss = _minimize_twice(_change_speed(task, speed), point, known)
     except NotExcited as trouble:
         raise CtrlidError(
             "The data do not determine the coefficients: the direction "
-            f"{np.array2string(trouble.direction, precision=3)} of {listing(task.structure.names)} "
-            "changes no prediction. Vary the reference, lower the orders or add a constraint."
+            f"{np.array2string(trouble.direction, precision=3)} of "
+            f"{write_list(task.structure.names)} changes no prediction. Vary the reference, "
+            "lower the orders or add a constraint."
         ) from None
     used = sum(p.n for p in task.pieces) - len(task.pieces) * (
         task.structure.na + 1 + (len(task.circuit.a) if task.circuit else 0)
@@ -241,7 +252,7 @@ def best_fit(
     return best, found, rss, used
 
 
-def _refined_twice(
+def _minimize_twice(
     task: Task, point: Point, known: Sequence[AbstractConstraint]
 ) -> tuple[Point, Found, float]:
     """Refine, and once more from the observer of pure sensor noise.
@@ -249,20 +260,22 @@ def _refined_twice(
     At short periods a search may slide along the border where the observer turns unstable, and
     stop there short of the minimum.
     """
-    first = _refine(task, point, known)
-    open_loop = _open_loop(task, first[0].theta)
-    gain = _place(open_loop.f, open_loop.c, _inside(task, np.linalg.eigvals(open_loop.f)))
+    first = _minimize_errors(task, point, known)
+    open_loop = _discretize_open_loop(task, first[0].theta)
+    gain = _place_poles(
+        open_loop.f, open_loop.c, _reflect_poles(task, np.linalg.eigvals(open_loop.f))
+    )
     start = first[0] if gain is None else replace(first[0], gain=gain)
-    if start is first[0] or not np.isfinite(_cost(task, start)[0]):
+    if start is first[0] or not np.isfinite(_evaluate_cost(task, start)[0]):
         return first
     try:
-        second = _refine(task, start, known)
+        second = _minimize_errors(task, start, known)
     except NotExcited:
         return first
     return min(first, second, key=lambda r: r[2])
 
 
-def _inside(task: Task, poles: Any) -> Array:
+def _reflect_poles(task: Task, poles: Any) -> Array:
     """Reflect poles at the unit circle; none slower than the data are long."""
     size = np.abs(poles)
     most = 1 - SLOWEST / max(p.n for p in task.pieces)
@@ -270,17 +283,17 @@ def _inside(task: Task, poles: Any) -> Array:
     return np.asarray(poles * wanted / np.maximum(size, 1e-300))
 
 
-def _open_loop(task: Task, theta: Array) -> Flow:
+def _discretize_open_loop(task: Task, theta: Array) -> DiscreteModel:
     """Return how the plant's states move by themselves over one period."""
     den = np.concatenate([[1.0], theta[: task.structure.na]])
-    return flow(*realize(den, np.ones(1), task.speed), task.dt, "zoh")
+    return discretize_model(*realize_model(den, np.ones(1), task.speed), task.dt, "zoh")
 
 
-def _with_speed(task: Task, speed: float) -> Task:
+def _change_speed(task: Task, speed: float) -> Task:
     return replace(task, speed=speed)
 
 
-def _head(pieces: tuple[Piece, ...], samples: int = 8000) -> tuple[Piece, ...]:
+def _take_head(pieces: tuple[Piece, ...], samples: int = 8000) -> tuple[Piece, ...]:
     """Return a beginning of the data that is long enough to rank the starts."""
     head: list[Piece] = []
     total = 0
@@ -293,13 +306,13 @@ def _head(pieces: tuple[Piece, ...], samples: int = 8000) -> tuple[Piece, ...]:
     return tuple(head)
 
 
-def _starts(task: Task, delay: float) -> list[tuple[float, Point]]:
+def _rank_starts(task: Task, delay: float) -> list[tuple[float, Point]]:
     """Rank poles on a logarithmic grid, with the best numerator for each.
 
     For given poles the errors are linear in the numerator, with the observer of pure sensor noise
     (unstable poles reflected, Anderson and Moore) a little faster than the poles themselves.
     """
-    s, pieces = task.structure, _head(task.pieces, 4000)
+    s, pieces = task.structure, _take_head(task.pieces, 4000)
     length = max(p.n for p in pieces) * task.dt
     rates = np.geomspace(max(3 / length, 1e-3 / task.dt), 1.5 / task.dt, 8)
     levels = [0.0, *rates, *-rates]
@@ -311,36 +324,38 @@ def _starts(task: Task, delay: float) -> list[tuple[float, Point]]:
     ranked = []
     for roots in combinations:
         speed = max(float(np.exp(np.mean(np.log(np.maximum(np.abs(roots), rates[0]))))), rates[0])
-        point, rss = _linear_start(_with_speed(task, speed), pieces, np.array(roots), delay)
+        point, rss = _fit_numerator(_change_speed(task, speed), pieces, np.array(roots), delay)
         if point is not None:
             ranked.append((rss, speed, point))
     ranked.sort(key=lambda r: r[0])
     return [(speed, point) for _, speed, point in ranked]
 
 
-def _linear_start(
+def _fit_numerator(
     task: Task, pieces: tuple[Piece, ...], roots: Array, delay: float
 ) -> tuple[Point | None, float]:  # fmt: skip
     s = task.structure
     den = np.real(np.poly(roots))
     blank = Point(np.concatenate([den[1:], np.zeros(s.nb)]), np.zeros(s.na), delay)
-    motion = task.motion(blank.theta, delay)
+    motion = task.discretize(blank.theta, delay)
     plant = motion.f[: s.na, : s.na] if task.circuit is None else None
     if plant is None:
-        plant = _open_loop(task, blank.theta).f
+        plant = _discretize_open_loop(task, blank.theta).f
     inside = np.exp(-np.abs(roots) * task.dt) * 0.98
-    gain = _place(plant, motion.c[: s.na], inside)
+    gain = _place_poles(plant, motion.c[: s.na], inside)
     if gain is None:
         return None, np.inf
     blocks = []
     for piece in pieces:
-        table = _columns(task, Point(blank.theta, gain, delay), piece)
+        table = _compute_columns(task, Point(blank.theta, gain, delay), piece)
         if table is None:
             return None, np.inf
         slopes = []
         for i in range(s.nb):
-            theta = blank.theta + _unit(len(s.names), s.na + i)
-            errors, _ = prediction_errors(task.motion(theta, delay), gain, piece.signals)
+            theta = blank.theta + _make_unit_vector(len(s.names), s.na + i)
+            errors, _ = compute_prediction_errors(
+                task.discretize(theta, delay), gain, piece.signals
+            )
             if errors is None:
                 return None, np.inf
             slopes.append(errors - table[:, -1])
@@ -349,8 +364,8 @@ def _linear_start(
         whole = np.column_stack([table[:, :-1], *slopes, table[:, -1]])
         if not np.isfinite(whole).all():
             return None, np.inf
-        blocks.append(_triangle(whole)[table.shape[1] - 1 :, table.shape[1] - 1 :])
-    factor = merge(blocks)
+        blocks.append(_triangularize(whole)[table.shape[1] - 1 :, table.shape[1] - 1 :])
+    factor = merge_factors(blocks)
     columns = factor[: s.nb, : s.nb]
     if not np.all(np.linalg.norm(columns, axis=0) > 0):
         return None, np.inf
@@ -359,7 +374,7 @@ def _linear_start(
     return Point(theta, gain, delay), float(np.sum(factor[s.nb :, -1] ** 2))
 
 
-def _place(f: Array, c: Array, poles: Array) -> Array | None:
+def _place_poles(f: Array, c: Array, poles: Array) -> Array | None:
     """Return the observer gain that puts the poles of ``f - k c`` there (Ackermann)."""
     n = len(f)
     observability = np.vstack([c @ np.linalg.matrix_power(f, i) for i in range(n)])
@@ -368,7 +383,7 @@ def _place(f: Array, c: Array, poles: Array) -> Array | None:
         (v * np.linalg.matrix_power(f, n - i) for i, v in enumerate(value)), np.zeros((n, n))
     )
     try:
-        gain = polynomial @ np.linalg.solve(observability, _unit(n, n - 1))
+        gain = polynomial @ np.linalg.solve(observability, _make_unit_vector(n, n - 1))
     except np.linalg.LinAlgError:
         return None
     return gain if np.isfinite(gain).all() else None

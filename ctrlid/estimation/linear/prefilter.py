@@ -21,7 +21,7 @@ MOST_COLOURED = 10
 class View:
     """How the data are looked at: through ``num / den``, and curved up to some degree.
 
-    ``bend`` holds of each stretch the coefficients of the products, and ``shift`` how far the
+    ``curvature`` holds of each stretch the coefficients of the products, and ``shift`` how far the
     equilibrium of each record lies from the mean of u: a curved plant rectifies what moves it.
 
     Parameters
@@ -30,7 +30,7 @@ class View:
         Prefilter in powers of the delay.
     degree : int
         Degree of the products of y and u that are estimated with the model; 1 for none.
-    bend : tuple of arrays
+    curvature : tuple of arrays
         Coefficients of the products on each stretch, once known.
     shift : tuple of float
         For each record the input at the equilibrium, less the mean input.
@@ -39,14 +39,14 @@ class View:
     num: Array
     den: Array
     degree: int = 1
-    bend: tuple[Array, ...] = ()
+    curvature: tuple[Array, ...] = ()
     shift: tuple[float, ...] = ()
 
     def __call__(self, s: Array) -> Array:
         """Filter a signal, from rest."""
         return np.asarray(signal.lfilter(self.num, self.den, s), dtype=float)
 
-    def decays(self, n: int) -> Array:
+    def list_decays(self, n: int) -> Array:
         """All ways in which the filter's unknown initial state decays, ``(n, order)``.
 
         Estimated with the model they make the start of each stretch exact: else the filter would
@@ -60,7 +60,7 @@ class View:
         return np.column_stack([h[order - i : order - i + n] for i in range(1, order + 1)])
 
 
-def stable_factor(structure: Structure, theta: Array, n: int) -> Array:
+def reflect_poles(structure: Structure, theta: Array, n: int) -> Array:
     """Denominator with the poles outside the unit circle reflected into it.
 
     ``A(q)`` over it is an all-pass: it whitens the equation error ``A v`` of white sensor noise v.

@@ -12,7 +12,7 @@ from scipy.linalg.lapack import dgeqrf, dgeqrf_lwork
 
 from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
-from ..._base.jobs import spread
+from ..._base.jobs import share_out
 from ...data.record import Record
 from ..identified_model import Structure
 
@@ -68,7 +68,7 @@ def block_qr(fill: Fill, rows: int, columns: int, block: int = BLOCK) -> Array:
     return np.array(buffer[:columns])
 
 
-def merge(factors: Sequence[Array]) -> Array:
+def merge_factors(factors: Sequence[Array]) -> Array:
     """Triangular factor of matrices stacked on each other, from the factor of each."""
     if len(factors) == 1:
         return factors[0]
@@ -175,12 +175,12 @@ class Part:
 
 def reduce_record(record: Record, structure: Structure, intercept: bool = True) -> Part:
     """Return the factor of ``[1 | y D y ... | u D u ... | D^na y]`` of one record."""
-    y0, u0 = _levels(record) if intercept else (0.0, 0.0)
-    factor, rows = _factor(record, structure, y0, u0, intercept)
+    y0, u0 = _find_levels(record) if intercept else (0.0, 0.0)
+    factor, rows = _compute_factor(record, structure, y0, u0, intercept)
     return Part(factor, rows, (y0, u0), len(record.y), int(record.valid.sum()))
 
 
-def arx_regression(
+def build_arx_regression(
     records: Iterable[Record],
     structure: Structure,
     intercept: bool = True,
@@ -215,7 +215,7 @@ def arx_regression(
     used = 0
     noise = np.zeros(p)
     task = partial(reduce_record, structure=structure, intercept=intercept)
-    for number, part in enumerate(spread(task, records, jobs), start=1):
+    for number, part in enumerate(share_out(task, records, jobs), start=1):
         factor = part.factor
         if not part.rows:
             needed = max(structure.na, structure.nk + structure.nb - 1) + 1
@@ -229,8 +229,8 @@ def arx_regression(
         if intercept:
             firsts.append((factor[0], *part.levels))
             factor = factor[1:, 1:]
-        total = factor if number == 1 else merge([total, factor])
-        noise += _rounding(factor, structure, *part.levels, part.rows) ** 2
+        total = factor if number == 1 else merge_factors([total, factor])
+        noise += _estimate_rounding(factor, structure, *part.levels, part.rows) ** 2
     return Regression(
         structure,
         total[:p, :p],
@@ -242,7 +242,7 @@ def arx_regression(
     )
 
 
-def _levels(record: Record) -> tuple[float, float]:
+def _find_levels(record: Record) -> tuple[float, float]:
     """Means of y and u where they count: taken off before any product is formed."""
     if record.valid.all():
         return float(record.y.mean()), float(record.u.mean())
@@ -251,7 +251,7 @@ def _levels(record: Record) -> tuple[float, float]:
     return float(record.y.mean(where=record.valid)), float(record.u.mean(where=record.valid))
 
 
-def _factor(
+def _compute_factor(
     record: Record, structure: Structure, y0: float, u0: float, intercept: bool
 ) -> tuple[Array, int]:
     """Triangular factor of ``[1 | y D y ... | u D u ... | D^na y]`` and the rows that count."""
@@ -268,8 +268,8 @@ def _factor(
         i, j = first + start, first + stop
         if intercept:
             out[:, 0] = 1.0
-        _differences(y[i - na : j] - y0, [*out[:, lead : lead + na].T, out[:, -1]])
-        _differences(u[i - nk - nb + 1 : j - nk] - u0, list(out[:, lead + na : -1].T))
+        _write_differences(y[i - na : j] - y0, [*out[:, lead : lead + na].T, out[:, -1]])
+        _write_differences(u[i - nk - nb + 1 : j - nk] - u0, list(out[:, lead + na : -1].T))
         used += stop - start
         if masked:
             counts = valid[i:j].copy()
@@ -285,7 +285,7 @@ def _factor(
     return factor, used
 
 
-def _differences(signal: Array, columns: Sequence[Array]) -> None:
+def _write_differences(signal: Array, columns: Sequence[Array]) -> None:
     """Write the signal and its forward differences, all at the oldest sample, into columns."""
     n = len(columns[0])
     for k, column in enumerate(columns):
@@ -294,7 +294,9 @@ def _differences(signal: Array, columns: Sequence[Array]) -> None:
         column[:] = signal[:n]
 
 
-def _rounding(factor: Array, structure: Structure, y0: float, u0: float, rows: int) -> Array:
+def _estimate_rounding(
+    factor: Array, structure: Structure, y0: float, u0: float, rows: int
+) -> Array:
     """Size of the rounding errors of the data in each differenced column."""
     na, nb = structure.na, structure.nb
     eps = float(np.finfo(float).eps)

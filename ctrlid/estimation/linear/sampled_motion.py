@@ -30,7 +30,7 @@ class Circuit:
 
 
 @dataclass(frozen=True, eq=False)
-class Flow:
+class DiscreteModel:
     """The discretized model: ``x+ = f x + b0 u_k + b1 u_(k-1) + ...``, and ``y = c x``.
 
     With a circuit, x stacks plant and controller states and two more inputs follow those of u:
@@ -43,7 +43,7 @@ class Flow:
     order: int
 
 
-def realize(a: Array, b: Array, speed: float) -> tuple[Array, Array, Array]:
+def realize_model(a: Array, b: Array, speed: float) -> tuple[Array, Array, Array]:
     """Return an observer form of ``b(s)/a(s)`` in time units of ``1/speed``.
 
     Parameters
@@ -94,7 +94,7 @@ def _exponential(matrix: Array) -> Array:
     return total if np.isfinite(total).all() else np.full(matrix.shape, np.nan)
 
 
-def _hold_integral(a: Array, b: Array, time: float) -> tuple[Array, Array]:
+def _integrate_hold(a: Array, b: Array, time: float) -> tuple[Array, Array]:
     n = len(a)
     block = np.zeros((n + 1, n + 1))
     block[:n, :n], block[:n, n] = a * time, b * time
@@ -102,10 +102,10 @@ def _hold_integral(a: Array, b: Array, time: float) -> tuple[Array, Array]:
     return e[:n, :n], e[:n, n]
 
 
-def flow(
+def discretize_model(
     a: Array, b: Array, c: Array, dt: float, hold: str, delay: float = 0.0,
     circuit: Circuit | None = None,
-) -> Flow:  # fmt: skip
+) -> DiscreteModel:  # fmt: skip
     """Return the exact motion of the model over one period.
 
     Parameters
@@ -128,23 +128,25 @@ def flow(
     """
     n = len(a)
     if circuit is not None:
-        return _flow_with_circuit(a, b, c, dt, circuit)
+        return _discretize_with_circuit(a, b, c, dt, circuit)
     if hold == "foh":
         block = np.zeros((n + 2, n + 2))
         block[:n, :n], block[:n, n], block[n, n + 1] = a * dt, b * dt, 1.0
         e = _exponential(block)
-        return Flow(e[:n, :n], (("u", 0, e[:n, n] - e[:n, n + 1]), ("u", -1, e[:n, n + 1])), c, n)
+        return DiscreteModel(
+            e[:n, :n], (("u", 0, e[:n, n] - e[:n, n + 1]), ("u", -1, e[:n, n + 1])), c, n
+        )
     whole, part = divmod(delay / dt, 1.0)
     late = int(whole)
-    f, gamma = _hold_integral(a, b, dt)
+    f, gamma = _integrate_hold(a, b, dt)
     if part < 1e-12:
-        return Flow(f, (("u", late, gamma),), c, n)
-    after, new = _hold_integral(a, b, (1 - part) * dt)
-    _, old = _hold_integral(a, b, part * dt)
-    return Flow(f, (("u", late, new), ("u", late + 1, after @ old)), c, n)
+        return DiscreteModel(f, (("u", late, gamma),), c, n)
+    after, new = _integrate_hold(a, b, (1 - part) * dt)
+    _, old = _integrate_hold(a, b, part * dt)
+    return DiscreteModel(f, (("u", late, new), ("u", late + 1, after @ old)), c, n)
 
 
-def _flow_with_circuit(a: Array, b: Array, c: Array, dt: float, k: Circuit) -> Flow:
+def _discretize_with_circuit(a: Array, b: Array, c: Array, dt: float, k: Circuit) -> DiscreteModel:
     """Plant, circuit and the input itself as one system, driven by the held r and sensor noise."""
     n, m = len(a), len(k.a)
     size = n + m + 1
@@ -160,12 +162,12 @@ def _flow_with_circuit(a: Array, b: Array, c: Array, dt: float, k: Circuit) -> F
     # e = r - (y_measured - c x): the estimate of the noise at the sample.
     f[:, x] += np.outer(motion[:, e], c)
     both = np.concatenate([c, np.zeros(m)])
-    return Flow(
+    return DiscreteModel(
         f, (("u", 0, motion[:, v]), ("y", 0, -motion[:, e]), ("r", 0, motion[:, e])), both, n
     )
 
 
-def prediction_errors(motion: Flow, gain: Array, signals: dict[str, Array]) -> Any:
+def compute_prediction_errors(motion: DiscreteModel, gain: Array, signals: dict[str, Array]) -> Any:
     r"""Return the prediction errors of the model with an observer gain, and the filter behind them.
 
     .. math:: \hat x_{k+1} = F \hat x_k + \sum_i B_i s_{i,k} + K \varepsilon_k, \quad
@@ -203,12 +205,12 @@ def prediction_errors(motion: Flow, gain: Array, signals: dict[str, Array]) -> A
             continue
         # C (zI - closed)^-1 column, whose poles are those of the observer.
         num = np.real(np.poly(closed - np.outer(column, motion.c))) - observer
-        moved = signal.lfilter(-num, observer, _late(signals[name], late))
+        moved = signal.lfilter(-num, observer, _delay_signal(signals[name], late))
         errors += moved
     return errors, observer
 
 
-def _late(s: Array, samples: int) -> Array:
+def _delay_signal(s: Array, samples: int) -> Array:
     """Shift a signal later by some samples, or earlier by one; its ends are held."""
     if samples == 0:
         return s

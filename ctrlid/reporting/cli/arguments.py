@@ -28,7 +28,7 @@ CHANNELS = ("r", "u", "y", "time")
 SYSTEMS = (ct.NonlinearIOSystem, ct.StateSpace, ct.TransferFunction)
 
 
-def spoken_record(path: Path, args: argparse.Namespace) -> Record:
+def read_record(path: Path, args: argparse.Namespace) -> Record:
     """Return the record in a file, or say in the words of the command line what is wrong."""
     unknown = [key for key in args.columns if key not in CHANNELS]
     if unknown:
@@ -45,10 +45,10 @@ def spoken_record(path: Path, args: argparse.Namespace) -> Record:
         raise CtrlidError(text) from reason
 
 
-def spoken_loop(args: argparse.Namespace, record: Record) -> Loop:
+def read_loop(args: argparse.Namespace, record: Record) -> Loop:
     """Return the loop that the command line describes."""
     values = dict(args.param)
-    model = plant(args.model, values)
+    model = read_plant(args.model, values)
     if isinstance(model, Loop):
         given = {"--at-output": args.at_output, "--input-bias": args.input_bias,
                  "--controller": args.controller}  # fmt: skip
@@ -63,10 +63,10 @@ def spoken_loop(args: argparse.Namespace, record: Record) -> Loop:
             raise CtrlidError(f"{args.model} is sampled at {model.dt:g} s, the record at "
                               f"{record.dt:g} s; {advice}")  # fmt: skip
         free = model.free if args.free is None else tuple(args.free)
-        _known(args.model, list(model.parameters), [*values, *free])
+        _require_known(args.model, list(model.parameters), [*values, *free])
         return dataclasses.replace(model.with_parameters(values), free=free)
     free = PLANTS.get(args.model, ()) if args.free is None else tuple(args.free)
-    _known(args.model, list(trace(model).parameters), [*values, *free])
+    _require_known(args.model, list(trace(model).parameters), [*values, *free])
     model = with_parameters(model, values) if values else model
     output = float(np.mean(record.y[record.valid])) if args.at_output is None else args.at_output
     # A linear model acts on deviations from the means of the record.
@@ -76,20 +76,20 @@ def spoken_loop(args: argparse.Namespace, record: Record) -> Loop:
         at = operating_point(model, output=output)
     if args.input_bias is not None:
         at = dataclasses.replace(at, input=args.input_bias)
-    law = None if args.controller is None else controller(args.controller)
-    return Loop(model, law, dt=record.dt, at=at, free=free)
+    given_controller = None if args.controller is None else read_controller(args.controller)
+    return Loop(model, given_controller, dt=record.dt, at=at, free=free)
 
 
-def plant(text: str, values: dict[str, float]) -> Any:
+def read_plant(text: str, values: dict[str, float]) -> Any:
     """Return the system or loop that ``--model`` names; values that made it are taken out."""
-    made = getattr(plants, text) if text in PLANTS else imported("--model", text)
+    made = getattr(plants, text) if text in PLANTS else import_object("--model", text)
     if isinstance(made, (Loop, *SYSTEMS)):
         return made
     if not inspect.isfunction(made):
         raise CtrlidError(f"--model {text} is a {type(made).__name__}; needed is a control system, "
                           "a ctrlid.Loop, or a function that returns one")  # fmt: skip
     known = inspect.signature(made).parameters
-    _known(text, list(known), list(values))
+    _require_known(text, list(known), list(values))
     lacking = [k for k, p in known.items() if p.default is p.empty and k not in values]
     if lacking:
         raise CtrlidError(f"the model {text} needs {', '.join(lacking)}; give them in SI units, as "
@@ -102,26 +102,26 @@ def plant(text: str, values: dict[str, float]) -> Any:
     return system
 
 
-def controller(text: str) -> Any:
+def read_controller(text: str) -> Any:
     """Return the controller that ``--controller`` describes."""
     if "=" not in text:
-        return imported("--controller", text)
+        return import_object("--controller", text)
     types = {f.name: f.type for f in dataclasses.fields(PID)}
     values: dict[str, Any] = {}
     try:
-        given = assignments(text)
+        given = parse_assignments(text)
     except argparse.ArgumentTypeError as reason:
         raise CtrlidError(f"--controller {reason}") from reason
     for key, value in given.items():
-        _known("a PID", list(types), [key])
+        _require_known("a PID", list(types), [key])
         words = types[key] not in (float, float | None)
-        values[key] = value if words else _number(f"--controller {key}=", value)
+        values[key] = value if words else _parse_number(f"--controller {key}=", value)
     if "kp" not in values:
         raise CtrlidError(f"a PID needs kp, as in --controller kp=2,ki=1; given {text}")
     return PID(**values)
 
 
-def imported(option: str, text: str) -> Any:
+def import_object(option: str, text: str) -> Any:
     """Return an object given as ``module:object`` or ``file.py:object``."""
     module, colon, name = text.rpartition(":")
     if not colon or not module or not name:
@@ -150,24 +150,24 @@ def imported(option: str, text: str) -> Any:
     return getattr(found, name)
 
 
-def _known(what: str, known: Sequence[str], names: Sequence[str]) -> None:
+def _require_known(what: str, known: Sequence[str], names: Sequence[str]) -> None:
     for name in names:
         if name not in known:
             raise CtrlidError(f"{what} has no parameter {name!r}; it has {', '.join(known)}")
 
 
-def assignment(text: str) -> tuple[str, float]:
+def parse_assignment(text: str) -> tuple[str, float]:
     """Read NAME=VALUE with a number."""
     name, equal, value = text.partition("=")
     if not (name.strip() and equal):
         raise argparse.ArgumentTypeError(f"needs NAME=VALUE, as in K=3.3e-6; given {text}")
     try:
-        return name.strip(), _number(f"{name}=", value)
+        return name.strip(), _parse_number(f"{name}=", value)
     except CtrlidError as reason:  # argparse prints what it is told in its own error alone.
         raise argparse.ArgumentTypeError(str(reason)) from reason
 
 
-def assignments(text: str) -> dict[str, str]:
+def parse_assignments(text: str) -> dict[str, str]:
     """Read NAME=VALUE,NAME=VALUE."""
     pairs = [part.partition("=") for part in text.split(",") if part.strip()]
     if not pairs or not all(key.strip() and equal and value for key, equal, value in pairs):
@@ -175,7 +175,7 @@ def assignments(text: str) -> dict[str, str]:
     return {key.strip(): value.strip() for key, _, value in pairs}
 
 
-def _number(what: str, text: str) -> float:
+def _parse_number(what: str, text: str) -> float:
     try:
         value = float(text)
     except ValueError:

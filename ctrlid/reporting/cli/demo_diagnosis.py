@@ -55,7 +55,7 @@ HIDDEN: tuple[tuple[type[AbstractEffect], dict[str, tuple[float, float]]], ...] 
 )
 
 
-def hide(seed: int) -> tuple[AbstractEffect, float]:
+def hide_effect(seed: int) -> tuple[AbstractEffect, float]:
     """Draw the hidden effect, and the believed over the true value of the magnet's constant.
 
     Parameters
@@ -79,7 +79,7 @@ def hide(seed: int) -> tuple[AbstractEffect, float]:
     return kind(**sizes), 1 + BELIEVED * float(rng.choice([-1, 1]))
 
 
-def second_act(
+def tell_diagnosis(
     *, samples: int = LONGEST, seed: int = 1, progress: bool = False
 ) -> Iterator[Section]:
     """Hide an effect in a record, diagnose the record, and reveal what was hidden.
@@ -98,12 +98,12 @@ def second_act(
     Section
         One for each of `TITLES`.
     """
-    effect, factor = hide(seed)
+    effect, factor = hide_effect(seed)
     toss, hiss = (int(s) for s in np.random.SeedSequence([seed, 3]).generate_state(2))
     plant = maglev(m=BALL, K=MAGNET)
     at = operating_point(plant, output=GAP)
-    law = design_lead(linearize(plant, at), crossover=CROSSOVER, phase_margin=PHASE_MARGIN)
-    loop = Loop(plant, law.sample(PERIOD, "tustin"), dt=PERIOD, at=at, free=("K",))
+    lead = design_lead(linearize(plant, at), crossover=CROSSOVER, phase_margin=PHASE_MARGIN)
+    loop = Loop(plant, lead.sample(PERIOD, "tustin"), dt=PERIOD, at=at, free=("K",))
     r = random_binary(min(samples, LONGEST), amplitude=AMPLITUDE, hold=HOLD, around=GAP, seed=toss)
     record = simulate(loop.with_effect(effect), r, sensor_noise=SENSOR_NOISE,
                       force_noise=FORCE_NOISE, seed=hiss)  # fmt: skip
@@ -122,10 +122,12 @@ def second_act(
     yield Section(TITLES[0], text, None, {"The beginning of the record.": axes})
     found = diagnose(model, record, progress=progress)
     yield Section(TITLES[1], "", found)
-    yield Section(TITLES[2], reveal(found, effect, loop), _sizes(found, effect), {})
+    yield Section(
+        TITLES[2], reveal_effect(found, effect, loop), _make_size_table(found, effect), {}
+    )
 
 
-def reveal(found: Diagnosis, effect: AbstractEffect, loop: Loop) -> str:
+def reveal_effect(found: Diagnosis, effect: AbstractEffect, loop: Loop) -> str:
     """Return in words what was hidden and whether it was found.
 
     Parameters
@@ -156,7 +158,7 @@ def reveal(found: Diagnosis, effect: AbstractEffect, loop: Loop) -> str:
     text = f"Hidden was {effect.text(loop)}. {verdict}"
     if math.isfinite(gap.before) and gap.before > 0 and found.findings:
         before, after, floor = (
-            _text.quantity(v, gap.unit) for v in (gap.before, gap.after, gap.floor)
+            _text.write_quantity(v, gap.unit) for v in (gap.before, gap.after, gap.floor)
         )
         closed = write_percent(1 - gap.after / gap.before)
         text += (f" On samples that no parameter was fitted to the gap of the {gap.kind} shrank "
@@ -164,7 +166,7 @@ def reveal(found: Diagnosis, effect: AbstractEffect, loop: Loop) -> str:
     return text
 
 
-def _sizes(found: Diagnosis, effect: AbstractEffect) -> Any:
+def _make_size_table(found: Diagnosis, effect: AbstractEffect) -> Any:
     """Return the true values beside the fitted ones."""
     own = next((f for f in found.findings if type(f.effect) is type(effect)), None)
     rows = [(c.name, f"{MAGNET:.5g}", f"{c.given:.5g}", _text.with_error(c.after, c.standard_error))

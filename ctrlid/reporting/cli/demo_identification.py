@@ -87,7 +87,9 @@ class _Bench:
         return dict(zip(("a1", "a2", "b1", "b2"), (a[1], a[2], b[-2], b[-1]), strict=True))
 
 
-def story(*, samples: int = 45_000, noise: float = 0.1, seed: int = 1) -> Iterator[Section]:
+def tell_identification(
+    *, samples: int = 45_000, noise: float = 0.1, seed: int = 1
+) -> Iterator[Section]:
     """Tell the main job, section by section as it is computed.
 
     Parameters
@@ -114,24 +116,24 @@ def story(*, samples: int = 45_000, noise: float = 0.1, seed: int = 1) -> Iterat
     >>> next(story()).title
     'The physics'
     """
-    bench = _bench()
-    yield _physics(bench)
-    yield _controller(bench)
-    record, perfect = _records(bench, samples, noise, seed)
-    yield _experiment(record, noise)
+    bench = _make_bench()
+    yield _tell_physics(bench)
+    yield _tell_controller(bench)
+    record, perfect = _simulate_records(bench, samples, noise, seed)
+    yield _tell_experiment(record, noise)
     models = {"plain": fit_arx(record, na=2, nb=2)}
-    yield _plain_fit(bench, models, fit_arx(perfect, na=2, nb=2), noise)
+    yield _tell_plain_fit(bench, models, fit_arx(perfect, na=2, nb=2), noise)
     models["constrained"] = fit_arx(record, na=2, nb=2, constraints=[ReciprocalPoles()])
-    yield _constrained_fit(bench, models)
+    yield _tell_constrained_fit(bench, models)
     with warnings.catch_warnings(record=True) as doubts:
         warnings.simplefilter("always", CtrlidWarning)
         models["instruments"] = fit_iv(record, na=2, nb=2, constraints=[ReciprocalPoles()])
-    yield _instruments(bench, models, [str(doubt.message) for doubt in doubts])
-    yield _comparisons(bench, record, models)
-    yield _redesigns(bench, models)
+    yield _tell_instruments(bench, models, [str(doubt.message) for doubt in doubts])
+    yield _tell_comparisons(bench, record, models)
+    yield _tell_redesigns(bench, models)
 
 
-def _bench() -> _Bench:
+def _make_bench() -> _Bench:
     plant = maglev(m=BALL, K=MAGNET, g=GRAVITY)
     op = operating_point(plant, output=GAP)
     P = linearize(plant, op)
@@ -140,7 +142,7 @@ def _bench() -> _Bench:
     return _Bench(plant, op, P, sampled, Loop(plant, C, dt=PERIOD, at=op))
 
 
-def _physics(bench: _Bench) -> Section:
+def _tell_physics(bench: _Bench) -> Section:
     alpha, beta = -bench.P.den[0][0][-1], -bench.P.num[0][0][-1]
     volts, pole = bench.op.input, bench.pole
     text = f"""
@@ -155,14 +157,14 @@ def _physics(bench: _Bench) -> Section:
         ("beta = 2g/V0 [m/(s^2 V)]", f"{2 * GRAVITY / volts:.5f}", f"{beta:.5f}"),
         ("unstable pole [rad/s]", f"{pole:.4f}", f"{max(bench.P.poles().real):.4f}"),
     )
-    return Section(TITLES[0], _plain_words(text), Table(("", "by hand", "linearize()"), rows), {})
+    return Section(TITLES[0], _join_lines(text), Table(("", "by hand", "linearize()"), rows), {})
 
 
-def _controller(bench: _Bench) -> Section:
+def _tell_controller(bench: _Bench) -> Section:
     C = bench.loop.controller
     gain, zero, pole = C.num[0][0][0], C.zeros()[0].real, C.poles()[0].real
     poles = " and ".join(f"{p:.3f}" for p in sorted(bench.sampled.poles().real, reverse=True))
-    lead = f"{gain:.0f} (z {_signed(-zero)})/(z {_signed(-pole)})"
+    lead = f"{gain:.0f} (z {_write_signed(-zero)})/(z {_write_signed(-pole)})"
     text = f"""
         The controller is digital: every {1e3 * PERIOD:g} ms it reads the gap and then holds the
         voltage. Sampled like that, the plant has its poles at z = {poles}: one of them is outside
@@ -180,11 +182,13 @@ def _controller(bench: _Bench) -> Section:
         ("extra delay allowed [ms]", f"{1e3 * m.delay_margin:.2f}"),
     )
     axes = plot.bode({"plant P (sampled)": bench.sampled, "loop C P": bench.sampled * C})
-    return Section(TITLES[1], _plain_words(text), Table(("margins of the loop", ""), rows),
+    return Section(TITLES[1], _join_lines(text), Table(("margins of the loop", ""), rows),
                    {"The plant and the loop with the lead.": axes})  # fmt: skip
 
 
-def _records(bench: _Bench, samples: int, noise: float, seed: int) -> tuple[Record, Record]:
+def _simulate_records(
+    bench: _Bench, samples: int, noise: float, seed: int
+) -> tuple[Record, Record]:
     """Return the experiment as measured, and as a perfect sensor would have measured it."""
     toss, hiss = (int(s) for s in np.random.SeedSequence(seed).generate_state(2))
     r = random_binary(samples, amplitude=AMPLITUDE, hold=HOLD, around=bench.op.output, seed=toss)
@@ -193,7 +197,7 @@ def _records(bench: _Bench, samples: int, noise: float, seed: int) -> tuple[Reco
     return measured, perfect
 
 
-def _experiment(record: Record, noise: float) -> Section:
+def _tell_experiment(record: Record, noise: float) -> Section:
     text = f"""
         The reference jumps at random by {2e3 * AMPLITUDE:g} mm; a coin is tossed every
         {1e3 * HOLD * PERIOD:g} ms. The sensor adds white noise with a standard deviation of
@@ -203,17 +207,19 @@ def _experiment(record: Record, noise: float) -> Section:
     axes = plot.figure(2, 2, (10, 4.6), sharex="col")
     plot.record(record, axes[:, 0])
     plot.record(record[: min(len(record), 16 * HOLD)], axes[:, 1])
-    return Section(TITLES[2], _plain_words(text), None,
+    return Section(TITLES[2], _join_lines(text), None,
                    {"The whole record and its beginning.": axes})  # fmt: skip
 
 
-def _plain_fit(bench: _Bench, models: Models, perfect: IdentifiedModel, noise: float) -> Section:
+def _tell_plain_fit(
+    bench: _Bench, models: Models, perfect: IdentifiedModel, noise: float
+) -> Section:
     plain = models["plain"]
     text = """
         y(k) + a1 y(k-1) + a2 y(k-2) = b1 u(k-1) + b2 u(k-2) + c is fitted to all samples by least
         squares, as in equation (5) of the paper, "Identification of a class of unstable
         processes"."""
-    largest, pole = _largest(plain), _unstable(plain)
+    largest, pole = _find_largest_pole(plain), _find_unstable_pole(plain)
     if pole is None:
         text += f"""
 
@@ -223,19 +229,19 @@ def _plain_fit(bench: _Bench, models: Models, perfect: IdentifiedModel, noise: f
         text += f"""
 
         It finds the unstable pole at {pole:+.2f} rad/s, where physics has {bench.pole:+.2f}."""
-    clean = _unstable(perfect)
+    clean = _find_unstable_pole(perfect)
     if noise and clean is not None:
         text += f"""
 
         With a perfect sensor the same experiment gives {clean:+.2f} rad/s, so noise makes the
         difference. It enters the regressors y(k-1) and y(k-2), and through the controller u as
         well, and least squares takes that for dynamics. More samples do not help."""
-    table = _coefficients(bench, {"plain": plain, "plain, perfect sensor": perfect})
-    return Section(TITLES[3], _plain_words(text), table, {})
+    table = _make_coefficient_table(bench, {"plain": plain, "plain, perfect sensor": perfect})
+    return Section(TITLES[3], _join_lines(text), table, {})
 
 
-def _constrained_fit(bench: _Bench, models: Models) -> Section:
-    e, pole = models["constrained"].estimate, _unstable(models["constrained"])
+def _tell_constrained_fit(bench: _Bench, models: Models) -> Section:
+    e, pole = models["constrained"].estimate, _find_unstable_pole(models["constrained"])
     text = f"""
         Physics says that the poles are a pair +/-p. In z their product is then 1, a2 = 1, and that
         one of them is unstable means |a1| > 2. fit_arx() takes this as ReciprocalPoles(), minimises
@@ -244,8 +250,8 @@ def _constrained_fit(bench: _Bench, models: Models) -> Section:
         text += f""" with a1 = {e["a1"]:g}: THE MODEL SITS ON ITS BOUND, as the paper's equation (8)
         does. The data would take it further; that is a symptom, not a cure."""
     else:
-        text += f""" and the unstable pole at {_against(pole, bench.pole)}."""
-    errors = _gain_errors(bench, e)
+        text += f""" and the unstable pole at {_write_against_truth(pole, bench.pole)}."""
+    errors = _compute_gain_errors(bench, e)
     if max(map(abs, errors)) > WORTH_A_WORD:
         text += f"""
 
@@ -253,13 +259,17 @@ def _constrained_fit(bench: _Bench, models: Models) -> Section:
         {100 * errors[0]:+.0f} % and b2 by {100 * errors[1]:+.0f} %. The noise is still in the
         regressors."""
     figures = {"Poles of the fits and of the physics.": plot.poles(models, truth=bench.P)}
-    return Section(TITLES[4], _plain_words(text), _coefficients(bench, models), figures)
+    return Section(TITLES[4], _join_lines(text), _make_coefficient_table(bench, models), figures)
 
 
-def _instruments(bench: _Bench, models: Models, doubts: list[str]) -> Section:
-    e, pole = models["instruments"].estimate, _unstable(models["instruments"])
-    found = "without an unstable pole" if pole is None else f"at {_against(pole, bench.pole)}"
-    errors = _gain_errors(bench, e)
+def _tell_instruments(bench: _Bench, models: Models, doubts: list[str]) -> Section:
+    e, pole = models["instruments"].estimate, _find_unstable_pole(models["instruments"])
+    found = (
+        "without an unstable pole"
+        if pole is None
+        else f"at {_write_against_truth(pole, bench.pole)}"
+    )
+    errors = _compute_gain_errors(bench, e)
     text = f"""
         The reference was tossed without regard to the noise. fit_iv() takes its past as
         instruments: it asks for errors that are unrelated to the reference rather than for small
@@ -269,11 +279,11 @@ def _instruments(bench: _Bench, models: Models, doubts: list[str]) -> Section:
         {100 * errors[1]:+.1f} %."""
     text += "".join(f"\n\nIn doubt: {doubt}" for doubt in doubts)
     responses = plot.bode({"physics (sampled)": bench.sampled, **models})
-    return Section(TITLES[5], _plain_words(text), _coefficients(bench, models),
+    return Section(TITLES[5], _join_lines(text), _make_coefficient_table(bench, models),
                    {"Frequency responses of the fits and of the physics.": responses})  # fmt: skip
 
 
-def _comparisons(bench: _Bench, record: Record, models: Models) -> Section:
+def _tell_comparisons(bench: _Bench, record: Record, models: Models) -> Section:
     record = record[:COMPARED]
     # A fit knows nothing of the operating point; like its intercept, the means stand in for it.
     means = replace(bench.op, input=float(record.u.mean()), output=float(record.y.mean()))
@@ -304,12 +314,12 @@ def _comparisons(bench: _Bench, record: Record, models: Models) -> Section:
         ("model in the loop", "one-step fit", "its errors", "simulation fit", "noise explains"),
         tuple(rows),
     )
-    return Section(TITLES[6], _plain_words(text), table, _comparison_figures(found))
+    return Section(TITLES[6], _join_lines(text), table, _draw_comparisons(found))
 
 
-def _comparison_figures(found: dict[str, Comparison]) -> dict[str, Any]:
+def _draw_comparisons(found: dict[str, Comparison]) -> dict[str, Any]:
     known, good = found["constrained"], found["instruments"]
-    first = _pictures.telling(known)
+    first = _pictures.find_telling_window(known)
     t = known.record.t[first : first + _pictures.WINDOW]
     window = (t[0], t[-1] + PERIOD)
     figures = {
@@ -321,7 +331,7 @@ def _comparison_figures(found: dict[str, Comparison]) -> dict[str, Any]:
     return figures
 
 
-def _redesigns(bench: _Bench, models: Models) -> Section:
+def _tell_redesigns(bench: _Bench, models: Models) -> Section:
     crossover, margin = WANTED
     text = f"""
         A lead with a crossover of {crossover:g} rad/s and a phase margin of {margin:g} degrees is
@@ -335,15 +345,15 @@ def _redesigns(bench: _Bench, models: Models) -> Section:
         except CtrlidError as reason:  # The page prints a refusal in the place of a design.
             text += f"\n\n{label.capitalize()}: REFUSED. {reason}"
             continue
-        text += f"\n\n{label.capitalize()}: {_verdict(outcome)}"
-        rows.append(_performance(label, outcome))
+        text += f"\n\n{label.capitalize()}: {_write_verdict(outcome)}"
+        rows.append(_write_performance(label, outcome))
         figures[f"Step of the reference, designed on: {label}."] = plot.step(outcome)
     head = ("designed on", "crossover [rad/s]", "phase margin [deg]", "overshoot [%]")
     table = Table(head, tuple(rows), "Promised / achieved on the physics.") if rows else None
-    return Section(TITLES[7], _plain_words(text), table, figures)
+    return Section(TITLES[7], _join_lines(text), table, figures)
 
 
-def _verdict(outcome: Redesign) -> str:
+def _write_verdict(outcome: Redesign) -> str:
     p = outcome.promised
     if outcome.stable:
         return outcome.verdict
@@ -352,47 +362,47 @@ def _verdict(outcome: Redesign) -> str:
             f"KEEP THE BALL. {why[:1].upper()}{why[1:]}.")  # fmt: skip
 
 
-def _performance(label: str, outcome: Redesign) -> tuple[str, ...]:
+def _write_performance(label: str, outcome: Redesign) -> tuple[str, ...]:
     p, a = outcome.promised, outcome.achieved
     pairs = ((getattr(p, name), getattr(a, name)) for name in
              ("crossover", "phase_margin", "overshoot"))  # fmt: skip
     return (label, *(f"{x:.1f} / {y:.1f}" if a.stable else f"{x:.1f} / -" for x, y in pairs))
 
 
-def _largest(G: IdentifiedModel) -> float:
+def _find_largest_pole(G: IdentifiedModel) -> float:
     return float(np.abs(G.estimate.poles).max())
 
 
-def _unstable(G: IdentifiedModel) -> float | None:
+def _find_unstable_pole(G: IdentifiedModel) -> float | None:
     """Return the real part of the most unstable pole [rad/s], None without one."""
     # Two poles merged at the edge are known to half the digits only.
-    return float(G.estimate.poles_s.real.max()) if _largest(G) > 1 + 1e-6 else None
+    return float(G.estimate.poles_s.real.max()) if _find_largest_pole(G) > 1 + 1e-6 else None
 
 
-def _signed(value: float) -> str:
+def _write_signed(value: float) -> str:
     return f"{'-' if value < 0 else '+'} {abs(value):.4f}"
 
 
-def _against(value: float, truth: float) -> str:
+def _write_against_truth(value: float, truth: float) -> str:
     error = 100 * (value / truth - 1)
     return f"{value:+.2f} rad/s, {error:+.1f} % from sqrt(2g/x0) = {truth:.2f}"
 
 
-def _gain_errors(bench: _Bench, e: Estimate) -> list[float]:
+def _compute_gain_errors(bench: _Bench, e: Estimate) -> list[float]:
     return [e[name] / bench.coefficients[name] - 1 for name in ("b1", "b2")]
 
 
-def _coefficients(bench: _Bench, models: Models) -> Table:
+def _make_coefficient_table(bench: _Bench, models: Models) -> Table:
     rows = [
         (name, f"{value:.5g}", *(f"{G.estimate[name]:.5g}" for G in models.values()))
         for name, value in bench.coefficients.items()
     ]
-    poles = {k: _unstable(G) for k, G in models.items()}
+    poles = {k: _find_unstable_pole(G) for k, G in models.items()}
     rows.append(("unstable pole [rad/s]", f"{bench.pole:.2f}",
                  *("none" if p is None else f"{p:.2f}" for p in poles.values())))  # fmt: skip
     return Table(("", "physics", *models), tuple(rows))
 
 
-def _plain_words(text: str) -> str:
+def _join_lines(text: str) -> str:
     """Join the lines of each paragraph."""
     return "\n\n".join(" ".join(p.split()) for p in text.split("\n\n") if p.strip())

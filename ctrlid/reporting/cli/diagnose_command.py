@@ -11,7 +11,7 @@ from ..._base.errors import CtrlidError
 from ...diagnosis import diagnose
 from .. import plot
 from ..html_page import write_report
-from .arguments import PLANTS, assignment, assignments, spoken_loop, spoken_record
+from .arguments import PLANTS, parse_assignment, parse_assignments, read_loop, read_record
 
 EPILOG = """\
 example: a levitated ball was logged in log.csv with the columns time [s], ref [m], volt [V] and
@@ -45,8 +45,15 @@ def add_parser(commands: Any) -> None:
     add("--model", required=True, metavar="MODEL",
         help=f"{', '.join(PLANTS)}, or MODULE:NAME or FILE.py:NAME of a control system, of a "
         "ctrlid.Loop, or of a function that returns one")  # fmt: skip
-    add("--param", type=assignment, nargs="+", action="extend", default=[], metavar="NAME=VALUE",
-        help="parameters of the model, in SI units")  # fmt: skip
+    add(
+        "--param",
+        type=parse_assignment,
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="NAME=VALUE",
+        help="parameters of the model, in SI units",
+    )
     add("--free", nargs="*", metavar="NAME",
         help="parameters that are uncertain and recalibrated first; by default "
         + ", ".join(f"{' and '.join(v)} of {k}" for k, v in PLANTS.items()))  # fmt: skip
@@ -54,7 +61,7 @@ def add_parser(commands: Any) -> None:
     add("--input-bias", type=float, metavar="U",
         help="what the controller adds to u; by default what holds the model at rest")  # fmt: skip
     add("--dt", type=float, metavar="S", help="sampling period; by default of the time column")
-    add("--columns", type=assignments, default={}, metavar="r=REF,u=VOLT,y=GAP",
+    add("--columns", type=parse_assignments, default={}, metavar="r=REF,u=VOLT,y=GAP",
         help="names of the columns for r, u, y and time")  # fmt: skip
     add("--controller", metavar="C",
         help="as for --model, or a PID as in kp=..,ki=..,kd=..; by default unknown")  # fmt: skip
@@ -67,10 +74,10 @@ def add_parser(commands: Any) -> None:
     add("--jobs", type=int, default=None, metavar="N", help="processor cores to use")
     add("--save", type=Path, metavar="DIR", help="new folder for report, picture and diagnosis")
     add("--quiet", action="store_true", help="no progress on the terminal")
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=run_diagnosis)
 
 
-def run(args: argparse.Namespace) -> int:
+def run_diagnosis(args: argparse.Namespace) -> int:
     """Diagnose a file as the command line says, and print the report.
 
     Parameters
@@ -83,12 +90,12 @@ def run(args: argparse.Namespace) -> int:
     int
         0.
     """
-    record = spoken_record(args.file, args)
-    loop = spoken_loop(args, record)
+    record = read_record(args.file, args)
+    loop = read_loop(args, record)
     settings: dict[str, Any] = {} if args.jobs is None else {"jobs": args.jobs}
     if args.validation is not None:
-        settings["validation"] = spoken_record(args.validation, args)
-    folder = None if args.save is None else new_folder(args.save, "--save")
+        settings["validation"] = read_record(args.validation, args)
+    folder = None if args.save is None else make_folder(args.save, "--save")
     try:
         found = diagnose(loop, record, progress=not args.quiet and sys.stderr.isatty(), **settings)
     except BaseException:
@@ -106,7 +113,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def new_folder(wanted: Path | None, option: str, default: str = "ctrlid-report") -> Path:
+def make_folder(wanted: Path | None, option: str, default: str = "ctrlid-report") -> Path:
     """Make a folder; nothing that exists is touched.
 
     Parameters

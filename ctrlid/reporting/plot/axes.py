@@ -124,7 +124,7 @@ def new_figure(size: tuple[float, float]) -> Any:
     return Figure(figsize=size, layout="constrained")
 
 
-def require(value: Any, kind: type, sentence: str) -> None:
+def require_kind(value: Any, kind: type, sentence: str) -> None:
     """Refuse what is not of the kind that a picture shows."""
     if not isinstance(value, kind):
         raise CtrlidError(f"{sentence}; given {type(value).__name__}")
@@ -144,7 +144,7 @@ def take_axes(
     return given
 
 
-def line_style(i: int) -> dict[str, Any]:
+def choose_line_style(i: int) -> dict[str, Any]:
     """Return colour, dashes and width of the line number `i`."""
     return {
         "color": COLOURS[i % len(COLOURS)],
@@ -153,7 +153,7 @@ def line_style(i: int) -> dict[str, Any]:
     }
 
 
-def finish(ax: Any, *, legend: bool = True, columns: int = 2, size: str = "medium") -> Any:
+def finish_axes(ax: Any, *, legend: bool = True, columns: int = 2, size: str = "medium") -> Any:
     """Grid, open frame, and a legend above the axes, where it covers no data."""
     ax.grid(True, color="0.9", linewidth=0.6)
     ax.set_axisbelow(True)

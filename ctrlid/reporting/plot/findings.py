@@ -10,7 +10,7 @@ from ...diagnosis.findings import BinnedErrors
 from ...diagnosis.result import Diagnosis
 from ...diagnosis.thresholds import THRESHOLD
 from .. import pictures as _pictures
-from .axes import COLOURS, MEASURED, finish, new_figure, require, take_axes
+from .axes import COLOURS, MEASURED, finish_axes, new_figure, require_kind, take_axes
 
 BEFORE = {"color": COLOURS[1], "linestyle": "--", "linewidth": 1.4}
 AFTER = {"color": COLOURS[0], "linestyle": "-", "linewidth": 1.4}
@@ -47,8 +47,8 @@ def diagnosis(found: Diagnosis, axes: Any = None) -> Any:
     CtrlidError
         If something else than a diagnosis is given, or the number of axes differs.
     """
-    require(found, Diagnosis, "plot.diagnosis draws a Diagnosis, as diagnose() returns")
-    rounds = _pictures.ranking(found)
+    require_kind(found, Diagnosis, "plot.diagnosis draws a Diagnosis, as diagnose() returns")
+    rounds = _pictures.make_ranking(found)
     if axes is None:
         rows = max(sum(len(bars) + 1 for bars in rounds.values()), 3)
         height = 0.21 * rows + 0.9
@@ -59,19 +59,19 @@ def diagnosis(found: Diagnosis, axes: Any = None) -> Any:
         )
         axes = list(made.values())
     axes = take_axes(axes, 5)
-    _gap(axes[0], axes[1], found)
-    places = _pictures.two_most_telling(found)
+    _draw_gap(axes[0], axes[1], found)
+    places = _pictures.choose_two_most_telling(found)
     for ax, place in zip(axes[2:4], [*places, None, None][:2], strict=True):
-        _where(ax, place, found)
-    _ranking(axes[4], rounds)
+        _draw_errors(ax, place, found)
+    _draw_ranking(axes[4], rounds)
     return axes
 
 
-def _gap(above: Any, below: Any, found: Diagnosis) -> None:
+def _draw_gap(above: Any, below: Any, found: Diagnosis) -> None:
     """Draw the measured output against the model before and after, and the errors below."""
-    gap, part = found.gap, _pictures.largest_gap(found.gap)
+    gap, part = found.gap, _pictures.find_largest_gap(found.gap)
     t, y = gap.time[part], gap.measured[part]
-    scale, unit = _pictures.scale([y], gap.unit)
+    scale, unit = _pictures.choose_scale([y], gap.unit)
     above.plot(t, scale * y, label="measured", **MEASURED)
     names = " and ".join(f.name for f in found.findings[:2])
     names += f" and {len(found.findings) - 2} more" if len(found.findings) > 2 else ""
@@ -82,7 +82,7 @@ def _gap(above: Any, below: Any, found: Diagnosis) -> None:
     errors = [y - values[part] for _, values, _, _ in cases]
     known = [e[np.isfinite(e)] for e in errors if np.isfinite(e).any()] or [np.zeros(1)]
     floored = np.isfinite(gap.floor) and gap.floor > 0
-    fine, small = _pictures.scale([np.full(1, gap.floor)] if floored else known, gap.unit)
+    fine, small = _pictures.choose_scale([np.full(1, gap.floor)] if floored else known, gap.unit)
     # Where the unit is not known, only the label of the axis says so.
     short = f" {small}" if gap.unit else ""
     if floored:
@@ -97,23 +97,23 @@ def _gap(above: Any, below: Any, found: Diagnosis) -> None:
         shown = scale * values[part]
         above.plot(t[made], shown[made], label=f"{gap.kind}, {long}", **style)
         below.plot(t[made], fine * error[made], label=f"{label}: {rms}", **style)
-    _limit(above, scale * y)
+    _limit_view(above, scale * y)
     above.set_ylabel(f"output [{unit}]")
     below.set_ylabel(f"error [{small}]")
     below.set_xlabel(f"time [s], where the gap is largest among {len(gap.time)} samples kept back")
     for ax in (above, below):
         ax.set_xlim(t[0], t[-1])
-        finish(ax, columns=1 if ax is above else 3, size="small")
+        finish_axes(ax, columns=1 if ax is above else 3, size="small")
 
 
-def _limit(ax: Any, y: Array) -> None:
+def _limit_view(ax: Any, y: Array) -> None:
     """Keep what was measured readable, wherever a wrong model goes."""
     span = float(np.ptp(y)) or 1.0
     low, high = ax.get_ylim()
     ax.set_ylim(max(low, y.min() - 0.8 * span), min(high, y.max() + 0.8 * span))
 
 
-def _where(ax: Any, place: BinnedErrors | None, found: Diagnosis) -> None:
+def _draw_errors(ax: Any, place: BinnedErrors | None, found: Diagnosis) -> None:
     """Draw the RMS of the one-step errors along one quantity, before and after."""
     if place is None:
         ax.text(0.5, 0.5, "no place is known", ha="center", va="center", transform=ax.transAxes)
@@ -129,13 +129,13 @@ def _where(ax: Any, place: BinnedErrors | None, found: Diagnosis) -> None:
     else:
         ax.bar(at + 0.5, before, 0.8, label="recalibrated", **solid)
     ax.axhline(1, color="k", linewidth=1.2, linestyle=":", label="noise")
-    labels, title = _pictures.bin_labels(place)
+    labels, title = _pictures.write_bin_labels(place)
     every = -(-len(at) // 5)
     ax.set_xlim(0, len(at))
     ax.set_xlabel(title)
     ax.set_ylabel("one-step RMS error /\nthat of noise [1]")
     top = float(np.nanmax([*before, *after, 1.0]))
-    finish(ax, columns=3, size="small")
+    finish_axes(ax, columns=3, size="small")
     if top > 10:
         ax.set_yscale("log")
     else:
@@ -143,7 +143,7 @@ def _where(ax: Any, place: BinnedErrors | None, found: Diagnosis) -> None:
     ax.set_xticks(np.arange(len(labels))[::every], labels[::every])
 
 
-def _ranking(ax: Any, rounds: Mapping[int, Sequence[_pictures.Bar]]) -> None:
+def _draw_ranking(ax: Any, rounds: Mapping[int, Sequence[_pictures.Bar]]) -> None:
     """Draw the net gain of each candidate as bars, round below round."""
     labels, row, drawn = [], 0, set()
     top = max((bar.net_gain for bars in rounds.values() for bar in bars), default=0.0)
@@ -172,5 +172,5 @@ def _ranking(ax: Any, rounds: Mapping[int, Sequence[_pictures.Bar]]) -> None:
     ax.tick_params(axis="y", length=0)
     ax.set_ylim(row - 0.4, -0.6)
     ax.set_xlabel("net gain: evidence less the Bayesian penalty (BIC) [log-likelihood]")
-    finish(ax, columns=5, size="small")
+    finish_axes(ax, columns=5, size="small")
     ax.grid(False, axis="y")

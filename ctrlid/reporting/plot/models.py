@@ -9,11 +9,11 @@ from ..._base import text as _text
 from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
 from ...estimation.confidence_band import response_band
-from ...estimation.identified_model import IdentifiedModel, delay_of
+from ...estimation.identified_model import IdentifiedModel, read_delay
 from ...estimation.series import FitSeries
 from ...physics.trace import timebase
 from .. import pictures as _pictures
-from .axes import COLOURS, MARKERS, finish, line_style, require, take_axes
+from .axes import COLOURS, MARKERS, choose_line_style, finish_axes, require_kind, take_axes
 
 
 def poles(models: Any, ax: Any = None, *, truth: Any = None) -> Any:
@@ -49,12 +49,10 @@ def poles(models: Any, ax: Any = None, *, truth: Any = None) -> Any:
     >>> ax.get_xlabel()
     'real part of z [1]'
     """
-    models = _pictures.checked_models(models, "plot.poles")
-    physics = (
-        _pictures.checked_models({"physics": truth}, "plot.poles") if truth is not None else {}
-    )
-    dt = _pictures.period({**models, **physics})
-    found = {k: _pictures.places(m, dt) for k, m in (*models.items(), *physics.items())}
+    models = _pictures.check_models(models, "plot.poles")
+    physics = _pictures.check_models({"physics": truth}, "plot.poles") if truth is not None else {}
+    dt = _pictures.find_period({**models, **physics})
+    found = {k: _pictures.find_poles(m, dt) for k, m in (*models.items(), *physics.items())}
     if not any(p.size for p in found.values()):
         raise CtrlidError("plot.poles has nothing to draw: none of the models has a pole")
     ax = take_axes(ax, 1, size=(6.4, 3.6))[0]
@@ -70,14 +68,14 @@ def poles(models: Any, ax: Any = None, *, truth: Any = None) -> Any:
         if label in models:
             style = {"color": COLOURS[i % len(COLOURS)], "marker": MARKERS[i % len(MARKERS)],
                      "markersize": 8, "markerfacecolor": "none", "zorder": 3}  # fmt: skip
-        listed = ", ".join(_text.number(p, 4) for p in places) or "none"
+        listed = ", ".join(_text.write_number(p, 4) for p in places) or "none"
         ax.plot(places.real, places.imag, linestyle="none", markeredgewidth=1.8,
                 label=f"{label}: {listed}", **style)  # fmt: skip
-    _view(ax, np.concatenate([*found.values(), [1.0 if dt else 0.0]]))
+    _choose_view(ax, np.concatenate([*found.values(), [1.0 if dt else 0.0]]))
     plane, unit = ("z", "1") if dt else ("s", "rad/s")
     ax.set_xlabel(f"real part of {plane} [{unit}]")
     ax.set_ylabel(f"imaginary part of {plane} [{unit}]")
-    return finish(ax, columns=1)
+    return finish_axes(ax, columns=1)
 
 
 def bode(models: Any, axes: Any = None, *, omega: Any = None, level: float | None = 0.95) -> Any:
@@ -115,9 +113,9 @@ def bode(models: Any, axes: Any = None, *, omega: Any = None, level: float | Non
     >>> phase.get_ylabel(), phase.get_xlabel()
     ('phase [deg]', 'frequency [rad/s]')
     """
-    models = _pictures.checked_models(models, "plot.bode")
+    models = _pictures.check_models(models, "plot.bode")
     grid = (
-        _pictures.frequencies(models)
+        _pictures.make_frequency_grid(models)
         if omega is None
         else np.sort(np.atleast_1d(np.asarray(omega, float)))
     )
@@ -135,7 +133,7 @@ def bode(models: Any, axes: Any = None, *, omega: Any = None, level: float | Non
         if not w.size:
             continue
         values = np.atleast_1d(model(np.exp(1j * w * dt) if dt else 1j * w))
-        values = values * np.exp(-1j * w * delay_of(model))
+        values = values * np.exp(-1j * w * read_delay(model))
         phase = np.degrees(np.unwrap(np.angle(values)))
         # All phases are on the sheet of the first model, which starts within (-270, 90] degrees.
         turn = (
@@ -147,24 +145,24 @@ def bode(models: Any, axes: Any = None, *, omega: Any = None, level: float | Non
             turn -= 1
         phase = phase - 360 * turn
         sheet = float(phase[0]) if sheet is None else sheet
-        axes[0].semilogx(w, 20 * np.log10(np.abs(values)), label=label, **line_style(i))
-        axes[1].semilogx(w, phase, **line_style(i))
+        axes[0].semilogx(w, 20 * np.log10(np.abs(values)), label=label, **choose_line_style(i))
+        axes[1].semilogx(w, phase, **choose_line_style(i))
         if level is not None and isinstance(model, IdentifiedModel):
-            _band(axes, model, w, level, phase, line_style(i)["color"], label)
+            _draw_band(axes, model, w, level, phase, choose_line_style(i)["color"], label)
     for limit in sorted(set(np.round(limits, 9))):
         for ax in axes:
             ax.axvline(limit, color="0.5", linewidth=1, linestyle=":",
                        label="Nyquist frequency" if ax is axes[0] else None)  # fmt: skip
-    _degrees(axes[1])
+    _set_degree_ticks(axes[1])
     axes[0].set_ylabel("magnitude [dB]")
     axes[1].set_ylabel("phase [deg]")
     axes[1].set_xlabel("frequency [rad/s]")
-    finish(axes[0])
-    finish(axes[1], legend=False)
+    finish_axes(axes[0])
+    finish_axes(axes[1], legend=False)
     return axes
 
 
-def _band(
+def _draw_band(
     axes: Any, model: IdentifiedModel, w: Array, level: float, phase: Array, color: str, label: str
 ) -> None:
     """Shade where the response of a fit lies, without letting a wide band set the view."""
@@ -219,23 +217,23 @@ def trend(series: FitSeries, ax: Any = None, *, truth: Any = None) -> Any:
     >>> cid.plot.trend(cid.fit_each(cid.fit_iv, runs, na=2, nb=2)).get_ylabel()
     'rightmost pole [rad/s]'
     """
-    require(series, FitSeries, "plot.trend draws a FitSeries, as fit_each() returns")
+    require_kind(series, FitSeries, "plot.trend draws a FitSeries, as fit_each() returns")
     line = series.trend
     ax = take_axes(ax, 1)[0]
-    scale, unit = _pictures.scale([series.levels], series.unit)
+    scale, unit = _pictures.choose_scale([series.levels], series.unit)
     y = np.linspace(series.levels.min(), series.levels.max(), 101)
     ax.plot(scale * y, line.pole + line.slope * (y - line.level), label="line through the fits",
-            **line_style(0))  # fmt: skip
+            **choose_line_style(0))  # fmt: skip
     if truth is not None:
-        ax.plot(scale * y, truth(y), label="physics", **line_style(1))
+        ax.plot(scale * y, truth(y), label="physics", **choose_line_style(1))
     ax.errorbar(scale * series.levels, series.rates, 1.96 * series.rate_errors, fmt=MARKERS[0],
                 color="k", capsize=4, label="fits, 95 % intervals")  # fmt: skip
     ax.set_xlabel(f"mean output [{unit}]")
     ax.set_ylabel("rightmost pole [rad/s]")
-    return finish(ax, columns=3)
+    return finish_axes(ax, columns=3)
 
 
-def _view(ax: Any, places: Any) -> None:
+def _choose_view(ax: Any, places: Any) -> None:
     """Choose limits that hold all places, of the same scale in both directions."""
     low, high = places.real.min(), places.real.max()
     tall = np.abs(places.imag).max()
@@ -248,7 +246,7 @@ def _view(ax: Any, places: Any) -> None:
     ax.set_aspect("equal", adjustable="box")
 
 
-def _degrees(ax: Any) -> None:
+def _set_degree_ticks(ax: Any) -> None:
     """Put the ticks of a phase at parts of a right angle."""
     low, high = ax.get_ylim()
     step = next((s for s in (1, 5, 15, 30, 45, 90) if high - low <= 7 * s), 180)

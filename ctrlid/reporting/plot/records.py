@@ -12,7 +12,16 @@ from ...data.record import Record
 from ...data.validity import find_runs
 from ...validation.comparison import Comparison
 from .. import pictures as _pictures
-from .axes import BINS, COLOURS, DASHES, MEASURED, finish, line_style, require, take_axes
+from .axes import (
+    BINS,
+    COLOURS,
+    DASHES,
+    MEASURED,
+    choose_line_style,
+    finish_axes,
+    require_kind,
+    take_axes,
+)
 
 
 def record(record: Record, axes: Any = None, *, extra: Sequence[str] = ()) -> Any:
@@ -48,29 +57,31 @@ def record(record: Record, axes: Any = None, *, extra: Sequence[str] = ()) -> An
     >>> [ax.get_ylabel() for ax in axes]
     ['y [mm]', 'u [unit not given]']
     """
-    require(record, Record, "plot.record draws a Record")
+    require_kind(record, Record, "plot.record draws a Record")
     extra = (extra,) if isinstance(extra, str) else tuple(extra)
     unknown = [name for name in extra if name not in record.extra]
     if unknown:
         raise CtrlidError(f"the record has no extra channel {unknown}; it has {list(record.extra)}")
     axes = take_axes(axes, 2 + len(extra), sharex=True)
     both = [record.y] if record.r is None else [record.y, record.r]
-    scale, unit = _pictures.scale(both, record.units.get("y", ""))
+    scale, unit = _pictures.choose_scale(both, record.units.get("y", ""))
     name = record.names.get("y", "y")
-    _trace(axes[0], record, scale * record.y, 0, f"measured {name}")
+    _draw_trace(axes[0], record, scale * record.y, 0, f"measured {name}")
     if record.r is not None:
-        _trace(axes[0], record, scale * record.r, 1, f"reference {record.names.get('r', '')}", True)
+        _draw_trace(
+            axes[0], record, scale * record.r, 1, f"reference {record.names.get('r', '')}", True
+        )
     axes[0].set_ylabel(f"{name} [{unit}]")
     panels = [(record.names.get("u", "u"), record.u, "u", record.hold == "zoh")]
     panels += [(key, record.extra[key], key, False) for key in extra]
     for i, (ax, (name, values, key, held)) in enumerate(zip(axes[1:], panels, strict=True)):
-        scale, unit = _pictures.scale([values], record.units.get(key, ""))
+        scale, unit = _pictures.choose_scale([values], record.units.get(key, ""))
         label = name if i else f"input {name}"
-        _trace(ax, record, scale * values, (2 + i) % len(COLOURS), label, held)
+        _draw_trace(ax, record, scale * values, (2 + i) % len(COLOURS), label, held)
         ax.set_ylabel(f"{name} [{unit}]")
     for ax in axes:
-        _shade(ax, record)
-        finish(ax)
+        _shade_gaps(ax, record)
+        finish_axes(ax)
     axes[-1].set_xlabel("time [s]")
     return axes
 
@@ -110,10 +121,10 @@ def comparison(
     >>> ax.get_xlabel()
     'time [s], 0 to 5 s of a record from 0 to 10 s'
     """
-    require(comparison, Comparison, "plot.comparison draws a Comparison, as compare() returns")
+    require_kind(comparison, Comparison, "plot.comparison draws a Comparison, as compare() returns")
     whole = comparison.record
     if window is None:
-        first = _pictures.telling(comparison)
+        first = _pictures.find_telling_window(comparison)
         stop = min(first + _pictures.WINDOW, len(whole))
     else:
         part = whole.between(*window)
@@ -121,7 +132,7 @@ def comparison(
         stop = first + len(part)
     ax = take_axes(ax, 1)[0]
     t, shown = whole.t[first:stop], slice(first, stop)
-    scale, unit = _pictures.scale([whole.y[shown]], whole.units.get("y", ""))
+    scale, unit = _pictures.choose_scale([whole.y[shown]], whole.units.get("y", ""))
     y = scale * whole.y[shown]
     ax.plot(t, y, label=f"measured {whole.names.get('y', 'y')}", **MEASURED)
     for i, curve in enumerate(comparison.curves):
@@ -129,7 +140,7 @@ def comparison(
         # Long predictions are made from every few samples only; breaks are where nothing counts.
         kept = np.isfinite(values) | ~whole.valid[shown]
         label = f"{curve.label}: fit {curve.fit:.1f} %"
-        ax.plot(t[kept], values[kept], label=label, **line_style(i))
+        ax.plot(t[kept], values[kept], label=label, **choose_line_style(i))
     # A prediction of a wrong model can be anywhere; what was measured must stay readable.
     span = float(np.ptp(y)) or 1.0
     low, high = ax.get_ylim()
@@ -141,12 +152,12 @@ def comparison(
         values = scale * curve.y[shown]
         if not np.any((low < values) & (values < high)):
             line.set_label(f"{line.get_label()}, outside this picture")
-    _shade(ax, whole[first:stop])
+    _shade_gaps(ax, whole[first:stop])
     ax.set_ylabel(f"{whole.names.get('y', 'y')} [{unit}]")
     ends = [f"{a:.4g} to {a + n * whole.dt:.4g} s" for a, n in
             ((t[0], len(t)), (whole.start, len(whole)))]  # fmt: skip
     ax.set_xlabel(f"time [s], {ends[0]} of a record from {ends[1]}")
-    return finish(ax)
+    return finish_axes(ax)
 
 
 def residuals(comparison: Comparison, axes: Any = None) -> Any:
@@ -178,7 +189,7 @@ def residuals(comparison: Comparison, axes: Any = None) -> Any:
     >>> len(cid.plot.residuals(found))
     3
     """
-    require(comparison, Comparison, "plot.residuals draws a Comparison, as compare() returns")
+    require_kind(comparison, Comparison, "plot.residuals draws a Comparison, as compare() returns")
     if not comparison.tests:
         raise CtrlidError("plot.residuals has nothing to draw: the one-step errors of this record "
                           "were not tested, they are round-off or too few")  # fmt: skip
@@ -196,24 +207,26 @@ def residuals(comparison: Comparison, axes: Any = None) -> Any:
                 ax.plot(test.lags[which], test.values[which], marker, color=colour, markersize=4,
                         label=label)  # fmt: skip
         verdict = "chance explains it" if test.passed else "NOT CHANCE"
-        title = f"{test.name}: {verdict} ({_text.chance(test.p_value)})"
+        title = f"{test.name}: {verdict} ({_text.write_p_value(test.p_value)})"
         ax.set_title(title, loc="left", fontsize="medium")
         reach = 1.15 * max(float(np.abs(test.values).max()), min(test.band, 1.0))
         ax.set_ylim(-reach, reach)
         ax.set_ylabel("correlation [1]")
-        finish(ax, legend=False)
+        finish_axes(ax, legend=False)
     axes[0].legend(loc="lower right", bbox_to_anchor=(1, 1.12), ncols=3, frameon=False, borderpad=0)
     axes[-1].set_xlabel("lag [samples]")
     return axes
 
 
-def _trace(ax: Any, record: Record, values: Array, i: int, label: str, held: bool = False) -> None:
+def _draw_trace(
+    ax: Any, record: Record, values: Array, i: int, label: str, held: bool = False
+) -> None:
     """Draw one signal over time, or the band it fills where there are more samples than pixels."""
     n = len(record)
     if n <= 2 * BINS:
         where = "steps-post" if held else "default"
         # Two signals share the first axes only.
-        style = {**line_style(i), "linestyle": DASHES[i == 1]}
+        style = {**choose_line_style(i), "linestyle": DASHES[i == 1]}
         ax.plot(record.t, values, drawstyle=where, label=label.strip(), **style)
         return
     # Only the border of a reference is drawn, so that the output shows through.
@@ -222,13 +235,13 @@ def _trace(ax: Any, record: Record, values: Array, i: int, label: str, held: boo
     low, high = np.minimum.reduceat(values, edges), np.maximum.reduceat(values, edges)
     t, label = record.t[edges], f"{label.strip()}, range"
     if bounded:
-        ax.step(t, high, where="post", label=label, **line_style(i))
-        ax.step(t, low, where="post", **line_style(i))
+        ax.step(t, high, where="post", label=label, **choose_line_style(i))
+        ax.step(t, low, where="post", **choose_line_style(i))
         return
     ax.fill_between(t, low, high, color=COLOURS[i], alpha=0.55, linewidth=0.4, label=label)
 
 
-def _shade(ax: Any, record: Record) -> None:
+def _shade_gaps(ax: Any, record: Record) -> None:
     """Shade the stretches that do not count."""
     for k, (start, stop) in enumerate(zip(*find_runs(~record.valid), strict=True)):
         t0, t1 = (record.start + i * record.dt for i in (start, stop))

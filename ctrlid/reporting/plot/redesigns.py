@@ -7,7 +7,7 @@ import numpy as np
 
 from ..._base.errors import CtrlidError
 from ...design.redesigning import Redesign
-from .axes import MARKERS, finish, line_style, require, take_axes
+from .axes import MARKERS, choose_line_style, finish_axes, require_kind, take_axes
 
 
 def step(redesigns: Any, axes: Any = None) -> Any:
@@ -49,12 +49,12 @@ def step(redesigns: Any, axes: Any = None) -> Any:
         raise CtrlidError("plot.step has nothing to draw: the mapping is empty")
     needed = "plot.step draws a Redesign, as redesign() returns, or a mapping of them"
     for redesign in several.values():
-        require(redesign, Redesign, needed)
+        require_kind(redesign, Redesign, needed)
     size = (7.2, 3.2 * len(several)) if len(several) > 1 else None
     axes = take_axes(axes, len(several), size, sharex=True)
     ends = []
     for ax, (label, redesign) in zip(axes, several.items(), strict=True):
-        ends.append(_step(ax, redesign))
+        ends.append(_draw_step(ax, redesign))
         if label:
             ax.get_legend().set_title(label)
             ax.get_legend().set_alignment("left")
@@ -64,7 +64,7 @@ def step(redesigns: Any, axes: Any = None) -> Any:
     return axes if isinstance(redesigns, Mapping) else axes[0]
 
 
-def _step(ax: Any, redesign: Redesign) -> float:
+def _draw_step(ax: Any, redesign: Redesign) -> float:
     """Draw the promised and the achieved response; return where the axis should end."""
     cases = (("promised on the model", redesign.promised, redesign.promised_step),
              ("achieved on the physics", redesign.achieved, redesign.achieved_step))  # fmt: skip
@@ -78,7 +78,7 @@ def _step(ax: Any, redesign: Redesign) -> float:
         else:
             label = (f"{what}: {performance.overshoot:.0f} % overshoot, "
                      f"{performance.settling_time:.2g} s to settle")  # fmt: skip
-        ax.plot(redesign.time[: len(values)], values, label=label, **line_style(i),
+        ax.plot(redesign.time[: len(values)], values, label=label, **choose_line_style(i),
                 marker=MARKERS[i], markevery=max(len(values) // 25, 1), markersize=4)  # fmt: skip
     promised = redesign.promised_step
     restless = any(p.stable and not np.isfinite(p.settling_time) for _, p, _ in cases)
@@ -88,7 +88,7 @@ def _step(ax: Any, redesign: Redesign) -> float:
     settled = [t for t in (redesign.promised.settling_time, redesign.achieved.settling_time)
                if np.isfinite(t)]  # fmt: skip
     ax.set_ylabel("output per step\nof the reference [1]")
-    finish(ax, columns=1)
+    finish_axes(ax, columns=1)
     last = float(redesign.time[-1])
     # The axis is long enough to see whether the promise is kept and short enough to see how.
     return min(last, max(3 * max(settled), 20 * redesign.loop.dt)) if settled else last
