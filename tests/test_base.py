@@ -13,9 +13,9 @@ from scipy.signal import lfilter
 from ctrlid._base.criterion import bayesian_penalty
 from ctrlid._base.statistics import (
     autocorrelation_time,
+    compute_lagged_products,
     fit_autoregression,
     kurtosis_about_zero,
-    lagged_products,
     portmanteau,
     pseudo_inverse,
     reflect_into_circle,
@@ -55,7 +55,7 @@ def test_the_penalty_is_half_that_of_the_criterion(n, samples):
 def test_products_of_delayed_signals_are_the_same_either_way(lags):
     a, b = np.random.default_rng(3).standard_normal((2, 300))
     expected = [sum(a[k] * b[k - t] for k in range(t, 300)) for t in range(lags + 1)]
-    np.testing.assert_allclose(lagged_products(a, b, lags), expected, atol=1e-12)
+    np.testing.assert_allclose(compute_lagged_products(a, b, lags), expected, atol=1e-12)
 
 
 @pytest.mark.parametrize("power", [1, 3, 4])
@@ -95,7 +95,7 @@ def test_a_gaussian_signal_has_kurtosis_three():
 @pytest.mark.parametrize("poles", [[], [0.5], [0.9, -0.3], [0.8 + 0.5j, 0.8 - 0.5j]])
 def test_the_order_of_an_autoregression_is_that_of_the_criterion(poles):
     e = lfilter([1.0], np.poly(poles).real, np.random.default_rng(6).standard_normal(20_000))
-    r = lagged_products(e, e, 8)
+    r = compute_lagged_products(e, e, 8)
     # Each order by the normal equations themselves.
     filters = [np.append(1.0, np.linalg.solve(toeplitz(r[:p]), -r[1 : p + 1])) if p else np.ones(1)
                for p in range(9)]  # fmt: skip

@@ -15,7 +15,7 @@ from scipy import integrate, linalg, signal
 import ctrlid as cid
 from ctrlid import effects as E
 from ctrlid.estimation.likelihood.filter_data import find_rest_state, make_filter_data
-from ctrlid.estimation.likelihood.kalman_filter import Noise, guess_trajectory, settle_trajectory
+from ctrlid.estimation.likelihood.kalman_filter import Noise, converge_trajectory, guess_trajectory
 from ctrlid.estimation.likelihood.kalman_recursion import filter_pass
 from ctrlid.estimation.likelihood.likelihood import make_problem
 from ctrlid.estimation.likelihood.maximization import begin_fit
@@ -477,7 +477,9 @@ def test_nobody_knows_where_a_play_begins():
     for first in range(0, 40, 5):
         data = make_filter_data(loop, record[first:])
         m = SampledPlant(loop, ("InputBacklash.width",), "zoh", False)
-        lin, out = settle_trajectory(m, data, np.array([0.2]), known, guess_trajectory(m, data), 30)
+        lin, out = converge_trajectory(
+            m, data, np.array([0.2]), known, guess_trajectory(m, data), 30
+        )
         z = out.innovations / np.sqrt(out.variance) / 3e-4
         assert np.abs(z).max() < 5
         assert np.mean(z[:60] ** 2) < 1.6
@@ -492,7 +494,7 @@ def test_nobody_knows_what_a_delay_brings_at_first():
     for first in range(0, 80, 10):
         data = make_filter_data(loop, record[first:])
         m = SampledPlant(loop, (), "zoh", False)
-        lin, out = settle_trajectory(
+        lin, out = converge_trajectory(
             m, data, np.zeros(0), Noise((9e4,)), guess_trajectory(m, data), 30
         )
         z = out.innovations / np.sqrt(out.variance) / 1e-4
@@ -563,7 +565,7 @@ def test_an_analog_circuit_moves_the_input_between_samples():
     record = cid.simulate(loop, r)
     m = SampledPlant(loop, (), "foh", True)
     data = make_filter_data(loop, record)
-    fit = settle_trajectory(m, data, np.empty(0), Noise((1e12,)), guess_trajectory(m, data))[1]
+    fit = converge_trajectory(m, data, np.empty(0), Noise((1e12,)), guess_trajectory(m, data))[1]
     late = slice(15, None)
     assert np.abs(fit.innovations[late]).max() < 1e-4 * np.std(record.y)
 
@@ -635,8 +637,8 @@ def test_machines_share_what_values_do_not_change():
     changed = friction.with_parameters({"k": 4.0, "CoulombFriction.fc": 0.2})
     other = SampledPlant(changed, ["k"], "zoh", False)  # fmt: skip
     assert one.maps is other.maps
-    assert other.values(np.array([5.0])).tolist() == [1.0, 2.0, 5.0, 0.2]
-    assert one.values(np.array([5.0])).tolist() == [1.0, 2.0, 5.0, 0.1]
+    assert other.insert_free_values(np.array([5.0])).tolist() == [1.0, 2.0, 5.0, 0.2]
+    assert one.insert_free_values(np.array([5.0])).tolist() == [1.0, 2.0, 5.0, 0.1]
     for different in (
         SampledPlant(friction, ["c"], "zoh", False), SampledPlant(friction, ["k"], "foh", False),
         SampledPlant(loop, ["k"], "zoh", False),

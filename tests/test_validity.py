@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from ctrlid.data.validity import find_runs, whole_past
+from ctrlid.data.validity import find_runs, find_whole_past
 
 
 @pytest.mark.parametrize("lags", [0, 1, 4, 29, 30, 31])
@@ -13,7 +13,7 @@ from ctrlid.data.validity import find_runs, whole_past
 def test_a_row_counts_where_every_sample_of_its_past_does(lags, seed):
     valid = np.random.default_rng(seed).random(30) < (0.5, 0.8, 1.0, 0.0)[seed]
     expected = [k >= lags and bool(valid[k - lags : k + 1].all()) for k in range(30)]
-    assert whole_past(valid, lags).tolist() == expected
+    assert find_whole_past(valid, lags).tolist() == expected
 
 
 @pytest.mark.parametrize("mask", [[], [0, 0], [1, 1], [1, 0, 0, 1, 1, 0, 1]])

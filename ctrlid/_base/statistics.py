@@ -13,7 +13,7 @@ SINGULAR = 1e-10  # A direction with a smaller relative eigenvalue is not in the
 FEW_LAGS = 50  # Up to so many, products lag by lag are faster than by Fourier transform.
 
 
-def lagged_products(a: Array, b: Array, lags: int) -> Array:
+def compute_lagged_products(a: Array, b: Array, lags: int) -> Array:
     r"""Return the sums of products of two signals, the second one delayed.
 
     .. math:: S(\tau) = \sum_k a_k \, b_{k - \tau}, \quad \tau = 0, \dots, n_\tau
@@ -76,7 +76,7 @@ def autocorrelation_time(e: Array, power: int = 1) -> float:
     >>> round(autocorrelation_time(signal.lfilter([1.0], [1.0, -0.8], white)))
     9
     """
-    products = lagged_products(e, e, max(len(e) // 4 - 1, 0))
+    products = compute_lagged_products(e, e, max(len(e) // 4 - 1, 0))
     rho = products / max(products[0], 1e-300)
     ends = np.flatnonzero(rho <= 0)
     return float(1 + 2 * np.sum(rho[1 : ends[0] if len(ends) else len(rho)] ** power))
@@ -179,7 +179,8 @@ def fit_autoregression(products: Array, samples: float) -> Array:
     chosen = a = np.ones(1)
     if products[0] <= 0:
         return chosen
-    least, share = 0.0, 1.0  # the share of the variance that past samples do not predict
+    # `share` is the share of the variance that past samples do not predict.
+    least, share = 0.0, 1.0
     for order in range(1, len(products)):
         reflection = -float(a @ products[order:0:-1]) / (share * products[0])
         a = np.append(a, 0.0) + reflection * np.append(a, 0.0)[::-1]

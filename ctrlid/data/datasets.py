@@ -325,5 +325,6 @@ def _find_file(source: Source) -> Path:
             f"cannot fetch {source.address} ({type(reason).__name__}: {reason}). Connect to the "
             f"network, or put the file into a folder as {source.file} and name that folder in the "
             f"environment variable {FOLDER_VARIABLE}"
-        ) from None  # the text says all that a page of network frames would
+            # The text says all that a page of network frames would.
+        ) from None
     return Path(fetched)

@@ -16,7 +16,7 @@ from .._base.text import Printed
 from . import csv_files as _csv
 from . import responses as _response
 from .field_checks import check_samples, check_seconds, check_words
-from .validity import find_runs, whole_past
+from .validity import find_runs, find_whole_past
 
 Hold = Literal["zoh", "foh"]
 SIGNALS = ("r", "u", "y")
@@ -279,7 +279,7 @@ class Record(Printed):
         if not antialias:
             return self._change_channels(lambda s: s[::q], valid=self.valid[::q], dt=self.dt * q)
         half = 10 * q
-        valid = whole_past(np.pad(self.valid, half), 2 * half)[2 * half :: q]
+        valid = find_whole_past(np.pad(self.valid, half), 2 * half)[2 * half :: q]
         if not valid.any():
             longest = max((b - a for a, b in self.segments()), default=0)
             raise CtrlidError(

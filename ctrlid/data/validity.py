@@ -11,7 +11,7 @@ def find_runs(mask: Any) -> tuple[Any, Any]:
     return edges[::2], edges[1::2]
 
 
-def whole_past(valid: Any, lags: int) -> Any:
+def find_whole_past(valid: Any, lags: int) -> Any:
     """Return which samples count together with all of a number of samples before them.
 
     Parameters

@@ -15,7 +15,7 @@ from ..estimation.likelihood.likelihood import Fit
 from ..estimation.likelihood.prediction import predict, predict_ahead, predict_spread
 from ..loop.loop import Loop
 from ..loop.simulation import Simulator
-from ..validation.record_simulation import long_stretches, prepare_stretch
+from ..validation.record_simulation import find_long_stretches, prepare_stretch
 from ..validation.reproduction import Reproduction
 from .thresholds import THRESHOLD
 
@@ -92,7 +92,7 @@ def simulate_window(loop: Loop, window: Window, how: Reproduction) -> Array:
         simulator = make_simulator(loop)
     except (ModelCannotRun, EffectDoesNotApply):
         return y
-    for part in long_stretches(record):
+    for part in find_long_stretches(record):
         try:
             stretch = prepare_stretch(simulator, record, part, start_time=window.start_time)
             y[part] = stretch.run(simulator)[0]
@@ -171,7 +171,7 @@ def _simulate_noise(
         return np.tile(size * known**2, (runs, 1))
     simulator = make_simulator(loop)
     squares, count = np.zeros((runs, 2)), 0
-    for part in long_stretches(record):
+    for part in find_long_stretches(record):
         use = window.mask[part]
         if not use.any():
             continue

@@ -106,7 +106,8 @@ def find_objection(trial: Trial) -> Objection | None:
     if _is_insignificant(trial, effect):
         return Objection("insignificant", "no larger than its uncertainty")
     if not all(f"{trial.label}.{p.name}" in names for p in effect.parameters()):
-        return None  # What is held still, another effect has.
+        # A parameter that is held at its neutral value is another effect's, which excuses this one.
+        return None
     doubt = effect.doubt()
     return None if doubt is None else Objection("doubtful", doubt)
 

@@ -10,8 +10,8 @@ from scipy import stats
 from .._base.arrays import Array
 from .._base.statistics import (
     autocorrelation_time,
+    compute_lagged_products,
     kurtosis_about_zero,
-    lagged_products,
     portmanteau,
 )
 from ..estimation.likelihood.filter_data import FilterData
@@ -99,7 +99,8 @@ def run_noise_tests(fit: Fit) -> NoiseTests:
         keep = np.isfinite(z)
         filled = np.where(keep, z, 0.0)
         n = int(keep.sum())
-        rho = lagged_products(filled, filled, THRESHOLD.lags)[1:] / n  # of variance one
+        # The standardized innovations have variance one, so that these are correlations.
+        rho = compute_lagged_products(filled, filled, THRESHOLD.lags)[1:] / n
         # Without weights for short records: names and verdicts were studied with this statistic.
         white += portmanteau(rho, n, short=False)
         white_df += THRESHOLD.lags

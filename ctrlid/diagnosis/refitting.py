@@ -8,7 +8,7 @@ import numpy as np
 from .._base.criterion import bayesian_penalty
 from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from ..estimation.likelihood.kalman_filter import Noise
-from ..estimation.likelihood.likelihood import Fit, evaluate_likelihood
+from ..estimation.likelihood.likelihood import Fit, evaluate_likelihood, rank_by_likelihood
 from ..estimation.likelihood.maximization import OTHER_NOISE_GAIN, maximize
 from .candidates import Objection, Trial
 from .fitted_model import Model, can_simulate, carry_over_fit, drop_arrays, drop_linearization
@@ -78,7 +78,8 @@ def weigh_refit(base: Model, trial: Trial, fit: Fit) -> Trial:
     done = replace(trial, model=model, gain=fit.value - before, penalty=penalty)
     try:
         done = replace(done, out=find_objection(done))
-    except EffectDoesNotApply as reason:  # values that do not go together, such as crossed limits
+    # Fitted values may exclude each other, as a lower limit above the upper one does.
+    except EffectDoesNotApply as reason:
         return replace(trial, out=Objection.of(reason))
     return done if done.net_gain > 0 else replace(done, model=Model(model.loop, drop_arrays(fit)))
 
@@ -119,7 +120,7 @@ def place_instants(fit: Fit) -> Fit:
             reach = 2.0 ** np.arange(THRESHOLD.instant_doublings)
             there = max(
                 (_move_instant(best, k, s * r) for r in reach for s in (-1, 1)),
-                key=_replace_nan_likelihood,
+                key=rank_by_likelihood,
             )
             if not there.value > best.value + OTHER_NOISE_GAIN:
                 break
@@ -133,7 +134,3 @@ def _move_instant(fit: Fit, k: int, samples: float) -> Fit:
     theta[k] = np.clip(theta[k] + samples * problem.plant.loop.dt, problem.lower[k],
                        problem.upper[k])  # fmt: skip
     return evaluate_likelihood(problem, theta, fit.noise, fit.trajectories)
-
-
-def _replace_nan_likelihood(fit: Fit) -> float:
-    return fit.value if np.isfinite(fit.value) else -np.inf

@@ -10,11 +10,15 @@ import numpy as np
 
 from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from ..data.record import Record
-from ..estimation.likelihood.likelihood import Fit, evaluate_likelihood, make_problem
+from ..estimation.likelihood.likelihood import (
+    evaluate_likelihood,
+    make_problem,
+    rank_by_likelihood,
+)
 from ..estimation.likelihood.maximization import begin_fit, maximize
 from ..loop.loop import Loop
 from ..loop.period_map import comes_to_rest
-from ..validation.record_simulation import long_stretches, prepare_stretch
+from ..validation.record_simulation import find_long_stretches, prepare_stretch
 from .candidates import Trial
 from .fitted_model import Model, can_simulate, carry_over_fit
 from .gap import draw_noise, make_simulator
@@ -59,15 +63,11 @@ def make_replica(model: Model, seed: int = 0) -> Model | None:
         along = evaluate_likelihood(problem, fit.theta, fit.noise, fit.trajectories)
         starts = along, begin_fit(problem, fit.theta, fit.noise)
         again = maximize(
-            max(starts, key=_replace_nan_likelihood), rounds=THRESHOLD.replica_rounds, exact=False
+            max(starts, key=rank_by_likelihood), rounds=THRESHOLD.replica_rounds, exact=False
         )
     except (ModelCannotRun, EffectDoesNotApply):
         return None
     return Model(loop, again) if math.isfinite(again.value) else None
-
-
-def _replace_nan_likelihood(fit: Fit) -> float:
-    return fit.value if math.isfinite(fit.value) else -math.inf
 
 
 def _simulate_record(
@@ -79,7 +79,7 @@ def _simulate_record(
         raise ModelCannotRun("the record cannot be followed")
     simulator = make_simulator(loop)
     y, u = np.array(record.y), np.array(record.u)
-    for part in long_stretches(record, THRESHOLD.shortest_segment):
+    for part in find_long_stretches(record, THRESHOLD.shortest_segment):
         stretch = prepare_stretch(simulator, record, part, start_time=first, follow=follows)
         noise = draw_noise(model.fit, sensor, len(stretch.d), seed + part.start)
         y[part], u[part] = stretch.run(simulator, noise)

@@ -193,5 +193,6 @@ def scan_candidate(model: Model, effect: AbstractEffect) -> Trial:
             tried = (screen_starts(model, group, penalty) for group in scan.starts)
             best = max(tried, key=lambda t: t.score)
         return replace(best, others=scan.others)
-    except (ModelCannotRun, EffectDoesNotApply) as reason:  # a place that the effect cannot have
+    # An effect may be impossible at a place, as at a frequency outside its bounds.
+    except (ModelCannotRun, EffectDoesNotApply) as reason:
         return Trial(effect, "", model, -math.inf, out=Objection.of(reason))

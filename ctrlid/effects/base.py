@@ -48,7 +48,8 @@ class AbstractEffect:
     )
     # True says that a plant may have several effects of this class at once.
     repeatable: ClassVar[bool] = False
-    doubt_of_several: ClassVar[str | None] = None  # why several of it at once prove little
+    # This says why several effects of this class at once prove little.
+    doubt_of_several: ClassVar[str | None] = None
 
     def __post_init__(self) -> None:
         kind = type(self).__name__

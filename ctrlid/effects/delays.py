@@ -10,7 +10,7 @@ from .._base.errors import EffectDoesNotApply
 from ..physics.equations import Backlash, Equations
 from ..physics.linearization import OperatingPoint
 from .context import Moment
-from .kinds import InputEffect, first_width
+from .kinds import InputEffect, choose_first_width
 from .parameters import parameter
 from .symbolic import to_expression
 
@@ -143,7 +143,7 @@ class InputBacklash(InputEffect):
     @classmethod
     def candidates(cls, loop: Any, record: Any = None) -> tuple[Self, ...]:
         """Return a gap of a tenth of the range of the recorded input."""
-        return cls._applicable(loop, cls(width=first_width(loop, record)))
+        return cls._applicable(loop, cls(width=choose_first_width(loop, record)))
 
     def build(self, e: Equations, m: Moment) -> Equations:
         """Return the equations with the backlash ahead of them."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from .._base.errors import EffectDoesNotApply
 from .context import Moment
-from .kinds import InputEffect, first_width
+from .kinds import InputEffect, choose_first_width
 from .parameters import parameter
 from .scanning import CUT_OFF, Scan, Sight
 
@@ -132,7 +132,7 @@ class InputDeadZone(InputEffect):
     @classmethod
     def candidates(cls, loop: Any, record: Any = None) -> tuple[Self, ...]:
         """Return a zone of a tenth of the range of the recorded input."""
-        return cls._applicable(loop, cls(width=first_width(loop, record)))
+        return cls._applicable(loop, cls(width=choose_first_width(loop, record)))
 
     def input(self, m: Moment) -> Any:
         """Return the input without what the zone swallows."""

@@ -78,7 +78,7 @@ class InputEffect(AbstractEffect):
         return substitute_symbol(e, e.u, to_expression(trace_hook(self.input)(m)))
 
 
-def first_width(loop: Any, record: Any) -> float:
+def choose_first_width(loop: Any, record: Any) -> float:
     """Return the width of a gap or a zone to start from: a tenth of the recorded input's range."""
     if record is None:
         return 0.1 * max(abs(float(loop.point.input)), 1.0)

@@ -18,6 +18,7 @@ TOLERANCE = 1e-9
 # A local error above this share, which could not be refined further, causes a warning.
 COARSE = 1e-5
 # A period has at most so many integration steps, which bounds the time of a simulation.
+# A period has at most so many integration steps, which bounds the time of a simulation.
 MOST_SUBSTEPS = 128
 # So many samples run at once, so that one compiled function serves records of any length.
 CHUNK = 2048
@@ -254,7 +255,7 @@ class Simulator:
                 substeps *= 2
             if stop is not None:
                 inside = bool(np.isfinite(states[:, stop]).all())
-                growth, until = _known_growth(loop), slice(stop + 1)
+                growth, until = _compute_known_growth(loop), slice(stop + 1)
                 stopped = SimulationStopped(
                     _explain_stop(loop, growth, first + stop, inside, ys[:, until], us[:, until], w)
                 )
@@ -292,7 +293,7 @@ def _find_first_bad(
     return int(np.argmax(bad)) if bad.any() else None
 
 
-def _known_growth(loop: Loop) -> float:
+def _compute_known_growth(loop: Loop) -> float:
     """Return how fast small deviations grow [1/s]; NaN where the loop has no derivative."""
     try:
         return compute_growth_rate(loop)

@@ -58,7 +58,8 @@ def to_polynomials(
     m, last = np.zeros((n, n), dtype=object), 1
     for k in range(1, n + 1):
         m = A @ m + last * np.eye(n, dtype=int).astype(object)
-        last = -int(np.trace(A @ m)) // k  # which divides it
+        # The trace of integers is divisible by k in the recursion of Faddeev and LeVerrier.
+        last = -int(np.trace(A @ m)) // k
         den.append(Fraction(last, p**k))
         for num, v, gain in zip(numerators, direct, (C @ m @ B).ravel(), strict=True):
             num.append(Fraction(int(gain), p ** (k - 1) * q * r) + v * den[-1])

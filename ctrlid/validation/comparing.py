@@ -14,7 +14,7 @@ from .._base.errors import CtrlidError, CtrlidWarning, EffectDoesNotApply, Model
 from .._base.text import write_number
 from ..data.record import Record
 from ..data.several_records import order_model_and_data
-from ..data.validity import whole_past
+from ..data.validity import find_whole_past
 from ..estimation.identified_model import IdentifiedModel, read_delay
 from ..estimation.likelihood.filter_data import FEWEST
 from ..estimation.likelihood.prediction import Prediction, predict, predict_ahead, predict_spread
@@ -26,7 +26,7 @@ from ..physics.conversions import to_polynomials, to_state_matrices
 from ..physics.trace import timebase
 from .comparison import EXACT, Comparison, Curve
 from .noise_model import fit_noise_polynomial, whiten_errors
-from .record_simulation import Stretch, long_stretches, prepare_stretch
+from .record_simulation import Stretch, find_long_stretches, prepare_stretch
 from .reproduction import (
     CLOSED_LOOP,
     ONE_STEP,
@@ -161,7 +161,7 @@ def _simulate(record: Record, loop: Loop, prediction: Prediction) -> Curve:
         )
     y, injected, noisy = np.full(len(record), np.nan), np.zeros(len(record)), np.zeros(len(record))
     simulator = Simulator(loop)
-    for part in long_stretches(record):
+    for part in find_long_stretches(record):
         stretch = prepare_stretch(
             simulator, record, part, guess=prediction.states[part.start], seek_controller=True,
             set_point=True,
@@ -227,7 +227,7 @@ def _compare_model(record: Record, model: Any, horizon: int | None) -> Compariso
     den = den / den[0]
     order = len(den) - 1
     valid = np.asarray(record.valid)
-    usable = whole_past(valid, order)
+    usable = find_whole_past(valid, order)
     if np.count_nonzero(usable) < FEWEST:
         raise ModelCannotRun(
             f"a model of order {order} needs {FEWEST + order} valid samples in "
@@ -304,7 +304,7 @@ def _predict_arx_ahead(
         past = [new, *past][:order]
     ahead = np.full(n, np.nan)
     ahead[steps:] = new[: n - steps]
-    ahead[~whole_past(usable, steps - 1)] = np.nan
+    ahead[~find_whole_past(usable, steps - 1)] = np.nan
     ahead[: steps + order] = np.nan
     return ahead
 

@@ -10,7 +10,7 @@ from .._base.arrays import Array
 from .._base.errors import CtrlidError
 from .._base.text import Printed
 from ..data.record import Record
-from ..data.validity import whole_past
+from ..data.validity import find_whole_past
 from .residual_tests import Correlation, cross_correlation
 
 # This is the probability of calling an open loop closed.
@@ -214,7 +214,7 @@ def _compute_residual(
     weigh more in what it leaves than three times the usual remainder.
     """
     reach = max(last for _, last in past.values())
-    rows = np.flatnonzero(whole_past(valid, reach))[:MOST]
+    rows = np.flatnonzero(find_whole_past(valid, reach))[:MOST]
     mean = {k: float(np.mean(v[rows])) for k, v in signals.items()}
     columns = [np.ones(len(rows))]
     for key, (first, last) in past.items():
@@ -280,7 +280,7 @@ def _decide_without_noise(signals: dict[str, Array], valid: Any, now: int) -> Fe
 
 def _is_unstable(signals: dict[str, Array], valid: Any, order: int, now: int) -> bool:
     """Return whether the exact difference equation has a pole clearly outside the unit circle."""
-    rows = np.flatnonzero(whole_past(valid, order))[:MOST]
+    rows = np.flatnonzero(find_whole_past(valid, order))[:MOST]
     y, u = signals["y"], signals["u"]
     columns = [y[rows - k] - y[rows[0]] for k in range(1, order + 1)]
     columns += [u[rows - k] - u[rows[0]] for k in range(now, order + 1)]

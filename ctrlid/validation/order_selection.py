@@ -14,7 +14,7 @@ from .._base.errors import CtrlidError
 from .._base.statistics import regress
 from .._base.text import Printed
 from ..data.record import Record
-from ..data.validity import whole_past
+from ..data.validity import find_whole_past
 
 # The long regression has at most so many lags.
 LONGEST = 60
@@ -22,6 +22,7 @@ LONGEST = 60
 ROWS = 30_000
 # This share of the record is fitted, and the rest judges.
 SHARE = 2 / 3
+# A weighted fit that needs more iterations does not converge.
 # A weighted fit that needs more iterations does not converge.
 ITERATIONS = 20
 # A one-step error that differs by more than this share says that the choice is wrong.
@@ -208,7 +209,7 @@ def _check_whole_numbers(name: str, values: Any) -> list[int]:
 
 def _find_rows(record: Record, start: int, stop: int, length: int) -> Any:
     """Return the samples whose past counts, not more than are needed."""
-    return start + np.flatnonzero(whole_past(record.valid[start:stop], length))[:ROWS]
+    return start + np.flatnonzero(find_whole_past(record.valid[start:stop], length))[:ROWS]
 
 
 def _make_table(record: Record, rows: Any, length: int) -> tuple[Array, Array]:

@@ -49,7 +49,7 @@ class Stretch:
         return simulator.run(self.initial, self.r, self.d, noise, self.start_time)
 
 
-def long_stretches(record: Record, shortest: int = FEWEST) -> list[slice]:
+def find_long_stretches(record: Record, shortest: int = FEWEST) -> list[slice]:
     """Return the valid stretches of a record that have at least so many samples."""
     return [slice(a, b) for a, b in record.segments() if b - a >= shortest]
 
@@ -75,7 +75,7 @@ def prepare_stretch(
     record : Record
         The data.
     samples : slice
-        One of its `long_stretches`.
+        One of its `find_long_stretches`.
     start_time : float, optional
         Time of the record's first sample since the start of the experiment [s]; by default each
         stretch is an experiment of its own.

@@ -8,8 +8,8 @@ import numpy as np
 from scipy import linalg, signal, stats
 
 from .._base.arrays import Array
-from .._base.statistics import fit_autoregression, lagged_products, portmanteau
-from ..data.validity import whole_past
+from .._base.statistics import compute_lagged_products, fit_autoregression, portmanteau
+from ..data.validity import find_whole_past
 
 # The bands and tests have this probability of covering what chance does.
 LEVEL = 0.99
@@ -86,7 +86,7 @@ def autocorrelation(e: Array, valid: Any, lags: int = 25, fitted: int = 0) -> Co
     Ljung and Box, Biometrika 65 (1978) 297-303.
     """
     e, n = _remove_mean(e, valid)
-    c = lagged_products(e, e, lags)
+    c = compute_lagged_products(e, e, lags)
     rho = c[1:] / c[0] if c[0] > 0 else np.zeros(lags)
     tau = np.arange(1, lags + 1)
     band = float(stats.norm.ppf(0.5 + LEVEL / 2) / np.sqrt(n))
@@ -110,7 +110,7 @@ def _smooth_autocovariance(e: Array, n: int, memory: int) -> Array:
     The order is chosen by the Bayesian information criterion: white residuals stay white.
     """
     order = min(MOST_ORDER, n // 20, memory)
-    r = lagged_products(e, e, order) / len(e)
+    r = compute_lagged_products(e, e, order) / len(e)
     a = fit_autoregression(r, n)
     p = len(a) - 1
     out = np.zeros(memory + 1)
@@ -155,9 +155,12 @@ def cross_correlation(
     e, n = _remove_mean(e, valid)
     s, _ = _remove_mean(s, valid)
     tau = np.arange(first, first + lags)
-    r = lagged_products(e, s, int(tau[-1]))[tau] / len(e)
+    r = compute_lagged_products(e, s, int(tau[-1]))[tau] / len(e)
     memory = min(n // 10, MEMORY)
-    re, rs = _smooth_autocovariance(e, n, memory), lagged_products(s, s, memory + lags) / len(s)
+    re, rs = (
+        _smooth_autocovariance(e, n, memory),
+        compute_lagged_products(s, s, memory + lags) / len(s),
+    )
     scale = np.sqrt(re[0] * rs[0])
     if scale <= 0:
         return Correlation(f"residual with past {name}", tau, np.zeros(lags), np.inf, 1.0)
@@ -169,13 +172,13 @@ def cross_correlation(
     row[0] = max(row[0], 1e-300)
     band = float(stats.norm.ppf(0.5 + LEVEL / 2) * np.sqrt(row[0] / n) / scale)
     # Signals that move slowly make neighbouring lags nearly the same number.
-    z = _whitening(linalg.toeplitz(row), 1e-6).T @ r * np.sqrt(n)
+    z = _compute_whitening(linalg.toeplitz(row), 1e-6).T @ r * np.sqrt(n)
     p = float(stats.chi2.sf(float(z @ z), len(z)))
     share = _compute_share(r, rs[:lags], re[0], linalg.toeplitz(row) / n)
     return Correlation(f"residual with past {name}", tau, r / scale, band, p, share)
 
 
-def _whitening(covariance: Array, smallest: float) -> Array:
+def _compute_whitening(covariance: Array, smallest: float) -> Array:
     """Return directions in which signals of this covariance are independent and of size one.
 
     Directions with a smaller eigenvalue, relative to the largest one, are rounding errors.
@@ -187,7 +190,7 @@ def _whitening(covariance: Array, smallest: float) -> Array:
 
 def _compute_share(r: Array, rs: Array, variance: float, covariance: Array) -> float:
     """Return the share of the variance that a regression on the lagged signal would explain."""
-    basis = _whitening(linalg.toeplitz(rs), 1e-6)
+    basis = _compute_whitening(linalg.toeplitz(rs), 1e-6)
     raw = float(np.sum((basis.T @ r) ** 2)) / variance
     chance = float(np.trace(basis.T @ covariance @ basis)) / variance
     return _subtract_chance(raw, chance)
@@ -235,7 +238,7 @@ def compute_explained_share(
     lags = max(1, min(lags, len(e) // (10 * max(len(signals), 1))))
     first = max((delay for _, delay in signals), default=0) + lags - 1
     rows = np.arange(first, len(e), max(1, -(-len(e) // ROWS)))
-    rows = rows[whole_past(valid, first)[rows]]
+    rows = rows[find_whole_past(valid, first)[rows]]
     if not signals or len(rows) < 3 * lags * len(signals):
         return 0.0
     target = e[rows] - np.mean(e[rows])
@@ -249,7 +252,7 @@ def compute_explained_share(
     scale = np.linalg.norm(past, axis=0)
     past /= np.where(scale > 0, scale, 1.0)
     # The share needs few digits, so that the small normal matrix is accurate enough.
-    basis = past @ _whitening(past.T @ past, 1e-9)
+    basis = past @ _compute_whitening(past.T @ past, 1e-9)
     along = basis.T @ target
     left = target - basis @ along
     n = len(rows)

@@ -11,8 +11,8 @@ import numpy as np
 from scipy import ndimage, stats
 
 from .._base.arrays import Array
-from .._base.statistics import lagged_products, regress
-from ..data.validity import find_runs, whole_past
+from .._base.statistics import compute_lagged_products, regress
+from ..data.validity import find_runs, find_whole_past
 
 # So many samples are enough to find the grid of a quantized signal.
 ENOUGH = 20_000
@@ -353,7 +353,7 @@ def find_share_beyond_controller(u: Array, y: Array, valid: Any) -> float:
         0 where a linear controller of a constant reference computes u; 1 with too few samples.
     """
     order = 10
-    rows = np.flatnonzero(whole_past(valid, order))[:ENOUGH]
+    rows = np.flatnonzero(find_whole_past(valid, order))[:ENOUGH]
     if len(rows) < 4 * order:
         return 1.0
     law = np.column_stack([
@@ -388,7 +388,7 @@ def find_period(r: Array) -> int:
     if n < 8 or variance <= estimate_rounding(r) ** 2:
         return 0
     lags = np.arange(n // 2 + 1)
-    products = lagged_products(v, v, n // 2)
+    products = compute_lagged_products(v, v, n // 2)
     power = np.concatenate([[0.0], np.cumsum(v**2)])
     D = (power[n - lags] + power[n] - power[lags] - 2 * products) / (n - lags)
     near = min(4e-4 * variance, 0.25 * float(D[1])) > D

@@ -86,7 +86,8 @@ class Branch:
 class AbstractConstraint(ABC):
     """Something known about the coefficients; a subclass says which rows that gives."""
 
-    unstable: ClassVar[bool] = False  # True: it says that the plant has a pole that is unstable
+    # True says that the constraint states an unstable pole of the plant.
+    unstable: ClassVar[bool] = False
 
     @abstractmethod
     def branches(self, structure: Structure) -> Sequence[Branch]:

@@ -87,7 +87,7 @@ def run_filter(
                     disturbance)  # fmt: skip
 
 
-def settled_samples(data: FilterData, out: Filtered) -> Any:
+def choose_settled_samples(data: FilterData, out: Filtered) -> Any:
     """Return the usable samples whose prediction does not depend on the start."""
     known = data.valid & np.isfinite(out.variance)
     return (
@@ -137,7 +137,7 @@ def _invert_sensor(plant: SampledPlant, seen: Any, x: Any, at: float, values: Ar
     return np.where(left <= first, found, at)
 
 
-def settle_trajectory(
+def converge_trajectory(
     plant: SampledPlant,
     data: FilterData,
     theta: Array,

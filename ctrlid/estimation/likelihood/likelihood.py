@@ -193,6 +193,11 @@ def evaluate_likelihood(
     return evaluate_linearized(problem, theta, noise, lins)
 
 
+def rank_by_likelihood(fit: Fit) -> float:
+    """Return the log-likelihood to rank a fit by: one that is not finite comes last."""
+    return fit.value if math.isfinite(fit.value) else -math.inf
+
+
 def relinearize_fit(fit: Fit) -> Fit:
     """Return the likelihood of the same values, the plant linearized along its last trajectory."""
     return evaluate_likelihood(fit.problem, fit.theta, fit.noise, fit.trajectories)

@@ -10,7 +10,7 @@ from ..._base.arrays import Array
 from ..._base.criterion import bayesian_penalty
 from ..._base.errors import EffectDoesNotApply, ModelCannotRun
 from ..._base.statistics import pseudo_inverse
-from .kalman_filter import Noise, guess_trajectory, settle_trajectory, settled_samples
+from .kalman_filter import Noise, choose_settled_samples, converge_trajectory, guess_trajectory
 from .likelihood import Fit, Problem, evaluate_likelihood, list_start_values, relinearize_fit
 from .noise_fit import (
     LOG_STEP,
@@ -65,17 +65,17 @@ def begin_fit(problem: Problem, theta: Array | None = None, noise: Noise | None 
     for data in problem.data:
         at = guess_trajectory(plant, data)
         if noise is None:
-            at = settle_trajectory(plant, data, theta, first, at, passes=2)[1].trajectory
+            at = converge_trajectory(plant, data, theta, first, at, passes=2)[1].trajectory
         guessed.append((data, at))
     if noise is None:
         lins = tuple(plant.linearize(data, theta, at) for data, at in guessed)
         counts = tuple(data.usable for data in problem.data)
         first = fit_noise(replace(problem, counts=counts), theta, lins, first, wide=True).noise
-    results = [settle_trajectory(plant, data, theta, first, at) for data, at in guessed]
+    results = [converge_trajectory(plant, data, theta, first, at) for data, at in guessed]
     if not problem.counts:
-        problem = replace(problem, counts=tuple(
-            settled_samples(data, out) for data, (_, out) in zip(problem.data, results, strict=True)
-        ))  # fmt: skip
+        pairs = zip(problem.data, results, strict=True)
+        counts = tuple(choose_settled_samples(data, out) for data, (_, out) in pairs)
+        problem = replace(problem, counts=counts)
     return evaluate_likelihood(problem, theta, first, [out.trajectory for _, out in results])
 
 

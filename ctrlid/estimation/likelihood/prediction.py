@@ -14,7 +14,7 @@ from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
 from ...data.record import Record
 from ...data.several_records import order_model_and_data
-from ...data.validity import whole_past
+from ...data.validity import find_whole_past
 from ...loop.loop import Loop
 from .kalman_filter import Noise
 from .likelihood import make_problem
@@ -151,7 +151,7 @@ def predict_ahead(
     """
     every = max(1, horizon // 4)
     starts = np.arange(0, len(record) - horizon, every)
-    known = whole_past(record.valid, horizon)[starts + horizon]
+    known = find_whole_past(record.valid, horizon)[starts + horizon]
     starts = starts[known & prediction.settled[starts]]
     if not len(starts):
         return starts, np.empty(0)
@@ -201,7 +201,7 @@ def predict_spread(
     lin = begin_fit(problem, noise=noise).linearized[0]
     lead = int(np.clip(LEAD * horizon, 50, 500))
     starts = np.arange(0, len(record) - lead - horizon, max(1, len(record) // STARTS))
-    starts = starts[whole_past(record.valid, lead + horizon)[starts + lead + horizon]]
+    starts = starts[find_whole_past(record.valid, lead + horizon)[starts + lead + horizon]]
     if not len(starts):
         return math.nan, math.nan
     found = []

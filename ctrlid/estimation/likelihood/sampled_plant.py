@@ -22,7 +22,7 @@ from .transition_maps import (
     build_backlash,
     build_maps,
     choose_scheme,
-    scheme_suits,
+    is_scheme_suitable,
 )
 
 # After each so many samples it is checked whether the backlash has forgotten where it began.
@@ -134,13 +134,13 @@ class SampledPlant:
             late = evaluate_delay(e, p) / dt + 1e-9
             if not self.delay_samples <= late <= self.delay_samples + 1 + 1e-6:
                 return False
-        return scheme_suits(self.scheme, e, p, dt)
+        return is_scheme_suitable(self.scheme, e, p, dt)
 
     def linearize(self, data: FilterData, theta: Array, at: Trajectory) -> Linearized:
         """Return the plant along a trajectory, for parameter values `theta`."""
         p = self.insert_free_values(theta)
         u = data.u
-        applied, slopes = self._through_backlash(u, p)
+        applied, slopes = self._find_applied_input(u, p)
         input_variance = (
             data.input_variance + self.initial_conditions.find_input_variance(u, p) / data.scale**2
         )
@@ -193,7 +193,7 @@ class SampledPlant:
         slope: Array = (above - below)[:, :, 0] / (2 * h)
         return slope
 
-    def _through_backlash(self, u: Array, p: Array) -> tuple[Array, Array | None]:
+    def _find_applied_input(self, u: Array, p: Array) -> tuple[Array, Array | None]:
         """Return the input behind the backlash, and how it depends on the free parameters."""
         if self.e.play is None:
             return u, None
@@ -228,13 +228,13 @@ class SampledPlant:
     def stack_inputs(self, data: FilterData, theta: Array) -> Array:
         """Return the rows over which the map is evaluated, shape (6, n), behind any backlash."""
         return self._stack_applied_inputs(
-            data, self._through_backlash(data.u, self.insert_free_values(theta))[0]
+            data, self._find_applied_input(data.u, self.insert_free_values(theta))[0]
         )
 
     def advance(self, data: FilterData, x: Array, rows: Any, known: bool = True) -> Array:
         """Return states (k, n) one period after the samples `rows`, with the loop's parameters."""
         p = self.e.values
-        w = self._stack_applied_inputs(data, self._through_backlash(data.u, p)[0])[:, rows]
+        w = self._stack_applied_inputs(data, self._find_applied_input(data.u, p)[0])[:, rows]
         if not known:
             w[5] = self.evaluate_output(data, x, rows)
         quiet = np.zeros((self.n, 1))
@@ -245,7 +245,7 @@ class SampledPlant:
     def evaluate_output(self, data: FilterData, x: Array, rows: Any) -> Array:
         """Return the outputs at states (k, n) and the samples `rows`."""
         p = self.e.values
-        w = self._stack_applied_inputs(data, self._through_backlash(data.u, p)[0])[:, rows]
+        w = self._stack_applied_inputs(data, self._find_applied_input(data.u, p)[0])[:, rows]
         return self.maps.sensor(x.T, w, p, np.zeros((self.n, 1)))[0][:, 0, 0]
 
     def _stack_applied_inputs(self, data: FilterData, applied: Array) -> Array:

@@ -149,7 +149,7 @@ def _choose_lag_step(e: Equations) -> float:
     return LAG_STEP_AT_KINK if e.kinked else LAG_STEP
 
 
-def scheme_suits(scheme: Scheme, e: Equations, p: Array, dt: float) -> bool:
+def is_scheme_suitable(scheme: Scheme, e: Equations, p: Array, dt: float) -> bool:
     """Whether a period is integrated well enough for the lag that parameter values `p` have."""
     time = _find_input_lag_time(e, p)
     if scheme.sharp:

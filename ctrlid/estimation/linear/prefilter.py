@@ -9,7 +9,7 @@ import numpy as np
 from scipy import signal
 
 from ..._base.arrays import Array
-from ..._base.statistics import fit_autoregression, lagged_products, reflect_into_circle
+from ..._base.statistics import compute_lagged_products, fit_autoregression, reflect_into_circle
 from ..identified_model import Structure
 from .regression import to_differences
 
@@ -117,5 +117,5 @@ def autoregression(residuals: Sequence[Array], highest: int = MOST_COLOURED) -> 
     >>> autoregression([lfilter([1.0], [1.0, -0.8], white)]).round(1)
     array([ 1. , -0.8])
     """
-    products = np.sum([lagged_products(e, e, highest) for e in residuals], axis=0)
+    products = np.sum([compute_lagged_products(e, e, highest) for e in residuals], axis=0)
     return fit_autoregression(products, sum(len(e) for e in residuals))
