@@ -29,7 +29,7 @@ def hill(monkeypatch):
 
         problem = SimpleNamespace(
             lower=np.full(len(theta), lower), upper=np.full(len(theta), upper),
-            plant=SimpleNamespace(fits=lambda theta: True),
+            plant=SimpleNamespace(is_built_for=lambda theta: True),
         )  # fmt: skip
         monkeypatch.setattr(maximum, "evaluate_likelihood", evaluate)
         monkeypatch.setattr(maximum, "relinearize_fit", lambda fit: fit)

@@ -17,7 +17,7 @@ LAYOUT = {"wording", "report_text", "saving", "several_records"}  # columns and 
 PLAIN = {0, 1, 2, 0.5}
 # Coefficients of published formulas, and numbers that belong to nobody's judgement.
 FORMULAS = {
-    ("noise_tests", "_deviates_of_force"),  # D'Agostino; Anscombe and Glynn
+    ("noise_tests", "_compute_force_deviates"),  # D'Agostino; Anscombe and Glynn
     ("noise_tests", "_test_tails"),  # kurtosis of a Gaussian, and its variance 24 / n
     ("gap", "draw_noise"),  # three streams of random numbers
     ("verdict", "write_conclusion"),  # per cent
@@ -146,7 +146,7 @@ STATEMENTS = {
     "more than N of the floor's variance": lambda t: t.large_disturbance,
     "within N units of log-likelihood": lambda t: t.close,
     "Vuong's test at z = N": lambda t: t.vuong_z,
-    "[Bb]eyond N samples even stretches": lambda t: t.fitted_samples,
+    "more than N samples is fitted on evenly": lambda t: t.fitted_samples,
 }
 
 
