@@ -80,7 +80,7 @@ def test_floors_are_few_and_complete():
     floors = LAYERS["ctrlid"]
     assert floors["name"] == "floors"
     assert floors["exhaustive"]
-    assert len(floors["layers"]) <= 9
+    assert len(floors["layers"]) <= 8
     assert floors["layers"][-1] == "_base"
     assert set().union(*map(names_in, floors["layers"])) == ROOMS | {"__main__"}
 
