@@ -308,7 +308,7 @@ def test_many_effects_at_once_are_no_explanation():
     loose = find_doubt(kinds, [50.0] * 4, 200.0)
     text = write_conclusion("partly explained", findings, gap, quiet, tests, (), loose)
     assert text.startswith("With CoulombFriction and LinearStiffness and")
-    assert "so many effects at once describe almost any error" in text
+    assert "so many effects together can describe almost any error" in text
 
 
 def test_a_pair_is_not_taken_for_the_mixture_that_alone_gains_most():
@@ -354,7 +354,7 @@ def test_units_of_the_record_that_are_not_those_of_the_plant_are_told():
     found = cid.diagnose(loop, volts, progress=False, catalogue=[E.CoulombFriction])
     told = [text for text in found.audit if text.startswith("units: ")]
     assert len(told) == 2
-    assert "u is recorded in plain numbers" in told[0]
+    assert "u is recorded without a unit, but the plant has it in" in told[0]
     assert "y is recorded in V, and the plant counts it in m" in told[1]
     again = cid.diagnose(loop, record, progress=False, catalogue=[E.CoulombFriction])
     assert not [text for text in again.audit if text.startswith("units: ")]
@@ -445,7 +445,7 @@ def test_two_look_alikes_of_which_either_would_do_are_one_thing():
     """A limited rate is nearly a delay and nearly a lag; the rest is filled with the other."""
     both = [E.InputDelay(1e-3), E.ActuatorLag(1e-3)]
     text = find_doubt(both, [80.0, 57.0], 2050.0)
-    assert "InputDelay and ActuatorLag resemble each other" in text
+    assert "InputDelay and ActuatorLag are look-alikes" in text
     assert not find_doubt(both, [1240.0, 240.0], 4200.0)
     assert not find_doubt([both[0], E.LinearStiffness(1.0)], [80.0, 57.0], 4100.0)
 
