@@ -369,7 +369,7 @@ def test_picture_of_an_explanation(found):
     assert set(legend(first)) == {"before", "after", "noise"}
     assert len(first.patches) == 16
     assert set(legend(ranking)) == {
-        "gate (net gain 5)",
+        "required net gain, 5",
         "found",
         "not told apart",
         "refitted",

@@ -166,7 +166,7 @@ class AsymmetricCoulombFriction(ForceEffect):
     def doubt(self) -> str | None:
         """Say so where it would push: friction is against the motion in both directions."""
         if abs(self.difference) > LARGEST_ASYMMETRY * self.fc:
-            return "in one direction it would drive the motion, which no friction does"
+            return "in one direction it would push along the motion, which no friction does"
         return None
 
     def force(self, m: Moment) -> Any:

@@ -163,7 +163,7 @@ def _draw_ranking(ax: Any, rounds: Mapping[int, Sequence[_pictures.Bar]]) -> Non
     if not rounds:
         ax.text(0.5, 0.5, "no candidate was tried", ha="center", transform=ax.transAxes)
     gate = THRESHOLD.gate
-    ax.axvline(gate, color="k", linewidth=1, linestyle="--", label=f"gate (net gain {gate:g})")
+    ax.axvline(gate, color="k", linewidth=1, linestyle="--", label=f"required net gain, {gate:g}")
     ax.axvline(0, color="0.3", linewidth=0.8)
     ax.set_xscale("symlog", linthresh=2 * gate)
     ax.xaxis.set_major_formatter("{x:g}")
