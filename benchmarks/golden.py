@@ -275,7 +275,7 @@ def without_times(text: str) -> str:
 
     def is_time(line: str) -> bool:
         words = line.split()
-        return len(words) == 2 and words[1] == "s" and words[0].replace(".", "").isdigit()
+        return words[:2] == ["computed", "in"] and words[3:] == ["s"]
 
     return "\n".join(line for line in text.splitlines() if not is_time(line)) + "\n"
 

@@ -62,8 +62,8 @@ record = cid.simulate(rig, r, sensor_noise=5e-6, seed=2)
 # ---------------------------
 # The search finds the most similar effect, or a large random force. The report does not present
 # them as the answer: it says that something is still missing, and that an effect which is named
-# "may stand in for what is still missing". In the upper part of the figure, the simulations before
-# and after hardly differ.
+# "may stand in for an effect that is not in the catalogue". In the upper part of the figure, the
+# simulations before and after hardly differ.
 
 first = cid.diagnose(model, record, progress=False)
 print(first)

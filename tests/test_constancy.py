@@ -66,7 +66,7 @@ def test_a_diagnosis_is_not_clean_where_a_gain_breathes():
     found = cid.diagnose(breathing(), record_of(breathing(rhythm=0.03), 9740), progress=False,
                          catalogue=[E.CoulombFriction, E.ActuatorLag])  # fmt: skip
     assert found.verdict == "unknown"
-    assert "rhythm of k" in str(found)
+    assert "a periodic change of k" in str(found)
 
 
 def test_edges_of_bins_have_no_rounding_errors_in_place_of_zero():

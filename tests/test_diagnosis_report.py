@@ -118,7 +118,7 @@ def test_report_is_read_in_a_minute(found, verdict):
     assert max(map(len, lines)) <= 100
     assert SENTENCES[verdict] in text(found[verdict])
     for part in ("maglev, 3000 samples", "closed-loop simulation of 1000 samples kept back",
-                 "the model as given", "noise floor", "random force", "8.4 s",
+                 "the model as given", "noise floor", "random force", "computed in 8.4 s",
                  "about the record: u moves in steps", "note: two samples were left out",
                  "0.0213 (not in the data)"):  # fmt: skip
         assert part in text(found[verdict])
@@ -131,17 +131,17 @@ def test_report_of_an_explanation(found):
         "Explained. CoulombFriction explains",
         "CoulombFriction: a force of constant size against the motion, as of dry surfaces",
         "fc = 0.3987 ± 0.0061 m/s^2 (8.49 mN at m = 0.0213 kg)",
-        "evidence 812, beyond doubt; ONE OF 2 that explain the record",
-        "this record does not tell it from StribeckFriction (fs = 0.41 m/s^2, vs = 0.3 m/s)",
-        "what would tell: slow motion with reversals",
-        "a reference for it is ready: .reference, 200 samples",
+        "evidence 812 (very strong); ONE OF 2 EFFECTS that explain the record",
+        "this record cannot distinguish it from StribeckFriction (fs = 0.41 m/s^2, vs = 0.3 m/s)",
+        "to decide, use slow motion with reversals",
+        "the reference signal for it is in .reference of this finding (200 samples)",
         "velocity where the motion turns 1.74 1.02",
         "position between 0.0118 and 0.012 m 1.74 1.02",
         "K 3.1e-06 3.31e-06 (3.3391 ± 0.0021)e-06",
-        "On samples kept back the effects close",
-        "random force: white 30 mm/s^2, 12 % of the noise floor's variance",
-        "what remains: noise, by 2 tests, the most doubtful of which is heavy tails, p = 0.22",
-        "chance reaches 2 or 3, 10 is strong",
+        "On these samples the effects remove",
+        "random force: white (30 mm/s^2 RMS); it causes 12 % of the variance of the noise floor",
+        "residuals: noise, by 2 tests. The smallest p-value is that of heavy tails, p = 0.22",
+        "Chance reaches 2 or 3; from 10 on evidence is strong, from 30 on very strong.",
     ):
         assert part in words
     assert "time all the time alike" not in words
@@ -150,30 +150,30 @@ def test_report_of_an_explanation(found):
 def test_report_of_a_clean_bill(found):
     words = text(found["nothing missing"])
     assert "Nothing missing. Noise" in words
-    assert (
-        "where it sits: nowhere; noise looks like this along velocity, position and time" in words
-    )
-    assert "the smallest effects that this record would have shown" in words
+    assert "where the error is: nowhere. In bins of velocity, position and time, the one" in words
+    assert "smallest size of each effect that this record would have shown" in words
     assert "CoulombFriction.fc 21 mm/s^2" in words
     assert "ActuatorLag.tau 0.11 ms" in words
     assert "Homemade.size 3" in words
     assert "StribeckFriction.vs not visible" in words
-    assert "A LARGE RANDOM FORCE: white 30 mm/s^2 and coloured 0.4 m/s^2 with a time " in words
-    assert "81 % of the noise floor's variance" in words
+    assert "A LARGE RANDOM FORCE: white (30 mm/s^2 RMS) and coloured (0.4 m/s^2 RMS, time " in words
+    assert "it causes 81 % of the variance of the noise floor" in words
     assert "what is missing" not in words
 
 
 def test_a_parameter_at_its_limit_is_said_to_be(found):
     stuck = replace(found["explained"].calibrated[0], after=3.1e-5, standard_error=0.0)
-    assert "3.1e-05 (AT ITS LIMIT)" in text(replace(found["explained"], calibrated=(stuck,)))
+    assert "3.1e-05 (ON ITS BOUND)" in text(replace(found["explained"], calibrated=(stuck,)))
 
 
 def test_one_of_many_tests_may_look_bad(found):
     """The verdict counts how many tests there are; the line on what remains does not deny it."""
     tests = {**{f"test {k}": 0.5 for k in range(30)}, "rhythm of K": 4e-4}
     words = text(replace(found["explained"], tests=tests))
-    assert "noise, by 31 tests, the most doubtful of which is rhythm of K, p = 0.0004" in words
-    assert "among so many p = 0.012" in words
+    assert (
+        "noise, by 31 tests. The smallest p-value is that of a periodic change of K, p = 0" in words
+    )
+    assert "p = 0.0004 (p = 0.012 when corrected for the number of tests)" in words
     assert "NOT NOISE ALONE" not in words
     assert "NOT NOISE ALONE" in text(replace(found["unknown"], tests={**tests, "whiteness": 1e-6}))
 
@@ -181,7 +181,7 @@ def test_one_of_many_tests_may_look_bad(found):
 def test_an_alarm_of_many_effects_is_told(found):
     partly = found["partly explained"]
     many = replace(partly, findings=partly.findings * 4, tests={"whiteness": 1.5e-3, "size": 0.5})
-    assert "NOT NOISE ALONE, by 1 of 2 tests: whiteness (p = 0.0015)" in text(many)
+    assert "residuals: NOT NOISE ALONE. 1 of 2 tests fails: whiteness (p = 0.0015)" in text(many)
 
 
 def test_the_more_effects_the_sooner_an_alarm():
@@ -191,23 +191,27 @@ def test_the_more_effects_the_sooner_an_alarm():
 
 def test_bad_news_is_in_capitals(found):
     assert "PARTLY EXPLAINED: SOMETHING IS STILL MISSING. " in text(found["partly explained"])
-    assert "NOT NOISE ALONE, by 1 of 2 tests: whiteness (p < 0.0001)" in text(found["unknown"])
-    assert "UNKNOWN: SOMETHING IS MISSING that no candidate explains. " in text(found["unknown"])
+    assert "residuals: NOT NOISE ALONE. 1 of 2 tests fails: whiteness (p < 0.0001)" in text(
+        found["unknown"]
+    )
+    assert "UNKNOWN: SOMETHING IS MISSING. The model disagrees" in text(found["unknown"])
     assert "with the effects" not in text(found["unknown"])
-    assert "It may stand in for what is still missing" in text(found["partly explained"])
+    assert "It may stand in for an effect that is not in the catalogue" in text(
+        found["partly explained"]
+    )
     many = dict.fromkeys(("a", "b", "c", "d", "e", "f"), 1e-5)
     words = text(replace(found["unknown"], tests={**many, "g": 0.5}))
-    assert "by 6 of 7 tests: a, b, c and 3 others (p < 0.0001)" in words
+    assert "6 of 7 tests fail: a, b, c and 3 others (smallest p < 0.0001)" in words
     assert "velocity where the motion turns 1.74" in text(found["unknown"])
     base = found["explained"]
     worse = replace(base, gap=replace(base.gap, after=2 * base.gap.before))
-    assert "the effects do NOT MAKE THE GAP SMALLER" in text(worse)
+    assert "the effects do NOT REDUCE THE GAP" in text(worse)
     for given, widened in ((0.5 * base.gap.before, True), (base.gap.before, False)):
         other = replace(base, gap=replace(base.gap, given=given))
-        assert ("Recalibrating alone makes" in text(other)) == widened
+        assert ("Recalibration alone decreases" in text(other)) == widened
     lost = replace(base, gap=replace(base.gap, given=math.inf, before=math.inf))
-    assert "RUNS AWAY" in text(lost)
-    assert "of the squared gap" not in text(lost)
+    assert "DIVERGES" in text(lost)
+    assert "of the mean square error" not in text(lost)
 
 
 def test_report_of_rare_cases(found):
@@ -218,19 +222,17 @@ def test_report_of_rare_cases(found):
     words = text(replace(base, findings=(weak, replace(weak, evidence=20.0)), where=()))
     assert "1. CoulombFriction" in words
     assert "2. CoulombFriction" in words
-    assert "evidence 8.0, WEAK; closes 99.5 % of the squared gap above the floor" in words
-    assert "evidence 20, strong" in words
-    assert (
-        "no record of u and y tells it from InputOffset: on this plant they are the same" in words
-    )
+    assert "evidence 8.0 (WEAK); without it, 99.5 % of the mean square error above the" in words
+    assert "evidence 20 (strong)" in words
+    assert "no record of u and y can distinguish it from InputOffset, because on this" in words
     assert "in 2 of 3 records" in words
-    assert "where it sits: not known" in words
+    assert "where the error is: not known" in words
     bare = replace(base, calibrated=(), tests={}, disturbance=Disturbance(0.0, 0.0, math.nan, 0.0),
                    gap=replace(base.gap, unit="", floor=0.0))  # fmt: skip
     words = text(bare)
     assert "the model has no free parameters" in words
-    assert "what remains: not tested" in words
-    assert "random force: none; the noise floor is sensor noise" in words
+    assert "residuals: not tested" in words
+    assert "random force: none was found; the noise floor is due to sensor noise alone" in words
 
 
 def test_repr_and_notebook(found):
@@ -367,7 +369,7 @@ def test_picture_of_an_explanation(found):
     assert set(legend(first)) == {"before", "after", "noise"}
     assert len(first.patches) == 16
     assert set(legend(ranking)) == {
-        "earns a place",
+        "required net gain, 5",
         "found",
         "not told apart",
         "refitted",
@@ -411,7 +413,7 @@ def test_picture_of_rare_cases(found):
     assert output.get_ylabel() == "output [unit not given]"
     assert legend(error)[0] == "before: none"
     assert first.get_yscale() == "log"
-    assert [entry.get_text() for entry in second.texts] == ["no place is known"]
+    assert [entry.get_text() for entry in second.texts] == ["no bins to show"]
     assert [entry.get_text() for entry in ranking.texts] == ["no candidate was tried"]
     plot.png(output)
 
@@ -462,16 +464,18 @@ def test_page(found, verdict, tmp_path):
     assert "<h1>Diagnosis of maglev, 3000 samples at 0.002 s</h1>" in page
     assert page.count('src="data:image/png;base64,') == 1
     assert ("<h3>What is missing</h3>" in page) == ("explained" in verdict)
-    assert "<h3>Where it sits</h3>" in page
+    assert "<h3>Where the error is</h3>" in page
     assert SENTENCES[verdict] in page
     bad = verdict in ("unknown", "partly explained")
     assert ('<p class="bad">' in page) == (bad or verdict == "nothing missing")
     assert ("SOMETHING IS" in page) == bad
     assert ("1. CoulombFriction: a force of constant size" in page) == ("explained" in verdict)
-    assert ("smallest size that would have been seen" in page) == (verdict == "nothing missing")
+    assert ("smallest size that this record would have shown" in page) == (
+        verdict == "nothing missing"
+    )
     assert ("LARGE RANDOM FORCE" in page) == (verdict == "nothing missing")
     assert "StribeckFriction" in page
-    assert "About the record: u moves in steps of 0.00122 V." in page
+    assert "<h3>About the record</h3>\n<p>u moves in steps of 0.00122 V.</p>" in page
 
 
 def test_a_gap_where_only_the_given_model_can_be_simulated():
@@ -479,7 +483,7 @@ def test_a_gap_where_only_the_given_model_can_be_simulated():
     gap = Gap("closed-loop simulation", 2.7e-3, math.inf, math.inf, math.nan, "m", *[nothing] * 4)
     rows = {label: size for label, size, _ in wording.list_gap_rows(gap)}
     assert rows["the model as given"] == "2.70 mm"
-    assert rows["recalibrated"] == "RUNS AWAY"
+    assert rows["recalibrated"] == "DIVERGES"
 
 
 def test_a_window_far_from_rest_finds_its_start():
@@ -532,5 +536,5 @@ def test_noise_that_parts_a_loop_from_itself_explains_a_gap():
         )
         assert gap_stands_out(gap, fitted) == (loop is calm)
         assert (
-            "differ in noise alone" in wording.describe_shrinking(replace(gap, before=0.9))
+            "differ only in their noise" in wording.describe_shrinking(replace(gap, before=0.9))
         ) == (loop is rough)

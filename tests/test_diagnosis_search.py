@@ -229,7 +229,7 @@ def test_an_experiment_is_recommended_that_tells():
     record = record_of(loop, E.ForceExponent(n=2.2), 1e-4, 2e-6, 9500)
     best, other = refitted(loop, record, E.ForceExponent(n=2.0), E.PositionOffset(0.0))
     words, reference = find_experiment(best, [other], record)
-    assert "Recommended: " in words
+    assert "Recommended reference: " in words
     real = loop.with_effect(E.ForceExponent(n=2.2))
     second = cid.simulate(real, reference, sensor_noise=2e-6, seed=9502)
     best, other = refitted(loop, second, E.ForceExponent(n=2.0), E.PositionOffset(0.0))
@@ -307,8 +307,8 @@ def test_many_effects_at_once_are_no_explanation():
     findings = [Finding(e, {}, (), (), 50.0) for e in kinds]
     loose = find_doubt(kinds, [50.0] * 4, 200.0)
     text = write_conclusion("partly explained", findings, gap, quiet, tests, (), loose)
-    assert text.startswith("With CoulombFriction and LinearStiffness and")
-    assert "so many effects at once describe almost any error" in text
+    assert text.startswith("With CoulombFriction, LinearStiffness, ")
+    assert "so many effects together can describe almost any error" in text
 
 
 def test_a_pair_is_not_taken_for_the_mixture_that_alone_gains_most():
@@ -354,8 +354,8 @@ def test_units_of_the_record_that_are_not_those_of_the_plant_are_told():
     found = cid.diagnose(loop, volts, progress=False, catalogue=[E.CoulombFriction])
     told = [text for text in found.audit if text.startswith("units: ")]
     assert len(told) == 2
-    assert "u is recorded in plain numbers" in told[0]
-    assert "y is recorded in V, and the plant counts it in m" in told[1]
+    assert "u is recorded without a unit, but the plant has it in" in told[0]
+    assert "y is recorded in V, but the plant has it in m. A size that is given in m" in told[1]
     again = cid.diagnose(loop, record, progress=False, catalogue=[E.CoulombFriction])
     assert not [text for text in again.audit if text.startswith("units: ")]
 
@@ -437,7 +437,7 @@ def test_lists_that_prove_little():
     assert "several ripples" in find_doubt(ripples, [100.0, 90.0], 200.0)
     three = [E.QuadraticDrag(1.0), E.LinearStiffness(1.0), E.EddyCurrentDamping(0.1)]
     assert not find_doubt(three, [900.0, 300.0, 60.0], 1200.0)
-    assert "larger one gets wrong" in find_doubt(three, [900.0, 24.0, 11.0], 1000.0)
+    assert "an error in the form of a larger one" in find_doubt(three, [900.0, 24.0, 11.0], 1000.0)
     assert not find_doubt(three[:2], [900.0, 11.0], 1000.0)
 
 
@@ -445,7 +445,7 @@ def test_two_look_alikes_of_which_either_would_do_are_one_thing():
     """A limited rate is nearly a delay and nearly a lag; the rest is filled with the other."""
     both = [E.InputDelay(1e-3), E.ActuatorLag(1e-3)]
     text = find_doubt(both, [80.0, 57.0], 2050.0)
-    assert "InputDelay and ActuatorLag resemble each other" in text
+    assert "InputDelay and ActuatorLag are look-alikes" in text
     assert not find_doubt(both, [1240.0, 240.0], 4200.0)
     assert not find_doubt([both[0], E.LinearStiffness(1.0)], [80.0, 57.0], 4100.0)
 

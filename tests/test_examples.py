@@ -106,7 +106,7 @@ def test_the_tutorial(capsys):
     told = runpy.run_path(str(EXAMPLES / "plot_04_csv_to_controller.py"))
     printed = capsys.readouterr().out
     assert "SOMETHING IS MISSING" in printed
-    assert "Explained. Missing was InputDelay" in printed
+    assert "Explained. The model lacks InputDelay." in printed
     assert printed.count("the promise holds") == 2
     assert printed.count("DEGREES OF THE PROMISE ARE LOST") == 2
     assert told["found"].loop.parameters["K"] == pytest.approx(1.04 * 3.34e-6, rel=1e-3)

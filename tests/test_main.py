@@ -44,12 +44,12 @@ def test_the_whole_story(folder, capsys):
         "Plain: 50.0 deg are promised at 120 rad/s, but IT DOES NOT KEEP THE BALL.",
         "Constrained: Promised 50.0 deg at 120 rad/s, achieved",
         "Instruments: Promised 50.0 deg at 120 rad/s, achieved",
-        "The same ball at a gap of 12 mm",
-        "3000 samples every 2 ms",
+        "The same ball hangs at a gap of 12 mm",
+        "3000 samples, one every 2 ms",
         "Diagnosis of maglev (3000 samples, dt = 0.002 s)",
         "what is missing",
-        "Hidden was InputDelay: delay = 0.00",
-        "It was found and named alone.",
+        "The hidden effect was InputDelay: delay = 0.00",
+        "It was found, and no alternative was named.",
     ):
         assert sentence in text
     assert out.endswith(f"12 figures and report.html are in ctrlid-report{os.sep}\n")
@@ -259,18 +259,18 @@ def test_the_second_act_hides_what_the_seed_draws():
 def test_the_second_act_names_it(kind):
     seed = next(s for s in range(50) if type(act.hide_effect(s)[0]) is kind)
     first, second, third = act.tell_diagnosis(seed=seed)
-    assert "It is not told what was hidden." in first.text
+    assert "It is not told which effect was hidden." in first.text
     assert second.result.findings[0].name == kind.__name__
-    assert f"Hidden was {kind.__name__}" in third.text
-    assert "It was found and named" in third.text
-    assert "noise alone leaves" in third.text
+    assert f"The hidden effect was {kind.__name__}" in third.text
+    assert "It was found, and " in third.text
+    assert "the noise floor is " in third.text
 
 
 def test_the_second_act_admits_what_it_missed():
     sections = list(act.tell_diagnosis(samples=4000, seed=2))
     found, effect, loop = sections[1].result, act.hide_effect(2)[0], None
-    assert "It was found and named alone." in sections[2].text
+    assert "It was found, and no alternative was named." in sections[2].text
     stranger = cid.effects.Quantization(step=1.0)
     assert "IT WAS NOT NAMED: the verdict is " in act.reveal_effect(found, stranger, loop)
     two = replace(found, findings=found.findings * 2)
-    assert "It is among what was named." in act.reveal_effect(two, effect, loop)
+    assert "It is among the effects that were named." in act.reveal_effect(two, effect, loop)

@@ -28,7 +28,7 @@ def test_each_record_lacks_something_else(tmp_path):
     assert {type(e).__name__ for e in found.loop.effects} == set(notes)
     assert "CoulombFriction (seen in record 1 of 2 only)" in found.sentence
     assert found.gap.after < 1.1 * found.gap.floor < 0.2 * found.gap.before
-    assert any("each was fitted alone" in note for note in found.notes)
+    assert any("each was diagnosed alone" in note for note in found.notes)
     assert str(cid.load_diagnosis(found.save(tmp_path / "found.json"), loop)) == str(found)
 
 
@@ -50,7 +50,7 @@ def test_a_parameter_that_changed_between_the_records():
     found = diagnosed(loop, loop.with_parameters({"k": 27.0}), seed=8500)
     assert found.verdict == "unknown"
     assert not found.findings
-    assert "other values: k = " in found.sentence
+    assert "but with different values: k = " in found.sentence
     (k,) = (c for c in found.calibrated if c.name == "k")
     assert 27.0 < k.after < 30.0
 

@@ -54,11 +54,12 @@ def assemble_answer(
     verdict = choose_verdict(complete, named=bool(findings))
     notes = list(fitted.estimate.notes)
     if not loop.free:
-        notes.append("no parameter of the model was free: a wrong value counts as a missing effect")
+        notes.append("no parameter of the model was free, so a wrong value counts as a missing "
+                     "effect. Name the uncertain parameters in free=")  # fmt: skip
     if loop.linear_plant and not found.after.passed:
         notes.append(
-            "the model is linear; errors that depend on position, velocity or input ask for the "
-            "physics: write the plant with ct.nlsys and diagnose that"
+            "the model is linear. If the errors depend on position, velocity or input, write the "
+            "equations of the plant with ct.nlsys and diagnose that model"
         )
     before = dict(zip(found.base.names, found.base.fit.theta.tolist(), strict=True))
     calibrated = tuple(

@@ -34,7 +34,7 @@ class Objection:
         return cls("does not apply" if unfit else "cannot run", str(refusal))
 
 
-VANISHES = Objection("vanishes", "vanishes when refitted")
+VANISHES = Objection("vanishes", "the refit ends at the neutral value")
 
 
 @dataclass(frozen=True, eq=False)

@@ -79,15 +79,16 @@ def find_experiment(
         or 0.0
     )
     if chosen[0] * len(chosen[2]) < THRESHOLD.experiment_distance:
-        return (f"{words}. No steps of the reference that the loop is sure to survive would tell, "
+        return (f"{words}. No steps of the reference that are safe for the loop would decide "
                 f"within {len(chosen[2])} samples"), None  # fmt: skip
     if chosen[0] < THRESHOLD.experiment_worth * own:
         return words, None
     if own <= 0 or chosen[0] > THRESHOLD.experiment_gain * own:
-        return f"{words}. Recommended: {chosen[1]}.", chosen[2]
+        return f"{words}. Recommended reference: {chosen[1]}", chosen[2]
     times = chosen[0] / own
-    text = (f"{words}. Recommended: {chosen[1]}; there the candidates differ {times:.1f} times as "
-            "much for the same number of samples.")  # fmt: skip
+    text = (f"{words}. Recommended reference: {chosen[1]}. It separates the candidates "
+            f"{times:.1f} times as much as the reference of this record, with the same number of "
+            "samples")  # fmt: skip
     return text, chosen[2]
 
 
@@ -132,16 +133,18 @@ def _list_references(record: Record) -> list[tuple[str, Array]]:
     hold = max(2, round(len(r) / max(int(np.count_nonzero(moves)), 1)))
     times, found = THRESHOLD.experiment_times, []
     for label, amplitude, width, levels in (
-        ("the reference's kind of steps, around one set-point", step, hold, 0.0),
-        ("steps on several set-points over the range visited so far", step, hold, reach),
-        ("steps on several set-points over twice that range", step, hold, 2 * reach),
+        ("steps like those of this record, around one set-point", step, hold, 0.0),
+        ("steps around several set-points over the range of this record", step, hold, reach),
+        ("steps around several set-points over twice the range of this record", step, hold,
+         2 * reach),
         ("steps twice as large, around one set-point", 2 * step, hold, 0.0),
-        ("steps twice as large on several set-points over the range so far", 2 * step, hold, reach),
+        ("steps twice as large, around several set-points over the range of this record", 2 * step,
+         hold, reach),
         ("steps four times as large, around one set-point", times * step, hold, 0.0),
         ("steps that change four times as often", step, max(2, hold // times), 0.0),
-        ("steps that change four times as often on several set-points", step, max(2, hold // times),
-         reach),
-        ("slow steps, four times as long, on several set-points", step, times * hold, reach),
+        ("steps that change four times as often, around several set-points", step,
+         max(2, hold // times), reach),
+        ("slow steps, four times as long, around several set-points", step, times * hold, reach),
         ("steps four times as large that change four times as often", times * step,
          max(2, hold // times), 0.0),
         ("steps four times as large that change every other sample", times * step, 2, 0.0),

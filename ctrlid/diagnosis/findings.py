@@ -55,6 +55,11 @@ class Gap:
     widest: float = math.nan
     horizon: int = 0
 
+    @property
+    def force_unit(self) -> str:
+        """The unit of a force per unit of mass, by the unit of the output."""
+        return f"{self.unit or '[y]'}/s^2"
+
 
 @dataclass(frozen=True, eq=False)
 class Finding:
@@ -73,7 +78,7 @@ class Finding:
     evidence : float
         Gain of log-likelihood over the model without it; 10 is strong.
     share : float
-        Share of the (squared) gap above the floor that it closes.
+        Share of the mean square error above the floor that would return without it.
     experiment : str
         The experiment that would separate the effect from its alternatives; empty without any.
     reference : ndarray or None

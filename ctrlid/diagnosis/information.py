@@ -104,7 +104,8 @@ def find_objection(trial: Trial) -> Objection | None:
             words = f"{about.name} ends on its bound {fit.theta[k]:g}"
             return Objection("on a bound", words)
     if _is_insignificant(trial, effect):
-        return Objection("insignificant", "no larger than its uncertainty")
+        words = f"within {THRESHOLD.significant:g} standard errors of its neutral value"
+        return Objection("insignificant", words)
     if not all(f"{trial.label}.{p.name}" in names for p in effect.parameters()):
         # A parameter that is held at its neutral value is another effect's, which excuses this one.
         return None

@@ -34,9 +34,10 @@ from .several_records import merge_diagnoses
 from .thresholds import THRESHOLD
 
 BY_SIMULATION = (
-    "with filters a random force took up what is missing; so effects were looked for by the error "
-    "of an open-loop simulation, and sizes are those that simulate best. What is called one-step "
-    "errors above are errors of that simulation; evidence counts as many samples as are independent"
+    "in the Kalman filter a random force explained the error, so the effects were found by the "
+    "error of an open-loop simulation. Their sizes are those with the smallest simulation error. "
+    "What is called one-step errors above are errors of that simulation, and the evidence is "
+    "computed for the number of independent samples"
 )
 PROGRESS = 6  # The bar moves by so many steps, of which the comparison on fresh data makes two.
 
@@ -147,7 +148,7 @@ def diagnose(
     def work(function: Callable[..., Any], items: Iterable[Any]) -> list[Any]:
         return list(share_out(function, items, jobs))
 
-    tell("looking the records over", 1)
+    tell("checking the records", 1)
     audits, remarks = look_over_records(loop, records)
     question = Question(loop, records, audits, fresh, catalogue, work, tell)
     result, search = _answer_question(question)
@@ -170,7 +171,7 @@ def _answer_question(q: Question) -> tuple[Diagnosis, Search]:
     helps = make_fresh_data_test(q.fresh)
     if search.other and not search.after.passed:
         # Perhaps neither search explains the record; fresh data tell which of them leads further.
-        q.tell("another way")
+        q.tell("second search")
         other = search_effects(base, q.catalogue, q.work, q.tell, search.other)
         search = choose_search(search, other, helps, q.fresh.gap_of)
     # Step 3 again: what is left is tested with the steps of the converter in the replicas.
@@ -186,7 +187,7 @@ def _answer_question(q: Question) -> tuple[Diagnosis, Search]:
     if len(q.records) == 1:
         search, summary = take_back_widening(q.loop, search, summary, q.fresh)
     # Step 10: the decision table.
-    q.tell("writing down", 1)
+    q.tell("writing the report", 1)
     read = (*readout.found, *([steps] if steps else []))
     result = assemble_answer(q.loop, q.records, search, summary, read)
     if result.verdict not in COMPLETE and _is_worth_simulating(q.fresh, base.records):

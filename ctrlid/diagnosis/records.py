@@ -55,7 +55,7 @@ def look_over_records(
             raise CtrlidError(
                 f"{record.name or 'the record'} cannot be diagnosed: {' '.join(hopeless)}"
             )
-        which = f"record {k + 1}: " if len(records) > 1 else ""
+        which = f"record {k + 1}, " if len(records) > 1 else ""
         remarks += [f"{which}{f.kind}: {f.text}" for f in found.findings]
     return tuple(audits), tuple(remarks)
 
@@ -67,10 +67,10 @@ def _name_foreign_units(loop: Loop, record: Record) -> list[str]:
     for key, name in (("u", e.inputs[0]), ("y", e.outputs[0])):
         there, here = record.units.get(key, ""), known.get(name, "")
         if there and here and there != here:
-            there = "plain numbers" if there == "1" else there
+            there = "without a unit" if there == "1" else f"in {there}"
             remarks.append(
-                f"units: {key} is recorded in {there}, and the plant counts it in {here}; where "
-                f"sizes say {here}, it stands for {there}."
+                f"units: {key} is recorded {there}, but the plant has it in {here}. A size that is "
+                f"given in {here} is in the unit of the record."
             )
     return remarks
 

@@ -39,16 +39,19 @@ def write_report_text(found: Diagnosis) -> str:
         lines += ["", "  what is missing"]
         for k, finding in enumerate(found.findings, 1):
             lines += _write_finding(found, finding, f"{k}. ")
-        lines += _wrap_text(wording.EVIDENCE, 4)
+        lines += _wrap_text(wording.explain_evidence(), 4)
     elif found.verdict == "nothing missing" and found.sensitivity:
         lines += ["", *_write_sensitivity(found)]
     lines += ["", *_write_parameters(found)]
     lines += _wrap_text(wording.describe_disturbance(found), 2, hang=4)
     lines += _wrap_text(wording.describe_remains(found), 2, hang=4)
-    for title, remarks in (("about the record", found.audit), ("note", found.notes)):
-        for remark in remarks:
-            lines += _wrap_text(f"{title}: {remark}", 2, hang=4)
-    lines.append(f"  {found.seconds:.1f} s")
+    if found.audit:
+        lines.append("  about the record:")
+    for remark in found.audit:
+        lines += _wrap_text(remark, 4, hang=6)
+    for note in found.notes:
+        lines += _wrap_text(f"note: {note}", 2, hang=4)
+    lines.append(f"  computed in {found.seconds:.1f} s")
     return "\n".join(line.rstrip() for line in lines)
 
 
@@ -64,20 +67,20 @@ def _wrap_text(text: str, indent: int, hang: int | None = None) -> list[str]:
 
 def write_gap_lines(gap: Gap) -> list[str]:
     """Return the sizes of the gap as aligned lines."""
-    rows = wording.list_gap_rows(gap)
-    head = f"  how far apart: {gap.kind} of {len(gap.time)} samples kept back, RMS error"
-    return [head, *(f"    {label:<20}{size:>12}   {times}" for label, size, times in rows),
-            *_wrap_text(wording.describe_shrinking(gap), 4)]  # fmt: skip
+    rows = [f"    {label:<20}{size:>12}   {times}"
+            for label, size, times in wording.list_gap_rows(gap)]  # fmt: skip
+    head = _wrap_text(wording.introduce_gap(gap), 2, hang=4)
+    return [*head, *rows, *_wrap_text(wording.describe_shrinking(gap), 4)]
 
 
 def _write_where(found: Diagnosis) -> list[str]:
     places = wording.list_telling_places(found)
     if not places:
         axes = write_list([p.axis for p in found.where])
-        return ["  where it sits: " + (f"nowhere; noise looks like this along {axes}" if axes else
-                                       "not known")]  # fmt: skip
+        nowhere = f"nowhere. In bins of {axes}, the one-step errors are noise."
+        return _wrap_text(f"where the error is: {nowhere if axes else 'not known'}", 2, hang=4)
     same = not found.findings
-    head = "  where it sits: RMS of the one-step errors, 1 is noise"
+    head = "  where the error is: normalized RMS of the one-step errors (1 for noise)"
     rows = [f"{head:<79}{'worst' if same else 'before':>10}{'' if same else 'after':>10}"]
     for place in places:
         first, *more = textwrap.wrap(wording.describe_place(place), 60) or [""]
@@ -103,7 +106,7 @@ def _write_sensitivity(found: Diagnosis) -> list[str]:
             for key, size in wording.list_sensitivity_rows(found)]  # fmt: skip
     half = (len(rows) + 1) // 2
     right = [*rows[half:], ""][:half]
-    head = "  the smallest effects that this record would have shown"
+    head = "  smallest size of each effect that this record would have shown"
     return [head, *(f"    {a}    {b}" for a, b in zip(rows[:half], right, strict=True))]
 
 
@@ -111,12 +114,12 @@ def _write_parameters(found: Diagnosis) -> list[str]:
     if not found.calibrated:
         return ["  the model has no free parameters"]
     last = "with the effects" if found.findings else "fitted"
-    rows = [("the model's own parameters", "given", "recalibrated", last)]
+    rows = [("free parameters", "given", "recalibrated", f"{last} ± standard error")]
     for c in found.calibrated:
         fitted = write_quantity(c.after, error=c.standard_error, digits=4)
         if c.standard_error == 0:
-            fitted = f"{write_number(c.after, 4)} (AT ITS LIMIT)"
+            fitted = f"{write_number(c.after, 4)} (ON ITS BOUND)"
         rows.append((f"  {c.name}", write_number(c.given, 4), write_number(c.before, 4), fitted))
     if not found.findings:
         rows = [(a, b, "", d) for a, b, _, d in rows]
-    return [f"  {a:<26}{b:>12}{c:>14}  {d:>28}" for a, b, c, d in rows]
+    return [f"  {a:<26}{b:>12}{c:>14}  {d:>34}" for a, b, c, d in rows]

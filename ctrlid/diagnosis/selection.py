@@ -207,6 +207,6 @@ def _check_on_replicas(base: Model, trials: list[Trial], copies: list[Model | No
             > THRESHOLD.gate
         ):
             break
-        words = "gains as much on a simulated record in which it is known not to be"
+        words = "gains nearly as much on a simulated record that does not contain it"
         trials[0] = replace(best, out=Objection("artefact", words))
     return trials

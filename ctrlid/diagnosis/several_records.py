@@ -14,6 +14,7 @@ from .candidates import is_same_kind
 from .findings import Calibrated, Candidate, Finding, Gap
 from .result import Diagnosis
 from .thresholds import THRESHOLD
+from .wording import join_names
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,18 +51,18 @@ def merge_diagnoses(loop: Loop, parts: Sequence[Diagnosis]) -> Diagnosis:
             complete = complete.with_effect(f.effect)
     notes = list(dict.fromkeys(n for p in parts for n in p.notes))
     notes.append(
-        "the records do not have the same in them, so each was fitted alone; the gap is that of "
-        "all, on the last quarter of each; axes and curves are those of record "
-        f"{parts.index(lead) + 1}"
+        "the records do not lack the same effects, so each was diagnosed alone. The gap is that of "
+        "all records, on the last quarter of each. The table of where the error is and the curves "
+        f"of the picture are those of record {parts.index(lead) + 1}"
     )
     verdict, sentence = lead.verdict, _write_sentence(findings, len(parts))
     if differing:
         words = "; ".join(differing)
-        notes.append(f"the model's own parameters differ between the records: {words}")
+        notes.append(f"the free parameters differ between the records: {words}")
     if not findings and differing:
         verdict = "unknown"
-        sentence = (f"Each record alone is explained by the model, but with other values: {words}. "
-                    "What changed between the records is not in it.")  # fmt: skip
+        sentence = (f"The model explains each record alone, but with different values: {words}. "
+                    "The cause of this difference is not in the model.")  # fmt: skip
     return replace(
         lead, verdict=verdict, sentence=sentence, findings=findings, loop=complete,
         gap=_merge_gaps(lead, parts), ranking=_merge_rankings(parts), calibrated=calibrated,
@@ -164,13 +165,11 @@ def _merge_calibrated(parts: Sequence[Diagnosis]) -> tuple[tuple[Calibrated, ...
 
 def _write_sentence(findings: Sequence[Finding], records: int) -> str:
     if not findings:
-        return "At the sensitivity of these records, what is left is noise."
+        return ("No effect that is large enough to show in these records is missing: the residuals "
+                "are noise.")  # fmt: skip
     seen = [describe_presence([k - 1 for k in f.records], records) for f in findings]
-    names = " and ".join(
-        f"{' or '.join(f.names)} ({where})" for f, where in zip(findings, seen, strict=True)
-    )
-    were, them = ("were", "them") if len(findings) > 1 else ("was", "it")
-    return f"Missing {were} {names}; with {them}, what is left is noise."
+    them = "them" if len(findings) > 1 else "it"
+    return f"The model lacks {join_names(findings, seen)}. With {them} the residuals are noise."
 
 
 def _merge_gaps(lead: Diagnosis, parts: Sequence[Diagnosis]) -> Gap:

@@ -433,7 +433,7 @@ class Thresholds:
     )  # fmt: skip
     strong: float = declare_number(10.0, convention="evidence that is called strong",
                           unit="of log-likelihood")  # fmt: skip
-    certain: float = declare_number(30.0, convention="evidence that is called more than strong",
+    certain: float = declare_number(30.0, convention="evidence that is called very strong",
                            unit="of log-likelihood")  # fmt: skip
 
     # Several records.

@@ -11,6 +11,7 @@ from ..estimation.likelihood.likelihood import Fit
 from .findings import BinnedErrors, Disturbance, Finding, Gap, Verdict
 from .noise_tests import NoiseTests
 from .thresholds import THRESHOLD
+from .wording import join_names, name_test
 
 
 def choose_verdict(complete: bool, named: bool) -> Verdict:
@@ -68,18 +69,18 @@ def find_doubt(
         The reason; None if there is none.
     """
     if len(effects) >= THRESHOLD.many_effects:
-        return "so many effects at once describe almost any error, and prove little"
+        return "so many effects together can describe almost any error"
     for kind, count in Counter(type(e) for e in effects).items():
         if count > 1 and kind.doubt_of_several is not None:
             return kind.doubt_of_several
     if len(effects) >= THRESHOLD.some_effects and min(gains) < THRESHOLD.slight_effect * max(gains):
-        return "the smallest of so many effects may only correct what a larger one gets wrong"
+        return "the smallest of these effects may only correct an error in the form of a larger one"
     for one, other in itertools.combinations(range(len(effects)), 2):
         alone = max(gains[one], gains[other]) < THRESHOLD.residue * total
         if alone and _are_look_alikes(effects[one], effects[other]):
             names = [type(effects[k]).__name__ for k in (one, other)]
-            return (f"{names[0]} and {names[1]} resemble each other, and either alone explains "
-                    "nearly all of it: one effect of another kind may be behind both")  # fmt: skip
+            return (f"{names[0]} and {names[1]} are look-alikes, and either alone explains nearly "
+                    "all of the error: both may stand in for one other effect")  # fmt: skip
     return None
 
 
@@ -140,36 +141,38 @@ def write_conclusion(
     str
         One to three sentences.
     """
-    names = " and ".join(" or ".join(f.names) for f in findings)
+    names = join_names(findings)
     name, p = after.worst
-    why = f"the test of {name} fails ({write_p_value(p)})"
+    why = f"the test of {name_test(name)} fails ({write_p_value(p)})"
     if after.passed:
-        why = "on data kept back the gap stays well above the noise floor"
+        why = "on the samples kept back, the RMS error is well above the noise floor"
         if gap.after > gap.given:
-            why = "on data kept back the gap is wider than that of the model as given"
-    were, them = ("were", "them") if len(findings) > 1 else ("was", "it")
+            why = "on the samples kept back, the RMS error exceeds that of the model as given"
+    verb, them = ("explain", "them") if len(findings) > 1 else ("explains", "it")
     if verdict == "nothing missing":
-        text = "At the sensitivity of this record, what is left is noise."
+        text = ("No effect that is large enough to show in this record is missing: the residuals "
+                "are noise.")  # fmt: skip
     elif verdict == "explained":
-        text = f"Missing {were} {names}; with {them}, what is left is noise."
+        text = f"The model lacks {names}. With {them} the residuals are noise."
     elif verdict == "partly explained" and after.passed and objection is not None:
-        text = f"With {names} what is left is noise; but {objection}."
+        text = f"With {names} the residuals are noise, but {objection}."
     elif verdict == "partly explained":
-        verb = "explain" if len(findings) > 1 else "explains"
-        text = (f"{names} {verb} part of the gap. Something else remains that no known effect "
-                f"accounts for: {why}.")  # fmt: skip
+        text = (f"{names} {verb} part of the error. The rest is not noise alone: {why}. No other "
+                "effect of the catalogue explains it.")  # fmt: skip
     else:
-        text = f"Something is missing, but none of the known effects accounts for it: {why}."
+        text = (f"The error is not noise alone: {why}. No effect of the catalogue explains "
+                "it.")  # fmt: skip
     left = [w for w in where if w.p_after < THRESHOLD.surely_left]
     if left and verdict in ("partly explained", "unknown"):
-        text += f" It shows along {' and '.join(w.axis for w in left[:2])}."
+        text += f" The remaining error depends on {' and '.join(w.axis for w in left[:2])}."
     if disturbance.large:
         kind = "A random force"
         if disturbance.coloured:
             kind = (
-                f"A slowly varying random force of {write_number(disturbance.coloured, 2)} with a "
-                f"time constant of {write_number(disturbance.time_constant, 2)} s"
+                f"A slowly varying random force of {write_number(disturbance.coloured, 2)} "
+                f"{gap.force_unit} RMS with a time constant of "
+                f"{write_number(disturbance.time_constant, 2)} s"
             )
-        text += (f" {kind} makes {100 * disturbance.share:.0f} % of the noise floor's variance: "
-                 "it is counted as noise here, and may hide a cause of its own.")  # fmt: skip
+        text += (f" {kind} causes {100 * disturbance.share:.0f} % of the variance of the noise "
+                 "floor. It is treated as noise here, and may hide a missing effect.")  # fmt: skip
     return text

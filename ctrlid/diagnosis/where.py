@@ -41,9 +41,11 @@ def _describe_place(
     strength = np.sqrt(count) * np.abs(mean)
     spread = np.sqrt(count / 2) * np.abs(square - 1)
     k = int(np.argmax(np.maximum(strength, spread)))
-    between = f"{name} {edges[k]:.4g} to {edges[k + 1]:.4g} {unit}".rstrip()
+    unit = "" if unit == "1" else unit
+    place = f"at {name} from {edges[k]:.4g} to {edges[k + 1]:.4g} {unit}".rstrip()
     if strength[k] >= spread[k]:
         side = "above" if mean[k] > 0 else "below"
-        return f"at {between} the output lies {side} its prediction, by {abs(mean[k]):.2g} sigma"
+        return (f"{place}, the output is {side} its prediction by {abs(mean[k]):.2g} standard "
+                "deviations on average")  # fmt: skip
     side = "larger" if square[k] > 1 else "smaller"
-    return f"at {between} the prediction errors are {side} than noise"
+    return f"{place}, the one-step errors are {side} than noise"

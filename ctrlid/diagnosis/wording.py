@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -27,16 +27,25 @@ HEADLINES = {
     "nothing missing": "Nothing missing",
     "explained": "Explained",
     "partly explained": "PARTLY EXPLAINED: SOMETHING IS STILL MISSING",
-    "unknown": "UNKNOWN: SOMETHING IS MISSING that no candidate explains",
+    "unknown": "UNKNOWN: SOMETHING IS MISSING",
 }
-EVIDENCE = (
-    "Evidence: the logarithm of how many times likelier the record is with the effect than "
-    "without; chance reaches 2 or 3, 10 is strong."
-)
 WIDENED = (
-    "Recalibrating alone makes the one-step errors smaller and this gap larger: parameters cannot "
-    "stand in for what is missing."
+    "Recalibration alone decreases the one-step errors but increases this gap, because no values "
+    "of the parameters can replace what is missing."
 )
+# The tests of noise whose names say too little in a sentence.
+TESTS = {
+    "independence of past signals": "independence of past input and reference",
+    "following the record": "whether the filter follows the record",
+}
+# The first words of the names of tests that are made for each quantity or parameter.
+TESTS_OF = {
+    "mean by ": "the mean in bins of ",
+    "size by ": "the variance in bins of ",
+    "rhythm of ": "a periodic change of ",
+}
+# What is no effect of the catalogue needs an article in a sentence.
+ARTICLES = {"delay of the output": "a delay of the output"}
 MASSES = ("m", "M", "mass")
 # Units of a force parameter times a mass in kg, by its unit per unit of mass.
 FORCES = {"m/s^2": "N", "1/s": "N s/m", "1/s^2": "N/m", "1/m": "kg/m"}
@@ -45,6 +54,52 @@ FORCES = {"m/s^2": "N", "1/s": "N s/m", "1/s^2": "N/m", "1/m": "kg/m"}
 def write_headline(found: Diagnosis) -> str:
     """Return the verdict with its sentence."""
     return f"{HEADLINES[found.verdict]}. {found.sentence}"
+
+
+def name_test(key: str) -> str:
+    """Return the name of a test of noise as a sentence has it: ``the test of ...``.
+
+    Examples
+    --------
+    >>> name_test("mean by velocity"), name_test("whiteness")
+    ('the mean in bins of velocity', 'whiteness')
+    """
+    for start, words in TESTS_OF.items():
+        if key.startswith(start):
+            return words + key.removeprefix(start)
+    return TESTS.get(key, key)
+
+
+def join_names(findings: Sequence[Finding], remarks: Sequence[str] = ()) -> str:
+    """Return the names of findings and of what may be in their place, for a sentence.
+
+    Where a name has alternatives, findings are separated by semicolons. Remarks, one for each
+    finding, follow in parentheses.
+    """
+    names = [f"{', '.join(f.names[:-1])} or {f.names[-1]}" if len(f.names) > 1 else f.name
+             for f in findings]  # fmt: skip
+    if remarks:
+        names = [f"{name} ({remark})" for name, remark in zip(names, remarks, strict=True)]
+    if len(names) < 2 or all(len(f.names) == 1 for f in findings):
+        return write_list(names)
+    return f"{'; '.join(names[:-1])}; and {names[-1]}"
+
+
+def explain_evidence() -> str:
+    """Say what the evidence is, and how much of it is strong."""
+    return (
+        "Evidence E means that the record is exp(E) times as probable with the effect as without "
+        f"it. Chance reaches 2 or 3; from {THRESHOLD.strong:g} on evidence is strong, from "
+        f"{THRESHOLD.certain:g} on very strong."
+    )
+
+
+def introduce_gap(gap: Gap) -> str:
+    """Say what the gap is."""
+    return (
+        f"gap between model and record: RMS error of the {gap.kind} of {len(gap.time)} samples "
+        "kept back"
+    )
 
 
 def list_gap_rows(gap: Gap) -> list[tuple[str, str, str]]:
@@ -60,7 +115,7 @@ def list_gap_rows(gap: Gap) -> list[tuple[str, str, str]]:
             return f"{factor * value:.{max(places, 0)}f} {unit}".strip()
         if math.isfinite(value):
             return f"{write_number(factor * value, 3)} {unit}".strip()
-        return "none" if math.isnan(value) else "RUNS AWAY"
+        return "none" if math.isnan(value) else "DIVERGES"
 
     def times(value: float) -> str:
         ratio = value / gap.floor if gap.floor > 0 else math.nan
@@ -72,7 +127,7 @@ def list_gap_rows(gap: Gap) -> list[tuple[str, str, str]]:
              ("with the effects", gap.after))  # fmt: skip
     shown = cases[:2] if gap.after == gap.before else cases
     rows = [(label, size(value), times(value)) for label, value in shown]
-    return [*rows, ("noise floor", size(gap.floor), "what noise and random force leave")]
+    return [*rows, ("noise floor", size(gap.floor), "due to sensor noise and random force alone")]
 
 
 def describe_shrinking(gap: Gap) -> str:
@@ -84,17 +139,18 @@ def describe_shrinking(gap: Gap) -> str:
         return ""
     if THRESHOLD.excess * gap.floor < gap.after < THRESHOLD.excess * gap.widest:
         widest = write_quantity(gap.widest, gap.unit)
-        return (f"Two runs of the completed model that differ in noise alone end up as far as "
-                f"{widest} apart, so the gap shows little of what the effects close; the "
-                "one-step errors do.")  # fmt: skip
+        return ("Two simulations of the completed model that differ only in their noise differ by "
+                f"up to {widest}. So the gap hardly shows the benefit of the effects; the one-step "
+                "errors show it.")  # fmt: skip
     if above <= 0 and gap.after < THRESHOLD.near_floor * gap.floor:
-        return ("Noise alone moves two runs of the completed model apart by as much, so "
-                "the gap cannot show what the effects close; the one-step errors do.")  # fmt: skip
+        return ("Two simulations of the completed model that differ only in their noise differ by "
+                "as much. So the gap cannot show the benefit of the effects; the one-step errors "
+                "show it.")  # fmt: skip
     if above <= 0 or gap.after >= gap.before:
-        return "On samples kept back the effects do NOT MAKE THE GAP SMALLER."
+        return "On these samples the effects do NOT REDUCE THE GAP."
     share = min((gap.before**2 - gap.after**2) / above, 1.0)
-    closed = (f"On samples kept back the effects close {write_percent(share)} of the squared gap "
-              "above the noise floor.")  # fmt: skip
+    closed = (f"On these samples the effects remove {write_percent(share)} of the mean square "
+              "error above the noise floor.")  # fmt: skip
     return f"{closed} {WIDENED}" if gap.before > gap.given * THRESHOLD.widened else closed
 
 
@@ -157,19 +213,19 @@ def describe_forces(found: Diagnosis, effect: AbstractEffect) -> str:
 def describe_certainty(found: Diagnosis, finding: Finding) -> str:
     """Say how sure it is that something like this effect is there, and that it is this one."""
     sure = ("WEAK" if finding.evidence < THRESHOLD.strong else
-            "strong" if finding.evidence < THRESHOLD.certain else "beyond doubt")  # fmt: skip
-    text = (
-        f"evidence {finding.evidence:.{0 if finding.evidence >= THRESHOLD.strong else 1}f}, {sure}"
-    )
+            "strong" if finding.evidence < THRESHOLD.certain else "very strong")  # fmt: skip
+    digits = 0 if finding.evidence >= THRESHOLD.strong else 1
+    text = f"evidence {finding.evidence:.{digits}f} ({sure})"
     if math.isfinite(finding.share) and len(found.findings) > 1:
-        text += f"; closes {write_percent(finding.share)} of the squared gap above the floor"
+        share = write_percent(finding.share)
+        text += f"; without it, {share} of the mean square error above the noise floor would return"
     many = len(finding.names)
     if many > 1:
-        text += f"; ONE OF {many} that explain the record"
+        text += f"; ONE OF {many} EFFECTS that explain the record"
     else:
-        text += "; no other effect explains the record as well"
+        text += "; no other effect of the catalogue explains the record as well"
     if found.verdict == "partly explained" and not isinstance(finding.effect, ReadingEffect):
-        text += ". It may stand in for what is still missing"
+        text += ". It may stand in for an effect that is not in the catalogue"
     return text
 
 
@@ -179,16 +235,18 @@ def list_doubts(found: Diagnosis, finding: Finding) -> list[str]:
     apart = [e for e in finding.alternatives if type(e).__name__ not in finding.equivalents]
     if apart:
         others = [f"{type(e).__name__} ({describe_parameters(found, e)})" for e in apart]
-        lines.append(f"this record does not tell it from {write_list(others)}")
+        lines.append(f"this record cannot distinguish it from {write_list(others)}")
     if finding.equivalents:
+        same = [ARTICLES.get(name, name) for name in finding.equivalents]
         lines.append(
-            f"no record of u and y tells it from {write_list(finding.equivalents)}: on this "
-            "plant they are the same"
+            f"no record of u and y can distinguish it from {write_list(same)}, because on this "
+            "plant their influence is the same"
         )
     if finding.experiment:
-        lines.append(f"what would tell: {finding.experiment}")
+        lines.append(f"to decide, use {finding.experiment}")
     if finding.reference is not None:
-        lines.append(f"a reference for it is ready: .reference, {len(finding.reference)} samples")
+        lines.append(f"the reference signal for it is in .reference of this finding "
+                     f"({len(finding.reference)} samples)")  # fmt: skip
     return [*lines, *([finding.note] if finding.note else [])]
 
 
@@ -219,37 +277,39 @@ def list_sensitivity_rows(found: Diagnosis) -> list[tuple[str, str]]:
 
 def describe_disturbance(found: Diagnosis) -> str:
     """Say how large the random force is, and in capitals if it may hide something."""
-    d, unit = found.disturbance, f"{found.gap.unit}/s^2" if found.gap.unit else ""
-    parts = [f"white {write_quantity(d.white, unit)}"] if d.white else []
+    d, unit = found.disturbance, found.gap.force_unit
+    parts = [f"white ({write_quantity(d.white, unit)} RMS)"] if d.white else []
     if d.coloured:
-        parts.append(f"coloured {write_quantity(d.coloured, unit)} with a time constant of "
-                     f"{write_quantity(d.time_constant, 's')}")  # fmt: skip
+        parts.append(f"coloured ({write_quantity(d.coloured, unit)} RMS, time constant "
+                     f"{write_quantity(d.time_constant, 's')})")  # fmt: skip
     if not parts:
-        return "random force: none; the noise floor is sensor noise"
+        return "random force: none was found; the noise floor is due to sensor noise alone"
     words = " and ".join(parts)
     if math.isfinite(d.share):
-        words += f", {write_percent(d.share)} of the noise floor's variance"
+        words += f"; it causes {write_percent(d.share)} of the variance of the noise floor"
     if not d.large:
         return f"random force: {words}"
-    return (f"A LARGE RANDOM FORCE: {words}. Effects that it hides cannot be seen; the verdict "
-            "holds above it only")  # fmt: skip
+    return (f"A LARGE RANDOM FORCE: {words}. It may hide effects, so the verdict holds only for "
+            "effects larger than this force")  # fmt: skip
 
 
 def describe_remains(found: Diagnosis) -> str:
-    """Say whether what is left is noise, by the tests of the final one-step errors."""
+    """Say whether the residuals are noise, by the tests of the final one-step errors."""
     if not found.tests:
-        return "what remains: not tested"
+        return "residuals: not tested"
     count = len(found.tests)
     name, p = min(found.tests.items(), key=lambda item: item[1])
     together = min(1.0, count * p)
     if found.verdict in COMPLETE or together > choose_alarm_level(len(found.findings)):
-        doubt = f"{name}, {write_p_value(p)}"
+        text = f"residuals: noise, by {count} tests. The smallest p-value is that of "
+        text += f"{name_test(name)}, {write_p_value(p)}"
         if p < THRESHOLD.telling:
-            doubt += f", among so many {write_p_value(together)}"
-        return f"what remains: noise, by {count} tests, the most doubtful of which is {doubt}"
+            text += f" ({write_p_value(together)} when corrected for the number of tests)"
+        return text
     failed = sorted((v, k) for k, v in found.tests.items() if v < THRESHOLD.telling) or [(p, name)]
-    names = [name for _, name in failed[:LISTED]]
+    names = [name_test(name) for _, name in failed[:LISTED]]
     if len(failed) > LISTED:
         names[-1] = f"{len(failed) - LISTED + 1} others"
-    return (f"what remains: NOT NOISE ALONE, by {len(failed)} of {count} tests: "
-            f"{write_list(names)} ({write_p_value(failed[0][0])})")  # fmt: skip
+    fail, smallest = ("fail", "smallest ") if len(failed) > 1 else ("fails", "")
+    return (f"residuals: NOT NOISE ALONE. {len(failed)} of {count} tests {fail}: "
+            f"{write_list(names)} ({smallest}{write_p_value(failed[0][0])})")  # fmt: skip

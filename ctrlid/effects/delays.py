@@ -41,10 +41,10 @@ class ActuatorLag(InputEffect):
     stage: ClassVar[int] = 4
     states: ClassVar[tuple[str, ...]] = ("input",)
     look_alikes: ClassVar[tuple[str, ...]] = ("InputDelay", "SensorLag")
-    sentence: ClassVar[str] = "The actuator reaches the commanded value only after a while."
+    sentence: ClassVar[str] = "The actuator follows its command with a first-order lag."
     experiment: ClassVar[str] = (
-        "large jumps of the input: a lag of the actuator acts ahead of the plant's curves, a lag "
-        "of the sensor behind them, and a delay has no tail"
+        "large steps of the input: a lag of the actuator acts before the nonlinearities of the "
+        "plant, a lag of the sensor after them, and the response to a delay has no exponential tail"
     )
 
     @classmethod
@@ -91,10 +91,10 @@ class InputDelay(InputEffect):
 
     stage: ClassVar[int] = 6
     look_alikes: ClassVar[tuple[str, ...]] = ("SensorLag", "ActuatorLag", "ViscousFriction")
-    sentence: ClassVar[str] = "The input takes effect a fixed time after it was computed."
+    sentence: ClassVar[str] = "The input acts on the plant after a fixed delay."
     experiment: ClassVar[str] = (
-        "fast excitation: the phase of a delay goes on falling with frequency where that of a lag "
-        "levels off"
+        "fast excitation: at high frequencies the phase of a delay continues to fall, while that "
+        "of a lag levels off"
     )
 
     @classmethod
@@ -112,7 +112,7 @@ class InputDelay(InputEffect):
 @final
 @dataclass(frozen=True)
 class InputBacklash(InputEffect):
-    r"""Play between the actuator and the plant.
+    r"""Backlash between the actuator and the plant.
 
     .. math:: m_{k} = \min(\max(m_{k-1}, u_k - w/2), u_k + w/2), \quad u_a = m_k
 
@@ -135,9 +135,12 @@ class InputBacklash(InputEffect):
     stage: ClassVar[int] = 7
     in_linear_model: ClassVar[bool] = False
     look_alikes: ClassVar[tuple[str, ...]] = ("InputDeadZone", "InputDelay", "CoulombFriction")
-    sentence: ClassVar[str] = "When the input turns round, it first has to cross a gap."
+    sentence: ClassVar[str] = (
+        "After a reversal the input moves the plant only when it has crossed a gap."
+    )
     experiment: ClassVar[str] = (
-        "slow triangles of several sizes: play opens a loop of constant width whatever the size"
+        "slow triangular inputs of several amplitudes: the hysteresis of a backlash has the same "
+        "width at each amplitude"
     )
 
     @classmethod

@@ -88,10 +88,11 @@ class LinearStiffness(ForceEffect):
     k1: float = parameter("1/s^2", neutral=0.0)
 
     look_alikes: ClassVar[tuple[str, ...]] = ("ForceExponent", "PositionOffset", "CubicStiffness")
-    sentence: ClassVar[str] = "A spring, a cable or a guide pulls back."
+    sentence: ClassVar[str] = (
+        "A force in proportion to the deflection, as of a spring, a cable or a guide."
+    )
     experiment: ClassVar[str] = (
-        "a sweep of the operating point over the whole stroke: a spring has the same stiffness "
-        "everywhere"
+        "several operating points over the whole stroke: a spring has the same stiffness at each"
     )
 
     def force(self, m: Moment) -> Any:
@@ -157,10 +158,10 @@ class ConstantForce(ForceEffect):
     look_alikes: ClassVar[tuple[str, ...]] = (
         "InputOffset", "InputSaturatingGain", "AsymmetricCoulombFriction", "PositionOffset",
     )  # fmt: skip
-    sentence: ClassVar[str] = "A constant force acts besides those of the model."
+    sentence: ClassVar[str] = "A constant force acts in addition to those of the model."
     experiment: ClassVar[str] = (
         "several operating points with different inputs: a constant force is the same at each, "
-        "what an offset of the input does changes with the plant's gain"
+        "while the force of an input offset changes with the gain of the plant"
     )
 
     def force(self, m: Moment) -> Any:
@@ -201,10 +202,10 @@ class PeriodicForce(ForceEffect):
     in_linear_model: ClassVar[bool] = False
     repeatable: ClassVar[bool] = True
     look_alikes: ClassVar[tuple[str, ...]] = ("PositionRipple", "FlexibleMode")
-    sentence: ClassVar[str] = "Something shakes the plant at a fixed frequency."
+    sentence: ClassVar[str] = "A vibration at a fixed frequency acts on the plant."
     experiment: ClassVar[str] = (
-        "a record at rest, and motion at two speeds: a line that stays at its frequency is a "
-        "vibration, one that follows the speed is a ripple"
+        "a record at rest, and motion at two speeds: the frequency of a vibration is always the "
+        "same, while that of a ripple is proportional to the speed"
     )
 
     @classmethod
@@ -267,11 +268,13 @@ class PositionRipple(ForceEffect):
     private: ClassVar[tuple[str, ...]] = ("phase",)
     repeatable: ClassVar[bool] = True
     doubt_of_several: ClassVar[str | None] = (
-        "several ripples together describe any curve over the position, and prove little"
+        "several ripples together can describe any function of the position"
     )
     look_alikes: ClassVar[tuple[str, ...]] = ("PeriodicForce", "SensorNonlinearity")
     sentence: ClassVar[str] = "A force that repeats with the position, as of a screw or a gear."
-    experiment: ClassVar[str] = "the same way at two speeds: the ripple stays where it is"
+    experiment: ClassVar[str] = (
+        "the same motion at two speeds: the period of the ripple in position does not change"
+    )
 
     @classmethod
     def candidates(cls, loop: Any, record: Any = None) -> tuple[Self, ...]:
@@ -290,7 +293,7 @@ class PositionRipple(ForceEffect):
         grain = max(_find_quantization_step(y) for y in sight.outputs)
         shortest = max(travel / LENGTHS, 4 * step, 4 * grain)
         if not travel > 2 * shortest:
-            return Scan((), remark="the travel is too short to see a ripple")
+            return Scan((), remark="the motion is too small to show a ripple")
         finest = 0.25 / travel
         places = max((1.0 / shortest - 1.0 / travel) * travel, 1)
 
@@ -361,7 +364,9 @@ class FlexibleMode(ForceEffect):
     states: ClassVar[tuple[str, ...]] = ("deflection", "speed")
     look_alikes: ClassVar[tuple[str, ...]] = ("PeriodicForce", "InputDelay", "ActuatorLag")
     sentence: ClassVar[str] = "Part of the moving mass is attached by a spring."
-    experiment: ClassVar[str] = "a sine sweep through the resonance, which must repeat"
+    experiment: ClassVar[str] = (
+        "a sine sweep through the resonance, repeated: the resonance is at the same frequency again"
+    )
 
     @classmethod
     def candidates(cls, loop: Any, record: Any = None) -> tuple[Self, ...]:

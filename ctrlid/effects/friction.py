@@ -49,8 +49,8 @@ class ViscousFriction(ForceEffect):
     )  # fmt: skip
     sentence: ClassVar[str] = "A force against the motion that grows with the speed."
     experiment: ClassVar[str] = (
-        "runs at several constant speeds, and at several positions: viscous friction grows in "
-        "proportion to the speed and is the same everywhere"
+        "motion at several constant speeds and positions: viscous friction is proportional to the "
+        "speed and the same at every position"
     )
 
     def force(self, m: Moment) -> Any:
@@ -86,7 +86,7 @@ class AsymmetricViscousFriction(ForceEffect):
 
     look_alikes: ClassVar[tuple[str, ...]] = ("ViscousFriction", "AsymmetricCoulombFriction")
     sentence: ClassVar[str] = "Viscous friction is stronger in one direction."
-    experiment: ClassVar[str] = "the same strokes forwards and backwards at several speeds"
+    experiment: ClassVar[str] = "the same strokes in both directions at several speeds"
 
     def force(self, m: Moment) -> Any:
         """Return the acceleration."""
@@ -160,14 +160,13 @@ class AsymmetricCoulombFriction(ForceEffect):
     )  # fmt: skip
     sentence: ClassVar[str] = "Dry friction is stronger in one direction."
     experiment: ClassVar[str] = (
-        "slow strokes forwards and backwards: the force that each direction takes is read off one "
-        "by one"
+        "slow strokes in both directions: the force that each of them needs is measured on its own"
     )
 
     def doubt(self) -> str | None:
         """Say so where it would push: friction is against the motion in both directions."""
         if abs(self.difference) > LARGEST_ASYMMETRY * self.fc:
-            return "in one direction it would push along, as a constant force does and no friction"
+            return "in one direction it would push along the motion, which no friction does"
         return None
 
     def force(self, m: Moment) -> Any:
@@ -204,7 +203,7 @@ class StribeckFriction(ForceEffect):
 
     look_alikes: ClassVar[tuple[str, ...]] = ("CoulombFriction", "AsymmetricCoulombFriction")
     sentence: ClassVar[str] = "Friction is larger at standstill than in motion."
-    experiment: ClassVar[str] = "very slow motion, where it sticks and slips"
+    experiment: ClassVar[str] = "very slow motion, in which the plant sticks and slips"
 
     @classmethod
     def candidates(cls, loop: Any, record: Any = None) -> tuple[Self, ...]:
@@ -247,7 +246,9 @@ class QuadraticDrag(ForceEffect):
 
     look_alikes: ClassVar[tuple[str, ...]] = ("ViscousFriction",)
     sentence: ClassVar[str] = "A force against the motion that grows with the speed squared."
-    experiment: ClassVar[str] = "runs at several speeds: twice the speed, four times the force"
+    experiment: ClassVar[str] = (
+        "motion at several speeds: at twice the speed the drag is four times as large"
+    )
 
     def force(self, m: Moment) -> Any:
         """Return the acceleration."""
@@ -278,7 +279,7 @@ class EddyCurrentDamping(ForceEffect):
     look_alikes: ClassVar[tuple[str, ...]] = ("ViscousFriction",)
     sentence: ClassVar[str] = "A magnet brakes metal that moves in its field."
     experiment: ClassVar[str] = (
-        "several operating points with different inputs: this damping grows with the input, "
+        "several operating points with different inputs: this damping grows with the input, while "
         "viscous friction does not"
     )
 

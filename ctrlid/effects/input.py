@@ -124,9 +124,9 @@ class InputDeadZone(InputEffect):
     look_alikes: ClassVar[tuple[str, ...]] = (
         "InputBacklash", "CoulombFriction", "InputSaturation",
     )  # fmt: skip
-    sentence: ClassVar[str] = "Inputs near the one at rest have no effect."
+    sentence: ClassVar[str] = "Small deviations of the input from the operating point do nothing."
     experiment: ClassVar[str] = (
-        "small signals around the operating point against large ones: the gain falls for small ones"
+        "small and large signals around the operating point: the gain is lower for small ones"
     )
 
     @classmethod
@@ -164,8 +164,8 @@ class InputOffset(InputEffect):
     look_alikes: ClassVar[tuple[str, ...]] = (
         "ConstantForce", "InputSaturatingGain", "InputNonlinearity", "PositionOffset",
     )  # fmt: skip
-    sentence: ClassVar[str] = "The actuator adds a constant to what it is told."
-    experiment: ClassVar[str] = "several operating points: an offset is the same at each"
+    sentence: ClassVar[str] = "A constant offset is added to the input."
+    experiment: ClassVar[str] = "several operating points: the offset is the same at each"
 
     def input(self, m: Moment) -> Any:
         """Return the input with the constant added."""
@@ -197,8 +197,10 @@ class InputNonlinearity(InputEffect):
     look_alikes: ClassVar[tuple[str, ...]] = (
         "InputSaturatingGain", "InputOffset", "ForceExponent",
     )  # fmt: skip
-    sentence: ClassVar[str] = "The gain of the actuator is not the same everywhere."
-    experiment: ClassVar[str] = "large inputs to both sides: the gain differs between the sides"
+    sentence: ClassVar[str] = "The gain of the actuator depends on the input."
+    experiment: ClassVar[str] = (
+        "large inputs to both sides of the operating point: the gain differs between the sides"
+    )
 
     def input(self, m: Moment) -> Any:
         """Return the input bent around the operating point."""
@@ -231,8 +233,8 @@ class InputSaturatingGain(InputEffect):
     look_alikes: ClassVar[tuple[str, ...]] = (
         "InputOffset", "ConstantForce", "InputNonlinearity", "InputSaturation",
     )  # fmt: skip
-    sentence: ClassVar[str] = "The larger the input, the less of it takes effect."
-    experiment: ClassVar[str] = "a wide range of inputs: operating points far apart"
+    sentence: ClassVar[str] = "The gain of the actuator decreases with the size of the input."
+    experiment: ClassVar[str] = "operating points far apart, which need a wide range of inputs"
 
     def input(self, m: Moment) -> Any:
         """Return the saturating input."""

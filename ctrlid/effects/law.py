@@ -45,10 +45,10 @@ class PositionOffset(LawEffect):
     look_alikes: ClassVar[tuple[str, ...]] = (
         "SensorOffset", "ForceExponent", "LinearStiffness", "InputOffset",
     )  # fmt: skip
-    sentence: ClassVar[str] = "The force depends on a distance that starts at another zero."
+    sentence: ClassVar[str] = "The position in the force law has an offset."
     experiment: ClassVar[str] = (
-        "the stiffness at operating points far apart; the zero of the sensor has to be measured "
-        "with a gauge"
+        "the stiffness at operating points far apart, and a reference measurement of the zero of "
+        "the sensor"
     )
 
     def law(self, m: Moment) -> dict[str, Any]:
@@ -94,8 +94,10 @@ class ForceExponent(LawEffect):
     look_alikes: ClassVar[tuple[str, ...]] = (
         "PositionOffset", "LinearStiffness", "CubicStiffness", "SensorNonlinearity",
     )  # fmt: skip
-    sentence: ClassVar[str] = "The force falls with the distance by another power."
-    experiment: ClassVar[str] = "the input at rest at operating points over the whole stroke"
+    sentence: ClassVar[str] = "The force decreases with another power of the distance."
+    experiment: ClassVar[str] = (
+        "the input that holds the plant at rest, at operating points over the whole stroke"
+    )
 
     def build(self, e: Equations, m: Moment) -> Equations:
         """Return the changed equations, if the force falls with the square of the distance."""

@@ -42,9 +42,10 @@ class SensorLag(OutputEffect):
 
     states: ClassVar[tuple[str, ...]] = ("reading",)
     look_alikes: ClassVar[tuple[str, ...]] = ("InputDelay", "ActuatorLag")
-    sentence: ClassVar[str] = "The sensor shows what was a while ago."
+    sentence: ClassVar[str] = "The sensor follows the output with a first-order lag."
     experiment: ClassVar[str] = (
-        "fast excitation: the phase of a lag levels off where that of a delay goes on falling"
+        "fast excitation: at high frequencies the phase of a lag levels off, while that of a delay "
+        "continues to fall"
     )
 
     @classmethod
@@ -88,8 +89,8 @@ class SensorNonlinearity(OutputEffect):
     curvature: float = parameter("1/{y}", neutral=0.0)
 
     look_alikes: ClassVar[tuple[str, ...]] = ("ForceExponent", "CubicStiffness", "PositionRipple")
-    sentence: ClassVar[str] = "The sensor's gain is not the same over its range."
-    experiment: ClassVar[str] = "positions over the whole range, checked with a gauge"
+    sentence: ClassVar[str] = "The gain of the sensor depends on the position."
+    experiment: ClassVar[str] = "reference measurements at positions over the whole range"
 
     def output(self, m: Moment) -> Any:
         """Return the bent reading."""
@@ -119,8 +120,10 @@ class SensorOffset(OutputEffect):
     offset: float = parameter("{y}", neutral=0.0)
 
     look_alikes: ClassVar[tuple[str, ...]] = ("PositionOffset", "InputOffset", "ConstantForce")
-    sentence: ClassVar[str] = "The sensor's zero is wrong."
-    experiment: ClassVar[str] = "a gauge at a known position; from input and output alone, none"
+    sentence: ClassVar[str] = "The sensor has an offset."
+    experiment: ClassVar[str] = (
+        "a reference measurement at a known position; no record of u and y alone decides"
+    )
 
     @classmethod
     def candidates(cls, loop: Any, record: Any = None) -> tuple[Self, ...]:
@@ -163,7 +166,9 @@ class SensorSaturation(ReadingEffect):
 
     look_alikes: ClassVar[tuple[str, ...]] = ("StateLimit", "InputSaturation")
     sentence: ClassVar[str] = "The sensor shows nothing beyond its range."
-    experiment: ClassVar[str] = "motion beyond the range and back: u goes on while y stands still"
+    experiment: ClassVar[str] = (
+        "motion beyond the range and back: u continues to change while y does not"
+    )
 
     def check(self) -> None:
         """Refuse limits in the wrong order."""
@@ -207,7 +212,7 @@ class Quantization(ReadingEffect):
 
     in_linear_model: ClassVar[bool] = False
     look_alikes: ClassVar[tuple[str, ...]] = ("CoulombFriction", "InputDeadZone")
-    sentence: ClassVar[str] = "The converter knows steps only."
+    sentence: ClassVar[str] = "The reading is quantized."
     experiment: ClassVar[str] = "the distinct values of a slow ramp"
 
     @classmethod

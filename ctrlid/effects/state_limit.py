@@ -56,8 +56,8 @@ class StateLimit(LawEffect):
     share: float = parameter("", lower=0.0, upper=1.0, default=1.0)
 
     look_alikes: ClassVar[tuple[str, ...]] = ("SensorSaturation", "InputSaturation")
-    sentence: ClassVar[str] = "A tank is full, and what comes in runs over."
-    experiment: ClassVar[str] = "large slow steps that fill it to the brim and beyond"
+    sentence: ClassVar[str] = "A state has an upper limit, as a tank that overflows."
+    experiment: ClassVar[str] = "large slow steps that take the state up to its limit and beyond"
 
     @classmethod
     def candidates(cls, loop: Any, record: Any = None) -> tuple[Self, ...]:

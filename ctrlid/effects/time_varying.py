@@ -52,7 +52,7 @@ class ParameterDrift(LawEffect):
     rate: float = parameter("1/s", neutral=0.0)
 
     look_alikes: ClassVar[tuple[str, ...]] = ("ParameterStep", "ConstantForce")
-    sentence: ClassVar[str] = "A parameter of the plant drifts, as of a coil that warms up."
+    sentence: ClassVar[str] = "A parameter of the plant drifts, as in a coil that warms up."
     experiment: ClassVar[str] = "the same excitation at the beginning and at the end of a record"
 
     @classmethod
@@ -96,8 +96,10 @@ class ParameterStep(LawEffect):
     size: float = parameter("", neutral=0.0)
 
     look_alikes: ClassVar[tuple[str, ...]] = ("ParameterDrift", "ConstantForce")
-    sentence: ClassVar[str] = "A parameter of the plant changes at one moment."
-    experiment: ClassVar[str] = "excitation that never pauses, so that the moment is seen"
+    sentence: ClassVar[str] = "A parameter of the plant jumps at one instant."
+    experiment: ClassVar[str] = (
+        "excitation without pauses, so that the instant of the change can be seen"
+    )
 
     @classmethod
     def candidates(cls, loop: Any, record: Any = None) -> tuple[Self, ...]:

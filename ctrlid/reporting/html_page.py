@@ -61,8 +61,8 @@ footer { margin-top: 3rem; color: var(--faint); font-size: 0.85rem; }
 # So many samples of a long record are also drawn one by one.
 CLOSE = 600
 DIAGNOSIS = (
-    "Output and errors where the gap is largest; RMS of the one-step errors along the two most "
-    "telling quantities; the candidates by rounds of the search."
+    "Output and errors where the gap is largest; normalized RMS of the one-step errors in bins of "
+    "two quantities; the candidates by rounds of the search."
 )
 
 

@@ -78,6 +78,7 @@ class Title:
 
 
 Block = Table | Title | str
+PLACES = "Normalized RMS of the one-step errors in the bin where it is largest (1 for noise)."
 
 
 def write_heading(result: Any) -> str:
@@ -210,9 +211,9 @@ def _make_redesign_blocks(r: Redesign) -> list[Block]:
 
 
 def _make_diagnosis_blocks(found: Diagnosis) -> list[Block]:
-    caption = f"{found.gap.kind.capitalize()} of {len(found.gap.time)} samples kept back."
+    caption = f"{_upper(wording.introduce_gap(found.gap))}."
     sizes = tuple(wording.list_gap_rows(found.gap))
-    gap = Table(("", "RMS error", "against the noise floor"), sizes, caption)
+    gap = Table(("", "RMS error", "relative to the noise floor"), sizes, caption)
     made: list[Block] = [wording.write_headline(found), gap, wording.describe_shrinking(found.gap)]
     if found.findings:
         made.append(Title("What is missing"))
@@ -224,11 +225,12 @@ def _make_diagnosis_blocks(found: Diagnosis) -> list[Block]:
         ]
         made += [f"{_upper(doubt)}." for doubt in wording.list_doubts(found, finding)]
     if found.findings:
-        made.append(wording.EVIDENCE)
+        made.append(wording.explain_evidence())
     if found.where:
-        made.append(Title("Where it sits"))
+        made.append(Title("Where the error is"))
     made += [
-        f"Along {p.axis}: {wording.describe_place(p)}." for p in wording.list_telling_places(found)
+        f"{_upper(p.axis)}: {wording.describe_place(p)}."
+        for p in wording.list_telling_places(found)
     ]
     sides = 2 if found.findings else 1
     places = tuple(
@@ -244,13 +246,13 @@ def _make_diagnosis_blocks(found: Diagnosis) -> list[Block]:
     )
     if places:
         columns = (
-            "along",
+            "in bins of",
             *("before", "after")[:sides],
-            *("chance before", "chance after")[:sides],
+            *("p-value before", "p-value after")[:sides],
         )
-        made.append(Table(columns, places, "RMS of the one-step errors at worst; 1 is noise."))
+        made.append(Table(columns, places, PLACES))
     if found.verdict == "nothing missing" and found.sensitivity:
-        made.append(Table(("effect", "smallest size that would have been seen"),
+        made.append(Table(("effect", "smallest size that this record would have shown"),
                           tuple(wording.list_sensitivity_rows(found))))  # fmt: skip
     made.append(Title("Parameters, noise and remarks"))
     parameters = tuple(
@@ -260,12 +262,14 @@ def _make_diagnosis_blocks(found: Diagnosis) -> list[Block]:
     )  # fmt: skip
     if parameters:
         titles = ("parameter", "given", "recalibrated", "final", "standard error")
-        made.append(Table(titles, parameters, "The model's own parameters."))
+        made.append(Table(titles, parameters, "The free parameters of the model."))
     made += [
         f"{_upper(line)}."
         for line in (wording.describe_disturbance(found), wording.describe_remains(found))
     ]
-    made += [f"About the record: {remark.rstrip('.')}." for remark in found.audit]
+    if found.audit:
+        made.append(Title("About the record"))
+    made += [f"{remark.rstrip('.')}." for remark in found.audit]
     made += [f"Note: {remark.rstrip('.')}." for remark in found.notes]
     tried = tuple(
         (type(c.effect).__name__, str(c.round), f"{c.gain:.1f}", f"{c.penalty:.1f}", c.remark)

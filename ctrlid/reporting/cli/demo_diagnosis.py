@@ -110,14 +110,14 @@ def tell_diagnosis(
     model = loop.with_parameters({"K": factor * MAGNET})
     axes = plot.record(record[: min(len(record), 16 * HOLD)])
     text = (
-        f"The same ball at a gap of {1e3 * GAP:g} mm, with jumps of {2e3 * AMPLITUDE:g} mm: large "
-        "enough to see more than a linear model. This apparatus has something that the equation "
-        "m x'' = m g - K V^2/x^2 lacks: the seed has drawn one effect of five, and its size. The "
-        f"model does not have it, and its K is {100 * abs(factor - 1):.0f} % too "
-        f"{'large' if factor > 1 else 'small'}. Logged are "
-        f"{len(record)} samples every {1e3 * PERIOD:g} ms, with sensor noise of "
-        f"{1e6 * SENSOR_NOISE:g} um and a random force of {FORCE_NOISE:g} m/s^2.\n\n"
-        "diagnose() gets the model and the record. It is not told what was hidden."
+        f"The same ball hangs at a gap of {1e3 * GAP:g} mm, and the reference jumps by "
+        f"{2e3 * AMPLITUDE:g} mm, which is enough for nonlinear effects to show. This rig has an "
+        "effect that the equation m x'' = m g - K V^2/x^2 lacks. The seed has drawn it from five, "
+        f"and its size. The model does not contain it, and its K is {100 * abs(factor - 1):.0f} % "
+        f"too {'large' if factor > 1 else 'small'}. The record has {len(record)} samples, one "
+        f"every {1e3 * PERIOD:g} ms, with sensor noise of {1e6 * SENSOR_NOISE:g} um and a random "
+        f"force of {FORCE_NOISE:g} m/s^2.\n\n"
+        "diagnose() gets the model and the record. It is not told which effect was hidden."
     )
     yield Section(TITLES[0], text, None, {"The beginning of the record.": axes})
     found = diagnose(model, record, progress=progress)
@@ -148,21 +148,23 @@ def reveal_effect(found: Diagnosis, effect: AbstractEffect, loop: Loop) -> str:
     named = {n for f in found.findings for n in (*f.names, *f.equivalents)}
     first = found.findings[0] if found.findings else None
     if first is not None and first.name == name and len(found.findings) == 1:
-        verdict = "It was found and named"
-        verdict += " alone." if len(first.names) == 1 else ", with others that look like it."
+        verdict = "It was found, and "
+        verdict += ("no alternative was named." if len(first.names) == 1 else
+                    "effects that resemble it were named beside it.")  # fmt: skip
     elif name in named:
-        verdict = "It is among what was named."
+        verdict = "It is among the effects that were named."
     else:
         verdict = f"IT WAS NOT NAMED: the verdict is {found.verdict!r}."
     gap = found.gap
-    text = f"Hidden was {effect.text(loop)}. {verdict}"
+    text = f"The hidden effect was {effect.text(loop)}. {verdict}"
     if math.isfinite(gap.before) and gap.before > 0 and found.findings:
         before, after, floor = (
             _text.write_quantity(v, gap.unit) for v in (gap.before, gap.after, gap.floor)
         )
         closed = write_percent(1 - gap.after / gap.before)
-        text += (f" On samples that no parameter was fitted to the gap of the {gap.kind} shrank "
-                 f"from {before} to {after}, by {closed}; noise alone leaves {floor}.")  # fmt: skip
+        text += (f" On samples that were not used for the fit, the RMS error of the {gap.kind} "
+                 f"decreased from {before} to {after}, by {closed}; the noise floor is "
+                 f"{floor}.")  # fmt: skip
     return text
 
 
@@ -175,4 +177,4 @@ def _make_size_table(found: Diagnosis, effect: AbstractEffect) -> Any:
         fitted = "not found" if own is None else _text.with_error(
             own.effect.values()[name], own.standard_errors.get(name, math.nan))  # fmt: skip
         rows.append((f"{type(effect).__name__}.{name}", f"{value:.5g}", "none", fitted))
-    return Table(("", "true", "believed", "fitted"), tuple(rows))
+    return Table(("", "true", "model", "fitted"), tuple(rows))

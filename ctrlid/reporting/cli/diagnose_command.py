@@ -15,15 +15,16 @@ from .arguments import PLANTS, parse_assignment, parse_assignments, read_loop, r
 
 EPILOG = """\
 example: a levitated ball was logged in log.csv with the columns time [s], ref [m], volt [V] and
-gap [m]; the magnet constant K is known to 10 % only, the controller is a sampled PID:
+gap [m]. The magnet constant K is known only to 10 %, and the controller is a sampled PID:
 
   ctrlid diagnose log.csv --columns r=ref,u=volt,y=gap --model maglev \\
       --param m=0.0213 K=3.3e-6 --free K --at-output 0.012 \\
       --controller kp=-1200,kd=-20,bias=3.0 --save found
 
-It prints what the model lacks, and found/ holds the report, its picture and the diagnosis as a
-file that ctrlid.load_diagnosis() reads. For a plant of your own write plant.py with a
-control.nlsys called ball, or with a whole ctrlid.Loop, and give --model plant.py:ball.
+It prints what the model lacks. The folder found/ then holds the report, its picture and the
+diagnosis as a file that ctrlid.load_diagnosis() reads. For a plant of your own, write a file
+plant.py with a control.nlsys system or a whole ctrlid.Loop called ball, and give
+--model plant.py:ball.
 """
 
 
@@ -36,15 +37,20 @@ def add_parser(commands: Any) -> None:
         What ``ArgumentParser.add_subparsers`` returned.
     """
     parser = commands.add_parser(
-        "diagnose", help="find what a model lacks that a measured record has",
-        description="Find the physics that a model lacks and a measured record shows.",
+        "diagnose", help="find the physics that a model lacks, from a measured record",
+        description="Find the physics that a model lacks, from a measured record.",
         epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip
     add = parser.add_argument
-    add("file", type=Path, metavar="FILE.csv", help="record: columns for u and y, better also r")
+    add(
+        "file",
+        type=Path,
+        metavar="FILE.csv",
+        help="file of the record, with columns for u, y and, if possible, r",
+    )
     add("--model", required=True, metavar="MODEL",
-        help=f"{', '.join(PLANTS)}, or MODULE:NAME or FILE.py:NAME of a control system, of a "
-        "ctrlid.Loop, or of a function that returns one")  # fmt: skip
+        help=f"one of {', '.join(PLANTS)}; or MODULE:NAME or FILE.py:NAME, where NAME is a "
+        "python-control system, a ctrlid.Loop, or a function that returns one")  # fmt: skip
     add(
         "--param",
         type=parse_assignment,
@@ -55,25 +61,43 @@ def add_parser(commands: Any) -> None:
         help="parameters of the model, in SI units",
     )
     add("--free", nargs="*", metavar="NAME",
-        help="parameters that are uncertain and recalibrated first; by default "
-        + ", ".join(f"{' and '.join(v)} of {k}" for k, v in PLANTS.items()))  # fmt: skip
-    add("--at-output", type=float, metavar="Y", help="operating point; by default the mean of y")
+        help="uncertain parameters of the model, which are fitted first (default: "
+        + ", ".join(f"{' and '.join(v)} of {k}" for k, v in PLANTS.items()) + ")")  # fmt: skip
+    add("--at-output", type=float, metavar="Y",
+        help="output at the operating point (default: the mean of y)")  # fmt: skip
     add("--input-bias", type=float, metavar="U",
-        help="what the controller adds to u; by default what holds the model at rest")  # fmt: skip
-    add("--dt", type=float, metavar="S", help="sampling period; by default of the time column")
+        help="bias that the controller adds to u (default: the input that holds the model at "
+        "rest)")  # fmt: skip
+    add("--dt", type=float, metavar="S",
+        help="sampling period in seconds (default: that of the time column)")  # fmt: skip
     add("--columns", type=parse_assignments, default={}, metavar="r=REF,u=VOLT,y=GAP",
         help="names of the columns for r, u, y and time")  # fmt: skip
     add("--controller", metavar="C",
-        help="as for --model, or a PID as in kp=..,ki=..,kd=..; by default unknown")  # fmt: skip
+        help="the controller: MODULE:NAME, FILE.py:NAME, or a PID written as "
+        "kp=..,ki=..,kd=.. (default: not known)")  # fmt: skip
     add("--hold", choices=("zoh", "foh"),
-        help="u between samples: held (default), or straight, as of an analog circuit")  # fmt: skip
+        help="u between the samples: zoh for held (default), foh for straight lines, as an analog "
+        "controller makes them")  # fmt: skip
     add("--gaps", choices=("error", "mask"), default="error",
-        help="missing samples: refuse the file (default), or leave them out")  # fmt: skip
+        help="missing samples: error to refuse the file (default), mask to leave them "
+        "out")  # fmt: skip
     add("--validation", type=Path, metavar="FILE2.csv",
-        help="a second record, to show the gap on; by default a part of the first")  # fmt: skip
-    add("--jobs", type=int, default=None, metavar="N", help="processor cores to use")
-    add("--save", type=Path, metavar="DIR", help="new folder for report, picture and diagnosis")
-    add("--quiet", action="store_true", help="no progress on the terminal")
+        help="a second record, on which model and data are compared (default: the last quarter "
+        "of the first)")  # fmt: skip
+    add(
+        "--jobs",
+        type=int,
+        default=None,
+        metavar="N",
+        help="number of processor cores to use (default: 1)",
+    )
+    add(
+        "--save",
+        type=Path,
+        metavar="DIR",
+        help="new folder for the report, its picture and the diagnosis",
+    )
+    add("--quiet", action="store_true", help="show no progress on the terminal")
     parser.set_defaults(run=run_diagnosis)
 
 

@@ -116,7 +116,7 @@ def _limit_view(ax: Any, y: Array) -> None:
 def _draw_errors(ax: Any, place: BinnedErrors | None, found: Diagnosis) -> None:
     """Draw the RMS of the one-step errors along one quantity, before and after."""
     if place is None:
-        ax.text(0.5, 0.5, "no place is known", ha="center", va="center", transform=ax.transAxes)
+        ax.text(0.5, 0.5, "no bins to show", ha="center", va="center", transform=ax.transAxes)
         ax.set_axis_off()
         return
     at, before, after = np.arange(len(place.before)), np.sqrt(place.before), np.sqrt(place.after)
@@ -133,7 +133,7 @@ def _draw_errors(ax: Any, place: BinnedErrors | None, found: Diagnosis) -> None:
     every = -(-len(at) // 5)
     ax.set_xlim(0, len(at))
     ax.set_xlabel(title)
-    ax.set_ylabel("one-step RMS error /\nthat of noise [1]")
+    ax.set_ylabel("normalized RMS of\none-step errors [1]")
     top = float(np.nanmax([*before, *after, 1.0]))
     finish_axes(ax, columns=3, size="small")
     if top > 10:
@@ -163,7 +163,7 @@ def _draw_ranking(ax: Any, rounds: Mapping[int, Sequence[_pictures.Bar]]) -> Non
     if not rounds:
         ax.text(0.5, 0.5, "no candidate was tried", ha="center", transform=ax.transAxes)
     gate = THRESHOLD.gate
-    ax.axvline(gate, color="k", linewidth=1, linestyle="--", label="earns a place")
+    ax.axvline(gate, color="k", linewidth=1, linestyle="--", label=f"required net gain, {gate:g}")
     ax.axvline(0, color="0.3", linewidth=0.8)
     ax.set_xscale("symlog", linthresh=2 * gate)
     ax.xaxis.set_major_formatter("{x:g}")
