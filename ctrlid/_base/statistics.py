@@ -32,7 +32,7 @@ def compute_lagged_products(a: Array, b: Array, lags: int) -> Array:
 
     Examples
     --------
-    >>> lagged_products(np.array([1.0, 2.0, 3.0]), np.array([1.0, 0.0, 1.0]), 3)
+    >>> compute_lagged_products(np.array([1.0, 2.0, 3.0]), np.array([1.0, 0.0, 1.0]), 3)
     array([4., 2., 3., 0.])
     """
     n = len(a)

@@ -86,7 +86,7 @@ def choose_prefix(size: float, unit: str) -> tuple[float, str]:
 
     Examples
     --------
-    >>> prefix(0.03, "m"), prefix(0.03, "1/s")
+    >>> choose_prefix(0.03, "m"), choose_prefix(0.03, "1/s")
     ((1000.0, 'mm'), (1.0, '1/s'))
     """
     if unit not in PREFIXED or not 0 < abs(size) < math.inf:
@@ -118,7 +118,7 @@ def write_quantity(
 
     Examples
     --------
-    >>> quantity(6.1234e-4, "s", 3e-6), quantity(1.23456e-5, "m")
+    >>> write_quantity(6.1234e-4, "s", 3e-6), write_quantity(1.23456e-5, "m")
     ('0.6123 ± 0.0030 ms', '12.3 µm')
     """
     factor, unit = choose_prefix(value, unit)
@@ -145,7 +145,7 @@ def drop_roundoff(value: float, error: float) -> float:
 
     Examples
     --------
-    >>> shortest(0.1 + 0.2, 1e-15), shortest(1 / 3, 1e-15)
+    >>> drop_roundoff(0.1 + 0.2, 1e-15), drop_roundoff(1 / 3, 1e-15)
     (0.3, 0.3333333333333333)
     """
     short = float(f"{value:.12g}")
@@ -171,8 +171,10 @@ def write_polynomial(coefficients: Sequence[float], variable: str, digits: int =
 
     Examples
     --------
-    >>> polynomial([2.0, -1.0, 0.0, 0.5], "s"), polynomial([-1, 0, 1], "z"), polynomial([0], "z")
-    ('2 s^3 - s^2 + 0.5', '-z^2 + 1', '0')
+    >>> write_polynomial([2.0, -1.0, 0.0, 0.5], "s"), write_polynomial([-1, 0, 1], "z")
+    ('2 s^3 - s^2 + 0.5', '-z^2 + 1')
+    >>> write_polynomial([0], "z")
+    '0'
     """
     text = ""
     for power, value in zip(range(len(coefficients) - 1, -1, -1), coefficients, strict=True):
@@ -285,7 +287,7 @@ def write_html(text: str, width: int = 100) -> str:
 
     Examples
     --------
-    >>> print(html_lines("p < 0.01\n  NO POLE OUTSIDE"))
+    >>> print(write_html("p < 0.01\n  NO POLE OUTSIDE"))
     <pre class="ctrlid" style="line-height: 1.35; overflow-x: auto">p &lt; 0.01
     <strong>  NO POLE OUTSIDE</strong></pre>
     """

@@ -28,7 +28,7 @@ def find_whole_past(valid: Any, lags: int) -> Any:
 
     Examples
     --------
-    >>> whole_past(np.array([True, True, False, True, True, True]), 1).tolist()
+    >>> find_whole_past(np.array([True, True, False, True, True, True]), 1).tolist()
     [False, True, False, False, True, True]
     """
     bad = np.concatenate([[0], np.cumsum(~np.asarray(valid, dtype=bool))])

@@ -83,7 +83,7 @@ def reflect_poles(structure: Structure, theta: Array, n: int) -> Array:
     Examples
     --------
     >>> import numpy as np
-    >>> stable_factor(Structure(2, 1), np.array([-2.5, 1.0, 0.3]), 10_000)
+    >>> reflect_poles(Structure(2, 1), np.array([-2.5, 1.0, 0.3]), 10_000)
     array([ 1.  , -1.  ,  0.25])
     """
     delta = to_differences(structure, theta)[: structure.na]

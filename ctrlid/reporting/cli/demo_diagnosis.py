@@ -70,7 +70,7 @@ def hide_effect(seed: int) -> tuple[AbstractEffect, float]:
 
     Examples
     --------
-    >>> hide(3) == hide(3)
+    >>> hide_effect(3) == hide_effect(3)
     True
     """
     rng = np.random.default_rng([seed, 2])

@@ -113,7 +113,7 @@ def tell_identification(
 
     Examples
     --------
-    >>> next(story()).title
+    >>> next(tell_identification()).title
     'The physics'
     """
     bench = _make_bench()
