@@ -296,7 +296,7 @@ def test_active_bound_is_exact_and_in_capitals():
     for words in (
         "a1 = -2 (on its bound)",
         "a2 = 1 (fixed)",
-        "a1 SITS ON ITS BOUND -2: without ReciprocalPoles() the data would take it to -1.9",
+        "a1 IS ON ITS BOUND -2: without ReciprocalPoles() the data would take it to -1.9",
         "symptom, not a cure",
         "TWO POLES MERGE at z = 1",
     ):

@@ -224,7 +224,7 @@ def test_constraints_hold_exactly():
     assert G.estimate["b1"] / G.estimate["a2"] == pytest.approx(0.004, rel=1e-12)
     bounded = cid.fit_continuous(record, 2, constraints=[*SYMMETRIC, cid.Bounds("b1", -6.0, 0.0)])
     assert bounded.estimate["b1"] == -6.0
-    assert "SITS ON ITS BOUND" in str(bounded.estimate)
+    assert "IS ON ITS BOUND" in str(bounded.estimate)
 
 
 def test_records_and_stretches_share_one_model():

@@ -41,7 +41,7 @@ def test_the_papers_experiment(capsys):
     error = {T: abs(told["rate"](line["tied"]) - truth) for T, line in by_period.items()}
     assert error[0.001] > error[0.002] > error[0.005] < error[0.010]
     printed = capsys.readouterr().out
-    assert "SITS ON ITS BOUND" in printed
+    assert "IS ON ITS BOUND" in printed
     assert "NO POLE OUTSIDE THE UNIT CIRCLE" in printed
 
 

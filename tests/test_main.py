@@ -232,7 +232,7 @@ def test_doubts_of_the_estimator_are_passed_on(monkeypatch):
 
 def test_a_model_on_its_bound_is_called_so():
     text = chapters(told.TITLES[4], noise=0.5)[told.TITLES[4]].text
-    assert "THE MODEL SITS ON ITS BOUND, as the paper's equation (8) does" in text
+    assert "THE MODEL IS ON ITS BOUND, as the paper's equation (8) does" in text
 
 
 def test_a_refused_redesign_is_reported(monkeypatch):

@@ -165,7 +165,7 @@ constrained least squares (ARX): 100 rows, dt = 0.01 s
   equation error: standard deviation 0.1
   solved by orthogonal least squares
   active bounds: a1 <= -2 [ReciprocalPoles()]
-  a1 SITS ON ITS BOUND -2: without ReciprocalPoles() the data would take it to -1.95. \
+  a1 IS ON ITS BOUND -2: without ReciprocalPoles() the data would take it to -1.95. \
 An active bound is a symptom, not a cure: look for noise fed back through the controller, \
 a sampling period that is too short, or a constraint that does not hold.
   TWO POLES MERGE at z = 1.

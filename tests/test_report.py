@@ -128,7 +128,7 @@ def test_bad_news_of_a_model_stands_out(record, tmp_path):
     G = cid.fit_arx(record[1], na=2, nb=2, constraints=[cid.Bounds("a1", -1.0, 0.0)])
     page = read(cid.write_report(G, tmp_path / "r.html"))
     assert "on its bound" in page.cells
-    assert any("SITS ON ITS BOUND" in text for text in page.bad)
+    assert any("IS ON ITS BOUND" in text for text in page.bad)
     fixed = cid.fit_arx(record[1], na=2, nb=2, constraints=[cid.Fixed("a2", 0.9)])
     assert "fixed" in read(cid.write_report(fixed, tmp_path / "f.html")).cells
 

@@ -53,7 +53,7 @@ def share_out(
 
     Examples
     --------
-    >>> list(spread(abs, (-1, 2, -3), None))
+    >>> list(share_out(abs, (-1, 2, -3), None))
     [1, 2, 3]
     """
     if joblib.effective_n_jobs(jobs) == 1:
@@ -85,7 +85,7 @@ def run_side_by_side(function: Callable[[Item], Result], items: Iterable[Item]) 
 
     Examples
     --------
-    >>> side_by_side(abs, (-1, 2, -3))
+    >>> run_side_by_side(abs, (-1, 2, -3))
     [1, 2, 3]
     """
     given = list(items)

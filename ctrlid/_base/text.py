@@ -13,7 +13,7 @@ PREFIXED = ("m", "V", "A", "N", "m/s", "m/s^2", "N s/m", "s")
 
 
 def write_number(value: complex, digits: int = 7) -> str:
-    """Shortest usual form of a real or complex number."""
+    """Return the shortest usual form of a real or complex number."""
     value = complex(value)
     if value.imag == 0:
         return f"{value.real:.{digits}g}"
@@ -21,7 +21,7 @@ def write_number(value: complex, digits: int = 7) -> str:
 
 
 def with_error(value: complex, error: float) -> str:
-    """``value ± error`` with as many digits as the error allows.
+    """Return ``value ± error`` with as many digits as the error allows.
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ def choose_prefix(size: float, unit: str) -> tuple[float, str]:
 
     Examples
     --------
-    >>> prefix(0.03, "m"), prefix(0.03, "1/s")
+    >>> choose_prefix(0.03, "m"), choose_prefix(0.03, "1/s")
     ((1000.0, 'mm'), (1.0, '1/s'))
     """
     if unit not in PREFIXED or not 0 < abs(size) < math.inf:
@@ -118,12 +118,14 @@ def write_quantity(
 
     Examples
     --------
-    >>> quantity(6.1234e-4, "s", 3e-6), quantity(1.23456e-5, "m")
+    >>> write_quantity(6.1234e-4, "s", 3e-6), write_quantity(1.23456e-5, "m")
     ('0.6123 ± 0.0030 ms', '12.3 µm')
     """
     factor, unit = choose_prefix(value, unit)
     if error is None or error == 0 or not math.isfinite(error):
-        known = "" if error is None else " (fixed)" if error == 0 else " (not in the data)"
+        known = (
+            "" if error is None else " (fixed)" if error == 0 else " (not determined by the data)"
+        )
         return f"{write_number(factor * value, digits)} {unit}".strip() + known
     return f"{with_error(factor * value, factor * error)} {unit}".strip()
 
@@ -145,7 +147,7 @@ def drop_roundoff(value: float, error: float) -> float:
 
     Examples
     --------
-    >>> shortest(0.1 + 0.2, 1e-15), shortest(1 / 3, 1e-15)
+    >>> drop_roundoff(0.1 + 0.2, 1e-15), drop_roundoff(1 / 3, 1e-15)
     (0.3, 0.3333333333333333)
     """
     short = float(f"{value:.12g}")
@@ -171,8 +173,10 @@ def write_polynomial(coefficients: Sequence[float], variable: str, digits: int =
 
     Examples
     --------
-    >>> polynomial([2.0, -1.0, 0.0, 0.5], "s"), polynomial([-1, 0, 1], "z"), polynomial([0], "z")
-    ('2 s^3 - s^2 + 0.5', '-z^2 + 1', '0')
+    >>> write_polynomial([2.0, -1.0, 0.0, 0.5], "s"), write_polynomial([-1, 0, 1], "z")
+    ('2 s^3 - s^2 + 0.5', '-z^2 + 1')
+    >>> write_polynomial([0], "z")
+    '0'
     """
     text = ""
     for power, value in zip(range(len(coefficients) - 1, -1, -1), coefficients, strict=True):
@@ -194,8 +198,33 @@ def write_list(items: list[str] | tuple[str, ...]) -> str:
     return ", ".join(items[:-1]) + " and " + items[-1]
 
 
+def write_count(number: int, noun: str, plural: str = "") -> str:
+    """Write a number of things: one sample, two samples.
+
+    Parameters
+    ----------
+    number : int
+        How many there are.
+    noun : str
+        What one of them is called.
+    plural : str, optional
+        What several are called; by default the noun with an s.
+
+    Returns
+    -------
+    str
+        Number and noun.
+
+    Examples
+    --------
+    >>> write_count(1, "sample"), write_count(20, "sample")
+    ('1 sample', '20 samples')
+    """
+    return f"{number} {noun if number == 1 else plural or noun + 's'}"
+
+
 def with_unit(name: str, unit: str) -> str:
-    """``name [unit]``, so written that `split_unit` takes it apart again.
+    """Return ``name [unit]``, so written that `split_unit` takes it apart again.
 
     Parameters
     ----------
@@ -243,7 +272,7 @@ def split_unit(label: str) -> tuple[str, str]:
 
 
 def is_bad_news(text: str) -> bool:
-    """Whether a sentence has bad news in it: three or more words in capitals in a row.
+    """Return whether a sentence has bad news in it: three or more words in capitals in a row.
 
     Parameters
     ----------
@@ -257,7 +286,7 @@ def is_bad_news(text: str) -> bool:
 
     Examples
     --------
-    >>> is_bad_news("a1 SITS ON ITS BOUND -2"), is_bad_news("a PID under FOH")
+    >>> is_bad_news("a1 IS ON ITS BOUND -2"), is_bad_news("a PID under FOH")
     (True, False)
     """
     words = [w.strip(".,:;()") for w in text.split()]
@@ -285,7 +314,7 @@ def write_html(text: str, width: int = 100) -> str:
 
     Examples
     --------
-    >>> print(html_lines("p < 0.01\n  NO POLE OUTSIDE"))
+    >>> print(write_html("p < 0.01\n  NO POLE OUTSIDE"))
     <pre class="ctrlid" style="line-height: 1.35; overflow-x: auto">p &lt; 0.01
     <strong>  NO POLE OUTSIDE</strong></pre>
     """

@@ -8,14 +8,15 @@ from typing import Any
 import numpy as np
 
 from .._base.errors import CtrlidError
+from .._base.text import write_list
 
 
 def check_samples(name: str, values: Any) -> Any:
     """Copy a signal to a read-only (n,) float array, or say what is wrong with it."""
     if np.ma.is_masked(values):
         raise CtrlidError(
-            f"{name} is a masked array, and its masked values would come back to life: fill them "
-            "and give valid=~mask"
+            f"{name} is a masked array, and a record would use its masked values: fill them and "
+            "give valid=~mask"
         )
     try:
         array = np.asarray(values)
@@ -34,8 +35,8 @@ def check_samples(name: str, values: Any) -> Any:
     if bad.size:
         raise CtrlidError(
             f"{name} must be finite; {bad.size} of {array.size} values are NaN or infinite, the "
-            f"first at sample {bad[0]}. Cut them out by slicing, or fill them and mark the samples "
-            "as not counting with valid="
+            f"first at sample {bad[0]}. Cut them out by slicing, or fill them and exclude the "
+            "samples with valid="
         )
     array.setflags(write=False)
     return array
@@ -47,12 +48,15 @@ def check_words(what: str, given: Any, known: Sequence[str]) -> Mapping[str, str
         raise CtrlidError(f"{what} maps signals to words, as in {{'y': 'm'}}; given {given!r}")
     unknown = [k for k in given if k not in known]
     if unknown:
-        raise CtrlidError(f"{what} has {unknown}, which the record does not; known: {list(known)}")
+        raise CtrlidError(
+            f"{what} names {write_list([repr(k) for k in unknown])}, which the record does not "
+            f"have; it has {', '.join(known)}"
+        )
     return MappingProxyType(dict(given))
 
 
 def check_seconds(what: str, value: Any) -> float:
     """Return a time as float, or say what it is and that it must be a finite number."""
     if isinstance(value, bool) or not isinstance(value, Real) or not np.isfinite(float(value)):
-        raise CtrlidError(f"{what} in seconds, a finite number; given {value!r}")
+        raise CtrlidError(f"{what} must be a finite number, in seconds; given {value!r}")
     return float(value)

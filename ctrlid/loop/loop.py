@@ -96,8 +96,9 @@ class Loop:
                 f"OperatingPoint(states=, input=, output=); given {type(at).__name__}"
             )
         if not self.linear_plant and len(at.states) != n:
-            raise CtrlidError(f"at= has {len(at.states)} states, {equations.name} has {n}: "
-                              f"{', '.join(equations.states)}")  # fmt: skip
+            raise CtrlidError(f"at= has {len(at.states)} states, but {equations.name} has {n} "
+                              f"({', '.join(equations.states)}); give "
+                              "at=operating_point(plant, output=...)")  # fmt: skip
         try:
             lower, upper = (float(v) for v in self.input_limits)
         except (TypeError, ValueError) as reason:
@@ -146,8 +147,8 @@ class Loop:
             refusal = EffectDoesNotApply if effects else CtrlidError
             raise refusal(
                 f"{kept.name} passes its input to its output without delay, so the loop with "
-                "a controller is algebraic; add the sensor's or actuator's lag to the plant. If "
-                "this is the controller, the order is Loop(plant, controller, ...)"
+                "a controller would be algebraic; add the lag of the sensor or the actuator to the "
+                "plant. If this is the controller, the order is Loop(plant, controller, ...)"
             )
 
     @property

@@ -25,7 +25,7 @@ def list_coefficients(system: Any) -> dict[str, float]:
 
     Examples
     --------
-    >>> coefficients(ct.tf([6.0], [2.0, 4.0, 0.0]))
+    >>> list_coefficients(ct.tf([6.0], [2.0, 4.0, 0.0]))
     {'a1': 2.0, 'a2': 0.0, 'b1': 3.0}
     """
     num, den = (np.trim_zeros(np.asarray(c[0][0], float), "f") for c in (system.num, system.den))

@@ -197,7 +197,7 @@ def solve_program(cost: Cost, rows: Rows, below: float = np.inf) -> Solution:
 
 
 def _find_active_set(slope: Array, room: Array, rows: Rows) -> IndexArray:
-    """Rows held with equality at the point of ``slope @ u <= room`` nearest to zero.
+    """Return the rows held with equality at the point of ``slope @ u <= room`` nearest to zero.
 
     ProxQP proposes; then rows with a multiplier of the wrong sign leave and violated rows enter
     until the optimality conditions hold to rounding.
@@ -219,8 +219,8 @@ def _find_active_set(slope: Array, room: Array, rows: Rows) -> IndexArray:
         return held
     raise CtrlidError(
         "The quadratic program of the constrained fit could not be solved to its optimality "
-        f"conditions; its rows are {', '.join(map(repr, rows.rows))}. Nearly contradicting bounds "
-        "do this: loosen or drop one of them."
+        f"conditions; its rows are {', '.join(map(repr, rows.rows))}. The usual cause are bounds "
+        "that nearly contradict each other: loosen or drop one of them."
     )
 
 
@@ -246,7 +246,7 @@ def _exchange_rows(slope: Array, room: Array, start: IndexArray) -> IndexArray |
 
 
 def compute_covariance(cost: Cost, normals: Array) -> tuple[Array, float]:
-    """How equation errors of variance one scatter the coefficients.
+    """Return how equation errors of variance one scatter the coefficients.
 
     Parameters
     ----------
