@@ -108,6 +108,6 @@ def test_the_tutorial(capsys):
     assert "SOMETHING IS MISSING" in printed
     assert "Explained. Missing was InputDelay" in printed
     assert printed.count("the promise holds") == 2
-    assert printed.count("DEGREES OF THE PROMISE ARE LOST") == 2
+    assert printed.count("DEGREES OF PHASE MARGIN ARE LOST") == 2
     assert told["found"].loop.parameters["K"] == pytest.approx(1.04 * 3.34e-6, rel=1e-3)
     assert told["page"].read_text("utf-8").count("<img ") >= 6

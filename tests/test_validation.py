@@ -374,7 +374,7 @@ def test_the_table_reads_as_it_should():
     assert lines[1].split() == ["curve", "fit", "RMS", "error", "[m]", "noise", "explains"]
     assert lines[2].strip().startswith("one-step prediction ")
     assert lines[4].strip().startswith("closed-loop simulation ")
-    head = "  correlation of one-step errors       passed?           largest share of variance"
+    head = "  correlation of one-step errors       passed?           largest    variance share"
     assert lines[5] == head
     assert lines[6].split()[:5] == ["with", "their", "own", "past", "yes"]
     assert len({len(line) for line in lines[1:6]}) == 1

@@ -49,8 +49,8 @@ def check_words(what: str, given: Any, known: Sequence[str]) -> Mapping[str, str
     unknown = [k for k in given if k not in known]
     if unknown:
         raise CtrlidError(
-            f"{what} names {write_list([repr(k) for k in unknown])}, which the record does not "
-            f"have; it has {', '.join(known)}"
+            f"{what} has {write_list([repr(k) for k in unknown])}, which the record does not have; "
+            f"its signals are {', '.join(known)}"
         )
     return MappingProxyType(dict(given))
 
@@ -58,5 +58,5 @@ def check_words(what: str, given: Any, known: Sequence[str]) -> Mapping[str, str
 def check_seconds(what: str, value: Any) -> float:
     """Return a time as float, or say what it is and that it must be a finite number."""
     if isinstance(value, bool) or not isinstance(value, Real) or not np.isfinite(float(value)):
-        raise CtrlidError(f"{what} must be a finite number, in seconds; given {value!r}")
+        raise CtrlidError(f"{what} in seconds, a finite number; given {value!r}")
     return float(value)

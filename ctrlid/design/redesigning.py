@@ -126,8 +126,7 @@ class Redesign(Printed):
             text += f": {loss:.1f} DEGREES OF PHASE MARGIN ARE LOST."
         elif abs(shift) > CLOSE:
             side = "LOWER" if shift < 0 else "HIGHER"
-            text += (f": the phase margin is kept, but THE CROSSOVER IS {side} BY "
-                     f"{100 * abs(shift):.0f} %.")  # fmt: skip
+            text += f": THE CROSSOVER IS {side} BY {100 * abs(shift):.0f} %."
         else:
             worst = max(loss / p.phase_margin, abs(shift))
             text += f", so the promise holds within {max(math.ceil(100 * worst), 1)} %."

@@ -180,7 +180,7 @@ class Simulator:
         e = loop.equations()
         if not np.isfinite(e.evaluate(first.rest[: len(e.states)], loop.point.input)[0]).all():
             raise ModelCannotRun(
-                f"{e.name} is not defined at the operating point ({loop.point}); give "
+                f"{e.name} is not defined at the {loop.point}; give "
                 "at=operating_point(plant, output=...)"
             )
         # An undamped plant neither grows nor decays; round-off must not decide which.
@@ -310,10 +310,10 @@ def _explain_stop(
     good = max(k - 1, 0)
     text = f"the simulation stops at t = {at * loop.dt:.5g} s (sample {at}): "
     if inside:
-        text += f"{output} has diverged to {ys[0, k]:.4g}"
+        text += f"{output} has diverged to {ys[0, k]:.4g}, with {inp} = {us[0, good]:.4g}."
     else:
-        text += f"{output} has left the range where the plant is defined, from {ys[0, good]:.4g}"
-    text += f", with {inp} = {us[0, good]:.4g}."
+        text += (f"{output} left the range where the plant is defined. The last values inside are "
+                 f"{output} = {ys[0, good]:.4g} and {inp} = {us[0, good]:.4g}.")  # fmt: skip
     lower, upper = loop.input_limits
     recent = us[0, max(0, good - 20) : good + 1]
     if loop.controller is None:
@@ -327,11 +327,13 @@ def _explain_stop(
         )
     if np.any(recent <= lower) or np.any(recent >= upper):
         text += f" {inp} was at its limit ({lower:g} to {upper:g}) shortly before."
-    swing = np.max(np.abs(us[0, : good + 1] - op.input)) if good else 0.0
     asked = float(np.max(np.abs(w[1] - op.output)))
     text += (f" Near the operating point the loop is stable, so the signals are too large for it: "
-             f"the reference is up to {asked:.3g} from the operating point, and {inp} was up to "
-             f"{swing:.3g} from {op.input:.4g}.")  # fmt: skip
+             f"the reference is up to {asked:.3g} away from the operating point")  # fmt: skip
+    if good:
+        swing = np.max(np.abs(us[0, : good + 1] - op.input))
+        text += f", and {inp} was up to {swing:.3g} away from {op.input:.4g}"
+    text += "."
     if np.max(np.abs(w[1])) < abs(op.output) / 2:
         return (f"{text} Signals are absolute: if r was meant as a deviation from the operating "
                 f"point, add {op.output:.6g} to it")  # fmt: skip

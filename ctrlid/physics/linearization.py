@@ -11,7 +11,7 @@ from scipy import linalg
 
 from .._base.arrays import Array
 from .._base.errors import CtrlidError, ModelCannotRun
-from .._base.text import write_number
+from .._base.text import Printed, write_number
 from .conversions import to_polynomials
 from .equations import Equations, require_siso
 from .trace import trace
@@ -24,8 +24,8 @@ EQUILIBRIUM = 1e-9
 STARTS = 60
 
 
-@dataclass(frozen=True)
-class OperatingPoint:
+@dataclass(frozen=True, repr=False)
+class OperatingPoint(Printed):
     """Where a plant rests: its states, input and output in physical units.
 
     Parameters
@@ -46,7 +46,7 @@ class OperatingPoint:
     --------
     >>> import ctrlid as cid
     >>> print(cid.OperatingPoint(states=(0.012, 0.0), input=3.0, output=0.012))
-    input 3, output 0.012, states (0.012, 0)
+    operating point with input 3, output 0.012 and states (0.012, 0)
     """
 
     states: tuple[float, ...]
@@ -72,8 +72,8 @@ class OperatingPoint:
 
     def __str__(self) -> str:
         states = ", ".join(write_number(s, 6) for s in self.states)
-        return (f"input {write_number(self.input, 6)}, output {write_number(self.output, 6)}, "
-                f"states ({states})")  # fmt: skip
+        return (f"operating point with input {write_number(self.input, 6)}, output "
+                f"{write_number(self.output, 6)} and states ({states})")  # fmt: skip
 
 
 def operating_point(

@@ -140,7 +140,7 @@ class Comparison(Printed):
         ]
         if self.tests:
             rows.append(f"  {'correlation of one-step errors':<34}{'passed?':>10}{'largest':>18}"
-                        f"{'share of variance':>18}")  # fmt: skip
+                        f"{'variance share':>18}")  # fmt: skip
         for t in self.tests:
             worst = int(np.argmax(np.abs(t.values)))
             largest = f"{t.values[worst]:+.3f} at lag {t.lags[worst]}"

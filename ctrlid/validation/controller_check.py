@@ -147,10 +147,11 @@ def _explain_remainder(e: Any, left: float, record: Record) -> Fact:
     moving = [(s, 0) for s in (record.y, record.r) if np.ptp(s[record.valid]) > 0]
     follows = compute_explained_share(e, moving, record.valid, lags=10)
     if follows > FOLLOWS:
-        return ("other", f"the controller of the loop does not explain {100 * left:.3g} % of the "
-                f"variance of u (RMS {rms}), and {100 * follows:.0f} % of this part depends on r "
-                "and y: the true controller has other gains or another structure, or a slow signal "
-                "is added to u. Correct the controller, or give None.", left, True)  # fmt: skip
+        share = f"{100 * left:.3g} % of the variance of u" if left < 1 else "u"
+        return ("other", f"the controller of the loop does not explain {share} (RMS {rms}), and "
+                f"{100 * follows:.0f} % of this part depends on r and y: the true controller has "
+                "other gains or another structure, or a slow signal is added to u. Correct the "
+                "controller, or give None.", left, True)  # fmt: skip
     return ("injected", f"in addition to the output of the controller, u contains a signal of RMS "
             f"{rms} that does not depend on r and y: excitation, dither or rounding.", left,
             False)  # fmt: skip

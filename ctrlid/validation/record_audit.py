@@ -101,6 +101,8 @@ class Audit(Printed):
             return "Audit: no defect was found in this record."
         bad = len(self.harmful)
         harm = f"{bad} of which harm" if bad > 1 else f"{bad or 'none'} of which harms"
+        if len(self.findings) == 1:
+            harm = "which harms" if bad else "which does not harm"
         rows = [f"Audit: {write_count(len(self.findings), 'finding')}, {harm} a fit"]
         for f in self.findings:
             kind = f.kind.upper() if f.harmful else f.kind
@@ -147,7 +149,7 @@ def audit(record: Record, loop: Loop | None = None) -> Audit:
     >>> r = cid.random_binary(2000, amplitude=0.1, hold=50, seed=1)
     >>> record = cid.simulate(loop, r, sensor_noise=1e-4, seed=2)
     >>> print(cid.audit(record, loop))
-    Audit: 1 finding, none of which harms a fit
+    Audit: 1 finding, which does not harm a fit
       controller: the controller of the loop computes exactly the logged u from r and y.
     >>> stuck = cid.Record(r=r, u=record.u, y=np.minimum(record.y, 0.08), dt=0.01)
     >>> [f.kind for f in cid.audit(stuck).harmful]

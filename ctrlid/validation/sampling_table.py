@@ -145,7 +145,9 @@ def _poles(row: SamplingRow) -> str:
 
 
 def _write_result(row: SamplingRow, width: int) -> str:
-    off = f"> {100 * FAR:.0f} %" if row.deviation >= FAR else f"{100 * row.deviation:.2g} %"
+    share = 100 * row.deviation
+    off = f"> {100 * FAR:.0f} %" if row.deviation >= FAR else (
+        f"{share:.2g} %" if share < 99.5 else f"{share:.0f} %")  # fmt: skip
     judged = {True: "white", False: "NOT WHITE", None: "not tested"}[row.white]
     if row.independent is not None:
         judged += ", independent" if row.independent else ", CORRELATED WITH u OR r"

@@ -185,7 +185,9 @@ def solve_program(cost: Cost, rows: Rows, below: float = np.inf) -> Solution:
     slope, room = slope[~decided] / norm[~decided, None], room[~decided] / norm[~decided]
     worst = float(-room.min(initial=0.0))
     if worst <= 1e-13 * float(np.linalg.norm(cost.d)):
-        text = "orthogonal least squares" + (", equalities eliminated" if len(values) else "")
+        text = "orthogonal least squares" + (
+            " with the equality constraints eliminated" if len(values) else ""
+        )
         return Solution(free_theta, free_cost, rows, weights, (), free_theta, text)
     held = _find_active_set(slope, room / worst, rows)
     active = origin[held]

@@ -102,8 +102,8 @@ def fit_arx(
     unknowns = na + nb + len(regression.intercept_rows)
     if regression.rows <= unknowns:
         raise CtrlidError(
-            f"Too few samples: {regression.rows} equations for {unknowns} unknowns. An "
-            f"equation needs {max(na, nk + nb - 1) + 1} valid samples in succession. Record longer "
+            f"Too few samples: {_text.write_count(regression.rows, 'equation')} for {unknowns} "
+            f"unknowns. An equation needs {max(na, nk + nb - 1) + 1} valid samples in succession. Record longer "
             "or lower the orders."
         )
     try:
