@@ -268,7 +268,7 @@ def test_data_that_do_not_suffice_are_refused():
     with pytest.raises(CtrlidError, match="u is constant in all valid samples"):
         cid.fit_continuous(replace(record, u=np.ones(500)), poles=2)
     analog = experiment(loop_at(0.005, analog=True), n=500)
-    with pytest.raises(CtrlidError, match="a delay is modelled for a held input only"):
+    with pytest.raises(CtrlidError, match="a delay can be fitted only where the input is held"):
         cid.fit_continuous(analog, 2, delay=None, controller=loop_at(0.005, True).controller)
 
 

@@ -21,20 +21,20 @@ from problems import ROOT, drive, levitation, tank
 # Where any refusal is caught: it goes on as another one, or is printed, and decides nothing.
 BOUNDARIES = {
     "__main__.py: main",
-    "estimation/series.py: _one",
-    "reporting/cli/arguments.py: spoken_record",
-    "reporting/cli/arguments.py: assignment",
-    "reporting/cli/demo_identification.py: _redesigns",
+    "estimation/series.py: _fit_one",
+    "reporting/cli/arguments.py: read_record",
+    "reporting/cli/arguments.py: parse_assignment",
+    "reporting/cli/demo_identification.py: _tell_redesigns",
     "validation/controller_check.py: check_controller",
-    "validation/sampling_sweep.py: _fit",
+    "validation/sampling_sweep.py: _fit_row",
 }
 # A refusal is a `ValueError` too: where that is caught, in the rooms that try candidates out.
 OF_OTHERS = {
     "diagnosis/loading.py: load_diagnosis",
     "diagnosis/open_loop_fit.py: fit",  # hands a refusal on
-    "diagnosis/replicas.py: _normalized_controller",  # runs python-control alone
+    "diagnosis/replicas.py: _design_normalized_controller",  # runs python-control alone
     "loop/loop.py: __post_init__",
-    "loop/simulation.py: _signals",
+    "loop/simulation.py: _check_signals",
 }
 TRYING = ("diagnosis", "effects", "estimation/likelihood", "loop")
 

@@ -225,6 +225,15 @@ def test_several_steps_need_as_many_valid_samples():
 # --- refusals
 
 
+def test_a_prediction_prints_its_noise_with_units():
+    loop = levitated()
+    lines = str(cid.predict(loop, experiment(loop, n=500, sensor_noise=1e-6))).splitlines()
+    assert lines[0] == "One-step prediction of 500 samples"
+    assert "RMS of the innovations: " in lines[1]
+    assert " m; of the white force: " in lines[2]
+    assert lines[2].endswith(" m/s^2")
+
+
 def test_refusals():
     loop = levitated()
     record = experiment(loop, n=200)

@@ -103,8 +103,8 @@ def fit_arx(
     if regression.rows <= unknowns:
         raise CtrlidError(
             f"Too few samples: {_text.write_count(regression.rows, 'equation')} for {unknowns} "
-            f"unknowns. An equation needs {max(na, nk + nb - 1) + 1} valid samples in succession. Record longer "
-            "or lower the orders."
+            f"unknowns. An equation needs {max(na, nk + nb - 1) + 1} valid samples in succession. "
+            "Record longer or lower the orders."
         )
     try:
         found = minimize(make_arx_cost(regression), known, structure)
