@@ -69,8 +69,8 @@ def _make_parser() -> argparse.ArgumentParser:
         prog="ctrlid",
         description="Identify an unstable plant in closed loop: physics, lead controller, "
         "experiment, plain and constrained fit, comparison, and a redesign tried on the physics. "
-        "Then find what a model lacks: an effect drawn by the seed is hidden in a record and "
-        "diagnosed without being told. Results go to the terminal; figures and report.html to a "
+        "Then find what a model lacks: the seed draws an effect and hides it in a record, and the "
+        "diagnosis has to find it. Results are printed; figures and report.html are written to a "
         "new folder.",
     )
     parser.add_argument("--version", action="version", version=f"ctrlid {__version__}")
@@ -78,17 +78,17 @@ def _make_parser() -> argparse.ArgumentParser:
         "--seed",
         type=_parse_natural,
         default=1,
-        help="of reference, noise and what is hidden (%(default)s)",
+        help="seed of the reference, the noise and the hidden effect (default: %(default)s)",
     )
     parser.add_argument("--samples", type=_parse_samples, default=45_000, metavar="N",
-                        help="length of the experiment (%(default)s)")  # fmt: skip
+                        help="samples of the experiment (default: %(default)s)")  # fmt: skip
     parser.add_argument("--noise", type=_parse_share, default=0.1, metavar="SHARE",
                         help="standard deviation of the sensor noise, as a share of the jump "
-                        "of the reference (%(default)s)")  # fmt: skip
+                        "of the reference (default: %(default)s)")  # fmt: skip
     parser.add_argument("--output", type=Path, metavar="DIR",
-                        help=f"folder for figures and report; by default {FOLDER}, with a number "
-                        "where that exists")  # fmt: skip
-    parser.add_argument("--quiet", action="store_true", help="no progress on the terminal")
+                        help=f"folder for figures and report (default: {FOLDER}, with a number "
+                        "if it exists)")  # fmt: skip
+    parser.add_argument("--quiet", action="store_true", help="do not show the progress")
     add_parser(parser.add_subparsers(title="commands", metavar="COMMAND"))
     parser.set_defaults(run=_tell_stories)
     return parser
@@ -96,7 +96,7 @@ def _make_parser() -> argparse.ArgumentParser:
 
 def _parse_natural(text: str) -> int:
     if not text.isdecimal():
-        raise argparse.ArgumentTypeError(f"needs a whole number from 0; given {text}")
+        raise argparse.ArgumentTypeError(f"needs a whole number >= 0; given {text}")
     return int(text)
 
 
@@ -112,7 +112,7 @@ def _parse_share(text: str) -> float:
     except ValueError:
         value = math.nan
     if not (math.isfinite(value) and value >= 0):
-        raise argparse.ArgumentTypeError(f"needs a share such as 0.1, not negative; given {text}")
+        raise argparse.ArgumentTypeError(f"needs a share >= 0, such as 0.1; given {text}")
     return value
 
 

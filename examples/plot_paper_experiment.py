@@ -149,6 +149,7 @@ axes.minorticks_off()
 axes.set_xlabel("sampling period [ms]")
 axes.set_ylabel("rate of the largest pole [rad/s]")
 axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2)
+plt.show()
 
 # %%
 # This story asserts the findings of the paper.

@@ -102,6 +102,17 @@ def test_symmetric_poles_leave_no_doubt_about_the_phase():
     assert np.ptp([band.phase_low, band.phase_high]) == pytest.approx(0, abs=1e-9)
 
 
+def test_a_band_prints_as_a_table():
+    s = Structure(1, 1, domain="s")
+    model = fitted(s, [2.0, 3.0], np.diag([0.01, 0.04]), 0.0)
+    lines = str(cid.response_band(model, np.geomspace(0.1, 10, 50))).splitlines()
+    assert lines[0].startswith("Frequency response with 95 % confidence limits")
+    assert lines[1].split()[:2] == ["omega", "[rad/s]"]
+    assert len(lines) == 2 + 12
+    assert lines[2].split()[0] == "0.1"
+    assert lines[-1].split()[0] == "10"
+
+
 def test_bode_shades_the_band_of_a_fit():
     model = fitted(Structure(2, 2), [-2.04, 1.0, -0.3, -0.28], np.diag([1e-6, 0, 1e-4, 0]), 0.005)
     magnitude, phase = plot.bode({"fit": model, "physics": PLANT})

@@ -238,7 +238,7 @@ def test_leading_zeros_do_not_make_a_controller_improper():
         ({"integral": "euler"}, "PID integral must be one of backward, forward, trapezoidal; giv"),
         ({"derivative": "y"}, "PID derivative must be one of error, measurement; given 'y'"),
         ({"anti_windup": True}, "PID anti_windup must be one of clamp, .*; given True"),
-        ({"derivative": "measurement", "c": 0.5}, "means c=0; given c=0.5"),
+        ({"derivative": "measurement", "c": 0.5}, "sets c=0; leave c=0.5 out"),
         ({"anti_windup": "back-calculation", "ki": -2.0}, "back-calculation needs tracking_time"),
         ({"anti_windup": "back-calculation", "ki": 2.0, "tracking_time": 0.0},
          "needs tracking_time > 0 s; given tracking_time=0.0 with kp=1.0, ki=2.0"),

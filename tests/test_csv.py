@@ -124,7 +124,7 @@ def test_dt_without_a_time_column_and_a_valid_column(tmp_path):
         ("t,u,y\n0,1,2,9\n1,3,3,9\n", {}, "names 3 columns, its rows have 4; give every column"),
         ("t,u,y\n", {}, "has no rows of numbers below its header"),
         ("", {}, "has no header line"),
-        ("u,y\n1,2\n3,4\n", {}, r"has no time column \(t, time, .*\); its columns are u, y. Give"),
+        ("u,y\n1,2\n3,4\n", {}, r"has no time column \(t, time, .*\); its columns are u, y. Name"),
         ("t,u,y\n0,1,2\n1,3,4\n", {"time": "clock"}, "no column 'clock' for time"),
         ("t,u,y\n0,1,2\n1,3,4\n", {"extra": ["i"]}, "no column 'i' for extra"),
         ("t,u,y\n0,1,2\n1,3,4\n", {"gaps": "fill"}, "gaps must be 'error' or 'mask'; given 'fill'"),

@@ -116,7 +116,7 @@ HOLES = np.array([0.0, np.nan, 1.0, np.inf])
     [
         ({"u": None}, "needs u and y; u is None"),
         ({"y": HOLES}, r"y must be finite; 2 of 4 values are NaN or infinite, the first at sample 1"
-                       r"\. Cut them out by slicing, or fill them and mark .* with valid="),
+                       r"\. Cut them out by slicing, or fill them and exclude .* with valid="),
         ({"extra": {"i": HOLES}}, r"extra\['i'\] must be finite"),
         ({"u": np.ones((4, 2))}, r"u must be one-dimensional .* shape \(4, 2\). Pick one .*\[:, 0"),
         ({"u": 1.0}, r"one value per sample; given shape \(\). Repeat it with np.full"),
@@ -141,9 +141,9 @@ HOLES = np.array([0.0, np.nan, 1.0, np.inf])
         ({"valid": np.ones(N)}, r"valid must be 40 booleans, one per sample; given float64 of "
                                 r"shape \(40,\). A comparison makes booleans"),
         ({"valid": [True]}, r"given bool of shape \(1,\)"),
-        ({"names": {"v": "speed"}}, r"names has \['v'\], .* does not; known: \['r', 'u', 'y'\]"),
+        ({"names": {"v": "speed"}}, r"names has 'v', .* does not have; its signals are r, u, y"),
         ({"names": "force"}, "names maps signals to words, .*given 'force'"),
-        ({"units": {"i": "A"}}, r"units has \['i'\], .* does not; known: \['r', 'u', 'y'\]"),
+        ({"units": {"i": "A"}}, r"units has 'i', .* does not have; its signals are r, u, y"),
         ({"units": {"y": 1}}, "units maps signals to words, as in {'y': 'm'}; given {'y': 1}"),
         ({"extra": {"u": np.ones(N)}}, r"names other than r, u, y, t, time, valid; given \['u'\]"),
         ({"extra": {0: np.ones(N)}}, r"names other than .* given \[0\]"),
@@ -312,7 +312,9 @@ def test_unnamed_signals_move_under_plain_words(names):
 @pytest.mark.parametrize("old", ["x[0]", "y", "valid"])
 def test_nothing_is_overwritten(old):
     record = full(names={"u": old})
-    words = r"the old u would move to the extra channels as .* taken; name it otherwise with names="
+    words = (
+        r"the old u would be kept as the extra channel .* taken; give it another name first, with"
+    )
     with pytest.raises(cid.CtrlidError, match=words):
         record.with_input("current")
 
@@ -392,7 +394,7 @@ def test_a_sample_counts_where_all_under_the_filter_count(valid, q):
     if any(expected):
         np.testing.assert_array_equal(record.decimate(q).valid, expected)
     else:
-        with pytest.raises(cid.CtrlidError, match="no sample that counts"):
+        with pytest.raises(cid.CtrlidError, match="no valid sample"):
             record.decimate(q)
 
 
@@ -418,7 +420,7 @@ def test_refused_factors(q):
 
 
 def test_too_short_for_the_filter():
-    words = (r"decimate\(4\) would leave no sample that counts: its filter spans 81 samples and "
+    words = (r"decimate\(4\) would leave no valid sample: its filter spans 81 samples and "
              r"the longest valid stretch has 40. Use a smaller factor")  # fmt: skip
     with pytest.raises(cid.CtrlidError, match=words):
         make().decimate(4)
@@ -522,7 +524,7 @@ def test_a_closed_loop_is_recognised_by_its_labels():
 
 
 def test_a_reference_is_never_taken_for_the_input():
-    words = r"which signal is u: given None; .* has the inputs \['r'\] and the outputs \['y'\]"
+    words = r"which signal .* is u \(given u=None\); .* inputs \['r'\] or of the outputs \['y'\]"
     with pytest.raises(cid.CtrlidError, match=words):
         cid.Record.from_response(loop_response(["y"]))
 
@@ -530,15 +532,15 @@ def test_a_reference_is_never_taken_for_the_input():
 @pytest.mark.parametrize(
     ("response", "options", "words"),
     [
-        (loop_response(["y", "u"]), {"y": "x"}, "which signal is y: given 'x'; the response has"),
-        (loop_response(["y", "u"]), {"r": "x"}, "say which signal is r: given 'x'"),
-        (ct.initial_response(ct.ss(-1, 1, 1, 0), [0, 1, 2], [1]), {}, "which signal is u"),
+        (loop_response(["y", "u"]), {"y": "x"}, r"of the response is y \(given y='x'\); name one"),
+        (loop_response(["y", "u"]), {"r": "x"}, r"of the response is r \(given r='x'\)"),
+        (ct.initial_response(ct.ss(-1, 1, 1, 0), [0, 1, 2], [1]), {}, "of the response is u"),
         (ct.step_response(ct.ss([[-1.0]], [[1, 2]], 1, [[0, 0]]), [0, 1, 2]), {},
          "one experiment; the response has 2 traces. Compute it for one input at a time"),
         (ct.forced_response(ct.ss(-1, [[1, 2]], 1, [[0, 0]]), [0, 1, 2], np.ones((2, 3))), {},
-         r"which signal is u: given None; the response has the inputs \['u\[0\]', 'u\[1\]'\]"),
+         r"is u \(given u=None\); name one of the inputs \['u\[0\]', 'u\[1\]'\]"),
         (ct.TimeResponseData([0, 1, 3], [[0, 1, 2]], inputs=[[1, 1, 1]], issiso=True), {},
-         "sampled uniformly; the times of the response step by 1 to 2 s. Compute it at np.arange"),
+         "sampled uniformly, but the times of the response are 1 to 2 s apart. Compute it at"),
         (ct.TimeResponseData([0], [[0]], inputs=[[1]], issiso=True), {}, "at least 2 samples; the"),
         (ct.TimeResponseData([0, 1], [[0, 1]], inputs=[[1, 1]], issiso=True, input_labels=["x"],
                              output_labels=["x"]), {}, "input and an output called 'x' that diff"),
@@ -577,9 +579,9 @@ def test_as_records():
         ([make(), np.ones(3), 4], "the list given has ndarray, int"),
         (
             [make(), make(dt=0.2)],
-            "one sampling period and one hold; given 0.1 s zoh and 0.2 s zoh. De",
+            "the same sampling period and the same hold; given 0.1 s, 'zoh' and 0.2 s, 'zoh'. De",
         ),
-        ([make(), make(hold="foh")], "given 0.1 s zoh and 0.1 s foh"),
+        ([make(), make(hold="foh")], "given 0.1 s, 'zoh' and 0.1 s, 'foh'"),
     ],
 )
 def test_refused_lists(data, words):

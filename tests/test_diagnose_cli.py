@@ -192,7 +192,7 @@ def test_refusals_say_what_to_do(folder, asked, capsys):
     for words, arguments in (
         ("no column 'volts' for u; its columns are time [s], ref [m], volt [V], angle [m]. Name "
          "the right one with --columns u=NAME", ("--columns", "u=volts", *SERVO)),
-        ("--columns names r, u, y, time, as in --columns u=volt,y=gap; given v",
+        ("--columns takes r, u, y, time, as in --columns u=volt,y=gap; given v",
          ("--columns", "v=volt", *SERVO)),
         ("the model servo needs m, c; give them in SI units, as in --param m=... c=...",
          (*COLUMNS, "--model", "servo", "--param", "k=3")),
@@ -204,13 +204,13 @@ def test_refusals_say_what_to_do(folder, asked, capsys):
          (*COLUMNS, "--model", "nowhere:ball")),
         ("--model nowhere.py:ball: nowhere.py cannot be imported",
          (*COLUMNS, "--model", "nowhere.py:ball")),
-        ("bench.py has no ball; its control systems and loops are mine, loop, linear",
+        ("bench.py has no ball; its python-control systems and loops are mine, loop, linear",
          (*COLUMNS, "--model", "bench.py:ball")),
-        ("--model bench.py:number is a int; needed is a control system",
+        ("--model bench.py:number is a int; needed is a python-control system",
          (*COLUMNS, "--model", "bench.py:number")),
         ("--model bench.py:nothing returns a NoneType", (*COLUMNS, "--model", "bench.py:nothing")),
-        ("bench.py:loop is a whole loop and has its own operating point and controller: leave out "
-         "--at-output", (*COLUMNS, "--model", "bench.py:loop", "--at-output", "0")),
+        ("bench.py:loop is a ctrlid.Loop, which has its own operating point and controller: leave "
+         "out --at-output", (*COLUMNS, "--model", "bench.py:loop", "--at-output", "0")),
         ("bench.py:mine has no parameter 'c'; it has m, k",
          (*COLUMNS, "--model", "bench.py:mine", "--param", "c=3")),
         ("a PID has no parameter 'gain'; it has kp, ki",
@@ -225,11 +225,13 @@ def test_refusals_say_what_to_do(folder, asked, capsys):
     ):  # fmt: skip
         assert words in refused(capsys, "log.csv", *arguments)
     assert "cannot read nowhere.csv" in refused(capsys, "nowhere.csv", *SERVO)
-    assert "Give --columns time=NAME or --dt" in refused(capsys, "bare.csv", *SERVO)
+    assert "Name the column with --columns time=NAME, or give --dt" in refused(
+        capsys, "bare.csv", *SERVO
+    )
     slow = ("bare.csv", "--dt", 0.02, "--model", "bench.py:loop")
     assert "is sampled at 0.01 s, the record at 0.02 s; give" in refused(capsys, *slow)
     slow = ("bare.csv", "--dt", 10.0, "--model", "bench.py:loop")
-    assert "if the times are milliseconds, head their column t [ms]" in refused(capsys, *slow)
+    assert "if the times are in milliseconds, name their column t [ms]" in refused(capsys, *slow)
     assert asked == []
 
 

@@ -120,7 +120,7 @@ def test_report_is_read_in_a_minute(found, verdict):
     for part in ("maglev, 3000 samples", "closed-loop simulation of 1000 samples kept back",
                  "the model as given", "noise floor", "random force", "computed in 8.4 s",
                  "about the record: u moves in steps", "note: two samples were left out",
-                 "0.0213 (not in the data)"):  # fmt: skip
+                 "0.0213 (not determined by the data)"):  # fmt: skip
         assert part in text(found[verdict])
     assert "likelihood" not in text(found[verdict])
 

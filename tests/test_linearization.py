@@ -56,8 +56,12 @@ def test_servo_keeps_its_pole_at_the_origin():
     ("plant", "output", "words"),
     [
         (cid.plants.maglev(m=0.02, K=3e-6), -0.01, "maglev has no equilibrium with x = -0.01"),
-        (cid.plants.maglev(m=0.02, K=3e-6), 0.0, "no states and input V hold it there"),
-        (tank().plant, -0.2, "inside the plant's range"),
+        (
+            cid.plants.maglev(m=0.02, K=3e-6),
+            0.0,
+            "no states and input V were found that hold it there",
+        ),
+        (tank().plant, -0.2, "inside the range of the plant"),
         (cid.plants.maglev(m=0.02, K=3e-6), np.nan, "output must be a finite number"),
         (cid.plants.maglev(m=0.02, K=3e-6), "high", "output must be a finite number; given 'high'"),
     ],

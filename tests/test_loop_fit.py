@@ -3,6 +3,7 @@
 Groups: without noise; scatter; what is fitted with what; information; noise; limits; refusals.
 """
 
+import re
 from dataclasses import replace
 
 import control as ct
@@ -381,8 +382,10 @@ def test_parameters_that_do_the_same_are_said_to():
     fitted = cid.fit_loop(astray(loop, 7), record)
     found = fitted.estimate
     assert np.isinf(found.standard_errors).all()
-    assert found.notes == ("the data do not determine K, m (other parameters do the same)",)
-    assert str(found).count("(not in the data)") == 2
+    assert found.notes == (
+        "the data do not determine K and m: other parameters can compensate a change of them",
+    )
+    assert str(found).count("(not determined by the data)") == 2
     ratio = fitted.loop.parameters["K"] / fitted.loop.parameters["m"]
     assert ratio == pytest.approx(3.34e-6 / 0.0213, rel=1e-3)
     alone = cid.fit_loop(levitation(), record).estimate
@@ -433,15 +436,17 @@ def test_refusals():
     with pytest.raises(CtrlidError, match=r"fit_loop needs a Loop\(plant, .* given Transfer"):
         cid.fit_loop(ct.tf([1.0], [1.0, 1.0]), record)
     with pytest.raises(
-        CtrlidError, match=r"none was given; put them into free= .* \['m', 'K', 'g'"
+        CtrlidError, match=r"none was given\. Name them in free= .* the loop has m, K, g"
     ):
         cid.fit_loop(levitation(free=()), record)
-    with pytest.raises(CtrlidError, match=r"names of free parameters, given \['Km'\]"):
+    with pytest.raises(CtrlidError, match=r"names of the parameters to fit, given \['Km'\]"):
         cid.fit_loop(loop, record, free=("K", "Km"))
     with pytest.raises(CtrlidError, match=r"sampled at 0\.002 s, the record at 0\.004 s"):
         cid.fit_loop(loop, record.decimate(2, antialias=False))
     other = replace(record, hold="foh")
-    with pytest.raises(CtrlidError, match=r"one hold; given 0\.002 s zoh and 0\.002 s foh"):
+    with pytest.raises(
+        CtrlidError, match=r"the same hold; given 0\.002 s, 'zoh' and 0\.002 s, 'foh'"
+    ):
         cid.fit_loop(loop, [record, other])
     blind = cid.Record(u=record.u, y=record.y, dt=record.dt, valid=np.arange(300) < 9)
     with pytest.raises(CtrlidError, match="at least 10 valid samples; the record has 9 of 300"):
@@ -454,10 +459,13 @@ def test_texts():
     fitted = cid.fit_loop(loop, record)
     text = str(fitted)
     assert text.startswith("Loop(maglev, digital controller, dt=0.002 s")
-    assert f"maximum likelihood, {fitted.estimate.n_samples} samples, log-likelihood" in text
+    assert f"maximum likelihood, {fitted.estimate.n_samples} samples used, log-likelihood" in text
     error = float(fitted.estimate.standard_errors[0])
     assert f"  K = {with_error(fitted.estimate['K'], error)}\n" in text
-    assert "sensor noise" in text
+    noise = r"standard deviation of the sensor noise: \S+ m; of the white force: \S+ m/s\^2"
+    assert re.search(noise, text)
+    bare = replace(loop, plant=cid.linearize(loop.plant, loop.at), free=())
+    assert cid.predict(bare, replace(record, units={})).units == ("", "")
     assert "note:" not in text
     with pytest.raises(CtrlidError, match="'m' was not fitted; fitted were K"):
         fitted.estimate["m"]

@@ -34,16 +34,16 @@ def test_the_whole_story(folder, capsys):
         assert f"{number}. {title}" in out
     for sentence in (
         "A steel ball of 21.3 g hangs below a magnet",
-        "so it can only be identified in a closed loop",
+        "so the ball can be identified in closed loop only",
         "finds the lead with a crossover of 130 rad/s and a phase margin of 60 degrees",
-        "Logged are 3000 samples",
-        "finds a2 = 1",
-        "The constraint keeps the structure; it does not cure the feedback bias",
-        "what share of this error the noise explains",
-        "fit_iv() takes its past as instruments",
-        "Plain: 50.0 deg are promised at 120 rad/s, but IT DOES NOT KEEP THE BALL.",
-        "Constrained: Promised 50.0 deg at 120 rad/s, achieved",
-        "Instruments: Promised 50.0 deg at 120 rad/s, achieved",
+        "The record has 3000 samples",
+        "The result is a2 = 1",
+        "gives the right structure, but does not remove the bias under feedback",
+        "the share of the variance of its error that noise explains",
+        "fit_iv() uses its past as instruments",
+        "at 120 rad/s, but THE LOOP IS UNSTABLE on the physics.",
+        "Constrained: The model promises a phase margin of 50.0 deg at 120 rad/s; achieved",
+        "Instruments: The model promises a phase margin of 50.0 deg at 120 rad/s; achieved",
         "The same ball hangs at a gap of 12 mm",
         "3000 samples, one every 2 ms",
         "Diagnosis of maglev (3000 samples, dt = 0.002 s)",
@@ -106,11 +106,11 @@ def short(monkeypatch):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [(["--samples", "10"], "needs at least 500 samples; given 10"),
-     (["--seed", "-1"], "needs a whole number from 0; given -1"),
-     (["--seed", "x"], "needs a whole number from 0; given x"),
+     (["--seed", "-1"], "needs a whole number >= 0; given -1"),
+     (["--seed", "x"], "needs a whole number >= 0; given x"),
      (["--samples", "many"], "needs at least 500 samples; given many"),
-     (["--noise", "loud"], "needs a share such as 0.1, not negative; given loud"),
-     (["--noise", "-0.1"], "needs a share such as 0.1, not negative; given -0.1"),
+     (["--noise", "loud"], "needs a share >= 0, such as 0.1; given loud"),
+     (["--noise", "-0.1"], "needs a share >= 0, such as 0.1; given -0.1"),
      (["--noise", "nan"], "given nan"), (["--nonsense"], "unrecognized arguments: --nonsense"),
      (["nonsense"], "invalid choice: 'nonsense' (choose from ")],
 )  # fmt: skip
@@ -212,9 +212,9 @@ def chapters(last=told.TITLES[-1], **settings):
 def test_without_noise_the_story_does_not_speak_of_its_harm():
     sections = chapters(noise=0.0)
     plain, known = sections[told.TITLES[3]].text, sections[told.TITLES[4]].text
-    assert "It finds the unstable pole at +25." in plain
+    assert "The unstable pole of the fit is +25." in plain
     assert "NO POLE" not in plain
-    assert "perfect sensor" not in plain
+    assert "Without sensor noise" not in plain
     assert "bias" not in known
     assert sections[told.TITLES[7]].text.count("the promise holds") == 3
 
@@ -226,13 +226,13 @@ def test_doubts_of_the_estimator_are_passed_on(monkeypatch):
 
     monkeypatch.setattr(told, "fit_iv", doubtful)
     text = chapters(told.TITLES[5], noise=0.5)[told.TITLES[5]].text
-    assert "The model comes out without an unstable pole" in text
-    assert text.endswith("In doubt: the instruments are weak")
+    assert "The model has no unstable pole" in text
+    assert text.endswith("Warning: the instruments are weak")
 
 
 def test_a_model_on_its_bound_is_called_so():
     text = chapters(told.TITLES[4], noise=0.5)[told.TITLES[4]].text
-    assert "THE MODEL SITS ON ITS BOUND, as the paper's equation (8) does" in text
+    assert "THE MODEL IS ON ITS BOUND, as in equation (8) of the paper" in text
 
 
 def test_a_refused_redesign_is_reported(monkeypatch):

@@ -156,6 +156,16 @@ def test_a_resonance_a_thousandth_wide_is_not_missed():
     assert margins.phase_margin == pytest.approx(angles.min(), abs=0.05)
 
 
+def test_margins_print_as_a_table():
+    lines = str(cid.loop_margins(ct.tf([2], [1, -1]))).splitlines()
+    assert [line.split()[-1] for line in lines] == ["1.732", "60", "inf", "0.5", "1", "0.6046"]
+    assert str(cid.loop_margins(ct.tf([0.5], [1, 1]))).startswith("crossover [rad/s]")
+    assert "none" in str(cid.loop_margins(ct.tf([0.5], [1, 1])))
+    assert (
+        str(cid.loop_margins(ct.tf([1], [1, -2]))) == "THE LOOP IS UNSTABLE and so has no margins."
+    )
+
+
 def test_pure_gain_and_integrator_loops():
     margins = cid.loop_margins(2.0)
     assert margins.stable

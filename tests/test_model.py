@@ -150,25 +150,25 @@ def test_continuous_model():
     stable = estimate(
         [3.0, 2.0, 1.0], np.zeros((3, 3)), structure=Structure(2, 1, domain="s"), dt=0
     )
-    assert "no pole in the right half plane: the model is stable." in str(stable)
+    assert "no pole is in the right half plane: the model is stable." in str(stable)
 
 
 GOLDEN = """\
-constrained least squares (ARX): 100 rows, dt = 0.01 s
+constrained least squares (ARX), 100 samples used, dt = 0.01 s
   a1 = -2 (on its bound)
   a2 = 1 (fixed)
   b1 = (2.000 ± 0.010)e-05
   b2 = 0.100 ± 0.010
-  branch: a1 <= -2
+  branch of the constraint: a1 <= -2
   pole at z = 1 (fixed), s = 0 (fixed) rad/s
   pole at z = 1 (fixed), s = 0 (fixed) rad/s
   equation error: standard deviation 0.1
   solved by orthogonal least squares
   active bounds: a1 <= -2 [ReciprocalPoles()]
-  a1 SITS ON ITS BOUND -2: without ReciprocalPoles() the data would take it to -1.95. \
-An active bound is a symptom, not a cure: look for noise fed back through the controller, \
-a sampling period that is too short, or a constraint that does not hold.
-  TWO POLES MERGE at z = 1.
+  a1 IS ON ITS BOUND -2. Without ReciprocalPoles() the estimate would be -1.95. \
+An active bound is a symptom of bias, not a result: check for noise fed back through the \
+controller, a sampling period that is too short, or a constraint that does not hold.
+  TWO POLES COINCIDE at z = 1.
   NO POLE OUTSIDE THE UNIT CIRCLE."""
 
 

@@ -85,7 +85,7 @@ def test_a_model_shows_formula_and_estimate(record):
 def test_bad_news_is_bold_and_names_are_escaped(record):
     held = cid.fit_arx(record, na=2, nb=2, constraints=[cid.Bounds("a1", -1.0, 0.0)])
     page = held.estimate._repr_html_()
-    assert "SITS ON ITS BOUND" in re.search("<strong>(.*?)</strong>", page, re.DOTALL)[1]
+    assert "IS ON ITS BOUND" in re.search("<strong>(.*?)</strong>", page, re.DOTALL)[1]
     named = replace(record, name="<b> & co")
     assert "&lt;b&gt; &amp; co" in named._repr_html_()
     assert "<b>" not in named._repr_html_()

@@ -100,9 +100,7 @@ def test_record_without_reference_and_with_extra_channels(record):
     assert len(axes) == 3
     assert axes[2].get_ylabel() == "current [A]"
     assert legend(axes[0]) == ["measured y"]
-    with pytest.raises(
-        cid.CtrlidError, match=r"no extra channel \['speed'\]; it has \['current'\]"
-    ):
+    with pytest.raises(cid.CtrlidError, match=r"no extra channel 'speed'; it has current"):
         plot.record(made, extra=["speed"])
 
 
@@ -201,10 +199,10 @@ def test_residuals_have_bands_and_verdicts(comparison):
     assert len(axes) == len(comparison.tests) == 3
     for ax, test in zip(axes, comparison.tests, strict=True):
         assert ax.get_ylabel() == "correlation [1]"
-        assert ax.get_title(loc="left").startswith(test.name)
+        assert ax.get_title(loc="left").startswith(f"one-step errors {test.name}: ")
         assert ax.patches[0].get_y() == pytest.approx(-test.band)
     assert axes[-1].get_xlabel() == "lag [samples]"
-    assert "99 % band of chance" in legend(axes[0])
+    assert "99 % band" in legend(axes[0])
 
 
 def test_residuals_mark_what_is_no_chance(comparison):
@@ -212,7 +210,7 @@ def test_residuals_mark_what_is_no_chance(comparison):
     bad = replace(test, values=np.full_like(test.values, 0.5), p_value=1e-20)
     endless = replace(test, band=np.inf)
     axes = plot.residuals(replace(comparison, tests=(bad, endless)))
-    assert axes[0].get_title(loc="left").endswith("NOT CHANCE (p < 0.0001)")
+    assert axes[0].get_title(loc="left").endswith("NOT BY CHANCE (p < 0.0001)")
     assert "outside" in legend(axes[0])
     assert not axes[1].patches
 
@@ -321,7 +319,10 @@ def test_step_shows_promise_and_achievement(outcome):
 def test_step_says_when_the_physics_is_lost(outcome):
     lost = replace(outcome.achieved, stable=False)
     ax = plot.step(replace(outcome, achieved=lost, achieved_step=outcome.achieved_step[:4]))
-    assert legend(ax)[1] == f"achieved on the physics: UNSTABLE, lost after {outcome.time[4]:.2g} s"
+    assert (
+        legend(ax)[1]
+        == f"achieved on the physics: UNSTABLE, the simulation stops after {outcome.time[4]:.2g} s"
+    )
     assert len(ax.lines[1].get_ydata()) == 4
     never = replace(outcome.promised, settling_time=np.inf)
     endless = replace(outcome, promised=never, achieved=never)

@@ -225,6 +225,15 @@ def test_several_steps_need_as_many_valid_samples():
 # --- refusals
 
 
+def test_a_prediction_prints_its_noise_with_units():
+    loop = levitated()
+    lines = str(cid.predict(loop, experiment(loop, n=500, sensor_noise=1e-6))).splitlines()
+    assert lines[0] == "One-step prediction of 500 samples"
+    assert "RMS of the innovations: " in lines[1]
+    assert " m; of the white force: " in lines[2]
+    assert lines[2].endswith(" m/s^2")
+
+
 def test_refusals():
     loop = levitated()
     record = experiment(loop, n=200)
@@ -233,7 +242,7 @@ def test_refusals():
     with pytest.raises(CtrlidError, match=r"the loop is sampled at 0.001 s, the record at 0.002 s"):
         cid.predict(loop, record.decimate(2, antialias=False))
     for bad in (-1.0, np.nan, np.inf):
-        with pytest.raises(CtrlidError, match=r"force_noise is a ratio >= 0; given"):
+        with pytest.raises(CtrlidError, match=r"force_noise is the ratio .* >= 0; given"):
             cid.predict(loop, record, force_noise=bad)
     blind = cid.Record(u=record.u, y=record.y, dt=1e-3, valid=np.arange(200) < 9)
     with pytest.raises(CtrlidError, match="at least 10 valid samples; the record has 9 of 200"):
@@ -247,6 +256,6 @@ def test_a_model_that_cannot_follow_says_where():
     )  # fmt: skip
     y = 900 + np.sin(np.arange(300))
     record = cid.Record(u=np.zeros(300), y=y, dt=0.1, start=5.0)
-    with pytest.raises(CtrlidError, match=r"the predictor of burst lost the record at sample \d+ "
-                       r"\(t = [\d.]+ s\): .* mark the stretch as not valid"):  # fmt: skip
+    with pytest.raises(CtrlidError, match=r"the Kalman filter of burst diverges at sample \d+ "
+                       r"\(t = [\d.]+ s\): .* exclude these samples with valid="):  # fmt: skip
         cid.predict(cid.Loop(plant, None, dt=0.1), record)

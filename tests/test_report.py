@@ -111,7 +111,7 @@ def test_page_of_a_record_with_gaps_and_other_channels(record, tmp_path):
                       extra={"current": record[1].u})  # fmt: skip
     cid.write_report(made, tmp_path / "r.html")
     text = (tmp_path / "r.html").read_text("utf-8")
-    assert "75.0 % of them count; u is straight between samples." in text
+    assert "75.0 % of them valid; u is a straight line between samples." in text
     assert "not given" in read(tmp_path / "r.html").cells
     assert "current" in read(tmp_path / "r.html").cells
 
@@ -128,7 +128,7 @@ def test_bad_news_of_a_model_stands_out(record, tmp_path):
     G = cid.fit_arx(record[1], na=2, nb=2, constraints=[cid.Bounds("a1", -1.0, 0.0)])
     page = read(cid.write_report(G, tmp_path / "r.html"))
     assert "on its bound" in page.cells
-    assert any("SITS ON ITS BOUND" in text for text in page.bad)
+    assert any("IS ON ITS BOUND" in text for text in page.bad)
     fixed = cid.fit_arx(record[1], na=2, nb=2, constraints=[cid.Fixed("a2", 0.9)])
     assert "fixed" in read(cid.write_report(fixed, tmp_path / "f.html")).cells
 
@@ -161,11 +161,13 @@ def test_page_of_physical_parameters(record, tmp_path):
     page = read(cid.write_report(fitted, tmp_path / "r.html"))
     assert len(page.images) == 2
     assert {"k", f"{fitted.estimate['k']:.7g}", "standard error"} <= set(page.cells)
-    assert any(text.startswith("Sensor noise") for text in page.paragraphs)
+    assert any(
+        text.startswith("Standard deviation of the sensor noise: ") for text in page.paragraphs
+    )
     assert any("servo, " in text for text in page.paragraphs)
     lost = replace(fitted.estimate, covariance=np.diag([np.inf, 1e-6]), active=("c",))
     cells = read(cid.write_report(replace(fitted, estimate=lost), tmp_path / "l.html")).cells
-    assert "not in the data" in cells
+    assert "not determined by the data" in cells
     assert "on its bound" in cells
 
 
@@ -179,7 +181,7 @@ def test_standard_errors_are_qualified_where_they_need_it(record, tmp_path):
     for fit, said in ((cid.fit_arx, True), (cid.fit_iv, False)):
         G = fit(replace(record[1], hold="zoh"), na=2, nb=2)
         text = cid.write_report(G, tmp_path / "r.html").read_text("utf-8")
-        assert ("hold for white errors only" in text) == said
+        assert ("valid only if the errors are white" in text) == said
 
 
 def test_page_of_a_redesign(outcome, tmp_path):
@@ -194,7 +196,7 @@ def test_page_of_a_redesign(outcome, tmp_path):
     achieved = replace(outcome.achieved, stable=False, phase_margin=np.nan)
     lost = replace(outcome, achieved=achieved)
     page = read(cid.write_report(lost, tmp_path / "lost.html"))
-    assert any("DOES NOT KEEP THE PHYSICS STABLE" in text for text in page.bad)
+    assert any("DOES NOT STABILIZE THE PHYSICS" in text for text in page.bad)
 
 
 def test_sections_in_their_order(record, tmp_path):

@@ -69,7 +69,7 @@ def test_dependence_is_found():
     every = np.ones(2000, dtype=bool)
     found = cross_correlation(e, s, every, "r", first=0)
     assert not found.passed
-    assert found.name == "residual with past r"
+    assert found.name == "with past r"
     assert found.lags[np.argmax(np.abs(found.values))] == 3
     assert found.share == pytest.approx(np.var(0.25 * s) / np.var(e), abs=0.02)
     # What happened after it says nothing about a residual's past.

@@ -164,13 +164,13 @@ def test_a_ball_that_leaves_the_gap_is_an_error_that_says_when_and_why():
     assert "the simulation stops at t = " in text
     assert "x left the range where the plant is defined" in text
     assert "the signals are too large" in text
-    assert "V moved" in text
+    assert "V was up to" in text
     assert text.endswith("Use a smaller reference or less noise")
 
 
 def test_a_reference_of_deviations_is_recognized():
     loop, op = make(0.02, 0.01, 3.0)
-    with pytest.raises(CtrlidError, match=r"add 0\.01: signals are absolute"):
+    with pytest.raises(CtrlidError, match=r"Signals are absolute: .* add 0\.01 to it"):
         cid.simulate(loop, cid.random_binary(400, amplitude=0.01 * op.output, hold=30, seed=1))
 
 
@@ -195,7 +195,7 @@ def test_the_growth_of_a_loop_with_an_analog_controller_is_that_of_its_poles():
 def test_a_saturated_loop_says_so():
     loop, op = make(0.02, 0.01, 3.0)
     tight = cid.Loop(loop.plant, loop.controller, dt=loop.dt, at=op, input_limits=(2.95, 3.05))
-    with pytest.raises(CtrlidError, match=r"V was at its limit \(2.95..3.05\)"):
+    with pytest.raises(CtrlidError, match=r"V was at its limit \(2.95 to 3.05\)"):
         cid.simulate(tight, np.full(2000, op.output * 1.1))
 
 
@@ -264,7 +264,7 @@ POINT = cid.operating_point(MAGLEV, output=0.01)
         ({"dt": 0.01, "at": (0.01, 0.0)}, "at= needs an OperatingPoint"),
         (
             {"dt": 0.01, "at": cid.OperatingPoint((0.01,), 3, 0.01)},
-            "at= has 1 states, maglev has 2",
+            "at= has 1 state, but maglev has 2",
         ),
         ({"dt": 0.01, "input_limits": (3, 1)}, "needs lower < upper"),
         ({"dt": 0.01, "input_limits": 3}, "is a pair"),
@@ -335,7 +335,7 @@ def test_records_of_textbook_plants_have_units_and_an_open_fall_is_noticed():
     loop, op = make(0.02, 0.01, 3.0)
     assert dict(cid.simulate(loop, np.full(10, op.output)).units) == {"r": "m", "u": "V", "y": "m"}
     alone = cid.Loop(loop.plant, None, dt=loop.dt, at=op)
-    with pytest.raises(CtrlidError, match=r"x ran away to .* The loop is open"):
+    with pytest.raises(CtrlidError, match=r"x has diverged to .* The loop is open"):
         cid.simulate(alone, d=np.full(5000, -0.01))
     assert (
         cid.simulate(servo(None, dt=0.1), d=np.ones(4500)).y[-1] > 600

@@ -54,8 +54,8 @@ def test_a_noise_free_loop_is_reproduced_exactly(controller):
         assert curve.noise_share == 1
     simulated = found["simulation"]
     np.testing.assert_allclose(simulated.y, record.y, atol=1e-9 * np.std(record.y))
-    assert found.verdict == ("The closed-loop simulation reproduces maglev with a fit of 100 %: "
-                             "nothing is left to explain.")  # fmt: skip
+    assert found.verdict == ("The fit of the closed-loop simulation is 100 %: the model explains "
+                             "the whole record.")  # fmt: skip
     assert found.tests == ()
     assert found.notes == ()
 
@@ -147,11 +147,13 @@ def test_noise_explains_what_the_right_model_leaves(controller):
         assert curve.noise_share > 0.85
     assert all(test.passed for test in found.tests)
     assert [t.name for t in found.tests] == [
-        "residual with its own past", "residual with past u", "residual with past r",
+        "with their own past", "with past u", "with past r",
     ]  # fmt: skip
     assert "Noise explains" in found.verdict
     assert "MISSING" not in found.verdict
-    assert found.verdict.endswith("The one-step errors are white and independent of the signals.")
+    assert found.verdict.endswith(
+        "The one-step errors are white and independent of the past signals."
+    )
 
 
 def test_the_right_model_passes_as_often_as_it_should():
@@ -172,7 +174,7 @@ def test_a_wrong_mass_is_seen_in_every_curve():
     assert found.curves[-1].fit < 0
     assert found.curves[-1].noise_share < 0.2
     assert "SOMETHING IS MISSING in the model" in found.verdict
-    assert "NOT NOISE ALONE: residual with its own past" in found.verdict
+    assert "NOT NOISE ALONE: they are correlated with their own past (" in found.verdict
 
 
 def test_a_wrong_gain_that_follows_the_reference_is_named_so():
@@ -185,7 +187,7 @@ def test_a_wrong_gain_that_follows_the_reference_is_named_so():
     assert cid.compare(record, loop_with(DIGITAL, strong)).fit["closed-loop simulation"] > 97
     found = cid.compare(record, loop_with(DIGITAL, soft))
     assert found["closed-loop"].follows > 0.3
-    assert "of the error's variance follows reference or input" in found.verdict
+    assert "of the variance of the error depends on the reference or the input" in found.verdict
 
 
 def test_an_offset_is_not_called_noise():
@@ -203,15 +205,17 @@ def test_small_but_certain_is_said_to_be_small():
     lags = np.arange(1, 3)
 
     def verdict(p, share):
-        test = Correlation("residual with past u", lags, np.array([0.1, 0.2]), 0.05, p, share)
+        test = Correlation("with past u", lags, np.array([0.1, 0.2]), 0.05, p, share)
         return Comparison(curves=(curve,), tests=(test,), **base).verdict
 
-    assert "nearly noise alone; what correlates is certain but small: residual with past u, " in (
-        verdict(1e-9, 0.004)
+    assert verdict(1e-9, 0.004).endswith(
+        "nearly noise: they are correlated with past u (0.4 % of the variance), which is "
+        "significant but small."
     )
-    assert "0.4 % of the variance" in verdict(1e-9, 0.004)
     assert "SOMETHING IS MISSING in the model, or its noise is not white" in verdict(1e-9, 0.3)
-    assert "NOT NOISE ALONE: residual with past u, 30 % of the variance" in verdict(1e-9, 0.3)
+    assert "NOT NOISE ALONE: they are correlated with past u (30 % of the variance)." in verdict(
+        1e-9, 0.3
+    )
     assert "are white and independent" in verdict(0.5, 0.0)
 
 
@@ -222,7 +226,7 @@ def test_a_model_that_cannot_be_simulated_says_why():
     assert "no simulation: the simulation stops at t = " in weak.notes[0]
     assert "closed loop is unstable" in weak.notes[0]
     alone = cid.compare(record, loop_with(None))
-    assert "the plant is not stable and the controller is unknown" in alone.notes[0]
+    assert "the plant is not stable and the loop has no controller" in alone.notes[0]
     assert "note: no simulation" in str(alone)
 
 
@@ -254,7 +258,7 @@ def test_one_step_and_several_steps_of_an_arx_model_by_hand():
             new = -a1 * past[0] - past[1] + b1 * du[k + j - 1] + b2 * du[k + j - 2] + constant
             past = [new, past[0]]
         assert found["4-step"].y[k + 4] == pytest.approx(past[0] + record.y.mean(), abs=1e-9)
-    assert "an unstable model is not simulated open loop" in found.notes[0]
+    assert "an unstable model cannot be simulated in open loop" in found.notes[0]
 
 
 def test_a_stable_model_is_simulated_from_its_first_outputs():
@@ -295,10 +299,10 @@ def test_identified_models_of_an_unstable_plant():
     record = noisy(loop_with(DIGITAL), sensor_noise=1e-8, force_noise=0.0)
     G = cid.fit_arx(record, 2, 2, constraints=[cid.ReciprocalPoles()])
     found = cid.compare(record, G)
-    assert "identified: poles 1.04" in found.what
+    assert "identified (poles 1.04" in found.what
     assert found.curves[-1].label.endswith("-step prediction")
     assert found["one-step"].fit > 99.8
-    assert "an unstable model is not simulated open loop" in str(found)
+    assert "an unstable model cannot be simulated in open loop" in str(found)
 
 
 # --- stretches, missing references
@@ -335,9 +339,9 @@ def test_dither_without_a_logged_reference():
     assert "Noise explains" in found.verdict
     assert len(found.tests) == 2
     with_limits = cid.compare(blind, loop_with(PID))
-    assert "a PID with limits is simulated from its reference" in with_limits.notes[0]
+    assert "a loop with a limited PID is simulated from its reference" in with_limits.notes[0]
     analog = cid.compare(blind, loop_with(LEAD))
-    assert "an analog loop is simulated from its reference" in analog.notes[0]
+    assert "a loop with an analog controller is simulated from its reference" in analog.notes[0]
 
 
 def test_a_stretch_too_short_for_the_horizon():
@@ -345,7 +349,7 @@ def test_a_stretch_too_short_for_the_horizon():
     valid = np.arange(1000) % 40 > 5
     marked = cid.Record(r=record.r, u=record.u, y=record.y, dt=DT, valid=valid)
     found = cid.compare(marked, loop_with(DIGITAL), horizon=100)
-    assert "no 100-step prediction: no valid stretch is long enough" in found.notes
+    assert "no 100-step prediction: no stretch of valid samples is long enough" in found.notes
     assert all("100" not in c.label for c in found.curves)
 
 
@@ -354,7 +358,7 @@ def test_a_sharp_plant_gets_a_note_instead_of_a_warning():
     smooth = cid.simulate(cid.Loop(cid.plants.servo(m=1.0, c=2.0, k=1.0), 20.0, dt=0.05),
                           0.5 * np.sin(t), sensor_noise=1e-4, seed=1)  # fmt: skip
     found = cid.compare(smooth, cid.Loop(rough_mass(5), 20.0, dt=0.05))
-    assert any("the simulation is only good to about" in note for note in found.notes)
+    assert any("the simulation has an error of about" in note for note in found.notes)
 
 
 # --- texts
@@ -366,13 +370,14 @@ def test_the_table_reads_as_it_should():
     named = cid.Record(r=record.r, u=record.u, y=record.y, dt=DT, name="run 7", units={"y": "m"})
     found = cid.compare(named, loop)
     lines = str(found).splitlines()
-    assert lines[0].endswith("against run 7 (3000 samples, 3000 valid)")
+    assert lines[0].endswith("with the record run 7 (3000 samples, 3000 valid)")
     assert lines[1].split() == ["curve", "fit", "RMS", "error", "[m]", "noise", "explains"]
     assert lines[2].strip().startswith("one-step prediction ")
     assert lines[4].strip().startswith("closed-loop simulation ")
-    assert lines[5].split() == ["one-step", "errors", "chance?", "largest", "of", "variance"]
-    assert lines[6].split()[:6] == ["residual", "with", "its", "own", "past", "yes"]
-    assert len({len(line) for line in lines[1:5]}) == 1
+    head = "  correlation of one-step errors       passed?           largest    variance share"
+    assert lines[5] == head
+    assert lines[6].split()[:5] == ["with", "their", "own", "past", "yes"]
+    assert len({len(line) for line in lines[1:6]}) == 1
     assert lines[-1].strip() == found.verdict
     assert found.fit["one-step prediction"] == found.curves[0].fit
     with pytest.raises(CtrlidError, match=r"no curve is called 'nyquist'; there are one-step pred"):

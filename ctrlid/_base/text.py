@@ -13,7 +13,7 @@ PREFIXED = ("m", "V", "A", "N", "m/s", "m/s^2", "N s/m", "s")
 
 
 def write_number(value: complex, digits: int = 7) -> str:
-    """Shortest usual form of a real or complex number."""
+    """Return the shortest usual form of a real or complex number."""
     value = complex(value)
     if value.imag == 0:
         return f"{value.real:.{digits}g}"
@@ -21,7 +21,7 @@ def write_number(value: complex, digits: int = 7) -> str:
 
 
 def with_error(value: complex, error: float) -> str:
-    """``value ± error`` with as many digits as the error allows.
+    """Return ``value ± error`` with as many digits as the error allows.
 
     Parameters
     ----------
@@ -123,7 +123,9 @@ def write_quantity(
     """
     factor, unit = choose_prefix(value, unit)
     if error is None or error == 0 or not math.isfinite(error):
-        known = "" if error is None else " (fixed)" if error == 0 else " (not in the data)"
+        known = (
+            "" if error is None else " (fixed)" if error == 0 else " (not determined by the data)"
+        )
         return f"{write_number(factor * value, digits)} {unit}".strip() + known
     return f"{with_error(factor * value, factor * error)} {unit}".strip()
 
@@ -196,8 +198,33 @@ def write_list(items: list[str] | tuple[str, ...]) -> str:
     return ", ".join(items[:-1]) + " and " + items[-1]
 
 
+def write_count(number: int, noun: str, plural: str = "") -> str:
+    """Write a number of things: one sample, two samples.
+
+    Parameters
+    ----------
+    number : int
+        How many there are.
+    noun : str
+        What one of them is called.
+    plural : str, optional
+        What several are called; by default the noun with an s.
+
+    Returns
+    -------
+    str
+        Number and noun.
+
+    Examples
+    --------
+    >>> write_count(1, "sample"), write_count(20, "sample")
+    ('1 sample', '20 samples')
+    """
+    return f"{number} {noun if number == 1 else plural or noun + 's'}"
+
+
 def with_unit(name: str, unit: str) -> str:
-    """``name [unit]``, so written that `split_unit` takes it apart again.
+    """Return ``name [unit]``, so written that `split_unit` takes it apart again.
 
     Parameters
     ----------
@@ -245,7 +272,7 @@ def split_unit(label: str) -> tuple[str, str]:
 
 
 def is_bad_news(text: str) -> bool:
-    """Whether a sentence has bad news in it: three or more words in capitals in a row.
+    """Return whether a sentence has bad news in it: three or more words in capitals in a row.
 
     Parameters
     ----------
@@ -259,7 +286,7 @@ def is_bad_news(text: str) -> bool:
 
     Examples
     --------
-    >>> is_bad_news("a1 SITS ON ITS BOUND -2"), is_bad_news("a PID under FOH")
+    >>> is_bad_news("a1 IS ON ITS BOUND -2"), is_bad_news("a PID under FOH")
     (True, False)
     """
     words = [w.strip(".,:;()") for w in text.split()]

@@ -97,8 +97,10 @@ def read_csv(
     period_given = own.get("dt") if dt is None else dt
     if clock is None:
         if period_given is None:
-            raise CtrlidError(f"{path} has no time column ({', '.join(TIME)}); its columns are "
-                              f"{', '.join(header)}. Give time= or dt=")  # fmt: skip
+            raise CtrlidError(
+                f"{path} has no time column ({', '.join(TIME)}); its columns are "
+                f"{', '.join(header)}. Name the column with time=, or give dt="
+            )
         dt = period_given
     else:
         unit = labels[clock][1]
@@ -312,7 +314,7 @@ def _make_uniform(stamps: Any, dt: float | None, gaps: str, path: Path) -> tuple
     usual = float(np.mean(regular))
     if dt is not None and not abs(usual - dt) < 0.05 * usual:
         raise CtrlidError(f"the time column of {path} steps by {usual:.4g} s, but dt is {dt:g} s. "
-                          "Leave dt= out, or remove the column")  # fmt: skip
+                          "Leave out dt=, or remove the column")  # fmt: skip
     if dt is None:
         dt = estimate_period(stamps) if len(regular) == len(steps) else usual
     missing = np.where(steps < GAP * dt, 0, np.round(steps / dt).astype(int) - 1)

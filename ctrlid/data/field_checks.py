@@ -8,14 +8,15 @@ from typing import Any
 import numpy as np
 
 from .._base.errors import CtrlidError
+from .._base.text import write_list
 
 
 def check_samples(name: str, values: Any) -> Any:
     """Copy a signal to a read-only (n,) float array, or say what is wrong with it."""
     if np.ma.is_masked(values):
         raise CtrlidError(
-            f"{name} is a masked array, and its masked values would come back to life: fill them "
-            "and give valid=~mask"
+            f"{name} is a masked array, and a record would use its masked values: fill them and "
+            "give valid=~mask"
         )
     try:
         array = np.asarray(values)
@@ -34,8 +35,8 @@ def check_samples(name: str, values: Any) -> Any:
     if bad.size:
         raise CtrlidError(
             f"{name} must be finite; {bad.size} of {array.size} values are NaN or infinite, the "
-            f"first at sample {bad[0]}. Cut them out by slicing, or fill them and mark the samples "
-            "as not counting with valid="
+            f"first at sample {bad[0]}. Cut them out by slicing, or fill them and exclude the "
+            "samples with valid="
         )
     array.setflags(write=False)
     return array
@@ -47,7 +48,10 @@ def check_words(what: str, given: Any, known: Sequence[str]) -> Mapping[str, str
         raise CtrlidError(f"{what} maps signals to words, as in {{'y': 'm'}}; given {given!r}")
     unknown = [k for k in given if k not in known]
     if unknown:
-        raise CtrlidError(f"{what} has {unknown}, which the record does not; known: {list(known)}")
+        raise CtrlidError(
+            f"{what} has {write_list([repr(k) for k in unknown])}, which the record does not have; "
+            f"its signals are {', '.join(known)}"
+        )
     return MappingProxyType(dict(given))
 
 

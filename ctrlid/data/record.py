@@ -283,7 +283,7 @@ class Record(Printed):
         if not valid.any():
             longest = max((b - a for a, b in self.segments()), default=0)
             raise CtrlidError(
-                f"decimate({q}) would leave no sample that counts: its filter spans {2 * half + 1} "
+                f"decimate({q}) would leave no valid sample: its filter spans {2 * half + 1} "
                 f"samples and the longest valid stretch has {longest}. Use a smaller factor, or "
                 "antialias=False"
             )
@@ -347,8 +347,8 @@ class Record(Printed):
         extra = {k: v for k, v in self.extra.items() if k != channel}
         if old in (*extra, *RESERVED):
             raise CtrlidError(
-                f"the old {key} would move to the extra channels as {old!r}, but that name is "
-                f"taken; name it otherwise with names={{{key!r}: ...}}"
+                f"the old {key} would be kept as the extra channel {old!r}, but that name is "
+                f"taken; give it another name first, with names={{{key!r}: ...}}"
             )
         units = {k: v for k, v in self.units.items() if k not in (key, channel)}
         if key in self.units:

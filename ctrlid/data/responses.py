@@ -45,8 +45,9 @@ def read_response(response: Any, chosen: dict[str, str | None]) -> dict[str, Any
     for key, wanted in labels.items():
         if wanted is None and (key != "r" or chosen[key] is not None):
             raise CtrlidError(
-                f"say which signal is {key}: given {chosen[key]!r}; the response has the inputs "
-                f"{list(inputs)} and the outputs {list(outputs)}"
+                f"it is not clear which signal of the response is {key} (given {key}="
+                f"{chosen[key]!r}); name one of the inputs {list(inputs)} or of the outputs "
+                f"{list(outputs)} with {key}="
             )
     stamps = np.asarray(response.time, dtype=float)
     if len(stamps) < 2:
@@ -56,8 +57,8 @@ def read_response(response: Any, chosen: dict[str, str | None]) -> dict[str, Any
     dt = drop_roundoff(mean, 4 * float(np.spacing(np.abs(stamps).max())))
     if np.any(np.abs(steps - dt) > 1e-6 * dt):
         raise CtrlidError(
-            f"a record is sampled uniformly; the times of the response step by {steps.min():.4g} "
-            f"to {steps.max():.4g} s. Compute it at np.arange(n) * dt"
+            f"a record is sampled uniformly, but the times of the response are {steps.min():.4g} "
+            f"to {steps.max():.4g} s apart. Compute it at np.arange(n) * dt"
         )
     found = {key: split_unit(label) for key, label in labels.items() if label is not None}
     return {

@@ -105,9 +105,9 @@ def _require_same_kind(first: Record, record: Record) -> None:
     # Periods read from printed times differ by their last digits.
     if abs(record.dt - first.dt) > 1e-6 * first.dt or record.hold != first.hold:
         raise CtrlidError(
-            "records used together need one sampling period and one hold; given "
-            f"{first.dt:g} s {first.hold} and {record.dt:g} s {record.hold}. Decimate the "
-            "faster one, or give both the hold that is nearer the truth"
+            "records used together need the same sampling period and the same hold; given "
+            f"{first.dt:g} s, {first.hold!r} and {record.dt:g} s, {record.hold!r}. Decimate the "
+            "faster one, or give both the hold that describes their input better"
         )
 
 

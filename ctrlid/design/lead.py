@@ -168,17 +168,17 @@ def design_lead(P: Any, crossover: float, phase_margin: float) -> Any:
         raise CtrlidError(f"crossover is {crossover:g} rad/s; needed is a frequency above 0.")
     if crossover >= plant.nyquist * (1 - 1e-9):
         raise CtrlidError(
-            f"crossover is {crossover:g} rad/s, but with a sampling period of {plant.dt:g} s there "
-            f"is nothing above pi/dt = {plant.nyquist:.4g} rad/s; ask for less or sample faster."
+            f"crossover is {crossover:g} rad/s, but with a sampling period of {plant.dt:g} s it "
+            f"must be below pi/dt = {plant.nyquist:.4g} rad/s; give a lower one or sample faster."
         )
     if not 0 < phase_margin < 180:
         raise CtrlidError(
-            f"phase_margin is {phase_margin:g} degrees; needed is one between 0 and 180."
+            f"phase_margin is {phase_margin:g} degrees; needed is a value between 0 and 180."
         )
     if phase_margin < math.pi / 2:
         warnings.warn(
-            f"phase_margin is {phase_margin:g} degrees, next to none; if that was in radians, ask "
-            f"for {math.degrees(phase_margin):.3g}", CtrlidWarning, stacklevel=2,
+            f"phase_margin is {phase_margin:g} degrees, which is almost none; if it was meant in "
+            f"radians, give {math.degrees(phase_margin):.3g}", CtrlidWarning, stacklevel=2,
         )  # fmt: skip
     _check_plant(plant, crossover)
 
@@ -220,7 +220,7 @@ def _check_plant(plant: Rational, crossover: float) -> None:
             raise CtrlidError(
                 f"P is {word} at the crossover {crossover:g} rad/s, to the accuracy of its "
                 f"coefficients{crowd if plant.dt else ''}, so no compensator gives a gain of 1 "
-                f"there; choose another one."
+                f"there; choose another crossover."
             )
 
 
@@ -289,10 +289,10 @@ def _explain_phase(task: _Task, signs: tuple[int, ...]) -> str:
     )
     text = f"A phase margin of {task.phase_margin:g} degrees at {task.crossover:g} rad/s"
     if needed[sign] > 0:
-        text += f" needs {needed[sign]:.1f} degrees of lead, one lead gives less than 90"
+        text += f" needs {needed[sign]:.1f} degrees of lead, but one lead gives less than 90"
     else:
         text += (
-            f" would need phase removed, a lead only adds it: a pure gain gives exactly "
+            f" would need a phase lag, but a lead only adds phase: a pure gain gives exactly "
             f"{plain[sign]:.4f} degrees"
         )
     if not allowed[sign]:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from .._base.arrays import Array, ComplexArray
+from .._base.text import Printed
 from .rational import (
     Rational,
     find_closed_loop_poles,
@@ -20,8 +21,8 @@ from .rational import (
 )
 
 
-@dataclass(frozen=True)
-class Margins:
+@dataclass(frozen=True, repr=False)
+class Margins(Printed):
     """Distances of one feedback loop from instability, the worst of all crossovers.
 
     For an unstable loop `stable` is False and every number is NaN: there is no margin to speak of.
@@ -54,6 +55,22 @@ class Margins:
     gain_reduction_margin: float
     modulus_margin: float
     delay_margin: float
+
+    def __str__(self) -> str:
+        if not self.stable:
+            return "THE LOOP IS UNSTABLE and so has no margins."
+        rows = (
+            ("crossover [rad/s]", self.crossover),
+            ("phase margin [deg]", self.phase_margin),
+            ("gain margin [factor]", self.gain_margin),
+            ("gain reduction margin [factor]", self.gain_reduction_margin),
+            ("modulus margin [1]", self.modulus_margin),
+            ("delay margin [s]", self.delay_margin),
+        )
+        values = ("none" if math.isnan(v) else f"{v:.4g}" for _, v in rows)
+        return "\n".join(
+            f"{label:<32}{value:>10}" for (label, _), value in zip(rows, values, strict=True)
+        )
 
 
 def loop_margins(L: Any) -> Margins:

@@ -145,8 +145,8 @@ def to_rational(system: Any, name: str) -> Rational:
         )
     if system.dt is True:
         raise CtrlidError(
-            f"{name} is discrete with no sampling period (dt=True), so rad/s mean nothing to it; "
-            f"give it one in seconds, for example dt=0.001."
+            f"{name} is discrete with no sampling period (dt=True), so frequencies in rad/s are "
+            f"not defined; give it one in seconds, for example dt=0.001."
         )
     dt = float(system.dt or 0.0)
     if isinstance(system, ct.StateSpace):
@@ -156,13 +156,14 @@ def to_rational(system: Any, name: str) -> Rational:
     num, den = num.astype(float), den.astype(float)
     if not (np.isfinite(num).all() and np.isfinite(den).all()):
         raise CtrlidError(
-            f"{name} has coefficients that are NaN or infinite: num {num}, den {den}."
+            f"{name} has coefficients that are NaN or infinite: num {num}, den {den}. "
+            "Replace them by finite numbers."
         )
     num, den = _drop_dust(num, den, dt)
     if len(num) > len(den):
         raise CtrlidError(
             f"{name} is improper (degree {len(num) - 1} over {len(den) - 1}), so it answers a step "
-            f"with an impulse; needed are at least as many poles as zeros."
+            f"with an impulse; needed are at least as many poles as zeros: add a filter pole."
         )
     return Rational(num, den, dt)
 

@@ -114,30 +114,34 @@ class Redesign(Printed):
         p, a = self.promised, self.achieved
         if not a.stable and not np.isfinite(a.phase_margin):
             return (
-                "The controller DOES NOT KEEP THE PHYSICS STABLE: the model is too far from it. "
-                + self.failure
+                "The controller DOES NOT STABILIZE THE PHYSICS: the model is too different from "
+                f"it. {self.failure}"
             )
-        text = (f"Promised {p.phase_margin:.1f} deg at {p.crossover:.4g} rad/s, achieved "
-                f"{a.phase_margin:.1f} deg at {a.crossover:.4g} rad/s on the physics")  # fmt: skip
+        text = (f"The model promises a phase margin of {p.phase_margin:.1f} deg at "
+                f"{p.crossover:.4g} rad/s; achieved on the physics are {a.phase_margin:.1f} deg at "
+                f"{a.crossover:.4g} rad/s")  # fmt: skip
         loss = p.phase_margin - a.phase_margin
         shift = a.crossover / p.crossover - 1
         if loss > CLOSE * p.phase_margin:
-            text += f": {loss:.1f} DEGREES OF THE PROMISE ARE LOST."
+            text += f": {loss:.1f} DEGREES OF PHASE MARGIN ARE LOST."
         elif abs(shift) > CLOSE:
-            text += f": the margin holds, but THE CROSSOVER IS OFF BY {100 * shift:+.0f} %."
+            side = "LOWER" if shift < 0 else "HIGHER"
+            text += f": THE CROSSOVER IS {side} BY {100 * abs(shift):.0f} %."
         else:
             worst = max(loss / p.phase_margin, abs(shift))
-            text += f": the promise holds within {max(math.ceil(100 * worst), 1)} %."
+            text += f", so the promise holds within {max(math.ceil(100 * worst), 1)} %."
         if not a.stable:
-            text += (f" That is for small signals: A STEP OF {self.step:.3g} LOSES CONTROL. "
-                     f"{self.failure}")  # fmt: skip
+            text += (f" This is for small signals: WITH A STEP OF {self.step:.3g} THE LOOP "
+                     f"DIVERGES. {self.failure}")  # fmt: skip
         elif np.isfinite(p.settling_time) and not np.isfinite(a.settling_time):
-            text += (f" That is for small signals: A STEP OF {self.step:.3g} DOES NOT SETTLE, it "
-                     "meets limits or leaves the nearly linear range.")  # fmt: skip
-        sure = "guaranteed" if self.nu_gap < self.robust_margin else "not guaranteed"
+            text += (f" This is for small signals: WITH A STEP OF {self.step:.3g} THE RESPONSE "
+                     "DOES NOT SETTLE, because the input saturates or the step leaves the linear "
+                     "range.")  # fmt: skip
+        sure = self.nu_gap < self.robust_margin
         return (
-            f"{text} Stability near the operating point is {sure} by the nu-gap "
-            f"({self.nu_gap:.3f} against a robust margin of {self.robust_margin:.3f})."
+            f"{text} Stability near the operating point is {'' if sure else 'not '}guaranteed: "
+            f"the nu-gap between model and physics is {self.nu_gap:.3f}, and it has to be below "
+            f"the robust margin of {self.robust_margin:.3f}."
         )
 
     @property
@@ -170,8 +174,9 @@ class Redesign(Printed):
         loop = self.loop
         unit = getattr(loop.plant, "units", {}).get(loop.equations().outputs[0], "")
         step = (
-            f"  The last three were achieved with a step of {write_quantity(self.step, unit)} on "
-            "the nonlinear physics; a smaller step= comes nearer to the promise."
+            "  The last three values achieved are for a step of "
+            f"{write_quantity(self.step, unit)} on the nonlinear physics. With a smaller step= "
+            "they are closer to the promised values."
         )
         return "\n".join([f"controller: ({num}) / ({den})", *rows, step, "  " + self.verdict])
 
@@ -230,7 +235,8 @@ def redesign(
         raise CtrlidError("redesign needs a linear model (a TransferFunction, as the fits return); "
                           f"given {type(G).__name__}")  # fmt: skip
     if not isinstance(loop, Loop):
-        raise CtrlidError(f"redesign tries the controller on a Loop; given {type(loop).__name__}")
+        raise CtrlidError("redesign needs a Loop, on which the controller is tried; given "
+                          f"{type(loop).__name__}")  # fmt: skip
     # The design needs a plain transfer function with the delay of the fit in it.
     G = G.with_delay() if isinstance(G, IdentifiedModel) else to_transfer_function(G)
     C = design_lead(G, crossover=crossover, phase_margin=phase_margin)
@@ -253,7 +259,7 @@ def redesign(
         if not told:
             # Dry friction holds what is at rest; the loop around it may be unstable all the same.
             why = (f"Small deviations grow at {growth:.3g} 1/s." if growth >= 0 else
-                   "Friction aside, the loop is unstable.")  # fmt: skip
+                   "Without friction the loop is unstable.")  # fmt: skip
             failure = why if failure is None else f"{why} {failure}"
     else:
         achieved = _measure_performance(
@@ -272,8 +278,8 @@ def _choose_height(loop: Loop, step: float | None) -> float:
     if step is None:
         return 0.01 * abs(loop.point.output) or 0.01
     if not isinstance(step, Real) or not np.isfinite(float(step)) or step == 0:
-        raise CtrlidError(f"step is the height of the reference step in output units, not zero; "
-                          f"given {step!r}")  # fmt: skip
+        raise CtrlidError("step must be the height of the reference step in output units, a "
+                          f"finite number other than zero; given {step!r}")  # fmt: skip
     return float(step)
 
 
@@ -306,10 +312,10 @@ def _simulate_physical_step(
     if not far.any():
         return response, None, False
     k = int(np.argmax(far))
-    text = f"After {k * loop.dt:.4g} s {moved.names['y']} had run away to {moved.y[k]:.4g}"
+    text = f"After {k * loop.dt:.4g} s {moved.names['y']} has diverged to {moved.y[k]:.4g}"
     lower, upper = loop.input_limits
     if np.any(moved.u[: k + 1] <= lower) or np.any(moved.u[: k + 1] >= upper):
-        text += f", with {moved.names['u']} at its limit ({lower:g}..{upper:g})"
+        text += f", with {moved.names['u']} at its limit ({lower:g} to {upper:g})"
     return response[: k + 1], text + ".", False
 
 

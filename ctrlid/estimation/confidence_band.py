@@ -10,11 +10,15 @@ from scipy.stats import t as student_t
 
 from .._base.arrays import Array
 from .._base.errors import CtrlidError
+from .._base.text import Printed, write_count
 from .identified_model import IdentifiedModel
 
+# A band of more frequencies is printed at so many of them, evenly over its range.
+MOST_ROWS = 12
 
-@dataclass(frozen=True, eq=False)
-class ResponseBand:
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ResponseBand(Printed):
     """Frequency response of a model with its confidence limits, each frequency on its own.
 
     Attributes
@@ -38,9 +42,23 @@ class ResponseBand:
     phase_high: Array
     level: float
 
+    def __str__(self) -> str:
+        rows = [f"Frequency response with {100 * self.level:g} % confidence limits at each "
+                f"frequency ({write_count(len(self.omega), 'frequency', 'frequencies')})",
+                f"{'omega [rad/s]':>15}{'magnitude':>12}{'from':>12}{'to':>12}"
+                f"{'phase [deg]':>14}{'from':>10}{'to':>10}"]  # fmt: skip
+        shown = np.unique(np.linspace(0, len(self.omega) - 1, MOST_ROWS).astype(int))
+        rows += [
+            f"{self.omega[k]:>15.4g}{self.magnitude[k]:>12.4g}{self.magnitude_low[k]:>12.4g}"
+            f"{self.magnitude_high[k]:>12.4g}{self.phase[k]:>14.2f}{self.phase_low[k]:>10.2f}"
+            f"{self.phase_high[k]:>10.2f}"
+            for k in shown
+        ]
+        return "\n".join(rows)
+
 
 def response_band(model: IdentifiedModel, omega: Any, level: float = 0.95) -> ResponseBand:
-    r"""Confidence band of a fitted model's frequency response.
+    r"""Return the confidence band of a fitted model's frequency response.
 
     .. math:: \ln G = \ln B - \ln A, \quad
         g = \frac{\partial \ln G}{\partial \theta}

@@ -55,19 +55,19 @@ class Structure:
         return (*a, *b)
 
     def vector(self, weights: Mapping[str, float], who: str = "A constraint") -> Array:
-        """Weights by coefficient name as a ``(na + nb,)`` vector; unknown names are refused."""
+        """Return weights by name as a ``(na + nb,)`` vector; unknown names are refused."""
         row = np.zeros(len(self.names))
         for name, weight in weights.items():
             if name not in self.names:
                 raise CtrlidError(
-                    f"{who} speaks of {name!r}, but this model has no such coefficient: "
-                    f"it has {', '.join(self.names)}."
+                    f"{who} uses {name!r}, but this model has no such coefficient; it has "
+                    f"{', '.join(self.names)}."
                 )
             row[self.names.index(name)] = weight
         return row
 
     def fraction(self, theta: Array) -> tuple[Array, Array]:
-        """Numerator and denominator in falling powers of z (or s)."""
+        """Return numerator and denominator in falling powers of z (or s)."""
         denominator = np.concatenate([[1.0], theta[: self.na]])
         numerator = np.asarray(theta[self.na :], dtype=float)
         if self.domain == "s":
@@ -197,7 +197,7 @@ class Estimate(_text.Printed):
         return self.names.index(name)
 
     def confidence_interval(self, name: str, level: float = 0.95) -> tuple[float, float]:
-        """Interval that covers a coefficient with the given probability (Student's t).
+        """Return the interval that covers a coefficient with the given probability (Student's t).
 
         Parameters
         ----------
@@ -298,9 +298,10 @@ def compute_root_errors(roots: ComplexArray, covariance: Array) -> Array:
 
 
 def _write_report(e: Estimate) -> str:
-    """Lines of text: normal facts in normal case, bad news in capitals."""
+    """Return lines of text: normal facts in normal case, bad news in capitals."""
     held = {bound.quantity for bound in e.active_bounds}
-    lines = [f"{e.method}: {e.n_samples} rows" + (f", dt = {e.dt:g} s" if e.dt else "")]
+    used = _text.write_count(e.n_samples, "sample")
+    lines = [f"{e.method}, {used} used" + (f", dt = {e.dt:g} s" if e.dt else "")]
     for name, value, error in zip(e.names, e.values, e.standard_errors, strict=True):
         if name in held:
             lines.append(f"  {name} = {value:.10g} (on its bound)")
@@ -309,7 +310,7 @@ def _write_report(e: Estimate) -> str:
         else:
             lines.append(f"  {name} = {_text.with_error(value, error)}")
     if e.branch:
-        lines.append(f"  branch: {e.branch}")
+        lines.append(f"  branch of the constraint: {e.branch}")
     pairs = zip(e.poles, e.poles_standard_errors, e.poles_s, e.poles_s_standard_errors, strict=True)
     for z, dz, s, ds in pairs:
         pole = f"  pole at s = {_text.with_error(s, ds)} rad/s"
@@ -327,16 +328,16 @@ def _write_report(e: Estimate) -> str:
 def _list_bad_news(e: Estimate) -> list[str]:
     news = [f"  {note}" for note in e.notes]
     for bound in e.active_bounds:
-        free = f": without {bound.constraint} the data would take it to {bound.free:.7g}"
+        free = f" Without {bound.constraint} the estimate would be {bound.free:.7g}."
         news.append(
-            f"  {bound.quantity} SITS ON ITS BOUND {bound.bound:.10g}"
-            f"{free if np.isfinite(bound.free) else ''}. An active bound is a symptom, not a "
-            "cure: look for noise fed back through the controller, a sampling period that is "
+            f"  {bound.quantity} IS ON ITS BOUND {bound.bound:.10g}."
+            f"{free if np.isfinite(bound.free) else ''} An active bound is a symptom of bias, not "
+            "a result: check for noise fed back through the controller, a sampling period that is "
             "too short, or a constraint that does not hold."
         )
     z = e.poles
     merged = [
-        f"  TWO POLES MERGE at {e.structure.domain} = {_text.write_number(z[k])}."
+        f"  TWO POLES COINCIDE at {e.structure.domain} = {_text.write_number(z[k])}."
         for k in range(len(z) - 1)
         if e.active_bounds and np.any(np.abs(z[k + 1 :] - z[k]) < 1e-6)
     ]
@@ -348,7 +349,8 @@ def _list_bad_news(e: Estimate) -> list[str]:
         if any(bound.unstable for bound in e.active_bounds):
             news.append(f"  NO POLE {edge.upper()}.")
         else:
-            news.append(f"  no pole {edge}: the model is stable.")
+            news.append(f"  no pole is {edge}: the model is stable. If the plant is unstable, the "
+                        "model is wrong.")  # fmt: skip
     return news
 
 

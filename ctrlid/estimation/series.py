@@ -101,11 +101,14 @@ class FitSeries(_text.Printed):
         y, p, sigma = self.levels, self.rates, self.rate_errors
         if len(np.unique(y)) < 2:
             raise CtrlidError(
-                f"a trend needs records at two different outputs at least; given {len(y)} at "
+                "a trend needs records at two or more different outputs; given "
+                f"{_text.write_count(len(y), 'record')} at "
                 f"{', '.join(_text.write_number(v, 4) for v in y)}"
             )
         if not (np.isfinite(sigma).all() and np.isfinite(p).all()):
-            raise CtrlidError("a trend needs poles with finite standard errors: two of them merge")
+            raise CtrlidError("a trend needs poles with finite standard errors, and two poles of a "
+                              "model coincide. Leave this record out, or fit it with other "
+                              "constraints")  # fmt: skip
         exact = not (sigma > 0).all()
         weight = np.ones(len(y)) if exact else sigma**-2
         level = float(weight @ y / weight.sum())
@@ -143,17 +146,18 @@ class FitSeries(_text.Printed):
 
 def _write_trend(line: PoleTrend, unit: str) -> str:
     text = (
-        f"rightmost pole {_text.with_error(line.pole, line.pole_error)} rad/s at "
+        f"trend of the rightmost pole: {_text.with_error(line.pole, line.pole_error)} rad/s at "
+        "an output of "
         f"{line.level:.4g} {unit}".rstrip()
         + f", slope {_text.with_error(line.slope, line.slope_error)} rad/s per {unit or 'unit'}"
     )
     if np.isfinite(line.exponent):
         power = _text.with_error(line.exponent, line.exponent_error)
-        text += f": as the output to the power {power}"
+        text += f", proportional to the output to the power {power}"
     if np.isfinite(line.p_value):
-        verb = "EXCEED" if line.p_value < 0.01 else "are within"
-        text += f". Distances from the line {verb} the standard errors "
-        text += f"({_text.write_p_value(line.p_value)})"
+        large = line.p_value < 0.01
+        verb = "IS LARGER THAN THE STANDARD ERRORS" if large else "agrees with the standard errors"
+        text += f". The scatter about the line {verb} ({_text.write_p_value(line.p_value)})"
     return text + "."
 
 
@@ -215,7 +219,7 @@ def fit_each(
     records = (records,) if isinstance(records, Record) else records
     done = list(share_out(partial(_fit_one, fit, options), enumerate(records, 1), check_jobs(jobs)))
     if not done:
-        raise CtrlidError("fit_each needs one record at least; the list given is empty")
+        raise CtrlidError("fit_each needs at least one record; the list given is empty")
     models, names, levels, units = zip(*done, strict=True)
     return FitSeries(models, names, np.array(levels), units[0])
 

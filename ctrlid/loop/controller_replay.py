@@ -20,8 +20,7 @@ def _build_controller_run(loop: Loop, y: Array, r: Array | None) -> tuple[Any, A
     if law is None or law.dt == 0.0:
         kind = "no controller" if law is None else "an analog one"
         raise CtrlidError(
-            f"only a digital controller computes its output from the samples alone; this loop has "
-            f"{kind}"
+            f"only a digital controller can be replayed from the samples; this loop has {kind}"
         )
     x, w = casadi.SX.sym("x", len(law.rest)), casadi.SX.sym("w", 3)
     u, after = law.apply(w[0], x, w[1], w[2])
@@ -100,9 +99,11 @@ def replay_controller(loop: Loop, record: Record) -> Array:
 def replay_from_best_state(loop: Loop, record: Record) -> tuple[Array, Array]:
     """Return what `replay_controller` does, and the controller's initial state that it chose."""
     if abs(loop.dt - record.dt) > 1e-9 * loop.dt:
-        raise CtrlidError(f"the loop is sampled at {loop.dt:g} s, the record at {record.dt:g} s")
+        raise CtrlidError(f"the loop is sampled at {loop.dt:g} s, the record at {record.dt:g} s; "
+                          "give both the same period")  # fmt: skip
     if record.r is None:
-        raise ModelCannotRun("the record has no reference r, which the controller needs")
+        raise ModelCannotRun("the record has no reference r, which the controller needs; give it "
+                              "r=, a constant for a fixed set-point")  # fmt: skip
     run, start = _build_controller_run(loop, record.y, record.r)
     replayed, best = _compare_inputs(run, start, record)
     if start.size and np.isfinite(loop.input_limits).any():

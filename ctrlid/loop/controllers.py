@@ -115,7 +115,7 @@ class PID:
                 raise CtrlidError(f"PID {name} must be one of {', '.join(get_args(words))}; "
                                   f"given {getattr(self, name)!r}")  # fmt: skip
         if self.derivative == "measurement" and self.c not in (0.0, 1.0):
-            raise CtrlidError(f"derivative='measurement' means c=0; given c={self.c}")
+            raise CtrlidError(f"derivative='measurement' sets c=0; leave c={self.c} out")
         if self.anti_windup == "back-calculation":
             tracking = self.tracking_time
             if tracking is None and self.ki:

@@ -11,6 +11,7 @@ import control as ct
 import numpy as np
 
 from .._base.errors import CtrlidError, EffectDoesNotApply
+from .._base.text import write_count
 from ..effects import AbstractEffect
 from ..effects.composition import compose_effects, label_effects
 from ..effects.python_control import as_system, linearize_with_effects
@@ -96,8 +97,10 @@ class Loop:
                 f"OperatingPoint(states=, input=, output=); given {type(at).__name__}"
             )
         if not self.linear_plant and len(at.states) != n:
-            raise CtrlidError(f"at= has {len(at.states)} states, {equations.name} has {n}: "
-                              f"{', '.join(equations.states)}")  # fmt: skip
+            raise CtrlidError(
+                f"at= has {write_count(len(at.states), 'state')}, but {equations.name} has {n} "
+                f"({', '.join(equations.states)}); give at=operating_point(plant, output=...)"
+            )
         try:
             lower, upper = (float(v) for v in self.input_limits)
         except (TypeError, ValueError) as reason:
@@ -146,8 +149,8 @@ class Loop:
             refusal = EffectDoesNotApply if effects else CtrlidError
             raise refusal(
                 f"{kept.name} passes its input to its output without delay, so the loop with "
-                "a controller is algebraic; add the sensor's or actuator's lag to the plant. If "
-                "this is the controller, the order is Loop(plant, controller, ...)"
+                "a controller would be algebraic; add the lag of the sensor or the actuator to the "
+                "plant. If this is the controller, the order is Loop(plant, controller, ...)"
             )
 
     @property

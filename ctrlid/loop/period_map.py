@@ -86,9 +86,10 @@ def make_period_map(loop: Loop, substeps: int) -> PeriodMap:
     if loop.analog:
         if kept or e.play is not None:
             raise EffectDoesNotApply(
-                "a delay or a play acts on the samples of a digital controller; this loop has an "
-                "analog one: sample it (redesign does so for a sampled model, ct.sample_system(G, "
-                "dt)), or put the delay into the plant as a Padé approximation (control.pade)"
+                "a delay or a backlash acts on the samples of a digital controller; this loop has "
+                "an analog one: sample it (redesign does so for a sampled model, "
+                "ct.sample_system(G, dt)), or put the delay into the plant as a Padé approximation "
+                "(control.pade)"
             )
 
         # The reference jumps only at the samples, so that the motion within a period is smooth.
@@ -178,7 +179,7 @@ def compute_growth_rate(loop: Loop) -> float:
     matrix, _ = linearize_at_rest(s, loop.point.output, function)
     if not np.isfinite(matrix).all():
         raise ModelCannotRun(
-            f"{loop.equations().name} has no derivative at its operating point {loop.point}; "
+            f"{loop.equations().name} has no derivative at its {loop.point}; "
             "give at=operating_point(plant, output=...)"
         )
     poles = np.linalg.eigvals(matrix)
@@ -191,5 +192,5 @@ def compute_growth_rate(loop: Loop) -> float:
 
 @functools.lru_cache(maxsize=32)
 def comes_to_rest(loop: Loop) -> bool:
-    """Whether small deviations die out in a loop; without a controller, in the plant itself."""
+    """Return whether small deviations die out in a loop, or in the plant without a controller."""
     return compute_growth_rate(loop) < -1e-6 / loop.dt

@@ -181,7 +181,7 @@ class Simulator:
         e = loop.equations()
         if not np.isfinite(e.evaluate(first.rest[: len(e.states)], loop.point.input)[0]).all():
             raise ModelCannotRun(
-                f"{e.name} is not defined at the operating point {loop.point}; give "
+                f"{e.name} is not defined at the {loop.point}; give "
                 "at=operating_point(plant, output=...)"
             )
         # An undamped plant neither grows nor decays; round-off must not decide which.
@@ -270,9 +270,9 @@ class Simulator:
                 substeps //= 2
         if worst > COARSE and self.most == MOST_SUBSTEPS:
             warnings.warn(
-                f"the simulation is only good to about {worst:.0e} of the signals near t = "
-                f"{where * loop.dt:.4g} s: the plant or the controller is too sharp or too fast "
-                f"for {MOST_SUBSTEPS} steps in {loop.dt:g} s; simulate with a smaller dt",
+                f"near t = {where * loop.dt:.4g} s the simulation has an error of about "
+                f"{worst:.0e} of the signals: the plant or the controller changes too fast for "
+                f"{MOST_SUBSTEPS} steps in {loop.dt:g} s; simulate with a smaller dt",
                 CtrlidWarning, stacklevel=3,
             )  # fmt: skip
         return y, u
@@ -281,7 +281,7 @@ class Simulator:
 def _find_first_bad(
     loop: Loop, unstable: bool, states: Array, ys: Array, us: Array, w: Array
 ) -> int | None:
-    """Index of the first sample at which the loop is no longer where it can be."""
+    """Return the first sample at which the loop is no longer where it can be, or None."""
     bad = ~(np.isfinite(states).all(axis=0) & np.isfinite(ys[0]) & np.isfinite(us[0]))
     rest = loop.point.output
     asked = abs(rest)
@@ -311,10 +311,10 @@ def _explain_stop(
     good = max(k - 1, 0)
     text = f"the simulation stops at t = {at * loop.dt:.5g} s (sample {at}): "
     if inside:
-        text += f"{output} ran away to {ys[0, k]:.4g}"
+        text += f"{output} has diverged to {ys[0, k]:.4g}, with {inp} = {us[0, good]:.4g}."
     else:
-        text += f"{output} left the range where the plant is defined, last at {ys[0, good]:.4g}"
-    text += f", with {inp} = {us[0, good]:.4g}."
+        text += (f"{output} left the range where the plant is defined. The last values inside are "
+                 f"{output} = {ys[0, good]:.4g} and {inp} = {us[0, good]:.4g}.")  # fmt: skip
     lower, upper = loop.input_limits
     recent = us[0, max(0, good - 20) : good + 1]
     if loop.controller is None:
@@ -327,13 +327,15 @@ def _explain_stop(
             "the sign and the gain of the controller and the operating point"
         )
     if np.any(recent <= lower) or np.any(recent >= upper):
-        text += f" {inp} was at its limit ({lower:g}..{upper:g}) when control was lost."
-    swing = np.max(np.abs(us[0, : good + 1] - op.input)) if good else 0.0
-    text += (f" Near the operating point the loop is stable, so the signals are too large for it: "
-             f"{inp} moved {swing:.3g} away from {op.input:.4g}")  # fmt: skip
+        text += f" {inp} was at its limit ({lower:g} to {upper:g}) shortly before."
     asked = float(np.max(np.abs(w[1] - op.output)))
-    text += f", {output} was asked to move by {asked:.3g}."
+    text += (f" Near the operating point the loop is stable, so the signals are too large for it: "
+             f"the reference is up to {asked:.3g} away from the operating point")  # fmt: skip
+    if good:
+        swing = np.max(np.abs(us[0, : good + 1] - op.input))
+        text += f", and {inp} was up to {swing:.3g} away from {op.input:.4g}"
+    text += "."
     if np.max(np.abs(w[1])) < abs(op.output) / 2:
-        return (f"{text} If r was meant as a deviation from the operating point, add "
-                f"{op.output:.6g}: signals are absolute")  # fmt: skip
+        return (f"{text} Signals are absolute: if r was meant as a deviation from the operating "
+                f"point, add {op.output:.6g} to it")  # fmt: skip
     return f"{text} Use a smaller reference or less noise"

@@ -11,6 +11,7 @@ from scipy import linalg
 
 from .._base.arrays import Array
 from .._base.errors import CtrlidError, ModelCannotRun
+from .._base.text import Printed, write_number
 from .conversions import to_polynomials
 from .equations import Equations, require_siso
 from .trace import trace
@@ -23,8 +24,8 @@ EQUILIBRIUM = 1e-9
 STARTS = 60
 
 
-@dataclass(frozen=True)
-class OperatingPoint:
+@dataclass(frozen=True, repr=False)
+class OperatingPoint(Printed):
     """Where a plant rests: its states, input and output in physical units.
 
     Parameters
@@ -44,8 +45,8 @@ class OperatingPoint:
     Examples
     --------
     >>> import ctrlid as cid
-    >>> cid.OperatingPoint(states=(0.012, 0.0), input=3.0, output=0.012).input
-    3.0
+    >>> print(cid.OperatingPoint(states=(0.012, 0.0), input=3.0, output=0.012))
+    operating point with input 3, output 0.012 and states (0.012, 0)
     """
 
     states: tuple[float, ...]
@@ -68,6 +69,11 @@ class OperatingPoint:
         object.__setattr__(self, "states", states)
         object.__setattr__(self, "input", point[0])
         object.__setattr__(self, "output", point[1])
+
+    def __str__(self) -> str:
+        states = ", ".join(write_number(s, 6) for s in self.states)
+        return (f"operating point with input {write_number(self.input, 6)}, output "
+                f"{write_number(self.output, 6)} and states ({states})")  # fmt: skip
 
 
 def operating_point(
@@ -147,11 +153,12 @@ def operating_point(
         if closest is not None:
             near = ", ".join(f"{s}={v:.4g}" for s, v in zip(
                 (*equations.states, *equations.inputs), closest[1], strict=True))  # fmt: skip
-            hint = f" The nearest miss is {near}, which does not rest there."
+            hint = f" The nearest point found is {near}, which is no equilibrium."
         raise ModelCannotRun(
-            f"{equations.name} has no equilibrium with {equations.outputs[0]} = {target:g}: no "
-            f"states and input {equations.inputs[0]} hold it there ({STARTS} starting points)."
-            f"{hint} Choose an output inside the plant's range, or give guess= near one"
+            f"{equations.name} has no equilibrium with {equations.outputs[0]} = {target:g}: from "
+            f"{STARTS} starting points no states and input {equations.inputs[0]} were found that "
+            f"hold it there.{hint} Choose an output inside the range of the plant, or give guess= "
+            "near an equilibrium"
         )
     best = min(found, key=lambda s: (s[n] < -1e-12 * abs(s).max(), abs(s[n])))
     return OperatingPoint(tuple(best[:n].tolist()), float(best[n]) + 0.0, target)
@@ -182,7 +189,7 @@ def _draw_starts(n: int, target: float, guess: Any) -> list[Array]:
 def _solve_equilibrium(
     evaluate: Any, start: Array, damped: bool
 ) -> tuple[Array | None, float]:  # fmt: skip
-    """Newton's method: a root near the start, and its residual relative to what cancels there.
+    """Find a root by Newton's method, and its residual relative to what cancels there.
 
     Full steps solve the rows that are linear at once (the output is often a state) and are the
     best choice for products and powers; damped ones (Deuflhard's natural monotonicity test, which
@@ -318,7 +325,7 @@ def _reduce_to_minimal(a: Array, b: Array, c: Array, d: Array) -> tuple[Array, A
 
 
 def _find_reached_states(a: Array, b: Array) -> Any:
-    """Which states a signal entering through `b` reaches along the non-zero couplings."""
+    """Return which states a signal entering through `b` reaches along the non-zero couplings."""
     reached = np.any(b != 0, axis=1)
     for _ in range(len(a)):
         reached = reached | np.any((a != 0) & reached[None, :], axis=1)

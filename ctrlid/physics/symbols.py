@@ -173,7 +173,7 @@ ELEMENTWISE: dict[str, Function] = {
 
 
 def has_symbols(value: Any) -> bool:
-    """Whether a value is a symbol, or an array or a sequence with one in it."""
+    """Return whether a value is a symbol, or an array or a sequence with one in it."""
     if isinstance(value, (list, tuple)):
         return any(has_symbols(v) for v in value)
     if isinstance(value, np.ndarray) and value.dtype == object:

@@ -276,8 +276,8 @@ def _check_equations(system: Any, equations: Equations) -> Equations:
     if not found:
         raise TracingError(
             f"the Python function of {system.name} gave no finite value at {6 * CHECKS} random "
-            f"points{failure}, so the traced equations cannot be checked; see that it works for "
-            "states between 1e-4 and 1e3"
+            f"points{failure}, so the traced equations cannot be checked; make sure that it works "
+            "for states between 1e-4 and 1e3"
         )
     return equations
 

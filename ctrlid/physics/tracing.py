@@ -44,7 +44,7 @@ def _dispatch_on_symbols(symbolic: Function, original: Function) -> Function:
 
 
 def _allow_symbols(make: Function) -> Function:
-    """Numpy's constructor with room for symbols, whatever number type was asked for."""
+    """Return numpy's constructor with room for symbols, whatever number type was asked for."""
 
     @functools.wraps(make, updated=())
     def build(*args: Any, **kwargs: Any) -> Any:
@@ -102,7 +102,7 @@ class _Module:
 
 
 def _keep_symbols(function: Function) -> Function:
-    """Numpy's function, whose arrays of symbols stay arrays of symbols (hstack, diff, ...)."""
+    """Return numpy's function (hstack, ...), whose arrays of symbols stay arrays of symbols."""
 
     @functools.wraps(function, updated=())
     def call(*args: Any, **kwargs: Any) -> Any:

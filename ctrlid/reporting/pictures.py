@@ -76,8 +76,8 @@ def find_period(models: Mapping[str, Any]) -> float:
     periods = {k: timebase(m) for k, m in models.items() if timebase(m)}
     if len({round(p, 12) for p in periods.values()}) > 1:
         listed = ", ".join(f"{k}: {p:g} s" for k, p in periods.items())
-        raise CtrlidError(f"poles at different sampling periods do not compare ({listed}); draw "
-                          "each period on its own axes")  # fmt: skip
+        raise CtrlidError(f"poles at different sampling periods cannot be compared ({listed}); "
+                          "draw each period on its own axes")  # fmt: skip
     return next(iter(periods.values()), 0.0)
 
 

@@ -134,11 +134,11 @@ def _make_record_table(record: Record) -> Table:
         (name, unit or "not given", *(f"{f(v):.6g}" for f in (np.min, np.mean, np.max, np.std)))
         for name, unit, v in channels
     )
-    valid = "" if record.valid.all() else f", {100 * record.valid.mean():.1f} % of them count"
-    between = "held" if record.hold == "zoh" else "straight"
+    valid = "" if record.valid.all() else f", {100 * record.valid.mean():.1f} % of them valid"
+    between = "is held" if record.hold == "zoh" else "is a straight line"
     caption = (
         f"{len(record)} samples at {record.dt:g} s, {record.duration:.4g} s in all{valid}; "
-        f"u is {between} between samples."
+        f"u {between} between samples."
     )
     head = ("signal", "unit", "smallest", "mean", "largest", "standard deviation")
     return Table(head, rows, caption)
@@ -159,8 +159,13 @@ def _make_estimate_blocks(e: Estimate) -> list[Block]:
     text = str(e).splitlines()
     news = text[1 + next(i for i, line in enumerate(text) if "active bounds:" in line) :]
     period = f", dt = {e.dt:g} s" if e.dt else ""
-    white = " Standard errors hold for white errors only." if e.errors == "equation error" else ""
-    caption = f"{_upper(e.method)}, {e.n_samples} rows{period}.{white}"
+    white = (
+        " Standard errors are valid only if the errors are white."
+        if e.errors == "equation error"
+        else ""
+    )
+    used = _text.write_count(e.n_samples, "sample")
+    caption = f"{_upper(e.method)}, {used} used{period}.{white}"
     return [
         Table(("coefficient", "value", "standard error"), tuple(rows), caption),
         Table(head, poles),
@@ -175,22 +180,22 @@ def _make_comparison_tables(c: Comparison) -> list[Table]:
         for q in c.curves
     )
     tests = tuple(
-        (t.name, "chance" if t.passed else "NOT CHANCE", f"{np.abs(t.values).max():.3f}",
+        (t.name, "yes" if t.passed else "NO", f"{np.abs(t.values).max():.3f}",
          f"{t.band:.3f}", _text.write_p_value(t.p_value)) for t in c.tests
     )  # fmt: skip
     tables = [
         Table(("curve", "fit", f"RMS error [{unit}]", "noise explains"), curves, f"{c.what}.")
     ]
     if tests:
-        head = ("correlation", "verdict", "largest", "99 % band", "by chance")
-        tables.append(Table(head, tests, "One-step errors."))
+        head = ("correlation", "passed?", "largest", "99 % band", "p-value")
+        tables.append(Table(head, tests, "Correlation of the one-step errors."))
     return tables
 
 
 def _make_loop_fit_blocks(fit: LoopFit) -> list[Block]:
     e = fit.estimate
     errors = ("on its bound" if name in e.active else
-              f"{error:.2g}" if np.isfinite(error) else "not in the data"
+              f"{error:.2g}" if np.isfinite(error) else "not determined by the data"
               for name, error in zip(e.names, e.standard_errors, strict=True))  # fmt: skip
     rows = tuple(zip(e.names, (f"{v:.7g}" for v in e.values), errors, strict=True))
     first, *rest = str(e).splitlines()

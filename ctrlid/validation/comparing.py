@@ -143,7 +143,8 @@ def _make_comparison(
     what: str, record: Record, curves: list[Curve], residuals: Array, notes: list[str]
 ) -> Comparison:
     known = tuple(c for c in curves if np.isfinite(c.rms))
-    notes += [f"no {c.label}: no valid stretch is long enough" for c in curves if c not in known]
+    notes += [f"no {c.label}: no stretch of valid samples is long enough"
+              for c in curves if c not in known]  # fmt: skip
     exact = known[0].fit > EXACT
     tests = () if exact else _test_residuals(record, residuals)
     return Comparison(what, record, known, residuals, tests, tuple(notes))
@@ -156,8 +157,9 @@ def _simulate(record: Record, loop: Loop, prediction: Prediction) -> Curve:
     """
     if loop.controller is None and compute_growth_rate(loop) > -1e-9:
         raise ModelCannotRun(
-            "the plant is not stable and the controller is unknown; an open-loop simulation "
-            "would drift without bound. Give the loop its controller"
+            "the plant is not stable and the loop has no controller, so an open-loop simulation "
+            "would drift without bound. Make the loop with the controller of the record: "
+            "Loop(plant, controller, ...)"
         )
     y, injected, noisy = np.full(len(record), np.nan), np.zeros(len(record)), np.zeros(len(record))
     simulator = Simulator(loop)
@@ -207,7 +209,9 @@ def _sample_model(model: Any, record: Record, delay: float) -> tuple[Array, Arra
 
 def _compare_model(record: Record, model: Any, horizon: int | None) -> Comparison:
     if model.ninputs != 1 or model.noutputs != 1:
-        raise CtrlidError("compare needs a model with one input and one output")
+        raise CtrlidError("compare needs a model with one input and one output; given "
+                          f"{model.ninputs} inputs and {model.noutputs} outputs. Pick a channel, "
+                          "for example G[0, 0]")  # fmt: skip
     dt = record.dt if model.dt is True else timebase(model)
     if dt and abs(dt - record.dt) > 1e-9 * dt:
         raise CtrlidError(
@@ -215,10 +219,9 @@ def _compare_model(record: Record, model: Any, horizon: int | None) -> Compariso
             "model at the record's period"
         )
     poles = ", ".join(write_number(p, 4) for p in model.poles())
-    what = f"{model.name}: poles {poles or 'none'}"
+    what = f"{model.name} (poles {poles or 'none'}"
     delay = read_delay(model)
-    if delay:
-        what += f", delay {write_number(delay, 4)} s"
+    what += f", delay {write_number(delay, 4)} s)" if delay else ")"
     if not dt:
         num, den = _sample_model(model, record, delay)
     else:
@@ -270,8 +273,8 @@ def _compare_model(record: Record, model: Any, horizon: int | None) -> Compariso
         outside = _list_known_signals(record, 1)
         curves.append(_judge_curve(OPEN_LOOP, record, free, outside, white * grown[-1]))
     else:
-        notes.append("an unstable model is not simulated open loop; put it into a Loop with the "
-                     "controller")  # fmt: skip
+        notes.append("an unstable model cannot be simulated in open loop; for a closed-loop "
+                     "simulation put it into a Loop with its controller")  # fmt: skip
     return _make_comparison(what, record, curves, residuals, notes)
 
 

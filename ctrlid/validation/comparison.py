@@ -6,7 +6,7 @@ import numpy as np
 
 from .._base.arrays import Array
 from .._base.errors import CtrlidError
-from .._base.text import Printed
+from .._base.text import Printed, write_list
 from ..data.record import Record
 from .residual_tests import Correlation
 
@@ -92,40 +92,45 @@ class Comparison(Printed):
     def verdict(self) -> str:
         """The comparison in words: the last curve, then the one-step errors."""
         last = self.curves[-1]
-        what = self.record.name or "the record"
-        text = f"The {last.label} reproduces {what} with a fit of {_write_fit(last.fit)}"
+        text = f"The fit of the {last.label} is {_write_fit(last.fit)}"
         if last.fit <= 0:
-            text = f"The {last.label} does not reproduce {what}: it errs by more than y moves"
+            text = (f"The fit of the {last.label} is negative: its error is larger than the "
+                    "variation of y")  # fmt: skip
         if last.fit > EXACT:
-            return text + ": nothing is left to explain."
+            return text + ": the model explains the whole record."
         failed = [t for t in self.tests if not t.passed]
         large = [t for t in failed if t.share >= SYSTEMATIC]
         if last.follows >= SYSTEMATIC:
             text += (f". SOMETHING IS MISSING in the model: {_write_percent(last.follows)} of the "
-                     "error's variance follows reference or input, as noise does not.")  # fmt: skip
+                     "variance of the error depends on the reference or the input, and noise "
+                     "depends on neither.")  # fmt: skip
         elif last.noise_share < ENOUGH:
             text += (
                 ". SOMETHING IS MISSING in the model: noise of the size of the one-step "
-                f"errors explains {_write_percent(last.noise_share)} of the error's variance; an "
-                "offset, a drift or a nonlinearity looks like this."
+                f"errors explains only {_write_percent(last.noise_share)} of the variance of the "
+                "error. The cause may be an offset, a drift or a nonlinearity."
             )
         elif large:
             text += ". SOMETHING IS MISSING in the model, or its noise is not white."
         else:
-            text += f". Noise explains {_write_percent(last.noise_share)} of the error's variance."
+            text += (f". Noise explains {_write_percent(last.noise_share)} of the variance of its "
+                     "error.")  # fmt: skip
         if large:
-            return text + f" The one-step errors are NOT NOISE ALONE: {_write_shares(large)}."
+            return text + (" The one-step errors are NOT NOISE ALONE: they are correlated "
+                           f"{_write_shares(large)}.")  # fmt: skip
         if failed:
-            return text + (" The one-step errors are nearly noise alone; what correlates is "
-                           f"certain but small: {_write_shares(failed)}.")  # fmt: skip
+            return text + (" The one-step errors are nearly noise: they are correlated "
+                           f"{_write_shares(failed)}, which is significant but small.")  # fmt: skip
         if self.tests:
-            text += " The one-step errors are white and independent of the signals."
+            text += " The one-step errors are white and independent of the past signals."
         return text
 
     def __str__(self) -> str:
         unit = self.record.units.get("y", "")
-        rows = [f"{self.what} against {self.record.name or 'record'} ({len(self.record)} samples, "
-                f"{np.count_nonzero(self.record.valid)} valid)"]  # fmt: skip
+        rows = [
+            f"Comparison of {self.what} with the record {self.record.name}".rstrip()
+            + f" ({len(self.record)} samples, {np.count_nonzero(self.record.valid)} valid)"
+        ]
         size = f"RMS error [{unit}]" if unit else "RMS error"
         rows.append(f"  {'curve':<34}{'fit':>10}{size:>18}{'noise explains':>18}")
         rows += [
@@ -134,8 +139,8 @@ class Comparison(Printed):
             for c in self.curves
         ]
         if self.tests:
-            rows.append(f"  {'one-step errors':<34}{'chance?':>10}{'largest':>18}"
-                        f"{'of variance':>18}")  # fmt: skip
+            rows.append(f"  {'correlation of one-step errors':<34}{'passed?':>10}{'largest':>18}"
+                        f"{'variance share':>18}")  # fmt: skip
         for t in self.tests:
             worst = int(np.argmax(np.abs(t.values)))
             largest = f"{t.values[worst]:+.3f} at lag {t.lags[worst]}"
@@ -161,4 +166,4 @@ def _write_fit(fit: float) -> str:
 
 def _write_shares(tests: list[Correlation]) -> str:
     """Say how much of the variance each failed test stands for."""
-    return ", ".join(f"{t.name}, {_write_percent(t.share)} of the variance" for t in tests)
+    return write_list([f"{t.name} ({_write_percent(t.share)} of the variance)" for t in tests])

@@ -58,23 +58,26 @@ def check_controller(loop: Loop, record: Record) -> list[Fact]:
     slack = 1e-6 * (float(np.ptp(part.u)) + 1e-300)
     beyond = float(np.mean((part.u < lower - slack) | (part.u > upper + slack)))
     if beyond:
-        facts.append(("limits", f"u goes beyond the input limits {lower:g} .. {upper:g} for "
-                      f"{100 * beyond:.2g} % of the samples: u was logged ahead of the limiter. "
-                      "Limit it before fitting, or correct the limits.", beyond, True))  # fmt: skip
+        facts.append(("limits", f"u is outside the input limits of the loop ({lower:g} to "
+                      f"{upper:g}) for {100 * beyond:.2g} % of the samples: u was logged before "
+                      "the limiter, or the limits are wrong. Limit u before fitting, or correct "
+                      "input_limits=.", beyond, True))  # fmt: skip
         loop = replace(loop, input_limits=(-np.inf, np.inf))
     try:
         e, left = _compute_remainder(loop, part)
     except CtrlidError as reason:  # The audit prints a refusal among its facts.
-        return [*facts, ("refused", f"the controller cannot be replayed: {reason}.", 1.0, True)]
+        return [*facts, ("refused", "u cannot be computed with the controller of the loop: "
+                         f"{reason}.", 1.0, True)]  # fmt: skip
     if left <= EXACT:
-        return [*facts, ("exact", "the logged u is what the stated controller computes from r "
-                         "and y.", left, False)]  # fmt: skip
+        return [*facts, ("exact", "the controller of the loop computes exactly the logged u from "
+                         "r and y.", left, False)]  # fmt: skip
     shift = _find_shift(loop, part, left)
     if shift is not None:
         words, moved, remains = shift
-        facts.append(("late", f"{words}: so shifted, the controller explains "
-                      f"{100 * (1 - remains):.4g} % of u, as logged {100 * (1 - left):.4g} %. "
-                      "Shift the channel back before fitting.", left, True))  # fmt: skip
+        facts.append(("late", f"{words}: the controller of the loop explains "
+                      f"{100 * (1 - left):.4g} % of the variance of u as logged, and "
+                      f"{100 * (1 - remains):.4g} % with this shift removed. Shift the channel "
+                      "back before fitting.", left, True))  # fmt: skip
         part = moved
         e, left = _compute_remainder(loop, part)
         if left <= EXACT:
@@ -138,15 +141,17 @@ def _explain_remainder(e: Any, left: float, record: Record) -> Fact:
         like = float(np.corrcoef(channel[record.valid], e[record.valid])[0, 1] ** 2) if (
             np.ptp(channel[record.valid]) and np.ptp(e[record.valid])) else 0.0  # fmt: skip
         if like > 0.9:
-            return ("injected", f"besides the controller's part, u contains an injected signal of "
-                    f"RMS {rms} that runs like the channel {name!r}.", left, False)  # fmt: skip
+            return ("injected", f"in addition to the output of the controller, u contains a signal "
+                    f"of RMS {rms} that is correlated with the channel {name!r}.", left,
+                    False)  # fmt: skip
     moving = [(s, 0) for s in (record.y, record.r) if np.ptp(s[record.valid]) > 0]
     follows = compute_explained_share(e, moving, record.valid, lags=10)
     if follows > FOLLOWS:
-        return ("other", f"the stated controller leaves {100 * left:.3g} % of u unexplained (RMS "
-                f"{rms}), and {100 * follows:.2g} % of that follows r and y: gains or structure "
-                "are others, or a slow signal is added to u. Correct the controller, or give "
-                "None.", left, True)  # fmt: skip
-    return ("injected", f"besides the controller's part, u contains an injected signal of RMS "
-            f"{rms}, which r and y do not explain: excitation, dither or rounding.", left,
+        share = f"{100 * left:.3g} % of the variance of u" if left < 1 else "u"
+        return ("other", f"the controller of the loop does not explain {share} (RMS {rms}), and "
+                f"{100 * follows:.0f} % of this part depends on r and y: the true controller has "
+                "other gains or another structure, or a slow signal is added to u. Correct the "
+                "controller, or give None.", left, True)  # fmt: skip
+    return ("injected", f"in addition to the output of the controller, u contains a signal of RMS "
+            f"{rms} that does not depend on r and y: excitation, dither or rounding.", left,
             False)  # fmt: skip

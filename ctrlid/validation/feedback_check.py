@@ -8,7 +8,7 @@ from scipy import linalg, stats
 
 from .._base.arrays import Array
 from .._base.errors import CtrlidError
-from .._base.text import Printed
+from .._base.text import Printed, write_count
 from ..data.record import Record
 from ..data.validity import find_whole_past
 from .residual_tests import Correlation, cross_correlation
@@ -40,12 +40,12 @@ class FeedbackCheck(Printed):
     closed_loop : bool
         Whether u reacts to y.
     p_value : float
-        Probability of correlations as large as these if it does not; 0 or 1 where an exact law
-        decided.
+        Probability of correlations as large as these if it does not; 0 or 1 where an exact
+        function decided.
     lags : ndarray of int
         Lags in samples: at lag tau, u is compared with what was new in y tau samples before.
     correlation : ndarray
-        Correlation coefficients; empty where an exact law decided.
+        Correlation coefficients; empty where an exact function decided.
     text : str
         The finding in words.
     """
@@ -108,11 +108,12 @@ def check_feedback(record: Record) -> FeedbackCheck:
         raise CtrlidError(f"check_feedback needs a Record; given {type(record).__name__}")
     longest = max((b - a for a, b in record.segments()), default=0)
     if longest < 60:
-        raise CtrlidError(f"check_feedback needs 60 valid samples in succession; the longest "
-                          f"stretch has {longest}. Record longer")  # fmt: skip
+        raise CtrlidError(f"check_feedback needs 60 valid samples in succession; the record has "
+                          f"{longest}. Record longer")  # fmt: skip
     for key in ("u", "y"):
         if np.ptp(getattr(record, key)[record.valid]) == 0:
-            raise CtrlidError(f"{key} is constant, so nothing tells whether there is feedback")
+            raise CtrlidError(f"{key} is constant, so the record does not show whether there is "
+                              "feedback. Excite the loop")  # fmt: skip
     order = int(np.clip(longest // 20, 2, ORDER))
     signals = {"u": record.u, "y": record.y}
     if record.r is not None and np.ptp(record.r[record.valid]) > 0:
@@ -132,7 +133,8 @@ def check_feedback(record: Record) -> FeedbackCheck:
     good[rows] = True
     if np.std(w[rows]) <= NOTHING * np.std(record.u[rows]):
         return FeedbackCheck(False, 1.0, np.zeros(0, int), np.zeros(0),
-                             "No feedback found: u follows from its own past alone.")  # fmt: skip
+                             "No feedback found: u is a function of its own past "
+                             f"{'and r ' if 'r' in signals else ''}alone.")  # fmt: skip
     test = cross_correlation(w, e, good, "y", lags=LAGS, first=0)
     p = _compute_p_value(test)
     if record.hold == "foh":
@@ -145,12 +147,13 @@ def check_feedback(record: Record) -> FeedbackCheck:
     closed = p < LEVEL
     if closed:
         worst = int(np.argmax(np.abs(test.values)))
-        text = (f"Closed loop: u reacts to what is new in y (correlation {test.values[worst]:+.2g} "
-                f"after {test.lags[worst]} samples, chance {p:.1g}). Use estimators that hold "
-                "under feedback: fit_iv or fit_continuous.")  # fmt: skip
+        text = (f"Closed loop: u depends on the innovations of y (correlation "
+                f"{test.values[worst]:+.2g} after {write_count(int(test.lags[worst]), 'sample')}, "
+                f"p = {p:.1g}). Use an estimator that is consistent under feedback: fit_iv or "
+                "fit_continuous.")  # fmt: skip
     else:
-        text = (f"No feedback found: what is new in y does not show in u (chance {p:.2g}), as in "
-                "open loop, or with feedback too weak to be seen.")  # fmt: skip
+        text = (f"No feedback found: u does not depend on the innovations of y (p = {p:.2g}). The "
+                "loop is open, or its feedback is too weak to be seen.")  # fmt: skip
     return FeedbackCheck(closed, p, test.lags, test.values, text)
 
 
@@ -181,9 +184,9 @@ def _test_short_law(
         if shorter or (least > NOTHING * size and left <= TELLING * least):
             return FeedbackCheck(
                 True, 0.0, np.zeros(0, int), np.zeros(0),
-                f"Closed loop: r and y, now and {n} samples back, give u nearly exactly, while r "
-                "and past u do not. Use estimators that hold under feedback: fit_iv or "
-                "fit_continuous.",
+                f"Closed loop: u is nearly exactly a function of r and y {_write_reach(n)}, and "
+                "not of r and past u alone. Use an estimator that is consistent under feedback: "
+                "fit_iv or fit_continuous.",
             )  # fmt: skip
     return None
 
@@ -267,15 +270,21 @@ def _decide_without_noise(signals: dict[str, Array], valid: Any, now: int) -> Fe
         with_y = _find_exact_order(signals, valid, "uyr", "u", now)
         without = _find_exact_order(signals, valid, "ur", "u", now)
         if with_y < without:
-            return answer(True, "Closed loop: there is no noise, and u is an exact function of y "
-                          f"and r with {with_y} past samples, while r alone does not give it as "
-                          "simply.")  # fmt: skip
+            return answer(True, "Closed loop: there is no noise, and u is an exact function of r "
+                          f"and y {_write_reach(with_y)}, while one of r alone needs more "
+                          "samples.")  # fmt: skip
     order = _find_exact_order(signals, valid, "yu", "y", now)
     if 0 < order <= EXACT_LAGS and _is_unstable(signals, valid, order, now):
-        return answer(True, "Closed loop: there is no noise, and the plant is unstable, yet y "
-                      "stays bounded.")  # fmt: skip
-    return answer(False, "No feedback found: there is no noise in y that could show in u, and no "
-                  "law that needs y. Without noise this is no proof of an open loop.")  # fmt: skip
+        return answer(True, "Closed loop: there is no noise, and y stays bounded although the "
+                      "plant is unstable.")  # fmt: skip
+    return answer(False, "No feedback found: there is no noise in y that could appear in u, and "
+                  "u can be explained without y. Without noise this does not prove an open "
+                  "loop.")  # fmt: skip
+
+
+def _write_reach(n: int) -> str:
+    """Say which samples a controller uses."""
+    return f"at the present and {write_count(n, 'past sample')}" if n else "at the present sample"
 
 
 def _is_unstable(signals: dict[str, Array], valid: Any, order: int, now: int) -> bool:

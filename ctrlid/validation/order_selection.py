@@ -87,7 +87,7 @@ class OrderChoice(Printed):
     text: str
 
     def __str__(self) -> str:
-        lines = ["   na  nb  nk      misfit   chance         BIC   held-out error"]
+        lines = ["   na  nb  nk      misfit  p-value         BIC   held-out error"]
         lines += [
             f"  {row.na:>3} {row.nb:>3} {row.nk:>3} {row.misfit:>11.4g} {row.p_value:>8.2g} "
             f"{row.bic:>11.5g} {row.held_out:>16.4f}"
@@ -163,7 +163,8 @@ def select_order(
     if record.valid.any():
         for key in ("u", "y"):
             if np.ptp(getattr(record, key)[record.valid]) == 0:
-                raise CtrlidError(f"{key} is constant: no structure shows. Excite the loop")
+                raise CtrlidError(f"{key} is constant, so no structure can be selected. Excite the "
+                                  "loop")  # fmt: skip
     length = _choose_length(record, cut, most)
     long = _fit_long_regression(record, 0, cut, length)
     judge = _find_rows(record, cut, record.n, length)
@@ -227,9 +228,9 @@ def _fit_long_regression(
 ) -> _Long:
     rows = _find_rows(record, start, stop, max(length, reach))
     if len(rows) < 4 * length + 20:
-        raise CtrlidError(f"select_order needs {4 * length + 20} rows for {length} lags; the first "
-                          f"two thirds have {len(rows)}. Record longer, or try fewer "
-                          "orders")  # fmt: skip
+        raise CtrlidError(f"a regression on {length} lags needs {4 * length + 20} equations; the "
+                          f"first two thirds of the record give {len(rows)}. Record longer, or try "
+                          "lower orders")  # fmt: skip
     table, goal = _make_table(record, rows, length)
     size = np.maximum(np.linalg.norm(table, axis=0), 1e-300)
     _, values, vt = np.linalg.svd(np.linalg.qr(table / size, mode="r"))
@@ -249,7 +250,8 @@ def _choose_length(record: Record, cut: int, most: int) -> int:
     longest = min(LONGEST, room // 12)
     if longest < most + 2:
         raise CtrlidError(f"select_order needs about {12 * (most + 2) * 3 // 2} samples in "
-                          f"succession for these orders; given {record.n}")  # fmt: skip
+                          f"succession for these orders; the record has {record.n}. Record longer, "
+                          "or try lower orders")  # fmt: skip
     scores = {}
     for n in sorted({most + 2, 10, 15, 20, 30, 40, longest}):
         if most + 2 <= n <= longest:
@@ -301,20 +303,24 @@ def _fit_structure(long: _Long, na: int, nb: int, nk: int) -> tuple[Array, float
 
 def _write_choice(rows: list[OrderRow], unit: float, length: int) -> str:
     best = rows[0]
-    text = (f"Chosen: na={best.na}, nb={best.nb}, nk={best.nk}, held against {length} lags of "
-            f"y and u; its one-step error on the last third is {best.held_out:.3f} times that of "
-            "the long regression.")  # fmt: skip
+    text = (f"Chosen: na={best.na}, nb={best.nb}, nk={best.nk}, by comparison with a long "
+            f"regression on {length} lags of y and u. On the last third of the record, which was "
+            f"not fitted, its one-step error is {best.held_out:.3f} times that of the long "
+            "regression.")  # fmt: skip
     if len(rows) > 1:
         ahead = rows[1].bic - best.bic
-        text += (f" Next: na={rows[1].na}, nb={rows[1].nb}, nk={rows[1].nk}, behind by {ahead:.3g}"
+        text += (f" The next structure is na={rows[1].na}, nb={rows[1].nb}, nk={rows[1].nk}; its "
+                 f"BIC is larger by {ahead:.3g}"
                  f"{', NOT A CLEAR DECISION' if ahead < 6 else ''}.")  # fmt: skip
     if best.held_out < 1 - COSTS:
-        text += (" THE RECORD DECIDES LITTLE: the long regression predicts worse than the short "
-                 "one, so u is too poor or too smooth, or the record too short. Trust no order "
-                 "here.")  # fmt: skip
+        text += (" THE RECORD DOES NOT DECIDE: the long regression predicts worse than the chosen "
+                 "structure. The excitation is too weak or too smooth, or the record is too short. "
+                 "No order can be trusted here.")  # fmt: skip
     elif best.held_out > 1 + COSTS:
-        text += " THE STRUCTURE COSTS PREDICTION: try higher orders or longer delays."
+        text += (" THE STRUCTURE PREDICTS WORSE than the long regression: try higher orders or "
+                 "longer delays.")  # fmt: skip
     if unit > 2:
-        text += (f" NO STRUCTURE FITS TO CHANCE (misfit {unit:.2g} times what noise leaves): more "
-                 "poles, a nonlinearity, or changes during the record.")  # fmt: skip
+        text += (f" NO STRUCTURE FITS THE RECORD: the misfit is {unit:.2g} times that of noise. "
+                 "The plant may have more poles or a nonlinearity, or it changed during the "
+                 "record.")  # fmt: skip
     return text

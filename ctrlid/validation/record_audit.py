@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from .._base.errors import CtrlidError
-from .._base.text import Printed
+from .._base.text import Printed, write_count
 from ..data.record import SIGNALS, Record
 from ..data.several_records import order_model_and_data
 from ..data.validity import find_runs
@@ -99,12 +99,16 @@ class Audit(Printed):
 
     def __str__(self) -> str:
         if not self.findings:
-            return "Audit: nothing to say against this record."
+            return "Audit: no defect was found in this record."
         bad = len(self.harmful)
-        rows = [f"Audit: {_write_count(len(self.findings))}, {bad or 'none'} harmful"]
+        harm = f"{bad} of which harm" if bad > 1 else f"{bad or 'none'} of which harms"
+        if len(self.findings) == 1:
+            harm = "which harms" if bad else "which does not harm"
+        rows = [f"Audit: {write_count(len(self.findings), 'finding')}, {harm} a fit"]
         for f in self.findings:
             kind = f.kind.upper() if f.harmful else f.kind
-            rows.append(f"  {kind}{f' of {f.channel}' if f.channel else ''}: {f.text}")
+            of = f" of {f.channel}" if f.channel and f.kind != "controller" else ""
+            rows.append(f"  {kind}{of}: {f.text}")
         return "\n".join(rows)
 
 
@@ -146,8 +150,8 @@ def audit(record: Record, loop: Loop | None = None) -> Audit:
     >>> r = cid.random_binary(2000, amplitude=0.1, hold=50, seed=1)
     >>> record = cid.simulate(loop, r, sensor_noise=1e-4, seed=2)
     >>> print(cid.audit(record, loop))
-    Audit: 1 finding, none harmful
-      controller of u: the logged u is what the stated controller computes from r and y.
+    Audit: 1 finding, which does not harm a fit
+      controller: the controller of the loop computes exactly the logged u from r and y.
     >>> stuck = cid.Record(r=r, u=record.u, y=np.minimum(record.y, 0.08), dt=0.01)
     >>> [f.kind for f in cid.audit(stuck).harmful]
     ['saturation']
@@ -155,13 +159,13 @@ def audit(record: Record, loop: Loop | None = None) -> Audit:
     loop, record = order_model_and_data(loop, record)
     if not isinstance(record, Record) or not (loop is None or isinstance(loop, Loop)):
         raise CtrlidError(
-            "audit needs a Record and, if you like, its Loop; given "
+            "audit needs a Record and, optionally, its Loop; given "
             f"{type(record).__name__} and {type(loop).__name__}. Audit several records one by one"
         )
     count = int(np.count_nonzero(record.valid))
     if count < 2:
-        few = AuditFinding("too few samples", "", f"{count} samples count", count, (0, record.n),
-                           harmful=True)  # fmt: skip
+        text = f"the record has {write_count(count, 'valid sample')}. Record longer."
+        few = AuditFinding("too few samples", "", text, count, (0, record.n), harmful=True)
         still = dict.fromkeys(SIGNALS, (0.0, 0.0, 0.0, 0.0))
         return Audit((few,), MappingProxyType(dict.fromkeys(SIGNALS, 0.0)), (0, 0),
                      MappingProxyType(still))  # fmt: skip
@@ -217,8 +221,9 @@ class _RecordChecks:
         longest = max(b - a for a, b in self.record.segments())
         if count >= FEW and longest >= STRETCH:
             return []
-        text = (f"{count} samples count, at most {longest} in succession; a fit of a few "
-                f"coefficients needs {FEW} and more. Record longer.")  # fmt: skip
+        text = (f"the record has {write_count(count, 'valid sample')}, at most {longest} of them "
+                f"in succession. A fit of a few coefficients needs at least {FEW}, and {STRETCH} "
+                "in succession. Record longer.")  # fmt: skip
         return [AuditFinding("too few samples", "", text, count, self.whole, harmful=True)]
 
     def find_constant(self) -> list[AuditFinding]:
@@ -231,10 +236,11 @@ class _RecordChecks:
                 share, value = defects.find_stuck(v, driver) if key == "y" else (0.0, 0.0)
                 if not share:
                     continue
-                long = f" for {100 * share:.4g} % of the samples, whatever moves it"
+                long = (f" for {100 * share:.4g} % of the samples, although the excitation "
+                        "changes")  # fmt: skip
             text = (
-                f"{key} stays at {self.write_value(key, value)}{long}: nothing can be learnt "
-                "from it."
+                f"{key} stays at {self.write_value(key, value)}{long}: no model can be "
+                "identified from it."
             )
             kind = "constant signal"
             out.append(AuditFinding(kind, key, text, 0.0, self.whole, harmful=True))
@@ -262,16 +268,17 @@ class _RecordChecks:
             )
             if key == "y":
                 self.at_limit = mask
-                cure = ("the sensor, or a stop, hides what y does there. Mark these samples "
-                        "with valid=, with some before and after.")  # fmt: skip
+                cure = (": the sensor, or a mechanical stop, is at its limit. Exclude these "
+                        "samples, and some before and after them, with valid=.")  # fmt: skip
             else:
                 reached = [v for share, v in zip(shares, values, strict=True) if share]
                 known = all(np.isclose(v, self.stated, rtol=1e-3).any() for v in reached)
-                tell = "its limits are known" if known else "tell the loop with input_limits="
-                cure = ("a limiter at work. Fits from u to y stand if the logged u is the "
-                        f"limited one; {tell}.")  # fmt: skip
+                advice = ("The loop has these limits" if known else
+                          "Give the limits to the loop with input_limits=")  # fmt: skip
+                cure = (", so it is limited. Fits from u to y are valid if the logged u is the "
+                        f"limited one. {advice}.")  # fmt: skip
             where = np.flatnonzero(mask)
-            out.append(AuditFinding("saturation", key, f"{key} sits exactly at {ends}: {cure}",
+            out.append(AuditFinding("saturation", key, f"{key} is exactly {ends}{cure}",
                                     float(np.mean(mask[self.valid])),
                                     (int(where[0]), int(where[-1]) + 1), key == "y"))  # fmt: skip
         return out
@@ -285,9 +292,12 @@ class _RecordChecks:
                 continue
             ratio = step / spread
             size = self.write_value(key, step)
-            text = f"{key} moves in steps of {size}, {100 * ratio:.2g} % of its spread"
+            text = (f"{key} is quantized in steps of {size}, {100 * ratio:.2g} % of its standard "
+                    "deviation")  # fmt: skip
             bad = key == "y" and ratio > COARSE
-            text += ": too coarse to follow the motion. Excite more strongly." if bad else "."
+            text += (
+                ": too coarse to show the motion. Excite the loop more strongly." if bad else "."
+            )
             out.append(AuditFinding("quantization", key, text, ratio, self.whole, bad))
         return out
 
@@ -302,15 +312,16 @@ class _RecordChecks:
         with_u = np.mean([np.ptp(u[a - 1 : b]) == 0 for a, b in zip(first, stop, strict=True)])
         also = with_u > 0.8 and np.mean(np.diff(u) == 0) < 0.5
         what = "y and u repeat their" if also else "y repeats its"
-        text = (f"{what} last value for {mask.sum()} samples in {len(first)} places, though "
-                "the neighbours move: ")  # fmt: skip
+        count, places = write_count(int(mask.sum()), "sample"), write_count(len(first), "place")
+        text = (f"{what} last value for {count} in {places}, "
+                "although the samples before and after change: ")  # fmt: skip
         every = np.diff(first)
         usual = int(np.median(every)) if len(every) > 10 else 0
         if share > 0.3 and np.mean(every == usual) > 0.9:
-            text += (f"y is refreshed every {usual} samples only. Decimate by {usual} with "
-                     "antialias=False.")  # fmt: skip
+            text += (f"y is measured only once in {usual} samples. Decimate the record by "
+                     f"{usual} with antialias=False.")  # fmt: skip
         else:
-            text += "samples were lost and filled in. Mark them with valid=."
+            text += "samples were lost and replaced. Exclude them with valid=."
         return [AuditFinding("dropped samples", "y", text, share,
                              (int(first[0]), int(stop[-1])), harmful=True)]  # fmt: skip
 
@@ -321,9 +332,9 @@ class _RecordChecks:
             return []
         worst = at[np.argmax(np.abs(height[at]))]
         text = (
-            f"{at.size} isolated spikes of y, the largest {self.write_value('y', height[worst])} "
-            f"at sample {worst}: no plant moves there and back within a sample. Mark them with "
-            "valid=."
+            f"y has {write_count(at.size, 'isolated spike')}, the largest of "
+            f"{self.write_value('y', height[worst])} at sample {worst}. No plant moves there and "
+            f"back within one sample. Exclude {'it' if at.size == 1 else 'them'} with valid=."
         )
         return [AuditFinding("outliers", "y", text, at.size / self.record.n,
                              (int(at[0]), int(at[-1]) + 1), harmful=True)]  # fmt: skip
@@ -337,16 +348,18 @@ class _RecordChecks:
         if p < SURE and change > scatter > 0:
             ratio = change / scatter
             text = (
-                f"y drifts by {self.write_value('y', change)} over the record, {ratio:.2g} times "
-                f"its scatter, and {'u' if r is None else 'r'} does not explain it. Cut the record "
-                "into parts and give them as a list: each has its own intercept."
+                f"y drifts by {self.write_value('y', change)} over the record, which is "
+                f"{ratio:.2g} times the standard deviation about it, and "
+                f"{'u' if r is None else 'r'} does not explain it. Divide the record into parts "
+                "and give them as a list: each part then has its own constant."
             )
             out.append(AuditFinding("drift", "y", text, ratio, self.whole, ratio > 2))
         if r is not None:
             mean, sd = float(np.mean(y - r)), float(np.std(y - r))
             if abs(mean) > 0.5 * sd and abs(mean) > 1e-9 * float(np.max(np.abs(y))):
                 away = self.write_value("y", mean)
-                text = f"y is on average {away} away from r; no integral action?"
+                text = (f"the mean of y - r is {away}; the controller may have no integral "
+                        "action.")  # fmt: skip
                 out.append(AuditFinding("offset", "y", text, abs(mean) / max(sd, 1e-300),
                                         self.whole))  # fmt: skip
         return out
@@ -357,9 +370,10 @@ class _RecordChecks:
         ratio = float(np.median(y)) / rest if rest else 0.0
         if ratio < ELSEWHERE or y.min() < math.sqrt(ELSEWHERE) * rest:
             return []
-        text = (f"y is {ratio:.3g} times as large as where the loop rests, {loop.at.output:.4g}: "
-                "logged in other units than the plant counts in, or u and y swapped? Scale or swap "
-                "the channels, or give the loop the operating point of this record.")  # fmt: skip
+        text = (f"y is {ratio:.3g} times the output of the operating point, {loop.at.output:.4g}. "
+                "The record may be in another unit than the plant, or u and y may be exchanged. "
+                "Scale or exchange the channels, or give the loop the operating point of this "
+                "record.")  # fmt: skip
         return [AuditFinding("operating point", "y", text, ratio, self.whole, harmful=True)]
 
     def find_repetition(self) -> list[AuditFinding]:
@@ -369,9 +383,9 @@ class _RecordChecks:
             return []
         times = self.record.n // found
         self.repeats = (found, times)
-        text = (f"the reference repeats itself every {found} samples, "
-                f"{self.record.n / found:.3g} times in all: averaging "
-                "over the periods separates noise from response.")  # fmt: skip
+        text = (f"the reference has a period of {found} samples, and the record has "
+                f"{self.record.n / found:.3g} periods. Averaging over the periods separates the "
+                "noise from the response.")  # fmt: skip
         return [AuditFinding("repeats", "r", text, times, self.whole)]
 
     def check_excitation(self, injected: bool) -> list[AuditFinding]:
@@ -386,19 +400,21 @@ class _RecordChecks:
             # A constant u is reported by the check for constant signals.
             if injected or key == "u":
                 return []
-            text = "r does not change while the record counts, and "
+            text = "r is constant in the valid samples, and "
             share = defects.find_share_beyond_controller(self.record.u, self.record.y, self.valid)
             if share > OWN:
-                text += (f"{100 * share:.2g} % of u is no linear function of y: a signal added to "
-                         "u, or noise of the input, is all that excites the loop.")  # fmt: skip
+                text += (f"{100 * share:.3g} % of the variance of u does not depend linearly on "
+                         "y: only a signal added to u, or noise of the input, excites the "
+                         "loop.")  # fmt: skip
             else:
-                text += ("u follows from y: there is noise only, of which no fit can learn the "
-                         "plant. Vary the reference (random_binary) or add a signal to "
-                         "u.")  # fmt: skip
+                text += ("u is computed from y: only noise excites the loop, and the plant cannot "
+                         "be identified from it. Vary the reference (random_binary) or add a "
+                         "signal to u.")  # fmt: skip
             return [AuditFinding(kind, key, text, size, self.whole, share <= OWN)]
         if changes < FEW_CHANGES:
-            text = (f"{key} changes {('once', 'twice', 'three times')[changes - 1]} only: little "
-                    "to average over. Use many steps, as random_binary gives.")  # fmt: skip
+            times = ("once", "twice", "three times")[changes - 1]
+            text = (f"{key} changes only {times}, so the estimates have a large variance. Use a "
+                    "reference with many steps, such as random_binary.")  # fmt: skip
             return [AuditFinding(kind, key, text, size, self.whole)]
         a, b = max(self.record.segments(), key=lambda part: part[1] - part[0])
         if changes > 0.5 * self.record.n and _count_lines(v[a:b]) == 1 and not injected:
@@ -406,10 +422,6 @@ class _RecordChecks:
                     "several frequencies, as multisine gives.")  # fmt: skip
             return [AuditFinding(kind, key, text, 2.0, self.whole, harmful=True)]
         return []
-
-
-def _write_count(n: int) -> str:
-    return f"{n} finding{'s' if n != 1 else ''}"
 
 
 def _count_lines(v: Any) -> int:

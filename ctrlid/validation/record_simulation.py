@@ -111,7 +111,8 @@ def prepare_stretch(
     elif loop.analog:
         if r is None:
             raise ModelCannotRun(
-                "an analog loop is simulated from its reference, but the record has none"
+                "a loop with an analog controller is simulated from its reference, but the record "
+                "has none; give it r=, a constant for a fixed set-point"
             )
         d = np.zeros(len(part))
         fitted = len(initial) if seek_controller else fitted
@@ -119,8 +120,8 @@ def prepare_stretch(
         pid = loop.controller
         if isinstance(pid, PID) and np.isfinite([pid.lower, pid.upper]).any():
             raise ModelCannotRun(
-                "a PID with limits is simulated from its reference, but the record "
-                "has none; give it r=, a constant for a fixed set-point"
+                "a loop with a limited PID is simulated from its reference, but the record has "
+                "none; give it r=, a constant for a fixed set-point"
             )
         r = np.full(len(part), loop.point.output)
         d = part.u - run_controller(loop, part.y, r)

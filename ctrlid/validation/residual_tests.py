@@ -28,7 +28,7 @@ class Correlation:
     Parameters
     ----------
     name : str
-        What is correlated.
+        What the residuals are correlated with, as in ``"with past u"``.
     lags : ndarray of int
         Lags in samples; at lag tau the residual is compared with the signal tau samples before.
     values : ndarray
@@ -96,7 +96,7 @@ def autocorrelation(e: Array, valid: Any, lags: int = 25, fitted: int = 0) -> Co
         # What the best prediction from this many past residuals would take away.
         whole = linalg.toeplitz(np.concatenate([[1.0], rho[:-1]])) + 1e-12 * np.eye(lags)
         share = _subtract_chance(float(rho @ np.linalg.solve(whole, rho)), lags / n)
-    return Correlation("residual with its own past", tau, rho, band, p, share)
+    return Correlation("with their own past", tau, rho, band, p, share)
 
 
 def _subtract_chance(raw: float, chance: float) -> float:
@@ -163,7 +163,7 @@ def cross_correlation(
     )
     scale = np.sqrt(re[0] * rs[0])
     if scale <= 0:
-        return Correlation(f"residual with past {name}", tau, np.zeros(lags), np.inf, 1.0)
+        return Correlation(f"with past {name}", tau, np.zeros(lags), np.inf, 1.0)
     two_sided_e = np.concatenate([re[:0:-1], re])
     shifted = [
         float(two_sided_e @ rs[np.abs(np.arange(-memory, memory + 1) + k)]) for k in range(lags)
@@ -175,7 +175,7 @@ def cross_correlation(
     z = _compute_whitening(linalg.toeplitz(row), 1e-6).T @ r * np.sqrt(n)
     p = float(stats.chi2.sf(float(z @ z), len(z)))
     share = _compute_share(r, rs[:lags], re[0], linalg.toeplitz(row) / n)
-    return Correlation(f"residual with past {name}", tau, r / scale, band, p, share)
+    return Correlation(f"with past {name}", tau, r / scale, band, p, share)
 
 
 def _compute_whitening(covariance: Array, smallest: float) -> Array:

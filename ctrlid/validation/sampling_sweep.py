@@ -120,7 +120,7 @@ def sweep_sampling_period(
     names = tuple(estimators)
     unknown = [name for name in names if name not in ESTIMATORS]
     if unknown or not names:
-        raise CtrlidError(f"estimators are of {write_list(ESTIMATORS)}; given {names}")
+        raise CtrlidError(f"estimators takes names out of {write_list(ESTIMATORS)}; given {names}")
     known = {
         name: tuple(constraints.get(name, ())) if isinstance(constraints, Mapping)
         else tuple(_as_list(constraints)) for name in names
@@ -139,17 +139,23 @@ def sweep_sampling_period(
     voters = sound or done
     centre = min(voters, key=lambda row: _measure_median_distance(row.poles, voters)).poles
     rows = [_rate_row(row, centre) for row in rows]
-    best, reason = _recommend(rows, names, "sound rows" if sound else "rows")
-    reason += (" Sound are those whose one-step errors are independent of u and r." if sound else
-               " In no row are the one-step errors known to be independent of u and r: MOST ROWS "
-               "MAY AGREE ON WRONG POLES.")  # fmt: skip
+    best, reason = _recommend(rows, names)
+    agreed = "The consensus poles are those on which most rows agree"
+    scale = "p is the largest of them, and distance is relative to it."
+    if sound:
+        reason += f" {agreed} whose one-step errors are independent of u and r; {scale}"
+    else:
+        reason += (f" {agreed}; {scale} In no row are the one-step errors known to be independent "
+                   "of u and r: MOST ROWS MAY AGREE ON WRONG POLES.")  # fmt: skip
     warning = ""
     if max(factors) > 1:
         what = (
-            "The controller that held u acts" if record.hold == "zoh" else "u moves"
-        ) + " within"
-        warning = (f"{what} the slower periods: u between the slow samples is approximated (see "
-                   "input_between), which standard errors do not contain.")  # fmt: skip
+            "The controller changed u more often than the longer periods sample it."
+            if record.hold == "zoh"
+            else "u changes between the samples of the longer periods."
+        )
+        warning = (f"{what} There u is approximated (see input_between), and the standard errors "
+                   "do not include the error of this approximation.")  # fmt: skip
     return SamplingSweep(record, tuple(rows), centre, best, reason, warning)
 
 
@@ -165,8 +171,8 @@ def _choose_factors(record: Any, periods: Sequence[float] | None) -> list[int]:
     ratios = np.asarray(periods, dtype=float) / record.dt
     whole = np.round(ratios)
     if not ratios.size or np.any(whole < 1) or np.any(np.abs(ratios - whole) > 1e-6 * whole):
-        raise CtrlidError(f"periods are whole multiples of the record's {record.dt:g} s; given "
-                          f"{list(periods)}")  # fmt: skip
+        raise CtrlidError("periods needs whole multiples of the sampling period of the record, "
+                          f"{record.dt:g} s; given {list(periods)}")  # fmt: skip
     return sorted({int(q) for q in whole})
 
 
@@ -189,7 +195,8 @@ def average_input(record: Record, factor: int) -> Record:
     if factor == 1:
         return record
     if n < 2:
-        raise CtrlidError(f"{record.n} samples leave fewer than 2 at {factor} times the period")
+        raise CtrlidError(f"at {factor} times the period fewer than 2 of the {record.n} samples "
+                          "are left; use a shorter period")  # fmt: skip
     cut = n * factor
     return Record(
         r=None if record.r is None else record.r[:cut:factor],
@@ -260,7 +267,7 @@ def _rate_row(row: SamplingRow, centre: Any) -> SamplingRow:
     return replace(row, deviation=_measure_distance(row.poles, centre))
 
 
-def _recommend(rows: Sequence[SamplingRow], names: Sequence[str], voters: str) -> tuple[float, str]:
+def _recommend(rows: Sequence[SamplingRow], names: Sequence[str]) -> tuple[float, str]:
     """Return the period at which the worst estimator is least off, and the words for it."""
     worst: dict[float, float] = {}
     for row in rows:
@@ -274,12 +281,15 @@ def _recommend(rows: Sequence[SamplingRow], names: Sequence[str], voters: str) -
             words.append(f"{name} at every period")
         elif good:
             reach = f"{min(good):.4g}" + (f" to {max(good):.4g}" if len(good) > 1 else "")
-            words.append(f"{name} at {reach} s ({len(good)} of {tried})")
+            words.append(f"{name} at {reach} s ({len(good)} of {tried} periods)")
         else:
-            words.append(f"{name} AT NONE")
-    off = "more than all" if worst[best] >= 1 else f"{100 * worst[best]:.2g} %"
+            words.append(f"{name} AT NO PERIOD")
+    off = (
+        "the estimates agree best, although not all are within 100 % of"
+        if worst[best] >= 1
+        else f"all estimates are within {100 * worst[best]:.2g} % of"
+    )
     return best, (
-        f"Recommended: {best:.4g} s, where the farthest estimate differs by {off} of the largest "
-        f"pole from the poles on which most {voters} agree. Within {100 * AGREES:.0f} % of these "
-        f"poles: {'; '.join(words)}."
+        f"Recommended: {best:.4g} s, where {off} the consensus poles. Within "
+        f"{100 * AGREES:.0f} % of these poles: {'; '.join(words)}."
     )

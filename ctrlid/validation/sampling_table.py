@@ -43,7 +43,7 @@ class SamplingRow:
         Inequalities on which the estimate sits.
     deviation : float
         Ratio: largest distance of a pole to that of the whole table, over the largest of those,
-        printed as "differs".
+        printed as "distance".
     failure : str
         Why there is no fit; empty if there is one.
     notes : tuple of str
@@ -114,11 +114,12 @@ class SamplingSweep(Printed):
 
     def __str__(self) -> str:
         largest = float(np.max(np.abs(self.poles))) if len(self.poles) else np.nan
-        width = 2 + max([len("poles [rad/s]"), *(len(_poles(row)) for row in self.table)])
+        heading = "poles ± standard error [rad/s]"
+        width = 2 + max([len(heading), *(len(_poles(row)) for row in self.table)])
         lines = [f"Sampling period of {self.record.name or 'the record'}: {self.record.n} samples "
                  f"at {self.record.dt:g} s",
                  f"  {'Ts [s]':>9} {'p Ts':>7}  {'estimator':<15}{'samples':>8}  "
-                 f"{'poles [rad/s]':<{width}}{'differs':>8}  one-step errors"]  # fmt: skip
+                 f"{heading:<{width}}{'distance':>8}  one-step errors"]  # fmt: skip
         for row in self.table:
             head = (f"  {row.period:>9.4g} {largest * row.period:>7.3g}  {row.estimator:<15}"
                     f"{row.n:>8}  ")  # fmt: skip
@@ -144,9 +145,11 @@ def _poles(row: SamplingRow) -> str:
 
 
 def _write_result(row: SamplingRow, width: int) -> str:
-    off = "far" if row.deviation >= FAR else f"{100 * row.deviation:.2g} %"
+    share = 100 * row.deviation
+    off = f"> {100 * FAR:.0f} %" if row.deviation >= FAR else (
+        f"{share:.2g} %" if share < 99.5 else f"{share:.0f} %")  # fmt: skip
     judged = {True: "white", False: "NOT WHITE", None: "not tested"}[row.white]
     if row.independent is not None:
-        judged += ", independent" if row.independent else ", FOLLOW u OR r"
+        judged += ", independent" if row.independent else ", CORRELATED WITH u OR r"
     bound = f"; ON ITS BOUND: {write_list(row.active)}" if row.active else ""
     return f"{_poles(row):<{width}}{off:>8}  {judged}{bound}"

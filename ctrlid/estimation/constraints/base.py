@@ -123,7 +123,7 @@ def check_finite(value: Any, what: str) -> float:
 
 
 def check_interval(lower: Any, upper: Any, what: str) -> tuple[float, float]:
-    """Both bounds as floats; -inf and inf stand for "no bound"."""
+    """Return both bounds as floats; -inf and inf stand for "no bound"."""
     low, high = (float(v) if _is_infinite(v) else check_finite(v, what) for v in (lower, upper))
     if low == math.inf or high == -math.inf:
         raise CtrlidError(f"{what}: lower={lower!r}, upper={upper!r} leave no room at all.")

@@ -83,7 +83,7 @@ class Case:
     functions: tuple[tuple[str, Branch], ...]
 
     def at(self, x: float) -> Rows:
-        """All rows, with those of the family at ``x``."""
+        """Return all rows, with those of the family at ``x``."""
         if self.family is None:
             return self.rows
         owner, family, _ = self.family
@@ -96,12 +96,12 @@ class Case:
 
 
 def list_cases(constraints: Sequence[AbstractConstraint], structure: Structure) -> list[Case]:
-    """All combinations of the branches of the constraints."""
+    """Return all combinations of the branches of the constraints."""
     choices = [[(repr(c), b) for b in c.branches(structure)] for c in constraints]
     if np.prod([float(len(c)) for c in choices]) > _MOST_CASES:
         raise CtrlidError(
-            f"These constraints branch into more than {_MOST_CASES} quadratic programs: drop those "
-            "that branch and are not needed."
+            f"These constraints have more than {_MOST_CASES} combinations of branches, each a "
+            "quadratic program of its own. Drop constraints with branches that are not needed."
         )
     found = []
     for choice in itertools.product(*choices):
@@ -109,8 +109,8 @@ def list_cases(constraints: Sequence[AbstractConstraint], structure: Structure) 
         if len(families) > 1:
             names = _text.write_list([owner for owner, _, _ in families])
             raise CtrlidError(
-                f"{names} each search for a free number in a model with {structure.na} poles; only "
-                "one constraint of that kind can be used at a time."
+                f"{names} each need a search for a free number in a model with {structure.na} "
+                "poles; use only one constraint of this kind at a time."
             )
         found.append(
             Case(
@@ -147,7 +147,7 @@ class Elimination:
 
 
 def eliminate_equalities(weights: Array, values: Array) -> Elimination:
-    """Reduced row echelon form of ``weights @ theta = values``; `Infeasible` if they contradict."""
+    """Return the row echelon form of ``weights @ theta = values``, or raise `Infeasible`."""
     work = np.column_stack([weights, values])
     return _eliminate_cached(work.shape, work.tobytes())
 
@@ -193,7 +193,7 @@ def _eliminate_cached(shape: tuple[int, int], numbers: bytes) -> Elimination:
 
 
 def split_inequalities(rows: Rows) -> tuple[Array, Array, NDArray[np.intp], Array]:
-    """Inequalities as ``G theta <= h``, the row each comes from, and its sign in it."""
+    """Return inequalities as ``G theta <= h``, the row each comes from, and its sign in it."""
     below = np.flatnonzero(~rows.equality & (rows.upper < np.inf))
     above = np.flatnonzero(~rows.equality & (rows.lower > -np.inf))
     sign = np.concatenate([np.ones(len(below)), -np.ones(len(above))])
@@ -203,7 +203,7 @@ def split_inequalities(rows: Rows) -> tuple[Array, Array, NDArray[np.intp], Arra
 
 
 def is_forced(rows: Rows, nonzero: Rows) -> bool:
-    """Whether the equalities force a sum to the very value it must differ from."""
+    """Return whether the equalities force a sum to the very value it must differ from."""
     if not len(nonzero.lower):
         return False
     e = eliminate_equalities(rows.weights[rows.equality], rows.lower[rows.equality])
@@ -213,7 +213,7 @@ def is_forced(rows: Rows, nonzero: Rows) -> bool:
 
 
 def is_feasible(rows: Rows, nonzero: Rows) -> bool:
-    """Whether any coefficients satisfy the rows, by linear programming."""
+    """Return whether any coefficients satisfy the rows, by linear programming."""
     try:
         e = eliminate_equalities(rows.weights[rows.equality], rows.lower[rows.equality])
         if is_forced(rows, nonzero):
@@ -245,7 +245,7 @@ def is_feasible(rows: Rows, nonzero: Rows) -> bool:
 
 
 def is_possible(constraints: Sequence[AbstractConstraint], structure: Structure) -> bool:
-    """Whether the linear rows of some case can be met together."""
+    """Return whether the linear rows of some case can be met together."""
     return any(
         is_feasible(case.at(x), case.nonzero)
         for case in list_cases(constraints, structure)

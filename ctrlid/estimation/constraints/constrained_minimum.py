@@ -159,7 +159,7 @@ def _find_ends(case: Case) -> tuple[float, float]:
 
 
 def _search_family(cost: Cost, case: Case) -> tuple[float, Solution, Array]:
-    """Best member of a family: scan, refine in the brackets, finish by Newton steps."""
+    """Find the best member of a family: scan, refine in the brackets, finish by Newton steps."""
 
     def value(x: float) -> float:
         try:
@@ -188,7 +188,7 @@ def _search_family(cost: Cost, case: Case) -> tuple[float, Solution, Array]:
 
 
 def _refine_family(cost: Cost, case: Case, x: float) -> tuple[float, Solution, Array]:
-    """Newton steps on coefficients and the family's number together.
+    """Take Newton steps on coefficients and the family's number together.
 
     A line search in x stops at half the digits of x. To first order the family lets its rows move
     along ``slope`` when x moves, so the rows at right angles to the slope are what truly holds:

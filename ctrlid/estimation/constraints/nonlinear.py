@@ -32,7 +32,7 @@ class _Functions:
     typical: Array
 
     def evaluate_parts(self, theta: Array) -> tuple[Array, int, list[tuple[str, str]]]:
-        """Values, the number of equalities, and for each its owner and its words."""
+        """Return values, the number of equalities, and for each its owner and its words."""
         values: list[Array] = []
         words: list[tuple[str, str]] = []
         count = 0
@@ -50,11 +50,11 @@ class _Functions:
         return np.concatenate(values), count, words
 
     def __call__(self, theta: Array) -> Array:
-        """Values of all functions."""
+        """Return the values of all functions."""
         return self.evaluate_parts(theta)[0]
 
     def jacobian(self, theta: Array) -> Array:
-        """Central differences, ``(functions, p)``."""
+        """Return central differences, ``(functions, p)``."""
         columns = []
         for i, h in enumerate(6e-6 * np.maximum(np.abs(theta), self.typical)):
             e = np.zeros(len(theta))
@@ -63,7 +63,7 @@ class _Functions:
         return np.column_stack(columns)
 
     def curvature(self, theta: Array, multipliers: Array) -> Array:
-        """Hessian of ``multipliers @ c`` by central differences, ``(p, p)``."""
+        """Return the Hessian of ``multipliers @ c`` by central differences, ``(p, p)``."""
         p = len(theta)
         steps = np.diag(2e-4 * np.maximum(np.abs(theta), self.typical))
         hessian = np.empty((p, p))
@@ -149,8 +149,8 @@ def _check_functions(c: _Functions, theta: Array) -> None:
                 ) from error
             if not np.all(np.isfinite(value)):
                 raise CtrlidError(
-                    f"A function of {owner} gave {value} at theta = {theta}, the fit without it. "
-                    "It must be finite there."
+                    f"A function of {owner} gave {value} at theta = {theta}, which is the fit "
+                    "without this constraint. It must be finite there."
                 )
 
 
@@ -165,7 +165,7 @@ def _compute_linear_violation(rows: Rows, theta: Array) -> float:
 
 
 def _run_sequence(cost: Cost, rows: Rows, c: _Functions, theta: Array, reach: float) -> Solution:
-    """One sequence: linearise the functions, solve the QP, shorten the step by an l1 merit."""
+    """Run one sequence: linearise the functions, solve the QP, shorten the step by an l1 merit."""
     inverse = np.linalg.inv(cost.basis)
     hessian = cost.R.T @ cost.R
 
@@ -215,7 +215,7 @@ def _run_sequence(cost: Cost, rows: Rows, c: _Functions, theta: Array, reach: fl
 
 
 def _estimate_sizes(slopes: Array, cost: Cost, reach: float) -> Array:
-    """Size of each function: what moving all coefficients by their reach would do to it."""
+    """Return the size of each function: what all coefficients moved by their reach do to it."""
     size: Array = np.maximum(np.linalg.norm(slopes @ cost.basis, axis=1) * reach, 1e-300)
     return size
 
@@ -288,7 +288,7 @@ def _linearize_functions(
 def _assign_multipliers(
     held: Array, rows: Rows, equalities: int, active: Sequence[int], count: int
 ) -> Array:
-    """Multipliers of the functions, in their own order, from those of the rows held."""
+    """Return the multipliers of the functions, in their own order, from those of the rows held."""
     first = int(rows.equality.sum())
     multipliers = np.zeros(count)
     multipliers[:equalities] = held[first : first + equalities]

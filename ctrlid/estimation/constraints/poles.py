@@ -16,7 +16,7 @@ from .base import Branch, Known, Row, equals, make_denominator_weights, require_
 
 
 def _write_pole_rows(structure: Structure, pole: complex) -> list[Row]:
-    """``A(pole) = 0``; both parts of it if the pole is complex."""
+    """Return ``A(pole) = 0``; both parts of it if the pole is complex."""
     # Products, unlike powers of complex numbers, are exact for poles such as 1j.
     powers = np.cumprod([1.0, *[complex(pole)] * structure.na])[::-1]
     # Beyond the unit circle the powers grow: divided by the largest, the row stays of size one.
@@ -49,7 +49,7 @@ class ReciprocalPoles(Known):
         """See the base class."""
         if structure.domain == "s":
             raise CtrlidError(
-                "ReciprocalPoles() speaks of sampled poles z and 1/z, but this model is in "
+                "ReciprocalPoles() is about sampled poles z and 1/z, but this model is in "
                 "continuous time: write SymmetricPoles() for poles at s = ±p."
             )
         require_poles(self, structure, 2)

@@ -185,7 +185,9 @@ def solve_program(cost: Cost, rows: Rows, below: float = np.inf) -> Solution:
     slope, room = slope[~decided] / norm[~decided, None], room[~decided] / norm[~decided]
     worst = float(-room.min(initial=0.0))
     if worst <= 1e-13 * float(np.linalg.norm(cost.d)):
-        text = "orthogonal least squares" + (", equalities eliminated" if len(values) else "")
+        text = "orthogonal least squares" + (
+            " with the equality constraints eliminated" if len(values) else ""
+        )
         return Solution(free_theta, free_cost, rows, weights, (), free_theta, text)
     held = _find_active_set(slope, room / worst, rows)
     active = origin[held]
@@ -197,7 +199,7 @@ def solve_program(cost: Cost, rows: Rows, below: float = np.inf) -> Solution:
 
 
 def _find_active_set(slope: Array, room: Array, rows: Rows) -> IndexArray:
-    """Rows held with equality at the point of ``slope @ u <= room`` nearest to zero.
+    """Return the rows held with equality at the point of ``slope @ u <= room`` nearest to zero.
 
     ProxQP proposes; then rows with a multiplier of the wrong sign leave and violated rows enter
     until the optimality conditions hold to rounding.
@@ -219,8 +221,8 @@ def _find_active_set(slope: Array, room: Array, rows: Rows) -> IndexArray:
         return held
     raise CtrlidError(
         "The quadratic program of the constrained fit could not be solved to its optimality "
-        f"conditions; its rows are {', '.join(map(repr, rows.rows))}. Nearly contradicting bounds "
-        "do this: loosen or drop one of them."
+        f"conditions; its rows are {', '.join(map(repr, rows.rows))}. The usual cause are bounds "
+        "that nearly contradict each other: loosen or drop one of them."
     )
 
 
@@ -246,7 +248,7 @@ def _exchange_rows(slope: Array, room: Array, start: IndexArray) -> IndexArray |
 
 
 def compute_covariance(cost: Cost, normals: Array) -> tuple[Array, float]:
-    """How equation errors of variance one scatter the coefficients.
+    """Return how equation errors of variance one scatter the coefficients.
 
     Parameters
     ----------

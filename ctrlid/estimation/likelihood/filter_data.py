@@ -96,6 +96,16 @@ def make_filter_data(loop: Loop, record: Record, start_time: float = 0.0) -> Fil
     )
 
 
+def find_noise_units(loop: Loop, record: Record) -> tuple[str, str]:
+    """Return the units of sensor noise and of force noise, empty where they are not known."""
+    of_plant = getattr(loop.plant, "units", {}).get(loop.equations().outputs[0], "")
+    unit = record.units.get("y", "") or of_plant
+    if unit in ("", "1"):
+        return "", ""
+    # Without a moving mass the noise acts on the rates of the states, whose units are not known.
+    return unit, f"{unit}/s^2" if loop.equations().velocities else ""
+
+
 def prepare_for_loop(data: FilterData, loop: Loop) -> FilterData:
     """Return data made ready for another model of the same loop; the signals are shared."""
     start, spread, _ = _guess_initial_state(loop, data.record)

@@ -159,9 +159,9 @@ def converge_trajectory(
         if not np.isfinite(out.innovations).all() or not np.isfinite(moved).all():
             k = int(np.argmin(np.isfinite(out.innovations)))
             raise ModelCannotRun(
-                f"the predictor of {plant.e.name} lost the record at sample {k} "
-                f"(t = {data.record.t[k]:.4g} s): the model cannot follow these data there; "
-                "check units, signs and the operating point, or mark the stretch as not valid"
+                f"the Kalman filter of {plant.e.name} diverges at sample {k} "
+                f"(t = {data.record.t[k]:.4g} s): the model contradicts the record there. Check "
+                "units, signs and the operating point, or exclude these samples with valid="
             )
         size = np.maximum(np.std(out.trajectory.filtered, axis=0), 1e-300)
         still = bool((np.sqrt(np.mean(moved**2, axis=0)) <= CONVERGED_MOTION * size).all())

@@ -45,6 +45,9 @@ class LoopEstimate(Printed):
         The parameters that sit on a bound.
     notes : tuple of str
         What the user should know before believing the numbers.
+    units : (str, str)
+        Units of the sensor noise and of the force noise; empty where neither the record nor the
+        plant has one.
     """
 
     names: tuple[str, ...]
@@ -58,6 +61,7 @@ class LoopEstimate(Printed):
     n_samples: int
     active: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+    units: tuple[str, str] = ("", "")
 
     @property
     def standard_errors(self) -> Array:
@@ -102,7 +106,7 @@ class LoopEstimate(Printed):
         return float(middle - half), float(middle + half)
 
     def __str__(self) -> str:
-        rows = [f"maximum likelihood, {self.n_samples} samples, log-likelihood "
+        rows = [f"fit by maximum likelihood, {self.n_samples} samples used, log-likelihood "
                 f"{self.log_likelihood:.1f}"]  # fmt: skip
         width = max((len(name) for name in self.names), default=0)
         for name, value, error in zip(self.names, self.values, self.standard_errors, strict=True):
@@ -111,16 +115,19 @@ class LoopEstimate(Printed):
                 write_number(value, 6) if bound else write_quantity(value, error=error, digits=6)
             )
             rows.append(f"  {name:<{width}} = {shown}{' (on its bound)' if bound else ''}")
-        noise = ", ".join(write_number(v, 3) for v in self.sensor_noise)
-        rows.append(
-            f"  sensor noise {noise}, white force noise {write_number(self.force_noise, 3)}"
-        )
+        size, push = self.units
+        noise = ", ".join(_write_size(v, size) for v in self.sensor_noise)
+        rows.append(f"  standard deviation of the sensor noise: {noise}; of the white force: "
+                    f"{_write_size(self.force_noise, push)}")  # fmt: skip
         if self.coloured_force:
-            rows.append(
-                f"  coloured force {write_number(self.coloured_force, 3)} with a time constant "
-                f"of {write_number(self.force_time, 3)} s"
-            )
+            rows.append(f"  standard deviation of the coloured force: "
+                        f"{_write_size(self.coloured_force, push)}, with a time constant of "
+                        f"{write_number(self.force_time, 3)} s")  # fmt: skip
         return "\n".join([*rows, *(f"  note: {note}" for note in self.notes)])
+
+
+def _write_size(value: float, unit: str) -> str:
+    return f"{write_number(value, 3)} {unit}".strip()
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -9,9 +9,11 @@ import numpy as np
 from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
 from ..._base.statistics import pseudo_inverse
+from ..._base.text import write_list
 from ...data.record import Record
 from ...data.several_records import as_records, order_model_and_data
 from ...loop.loop import Loop
+from .filter_data import find_noise_units
 from .likelihood import Fit, list_effect_bounds, make_problem
 from .maximization import begin_fit, choose_noise, compute_information, maximize, refit_noise_size
 from .physics_estimate import LoopEstimate, LoopFit
@@ -99,8 +101,9 @@ def _choose_free_names(loop: Loop, free: Sequence[str] | None) -> tuple[str, ...
     unknown = [name for name in names if name not in known]
     if unknown or not names:
         what = f"given {unknown}" if unknown else "none was given"
-        raise CtrlidError(f"fit_loop needs the names of free parameters, {what}; put them into "
-                          f"free= of the loop or of fit_loop. Known are {known}")  # fmt: skip
+        raise CtrlidError(f"fit_loop needs the names of the parameters to fit, {what}. Name them "
+                          "in free= of the loop or of fit_loop; the loop has "
+                          f"{', '.join(known) or 'none'}")  # fmt: skip
     return names
 
 
@@ -121,8 +124,9 @@ def summarize_fit(loop: Loop, fit: Fit) -> LoopFit:
         covariance[k, :] = covariance[:, k] = 0.0
         covariance[k, k] = math.inf
     if lost:
-        notes.append("the data do not determine " + ", ".join(names[k] for k in lost)
-                     + " (other parameters do the same)")  # fmt: skip
+        notes.append(f"the data do not determine {write_list([names[k] for k in lost])}: other "
+                     "parameters can compensate a change of "
+                     f"{'them' if len(lost) > 1 else 'it'}")  # fmt: skip
     noise, scale = fit.noise, float(np.mean(fit.sensor))
     time = -loop.dt / math.log(noise.memory) if noise.drift else math.nan
     estimate = LoopEstimate(
@@ -130,13 +134,14 @@ def summarize_fit(loop: Loop, fit: Fit) -> LoopFit:
         math.sqrt(scale * float(np.mean(noise.force))),
         math.sqrt(scale * noise.coloured) if noise.drift else 0.0, time, fit.value, fit.size,
         tuple(n for n, b in zip(names, on_bound, strict=True) if b), tuple(notes),
+        find_noise_units(loop, fit.problem.data[0].record),
     )  # fmt: skip
     fitted = loop.with_parameters(dict(zip(names, fit.theta.tolist(), strict=True)))
     return LoopFit(fitted, estimate)
 
 
 def _is_unseen(matrix: Array, rows: Any, k: int) -> bool:
-    """Whether a parameter takes part in a direction that is not in the data."""
+    """Return whether a parameter takes part in a direction that is not in the data."""
     if k not in rows:
         return False
     part = matrix[np.ix_(rows, rows)]

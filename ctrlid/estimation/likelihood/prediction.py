@@ -12,10 +12,12 @@ import numpy as np
 
 from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
+from ..._base.text import Printed
 from ...data.record import Record
 from ...data.several_records import order_model_and_data
 from ...data.validity import find_whole_past
 from ...loop.loop import Loop
+from .filter_data import find_noise_units
 from .kalman_filter import Noise
 from .likelihood import make_problem
 from .maximization import begin_fit, maximize
@@ -26,8 +28,8 @@ LEAD = 4
 STARTS = 300
 
 
-@dataclass(frozen=True, eq=False)
-class Prediction:
+@dataclass(frozen=True, eq=False, repr=False)
+class Prediction(Printed):
     """One-step predictions of a record.
 
     Parameters
@@ -47,6 +49,8 @@ class Prediction:
         State of a known analog controller at each sample [units of the controller], else empty.
     sensor_noise, force_noise : float
         Standard deviations of the noise model [output unit, and unit of the acceleration].
+    units : (str, str)
+        Units of both noises; empty where neither the record nor the plant has one.
     """
 
     y: Array
@@ -57,6 +61,19 @@ class Prediction:
     circuit: Array
     sensor_noise: float
     force_noise: float
+    units: tuple[str, str] = ("", "")
+
+    def __str__(self) -> str:
+        unit, push = (f" {u}" if u else "" for u in self.units)
+        found = float(np.sqrt(np.mean(self.innovations[self.settled] ** 2)))
+        expected = float(np.sqrt(np.mean(self.spread[self.settled] ** 2)))
+        return (
+            f"One-step prediction of {len(self.y)} samples\n"
+            f"  RMS of the innovations: {found:.3g}{unit}; the filter expects "
+            f"{expected:.3g}{unit}\n"
+            f"  standard deviation of the sensor noise: {self.sensor_noise:.3g}{unit}; of the "
+            f"white force: {self.force_noise:.3g}{push}"
+        )
 
 
 def predict(loop: Loop, record: Record, force_noise: float | None = None) -> Prediction:
@@ -107,7 +124,8 @@ def predict(loop: Loop, record: Record, force_noise: float | None = None) -> Pre
         raise CtrlidError("predict needs a Loop and a Record; given "
                           f"{type(loop).__name__} and {type(record).__name__}")  # fmt: skip
     if force_noise is not None and not (np.isfinite(force_noise) and force_noise >= 0):
-        raise CtrlidError(f"force_noise is a ratio >= 0; given {force_noise!r}")
+        raise CtrlidError("force_noise is the ratio of force noise to sensor noise [1/s^2], >= 0; "
+                          f"given {force_noise!r}")  # fmt: skip
     problem = make_problem(loop, (), [record])
     plant = problem.plant
     if force_noise is None:
@@ -122,7 +140,7 @@ def predict(loop: Loop, record: Record, force_noise: float | None = None) -> Pre
     return Prediction(
         record.y - out.innovations, out.innovations, fit.counts[0],
         sensor * np.sqrt(out.variance), states[:, own], states[:, plant.n :], sensor,
-        sensor * float(np.sqrt(fit.noise.force[0])),
+        sensor * float(np.sqrt(fit.noise.force[0])), find_noise_units(loop, record),
     )  # fmt: skip
 
 

@@ -128,7 +128,7 @@ class SampledPlant:
         return p
 
     def is_built_for(self, theta: Array) -> bool:
-        """Whether the map was built for such values of a delay or of a lag."""
+        """Return whether the map was built for such values of a delay or of a lag."""
         e, dt, p = self.e, self.loop.dt, self.insert_free_values(theta)
         if e.delay is not None:
             late = evaluate_delay(e, p) / dt + 1e-9
@@ -351,7 +351,7 @@ class InitialConditions:
 
 
 def _find_lags(e: Equations) -> list[tuple[int, bool, BlockEvaluation]]:
-    """Lags behind the input, or behind what the plant shows: whether so, time and target."""
+    """Return the lags behind the input or the output of the plant: which, time and target."""
     found = []
     for lag in e.lags:
         shown = not casadi.depends_on(lag.target, casadi.vertcat(e.t, e.u))

@@ -137,8 +137,8 @@ def choose_scheme(e: Equations, loop: Loop) -> Scheme:
     steps = max(2 if e.kinked else 1, math.ceil(rate / 1.5))
     if steps > MOST_STEPS:
         raise ModelCannotRun(
-            f"{e.name} moves at {rate / loop.dt:.3g} rad/s, {rate:.3g} times faster than it is "
-            "sampled; what settles within a sample is a constant for the filter: leave that motion "
+            f"{e.name} has a motion at {rate / loop.dt:.3g} rad/s, {rate:.3g} times faster than it "
+            "is sampled. The filter cannot follow a motion that ends within one sample: leave it "
             "out of the plant, or sample faster"
         )
     return Scheme(8, steps, (8, steps) if cut else None)
@@ -150,7 +150,7 @@ def _choose_lag_step(e: Equations) -> float:
 
 
 def is_scheme_suitable(scheme: Scheme, e: Equations, p: Array, dt: float) -> bool:
-    """Whether a period is integrated well enough for the lag that parameter values `p` have."""
+    """Return whether a period is integrated well enough for the lag of the parameters `p`."""
     time = _find_input_lag_time(e, p)
     if scheme.sharp:
         return time < dt / 4

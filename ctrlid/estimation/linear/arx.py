@@ -102,9 +102,9 @@ def fit_arx(
     unknowns = na + nb + len(regression.intercept_rows)
     if regression.rows <= unknowns:
         raise CtrlidError(
-            f"Too few samples: {regression.rows} usable rows for {unknowns} unknowns. A row needs "
-            f"{max(na, nk + nb - 1) + 1} valid samples in succession. Record longer or lower the "
-            "orders."
+            f"Too few samples: {_text.write_count(regression.rows, 'equation')} for {unknowns} "
+            f"unknowns. An equation needs {max(na, nk + nb - 1) + 1} valid samples in succession. "
+            "Record longer or lower the orders."
         )
     try:
         found = minimize(make_arx_cost(regression), known, structure)
@@ -115,9 +115,9 @@ def fit_arx(
     share = max(motions, default=0.0)
     if share > VISIBLE_MOTION:
         note = (
-            f"u MOVES BETWEEN THE SAMPLES (hold='foh', by {100 * share:.0f} % of its spread a "
-            "period), but a difference equation takes it as held: the poles are off. "
-            "Sample faster, or use fit_continuous with the controller."
+            f"u CHANGES BETWEEN THE SAMPLES (hold='foh', by {100 * share:.0f} % of its standard "
+            "deviation in a period), but a difference equation takes it as held, so the poles are "
+            "biased. Sample faster, or use fit_continuous with the controller."
         )
         estimate = replace(estimate, notes=(note,))
     names = first.names
@@ -174,8 +174,8 @@ def _explain_no_excitation(regression: Regression, direction: Array) -> str:
     for signal, column in (("u", na), ("y", 0)):
         if still[column]:
             return (
-                f"{head}{signal} is constant wherever the record counts. Excite the loop: vary "
-                "the reference (random_binary) or add a signal to u."
+                f"{head}{signal} is constant in all valid samples. Excite the loop: vary the "
+                "reference (random_binary) or add a signal to u."
             )
     # Weighted by the size of the signals: what the coefficients do to a prediction.
     effect = np.abs(direction) * np.r_[np.full(na, size[0]), np.full(structure.nb, size[na])]
@@ -183,8 +183,8 @@ def _explain_no_excitation(regression: Regression, direction: Array) -> str:
     weights = direction / np.abs(direction).max()
     moves = ", ".join(f"{n} by {weights[structure.names.index(n)]:.3g}" for n in involved)
     return (
-        f"{head}{_text.write_list(involved)} can move together ({moves}) and no prediction "
-        "changes. Either nothing but the controller moves u (vary the reference, or add a signal "
-        "to u), "
-        "or the orders are higher than the plant's (lower na or nb), or a constraint is missing."
+        f"{head}{_text.write_list(involved)} can change together ({moves}) without a change of any "
+        "prediction. Either only the controller changes u (vary the reference, or add a signal to "
+        "u), or the orders are higher than those of the plant (lower na or nb), or a constraint is "
+        "missing."
     )

@@ -101,13 +101,14 @@ def fit_continuous(
     total = sum(p.n for p in pieces)
     if total < needed:
         raise CtrlidError(
-            f"Too few samples: {total} valid ones for {len(structure.names)} coefficients and the "
-            f"noise model; at least {needed} are needed. Record longer or lower the orders."
+            f"Too few samples: {total} valid samples for {len(structure.names)} coefficients and "
+            f"the noise model, which need {needed}. Record longer or lower the orders."
         )
     if delay is not None and not (np.isfinite(delay) and delay >= 0):
         raise CtrlidError(f"delay is a time >= 0 s, or None to estimate it; given {delay!r}")
     if (delay is None or delay) and (circuit or records[0].hold != "zoh"):
-        raise CtrlidError("a delay is modelled for a held input only; give delay=0")
+        raise CtrlidError("a delay can be fitted only where the input is held (hold='zoh') and "
+                          "controller= is not given; give delay=0")  # fmt: skip
     task = Task(structure, pieces, records[0].dt, records[0].hold, circuit, delay is None, 1.0)
     point, found, rss, used = find_best_fit(task, known, delay or 0.0)
     degrees = used - found.free - structure.na - int(task.free_delay)
@@ -117,7 +118,7 @@ def fit_continuous(
         intercepts=np.zeros(0), rss=rss, residual_variance=rss / degrees, n_samples=total,
         degrees_of_freedom=degrees, active_bounds=found.active_bounds, branch=found.branch,
         method=("constrained " if known else "") + "prediction error (continuous time)",
-        solver=f"Gauss-Newton, {found.solver}{late}", dt=0.0, condition=found.condition,
+        solver=f"Gauss-Newton steps, {found.solver}{late}", dt=0.0, condition=found.condition,
     )  # fmt: skip
     names = records[0].names
     model = IdentifiedModel(estimate, inputs=names.get("u", "u"), outputs=names.get("y", "y"))
@@ -146,9 +147,10 @@ def _make_circuit(controller: Any, records: Sequence[Record]) -> Circuit | None:
         moves = measure_input_motion(records)
         if moves > VISIBLE_MOTION:
             warnings.warn(
-                f"the input of an analog controller moves by {100 * moves:.0f} % of its spread "
-                "from sample to sample and is taken as straight between them; give controller= "
-                "(and record the reference) so that it can be reconstructed, or sample faster",
+                f"the input of an analog controller changes by {100 * moves:.0f} % of its standard "
+                "deviation from sample to sample, and a straight line is assumed between the "
+                "samples; give controller= (and record the reference) so that u can be "
+                "reconstructed, or sample faster",
                 CtrlidWarning, stacklevel=3,
             )  # fmt: skip
         return None
@@ -164,8 +166,8 @@ def _make_circuit(controller: Any, records: Sequence[Record]) -> Circuit | None:
     if any(r.r is None for r in records):
         if records[0].dt * circuit.fastest > FAST_CIRCUIT:
             warnings.warn(
-                f"without a recorded reference the input between the samples is taken as straight, "
-                f"but the controller's fastest pole times dt is "
+                "the record has no reference, so a straight line is assumed for u between the "
+                "samples, but the fastest pole of the controller times dt is "
                 f"{records[0].dt * circuit.fastest:.2g}; record the reference or sample faster",
                 CtrlidWarning, stacklevel=3,
             )  # fmt: skip
@@ -187,13 +189,14 @@ def _cut_pieces(records: Sequence[Record], order: int) -> tuple[Piece, ...]:
                 part["r"] = record.r[start:stop] - y0
             pieces.append(Piece(part, stop - start))
     if not pieces:
-        raise CtrlidError("the record has no valid stretch long enough to predict anything; "
-                          f"a stretch needs {4 * (order + 2)} samples")  # fmt: skip
+        raise CtrlidError(f"a fit of this order needs {4 * (order + 2)} valid samples in "
+                          "succession; the record has no stretch so long. Record longer, or lower "
+                          "the orders")  # fmt: skip
     flat = [name for name in ("u", "y") if all(np.ptp(p.signals[name]) == 0 for p in pieces)]
     if flat:
         raise CtrlidError(
-            f"The data do not determine the coefficients: {write_list(flat)} is constant wherever "
-            "the record counts. Excite the loop: vary the reference (random_binary) or add a "
-            "signal to u."
+            f"The data do not determine the coefficients: {write_list(flat)} "
+            f"{'are' if len(flat) > 1 else 'is'} constant in all valid samples. Excite the loop: "
+            "vary the reference (random_binary) or add a signal to u."
         )
     return tuple(pieces)

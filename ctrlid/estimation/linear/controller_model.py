@@ -87,11 +87,11 @@ def convert_controller(controller: Any, names: Sequence[str], dt: float) -> Line
         numerators = numerators[::-1]
     feedback = numerators[1] if len(numerators) == 2 else -numerators[0]
     external = tuple(numerators[0] if name == "r" else den for name in names)
-    return LinearController(den, external, feedback, "the given controller")
+    return LinearController(den, external, feedback, "a simulation with the given controller")
 
 
 def _expand_fractions(controller: Any) -> tuple[list[Array], Array]:
-    """Numerators over one denominator, all of one length, in powers of the delay."""
+    """Return numerators over one denominator, all of one length, in powers of the delay."""
     if isinstance(controller, control.StateSpace):
         return to_polynomials(controller.A, controller.B, controller.C, controller.D)
     parts = [
@@ -103,7 +103,9 @@ def _expand_fractions(controller: Any) -> tuple[list[Array], Array]:
         parts = [(np.convolve(num, parts[1 - i][1]), d) for i, (num, d) in enumerate(parts)]
         den = np.convolve(den, controller.den[0][1])
     if any(len(num) > len(den) for num, _ in parts):
-        raise CtrlidError("The controller has more zeros than poles: it would need the future.")
+        raise CtrlidError(
+            "The controller has more zeros than poles, so it would need future samples. Add a pole."
+        )
     padded = [np.concatenate([np.zeros(len(den) - len(num)), num]) for num, _ in parts]
     return [num / den[0] for num in padded], den / den[0]
 
@@ -145,7 +147,7 @@ def identify_controller(pieces: Sequence[Piece], names: Sequence[str]) -> Linear
         if criterion < best[0] - 1e-9 * abs(best[0]) or best[1] is None:
             taps = x[m:].reshape(len(names) + 1, m + 1)
             den = np.concatenate([[1.0], -x[:m]])
-            source = f"a controller of order {m} found in the record"
+            source = f"a simulation with a controller of order {m} that was fitted to the record"
             best = (criterion, LinearController(den, tuple(taps[:-1]), taps[-1], source))
         if left <= 1e-16 * swing:
             break

@@ -141,7 +141,7 @@ def _average_delays(sums: Sequence[Array], edges: list[int], start: int, stop: i
 
 
 def check_instruments(records: Sequence[Record], instruments: Any) -> tuple[str, ...]:
-    """Names of the external signals, refused in words where they cannot serve.
+    """Return the names of the external signals, refused in words where they cannot serve.
 
     Parameters
     ----------

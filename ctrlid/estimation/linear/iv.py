@@ -217,7 +217,7 @@ def _refine_noise_model(
 
 
 def _find_start(task: Task, known: Sequence[AbstractConstraint]) -> Array:
-    """First coefficients: delayed references, under prefilters from wide to narrow.
+    """Find first coefficients: delayed references, under prefilters from wide to narrow.
 
     The candidate with the least one-step prediction error wins.
     """
@@ -246,7 +246,7 @@ def _find_start(task: Task, known: Sequence[AbstractConstraint]) -> Array:
 
 
 def _is_curved(task: Task, fit: _Fit, view: View) -> bool:
-    """Whether products of a higher degree explain more than Schwarz' criterion asks of them."""
+    """Return whether products of a higher degree explain more than Schwarz' criterion asks."""
     theta = fit.found.theta
     straight = compute_moments(task, fit.hats, view)
     curved = compute_moments(task, fit.hats, replace(view, degree=view.degree + 1, curvature=()))
@@ -268,7 +268,7 @@ def _update_curvature(task: Task, fit: _Fit) -> View:
 
 
 def _average_by_record(task: Task, values: Sequence[float]) -> Array:
-    """Mean of what each stretch says, over the samples of each record."""
+    """Return the mean of what each stretch says, over the samples of each record."""
     owners = [piece.owner for piece in task.pieces]
     sizes = [len(piece.y) for piece in task.pieces]
     total = np.bincount(owners, np.multiply(values, sizes), task.records)
@@ -333,12 +333,12 @@ def _make_estimate(task: Task, fit: _Fit, constrained: bool, dt: float) -> Estim
     residuals = separate_nuisances(task, found.theta, fit.hats, fit.view)
     covariance = found.spread * rss / degrees
     sandwich = _compute_sandwich(moments, found, residuals)
-    words = [f"{fit.iterations} iterations", f"instruments from {fit.source}"]
+    words = [_text.write_count(fit.iterations, "iteration"), f"instruments from {fit.source}"]
     notes = [] if fit.converged else [_NOT_SETTLED]
     if fit.view.degree > 1:
         notes.append(_CURVED.format(degree=fit.view.degree))
     if len(fit.view.num) > 1:
-        words.append(f"sensor noise of order {len(fit.view.num) - 1}")
+        words.append(f"a noise model of order {len(fit.view.num) - 1}")
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.nanmax(np.diag(sandwich) / np.diag(covariance), initial=0.0)
     if ratio > 2.0 and rss > 1e-20 * moments.size**2:
@@ -370,7 +370,7 @@ def _make_estimate(task: Task, fit: _Fit, constrained: bool, dt: float) -> Estim
 
 
 def _compute_sandwich(moments: Moments, found: Found, residuals: Sequence[Residuals]) -> Array:
-    """Covariance without a noise model, from the correlations of ``z e`` (Newey and West)."""
+    """Return the covariance by the correlations of ``z e``, without a noise model (Newey, West)."""
     p = len(moments.structure.names)
     upper = moments.factor[:p, :p]
     cost = moments.cost
@@ -390,17 +390,19 @@ def _compute_sandwich(moments: Moments, found: Found, residuals: Sequence[Residu
 # -- words ---------------------------------------------------------------------------------------
 
 _NOT_SETTLED = (
-    f"THE ITERATIONS DID NOT SETTLE in {_MOST} steps: these are the coefficients with the least "
-    "prediction error among them. The orders may be too high, or the reference too weak."
+    f"THE ITERATIONS DID NOT CONVERGE in {_MOST} steps: the coefficients above are those of the "
+    "step with the smallest prediction error. The orders may be too high, or the reference too "
+    "weak."
 )
 _CURVED = (
-    "THE PLANT IS CURVED over the range of this record: products of y and u to degree {degree} "
-    "were estimated too, and the coefficients are those at the equilibrium. Smaller signals, or "
-    "fit_loop with the physics, tell more."
+    "THE PLANT IS NONLINEAR over the range of this record: products of y and u up to degree "
+    "{degree} were fitted as well, and the coefficients above are those of the linear model at the "
+    "equilibrium. Use smaller signals, or fit_loop with the physics."
 )
 _CORRELATED = (
-    "THE NOISE MODEL DOES NOT HOLD: the standard errors come from the residuals' own "
-    "correlations. Compare residuals with the reference and look for missing physics."
+    "THE NOISE MODEL DOES NOT HOLD: the standard errors were computed from the correlations of "
+    "the residuals instead. Check with compare() whether the residuals depend on the reference: "
+    "physics may be missing."
 )
 
 
@@ -408,10 +410,10 @@ def _check_hold(records: Sequence[Record]) -> None:
     if records[0].hold != "zoh":
         raise CtrlidError(
             "fit_iv needs an input that is held between samples, but this record has "
-            f"hold={records[0].hold!r}: u of an analog controller moves meanwhile, and a "
-            "difference equation that knows it at the samples only is biased. Use fit_continuous "
-            "with controller=, or fit_loop. Where u is held in truth, or reference and u are "
-            "smooth and dt short, say so with dataclasses.replace(record, hold='zoh')."
+            f"hold={records[0].hold!r}: u of an analog controller changes between the samples, and "
+            "a difference equation, which knows it at the samples only, is biased. Use "
+            "fit_continuous with controller=, or fit_loop. If u is held in fact, or r and u are "
+            "smooth and dt is short, use dataclasses.replace(record, hold='zoh')."
         )
 
 
@@ -419,9 +421,9 @@ def _explain_no_excitation(structure: Structure, names: tuple[str, ...], directi
     size = np.abs(direction)
     involved = [n for n, d in zip(structure.names, size, strict=True) if d > 1e-3 * size.max()]
     return (
-        f"The instruments do not determine the coefficients: {_text.write_list(involved)} can move "
-        f"together and nothing that {_text.write_list(names)} causes would change. Excite the loop "
-        "with more frequencies (random_binary), lower na or nb, or add what is known as a "
+        f"The instruments do not determine the coefficients: {_text.write_list(involved)} can "
+        f"change together without a change of the response to {_text.write_list(names)}. Excite "
+        "the loop with more frequencies (random_binary), lower na or nb, or add what you know as a "
         "constraint."
     )
 
@@ -438,7 +440,7 @@ def _check_strength(estimate: Estimate, names: tuple[str, ...]) -> None:
     rank = int(np.linalg.matrix_rank(covariance, hermitian=True))
     if wald < stats.chi2.ppf(0.999, rank):
         raise CtrlidError(
-            f"The instruments are too weak: with what {_text.write_list(names)} causes, b is not "
-            "distinguishable from zero. Check that it is the signal that drives this loop and is "
-            "logged at the right time; else move it further or longer."
+            f"The instruments are too weak: in the response to {_text.write_list(names)} the "
+            "coefficients b cannot be distinguished from zero. Check that this signal drives the "
+            "loop and that it is logged at the right time; if so, make it larger or record longer."
         )

@@ -82,15 +82,15 @@ class Task:
                 longest = max((j - i for i, j in one.segments()), default=0)
                 raise CtrlidError(
                     f"Record {number + 1} of {len(records)} has no stretch of {shortest} valid "
-                    f"samples in succession, the longest has {longest}. Record longer, leave it "
+                    f"samples in succession; its longest has {longest}. Record longer, leave it "
                     "out or lower the orders."
                 )
         unknowns = na + structure.nb + len(records) + na * len(pieces)
         total = sum(len(piece.y) for piece in pieces)
         if total < 10 * unknowns:
             raise CtrlidError(
-                f"Too few samples: {total} valid ones for {unknowns} unknowns. Instrumental "
-                f"variables need at least {10 * unknowns}; record longer or lower the orders."
+                f"Too few samples: {total} valid samples for {unknowns} unknowns. Instrumental "
+                f"variables need at least {10 * unknowns}. Record longer or lower the orders."
             )
         return cls(structure, pieces, project_on_references(pieces), len(records), intercept)
 
@@ -135,7 +135,7 @@ class Moments:
         return Cost(np.where(excited, upper, 0.0), self.factor[:p, -1], basis, origin, rest)
 
     def rss(self, theta: Array) -> float:
-        """Sum of squares of the filtered equation error."""
+        """Return the sum of squares of the filtered equation error."""
         p = len(self.structure.names)
         delta = to_differences(self.structure, theta)
         return float(np.sum((self.factor[:, -1] - self.factor[:, p : 2 * p] @ delta) ** 2))
@@ -202,7 +202,7 @@ def compute_curved_force(task: Task, hats: Signals, view: View) -> list[Array] |
 def _make_table(
     task: Task, piece: Piece, hats: tuple[Array, Array], view: View
 ) -> tuple[list[Array], int]:
-    """Columns ``nuisances | 1 | instruments | regressors | target``; the number of the first.
+    """Return ``nuisances | 1 | instruments | regressors | target`` and the number of the first.
 
     Nuisances are what the prefilter's initial state leaves behind, and products of y and u.
     """

@@ -167,7 +167,7 @@ def _make_unit_vector(n: int, i: int) -> Array:
 def _minimize_errors(
     task: Task, point: Point, known: Sequence[AbstractConstraint], rounds: int = ROUNDS
 ) -> tuple[Point, Found, float]:
-    """Gauss-Newton with the constraints in each step; halved until the errors shrink."""
+    """Run Gauss-Newton with the constraints in each step; halved until the errors shrink."""
     extra = task.structure.na + int(task.free_delay)
     rss, tables = _evaluate_cost(task, point)
     found: Found | None = None
@@ -232,8 +232,9 @@ def find_best_fit(
         ranked.append((rss, speed, refined))
     if not ranked:
         raise CtrlidError(
-            "The data do not determine the coefficients: no start of the search could tell them "
-            "apart. Vary the reference, lower the orders or add a constraint."
+            "The data do not determine the coefficients: from every start of the search some "
+            "coefficients changed no prediction. Vary the reference, lower the orders or add a "
+            "constraint."
         )
     ranked.sort(key=lambda r: r[0])
     _, speed, point = ranked[0]
@@ -241,10 +242,10 @@ def find_best_fit(
         best, found, rss = _minimize_twice(_change_speed(task, speed), point, known)
     except NotExcited as trouble:
         raise CtrlidError(
-            "The data do not determine the coefficients: the direction "
-            f"{np.array2string(trouble.direction, precision=3)} of "
-            f"{write_list(task.structure.names)} changes no prediction. Vary the reference, "
-            "lower the orders or add a constraint."
+            "The data do not determine the coefficients: a change of "
+            f"{write_list(task.structure.names)} in the direction "
+            f"{np.array2string(trouble.direction, precision=3)} changes no prediction. Vary the "
+            "reference, lower the orders or add a constraint."
         ) from None
     used = sum(p.n for p in task.pieces) - len(task.pieces) * (
         task.structure.na + 1 + (len(task.circuit.a) if task.circuit else 0)

@@ -47,7 +47,7 @@ class View:
         return np.asarray(signal.lfilter(self.num, self.den, s), dtype=float)
 
     def list_decays(self, n: int) -> Array:
-        """All ways in which the filter's unknown initial state decays, ``(n, order)``.
+        """Return all ways in which the filter's unknown initial state decays, ``(n, order)``.
 
         Estimated with the model they make the start of each stretch exact: else the filter would
         need several of its time constants to forget it.
@@ -61,7 +61,7 @@ class View:
 
 
 def reflect_poles(structure: Structure, theta: Array, n: int) -> Array:
-    """Denominator with the poles outside the unit circle reflected into it.
+    """Return the denominator with the poles outside the unit circle reflected into it.
 
     ``A(q)`` over it is an all-pass: it whitens the equation error ``A v`` of white sensor noise v.
     Poles within 5/n of the circle are drawn in by that much, beyond what n samples resolve.
@@ -93,7 +93,7 @@ def reflect_poles(structure: Structure, theta: Array, n: int) -> Array:
 
 
 def autoregression(residuals: Sequence[Array], highest: int = MOST_COLOURED) -> Array:
-    """Autoregressive whitening filter of residuals, its order by Schwarz' criterion.
+    """Return an autoregressive whitening filter of residuals, its order by Schwarz' criterion.
 
     Parameters
     ----------

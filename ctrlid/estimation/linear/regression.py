@@ -27,7 +27,7 @@ for matrices this narrow, waking others costs more than it gives, up to tenfold 
 
 
 def block_qr(fill: Fill, rows: int, columns: int, block: int = BLOCK) -> Array:
-    """Triangular factor R of a tall matrix that is never held as a whole.
+    """Return the triangular factor R of a tall matrix that is never held as a whole.
 
     ``R'R = A'A``: each chunk of rows is put under the factor so far and both are triangularised
     together. Orthogonal throughout, so columns of very different size lose nothing.
@@ -69,7 +69,7 @@ def block_qr(fill: Fill, rows: int, columns: int, block: int = BLOCK) -> Array:
 
 
 def merge_factors(factors: Sequence[Array]) -> Array:
-    """Triangular factor of matrices stacked on each other, from the factor of each."""
+    """Return the triangular factor of matrices stacked on each other, from the factor of each."""
     if len(factors) == 1:
         return factors[0]
     return np.asarray(np.linalg.qr(np.vstack(factors), mode="r"), dtype=float)
@@ -77,7 +77,7 @@ def merge_factors(factors: Sequence[Array]) -> Array:
 
 @lru_cache(maxsize=64)
 def from_differences(structure: Structure) -> tuple[Array, Array]:
-    """Coefficients as ``theta = origin + basis @ delta``, delta in the differenced basis.
+    """Return coefficients as ``theta = origin + basis @ delta``, delta in the differenced basis.
 
     With the forward difference ``D = q - 1`` the model reads ``D^na y = delta_0 y + delta_1 D y +
     ... + beta_0 u + beta_1 D u + ...``, all at the oldest sample of each signal. The origin is
@@ -109,7 +109,7 @@ def from_differences(structure: Structure) -> tuple[Array, Array]:
 
 
 def to_differences(structure: Structure, theta: Array) -> Array:
-    """Inverse of `from_differences`, without solving anything."""
+    """Return the inverse of `from_differences`, without solving anything."""
     na, nb = structure.na, structure.nb
     _, origin = from_differences(structure)
     x = theta - origin
@@ -186,7 +186,7 @@ def build_arx_regression(
     intercept: bool = True,
     jobs: int | None = None,
 ) -> Regression:
-    """Regression of ``A y = B u + c`` on one or several records, one intercept each.
+    """Return the regression of ``A y = B u + c`` on one or several records, one intercept each.
 
     Parameters
     ----------
@@ -221,9 +221,9 @@ def build_arx_regression(
             needed = max(structure.na, structure.nk + structure.nb - 1) + 1
             count = f" of {len(records)}" if isinstance(records, Sized) else ""
             raise CtrlidError(
-                f"Record {number}{count} has no usable row: that takes {needed} valid samples in "
-                f"succession, and it has {part.valid} valid samples of {part.samples}. Leave it "
-                "out or lower the orders."
+                f"Record {number}{count} gives no equation: an equation needs {needed} valid "
+                f"samples in succession, and {part.valid} of its {part.samples} samples are valid. "
+                "Leave it out or lower the orders."
             )
         used += part.rows
         if intercept:
@@ -243,7 +243,7 @@ def build_arx_regression(
 
 
 def _find_levels(record: Record) -> tuple[float, float]:
-    """Means of y and u where they count: taken off before any product is formed."""
+    """Return means of y and u where they count: taken off before any product is formed."""
     if record.valid.all():
         return float(record.y.mean()), float(record.u.mean())
     if not record.valid.any():
@@ -254,7 +254,7 @@ def _find_levels(record: Record) -> tuple[float, float]:
 def _compute_factor(
     record: Record, structure: Structure, y0: float, u0: float, intercept: bool
 ) -> tuple[Array, int]:
-    """Triangular factor of ``[1 | y D y ... | u D u ... | D^na y]`` and the rows that count."""
+    """Return the factor R of ``[1 | y D y ... | u D u ... | D^na y]`` and the rows that count."""
     na, nb, nk = structure.na, structure.nb, structure.nk
     y, u, valid = record.y, record.u, record.valid
     first = max(na, nk + nb - 1)
@@ -297,7 +297,7 @@ def _write_differences(signal: Array, columns: Sequence[Array]) -> None:
 def _estimate_rounding(
     factor: Array, structure: Structure, y0: float, u0: float, rows: int
 ) -> Array:
-    """Size of the rounding errors of the data in each differenced column."""
+    """Return the size of the rounding errors of the data in each differenced column."""
     na, nb = structure.na, structure.nb
     eps = float(np.finfo(float).eps)
     norm = np.linalg.norm(factor, axis=0)
@@ -307,7 +307,7 @@ def _estimate_rounding(
 
 
 def check_orders(na: object, nb: object, nk: object) -> Structure:
-    """Orders of a sampled model, refused in words unless they are usable integers."""
+    """Return the orders of a sampled model, refused in words unless they are usable integers."""
     for name, value, least in (("na", na, 1), ("nb", nb, 1), ("nk", nk, 0)):
         if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
             raise CtrlidError(

@@ -147,7 +147,7 @@ def discretize_model(
 
 
 def _discretize_with_circuit(a: Array, b: Array, c: Array, dt: float, k: Circuit) -> DiscreteModel:
-    """Plant, circuit and the input itself as one system, driven by the held r and sensor noise."""
+    """Return plant, circuit and input as one system, driven by the held r and sensor noise."""
     n, m = len(a), len(k.a)
     size = n + m + 1
     block = np.zeros((size + 1, size + 1))

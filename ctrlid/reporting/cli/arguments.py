@@ -32,7 +32,7 @@ def read_record(path: Path, args: argparse.Namespace) -> Record:
     """Return the record in a file, or say in the words of the command line what is wrong."""
     unknown = [key for key in args.columns if key not in CHANNELS]
     if unknown:
-        raise CtrlidError(f"--columns names {', '.join(CHANNELS)}, as in --columns u=volt,y=gap; "
+        raise CtrlidError(f"--columns takes {', '.join(CHANNELS)}, as in --columns u=volt,y=gap; "
                           f"given {unknown[0]}")  # fmt: skip
     try:
         return Record.from_csv(path, dt=args.dt, hold=args.hold, gaps=args.gaps, **args.columns)
@@ -40,7 +40,7 @@ def read_record(path: Path, args: argparse.Namespace) -> Record:
         text = str(reason)
         for key in CHANNELS:
             text = text.replace(f"with {key}=", f"with --columns {key}=NAME")
-        text = text.replace("Give time= or dt=", "Give --columns time=NAME or --dt")
+        text = text.replace("give dt=", "give --dt")
         text = text.replace("gaps='mask'", "--gaps mask")
         raise CtrlidError(text) from reason
 
@@ -54,12 +54,12 @@ def read_loop(args: argparse.Namespace, record: Record) -> Loop:
                  "--controller": args.controller}  # fmt: skip
         clash = [name for name, value in given.items() if value is not None]
         if clash:
-            raise CtrlidError(f"{args.model} is a whole loop and has its own operating point and "
-                              f"controller: leave out {', '.join(clash)}")  # fmt: skip
+            raise CtrlidError(f"{args.model} is a ctrlid.Loop, which has its own operating point "
+                              f"and controller: leave out {', '.join(clash)}")  # fmt: skip
         if abs(model.dt - record.dt) > 1e-6 * record.dt:
             advice = "give both the same period"
             if abs(1000 * model.dt - record.dt) < 0.01 * record.dt:
-                advice = "if the times are milliseconds, head their column t [ms]"
+                advice = "if the times are in milliseconds, name their column t [ms]"
             raise CtrlidError(f"{args.model} is sampled at {model.dt:g} s, the record at "
                               f"{record.dt:g} s; {advice}")  # fmt: skip
         free = model.free if args.free is None else tuple(args.free)
@@ -86,8 +86,8 @@ def read_plant(text: str, values: dict[str, float]) -> Any:
     if isinstance(made, (Loop, *SYSTEMS)):
         return made
     if not inspect.isfunction(made):
-        raise CtrlidError(f"--model {text} is a {type(made).__name__}; needed is a control system, "
-                          "a ctrlid.Loop, or a function that returns one")  # fmt: skip
+        raise CtrlidError(f"--model {text} is a {type(made).__name__}; needed is a python-control "
+                          "system, a ctrlid.Loop, or a function that returns one")  # fmt: skip
     known = inspect.signature(made).parameters
     _require_known(text, list(known), list(values))
     lacking = [k for k, p in known.items() if p.default is p.empty and k not in values]
@@ -97,8 +97,8 @@ def read_plant(text: str, values: dict[str, float]) -> Any:
     system = made(**values)
     values.clear()
     if not isinstance(system, (Loop, *SYSTEMS)):
-        raise CtrlidError(f"--model {text} returns a {type(system).__name__}; needed is a control "
-                          "system or a ctrlid.Loop")  # fmt: skip
+        raise CtrlidError(f"--model {text} returns a {type(system).__name__}; needed is a "
+                          "python-control system or a ctrlid.Loop")  # fmt: skip
     return system
 
 
@@ -145,8 +145,8 @@ def import_object(option: str, text: str) -> Any:
         ) from reason
     if not hasattr(found, name):
         systems = [k for k, v in vars(found).items() if isinstance(v, (Loop, *SYSTEMS))]
-        raise CtrlidError(f"{option} {text}: {module} has no {name}; its control systems and loops "
-                          f"are {', '.join(systems) or 'none'}")  # fmt: skip
+        raise CtrlidError(f"{option} {text}: {module} has no {name}; its python-control "
+                          f"systems and loops are {', '.join(systems) or 'none'}")  # fmt: skip
     return getattr(found, name)
 
 

@@ -77,7 +77,7 @@ class _Bench:
 
     @property
     def pole(self) -> float:
-        """What physics says of the unstable pole, sqrt(2 g / x0) [rad/s]."""
+        """The unstable pole by physics, sqrt(2 g / x0) [rad/s]."""
         return math.sqrt(2 * GRAVITY / GAP)
 
     @property
@@ -147,11 +147,11 @@ def _tell_physics(bench: _Bench) -> Section:
     volts, pole = bench.op.input, bench.pole
     text = f"""
         A steel ball of {1e3 * BALL:g} g hangs below a magnet: m x'' = m g - K V^2/x^2, with the gap
-        x and the voltage V. At a gap of {1e3 * GAP:g} mm, {volts:.3f} V carry it.
+        x and the voltage V. At a gap of {1e3 * GAP:g} mm a voltage of {volts:.3f} V holds it.
 
-        For small deviations this is x = -beta/(s^2 - alpha) V, with poles at +/-sqrt(alpha). Left
-        alone, the ball doubles any error every {1e3 * math.log(2) / pole:.0f} ms; so it can only be
-        identified in a closed loop."""
+        For small deviations this is X(s) = -beta/(s^2 - alpha) V(s), with poles at +/-sqrt(alpha).
+        Without control any deviation doubles every {1e3 * math.log(2) / pole:.0f} ms, so the ball
+        can be identified in closed loop only."""
     rows = (
         ("alpha = 2g/x0 [1/s^2]", f"{2 * GRAVITY / GAP:.3f}", f"{alpha:.3f}"),
         ("beta = 2g/V0 [m/(s^2 V)]", f"{2 * GRAVITY / volts:.5f}", f"{beta:.5f}"),
@@ -166,20 +166,20 @@ def _tell_controller(bench: _Bench) -> Section:
     poles = " and ".join(f"{p:.3f}" for p in sorted(bench.sampled.poles().real, reverse=True))
     lead = f"{gain:.0f} (z {_write_signed(-zero)})/(z {_write_signed(-pole)})"
     text = f"""
-        The controller is digital: every {1e3 * PERIOD:g} ms it reads the gap and then holds the
-        voltage. Sampled like that, the plant has its poles at z = {poles}: one of them is outside
-        the unit circle.
+        The controller is digital: every {1e3 * PERIOD:g} ms it reads the gap, computes the voltage
+        and holds it. With this sampling the poles of the plant are z = {poles}; one of them is
+        outside the unit circle.
 
         design_lead() finds the lead with a crossover of {CROSSOVER:g} rad/s and a phase margin of
-        {PHASE_MARGIN:g} degrees, u = V0 + C (r - y) with C = {lead}
+        {PHASE_MARGIN:g} degrees. It gives u = V0 + C (r - y) with C = {lead}
         V/m."""
     m = loop_margins(bench.sampled * C)
     rows = (
         ("crossover [rad/s]", f"{m.crossover:.2f}"),
         ("phase margin [deg]", f"{m.phase_margin:.2f}"),
-        ("gain may grow by the factor", f"{m.gain_margin:.2f}"),
-        ("gain may fall by the factor", f"{m.gain_reduction_margin:.2f}"),
-        ("extra delay allowed [ms]", f"{1e3 * m.delay_margin:.2f}"),
+        ("gain margin [factor]", f"{m.gain_margin:.2f}"),
+        ("gain reduction margin [factor]", f"{m.gain_reduction_margin:.2f}"),
+        ("delay margin [ms]", f"{1e3 * m.delay_margin:.2f}"),
     )
     axes = plot.bode({"plant P (sampled)": bench.sampled, "loop C P": bench.sampled * C})
     return Section(TITLES[1], _join_lines(text), Table(("margins of the loop", ""), rows),
@@ -199,11 +199,11 @@ def _simulate_records(
 
 def _tell_experiment(record: Record, noise: float) -> Section:
     text = f"""
-        The reference jumps at random by {2e3 * AMPLITUDE:g} mm; a coin is tossed every
-        {1e3 * HOLD * PERIOD:g} ms. The sensor adds white noise with a standard deviation of
-        {2e6 * AMPLITUDE * noise:g} um, {100 * noise:g} % of a jump. Logged are {len(record)}
-        samples of reference, voltage and gap, {record.duration:g} s in all; the voltage runs from
-        {record.u.min():.2f} to {record.u.max():.2f} V."""
+        The reference is a random binary signal with jumps of {2e3 * AMPLITUDE:g} mm, which may
+        switch every {1e3 * HOLD * PERIOD:g} ms. The sensor adds white noise with a standard
+        deviation of {2e6 * AMPLITUDE * noise:g} um, {100 * noise:g} % of a jump. The record has
+        {len(record)} samples of reference, voltage and gap, {record.duration:g} s in all; the
+        voltage is between {record.u.min():.2f} and {record.u.max():.2f} V."""
     axes = plot.figure(2, 2, (10, 4.6), sharex="col")
     plot.record(record, axes[:, 0])
     plot.record(record[: min(len(record), 16 * HOLD)], axes[:, 1])
@@ -216,48 +216,50 @@ def _tell_plain_fit(
 ) -> Section:
     plain = models["plain"]
     text = """
-        y(k) + a1 y(k-1) + a2 y(k-2) = b1 u(k-1) + b2 u(k-2) + c is fitted to all samples by least
-        squares, as in equation (5) of the paper, "Identification of a class of unstable
-        processes"."""
+        The equation y(k) + a1 y(k-1) + a2 y(k-2) = b1 u(k-1) + b2 u(k-2) + c is fitted to all
+        samples by least squares, as in equation (5) of the paper, "Identification of a class of
+        unstable processes"."""
     largest, pole = _find_largest_pole(plain), _find_unstable_pole(plain)
     if pole is None:
         text += f"""
 
-        NO POLE OUTSIDE THE UNIT CIRCLE: the largest has size {largest:.4f}, as in the paper's
-        equation (6). An unstable plant has come out stable."""
+        NO POLE OUTSIDE THE UNIT CIRCLE: the largest absolute value is {largest:.4f}, as in equation
+        (6) of the paper. The model of an unstable plant is stable."""
     else:
         text += f"""
 
-        It finds the unstable pole at {pole:+.2f} rad/s, where physics has {bench.pole:+.2f}."""
+        The unstable pole of the fit is {pole:+.2f} rad/s; that of the physics is
+        {bench.pole:+.2f}."""
     clean = _find_unstable_pole(perfect)
     if noise and clean is not None:
         text += f"""
 
-        With a perfect sensor the same experiment gives {clean:+.2f} rad/s, so noise makes the
-        difference. It enters the regressors y(k-1) and y(k-2), and through the controller u as
-        well, and least squares takes that for dynamics. More samples do not help."""
-    table = _make_coefficient_table(bench, {"plain": plain, "plain, perfect sensor": perfect})
+        Without sensor noise the same experiment gives {clean:+.2f} rad/s, so the noise is the
+        cause. It is in the regressors y(k-1) and y(k-2) and, through the controller, in u(k-1) and
+        u(k-2), and so biases least squares. More samples do not help."""
+    table = _make_coefficient_table(bench, {"plain": plain, "plain, without noise": perfect})
     return Section(TITLES[3], _join_lines(text), table, {})
 
 
 def _tell_constrained_fit(bench: _Bench, models: Models) -> Section:
     e, pole = models["constrained"].estimate, _find_unstable_pole(models["constrained"])
     text = f"""
-        Physics says that the poles are a pair +/-p. In z their product is then 1, a2 = 1, and that
-        one of them is unstable means |a1| > 2. fit_arx() takes this as ReciprocalPoles(), minimises
-        the same sum of squares and finds a2 = {e["a2"]:g}"""
+        By physics the poles are a pair +/-p. In z their product is then 1, so a2 = 1; and since one
+        of them is unstable, |a1| > 2. fit_arx() takes this as ReciprocalPoles() and minimises the
+        same sum of squares. The result is a2 = {e["a2"]:g}"""
     if e.active_bounds or pole is None:
-        text += f""" with a1 = {e["a1"]:g}: THE MODEL SITS ON ITS BOUND, as the paper's equation (8)
-        does. The data would take it further; that is a symptom, not a cure."""
+        text += f""" with a1 = {e["a1"]:g}: THE MODEL IS ON ITS BOUND, as in equation (8) of the
+        paper. Without the constraint a1 would be beyond it: this is a symptom of bias, not a
+        result."""
     else:
-        text += f""" and the unstable pole at {_write_against_truth(pole, bench.pole)}."""
+        text += f""" with the unstable pole {_write_against_truth(pole, bench.pole)}."""
     errors = _compute_gain_errors(bench, e)
     if max(map(abs, errors)) > WORTH_A_WORD:
         text += f"""
 
-        The constraint keeps the structure; it does not cure the feedback bias: b1 is off by
-        {100 * errors[0]:+.0f} % and b2 by {100 * errors[1]:+.0f} %. The noise is still in the
-        regressors."""
+        The constraint gives the right structure, but does not remove the bias under feedback: the
+        error of b1 is {100 * errors[0]:+.0f} %, that of b2 {100 * errors[1]:+.0f} %. The noise is
+        still in the regressors."""
     figures = {"Poles of the fits and of the physics.": plot.poles(models, truth=bench.P)}
     return Section(TITLES[4], _join_lines(text), _make_coefficient_table(bench, models), figures)
 
@@ -265,19 +267,19 @@ def _tell_constrained_fit(bench: _Bench, models: Models) -> Section:
 def _tell_instruments(bench: _Bench, models: Models, doubts: list[str]) -> Section:
     e, pole = models["instruments"].estimate, _find_unstable_pole(models["instruments"])
     found = (
-        "without an unstable pole"
+        "The model has no unstable pole"
         if pole is None
-        else f"at {_write_against_truth(pole, bench.pole)}"
+        else f"The unstable pole is {_write_against_truth(pole, bench.pole)}"
     )
     errors = _compute_gain_errors(bench, e)
     text = f"""
-        The reference was tossed without regard to the noise. fit_iv() takes its past as
-        instruments: it asks for errors that are unrelated to the reference rather than for small
-        ones, under the same constraint.
+        The reference does not depend on the noise. fit_iv() uses its past as instruments: instead
+        of small errors it requires errors that are uncorrelated with the reference, under the same
+        constraint.
 
-        The model comes out {found}, with b1 off by {100 * errors[0]:+.1f} % and b2 by
+        {found}; the error of b1 is {100 * errors[0]:+.1f} %, that of b2
         {100 * errors[1]:+.1f} %."""
-    text += "".join(f"\n\nIn doubt: {doubt}" for doubt in doubts)
+    text += "".join(f"\n\nWarning: {doubt}" for doubt in doubts)
     responses = plot.bode({"physics (sampled)": bench.sampled, **models})
     return Section(TITLES[5], _join_lines(text), _make_coefficient_table(bench, models),
                    {"Frequency responses of the fits and of the physics.": responses})  # fmt: skip
@@ -291,17 +293,17 @@ def _tell_comparisons(bench: _Bench, record: Record, models: Models) -> Section:
     found = {k: compare(record, loop) for k, loop in {**loops, "physics": bench.loop}.items()}
     fits = {k: c["one-step"].fit for k, c in found.items()}
     steps = {k: f"{fit:.1f} %" for k, fit in fits.items()}
-    near = "curves that lie close together, as in the paper's figures 6 and 7, say little about it."
-    far = "with so much noise that tells them apart, and still not what the model lacks."
+    near = "Curves that are close together, as in figures 6 and 7 of the paper, say little."
+    far = "With so much noise the two differ, but the fit does not say what the model lacks."
     text = f"""
         Each model is put into the loop with the controller and compared with the first
-        {record.duration:g} s. One step ahead the plain model predicts with a fit of
-        {steps["plain"]} and the physics itself with {steps["physics"]}:
+        {record.duration:g} s. One step ahead, the fit of the plain model is {steps["plain"]} and
+        that of the physics itself {steps["physics"]}.
         {near if fits["physics"] - fits["plain"] < CLOSE else far}
 
-        Simulated in the closed loop, without a look at the measured gap, the models part. The last
-        column says what share of this error the noise explains: about 100 % for a model that lacks
-        nothing."""
+        In a closed-loop simulation, which does not use the measured gap, the models differ clearly.
+        The last column is the share of the variance of its error that noise explains: about 100 %
+        for a model that lacks nothing."""
     rows = []
     for label, c in found.items():
         curve = next((q for q in c.curves if "simulation" in q.label), None)
@@ -335,8 +337,8 @@ def _tell_redesigns(bench: _Bench, models: Models) -> Section:
     crossover, margin = WANTED
     text = f"""
         A lead with a crossover of {crossover:g} rad/s and a phase margin of {margin:g} degrees is
-        designed on each model and tried on the nonlinear physics, with a step as large as the jumps
-        of the experiment."""
+        designed on each model. It is then tried on the nonlinear physics, with a step as large as
+        the jumps of the experiment."""
     rows, figures = [], {}
     for label, model in models.items():
         try:
@@ -358,8 +360,9 @@ def _write_verdict(outcome: Redesign) -> str:
     if outcome.stable:
         return outcome.verdict
     why = outcome.failure.split(". ")[0]
-    return (f"{p.phase_margin:.1f} deg are promised at {p.crossover:.0f} rad/s, but IT DOES NOT "
-            f"KEEP THE BALL. {why[:1].upper()}{why[1:]}.")  # fmt: skip
+    return (f"The model promises a phase margin of {p.phase_margin:.1f} deg at "
+            f"{p.crossover:.0f} rad/s, but THE LOOP IS UNSTABLE on the physics. "
+            f"{why[:1].upper()}{why[1:]}.")  # fmt: skip
 
 
 def _write_performance(label: str, outcome: Redesign) -> tuple[str, ...]:
@@ -385,7 +388,7 @@ def _write_signed(value: float) -> str:
 
 def _write_against_truth(value: float, truth: float) -> str:
     error = 100 * (value / truth - 1)
-    return f"{value:+.2f} rad/s, {error:+.1f} % from sqrt(2g/x0) = {truth:.2f}"
+    return f"{value:+.2f} rad/s ({error:+.1f} % from sqrt(2g/x0) = {truth:.2f})"
 
 
 def _compute_gain_errors(bench: _Bench, e: Estimate) -> list[float]:

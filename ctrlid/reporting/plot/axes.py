@@ -154,7 +154,7 @@ def choose_line_style(i: int) -> dict[str, Any]:
 
 
 def finish_axes(ax: Any, *, legend: bool = True, columns: int = 2, size: str = "medium") -> Any:
-    """Grid, open frame, and a legend above the axes, where it covers no data."""
+    """Add grid, open frame, and a legend above the axes, where it covers no data."""
     ax.grid(True, color="0.9", linewidth=0.6)
     ax.set_axisbelow(True)
     for side in ("top", "right"):

@@ -61,7 +61,10 @@ def record(record: Record, axes: Any = None, *, extra: Sequence[str] = ()) -> An
     extra = (extra,) if isinstance(extra, str) else tuple(extra)
     unknown = [name for name in extra if name not in record.extra]
     if unknown:
-        raise CtrlidError(f"the record has no extra channel {unknown}; it has {list(record.extra)}")
+        raise CtrlidError(
+            f"the record has no extra channel {_text.write_list([repr(k) for k in unknown])}; it "
+            f"has {', '.join(record.extra) or 'none'}"
+        )
     axes = take_axes(axes, 2 + len(extra), sharex=True)
     both = [record.y] if record.r is None else [record.y, record.r]
     scale, unit = _pictures.choose_scale(both, record.units.get("y", ""))
@@ -191,13 +194,13 @@ def residuals(comparison: Comparison, axes: Any = None) -> Any:
     """
     require_kind(comparison, Comparison, "plot.residuals draws a Comparison, as compare() returns")
     if not comparison.tests:
-        raise CtrlidError("plot.residuals has nothing to draw: the one-step errors of this record "
-                          "were not tested, they are round-off or too few")  # fmt: skip
+        raise CtrlidError("plot.residuals has nothing to draw: the one-step errors are only "
+                          "round-off and were not tested")  # fmt: skip
     axes = take_axes(axes, len(comparison.tests), sharex=True)
     for ax, test in zip(axes, comparison.tests, strict=True):
         inside = np.abs(test.values) <= test.band
         if np.isfinite(test.band):
-            ax.axhspan(-test.band, test.band, color="0.85", label="99 % band of chance")
+            ax.axhspan(-test.band, test.band, color="0.85", label="99 % band")
         ax.axhline(0, color="0.3", linewidth=0.8)
         ax.vlines(test.lags, 0, test.values, color="0.5", linewidth=1)
         for which, marker, colour, label in (
@@ -206,8 +209,9 @@ def residuals(comparison: Comparison, axes: Any = None) -> Any:
             if which.any():
                 ax.plot(test.lags[which], test.values[which], marker, color=colour, markersize=4,
                         label=label)  # fmt: skip
-        verdict = "chance explains it" if test.passed else "NOT CHANCE"
-        title = f"{test.name}: {verdict} ({_text.write_p_value(test.p_value)})"
+        verdict = "not significant" if test.passed else "NOT BY CHANCE"
+        title = (f"one-step errors {test.name}: {verdict} "
+                 f"({_text.write_p_value(test.p_value)})")  # fmt: skip
         ax.set_title(title, loc="left", fontsize="medium")
         reach = 1.15 * max(float(np.abs(test.values).max()), min(test.band, 1.0))
         ax.set_ylim(-reach, reach)

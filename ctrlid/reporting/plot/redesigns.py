@@ -72,12 +72,12 @@ def _draw_step(ax: Any, redesign: Redesign) -> float:
         if not performance.stable:
             label = f"{what}: UNSTABLE"
             if len(values) < len(redesign.time):
-                label += f", lost after {redesign.time[len(values)]:.2g} s"
+                label += f", the simulation stops after {redesign.time[len(values)]:.2g} s"
         elif not np.isfinite(performance.settling_time):
             label = f"{what}: DOES NOT SETTLE"
         else:
             label = (f"{what}: {performance.overshoot:.0f} % overshoot, "
-                     f"{performance.settling_time:.2g} s to settle")  # fmt: skip
+                     f"settling time {performance.settling_time:.2g} s")  # fmt: skip
         ax.plot(redesign.time[: len(values)], values, label=label, **choose_line_style(i),
                 marker=MARKERS[i], markevery=max(len(values) // 25, 1), markersize=4)  # fmt: skip
     promised = redesign.promised_step
