@@ -299,7 +299,7 @@ def test_refusals():
         with pytest.raises(CtrlidError, match=match):
             cid.diagnose(*arguments, progress=False, **options)
 
-    refuse("cannot be diagnosed: .*20 samples", loop, record[:20])
+    refuse("cannot be diagnosed: .*20 valid samples", loop, record[:20])
     still = replace(record, y=np.full(600, 0.012))
     refuse(r"cannot be diagnosed: y stays at 0\.012", loop, still)
     dead = replace(record, u=np.full(600, 3.0))

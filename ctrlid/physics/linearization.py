@@ -11,7 +11,6 @@ from scipy import linalg
 
 from .._base.arrays import Array
 from .._base.errors import CtrlidError, ModelCannotRun
-from .._base.text import Printed, write_number
 from .conversions import to_polynomials
 from .equations import Equations, require_siso
 from .trace import trace
@@ -24,8 +23,8 @@ EQUILIBRIUM = 1e-9
 STARTS = 60
 
 
-@dataclass(frozen=True, repr=False)
-class OperatingPoint(Printed):
+@dataclass(frozen=True)
+class OperatingPoint:
     """Where a plant rests: its states, input and output in physical units.
 
     Parameters
@@ -45,8 +44,8 @@ class OperatingPoint(Printed):
     Examples
     --------
     >>> import ctrlid as cid
-    >>> print(cid.OperatingPoint(states=(0.012, 0.0), input=3.0, output=0.012))
-    operating point with input 3, output 0.012 and states (0.012, 0)
+    >>> cid.OperatingPoint(states=(0.012, 0.0), input=3.0, output=0.012).input
+    3.0
     """
 
     states: tuple[float, ...]
@@ -69,11 +68,6 @@ class OperatingPoint(Printed):
         object.__setattr__(self, "states", states)
         object.__setattr__(self, "input", point[0])
         object.__setattr__(self, "output", point[1])
-
-    def __str__(self) -> str:
-        states = ", ".join(write_number(s, 6) for s in self.states)
-        return (f"operating point with input {write_number(self.input, 6)}, output "
-                f"{write_number(self.output, 6)} and states ({states})")  # fmt: skip
 
 
 def operating_point(

@@ -69,8 +69,8 @@ def check_controller(loop: Loop, record: Record) -> list[Fact]:
         return [*facts, ("refused", "u cannot be computed with the controller of the loop: "
                          f"{reason}.", 1.0, True)]  # fmt: skip
     if left <= EXACT:
-        return [*facts, ("exact", "the controller of the loop computes exactly the logged u from "
-                         "r and y.", left, False)]  # fmt: skip
+        return [*facts, ("exact", "the logged u is exactly what the controller of the loop "
+                         "computes from r and y.", left, False)]  # fmt: skip
     shift = _find_shift(loop, part, left)
     if shift is not None:
         words, moved, remains = shift

@@ -151,7 +151,7 @@ def audit(record: Record, loop: Loop | None = None) -> Audit:
     >>> record = cid.simulate(loop, r, sensor_noise=1e-4, seed=2)
     >>> print(cid.audit(record, loop))
     Audit: 1 finding, which does not harm a fit
-      controller: the controller of the loop computes exactly the logged u from r and y.
+      controller: the logged u is exactly what the controller of the loop computes from r and y.
     >>> stuck = cid.Record(r=r, u=record.u, y=np.minimum(record.y, 0.08), dt=0.01)
     >>> [f.kind for f in cid.audit(stuck).harmful]
     ['saturation']
