@@ -258,7 +258,7 @@ def _tell_constrained_fit(bench: _Bench, models: Models) -> Section:
         text += f"""
 
         The constraint gives the right structure, but does not remove the bias under feedback: the
-        error of b1 is {100 * errors[0]:+.0f} %, that of b2 {100 * errors[1]:+.0f} %. The noise is
+        error of b1 is {100 * errors[0]:+z.0f} %, that of b2 {100 * errors[1]:+z.0f} %. The noise is
         still in the regressors."""
     figures = {"Poles of the fits and of the physics.": plot.poles(models, truth=bench.P)}
     return Section(TITLES[4], _join_lines(text), _make_coefficient_table(bench, models), figures)
@@ -277,8 +277,8 @@ def _tell_instruments(bench: _Bench, models: Models, doubts: list[str]) -> Secti
         of small errors it requires errors that are uncorrelated with the reference, under the same
         constraint.
 
-        {found}; the error of b1 is {100 * errors[0]:+.1f} %, that of b2
-        {100 * errors[1]:+.1f} %."""
+        {found}; the error of b1 is {100 * errors[0]:+z.1f} %, that of b2
+        {100 * errors[1]:+z.1f} %."""
     text += "".join(f"\n\nWarning: {doubt}" for doubt in doubts)
     responses = plot.bode({"physics (sampled)": bench.sampled, **models})
     return Section(TITLES[5], _join_lines(text), _make_coefficient_table(bench, models),
@@ -388,7 +388,7 @@ def _write_signed(value: float) -> str:
 
 def _write_against_truth(value: float, truth: float) -> str:
     error = 100 * (value / truth - 1)
-    return f"{value:+.2f} rad/s ({error:+.1f} % from sqrt(2g/x0) = {truth:.2f})"
+    return f"{value:+.2f} rad/s ({error:+z.1f} % from sqrt(2g/x0) = {truth:.2f})"
 
 
 def _compute_gain_errors(bench: _Bench, e: Estimate) -> list[float]:
