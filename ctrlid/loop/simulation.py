@@ -181,7 +181,7 @@ class Simulator:
         e = loop.equations()
         if not np.isfinite(e.evaluate(first.rest[: len(e.states)], loop.point.input)[0]).all():
             raise ModelCannotRun(
-                f"{e.name} is not defined at the {loop.point}; give "
+                f"{e.name} is not defined at the operating point, {loop.point}; give "
                 "at=operating_point(plant, output=...)"
             )
         # An undamped plant neither grows nor decays; round-off must not decide which.
