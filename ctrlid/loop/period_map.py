@@ -179,7 +179,7 @@ def compute_growth_rate(loop: Loop) -> float:
     matrix, _ = linearize_at_rest(s, loop.point.output, function)
     if not np.isfinite(matrix).all():
         raise ModelCannotRun(
-            f"{loop.equations().name} has no derivative at its {loop.point}; "
+            f"{loop.equations().name} has no derivative at its operating point, {loop.point}; "
             "give at=operating_point(plant, output=...)"
         )
     poles = np.linalg.eigvals(matrix)
