@@ -28,7 +28,6 @@ FOLDER = "ctrlid-report"
 # The story can be told with at least so many samples.
 FEWEST = 500
 # Paragraphs are wrapped at so many characters.
-# Paragraphs are wrapped at so many characters.
 WIDTH = 88
 
 

@@ -635,7 +635,7 @@ def test_machines_share_what_values_do_not_change():
     friction = loop.with_effect(cid.effects.CoulombFriction(fc=0.1))
     one = SampledPlant(friction, ["k"], "zoh", False)
     changed = friction.with_parameters({"k": 4.0, "CoulombFriction.fc": 0.2})
-    other = SampledPlant(changed, ["k"], "zoh", False)  # fmt: skip
+    other = SampledPlant(changed, ["k"], "zoh", False)
     assert one.maps is other.maps
     assert other.insert_free_values(np.array([5.0])).tolist() == [1.0, 2.0, 5.0, 0.2]
     assert one.insert_free_values(np.array([5.0])).tolist() == [1.0, 2.0, 5.0, 0.1]

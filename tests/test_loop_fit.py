@@ -44,7 +44,7 @@ LOOPS = {
     "analog levitation": (lambda **k: levitation(analog=True, **k), 1e-4, 15, 5e-6),
     "drive": (drive, 0.05, 40, 2e-3),
     "discrete time": (sampled, 0.5, 5, 0.02),
-}  # fmt: skip
+}
 
 
 def experiment(loop, swing, hold, n=3000, seed=1, **noise):

@@ -11,7 +11,7 @@ import problems
 from ctrlid import effects as E
 from ctrlid.diagnosis.fitted_model import Model
 from ctrlid.diagnosis.fresh_data import FreshData, choose_fresh_data
-from ctrlid.diagnosis.recalibration import fit_base_model, weigh_by_repeats
+from ctrlid.diagnosis.recalibration import fit_base_model, fit_with_repeat_noise
 from ctrlid.diagnosis.refitting import refit_candidate
 from ctrlid.diagnosis.screening import screen_at
 from ctrlid.estimation.likelihood.likelihood import evaluate_likelihood
@@ -49,7 +49,7 @@ def test_what_is_left_is_counted_in_units_of_that_noise():
     """With the effect in the model chi squared is one, without it it is much more."""
     loop = drive()
     record = repeated(loop.with_effect(E.QuadraticDrag(c2=20.0)), seed=3)
-    base = weigh_by_repeats(fit_base_model(loop, [record], loop.free), [PERIOD])
+    base = fit_with_repeat_noise(fit_base_model(loop, [record], loop.free), [PERIOD])
     assert np.nanmean(base.fit.standardized[0] ** 2) > 2
     best = refit_candidate(base, screen_at(base, E.QuadraticDrag(c2=10.0)))
     assert np.nanmean(best.model.fit.standardized[0] ** 2) == pytest.approx(1.0, abs=0.08)
@@ -59,7 +59,7 @@ def test_what_is_left_is_counted_in_units_of_that_noise():
 def test_known_noise_is_not_tuned():
     loop = drive()
     record = repeated(loop, seed=4)
-    base = weigh_by_repeats(fit_base_model(loop, [record], loop.free), [PERIOD])
+    base = fit_with_repeat_noise(fit_base_model(loop, [record], loop.free), [PERIOD])
     known = base.fit.problem.known
     again = maximize(base.fit)
     assert again.noise == known.noise

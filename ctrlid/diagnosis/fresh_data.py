@@ -90,13 +90,13 @@ class FreshData:
 
 def choose_fresh_data(
     loop: Loop, records: Sequence[Record], validation: Sequence[Record] | None
-) -> FreshData:  # fmt: skip
+) -> FreshData:
     """Return the records given for validation, or the last quarter of each record.
 
     Raises
     ------
     CtrlidError
-        If a record for validation is sampled in another way than the loop.
+        If a record for validation has another sampling period than the loop.
     """
     for r in validation or ():
         if abs(r.dt - loop.dt) > THRESHOLD.same_period * loop.dt:

@@ -34,7 +34,7 @@ class Window:
 
 
 def hold_out(record: Record) -> tuple[Window, Record]:
-    """Return the last quarter of what counts, and the record before it."""
+    """Return the last quarter of what counts, less of a long record, and the record before it."""
     valid = np.flatnonzero(record.valid)
     first = max(
         int(valid[int((1 - THRESHOLD.held_out) * len(valid))]),
@@ -66,7 +66,7 @@ def root_mean_square(windows: Sequence[Window], results: Sequence[Array]) -> flo
 
 
 def simulate_window(loop: Loop, window: Window, how: Reproduction) -> Array:
-    """Return what a loop makes of a window, without any of its measured outputs but the first.
+    """Return what a loop makes of a window: a simulation, or a prediction some samples ahead.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ def simulate_window(loop: Loop, window: Window, how: Reproduction) -> Array:
     Returns
     -------
     ndarray
-        Outputs; NaN where there are none.
+        Outputs [output unit]; NaN where there are none.
     """
     record = window.record
     y = np.full(len(record), np.nan)
@@ -138,7 +138,7 @@ def compute_floor(
         The data.
     how : Reproduction
         As `choose_reproduction` says it.
-    runs : int
+    runs : int, optional
         Simulations with noise.
 
     Returns
@@ -162,7 +162,7 @@ def compute_floor(
 
 def _simulate_noise(
     loop: Loop, fit: Fit, sensor: float, window: Window, how: Reproduction, runs: int
-) -> Array:  # fmt: skip
+) -> Array:
     """Return what noise leaves in a window, squared and summed over its samples, for each run."""
     record = window.record
     size = int(np.count_nonzero(window.mask))
@@ -180,8 +180,8 @@ def _simulate_noise(
         for seed in range(runs):
             noise = draw_noise(fit, sensor, len(rest), seed)
             for k, both in enumerate((noise, [noise[0], 0 * noise[1]])):
-                moved = stretch.run(simulator, both)[0] - rest
-                squares[seed, k] += float(np.sum(moved[use] ** 2))
+                error = stretch.run(simulator, both)[0] - rest
+                squares[seed, k] += float(np.sum(error[use] ** 2))
         count += int(use.sum())
     if not count:
         raise ModelCannotRun("no stretch is long enough to be simulated")
@@ -189,7 +189,7 @@ def _simulate_noise(
 
 
 def draw_noise(fit: Fit, sensor: float, n: int, seed: int) -> list[Array]:
-    """Return sensor noise and force noise as a fit found them."""
+    """Return sensor noise and force noise of a fit; `sensor` is the variance of the sensor's."""
     noise, streams = fit.noise, np.random.default_rng(seed).standard_normal((3, n))
     force = streams[1] * math.sqrt(sensor * float(np.mean(noise.force)))
     if noise.drift:

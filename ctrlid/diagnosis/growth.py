@@ -33,8 +33,8 @@ from .thresholds import THRESHOLD
 class Search:
     """The end of a search: the base, the rounds, the final model and its effects.
 
-    Where the choice of a round was taken back for a better pair, `other` are the rounds of the way
-    that was left first, with the one that showed it.
+    Where the choice of a round was taken back for a better pair, `other` holds the rounds before
+    the first such change, with the round that showed it.
     """
 
     base: Model
@@ -63,8 +63,8 @@ def search_effects(
     tell : callable
         Told what is being done.
     first : sequence of Round, optional
-        The rounds of a way that another search has left. This one goes on from there and takes
-        nothing back.
+        The rounds that another search had taken when it changed a choice. This one goes on from
+        there and takes nothing back.
 
     Returns
     -------
@@ -112,19 +112,19 @@ def choose_search(
     one: Search, other: Search, helps: Callable[[Weighed, Model], bool],
     gap: Callable[[Model], float],
 ) -> Search:  # fmt: skip
-    """Return the end of that way of a search which leaves noise alone, or else the narrower gap.
+    """Return the search that leaves noise alone, or else the one with the narrower gap.
 
     Parameters
     ----------
     one, other : Search
-        The ends of two ways, of which the second took nothing back.
+        Two searches of the same records, of which the second took nothing back.
     helps : callable
         As in `keep_main_effects`.
     gap : callable
         ``gap(model)``: the RMS error of a model on fresh data [output unit].
     """
-    ways = [keep_main_effects(search, helps) for search in (one, other)]
-    return min(ways, key=lambda search: (not search.after.passed, gap(search.final)))
+    kept = [keep_main_effects(search, helps) for search in (one, other)]
+    return min(kept, key=lambda search: (not search.after.passed, gap(search.final)))
 
 
 def compare_names(found: Search, work: Work) -> Search:
@@ -160,7 +160,7 @@ def _is_stand_in(best: Trial, model: Model, beside: bool) -> bool:
 
 def _look_back(
     last: Round, step: Round, catalogue: Sequence[type[AbstractEffect]], work: Work
-) -> Trial | None:  # fmt: skip
+) -> Trial | None:
     """Return what would have been the better choice of the last round, now that more is found.
 
     Where two effects hide together, the one that alone gains most may be a mixture of both. So each

@@ -67,10 +67,11 @@ class NoiseTests:
 def run_noise_tests(fit: Fit) -> NoiseTests:
     """Test the innovations of a fit.
 
-    Whiteness, independence of past input and reference, one line in the spectrum, heavy tails and
-    isolated events, and mean and mean square in bins of time, position, velocity, input and
-    reference; whether each parameter is the same there; where a coloured force was fitted, whether
-    its estimate has the skewness and the tails of a random one.
+    The tests are of whiteness, independence of past input and reference, one line in the spectrum,
+    heavy tails and isolated events, and of mean and mean square in bins of time, states, input, its
+    change and reference; of whether each parameter is the same in these bins and at all times; and,
+    where a coloured force was fitted, of whether its estimate has the skewness and the tails of a
+    random one.
 
     Parameters
     ----------
@@ -139,12 +140,12 @@ def run_noise_tests(fit: Fit) -> NoiseTests:
 
 
 def _regress_on_past(z: Array, keep: Array, u: Array, r: Array) -> tuple[float, int]:
-    """Return the gain of regressing innovations on past input and reference, and its freedom."""
+    """Return the gain of regressing innovations on past signals, and its degrees of freedom."""
     columns = []
     for signal in (u, r):
-        moved = np.diff(signal, prepend=signal[0])
-        if np.std(moved) > 0:
-            columns += [np.roll(moved, k) for k in THRESHOLD.past_lags]
+        change = np.diff(signal, prepend=signal[0])
+        if np.std(change) > 0:
+            columns += [np.roll(change, k) for k in THRESHOLD.past_lags]
             columns.append(np.roll(signal, 1) - np.mean(signal))
     if not columns:
         return 0.0, 0
@@ -211,9 +212,9 @@ def _find_axes(fit: Fit, out: Filtered, data: FilterData) -> dict[str, Array]:
     # The input of the same sample is computed from the very output that is predicted.
     axes = {"time": data.t, "input": np.concatenate([data.u[:1], data.u[:-1]])}
     axes["input change"] = np.diff(axes["input"], prepend=axes["input"][0])
-    moving = [k for k in range(len(e.states) - len(e.rest)) if k not in e.velocities]
-    for k in moving:
-        axes["position" if e.velocities and len(moving) == 1 else e.states[k]] = states[:, k]
+    others = [k for k in range(len(e.states) - len(e.rest)) if k not in e.velocities]
+    for k in others:
+        axes["position" if e.velocities and len(others) == 1 else e.states[k]] = states[:, k]
     for k in e.velocities:
         axes["velocity" if len(e.velocities) == 1 else e.states[k]] = states[:, k]
     if data.record.r is not None:

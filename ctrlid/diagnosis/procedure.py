@@ -39,7 +39,9 @@ BY_SIMULATION = (
     "What is called one-step errors above are errors of that simulation, and the evidence is "
     "computed for the number of independent samples"
 )
-PROGRESS = 6  # The bar moves by so many steps, of which the comparison on fresh data makes two.
+# The bar has so many steps; the comparison on fresh data makes two, and the bar is closed before
+# the last one.
+PROGRESS = 6
 
 
 @dataclass(frozen=True, eq=False)

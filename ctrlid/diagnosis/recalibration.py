@@ -42,7 +42,7 @@ def recalibrate(loop: Loop, records: Sequence[Record], audits: Sequence[Audit]) 
     parts, start_times = cut_stretches(records)
     base = fit_base_model(loop, parts, loop.free, start_times)
     periods = find_repeat_periods(parts, audits)
-    return weigh_by_repeats(base, periods) if periods else base
+    return fit_with_repeat_noise(base, periods) if periods else base
 
 
 def fit_base_model(
@@ -56,7 +56,7 @@ def fit_base_model(
     return Model(loop, choose_noise(fit))
 
 
-def weigh_by_repeats(base: Model, periods: Sequence[int]) -> Model:
+def fit_with_repeat_noise(base: Model, periods: Sequence[int]) -> Model:
     """Return the model fitted with the noise that differs between repeats.
 
     A noise that is fitted to what a model leaves takes part of a missing effect for noise.
@@ -95,7 +95,10 @@ def _narrow_bounds(
 
 
 def cut_stretches(records: Sequence[Record]) -> tuple[list[Record], list[float]]:
-    """Return records short enough to be fitted many times: even stretches of long ones."""
+    """Return records short enough to be fitted many times, and the times at which they start [s].
+
+    Of long records these are stretches, evenly spaced.
+    """
     total = sum(len(r) for r in records)
     if total <= THRESHOLD.fitted_samples:
         return list(records), [0.0] * len(records)

@@ -44,7 +44,7 @@ def make_loop(loop: Any, record: Record) -> Loop:
 
 def look_over_records(
     loop: Loop, records: Sequence[Record]
-) -> tuple[tuple[Audit, ...], tuple[str, ...]]:  # fmt: skip
+) -> tuple[tuple[Audit, ...], tuple[str, ...]]:
     """Return what is remarkable about the records; refuse those that carry nothing."""
     audits, remarks = [], _name_foreign_units(loop, records[0])
     for k, record in enumerate(records):
@@ -61,7 +61,7 @@ def look_over_records(
 
 
 def _name_foreign_units(loop: Loop, record: Record) -> list[str]:
-    """Say where a record counts in other units than the plant, whose words sizes are written in."""
+    """Say where a record has other units than the plant, in whose units sizes are written."""
     e, known = loop.equations(), getattr(loop.plant, "units", {})
     remarks = []
     for key, name in (("u", e.inputs[0]), ("y", e.outputs[0])):

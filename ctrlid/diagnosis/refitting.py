@@ -64,8 +64,8 @@ def refit_under_noise(base: Model, trial: Trial, noise: Noise) -> Trial:
     The likelihood of the noise has several maxima: a slow force that stood for what is missing may
     stay beside one candidate and leave the next, which says nothing of the candidates.
     """
-    moved = replace(trial.model.fit, noise=noise)
-    fit = drop_linearization(maximize(moved, rounds=THRESHOLD.refit_rounds, exact=False))
+    start = replace(trial.model.fit, noise=noise)
+    fit = drop_linearization(maximize(start, rounds=THRESHOLD.refit_rounds, exact=False))
     return weigh_refit(base, trial, fit) if fit.value > trial.model.fit.value else trial
 
 

@@ -101,7 +101,7 @@ def _drop_effects(model: Model, positions: Sequence[int]) -> Model:
 
 def take_out_effect(
     loop: Loop, position: int, names: Sequence[str]
-) -> tuple[Loop, tuple[str, ...]]:  # fmt: skip
+) -> tuple[Loop, tuple[str, ...]]:
     """Return a loop without one of its effects, and the names of what is free then."""
     labels = list(loop.labelled)
     label, less = labels[position], loop.without_effect(labels[position])

@@ -28,7 +28,8 @@ from .refitting import refit_candidate
 from .screening import screen_at
 from .thresholds import THRESHOLD
 
-SEEDS = 101  # The seeds of two records are so far apart that no two segments share one.
+# The seeds of successive records differ by so much that segments that start alike get other noise.
+SEEDS = 101
 
 
 def make_replica(model: Model, seed: int = 0) -> Model | None:
@@ -58,8 +59,7 @@ def make_replica(model: Model, seed: int = 0) -> Model | None:
         ]
         problem = make_problem(loop, model.names, records, start_times)
         problem = replace(problem, counts=fit.counts, known=fit.known)
-        # With other noise a loop may take another path, so both the old path and a new guess are
-        # tried.
+        # With other noise a loop may take another path, so the old one and a new guess are tried.
         along = evaluate_likelihood(problem, fit.theta, fit.noise, fit.trajectories)
         starts = along, begin_fit(problem, fit.theta, fit.noise)
         again = maximize(

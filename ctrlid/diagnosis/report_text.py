@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     from .result import Diagnosis
 
 # Lines of the report have at most so many characters, which fits a terminal.
-# Lines of the report have at most so many characters, which fits a terminal.
 WIDTH = 100
 
 

@@ -118,8 +118,8 @@ class ModelSight:
     @property
     def travel(self) -> float:
         """How far the position moves on samples that count [output unit]."""
-        ways, counts = self.positions(), self.model.fit.counts
-        return max(float(np.ptp(way[keep])) for way, keep in zip(ways, counts, strict=True))
+        positions, counts = self.positions(), self.model.fit.counts
+        return max(float(np.ptp(x[keep])) for x, keep in zip(positions, counts, strict=True))
 
     @property
     def block(self) -> int:

@@ -17,7 +17,7 @@ from .thresholds import THRESHOLD
 def screen_candidate(base: Model, effect: AbstractEffect, scan_penalty: float = 0.0) -> Trial:
     """Add an effect, as it is or nearer to nothing, and ask what a first step would gain.
 
-    An effect that is faint is tried faint: far from there its score is zero. The
+    An effect that may be faint is tried faint, since far from there its score is zero. The
     arguments are those of `screen_at`.
     """
     best = screen_at(base, effect, scan_penalty)
@@ -103,6 +103,6 @@ def screen_starts(base: Model, effects: Sequence[AbstractEffect], scan_penalty: 
             continue
         score = fit.value - base.fit.value + compute_expected_gain(fit)
         if score > best.score:
-            moved = loop.with_parameters(dict(zip(names, theta.tolist(), strict=True)))
-            best = Trial(effect, label, Model(moved, drop_arrays(fit)), score, scan_penalty)
+            there = loop.with_parameters(dict(zip(names, theta.tolist(), strict=True)))
+            best = Trial(effect, label, Model(there, drop_arrays(fit)), score, scan_penalty)
     return best

@@ -16,8 +16,6 @@ from .screening import screen_at
 from .thresholds import THRESHOLD
 
 Work = Callable[[Callable[..., Any], Iterable[Any]], list[Any]]
-
-
 # A job is the trial that is refitted, the start, and the model near whose values it starts.
 Job = tuple[Trial, Trial | AbstractEffect, Model | None]
 
@@ -132,8 +130,8 @@ def _forces_differ(one: Trial, other: Trial) -> bool:
 def _find_stuck(best: Trial, tried: Sequence[Trial]) -> list[Trial]:
     """Return what may have lost only because its likelihood is rugged, as dry friction's is.
 
-    Where a large random force smooths the kink away, a fit stays there. It is climbed on with
-    hardly any such force: from its own values, which are near; from its first ones that is chance.
+    Where a large random force smooths the kink away, a fit stays there. It is refitted with hardly
+    any such force, from the values that it has reached: from its first ones success is chance.
     """
     if not best.net_gain > 0:
         return []

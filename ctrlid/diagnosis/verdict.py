@@ -139,7 +139,7 @@ def write_conclusion(
     Returns
     -------
     str
-        One to three sentences.
+        A few sentences.
     """
     names = join_names(findings)
     name, p = after.worst

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from .result import Diagnosis
 
 # The report shows so many quantities along which the errors are not noise.
-# The report shows so many quantities along which the errors are not noise.
 PLACES = 3
 # So many failed tests are named, which still makes one sentence.
 LISTED = 4

@@ -118,4 +118,4 @@ class ReadingEffect(AbstractEffect):
         m.y = Symbol(reading if e.readout is None else e.readout)
         return dataclasses.replace(
             e, reading=reading, readout=to_expression(trace_hook(self.read)(m))
-        )  # fmt: skip
+        )

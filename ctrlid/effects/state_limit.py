@@ -130,6 +130,6 @@ def _find_high_value(loop: Any, record: Any, i: int) -> float:
         if np.linalg.eigvals(a).real.max() < 0:
             n = len(a)
             sampled = signal.cont2discrete((a, b, np.eye(n), np.zeros((n, 1))), record.dt)
-            moved = signal.dlsim(sampled, record.u - at.input)[1][:, i]
-            return float(at.states[i] + np.quantile(moved, 0.9))
+            deviation = signal.dlsim(sampled, record.u - at.input)[1][:, i]
+            return float(at.states[i] + np.quantile(deviation, 0.9))
     return float(at.states[i] + 0.5 * max(abs(at.states[i]), 1e-3))

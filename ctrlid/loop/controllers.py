@@ -221,7 +221,7 @@ def _make_linear_law(a: Any, b: Any, c: Any, d: Any, at: OperatingPoint, dt: flo
 
 def _make_traced_law(
     controller: Any, at: OperatingPoint, dt: float, order: tuple[int, int]
-) -> ControlLaw:  # fmt: skip
+) -> ControlLaw:
     equations = trace(controller)
     one_input = len(equations.inputs) == 1
 

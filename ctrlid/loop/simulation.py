@@ -18,7 +18,6 @@ TOLERANCE = 1e-9
 # A local error above this share, which could not be refined further, causes a warning.
 COARSE = 1e-5
 # A period has at most so many integration steps, which bounds the time of a simulation.
-# A period has at most so many integration steps, which bounds the time of a simulation.
 MOST_SUBSTEPS = 128
 # So many samples run at once, so that one compiled function serves records of any length.
 CHUNK = 2048
@@ -241,15 +240,14 @@ class Simulator:
                 stop = _find_first_bad(loop, self._unstable, states, ys, us, w)
                 good = count if stop is None else max(stop - 1, 0)
                 travel = np.max(np.abs(states[:, :good] - start[:, None]), axis=1, initial=0.0)
-                moved = np.maximum(reach, travel)
+                excursion = np.maximum(reach, travel)
                 largest = np.max(errors[:, :good], axis=1, initial=0.0)
                 with np.errstate(all="ignore"):
-                    error = float(np.max(np.where(largest > 0, largest / moved, 0.0)))
+                    error = float(np.max(np.where(largest > 0, largest / excursion, 0.0)))
                 if (stop is None and error <= self.tolerance) or substeps >= self.most:
                     break
                 if stop is not None and stop == previous_stop and good and error <= COARSE:
-                    # The steps were accurate until then, and finer ones leave the domain at the
-                    # same sample.
+                    # The steps were accurate so far, and finer ones stop at the same sample.
                     break
                 previous_stop = stop
                 substeps *= 2
@@ -265,7 +263,7 @@ class Simulator:
             if error > worst:
                 worst, where = error, first
             y[first : first + count], u[first : first + count] = ys[0], us[0]
-            z, reach = states[:, -1], moved
+            z, reach = states[:, -1], excursion
             if error < self.tolerance / 1e4 and substeps > 1:
                 substeps //= 2
         if worst > COARSE and self.most == MOST_SUBSTEPS:

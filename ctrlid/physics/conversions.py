@@ -1,4 +1,4 @@
-"""Linear systems as polynomials, as state matrices and at the samples, without dust.
+"""Linear systems as polynomials, as state matrices and at the samples.
 
 `canonical` is the other way to states: symbols whose coefficients are named parameters.
 """

@@ -55,7 +55,7 @@ def _pack_value(value: Any, found: list[Any]) -> Any:
 
 
 def _unpack_value(packed: Any, found: list[Any]) -> Any:
-    """Return what `_pack_value` put away."""
+    """Return what `_pack_value` packed."""
     kind, content = packed
     if kind == "expression":
         return found[content]
@@ -153,7 +153,7 @@ class Equations:
         spread = casadi.SX.sym("s", len(self.states)) if self.spread is None else self.spread
         return casadi.Function(
             "smoothed", [self.t, self.x, self.u, self.p, spread], [self.rhs, self.output]
-        )  # fmt: skip
+        )
 
     @functools.cached_property
     def reader(self) -> Any:

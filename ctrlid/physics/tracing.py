@@ -29,7 +29,7 @@ from .symbols import (
     has_symbols,
     interp,
     lift,
-)  # fmt: skip
+)
 
 
 def _dispatch_on_symbols(symbolic: Function, original: Function) -> Function:

@@ -239,8 +239,8 @@ def _compare_model(record: Record, model: Any, horizon: int | None) -> Compariso
         )
     y0, u0 = float(np.mean(record.y[valid])), float(np.mean(record.u[valid]))
     y, u = record.y - y0, record.u - u0
-    moved = np.convolve(u, num)[: len(u)]
-    error = np.convolve(y, den)[: len(y)] - moved
+    driven = np.convolve(u, num)[: len(u)]
+    error = np.convolve(y, den)[: len(y)] - driven
     constant = float(np.mean(error[usable]))
     error = np.where(usable, error - constant, 0.0)
     stretches = [(a + order, b) for a, b in record.segments() if b - a > order]
@@ -259,7 +259,7 @@ def _compare_model(record: Record, model: Any, horizon: int | None) -> Compariso
     steps = horizon or find_time_constant(roots, record.dt, record)
     if steps > 1:
         ahead = y0 + _predict_arx_ahead(
-            y, moved + constant, den, noise, white_errors, steps, usable
+            y, driven + constant, den, noise, white_errors, steps, usable
         )
         known = _list_known_signals(record, steps)
         curves.append(
@@ -269,7 +269,7 @@ def _compare_model(record: Record, model: Any, horizon: int | None) -> Compariso
         )
     notes = []
     if np.all(np.abs(roots) < 1 - 1e-9):
-        free = y0 + _simulate_arx(record, y, moved + constant, den)
+        free = y0 + _simulate_arx(record, y, driven + constant, den)
         outside = _list_known_signals(record, 1)
         curves.append(_judge_curve(OPEN_LOOP, record, free, outside, white * grown[-1]))
     else:
@@ -293,7 +293,7 @@ def _simulate_arx(record: Record, y: Array, driven: Array, den: Array) -> Array:
 
 def _predict_arx_ahead(
     y: Array, driven: Array, den: Array, noise: Array, white: Array, steps: int, usable: Any
-) -> Array:  # fmt: skip
+) -> Array:
     """Iterate ``A y = B u + C e`` `steps` times, with the predictions and errors made before."""
     order, n = len(den) - 1, len(y)
     # past[i] holds, for each origin k, the (predicted or measured) output at k + j - i.

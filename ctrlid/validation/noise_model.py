@@ -37,7 +37,7 @@ def whiten_errors(equation_errors: Array, segments: list[tuple[int, int]], noise
 
 def fit_noise_polynomial(
     equation_errors: Array, segments: list[tuple[int, int]], den: Array
-) -> Array:  # fmt: skip
+) -> Array:
     """Return the polynomial C of a model's order that leaves the smallest one-step errors.
 
     Noise of the sensor alone makes C the denominator A with its unstable roots reflected into the

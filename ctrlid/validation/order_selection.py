@@ -23,7 +23,6 @@ ROWS = 30_000
 # This share of the record is fitted, and the rest judges.
 SHARE = 2 / 3
 # A weighted fit that needs more iterations does not converge.
-# A weighted fit that needs more iterations does not converge.
 ITERATIONS = 20
 # A one-step error that differs by more than this share says that the choice is wrong.
 COSTS = 0.1

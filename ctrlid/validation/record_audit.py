@@ -24,7 +24,6 @@ STRETCH = 20
 # A quantization step above this share of y's standard deviation disturbs a fit.
 COARSE = 0.3
 # With fewer changes of the excitation there is little to average over.
-# With fewer changes of the excitation there is little to average over.
 FEW_CHANGES = 4
 # A drift that chance produces with a smaller probability is reported.
 SURE = 2e-4

@@ -38,7 +38,7 @@ class Stretch:
 
     def run(
         self, simulator: Simulator, noise: Sequence[Array] | None = None
-    ) -> tuple[Array, Array]:  # fmt: skip
+    ) -> tuple[Array, Array]:
         """Return simulated output and input, with given sensor and force noise.
 
         Raises

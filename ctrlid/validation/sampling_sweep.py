@@ -21,7 +21,6 @@ from .sampling_table import FAR, SamplingRow, SamplingSweep
 
 ESTIMATORS = ("fit_arx", "fit_iv", "fit_continuous")
 # By default a record is slowed down by these factors, evenly on a logarithmic scale.
-# By default a record is slowed down by these factors, evenly on a logarithmic scale.
 FACTORS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 50, 70, 100)
 # By default a slower record keeps at least so many samples.
 FEWEST = 150

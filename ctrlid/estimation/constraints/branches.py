@@ -18,7 +18,6 @@ from ..identified_model import Structure
 from . import AbstractConstraint, Branch, Row
 
 # More combinations of branches are refused, since each is a quadratic program of its own.
-# More combinations of branches are refused, since each is a quadratic program of its own.
 _MOST_CASES = 256
 
 

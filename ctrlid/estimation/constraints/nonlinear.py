@@ -14,9 +14,7 @@ from .branches import Infeasible, Rows
 from .quadratic_program import Cost, Solution, solve_program
 
 # Each sequence ends in a local minimum, so that so many random starts are tried.
-# Each sequence ends in a local minimum, so that so many random starts are tried.
 _STARTS = 12
-# A sequence that needs more quadratic programs does not converge.
 # A sequence that needs more quadratic programs does not converge.
 _ITERATIONS = 80
 # A function or row holds if it is violated by less than this share of its own terms.

@@ -155,8 +155,8 @@ def converge_trajectory(
     for count in range(passes):
         at, lin = _linearize_inside_domain(plant, data, theta, at)
         out = run_filter(plant, data, lin, noise, sensitive=False)
-        moved = np.abs(out.trajectory.filtered - at.filtered)
-        if not np.isfinite(out.innovations).all() or not np.isfinite(moved).all():
+        change = np.abs(out.trajectory.filtered - at.filtered)
+        if not np.isfinite(out.innovations).all() or not np.isfinite(change).all():
             k = int(np.argmin(np.isfinite(out.innovations)))
             raise ModelCannotRun(
                 f"the Kalman filter of {plant.e.name} diverges at sample {k} "
@@ -164,7 +164,7 @@ def converge_trajectory(
                 "units, signs and the operating point, or exclude these samples with valid="
             )
         size = np.maximum(np.std(out.trajectory.filtered, axis=0), 1e-300)
-        still = bool((np.sqrt(np.mean(moved**2, axis=0)) <= CONVERGED_MOTION * size).all())
+        still = bool((np.sqrt(np.mean(change**2, axis=0)) <= CONVERGED_MOTION * size).all())
         at = out.trajectory
         if still and count:
             break

@@ -11,7 +11,6 @@ import numba
 import numpy as np
 
 # A state beyond this size has lost the record, and its square would soon overflow.
-# A state beyond this size has lost the record, and its square would soon overflow.
 LARGE = 1e150
 
 

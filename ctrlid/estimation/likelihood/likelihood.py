@@ -47,7 +47,7 @@ class Problem:
     counts : tuple of ndarray of bool
         Samples of each record that enter the likelihood.
     known : Known, optional
-        The noise, where it is not to be searched.
+        The noise, where it is not estimated.
     periods : tuple of int
         For each record, after how many samples it repeats itself: then only the differences
         between the repeats count, which no wrong model can have made.
@@ -63,9 +63,9 @@ class Problem:
 
 
 def make_problem(
-    loop: Loop, names: Sequence[str], records: Sequence[Record], begins: Sequence[float] = ()
+    loop: Loop, names: Sequence[str], records: Sequence[Record], start_times: Sequence[float] = ()
 ) -> Problem:
-    """Return the likelihood problem of a loop on records that begin at given times.
+    """Return the likelihood problem of a loop on records that start at given times [s].
 
     Raises
     ------
@@ -73,8 +73,8 @@ def make_problem(
         If the records do not fit the loop, or the plant moves too fast for its sampling period.
     """
     bounds = list_parameter_bounds(loop, names)
-    begins = begins or [0.0] * len(records)
-    data = tuple(make_filter_data(loop, r, b) for r, b in zip(records, begins, strict=True))
+    start_times = start_times or [0.0] * len(records)
+    data = tuple(make_filter_data(loop, r, b) for r, b in zip(records, start_times, strict=True))
     follow = records[0].r is not None and loop.analog
     plant = make_sampled_plant(loop, tuple(names), records[0].hold, follow)
     return Problem(plant, data, *bounds)
@@ -146,7 +146,7 @@ class Fit:
 
     @property
     def known(self) -> Known | None:
-        """The noise, where it is not searched."""
+        """The noise, where it is not estimated."""
         return self.problem.known
 
     @property

@@ -50,7 +50,7 @@ def begin_fit(problem: Problem, theta: Array | None = None, noise: Noise | None 
     theta : ndarray, shape (p,), optional
         Parameter values; by default those of the loop.
     noise : Noise, optional
-        The noise; by default searched.
+        The noise; by default estimated.
 
     Returns
     -------
@@ -103,8 +103,8 @@ def maximize(fit: Fit, rounds: int = ROUNDS, exact: bool = True) -> Fit:
     tuned, far, enough = -math.inf, True, 0.02 if exact else 0.3
     for _ in range(rounds):
         # A short step was already evaluated along the trajectory of the pass before.
-        moved = relinearize_fit(fit) if far else fit
-        fit = moved if np.isfinite(moved.value) else fit
+        again = relinearize_fit(fit) if far else fit
+        fit = again if np.isfinite(again.value) else fit
         if fit.value > tuned + 2.0:
             fit = fit_noise(fit.problem, fit.theta, fit.linearized, fit.noise, enough=enough)
             tuned = fit.value
@@ -139,8 +139,7 @@ def choose_noise(fit: Fit, always: bool = False) -> Fit:
         if always:
             raise
         return fit
-    # A coloured force has two parameters and is refitted only if it gains half their penalty at
-    # once.
+    # A coloured force is refitted only if it gains at once half the penalty of its two parameters.
     if not always and richer.value < fit.value + bayesian_penalty(1, fit.size):
         return fit
     richer = maximize(richer)
@@ -315,9 +314,9 @@ def compute_information(fit: Fit) -> tuple[Array, Array]:
     for k in range(len(logs)):
         pair = []
         for h in (-LOG_STEP, LOG_STEP):
-            moved = logs.copy()
-            moved[k] += h
-            pair.append(compute_innovations(fit.theta, make_noise(moved, plant.channels, dt)))
+            shifted = logs.copy()
+            shifted[k] += h
+            pair.append(compute_innovations(fit.theta, make_noise(shifted, plant.channels, dt)))
         columns.append(_divide_difference(pair, 2 * LOG_STEP))
     count, records = len(columns), len(problem.data) if problem.known is None else 0
     matrix = np.zeros((count + records, count + records))

@@ -103,7 +103,7 @@ def _evaluate_costs(cost: Callable[[Array], float], points: Iterable[Array]) -> 
 
 def _minimize_by_newton(
     cost: Callable[[Array], float], x: Array, low: Array, high: Array, enough: float
-) -> Array:  # fmt: skip
+) -> Array:
     """Minimise a smooth function of a few logarithms by damped Newton steps with differences.
 
     Where a step gained what the parabola g^2/2h foresaw but for e, a function with a third
@@ -129,8 +129,8 @@ def _minimize_by_newton(
             step = -vectors @ (turned / (values + damping))
             step *= min(1.0, 2.5 / max(float(np.abs(step).max()), 1e-300))
             trial = np.clip(x + step, low, high)
-            moved = vectors.T @ (trial - x)
-            foreseen = -float((turned + 0.5 * values * moved) @ moved)
+            taken = vectors.T @ (trial - x)
+            foreseen = -float((turned + 0.5 * values * taken) @ taken)
             if convex and foreseen < 0.1 * enough:
                 return x
             there = cost(trial)
@@ -145,7 +145,7 @@ def _minimize_by_newton(
             break
         if convex:
             # This slope of the quadratic model is left after the step.
-            slope_left = turned + values * moved
+            slope_left = turned + values * taken
             left = (
                 0.5 * float(slope_left @ (slope_left / values))
                 + 2.25 * (gain - foreseen) ** 2 / foreseen

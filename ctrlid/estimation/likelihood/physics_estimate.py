@@ -147,17 +147,17 @@ class LoopFit(Printed):
 
     @property
     def model(self) -> Any:
-        """Return the plant with its effects, linearized where it rests at the loop's output."""
+        """The plant with its effects, linearized where it rests at the loop's output."""
         return _linearize_at_rest(self.loop)
 
     @property
     def poles(self) -> Any:
-        """Return the poles of `model`, in rad/s (in z for a plant in discrete time)."""
+        """The poles of `model`, in rad/s (in z for a plant in discrete time)."""
         return np.roots(self.model.den[0][0]).astype(complex)
 
     @property
     def poles_standard_errors(self) -> Array:
-        """Return the standard errors of `poles`, by the delta method.
+        """The standard errors of `poles`, by the delta method.
 
         The denominator is differenced along each fitted parameter; the operating point moves with
         it. Infinite where a pole depends on a parameter that the data do not determine.

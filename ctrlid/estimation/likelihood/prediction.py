@@ -146,7 +146,7 @@ def predict(loop: Loop, record: Record, force_noise: float | None = None) -> Pre
 
 def predict_ahead(
     loop: Loop, record: Record, prediction: Prediction, horizon: int
-) -> tuple[Any, Array]:  # fmt: skip
+) -> tuple[Any, Array]:
     """Predict several samples ahead from the filtered states and the measured input.
 
     Parameters
@@ -185,7 +185,7 @@ def predict_ahead(
 
 def predict_spread(
     loop: Loop, record: Record, prediction: Prediction, horizon: int
-) -> tuple[float, float]:  # fmt: skip
+) -> tuple[float, float]:
     r"""Return the standard deviation that noise gives predictions several samples ahead.
 
     .. math:: P_{k+1} = A_k P_k A_k^T + Q, \quad \sigma^2 = h P_{k+j} h^T + R

@@ -25,7 +25,7 @@ from .transition_maps import (
     is_scheme_suitable,
 )
 
-# After each so many samples it is checked whether the backlash has forgotten where it began.
+# Every so many samples it is checked whether the backlash has forgotten where it began.
 FORGOTTEN = 200
 # A lasting error of the input moves the plant as far as white noise of so many times its variance.
 LASTING = 10
@@ -65,7 +65,7 @@ class Linearized:
 class SampledPlant:
     """The equations of a loop's plant made ready to be filtered along records.
 
-    Sampled plants whose equations differ in the values of their parameters only share their maps.
+    Sampled plants whose equations differ only in the values of their parameters share their maps.
 
     Parameters
     ----------
@@ -147,12 +147,12 @@ class SampledPlant:
         w = self._stack_applied_inputs(data, applied)
         spread = at.spread[:, : self.n].T
         given = (at.filtered.T, w, p, spread, np.zeros(self.channels))
-        step, a, b, dp, *moved = self._evaluate_transition(self.maps.stages, *given)
+        step, a, b, dp, *by_input = self._evaluate_transition(self.maps.stages, *given)
         # How the input moves the state matters only where the input is not what was measured.
         du = np.zeros((len(u), self.size))
         rows = np.flatnonzero(input_variance)
         if slopes is not None:
-            dw = _repeat_over_samples(moved[0], len(u))
+            dw = _repeat_over_samples(by_input[0], len(u))
             du = dw.sum(axis=2)
             dp = _repeat_over_samples(dp, len(u)).copy()
             for k in (-1, 0, 1):
@@ -205,7 +205,7 @@ class SampledPlant:
         """Return one period of the plant, as it is, together with that of its sensitivities.
 
         ``f(z, w, p) -> (next z, y and its slopes)``; z stacks the state and its derivatives by the
-        free parameters and the initial state, w is a column of `inputs`.
+        free parameters and the initial state, w is a column of `stack_inputs`.
         """
         n, p = self.size, len(self.index)
         x, s, w, values = (casadi.SX.sym(k, *size) for k, size in (
@@ -219,10 +219,10 @@ class SampledPlant:
         for function, part in itertools.product(self.maps.functions, range(self.maps.parts)):
             stage = function.call([*stage[:carried], w, values, still, quiet, part])
         after, a, _, dp, *_ = stage
-        moved = casadi.mtimes(a, s) + casadi.horzcat(dp, casadi.SX.zeros(n, n))
+        onward = casadi.mtimes(a, s) + casadi.horzcat(dp, casadi.SX.zeros(n, n))
         return casadi.Function(
             "period", [casadi.vertcat(x, casadi.vec(s)), w, values],
-            [casadi.vertcat(after, casadi.vec(moved)), casadi.vertcat(y, seen.T)], {"cse": True},
+            [casadi.vertcat(after, casadi.vec(onward)), casadi.vertcat(y, seen.T)], {"cse": True},
         )  # fmt: skip
 
     def stack_inputs(self, data: FilterData, theta: Array) -> Array:
@@ -251,8 +251,8 @@ class SampledPlant:
     def _stack_applied_inputs(self, data: FilterData, applied: Array) -> Array:
         """Return the rows (t, input before, now, ahead, r, y) over which the map is evaluated."""
         t, r, y = data.t, data.r, data.y
-        moved = [shift_signal(applied, self.delay_samples - k) for k in (-1, 0, 1)]
-        return np.vstack([t, *moved, r, y])
+        shifted = [shift_signal(applied, self.delay_samples - k) for k in (-1, 0, 1)]
+        return np.vstack([t, *shifted, r, y])
 
     def pad_controller_states(self, values: Array) -> Array:
         """Add the states of a known analog controller, at rest, to a start."""
@@ -336,12 +336,11 @@ class InitialConditions:
             if shown:
                 spread[k] = spread[:, k] = near[0] @ spread
                 wide = near[0] @ spread @ near[0]
-                moved = late**2 * float(np.var(np.diff(y))) / data.scale**2
-                spread[k, k] = wide + min(moved, wide) + NEARLY
+                change = late**2 * float(np.var(np.diff(y))) / data.scale**2
+                spread[k, k] = wide + min(change, wide) + NEARLY
             else:
                 before = float(np.mean((target - start[k]) ** 2))
-                # Without restarts a lag is as far from its target as this moves within the time
-                # constant.
+                # Without restarts a lag is off by what its target moves within the time constant.
                 if alone:
                     start[k] = target[0, 0]
                     steps = float(np.var(np.diff(target[:, 0])))

@@ -64,8 +64,10 @@ class PeriodPlan:
         Number of these forces; a single one acts on all.
     index : tuple of int
         Places of the free parameters.
-    late : int
+    delay_samples : int
         Whole periods by which the input comes late.
+    structure : tuple
+        What is compared in place of equations and law: their expressions without values.
     """
 
     equations: Equations = field(compare=False)
@@ -188,8 +190,8 @@ def build_maps(plan: PeriodPlan) -> TransitionMaps:
     # Behind backlash, the input itself depends on the free parameters.
     own = ("force", "free") if plan.equations.play is None else ("force", "free", "input")
     functions = _chain_maps(x, ends, parts, given, [by[key] for key in own])
-    height = by["height"]
-    outputs = [height, casadi.jacobian(height, x), casadi.jacobian(height, by["free"])]
+    output = by["output"]
+    outputs = [output, casadi.jacobian(output, x), casadi.jacobian(output, by["free"])]
     sensor = casadi.Function("sensor", [x, *given[:3]], outputs, {"cse": True})
     stages = tuple(BlockEvaluation(f) for f in functions)
     return TransitionMaps(functions, stages, parts, sensor, BlockEvaluation(sensor))
@@ -221,7 +223,7 @@ def _build_period(plan: PeriodPlan) -> tuple[Any, list[Any], list[Any], dict[str
         parts = 1
     free = casadi.vertcat(*(p[k] for k in plan.index)) if plan.index else casadi.SX(0, 1)
     by = {"force": force, "free": free, "input": casadi.vertcat(before, now, ahead),
-          "height": e.smoothed(t, x[:n], now, p, s)[1]}  # fmt: skip
+          "output": e.smoothed(t, x[:n], now, p, s)[1]}  # fmt: skip
     return x, ends, [casadi.vertcat(*w), p, s, force, part], by, parts
 
 
@@ -268,15 +270,14 @@ def _integrate_with_controller(
     e, law, n = plan.equations, plan.law, len(plan.equations.states)
     assert law is not None
     noise = y - e.smoothed(t, x[:n], u, p, s)[1]
-    # The offset holds the bias, injected signals and what the controller's state leaves
-    # unexplained.
+    # The offset holds bias, injected signals and what the controller's state leaves unexplained.
     offset = u - law.apply(t, x[n:], r, y)[0]
 
     def rate(tau: Any, z: Any) -> Any:
         seen = e.smoothed(t + tau, z[:n], u, p, s)[1] + noise
         computed, slope = law.apply(t + tau, z[n:], r, seen)
-        moved = e.smoothed(t + tau, z[:n], computed + offset, p, s)[0] + held_rate
-        return casadi.vertcat(moved, slope)
+        driven = e.smoothed(t + tau, z[:n], computed + offset, p, s)[0] + held_rate
+        return casadi.vertcat(driven, slope)
 
     return integrate(rate, x, plan.dt, substeps)[0]
 
@@ -336,8 +337,8 @@ class BacklashMap:
         """
         memories = self.compute_memories(first, u, p)[:-1]
         applied, *slopes = self.slopes(memories[None, :], u[None, :], p)
-        seen, moved = (np.broadcast_to(v, (len(u), *v.shape[1:]))[:, 0, :] for v in slopes)
-        by_memory = _carry_sensitivity(moved[:, 0], moved[:, 1:])
+        seen, carried = (np.broadcast_to(v, (len(u), *v.shape[1:]))[:, 0, :] for v in slopes)
+        by_memory = _carry_sensitivity(carried[:, 0], carried[:, 1:])
         return applied[:, 0, 0], seen[:, :1] * by_memory + seen[:, 1:]
 
 

@@ -218,7 +218,7 @@ def _is_violated(task: Task, point: Point, known: Sequence[AbstractConstraint]) 
 
 def find_best_fit(
     task: Task, known: Sequence[AbstractConstraint], delay: float
-) -> tuple[Point, Found, float, int]:  # fmt: skip
+) -> tuple[Point, Found, float, int]:
     """Search from the most promising starts; return the best minimum."""
     starts = _rank_starts(task, delay)
     short = replace(task, pieces=_take_head(task.pieces))
@@ -334,7 +334,7 @@ def _rank_starts(task: Task, delay: float) -> list[tuple[float, Point]]:
 
 def _fit_numerator(
     task: Task, pieces: tuple[Piece, ...], roots: Array, delay: float
-) -> tuple[Point | None, float]:  # fmt: skip
+) -> tuple[Point | None, float]:
     s = task.structure
     den = np.real(np.poly(roots))
     blank = Point(np.concatenate([den[1:], np.zeros(s.nb)]), np.zeros(s.na), delay)

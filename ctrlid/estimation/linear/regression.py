@@ -130,8 +130,8 @@ class Regression:
         Triangular factor and right-hand side, in the differenced basis.
     rss : float
         Sum of squares that no coefficients can remove.
-    rows, intercept_count : int
-        Rows used, and intercepts estimated besides the coefficients.
+    rows : int
+        Rows used.
     floor : (p,) array
         Size of the rounding errors in each column.
     intercept_rows : tuple of (p + 2,) arrays
