@@ -122,11 +122,11 @@ def _describe_shift(u: int, y: int) -> str:
     """Say which channel is late."""
     k, late = abs(u or y), "late" if (u or y) > 0 else "early"
     if u and y:
-        return f"r is logged {_write_count(k)} {'early' if late == 'late' else 'late'}"
-    return f"{'u' if u else 'y'} is logged {_write_count(k)} {late}"
+        return f"r is logged {_spell_samples(k)} {'early' if late == 'late' else 'late'}"
+    return f"{'u' if u else 'y'} is logged {_spell_samples(k)} {late}"
 
 
-def _write_count(k: int) -> str:
+def _spell_samples(k: int) -> str:
     return f"{('one', 'two', 'three')[k - 1]} sample{'s' if k > 1 else ''}"
 
 

@@ -274,7 +274,7 @@ class InitialConditions:
 
     def __init__(self, plan: PeriodPlan) -> None:
         self.plan = plan
-        self.lags = _find_lags(plan.equations)
+        self.lags = _prepare_lags(plan.equations)
 
     def find_memory(self, u: float, p: Array) -> tuple[float, float]:
         """Return the memory of the backlash at the start, and how far off it may be."""
@@ -349,7 +349,7 @@ class InitialConditions:
         return start, spread
 
 
-def _find_lags(e: Equations) -> list[tuple[int, bool, BlockEvaluation]]:
+def _prepare_lags(e: Equations) -> list[tuple[int, bool, BlockEvaluation]]:
     """Return the lags behind the input or the output of the plant: which, time and target."""
     found = []
     for lag in e.lags:
