@@ -2,17 +2,19 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from ..._base.arrays import Array
-from ..._base.errors import CtrlidError
+from ..._base.errors import CtrlidError, ModelCannotRun
 from ..._base.statistics import pseudo_inverse
 from ..._base.text import write_list
 from ...data.record import Record
 from ...data.several_records import as_records, order_model_and_data
 from ...loop.loop import Loop
+from ..whiteness import note_coloured_innovations
 from .filter_data import find_noise_units
 from .likelihood import Fit, list_effect_bounds, make_problem
 from .maximization import begin_fit, choose_noise, compute_information, maximize, refit_noise_size
@@ -87,7 +89,23 @@ def fit_loop(
     fit = refit_noise_size(maximize(begin_fit(make_problem(loop, names, records))))
     if coloured or coloured is None:
         fit = choose_noise(fit, always=bool(coloured))
-    return summarize_fit(loop, fit)
+    if not math.isfinite(fit.value):
+        raise ModelCannotRun(
+            f"The filter lost the record: the log-likelihood of the best fit is {fit.value}. Mark "
+            "outliers and stretches that are no measurement as not valid (valid=), start from "
+            "values nearer to the truth, or free fewer parameters"
+        )
+    fitted = summarize_fit(loop, fit)
+    colour = note_coloured_innovations(fit.standardized, len(fit.theta), _TOO_NARROW)
+    return replace(
+        fitted, estimate=replace(fitted.estimate, notes=(*fitted.estimate.notes, *colour))
+    )
+
+
+_TOO_NARROW = (
+    "The standard errors are too small, and the values may be biased: diagnose() tells what the "
+    "model lacks."
+)
 
 
 def _choose_free_names(loop: Loop, free: Sequence[str] | None) -> tuple[str, ...]:

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.signal import lfilter
 
 from ..._base import text as _text
 from ..._base.arrays import Array
@@ -13,10 +14,12 @@ from ..._base.errors import CtrlidError
 from ..._base.jobs import check_jobs
 from ...data.record import Record
 from ...data.several_records import VISIBLE_MOTION, measure_input_motion, stream_records
+from ...data.validity import find_whole_past
 from ..constraints import AbstractConstraint, check_constraints
 from ..constraints.constrained_minimum import Found, minimize
 from ..constraints.quadratic_program import Cost, NotExcited
 from ..identified_model import Estimate, IdentifiedModel, Structure
+from ..whiteness import ENOUGH, note_coloured_innovations
 from .regression import Regression, build_arx_regression, check_orders, from_differences
 
 
@@ -112,6 +115,9 @@ def fit_arx(
         message = _explain_no_excitation(regression, trouble.direction)
         raise CtrlidError(message) from None
     estimate = _make_estimate(regression, found, constrained=bool(known), dt=first.dt)
+    if not isinstance(record, Iterator):
+        # An iterator of records was read once, and is gone.
+        estimate = replace(estimate, notes=_note_colour(list(records), estimate))
     share = max(motions, default=0.0)
     if share > VISIBLE_MOTION:
         note = (
@@ -119,7 +125,7 @@ def fit_arx(
             "deviation in a period), but a difference equation takes it as held, so the poles are "
             "biased. Sample faster, or use fit_continuous with the controller."
         )
-        estimate = replace(estimate, notes=(note,))
+        estimate = replace(estimate, notes=(*estimate.notes, note))
     names = first.names
     return IdentifiedModel(estimate, inputs=names.get("u", "u"), outputs=names.get("y", "y"))
 
@@ -129,6 +135,31 @@ def _note_motion(records: Iterable[Record], motions: list[float]) -> Iterator[Re
     for record in records:
         motions.append(measure_input_motion([record]))
         yield record
+
+
+def _note_colour(records: Sequence[Record], estimate: Estimate) -> tuple[str, ...]:
+    """Return a note if the equation errors are not white; those of the first samples tell."""
+    num, den = estimate.structure.fraction(estimate.values)
+    # Both are in falling powers of z, so that a shorter numerator begins later.
+    num = np.concatenate([np.zeros(len(den) - len(num)), num])
+    order, left = len(den) - 1, ENOUGH
+    stretches, size = [], 0.0
+    for record in records:
+        part = record[:left]
+        error = lfilter(den, [1.0], part.y) - lfilter(num, [1.0], part.u)
+        error[~find_whole_past(part.valid, order)] = np.nan
+        stretches.append(error)
+        size = max(size, float(np.max(np.abs(part.y[part.valid]), initial=0.0)))
+        left -= len(part)
+        if left <= 0:
+            break
+    return note_coloured_innovations(stretches, len(estimate.names), _BIASED, size)
+
+
+_BIASED = (
+    "In closed loop the coefficients are then biased and their standard errors too small: use "
+    "fit_iv, fit_continuous or fit_loop."
+)
 
 
 def make_arx_cost(regression: Regression) -> Cost:

@@ -8,18 +8,22 @@ import control as ct
 import numpy as np
 
 from ..._base.errors import CtrlidError, CtrlidWarning
-from ..._base.text import write_list
+from ..._base.text import write_list, write_number
 from ...data.record import Record
 from ...data.several_records import VISIBLE_MOTION, as_records, measure_input_motion
 from ...loop.controllers import PID
 from ...physics.conversions import to_state_matrices
 from ..constraints import AbstractConstraint, check_constraints
 from ..identified_model import Estimate, IdentifiedModel, Structure
+from ..whiteness import note_coloured_innovations
 from .prediction_error import Piece, Task, find_best_fit
 from .sampled_motion import Circuit
 
 # Above this product of dt and the controller's fastest pole, u moves visibly between samples.
 FAST_CIRCUIT = 0.1
+
+# A pole this many times 1/dt decays below the rounding of a number within one period.
+BEYOND = float(-np.log(np.finfo(float).eps))
 
 
 def fit_continuous(
@@ -110,8 +114,13 @@ def fit_continuous(
         raise CtrlidError("a delay can be fitted only where the input is held (hold='zoh') and "
                           "controller= is not given; give delay=0")  # fmt: skip
     task = Task(structure, pieces, records[0].dt, records[0].hold, circuit, delay is None, 1.0)
-    point, found, rss, used = find_best_fit(task, known, delay or 0.0)
+    point, found, rss, used, residuals = find_best_fit(task, known, delay or 0.0)
     degrees = used - found.free - structure.na - int(task.free_delay)
+    _check_speed(np.roots(structure.fraction(found.theta)[1]), records[0].dt)
+    size = max(float(np.max(np.abs(p.signals["y"]))) for p in pieces)
+    notes = note_coloured_innovations(
+        residuals, len(structure.names) + structure.na, _TOO_NARROW, size
+    )
     late = f", delay {point.delay:.6g} s" if task.free_delay else ""
     estimate = Estimate(
         structure=structure, values=found.theta, covariance=found.spread * rss / degrees,
@@ -119,11 +128,30 @@ def fit_continuous(
         degrees_of_freedom=degrees, active_bounds=found.active_bounds, branch=found.branch,
         method=("constrained " if known else "") + "prediction error (continuous time)",
         solver=f"Gauss-Newton steps, {found.solver}{late}", dt=0.0, condition=found.condition,
+        notes=notes,
     )  # fmt: skip
     names = records[0].names
     model = IdentifiedModel(estimate, inputs=names.get("u", "u"), outputs=names.get("y", "y"))
     model.delay = point.delay
     return model
+
+
+_TOO_NARROW = (
+    "The observer takes a mixture of white sensor noise and white force noise, so that the "
+    "standard errors are too small and coefficients may be biased: compare with fit_iv, or raise "
+    "the order."
+)
+
+
+def _check_speed(poles: Any, dt: float) -> None:
+    """Refuse a pole whose motion over one period is below rounding, or overflows it."""
+    fastest = poles[int(np.argmax(np.abs(poles.real)))]
+    if not np.isfinite(poles).all() or abs(fastest.real) * dt > BEYOND:
+        raise CtrlidError(
+            f"The data do not determine the model: the fit ended with a pole at "
+            f"{write_number(fastest.real, 3)} rad/s, of which nothing is left after one period of "
+            f"{dt:g} s. Lower the number of poles, or add a constraint."
+        )
 
 
 def _check_orders(poles: Any, zeros: Any) -> Structure:

@@ -20,6 +20,7 @@ from ..constraints import AbstractConstraint, check_constraints
 from ..constraints.constrained_minimum import Found, minimize
 from ..constraints.quadratic_program import NotExcited
 from ..identified_model import Estimate, IdentifiedModel, Structure
+from ..whiteness import note_coloured_innovations
 from .controller_model import (
     LinearController,
     convert_controller,
@@ -344,6 +345,9 @@ def _make_estimate(task: Task, fit: _Fit, constrained: bool, dt: float) -> Estim
     if ratio > 2.0 and rss > 1e-20 * moments.size**2:
         covariance = sandwich
         notes.append(_CORRELATED)
+    size = max(float(np.max(np.abs(piece.y))) for piece in task.pieces)
+    errors = [part.e for part in residuals]
+    notes += note_coloured_innovations(errors, len(s.names), _COLOURED, size)
     delta = to_differences(s, found.theta)
     # A(1) = -delta_0 and B(1) = beta_0 return the levels that were taken off.
     constants = [
@@ -398,6 +402,10 @@ _CURVED = (
     "THE PLANT IS NONLINEAR over the range of this record: products of y and u up to degree "
     "{degree} were fitted as well, and the coefficients above are those of the linear model at the "
     "equilibrium. Use smaller signals, or fit_loop with the physics."
+)
+_COLOURED = (
+    "Check with compare() whether the residuals depend on past u: then the orders are too low, or "
+    "physics is missing, and the coefficients are wrong."
 )
 _CORRELATED = (
     "THE NOISE MODEL DOES NOT HOLD: the standard errors were computed from the correlations of "

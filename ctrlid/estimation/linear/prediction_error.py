@@ -31,6 +31,9 @@ CONVERGED = 1e-7
 # Observer poles stay so many over the samples of a stretch inside the unit circle, since the data
 # resolve no slower ones.
 SLOWEST = 3
+# Directions of initial state and operating point below this share of the largest are not in the
+# data.
+RESOLVED = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,6 +94,18 @@ def _compute_columns(task: Task, point: Point, piece: Piece) -> Array | None:
     ones = {name: np.zeros(n) for name in piece.signals} | {"u": np.ones(n)}
     rest, _ = compute_prediction_errors(motion, point.gain, ones)
     return np.column_stack([free, rest, errors])
+
+
+def _compute_residuals(task: Task, point: Point) -> list[Array]:
+    """Return the prediction errors of each stretch, with the best initial state and level.
+
+    These are the innovations, if model and observer are right.
+    """
+    errors = []
+    for table in _evaluate_cost(task, point)[1]:
+        free = table[:, :-1]
+        errors.append(table[:, -1] - free @ regress(free, table[:, -1], RESOLVED))
+    return errors
 
 
 def _triangularize(table: Array) -> Array:
@@ -218,8 +233,8 @@ def _is_violated(task: Task, point: Point, known: Sequence[AbstractConstraint]) 
 
 def find_best_fit(
     task: Task, known: Sequence[AbstractConstraint], delay: float
-) -> tuple[Point, Found, float, int]:
-    """Search from the most promising starts; return the best minimum."""
+) -> tuple[Point, Found, float, int, list[Array]]:
+    """Search from the most promising starts; return the best minimum and its residuals."""
     starts = _rank_starts(task, delay)
     short = replace(task, pieces=_take_head(task.pieces))
     ranked: list[tuple[float, float, Point]] = []
@@ -239,7 +254,8 @@ def find_best_fit(
     ranked.sort(key=lambda r: r[0])
     _, speed, point = ranked[0]
     try:
-        best, found, rss = _minimize_twice(_change_speed(task, speed), point, known)
+        task = _change_speed(task, speed)
+        best, found, rss = _minimize_twice(task, point, known)
     except NotExcited as trouble:
         raise CtrlidError(
             "The data do not determine the coefficients: a change of "
@@ -250,7 +266,7 @@ def find_best_fit(
     used = sum(p.n for p in task.pieces) - len(task.pieces) * (
         task.structure.na + 1 + (len(task.circuit.a) if task.circuit else 0)
     )
-    return best, found, rss, used
+    return best, found, rss, used, _compute_residuals(task, best)
 
 
 def _minimize_twice(

@@ -1,0 +1,128 @@
+"""Every estimator says in capitals when its innovations are not white, and refuses what is absurd.
+
+The records come from a simulator of this file's own: the held-input map of a plant, by
+scipy.linalg.expm, under a digital law written out in numpy.
+"""
+
+import numpy as np
+import pytest
+from scipy import linalg, signal
+
+import ctrlid as cid
+from ctrlid.estimation.whiteness import HARMLESS, LEVEL, note_coloured_innovations
+
+SAYS = "INNOVATIONS ARE NOT WHITE"
+DT = 0.01
+
+
+def draw_noise(kind, n, rng):
+    white = rng.standard_normal(n + 100)
+    shapes = {
+        "white": ([1.0], [1.0]),
+        "averaged": ([0.5, 0.5], [1.0]),
+        "slow": ([1.0], [1.0, -0.9]),
+    }
+    return signal.lfilter(*shapes[kind], white)[100:]
+
+
+def simulate_unstable(kind, seed, n=3000, size=1e-4):
+    """A plant 30 / (s^2 - 16) behind a held input, kept upright by a lead."""
+    rng = np.random.default_rng(seed)
+    a, b = np.array([[0.0, 1.0], [16.0, 0.0]]), np.array([[0.0], [30.0]])
+    whole = linalg.expm(np.block([[a, b], [np.zeros((1, 3))]]) * DT)
+    f, g = whole[:2, :2], whole[:2, 2]
+    r = np.repeat(rng.choice([-0.01, 0.01], n // 30 + 1), 30)[:n]
+    noise = size * draw_noise(kind, n, rng)
+    x, before, held = np.zeros(2), 0.0, 0.0
+    u, y = np.zeros(n), np.zeros(n)
+    for k in range(n):
+        y[k] = x[0] + noise[k]
+        error = r[k] - y[k]
+        # A lead: 8 (s + 4) / (s + 60), discretised by hand with backward differences.
+        held = (held + 8.0 * ((1 + 4 * DT) * error - before)) / (1 + 60 * DT)
+        before = error
+        u[k] = held
+        x = f @ x + g * u[k]
+    return cid.Record(r=r, u=u, y=y, dt=DT)
+
+
+def fit(estimator, record):
+    if estimator == "fit_loop":
+        # The plant of the simulator as equations: x" = a x + b u.
+        import control as ct
+
+        plant = ct.nlsys(
+            lambda t, x, u, p: np.array([x[1], p["a"] * x[0] + p["b"] * u[0]]),
+            lambda t, x, u, p: x[0],
+            inputs=["u"], outputs=["y"], states=["y", "v"], params={"a": 14.0, "b": 28.0},
+        )  # fmt: skip
+        at = cid.OperatingPoint((0.0, 0.0), 0.0, 0.0)
+        loop = cid.Loop(plant, None, dt=DT, at=at, free=("a", "b"))
+        return cid.fit_loop(loop, record).estimate
+    if estimator == "fit_continuous":
+        return cid.fit_continuous(record, 2).estimate
+    if estimator == "fit_arx":
+        return cid.fit_arx(record, 2, 2).estimate
+    return cid.fit_iv(record, 2, 2).estimate
+
+
+@pytest.mark.parametrize("kind", ["averaged", "slow"])
+@pytest.mark.parametrize("estimator", ["fit_continuous", "fit_loop"])
+def test_coloured_noise_is_said_in_capitals(estimator, kind):
+    notes = fit(estimator, simulate_unstable(kind, 1)).notes
+    assert any(SAYS in note for note in notes), notes
+
+
+@pytest.mark.parametrize("estimator", ["fit_continuous", "fit_loop", "fit_iv"])
+def test_white_noise_is_not_blamed(estimator):
+    said = [any(SAYS in note for note in fit(estimator, simulate_unstable("white", s)).notes)
+            for s in (1, 2)]  # fmt: skip
+    assert not any(said)
+
+
+def test_least_squares_in_a_noisy_loop_is_told_to_be_biased():
+    estimate = fit("fit_arx", simulate_unstable("white", 1))
+    assert any(SAYS in note and "fit_iv" in note for note in estimate.notes)
+
+
+def test_least_squares_without_noise_has_nothing_to_say():
+    estimate = fit("fit_arx", simulate_unstable("white", 1, size=0.0))
+    assert not estimate.notes
+    assert np.max(np.log(np.abs(estimate.poles)) / DT) == pytest.approx(4.0, rel=1e-6)
+
+
+def test_the_level_is_what_it_says():
+    """Of white innovations with a share of gaps at most one in a hundred is called coloured."""
+    rng = np.random.default_rng(7)
+    called = 0
+    for _ in range(1000):
+        e = rng.standard_normal(800)
+        e[rng.random(800) < 0.05] = np.nan
+        called += bool(note_coloured_innovations([e[:300], e[300:]], 0, ""))
+    # The rate may be below the level, since the correlation must also do harm; five standard
+    # deviations above it would be a fault.
+    assert called <= 1000 * LEVEL + 5 * np.sqrt(1000 * LEVEL)
+
+
+def test_a_certain_but_harmless_colour_is_not_mentioned():
+    rng = np.random.default_rng(3)
+    e = rng.standard_normal(50_000)
+    faint = e[1:] + 0.03 * e[:-1]
+    assert 2 * 0.03 < HARMLESS
+    assert not note_coloured_innovations([faint], 2, "")
+    strong = e[1:] + 0.4 * e[:-1]
+    assert note_coloured_innovations([strong], 2, "")
+
+
+def test_an_absurd_pole_is_refused():
+    """A static plant has no second pole: a search sends it to where nothing of it is left."""
+    rng = np.random.default_rng(5)
+    u = np.repeat(rng.choice([-1.0, 1.0], 400), 5)
+    x = signal.lfilter([0.0, 0.1], [1.0, -0.9], u)
+    record = cid.Record(u=u, y=x + 1e-3 * rng.standard_normal(len(u)), dt=DT)
+    try:
+        model = cid.fit_continuous(record, 3)
+    except cid.CtrlidError as refusal:
+        assert "Lower the number of poles" in str(refusal) or "do not determine" in str(refusal)
+    else:
+        assert np.max(np.abs(model.estimate.poles.real)) * DT < 37
