@@ -108,7 +108,7 @@ def test_a_certain_but_harmless_colour_is_not_mentioned():
     rng = np.random.default_rng(3)
     e = rng.standard_normal(50_000)
     faint = e[1:] + 0.03 * e[:-1]
-    assert 2 * 0.03 < HARMLESS
+    assert HARMLESS > 2 * 0.03
     assert not note_coloured_innovations([faint], 2, "")
     strong = e[1:] + 0.4 * e[:-1]
     assert note_coloured_innovations([strong], 2, "")
@@ -120,9 +120,5 @@ def test_an_absurd_pole_is_refused():
     u = np.repeat(rng.choice([-1.0, 1.0], 400), 5)
     x = signal.lfilter([0.0, 0.1], [1.0, -0.9], u)
     record = cid.Record(u=u, y=x + 1e-3 * rng.standard_normal(len(u)), dt=DT)
-    try:
-        model = cid.fit_continuous(record, 3)
-    except cid.CtrlidError as refusal:
-        assert "Lower the number of poles" in str(refusal) or "do not determine" in str(refusal)
-    else:
-        assert np.max(np.abs(model.estimate.poles.real)) * DT < 37
+    with pytest.raises(cid.CtrlidError, match=r"Lower the number of poles|do not determine"):
+        cid.fit_continuous(record, 3)

@@ -24,6 +24,7 @@ from .findings import COMPLETE, Disturbance, Gap
 from .fresh_data import FreshData, choose_fresh_data
 from .gap_summary import make_fresh_data_test, summarize_gap, take_back_widening
 from .growth import Search, choose_search, compare_names, keep_main_effects, search_effects
+from .log_errors import LogError, find_log_error
 from .open_loop_search import search_by_simulation
 from .recalibration import recalibrate
 from .records import Readout, look_over_records, make_loop, read_limits, read_steps
@@ -171,6 +172,12 @@ def _answer_question(q: Question) -> tuple[Diagnosis, Search]:
     # Steps 3 to 7: effects are screened, refitted, decided upon, added and dropped.
     search = search_effects(base, q.catalogue, q.work, q.tell)
     helps = make_fresh_data_test(q.fresh)
+    if search.found or not search.after.passed:
+        # A wrong sign or unit in the log makes the plant look as if almost anything were missing.
+        reached = _compute_penalized_likelihood(search.final.fit)
+        wrong = find_log_error(readout.loop, readout.records, q.audits, reached)
+        if wrong is not None:
+            return _blame_log(q, search, wrong)
     if search.other and not search.after.passed:
         # Perhaps neither search explains the record; fresh data tell which of them leads further.
         q.tell("second search")
@@ -195,6 +202,19 @@ def _answer_question(q: Question) -> tuple[Diagnosis, Search]:
     if result.verdict not in COMPLETE and _is_worth_simulating(q.fresh, base.records):
         return _answer_by_simulation(q, search, summary.gap, read) or (result, search)
     return result, search
+
+
+def _blame_log(q: Question, search: Search, wrong: LogError) -> tuple[Diagnosis, Search]:
+    """Answer that the log is wrong: nothing is named on a record that contradicts itself."""
+    empty = replace(search, final=search.base, found=(), after=search.before)
+    summary = summarize_gap(q.loop, empty, q.fresh)
+    result = assemble_answer(q.loop, q.records, empty, summary, ())
+    sentence = (
+        f"THE LOG LOOKS WRONG: {wrong.words}. So repaired, the record is explained better than by "
+        f"any effect of the catalogue, by {wrong.gain:.0f} of log-likelihood. No effect is named "
+        "on a record that may be wrong: check the log, mend it, and diagnose again."
+    )
+    return replace(result, verdict="unknown", sentence=sentence), empty
 
 
 def _answer_by_simulation(

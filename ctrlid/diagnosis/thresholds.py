@@ -65,6 +65,9 @@ class Thresholds:
         3, convention="an experiment that repeats itself so often gives its noise without a model",
         unit="periods",
     )  # fmt: skip
+    log_error_samples: int = declare_number(
+        1000, cost="on which repairs of the log are tried at the given values", unit="samples"
+    )
     clipped: float = declare_number(
         0.005, study="samples exactly on a limit are worth a name from here on",
         unit="of the samples",

@@ -1,0 +1,133 @@
+"""Step 2: gross errors of the log: a wrong sign, or a signal in another unit than the model's."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from .._base.criterion import bayesian_penalty
+from .._base.errors import ModelCannotRun
+from ..data.record import Record
+from ..loop.loop import Loop
+from ..validation.record_audit import Audit
+from .recalibration import fit_base_model, recalibrate
+from .thresholds import THRESHOLD
+
+DEGREE = math.pi / 180
+
+
+@dataclass(frozen=True)
+class LogError:
+    """A repair of the log that explains the record better than any model of the log as it is.
+
+    Parameters
+    ----------
+    words : str
+        What is wrong, as part of a sentence.
+    gain : float
+        What the repair gains of penalized log-likelihood over the model that it was compared with.
+    """
+
+    words: str
+    gain: float
+
+
+# What is wrong, in words; the factor by which u is multiplied to mend it; and that for y and r.
+REPAIRS = (
+    ("u is logged with the wrong sign", -1.0, 1.0),
+    ("y and r are logged with the wrong sign", 1.0, -1.0),
+    ("y and r are in degrees where the model has radians", 1.0, DEGREE),
+    ("y and r are in radians where the model has degrees", 1.0, 1 / DEGREE),
+    ("y and r are a thousand times too large", 1.0, 1e-3),
+    ("y and r are a thousand times too small", 1.0, 1e3),
+    ("u is a thousand times too large", 1e-3, 1.0),
+    ("u is a thousand times too small", 1e3, 1.0),
+    ("u is in degrees where the model has radians", DEGREE, 1.0),
+    ("u is in radians where the model has degrees", 1 / DEGREE, 1.0),
+    ("u is in per cent where the model has shares of one", 1e-2, 1.0),
+    ("u is in shares of one where the model has per cent", 1e2, 1.0),
+)
+
+
+def find_log_error(
+    loop: Loop, records: Sequence[Record], audits: Sequence[Audit], reached: float
+) -> LogError | None:
+    r"""Return the gross error of the log that explains records better than what was found.
+
+    A repair multiplies u by a factor, or y and r. Beside the density of the outputs as they were
+    logged, that of repaired outputs counts with the factor a of their unit,
+
+    .. math:: \ln p(y \mid u) = \ln p(a y \mid u) + N \ln |a|,
+
+    so that a wrong unit competes with missing effects by the same criterion. The plant alone, with
+    its free parameters, is fitted to the repaired records; it has to do better than the search.
+
+    Parameters
+    ----------
+    loop : Loop
+        The model as given.
+    records : sequence of Record
+        The data as logged.
+    audits : sequence of Audit
+        What the records show by themselves.
+    reached : float
+        Penalized log-likelihood of the model that the search ended with.
+
+    Returns
+    -------
+    LogError or None
+        The best repair, with those that do as well in the same sentence; None if none helps.
+    """
+    # The heads are fitted at the given values, with the noise alone free: a gross error shows.
+    heads = [r[: THRESHOLD.log_error_samples] for r in records]
+    as_logged = _measure(loop, heads, None)
+    found: list[tuple[float, str]] = []
+    for words, input_factor, output_factor in REPAIRS:
+        if _measure(loop, _repair(heads, input_factor, output_factor), None, output_factor) < (
+            as_logged + THRESHOLD.gate
+        ):
+            continue
+        repaired = _repair(records, input_factor, output_factor)
+        found.append((_measure(loop, repaired, audits, output_factor) - reached, words))
+    gains = [gain for gain, _ in found]
+    best = max(gains, default=-math.inf)
+    if not best > THRESHOLD.gate:
+        return None
+    # Where u enters by its square, or the plant is the same upside down, repairs do the same.
+    same = [words for gain, words in found if gain > best - THRESHOLD.gate]
+    return LogError(", or ".join(same), best)
+
+
+def _repair(records: Sequence[Record], input_factor: float, output_factor: float) -> list[Record]:
+    """Return records with u, or y and r, multiplied by a factor."""
+    return [
+        replace(
+            record,
+            u=input_factor * np.asarray(record.u),
+            y=output_factor * np.asarray(record.y),
+            r=None if record.r is None else output_factor * np.asarray(record.r),
+        )
+        for record in records
+    ]
+
+
+def _measure(
+    loop: Loop, records: Sequence[Record], audits: Sequence[Audit] | None, factor: float = 1.0
+) -> float:
+    """Return the penalized log-likelihood of y as logged; minus infinity where nothing runs.
+
+    Without audits the plant keeps its given values.
+    """
+    try:
+        model = (
+            fit_base_model(loop, records, ()) if audits is None
+            else recalibrate(loop, records, audits)
+        )  # fmt: skip
+    except ModelCannotRun:
+        return -math.inf
+    fit = model.fit
+    if not math.isfinite(fit.value):
+        return -math.inf
+    count = sum(int(np.count_nonzero(np.isfinite(z))) for z in fit.standardized)
+    return fit.value - bayesian_penalty(len(fit.theta), fit.size) + count * math.log(abs(factor))

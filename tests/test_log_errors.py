@@ -1,0 +1,83 @@
+"""A record with a wrong sign or a wrong unit is told so, and no effect is named on it.
+
+The rig is simulated here, in numpy: a stick that stands on its pivot, J th" = m g l sin th - c th'
++ u, under a digital law on filtered differences.
+"""
+
+import math
+
+import control as ct
+import numpy as np
+import pytest
+
+import ctrlid as cid
+
+MASS, LENGTH, GRAVITY, DT = 0.35, 0.40, 9.81, 0.005
+INERTIA = MASS * LENGTH**2
+
+
+def simulate(n=1500, seed=0, damping=0.02, friction=0.0, inertia=1.08 * INERTIA):
+    rng = np.random.default_rng(seed)
+    r = np.repeat(rng.choice([-0.08, 0.08], n // 40 + 1), 40)[:n]
+    y, u, angle, rate, before = np.zeros(n), np.zeros(n), 0.0, 0.0, None
+    steps = 6
+    h = DT / steps
+
+    def move(state, torque):
+        angle, rate = state
+        push = MASS * GRAVITY * LENGTH * math.sin(angle) + torque - damping * rate
+        return np.array([rate, (push - friction * math.tanh(rate / 1e-3)) / inertia])
+
+    for k in range(n):
+        y[k] = angle + 3e-4 * rng.standard_normal()
+        before = y[k] if before is None else before
+        u[k] = 9.0 * (r[k] - y[k]) - 0.9 * (y[k] - before) / DT
+        before = y[k]
+        for _ in range(steps):
+            state = np.array([angle, rate])
+            k1 = move(state, u[k])
+            k2 = move(state + h / 2 * k1, u[k])
+            k3 = move(state + h / 2 * k2, u[k])
+            k4 = move(state + h * k3, u[k])
+            angle, rate = state + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    return r, u, y
+
+
+@pytest.fixture(scope="module")
+def loop():
+    plant = ct.nlsys(
+        lambda t, x, u, p: [x[1], (MASS * GRAVITY * LENGTH * np.sin(x[0]) + u[0]
+                                   - 0.02 * x[1]) / p["J"]],
+        lambda t, x, u, p: [x[0]],
+        states=["theta", "omega"], inputs=["tau"], outputs=["theta"], name="stick",
+        params={"J": INERTIA},
+    )  # fmt: skip
+    return cid.Loop(plant, None, dt=DT, free=("J",))
+
+
+FAULTS = {
+    "sign of u": (lambda r, u, y: (r, -u, y), "wrong sign"),
+    "degrees": (lambda r, u, y: (np.rad2deg(r), u, np.rad2deg(y)), "degrees where the model has"),
+    "milli": (lambda r, u, y: (r, 1e3 * u, y), "u is a thousand times too large"),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_the_log_is_the_headline_and_nothing_is_named(loop, fault):
+    spoil, words = FAULTS[fault]
+    r, u, y = spoil(*simulate(seed=1))
+    small = [cid.effects.CoulombFriction, cid.effects.ConstantForce, cid.effects.ViscousFriction]
+    found = cid.diagnose(loop, cid.Record(r=r, u=u, y=y, dt=DT), catalogue=small, progress=False)
+    assert found.verdict == "unknown"
+    assert not found.findings
+    assert found.sentence.startswith("THE LOG LOOKS WRONG")
+    assert words in found.sentence
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.06])
+def test_a_right_log_is_not_blamed(loop, friction):
+    r, u, y = simulate(seed=2, friction=friction)
+    small = [cid.effects.CoulombFriction, cid.effects.ConstantForce, cid.effects.ViscousFriction]
+    found = cid.diagnose(loop, cid.Record(r=r, u=u, y=y, dt=DT), catalogue=small, progress=False)
+    assert "LOG" not in found.sentence
+    assert [f.name for f in found.findings] == (["CoulombFriction"] if friction else [])
