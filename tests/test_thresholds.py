@@ -22,7 +22,14 @@ FORMULAS = {
     ("gap", "draw_noise"),  # three streams of random numbers
     ("verdict", "write_conclusion"),  # per cent
 }
-CONSTANTS = {("procedure", "PROGRESS"), ("records", "ROUNDING"), ("replicas", "SEEDS")}
+CONSTANTS = {
+    ("procedure", "PROGRESS"),
+    ("records", "ROUNDING"),
+    ("replicas", "SEEDS"),
+    # Ratios of units, by which a log can be off.
+    ("log_errors", "DEGREE"),
+    ("log_errors", "REPAIRS"),
+}
 
 
 def numbers_in(source, stem):
