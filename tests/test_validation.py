@@ -9,6 +9,7 @@ from dataclasses import replace
 import control as ct
 import numpy as np
 import pytest
+from scipy import signal
 
 import ctrlid as cid
 from ctrlid import CtrlidError
@@ -452,3 +453,53 @@ def test_inteco_log_is_predicted_over_its_valid_stretches(data_dir):
     found = cid.compare(record, cid.Loop(plant, None, dt=1e-3, at=at))
     assert found["one-step"].fit > 98
     assert "SOMETHING IS MISSING" in found.verdict  # the coil
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.4, 1.0, 2.3])
+def test_an_input_that_runs_straight_is_simulated_so(delay):
+    # An oscillator with a period of few samples, integrated by scipy, its input straight or late.
+    rng = np.random.default_rng(5)
+    a, b, d, dt, n = 900.0, 1100.0, 7.0, 0.02, 600
+    fine = 10
+    u = signal.lfilter([0.3], [1, -0.7], rng.standard_normal(n))
+    u[:5] = 0.0
+    time = np.arange((n - 1) * fine + 1) * dt / fine
+    late = np.interp(time - delay * dt, np.arange(n) * dt, u, left=0.0)
+    matrices = np.array([[0, 1], [-a, -d]]), np.array([[0], [b]]), np.array([[1, 0]]), 0
+    y = signal.lsim(matrices, late, time, interp=True)[1][::fine]
+    effects = (cid.effects.InputDelay(delay * dt),) if delay else ()
+    loop = cid.Loop(rough_oscillator(a, b, d), dt=dt, at=cid.OperatingPoint((0.0, 0.0), 0.0, 0.0),
+                    effects=effects)  # fmt: skip
+    record = cid.Record(u=u, y=y, dt=dt, hold="foh")
+    curves = {c.label: c for c in cid.compare(record, loop).curves}
+    assert curves["open-loop simulation"].fit > 99.9
+    held = cid.compare(replace(record, hold="zoh"), loop)
+    assert {c.label: c for c in held.curves}["open-loop simulation"].fit < 95
+
+
+def rough_oscillator(a, b, d):
+    return ct.nlsys(lambda t, x, u, p: [x[1], b * u[0] - a * x[0] - d * x[1]],
+                    lambda t, x, u, p: x[0], inputs=["u"], outputs=["y"], states=["y", "v"],
+                    name="oscillator")  # fmt: skip
+
+
+@pytest.mark.parametrize("effect", [cid.effects.ActuatorLag(0.0), cid.effects.SensorLag(0.0)])
+def test_a_lag_of_zero_is_no_lag(effect):
+    rng = np.random.default_rng(3)
+    u, dt = np.repeat(rng.choice([-1.0, 1.0], 50), 10), 0.02
+    phi, gamma = signal.cont2discrete(
+        (np.array([[0, 1], [-9.0, -1.0]]), np.array([[0], [2.0]]), np.eye(2), np.zeros((2, 1))), dt
+    )[:2]
+    x, y = np.zeros(2), []
+    for value in u:
+        y.append(x[0])
+        x = phi @ x + gamma[:, 0] * value
+    record = cid.Record(u=u, y=np.array(y) + 1e-3 * rng.standard_normal(len(u)), dt=dt)
+    at = cid.OperatingPoint((0.0, 0.0), 0.0, 0.0)
+    plain = cid.Loop(rough_oscillator(9.0, 2.0, 1.0), dt=dt, at=at)
+    given = cid.Loop(rough_oscillator(9.0, 2.0, 1.0), dt=dt, at=at, effects=(effect,))
+    without, with_ = cid.compare(record, plain), cid.compare(record, given)
+    for one, other in zip(without.curves, with_.curves, strict=True):
+        assert other.rms == pytest.approx(one.rms, rel=1e-6)
+    ahead = cid.predict(given, record)
+    assert ahead.states.shape == (len(u), 2)

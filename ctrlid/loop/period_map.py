@@ -21,8 +21,9 @@ class PeriodMap:
     """The loop over one sampling period as a CasADi function.
 
     ``step(z, w) -> (next z, y, u, local error)``; z stacks plant and controller states, then what
-    the input remembers; w is ``(t, r, d, sensor noise, force noise)``, all held over the
-    period. ``rate(z, w)`` is the derivative of z for a loop with an analog controller, else None.
+    the input remembers; w is ``(t, r, d, sensor noise, force noise, next d)``, all held over the
+    period but for an input without controller that runs straight from d to the next d.
+    ``rate(z, w)`` is the derivative of z for a loop with an analog controller, else None.
     """
 
     plant_states: tuple[str, ...]
@@ -31,7 +32,7 @@ class PeriodMap:
     rate: Any = None
 
 
-def make_period_map(loop: Loop, substeps: int) -> PeriodMap:
+def make_period_map(loop: Loop, substeps: int, hold: str = "zoh") -> PeriodMap:
     """Build the map of a loop over one sampling period.
 
     Parameters
@@ -40,6 +41,9 @@ def make_period_map(loop: Loop, substeps: int) -> PeriodMap:
         The loop.
     substeps : int
         Integration steps in a period.
+    hold : {"zoh", "foh"}, optional
+        How the input of a loop without controller runs between samples. A digital controller holds
+        its input, and an analog one moves it by its own law.
 
     Returns
     -------
@@ -57,22 +61,24 @@ def make_period_map(loop: Loop, substeps: int) -> PeriodMap:
     # What the input remembers: the backlash, then the inputs of the last samples.
     kept = 0 if e.delay is None else late + 1
     size = n + nc + (e.play is not None) + kept
-    z, w = casadi.SX.sym("z", size), casadi.SX.sym("w", 5)
-    t0, r, d, sensor, force = casadi.vertsplit(w)
+    z, w = casadi.SX.sym("z", size), casadi.SX.sym("w", 6)
+    t0, r, d, sensor, force, next_d = casadi.vertsplit(w)
     held_rate = casadi.SX.zeros(n, 1)
     for j in e.velocities or (range(n) if e.dt == 0 else ()):
         held_rate[j] = force
     at, (lower, upper) = loop.point, loop.input_limits
     p = e.values
 
-    def compute_input(t: Any, z: Any, y: Any) -> tuple[Any, Any]:
-        wish, moved = law.apply(t, z[n:], r, y) if law else (at.input, casadi.SX(0, 1))
-        u = wish + d
+    def limit_input(u: Any) -> Any:
         if math.isfinite(lower):
             u = casadi.fmax(u, lower)
         if math.isfinite(upper):
             u = casadi.fmin(u, upper)
-        return u, moved
+        return u
+
+    def compute_input(t: Any, z: Any, y: Any) -> tuple[Any, Any]:
+        wish, moved = law.apply(t, z[n:], r, y) if law else (at.input, casadi.SX(0, 1))
+        return limit_input(wish + d), moved
 
     def measure_output(t: Any, z: Any, u: Any) -> Any:
         y = e.function(t, z[:n], u, p)[1] + sensor
@@ -102,8 +108,12 @@ def make_period_map(loop: Loop, substeps: int) -> PeriodMap:
     else:
         applied, memory = apply_backlash(e, z[n + nc] if e.play is not None else None, u, p)
         past = [z[k] for k in range(size - kept, size)]
-        path = (past[kept - 1] if kept else applied, past[late - 1] if late else applied, applied)
-        pieces = _insert_values(e, cut_input(e, loop.dt, path, "zoh"), p)
+        hold = "zoh" if law else hold
+        ahead = apply_backlash(e, memory, limit_input(at.input + next_d), p)[0]
+        # The inputs from the oldest that is remembered to the one of the next sample.
+        known = [*reversed(past), applied, ahead if hold == "foh" else applied]
+        path = known[:3] if kept else [applied, *known]
+        pieces = _insert_values(e, cut_input(e, loop.dt, path, hold), p)
         scheme = Scheme(8, substeps, sharp=(8, substeps))
         x, error = advance(e, t0, z[:n], pieces, p, None, held_rate, scheme=scheme)
         after = casadi.vertcat(x, moved, memory)
@@ -144,10 +154,10 @@ def _insert_values(e: Equations, pieces: Sequence[Piece], p: Any) -> list[Piece]
 
 def linearize_at_rest(s: PeriodMap, reference: float, function: Any) -> tuple[Array, Array]:
     """Return the derivatives of a function (step, rate) by state and signals at rest."""
-    z, w = casadi.SX.sym("z", len(s.rest)), casadi.SX.sym("w", 5)
+    z, w = casadi.SX.sym("z", len(s.rest)), casadi.SX.sym("w", 6)
     first = function.call([z, w])[0]
     both = casadi.Function("j", [z, w], [casadi.jacobian(first, z), casadi.jacobian(first, w)])
-    a, b = both(s.rest, [0.0, reference, 0.0, 0.0, 0.0])
+    a, b = both(s.rest, [0.0, reference, 0.0, 0.0, 0.0, 0.0])
     return np.asarray(a, float), np.asarray(b, float)
 
 

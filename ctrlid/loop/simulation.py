@@ -166,13 +166,16 @@ class Simulator:
         Local error of a step, relative to the excursion of each state.
     most : int, optional
         Integration steps per period at most.
+    hold : {"zoh", "foh"}, optional
+        How the input of a loop without controller runs between samples.
     """
 
     def __init__(
-        self, loop: Loop, tolerance: float = TOLERANCE, most: int = MOST_SUBSTEPS
+        self, loop: Loop, tolerance: float = TOLERANCE, most: int = MOST_SUBSTEPS,
+        hold: str = "zoh",
     ) -> None:  # fmt: skip
-        self.loop, self.tolerance, self.most = loop, tolerance, most
-        first = make_period_map(loop, 1)
+        self.loop, self.tolerance, self.most, self.hold = loop, tolerance, most, hold
+        first = make_period_map(loop, 1, hold)
         self.plant_states = first.plant_states
         self.rest: Array = np.array(first.rest, dtype=float)
         self._steps: dict[int, Any] = {1: first.step}
@@ -190,7 +193,7 @@ class Simulator:
             np.nan_to_num(np.abs(m))
             for m in linearize_at_rest(first, loop.point.output, first.step)
         )
-        self._floor = 1e-6 * (a @ np.abs(self.rest) + b[:, 2] * abs(loop.point.input))
+        self._floor = 1e-6 * (a @ np.abs(self.rest) + (b[:, 2] + b[:, 5]) * abs(loop.point.input))
 
     def start(self, initial: Sequence[float] | None) -> Array:
         """Return the state to start from: at rest, or with the given values."""
@@ -209,7 +212,7 @@ class Simulator:
         key = (substeps, size)
         if key not in self._runners:
             if substeps not in self._steps:
-                self._steps[substeps] = make_period_map(self.loop, substeps).step
+                self._steps[substeps] = make_period_map(self.loop, substeps, self.hold).step
             self._runners[key] = self._steps[substeps].mapaccum("run", size)
         return self._runners[key]
 
@@ -224,7 +227,7 @@ class Simulator:
         loop, n = self.loop, d.size
         quiet = np.zeros(n)
         w = np.vstack([start_time + np.arange(n) * loop.dt, quiet if r is None else r, d,
-                       *(noise or (quiet, quiet))])  # fmt: skip
+                       *(noise or (quiet, quiet)), np.append(d[1:], d[-1])])  # fmt: skip
         y, u = np.empty(n), np.empty(n)
         start, reach = z, self._floor
         substeps, size = 1, min(CHUNK, n)

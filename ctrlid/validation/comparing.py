@@ -162,7 +162,7 @@ def _simulate(record: Record, loop: Loop, prediction: Prediction) -> Curve:
             "Loop(plant, controller, ...)"
         )
     y, injected, noisy = np.full(len(record), np.nan), np.zeros(len(record)), np.zeros(len(record))
-    simulator = Simulator(loop)
+    simulator = Simulator(loop, hold=record.hold)
     for part in find_long_stretches(record):
         stretch = prepare_stretch(
             simulator, record, part, guess=prediction.states[part.start], seek_controller=True,

@@ -126,6 +126,7 @@ def predict(loop: Loop, record: Record, force_noise: float | None = None) -> Pre
     if force_noise is not None and not (np.isfinite(force_noise) and force_noise >= 0):
         raise CtrlidError("force_noise is the ratio of force noise to sensor noise [1/s^2], >= 0; "
                           f"given {force_noise!r}")  # fmt: skip
+    loop = _drop_neutral_effects(loop)
     problem = make_problem(loop, (), [record])
     plant = problem.plant
     if force_noise is None:
@@ -135,13 +136,19 @@ def predict(loop: Loop, record: Record, force_noise: float | None = None) -> Pre
         fit = begin_fit(problem, noise=noise)
     out, sensor = fit.filtered[0], float(np.sqrt(fit.sensor[0]))
     states = out.trajectory.filtered
-    # An effect at its neutral values has a state in the filter, but none in the loop.
-    own = [plant.e.states.index(name) for name in loop.equations().states]
     return Prediction(
         record.y - out.innovations, out.innovations, fit.counts[0],
-        sensor * np.sqrt(out.variance), states[:, own], states[:, plant.n :], sensor,
+        sensor * np.sqrt(out.variance), states[:, : plant.n], states[:, plant.n :], sensor,
         sensor * float(np.sqrt(fit.noise.force[0])), find_noise_units(loop, record),
     )  # fmt: skip
+
+
+def _drop_neutral_effects(loop: Loop) -> Loop:
+    """Return a loop without effects that do nothing: a lag of zero, say, is no lag.
+
+    The filter keeps their states for a fit that asks which way they go; a prediction needs none.
+    """
+    return replace(loop, effects=tuple(e for e in loop.effects if not e.neutral))
 
 
 def predict_ahead(
@@ -173,7 +180,7 @@ def predict_ahead(
     starts = starts[known & prediction.settled[starts]]
     if not len(starts):
         return starts, np.empty(0)
-    problem = make_problem(loop, (), [record])
+    problem = make_problem(_drop_neutral_effects(loop), (), [record])
     plant, data = problem.plant, problem.data[0]
     x = np.hstack([prediction.states, prediction.circuit])[starts]
     for j in range(horizon):
@@ -211,7 +218,7 @@ def predict_spread(
         Standard deviations by all noise, and by the sensor's alone [output unit]; NaN where no
         stretch is long enough.
     """
-    plain = replace(loop, controller=None)
+    plain = replace(_drop_neutral_effects(loop), controller=None)
     r, force = prediction.sensor_noise**2, prediction.force_noise**2
     ratio = max(force / r, 1e-300) if r else 1.0
     problem = make_problem(plain, (), [record])
