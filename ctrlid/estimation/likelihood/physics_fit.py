@@ -2,14 +2,16 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from ..._base.arrays import Array
-from ..._base.errors import CtrlidError
+from ..._base.errors import CtrlidError, ModelCannotRun
 from ..._base.statistics import pseudo_inverse
 from ..._base.text import write_list
+from ...data.outliers import describe_outliers, mask_outliers
 from ...data.record import Record
 from ...data.several_records import as_records, order_model_and_data
 from ...loop.loop import Loop
@@ -38,6 +40,7 @@ def fit_loop(
     make the likelihood; noise of the sensor and of the force is estimated with the parameters. The
     filter uses the measured input only: feedback does not bias the estimate, and neither reference
     nor controller is needed. Sensitivities are exact derivatives of the traced equations.
+    Gross outliers of the sensor are left out, and a note says how many and where.
 
     Parameters
     ----------
@@ -60,7 +63,8 @@ def fit_loop(
     Raises
     ------
     CtrlidError
-        If nothing is free, the records do not fit the loop, or the filter loses them.
+        If nothing is free, the records do not fit the loop, or the filter loses them so that the
+        likelihood is not finite.
 
     References
     ----------
@@ -82,12 +86,26 @@ def fit_loop(
     True
     """
     loop, record = order_model_and_data(loop, record)
-    records = as_records(record)
+    given = as_records(record)
     names = _choose_free_names(loop, free)
+    # A single reading far outside makes any Gaussian likelihood follow it and nothing else.
+    masked = [mask_outliers(one) for one in given]
+    records = [one for one, _ in masked]
     fit = refit_noise_size(maximize(begin_fit(make_problem(loop, names, records))))
     if coloured or coloured is None:
         fit = choose_noise(fit, always=bool(coloured))
-    return summarize_fit(loop, fit)
+    if not math.isfinite(fit.value):
+        raise ModelCannotRun(
+            f"the likelihood of {fit.plant.e.name} on this record is not finite: the model has "
+            "lost the record, and no parameter can be told. Check units, signs and the operating "
+            "point, and exclude with valid= what the sensor cannot have seen"
+        )
+    fitted = summarize_fit(loop, fit)
+    notes = [describe_outliers(one, found)
+             for one, (_, found) in zip(given, masked, strict=True) if found.any()]  # fmt: skip
+    return replace(
+        fitted, estimate=replace(fitted.estimate, notes=(*notes, *fitted.estimate.notes))
+    )
 
 
 def _choose_free_names(loop: Loop, free: Sequence[str] | None) -> tuple[str, ...]:
