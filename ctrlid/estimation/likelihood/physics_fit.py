@@ -11,6 +11,7 @@ from ..._base.arrays import Array
 from ..._base.errors import CtrlidError, ModelCannotRun
 from ..._base.statistics import pseudo_inverse
 from ..._base.text import write_list
+from ...data.outliers import describe_outliers, mask_outliers
 from ...data.record import Record
 from ...data.several_records import as_records, order_model_and_data
 from ...loop.loop import Loop
@@ -40,6 +41,7 @@ def fit_loop(
     make the likelihood; noise of the sensor and of the force is estimated with the parameters. The
     filter uses the measured input only: feedback does not bias the estimate, and neither reference
     nor controller is needed. Sensitivities are exact derivatives of the traced equations.
+    Gross outliers of the sensor are left out, and a note says how many and where.
 
     Parameters
     ----------
@@ -62,7 +64,8 @@ def fit_loop(
     Raises
     ------
     CtrlidError
-        If nothing is free, the records do not fit the loop, or the filter loses them.
+        If nothing is free, the records do not fit the loop, or the filter loses them so that the
+        likelihood is not finite.
 
     References
     ----------
@@ -84,22 +87,26 @@ def fit_loop(
     True
     """
     loop, record = order_model_and_data(loop, record)
-    records = as_records(record)
+    given = as_records(record)
     names = _choose_free_names(loop, free)
+    # A single reading far outside makes any Gaussian likelihood follow it and nothing else.
+    masked = [mask_outliers(one) for one in given]
+    records = [one for one, _ in masked]
     fit = refit_noise_size(maximize(begin_fit(make_problem(loop, names, records))))
     if coloured or coloured is None:
         fit = choose_noise(fit, always=bool(coloured))
     if not math.isfinite(fit.value):
         raise ModelCannotRun(
-            f"The filter lost the record: the log-likelihood of the best fit is {fit.value}. Mark "
-            "outliers and stretches that are no measurement as not valid (valid=), start from "
-            "values nearer to the truth, or free fewer parameters"
+            f"the likelihood of {fit.plant.e.name} on this record is not finite: the model has "
+            "lost the record, and no parameter can be told. Check units, signs and the operating "
+            "point, and exclude with valid= what the sensor cannot have seen"
         )
     fitted = summarize_fit(loop, fit)
+    left_out = [describe_outliers(one, found)
+                for one, (_, found) in zip(given, masked, strict=True) if found.any()]  # fmt: skip
     colour = note_coloured_innovations(fit.standardized, len(fit.theta), _TOO_NARROW)
-    return replace(
-        fitted, estimate=replace(fitted.estimate, notes=(*fitted.estimate.notes, *colour))
-    )
+    notes = (*left_out, *fitted.estimate.notes, *colour)
+    return replace(fitted, estimate=replace(fitted.estimate, notes=notes))
 
 
 _TOO_NARROW = (

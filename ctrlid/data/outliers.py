@@ -1,0 +1,81 @@
+"""Gross outliers of a record: single readings that no motion can have made."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from scipy import ndimage
+
+from .._base.arrays import Array
+from .record import Record
+
+# The median of so many neighbours does not follow an outlier, nor two side by side.
+NEIGHBOURS = 5
+# Gaussian noise goes so many standard deviations away once in 10^23 samples.
+FAR = 10.0
+# The median of the absolute value of a Gaussian variable is one standard deviation over this.
+MEDIAN_TO_DEVIATION = 1.4826
+
+
+def find_outliers(record: Record) -> Any:
+    """Return which readings of y are gross outliers.
+
+    Those are away from the median of their neighbours by more than ten standard deviations, and by
+    more than the whole range in which the medians move: within one sample and back, nothing that
+    has inertia goes so far. After a jump of the input that stands out alike nothing is an
+    outlier: the plant may have answered.
+
+    Parameters
+    ----------
+    record : Record
+        The data.
+
+    Returns
+    -------
+    ndarray of bool, shape (n,)
+        True for valid samples that are outliers.
+    """
+    valid = np.flatnonzero(record.valid)
+    found = np.zeros(len(record), dtype=bool)
+    if len(valid) < NEIGHBOURS:
+        return found
+    away = _stands_out(record.y[valid])
+    # A record without noise may have been driven by single pulses, whose answers are real.
+    driven = _stands_out(record.u[valid])
+    found[valid] = away & ~np.concatenate([[False], driven[:-1]])
+    return found
+
+
+def _stands_out(signal: Array) -> Any:
+    middle = ndimage.median_filter(signal, NEIGHBOURS, mode="mirror")
+    distance = np.abs(signal - middle)
+    noise = MEDIAN_TO_DEVIATION * float(np.median(distance))
+    return distance > max(FAR * noise, float(np.ptp(middle)))
+
+
+def mask_outliers(record: Record) -> tuple[Record, Any]:
+    """Return a record without its gross outliers, which are no longer valid, and which they are.
+
+    A record without any is returned as it is.
+    """
+    found = find_outliers(record)
+    if not found.any():
+        return record, found
+    return replace(record, valid=record.valid & ~found), found
+
+
+def describe_outliers(record: Record, found: Any) -> str:
+    """Return a sentence on the outliers of a record: how many, where, and how far out."""
+    places = np.flatnonzero(found)
+    times = ", ".join(f"{record.t[k]:.4g}" for k in places[:3])
+    more = ", ..." if len(places) > 3 else ""
+    middle = float(np.median(record.y[record.valid & ~found]))
+    largest = float(np.max(np.abs(record.y[found] - middle)))
+    unit = record.units.get("y", "")
+    one = len(places) == 1
+    return (
+        f"{len(places)} OF {np.count_nonzero(record.valid)} READINGS OF y "
+        f"{'IS A GROSS OUTLIER' if one else 'ARE GROSS OUTLIERS'}, AND {'WAS' if one else 'WERE'} "
+        f"LEFT OUT: at t = {times}{more} s, up to {largest:.3g}{f' {unit}' if unit else ''} from "
+        "the median"
+    )
