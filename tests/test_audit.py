@@ -9,6 +9,7 @@ import pytest
 import ctrlid as cid
 import problems
 from ctrlid import CtrlidError
+from ctrlid.loop.controller_replay import run_controller
 from ctrlid.validation import signal_defects as defects
 
 
@@ -254,7 +255,7 @@ def test_u_ahead_of_the_limiter_and_behind_it(servo):
         "Give the limits to the loop with input_limits="
         in cid.audit(record, loop)["saturation"][0].text
     )
-    wish = replace(record, u=cid.replay_controller(loop, record))
+    wish = replace(record, u=run_controller(loop, record.y, record.r))
     said = cid.audit(wish, limited)
     assert "before the limiter" in said["limit"][0].text
     assert "computes from r and y" in said["controller"][0].text

@@ -308,7 +308,7 @@ def _list_changes(loop: Loop, record: Record) -> Iterator[tuple[str, str, Loop]]
     u = record.u[record.valid]
     ends = [float(end) if np.count_nonzero(u == end) > 2 else side * np.inf
             for end, side in ((np.min(u), -1), (np.max(u), 1))]  # fmt: skip
-    if np.isfinite(ends).any():
+    if np.isfinite(ends).any() and ends[0] < ends[1]:
         low, high = ends
         words = f"it is limited to {low:.4g} to {high:.4g}"
         yield "limit", words, replace(loop, input_limits=(low, high))
