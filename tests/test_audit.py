@@ -9,6 +9,7 @@ import pytest
 import ctrlid as cid
 import problems
 from ctrlid import CtrlidError
+from ctrlid.loop.controller_replay import run_controller
 from ctrlid.validation import signal_defects as defects
 
 
@@ -191,7 +192,7 @@ def test_a_channel_logged_late_or_early(healthy, lag, channel):
     for loop, record in [pair for pair in healthy if not pair[0].analog][:5]:
         moved = np.roll(getattr(record, channel), lag)
         late = replace(record, **{channel: moved})[5:-5]
-        said = cid.audit(late, loop)["controller"]
+        said = cid.audit(late, loop)["delay"]
         assert said[0].harmful
         assert f"logged {word}" in said[0].text
 
@@ -228,7 +229,7 @@ def test_around_a_constant_reference_late_u_is_early_y(servo):
     noise = cid.simulate(loop, 0 * r, sensor_noise=1e-3, seed=1)
     assert "u is computed from y" in cid.audit(noise)["too little excitation"][0].text
     late = replace(noise[1:], u=noise.u[:-1])
-    text = cid.audit(late, loop)["controller"][0].text
+    text = cid.audit(late, loop)["delay"][0].text
     assert text.startswith("u is logged one sample late or y is logged one sample early")
 
 
@@ -236,7 +237,7 @@ def test_another_controller_is_said(servo):
     loop, r = servo
     record = cid.simulate(loop, r, sensor_noise=1e-4, seed=1)
     other = replace(loop, controller=cid.PID(kp=14.0, kd=0.8))
-    said = cid.audit(record, other)["controller"][0]
+    said = cid.audit(record, other)["unknown"][0]
     assert said.harmful
     assert "other gains or another structure" in said.text
 
@@ -254,10 +255,10 @@ def test_u_ahead_of_the_limiter_and_behind_it(servo):
         "Give the limits to the loop with input_limits="
         in cid.audit(record, loop)["saturation"][0].text
     )
-    wish = replace(record, u=cid.replay_controller(loop, record))
-    said = cid.audit(wish, limited)["controller"]
-    assert "before the limiter" in said[0].text
-    assert "computes from r and y" in said[1].text
+    wish = replace(record, u=run_controller(loop, record.y, record.r))
+    said = cid.audit(wish, limited)
+    assert "before the limiter" in said["limit"][0].text
+    assert "computes from r and y" in said["controller"][0].text
 
 
 def test_wrong_period_of_the_loop_is_a_finding(servo):

@@ -25,6 +25,7 @@ from ..loop.simulation import Simulator
 from ..physics.conversions import to_polynomials, to_state_matrices
 from ..physics.trace import timebase
 from .comparison import EXACT, Comparison, Curve
+from .controller_check import find_rejection
 from .noise_model import fit_noise_polynomial, whiten_errors
 from .record_simulation import Stretch, find_long_stretches, prepare_stretch
 from .reproduction import (
@@ -118,9 +119,13 @@ def _compare_loop(record: Record, loop: Loop, horizon: int | None) -> Comparison
         curves.append(_judge_curve(Reproduction("prediction", steps), record, ahead,
                              _list_known_signals(record, steps),
                              predict_spread(loop, record, prediction, steps)[0]))  # fmt: skip
+    rejected = find_rejection(loop, record)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", CtrlidWarning)
         try:
+            if rejected:
+                raise ModelCannotRun(f"the law of the controller is rejected, because {rejected} "
+                                     "The prediction uses the logged u instead")  # fmt: skip
             curves.append(_simulate(record, loop, prediction))
         except (ModelCannotRun, EffectDoesNotApply) as reason:
             notes.append(f"no simulation: {reason}")

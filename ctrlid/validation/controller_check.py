@@ -1,15 +1,21 @@
 """Whether a logged u is what the controller computes from the logged r and y; if not, why."""
 
+from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any
+from typing import Any, get_args
 
+import control as ct
 import numpy as np
+from scipy import stats
 
 from .._base.errors import CtrlidError
 from ..data.record import Record
-from ..loop.controller_replay import replay_controller
+from ..data.validity import find_whole_past
+from ..loop.controller_replay import differentiate_replay, replay_controller, replay_from_best_state
+from ..loop.controllers import PID, AntiWindup, Derivative, Integral
 from ..loop.loop import Loop
 from .residual_tests import compute_explained_share
+from .signal_defects import find_grid_step
 
 # At most so many samples are replayed, which tell enough and take seconds.
 MOST = 20_000
@@ -23,8 +29,20 @@ STEPS = (1, -1, 2, -2, 3, -3)
 EXACT = 1e-6
 # A shift is believed if it leaves less than this share of what was unexplained.
 CLEARLY = 0.1
-# If a larger share of what is left follows r and y, the controller is another one.
+# Where the past of an added signal tells it exactly, it follows r and y above this share.
 FOLLOWS = 0.2
+# A remainder that the present and past of y tells is an independent one with this probability.
+LEVEL = 1e-3
+# An added signal is told by so many samples of its own past, of r and of y.
+MEMORY = 10
+# Below this share of its variance the remainder of a regression is rounding of the computer.
+ROUNDING = 1e-12
+# A remainder of no known kind below this share of u's variance steers no simulation.
+IMMATERIAL = 0.01
+# Kinds of finding after which the stated law is not that of the record.
+REJECTED = ("gain", "sign", "delay", "limit", "filter", "unknown")
+# What may be wrong with a stated law; a constant that is added to it leaves it standing.
+FAULTS = (*REJECTED, "bias")
 
 # A fact is its kind, its words, the unexplained share of u's variance, and whether it is harmful.
 Fact = tuple[str, str, float, bool]
@@ -58,7 +76,7 @@ def check_controller(loop: Loop, record: Record) -> list[Fact]:
     slack = 1e-6 * (float(np.ptp(part.u)) + 1e-300)
     beyond = float(np.mean((part.u < lower - slack) | (part.u > upper + slack)))
     if beyond:
-        facts.append(("limits", f"u is outside the input limits of the loop ({lower:g} to "
+        facts.append(("limit", f"u is outside the input limits of the loop ({lower:g} to "
                       f"{upper:g}) for {100 * beyond:.2g} % of the samples: u was logged before "
                       "the limiter, or the limits are wrong. Limit u before fitting, or correct "
                       "input_limits=.", beyond, True))  # fmt: skip
@@ -68,30 +86,63 @@ def check_controller(loop: Loop, record: Record) -> list[Fact]:
     except CtrlidError as reason:  # The audit prints a refusal among its facts.
         return [*facts, ("refused", "u cannot be computed with the controller of the loop: "
                          f"{reason}.", 1.0, True)]  # fmt: skip
-    if left <= EXACT:
+    if _is_rounding(e, left, part):
+        constant = _read_constant(loop, part)
+        if constant:
+            return [*facts, _report_bias(constant, left)]
         return [*facts, ("exact", "the logged u is exactly what the controller of the loop "
                          "computes from r and y.", left, False)]  # fmt: skip
     shift = _find_shift(loop, part, left)
     if shift is not None:
         words, moved, remains = shift
-        facts.append(("late", f"{words}: the controller of the loop explains "
+        facts.append(("delay", f"{words}: the controller of the loop explains "
                       f"{100 * (1 - left):.4g} % of the variance of u as logged, and "
                       f"{100 * (1 - remains):.4g} % with this shift removed. Shift the channel "
                       "back before fitting.", left, True))  # fmt: skip
         part = moved
         e, left = _compute_remainder(loop, part)
-        if left <= EXACT:
+        if _is_rounding(e, left, part):
             return facts
-    facts.append(_explain_remainder(e, left, part))
-    return facts
+    stated = _explain_remainder(loop, e, left, part)
+    # Another form of a derivative adds a function of r, and only its exact replay tells it.
+    exact_only = stated[0] == "injected"
+    if stated[0] == "bias":
+        return [*facts, stated]
+    return [*facts, _find_wrong_law(loop, part, left, exact_only) or stated]
+
+
+def find_rejection(loop: Loop, record: Record) -> str:
+    """Return why the stated law is not what computed the logged u; empty where it stands.
+
+    An added signal that is independent of y, or a constant one, does not speak against a law. Nor
+    does a remainder without a name that is far smaller than u: no real record is exact to the
+    last digit.
+    """
+    for kind, text, share, _ in check_controller(loop, record):
+        if kind in REJECTED and not (kind == "unknown" and share < IMMATERIAL):
+            return text
+    return ""
 
 
 def _compute_remainder(loop: Loop, record: Record) -> tuple[Any, float]:
-    """Return what the controller leaves of u, and its share of the variance."""
-    e = record.u - replay_controller(loop, record)
-    counts = record.valid if record.valid.sum() > 1 else np.ones(record.n, bool)
+    """Return what the controller leaves of u, and its share of the variance.
+
+    Samples that do not count leave the state of the controller unknown, so that each stretch is
+    replayed from its own best state. What is too short to tell it leaves nothing.
+    """
+    e, counts = np.zeros(record.n), np.zeros(record.n, bool)
+    long = [(a, b) for a, b in record.segments() if b - a >= FEWEST]
+    for a, b in long or [(0, record.n)]:
+        e[a:b] = record.u[a:b] - replay_controller(loop, record[a:b])
+        counts[a:b] = True
     spread = float(np.var(record.u[counts]))
     return e, float(np.mean(e[counts] ** 2)) / max(spread, 1e-300)
+
+
+def _is_rounding(e: Any, left: float, record: Record) -> bool:
+    """Tell whether a remainder is no more than the rounding of the logged u."""
+    step = find_grid_step(record.u[record.valid])
+    return left <= EXACT or (bool(step) and float(np.max(np.abs(e))) <= 0.51 * step)
 
 
 def _shift_channels(record: Record, u: int, y: int) -> Record:
@@ -130,7 +181,7 @@ def _spell_samples(k: int) -> str:
     return f"{('one', 'two', 'three')[k - 1]} sample{'s' if k > 1 else ''}"
 
 
-def _explain_remainder(e: Any, left: float, record: Record) -> Fact:
+def _explain_remainder(loop: Loop, e: Any, left: float, record: Record) -> Fact:
     """Say what the part of u is that does not come from the controller."""
     assert record.r is not None
     unit = record.units.get("u", "")
@@ -144,14 +195,185 @@ def _explain_remainder(e: Any, left: float, record: Record) -> Fact:
             return ("injected", f"in addition to the output of the controller, u contains a signal "
                     f"of RMS {rms} that is correlated with the channel {name!r}.", left,
                     False)  # fmt: skip
-    moving = [(s, 0) for s in (record.y, record.r) if np.ptp(s[record.valid]) > 0]
-    follows = compute_explained_share(e, moving, record.valid, lags=10)
-    if follows > FOLLOWS:
+    if float(np.ptp(e[record.valid])) <= 1e-6 * float(np.ptp(record.u[record.valid])):
+        return _report_bias(float(np.mean(e[record.valid])), left)
+    if not _is_independent(loop, e, record):
         share = f"{100 * left:.3g} % of the variance of u" if left < 1 else "u"
-        return ("other", f"the controller of the loop does not explain {share} (RMS {rms}), and "
-                f"{100 * follows:.0f} % of this part depends on r and y: the true controller has "
-                "other gains or another structure, or a slow signal is added to u. Correct the "
+        return ("unknown", f"the controller of the loop does not explain {share} (RMS {rms}), and "
+                "this part depends on y: the true controller has "
+                "other gains or another structure. Correct the "
                 "controller, or give None.", left, True)  # fmt: skip
     return ("injected", f"in addition to the output of the controller, u contains a signal of RMS "
             f"{rms} that does not depend on r and y: excitation, dither or rounding.", left,
             False)  # fmt: skip
+
+
+def _report_bias(constant: float, left: float) -> Fact:
+    return ("bias", "u is the output of the controller of the loop plus a constant of "
+            f"{constant:.4g}. Correct the bias of the controller or the input of the operating "
+            "point.", left, True)  # fmt: skip
+
+
+def _read_constant(loop: Loop, record: Record) -> float:
+    """Return the constant that the state of an integral without gain took over; 0 if none."""
+    if not isinstance(loop.controller, PID) or loop.controller.ki:
+        return 0.0
+    a, b = max(record.segments(), key=lambda part: part[1] - part[0])
+    constant = float(replay_from_best_state(loop, record[a:b])[1][0])
+    u = record.u[record.valid]
+    seen = max(np.sqrt(EXACT) * float(np.std(u)), 0.5 * find_grid_step(u))
+    return constant if abs(constant) > seen else 0.0
+
+
+def _is_independent(loop: Loop, e: Any, record: Record) -> bool:
+    """Test whether a remainder is independent of y up to now, given r and its own past.
+
+    Under feedback y follows an added signal, but tells nothing of it that its own past does not.
+    The samples at the stated limits are left out, which cut off what was added.
+    """
+    assert record.r is not None
+    y, u, valid = record.y, record.u, record.valid
+    lower, upper = loop.input_limits
+    if isinstance(loop.controller, PID):
+        lower, upper = max(lower, loop.controller.lower), min(upper, loop.controller.upper)
+    inner = valid & (u > lower) & (u < upper)
+    moves = valid[1:] & valid[:-1] & (np.abs(np.diff(y)) > 1e-6 * np.ptp(y[valid]))
+    held = np.abs(np.diff(e)) <= 1e-6 * np.ptp(e[valid])
+    # What holds its value while y moves is not computed from y, however regular its steps are.
+    if moves.any() and np.mean(held[moves]) > 0.5:
+        return True
+    rows = np.flatnonzero(find_whole_past(valid, MEMORY) & inner)
+    if len(rows) <= 4 * (3 * MEMORY + 3):
+        return not _follows(e, record)
+    e, y, r = (
+        (v - np.mean(v[valid])) / max(float(np.std(v[valid])), 1e-300) for v in (e, y, record.r)
+    )
+    own = np.column_stack([np.ones(len(rows)), *(e[rows - k] for k in range(1, MEMORY + 1)),
+                           *(r[rows - k] for k in range(MEMORY + 1))])  # fmt: skip
+    every = np.column_stack([own, *(y[rows - k] for k in range(MEMORY + 1))])
+    (without, few), (with_y, many) = (_regress(table, e[rows]) for table in (own, every))
+    if without <= ROUNDING * len(rows):
+        return not _follows(e, record)
+    if many == few:
+        return True
+    ratio = (without - with_y) / (many - few) / max(with_y / (len(rows) - many), 1e-300)
+    return bool(stats.f.sf(ratio, many - few, len(rows) - many) >= LEVEL)
+
+
+def _regress(table: Any, goal: Any) -> tuple[float, int]:
+    """Return the sum of squares that a regression leaves, and its number of coefficients."""
+    solution, _, rank, _ = np.linalg.lstsq(table, goal, rcond=1e-10)
+    return float(np.sum((goal - table @ solution) ** 2)), int(rank)
+
+
+def _follows(e: Any, record: Record) -> bool:
+    """Tell whether a remainder follows r and y where its own past leaves nothing to be tested."""
+    channels = [s for s in (record.y, record.r) if s is not None]
+    moving = [(s, 0) for s in channels if np.ptp(s[record.valid]) > 0]
+    return compute_explained_share(e, moving, record.valid, lags=MEMORY) > FOLLOWS
+
+
+def _find_wrong_law(loop: Loop, record: Record, left: float, exact_only: bool) -> Fact | None:
+    """Return which single change of the stated law leaves only rounding or an added signal."""
+    for kind, words, changed in _list_changes(loop, record):
+        try:
+            e, remains = _compute_remainder(changed, record)
+        except CtrlidError:
+            continue
+        if remains > CLEARLY * left:
+            continue
+        if _is_rounding(e, remains, record) or (
+            not exact_only and _is_independent(changed, e, record)
+        ):
+            text = (f"u is not what the controller of the loop computes from r and y, but {words}: "
+                    f"what remains unexplained falls from {100 * left:.3g} to {100 * remains:.3g} "
+                    "% of the variance of u. Correct the controller.")  # fmt: skip
+            return kind, text, left, True
+    return None
+
+
+def _list_changes(loop: Loop, record: Record) -> Iterator[tuple[str, str, Loop]]:
+    """Yield the changes of a law that are tried, each as its kind, its words and the loop."""
+    bias = _estimate_gain(loop, record, known=True)
+    if bias is not None and (shifted := _scale_controller(loop, *bias)):
+        yield "bias", f"that about a constant of {bias[1]:.4g}", shifted
+    gain = _estimate_gain(loop, record)
+    if gain is not None and gain[0] != 0.0 and (scaled := _scale_controller(loop, *gain)):
+        factor = gain[0]
+        words = f"{factor:.4g} times that"
+        if factor < 0:
+            words = ("has the opposite sign" if abs(factor + 1) < 1e-3
+                     else f"has the opposite sign and {-factor:.4g} times the size")  # fmt: skip
+        yield ("sign" if factor < 0 else "gain"), words, scaled
+    u = record.u[record.valid]
+    ends = [float(end) if np.count_nonzero(u == end) > 2 else side * np.inf
+            for end, side in ((np.min(u), -1), (np.max(u), 1))]  # fmt: skip
+    if np.isfinite(ends).any() and ends[0] < ends[1]:
+        low, high = ends
+        words = f"it is limited to {low:.4g} to {high:.4g}"
+        yield "limit", words, replace(loop, input_limits=(low, high))
+        if isinstance(loop.controller, PID):
+            yield (
+                "limit",
+                words,
+                replace(loop, controller=replace(loop.controller, lower=low, upper=high)),
+            )
+    pid = loop.controller
+    if not isinstance(pid, PID):
+        return
+    if np.isfinite([pid.lower, pid.upper]).any():
+        yield ("limit", "without the limits of the controller", replace(
+            loop, controller=replace(pid, lower=-np.inf, upper=np.inf)))  # fmt: skip
+    for name, kind, choices in (("derivative", "filter", get_args(Derivative)),
+                                ("integral", "filter", get_args(Integral)),
+                                ("anti_windup", "limit", get_args(AntiWindup))):  # fmt: skip
+        for choice in choices:
+            if choice == getattr(pid, name) or (choice == "measurement" and pid.c not in (0, 1)):
+                continue
+            try:
+                other = replace(pid, **{name: choice})
+            except CtrlidError:
+                continue
+            yield kind, f"with {name}={choice!r}", replace(loop, controller=other)
+
+
+def _estimate_gain(loop: Loop, record: Record, known: bool = False) -> tuple[float, float] | None:
+    """Return the factor and the constant between u and the unlimited output of the controller.
+
+    From the longest stretch, where both are read together with the controller's unknown state:
+    the state adds its own slow response, which an alternating solution would share out wrongly.
+    A `known` factor is one, and only the constant is sought.
+    """
+    a, b = max(record.segments(), key=lambda part: part[1] - part[0])
+    part = record[a : min(b, a + TRIAL)]
+    free = replace(loop, input_limits=(-np.inf, np.inf))
+    if isinstance(free.controller, PID):
+        free = replace(free, controller=replace(free.controller, lower=-np.inf, upper=np.inf))
+    try:
+        output, responses, rest = differentiate_replay(free, part)
+    except CtrlidError:
+        return None
+    inner = (part.u > np.min(part.u)) & (part.u < np.max(part.u))
+    table = np.column_stack([output - rest, np.ones(part.n), responses])[inner]
+    goal = part.u[inner]
+    if known:
+        goal, table = goal - table[:, 0], table[:, 1:]
+    size = np.linalg.norm(table, axis=0)
+    table = table / np.where(size > 0, size, 1.0)
+    if len(table) <= 2 * table.shape[1]:
+        return None
+    found = np.linalg.lstsq(table, goal, rcond=1e-10)[0] / np.where(size > 0, size, 1.0)
+    return (1.0, float(found[0])) if known else (float(found[0]), float(found[1]))
+
+
+def _scale_controller(loop: Loop, factor: float, constant: float) -> Loop | None:
+    """Return the loop with so many times its controller, about another constant input."""
+    controller = loop.controller
+    if isinstance(controller, PID):
+        other = replace(controller, kp=factor * controller.kp, ki=factor * controller.ki,
+                        kd=factor * controller.kd, bias=constant)  # fmt: skip
+        return replace(loop, controller=other)
+    if isinstance(controller, ct.TransferFunction | ct.StateSpace | int | float):
+        return replace(loop, controller=factor * controller,
+                       at=replace(loop.point, input=constant))  # fmt: skip
+    return None

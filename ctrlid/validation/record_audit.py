@@ -15,7 +15,7 @@ from ..data.several_records import order_model_and_data
 from ..data.validity import find_runs
 from ..loop.loop import Loop
 from . import signal_defects as defects
-from .controller_check import check_controller
+from .controller_check import FAULTS, check_controller
 
 # With fewer valid samples no fit says much.
 FEW = 50
@@ -44,7 +44,9 @@ class AuditFinding:
     kind : str
         ``"saturation"``, ``"quantization"``, ``"repeats"``, ``"dropped samples"``, ``"outliers"``,
         ``"drift"``, ``"offset"``, ``"too little excitation"``, ``"constant signal"``,
-        ``"too few samples"``, ``"controller"`` or ``"operating point"``.
+        ``"too few samples"``, ``"controller"`` or ``"operating point"``; where the stated
+        controller does not compute the logged u, what is wrong with it: ``"gain"``, ``"sign"``,
+        ``"bias"``, ``"delay"``, ``"limit"``, ``"filter"`` or ``"unknown"``.
     channel : str
         ``"r"``, ``"u"`` or ``"y"``; empty where it concerns the whole record.
     text : str
@@ -106,7 +108,7 @@ class Audit(Printed):
         rows = [f"Audit: {write_count(len(self.findings), 'finding')}, {harm} a fit"]
         for f in self.findings:
             kind = f.kind.upper() if f.harmful else f.kind
-            of = f" of {f.channel}" if f.channel and f.kind != "controller" else ""
+            of = f" of {f.channel}" if f.channel and f.kind not in ("controller", *FAULTS) else ""
             rows.append(f"  {kind}{of}: {f.text}")
         return "\n".join(rows)
 
@@ -184,7 +186,8 @@ def audit(record: Record, loop: Loop | None = None) -> Audit:
         findings += checks.check_operating_point(loop)
         for kind, text, size, harmful in check_controller(loop, record):
             injected = injected or kind == "injected"
-            findings.append(AuditFinding("controller", "u", text, size, checks.whole, harmful))
+            named = kind if kind in FAULTS else "controller"
+            findings.append(AuditFinding(named, "u", text, size, checks.whole, harmful))
     findings += checks.check_excitation(injected)
     findings.sort(key=lambda f: not f.harmful)
     return Audit(tuple(findings), MappingProxyType(checks.quantum), checks.repeats,

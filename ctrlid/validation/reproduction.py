@@ -9,6 +9,7 @@ from ..data.record import Record
 from ..loop.loop import Loop
 from ..loop.period_map import comes_to_rest
 from ..physics.linearization import compute_state_matrices
+from .controller_check import find_rejection
 
 Name = Literal["closed-loop simulation", "open-loop simulation", "prediction"]
 
@@ -35,8 +36,12 @@ CLOSED_LOOP = Reproduction("closed-loop simulation")
 
 
 def choose_reproduction(loop: Loop, record: Record) -> Reproduction:
-    """Return the most telling reproduction that there is: a simulation where one is possible."""
-    if loop.controller is not None and record.r is not None:
+    """Return the most telling reproduction that there is: a simulation where one is possible.
+
+    What a wrong law leaves of the logged input carries the measured output into a simulation, so
+    that after a rejected law only a prediction remains, which does not contain the controller.
+    """
+    if loop.controller is not None and record.r is not None and not find_rejection(loop, record):
         return CLOSED_LOOP
     if loop.controller is None and comes_to_rest(loop):
         return OPEN_LOOP
