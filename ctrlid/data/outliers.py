@@ -22,8 +22,8 @@ def find_outliers(record: Record) -> Any:
 
     Those are away from the median of their neighbours by more than ten standard deviations, and by
     more than the whole range in which the medians move: within one sample and back, nothing that
-    has inertia goes so far. After a jump of the input that stands out alike nothing is an
-    outlier: the plant may have answered.
+    has inertia goes so far. Where every pulse of the input is followed by such a reading, these
+    are answers of the plant and no outliers.
 
     Parameters
     ----------
@@ -40,9 +40,9 @@ def find_outliers(record: Record) -> Any:
     if len(valid) < NEIGHBOURS:
         return found
     away = _stands_out(record.y[valid])
-    # A record without noise may have been driven by single pulses, whose answers are real.
-    driven = _stands_out(record.u[valid])
-    found[valid] = away & ~np.concatenate([[False], driven[:-1]])
+    # Single pulses of the input have real answers, and then every pulse has one.
+    after_pulse = np.concatenate([[False], _stands_out(record.u[valid])[:-1]])
+    found[valid] = away & ~(after_pulse & away[after_pulse].all())
     return found
 
 
