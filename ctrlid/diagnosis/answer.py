@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from .._base.errors import EffectDoesNotApply, ModelCannotRun
+from .._base.text import write_quantity
 from ..data.record import Record
 from ..effects import AbstractEffect, equivalents
 from ..estimation.likelihood.physics_fit import summarize_fit
@@ -60,6 +61,13 @@ def assemble_answer(
         notes.append(
             "the model is linear. If the errors depend on position, velocity or input, write the "
             "equations of the plant with ct.nlsys and diagnose that model"
+        )
+    noise = found.final.fit.noise
+    if noise.ar or noise.ma:
+        size = math.sqrt(float(np.mean(found.final.fit.sensor)))
+        notes.append(
+            f"the sensor noise is taken as coloured, ARMA({len(noise.ar)}, {len(noise.ma)}), of "
+            f"{write_quantity(size, gap.unit)} RMS: the reading errs alike in successive samples"
         )
     before = dict(zip(found.base.names, found.base.fit.theta.tolist(), strict=True))
     calibrated = tuple(

@@ -10,7 +10,7 @@ import numpy as np
 from .._base.arrays import Array
 from ..data.record import Record
 from ..estimation.likelihood.filter_data import FilterData, prepare_for_loop
-from ..estimation.likelihood.kalman_filter import Noise, guess_trajectory
+from ..estimation.likelihood.kalman_filter import guess_trajectory
 from ..estimation.likelihood.likelihood import (
     Fit,
     evaluate_likelihood,
@@ -77,7 +77,8 @@ def without_random_force(model: Model) -> Model:
     if model.fit.known is not None:
         return model
     force = tuple(THRESHOLD.quiet_force * v for v in noise.force)
-    return replace(model, fit=replace(model.fit, noise=Noise(force)))
+    quiet = replace(noise, force=force, memory=0.0, drift=0.0)
+    return replace(model, fit=replace(model.fit, noise=quiet))
 
 
 def drop_arrays(fit: Fit) -> Fit:

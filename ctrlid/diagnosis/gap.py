@@ -11,6 +11,7 @@ from scipy import signal
 from .._base.arrays import Array
 from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from ..data.record import Record
+from ..estimation.likelihood.kalman_filter import make_sensor_states
 from ..estimation.likelihood.likelihood import Fit
 from ..estimation.likelihood.prediction import predict, predict_ahead, predict_spread
 from ..loop.loop import Loop
@@ -196,4 +197,11 @@ def draw_noise(fit: Fit, sensor: float, n: int, seed: int) -> list[Array]:
         steps = streams[2] * math.sqrt(sensor * noise.drift)
         steps[0] *= 1 / math.sqrt(1 - noise.memory**2)
         force = force + signal.lfilter([1.0], [1.0, -noise.memory], steps)
-    return [streams[0] * math.sqrt(sensor), force]
+    reading = streams[0]
+    if noise.ar or noise.ma:
+        # As many samples again let the noise begin anywhere in its stationary run.
+        long = np.append(np.random.default_rng([seed, 1]).standard_normal(n), reading)
+        _, drive, _ = make_sensor_states(noise)
+        colour = [1.0, *noise.ma], [1.0, *(-v for v in noise.ar)]
+        reading = drive[0] * signal.lfilter(*colour, long)[n:]
+    return [reading * math.sqrt(sensor), force]

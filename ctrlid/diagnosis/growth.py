@@ -6,9 +6,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from .._base.criterion import bayesian_penalty
 from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from ..effects import AbstractEffect
 from ..estimation.likelihood.likelihood import Fit
+from ..estimation.likelihood.maximization import choose_sensor_noise
+from ..estimation.likelihood.noise_fit import compute_noise_criterion
 from .candidates import Trial, contains, list_missing_candidates
 from .fitted_model import Model, can_simulate, drop_linearization, with_linearization
 from .noise_tests import NoiseTests, choose_alarm_level, run_noise_tests
@@ -88,6 +91,11 @@ def search_effects(
         tell(f"round {len(steps) + 1}: screening")
         pool = list_missing_candidates(model, catalogue)
         step = run_round(model, pool, work, None if steps else restore_given_values(base))
+        coloured = _prefer_sensor_noise(model, step.best)
+        if coloured is not None:
+            tell("coloured sensor noise")
+            model, base = coloured, base if steps else coloured
+            step = run_round(model, list_missing_candidates(model, catalogue), work)
         step = replace(step, base=Model(model.loop, drop_linearization(model.fit)))
         if step.best is not None and _is_stand_in(step.best, model, beside=bool(steps)):
             step = replace(step, best=None)
@@ -106,6 +114,29 @@ def search_effects(
         model, found = base, ()
     tests = run_noise_tests(base.fit), retest_with_replicas(model)
     return Search(base, tuple(steps), model, found, *tests, left)
+
+
+def _prefer_sensor_noise(model: Model, best: Trial | None) -> Model | None:
+    """Return the model with coloured sensor noise if that gains more than the best effect does.
+
+    Only where the innovations are not white noise, or a coloured force had to make them so.
+    """
+    fit = model.fit
+    if fit.known is not None or fit.noise.ar or fit.noise.ma:
+        return None
+    if not fit.noise.drift and run_noise_tests(fit).passed:
+        return None
+    try:
+        other = choose_sensor_noise(fit)
+    except ModelCannotRun:
+        return None
+    gain = compute_noise_criterion(other) - compute_noise_criterion(fit)
+    # Further noise in the fit of the best effect is paid for as well.
+    more = 0.0
+    if best is not None:
+        parameters = best.model.fit.noise.parameters - fit.noise.parameters
+        more = max(0.0, best.net_gain - bayesian_penalty(parameters, fit.size))
+    return with_linearization(Model(model.loop, other)) if gain > more else None
 
 
 def choose_search(

@@ -95,7 +95,8 @@ def run_noise_tests(fit: Fit) -> NoiseTests:
     white = cross = 0.0
     white_df = cross_df = 0
     lines, tails, shapes = [], [], []
-    p = len(fit.theta)
+    # Fitted coefficients of the noise take as many correlations to zero.
+    p = len(fit.theta) + len(fit.noise.ar) + len(fit.noise.ma)
     for z, out, data in zip(fit.standardized, fit.filtered, fit.data, strict=True):
         keep = np.isfinite(z)
         filled = np.where(keep, z, 0.0)

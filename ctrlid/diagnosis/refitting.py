@@ -42,10 +42,10 @@ def refit_candidate(base: Model, trial: Trial, near: Model | None = None) -> Tri
     try:
         start = carry_over_fit(near or base, loop, names)
         starts = [start]
-        if start.noise.drift and start.problem.known is None and can_simulate(base):
-            # A random force that was fitted while the effect was missing may never let it in.
+        if start.noise.parameters and start.problem.known is None and can_simulate(base):
+            # Coloured noise that was fitted while the effect was missing may never let it in.
             # (Where no simulation can check it, the likelihood also leads to absurd values.)
-            starts.append(replace(start, noise=replace(start.noise, memory=0.0, drift=0.0)))
+            starts.append(replace(start, noise=Noise(start.noise.force)))
         fits = [
             drop_linearization(
                 place_instants(maximize(s, rounds=THRESHOLD.refit_rounds, exact=False))

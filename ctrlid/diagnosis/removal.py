@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from .._base.criterion import bayesian_penalty
+from ..estimation.likelihood.kalman_filter import Noise
 from ..estimation.likelihood.maximization import (
     begin_fit,
     choose_noise,
@@ -13,6 +14,7 @@ from ..estimation.likelihood.maximization import (
     polish_fit,
     refit_noise_size,
 )
+from ..estimation.likelihood.noise_fit import compute_noise_criterion
 from ..loop.loop import Loop
 from .candidates import Trial, contains
 from .fitted_model import Model, can_simulate, carry_over_fit, drop_linearization
@@ -42,7 +44,7 @@ def weigh_effects(
         return model, ()
     best = steps[0].best
     alone = len(model.loop.effects) == given + 1 and len(steps) <= 2
-    if alone and best is not None and _has_coloured_force(best.model) == _has_coloured_force(model):
+    if alone and best is not None and _has_same_noise(best.model, model):
         return model, (Weighed(best, (), steps[0].base, given),)
     one = fuse_effects(model, given, steps)
     if one is not model:
@@ -57,8 +59,9 @@ def weigh_effects(
     return model, tuple(found)
 
 
-def _has_coloured_force(model: Model) -> bool:
-    return bool(model.fit.noise.drift)
+def _has_same_noise(one: Model, other: Model) -> bool:
+    a, b = one.fit.noise, other.fit.noise
+    return (bool(a.drift), len(a.ar), len(a.ma)) == (bool(b.drift), len(b.ar), len(b.ma))
 
 
 def fuse_effects(model: Model, given: int, steps: Sequence[Round]) -> Model:
@@ -133,13 +136,13 @@ def refit_noise(model: Model) -> Model:
     fit = refit_noise_size(polish_fit(model.fit))
     if fit.known is not None:
         return Model(model.loop, fit)
-    if fit.noise.drift:
-        plain = maximize(replace(fit, noise=replace(fit.noise, memory=0.0, drift=0.0)))
-        if plain.value > fit.value - bayesian_penalty(2, fit.size):
+    if fit.noise.parameters:
+        plain = maximize(replace(fit, noise=Noise(fit.noise.force)))
+        if plain.value > fit.value - bayesian_penalty(fit.noise.parameters, fit.size):
             return Model(model.loop, plain)
-        # The coloured force that stood in for the effect may be far from the one that remains.
+        # The coloured noise that stood in for the effect may be far from the one that remains.
         anew = choose_noise(plain)
-        return Model(model.loop, max(fit, anew, key=lambda f: f.value))
+        return Model(model.loop, max(fit, anew, key=compute_noise_criterion))
     return Model(model.loop, choose_noise(fit))
 
 

@@ -5,11 +5,12 @@ once about the estimate of the pass before, which is the same thing when the two
 after two or three passes, and between the passes parameters and noise may move as well.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import casadi
 import numpy as np
+from scipy import linalg
 
 from ..._base.arrays import Array
 from ..._base.errors import ModelCannotRun
@@ -40,11 +41,21 @@ class Noise:
         Correlation of the coloured force from one sample to the next.
     drift : float
         Variance of the steps of the coloured force; zero: there is none.
+    ar, ma : tuple of float
+        Coefficients of coloured sensor noise,
+        ``n[k] = ar[0] n[k-1] + ... + w[k] + ma[0] w[k-1] + ...``; white if both are empty.
     """
 
     force: tuple[float, ...]
     memory: float = 0.0
     drift: float = 0.0
+    ar: tuple[float, ...] = ()
+    ma: tuple[float, ...] = ()
+
+    @property
+    def parameters(self) -> int:
+        """Number of parameters beyond those of white noise."""
+        return 2 * bool(self.drift) + len(self.ar) + len(self.ma)
 
     @property
     def coloured(self) -> float:
@@ -70,21 +81,76 @@ def run_filter(
     """Run the filter along a linearized plant, with sensitivities to its first columns."""
     p = len(plant.index) if columns is None else columns
     p = p if sensitive else 0
+    n, white = plant.size, not (noise.ar or noise.ma)
+    force = np.asarray(noise.force, dtype=float)
+    if not white:
+        lin, force = _append_sensor_noise(lin, force, noise)
+    states = lin.step.shape[1]
     out = filter_pass(
         lin.step, lin.a, lin.b, lin.du, np.ascontiguousarray(lin.dp[:, :, :p]), lin.output,
         lin.c, np.ascontiguousarray(lin.hp[:, :p]), lin.trajectory.predicted,
         lin.trajectory.filtered, data.y, data.valid, data.restart, lin.input_variance,
-        lin.start, lin.spread, 1.0,
-        np.asarray(noise.force, dtype=float), noise.memory, noise.drift, (0,) * plant.size,
-        (0,) * (plant.size + bool(noise.drift > 0)),
+        lin.start, lin.spread, 1.0 if white else 0.0,
+        force, noise.memory, noise.drift, (0,) * states,
+        (0,) * (states + bool(noise.drift > 0)),
     )  # fmt: skip
     error, variance, before, after, wide, slopes, disturbance = out
+    before, after, wide = before[:, :n], after[:, :n], wide[:, :n]
     counts = data.usable
     # The caller reports a filter that lost the record, so that no warning is needed here.
     with np.errstate(all="ignore"):
         sensor = np.sqrt(np.mean(error[counts] ** 2 / variance[counts]))
     return Filtered(error, variance, Trajectory(before, after, wide * sensor), slopes,
                     disturbance)  # fmt: skip
+
+
+def _append_sensor_noise(lin: Linearized, force: Array, noise: Noise) -> tuple[Linearized, Array]:
+    """Return the plant with the sensor noise as further states, and the variances that drive it."""
+    move, drive, start = make_sensor_states(noise)
+    n = lin.step.shape[1]
+    r, channels = len(move), lin.b.shape[2]
+
+    def pad(array: Array, *widths: int) -> Array:
+        return np.pad(array, [(0, 0), *((0, w) for w in widths)])
+
+    a = pad(lin.a, r, r)
+    a[:, n:, n:] = move
+    # Of two opposite drives with half the variance each, the coloured force moves neither.
+    b = pad(lin.b, r, 2)
+    b[:, n:, channels], b[:, n:, channels + 1] = drive, -drive
+    c = pad(lin.c, r)
+    c[:, n] = 1.0
+    at = Trajectory(*(pad(v, r) for v in (lin.trajectory.predicted, lin.trajectory.filtered,
+                                          lin.trajectory.spread)))  # fmt: skip
+    longer = replace(
+        lin, step=pad(lin.step, r), a=a, b=b, du=pad(lin.du, r), dp=pad(lin.dp, r, 0), c=c,
+        start=np.pad(lin.start, (0, r)), spread=linalg.block_diag(lin.spread, start),
+        trajectory=at,
+    )  # fmt: skip
+    return longer, np.append(force, [0.5, 0.5])
+
+
+def make_sensor_states(noise: Noise) -> tuple[Array, Array, Array]:
+    r"""Return coloured sensor noise of variance one as states, the first of which is the noise.
+
+    .. math:: \alpha_{k+1} = T \alpha_k + R w_{k+1}, \quad P = T P T^T + R R^T, \quad P_{11} = 1
+
+    Returns
+    -------
+    move, drive, start : ndarray, shapes (r, r), (r,), (r, r)
+        The matrix T, the drive R and the stationary covariance P, with r = max(p, q + 1).
+
+    References
+    ----------
+    Harvey, *Forecasting, Structural Time Series Models and the Kalman Filter* (1989), section 3.3.
+    """
+    r = max(len(noise.ar), len(noise.ma) + 1)
+    move, drive = np.eye(r, k=1), np.zeros(r)
+    move[: len(noise.ar), 0] = noise.ar
+    drive[: len(noise.ma) + 1] = 1.0, *noise.ma
+    start = linalg.solve_discrete_lyapunov(move, np.outer(drive, drive))
+    size = max(float(start[0, 0]), 1e-300)
+    return move, np.asarray(drive / np.sqrt(size)), np.asarray(0.5 * (start + start.T) / size)
 
 
 def choose_settled_samples(data: FilterData, out: Filtered) -> Any:

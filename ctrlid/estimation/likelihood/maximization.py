@@ -15,10 +15,12 @@ from .likelihood import Fit, Problem, evaluate_likelihood, list_start_values, re
 from .noise_fit import (
     LOG_STEP,
     choose_noise_ratio,
+    compute_noise_criterion,
     compute_noise_logs,
     fit_noise,
     make_noise,
     try_coloured_force,
+    try_coloured_sensor,
 )
 
 # A climb ends after at most so many Gauss-Newton steps.
@@ -144,6 +146,17 @@ def choose_noise(fit: Fit, always: bool = False) -> Fit:
         return fit
     richer = maximize(richer)
     return richer if always or richer.value > fit.value + bayesian_penalty(2, fit.size) else fit
+
+
+def choose_sensor_noise(fit: Fit) -> Fit:
+    """Return the fit with coloured sensor noise if the BIC wants it, in place of a coloured force.
+
+    Both explain much of the same, so the likelihood decides between them.
+    """
+    if fit.known is not None:
+        return fit
+    richer = maximize(try_coloured_sensor(fit))
+    return max(fit, richer, key=compute_noise_criterion)
 
 
 def compute_expected_gain(fit: Fit) -> float:
@@ -290,8 +303,8 @@ def compute_information(fit: Fit) -> tuple[Array, Array]:
     ----------
     Åström, "Maximum likelihood and prediction error methods", Automatica 16 (1980).
     """
-    problem, plant = fit.problem, fit.plant
-    dt, p = plant.loop.dt, len(fit.theta)
+    problem = fit.problem
+    dt, p = fit.plant.loop.dt, len(fit.theta)
     at = fit.trajectories
     _, error = compute_bounded_step(fit, *fit.normal)
     logs = compute_noise_logs(fit.noise, dt) if problem.known is None else np.zeros(0)
@@ -316,7 +329,7 @@ def compute_information(fit: Fit) -> tuple[Array, Array]:
         for h in (-LOG_STEP, LOG_STEP):
             shifted = logs.copy()
             shifted[k] += h
-            pair.append(compute_innovations(fit.theta, make_noise(shifted, plant.channels, dt)))
+            pair.append(compute_innovations(fit.theta, make_noise(shifted, fit.noise, dt)))
         columns.append(_divide_difference(pair, 2 * LOG_STEP))
     count, records = len(columns), len(problem.data) if problem.known is None else 0
     matrix = np.zeros((count + records, count + records))

@@ -25,6 +25,10 @@ SLOWEST = 0.05
 LOG_STEP = 0.2
 # Above this second derivative by a log variance, a parabola tells how far the minimum is.
 CONVEX = 0.05
+# Partial autocorrelations are read back from coefficients up to this size.
+SURE = 1 - 1e-9
+# Orders of coloured sensor noise: of the autoregression and of the moving average, at most.
+ORDERS = 2, 3
 
 
 def fit_noise(
@@ -37,7 +41,7 @@ def fit_noise(
         return evaluate_linearized(problem, theta, problem.known.noise, lins)
 
     def at(logs: Array) -> Noise:
-        return make_noise(logs, plant.channels, dt)
+        return make_noise(logs, noise, dt)
 
     def cost(logs: Array) -> float:
         value = evaluate_linearized(
@@ -47,7 +51,7 @@ def fit_noise(
 
     start = compute_noise_logs(noise, dt)
     longest = max(len(data.record) for data in problem.data)
-    low, high = _bound_logs(plant, len(start) > plant.channels, longest)
+    low, high = _bound_logs(plant, noise, longest)
     start = np.clip(start, low, high)
     if wide:
         grid = np.linspace(low[0], high[0], 20)
@@ -66,34 +70,65 @@ def choose_noise_ratio(plant: SampledPlant) -> float:
 
 
 def compute_noise_logs(noise: Noise, dt: float) -> Array:
-    """Return the logarithms that are searched: of variances, and of the coloured force's time."""
+    """Return what is searched: logarithms of variances and of the coloured force's time, angles.
+
+    The partial autocorrelations of coloured sensor noise are tanh of the angles of its
+    autoregression, which keeps it stationary, and sin of those of its moving average, which
+    reaches the zeros on the unit circle that an average over several samples has.
+    """
     logs = list(np.log(noise.force))
     if noise.drift:
         logs += [math.log(noise.coloured), math.log(-dt / math.log(noise.memory))]
+    logs += np.arctanh(_compute_reflections(noise.ar)).tolist()
+    logs += np.arcsin(_compute_reflections([-v for v in noise.ma])).tolist()
     return np.array(logs)
 
 
-def make_noise(logs: Array, channels: int, dt: float) -> Noise:
-    """Return the noise that has such logarithms."""
+def make_noise(logs: Array, like: Noise, dt: float) -> Noise:
+    """Return the noise of the same kind that has such logarithms and angles."""
+    channels, p, q = len(like.force), len(like.ar), len(like.ma)
     force = tuple(np.exp(np.clip(logs[:channels], -300, 300)).tolist())
-    if len(logs) == channels:
-        return Noise(force)
+    ar, ma = np.tanh(logs[len(logs) - p - q : len(logs) - q]), np.sin(logs[len(logs) - q :])
+    noise = Noise(force, ar=_make_coefficients(ar), ma=tuple(-v for v in _make_coefficients(ma)))
+    if not like.drift:
+        return noise
     memory = math.exp(-dt / math.exp(min(max(logs[channels + 1], -50), 50)))
     memory = min(max(memory, 1e-6), 1 - 1e-9)
-    return Noise(force, memory, math.exp(min(max(logs[channels], -300), 300)) * (1 - memory**2))
+    drift = math.exp(min(max(logs[channels], -300), 300)) * (1 - memory**2)
+    return replace(noise, memory=memory, drift=drift)
 
 
-def _bound_logs(plant: SampledPlant, coloured: bool, longest: int) -> tuple[Array, Array]:
-    """Return bounds of the logarithms of the noise variances.
+def _make_coefficients(reflections: Iterable[float]) -> tuple[float, ...]:
+    """Return the autoregression with given partial autocorrelations, by Levinson's recursion."""
+    phi = np.zeros(0)
+    for k in reflections:
+        phi = np.append(phi - k * phi[::-1], k)
+    return tuple(phi.tolist())
+
+
+def _compute_reflections(coefficients: Sequence[float]) -> Array:
+    """Return the partial autocorrelations of an autoregression: Levinson's recursion backwards."""
+    phi, found = np.asarray(coefficients, dtype=float), []
+    while len(phi):
+        k, phi = float(np.clip(phi[-1], -SURE, SURE)), phi[:-1]
+        found.append(k)
+        phi = (phi + k * phi[::-1]) / (1 - k**2)
+    return np.array(found[::-1])
+
+
+def _bound_logs(plant: SampledPlant, noise: Noise, longest: int) -> tuple[Array, Array]:
+    """Return bounds of the logarithms of the noise variances, and of the angles.
 
     A force that hardly changes during a record is an offset, not noise.
     """
     unit, dt = 2 * math.log(choose_noise_ratio(plant)), plant.loop.dt
     low, high = [unit + LEAST] * plant.channels, [unit + MOST] * plant.channels
-    if coloured:
+    if noise.drift:
         low += [unit + LEAST, math.log(2 * dt)]
         high += [unit + MOST, math.log(max(min(SLOWEST * longest, 2e4), 4.0) * dt)]
-    return np.array(low), np.array(high)
+    # Sensor noise that is correlated over more than the record would be an offset.
+    ends = [math.atanh(1 - 1 / longest)] * len(noise.ar) + [math.pi] * len(noise.ma)
+    return np.array([*low, *(-v for v in ends)]), np.array([*high, *ends])
 
 
 def _evaluate_costs(cost: Callable[[Array], float], points: Iterable[Array]) -> Array:
@@ -174,6 +209,66 @@ def try_coloured_force(fit: Fit) -> Fit:
     if not np.isfinite(best.value):
         raise ModelCannotRun(f"no coloured force can be fitted to {plant.e.name}")
     return fit_noise(fit.problem, fit.theta, fit.linearized, best.noise)
+
+
+def try_coloured_sensor(fit: Fit) -> Fit:
+    """Return the fit with the coloured sensor noise that the BIC prefers, no coloured force beside.
+
+    Parameters of the plant stay as they are. From the first order on, a coefficient more is tried
+    on either side until none pays.
+
+    References
+    ----------
+    Hannan and Rissanen, Biometrika 69 (1982) 81-94, for the choice of orders by a criterion.
+    """
+    starts = [tuple(share * v for v in fit.noise.force) for share in (1.0, 1e-2, 1e-4)]
+    sizes = (-0.4, 0.4, 0.8, 0.97)
+    first = [
+        _fit_best(fit, [Noise(force, ar=(v,)) for force in starts for v in sizes]),
+        _fit_best(fit, [Noise(force, ma=(v,)) for force in starts for v in sizes]),
+    ]
+    return max((_lengthen_sensor_noise(f) for f in first), key=compute_noise_criterion)
+
+
+def compute_noise_criterion(fit: Fit) -> float:
+    """Return the log-likelihood less the penalty for the parameters of the noise."""
+    value = fit.value - bayesian_penalty(fit.noise.parameters, fit.size)
+    return value if np.isfinite(value) else -math.inf
+
+
+def _fit_best(fit: Fit, noises: Sequence[Noise]) -> Fit:
+    """Return the fit with the noise fitted from the likeliest of several."""
+    tried = run_side_by_side(
+        lambda noise: (
+            evaluate_linearized(
+                fit.problem, fit.theta, noise, fit.linearized, sensitive=False
+            ).value
+        ),
+        noises,
+    )
+    best = noises[int(np.nanargmax([v if np.isfinite(v) else -1e300 for v in tried]))]
+    return fit_noise(fit.problem, fit.theta, fit.linearized, best)
+
+
+def _lengthen_sensor_noise(fit: Fit) -> Fit:
+    """Return the fit with coefficients added to its sensor noise while the BIC wants them."""
+    while True:
+        noise, dt = fit.noise, fit.plant.loop.dt
+        logs = compute_noise_logs(noise, dt)
+        p, q = len(noise.ar), len(noise.ma)
+        tried = []
+        for longer, at, most in (
+            (replace(noise, ar=(*noise.ar, 0.0)), len(logs) - q, ORDERS[0]),
+            (replace(noise, ma=(*noise.ma, 0.0)), len(logs), ORDERS[1]),
+        ):
+            if (p if len(longer.ar) > p else q) >= most:
+                continue
+            near = [make_noise(np.insert(logs, at, v), longer, dt) for v in (-0.5, 0.05, 0.5)]
+            tried.append(_fit_best(fit, near))
+        better = max(tried, key=compute_noise_criterion, default=fit)
+        if compute_noise_criterion(better) <= compute_noise_criterion(fit):
+            return fit
+        fit = better
 
 
 def estimate_noise_from_repeats(fit: Fit, periods: Sequence[int]) -> Known:
