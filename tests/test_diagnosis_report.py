@@ -214,6 +214,24 @@ def test_bad_news_is_in_capitals(found):
     assert "of the mean square error" not in text(lost)
 
 
+def test_a_recalibration_that_ends_on_a_limit_is_marked(found):
+    base = found["explained"]
+    c = replace(base.calibrated[0], name="k", given=2.0, before=0.2)
+    assert "k ENDS AT ITS LIMIT" in text(replace(base, calibrated=(c,)))
+    assert "LIMIT" not in text(replace(base, calibrated=(replace(c, before=0.21),)))
+
+
+def test_what_the_effects_close_counts_from_the_smaller_gap(found):
+    base = found["explained"]
+    gap = replace(base.gap, given=2.0, before=2.0, recalibrated=9.0, after=1.0, floor=0.9,
+                  widest=0.9)  # fmt: skip
+    words = text(replace(base, gap=gap))
+    assert "recalibrated" in words
+    assert "9.00" in words
+    assert "the effects remove 94 % of the mean square" in words
+    assert "Recalibration alone decreases" in words
+
+
 def test_report_of_rare_cases(found):
     base = found["explained"]
     finding = base.findings[0]

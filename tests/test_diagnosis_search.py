@@ -18,6 +18,7 @@ from ctrlid.diagnosis.candidates import _has_effect, contains
 from ctrlid.diagnosis.experiment import _can_survive, find_experiment
 from ctrlid.diagnosis.findings import Disturbance, Finding, Gap
 from ctrlid.diagnosis.fitted_model import Model, drop_linearization, with_linearization
+from ctrlid.diagnosis.gap import Window, root_mean_square, share_samples
 from ctrlid.diagnosis.growth import _is_stand_in, _look_back, drop_worst_effect, search_effects
 from ctrlid.diagnosis.noise_tests import NoiseTests, _compute_force_deviates, run_noise_tests
 from ctrlid.diagnosis.recalibration import fit_base_model
@@ -751,3 +752,38 @@ def test_an_order_that_makes_no_difference_is_kept():
     one = fit_base_model(loop.with_effect(E.InputOffset(0.1)), [record], loop.free)
     two = refit_candidate(one, screen_at(one, E.InputDeadZone(0.01))).model
     assert order_last_effect(two, given=1) is two  # whose place the user knows
+
+
+def test_models_are_compared_on_the_samples_that_all_of_them_reach():
+    record = cid.Record(u=np.zeros(100), y=np.zeros(100), dt=0.1)
+    window = Window(record, 0.0, np.arange(100) >= 10)
+    whole, half, nothing = np.ones(100), np.full(100, 2.0), np.full(100, np.nan)
+    whole[50:] = 5.0
+    half[50:] = np.nan
+    shared = share_samples([window], [[whole], [half], [nothing]])
+    assert np.flatnonzero(shared[0].mask).tolist() == list(range(10, 50))
+    sizes = [root_mean_square(shared, [y]) for y in (whole, half, nothing)]
+    assert sizes == [1.0, 2.0, np.inf]
+
+
+@pytest.mark.parametrize("free", [(), ("k",)])
+def test_the_gap_before_is_the_smaller_of_given_and_recalibrated(free):
+    """A gain that is twice as large on the fitted part alone spoils the recalibration."""
+    dt, n, k = 0.02, 2000, 3.0
+    rng = np.random.default_rng(3)
+    u = np.repeat(rng.choice([-1.0, 1.0], n // 40), 40)
+    y, x, v = np.zeros(n), 0.0, 0.0
+    for i in range(n):
+        y[i] = x + 1e-4 * rng.standard_normal()
+        gain = 2 * k if i < 3 * n // 4 else k
+        for _ in range(10):
+            v += dt / 10 * (gain * u[i] - 2.0 * v)
+            x += dt / 10 * v
+    loop = cid.Loop(cid.plants.servo(m=1.0, c=2.0, k=k), dt=dt, free=free,
+                    at=cid.OperatingPoint(states=(0.0, 0.0), input=0.0, output=0.0))  # fmt: skip
+    found = cid.diagnose(loop, cid.Record(u=u, y=y, dt=dt), catalogue=(), progress=False)
+    gap = found.gap
+    assert gap.before == min(gap.given, gap.recalibrated)
+    assert (gap.recalibrated > 2 * gap.given) == bool(free)
+    error = gap.measured - gap.simulated_before
+    assert np.sqrt(np.nanmean(error**2)) == pytest.approx(gap.before)

@@ -24,8 +24,9 @@ class Gap:
         What was compared: ``"closed-loop simulation"``, ``"open-loop simulation"`` or, for
         instance, ``"25-step prediction"``.
     given, before, after : float
-        RMS error of the model as handed in, after recalibrating its free parameters, and with the
-        effects added [output unit]; infinite where the simulation leaves the plant's domain.
+        RMS error of the model as handed in, the smaller of that and of the recalibrated model's,
+        and with the effects added [output unit], all on the samples of which each model makes
+        something; infinite where a model makes nothing of a whole record.
     floor : float
         RMS error that sensor and force noise alone leave through this very loop [output unit].
     unit : str
@@ -33,13 +34,16 @@ class Gap:
     time, measured : ndarray, shape (m,)
         The held-out samples [s, output unit].
     simulated_before, simulated_after : ndarray, shape (m,)
-        What the recalibrated model and the model with the effects make of them [output unit]; NaN
-        where there is nothing.
+        What the model behind `before` and the model with the effects make of them [output unit];
+        NaN where there is nothing.
     widest : float
         RMS error of the widest of several simulations with noise [output unit]: far above the
         floor where a loop hunts, which no simulation follows for long.
     horizon : int
         How many samples ahead a prediction looks; 0 for a simulation.
+    recalibrated : float
+        RMS error after recalibrating the free parameters alone [output unit]; NaN where it is not
+        kept, as in files of earlier versions, whose `before` it is.
     """
 
     kind: str
@@ -54,6 +58,12 @@ class Gap:
     simulated_after: Array
     widest: float = math.nan
     horizon: int = 0
+    recalibrated: float = math.nan
+
+    @property
+    def fitted(self) -> float:
+        """RMS error of the recalibrated model, whether or not it is the smaller [output unit]."""
+        return self.before if math.isnan(self.recalibrated) else self.recalibrated
 
     @property
     def force_unit(self) -> str:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -64,6 +64,24 @@ def root_mean_square(windows: Sequence[Window], results: Sequence[Array]) -> flo
         squares += float(np.sum((window.record.y[use] - y[use]) ** 2))
         count += int(use.sum())
     return math.sqrt(squares / max(count, 1))
+
+
+def share_samples(
+    windows: Sequence[Window], results: Sequence[Sequence[Array]]
+) -> tuple[Window, ...]:
+    """Return the windows with only those samples compared of which every model makes something.
+
+    A stretch that one model cannot simulate is taken out for all: on other samples the errors of
+    two models cannot be compared. A model that makes nothing of a whole window takes nothing out,
+    and its error is infinite.
+    """
+    shared = []
+    for k, window in enumerate(windows):
+        known = [np.isfinite(y[k]) for y in results]
+        known = [mask for mask in known if (mask & window.mask).any()]
+        common = np.logical_and.reduce([window.mask, *known])
+        shared.append(replace(window, mask=common) if common.any() else window)
+    return tuple(shared)
 
 
 def simulate_window(loop: Loop, window: Window, how: Reproduction) -> Array:

@@ -3,7 +3,7 @@
 import functools
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -35,24 +35,28 @@ def summarize_gap(loop: Loop, found: Search, fresh: FreshData) -> GapSummary:
     for effect in found.base.loop.effects[len(loop.effects) :]:
         before = tuple(x.without_effect(type(effect).__name__) for x in before)
     results = [fresh.simulate_outputs(x) for x in ((loop,) * len(windows), before, after)]
-    sizes = [gaps.root_mean_square(windows, y) for y in results]
+    shared = replace(fresh, windows=gaps.share_samples(windows, results))
+    given, recalibrated, left = (gaps.root_mean_square(shared.windows, y) for y in results)
+    # Effects that only undo what a recalibration spoiled close nothing.
+    smaller, start = min((recalibrated, results[1]), (given, results[0]), key=lambda pair: pair[0])
     fit = found.final.fit
-    floor = gaps.compute_floor(after, fit, windows, how)
-    if sizes[2] > THRESHOLD.excess * floor.both:
-        floor = gaps.compute_floor(after, fit, windows, how, THRESHOLD.floor_more_runs)
+    floor = gaps.compute_floor(after, fit, shared.windows, how)
+    if left > THRESHOLD.excess * floor.both:
+        floor = gaps.compute_floor(after, fit, shared.windows, how, THRESHOLD.floor_more_runs)
     shares: dict[int, float] = {}
     for f in found.found:
-        error = sizes[1]
+        error = smaller
         if len(found.found) > 1:
             label = list(after[0].labelled)[f.position]
-            error = fresh.measure_gap([x.without_effect(label) for x in after])
-        shares[f.position] = _compute_share_closed(error**2 - sizes[2] ** 2, sizes[1], floor.both)
+            error = shared.measure_gap([x.without_effect(label) for x in after])
+        shares[f.position] = _compute_share_closed(error**2 - left**2, smaller, floor.both)
     first = windows[0]
     gap = Gap(
-        str(how), sizes[0], sizes[1], sizes[2], floor.both, first.record.units.get("y", ""),
+        str(how), given, smaller, left, floor.both, first.record.units.get("y", ""),
         first.start_time + np.asarray(first.record.t - first.record.start)[first.mask],
-        np.asarray(first.record.y)[first.mask], results[1][0][first.mask],
+        np.asarray(first.record.y)[first.mask], start[0][first.mask],
         results[2][0][first.mask], floor.widest, how.horizon,
+        recalibrated,
     )  # fmt: skip
     return GapSummary(gap, shares, _measure_disturbance(fit, loop, floor))
 

@@ -121,4 +121,5 @@ def _write_parameters(found: Diagnosis) -> list[str]:
         rows.append((f"  {c.name}", write_number(c.given, 4), write_number(c.before, 4), fitted))
     if not found.findings:
         rows = [(a, b, "", d) for a, b, _, d in rows]
-    return [f"  {a:<26}{b:>12}{c:>14}  {d:>34}" for a, b, c, d in rows]
+    lines = [f"  {a:<26}{b:>12}{c:>14}  {d:>34}" for a, b, c, d in rows]
+    return [*lines, *_wrap_text(wording.describe_limits(found), 4)]

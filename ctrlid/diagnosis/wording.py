@@ -122,16 +122,16 @@ def list_gap_rows(gap: Gap) -> list[tuple[str, str, str]]:
             return ""
         return f"{ratio:.2f} x the floor" if ratio < 9.995 else f"{ratio:.0f} x the floor"
 
-    cases = (("the model as given", gap.given), ("recalibrated", gap.before),
+    cases = (("the model as given", gap.given), ("recalibrated", gap.fitted),
              ("with the effects", gap.after))  # fmt: skip
-    shown = cases[:2] if gap.after == gap.before else cases
+    shown = cases[:2] if gap.after == gap.fitted else cases
     rows = [(label, size(value), times(value)) for label, value in shown]
     return [*rows, ("noise floor", size(gap.floor), "due to sensor noise and random force alone")]
 
 
 def describe_shrinking(gap: Gap) -> str:
     """Say how much of the gap above the noise floor the effects close; empty if they do not."""
-    if gap.before == gap.after:
+    if gap.fitted == gap.after:
         return ""
     above = gap.before**2 - gap.floor**2
     if not math.isfinite(above):
@@ -150,7 +150,21 @@ def describe_shrinking(gap: Gap) -> str:
     share = min((gap.before**2 - gap.after**2) / above, 1.0)
     closed = (f"On these samples the effects remove {write_percent(share)} of the mean square "
               "error above the noise floor.")  # fmt: skip
-    return f"{closed} {WIDENED}" if gap.before > gap.given * THRESHOLD.widened else closed
+    return f"{closed} {WIDENED}" if gap.fitted > gap.given * THRESHOLD.widened else closed
+
+
+def describe_limits(found: Diagnosis) -> str:
+    """Say which parameters a recalibration alone took to a limit; empty if there is none."""
+    factors = (THRESHOLD.parameter_range, 1 / THRESHOLD.parameter_range)
+    plant = [c for c in found.calibrated if "." not in c.name]
+    names = [c.name for c in plant
+             if any(math.isclose(c.before, f * c.given, rel_tol=1e-6)
+                    for f in factors)]  # fmt: skip
+    if not names or not found.findings:
+        return ""
+    ends = "ENDS AT ITS LIMIT" if len(names) == 1 else "END AT THEIR LIMITS"
+    return (f"Recalibrated alone, {write_list(names)} {ends}, a tenth or ten times the value as "
+            "given: the model without the effects has no good value there.")  # fmt: skip
 
 
 def write_percent(share: float) -> str:

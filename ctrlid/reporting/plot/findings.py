@@ -75,8 +75,8 @@ def _draw_gap(above: Any, below: Any, found: Diagnosis) -> None:
     above.plot(t, scale * y, label="measured", **MEASURED)
     names = " and ".join(f.name for f in found.findings[:2])
     names += f" and {len(found.findings) - 2} more" if len(found.findings) > 2 else ""
-    cases = [("before" if names else "recalibrated", gap.simulated_before, gap.before,
-              BEFORE if names else AFTER)]  # fmt: skip
+    label = "before" if names or gap.before != gap.fitted else "recalibrated"
+    cases = [(label, gap.simulated_before, gap.before, BEFORE if names else AFTER)]
     if names:
         cases.append(("after", gap.simulated_after, gap.after, AFTER))
     errors = [y - values[part] for _, values, _, _ in cases]
