@@ -74,7 +74,8 @@ def test_a_model_shows_formula_and_estimate(record):
     formula, block = page.split("<pre", 1)
     assert formula.rstrip() == ct.TransferFunction._repr_html_(G).rstrip()
     assert r"\dfrac" in formula
-    assert read("<pre" + block) == str(G.estimate)
+    # Long sentences are folded in a notebook.
+    assert read("<pre" + block).split() == str(G.estimate).split()
     assert G._repr_markdown_() == page
     assert "$" not in block  # which a notebook would read as a formula
     plain = ct.tf(G)
@@ -85,7 +86,8 @@ def test_a_model_shows_formula_and_estimate(record):
 def test_bad_news_is_bold_and_names_are_escaped(record):
     held = cid.fit_arx(record, na=2, nb=2, constraints=[cid.Bounds("a1", -1.0, 0.0)])
     page = held.estimate._repr_html_()
-    assert "IS ON ITS BOUND" in re.search("<strong>(.*?)</strong>", page, re.DOTALL)[1]
+    bold = re.findall("<strong>(.*?)</strong>", page, re.DOTALL)
+    assert any("IS ON ITS BOUND" in part for part in bold)
     named = replace(record, name="<b> & co")
     assert "&lt;b&gt; &amp; co" in named._repr_html_()
     assert "<b>" not in named._repr_html_()

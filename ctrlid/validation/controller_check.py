@@ -276,10 +276,7 @@ def _follows(e: Any, record: Record) -> bool:
 def _find_wrong_law(loop: Loop, record: Record, left: float, exact_only: bool) -> Fact | None:
     """Return which single change of the stated law leaves only rounding or an added signal."""
     for kind, words, changed in _list_changes(loop, record):
-        try:
-            e, remains = _compute_remainder(changed, record)
-        except CtrlidError:
-            continue
+        e, remains = _compute_remainder(changed, record)
         if remains > CLEARLY * left:
             continue
         if _is_rounding(e, remains, record) or (
@@ -330,10 +327,11 @@ def _list_changes(loop: Loop, record: Record) -> Iterator[tuple[str, str, Loop]]
         for choice in choices:
             if choice == getattr(pid, name) or (choice == "measurement" and pid.c not in (0, 1)):
                 continue
-            try:
-                other = replace(pid, **{name: choice})
-            except CtrlidError:
+            tracking = pid.tracking_time or (pid.kp / pid.ki if pid.ki else 1.0)
+            if choice == "back-calculation" and tracking <= 0:
+                # Such a controller does not exist: its integrator would run away.
                 continue
+            other = replace(pid, **{name: choice})
             yield kind, f"with {name}={choice!r}", replace(loop, controller=other)
 
 
@@ -349,10 +347,7 @@ def _estimate_gain(loop: Loop, record: Record, known: bool = False) -> tuple[flo
     free = replace(loop, input_limits=(-np.inf, np.inf))
     if isinstance(free.controller, PID):
         free = replace(free, controller=replace(free.controller, lower=-np.inf, upper=np.inf))
-    try:
-        output, responses, rest = differentiate_replay(free, part)
-    except CtrlidError:
-        return None
+    output, responses, rest = differentiate_replay(free, part)
     inner = (part.u > np.min(part.u)) & (part.u < np.max(part.u))
     table = np.column_stack([output - rest, np.ones(part.n), responses])[inner]
     goal = part.u[inner]

@@ -146,9 +146,10 @@ def predict(loop: Loop, record: Record, force_noise: float | None = None) -> Pre
 def _drop_neutral_effects(loop: Loop) -> Loop:
     """Return a loop without effects that do nothing: a lag of zero, say, is no lag.
 
-    The filter keeps their states for a fit that asks which way they go; a prediction needs none.
+    The filter keeps their states for a fit that asks which way they go; a prediction needs none,
+    and nothing is free in it.
     """
-    return replace(loop, effects=tuple(e for e in loop.effects if not e.neutral))
+    return replace(loop, effects=tuple(e for e in loop.effects if not e.neutral), free=())
 
 
 def predict_ahead(
