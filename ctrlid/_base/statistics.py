@@ -4,12 +4,13 @@ import math
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy import signal
+from scipy import signal, stats
 
 from .arrays import Array, ComplexArray
 from .criterion import bayesian_penalty
 
 SINGULAR = 1e-10  # A direction with a smaller relative eigenvalue is not in the data.
+MEDIAN_TO_DEVIATION = 1.4826  # One over the median of a standard Gaussian variable's size.
 FEW_LAGS = 50  # Up to so many, products lag by lag are faster than by Fourier transform.
 
 
@@ -105,6 +106,31 @@ def kurtosis_about_zero(z: Array) -> float:
     return float(np.mean(z**4) / np.mean(z**2) ** 2)
 
 
+def robust_deviation(e: Array) -> float:
+    r"""Return the standard deviation of errors about zero, as their middle half tells it.
+
+    .. math:: 1.4826 \operatorname{med} |e|
+
+    For Gaussian errors it is the standard deviation; a few outliers do not move it.
+
+    Parameters
+    ----------
+    e : ndarray
+        Errors.
+
+    Returns
+    -------
+    float
+        The deviation [unit of the errors].
+
+    Examples
+    --------
+    >>> robust_deviation(np.array([1.0, -1.0, 1.0, 1e6]))
+    1.4826
+    """
+    return MEDIAN_TO_DEVIATION * float(np.median(np.abs(e)))
+
+
 def portmanteau(rho: Array, samples: int, short: bool) -> float:
     r"""Return how large autocorrelations are together.
 
@@ -143,6 +169,32 @@ def portmanteau(rho: Array, samples: int, short: bool) -> float:
         return samples * float(np.sum(rho**2))
     left = np.maximum(samples - np.arange(1, len(rho) + 1), 1)
     return samples * (samples + 2) * float(np.sum(rho**2 / left))
+
+
+def compute_whiteness_probability(rho: Array, samples: int, fitted: int) -> float:
+    """Return the probability that white noise has as large autocorrelations (Ljung and Box).
+
+    Parameters
+    ----------
+    rho : ndarray
+        Autocorrelations at lags 1, 2, ...
+    samples : int
+        Number of samples.
+    fitted : int
+        Number of coefficients fitted on these very data, each of which takes a degree of freedom.
+
+    Returns
+    -------
+    float
+        The probability.
+
+    Examples
+    --------
+    >>> round(compute_whiteness_probability(np.array([0.1, 0.05]), 100, 0), 3)
+    0.525
+    """
+    degrees = max(len(rho) - fitted, 1)
+    return float(stats.chi2.sf(portmanteau(rho, samples, short=True), degrees))
 
 
 def fit_autoregression(products: Array, samples: float) -> Array:

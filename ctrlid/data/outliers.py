@@ -7,14 +7,13 @@ import numpy as np
 from scipy import ndimage
 
 from .._base.arrays import Array
+from .._base.statistics import robust_deviation
 from .record import Record
 
 # The median of so many neighbours does not follow an outlier, nor two side by side.
 NEIGHBOURS = 5
 # Gaussian noise goes so many standard deviations away once in 10^23 samples.
 FAR = 10.0
-# The median of the absolute value of a Gaussian variable is one standard deviation over this.
-MEDIAN_TO_DEVIATION = 1.4826
 
 
 def find_outliers(record: Record) -> Any:
@@ -49,8 +48,7 @@ def find_outliers(record: Record) -> Any:
 def _stands_out(signal: Array) -> Any:
     middle = ndimage.median_filter(signal, NEIGHBOURS, mode="mirror")
     distance = np.abs(signal - middle)
-    noise = MEDIAN_TO_DEVIATION * float(np.median(distance))
-    return distance > max(FAR * noise, float(np.ptp(middle)))
+    return distance > max(FAR * robust_deviation(distance), float(np.ptp(middle)))
 
 
 def mask_outliers(record: Record) -> tuple[Record, Any]:

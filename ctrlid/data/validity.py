@@ -11,6 +11,13 @@ def find_runs(mask: Any) -> tuple[Any, Any]:
     return edges[::2], edges[1::2]
 
 
+def find_longest_run(mask: Any) -> slice:
+    """Return the longest stretch in which a mask is true, the first of several; it has one."""
+    first, stop = find_runs(mask)
+    k = int(np.argmax(stop - first))
+    return slice(int(first[k]), int(stop[k]))
+
+
 def find_whole_past(valid: Any, lags: int) -> Any:
     """Return which samples count together with all of a number of samples before them.
 

@@ -63,7 +63,7 @@ def assemble_answer(
             "equations of the plant with ct.nlsys and diagnose that model"
         )
     noise = found.final.fit.noise
-    if noise.ar or noise.ma:
+    if not noise.sensor_is_white:
         size = math.sqrt(float(np.mean(found.final.fit.sensor)))
         notes.append(
             f"the sensor noise is taken as coloured, ARMA({len(noise.ar)}, {len(noise.ma)}), of "

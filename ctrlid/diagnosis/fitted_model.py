@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from .._base.arrays import Array
+from .._base.criterion import bayesian_penalty
 from ..data.record import Record
 from ..estimation.likelihood.filter_data import FilterData, prepare_for_loop
 from ..estimation.likelihood.kalman_filter import guess_trajectory
@@ -79,6 +80,11 @@ def without_random_force(model: Model) -> Model:
     force = tuple(THRESHOLD.quiet_force * v for v in noise.force)
     quiet = replace(noise, force=force, memory=0.0, drift=0.0)
     return replace(model, fit=replace(model.fit, noise=quiet))
+
+
+def compute_penalized_likelihood(fit: Fit) -> float:
+    """Return the log-likelihood less half the penalty of the Bayesian information criterion."""
+    return fit.value - bayesian_penalty(len(fit.theta), fit.size)
 
 
 def drop_arrays(fit: Fit) -> Fit:

@@ -216,7 +216,7 @@ def draw_noise(fit: Fit, sensor: float, n: int, seed: int) -> list[Array]:
         steps[0] *= 1 / math.sqrt(1 - noise.memory**2)
         force = force + signal.lfilter([1.0], [1.0, -noise.memory], steps)
     reading = streams[0]
-    if noise.ar or noise.ma:
+    if not noise.sensor_is_white:
         # As many samples again let the noise begin anywhere in its stationary run.
         long = np.append(np.random.default_rng([seed, 1]).standard_normal(n), reading)
         _, drive, _ = make_sensor_states(noise)

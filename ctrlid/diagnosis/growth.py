@@ -122,7 +122,7 @@ def _prefer_sensor_noise(model: Model, best: Trial | None) -> Model | None:
     Only where the innovations are not white noise, or a coloured force had to make them so.
     """
     fit = model.fit
-    if fit.known is not None or fit.noise.ar or fit.noise.ma:
+    if fit.known is not None or not fit.noise.sensor_is_white:
         return None
     if not fit.noise.drift and run_noise_tests(fit).passed:
         return None

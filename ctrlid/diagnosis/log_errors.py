@@ -1,4 +1,4 @@
-"""Step 2: gross errors of the log: a wrong sign, or a signal in another unit than the model's."""
+"""Step 7: gross errors of the log: a wrong sign, or a signal in another unit than the model's."""
 
 import math
 from collections.abc import Sequence
@@ -6,11 +6,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .._base.criterion import bayesian_penalty
 from .._base.errors import ModelCannotRun
 from ..data.record import Record
 from ..loop.loop import Loop
 from ..validation.record_audit import Audit
+from .fitted_model import compute_penalized_likelihood
 from .recalibration import fit_base_model, recalibrate
 from .thresholds import THRESHOLD
 
@@ -130,4 +130,4 @@ def _measure(
     if not math.isfinite(fit.value):
         return -math.inf
     count = sum(int(np.count_nonzero(np.isfinite(z))) for z in fit.standardized)
-    return fit.value - bayesian_penalty(len(fit.theta), fit.size) + count * math.log(abs(factor))
+    return compute_penalized_likelihood(fit) + count * math.log(abs(factor))

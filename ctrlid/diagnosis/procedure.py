@@ -8,19 +8,18 @@ from typing import Any
 
 from tqdm import tqdm
 
-from .._base.criterion import bayesian_penalty
 from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from .._base.jobs import check_jobs, share_out
 from ..data.record import Record
 from ..data.several_records import as_records, order_model_and_data
 from ..effects import CATALOGUE, AbstractEffect
-from ..estimation.likelihood.likelihood import Fit
 from ..loop.loop import Loop
 from ..validation.record_audit import Audit
 from ..validation.reproduction import OPEN_LOOP
 from .answer import assemble_answer, name_records
 from .candidates import check_catalogue
 from .findings import COMPLETE, Disturbance, Gap
+from .fitted_model import compute_penalized_likelihood
 from .fresh_data import FreshData, choose_fresh_data
 from .gap_summary import make_fresh_data_test, summarize_gap, take_back_widening
 from .growth import Search, choose_search, compare_names, keep_main_effects, search_effects
@@ -174,7 +173,7 @@ def _answer_question(q: Question) -> tuple[Diagnosis, Search]:
     helps = make_fresh_data_test(q.fresh)
     if search.found or not search.after.passed:
         # A wrong sign or unit in the log makes the plant look as if almost anything were missing.
-        reached = _compute_penalized_likelihood(search.final.fit)
+        reached = compute_penalized_likelihood(search.final.fit)
         wrong = find_log_error(readout.loop, readout.records, q.audits, reached)
         if wrong is not None:
             return _blame_log(q, search, wrong)
@@ -260,13 +259,8 @@ def _answer_each_record(q: Question, together: Search) -> Diagnosis | None:
         if result.verdict not in COMPLETE:
             return None
         parts.append(result)
-        gained += _compute_penalized_likelihood(search.final.fit)
+        gained += compute_penalized_likelihood(search.final.fit)
         size += search.final.fit.size
     fit = together.final.fit
-    better = size != fit.size or gained > _compute_penalized_likelihood(fit) + THRESHOLD.gate
+    better = size != fit.size or gained > compute_penalized_likelihood(fit) + THRESHOLD.gate
     return merge_diagnoses(q.loop, parts) if better else None
-
-
-def _compute_penalized_likelihood(fit: Fit) -> float:
-    """Return the log-likelihood less half the penalty of the Bayesian information criterion."""
-    return fit.value - bayesian_penalty(len(fit.theta), fit.size)

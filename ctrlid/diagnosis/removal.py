@@ -138,7 +138,7 @@ def refit_noise(model: Model) -> Model:
         return Model(model.loop, fit)
     if fit.noise.parameters:
         plain = maximize(replace(fit, noise=Noise(fit.noise.force)))
-        if plain.value > fit.value - bayesian_penalty(fit.noise.parameters, fit.size):
+        if compute_noise_criterion(plain) > compute_noise_criterion(fit):
             return Model(model.loop, plain)
         # The coloured noise that stood in for the effect may be far from the one that remains.
         anew = choose_noise(plain)

@@ -65,9 +65,6 @@ class Thresholds:
         3, convention="an experiment that repeats itself so often gives its noise without a model",
         unit="periods",
     )  # fmt: skip
-    log_error_samples: int = declare_number(
-        1000, cost="on which repairs of the log are tried at the given values", unit="samples"
-    )
     clipped: float = declare_number(
         0.005, study="samples exactly on a limit are worth a name from here on",
         unit="of the samples",
@@ -300,6 +297,9 @@ class Thresholds:
         10, cost="of a model from which an effect is taken, or whose order is changed",
         unit="steps of the climb",
     )  # fmt: skip
+    log_error_samples: int = declare_number(
+        1000, cost="on which repairs of the log are tried at the given values", unit="samples"
+    )
 
     # Step 8: what else would do, and which experiment tells.
     close: float = declare_number(

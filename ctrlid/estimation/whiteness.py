@@ -6,7 +6,7 @@ import numpy as np
 from scipy import stats
 
 from .._base.arrays import Array
-from .._base.statistics import compute_lagged_products, portmanteau
+from .._base.statistics import compute_lagged_products, compute_whiteness_probability
 from .._base.text import write_p_value
 
 # Innovations are compared with so many samples of their own past.
@@ -76,7 +76,7 @@ def note_coloured_innovations(
     if samples <= fitted + LAGS or not products[0] > rounding:
         return ()
     rho = products[1:] / products[0]
-    p = float(stats.chi2.sf(portmanteau(rho, samples, short=True), max(LAGS - fitted, 1)))
+    p = compute_whiteness_probability(rho, samples, fitted)
     chance = float(stats.norm.ppf(1 - LEVEL / 2)) / np.sqrt(samples)
     sure = np.abs(rho[np.abs(rho) > chance])
     if p >= LEVEL or 2 * float(np.sum(sure)) < HARMLESS:

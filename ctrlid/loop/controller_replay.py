@@ -129,29 +129,7 @@ def replay_from_best_state(loop: Loop, record: Record) -> tuple[Array, Array]:
 
 
 def differentiate_replay(loop: Loop, record: Record) -> tuple[Array, Array, float]:
-    """Return what a controller computes from rest, its slope by its state, and its output at rest.
-
-    Parameters
-    ----------
-    loop : Loop
-        Loop with a digital controller.
-    record : Record
-        Record with a reference.
-
-    Returns
-    -------
-    ndarray, shape (n,)
-        Input at each sample [input unit].
-    ndarray, shape (n, states)
-        Its derivative with respect to the controller's initial state.
-    float
-        The input while reference and output stay at the operating point [input unit].
-
-    Raises
-    ------
-    CtrlidError
-        If there is no digital controller.
-    """
+    """Return what `run_controller` does, its slope by the initial state, and its output at rest."""
     run, rest = _build_controller_run(loop, record.y, record.r)
     slope = np.asarray(_differentiate_outputs(run, rest.size)(rest).full(), float)
     still = run_controller(loop, np.full(1, loop.point.output))

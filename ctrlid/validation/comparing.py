@@ -123,12 +123,13 @@ def _compare_loop(record: Record, loop: Loop, horizon: int | None) -> Comparison
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", CtrlidWarning)
         try:
-            if rejected:
-                raise ModelCannotRun(f"the law of the controller is rejected, because {rejected} "
-                                     "The prediction uses the logged u instead")  # fmt: skip
-            curves.append(_simulate(record, loop, prediction))
+            if not rejected:
+                curves.append(_simulate(record, loop, prediction))
         except (ModelCannotRun, EffectDoesNotApply) as reason:
             notes.append(f"no simulation: {reason}")
+    if rejected:
+        notes.append(f"no simulation: the law of the controller is rejected, because {rejected} "
+                     "The prediction uses the logged u instead")  # fmt: skip
     notes += sorted({str(w.message) for w in caught})[-1:]
     return _make_comparison(repr(loop), record, curves, residuals, notes)
 

@@ -9,8 +9,9 @@ import numpy as np
 from scipy import stats
 
 from .._base.errors import CtrlidError
+from .._base.statistics import regress
 from ..data.record import Record
-from ..data.validity import find_whole_past
+from ..data.validity import find_longest_run, find_whole_past
 from ..loop.controller_replay import differentiate_replay, replay_controller, replay_from_best_state
 from ..loop.controllers import PID, AntiWindup, Derivative, Integral
 from ..loop.loop import Loop
@@ -37,6 +38,8 @@ LEVEL = 1e-3
 MEMORY = 10
 # Below this share of its variance the remainder of a regression is rounding of the computer.
 ROUNDING = 1e-12
+# Directions below this share of the largest are not in a regression's data.
+DETERMINED = 1e-10
 # A remainder of no known kind below this share of u's variance steers no simulation.
 IMMATERIAL = 0.01
 # Kinds of finding after which the stated law is not that of the record.
@@ -218,8 +221,8 @@ def _read_constant(loop: Loop, record: Record) -> float:
     """Return the constant that the state of an integral without gain took over; 0 if none."""
     if not isinstance(loop.controller, PID) or loop.controller.ki:
         return 0.0
-    a, b = max(record.segments(), key=lambda part: part[1] - part[0])
-    constant = float(replay_from_best_state(loop, record[a:b])[1][0])
+    longest = record[find_longest_run(record.valid)]
+    constant = float(replay_from_best_state(loop, longest)[1][0])
     u = record.u[record.valid]
     seen = max(np.sqrt(EXACT) * float(np.std(u)), 0.5 * find_grid_step(u))
     return constant if abs(constant) > seen else 0.0
@@ -262,7 +265,7 @@ def _is_independent(loop: Loop, e: Any, record: Record) -> bool:
 
 def _regress(table: Any, goal: Any) -> tuple[float, int]:
     """Return the sum of squares that a regression leaves, and its number of coefficients."""
-    solution, _, rank, _ = np.linalg.lstsq(table, goal, rcond=1e-10)
+    solution, _, rank, _ = np.linalg.lstsq(table, goal, rcond=DETERMINED)
     return float(np.sum((goal - table @ solution) ** 2)), int(rank)
 
 
@@ -291,17 +294,9 @@ def _find_wrong_law(loop: Loop, record: Record, left: float, exact_only: bool) -
 
 def _list_changes(loop: Loop, record: Record) -> Iterator[tuple[str, str, Loop]]:
     """Yield the changes of a law that are tried, each as its kind, its words and the loop."""
-    bias = _estimate_gain(loop, record, known=True)
-    if bias is not None and (shifted := _scale_controller(loop, *bias)):
-        yield "bias", f"that about a constant of {bias[1]:.4g}", shifted
     gain = _estimate_gain(loop, record)
-    if gain is not None and gain[0] != 0.0 and (scaled := _scale_controller(loop, *gain)):
-        factor = gain[0]
-        words = f"{factor:.4g} times that"
-        if factor < 0:
-            words = ("has the opposite sign" if abs(factor + 1) < 1e-3
-                     else f"has the opposite sign and {-factor:.4g} times the size")  # fmt: skip
-        yield ("sign" if factor < 0 else "gain"), words, scaled
+    if gain is not None:
+        yield from _list_gains(loop, *gain)
     u = record.u[record.valid]
     ends = [float(end) if np.count_nonzero(u == end) > 2 else side * np.inf
             for end, side in ((np.min(u), -1), (np.max(u), 1))]  # fmt: skip
@@ -335,30 +330,41 @@ def _list_changes(loop: Loop, record: Record) -> Iterator[tuple[str, str, Loop]]
             yield kind, f"with {name}={choice!r}", replace(loop, controller=other)
 
 
-def _estimate_gain(loop: Loop, record: Record, known: bool = False) -> tuple[float, float] | None:
-    """Return the factor and the constant between u and the unlimited output of the controller.
+def _list_gains(
+    loop: Loop, constant: float, factor: float, beside: float
+) -> Iterator[tuple[str, str, Loop]]:
+    """Yield a law about another constant, and so many times the law beside its own constant."""
+    if shifted := _scale_controller(loop, 1.0, constant):
+        yield "bias", f"that about a constant of {constant:.4g}", shifted
+    if factor == 0.0 or not (scaled := _scale_controller(loop, factor, beside)):
+        return
+    words = f"{factor:.4g} times that"
+    if factor < 0:
+        words = ("has the opposite sign" if abs(factor + 1) < 1e-3
+                 else f"has the opposite sign and {-factor:.4g} times the size")  # fmt: skip
+    yield ("sign" if factor < 0 else "gain"), words, scaled
 
-    From the longest stretch, where both are read together with the controller's unknown state:
-    the state adds its own slow response, which an alternating solution would share out wrongly.
-    A `known` factor is one, and only the constant is sought.
+
+def _estimate_gain(loop: Loop, record: Record) -> tuple[float, float, float] | None:
+    """Return the constant between u and the unlimited output of the controller, and its factor.
+
+    First the constant beside a factor of one, then factor and constant together. Both are read from
+    the longest stretch with the controller's unknown state: the state adds its own slow response,
+    which an alternating solution would share out wrongly.
     """
-    a, b = max(record.segments(), key=lambda part: part[1] - part[0])
-    part = record[a : min(b, a + TRIAL)]
+    part = record[find_longest_run(record.valid)][:TRIAL]
     free = replace(loop, input_limits=(-np.inf, np.inf))
     if isinstance(free.controller, PID):
         free = replace(free, controller=replace(free.controller, lower=-np.inf, upper=np.inf))
     output, responses, rest = differentiate_replay(free, part)
     inner = (part.u > np.min(part.u)) & (part.u < np.max(part.u))
     table = np.column_stack([output - rest, np.ones(part.n), responses])[inner]
-    goal = part.u[inner]
-    if known:
-        goal, table = goal - table[:, 0], table[:, 1:]
-    size = np.linalg.norm(table, axis=0)
-    table = table / np.where(size > 0, size, 1.0)
     if len(table) <= 2 * table.shape[1]:
         return None
-    found = np.linalg.lstsq(table, goal, rcond=1e-10)[0] / np.where(size > 0, size, 1.0)
-    return (1.0, float(found[0])) if known else (float(found[0]), float(found[1]))
+    goal = part.u[inner]
+    constant = regress(table[:, 1:], goal - table[:, 0], DETERMINED)[0]
+    factor, beside = regress(table, goal, DETERMINED)[:2]
+    return float(constant), float(factor), float(beside)
 
 
 def _scale_controller(loop: Loop, factor: float, constant: float) -> Loop | None:

@@ -8,6 +8,7 @@ from scipy import linalg, stats
 
 from .._base.arrays import Array
 from .._base.errors import CtrlidError
+from .._base.statistics import robust_deviation
 from .._base.text import Printed, write_count
 from ..data.record import Record
 from ..data.validity import find_whole_past
@@ -228,7 +229,7 @@ def _compute_residual(
     goal = signals[target][rows] - mean[target]
     left = goal - table @ _solve_least_squares(table, goal)
     for _ in range(4 if robust else 0):
-        usual = 3 * 1.4826 * float(np.median(np.abs(left)))
+        usual = 3 * robust_deviation(left)
         if usual <= NOTHING * float(np.std(goal)):
             break
         weight = np.sqrt(usual / np.maximum(np.abs(left), usual))

@@ -12,7 +12,7 @@ from .._base.errors import CtrlidError
 from .._base.text import Printed, write_count
 from ..data.record import SIGNALS, Record
 from ..data.several_records import order_model_and_data
-from ..data.validity import find_runs
+from ..data.validity import find_longest_run, find_runs
 from ..loop.loop import Loop
 from . import signal_defects as defects
 from .controller_check import FAULTS, check_controller
@@ -418,8 +418,8 @@ class _RecordChecks:
             text = (f"{key} changes only {times}, so the estimates have a large variance. Use a "
                     "reference with many steps, such as random_binary.")  # fmt: skip
             return [AuditFinding(kind, key, text, size, self.whole)]
-        a, b = max(self.record.segments(), key=lambda part: part[1] - part[0])
-        if changes > 0.5 * self.record.n and _count_lines(v[a:b]) == 1 and not injected:
+        longest = find_longest_run(self.valid)
+        if changes > 0.5 * self.record.n and _count_lines(v[longest]) == 1 and not injected:
             text = (f"{key} is a single sine, which determines two coefficients and no more. Use "
                     "several frequencies, as multisine gives.")  # fmt: skip
             return [AuditFinding(kind, key, text, 2.0, self.whole, harmful=True)]

@@ -8,7 +8,11 @@ import numpy as np
 from scipy import linalg, signal, stats
 
 from .._base.arrays import Array
-from .._base.statistics import compute_lagged_products, fit_autoregression, portmanteau
+from .._base.statistics import (
+    compute_lagged_products,
+    compute_whiteness_probability,
+    fit_autoregression,
+)
 from ..data.validity import find_whole_past
 
 # The bands and tests have this probability of covering what chance does.
@@ -90,7 +94,7 @@ def autocorrelation(e: Array, valid: Any, lags: int = 25, fitted: int = 0) -> Co
     rho = c[1:] / c[0] if c[0] > 0 else np.zeros(lags)
     tau = np.arange(1, lags + 1)
     band = float(stats.norm.ppf(0.5 + LEVEL / 2) / np.sqrt(n))
-    p = float(stats.chi2.sf(portmanteau(rho, n, short=True), max(lags - fitted, 1)))
+    p = compute_whiteness_probability(rho, n, fitted)
     share = 0.0
     if c[0] > 0:
         # What the best prediction from this many past residuals would take away.

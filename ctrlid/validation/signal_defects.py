@@ -11,7 +11,7 @@ import numpy as np
 from scipy import ndimage, stats
 
 from .._base.arrays import Array
-from .._base.statistics import compute_lagged_products, regress
+from .._base.statistics import compute_lagged_products, regress, robust_deviation
 from ..data.validity import find_runs, find_whole_past
 
 # So many samples are enough to find the grid of a quantized signal.
@@ -263,7 +263,7 @@ def find_spikes(v: Array, valid: Any, step: float) -> Array:
                     np.abs(np.diff(v, 2)), 0.0)  # fmt: skip
     if not clear.any():
         return height
-    noise = max(1.4826 * float(np.median(np.abs(off[2][clear]))), step, 1e-9 * float(np.ptp(v)))
+    noise = max(robust_deviation(off[2][clear]), step, 1e-9 * float(np.ptp(v)))
     bound = 1.5 * float(stats.norm.isf(0.0005 / len(v))) * noise
     # Curvature centred 3 to 8 samples away on either side does not touch the spike.
     wide, reach = np.pad(curvature, QUIET + 1), QUIET - 2

@@ -53,6 +53,11 @@ class Noise:
     ma: tuple[float, ...] = ()
 
     @property
+    def sensor_is_white(self) -> bool:
+        """Whether the sensor noise is white."""
+        return not (self.ar or self.ma)
+
+    @property
     def parameters(self) -> int:
         """Number of parameters beyond those of white noise."""
         return 2 * bool(self.drift) + len(self.ar) + len(self.ma)
@@ -81,7 +86,7 @@ def run_filter(
     """Run the filter along a linearized plant, with sensitivities to its first columns."""
     p = len(plant.index) if columns is None else columns
     p = p if sensitive else 0
-    n, white = plant.size, not (noise.ar or noise.ma)
+    n, white = plant.size, noise.sensor_is_white
     force = np.asarray(noise.force, dtype=float)
     if not white:
         lin, force = _append_sensor_noise(lin, force, noise)

@@ -192,23 +192,32 @@ def _minimize_by_newton(
 
 def try_coloured_force(fit: Fit) -> Fit:
     """Return the fit with a coloured force added, whether or not the BIC prefers it."""
-    plant, dt = fit.plant, fit.plant.loop.dt
-    best: Fit | None = None
-    sizes = np.array([1e-2, 1.0]) * sum(fit.noise.force)
-    for time in (3 * dt, 30 * dt, 300 * dt):
-        for size in sizes:
-            memory = math.exp(-dt / time)
-            force = tuple(0.5 * v for v in fit.noise.force)
-            noise = Noise(force, memory, size * (1 - memory**2))
-            trial = evaluate_linearized(
-                fit.problem, fit.theta, noise, fit.linearized, sensitive=False
-            )
-            if best is None or trial.value > best.value:
-                best = trial
-    assert best is not None
-    if not np.isfinite(best.value):
-        raise ModelCannotRun(f"no coloured force can be fitted to {plant.e.name}")
-    return fit_noise(fit.problem, fit.theta, fit.linearized, best.noise)
+    dt = fit.plant.loop.dt
+    force, whole = tuple(0.5 * v for v in fit.noise.force), sum(fit.noise.force)
+    memories = [math.exp(-dt / time) for time in (3 * dt, 30 * dt, 300 * dt)]
+    noises = [
+        Noise(force, memory, share * whole * (1 - memory**2))
+        for memory in memories
+        for share in (1e-2, 1.0)
+    ]
+    best, value = _find_likeliest(fit, noises)
+    if not np.isfinite(value):
+        raise ModelCannotRun(f"no coloured force can be fitted to {fit.plant.e.name}")
+    return fit_noise(fit.problem, fit.theta, fit.linearized, best)
+
+
+def _find_likeliest(fit: Fit, noises: Sequence[Noise]) -> tuple[Noise, float]:
+    """Return the likeliest of several noises with all else as it is, and its likelihood."""
+
+    def measure(noise: Noise) -> float:
+        value = evaluate_linearized(
+            fit.problem, fit.theta, noise, fit.linearized, sensitive=False
+        ).value
+        return value if np.isfinite(value) else -math.inf
+
+    values = run_side_by_side(measure, noises)
+    k = int(np.argmax(values))
+    return noises[k], values[k]
 
 
 def try_coloured_sensor(fit: Fit) -> Fit:
@@ -238,15 +247,7 @@ def compute_noise_criterion(fit: Fit) -> float:
 
 def _fit_best(fit: Fit, noises: Sequence[Noise]) -> Fit:
     """Return the fit with the noise fitted from the likeliest of several."""
-    tried = run_side_by_side(
-        lambda noise: (
-            evaluate_linearized(
-                fit.problem, fit.theta, noise, fit.linearized, sensitive=False
-            ).value
-        ),
-        noises,
-    )
-    best = noises[int(np.nanargmax([v if np.isfinite(v) else -1e300 for v in tried]))]
+    best, _ = _find_likeliest(fit, noises)
     return fit_noise(fit.problem, fit.theta, fit.linearized, best)
 
 

@@ -116,7 +116,6 @@ def fit_continuous(
     task = Task(structure, pieces, records[0].dt, records[0].hold, circuit, delay is None, 1.0)
     point, found, rss, used, residuals = find_best_fit(task, known, delay or 0.0)
     degrees = used - found.free - structure.na - int(task.free_delay)
-    _check_speed(np.roots(structure.fraction(found.theta)[1]), records[0].dt)
     size = max(float(np.max(np.abs(p.signals["y"]))) for p in pieces)
     notes = note_coloured_innovations(
         residuals, len(structure.names) + structure.na, _TOO_NARROW, size
@@ -130,6 +129,7 @@ def fit_continuous(
         solver=f"Gauss-Newton steps, {found.solver}{late}", dt=0.0, condition=found.condition,
         notes=notes,
     )  # fmt: skip
+    _check_speed(estimate.poles, records[0].dt)
     names = records[0].names
     model = IdentifiedModel(estimate, inputs=names.get("u", "u"), outputs=names.get("y", "y"))
     model.delay = point.delay
