@@ -214,10 +214,12 @@ def test_bad_news_is_in_capitals(found):
     assert "of the mean square error" not in text(lost)
 
 
-def test_a_recalibration_that_ends_on_a_limit_is_marked(found):
+def test_a_recalibration_that_ends_on_a_limit_is_marked(found, tmp_path):
     base = found["explained"]
     c = replace(base.calibrated[0], name="k", given=2.0, before=0.2)
     assert "k ENDS AT ITS LIMIT" in text(replace(base, calibrated=(c,)))
+    page = cid.write_report(replace(base, calibrated=(c,)), tmp_path / "report.html")
+    assert "k ENDS AT ITS LIMIT" in page.read_text("utf-8")
     assert "LIMIT" not in text(replace(base, calibrated=(replace(c, before=0.21),)))
 
 
@@ -230,6 +232,8 @@ def test_what_the_effects_close_counts_from_the_smaller_gap(found):
     assert "9.00" in words
     assert "the effects remove 94 % of the mean square" in words
     assert "Recalibration alone decreases" in words
+    output = plot.diagnosis(replace(base, gap=gap))[0]
+    assert legend(output)[1] == "closed-loop simulation, model as given"
 
 
 def test_report_of_rare_cases(found):

@@ -268,6 +268,7 @@ def _make_diagnosis_blocks(found: Diagnosis) -> list[Block]:
     if parameters:
         titles = ("parameter", "given", "recalibrated", "final", "standard error")
         made.append(Table(titles, parameters, "The free parameters of the model."))
+        made.append(wording.describe_limits(found))
     made += [
         f"{_upper(line)}."
         for line in (wording.describe_disturbance(found), wording.describe_remains(found))

@@ -75,6 +75,7 @@ def _draw_gap(above: Any, below: Any, found: Diagnosis) -> None:
     above.plot(t, scale * y, label="measured", **MEASURED)
     names = " and ".join(f.name for f in found.findings[:2])
     names += f" and {len(found.findings) - 2} more" if len(found.findings) > 2 else ""
+    start = "recalibrated model" if gap.before == gap.fitted else "model as given"
     label = "before" if names or gap.before != gap.fitted else "recalibrated"
     cases = [(label, gap.simulated_before, gap.before, BEFORE if names else AFTER)]
     if names:
@@ -91,7 +92,7 @@ def _draw_gap(above: Any, below: Any, found: Diagnosis) -> None:
     below.axhline(0, color="0.3", linewidth=0.8)
     for (label, values, size, style), error in zip(cases, errors, strict=True):
         rms = "none" if np.isnan(size) else f"RMS {fine * size:.3g}{short}"
-        long = {"before": "recalibrated model", "after": f"with {names}"}.get(label, label)
+        long = {"before": start, "after": f"with {names}"}.get(label, label)
         # A long prediction is made at some of the samples only.
         made = np.isfinite(error) if gap.horizon else slice(None)
         shown = scale * values[part]
