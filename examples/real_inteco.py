@@ -44,8 +44,9 @@ model = cid.Loop(plant, None, dt=record.dt, at=at, free=("K",))
 # ----------------
 # `diagnose` names a lag between the duty cycle and the reading of the sensor. It may be one of the
 # actuator or of the sensor, which a single oscillation does not tell apart. It also names an offset
-# of the gap in the law of the force. A small friction, although the ball moves in air, and a
-# nonlinear sensor are named as well, and may stand in for what is left.
+# of the gap in the law of the force. A small friction, although the ball moves in air, and a gain
+# of the actuator that decreases are named as well, and may stand in for what is left. So does the
+# coloured sensor noise of the last note: it is larger than the gap that remains.
 
 found = cid.diagnose(model, record, progress=False)
 print(found)
