@@ -6,6 +6,7 @@ after two or three passes, and between the passes parameters and noise may move 
 """
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import casadi
@@ -112,27 +113,34 @@ def run_filter(
 def _append_sensor_noise(lin: Linearized, force: Array, noise: Noise) -> tuple[Linearized, Array]:
     """Return the plant with the sensor noise as further states, and the variances that drive it."""
     move, drive, start = make_sensor_states(noise)
-    n = lin.step.shape[1]
-    r, channels = len(move), lin.b.shape[2]
+    n, channels = lin.step.shape[1], lin.b.shape[2]
+    longer = _make_room(lin, len(move))
+    a, b, spread = longer.a.copy(), longer.b.copy(), longer.spread.copy()
+    a[:, n:, n:], spread[n:, n:] = move, start
+    # Of two opposite drives with half the variance each, the coloured force moves neither.
+    b[:, n:, channels], b[:, n:, channels + 1] = drive, -drive
+    return replace(longer, a=a, b=b, spread=spread), np.append(force, [0.5, 0.5])
+
+
+@lru_cache(maxsize=8)
+def _make_room(lin: Linearized, r: int) -> Linearized:
+    """Return the plant with r states more that nothing moves yet, the first of which is measured.
+
+    A search for the noise filters the same plant many times, so that the last ones are kept.
+    """
 
     def pad(array: Array, *widths: int) -> Array:
         return np.pad(array, [(0, 0), *((0, w) for w in widths)])
 
-    a = pad(lin.a, r, r)
-    a[:, n:, n:] = move
-    # Of two opposite drives with half the variance each, the coloured force moves neither.
-    b = pad(lin.b, r, 2)
-    b[:, n:, channels], b[:, n:, channels + 1] = drive, -drive
     c = pad(lin.c, r)
-    c[:, n] = 1.0
+    c[:, lin.c.shape[1]] = 1.0
     at = Trajectory(*(pad(v, r) for v in (lin.trajectory.predicted, lin.trajectory.filtered,
                                           lin.trajectory.spread)))  # fmt: skip
-    longer = replace(
-        lin, step=pad(lin.step, r), a=a, b=b, du=pad(lin.du, r), dp=pad(lin.dp, r, 0), c=c,
-        start=np.pad(lin.start, (0, r)), spread=linalg.block_diag(lin.spread, start),
-        trajectory=at,
+    return replace(
+        lin, step=pad(lin.step, r), a=pad(lin.a, r, r), b=pad(lin.b, r, 2), du=pad(lin.du, r),
+        dp=pad(lin.dp, r, 0), c=c, start=np.pad(lin.start, (0, r)),
+        spread=np.pad(lin.spread, (0, r)), trajectory=at,
     )  # fmt: skip
-    return longer, np.append(force, [0.5, 0.5])
 
 
 def make_sensor_states(noise: Noise) -> tuple[Array, Array, Array]:
