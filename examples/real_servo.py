@@ -43,9 +43,10 @@ model = cid.Loop(plant, None, dt=record.dt, at=rest, free=("a", "b"))
 # What is missing?
 # ----------------
 # `diagnose` names dry friction that is stronger in one direction. On this plant that is the same as
-# symmetric dry friction with a constant force, and no record of u and y can tell them apart. The
-# residuals are not noise. The report says so, and that the friction may stand in for a part of what
-# is missing. The gap is that of a prediction four samples ahead on the random steps, which were not
+# symmetric dry friction with a constant force, and no record of u and y can tell them apart. A
+# ripple and a lag of the actuator come in beside it, of which nothing is published. The residuals
+# are not noise. The report says so, and that what is named may stand in for a part of what is
+# missing. The gap is that of a prediction four samples ahead on the random steps, which were not
 # used for the fit.
 
 found = cid.diagnose(model, record, validation=other, progress=False)
