@@ -1,0 +1,38 @@
+"""Two draws of each of the study's twelve noise and sensor classes, from a foreign simulator.
+
+All 1 200 draws are ``python benchmarks/study_suspects.py --classes all --seeds 0-24``; what holds
+of their shares is read there. Here each draw has to be right in what is wrong at any size of the
+study: nobody blames a plant that is as modelled, and a sensor's effect is in a set.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from problems import load_script
+
+study = load_script("benchmarks", "study_suspects")
+rigs = study.rigs
+DRAWS = [
+    (name, rigs.PLANTS[(i + 2 * k) % 4]) for i, name in enumerate(rigs.CLASSES) for k in (0, 1)
+]
+
+
+@pytest.mark.parametrize(("name", "plant"), DRAWS)
+def test_no_plant_is_blamed_for_what_its_sensor_or_noise_does(name: str, plant: str) -> None:
+    """Noise of any kind gives no name; a hidden sensor effect is in a set, or no name is given."""
+    line = study.run(name, plant, seed=1000, n=1500)
+    assert "error" not in line, line
+    if study.is_hidden(line):
+        assert not study.blames_the_plant_alone(line), line
+        assert study.is_in_set(line), line
+    elif name in rigs.NOISES:
+        assert study.named(line) == [], line
+
+
+def test_the_foreign_simulator_knows_nothing_of_ctrlid() -> None:
+    """A simulator that shared code with ctrlid would share its errors."""
+    assert "import ctrlid" not in Path(rigs.__file__).read_text()
+    assert "from ctrlid" not in Path(rigs.__file__).read_text()
