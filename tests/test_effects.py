@@ -103,6 +103,9 @@ VISIBLE = {
     "SensorLag": lambda s: {"tau": 0.5 * s["dt"]},
     "SensorNonlinearity": lambda s: {"curvature": 0.1 / s["Y"]},
     "SensorOffset": lambda s: {"offset": 0.05 * s["Y"]},
+    "SensorGain": lambda s: {"error": 0.05},
+    "SensorDrift": lambda s: {"rate": 0.1 * s["Y"] / (SAMPLES * s["dt"])},
+    "SensorHum": lambda s: {"amplitude": 0.05 * s["Y"], "frequency": 0.1 / s["dt"]},
     "Quantization": lambda s: {"step": 0.05 * s["Y"]},
 }  # fmt: skip
 PAIRS = [(cls, name) for cls in CATALOGUE for name in PLANTS]
@@ -330,7 +333,7 @@ class Wrong(effects.LawEffect):
 
 
 def test_the_catalogue_is_explicit_and_public():
-    assert len(set(CATALOGUE)) == len(CATALOGUE) == 31
+    assert len(set(CATALOGUE)) == len(CATALOGUE) == 34
     for cls in CATALOGUE:
         assert getattr(effects, cls.__name__) is cls
         assert cls.__name__ in effects.__all__

@@ -471,7 +471,7 @@ def test_equivalences_follow_from_the_equations():
     assert E.equivalents(E.ActuatorLag(0.001), maglev) == ()
     assert E.equivalents(E.ActuatorLag(0.001), servo) == ("SensorLag",)
     assert E.equivalents(E.SensorLag(0.001), servo) == ("ActuatorLag",)
-    assert E.equivalents(E.ConstantForce(0.1), servo) == ("InputOffset",)
+    assert E.equivalents(E.ConstantForce(0.1), servo) == ("InputOffset", "SensorDrift")
     assert E.equivalents(E.ViscousFriction(0.1), servo) == ("parameter c",)
     assert E.equivalents(E.SensorOffset(0.1), servo) == ("the initial position",)
     assert E.equivalents(E.SensorOffset(0.1), unstable) == (

@@ -76,11 +76,13 @@ def assemble_answer(
         for name in loop.free
     )  # fmt: skip
     tests = dict(found.after.p_values)
+    ranking = _rank_candidates(found)
     sentence = write_conclusion(
-        verdict, findings, gap, disturbance, found.after, where, None if left else objection
-    )
+        verdict, findings, gap, disturbance, found.after, where, None if left else objection,
+        len({type(c.effect) for c in ranking}),
+    )  # fmt: skip
     return Diagnosis(
-        verdict, sentence, findings, final, gap, where, _rank_candidates(found), disturbance,
+        verdict, sentence, findings, final, gap, where, ranking, disturbance,
         calibrated, _find_sensitivity(found), tests, notes=tuple(notes),
     )  # fmt: skip
 

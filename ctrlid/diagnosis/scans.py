@@ -3,12 +3,14 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
 from .._base.arrays import Array
 from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from .._base.statistics import pseudo_inverse
+from ..data.record import Record
 from ..effects import AbstractEffect
 from ..estimation.likelihood.kalman_filter import run_filter
 from .candidates import Objection, Trial
@@ -18,8 +20,9 @@ from .thresholds import THRESHOLD
 
 
 def score_shapes(
-    model: Model, shapes: Sequence[Array], parameter: str | None = None, width: int = 1
-) -> tuple[Array, Array]:
+    model: Model, shapes: Sequence[Array], parameter: str | None = None, width: int = 1,
+    place: Literal["force", "output"] = "force",
+) -> tuple[Array, Array]:  # fmt: skip
     r"""Return what forces of given shapes would gain, with the model's parameters moving along.
 
     .. math:: \tfrac12 g^T H^{-1} g, \quad g = \sum_k \psi_k e_k / s_k, \quad
@@ -38,6 +41,8 @@ def score_shapes(
         What is modulated: by default a force, else the named parameter of the model.
     width : int, optional
         Neighbouring shapes that belong together, such as a sine and a cosine.
+    place : {"force", "output"}, optional
+        Whether the shapes are forces, or are added to the reading.
 
     Returns
     -------
@@ -64,13 +69,17 @@ def score_shapes(
             strict=True,
         ):
             part = shape[:, None, first : first + size]
-            if parameter is None:
+            shown = np.zeros((len(shape), size))
+            if place == "output":
+                shown = shape[:, first : first + size]
+                extra = np.zeros((*lin.dp.shape[:2], size))
+            elif parameter is None:
                 extra = lin.b.sum(axis=2)[:, :, None] * part
             else:
                 extra = lin.dp[:, :, plant.names.index(parameter)][:, :, None] * part
             wide = replace(
                 lin, dp=np.concatenate([lin.dp, extra], axis=2),
-                hp=np.concatenate([lin.hp, np.zeros((len(shape), size))], axis=1),
+                hp=np.concatenate([lin.hp, shown], axis=1),
             )  # fmt: skip
             out = run_filter(plant, data, wide, fit.noise, columns=p + size)
             slopes, s = out.slopes[keep], out.variance[keep] * r
@@ -151,10 +160,11 @@ class ModelSight:
         return find_strongest_line(np.nan_to_num(z), self.dt)
 
     def score_shapes(
-        self, shapes: Sequence[Array], parameter: str | None = None, width: int = 1
-    ) -> tuple[Array, Array]:
+        self, shapes: Sequence[Array], parameter: str | None = None, width: int = 1,
+        place: Literal["force", "output"] = "force",
+    ) -> tuple[Array, Array]:  # fmt: skip
         """Return what forces of given shapes would gain, and the sizes that gain it."""
-        return score_shapes(self.model, shapes, parameter, width)
+        return score_shapes(self.model, shapes, parameter, width, place)
 
 
 def find_strongest_line(errors: Array, dt: float) -> float:
@@ -163,6 +173,34 @@ def find_strongest_line(errors: Array, dt: float) -> float:
     power = np.abs(np.fft.rfft(errors, size)) ** 2
     power[: THRESHOLD.slowest_line] = 0.0
     return int(np.argmax(power)) / (size * dt)
+
+
+def is_line_of_reference(record: Record, frequency: float) -> bool:
+    r"""Whether the reference of a record has power at a frequency.
+
+    .. math:: p = e^{-n R^2 / 2}
+
+    is how often white noise has so large a share :math:`R^2` of its variance at a frequency given
+    beforehand. A line there may be the loop's answer to the reference.
+
+    Parameters
+    ----------
+    record : Record
+        A record; without a reference the answer is no.
+    frequency : float
+        The frequency [Hz].
+    """
+    if record.r is None:
+        return False
+    keep = record.valid & np.isfinite(record.r)
+    if not keep.any() or np.ptp(record.r[keep]) == 0:
+        return False
+    r = record.r[keep] - np.mean(record.r[keep])
+    angle = 2 * np.pi * frequency * record.t[keep]
+    waves = np.column_stack([np.sin(angle), np.cos(angle), np.ones(len(r))])
+    left = r - waves @ np.linalg.lstsq(waves, r, rcond=None)[0]
+    share = 1 - float(left @ left) / float(r @ r)
+    return math.exp(-len(r) * share / 2) < THRESHOLD.telling
 
 
 def scan_candidate(model: Model, effect: AbstractEffect) -> Trial:

@@ -116,6 +116,7 @@ def gap_is_wider(gap: Gap, disturbance: Disturbance) -> bool:
 def write_conclusion(
     verdict: Verdict, findings: Sequence[Finding], gap: Gap, disturbance: Disturbance,
     after: NoiseTests, where: Sequence[BinnedErrors], objection: str | None = None,
+    tried: int = 0,
 ) -> str:  # fmt: skip
     """Return the verdict with what it rests on.
 
@@ -135,6 +136,8 @@ def write_conclusion(
         Where the disagreement sits.
     objection : str, optional
         Why effects that leave nothing but noise may yet be no explanation.
+    tried : int, optional
+        How many effects of the catalogue were tried.
 
     Returns
     -------
@@ -157,11 +160,11 @@ def write_conclusion(
     elif verdict == "partly explained" and after.passed and objection is not None:
         text = f"With {names} the residuals are noise, but {objection}."
     elif verdict == "partly explained":
-        text = (f"{names} {verb} part of the error. The rest is not noise alone: {why}. No other "
-                "effect of the catalogue explains it.")  # fmt: skip
+        text = (f"{names} {verb} part of the error. The rest is not noise alone: {why}. None of "
+                f"the {tried} effects of the catalogue explains it.")  # fmt: skip
     else:
-        text = (f"The error is not noise alone: {why}. No effect of the catalogue explains "
-                "it.")  # fmt: skip
+        text = (f"The error is not noise alone: {why}. None of the {tried} effects of the "
+                "catalogue explains it.")  # fmt: skip
     left = [w for w in where if w.p_after < THRESHOLD.surely_left]
     if left and verdict in ("partly explained", "unknown"):
         text += f" The remaining error depends on {' and '.join(w.axis for w in left[:2])}."

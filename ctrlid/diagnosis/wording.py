@@ -45,6 +45,11 @@ TESTS_OF = {
 }
 # What is no effect of the catalogue needs an article in a sentence.
 ARTICLES = {"delay of the output": "a delay of the output"}
+# Lines of the mains [Hz], so many multiples of them, and how far they may be off: by EN 50160,
+# an interconnected grid keeps within one per cent.
+MAINS = (50.0, 60.0)
+HARMONICS = 3
+MAINS_WIDTH = 0.01
 MASSES = ("m", "M", "mass")
 # Units of a force parameter times a mass in kg, by its unit per unit of mass.
 FORCES = {"m/s^2": "N", "1/s": "N s/m", "1/s^2": "N/m", "1/m": "kg/m"}
@@ -69,17 +74,31 @@ def name_test(key: str) -> str:
     return TESTS.get(key, key)
 
 
+def list_names(finding: Finding) -> list[str]:
+    """Return the name of a finding, what is the same on this plant, and what may be in its place.
+
+    What no record can tell apart is one name, of which no part stands alone.
+    """
+    same = [ARTICLES.get(name, name) for name in finding.equivalents]
+    same = [f"the {name} of the plant" if name.startswith("parameter ") else name for name in same]
+    return list(dict.fromkeys([finding.name, *same, *finding.names[1:]]))
+
+
+def join_alternatives(names: Sequence[str]) -> str:
+    """Return names of which one is right, for a sentence."""
+    return f"{', '.join(names[:-1])} or {names[-1]}" if len(names) > 1 else names[0]
+
+
 def join_names(findings: Sequence[Finding], remarks: Sequence[str] = ()) -> str:
     """Return the names of findings and of what may be in their place, for a sentence.
 
     Where a name has alternatives, findings are separated by semicolons. Remarks, one for each
     finding, follow in parentheses.
     """
-    names = [f"{', '.join(f.names[:-1])} or {f.names[-1]}" if len(f.names) > 1 else f.name
-             for f in findings]  # fmt: skip
+    names = [join_alternatives(list_names(f)) for f in findings]
     if remarks:
         names = [f"{name} ({remark})" for name, remark in zip(names, remarks, strict=True)]
-    if len(names) < 2 or all(len(f.names) == 1 for f in findings):
+    if len(names) < 2 or all(len(list_names(f)) == 1 for f in findings):
         return write_list(names)
     return f"{'; '.join(names[:-1])}; and {names[-1]}"
 
@@ -232,11 +251,13 @@ def describe_certainty(found: Diagnosis, finding: Finding) -> str:
     if math.isfinite(finding.share) and len(found.findings) > 1:
         share = write_percent(finding.share)
         text += f"; without it, {share} of the mean square error above the noise floor would return"
-    many = len(finding.names)
+    many = len(set(finding.names) - set(finding.equivalents))
     if many > 1:
         text += f"; ONE OF {many} EFFECTS that explain the record"
     else:
-        text += "; no other effect of the catalogue explains the record as well"
+        kinds = {type(c.effect).__name__ for c in found.ranking}
+        count = len(kinds - set(list_names(finding)))
+        text += f"; none of the {count} other effects of the catalogue explains the record as well"
     if found.verdict == "partly explained" and not isinstance(finding.effect, ReadingEffect):
         text += ". It may stand in for an effect that is not in the catalogue"
     return text
@@ -255,6 +276,10 @@ def list_doubts(found: Diagnosis, finding: Finding) -> list[str]:
             f"no record of u and y can distinguish it from {write_list(same)}, because on this "
             "plant their influence is the same"
         )
+    frequency = finding.effect.values().get("frequency")
+    if frequency is not None and finding.effect.repeatable:
+        error = finding.standard_errors.get("frequency", 0.0)
+        lines.append(describe_aliases(frequency, found.loop.dt, THRESHOLD.significant * error))
     if finding.experiment:
         lines.append(f"to decide, use {finding.experiment}")
     if finding.reference is not None:
@@ -263,15 +288,43 @@ def list_doubts(found: Diagnosis, finding: Finding) -> list[str]:
     return [*lines, *([finding.note] if finding.note else [])]
 
 
+def describe_aliases(frequency: float, dt: float, width: float = 0.0) -> str:
+    """Say which lines samples show at a frequency: those of the mains by name.
+
+    Examples
+    --------
+    >>> describe_aliases(40.0, 0.01)
+    '40 Hz, or 60 Hz (of the mains) folded at 100 Hz sampling'
+    """
+    rate = 1 / dt
+    near = max(width, MAINS_WIDTH * frequency)
+
+    def is_seen(line: float) -> bool:
+        return abs(abs(line - rate * round(line / rate)) - frequency) <= near
+
+    lines = [n * f for f in MAINS for n in range(1, HARMONICS + 1) if is_seen(n * f)]
+    direct = [f for f in lines if f < rate / 2]
+    text = f"{write_number(frequency, 4)} Hz{' (of the mains)' if direct else ''}"
+    folded = [f"{write_number(f, 4)} Hz (of the mains)" for f in sorted(set(lines) - set(direct))]
+    if not folded:
+        folded = [f"{write_number(rate - frequency, 4)} Hz"]
+    return f"{text}, or {' or '.join(folded)} folded at {write_number(rate, 4)} Hz sampling"
+
+
 def name_finding(finding: Finding) -> str:
     """Name the effect of a finding and say what it is."""
     what = finding.effect.sentence.rstrip(".")
-    return f"{finding.name}: {what[:1].lower()}{what[1:]}" if what else finding.name
+    same = [n for n in list_names(finding) if n not in finding.names or n in finding.equivalents]
+    name = join_alternatives([finding.name, *same])
+    return f"{name}: {what[:1].lower()}{what[1:]}" if what else name
 
 
 def describe_size(found: Diagnosis, finding: Finding) -> str:
     """Write the fitted parameters of a finding, and its accelerations as forces if they are one."""
     force = describe_forces(found, finding.effect)
+    if "SensorHum" in finding.equivalents:
+        # Newtons would blame the plant for what may be in the reading.
+        force = ""
     size = describe_parameters(found, finding.effect, finding.standard_errors)
     return f"{size} ({force})" if force else size
 

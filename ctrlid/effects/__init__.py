@@ -34,6 +34,9 @@ from .kinds import ForceEffect, InputEffect, LawEffect, OutputEffect, ReadingEff
 from .law import ForceExponent, PositionOffset
 from .output import (
     Quantization,
+    SensorDrift,
+    SensorGain,
+    SensorHum,
     SensorLag,
     SensorNonlinearity,
     SensorOffset,
@@ -78,6 +81,9 @@ __all__ = [
     "QuadraticDrag",
     "Quantization",
     "ReadingEffect",
+    "SensorDrift",
+    "SensorGain",
+    "SensorHum",
     "SensorLag",
     "SensorNonlinearity",
     "SensorOffset",

@@ -29,6 +29,9 @@ from .input import (
 from .law import ForceExponent, PositionOffset
 from .output import (
     Quantization,
+    SensorDrift,
+    SensorGain,
+    SensorHum,
     SensorLag,
     SensorNonlinearity,
     SensorOffset,
@@ -67,6 +70,9 @@ CATALOGUE: tuple[type[AbstractEffect], ...] = (
     SensorLag,
     SensorNonlinearity,
     SensorOffset,
+    SensorGain,
+    SensorDrift,
+    SensorHum,
     SensorSaturation,
     Quantization,
 )

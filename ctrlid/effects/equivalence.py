@@ -10,6 +10,7 @@ import numpy as np
 from .._base.arrays import Array
 from .._base.errors import EffectDoesNotApply
 from ..physics.equations import Equations
+from ..physics.linearization import compute_state_matrices
 from .base import AbstractEffect
 from .catalogue import CATALOGUE
 from .context import find_motion
@@ -21,6 +22,11 @@ POINTS = 24
 SAME = 1e-6
 # Changes are compared at two sizes of a parameter, since equal ones agree at every size.
 SIZES = (1e-4, 1e-2)
+# A wrong scale is compared at this size, at which it is not nearly a straight line.
+SCALE = 0.1
+# Newton's method, with differences of this relative width, is at the solution after so many steps.
+NEWTON_STEPS = 6
+NEWTON_WIDTH = 1e-5
 
 
 def equivalents(
@@ -31,7 +37,10 @@ def equivalents(
     Two effects that change rates and output alike, at random points and at two sizes, are one:
     only a further measurement can tell them apart. So is an offset of the sensor and one of the
     position in the law, where the output is the position: the state is counted from another zero.
-    So is, on a linear plant, a lag ahead of it and one behind it; and a delay at either end of any.
+    So is, on a linear plant, a lag ahead of it and one behind it, and a line in the force and one
+    in the reading; and a delay at either end of any. A wrong scale of the sensor is the same plant
+    on another scale: it is compared with the free parameters moving along. A drift of the sensor
+    is a steady motion, which on a linear plant a constant force may keep up.
 
     Parameters
     ----------
@@ -54,7 +63,7 @@ def equivalents(
     >>> plant = cid.plants.servo(m=2.0, c=1.0, k=3.0)
     >>> loop = cid.Loop(plant, dt=0.01)
     >>> cid.effects.equivalents(cid.effects.ConstantForce(bias=0.1), loop)
-    ('InputOffset',)
+    ('InputOffset', 'SensorDrift')
     """
     base = loop.without_effect(effect) if effect in loop.effects else loop
     name = type(effect).__name__
@@ -62,9 +71,15 @@ def equivalents(
         return ("delay of the output",)
     if name == "AsymmetricCoulombFriction":
         return ("CoulombFriction with a constant force",)
+    if name in LINES:
+        e = base.equations()
+        both = _is_linear(e, forced=True) and find_motion(e) is not None
+        asked = {cls.__name__ for cls in catalogue}
+        return tuple(k for k in LINES if k != name and k in asked) if both else ()
     if name in LAGS:
         return tuple(k for k in LAGS if k != name) if _is_linear(base.equations()) else ()
     others = [e for e in (_make_member(cls, base) for cls in catalogue) if e is not None]
+    tied = _find_tied(base, others)
     found = {name: effect}
     words: set[str] = set()
     todo = [name]
@@ -75,9 +90,14 @@ def equivalents(
         equal = [
             e
             for e in others
-            if type(e).__name__ in shifted or _is_same_change(base, found[known], e)
+            if type(e).__name__ in shifted
+            or {known, type(e).__name__} in tied
+            or _is_same_change(base, found[known], e)
         ]
         words |= {word for word in shifted if word not in OFFSETS}
+        words |= {
+            word for pair in tied if known in pair for word in pair if not word.isidentifier()
+        }
         words |= {
             f"parameter {key}"
             for key in base.equations().parameters
@@ -91,6 +111,131 @@ def equivalents(
 
 LAGS = ("ActuatorLag", "SensorLag")
 OFFSETS = ("PositionOffset", "SensorOffset")
+LINES = ("PeriodicForce", "SensorHum")
+
+
+def _find_tied(loop: Any, others: Sequence[AbstractEffect]) -> list[set[str]]:
+    """Return pairs of names that are one when states are counted otherwise."""
+    names = {type(e).__name__ for e in others}
+    tied = []
+    if "SensorGain" in names:
+        tied += [{"SensorGain", name} for name in _find_scaled(loop, others)]
+    if "SensorDrift" in names:
+        tied += [{"SensorDrift", name} for name in _find_steady_motion(loop)]
+    return tied
+
+
+def _find_scaled(loop: Any, others: Sequence[AbstractEffect]) -> set[str]:
+    r"""Return what does as a wrong scale of the sensor does, the free parameters moving along.
+
+    .. math:: \dot z = S f(S^{-1} z, u), \quad z = S x, \quad S = 1 + \epsilon
+
+    for position and velocity: the same plant, as its sensor shows it.
+    """
+    e = loop.equations()
+    motion = find_motion(e)
+    if motion is None or not casadi.is_equal(casadi.simplify(e.output), e.x[motion[0]], 2):
+        return set()
+    stretch = np.ones(len(e.states))
+    stretch[list(motion)] = 1 + SCALE
+    points = _draw_points(loop.point)
+    rates = [stretch * e.evaluate(x / stretch, u, t)[0] for t, (x, u) in enumerate(points)]
+    own = [n for n in loop.free if "." not in n]
+    if _can_reproduce(e, own, points, np.concatenate(rates)):
+        # The free parameters take it up, so that no effect is left to stand for it.
+        return set()
+    found = {
+        f"parameter {n}"
+        for n in e.parameters
+        if "." not in n
+        and n not in own
+        and _can_reproduce(e, [*own, n], points, np.concatenate(rates))
+    }
+    for effect in others:
+        if effect.place == "output" or effect.states:
+            continue
+        key = effect.parameters()[0].name
+        try:
+            there = loop.with_effect(replace(effect, **{key: effect.parameters()[0].neutral}))
+            changed = there.equations(keep=True)
+        except EffectDoesNotApply:
+            continue
+        if changed.delay is not None or changed.play is not None or changed.readout is not None:
+            continue
+        unknown = [*own, f"{list(there.labelled)[-1]}.{key}"]
+        if unknown[-1] in changed.parameters and _can_reproduce(
+            changed, unknown, points, np.concatenate(rates)
+        ):
+            found.add(type(effect).__name__)
+    return found
+
+
+def _can_reproduce(
+    e: Equations, names: Sequence[str], points: Sequence[tuple[Array, float]], wanted: Array
+) -> bool:
+    """Whether some values of named parameters give the wanted rates at all points."""
+    if not names:
+        return False
+    index = [list(e.parameters).index(n) for n in names]
+    start = np.array(e.values, dtype=float)
+    scale = np.where(start == 0, 1.0, np.abs(start))[index]
+
+    def compute_error(shift: Array) -> Array:
+        values = start.copy()
+        values[index] += scale * shift
+        rows = [e.evaluate(x, u, t, values)[0] for t, (x, u) in enumerate(points)]
+        return np.asarray(np.concatenate(rows) - wanted)
+
+    shift = np.zeros(len(names))
+    first = error = compute_error(shift)
+    if not np.isfinite(first).all() or not first.any():
+        return False
+    for _ in range(NEWTON_STEPS):
+        columns = [
+            (compute_error(shift + h) - compute_error(shift - h)) / (2 * NEWTON_WIDTH)
+            for h in NEWTON_WIDTH * np.eye(len(names))
+        ]
+        slopes = np.column_stack(columns)
+        if not np.isfinite(slopes).all():
+            return False
+        shift = shift - np.linalg.lstsq(slopes, error, rcond=None)[0]
+        error = compute_error(shift)
+        # What first slopes cannot nearly reproduce, no values do.
+        if not np.linalg.norm(error) < 0.1 * np.linalg.norm(first):
+            return False
+    return bool(np.linalg.norm(error) <= SAME * np.linalg.norm(first))
+
+
+def _find_steady_motion(loop: Any) -> set[str]:
+    r"""Return what makes the output of a linear plant a ramp, as a drift of its sensor does.
+
+    .. math:: A x_1 = 0, \quad C x_1 = 1, \quad A x_0 + b f = x_1, \quad C x_0 = 0
+
+    for the motion :math:`x_0 + x_1 t` under a constant force f.
+    """
+    e = loop.equations()
+    motion = find_motion(e)
+    if motion is None or not _is_linear(e, forced=True):
+        return set()
+    a, _, c, _ = compute_state_matrices(e, loop.point)
+    n = len(a)
+    push = np.zeros((n, 1))
+    push[motion[1]] = 1.0
+    zero = np.zeros((n, n))
+    rows = np.block([
+        [a, zero, np.zeros((n, 1))],
+        [c, np.zeros((1, n + 1))],
+        [-np.eye(n), a, push],
+        [np.zeros((1, n)), c, np.zeros((1, 1))],
+    ])  # fmt: skip
+    wanted = np.zeros(2 * n + 2)
+    wanted[n] = 1.0
+    for kept, name in ((slice(0, 2 * n), "the initial velocity"), (slice(None), "ConstantForce")):
+        part = rows[:, kept]
+        z = np.linalg.lstsq(part, wanted, rcond=None)[0]
+        if np.linalg.norm(part @ z - wanted) <= SAME:
+            return {name}
+    return set()
 
 
 def _find_shifted_offsets(name: str, loop: Any) -> set[str]:
@@ -129,14 +274,18 @@ def _is_seen_by_law_alone(loop: Any, i: int) -> bool:
     return _are_equal(elsewhere - here, offset - here)
 
 
-def _is_linear(e: Equations) -> bool:
-    """Whether rates and output are straight lines in states and input, the same at all times."""
+def _is_linear(e: Equations, forced: bool = False) -> bool:
+    """Whether rates and output are straight lines in states and input, the same at all times.
+
+    What is only added may change with time if the plant is allowed to be `forced`.
+    """
     if e.dt:
         return False
     both = casadi.vertcat(e.rhs, e.output)
     z = casadi.vertcat(e.x, e.u)
     bent = any(casadi.which_depends(both, z, 2, True))
-    return not bent and not any(casadi.which_depends(both, e.t, 1, True))
+    steady = casadi.vec(casadi.densify(casadi.jacobian(both, z))) if forced else both
+    return not bent and not any(casadi.which_depends(steady, e.t, 1, True))
 
 
 def _make_member(cls: type[AbstractEffect], loop: Any) -> AbstractEffect | None:

@@ -10,10 +10,18 @@ from .._base.arrays import Array
 from .context import Moment
 from .kinds import ForceEffect
 from .parameters import parameter
-from .scanning import Overview, Range, Scan, Sight
+from .scanning import (
+    Overview,
+    Range,
+    Scan,
+    Sight,
+    choose_middle_frequency,
+    compute_amplitude_and_phase,
+    find_visible_frequencies,
+    make_waves,
+    scan_line,
+)
 
-# Vibrations above this share of the sampling frequency are aliased.
-VISIBLE = 0.4
 # Wavelengths shorter than the travel over this number are not scanned, to save time.
 LENGTHS = 150
 # A wave is scanned if the motion is slow enough for it at this share of the samples.
@@ -28,28 +36,6 @@ MODES = 7
 SLOWEST_MODE = 5.0
 # A mode above this share of the sampling frequency does not show.
 FASTEST_MODE = 0.35
-
-
-def choose_middle_frequency(loop: Any, record: Any) -> float:
-    """Return a frequency [Hz] halfway, on a logarithmic scale, of what a record can show."""
-    samples = 1000 if record is None else len(record)
-    return math.sqrt(0.5 / samples) / float(loop.dt)
-
-
-def find_visible_frequencies(seen: Range) -> tuple[float, float]:
-    """Return the frequencies that samples show [Hz]: one period in the record, below Nyquist's."""
-    return 1.0 / seen.duration, VISIBLE / seen.dt
-
-
-def make_waves(angles: Array) -> Array:
-    """Return sine and cosine of each column of angles, side by side."""
-    both = np.stack([np.sin(angles), np.cos(angles)], axis=2)
-    return both.reshape(len(angles), -1)
-
-
-def compute_amplitude_and_phase(size: Array) -> tuple[float, float]:
-    """Return amplitude and phase of ``size[0] sin + size[1] cos``."""
-    return float(np.hypot(*size)), float(np.arctan2(size[1], size[0]))
 
 
 def _find_peaks(gains: Array, nearly: float, most: int) -> list[int]:
@@ -157,6 +143,7 @@ class ConstantForce(ForceEffect):
 
     look_alikes: ClassVar[tuple[str, ...]] = (
         "InputOffset", "InputSaturatingGain", "AsymmetricCoulombFriction", "PositionOffset",
+        "SensorGain", "SensorDrift",
     )  # fmt: skip
     sentence: ClassVar[str] = "A constant force acts in addition to those of the model."
     experiment: ClassVar[str] = (
@@ -201,7 +188,7 @@ class PeriodicForce(ForceEffect):
     private: ClassVar[tuple[str, ...]] = ("phase",)
     in_linear_model: ClassVar[bool] = False
     repeatable: ClassVar[bool] = True
-    look_alikes: ClassVar[tuple[str, ...]] = ("PositionRipple", "FlexibleMode")
+    look_alikes: ClassVar[tuple[str, ...]] = ("PositionRipple", "FlexibleMode", "SensorHum")
     sentence: ClassVar[str] = "A vibration at a fixed frequency acts on the plant."
     experiment: ClassVar[str] = (
         "a record at rest, and motion at two speeds: the frequency of a vibration is always the "
@@ -219,12 +206,7 @@ class PeriodicForce(ForceEffect):
 
     def scan(self, sight: Sight) -> Scan:
         """Look at the strongest line of the prediction errors."""
-        frequency = sight.strongest_line()
-        angles = [2 * np.pi * frequency * t for t in sight.times]
-        _, sizes = sight.score_shapes([make_waves(a[:, None]) for a in angles], width=2)
-        amplitude, phase = compute_amplitude_and_phase(sizes[0])
-        start = replace(self, amplitude=amplitude, frequency=frequency, phase=phase)
-        return Scan(((start,),), places=max(map(len, angles)) / 2)
+        return scan_line(self, sight)
 
     def spread_starts(self, sight: Overview) -> tuple[Self, ...]:
         """Return the strongest line in two phases."""

@@ -1,7 +1,7 @@
-"""Between the plant and the record: lags, curves, offsets and steps of the sensor."""
+"""Between the plant and the record: lags, scale, curves, offsets, drift, lines and steps."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Self, final
 
 import numpy as np
@@ -12,6 +12,14 @@ from .context import Moment
 from .input import find_range
 from .kinds import OutputEffect, ReadingEffect
 from .parameters import parameter
+from .scanning import (
+    Overview,
+    Range,
+    Scan,
+    Sight,
+    choose_middle_frequency,
+    scan_line,
+)
 
 # At a spread so many times the output every kink is smooth.
 SHIFTED_FAR = 1e6
@@ -140,6 +148,137 @@ class SensorOffset(OutputEffect):
     def output(self, m: Moment) -> Any:
         """Return the shifted reading."""
         return m.y + self.offset
+
+
+@final
+@dataclass(frozen=True)
+class SensorGain(OutputEffect):
+    r"""The sensor's scale is off: it reads a fixed share too much, from its zero on.
+
+    .. math:: y_s = (1 + \epsilon) y
+
+    Parameters
+    ----------
+    error : float
+        The relative error epsilon of the scale.
+
+    Examples
+    --------
+    >>> import ctrlid as cid
+    >>> print(cid.effects.SensorGain(error=0.03))
+    SensorGain: error = 0.03
+    """
+
+    error: float = parameter("", neutral=0.0)
+
+    look_alikes: ClassVar[tuple[str, ...]] = (
+        "ConstantForce", "SensorNonlinearity", "ForceExponent", "InputOffset",
+    )  # fmt: skip
+    sentence: ClassVar[str] = "The scale of the sensor is off."
+    experiment: ClassVar[str] = "reference measurements at two known positions"
+
+    def output(self, m: Moment) -> Any:
+        """Return the reading on the wrong scale."""
+        return (1 + self.error) * m.y
+
+
+@final
+@dataclass(frozen=True)
+class SensorDrift(OutputEffect):
+    r"""The zero of the sensor drifts steadily.
+
+    .. math:: y_s = y + \rho t
+
+    A sensor that warms up. The time t counts from the start of the record.
+
+    Parameters
+    ----------
+    rate : float
+        The drift rho [output unit/s].
+
+    Examples
+    --------
+    >>> import ctrlid as cid
+    >>> print(cid.effects.SensorDrift(rate=1e-6))
+    SensorDrift: rate = 1e-06 [y]/s
+    """
+
+    rate: float = parameter("{y}/s", neutral=0.0)
+
+    look_alikes: ClassVar[tuple[str, ...]] = ("ParameterDrift", "ConstantForce", "InputOffset")
+    sentence: ClassVar[str] = "The zero of the sensor drifts."
+    experiment: ClassVar[str] = (
+        "a reference measurement at one known position, at the beginning and at the end"
+    )
+
+    def output(self, m: Moment) -> Any:
+        """Return the drifting reading."""
+        return m.y + self.rate * m.t
+
+
+@final
+@dataclass(frozen=True)
+class SensorHum(OutputEffect):
+    r"""A line at a fixed frequency in the reading.
+
+    .. math:: y_s = y + A \sin(2 \pi f t + \varphi)
+
+    Mains hum in a cable or an amplifier.
+
+    Parameters
+    ----------
+    amplitude : float
+        The amplitude A [output unit].
+    frequency : float
+        Frequency f [Hz].
+    phase : float, optional
+        Phase at time zero [rad], private to a record.
+
+    Examples
+    --------
+    >>> import ctrlid as cid
+    >>> print(cid.effects.SensorHum(amplitude=1e-5, frequency=50.0))
+    SensorHum: amplitude = 1e-05 [y], frequency = 50 Hz, phase = 0 rad
+    """
+
+    amplitude: float = parameter("{y}", lower=0.0, neutral=0.0)
+    frequency: float = parameter("Hz", lower=1e-9, searched=True)
+    phase: float = parameter("rad", default=0.0)
+
+    private: ClassVar[tuple[str, ...]] = ("phase",)
+    in_linear_model: ClassVar[bool] = False
+    repeatable: ClassVar[bool] = True
+    look_alikes: ClassVar[tuple[str, ...]] = ("PeriodicForce", "PositionRipple")
+    sentence: ClassVar[str] = "A line at a fixed frequency, such as mains hum, is in the reading."
+    experiment: ClassVar[str] = (
+        "a record with the actuator off and the plant held still: a line that remains is the "
+        "sensor's"
+    )
+
+    @classmethod
+    def candidates(cls, loop: Any, record: Any = None) -> tuple[Self, ...]:
+        """Return a line of no amplitude; its frequency is to be scanned."""
+        return cls._applicable(loop, cls(0.0, choose_middle_frequency(loop, record)))
+
+    def limits(self, seen: Range) -> dict[str, tuple[float, float]]:
+        """Keep the frequency between one period in the record and half the sampling rate.
+
+        The reading is sampled as it is, while the mass that a force moves averages over a period.
+        """
+        return {"frequency": (1.0 / seen.duration, 0.5 / seen.dt)}
+
+    def scan(self, sight: Sight) -> Scan:
+        """Look at the strongest line of the prediction errors."""
+        return scan_line(self, sight, "output")
+
+    def spread_starts(self, sight: Overview) -> tuple[Self, ...]:
+        """Return the strongest line in two phases."""
+        line = sight.strongest_line()
+        return tuple(replace(self, frequency=line, phase=p) for p in (0.0, np.pi / 2))
+
+    def output(self, m: Moment) -> Any:
+        """Return the reading with the line in it."""
+        return m.y + self.amplitude * np.sin(2 * np.pi * self.frequency * m.t + self.phase)
 
 
 @final

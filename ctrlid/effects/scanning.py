@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Literal, Protocol
+
+import numpy as np
 
 from .._base.arrays import Array
 
@@ -12,6 +15,8 @@ if TYPE_CHECKING:
     from .base import AbstractEffect
 
 
+# Vibrations above this share of the sampling frequency are aliased.
+VISIBLE = 0.4
 # Quantiles of a signal that a limit may cut off, from the highest down.
 CUT_OFF = (0.999, 0.998, 0.995, 0.99, 0.98, 0.95, 0.9, 0.8)
 
@@ -80,8 +85,9 @@ class Sight(Overview, Protocol):
         """Return the fitted value of a free parameter of the plant, or None if it is not free."""
 
     def score_shapes(
-        self, shapes: Sequence[Array], parameter: str | None = None, width: int = 1
-    ) -> tuple[Array, Array]:
+        self, shapes: Sequence[Array], parameter: str | None = None, width: int = 1,
+        place: Literal["force", "output"] = "force",
+    ) -> tuple[Array, Array]:  # fmt: skip
         """Return what forces of given shapes would gain, and the sizes that gain it.
 
         Parameters
@@ -92,6 +98,8 @@ class Sight(Overview, Protocol):
             What is modulated: by default a force, else the named parameter of the plant.
         width : int, optional
             Neighbouring shapes that belong together, such as a sine and a cosine.
+        place : {"force", "output"}, optional
+            Whether the shapes are forces, or are added to the reading.
 
         Returns
         -------
@@ -125,3 +133,36 @@ class Scan:
     places: float = 1.0
     others: tuple[AbstractEffect, ...] = ()
     remark: str = ""
+
+
+def choose_middle_frequency(loop: Any, record: Any) -> float:
+    """Return a frequency [Hz] halfway, on a logarithmic scale, of what a record can show."""
+    samples = 1000 if record is None else len(record)
+    return math.sqrt(0.5 / samples) / float(loop.dt)
+
+
+def find_visible_frequencies(seen: Range) -> tuple[float, float]:
+    """Return the frequencies that samples show [Hz]: one period in the record, below Nyquist's."""
+    return 1.0 / seen.duration, VISIBLE / seen.dt
+
+
+def make_waves(angles: Array) -> Array:
+    """Return sine and cosine of each column of angles, side by side."""
+    both = np.stack([np.sin(angles), np.cos(angles)], axis=2)
+    return both.reshape(len(angles), -1)
+
+
+def compute_amplitude_and_phase(size: Array) -> tuple[float, float]:
+    """Return amplitude and phase of ``size[0] sin + size[1] cos``."""
+    return float(np.hypot(*size)), float(np.arctan2(size[1], size[0]))
+
+
+def scan_line(line: Any, sight: Sight, place: Literal["force", "output"] = "force") -> Scan:
+    """Return a wave of an effect with amplitude, frequency and phase at the strongest line."""
+    frequency = sight.strongest_line()
+    angles = [2 * np.pi * frequency * t for t in sight.times]
+    waves = [make_waves(a[:, None]) for a in angles]
+    _, sizes = sight.score_shapes(waves, width=2, place=place)
+    amplitude, phase = compute_amplitude_and_phase(sizes[0])
+    start = replace(line, amplitude=amplitude, frequency=frequency, phase=phase)
+    return Scan(((start,),), places=max(map(len, angles)) / 2)

@@ -8,7 +8,7 @@ import numpy as np
 from .context import Moment
 from .kinds import LawEffect
 from .parameters import parameter
-from .scanning import Overview, Scan, Sight
+from .scanning import Overview, Range, Scan, Sight
 
 # A step is not looked for in this share of the record at either end.
 EDGE = 0.05
@@ -51,7 +51,7 @@ class ParameterDrift(LawEffect):
     name: str
     rate: float = parameter("1/s", neutral=0.0)
 
-    look_alikes: ClassVar[tuple[str, ...]] = ("ParameterStep", "ConstantForce")
+    look_alikes: ClassVar[tuple[str, ...]] = ("ParameterStep", "ConstantForce", "SensorDrift")
     sentence: ClassVar[str] = "A parameter of the plant drifts, as in a coil that warms up."
     experiment: ClassVar[str] = "the same excitation at the beginning and at the end of a record"
 
@@ -92,7 +92,7 @@ class ParameterStep(LawEffect):
     """
 
     name: str
-    time: float = parameter("s", instant=True)
+    time: float = parameter("s", instant=True, searched=True)
     size: float = parameter("", neutral=0.0)
 
     look_alikes: ClassVar[tuple[str, ...]] = ("ParameterDrift", "ConstantForce")
@@ -108,6 +108,10 @@ class ParameterStep(LawEffect):
         return cls._applicable(
             loop, *(cls(name, half, 0.0) for name in _list_plant_parameters(loop))
         )
+
+    def limits(self, seen: Range) -> dict[str, tuple[float, float]]:
+        """Keep the instant within the record: outside, a step is a constant of the plant."""
+        return {"time": (0.0, seen.duration)}
 
     def scan(self, sight: Sight) -> Scan | None:
         """Look at instants over the record, ever closer around the best, down to one sample."""
