@@ -13,7 +13,7 @@ from scipy import signal, stats
 import ctrlid as cid
 import problems
 from ctrlid import effects as E
-from ctrlid.diagnosis import removal, replicas, selection
+from ctrlid.diagnosis import removal, replicas, screening, selection
 from ctrlid.diagnosis.candidates import _has_effect, contains
 from ctrlid.diagnosis.experiment import _can_survive, find_experiment
 from ctrlid.diagnosis.findings import Disturbance, Finding, Gap
@@ -54,6 +54,30 @@ def test_a_small_zone_is_found_from_a_large_start():
     assert trial.score > 0
     found = refit_candidate(base, trial)
     assert found.fitted.width == pytest.approx(0.004, rel=0.1)
+
+
+def test_a_candidate_that_the_values_of_another_exclude_fails_alone():
+    loop = drive()
+    record = record_of(loop, E.CoulombFriction(0.5), 0.3, 1e-3, 9330)
+    base = fit_base_model(loop, [record], loop.free)
+    middle, reach = float(np.mean(record.y)), float(np.ptp(record.y))
+    trial = screen_at(base, E.SensorSaturation(middle - reach, middle + reach))
+    assert trial.out is None
+    near = screen_at(base, E.SensorSaturation(middle + 2 * reach, np.inf)).model
+    refused = refit_candidate(base, trial, near)
+    assert refused.out.ground == "does not apply"
+    assert refused.net_gain == -np.inf
+
+
+def test_a_candidate_without_what_the_model_doubles_fails_alone(monkeypatch):
+    loop = drive()
+    record = record_of(loop, E.CoulombFriction(0.5), 0.3, 1e-3, 9330)
+    base = fit_base_model(loop, [record], loop.free)
+    # With this value in place of what the model doubles, the lower limit is above the upper one.
+    excluded = {"SensorSaturation.lower": 11.0}
+    monkeypatch.setattr(screening, "find_doubles", lambda *_: excluded)
+    refused = screen_at(base, E.SensorSaturation(-10.0, 10.0))
+    assert refused.out.ground == "does not apply"
 
 
 def test_what_contains_what():

@@ -36,10 +36,10 @@ def refit_candidate(base: Model, trial: Trial, near: Model | None = None) -> Tri
     if trial.out is not None:
         return trial
     loop, names = trial.model.loop, trial.model.names
-    if near is not None:
-        known = dict(zip(near.names, near.fit.theta.tolist(), strict=True))
-        loop = loop.with_parameters({n: known[n] for n in names if n in known})
     try:
+        if near is not None:
+            known = dict(zip(near.names, near.fit.theta.tolist(), strict=True))
+            loop = loop.with_parameters({n: known[n] for n in names if n in known})
         start = carry_over_fit(near or base, loop, names)
         starts = [start]
         if start.noise.parameters and start.problem.known is None and can_simulate(base):

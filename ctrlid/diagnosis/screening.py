@@ -67,13 +67,13 @@ def screen_at(base: Model, effect: AbstractEffect, scan_penalty: float = 0.0) ->
     names = (*base.names, *own)
     try:
         fit = carry_over_fit(base, loop, names)
-    except ModelCannotRun as reason:
+        doubled = find_doubles(fit, label, effect)
+        if doubled:
+            loop = loop.with_parameters(doubled)
+            names = tuple(n for n in names if n not in doubled)
+            fit = carry_over_fit(base, loop, names)
+    except (ModelCannotRun, EffectDoesNotApply) as reason:
         return Trial(effect, label, base, -math.inf, scan_penalty, out=Objection.of(reason))
-    doubled = find_doubles(fit, label, effect)
-    if doubled:
-        loop = loop.with_parameters(doubled)
-        names = tuple(n for n in names if n not in doubled)
-        fit = carry_over_fit(base, loop, names)
     model = Model(loop, fit)
     if not math.isfinite(fit.value):
         lost = Objection("cannot run", "cannot follow the record")
