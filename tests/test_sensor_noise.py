@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 from scipy import signal
-from scipy.linalg import toeplitz
+from scipy.linalg import expm, toeplitz
 
 import ctrlid as cid
 from ctrlid.estimation.likelihood.kalman_filter import Noise
@@ -13,16 +13,36 @@ from ctrlid.estimation.likelihood.likelihood import make_problem
 from ctrlid.estimation.likelihood.maximization import begin_fit, choose_sensor_noise, maximize
 
 
-def make_loop_and_record(b, a, n=1500):
+def simulate_servo(r, noise, dt=0.01, kp=20.0, kd=1.0, filter_time=0.02):
+    """Return reading and input of y" = 3 u - 2 y' with a PD that sees the noise, held exactly.
+
+    The transition is a matrix exponential: what interpolates the input between samples, as
+    scipy.signal.lsim does unless told otherwise, is another plant, with a large random force.
+    """
+    rates = np.array([[0.0, 1.0, 0.0], [0.0, -2.0, 3.0], [0.0, 0.0, 0.0]])
+    move = expm(rates * dt)
+    x, d, last = np.zeros(2), 0.0, r[0] - noise[0]
+    y, u = np.zeros(len(r)), np.zeros(len(r))
+    for k in range(len(r)):
+        y[k] = x[0] + noise[k]
+        e = r[k] - y[k]
+        d = (filter_time * d + kd * (e - last)) / (filter_time + dt)
+        u[k], last = kp * e + d, e
+        x = move[:2, :2] @ x + move[:2, 2] * u[k]
+    return y, u
+
+
+def make_loop_and_record(b, a, n=1500, seed=2):
     plant = cid.plants.servo(m=1.0, c=2.0, k=3.0)
     at = cid.OperatingPoint(states=(0.0, 0.0), input=0.0, output=0.0)
-    loop = cid.Loop(plant, cid.PID(kp=20.0, kd=1.0), dt=0.01, at=at, free=("k", "c"))
-    r = cid.random_binary(n, amplitude=0.1, hold=50, seed=1)
-    record = cid.simulate(loop, r, sensor_noise=0.0, seed=2)
-    noise = signal.lfilter(b, a, np.random.default_rng(2).standard_normal(n + 500))[500:]
+    law = cid.PID(kp=20.0, kd=1.0, filter_time=0.02)
+    loop = cid.Loop(plant, law, dt=0.01, at=at, free=("k", "c"))
+    rng = np.random.default_rng(seed)
+    r = np.repeat(rng.choice([-0.1, 0.1], n // 50), 50)
+    noise = signal.lfilter(b, a, rng.standard_normal(n + 500))[500:]
     noise *= 1e-4 / noise.std()
-    # The noise is added to the reading only: u is that of the exact output.
-    return loop, dataclasses.replace(record, y=np.array(record.y) + noise), noise
+    y, u = simulate_servo(r, noise)
+    return loop, cid.Record(r=r, u=u, y=y, dt=0.01), noise
 
 
 @pytest.mark.parametrize(
