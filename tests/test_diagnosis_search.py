@@ -660,7 +660,8 @@ def two_found():
     record = cid.simulate(real, r, sensor_noise=1e-4, seed=9471)
     base = fit_base_model(loop, [record], loop.free)
     kinds = (E.CoulombFriction, E.LinearStiffness)
-    return search_effects(base, kinds, lambda f, items: [f(x) for x in items], lambda text: None)
+    return search_effects(base, kinds, lambda f, items: [f(x) for x in items], lambda text: None,
+                          lambda model: False)  # fmt: skip
 
 
 def test_the_name_without_which_the_gap_is_narrowest_goes_first(two_found):

@@ -1,6 +1,7 @@
 """Coloured sensor noise in the likelihood, against theory and noise made by a filter."""
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
@@ -8,9 +9,14 @@ from scipy import signal
 from scipy.linalg import expm, toeplitz
 
 import ctrlid as cid
+from ctrlid._base.statistics import autocorrelation_time
+from ctrlid.diagnosis.fitted_model import Model
+from ctrlid.diagnosis.fresh_data import choose_fresh_data
+from ctrlid.diagnosis.gap_summary import compute_ratio_probability, make_size_test
 from ctrlid.estimation.likelihood.kalman_filter import Noise
 from ctrlid.estimation.likelihood.likelihood import make_problem
 from ctrlid.estimation.likelihood.maximization import begin_fit, choose_sensor_noise, maximize
+from ctrlid.estimation.likelihood.noise_fit import fit_noise
 
 
 def simulate_servo(r, noise, dt=0.01, kp=20.0, kd=1.0, filter_time=0.02):
@@ -86,3 +92,41 @@ def test_the_order_of_coloured_noise_is_found_and_white_stays_white(b, a, orders
     assert abs(np.mean(z[1:] * z[:-1])) < 4 / np.sqrt(len(z))
     error = (fit.theta - [3.0, 2.0]) / fit.standard_errors
     assert np.abs(error).max() < 4
+
+
+@pytest.mark.parametrize("controller", ["known", "unknown"])
+def test_noise_larger_than_the_gap_is_refused_and_true_noise_is_not(controller):
+    loop, record, _ = make_loop_and_record([1.0], [1.0, -0.9], seed=5)
+    if controller == "unknown":
+        loop = dataclasses.replace(loop, controller=None)
+    fit = maximize(begin_fit(make_problem(loop, ("k", "c"), [record])))
+    fit = choose_sensor_noise(fit)
+    assert not fit.noise.sensor_is_white
+    is_larger = make_size_test(choose_fresh_data(loop, [record], None))
+    assert not is_larger(Model(loop, fit))
+    # The same record with the noise three times as large as it is.
+    larger = dataclasses.replace(fit, sensor=9 * fit.sensor)
+    assert is_larger(Model(loop, larger))
+
+
+def test_the_size_test_keeps_its_level():
+    # Of true noise it refuses one in a hundred: seven of sixty would be a chance of 1e-5.
+    rng = np.random.default_rng(7)
+    refused = 0
+    for _ in range(60):
+        e = signal.lfilter([1.0], [1.0, -0.9], rng.standard_normal(900))[400:]
+        ratio = np.mean(e**2) * (1 - 0.81)
+        worth = len(e) / autocorrelation_time(e, 2)
+        refused += compute_ratio_probability(ratio, worth, math.inf) < 0.01
+    assert refused <= 6
+
+
+def test_holding_the_colour_fits_the_force_alone():
+    loop, record, _ = make_loop_and_record([1.0], [1.0, -0.8])
+    start = begin_fit(make_problem(loop, ("k", "c"), [record]), noise=Noise((1e2,), ar=(0.6,)))
+    held = fit_noise(start.problem, start.theta, start.linearized, start.noise, hold_colour=True)
+    free = fit_noise(start.problem, start.theta, start.linearized, start.noise)
+    assert held.noise.ar == pytest.approx((0.6,))
+    assert held.noise.force != start.noise.force
+    assert free.noise.ar[0] == pytest.approx(0.8, abs=0.05)
+    assert free.value > held.value > start.value

@@ -11,6 +11,11 @@ from .._base.errors import CtrlidError, ModelCannotRun
 from ..data.record import Record
 from ..estimation.likelihood.likelihood import Fit, Known, evaluate_likelihood, make_problem
 from ..estimation.likelihood.maximization import begin_fit, maximize
+from ..estimation.likelihood.prediction import (
+    compute_spread_ahead,
+    make_prediction,
+    predict_ahead,
+)
 from ..loop.loop import Loop
 from ..validation.reproduction import Reproduction, choose_reproduction
 from . import gap as gaps
@@ -86,6 +91,38 @@ class FreshData:
             z = here.standardized[0][window.mask]
             total += 0.5 * float(np.nansum(z**2 - 1))
         return max(total, 0.0)
+
+    def compare_noise(self, loops: Sequence[Loop], fit: Fit) -> tuple[list[Array], float]:
+        """Return the errors of loops in each window, and the RMS error that noise would give them.
+
+        The noise is that of the fit, as coloured as it is; the errors are those of a simulation, or
+        of predictions of the true output. NaN where the noise cannot be computed.
+        """
+        if not self.how.horizon:
+            usual = gaps.compute_floor(
+                loops, fit, self.windows, self.how, THRESHOLD.floor_more_runs
+            ).both
+            outputs = self.simulate_outputs(loops)
+            return [
+                (w.record.y - y)[w.mask & np.isfinite(y)]
+                for w, y in zip(self.windows, outputs, strict=True)
+            ], usual
+        known, horizon = Known(fit.noise, np.full(1, float(np.mean(fit.sensor)))), self.how.horizon
+        errors, squares, count = [], 0.0, 0
+        for loop, window in zip(loops, self.windows, strict=True):
+            plain, record = replace(loop, controller=None), window.record
+            problem = make_problem(plain, (), [record], [window.start_time])
+            try:
+                here = begin_fit(replace(problem, known=known))
+            except ModelCannotRun:
+                return [], math.nan
+            index, y = predict_ahead(plain, record, make_prediction(here), horizon)
+            use = window.mask[index] & np.isfinite(y)
+            errors.append((record.y[index] - y)[use])
+            spread = compute_spread_ahead(here.linearized[0], fit.noise, record.valid, horizon)
+            count += len(errors[-1])
+            squares += len(errors[-1]) * float(here.sensor[0]) * spread**2
+        return errors, math.sqrt(squares / max(count, 1))
 
 
 def choose_fresh_data(

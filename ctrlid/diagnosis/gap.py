@@ -219,7 +219,7 @@ def draw_noise(fit: Fit, sensor: float, n: int, seed: int) -> list[Array]:
     if not noise.sensor_is_white:
         # As many samples again let the noise begin anywhere in its stationary run.
         long = np.append(np.random.default_rng([seed, 1]).standard_normal(n), reading)
-        _, drive, _ = make_sensor_states(noise)
+        _, drive, _ = make_sensor_states(noise.ar, noise.ma)
         colour = [1.0, *noise.ma], [1.0, *(-v for v in noise.ar)]
         reading = drive[0] * signal.lfilter(*colour, long)[n:]
     return [reading * math.sqrt(sensor), force]

@@ -9,8 +9,14 @@ import numpy as np
 from .._base.criterion import bayesian_penalty
 from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from ..effects import AbstractEffect
+from ..estimation.likelihood.kalman_filter import Noise
 from ..estimation.likelihood.likelihood import Fit
-from ..estimation.likelihood.maximization import choose_sensor_noise
+from ..estimation.likelihood.maximization import (
+    choose_noise,
+    choose_sensor_noise,
+    maximize,
+    refit_noise_size,
+)
 from ..estimation.likelihood.noise_fit import compute_noise_criterion
 from .candidates import Trial, contains, list_missing_candidates
 from .fitted_model import Model, can_simulate, drop_linearization, with_linearization
@@ -51,7 +57,7 @@ class Search:
 
 def search_effects(
     base: Model, catalogue: Sequence[type[AbstractEffect]], work: Work,
-    tell: Callable[[str], None], first: Sequence[Round] = (),
+    tell: Callable[[str], None], is_larger: Callable[[Model], bool], first: Sequence[Round] = (),
 ) -> Search:  # fmt: skip
     """Add effects to a base model until nothing more earns a place, and drop what is superfluous.
 
@@ -65,6 +71,8 @@ def search_effects(
         ``work(function, items)``, a map that may run in parallel.
     tell : callable
         Told what is being done.
+    is_larger : callable
+        ``is_larger(model)``: whether the noise of a model exceeds what the model leaves.
     first : sequence of Round, optional
         The rounds that another search had taken when it changed a choice. This one goes on from
         there and takes nothing back.
@@ -91,7 +99,7 @@ def search_effects(
         tell(f"round {len(steps) + 1}: screening")
         pool = list_missing_candidates(model, catalogue)
         step = run_round(model, pool, work, None if steps else restore_given_values(base))
-        coloured = _prefer_sensor_noise(model, step.best)
+        coloured = _prefer_sensor_noise(model, step.best, is_larger)
         if coloured is not None:
             tell("coloured sensor noise")
             model, base = coloured, base if steps else coloured
@@ -116,10 +124,13 @@ def search_effects(
     return Search(base, tuple(steps), model, found, *tests, left)
 
 
-def _prefer_sensor_noise(model: Model, best: Trial | None) -> Model | None:
+def _prefer_sensor_noise(
+    model: Model, best: Trial | None, is_larger: Callable[[Model], bool]
+) -> Model | None:
     """Return the model with coloured sensor noise if that gains more than the best effect does.
 
-    Only where the innovations are not white noise, or a coloured force had to make them so.
+    Only where the innovations are not white noise, or a coloured force had to make them so, and
+    where the noise is not larger than the error that it explains.
     """
     fit = model.fit
     if fit.known is not None or not fit.noise.sensor_is_white:
@@ -136,7 +147,23 @@ def _prefer_sensor_noise(model: Model, best: Trial | None) -> Model | None:
     if best is not None:
         parameters = best.model.fit.noise.parameters - fit.noise.parameters
         more = max(0.0, best.net_gain - bayesian_penalty(parameters, fit.size))
-    return with_linearization(Model(model.loop, other)) if gain > more else None
+    if not gain > more or is_larger(Model(model.loop, other)):
+        return None
+    return with_linearization(Model(model.loop, other))
+
+
+def refuse_larger_noise(found: Search, is_larger: Callable[[Model], bool]) -> Search:
+    """Return the search with white sensor noise in the place of what exceeds the gap that it left.
+
+    Coloured noise that was chosen before the effects were found may be too large beside them.
+    """
+    fit = found.final.fit
+    if fit.noise.sensor_is_white or fit.known is not None or not is_larger(found.final):
+        return found
+    plain = refit_noise_size(maximize(replace(fit, noise=Noise(fit.noise.force))))
+    model = Model(found.final.loop, drop_linearization(choose_noise(plain)))
+    model, left = weigh_effects(model, len(found.base.loop.effects), found.steps)
+    return replace(found, final=model, found=left, after=retest_with_replicas(model))
 
 
 def choose_search(

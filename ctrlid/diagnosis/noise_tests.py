@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 from scipy import stats
@@ -64,6 +65,8 @@ class NoiseTests:
         return self.worst[1] > self.alpha
 
 
+# Several steps of a search ask the same fit.
+@lru_cache(maxsize=2)
 def run_noise_tests(fit: Fit) -> NoiseTests:
     """Test the innovations of a fit.
 

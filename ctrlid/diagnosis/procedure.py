@@ -21,8 +21,15 @@ from .candidates import check_catalogue
 from .findings import COMPLETE, Disturbance, Gap
 from .fitted_model import compute_penalized_likelihood
 from .fresh_data import FreshData, choose_fresh_data
-from .gap_summary import make_fresh_data_test, summarize_gap, take_back_widening
-from .growth import Search, choose_search, compare_names, keep_main_effects, search_effects
+from .gap_summary import make_fresh_data_test, make_size_test, summarize_gap, take_back_widening
+from .growth import (
+    Search,
+    choose_search,
+    compare_names,
+    keep_main_effects,
+    refuse_larger_noise,
+    search_effects,
+)
 from .log_errors import LogError, find_log_error
 from .open_loop_search import search_by_simulation
 from .recalibration import recalibrate
@@ -169,7 +176,9 @@ def _answer_question(q: Question) -> tuple[Diagnosis, Search]:
     q.tell("recalibrating", 1)
     base = recalibrate(readout.loop, readout.records, q.audits)
     # Steps 3 to 7: effects are screened, refitted, decided upon, added and dropped.
-    search = search_effects(base, q.catalogue, q.work, q.tell)
+    is_larger = make_size_test(q.fresh)
+    search = search_effects(base, q.catalogue, q.work, q.tell, is_larger)
+    search = refuse_larger_noise(search, is_larger)
     helps = make_fresh_data_test(q.fresh)
     if search.found or not search.after.passed:
         # A wrong sign or unit in the log makes the plant look as if almost anything were missing.
@@ -180,7 +189,8 @@ def _answer_question(q: Question) -> tuple[Diagnosis, Search]:
     if search.other and not search.after.passed:
         # Perhaps neither search explains the record; fresh data tell which of them leads further.
         q.tell("second search")
-        other = search_effects(base, q.catalogue, q.work, q.tell, search.other)
+        other = search_effects(base, q.catalogue, q.work, q.tell, is_larger, search.other)
+        other = refuse_larger_noise(other, is_larger)
         search = choose_search(search, other, helps, q.fresh.gap_of)
     # Step 3 again: what is left is tested with the steps of the converter in the replicas.
     q.tell("comparing on fresh data", 2)

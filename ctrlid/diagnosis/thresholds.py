@@ -407,6 +407,10 @@ class Thresholds:
         8, cost="the same where a gap stands out: loops that hunt differ from run to run",
         unit="runs",
     )  # fmt: skip
+    noise_too_large: float = declare_number(
+        0.01, convention="chance below which noise that leaves as little as the gap is refused, as "
+        "larger than the gap that it explains", unit="probability",
+    )  # fmt: skip
     phase_starts: int = declare_number(4, cost="phases from which that of a record is looked for",
                               unit="phases")  # fmt: skip
     helps: float = declare_number(

@@ -90,7 +90,7 @@ def run_filter(
     n, white = plant.size, noise.sensor_is_white
     force = np.asarray(noise.force, dtype=float)
     if not white:
-        lin, force = _append_sensor_noise(lin, force, noise)
+        lin, force = append_sensor_noise(lin, force, noise)
     states = lin.step.shape[1]
     out = filter_pass(
         lin.step, lin.a, lin.b, lin.du, np.ascontiguousarray(lin.dp[:, :, :p]), lin.output,
@@ -110,9 +110,9 @@ def run_filter(
                     disturbance)  # fmt: skip
 
 
-def _append_sensor_noise(lin: Linearized, force: Array, noise: Noise) -> tuple[Linearized, Array]:
+def append_sensor_noise(lin: Linearized, force: Array, noise: Noise) -> tuple[Linearized, Array]:
     """Return the plant with the sensor noise as further states, and the variances that drive it."""
-    move, drive, start = make_sensor_states(noise)
+    move, drive, start = make_sensor_states(noise.ar, noise.ma)
     n, channels = lin.step.shape[1], lin.b.shape[2]
     longer = _make_room(lin, len(move))
     a, b, spread = longer.a.copy(), longer.b.copy(), longer.spread.copy()
@@ -143,7 +143,8 @@ def _make_room(lin: Linearized, r: int) -> Linearized:
     )  # fmt: skip
 
 
-def make_sensor_states(noise: Noise) -> tuple[Array, Array, Array]:
+@lru_cache(maxsize=64)
+def make_sensor_states(ar: tuple[float, ...], ma: tuple[float, ...]) -> tuple[Array, Array, Array]:
     r"""Return coloured sensor noise of variance one as states, the first of which is the noise.
 
     .. math:: \alpha_{k+1} = T \alpha_k + R w_{k+1}, \quad P = T P T^T + R R^T, \quad P_{11} = 1
@@ -157,10 +158,10 @@ def make_sensor_states(noise: Noise) -> tuple[Array, Array, Array]:
     ----------
     Harvey, *Forecasting, Structural Time Series Models and the Kalman Filter* (1989), section 3.3.
     """
-    r = max(len(noise.ar), len(noise.ma) + 1)
+    r = max(len(ar), len(ma) + 1)
     move, drive = np.eye(r, k=1), np.zeros(r)
-    move[: len(noise.ar), 0] = noise.ar
-    drive[: len(noise.ma) + 1] = 1.0, *noise.ma
+    move[: len(ar), 0] = ar
+    drive[: len(ma) + 1] = 1.0, *ma
     start = linalg.solve_discrete_lyapunov(move, np.outer(drive, drive))
     size = max(float(start[0, 0]), 1e-300)
     return move, np.asarray(drive / np.sqrt(size)), np.asarray(0.5 * (start + start.T) / size)

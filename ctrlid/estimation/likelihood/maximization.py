@@ -95,27 +95,34 @@ def maximize(fit: Fit, rounds: int = ROUNDS, exact: bool = True) -> Fit:
     rounds : int, optional
         Steps at most.
     exact : bool, optional
-        Whether to end with steps on the likelihood itself.
+        Whether to end with steps on the likelihood itself, and to fit the colour of the sensor
+        noise along, which else stays.
 
     Returns
     -------
     Fit
         The maximum, or the best point found.
     """
+
+    def tune(fit: Fit) -> Fit:
+        return fit_noise(
+            fit.problem, fit.theta, fit.linearized, fit.noise, enough=enough, hold_colour=not exact
+        )
+
     tuned, far, enough = -math.inf, True, 0.02 if exact else 0.3
     for _ in range(rounds):
         # A short step was already evaluated along the trajectory of the pass before.
         again = relinearize_fit(fit) if far else fit
         fit = again if np.isfinite(again.value) else fit
         if fit.value > tuned + 2.0:
-            fit = fit_noise(fit.problem, fit.theta, fit.linearized, fit.noise, enough=enough)
+            fit = tune(fit)
             tuned = fit.value
         fit, length = _take_step(fit, *fit.normal)
         far = bool(length > RELINEARIZED_BEYOND)
         if length < (CONVERGED_STEP if exact else 5 * CONVERGED_STEP):
             if fit.value <= tuned + 2.5 * enough:
                 break
-            fit = fit_noise(fit.problem, fit.theta, fit.linearized, fit.noise, enough=enough)
+            fit = tune(fit)
             tuned = fit.value
     return polish_fit(fit) if exact else fit
 

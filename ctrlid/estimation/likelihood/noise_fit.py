@@ -33,15 +33,23 @@ ORDERS = 2, 3
 
 def fit_noise(
     problem: Problem, theta: Array, lins: Sequence[Linearized], noise: Noise, wide: bool = False,
-    enough: float = 0.02,
+    enough: float = 0.02, hold_colour: bool = False,
 ) -> Fit:  # fmt: skip
-    """Return the most likely noise for parameters as they are."""
+    """Return the most likely noise for parameters as they are.
+
+    With `hold_colour` the coefficients of coloured sensor noise stay: each of them is a direction
+    more of the search, and they hardly move from one candidate to the next.
+    """
     plant, dt = problem.plant, problem.plant.loop.dt
     if problem.known is not None:
         return evaluate_linearized(problem, theta, problem.known.noise, lins)
 
+    held = len(noise.ar) + len(noise.ma) if hold_colour else 0
+    start = compute_noise_logs(noise, dt)
+    start, colour = np.split(start, [len(start) - held])
+
     def at(logs: Array) -> Noise:
-        return make_noise(logs, noise, dt)
+        return make_noise(np.append(logs, colour), noise, dt)
 
     def cost(logs: Array) -> float:
         value = evaluate_linearized(
@@ -49,9 +57,8 @@ def fit_noise(
         ).value
         return -value if np.isfinite(value) else 1e15
 
-    start = compute_noise_logs(noise, dt)
     longest = max(len(data.record) for data in problem.data)
-    low, high = _bound_logs(plant, noise, longest)
+    low, high = (ends[: len(start)] for ends in _bound_logs(plant, noise, longest))
     start = np.clip(start, low, high)
     if wide:
         grid = np.linspace(low[0], high[0], 20)

@@ -18,9 +18,10 @@ from ...data.several_records import order_model_and_data
 from ...data.validity import find_whole_past
 from ...loop.loop import Loop
 from .filter_data import find_noise_units
-from .kalman_filter import Noise
-from .likelihood import make_problem
+from .kalman_filter import Noise, append_sensor_noise
+from .likelihood import Fit, make_problem
 from .maximization import begin_fit, maximize
+from .sampled_plant import Linearized
 
 # The covariance of the filter has converged after so many horizons.
 LEAD = 4
@@ -128,18 +129,23 @@ def predict(loop: Loop, record: Record, force_noise: float | None = None) -> Pre
                           f"given {force_noise!r}")  # fmt: skip
     loop = _drop_neutral_effects(loop)
     problem = make_problem(loop, (), [record])
-    plant = problem.plant
     if force_noise is None:
         fit = maximize(begin_fit(problem))
     else:
-        noise = Noise((max(force_noise, 1e-150) ** 2,) * plant.channels)
+        noise = Noise((max(force_noise, 1e-150) ** 2,) * problem.plant.channels)
         fit = begin_fit(problem, noise=noise)
+    return make_prediction(fit)
+
+
+def make_prediction(fit: Fit) -> Prediction:
+    """Return the one-step predictions of the only record of a fit."""
+    plant, record = fit.plant, fit.data[0].record
     out, sensor = fit.filtered[0], float(np.sqrt(fit.sensor[0]))
     states = out.trajectory.filtered
     return Prediction(
         record.y - out.innovations, out.innovations, fit.counts[0],
         sensor * np.sqrt(out.variance), states[:, : plant.n], states[:, plant.n :], sensor,
-        sensor * float(np.sqrt(fit.noise.force[0])), find_noise_units(loop, record),
+        sensor * float(np.sqrt(fit.noise.force[0])), find_noise_units(plant.loop, record),
     )  # fmt: skip
 
 
@@ -225,22 +231,60 @@ def predict_spread(
     problem = make_problem(plain, (), [record])
     noise = Noise((ratio,) * problem.plant.channels)
     lin = begin_fit(problem, noise=noise).linearized[0]
+    both, sensor = (
+        compute_spread_ahead(lin, Noise((v,) * problem.plant.channels), record.valid, horizon)
+        for v in (force / r if r else 0.0, 0.0)
+    )
+    return math.sqrt(r) * both, math.sqrt(r) * sensor
+
+
+def compute_spread_ahead(lin: Linearized, noise: Noise, valid: Any, horizon: int) -> float:
+    r"""Return the root mean square error that noise gives predictions of the true output.
+
+    .. math:: \sigma^2 = h P h^T + R + \operatorname{var} \hat n
+
+    from the covariance P of the filtered states, carried over so many samples. What of coloured
+    sensor noise n is foreseen, :math:`\hat n`, is not in a prediction of the true output.
+
+    Parameters
+    ----------
+    lin : Linearized
+        The plant along a record.
+    noise : Noise
+        The noise, coloured or white; a coloured force has no part in it.
+    valid : ndarray of bool
+        Samples of the record that are valid.
+    horizon : int
+        Number of samples ahead.
+
+    Returns
+    -------
+    float
+        The error in standard deviations of the sensor noise; NaN where no stretch is long enough.
+    """
+    force, r, n = np.asarray(noise.force), 1.0, lin.a.shape[1]
+    p = np.eye(n)
+    if not noise.sensor_is_white:
+        # Such noise is a state that is measured exactly.
+        r = 0.0
+        lin, force = append_sensor_noise(lin, force, noise)
+        p = np.array(lin.spread)
+        p[:n, :n] = np.eye(n)
     lead = int(np.clip(LEAD * horizon, 50, 500))
-    starts = np.arange(0, len(record) - lead - horizon, max(1, len(record) // STARTS))
-    starts = starts[find_whole_past(record.valid, lead + horizon)[starts + lead + horizon]]
+    size = len(lin.output)
+    starts = np.arange(0, size - lead - horizon, max(1, size // STARTS))
+    starts = starts[find_whole_past(valid, lead + horizon)[starts + lead + horizon]]
     if not len(starts):
-        return math.nan, math.nan
-    found = []
-    for variance in (force, 0.0):
-        p = np.broadcast_to(r * np.eye(lin.a.shape[1]), (len(starts), *lin.a.shape[1:]))
-        for j in range(lead + horizon):
-            k = starts + j
-            if j <= lead:
-                h = lin.c[k][:, None, :]
-                seen = p @ h.transpose(0, 2, 1)
-                p = p - seen @ seen.transpose(0, 2, 1) / np.maximum(h @ seen + r, 1e-300)
-            a, b = lin.a[k], lin.b[k]
-            p = a @ p @ a.transpose(0, 2, 1) + variance * (b @ b.transpose(0, 2, 1))
-        h = lin.c[starts + lead + horizon][:, None, :]
-        found.append(math.sqrt(float(np.mean(h @ p @ h.transpose(0, 2, 1))) + r))
-    return found[0], found[1]
+        return math.nan
+    p = np.broadcast_to(p, (len(starts), *p.shape))
+    for j in range(lead + horizon):
+        k = starts + j
+        if j <= lead:
+            h = lin.c[k][:, None, :]
+            seen = p @ h.transpose(0, 2, 1)
+            p = p - seen @ seen.transpose(0, 2, 1) / np.maximum(h @ seen + r, 1e-300)
+        a, b = lin.a[k], lin.b[k]
+        p = a @ p @ a.transpose(0, 2, 1) + (b * force) @ b.transpose(0, 2, 1)
+    h = lin.c[starts + lead + horizon][:, None, :]
+    foreseen = 0.0 if noise.sensor_is_white else 1 - float(np.mean(p[:, n, n]))
+    return math.sqrt(float(np.mean(h @ p @ h.transpose(0, 2, 1))) + r + foreseen)
