@@ -136,8 +136,8 @@ HOLES = np.array([0.0, np.nan, 1.0, np.inf])
         ({"dt": True}, "a finite number; given True"),
         ({"start": np.nan}, "start is the time of sample 0 in seconds, a finite number; given nan"),
         ({"start": "now"}, "a finite number; given 'now'"),
-        ({"hold": "linear"}, r"hold must be 'zoh' \(held between samples\) or 'foh' \(straight\); "
-                             "given 'linear'"),
+        ({"hold": "linear"}, r"hold must be 'zoh' \(held between samples\), 'foh' \(straight\) or "
+                             "'bandlimited'; given 'linear'"),
         ({"valid": np.ones(N)}, r"valid must be 40 booleans, one per sample; given float64 of "
                                 r"shape \(40,\). A comparison makes booleans"),
         ({"valid": [True]}, r"given bool of shape \(1,\)"),

@@ -18,7 +18,7 @@ from . import responses as _response
 from .field_checks import check_samples, check_seconds, check_words
 from .validity import find_runs, find_whole_past
 
-Hold = Literal["zoh", "foh"]
+Hold = Literal["zoh", "foh", "bandlimited"]
 SIGNALS = ("r", "u", "y")
 # Columns of a CSV file have these names, so that no extra channel may.
 RESERVED = (*SIGNALS, "t", "time", "valid")
@@ -40,9 +40,11 @@ class Record(Printed):
         Sampling period [s].
     r : array_like, shape (n,), optional
         Reference [output unit], if it was logged.
-    hold : {"zoh", "foh"}, optional
-        How u runs between samples: held, as a digital controller does, or straight, as a smooth
-        analog signal nearly does.
+    hold : {"zoh", "foh", "bandlimited"}, optional
+        How u runs between samples: held, as a digital controller does; straight, as a smooth
+        analog signal nearly does; or as the samples of a measured signal say that has nothing above
+        half the sampling rate, which takes later samples and so holds only where u does not react
+        to y.
     extra : mapping of str to array_like, optional
         Further measured channels [as in `units`], for instance a coil current.
     valid : array_like of bool, shape (n,), optional
@@ -108,8 +110,8 @@ class Record(Printed):
         if dt <= 0:
             raise CtrlidError(f"dt is the sampling period in seconds, > 0; given {self.dt!r}")
         if self.hold not in get_args(Hold):
-            raise CtrlidError(f"hold must be 'zoh' (held between samples) or 'foh' (straight); "
-                              f"given {self.hold!r}")  # fmt: skip
+            raise CtrlidError(f"hold must be 'zoh' (held between samples), 'foh' (straight) or "
+                              f"'bandlimited'; given {self.hold!r}")  # fmt: skip
         valid = np.ones(n, dtype=bool) if self.valid is None else np.array(self.valid)
         if valid.dtype != bool or valid.shape != (n,):
             raise CtrlidError(
@@ -242,7 +244,7 @@ class Record(Printed):
         relation. It passes what is below two thirds of the new Nyquist frequency and takes 50 dB
         off what is above the new Nyquist frequency. A sample counts only where all 20 q + 1
         samples under the filter count, which costs 10 slow samples at either end. An input that
-        was held is smooth afterwards, so `hold` becomes ``"foh"``.
+        was held is smooth afterwards, so `hold` becomes ``"foh"``; a band-limited one stays so.
 
         Parameters
         ----------
@@ -295,7 +297,8 @@ class Record(Printed):
             around = np.pad(s - s[0], half, mode="reflect", reflect_type="odd")
             return s[0] + signal.fftconvolve(around, taps, "valid")[::q]
 
-        return self._change_channels(filtered, valid=valid, dt=self.dt * q, hold="foh")
+        hold = "foh" if self.hold == "zoh" else self.hold
+        return self._change_channels(filtered, valid=valid, dt=self.dt * q, hold=hold)
 
     def with_input(self, channel: str) -> "Record":
         """Return the record with an extra channel as input; the old input becomes an extra one.

@@ -111,22 +111,25 @@ def _require_same_kind(first: Record, record: Record) -> None:
         )
 
 
-def measure_input_motion(records: Sequence[Record]) -> float:
+def measure_input_motion(records: Sequence[Record], reconstructed: bool = True) -> float:
     """Return how far u moves from sample to sample where it is not held, as share of its spread.
 
     Parameters
     ----------
     records : sequence of Record
         The experiments.
+    reconstructed : bool, optional
+        Whether the motion of a band-limited input is known between the samples, and no error.
 
     Returns
     -------
     float
-        Zero for held inputs; above `VISIBLE_MOTION` a hold assumption shows in the poles.
+        Zero for held inputs, and for reconstructed ones where that counts; above `VISIBLE_MOTION`
+        a hold assumption shows in the poles.
     """
     shares = [0.0]
     for record in records:
         spread = float(np.std(record.u))
-        if record.hold == "foh" and spread:
+        if (record.hold == "foh" or (record.hold != "zoh" and not reconstructed)) and spread:
             shares.append(float(np.std(np.diff(record.u))) / spread)
     return max(shares)

@@ -11,6 +11,7 @@ import numpy as np
 
 from .._base.arrays import Array
 from .._base.errors import EffectDoesNotApply, ModelCannotRun
+from ..data.reconstruction import count_pieces
 from ..physics.equations import Equations
 from ..physics.integration import Piece, Scheme, advance, count_delay_samples, cut_input, integrate
 from .loop import Loop
@@ -22,7 +23,8 @@ class PeriodMap:
 
     ``step(z, w) -> (next z, y, u, local error)``; z stacks plant and controller states, then what
     the input remembers; w is ``(t, r, d, sensor noise, force noise, next d)``, all held over the
-    period but for an input without controller that runs straight from d to the next d.
+    period but for an input without controller that runs straight from d to the next d. For a
+    band-limited input the corners of its pieces, the next sample last, stand in place of next d.
     ``rate(z, w)`` is the derivative of z for a loop with an analog controller, else None.
     """
 
@@ -41,7 +43,7 @@ def make_period_map(loop: Loop, substeps: int, hold: str = "zoh") -> PeriodMap:
         The loop.
     substeps : int
         Integration steps in a period.
-    hold : {"zoh", "foh"}, optional
+    hold : {"zoh", "foh", "bandlimited"}, optional
         How the input of a loop without controller runs between samples. A digital controller holds
         its input, and an analog one moves it by its own law.
 
@@ -57,12 +59,16 @@ def make_period_map(loop: Loop, substeps: int, hold: str = "zoh") -> PeriodMap:
     """
     e, law = loop.equations(), loop.law()
     n, nc = len(e.states), len(law.rest) if law else 0
-    late = count_delay_samples(e, loop.dt)
+    pieces = 1 if law else count_pieces(hold)
+    late = count_delay_samples(e, loop.dt / pieces)
     # What the input remembers: the backlash, then the inputs of the last samples.
     kept = 0 if e.delay is None else late + 1
     size = n + nc + (e.play is not None) + kept
-    z, w = casadi.SX.sym("z", size), casadi.SX.sym("w", 6)
-    t0, r, d, sensor, force, next_d = casadi.vertsplit(w)
+    # Corners of a band-limited input follow the signals that are held; else the next sample does.
+    corners = pieces + 1 if pieces > 1 else 1
+    z, w = casadi.SX.sym("z", size), casadi.SX.sym("w", 5 + corners)
+    t0, r, d, sensor, force, *path = casadi.vertsplit(w)
+    path = path if pieces > 1 else [d, *path]
     held_rate = casadi.SX.zeros(n, 1)
     for j in e.velocities or (range(n) if e.dt == 0 else ()):
         held_rate[j] = force
@@ -106,22 +112,34 @@ def make_period_map(loop: Loop, substeps: int, hold: str = "zoh") -> PeriodMap:
         slope = casadi.Function("rate", [z, w], [rate(0.0, z)])
         after, error = integrate(rate, z, loop.dt, substeps)
     else:
-        applied, memory = apply_backlash(e, z[n + nc] if e.play is not None else None, u, p)
+        memory: Any = z[n + nc] if e.play is not None else None
+        wanted = [u] if pieces == 1 else [limit_input(at.input + value) for value in path[:-1]]
+        applied = []
+        for value in wanted:
+            behind, memory = apply_backlash(e, memory, value, p)
+            applied.append(behind)
         past = [z[k] for k in range(size - kept, size)]
         hold = "zoh" if law else hold
-        ahead = apply_backlash(e, memory, limit_input(at.input + next_d), p)[0]
+        ahead = apply_backlash(e, memory, limit_input(at.input + path[-1]), p)[0]
         # The inputs from the oldest that is remembered to the one of the next sample.
-        known = [*reversed(past), applied, ahead if hold == "foh" else applied]
-        path = known[:3] if kept else [applied, *known]
-        pieces = _insert_values(e, cut_input(e, loop.dt, path, hold), p)
+        known = [*reversed(past), *applied, ahead if hold != "zoh" else applied[-1]]
+        known = known if kept else [applied[0], *known]
+        straight = [
+            piece
+            for k in range(pieces)
+            for piece in cut_input(e, loop.dt / pieces, known[k : k + 3], hold)
+        ]
         scheme = Scheme(8, substeps, sharp=(8, substeps))
-        x, error = advance(e, t0, z[:n], pieces, p, None, held_rate, scheme=scheme)
+        x, error = advance(
+            e, t0, z[:n], _insert_values(e, straight, p), p, None, held_rate, scheme=scheme
+        )
         after = casadi.vertcat(x, moved, memory)
         if kept:
-            after = casadi.vertcat(after, applied, *past[: kept - 1])
+            after = casadi.vertcat(after, *[*reversed(applied), *past][:kept])
         error = casadi.vertcat(error, casadi.SX.zeros(size - n, 1))
     rest = [*at.states, *(law.rest if law else ())]
-    input_at_rest, memory = at.input, []
+    input_at_rest = at.input
+    memory = []
     if e.play is not None:
         start = casadi.substitute(casadi.vertcat(e.play.start), casadi.vertcat(e.play.u, e.p),
                                   casadi.vertcat(at.input, p))  # fmt: skip
@@ -154,10 +172,10 @@ def _insert_values(e: Equations, pieces: Sequence[Piece], p: Any) -> list[Piece]
 
 def linearize_at_rest(s: PeriodMap, reference: float, function: Any) -> tuple[Array, Array]:
     """Return the derivatives of a function (step, rate) by state and signals at rest."""
-    z, w = casadi.SX.sym("z", len(s.rest)), casadi.SX.sym("w", 6)
+    z, w = casadi.SX.sym("z", len(s.rest)), casadi.SX.sym("w", s.step.size1_in(1))
     first = function.call([z, w])[0]
     both = casadi.Function("j", [z, w], [casadi.jacobian(first, z), casadi.jacobian(first, w)])
-    a, b = both(s.rest, [0.0, reference, 0.0, 0.0, 0.0, 0.0])
+    a, b = both(s.rest, [0.0, reference, *[0.0] * (w.shape[0] - 2)])
     return np.asarray(a, float), np.asarray(b, float)
 
 

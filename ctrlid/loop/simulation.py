@@ -9,6 +9,7 @@ import numpy as np
 
 from .._base.arrays import Array
 from .._base.errors import CtrlidError, CtrlidWarning, ModelCannotRun
+from ..data.reconstruction import PIECES, count_pieces, reconstruct_signal
 from ..data.record import Record
 from .loop import Loop
 from .period_map import compute_growth_rate, linearize_at_rest, make_period_map
@@ -166,7 +167,7 @@ class Simulator:
         Local error of a step, relative to the excursion of each state.
     most : int, optional
         Integration steps per period at most.
-    hold : {"zoh", "foh"}, optional
+    hold : {"zoh", "foh", "bandlimited"}, optional
         How the input of a loop without controller runs between samples.
     """
 
@@ -193,7 +194,9 @@ class Simulator:
             np.nan_to_num(np.abs(m))
             for m in linearize_at_rest(first, loop.point.output, first.step)
         )
-        self._floor = 1e-6 * (a @ np.abs(self.rest) + (b[:, 2] + b[:, 5]) * abs(loop.point.input))
+        self._floor = 1e-6 * (
+            a @ np.abs(self.rest) + (b[:, 2] + b[:, 5:].sum(axis=1)) * abs(loop.point.input)
+        )
 
     def start(self, initial: Sequence[float] | None) -> Array:
         """Return the state to start from: at rest, or with the given values."""
@@ -216,6 +219,14 @@ class Simulator:
             self._runners[key] = self._steps[substeps].mapaccum("run", size)
         return self._runners[key]
 
+    def _find_path(self, d: Array) -> Array:
+        """Return how d runs on within each period: the next sample, or the corners until there."""
+        following = np.append(d[1:], d[-1])
+        if self.loop.controller is not None or count_pieces(self.hold) == 1:
+            return following[None]
+        corners = reconstruct_signal(d).reshape(-1, PIECES)
+        return np.vstack([corners.T, np.append(corners[1:, 0], following[-1])])
+
     def run(
         self, z: Array, r: Array | None, d: Array, noise: Sequence[Array] | None = None,
         start_time: float = 0.0,
@@ -227,7 +238,7 @@ class Simulator:
         loop, n = self.loop, d.size
         quiet = np.zeros(n)
         w = np.vstack([start_time + np.arange(n) * loop.dt, quiet if r is None else r, d,
-                       *(noise or (quiet, quiet)), np.append(d[1:], d[-1])])  # fmt: skip
+                       *(noise or (quiet, quiet)), self._find_path(d)])  # fmt: skip
         y, u = np.empty(n), np.empty(n)
         start, reach = z, self._floor
         substeps, size = 1, min(CHUNK, n)

@@ -132,8 +132,9 @@ def cut_input(e: Equations, dt: float, path: Sequence[Any], hold: str) -> list[P
         Sampling period T [s].
     path : sequence of 3 expressions
         The input at the samples k - l - 1, k - l and k - l + 1.
-    hold : {"zoh", "foh"}
-        How the input runs between samples.
+    hold : {"zoh", "foh", "bandlimited"}
+        How the input runs between samples: held or straight. A band-limited one is straight
+        between many closer samples.
 
     Returns
     -------
@@ -141,7 +142,7 @@ def cut_input(e: Equations, dt: float, path: Sequence[Any], hold: str) -> list[P
         Duration [s], input at the start of the piece, slope [1/s].
     """
     before, now, ahead = path
-    slopes = [(now - before) / dt, (ahead - now) / dt] if hold == "foh" else [0.0, 0.0]
+    slopes = [(now - before) / dt, (ahead - now) / dt] if hold != "zoh" else [0.0, 0.0]
     if e.delay is None:
         return [(dt, now, slopes[1])]
     late = substitute_delay(e, e.p) / dt - count_delay_samples(e, dt)

@@ -16,6 +16,13 @@ from ..estimation.likelihood.physics_estimate import LoopFit
 from ..physics.trace import timebase
 from ..validation.comparison import Comparison
 
+# What u does between the samples, by the record's hold.
+BETWEEN = {
+    "zoh": "is held",
+    "foh": "is a straight line",
+    "bandlimited": "is reconstructed as a band-limited signal",
+}
+
 
 @dataclass(frozen=True, repr=False)
 class Table(_text.Printed):
@@ -135,7 +142,7 @@ def _make_record_table(record: Record) -> Table:
         for name, unit, v in channels
     )
     valid = "" if record.valid.all() else f", {100 * record.valid.mean():.1f} % of them valid"
-    between = "is held" if record.hold == "zoh" else "is a straight line"
+    between = BETWEEN[record.hold]
     caption = (
         f"{len(record)} samples at {record.dt:g} s, {record.duration:.4g} s in all{valid}; "
         f"u {between} between samples."

@@ -18,7 +18,7 @@ from ..data.validity import find_whole_past
 from ..estimation.identified_model import IdentifiedModel, read_delay
 from ..estimation.likelihood.filter_data import FEWEST
 from ..estimation.likelihood.prediction import Prediction, predict, predict_ahead, predict_spread
-from ..estimation.linear.sampled_motion import discretize_model
+from ..estimation.linear.sampled_motion import discretize_model, list_inputs
 from ..loop.loop import Loop
 from ..loop.period_map import compute_growth_rate
 from ..loop.simulation import Simulator
@@ -198,8 +198,11 @@ def _run_with_noise(simulator: Simulator, stretch: Stretch, prediction: Predicti
         return unknown
 
 
-def _sample_model(model: Any, record: Record, delay: float) -> tuple[Array, Array]:
-    """Return the polynomials in z of a continuous model, its input held and late."""
+def _sample_model(model: Any, record: Record, delay: float) -> tuple[dict[str, Array], Array]:
+    """Return the polynomials in z of a continuous model, its input as the record has it and late.
+
+    A band-limited input has a numerator for each of its corners.
+    """
     if delay and record.hold != "zoh":
         model, delay = model.with_delay(), 0.0
     a, b, c, d = to_state_matrices(model)
@@ -207,10 +210,11 @@ def _sample_model(model: Any, record: Record, delay: float) -> tuple[Array, Arra
     columns = np.column_stack([column for *_, column in motion.inputs])
     paths, den = to_polynomials(motion.f, columns, motion.c[None], np.zeros((1, columns.shape[1])))
     late = max(lag for _, lag, _ in motion.inputs)
-    num: Array = float(d[0, 0]) * den
-    for (_, lag, _), path in zip(motion.inputs, paths, strict=True):
-        num = np.asarray(np.polyadd(num, np.append(path[1:], np.zeros(late - lag))), dtype=float)
-    return num, np.append(den, np.zeros(late))
+    nums: dict[str, Array] = {"u": float(d[0, 0]) * den}
+    for (name, lag, _), path in zip(motion.inputs, paths, strict=True):
+        more = np.append(path[1:], np.zeros(late - lag))
+        nums[name] = np.asarray(np.polyadd(nums.get(name, np.zeros(1)), more), dtype=float)
+    return nums, np.append(den, np.zeros(late))
 
 
 def _compare_model(record: Record, model: Any, horizon: int | None) -> Comparison:
@@ -229,10 +233,14 @@ def _compare_model(record: Record, model: Any, horizon: int | None) -> Compariso
     delay = read_delay(model)
     what += f", delay {write_number(delay, 4)} s)" if delay else ")"
     if not dt:
-        num, den = _sample_model(model, record, delay)
+        nums, den = _sample_model(model, record, delay)
     else:
         num, den = (np.asarray(p[0][0], float) for p in (model.num, model.den))
-    num = np.concatenate([np.zeros(len(den) - len(num)), num]) / den[0]
+        nums = {"u": num}
+    nums = {
+        name: np.concatenate([np.zeros(len(den) - len(num)), num]) / den[0]
+        for name, num in nums.items()
+    }
     den = den / den[0]
     order = len(den) - 1
     valid = np.asarray(record.valid)
@@ -245,7 +253,8 @@ def _compare_model(record: Record, model: Any, horizon: int | None) -> Compariso
         )
     y0, u0 = float(np.mean(record.y[valid])), float(np.mean(record.u[valid]))
     y, u = record.y - y0, record.u - u0
-    driven = np.convolve(u, num)[: len(u)]
+    signals = list_inputs(u, record.hold, valid)
+    driven = np.sum([np.convolve(signals[k], num)[: len(u)] for k, num in nums.items()], axis=0)
     error = np.convolve(y, den)[: len(y)] - driven
     constant = float(np.mean(error[usable]))
     error = np.where(usable, error - constant, 0.0)

@@ -7,6 +7,7 @@ import numpy as np
 
 from ..._base.arrays import Array
 from ..._base.errors import CtrlidError, ModelCannotRun
+from ...data.reconstruction import count_pieces, reconstruct_signal
 from ...data.record import Record
 from ...loop.loop import Loop
 from ...physics.equations import Equations
@@ -29,6 +30,9 @@ class FilterData:
     t, u, r, y : ndarray, shape (n,)
         Time since the start of the experiment [s], input, reference (without one the output) and
         output, each held where the record is not valid.
+    path : ndarray, shape (n,) or (n * PIECES,)
+        The input between the corners of which it runs straight: u itself, or for a band-limited
+        one closer points.
     valid, restart : ndarray of bool, shape (n,)
         Samples that are valid; samples at which the filter starts anew.
     input_variance : ndarray, shape (n,)
@@ -44,6 +48,7 @@ class FilterData:
     u: Array
     r: Array
     y: Array
+    path: Array
     valid: Any
     restart: Any
     input_variance: Array
@@ -63,8 +68,17 @@ def make_filter_data(loop: Loop, record: Record, start_time: float = 0.0) -> Fil
     Raises
     ------
     CtrlidError
-        If the sampling periods differ or too few samples are valid.
+        If the sampling periods differ, too few samples are valid, or the input of a loop with a
+        controller is said to be band-limited.
     """
+    if record.hold == "bandlimited" and loop.controller is not None:
+        raise CtrlidError(
+            "hold='bandlimited' reconstructs u between the samples from later ones as well, and "
+            "under feedback these contain the noise of y. The loop has a controller: give the "
+            "record hold='zoh' for a digital or hold='foh' for an analog one, as in "
+            "dataclasses.replace(record, hold='zoh'), or a Loop without controller if u did not "
+            "react to y"
+        )
     if abs(loop.dt - record.dt) > 1e-9 * loop.dt:
         raise CtrlidError(f"the loop is sampled at {loop.dt:g} s, the record at {record.dt:g} s; "
                           "give both the same period")  # fmt: skip
@@ -81,12 +95,14 @@ def make_filter_data(loop: Loop, record: Record, start_time: float = 0.0) -> Fil
     start, spread, scale = _guess_initial_state(loop, record)
     input_variance = np.where(valid, 0.0, (np.std(record.u[valid]) / scale) ** 2)
     t = start_time + record.t - record.start
+    path = u if count_pieces(record.hold) == 1 else reconstruct_signal(u, valid)
     return FilterData(
         record,
         t,
         u,
         r,
         y,
+        path,
         valid,
         find_segment_starts(loop, record),
         input_variance,

@@ -12,6 +12,7 @@ import casadi
 import numpy as np
 
 from ..._base.arrays import Array
+from ...data.reconstruction import count_pieces
 from ...loop.loop import Loop
 from ...physics.block_evaluation import BlockEvaluation, evaluate_blocks
 from ...physics.equations import Equations
@@ -73,7 +74,7 @@ class SampledPlant:
         The loop; effects at their neutral values take part.
     names : sequence of str
         Parameters whose sensitivities are wanted.
-    hold : {"zoh", "foh"}
+    hold : {"zoh", "foh", "bandlimited"}
         How the input runs between samples.
     follow : bool
         Whether a known analog controller moves the input between samples.
@@ -88,11 +89,12 @@ class SampledPlant:
         self.law = law if law is not None and law.dt == 0.0 else None
         self.n = len(e.states)
         self.size = self.n + (len(self.law.rest) if self.law else 0)
-        self.delay_samples = count_delay_samples(e, loop.dt)
+        self.pieces = count_pieces(hold)
+        self.delay_samples = count_delay_samples(e, loop.dt / self.pieces)
         self.forces = e.velocities or tuple(range(self.n - len(e.rest)))
         # One force on all velocities; without any, each state has a noise of its own.
         self.channels = 1 if e.velocities else len(self.forces)
-        self.scheme = choose_scheme(e, loop)
+        self.scheme = choose_scheme(e, loop, loop.dt / self.pieces)
         self.plan = PeriodPlan(e, self.law, loop.dt, hold, self.scheme, self.forces, self.channels,
                          tuple(self.index), self.delay_samples)  # fmt: skip
         self.maps = build_maps(self.plan)
@@ -129,7 +131,7 @@ class SampledPlant:
 
     def is_built_for(self, theta: Array) -> bool:
         """Return whether the map was built for such values of a delay or of a lag."""
-        e, dt, p = self.e, self.loop.dt, self.insert_free_values(theta)
+        e, dt, p = self.e, self.loop.dt / self.pieces, self.insert_free_values(theta)
         if e.delay is not None:
             late = evaluate_delay(e, p) / dt + 1e-9
             if not self.delay_samples <= late <= self.delay_samples + 1 + 1e-6:
@@ -140,7 +142,7 @@ class SampledPlant:
         """Return the plant along a trajectory, for parameter values `theta`."""
         p = self.insert_free_values(theta)
         u = data.u
-        applied, slopes = self._find_applied_input(u, p)
+        applied, slopes = self._find_applied_input(data.path, p)
         input_variance = (
             data.input_variance + self.initial_conditions.find_input_variance(u, p) / data.scale**2
         )
@@ -155,10 +157,8 @@ class SampledPlant:
             dw = _repeat_over_samples(by_input[0], len(u))
             du = dw.sum(axis=2)
             dp = _repeat_over_samples(dp, len(u)).copy()
-            for k in (-1, 0, 1):
-                dp += (
-                    dw[:, :, k + 1, None] * shift_signal(slopes, self.delay_samples - k)[:, None, :]
-                )
+            for k, moved in enumerate(self._list_corners(slopes)):
+                dp += dw[:, :, k, None] * moved[:, None, :]
         elif len(rows):
             du[rows] = self._differentiate_by_input(
                 rows, given, 1e-3 * float(np.std(u[data.valid]))
@@ -183,7 +183,7 @@ class SampledPlant:
     def _differentiate_by_input(self, rows: Any, given: Sequence[Array], h: float) -> Array:
         """Return by differences how the state after the samples `rows` depends on the input."""
         x, w, p, spread, force = given
-        held = np.array([0.0, 1.0, 1.0, 1.0, 0.0, 0.0])[:, None]
+        held = np.array([0.0, *[1.0] * (self.pieces + 2), 0.0, 0.0])[:, None]
         above, below = (
             self._evaluate_transition(
                 self.maps.stages, x[:, rows], w[:, rows] + s * h * held, p, spread[:, rows], force
@@ -208,12 +208,12 @@ class SampledPlant:
         free parameters and the initial state, w is a column of `stack_inputs`.
         """
         n, p = self.size, len(self.index)
-        x, s, w, values = (casadi.SX.sym(k, *size) for k, size in (
-            ("x", (n, 1)), ("s", (n, p + n)), ("w", (6, 1)), ("p", self.e.p.shape)))  # fmt: skip
+        sizes = {"x": (n, 1), "s": (n, p + n), "w": (self.pieces + 5, 1), "p": self.e.p.shape}
+        x, s, w, values = (casadi.SX.sym(k, *size) for k, size in sizes.items())
         still, quiet = casadi.SX.zeros(self.n), casadi.SX.zeros(self.channels)
         y, c, hp = self.maps.sensor_function(x, w, values, still)
         seen = casadi.mtimes(c, s) + casadi.horzcat(hp, casadi.SX.zeros(1, n))
-        widths = [self.channels, p] + ([] if self.e.play is None else [3])
+        widths = [self.channels, p] + ([] if self.e.play is None else [self.pieces + 2])
         stage = [x, casadi.SX.eye(n), *(casadi.SX(n, width) for width in widths)]
         carried = len(stage) if self.maps.carries else 1
         for function, part in itertools.product(self.maps.functions, range(self.maps.parts)):
@@ -226,17 +226,20 @@ class SampledPlant:
         )  # fmt: skip
 
     def stack_inputs(self, data: FilterData, theta: Array) -> Array:
-        """Return the rows over which the map is evaluated, shape (6, n), behind any backlash."""
+        """Return the rows over which the map is evaluated, behind any backlash.
+
+        They have the shape (pieces + 5, n).
+        """
         return self._stack_applied_inputs(
-            data, self._find_applied_input(data.u, self.insert_free_values(theta))[0]
+            data, self._find_applied_input(data.path, self.insert_free_values(theta))[0]
         )
 
     def advance(self, data: FilterData, x: Array, rows: Any, known: bool = True) -> Array:
         """Return states (k, n) one period after the samples `rows`, with the loop's parameters."""
         p = self.e.values
-        w = self._stack_applied_inputs(data, self._find_applied_input(data.u, p)[0])[:, rows]
+        w = self._stack_applied_inputs(data, self._find_applied_input(data.path, p)[0])[:, rows]
         if not known:
-            w[5] = self.evaluate_output(data, x, rows)
+            w[-1] = self.evaluate_output(data, x, rows)
         quiet = np.zeros((self.n, 1))
         return self._evaluate_transition(
             self.maps.stages, x.T, w, p, quiet, np.zeros(self.channels)
@@ -245,14 +248,17 @@ class SampledPlant:
     def evaluate_output(self, data: FilterData, x: Array, rows: Any) -> Array:
         """Return the outputs at states (k, n) and the samples `rows`."""
         p = self.e.values
-        w = self._stack_applied_inputs(data, self._find_applied_input(data.u, p)[0])[:, rows]
+        w = self._stack_applied_inputs(data, self._find_applied_input(data.path, p)[0])[:, rows]
         return self.maps.sensor(x.T, w, p, np.zeros((self.n, 1)))[0][:, 0, 0]
 
     def _stack_applied_inputs(self, data: FilterData, applied: Array) -> Array:
-        """Return the rows (t, input before, now, ahead, r, y) over which the map is evaluated."""
-        t, r, y = data.t, data.r, data.y
-        shifted = [shift_signal(applied, self.delay_samples - k) for k in (-1, 0, 1)]
-        return np.vstack([t, *shifted, r, y])
+        """Return the rows (t, input before, now, ..., ahead, r, y) the map is evaluated over."""
+        return np.vstack([data.t, *self._list_corners(applied), data.r, data.y])
+
+    def _list_corners(self, path: Array) -> list[Array]:
+        """Return what acts at each corner, one before the sample to the one ahead of it."""
+        steps = range(-1, self.pieces + 1)
+        return [shift_signal(path, self.delay_samples - k)[:: self.pieces] for k in steps]
 
     def pad_controller_states(self, values: Array) -> Array:
         """Add the states of a known analog controller, at rest, to a start."""
@@ -302,10 +308,11 @@ class InitialConditions:
         """
         e, variance = self.plan.equations, np.zeros(len(u))
         if e.play is not None:
-            variance = shift_signal(self._find_backlash_variance(u, p), self.plan.delay_samples)
+            late = self.plan.delay_samples // self.plan.pieces
+            variance = shift_signal(self._find_backlash_variance(u, p), late)
         if e.delay is not None:
-            late = evaluate_delay(e, p) / self.plan.dt - np.arange(len(u))
-            variance = variance + np.clip(late, 0.0, 1.0) ** 2 * np.var(u)
+            far = evaluate_delay(e, p) / self.plan.dt - np.arange(len(u))
+            variance = variance + np.clip(far, 0.0, 1.0) ** 2 * np.var(u)
         return variance
 
     def _find_backlash_variance(self, u: Array, p: Array) -> Array:

@@ -12,6 +12,7 @@ import numpy as np
 
 from ..._base.arrays import Array
 from ..._base.errors import ModelCannotRun
+from ...data.reconstruction import count_pieces
 from ...loop.controllers import ControlLaw
 from ...loop.loop import Loop
 from ...loop.period_map import apply_backlash
@@ -54,7 +55,7 @@ class PeriodPlan:
         A known analog controller that moves the input between samples.
     dt : float
         Sampling period [s].
-    hold : {"zoh", "foh"}
+    hold : {"zoh", "foh", "bandlimited"}
         How the input runs between samples otherwise.
     scheme : Scheme
         How a period is integrated.
@@ -65,7 +66,7 @@ class PeriodPlan:
     index : tuple of int
         Places of the free parameters.
     delay_samples : int
-        Whole periods by which the input comes late.
+        Whole pieces by which the input comes late: periods, or parts of one if it is band-limited.
     structure : tuple
         What is compared in place of equations and law: their expressions without values.
     """
@@ -104,22 +105,27 @@ class PeriodPlan:
         """Number of states, those of the controller among them."""
         return len(self.equations.states) + (len(self.law.rest) if self.law else 0)
 
+    @property
+    def pieces(self) -> int:
+        """Number of straight pieces of the input in a period."""
+        return count_pieces(self.hold)
 
-def choose_scheme(e: Equations, loop: Loop) -> Scheme:
-    """Return the cheapest scheme that integrates a period of the plant accurately enough."""
+
+def choose_scheme(e: Equations, loop: Loop, dt: float) -> Scheme:
+    """Return the cheapest scheme that integrates the plant over a time dt accurately enough."""
     if e.dt:
         return Scheme(4, 1)
     hidden = [lag.state for lags in find_lags(e) for lag in lags]
     plain = [k for k in range(len(e.states)) if k not in hidden]
     time = _find_input_lag_time(e, e.values)
-    driven, cut = np.isfinite(time), bool(time < loop.dt / 8)
+    driven, cut = np.isfinite(time), bool(time < dt / 8)
     # The filter's own uncertainty smooths kinks; sharp friction does not make the plant stiff.
     try:
         point = replace(loop.point, states=find_rest_state(loop, e))
         a = compute_state_matrices(e, point, spread=1e6)[0][np.ix_(plain, plain)]
     except ModelCannotRun:
         return Scheme(8, 2, (8, 2) if cut else None)
-    rate = float(np.max(np.abs(np.linalg.eigvals(a)), initial=0.0)) * loop.dt
+    rate = float(np.max(np.abs(np.linalg.eigvals(a)), initial=0.0)) * dt
     if rate <= 3 * SLOW:
         # A velocity that turns within a period crosses the kink of friction there.
         few = max(KINK_STEPS if e.kinked else 1, math.ceil(rate / SLOW))
@@ -132,14 +138,14 @@ def choose_scheme(e: Equations, loop: Loop) -> Scheme:
         few = max(
             2 * few if e.kinked else few,
             2,
-            math.ceil(loop.dt / time / _choose_lag_step(e)),
+            math.ceil(dt / time / _choose_lag_step(e)),
         )
         if e.kinked or few <= FEW_STEPS:
             return Scheme(4, few)
     steps = max(2 if e.kinked else 1, math.ceil(rate / 1.5))
     if steps > MOST_STEPS:
         raise ModelCannotRun(
-            f"{e.name} has a motion at {rate / loop.dt:.3g} rad/s, {rate:.3g} times faster than it "
+            f"{e.name} has a motion at {rate / dt:.3g} rad/s, {rate:.3g} times faster than it "
             "is sampled. The filter cannot follow a motion that ends within one sample: leave it "
             "out of the plant, or sample faster"
         )
@@ -202,7 +208,13 @@ def _build_period(plan: PeriodPlan) -> tuple[Any, list[Any], list[Any], dict[str
     e, n, dt = plan.equations, len(plan.equations.states), plan.dt
     x, p, s = (casadi.SX.sym(k, m) for k, m in (("x", plan.size), ("p", e.p.shape[0]),
                                                 ("s", n)))  # fmt: skip
-    t, before, now, ahead, r, y = w = [casadi.SX.sym(k) for k in "tbnary"]
+    t, r, y = (casadi.SX.sym(k) for k in "try")
+    path = casadi.vertsplit(casadi.SX.sym("u", plan.pieces + 2))
+    w = [t, *path, r, y]
+    now = path[1]
+    if plan.pieces > 1:
+        # The corners are off the signal itself, but this mean of three of them is on it.
+        now = (path[0] + 10 * now + path[2]) / 12
     force = casadi.SX.sym("f", plan.channels)
     held_rate = casadi.SX.zeros(n, 1)
     for k, j in enumerate(plan.forces):
@@ -213,7 +225,8 @@ def _build_period(plan: PeriodPlan) -> tuple[Any, list[Any], list[Any], dict[str
     if plan.law is None:
         pieces = [
             tuple(casadi.substitute(casadi.SX(value), e.p, p) for value in piece)
-            for piece in cut_input(e, dt, (before, now, ahead), plan.hold)
+            for k in range(plan.pieces)
+            for piece in cut_input(e, dt / plan.pieces, path[k : k + 3], plan.hold)
         ]
         ends, parts = _build_stages(plan, t, x, pieces, p, s, held_rate, scheme, part)
     else:
@@ -222,7 +235,7 @@ def _build_period(plan: PeriodPlan) -> tuple[Any, list[Any], list[Any], dict[str
         ]
         parts = 1
     free = casadi.vertcat(*(p[k] for k in plan.index)) if plan.index else casadi.SX(0, 1)
-    by = {"force": force, "free": free, "input": casadi.vertcat(before, now, ahead),
+    by = {"force": force, "free": free, "input": casadi.vertcat(*path),
           "output": e.smoothed(t, x[:n], now, p, s)[1]}  # fmt: skip
     return x, ends, [casadi.vertcat(*w), p, s, force, part], by, parts
 

@@ -120,10 +120,11 @@ def fit_arx(
         estimate = replace(estimate, notes=_note_colour(list(records), estimate))
     share = max(motions, default=0.0)
     if share > VISIBLE_MOTION:
+        instead = " with the controller" if first.hold == "foh" else ""
         note = (
-            f"u CHANGES BETWEEN THE SAMPLES (hold='foh', by {100 * share:.0f} % of its standard "
-            "deviation in a period), but a difference equation takes it as held, so the poles are "
-            "biased. Sample faster, or use fit_continuous with the controller."
+            f"u CHANGES BETWEEN THE SAMPLES (hold={first.hold!r}, by {100 * share:.0f} % of its "
+            "standard deviation in a period), but a difference equation takes it as held, so the "
+            f"poles are biased. Sample faster, or use fit_continuous{instead}."
         )
         estimate = replace(estimate, notes=(*estimate.notes, note))
     names = first.names
@@ -133,7 +134,7 @@ def fit_arx(
 def _note_motion(records: Iterable[Record], motions: list[float]) -> Iterator[Record]:
     """Pass records on, and note of each how far its input moves between samples."""
     for record in records:
-        motions.append(measure_input_motion([record]))
+        motions.append(measure_input_motion([record], reconstructed=False))
         yield record
 
 

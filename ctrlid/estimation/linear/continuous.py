@@ -17,7 +17,7 @@ from ..constraints import AbstractConstraint, check_constraints
 from ..identified_model import Estimate, IdentifiedModel, Structure
 from ..whiteness import note_coloured_innovations
 from .prediction_error import Piece, Task, find_best_fit
-from .sampled_motion import Circuit
+from .sampled_motion import Circuit, list_inputs
 
 # Above this product of dt and the controller's fastest pole, u moves visibly between samples.
 FAST_CIRCUIT = 0.1
@@ -211,7 +211,10 @@ def _cut_pieces(records: Sequence[Record], order: int) -> tuple[Piece, ...]:
         for start, stop in record.segments():
             if stop - start < 4 * (order + 2):
                 continue
-            part = {"y": record.y[start:stop] - y0, "u": record.u[start:stop] - u0}
+            part = {
+                "y": record.y[start:stop] - y0,
+                **list_inputs(record.u[start:stop] - u0, record.hold),
+            }
             if record.r is not None:
                 # The same level is taken off r and y, so that r - y keeps its value.
                 part["r"] = record.r[start:stop] - y0

@@ -21,6 +21,7 @@ from .sampled_motion import (
     DiscreteModel,
     compute_prediction_errors,
     discretize_model,
+    list_inputs,
     realize_model,
 )
 
@@ -91,7 +92,7 @@ def _compute_columns(task: Task, point: Point, piece: Piece) -> Array | None:
         more = min(filled, n - filled)
         free[filled : filled + more] = free[:more] @ power
         power, filled = power @ power, filled + more
-    ones = {name: np.zeros(n) for name in piece.signals} | {"u": np.ones(n)}
+    ones = {name: np.zeros(n) for name in piece.signals} | list_inputs(np.ones(n), task.hold)
     rest, _ = compute_prediction_errors(motion, point.gain, ones)
     return np.column_stack([free, rest, errors])
 

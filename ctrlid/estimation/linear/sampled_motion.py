@@ -12,6 +12,7 @@ import numpy as np
 from scipy import signal
 
 from ..._base.arrays import Array
+from ...data.reconstruction import PIECES, reconstruct_signal
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,8 +34,9 @@ class Circuit:
 class DiscreteModel:
     """The discretized model: ``x+ = f x + b0 u_k + b1 u_(k-1) + ...``, and ``y = c x``.
 
-    With a circuit, x stacks plant and controller states and two more inputs follow those of u:
-    the measured output and the reference.
+    The corners of a band-limited input are inputs of their own, `name_corner`. With a circuit, x
+    stacks plant and controller states and two more inputs follow those of u: the measured output
+    and the reference.
     """
 
     f: Array
@@ -115,7 +117,7 @@ def discretize_model(
     dt : float
         Sampling period [s].
     hold : str
-        ``"zoh"`` or ``"foh"``.
+        ``"zoh"``, ``"foh"`` or ``"bandlimited"``.
     delay : float, optional
         Time from u to the plant [s], for a held input.
     circuit : Circuit, optional
@@ -129,6 +131,16 @@ def discretize_model(
     n = len(a)
     if circuit is not None:
         return _discretize_with_circuit(a, b, c, dt, circuit)
+    if hold == "bandlimited":
+        short = discretize_model(a, b, c, dt / PIECES, "foh")
+        (_, _, here), (_, _, ahead) = short.inputs
+        powers = [np.linalg.matrix_power(short.f, k) for k in range(PIECES + 1)]
+        columns = np.zeros((PIECES + 1, n))
+        for k in range(PIECES):
+            columns[k] += powers[PIECES - 1 - k] @ here
+            columns[k + 1] += powers[PIECES - 1 - k] @ ahead
+        corners = [(name_corner(k), 0, columns[k]) for k in range(PIECES)]
+        return DiscreteModel(powers[PIECES], (*corners, (name_corner(0), -1, columns[-1])), c, n)
     if hold == "foh":
         block = np.zeros((n + 2, n + 2))
         block[:n, :n], block[:n, n], block[n, n + 1] = a * dt, b * dt, 1.0
@@ -144,6 +156,19 @@ def discretize_model(
     after, new = _integrate_hold(a, b, (1 - part) * dt)
     _, old = _integrate_hold(a, b, part * dt)
     return DiscreteModel(f, (("u", late, new), ("u", late + 1, after @ old)), c, n)
+
+
+def name_corner(k: int) -> str:
+    """Return the name of the signal that a band-limited input has k pieces after the samples."""
+    return f"u {k}/{PIECES}"
+
+
+def list_inputs(u: Array, hold: str, valid: Any = None) -> dict[str, Array]:
+    """Return an input as the signals that a `DiscreteModel` is driven by."""
+    if hold != "bandlimited":
+        return {"u": u}
+    corners = reconstruct_signal(u, valid).reshape(-1, PIECES).T
+    return {"u": u} | {name_corner(k): values for k, values in enumerate(corners)}
 
 
 def _discretize_with_circuit(a: Array, b: Array, c: Array, dt: float, k: Circuit) -> DiscreteModel:

@@ -75,9 +75,10 @@ def add_parser(commands: Any) -> None:
     add("--controller", metavar="C",
         help="the controller: MODULE:NAME, FILE.py:NAME, or a PID written as "
         "kp=..,ki=..,kd=.. (default: not known)")  # fmt: skip
-    add("--hold", choices=("zoh", "foh"),
+    add("--hold", choices=("zoh", "foh", "bandlimited"),
         help="u between the samples: zoh for held (default), foh for straight lines, as an analog "
-        "controller makes them")  # fmt: skip
+        "controller makes them, bandlimited for a measured signal that does not react to "
+        "y")  # fmt: skip
     add("--gaps", choices=("error", "mask"), default="error",
         help="missing samples: error to refuse the file (default), mask to leave them "
         "out")  # fmt: skip
