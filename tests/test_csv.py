@@ -157,7 +157,7 @@ def clock(tmp_path, stamps, digits=None, **options):
         return repr(float(t)) if digits is None else f"{t:.{digits}f}"
 
     rows = "".join(f"{shown(t)},{k},{2 * k}\n" for k, t in enumerate(stamps))
-    return write(tmp_path, "t,u,y\n" + rows, **options)
+    return write(tmp_path, "t [s],u,y\n" + rows, **options)
 
 
 @pytest.mark.parametrize("start", [0.0, 17.3, 1.7e9])

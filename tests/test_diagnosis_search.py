@@ -380,9 +380,15 @@ def test_units_of_the_record_that_are_not_those_of_the_plant_are_told():
     told = [text for text in found.audit if text.startswith("units: ")]
     assert len(told) == 2
     assert "u is recorded without a unit, but the plant has it in" in told[0]
-    assert "y is recorded in V, but the plant has it in m. A size that is given in m" in told[1]
+    assert "y is recorded in V, but the plant has it in m. The model takes the numbers" in told[1]
+    assert "V/s^2" in str(found)
+    assert "m/s^2" not in str(found)
     again = cid.diagnose(loop, record, progress=False, catalogue=[E.CoulombFriction])
     assert not [text for text in again.audit if text.startswith("units: ")]
+    silent = replace(record, units={})
+    found = cid.diagnose(loop, silent, progress=False, catalogue=[E.CoulombFriction])
+    (told,) = [text for text in found.audit if text.startswith("units: ")]
+    assert "the record does not say its units" in told
 
 
 def test_a_limit_is_found_behind_a_random_force_that_stood_for_it():

@@ -8,8 +8,10 @@ import re
 import textwrap
 from collections.abc import Sequence
 
+from .units import is_unit
+
 PREFIXES = ((1e-1, 1.0, ""), (1e-4, 1e-3, "m"), (1e-7, 1e-6, "µ"), (0.0, 1e-9, "n"))
-PREFIXED = ("m", "V", "A", "N", "m/s", "m/s^2", "N s/m", "s")
+PREFIXED = ("m", "V", "A", "N", "m/s", "m/s^2", "N s/m", "N m", "N m s/rad", "s")
 
 
 def write_number(value: complex, digits: int = 7) -> str:
@@ -252,7 +254,8 @@ def split_unit(label: str) -> tuple[str, str]:
     Parameters
     ----------
     label : str
-        As in ``u [V]``, ``u[V]`` or ``u (V)``; ``x[0]`` is an index, not a unit.
+        As in ``u [V]``, ``u[V]`` or ``u (V)``, or quantity over unit as in ``u/V`` (ISO 80000-1)
+        where what follows the slash is a unit; ``x[0]`` is an index, not a unit.
 
     Returns
     -------
@@ -263,9 +266,14 @@ def split_unit(label: str) -> tuple[str, str]:
     --------
     >>> split_unit("position [m]"), split_unit("x[0]"), split_unit("u (V)")
     (('position', 'm'), ('x[0]', ''), ('u', 'V'))
+    >>> split_unit("Zeit/ms"), split_unit("speed/(m/s)"), split_unit("up/down")
+    (('Zeit', 'ms'), ('speed', 'm/s'), ('up/down', ''))
     """
     found = re.fullmatch(r"(.*\S)(\s*)\[([^\[\]]*)\]|(.*\S)(\s+)\(([^()]*)\)", label)
     if found is None:
+        quantity, slash, unit = label.partition("/")
+        if slash and quantity.strip() and is_unit(unit):
+            return quantity.strip(), unit.strip().removeprefix("(").removesuffix(")")
         return label, ""
     name, space, unit = found.groups()[:3] if found[1] else found.groups()[3:]
     return (name, unit) if space or not unit.isdigit() else (label, "")

@@ -6,6 +6,7 @@ import json
 import math
 import warnings
 from collections.abc import Mapping, Sequence
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import numpy as np
 from .._base.errors import CtrlidError, CtrlidWarning
 from .._base.text import drop_roundoff, split_unit, with_unit
 
-TIME = ("t", "time", "timestamp", "seconds")
+TIME = ("t", "time", "timestamp", "seconds", "zeit")
 SECONDS = {"": 1.0, "s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6,
            "min": 60.0, "h": 3600.0}  # fmt: skip
 MARK = "# ctrlid "
@@ -57,7 +58,7 @@ def write_csv(path: Path, record: Any) -> None:
 def read_csv(
     path: Path, sources: Mapping[str, str | None], time: str | None, dt: float | None,
     extra: Sequence[str] | None, units: Mapping[str, str] | None, hold: str | None,
-    name: str | None, gaps: str,
+    name: str | None, gaps: str, scale: Mapping[str, float] | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """Return the fields of a record; see `Record.from_csv`, `sources` are its r, u and y."""
     if gaps not in ("error", "mask"):
@@ -111,19 +112,45 @@ def read_csv(
         stamps = table[:, clock] * SECONDS[unit]
         dt, rows = _make_uniform(stamps, period_given, gaps, path)
         start = float(stamps[0])
+        if not unit and names[clock].lower() != "seconds" and period_given is None:
+            _question_period(dt, stamps, path, header[clock])
     if rows is not None and len(rows) != len(table):
         valid = valid[rows] & (np.diff(rows, prepend=-1) > 0)
         table = table[rows]
     every = {**places, **further}
-    read = {key: labels[k][1] for key, k in every.items() if labels[k][1]}
+    factors = _check_scale(scale or {}, every)
+    # The unit in the header is that of the numbers before they were scaled.
+    read = {key: labels[k][1] for key, k in every.items() if labels[k][1] and key not in factors}
     return {
-        **{key: table[:, k] for key, k in places.items()},
-        "extra": {label: table[:, k] for label, k in further.items()},
+        **{key: table[:, k] * factors.get(key, 1.0) for key, k in places.items()},
+        "extra": {label: table[:, k] * factors.get(label, 1.0) for label, k in further.items()},
         "dt": dt, "start": start, "valid": valid, "units": {**read, **(units or {})},
         "names": own.get("names", {k: names[p] for k, p in places.items() if names[p] != k}),
         "hold": hold or own.get("hold", "zoh"),
         "name": own.get("name", path.stem) if name is None else name,
     }  # fmt: skip
+
+
+def _check_scale(scale: Mapping[str, float], known: Mapping[str, int]) -> dict[str, float]:
+    """Return the factors of channels, or refuse what is none."""
+    for key, factor in scale.items():
+        if key not in known:
+            raise CtrlidError(f"scale= names {key!r}, but the channels are {', '.join(known)}")
+        number = isinstance(factor, Real) and not isinstance(factor, bool)
+        if not number or not math.isfinite(factor) or factor == 0:
+            raise CtrlidError(f"scale= needs a number other than zero for {key}; given {factor!r}")
+    return {key: float(factor) for key, factor in scale.items()}
+
+
+def _question_period(dt: float, stamps: Any, path: Path, label: str) -> None:
+    """Warn of times without a unit that are hardly in seconds: whole numbers, or below 1 µs."""
+    if dt < 1e-6 or (dt >= 1 and np.all(stamps == np.round(stamps))):
+        warnings.warn(
+            f"the time column {label!r} of {path} has no unit, so that it is taken in seconds and "
+            f"the period is {dt:g} s. If it is in milliseconds or counts samples, write its unit "
+            f"into the header, as in '{label} [ms]', or give dt=; otherwise write '{label} [s]'",
+            CtrlidWarning, stacklevel=4,
+        )  # fmt: skip
 
 
 def _read_table(path: Path) -> tuple[dict[str, Any], list[str], Any]:

@@ -376,12 +376,12 @@ class Record(Printed):
         cls, path: str | Path, *, r: str | None = None, u: str = "u", y: str = "y",
         time: str | None = None, dt: float | None = None, extra: Sequence[str] | None = None,
         units: Mapping[str, str] | None = None, hold: Hold | None = None, name: str | None = None,
-        gaps: Literal["error", "mask"] = "error",
+        gaps: Literal["error", "mask"] = "error", scale: Mapping[str, float] | None = None,
     ) -> "Record":  # fmt: skip
         """Read a record from a CSV file with a header line.
 
         Columns are separated by commas, semicolons or tabs; units are read from headers such as
-        ``u [V]`` or ``u (V)``. A column called valid tells which samples count.
+        ``u [V]``, ``u (V)`` or ``u/V``. A column called valid tells which samples count.
 
         Parameters
         ----------
@@ -390,8 +390,8 @@ class Record(Printed):
         r, u, y : str, optional
             Names of the columns; r by default if there is a column so called.
         time : str, optional
-            Name of the time column; by default one called t, time, timestamp or seconds. Its unit
-            is s unless the header says ms, us, min or h.
+            Name of the time column; by default one called t, time, timestamp, seconds or Zeit. Its
+            unit is s unless the header says ms, us, min or h.
         dt : float, optional
             Sampling period [s]; by default that of the time column.
         extra : sequence of str, optional
@@ -403,6 +403,10 @@ class Record(Printed):
         gaps : {"error", "mask"}, optional
             Whether missing samples are refused, or filled with the last values and marked as not
             valid.
+        scale : mapping of str to float, optional
+            Factors of channels by name: a log in degrees becomes radians with
+            ``scale={"r": np.pi / 180, "y": np.pi / 180}, units={"r": "rad", "y": "rad"}``. A scaled
+            channel has the unit in `units`, and none without.
 
         Returns
         -------
@@ -412,7 +416,8 @@ class Record(Printed):
         Warns
         -----
         CtrlidWarning
-            If the times jitter by more than 1 % of the period.
+            If the times jitter by more than 1 % of the period, or if they have no unit and are
+            hardly in seconds.
 
         Raises
         ------
@@ -421,7 +426,8 @@ class Record(Printed):
             samples are missing.
         """
         return cls(**_csv.read_csv(
-            Path(path), {"r": r, "u": u, "y": y}, time, dt, extra, units, hold, name, gaps
+            Path(path), {"r": r, "u": u, "y": y}, time, dt, extra, units, hold, name, gaps,
+            scale,
         ))  # fmt: skip
 
     def to_csv(self, path: str | Path) -> None:

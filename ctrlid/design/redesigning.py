@@ -172,7 +172,7 @@ class Redesign(Printed):
         num, den = (write_polynomial(p[0][0], variable)
                     for p in (self.controller.num, self.controller.den))  # fmt: skip
         loop = self.loop
-        unit = getattr(loop.plant, "units", {}).get(loop.equations().outputs[0], "")
+        unit = loop.known_units.get(loop.equations().outputs[0], "")
         step = (
             "  The last three values achieved are for a step of "
             f"{write_quantity(self.step, unit)} on the nonlinear physics. With a smaller step= "

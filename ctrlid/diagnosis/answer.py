@@ -7,6 +7,7 @@ import numpy as np
 
 from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from .._base.text import write_quantity
+from .._base.units import fill_unit
 from ..data.record import Record
 from ..effects import AbstractEffect, equivalents
 from ..estimation.likelihood.physics_fit import summarize_fit
@@ -45,7 +46,7 @@ def assemble_answer(
     final = fitted.loop
     for r in read:
         final = final if r.effect in final.effects else final.with_effect(r.effect)
-    units = _find_units(loop, records[0])
+    units = _find_units(loop)
     where = locate_errors(found.before, found.after, units)
     left = gap_is_left(gap, disturbance, found.final.fit)
     total = found.final.fit.value - found.base.fit.value
@@ -95,13 +96,11 @@ def name_records(records: Sequence[Record]) -> str:
     return f"{names} ({many}{size} samples, dt = {records[0].dt:g} s)"
 
 
-def _find_units(loop: Loop, record: Record) -> dict[str, str]:
-    e = loop.equations()
-    known = dict(getattr(loop.plant, "units", {}))
-    y = record.units.get("y", known.get(e.outputs[0], ""))
-    u = record.units.get("u", known.get(e.inputs[0], ""))
+def _find_units(loop: Loop) -> dict[str, str]:
+    e, known = loop.equations(), loop.known_units
+    y, u = known.get(e.outputs[0], ""), known.get(e.inputs[0], "")
     units = {"time": "s", "position": y, "reference": y, "input": u, "input change": u,
-             "velocity": f"{y}/s" if y else ""}  # fmt: skip
+             "velocity": fill_unit("{y}/s", {"y": y}) if y else ""}  # fmt: skip
     return {**known, **units}
 
 

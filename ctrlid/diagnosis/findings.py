@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from .._base.arrays import Array
+from .._base.units import fill_unit
 from ..effects import AbstractEffect
 from .thresholds import THRESHOLD
 
@@ -68,7 +69,7 @@ class Gap:
     @property
     def force_unit(self) -> str:
         """The unit of a force per unit of mass, by the unit of the output."""
-        return f"{self.unit or '[y]'}/s^2"
+        return fill_unit("{y}/s^2", {"y": self.unit or "[y]"})
 
 
 @dataclass(frozen=True, eq=False)

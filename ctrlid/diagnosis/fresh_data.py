@@ -8,6 +8,7 @@ import numpy as np
 
 from .._base.arrays import Array
 from .._base.errors import CtrlidError, ModelCannotRun
+from .._base.text import write_count
 from ..data.record import Record
 from ..estimation.likelihood.likelihood import Fit, Known, evaluate_likelihood, make_problem
 from ..estimation.likelihood.maximization import begin_fit, maximize
@@ -17,6 +18,7 @@ from ..estimation.likelihood.prediction import (
     predict_ahead,
 )
 from ..loop.loop import Loop
+from ..validation.record_audit import FEW
 from ..validation.reproduction import Reproduction, choose_reproduction
 from . import gap as gaps
 from .fitted_model import Model
@@ -145,6 +147,26 @@ def choose_fresh_data(
     else:
         windows = tuple(gaps.make_window(r) for r in validation)
     return FreshData(windows, rest, choose_reproduction(loop, windows[0].record))
+
+
+def check_length(fresh: FreshData) -> None:
+    """Refuse records of which too little is left to fit when a part is kept back.
+
+    Raises
+    ------
+    CtrlidError
+        If fewer samples are left than a fit of a few coefficients needs.
+    """
+    if fresh.rest is None:
+        return
+    left = sum(int(np.count_nonzero(r.valid)) for r in fresh.rest)
+    if left < FEW:
+        raise CtrlidError(
+            f"the record is too short for a diagnosis: {write_count(left, 'valid sample')} would "
+            f"be left to fit when the last quarter is kept back for the comparison, and a fit "
+            f"needs {FEW}. Record at least {math.ceil(FEW / (1 - THRESHOLD.held_out))} samples, or "
+            "give a second record for validation="
+        )
 
 
 def _fit_private_parameters(model: Model, window: gaps.Window) -> Loop:

@@ -53,8 +53,9 @@ def summarize_gap(loop: Loop, found: Search, fresh: FreshData) -> GapSummary:
             error = shared.measure_gap([x.without_effect(label) for x in after])
         shares[f.position] = _compute_share_closed(error**2 - left**2, smaller, floor.both)
     first = windows[0]
+    unit = loop.known_units.get(loop.equations().outputs[0], "")
     gap = Gap(
-        str(how), given, smaller, left, floor.both, first.record.units.get("y", ""),
+        str(how), given, smaller, left, floor.both, unit,
         first.start_time + np.asarray(first.record.t - first.record.start)[first.mask],
         np.asarray(first.record.y)[first.mask], start[0][first.mask],
         results[2][0][first.mask], floor.widest, how.horizon,

@@ -80,8 +80,12 @@ def _rebuild_loop(loop: Loop, saved: SavedLoop) -> Loop:
     if name != saved.plant_name:
         raise CtrlidError(f"the saved diagnosis is of the plant {saved.plant_name!r}; the loop "
                           f"given has {name!r}. Give the loop that was diagnosed")  # fmt: skip
-    changed = dataclasses.replace(loop, dt=saved.dt, at=saved.at, free=(), effects=saved.effects,
-                                  input_limits=saved.input_limits)  # fmt: skip
+    e, known = loop.equations(), saved.known_units
+    units = {name: known[name] for name in (e.inputs[0], e.outputs[0]) if name in known}
+    changed = dataclasses.replace(
+        loop, dt=saved.dt, at=saved.at, free=(), effects=saved.effects,
+        input_limits=saved.input_limits, units={**loop.units, **units},
+    )  # fmt: skip
     return dataclasses.replace(changed.with_parameters(saved.parameters), free=saved.free)
 
 
@@ -93,6 +97,7 @@ def _decode_loop(data: Mapping[str, Any]) -> SavedLoop:
         free=tuple(data["free"]), input_limits=tuple(read_numbers(data["input_limits"])),
         effects=tuple(_decode_effect(e) for e in data["effects"]),
         parameters=read_numbers(data["parameters"]), units=data["units"],
+        known_units=data.get("known_units", {}),
     )  # fmt: skip
 
 

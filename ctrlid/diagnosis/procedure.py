@@ -20,7 +20,7 @@ from .answer import assemble_answer, name_records
 from .candidates import check_catalogue
 from .findings import COMPLETE, Disturbance, Gap
 from .fitted_model import compute_penalized_likelihood
-from .fresh_data import FreshData, choose_fresh_data
+from .fresh_data import FreshData, check_length, choose_fresh_data
 from .gap_summary import make_fresh_data_test, make_size_test, summarize_gap, take_back_widening
 from .growth import (
     Search,
@@ -33,7 +33,14 @@ from .growth import (
 from .log_errors import LogError, find_log_error
 from .open_loop_search import search_by_simulation
 from .recalibration import recalibrate
-from .records import Readout, look_over_records, make_loop, read_limits, read_steps
+from .records import (
+    Readout,
+    look_over_records,
+    make_loop,
+    read_limits,
+    read_steps,
+    with_units_of,
+)
 from .replicas import forgive_rounding
 from .result import Diagnosis
 from .selection import Work
@@ -145,7 +152,8 @@ def diagnose(
     check_catalogue(catalogue)
     loop, record = order_model_and_data(loop, record)
     records = as_records(record)
-    loop = make_loop(loop, records[0])
+    given = make_loop(loop, records[0])
+    loop = with_units_of(given, records[0])
     fresh = choose_fresh_data(loop, records, None if validation is None else as_records(validation))
     jobs = check_jobs(jobs)
     bar = tqdm(total=PROGRESS, disable=not progress, leave=False, desc="diagnose")
@@ -158,7 +166,8 @@ def diagnose(
         return list(share_out(function, items, jobs))
 
     tell("checking the records", 1)
-    audits, remarks = look_over_records(loop, records)
+    audits, remarks = look_over_records(given, records)
+    check_length(fresh)
     question = Question(loop, records, audits, fresh, catalogue, work, tell)
     result, search = _answer_question(question)
     if len(records) > 1 and not _have_same_effects(result, len(records)):

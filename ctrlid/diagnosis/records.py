@@ -9,6 +9,7 @@ import control as ct
 import numpy as np
 
 from .._base.errors import CtrlidError
+from .._base.text import write_list
 from ..data.record import Record
 from ..effects import AbstractEffect, InputDelay, InputOffset, Quantization, SensorSaturation
 from ..estimation.identified_model import read_delay
@@ -42,11 +43,19 @@ def make_loop(loop: Any, record: Record) -> Loop:
     return linear.with_effect(InputDelay(delay)) if delay else linear
 
 
+def with_units_of(loop: Loop, record: Record) -> Loop:
+    """Return the loop with the units of a record, in which the sizes of effects will be written."""
+    e = loop.equations()
+    own = {name: record.units[key] for key, name in (("u", e.inputs[0]), ("y", e.outputs[0]))
+           if record.units.get(key)}  # fmt: skip
+    return replace(loop, units={**loop.units, **own}) if own else loop
+
+
 def look_over_records(
     loop: Loop, records: Sequence[Record]
 ) -> tuple[tuple[Audit, ...], tuple[str, ...]]:
     """Return what is remarkable about the records; refuse those that carry nothing."""
-    audits, remarks = [], _name_foreign_units(loop, records[0])
+    audits, remarks = [], _compare_units(loop, records[0])
     for k, record in enumerate(records):
         found = audit(record, loop)
         audits.append(found)
@@ -60,18 +69,26 @@ def look_over_records(
     return tuple(audits), tuple(remarks)
 
 
-def _name_foreign_units(loop: Loop, record: Record) -> list[str]:
-    """Say where a record has other units than the plant, in whose units sizes are written."""
-    e, known = loop.equations(), getattr(loop.plant, "units", {})
-    remarks = []
+def _compare_units(loop: Loop, record: Record) -> list[str]:
+    """Say where a record has other units than the plant, or none."""
+    e, of_plant = loop.equations(), loop.known_units
+    remarks, silent = [], []
     for key, name in (("u", e.inputs[0]), ("y", e.outputs[0])):
-        there, here = record.units.get(key, ""), known.get(name, "")
-        if there and here and there != here:
-            there = "without a unit" if there == "1" else f"in {there}"
+        there, here = record.units.get(key, ""), of_plant.get(name, "")
+        if here and not there:
+            silent.append(f"{key} in {here}")
+        elif here and there != here:
+            how = "without a unit" if there == "1" else f"in {there}"
             remarks.append(
-                f"units: {key} is recorded {there}, but the plant has it in {here}. A size that is "
-                f"given in {here} is in the unit of the record."
+                f"units: {key} is recorded {how}, but the plant has it in {here}. The model takes "
+                "the numbers as they are, and sizes are written in the unit of the record. If the "
+                "plant is right, convert the record: Record.from_csv has scale= for this."
             )
+    if silent:
+        remarks.append(
+            "units: the record does not say its units, so that those of the plant are written, "
+            f"{write_list(silent)}. Record has units= to state them."
+        )
     return remarks
 
 

@@ -6,7 +6,7 @@ import dataclasses
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -49,6 +49,8 @@ class SavedLoop:
         Values of the parameters of plant and effects.
     units : dict of str to dict
         Units of the parameters of effects, by class name.
+    known_units : dict of str to str
+        Units of signals, states and parameters of the plant, by name.
     """
 
     plant_name: str
@@ -60,6 +62,7 @@ class SavedLoop:
     effects: tuple[AbstractEffect, ...]
     parameters: dict[str, float]
     units: dict[str, dict[str, str]]
+    known_units: dict[str, str] = field(default_factory=dict)
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
@@ -143,7 +146,8 @@ def _encode_loop(loop: Loop | SavedLoop) -> dict[str, Any]:
                  (loop.equations().name, " ".join(str(loop.controller).split())))  # fmt: skip
     return {
         "plant": name,
-        "parameters": _encode(loop.parameters), "free": list(loop.free), "dt": _encode(loop.dt),
+        "parameters": _encode(loop.parameters), "known_units": loop.known_units,
+        "free": list(loop.free), "dt": _encode(loop.dt),
         "at": _encode(at), "input_limits": _encode(loop.input_limits),
         "controller": controller,
         "effects": [_encode(e) for e in loop.effects],

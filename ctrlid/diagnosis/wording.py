@@ -50,9 +50,14 @@ ARTICLES = {"delay of the output": "a delay of the output"}
 MAINS = (50.0, 60.0)
 HARMONICS = 3
 MAINS_WIDTH = 0.01
-MASSES = ("m", "M", "mass")
-# Units of a force parameter times a mass in kg, by its unit per unit of mass.
-FORCES = {"m/s^2": "N", "1/s": "N s/m", "1/s^2": "N/m", "1/m": "kg/m"}
+# What a parameter per unit of inertia is times the inertia, by the unit of the output: the unit of
+# that inertia, and the units of the products by the declared unit of the parameter.
+FORCES = {
+    "m": ("kg", {"{y}/s^2": "N", "1/s": "N s/m", "1/s^2": "N/m", "1/{y}": "kg/m",
+                 "1/(s^2 {y}^2)": "N/m^3"}),
+    "rad": ("kg m^2", {"{y}/s^2": "N m", "1/s": "N m s/rad", "1/s^2": "N m/rad",
+                       "1/{y}": "N m s^2/rad^2", "1/(s^2 {y}^2)": "N m/rad^3"}),
+}  # fmt: skip
 
 
 def write_headline(found: Diagnosis) -> str:
@@ -231,15 +236,22 @@ def describe_parameters(
 
 
 def describe_forces(found: Diagnosis, effect: AbstractEffect) -> str:
-    """Write the accelerations among the parameters as forces, where the mass is a parameter."""
-    known = found.loop.parameters
-    mass = next((name for name in MASSES if name in known), None)
-    if effect.place != "force" or mass is None:
+    """Write the accelerations among the parameters as forces, or angular ones as torques.
+
+    This takes an output in m (rad) and just one parameter in kg (kg m^2): of several masses it is
+    not known which one moves.
+    """
+    if effect.place != "force" or found.gap.unit not in FORCES:
         return ""
-    units = list_units(found.loop, effect)
-    words = [write_quantity(known[mass] * value, FORCES[units[name]])
-             for name, value in effect.values().items() if units[name] in FORCES]  # fmt: skip
-    return f"{write_list(words)} at {mass} = {write_quantity(known[mass], 'kg')}" if words else ""
+    unit, products = FORCES[found.gap.unit]
+    values = found.loop.parameters
+    names = [name for name, u in found.loop.known_units.items() if u == unit and name in values]
+    if len(names) != 1:
+        return ""
+    inertia = values[names[0]]
+    words = [write_quantity(inertia * getattr(effect, p.name), products[p.unit])
+             for p in effect.parameters() if p.unit in products]  # fmt: skip
+    return f"{write_list(words)} at {names[0]} = {write_quantity(inertia, unit)}" if words else ""
 
 
 def describe_certainty(found: Diagnosis, finding: Finding) -> str:

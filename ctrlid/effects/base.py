@@ -160,17 +160,17 @@ class AbstractEffect:
         return bool(deciding) and all(getattr(self, p.name) == p.neutral for p in deciding)
 
     def units(self, loop: Any = None) -> dict[str, str]:
-        """Return the unit of each parameter, in those of a loop's plant if they are known."""
+        """Return the unit of each parameter, in those of a loop if they are known."""
         signals: dict[str, str] = {}
         if loop is not None:
-            known: Mapping[str, str] = getattr(loop.plant, "units", {})
+            known: Mapping[str, str] = loop.known_units
             e = loop.equations()
             names = {"u": e.inputs[0], "y": e.outputs[0], "x": getattr(self, "name", "")}
             signals = {key: known[name] for key, name in names.items() if name in known}
         return {p.name: fill_unit(p.unit, signals) for p in self.parameters()}
 
     def text(self, loop: Any = None) -> str:
-        """Return the effect in words, with the units of a loop's plant if one is given."""
+        """Return the effect in words, with the units of a loop if one is given."""
         units = self.units(loop)
         parts = []
         for f in dataclasses.fields(self):

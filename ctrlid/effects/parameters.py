@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from .._base import units as _units
+
 
 @dataclass(frozen=True)
 class Parameter:
@@ -71,4 +73,4 @@ def parameter(
 def fill_unit(unit: str, signals: Mapping[str, str] | None = None) -> str:
     """Return a unit with the units of signals in it, or with [u] and [y] where they are unknown."""
     known = {"u": "[u]", "y": "[y]", "x": "[state]", **(signals or {})}
-    return unit.format(**known)
+    return _units.fill_unit(unit, known)

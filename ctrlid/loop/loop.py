@@ -49,6 +49,12 @@ class Loop:
     effects : sequence of effects, optional
         Physics that the plant lacks, from `ctrlid.effects`; `with_effect` adds one. Each is known
         by its class name, a second one of a class by name and number: "ViscousFriction2".
+    units : mapping of str to str, optional
+        Units of signals, states and parameters of the plant by their names, such as
+        ``{"theta": "rad", "tau": "N m", "J": "kg m^2"}``; by default those in the attribute `units`
+        of the plant, which the plants of `ctrlid.plants` have. Sizes of effects are written in
+        them, and as forces if the output is in m and one parameter in kg, or as torques if it is
+        in rad and one in kg m^2.
 
     Raises
     ------
@@ -72,6 +78,7 @@ class Loop:
     free: tuple[str, ...] = ()
     input_limits: tuple[float, float] = (-math.inf, math.inf)
     effects: tuple[AbstractEffect, ...] = field(default=(), kw_only=True)
+    units: Mapping[str, str] = field(default_factory=dict, kw_only=True)
     _traced: Equations = field(init=False, repr=False)
     _active: Equations = field(init=False, repr=False)
     _kept: Equations = field(init=False, repr=False)
@@ -112,6 +119,7 @@ class Loop:
         object.__setattr__(self, "at", at)
         object.__setattr__(self, "input_limits", (lower, upper))
         self._apply_effects()
+        self._check_units()
         law = self.law()
         if law and law.dt == 0.0 and equations.dt:
             raise CtrlidError("an analog controller cannot act on a plant in discrete time; give "
@@ -153,6 +161,18 @@ class Loop:
                 "plant. If this is the controller, the order is Loop(plant, controller, ...)"
             )
 
+    def _check_units(self) -> None:
+        e = self._traced
+        known = (*e.inputs, *e.outputs, *e.states, *e.parameters)
+        given = self.units
+        if not isinstance(given, Mapping) or not all(isinstance(v, str) for v in given.values()):
+            raise CtrlidError("units= maps names of the plant to units, as in "
+                              f"{{{e.outputs[0]!r}: 'm'}}; given {given!r}")  # fmt: skip
+        unknown = [name for name in given if name not in known]
+        if unknown:
+            raise CtrlidError(f"units= names {unknown}, but the signals, states and parameters of "
+                              f"{e.name} are {list(dict.fromkeys(known))}")  # fmt: skip
+
     @property
     def linear_plant(self) -> bool:
         """Whether the plant is a linear system and so acts on deviations from `at`."""
@@ -167,6 +187,11 @@ class Loop:
     def parameters(self) -> dict[str, float]:
         """Values of the plant's numeric parameters and of those of the effects."""
         return dict(self._kept.parameters)
+
+    @property
+    def known_units(self) -> dict[str, str]:
+        """Units by the names of the plant: those in `units`, and else those that the plant has."""
+        return {**getattr(self.plant, "units", {}), **self.units}
 
     def equations(self, keep: bool = False) -> Equations:
         """Return the traced equations of the plant with its effects, in absolute physical units.
@@ -339,7 +364,7 @@ class Loop:
         """
         if not self.linear_plant and self._active is self._traced:
             return self.plant
-        return as_system(self._active, self._bare_point, getattr(self.plant, "units", {}))
+        return as_system(self._active, self._bare_point, self.known_units)
 
     def linearize(self) -> Any:
         """Return the plant with its effects, linearized at the operating point.

@@ -103,7 +103,7 @@ def simulate(
     y, u = simulator.run(simulator.start(initial), r, d, noise)
     e = loop.equations()
     signals = {"r": e.outputs[0], "u": e.inputs[0], "y": e.outputs[0]}
-    known = getattr(loop.plant, "units", {})
+    known = loop.known_units
     units = {key: known[name] for key, name in signals.items() if name in known}
     return Record(
         r=r, u=u, y=y, dt=loop.dt, hold="foh" if loop.analog else "zoh",

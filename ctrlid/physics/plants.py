@@ -79,7 +79,13 @@ def maglev(m: float, K: float, g: float = 9.81) -> Any:
         return np.array([speed, params["g"] - pull / params["m"]])
 
     return _make_plant(
-        "maglev", update, ["V"], ["x"], ["x", "v"], {"m": m, "K": K, "g": g}, {"V": "V", "x": "m"}
+        "maglev",
+        update,
+        ["V"],
+        ["x"],
+        ["x", "v"],
+        {"m": m, "K": K, "g": g},
+        {"V": "V", "x": "m", "v": "m/s", "m": "kg", "K": "N m^2/V^2", "g": "m/s^2"},
     )
 
 
@@ -122,7 +128,13 @@ def servo(m: float, c: float, k: float) -> Any:
         return np.array([x[1], (params["k"] * u[0] - params["c"] * x[1]) / params["m"]])
 
     return _make_plant(
-        "servo", update, ["V"], ["x"], ["x", "v"], {"m": m, "c": c, "k": k}, {"V": "V", "x": "m"}
+        "servo",
+        update,
+        ["V"],
+        ["x"],
+        ["x", "v"],
+        {"m": m, "c": c, "k": k},
+        {"V": "V", "x": "m", "v": "m/s", "m": "kg", "c": "N s/m", "k": "N/V"},
     )
 
 
@@ -167,7 +179,8 @@ def tank(area: float, outlet: float, k: float, g: float = 9.81) -> Any:
         return np.array([(params["k"] * u[0] - drain) / params["area"]])
 
     parameters = {"area": area, "outlet": outlet, "k": k, "g": g}
-    return _make_plant("tank", update, ["V"], ["h"], ["h"], parameters, {"V": "V", "h": "m"})
+    units = {"V": "V", "h": "m", "area": "m^2", "outlet": "m^2", "k": "m^3/(s V)", "g": "m/s^2"}
+    return _make_plant("tank", update, ["V"], ["h"], ["h"], parameters, units)
 
 
 def pendulum(m: float, length: float, c: float = 0.0, g: float = 9.81) -> Any:
@@ -214,7 +227,8 @@ def pendulum(m: float, length: float, c: float = 0.0, g: float = 9.81) -> Any:
         return np.array([x[1], (weight - params["c"] * x[1] + u[0]) / inertia])
 
     parameters = {"m": m, "length": length, "c": c, "g": g}
-    units = {"tau": "N m", "theta": "rad"}
+    units = {"tau": "N m", "theta": "rad", "omega": "rad/s", "m": "kg", "length": "m",
+             "c": "N m s/rad", "g": "m/s^2"}  # fmt: skip
     return _make_plant(
         "pendulum", update, ["tau"], ["theta"], ["theta", "omega"], parameters, units
     )

@@ -192,12 +192,12 @@ def _compute_net_gain(c: Candidate) -> float:
 def write_bin_labels(place: BinnedErrors) -> tuple[list[str], str]:
     """Return the edges of the bins of a place as labels, and the title of the axis."""
     known = place.edges[np.isfinite(place.edges)]
-    factor, unit = choose_scale([known], place.unit) if known.size else (1.0, place.unit)
+    factor, unit = choose_scale([known] if known.size else [np.zeros(1)], place.unit)
     digits = next(
         (d for d in (2, 3, 4) if len({_text.write_number(e, d) for e in known}) == known.size), 5
     )
     labels = [_text.write_number(factor * e, digits) if np.isfinite(e) else "" for e in place.edges]
     widths = np.diff(known)
     even = widths.size == 0 or float(np.ptp(widths)) < 0.01 * float(np.max(widths))
-    title = f"{place.axis} [{unit if place.unit else '1'}]"
+    title = f"{place.axis} [{unit}]"
     return labels, title if even else f"{title}, at the edges of the bins"

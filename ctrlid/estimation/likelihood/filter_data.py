@@ -7,6 +7,7 @@ import numpy as np
 
 from ..._base.arrays import Array
 from ..._base.errors import CtrlidError, ModelCannotRun
+from ..._base.units import fill_unit
 from ...data.reconstruction import count_pieces, reconstruct_signal
 from ...data.record import Record
 from ...loop.loop import Loop
@@ -114,12 +115,12 @@ def make_filter_data(loop: Loop, record: Record, start_time: float = 0.0) -> Fil
 
 def find_noise_units(loop: Loop, record: Record) -> tuple[str, str]:
     """Return the units of sensor noise and of force noise, empty where they are not known."""
-    of_plant = getattr(loop.plant, "units", {}).get(loop.equations().outputs[0], "")
+    of_plant = loop.known_units.get(loop.equations().outputs[0], "")
     unit = record.units.get("y", "") or of_plant
     if unit in ("", "1"):
         return "", ""
     # Without a moving mass the noise acts on the rates of the states, whose units are not known.
-    return unit, f"{unit}/s^2" if loop.equations().velocities else ""
+    return unit, fill_unit("{y}/s^2", {"y": unit}) if loop.equations().velocities else ""
 
 
 def prepare_for_loop(data: FilterData, loop: Loop) -> FilterData:

@@ -35,13 +35,14 @@ def read_record(path: Path, args: argparse.Namespace) -> Record:
         raise CtrlidError(f"--columns takes {', '.join(CHANNELS)}, as in --columns u=volt,y=gap; "
                           f"given {unknown[0]}")  # fmt: skip
     try:
-        return Record.from_csv(path, dt=args.dt, hold=args.hold, gaps=args.gaps, **args.columns)
+        return Record.from_csv(path, dt=args.dt, hold=args.hold, gaps=args.gaps, units=args.units,
+                               scale=dict(args.scale), **args.columns)  # fmt: skip
     except CtrlidError as reason:  # Any refusal stays one, in the words of the command line.
         text = str(reason)
         for key in CHANNELS:
             text = text.replace(f"with {key}=", f"with --columns {key}=NAME")
         text = text.replace("give dt=", "give --dt")
-        text = text.replace("gaps='mask'", "--gaps mask")
+        text = text.replace("gaps='mask'", "--gaps mask").replace("scale=", "--scale")
         raise CtrlidError(text) from reason
 
 

@@ -72,6 +72,12 @@ def add_parser(commands: Any) -> None:
         help="sampling period in seconds (default: that of the time column)")  # fmt: skip
     add("--columns", type=parse_assignments, default={}, metavar="r=REF,u=VOLT,y=GAP",
         help="names of the columns for r, u, y and time")  # fmt: skip
+    add("--units", type=parse_assignments, default={}, metavar="y=UNIT,u=UNIT",
+        help="units of the channels, instead of those in the header")  # fmt: skip
+    add("--scale", type=parse_assignment, nargs="+", action="extend", default=[],
+        metavar="NAME=FACTOR",
+        help="factors of the channels r, u and y: y=0.0174533 r=0.0174533 makes radians of "
+        "degrees; say the new unit with --units")  # fmt: skip
     add("--controller", metavar="C",
         help="the controller: MODULE:NAME, FILE.py:NAME, or a PID written as "
         "kp=..,ki=..,kd=.. (default: not known)")  # fmt: skip

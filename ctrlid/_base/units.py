@@ -1,0 +1,118 @@
+"""Units as text: products, powers and quotients, and which texts are units at all."""
+
+import re
+from collections.abc import Mapping
+
+# What takes a prefix such as m or k, and what does not.
+WITH_PREFIX = ("m", "g", "s", "A", "K", "Hz", "rad", "N", "Nm", "Pa", "J", "W", "V", "F", "Ω",
+               "ohm", "H", "T", "bar", "l", "L")  # fmt: skip
+ALONE = ("%", "‰", "°", "deg", "grad", "°C", "C", "min", "h", "rpm", "cm", "in", "inch", "ft",
+         "psi", "rev", "turns", "ticks", "counts", "steps", "LSB")  # fmt: skip
+PREFIXES = ("", "n", "µ", "μ", "u", "m", "k", "M")
+KNOWN = frozenset([*ALONE, *(p + unit for p in PREFIXES for unit in WITH_PREFIX)])
+MARKS = re.compile(r"[/()*·]|\^-?\d+|[^\s/()*·^]+|\S")
+
+
+def fill_unit(template: str, signals: Mapping[str, str]) -> str:
+    """Return a unit in which names in braces stand for the units of signals.
+
+    Parameters
+    ----------
+    template : str
+        As in ``1/(s {u}^2)``.
+    signals : mapping of str to str
+        The unit of each name.
+
+    Returns
+    -------
+    str
+        The unit, in which powers of the same unit are one. A product keeps together: its square
+        is ``(N m)^2``.
+
+    Examples
+    --------
+    >>> fill_unit("1/(s {u}^2)", {"u": "N m"}), fill_unit("{y}/s^2", {"y": "m/s"})
+    ('1/(s (N m)^2)', 'm/s^3')
+    >>> fill_unit("{y}/s^2", {"y": "%"}), fill_unit("{y}", {"y": "N m"})
+    ('%/s^2', 'N m')
+    """
+    if "{" not in template:
+        return template
+    filled: dict[str, int] = {}
+    for symbol, power in _parse_unit(template).items():
+        unit = signals[symbol[1:-1]] if symbol.startswith("{") else symbol
+        parts = _parse_unit(unit)
+        if len(parts) > 1 and min(parts.values()) > 0:
+            parts = {unit: 1}
+        for part, times in parts.items():
+            filled[part] = filled.get(part, 0) + power * times
+    return _write_unit(filled)
+
+
+def is_unit(text: str) -> bool:
+    """Return whether a text is made of the usual symbols of units.
+
+    Parameters
+    ----------
+    text : str
+        What may be a unit.
+
+    Returns
+    -------
+    bool
+        True if each symbol in it is known.
+
+    Examples
+    --------
+    >>> [is_unit(text) for text in ("ms", "°/s", "N m", "(m/s)", "volt", "y")]
+    [True, True, True, True, False, False]
+    """
+    parts = _parse_unit(text)
+    return bool(parts) and KNOWN.issuperset(parts)
+
+
+def _parse_unit(text: str) -> dict[str, int]:
+    """Return the powers of the symbols in a unit; a text that is none is a symbol of its own."""
+    marks = MARKS.findall(text.replace("²", "^2").replace("³", "^3"))
+    try:
+        powers = _read_product(marks)
+    except (ValueError, IndexError):
+        return {text: 1}
+    return {text: 1} if marks else powers
+
+
+def _read_product(marks: list[str]) -> dict[str, int]:
+    """Take a product off the front of a list of marks, up to its end or a closing bracket."""
+    powers: dict[str, int] = {}
+    sign = 1
+    while marks and marks[0] != ")":
+        mark = marks.pop(0)
+        if mark in "*·":
+            continue
+        if mark == "/":
+            sign = -1
+            continue
+        part = {} if mark == "1" else {mark: 1}
+        if mark == "(":
+            part = _read_product(marks)
+            marks.pop(0)
+        elif mark.startswith("^"):
+            raise ValueError(mark)
+        power = int(marks.pop(0)[1:]) if marks and marks[0].startswith("^") else 1
+        for symbol, times in part.items():
+            powers[symbol] = powers.get(symbol, 0) + sign * power * times
+        sign = 1
+    return {symbol: n for symbol, n in powers.items() if n}
+
+
+def _write_unit(factors: Mapping[str, int]) -> str:
+    above = " ".join(_write_power(f, n) for f, n in factors.items() if n > 0)
+    below = [_write_power(f, -n, below=True) for f, n in factors.items() if n < 0]
+    if not below:
+        return above
+    return f"{above or '1'}/{below[0] if len(below) == 1 else '(' + ' '.join(below) + ')'}"
+
+
+def _write_power(factor: str, power: int, below: bool = False) -> str:
+    whole = f"({factor})" if " " in factor and (power > 1 or below) else factor
+    return whole if power == 1 else f"{whole}^{power}"

@@ -1,0 +1,166 @@
+"""Units: where they come from, what they become in powers, and when a size is told in newtons."""
+
+import math
+
+import control as ct
+import numpy as np
+import pytest
+
+import ctrlid as cid
+from ctrlid import effects as E
+from ctrlid._base.units import fill_unit, is_unit
+from problems import record_of as record_any
+
+DT = 0.01
+
+
+def turntable(units):
+    """Return a loop around a disc on a motor, J w' = k u - c w, with an angle as output."""
+    plant = ct.nlsys(
+        lambda t, x, u, p: np.array([x[1], (p["k"] * u[0] - p["c"] * x[1]) / p["J"]]),
+        lambda t, x, u, p: x[0], inputs=["duty"], outputs=["angle"], states=["angle", "rate"],
+        params={"J": 0.5, "c": 0.1, "k": 1.0}, name="disc",
+    )  # fmt: skip
+    return cid.Loop(plant, cid.PID(kp=10.0, kd=1.0), dt=DT, free=("k",), units=units)
+
+
+def record_of(loop, effect, swing, noise, seed, n):
+    real = loop.with_effect(effect)
+    return record_any(real, swing=swing, hold=60, n=n, seed=seed, sensor_noise=noise)
+
+
+@pytest.mark.parametrize(
+    ("template", "u", "y", "expected"),
+    [("{u}^2", "N m", "", "(N m)^2"), ("1/(s {u}^2)", "V", "", "1/(s V^2)"),
+     ("1/{u}", "N m", "", "1/(N m)"), ("{y}/s^2", "", "m/s", "m/s^3"), ("{y}/s", "", "°", "°/s"),
+     ("1/(s^2 {y}^2)", "", "m^2", "1/(s^2 m^4)"), ("{y}/s^2", "", "1", "1/s^2"),
+     ("1/{y}", "", "1/s", "s"), ("{u}", "%", "", "%"), ("m^3/s^2", "V", "m", "m^3/s^2"),
+     ("{y}/s^2", "", "odd ^ unit", "odd ^ unit/s^2")],
+)  # fmt: skip
+def test_units_of_products_and_quotients(template, u, y, expected):
+    assert fill_unit(template, {"u": u, "y": y}) == expected
+
+
+def test_which_texts_are_units():
+    known = ("s", "ms", "µm", "kV", "N m", "m/s^2", "°", "%", "1/s", "(m/s)", "m²", "rad/s")
+    assert [t for t in known if not is_unit(t)] == []
+    assert [t for t in ("", "y", "down", "volt", "x0", "((", "^2") if is_unit(t)] == []
+
+
+@pytest.fixture(scope="module")
+def degrees():
+    """Return a loop, and a record of it with friction, in degrees and per cent."""
+    loop = turntable({})
+    record = record_of(loop, E.CoulombFriction(3.0), 1.0, 1e-3, 11, n=1500)
+    return loop, cid.Record(r=record.r, u=record.u, y=record.y, dt=DT, name="log",
+                            units={"r": "deg", "u": "%", "y": "deg"})  # fmt: skip
+
+
+def test_a_log_in_degrees_and_per_cent_is_told_in_them(degrees):
+    loop, record = degrees
+    found = cid.diagnose(loop, record, progress=False, catalogue=[E.CoulombFriction])
+    (friction,) = found.findings
+    assert friction.effect.units(found.loop) == {"fc": "deg/s^2"}
+    assert found.gap.unit == "deg"
+    assert {p.axis: p.unit for p in found.where}["velocity"] == "deg/s"
+    text = str(found)
+    assert " deg/s^2" in text
+    assert "[y]" not in text
+    assert "kg" not in text
+    assert E.EddyCurrentDamping(0.1).units(found.loop) == {"ce": "1/(s %^2)"}
+    assert E.InputOffset(0.1).text(found.loop) == "InputOffset: offset = 0.1 %"
+    assert not any("units: " in remark for remark in found.audit)
+
+
+def test_forces_need_a_length_and_one_mass_in_kilograms(degrees, tmp_path):
+    loop, record = degrees
+    bare = cid.diagnose(loop, record, progress=False, catalogue=[E.CoulombFriction])
+    size = bare.findings[0].effect.fc
+
+    def tell(units, of_y):
+        made = cid.Record(r=record.r, u=record.u, y=record.y, dt=DT, units={"y": of_y})
+        found = cid.diagnose(turntable(units), made, progress=False, catalogue=[E.CoulombFriction])
+        loaded = cid.load_diagnosis(found.save(tmp_path / f"{len(list(tmp_path.iterdir()))}.json"))
+        assert str(loaded) == str(found)
+        return str(found)
+
+    assert f"({0.5 * size:.3g} N m at J = 0.5 kg m^2)" in tell({"J": "kg m^2"}, "rad")
+    assert f"({0.5 * size:.3g} N at J = 0.5 kg)" in tell({"J": "kg"}, "m")
+    for units, of_y in (({"J": "kg m^2"}, "deg"), ({"J": "kg"}, "rad"), ({"J": "kg"}, "mm"),
+                        ({}, "m"), ({"J": "kg", "c": "kg"}, "m")):  # fmt: skip
+        text = tell(units, of_y)
+        assert f"{of_y}/s^2" in text
+        assert " at J" not in text
+
+
+def test_the_mass_of_a_pendulum_moves_on_a_circle():
+    """N s/m at m = 0.35 kg would be wrong: friction at a pivot is in N m s/rad."""
+    plant = cid.plants.pendulum(m=0.35, length=0.3)
+    at = cid.operating_point(plant, output=0.0)
+    loop = cid.Loop(plant, cid.PID(kp=5.0, kd=0.5, bias=0.0), dt=DT, at=at, free=("m",))
+    record = record_of(loop, E.ViscousFriction(2.0), 0.1, 1e-4, 3, n=1500)
+    assert record.units == {"r": "rad", "u": "N m", "y": "rad"}
+    found = cid.diagnose(loop, record, progress=False, catalogue=[E.ViscousFriction])
+    assert [f.name for f in found.findings] == ["ViscousFriction"]
+    assert "kg" not in str(found)
+    assert E.EddyCurrentDamping(0.1).units(loop) == {"ce": "1/(s (N m)^2)"}
+
+
+def test_units_of_a_loop_are_checked():
+    with pytest.raises(cid.CtrlidError, match=r"names \['phi'\], but the signals, states and"):
+        turntable({"phi": "rad"})
+    with pytest.raises(cid.CtrlidError, match="maps names of the plant to units"):
+        turntable({"angle": 3})
+
+
+def test_axes_of_bins_say_where_no_unit_is_known(degrees):
+    loop, record = degrees
+    made = cid.Record(r=record.r, u=record.u, y=record.y, dt=DT)
+    found = cid.diagnose(loop, made, progress=False, catalogue=[E.CoulombFriction])
+    labels = {ax.get_xlabel() for ax in cid.plot.diagnosis(found)[0].figure.axes}
+    assert not any("[1]" in text for text in labels if "lag" not in text)
+    assert any("[unit not given]" in text for text in labels)
+
+
+def test_a_file_is_converted_on_a_stated_scale(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text("Zeit/ms;Soll/°;Ist/°;Stell/%\n0;0,0;0,0;50\n4;9,0;0,9;60\n8;9,0;1,8;70\n")
+    names = {"r": "Soll", "u": "Stell", "y": "Ist"}
+    plain = cid.Record.from_csv(path, **names)
+    assert plain.dt == 0.004
+    assert plain.units == {"r": "°", "u": "%", "y": "°"}
+    scale = {"r": math.pi / 180, "y": math.pi / 180}
+    made = cid.Record.from_csv(path, **names, scale=scale, units={"y": "rad"})
+    assert made.units == {"u": "%", "y": "rad"}
+    np.testing.assert_allclose(made.y, np.deg2rad(plain.y))
+    np.testing.assert_allclose(made.u, plain.u)
+    refusals = (({"x": 2.0}, "scale= names 'x', but the channels are"),
+                ({"y": 0.0}, "a number other than zero for y; given 0.0"),
+                ({"y": "deg"}, "a number other than zero for y; given 'deg'"))  # fmt: skip
+    for wrong, words in refusals:
+        with pytest.raises(cid.CtrlidError, match=words):
+            cid.Record.from_csv(path, **names, scale=wrong)
+
+
+def test_times_that_are_hardly_seconds_are_questioned(tmp_path):
+    path = tmp_path / "log.csv"
+
+    def write(label, step):
+        rows = "\n".join(f"{k * step:g},0.1,{0.1 * k}" for k in range(5))
+        path.write_text(f"{label},u,y\n{rows}\n")
+        return path
+
+    for step in (1, 4, 50):
+        with pytest.warns(cid.CtrlidWarning, match=rf"the period is {step} s. If it is in milli"):
+            cid.Record.from_csv(write("Zeit", step))
+    for label, step in (("t", 0.004), ("t", 1.5), ("t [s]", 4), ("Zeit/s", 4), ("seconds", 4)):
+        assert cid.Record.from_csv(write(label, step)).dt == step
+    assert cid.Record.from_csv(write("t", 4), dt=4).dt == 4
+
+
+@pytest.mark.parametrize("n", [50, 60])
+def test_a_record_that_is_too_short_is_called_so(n):
+    loop = turntable({})
+    record = record_of(loop, E.CoulombFriction(3.0), 1.0, 1e-3, 11, n=n)
+    with pytest.raises(cid.CtrlidError, match=r"too short for a diagnosis.* at least 67 samples"):
+        cid.diagnose(loop, record, progress=False)
