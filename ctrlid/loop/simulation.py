@@ -190,10 +190,8 @@ class Simulator:
         # An undamped plant neither grows nor decays; round-off must not decide which.
         self._unstable = loop.controller is None and compute_growth_rate(loop) * loop.dt > 1e-6
         # What a millionth of the operating values does to each state: smaller motion is rest.
-        a, b = (
-            np.nan_to_num(np.abs(m))
-            for m in linearize_at_rest(first, loop.point.output, first.step)
-        )
+        self._motion = linearize_at_rest(first, loop.point.output, first.step)
+        a, b = (np.nan_to_num(np.abs(m)) for m in self._motion)
         self._floor = 1e-6 * (
             a @ np.abs(self.rest) + (b[:, 2] + b[:, 5:].sum(axis=1)) * abs(loop.point.input)
         )
@@ -241,6 +239,7 @@ class Simulator:
                        *(noise or (quiet, quiet)), self._find_path(d)])  # fmt: skip
         y, u = np.empty(n), np.empty(n)
         start, reach = z, self._floor
+        asked, whole = self._measure_asked(w), loop.controller is None
         substeps, size = 1, min(CHUNK, n)
         worst, where = 0.0, 0
         for first in range(0, n, size):
@@ -251,7 +250,11 @@ class Simulator:
             while True:
                 results = self._build_runner(substeps, size)(z, block)
                 states, ys, us, errors = (np.asarray(a, float)[:, :count] for a in results)
-                stop = _find_first_bad(loop, self._unstable, states, ys, us, w)
+                stop = self._find_first_bad(states, ys, us, asked)
+                if stop is not None and not whole:
+                    # What moves the loop beside the reference asks for motion, too.
+                    asked, whole = max(asked, self._compute_reach(start, w)), True
+                    stop = self._find_first_bad(states, ys, us, asked)
                 good = count if stop is None else max(stop - 1, 0)
                 travel = np.max(np.abs(states[:, :good] - start[:, None]), axis=1, initial=0.0)
                 excursion = np.maximum(reach, travel)
@@ -269,7 +272,10 @@ class Simulator:
                 inside = bool(np.isfinite(states[:, stop]).all())
                 growth, until = _compute_known_growth(loop), slice(stop + 1)
                 stopped = SimulationStopped(
-                    _explain_stop(loop, growth, first + stop, inside, ys[:, until], us[:, until], w)
+                    _explain_stop(
+                        loop, growth, first + stop, inside, ys[:, until], us[:, until], w,
+                        float(np.max(np.abs(start - self.rest))) > 0,
+                    )  # fmt: skip
                 )
                 stopped.unstable = growth > 0
                 stopped.y = np.concatenate([y[:first], ys[0, :stop]])
@@ -289,20 +295,41 @@ class Simulator:
             )  # fmt: skip
         return y, u
 
+    def _measure_asked(self, w: Array) -> float:
+        """Return how far from zero the point of rest, the reference and the noise ask y to be."""
+        rest = self.loop.point.output
+        if self.loop.controller is None:
+            return abs(rest)
+        return max(abs(rest), *np.max(np.abs([w[1] - rest, w[3]]), axis=1))
 
-def _find_first_bad(
-    loop: Loop, unstable: bool, states: Array, ys: Array, us: Array, w: Array
-) -> int | None:
-    """Return the first sample at which the loop is no longer where it can be, or None."""
-    bad = ~(np.isfinite(states).all(axis=0) & np.isfinite(ys[0]) & np.isfinite(us[0]))
-    rest = loop.point.output
-    asked = abs(rest)
-    if loop.controller is not None:
-        asked = max(asked, *np.max(np.abs([w[1] - rest, w[3]]), axis=1), 1e-300)
-    # An open loop may travel far, an integrator must; only an unstable plant runs away from rest.
-    if loop.controller is not None or (asked and unstable):
-        bad |= np.abs(ys[0] - rest) > RUNAWAY * asked
-    return int(np.argmax(bad)) if bad.any() else None
+    def _compute_reach(self, start: Array, w: Array) -> float:
+        """Return how far a start, injected signals, noises and forces move the output from rest.
+
+        That is the largest output of the loop linearized at rest, without what would grow by
+        itself; infinity where it has no derivative.
+        """
+        a, n = self._motion[0], w.shape[1]
+        if not np.isfinite(a).all():
+            return math.inf
+        step, rest = self._steps[1].map(n), self.rest[:, None]
+        pushes = np.asarray(step(np.repeat(rest, n, axis=1), w)[0], float) - rest
+        a = a / max(1.0, float(np.max(np.abs(np.linalg.eigvals(a)), initial=0.0)))
+        moved = np.empty((len(start), n))
+        moved[:, 0] = start - self.rest
+        for k in range(n - 1):
+            moved[:, k + 1] = a @ moved[:, k] + pushes[:, k]
+        y = np.asarray(step(rest + moved, w * np.array([[1], [1], [1], [0], [1], [1]]))[1], float)
+        reach = float(np.max(np.abs(y - self.loop.point.output)))
+        return reach if math.isfinite(reach) else math.inf
+
+    def _find_first_bad(self, states: Array, ys: Array, us: Array, asked: float) -> int | None:
+        """Return the first sample at which the loop is no longer where it can be, or None."""
+        bad = ~(np.isfinite(states).all(axis=0) & np.isfinite(ys[0]) & np.isfinite(us[0]))
+        # An open loop may travel far, an integrator must; only an unstable plant runs away from
+        # rest.
+        if self.loop.controller is not None or (asked and self._unstable):
+            bad |= np.abs(ys[0] - self.loop.point.output) > RUNAWAY * asked
+        return int(np.argmax(bad)) if bad.any() else None
 
 
 def _compute_known_growth(loop: Loop) -> float:
@@ -314,7 +341,7 @@ def _compute_known_growth(loop: Loop) -> float:
 
 
 def _explain_stop(
-    loop: Loop, growth: float, at: int, inside: bool, ys: Array, us: Array, w: Array
+    loop: Loop, growth: float, at: int, inside: bool, ys: Array, us: Array, w: Array, pushed: bool
 ) -> str:
     """Say when and why a simulation broke off."""
     e, op = loop.equations(), loop.point
@@ -341,8 +368,13 @@ def _explain_stop(
     if np.any(recent <= lower) or np.any(recent >= upper):
         text += f" {inp} was at its limit ({lower:g} to {upper:g}) shortly before."
     asked = float(np.max(np.abs(w[1] - op.output)))
-    text += (f" Near the operating point the loop is stable, so the signals are too large for it: "
-             f"the reference is up to {asked:.3g} away from the operating point")  # fmt: skip
+    sizes = [f"the reference is up to {asked:.3g} away from the operating point"] if asked else []
+    sizes += [f"{name} is up to {np.max(np.abs(v)):.3g}"
+              for name, v in (("the injected signal d", w[2]), ("the sensor noise", w[3]),
+                              ("the force noise", w[4])) if np.any(v)]  # fmt: skip
+    sizes += ["it starts away from rest"] if pushed else []
+    text += (" Near the operating point the loop is stable, so the signals are too large for it: "
+             + ", ".join(sizes or ["what moves it is a force in the loop itself"]))  # fmt: skip
     if good:
         swing = np.max(np.abs(us[0, : good + 1] - op.input))
         text += f", and {inp} was up to {swing:.3g} away from {op.input:.4g}"
@@ -350,4 +382,7 @@ def _explain_stop(
     if np.max(np.abs(w[1])) < abs(op.output) / 2:
         return (f"{text} Signals are absolute: if r was meant as a deviation from the operating "
                 f"point, add {op.output:.6g} to it")  # fmt: skip
-    return f"{text} Use a smaller reference or less noise"
+    smaller = [name for name, v in (("a smaller reference", asked), ("a smaller d", w[2]),
+                                    ("less noise", w[3:5])) if np.any(v)]  # fmt: skip
+    smaller += ["a start nearer to rest"] if pushed else []
+    return f"{text} Use {' or '.join(smaller or ['a smaller force'])}"
