@@ -14,6 +14,7 @@ from scipy import linalg, signal
 
 import ctrlid as cid
 from ctrlid import CtrlidError, plot
+from ctrlid.estimation.linear import prediction_error
 from ctrlid.estimation.linear.sampled_motion import (
     Circuit,
     _exponential,
@@ -295,3 +296,38 @@ def test_an_absurd_trial_of_the_search_is_no_warning():
     ):
         signals = {name: np.zeros(50) for name in "yur"}
         assert compute_prediction_errors(motion, np.zeros(2), signals)[0] is None
+
+
+@pytest.mark.parametrize("gain", [1e-3, 1e-7, 1e-10])
+def test_a_plant_of_small_gain_in_si_units_is_found_as_well_as_a_large_one(gain):
+    """A piezo stage moves by 100 nm/V; its numerator must not be lost beside the poles."""
+    omega, dt = 2 * np.pi * 800, 3e-5
+    a, b, c, d, _ = signal.cont2discrete(
+        (
+            np.array([[0, 1], [-(omega**2), -0.2 * omega]]),
+            np.array([[0], [gain * omega**2]]),
+            np.array([[1, 0]]),
+            np.array([[0]]),
+        ),
+        dt,
+    )
+    rng = np.random.default_rng(11)
+    u = np.repeat(rng.choice([-1.0, 1.0], 200), 10)
+    _, y, _ = signal.dlsim((a, b, c, d, dt), u)
+    y = y[:, 0] + 0.01 * gain * rng.standard_normal(u.size)
+    e = cid.fit_continuous(cid.Record(u=u, y=y, dt=dt), 2).estimate
+    assert abs(e["b1"] / (gain * omega**2) - 1) < 4 * e.standard_errors[2] / (gain * omega**2)
+    assert e.standard_errors[2] < 1e-3 * e["b1"]
+    assert e.notes == ()
+
+
+def test_a_search_that_does_not_converge_says_so(monkeypatch):
+    record = experiment(loop_at(0.005), n=600, sensor_noise=1e-5)
+    search = prediction_error._minimize_errors
+    monkeypatch.setattr(
+        prediction_error, "_minimize_errors",
+        lambda task, point, known, rounds=1: search(task, point, known, 1),
+    )  # fmt: skip
+    assert "ENDED WITHOUT CONVERGENCE" in cid.fit_continuous(record, 2).estimate.notes[0]
+    monkeypatch.undo()
+    assert cid.fit_continuous(record, 2).estimate.notes == ()

@@ -15,7 +15,7 @@ from ...loop.controllers import PID
 from ...physics.conversions import to_state_matrices
 from ..constraints import AbstractConstraint, check_constraints
 from ..identified_model import Estimate, IdentifiedModel, Structure
-from ..whiteness import note_coloured_innovations
+from ..whiteness import ROUNDING, note_coloured_innovations
 from .prediction_error import Piece, Task, find_best_fit
 from .sampled_motion import Circuit, list_inputs
 
@@ -114,12 +114,15 @@ def fit_continuous(
         raise CtrlidError("a delay can be fitted only where the input is held (hold='zoh') and "
                           "controller= is not given; give delay=0")  # fmt: skip
     task = Task(structure, pieces, records[0].dt, records[0].hold, circuit, delay is None, 1.0)
-    point, found, rss, used, residuals = find_best_fit(task, known, delay or 0.0)
+    point, found, rss, used, residuals, settled = find_best_fit(task, known, delay or 0.0)
     degrees = used - found.free - structure.na - int(task.free_delay)
     size = max(float(np.max(np.abs(p.signals["y"]))) for p in pieces)
     notes = note_coloured_innovations(
         residuals, len(structure.names) + structure.na, _TOO_NARROW, size
     )
+    # Errors that are rounding beside y leave nothing to gain.
+    if not settled and rss > (ROUNDING * size) ** 2 * total:
+        notes = (_NOT_CONVERGED, *notes)
     late = f", delay {point.delay:.6g} s" if task.free_delay else ""
     estimate = Estimate(
         structure=structure, values=found.theta, covariance=found.spread * rss / degrees,
@@ -136,6 +139,10 @@ def fit_continuous(
     return model
 
 
+_NOT_CONVERGED = (
+    "THE SEARCH ENDED WITHOUT CONVERGENCE: a further step promised a better fit, and none of those "
+    "tried gave it. Lower the orders, add a constraint, or excite the loop more."
+)
 _TOO_NARROW = (
     "The observer takes a mixture of white sensor noise and white force noise, so that the "
     "standard errors are too small and coefficients may be biased: compare with fit_iv, or raise "

@@ -152,8 +152,7 @@ def _differentiate_errors(
 def _compute_jacobian(task: Task, point: Point, tables: list[Array]) -> Array:
     """Return the triangular factor of ``[gain, delay, theta, errors]``, nuisance projected out."""
     s = task.structure
-    speeds = task.speed ** np.arange(1.0, s.na + 1)
-    size = np.concatenate([speeds, np.full(s.nb, np.abs(point.theta[s.na :]).max())])
+    size = _measure_coefficients(task, point)
     steps: list[tuple[float, Callable[[float], Point]]] = []
     for e in np.eye(s.na):
         h = 1e-5 * max(abs(float(point.gain @ e)), 1e-3 * float(np.abs(point.gain).max()), 1e-9)
@@ -174,6 +173,13 @@ def _compute_jacobian(task: Task, point: Point, tables: list[Array]) -> Array:
     return merge_factors(factors)
 
 
+def _measure_coefficients(task: Task, point: Point) -> Array:
+    """Return a typical size of each coefficient, in its own unit."""
+    s = task.structure
+    largest = float(np.abs(point.theta[s.na :]).max())
+    return np.concatenate([task.speed ** np.arange(1.0, s.na + 1), np.full(s.nb, largest)])
+
+
 def _make_unit_vector(n: int, i: int) -> Array:
     e = np.zeros(n)
     e[i] = 1.0
@@ -182,8 +188,14 @@ def _make_unit_vector(n: int, i: int) -> Array:
 
 def _minimize_errors(
     task: Task, point: Point, known: Sequence[AbstractConstraint], rounds: int = ROUNDS
-) -> tuple[Point, Found, float]:
-    """Run Gauss-Newton with the constraints in each step; halved until the errors shrink."""
+) -> tuple[Point, Found, float, bool]:
+    """Run Gauss-Newton with the constraints in each step; halved until the errors shrink.
+
+    The last result says whether it converged: a further step of the coefficients promised less
+    than one residual variance, which is half a unit of log-likelihood. At short periods the best
+    observer is at the border of stability, so that a step of its gain may promise more for ever.
+    """
+    settled = False
     extra = task.structure.na + int(task.free_delay)
     rss, tables = _evaluate_cost(task, point)
     found: Found | None = None
@@ -202,6 +214,8 @@ def _minimize_errors(
         predicted = (
             rss - float(np.sum((inner @ move + right) ** 2)) - float(factor[p:, p] @ factor[p:, p])
         )
+        degrees = max(sum(q.n for q in task.pieces) - p, 1)
+        settled = predicted < rss / degrees
         for k in range(12):
             share = 0.5**k
             step = share * others
@@ -216,33 +230,42 @@ def _minimize_errors(
         else:
             break
         gained, rss, point, tables = rss - new, new, trial, new_tables
-        degrees = max(sum(q.n for q in task.pieces) - p, 1)
-        if share == 1.0 and abs(gained) < CONVERGED * rss / degrees and predicted < rss / degrees:
+        if share == 1.0 and abs(gained) < CONVERGED * rss / degrees and settled:
             break
     assert found is not None
-    return point, found, rss
+    if not settled:
+        alone, right = factor[:, extra:p], factor[:, p]
+        size = np.where((size := np.linalg.norm(alone, axis=0)) > 0, size, 1.0)
+        cost = Cost(alone / size, -right, np.diag(1 / size), point.theta)
+        move = minimize(cost, known, task.structure).theta - point.theta
+        settled = right @ right - float(np.sum((alone @ move + right) ** 2)) < rss / degrees
+    return point, found, rss, settled
 
 
 def _is_violated(task: Task, point: Point, known: Sequence[AbstractConstraint]) -> bool:
     if not known:
         return False
-    eye = np.eye(len(point.theta)) / np.maximum(np.abs(point.theta), 1e-12)
-    nearest = minimize(Cost(eye, np.zeros(len(point.theta)), np.eye(len(point.theta)), point.theta),
-                       known, task.structure).theta  # fmt: skip
-    return bool(np.any(np.abs(nearest - point.theta) > 1e-9 * (np.abs(point.theta) + 1e-12)))
+    least = 1e-12 * np.maximum(_measure_coefficients(task, point), np.finfo(float).tiny)
+    eye = np.eye(len(point.theta))
+    cost = Cost(eye / np.maximum(np.abs(point.theta), least), np.zeros(len(eye)), eye, point.theta)
+    nearest = minimize(cost, known, task.structure).theta
+    return bool(np.any(np.abs(nearest - point.theta) > 1e-9 * (np.abs(point.theta) + least)))
 
 
 def find_best_fit(
     task: Task, known: Sequence[AbstractConstraint], delay: float
-) -> tuple[Point, Found, float, int, list[Array]]:
-    """Search from the most promising starts; return the best minimum and its residuals."""
+) -> tuple[Point, Found, float, int, list[Array], bool]:
+    """Search from the most promising starts; return the best minimum and its residuals.
+
+    The last result says whether the search for it converged.
+    """
     starts = _rank_starts(task, delay)
     short = replace(task, pieces=_take_head(task.pieces))
     ranked: list[tuple[float, float, Point]] = []
     for speed, point in starts[:6]:
         local = _change_speed(short, speed)
         try:
-            refined, _, rss = _minimize_errors(local, point, known, rounds=12)
+            refined, _, rss, _ = _minimize_errors(local, point, known, rounds=12)
         except NotExcited:
             continue
         ranked.append((rss, speed, refined))
@@ -256,7 +279,7 @@ def find_best_fit(
     _, speed, point = ranked[0]
     try:
         task = _change_speed(task, speed)
-        best, found, rss = _minimize_twice(task, point, known)
+        best, found, rss, settled = _minimize_twice(task, point, known)
     except NotExcited as trouble:
         raise CtrlidError(
             "The data do not determine the coefficients: a change of "
@@ -267,12 +290,12 @@ def find_best_fit(
     used = sum(p.n for p in task.pieces) - len(task.pieces) * (
         task.structure.na + 1 + (len(task.circuit.a) if task.circuit else 0)
     )
-    return best, found, rss, used, _compute_residuals(task, best)
+    return best, found, rss, used, _compute_residuals(task, best), settled
 
 
 def _minimize_twice(
     task: Task, point: Point, known: Sequence[AbstractConstraint]
-) -> tuple[Point, Found, float]:
+) -> tuple[Point, Found, float, bool]:
     """Refine, and once more from the observer of pure sensor noise.
 
     At short periods a search may slide along the border where the observer turns unstable, and

@@ -228,8 +228,10 @@ def compute_prediction_errors(motion: DiscreteModel, gain: Array, signals: dict[
     for name, late, column in (*motion.inputs, ("y", 0, k)):
         if not np.any(column):
             continue
-        # C (zI - closed)^-1 column, whose poles are those of the observer.
-        num = np.real(np.poly(closed - np.outer(column, motion.c))) - observer
+        # C (zI - closed)^-1 column, whose poles are those of the observer. The numerator is a
+        # difference of polynomials, linear in the column: a small column would be lost in it.
+        unit = 2.0 ** np.round(np.log2(np.max(np.abs(column))))
+        num = (np.real(np.poly(closed - np.outer(column / unit, motion.c))) - observer) * unit
         moved = signal.lfilter(-num, observer, _delay_signal(signals[name], late))
         errors += moved
     return errors, observer
