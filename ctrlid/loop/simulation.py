@@ -271,12 +271,11 @@ class Simulator:
             if stop is not None:
                 inside = bool(np.isfinite(states[:, stop]).all())
                 growth, until = _compute_known_growth(loop), slice(stop + 1)
+                pushed = bool(np.any(start != self.rest))
                 stopped = SimulationStopped(
-                    _explain_stop(
-                        loop, growth, first + stop, inside, ys[:, until], us[:, until], w,
-                        float(np.max(np.abs(start - self.rest))) > 0,
-                    )  # fmt: skip
-                )
+                    _explain_stop(loop, growth, first + stop, inside, ys[:, until], us[:, until], w,
+                                  pushed)
+                )  # fmt: skip
                 stopped.unstable = growth > 0
                 stopped.y = np.concatenate([y[:first], ys[0, :stop]])
                 raise stopped
@@ -300,7 +299,7 @@ class Simulator:
         rest = self.loop.point.output
         if self.loop.controller is None:
             return abs(rest)
-        return max(abs(rest), *np.max(np.abs([w[1] - rest, w[3]]), axis=1))
+        return max(abs(rest), *map(float, np.max(np.abs([w[1] - rest, w[3]]), axis=1)))
 
     def _compute_reach(self, start: Array, w: Array) -> float:
         """Return how far a start, injected signals, noises and forces move the output from rest.

@@ -238,7 +238,8 @@ def _minimize_errors(
         size = np.where((size := np.linalg.norm(alone, axis=0)) > 0, size, 1.0)
         cost = Cost(alone / size, -right, np.diag(1 / size), point.theta)
         move = minimize(cost, known, task.structure).theta - point.theta
-        settled = right @ right - float(np.sum((alone @ move + right) ** 2)) < rss / degrees
+        left = float(np.sum((alone @ move + right) ** 2))
+        settled = float(right @ right) - left < rss / degrees
     return point, found, rss, settled
 
 
