@@ -1,5 +1,6 @@
 """CSV files: exact round trips, files that other tools write, and clocks that are not regular."""
 
+import re
 import warnings
 
 import numpy as np
@@ -273,3 +274,18 @@ def test_blank_cells_are_masked(tmp_path):
     assert record.valid.tolist() == [True, False, False, True, True]
     assert record.u.tolist() == [1, 1, 5, 7, 9]
     assert record.y.tolist() == [2, 4, 4, 8, 10]
+
+
+@pytest.mark.parametrize("every", [6, 7, 20, 50, 133])
+def test_rows_lost_at_a_regular_pace_are_not_taken_for_a_slower_clock(tmp_path, every):
+    """A clock of 1.0204 ms in whole milliseconds would write the same stamps."""
+    k = np.arange(2000)
+    kept = k[k % every != every - 1]
+    with pytest.raises(CtrlidError, match=r"at a regular pace, by twice as much") as refusal:
+        clock(tmp_path, 1e-3 * kept, 3)
+    record = clock(tmp_path, 1e-3 * kept, 3, gaps="mask")
+    assert record.dt == 1e-3
+    np.testing.assert_array_equal(np.flatnonzero(record.valid), kept)
+    slow = float(re.search(r"give dt=([\d.e-]+)", str(refusal.value))[1])
+    record = clock(tmp_path, 1e-3 * kept, 3, dt=slow)
+    assert (record.dt, len(record), record.valid.all()) == (slow, len(kept), True)

@@ -23,6 +23,9 @@ MARK = "# ctrlid "
 JITTER = 0.01
 # A step of more periods between two time stamps says that samples are missing.
 GAP = 1.5
+# Where steps of two units come less often than this, rows may have been lost at a regular pace. A
+# recorder that loses a fifth of all rows would have been noticed.
+LOST = 0.2
 # So many rows are written at once, which bounds the memory that their text takes.
 CHUNK = 20_000
 
@@ -305,13 +308,24 @@ def _find_even_period(stamps: Any, rounding: float, dt: float | None) -> float |
     ):
         return None
     if dt is not None:
-        return dt if fits(dt) else None
+        return dt if fits(dt, 1.25) else None
     slope = float(np.polyfit(k / n, stamps - stamps[0], 1)[0]) / n
     if not fits(slope, 1.25):
         return None
     # Of the periods that the stamps allow, the one with the fewest digits is taken.
     short = (float(f"{slope:.{digits}g}") for digits in range(1, 16))
     return next((p for p in short if fits(p) and abs(p - slope) <= rounding / n), slope)
+
+
+def _find_lossy_unit(stamps: Any) -> float | None:
+    """Return the step of a clock of which few steps are twice as long, None for other clocks."""
+    steps = np.diff(stamps)
+    unit = float(np.median(steps))
+    finest = 4 * float(np.spacing(np.abs(stamps).max()))
+    longer = np.round(steps / unit) if unit > 0 else np.zeros(0)
+    lossy = 0 < np.count_nonzero(longer > 1) <= LOST * len(steps) + 1
+    whole = np.all(np.abs(steps - longer * unit) <= finest)
+    return drop_roundoff(unit, finest) if lossy and whole else None
 
 
 def estimate_period(stamps: Any) -> float:
@@ -326,6 +340,17 @@ def _make_uniform(stamps: Any, dt: float | None, gaps: str, path: Path) -> tuple
         raise CtrlidError(f"the time column of {path} needs at least 2 values, all finite")
     rounding = _find_resolution(stamps)
     even = _find_even_period(stamps, rounding, dt)
+    if even is not None and dt is None and (unit := _find_lossy_unit(stamps)) is not None:
+        # A slow clock in whole units and a fast one that lost rows write the same stamps.
+        if gaps == "error":
+            longer = int(np.count_nonzero(np.diff(stamps) > GAP * unit))
+            raise CtrlidError(
+                f"the time column of {path} steps by {unit:g} s, and {longer} times, at a regular "
+                f"pace, by twice as much: either rows were lost (give gaps='mask' to fill them and "
+                f"mark them as not valid), or the period is no whole number of {unit:g} s (give "
+                f"dt={even:.10g})"
+            )
+        even, dt = None, unit
     if even is not None:
         return even, np.arange(len(stamps))
     steps = np.diff(stamps)
