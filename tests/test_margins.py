@@ -355,3 +355,36 @@ P = ct.tf([1], [1, 1])
 def test_refusals_say_what_is_needed(call, words):
     with pytest.raises(cid.CtrlidError, match=words):
         call()
+
+
+@pytest.mark.parametrize("ratio", [1e7, 1e9, 1e12])
+@pytest.mark.parametrize("slow", [1e-5, 3.0])
+def test_the_slowest_mode_counts_beside_one_that_is_far_faster(ratio, slow):
+    """A lag of gain two crosses over at sqrt(3) of its corner, with 120 degrees of phase margin."""
+    fast = ct.tf([slow * ratio], [1, slow * ratio])
+    margins = cid.loop_margins(ct.tf([2 * slow], [1, slow]) * fast)
+    assert margins.crossover == pytest.approx(math.sqrt(3) * slow, rel=1e-6)
+    assert margins.phase_margin == pytest.approx(120, abs=1e-4)
+    P, C = ct.tf([50 * slow], [1, slow]), ct.tf([0.2, 0.4 * slow], [1, 0]) * fast
+    omega = slow * np.geomspace(1e-4, 1e4, 40_001)
+    p, c = P(1j * omega), C(1j * omega)
+    share = np.abs(1 + p * c) / np.hypot(1, np.abs(p)) / np.hypot(1, np.abs(c))
+    # Far above the fastest mode both gains are zero, where the share is one.
+    assert cid.robust_margin(P, C) == pytest.approx(share.min(), rel=1e-5)
+
+
+def test_the_nu_gap_is_a_maximum_wherever_the_grid_has_two_points_for_one():
+    rng = np.random.default_rng(4)
+    for _ in range(60):
+        pole, gain = 10.0 ** rng.uniform(-4, -2), 10.0 ** rng.uniform(-5, 0)
+        plants = [
+            ct.tf([gain * rng.uniform(0.8, 1.2)],
+                  [1, pole * rng.uniform(0.9, 1.1), -(pole**2) * rng.uniform(0.01, 0.1)])
+            for _ in range(2)
+        ]  # fmt: skip
+        omega = pole * np.geomspace(1e-4, 1e5, 30_001)
+        first, second = (P(1j * omega) for P in plants)
+        gap = np.abs(first - second) / np.hypot(1, np.abs(first)) / np.hypot(1, np.abs(second))
+        found = cid.nu_gap(*plants)
+        assert found == 1 or found >= gap.max() * (1 - 1e-9)
+        assert found == 1 or found <= gap.max() * (1 + 1e-3)

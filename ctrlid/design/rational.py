@@ -18,6 +18,8 @@ Function = Callable[[Array], Array]
 
 # A closed-loop pole closer to the stability limit than this share of its size counts as unstable.
 AXIS_TOLERANCE = 1e-9
+# Values that differ by less than this share may differ by rounding alone.
+FLAT = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,6 +216,23 @@ def are_resolved(s: ComplexArray, dt: float) -> npt.NDArray[np.bool_]:
     return np.asarray(sizes > 1e-7 * (1 / dt if dt else max(sizes, default=0.0)))
 
 
+def find_time_scales(polynomial: npt.ArrayLike, dt: float) -> ComplexArray:
+    """Return the roots that set a time scale, in the s-plane.
+
+    Those of an integrator do not. In continuous time they are zero; in discrete time they lie at
+    z = 1 as nearly as the rounding of the coefficients lets them be found.
+    """
+    c = np.trim_zeros(np.atleast_1d(np.asarray(polynomial)), "f")
+    roots = find_roots(c)
+    if not dt:
+        return roots[(np.abs(roots) > 0) & np.isfinite(roots)]
+    roots = roots[np.abs(roots) > 1e-12]
+    with np.errstate(all="ignore"):
+        moved = np.polyval(np.abs(c), np.abs(roots)) / np.abs(np.polyval(np.polyder(c), roots))
+        resolved = np.abs(roots - 1) > 10 * np.finfo(float).eps * moved
+    return to_s(roots[resolved], dt)
+
+
 def is_stable(points: ComplexArray, dt: float) -> bool:
     """Tell whether all points lie clearly inside the stability region."""
     if dt:
@@ -237,8 +256,7 @@ def make_frequency_grid(
     A resonance at |Im s| is as narrow as |Re s|, so each root brings its own points. Roots of the
     `special` polynomials are single points; they may be far off, so they do not set the range.
     """
-    s = np.concatenate([to_s(find_roots(p), dt) for p in acting])
-    s = s[are_resolved(s, dt)]
+    s = np.concatenate([find_time_scales(p, dt) for p in acting])
     sizes = np.abs(s) if len(s) else np.array([1.0 / dt if dt else 1.0])
     top = math.pi / dt if dt else 1e3 * float(max(sizes))
     bottom = 1e-3 * min(float(min(sizes)), top)
@@ -264,9 +282,13 @@ def find_smallest(function: Function, grid: Array, ends: tuple[float, ...]) -> t
     found += [(end, float(function(np.array([end]))[0])) for end in ends]
     # Only dips that can still win are worth refining.
     for k in sorted(dips, key=lambda k: float(values[k]))[:8]:
+        # Points that differ by rounding do not tell on which side of them the minimum lies.
+        higher = np.flatnonzero(values > values[k] + FLAT * abs(values[k]))
+        below, above = higher[higher < k], higher[higher > k]
+        low, high = below[-1] if below.size else 0, above[0] if above.size else len(grid) - 1
         fine = minimize_scalar(
             lambda x: float(function(np.array([math.exp(x)]))[0]),
-            bounds=(math.log(grid[k - 1]), math.log(grid[k + 1])),
+            bounds=(math.log(grid[low]), math.log(grid[high])),
             method="bounded",
             options={"xatol": 1e-10},
         )
