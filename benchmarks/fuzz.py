@@ -9,6 +9,9 @@ invariant.
     python benchmarks/fuzz.py --calls 10000 --seed 1
 """
 
+# A row stands for each call, however long it is.
+# ruff: noqa: E501
+
 from __future__ import annotations
 
 import argparse
@@ -413,7 +416,10 @@ def try_call(name: str, arguments: Arguments) -> tuple[str, str]:
             frames = [f for f in traceback.extract_tb(error.__traceback__) if "ctrlid" in f.filename
                       and "fuzz" not in f.filename]  # fmt: skip
             at = f"{Path(frames[-1].filename).name}:{frames[-1].lineno}" if frames else "call"
-            return "failure", f"{type(error).__name__} at {at}: {' '.join(str(error).split())[:110]}"
+            return (
+                "failure",
+                f"{type(error).__name__} at {at}: {' '.join(str(error).split())[:110]}",
+            )
         finally:
             if name.startswith("plot."):
                 import matplotlib.pyplot as plt
