@@ -19,7 +19,7 @@ from ctrlid.diagnosis.experiment import _can_survive, find_experiment
 from ctrlid.diagnosis.findings import Disturbance, Finding, Gap
 from ctrlid.diagnosis.fitted_model import Model, drop_linearization, with_linearization
 from ctrlid.diagnosis.gap import Window, root_mean_square, share_samples
-from ctrlid.diagnosis.growth import _is_stand_in, _look_back, drop_worst_effect, search_effects
+from ctrlid.diagnosis.growth import _is_stand_in, _look_back, exchange_worst_effect, search_effects
 from ctrlid.diagnosis.noise_tests import NoiseTests, _compute_force_deviates, run_noise_tests
 from ctrlid.diagnosis.recalibration import fit_base_model
 from ctrlid.diagnosis.refitting import place_instants, refit_candidate, refit_under_noise
@@ -665,18 +665,45 @@ def two_found():
     r = cid.random_binary(2000, amplitude=0.3, hold=60, seed=9470)
     record = cid.simulate(real, r, sensor_noise=1e-4, seed=9471)
     base = fit_base_model(loop, [record], loop.free)
-    kinds = (E.CoulombFriction, E.LinearStiffness)
+    kinds = (E.CoulombFriction, E.AsymmetricCoulombFriction, E.LinearStiffness)
     return search_effects(base, kinds, lambda f, items: [f(x) for x in items], lambda text: None,
                           lambda model: False)  # fmt: skip
+
+
+class FreshStub:
+    """Fresh data that each name in a model makes so much wider, of which chance makes nothing."""
+
+    def __init__(self, widens):
+        self.widens = widens
+
+    def gap_of(self, model):
+        return sum(self.widens.get(name, 0.0) for name in model.loop.labelled)
+
+    def compute_widening_chance(self, one, other):
+        return 0.0 if self.gap_of(one) < self.gap_of(other) else 1.0
+
+
+def test_the_rival_that_fresh_data_like_takes_the_place_of_a_harmful_name(two_found):
+    rivals = {t.name for step in two_found.steps for t in step.trials if t.net_gain > 5}
+    rivals -= {"CoulombFriction", "LinearStiffness"}
+    assert rivals == {"AsymmetricCoulombFriction"}
+    other = "AsymmetricCoulombFriction"
+    fresh = FreshStub({"CoulombFriction": 1.0, other: -1.0})
+    left, worst = exchange_worst_effect(two_found, (), fresh)
+    assert worst == "CoulombFriction"
+    assert other in {f.trial.name for f in left.found}
+    assert "CoulombFriction" not in left.final.loop.labelled
+    kept, _ = exchange_worst_effect(two_found, (other,), fresh)
+    assert other not in {f.trial.name for f in kept.found}
 
 
 def test_the_name_without_which_the_gap_is_narrowest_goes_first(two_found):
     names = {f.trial.name for f in two_found.found}
     assert names == {"CoulombFriction", "LinearStiffness"}
     for name in names:
-        left = drop_worst_effect(
-            two_found, lambda model, name=name: float(name in model.loop.labelled)
-        )
+        fresh = FreshStub({name: 1.0})
+        left, worst = exchange_worst_effect(two_found, (), fresh)
+        assert worst == name
         assert {f.trial.name for f in left.found} == names - {name}
         assert list(left.final.loop.labelled) == [*names - {name}]
 

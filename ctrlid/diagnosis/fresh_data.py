@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 
@@ -46,6 +47,11 @@ class FreshData:
             return tuple(_fit_private_parameters(model, w) for w in self.windows)
         return (self._fit_loop(model, self.rest),) * len(self.windows)
 
+    def halve(self) -> tuple[Self, Self]:
+        """Return the first and the second half of what is compared."""
+        first, second = gaps.halve_windows(self.windows)
+        return replace(self, windows=first), replace(self, windows=second)
+
     def without_windows(self, records: Sequence[Record]) -> list[Record]:
         """Return of the diagnosed records what may be fitted without touching the windows."""
         if self.rest is None:
@@ -78,6 +84,12 @@ class FreshData:
     def gap_of(self, model: Model) -> float:
         """Return the RMS error of a model, made ready for each window [output unit]."""
         return self.measure_gap(self.prepare_loops(model))
+
+    def compute_widening_chance(self, one: Model, other: Model) -> float:
+        """Return the probability with which chance alone makes one model err so much more."""
+        results = [self.simulate_outputs(self.prepare_loops(m)) for m in (one, other)]
+        windows = gaps.share_samples(self.windows, results)
+        return gaps.compute_widening_chance(windows, *results)
 
     def measure_excess(self, loops: Sequence[Loop], fit: Fit) -> float:
         r"""Return what noise, as a fit knows it, leaves unexplained of the innovations.

@@ -6,10 +6,11 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy import signal
+from scipy import signal, stats
 
 from .._base.arrays import Array
 from .._base.errors import EffectDoesNotApply, ModelCannotRun
+from .._base.statistics import autocorrelation_time
 from ..data.record import Record
 from ..estimation.likelihood.kalman_filter import make_sensor_states
 from ..estimation.likelihood.likelihood import Fit
@@ -82,6 +83,68 @@ def share_samples(
         common = np.logical_and.reduce([window.mask, *known])
         shared.append(replace(window, mask=common) if common.any() else window)
     return tuple(shared)
+
+
+def halve_windows(windows: Sequence[Window]) -> tuple[tuple[Window, ...], tuple[Window, ...]]:
+    """Return the windows with the first and with the second half of the compared samples only."""
+    halves: tuple[list[Window], list[Window]] = ([], [])
+    for window in windows:
+        count = np.cumsum(window.mask)
+        first = count <= count[-1] // 2
+        for half, part in zip(halves, (first, ~first), strict=True):
+            half.append(replace(window, mask=window.mask & part))
+    return tuple(halves[0]), tuple(halves[1])
+
+
+def compute_widening_chance(
+    windows: Sequence[Window], one: Sequence[Array], other: Sequence[Array]
+) -> float:
+    r"""Return the probability with which chance alone makes one model err so much more.
+
+    .. math:: d_k = (y_k - \hat y^{other}_k)^2 - (y_k - \hat y^{one}_k)^2
+
+    are averaged over blocks, each several autocorrelation times of d long, and Student's test asks
+    whether their mean is above zero. The samples are paired, so what both models miss cancels.
+
+    Parameters
+    ----------
+    windows : sequence of Window
+        The data.
+    one, other : sequence of ndarray
+        What two models make of each window [output unit].
+
+    Returns
+    -------
+    float
+        The probability; 1 if there are not two blocks, or if the first model makes nothing of a
+        whole window.
+
+    References
+    ----------
+    Diebold and Mariano, Journal of Business and Economic Statistics 13 (1995) 253-263; Law and
+    Kelton, *Simulation Modeling and Analysis*, section 9.5 (batch means).
+    """
+    sizes = [root_mean_square(windows, y) for y in (one, other)]
+    if not all(map(math.isfinite, sizes)):
+        return 0.0 if math.isfinite(sizes[0]) else 1.0
+    parts = []
+    for window, a, b in zip(windows, one, other, strict=True):
+        use = window.mask & np.isfinite(a) & np.isfinite(b)
+        y = np.asarray(window.record.y)[use] / (max(sizes) or 1.0)
+        a, b = (v[use] / (max(sizes) or 1.0) for v in (a, b))
+        parts.append((y - b) ** 2 - (y - a) ** 2)
+    d = np.concatenate(parts)
+    if len(d) < 2:
+        return 1.0
+    length = math.ceil(THRESHOLD.independent_block * autocorrelation_time(d - np.mean(d)))
+    count = len(d) // length
+    if count < 2:
+        return 1.0
+    means = np.mean(d[: count * length].reshape(count, length), axis=1)
+    scatter = float(np.std(means, ddof=1)) / math.sqrt(count)
+    if not scatter:
+        return 0.0 if means[0] > 0 else 1.0
+    return float(stats.t.sf(float(np.mean(means)) / scatter, count - 1))
 
 
 def simulate_window(loop: Loop, window: Window, how: Reproduction) -> Array:

@@ -2,12 +2,13 @@
 
 import functools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import stats
 
+from .._base.arrays import Array
 from .._base.statistics import autocorrelation_time
 from ..estimation.likelihood.likelihood import Fit
 from ..loop.loop import Loop
@@ -15,7 +16,7 @@ from . import gap as gaps
 from .findings import Disturbance, Gap
 from .fitted_model import Model
 from .fresh_data import FreshData
-from .growth import Search, drop_worst_effect
+from .growth import Search, exchange_worst_effect
 from .removal import Weighed
 from .thresholds import THRESHOLD
 from .verdict import gap_is_wider
@@ -33,14 +34,11 @@ class GapSummary:
 def summarize_gap(loop: Loop, found: Search, fresh: FreshData) -> GapSummary:
     """Return the gap on data that no parameter was fitted to, and what each finding closes."""
     windows, how = fresh.windows, fresh.how
-    before, after = (fresh.prepare_loops(m) for m in (found.base, found.final))
-    for effect in found.base.loop.effects[len(loop.effects) :]:
-        before = tuple(x.without_effect(type(effect).__name__) for x in before)
-    results = [fresh.simulate_outputs(x) for x in ((loop,) * len(windows), before, after)]
+    made = _reproduce(loop, found, fresh)
+    after, results = made.after, made.results
     shared = replace(fresh, windows=gaps.share_samples(windows, results))
     given, recalibrated, left = (gaps.root_mean_square(shared.windows, y) for y in results)
-    # Effects that only undo what a recalibration spoiled close nothing.
-    smaller, start = min((recalibrated, results[1]), (given, results[0]), key=lambda pair: pair[0])
+    smaller, start = made.choose_start(windows)
     fit = found.final.fit
     floor = gaps.compute_floor(after, fit, shared.windows, how)
     if left > THRESHOLD.excess * floor.both:
@@ -64,17 +62,63 @@ def summarize_gap(loop: Loop, found: Search, fresh: FreshData) -> GapSummary:
     return GapSummary(gap, shares, _measure_disturbance(fit, loop, floor))
 
 
+@dataclass(frozen=True, eq=False)
+class _Reproductions:
+    """What the model as given, recalibrated and with the effects make of each window."""
+
+    after: tuple[Loop, ...]
+    results: list[tuple[Array, ...]]
+
+    def choose_start(self, windows: Sequence[gaps.Window]) -> tuple[float, tuple[Array, ...]]:
+        """Return the smaller RMS error of those without the effects, and that model's outputs.
+
+        Effects that only undo what a recalibration spoiled close nothing.
+        """
+        given, recalibrated, _ = self.results
+        windows = gaps.share_samples(windows, self.results)
+        pairs = [(gaps.root_mean_square(windows, y), y) for y in (recalibrated, given)]
+        return min(pairs, key=lambda pair: pair[0])
+
+    def compute_widening_chance(self, windows: Sequence[gaps.Window]) -> float:
+        """Return the probability with which chance alone widens the gap so much."""
+        start = self.choose_start(windows)[1]
+        windows = gaps.share_samples(windows, self.results)
+        return gaps.compute_widening_chance(windows, start, self.results[2])
+
+
+def _reproduce(loop: Loop, found: Search, fresh: FreshData) -> _Reproductions:
+    before, after = (fresh.prepare_loops(m) for m in (found.base, found.final))
+    for effect in found.base.loop.effects[len(loop.effects) :]:
+        before = tuple(x.without_effect(type(effect).__name__) for x in before)
+    cases = ((loop,) * len(fresh.windows), before, after)
+    return _Reproductions(after, [fresh.simulate_outputs(x) for x in cases])
+
+
 def take_back_widening(
     loop: Loop, found: Search, summary: GapSummary, fresh: FreshData
 ) -> tuple[Search, GapSummary]:
-    """Take effects back, the worst first, while they leave the gap wider than it was.
+    """Take effects back, the worst first, while they leave the gap wider beyond chance.
 
     What names something and leaves more unexplained than before has a wrong name among its names.
+    The half of the samples that shows it better decides which name goes, and what fresh data like
+    in its place; the gap is reported on the other half.
     """
-    while found.found and not found.after.passed and gap_is_wider(summary.gap, summary.disturbance):
-        found = drop_worst_effect(found, fresh.gap_of)
-        summary = summarize_gap(loop, found, fresh)
-    return found, summary
+    if not found.found or not gap_is_wider(summary.gap, summary.disturbance):
+        return found, summary
+    made = _reproduce(loop, found, fresh)
+    if made.compute_widening_chance(fresh.windows) >= THRESHOLD.beyond_chance:
+        return found, summary
+    halves = fresh.halve()
+    deciding, reported = sorted(halves, key=lambda h: made.compute_widening_chance(h.windows))
+    refused: set[str] = set()
+    # What is reported is never wider beyond chance either.
+    while found.found and THRESHOLD.beyond_chance > min(
+        made.compute_widening_chance(part.windows) for part in (fresh, reported)
+    ):
+        found, worst = exchange_worst_effect(found, refused, deciding)
+        refused.add(worst)
+        made = _reproduce(loop, found, fresh)
+    return found, summarize_gap(loop, found, reported)
 
 
 def make_fresh_data_test(fresh: FreshData) -> Callable[[Weighed, Model], bool]:

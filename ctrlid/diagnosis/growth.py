@@ -1,7 +1,7 @@
 """Step 7: the search adds effects, drops superfluous ones and looks back, round by round."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,6 +20,7 @@ from ..estimation.likelihood.maximization import (
 from ..estimation.likelihood.noise_fit import compute_noise_criterion
 from .candidates import Trial, contains, list_missing_candidates
 from .fitted_model import Model, can_simulate, drop_linearization, with_linearization
+from .fresh_data import FreshData
 from .noise_tests import NoiseTests, choose_alarm_level, run_noise_tests
 from .recalibration import restore_given_values
 from .refitting import refit_candidate
@@ -34,6 +35,7 @@ from .removal import (
 from .replicas import forgive_filter, make_replica
 from .rivals import compare_effects
 from .scans import scan_candidate
+from .screening import screen_at
 from .selection import Round, Work, run_round
 from .thresholds import THRESHOLD
 
@@ -311,8 +313,39 @@ def keep_main_effects(found: Search, helps: Callable[[Weighed, Model], bool]) ->
     return replace(found, final=model, found=left, after=retest_with_replicas(model))
 
 
-def drop_worst_effect(found: Search, gap: Callable[[Model], float]) -> Search:
-    """Take back the effect without which a model leaves the narrowest gap."""
-    worst = min(found.found, key=lambda f: gap(f.base))
-    model, left = weigh_effects(worst.base, len(found.base.loop.effects), found.steps)
-    return replace(found, final=model, found=left, after=retest_with_replicas(model))
+def exchange_worst_effect(
+    found: Search, refused: Collection[str], fresh: FreshData
+) -> tuple[Search, str]:
+    """Take back the effect without which a model leaves the narrowest gap, and name it.
+
+    Its place is taken by the rival that narrows the gap most, if one does so beyond chance: the
+    harmful name was only likelier.
+
+    Parameters
+    ----------
+    found : Search
+        The end of a search.
+    refused : collection of str
+        Names that are not tried again.
+    fresh : FreshData
+        What models are compared on.
+    """
+    given = len(found.base.loop.effects)
+    worst = min(found.found, key=lambda f: fresh.gap_of(f.base))
+    base = with_linearization(worst.base)
+    out = {worst.trial.name, *refused, *(type(e).__name__ for e in base.loop.effects)}
+    best: dict[str, Trial] = {}
+    for t in (*worst.rivals, *(t for step in found.steps for t in step.trials)):
+        if t.net_gain > THRESHOLD.gate and t.name not in out:
+            best[t.name] = max(best.get(t.name, t), t, key=lambda t: t.net_gain)
+    rivals = sorted(best.values(), key=lambda t: -t.net_gain)[: THRESHOLD.looked_at]
+    tried = [refit_candidate(base, screen_at(base, t.fitted)) for t in rivals]
+    liked = [
+        t.model for t in tried
+        if t.net_gain > THRESHOLD.gate
+        and fresh.compute_widening_chance(t.model, worst.base) < THRESHOLD.beyond_chance
+    ]  # fmt: skip
+    model = min(liked, key=fresh.gap_of, default=worst.base)
+    model, left = weigh_effects(model, given, found.steps)
+    after = retest_with_replicas(model)
+    return replace(found, final=model, found=left, after=after), worst.trial.name

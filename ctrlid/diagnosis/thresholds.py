@@ -411,6 +411,15 @@ class Thresholds:
         0.01, convention="chance below which noise that leaves as little as the gap is refused, as "
         "larger than the gap that it explains", unit="probability",
     )  # fmt: skip
+    beyond_chance: float = declare_number(
+        0.01, convention="errors of two models differ beyond chance if chance alone makes such a "
+        "difference less often", unit="probability",
+    )  # fmt: skip
+    independent_block: float = declare_number(
+        4.0, law="means of so long blocks hardly correlate, so that Student's test of them keeps "
+        "its level: 1.0 to 1.3 % at 1 %, for memories of 1 to 100 samples in 500 to 2000",
+        unit="autocorrelation times",
+    )  # fmt: skip
     phase_starts: int = declare_number(4, cost="phases from which that of a record is looked for",
                               unit="phases")  # fmt: skip
     helps: float = declare_number(

@@ -106,10 +106,11 @@ def gap_stands_out(gap: Gap, fit: Fit) -> bool:
 def gap_is_wider(gap: Gap, disturbance: Disturbance) -> bool:
     """Whether effects leave a wider gap than sensor noise does, by itself, in a loop with them.
 
-    With friction and backlash a loop hunts, and no simulation follows it for long. Two gaps below
-    the floor differ by chance.
+    With friction and backlash a loop hunts, and no simulation follows it for long: the widest of
+    several runs counts. Two gaps below the floor differ by chance.
     """
-    by_noise = not disturbance.large and gap.after <= THRESHOLD.excess * gap.floor
+    noise = max(gap.floor, gap.widest)
+    by_noise = not disturbance.large and gap.after <= THRESHOLD.excess * noise
     return max(gap.before, gap.floor) < gap.after and not by_noise
 
 

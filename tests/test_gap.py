@@ -1,0 +1,114 @@
+"""The gap on fresh data: what chance makes of it, and which samples decide and which are shown."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy import signal
+
+import ctrlid as cid
+from ctrlid.diagnosis import gap_summary
+from ctrlid.diagnosis.findings import Disturbance, Gap
+from ctrlid.diagnosis.gap import Window, compute_widening_chance, halve_windows
+
+NOTHING = Disturbance(0.0, 0.0, np.nan, 0.0)
+
+
+def window(y, mask=None):
+    record = cid.Record(u=np.zeros(len(y)), y=y, dt=0.01)
+    return Window(record, 0.0, np.ones(len(y), bool) if mask is None else mask)
+
+
+def slow(rng, n, memory):
+    return signal.lfilter([1.0], [1.0, -memory], rng.standard_normal(n + 500))[500:]
+
+
+@pytest.mark.parametrize("memory", [0.0, 0.9, 0.98])
+def test_a_difference_by_chance_is_rarely_beyond_chance(memory):
+    rng = np.random.default_rng(11)
+    y = np.zeros(800)
+    hits = 0
+    for _ in range(400):
+        common, one, other = (slow(rng, 800, memory) for _ in range(3))
+        chance = compute_widening_chance([window(y)], [common + one / 2], [common + other / 2])
+        hits += chance < 0.01
+    assert hits <= 11  # 4 are expected; more than 11 has a probability of 1e-3
+
+
+def test_a_wider_gap_is_seen_although_what_both_models_miss_is_large():
+    rng = np.random.default_rng(12)
+    y = slow(rng, 1000, 0.9)
+    both = y + 2 * slow(rng, 1000, 0.5)
+    wider = both + slow(rng, 1000, 0.5)
+    assert compute_widening_chance([window(y)], [both], [wider]) < 1e-3
+    assert compute_widening_chance([window(y)], [wider], [both]) > 0.99
+    assert compute_widening_chance([window(y)], [both], [both]) == 1.0
+
+
+def test_a_model_that_makes_nothing_of_a_window_is_wider_and_two_blocks_are_needed():
+    y = np.sin(np.arange(300.0))
+    nothing = np.full(300, np.nan)
+    assert compute_widening_chance([window(y)], [0 * y], [nothing]) == 0.0
+    assert compute_widening_chance([window(y)], [nothing], [0 * y]) == 1.0
+    few = window(y, np.arange(300) < 3)
+    assert compute_widening_chance([few], [y], [y + np.arange(300)]) == 1.0
+
+
+def test_the_halves_have_every_compared_sample_once():
+    mask = np.random.default_rng(13).random(501) < 0.7
+    one = window(np.arange(501.0), mask)
+    first, second = (half[0] for half in halve_windows([one]))
+    np.testing.assert_array_equal(first.mask | second.mask, mask)
+    assert not np.any(first.mask & second.mask)
+    assert np.flatnonzero(first.mask)[-1] < np.flatnonzero(second.mask)[0]
+    assert abs(int(first.mask.sum()) - int(second.mask.sum())) <= 1
+
+
+def take_back(monkeypatch, after):
+    """Take back the only effect of a search where the model errs so much with it."""
+    n = len(after)
+    y = np.zeros(n)
+    fresh = SimpleNamespace(windows=(window(y),))
+    fresh.halve = lambda: tuple(SimpleNamespace(windows=w) for w in halve_windows(fresh.windows))
+    noise = np.random.default_rng(14).standard_normal(n)
+    found = SimpleNamespace(found=("one",))
+    shown = []
+
+    def reproduce(loop, search, fresh):
+        with_it = noise + after if search.found else noise
+        return gap_summary._Reproductions((), [(2 * noise,), (noise,), (with_it,)])
+
+    def exchange(search, refused, deciding):
+        shown.append(deciding.windows[0].mask)
+        return SimpleNamespace(found=()), "one"
+
+    def summarize(loop, search, fresh):
+        shown.append(fresh.windows[0].mask)
+        return "summary of a half"
+
+    monkeypatch.setattr(gap_summary, "_reproduce", reproduce)
+    monkeypatch.setattr(gap_summary, "exchange_worst_effect", exchange)
+    monkeypatch.setattr(gap_summary, "summarize_gap", summarize)
+    size = float(np.sqrt(np.mean((noise + after) ** 2)))
+    gap = Gap("simulation", 2.0, 1.0, size, 0.1, "m", *[np.zeros(3)] * 4)
+    whole = gap_summary.GapSummary(gap, {}, NOTHING)
+    left, summary = gap_summary.take_back_widening(None, found, whole, fresh)
+    return left.found, summary, whole, shown
+
+
+def test_samples_that_decide_a_take_back_are_not_those_on_which_the_gap_is_shown(monkeypatch):
+    after = 2.0 * np.random.default_rng(15).standard_normal(1000)
+    after[500:] /= 2
+    left, summary, _, (decided, shown) = take_back(monkeypatch, after)
+    assert left == ()
+    assert summary == "summary of a half"
+    assert not np.any(decided & shown)
+    assert decided[0]  # the half in which the gap is wider by more
+
+
+def test_a_gap_that_is_wider_within_chance_takes_nothing_back(monkeypatch):
+    after = 0.05 * np.random.default_rng(16).standard_normal(1000)
+    left, summary, whole, shown = take_back(monkeypatch, after)
+    assert left == ("one",)
+    assert summary is whole
+    assert shown == []
