@@ -19,6 +19,7 @@ NAMES = (
     "magnetoshield_r3",
     "servo_random_steps",
     "servo_swept_sine",
+    "silverbox",
     "tanks_estimation",
     "tanks_validation",
 )
@@ -45,8 +46,8 @@ def no_folder(monkeypatch):
 # --- what is in the records -------------------------------------------------------------------
 
 
-def check(record, n, dt, units, extra=()):
-    assert (len(record), record.dt, record.hold) == (n, dt, "zoh")
+def check(record, n, dt, units, extra=(), hold="zoh"):
+    assert (len(record), record.dt, record.hold) == (n, dt, hold)
     assert dict(record.units) == units
     assert tuple(record.extra) == tuple(extra)
 
@@ -149,6 +150,18 @@ def test_servo(load, name, n):
     assert np.mean(np.abs(record.u) == 10) == pytest.approx(
         {59802: 0.112, 60001: 0.058}[n], abs=1e-3
     )
+
+
+def test_silverbox(load):
+    record = load("silverbox")
+    check(record, 131072, 1 / 610.35, {"u": "V", "y": "V"}, hold="bandlimited")
+    part = record[50_000:58_192]
+    # The multisine ends at 200 Hz, and the gain at low frequencies is one.
+    u, y = (np.abs(np.fft.rfft(s)) for s in (part.u, part.y))
+    frequency = np.fft.rfftfreq(len(part), part.dt)
+    assert np.sum(u[frequency > 201] ** 2) < 1e-3 * np.sum(u**2)
+    slow = (frequency > 1) & (frequency < 5)
+    assert np.sqrt(np.sum(y[slow] ** 2) / np.sum(u[slow] ** 2)) == pytest.approx(1, abs=0.05)
 
 
 @pytest.mark.parametrize("name", ["tanks_estimation", "tanks_validation"])

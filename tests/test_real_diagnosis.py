@@ -9,7 +9,7 @@ import pytest
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
 
-RIGS = ("emps", "inteco", "magnetoshield", "servo", "tanks")
+RIGS = ("emps", "inteco", "magnetoshield", "servo", "silverbox", "tanks")
 
 
 @pytest.mark.slow

@@ -82,6 +82,12 @@ SERVO_STEPS = _make_servo_source(
 SERVO_SINE = _make_servo_source(
     "04_swept_sine.mat", "9b4c7e08602acaa8b72ff1fbfdf38d08bf9e0466fd7bea7102916b1f8f6d3fac"
 )
+SILVERBOX = Source(
+    "silverbox/SNLS80mV.mat", "biaslab/nsi-silverbox", "728f07e4539d4f7da76a4778b52a756260b488ac",
+    "data/Silverbox/SNLS80mV.mat",
+    "5c7413a52255af0cb4e2f93fb6903beb92b08965ba1e6ad0a6ffedfed8477ed4",
+    "public benchmark; cite Wigren and Schoukens (2013), Three free data sets",
+)  # fmt: skip
 TANKS = Source(
     "tanks/dataBenchmark.mat", "forgi86/sysid-neural-unc",
     "4652931922a0a482babe6395057c54c8ceafda7e",
@@ -159,6 +165,14 @@ def _read_servo(table: Any) -> Record:
     )
 
 
+def _read_silverbox(table: Any) -> Record:
+    u, y = (_read_channel(table, key) for key in ("V1", "V2"))
+    return Record(
+        u=u - u.mean(), y=y - y.mean(), dt=1 / 610.35, hold="bandlimited",
+        units={"u": "V", "y": "V"}, names={"u": "V1", "y": "V2"},
+    )  # fmt: skip
+
+
 def _choose_tanks_reader(which: str) -> Callable[[Any], Record]:
     def read(table: Any) -> Record:
         return Record(
@@ -212,6 +226,14 @@ _CATALOGUE: dict[str, tuple[Source, Callable[[Any], Any], str]] = {
     ),
     "servo_random_steps": (SERVO_STEPS, _read_servo, _SERVO_TEXT.format("random steps", 59802)),
     "servo_swept_sine": (SERVO_SINE, _read_servo, _SERVO_TEXT.format("swept sine", 60001)),
+    "silverbox": (
+        SILVERBOX, _read_silverbox,
+        "Silverbox, an electronic circuit that imitates a mass on a spring, in open loop. 131072 "
+        "samples at 1/610.35 s; u voltage measured behind an anti-aliasing filter, so band-limited "
+        "between the samples, y voltage [V], both less their means. About 40700 samples of white "
+        "noise of growing amplitude (the arrow), then ten odd random-phase multisines of 8192 "
+        "samples",
+    ),
     "tanks_estimation": (TANKS, _choose_tanks_reader("Est"), _TANKS_TEXT.format("estimation")),
     "tanks_validation": (TANKS, _choose_tanks_reader("Val"), _TANKS_TEXT.format("validation")),
 }  # fmt: skip
