@@ -160,3 +160,40 @@ def test_operating_point_checks_its_numbers():
 def test_plants_refuse_unphysical_parameters(make, words):
     with pytest.raises(CtrlidError, match=words):
         make()
+
+
+def test_states_are_those_of_the_plant_in_their_order():
+    plant = cid.plants.pendulum(m=0.2, length=0.5, c=0.01)
+    op = cid.operating_point(plant, output=0.3)
+    made, theirs = cid.linearize(plant, op, states=True), ct.linearize(plant, op.states, op.input)
+    for name in ("A", "B", "C", "D"):
+        np.testing.assert_allclose(getattr(made, name), getattr(theirs, name), rtol=1e-5, atol=1e-6)
+    assert made.state_labels == ["theta", "omega"]
+    assert (made.input_labels, made.output_labels, made.dt) == (["tau"], ["theta"], 0)
+    assert (
+        cid.Loop(plant, None, dt=0.01, at=op).linearize(states=True).A.tolist() == made.A.tolist()
+    )
+
+
+def test_a_state_feedback_for_the_completed_plant():
+    """K from the states of the model with its effects puts the poles of x' = f(x, -K x)."""
+    plant = cid.plants.servo(m=2.0, c=1.0, k=3.0)
+    loop = cid.Loop(plant, None, dt=0.01, effects=[cid.effects.LinearStiffness(k1=5.0)])
+    G = loop.linearize(states=True)
+    K = ct.place(G.A, G.B, [-2.0, -3.0])
+    A = np.array([[0.0, 1.0], [-5.0, -0.5]]) - np.array([[0.0], [1.5]]) @ K
+    np.testing.assert_allclose(np.sort(np.linalg.eigvals(A)), [-3.0, -2.0], rtol=1e-9)
+
+
+def test_states_of_effects_follow_those_of_the_plant():
+    plant = cid.plants.servo(m=2.0, c=1.0, k=3.0)
+    late = cid.Loop(plant, None, dt=0.01).with_effect(cid.effects.InputDelay(0.02))
+    G = late.with_effect(cid.effects.ActuatorLag(0.05)).linearize(states=True)
+    assert G.state_labels[:2] == ["x", "v"]
+    assert G.nstates == 5
+    assert not any("." in name for name in G.state_labels)
+    w = 1j * np.array([0.1, 1.0, 10.0])
+    bare = late.with_effect(cid.effects.ActuatorLag(0.05)).linearize()
+    np.testing.assert_allclose(G(w), bare(w), rtol=1e-9)
+    sampled = cid.Loop(ct.tf([1.0], [1.0, -1.1], 0.1, name="G"), None, dt=0.1)
+    assert sampled.linearize(states=True).dt == 0.1

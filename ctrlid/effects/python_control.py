@@ -62,9 +62,10 @@ def as_system(e: Equations, at: OperatingPoint, units: Mapping[str, str]) -> Any
 
 
 def linearize_with_effects(
-    e: Equations, effects: Mapping[str, AbstractEffect], at: OperatingPoint, dt: float
-) -> Any:
-    """Return the transfer function of a plant with effects, at the equilibrium with its output.
+    e: Equations, effects: Mapping[str, AbstractEffect], at: OperatingPoint, dt: float,
+    states: bool = False,
+) -> Any:  # fmt: skip
+    """Return the linear model of a plant with effects, at the equilibrium with its output.
 
     Parameters
     ----------
@@ -76,10 +77,12 @@ def linearize_with_effects(
         The operating point, with the plant's states; its output is kept.
     dt : float
         Sampling period [s].
+    states : bool, optional
+        Whether to keep the states, as in `linearize`.
 
     Returns
     -------
-    control.TransferFunction
+    control.TransferFunction or control.StateSpace
         From deviations of the input to deviations of the output.
 
     Raises
@@ -92,7 +95,7 @@ def linearize_with_effects(
     resting = make_ordinary(changed, at)
     guess = OperatingPoint((*at.states, *resting.rest), at.input, at.output)
     point = operating_point(resting, output=at.output, guess=guess)
-    return linearize(make_ordinary(with_spread(changed, FAR), at), point)
+    return linearize(make_ordinary(with_spread(changed, FAR), at), point, states=states)
 
 
 def make_ordinary(e: Equations, at: OperatingPoint) -> Equations:

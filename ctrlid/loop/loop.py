@@ -366,7 +366,7 @@ class Loop:
             return self.plant
         return as_system(self._active, self._bare_point, self.known_units)
 
-    def linearize(self) -> Any:
+    def linearize(self, *, states: bool = False) -> Any:
         """Return the plant with its effects, linearized at the operating point.
 
         The point keeps its output; with effects, its states and input are solved for anew.
@@ -374,22 +374,41 @@ class Loop:
         zones, backlash, steps of a converter and vibrations are left out; a delay is its Padé
         approximation of order two; what drifts has its value at time zero.
 
+        Parameters
+        ----------
+        states : bool, optional
+            Whether to keep the states of the plant and of its effects, which a state feedback
+            needs: ``ct.lqr(loop.linearize(states=True), Q, R)``.
+
         Returns
         -------
-        control.TransferFunction
-            From deviations of the input to deviations of the output.
+        control.TransferFunction or control.StateSpace
+            From deviations of the input to deviations of the output; with ``states=True`` a
+            state-space model in the physical states, first those of the plant in their order,
+            under the names of `equations`, with an underscore for a dot.
 
         Raises
         ------
         CtrlidError
             If the plant with its effects has no equilibrium at this output.
+
+        Examples
+        --------
+        >>> import ctrlid as cid
+        >>> loop = cid.Loop(cid.plants.servo(m=2.0, c=1.0, k=3.0), dt=0.01)
+        >>> stiff = loop.with_effect(cid.effects.LinearStiffness(k1=5.0))
+        >>> G = stiff.linearize(states=True)
+        >>> G.A.tolist(), G.state_labels, G.input_labels, G.output_labels
+        ([[0.0, 1.0], [-5.0, -0.5]], ['x', 'v'], ['V'], ['x'])
         """
         active = {k: e for k, e in self.labelled.items() if not e.neutral and e.in_linear_model}
         if not active:
-            if isinstance(self.plant, ct.TransferFunction):
+            if isinstance(self.plant, ct.TransferFunction) and not states:
                 return self.plant
-            return linearize(self.plant, self.point)
-        return linearize_with_effects(self._shift_to_absolute(), active, self._bare_point, self.dt)
+            return linearize(self.plant, self.point, states=states)
+        return linearize_with_effects(
+            self._shift_to_absolute(), active, self._bare_point, self.dt, states
+        )
 
     def __repr__(self) -> str:
         e = self._traced

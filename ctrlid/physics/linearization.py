@@ -245,8 +245,8 @@ def compute_state_matrices(
     return a, b, c, d
 
 
-def linearize(plant: Any, at: OperatingPoint) -> Any:
-    r"""Return the transfer function of a plant for small deviations from an operating point.
+def linearize(plant: Any, at: OperatingPoint, *, states: bool = False) -> Any:
+    r"""Return the linear model of a plant for small deviations from an operating point.
 
     .. math:: G(s) = C (s I - A)^{-1} B + D, \quad A = \partial f/\partial x, \;
         B = \partial f/\partial u, \; C = \partial h/\partial x
@@ -254,7 +254,9 @@ def linearize(plant: Any, at: OperatingPoint) -> Any:
     The derivatives are those of the traced equations, without differencing, and the polynomials are
     formed in rational arithmetic, so that no dust coefficients appear: the levitated ball gives
     exactly ``-beta/(s^2 - alpha)``. States are removed only where the input does not reach
-    them or the output does not show them.
+    them or the output does not show them. `control.linearize` returns a state-space model; here
+    it is one with ``states=True``. For a state feedback take that one: the states of
+    ``ct.ss(linearize(plant, at))`` are no physical quantities.
 
     Parameters
     ----------
@@ -262,11 +264,14 @@ def linearize(plant: Any, at: OperatingPoint) -> Any:
         Plant with one input and one output; discrete plants give discrete transfer functions.
     at : OperatingPoint
         The point, from `operating_point` or given directly.
+    states : bool, optional
+        Whether to keep the states of the plant, all of them and in their order.
 
     Returns
     -------
-    control.TransferFunction
-        From the deviation of the input to the deviation of the output.
+    control.TransferFunction or control.StateSpace
+        From the deviation of the input to the deviation of the output; with ``states=True`` a
+        state-space model of the deviations of the plant's states, under their names.
 
     Raises
     ------
@@ -287,6 +292,8 @@ def linearize(plant: Any, at: OperatingPoint) -> Any:
     >>> P = cid.linearize(plant, cid.operating_point(plant, output=0.012))
     >>> P.den[0][0].round(6).tolist()
     [1.0, 0.0, -1635.0]
+    >>> cid.linearize(plant, cid.operating_point(plant, output=0.012), states=True).state_labels
+    ['x', 'v']
     """
     if not isinstance(at, OperatingPoint):
         raise CtrlidError(
@@ -295,9 +302,18 @@ def linearize(plant: Any, at: OperatingPoint) -> Any:
         )
     equations = trace(plant)
     require_siso(equations)
-    (num,), den = to_polynomials(*_reduce_to_minimal(*compute_state_matrices(equations, at)))
-    return ct.tf(num, den, equations.dt if equations.dt else 0, name=f"{equations.name}_linear",
-                 inputs=list(equations.inputs), outputs=list(equations.outputs))  # fmt: skip
+    matrices = compute_state_matrices(equations, at)
+    dt = equations.dt if equations.dt else 0
+    labels: dict[str, Any] = {
+        "name": f"{equations.name}_linear", "inputs": list(equations.inputs),
+        "outputs": list(equations.outputs),
+    }  # fmt: skip
+    if states:
+        # python-control keeps dots for the names of systems.
+        names = [name.replace(".", "_") for name in equations.states]
+        return ct.ss(*matrices, dt, states=names, **labels)
+    (num,), den = to_polynomials(*_reduce_to_minimal(*matrices))
+    return ct.tf(num, den, dt, **labels)
 
 
 def _reduce_to_minimal(a: Array, b: Array, c: Array, d: Array) -> tuple[Array, Array, Array, Array]:
