@@ -71,7 +71,7 @@ def test_one_effect_is_named_and_closes_the_gap(build, effect, seed, options):
         assert within(first, effect)
     assert first.evidence > 10
     gap = found.gap
-    assert gap.kind == "closed-loop simulation"
+    assert (gap.kind, gap.name, gap.horizon) == ("simulation", "closed-loop simulation", 0)
     assert gap.given >= 0.99 * gap.before
     assert gap.before > 1.05 * gap.floor
     assert 0.9 * gap.floor < gap.after < 1.1 * gap.floor
@@ -138,7 +138,10 @@ def test_an_unstable_plant_without_its_controller():
     bare = cid.Record(u=record.u, y=record.y, dt=record.dt)
     alone = cid.Loop(loop.plant, None, dt=loop.dt, at=loop.at, free=("K",))
     found = diagnose(alone, bare, 7700, catalogue=FEW)
-    assert found.gap.kind.endswith("-step prediction")
+    assert found.gap.kind == "prediction"
+    assert found.gap.name == f"{found.gap.horizon}-step prediction"
+    assert found.gap.after < found.gap.trivial
+    assert "last value or line" in str(found)
     assert found.verdict == "explained"
     assert found.findings[0].name == "ViscousFriction"
     assert within(found.findings[0], effect)
@@ -153,7 +156,7 @@ def test_a_stable_plant_in_open_loop():
     rng_input = cid.random_binary(N, amplitude=0.3, hold=60, seed=7801) + walk(N, 0.3, 7802)
     record = cid.simulate(loop.with_effect(effect), d=rng_input, sensor_noise=2e-4, seed=7803)
     found = diagnose(loop, record, 7800, catalogue=(*FEW, E.InputDeadZone))
-    assert found.gap.kind == "open-loop simulation"
+    assert (found.gap.kind, found.gap.name) == ("simulation", "open-loop simulation")
     assert found.findings[0].name == "InputDeadZone"
     assert within(found.findings[0], effect)
     assert found.gap.after < 1.1 * found.gap.floor < found.gap.before

@@ -80,8 +80,8 @@ def found(experiment):
         good = verdict == "nothing missing"
         rest = {"partly explained": 0.6 * a + 0.4 * b, "unknown": b}.get(verdict, a)
         first = a if good else b
-        gap = Gap("closed-loop simulation", 1.3 * rms(y - first), rms(y - first), rms(y - rest),
-                  floor, "m", record.t[2 * N // 3 :], y, first, rest)  # fmt: skip
+        gap = Gap("simulation", 1.3 * rms(y - first), rms(y - first), rms(y - rest),
+                  floor, "m", record.t[2 * N // 3 :], y, first, rest, closed_loop=True)  # fmt: skip
         levels = (FLAT if good else BAD, FLAT if good or verdict == "explained" else BAD)
         chances = tuple(0.4 if v is FLAT else 1e-30 for v in levels)
         where = (
@@ -443,7 +443,7 @@ def test_picture_of_rare_cases(found):
 def test_predictions_at_some_samples_only_are_drawn_as_lines(found):
     base = found["explained"]
     sparse = np.where(np.arange(len(base.gap.time)) % 3 == 0, base.gap.simulated_after, np.nan)
-    gap = replace(base.gap, kind="12-step prediction", horizon=12, simulated_after=sparse)
+    gap = replace(base.gap, kind="prediction", horizon=12, simulated_after=sparse)
     output, error, *_ = plot.diagnosis(replace(base, gap=gap))
     for ax in (output, error):
         drawn = [line.get_ydata() for line in ax.get_lines() if "after" in line.get_label()
@@ -502,7 +502,7 @@ def test_page(found, verdict, tmp_path):
 
 def test_a_gap_where_only_the_given_model_can_be_simulated():
     nothing = np.zeros(3)
-    gap = Gap("closed-loop simulation", 2.7e-3, math.inf, math.inf, math.nan, "m", *[nothing] * 4)
+    gap = Gap("simulation", 2.7e-3, math.inf, math.inf, math.nan, "m", *[nothing] * 4)
     rows = {label: size for label, size, _ in wording.list_gap_rows(gap)}
     assert rows["the model as given"] == "2.70 mm"
     assert rows["recalibrated"] == "DIVERGES"
@@ -553,9 +553,7 @@ def test_noise_that_parts_a_loop_from_itself_explains_a_gap():
     assert floors[1].widest < 1.2 * floors[1].both
     for loop, floor in zip((rough, calm), floors, strict=True):
         left = 2 * floor.both
-        gap = Gap(
-            str(CLOSED_LOOP), 1.0, 1.0, left, floor.both, "m", *[np.zeros(3)] * 4, floor.widest
-        )
+        gap = Gap("simulation", 1.0, 1.0, left, floor.both, "m", *[np.zeros(3)] * 4, floor.widest)
         assert gap_stands_out(gap, fitted) == (loop is calm)
         assert (
             "differ only in their noise" in wording.describe_shrinking(replace(gap, before=0.9))

@@ -320,7 +320,7 @@ def test_a_motion_far_faster_than_the_samples_is_refused():
 
 
 def test_many_effects_at_once_are_no_explanation():
-    gap = Gap("closed-loop simulation", 3.0, 2.0, 1.1, 1.0, "m", *[np.zeros(3)] * 4)
+    gap = Gap("simulation", 3.0, 2.0, 1.1, 1.0, "m", *[np.zeros(3)] * 4)
     quiet = Disturbance(0.0, 0.0, np.nan, 0.0)
     tests = NoiseTests({"whiteness": 0.5}, np.zeros(3), {})
     kinds = (
@@ -720,7 +720,7 @@ def test_what_is_put_back_and_stuck_keeps_its_evidence(two_found, monkeypatch):
 
 def test_a_loop_that_hunts_keeps_its_names():
     def gap(after):
-        return Gap("closed-loop simulation", 9.0, 3.0, after, 4.0, "m", *[np.zeros(3)] * 4)
+        return Gap("simulation", 9.0, 3.0, after, 4.0, "m", *[np.zeros(3)] * 4)
 
     sensor, force = Disturbance(0.1, 0.0, np.nan, 0.2), Disturbance(0.1, 0.0, np.nan, 0.9)
     assert not gap_is_wider(gap(2.9), force)

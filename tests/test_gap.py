@@ -1,5 +1,6 @@
 """The gap on fresh data: what chance makes of it, and which samples decide and which are shown."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,7 +10,15 @@ from scipy import signal
 import ctrlid as cid
 from ctrlid.diagnosis import gap_summary
 from ctrlid.diagnosis.findings import Disturbance, Gap
-from ctrlid.diagnosis.gap import Window, compute_widening_chance, halve_windows
+from ctrlid.diagnosis.fresh_data import FreshData
+from ctrlid.diagnosis.gap import (
+    Window,
+    compute_widening_chance,
+    halve_windows,
+    measure_trivial_error,
+)
+from ctrlid.diagnosis.wording import describe_trivial, list_gap_rows
+from ctrlid.validation.reproduction import Reproduction
 
 NOTHING = Disturbance(0.0, 0.0, np.nan, 0.0)
 
@@ -112,3 +121,63 @@ def test_a_gap_that_is_wider_within_chance_takes_nothing_back(monkeypatch):
     assert left == ("one",)
     assert summary is whole
     assert shown == []
+
+
+# --- the trivial predictor
+
+
+def test_trivial_predictors_are_exact_on_what_they_assume():
+    line = 3.0 + 0.5 * np.arange(200.0)
+    later = np.arange(200) > 50
+    assert measure_trivial_error([window(line, later)], 7) < 1e-10
+    assert measure_trivial_error([window(np.full(200, 2.0))], 1) < 1e-12
+    noisy = line + np.random.default_rng(17).standard_normal(200)
+    longer = measure_trivial_error([window(noisy, later)], 16)
+    # A line of least squares through 16 samples, 16 ahead, by its textbook variance.
+    assert longer < 1.3 * np.sqrt(1 + 1 / 16 + 23.5**2 / (16 * (16**2 - 1) / 12))
+
+
+def test_samples_that_do_not_count_tell_a_trivial_predictor_nothing():
+    line = np.arange(100.0)
+    valid = np.ones(100, bool)
+    valid[40:43] = False
+    spoiled = np.where(valid, line, 1e6)
+    record = cid.Record(u=np.zeros(100), y=spoiled, dt=0.01, valid=valid)
+    mask = valid & (np.arange(100) > 60)
+    assert measure_trivial_error([Window(record, 0.0, mask)], 3) < 1e-10
+
+
+def test_a_horizon_at_which_a_straight_line_wins_is_lengthened(monkeypatch):
+    n = 2000
+    t = np.arange(n) * 0.01
+    y = np.sin(2 * t)
+    made = []
+
+    def simulate_outputs(self, loops):
+        made.append(self.how.horizon)
+        return (y + 0.05,)  # a model with a constant error, whatever the horizon
+
+    monkeypatch.setattr(FreshData, "simulate_outputs", simulate_outputs)
+    fresh = FreshData((window(y),), None, Reproduction("prediction", 5))
+    model = SimpleNamespace(fitted=None)
+    search = SimpleNamespace(base=model, final=model)
+    longer = gap_summary.lengthen_horizon(None, search, fresh)
+    assert longer.how == Reproduction("prediction", 20)
+    # No horizon helps a model that errs more than the output moves: it stays, and is said.
+    monkeypatch.setattr(FreshData, "simulate_outputs", lambda self, loops: (y + 9,))
+    assert gap_summary.lengthen_horizon(None, search, fresh) is fresh
+    gap = Gap("prediction", 9.0, 9.0, 9.0, 0.1, "m", *[np.zeros(3)] * 4, horizon=5, trivial=0.1)
+    assert gap.trivial_wins
+    assert "SAYS NOTHING ABOUT THE MODEL" in " ".join(describe_trivial(gap).split())
+    assert ("last value or line", "0.100 m") in [row[:2] for row in list_gap_rows(gap)]
+    assert not replace(gap, after=0.05).trivial_wins
+    simulated = FreshData((window(y),), None, Reproduction("closed-loop simulation"))
+    assert gap_summary.lengthen_horizon(None, search, simulated) is simulated
+
+
+def test_a_gap_is_named_by_its_kind_and_horizon():
+    arrays = [np.zeros(3)] * 4
+    one = Gap("prediction", 1.0, 1.0, 1.0, 0.1, "m", *arrays, horizon=25)
+    assert (one.kind, one.name) == ("prediction", "25-step prediction")
+    assert replace(one, horizon=1).name == "one-step prediction"
+    assert Gap("simulation", 1.0, 1.0, 1.0, 0.1, "m", *arrays).name == "open-loop simulation"

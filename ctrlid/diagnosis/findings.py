@@ -7,9 +7,11 @@ from typing import Literal
 from .._base.arrays import Array
 from .._base.units import fill_unit
 from ..effects import AbstractEffect
+from ..validation.reproduction import CLOSED_LOOP, OPEN_LOOP, Reproduction
 from .thresholds import THRESHOLD
 
 Verdict = Literal["nothing missing", "explained", "partly explained", "unknown"]
+GapKind = Literal["simulation", "prediction"]
 
 
 COMPLETE: tuple[Verdict, ...] = ("explained", "nothing missing")
@@ -22,8 +24,8 @@ class Gap:
     Parameters
     ----------
     kind : str
-        What was compared: ``"closed-loop simulation"``, ``"open-loop simulation"`` or, for
-        instance, ``"25-step prediction"``.
+        What was compared: ``"simulation"``, which uses no measured output, or ``"prediction"``,
+        which uses those up to `horizon` samples before.
     given, before, after : float
         RMS error of the model as handed in, the smaller of that and of the recalibrated model's,
         and with the effects added [output unit], all on the samples of which each model makes
@@ -45,9 +47,14 @@ class Gap:
     recalibrated : float
         RMS error after recalibrating the free parameters alone [output unit]; NaN where it is not
         kept, as in files of earlier versions, whose `before` it is.
+    closed_loop : bool
+        Whether a simulation was closed loop, from the reference.
+    trivial : float
+        RMS error of the best trivial predictor beside a prediction, on the same samples [output
+        unit]: the last value, or a straight line through the last samples; NaN for a simulation.
     """
 
-    kind: str
+    kind: GapKind
     given: float
     before: float
     after: float
@@ -60,6 +67,20 @@ class Gap:
     widest: float = math.nan
     horizon: int = 0
     recalibrated: float = math.nan
+    closed_loop: bool = False
+    trivial: float = math.nan
+
+    @property
+    def name(self) -> str:
+        """The kind in full, such as ``"closed-loop simulation"`` or ``"25-step prediction"``."""
+        if self.kind == "prediction":
+            return str(Reproduction("prediction", self.horizon))
+        return str(CLOSED_LOOP if self.closed_loop else OPEN_LOOP)
+
+    @property
+    def trivial_wins(self) -> bool:
+        """Whether a trivial predictor errs less than each of the models: the gap says nothing."""
+        return self.trivial < min(self.given, self.before, self.after)
 
     @property
     def fitted(self) -> float:

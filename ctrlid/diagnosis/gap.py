@@ -12,6 +12,7 @@ from .._base.arrays import Array
 from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from .._base.statistics import autocorrelation_time
 from ..data.record import Record
+from ..data.validity import find_whole_past
 from ..estimation.likelihood.kalman_filter import make_sensor_states
 from ..estimation.likelihood.likelihood import Fit
 from ..estimation.likelihood.prediction import predict, predict_ahead, predict_spread
@@ -83,6 +84,37 @@ def share_samples(
         common = np.logical_and.reduce([window.mask, *known])
         shared.append(replace(window, mask=common) if common.any() else window)
     return tuple(shared)
+
+
+def measure_trivial_error(windows: Sequence[Window], horizon: int) -> float:
+    """Return the RMS error of the best trivial predictor, so many samples ahead [output unit].
+
+    The last value, and straight lines through the last 2, 4, 8, ... samples, as many as it looks
+    ahead at most: a few where the sensor is quiet, many where it is noisy.
+    """
+    lengths = [1, 2]
+    while 2 * lengths[-1] <= horizon:
+        lengths.append(2 * lengths[-1])
+    return min(
+        root_mean_square(windows, [_extrapolate(w.record, horizon, n) for w in windows])
+        for n in lengths
+    )
+
+
+def _extrapolate(record: Record, horizon: int, samples: int) -> Array:
+    """Return each output by the straight line of least squares through samples before it.
+
+    The last of them is `horizon` samples before. One sample is the last value, which also stands
+    where a line has too few.
+    """
+    ago = np.arange(float(samples))
+    middle = ago - np.mean(ago)
+    slope = -middle / np.sum(middle**2) if samples > 1 else middle
+    weights: Array = 1 / samples + (horizon + np.mean(ago)) * slope
+    y = np.where(record.valid, record.y, 0.0)
+    line = np.append(np.full(horizon, np.nan), np.convolve(weights, y)[: len(y) - horizon])
+    known = find_whole_past(np.asarray(record.valid), horizon + samples - 1)
+    return np.where(known, line, np.append(np.full(horizon, np.nan), y[:-horizon]))
 
 
 def halve_windows(windows: Sequence[Window]) -> tuple[tuple[Window, ...], tuple[Window, ...]]:

@@ -12,8 +12,9 @@ from .._base.arrays import Array
 from .._base.statistics import autocorrelation_time
 from ..estimation.likelihood.likelihood import Fit
 from ..loop.loop import Loop
+from ..validation.reproduction import CLOSED_LOOP, Reproduction, find_longest_horizon
 from . import gap as gaps
-from .findings import Disturbance, Gap
+from .findings import Disturbance, Gap, GapKind
 from .fitted_model import Model
 from .fresh_data import FreshData
 from .growth import Search, exchange_worst_effect
@@ -52,14 +53,39 @@ def summarize_gap(loop: Loop, found: Search, fresh: FreshData) -> GapSummary:
         shares[f.position] = _compute_share_closed(error**2 - left**2, smaller, floor.both)
     first = windows[0]
     unit = loop.known_units.get(loop.equations().outputs[0], "")
+    trivial = gaps.measure_trivial_error(shared.windows, how.horizon) if how.horizon else math.nan
+    kind: GapKind = "prediction" if how.horizon else "simulation"
     gap = Gap(
-        str(how), given, smaller, left, floor.both, unit,
+        kind, given, smaller, left, floor.both, unit,
         first.start_time + np.asarray(first.record.t - first.record.start)[first.mask],
         np.asarray(first.record.y)[first.mask], start[0][first.mask],
         results[2][0][first.mask], floor.widest, how.horizon,
-        recalibrated,
+        recalibrated, how == CLOSED_LOOP, trivial,
     )  # fmt: skip
     return GapSummary(gap, shares, _measure_disturbance(fit, loop, floor))
+
+
+def lengthen_horizon(loop: Loop, found: Search, fresh: FreshData) -> FreshData:
+    """Return fresh data with a horizon at which a model predicts better than a trivial predictor.
+
+    A horizon at which the last value or a straight line wins says nothing of the models, so it is
+    doubled until it does not, up to a tenth of the record; where none does, it stays as it is.
+    """
+    horizon, windows = fresh.how.horizon, fresh.windows
+    if not horizon:
+        return fresh
+    longest = max(find_longest_horizon(w.record) for w in windows)
+    loops = [(x,) * len(windows) for x in (loop, found.base.fitted, found.final.fitted)]
+    while True:
+        longer = replace(fresh, how=Reproduction("prediction", horizon))
+        results = [longer.simulate_outputs(x) for x in loops]
+        shared = gaps.share_samples(windows, results)
+        best = min(gaps.root_mean_square(shared, y) for y in results)
+        if best <= gaps.measure_trivial_error(shared, horizon):
+            return longer
+        if horizon >= longest:
+            return fresh
+        horizon = min(2 * horizon, longest)
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,7 +4,7 @@ import dataclasses
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
@@ -12,7 +12,8 @@ from .._base.errors import CtrlidError
 from ..effects import AbstractEffect
 from ..loop.loop import Loop
 from ..physics.linearization import OperatingPoint
-from .findings import BinnedErrors, Calibrated, Candidate, Disturbance, Finding, Gap
+from ..validation.reproduction import CLOSED_LOOP, OPEN_LOOP
+from .findings import BinnedErrors, Calibrated, Candidate, Disturbance, Finding, Gap, GapKind
 from .result import Diagnosis
 from .saving import FORMAT, SavedLoop, read_numbers
 
@@ -62,7 +63,8 @@ def _decode_diagnosis(data: Mapping[str, Any], loop: Loop | None) -> Diagnosis:
         verdict=data["verdict"], sentence=data["sentence"],
         findings=tuple(_decode(Finding, f) for f in data["findings"]),
         loop=saved if loop is None else _rebuild_loop(loop, saved),  # type: ignore[arg-type]
-        gap=_decode(Gap, data["gap"]), where=tuple(_decode(BinnedErrors, p) for p in data["where"]),
+        gap=_decode(Gap, _name_kind(data["gap"])),
+        where=tuple(_decode(BinnedErrors, p) for p in data["where"]),
         ranking=tuple(_decode(Candidate, c) for c in data["ranking"]),
         disturbance=_decode(Disturbance, data["disturbance"]),
         calibrated=tuple(_decode(Calibrated, c) for c in data["calibrated"]),
@@ -70,6 +72,15 @@ def _decode_diagnosis(data: Mapping[str, Any], loop: Loop | None) -> Diagnosis:
         audit=tuple(data["audit"]), notes=tuple(data["notes"]), record=data["record"],
         seconds=read_numbers(data["seconds"]), extra=read_numbers(data["extra"]),
     )  # fmt: skip
+
+
+def _name_kind(gap: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the fields of a gap with the kind as it is called now; files may be older."""
+    if gap["kind"] in get_args(GapKind):
+        return gap
+    simulated = gap["kind"] in (str(CLOSED_LOOP), str(OPEN_LOOP))
+    return {**gap, "kind": "simulation" if simulated else "prediction",
+            "closed_loop": gap["kind"] == str(CLOSED_LOOP)}  # fmt: skip
 
 
 def _rebuild_loop(loop: Loop, saved: SavedLoop) -> Loop:

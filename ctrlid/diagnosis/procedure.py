@@ -21,7 +21,13 @@ from .candidates import check_catalogue
 from .findings import COMPLETE, Disturbance, Gap
 from .fitted_model import compute_penalized_likelihood
 from .fresh_data import FreshData, check_length, choose_fresh_data
-from .gap_summary import make_fresh_data_test, make_size_test, summarize_gap, take_back_widening
+from .gap_summary import (
+    lengthen_horizon,
+    make_fresh_data_test,
+    make_size_test,
+    summarize_gap,
+    take_back_widening,
+)
 from .growth import (
     Search,
     choose_search,
@@ -188,6 +194,7 @@ def _answer_question(q: Question) -> tuple[Diagnosis, Search]:
     is_larger = make_size_test(q.fresh)
     search = search_effects(base, q.catalogue, q.work, q.tell, is_larger)
     search = refuse_larger_noise(search, is_larger)
+    q = replace(q, fresh=lengthen_horizon(q.loop, search, q.fresh))
     helps = make_fresh_data_test(q.fresh)
     if search.found or not search.after.passed:
         # A wrong sign or unit in the log makes the plant look as if almost anything were missing.

@@ -69,7 +69,8 @@ def write_gap_lines(gap: Gap) -> list[str]:
     rows = [f"    {label:<20}{size:>12}   {times}"
             for label, size, times in wording.list_gap_rows(gap)]  # fmt: skip
     head = _wrap_text(wording.introduce_gap(gap), 2, hang=4)
-    return [*head, *rows, *_wrap_text(wording.describe_shrinking(gap), 4)]
+    words = (wording.describe_shrinking(gap), wording.describe_trivial(gap))
+    return [*head, *rows, *(line for text in words for line in _wrap_text(text, 4))]
 
 
 def _write_where(found: Diagnosis) -> list[str]:

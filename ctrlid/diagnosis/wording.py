@@ -120,7 +120,7 @@ def explain_evidence() -> str:
 def introduce_gap(gap: Gap) -> str:
     """Say what the gap is."""
     return (
-        f"gap between model and record: RMS error of the {gap.kind} of {len(gap.time)} samples "
+        f"gap between model and record: RMS error of the {gap.name} of {len(gap.time)} samples "
         "kept back"
     )
 
@@ -150,6 +150,8 @@ def list_gap_rows(gap: Gap) -> list[tuple[str, str, str]]:
              ("with the effects", gap.after))  # fmt: skip
     shown = cases[:2] if gap.after == gap.fitted else cases
     rows = [(label, size(value), times(value)) for label, value in shown]
+    if gap.kind == "prediction" and math.isfinite(gap.trivial):
+        rows.append(("last value or line", size(gap.trivial), times(gap.trivial)))
     return [*rows, ("noise floor", size(gap.floor), "due to sensor noise and random force alone")]
 
 
@@ -175,6 +177,17 @@ def describe_shrinking(gap: Gap) -> str:
     closed = (f"On these samples the effects remove {write_percent(share)} of the mean square "
               "error above the noise floor.")  # fmt: skip
     return f"{closed} {WIDENED}" if gap.fitted > gap.given * THRESHOLD.widened else closed
+
+
+def describe_trivial(gap: Gap) -> str:
+    """Say that a trivial predictor wins; empty where it does not."""
+    if not gap.trivial_wins:
+        return ""
+    return (
+        "The last value, or a straight line through the last samples, predicts better than each of "
+        "these models, and no longer horizon changes that. So this gap SAYS NOTHING ABOUT THE "
+        "MODEL; the one-step errors do."
+    )
 
 
 def describe_limits(found: Diagnosis) -> str:

@@ -14,7 +14,7 @@ from ..diagnosis.result import Diagnosis
 from ..estimation.identified_model import Estimate, IdentifiedModel
 from ..estimation.likelihood.physics_estimate import LoopFit
 from ..physics.trace import timebase
-from ..validation.comparison import Comparison
+from ..validation.comparison import Comparison, write_fit
 
 # What u does between the samples, by the record's hold.
 BETWEEN = {
@@ -183,7 +183,7 @@ def _make_estimate_blocks(e: Estimate) -> list[Block]:
 def _make_comparison_tables(c: Comparison) -> list[Table]:
     unit = c.record.units.get("y", "unit of y")
     curves = tuple(
-        (q.label, f"{q.fit:.2f} %", f"{q.rms:.3g}", f"{100 * q.noise_share:.1f} %")
+        (q.label, write_fit(q.fit), f"{q.rms:.3g}", f"{100 * q.noise_share:.1f} %")
         for q in c.curves
     )
     tests = tuple(
@@ -226,7 +226,12 @@ def _make_diagnosis_blocks(found: Diagnosis) -> list[Block]:
     caption = f"{_upper(wording.introduce_gap(found.gap))}."
     sizes = tuple(wording.list_gap_rows(found.gap))
     gap = Table(("", "RMS error", "relative to the noise floor"), sizes, caption)
-    made: list[Block] = [wording.write_headline(found), gap, wording.describe_shrinking(found.gap)]
+    made: list[Block] = [
+        wording.write_headline(found),
+        gap,
+        wording.describe_shrinking(found.gap),
+        wording.describe_trivial(found.gap),
+    ]
     if found.findings:
         made.append(Title("What is missing"))
     for k, finding in enumerate(found.findings, 1):

@@ -6,7 +6,7 @@ import numpy as np
 
 from .._base.arrays import Array
 from .._base.errors import CtrlidError
-from .._base.text import Printed, write_list
+from .._base.text import Printed, write_list, write_number
 from ..data.record import Record
 from .residual_tests import Correlation
 
@@ -92,10 +92,10 @@ class Comparison(Printed):
     def verdict(self) -> str:
         """The comparison in words: the last curve, then the one-step errors."""
         last = self.curves[-1]
-        text = f"The fit of the {last.label} is {_write_fit(last.fit)}"
+        text = f"The fit of the {last.label} is {write_fit(last.fit)}"
         if last.fit <= 0:
-            text = (f"The fit of the {last.label} is negative: its error is larger than the "
-                    "variation of y")  # fmt: skip
+            text = (f"The fit of the {last.label} is negative: its error is "
+                    f"{write_times(last.fit)} the variation of y")  # fmt: skip
         if last.fit > EXACT:
             return text + ": the model explains the whole record."
         failed = [t for t in self.tests if not t.passed]
@@ -134,7 +134,7 @@ class Comparison(Printed):
         size = f"RMS error [{unit}]" if unit else "RMS error"
         rows.append(f"  {'curve':<34}{'fit':>10}{size:>18}{'noise explains':>18}")
         rows += [
-            f"  {c.label:<34}{_write_fit(c.fit):>10}{c.rms:>18.3e}"
+            f"  {c.label:<34}{write_fit(c.fit):>10}{c.rms:>18.3e}"
             f"{_write_percent(c.noise_share):>18}"
             for c in self.curves
         ]
@@ -158,10 +158,31 @@ def _write_percent(share: float) -> str:
     return f"{value:.0f} %" if value >= 9.5 or value < 1e-3 else f"{value:.1g} %"
 
 
-def _write_fit(fit: float) -> str:
+def write_times(fit: float) -> str:
+    """Say how many times the variation of y an error is, by a fit that is not positive.
+
+    Examples
+    --------
+    >>> write_times(-58994.0)
+    '590 times'
+    """
+    times = 1 - fit / 100
+    return f"{write_number(times, 2)} times" if times >= 1.05 else "as large as"
+
+
+def write_fit(fit: float, places: int = 2) -> str:
+    """Write a fit in percent; one far below zero only says so, since its size tells nothing.
+
+    Examples
+    --------
+    >>> write_fit(87.654), write_fit(-58994.0)
+    ('87.65 %', 'below 0 %')
+    """
     if fit > EXACT:
         return "100 %"
-    return f"{fit:.2f} %" if fit < 99.9 else f"{fit:.4f} %"
+    if fit < -100:
+        return "below 0 %"
+    return f"{fit:.{places}f} %" if fit < 99.9 else f"{fit:.{places + 2}f} %"
 
 
 def _write_shares(tests: list[Correlation]) -> str:

@@ -62,4 +62,9 @@ def find_time_constant(poles: Any, dt: float, record: Record) -> int:
         rates = (np.log(poles.astype(complex)) / dt if dt else poles).real
     fast = rates[rates > 1e-6] if np.any(rates > 1e-6) else -rates[rates < -1e-6]
     slowest = float(np.min(fast)) if fast.size else 10 / record.duration
-    return int(np.clip(round(1 / (slowest * record.dt)), 1, max(len(record) // 10, 1)))
+    return int(np.clip(round(1 / (slowest * record.dt)), 1, find_longest_horizon(record)))
+
+
+def find_longest_horizon(record: Record) -> int:
+    """Return how many samples ahead a record is predicted at most: a tenth of it."""
+    return max(len(record) // 10, 1)

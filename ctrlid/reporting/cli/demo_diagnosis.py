@@ -161,10 +161,12 @@ def reveal_effect(found: Diagnosis, effect: AbstractEffect, loop: Loop) -> str:
         before, after, floor = (
             _text.write_quantity(v, gap.unit) for v in (gap.before, gap.after, gap.floor)
         )
-        closed = write_percent(1 - gap.after / gap.before)
-        text += (f" On samples that were not used for the fit, the RMS error of the {gap.kind} "
-                 f"decreased from {before} to {after}, by {closed}; the noise floor is "
-                 f"{floor}.")  # fmt: skip
+        closed = f"by {write_percent(1 - gap.after / gap.before)}"
+        changed = f"decreased from {before} to {after}, {closed}"
+        if gap.after >= gap.before:
+            changed = f"DID NOT DECREASE: it was {before} and is {after}"
+        text += (f" On samples that were not used for the fit, the RMS error of the {gap.name} "
+                 f"{changed}; the noise floor is {floor}.")  # fmt: skip
     return text
 
 

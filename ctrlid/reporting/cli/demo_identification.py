@@ -25,7 +25,7 @@ from ...physics.conversions import sample_held
 from ...physics.linearization import OperatingPoint, linearize, operating_point
 from ...physics.plants import maglev
 from ...validation.comparing import compare
-from ...validation.comparison import Comparison
+from ...validation.comparison import Comparison, write_fit
 from .. import pictures as _pictures
 from .. import plot
 from ..html_page import Section
@@ -292,7 +292,7 @@ def _tell_comparisons(bench: _Bench, record: Record, models: Models) -> Section:
     loops = {k: replace(bench.loop, plant=ct.tf(G), at=means) for k, G in models.items()}
     found = {k: compare(record, loop) for k, loop in {**loops, "physics": bench.loop}.items()}
     fits = {k: c["one-step"].fit for k, c in found.items()}
-    steps = {k: f"{fit:.1f} %" for k, fit in fits.items()}
+    steps = {k: write_fit(fit, 1) for k, fit in fits.items()}
     near = "Curves that are close together, as in figures 6 and 7 of the paper, say little."
     far = "With so much noise the two differ, but the fit does not say what the model lacks."
     text = f"""
@@ -308,7 +308,7 @@ def _tell_comparisons(bench: _Bench, record: Record, models: Models) -> Section:
     for label, c in found.items():
         curve = next((q for q in c.curves if "simulation" in q.label), None)
         cells = ("none", "-") if curve is None else (
-            f"{curve.fit:.1f} %", f"{100 * curve.noise_share:.0f} %")  # fmt: skip
+            write_fit(curve.fit, 1), f"{100 * curve.noise_share:.0f} %")  # fmt: skip
         # Round-off alone is not tested.
         white = "none" if not c.tests else "white" if c.tests[0].passed else "not white"
         rows.append((label, steps[label], white, *cells))

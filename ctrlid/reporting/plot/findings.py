@@ -96,7 +96,7 @@ def _draw_gap(above: Any, below: Any, found: Diagnosis) -> None:
         # A long prediction is made at some of the samples only.
         made = np.isfinite(error) if gap.horizon else slice(None)
         shown = scale * values[part]
-        above.plot(t[made], shown[made], label=f"{gap.kind}, {long}", **style)
+        above.plot(t[made], shown[made], label=f"{gap.name}, {long}", **style)
         below.plot(t[made], fine * error[made], label=f"{label}: {rms}", **style)
     _limit_view(above, scale * y)
     above.set_ylabel(f"output [{unit}]")

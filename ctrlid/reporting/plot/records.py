@@ -10,7 +10,7 @@ from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
 from ...data.record import Record
 from ...data.validity import find_runs
-from ...validation.comparison import Comparison
+from ...validation.comparison import Comparison, write_fit
 from .. import pictures as _pictures
 from .axes import (
     BINS,
@@ -142,7 +142,7 @@ def comparison(
         values = scale * curve.y[shown]
         # Long predictions are made from every few samples only; breaks are where nothing counts.
         kept = np.isfinite(values) | ~whole.valid[shown]
-        label = f"{curve.label}: fit {curve.fit:.1f} %"
+        label = f"{curve.label}: fit {write_fit(curve.fit, 1)}"
         ax.plot(t[kept], values[kept], label=label, **choose_line_style(i))
     # A prediction of a wrong model can be anywhere; what was measured must stay readable.
     span = float(np.ptp(y)) or 1.0
