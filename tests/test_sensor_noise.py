@@ -19,7 +19,7 @@ from ctrlid.estimation.likelihood.maximization import begin_fit, choose_sensor_n
 from ctrlid.estimation.likelihood.noise_fit import fit_noise
 
 
-def simulate_servo(r, noise, dt=0.01, kp=20.0, kd=1.0, filter_time=0.02):
+def simulate_servo(r, noise, dt=0.01, kp=20.0, kd=1.0, filter_time=0.02, dead_zone=0.0):
     """Return reading and input of y" = 3 u - 2 y' with a PD that sees the noise, held exactly.
 
     The transition is a matrix exponential: what interpolates the input between samples, as
@@ -34,7 +34,8 @@ def simulate_servo(r, noise, dt=0.01, kp=20.0, kd=1.0, filter_time=0.02):
         e = r[k] - y[k]
         d = (filter_time * d + kd * (e - last)) / (filter_time + dt)
         u[k], last = kp * e + d, e
-        x = move[:2, :2] @ x + move[:2, 2] * u[k]
+        acting = u[k] - np.clip(u[k], -dead_zone, dead_zone)
+        x = move[:2, :2] @ x + move[:2, 2] * acting
     return y, u
 
 

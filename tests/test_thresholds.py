@@ -19,8 +19,10 @@ PLAIN = {0, 1, 2, 0.5}
 FORMULAS = {
     ("noise_tests", "_compute_force_deviates"),  # D'Agostino; Anscombe and Glynn
     ("noise_tests", "_test_tails"),  # kurtosis of a Gaussian, and its variance 24 / n
+    ("noise_tests", "compute_excess"),  # kurtosis of a Gaussian
     ("gap", "draw_noise"),  # three streams of random numbers
     ("verdict", "write_conclusion"),  # per cent
+    ("findings", "SensorNoise"),  # per cent
 }
 CONSTANTS = {
     ("procedure", "PROGRESS"),

@@ -6,15 +6,15 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from .._base.errors import EffectDoesNotApply, ModelCannotRun
-from .._base.text import write_quantity
 from .._base.units import fill_unit
 from ..data.record import Record
 from ..effects import AbstractEffect, equivalents
+from ..estimation.likelihood.likelihood import Fit
 from ..estimation.likelihood.physics_fit import summarize_fit
 from ..loop.loop import Loop
 from .candidates import Trial, is_same_kind
 from .experiment import find_experiment
-from .findings import Calibrated, Candidate, Finding
+from .findings import Calibrated, Candidate, Finding, SensorNoise
 from .gap_summary import GapSummary
 from .growth import Search
 from .recalibration import fit_base_model
@@ -63,13 +63,6 @@ def assemble_answer(
             "the model is linear. If the errors depend on position, velocity or input, write the "
             "equations of the plant with ct.nlsys and diagnose that model"
         )
-    noise = found.final.fit.noise
-    if not noise.sensor_is_white:
-        size = math.sqrt(float(np.mean(found.final.fit.sensor)))
-        notes.append(
-            f"the sensor noise is taken as coloured, ARMA({len(noise.ar)}, {len(noise.ma)}), of "
-            f"{write_quantity(size, gap.unit)} RMS: the reading errs alike in successive samples"
-        )
     before = dict(zip(found.base.names, found.base.fit.theta.tolist(), strict=True))
     calibrated = tuple(
         Calibrated(name, loop.parameters[name], before[name], fitted.loop.parameters[name],
@@ -78,13 +71,26 @@ def assemble_answer(
     )  # fmt: skip
     tests = dict(found.after.p_values)
     ranking = _rank_candidates(found)
+    noise = describe_noise(found.final.fit, gap.unit)
     sentence = write_conclusion(
         verdict, findings, gap, disturbance, found.after, where, None if left else objection,
-        len({type(c.effect) for c in ranking}),
+        len({type(c.effect) for c in ranking}), noise,
     )  # fmt: skip
     return Diagnosis(
         verdict, sentence, findings, final, gap, where, ranking, disturbance,
-        calibrated, _find_sensitivity(found), tests, notes=tuple(notes),
+        calibrated, _find_sensitivity(found), tests, notes=tuple(notes), noise=noise,
+    )  # fmt: skip
+
+
+def describe_noise(fit: Fit, unit: str) -> SensorNoise:
+    """Return the sensor noise of a fit as a diagnosis tells it."""
+    noise, variance = fit.noise, float(np.mean(fit.sensor))
+    if noise.tails is None:
+        return SensorNoise(math.sqrt(variance), unit, noise.ar, noise.ma)
+    tails = noise.tails
+    return SensorNoise(
+        math.sqrt(variance * tails.variance), unit, noise.ar, noise.ma,
+        tails.freedom or math.inf, tails.share, tails.ratio,
     )  # fmt: skip
 
 

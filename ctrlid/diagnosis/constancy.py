@@ -44,9 +44,9 @@ def run_constancy_tests(fit: Fit, axes: Mapping[str, Array]) -> dict[str, float]
     """
     names = fit.plant.names
     parts = [
-        (out.slopes[keep], out.innovations[keep], out.variance[keep] * r, keep)
-        for out, r, keep in zip(
-            fit.filtered, fit.sensor, map(np.isfinite, fit.standardized), strict=True
+        (out.slopes[keep], e[keep], s[keep], keep)
+        for out, (e, s), keep in zip(
+            fit.filtered, fit.working, map(np.isfinite, fit.standardized), strict=True
         )
     ]
     scores = np.concatenate([x * (e / s)[:, None] for x, e, s, _ in parts])

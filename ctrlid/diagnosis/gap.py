@@ -310,11 +310,14 @@ def draw_noise(fit: Fit, sensor: float, n: int, seed: int) -> list[Array]:
         steps = streams[2] * math.sqrt(sensor * noise.drift)
         steps[0] *= 1 / math.sqrt(1 - noise.memory**2)
         force = force + signal.lfilter([1.0], [1.0, -noise.memory], steps)
-    reading = streams[0]
+    tails, reading = noise.tails, streams[0]
     if not noise.sensor_is_white:
         # As many samples again let the noise begin anywhere in its stationary run.
-        long = np.append(np.random.default_rng([seed, 1]).standard_normal(n), reading)
+        reading = np.append(np.random.default_rng([seed, 1]).standard_normal(n), reading)
+    if tails is not None:
+        reading = tails.draw(reading, seed)
+    if not noise.sensor_is_white:
         _, drive, _ = make_sensor_states(noise.ar, noise.ma)
         colour = [1.0, *noise.ma], [1.0, *(-v for v in noise.ar)]
-        reading = drive[0] * signal.lfilter(*colour, long)[n:]
+        reading = drive[0] * signal.lfilter(*colour, reading)[n:]
     return [reading * math.sqrt(sensor), force]

@@ -1,5 +1,6 @@
 """Step 7: the search adds effects, drops superfluous ones and looks back, round by round."""
 
+import contextlib
 import math
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
@@ -9,11 +10,11 @@ import numpy as np
 from .._base.criterion import bayesian_penalty
 from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from ..effects import AbstractEffect
-from ..estimation.likelihood.kalman_filter import Noise
 from ..estimation.likelihood.likelihood import Fit
 from ..estimation.likelihood.maximization import (
     choose_noise,
     choose_sensor_noise,
+    choose_tails,
     maximize,
     refit_noise_size,
 )
@@ -101,10 +102,10 @@ def search_effects(
         tell(f"round {len(steps) + 1}: screening")
         pool = list_missing_candidates(model, catalogue)
         step = run_round(model, pool, work, None if steps else restore_given_values(base))
-        coloured = _prefer_sensor_noise(model, step.best, is_larger)
-        if coloured is not None:
-            tell("coloured sensor noise")
-            model, base = coloured, base if steps else coloured
+        # Noise may be coloured and have heavy tails, one after the other.
+        while (other := _prefer_sensor_noise(model, step.best, is_larger)) is not None:
+            tell("other sensor noise")
+            model, base = other, base if steps else other
             step = run_round(model, list_missing_candidates(model, catalogue), work)
         step = replace(step, base=Model(model.loop, drop_linearization(model.fit)))
         if step.best is not None and _is_stand_in(step.best, model, beside=bool(steps)):
@@ -129,27 +130,34 @@ def search_effects(
 def _prefer_sensor_noise(
     model: Model, best: Trial | None, is_larger: Callable[[Model], bool]
 ) -> Model | None:
-    """Return the model with coloured sensor noise if that gains more than the best effect does.
+    """Return the model with other sensor noise if that gains more than the best effect does.
 
-    Only where the innovations are not white noise, or a coloured force had to make them so, and
-    where the noise is not larger than the error that it explains.
+    Coloured, or with heavy tails. Only where the innovations are not white noise, or a coloured
+    force had to make them so, and where the noise is not larger than the error that it explains.
     """
     fit = model.fit
-    if fit.known is not None or not fit.noise.sensor_is_white:
+    if fit.known is not None or not math.isfinite(fit.value):
         return None
-    if not fit.noise.drift and run_noise_tests(fit).passed:
+    tests = run_noise_tests(fit)
+    if tests.passed and not fit.noise.drift:
         return None
-    try:
-        other = choose_sensor_noise(fit)
-    except ModelCannotRun:
-        return None
+    tried = []
+    if fit.noise.sensor_is_white:
+        with contextlib.suppress(ModelCannotRun):
+            tried.append(choose_sensor_noise(fit))
+    if fit.noise.tails is None and tests.has_heavy_tails:
+        tried.append(choose_tails(fit))
+    other = max(tried, key=compute_noise_criterion, default=fit)
     gain = compute_noise_criterion(other) - compute_noise_criterion(fit)
     # Further noise in the fit of the best effect is paid for as well.
     more = 0.0
     if best is not None:
         parameters = best.model.fit.noise.parameters - fit.noise.parameters
         more = max(0.0, best.net_gain - bayesian_penalty(parameters, fit.size))
-    if not gain > more or is_larger(Model(model.loop, other)):
+    if not gain > more:
+        return None
+    newly_coloured = fit.noise.sensor_is_white and not other.noise.sensor_is_white
+    if newly_coloured and is_larger(Model(model.loop, other)):
         return None
     return with_linearization(Model(model.loop, other))
 
@@ -162,7 +170,7 @@ def refuse_larger_noise(found: Search, is_larger: Callable[[Model], bool]) -> Se
     fit = found.final.fit
     if fit.noise.sensor_is_white or fit.known is not None or not is_larger(found.final):
         return found
-    plain = refit_noise_size(maximize(replace(fit, noise=Noise(fit.noise.force))))
+    plain = refit_noise_size(maximize(replace(fit, noise=fit.noise.plain)))
     model = Model(found.final.loop, drop_linearization(choose_noise(plain)))
     model, left = weigh_effects(model, len(found.base.loop.effects), found.steps)
     return replace(found, final=model, found=left, after=retest_with_replicas(model))

@@ -13,7 +13,16 @@ from ..effects import AbstractEffect
 from ..loop.loop import Loop
 from ..physics.linearization import OperatingPoint
 from ..validation.reproduction import CLOSED_LOOP, OPEN_LOOP
-from .findings import BinnedErrors, Calibrated, Candidate, Disturbance, Finding, Gap, GapKind
+from .findings import (
+    BinnedErrors,
+    Calibrated,
+    Candidate,
+    Disturbance,
+    Finding,
+    Gap,
+    GapKind,
+    SensorNoise,
+)
 from .result import Diagnosis
 from .saving import FORMAT, SavedLoop, read_numbers
 
@@ -71,6 +80,7 @@ def _decode_diagnosis(data: Mapping[str, Any], loop: Loop | None) -> Diagnosis:
         sensitivity=read_numbers(data["sensitivity"]), tests=read_numbers(data["tests"]),
         audit=tuple(data["audit"]), notes=tuple(data["notes"]), record=data["record"],
         seconds=read_numbers(data["seconds"]), extra=read_numbers(data["extra"]),
+        noise=_decode(SensorNoise, data["noise"]) if data.get("noise") else None,
     )  # fmt: skip
 
 
@@ -140,7 +150,7 @@ def _decode(kind: Any, data: Mapping[str, Any]) -> Any:
                 made[field.name] = _decode_effect(value)
             case "alternatives":
                 made[field.name] = tuple(_decode_effect(e) for e in value)
-            case "equivalents" | "records":
+            case "equivalents" | "records" | "ar" | "ma":
                 made[field.name] = tuple(value)
             case _:
                 made[field.name] = value if field.type in (str, "str") else read_numbers(value)

@@ -42,6 +42,7 @@ def write_report_text(found: Diagnosis) -> str:
     elif found.verdict == "nothing missing" and found.sensitivity:
         lines += ["", *_write_sensitivity(found)]
     lines += ["", *_write_parameters(found)]
+    lines += _wrap_text(wording.describe_sensor_noise(found), 2, hang=4)
     lines += _wrap_text(wording.describe_disturbance(found), 2, hang=4)
     lines += _wrap_text(wording.describe_remains(found), 2, hang=4)
     if found.audit:

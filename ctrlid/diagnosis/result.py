@@ -7,7 +7,16 @@ from typing import Any
 from .._base.text import Printed
 from ..effects import AbstractEffect
 from ..loop.loop import Loop
-from .findings import BinnedErrors, Calibrated, Candidate, Disturbance, Finding, Gap, Verdict
+from .findings import (
+    BinnedErrors,
+    Calibrated,
+    Candidate,
+    Disturbance,
+    Finding,
+    Gap,
+    SensorNoise,
+    Verdict,
+)
 from .report_text import write_report_text
 from .saving import save_diagnosis
 
@@ -51,6 +60,8 @@ class Diagnosis(Printed):
         Run time [s].
     extra : dict of str to object
         What else was computed along.
+    noise : SensorNoise or None
+        The noise of the sensor, in words and numbers; None in files of earlier versions.
     """
 
     verdict: Verdict
@@ -69,6 +80,7 @@ class Diagnosis(Printed):
     record: str = ""
     seconds: float = 0.0
     extra: dict[str, Any] = field(default_factory=dict, repr=False)
+    noise: SensorNoise | None = None
 
     @property
     def effects(self) -> tuple[AbstractEffect, ...]:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from .._base.text import write_number, write_p_value
 from ..effects import AbstractEffect
 from ..estimation.likelihood.likelihood import Fit
-from .findings import BinnedErrors, Disturbance, Finding, Gap, Verdict
+from .findings import BinnedErrors, Disturbance, Finding, Gap, SensorNoise, Verdict
 from .noise_tests import NoiseTests
 from .thresholds import THRESHOLD
 from .wording import join_names, name_test
@@ -118,6 +118,7 @@ def write_conclusion(
     verdict: Verdict, findings: Sequence[Finding], gap: Gap, disturbance: Disturbance,
     after: NoiseTests, where: Sequence[BinnedErrors], objection: str | None = None,
     tried: int = 0,
+    noise: SensorNoise | None = None,
 ) -> str:  # fmt: skip
     """Return the verdict with what it rests on.
 
@@ -139,6 +140,8 @@ def write_conclusion(
         Why effects that leave nothing but noise may yet be no explanation.
     tried : int, optional
         How many effects of the catalogue were tried.
+    noise : SensorNoise, optional
+        The noise of the sensor, told beside a clean bill that needs more than white noise.
 
     Returns
     -------
@@ -156,6 +159,8 @@ def write_conclusion(
     if verdict == "nothing missing":
         text = ("No effect that is large enough to show in this record is missing: the residuals "
                 "are noise.")  # fmt: skip
+        if noise is not None and noise.kind != "white":
+            text += f" {noise}"
     elif verdict == "explained":
         text = f"The model lacks {names}. With {them} the residuals are noise."
     elif verdict == "partly explained" and after.passed and objection is not None:

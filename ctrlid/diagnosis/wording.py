@@ -384,6 +384,11 @@ def describe_disturbance(found: Diagnosis) -> str:
             "effects larger than this force")  # fmt: skip
 
 
+def describe_sensor_noise(found: Diagnosis) -> str:
+    """Say what the noise of the sensor is, and how large."""
+    return "" if found.noise is None else f"sensor noise: {found.noise.words}"
+
+
 def describe_remains(found: Diagnosis) -> str:
     """Say whether the residuals are noise, by the tests of the final one-step errors."""
     if not found.tests:

@@ -283,7 +283,12 @@ def _make_diagnosis_blocks(found: Diagnosis) -> list[Block]:
         made.append(wording.describe_limits(found))
     made += [
         f"{_upper(line)}."
-        for line in (wording.describe_disturbance(found), wording.describe_remains(found))
+        for line in (
+            wording.describe_sensor_noise(found),
+            wording.describe_disturbance(found),
+            wording.describe_remains(found),
+        )
+        if line
     ]
     if found.audit:
         made.append(Title("About the record"))

@@ -19,6 +19,7 @@ from ...physics.block_evaluation import BlockEvaluation
 from .filter_data import FilterData
 from .kalman_recursion import filter_pass
 from .sampled_plant import Linearized, SampledPlant, Trajectory
+from .tails import Tails
 
 # While its variance exceeds so many times the median, a prediction depends on the initial state.
 INITIAL_VARIANCE_RATIO = 4.0
@@ -28,6 +29,8 @@ NEWTON = 6
 PASSES = 12
 # A trajectory that moves by less than this share of its standard deviation has converged.
 CONVERGED_MOTION = 1e-3
+# What the compiled filter takes for noise without heavy tails.
+GAUSSIAN = 0.0, 0.0, 0.0, 0.0
 
 
 @dataclass(frozen=True)
@@ -45,6 +48,8 @@ class Noise:
     ar, ma : tuple of float
         Coefficients of coloured sensor noise,
         ``n[k] = ar[0] n[k-1] + ... + w[k] + ma[0] w[k-1] + ...``; white if both are empty.
+    tails : Tails or None
+        Heavy tails of the sensor noise; None: it is Gaussian.
     """
 
     force: tuple[float, ...]
@@ -52,6 +57,17 @@ class Noise:
     drift: float = 0.0
     ar: tuple[float, ...] = ()
     ma: tuple[float, ...] = ()
+    tails: Tails | None = None
+
+    @property
+    def plain(self) -> "Noise":
+        """The noise without its colours, of force and sensor."""
+        return Noise(self.force, tails=self.tails)
+
+    @property
+    def is_coloured(self) -> bool:
+        """Whether the force or the sensor noise has a colour."""
+        return bool(self.drift) or not self.sensor_is_white
 
     @property
     def sensor_is_white(self) -> bool:
@@ -60,8 +76,9 @@ class Noise:
 
     @property
     def parameters(self) -> int:
-        """Number of parameters beyond those of white noise."""
-        return 2 * bool(self.drift) + len(self.ar) + len(self.ma)
+        """Number of parameters beyond those of white Gaussian noise."""
+        tails = self.tails.parameters if self.tails is not None else 0
+        return 2 * bool(self.drift) + len(self.ar) + len(self.ma) + tails
 
     @property
     def coloured(self) -> float:
@@ -87,7 +104,7 @@ def run_filter(
     """Run the filter along a linearized plant, with sensitivities to its first columns."""
     p = len(plant.index) if columns is None else columns
     p = p if sensitive else 0
-    n, white = plant.size, noise.sensor_is_white
+    n, white, tails = plant.size, noise.sensor_is_white, noise.tails
     force = np.asarray(noise.force, dtype=float)
     if not white:
         lin, force = append_sensor_noise(lin, force, noise)
@@ -96,7 +113,7 @@ def run_filter(
         lin.step, lin.a, lin.b, lin.du, np.ascontiguousarray(lin.dp[:, :, :p]), lin.output,
         lin.c, np.ascontiguousarray(lin.hp[:, :p]), lin.trajectory.predicted,
         lin.trajectory.filtered, data.y, data.valid, data.restart, lin.input_variance,
-        lin.start, lin.spread, 1.0 if white else 0.0,
+        lin.start, lin.spread, 1.0 if white else 0.0, GAUSSIAN if tails is None else tails.numbers,
         force, noise.memory, noise.drift, (0,) * states,
         (0,) * (states + bool(noise.drift > 0)),
     )  # fmt: skip
@@ -105,7 +122,8 @@ def run_filter(
     counts = data.usable
     # The caller reports a filter that lost the record, so that no warning is needed here.
     with np.errstate(all="ignore"):
-        sensor = np.sqrt(np.mean(error[counts] ** 2 / variance[counts]))
+        square = np.mean(error[counts] ** 2 / variance[counts]) if tails is None else tails.scale
+        sensor = np.sqrt(square)
     return Filtered(error, variance, Trajectory(before, after, wide * sensor), slopes,
                     disturbance)  # fmt: skip
 

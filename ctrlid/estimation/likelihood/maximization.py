@@ -21,7 +21,9 @@ from .noise_fit import (
     make_noise,
     try_coloured_force,
     try_coloured_sensor,
+    try_tails,
 )
+from .tails import compute_information_shares
 
 # A climb ends after at most so many Gauss-Newton steps.
 ROUNDS = 25
@@ -133,7 +135,7 @@ def refit_noise_size(fit: Fit) -> Fit:
     A random force that stood for a wrong parameter at the start may have left no noise to the
     sensor, from where small changes lead nowhere.
     """
-    plain = Noise(fit.noise.force)
+    plain = fit.noise.plain
     other = fit_noise(fit.problem, fit.theta, fit.linearized, plain, wide=True)
     return maximize(other) if other.value > fit.value + OTHER_NOISE_GAIN else fit
 
@@ -163,6 +165,14 @@ def choose_sensor_noise(fit: Fit) -> Fit:
     if fit.known is not None:
         return fit
     richer = maximize(try_coloured_sensor(fit))
+    return max(fit, richer, key=compute_noise_criterion)
+
+
+def choose_tails(fit: Fit) -> Fit:
+    """Return the fit with heavy tails of the sensor noise if the BIC wants them."""
+    if fit.known is not None:
+        return fit
+    richer = maximize(try_tails(fit))
     return max(fit, richer, key=compute_noise_criterion)
 
 
@@ -338,6 +348,8 @@ def compute_information(fit: Fit) -> tuple[Array, Array]:
             shifted[k] += h
             pair.append(compute_innovations(fit.theta, make_noise(shifted, fit.noise, dt)))
         columns.append(_divide_difference(pair, 2 * LOG_STEP))
+    tails = fit.noise.tails
+    mean, scale = compute_information_shares(tails)
     count, records = len(columns), len(problem.data) if problem.known is None else 0
     matrix = np.zeros((count + records, count + records))
     score = np.zeros(count + records)
@@ -345,10 +357,14 @@ def compute_information(fit: Fit) -> tuple[Array, Array]:
         s, e = out.variance[keep] * r, out.innovations[keep]
         size = np.zeros((len(e), records))
         size[:, k : k + 1] = 1.0
+        z2 = e**2 / s
+        if tails is not None:
+            w = tails.compute_weight(np.sqrt(z2))
+            e, z2 = w * e, w * z2
         slopes = np.column_stack([c[k][0] for c in columns] + [np.zeros_like(size)])
         widths = np.column_stack([c[k][1] for c in columns] + [size])
-        matrix += (slopes / s[:, None]).T @ slopes + 0.5 * widths.T @ widths
-        score += -slopes.T @ (e / s) + 0.5 * widths.T @ (e**2 / s - 1)
+        matrix += mean * (slopes / s[:, None]).T @ slopes + 0.5 * scale * widths.T @ widths
+        score += -slopes.T @ (e / s) + 0.5 * widths.T @ (z2 - 1)
     return matrix, score
 
 

@@ -14,6 +14,7 @@ from ..._base.jobs import run_side_by_side
 from .kalman_filter import Noise
 from .likelihood import Fit, Known, Problem, evaluate_linearized
 from .sampled_plant import Linearized, SampledPlant
+from .tails import fit_tails, list_tails
 
 # Logarithm of the least variance of a force, below which it affects only the start of a record.
 LEAST = -24.0
@@ -66,9 +67,51 @@ def fit_noise(
             int(np.argmin(_evaluate_costs(cost, [np.full(plant.channels, g) for g in grid])))
         ]
         start[: plant.channels] = best
-    return evaluate_linearized(
+    fit = evaluate_linearized(
         problem, theta, at(_minimize_by_newton(cost, start, low, high, enough)), lins
     )
+    return fit if noise.tails is None else _refit_tails(fit, hold_colour)
+
+
+def _refit_tails(fit: Fit, hold_shape: bool) -> Fit:
+    """Return the fit with the likeliest tails of its innovations, or as it is where that is less.
+
+    Only the scale moves with `hold_shape`. The filter weighs readings anew, by the new law.
+    """
+    tails = fit.noise.tails
+    assert tails is not None
+    if not math.isfinite(fit.value):
+        return fit
+    new = replace(tails, scale=float(np.mean(fit.sensor)))
+    if not hold_shape:
+        new, _ = fit_tails(new, *_list_squares(fit))
+    again = evaluate_linearized(
+        fit.problem, fit.theta, replace(fit.noise, tails=new), fit.linearized
+    )
+    return again if again.value > fit.value else fit
+
+
+def _list_squares(fit: Fit) -> tuple[Array, float]:
+    """Return squared innovations over their relative variances, and half the sum of their logs."""
+    pairs = [(out.innovations[keep] ** 2, out.variance[keep])
+             for out, keep in zip(fit.filtered, fit.counts, strict=True)]  # fmt: skip
+    return (np.concatenate([e / s for e, s in pairs]),
+            0.5 * float(sum(np.sum(np.log(s)) for _, s in pairs)))  # fmt: skip
+
+
+def try_tails(fit: Fit) -> Fit:
+    """Return the fit with the heavy tails of the sensor noise that the BIC prefers.
+
+    Student's law and a share of wild readings compete; parameters of the plant stay as they are.
+    """
+    squares, logs = _list_squares(fit)
+    laws = [fit_tails(law, squares, logs) for law in list_tails(squares)]
+    tried = []
+    for student in (True, False):
+        law, _ = max(((t, v) for t, v in laws if bool(t.freedom) == student), key=lambda p: p[1])
+        noise = replace(fit.noise, tails=law)
+        tried.append(fit_noise(fit.problem, fit.theta, fit.linearized, noise))
+    return max(tried, key=compute_noise_criterion)
 
 
 def choose_noise_ratio(plant: SampledPlant) -> float:
@@ -96,7 +139,8 @@ def make_noise(logs: Array, like: Noise, dt: float) -> Noise:
     channels, p, q = len(like.force), len(like.ar), len(like.ma)
     force = tuple(np.exp(np.clip(logs[:channels], -300, 300)).tolist())
     ar, ma = np.tanh(logs[len(logs) - p - q : len(logs) - q]), np.sin(logs[len(logs) - q :])
-    noise = Noise(force, ar=_make_coefficients(ar), ma=tuple(-v for v in _make_coefficients(ma)))
+    noise = Noise(force, ar=_make_coefficients(ar), ma=tuple(-v for v in _make_coefficients(ma)),
+                  tails=like.tails)  # fmt: skip
     if not like.drift:
         return noise
     memory = math.exp(-dt / math.exp(min(max(logs[channels + 1], -50), 50)))
@@ -203,7 +247,7 @@ def try_coloured_force(fit: Fit) -> Fit:
     force, whole = tuple(0.5 * v for v in fit.noise.force), sum(fit.noise.force)
     memories = [math.exp(-dt / time) for time in (3 * dt, 30 * dt, 300 * dt)]
     noises = [
-        Noise(force, memory, share * whole * (1 - memory**2))
+        Noise(force, memory, share * whole * (1 - memory**2), tails=fit.noise.tails)
         for memory in memories
         for share in (1e-2, 1.0)
     ]
@@ -238,10 +282,10 @@ def try_coloured_sensor(fit: Fit) -> Fit:
     Hannan and Rissanen, Biometrika 69 (1982) 81-94, for the choice of orders by a criterion.
     """
     starts = [tuple(share * v for v in fit.noise.force) for share in (1.0, 1e-2, 1e-4)]
-    sizes = (-0.4, 0.4, 0.8, 0.97)
+    sizes, tails = (-0.4, 0.4, 0.8, 0.97), fit.noise.tails
     first = [
-        _fit_best(fit, [Noise(force, ar=(v,)) for force in starts for v in sizes]),
-        _fit_best(fit, [Noise(force, ma=(v,)) for force in starts for v in sizes]),
+        _fit_best(fit, [Noise(force, ar=(v,), tails=tails) for force in starts for v in sizes]),
+        _fit_best(fit, [Noise(force, ma=(v,), tails=tails) for force in starts for v in sizes]),
     ]
     return max((_lengthen_sensor_noise(f) for f in first), key=compute_noise_criterion)
 
