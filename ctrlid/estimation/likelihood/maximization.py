@@ -40,6 +40,8 @@ SECOND_STEP_SHARES = 2
 SECOND_STEP_GAIN = 30.0
 # Noise found far away must gain so much log-likelihood before the climb goes on from there.
 OTHER_NOISE_GAIN = 2.0
+# A force is hardly any with so small a share of its variance.
+QUIET = 1e-4
 # A step that is expected to gain less log-likelihood is not worth its evaluation.
 LEAST_STEP_GAIN = 1e-3
 
@@ -165,6 +167,12 @@ def choose_sensor_noise(fit: Fit) -> Fit:
     if fit.known is not None:
         return fit
     richer = maximize(try_coloured_sensor(fit))
+    # A force that stood for the colour may have led a parameter astray, which needs it there.
+    force = tuple(QUIET * v for v in richer.noise.force)
+    quiet = maximize(replace(richer, noise=replace(richer.noise, force=force)), exact=False)
+    if quiet.value > richer.value + OTHER_NOISE_GAIN:
+        anew = try_coloured_sensor(relinearize_fit(quiet))
+        richer = maximize(max(quiet, anew, key=compute_noise_criterion))
     return max(fit, richer, key=compute_noise_criterion)
 
 

@@ -281,8 +281,8 @@ def try_coloured_sensor(fit: Fit) -> Fit:
     ----------
     Hannan and Rissanen, Biometrika 69 (1982) 81-94, for the choice of orders by a criterion.
     """
-    starts = [tuple(share * v for v in fit.noise.force) for share in (1.0, 1e-2, 1e-4)]
     sizes, tails = (-0.4, 0.4, 0.8, 0.97), fit.noise.tails
+    starts = [tuple(share * v for v in fit.noise.force) for share in (1.0, 1e-2, 1e-4)]
     first = [
         _fit_best(fit, [Noise(force, ar=(v,), tails=tails) for force in starts for v in sizes]),
         _fit_best(fit, [Noise(force, ma=(v,), tails=tails) for force in starts for v in sizes]),
