@@ -28,6 +28,8 @@ LOG_STEP = 0.2
 CONVEX = 0.05
 # Partial autocorrelations are read back from coefficients up to this size.
 SURE = 1 - 1e-9
+# Coefficients of coloured sensor noise from which a fit starts, and those of an average.
+SIZES, AVERAGED = (-0.4, 0.4, 0.8, 0.97), 0.9
 # Orders of coloured sensor noise: of the autoregression and of the moving average, at most.
 ORDERS = 2, 3
 
@@ -281,13 +283,21 @@ def try_coloured_sensor(fit: Fit) -> Fit:
     ----------
     Hannan and Rissanen, Biometrika 69 (1982) 81-94, for the choice of orders by a criterion.
     """
-    sizes, tails = (-0.4, 0.4, 0.8, 0.97), fit.noise.tails
-    starts = [tuple(share * v for v in fit.noise.force) for share in (1.0, 1e-2, 1e-4)]
-    first = [
-        _fit_best(fit, [Noise(force, ar=(v,), tails=tails) for force in starts for v in sizes]),
-        _fit_best(fit, [Noise(force, ma=(v,), tails=tails) for force in starts for v in sizes]),
-    ]
-    return max((_lengthen_sensor_noise(f) for f in first), key=compute_noise_criterion)
+    shares = (1.0, 1e-2, 1e-4, 1e-6, 1e-8)
+    forces = [tuple(share * v for v in fit.noise.force) for share in shares]
+    # A converter that averages samples has zeros on the unit circle, all of which it needs at once.
+    averages = [(AVERAGED,) * q for q in range(2, ORDERS[1] + 1)]
+    moving = [[(v,) for v in SIZES], *([a] for a in averages)]
+    tails = fit.noise.tails
+    chains = [
+        _fit_best(fit, [Noise(f, ar=(v,), tails=tails) for f in forces for v in SIZES]),
+        max(
+            (_fit_best(fit, [Noise(f, ma=ma, tails=tails) for f in forces for ma in some])
+             for some in moving),
+            key=compute_noise_criterion,
+        ),
+    ]  # fmt: skip
+    return max((_lengthen_sensor_noise(f) for f in chains), key=compute_noise_criterion)
 
 
 def compute_noise_criterion(fit: Fit) -> float:
