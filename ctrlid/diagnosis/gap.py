@@ -260,18 +260,38 @@ def compute_floor(
     Floor
         RMS errors [output unit]; NaN where they cannot be computed.
     """
-    runs = runs or THRESHOLD.floor_runs
+    errors = measure_noise_errors(loops, fit, windows, how, runs or THRESHOLD.floor_runs)
+    both, sensor = np.sqrt(np.mean(errors**2, axis=0)).tolist()
+    return Floor(both, sensor, float(np.max(errors[:, 0])))
+
+
+def measure_noise_errors(
+    loops: Sequence[Loop], fit: Fit, windows: Sequence[Window], how: Reproduction, runs: int
+) -> Array:
+    """Return the RMS errors that noise leaves in each run, with all noise and with the sensor's.
+
+    NaN where they cannot be computed.
+    """
     squares, count = np.zeros((runs, 2)), 0
     for k, (loop, window) in enumerate(zip(loops, windows, strict=True)):
         noise = float(fit.sensor[min(k, len(fit.sensor) - 1)])
         try:
             squares += _simulate_noise(loop, fit, noise, window, how, runs)
         except (ModelCannotRun, EffectDoesNotApply):
-            return Floor(math.nan, math.nan, math.nan)
+            return np.full((runs, 2), math.nan)
         count += int(np.count_nonzero(window.mask))
-    errors = np.sqrt(squares / max(count, 1))
-    both, sensor = np.sqrt(np.mean(errors**2, axis=0)).tolist()
-    return Floor(both, sensor, float(np.max(errors[:, 0])))
+    return np.asarray(np.sqrt(squares / max(count, 1)))
+
+
+def compute_chance_among_runs(size: float, runs: Array) -> float:
+    r"""Return the probability that one more run errs as little, of runs with noise.
+
+    .. math:: \frac{\ln e - \overline{\ln e_r}}{s \sqrt{1 + 1/R}} \sim t_{R-1}
+    """
+    logs, count = np.log(runs), len(runs)
+    width = float(np.std(logs, ddof=1)) * math.sqrt(1 + 1 / count)
+    away = math.log(max(size, THRESHOLD.tiny)) - float(np.mean(logs))
+    return float(stats.t.cdf(away / max(width, THRESHOLD.tiny), count - 1))
 
 
 def _simulate_noise(

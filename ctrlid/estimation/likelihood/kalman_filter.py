@@ -11,10 +11,11 @@ from typing import Any
 
 import casadi
 import numpy as np
-from scipy import linalg
+from scipy import linalg, signal
 
 from ..._base.arrays import Array
 from ..._base.errors import ModelCannotRun
+from ..._base.statistics import compute_lagged_products
 from ...physics.block_evaluation import BlockEvaluation
 from .filter_data import FilterData
 from .kalman_recursion import filter_pass
@@ -183,6 +184,20 @@ def make_sensor_states(ar: tuple[float, ...], ma: tuple[float, ...]) -> tuple[Ar
     start = linalg.solve_discrete_lyapunov(move, np.outer(drive, drive))
     size = max(float(start[0, 0]), 1e-300)
     return move, np.asarray(drive / np.sqrt(size)), np.asarray(0.5 * (start + start.T) / size)
+
+
+def compute_memory(noise: Noise, samples: int) -> float:
+    r"""Return how many successive samples of the sensor noise tell its variance like one.
+
+    .. math:: 1 + 2 \sum_{\tau \ge 1} \rho(\tau)^2
+
+    over so many samples, with its autocorrelation :math:`\rho`.
+    """
+    impulse = np.zeros(samples)
+    impulse[0] = 1.0
+    response = signal.lfilter([1.0, *noise.ma], [1.0, *(-v for v in noise.ar)], impulse)
+    products = compute_lagged_products(response, response, samples - 1)
+    return float(1 + 2 * np.sum((products[1:] / products[0]) ** 2))
 
 
 def choose_settled_samples(data: FilterData, out: Filtered) -> Any:
