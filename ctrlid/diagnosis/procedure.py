@@ -179,7 +179,7 @@ def diagnose(
     if len(records) > 1 and not _have_same_effects(result, len(records)):
         result = _answer_each_record(question, search) or result
     bar.close()
-    return replace(result, audit=remarks, record=name_records(records),
+    return replace(result, audit=(*remarks, *result.audit), record=name_records(records),
                    seconds=time.perf_counter() - started)  # fmt: skip
 
 

@@ -157,7 +157,7 @@ def _encode_loop(loop: Loop | SavedLoop) -> dict[str, Any]:
 def _list_effect_units(found: Diagnosis) -> dict[str, dict[str, str]]:
     """Return the units of all effects that a diagnosis speaks of, by class name."""
     spoken = [*found.loop.effects, *(c.effect for c in found.ranking)]
-    spoken += [e for f in found.findings for e in (f.effect, *f.alternatives)]
+    spoken += [e for f in found.added for e in (f.effect, *f.alternatives)]
     return {type(e).__name__: list_units(found.loop, e) for e in spoken}
 
 

@@ -114,10 +114,16 @@ def gap_is_wider(gap: Gap, disturbance: Disturbance) -> bool:
     return max(gap.before, gap.floor) < gap.after and not by_noise
 
 
+def describe_grounds(stand_ins: Sequence[tuple[Finding, str]]) -> str | None:
+    """Say why names do not stand, in one clause; None without any."""
+    words = [f"the name {join_names([f])} does not stand, since {why}" for f, why in stand_ins]
+    return ", and ".join(words) or None
+
+
 def write_conclusion(
     verdict: Verdict, findings: Sequence[Finding], gap: Gap, disturbance: Disturbance,
     after: NoiseTests, where: Sequence[BinnedErrors], objection: str | None = None,
-    tried: int = 0,
+    tried: int = 0, stand_ins: Sequence[tuple[Finding, str]] = (),
     noise: SensorNoise | None = None,
 ) -> str:  # fmt: skip
     """Return the verdict with what it rests on.
@@ -140,6 +146,8 @@ def write_conclusion(
         Why effects that leave nothing but noise may yet be no explanation.
     tried : int, optional
         How many effects of the catalogue were tried.
+    stand_ins : sequence of (Finding, str), optional
+        Effects in the model whose names do not stand, with the ground of each.
     noise : SensorNoise, optional
         The noise of the sensor, told beside a clean bill that needs more than white noise.
 
@@ -163,14 +171,19 @@ def write_conclusion(
             text += f" {noise}"
     elif verdict == "explained":
         text = f"The model lacks {names}. With {them} the residuals are noise."
-    elif verdict == "partly explained" and after.passed and objection is not None:
-        text = f"With {names} the residuals are noise, but {objection}."
+    elif (findings or stand_ins) and after.passed and objection is not None:
+        every = join_names([*findings, *(f for f, _ in stand_ins)])
+        text = f"With {every} the residuals are noise, but {objection}."
     elif verdict == "partly explained":
         text = (f"{names} {verb} part of the error. The rest is not noise alone: {why}. None of "
                 f"the {tried} effects of the catalogue explains it.")  # fmt: skip
     else:
         text = (f"The error is not noise alone: {why}. None of the {tried} effects of the "
                 "catalogue explains it.")  # fmt: skip
+    doubted = after.passed and objection is not None
+    grounds = None if doubted else describe_grounds(stand_ins)
+    if grounds is not None:
+        text += f" {grounds[:1].upper()}{grounds[1:]}."
     left = [w for w in where if w.p_after < THRESHOLD.surely_left]
     if left and verdict in ("partly explained", "unknown"):
         text += f" The remaining error depends on {' and '.join(w.axis for w in left[:2])}."

@@ -14,6 +14,7 @@ from ..._base import text as _text
 from ..._base.arrays import Array
 from ..._base.criterion import bayesian_penalty
 from ..._base.errors import CtrlidError, CtrlidWarning
+from ..._base.statistics import sum_with_correlations
 from ...data.record import Record
 from ...data.several_records import as_records
 from ..constraints import AbstractConstraint, check_constraints
@@ -383,10 +384,7 @@ def _compute_sandwich(moments: Moments, found: Found, residuals: Sequence[Residu
     middle = np.zeros((p, p))
     for part in residuals:
         g = np.linalg.lstsq(upper.T, (part.z * part.e[:, None]).T, rcond=None)[0].T
-        lags = int(np.ceil(1.5 * len(g) ** (1 / 3)))
-        for lag in range(lags + 1):
-            both = g[lag:].T @ g[: len(g) - lag] * (1 - lag / (lags + 1))
-            middle += both if lag == 0 else both + both.T
+        middle += sum_with_correlations(np.asarray(g, dtype=float))
     bread = found.spread @ slope.T
     return np.asarray(bread @ middle @ bread.T)
 
