@@ -34,7 +34,6 @@ OF_OTHERS = {
     "diagnosis/open_loop_fit.py: fit",  # hands a refusal on
     "diagnosis/replicas.py: _design_normalized_controller",  # runs python-control alone
     "loop/loop.py: __post_init__",
-    "loop/simulation.py: _check_signals",
 }
 TRYING = ("diagnosis", "effects", "estimation/likelihood", "loop")
 

@@ -8,6 +8,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from itertools import islice
+from numbers import Integral
 from typing import Any, TypeVar
 
 import joblib
@@ -23,8 +24,9 @@ BATCH = 16
 
 def check_jobs(jobs: Any) -> int | None:
     """Return a number of jobs as joblib takes it, refused in words otherwise."""
-    if jobs is None or (isinstance(jobs, int) and not isinstance(jobs, bool) and jobs != 0):
-        return jobs
+    if jobs is None or (isinstance(jobs, Integral) and not isinstance(jobs, bool) and jobs != 0):
+        # More than any machine has are all.
+        return None if jobs is None else max(min(int(jobs), 2**16), -(2**16))
     raise CtrlidError(
         "jobs is a number of processes, at least 1, or -1 for all processors, or None for what "
         f"joblib.parallel_config says; given {jobs!r}"

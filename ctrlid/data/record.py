@@ -11,6 +11,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from scipy import signal
 
+from .._base.arguments import check_arguments
 from .._base.errors import CtrlidError
 from .._base.text import Printed
 from . import csv_files as _csv
@@ -197,6 +198,7 @@ class Record(Printed):
         CtrlidError
             If fewer than 2 samples lie between.
         """
+        check_arguments(Record.between, locals())
         if not t0 < t1:
             raise CtrlidError(f"between needs t0 < t1 in seconds; given {t0!r} and {t1!r}")
         # A sample that round-off puts a hair before t0 belongs to it.
@@ -230,6 +232,7 @@ class Record(Printed):
         CtrlidError
             If the fractions are not increasing between 0 and 1.
         """
+        check_arguments(Record.split, locals())
         cuts = fractions or (0.5,)
         edges = np.array([0.0, *cuts, 1.0])
         if not np.all(np.diff(edges) > 0):
@@ -272,6 +275,7 @@ class Record(Printed):
         >>> len(slow), slow.dt, float(slow.y[0]), slow.segments()
         (25, 0.004, 1.0, [(10, 15)])
         """
+        check_arguments(Record.decimate, locals(), "q")
         if not isinstance(q, Integral) or not 1 <= q <= len(self) // 2:
             raise CtrlidError(f"decimate needs a whole factor from 1 to {len(self) // 2} for "
                               f"{len(self)} samples; given {q!r}")  # fmt: skip
@@ -318,6 +322,7 @@ class Record(Printed):
         CtrlidError
             If there is no such channel.
         """
+        check_arguments(Record.with_input, locals())
         return self._swap_channels("u", channel)
 
     def with_output(self, channel: str) -> "Record":
@@ -338,6 +343,7 @@ class Record(Printed):
         CtrlidError
             If there is no such channel.
         """
+        check_arguments(Record.with_output, locals())
         return self._swap_channels("y", channel)
 
     def _swap_channels(self, key: str, channel: str) -> "Record":
@@ -425,6 +431,7 @@ class Record(Printed):
             If the file is no table of numbers, a column is missing, the time does not increase or
             samples are missing.
         """
+        check_arguments(Record.from_csv, locals())
         return cls(**_csv.read_csv(
             Path(path), {"r": r, "u": u, "y": y}, time, dt, extra, units, hold, name, gaps,
             scale,
@@ -445,6 +452,7 @@ class Record(Printed):
         CtrlidError
             If a channel's name or unit cannot stand in a header line.
         """
+        check_arguments(Record.to_csv, locals())
         _csv.write_csv(Path(path), self)
 
     @classmethod
@@ -486,6 +494,7 @@ class Record(Printed):
           u (force)  1 .. 1
           y (speed)  0 .. 0.632121 m/s
         """
+        check_arguments(Record.from_response, locals())
         return cls(**{**_response.read_response(response, {"r": r, "u": u, "y": y}), **fields})
 
     def to_response(self) -> Any:

@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
-from .._base.arrays import Array
+from .._base.arrays import Array, freeze_arrays
 from .._base.text import Printed, write_number, write_quantity
 from .._base.units import fill_unit
 from ..effects import AbstractEffect
@@ -83,6 +83,9 @@ class Gap:
         """Whether a trivial predictor errs less than each of the models: the gap says nothing."""
         return self.trivial < min(self.given, self.before, self.after)
 
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
+
     @property
     def fitted(self) -> float:
         """RMS error of the recalibrated model, whether or not it is the smaller [output unit]."""
@@ -130,6 +133,10 @@ class Finding:
     evidence: float
     share: float = float("nan")
     experiment: str = ""
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
+
     reference: Array | None = None
     note: str = ""
     records: tuple[int, ...] = ()
@@ -198,6 +205,10 @@ class BinnedErrors:
 
     axis: str
     unit: str
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
+
     edges: Array
     before: Array
     after: Array

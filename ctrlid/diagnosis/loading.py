@@ -8,6 +8,7 @@ from typing import Any, get_args
 
 import numpy as np
 
+from .._base.arguments import check_arguments
 from .._base.errors import CtrlidError
 from ..effects import AbstractEffect
 from ..loop.loop import Loop
@@ -49,6 +50,7 @@ def load_diagnosis(path: str | Path, loop: Loop | None = None) -> Diagnosis:
     CtrlidError
         If the file is none of these, an effect is of an unknown class, or the loop does not fit.
     """
+    check_arguments(load_diagnosis, locals())
     try:
         data = json.loads(Path(path).read_text("utf-8"))
     except OSError as reason:

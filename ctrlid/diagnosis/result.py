@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from .._base.arguments import check_arguments
 from .._base.text import Printed
 from ..effects import AbstractEffect
 from ..loop.loop import Loop
@@ -128,4 +129,5 @@ class Diagnosis(Printed):
         CtrlidError
             If the file cannot be written.
         """
+        check_arguments(Diagnosis.save, locals())
         return save_diagnosis(self, path)

@@ -12,6 +12,7 @@ from scipy.special import binom
 from scipy.stats import t as student_t
 
 from .._base import text as _text
+from .._base.arguments import check_arguments
 from .._base.arrays import Array, ComplexArray
 from .._base.errors import CtrlidError
 from ..physics.conversions import to_transfer_function
@@ -211,6 +212,7 @@ class Estimate(_text.Printed):
         lower, upper : float
             Both equal to the value where a constraint fixes the coefficient.
         """
+        check_arguments(Estimate.confidence_interval, locals())
         if not 0.0 < level < 1.0:
             raise CtrlidError(f"A confidence level lies between 0 and 1; given {level!r}.")
         i = self._find_index(name)
@@ -424,6 +426,7 @@ class IdentifiedModel(control.TransferFunction):
         control.TransferFunction
             A plain transfer function; the model itself if it has no delay.
         """
+        check_arguments(IdentifiedModel.with_delay, locals())
         plain = to_transfer_function(self)
         return plain * control.tf(*control.pade(self.delay, order)) if self.delay else plain
 

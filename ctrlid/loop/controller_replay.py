@@ -7,6 +7,7 @@ from typing import Any
 import casadi
 import numpy as np
 
+from .._base.arguments import check_arguments
 from .._base.arrays import Array
 from .._base.errors import CtrlidError, ModelCannotRun
 from ..data.record import Record
@@ -93,7 +94,9 @@ def replay_controller(loop: Loop, record: Record) -> Array:
     >>> bool(abs(cid.replay_controller(loop, record) - record.u).max() < 1e-12)
     True
     """
-    return replay_from_best_state(*order_model_and_data(loop, record))[0]
+    loop, record = order_model_and_data(loop, record)
+    check_arguments(replay_controller, locals())
+    return replay_from_best_state(loop, record)[0]
 
 
 def replay_from_best_state(loop: Loop, record: Record) -> tuple[Array, Array]:

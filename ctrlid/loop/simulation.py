@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from .._base.arrays import Array
+from .._base.arguments import check_arguments, is_number
+from .._base.arrays import Array, to_real_array
 from .._base.errors import CtrlidError, CtrlidWarning, ModelCannotRun
 from ..data.reconstruction import PIECES, count_pieces, reconstruct_signal
 from ..data.record import Record
@@ -93,6 +94,7 @@ def simulate(
     >>> len(cid.simulate(loop, r, sensor_noise=2e-6, seed=2))
     2000
     """
+    check_arguments(simulate, locals(), "loop", "sensor_noise", "force_noise")
     if not isinstance(loop, Loop):
         raise CtrlidError(
             f"simulate needs a Loop(plant, controller, dt=..., at=...); given {type(loop).__name__}"
@@ -117,10 +119,7 @@ def _check_signals(loop: Loop, r: Any, d: Any) -> tuple[Array | None, Array]:
     for name, value in (("r", r), ("d", d)):
         if value is None:
             continue
-        try:
-            array = np.asarray(value, dtype=float)
-        except (TypeError, ValueError) as reason:
-            raise CtrlidError(f"simulate needs {name} as an array of numbers; {reason}") from reason
+        array = to_real_array(value, f"simulate needs {name} as an array of numbers: they")
         if array.ndim != 1 or array.size < 2 or not np.isfinite(array).all():
             raise CtrlidError(
                 f"simulate needs {name} as a one-dimensional array of at least 2 finite numbers, "
@@ -143,14 +142,15 @@ def _check_signals(loop: Loop, r: Any, d: Any) -> tuple[Array | None, Array]:
 
 def _draw_noise(loop: Loop, n: int, sensor: float, force: float, seed: int | None) -> list[Array]:
     for name, value in (("sensor_noise", sensor), ("force_noise", force)):
-        number = isinstance(value, int | float | np.number)
-        if not (number and np.isfinite(value) and value >= 0):
+        if not (is_number(value) and np.isfinite(value) and value >= 0):
             raise CtrlidError(f"{name} is a standard deviation >= 0; given {value!r}")
     if force and not loop.equations().velocities:
         raise CtrlidError(
             f"force_noise needs a plant with a moving mass, that is a state whose rate is another "
             f"state; {loop.equations().name} has none. Use d= for a disturbance of the input"
         )
+    if seed is not None and seed < 0:
+        raise CtrlidError(f"seed is a whole number from 0 upwards, or None; given {seed}")
     # Each noise has its own stream, so that switching one on does not change the other.
     streams = np.random.default_rng(seed).spawn(2)
     return [s.standard_normal(n) * v for s, v in zip(streams, (sensor, force), strict=True)]
@@ -200,8 +200,8 @@ class Simulator:
         """Return the state to start from: at rest, or with the given values."""
         z, n = self.rest.copy(), len(self.plant_states)
         if initial is not None:
-            given = np.atleast_1d(np.asarray(initial, dtype=float))
-            if given.size not in (n, z.size) or not np.isfinite(given).all():
+            given = np.atleast_1d(to_real_array(initial, "initial states"))
+            if given.ndim > 1 or given.size not in (n, z.size) or not np.isfinite(given).all():
                 raise CtrlidError(
                     f"initial needs {n} plant states ({', '.join(self.plant_states)}) or these and "
                     f"{z.size - n} controller states, all finite; given {given.tolist()}"

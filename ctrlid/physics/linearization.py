@@ -9,7 +9,8 @@ import control as ct
 import numpy as np
 from scipy import linalg
 
-from .._base.arrays import Array
+from .._base.arguments import check_arguments, is_number
+from .._base.arrays import Array, to_real_array
 from .._base.errors import CtrlidError, ModelCannotRun
 from .conversions import to_polynomials
 from .equations import Equations, require_siso
@@ -21,6 +22,8 @@ UNREACHABLE = 1e-12
 EQUILIBRIUM = 1e-9
 # The search for equilibria starts from so many random points.
 STARTS = 60
+
+WANTED = "an operating point is given by numbers: states=(...), input=, output=, which"
 
 
 @dataclass(frozen=True)
@@ -53,13 +56,11 @@ class OperatingPoint:
     output: float
 
     def __post_init__(self) -> None:
-        try:
-            states = tuple(float(s) for s in np.atleast_1d(np.asarray(self.states, dtype=float)))
-            point = (float(self.input), float(self.output))
-        except (TypeError, ValueError) as reason:
-            raise CtrlidError(
-                "an operating point is given by numbers: states=(...), input=, output="
-            ) from reason
+        given = np.atleast_1d(to_real_array(self.states, WANTED))
+        if given.ndim > 1 or not (is_number(self.input) and is_number(self.output)):
+            raise CtrlidError(f"{WANTED}: given {self}")
+        states = tuple(given.tolist())
+        point = (float(self.input), float(self.output))
         if not np.isfinite([*states, *point]).all():
             raise ModelCannotRun(
                 f"an operating point must be finite; given states={states}, "
@@ -110,6 +111,7 @@ def operating_point(
     >>> op.states, round(op.input, 6)
     ((0.012, 0.0), 3.001458)
     """
+    check_arguments(operating_point, locals(), "output")
     equations = trace(plant)
     require_siso(equations)
     if not (isinstance(output, int | float | np.number) and np.isfinite(output)):
@@ -162,9 +164,11 @@ def _draw_starts(n: int, target: float, guess: Any) -> list[Array]:
     rng = np.random.default_rng(1)
     starts = []
     if isinstance(guess, OperatingPoint):
+        if len(guess.states) != n:
+            raise CtrlidError(f"guess needs {n} states; given {len(guess.states)}")
         starts.append(np.array([*guess.states, guess.input]))
     elif guess is not None:
-        states = np.atleast_1d(np.asarray(guess, dtype=float))
+        states = np.atleast_1d(to_real_array(guess, "guess"))
         if states.shape != (n,):
             raise CtrlidError(f"guess needs {n} states; given {states.size}")
         starts += [np.append(states, s * 10.0**k) for k in range(-2, 3) for s in (1, -1)]
@@ -295,6 +299,7 @@ def linearize(plant: Any, at: OperatingPoint, *, states: bool = False) -> Any:
     >>> cid.linearize(plant, cid.operating_point(plant, output=0.012), states=True).state_labels
     ['x', 'v']
     """
+    check_arguments(linearize, locals())
     if not isinstance(at, OperatingPoint):
         raise CtrlidError(
             f"linearize needs an OperatingPoint, as operating_point() returns; given "

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from .._base.arguments import check_arguments, check_fields
 from .._base.errors import CtrlidError
 from .._base.text import is_bad_news
 from ..data.record import Record
@@ -94,6 +95,9 @@ class Section:
     result: Any = None
     figure: Any = None
 
+    def __post_init__(self) -> None:
+        check_fields(self)
+
     @property
     def figures(self) -> dict[str, Any]:
         """The figures by caption."""
@@ -138,6 +142,7 @@ def write_report(result: Any, path: str | Path, *, title: str = "") -> Path:
     >>> page.startswith("<!DOCTYPE html>")
     True
     """
+    check_arguments(write_report, locals())
     given = (
         list(result) if isinstance(result, Sequence) and not isinstance(result, str) else [result]
     )

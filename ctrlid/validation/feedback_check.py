@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 from scipy import linalg, stats
 
-from .._base.arrays import Array
+from .._base.arguments import check_arguments
+from .._base.arrays import Array, freeze_arrays
 from .._base.errors import CtrlidError
 from .._base.statistics import robust_deviation
 from .._base.text import Printed, write_count
@@ -57,6 +58,9 @@ class FeedbackCheck(Printed):
     correlation: Array
     text: str
 
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
+
     def __str__(self) -> str:
         return self.text
 
@@ -105,6 +109,7 @@ def check_feedback(record: Record) -> FeedbackCheck:
     >>> cid.check_feedback(closed).closed_loop, cid.check_feedback(opened).closed_loop
     (True, False)
     """
+    check_arguments(check_feedback, locals())
     if not isinstance(record, Record):
         raise CtrlidError(f"check_feedback needs a Record; given {type(record).__name__}")
     longest = max((b - a for a, b in record.segments()), default=0)

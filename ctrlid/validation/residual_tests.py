@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy import linalg, signal, stats
 
-from .._base.arrays import Array
+from .._base.arrays import Array, freeze_arrays
 from .._base.statistics import (
     compute_lagged_products,
     compute_whiteness_probability,
@@ -53,6 +53,9 @@ class Correlation:
     band: float
     p_value: float
     share: float = 0.0
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
 
     @property
     def passed(self) -> bool:

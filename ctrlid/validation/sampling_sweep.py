@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from .._base.arguments import check_arguments
 from .._base.errors import CtrlidError, CtrlidWarning, ModelCannotRun
 from .._base.jobs import check_jobs, share_out
 from .._base.text import write_list
@@ -115,6 +116,7 @@ def sweep_sampling_period(
     >>> sweep.recommended
     0.005
     """
+    check_arguments(sweep_sampling_period, locals(), "record", "constraints")
     factors = _choose_factors(record, periods)
     names = tuple(estimators)
     unknown = [name for name in names if name not in ESTIMATORS]

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from .._base.arrays import Array
+from .._base.arrays import Array, freeze_arrays
 from .._base.errors import CtrlidError
 from .._base.text import Printed, with_error, write_list
 from ..data.record import Record
@@ -64,6 +64,9 @@ class SamplingRow:
     failure: str = ""
     notes: tuple[str, ...] = ()
 
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
+
     @property
     def failed(self) -> bool:
         """Whether there is no fit."""
@@ -99,6 +102,10 @@ class SamplingSweep(Printed):
     record: Record
     table: tuple[SamplingRow, ...]
     poles: Any
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
+
     recommended: float
     reason: str
     warning: str = ""

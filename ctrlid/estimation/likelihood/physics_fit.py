@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from ..._base.arguments import check_arguments
 from ..._base.arrays import Array
 from ..._base.errors import CtrlidError, ModelCannotRun
 from ..._base.statistics import pseudo_inverse
@@ -87,6 +88,7 @@ def fit_loop(
     True
     """
     loop, record = order_model_and_data(loop, record)
+    check_arguments(fit_loop, locals(), "loop", "record")
     given = as_records(record)
     names = _choose_free_names(loop, free)
     # A single reading far outside makes any Gaussian likelihood follow it and nothing else.

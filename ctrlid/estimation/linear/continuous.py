@@ -7,6 +7,7 @@ from typing import Any
 import control as ct
 import numpy as np
 
+from ..._base.arguments import check_arguments
 from ..._base.errors import CtrlidError, CtrlidWarning
 from ..._base.text import write_list, write_number
 from ...data.record import Record
@@ -96,6 +97,7 @@ def fit_continuous(
     >>> G.estimate["a1"], round(G.estimate.poles.real.max())
     (0.0, 40)
     """
+    check_arguments(fit_continuous, locals(), "record", "poles", "zeros", "constraints")
     structure = _check_orders(poles, zeros)
     known = check_constraints(constraints)
     records = as_records(record)

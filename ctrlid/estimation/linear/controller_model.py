@@ -10,6 +10,7 @@ import control
 import numpy as np
 from scipy import signal
 
+from ..._base.arguments import is_number
 from ..._base.arrays import Array
 from ..._base.criterion import bayesian_penalty
 from ..._base.errors import CtrlidError
@@ -58,7 +59,7 @@ def convert_controller(controller: Any, names: Sequence[str], dt: float) -> Line
     CtrlidError
         If it is no linear controller in discrete time with the period of the record.
     """
-    if isinstance(controller, int | float | np.number):
+    if is_number(controller):
         controller = control.tf([float(controller)], [1.0], dt)
     if not isinstance(controller, control.TransferFunction | control.StateSpace):
         raise CtrlidError(

@@ -11,6 +11,7 @@ import numpy as np
 from scipy import stats
 
 from ..._base import text as _text
+from ..._base.arguments import check_arguments
 from ..._base.arrays import Array
 from ..._base.criterion import bayesian_penalty
 from ..._base.errors import CtrlidError, CtrlidWarning
@@ -158,6 +159,7 @@ def fit_iv(
     >>> cid.fit_iv(record, 2, 2, constraints=known).estimate.poles.real.round(2)
     array([1.05, 0.95])
     """
+    check_arguments(fit_iv, locals(), "record", "na", "nb", "nk", "constraints", "instruments")
     structure = check_orders(na, nb, nk)
     known = check_constraints(constraints)
     records = as_records(record)
