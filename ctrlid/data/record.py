@@ -113,6 +113,9 @@ class Record(Printed):
         if self.hold not in get_args(Hold):
             raise CtrlidError(f"hold must be 'zoh' (held between samples), 'foh' (straight) or "
                               f"'bandlimited'; given {self.hold!r}")  # fmt: skip
+        if np.ma.is_masked(self.valid):
+            raise CtrlidError("valid is a masked array, and a record would use its masked values: "
+                              "give valid.filled(False)")  # fmt: skip
         valid = np.ones(n, dtype=bool) if self.valid is None else np.array(self.valid)
         if valid.dtype != bool or valid.shape != (n,):
             raise CtrlidError(
@@ -431,7 +434,7 @@ class Record(Printed):
             If the file is no table of numbers, a column is missing, the time does not increase or
             samples are missing.
         """
-        check_arguments(Record.from_csv, locals())
+        check_arguments(Record.from_csv, locals(), "gaps")
         return cls(**_csv.read_csv(
             Path(path), {"r": r, "u": u, "y": y}, time, dt, extra, units, hold, name, gaps,
             scale,
@@ -453,7 +456,13 @@ class Record(Printed):
             If a channel's name or unit cannot stand in a header line.
         """
         check_arguments(Record.to_csv, locals())
-        _csv.write_csv(Path(path), self)
+        try:
+            _csv.write_csv(Path(path), self)
+        except OSError as reason:
+            raise CtrlidError(
+                f"the record cannot be written to {path}: {reason.strerror}. Give a file in a "
+                "folder that exists and may be written to"
+            ) from reason
 
     @classmethod
     def from_response(

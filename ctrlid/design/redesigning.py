@@ -10,7 +10,7 @@ import numpy as np
 
 from .._base.arguments import check_arguments
 from .._base.arrays import Array, freeze_arrays
-from .._base.errors import CtrlidError, EffectDoesNotApply, ModelCannotRun
+from .._base.errors import CtrlidError, ModelCannotRun
 from .._base.text import Printed, write_polynomial, write_quantity
 from ..estimation.identified_model import IdentifiedModel
 from ..loop.loop import Loop
@@ -305,7 +305,7 @@ def _simulate_physical_step(
         still = simulate(loop, rest)
     except SimulationStopped as reason:
         return np.empty(0), _write_sentence(reason), reason.unstable
-    except (ModelCannotRun, EffectDoesNotApply) as reason:
+    except ModelCannotRun as reason:
         return np.empty(0), _write_sentence(reason), False
     try:
         moved = simulate(loop, rest + height)

@@ -133,13 +133,12 @@ class Finding:
     evidence: float
     share: float = float("nan")
     experiment: str = ""
-
-    def __post_init__(self) -> None:
-        freeze_arrays(self)
-
     reference: Array | None = None
     note: str = ""
     records: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
 
     @property
     def name(self) -> str:
@@ -205,16 +204,15 @@ class BinnedErrors:
 
     axis: str
     unit: str
-
-    def __post_init__(self) -> None:
-        freeze_arrays(self)
-
     edges: Array
     before: Array
     after: Array
     p_before: float
     p_after: float
     words: str
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,11 @@ from scipy import stats
 
 from .._base.arrays import Array
 from .._base.errors import CtrlidError, ModelCannotRun
+from .._base.periods import write_both_periods
 from .._base.statistics import autocorrelation_time
 from .._base.text import write_count
 from ..data.record import Record
+from ..data.several_records import require_valid_samples
 from ..estimation.likelihood.kalman_filter import compute_memory
 from ..estimation.likelihood.likelihood import Fit, Known, evaluate_likelihood, make_problem
 from ..estimation.likelihood.maximization import begin_fit, maximize
@@ -143,7 +145,7 @@ class FreshData:
             squares += float(np.sum(e**2))
             usual += len(e) * float(here.sensor[0]) * spread**2
             # Errors may look more independent than such noise would be.
-            memory = compute_memory(fit.noise, np.count_nonzero(window.mask))
+            memory = compute_memory(fit.noise, int(np.count_nonzero(window.mask)))
             worth += min(
                 len(e) / autocorrelation_time(e, 2), np.count_nonzero(window.mask) / memory
             )
@@ -162,10 +164,11 @@ def choose_fresh_data(
     CtrlidError
         If a record for validation has another sampling period than the loop.
     """
+    require_valid_samples(validation or (), "validation=")
     for r in validation or ():
         if abs(r.dt - loop.dt) > THRESHOLD.same_period * loop.dt:
-            raise CtrlidError(f"validation= is sampled at {r.dt:g} s, the loop at {loop.dt:g} s; "
-                              "give both the same period")  # fmt: skip
+            both = write_both_periods("validation= is sampled", r.dt, "the loop", loop.dt)
+            raise CtrlidError(f"{both}; give both the same period")
     rest: tuple[Record, ...] | None = None
     if validation is None:
         windows, rest = zip(*(gaps.hold_out(r) for r in records), strict=True)

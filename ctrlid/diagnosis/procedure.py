@@ -11,7 +11,7 @@ from tqdm import tqdm
 from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from .._base.jobs import check_jobs, share_out
 from ..data.record import Record
-from ..data.several_records import as_records, order_model_and_data
+from ..data.several_records import as_records, order_model_and_data, require_valid_samples
 from ..effects import CATALOGUE, AbstractEffect
 from ..loop.loop import Loop
 from ..validation.record_audit import Audit
@@ -158,6 +158,7 @@ def diagnose(
     check_catalogue(catalogue)
     loop, record = order_model_and_data(loop, record)
     records = as_records(record)
+    require_valid_samples(records, "record=")
     given = make_loop(loop, records[0])
     loop = with_units_of(given, records[0])
     fresh = choose_fresh_data(loop, records, None if validation is None else as_records(validation))

@@ -12,6 +12,7 @@ import numpy as np
 
 from .._base.arguments import check_arguments
 from .._base.errors import CtrlidError, EffectDoesNotApply
+from .._base.periods import have_same_period, write_both_periods
 from .._base.text import write_count
 from ..effects import AbstractEffect
 from ..effects.composition import compose_effects, label_effects
@@ -91,9 +92,10 @@ class Loop:
         # A loop is a value: its equations are those of the plant at the time it was made.
         object.__setattr__(self, "_traced", equations)
         require_siso(equations)
-        if equations.dt and self.plant.dt is not True and abs(equations.dt - self.dt) > 1e-9:
-            raise CtrlidError(f"the plant is sampled at {equations.dt:g} s, the loop at "
-                              f"{self.dt:g} s; give dt={equations.dt:g}")  # fmt: skip
+        own = equations.dt and self.plant.dt is not True
+        if own and not have_same_period(equations.dt, self.dt):
+            both = write_both_periods("the plant is sampled", equations.dt, "the loop", self.dt)
+            raise CtrlidError(f"{both}; give dt={equations.dt:.10g}")
         n = len(equations.states)
         if self.at is None and not np.isfinite(equations.evaluate(np.zeros(n), 0.0)[0]).all():
             raise CtrlidError(f"{equations.name} is not defined where all its signals are zero; "

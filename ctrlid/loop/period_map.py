@@ -186,6 +186,8 @@ def compute_growth_rate(loop: Loop) -> float:
 
     over the eigenvalues of the linearized map over one sampling period T, with the controller as it
     runs; with an analog controller the largest real part of the loop's poles. Negative: stable.
+    As in `Loop.linearize`, the steps of a converter, dead zones and backlash are left out: within
+    one step of it at rest, no converter passes anything on.
 
     Parameters
     ----------
@@ -202,6 +204,9 @@ def compute_growth_rate(loop: Loop) -> float:
     CtrlidError
         If the plant has no derivative at the operating point.
     """
+    for label, effect in loop.labelled.items():
+        if not effect.in_linear_model:
+            loop = loop.without_effect(label)
     s = make_period_map(loop, 8)
     function = s.step if s.rate is None else s.rate
     matrix, _ = linearize_at_rest(s, loop.point.output, function)

@@ -75,13 +75,12 @@ class Comparison(Printed):
     what: str
     record: Record
     curves: tuple[Curve, ...]
-
-    def __post_init__(self) -> None:
-        freeze_arrays(self)
-
     residuals: Array
     tests: tuple[Correlation, ...]
     notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
 
     def __getitem__(self, label: str) -> Curve:
         for curve in self.curves:

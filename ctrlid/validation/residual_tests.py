@@ -242,6 +242,8 @@ def compute_explained_share(
         Between 0 (chance can do it) and 1.
     """
     valid = np.asarray(valid)
+    # Nothing follows a signal that does not move.
+    signals = [(s, delay) for s, delay in signals if np.ptp(s[valid]) > 0]
     lags = max(1, min(lags, len(e) // (10 * max(len(signals), 1))))
     first = max((delay for _, delay in signals), default=0) + lags - 1
     rows = np.arange(first, len(e), max(1, -(-len(e) // ROWS)))

@@ -122,6 +122,9 @@ def sweep_sampling_period(
     unknown = [name for name in names if name not in ESTIMATORS]
     if unknown or not names:
         raise CtrlidError(f"estimators takes names out of {write_list(ESTIMATORS)}; given {names}")
+    if isinstance(constraints, Mapping) and (strange := [k for k in constraints if k not in names]):
+        raise CtrlidError(f"constraints= names {strange}, but the estimators of this sweep are "
+                          f"{list(names)}")  # fmt: skip
     known = {
         name: tuple(constraints.get(name, ())) if isinstance(constraints, Mapping)
         else tuple(_as_list(constraints)) for name in names

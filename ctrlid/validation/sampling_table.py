@@ -102,13 +102,12 @@ class SamplingSweep(Printed):
     record: Record
     table: tuple[SamplingRow, ...]
     poles: Any
-
-    def __post_init__(self) -> None:
-        freeze_arrays(self)
-
     recommended: float
     reason: str
     warning: str = ""
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
 
     def __getitem__(self, estimator: str) -> tuple[SamplingRow, ...]:
         """Return the rows of one estimator, shortest period first."""

@@ -285,16 +285,18 @@ def try_coloured_sensor(fit: Fit) -> Fit:
     """
     shares = (1.0, 1e-2, 1e-4, 1e-6, 1e-8)
     forces = [tuple(share * v for v in fit.noise.force) for share in shares]
-    tails, values = fit.noise.tails, [(v,) for v in SIZES]
+    tails = fit.noise.tails
+    values: list[tuple[float, ...]] = [(v,) for v in SIZES]
 
     def fit_moving(averages: Sequence[tuple[float, ...]]) -> Fit:
         return _fit_best(fit, [Noise(f, ma=ma, tails=tails) for f in forces for ma in averages])
 
     # A converter that averages samples has zeros on the unit circle, all of which it needs at once.
-    longer = ([(AVERAGED,) * q] for q in range(2, ORDERS[1] + 1))
+    longer: list[list[tuple[float, ...]]]
+    longer = [[(AVERAGED,) * q] for q in range(2, ORDERS[1] + 1)]
     chains = [
         _fit_best(fit, [Noise(f, ar=ar, tails=tails) for f in forces for ar in values]),
-        max(map(fit_moving, (values, *longer)), key=compute_noise_criterion),
+        max((fit_moving(averages) for averages in (values, *longer)), key=compute_noise_criterion),
     ]
     return max((_lengthen_sensor_noise(f) for f in chains), key=compute_noise_criterion)
 

@@ -115,6 +115,10 @@ def fit_continuous(
     if (delay is None or delay) and (circuit or records[0].hold != "zoh"):
         raise CtrlidError("a delay can be fitted only where the input is held (hold='zoh') and "
                           "controller= is not given; give delay=0")  # fmt: skip
+    longest = max(p.n for p in pieces) * records[0].dt
+    if delay is not None and delay >= longest:
+        raise CtrlidError(f"delay is {delay:g} s, but no stretch of valid samples is longer than "
+                          f"{longest:g} s, so that no input would reach its output")  # fmt: skip
     task = Task(structure, pieces, records[0].dt, records[0].hold, circuit, delay is None, 1.0)
     point, found, rss, used, residuals, settled = find_best_fit(task, known, delay or 0.0)
     degrees = used - found.free - structure.na - int(task.free_delay)

@@ -14,6 +14,7 @@ from ..._base.arguments import is_number
 from ..._base.arrays import Array
 from ..._base.criterion import bayesian_penalty
 from ..._base.errors import CtrlidError
+from ..._base.periods import have_same_period, write_both_periods
 from ..._base.statistics import regress
 from ...physics.conversions import to_polynomials
 from ..identified_model import Structure
@@ -78,11 +79,9 @@ def convert_controller(controller: Any, names: Sequence[str], dt: float) -> Line
             "difference equation that runs in the computer, for instance "
             f"control.sample_system(C, {dt:g}, method='bilinear'), or leave controller=None."
         )
-    if controller.dt is not True and abs(controller.dt - dt) > 1e-9 * dt:
-        raise CtrlidError(
-            f"The controller runs at {controller.dt:g} s, the record at {dt:g} s. Convert it to "
-            "the period of the record."
-        )
+    if controller.dt is not True and not have_same_period(controller.dt, dt):
+        both = write_both_periods("The controller runs", controller.dt, "the record", dt)
+        raise CtrlidError(f"{both}. Convert it to the period of the record.")
     numerators, den = _expand_fractions(controller)
     if controller.ninputs == 2 and list(controller.input_labels) == ["y", "r"]:
         numerators = numerators[::-1]
