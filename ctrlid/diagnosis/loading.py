@@ -69,8 +69,8 @@ def load_diagnosis(path: str | Path, loop: Loop | None = None) -> Diagnosis:
     except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as reason:
         if isinstance(reason, CtrlidError):
             raise
-        raise CtrlidError(f"the saved diagnosis {path} is damaged: {type(reason).__name__}, "
-                          f"{reason}. Save it again with found.save(file)") from reason  # fmt: skip
+        raise CtrlidError(f"the saved diagnosis {path} is damaged: {reason}. Save it again with "
+                          "found.save(file)") from reason  # fmt: skip
 
 
 def _decode_diagnosis(data: Mapping[str, Any], loop: Loop | None) -> Diagnosis:
