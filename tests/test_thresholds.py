@@ -13,7 +13,13 @@ ROOT = Path(__file__).resolve().parents[1]
 FILES = sorted(
     path for path in (ROOT / "ctrlid" / "diagnosis").glob("*.py") if path.stem != "thresholds"
 )
-LAYOUT = {"wording", "report_text", "saving", "several_records"}  # columns and digits of texts
+LAYOUT = {
+    "wording",
+    "report_text",
+    "saving",
+    "several_records",
+    "progress",
+}  # columns and digits of texts
 PLAIN = {0, 1, 2, 0.5}
 # Coefficients of published formulas, and numbers that belong to nobody's judgement.
 FORMULAS = {

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from .._base.errors import CtrlidError, CtrlidWarning
+from .._base.files import replace_file
 from .._base.text import drop_roundoff, split_unit, with_unit
 
 TIME = ("t", "time", "timestamp", "seconds", "zeit")
@@ -55,8 +56,9 @@ def write_csv(path: Path, record: Any) -> None:
         raise CtrlidError(f"the header {header} would not be read back as it is: remove brackets, "
                           "outer spaces and line breaks from names and units")  # fmt: skip
     fields = {key: getattr(record, key) for key in ("name", "dt", "hold")}
-    fields["names"] = dict(record.names)
-    with path.open("w", encoding="utf-8", newline="\n") as file:
+    # A file that was cut off by a full disk or a copy is told by its number of rows.
+    fields |= {"names": dict(record.names), "rows": len(record)}
+    with replace_file(path) as file:
         file.write(f"{MARK}{json.dumps(fields, ensure_ascii=False)}\n{line.getvalue()}\n")
         for first in range(0, len(record), CHUNK):
             rows = np.column_stack([c[first : first + CHUNK] for c in channels.values()])
@@ -73,6 +75,12 @@ def read_csv(
     if gaps not in ("error", "mask"):
         raise CtrlidError(f"gaps must be 'error' or 'mask'; given {gaps!r}")
     own, header, table = _read_table(path)
+    if own.get("rows", len(table)) != len(table):
+        raise CtrlidError(
+            f"{path} is not whole: its line {MARK.strip()!r} says {own['rows']} rows, and it has "
+            f'{len(table)}. Copy it again; if the rows were changed on purpose, take "rows" out '
+            "of that line"
+        )
     labels = [split_unit(cell) for cell in header]
     names = [label for label, _ in labels]
 

@@ -89,6 +89,7 @@ def _decode_diagnosis(data: Mapping[str, Any], loop: Loop | None) -> Diagnosis:
         seconds=read_numbers(data["seconds"]), extra=read_numbers(data["extra"]),
         noise=_decode(SensorNoise, data["noise"]) if data.get("noise") else None,
         stand_ins=tuple(_decode(Finding, f) for f in data.get("stand_ins", ())),
+        finished=bool(data.get("finished", True)),
     )  # fmt: skip
     check_fields(found, "loop")
     return found

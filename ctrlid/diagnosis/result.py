@@ -66,6 +66,8 @@ class Diagnosis(Printed):
     stand_ins : tuple of Finding
         Effects that only describe part of the record, most important first: the note of each says
         on what ground its name does not stand. `loop`, `gap` and `where` are with them.
+    finished : bool
+        Whether the search came to its end; not if its budget of seconds was spent before.
     """
 
     verdict: Verdict
@@ -86,6 +88,7 @@ class Diagnosis(Printed):
     extra: dict[str, Any] = field(default_factory=dict, repr=False)
     noise: SensorNoise | None = None
     stand_ins: tuple[Finding, ...] = ()
+    finished: bool = True
 
     @property
     def effects(self) -> tuple[AbstractEffect, ...]:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .._base.errors import CtrlidError
+from .._base.files import replace_file
 from ..effects import AbstractEffect
 from ..loop.loop import Loop
 from ..physics.linearization import OperatingPoint
@@ -98,7 +99,8 @@ def save_diagnosis(found: Diagnosis, path: str | Path) -> Path:
     text = write_readable_json({"format": FORMAT, **fields, "loop": loop, "gap": arrays})
     path = Path(path)
     try:
-        path.write_text(text + "\n", encoding="utf-8")
+        with replace_file(path) as file:
+            file.write(text + "\n")
     except OSError as reason:
         raise CtrlidError(
             f"the diagnosis cannot be written to {path}: {reason.strerror}. Give a file in a "

@@ -1,17 +1,24 @@
 """Step 10: the decision table, and the verdict in words."""
 
+from __future__ import annotations
+
 import itertools
 import math
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
 from .._base.text import write_number, write_p_value
 from ..effects import AbstractEffect
 from ..estimation.likelihood.likelihood import Fit
 from .findings import BinnedErrors, Disturbance, Finding, Gap, SensorNoise, Verdict
-from .noise_tests import NoiseTests
+from .noise_tests import NoiseTests, choose_alarm_level
 from .thresholds import THRESHOLD
 from .wording import join_names, name_test
+
+if TYPE_CHECKING:
+    from .result import Diagnosis
 
 
 def choose_verdict(complete: bool, named: bool) -> Verdict:
@@ -118,6 +125,38 @@ def describe_grounds(stand_ins: Sequence[tuple[Finding, str]]) -> str | None:
     """Say why names do not stand, in one clause; None without any."""
     words = [f"the name {join_names([f])} does not stand, since {why}" for f, why in stand_ins]
     return ", and ".join(words) or None
+
+
+def declare_unfinished(found: Diagnosis, place: str, seconds: float) -> Diagnosis:
+    """Return a diagnosis whose search was stopped, which claims no more than was checked.
+
+    Parameters
+    ----------
+    found : Diagnosis
+        The answer so far.
+    place : str
+        Where the search was, in words.
+    seconds : float
+        How long it had been going on [s].
+
+    Returns
+    -------
+    Diagnosis
+        Its verdict is ``"partly explained"`` or ``"unknown"``.
+    """
+    named = bool(found.findings)
+    level = choose_alarm_level(len(found.findings))
+    noise = min(found.tests.values(), default=1.0) * len(found.tests) > level
+    left = "only noise is left so far" if noise else "what is left is not noise alone"
+    so_far = (
+        f"So far the model lacks {join_names(found.findings)}" if named else "Nothing is named yet"
+    )
+    sentence = (
+        f"THE SEARCH WAS NOT FINISHED: it was stopped after {write_number(seconds, 2)} s "
+        f"({place}). {so_far}, and {left}. What was not tried may explain it better. Give the "
+        "search more time, or fewer effects in catalogue=."
+    )
+    return replace(found, verdict=choose_verdict(False, named), sentence=sentence, finished=False)
 
 
 def write_conclusion(

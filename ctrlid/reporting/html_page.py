@@ -9,6 +9,7 @@ from typing import Any
 
 from .._base.arguments import check_arguments, check_fields
 from .._base.errors import CtrlidError
+from .._base.files import replace_file
 from .._base.text import is_bad_news
 from ..data.record import Record
 from ..design.redesigning import Redesign
@@ -162,7 +163,8 @@ def write_report(result: Any, path: str | Path, *, title: str = "") -> Path:
     )
     path = Path(path)
     try:
-        path.write_text(page, encoding="utf-8")
+        with replace_file(path) as file:
+            file.write(page)
     except OSError as reason:
         raise CtrlidError(f"the report cannot be written to {path}: {reason.strerror}. Give a file "
                           "in a folder that exists and may be written to") from reason  # fmt: skip

@@ -15,6 +15,7 @@ from scipy import linalg, signal
 
 from ..._base.arrays import Array
 from ..._base.errors import ModelCannotRun
+from ..._base.interruption import check_budget
 from ..._base.statistics import compute_lagged_products
 from ...physics.block_evaluation import BlockEvaluation
 from .filter_data import FilterData
@@ -110,6 +111,7 @@ def run_filter(
     if not white:
         lin, force = append_sensor_noise(lin, force, noise)
     states = lin.step.shape[1]
+    check_budget()
     out = filter_pass(
         lin.step, lin.a, lin.b, lin.du, np.ascontiguousarray(lin.dp[:, :, :p]), lin.output,
         lin.c, np.ascontiguousarray(lin.hp[:, :p]), lin.trajectory.predicted,

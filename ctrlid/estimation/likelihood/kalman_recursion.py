@@ -7,14 +7,17 @@ of states, serves every plant and every effect.
 
 from typing import Any
 
-import numba
 import numpy as np
+
+from ..._base.compilation import compile_loop
+from ..._base.interruption import keep_interrupt
 
 # A state beyond this size has lost the record, and its square would soon overflow.
 LARGE = 1e150
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@keep_interrupt
+@compile_loop(nogil=True, error_model="numpy")
 def filter_pass(
     step: Any, a: Any, b: Any, du: Any, dp: Any, output: Any, c: Any, hp: Any, predicted: Any,
     filtered: Any, y: Any, valid: Any, restart: Any, input_variance: Any, start: Any, spread: Any,

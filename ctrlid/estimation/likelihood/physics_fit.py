@@ -10,6 +10,7 @@ import numpy as np
 from ..._base.arguments import check_arguments
 from ..._base.arrays import Array
 from ..._base.errors import CtrlidError, ModelCannotRun
+from ..._base.interruption import hold_interrupt
 from ..._base.statistics import pseudo_inverse
 from ..._base.text import write_list
 from ...data.outliers import describe_outliers, mask_outliers
@@ -94,9 +95,10 @@ def fit_loop(
     # A single reading far outside makes any Gaussian likelihood follow it and nothing else.
     masked = [mask_outliers(one) for one in given]
     records = [one for one, _ in masked]
-    fit = refit_noise_size(maximize(begin_fit(make_problem(loop, names, records))))
-    if coloured or coloured is None:
-        fit = choose_noise(fit, always=bool(coloured))
+    with hold_interrupt():
+        fit = refit_noise_size(maximize(begin_fit(make_problem(loop, names, records))))
+        if coloured or coloured is None:
+            fit = choose_noise(fit, always=bool(coloured))
     if not math.isfinite(fit.value):
         raise ModelCannotRun(
             f"the likelihood of {fit.plant.e.name} on this record is not finite: the model has "

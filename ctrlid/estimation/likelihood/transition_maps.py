@@ -7,11 +7,12 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import casadi
-import numba
 import numpy as np
 
 from ..._base.arrays import Array
+from ..._base.compilation import compile_loop
 from ..._base.errors import ModelCannotRun
+from ..._base.interruption import keep_interrupt
 from ...data.reconstruction import count_pieces
 from ...loop.controllers import ControlLaw
 from ...loop.loop import Loop
@@ -369,7 +370,8 @@ def build_backlash(plan: PeriodPlan) -> BacklashMap:
     )
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@keep_interrupt
+@compile_loop(nogil=True, error_model="numpy")
 def _carry_sensitivity(gain: Any, push: Any) -> Any:  # pragma: no cover - compiled
     """Return what obeys ``s[k + 1] = gain[k] s[k] + push[k]`` and begins at zero."""
     out = np.zeros(push.shape)
