@@ -55,7 +55,7 @@ def write_csv(path: Path, record: Any) -> None:
     ):
         raise CtrlidError(f"the header {header} would not be read back as it is: remove brackets, "
                           "outer spaces and line breaks from names and units")  # fmt: skip
-    fields = {key: getattr(record, key) for key in ("name", "dt", "hold")}
+    fields = {key: getattr(record, key) for key in ("name", "dt", "hold", "hold_r")}
     # A file that was cut off by a full disk or a copy is told by its number of rows.
     fields |= {"names": dict(record.names), "rows": len(record)}
     with replace_file(path) as file:
@@ -144,6 +144,7 @@ def read_csv(
         "dt": dt, "start": start, "valid": valid, "units": {**read, **(units or {})},
         "names": own.get("names", {k: names[p] for k, p in places.items() if names[p] != k}),
         "hold": hold or own.get("hold", "zoh"),
+        "hold_r": own.get("hold_r", "zoh"),
         "name": own.get("name", path.stem) if name is None else name,
     }  # fmt: skip
 

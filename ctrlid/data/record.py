@@ -46,6 +46,9 @@ class Record(Printed):
         analog signal nearly does; or as the samples of a measured signal say that has nothing above
         half the sampling rate, which takes later samples and so holds only where u does not react
         to y.
+    hold_r : {"zoh", "foh"}, optional
+        How r runs between samples, which counts where an analog controller sees it: held, or
+        straight, as in a simulation of python-control.
     extra : mapping of str to array_like, optional
         Further measured channels [as in `units`], for instance a coil current.
     valid : array_like of bool, shape (n,), optional
@@ -84,6 +87,7 @@ class Record(Printed):
     units: Mapping[str, str] = field(default_factory=dict)
     name: str = ""
     start: float = 0.0
+    hold_r: Literal["zoh", "foh"] = "zoh"
 
     def __post_init__(self) -> None:
         given = {k: getattr(self, k) for k in SIGNALS}
@@ -113,6 +117,9 @@ class Record(Printed):
         if self.hold not in get_args(Hold):
             raise CtrlidError(f"hold must be 'zoh' (held between samples), 'foh' (straight) or "
                               f"'bandlimited'; given {self.hold!r}")  # fmt: skip
+        if self.hold_r not in ("zoh", "foh"):
+            raise CtrlidError(f"hold_r must be 'zoh' (held between samples) or 'foh' (straight); "
+                              f"given {self.hold_r!r}")  # fmt: skip
         if np.ma.is_masked(self.valid):
             raise CtrlidError("valid is a masked array, and a record would use its masked values: "
                               "give valid.filled(False)")  # fmt: skip
@@ -470,6 +477,9 @@ class Record(Printed):
         **fields: Any,
     ) -> "Record":  # fmt: skip
         """Make a record of a `control.TimeResponseData`.
+
+        python-control takes the inputs of a system in continuous time as straight between the
+        samples. Where the states of the response show that, `hold` and `hold_r` are ``"foh"``.
 
         Parameters
         ----------

@@ -203,7 +203,7 @@ def simulate_window(loop: Loop, window: Window, how: Reproduction) -> Array:
             index, values = predict_ahead(loop, record, predict(loop, record), how.horizon)
             y[index] = values
             return y
-        simulator = make_simulator(loop, record.hold)
+        simulator = make_simulator(loop, record.hold, record.hold_r)
     except (ModelCannotRun, EffectDoesNotApply):
         return y
     for part in find_long_stretches(record):
@@ -215,9 +215,9 @@ def simulate_window(loop: Loop, window: Window, how: Reproduction) -> Array:
     return y
 
 
-def make_simulator(loop: Loop, hold: str = "zoh") -> Simulator:
+def make_simulator(loop: Loop, hold: str = "zoh", hold_r: str = "zoh") -> Simulator:
     """Return a loop made ready to be simulated many times, as exactly as a gap needs."""
-    return Simulator(loop, THRESHOLD.gap_integration_error, THRESHOLD.gap_steps, hold)
+    return Simulator(loop, THRESHOLD.gap_integration_error, THRESHOLD.gap_steps, hold, hold_r)
 
 
 @dataclass(frozen=True)
@@ -303,7 +303,7 @@ def _simulate_noise(
     if how.horizon:
         known = np.array(predict_spread(loop, record, predict(loop, record), how.horizon))
         return np.tile(size * known**2, (runs, 1))
-    simulator = make_simulator(loop, record.hold)
+    simulator = make_simulator(loop, record.hold, record.hold_r)
     squares, count = np.zeros((runs, 2)), 0
     for part in find_long_stretches(record):
         use = window.mask[part]

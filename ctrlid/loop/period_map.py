@@ -34,7 +34,7 @@ class PeriodMap:
     rate: Any = None
 
 
-def make_period_map(loop: Loop, substeps: int, hold: str = "zoh") -> PeriodMap:
+def make_period_map(loop: Loop, substeps: int, hold: str = "zoh", hold_r: str = "zoh") -> PeriodMap:
     """Build the map of a loop over one sampling period.
 
     Parameters
@@ -46,6 +46,9 @@ def make_period_map(loop: Loop, substeps: int, hold: str = "zoh") -> PeriodMap:
     hold : {"zoh", "foh", "bandlimited"}, optional
         How the input of a loop without controller runs between samples. A digital controller holds
         its input, and an analog one moves it by its own law.
+    hold_r : {"zoh", "foh"}, optional
+        How r runs between samples, as an analog controller sees it. If it is straight, the next r
+        comes last in w.
 
     Returns
     -------
@@ -66,8 +69,10 @@ def make_period_map(loop: Loop, substeps: int, hold: str = "zoh") -> PeriodMap:
     size = n + nc + (e.play is not None) + kept
     # Corners of a band-limited input follow the signals that are held; else the next sample does.
     corners = pieces + 1 if pieces > 1 else 1
-    z, w = casadi.SX.sym("z", size), casadi.SX.sym("w", 5 + corners)
+    straight_r = loop.analog and hold_r == "foh"
+    z, w = casadi.SX.sym("z", size), casadi.SX.sym("w", 5 + corners + straight_r)
     t0, r, d, sensor, force, *path = casadi.vertsplit(w)
+    climb = (path.pop() - r) / loop.dt if straight_r else casadi.SX(0)
     path = path if pieces > 1 else [d, *path]
     held_rate = casadi.SX.zeros(n, 1)
     for j in e.velocities or (range(n) if e.dt == 0 else ()):
@@ -82,8 +87,10 @@ def make_period_map(loop: Loop, substeps: int, hold: str = "zoh") -> PeriodMap:
             u = casadi.fmin(u, upper)
         return u
 
-    def compute_input(t: Any, z: Any, y: Any) -> tuple[Any, Any]:
-        wish, moved = law.apply(t, z[n:], r, y) if law else (at.input, casadi.SX(0, 1))
+    def compute_input(t: Any, z: Any, y: Any, tau: Any = 0.0) -> tuple[Any, Any]:
+        wish, moved = (
+            law.apply(t, z[n:], r + climb * tau, y) if law else (at.input, casadi.SX(0, 1))
+        )
         return limit_input(wish + d), moved
 
     def measure_output(t: Any, z: Any, u: Any) -> Any:
@@ -104,9 +111,9 @@ def make_period_map(loop: Loop, substeps: int, hold: str = "zoh") -> PeriodMap:
                 "(control.pade)"
             )
 
-        # The reference jumps only at the samples, so that the motion within a period is smooth.
+        # The reference jumps or bends only at the samples, so that a period has a smooth motion.
         def rate(tau: Any, z: Any) -> Any:
-            u, charge = compute_input(t0 + tau, z, measure_output(t0 + tau, z, at.input))
+            u, charge = compute_input(t0 + tau, z, measure_output(t0 + tau, z, at.input), tau)
             return casadi.vertcat(e.function(t0 + tau, z[:n], u, p)[0] + held_rate, charge)
 
         slope = casadi.Function("rate", [z, w], [rate(0.0, z)])

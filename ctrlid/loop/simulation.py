@@ -169,14 +169,17 @@ class Simulator:
         Integration steps per period at most.
     hold : {"zoh", "foh", "bandlimited"}, optional
         How the input of a loop without controller runs between samples.
+    hold_r : {"zoh", "foh"}, optional
+        How the reference of an analog controller runs between samples.
     """
 
     def __init__(
         self, loop: Loop, tolerance: float = TOLERANCE, most: int = MOST_SUBSTEPS,
-        hold: str = "zoh",
+        hold: str = "zoh", hold_r: str = "zoh",
     ) -> None:  # fmt: skip
         self.loop, self.tolerance, self.most, self.hold = loop, tolerance, most, hold
-        first = make_period_map(loop, 1, hold)
+        self.hold_r = hold_r if loop.analog else "zoh"
+        first = make_period_map(loop, 1, hold, self.hold_r)
         self.plant_states = first.plant_states
         self.rest: Array = np.array(first.rest, dtype=float)
         self._steps: dict[int, Any] = {1: first.step}
@@ -213,7 +216,9 @@ class Simulator:
         key = (substeps, size)
         if key not in self._runners:
             if substeps not in self._steps:
-                self._steps[substeps] = make_period_map(self.loop, substeps, self.hold).step
+                self._steps[substeps] = make_period_map(
+                    self.loop, substeps, self.hold, self.hold_r
+                ).step
             self._runners[key] = self._steps[substeps].mapaccum("run", size)
         return self._runners[key]
 
@@ -237,6 +242,8 @@ class Simulator:
         quiet = np.zeros(n)
         w = np.vstack([start_time + np.arange(n) * loop.dt, quiet if r is None else r, d,
                        *(noise or (quiet, quiet)), self._find_path(d)])  # fmt: skip
+        if self.hold_r == "foh" and r is not None:
+            w = np.vstack([w, np.append(r[1:], r[-1])])
         y, u = np.empty(n), np.empty(n)
         start, reach = z, self._floor
         asked, whole = self._measure_asked(w), loop.controller is None

@@ -175,7 +175,7 @@ def _simulate(record: Record, loop: Loop, prediction: Prediction) -> Curve:
             "Loop(plant, controller, ...)"
         )
     y, injected, noisy = np.full(len(record), np.nan), np.zeros(len(record)), np.zeros(len(record))
-    simulator = Simulator(loop, hold=record.hold)
+    simulator = Simulator(loop, hold=record.hold, hold_r=record.hold_r)
     for part in find_long_stretches(record):
         stretch = prepare_stretch(
             simulator, record, part, guess=prediction.states[part.start], seek_controller=True,

@@ -79,7 +79,9 @@ def make_problem(
     start_times = start_times or [0.0] * len(records)
     data = tuple(make_filter_data(loop, r, b) for r, b in zip(records, start_times, strict=True))
     follow = records[0].r is not None and loop.analog
-    plant = make_sampled_plant(loop, tuple(names), records[0].hold, follow)
+    plant = make_sampled_plant(
+        loop, tuple(names), records[0].hold, follow, records[0].hold_r if follow else "zoh"
+    )
     return Problem(plant, data, *bounds)
 
 

@@ -68,6 +68,8 @@ class PeriodPlan:
         Places of the free parameters.
     delay_samples : int
         Whole pieces by which the input comes late: periods, or parts of one if it is band-limited.
+    hold_r : {"zoh", "foh"}
+        How the reference of the controller runs between samples.
     structure : tuple
         What is compared in place of equations and law: their expressions without values.
     """
@@ -81,6 +83,7 @@ class PeriodPlan:
     channels: int
     index: tuple[int, ...]
     delay_samples: int
+    hold_r: str
     structure: tuple[Any, ...] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -211,7 +214,9 @@ def _build_period(plan: PeriodPlan) -> tuple[Any, list[Any], list[Any], dict[str
                                                 ("s", n)))  # fmt: skip
     t, r, y = (casadi.SX.sym(k) for k in "try")
     path = casadi.vertsplit(casadi.SX.sym("u", plan.pieces + 2))
-    w = [t, *path, r, y]
+    # A straight reference comes with the one of the next sample.
+    next_r = casadi.SX.sym("n") if plan.hold_r == "foh" else r
+    w = [t, *path, r, *([next_r] if plan.hold_r == "foh" else []), y]
     now = path[1]
     if plan.pieces > 1:
         # The corners are off the signal itself, but this mean of three of them is on it.
@@ -232,7 +237,9 @@ def _build_period(plan: PeriodPlan) -> tuple[Any, list[Any], list[Any], dict[str
         ends, parts = _build_stages(plan, t, x, pieces, p, s, held_rate, scheme, part)
     else:
         ends = [
-            _integrate_with_controller(plan, t, x, p, s, held_rate, now, r, y, max(scheme.steps, 2))
+            _integrate_with_controller(
+                plan, t, x, p, s, held_rate, now, (r, next_r), y, max(scheme.steps, 2)
+            )
         ]
         parts = 1
     free = casadi.vertcat(*(p[k] for k in plan.index)) if plan.index else casadi.SX(0, 1)
@@ -276,20 +283,24 @@ def _integrate_with_controller(
     s: Any,
     held_rate: Any,
     u: Any,
-    r: Any,
+    path_r: tuple[Any, Any],
     y: Any,
     substeps: int,
 ) -> Any:
-    """Advance plant and analog controller together, u being the measured one at the start."""
+    """Advance plant and analog controller together, u being the measured one at the start.
+
+    The reference runs straight from one value to the next one, or is held if both are the same.
+    """
     e, law, n = plan.equations, plan.law, len(plan.equations.states)
     assert law is not None
+    r, climb = path_r[0], (path_r[1] - path_r[0]) / plan.dt
     noise = y - e.smoothed(t, x[:n], u, p, s)[1]
     # The offset holds bias, injected signals and what the controller's state leaves unexplained.
     offset = u - law.apply(t, x[n:], r, y)[0]
 
     def rate(tau: Any, z: Any) -> Any:
         seen = e.smoothed(t + tau, z[:n], u, p, s)[1] + noise
-        computed, slope = law.apply(t + tau, z[n:], r, seen)
+        computed, slope = law.apply(t + tau, z[n:], r + climb * tau, seen)
         driven = e.smoothed(t + tau, z[:n], computed + offset, p, s)[0] + held_rate
         return casadi.vertcat(driven, slope)
 

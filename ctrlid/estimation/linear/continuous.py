@@ -203,7 +203,7 @@ def _make_circuit(controller: Any, records: Sequence[Record]) -> Circuit | None:
             f"with one input and one output; given {type(controller).__name__}"
         )
     a, b, c, d = to_state_matrices(controller)
-    circuit = Circuit(a, b[:, 0], c[0], float(d[0, 0]))
+    circuit = Circuit(a, b[:, 0], c[0], float(d[0, 0]), records[0].hold_r)
     if any(r.r is None for r in records):
         if records[0].dt * circuit.fastest > FAST_CIRCUIT:
             warnings.warn(
