@@ -100,12 +100,12 @@ def compare_stretches(fit: Fit, name: str) -> float:
     """
     j = fit.plant.names.index(name)
     moves, sizes = [], []
-    for out, r, shown in zip(
-        fit.filtered, fit.sensor, map(np.isfinite, fit.standardized), strict=True
+    for out, (errors, width), shown in zip(
+        fit.filtered, fit.working, map(np.isfinite, fit.standardized), strict=True
     ):
-        deviation = np.sqrt(out.variance[shown] * r)
+        deviation = np.sqrt(width[shown])
         slopes = out.slopes[shown] / deviation[:, None]
-        z = out.innovations[shown] / deviation
+        z = errors[shown] / deviation
         for x, e in zip(
             np.array_split(slopes, THRESHOLD.stretches_compared),
             np.array_split(z, THRESHOLD.stretches_compared), strict=True,

@@ -70,6 +70,8 @@ class FreshData:
             return model.fitted
         parts, start_times = cut_stretches(records)
         problem = make_problem(model.fitted, model.names, parts, start_times)
+        # What is believed stays about the values of the model as given.
+        problem = replace(problem, priors=fit.problem.priors)
         known = fit.known
         if known is not None and (known.sensor is None or len(parts) == len(known.sensor)):
             problem = replace(problem, known=known)

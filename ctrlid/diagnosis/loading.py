@@ -126,13 +126,17 @@ def _decode_loop(data: Mapping[str, Any]) -> SavedLoop:
     saved = SavedLoop(
         plant_name=data["plant"], controller_text=data["controller"], dt=read_numbers(data["dt"]),
         at=OperatingPoint(tuple(at["states"]), at["input"], at["output"]),
-        free=tuple(data["free"]), input_limits=tuple(read_numbers(data["input_limits"])),
+        free=_decode_free(data["free"]), input_limits=tuple(read_numbers(data["input_limits"])),
         effects=tuple(_decode_effect(e) for e in data["effects"]),
         parameters=read_numbers(data["parameters"]), units=data["units"],
         known_units=data.get("known_units", {}),
     )  # fmt: skip
     check_fields(saved)
     return saved
+
+
+def _decode_free(data: Any) -> tuple[str, ...] | dict[str, float]:
+    return read_numbers(data) if isinstance(data, dict) else tuple(data)
 
 
 def _decode_effect(data: Mapping[str, Any]) -> AbstractEffect:

@@ -95,7 +95,8 @@ class Simulation:
     ) -> None:
         self.loop, self.names = loop, tuple(names)
         self.records, self.start_times = tuple(records), tuple(start_times)
-        self.problem = make_problem(loop, self.names, records, start_times)
+        # The error of a simulation is no likelihood that a belief could be weighed against.
+        self.problem = replace(make_problem(loop, self.names, records, start_times), priors={})
         plant = self.plant = self.problem.plant
         step = plant.build_sensitivity_map()
         self.runs = [step.mapaccum("run", len(data.record)) for data in self.problem.data]

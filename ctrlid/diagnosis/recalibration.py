@@ -40,7 +40,7 @@ def recalibrate(loop: Loop, records: Sequence[Record], audits: Sequence[Audit]) 
         The base to which effects are added.
     """
     parts, start_times = cut_stretches(records)
-    base = fit_base_model(loop, parts, loop.free, start_times)
+    base = fit_base_model(loop, parts, tuple(loop.free), start_times)
     periods = find_repeat_periods(parts, audits)
     return fit_with_repeat_noise(base, periods) if periods else base
 

@@ -40,8 +40,8 @@ class SavedLoop:
         Sampling period [s].
     at : OperatingPoint
         The operating point.
-    free : tuple of str
-        The uncertain parameters.
+    free : tuple of str, or dict of str to float
+        The uncertain parameters, with how well each was known if that was said.
     input_limits : (float, float)
         Limits of the actuator.
     effects : tuple of AbstractEffect
@@ -58,7 +58,7 @@ class SavedLoop:
     controller_text: str
     dt: float
     at: OperatingPoint
-    free: tuple[str, ...]
+    free: tuple[str, ...] | dict[str, float]
     input_limits: tuple[float, float]
     effects: tuple[AbstractEffect, ...]
     parameters: dict[str, float]
@@ -149,7 +149,7 @@ def _encode_loop(loop: Loop | SavedLoop) -> dict[str, Any]:
     return {
         "plant": name,
         "parameters": _encode(loop.parameters), "known_units": loop.known_units,
-        "free": list(loop.free), "dt": _encode(loop.dt),
+        "free": _encode(loop.free), "dt": _encode(loop.dt),
         "at": _encode(at), "input_limits": _encode(loop.input_limits),
         "controller": controller,
         "effects": [_encode(e) for e in loop.effects],

@@ -10,7 +10,7 @@ import casadi
 import control as ct
 import numpy as np
 
-from .._base.arguments import check_arguments
+from .._base.arguments import check_arguments, is_number
 from .._base.errors import CtrlidError, EffectDoesNotApply
 from .._base.periods import have_same_period, write_both_periods
 from .._base.text import write_count
@@ -44,8 +44,10 @@ class Loop:
         Sampling period of the record [s].
     at : OperatingPoint, optional
         Operating point; by default all zero, which a plant must be defined at.
-    free : sequence of str, optional
-        Names of the plant parameters that are uncertain.
+    free : sequence of str, or mapping of str to float, optional
+        Names of the plant parameters that are uncertain; ``{"K": 0.1}`` also says how well each is
+        known, by the standard deviation of what is believed, as a share of the value that the loop
+        has. Fits weigh that against the data, as a Gaussian prior; infinite is a name alone.
     input_limits : (float, float), optional
         Limits of the actuator [input unit]; the logged u is the limited one.
     effects : sequence of effects, optional
@@ -77,7 +79,7 @@ class Loop:
     controller: Any = None
     dt: float = 0.0
     at: OperatingPoint | None = None
-    free: tuple[str, ...] = ()
+    free: tuple[str, ...] | Mapping[str, float] = ()
     input_limits: tuple[float, float] = (-math.inf, math.inf)
     effects: tuple[AbstractEffect, ...] = field(default=(), kw_only=True)
     units: Mapping[str, str] = field(default_factory=dict, kw_only=True)
@@ -151,13 +153,18 @@ class Loop:
             kept if len(active) == len(effects) else compose_effects(plant, active, at, self.dt)
         )
         object.__setattr__(self, "_active", changed)
-        free = (self.free,) if isinstance(self.free, str) else tuple(dict.fromkeys(self.free))
+        if isinstance(self.free, Mapping):
+            free: Any = dict(self.free)
+        else:
+            free = (self.free,) if isinstance(self.free, str) else tuple(dict.fromkeys(self.free))
         unknown = [name for name in free if name not in kept.parameters]
         if unknown:
             raise CtrlidError(
                 f"free= names {unknown}, but the numeric parameters of {kept.name} are "
                 f"{list(kept.parameters)}; give parameters to ct.nlsys with params={{...}}"
             )
+        if isinstance(free, dict):
+            _check_beliefs(free, kept.parameters)
         object.__setattr__(self, "free", free)
         if self.controller is not None and self._active.feedthrough:
             # With effects it is they, or their values, that close the loop without delay.
@@ -293,7 +300,8 @@ class Loop:
         if label is None:
             raise CtrlidError(f"the loop has no effect {effect}; it has {list(known) or 'none'}")
         rest = tuple(e for key, e in known.items() if key != label)
-        free = tuple(name for name in self.free if not name.startswith(f"{label}."))
+        kept = [name for name in self.free if not name.startswith(f"{label}.")]
+        free = {n: self.free[n] for n in kept} if isinstance(self.free, Mapping) else tuple(kept)
         return self._replace_fields(effects=rest, free=free)
 
     def with_parameters(self, values: Mapping[str, float]) -> "Loop":
@@ -431,7 +439,33 @@ class Loop:
         if np.isfinite(self.input_limits).any():
             text += f", {e.inputs[0]} within {self.input_limits[0]:g}..{self.input_limits[1]:g}"
         if self.free:
-            text += f", free: {', '.join(self.free)}"
+            known = self.free if isinstance(self.free, Mapping) else {}
+            names = [
+                n if math.isinf(known.get(n, math.inf)) else f"{n} (± {100 * known[n]:.3g} %)"
+                for n in self.free
+            ]
+            text += f", free: {', '.join(names)}"
         if self.effects:
             text += f", effects: {', '.join(self.labelled)}"
         return text + ")"
+
+
+def _check_beliefs(free: Mapping[str, Any], parameters: Mapping[str, float]) -> None:
+    """Refuse what does not say how well a parameter is known."""
+    for name, share in free.items():
+        if not is_number(share):
+            problem = f"given {share!r} for {name}"
+        elif math.isnan(share) or share < 0:
+            problem = f"given {share:g} for {name}"
+        elif share == 0:
+            problem = f"{name} is known exactly by what is given, 0: leave out what is not free"
+        elif parameters[name] == 0 and share < math.inf:
+            problem = (f"{name} is zero in the loop, of which no share can be taken: give inf for "
+                       "it, or the value that is believed")  # fmt: skip
+        else:
+            continue
+        raise CtrlidError(
+            "free= as a mapping says how well each parameter is known, by the standard deviation "
+            f'of what is believed relative to its value, such as {{"{name}": 0.1}} for 10 %; '
+            f"{problem}"
+        )

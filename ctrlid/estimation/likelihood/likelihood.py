@@ -2,8 +2,8 @@
 
 import functools
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -54,6 +54,8 @@ class Problem:
     periods : tuple of int
         For each record, after how many samples it repeats itself: then only the differences
         between the repeats count, which no wrong model can have made.
+    priors : mapping of str to (float, float)
+        Mean and standard deviation of what is believed of parameters, by name.
     """
 
     plant: SampledPlant
@@ -63,6 +65,14 @@ class Problem:
     counts: tuple[Any, ...] = ()
     known: Known | None = None
     periods: tuple[int, ...] = ()
+    priors: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+
+    @functools.cached_property
+    def beliefs(self) -> tuple[Array, Array]:
+        """Mean and information (inverse variance) of what is believed of each parameter."""
+        known = [self.priors.get(name, (0.0, math.inf)) for name in self.plant.names]
+        mean, deviation = np.array(known, dtype=float).reshape(-1, 2).T
+        return mean, deviation**-2
 
 
 def make_problem(
@@ -82,7 +92,24 @@ def make_problem(
     plant = make_sampled_plant(
         loop, tuple(names), records[0].hold, follow, records[0].hold_r if follow else "zoh"
     )
-    return Problem(plant, data, *bounds)
+    return Problem(plant, data, *bounds, priors=find_priors(loop, loop.free))
+
+
+def find_priors(
+    loop: Loop, free: Sequence[str] | Mapping[str, float]
+) -> dict[str, tuple[float, float]]:
+    """Return mean and standard deviation of what is believed of parameters, by name.
+
+    A parameter that an effect has driven to zero has no share of its value left to say.
+    """
+    if not isinstance(free, Mapping):
+        return {}
+    values = loop.equations(keep=True).parameters
+    return {
+        name: (values[name], abs(values[name]) * share)
+        for name, share in free.items()
+        if math.isfinite(share) and values[name] != 0
+    }
 
 
 def list_effect_bounds(loop: Loop) -> dict[str, tuple[float, float]]:
@@ -187,7 +214,8 @@ class Fit:
             slopes = out.slopes[keep]
             matrix += (slopes / s[keep, None]).T @ slopes
             score += slopes.T @ (e[keep] / s[keep])
-        return matrix, score
+        mean, information = self.problem.beliefs
+        return matrix + np.diag(information), score - information * (self.theta - mean)
 
     @property
     def standard_errors(self) -> Array:
@@ -255,7 +283,9 @@ def _evaluate_at_scale(
         run_filter(plant, one, lin, noise, sensitive)
         for one, lin in zip(problem.data, lins, strict=True)
     )
-    value, sensors = 0.0, []
+    believed, information = problem.beliefs
+    value = -0.5 * float(information @ (theta - believed) ** 2)
+    sensors = []
     for k, (data, out, keep) in enumerate(zip(problem.data, outs, problem.counts, strict=True)):
         e, s = out.innovations[keep], out.variance[keep]
         if problem.periods:

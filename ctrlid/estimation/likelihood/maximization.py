@@ -310,7 +310,7 @@ def compute_information(fit: Fit) -> tuple[Array, Array]:
         \frac{\partial s_k}{\partial\eta} \frac{\partial s_k}{\partial\eta}^T
 
     over parameters, logarithms of the noise ratios and of each record's sensor variance, with the
-    gain of the filter moving with them.
+    gain of the filter moving with them, and what is believed of the parameters added.
 
     Parameters
     ----------
@@ -373,6 +373,9 @@ def compute_information(fit: Fit) -> tuple[Array, Array]:
         widths = np.column_stack([c[k][1] for c in columns] + [size])
         matrix += mean * (slopes / s[:, None]).T @ slopes + 0.5 * scale * widths.T @ widths
         score += -slopes.T @ (e / s) + 0.5 * widths.T @ (z2 - 1)
+    believed, information = problem.beliefs
+    matrix[range(p), range(p)] += information
+    score[:p] -= information * (fit.theta - believed)
     return matrix, score
 
 

@@ -1,7 +1,7 @@
 """fit_loop(): the physical parameters of a loop's plant, by maximum likelihood."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -19,7 +19,7 @@ from ...data.several_records import as_records, order_model_and_data
 from ...loop.loop import Loop
 from ..whiteness import note_coloured_innovations
 from .filter_data import find_noise_units
-from .likelihood import Fit, list_effect_bounds, make_problem
+from .likelihood import Fit, find_priors, list_effect_bounds, make_problem
 from .maximization import begin_fit, choose_noise, compute_information, maximize, refit_noise_size
 from .physics_estimate import LoopEstimate, LoopFit
 
@@ -31,7 +31,7 @@ def fit_loop(
     loop: Loop,
     record: Record | Sequence[Record],
     *,
-    free: Sequence[str] | None = None,
+    free: Sequence[str] | Mapping[str, float] | None = None,
     coloured: bool | None = None,
 ) -> LoopFit:
     r"""Fit the uncertain physical parameters of a loop's plant to one or several records.
@@ -52,8 +52,11 @@ def fit_loop(
         Effects in the loop are fitted with them.
     record : Record or sequence of Record
         The data; several records share the parameters and the force noise.
-    free : sequence of str, optional
-        Parameters to fit; by default those of `loop.free` and those of the effects.
+    free : sequence of str, or mapping of str to float, optional
+        Parameters to fit; by default those of `loop.free` and those of the effects. ``{"K": 0.1}``
+        also says how well each is known beforehand, as in a `Loop`: then the penalized likelihood
+        is maximized, to which a Gaussian prior around the value of the loop is added, and the
+        covariance is that of both together.
     coloured : bool, optional
         Whether a coloured (Ornstein-Uhlenbeck) random force takes part; by default if it pays by
         the Bayesian information criterion.
@@ -95,8 +98,12 @@ def fit_loop(
     # A single reading far outside makes any Gaussian likelihood follow it and nothing else.
     masked = [mask_outliers(one) for one in given]
     records = [one for one, _ in masked]
+    problem = make_problem(loop, names, records)
+    if free is not None:
+        asked = replace(loop, free=free) if isinstance(free, Mapping) else loop
+        problem = replace(problem, priors=find_priors(asked, free))
     with hold_interrupt():
-        fit = refit_noise_size(maximize(begin_fit(make_problem(loop, names, records))))
+        fit = refit_noise_size(maximize(begin_fit(problem)))
         if coloured or coloured is None:
             fit = choose_noise(fit, always=bool(coloured))
     if not math.isfinite(fit.value):
@@ -119,7 +126,9 @@ _TOO_NARROW = (
 )
 
 
-def _choose_free_names(loop: Loop, free: Sequence[str] | None) -> tuple[str, ...]:
+def _choose_free_names(
+    loop: Loop, free: Sequence[str] | Mapping[str, float] | None
+) -> tuple[str, ...]:
     if not isinstance(loop, Loop):
         raise CtrlidError(f"fit_loop needs a Loop(plant, ..., dt=...); given {type(loop).__name__}")
     known = list(loop.equations(keep=True).parameters)
