@@ -13,11 +13,16 @@ from scipy import signal, stats
 import ctrlid as cid
 import problems
 from ctrlid import effects as E
-from ctrlid.diagnosis import removal, replicas, screening, selection
-from ctrlid.diagnosis.candidates import _has_effect, contains
+from ctrlid.diagnosis import growth, removal, replicas, screening, selection
+from ctrlid.diagnosis.candidates import Objection, _has_effect, contains
 from ctrlid.diagnosis.experiment import _can_survive, find_experiment
 from ctrlid.diagnosis.findings import Disturbance, Finding, Gap
-from ctrlid.diagnosis.fitted_model import Model, drop_linearization, with_linearization
+from ctrlid.diagnosis.fitted_model import (
+    Model,
+    compute_criterion,
+    drop_linearization,
+    with_linearization,
+)
 from ctrlid.diagnosis.gap import Window, root_mean_square, share_samples
 from ctrlid.diagnosis.growth import _is_stand_in, _look_back, exchange_worst_effect, search_effects
 from ctrlid.diagnosis.noise_tests import NoiseTests, _compute_force_deviates, run_noise_tests
@@ -706,6 +711,45 @@ def test_the_name_without_which_the_gap_is_narrowest_goes_first(two_found):
         assert worst == name
         assert {f.trial.name for f in left.found} == names - {name}
         assert list(left.final.loop.labelled) == [*names - {name}]
+
+
+def test_a_standard_error_does_not_overrule_a_likelihood(two_found, monkeypatch):
+    model = two_found.final
+    smaller, trial = refit_without_effect(model, 0)
+    flat = replace(trial, out=Objection("insignificant", "within 2 standard errors"))
+    monkeypatch.setattr(removal, "refit_without_effect", lambda *_: (smaller, flat))
+    left, kept = removal.weigh_without_effect(model, 0)
+    assert kept.out is None
+    assert kept.net_gain > 100
+    assert compute_criterion(left) < compute_criterion(model) - 100
+    assert kept.net_gain == pytest.approx(compute_criterion(model) - compute_criterion(left))
+    # What explains as much without the effect takes its place all the same.
+    monkeypatch.setattr(removal, "refit_noise", lambda smaller: model)
+    assert removal.weigh_without_effect(model, 0)[1] is flat
+
+
+def test_a_search_ends_with_the_likeliest_state_it_passed_through(monkeypatch):
+    loop = replace(drive(), controller=None)
+    real = drive().with_effect(E.CoulombFriction(0.3)).with_effect(E.LinearStiffness(20.0))
+    r = cid.random_binary(600, amplitude=0.3, hold=60, seed=9472)
+    record = cid.simulate(real, r, sensor_noise=1e-4, seed=9473)
+    base = fit_base_model(loop, [record], loop.free)
+    drop = growth.drop_superfluous
+
+    def drop_the_first(model, given):
+        """Lose what gained much as soon as something that gains little is beside it."""
+        if len(model.loop.effects) < given + 2:
+            return drop(model, given)
+        return refit_without_effect(model, given)[0]
+
+    monkeypatch.setattr(growth, "drop_superfluous", drop_the_first)
+    kinds = (E.CoulombFriction, E.LinearStiffness)
+    found = search_effects(base, kinds, lambda f, items: [f(x) for x in items], lambda text: None,
+                           lambda model: False)  # fmt: skip
+    passed = [Model(step.base.loop, step.base.fit) for step in found.steps]
+    assert len(passed) > 1
+    reached = max(map(compute_criterion, passed))
+    assert compute_criterion(found.final) > reached - THRESHOLD.gate
 
 
 def test_what_is_put_back_and_stuck_keeps_its_evidence(two_found, monkeypatch):

@@ -259,3 +259,53 @@ def test_a_model_that_cannot_follow_says_where():
     with pytest.raises(CtrlidError, match=r"the Kalman filter of burst diverges at sample \d+ "
                        r"\(t = [\d.]+ s\): .* exclude these samples with valid="):  # fmt: skip
         cid.predict(cid.Loop(plant, None, dt=0.1), record)
+
+
+def move_cart_and_pole(x, force, p, fc):
+    """Return the derivative of a cart with a pole upright and dry friction at the cart."""
+    _, v, angle, rate = x
+    sine, cosine = np.sin(angle), np.cos(angle)
+    load = p["M"] + p["m"] * sine**2
+    f = force - fc * np.tanh(v / 2e-3)
+    pull = p["m"] * p["l"] * rate**2 * sine
+    push = (f + pull - p["m"] * p["g"] * sine * cosine) / load
+    fall = (load + p["m"] * cosine**2) * p["g"] * sine - cosine * (f + pull)
+    return np.array([v, push, rate, fall / (p["l"] * load)])
+
+
+def run_cart_and_pole(p, fc, n, dt, seed, steps=20):
+    """Return input and measured position of a cart with a pole under a state feedback."""
+    rng = np.random.default_rng(seed)
+    a = np.zeros((4, 4))
+    b = np.zeros(4)
+    for k in range(4):
+        a[:, k] = move_cart_and_pole(1e-6 * np.eye(4)[k], 0.0, p, 0.0) / 1e-6
+    b = move_cart_and_pole(np.zeros(4), 1e-6, p, 0.0) / 1e-6
+    riccati = linalg.solve_continuous_are(a, b[:, None], np.diag([10.0, 1, 100, 1]), [[0.5]])
+    gain = b @ riccati / 0.5
+    r = np.repeat(rng.choice([-0.15, 0.15], n // 100), 100)
+    x, u, y = np.zeros(4), np.zeros(n), np.zeros(n)
+    for k in range(n):
+        seen = x + rng.standard_normal(4) * [2e-4, 1e-3, 4e-4, 1e-3]
+        u[k], y[k] = -gain @ (seen - [r[k], 0, 0, 0]), seen[0]
+        for _ in range(steps):
+            half = x + dt / steps / 2 * move_cart_and_pole(x, u[k], p, fc)
+            x = x + dt / steps * move_cart_and_pole(half, u[k], p, fc)
+    return u, y
+
+
+@pytest.mark.parametrize("fc", [0.05, 0.15])
+def test_dry_friction_in_an_unstable_plant_is_followed_from_a_trajectory_without_it(fc):
+    p = {"M": 0.6, "m": 0.25, "l": 0.35, "g": 9.81}
+    u, y = run_cart_and_pole(p, fc, 1500, 0.005, 21)
+    plant = ct.nlsys(
+        lambda t, x, u, p: move_cart_and_pole(x, u[0], p, 0.0), lambda t, x, u, p: x[0],
+        inputs=["F"], outputs=["s"], states=["s", "v", "angle", "rate"], params=p, name="cart",
+    )  # fmt: skip
+    bare = cid.Loop(plant, None, dt=0.005)
+    record = cid.Record(u=u, y=y, dt=0.005)
+    errors = []
+    for loop in (bare, bare.with_effect(cid.effects.CoulombFriction(fc=fc / p["M"]))):
+        index, ahead = predict_ahead(loop, record, cid.predict(loop, record), 30)
+        errors.append(float(np.sqrt(np.mean((ahead - y[index]) ** 2))))
+    assert errors[1] < 0.6 * errors[0]

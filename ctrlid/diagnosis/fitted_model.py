@@ -11,7 +11,7 @@ from .._base.arrays import Array
 from .._base.criterion import bayesian_penalty
 from ..data.record import Record
 from ..estimation.likelihood.filter_data import FilterData, prepare_for_loop
-from ..estimation.likelihood.kalman_filter import guess_trajectory
+from ..estimation.likelihood.kalman_filter import carry_trajectory, guess_trajectory
 from ..estimation.likelihood.likelihood import (
     Fit,
     evaluate_likelihood,
@@ -87,6 +87,13 @@ def compute_penalized_likelihood(fit: Fit) -> float:
     return fit.value - bayesian_penalty(len(fit.theta), fit.size)
 
 
+def compute_criterion(model: Model) -> float:
+    """Return the log-likelihood less the penalty for all that was fitted, the noise included."""
+    fit = model.fit
+    value = fit.value - bayesian_penalty(len(fit.theta) + fit.noise.parameters, fit.size)
+    return value if math.isfinite(value) else -math.inf
+
+
 def drop_arrays(fit: Fit) -> Fit:
     """Return a fit without its arrays: many candidates on a long record must fit into memory."""
     return keep_information(fit, replace(fit, linearized=(), filtered=()))
@@ -131,7 +138,7 @@ def carry_over_fit(base: Model, loop: Loop, names: Sequence[str]) -> Fit:
     plant = old.plant.of_loop(loop, names)
     data = tuple(prepare_for_loop(one, loop) for one in old.data)
     at = [
-        _carry_trajectory(old.plant, plant, out.trajectory, guess_trajectory(plant, one))
+        carry_trajectory(old.plant, plant, out.trajectory, guess_trajectory(plant, one))
         for out, one in zip(base.fit.filtered, data, strict=True)
     ]
     lower, upper = list_parameter_bounds(loop, names)
@@ -183,22 +190,3 @@ class RecordRange:
         speeds = [np.abs(at.filtered[:, j]) for j in self.plant.e.velocities]
         usual = (float(np.quantile(v, THRESHOLD.usual_speed)) for v in speeds)
         return max(usual, default=1.0) or 1.0
-
-
-def _carry_trajectory(
-    old: SampledPlant, new: SampledPlant, known: Trajectory, guess: Trajectory
-) -> Trajectory:
-    """Take states that both have from the old trajectory, and guess the others."""
-    mine = list(new.e.states)
-    columns = [(mine.index(s), k) for k, s in enumerate(old.e.states) if s in mine]
-    # A delay keeps a known analog controller from being followed, so both plants need its states.
-    if new.size - new.n == old.size - old.n:
-        columns += [(new.n + k, old.n + k) for k in range(old.size - old.n)]
-    result = []
-    for start, theirs in ((guess.predicted, known.predicted), (guess.filtered, known.filtered),
-                         (guess.spread, known.spread)):  # fmt: skip
-        mixed = start.copy()
-        for i, k in columns:
-            mixed[:, i] = theirs[:, k]
-        result.append(mixed)
-    return Trajectory(*result)

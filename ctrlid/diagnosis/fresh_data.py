@@ -75,9 +75,14 @@ class FreshData:
         known = fit.known
         if known is not None and (known.sensor is None or len(parts) == len(known.sensor)):
             problem = replace(problem, known=known)
-        return Model(
-            model.loop, maximize(begin_fit(problem, fit.theta, fit.noise), exact=False)
-        ).fitted
+        for noise in (fit.noise, None):
+            try:
+                start = begin_fit(problem, fit.theta, noise)
+            except ModelCannotRun:
+                # A model that lacks much may lose a part of a record that it could follow whole.
+                continue
+            return Model(model.loop, maximize(start, exact=False)).fitted
+        return model.fitted
 
     def simulate_outputs(self, loops: Sequence[Loop]) -> tuple[Array, ...]:
         """Return what each loop makes of its window."""

@@ -21,7 +21,13 @@ from ..estimation.likelihood.maximization import (
 )
 from ..estimation.likelihood.noise_fit import compute_noise_criterion
 from .candidates import Trial, contains, is_same_kind, list_missing_candidates
-from .fitted_model import Model, can_simulate, drop_linearization, with_linearization
+from .fitted_model import (
+    Model,
+    can_simulate,
+    compute_criterion,
+    drop_linearization,
+    with_linearization,
+)
 from .fresh_data import FreshData
 from .noise_tests import NoiseTests, choose_alarm_level, run_noise_tests
 from .recalibration import restore_given_values
@@ -114,12 +120,14 @@ def _grow_model(
     steps = reached.steps
     model = with_linearization(first[-1].base) if first else base
     changed, left = False, tuple[Round, ...]()
+    likeliest = model
     while not steps or steps[-1].best is not None:
         if steps and steps[-1].best is not None:
             tell(f"round {len(steps)}: {steps[-1].best.name} with all else")
             reached.model = steps[-1].best.model
             model = refit_noise(order_last_effect(steps[-1].best.model, given))
             model = with_linearization(drop_superfluous(model, given))
+            likeliest = max(likeliest, model, key=compute_criterion)
         if (
             len(model.loop.effects) - given >= THRESHOLD.many_effects
             or len(steps) >= THRESHOLD.many_effects + THRESHOLD.more_rounds
@@ -148,6 +156,9 @@ def _grow_model(
         else:
             steps.append(step)
     tell("weighing what was found")
+    if compute_criterion(likeliest) > compute_criterion(model) + THRESHOLD.gate:
+        # What was dropped, or came in its place, was worth less than what it cost.
+        model = likeliest
     try:
         model, found = weigh_effects(model, given, steps)
     except (ModelCannotRun, EffectDoesNotApply):

@@ -17,7 +17,13 @@ from ..estimation.likelihood.maximization import (
 from ..estimation.likelihood.noise_fit import compute_noise_criterion
 from ..loop.loop import Loop
 from .candidates import Trial, contains
-from .fitted_model import Model, can_simulate, carry_over_fit, drop_linearization
+from .fitted_model import (
+    Model,
+    can_simulate,
+    carry_over_fit,
+    compute_criterion,
+    drop_linearization,
+)
 from .information import estimate_need
 from .refitting import refit_candidate, weigh_refit
 from .screening import screen_at
@@ -44,6 +50,7 @@ def weigh_effects(
         return model, ()
     best = steps[0].best
     alone = len(model.loop.effects) == given + 1 and len(steps) <= 2
+    alone = alone and best is not None and list(best.model.names) == list(model.names)
     if alone and best is not None and _has_same_noise(best.model, model):
         return model, (Weighed(best, (), steps[0].base, given),)
     one = fuse_effects(model, given, steps)
@@ -51,7 +58,7 @@ def weigh_effects(
         return weigh_effects(refit_noise(one), given, steps)
     found: list[Weighed] = []
     for position in range(given, len(model.loop.effects)):
-        smaller, mine = refit_without_effect(model, position)
+        smaller, mine = weigh_without_effect(model, position)
         if mine.net_gain <= THRESHOLD.gate:
             return weigh_effects(refit_noise(smaller), given, steps)
         found.append(Weighed(mine, (), smaller, position))
@@ -135,6 +142,25 @@ def refit_without_effect(model: Model, position: int) -> tuple[Model, Trial]:
     return smaller, again if again.gain > 0 else known
 
 
+def weigh_without_effect(model: Model, position: int) -> tuple[Model, Trial]:
+    """Return what `refit_without_effect` does, unless a standard error overrules a likelihood.
+
+    The likelihood beside the maximum may be flat, and fall far away where the effect is absent: dry
+    friction that a slow mode partly replaces has a wide error, and gains thousands. The model
+    without it is then fitted as well as it can be, noise included, and what that leaves decides.
+    """
+    smaller, trial = refit_without_effect(model, position)
+    flat = trial.out is not None and trial.out.ground == "insignificant"
+    if not (flat and trial.gain - trial.penalty > THRESHOLD.gate):
+        return smaller, trial
+    smaller = refit_noise(smaller)
+    lost = compute_criterion(model) - compute_criterion(smaller)
+    if lost <= THRESHOLD.gate:
+        return smaller, trial
+    gain = model.fit.value - smaller.fit.value
+    return smaller, replace(trial, gain=gain, penalty=gain - lost, out=None)
+
+
 def refit_noise(model: Model) -> Model:
     """Ask again whether the data want a coloured force, now that an effect is in the model."""
     fit = refit_noise_size(polish_fit(model.fit))
@@ -159,7 +185,7 @@ def drop_superfluous(model: Model, given: int) -> Model:
     for position in range(given, len(model.loop.effects) - 1):
         if estimate_need(model, position) > THRESHOLD.surely_needed * THRESHOLD.gate:
             continue
-        smaller, trial = refit_without_effect(model, position)
+        smaller, trial = weigh_without_effect(model, position)
         if trial.net_gain <= THRESHOLD.gate:
             return drop_superfluous(smaller, given)
     return model

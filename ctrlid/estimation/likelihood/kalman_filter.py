@@ -252,6 +252,25 @@ def _invert_sensor(plant: SampledPlant, seen: Any, x: Any, at: float, values: Ar
     return np.where(left <= first, found, at)
 
 
+def carry_trajectory(
+    old: SampledPlant, new: SampledPlant, known: Trajectory, guess: Trajectory
+) -> Trajectory:
+    """Take states that both have from the old trajectory, and guess the others."""
+    mine = list(new.e.states)
+    columns = [(mine.index(s), k) for k, s in enumerate(old.e.states) if s in mine]
+    # A delay keeps a known analog controller from being followed, so both plants need its states.
+    if new.size - new.n == old.size - old.n:
+        columns += [(new.n + k, old.n + k) for k in range(old.size - old.n)]
+    result = []
+    for start, theirs in ((guess.predicted, known.predicted), (guess.filtered, known.filtered),
+                         (guess.spread, known.spread)):  # fmt: skip
+        mixed = start.copy()
+        for i, k in columns:
+            mixed[:, i] = theirs[:, k]
+        result.append(mixed)
+    return Trajectory(*result)
+
+
 def converge_trajectory(
     plant: SampledPlant,
     data: FilterData,

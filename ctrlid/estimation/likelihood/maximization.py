@@ -10,7 +10,14 @@ from ..._base.arrays import Array
 from ..._base.criterion import bayesian_penalty
 from ..._base.errors import EffectDoesNotApply, ModelCannotRun
 from ..._base.statistics import pseudo_inverse
-from .kalman_filter import Noise, choose_settled_samples, converge_trajectory, guess_trajectory
+from .filter_data import prepare_for_loop
+from .kalman_filter import (
+    Noise,
+    carry_trajectory,
+    choose_settled_samples,
+    converge_trajectory,
+    guess_trajectory,
+)
 from .likelihood import Fit, Problem, evaluate_likelihood, list_start_values, relinearize_fit
 from .noise_fit import (
     LOG_STEP,
@@ -62,10 +69,53 @@ def begin_fit(problem: Problem, theta: Array | None = None, noise: Noise | None 
     -------
     Fit
         The starting point.
+
+    Raises
+    ------
+    ModelCannotRun
+        If the filter cannot follow the record with this model.
+    """
+    noise = problem.known.noise if problem.known else noise
+    theta = list_start_values(problem.plant.loop, problem.plant.names) if theta is None else theta
+    try:
+        return _begin_with_noise(problem, theta, noise)
+    except ModelCannotRun:
+        if not problem.plant.loop.effects:
+            raise
+    return _begin_beside_effects(problem, theta, noise)
+
+
+def _begin_beside_effects(problem: Problem, theta: Array, noise: Noise | None) -> Fit:
+    """Return the starting point along the trajectory of the plant without its effects.
+
+    Dry friction in a plant that is unstable and hardly measured makes a filter lose the record from
+    a guess, though not from a trajectory that is nearly right.
     """
     plant = problem.plant
-    theta = list_start_values(plant.loop, plant.names) if theta is None else theta
-    noise = problem.known.noise if problem.known else noise
+    loop = replace(plant.loop, effects=(), free=())
+    own = [k for k, name in enumerate(plant.names) if "." not in name]
+    bare = plant.of_loop(loop, tuple(plant.names[k] for k in own))
+    data = tuple(prepare_for_loop(one, loop) for one in problem.data)
+    simple = replace(
+        problem, plant=bare, data=data, lower=problem.lower[own], upper=problem.upper[own]
+    )
+    known = maximize(_begin_with_noise(simple, theta[own], noise if problem.known else None))
+    at = [
+        carry_trajectory(bare, plant, out.trajectory, guess_trajectory(plant, one))
+        for out, one in zip(known.filtered, problem.data, strict=True)
+    ]
+    there = replace(problem, counts=known.counts)
+    fit = evaluate_likelihood(there, theta, noise or known.noise, at)
+    if not math.isfinite(fit.value):
+        raise ModelCannotRun(
+            f"the Kalman filter of {plant.e.name} loses the record with its effects: the model "
+            "contradicts the record. Check units, signs and the operating point"
+        )
+    return fit
+
+
+def _begin_with_noise(problem: Problem, theta: Array, noise: Noise | None) -> Fit:
+    plant = problem.plant
     first = noise or Noise((choose_noise_ratio(plant) ** 2 * 1e-2,) * plant.channels)
     guessed = []
     for data in problem.data:

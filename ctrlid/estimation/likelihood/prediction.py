@@ -12,7 +12,7 @@ import numpy as np
 
 from ..._base.arguments import is_number
 from ..._base.arrays import Array, freeze_arrays
-from ..._base.errors import CtrlidError
+from ..._base.errors import CtrlidError, ModelCannotRun
 from ..._base.text import Printed
 from ...data.record import Record
 from ...data.several_records import order_model_and_data
@@ -147,6 +147,11 @@ def make_prediction(fit: Fit) -> Prediction:
     """Return the one-step predictions of the only record of a fit."""
     plant, record = fit.plant, fit.data[0].record
     out, sensor = fit.filtered[0], float(np.sqrt(fit.sensor[0]))
+    if not np.isfinite(out.innovations).all():
+        raise ModelCannotRun(
+            f"the Kalman filter of {plant.e.name} loses the record: the model contradicts it. "
+            "Check units, signs and the operating point, or exclude samples with valid="
+        )
     states = out.trajectory.filtered
     return Prediction(
         record.y - out.innovations, out.innovations, fit.counts[0],
