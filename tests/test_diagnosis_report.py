@@ -216,11 +216,11 @@ def test_bad_news_is_in_capitals(found):
 
 def test_a_recalibration_that_ends_on_a_limit_is_marked(found, tmp_path):
     base = found["explained"]
-    c = replace(base.calibrated[0], name="k", given=2.0, before=0.2)
+    c = replace(base.calibrated[0], name="k", given=2.0, before=0.2, at_limit=True)
     assert "k ENDS AT ITS LIMIT" in text(replace(base, calibrated=(c,)))
     page = cid.write_report(replace(base, calibrated=(c,)), tmp_path / "report.html")
     assert "k ENDS AT ITS LIMIT" in page.read_text("utf-8")
-    assert "LIMIT" not in text(replace(base, calibrated=(replace(c, before=0.21),)))
+    assert "LIMIT" not in text(replace(base, calibrated=(replace(c, at_limit=False),)))
 
 
 def test_what_the_effects_close_counts_from_the_smaller_gap(found):

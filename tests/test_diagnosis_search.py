@@ -13,7 +13,7 @@ from scipy import signal, stats
 import ctrlid as cid
 import problems
 from ctrlid import effects as E
-from ctrlid.diagnosis import growth, removal, replicas, screening, selection
+from ctrlid.diagnosis import growth, refitting, removal, replicas, scans, screening, selection
 from ctrlid.diagnosis.candidates import Objection, _has_effect, contains
 from ctrlid.diagnosis.experiment import _can_survive, find_experiment
 from ctrlid.diagnosis.findings import Disturbance, Finding, Gap
@@ -671,8 +671,8 @@ def two_found():
     record = cid.simulate(real, r, sensor_noise=1e-4, seed=9471)
     base = fit_base_model(loop, [record], loop.free)
     kinds = (E.CoulombFriction, E.AsymmetricCoulombFriction, E.LinearStiffness)
-    return search_effects(base, kinds, lambda f, items: [f(x) for x in items], lambda text: None,
-                          lambda model: False)  # fmt: skip
+    return search_effects(base, kinds, lambda f, items: [f(x) for x in items],
+                          lambda text, **_: None, lambda model: False)  # fmt: skip
 
 
 class FreshStub:
@@ -744,8 +744,8 @@ def test_a_search_ends_with_the_likeliest_state_it_passed_through(monkeypatch):
 
     monkeypatch.setattr(growth, "drop_superfluous", drop_the_first)
     kinds = (E.CoulombFriction, E.LinearStiffness)
-    found = search_effects(base, kinds, lambda f, items: [f(x) for x in items], lambda text: None,
-                           lambda model: False)  # fmt: skip
+    found = search_effects(base, kinds, lambda f, items: [f(x) for x in items],
+                           lambda text, **_: None, lambda model: False)  # fmt: skip
     passed = [Model(step.base.loop, step.base.fit) for step in found.steps]
     assert len(passed) > 1
     reached = max(map(compute_criterion, passed))
@@ -889,3 +889,20 @@ def test_the_gap_before_is_the_smaller_of_given_and_recalibrated(free):
     assert (gap.recalibrated > 2 * gap.given) == bool(free)
     error = gap.measured - gap.simulated_before
     assert np.sqrt(np.nanmean(error**2)) == pytest.approx(gap.before)
+
+
+@pytest.mark.parametrize("failure", [np.linalg.LinAlgError("SVD did not converge"),
+                                     SystemError("error without exception set")])  # fmt: skip
+def test_a_candidate_whose_arithmetic_fails_fails_alone(two_found, monkeypatch, failure):
+    def fail(*_, **__):
+        raise failure
+
+    base = two_found.found[0].base
+    with monkeypatch.context() as patch:
+        patch.setattr(scans, "screen_candidate", fail)
+        out = scan_candidate(base, E.ViscousFriction(c=0.1)).out
+        assert out.ground == "cannot run"
+        assert str(failure) in out.words
+    trial = screen_candidate(with_linearization(base), two_found.found[0].trial.effect)
+    monkeypatch.setattr(refitting, "maximize", fail)
+    assert refit_candidate(base, trial).out.ground == "cannot run"

@@ -83,10 +83,13 @@ def assemble_answer(
             "the model is linear. If the errors depend on position, velocity or input, write the "
             "equations of the plant with ct.nlsys and diagnose that model"
         )
-    before = dict(zip(found.base.names, found.base.fit.theta.tolist(), strict=True))
+    first = found.base.fit
+    before = dict(zip(found.base.names, first.theta.tolist(), strict=True))
+    on_limit = (first.theta == first.problem.lower) | (first.theta == first.problem.upper)
+    ended = {name for name, there in zip(found.base.names, on_limit, strict=True) if there}
     calibrated = tuple(
         Calibrated(name, loop.parameters[name], before[name], fitted.loop.parameters[name],
-                   errors.get(name, math.nan))
+                   errors.get(name, math.nan), name in ended)
         for name in loop.free
     )  # fmt: skip
     tests = dict(found.after.p_values)

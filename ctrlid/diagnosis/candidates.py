@@ -33,7 +33,14 @@ class Objection:
         unfit = isinstance(refusal, EffectDoesNotApply)
         return cls("does not apply" if unfit else "cannot run", str(refusal))
 
+    @classmethod
+    def of_failure(cls, failure: Exception) -> Self:
+        """Return the objection that a failure of the arithmetic is."""
+        return cls("cannot run", f"the arithmetic fails with it: {failure}")
 
+
+# A decomposition that does not converge, and a function of the equations that CasADi gives up.
+NUMERICAL_FAILURES = (np.linalg.LinAlgError, SystemError)
 VANISHES = Objection("vanishes", "the refit ends at the neutral value")
 
 

@@ -316,6 +316,8 @@ class Calibrated:
         Its value as handed in, recalibrated alone, and with the effects [its unit].
     standard_error : float
         Standard error of the last [its unit].
+    at_limit : bool
+        Whether recalibrated alone it ended at a limit: the model has no good value there.
     """
 
     name: str
@@ -323,3 +325,4 @@ class Calibrated:
     before: float
     after: float
     standard_error: float
+    at_limit: bool = False

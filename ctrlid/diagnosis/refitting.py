@@ -10,7 +10,7 @@ from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from ..estimation.likelihood.kalman_filter import Noise
 from ..estimation.likelihood.likelihood import Fit, evaluate_likelihood, rank_by_likelihood
 from ..estimation.likelihood.maximization import OTHER_NOISE_GAIN, maximize
-from .candidates import Objection, Trial
+from .candidates import NUMERICAL_FAILURES, Objection, Trial
 from .fitted_model import Model, can_simulate, carry_over_fit, drop_arrays, drop_linearization
 from .information import count_own_parameters, find_objection
 from .thresholds import THRESHOLD
@@ -53,9 +53,11 @@ def refit_candidate(base: Model, trial: Trial, near: Model | None = None) -> Tri
             for s in starts
         ]
         fit = max(fits, key=lambda f: f.value)
+        return weigh_refit(base, trial, fit)
     except (ModelCannotRun, EffectDoesNotApply) as reason:
         return replace(trial, out=Objection.of(reason))
-    return weigh_refit(base, trial, fit)
+    except NUMERICAL_FAILURES as reason:
+        return replace(trial, out=Objection.of_failure(reason))
 
 
 def refit_under_noise(base: Model, trial: Trial, noise: Noise) -> Trial:

@@ -13,7 +13,7 @@ from .._base.statistics import pseudo_inverse
 from ..data.record import Record
 from ..effects import AbstractEffect
 from ..estimation.likelihood.kalman_filter import run_filter
-from .candidates import Objection, Trial
+from .candidates import NUMERICAL_FAILURES, Objection, Trial
 from .fitted_model import Model
 from .screening import screen_candidate, screen_starts
 from .thresholds import THRESHOLD
@@ -234,3 +234,5 @@ def scan_candidate(model: Model, effect: AbstractEffect) -> Trial:
     # An effect may be impossible at a place, as at a frequency outside its bounds.
     except (ModelCannotRun, EffectDoesNotApply) as reason:
         return Trial(effect, "", model, -math.inf, out=Objection.of(reason))
+    except NUMERICAL_FAILURES as reason:
+        return Trial(effect, "", model, -math.inf, out=Objection.of_failure(reason))

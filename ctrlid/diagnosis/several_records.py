@@ -153,7 +153,14 @@ def _merge_calibrated(parts: Sequence[Diagnosis]) -> tuple[tuple[Calibrated, ...
         mean = float(weights @ values / weights.sum())
         before = float(np.mean([c.before for c in same]))
         means.append(
-            Calibrated(first.name, first.given, before, mean, float(weights.sum()) ** -0.5)
+            Calibrated(
+                first.name,
+                first.given,
+                before,
+                mean,
+                float(weights.sum()) ** -0.5,
+                any(c.at_limit for c in same),
+            )
         )
         spread = float(weights @ (values - mean) ** 2)
         if len(sure) > 1 and stats.chi2.sf(spread, len(sure) - 1) < THRESHOLD.different_values:

@@ -194,11 +194,7 @@ def describe_trivial(gap: Gap) -> str:
 
 def describe_limits(found: Diagnosis) -> str:
     """Say which parameters a recalibration alone took to a limit; empty if there is none."""
-    factors = (THRESHOLD.parameter_range, 1 / THRESHOLD.parameter_range)
-    plant = [c for c in found.calibrated if "." not in c.name]
-    names = [c.name for c in plant
-             if any(math.isclose(c.before, f * c.given, rel_tol=1e-6)
-                    for f in factors)]  # fmt: skip
+    names = [c.name for c in found.calibrated if c.at_limit and "." not in c.name]
     if not names or not found.added:
         return ""
     ends = "ENDS AT ITS LIMIT" if len(names) == 1 else "END AT THEIR LIMITS"
