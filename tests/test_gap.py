@@ -181,3 +181,16 @@ def test_a_gap_is_named_by_its_kind_and_horizon():
     assert (one.kind, one.name) == ("prediction", "25-step prediction")
     assert replace(one, horizon=1).name == "one-step prediction"
     assert Gap("simulation", 1.0, 1.0, 1.0, 0.1, "m", *arrays).name == "open-loop simulation"
+
+
+def test_the_time_of_a_force_runs_on_through_a_gap_of_the_log():
+    plant = cid.plants.servo(m=1.0, c=2.0, k=3.0)
+    point = cid.OperatingPoint(states=(0.0, 0.0), input=0.0, output=0.0)
+    loop = cid.Loop(plant, cid.PID(kp=20.0, kd=1.0), dt=0.01, at=point)
+    loop = loop.with_effect(cid.effects.PeriodicForce(amplitude=2.0, frequency=0.7, phase=0.3))
+    r = cid.random_binary(1500, amplitude=0.1, hold=60, seed=3)
+    record = cid.simulate(loop, r, sensor_noise=1e-4, seed=4)
+    valid = np.ones(1500, bool)
+    valid[500:640] = False  # the second stretch begins 4.48 periods after the first
+    gapped = replace(record, valid=valid)
+    assert cid.compare(gapped, loop)["closed-loop simulation"].fit > 99

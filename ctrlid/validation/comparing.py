@@ -178,8 +178,8 @@ def _simulate(record: Record, loop: Loop, prediction: Prediction) -> Curve:
     simulator = Simulator(loop, hold=record.hold, hold_r=record.hold_r)
     for part in find_long_stretches(record):
         stretch = prepare_stretch(
-            simulator, record, part, guess=prediction.states[part.start], seek_controller=True,
-            set_point=True,
+            simulator, record, part, start_time=0.0, guess=prediction.states[part.start],
+            seek_controller=True, set_point=True,
         )  # fmt: skip
         y[part], injected[part] = stretch.run(simulator)[0], stretch.d
         noisy[part] = _run_with_noise(simulator, stretch, prediction) - y[part]
