@@ -6,6 +6,7 @@ is known; ctrlid takes no part in making them.
 
 from dataclasses import replace
 
+import control as ct
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -171,3 +172,41 @@ def test_backlash_and_dead_zone_act_on_what_is_reconstructed():
         ahead, plain = (cid.predict(one, make_record(y), force_noise=1.0).innovations[30:-3]
                         for one in (loop, oscillator()))  # fmt: skip
         assert relative(ahead, y) < 3e-3 < 0.1 * relative(plain, y)
+
+
+def test_an_audit_says_how_the_input_looks(y):
+    loop = oscillator()
+    noise = 3e-4 * np.std(y)
+    for hold in ("zoh", "foh"):
+        (found,) = cid.audit(make_record(y, hold, noise), loop)["between samples"]
+        assert found.harmful
+        assert "looks band-limited" in found.text
+        assert "hold='bandlimited'" in found.text
+    (found,) = cid.audit(make_record(y, noise=noise), loop)["between samples"]
+    assert not found.harmful
+    (found,) = cid.audit(make_record(y, "zoh", noise))["between samples"]
+    assert "u is not held" in found.text
+
+
+def test_an_audit_says_nothing_of_a_held_input():
+    loop = oscillator()
+    d = drive(DT * np.arange(N))
+    record = cid.simulate(loop, d=d, sensor_noise=1e-5, seed=1)
+    assert not cid.audit(record)["between samples"]
+    assert not cid.audit(record, loop)["between samples"]
+    (found,) = cid.audit(replace(record, hold="foh"), loop)["between samples"]
+    assert "looks held" in found.text
+
+
+def test_an_audit_and_a_fit_speak_of_an_unknown_analog_controller():
+    plant = cid.plants.servo(m=1.0, c=2.0, k=3.0)
+    loop = cid.Loop(plant, ct.tf([8, 30], [0.02, 1]), dt=0.02, free=("m",))
+    r = cid.random_binary(1000, amplitude=0.1, hold=10, seed=1)
+    record = cid.simulate(loop, r, sensor_noise=1e-3, seed=1)
+    unknown = replace(loop, controller=None)
+    (found,) = cid.audit(record, unknown)["between samples"]
+    assert found.harmful
+    assert "give the analog controller to the loop" in found.text
+    assert not cid.audit(record, loop)["between samples"]
+    notes = [cid.fit_loop(one, record).estimate.notes for one in (unknown, loop)]
+    assert [any("MOVES BETWEEN THE SAMPLES" in n for n in each) for each in notes] == [True, False]

@@ -15,6 +15,8 @@ from ..data.record import Record
 from ..data.validity import find_whole_past
 from .residual_tests import Correlation, cross_correlation
 
+# A check needs so many valid samples in succession.
+FEWEST = 60
 # This is the probability of calling an open loop closed.
 LEVEL = 1e-3
 # Regressions use at most so many past samples of each signal.
@@ -119,9 +121,9 @@ def check_feedback(record: Record) -> FeedbackCheck:
     if not isinstance(record, Record):
         raise CtrlidError(f"check_feedback needs a Record; given {type(record).__name__}")
     longest = max((b - a for a, b in record.segments()), default=0)
-    if longest < 60:
-        raise CtrlidError(f"check_feedback needs 60 valid samples in succession; the record has "
-                          f"{longest}. Record longer")  # fmt: skip
+    if longest < FEWEST:
+        raise CtrlidError(f"check_feedback needs {FEWEST} valid samples in succession; the record "
+                          f"has {longest}. Record longer")  # fmt: skip
     for key in ("u", "y"):
         if np.ptp(getattr(record, key)[record.valid]) == 0:
             raise CtrlidError(f"{key} is constant, so the record does not show whether there is "
@@ -136,11 +138,11 @@ def check_feedback(record: Record) -> FeedbackCheck:
         said := _test_short_law(signals, record.valid, order, record.hold == "zoh")
     ):
         return said
-    e, rows = _compute_residual(signals, record.valid, "y", {"y": (1, order), "u": (1, order)})
+    e, rows = compute_residual(signals, record.valid, "y", {"y": (1, order), "u": (1, order)})
     if np.std(e[rows]) <= ROUNDING * np.std(record.y[rows]):
         return _decide_without_noise(signals, record.valid, int(record.hold == "zoh"))
     past = {"u": (1, order + LAGS)} | ({"r": (0, order)} if "r" in signals else {})
-    w, rows = _compute_residual(signals, record.valid, "u", past, robust=True)
+    w, rows = compute_residual(signals, record.valid, "u", past, robust=True)
     good = np.zeros(record.n, dtype=bool)
     good[rows] = True
     if np.std(w[rows]) <= NOTHING * np.std(record.u[rows]):
@@ -200,7 +202,7 @@ def _test_short_law(
 
     def rest(keys: str, n: int) -> float:
         past = {k: (int(k == "u"), n) for k in keys if n or k != "u"}
-        left, rows = _compute_residual(signals, valid, "u", past)
+        left, rows = compute_residual(signals, valid, "u", past)
         return float(np.std(left[rows]))
 
     least, size = rest("ur", order), float(np.std(signals["u"][valid]))
@@ -226,13 +228,13 @@ def _is_tie_of_plant(
     direction and further in the next, by `least` times.
     """
     ahead = {"y": (2, order + 1), "u": (2, order + 1)}
-    next_e, rows = _compute_residual(signals, valid, "y", ahead)
+    next_e, rows = compute_residual(signals, valid, "y", ahead)
     now = float(np.mean(w[rows] * e[rows]))
     next_ = float(np.mean(w[rows - 1] * next_e[rows]))
     return now * next_ > 0 and abs(next_) > least * abs(now)
 
 
-def _compute_residual(
+def compute_residual(
     signals: dict[str, Array],
     valid: Any,
     target: str,
@@ -282,7 +284,7 @@ def _find_exact_order(
     for order in range(EXACT_LAGS + 1):
         past = {k: (now if k == target or target == "y" else 0, order) for k in keys}
         past = {k: (1 if k == target else first, last) for k, (first, last) in past.items()}
-        left, rows = _compute_residual(signals, valid, target, past)
+        left, rows = compute_residual(signals, valid, target, past)
         if np.std(left[rows]) <= NOTHING * np.std(signals[target][rows]):
             return order
     return EXACT_LAGS + 1

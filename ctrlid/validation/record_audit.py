@@ -16,6 +16,7 @@ from ..data.validity import find_longest_run, find_runs
 from ..loop.loop import Loop
 from . import signal_defects as defects
 from .controller_check import FAULTS, check_controller
+from .hold_check import check_hold
 
 # With fewer valid samples no fit says much.
 FEW = 50
@@ -44,16 +45,17 @@ class AuditFinding:
     kind : str
         ``"saturation"``, ``"quantization"``, ``"repeats"``, ``"dropped samples"``, ``"outliers"``,
         ``"drift"``, ``"offset"``, ``"too little excitation"``, ``"constant signal"``,
-        ``"too few samples"``, ``"controller"`` or ``"operating point"``; where the stated
-        controller does not compute the logged u, what is wrong with it: ``"gain"``, ``"sign"``,
-        ``"bias"``, ``"delay"``, ``"limit"``, ``"filter"`` or ``"unknown"``.
+        ``"too few samples"``, ``"between samples"``, ``"controller"`` or ``"operating point"``;
+        where the stated controller does not compute the logged u, what is wrong with it:
+        ``"gain"``, ``"sign"``, ``"bias"``, ``"delay"``, ``"limit"``, ``"filter"`` or ``"unknown"``.
     channel : str
         ``"r"``, ``"u"`` or ``"y"``; empty where it concerns the whole record.
     text : str
         The finding in words, with what to do about it.
     size : float
         How large it is: a share of the samples (saturation, dropped samples, outliers), a ratio to
-        the signal's spread (quantization, drift, offset), a number (repeats, changes, samples), the
+        the signal's spread (quantization, drift, offset), a gain of log-likelihood or the motion
+        of u from sample to sample (between samples), a number (repeats, changes, samples), the
         share of u that the controller does not explain, or the ratio of y to where the loop rests.
     where : (int, int)
         First sample concerned and the one after the last.
@@ -181,6 +183,10 @@ def audit(record: Record, loop: Loop | None = None) -> Audit:
         *checks.find_drift(),
         *checks.find_repetition(),
     ]
+    said = check_hold(record, loop)
+    if said is not None:
+        text, size, harmful = said
+        findings.append(AuditFinding("between samples", "u", text, size, checks.whole, harmful))
     injected = False
     if loop is not None:
         findings += checks.check_operating_point(loop)

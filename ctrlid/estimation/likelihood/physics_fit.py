@@ -15,7 +15,12 @@ from ..._base.statistics import pseudo_inverse
 from ..._base.text import write_list
 from ...data.outliers import describe_outliers, mask_outliers
 from ...data.record import Record
-from ...data.several_records import as_records, order_model_and_data
+from ...data.several_records import (
+    VISIBLE_MOTION,
+    as_records,
+    measure_input_motion,
+    order_model_and_data,
+)
 from ...loop.loop import Loop
 from ..whiteness import note_coloured_innovations
 from .filter_data import find_noise_units
@@ -116,8 +121,21 @@ def fit_loop(
     left_out = [describe_outliers(one, found)
                 for one, (_, found) in zip(given, masked, strict=True) if found.any()]  # fmt: skip
     colour = note_coloured_innovations(fit.standardized, len(fit.theta), _TOO_NARROW)
-    notes = (*left_out, *fitted.estimate.notes, *colour)
+    notes = (*left_out, *fitted.estimate.notes, *colour, *_note_unknown_controller(loop, given))
     return replace(fitted, estimate=replace(fitted.estimate, notes=notes))
+
+
+def _note_unknown_controller(loop: Loop, records: Sequence[Record]) -> tuple[str, ...]:
+    """Return what to say where an analog controller that is not known may move u visibly."""
+    moves = measure_input_motion(records)
+    known = loop.controller is not None or all(record.r is None for record in records)
+    if known or moves <= VISIBLE_MOTION:
+        return ()
+    return (
+        f"u MOVES BETWEEN THE SAMPLES, by {100 * moves:.0f} % of its standard deviation from one "
+        "to the next, and a straight line is assumed. Where an analog controller moves it "
+        "otherwise, the values are biased: give the controller to the loop, or sample faster.",
+    )
 
 
 _TOO_NARROW = (
