@@ -157,7 +157,7 @@ def check_feedback(record: Record) -> FeedbackCheck:
         # Lag 0 says how u runs on between the samples, and so do the next lags up to its tail.
         moved = True
         p = _compute_p_value(cross_correlation(w, e, good, "y", lags=LAGS, first=1))
-        if np.max(np.abs(test.values[1:])) <= TAIL * abs(test.values[0]):
+        if np.max(np.abs(test.values[1:])) <= TAIL * abs(test.values[0]) + test.band:
             p = 1.0
     elif record.hold == "foh":
         later = _compute_p_value(cross_correlation(w, e, good, "y", lags=LAGS, first=1))
