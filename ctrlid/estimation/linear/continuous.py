@@ -17,7 +17,7 @@ from ...physics.conversions import to_state_matrices
 from ..constraints import AbstractConstraint, check_constraints
 from ..identified_model import Estimate, IdentifiedModel, Structure
 from ..whiteness import ROUNDING, note_coloured_innovations
-from .prediction_error import Piece, Task, find_best_fit
+from .prediction_error import Minimum, Piece, Task, colour_noise, find_best_fit
 from .sampled_motion import Circuit, list_inputs
 
 # Above this product of dt and the controller's fastest pole, u moves visibly between samples.
@@ -44,7 +44,9 @@ def fit_continuous(
     and corrects its state with an observer gain K that is estimated along. Since K takes whatever
     mixture of sensor noise and force noise the data hold, the estimate is right under feedback,
     without the reference and without knowing the controller; with white Gaussian noises it is
-    maximum likelihood. Initial state and operating point are estimated for each valid stretch.
+    maximum likelihood. Where the innovations are not white, the sensor noise becomes a moving
+    average of an order chosen by the Bayesian criterion. Initial state and operating point are
+    estimated for each valid stretch.
 
     Parameters
     ----------
@@ -120,16 +122,25 @@ def fit_continuous(
         raise CtrlidError(f"delay is {delay:g} s, but no stretch of valid samples is longer than "
                           f"{longest:g} s, so that no input would reach its output")  # fmt: skip
     task = Task(structure, pieces, records[0].dt, records[0].hold, circuit, delay is None, 1.0)
-    point, found, rss, used, residuals, settled = find_best_fit(task, known, delay or 0.0)
-    degrees = used - found.free - structure.na - int(task.free_delay)
     size = max(float(np.max(np.abs(p.signals["y"]))) for p in pieces)
-    notes = note_coloured_innovations(
-        residuals, len(structure.names) + structure.na, _TOO_NARROW, size
-    )
+
+    def note_colour(fit: Minimum) -> tuple[str, ...]:
+        fitted = len(structure.names) + len(fit.point.gain)
+        return note_coloured_innovations(fit.residuals, fitted, _TOO_NARROW, size)
+
+    best = find_best_fit(task, known, delay or 0.0)
+    notes = note_colour(best)
+    if notes:
+        best = colour_noise(best, known)
+        notes = note_colour(best)
+    point, found, rss, settled = best.point, best.found, best.rss, best.settled
+    degrees = best.used - found.free - len(point.gain) - int(task.free_delay)
     # Errors that are rounding beside y leave nothing to gain.
     if not settled and rss > (ROUNDING * size) ** 2 * total:
         notes = (_NOT_CONVERGED, *notes)
     late = f", delay {point.delay:.6g} s" if task.free_delay else ""
+    if best.task.colour:
+        late += f", sensor noise a moving average of order {best.task.colour}"
     estimate = Estimate(
         structure=structure, values=found.theta, covariance=found.spread * rss / degrees,
         intercepts=np.zeros(0), rss=rss, residual_variance=rss / degrees, n_samples=total,
@@ -150,9 +161,9 @@ _NOT_CONVERGED = (
     "tried gave it. Lower the orders, add a constraint, or excite the loop more."
 )
 _TOO_NARROW = (
-    "The observer takes a mixture of white sensor noise and white force noise, so that the "
-    "standard errors are too small and coefficients may be biased: compare with fit_iv, or raise "
-    "the order."
+    "The observer takes a mixture of white force noise and sensor noise of short memory, so that "
+    "the standard errors are too small and coefficients may be biased: compare with fit_iv, or "
+    "raise the order."
 )
 
 

@@ -1,5 +1,7 @@
 """Minimising the prediction errors of a continuous-time model: starts, steps and constraints."""
 
+from __future__ import annotations
+
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -19,14 +21,18 @@ from .regression import block_qr, merge_factors
 from .sampled_motion import (
     Circuit,
     DiscreteModel,
+    add_noise_states,
     compute_prediction_errors,
     discretize_model,
     list_inputs,
+    place_gain,
     realize_model,
 )
 
 # A search ends after at most so many Gauss-Newton steps.
 ROUNDS = 40
+# An averaging converter takes up to four samples in practice, AR noise is followed for so long.
+MOST_COLOUR = 6
 # A search has converged when a full step gains less than this share of the residual variance.
 CONVERGED = 1e-7
 # Observer poles stay so many over the samples of a stretch inside the unit circle, since the data
@@ -55,6 +61,31 @@ class Point:
 
 
 @dataclass(frozen=True, eq=False)
+class Minimum:
+    """Where a search ended: its task, the residuals, and whether it converged."""
+
+    task: Task
+    point: Point
+    found: Found
+    rss: float
+    residuals: list[Array]
+    settled: bool
+
+    @property
+    def used(self) -> int:
+        """Number of samples less the initial states and levels fitted to them."""
+        task = self.task
+        states = task.structure.na + task.colour + (len(task.circuit.a) if task.circuit else 0)
+        return sum(p.n for p in task.pieces) - len(task.pieces) * (states + 1)
+
+    @property
+    def criterion(self) -> float:
+        """The Bayesian information criterion of the noise model."""
+        n = sum(p.n for p in self.task.pieces)
+        return n * float(np.log(self.rss)) + len(self.point.gain) * float(np.log(n))
+
+
+@dataclass(frozen=True, eq=False)
 class Task:
     """What is fitted to which data; `speed` is a typical rate [rad/s] that scales the states."""
 
@@ -65,13 +96,16 @@ class Task:
     circuit: Circuit | None
     free_delay: bool
     speed: float
+    # Order of the moving average that the sensor noise is.
+    colour: int = 0
 
     def discretize(self, theta: Array, delay: float) -> DiscreteModel:
         """Return the model over one period."""
         num, den = self.structure.fraction(theta)
-        return discretize_model(
+        motion = discretize_model(
             *realize_model(den, num, self.speed), self.dt, self.hold, delay, self.circuit
         )
+        return add_noise_states(motion, self.colour) if self.colour else motion
 
 
 def _compute_columns(task: Task, point: Point, piece: Piece) -> Array | None:
@@ -81,8 +115,7 @@ def _compute_columns(task: Task, point: Point, piece: Piece) -> Array | None:
     if errors is None:
         return None
     size, n = len(motion.f), piece.n
-    gain = np.concatenate([point.gain, np.zeros(size - task.structure.na)])
-    closed = motion.f - np.outer(gain, motion.c)
+    closed = motion.f - np.outer(place_gain(motion, point.gain), motion.c)
     free = np.empty((n, size))
     state = np.eye(size)
     # -c closed^k by doubling: the first rows times a power of the matrix give the next ones.
@@ -154,7 +187,7 @@ def _compute_jacobian(task: Task, point: Point, tables: list[Array]) -> Array:
     s = task.structure
     size = _measure_coefficients(task, point)
     steps: list[tuple[float, Callable[[float], Point]]] = []
-    for e in np.eye(s.na):
+    for e in np.eye(len(point.gain)):
         h = 1e-5 * max(abs(float(point.gain @ e)), 1e-3 * float(np.abs(point.gain).max()), 1e-9)
         steps.append((h, lambda h, e=e: replace(point, gain=point.gain + h * e)))  # type: ignore[misc]
     if task.free_delay:
@@ -196,7 +229,7 @@ def _minimize_errors(
     observer is at the border of stability, so that a step of its gain may promise more for ever.
     """
     settled = False
-    extra = task.structure.na + int(task.free_delay)
+    extra = len(point.gain) + int(task.free_delay)
     rss, tables = _evaluate_cost(task, point)
     found: Found | None = None
     for _ in range(rounds):
@@ -220,7 +253,7 @@ def _minimize_errors(
             share = 0.5**k
             step = share * others
             delay = max(point.delay + (step[-1] if task.free_delay else 0.0), 0.0)
-            trial = Point(point.theta + share * move, point.gain + step[: task.structure.na], delay)
+            trial = Point(point.theta + share * move, point.gain + step[: len(point.gain)], delay)
             new, new_tables = _evaluate_cost(task, trial)
             # The first step may raise the cost, since it has to meet the constraints.
             if new < rss or (
@@ -253,13 +286,8 @@ def _is_violated(task: Task, point: Point, known: Sequence[AbstractConstraint]) 
     return bool(np.any(np.abs(nearest - point.theta) > 1e-9 * (np.abs(point.theta) + least)))
 
 
-def find_best_fit(
-    task: Task, known: Sequence[AbstractConstraint], delay: float
-) -> tuple[Point, Found, float, int, list[Array], bool]:
-    """Search from the most promising starts; return the best minimum and its residuals.
-
-    The last result says whether the search for it converged.
-    """
+def find_best_fit(task: Task, known: Sequence[AbstractConstraint], delay: float) -> Minimum:
+    """Search from the most promising starts and return the best minimum."""
     starts = _rank_starts(task, delay)
     short = replace(task, pieces=_take_head(task.pieces))
     ranked: list[tuple[float, float, Point]] = []
@@ -288,10 +316,38 @@ def find_best_fit(
             f"{np.array2string(trouble.direction, precision=3)} changes no prediction. Vary the "
             "reference, lower the orders or add a constraint."
         ) from None
-    used = sum(p.n for p in task.pieces) - len(task.pieces) * (
-        task.structure.na + 1 + (len(task.circuit.a) if task.circuit else 0)
-    )
-    return best, found, rss, used, _compute_residuals(task, best), settled
+    return Minimum(task, best, found, rss, _compute_residuals(task, best), settled)
+
+
+def colour_noise(white: Minimum, known: Sequence[AbstractConstraint]) -> Minimum:
+    """Return the minimum with sensor noise that is a moving average of the best order.
+
+    The order is chosen by the Bayesian criterion, and none is taken that gains nothing by it.
+    """
+    best, first = white, white.task.structure.na
+    for order in range(1, MOST_COLOUR + 1):
+        task, tried = replace(white.task, colour=order), []
+        # From the white minimum, whose observer took up colour, and from that of sensor noise.
+        for gain in (best.point.gain, _find_sensor_gain(white)):
+            start = replace(best.point, gain=np.append(gain, np.zeros(first + order - len(gain))))
+            try:
+                point, found, rss, settled = _minimize_errors(task, start, known)
+            except NotExcited:
+                continue
+            tried.append(Minimum(task, point, found, rss, _compute_residuals(task, point), settled))
+        # The observer does the work of one order by itself, so that one without a gain is no end.
+        best = min([best, *tried], key=lambda m: m.criterion)
+        if order > best.task.colour + 1:
+            break
+    return best
+
+
+def _find_sensor_gain(white: Minimum) -> Array:
+    """Return the observer gain of pure sensor noise; that of the minimum where there is none."""
+    motion = _discretize_open_loop(white.task, white.point.theta)
+    poles = _reflect_poles(white.task, np.linalg.eigvals(motion.f))
+    gain = _place_poles(motion.f, motion.c, poles)
+    return white.point.gain if gain is None else gain
 
 
 def _minimize_twice(

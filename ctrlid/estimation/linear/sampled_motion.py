@@ -203,6 +203,31 @@ def _discretize_with_circuit(a: Array, b: Array, c: Array, dt: float, k: Circuit
     return DiscreteModel(f, tuple(signals), both, n)
 
 
+def add_noise_states(motion: DiscreteModel, order: int) -> DiscreteModel:
+    r"""Return the motion with sensor noise that is a moving average, as states at its end.
+
+    .. math:: v_{k} = e_k + c_1 e_{k-1} + \dots + c_m e_{k-m}
+
+    The states are a chain of delays, and the coefficients are what their observer gains are.
+    """
+    size = len(motion.f)
+    f = np.zeros((size + order, size + order))
+    f[:size, :size] = motion.f
+    f[size:, size:] = np.eye(order, k=1)
+    inputs = tuple((name, late, np.append(column, np.zeros(order)))
+                   for name, late, column in motion.inputs)  # fmt: skip
+    return DiscreteModel(f, inputs, np.concatenate([motion.c, np.eye(1, order)[0]]), motion.order)
+
+
+def place_gain(motion: DiscreteModel, gain: Array) -> Array:
+    """Return an observer gain of plant and noise as one of all states."""
+    k = np.zeros(len(motion.f))
+    k[: motion.order] = gain[: motion.order]
+    noise = len(gain) - motion.order
+    k[len(k) - noise :] = gain[motion.order :]
+    return k
+
+
 def compute_prediction_errors(motion: DiscreteModel, gain: Array, signals: dict[str, Array]) -> Any:
     r"""Return the prediction errors of the model with an observer gain, and the filter behind them.
 
@@ -214,7 +239,7 @@ def compute_prediction_errors(motion: DiscreteModel, gain: Array, signals: dict[
     motion : Flow
         The model over one period.
     gain : ndarray
-        Observer gain K of the plant's states.
+        Observer gain K of the plant's states, then of those of the noise.
     signals : dict
         Arrays of the signals by name; all of the same length, deviations from a constant.
 
@@ -225,9 +250,7 @@ def compute_prediction_errors(motion: DiscreteModel, gain: Array, signals: dict[
     observer : ndarray
         Denominator of the filter.
     """
-    size = len(motion.f)
-    k = np.zeros(size)
-    k[: motion.order] = gain
+    k = place_gain(motion, gain)
     closed = motion.f - np.outer(k, motion.c)
     if not np.isfinite(closed).all():
         return None, np.ones(1)
