@@ -46,9 +46,6 @@ class Record(Printed):
         analog signal nearly does; or as the samples of a measured signal say that has nothing above
         half the sampling rate, which takes later samples and so holds only where u does not react
         to y.
-    hold_r : {"zoh", "foh"}, optional
-        How r runs between samples, which counts where an analog controller sees it: held, or
-        straight, as in a simulation of python-control.
     extra : mapping of str to array_like, optional
         Further measured channels [as in `units`], for instance a coil current.
     valid : array_like of bool, shape (n,), optional
@@ -61,6 +58,9 @@ class Record(Printed):
         Name of the experiment.
     start : float, optional
         Time of sample 0 [s].
+    hold_r : {"zoh", "foh"}, optional
+        How r runs between samples, which counts where an analog controller sees it: held, or
+        straight, as in a simulation of python-control.
 
     Raises
     ------
