@@ -237,7 +237,7 @@ def test_records_and_reports_are_written_whole(record, tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(np, "column_stack", fail)
-    with pytest.raises(OSError, match="No space"):
+    with pytest.raises(CtrlidError, match="No space"):
         record.to_csv(file)
     monkeypatch.undo()
     assert (file.read_bytes(), os.listdir(tmp_path)) == (before, ["log.csv"])

@@ -272,7 +272,6 @@ class Loop:
         >>> loop.with_effect(cid.effects.CoulombFriction(fc=0.2)).parameters
         {'m': 2.0, 'c': 1.0, 'k': 3.0, 'CoulombFriction.fc': 0.2}
         """
-        check_arguments(Loop.with_effect, locals())
         return self._replace_fields(effects=(*self.effects, effect))
 
     def without_effect(self, effect: str | AbstractEffect) -> "Loop":

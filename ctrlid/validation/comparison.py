@@ -6,7 +6,7 @@ import numpy as np
 
 from .._base.arrays import Array, freeze_arrays
 from .._base.errors import CtrlidError
-from .._base.text import Printed, write_list, write_number
+from .._base.text import Printed, write_list
 from ..data.record import Record
 from .residual_tests import Correlation
 
@@ -173,7 +173,7 @@ def write_times(fit: float) -> str:
     '590 times'
     """
     times = 1 - fit / 100
-    return f"{write_number(times, 2)} times" if times >= 1.05 else "as large as"
+    return f"{float(f'{times:.2g}'):g} times" if times >= 1.05 else "as large as"
 
 
 def write_fit(fit: float, places: int = 2) -> str:
