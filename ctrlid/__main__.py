@@ -25,6 +25,7 @@ from .reporting.cli.demo_diagnosis import tell_diagnosis
 from .reporting.cli.demo_identification import TITLES, tell_identification
 from .reporting.cli.diagnose_command import INTERRUPTED, add_parser, make_folder
 from .reporting.html_page import Section, write_report
+from .reporting.plot.axes import off_screen
 from .reporting.tables import Table
 
 FOLDER = "ctrlid-report"
@@ -148,7 +149,8 @@ def _tell_stories(args: argparse.Namespace) -> int:
         with tqdm(total=len(titles), disable=args.quiet or None, leave=False, unit="step") as bar:
             for number, title in enumerate(titles, 1):
                 bar.set_description(title)
-                section = _save_figures(next(chapters), number, folder)
+                with off_screen():
+                    section = _save_figures(next(chapters), number, folder)
                 sections.append(section)
                 with tqdm.external_write_mode():
                     print(_write_text(section, number))

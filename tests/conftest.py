@@ -1,6 +1,7 @@
 """What several test files share."""
 
 import os
+import sys
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,14 @@ def pytest_collection_modifyitems(config, items):
     if not config.option.markexpr:
         config.hook.pytest_deselected(items=[i for i in items if i.get_closest_marker("slow")])
         items[:] = [i for i in items if not i.get_closest_marker("slow")]
+
+
+@pytest.fixture(autouse=True)
+def close_pictures():
+    """Close the figures of a test: pyplot keeps them for plt.show(), and warns of more than 20."""
+    yield
+    if "matplotlib.pyplot" in sys.modules:
+        sys.modules["matplotlib.pyplot"].close("all")
 
 
 @pytest.fixture

@@ -25,13 +25,13 @@ MODULES = [name for name in ctrlid.__all__ if inspect.ismodule(getattr(ctrlid, n
 
 
 def functions_of(module):
-    """Public functions written in a public module, or in a file of it."""
+    """Public functions and classes written in a public module, or in a file of it."""
     return [
         f"{module.__name__.rpartition('.')[2]}.{name}"
         for name, value in vars(module).items()
         if not name.startswith("_")
         and f"{getattr(value, '__module__', '')}.".startswith(f"{module.__name__}.")
-        and inspect.isfunction(value)
+        and (inspect.isfunction(value) or name in getattr(module, "__all__", ()))
     ]
 
 

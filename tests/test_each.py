@@ -69,7 +69,7 @@ def test_trend_in_words_and_as_a_picture(series):
     assert "gap 2" in text
     assert "rightmost pole" in text
     assert "proportional to the output to the power -0." in text
-    ax = plot.trend(series, truth=lambda y: np.sqrt(2 * 9.81 / y))
+    (ax,) = plot.trend(series, truth=lambda y: np.sqrt(2 * 9.81 / y))
     assert ax.get_xlabel() == "mean output [mm]" or "unit" in ax.get_xlabel()
     assert legend(ax) == ["line through the fits", "physics", "fits, 95 % intervals"]
 

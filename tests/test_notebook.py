@@ -107,6 +107,30 @@ def test_the_block_suits_light_and_dark():
     assert "background" not in write_html("NO POLE OUTSIDE")
 
 
+def run_cells(monkeypatch, tmp_path, *sources):
+    """Return what a notebook of these cells shows, cell by cell."""
+    monkeypatch.setenv("IPYTHONDIR", str(tmp_path))
+    monkeypatch.setenv("JUPYTER_PLATFORM_DIRS", "1")
+    monkeypatch.setenv("MPLBACKEND", "module://matplotlib_inline.backend_inline")
+    cells = [nbformat.v4.new_code_cell(source) for source in sources]
+    done = nbclient.NotebookClient(
+        nbformat.v4.new_notebook(cells=cells), timeout=300, kernel_name="python3",
+        resources={"metadata": {"path": str(tmp_path)}},
+    ).execute()  # fmt: skip
+    return [cell.outputs for cell in done.cells]
+
+
+def test_a_notebook_without_pyplot_shows_each_picture_once(monkeypatch, tmp_path):
+    shown = run_cells(
+        monkeypatch, tmp_path,
+        "import ctrlid as cid\nrecord = cid.Record(u=[0, 1, 0, 1], y=[0, 0, 1, 1], dt=0.1)",
+        "cid.plot.record(record)", "picture = cid.plot.record(record)", "picture",
+    )  # fmt: skip
+    assert [sum("image/png" in o.get("data", {}) for o in cell) for cell in shown] == [0, 1, 1, 1]
+    assert shown[0] == []  # not even a warning that the bars of progress will be text
+    assert not any("array(" in str(cell) for cell in shown)
+
+
 @pytest.fixture(scope="module")
 def notebook():
     return nbformat.read(NOTEBOOK, as_version=4)

@@ -42,29 +42,67 @@ def labels(ax):
     return ax.get_xlabel(), ax.get_ylabel()
 
 
-def test_nothing_global_is_changed(record, comparison):
+def test_no_setting_of_matplotlib_is_changed(record, comparison):
     before = dict(mpl.rcParams)
     plot.record(record)
     plot.png(plot.comparison(comparison))
-    import matplotlib.pyplot as plt
-
-    assert plt.get_fignums() == []
     assert dict(mpl.rcParams) == before
 
 
-def test_a_script_with_pyplot_can_show_the_pictures(record, tmp_path):
+def test_pyplot_saves_and_closes_what_was_drawn_last(record, tmp_path):
+    picture = plot.record(record)
+    # A user may import pyplot after the call, and then save.
     import matplotlib.pyplot as plt
 
-    script = {"plot": plot, "cid": cid, "record": record, "path": tmp_path / "r.html"}
-    exec("plot.record(record)", script)
+    assert plt.gcf() is picture.figure
+    plt.savefig(tmp_path / "pyplot.png")
+    picture.figure.savefig(tmp_path / "own.png")
+    assert (tmp_path / "pyplot.png").read_bytes() == (tmp_path / "own.png").read_bytes()
+    other = plot.record(record)
+    assert plt.get_fignums() == [picture.figure.number, other.figure.number]
+    plt.close(other.figure)
+    assert plt.gcf() is picture.figure
+
+
+def test_an_empty_figure_is_drawn_on_as_python_control_does(record):
+    import matplotlib.pyplot as plt
+
+    wide = plt.figure(figsize=(12, 5))
+    assert plot.record(record).figure is wide
+    assert plot.record(record).figure is not wide
+    assert len(plt.get_fignums()) == 2
+
+
+def test_files_leave_no_figures_open(record, tmp_path):
+    import matplotlib.pyplot as plt
+
+    cid.write_report(record, tmp_path / "r.html")
     assert plt.get_fignums() == []
-    script["plt"] = plt
-    exec("cid.write_report(record, path)", script)
-    assert plt.get_fignums() == []
-    exec("axes = plot.record(record)", script)
-    (number,) = plt.get_fignums()
-    assert script["axes"][0].figure is plt.figure(number)
-    plt.close(number)
+
+
+def test_a_picture_shows_itself(record):
+    picture = plot.record(record)
+    assert repr(picture) == "Picture with 2 axes"
+    assert picture._repr_png_() == plot.png(picture, dpi=100)
+    assert [ax.figure for ax in picture] == [picture.figure] * len(picture)
+    assert picture[0] is picture.axes[0]
+    assert repr(plot.poles(ct.tf(1, [1, 1]))) == "Picture with 1 axis"
+
+
+def test_every_picture_takes_axes_by_the_same_name(record, comparison, outcome):
+    G = ct.tf(1, [1, 1])
+    pictures = ((plot.record, record), (plot.comparison, comparison), (plot.poles, G),
+                (plot.residuals, comparison), (plot.bode, G), (plot.step, outcome))  # fmt: skip
+    for draw, what in pictures:
+        axes = draw(what).axes
+        with plot.axes.off_screen():
+            own = plot.figure(len(axes))
+        for given in (own, own.axes[:, 0], list(own.axes[:, 0])):
+            picture = draw(what, ax=given)
+            assert list(picture.axes) == list(own.axes[:, 0])
+            assert picture.figure is own.figure
+        if len(axes) == 1:
+            assert draw(what, ax=own[0, 0]).axes[0] is own[0, 0]
 
 
 def test_record_has_names_and_units(record):
@@ -133,7 +171,7 @@ def test_stretches_that_do_not_count_are_shaded(record):
 def test_given_axes_are_drawn_on_and_returned(record, comparison):
     axes = plot.figure(2, 2)
     assert list(plot.record(record, axes[:, 0])) == list(axes[:, 0])
-    assert plot.comparison(comparison, axes[0, 1]) is axes[0, 1]
+    assert plot.comparison(comparison, axes[0, 1]).axes[0] is axes[0, 1]
     with pytest.raises(cid.CtrlidError, match="needs 2 matplotlib Axes; given 1"):
         plot.record(record, axes[0, 0])
     with pytest.raises(cid.CtrlidError, match="needs 1 matplotlib Axes; given 1: str"):
@@ -150,7 +188,7 @@ def test_axes_of_ones_own_in_the_same_style():
 
 
 def test_comparison_labels_every_curve(comparison):
-    ax = plot.comparison(comparison)
+    (ax,) = plot.comparison(comparison)
     text = legend(ax)
     assert text[0].startswith("measured")
     assert len(text) == 1 + len(comparison.curves)
@@ -163,7 +201,7 @@ def test_comparison_labels_every_curve(comparison):
 
 
 def test_comparison_window(comparison):
-    ax = plot.comparison(comparison, window=(2, 3))
+    (ax,) = plot.comparison(comparison, window=(2, 3))
     t = ax.get_lines()[0].get_xdata()
     assert (t[0], len(t)) == (pytest.approx(2), 100)
     with pytest.raises(cid.CtrlidError, match="fewer than 2 samples lie between 20 and 30 s"):
@@ -181,7 +219,7 @@ def test_default_window_is_lively_and_usual(comparison):
 
 def test_a_curve_far_away_leaves_the_measurement_readable(comparison):
     far = replace(comparison.curves[-1], y=comparison.curves[-1].y + 100)
-    ax = plot.comparison(replace(comparison, curves=(*comparison.curves[:-1], far)))
+    (ax,) = plot.comparison(replace(comparison, curves=(*comparison.curves[:-1], far)))
     assert legend(ax)[-1].endswith("outside this picture")
     low, high = ax.get_ylim()
     assert high - low < 3 * 1e3 * np.ptp(comparison.record.y)
@@ -190,7 +228,7 @@ def test_a_curve_far_away_leaves_the_measurement_readable(comparison):
 def test_predictions_of_every_few_samples_are_connected(comparison):
     curve = comparison.curves[1]
     sparse = np.where(np.arange(len(curve.y)) % 3 == 0, curve.y, np.nan)
-    ax = plot.comparison(replace(comparison, curves=(replace(curve, y=sparse),)), window=(2, 5))
+    (ax,) = plot.comparison(replace(comparison, curves=(replace(curve, y=sparse),)), window=(2, 5))
     assert np.isfinite(ax.get_lines()[1].get_ydata()).all()
 
 
@@ -218,7 +256,7 @@ def test_residuals_mark_what_is_no_chance(comparison):
 def test_poles_in_the_z_plane():
     P = ct.tf(-2.6, [1, 0, -654])
     G = ct.tf([1, 1], [1, -2.01, 1], 0.005)
-    ax = plot.poles({"fit": G}, truth=P)
+    (ax,) = plot.poles({"fit": G}, truth=P)
     assert labels(ax) == ("real part of z [1]", "imaginary part of z [1]")
     outer, inner = (np.exp(s * np.sqrt(654) * 0.005) for s in (1, -1))
     assert legend(ax) == ["fit: 1.105, 0.9049", f"physics: {outer:.4g}, {inner:.4g}"]
@@ -227,11 +265,11 @@ def test_poles_in_the_z_plane():
 
 def test_poles_of_a_fit_are_those_of_its_estimate(record):
     G = cid.fit_arx(record, na=2, nb=2)
-    assert len(legend(plot.poles({"fit": G}))) == 1
+    assert len(legend(plot.poles({"fit": G})[0])) == 1
 
 
 def test_poles_in_the_s_plane():
-    ax = plot.poles({"a": ct.tf(1, [1, 2, 10]), "b": ct.tf(1, [1, 0])})
+    (ax,) = plot.poles({"a": ct.tf(1, [1, 2, 10]), "b": ct.tf(1, [1, 0])})
     assert labels(ax) == ("real part of s [rad/s]", "imaginary part of s [rad/s]")
     assert legend(ax) == ["a: -1+3j, -1-3j", "b: 0"]
 
@@ -251,7 +289,7 @@ def test_models_are_checked(draw, models, words):
 
 @pytest.mark.parametrize("draw", [plot.poles, plot.bode])
 def test_one_model_needs_no_label(draw):
-    ax = np.ravel(draw(ct.tf(1, [1, 0.5], name="tank")))[0]
+    ax = draw(ct.tf(1, [1, 0.5], name="tank"))[0]
     assert legend(ax)[0].startswith("tank")
 
 
@@ -307,7 +345,7 @@ def test_bode_leaves_out_a_model_sampled_too_slowly_for_the_frequencies():
 
 
 def test_step_shows_promise_and_achievement(outcome):
-    ax = plot.step(outcome)
+    (ax,) = plot.step(outcome)
     assert labels(ax) == ("time after the step [s]", "output per step\nof the reference [1]")
     promised, achieved = legend(ax)
     assert promised.startswith(
@@ -318,7 +356,7 @@ def test_step_shows_promise_and_achievement(outcome):
 
 def test_step_says_when_the_physics_is_lost(outcome):
     lost = replace(outcome.achieved, stable=False)
-    ax = plot.step(replace(outcome, achieved=lost, achieved_step=outcome.achieved_step[:4]))
+    (ax,) = plot.step(replace(outcome, achieved=lost, achieved_step=outcome.achieved_step[:4]))
     assert (
         legend(ax)[1]
         == f"achieved on the physics: UNSTABLE, the simulation stops after {outcome.time[4]:.2g} s"
@@ -326,7 +364,7 @@ def test_step_says_when_the_physics_is_lost(outcome):
     assert len(ax.lines[1].get_ydata()) == 4
     never = replace(outcome.promised, settling_time=np.inf)
     endless = replace(outcome, promised=never, achieved=never)
-    assert plot.step(endless).get_xlim()[1] >= outcome.time[-1]
+    assert plot.step(endless)[0].get_xlim()[1] >= outcome.time[-1]
 
 
 def test_step_draws_redesigns_by_their_labels_over_one_time(outcome):
@@ -335,9 +373,9 @@ def test_step_draws_redesigns_by_their_labels_over_one_time(outcome):
     legends = [ax.get_legend() for ax in axes]
     assert [legend.get_title().get_text() for legend in legends] == ["first", "second"]
     assert [ax.get_xlabel() for ax in axes] == ["", "time after the step [s]"]
-    assert axes[0].get_xlim() == axes[1].get_xlim() == (0, plot.step(longer).get_xlim()[1])
+    assert axes[0].get_xlim() == axes[1].get_xlim() == (0, plot.step(longer)[0].get_xlim()[1])
     restless = replace(outcome, achieved=replace(outcome.achieved, settling_time=np.inf))
-    _, achieved = plot.step(restless).get_legend().get_texts()
+    _, achieved = plot.step(restless)[0].get_legend().get_texts()
     assert achieved.get_text() == "achieved on the physics: DOES NOT SETTLE"
     with pytest.raises(cid.CtrlidError, match="the mapping is empty"):
         plot.step({})

@@ -134,3 +134,12 @@ def test_a_diagnosis_saved_before_the_move_runs_on_its_loop(tmp_path):
     r = cid.random_binary(200, amplitude=1e-4, hold=20, around=0.012, seed=1)
     assert abs(cid.simulate(back.loop, r).y - 0.012).max() < 1e-3
     assert str(cid.load_diagnosis(back.save(tmp_path / "again.json"))) == str(back)
+
+
+def test_what_takes_long_is_imported_when_it_is_needed():
+    """The compiler, downloads and processes would add most to the time of `import ctrlid`."""
+    late = ["numba", "pooch", "joblib", "tqdm.auto", "scipy.io"]
+    code = f"import sys, control, ctrlid; print([m for m in {late} if m in sys.modules])"
+    command = [sys.executable, "-W", "error", "-c", code]
+    run = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (run.stdout.strip(), run.stderr) == ("[]", "")

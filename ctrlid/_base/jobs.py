@@ -15,8 +15,6 @@ from itertools import islice
 from numbers import Integral
 from typing import Any, TypeVar
 
-import joblib
-
 from .errors import CtrlidError
 from .interruption import Budget, check_budget, check_interrupt, find_budget
 
@@ -63,6 +61,8 @@ def share_out(
     >>> list(share_out(abs, (-1, 2, -3), None))
     [1, 2, 3]
     """
+    import joblib  # Late, since it takes a while and a fit alone does not need it.
+
     if joblib.effective_n_jobs(jobs) == 1:
         for item in items:
             check_budget()
@@ -155,6 +155,8 @@ def run_side_by_side(function: Callable[[Item], Result], items: Iterable[Item]) 
 @functools.cache
 def count_processors() -> int:
     """Return the number of processors that this process may use."""
+    import joblib
+
     return int(joblib.cpu_count())
 
 

@@ -322,8 +322,8 @@ def write_html(text: str, width: int = 100) -> str:
 
     Examples
     --------
-    >>> print(write_html("p < 0.01\n  NO POLE OUTSIDE"))
-    <pre class="ctrlid" style="line-height: 1.35; overflow-x: auto">p &lt; 0.01
+    >>> print(write_html("p < 1\n  NO POLE OUTSIDE"))
+    <pre class="ctrlid" style="font-family: monospace; line-height: 1.35; overflow-x: auto">p &lt; 1
     <strong>  NO POLE OUTSIDE</strong></pre>
     """
     shown = []
@@ -335,7 +335,8 @@ def write_html(text: str, width: int = 100) -> str:
             folded = textwrap.wrap(line, width, subsequent_indent=indent)
         escaped = html.escape("\n".join(folded))
         shown.append(f"<strong>{escaped}</strong>" if is_bad_news(line) else escaped)
-    style = "line-height: 1.35; overflow-x: auto"
+    # The page around it may say otherwise, and columns need letters of one width.
+    style = "font-family: monospace; line-height: 1.35; overflow-x: auto"
     return f'<pre class="ctrlid" style="{style}">' + "\n".join(shown) + "</pre>"
 
 

@@ -7,8 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pooch
-from scipy import io
 
 from .._base.arguments import check_arguments
 from .._base.errors import CtrlidError
@@ -318,6 +316,9 @@ def load(name: str) -> Any:
         If there is no such record, the file cannot be fetched or is not the published one.
     """
     check_arguments(load, locals())
+    # Only who loads a record waits for this import.
+    from scipy import io
+
     source, read, _ = _find_entry(name)
     table = io.loadmat(_find_file(source))
     loaded = read(table)
@@ -327,6 +328,9 @@ def load(name: str) -> Any:
 
 
 def _find_file(source: Source) -> Path:
+    # Only who loads a record waits for this import.
+    import pooch
+
     folder = os.environ.get(FOLDER_VARIABLE)
     if folder:
         local = Path(folder) / source.file

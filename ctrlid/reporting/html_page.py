@@ -18,7 +18,7 @@ from ..estimation.identified_model import IdentifiedModel
 from ..estimation.likelihood.physics_estimate import LoopFit
 from ..validation.comparison import Comparison
 from . import plot
-from .plot.axes import BINS
+from .plot.axes import BINS, off_screen
 from .tables import Table, Title, make_blocks, write_heading
 
 STYLE = """
@@ -82,8 +82,9 @@ class Section:
         A `Table`, `Record`, `IdentifiedModel`, `LoopFit`, `Comparison`, `Redesign` or `Diagnosis`,
         or a tuple of them.
     figure : object, optional
-        A matplotlib figure or axes, or the bytes of a PNG file, or a mapping of such by caption. By
-        default the pictures that belong to the result; an empty mapping for none.
+        A `plot.Picture`, a matplotlib figure or axes, or the bytes of a PNG file, or a mapping of
+        such by caption. By default the pictures that belong to the result, an empty mapping for
+        none.
 
     Examples
     --------
@@ -151,9 +152,9 @@ def write_report(result: Any, path: str | Path, *, title: str = "") -> Path:
         raise CtrlidError("write_report needs at least one result; given an empty sequence")
     sections = [r if isinstance(r, Section) else Section(write_heading(r), "", r) for r in given]
     title = title or (sections[0].title if len(sections) == 1 else "ctrlid report")
-    body = "\n".join(
-        _write_section(s, alone=len(sections) == 1 and s.title == title) for s in sections
-    )
+    alone = len(sections) == 1 and sections[0].title == title
+    with off_screen():
+        body = "\n".join(_write_section(s, alone) for s in sections)
     page = (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'

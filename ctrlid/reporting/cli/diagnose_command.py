@@ -17,6 +17,7 @@ from ..._base.interruption import Budget
 from ...diagnosis import Diagnosis, diagnose
 from .. import plot
 from ..html_page import write_report
+from ..plot.axes import off_screen
 from .arguments import PLANTS, parse_assignment, parse_assignments, read_loop, read_record
 
 # The exit status of a command that Ctrl-C ended, by the convention of shells.
@@ -159,7 +160,7 @@ def _save_files(found: Diagnosis, folder: Path) -> str:
     found.save(folder / "diagnosis.json")
     with replace_file(folder / "report.txt") as file:
         file.write(f"{found}\n")
-    with replace_file(folder / "diagnosis.png", binary=True) as file:
+    with off_screen(), replace_file(folder / "diagnosis.png", binary=True) as file:
         file.write(plot.png(plot.diagnosis(found)))
     write_report(found, folder / "report.html")
     files = "report.html, report.txt, diagnosis.png and diagnosis.json"

@@ -1,18 +1,18 @@
-"""Pictures: a result and Axes in, the Axes out. The only package that imports matplotlib.
+"""Pictures: a result in, a `Picture` out. The only package that imports matplotlib.
 
-Without Axes a function makes its own figure. A script or notebook that has imported pyplot gets it
-through pyplot, so that ``plt.show()`` shows it; otherwise it is outside pyplot's list of open
-figures. Save it with ``axes.figure.savefig(...)`` or turn it into bytes with `png`. Nothing else
-that is global is changed.
+Without ``ax=`` a function makes a figure of pyplot, as python-control does: a notebook shows it,
+and ``plt.show()`` and ``plt.savefig(...)`` work after the call. ``ax=`` takes one Axes or as many
+as the picture has. `png` turns a picture into bytes. Nothing else that is global is changed.
 """
 
-from .axes import figure, png, style
+from .axes import Picture, figure, png, style
 from .findings import diagnosis
 from .models import bode, poles, trend
 from .records import comparison, record, residuals
 from .redesigns import step
 
 __all__ = [
+    "Picture",
     "bode",
     "comparison",
     "diagnosis",

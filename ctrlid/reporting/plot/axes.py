@@ -1,7 +1,10 @@
 """Figures, axes and the style that all pictures share."""
 
 import io
-import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,6 +14,7 @@ from matplotlib.rcsetup import cycler
 from matplotlib.text import Text
 
 from ..._base.errors import CtrlidError
+from ..._base.text import write_count
 
 # Okabe and Ito's colours, told apart by the colour-blind; lines and markers differ as well.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
@@ -63,16 +67,16 @@ def figure(
 
     Returns
     -------
-    numpy.ndarray of matplotlib Axes, shape (rows, columns)
-        The axes; ``axes[0, 0].figure`` is the figure.
+    Picture
+        The figure and its axes, of shape (rows, columns).
 
     Examples
     --------
     >>> import ctrlid as cid
-    >>> cid.plot.figure(2, 2).shape
+    >>> cid.plot.figure(2, 2).axes.shape
     (2, 2)
     """
-    return new_figure(size).subplots(rows, columns, squeeze=False, sharex=sharex)
+    return Picture(new_figure(size).subplots(rows, columns, squeeze=False, sharex=sharex))
 
 
 def png(drawn: Any, dpi: float = 150) -> bytes:
@@ -80,8 +84,8 @@ def png(drawn: Any, dpi: float = 150) -> bytes:
 
     Parameters
     ----------
-    drawn : matplotlib Figure, Axes or array of Axes
-        What the functions here return, or its figure.
+    drawn : Picture, matplotlib Figure, Axes or array of Axes
+        What the functions here return, or a figure or axes of matplotlib.
     dpi : float, optional
         Resolution [pixels per inch].
 
@@ -101,6 +105,7 @@ def png(drawn: Any, dpi: float = 150) -> bytes:
     >>> cid.plot.png(cid.plot.figure())[1:4]
     b'PNG'
     """
+    drawn = drawn.figure if isinstance(drawn, Picture) else drawn
     first = np.asarray(drawn, dtype=object).ravel()[0] if np.size(drawn) else None
     picture = first if isinstance(first, Figure) else getattr(first, "figure", None)
     if not isinstance(picture, Figure):
@@ -111,18 +116,70 @@ def png(drawn: Any, dpi: float = 150) -> bytes:
     return buffer.getvalue()
 
 
+@dataclass(frozen=True, eq=False, repr=False)
+class Picture:
+    """A figure with the axes that were drawn on; a notebook shows it.
+
+    Iterating over it, indexing it and ``len`` go to its axes. The figure is one of pyplot's, so
+    that ``plt.show()`` and ``plt.savefig`` find it; ``plt.close(picture.figure)`` frees it.
+
+    Parameters
+    ----------
+    axes : numpy.ndarray of matplotlib Axes
+        What was drawn on, from top to bottom.
+    """
+
+    axes: Any
+
+    @property
+    def figure(self) -> Any:
+        """The matplotlib Figure."""
+        return self.axes.flat[0].figure
+
+    def __iter__(self) -> Iterator[Any]:
+        return iter(self.axes)
+
+    def __len__(self) -> int:
+        return len(self.axes)
+
+    def __getitem__(self, index: Any) -> Any:
+        return self.axes[index]
+
+    def __repr__(self) -> str:
+        return f"Picture with {write_count(self.axes.size, 'axis', 'axes')}"
+
+    def _repr_png_(self) -> bytes | None:
+        """Return the bytes that a notebook shows, None where it shows pyplot's figures itself."""
+        from matplotlib import pyplot as plt
+
+        shown = "inline" in plt.get_backend() and plt.fignum_exists(self.figure.number)
+        return None if shown else png(self, dpi=100)
+
+
+_unseen: ContextVar[bool] = ContextVar("unseen", default=False)
+
+
+@contextmanager
+def off_screen() -> Iterator[None]:
+    """Make figures that pyplot does not know, for pictures that end up in files."""
+    before = _unseen.set(True)
+    try:
+        yield
+    finally:
+        _unseen.reset(before)
+
+
 def new_figure(size: tuple[float, float]) -> Any:
-    """Make a figure, through pyplot where the calling code has imported it and may show it."""
-    frame = sys._getframe(1)
-    while frame.f_back is not None and frame.f_globals.get("__package__") == __package__:
-        frame = frame.f_back
-    pyplot = sys.modules.get("matplotlib.pyplot")
-    inside = str(frame.f_globals.get("__name__", "")).split(".")[0] == __name__.split(".")[0]
-    names = [*frame.f_globals.values(), *frame.f_locals.values()]
-    # The package control imports pyplot as well, but it does not show our figures.
-    if pyplot is not None and not inside and any(value is pyplot for value in names):
-        return pyplot.figure(figsize=size, layout="constrained")
-    return Figure(figsize=size, layout="constrained")
+    """Make a figure as python-control does: by pyplot, on the present one while it is empty."""
+    if _unseen.get():
+        return Figure(figsize=size, layout="constrained")
+    # The import takes a while, and a session without pictures does not need it.
+    from matplotlib import pyplot as plt
+
+    if plt.get_fignums() and not plt.gcf().axes:
+        plt.gcf().set_layout_engine("constrained")
+        return plt.gcf()
+    return plt.figure(figsize=size, layout="constrained")
 
 
 def require_kind(value: Any, kind: type, sentence: str) -> None:
@@ -132,16 +189,17 @@ def require_kind(value: Any, kind: type, sentence: str) -> None:
 
 
 def take_axes(
-    axes: Any, number: int, size: tuple[float, float] | None = None, sharex: bool = False
+    ax: Any, number: int, size: tuple[float, float] | None = None, sharex: bool = False
 ) -> Any:
     """Return the axes as an array of the right length, new ones if none are given."""
-    if axes is None:
+    if ax is None:
         size = size or (7.2, 3.6 if number == 1 else 1.4 + 1.7 * number)
-        return figure(number, 1, size, sharex).ravel()
-    given = np.atleast_1d(np.asarray(axes, dtype=object)).ravel()
-    if given.size != number or not all(isinstance(ax, Axes) for ax in given):
+        return figure(number, 1, size, sharex).axes.ravel()
+    given = ax.axes if isinstance(ax, Picture) else ax
+    given = np.atleast_1d(np.asarray(given, dtype=object)).ravel()
+    if given.size != number or not all(isinstance(one, Axes) for one in given):
         raise CtrlidError(f"this picture needs {number} matplotlib Axes; given {given.size}: "
-                          f"{', '.join(type(ax).__name__ for ax in given)}")  # fmt: skip
+                          f"{', '.join(type(one).__name__ for one in given)}")  # fmt: skip
     return given
 
 

@@ -10,7 +10,7 @@ from ...diagnosis.findings import BinnedErrors
 from ...diagnosis.result import Diagnosis
 from ...diagnosis.thresholds import THRESHOLD
 from .. import pictures as _pictures
-from .axes import COLOURS, MEASURED, finish_axes, new_figure, require_kind, take_axes
+from .axes import COLOURS, MEASURED, Picture, finish_axes, new_figure, require_kind, take_axes
 
 BEFORE = {"color": COLOURS[1], "linestyle": "--", "linewidth": 1.4}
 AFTER = {"color": COLOURS[0], "linestyle": "-", "linewidth": 1.4}
@@ -22,7 +22,7 @@ FILLS: dict[str, dict[str, Any]] = {
 }
 
 
-def diagnosis(found: Diagnosis, axes: Any = None) -> Any:
+def diagnosis(found: Diagnosis, ax: Any = None) -> Picture:
     """Draw what a diagnosis found: the gap before and after, where it sits, and the ranking.
 
     From top to bottom: the measured output against the model before and after, on those samples
@@ -34,13 +34,13 @@ def diagnosis(found: Diagnosis, axes: Any = None) -> Any:
     ----------
     found : Diagnosis
         From `diagnose`.
-    axes : sequence of five matplotlib Axes, optional
+    ax : sequence of five matplotlib Axes, optional
         By default those of a new figure.
 
     Returns
     -------
-    numpy.ndarray of matplotlib Axes
-        The axes of the outputs, the errors, the two places and the ranking.
+    Picture
+        With the axes of the outputs, the errors, the two places and the ranking.
 
     Raises
     ------
@@ -49,7 +49,7 @@ def diagnosis(found: Diagnosis, axes: Any = None) -> Any:
     """
     require_kind(found, Diagnosis, "plot.diagnosis draws a Diagnosis, as diagnose() returns")
     rounds = _pictures.make_ranking(found)
-    if axes is None:
+    if ax is None:
         rows = max(sum(len(bars) + 1 for bars in rounds.values()), 3)
         height = 0.21 * rows + 0.9
         layout = [["output"] * 2, ["error"] * 2, ["first", "second"], ["ranking"] * 2]
@@ -57,14 +57,14 @@ def diagnosis(found: Diagnosis, axes: Any = None) -> Any:
         made = new_figure((8.0, sum(heights))).subplot_mosaic(
             layout, gridspec_kw={"height_ratios": heights}
         )
-        axes = list(made.values())
-    axes = take_axes(axes, 5)
+        ax = list(made.values())
+    axes = take_axes(ax, 5)
     _draw_gap(axes[0], axes[1], found)
     places = _pictures.choose_two_most_telling(found)
     for ax, place in zip(axes[2:4], [*places, None, None][:2], strict=True):
         _draw_errors(ax, place, found)
     _draw_ranking(axes[4], rounds)
-    return axes
+    return Picture(axes)
 
 
 def _draw_gap(above: Any, below: Any, found: Diagnosis) -> None:

@@ -13,10 +13,10 @@ from ...estimation.identified_model import IdentifiedModel, read_delay
 from ...estimation.series import FitSeries
 from ...physics.trace import timebase
 from .. import pictures as _pictures
-from .axes import COLOURS, MARKERS, choose_line_style, finish_axes, require_kind, take_axes
+from .axes import COLOURS, MARKERS, Picture, choose_line_style, finish_axes, require_kind, take_axes
 
 
-def poles(models: Any, ax: Any = None, *, truth: Any = None) -> Any:
+def poles(models: Any, ax: Any = None, *, truth: Any = None) -> Picture:
     """Draw the poles of models against the border of stability.
 
     If one of the models is sampled, all are drawn in the z-plane (continuous ones at
@@ -34,8 +34,8 @@ def poles(models: Any, ax: Any = None, *, truth: Any = None) -> Any:
 
     Returns
     -------
-    matplotlib Axes
-        The axes; the legend lists the poles.
+    Picture
+        Its legend lists the poles.
 
     Raises
     ------
@@ -45,8 +45,8 @@ def poles(models: Any, ax: Any = None, *, truth: Any = None) -> Any:
     Examples
     --------
     >>> import control as ct, ctrlid as cid
-    >>> ax = cid.plot.poles({"guess": ct.tf(1, [1, -1.9, 1], 0.1)}, truth=ct.tf(1, [1, 0, -1]))
-    >>> ax.get_xlabel()
+    >>> made = cid.plot.poles({"guess": ct.tf(1, [1, -1.9, 1], 0.1)}, truth=ct.tf(1, [1, 0, -1]))
+    >>> made.axes[0].get_xlabel()
     'real part of z [1]'
     """
     models = _pictures.check_models(models, "plot.poles")
@@ -55,7 +55,8 @@ def poles(models: Any, ax: Any = None, *, truth: Any = None) -> Any:
     found = {k: _pictures.find_poles(m, dt) for k, m in (*models.items(), *physics.items())}
     if not any(p.size for p in found.values()):
         raise CtrlidError("plot.poles has nothing to draw: none of the models has a pole")
-    ax = take_axes(ax, 1, size=(6.4, 3.6))[0]
+    axes = take_axes(ax, 1, size=(6.4, 3.6))
+    ax = axes[0]
     if dt:
         angle = np.linspace(0, 2 * np.pi, 721)
         ax.plot(np.cos(angle), np.sin(angle), color="0.5", linewidth=1)
@@ -75,10 +76,11 @@ def poles(models: Any, ax: Any = None, *, truth: Any = None) -> Any:
     plane, unit = ("z", "1") if dt else ("s", "rad/s")
     ax.set_xlabel(f"real part of {plane} [{unit}]")
     ax.set_ylabel(f"imaginary part of {plane} [{unit}]")
-    return finish_axes(ax, columns=1)
+    finish_axes(ax, columns=1)
+    return Picture(axes)
 
 
-def bode(models: Any, axes: Any = None, *, omega: Any = None, level: float | None = 0.95) -> Any:
+def bode(models: Any, ax: Any = None, *, omega: Any = None, level: float | None = 0.95) -> Picture:
     """Draw the frequency responses of models, magnitude above phase, of fits with their bands.
 
     Parameters
@@ -86,7 +88,7 @@ def bode(models: Any, axes: Any = None, *, omega: Any = None, level: float | Non
     models : mapping of str to control.TransferFunction or control.StateSpace
         The models by label, or one model. Sampled ones end at their Nyquist frequency, which is
         marked.
-    axes : sequence of two matplotlib Axes, optional
+    ax : sequence of two matplotlib Axes, optional
         By default those of a new figure.
     omega : array_like, optional
         Frequencies [rad/s]; by default around all poles and zeros.
@@ -96,8 +98,8 @@ def bode(models: Any, axes: Any = None, *, omega: Any = None, level: float | Non
 
     Returns
     -------
-    numpy.ndarray of matplotlib Axes
-        Magnitude and phase. Phases run on without jumps of 360 degrees, and those of different
+    Picture
+        Magnitude above phase. Phases run on without jumps of 360 degrees, and those of different
         models are drawn on the same sheet.
 
     Raises
@@ -121,7 +123,7 @@ def bode(models: Any, axes: Any = None, *, omega: Any = None, level: float | Non
     )
     if not (np.isfinite(grid).all() and grid.size > 1 and (grid > 0).all()):
         raise CtrlidError("omega needs at least two positive frequencies in rad/s")
-    axes = take_axes(axes, 2, sharex=True)
+    axes = take_axes(ax, 2, sharex=True)
     sheet: float | None = None
     limits = []
     for i, (label, model) in enumerate(models.items()):
@@ -159,7 +161,7 @@ def bode(models: Any, axes: Any = None, *, omega: Any = None, level: float | Non
     axes[1].set_xlabel("frequency [rad/s]")
     finish_axes(axes[0])
     finish_axes(axes[1], legend=False)
-    return axes
+    return Picture(axes)
 
 
 def _draw_band(
@@ -186,7 +188,7 @@ def _draw_band(
         ax.autoscale(True, axis="x")
 
 
-def trend(series: FitSeries, ax: Any = None, *, truth: Any = None) -> Any:
+def trend(series: FitSeries, ax: Any = None, *, truth: Any = None) -> Picture:
     """Draw the rightmost pole of each record against its mean output, and the line through them.
 
     Parameters
@@ -200,8 +202,8 @@ def trend(series: FitSeries, ax: Any = None, *, truth: Any = None) -> Any:
 
     Returns
     -------
-    matplotlib Axes
-        The axes; bars are 95 % intervals.
+    Picture
+        Its bars are 95 % intervals.
 
     Raises
     ------
@@ -214,12 +216,13 @@ def trend(series: FitSeries, ax: Any = None, *, truth: Any = None) -> Any:
     >>> loop = cid.Loop(cid.plants.servo(m=1.0, c=2.0, k=3.0), ct.tf(5, 1, 0.05), dt=0.05)
     >>> runs = [cid.simulate(loop, cid.random_binary(500, amplitude=0.1, hold=9, around=at, seed=1),
     ...                      sensor_noise=1e-3, seed=2) for at in (0, 1)]
-    >>> cid.plot.trend(cid.fit_each(cid.fit_iv, runs, na=2, nb=2)).get_ylabel()
+    >>> cid.plot.trend(cid.fit_each(cid.fit_iv, runs, na=2, nb=2)).axes[0].get_ylabel()
     'rightmost pole [rad/s]'
     """
     require_kind(series, FitSeries, "plot.trend draws a FitSeries, as fit_each() returns")
     line = series.trend
-    ax = take_axes(ax, 1)[0]
+    axes = take_axes(ax, 1)
+    ax = axes[0]
     scale, unit = _pictures.choose_scale([series.levels], series.unit)
     y = np.linspace(series.levels.min(), series.levels.max(), 101)
     ax.plot(scale * y, line.pole + line.slope * (y - line.level), label="line through the fits",
@@ -230,7 +233,8 @@ def trend(series: FitSeries, ax: Any = None, *, truth: Any = None) -> Any:
                 color="k", capsize=4, label="fits, 95 % intervals")  # fmt: skip
     ax.set_xlabel(f"mean output [{unit}]")
     ax.set_ylabel("rightmost pole [rad/s]")
-    return finish_axes(ax, columns=3)
+    finish_axes(ax, columns=3)
+    return Picture(axes)
 
 
 def _choose_view(ax: Any, places: Any) -> None:

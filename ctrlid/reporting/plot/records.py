@@ -17,6 +17,7 @@ from .axes import (
     COLOURS,
     DASHES,
     MEASURED,
+    Picture,
     choose_line_style,
     finish_axes,
     require_kind,
@@ -24,7 +25,7 @@ from .axes import (
 )
 
 
-def record(record: Record, axes: Any = None, *, extra: Sequence[str] = ()) -> Any:
+def record(record: Record, ax: Any = None, *, extra: Sequence[str] = ()) -> Picture:
     """Draw an experiment: reference and output, the input below, and extra channels on request.
 
     Stretches that do not count are shaded. A long record is drawn as the band between the smallest
@@ -34,15 +35,15 @@ def record(record: Record, axes: Any = None, *, extra: Sequence[str] = ()) -> An
     ----------
     record : Record
         The experiment; draw a part with ``record.between(t0, t1)``.
-    axes : sequence of matplotlib Axes, optional
+    ax : sequence of matplotlib Axes, optional
         Two, and one more for each extra channel; by default those of a new figure.
     extra : sequence of str, optional
         Names of extra channels.
 
     Returns
     -------
-    numpy.ndarray of matplotlib Axes
-        The axes, from top to bottom.
+    Picture
+        Its axes, from top to bottom.
 
     Raises
     ------
@@ -53,8 +54,8 @@ def record(record: Record, axes: Any = None, *, extra: Sequence[str] = ()) -> An
     --------
     >>> import ctrlid as cid
     >>> r = cid.random_binary(500, amplitude=1, hold=20, seed=1)
-    >>> axes = cid.plot.record(cid.Record(r=r, u=-r, y=0.9 * r, dt=0.01, units={"y": "mm"}))
-    >>> [ax.get_ylabel() for ax in axes]
+    >>> picture = cid.plot.record(cid.Record(r=r, u=-r, y=0.9 * r, dt=0.01, units={"y": "mm"}))
+    >>> [ax.get_ylabel() for ax in picture.axes]
     ['y [mm]', 'u [unit not given]']
     """
     require_kind(record, Record, "plot.record draws a Record")
@@ -65,7 +66,7 @@ def record(record: Record, axes: Any = None, *, extra: Sequence[str] = ()) -> An
             f"the record has no extra channel {_text.write_list([repr(k) for k in unknown])}; it "
             f"has {', '.join(record.extra) or 'none'}"
         )
-    axes = take_axes(axes, 2 + len(extra), sharex=True)
+    axes = take_axes(ax, 2 + len(extra), sharex=True)
     both = [record.y] if record.r is None else [record.y, record.r]
     scale, unit = _pictures.choose_scale(both, record.units.get("y", ""))
     name = record.names.get("y", "y")
@@ -86,12 +87,12 @@ def record(record: Record, axes: Any = None, *, extra: Sequence[str] = ()) -> An
         _shade_gaps(ax, record)
         finish_axes(ax)
     axes[-1].set_xlabel("time [s]")
-    return axes
+    return Picture(axes)
 
 
 def comparison(
     comparison: Comparison, ax: Any = None, *, window: tuple[float, float] | None = None
-) -> Any:
+) -> Picture:
     """Draw the measured output against each prediction and simulation.
 
     Parameters
@@ -106,8 +107,8 @@ def comparison(
 
     Returns
     -------
-    matplotlib Axes
-        The axes; the legend says of every curve what it is and its fit over the whole record.
+    Picture
+        Its legend says of every curve what it is and its fit over the whole record.
 
     Raises
     ------
@@ -120,8 +121,7 @@ def comparison(
     >>> loop = cid.Loop(cid.plants.servo(m=1.0, c=2.0, k=3.0), 5.0, dt=0.01)
     >>> r = cid.random_binary(1000, amplitude=0.1, hold=50, seed=1)
     >>> found = cid.compare(cid.simulate(loop, r, sensor_noise=1e-3, seed=2), loop)
-    >>> ax = cid.plot.comparison(found, window=(0, 5))
-    >>> ax.get_xlabel()
+    >>> cid.plot.comparison(found, window=(0, 5)).axes[0].get_xlabel()
     'time [s], 0 to 5 s of a record from 0 to 10 s'
     """
     require_kind(comparison, Comparison, "plot.comparison draws a Comparison, as compare() returns")
@@ -133,7 +133,8 @@ def comparison(
         part = whole.between(*window)
         first = round((part.start - whole.start) / whole.dt)
         stop = first + len(part)
-    ax = take_axes(ax, 1)[0]
+    axes = take_axes(ax, 1)
+    ax = axes[0]
     t, shown = whole.t[first:stop], slice(first, stop)
     scale, unit = _pictures.choose_scale([whole.y[shown]], whole.units.get("y", ""))
     y = scale * whole.y[shown]
@@ -160,23 +161,24 @@ def comparison(
     ends = [f"{a:.4g} to {a + n * whole.dt:.4g} s" for a, n in
             ((t[0], len(t)), (whole.start, len(whole)))]  # fmt: skip
     ax.set_xlabel(f"time [s], {ends[0]} of a record from {ends[1]}")
-    return finish_axes(ax)
+    finish_axes(ax)
+    return Picture(axes)
 
 
-def residuals(comparison: Comparison, axes: Any = None) -> Any:
+def residuals(comparison: Comparison, ax: Any = None) -> Picture:
     """Draw the correlations of the one-step errors with their 99 % bands.
 
     Parameters
     ----------
     comparison : Comparison
         From `compare`.
-    axes : sequence of matplotlib Axes, optional
+    ax : sequence of matplotlib Axes, optional
         One for each of `comparison.tests`; by default those of a new figure.
 
     Returns
     -------
-    numpy.ndarray of matplotlib Axes
-        The axes, from top to bottom.
+    Picture
+        Its axes, from top to bottom.
 
     Raises
     ------
@@ -189,14 +191,14 @@ def residuals(comparison: Comparison, axes: Any = None) -> Any:
     >>> loop = cid.Loop(cid.plants.servo(m=1.0, c=2.0, k=3.0), 5.0, dt=0.01)
     >>> r = cid.random_binary(1000, amplitude=0.1, hold=50, seed=1)
     >>> found = cid.compare(cid.simulate(loop, r, sensor_noise=1e-3, seed=2), loop)
-    >>> len(cid.plot.residuals(found))
-    3
+    >>> cid.plot.residuals(found)
+    Picture with 3 axes
     """
     require_kind(comparison, Comparison, "plot.residuals draws a Comparison, as compare() returns")
     if not comparison.tests:
         raise CtrlidError("plot.residuals has nothing to draw: the one-step errors are only "
                           "round-off and were not tested")  # fmt: skip
-    axes = take_axes(axes, len(comparison.tests), sharex=True)
+    axes = take_axes(ax, len(comparison.tests), sharex=True)
     for ax, test in zip(axes, comparison.tests, strict=True):
         inside = np.abs(test.values) <= test.band
         if np.isfinite(test.band):
@@ -219,7 +221,7 @@ def residuals(comparison: Comparison, axes: Any = None) -> Any:
         finish_axes(ax, legend=False)
     axes[0].legend(loc="lower right", bbox_to_anchor=(1, 1.12), ncols=3, frameon=False, borderpad=0)
     axes[-1].set_xlabel("lag [samples]")
-    return axes
+    return Picture(axes)
 
 
 def _draw_trace(

@@ -7,23 +7,23 @@ import numpy as np
 
 from ..._base.errors import CtrlidError
 from ...design.redesigning import Redesign
-from .axes import MARKERS, choose_line_style, finish_axes, require_kind, take_axes
+from .axes import MARKERS, Picture, choose_line_style, finish_axes, require_kind, take_axes
 
 
-def step(redesigns: Any, axes: Any = None) -> Any:
+def step(redesigns: Any, ax: Any = None) -> Picture:
     """Draw what redesigns promised against what they achieved on the physics.
 
     Parameters
     ----------
     redesigns : Redesign or mapping of str to Redesign
         From `redesign`: one, or several by a label, each with axes of its own.
-    axes : matplotlib Axes or sequence of them, optional
+    ax : matplotlib Axes or sequence of them, optional
         By default those of a new figure.
 
     Returns
     -------
-    matplotlib Axes or numpy.ndarray of matplotlib Axes
-        The axes of the redesign; of a mapping an array, in its order.
+    Picture
+        With axes for each redesign, in their order.
 
     Raises
     ------
@@ -38,11 +38,11 @@ def step(redesigns: Any, axes: Any = None) -> Any:
     >>> loop = cid.Loop(plant, None, dt=0.001, at=op)
     >>> G = cid.linearize(plant, op)
     >>> slow = cid.redesign(G, loop, crossover=100, phase_margin=50)
-    >>> cid.plot.step(slow).get_xlabel()
+    >>> cid.plot.step(slow).axes[0].get_xlabel()
     'time after the step [s]'
     >>> fast = cid.redesign(G, loop, crossover=200, phase_margin=50)
-    >>> len(cid.plot.step({"100 rad/s": slow, "200 rad/s": fast}))
-    2
+    >>> cid.plot.step({"100 rad/s": slow, "200 rad/s": fast})
+    Picture with 2 axes
     """
     several = redesigns if isinstance(redesigns, Mapping) else {"": redesigns}
     if not several:
@@ -51,7 +51,7 @@ def step(redesigns: Any, axes: Any = None) -> Any:
     for redesign in several.values():
         require_kind(redesign, Redesign, needed)
     size = (7.2, 3.2 * len(several)) if len(several) > 1 else None
-    axes = take_axes(axes, len(several), size, sharex=True)
+    axes = take_axes(ax, len(several), size, sharex=True)
     ends = []
     for ax, (label, redesign) in zip(axes, several.items(), strict=True):
         ends.append(_draw_step(ax, redesign))
@@ -61,7 +61,7 @@ def step(redesigns: Any, axes: Any = None) -> Any:
     for ax in axes:
         ax.set_xlim(0, max(ends))
         ax.set_xlabel("time after the step [s]" if ax is axes[-1] else "")
-    return axes if isinstance(redesigns, Mapping) else axes[0]
+    return Picture(axes)
 
 
 def _draw_step(ax: Any, redesign: Redesign) -> float:
