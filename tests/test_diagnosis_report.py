@@ -5,6 +5,7 @@ import json
 import math
 from dataclasses import replace
 
+import control as ct
 import numpy as np
 import pytest
 
@@ -389,7 +390,11 @@ def test_picture_of_an_explanation(found):
     assert error.get_xlabel() == "time [s], where the gap is largest among 1000 samples kept back"
     assert [ax.get_xlabel() for ax in (first, second)] == ["velocity [mm/s]", "position [mm]"]
     assert set(legend(first)) == {"before", "after", "noise"}
-    assert len(first.patches) == 16
+    edges = [bars.get_data().edges for bars in first.patches]
+    places = {place.axis: 1e3 * place.edges for place in found["explained"].where}
+    assert len(edges) == 3
+    for drawn in edges:
+        np.testing.assert_allclose(drawn, places["velocity"])
     assert set(legend(ranking)) == {
         "required net gain, 5",
         "found",
@@ -411,6 +416,41 @@ def test_picture_without_effects(found, verdict):
     assert set(legend(first)) == {"recalibrated", "noise"}
     assert "found" not in legend(ranking)
     plot.png(output)
+
+
+def test_an_effect_is_drawn_as_found_in_the_round_that_took_it(found):
+    """A lag stood in for friction in round 1 with the longest bar, was dropped, and came back."""
+    base = found["explained"]
+    bar = next(c for c in base.ranking if type(c.effect).__name__ == "CoulombFriction")
+    ranking = tuple(replace(bar, round=k, gain=g) for k, g in ((1, 900.0), (2, 400.0), (3, 2.0)))
+    rounds = _pictures.make_ranking(replace(base, ranking=ranking))
+    assert {k: bars[0].kind for k, bars in rounds.items()} == {
+        1: "refitted", 2: "found", 3: "refitted"}  # fmt: skip
+    assert rounds[2][0].evidence == base.findings[0].evidence
+    shown = [t.get_text() for t in plot.diagnosis(replace(base, ranking=ranking))[4].texts]
+    assert any(t.endswith(f"; evidence {base.findings[0].evidence:.0f}") for t in shown)
+
+
+def test_legends_stay_in_the_figure_and_ticks_are_plain_numbers(found):
+    base = found["explained"]
+    wide = replace(base.gap, unit="a long unit", floor=1.23e-4, before=1234.5, after=987.6)
+    far = replace(base.where[0], edges=np.r_[-5e3, np.linspace(-740, 700, 7), 5e3], unit="V")
+    picture = plot.diagnosis(replace(base, gap=wide, where=(far, base.where[1])))
+    picture.figure.draw_without_rendering()
+    for ax in picture:
+        made = ax.get_legend()
+        assert made is None or made.get_window_extent().x1 <= picture.figure.bbox.x1
+        shown = [t.get_text() for t in (*ax.get_xticklabels(), *ax.get_yticklabels())]
+        assert not any("e+" in t for t in shown)
+    assert "-740" in [t.get_text() for t in picture[2].get_xticklabels()]
+
+
+def test_the_unit_circle_is_round():
+    for size in ((4, 6), (9, 3)):
+        (ax,) = plot.poles(ct.tf([1, 1], [1, -2.01, 1], 0.005), plot.figure(size=size))
+        ax.figure.draw_without_rendering()
+        (x0, y0), (x1, y1) = ax.transData.transform([(0, 0), (1, 1)])
+        assert x1 - x0 == pytest.approx(y1 - y0)
 
 
 def test_a_candidate_that_no_round_took_is_not_drawn_as_found(found):

@@ -13,6 +13,7 @@ from .._base.arrays import Array
 from .._base.errors import CtrlidError
 from ..diagnosis.findings import BinnedErrors, Candidate, Gap
 from ..diagnosis.result import Diagnosis
+from ..diagnosis.thresholds import THRESHOLD
 from ..physics.trace import timebase
 from ..validation.comparison import Comparison
 
@@ -146,28 +147,35 @@ class Bar:
     kind : {"found", "not told apart", "refitted", "not refitted"}
         What became of it; of one that was not refitted the gain is the score, which its first
         step expects.
+    evidence : float
+        The evidence of what was found, in the end: its gain over the model without it but with all
+        other effects; NaN for others.
     """
 
     label: str
     net_gain: float
     kind: Kind
+    evidence: float = math.nan
 
 
 def make_ranking(found: Diagnosis) -> dict[int, list[Bar]]:
     """Return the best candidates of each round as bars, the best first."""
     value = {id(c): _compute_net_gain(c) for c in found.ranking}
     kinds: dict[int, Kind] = {}
+    evidence: dict[int, float] = {}
     for finding in found.added:
-        own = [c for c in found.ranking
-               if type(c.effect).__name__ == finding.name and value[id(c)] > 0]  # fmt: skip
-        # An effect that was read off the record itself, such as the steps of a converter, has no
-        # bar.
-        if not own:
+        # Once it is taken an effect is no candidate any more, so that it was taken in the last
+        # round in which it earned a place. One that was read off the record has no bar.
+        own = [c for c in found.ranking if type(c.effect).__name__ == finding.name
+               and value[id(c)] > 0 and id(c) not in kinds]  # fmt: skip
+        earned = [c for c in own if value[id(c)] > THRESHOLD.gate] or own
+        if not earned:
             continue
-        best = max(own, key=lambda c: value[id(c)])
-        kinds[id(best)] = "found"
+        taken = max(earned, key=lambda c: c.round)
+        kinds[id(taken)] = "found"
+        evidence[id(taken)] = finding.evidence
         for c in found.ranking:
-            if c.round == best.round and type(c.effect).__name__ in (
+            if c.round == taken.round and type(c.effect).__name__ in (
                 *finding.names[1:], *finding.equivalents
             ):  # fmt: skip
                 kinds.setdefault(id(c), "not told apart")
@@ -178,7 +186,8 @@ def make_ranking(found: Diagnosis) -> dict[int, list[Bar]]:
         shown = sorted(tried[:BARS], key=lambda c: -value[id(c)])
         rounds[number] = [
             Bar(type(c.effect).__name__, value[id(c)],
-                kinds.get(id(c), "refitted" if math.isfinite(c.gain) else "not refitted"))
+                kinds.get(id(c), "refitted" if math.isfinite(c.gain) else "not refitted"),
+                evidence.get(id(c), math.nan))
             for c in shown
         ]  # fmt: skip
     return rounds
@@ -189,15 +198,13 @@ def _compute_net_gain(c: Candidate) -> float:
     return max(gain - c.penalty, LEAST) if math.isfinite(gain) else LEAST
 
 
-def write_bin_labels(place: BinnedErrors) -> tuple[list[str], str]:
-    """Return the edges of the bins of a place as labels, and the title of the axis."""
-    known = place.edges[np.isfinite(place.edges)]
-    factor, unit = choose_scale([known] if known.size else [np.zeros(1)], place.unit)
-    digits = next(
-        (d for d in (2, 3, 4) if len({_text.write_number(e, d) for e in known}) == known.size), 5
-    )
-    labels = [_text.write_number(factor * e, digits) if np.isfinite(e) else "" for e in place.edges]
-    widths = np.diff(known)
-    even = widths.size == 0 or float(np.ptp(widths)) < 0.01 * float(np.max(widths))
-    title = f"{place.axis} [{unit}]"
-    return labels, title if even else f"{title}, at the edges of the bins"
+def scale_edges(place: BinnedErrors) -> tuple[Array, str]:
+    """Return the edges of the bins of a place as they are drawn, and the title of their axis."""
+    edges = np.array(place.edges, dtype=float)
+    # A bin without an end is drawn as wide as its neighbour.
+    if not np.isfinite(edges[0]):
+        edges[0] = 2 * edges[1] - edges[2]
+    if not np.isfinite(edges[-1]):
+        edges[-1] = 2 * edges[-2] - edges[-3]
+    factor, unit = choose_scale([edges], place.unit)
+    return factor * edges, f"{place.axis} [{unit}]"

@@ -222,8 +222,7 @@ def finish_axes(ax: Any, *, legend: bool = True, columns: int = 2, size: str = "
         ax.ticklabel_format(useOffset=False, axis="both")
         ax.locator_params(axis="x", nbins=6)
     if legend:
-        ax.legend(loc="lower left", bbox_to_anchor=(0, 1.0), ncols=columns, frameon=False,
-                  borderaxespad=0.3, fontsize=size, handlelength=2.6)  # fmt: skip
+        _place_legend(ax, columns, size)
     take_literally(ax)
     return ax
 
@@ -237,3 +236,17 @@ def take_literally(ax: Any) -> None:
     for text in ax.findobj(Text):
         if text not in ticks:
             text.set_parse_math(False)
+
+
+def _place_legend(ax: Any, columns: int, size: str) -> None:
+    """Put a legend above the axes, in so many columns that it does not run off the figure."""
+    for number in range(columns, 0, -1):
+        made = ax.legend(loc="lower left", bbox_to_anchor=(0, 1.0), ncols=number, frameon=False,
+                         borderaxespad=0.3, fontsize=size, handlelength=2.6)  # fmt: skip
+        for text in made.get_texts():
+            text.set_parse_math(False)
+        # The layout is made when the figure is drawn, and only widens this place.
+        place = ax.get_subplotspec()
+        room = ax.get_position() if place is None else place.get_position(ax.figure)
+        if made.get_window_extent().width <= room.width * ax.figure.bbox.width:
+            return

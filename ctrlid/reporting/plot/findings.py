@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from matplotlib.ticker import FixedLocator, NullLocator
 
 from ..._base.arrays import Array
 from ...diagnosis.findings import BinnedErrors
@@ -120,28 +121,33 @@ def _draw_errors(ax: Any, place: BinnedErrors | None, found: Diagnosis) -> None:
         ax.text(0.5, 0.5, "no bins to show", ha="center", va="center", transform=ax.transAxes)
         ax.set_axis_off()
         return
-    at, before, after = np.arange(len(place.before)), np.sqrt(place.before), np.sqrt(place.after)
+    edges, title = _pictures.scale_edges(place)
+    before, after = np.sqrt(place.before), np.sqrt(place.after)
     both = bool(found.added)
-    solid = {"facecolor": COLOURS[0], "edgecolor": COLOURS[0], "linewidth": 0.8}
+    # Bins hold equally many samples each, so that they are of unequal width.
+    filled, label = (after, "after") if both else (before, "recalibrated")
+    ax.stairs(np.nan_to_num(filled), edges, fill=True, color=COLOURS[0], alpha=0.55, label=label)
+    ax.stairs(filled, edges, color=COLOURS[0], linewidth=0.8)
     if both:
-        ax.bar(at + 0.3, before, 0.4, label="before", facecolor="w", edgecolor=COLOURS[1],
-               hatch="//////", linewidth=0.8)  # fmt: skip
-        ax.bar(at + 0.7, after, 0.4, label="after", **solid)
-    else:
-        ax.bar(at + 0.5, before, 0.8, label="recalibrated", **solid)
+        ax.stairs(before, edges, label="before", baseline=None, **BEFORE)
     ax.axhline(1, color="k", linewidth=1.2, linestyle=":", label="noise")
-    labels, title = _pictures.write_bin_labels(place)
-    every = -(-len(at) // 5)
-    ax.set_xlim(0, len(at))
+    ax.set_xlim(edges[0], edges[-1])
     ax.set_xlabel(title)
     ax.set_ylabel("normalized RMS of\none-step errors [1]")
     top = float(np.nanmax([*before, *after, 1.0]))
     finish_axes(ax, columns=3, size="small")
+    ax.locator_params(axis="x", nbins=5)
+    inner = edges[1:-1]
+    if np.ptp(inner) < np.ptp(edges) / 4 and np.any(inner):
+        # Seldom and far values would leave no room for the others.
+        ax.set_xscale("symlog", linthresh=float(np.max(np.abs(inner))))
+        ax.xaxis.set_major_locator(FixedLocator([edges[0], inner[0], 0.0, inner[-1], edges[-1]]))
+        ax.xaxis.set_minor_locator(NullLocator())
+        ax.xaxis.set_major_formatter(lambda v, _: f"{v:.0f}" if abs(v) >= 100 else f"{v:.3g}")
     if top > 10:
         ax.set_yscale("log")
     else:
         ax.set_ylim(0, 1.1 * top)
-    ax.set_xticks(np.arange(len(labels))[::every], labels[::every])
 
 
 def _draw_ranking(ax: Any, rounds: Mapping[int, Sequence[_pictures.Bar]]) -> None:
@@ -156,7 +162,10 @@ def _draw_ranking(ax: Any, rounds: Mapping[int, Sequence[_pictures.Bar]]) -> Non
         for bar in bars:
             ax.barh(row, bar.net_gain, 0.72, linewidth=0.7, **FILLS[bar.kind],
                     label=None if bar.kind in drawn else bar.kind)  # fmt: skip
-            ax.annotate(f"{bar.net_gain:.0f}", (max(bar.net_gain, 0.0), row), (3, 0), va="center",
+            words = f"{bar.net_gain:.0f}"
+            if np.isfinite(bar.evidence):
+                words += f"; evidence {bar.evidence:.0f}"
+            ax.annotate(words, (max(bar.net_gain, 0.0), row), (3, 0), va="center",
                         textcoords="offset points", fontsize="x-small")  # fmt: skip
             drawn.add(bar.kind)
             labels.append(bar.label)
@@ -168,10 +177,10 @@ def _draw_ranking(ax: Any, rounds: Mapping[int, Sequence[_pictures.Bar]]) -> Non
     ax.axvline(0, color="0.3", linewidth=0.8)
     ax.set_xscale("symlog", linthresh=2 * gate)
     ax.xaxis.set_major_formatter("{x:g}")
-    ax.set_xlim(_pictures.LEAST, 3 * max(top, 2 * gate))
+    ax.set_xlim(_pictures.LEAST, 12 * max(top, 2 * gate))
     ax.set_yticks(range(row), labels, fontsize="small")
     ax.tick_params(axis="y", length=0)
     ax.set_ylim(row - 0.4, -0.6)
-    ax.set_xlabel("net gain: evidence less the Bayesian penalty (BIC) [log-likelihood]")
+    ax.set_xlabel("net gain in its round, less the Bayesian penalty (BIC) [log-likelihood]")
     finish_axes(ax, columns=5, size="small")
     ax.grid(False, axis="y")
