@@ -102,7 +102,7 @@ def test_a_simulation_follows_a_tight_solver(y):
 def test_a_prediction_follows_a_tight_solver(y):
     sizes = {}
     for hold in ("foh", "bandlimited"):
-        found = cid.predict(oscillator(), make_record(y, hold), force_noise=1.0)
+        found = cid.predict(oscillator(), make_record(y, hold), noise_ratio=1.0)
         sizes[hold] = relative(found.innovations[30:-3], y)
     assert sizes["bandlimited"] < 1e-3
     assert sizes["foh"] > 30 * sizes["bandlimited"]
@@ -169,7 +169,7 @@ def test_backlash_and_dead_zone_act_on_what_is_reconstructed():
         loop = oscillator().with_effect(effect)
         simulator = Simulator(loop, tolerance=1e-5, hold="bandlimited")
         y = simulator.run(simulator.start(None), None, d)[0]
-        ahead, plain = (cid.predict(one, make_record(y), force_noise=1.0).innovations[30:-3]
+        ahead, plain = (cid.predict(one, make_record(y), noise_ratio=1.0).innovations[30:-3]
                         for one in (loop, oscillator()))  # fmt: skip
         assert relative(ahead, y) < 3e-3 < 0.1 * relative(plain, y)
 

@@ -258,7 +258,7 @@ def test_the_fixed_point_is_the_extended_kalman_filter():
     record = cid.simulate(with_less, 0.012 + 0.4 * (r - 0.012), sensor_noise=2e-5, force_noise=0.3,
                           seed=4)  # fmt: skip
     expected, s, states = sequential(record, 0.3, 2e-5, 0.0213, 3.34e-6)
-    found = cid.predict(with_less, record, force_noise=0.3 / 2e-5)
+    found = cid.predict(with_less, record, noise_ratio=0.3 / 2e-5)
     late = slice(40, None)
     # Far from linear: a filter about the operating point differs much.
     flat = linearized_at_rest(with_less, record)
@@ -275,7 +275,7 @@ def linearized_at_rest(loop, record):
     """Innovations of the filter that is linearized at the operating point once and for all."""
     P = cid.linearize(loop.plant, loop.at)
     linear = cid.Loop(P, None, dt=loop.dt, at=cid.OperatingPoint((), loop.at.input, 0.012))
-    return cid.predict(linear, record, force_noise=0.3 / 2e-5).innovations
+    return cid.predict(linear, record, noise_ratio=0.3 / 2e-5).innovations
 
 
 # --- maps over one period
@@ -624,7 +624,7 @@ def test_a_neutral_effect_rests_in_the_place_of_its_own_states():
     # So nothing moves the mode at the start, and the filter is that with next to nothing of it.
     record = record_of(driven, swing=1e-4, hold=20, n=400, seed=1, sensor_noise=1e-5)
     slight = loop.with_effect(E.FlexibleMode(frequency=28.0, damping=0.03, coupling=1e-9))
-    still, moved = (cid.predict(x, record, force_noise=0.1) for x in (both, slight))
+    still, moved = (cid.predict(x, record, noise_ratio=0.1) for x in (both, slight))
     assert still.circuit.shape == moved.circuit.shape == (400, 0)
     np.testing.assert_allclose(still.states, moved.states[:, [0, 1, 4]], rtol=1e-6, atol=1e-9)
 

@@ -58,7 +58,7 @@ def test_equals_an_independent_kalman_filter(stiffness):
     r = 0.3 + cid.random_binary(3000, amplitude=1e-3, hold=50, seed=1)
     record = cid.simulate(loop, r, sensor_noise=1e-5, force_noise=1.0, seed=2)
     ratio = 1e5
-    prediction = cid.predict(loop, record, force_noise=ratio)
+    prediction = cid.predict(loop, record, noise_ratio=ratio)
     both = np.vstack([np.column_stack([A, B, [0.0, 1.0]]), np.zeros((2, 4))])
     whole = linalg.expm(dt * both)
     expected, s = kalman(whole[:2, :2], whole[:2, 2], np.array([1.0, 0.0]), whole[:2, 3],
@@ -82,7 +82,7 @@ def test_a_plant_in_discrete_time():
         x = a @ x + b * (uk + 0.1 * rng.standard_normal())
     loop = cid.Loop(plant, None, dt=0.1)
     record = cid.Record(u=u, y=y, dt=0.1)
-    prediction = cid.predict(loop, record, force_noise=2.0)
+    prediction = cid.predict(loop, record, noise_ratio=2.0)
     expected, _ = kalman(a, b, c, b, u, record.y, 2.0)
     np.testing.assert_allclose(prediction.y[200:], expected[200:], atol=1e-7)
     assert prediction.sensor_noise == pytest.approx(0.05, rel=0.05)
@@ -97,7 +97,7 @@ def test_a_plant_in_discrete_time():
 def test_innovations_are_white_and_of_the_expected_size(analog):
     loop = levitated(analog=analog)
     record = experiment(loop, force_noise=FORCE)
-    prediction = cid.predict(loop, record, force_noise=FORCE / SENSOR)
+    prediction = cid.predict(loop, record, noise_ratio=FORCE / SENSOR)
     assert prediction.sensor_noise == pytest.approx(SENSOR, rel=0.05)
     e, known = prediction.innovations, prediction.settled
     assert known.sum() > 5900
@@ -131,9 +131,9 @@ def test_a_known_analog_circuit_is_followed_between_samples():
     """A straight line between the samples of u misses what the circuit did at each switch."""
     loop = levitated(analog=True)
     record = experiment(loop, sensor_noise=0.0)
-    known = cid.predict(loop, record, force_noise=1e3).innovations
+    known = cid.predict(loop, record, noise_ratio=1e3).innovations
     alone = cid.Loop(loop.plant, None, dt=loop.dt, at=loop.at)
-    straight = cid.predict(alone, record, force_noise=1e3).innovations
+    straight = cid.predict(alone, record, noise_ratio=1e3).innovations
     assert known.std() < 1e-3 * straight.std()
 
 
@@ -170,7 +170,7 @@ def test_what_is_not_valid_is_not_looked_at():
     y[~valid] = 5.0  # nonsense, as from a ball on the floor
     u[:700], u[2000:2400] = 9.0, 9.0
     soiled = cid.Record(r=record.r, u=u, y=y, dt=record.dt, valid=valid)
-    a, b = (cid.predict(loop, r, force_noise=1e4) for r in (clean, soiled))
+    a, b = (cid.predict(loop, r, noise_ratio=1e4) for r in (clean, soiled))
     np.testing.assert_array_equal(a.innovations, b.innovations)
     assert np.all(a.innovations[~valid] == 0)
     assert not a.settled[~valid].any()
@@ -242,8 +242,8 @@ def test_refusals():
     with pytest.raises(CtrlidError, match=r"the loop is sampled at 0.001 s, the record at 0.002 s"):
         cid.predict(loop, record.decimate(2, antialias=False))
     for bad in (-1.0, np.nan, np.inf):
-        with pytest.raises(CtrlidError, match=r"force_noise is the ratio .* >= 0; given"):
-            cid.predict(loop, record, force_noise=bad)
+        with pytest.raises(CtrlidError, match=r"noise_ratio is the ratio .* >= 0; given"):
+            cid.predict(loop, record, noise_ratio=bad)
     blind = cid.Record(u=record.u, y=record.y, dt=1e-3, valid=np.arange(200) < 9)
     with pytest.raises(CtrlidError, match="at least 10 valid samples; the record has 9 of 200"):
         cid.predict(loop, blind)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import difflib
 import html
 import math
 import re
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from .units import is_unit
 
@@ -69,6 +70,33 @@ def with_error(value: complex, error: float) -> str:
 def write_p_value(p: float) -> str:
     """Return a p-value in words; of the very small ones the size says nothing."""
     return f"p = {p:.2g}" if p >= 1e-4 else "p < 0.0001"
+
+
+def write_percent(share: float, digits: int = 2) -> str:
+    """Write a share in per cent with so many digits, never as a power of ten.
+
+    Parameters
+    ----------
+    share : float
+        The share; 1 is all.
+    digits : int, optional
+        Significant digits of what is below 100 %; above, all digits before the point are written.
+
+    Returns
+    -------
+    str
+        The share in per cent.
+
+    Examples
+    --------
+    >>> write_percent(1.0), write_percent(34.2), write_percent(0.0123), write_percent(2e-7)
+    ('100 %', '3420 %', '1.2 %', 'under 0.001 %')
+    """
+    percent = 100 * share
+    if 0 < percent < 1e-3:
+        return "under 0.001 %"
+    text = f"{percent:.{digits}g}"
+    return f"{percent:.0f} %" if "e+" in text else f"{float(text):.10g} %"
 
 
 def choose_prefix(size: float, unit: str) -> tuple[float, str]:
@@ -198,6 +226,37 @@ def write_list(items: list[str] | tuple[str, ...]) -> str:
     if len(items) < 2:
         return "".join(items)
     return ", ".join(items[:-1]) + " and " + items[-1]
+
+
+def find_near_name(name: str, known: Iterable[str]) -> str | None:
+    """Return what a wrong name probably means; None if nothing is near.
+
+    Parameters
+    ----------
+    name : str
+        The name as it was typed.
+    known : iterable of str
+        The names that there are.
+
+    Returns
+    -------
+    str or None
+        One that differs in capitals only, or begins or ends with it, or else is spelled alike.
+
+    Examples
+    --------
+    >>> find_near_name("Coulomb", ("ViscousFriction", "CoulombFriction")), find_near_name("q", "ab")
+    ('CoulombFriction', None)
+    """
+    lower = {k.lower(): k for k in sorted(known, reverse=True)}
+    typed = name.lower().replace("_", "")
+    plain = {k.replace("_", ""): v for k, v in lower.items()}
+    if typed in plain:
+        return plain[typed]
+    parts = [v for k, v in sorted(plain.items()) if len(typed) > 2
+             and (k.startswith(typed) or k.endswith(typed))]  # fmt: skip
+    alike = parts or [plain[k] for k in difflib.get_close_matches(typed, plain, 1)]
+    return alike[0] if alike else None
 
 
 def write_count(number: int, noun: str, plural: str = "") -> str:

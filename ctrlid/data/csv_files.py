@@ -15,7 +15,7 @@ import numpy as np
 
 from .._base.errors import CtrlidError, CtrlidWarning
 from .._base.files import replace_file
-from .._base.text import drop_roundoff, split_unit, with_unit
+from .._base.text import drop_roundoff, split_unit, with_unit, write_percent
 
 TIME = ("t", "time", "timestamp", "seconds", "zeit")
 SECONDS = {"": 1.0, "s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6,
@@ -445,9 +445,9 @@ def _make_uniform(stamps: Any, dt: float | None, gaps: str, path: Path) -> tuple
     jitter = float(np.max(np.abs(steps - (missing + 1) * dt))) / dt
     if jitter > JITTER + rounding / dt:
         warnings.warn(
-            f"the times of {path} jitter by up to {100 * jitter:.2g} % of the period {dt:.4g} s; "
-            "they are taken as uniform. If the samples really were taken unevenly, resample them "
-            "first",
+            f"the times of {path} jitter by up to {write_percent(jitter)} of the period "
+            f"{dt:.4g} s; they are taken as uniform. If the samples really were taken "
+            "unevenly, resample them first",
             CtrlidWarning, stacklevel=4,
         )  # fmt: skip
     return dt, np.repeat(np.arange(len(stamps)), np.append(missing, 0) + 1)

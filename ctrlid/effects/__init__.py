@@ -1,6 +1,9 @@
 """The catalogue of effects: what real plants have and models leave out."""
 
+from typing import Any
+
 from .._base.errors import EffectDoesNotApply
+from .._base.text import find_near_name
 from .base import AbstractEffect
 from .catalogue import CATALOGUE
 from .context import Moment
@@ -94,3 +97,10 @@ __all__ = [
     "equivalents",
     "parameter",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """Refuse a name that there is not, with the nearest one."""
+    near = find_near_name(name, __all__)
+    hint = f"did you mean {near}?" if near else "CATALOGUE lists the effects"
+    raise AttributeError(f"ctrlid.effects has no {name!r}; {hint}")

@@ -6,11 +6,12 @@ a state, a rule for its next value (or its rate) and the input it applies, in ab
 units.
 """
 
+import inspect
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from numbers import Real
-from typing import Any, Literal, get_args
+from typing import Any, Literal, Self, get_args
 
 import casadi
 import control as ct
@@ -18,6 +19,7 @@ import numpy as np
 
 from .._base.errors import CtrlidError
 from .._base.periods import have_same_period, write_both_periods
+from .._base.text import find_near_name
 from ..physics.conversions import to_state_matrices
 from ..physics.linearization import OperatingPoint
 from ..physics.trace import timebase, trace
@@ -96,6 +98,17 @@ class PID:
     anti_windup: AntiWindup = "clamp"
     tracking_time: float | None = None
 
+    def __new__(cls, *args: Any, **fields: Any) -> Self:
+        """Refuse unknown fields in words, before the generated constructor does so curtly."""
+        del args
+        known = tuple(cls.__dataclass_fields__)
+        for name in fields:
+            if name not in known:
+                near = find_near_name(name, known)
+                hint = f"did you mean {near}=?" if near else f"it has {', '.join(known)}"
+                raise CtrlidError(f"a PID has no {name}=; {hint}")
+        return super().__new__(cls)
+
     def __post_init__(self) -> None:
         for name in ("kp", "ki", "kd", "b", "c", "filter_time", "bias", "tracking_time"):
             value = getattr(self, name)
@@ -125,6 +138,13 @@ class PID:
                 raise CtrlidError("back-calculation needs tracking_time > 0 s; given "
                                   f"tracking_time={self.tracking_time} with kp={self.kp}, "
                                   f"ki={self.ki}")  # fmt: skip
+
+
+# Help shows the fields, not the arguments of the check of their names.
+_init = inspect.signature(PID.__init__)
+PID.__signature__ = _init.replace(  # type: ignore[attr-defined]
+    parameters=list(_init.parameters.values())[1:]
+)
 
 
 @dataclass(frozen=True, eq=False)

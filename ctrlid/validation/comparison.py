@@ -153,7 +153,7 @@ class Comparison(Printed):
             share = "" if t.passed else _write_percent(t.share)
             rows.append(f"  {t.name:<34}{'yes' if t.passed else 'NO':>10}{largest:>18}{share:>18}")
         rows += [f"  note: {note}" for note in self.notes]
-        return "\n".join([*rows, "  " + self.verdict])
+        return "\n".join(line.rstrip() for line in [*rows, "  " + self.verdict])
 
 
 def _write_percent(share: float) -> str:

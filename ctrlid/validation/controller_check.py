@@ -10,6 +10,7 @@ from scipy import stats
 
 from .._base.errors import CtrlidError
 from .._base.statistics import regress
+from .._base.text import write_percent
 from ..data.record import Record
 from ..data.validity import find_longest_run, find_whole_past
 from ..loop.controller_replay import differentiate_replay, replay_controller, replay_from_best_state
@@ -80,7 +81,7 @@ def check_controller(loop: Loop, record: Record) -> list[Fact]:
     beyond = float(np.mean((part.u < lower - slack) | (part.u > upper + slack)))
     if beyond:
         facts.append(("limit", f"u is outside the input limits of the loop ({lower:g} to "
-                      f"{upper:g}) for {100 * beyond:.2g} % of the samples: u was logged before "
+                      f"{upper:g}) for {write_percent(beyond)} of the samples: u was logged before "
                       "the limiter, or the limits are wrong. Limit u before fitting, or correct "
                       "input_limits=.", beyond, True))  # fmt: skip
         loop = replace(loop, input_limits=(-np.inf, np.inf))
@@ -99,8 +100,8 @@ def check_controller(loop: Loop, record: Record) -> list[Fact]:
     if shift is not None:
         words, moved, remains = shift
         facts.append(("delay", f"{words}: the controller of the loop explains "
-                      f"{100 * (1 - left):.4g} % of the variance of u as logged, and "
-                      f"{100 * (1 - remains):.4g} % with this shift removed. Shift the channel "
+                      f"{write_percent(1 - left, 4)} of the variance of u as logged, and "
+                      f"{write_percent(1 - remains, 4)} with this shift removed. Shift the channel "
                       "back before fitting.", left, True))  # fmt: skip
         part = moved
         e, left = _compute_remainder(loop, part)
@@ -201,7 +202,7 @@ def _explain_remainder(loop: Loop, e: Any, left: float, record: Record) -> Fact:
     if float(np.ptp(e[record.valid])) <= 1e-6 * float(np.ptp(record.u[record.valid])):
         return _report_bias(float(np.mean(e[record.valid])), left)
     if not _is_independent(loop, e, record):
-        share = f"{100 * left:.3g} % of the variance of u" if left < 1 else "u"
+        share = f"{write_percent(left, 3)} of the variance of u" if left < 1 else "u"
         return ("unknown", f"the controller of the loop does not explain {share} (RMS {rms}), and "
                 "this part depends on y: the true controller has "
                 "other gains or another structure. Correct the "

@@ -1,6 +1,6 @@
 """check_feedback(): whether a record was taken in closed loop."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -120,6 +120,21 @@ def check_feedback(record: Record) -> FeedbackCheck:
     check_arguments(check_feedback, locals())
     if not isinstance(record, Record):
         raise CtrlidError(f"check_feedback needs a Record; given {type(record).__name__}")
+    found = _find_feedback(record)
+    if not found.closed_loop:
+        return found
+    return replace(found, text=f"{found.text} {_recommend_estimator(record)}")
+
+
+def _recommend_estimator(record: Record) -> str:
+    """Say which estimator is consistent under feedback with what a record has."""
+    if record.r is not None and record.hold == "zoh":
+        return "Use an estimator that is consistent under feedback: fit_iv, by the reference."
+    why = "needs no reference" if record.r is None else "knows how u runs between the samples"
+    return f"Use an estimator that is consistent under feedback: fit_continuous, which {why}."
+
+
+def _find_feedback(record: Record) -> FeedbackCheck:
     longest = max((b - a for a, b in record.segments()), default=0)
     if longest < FEWEST:
         raise CtrlidError(f"check_feedback needs {FEWEST} valid samples in succession; the record "
@@ -167,8 +182,7 @@ def check_feedback(record: Record) -> FeedbackCheck:
         worst = int(np.argmax(np.abs(test.values[int(moved) :]))) + int(moved)
         text = (f"Closed loop: u depends on the innovations of y (correlation "
                 f"{test.values[worst]:+.2g} after {write_count(int(test.lags[worst]), 'sample')}, "
-                f"p = {p:.1g}). Use an estimator that is consistent under feedback: fit_iv or "
-                "fit_continuous.")  # fmt: skip
+                f"p = {p:.1g}).")  # fmt: skip
     elif moved:
         text = (
             "No feedback found: u and y go together within a sample, but in the direction in which "
@@ -213,8 +227,7 @@ def _test_short_law(
             return FeedbackCheck(
                 True, 0.0, np.zeros(0, int), np.zeros(0),
                 f"Closed loop: u is nearly exactly a function of r and y {_write_reach(n)}, and "
-                "not of r and past u alone. Use an estimator that is consistent under feedback: "
-                "fit_iv or fit_continuous.",
+                "not of r and past u alone.",
             )  # fmt: skip
     return None
 

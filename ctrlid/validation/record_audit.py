@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from .._base.errors import CtrlidError
-from .._base.text import Printed, write_count
+from .._base.text import Printed, write_count, write_percent
 from ..data.record import SIGNALS, Record
 from ..data.several_records import order_model_and_data
 from ..data.validity import find_longest_run, find_runs
@@ -244,7 +244,7 @@ class _RecordChecks:
                 share, value = defects.find_stuck(v, driver) if key == "y" else (0.0, 0.0)
                 if not share:
                     continue
-                long = (f" for {100 * share:.4g} % of the samples, although the excitation "
+                long = (f" for {write_percent(share, 4)} of the samples, although the excitation "
                         "changes")  # fmt: skip
             text = (
                 f"{key} stays at {self.write_value(key, value)}{long}: no model can be "
@@ -270,7 +270,7 @@ class _RecordChecks:
             if not mask.any():
                 continue
             ends = " and ".join(
-                f"{self.write_value(key, value)} for {100 * share:.2g} % of the samples"
+                f"{self.write_value(key, value)} for {write_percent(share)} of the samples"
                 for share, value in zip(shares, values, strict=True)
                 if share
             )
@@ -300,8 +300,8 @@ class _RecordChecks:
                 continue
             ratio = step / spread
             size = self.write_value(key, step)
-            text = (f"{key} is quantized in steps of {size}, {100 * ratio:.2g} % of its standard "
-                    "deviation")  # fmt: skip
+            text = (f"{key} is quantized in steps of {size}, {write_percent(ratio)} of its "
+                    "standard deviation")  # fmt: skip
             bad = key == "y" and ratio > COARSE
             text += (
                 ": too coarse to show the motion. Excite the loop more strongly." if bad else "."
@@ -411,8 +411,8 @@ class _RecordChecks:
             text = "r is constant in the valid samples, and "
             share = defects.find_share_beyond_controller(self.record.u, self.record.y, self.valid)
             if share > OWN:
-                text += (f"{100 * share:.3g} % of the variance of u does not depend linearly on "
-                         "y: only a signal added to u, or noise of the input, excites the "
+                text += (f"{write_percent(share, 3)} of the variance of u does not depend linearly "
+                         "on y: only a signal added to u, or noise of the input, excites the "
                          "loop.")  # fmt: skip
             else:
                 text += ("u is computed from y: only noise excites the loop, and the plant cannot "

@@ -10,7 +10,7 @@ import numpy as np
 from .._base.arguments import check_arguments
 from .._base.errors import CtrlidError, CtrlidWarning, ModelCannotRun
 from .._base.jobs import check_jobs, share_out
-from .._base.text import write_list
+from .._base.text import write_list, write_percent
 from ..data.record import Record
 from ..estimation.constraints import AbstractConstraint
 from ..estimation.linear.arx import fit_arx
@@ -291,7 +291,7 @@ def _recommend(rows: Sequence[SamplingRow], names: Sequence[str]) -> tuple[float
     off = (
         "the estimates agree best, although not all are within 100 % of"
         if worst[best] >= 1
-        else f"all estimates are within {100 * worst[best]:.2g} % of"
+        else f"all estimates are within {write_percent(worst[best])} of"
     )
     return best, (
         f"Recommended: {best:.4g} s, where {off} the consensus poles. Within "

@@ -81,7 +81,7 @@ class Prediction(Printed):
         )
 
 
-def predict(loop: Loop, record: Record, force_noise: float | None = None) -> Prediction:
+def predict(loop: Loop, record: Record, noise_ratio: float | None = None) -> Prediction:
     r"""Predict each output sample of a record from the samples before it.
 
     .. math:: \hat y_k = h(\hat x_{k|k-1}), \quad
@@ -97,8 +97,9 @@ def predict(loop: Loop, record: Record, force_noise: float | None = None) -> Pre
         The model; its controller is not used.
     record : Record
         The data.
-    force_noise : float, optional
-        Ratio of force noise to sensor noise, as standard deviations [1/s^2].
+    noise_ratio : float, optional
+        Ratio of force noise to sensor noise, as standard deviations [1/s^2]; in `simulate` and in
+        the result, force_noise is the acceleration itself.
 
     Returns
     -------
@@ -128,17 +129,17 @@ def predict(loop: Loop, record: Record, force_noise: float | None = None) -> Pre
     if not (isinstance(loop, Loop) and isinstance(record, Record)):
         raise CtrlidError("predict needs a Loop and a Record; given "
                           f"{type(loop).__name__} and {type(record).__name__}")  # fmt: skip
-    if force_noise is not None and not (
-        is_number(force_noise) and np.isfinite(force_noise) and force_noise >= 0
+    if noise_ratio is not None and not (
+        is_number(noise_ratio) and np.isfinite(noise_ratio) and noise_ratio >= 0
     ):
-        raise CtrlidError("force_noise is the ratio of force noise to sensor noise [1/s^2], >= 0; "
-                          f"given {force_noise!r}")  # fmt: skip
+        raise CtrlidError("noise_ratio is the ratio of force noise to sensor noise [1/s^2], >= 0; "
+                          f"given {noise_ratio!r}")  # fmt: skip
     loop = _drop_neutral_effects(loop)
     problem = make_problem(loop, (), [record])
-    if force_noise is None:
+    if noise_ratio is None:
         fit = maximize(begin_fit(problem))
     else:
-        noise = Noise((max(force_noise, 1e-150) ** 2,) * problem.plant.channels)
+        noise = Noise((max(noise_ratio, 1e-150) ** 2,) * problem.plant.channels)
         fit = begin_fit(problem, noise=noise)
     return make_prediction(fit)
 

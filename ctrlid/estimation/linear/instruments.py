@@ -182,8 +182,8 @@ def check_instruments(records: Sequence[Record], instruments: Any) -> tuple[str,
                 raise CtrlidError(
                     f"{where} has a constant {name}: nothing from outside moves the loop, so there "
                     "is no instrument. Vary the reference (random_binary), or name an injected "
-                    "signal with instruments=. Without either use fit_loop, which needs u and y "
-                    "only."
+                    "signal with instruments=. Without either use fit_continuous, which needs u "
+                    "and y only, or fit_loop for physical parameters."
                 )
     return names
 
@@ -196,5 +196,5 @@ def _explain_missing(where: str, name: str, record: Record) -> str:
         f"{where} has no reference r. Instruments must come from outside the loop: log the "
         "reference, or, if a dither or pulses were added to u, put them into extra and name them, "
         "instruments='dither'" + (f" (there is {has})" if has else "") + ". Without either use "
-        "fit_loop, which needs u and y only."
+        "fit_continuous, which needs u and y only, or fit_loop for physical parameters."
     )
