@@ -83,6 +83,8 @@ def share_out(
 def _list_calls(function: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[Any]:
     """Yield the calls that joblib makes, each with the time that is left when it is handed out."""
     budget = find_budget()
+    import joblib
+
     for item in items:
         left = math.inf if budget is None else budget.left
         yield joblib.delayed(_call_elsewhere)(function, item, left)
