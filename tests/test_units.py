@@ -136,7 +136,7 @@ def test_a_file_is_converted_on_a_stated_scale(tmp_path):
     np.testing.assert_allclose(made.u, plain.u)
     refusals = (({"x": 2.0}, "scale= names 'x', but the channels are"),
                 ({"y": 0.0}, "a number other than zero for y; given 0.0"),
-                ({"y": "deg"}, "a number other than zero for y; given 'deg'"))  # fmt: skip
+                ({"y": "deg"}, "as scale; given {'y': 'deg'}"))  # fmt: skip
     for wrong, words in refusals:
         with pytest.raises(cid.CtrlidError, match=words):
             cid.Record.from_csv(path, **names, scale=wrong)
