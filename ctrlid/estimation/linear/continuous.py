@@ -130,7 +130,7 @@ def fit_continuous(
 
     best = find_best_fit(task, known, delay or 0.0)
     notes = note_colour(best)
-    if notes:
+    if len(notes) > 0:
         best = colour_noise(best, known)
         notes = note_colour(best)
     point, found, rss, settled = best.point, best.found, best.rss, best.settled
