@@ -1,9 +1,14 @@
-"""Time and memory of diagnose() against the length of the record.
+"""What diagnose() costs: processor and wall time, passes of the filter by purpose, peak memory.
 
-Run it as ``python benchmarks/bench_diagnose.py``. It diagnoses a levitation with the whole
-catalogue, once with viscous friction missing and once with nothing missing, for 5 000 to 80 000
-samples; ``--samples 1000000`` gives another length. Each run is a process of its own, so that the
-peak memory is that of one record.
+Run it as ``python benchmarks/bench_diagnose.py``; ``--samples 5000`` gives another length than
+20 000, ``--cases one two`` only some of the cases, ``--jobs 2`` two processes (whose passes are not
+counted). Each case is a process of its own, so that the peak memory is that of one diagnosis, and
+the compiled loops are warm before the clock starts.
+
+Times of a shared machine say little. So each case is timed beside a yardstick, a fixed piece of
+numpy and Python that no change of ctrlid makes faster, run before and after it in the same
+process: what can be compared from day to day is the number of yardsticks of processor time, and
+the number of passes.
 """
 
 from __future__ import annotations
@@ -11,54 +16,142 @@ from __future__ import annotations
 import argparse
 import multiprocessing
 import resource
+import sys
+import threading
 import time
+from collections import Counter
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
 
 import ctrlid as cid
-from ctrlid import effects
+from ctrlid import effects as E
+from ctrlid.estimation.likelihood import kalman_filter
 
-LENGTHS = (5_000, 20_000, 80_000)
+DT = 2e-3
+# What a pass is for is told by the outermost of these functions that asked for it.
+PURPOSES = {
+    "recalibrate": "recalibrate", "scan_candidate": "screen", "refit_candidate": "refit",
+    "refit_under_noise": "refit", "_prefer_sensor_noise": "noise",
+    "_check_on_replicas": "replicas", "retest_with_replicas": "replicas", "_look_back": "look back",
+    "refit_noise": "weigh", "drop_superfluous": "weigh", "order_last_effect": "weigh",
+    "weigh_effects": "weigh", "find_log_error": "log errors", "compare_names": "names",
+    "summarize_gap": "gap",
+}  # fmt: skip
+COLUMNS = tuple(dict.fromkeys(PURPOSES.values()))
 
 
-def loop_of() -> cid.Loop:
-    """Return a levitation 12 mm below its magnet, with a lead at 2 ms."""
+def make_loop(*known: Any) -> cid.Loop:
+    """Return a levitation 12 mm below its magnet, with a lead; `known` effects are in the model."""
     plant = cid.plants.maglev(m=0.0213, K=3.34e-6)
-    op = cid.operating_point(plant, output=0.012)
-    lead = cid.design_lead(cid.linearize(plant, op), crossover=100, phase_margin=50)
-    return cid.Loop(plant, lead.sample(2e-3, "tustin"), dt=2e-3, at=op, free=("K",))
+    at = cid.operating_point(plant, output=0.012)
+    lead = cid.design_lead(cid.linearize(plant, at), crossover=100, phase_margin=50)
+    loop = cid.Loop(plant, lead.sample(DT, "tustin"), dt=DT, at=at, free=("K",))
+    for effect in known:
+        loop = loop.with_effect(effect)
+    return loop
 
 
-def one(samples: int, hidden: float) -> tuple[str, float, float, float]:
-    """Diagnose a record; return verdict, seconds, and peak memory before and at the end [MB]."""
-    loop = loop_of()
-    real = loop.with_effect(effects.ViscousFriction(c=hidden)) if hidden else loop
-    r = cid.random_binary(samples, amplitude=1e-4, hold=40, around=loop.point.output, seed=1)
-    record = cid.simulate(real, r, sensor_noise=2e-6, seed=2)
-    wrong = loop.with_parameters({"K": 1.05 * loop.parameters["K"]})
-    cid.diagnose(wrong, record[:2000], catalogue=(effects.ViscousFriction,), progress=False)
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    started = time.perf_counter()
-    found = cid.diagnose(wrong, record, progress=False)
-    seconds = time.perf_counter() - started
+def make_records(hidden: Sequence[Any], known: Sequence[Any], count: int, samples: int) -> Any:
+    """Return records of a loop in which effects are hidden."""
+    real = make_loop(*known, *hidden)
+    made = []
+    for seed in range(1, count + 1):
+        r = cid.random_binary(samples // count, amplitude=1e-4, hold=40, around=0.012, seed=seed)
+        made.append(cid.simulate(real, r, sensor_noise=2e-6, seed=100 + seed))
+    return made
+
+
+DRAG, OFFSET = E.ViscousFriction(c=0.3), E.InputOffset(offset=0.02)
+LAG, DRY = E.ActuatorLag(tau=0.004), E.CoulombFriction(fc=0.004)
+# For each case what is hidden, what the model knows, the records, and what the catalogue lacks.
+CASES: dict[str, tuple[tuple[Any, ...], tuple[Any, ...], int, tuple[type, ...]]] = {
+    "nothing": ((), (), 1, ()),
+    "one": ((DRAG,), (), 1, ()),
+    "two": ((DRAG, OFFSET), (), 1, ()),
+    "three": ((DRAG, OFFSET, LAG), (), 1, ()),
+    "unknown": ((LAG,), (), 1, (E.ActuatorLag, E.InputDelay, E.SensorLag)),
+    "friction": ((OFFSET,), (DRY,), 1, ()),
+    "records": ((DRAG,), (), 3, ()),
+}
+
+
+def measure_yardstick() -> float:
+    """Return the processor time of a fixed piece of numpy and Python [s]."""
+    rng = np.random.default_rng(1)
+    matrix, begun = rng.standard_normal((120, 120)), time.process_time()
+    for _ in range(20):
+        np.linalg.svd(matrix)
+    total = 0.0
+    for k in range(300_000):
+        total += 1.0 / (k + 1)
+    return time.process_time() - begun
+
+
+def count_passes(passes: Counter[str]) -> None:
+    """Count every pass of the filter by its purpose from now on."""
+    plain = kalman_filter.run_filter
+
+    def run_filter(*arguments: Any, **options: Any) -> Any:
+        # Only noise is looked for in threads, whatever for.
+        main = threading.current_thread() is threading.main_thread()
+        purpose = "other" if main else "noise"
+        frame = sys._getframe(1) if main else None
+        while frame is not None:
+            purpose = PURPOSES.get(frame.f_code.co_name, purpose)
+            frame = frame.f_back
+        passes[purpose] += 1
+        return plain(*arguments, **options)
+
+    for module in list(sys.modules.values()):
+        if getattr(module, "run_filter", None) is plain:
+            module.run_filter = run_filter  # type: ignore[attr-defined]
+
+
+def measure_case(case: str, samples: int, jobs: int | None) -> dict[str, Any]:
+    """Diagnose the records of a case, and return what it cost."""
+    hidden, known, count, lacking = CASES[case]
+    records = make_records(hidden, known, count, samples)
+    loop = make_loop(*known).with_parameters({"K": 1.05 * 3.34e-6})
+    catalogue = [kind for kind in E.CATALOGUE if kind not in lacking]
+    cid.diagnose(loop, [r[:1500] for r in records], catalogue=(E.InputOffset,), progress=False)
+    passes = Counter[str]()
+    count_passes(passes)
+    before = measure_yardstick()
+    cpu, wall = time.process_time(), time.perf_counter()
+    found = cid.diagnose(loop, records, catalogue=catalogue, jobs=jobs, progress=False)
+    cpu, wall = time.process_time() - cpu, time.perf_counter() - wall
+    yardstick = 0.5 * (before + measure_yardstick())
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     names = ", ".join(f.name for f in found.findings)
-    return f"{found.verdict} {names}".strip(), seconds, before, peak
+    answer = f"{found.verdict}{': ' if names else ''}{names}"
+    return {"cpu": cpu, "wall": wall, "yardsticks": cpu / yardstick, "peak": peak,
+            "passes": passes, "answer": answer}  # fmt: skip
 
 
 def main() -> None:
-    """Print a table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--samples", nargs="+", type=int, default=LENGTHS)
-    options = parser.parse_args()
-    print(f"{'samples':>9}  {'answer':<28}{'s':>7}{'us a sample':>13}{'MB before':>11}{'peak':>7}")
+    """Print a row for each case."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--samples", type=int, default=20_000)
+    parser.add_argument("--cases", nargs="+", choices=CASES, default=list(CASES))
+    parser.add_argument("--jobs", type=int, default=None)
+    args = parser.parse_args()
+    print(f"{args.samples} samples; a yardstick is {measure_yardstick():.3f} s of CPU now")
+    print(f"{'case':<10}{'CPU s':>8}{'wall s':>8}{'yards':>7}{'MB':>6}{'passes':>8}  "
+          + "".join(f"{c:>13}" for c in (*COLUMNS, "other")))  # fmt: skip
     context = multiprocessing.get_context("spawn")
-    for hidden in (3.0, 0.0):
-        for samples in options.samples:
-            with context.Pool(1) as pool:
-                answer, seconds, before, peak = pool.apply(one, (samples, hidden))
-            print(f"{samples:>9}  {answer:<28}{seconds:>7.1f}{1e6 * seconds / samples:>13.0f}"
-                  f"{before:>11.0f}{peak:>7.0f}", flush=True)  # fmt: skip
+    for case in args.cases:
+        with context.Pool(1) as pool:
+            done = pool.apply(measure_case, (case, args.samples, args.jobs))
+            # Left to itself, the process ends without tidying up after joblib.
+            pool.close()
+            pool.join()
+        passes = done["passes"]
+        row = f"{case:<10}{done['cpu']:>8.1f}{done['wall']:>8.1f}{done['yardsticks']:>7.0f}"
+        row += f"{done['peak']:>6.0f}{sum(passes.values()):>8}  "
+        print(row + "".join(f"{passes[c]:>13}" for c in (*COLUMNS, "other")), flush=True)
+        print(f"{'':<10}{done['answer']}", flush=True)
 
 
 if __name__ == "__main__":
