@@ -6,6 +6,11 @@ from pathlib import Path
 
 import pytest
 
+from ctrlid._base import rounding
+
+# A warning of numpy is an error here, so that numbers that fail are found.
+rounding.HANDLING |= {"divide": "warn", "over": "warn", "invalid": "warn"}
+
 
 def pytest_collection_modifyitems(config, items):
     """Leave slow tests to those who ask for them with -m."""

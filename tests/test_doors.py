@@ -1,7 +1,7 @@
 """Arguments are checked at the door, answers are right or refused, and results are values.
 
 Groups: the check of kinds; wild calls; results that cannot be changed; what once was silently
-wrong; damaged files.
+wrong, or crashed; damaged files.
 """
 
 import copy
@@ -226,6 +226,21 @@ def test_dollars_in_names_are_drawn_as_they_are(record, tmp_path):
     named = replace(record, units={"y": "$$"}, names={"y": "$x_", "u": "a$b$"}, name="$")
     page = cid.write_report(named, tmp_path / "page.html").read_text("utf-8")
     assert "$$" in page
+
+
+@pytest.mark.parametrize("name", ["fit_loop", "fit_continuous", "fit_iv", "compare", "redesign"])
+def test_a_numpy_that_raises_at_every_rounding_changes_nothing(loop, record, name):
+    """Search for errors with np.seterr(all="raise") is for the user's own code."""
+    calls = {
+        "fit_loop": lambda: cid.fit_loop(loop, record).estimate.values,
+        "fit_continuous": lambda: cid.fit_continuous(record, 2).estimate.values,
+        "fit_iv": lambda: cid.fit_iv(record, 2, 2).estimate.values,
+        "compare": lambda: cid.compare(record, loop).residuals,
+        "redesign": lambda: cid.redesign(cid.fit_continuous(record, 2), loop, 2.0, 50.0).time,
+    }
+    with np.errstate(all="raise"):
+        strict = calls[name]()
+    np.testing.assert_array_equal(strict, calls[name]())
 
 
 # --- damaged files

@@ -72,7 +72,7 @@ def read_csv(
     name: str | None, gaps: str, scale: Mapping[str, float] | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """Return the fields of a record; see `Record.from_csv`, `sources` are its r, u and y."""
-    if gaps not in ("error", "mask"):
+    if not isinstance(gaps, str) or gaps not in ("error", "mask"):
         raise CtrlidError(f"gaps must be 'error' or 'mask'; given {gaps!r}")
     own, header, table = _read_table(path)
     if own.get("rows", len(table)) != len(table):

@@ -35,6 +35,9 @@ _TAPS = {
     20: (20, 17),
 }
 
+# A signal of more samples than this, 8 GB, is a slip of the keyboard.
+MOST = 10**9
+
 
 def random_binary(
     n: int, *, amplitude: float, hold: int = 1, around: float = 0.0, seed: int | None = None
@@ -82,7 +85,8 @@ def random_binary(
     n, hold = _check_count(n, "n"), _check_count(hold, "hold")
     amplitude, around = _check_positive(amplitude, "amplitude"), _check_level(around, "around")
     tosses = _make_generator(seed).integers(0, 2, size=-(-n // hold))
-    return np.repeat(np.where(tosses == 1, around + amplitude, around - amplitude), hold)[:n]
+    levels = np.where(tosses == 1, around + amplitude, around - amplitude)
+    return np.asarray(np.repeat(levels, min(hold, n))[:n], dtype=float)
 
 
 def staircase(n: int, *, levels: Sequence[float] | npt.ArrayLike, hold: int) -> Array:
@@ -292,6 +296,8 @@ def _check_count(value: Any, name: str) -> int:
         number = 0
     if isinstance(value, bool) or number < 1:
         raise CtrlidError(f"{name} is {value!r}; needed is a whole number, at least 1.")
+    if number > MOST:
+        raise CtrlidError(f"{name} is {value!r}; needed are at most {MOST:g} samples.")
     return number
 
 

@@ -11,6 +11,7 @@ import control as ct
 import numpy as np
 
 from .._base.errors import CtrlidError, CtrlidWarning
+from .._base.rounding import keep_numpy_quiet
 from .margins import find_gain_crossovers, modulus_margin
 from .rational import Rational, are_resolved, find_closed_loop_poles, is_stable, to_rational, to_s
 
@@ -92,6 +93,7 @@ class _Task:
         )
 
 
+@keep_numpy_quiet
 def design_lead(P: Any, crossover: float, phase_margin: float) -> Any:
     r"""Design a lead compensator with exactly this gain crossover and phase margin.
 
@@ -178,7 +180,7 @@ def design_lead(P: Any, crossover: float, phase_margin: float) -> Any:
     if phase_margin < math.pi / 2:
         warnings.warn(
             f"phase_margin is {phase_margin:g} degrees, which is almost none; if it was meant in "
-            f"radians, give {math.degrees(phase_margin):.3g}", CtrlidWarning, stacklevel=2,
+            f"radians, give {math.degrees(phase_margin):.3g}", CtrlidWarning, stacklevel=3,
         )  # fmt: skip
     _check_plant(plant, crossover)
 
@@ -326,6 +328,9 @@ def _explain_crossovers(task: _Task) -> str:
 
     s = to_s(np.concatenate([plant.poles(), plant.zeros()]), plant.dt)
     sizes = np.concatenate([np.abs(s[are_resolved(s, plant.dt)]), [task.crossover]])
+    sizes = sizes[sizes > np.finfo(float).tiny * 100]
+    if not sizes.size:
+        return "No other crossover was tried."
     top = min(30 * float(max(sizes)), 0.999 * plant.nyquist)
     grid = np.geomspace(min(float(min(sizes)), top) / 30, top, 61).tolist()
     # At fast sampling the coefficients do not tell the plant at low frequencies.

@@ -196,7 +196,14 @@ def multiply_polynomials(first: Array, second: Array) -> Array:
 
 def find_roots(polynomial: npt.ArrayLike) -> ComplexArray:
     """Return the roots of a polynomial, none for a constant."""
-    return np.asarray(np.roots(np.asarray(polynomial)), dtype=complex)
+    c = np.atleast_1d(np.asarray(polynomial))
+    size = float(np.max(np.abs(c), initial=0.0))
+    if not 0 < size < math.inf:
+        return np.zeros(0, dtype=complex)
+    with np.errstate(under="ignore"):
+        c = c / size
+    # A root beyond 1e300 is at infinity.
+    return np.asarray(np.roots(np.where(np.abs(c) < 1e-300, 0.0, c)), dtype=complex)
 
 
 def make_real_polynomial(zeros: Iterable[complex]) -> Array:

@@ -11,6 +11,7 @@ import numpy as np
 from .._base.arguments import check_arguments
 from .._base.arrays import Array, freeze_arrays
 from .._base.errors import CtrlidError, ModelCannotRun
+from .._base.rounding import keep_numpy_quiet
 from .._base.text import Printed, write_polynomial, write_quantity
 from ..estimation.identified_model import IdentifiedModel
 from ..loop.loop import Loop
@@ -185,6 +186,7 @@ class Redesign(Printed):
         return "\n".join([f"controller: ({num}) / ({den})", *rows, step, "  " + self.verdict])
 
 
+@keep_numpy_quiet
 def redesign(
     G: Any, loop: Loop, crossover: float, phase_margin: float, *, step: float | None = None
 ) -> Redesign:

@@ -11,6 +11,7 @@ from typing import Any
 from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from .._base.interruption import Budget, Stopped, check_seconds, hold_interrupt
 from .._base.jobs import check_jobs, share_out
+from .._base.rounding import keep_numpy_quiet
 from ..data.record import Record
 from ..data.several_records import as_records, order_model_and_data, require_valid_samples
 from ..effects import CATALOGUE, AbstractEffect
@@ -94,6 +95,7 @@ class Question:
             return otherwise
 
 
+@keep_numpy_quiet
 def diagnose(
     loop: Any,
     record: Record | Sequence[Record],

@@ -11,6 +11,7 @@ from scipy.stats import t as student_t
 from .._base.arguments import check_arguments
 from .._base.arrays import Array, freeze_arrays, to_real_array
 from .._base.errors import CtrlidError
+from .._base.rounding import keep_numpy_quiet
 from .._base.text import Printed, write_count
 from .identified_model import IdentifiedModel
 
@@ -61,6 +62,7 @@ class ResponseBand(Printed):
         return "\n".join(rows)
 
 
+@keep_numpy_quiet
 def response_band(model: IdentifiedModel, omega: Any, level: float = 0.95) -> ResponseBand:
     r"""Return the confidence band of a fitted model's frequency response.
 
@@ -120,9 +122,11 @@ def response_band(model: IdentifiedModel, omega: Any, level: float = 0.95) -> Re
     if not 0.0 < level < 1.0:
         raise CtrlidError(f"A confidence level lies between 0 and 1; given {level!r}.")
     w = np.atleast_1d(to_real_array(omega, "omega"))
-    limit = np.pi / estimate.dt if estimate.dt else np.finfo(float).max
+    # A power of the frequency has to be a number too.
+    limit = np.pi / estimate.dt if estimate.dt else 1e300 ** (1 / (1 + len(estimate.names)))
     if w.ndim != 1 or not w.size or not np.all((w > 0) & (w < limit)):
-        below = f" below the Nyquist frequency {limit:.6g} rad/s" if estimate.dt else ""
+        below = f" below the Nyquist frequency {limit:.6g} rad/s" if estimate.dt else (
+            f" below {limit:.3g} rad/s")  # fmt: skip
         raise CtrlidError(f"omega needs positive frequencies in rad/s{below}; given {omega!r}")
     at = np.exp(1j * w * estimate.dt) if estimate.dt else 1j * w
     structure, p = estimate.structure, len(estimate.names)

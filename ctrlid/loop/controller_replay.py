@@ -11,6 +11,7 @@ from .._base.arguments import check_arguments
 from .._base.arrays import Array
 from .._base.errors import CtrlidError, ModelCannotRun
 from .._base.periods import have_same_period, write_both_periods, write_difference
+from .._base.rounding import keep_numpy_quiet
 from ..data.record import Record
 from ..data.several_records import order_model_and_data
 from .loop import Loop
@@ -62,6 +63,7 @@ def run_controller(loop: Loop, y: Array, r: Array | None = None) -> Array:
     return np.asarray(run(rest), float).ravel()
 
 
+@keep_numpy_quiet
 def replay_controller(loop: Loop, record: Record) -> Array:
     """Return the input that the controller of a loop computes from a record's own r and y.
 

@@ -10,13 +10,13 @@ import inspect
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from numbers import Real
 from typing import Any, Literal, Self, get_args
 
 import casadi
 import control as ct
 import numpy as np
 
+from .._base.arguments import is_number
 from .._base.errors import CtrlidError
 from .._base.periods import have_same_period, write_both_periods
 from .._base.text import find_near_name
@@ -114,10 +114,10 @@ class PID:
             value = getattr(self, name)
             if value is None and name in ("bias", "tracking_time"):
                 continue
-            if not isinstance(value, Real) or not np.isfinite(float(value)):
+            if not is_number(value) or not np.isfinite(float(value)):
                 raise CtrlidError(f"PID needs a finite number as {name}; given {value!r}")
         limits = (self.lower, self.upper)
-        if not all(isinstance(limit, Real) for limit in limits) or not self.lower < self.upper:
+        if not all(is_number(limit) for limit in limits) or not self.lower < self.upper:
             raise CtrlidError(
                 f"PID needs lower < upper; given lower={self.lower}, upper={self.upper}"
             )

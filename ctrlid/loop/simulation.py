@@ -10,6 +10,7 @@ import numpy as np
 from .._base.arguments import check_arguments, is_number
 from .._base.arrays import Array, to_real_array
 from .._base.errors import CtrlidError, CtrlidWarning, ModelCannotRun
+from .._base.rounding import keep_numpy_quiet
 from ..data.reconstruction import PIECES, count_pieces, reconstruct_signal
 from ..data.record import Record
 from .loop import Loop
@@ -37,6 +38,7 @@ class SimulationStopped(ModelCannotRun):
     unstable: bool = False
 
 
+@keep_numpy_quiet
 def simulate(
     loop: Loop,
     r: Any = None,
@@ -297,7 +299,7 @@ class Simulator:
                 f"near t = {where * loop.dt:.4g} s the simulation has an error of about "
                 f"{worst:.0e} of the signals: the plant or the controller changes too fast for "
                 f"{MOST_SUBSTEPS} steps in {loop.dt:g} s; simulate with a smaller dt",
-                CtrlidWarning, stacklevel=3,
+                CtrlidWarning, stacklevel=4,
             )  # fmt: skip
         return y, u
 

@@ -12,6 +12,7 @@ from scipy import linalg
 from .._base.arguments import check_arguments, is_number
 from .._base.arrays import Array, to_real_array
 from .._base.errors import CtrlidError, ModelCannotRun
+from .._base.rounding import keep_numpy_quiet
 from .conversions import to_polynomials
 from .equations import Equations, require_siso
 from .trace import trace
@@ -71,6 +72,7 @@ class OperatingPoint:
         object.__setattr__(self, "output", point[1])
 
 
+@keep_numpy_quiet
 def operating_point(
     plant: Any, *, output: float, guess: Sequence[float] | OperatingPoint | None = None
 ) -> OperatingPoint:
@@ -249,6 +251,7 @@ def compute_state_matrices(
     return a, b, c, d
 
 
+@keep_numpy_quiet
 def linearize(plant: Any, at: OperatingPoint, *, states: bool = False) -> Any:
     r"""Return the linear model of a plant for small deviations from an operating point.
 

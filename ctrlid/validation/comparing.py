@@ -12,6 +12,7 @@ from scipy import signal
 from .._base.arrays import Array
 from .._base.errors import CtrlidError, CtrlidWarning, EffectDoesNotApply, ModelCannotRun
 from .._base.periods import have_same_period, write_both_periods, write_difference
+from .._base.rounding import keep_numpy_quiet
 from .._base.text import write_number
 from ..data.record import Record
 from ..data.several_records import order_model_and_data
@@ -43,6 +44,7 @@ from .residual_tests import Correlation, autocorrelation, compute_explained_shar
 MEANINGFUL = 1e-6
 
 
+@keep_numpy_quiet
 def compare(record: Record, model_or_loop: Any, *, horizon: int | None = None) -> Comparison:
     """Compare a record with a model or a loop.
 

@@ -9,6 +9,7 @@ from scipy import linalg, stats
 from .._base.arguments import check_arguments
 from .._base.arrays import Array, freeze_arrays
 from .._base.errors import CtrlidError
+from .._base.rounding import keep_numpy_quiet
 from .._base.statistics import robust_deviation
 from .._base.text import Printed, write_count
 from ..data.record import Record
@@ -73,6 +74,7 @@ class FeedbackCheck(Printed):
         return self.text
 
 
+@keep_numpy_quiet
 def check_feedback(record: Record) -> FeedbackCheck:
     r"""Check whether u was computed from y, from the record alone.
 

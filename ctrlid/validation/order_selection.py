@@ -12,6 +12,7 @@ from .._base.arguments import check_arguments
 from .._base.arrays import Array, freeze_arrays
 from .._base.criterion import bayesian_penalty
 from .._base.errors import CtrlidError
+from .._base.rounding import keep_numpy_quiet
 from .._base.statistics import regress
 from .._base.text import Printed
 from ..data.record import Record
@@ -101,6 +102,7 @@ class OrderChoice(Printed):
         return "\n".join([*lines, self.text])
 
 
+@keep_numpy_quiet
 def select_order(
     record: Record,
     na: Iterable[int] = range(1, 5),

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from .._base.errors import CtrlidError
+from .._base.rounding import keep_numpy_quiet
 from .._base.text import Printed, write_count, write_percent
 from ..data.record import SIGNALS, Record
 from ..data.several_records import order_model_and_data
@@ -115,6 +116,7 @@ class Audit(Printed):
         return "\n".join(rows)
 
 
+@keep_numpy_quiet
 def audit(record: Record, loop: Loop | None = None) -> Audit:
     """Look a record over before any fit: limits, steps, repeats, gaps, spikes, drift, excitation.
 

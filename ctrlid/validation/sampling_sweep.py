@@ -10,6 +10,7 @@ import numpy as np
 from .._base.arguments import check_arguments
 from .._base.errors import CtrlidError, CtrlidWarning, ModelCannotRun
 from .._base.jobs import check_jobs, share_out
+from .._base.rounding import keep_numpy_quiet
 from .._base.text import write_list, write_percent
 from ..data.record import Record
 from ..estimation.constraints import AbstractConstraint
@@ -29,6 +30,7 @@ FEWEST = 150
 AGREES = 0.1
 
 
+@keep_numpy_quiet
 def sweep_sampling_period(
     record: Record,
     periods: Sequence[float] | None = None,

@@ -10,6 +10,7 @@ from typing import ClassVar, final
 import numpy as np
 from scipy.special import eval_chebyt, eval_chebyu
 
+from ..._base.arguments import is_number
 from ..._base.errors import CtrlidError
 from ..identified_model import Structure
 from .base import Branch, Known, Row, equals, make_denominator_weights, require_poles
@@ -141,11 +142,10 @@ class PoleAt(Known):
     pole: complex
 
     def __post_init__(self) -> None:
-        try:
-            pole = complex(self.pole)
-        except (TypeError, ValueError):
-            raise CtrlidError(f"PoleAt needs a number; given {self.pole!r}.") from None
-        if not np.isfinite(pole):
+        given = self.pole
+        if not (is_number(given) or isinstance(given, complex | np.complexfloating)):
+            raise CtrlidError(f"PoleAt needs a number; given {given!r}.")
+        if not np.isfinite(complex(given)):
             raise CtrlidError(f"PoleAt needs a finite pole; given {self.pole!r}.")
 
     def branches(self, structure: Structure) -> Sequence[Branch]:

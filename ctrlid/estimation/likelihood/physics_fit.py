@@ -11,6 +11,7 @@ from ..._base.arguments import check_arguments
 from ..._base.arrays import Array
 from ..._base.errors import CtrlidError, ModelCannotRun
 from ..._base.interruption import hold_interrupt
+from ..._base.rounding import keep_numpy_quiet
 from ..._base.statistics import pseudo_inverse
 from ..._base.text import write_list
 from ...data.outliers import describe_outliers, mask_outliers
@@ -32,6 +33,7 @@ from .physics_estimate import LoopEstimate, LoopFit
 UNSEEN = 1e-9
 
 
+@keep_numpy_quiet
 def fit_loop(
     loop: Loop,
     record: Record | Sequence[Record],

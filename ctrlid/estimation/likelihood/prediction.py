@@ -13,6 +13,7 @@ import numpy as np
 from ..._base.arguments import is_number
 from ..._base.arrays import Array, freeze_arrays
 from ..._base.errors import CtrlidError, ModelCannotRun
+from ..._base.rounding import keep_numpy_quiet
 from ..._base.text import Printed
 from ...data.record import Record
 from ...data.several_records import order_model_and_data
@@ -81,6 +82,7 @@ class Prediction(Printed):
         )
 
 
+@keep_numpy_quiet
 def predict(loop: Loop, record: Record, noise_ratio: float | None = None) -> Prediction:
     r"""Predict each output sample of a record from the samples before it.
 

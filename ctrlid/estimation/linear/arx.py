@@ -13,6 +13,7 @@ from ..._base.arguments import check_arguments
 from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
 from ..._base.jobs import check_jobs
+from ..._base.rounding import keep_numpy_quiet
 from ...data.record import Record
 from ...data.several_records import VISIBLE_MOTION, measure_input_motion, stream_records
 from ...data.validity import find_whole_past
@@ -24,6 +25,7 @@ from ..whiteness import ENOUGH, note_coloured_innovations
 from .regression import Regression, build_arx_regression, check_orders, from_differences
 
 
+@keep_numpy_quiet
 def fit_arx(
     record: Record | Iterable[Record],
     na: int,

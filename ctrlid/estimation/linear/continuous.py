@@ -9,6 +9,7 @@ import numpy as np
 
 from ..._base.arguments import check_arguments
 from ..._base.errors import CtrlidError, CtrlidWarning
+from ..._base.rounding import keep_numpy_quiet
 from ..._base.text import write_list, write_number
 from ...data.record import Record
 from ...data.several_records import VISIBLE_MOTION, as_records, measure_input_motion
@@ -27,6 +28,7 @@ FAST_CIRCUIT = 0.1
 BEYOND = float(-np.log(np.finfo(float).eps))
 
 
+@keep_numpy_quiet
 def fit_continuous(
     record: Record | Sequence[Record],
     poles: int,
@@ -203,7 +205,7 @@ def _make_circuit(controller: Any, records: Sequence[Record]) -> Circuit | None:
                 "deviation from sample to sample, and a straight line is assumed between the "
                 "samples; give controller= (and record the reference) so that u can be "
                 "reconstructed, or sample faster",
-                CtrlidWarning, stacklevel=3,
+                CtrlidWarning, stacklevel=4,
             )  # fmt: skip
         return None
     if not isinstance(controller, ct.TransferFunction | ct.StateSpace) or (
@@ -221,7 +223,7 @@ def _make_circuit(controller: Any, records: Sequence[Record]) -> Circuit | None:
                 "the record has no reference, so a straight line is assumed for u between the "
                 "samples, but the fastest pole of the controller times dt is "
                 f"{records[0].dt * circuit.fastest:.2g}; record the reference or sample faster",
-                CtrlidWarning, stacklevel=3,
+                CtrlidWarning, stacklevel=4,
             )  # fmt: skip
         return None
     return circuit

@@ -15,6 +15,7 @@ from ..._base.arguments import check_arguments
 from ..._base.arrays import Array
 from ..._base.criterion import bayesian_penalty
 from ..._base.errors import CtrlidError, CtrlidWarning
+from ..._base.rounding import keep_numpy_quiet
 from ..._base.statistics import sum_with_correlations
 from ...data.record import Record
 from ...data.several_records import as_records
@@ -51,6 +52,7 @@ _PATIENCE = 8
 _STARTS = 0.5 ** np.arange(1, 10)
 
 
+@keep_numpy_quiet
 def fit_iv(
     record: Record | Sequence[Record],
     na: int,
@@ -176,7 +178,7 @@ def fit_iv(
     estimate = _make_estimate(task, fit, constrained=bool(known), dt=records[0].dt)
     _check_strength(estimate, names)
     if not fit.converged:
-        warnings.warn(_NOT_SETTLED, CtrlidWarning, stacklevel=2)
+        warnings.warn(_NOT_SETTLED, CtrlidWarning, stacklevel=3)
     labels = records[0].names
     return IdentifiedModel(estimate, inputs=labels.get("u", "u"), outputs=labels.get("y", "y"))
 

@@ -121,10 +121,12 @@ def _compute_columns(task: Task, point: Point, piece: Piece) -> Array | None:
     # -c closed^k by doubling: the first rows times a power of the matrix give the next ones.
     free[:1] = -motion.c @ state
     filled, power = 1, closed
-    while filled < n:
-        more = min(filled, n - filled)
-        free[filled : filled + more] = free[:more] @ power
-        power, filled = power @ power, filled + more
+    # What has died out is zero.
+    with np.errstate(under="ignore"):
+        while filled < n:
+            more = min(filled, n - filled)
+            free[filled : filled + more] = free[:more] @ power
+            power, filled = power @ power, filled + more
     ones = {name: np.zeros(n) for name in piece.signals} | list_inputs(np.ones(n), task.hold)
     rest, _ = compute_prediction_errors(motion, point.gain, ones)
     return np.column_stack([free, rest, errors])

@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.ticker import MultipleLocator
 
 from ..._base import text as _text
-from ..._base.arrays import Array
+from ..._base.arrays import Array, to_real_array
 from ..._base.errors import CtrlidError
 from ...estimation.confidence_band import response_band
 from ...estimation.identified_model import IdentifiedModel, read_delay
@@ -119,7 +119,7 @@ def bode(models: Any, ax: Any = None, *, omega: Any = None, level: float | None 
     grid = (
         _pictures.make_frequency_grid(models)
         if omega is None
-        else np.sort(np.atleast_1d(np.asarray(omega, float)))
+        else np.sort(np.atleast_1d(to_real_array(omega, "omega")).ravel())
     )
     if not (np.isfinite(grid).all() and grid.size > 1 and (grid > 0).all()):
         raise CtrlidError("omega needs at least two positive frequencies in rad/s")
