@@ -247,7 +247,11 @@ def test_records_and_stretches_share_one_model():
     ("arguments", "words"),
     [
         ({"poles": 0}, "poles must be an integer of at least 1; given 0"),
-        ({"poles": 2, "zeros": 2}, "fewer zeros than poles; given 2 zeros and 2 poles"),
+        ({"poles": 2, "zeros": 3}, "no more zeros than poles; given 3 zeros and 2 poles"),
+        (
+            {"poles": 2, "zeros": 2, "controller": ct.tf([1.0], [0.1, 1])},
+            "with controller= a plant has fewer zeros than poles",
+        ),
         ({"poles": 2, "delay": -1.0}, "delay is a time >= 0 s"),
         ({"poles": 2, "controller": "lead"}, "takes the analog controller of r - y"),
         ({"poles": 2, "constraints": [cid.Fixed("a9", 1.0)]}, "no such coefficient"),
@@ -352,3 +356,22 @@ def test_intervals_cover_with_a_sensor_that_averages():
     # Of 12 intervals of 95 %, fewer than 9 cover in one case of 500.
     assert sum(within) >= 9
     assert "moving average of order" in fit.solver
+
+
+@pytest.mark.parametrize(("hold", "late"), [("zoh", 0), ("zoh", 3), ("foh", 0)])
+def test_as_many_zeros_as_poles(hold, late):
+    """A pressure sensor beside the valve: y jumps with u, then follows slowly."""
+    num, den, dt = [2.0, 3.0, 80.0], [1.0, 4.0, 25.0], 0.02
+    rng = np.random.default_rng(7)
+    u = np.repeat(rng.choice([-1.0, 1.0], 150), 8)
+    if hold == "foh":
+        u = sum(np.sin(w * np.arange(u.size) + w) for w in (0.011, 0.023, 0.05, 0.09))
+    discrete = signal.cont2discrete(signal.tf2ss(num, den), dt, method=hold)
+    _, y, _ = signal.dlsim(discrete, np.concatenate([np.full(late, u[0]), u])[: u.size])
+    y = y[:, 0] + 5.0 + 1e-3 * rng.standard_normal(u.size)
+    record = cid.Record(u=u, y=y, dt=dt, hold=hold)
+    e = cid.fit_continuous(record, 2, 2, delay=late * dt).estimate
+    deviation = (e.values - [*den[1:], *num]) / e.standard_errors
+    assert np.max(np.abs(deviation)) < 4
+    assert np.all(e.standard_errors < 0.05 * np.abs(e.values))
+    assert e.notes == ()

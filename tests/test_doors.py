@@ -18,6 +18,7 @@ from ctrlid import CtrlidError
 from ctrlid import effects as E
 from ctrlid._base.arguments import check_arguments
 from ctrlid._base.arrays import to_real_array
+from ctrlid.validation.sampling_sweep import average_input
 from problems import ROOT, levitation, load_script, servo
 
 fuzz = load_script("benchmarks", "fuzz")
@@ -241,6 +242,25 @@ def test_a_numpy_that_raises_at_every_rounding_changes_nothing(loop, record, nam
     with np.errstate(all="raise"):
         strict = calls[name]()
     np.testing.assert_array_equal(strict, calls[name]())
+
+
+def test_all_records_for_validation_are_counted(loop, record):
+    r = cid.random_binary(300, amplitude=0.1, hold=10, seed=4)
+    other = cid.simulate(loop, r, sensor_noise=1e-3, seed=5)
+
+    def count(validation):
+        found = cid.diagnose(loop, record, validation=validation, catalogue=(), progress=False)
+        assert f"of {found.gap.samples} samples kept back" in str(found)
+        return found.gap.samples
+
+    assert count([record, other]) == count(record) + count(other)
+
+
+def test_a_slow_record_keeps_its_extra_channels(record):
+    whole = replace(record, extra={"current": record.u}, units={"current": "A", "y": "m"})
+    slow = average_input(whole, 4)
+    np.testing.assert_array_equal(slow.extra["current"], record.u[::4])
+    assert dict(slow.units) == {"current": "A", "y": "m"}
 
 
 # --- damaged files

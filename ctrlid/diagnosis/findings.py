@@ -53,6 +53,9 @@ class Gap:
     trivial : float
         RMS error of the best trivial predictor beside a prediction, on the same samples [output
         unit]: the last value, or a straight line through the last samples; NaN for a simulation.
+    samples : int
+        How many samples the RMS errors are of, in all records kept back; the curves are those of
+        the first. 0 in files of older versions.
     """
 
     kind: GapKind
@@ -70,6 +73,10 @@ class Gap:
     recalibrated: float = math.nan
     closed_loop: bool = False
     trivial: float = math.nan
+    samples: int = 0
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
 
     @property
     def name(self) -> str:
@@ -82,9 +89,6 @@ class Gap:
     def trivial_wins(self) -> bool:
         """Whether a trivial predictor errs less than each of the models: the gap says nothing."""
         return self.trivial < min(self.given, self.before, self.after)
-
-    def __post_init__(self) -> None:
-        freeze_arrays(self)
 
     @property
     def fitted(self) -> float:

@@ -59,6 +59,7 @@ def summarize_gap(loop: Loop, found: Search, fresh: FreshData) -> GapSummary:
         np.asarray(first.record.y)[first.mask], start[0][first.mask],
         results[2][0][first.mask], floor.widest, how.horizon,
         recalibrated, how == CLOSED_LOOP, trivial,
+        sum(int(np.count_nonzero(w.mask)) for w in shared.windows),
     )  # fmt: skip
     return GapSummary(gap, shares, _measure_disturbance(fit, loop, floor))
 

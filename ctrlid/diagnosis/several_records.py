@@ -181,7 +181,7 @@ def _write_sentence(findings: Sequence[Finding], records: int) -> str:
 
 def _merge_gaps(lead: Diagnosis, parts: Sequence[Diagnosis]) -> Gap:
     """Return the RMS over all records; the curves are those of one."""
-    weights = np.array([len(p.gap.time) for p in parts], dtype=float)
+    weights = np.array([p.gap.samples or len(p.gap.time) for p in parts], dtype=float)
 
     def rms(name: str) -> float:
         sizes = np.array([getattr(p.gap, name) for p in parts])

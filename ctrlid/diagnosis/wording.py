@@ -122,7 +122,8 @@ def explain_evidence() -> str:
 def introduce_gap(gap: Gap) -> str:
     """Say what the gap is."""
     return (
-        f"gap between model and record: RMS error of the {gap.name} of {len(gap.time)} samples "
+        f"gap between model and record: RMS error of the {gap.name} of "
+        f"{gap.samples or len(gap.time)} samples "
         "kept back"
     )
 

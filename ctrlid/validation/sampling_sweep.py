@@ -209,7 +209,7 @@ def average_input(record: Record, factor: int) -> Record:
         u=record.u[:cut].reshape(n, factor).mean(axis=1), y=record.y[:cut:factor],
         dt=record.dt * factor, valid=record.valid[:cut].reshape(n, factor).all(axis=1),
         names=record.names, name=record.name, start=record.start,
-        units={k: v for k, v in record.units.items() if k in ("r", "u", "y")},
+        units=record.units, extra={k: v[:cut:factor] for k, v in record.extra.items()},
     )  # fmt: skip
 
 

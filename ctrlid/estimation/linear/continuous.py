@@ -55,7 +55,8 @@ def fit_continuous(
     record : Record or sequence of Record
         The data; several records share the model.
     poles, zeros : int
-        Number of poles n and of zeros m < n.
+        Number of poles n and of zeros m. As many zeros as poles mean that y follows u at once,
+        within the sample: then u must not react to y within it, as under feedback it does.
     constraints : sequence of constraints, optional
         What is known: `SymmetricPoles`, `Integrator`, `StaticGain`, `Fixed`, `Bounds`, ...
     controller : control.TransferFunction or control.StateSpace, optional
@@ -106,6 +107,11 @@ def fit_continuous(
     known = check_constraints(constraints)
     records = as_records(record)
     circuit = _make_circuit(controller, records)
+    if circuit and zeros == poles:
+        raise CtrlidError(
+            "with controller= a plant has fewer zeros than poles: one that passes u on at once and "
+            "a circuit that answers at once have no solution"
+        )
     pieces = _cut_pieces(records, structure.na)
     needed = 4 * (len(structure.names) + structure.na + 2)
     total = sum(p.n for p in pieces)
@@ -184,9 +190,9 @@ def _check_orders(poles: Any, zeros: Any) -> Structure:
     for name, value, least in (("poles", poles, 1), ("zeros", zeros, 0)):
         if not isinstance(value, int | np.integer) or value < least:
             raise CtrlidError(f"{name} must be an integer of at least {least}; given {value!r}")
-    if zeros >= poles:
+    if zeros > poles:
         raise CtrlidError(
-            f"a plant has fewer zeros than poles; given {zeros} zeros and {poles} poles"
+            f"a plant has no more zeros than poles; given {zeros} zeros and {poles} poles"
         )
     return Structure(na=int(poles), nb=int(zeros) + 1, domain="s")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -102,10 +103,15 @@ class Task:
     def discretize(self, theta: Array, delay: float) -> DiscreteModel:
         """Return the model over one period."""
         num, den = self.structure.fraction(theta)
+        # With as many zeros as poles the first coefficient passes u on to y at once.
+        at_once = float(num[0]) if len(num) == len(den) else 0.0
+        num = num[1:] - at_once * den[1:] if len(num) == len(den) else num
         motion = discretize_model(
             *realize_model(den, num, self.speed), self.dt, self.hold, delay, self.circuit
         )
-        return add_noise_states(motion, self.colour) if self.colour else motion
+        motion = add_noise_states(motion, self.colour) if self.colour else motion
+        late = math.ceil(delay / self.dt - 1e-12) if self.hold == "zoh" else 0
+        return replace(motion, direct=(late, at_once))
 
 
 def _compute_columns(task: Task, point: Point, piece: Piece) -> Array | None:

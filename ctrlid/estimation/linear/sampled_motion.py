@@ -35,6 +35,8 @@ class Circuit:
 class DiscreteModel:
     """The discretized model: ``x+ = f x + b0 u_k + b1 u_(k-1) + ...``, and ``y = c x``.
 
+    `direct` has what y follows at once of u, and how many samples late.
+
     The corners of a band-limited input are inputs of their own, `name_corner`. With a circuit, x
     stacks plant and controller states and two more inputs follow those of u: the measured output
     and the reference.
@@ -44,6 +46,7 @@ class DiscreteModel:
     inputs: tuple[tuple[str, int, Array], ...]
     c: Array
     order: int
+    direct: tuple[int, float] = (0, 0.0)
 
 
 def realize_model(a: Array, b: Array, speed: float) -> tuple[Array, Array, Array]:
@@ -259,7 +262,10 @@ def compute_prediction_errors(motion: DiscreteModel, gain: Array, signals: dict[
     if not np.isfinite(poles).all() or np.max(np.abs(poles)) >= 1 - 1e-9:
         return None, observer
     errors = signals["y"].copy()
-    for name, late, column in (*motion.inputs, ("y", 0, k)):
+    straight, at_once = motion.direct
+    if at_once:
+        errors -= at_once * _delay_signal(signals["u"], straight)
+    for name, late, column in (*motion.inputs, ("y", 0, k), ("u", straight, -at_once * k)):
         if not np.any(column):
             continue
         # C (zI - closed)^-1 column, whose poles are those of the observer. The numerator is a
@@ -275,6 +281,7 @@ def _delay_signal(s: Array, samples: int) -> Array:
     """Shift a signal later by some samples, or earlier by one; its ends are held."""
     if samples == 0:
         return s
+    samples = min(samples, len(s))
     if samples < 0:
         return np.append(s[-samples:], np.repeat(s[-1], -samples))
     return np.concatenate([np.repeat(s[0], samples), s[:-samples]])
