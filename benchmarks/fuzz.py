@@ -74,7 +74,7 @@ class World:
         self.comparison = cid.compare(self.records[0], self.loop)
         self.sweep = cid.sweep_sampling_period(self.records[0], [0.05, 0.1], estimators=["fit_arx"])
         self.series = cid.fit_each(cid.fit_arx, self.records[:2], na=2, nb=2)
-        self.redesign = cid.redesign(self.continuous, self.pid, 2.0, 50.0)
+        self.redesign = cid.redesign(self.continuous, self.pid, 2.0, 80.0)
         self.found = cid.diagnose(
             self.loop, self.records[0], catalogue=[effects.ViscousFriction], progress=False
         )

@@ -125,7 +125,8 @@ class PID:
             raise CtrlidError(f"filter_time is a time constant >= 0 s; given {self.filter_time}")
         for name, words in (("derivative", Derivative), ("integral", Integral),
                             ("anti_windup", AntiWindup)):  # fmt: skip
-            if getattr(self, name) not in get_args(words):
+            given = getattr(self, name)
+            if not isinstance(given, str) or given not in get_args(words):
                 raise CtrlidError(f"PID {name} must be one of {', '.join(get_args(words))}; "
                                   f"given {getattr(self, name)!r}")  # fmt: skip
         if self.derivative == "measurement" and self.c not in (0.0, 1.0):

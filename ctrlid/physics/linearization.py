@@ -116,7 +116,7 @@ def operating_point(
     check_arguments(operating_point, locals(), "output")
     equations = trace(plant)
     require_siso(equations)
-    if not (isinstance(output, int | float | np.number) and np.isfinite(output)):
+    if not (is_number(output) and np.isfinite(float(output))):
         raise CtrlidError(f"output must be a finite number; given {output!r}")
     target = float(output)
     n = len(equations.states)
