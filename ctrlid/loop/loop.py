@@ -102,7 +102,7 @@ class Loop:
         if self.at is None and not np.isfinite(equations.evaluate(np.zeros(n), 0.0)[0]).all():
             raise CtrlidError(f"{equations.name} is not defined where all its signals are zero; "
                               "give at=operating_point(plant, output=...)")  # fmt: skip
-        at = self.at or OperatingPoint((0.0,) * n, 0.0, 0.0)
+        at = OperatingPoint((0.0,) * n, 0.0, 0.0) if self.at is None else self.at
         if not isinstance(at, OperatingPoint):
             raise CtrlidError(
                 "at= needs an OperatingPoint, from operating_point(plant, output=...) or given as "
@@ -115,7 +115,7 @@ class Loop:
             )
         try:
             lower, upper = (float(v) for v in self.input_limits)
-        except (TypeError, ValueError) as reason:
+        except (TypeError, ValueError, OverflowError, OSError) as reason:
             raise CtrlidError("input_limits is a pair (lower, upper) in input units; given "
                               f"{self.input_limits!r}") from reason  # fmt: skip
         if not lower < upper:
