@@ -59,7 +59,7 @@ def check_arguments(function: Callable[..., Any], given: Mapping[str, Any], *own
 
 def is_number(value: Any) -> bool:
     """Tell whether a value is one real number that a float can hold, and no truth value."""
-    return _is_float(value)
+    return not isinstance(value, np.ndarray) and _is_float(value)
 
 
 def check_fields(value: Any, *own: str) -> None:

@@ -209,6 +209,7 @@ def multisine(
             f"are {2 / period:.3g} of the Nyquist frequency apart: widen the band or the period."
         )
     count = last - first + 1
+    phases = phases if isinstance(phases, str) else repr(phases)
     if phases == "schroeder":
         index = np.arange(1, count + 1)
         angles = -np.pi * index * (index - 1) / count

@@ -102,6 +102,7 @@ def compare(record: Record, model_or_loop: Any, *, horizon: int | None = None) -
             f"y is {y[0]:g} in all valid samples, so that no curve can follow it better than "
             "another: record while the plant moves, or look whether the sensor is stuck"
         )
+    horizon = None if horizon is None else int(horizon)
     if isinstance(model_or_loop, Loop):
         return _compare_loop(record, model_or_loop, horizon)
     if isinstance(model_or_loop, ct.TransferFunction):

@@ -208,7 +208,8 @@ class _Long:
 
 
 def _check_whole_numbers(name: str, values: Any) -> list[int]:
-    listed = list(values) if isinstance(values, Iterable) else [values]
+    listed = np.atleast_1d(values) if isinstance(values, np.ndarray) else values
+    listed = list(listed) if isinstance(listed, Iterable) else [listed]
     if not listed or not all(isinstance(v, Integral) and int(v) >= 1 for v in listed):
         raise CtrlidError(f"{name} takes whole numbers from 1, as range(1, 5); given {listed}")
     return sorted({int(v) for v in listed})

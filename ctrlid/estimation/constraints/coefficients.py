@@ -190,6 +190,7 @@ class Linear(Known):
         if not any(weights.values()):
             raise CtrlidError(f"Linear: all weights are zero in {weights!r}: nothing is bounded.")
         object.__setattr__(self, "weights", weights)
+        check_fields(self, "weights", "equals")
         if self.equals is None:
             low, high = check_interval(self.lower, self.upper, "Linear")
             object.__setattr__(self, "lower", low)
