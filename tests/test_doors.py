@@ -103,6 +103,9 @@ CALLS = {
     ),
     "a negative seed": lambda loop, record: cid.simulate(loop, record.r, seed=-1),
     "no folder": lambda loop, record: record.to_csv("/nonexistent/x.csv"),
+    "processes without end": lambda loop, record: cid.fit_each(
+        cid.fit_arx, [record, record], na=1, nb=1, jobs=10**9
+    ),
     "no model": lambda loop, record: cid.fit_each(lambda r: 5, [record, record]),
     "nothing valid": lambda loop, record: cid.diagnose(
         loop, replace(record, valid=np.zeros(400, bool)), progress=False

@@ -23,16 +23,19 @@ Result = TypeVar("Result")
 
 # So many items are in work at a time, which bounds memory.
 BATCH = 16
+# Each process takes memory of its own, before it has done anything; more than these are a slip.
+MOST = 256
 
 
 def check_jobs(jobs: Any) -> int | None:
     """Return a number of jobs as joblib takes it, refused in words otherwise."""
-    if jobs is None or (isinstance(jobs, Integral) and not isinstance(jobs, bool) and jobs != 0):
-        # More than any machine has are all.
-        return None if jobs is None else max(min(int(jobs), 2**16), -(2**16))
+    if jobs is None:
+        return None
+    if isinstance(jobs, Integral) and not isinstance(jobs, bool) and 0 < abs(int(jobs)) <= MOST:
+        return int(jobs)
     raise CtrlidError(
-        "jobs is a number of processes, at least 1, or -1 for all processors, or None for what "
-        f"joblib.parallel_config says; given {jobs!r}"
+        f"jobs is a number of processes from 1 to {MOST}, or -1 for all processors, or None for "
+        f"what joblib.parallel_config says; given {jobs!r}"
     )
 
 
