@@ -1,12 +1,12 @@
 """Checks of the fields of a record: samples, words and seconds."""
 
 from collections.abc import Mapping, Sequence
-from numbers import Real
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
+from .._base.arguments import is_number
 from .._base.errors import CtrlidError
 from .._base.text import write_list
 
@@ -57,6 +57,6 @@ def check_words(what: str, given: Any, known: Sequence[str]) -> Mapping[str, str
 
 def check_seconds(what: str, value: Any) -> float:
     """Return a time as float, or say what it is and that it must be a finite number."""
-    if isinstance(value, bool) or not isinstance(value, Real) or not np.isfinite(float(value)):
+    if not is_number(value) or not np.isfinite(float(value)):
         raise CtrlidError(f"{what} in seconds, a finite number; given {value!r}")
     return float(value)

@@ -193,7 +193,7 @@ def multisine(
     generator = _make_generator(seed)
     try:
         low, high = (float(edge) for edge in band)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError, OSError):
         low = high = math.nan
     if not 0 <= low < high <= 1:
         raise CtrlidError(

@@ -153,10 +153,11 @@ class Loop:
             kept if len(active) == len(effects) else compose_effects(plant, active, at, self.dt)
         )
         object.__setattr__(self, "_active", changed)
-        if isinstance(self.free, Mapping):
-            free: Any = dict(self.free)
-        else:
-            free = (self.free,) if isinstance(self.free, str) else tuple(dict.fromkeys(self.free))
+        free: Any = (self.free,) if isinstance(self.free, str) else self.free
+        free = dict(free) if isinstance(free, Mapping) else tuple(free)
+        if not all(isinstance(name, str) for name in free):
+            raise CtrlidError(f"free= takes names of parameters; given {self.free!r}")
+        free = free if isinstance(free, Mapping) else tuple(dict.fromkeys(free))
         unknown = [name for name in free if name not in kept.parameters]
         if unknown:
             raise CtrlidError(
