@@ -35,8 +35,8 @@ _TAPS = {
     20: (20, 17),
 }
 
-# A signal of more samples than this, 8 GB, is a slip of the keyboard.
-MOST = 10**9
+# A signal of more samples than this takes gigabytes, and is a slip of the keyboard.
+MOST = 10**8
 
 
 def random_binary(

@@ -10,6 +10,7 @@ from typing import Any
 import control as ct
 import numpy as np
 
+from .._base.arguments import is_number
 from .._base.errors import CtrlidError, CtrlidWarning
 from .._base.rounding import keep_numpy_quiet
 from .margins import find_gain_crossovers, modulus_margin
@@ -197,10 +198,7 @@ def design_lead(P: Any, crossover: float, phase_margin: float) -> Any:
 
 
 def _check_number(value: Any, name: str, unit: str) -> float:
-    try:
-        number = float(value)
-    except (TypeError, ValueError):
-        number = math.nan
+    number = float(value) if is_number(value) else math.nan
     if not math.isfinite(number):
         raise CtrlidError(f"{name} is {value!r}; needed is one finite number, in {unit}.")
     return number

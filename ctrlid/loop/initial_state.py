@@ -79,10 +79,11 @@ def find_initial_state(
         # Bounds keep an absurd start from standing in for a force that acts from the first sample
         # on.
         lower, upper = (1 + (v[:fitted] - start[:fitted]) / scale for v in (low, high))
-        upper = np.maximum(upper, lower + 4 * NARROW)
+        narrow = NARROW * np.maximum(1.0, np.maximum(np.abs(lower), np.abs(upper)))
+        upper = np.maximum(upper, lower + 4 * narrow)
         # The search is around 1, so that its differences have the relative size that is asked for.
         best = optimize.least_squares(
-            residual, np.clip(np.ones(fitted), lower + NARROW, upper - NARROW),
+            residual, np.clip(np.ones(fitted), lower + narrow, upper - narrow),
             bounds=(lower, upper), diff_step=[1e-4], max_nfev=20,
         )  # fmt: skip
         return move_state(start, best.x)

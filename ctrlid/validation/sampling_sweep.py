@@ -1,7 +1,7 @@
 """sweep_sampling_period(): which sampling period, and which estimator at it."""
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -166,7 +166,9 @@ def sweep_sampling_period(
 
 
 def _as_list(constraints: Any) -> Sequence[AbstractConstraint]:
-    return (constraints,) if isinstance(constraints, AbstractConstraint) else constraints
+    # What is no sequence is refused by the fits.
+    one = isinstance(constraints, AbstractConstraint) or not isinstance(constraints, Iterable)
+    return (constraints,) if one else constraints
 
 
 def _choose_factors(record: Any, periods: Sequence[float] | None) -> list[int]:

@@ -306,6 +306,10 @@ def _estimate_rounding(
     return eps * np.concatenate([y * 2.0 ** np.arange(na), u * 2.0 ** np.arange(nb)])
 
 
+# No computer solves for more coefficients than these.
+MOST_ORDER = 100_000
+
+
 def check_orders(na: object, nb: object, nk: object) -> Structure:
     """Return the orders of a sampled model, refused in words unless they are usable integers."""
     for name, value, least in (("na", na, 1), ("nb", nb, 1), ("nk", nk, 0)):
@@ -315,4 +319,6 @@ def check_orders(na: object, nb: object, nk: object) -> Structure:
                 "poles, nb the numerator coefficients, nk the samples from u to y (1 for a plant "
                 "whose u is held between samples)."
             )
+        if value > MOST_ORDER:
+            raise CtrlidError(f"{name} is at most {MOST_ORDER}; given {value}")
     return Structure(int(na), int(nb), int(nk))  # type: ignore[call-overload]

@@ -59,7 +59,9 @@ def record(record: Record, ax: Any = None, *, extra: Sequence[str] = ()) -> Pict
     ['y [mm]', 'u [unit not given]']
     """
     require_kind(record, Record, "plot.record draws a Record")
-    extra = (extra,) if isinstance(extra, str) else tuple(extra)
+    extra = (extra,) if isinstance(extra, str) else extra
+    if not (isinstance(extra, list | tuple) and all(isinstance(name, str) for name in extra)):
+        raise CtrlidError(f"extra takes names of channels, as in ('current',); given {extra!r}")
     unknown = [name for name in extra if name not in record.extra]
     if unknown:
         raise CtrlidError(
@@ -130,6 +132,8 @@ def comparison(
         first = _pictures.find_telling_window(comparison)
         stop = min(first + _pictures.WINDOW, len(whole))
     else:
+        if not (isinstance(window, tuple | list | np.ndarray) and len(window) == 2):
+            raise CtrlidError(f"window is (from, to) in seconds; given {window!r}")
         part = whole.between(*window)
         first = round((part.start - whole.start) / whole.dt)
         stop = first + len(part)
