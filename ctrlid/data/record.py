@@ -114,7 +114,7 @@ class Record(Printed):
         dt = check_seconds("dt is the sampling period", self.dt)
         if dt <= 0:
             raise CtrlidError(f"dt is the sampling period in seconds, > 0; given {self.dt!r}")
-        if self.hold not in get_args(Hold):
+        if not isinstance(self.hold, str) or self.hold not in get_args(Hold):
             raise CtrlidError(f"hold must be 'zoh' (held between samples), 'foh' (straight) or "
                               f"'bandlimited'; given {self.hold!r}")  # fmt: skip
         if self.hold_r not in ("zoh", "foh"):

@@ -192,8 +192,8 @@ def multisine(
     amplitude, around = _check_positive(amplitude, "amplitude"), _check_level(around, "around")
     generator = _make_generator(seed)
     try:
-        low, high = (float(edge) for edge in band)
-    except (TypeError, ValueError, OverflowError, OSError):
+        low, high = to_real_array(band, "band").tolist()
+    except (TypeError, ValueError):
         low = high = math.nan
     if not 0 <= low < high <= 1:
         raise CtrlidError(

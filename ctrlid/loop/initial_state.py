@@ -79,7 +79,9 @@ def find_initial_state(
         # Bounds keep an absurd start from standing in for a force that acts from the first sample
         # on.
         lower, upper = (1 + (v[:fitted] - start[:fitted]) / scale for v in (low, high))
-        narrow = NARROW * np.maximum(1.0, np.maximum(np.abs(lower), np.abs(upper)))
+        # Beside a bound far away a narrow room would be lost to rounding.
+        far = [np.where(np.isfinite(bound), np.abs(bound), 1.0) for bound in (lower, upper)]
+        narrow = NARROW * np.maximum(1.0, np.maximum(*far))
         upper = np.maximum(upper, lower + 4 * narrow)
         # The search is around 1, so that its differences have the relative size that is asked for.
         best = optimize.least_squares(

@@ -11,6 +11,7 @@ import control as ct
 import numpy as np
 
 from .._base.arguments import check_arguments, is_number
+from .._base.arrays import to_real_array
 from .._base.errors import CtrlidError, EffectDoesNotApply
 from .._base.periods import have_same_period, write_both_periods
 from .._base.text import write_count
@@ -114,8 +115,8 @@ class Loop:
                 f"({', '.join(equations.states)}); give at=operating_point(plant, output=...)"
             )
         try:
-            lower, upper = (float(v) for v in self.input_limits)
-        except (TypeError, ValueError, OverflowError, OSError) as reason:
+            lower, upper = to_real_array(self.input_limits, "input_limits").tolist()
+        except (TypeError, ValueError) as reason:
             raise CtrlidError("input_limits is a pair (lower, upper) in input units; given "
                               f"{self.input_limits!r}") from reason  # fmt: skip
         if not lower < upper:

@@ -131,9 +131,7 @@ def predict(loop: Loop, record: Record, noise_ratio: float | None = None) -> Pre
     if not (isinstance(loop, Loop) and isinstance(record, Record)):
         raise CtrlidError("predict needs a Loop and a Record; given "
                           f"{type(loop).__name__} and {type(record).__name__}")  # fmt: skip
-    if noise_ratio is not None and not (
-        is_number(noise_ratio) and np.isfinite(noise_ratio) and noise_ratio >= 0
-    ):
+    if noise_ratio is not None and not (is_number(noise_ratio) and 0 <= noise_ratio < 1e150):
         raise CtrlidError("noise_ratio is the ratio of force noise to sensor noise [1/s^2], >= 0; "
                           f"given {noise_ratio!r}")  # fmt: skip
     loop = _drop_neutral_effects(loop)
