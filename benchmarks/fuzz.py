@@ -214,7 +214,7 @@ RECIPES: dict[str, Recipe] = {
     "nu_gap": lambda w, rng: {"P1": pick(rng, *w.linear[:3]), "P2": pick(rng, *w.linear[:3])},
     "operating_point": lambda w, rng: {"plant": w.plants[2], "output": rng.uniform(0.005, 0.02), "guess": pick(rng, None, (0.01, 0.0))},
     "prbs": lambda w, rng: {"n": int(rng.integers(1, 300)), "amplitude": 1.0, "order": int(rng.integers(2, 8)), "hold": 3, "around": 0.0, "seed": 1},
-    "predict": lambda w, rng: {"loop": w.loop, "record": pick(rng, *w.records[:2]), "force_noise": pick(rng, None, 0.1)},
+    "predict": lambda w, rng: {"loop": w.loop, "record": pick(rng, *w.records[:2]), "noise_ratio": pick(rng, None, 0.1)},
     "random_binary": lambda w, rng: {"n": int(rng.integers(1, 300)), "amplitude": 1.0, "hold": 4, "around": rng.normal(), "seed": pick(rng, None, 3)},
     "redesign": lambda w, rng: {"G": pick(rng, w.continuous, w.linear[0]), "loop": w.pid, "crossover": rng.uniform(1, 3), "phase_margin": rng.uniform(30, 60), "step": pick(rng, None, 0.05)},
     "replay_controller": lambda w, rng: {"loop": pick(rng, w.loop, w.pid), "record": pick(rng, *w.records[:2])},
@@ -235,8 +235,8 @@ RECIPES: dict[str, Recipe] = {
     "plants.tank": lambda w, rng: {"area": 0.01, "outlet": 1e-5, "k": 1e-5, "g": 9.81},
     "datasets.describe": lambda w, rng: {"name": pick(rng, *cid.datasets.names())},
     "datasets.names": lambda w, rng: {},
-    "plot.record": lambda w, rng: {"record": pick(rng, *w.records), "axes": None, "extra": ()},
-    "plot.bode": lambda w, rng: {"models": pick(rng, w.model, w.continuous), "axes": None, "omega": None, "level": 0.9},
+    "plot.record": lambda w, rng: {"record": pick(rng, *w.records), "ax": None, "extra": ()},
+    "plot.bode": lambda w, rng: {"models": pick(rng, w.model, w.continuous), "ax": None, "omega": None, "level": 0.9},
     "plot.comparison": lambda w, rng: {"comparison": w.comparison, "window": pick(rng, None, (0.0, 3.0))},
     "plot.diagnosis": lambda w, rng: {"found": w.found},
     "plot.poles": lambda w, rng: {"models": pick(rng, w.model, w.continuous), "truth": pick(rng, None, [0.9])},
@@ -270,8 +270,9 @@ def check_answer(name: str, given: Arguments, answer: Any) -> str | None:
     writable = [k for k in getattr(answer, "__dataclass_fields__", {})
                 if isinstance(v := getattr(answer, k), np.ndarray) and v.flags.writeable
                 and type(answer).__module__.startswith("ctrlid")]  # fmt: skip
-    # A section holds what the user gave it.
-    return f"writable arrays: {writable}" if writable and name != "Section" else None
+    # A section holds what the user gave it, and a picture is there to be drawn upon.
+    own = name == "Section" or name.startswith("plot.")
+    return f"writable arrays: {writable}" if writable and not own else None
 
 
 def is_finite_record(given: Arguments, record: Any) -> bool:
