@@ -102,6 +102,13 @@ def _check_each(first: Record, rest: Iterator[Any]) -> Iterator[Record]:
 
 
 def _require_same_kind(first: Record, record: Record) -> None:
+    if record.signals != first.signals:
+        counts = [{k: len(v) for k, v in one.signals.items()} for one in (first, record)]
+        if any(counts[0].get(k) != counts[1].get(k) for k in ("u", "y")):
+            raise CtrlidError(
+                "records used together need the same inputs and outputs; given "
+                f"{first.signals} and {record.signals}"
+            )
     # Periods read from printed times differ by their last digits.
     if abs(record.dt - first.dt) > 1e-6 * first.dt or record.hold != first.hold:
         raise CtrlidError(

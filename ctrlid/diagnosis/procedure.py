@@ -10,6 +10,7 @@ from tqdm import tqdm
 
 from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from .._base.jobs import check_jobs, share_out
+from .._base.signals import require_one_signal
 from ..data.record import Record
 from ..data.several_records import as_records, order_model_and_data
 from ..effects import CATALOGUE, AbstractEffect
@@ -158,6 +159,7 @@ def diagnose(
     check_catalogue(catalogue)
     loop, record = order_model_and_data(loop, record)
     records = as_records(record)
+    require_one_signal("diagnose", loop, records)
     given = make_loop(loop, records[0])
     loop = with_units_of(given, records[0])
     fresh = choose_fresh_data(loop, records, None if validation is None else as_records(validation))

@@ -9,6 +9,7 @@ import numpy as np
 
 from .._base.arrays import Array
 from .._base.errors import CtrlidError, ModelCannotRun
+from .._base.signals import require_one_signal
 from ..data.record import Record
 from ..data.several_records import order_model_and_data
 from .loop import Loop
@@ -98,6 +99,7 @@ def replay_controller(loop: Loop, record: Record) -> Array:
 
 def replay_from_best_state(loop: Loop, record: Record) -> tuple[Array, Array]:
     """Return what `replay_controller` does, and the controller's initial state that it chose."""
+    require_one_signal("replay_controller", loop, record)
     if abs(loop.dt - record.dt) > 1e-9 * loop.dt:
         raise CtrlidError(f"the loop is sampled at {loop.dt:g} s, the record at {record.dt:g} s; "
                           "give both the same period")  # fmt: skip

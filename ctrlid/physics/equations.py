@@ -118,6 +118,11 @@ class Equations:
         """The parameter values in the order of `p`."""
         return np.array(list(self.parameters.values()), dtype=float)
 
+    @property
+    def siso(self) -> bool:
+        """Whether the plant has one input and one output."""
+        return len(self.inputs) == 1 and len(self.outputs) == 1
+
     @functools.cached_property
     def velocities(self) -> tuple[int, ...]:
         """Indices of the plant's own states that are another one's rate: forces act on them."""

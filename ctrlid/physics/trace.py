@@ -14,6 +14,7 @@ from control.nlsys import InterconnectedSystem
 from .._base.arrays import Array
 from .._base.errors import CtrlidError
 from . import canonical
+from .conversions import to_state_matrices
 from .equations import Equations
 from .symbols import Symbol, Symbols, TracingError, lift
 from .tracing import rebind
@@ -143,7 +144,9 @@ def trace(system: Any) -> Equations:
     if isinstance(system, ct.TransferFunction) and system.issiso() and _is_proper(system):
         return _trace_transfer_function(system)
     if isinstance(system, ct.TransferFunction):
-        system = ct.ss(system, name=system.name, inputs=system.input_labels,
+        several = not system.issiso()
+        system = ct.ss(*((*to_state_matrices(system), system.dt) if several else (system,)),
+                       name=system.name, inputs=system.input_labels,
                        outputs=system.output_labels)  # fmt: skip
     if not isinstance(system, ct.NonlinearIOSystem):
         raise CtrlidError(

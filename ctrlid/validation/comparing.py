@@ -11,6 +11,7 @@ from scipy import signal
 
 from .._base.arrays import Array
 from .._base.errors import CtrlidError, CtrlidWarning, EffectDoesNotApply, ModelCannotRun
+from .._base.signals import require_one_signal
 from .._base.text import write_number
 from ..data.record import Record
 from ..data.several_records import order_model_and_data
@@ -89,6 +90,7 @@ def compare(record: Record, model_or_loop: Any, *, horizon: int | None = None) -
             "compare needs a Record and a model; given "
             f"{type(record).__name__} and {type(model_or_loop).__name__}"
         )
+    require_one_signal("compare", model_or_loop, record)
     if horizon is not None and not (isinstance(horizon, Integral) and 1 <= horizon < len(record)):
         raise CtrlidError(
             f"horizon must be between 1 and {len(record) - 1} samples; given {horizon}"

@@ -8,6 +8,7 @@ from scipy import linalg, stats
 
 from .._base.arrays import Array
 from .._base.errors import CtrlidError
+from .._base.signals import require_one_signal
 from .._base.statistics import robust_deviation
 from .._base.text import Printed, write_count
 from ..data.record import Record
@@ -107,6 +108,7 @@ def check_feedback(record: Record) -> FeedbackCheck:
     """
     if not isinstance(record, Record):
         raise CtrlidError(f"check_feedback needs a Record; given {type(record).__name__}")
+    require_one_signal("check_feedback", record)
     longest = max((b - a for a, b in record.segments()), default=0)
     if longest < 60:
         raise CtrlidError(f"check_feedback needs 60 valid samples in succession; the record has "

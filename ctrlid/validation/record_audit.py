@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from .._base.errors import CtrlidError
+from .._base.signals import require_one_signal
 from .._base.text import Printed, write_count
 from ..data.record import SIGNALS, Record
 from ..data.several_records import order_model_and_data
@@ -163,6 +164,7 @@ def audit(record: Record, loop: Loop | None = None) -> Audit:
             "audit needs a Record and, optionally, its Loop; given "
             f"{type(record).__name__} and {type(loop).__name__}. Audit several records one by one"
         )
+    require_one_signal("audit", record, loop)
     count = int(np.count_nonzero(record.valid))
     if count < 2:
         text = f"the record has {write_count(count, 'valid sample')}. Record longer."

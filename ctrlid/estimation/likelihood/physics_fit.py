@@ -9,6 +9,7 @@ import numpy as np
 
 from ..._base.arrays import Array
 from ..._base.errors import CtrlidError, ModelCannotRun
+from ..._base.signals import require_one_signal
 from ..._base.statistics import pseudo_inverse
 from ..._base.text import write_list
 from ...data.outliers import describe_outliers, mask_outliers
@@ -88,6 +89,7 @@ def fit_loop(
     """
     loop, record = order_model_and_data(loop, record)
     given = as_records(record)
+    require_one_signal("fit_loop", loop, given)
     names = _choose_free_names(loop, free)
     # A single reading far outside makes any Gaussian likelihood follow it and nothing else.
     masked = [mask_outliers(one) for one in given]

@@ -12,6 +12,7 @@ import numpy as np
 
 from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
+from ..._base.signals import require_one_signal
 from ..._base.text import Printed
 from ...data.record import Record
 from ...data.several_records import order_model_and_data
@@ -124,6 +125,7 @@ def predict(loop: Loop, record: Record, force_noise: float | None = None) -> Pre
     if not (isinstance(loop, Loop) and isinstance(record, Record)):
         raise CtrlidError("predict needs a Loop and a Record; given "
                           f"{type(loop).__name__} and {type(record).__name__}")  # fmt: skip
+    require_one_signal("predict", loop, record)
     if force_noise is not None and not (np.isfinite(force_noise) and force_noise >= 0):
         raise CtrlidError("force_noise is the ratio of force noise to sensor noise [1/s^2], >= 0; "
                           f"given {force_noise!r}")  # fmt: skip

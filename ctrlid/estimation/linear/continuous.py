@@ -8,6 +8,7 @@ import control as ct
 import numpy as np
 
 from ..._base.errors import CtrlidError, CtrlidWarning
+from ..._base.signals import require_one_signal
 from ..._base.text import write_list, write_number
 from ...data.record import Record
 from ...data.several_records import VISIBLE_MOTION, as_records, measure_input_motion
@@ -99,6 +100,7 @@ def fit_continuous(
     structure = _check_orders(poles, zeros)
     known = check_constraints(constraints)
     records = as_records(record)
+    require_one_signal("fit_continuous", records)
     circuit = _make_circuit(controller, records)
     pieces = _cut_pieces(records, structure.na)
     needed = 4 * (len(structure.names) + structure.na + 2)

@@ -14,6 +14,7 @@ from ..._base import text as _text
 from ..._base.arrays import Array
 from ..._base.criterion import bayesian_penalty
 from ..._base.errors import CtrlidError, CtrlidWarning
+from ..._base.signals import require_one_signal
 from ...data.record import Record
 from ...data.several_records import as_records
 from ..constraints import AbstractConstraint, check_constraints
@@ -160,6 +161,7 @@ def fit_iv(
     structure = check_orders(na, nb, nk)
     known = check_constraints(constraints)
     records = as_records(record)
+    require_one_signal("fit_iv", records)
     _check_hold(records)
     names = check_instruments(records, instruments)
     task = Task.prepare(records, structure, names, intercept)
