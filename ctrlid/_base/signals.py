@@ -54,12 +54,12 @@ def require_one_signal(function: str, *given: Any) -> None:
             require_one_signal(function, *one)
             continue
         signals: Mapping[str, Sequence[str]] = getattr(one, "signals", {})
-        several = [(key, names) for key, names in signals.items() if len(names) > 1]
+        several = [(key, names) for key, names in signals.items() if len(names) != 1]
         if not several:
             continue
         listed = write_list([f"{key} = ({', '.join(names)})" for key, names in several])
         raise CtrlidError(
             f"{function} takes one input and one output; the {type(one).__name__.lower()} has "
             f"{listed}. fit_loop, predict and simulate take several. Of a record, pick one with "
-            f"record.select({', '.join(f'{key}={names[0]!r}' for key, names in several)})"
+            f"record.select({', '.join(f'{key}={names[0]!r}' for key, names in several if names)})"
         )
