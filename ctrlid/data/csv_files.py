@@ -172,7 +172,7 @@ def read_csv(
     }  # fmt: skip
 
 
-def _check_scale(scale: Mapping[str, float], known: Mapping[str, int]) -> dict[str, float]:
+def _check_scale(scale: Mapping[str, float], known: Mapping[str, Any]) -> dict[str, float]:
     """Return the factors of channels, or refuse what is none."""
     for key, factor in scale.items():
         if key not in known:

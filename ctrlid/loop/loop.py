@@ -454,10 +454,10 @@ class Loop:
         Returns
         -------
         control.TransferFunction or control.StateSpace
-            From deviations of the input to deviations of the output; with ``states=True``, and for a
-            plant with several inputs or outputs, a state-space model in the physical states, first
-            those of the plant in their order, under the names of `equations`, with an underscore
-            for a dot.
+            From deviations of the input to deviations of the output; with ``states=True``, and for
+            a plant with several inputs or outputs, a state-space model in the physical states,
+            first those of the plant in their order, under the names of `equations`, with an
+            underscore for a dot.
 
         Raises
         ------

@@ -302,7 +302,8 @@ class Simulator:
             return following
         corners = np.array([reconstruct_signal(row).reshape(-1, PIECES).T for row in d])
         last = np.hstack([corners[:, 0, 1:], following[:, -1:]])
-        return np.concatenate([*corners.transpose(1, 0, 2), last])
+        path: Array = np.concatenate([*corners.transpose(1, 0, 2), last])
+        return path
 
     def run(
         self, z: Array, r: Array | None, d: Array, noise: Sequence[Array] | None = None,
@@ -379,7 +380,7 @@ class Simulator:
         """Return how far from zero the point of rest, the reference and the noise ask y to be."""
         rest = np.array(self.loop.point.outputs)
         if self.loop.controller is None:
-            return np.abs(rest)
+            return np.asarray(np.abs(rest))
         places = np.cumsum((0, *self.counts))
         parts = [np.abs(rest), np.max(np.abs(w[places[3] : places[4]]), axis=1)]
         if self.counts[1] == len(rest) == 1:

@@ -12,6 +12,7 @@ import numpy as np
 from .._base.arrays import Array
 from .._base.errors import CtrlidError
 from .._base.text import write_list
+from ..data.record import Record
 from ..physics.conversions import to_state_matrices
 from ..physics.equations import Equations
 from ..physics.linearization import OperatingPoint
@@ -268,6 +269,40 @@ def stack_references(
         for name, value in zip(wiring.open, wiring.held, strict=True)
     ]
     return np.array(series).reshape(len(series), n or 0), tuple(names)
+
+
+def match_signals(record: Record, plant: Equations) -> Record:
+    """Return a record with the inputs and outputs of a plant, in its order.
+
+    Parameters
+    ----------
+    record : Record
+        The data.
+    plant : Equations
+        The plant.
+
+    Returns
+    -------
+    Record
+        With the signals of the plant's names, or as it is where it has as many of other names.
+
+    Raises
+    ------
+    CtrlidError
+        If it has neither.
+    """
+    chosen: dict[str, Any] = {}
+    for key, names in (("u", plant.inputs), ("y", plant.outputs)):
+        known = record.signals[key]
+        if set(names) <= set(known):
+            chosen[key] = names
+        elif len(known) != len(names):
+            raise CtrlidError(
+                f"{plant.name} has {'inputs' if key == 'u' else 'outputs'} ({', '.join(names)}), "
+                f"but {key} of the record is ({', '.join(known)}): give it these, pick them with "
+                f"record.select({key}=...), or name the inputs that it has with Loop(driven=...)"
+            )
+    return record.select(**chosen) if chosen else record
 
 
 def make_wired_law(controller: Any, wiring: Wiring, at: OperatingPoint, dt: float) -> ControlLaw:

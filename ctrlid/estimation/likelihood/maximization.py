@@ -14,7 +14,7 @@ from .kalman_filter import Noise, choose_settled_samples, converge_trajectory, g
 from .likelihood import Fit, Problem, evaluate_likelihood, list_start_values, relinearize_fit
 from .noise_fit import (
     LOG_STEP,
-    choose_noise_ratio,
+    choose_force_ratios,
     compute_noise_criterion,
     compute_noise_logs,
     fit_noise,
@@ -62,7 +62,11 @@ def begin_fit(problem: Problem, theta: Array | None = None, noise: Noise | None 
     plant = problem.plant
     theta = list_start_values(plant.loop, plant.names) if theta is None else theta
     noise = problem.known.noise if problem.known else noise
-    first = noise or Noise((choose_noise_ratio(plant) ** 2 * 1e-2,) * plant.channels)
+    scales = problem.data[0].scales
+    first = noise or Noise(
+        tuple(float(v) ** 2 * 1e-2 for v in choose_force_ratios(problem)),
+        sensors=tuple((float(scale) / float(scales[0])) ** 2 for scale in scales[1:]),
+    )
     guessed = []
     for data in problem.data:
         at = guess_trajectory(plant, data)
@@ -133,14 +137,14 @@ def refit_noise_size(fit: Fit) -> Fit:
     A random force that stood for a wrong parameter at the start may have left no noise to the
     sensor, from where small changes lead nowhere.
     """
-    plain = Noise(fit.noise.force)
+    plain = Noise(fit.noise.force, sensors=fit.noise.sensors)
     other = fit_noise(fit.problem, fit.theta, fit.linearized, plain, wide=True)
     return maximize(other) if other.value > fit.value + OTHER_NOISE_GAIN else fit
 
 
 def choose_noise(fit: Fit, always: bool = False) -> Fit:
     """Add a coloured force if the Bayesian information criterion wants it."""
-    if fit.known is not None:
+    if fit.known is not None or (fit.noise.sensors and not always):
         return fit
     try:
         richer = try_coloured_force(fit)
