@@ -298,7 +298,7 @@ def test_a_loop_that_diverges_is_explained():
         cid.simulate(cid.Loop(CART, C, dt=DT), d=np.zeros(20000), initial=[0, 1e-6, 0, 0])
 
 
-def test_effects_and_diagnosis_say_that_they_take_one_signal():
+def test_a_diagnosis_says_that_it_takes_one_signal():
     loop = cid.Loop(CART, luenberger(CART), dt=DT)
-    with pytest.raises(cid.CtrlidError, match="An effect takes one input and one output"):
-        loop.with_effect(cid.effects.InputOffset(offset=0.1))
+    with pytest.raises(cid.CtrlidError, match="diagnose takes one input and one output"):
+        cid.diagnose(loop, cid.simulate(loop, d=np.zeros(50)))

@@ -11,7 +11,6 @@ import control as ct
 import numpy as np
 
 from .._base.errors import CtrlidError, EffectDoesNotApply
-from .._base.signals import require_one_signal
 from .._base.text import write_count
 from ..effects import AbstractEffect
 from ..effects.composition import compose_effects, label_effects
@@ -181,8 +180,6 @@ class Loop:
                 "effects are instances of the classes in ctrlid.effects, such as "
                 f"CoulombFriction(fc=0.1); given {strangers[0]!r}"
             )
-        if effects:
-            require_one_signal("An effect", self)
         object.__setattr__(self, "effects", effects)
         plant, at = self._shift_to_absolute(), self._bare_point
         kept = compose_effects(plant, self.labelled, at, self.dt)
@@ -473,9 +470,9 @@ class Loop:
         >>> G.A.tolist(), G.state_labels, G.input_labels, G.output_labels
         ([[0.0, 1.0], [-5.0, -0.5]], ['x', 'v'], ['V'], ['x'])
         """
-        if not self._traced.siso:
-            return make_state_space(self._active, self.point)
         active = {k: e for k, e in self.labelled.items() if not e.neutral and e.in_linear_model}
+        if not active and not self._traced.siso:
+            return make_state_space(self._active, self.point)
         if not active:
             if isinstance(self.plant, ct.TransferFunction) and not states:
                 return self.plant

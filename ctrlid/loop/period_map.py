@@ -64,7 +64,9 @@ def push_velocities(e: Equations, force: Any, t: Any, x: Any, p: Any) -> Any:
     n = len(e.states)
     if e.pushes is not None:
         given = casadi.Function("push", [e.t, e.x, e.u, e.p], [e.pushes])
-        return casadi.mtimes(given(t, x, casadi.SX.zeros(len(e.inputs), 1), p), force)
+        held = casadi.mtimes(given(t, x, casadi.SX.zeros(len(e.inputs), 1), p), force)
+        # Effects may have added states, which no force moves.
+        return casadi.vertcat(held, casadi.SX.zeros(n - held.shape[0], 1))
     held = casadi.SX.zeros(n, 1)
     for k, j in enumerate(e.velocities or (range(n) if e.dt == 0 else ())):
         held[j] = force[min(k, force.shape[0] - 1)]

@@ -243,7 +243,8 @@ def _guess_several_states(loop: Loop, record: Record) -> tuple[Array, Array, Arr
     e, at = loop.equations(keep=True), loop.point
     ys = np.reshape(record.y, (len(e.outputs), -1))
     rest = np.array(find_rest_state(loop, e))
-    _, _, c, _ = compute_state_matrices(e, replace(at, states=tuple(rest)))
+    # Wide against every kink: only what the outputs show is needed here.
+    _, _, c, _ = compute_state_matrices(e, replace(at, states=tuple(rest)), spread=1e6)
     wide, moving = np.zeros(len(rest)), np.zeros(len(rest))
     scales = np.zeros(len(ys))
     for k, (y, use, middle) in enumerate(zip(ys, record.valid_outputs, at.outputs, strict=True)):

@@ -208,10 +208,9 @@ def _linearize_at_rest(loop: Loop) -> Any:
     e = loop.equations()
     if not e.siso:
         # The outputs stay; the input that holds them there depends on the parameters.
-        at = loop.point
-        if not loop.linear_plant:
-            at = operating_point(e, output=at.output, guess=at)
-        return make_state_space(e, at)
+        if loop.effects or loop.linear_plant:
+            return loop.linearize()
+        return make_state_space(e, operating_point(e, output=loop.point.output, guess=loop.point))
     if not loop.linear_plant:
         assert loop.at is not None
         at = operating_point(loop.plant, output=loop.at.output, guess=loop.at)
