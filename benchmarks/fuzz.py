@@ -204,7 +204,7 @@ RECIPES: dict[str, Recipe] = {
     "diagnose": lambda w, rng: {"loop": w.loop, "record": w.records[0], "catalogue": (effects.ViscousFriction,), "progress": False},
     "fit_arx": lambda w, rng: {"record": data(w, rng), "na": int(rng.integers(1, 4)), "nb": int(rng.integers(1, 3)), "nk": pick(rng, 1, 2), "constraints": pick(rng, (), (cid.Integrator(),), cid.PoleAt(0.9)), "intercept": pick(rng, True, False), "jobs": None},
     "fit_continuous": lambda w, rng: {"record": pick(rng, *w.records[:3]), "poles": pick(rng, 1, 2), "zeros": 0, "constraints": pick(rng, (), (cid.Integrator(),)), "controller": None, "delay": pick(rng, 0.0, 0.02)},
-    "fit_each": lambda w, rng: {"fit": cid.fit_arx, "records": w.records[:2], "jobs": None, "na": 2, "nb": pick(rng, 1, 2)},
+    "fit_each": lambda w, rng: {"fit": pick(rng, cid.fit_arx, cid.fit_iv), "records": w.records[:2], "jobs": None, "na": 2, "nb": pick(rng, 1, 2)},
     "fit_iv": lambda w, rng: {"record": pick(rng, *w.records[:2]), "na": 2, "nb": 1, "nk": 1, "constraints": (), "controller": None, "intercept": pick(rng, True, False), "instruments": "r"},
     "fit_loop": lambda w, rng: {"loop": pick(rng, w.loop, w.pid), "record": pick(rng, w.records[0], w.records[:2]), "free": pick(rng, None, ("c",)), "coloured": pick(rng, None, False)},
     "linearize": lambda w, rng: {"plant": w.plants[0], "at": cid.OperatingPoint((0.0, 0.0), 0.0, 0.0)},
@@ -267,8 +267,8 @@ def check_answer(name: str, given: Arguments, answer: Any) -> str | None:
     check = INVARIANTS.get(name)
     if check is not None and not check(given, answer):
         return "the answer breaks its invariant"
-    writable = [k for k, v in getattr(answer, "__dict__", {}).items()
-                if isinstance(v, np.ndarray) and v.flags.writeable
+    writable = [k for k in getattr(answer, "__dataclass_fields__", {})
+                if isinstance(v := getattr(answer, k), np.ndarray) and v.flags.writeable
                 and type(answer).__module__.startswith("ctrlid")]  # fmt: skip
     return f"writable arrays: {writable}" if writable else None
 

@@ -18,6 +18,7 @@ from .diagnosis import (
     Disturbance,
     Finding,
     Gap,
+    SensorNoise,
     diagnose,
     load_diagnosis,
 )
@@ -105,6 +106,7 @@ __all__ = [
     "SamplingRow",
     "SamplingSweep",
     "Section",
+    "SensorNoise",
     "StaticGain",
     "SymmetricPoles",
     "__version__",

@@ -1,6 +1,8 @@
 """The command ``ctrlid``, also ``python -m ctrlid``: demonstrations and ``diagnose``."""
 
 import argparse
+import codecs
+import io
 import itertools
 import math
 import os
@@ -15,12 +17,13 @@ from tqdm import tqdm
 
 from . import __version__
 from ._base.errors import CtrlidError
+from ._base.files import replace_file
 from .diagnosis import Diagnosis
 from .reporting import plot
 from .reporting.cli.demo_diagnosis import TITLES as SECOND
 from .reporting.cli.demo_diagnosis import tell_diagnosis
 from .reporting.cli.demo_identification import TITLES, tell_identification
-from .reporting.cli.diagnose_command import add_parser, make_folder
+from .reporting.cli.diagnose_command import INTERRUPTED, add_parser, make_folder
 from .reporting.html_page import Section, write_report
 from .reporting.tables import Table
 
@@ -29,6 +32,11 @@ FOLDER = "ctrlid-report"
 FEWEST = 500
 # Paragraphs are wrapped at so many characters.
 WIDTH = 88
+# Signs of the reports, for terminals whose encoding lacks them.
+PLAIN = {
+    "±": "+-", "−": "-", "·": "*", "×": "x", "≤": "<=", "≥": ">=", "²": "^2", "³": "^3", "°": "deg",
+    "µ": "u", "μ": "u", "–": "-", "—": "-", "…": "...", "√": "sqrt",
+}  # fmt: skip
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -45,6 +53,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         0; 1 after a refusal, which is on stderr in one line; 130 after Ctrl-C. A wrong usage exits
         with 2.
     """
+    for stream in (sys.stdout, sys.stderr):
+        # A terminal that has no sign for plus or minus is no reason to lose a result.
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="ctrlid")
     args = _make_parser().parse_args(arguments)
     try:
         code: int = args.run(args)
@@ -54,12 +66,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     except KeyboardInterrupt:
         print("ctrlid: interrupted", file=sys.stderr)
-        return 130
+        return INTERRUPTED
     # The reader of the output, such as `head`, has seen enough.
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     return code
+
+
+def _spell_out(error: UnicodeError) -> tuple[str, int]:
+    """Replace signs that an encoding lacks by plain ones."""
+    assert isinstance(error, UnicodeEncodeError)
+    signs = error.object[error.start : error.end]
+    return "".join(PLAIN.get(sign, "?") for sign in signs), error.end
+
+
+codecs.register_error("ctrlid", _spell_out)
 
 
 def _make_parser() -> argparse.ArgumentParser:
@@ -149,7 +171,9 @@ def _save_figures(section: Section, number: int, folder: Path) -> Section:
     for letter, (caption, data) in zip("abcdefgh", figures.items(), strict=False):
         words = caption if several else section.title
         slug = re.sub(r"[^a-z]+", "-", words.lower()).strip("-")
-        (folder / f"{number}{letter if several else ''}-{slug}.png").write_bytes(data)
+        name = f"{number}{letter if several else ''}-{slug}.png"
+        with replace_file(folder / name, binary=True) as file:
+            file.write(data)
     return replace(section, figure=figures)
 
 

@@ -46,8 +46,7 @@ plt.show()
 given = cid.Loop(plant, None, dt=records[0].dt, at=at)
 physics = given.with_parameters({"K": found.loop.parameters["K"]})
 for finding in found.findings:
-    if finding.name != "Quantization":
-        physics = physics.with_effect(finding.effect)
+    physics = physics.with_effect(finding.effect)
 print("set-point   measured   as given   completed [V]")
 for record in sorted(records, key=lambda r: r.y.mean()):
     x = float(record.y.mean())

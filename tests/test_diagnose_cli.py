@@ -72,7 +72,7 @@ def test_a_file_is_diagnosed(folder, capsys):
     assert run("log.csv", *COLUMNS, *SERVO, "--controller", "kp=20,kd=1", "--at-output", 0,
                "--save", "found") == 0  # fmt: skip
     out, err = capsys.readouterr()
-    assert err == ""
+    assert all(line.startswith("ctrlid diagnose: ") for line in err.splitlines())
     assert out.startswith("Diagnosis of log (2000 samples, dt = 0.01 s)\n")
     assert "QuadraticDrag" in out
     assert out.endswith("report.html, report.txt, diagnosis.png and diagnosis.json are in "
@@ -91,7 +91,8 @@ def test_a_file_is_diagnosed(folder, capsys):
 def test_what_the_command_line_means(folder, asked, record, capsys):
     assert run("log.csv", *COLUMNS, *SERVO, "--free", "c", "--at-output", 0.02, "--input-bias", 0.1,
                "--controller", "kp=20,kd=1,derivative=measurement,upper=10", "--jobs", 2,
-               "--validation", "log.csv", "--hold", "foh", "--quiet") == 0  # fmt: skip
+               "--validation", "log.csv", "--hold", "foh", "--quiet",
+               "--seconds", 90) == 0  # fmt: skip
     ((loop, read, settings),) = asked
     assert loop.parameters == {"m": 1.0, "c": 2.0, "k": 3.0}
     assert (loop.free, loop.dt) == (("c",), DT)
@@ -99,8 +100,8 @@ def test_what_the_command_line_means(folder, asked, record, capsys):
     assert loop.controller == cid.PID(kp=20.0, kd=1.0, derivative="measurement", upper=10.0)
     np.testing.assert_allclose(read.y, record.y, rtol=1e-8, atol=1e-12)
     assert (read.hold, read.names["u"], read.units["y"]) == ("foh", "volt", "m")
-    assert settings.keys() == {"validation", "jobs", "progress"}
-    assert (settings["jobs"], settings["progress"]) == (2, False)
+    assert settings.keys() == {"validation", "jobs", "seconds", "progress"}
+    assert (settings["jobs"], settings["seconds"], settings["progress"]) == (2, 90.0, False)
     assert capsys.readouterr().out == "the report\n"
 
 
@@ -112,7 +113,7 @@ def test_what_is_taken_without_saying(folder, asked, record):
     assert loop.at.output == pytest.approx(record.y.mean())
     assert read.hold == "zoh"
     assert read.r is not None
-    assert settings == {"progress": False}
+    assert settings == {"progress": True}
     assert run("bare.csv", "--dt", DT, *SERVO, "--free") == 0
     assert asked[1][0].free == ()
 

@@ -35,7 +35,6 @@ OF_OTHERS = {
     "diagnosis/replicas.py: _design_normalized_controller",  # runs python-control alone
     "loop/loop.py: _check_limits",
     "loop/simulation.py: _check_several_signals",
-    "loop/simulation.py: _check_signals",
 }
 TRYING = ("diagnosis", "effects", "estimation/likelihood", "loop")
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 import control as ct
 import numpy as np
 import pytest
+from scipy import signal
 
 import ctrlid as cid
 import problems
@@ -129,12 +130,30 @@ def test_gaps_do_not_join():
 
 @pytest.mark.parametrize(("name", "closed"), [
     ("emps", True), ("inteco_pid_step", True), ("magnetoshield_r3", True),
-    ("inteco_coil_step", False), ("tanks_estimation", False), ("tanks_validation", False),
+    ("inteco_coil_step", False), ("silverbox", False), ("tanks_estimation", False),
+    ("tanks_validation", False),
 ])  # fmt: skip
 def test_measured_records(data_dir, name, closed):
     records = cid.datasets.load(name)
     for record in records if isinstance(records, list) else [records]:
         assert cid.check_feedback(record).closed_loop is closed
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("hold", ["zoh", "foh", "bandlimited"])
+def test_an_open_bench_whose_input_is_not_held_is_no_closed_loop(hold, seed):
+    """An oscillator under a filtered noise that runs straight between the samples, by SciPy."""
+    rng = np.random.default_rng(seed)
+    dt, n = 1 / 610, 3000
+    stiffness, cut = rng.uniform(0.5e5, 2.5e5), rng.uniform(0.3, 0.7)
+    plant = np.array([[0, 1.0], [-stiffness, -40.0]]), np.array([[0.0], [1e5]]), np.eye(2)[:1], 0.0
+    u = signal.lfilter(*signal.butter(6, cut), rng.standard_normal(n))
+    y = signal.lsim(plant, u, dt * np.arange(n), interp=True)[1]
+    y += 10 ** rng.uniform(-3.5, -2) * np.std(y) * rng.standard_normal(n)
+    found = cid.check_feedback(cid.Record(u=u, y=y, dt=dt, hold=hold))
+    assert not found.closed_loop
+    if abs(found.correlation[0]) > 0.5:
+        assert "not held between the samples" in str(found)
 
 
 def test_refusals():

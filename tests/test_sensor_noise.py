@@ -1,7 +1,6 @@
 """Coloured sensor noise in the likelihood, against theory and noise made by a filter."""
 
 import dataclasses
-import math
 
 import numpy as np
 import pytest
@@ -9,17 +8,17 @@ from scipy import signal
 from scipy.linalg import expm, toeplitz
 
 import ctrlid as cid
-from ctrlid._base.statistics import autocorrelation_time
 from ctrlid.diagnosis.fitted_model import Model
 from ctrlid.diagnosis.fresh_data import choose_fresh_data
-from ctrlid.diagnosis.gap_summary import compute_ratio_probability, make_size_test
-from ctrlid.estimation.likelihood.kalman_filter import Noise
+from ctrlid.diagnosis.gap import compute_chance_among_runs
+from ctrlid.diagnosis.gap_summary import make_size_test
+from ctrlid.estimation.likelihood.kalman_filter import Noise, compute_memory
 from ctrlid.estimation.likelihood.likelihood import make_problem
 from ctrlid.estimation.likelihood.maximization import begin_fit, choose_sensor_noise, maximize
 from ctrlid.estimation.likelihood.noise_fit import fit_noise
 
 
-def simulate_servo(r, noise, dt=0.01, kp=20.0, kd=1.0, filter_time=0.02):
+def simulate_servo(r, noise, dt=0.01, kp=20.0, kd=1.0, filter_time=0.02, dead_zone=0.0):
     """Return reading and input of y" = 3 u - 2 y' with a PD that sees the noise, held exactly.
 
     The transition is a matrix exponential: what interpolates the input between samples, as
@@ -34,7 +33,8 @@ def simulate_servo(r, noise, dt=0.01, kp=20.0, kd=1.0, filter_time=0.02):
         e = r[k] - y[k]
         d = (filter_time * d + kd * (e - last)) / (filter_time + dt)
         u[k], last = kp * e + d, e
-        x = move[:2, :2] @ x + move[:2, 2] * u[k]
+        acting = u[k] - np.clip(u[k], -dead_zone, dead_zone)
+        x = move[:2, :2] @ x + move[:2, 2] * acting
     return y, u
 
 
@@ -109,16 +109,20 @@ def test_noise_larger_than_the_gap_is_refused_and_true_noise_is_not(controller):
     assert is_larger(Model(loop, larger))
 
 
-def test_the_size_test_keeps_its_level():
-    # Of true noise it refuses one in a hundred: seven of sixty would be a chance of 1e-5.
+def test_the_chance_among_runs_keeps_its_level():
+    # Of true noise one in a hundred is refused.
     rng = np.random.default_rng(7)
-    refused = 0
-    for _ in range(60):
-        e = signal.lfilter([1.0], [1.0, -0.9], rng.standard_normal(900))[400:]
-        ratio = np.mean(e**2) * (1 - 0.81)
-        worth = len(e) / autocorrelation_time(e, 2)
-        refused += compute_ratio_probability(ratio, worth, math.inf) < 0.01
-    assert refused <= 6
+    runs = np.sqrt(rng.chisquare(20, (4000, 9)))
+    low = [compute_chance_among_runs(float(r[0]), r[1:]) < 0.01 for r in runs]
+    assert 0.004 < np.mean(low) < 0.02
+
+
+def test_the_memory_of_noise_is_that_of_its_autocorrelation():
+    # Of an autoregression of order one the sum is (1 + a^2) / (1 - a^2).
+    memory = compute_memory(Noise((1.0,), ar=(0.9,)), 2000)
+    assert memory == pytest.approx((1 + 0.81) / (1 - 0.81), rel=1e-6)
+    assert compute_memory(Noise((1.0,)), 2000) == pytest.approx(1)
+    assert compute_memory(Noise((1.0,), ma=(1.0,)), 2000) == pytest.approx(1.5)
 
 
 def test_holding_the_colour_fits_the_force_alone():

@@ -135,7 +135,7 @@ def test_responses_of_python_control():
     np.testing.assert_array_equal(record.u, Y)
     one = cid.Record.from_response(ct.forced_response(plant, t, Y), u="F", y=["theta"])
     assert one.signals == {"u": ("F",), "y": ("theta",)}
-    same(cid.Record.from_response(record.to_response()), record)
+    same(cid.Record.from_response(record.to_response(), hold="foh"), record)
     back = cid.Record.from_response(make().to_response(), r=["r theta", "r alpha"],
                                     y=["y theta", "y alpha"], u="V")  # fmt: skip
     np.testing.assert_array_equal(back.r, Y + 1)

@@ -13,14 +13,22 @@ ROOT = Path(__file__).resolve().parents[1]
 FILES = sorted(
     path for path in (ROOT / "ctrlid" / "diagnosis").glob("*.py") if path.stem != "thresholds"
 )
-LAYOUT = {"wording", "report_text", "saving", "several_records"}  # columns and digits of texts
+LAYOUT = {
+    "wording",
+    "report_text",
+    "saving",
+    "several_records",
+    "progress",
+}  # columns and digits of texts
 PLAIN = {0, 1, 2, 0.5}
 # Coefficients of published formulas, and numbers that belong to nobody's judgement.
 FORMULAS = {
     ("noise_tests", "_compute_force_deviates"),  # D'Agostino; Anscombe and Glynn
     ("noise_tests", "_test_tails"),  # kurtosis of a Gaussian, and its variance 24 / n
+    ("noise_tests", "compute_excess"),  # kurtosis of a Gaussian
     ("gap", "draw_noise"),  # three streams of random numbers
     ("verdict", "write_conclusion"),  # per cent
+    ("findings", "SensorNoise"),  # per cent
 }
 CONSTANTS = {
     ("procedure", "PROGRESS"),

@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import functools
+import math
+import multiprocessing
 import os
+import signal
+import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import islice
+from numbers import Integral
 from typing import Any, TypeVar
 
 import joblib
 
 from .errors import CtrlidError
+from .interruption import Budget, check_budget, check_interrupt, find_budget
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -23,8 +29,9 @@ BATCH = 16
 
 def check_jobs(jobs: Any) -> int | None:
     """Return a number of jobs as joblib takes it, refused in words otherwise."""
-    if jobs is None or (isinstance(jobs, int) and not isinstance(jobs, bool) and jobs != 0):
-        return jobs
+    if jobs is None or (isinstance(jobs, Integral) and not isinstance(jobs, bool) and jobs != 0):
+        # More than any machine has are all.
+        return None if jobs is None else max(min(int(jobs), 2**16), -(2**16))
     raise CtrlidError(
         "jobs is a number of processes, at least 1, or -1 for all processors, or None for what "
         f"joblib.parallel_config says; given {jobs!r}"
@@ -57,12 +64,40 @@ def share_out(
     [1, 2, 3]
     """
     if joblib.effective_n_jobs(jobs) == 1:
-        yield from map(function, items)
+        for item in items:
+            check_budget()
+            yield function(item)
         return
     source = iter(items)
-    with joblib.Parallel(n_jobs=jobs) as run:
+    with joblib.Parallel(n_jobs=jobs, return_as="generator") as run:
         while batch := list(islice(source, BATCH)):
-            yield from run(joblib.delayed(function)(item) for item in batch)
+            try:
+                for result in run(_list_calls(function, batch)):
+                    check_budget()
+                    yield result
+            finally:
+                # A process that Ctrl-C ended before its first item is reported as lost.
+                check_interrupt()
+
+
+def _list_calls(function: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[Any]:
+    """Yield the calls that joblib makes, each with the time that is left when it is handed out."""
+    budget = find_budget()
+    for item in items:
+        left = math.inf if budget is None else budget.left
+        yield joblib.delayed(_call_elsewhere)(function, item, left)
+
+
+def _call_elsewhere(function: Callable[[Item], Result], item: Item, left: float) -> Result:
+    """Call a function in another process or thread, for so many seconds."""
+    process = multiprocessing.parent_process() is not None
+    if process and threading.current_thread() is threading.main_thread():
+        # Ctrl-C reaches all processes of a terminal; the one that asked decides what it means.
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if math.isinf(left):
+        return function(item)
+    with Budget(left).running():
+        return function(item)
 
 
 def run_side_by_side(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
@@ -103,8 +138,13 @@ def run_side_by_side(function: Callable[[Item], Result], items: Iterable[Item]) 
     helpers = [
         _start_threads().submit(take) for _ in range(min(count_processors(), len(given)) - 1)
     ]
-    # The calling thread works too, while the others start.
-    take()
+    try:
+        # The calling thread works too, while the others start.
+        take()
+    except BaseException:
+        # Nobody waits for the rest any more, after Ctrl-C for instance.
+        waiting.clear()
+        raise
     for helper in helpers:
         # A thread that has not started yet is not needed any more.
         if not helper.cancel():

@@ -335,3 +335,31 @@ def pseudo_inverse(matrix: Array, smallest: float = SINGULAR) -> Array:
     keep = values > smallest * values.max()
     inverse = (vectors[:, keep] / values[keep]) @ vectors[:, keep].T
     return np.asarray(inverse / np.outer(size, size), dtype=float)
+
+
+def sum_with_correlations(g: Array) -> Array:
+    r"""Return the covariance of the sum of correlated rows (Newey, West).
+
+    .. math:: \sum_{|l| \le L} \Bigl(1 - \frac{|l|}{L + 1}\Bigr) \sum_k g_k g_{k - l}^T, \quad
+        L = \lceil 1.5\, n^{1/3} \rceil
+
+    Parameters
+    ----------
+    g : ndarray, shape (n, p)
+        Rows of mean zero, such as the scores of the samples.
+
+    Returns
+    -------
+    ndarray, shape (p, p)
+        The covariance.
+
+    References
+    ----------
+    Newey and West, Econometrica 55 (1987) 703-708.
+    """
+    lags = min(int(np.ceil(1.5 * len(g) ** (1 / 3))), max(len(g) - 1, 0))
+    total = g.T @ g
+    for lag in range(1, lags + 1):
+        both = g[lag:].T @ g[: len(g) - lag] * (1 - lag / (lags + 1))
+        total = total + both + both.T
+    return np.asarray(total)

@@ -4,8 +4,9 @@ import csv
 import io
 import json
 import math
+import re
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from numbers import Real
 from pathlib import Path
 from typing import Any
@@ -13,12 +14,18 @@ from typing import Any
 import numpy as np
 
 from .._base.errors import CtrlidError, CtrlidWarning
+from .._base.files import replace_file
 from .._base.text import drop_roundoff, split_unit, with_unit
 
 TIME = ("t", "time", "timestamp", "seconds", "zeit")
 SECONDS = {"": 1.0, "s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6,
            "min": 60.0, "h": 3600.0}  # fmt: skip
 MARK = "# ctrlid "
+# The first line in which Excel is told the separator.
+SEPARATOR = "sep="
+CLOCK = re.compile(r"\d{4}-\d\d-\d\d|\d{1,2}[./]\d{1,2}[./]\d{2,4}|\d{1,2}:\d\d")
+# A file with more missing samples than this many times its rows has a wild time stamp.
+WILD = 100
 # A good clock never jitters by more than this share of the period.
 JITTER = 0.01
 # A step of more periods between two time stamps says that samples are missing.
@@ -56,12 +63,13 @@ def write_csv(path: Path, record: Any) -> None:
     ):
         raise CtrlidError(f"the header {header} would not be read back as it is: remove brackets, "
                           "outer spaces and line breaks from names and units")  # fmt: skip
-    fields = {key: getattr(record, key) for key in ("name", "dt", "hold")}
-    fields["names"] = dict(record.names)
+    fields = {key: getattr(record, key) for key in ("name", "dt", "hold", "hold_r")}
+    # A file that was cut off by a full disk or a copy is told by its number of rows.
+    fields |= {"names": dict(record.names), "rows": len(record)}
     several = {key: labels for key, labels in columns.items() if len(labels) > 1}
     if several:
         fields["columns"] = several
-    with path.open("w", encoding="utf-8", newline="\n") as file:
+    with replace_file(path) as file:
         file.write(f"{MARK}{json.dumps(fields, ensure_ascii=False)}\n{line.getvalue()}\n")
         for first in range(0, len(record), CHUNK):
             rows = np.column_stack([c[first : first + CHUNK] for c in channels.values()])
@@ -89,6 +97,12 @@ def read_csv(
     if gaps not in ("error", "mask"):
         raise CtrlidError(f"gaps must be 'error' or 'mask'; given {gaps!r}")
     own, header, table = _read_table(path)
+    if own.get("rows", len(table)) != len(table):
+        raise CtrlidError(
+            f"{path} is not whole: its line {MARK.strip()!r} says {own['rows']} rows, and it has "
+            f'{len(table)}. Copy it again; if the rows were changed on purpose, take "rows" out '
+            "of that line"
+        )
     labels = [split_unit(cell) for cell in header]
     names = [label for label, _ in labels]
 
@@ -168,6 +182,7 @@ def read_csv(
         "units": {**{key: words for key, words in read.items() if any(words)}, **(units or {})},
         "names": own.get("names", {k: v for k, v in known.items() if v != (k,)}),
         "hold": hold or own.get("hold", "zoh"),
+        "hold_r": own.get("hold_r", "zoh"),
         "name": own.get("name", path.stem) if name is None else name,
     }  # fmt: skip
 
@@ -200,30 +215,38 @@ def _read_table(path: Path) -> tuple[dict[str, Any], list[str], Any]:
         data = path.read_bytes()
     except OSError as reason:
         raise CtrlidError(f"cannot read {path}: {reason.strerror}") from reason
-    try:
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        # Older Windows tools write this encoding.
-        text = data.decode("cp1252", errors="replace")
+    text = _decode(data)
     own: dict[str, Any] = {}
-    comment, at = "", 0
+    comment, told, at = "", "", 0
     while True:
         stop = text.find("\n", at)
         stop = len(text) if stop < 0 else stop + 1
         line = text[at:stop].strip()
-        if at >= len(text) or (line and not line.startswith("#")):
+        if at >= len(text) or (line and not line.startswith(("#", SEPARATOR))):
             break
         if line.startswith(MARK):
             try:
                 own = json.loads(line.removeprefix(MARK))
-            except json.JSONDecodeError as reason:
+            except (json.JSONDecodeError, RecursionError) as reason:
                 raise CtrlidError(f"the line {line!r} of {path} is damaged: {reason}. Restore or "
                                   "remove it") from reason  # fmt: skip
+            if not isinstance(own, dict):
+                raise CtrlidError(f"the line {line!r} of {path} is damaged: it has no fields. "
+                                  "Restore or remove it")  # fmt: skip
+        elif line.lower().startswith(SEPARATOR) and len(line) == len(SEPARATOR) + 1:
+            told = line[-1]
         elif line:
             comment = line.lstrip("# ")
         at = stop
-    separator = max(",;\t", key=line.count)
+    separator = told or max(",;\t", key=line.count)
     header = _split_cells(line, separator)
+    if len(header) == 1 and line:
+        other = next((c for c in "|:; " if c in line), "something else")
+        raise CtrlidError(
+            f"{path} has a single column, {line[:60]!r}: columns are separated by commas, "
+            f"semicolons or tabs. If these are separated by {other!r}, replace it, or say so in a "
+            "first line such as sep=| (Excel reads that, too)"
+        )
     if all(_is_number(cell) for cell in header):
         # numpy.savetxt writes its header as a comment.
         header = _split_cells(comment, separator)
@@ -247,10 +270,23 @@ def _read_table(path: Path) -> tuple[dict[str, Any], list[str], Any]:
     return own, header, table
 
 
+def _decode(data: bytes) -> str:
+    """Return the text of a file, with line ends of one kind; what tools of all ages write."""
+    if data.startswith((b"\xff\xfe", b"\xfe\xff")):
+        text = data.decode("utf-16", errors="replace")
+    else:
+        try:
+            text = data.decode("utf-8-sig")
+        except UnicodeDecodeError:
+            # Older Windows tools write this encoding.
+            text = data.decode("cp1252", errors="replace")
+    return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
 def _read_with_blanks(path: Path, body: str, separator: str, above: int) -> Any:
     """Read a table with blank cells, which are NaN, below so many lines."""
     rows = []
-    for k, cells in enumerate(csv.reader(io.StringIO(body), delimiter=separator)):
+    for k, cells in enumerate(_read_cells(body, separator)):
         if not cells or cells[0].lstrip().startswith("#"):
             continue
         numbers = []
@@ -258,6 +294,13 @@ def _read_with_blanks(path: Path, body: str, separator: str, above: int) -> Any:
             try:
                 numbers.append(float(cell) if cell.strip() else math.nan)
             except ValueError:
+                if CLOCK.match(cell.strip()):
+                    raise CtrlidError(
+                        f"{path} has a date or a time of day, {cell.strip()!r}, in line "
+                        f"{above + k + 1}; times are numbers, in seconds from any start. Convert "
+                        "them, for instance with pandas.to_datetime(column), or give dt= and leave "
+                        "the column out"
+                    ) from None
                 raise CtrlidError(
                     f"{path} is not a table of numbers: {cell.strip()!r} stands in line "
                     f"{above + k + 1}. Remove it, or leave the cell blank and give gaps='mask'"
@@ -296,8 +339,20 @@ def _fill_gaps(
 
 
 def _split_cells(line: str, separator: str) -> list[str]:
-    rows = list(csv.reader([line], delimiter=separator, skipinitialspace=True))
+    rows = list(_read_cells(line, separator, skipinitialspace=True))
     return [cell.strip() for cell in rows[0]] if rows else [""]
+
+
+def _read_cells(text: str, separator: str, **options: Any) -> Iterator[list[str]]:
+    """Return the cells of each line, or refuse what is no table."""
+    rows = csv.reader(io.StringIO(text), delimiter=separator, **options)
+    try:
+        yield from rows
+    except csv.Error as reason:
+        raise CtrlidError(
+            f"line {rows.line_num} below the header is not a line of a table: {reason}. Remove it, "
+            "or save the file as CSV again"
+        ) from reason
 
 
 def _is_number(cell: str) -> bool:
@@ -407,7 +462,15 @@ def _make_uniform(stamps: Any, dt: float | None, gaps: str, path: Path) -> tuple
                           "Leave out dt=, or remove the column")  # fmt: skip
     if dt is None:
         dt = estimate_period(stamps) if len(regular) == len(steps) else usual
-    missing = np.where(steps < GAP * dt, 0, np.round(steps / dt).astype(int) - 1)
+    lost = np.round(steps / dt) - 1
+    if np.sum(lost) > WILD * len(stamps):
+        k = int(np.argmax(lost))
+        raise CtrlidError(
+            f"the time column of {path} jumps from {stamps[k]:.6g} s to {stamps[k + 1]:.6g} s in "
+            f"row {k + 2} of the data, at a period of {dt:.4g} s: {lost[k]:.4g} samples would be "
+            "missing. Correct or remove the wild time stamp, or cut the file there"
+        )
+    missing = np.where(steps < GAP * dt, 0, lost).astype(int)
     where = np.flatnonzero(missing)
     if where.size and gaps == "error":
         k = int(where[np.argmax(missing[where])])

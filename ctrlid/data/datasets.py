@@ -10,6 +10,7 @@ import numpy as np
 import pooch
 from scipy import io
 
+from .._base.arguments import check_arguments
 from .._base.errors import CtrlidError
 from .record import Record
 
@@ -393,6 +394,7 @@ def describe(name: str) -> str:
     Source: https://raw.githubusercontent.com/forgi86/sysid-neural-unc/...
     Terms: public benchmark; cite Schoukens, Mattson, Wigren, Noël (2016)
     """
+    check_arguments(describe, locals())
     source, _, text = _find_entry(name)
     return f"{text}.\nSource: {source.address}\nTerms: {source.terms}"
 
@@ -421,6 +423,7 @@ def load(name: str) -> Any:
     CtrlidError
         If there is no such record, the file cannot be fetched or is not the published one.
     """
+    check_arguments(load, locals())
     source, read, _ = _find_entry(name)
     table = _read_file(_find_file(source))
     loaded = read(table)

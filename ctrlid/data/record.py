@@ -11,6 +11,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from scipy import signal
 
+from .._base.arguments import check_arguments
 from .._base.errors import CtrlidError
 from .._base.signals import list_signals, require_one_signal
 from .._base.text import Printed
@@ -46,6 +47,9 @@ class Record(Printed):
         analog signal nearly does; or as the samples of a measured signal say that has nothing above
         half the sampling rate, which takes later samples and so holds only where u does not react
         to y.
+    hold_r : {"zoh", "foh"}, optional
+        How r runs between samples, which counts where an analog controller sees it: held, or
+        straight, as in a simulation of python-control.
     extra : mapping of str to array_like, optional
         Further measured channels [as in `units`], for instance a coil current.
     valid : array_like of bool, shape (n,) or (outputs, n), optional
@@ -90,6 +94,7 @@ class Record(Printed):
     units: Mapping[str, Any] = field(default_factory=dict)
     name: str = ""
     start: float = 0.0
+    hold_r: Literal["zoh", "foh"] = "zoh"
 
     def __post_init__(self) -> None:
         given = {k: getattr(self, k) for k in SIGNALS}
@@ -120,6 +125,12 @@ class Record(Printed):
         if self.hold not in get_args(Hold):
             raise CtrlidError(f"hold must be 'zoh' (held between samples), 'foh' (straight) or "
                               f"'bandlimited'; given {self.hold!r}")  # fmt: skip
+        if self.hold_r not in ("zoh", "foh"):
+            raise CtrlidError(f"hold_r must be 'zoh' (held between samples) or 'foh' (straight); "
+                              f"given {self.hold_r!r}")  # fmt: skip
+        if np.ma.is_masked(self.valid):
+            raise CtrlidError("valid is a masked array, and a record would use its masked values: "
+                              "give valid.filled(False)")  # fmt: skip
         valid = np.ones(n, dtype=bool) if self.valid is None else np.array(self.valid)
         several = (counts["y"], n) if counts["y"] > 1 else (n,)
         if valid.dtype != bool or valid.shape not in ((n,), several):
@@ -276,6 +287,7 @@ class Record(Printed):
         CtrlidError
             If fewer than 2 samples lie between.
         """
+        check_arguments(Record.between, locals())
         if not t0 < t1:
             raise CtrlidError(f"between needs t0 < t1 in seconds; given {t0!r} and {t1!r}")
         # A sample that round-off puts a hair before t0 belongs to it.
@@ -309,6 +321,7 @@ class Record(Printed):
         CtrlidError
             If the fractions are not increasing between 0 and 1.
         """
+        check_arguments(Record.split, locals())
         cuts = fractions or (0.5,)
         edges = np.array([0.0, *cuts, 1.0])
         if not np.all(np.diff(edges) > 0):
@@ -351,6 +364,7 @@ class Record(Printed):
         >>> len(slow), slow.dt, float(slow.y[0]), slow.segments()
         (25, 0.004, 1.0, [(10, 15)])
         """
+        check_arguments(Record.decimate, locals(), "q")
         if not isinstance(q, Integral) or not 1 <= q <= len(self) // 2:
             raise CtrlidError(f"decimate needs a whole factor from 1 to {len(self) // 2} for "
                               f"{len(self)} samples; given {q!r}")  # fmt: skip
@@ -405,6 +419,7 @@ class Record(Printed):
         CtrlidError
             If there is no such channel.
         """
+        check_arguments(Record.with_input, locals())
         return self._swap_channels("u", channel)
 
     def with_output(self, channel: str) -> "Record":
@@ -425,6 +440,7 @@ class Record(Printed):
         CtrlidError
             If there is no such channel.
         """
+        check_arguments(Record.with_output, locals())
         return self._swap_channels("y", channel)
 
     def _swap_channels(self, key: str, channel: str) -> "Record":
@@ -515,6 +531,7 @@ class Record(Printed):
             If the file is no table of numbers, a column is missing, the time does not increase or
             samples are missing.
         """
+        check_arguments(Record.from_csv, locals(), "gaps")
         return cls(**_csv.read_csv(
             Path(path), {"r": r, "u": u, "y": y}, time, dt, extra, units, hold, name, gaps,
             scale,
@@ -535,7 +552,14 @@ class Record(Printed):
         CtrlidError
             If a channel's name or unit cannot stand in a header line.
         """
-        _csv.write_csv(Path(path), self)
+        check_arguments(Record.to_csv, locals())
+        try:
+            _csv.write_csv(Path(path), self)
+        except OSError as reason:
+            raise CtrlidError(
+                f"the record cannot be written to {path}: {reason.strerror}. Give a file in a "
+                "folder that exists and may be written to"
+            ) from reason
 
     @classmethod
     def from_response(
@@ -543,6 +567,9 @@ class Record(Printed):
         u: str | Sequence[str] | None = None, y: str | Sequence[str] | None = None, **fields: Any,
     ) -> "Record":  # fmt: skip
         """Make a record of a `control.TimeResponseData`.
+
+        python-control takes the inputs of a system in continuous time as straight between the
+        samples. Where the states of the response show that, `hold` and `hold_r` are ``"foh"``.
 
         Parameters
         ----------
@@ -576,6 +603,7 @@ class Record(Printed):
           u (force)  1 .. 1
           y (speed)  0 .. 0.632121 m/s
         """
+        check_arguments(Record.from_response, locals())
         return cls(**{**_response.read_response(response, {"r": r, "u": u, "y": y}), **fields})
 
     def to_response(self) -> Any:

@@ -8,7 +8,8 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from .._base.arrays import Array
+from .._base.arguments import is_number
+from .._base.arrays import Array, to_real_array
 from .._base.errors import CtrlidError
 
 # Feedback taps of maximum-length shift registers, by number of stages (XAPP 052 of Xilinx).
@@ -114,7 +115,7 @@ def staircase(n: int, *, levels: Sequence[float] | npt.ArrayLike, hold: int) -> 
     """
     n, hold = _check_count(n, "n"), _check_count(hold, "hold")
     try:
-        values = np.array(levels, dtype=float)
+        values = to_real_array(levels, "levels")
     except (TypeError, ValueError):
         values = np.array(math.nan)
     if values.ndim != 1 or not len(values) or not np.isfinite(values).all():
@@ -295,10 +296,7 @@ def _check_count(value: Any, name: str) -> int:
 
 
 def _check_level(value: Any, name: str) -> float:
-    try:
-        number = float(value)
-    except (TypeError, ValueError):
-        number = math.nan
+    number = float(value) if is_number(value) else math.nan
     if not math.isfinite(number):
         raise CtrlidError(f"{name} is {value!r}; needed is a finite number.")
     return number

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from .._base.errors import CtrlidError
+from .._base.periods import have_same_period
 from .record import Record
 
 # An input that moves by more than this share of its standard deviation in a period is not held.
@@ -42,6 +43,15 @@ def as_records(data: Any) -> tuple[Record, ...]:
     for record in records[1:]:
         _require_same_kind(records[0], record)
     return tuple(records)
+
+
+def require_valid_samples(records: Sequence[Record], what: str) -> None:
+    """Refuse records of which nothing counts."""
+    for k, record in enumerate(records, 1):
+        if not record.valid.any():
+            where = what if len(records) == 1 else f"number {k} of {what}"
+            raise CtrlidError(f"{where} has no valid sample: valid= is False everywhere, so that "
+                              "nothing of it counts")  # fmt: skip
 
 
 def order_model_and_data(first: Any, second: Any) -> tuple[Any, Any]:
@@ -109,12 +119,11 @@ def _require_same_kind(first: Record, record: Record) -> None:
                 "records used together need the same inputs and outputs; given "
                 f"{first.signals} and {record.signals}"
             )
-    # Periods read from printed times differ by their last digits.
-    if abs(record.dt - first.dt) > 1e-6 * first.dt or record.hold != first.hold:
+    if not have_same_period(record.dt, first.dt) or record.hold != first.hold:
         raise CtrlidError(
             "records used together need the same sampling period and the same hold; given "
-            f"{first.dt:g} s, {first.hold!r} and {record.dt:g} s, {record.hold!r}. Decimate the "
-            "faster one, or give both the hold that describes their input better"
+            f"{first.dt:.10g} s, {first.hold!r} and {record.dt:.10g} s, {record.hold!r}. Decimate "
+            "the faster one, or give both the hold that describes their input better"
         )
 
 

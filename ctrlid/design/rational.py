@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import brentq, minimize_scalar
 
+from .._base.arguments import is_number
 from .._base.arrays import Array, ComplexArray
 from .._base.errors import CtrlidError
 from ..physics.conversions import to_polynomials
@@ -132,7 +133,7 @@ class Rational:
 
 def to_rational(system: Any, name: str) -> Rational:
     """Return `system` as polynomials, or refuse and say what `name` has to be."""
-    if isinstance(system, int | float | np.number):
+    if is_number(system):
         system = ct.tf([float(system)], [1.0], 0)
     if not isinstance(system, ct.TransferFunction | ct.StateSpace):
         hint = ": linearize it first" if isinstance(system, ct.NonlinearIOSystem) else ""

@@ -8,8 +8,9 @@ from typing import Any
 import control as ct
 import numpy as np
 
-from .._base.arrays import Array
-from .._base.errors import CtrlidError, EffectDoesNotApply, ModelCannotRun
+from .._base.arguments import check_arguments
+from .._base.arrays import Array, freeze_arrays
+from .._base.errors import CtrlidError, ModelCannotRun
 from .._base.signals import require_one_signal
 from .._base.text import Printed, write_polynomial, write_quantity
 from ..estimation.identified_model import IdentifiedModel
@@ -103,6 +104,9 @@ class Redesign(Printed):
     achieved_step: Array
     step: float
     failure: str = ""
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
 
     @property
     def stable(self) -> bool:
@@ -232,6 +236,7 @@ def redesign(
     >>> outcome.stable, round(outcome.achieved.phase_margin, 6)
     (True, 50.0)
     """
+    check_arguments(redesign, locals(), "loop", "step")
     if not isinstance(G, ct.TransferFunction | ct.StateSpace):
         raise CtrlidError("redesign needs a linear model (a TransferFunction, as the fits return); "
                           f"given {type(G).__name__}")  # fmt: skip
@@ -302,7 +307,7 @@ def _simulate_physical_step(
         still = simulate(loop, rest)
     except SimulationStopped as reason:
         return np.empty(0), _write_sentence(reason), reason.unstable
-    except (ModelCannotRun, EffectDoesNotApply) as reason:
+    except ModelCannotRun as reason:
         return np.empty(0), _write_sentence(reason), False
     try:
         moved = simulate(loop, rest + height)

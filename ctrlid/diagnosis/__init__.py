@@ -1,6 +1,6 @@
 """diagnose(): where simulation and data disagree, which effect is missing, and what it closes."""
 
-from .findings import BinnedErrors, Calibrated, Candidate, Disturbance, Finding, Gap
+from .findings import BinnedErrors, Calibrated, Candidate, Disturbance, Finding, Gap, SensorNoise
 from .loading import load_diagnosis
 from .procedure import diagnose
 from .result import Diagnosis
@@ -13,6 +13,7 @@ __all__ = [
     "Disturbance",
     "Finding",
     "Gap",
+    "SensorNoise",
     "diagnose",
     "load_diagnosis",
 ]

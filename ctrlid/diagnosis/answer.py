@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -9,13 +10,15 @@ from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from .._base.text import write_quantity
 from .._base.units import fill_unit
 from ..data.record import Record
-from ..effects import AbstractEffect, equivalents
+from ..effects import AbstractEffect, Quantization, equivalents
+from ..estimation.likelihood.likelihood import Fit
 from ..estimation.likelihood.physics_fit import summarize_fit
 from ..loop.loop import Loop
 from .candidates import Trial, is_same_kind
 from .experiment import find_experiment
-from .findings import Calibrated, Candidate, Finding
+from .findings import Calibrated, Candidate, Finding, SensorNoise
 from .gap_summary import GapSummary
+from .grounds import Case, find_ground
 from .growth import Search
 from .recalibration import fit_base_model
 from .records import Readout
@@ -25,7 +28,13 @@ from .result import Diagnosis
 from .screening import screen_at
 from .several_records import describe_presence
 from .thresholds import THRESHOLD
-from .verdict import choose_verdict, find_doubt, gap_is_left, write_conclusion
+from .verdict import (
+    choose_verdict,
+    describe_grounds,
+    find_doubt,
+    gap_is_left,
+    write_conclusion,
+)
 from .where import locate_errors
 
 
@@ -38,9 +47,19 @@ def assemble_answer(
     fitted = summarize_fit(found.final.loop, found.final.fit)
     names, known = fitted.estimate.names, found.final.errors
     errors = dict(known or zip(names, fitted.estimate.standard_errors.tolist(), strict=True))
-    findings = tuple(
+    made = [
         _make_finding(f, fitted.loop, errors, summary.shares, found, records) for f in found.found
-    )
+    ]
+    case = Case(loop, found.final, records, errors)
+    judged = [(one, find_ground(case, f)) for one, f in zip(made, found.found, strict=True)]
+    judged.sort(key=lambda pair: -pair[0].evidence)
+    findings = tuple(one for one, ground in judged if not ground)
+    grounds = [pair for pair in judged if pair[1]]
+    stand_ins = tuple(_doubt_name(one, ground) for one, ground in grounds)
+    # The steps of a converter belong to the record; no part of the loop is missing.
+    steps = [r for r in read if isinstance(r.effect, Quantization)]
+    remarks = tuple(_describe_steps(r, gap.unit) for r in steps)
+    read = [r for r in read if r not in steps]
     findings += tuple(Finding(r.effect, r.errors, (), (), r.evidence) for r in read)
     findings = tuple(sorted(findings, key=lambda f: -f.evidence))
     final = fitted.loop
@@ -52,6 +71,7 @@ def assemble_answer(
     total = found.final.fit.value - found.base.fit.value
     effects, gains = [f.trial.effect for f in found.found], [f.trial.gain for f in found.found]
     objection = find_doubt(effects, gains, total if math.isfinite(total) else 0.0)
+    objection = objection or describe_grounds(grounds)
     complete = found.after.passed and not left and objection is None
     verdict = choose_verdict(complete, named=bool(findings))
     notes = list(fitted.estimate.notes)
@@ -63,13 +83,6 @@ def assemble_answer(
             "the model is linear. If the errors depend on position, velocity or input, write the "
             "equations of the plant with ct.nlsys and diagnose that model"
         )
-    noise = found.final.fit.noise
-    if not noise.sensor_is_white:
-        size = math.sqrt(float(np.mean(found.final.fit.sensor)))
-        notes.append(
-            f"the sensor noise is taken as coloured, ARMA({len(noise.ar)}, {len(noise.ma)}), of "
-            f"{write_quantity(size, gap.unit)} RMS: the reading errs alike in successive samples"
-        )
     before = dict(zip(found.base.names, found.base.fit.theta.tolist(), strict=True))
     calibrated = tuple(
         Calibrated(name, loop.parameters[name], before[name], fitted.loop.parameters[name],
@@ -78,14 +91,39 @@ def assemble_answer(
     )  # fmt: skip
     tests = dict(found.after.p_values)
     ranking = _rank_candidates(found)
+    noise = describe_noise(found.final.fit, gap.unit)
     sentence = write_conclusion(
         verdict, findings, gap, disturbance, found.after, where, None if left else objection,
-        len({type(c.effect) for c in ranking}),
+        len({type(c.effect) for c in ranking}), grounds, noise,
     )  # fmt: skip
     return Diagnosis(
         verdict, sentence, findings, final, gap, where, ranking, disturbance,
-        calibrated, _find_sensitivity(found), tests, notes=tuple(notes),
+        calibrated, _find_sensitivity(found), tests, remarks, tuple(notes), noise=noise,
+        stand_ins=stand_ins,
     )  # fmt: skip
+
+
+def describe_noise(fit: Fit, unit: str) -> SensorNoise:
+    """Return the sensor noise of a fit as a diagnosis tells it."""
+    noise, variance = fit.noise, float(np.mean(fit.sensor))
+    if noise.tails is None:
+        return SensorNoise(math.sqrt(variance), unit, noise.ar, noise.ma)
+    tails = noise.tails
+    return SensorNoise(
+        math.sqrt(variance * tails.variance), unit, noise.ar, noise.ma,
+        tails.freedom or math.inf, tails.share, tails.ratio,
+    )  # fmt: skip
+
+
+def _doubt_name(finding: Finding, ground: str) -> Finding:
+    words = f"THE NAME DOES NOT STAND, since {ground}"
+    return replace(finding, note="; ".join(filter(None, [words, finding.note])))
+
+
+def _describe_steps(read: Readout, unit: str) -> str:
+    step = write_quantity(read.effect.values()["step"], unit)
+    return (f"converter: y moves in steps of {step}, whose rounding makes a good part of the "
+            "sensor noise")  # fmt: skip
 
 
 def name_records(records: Sequence[Record]) -> str:

@@ -6,6 +6,7 @@ import numpy as np
 from scipy import stats
 
 from .._base.arrays import Array
+from .._base.statistics import pseudo_inverse, sum_with_correlations
 from ..estimation.likelihood.likelihood import Fit
 from .thresholds import THRESHOLD
 
@@ -44,9 +45,9 @@ def run_constancy_tests(fit: Fit, axes: Mapping[str, Array]) -> dict[str, float]
     """
     names = fit.plant.names
     parts = [
-        (out.slopes[keep], out.innovations[keep], out.variance[keep] * r, keep)
-        for out, r, keep in zip(
-            fit.filtered, fit.sensor, map(np.isfinite, fit.standardized), strict=True
+        (out.slopes[keep], e[keep], s[keep], keep)
+        for out, (e, s), keep in zip(
+            fit.filtered, fit.working, map(np.isfinite, fit.standardized), strict=True
         )
     ]
     scores = np.concatenate([x * (e / s)[:, None] for x, e, s, _ in parts])
@@ -68,6 +69,75 @@ def run_constancy_tests(fit: Fit, axes: Mapping[str, Array]) -> dict[str, float]
         if lines:
             p_values[f"rhythm of {name}"] = min(1.0, min(lines) * len(lines))
     return p_values
+
+
+def compare_stretches(fit: Fit, name: str) -> float:
+    r"""Return the probability that a parameter is as unlike in stretches of the records by chance.
+
+    .. math:: \delta_b = \bigl(I_b^{-1} U_b\bigr)_j, \quad
+        V_b = \bigl(I_b^{-1} J_b I_b^{-1}\bigr)_{jj}, \quad
+        \chi^2 = \sum_b (\delta_b - \bar\delta)^2 / V_b
+
+    with score :math:`U_b` and information :math:`I_b` of all parameters in stretch b, so that the
+    others move along, and the variance :math:`J_b` of the score by its own correlations: beside
+    something unknown the innovations are not white. Stretches that say nothing of it do not count.
+
+    Parameters
+    ----------
+    fit : Fit
+        The fitted model.
+    name : str
+        The parameter.
+
+    Returns
+    -------
+    float
+        The probability; one where fewer than two stretches say anything.
+
+    References
+    ----------
+    White, Econometrica 50 (1982) 1-25 (the variance of estimates of a wrong model).
+    """
+    j = fit.plant.names.index(name)
+    moves, sizes = [], []
+    for out, r, shown in zip(
+        fit.filtered, fit.sensor, map(np.isfinite, fit.standardized), strict=True
+    ):
+        deviation = np.sqrt(out.variance[shown] * r)
+        slopes = out.slopes[shown] / deviation[:, None]
+        z = out.innovations[shown] / deviation
+        for x, e in zip(
+            np.array_split(slopes, THRESHOLD.stretches_compared),
+            np.array_split(z, THRESHOLD.stretches_compared), strict=True,
+        ):  # fmt: skip
+            move, variance = _estimate_alone(x, e, j)
+            if variance > 0:
+                moves.append(move)
+                sizes.append(variance)
+    if len(moves) < 2:
+        return 1.0
+    d, weights = np.array(moves), 1 / np.array(sizes)
+    spread = float(weights @ (d - weights @ d / weights.sum()) ** 2)
+    return float(stats.chi2.sf(spread, len(d) - 1))
+
+
+def _estimate_alone(x: Array, e: Array, j: int) -> tuple[float, float]:
+    """Return how far a stretch moves a parameter, and the variance; zeros if it says nothing."""
+    matrix = x.T @ x
+    size = np.sqrt(np.maximum(np.diag(matrix), THRESHOLD.tiny))
+    scaled = matrix / np.outer(size, size)
+    others = [k for k in range(len(size)) if k != j]
+    inverse = pseudo_inverse(scaled[np.ix_(others, others)], THRESHOLD.seen)
+    row = np.zeros(len(size))
+    row[j] = 1.0
+    row[others] = -inverse @ scaled[others, j]
+    left = float(row @ scaled @ row)
+    if not (np.isfinite(left) and left > THRESHOLD.seen) or matrix[j, j] <= THRESHOLD.tiny:
+        return 0.0, 0.0
+    shares = (x / size) @ row * e / (left * size[j])
+    # A few hundred samples may show less correlation than white noise has on the average.
+    variance = max(float(sum_with_correlations(shares[:, None])[0, 0]), 1 / (left * size[j] ** 2))
+    return float(shares.sum()), variance
 
 
 def _test_slow_line(score: Array, size: float, keep: Array) -> float:

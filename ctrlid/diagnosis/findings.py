@@ -4,7 +4,8 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
-from .._base.arrays import Array
+from .._base.arrays import Array, freeze_arrays
+from .._base.text import Printed, write_number, write_quantity
 from .._base.units import fill_unit
 from ..effects import AbstractEffect
 from ..validation.reproduction import CLOSED_LOOP, OPEN_LOOP, Reproduction
@@ -82,6 +83,9 @@ class Gap:
         """Whether a trivial predictor errs less than each of the models: the gap says nothing."""
         return self.trivial < min(self.given, self.before, self.after)
 
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
+
     @property
     def fitted(self) -> float:
         """RMS error of the recalibrated model, whether or not it is the smaller [output unit]."""
@@ -132,6 +136,9 @@ class Finding:
     reference: Array | None = None
     note: str = ""
     records: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
 
     @property
     def name(self) -> str:
@@ -204,6 +211,9 @@ class BinnedErrors:
     p_after: float
     words: str
 
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
+
 
 @dataclass(frozen=True)
 class Disturbance:
@@ -229,6 +239,69 @@ class Disturbance:
     def large(self) -> bool:
         """Whether they make more than half of the floor's variance, and may hide something."""
         return self.share > THRESHOLD.large_disturbance
+
+
+@dataclass(frozen=True, repr=False)
+class SensorNoise(Printed):
+    r"""The noise of the sensor as the diagnosis takes it; its text is a sentence.
+
+    .. math:: n_k = a_1 n_{k-1} + \dots + w_k + b_1 w_{k-1} + \dots
+
+    Parameters
+    ----------
+    size : float
+        RMS value of the noise n [output unit].
+    unit : str
+        Output unit; empty where the record has none.
+    ar, ma : tuple of float
+        Coefficients a and b of coloured noise; both empty: it is white.
+    freedom : float
+        Degrees of freedom of Student's law where w has heavy tails; infinite: it has another law.
+    share, ratio : float
+        Share of wild readings, and how many times as large as the others these are; zero and one:
+        there are none.
+
+    Examples
+    --------
+    >>> import ctrlid as cid
+    >>> print(cid.SensorNoise(1e-4, "m"))
+    The sensor noise is white, of 0.1 mm RMS.
+    >>> print(cid.SensorNoise(1e-4, "m", share=0.01, ratio=10.0))
+    The sensor noise is heavy-tailed, of 0.1 mm RMS: 1 % of the readings err 10 times as much as ...
+    """
+
+    size: float
+    unit: str = ""
+    ar: tuple[float, ...] = ()
+    ma: tuple[float, ...] = ()
+    freedom: float = math.inf
+    share: float = 0.0
+    ratio: float = 1.0
+
+    @property
+    def kind(self) -> str:
+        """What it is: ``"white"``, ``"coloured"``, ``"heavy-tailed"`` or the two last together."""
+        kinds = ["coloured"] if self.ar or self.ma else []
+        if math.isfinite(self.freedom) or self.share:
+            kinds.append("heavy-tailed")
+        return " and ".join(kinds) or "white"
+
+    @property
+    def words(self) -> str:
+        """What it is, with its order and size, as the end of a sentence."""
+        order = f", ARMA({len(self.ar)}, {len(self.ma)})" if self.ar or self.ma else ""
+        text = f"{self.kind}{order}, of {write_quantity(self.size, self.unit or '[y]')} RMS"
+        told = ["the reading errs alike in successive samples"] if order else []
+        if math.isfinite(self.freedom):
+            told.append("large errors are as frequent as by Student's law with "
+                        f"{write_number(self.freedom, 2)} degrees of freedom")  # fmt: skip
+        if self.share:
+            told.append(f"{100 * self.share:.2g} % of the readings err "
+                        f"{write_number(self.ratio, 2)} times as much as the others")  # fmt: skip
+        return text + (f": {' and '.join(told)}" if told else "")
+
+    def __str__(self) -> str:
+        return f"The sensor noise is {self.words}."
 
 
 @dataclass(frozen=True)

@@ -114,8 +114,13 @@ def with_linearization(model: Model) -> Model:
 def compute_log_terms(fit: Fit) -> Array:
     """Return each sample's share of the log-likelihood, records one after the other."""
     parts: list[Any] = []
+    tails = fit.noise.tails
     for out, keep, r in zip(fit.filtered, fit.counts, fit.sensor, strict=True):
         s = out.variance[keep] * r
+        if tails is not None:
+            density = tails.compute_log_density(out.innovations[keep] / np.sqrt(s))
+            parts.append(density - 0.5 * np.log(s))
+            continue
         parts.append(-0.5 * (np.log(2 * np.pi * s) + out.innovations[keep] ** 2 / s))
     return np.concatenate(parts)
 

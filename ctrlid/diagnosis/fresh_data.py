@@ -6,11 +6,16 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
+from scipy import stats
 
 from .._base.arrays import Array
 from .._base.errors import CtrlidError, ModelCannotRun
+from .._base.periods import write_both_periods
+from .._base.statistics import autocorrelation_time
 from .._base.text import write_count
 from ..data.record import Record
+from ..data.several_records import require_valid_samples
+from ..estimation.likelihood.kalman_filter import compute_memory
 from ..estimation.likelihood.likelihood import Fit, Known, evaluate_likelihood, make_problem
 from ..estimation.likelihood.maximization import begin_fit, maximize
 from ..estimation.likelihood.prediction import (
@@ -106,37 +111,47 @@ class FreshData:
             total += 0.5 * float(np.nansum(z**2 - 1))
         return max(total, 0.0)
 
-    def compare_noise(self, loops: Sequence[Loop], fit: Fit) -> tuple[list[Array], float]:
-        """Return the errors of loops in each window, and the RMS error that noise would give them.
+    def compute_size_chance(self, loops: Sequence[Loop], fit: Fit) -> float:
+        r"""Return the probability that noise leaves errors as small as those of loops.
 
-        The noise is that of the fit, as coloured as it is; the errors are those of a simulation, or
-        of predictions of the true output. NaN where the noise cannot be computed.
+        The noise is that of the fit, as coloured as it is. The errors are those of the simulation,
+        among those of simulations with noise, or of predictions of the true output, with
+
+        .. math:: \nu\,\overline{e^2} / \sigma^2 \sim \chi^2_\nu, \quad \nu = N / \tau
+
+        for N samples of which one in :math:`\tau` is independent. NaN where the noise cannot be
+        computed.
         """
         if not self.how.horizon:
-            usual = gaps.compute_floor(
+            runs = gaps.measure_noise_errors(
                 loops, fit, self.windows, self.how, THRESHOLD.floor_more_runs
-            ).both
-            outputs = self.simulate_outputs(loops)
-            return [
-                (w.record.y - y)[w.mask & np.isfinite(y)]
-                for w, y in zip(self.windows, outputs, strict=True)
-            ], usual
+            )
+            return gaps.compute_chance_among_runs(self.measure_gap(loops), runs[:, 0])
         known, horizon = Known(fit.noise, np.full(1, float(np.mean(fit.sensor)))), self.how.horizon
-        errors, squares, count = [], 0.0, 0
+        squares = usual = worth = 0.0
         for loop, window in zip(loops, self.windows, strict=True):
             plain, record = replace(loop, controller=None), window.record
             problem = make_problem(plain, (), [record], [window.start_time])
             try:
                 here = begin_fit(replace(problem, known=known))
             except ModelCannotRun:
-                return [], math.nan
+                return math.nan
             index, y = predict_ahead(plain, record, make_prediction(here), horizon)
             use = window.mask[index] & np.isfinite(y)
-            errors.append((record.y[index] - y)[use])
+            e = (record.y[index] - y)[use]
+            if not len(e):
+                continue
             spread = compute_spread_ahead(here.linearized[0], fit.noise, record.valid, horizon)
-            count += len(errors[-1])
-            squares += len(errors[-1]) * float(here.sensor[0]) * spread**2
-        return errors, math.sqrt(squares / max(count, 1))
+            squares += float(np.sum(e**2))
+            usual += len(e) * float(here.sensor[0]) * spread**2
+            # Errors may look more independent than such noise would be.
+            memory = compute_memory(fit.noise, int(np.count_nonzero(window.mask)))
+            worth += min(
+                len(e) / autocorrelation_time(e, 2), np.count_nonzero(window.mask) / memory
+            )
+        if not usual > 0:
+            return math.nan
+        return float(stats.chi2.cdf(worth * squares / usual, worth))
 
 
 def choose_fresh_data(
@@ -149,10 +164,11 @@ def choose_fresh_data(
     CtrlidError
         If a record for validation has another sampling period than the loop.
     """
+    require_valid_samples(validation or (), "validation=")
     for r in validation or ():
         if abs(r.dt - loop.dt) > THRESHOLD.same_period * loop.dt:
-            raise CtrlidError(f"validation= is sampled at {r.dt:g} s, the loop at {loop.dt:g} s; "
-                              "give both the same period")  # fmt: skip
+            both = write_both_periods("validation= is sampled", r.dt, "the loop", loop.dt)
+            raise CtrlidError(f"{both}; give both the same period")
     rest: tuple[Record, ...] | None = None
     if validation is None:
         windows, rest = zip(*(gaps.hold_out(r) for r in records), strict=True)

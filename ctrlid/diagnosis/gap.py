@@ -203,7 +203,7 @@ def simulate_window(loop: Loop, window: Window, how: Reproduction) -> Array:
             index, values = predict_ahead(loop, record, predict(loop, record), how.horizon)
             y[index] = values
             return y
-        simulator = make_simulator(loop, record.hold)
+        simulator = make_simulator(loop, record.hold, record.hold_r)
     except (ModelCannotRun, EffectDoesNotApply):
         return y
     for part in find_long_stretches(record):
@@ -215,9 +215,9 @@ def simulate_window(loop: Loop, window: Window, how: Reproduction) -> Array:
     return y
 
 
-def make_simulator(loop: Loop, hold: str = "zoh") -> Simulator:
+def make_simulator(loop: Loop, hold: str = "zoh", hold_r: str = "zoh") -> Simulator:
     """Return a loop made ready to be simulated many times, as exactly as a gap needs."""
-    return Simulator(loop, THRESHOLD.gap_integration_error, THRESHOLD.gap_steps, hold)
+    return Simulator(loop, THRESHOLD.gap_integration_error, THRESHOLD.gap_steps, hold, hold_r)
 
 
 @dataclass(frozen=True)
@@ -260,18 +260,38 @@ def compute_floor(
     Floor
         RMS errors [output unit]; NaN where they cannot be computed.
     """
-    runs = runs or THRESHOLD.floor_runs
+    errors = measure_noise_errors(loops, fit, windows, how, runs or THRESHOLD.floor_runs)
+    both, sensor = np.sqrt(np.mean(errors**2, axis=0)).tolist()
+    return Floor(both, sensor, float(np.max(errors[:, 0])))
+
+
+def measure_noise_errors(
+    loops: Sequence[Loop], fit: Fit, windows: Sequence[Window], how: Reproduction, runs: int
+) -> Array:
+    """Return the RMS errors that noise leaves in each run, with all noise and with the sensor's.
+
+    NaN where they cannot be computed.
+    """
     squares, count = np.zeros((runs, 2)), 0
     for k, (loop, window) in enumerate(zip(loops, windows, strict=True)):
         noise = float(fit.sensor[min(k, len(fit.sensor) - 1)])
         try:
             squares += _simulate_noise(loop, fit, noise, window, how, runs)
         except (ModelCannotRun, EffectDoesNotApply):
-            return Floor(math.nan, math.nan, math.nan)
+            return np.full((runs, 2), math.nan)
         count += int(np.count_nonzero(window.mask))
-    errors = np.sqrt(squares / max(count, 1))
-    both, sensor = np.sqrt(np.mean(errors**2, axis=0)).tolist()
-    return Floor(both, sensor, float(np.max(errors[:, 0])))
+    return np.asarray(np.sqrt(squares / max(count, 1)))
+
+
+def compute_chance_among_runs(size: float, runs: Array) -> float:
+    r"""Return the probability that one more run errs as little, of runs with noise.
+
+    .. math:: \frac{\ln e - \overline{\ln e_r}}{s \sqrt{1 + 1/R}} \sim t_{R-1}
+    """
+    logs, count = np.log(runs), len(runs)
+    width = float(np.std(logs, ddof=1)) * math.sqrt(1 + 1 / count)
+    away = math.log(max(size, THRESHOLD.tiny)) - float(np.mean(logs))
+    return float(stats.t.cdf(away / max(width, THRESHOLD.tiny), count - 1))
 
 
 def _simulate_noise(
@@ -283,7 +303,7 @@ def _simulate_noise(
     if how.horizon:
         known = np.array(predict_spread(loop, record, predict(loop, record), how.horizon))
         return np.tile(size * known**2, (runs, 1))
-    simulator = make_simulator(loop, record.hold)
+    simulator = make_simulator(loop, record.hold, record.hold_r)
     squares, count = np.zeros((runs, 2)), 0
     for part in find_long_stretches(record):
         use = window.mask[part]
@@ -310,11 +330,14 @@ def draw_noise(fit: Fit, sensor: float, n: int, seed: int) -> list[Array]:
         steps = streams[2] * math.sqrt(sensor * noise.drift)
         steps[0] *= 1 / math.sqrt(1 - noise.memory**2)
         force = force + signal.lfilter([1.0], [1.0, -noise.memory], steps)
-    reading = streams[0]
+    tails, reading = noise.tails, streams[0]
     if not noise.sensor_is_white:
         # As many samples again let the noise begin anywhere in its stationary run.
-        long = np.append(np.random.default_rng([seed, 1]).standard_normal(n), reading)
+        reading = np.append(np.random.default_rng([seed, 1]).standard_normal(n), reading)
+    if tails is not None:
+        reading = tails.draw(reading, seed)
+    if not noise.sensor_is_white:
         _, drive, _ = make_sensor_states(noise.ar, noise.ma)
         colour = [1.0, *noise.ma], [1.0, *(-v for v in noise.ar)]
-        reading = drive[0] * signal.lfilter(*colour, long)[n:]
+        reading = drive[0] * signal.lfilter(*colour, reading)[n:]
     return [reading * math.sqrt(sensor), force]

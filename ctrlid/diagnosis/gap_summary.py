@@ -6,10 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import stats
 
 from .._base.arrays import Array
-from .._base.statistics import autocorrelation_time
 from ..estimation.likelihood.likelihood import Fit
 from ..loop.loop import Loop
 from ..validation.reproduction import CLOSED_LOOP, Reproduction, find_longest_horizon
@@ -168,36 +166,17 @@ def make_fresh_data_test(fresh: FreshData) -> Callable[[Weighed, Model], bool]:
 
 
 def make_size_test(fresh: FreshData) -> Callable[[Model], bool]:
-    r"""Return whether the noise of a model is larger than the error that the model makes.
+    """Return whether the noise of a model is larger than the error that the model makes.
 
-    .. math:: \bar{e^2} / \sigma^2 \sim F_{\nu, R\nu}, \quad \nu = N / \tau
-
-    Noise of variance :math:`\sigma^2` would leave as large an error e on fresh data: no prediction
-    is better than what is unpredictable. A noise model that explains a record only by being larger
-    is falsified. N samples with correlation time :math:`\tau` are worth :math:`\nu`, and the noise
-    was simulated in R runs.
+    Noise leaves errors of its size on fresh data: no prediction is better than what cannot be
+    predicted. A noise model that explains a record only by being larger is falsified.
     """
 
     def is_larger(model: Model) -> bool:
-        loops = fresh.prepare_loops(model)
-        errors, usual = fresh.compare_noise(loops, model.fit)
-        errors = [e for e in errors if len(e)]
-        if not errors or not usual > 0:
-            return False
-        whole = np.concatenate(errors)
-        worth = sum(len(e) / autocorrelation_time(e, 2) for e in errors)
-        ratio = float(np.mean(whole**2)) / usual**2
-        runs = math.inf if fresh.how.horizon else THRESHOLD.floor_more_runs
-        return bool(compute_ratio_probability(ratio, worth, runs) < THRESHOLD.noise_too_large)
+        chance = fresh.compute_size_chance(fresh.prepare_loops(model), model.fit)
+        return chance < THRESHOLD.noise_too_large
 
     return is_larger
-
-
-def compute_ratio_probability(ratio: float, worth: float, runs: float) -> float:
-    """Return how likely a ratio of variances is as small; with infinite runs one is known."""
-    if math.isinf(runs):
-        return float(stats.chi2.cdf(worth * ratio, worth))
-    return float(stats.f.cdf(ratio, worth, runs * worth))
 
 
 def _compute_share_closed(closed: float, before: float, floor: float) -> float:

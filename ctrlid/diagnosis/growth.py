@@ -1,5 +1,6 @@
 """Step 7: the search adds effects, drops superfluous ones and looks back, round by round."""
 
+import contextlib
 import math
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
@@ -8,17 +9,18 @@ import numpy as np
 
 from .._base.criterion import bayesian_penalty
 from .._base.errors import EffectDoesNotApply, ModelCannotRun
+from .._base.interruption import Stopped
 from ..effects import AbstractEffect
-from ..estimation.likelihood.kalman_filter import Noise
 from ..estimation.likelihood.likelihood import Fit
 from ..estimation.likelihood.maximization import (
     choose_noise,
     choose_sensor_noise,
+    choose_tails,
     maximize,
     refit_noise_size,
 )
 from ..estimation.likelihood.noise_fit import compute_noise_criterion
-from .candidates import Trial, contains, list_missing_candidates
+from .candidates import Trial, contains, is_same_kind, list_missing_candidates
 from .fitted_model import Model, can_simulate, drop_linearization, with_linearization
 from .fresh_data import FreshData
 from .noise_tests import NoiseTests, choose_alarm_level, run_noise_tests
@@ -45,7 +47,8 @@ class Search:
     """The end of a search: the base, the rounds, the final model and its effects.
 
     Where the choice of a round was taken back for a better pair, `other` holds the rounds before
-    the first such change, with the round that showed it.
+    the first such change, with the round that showed it. Where the budget was spent before the end,
+    it is not `finished`, and nothing was checked after the last round.
     """
 
     base: Model
@@ -55,11 +58,12 @@ class Search:
     before: NoiseTests
     after: NoiseTests
     other: tuple[Round, ...] = ()
+    finished: bool = True
 
 
 def search_effects(
     base: Model, catalogue: Sequence[type[AbstractEffect]], work: Work,
-    tell: Callable[[str], None], is_larger: Callable[[Model], bool], first: Sequence[Round] = (),
+    tell: Callable[..., None], is_larger: Callable[[Model], bool], first: Sequence[Round] = (),
 ) -> Search:  # fmt: skip
     """Add effects to a base model until nothing more earns a place, and drop what is superfluous.
 
@@ -82,15 +86,38 @@ def search_effects(
     Returns
     -------
     Search
-        The rounds and the final model.
+        The rounds and the final model; where the budget was spent before, those that were reached.
     """
+    reached = Reached(base, list(first), base)
+    try:
+        return _grow_model(base, catalogue, work, tell, is_larger, first, reached)
+    except Stopped:
+        return _end_search(reached)
+
+
+@dataclass(eq=False)
+class Reached:
+    """How far a search has come: what is left of it when it is stopped."""
+
+    base: Model
+    steps: list[Round]
+    model: Model
+
+
+def _grow_model(
+    base: Model, catalogue: Sequence[type[AbstractEffect]], work: Work,
+    tell: Callable[..., None], is_larger: Callable[[Model], bool], first: Sequence[Round],
+    reached: Reached,
+) -> Search:  # fmt: skip
+    """Take the rounds of `search_effects`, and keep what was reached."""
     given = len(base.loop.effects)
-    steps = list(first)
+    steps = reached.steps
     model = with_linearization(first[-1].base) if first else base
     changed, left = False, tuple[Round, ...]()
     while not steps or steps[-1].best is not None:
         if steps and steps[-1].best is not None:
-            tell(f"round {len(steps)}: {steps[-1].best.name}")
+            tell(f"round {len(steps)}: {steps[-1].best.name} with all else")
+            reached.model = steps[-1].best.model
             model = refit_noise(order_last_effect(steps[-1].best.model, given))
             model = with_linearization(drop_superfluous(model, given))
         if (
@@ -98,18 +125,21 @@ def search_effects(
             or len(steps) >= THRESHOLD.many_effects + THRESHOLD.more_rounds
         ):
             break
+        reached.model = model
         tell(f"round {len(steps) + 1}: screening")
         pool = list_missing_candidates(model, catalogue)
         step = run_round(model, pool, work, None if steps else restore_given_values(base))
-        coloured = _prefer_sensor_noise(model, step.best, is_larger)
-        if coloured is not None:
-            tell("coloured sensor noise")
-            model, base = coloured, base if steps else coloured
+        # Noise may be coloured and have heavy tails, one after the other.
+        while (other := _prefer_sensor_noise(model, step.best, is_larger)) is not None:
+            tell(f"round {len(steps) + 1}: screening beside other sensor noise")
+            model, base = other, base if steps else other
+            reached.model, reached.base = model, base
             step = run_round(model, list_missing_candidates(model, catalogue), work)
         step = replace(step, base=Model(model.loop, drop_linearization(model.fit)))
         if step.best is not None and _is_stand_in(step.best, model, beside=bool(steps)):
             step = replace(step, best=None)
         asked = steps and not first and not changed
+        tell(f"round {len(steps) + 1}: checking", ranked=False)
         better = _look_back(steps[-1], step, catalogue, work) if asked else None
         changed = better is not None
         if changed:
@@ -117,6 +147,7 @@ def search_effects(
             steps[-1] = replace(steps[-1], best=better)
         else:
             steps.append(step)
+    tell("weighing what was found")
     try:
         model, found = weigh_effects(model, given, steps)
     except (ModelCannotRun, EffectDoesNotApply):
@@ -126,30 +157,50 @@ def search_effects(
     return Search(base, tuple(steps), model, found, *tests, left)
 
 
+def _end_search(reached: Reached) -> Search:
+    """Return a search that was stopped, with each effect as it stood in the round that took it."""
+    base, model, found = reached.base, reached.model, list[Weighed]()
+    for position in range(len(base.loop.effects), len(model.loop.effects)):
+        effect = model.loop.effects[position]
+        taken = [(s.base, s.best) for s in reached.steps
+                 if s.best is not None and is_same_kind(s.best.effect, effect)]  # fmt: skip
+        found += [Weighed(best, (), before, position) for before, best in taken[-1:]]
+    found.sort(key=lambda f: -f.trial.gain)
+    before, after = run_noise_tests(base.fit), run_noise_tests(model.fit)
+    return Search(base, tuple(reached.steps), model, tuple(found), before, after, finished=False)
+
+
 def _prefer_sensor_noise(
     model: Model, best: Trial | None, is_larger: Callable[[Model], bool]
 ) -> Model | None:
-    """Return the model with coloured sensor noise if that gains more than the best effect does.
+    """Return the model with other sensor noise if that gains more than the best effect does.
 
-    Only where the innovations are not white noise, or a coloured force had to make them so, and
-    where the noise is not larger than the error that it explains.
+    Coloured, or with heavy tails. Only where the innovations are not white noise, or a coloured
+    force had to make them so, and where the noise is not larger than the error that it explains.
     """
     fit = model.fit
-    if fit.known is not None or not fit.noise.sensor_is_white:
+    if fit.known is not None or not math.isfinite(fit.value):
         return None
-    if not fit.noise.drift and run_noise_tests(fit).passed:
+    tests = run_noise_tests(fit)
+    if tests.passed and not fit.noise.drift:
         return None
-    try:
-        other = choose_sensor_noise(fit)
-    except ModelCannotRun:
-        return None
+    tried = []
+    if fit.noise.sensor_is_white:
+        with contextlib.suppress(ModelCannotRun):
+            tried.append(choose_sensor_noise(fit))
+    if fit.noise.tails is None and tests.has_heavy_tails:
+        tried.append(choose_tails(fit))
+    other = max(tried, key=compute_noise_criterion, default=fit)
     gain = compute_noise_criterion(other) - compute_noise_criterion(fit)
     # Further noise in the fit of the best effect is paid for as well.
     more = 0.0
     if best is not None:
         parameters = best.model.fit.noise.parameters - fit.noise.parameters
         more = max(0.0, best.net_gain - bayesian_penalty(parameters, fit.size))
-    if not gain > more or is_larger(Model(model.loop, other)):
+    if not gain > more:
+        return None
+    newly_coloured = fit.noise.sensor_is_white and not other.noise.sensor_is_white
+    if newly_coloured and is_larger(Model(model.loop, other)):
         return None
     return with_linearization(Model(model.loop, other))
 
@@ -162,7 +213,7 @@ def refuse_larger_noise(found: Search, is_larger: Callable[[Model], bool]) -> Se
     fit = found.final.fit
     if fit.noise.sensor_is_white or fit.known is not None or not is_larger(found.final):
         return found
-    plain = refit_noise_size(maximize(replace(fit, noise=Noise(fit.noise.force))))
+    plain = refit_noise_size(maximize(replace(fit, noise=fit.noise.plain)))
     model = Model(found.final.loop, drop_linearization(choose_noise(plain)))
     model, left = weigh_effects(model, len(found.base.loop.effects), found.steps)
     return replace(found, final=model, found=left, after=retest_with_replicas(model))

@@ -8,12 +8,22 @@ from typing import Any, get_args
 
 import numpy as np
 
+from .._base.arguments import check_arguments, check_fields
 from .._base.errors import CtrlidError
 from ..effects import AbstractEffect
 from ..loop.loop import Loop
 from ..physics.linearization import OperatingPoint
 from ..validation.reproduction import CLOSED_LOOP, OPEN_LOOP
-from .findings import BinnedErrors, Calibrated, Candidate, Disturbance, Finding, Gap, GapKind
+from .findings import (
+    BinnedErrors,
+    Calibrated,
+    Candidate,
+    Disturbance,
+    Finding,
+    Gap,
+    GapKind,
+    SensorNoise,
+)
 from .result import Diagnosis
 from .saving import FORMAT, SavedLoop, read_numbers
 
@@ -40,11 +50,12 @@ def load_diagnosis(path: str | Path, loop: Loop | None = None) -> Diagnosis:
     CtrlidError
         If the file is none of these, an effect is of an unknown class, or the loop does not fit.
     """
+    check_arguments(load_diagnosis, locals(), "loop")
     try:
         data = json.loads(Path(path).read_text("utf-8"))
     except OSError as reason:
         raise CtrlidError(f"cannot read {path}: {reason.strerror}") from reason
-    except ValueError as reason:
+    except (ValueError, RecursionError) as reason:
         raise CtrlidError(f"{path} is not a saved diagnosis: {reason}. Give a file that "
                           "found.save(file) wrote") from reason  # fmt: skip
     if not isinstance(data, dict) or data.get("format") != FORMAT:
@@ -52,14 +63,19 @@ def load_diagnosis(path: str | Path, loop: Loop | None = None) -> Diagnosis:
         raise CtrlidError(f"{path} is not a saved diagnosis: it has the format {given!r}, not "
                           f"{FORMAT!r}. Give a file that found.save(file) wrote")  # fmt: skip
     try:
-        return _decode_diagnosis(data, loop)
-    except (KeyError, TypeError) as reason:
-        raise CtrlidError(f"the saved diagnosis {path} is damaged: {reason}") from reason
+        found = _decode_diagnosis(data, loop)
+        str(found)  # What cannot be printed is damaged, too.
+        return found
+    except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as reason:
+        if isinstance(reason, CtrlidError):
+            raise
+        raise CtrlidError(f"the saved diagnosis {path} is damaged: {reason}. Save it again with "
+                          "found.save(file)") from reason  # fmt: skip
 
 
 def _decode_diagnosis(data: Mapping[str, Any], loop: Loop | None) -> Diagnosis:
     saved = _decode_loop(data["loop"])
-    return Diagnosis(
+    found = Diagnosis(
         verdict=data["verdict"], sentence=data["sentence"],
         findings=tuple(_decode(Finding, f) for f in data["findings"]),
         loop=saved if loop is None else _rebuild_loop(loop, saved),  # type: ignore[arg-type]
@@ -71,7 +87,12 @@ def _decode_diagnosis(data: Mapping[str, Any], loop: Loop | None) -> Diagnosis:
         sensitivity=read_numbers(data["sensitivity"]), tests=read_numbers(data["tests"]),
         audit=tuple(data["audit"]), notes=tuple(data["notes"]), record=data["record"],
         seconds=read_numbers(data["seconds"]), extra=read_numbers(data["extra"]),
+        noise=_decode(SensorNoise, data["noise"]) if data.get("noise") else None,
+        stand_ins=tuple(_decode(Finding, f) for f in data.get("stand_ins", ())),
+        finished=bool(data.get("finished", True)),
     )  # fmt: skip
+    check_fields(found, "loop")
+    return found
 
 
 def _name_kind(gap: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -102,7 +123,7 @@ def _rebuild_loop(loop: Loop, saved: SavedLoop) -> Loop:
 
 def _decode_loop(data: Mapping[str, Any]) -> SavedLoop:
     at = read_numbers(data["at"])
-    return SavedLoop(
+    saved = SavedLoop(
         plant_name=data["plant"], controller_text=data["controller"], dt=read_numbers(data["dt"]),
         at=OperatingPoint(tuple(at["states"]), at["input"], at["output"]),
         free=tuple(data["free"]), input_limits=tuple(read_numbers(data["input_limits"])),
@@ -110,6 +131,8 @@ def _decode_loop(data: Mapping[str, Any]) -> SavedLoop:
         parameters=read_numbers(data["parameters"]), units=data["units"],
         known_units=data.get("known_units", {}),
     )  # fmt: skip
+    check_fields(saved)
+    return saved
 
 
 def _decode_effect(data: Mapping[str, Any]) -> AbstractEffect:
@@ -130,7 +153,7 @@ def _decode_effect(data: Mapping[str, Any]) -> AbstractEffect:
 
 def _decode(kind: Any, data: Mapping[str, Any]) -> Any:
     """Return one of the values of a diagnosis from its fields."""
-    made: dict[str, Any] = {}
+    made: Any = {}
     for field in dataclasses.fields(kind):
         if field.name not in data and field.default is not dataclasses.MISSING:
             continue  # The file was written before there was this field.
@@ -140,10 +163,12 @@ def _decode(kind: Any, data: Mapping[str, Any]) -> Any:
                 made[field.name] = _decode_effect(value)
             case "alternatives":
                 made[field.name] = tuple(_decode_effect(e) for e in value)
-            case "equivalents" | "records":
+            case "equivalents" | "records" | "ar" | "ma":
                 made[field.name] = tuple(value)
             case _:
                 made[field.name] = value if field.type in (str, "str") else read_numbers(value)
                 if isinstance(value, list):
                     made[field.name] = np.asarray(made[field.name], dtype=float)
-    return kind(**made)
+    made = kind(**made)
+    check_fields(made)
+    return made

@@ -21,6 +21,9 @@ from ..estimation.likelihood.likelihood import Fit
 from .constancy import compute_line_probability, find_bin_edges, find_bins, run_constancy_tests
 from .thresholds import THRESHOLD
 
+# The tests of heavy tails.
+TAILS = "heavy tails", "isolated events"
+
 
 def choose_alarm_level(effects: int) -> float:
     """Return the chance of a false alarm that a model with so many effects is given.
@@ -49,6 +52,12 @@ class NoiseTests:
         """The most telling test, and its probability corrected for the number of tests."""
         name = min(self.p_values, key=lambda k: self.p_values[k])
         return name, min(1.0, self.p_values[name] * len(self.p_values))
+
+    @property
+    def has_heavy_tails(self) -> bool:
+        """Whether large errors are more frequent than those of Gaussian noise."""
+        tails = (self.p_values.get(name, 1.0) for name in TAILS)
+        return min(tails) < self.alpha and compute_excess(self.z) > 0
 
     @property
     def evidence(self) -> float:
@@ -98,6 +107,7 @@ def run_noise_tests(fit: Fit) -> NoiseTests:
     white = cross = 0.0
     white_df = cross_df = 0
     lines, tails, shapes = [], [], []
+    sizes, sizes_df = 0.0, 0
     # Fitted coefficients of the noise take as many correlations to zero.
     p = len(fit.theta) + len(fit.noise.ar) + len(fit.noise.ma)
     for z, out, data in zip(fit.standardized, fit.filtered, fit.data, strict=True):
@@ -109,6 +119,11 @@ def run_noise_tests(fit: Fit) -> NoiseTests:
         # Without weights for short records: names and verdicts were studied with this statistic.
         white += portmanteau(rho, n, short=False)
         white_df += THRESHOLD.lags
+        if fit.noise.tails is not None:
+            size = np.where(keep, z**2 - np.mean(z[keep] ** 2), 0.0)
+            products = compute_lagged_products(size, size, THRESHOLD.lags)
+            sizes += portmanteau(products[1:] / products[0], n, short=False)
+            sizes_df += THRESHOLD.lags
         value, df = _regress_on_past(filled, keep, data.u, data.r)
         cross += value
         cross_df += df
@@ -130,6 +145,10 @@ def run_noise_tests(fit: Fit) -> NoiseTests:
         "a single line in the spectrum": min(1.0, min(lines) * len(lines)),
         **tails_and_events,
     }
+    if sizes_df:
+        # Wild readings come one by one: what comes in bursts is an event of the plant.
+        p_values["independence of sizes"] = float(stats.chi2.sf(sizes, sizes_df))
+        of_noise.add("independence of sizes")
     if shapes:
         shape = float(stats.chi2.sf(sum(v**2 for v in shapes), len(shapes)))
         p_values["shape of the random force"] = shape
@@ -171,9 +190,14 @@ def _test_line(z: Array, n: int) -> float:
     return compute_line_probability(np.abs(np.fft.rfft(z))[1:-1] ** 2 / n)
 
 
+def compute_excess(z: Array) -> float:
+    """Return by how much the kurtosis of innovations exceeds that of a normal law."""
+    return kurtosis_about_zero(z) - 3.0
+
+
 def _test_tails(z: Array) -> dict[str, float]:
     n = len(z)
-    excess = kurtosis_about_zero(z) - 3.0
+    excess = compute_excess(z)
     largest = float(np.max(np.abs(z)))
     return {
         "heavy tails": float(2 * stats.norm.sf(abs(excess) / math.sqrt(24.0 / n))),

@@ -10,6 +10,7 @@ from scipy import optimize
 
 from .._base.arrays import Array
 from .._base.errors import CtrlidError, ModelCannotRun
+from .._base.interruption import check_budget
 from .._base.statistics import autocorrelation_time, pseudo_inverse
 from ..data.record import Record
 from ..estimation.likelihood.kalman_filter import Noise
@@ -118,6 +119,7 @@ class Simulation:
         n, count = plant.size, len(self.runs)
         values, errors, slopes, states = plant.insert_free_values(theta), [], [], []
         for k, (data, run) in enumerate(zip(self.problem.data, self.runs, strict=True)):
+            check_budget()
             z = np.concatenate([x0[k], np.zeros(n * p), np.eye(n).ravel()])
             after, seen = (np.asarray(out, float) for out in
                            run(z, plant.stack_inputs(data, theta), values))  # fmt: skip

@@ -6,13 +6,12 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from tqdm import tqdm
-
 from .._base.errors import EffectDoesNotApply, ModelCannotRun
+from .._base.interruption import Budget, Stopped, check_seconds, hold_interrupt
 from .._base.jobs import check_jobs, share_out
 from .._base.signals import require_one_signal
 from ..data.record import Record
-from ..data.several_records import as_records, order_model_and_data
+from ..data.several_records import as_records, order_model_and_data, require_valid_samples
 from ..effects import CATALOGUE, AbstractEffect
 from ..loop.loop import Loop
 from ..validation.record_audit import Audit
@@ -20,7 +19,7 @@ from ..validation.reproduction import OPEN_LOOP
 from .answer import assemble_answer, name_records
 from .candidates import check_catalogue
 from .findings import COMPLETE, Disturbance, Gap
-from .fitted_model import compute_penalized_likelihood
+from .fitted_model import Model, compute_penalized_likelihood
 from .fresh_data import FreshData, check_length, choose_fresh_data
 from .gap_summary import (
     lengthen_horizon,
@@ -39,6 +38,7 @@ from .growth import (
 )
 from .log_errors import LogError, find_log_error
 from .open_loop_search import search_by_simulation
+from .progress import Progress
 from .recalibration import recalibrate
 from .records import (
     Readout,
@@ -48,11 +48,13 @@ from .records import (
     read_steps,
     with_units_of,
 )
+from .removal import Weighed
 from .replicas import forgive_rounding
 from .result import Diagnosis
 from .selection import Work
 from .several_records import merge_diagnoses
 from .thresholds import THRESHOLD
+from .verdict import declare_unfinished
 
 BY_SIMULATION = (
     "in the Kalman filter a random force explained the error, so the effects were found by the "
@@ -60,9 +62,6 @@ BY_SIMULATION = (
     "What is called one-step errors above are errors of that simulation, and the evidence is "
     "computed for the number of independent samples"
 )
-# The bar has so many steps; the comparison on fresh data makes two, and the bar is closed before
-# the last one.
-PROGRESS = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +69,8 @@ class Question:
     """What is asked: a model, records of which much is known already, and the means to answer.
 
     `fresh` is what models are compared on, `audits` what the records show by themselves, `work` a
-    map that may run in parallel, and `tell` is told what is being done.
+    map that may run in parallel, `tell` is told what is being done. The `budget` is how long the
+    search may go on; `end` is called where it is spent.
     """
 
     loop: Loop
@@ -80,6 +80,17 @@ class Question:
     catalogue: Sequence[type[AbstractEffect]]
     work: Work
     tell: Callable[..., None]
+    budget: Budget
+    end: Callable[[], None]
+
+    def attempt(self, step: Callable[[], Any], otherwise: Any) -> Any:
+        """Return what a step gives, or something else where the budget is spent before."""
+        try:
+            with self.budget.running():
+                return step()
+        except Stopped:
+            self.end()
+            return otherwise
 
 
 def diagnose(
@@ -89,6 +100,7 @@ def diagnose(
     catalogue: Sequence[type[AbstractEffect]] = CATALOGUE,
     validation: Record | Sequence[Record] | None = None,
     jobs: int | None = None,
+    seconds: float | None = None,
     progress: bool = True,
 ) -> Diagnosis:
     r"""Find where a model and data disagree, name what is missing, and show what it closes.
@@ -123,8 +135,12 @@ def diagnose(
     jobs : int, optional
         Candidates that are tried at the same time, each in a process of its own, through joblib;
         by default one, or what ``joblib.parallel_config`` says.
+    seconds : float, optional
+        After so many seconds the search ends with its best answer so far, and the verdict says that
+        it was not finished [s]. The model is recalibrated and the gap measured in any case. By
+        default the search goes on to its end.
     progress : bool, optional
-        Whether to show progress.
+        Whether to show on stderr what is done: in a terminal as a bar, elsewhere a line a round.
 
     Returns
     -------
@@ -160,28 +176,39 @@ def diagnose(
     loop, record = order_model_and_data(loop, record)
     records = as_records(record)
     require_one_signal("diagnose", loop, records)
+    require_valid_samples(records, "record=")
     given = make_loop(loop, records[0])
     loop = with_units_of(given, records[0])
     fresh = choose_fresh_data(loop, records, None if validation is None else as_records(validation))
     jobs = check_jobs(jobs)
-    bar = tqdm(total=PROGRESS, disable=not progress, leave=False, desc="diagnose")
-
-    def tell(text: str, step: int = 0) -> None:
-        bar.set_description(f"diagnose: {text}")
-        bar.update(step)
+    shown = Progress(progress)
+    budget = shown.make_budget(check_seconds(seconds))
 
     def work(function: Callable[..., Any], items: Iterable[Any]) -> list[Any]:
-        return list(share_out(function, items, jobs))
+        given, results = list(items), []
+        shown.begin(len(given))
+        for result in share_out(function, given, jobs):
+            shown.count(result)
+            results.append(result)
+        return results
 
-    tell("checking the records", 1)
-    audits, remarks = look_over_records(given, records)
-    check_length(fresh)
-    question = Question(loop, records, audits, fresh, catalogue, work, tell)
-    result, search = _answer_question(question)
-    if len(records) > 1 and not _have_same_effects(result, len(records)):
-        result = _answer_each_record(question, search) or result
-    bar.close()
-    return replace(result, audit=remarks, record=name_records(records),
+    try:
+        # What has to be done in any case moves the bar, and asks for no time.
+        with hold_interrupt(), budget.running(binding=False):
+            audits, remarks = look_over_records(given, records)
+            check_length(fresh)
+            question = Question(
+                loop, records, audits, fresh, catalogue, work, shown.tell, budget, shown.end
+            )
+            result, search = _answer_question(question)
+            if len(records) > 1 and not _have_same_effects(result, len(records)):
+                each = question.attempt(lambda: _answer_each_record(question, search), None)
+                result = each or result
+    finally:
+        shown.close()
+    if shown.ended:
+        result = declare_unfinished(result, shown.ended, shown.seconds)
+    return replace(result, audit=(*remarks, *result.audit), record=name_records(records),
                    seconds=time.perf_counter() - started)  # fmt: skip
 
 
@@ -190,45 +217,65 @@ def _answer_question(q: Question) -> tuple[Diagnosis, Search]:
     # Step 1: what the readout of the sensor shows by itself is no candidate.
     readout = read_limits(q.loop, q.records, q.audits, q.catalogue)
     # Step 2: a wrong value of a parameter is no missing effect.
-    q.tell("recalibrating", 1)
+    q.tell("recalibrating")
     base = recalibrate(readout.loop, readout.records, q.audits)
     # Steps 3 to 7: effects are screened, refitted, decided upon, added and dropped.
     is_larger = make_size_test(q.fresh)
-    search = search_effects(base, q.catalogue, q.work, q.tell, is_larger)
-    search = refuse_larger_noise(search, is_larger)
+    with q.budget.running():
+        search = search_effects(base, q.catalogue, q.work, q.tell, is_larger)
+    if search.finished:
+        search = refuse_larger_noise(search, is_larger)
+    else:
+        q.end()
     q = replace(q, fresh=lengthen_horizon(q.loop, search, q.fresh))
     helps = make_fresh_data_test(q.fresh)
-    if search.found or not search.after.passed:
+    if search.finished and (search.found or not search.after.passed):
         # A wrong sign or unit in the log makes the plant look as if almost anything were missing.
+        q.tell("looking for errors of the log")
         reached = compute_penalized_likelihood(search.final.fit)
-        wrong = find_log_error(readout.loop, readout.records, q.audits, reached)
+        wrong = q.attempt(
+            lambda: find_log_error(readout.loop, readout.records, q.audits, reached), None
+        )
         if wrong is not None:
             return _blame_log(q, search, wrong)
     if search.other and not search.after.passed:
         # Perhaps neither search explains the record; fresh data tell which of them leads further.
         q.tell("second search")
-        other = search_effects(base, q.catalogue, q.work, q.tell, is_larger, search.other)
-        other = refuse_larger_noise(other, is_larger)
-        search = choose_search(search, other, helps, q.fresh.gap_of)
+        search = q.attempt(lambda: _search_again(q, base, search, helps, is_larger), search)
     # Step 3 again: what is left is tested with the steps of the converter in the replicas.
-    q.tell("comparing on fresh data", 2)
+    q.tell("comparing on fresh data")
     steps = read_steps(search.final.fit, q.audits, q.catalogue)
-    if steps and not search.after.passed:
+    if steps and search.finished and not search.after.passed:
         search = replace(search, after=forgive_rounding(search.after, search.final, steps))
     # Step 8: what else would do in the place of each effect.
-    q.tell("comparing names")
-    search = compare_names(keep_main_effects(search, helps), q.work)
+    if search.finished:
+        q.tell("comparing names")
+        search = q.attempt(lambda: compare_names(keep_main_effects(search, helps), q.work), search)
     # Step 9: the gap before and after. An effect of one of several records may widen the others'.
     summary = summarize_gap(q.loop, search, q.fresh)
-    if len(q.records) == 1:
+    if len(q.records) == 1 and search.finished:
         search, summary = take_back_widening(q.loop, search, summary, q.fresh)
     # Step 10: the decision table.
-    q.tell("writing the report", 1)
+    q.tell("writing the report")
     read = (*readout.found, *([steps] if steps else []))
     result = assemble_answer(q.loop, q.records, search, summary, read)
-    if result.verdict not in COMPLETE and _is_worth_simulating(q.fresh, base.records):
-        return _answer_by_simulation(q, search, summary.gap, read) or (result, search)
+    worth = result.verdict not in COMPLETE and _is_worth_simulating(q.fresh, base.records)
+    if worth and search.finished:
+        other = q.attempt(lambda: _answer_by_simulation(q, search, summary.gap, read), None)
+        return other or (result, search)
     return result, search
+
+
+def _search_again(
+    q: Question, base: Model, search: Search, helps: Callable[[Weighed, Model], bool],
+    is_larger: Callable[[Model], bool],
+) -> Search:  # fmt: skip
+    """Return the better of two searches, the second of which keeps what the first took back."""
+    other = search_effects(base, q.catalogue, q.work, q.tell, is_larger, search.other)
+    if not other.finished:
+        raise Stopped
+    other = refuse_larger_noise(other, is_larger)
+    return choose_search(search, other, helps, q.fresh.gap_of)
 
 
 def _blame_log(q: Question, search: Search, wrong: LogError) -> tuple[Diagnosis, Search]:

@@ -42,10 +42,10 @@ def refit_candidate(base: Model, trial: Trial, near: Model | None = None) -> Tri
             loop = loop.with_parameters({n: known[n] for n in names if n in known})
         start = carry_over_fit(near or base, loop, names)
         starts = [start]
-        if start.noise.parameters and start.problem.known is None and can_simulate(base):
+        if start.noise.is_coloured and start.problem.known is None and can_simulate(base):
             # Coloured noise that was fitted while the effect was missing may never let it in.
             # (Where no simulation can check it, the likelihood also leads to absurd values.)
-            starts.append(replace(start, noise=Noise(start.noise.force)))
+            starts.append(replace(start, noise=start.noise.plain))
         fits = [
             drop_linearization(
                 place_instants(maximize(s, rounds=THRESHOLD.refit_rounds, exact=False))

@@ -61,7 +61,11 @@ def weigh_effects(
 
 def _has_same_noise(one: Model, other: Model) -> bool:
     a, b = one.fit.noise, other.fit.noise
-    return (bool(a.drift), len(a.ar), len(a.ma)) == (bool(b.drift), len(b.ar), len(b.ma))
+    return _list_kinds(a) == _list_kinds(b)
+
+
+def _list_kinds(noise: Noise) -> tuple[bool, int, int, bool]:
+    return bool(noise.drift), len(noise.ar), len(noise.ma), noise.tails is not None
 
 
 def fuse_effects(model: Model, given: int, steps: Sequence[Round]) -> Model:
@@ -136,8 +140,12 @@ def refit_noise(model: Model) -> Model:
     fit = refit_noise_size(polish_fit(model.fit))
     if fit.known is not None:
         return Model(model.loop, fit)
-    if fit.noise.parameters:
-        plain = maximize(replace(fit, noise=Noise(fit.noise.force)))
+    if fit.noise.tails is not None:
+        # The tails may have been those of errors that the effect explains.
+        bare = maximize(replace(fit, noise=replace(fit.noise, tails=None)))
+        fit = max(fit, bare, key=compute_noise_criterion)
+    if fit.noise.is_coloured:
+        plain = maximize(replace(fit, noise=fit.noise.plain))
         if compute_noise_criterion(plain) > compute_noise_criterion(fit):
             return Model(model.loop, plain)
         # The coloured noise that stood in for the effect may be far from the one that remains.

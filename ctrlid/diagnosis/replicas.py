@@ -77,7 +77,7 @@ def _simulate_record(
     loop = follow_record(model.fitted, record) if follows else model.fitted
     if loop is None:
         raise ModelCannotRun("the record cannot be followed")
-    simulator = make_simulator(loop, record.hold)
+    simulator = make_simulator(loop, record.hold, record.hold_r)
     y, u = np.array(record.y), np.array(record.u)
     for part in find_long_stretches(record, THRESHOLD.shortest_segment):
         stretch = prepare_stretch(simulator, record, part, start_time=first, follow=follows)

@@ -38,10 +38,16 @@ def write_report_text(found: Diagnosis) -> str:
         lines += ["", "  what is missing"]
         for k, finding in enumerate(found.findings, 1):
             lines += _write_finding(found, finding, f"{k}. ")
+    if found.stand_ins:
+        lines += ["", f"  {wording.STAND_INS}"]
+        for k, finding in enumerate(found.stand_ins, 1):
+            lines += _write_finding(found, finding, f"{k}. ")
+    if found.added:
         lines += _wrap_text(wording.explain_evidence(), 4)
     elif found.verdict == "nothing missing" and found.sensitivity:
         lines += ["", *_write_sensitivity(found)]
     lines += ["", *_write_parameters(found)]
+    lines += _wrap_text(wording.describe_sensor_noise(found), 2, hang=4)
     lines += _wrap_text(wording.describe_disturbance(found), 2, hang=4)
     lines += _wrap_text(wording.describe_remains(found), 2, hang=4)
     if found.audit:
@@ -79,7 +85,7 @@ def _write_where(found: Diagnosis) -> list[str]:
         axes = write_list([p.axis for p in found.where])
         nowhere = f"nowhere. In bins of {axes}, the one-step errors are noise."
         return _wrap_text(f"where the error is: {nowhere if axes else 'not known'}", 2, hang=4)
-    same = not found.findings
+    same = not found.added
     head = "  where the error is: normalized RMS of the one-step errors (1 for noise)"
     rows = [f"{head:<79}{'worst' if same else 'before':>10}{'' if same else 'after':>10}"]
     for place in places:
@@ -113,14 +119,14 @@ def _write_sensitivity(found: Diagnosis) -> list[str]:
 def _write_parameters(found: Diagnosis) -> list[str]:
     if not found.calibrated:
         return ["  the model has no free parameters"]
-    last = "with the effects" if found.findings else "fitted"
+    last = "with the effects" if found.added else "fitted"
     rows = [("free parameters", "given", "recalibrated", f"{last} ± standard error")]
     for c in found.calibrated:
         fitted = write_quantity(c.after, error=c.standard_error, digits=4)
         if c.standard_error == 0:
             fitted = f"{write_number(c.after, 4)} (ON ITS BOUND)"
         rows.append((f"  {c.name}", write_number(c.given, 4), write_number(c.before, 4), fitted))
-    if not found.findings:
+    if not found.added:
         rows = [(a, b, "", d) for a, b, _, d in rows]
     lines = [f"  {a:<26}{b:>12}{c:>14}  {d:>34}" for a, b, c, d in rows]
     return [*lines, *_wrap_text(wording.describe_limits(found), 4)]

@@ -4,10 +4,20 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from .._base.arguments import check_arguments
 from .._base.text import Printed
 from ..effects import AbstractEffect
 from ..loop.loop import Loop
-from .findings import BinnedErrors, Calibrated, Candidate, Disturbance, Finding, Gap, Verdict
+from .findings import (
+    BinnedErrors,
+    Calibrated,
+    Candidate,
+    Disturbance,
+    Finding,
+    Gap,
+    SensorNoise,
+    Verdict,
+)
 from .report_text import write_report_text
 from .saving import save_diagnosis
 
@@ -23,7 +33,7 @@ class Diagnosis(Printed):
     sentence : str
         The verdict in words, with what it rests on.
     findings : tuple of Finding
-        The effects that were missing, most important first.
+        The effects that were missing, most important first: names that stand.
     loop : Loop
         The model with the effects added and everything refitted.
     gap : Gap
@@ -51,6 +61,13 @@ class Diagnosis(Printed):
         Run time [s].
     extra : dict of str to object
         What else was computed along.
+    noise : SensorNoise or None
+        The noise of the sensor, in words and numbers; None in files of earlier versions.
+    stand_ins : tuple of Finding
+        Effects that only describe part of the record, most important first: the note of each says
+        on what ground its name does not stand. `loop`, `gap` and `where` are with them.
+    finished : bool
+        Whether the search came to its end; not if its budget of seconds was spent before.
     """
 
     verdict: Verdict
@@ -69,17 +86,27 @@ class Diagnosis(Printed):
     record: str = ""
     seconds: float = 0.0
     extra: dict[str, Any] = field(default_factory=dict, repr=False)
+    noise: SensorNoise | None = None
+    stand_ins: tuple[Finding, ...] = ()
+    finished: bool = True
 
     @property
     def effects(self) -> tuple[AbstractEffect, ...]:
         """The effects that were found."""
         return tuple(f.effect for f in self.findings)
 
+    @property
+    def added(self) -> tuple[Finding, ...]:
+        """All that was added to the model: findings, then stand-ins."""
+        return (*self.findings, *self.stand_ins)
+
     def __str__(self) -> str:
         return write_report_text(self)
 
     def __repr__(self) -> str:
         names = ": " + ", ".join(f.name for f in self.findings) if self.findings else ""
+        if self.stand_ins:
+            names += "; stand-ins: " + ", ".join(f.name for f in self.stand_ins)
         g = self.gap
         sizes = f"{g.before:.3g} before, {g.after:.3g} after, floor {g.floor:.3g} {g.unit}"
         return f"Diagnosis({self.verdict}{names}; gap {sizes.strip()})"
@@ -105,4 +132,5 @@ class Diagnosis(Printed):
         CtrlidError
             If the file cannot be written.
         """
+        check_arguments(Diagnosis.save, locals())
         return save_diagnosis(self, path)

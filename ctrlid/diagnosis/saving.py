@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .._base.errors import CtrlidError
+from .._base.files import replace_file
 from ..effects import AbstractEffect
 from ..loop.loop import Loop
 from ..physics.linearization import OperatingPoint
@@ -98,7 +99,8 @@ def save_diagnosis(found: Diagnosis, path: str | Path) -> Path:
     text = write_readable_json({"format": FORMAT, **fields, "loop": loop, "gap": arrays})
     path = Path(path)
     try:
-        path.write_text(text + "\n", encoding="utf-8")
+        with replace_file(path) as file:
+            file.write(text + "\n")
     except OSError as reason:
         raise CtrlidError(
             f"the diagnosis cannot be written to {path}: {reason.strerror}. Give a file in a "
@@ -159,7 +161,7 @@ def _encode_loop(loop: Loop | SavedLoop) -> dict[str, Any]:
 def _list_effect_units(found: Diagnosis) -> dict[str, dict[str, str]]:
     """Return the units of all effects that a diagnosis speaks of, by class name."""
     spoken = [*found.loop.effects, *(c.effect for c in found.ranking)]
-    spoken += [e for f in found.findings for e in (f.effect, *f.alternatives)]
+    spoken += [e for f in found.added for e in (f.effect, *f.alternatives)]
     return {type(e).__name__: list_units(found.loop, e) for e in spoken}
 
 

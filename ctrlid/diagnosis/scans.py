@@ -60,11 +60,11 @@ def score_shapes(
     for first in range(0, count, step):
         size = min(step, count - first)
         matrix, score = np.zeros((p + size, p + size)), np.zeros(p + size)
-        for data, lin, keep, r, shape in zip(
+        for data, lin, keep, (e, s), shape in zip(
             fit.data,
             fit.linearized,
             fit.counts,
-            fit.sensor,
+            fit.working,
             shapes,
             strict=True,
         ):
@@ -82,10 +82,10 @@ def score_shapes(
                 hp=np.concatenate([lin.hp, shown], axis=1),
             )  # fmt: skip
             out = run_filter(plant, data, wide, fit.noise, columns=p + size)
-            slopes, s = out.slopes[keep], out.variance[keep] * r
-            weighted = slopes / s[:, None]
+            slopes = out.slopes[keep]
+            weighted = slopes / s[keep, None]
             matrix += weighted.T @ slopes
-            score += weighted.T @ out.innovations[keep]
+            score += weighted.T @ e[keep]
         own = pseudo_inverse(matrix[:p, :p]) if p else np.zeros((0, 0))
         through = matrix[p:, :p] @ own
         left = matrix[p:, p:] - through @ matrix[:p, p:]

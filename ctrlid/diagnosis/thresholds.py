@@ -70,7 +70,7 @@ class Thresholds:
         unit="of the samples",
     )  # fmt: skip
     coarse_steps: float = declare_number(
-        0.25, study="the steps of the converter are worth a name if they make so much of the noise",
+        0.25, study="steps of the converter that make so much of the noise are worth a remark",
         unit="of the sensor noise's variance",
     )  # fmt: skip
     noise_beside_steps: float = declare_number(
@@ -451,6 +451,15 @@ class Thresholds:
                           unit="of log-likelihood")  # fmt: skip
     certain: float = declare_number(30.0, convention="evidence that is called very strong",
                            unit="of log-likelihood")  # fmt: skip
+
+    # Names that stand.
+    differing: float = declare_number(
+        0.01, convention="level of the tests that a name has to stand", unit="probability",
+    )  # fmt: skip
+    stretches_compared: int = declare_number(
+        4, convention="sizes are compared between quarters, as long as what is kept back",
+        unit="of each record",
+    )  # fmt: skip
 
     # Several records.
     different_values: float = declare_number(

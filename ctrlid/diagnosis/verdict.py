@@ -1,17 +1,24 @@
 """Step 10: the decision table, and the verdict in words."""
 
+from __future__ import annotations
+
 import itertools
 import math
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
 from .._base.text import write_number, write_p_value
 from ..effects import AbstractEffect
 from ..estimation.likelihood.likelihood import Fit
-from .findings import BinnedErrors, Disturbance, Finding, Gap, Verdict
-from .noise_tests import NoiseTests
+from .findings import BinnedErrors, Disturbance, Finding, Gap, SensorNoise, Verdict
+from .noise_tests import NoiseTests, choose_alarm_level
 from .thresholds import THRESHOLD
 from .wording import join_names, name_test
+
+if TYPE_CHECKING:
+    from .result import Diagnosis
 
 
 def choose_verdict(complete: bool, named: bool) -> Verdict:
@@ -114,10 +121,49 @@ def gap_is_wider(gap: Gap, disturbance: Disturbance) -> bool:
     return max(gap.before, gap.floor) < gap.after and not by_noise
 
 
+def describe_grounds(stand_ins: Sequence[tuple[Finding, str]]) -> str | None:
+    """Say why names do not stand, in one clause; None without any."""
+    words = [f"the name {join_names([f])} does not stand, since {why}" for f, why in stand_ins]
+    return ", and ".join(words) or None
+
+
+def declare_unfinished(found: Diagnosis, place: str, seconds: float) -> Diagnosis:
+    """Return a diagnosis whose search was stopped, which claims no more than was checked.
+
+    Parameters
+    ----------
+    found : Diagnosis
+        The answer so far.
+    place : str
+        Where the search was, in words.
+    seconds : float
+        How long it had been going on [s].
+
+    Returns
+    -------
+    Diagnosis
+        Its verdict is ``"partly explained"`` or ``"unknown"``.
+    """
+    named = bool(found.findings)
+    level = choose_alarm_level(len(found.findings))
+    noise = min(found.tests.values(), default=1.0) * len(found.tests) > level
+    left = "only noise is left so far" if noise else "what is left is not noise alone"
+    so_far = (
+        f"So far the model lacks {join_names(found.findings)}" if named else "Nothing is named yet"
+    )
+    sentence = (
+        f"THE SEARCH WAS NOT FINISHED: it was stopped after {write_number(seconds, 2)} s "
+        f"({place}). {so_far}, and {left}. What was not tried may explain it better. Give the "
+        "search more time, or fewer effects in catalogue=."
+    )
+    return replace(found, verdict=choose_verdict(False, named), sentence=sentence, finished=False)
+
+
 def write_conclusion(
     verdict: Verdict, findings: Sequence[Finding], gap: Gap, disturbance: Disturbance,
     after: NoiseTests, where: Sequence[BinnedErrors], objection: str | None = None,
-    tried: int = 0,
+    tried: int = 0, stand_ins: Sequence[tuple[Finding, str]] = (),
+    noise: SensorNoise | None = None,
 ) -> str:  # fmt: skip
     """Return the verdict with what it rests on.
 
@@ -139,6 +185,10 @@ def write_conclusion(
         Why effects that leave nothing but noise may yet be no explanation.
     tried : int, optional
         How many effects of the catalogue were tried.
+    stand_ins : sequence of (Finding, str), optional
+        Effects in the model whose names do not stand, with the ground of each.
+    noise : SensorNoise, optional
+        The noise of the sensor, told beside a clean bill that needs more than white noise.
 
     Returns
     -------
@@ -156,16 +206,23 @@ def write_conclusion(
     if verdict == "nothing missing":
         text = ("No effect that is large enough to show in this record is missing: the residuals "
                 "are noise.")  # fmt: skip
+        if noise is not None and noise.kind != "white":
+            text += f" {noise}"
     elif verdict == "explained":
         text = f"The model lacks {names}. With {them} the residuals are noise."
-    elif verdict == "partly explained" and after.passed and objection is not None:
-        text = f"With {names} the residuals are noise, but {objection}."
+    elif (findings or stand_ins) and after.passed and objection is not None:
+        every = join_names([*findings, *(f for f, _ in stand_ins)])
+        text = f"With {every} the residuals are noise, but {objection}."
     elif verdict == "partly explained":
         text = (f"{names} {verb} part of the error. The rest is not noise alone: {why}. None of "
                 f"the {tried} effects of the catalogue explains it.")  # fmt: skip
     else:
         text = (f"The error is not noise alone: {why}. None of the {tried} effects of the "
                 "catalogue explains it.")  # fmt: skip
+    doubted = after.passed and objection is not None
+    grounds = None if doubted else describe_grounds(stand_ins)
+    if grounds is not None:
+        text += f" {grounds[:1].upper()}{grounds[1:]}."
     left = [w for w in where if w.p_after < THRESHOLD.surely_left]
     if left and verdict in ("partly explained", "unknown"):
         text += f" The remaining error depends on {' and '.join(w.axis for w in left[:2])}."

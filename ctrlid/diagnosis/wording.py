@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 PLACES = 3
 # So many failed tests are named, which still makes one sentence.
 LISTED = 4
+# The heading of what does not stand.
+STAND_INS = "what only describes part of the record"
 HEADLINES = {
     "nothing missing": "Nothing missing",
     "explained": "Explained",
@@ -197,7 +199,7 @@ def describe_limits(found: Diagnosis) -> str:
     names = [c.name for c in plant
              if any(math.isclose(c.before, f * c.given, rel_tol=1e-6)
                     for f in factors)]  # fmt: skip
-    if not names or not found.findings:
+    if not names or not found.added:
         return ""
     ends = "ENDS AT ITS LIMIT" if len(names) == 1 else "END AT THEIR LIMITS"
     return (f"Recalibrated alone, {write_list(names)} {ends}, a tenth or ten times the value as "
@@ -273,7 +275,7 @@ def describe_certainty(found: Diagnosis, finding: Finding) -> str:
             "strong" if finding.evidence < THRESHOLD.certain else "very strong")  # fmt: skip
     digits = 0 if finding.evidence >= THRESHOLD.strong else 1
     text = f"evidence {finding.evidence:.{digits}f} ({sure})"
-    if math.isfinite(finding.share) and len(found.findings) > 1:
+    if math.isfinite(finding.share) and len(found.added) > 1:
         share = write_percent(finding.share)
         text += f"; without it, {share} of the mean square error above the noise floor would return"
     many = len(set(finding.names) - set(finding.equivalents))
@@ -384,6 +386,11 @@ def describe_disturbance(found: Diagnosis) -> str:
             "effects larger than this force")  # fmt: skip
 
 
+def describe_sensor_noise(found: Diagnosis) -> str:
+    """Say what the noise of the sensor is, and how large."""
+    return "" if found.noise is None else f"sensor noise: {found.noise.words}"
+
+
 def describe_remains(found: Diagnosis) -> str:
     """Say whether the residuals are noise, by the tests of the final one-step errors."""
     if not found.tests:
@@ -391,7 +398,7 @@ def describe_remains(found: Diagnosis) -> str:
     count = len(found.tests)
     name, p = min(found.tests.items(), key=lambda item: item[1])
     together = min(1.0, count * p)
-    if found.verdict in COMPLETE or together > choose_alarm_level(len(found.findings)):
+    if found.verdict in COMPLETE or together > choose_alarm_level(len(found.added)):
         text = f"residuals: noise, by {count} tests. The smallest p-value is that of "
         text += f"{name_test(name)}, {write_p_value(p)}"
         if p < THRESHOLD.telling:

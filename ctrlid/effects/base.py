@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, Self
 
 import casadi
-import numpy as np
 
+from .._base.arguments import check_fields, is_number
 from .._base.errors import CtrlidError, EffectDoesNotApply
 from ..physics.equations import Equations
 from ..physics.linearization import OperatingPoint
@@ -66,9 +66,10 @@ class AbstractEffect:
 
     def __post_init__(self) -> None:
         kind = type(self).__name__
+        check_fields(self, *(p.name for p in self.parameters()))
         for p in self.parameters():
             value = getattr(self, p.name)
-            if isinstance(value, bool) or not isinstance(value, int | float | np.number):
+            if not is_number(value):
                 raise CtrlidError(f"{kind} needs a number for {p.name}; given {value!r}")
             value = float(value)
             # An infinite value is a limit that is never met.

@@ -7,8 +7,9 @@ from typing import Any
 import casadi
 import numpy as np
 
+from .._base.arguments import check_arguments
 from .._base.arrays import Array
-from .._base.errors import EffectDoesNotApply
+from .._base.errors import CtrlidError, EffectDoesNotApply
 from ..physics.equations import Equations
 from ..physics.linearization import compute_state_matrices
 from .base import AbstractEffect
@@ -65,6 +66,9 @@ def equivalents(
     >>> cid.effects.equivalents(cid.effects.ConstantForce(bias=0.1), loop)
     ('InputOffset', 'SensorDrift')
     """
+    check_arguments(equivalents, locals())
+    if isinstance(loop, type) or not callable(getattr(loop, "with_effect", None)):
+        raise CtrlidError(f"equivalents needs a Loop as loop; given {type(loop).__name__}")
     base = loop.without_effect(effect) if effect in loop.effects else loop
     name = type(effect).__name__
     if name == "InputDelay":

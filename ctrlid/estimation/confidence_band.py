@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from scipy.stats import t as student_t
 
-from .._base.arrays import Array
+from .._base.arguments import check_arguments
+from .._base.arrays import Array, freeze_arrays, to_real_array
 from .._base.errors import CtrlidError
 from .._base.text import Printed, write_count
 from .identified_model import IdentifiedModel
@@ -41,6 +42,9 @@ class ResponseBand(Printed):
     phase_low: Array
     phase_high: Array
     level: float
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
 
     def __str__(self) -> str:
         rows = [f"Frequency response with {100 * self.level:g} % confidence limits at each "
@@ -106,6 +110,7 @@ def response_band(model: IdentifiedModel, omega: Any, level: float = 0.95) -> Re
     >>> bool((band.magnitude_low < abs(3.0 / (0.5j * (0.5j + 2))))[0])
     True
     """
+    check_arguments(response_band, locals(), "model")
     estimate = getattr(model, "estimate", None)
     if not isinstance(model, IdentifiedModel) or estimate is None:
         raise CtrlidError(
@@ -114,7 +119,7 @@ def response_band(model: IdentifiedModel, omega: Any, level: float = 0.95) -> Re
         )
     if not 0.0 < level < 1.0:
         raise CtrlidError(f"A confidence level lies between 0 and 1; given {level!r}.")
-    w = np.atleast_1d(np.asarray(omega, dtype=float))
+    w = np.atleast_1d(to_real_array(omega, "omega"))
     limit = np.pi / estimate.dt if estimate.dt else np.finfo(float).max
     if w.ndim != 1 or not w.size or not np.all((w > 0) & (w < limit)):
         below = f" below the Nyquist frequency {limit:.6g} rad/s" if estimate.dt else ""

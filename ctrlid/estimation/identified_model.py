@@ -12,6 +12,7 @@ from scipy.special import binom
 from scipy.stats import t as student_t
 
 from .._base import text as _text
+from .._base.arguments import check_arguments
 from .._base.arrays import Array, ComplexArray
 from .._base.errors import CtrlidError
 from ..physics.conversions import to_transfer_function
@@ -211,6 +212,7 @@ class Estimate(_text.Printed):
         lower, upper : float
             Both equal to the value where a constraint fixes the coefficient.
         """
+        check_arguments(Estimate.confidence_interval, locals())
         if not 0.0 < level < 1.0:
             raise CtrlidError(f"A confidence level lies between 0 and 1; given {level!r}.")
         i = self._find_index(name)
@@ -241,8 +243,9 @@ class Estimate(_text.Printed):
         """The poles in the s-plane, ``log(z) / dt`` for a sampled model, in rad/s."""
         if self.structure.domain == "s":
             return self.poles
-        with np.errstate(divide="ignore"):
-            return np.asarray(np.log1p(self._shifted_poles) / self.dt, dtype=complex)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            poles = np.asarray(np.log1p(self._shifted_poles) / self.dt, dtype=complex)
+        return np.where(_are_at_zero(self.poles), -np.inf, poles)
 
     @property
     def poles_standard_errors(self) -> Array:
@@ -266,6 +269,11 @@ class Estimate(_text.Printed):
 
     def __str__(self) -> str:
         return _write_report(self)
+
+
+def _are_at_zero(poles: Any) -> Any:
+    """Tell which poles in z are at zero; they are found as differences from one."""
+    return np.abs(poles) < 8 * np.finfo(float).eps
 
 
 def compute_root_errors(roots: ComplexArray, covariance: Array) -> Array:
@@ -315,7 +323,12 @@ def _write_report(e: Estimate) -> str:
     for z, dz, s, ds in pairs:
         pole = f"  pole at s = {_text.with_error(s, ds)} rad/s"
         if e.structure.domain == "z":
-            pole = f"  pole at z = {_text.with_error(z, dz)}, s = {_text.with_error(s, ds)} rad/s"
+            # What is gone within one sample has no rate.
+            if _are_at_zero(z):
+                pole = "  pole at z = 0, a delay of one sample"
+            else:
+                rate = f"s = {_text.with_error(s, ds)} rad/s"
+                pole = f"  pole at z = {_text.with_error(z, dz)}, {rate}"
         lines.append(pole)
     # Least squares minimises the error of the difference equation, the others that of a prediction.
     what = e.errors
@@ -424,6 +437,7 @@ class IdentifiedModel(control.TransferFunction):
         control.TransferFunction
             A plain transfer function; the model itself if it has no delay.
         """
+        check_arguments(IdentifiedModel.with_delay, locals())
         plain = to_transfer_function(self)
         return plain * control.tf(*control.pade(self.delay, order)) if self.delay else plain
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
@@ -11,7 +12,8 @@ import numpy as np
 from scipy.stats import chi2
 
 from .._base import text as _text
-from .._base.arrays import Array
+from .._base.arguments import check_arguments
+from .._base.arrays import Array, freeze_arrays
 from .._base.errors import CtrlidError
 from .._base.jobs import check_jobs, share_out
 from ..data.record import Record
@@ -67,6 +69,9 @@ class FitSeries(_text.Printed):
     names: tuple[str, ...]
     levels: Array
     unit: str
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
 
     @property
     def rates(self) -> Array:
@@ -214,9 +219,12 @@ def fit_each(
     >>> abs(series.trend.exponent + 0.5) < 0.05
     True
     """
+    check_arguments(fit_each, locals(), "fit", "jobs", "records")
     if not callable(fit):
         raise CtrlidError(f"fit_each needs a function such as fit_iv; given {type(fit).__name__}")
     records = (records,) if isinstance(records, Record) else records
+    if not isinstance(records, Iterable):
+        raise CtrlidError(f"fit_each needs Records; given {type(records).__name__}")
     done = list(share_out(partial(_fit_one, fit, options), enumerate(records, 1), check_jobs(jobs)))
     if not done:
         raise CtrlidError("fit_each needs at least one record; the list given is empty")
@@ -230,9 +238,17 @@ def _fit_one(
     number, record = item
     if not isinstance(record, Record):
         raise CtrlidError(f"fit_each needs Records; number {number} is a {type(record).__name__}")
+    try:
+        inspect.signature(fit).bind(None, **options)
+    except (TypeError, ValueError) as reason:
+        raise CtrlidError(f"fit_each calls fit(record, ...) with the options {list(options)}, and "
+                          f"this one does not take them: {reason}") from reason  # fmt: skip
     name = record.name or f"record {number}"
     try:
         model = fit(record, **options)
     except CtrlidError as reason:  # Any refusal stays one, with the name of its record.
         raise CtrlidError(f"{name} (number {number}): {reason}") from reason
+    if not isinstance(model, IdentifiedModel):
+        raise CtrlidError(f"fit_each needs a function that returns an IdentifiedModel, as fit_iv "
+                          f"does; given one that returned {type(model).__name__}")  # fmt: skip
     return model, name, float(np.mean(record.y[record.valid])), record.units.get("y", "")

@@ -7,8 +7,10 @@ from typing import Any
 import casadi
 import numpy as np
 
+from .._base.arguments import check_arguments
 from .._base.arrays import Array
 from .._base.errors import CtrlidError, ModelCannotRun
+from .._base.periods import have_same_period, write_both_periods, write_difference
 from .._base.signals import require_one_signal
 from ..data.record import Record
 from ..data.several_records import order_model_and_data
@@ -94,15 +96,18 @@ def replay_controller(loop: Loop, record: Record) -> Array:
     >>> bool(abs(cid.replay_controller(loop, record) - record.u).max() < 1e-12)
     True
     """
-    return replay_from_best_state(*order_model_and_data(loop, record))[0]
+    loop, record = order_model_and_data(loop, record)
+    check_arguments(replay_controller, locals())
+    return replay_from_best_state(loop, record)[0]
 
 
 def replay_from_best_state(loop: Loop, record: Record) -> tuple[Array, Array]:
     """Return what `replay_controller` does, and the controller's initial state that it chose."""
     require_one_signal("replay_controller", loop, record)
-    if abs(loop.dt - record.dt) > 1e-9 * loop.dt:
-        raise CtrlidError(f"the loop is sampled at {loop.dt:g} s, the record at {record.dt:g} s; "
-                          "give both the same period")  # fmt: skip
+    if not have_same_period(loop.dt, record.dt):
+        both = write_both_periods("the loop is sampled", loop.dt, "the record", record.dt)
+        raise CtrlidError(f"{both}; give both the same period: "
+                          f"{write_difference(loop.dt, record.dt)}")  # fmt: skip
     if record.r is None:
         raise ModelCannotRun("the record has no reference r, which the controller needs; give it "
                               "r=, a constant for a fixed set-point")  # fmt: skip

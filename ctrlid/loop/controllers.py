@@ -17,6 +17,7 @@ import control as ct
 import numpy as np
 
 from .._base.errors import CtrlidError
+from .._base.periods import have_same_period, write_both_periods
 from ..physics.conversions import to_state_matrices
 from ..physics.linearization import OperatingPoint
 from ..physics.trace import timebase, trace
@@ -185,9 +186,9 @@ def make_control_law(controller: Any, at: OperatingPoint, dt: float) -> ControlL
             f"{controller.ninputs} inputs and {controller.noutputs} outputs"
         )
     sampled = timebase(controller) if controller.dt is not True else dt
-    if sampled and abs(sampled - dt) > 1e-9 * dt:
-        raise CtrlidError(f"the controller runs at {sampled:g} s, the loop at {dt:g} s; "
-                          "convert it to the period of the loop")  # fmt: skip
+    if sampled and not have_same_period(sampled, dt):
+        both = write_both_periods("the controller runs", sampled, "the loop", dt)
+        raise CtrlidError(f"{both}; convert it to the period of the loop")
     swap = controller.ninputs == 2 and list(controller.input_labels) == ["y", "r"]
     order = (1, 0) if swap else (0, 1)
     if isinstance(controller, ct.TransferFunction | ct.StateSpace):

@@ -2,7 +2,7 @@
 
 import copy
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -10,7 +10,9 @@ import casadi
 import control as ct
 import numpy as np
 
+from .._base.arguments import check_arguments
 from .._base.errors import CtrlidError, EffectDoesNotApply
+from .._base.periods import have_same_period, write_both_periods
 from .._base.text import write_count
 from ..effects import AbstractEffect
 from ..effects.composition import compose_effects, label_effects
@@ -111,9 +113,10 @@ class Loop:
         equations, inputs = self._trace_plant()
         # A loop is a value: its equations are those of the plant at the time it was made.
         object.__setattr__(self, "_traced", equations)
-        if equations.dt and self.plant.dt is not True and abs(equations.dt - self.dt) > 1e-9:
-            raise CtrlidError(f"the plant is sampled at {equations.dt:g} s, the loop at "
-                              f"{self.dt:g} s; give dt={equations.dt:g}")  # fmt: skip
+        own = equations.dt and self.plant.dt is not True
+        if own and not have_same_period(equations.dt, self.dt):
+            both = write_both_periods("the plant is sampled", equations.dt, "the loop", self.dt)
+            raise CtrlidError(f"{both}; give dt={equations.dt:.10g}")
         n = len(equations.states)
         if self.at is None and not np.isfinite(equations.evaluate(np.zeros(n), 0.0)[0]).all():
             raise CtrlidError(f"{equations.name} is not defined where all its signals are zero; "
@@ -172,6 +175,10 @@ class Loop:
 
     def _apply_effects(self) -> None:
         """Put the effects into the equations and see that the free parameters exist."""
+        for name in ("effects", "free"):
+            given = getattr(self, name)
+            if not isinstance(given, Iterable | AbstractEffect):
+                raise CtrlidError(f"a loop needs a sequence as {name}=; given {given!r}")
         effects = (self.effects,) if isinstance(self.effects, AbstractEffect) else self.effects
         effects = tuple(effects)
         strangers = [e for e in effects if not isinstance(e, AbstractEffect)]
@@ -267,6 +274,7 @@ class Loop:
         Equations
             The equations.
         """
+        check_arguments(Loop.equations, locals())
         return self._kept if keep else self._active
 
     def _shift_to_absolute(self) -> Equations:
@@ -318,6 +326,7 @@ class Loop:
         >>> loop.with_effect(cid.effects.CoulombFriction(fc=0.2)).parameters
         {'m': 2.0, 'c': 1.0, 'k': 3.0, 'CoulombFriction.fc': 0.2}
         """
+        check_arguments(Loop.with_effect, locals())
         return self._replace_fields(effects=(*self.effects, effect))
 
     def without_effect(self, effect: str | AbstractEffect) -> "Loop":
@@ -338,6 +347,7 @@ class Loop:
         CtrlidError
             If the loop has no such effect.
         """
+        check_arguments(Loop.without_effect, locals())
         known = self.labelled
         label = next((key for key, e in known.items() if key == effect or e is effect), None)
         label = label or next((key for key, e in known.items() if e == effect), None)
@@ -366,6 +376,7 @@ class Loop:
         CtrlidError
             If there is no such parameter or the value is out of its bounds.
         """
+        check_arguments(Loop.with_parameters, locals())
         unknown = [name for name in values if name not in self.parameters]
         if unknown:
             raise CtrlidError(

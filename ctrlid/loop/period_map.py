@@ -73,7 +73,7 @@ def push_velocities(e: Equations, force: Any, t: Any, x: Any, p: Any) -> Any:
     return held
 
 
-def make_period_map(loop: Loop, substeps: int, hold: str = "zoh") -> PeriodMap:
+def make_period_map(loop: Loop, substeps: int, hold: str = "zoh", hold_r: str = "zoh") -> PeriodMap:
     """Build the map of a loop over one sampling period.
 
     Parameters
@@ -85,6 +85,9 @@ def make_period_map(loop: Loop, substeps: int, hold: str = "zoh") -> PeriodMap:
     hold : {"zoh", "foh", "bandlimited"}, optional
         How the input of a loop without controller runs between samples. A digital controller holds
         its input, and an analog one moves it by its own law.
+    hold_r : {"zoh", "foh"}, optional
+        How r runs between samples, as an analog controller sees it. If it is straight, the next r
+        comes last in w.
 
     Returns
     -------
@@ -105,9 +108,13 @@ def make_period_map(loop: Loop, substeps: int, hold: str = "zoh") -> PeriodMap:
     size = n + nc + (e.play is not None) + kept
     # Corners of a band-limited input follow the signals that are held; else the next sample does.
     corners, m = (pieces + 1 if pieces > 1 else 1), len(e.inputs)
-    counts = (*count_signals(loop), m * corners)
+    straight_r = loop.analog and hold_r == "foh"
+    counts = count_signals(loop)
+    # A straight reference comes last, with its value at the next sample.
+    counts = (*counts, m * corners, *(counts[1:2] if straight_r else ()))
     z, w = casadi.SX.sym("z", size), casadi.SX.sym("w", sum(counts))
-    t0, r, d, sensor, force, ahead = casadi.vertsplit(w, np.cumsum((0, *counts)).tolist())
+    t0, r, d, sensor, force, ahead, *last = casadi.vertsplit(w, np.cumsum((0, *counts)).tolist())
+    climb = (last[0] - r) / loop.dt if straight_r else casadi.SX(0)
     following = casadi.vertsplit(ahead, m)
     path = following if pieces > 1 else [d, *following]
     at, limits = loop.point, loop.input_limits
@@ -124,12 +131,13 @@ def make_period_map(loop: Loop, substeps: int, hold: str = "zoh") -> PeriodMap:
             u = casadi.fmin(u, upper)
         return u
 
-    def compute_input(t: Any, z: Any, y: Any) -> tuple[Any, Any]:
-        wish, moved = law.apply(t, z[n:], r, y) if law else (u_rest, casadi.SX(0, 1))
+    def compute_input(t: Any, z: Any, y: Any, tau: Any = 0.0) -> tuple[Any, Any]:
+        now = r + climb * tau
+        wish, moved = law.apply(t, z[n:], now, y) if law else (u_rest, casadi.SX(0, 1))
         u = limit_input(wish + d)
         if law and law.reads_input:
             # An observer reads what the actuator applies, at its limits too.
-            moved = law.apply(t, z[n:], r, y, u)[1]
+            moved = law.apply(t, z[n:], now, y, u)[1]
         return u, moved
 
     def measure_output(t: Any, z: Any, u: Any) -> Any:
@@ -150,9 +158,9 @@ def make_period_map(loop: Loop, substeps: int, hold: str = "zoh") -> PeriodMap:
                 "(control.pade)"
             )
 
-        # The reference jumps only at the samples, so that the motion within a period is smooth.
+        # The reference jumps or bends only at the samples, so that a period has a smooth motion.
         def rate(tau: Any, z: Any) -> Any:
-            u, charge = compute_input(t0 + tau, z, measure_output(t0 + tau, z, u_rest))
+            u, charge = compute_input(t0 + tau, z, measure_output(t0 + tau, z, u_rest), tau)
             return casadi.vertcat(e.function(t0 + tau, z[:n], u, p)[0] + held_rate, charge)
 
         slope = casadi.Function("rate", [z, w], [rate(0.0, z)])
@@ -226,6 +234,8 @@ def linearize_at_rest(s: PeriodMap, function: Any) -> tuple[Array, Array]:
     both = casadi.Function("j", [z, w], [casadi.jacobian(first, z), casadi.jacobian(first, w)])
     still = np.zeros(sum(s.counts))
     still[s.places[1]] = s.reference
+    if len(s.counts) > 6:
+        still[s.places[6]] = s.reference
     a, b = both(s.rest, still)
     return np.asarray(a, float), np.asarray(b, float)
 
@@ -237,6 +247,8 @@ def compute_growth_rate(loop: Loop) -> float:
 
     over the eigenvalues of the linearized map over one sampling period T, with the controller as it
     runs; with an analog controller the largest real part of the loop's poles. Negative: stable.
+    As in `Loop.linearize`, the steps of a converter, dead zones and backlash are left out: within
+    one step of it at rest, no converter passes anything on.
 
     Parameters
     ----------
@@ -253,6 +265,9 @@ def compute_growth_rate(loop: Loop) -> float:
     CtrlidError
         If the plant has no derivative at the operating point.
     """
+    for label, effect in loop.labelled.items():
+        if not effect.in_linear_model:
+            loop = loop.without_effect(label)
     s = make_period_map(loop, 8)
     function = s.step if s.rate is None else s.rate
     matrix, _ = linearize_at_rest(s, function)

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from .._base.arrays import Array
+from .._base.arguments import check_arguments
+from .._base.arrays import Array, to_real_array
 from .._base.errors import CtrlidError, CtrlidWarning, ModelCannotRun
 from ..data.reconstruction import PIECES, count_pieces, reconstruct_signal
 from ..data.record import Record
@@ -104,6 +105,7 @@ def simulate(
     >>> len(cid.simulate(loop, r, sensor_noise=2e-6, seed=2))
     2000
     """
+    check_arguments(simulate, locals(), "loop", "sensor_noise", "force_noise")
     if not isinstance(loop, Loop):
         raise CtrlidError(
             f"simulate needs a Loop(plant, controller, dt=..., at=...); given {type(loop).__name__}"
@@ -153,10 +155,7 @@ def _check_signals(
     for name, value in (("r", r), ("d", d)):
         if value is None:
             continue
-        try:
-            array = np.asarray(value, dtype=float)
-        except (TypeError, ValueError) as reason:
-            raise CtrlidError(f"simulate needs {name} as an array of numbers; {reason}") from reason
+        array = to_real_array(value, f"simulate needs {name} as an array of numbers: they")
         if array.ndim != 1 or array.size < 2 or not np.isfinite(array).all():
             raise CtrlidError(
                 f"simulate needs {name} as a one-dimensional array of at least 2 finite numbers, "
@@ -225,6 +224,8 @@ def _draw_noise(loop: Loop, n: int, sensor: Any, force: Any, seed: int | None) -
             f"force_noise needs a plant with a moving mass, that is a state whose rate is another "
             f"state; {loop.equations().name} has none. Use d= for a disturbance of the input"
         )
+    if seed is not None and seed < 0:
+        raise CtrlidError(f"seed is a whole number from 0 upwards, or None; given {seed}")
     # Each noise has its own stream, so that switching one on does not change the other.
     streams = np.random.default_rng(seed).spawn(2)
     return [
@@ -245,14 +246,17 @@ class Simulator:
         Integration steps per period at most.
     hold : {"zoh", "foh", "bandlimited"}, optional
         How the input of a loop without controller runs between samples.
+    hold_r : {"zoh", "foh"}, optional
+        How the reference of an analog controller runs between samples.
     """
 
     def __init__(
         self, loop: Loop, tolerance: float = TOLERANCE, most: int = MOST_SUBSTEPS,
-        hold: str = "zoh",
+        hold: str = "zoh", hold_r: str = "zoh",
     ) -> None:  # fmt: skip
         self.loop, self.tolerance, self.most, self.hold = loop, tolerance, most, hold
-        first = make_period_map(loop, 1, hold)
+        self.hold_r = hold_r if loop.analog else "zoh"
+        first = make_period_map(loop, 1, hold, self.hold_r)
         self.plant_states, self.counts = first.plant_states, first.counts
         self.rest: Array = np.array(first.rest, dtype=float)
         self._steps: dict[int, Any] = {1: first.step}
@@ -268,7 +272,7 @@ class Simulator:
         # What a millionth of the operating values does to each state: smaller motion is rest.
         self._motion = linearize_at_rest(first, first.step)
         a, b = (np.nan_to_num(np.abs(m)) for m in self._motion)
-        _, _, now, *_, ahead = first.places
+        now, ahead = first.places[2], first.places[5]
         # The corners of a band-limited input are those of all inputs in turn.
         inputs = np.abs(loop.point.inputs)
         following = b[:, ahead].reshape(len(b), -1, len(inputs)).sum(axis=1)
@@ -278,8 +282,8 @@ class Simulator:
         """Return the state to start from: at rest, or with the given values."""
         z, n = self.rest.copy(), len(self.plant_states)
         if initial is not None:
-            given = np.atleast_1d(np.asarray(initial, dtype=float))
-            if given.size not in (n, z.size) or not np.isfinite(given).all():
+            given = np.atleast_1d(to_real_array(initial, "initial states"))
+            if given.ndim > 1 or given.size not in (n, z.size) or not np.isfinite(given).all():
                 raise CtrlidError(
                     f"initial needs {n} plant states ({', '.join(self.plant_states)}) or these and "
                     f"{z.size - n} controller states, all finite; given {given.tolist()}"
@@ -291,7 +295,9 @@ class Simulator:
         key = (substeps, size)
         if key not in self._runners:
             if substeps not in self._steps:
-                self._steps[substeps] = make_period_map(self.loop, substeps, self.hold).step
+                self._steps[substeps] = make_period_map(
+                    self.loop, substeps, self.hold, self.hold_r
+                ).step
             self._runners[key] = self._steps[substeps].mapaccum("run", size)
         return self._runners[key]
 
@@ -314,11 +320,15 @@ class Simulator:
         Runs chunk by chunk; the steps of a chunk are halved until its local errors are small.
         """
         loop, n = self.loop, d.shape[-1]
-        _, references, inputs, outputs, forces, _ = self.counts
+        _, references, inputs, outputs, forces, *_ = self.counts
         d, quiet = np.reshape(d, (inputs, n)), [np.zeros((k, n)) for k in (outputs, forces)]
+        r = None if r is None else np.reshape(r, (references, n))
         w = np.vstack([start_time + np.arange(n) * loop.dt,
                        np.zeros((references, n)) if r is None else r, d, *(noise or quiet),
                        self._find_path(d)])  # fmt: skip
+        if self.hold_r == "foh":
+            still = np.zeros((references, n))
+            w = np.vstack([w, still if r is None else np.hstack([r[:, 1:], r[:, -1:]])])
         y, u = np.empty((outputs, n)), np.empty((inputs, n))
         start, reach = z, self._floor
         asked, whole = self._measure_asked(w), loop.controller is None
@@ -404,8 +414,10 @@ class Simulator:
         moved[:, 0] = start - self.rest
         for k in range(n - 1):
             moved[:, k + 1] = a @ moved[:, k] + pushes[:, k]
-        quiet = np.repeat([1, 1, 1, 0, 1, 1], self.counts)[:, None]
-        y = np.asarray(step(rest + moved, w * quiet)[1], float)
+        told = w.copy()
+        places = np.cumsum((0, *self.counts))
+        told[places[3] : places[4]] = 0.0
+        y = np.asarray(step(rest + moved, told)[1], float)
         reach = np.max(np.abs(y - rest_of_outputs), axis=1)
         return np.where(np.isfinite(reach), reach, math.inf)
 

@@ -9,11 +9,12 @@ from collections.abc import Sequence
 from typing import Any
 
 import casadi
-import numba
 import numpy as np
 
 from .._base.arrays import Array
+from .._base.compilation import compile_loop
 from .._base.errors import CtrlidError
+from .._base.interruption import keep_interrupt
 from .._base.jobs import count_processors, run_side_by_side
 from .interpreter import BINARY, UNARY, run_programs
 
@@ -99,7 +100,8 @@ def _list_instructions(function: Any) -> tuple[Any, Array]:
     return np.array(steps, dtype=np.int64).reshape(-1, 4), np.array(constants, dtype=float)
 
 
-@numba.njit(cache=True)
+@keep_interrupt
+@compile_loop()
 def _allocate_registers(steps: Any) -> tuple[Any, int]:  # pragma: no cover - compiled
     """Return the program with registers of its own, and their number.
 

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from scipy import linalg
 
 from .._base.arrays import Array
+from .._base.errors import CtrlidError
 
 
 def to_polynomials(
@@ -113,6 +114,11 @@ def to_state_matrices(system: Any) -> tuple[Array, Array, Array, Array]:
     a, b, c, d : ndarray
         Of shapes (n, n), (n, inputs), (outputs, n) and (outputs, inputs); those of a state space
         as they are.
+
+    Raises
+    ------
+    CtrlidError
+        If the system has more zeros than poles.
     """
     if isinstance(system, ct.StateSpace):
         return system.A, system.B, system.C, system.D
@@ -120,6 +126,11 @@ def to_state_matrices(system: Any) -> tuple[Array, Array, Array, Array]:
     for nums, dens in zip(system.num, system.den, strict=True):
         parts = []
         for num, den in zip(nums, dens, strict=True):
+            if len(np.trim_zeros(num, "f")) > len(np.trim_zeros(den, "f")):
+                raise CtrlidError(
+                    f"{system.name} has more zeros than poles, so that it would differentiate "
+                    "without a filter: add the pole that the real one has"
+                )
             zero = not np.any(num)
             parts.append(ct.ss([], [], [], [[0]]) if zero else ct.ss(ct.tf(num, den, system.dt)))
         a, b = (linalg.block_diag(*m) for m in ([s.A for s in parts], [s.B for s in parts]))

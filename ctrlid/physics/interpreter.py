@@ -7,8 +7,10 @@ import math
 from typing import Any
 
 import casadi
-import numba
 import numpy as np
+
+from .._base.compilation import compile_loop
+from .._base.interruption import keep_interrupt
 
 UNARY = {
     casadi.OP_SQ, casadi.OP_TWICE, casadi.OP_NEG, casadi.OP_INV, casadi.OP_FABS, casadi.OP_SQRT,
@@ -25,7 +27,7 @@ BINARY = {
 }  # fmt: skip
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compile_loop(nogil=True, error_model="numpy")
 def run_program(
     program: Any, constants: Any, inputs: Any, work: Any, outputs: Any, size: int
 ) -> None:  # pragma: no cover - compiled
@@ -206,7 +208,8 @@ def run_program(
                 work[to, k] = math.copysign(work[a, k], work[b, k])
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@keep_interrupt
+@compile_loop(nogil=True, error_model="numpy")
 def iterate_program(
     program: Any, constants: Any, inputs: Any, work: Any, outputs: Any, signal: Any
 ) -> Any:  # pragma: no cover - compiled
@@ -235,7 +238,8 @@ def iterate_program(
     return carried
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@keep_interrupt
+@compile_loop(nogil=True, error_model="numpy")
 def run_programs(
     program: Any,
     starts: Any,

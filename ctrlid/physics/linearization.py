@@ -9,7 +9,8 @@ import control as ct
 import numpy as np
 from scipy import linalg
 
-from .._base.arrays import Array
+from .._base.arguments import check_arguments
+from .._base.arrays import Array, to_real_array
 from .._base.errors import CtrlidError, ModelCannotRun
 from .._base.text import write_count
 from .conversions import to_polynomials
@@ -22,6 +23,8 @@ UNREACHABLE = 1e-12
 EQUILIBRIUM = 1e-9
 # The search for equilibria starts from so many random points.
 STARTS = 60
+
+WANTED = "an operating point is given by numbers: states=(...), input=, output=, which"
 
 
 @dataclass(frozen=True)
@@ -57,16 +60,14 @@ class OperatingPoint:
     output: Any
 
     def __post_init__(self) -> None:
-        try:
-            states, inputs, outputs = (
-                tuple(np.asarray(values, dtype=float).ravel().tolist())
-                for values in (self.states, self.input, self.output)
-            )
-        except (TypeError, ValueError) as reason:
-            raise CtrlidError(
-                "an operating point is given by numbers: states=(...), input=, output="
-            ) from reason
-        point = tuple(values[0] if len(values) == 1 else values for values in (inputs, outputs))
+        values = []
+        for given in (self.states, self.input, self.output):
+            array = np.atleast_1d(to_real_array(given, WANTED))
+            if array.ndim > 1:
+                raise CtrlidError(f"{WANTED}: given {self}")
+            values.append(tuple(array.tolist()))
+        states, inputs, outputs = values
+        point = tuple(each[0] if len(each) == 1 else each for each in (inputs, outputs))
         if not np.isfinite([*states, *inputs, *outputs]).all():
             raise ModelCannotRun(
                 f"an operating point must be finite; given states={states}, "
@@ -176,6 +177,7 @@ def operating_point(
     >>> op.states, round(op.input, 6)
     ((0.012, 0.0), 3.001458)
     """
+    check_arguments(operating_point, locals(), "output")
     equations = trace(plant)
     one = len(equations.outputs) == 1
     if one and not (isinstance(output, int | float | np.number) and np.isfinite(output)):
@@ -247,9 +249,11 @@ def _draw_starts(n: int, target: Sequence[float], guess: Any, inputs: int = 1) -
     rng = np.random.default_rng(1)
     starts = []
     if isinstance(guess, OperatingPoint):
+        if len(guess.states) != n:
+            raise CtrlidError(f"guess needs {n} states; given {len(guess.states)}")
         starts.append(np.array([*guess.states, *guess.inputs]))
     elif guess is not None:
-        states = np.atleast_1d(np.asarray(guess, dtype=float))
+        states = np.atleast_1d(to_real_array(guess, "guess"))
         if states.shape != (n,):
             raise CtrlidError(f"guess needs {n} states; given {states.size}")
         sizes = [s * 10.0**k for k in range(-2, 3) for s in (1, -1)]
@@ -383,6 +387,7 @@ def linearize(plant: Any, at: OperatingPoint, *, states: bool = False) -> Any:
     >>> cid.linearize(plant, cid.operating_point(plant, output=0.012), states=True).state_labels
     ['x', 'v']
     """
+    check_arguments(linearize, locals())
     if not isinstance(at, OperatingPoint | ct.OperatingPoint):
         raise CtrlidError(
             f"linearize needs an OperatingPoint, as operating_point() returns; given "

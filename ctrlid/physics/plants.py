@@ -9,12 +9,13 @@ from typing import Any
 import control as ct
 import numpy as np
 
+from .._base.arguments import check_arguments, is_number
 from .._base.errors import CtrlidError
 
 
 def _require_positive(plant: str, **parameters: float) -> None:
     for name, value in parameters.items():
-        if not (np.isfinite(value) and value > 0):
+        if not (is_number(value) and np.isfinite(value) and value > 0):
             raise CtrlidError(f"{plant} needs {name} > 0 in SI units; given {name}={value!r}")
 
 
@@ -70,6 +71,7 @@ def maglev(m: float, K: float, g: float = 9.81) -> Any:
     >>> cid.plants.maglev(m=0.0213, K=3.34e-6).state_labels
     ['x', 'v']
     """
+    check_arguments(maglev, locals())
     _require_positive("maglev", m=m, K=K, g=g)
 
     def update(t: float, x: Any, u: Any, params: Any) -> Any:
@@ -120,6 +122,7 @@ def servo(m: float, c: float, k: float) -> Any:
     >>> cid.linearize(plant, cid.operating_point(plant, output=0.1)).poles().real.round(3)
     array([-2.14,  0.  ])
     """
+    check_arguments(servo, locals())
     _require_positive("servo", m=m, k=k)
     if not (np.isfinite(c) and c >= 0):
         raise CtrlidError(f"servo needs c >= 0 [N s/m]; given c={c!r}")
@@ -171,6 +174,7 @@ def tank(area: float, outlet: float, k: float, g: float = 9.81) -> Any:
     >>> round(cid.operating_point(plant, output=0.2).input, 4)
     1.9809
     """
+    check_arguments(tank, locals())
     _require_positive("tank", area=area, outlet=outlet, k=k, g=g)
 
     def update(t: float, x: Any, u: Any, params: Any) -> Any:
@@ -217,6 +221,7 @@ def pendulum(m: float, length: float, c: float = 0.0, g: float = 9.81) -> Any:
     >>> cid.operating_point(plant, output=0.0).input
     0.0
     """
+    check_arguments(pendulum, locals())
     _require_positive("pendulum", m=m, length=length, g=g)
     if not (np.isfinite(c) and c >= 0):
         raise CtrlidError(f"pendulum needs c >= 0 [N m s/rad]; given c={c!r}")

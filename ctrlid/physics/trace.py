@@ -144,10 +144,8 @@ def trace(system: Any) -> Equations:
     if isinstance(system, ct.TransferFunction) and system.issiso() and _is_proper(system):
         return _trace_transfer_function(system)
     if isinstance(system, ct.TransferFunction):
-        several = not system.issiso()
-        system = ct.ss(*((*to_state_matrices(system), system.dt) if several else (system,)),
-                       name=system.name, inputs=system.input_labels,
-                       outputs=system.output_labels)  # fmt: skip
+        system = ct.ss(*to_state_matrices(system), system.dt, name=system.name,
+                       inputs=system.input_labels, outputs=system.output_labels)  # fmt: skip
     if not isinstance(system, ct.NonlinearIOSystem):
         raise CtrlidError(
             f"a plant is a control.NonlinearIOSystem (ct.nlsys), a StateSpace or a "

@@ -7,7 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from .._base.arguments import check_arguments, check_fields
 from .._base.errors import CtrlidError
+from .._base.files import replace_file
 from .._base.text import is_bad_news
 from ..data.record import Record
 from ..design.redesigning import Redesign
@@ -94,6 +96,9 @@ class Section:
     result: Any = None
     figure: Any = None
 
+    def __post_init__(self) -> None:
+        check_fields(self)
+
     @property
     def figures(self) -> dict[str, Any]:
         """The figures by caption."""
@@ -138,6 +143,7 @@ def write_report(result: Any, path: str | Path, *, title: str = "") -> Path:
     >>> page.startswith("<!DOCTYPE html>")
     True
     """
+    check_arguments(write_report, locals())
     given = (
         list(result) if isinstance(result, Sequence) and not isinstance(result, str) else [result]
     )
@@ -157,7 +163,8 @@ def write_report(result: Any, path: str | Path, *, title: str = "") -> Path:
     )
     path = Path(path)
     try:
-        path.write_text(page, encoding="utf-8")
+        with replace_file(path) as file:
+            file.write(page)
     except OSError as reason:
         raise CtrlidError(f"the report cannot be written to {path}: {reason.strerror}. Give a file "
                           "in a folder that exists and may be written to") from reason  # fmt: skip

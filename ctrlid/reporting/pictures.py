@@ -157,7 +157,7 @@ def make_ranking(found: Diagnosis) -> dict[int, list[Bar]]:
     """Return the best candidates of each round as bars, the best first."""
     value = {id(c): _compute_net_gain(c) for c in found.ranking}
     kinds: dict[int, Kind] = {}
-    for finding in found.findings:
+    for finding in found.added:
         own = [c for c in found.ranking
                if type(c.effect).__name__ == finding.name and value[id(c)] > 0]  # fmt: skip
         # An effect that was read off the record itself, such as the steps of a converter, has no

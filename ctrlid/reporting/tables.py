@@ -229,16 +229,20 @@ def _make_diagnosis_blocks(found: Diagnosis) -> list[Block]:
         wording.describe_shrinking(found.gap),
         wording.describe_trivial(found.gap),
     ]
-    if found.findings:
-        made.append(Title("What is missing"))
-    for k, finding in enumerate(found.findings, 1):
-        sure = wording.describe_certainty(found, finding)
-        made += [
-            f"{k}. {wording.name_finding(finding)}. {wording.describe_size(found, finding)}.",
-            f"{_upper(sure)}.",
-        ]
-        made += [f"{_upper(doubt)}." for doubt in wording.list_doubts(found, finding)]
-    if found.findings:
+    for title, named in (
+        ("What is missing", found.findings),
+        (_upper(wording.STAND_INS), found.stand_ins),
+    ):
+        if named:
+            made.append(Title(title))
+        for k, finding in enumerate(named, 1):
+            sure = wording.describe_certainty(found, finding)
+            made += [
+                f"{k}. {wording.name_finding(finding)}. {wording.describe_size(found, finding)}.",
+                f"{_upper(sure)}.",
+            ]
+            made += [f"{_upper(doubt)}." for doubt in wording.list_doubts(found, finding)]
+    if found.added:
         made.append(wording.explain_evidence())
     if found.where:
         made.append(Title("Where the error is"))
@@ -246,7 +250,7 @@ def _make_diagnosis_blocks(found: Diagnosis) -> list[Block]:
         f"{_upper(p.axis)}: {wording.describe_place(p)}."
         for p in wording.list_telling_places(found)
     ]
-    sides = 2 if found.findings else 1
+    sides = 2 if found.added else 1
     places = tuple(
         (
             p.axis,
@@ -280,7 +284,12 @@ def _make_diagnosis_blocks(found: Diagnosis) -> list[Block]:
         made.append(wording.describe_limits(found))
     made += [
         f"{_upper(line)}."
-        for line in (wording.describe_disturbance(found), wording.describe_remains(found))
+        for line in (
+            wording.describe_sensor_noise(found),
+            wording.describe_disturbance(found),
+            wording.describe_remains(found),
+        )
+        if line
     ]
     if found.audit:
         made.append(Title("About the record"))

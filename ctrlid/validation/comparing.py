@@ -11,6 +11,7 @@ from scipy import signal
 
 from .._base.arrays import Array
 from .._base.errors import CtrlidError, CtrlidWarning, EffectDoesNotApply, ModelCannotRun
+from .._base.periods import have_same_period, write_both_periods, write_difference
 from .._base.signals import require_one_signal
 from .._base.text import write_number
 from ..data.record import Record
@@ -95,6 +96,12 @@ def compare(record: Record, model_or_loop: Any, *, horizon: int | None = None) -
         raise CtrlidError(
             f"horizon must be between 1 and {len(record) - 1} samples; given {horizon}"
         )
+    y = record.y[record.valid]
+    if y.size and np.ptp(y) == 0:
+        raise CtrlidError(
+            f"y is {y[0]:g} in all valid samples, so that no curve can follow it better than "
+            "another: record while the plant moves, or look whether the sensor is stuck"
+        )
     if isinstance(model_or_loop, Loop):
         return _compare_loop(record, model_or_loop, horizon)
     if isinstance(model_or_loop, ct.TransferFunction):
@@ -170,7 +177,7 @@ def _simulate(record: Record, loop: Loop, prediction: Prediction) -> Curve:
             "Loop(plant, controller, ...)"
         )
     y, injected, noisy = np.full(len(record), np.nan), np.zeros(len(record)), np.zeros(len(record))
-    simulator = Simulator(loop, hold=record.hold)
+    simulator = Simulator(loop, hold=record.hold, hold_r=record.hold_r)
     for part in find_long_stretches(record):
         stretch = prepare_stretch(
             simulator, record, part, guess=prediction.states[part.start], seek_controller=True,
@@ -225,11 +232,10 @@ def _compare_model(record: Record, model: Any, horizon: int | None) -> Compariso
                           f"{model.ninputs} inputs and {model.noutputs} outputs. Pick a channel, "
                           "for example G[0, 0]")  # fmt: skip
     dt = record.dt if model.dt is True else timebase(model)
-    if dt and abs(dt - record.dt) > 1e-9 * dt:
-        raise CtrlidError(
-            f"the model is sampled at {dt:g} s, the record at {record.dt:g} s; fit or sample the "
-            "model at the record's period"
-        )
+    if dt and not have_same_period(dt, record.dt):
+        both = write_both_periods("the model is sampled", dt, "the record", record.dt)
+        raise CtrlidError(f"{both}; fit or sample the model at the record's period: "
+                          f"{write_difference(dt, record.dt)}")  # fmt: skip
     poles = ", ".join(write_number(p, 4) for p in model.poles())
     what = f"{model.name} (poles {poles or 'none'}"
     delay = read_delay(model)
@@ -340,7 +346,7 @@ def _judge_curve(
         return Curve(str(how), y, nan, nan, nan, nan)
     error = np.where(known, record.y - y, 0.0)
     measured = record.y[known]
-    size = float(np.linalg.norm(measured - measured.mean()))
+    size = float(np.linalg.norm(measured - measured.mean())) if np.ptp(measured) > 0 else 0.0
     fit = 100 * (1 - float(np.linalg.norm(error[known])) / size) if size else float("nan")
     rms = float(np.sqrt(np.mean(error[known] ** 2)))
     follows = 0.0 if fit > EXACT else compute_explained_share(error, signals, known)

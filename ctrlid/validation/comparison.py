@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .._base.arrays import Array
+from .._base.arrays import Array, freeze_arrays
 from .._base.errors import CtrlidError
 from .._base.text import Printed, write_list, write_number
 from ..data.record import Record
@@ -48,6 +48,9 @@ class Curve:
     follows: float
     noise_share: float
 
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Comparison(Printed):
@@ -75,6 +78,9 @@ class Comparison(Printed):
     residuals: Array
     tests: tuple[Correlation, ...]
     notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
 
     def __getitem__(self, label: str) -> Curve:
         for curve in self.curves:

@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 from scipy import linalg, stats
 
-from .._base.arrays import Array
+from .._base.arguments import check_arguments
+from .._base.arrays import Array, freeze_arrays
 from .._base.errors import CtrlidError
 from .._base.signals import require_one_signal
 from .._base.statistics import robust_deviation
@@ -29,6 +30,12 @@ NOTHING = 1e-7
 ROUNDING = 1e-11
 # An exact controller is sought with at most so many past samples.
 EXACT_LAGS = 6
+# A band-limited input midway between two samples takes its next but one sample with a third of the
+# weight of the next one, sinc(3/2) / sinc(1/2): so far a correlation at lag 0 reaches to others.
+TAIL = 1 / 3
+# A straight input moves a slow plant in the period before its sample half as far as in both. Where
+# u is said to be held, it must show that; under feedback y would have to double what is new in it.
+FURTHER = 2.0
 # If y takes away all but this share of what r and past u leave of u, u is computed from y.
 TELLING = 0.01
 
@@ -57,6 +64,9 @@ class FeedbackCheck(Printed):
     lags: Any
     correlation: Array
     text: str
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
 
     def __str__(self) -> str:
         return self.text
@@ -106,6 +116,7 @@ def check_feedback(record: Record) -> FeedbackCheck:
     >>> cid.check_feedback(closed).closed_loop, cid.check_feedback(opened).closed_loop
     (True, False)
     """
+    check_arguments(check_feedback, locals())
     if not isinstance(record, Record):
         raise CtrlidError(f"check_feedback needs a Record; given {type(record).__name__}")
     require_one_signal("check_feedback", record)
@@ -139,21 +150,35 @@ def check_feedback(record: Record) -> FeedbackCheck:
                              "No feedback found: u is a function of its own past "
                              f"{'and r ' if 'r' in signals else ''}alone.")  # fmt: skip
     test = cross_correlation(w, e, good, "y", lags=LAGS, first=0)
-    p = _compute_p_value(test)
-    if record.hold == "foh":
+    p, moved = _compute_p_value(test), False
+    least = FURTHER if record.hold == "zoh" else 1.0
+    seen = abs(test.values[0]) > test.band
+    if seen and _is_tie_of_plant(signals, record.valid, w, e, order, least):
+        # Lag 0 says how u runs on between the samples, and so do the next lags up to its tail.
+        moved = True
+        p = _compute_p_value(cross_correlation(w, e, good, "y", lags=LAGS, first=1))
+        if np.max(np.abs(test.values[1:])) <= TAIL * abs(test.values[0]):
+            p = 1.0
+    elif record.hold == "foh":
         later = _compute_p_value(cross_correlation(w, e, good, "y", lags=LAGS, first=1))
-        p = (
-            later
-            if _is_tie_of_plant(signals, record.valid, w, e, order)
-            else min(1.0, 2 * min(p, later))
-        )
+        p = min(1.0, 2 * min(p, later))
     closed = p < LEVEL
     if closed:
-        worst = int(np.argmax(np.abs(test.values)))
+        worst = int(np.argmax(np.abs(test.values[int(moved) :]))) + int(moved)
         text = (f"Closed loop: u depends on the innovations of y (correlation "
                 f"{test.values[worst]:+.2g} after {write_count(int(test.lags[worst]), 'sample')}, "
                 f"p = {p:.1g}). Use an estimator that is consistent under feedback: fit_iv or "
                 "fit_continuous.")  # fmt: skip
+    elif moved:
+        text = (
+            "No feedback found: u and y go together within a sample, but in the direction in which "
+            "u moves y, and further in the next one. So u is not held between the samples"
+        )
+        text += (
+            ": give the record hold='foh', or hold='bandlimited' for a measured input."
+            if record.hold == "zoh"
+            else "."
+        )
     else:
         text = (f"No feedback found: u does not depend on the innovations of y (p = {p:.2g}). The "
                 "loop is open, or its feedback is too weak to be seen.")  # fmt: skip
@@ -194,17 +219,19 @@ def _test_short_law(
     return None
 
 
-def _is_tie_of_plant(signals: dict[str, Array], valid: Any, w: Array, e: Array, order: int) -> bool:
+def _is_tie_of_plant(
+    signals: dict[str, Array], valid: Any, w: Array, e: Array, order: int, least: float
+) -> bool:
     """Return whether the plant, and not a controller, may tie u to y of the same sample.
 
-    An input that runs straight between the samples moves y within its own period, but a plant
-    goes on in the same direction and further in the next.
+    An input that is not held moves y within its own period, but a plant goes on in the same
+    direction and further in the next, by `least` times.
     """
     ahead = {"y": (2, order + 1), "u": (2, order + 1)}
     next_e, rows = _compute_residual(signals, valid, "y", ahead)
     now = float(np.mean(w[rows] * e[rows]))
     next_ = float(np.mean(w[rows - 1] * next_e[rows]))
-    return now * next_ > 0 and abs(next_) > abs(now)
+    return now * next_ > 0 and abs(next_) > least * abs(now)
 
 
 def _compute_residual(

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from scipy import linalg, stats
 
-from .._base.arrays import Array
+from .._base.arguments import check_arguments
+from .._base.arrays import Array, freeze_arrays
 from .._base.criterion import bayesian_penalty
 from .._base.errors import CtrlidError
 from .._base.signals import require_one_signal
@@ -61,6 +62,9 @@ class OrderRow:
     bic: float
     held_out: float
     values: Array
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -153,6 +157,7 @@ def select_order(
     >>> choice.na, choice.nb, choice.nk
     (2, 2, 1)
     """
+    check_arguments(select_order, locals(), "record", "na", "nb", "nk")
     if not isinstance(record, Record):
         raise CtrlidError(f"select_order needs a Record; given {type(record).__name__}")
     require_one_signal("select_order", record)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy import linalg, signal, stats
 
-from .._base.arrays import Array
+from .._base.arrays import Array, freeze_arrays
 from .._base.statistics import (
     compute_lagged_products,
     compute_whiteness_probability,
@@ -53,6 +53,9 @@ class Correlation:
     band: float
     p_value: float
     share: float = 0.0
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
 
     @property
     def passed(self) -> bool:
@@ -239,6 +242,8 @@ def compute_explained_share(
         Between 0 (chance can do it) and 1.
     """
     valid = np.asarray(valid)
+    # Nothing follows a signal that does not move.
+    signals = [(s, delay) for s, delay in signals if np.ptp(s[valid]) > 0]
     lags = max(1, min(lags, len(e) // (10 * max(len(signals), 1))))
     first = max((delay for _, delay in signals), default=0) + lags - 1
     rows = np.arange(first, len(e), max(1, -(-len(e) // ROWS)))

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from .._base.arguments import check_arguments
 from .._base.errors import CtrlidError, CtrlidWarning, ModelCannotRun
 from .._base.jobs import check_jobs, share_out
 from .._base.signals import require_one_signal
@@ -116,11 +117,15 @@ def sweep_sampling_period(
     >>> sweep.recommended
     0.005
     """
+    check_arguments(sweep_sampling_period, locals(), "record", "constraints")
     factors = _choose_factors(record, periods)
     names = tuple(estimators)
     unknown = [name for name in names if name not in ESTIMATORS]
     if unknown or not names:
         raise CtrlidError(f"estimators takes names out of {write_list(ESTIMATORS)}; given {names}")
+    if isinstance(constraints, Mapping) and (strange := [k for k in constraints if k not in names]):
+        raise CtrlidError(f"constraints= names {strange}, but the estimators of this sweep are "
+                          f"{list(names)}")  # fmt: skip
     known = {
         name: tuple(constraints.get(name, ())) if isinstance(constraints, Mapping)
         else tuple(_as_list(constraints)) for name in names

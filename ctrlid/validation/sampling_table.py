@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from .._base.arrays import Array
+from .._base.arrays import Array, freeze_arrays
 from .._base.errors import CtrlidError
 from .._base.text import Printed, with_error, write_list
 from ..data.record import Record
@@ -64,6 +64,9 @@ class SamplingRow:
     failure: str = ""
     notes: tuple[str, ...] = ()
 
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
+
     @property
     def failed(self) -> bool:
         """Whether there is no fit."""
@@ -102,6 +105,9 @@ class SamplingSweep(Printed):
     recommended: float
     reason: str
     warning: str = ""
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
 
     def __getitem__(self, estimator: str) -> tuple[SamplingRow, ...]:
         """Return the rows of one estimator, shortest period first."""

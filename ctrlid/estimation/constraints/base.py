@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from ..._base.arguments import is_number
 from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
 from ..identified_model import Structure
@@ -113,10 +114,9 @@ class Known(AbstractConstraint):
 
 def check_finite(value: Any, what: str) -> float:
     """Return a number as float, or say that it must be a finite one."""
-    try:
-        number = float(value)
-    except (TypeError, ValueError):
-        raise CtrlidError(f"{what} must be a real number; given {value!r}.") from None
+    if not is_number(value):
+        raise CtrlidError(f"{what} must be a real number; given {value!r}.")
+    number = float(value)
     if not math.isfinite(number):
         raise CtrlidError(f"{what} must be finite; given {value!r}.")
     return number

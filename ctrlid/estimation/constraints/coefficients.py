@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import final
 
+from ..._base.arguments import check_fields
 from ..._base.errors import CtrlidError
 from ..identified_model import Structure
 from .base import (
@@ -80,6 +81,7 @@ class Fixed(Known):
     value: float
 
     def __post_init__(self) -> None:
+        check_fields(self, "value")
         object.__setattr__(self, "value", check_finite(self.value, f"Fixed({self.name!r}, ...)"))
 
     def branches(self, structure: Structure) -> Sequence[Branch]:
@@ -110,6 +112,7 @@ class Bounds(Known):
     upper: float = math.inf
 
     def __post_init__(self) -> None:
+        check_fields(self, "lower", "upper")
         low, high = check_interval(self.lower, self.upper, f"Bounds({self.name!r}, ...)")
         object.__setattr__(self, "lower", low)
         object.__setattr__(self, "upper", high)
@@ -139,6 +142,7 @@ class Equal(Known):
     second: str
 
     def __post_init__(self) -> None:
+        check_fields(self)
         if self.first == self.second:
             raise CtrlidError(
                 f"Equal needs two different coefficients; given {self.first!r} twice."

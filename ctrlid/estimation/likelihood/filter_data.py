@@ -8,6 +8,7 @@ import numpy as np
 
 from ..._base.arrays import Array
 from ..._base.errors import CtrlidError, ModelCannotRun
+from ..._base.periods import have_same_period, write_both_periods, write_difference
 from ..._base.units import fill_unit
 from ...data.reconstruction import count_pieces, reconstruct_signal
 from ...data.record import Record
@@ -88,9 +89,10 @@ def make_filter_data(loop: Loop, record: Record, start_time: float = 0.0) -> Fil
             "dataclasses.replace(record, hold='zoh'), or a Loop without controller if u did not "
             "react to y"
         )
-    if abs(loop.dt - record.dt) > 1e-9 * loop.dt:
-        raise CtrlidError(f"the loop is sampled at {loop.dt:g} s, the record at {record.dt:g} s; "
-                          "give both the same period")  # fmt: skip
+    if not have_same_period(loop.dt, record.dt):
+        both = write_both_periods("the loop is sampled", loop.dt, "the record", record.dt)
+        raise CtrlidError(f"{both}; give both the same period: "
+                          f"{write_difference(loop.dt, record.dt)}")  # fmt: skip
     if not loop.equations().siso:
         return _make_several(loop, record, start_time)
     # The copy is writable as all other arrays are, so that the filter is compiled only once.

@@ -11,14 +11,17 @@ from typing import Any
 
 import casadi
 import numpy as np
-from scipy import linalg
+from scipy import linalg, signal
 
 from ..._base.arrays import Array
 from ..._base.errors import ModelCannotRun
+from ..._base.interruption import check_budget
+from ..._base.statistics import compute_lagged_products
 from ...physics.block_evaluation import BlockEvaluation
 from .filter_data import FilterData
 from .kalman_recursion import filter_pass
 from .sampled_plant import Linearized, SampledPlant, Trajectory
+from .tails import Tails
 
 # While its variance exceeds so many times the median, a prediction depends on the initial state.
 INITIAL_VARIANCE_RATIO = 4.0
@@ -28,6 +31,8 @@ NEWTON = 6
 PASSES = 12
 # A trajectory that moves by less than this share of its standard deviation has converged.
 CONVERGED_MOTION = 1e-3
+# What the compiled filter takes for noise without heavy tails.
+GAUSSIAN = 0.0, 0.0, 0.0, 0.0
 
 
 @dataclass(frozen=True)
@@ -47,6 +52,8 @@ class Noise:
         ``n[k] = ar[0] n[k-1] + ... + w[k] + ma[0] w[k-1] + ...``; white if both are empty.
     sensors : tuple of float
         Variances of the sensor noise of all further outputs, relative to that of the first.
+    tails : Tails or None
+        Heavy tails of the sensor noise; None: it is Gaussian.
     """
 
     force: tuple[float, ...]
@@ -54,7 +61,18 @@ class Noise:
     drift: float = 0.0
     ar: tuple[float, ...] = ()
     ma: tuple[float, ...] = ()
+    tails: Tails | None = None
     sensors: tuple[float, ...] = ()
+
+    @property
+    def plain(self) -> "Noise":
+        """The noise without its colours, of force and sensor."""
+        return Noise(self.force, tails=self.tails, sensors=self.sensors)
+
+    @property
+    def is_coloured(self) -> bool:
+        """Whether the force or the sensor noise has a colour."""
+        return bool(self.drift) or not self.sensor_is_white
 
     @property
     def sensor_is_white(self) -> bool:
@@ -63,8 +81,9 @@ class Noise:
 
     @property
     def parameters(self) -> int:
-        """Number of parameters beyond those of white noise."""
-        return 2 * bool(self.drift) + len(self.ar) + len(self.ma)
+        """Number of parameters beyond those of white Gaussian noise."""
+        tails = self.tails.parameters if self.tails is not None else 0
+        return 2 * bool(self.drift) + len(self.ar) + len(self.ma) + tails
 
     @property
     def coloured(self) -> float:
@@ -96,16 +115,17 @@ def run_filter(
     p = p if sensitive else 0
     if lin.output.ndim == 2:
         return _run_several(data, lin, noise, p)
-    n, white = plant.size, noise.sensor_is_white
+    n, white, tails = plant.size, noise.sensor_is_white, noise.tails
     force = np.asarray(noise.force, dtype=float)
     if not white:
         lin, force = append_sensor_noise(lin, force, noise)
     states = lin.step.shape[1]
+    check_budget()
     out = filter_pass(
         lin.step, lin.a, lin.b, lin.du, np.ascontiguousarray(lin.dp[:, :, :p]), lin.output,
         lin.c, np.ascontiguousarray(lin.hp[:, :p]), lin.trajectory.predicted,
         lin.trajectory.filtered, data.y, data.valid, data.restart, lin.input_variance,
-        lin.start, lin.spread, 1.0 if white else 0.0,
+        lin.start, lin.spread, 1.0 if white else 0.0, GAUSSIAN if tails is None else tails.numbers,
         force, noise.memory, noise.drift, (0,) * states,
         (0,) * (states + bool(noise.drift > 0)),
     )  # fmt: skip
@@ -114,7 +134,8 @@ def run_filter(
     counts = data.usable
     # The caller reports a filter that lost the record, so that no warning is needed here.
     with np.errstate(all="ignore"):
-        sensor = np.sqrt(np.mean(error[counts] ** 2 / variance[counts]))
+        square = np.mean(error[counts] ** 2 / variance[counts]) if tails is None else tails.scale
+        sensor = np.sqrt(square)
     return Filtered(error, variance, Trajectory(before, after, wide * sensor), slopes,
                     disturbance)  # fmt: skip
 
@@ -155,13 +176,14 @@ def _run_several(
     restart[:, 0] = data.restart
     unsure = np.zeros((size, q))
     unsure[:, -1] = lin.input_variance
+    check_budget()
     error, variance, before, after, wide, slopes, disturbance = filter_pass(
         each.step, each.a, each.b, each.du, np.ascontiguousarray(each.dp[:, :, :p]),
         (lin.output / scale).ravel(), (lin.c / scale[:, None]).reshape(size * q, states),
         np.ascontiguousarray((lin.hp[:, :, :p] / scale[:, None]).reshape(size * q, p)),
         each.trajectory.predicted, each.trajectory.filtered, (data.y / scale).ravel(),
         data.valid.ravel(), restart.ravel(), unsure.ravel(), lin.start, lin.spread, 1.0,
-        np.asarray(noise.force, dtype=float), memory, noise.coloured * (1 - memory**2),
+        GAUSSIAN, np.asarray(noise.force, dtype=float), memory, noise.coloured * (1 - memory**2),
         (0,) * states, (0,) * (states + bool(noise.drift > 0)),
     )  # fmt: skip
     error, variance = error.reshape(size, q) * scale, variance.reshape(size, q) * scale**2
@@ -252,6 +274,20 @@ def make_sensor_states(ar: tuple[float, ...], ma: tuple[float, ...]) -> tuple[Ar
     start = linalg.solve_discrete_lyapunov(move, np.outer(drive, drive))
     size = max(float(start[0, 0]), 1e-300)
     return move, np.asarray(drive / np.sqrt(size)), np.asarray(0.5 * (start + start.T) / size)
+
+
+def compute_memory(noise: Noise, samples: int) -> float:
+    r"""Return how many successive samples of the sensor noise tell its variance like one.
+
+    .. math:: 1 + 2 \sum_{\tau \ge 1} \rho(\tau)^2
+
+    over so many samples, with its autocorrelation :math:`\rho`.
+    """
+    impulse = np.zeros(samples)
+    impulse[0] = 1.0
+    response = signal.lfilter([1.0, *noise.ma], [1.0, *(-v for v in noise.ar)], impulse)
+    products = compute_lagged_products(response, response, samples - 1)
+    return float(1 + 2 * np.sum((products[1:] / products[0]) ** 2))
 
 
 def choose_settled_samples(data: FilterData, out: Filtered) -> Any:

@@ -7,18 +7,21 @@ of states, serves every plant and every effect.
 
 from typing import Any
 
-import numba
 import numpy as np
+
+from ..._base.compilation import compile_loop
+from ..._base.interruption import keep_interrupt
 
 # A state beyond this size has lost the record, and its square would soon overflow.
 LARGE = 1e150
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@keep_interrupt
+@compile_loop(nogil=True, error_model="numpy")
 def filter_pass(
     step: Any, a: Any, b: Any, du: Any, dp: Any, output: Any, c: Any, hp: Any, predicted: Any,
     filtered: Any, y: Any, valid: Any, restart: Any, input_variance: Any, start: Any, spread: Any,
-    sensor: Any, force: Any, memory: Any, drift: Any, states: Any, widths: Any,
+    sensor: Any, tails: Any, force: Any, memory: Any, drift: Any, states: Any, widths: Any,
 ) -> Any:  # fmt: skip  # pragma: no cover - compiled
     r"""Run the filter over a record, linearized along a nominal trajectory.
 
@@ -31,6 +34,9 @@ def filter_pass(
     .. math:: S^-_{k+1} = A_k S_k + \partial f_k / \partial\theta, \quad
         S_k = S^-_k - K_k \psi_k, \quad
         \psi_k = c_k S^-_k + \partial h_k / \partial\theta.
+
+    Where the sensor noise has heavy tails, a reading with the error e counts as one of the variance
+    s/w, with the weight w of the law; s is the variance without.
 
     Parameters
     ----------
@@ -47,6 +53,9 @@ def filter_pass(
         State and covariance at a start.
     sensor : float
         Variance of the sensor noise.
+    tails : (float, float, float, float)
+        Degrees of freedom, share and ratio of wild readings, and scale, as in `Tails`; all zero
+        for Gaussian noise.
     force : ndarray, shape (m,)
         Variances of the white forces.
     memory, drift : float
@@ -68,6 +77,7 @@ def filter_pass(
     p = dp.shape[2]
     m = b.shape[2]
     coloured = drift > 0.0
+    freedom, share, ratio, scale = tails
     x, cov, sens = np.zeros(w), np.zeros((w, w)), np.zeros((w, p))
     error, variance = np.zeros(size), np.ones(size)
     before, after = np.empty((size, n)), np.empty((size, n))
@@ -111,6 +121,15 @@ def filter_pass(
         if valid[k]:
             e = y[k] - expected
             error[k] = e
+            wild = 0.0
+            if freedom > 0.0:
+                wild = e * e / (freedom * scale)
+            elif share > 0.0:
+                square = 0.5 * e * e / (s * scale) * (1.0 - 1.0 / (ratio * ratio))
+                odds = share / (1.0 - share) / ratio * np.exp(min(square, 600.0))
+                usual = 1.0 - odds / (1.0 + odds) * (1.0 - 1.0 / (ratio * ratio))
+                wild = s * (1.0 / usual - 1.0)
+            s += wild
             for i in range(w):
                 gain[i] = ph[i] / s
                 x[i] += gain[i] * e
@@ -128,7 +147,7 @@ def filter_pass(
                 along[i] = total
             for i in range(w):
                 for j in range(i + 1):
-                    value = turned[i, j] + (sensor * gain[i] - along[i]) * gain[j]
+                    value = turned[i, j] + ((sensor + wild) * gain[i] - along[i]) * gain[j]
                     cov[i, j] = value
                     cov[j, i] = value
         for i in range(n):

@@ -3,7 +3,7 @@
 import functools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,10 +15,13 @@ from ...loop.loop import Loop
 from .filter_data import FilterData, can_follow_controller, make_filter_data
 from .kalman_filter import Filtered, Noise, run_filter
 from .sampled_plant import Linearized, SampledPlant, Trajectory, make_sampled_plant
+from .tails import compute_information_shares
 
 # The sensor's variance is at least this share of the output's mean square, which keeps the
 # likelihood of a noise-free record finite.
 LEAST_SENSOR_SHARE = 1e-14
+# The scale of heavy-tailed noise is known when its logarithm changes by less; it is asked so often.
+SAME_SCALE, SCALE_PASSES = 0.05, 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +79,9 @@ def make_problem(
     start_times = start_times or [0.0] * len(records)
     data = tuple(make_filter_data(loop, r, b) for r, b in zip(records, start_times, strict=True))
     follow = can_follow_controller(loop, records[0])
-    plant = make_sampled_plant(loop, tuple(names), records[0].hold, follow)
+    plant = make_sampled_plant(
+        loop, tuple(names), records[0].hold, follow, records[0].hold_r if follow else "zoh"
+    )
     return Problem(plant, data, *bounds)
 
 
@@ -160,14 +165,28 @@ class Fit:
         return int(sum(np.count_nonzero(c) for c in self.counts))
 
     @functools.cached_property
+    def working(self) -> list[tuple[Array, Array]]:
+        """Innovations and variances that, as Gaussian ones, have the score and the information.
+
+        Of heavy-tailed noise a wild innovation counts for less than a usual one.
+        """
+        tails = self.noise.tails
+        pairs = [(out.innovations, out.variance * r)
+                 for out, r in zip(self.filtered, self.sensor, strict=True)]  # fmt: skip
+        if tails is None:
+            return pairs
+        share, _ = compute_information_shares(tails)
+        return [(e * tails.compute_weight(e / np.sqrt(s)) / share, s / share) for e, s in pairs]
+
+    @functools.cached_property
     def normal(self) -> tuple[Array, Array]:
         """The held-gain information matrix and score of the parameters."""
         p = len(self.theta)
         matrix, score = np.zeros((p, p)), np.zeros(p)
-        for out, keep, r in zip(self.filtered, self.counts, self.sensor, strict=True):
-            slopes, s = out.slopes[keep], out.variance[keep] * r
-            matrix += (slopes / s[:, None]).T @ slopes
-            score += slopes.T @ (out.innovations[keep] / s)
+        for out, keep, (e, s) in zip(self.filtered, self.counts, self.working, strict=True):
+            slopes = out.slopes[keep]
+            matrix += (slopes / s[keep, None]).T @ slopes
+            score += slopes.T @ (e[keep] / s[keep])
         return matrix, score
 
     @property
@@ -177,11 +196,16 @@ class Fit:
 
     @property
     def standardized(self) -> list[Array]:
-        """The innovations divided by their standard deviations; NaN where they do not count."""
-        return [
+        """The innovations divided by their standard deviations; NaN where they do not count.
+
+        Those of heavy-tailed noise are the standard normal deviates of the same probability.
+        """
+        z = [
             np.where(keep, out.innovations / np.sqrt(out.variance * r), np.nan)
             for out, keep, r in zip(self.filtered, self.counts, self.sensor, strict=True)
         ]
+        tails = self.noise.tails
+        return z if tails is None else [tails.normalize(part) for part in z]
 
 
 def evaluate_likelihood(
@@ -206,7 +230,26 @@ def relinearize_fit(fit: Fit) -> Fit:
 def evaluate_linearized(
     problem: Problem, theta: Array, noise: Noise, lins: Sequence[Linearized], sensitive: bool = True
 ) -> Fit:
-    """Return the likelihood of parameters and noise, the plant linearized before."""
+    """Return the likelihood of parameters and noise, the plant linearized before.
+
+    The filter weighs wild readings by the scale of the usual ones, which it finds itself.
+    """
+    fit = _evaluate_at_scale(problem, theta, noise, lins, sensitive)
+    for _ in range(SCALE_PASSES):
+        tails, scale = fit.noise.tails, float(np.mean(fit.sensor))
+        if tails is None or not math.isfinite(fit.value):
+            break
+        if abs(math.log(scale / tails.scale)) < SAME_SCALE:
+            break
+        noise = replace(noise, tails=replace(tails, scale=scale))
+        fit = _evaluate_at_scale(problem, theta, noise, lins, sensitive)
+    return fit
+
+
+def _evaluate_at_scale(
+    problem: Problem, theta: Array, noise: Noise, lins: Sequence[Linearized], sensitive: bool
+) -> Fit:
+    """Return the likelihood, wild readings weighed by the scale that the noise has."""
     plant = problem.plant
     outs = tuple(
         run_filter(plant, one, lin, noise, sensitive)
@@ -219,15 +262,21 @@ def evaluate_linearized(
             e, s = _subtract_repeat_mean(out, keep, problem.periods[k])
         if not (np.isfinite(e).all() and np.isfinite(s).all() and (s > 0).all()):
             value, e, s = -math.inf, np.ones(1), np.ones(1)
-        mean = float(np.mean(e**2 / s))
+        squares, tails = e**2 / s, noise.tails
+        mean = float(np.mean(squares))
         if problem.known is not None and problem.known.sensor is not None:
             r = float(problem.known.sensor[k])
         else:
+            usual = mean if tails is None else tails.find_scale(squares, tails.scale)
             # Of several outputs the first has this variance, the others have it times a ratio.
             y = data.y[keep] if keep.ndim == 1 else data.y[keep[:, 0], 0]
             least = LEAST_SENSOR_SHARE * float(np.var(y) + np.mean(y) ** 2)
-            r = max(mean, least, 1e-300)
-        value -= 0.5 * (len(e) * (math.log(2 * math.pi * r) + mean / r) + np.sum(np.log(s)))
+            r = max(usual, least, 1e-300)
+        if tails is None:
+            value -= 0.5 * (len(e) * (math.log(2 * math.pi * r) + mean / r) + np.sum(np.log(s)))
+        else:
+            value += np.sum(tails.compute_log_density(np.sqrt(squares / r)))
+            value -= 0.5 * (len(e) * math.log(r) + np.sum(np.log(s)))
         sensors.append(r)
     return Fit(problem, theta, noise, float(value), np.array(sensors), tuple(lins), outs)
 

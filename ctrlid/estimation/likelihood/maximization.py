@@ -21,7 +21,9 @@ from .noise_fit import (
     make_noise,
     try_coloured_force,
     try_coloured_sensor,
+    try_tails,
 )
+from .tails import compute_information_shares
 
 # A climb ends after at most so many Gauss-Newton steps.
 ROUNDS = 25
@@ -38,6 +40,8 @@ SECOND_STEP_SHARES = 2
 SECOND_STEP_GAIN = 30.0
 # Noise found far away must gain so much log-likelihood before the climb goes on from there.
 OTHER_NOISE_GAIN = 2.0
+# A force is hardly any with so small a share of its variance.
+QUIET = 1e-4
 # A step that is expected to gain less log-likelihood is not worth its evaluation.
 LEAST_STEP_GAIN = 1e-3
 
@@ -137,7 +141,7 @@ def refit_noise_size(fit: Fit) -> Fit:
     A random force that stood for a wrong parameter at the start may have left no noise to the
     sensor, from where small changes lead nowhere.
     """
-    plain = Noise(fit.noise.force, sensors=fit.noise.sensors)
+    plain = fit.noise.plain
     other = fit_noise(fit.problem, fit.theta, fit.linearized, plain, wide=True)
     return maximize(other) if other.value > fit.value + OTHER_NOISE_GAIN else fit
 
@@ -167,6 +171,20 @@ def choose_sensor_noise(fit: Fit) -> Fit:
     if fit.known is not None:
         return fit
     richer = maximize(try_coloured_sensor(fit))
+    # A force that stood for the colour may have led a parameter astray, which needs it there.
+    force = tuple(QUIET * v for v in richer.noise.force)
+    quiet = maximize(replace(richer, noise=replace(richer.noise, force=force)), exact=False)
+    if quiet.value > richer.value + OTHER_NOISE_GAIN:
+        anew = try_coloured_sensor(relinearize_fit(quiet))
+        richer = maximize(max(quiet, anew, key=compute_noise_criterion))
+    return max(fit, richer, key=compute_noise_criterion)
+
+
+def choose_tails(fit: Fit) -> Fit:
+    """Return the fit with heavy tails of the sensor noise if the BIC wants them."""
+    if fit.known is not None:
+        return fit
+    richer = maximize(try_tails(fit))
     return max(fit, richer, key=compute_noise_criterion)
 
 
@@ -342,6 +360,8 @@ def compute_information(fit: Fit) -> tuple[Array, Array]:
             shifted[k] += h
             pair.append(compute_innovations(fit.theta, make_noise(shifted, fit.noise, dt)))
         columns.append(_divide_difference(pair, 2 * LOG_STEP))
+    tails = fit.noise.tails
+    mean, scale = compute_information_shares(tails)
     count, records = len(columns), len(problem.data) if problem.known is None else 0
     matrix = np.zeros((count + records, count + records))
     score = np.zeros(count + records)
@@ -349,10 +369,14 @@ def compute_information(fit: Fit) -> tuple[Array, Array]:
         s, e = out.variance[keep] * r, out.innovations[keep]
         size = np.zeros((len(e), records))
         size[:, k : k + 1] = 1.0
+        z2 = e**2 / s
+        if tails is not None:
+            w = tails.compute_weight(np.sqrt(z2))
+            e, z2 = w * e, w * z2
         slopes = np.column_stack([c[k][0] for c in columns] + [np.zeros_like(size)])
         widths = np.column_stack([c[k][1] for c in columns] + [size])
-        matrix += (slopes / s[:, None]).T @ slopes + 0.5 * widths.T @ widths
-        score += -slopes.T @ (e / s) + 0.5 * widths.T @ (e**2 / s - 1)
+        matrix += mean * (slopes / s[:, None]).T @ slopes + 0.5 * scale * widths.T @ widths
+        score += -slopes.T @ (e / s) + 0.5 * widths.T @ (z2 - 1)
     return matrix, score
 
 

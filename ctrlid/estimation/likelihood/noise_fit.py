@@ -14,6 +14,7 @@ from ..._base.jobs import run_side_by_side
 from .kalman_filter import Noise
 from .likelihood import Fit, Known, Problem, evaluate_linearized
 from .sampled_plant import Linearized, SampledPlant
+from .tails import fit_tails, list_tails
 
 # Logarithm of the least variance of a force, below which it affects only the start of a record.
 LEAST = -24.0
@@ -27,6 +28,8 @@ LOG_STEP = 0.2
 CONVEX = 0.05
 # Partial autocorrelations are read back from coefficients up to this size.
 SURE = 1 - 1e-9
+# Coefficients of coloured sensor noise from which a fit starts, and those of an average.
+SIZES, AVERAGED = (-0.4, 0.4, 0.8, 0.97), 0.9
 # Orders of coloured sensor noise: of the autoregression and of the moving average, at most.
 ORDERS = 2, 3
 
@@ -66,9 +69,51 @@ def fit_noise(
         grid = np.linspace(low[0], high[0], 20)
         points = [np.append(np.full(plant.channels, g) + apart, rest) for g in grid]
         start = points[int(np.argmin(_evaluate_costs(cost, points)))]
-    return evaluate_linearized(
+    fit = evaluate_linearized(
         problem, theta, at(_minimize_by_newton(cost, start, low, high, enough)), lins
     )
+    return fit if noise.tails is None else _refit_tails(fit, hold_colour)
+
+
+def _refit_tails(fit: Fit, hold_shape: bool) -> Fit:
+    """Return the fit with the likeliest tails of its innovations, or as it is where that is less.
+
+    Only the scale moves with `hold_shape`. The filter weighs readings anew, by the new law.
+    """
+    tails = fit.noise.tails
+    assert tails is not None
+    if not math.isfinite(fit.value):
+        return fit
+    new = replace(tails, scale=float(np.mean(fit.sensor)))
+    if not hold_shape:
+        new, _ = fit_tails(new, *_list_squares(fit))
+    again = evaluate_linearized(
+        fit.problem, fit.theta, replace(fit.noise, tails=new), fit.linearized
+    )
+    return again if again.value > fit.value else fit
+
+
+def _list_squares(fit: Fit) -> tuple[Array, float]:
+    """Return squared innovations over their relative variances, and half the sum of their logs."""
+    pairs = [(out.innovations[keep] ** 2, out.variance[keep])
+             for out, keep in zip(fit.filtered, fit.counts, strict=True)]  # fmt: skip
+    return (np.concatenate([e / s for e, s in pairs]),
+            0.5 * float(sum(np.sum(np.log(s)) for _, s in pairs)))  # fmt: skip
+
+
+def try_tails(fit: Fit) -> Fit:
+    """Return the fit with the heavy tails of the sensor noise that the BIC prefers.
+
+    Student's law and a share of wild readings compete; parameters of the plant stay as they are.
+    """
+    squares, logs = _list_squares(fit)
+    laws = [fit_tails(law, squares, logs) for law in list_tails(squares)]
+    tried = []
+    for student in (True, False):
+        law, _ = max(((t, v) for t, v in laws if bool(t.freedom) == student), key=lambda p: p[1])
+        noise = replace(fit.noise, tails=law)
+        tried.append(fit_noise(fit.problem, fit.theta, fit.linearized, noise))
+    return max(tried, key=compute_noise_criterion)
 
 
 def choose_noise_ratio(plant: SampledPlant) -> float:
@@ -116,7 +161,8 @@ def make_noise(logs: Array, like: Noise, dt: float) -> Noise:
     ar, ma = np.tanh(logs[len(logs) - p - q : len(logs) - q]), np.sin(logs[len(logs) - q :])
     further = channels + len(like.sensors)
     noise = Noise(force, ar=_make_coefficients(ar), ma=tuple(-v for v in _make_coefficients(ma)),
-                  sensors=tuple(np.exp(logs[channels:further]).tolist()))  # fmt: skip
+                  sensors=tuple(np.exp(logs[channels:further]).tolist()),
+                  tails=like.tails)  # fmt: skip
     if not like.drift:
         return noise
     memory = math.exp(-dt / math.exp(min(max(logs[further + 1], -50), 50)))
@@ -227,7 +273,7 @@ def try_coloured_force(fit: Fit) -> Fit:
     force, whole = tuple(0.5 * v for v in fit.noise.force), sum(fit.noise.force)
     memories = [math.exp(-dt / time) for time in (3 * dt, 30 * dt, 300 * dt)]
     noises = [
-        Noise(force, memory, share * whole * (1 - memory**2))
+        Noise(force, memory, share * whole * (1 - memory**2), tails=fit.noise.tails)
         for memory in memories
         for share in (1e-2, 1.0)
     ]
@@ -261,13 +307,22 @@ def try_coloured_sensor(fit: Fit) -> Fit:
     ----------
     Hannan and Rissanen, Biometrika 69 (1982) 81-94, for the choice of orders by a criterion.
     """
-    starts = [tuple(share * v for v in fit.noise.force) for share in (1.0, 1e-2, 1e-4)]
-    sizes = (-0.4, 0.4, 0.8, 0.97)
-    first = [
-        _fit_best(fit, [Noise(force, ar=(v,)) for force in starts for v in sizes]),
-        _fit_best(fit, [Noise(force, ma=(v,)) for force in starts for v in sizes]),
+    shares = (1.0, 1e-2, 1e-4, 1e-6, 1e-8)
+    forces = [tuple(share * v for v in fit.noise.force) for share in shares]
+    tails = fit.noise.tails
+    values: list[tuple[float, ...]] = [(v,) for v in SIZES]
+
+    def fit_moving(averages: Sequence[tuple[float, ...]]) -> Fit:
+        return _fit_best(fit, [Noise(f, ma=ma, tails=tails) for f in forces for ma in averages])
+
+    # A converter that averages samples has zeros on the unit circle, all of which it needs at once.
+    longer: list[list[tuple[float, ...]]]
+    longer = [[(AVERAGED,) * q] for q in range(2, ORDERS[1] + 1)]
+    chains = [
+        _fit_best(fit, [Noise(f, ar=ar, tails=tails) for f in forces for ar in values]),
+        max((fit_moving(averages) for averages in (values, *longer)), key=compute_noise_criterion),
     ]
-    return max((_lengthen_sensor_noise(f) for f in first), key=compute_noise_criterion)
+    return max((_lengthen_sensor_noise(f) for f in chains), key=compute_noise_criterion)
 
 
 def compute_noise_criterion(fit: Fit) -> float:

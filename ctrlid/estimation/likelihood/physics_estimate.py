@@ -7,7 +7,8 @@ import control as ct
 import numpy as np
 from scipy.stats import norm
 
-from ..._base.arrays import Array
+from ..._base.arguments import check_arguments
+from ..._base.arrays import Array, freeze_arrays
 from ..._base.criterion import bayesian_penalty
 from ..._base.errors import CtrlidError
 from ..._base.text import Printed, write_number, write_quantity
@@ -67,6 +68,9 @@ class LoopEstimate(Printed):
     notes: tuple[str, ...] = ()
     units: tuple[Any, Any] = ("", "")
 
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
+
     @property
     def standard_errors(self) -> Array:
         """Standard errors of the parameters."""
@@ -103,6 +107,7 @@ class LoopEstimate(Printed):
         CtrlidError
             If the parameter was not fitted or the level is no probability.
         """
+        check_arguments(LoopEstimate.confidence_interval, locals())
         if not 0.0 < level < 1.0:
             raise CtrlidError(f"A confidence level lies between 0 and 1; given {level!r}.")
         middle = self[name]

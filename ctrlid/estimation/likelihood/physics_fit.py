@@ -7,8 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from ..._base.arguments import check_arguments
 from ..._base.arrays import Array
 from ..._base.errors import CtrlidError, ModelCannotRun
+from ..._base.interruption import hold_interrupt
 from ..._base.statistics import pseudo_inverse
 from ..._base.text import write_list
 from ...data.outliers import describe_outliers, mask_outliers
@@ -87,6 +89,7 @@ def fit_loop(
     True
     """
     loop, record = order_model_and_data(loop, record)
+    check_arguments(fit_loop, locals(), "loop", "record")
     given = as_records(record)
     names = _choose_free_names(loop, free)
     # A single reading far outside makes any Gaussian likelihood follow it and nothing else.
@@ -98,9 +101,10 @@ def fit_loop(
             f"one has outputs ({', '.join(loop.signals['y'])}). Leave out coloured=True: each "
             "velocity has a white force of its own"
         )
-    fit = refit_noise_size(maximize(begin_fit(make_problem(loop, names, records))))
-    if coloured or coloured is None:
-        fit = choose_noise(fit, always=bool(coloured))
+    with hold_interrupt():
+        fit = refit_noise_size(maximize(begin_fit(make_problem(loop, names, records))))
+        if coloured or coloured is None:
+            fit = choose_noise(fit, always=bool(coloured))
     if not math.isfinite(fit.value):
         raise ModelCannotRun(
             f"the likelihood of {fit.plant.e.name} on this record is not finite: the model has "

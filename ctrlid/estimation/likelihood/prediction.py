@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from ..._base.arrays import Array
+from ..._base.arguments import is_number
+from ..._base.arrays import Array, freeze_arrays
 from ..._base.errors import CtrlidError
 from ..._base.text import Printed
 from ...data.record import Record
@@ -64,6 +65,9 @@ class Prediction(Printed):
     sensor_noise: Any
     force_noise: Any
     units: tuple[Any, Any] = ("", "")
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
 
     def __str__(self) -> str:
         if self.y.ndim == 2:
@@ -143,7 +147,9 @@ def predict(loop: Loop, record: Record, force_noise: float | None = None) -> Pre
     if not (isinstance(loop, Loop) and isinstance(record, Record)):
         raise CtrlidError("predict needs a Loop and a Record; given "
                           f"{type(loop).__name__} and {type(record).__name__}")  # fmt: skip
-    if force_noise is not None and not (np.isfinite(force_noise) and force_noise >= 0):
+    if force_noise is not None and not (
+        is_number(force_noise) and np.isfinite(force_noise) and force_noise >= 0
+    ):
         raise CtrlidError("force_noise is the ratio of force noise to sensor noise [1/s^2], >= 0; "
                           f"given {force_noise!r}")  # fmt: skip
     loop = _drop_neutral_effects(loop)

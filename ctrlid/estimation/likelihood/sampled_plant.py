@@ -78,15 +78,20 @@ class SampledPlant:
         How the input runs between samples.
     follow : bool
         Whether a known analog controller moves the input between samples.
+    hold_r : {"zoh", "foh"}, optional
+        How the reference runs between samples, as such a controller sees it.
     """
 
-    def __init__(self, loop: Loop, names: Sequence[str], hold: str, follow: bool) -> None:
+    def __init__(
+        self, loop: Loop, names: Sequence[str], hold: str, follow: bool, hold_r: str = "zoh"
+    ) -> None:
         self.loop, self.names, self.hold = loop, tuple(names), hold
         e = self.e = loop.equations(keep=True)
         every = list(e.parameters)
         self.index = [every.index(name) for name in self.names]
         law = loop.law() if follow and e.play is None and e.delay is None else None
         self.law = law if law is not None and law.dt == 0.0 else None
+        self.hold_r = hold_r if self.law else "zoh"
         self.n = len(e.states)
         self.size = self.n + (len(self.law.rest) if self.law else 0)
         self.pieces = count_pieces(hold)
@@ -98,13 +103,13 @@ class SampledPlant:
             self.channels = len(self.forces)
         self.scheme = choose_scheme(e, loop, loop.dt / self.pieces)
         self.plan = PeriodPlan(e, self.law, loop.dt, hold, self.scheme, self.forces, self.channels,
-                         tuple(self.index), self.delay_samples)  # fmt: skip
+                         tuple(self.index), self.delay_samples, self.hold_r)  # fmt: skip
         self.maps = build_maps(self.plan)
         self.initial_conditions = InitialConditions(self.plan)
 
     def of_loop(self, loop: Loop, names: Sequence[str]) -> SampledPlant:
         """Return the plant of another loop, for the same kind of record."""
-        return SampledPlant(loop, names, self.hold, self.law is not None)
+        return SampledPlant(loop, names, self.hold, self.law is not None, self.hold_r)
 
     def _evaluate_transition(
         self, stages: Sequence[BlockEvaluation], x: Array, *given: Any
@@ -195,7 +200,8 @@ class SampledPlant:
         if law is not None and law.references is not None:
             r = np.array(law.references)
         corners = np.tile(at.inputs, self.pieces + 2)
-        w = np.concatenate([[0.0], corners, r, at.outputs])[:, None]
+        references = [r] if self.hold_r == "zoh" else [r, r]
+        w = np.concatenate([[0.0], corners, *references, at.outputs])[:, None]
         quiet = np.zeros((self.n, 1))
         stages = self.maps.stages
         _, a, b, *_ = self._evaluate_transition(stages, x, w, p, quiet, np.zeros(self.channels))
@@ -235,7 +241,12 @@ class SampledPlant:
         free parameters and the initial state, w is a column of `stack_inputs`.
         """
         n, p = self.size, len(self.index)
-        sizes = {"x": (n, 1), "s": (n, p + n), "w": (self.pieces + 5, 1), "p": self.e.p.shape}
+        sizes = {
+            "x": (n, 1),
+            "s": (n, p + n),
+            "w": (self.pieces + 5 + (self.hold_r == "foh"), 1),
+            "p": self.e.p.shape,
+        }
         x, s, w, values = (casadi.SX.sym(k, *size) for k, size in sizes.items())
         still, quiet = casadi.SX.zeros(self.n), casadi.SX.zeros(self.channels)
         y, c, hp = self.maps.sensor_function(x, w, values, still)
@@ -255,7 +266,7 @@ class SampledPlant:
     def stack_inputs(self, data: FilterData, theta: Array) -> Array:
         """Return the rows over which the map is evaluated, behind any backlash.
 
-        They have the shape (pieces + 5, n).
+        They have the shape (pieces + 5, n), one more if the reference runs straight.
         """
         return self._stack_applied_inputs(
             data, self._find_applied_input(data.path, self.insert_free_values(theta))[0]
@@ -281,8 +292,9 @@ class SampledPlant:
 
     def _stack_applied_inputs(self, data: FilterData, applied: Array) -> Array:
         """Return the rows (t, input before, now, ..., ahead, r, y) the map is evaluated over."""
+        references = [data.r] if self.hold_r == "zoh" else [data.r, shift_signal(data.r, -1)]
         corners = [part.T for part in self._list_corners(applied)]
-        return np.vstack([data.t, *corners, data.r.T, data.y.T])
+        return np.vstack([data.t, *corners, *(part.T for part in references), data.y.T])
 
     def _list_corners(self, path: Array) -> list[Array]:
         """Return what acts at each corner, one before the sample to the one ahead of it."""
@@ -415,6 +427,8 @@ def shift_signal(values: Array, late: int) -> Array:
 
 
 @functools.lru_cache(maxsize=8)
-def make_sampled_plant(loop: Loop, names: tuple[str, ...], hold: str, follow: bool) -> SampledPlant:
+def make_sampled_plant(
+    loop: Loop, names: tuple[str, ...], hold: str, follow: bool, hold_r: str = "zoh"
+) -> SampledPlant:
     """Return the plant of a loop, made once."""
-    return SampledPlant(loop, names, hold, follow)
+    return SampledPlant(loop, names, hold, follow, hold_r)

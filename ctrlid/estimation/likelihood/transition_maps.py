@@ -7,11 +7,12 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import casadi
-import numba
 import numpy as np
 
 from ..._base.arrays import Array
+from ..._base.compilation import compile_loop
 from ..._base.errors import ModelCannotRun
+from ..._base.interruption import keep_interrupt
 from ...data.reconstruction import count_pieces
 from ...loop.controllers import ControlLaw
 from ...loop.loop import Loop
@@ -67,6 +68,8 @@ class PeriodPlan:
         Places of the free parameters.
     delay_samples : int
         Whole pieces by which the input comes late: periods, or parts of one if it is band-limited.
+    hold_r : {"zoh", "foh"}
+        How the reference of the controller runs between samples.
     structure : tuple
         What is compared in place of equations and law: their expressions without values.
     """
@@ -80,6 +83,7 @@ class PeriodPlan:
     channels: int
     index: tuple[int, ...]
     delay_samples: int
+    hold_r: str
     structure: tuple[Any, ...] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -127,7 +131,8 @@ class PeriodPlan:
     def rows(self) -> tuple[int, ...]:
         """How many rows time, the input at each corner, reference and output have."""
         m, q = len(self.equations.inputs), len(self.equations.outputs)
-        return 1, *(m,) * (self.pieces + 2), self.references, q
+        references = (self.references,) * (2 if self.hold_r == "foh" else 1)
+        return 1, *(m,) * (self.pieces + 2), *references, q
 
 
 def choose_scheme(e: Equations, loop: Loop, dt: float) -> Scheme:
@@ -228,7 +233,9 @@ def _build_period(plan: PeriodPlan) -> tuple[Any, list[Any], list[Any], dict[str
     x, p, s = (casadi.SX.sym(k, m) for k, m in (("x", plan.size), ("p", e.p.shape[0]),
                                                 ("s", n)))  # fmt: skip
     w = [casadi.SX.sym(f"w{k}", rows) for k, rows in enumerate(plan.rows)]
-    t, *path, r, y = w
+    # A straight reference comes with the one of the next sample.
+    straight = plan.hold_r == "foh"
+    t, *path, r, next_r, y = w if straight else [*w[:-1], w[-2], w[-1]]
     now = path[1]
     if plan.pieces > 1:
         # The corners are off the signal itself, but this mean of three of them is on it.
@@ -251,7 +258,9 @@ def _build_period(plan: PeriodPlan) -> tuple[Any, list[Any], list[Any], dict[str
         ends, parts = _build_stages(plan, t, x, pieces, p, s, held_rate, scheme, part)
     else:
         ends = [
-            _integrate_with_controller(plan, t, x, p, s, held_rate, now, r, y, max(scheme.steps, 2))
+            _integrate_with_controller(
+                plan, t, x, p, s, held_rate, now, (r, next_r), y, max(scheme.steps, 2)
+            )
         ]
         parts = 1
     free = casadi.vertcat(*(p[k] for k in plan.index)) if plan.index else casadi.SX(0, 1)
@@ -295,20 +304,24 @@ def _integrate_with_controller(
     s: Any,
     held_rate: Any,
     u: Any,
-    r: Any,
+    path_r: tuple[Any, Any],
     y: Any,
     substeps: int,
 ) -> Any:
-    """Advance plant and analog controller together, u being the measured one at the start."""
+    """Advance plant and analog controller together, u being the measured one at the start.
+
+    The reference runs straight from one value to the next one, or is held if both are the same.
+    """
     e, law, n = plan.equations, plan.law, len(plan.equations.states)
     assert law is not None
+    r, climb = path_r[0], (path_r[1] - path_r[0]) / plan.dt
     noise = y - e.smoothed(t, x[:n], u, p, s)[1]
     # The offset holds bias, injected signals and what the controller's state leaves unexplained.
     offset = u - law.apply(t, x[n:], r, y)[0]
 
     def rate(tau: Any, z: Any) -> Any:
         seen = e.smoothed(t + tau, z[:n], u, p, s)[1] + noise
-        computed, slope = law.apply(t + tau, z[n:], r, seen)
+        computed, slope = law.apply(t + tau, z[n:], r + climb * tau, seen)
         driven = e.smoothed(t + tau, z[:n], computed + offset, p, s)[0] + held_rate
         return casadi.vertcat(driven, slope)
 
@@ -389,7 +402,8 @@ def build_backlash(plan: PeriodPlan) -> BacklashMap:
     )
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@keep_interrupt
+@compile_loop(nogil=True, error_model="numpy")
 def _carry_sensitivity(gain: Any, push: Any) -> Any:  # pragma: no cover - compiled
     """Return what obeys ``s[k + 1] = gain[k] s[k] + push[k]`` and begins at zero."""
     out = np.zeros(push.shape)

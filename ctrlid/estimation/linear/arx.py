@@ -9,6 +9,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from ..._base import text as _text
+from ..._base.arguments import check_arguments
 from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
 from ..._base.jobs import check_jobs
@@ -97,6 +98,7 @@ def fit_arx(
     >>> G.estimate.poles.real.round(6)
     array([1.25, 0.8 ])
     """
+    check_arguments(fit_arx, locals(), "record", "na", "nb", "nk", "constraints", "jobs")
     structure = check_orders(na, nb, nk)
     known = check_constraints(constraints)
     first, records = stream_records(record)

@@ -7,6 +7,7 @@ from typing import Any
 import control as ct
 import numpy as np
 
+from ..._base.arguments import check_arguments
 from ..._base.errors import CtrlidError, CtrlidWarning
 from ..._base.signals import require_one_signal
 from ..._base.text import write_list, write_number
@@ -97,6 +98,7 @@ def fit_continuous(
     >>> G.estimate["a1"], round(G.estimate.poles.real.max())
     (0.0, 40)
     """
+    check_arguments(fit_continuous, locals(), "record", "poles", "zeros", "constraints")
     structure = _check_orders(poles, zeros)
     known = check_constraints(constraints)
     records = as_records(record)
@@ -115,6 +117,10 @@ def fit_continuous(
     if (delay is None or delay) and (circuit or records[0].hold != "zoh"):
         raise CtrlidError("a delay can be fitted only where the input is held (hold='zoh') and "
                           "controller= is not given; give delay=0")  # fmt: skip
+    longest = max(p.n for p in pieces) * records[0].dt
+    if delay is not None and delay >= longest:
+        raise CtrlidError(f"delay is {delay:g} s, but no stretch of valid samples is longer than "
+                          f"{longest:g} s, so that no input would reach its output")  # fmt: skip
     task = Task(structure, pieces, records[0].dt, records[0].hold, circuit, delay is None, 1.0)
     point, found, rss, used, residuals, settled = find_best_fit(task, known, delay or 0.0)
     degrees = used - found.free - structure.na - int(task.free_delay)
@@ -199,7 +205,7 @@ def _make_circuit(controller: Any, records: Sequence[Record]) -> Circuit | None:
             f"with one input and one output; given {type(controller).__name__}"
         )
     a, b, c, d = to_state_matrices(controller)
-    circuit = Circuit(a, b[:, 0], c[0], float(d[0, 0]))
+    circuit = Circuit(a, b[:, 0], c[0], float(d[0, 0]), records[0].hold_r)
     if any(r.r is None for r in records):
         if records[0].dt * circuit.fastest > FAST_CIRCUIT:
             warnings.warn(

@@ -10,9 +10,11 @@ import control
 import numpy as np
 from scipy import signal
 
+from ..._base.arguments import is_number
 from ..._base.arrays import Array
 from ..._base.criterion import bayesian_penalty
 from ..._base.errors import CtrlidError
+from ..._base.periods import have_same_period, write_both_periods
 from ..._base.statistics import regress
 from ...physics.conversions import to_polynomials
 from ..identified_model import Structure
@@ -58,7 +60,7 @@ def convert_controller(controller: Any, names: Sequence[str], dt: float) -> Line
     CtrlidError
         If it is no linear controller in discrete time with the period of the record.
     """
-    if isinstance(controller, int | float | np.number):
+    if is_number(controller):
         controller = control.tf([float(controller)], [1.0], dt)
     if not isinstance(controller, control.TransferFunction | control.StateSpace):
         raise CtrlidError(
@@ -77,11 +79,9 @@ def convert_controller(controller: Any, names: Sequence[str], dt: float) -> Line
             "difference equation that runs in the computer, for instance "
             f"control.sample_system(C, {dt:g}, method='bilinear'), or leave controller=None."
         )
-    if controller.dt is not True and abs(controller.dt - dt) > 1e-9 * dt:
-        raise CtrlidError(
-            f"The controller runs at {controller.dt:g} s, the record at {dt:g} s. Convert it to "
-            "the period of the record."
-        )
+    if controller.dt is not True and not have_same_period(controller.dt, dt):
+        both = write_both_periods("The controller runs", controller.dt, "the record", dt)
+        raise CtrlidError(f"{both}. Convert it to the period of the record.")
     numerators, den = _expand_fractions(controller)
     if controller.ninputs == 2 and list(controller.input_labels) == ["y", "r"]:
         numerators = numerators[::-1]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -160,7 +160,8 @@ def check_instruments(records: Sequence[Record], instruments: Any) -> tuple[str,
     CtrlidError
         If a signal is missing, constant, or is u or y itself.
     """
-    names = (instruments,) if isinstance(instruments, str) else tuple(instruments)
+    one = isinstance(instruments, str) or not isinstance(instruments, Iterable)
+    names = (instruments,) if one else tuple(instruments)
     if not names or not all(isinstance(name, str) for name in names):
         raise CtrlidError(
             f"instruments names external signals, 'r' or channels of extra; given {instruments!r}."

@@ -11,10 +11,12 @@ import numpy as np
 from scipy import stats
 
 from ..._base import text as _text
+from ..._base.arguments import check_arguments
 from ..._base.arrays import Array
 from ..._base.criterion import bayesian_penalty
 from ..._base.errors import CtrlidError, CtrlidWarning
 from ..._base.signals import require_one_signal
+from ..._base.statistics import sum_with_correlations
 from ...data.record import Record
 from ...data.several_records import as_records
 from ..constraints import AbstractConstraint, check_constraints
@@ -158,6 +160,7 @@ def fit_iv(
     >>> cid.fit_iv(record, 2, 2, constraints=known).estimate.poles.real.round(2)
     array([1.05, 0.95])
     """
+    check_arguments(fit_iv, locals(), "record", "na", "nb", "nk", "constraints", "instruments")
     structure = check_orders(na, nb, nk)
     known = check_constraints(constraints)
     records = as_records(record)
@@ -385,10 +388,7 @@ def _compute_sandwich(moments: Moments, found: Found, residuals: Sequence[Residu
     middle = np.zeros((p, p))
     for part in residuals:
         g = np.linalg.lstsq(upper.T, (part.z * part.e[:, None]).T, rcond=None)[0].T
-        lags = int(np.ceil(1.5 * len(g) ** (1 / 3)))
-        for lag in range(lags + 1):
-            both = g[lag:].T @ g[: len(g) - lag] * (1 - lag / (lags + 1))
-            middle += both if lag == 0 else both + both.T
+        middle += sum_with_correlations(np.asarray(g, dtype=float))
     bread = found.spread @ slope.T
     return np.asarray(bread @ middle @ bread.T)
 

@@ -23,6 +23,7 @@ class Circuit:
     b: Array
     c: Array
     d: float
+    hold_r: str = "zoh"
 
     @property
     def fastest(self) -> float:
@@ -172,24 +173,34 @@ def list_inputs(u: Array, hold: str, valid: Any = None) -> dict[str, Array]:
 
 
 def _discretize_with_circuit(a: Array, b: Array, c: Array, dt: float, k: Circuit) -> DiscreteModel:
-    """Return plant, circuit and input as one system, driven by the held r and sensor noise."""
+    """Return plant, circuit and input as one system, driven by r and sensor noise.
+
+    The noise is held over the period, and so is r, unless it runs straight.
+    """
     n, m = len(a), len(k.a)
     size = n + m + 1
-    block = np.zeros((size + 1, size + 1))
+    block = np.zeros((size + 2, size + 2))
+    # The last state is the slope of the reference.
+    block[size, size + 1] = 1 / dt
     x, q, v, e = slice(0, n), slice(n, n + m), n + m, size
     block[x, x], block[x, v] = a, b
     block[q, q], block[q, x], block[q, e] = k.a, -np.outer(k.b, c), k.b
-    # v' = c_k q' - d_k y'; e is r less the noise, constant over the period.
+    # v' = c_k q' + d_k (r' - y'); e is r less the noise, which is constant over the period.
     block[v, :] = k.c @ block[q, :]
     block[v, :] -= k.d * (c @ block[x, :])
+    block[v, size + 1] = k.d / dt
     motion = _exponential(block * dt)[: n + m]
     f = motion[:, : n + m].copy()
     # e = r - (y_measured - c x): the estimate of the noise at the sample.
     f[:, x] += np.outer(motion[:, e], c)
     both = np.concatenate([c, np.zeros(m)])
-    return DiscreteModel(
-        f, (("u", 0, motion[:, v]), ("y", 0, -motion[:, e]), ("r", 0, motion[:, e])), both, n
-    )
+    signals = [("u", 0, motion[:, v]), ("y", 0, -motion[:, e])]
+    if k.hold_r == "foh":
+        ramp = motion[:, e + 1]
+        signals += [("r", 0, motion[:, e] - ramp), ("r", -1, ramp)]
+    else:
+        signals.append(("r", 0, motion[:, e]))
+    return DiscreteModel(f, tuple(signals), both, n)
 
 
 def compute_prediction_errors(motion: DiscreteModel, gain: Array, signals: dict[str, Array]) -> Any:

@@ -3,16 +3,25 @@
 import argparse
 import itertools
 import os
+import signal
 import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from ..._base.errors import CtrlidError
-from ...diagnosis import diagnose
+from ..._base.files import replace_file
+from ..._base.interruption import Budget
+from ...diagnosis import Diagnosis, diagnose
 from .. import plot
 from ..html_page import write_report
 from .arguments import PLANTS, parse_assignment, parse_assignments, read_loop, read_record
 
+# The exit status of a command that Ctrl-C ended, by the convention of shells.
+INTERRUPTED = 128 + signal.SIGINT
+STOPPING = b"\nctrlid: writing the answer so far; Ctrl-C again gives it up\n"
 EPILOG = """\
 example: a levitated ball was logged in log.csv with the columns time [s], ref [m], volt [V] and
 gap [m]. The magnet constant K is known only to 10 %, and the controller is a sampled PID:
@@ -50,7 +59,8 @@ def add_parser(commands: Any) -> None:
     )
     add("--model", required=True, metavar="MODEL",
         help=f"one of {', '.join(PLANTS)}; or MODULE:NAME or FILE.py:NAME, where NAME is a "
-        "python-control system, a ctrlid.Loop, or a function that returns one")  # fmt: skip
+        "python-control system, a ctrlid.Loop, or a function that returns one; the file is run as "
+        "a Python program, so give only one that you trust")  # fmt: skip
     add(
         "--param",
         type=parse_assignment,
@@ -104,6 +114,9 @@ def add_parser(commands: Any) -> None:
         metavar="DIR",
         help="new folder for the report, its picture and the diagnosis",
     )
+    add("--seconds", type=float, metavar="S",
+        help="end the search after so many seconds with the best answer so far (default: when it "
+        "is finished). Ctrl-C does the same at once")  # fmt: skip
     add("--quiet", action="store_true", help="show no progress on the terminal")
     parser.set_defaults(run=run_diagnosis)
 
@@ -119,29 +132,62 @@ def run_diagnosis(args: argparse.Namespace) -> int:
     Returns
     -------
     int
-        0.
+        0; 130 if Ctrl-C ended the search, whose answer so far is printed and saved.
     """
     record = read_record(args.file, args)
     loop = read_loop(args, record)
-    settings: dict[str, Any] = {} if args.jobs is None else {"jobs": args.jobs}
+    given = {"jobs": args.jobs, "seconds": args.seconds}
+    settings: dict[str, Any] = {k: v for k, v in given.items() if v is not None}
     if args.validation is not None:
         settings["validation"] = read_record(args.validation, args)
     folder = None if args.save is None else make_folder(args.save, "--save")
     try:
-        found = diagnose(loop, record, progress=not args.quiet and sys.stderr.isatty(), **settings)
+        with _stop_on_interrupt() as budget:
+            found = diagnose(loop, record, progress=not args.quiet, **settings)
     except BaseException:
         if folder is not None:
             folder.rmdir()
         raise
-    sys.stdout.write(f"{found}\n")
-    if folder is not None:
-        found.save(folder / "diagnosis.json")
-        (folder / "diagnosis.png").write_bytes(plot.png(plot.diagnosis(found)))
-        (folder / "report.txt").write_text(f"{found}\n", encoding="utf-8")
-        write_report(found, folder / "report.html")
-        files = "report.html, report.txt, diagnosis.png and diagnosis.json"
-        sys.stdout.write(f"{files} are in {folder}{os.sep}\n")
-    return 0
+    # What took minutes to find is saved before a terminal can refuse to show it.
+    where = "" if folder is None else _save_files(found, folder)
+    sys.stdout.write(f"{found}\n{where}")
+    return INTERRUPTED if budget.asked else 0
+
+
+def _save_files(found: Diagnosis, folder: Path) -> str:
+    """Write all that is kept of a diagnosis into a folder, and say so."""
+    found.save(folder / "diagnosis.json")
+    with replace_file(folder / "report.txt") as file:
+        file.write(f"{found}\n")
+    with replace_file(folder / "diagnosis.png", binary=True) as file:
+        file.write(plot.png(plot.diagnosis(found)))
+    write_report(found, folder / "report.html")
+    files = "report.html, report.txt, diagnosis.png and diagnosis.json"
+    return f"{files} are in {folder}{os.sep}\n"
+
+
+@contextmanager
+def _stop_on_interrupt() -> Iterator[Budget]:
+    """Let the first Ctrl-C end a search with its answer so far, and the second one the command."""
+    budget = Budget()
+
+    def stop(number: int, frame: Any) -> None:
+        if budget.asked:
+            raise KeyboardInterrupt
+        budget.stop()
+        # A signal may come in the middle of a write to the same stream, which Python refuses.
+        with suppress(OSError):
+            os.write(2, STOPPING)
+
+    # Only the main thread may say what a signal does.
+    main = threading.current_thread() is threading.main_thread()
+    before = signal.signal(signal.SIGINT, stop) if main else None
+    try:
+        with budget.running(binding=False):
+            yield budget
+    finally:
+        if main:
+            signal.signal(signal.SIGINT, before)
 
 
 def make_folder(wanted: Path | None, option: str, default: str = "ctrlid-report") -> Path:

@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.rcsetup import cycler
+from matplotlib.text import Text
 
 from ..._base.errors import CtrlidError
 
@@ -165,4 +166,16 @@ def finish_axes(ax: Any, *, legend: bool = True, columns: int = 2, size: str = "
     if legend:
         ax.legend(loc="lower left", bbox_to_anchor=(0, 1.0), ncols=columns, frameon=False,
                   borderaxespad=0.3, fontsize=size, handlelength=2.6)  # fmt: skip
+    take_literally(ax)
     return ax
+
+
+def take_literally(ax: Any) -> None:
+    """Draw names and units as they are: a dollar sign in them is no formula.
+
+    The numbers at the ticks of a logarithmic axis are formulas.
+    """
+    ticks = {t for axis in (ax.xaxis, ax.yaxis) for t in axis.findobj(Text) if t is not axis.label}
+    for text in ax.findobj(Text):
+        if text not in ticks:
+            text.set_parse_math(False)

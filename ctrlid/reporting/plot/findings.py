@@ -73,8 +73,8 @@ def _draw_gap(above: Any, below: Any, found: Diagnosis) -> None:
     t, y = gap.time[part], gap.measured[part]
     scale, unit = _pictures.choose_scale([y], gap.unit)
     above.plot(t, scale * y, label="measured", **MEASURED)
-    names = " and ".join(f.name for f in found.findings[:2])
-    names += f" and {len(found.findings) - 2} more" if len(found.findings) > 2 else ""
+    names = " and ".join(f.name for f in found.added[:2])
+    names += f" and {len(found.added) - 2} more" if len(found.added) > 2 else ""
     start = "recalibrated model" if gap.before == gap.fitted else "model as given"
     label = "before" if names or gap.before != gap.fitted else "recalibrated"
     cases = [(label, gap.simulated_before, gap.before, BEFORE if names else AFTER)]
@@ -121,7 +121,7 @@ def _draw_errors(ax: Any, place: BinnedErrors | None, found: Diagnosis) -> None:
         ax.set_axis_off()
         return
     at, before, after = np.arange(len(place.before)), np.sqrt(place.before), np.sqrt(place.after)
-    both = bool(found.findings)
+    both = bool(found.added)
     solid = {"facecolor": COLOURS[0], "edgecolor": COLOURS[0], "linewidth": 0.8}
     if both:
         ax.bar(at + 0.3, before, 0.4, label="before", facecolor="w", edgecolor=COLOURS[1],

@@ -1,0 +1,241 @@
+"""The check at the door: what a public function is given is of the kind that it declares."""
+
+import functools
+import inspect
+import os
+import sys
+import types
+import typing
+from collections.abc import Callable, Iterable, Mapping
+from numbers import Complex, Integral, Real
+from pathlib import Path
+from typing import Any, Literal, TypeVar, get_args, get_origin
+
+import numpy as np
+
+from .errors import CtrlidError
+
+NUMBERS = {
+    float: "a number", int: "a whole number", complex: "a real or complex number",
+    bool: "True or False", str: "a text", Path: "the path of a file", type(None): "None",
+}  # fmt: skip
+
+
+def check_arguments(function: Callable[..., Any], given: Mapping[str, Any], *own: str) -> None:
+    """Refuse arguments that are not of the kind that a function's annotations declare.
+
+    It stands in the first line of a public function. What goes beyond the kind, such as bounds and
+    shapes, is checked where it matters.
+
+    Parameters
+    ----------
+    function : function
+        The function itself.
+    given : mapping
+        Its arguments by name, ``locals()``.
+    *own : str
+        Parameters with a check of their own, whose words say more.
+
+    Raises
+    ------
+    CtrlidError
+        At the first argument of another kind.
+
+    Examples
+    --------
+    >>> def keep(samples: int, name: str = "") -> None:
+    ...     check_arguments(keep, locals())
+    >>> keep(3)
+    >>> keep(True)
+    Traceback (most recent call last):
+    ...
+    ctrlid._base.errors.CtrlidError: keep needs a whole number as samples; given True (bool)
+    """
+    function = getattr(function, "__func__", function)
+    for name, kind in _find_kinds(function).items():
+        if name not in own:
+            _check_kind(function.__name__, name, given[name], kind)
+
+
+def is_number(value: Any) -> bool:
+    """Tell whether a value is one real number that a float can hold, and no truth value."""
+    return _is_float(value)
+
+
+def check_fields(value: Any, *own: str) -> None:
+    """Refuse fields of a dataclass that are not of the kind that it declares.
+
+    Parameters
+    ----------
+    value : dataclass
+        The value that is being made.
+    *own : str
+        Fields with a check of their own, whose words say more.
+
+    Raises
+    ------
+    CtrlidError
+        At the first field of another kind.
+    """
+    cls: Any = type(value)
+    for name, kind in _find_field_kinds(cls).items():
+        if name not in own:
+            _check_kind(type(value).__name__, name, getattr(value, name), kind)
+
+
+def _check_kind(who: str, name: str, value: Any, kind: Any) -> None:
+    if not _is_kind(value, kind):
+        shown = " ".join(repr(value).split())
+        shown = shown if len(shown) <= 60 else shown[:57] + "..."
+        raise CtrlidError(
+            f"{who} needs {_describe_kind(kind)} as {name}; given {shown} ({type(value).__name__})"
+        )
+
+
+@functools.cache
+def _find_kinds(function: Any) -> dict[str, Any]:
+    parameters = inspect.signature(function).parameters.values()
+    return {
+        p.name: types.GenericAlias(tuple, (kind, ...)) if p.kind is p.VAR_POSITIONAL else kind
+        for p in parameters
+        if p.kind is not p.VAR_KEYWORD
+        and (kind := _resolve(p.annotation, sys.modules[function.__module__])) is not Any
+    }
+
+
+@functools.cache
+def _find_field_kinds(cls: Any) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for name, field in cls.__dataclass_fields__.items():
+        home = next(c for c in cls.__mro__ if name in inspect.get_annotations(c))
+        kind = _resolve(field.type, sys.modules[home.__module__])
+        if field.init and kind is not Any and get_origin(kind) is not typing.ClassVar:
+            found[name] = kind
+    return found
+
+
+def _resolve(annotation: Any, module: Any) -> Any:
+    """Return what an annotation means; Any for what only a type checker can see."""
+    if annotation is inspect.Parameter.empty:
+        return Any
+    probe = types.SimpleNamespace(__annotations__={"x": annotation}, __globals__=vars(module))
+    try:
+        return typing.get_type_hints(probe)["x"]
+    except NameError:
+        return Any
+
+
+def _is_kind(value: Any, kind: Any) -> bool:
+    """Tell whether a value is of a kind; a number may be numpy's, a sequence an array."""
+    origin, parts = get_origin(kind), get_args(kind)
+    if kind is Any or isinstance(kind, TypeVar | str | typing.ForwardRef):
+        return True
+    if origin in (typing.Union, types.UnionType):
+        return any(_is_kind(value, part) for part in parts)
+    if origin is Literal:
+        return isinstance(value, str) and value in parts
+    if origin is typing.Annotated:
+        return _is_kind(value, parts[0])
+    if kind is float:
+        return _is_float(value)
+    if kind in (int, complex, bool, str, Path):
+        return _is_plain(value, kind)
+    if origin is type:
+        return isinstance(value, type) and _is_class(value, parts)
+    if isinstance(origin, type) and issubclass(origin, Mapping):
+        return isinstance(value, Mapping) and all(
+            _is_kind(k, parts[0]) and _is_kind(v, parts[1]) for k, v in value.items()
+        )
+    if isinstance(origin, type) and issubclass(origin, np.ndarray):
+        return isinstance(value, np.ndarray)
+    if isinstance(origin, type) and issubclass(origin, tuple):
+        return _is_row(value, parts)
+    if isinstance(origin, type) and issubclass(origin, Iterable):
+        return _is_row(value, (parts[0] if parts else Any, ...), origin is Iterable)
+    if origin is not None or kind is Callable:
+        return callable(value)
+    return isinstance(value, kind) if isinstance(kind, type) else True
+
+
+def _is_float(value: Any) -> bool:
+    """Tell whether a value is one real number and no truth value."""
+    if isinstance(value, np.ndarray) and value.ndim == 0 and value.dtype.kind in "fiu":
+        value = value[()]
+    if isinstance(value, bool | np.bool_) or not isinstance(value, Real):
+        return False
+    try:
+        float(value)
+    except OverflowError:
+        return False
+    return True
+
+
+def _is_plain(value: Any, kind: type) -> bool:
+    if kind is bool:
+        return isinstance(value, bool | np.bool_)
+    if kind is Path:
+        return isinstance(value, os.PathLike)
+    if kind is str:
+        return isinstance(value, str)
+    numbers = {int: Integral, complex: Complex}
+    return isinstance(value, numbers[kind]) and not isinstance(value, bool | np.bool_)
+
+
+def _is_class(value: type, parts: tuple[Any, ...]) -> bool:
+    wanted = get_origin(parts[0]) or parts[0] if parts else object
+    return not isinstance(wanted, type) or issubclass(value, wanted)
+
+
+def _is_row(value: Any, parts: tuple[Any, ...], once: bool = False) -> bool:
+    """Tell whether a value is a row of values of given kinds, of any length where one is `...`.
+
+    What can be walked through only once is taken as it is, where that is allowed.
+    """
+    if isinstance(value, str):
+        # A single name stands for a row of one, where names are asked for.
+        return str in parts
+    if isinstance(value, bytes | Mapping | type) or not hasattr(type(value), "__iter__"):
+        return False
+    if isinstance(value, np.ndarray) and (value.ndim == 0 or value.dtype.kind in "fiu"):
+        return value.ndim == 1 and (
+            _is_kind(value.dtype.type(0), parts[0])
+            and ((len(parts) == 2 and parts[1] is Ellipsis) or len(value) == len(parts))
+        )  # fmt: skip
+    if not hasattr(type(value), "__len__"):
+        return once
+    if len(parts) == 2 and parts[1] is Ellipsis:
+        return all(_is_kind(v, parts[0]) for v in value)
+    return len(value) == len(parts) and all(map(_is_kind, value, parts))
+
+
+def _describe_kind(kind: Any) -> str:
+    """Return a kind in words."""
+    origin, parts = get_origin(kind), get_args(kind)
+    if kind in NUMBERS:
+        return NUMBERS[kind]
+    if origin in (typing.Union, types.UnionType):
+        words = list(dict.fromkeys(map(_describe_kind, sorted(parts, key=_is_none))))
+        if len(words) > 1 and {str, Path} <= set(parts):
+            words.remove(NUMBERS[str])
+        return " or ".join(words)
+    if origin is Literal:
+        return "one of " + ", ".join(map(repr, parts))
+    if origin is type:
+        return f"a subclass of {getattr(parts[0], '__name__', parts[0])}"
+    if isinstance(origin, type) and issubclass(origin, Mapping):
+        return f"a mapping of {_describe_kind(parts[0])} to {_describe_kind(parts[1])}"
+    if isinstance(origin, type) and issubclass(origin, np.ndarray):
+        return "an array"
+    if isinstance(origin, type) and issubclass(origin, Iterable):
+        if origin is tuple and parts[-1] is not Ellipsis:
+            return "(" + ", ".join(map(_describe_kind, parts)) + ")"
+        one = _describe_kind(parts[0])
+        return "a sequence, each of it " + one
+    if origin is not None or kind is Callable:
+        return "a function"
+    name = getattr(kind, "__name__", str(kind))
+    return f"{'an' if name[:1] in 'AEIOU' else 'a'} {name}"
+
+
+def _is_none(kind: Any) -> bool:
+    return kind is type(None)

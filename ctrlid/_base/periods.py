@@ -1,0 +1,33 @@
+"""Whether two sampling periods are one, and how they are printed where they are not."""
+
+# Periods read from printed times, and those of single precision, differ by their last digits. Over
+# a million samples, the longest of records, such a clock is one sample off.
+SAME = 1e-6
+
+
+def have_same_period(first: float, second: float) -> bool:
+    """Return whether two sampling periods [s] are the same but for their last digits.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> have_same_period(0.02, float(np.float32(0.02))), have_same_period(0.02, 0.0201)
+    (True, False)
+    """
+    return abs(first - second) <= SAME * max(abs(first), abs(second))
+
+
+def write_both_periods(one: str, first: float, other: str, second: float) -> str:
+    """Return that two things run at periods that differ, with as many digits as tell them apart.
+
+    Examples
+    --------
+    >>> write_both_periods("the loop is sampled", 0.02, "the record", 0.020001)
+    'the loop is sampled at 0.02 s, the record at 0.020001 s'
+    """
+    return f"{one} at {first:.10g} s, {other} at {second:.10g} s"
+
+
+def write_difference(first: float, second: float) -> str:
+    """Return by how much two periods differ, as the end of a sentence."""
+    return f"they differ by {abs(first - second):.3g} s"

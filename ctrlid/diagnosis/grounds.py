@@ -1,0 +1,163 @@
+"""Step 10: the grounds on which a name does not stand, one function each, and their table."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from .._base.text import write_p_value, write_quantity
+from ..data.record import Record
+from ..effects import AbstractEffect
+from ..effects.context import find_motion
+from ..loop.loop import Loop
+from .constancy import compare_stretches
+from .fitted_model import Model
+from .removal import Weighed
+from .scans import is_line_of_reference
+from .thresholds import THRESHOLD
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """What the grounds are judged by: the model as given, the final one, records and errors.
+
+    `errors` are standard errors of the final model's parameters by name.
+    """
+
+    given: Loop
+    final: Model
+    records: Sequence[Record]
+    errors: Mapping[str, float]
+
+    def read_effect(self, f: Weighed) -> tuple[str, AbstractEffect]:
+        """Return the label of an effect in the final model, and the effect with its values."""
+        return list(self.final.fitted.labelled.items())[f.position]
+
+
+def find_ground(case: Case, f: Weighed) -> str:
+    """Say why the name of an effect does not stand; empty if it does.
+
+    Parameters
+    ----------
+    case : Case
+        The end of a diagnosis.
+    f : Weighed
+        An effect of its final model.
+    """
+    return next((words for ground in GROUNDS if (words := ground(case, f))), "")
+
+
+def is_at_a_limit(case: Case, f: Weighed) -> str:
+    """Say which parameter went to its limit: beyond it is another model, whatever is named beside.
+
+    A parameter of which the record says so little that the limit is within chance of the given
+    value is at no limit.
+    """
+    given, problem = case.given.parameters, case.final.fit.problem
+    label, effect = case.read_effect(f)
+    about = {f"{label}.{p.name}": p for p in effect.parameters()}
+    for name, value, low, high in zip(
+        case.final.names, case.final.fit.theta, problem.lower, problem.upper, strict=True
+    ):
+        if value not in (low, high):
+            continue
+        own = about.get(name)
+        # A size may end where its effect begins or vanishes, as in a search.
+        ends = own is not None and (own.searched or own.neutral not in (None, low, high))
+        moved = abs(value - given.get(name, value))
+        if ends or ("." not in name and moved > _chance(case.errors.get(name, math.nan))):
+            return f"{name} went to its limit, {value:.4g}"
+    return ""
+
+
+def _chance(error: float) -> float:
+    """Return how far chance takes a value of this standard error."""
+    return THRESHOLD.significant * error if math.isfinite(error) else 0.0
+
+
+def cancels_a_known_force(case: Case, f: Weighed) -> str:
+    r"""Say if a constant force takes away most of the one that the model has at rest.
+
+    .. math:: 2 b / a_0 < -1, \quad a_0 = \dot v(x_0, u = 0)
+
+    for the force b, where less than half of the known one is left: it denies what is known, such as
+    the weight of a ball, and does not add to it.
+    """
+    effect = case.read_effect(f)[1]
+    if type(effect).__name__ != "ConstantForce":
+        return ""
+    e, at = case.given.equations(), case.given.point
+    motion = find_motion(e)
+    if motion is None:
+        return ""
+    known = float(e.evaluate(np.asarray(at.states, dtype=float), 0.0, 0.0)[0][motion[1]])
+    bias = effect.values()["bias"]
+    if not (math.isfinite(known) and known * bias < 0 and 2 * abs(bias) > abs(known)):
+        return ""
+    unit = effect.units(case.given)["bias"]
+    return f"it cancels a known constant force of {write_quantity(known, unit)}"
+
+
+def differs_between_stretches(case: Case, f: Weighed) -> str:
+    """Say if the sizes from stretches that inform about it differ; an event is in one of them."""
+    if case.final.errors is not None:
+        # What was fitted by another criterion has no scores.
+        return ""
+    label, effect = case.read_effect(f)
+    if any(p.instant for p in effect.parameters()):
+        return ""
+    sizes = [f"{label}.{p.name}" for p in effect.parameters() if p.neutral is not None]
+    sizes = [name for name in sizes if name in case.final.names]
+    chances = [compare_stretches(case.final.fit, name) for name in sizes]
+    p = min((p * len(sizes) for p in chances), default=1.0)
+    if p >= THRESHOLD.differing:
+        return ""
+    return f"its size differs between stretches of the record ({write_p_value(p)})"
+
+
+def follows_the_reference(case: Case, f: Weighed) -> str:
+    """Say if a line keeps its phase to one of the reference in every record.
+
+    Then it may as well be how the loop answers: a wrong law of force or a lag makes such lines.
+    """
+    effect = case.read_effect(f)[1]
+    values = effect.values()
+    if "frequency" not in values or "phase" not in values:
+        return ""
+    frequency = values["frequency"]
+    if not all(is_phase_locked(record, frequency) for record in case.records):
+        return ""
+    line = write_quantity(frequency, "Hz")
+    return f"the reference has a line at {line} too, and it keeps its phase to that"
+
+
+def is_phase_locked(record: Record, frequency: float) -> bool:
+    r"""Whether the reference has a line whose phase is constant over the record.
+
+    .. math:: S = \Bigl|\sum_b R_b\Bigr|^2 / \sum_b |R_b|^2, \quad p = (1 - S / B)^{B - 1}
+
+    with the Fourier coefficients :math:`R_b` of the reference in B stretches, through a Hann window
+    which keeps other lines out. p is how often Gaussian coefficients of random phases line up so
+    well. A line that was fitted to the whole record has a constant phase itself.
+    """
+    if record.r is None or not is_line_of_reference(record, frequency):
+        return False
+    keep = record.valid & np.isfinite(record.r)
+    r = np.where(keep, record.r - np.mean(record.r[keep]), 0.0)
+    wave = np.exp(-2j * np.pi * frequency * np.asarray(record.t))
+    parts = [np.sum(np.hanning(len(one)) * one) for one in np.array_split(r * wave, THRESHOLD.bins)]
+    size = float(np.sum(np.abs(parts) ** 2))
+    if size == 0:
+        return False
+    aligned = float(abs(np.sum(parts)) ** 2) / size / len(parts)
+    return (1 - min(aligned, 1.0)) ** (len(parts) - 1) < THRESHOLD.differing
+
+
+# A name stands if none of these has anything to say.
+GROUNDS: tuple[Callable[[Case, Weighed], str], ...] = (
+    is_at_a_limit,
+    cancels_a_known_force,
+    differs_between_stretches,
+    follows_the_reference,
+)

@@ -1,0 +1,131 @@
+"""What a diagnosis tells while it works: a bar in a terminal, a line a round elsewhere."""
+
+import sys
+import time
+from typing import Any
+
+from tqdm import tqdm
+
+from .._base.interruption import Budget
+from .._base.text import write_number
+from .candidates import Trial
+
+# The bar is drawn anew after so many seconds, also while nothing is finished.
+REFRESH = 0.5
+BAR = "{desc} |{bar:20}| {n_fmt}/{total_fmt}{postfix}"
+
+
+class Progress:
+    """What a diagnosis is doing, how much of it is done, what leads, and how long it may take.
+
+    Parameters
+    ----------
+    shown : bool
+        Whether anything is shown.
+    """
+
+    def __init__(self, shown: bool) -> None:
+        self.start = self.drawn = self.begun = self.first = time.monotonic()
+        self.step, self.round = "checking the records", ""
+        self.done, self.total, self.ranked = 0, 0, True
+        self.leader: Trial | None = None
+        # Where the search was stopped and after how many seconds; empty if it was not.
+        self.ended, self.seconds = "", 0.0
+        terminal = sys.stderr.isatty()
+        self.lines = shown and not terminal
+        self.bar = tqdm(total=0, disable=not (shown and terminal), leave=False, bar_format=BAR)
+
+    def tell(self, step: str, *, ranked: bool = True) -> None:
+        """Begin a step; one that begins with ``round k`` belongs to the round of this number.
+
+        Parameters
+        ----------
+        step : str
+            What is done in it.
+        ranked : bool, optional
+            Whether the candidates that are fitted in it compete with each other.
+        """
+        head = step.partition(":")[0]
+        now = time.monotonic()
+        if head != self.round:
+            if self.lines:
+                self._write_line(head, now)
+            if head.startswith("round "):
+                self.leader = None
+            self.round, self.begun = head, now
+        self.step, self.ranked, self.done, self.total = step, ranked, 0, 0
+        self._draw(now)
+
+    def _write_line(self, head: str, now: float) -> None:
+        """Write what the round before came to, and how long another may take."""
+        words = f"ctrlid diagnose: {now - self.start:.0f} s, {head}"
+        if self.round.startswith("round "):
+            last = f"{self.round} took {now - self.begun:.0f} s"
+            if self.leader is not None:
+                last += f", {self.describe_leader()}"
+            words += f" ({last})"
+        sys.stderr.write(f"{words}\n")
+        sys.stderr.flush()
+
+    def begin(self, total: int) -> None:
+        """Begin with so many candidates."""
+        if total:
+            self.done, self.total, self.first = 0, total, time.monotonic()
+            self._draw(self.first)
+
+    def count(self, result: Any) -> None:
+        """Count a candidate, which may lead from now on."""
+        self.done += 1
+        if self.ranked and isinstance(result, Trial) and result.net_gain > 0:
+            lead = self.leader
+            if lead is None or result.net_gain > lead.net_gain:
+                self.leader = result
+        self.beat()
+
+    def beat(self) -> None:
+        """Draw the bar anew, if it is time."""
+        now = time.monotonic()
+        if now - self.drawn > REFRESH:
+            self._draw(now)
+
+    def _draw(self, now: float) -> None:
+        self.drawn = now
+        if self.bar.disable:
+            return
+        self.bar.n, self.bar.total = self.done, self.total
+        self.bar.set_description_str(f"diagnose, {now - self.start:.0f} s: {self.step}",
+                                     refresh=False)  # fmt: skip
+        more = [self.describe_leader()] if self.leader is not None else []
+        if self.done:
+            rest = (now - self.first) / self.done * (self.total - self.done)
+            more.append(f"about {rest:.0f} s more for this step")
+        self.bar.set_postfix_str("; ".join(more), refresh=False)
+        self.bar.refresh()
+
+    def describe_leader(self) -> str:
+        """Say what leads, and by how much."""
+        assert self.leader is not None
+        evidence = write_number(self.leader.gain, 3)
+        return f"{self.leader.name} leads with an evidence of {evidence}"
+
+    def describe_place(self) -> str:
+        """Say where the search is."""
+        words = self.step
+        if self.total:
+            words += f", {self.done} of {self.total} candidates done"
+        if self.leader is not None:
+            words += f"; {self.describe_leader()}"
+        return words
+
+    def make_budget(self, seconds: float) -> Budget:
+        """Return a budget that keeps the bar moving."""
+        return Budget(seconds, self.beat)
+
+    def end(self) -> None:
+        """Note where the search is at its end, the first time."""
+        if not self.ended:
+            self.ended, self.seconds = self.describe_place(), time.monotonic() - self.start
+
+    def close(self) -> None:
+        """Remove the bar."""
+        self.bar.close()

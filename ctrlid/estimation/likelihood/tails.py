@@ -1,0 +1,177 @@
+"""Heavy tails of the sensor noise: their law, and what a robust filter makes of a wild reading."""
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from scipy import optimize, special, stats
+
+from ..._base.arrays import Array
+
+# Starts of the search: degrees of freedom, and shares of readings that are so many times as wild.
+FREEDOMS = 2.5, 6.0
+MIXTURES = (0.003, 10.0), (0.02, 6.0), (0.1, 3.0)
+# With fewer degrees of freedom noise has no variance, with more it is Gaussian.
+LEAST_FREEDOM, MOST_FREEDOM = 2.05, 100.0
+# Wild readings are fewer than the others, and wilder.
+MOST_SHARE, LEAST_RATIO, MOST_RATIO = 0.5, 1.5, 1e3
+# The scale is found when it changes by less than this share.
+SETTLED, STEPS = 1e-6, 200
+# Expectations are sums over so many points, evenly spaced in the inverse hyperbolic sine.
+POINTS, REACH = 4001, 12.0
+
+
+@dataclass(frozen=True)
+class Tails:
+    r"""Heavy-tailed sensor noise: Student's law, or a share of wild readings.
+
+    .. math:: p(z) \propto (1 + z^2/\nu)^{-(\nu+1)/2}, \quad
+        p(z) = (1 - \varepsilon) N(z; 0, 1) + \varepsilon N(z; 0, \kappa^2)
+
+    Parameters
+    ----------
+    freedom : float
+        Degrees of freedom of Student's law; zero: the other law.
+    share, ratio : float
+        Share of the wild readings and how many times as large they are as the others.
+    scale : float
+        Variance of the usual readings, by which the filter weighs a wild one [output unit^2].
+
+    References
+    ----------
+    Lange, Little and Taylor, Journal of the American Statistical Association 84 (1989) 881-896;
+    Harvey, *Dynamic Models for Volatility and Heavy Tails* (2013), chapter 3.
+    """
+
+    freedom: float = 0.0
+    share: float = 0.0
+    ratio: float = 1.0
+    scale: float = 1.0
+
+    @property
+    def parameters(self) -> int:
+        """Number of parameters beyond those of Gaussian noise."""
+        return 1 if self.freedom else 2
+
+    @property
+    def variance(self) -> float:
+        """Variance of the noise, in units of the scale."""
+        if self.freedom:
+            return self.freedom / (self.freedom - 2)
+        return 1 + self.share * (self.ratio**2 - 1)
+
+    @property
+    def numbers(self) -> tuple[float, float, float, float]:
+        """What the compiled filter takes."""
+        return self.freedom, self.share, self.ratio, self.scale
+
+    def compute_log_density(self, z: Array) -> Array:
+        """Return the logarithm of the density of errors in units of the scale's root."""
+        if self.freedom:
+            return np.asarray(stats.t.logpdf(z, self.freedom))
+        usual = math.log1p(-self.share) - 0.5 * z**2
+        wild = math.log(self.share / self.ratio) - 0.5 * (z / self.ratio) ** 2
+        return np.asarray(np.logaddexp(usual, wild) - 0.5 * math.log(2 * math.pi))
+
+    def compute_weight(self, z: Array) -> Array:
+        """Return what an error counts for: the score of the law, divided by the error."""
+        if self.freedom:
+            return np.asarray((self.freedom + 1) / (self.freedom + z**2))
+        odds = math.log(self.share / (1 - self.share) / self.ratio)
+        wild = special.expit(odds + 0.5 * z**2 * (1 - self.ratio**-2))
+        return np.asarray(1 - wild * (1 - self.ratio**-2))
+
+    def normalize(self, z: Array) -> Array:
+        """Return errors as standard normal deviates of the same probability."""
+        size = np.abs(z)
+        if self.freedom:
+            beyond = stats.t.sf(size, self.freedom)
+        else:
+            beyond = (1 - self.share) * special.ndtr(-size)
+            beyond += self.share * special.ndtr(-size / self.ratio)
+        # Zero stands for what is too small to be written.
+        return np.asarray(-np.sign(z) * special.ndtri(np.maximum(beyond, 1e-300)))
+
+    def draw(self, normal: Array, seed: int) -> Array:
+        """Return noise of the scale one, made of standard normal noise."""
+        rng = np.random.default_rng([seed, 2])
+        if self.freedom:
+            squares = rng.chisquare(self.freedom, len(normal))
+            return np.asarray(normal * np.sqrt(self.freedom / squares))
+        return np.where(rng.random(len(normal)) < self.share, self.ratio, 1.0) * normal
+
+    def find_scale(self, squares: Array, start: float) -> float:
+        r"""Return the likeliest variance of the usual errors, of squared errors.
+
+        .. math:: \sigma^2 = \overline{w(e/\sigma)\, e^2}
+        """
+        scale = start
+        for _ in range(STEPS):
+            old = max(scale, 1e-300)
+            scale = float(np.mean(self.compute_weight(np.sqrt(squares / old)) * squares))
+            if abs(scale - old) <= SETTLED * old:
+                break
+        return scale
+
+
+@lru_cache(maxsize=64)
+def compute_information_shares(tails: Tails | None) -> tuple[float, float]:
+    """Return what samples tell of a mean and of a scale, relative to samples of Gaussian noise."""
+    if tails is None:
+        return 1.0, 1.0
+    grid, step = np.linspace(-REACH, REACH, POINTS, retstep=True)
+    z = np.sinh(grid)
+    chance = np.exp(tails.compute_log_density(z)) * np.cosh(grid) * step
+    w = tails.compute_weight(z)
+    mean = float(np.sum(chance * (w * z) ** 2))
+    return mean, float(0.5 * np.sum(chance * (w * z**2 - 1) ** 2))
+
+
+def fit_tails(tails: Tails, squares: Array, logs: float) -> tuple[Tails, float]:
+    """Return the likeliest tails of the same kind, and their log-likelihood.
+
+    Parameters
+    ----------
+    tails : Tails
+        Where to begin.
+    squares : ndarray, shape (n,)
+        Squared errors over their variances, relative to the sensor noise's [output unit^2].
+    logs : float
+        Half the sum of the logarithms of these variances.
+    """
+    size = len(squares)
+
+    def make(x: Array) -> Tails:
+        if tails.freedom:
+            freedom = 2 + math.exp(min(max(x[0], -9.0), 9.0))
+            return Tails(freedom=min(max(freedom, LEAST_FREEDOM), MOST_FREEDOM), scale=tails.scale)
+        share = MOST_SHARE * float(special.expit(x[0]))
+        ratio = min(max(1 + math.exp(min(x[1], 9.0)), LEAST_RATIO), MOST_RATIO)
+        return Tails(share=max(share, 0.1 / size), ratio=ratio, scale=tails.scale)
+
+    def measure(law: Tails) -> tuple[float, float]:
+        scale = max(law.find_scale(squares, tails.scale), 1e-300)
+        density = law.compute_log_density(np.sqrt(squares / scale))
+        return float(np.sum(density)) - 0.5 * size * math.log(scale) - logs, scale
+
+    if tails.freedom:
+        start = np.array([math.log(tails.freedom - 2)])
+    else:
+        start = np.array([special.logit(tails.share / MOST_SHARE), math.log(tails.ratio - 1)])
+    minimize: Any = optimize.minimize
+    found = minimize(
+        lambda x: -measure(make(x))[0], start, method="Nelder-Mead",
+        options={"xatol": 0.01, "fatol": 0.01, "maxfev": 80},
+    )  # fmt: skip
+    law = make(found.x)
+    value, scale = measure(law)
+    return Tails(law.freedom, law.share, law.ratio, scale), value
+
+
+def list_tails(squares: Array) -> list[Tails]:
+    """Return heavy tails to begin a search with, for squared errors over their variances."""
+    scale = max(float(np.median(squares)) / float(stats.chi2.median(1)), 1e-300)
+    return [*(Tails(freedom=v, scale=scale) for v in FREEDOMS),
+            *(Tails(share=s, ratio=k, scale=scale) for s, k in MIXTURES)]  # fmt: skip

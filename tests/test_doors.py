@@ -1,0 +1,317 @@
+"""Arguments are checked at the door, answers are right or refused, and results are values.
+
+Groups: the check of kinds; wild calls; results that cannot be changed; what once was silently
+wrong; damaged files.
+"""
+
+import copy
+import json
+import random
+from dataclasses import replace
+
+import control as ct
+import numpy as np
+import pytest
+
+import ctrlid as cid
+from ctrlid import CtrlidError
+from ctrlid import effects as E
+from ctrlid._base.arguments import check_arguments
+from ctrlid._base.arrays import to_real_array
+from problems import ROOT, levitation, load_script, servo
+
+fuzz = load_script("benchmarks", "fuzz")
+
+
+@pytest.fixture(scope="module")
+def loop():
+    return servo(ct.tf([5.0], [1], 0.05), dt=0.05, free=("c",))
+
+
+@pytest.fixture(scope="module")
+def record(loop):
+    r = cid.random_binary(400, amplitude=0.1, hold=10, seed=1)
+    return cid.simulate(loop, r, sensor_noise=1e-3, seed=2)
+
+
+# --- the check of kinds
+
+
+def greet(
+    who: str,
+    times: int = 1,
+    loud: bool = False,
+    size: float | None = None,
+    where: tuple[float, float] = (0.0, 1.0),
+) -> None:
+    check_arguments(greet, locals())
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"who": 3}, r"greet needs a text as who; given 3 \(int\)"),
+        ({"who": "a", "times": 1.0}, "a whole number as times; given 1.0"),
+        ({"who": "a", "times": True}, "a whole number as times; given True"),
+        ({"who": "a", "loud": "no"}, "True or False as loud; given 'no'"),
+        ({"who": "a", "size": "1"}, "a number or None as size; given '1'"),
+        ({"who": "a", "size": 1 + 2j}, "a number or None as size"),
+        ({"who": "a", "size": np.complex128(1)}, "a number or None as size"),
+        ({"who": "a", "size": 10**400}, "a number or None as size"),
+        ({"who": "a", "where": (1.0,)}, r"\(a number, a number\) as where"),
+        ({"who": "a", "where": None}, r"\(a number, a number\) as where"),
+    ],
+)
+def test_arguments_of_another_kind_are_refused_by_name(given, words):
+    with pytest.raises(CtrlidError, match=words):
+        greet(**given)
+
+
+def test_numbers_of_numpy_and_rows_of_any_kind_are_what_they_say():
+    greet("a", np.int8(2), np.bool_(True), np.float32(0.5), np.array([0.0, 1.0]))
+    greet("a", size=np.array(0.5), where=[0, 1])
+
+
+@pytest.mark.parametrize("values", [[1j], ["1"], [[1], [1, 2]], np.ma.array([1.0], mask=[True])])
+def test_what_would_lose_a_part_is_no_array(values):
+    with pytest.raises(CtrlidError, match="levels must be"):
+        to_real_array(values, "levels")
+
+
+CALLS = {
+    "imaginary reference": lambda loop, record: cid.simulate(loop, record.r * 1j),
+    "imaginary frequency": lambda loop, record: cid.response_band(cid.fit_arx(record, 2, 2), [1j]),
+    "intercept": lambda loop, record: cid.fit_arx(record, 2, 2, intercept="no"),
+    "masked samples": lambda loop, record: replace(
+        record, valid=np.ma.array(record.valid, mask=record.u > 0)
+    ),
+    "unknown key": lambda loop, record: cid.sweep_sampling_period(
+        record, estimators=["fit_arx"], constraints={"fit_arxx": [cid.Integrator()]}
+    ),
+    "no number": lambda loop, record: cid.plants.servo(m="1", c=1, k=1),
+    "an endless delay": lambda loop, record: cid.fit_continuous(record, 2, delay=1000.0),
+    "a differentiator": lambda loop, record: cid.fit_continuous(
+        record, 2, controller=ct.tf([1, 0], [1])
+    ),
+    "an improper plant": lambda loop, record: cid.Loop(ct.tf([1, 0, 0], [1, 1]), 1.0, dt=0.1),
+    "two inputs": lambda loop, record: cid.Loop(
+        ct.tf([[[1], [1]]], [[[1, 1], [1, 2]]]), 1.0, dt=0.1
+    ),
+    "a guess of another plant": lambda loop, record: cid.operating_point(
+        loop.plant, output=0.2, guess=cid.OperatingPoint((1, 2, 3), 0, 0)
+    ),
+    "a negative seed": lambda loop, record: cid.simulate(loop, record.r, seed=-1),
+    "no folder": lambda loop, record: record.to_csv("/nonexistent/x.csv"),
+    "no model": lambda loop, record: cid.fit_each(lambda r: 5, [record, record]),
+    "nothing valid": lambda loop, record: cid.diagnose(
+        loop, replace(record, valid=np.zeros(400, bool)), progress=False
+    ),
+    "nothing valid for validation": lambda loop, record: cid.diagnose(
+        loop, record, validation=replace(record, valid=np.zeros(400, bool)), progress=False
+    ),
+    "a stuck sensor": lambda loop, record: cid.compare(replace(record, y=np.full(400, 0.1)), loop),
+}
+
+
+@pytest.mark.parametrize("name", CALLS)
+def test_what_does_not_fit_is_refused(loop, record, name):
+    with pytest.raises(CtrlidError):
+        CALLS[name](loop, record)
+
+
+# --- wild calls
+
+
+def test_every_public_callable_is_fuzzed():
+    assert fuzz.find_public() - fuzz.LEFT_OUT == set(fuzz.RECIPES)
+
+
+def test_wild_calls_are_answered_right_or_refused():
+    done = fuzz.run(500, seed=3)
+    assert done["failures"] == {}
+    assert done["counts"]["answer"] >= 500 / 3
+
+
+def test_the_fuzzer_notices_what_is_wrong(monkeypatch):
+    monkeypatch.setattr(cid, "nu_gap", lambda P1, P2: 2.0)
+    assert "breaks its invariant" in str(fuzz.run(20, 1, only="nu_gap")["failures"])
+
+    def raising(P1, P2):
+        raise TypeError("P1")
+
+    monkeypatch.setattr(cid, "nu_gap", raising)
+    assert "TypeError" in str(fuzz.run(20, 1, only="nu_gap")["failures"])
+
+
+# --- results that cannot be changed
+
+
+def test_arrays_of_results_are_read_only(loop, record):
+    model, open_loop = cid.fit_arx(record, 2, 2), cid.fit_continuous(record, 2)
+    found = cid.diagnose(loop, record, catalogue=(E.ViscousFriction,), progress=False)
+    comparison = cid.compare(record, loop)
+    results = [
+        cid.predict(loop, record), comparison, *comparison.curves, *comparison.tests,
+        cid.redesign(open_loop, loop, 2.0, 50.0), cid.fit_loop(loop, record).estimate,
+        found.gap, *found.where, cid.response_band(model, [1.0, 2.0]), cid.check_feedback(record),
+        *cid.select_order(record, [1, 2], [1], [1]).rows, model.estimate,
+        cid.sweep_sampling_period(record, [0.05], estimators=["fit_arx"]),
+        cid.fit_each(cid.fit_arx, [record, record], na=1, nb=1),
+    ]  # fmt: skip
+    seen = 0
+    for result in results:
+        for name in result.__dataclass_fields__:
+            value = getattr(result, name)
+            if isinstance(value, np.ndarray):
+                seen += 1
+                assert not value.flags.writeable, (type(result).__name__, name)
+    assert seen > 30
+
+
+# --- what once was silently wrong
+
+
+@pytest.mark.parametrize("effect", [E.InputDelay(0.03), E.InputBacklash(0.02)])
+@pytest.mark.parametrize("order", [0, 1])
+def test_a_loop_whose_input_remembers_simulates_its_own_record(effect, order):
+    """The states of the controller stand before what the input remembers."""
+    C = ct.tf([5.0], [1], 0.05) if order == 0 else ct.tf([5.0, -4.0], [1, -0.8], 0.05)
+    loop = servo(C, dt=0.05).with_effect(effect)
+    record = cid.simulate(loop, cid.random_binary(400, amplitude=0.1, hold=20, seed=1))
+    curve = cid.compare(record, loop)["simulation"]
+    assert curve.fit > 99.9
+    assert abs(curve.y[0] - record.y[0]) < 1e-6
+
+
+def test_a_constant_reference_is_followed_by_nothing(loop):
+    record = cid.simulate(loop, np.full(400, 0.1), initial=(0.05, 0.0), sensor_noise=1e-3, seed=2)
+    r = cid.random_binary(400, amplitude=0.1, hold=10, seed=1)
+    for model in (loop, cid.fit_arx(cid.simulate(loop, r), 2, 2)):
+        comparison = cid.compare(record, model)
+        assert all(np.isfinite(curve.fit) for curve in comparison.curves)
+    assert cid.compare(record, loop)["one-step"].follows == 0
+
+
+@pytest.mark.parametrize("effect", [E.Quantization(step=1e-8), E.InputDeadZone(width=1e-4)])
+def test_a_redesign_counts_a_converter_and_a_dead_zone_as_small_not_as_unstable(effect):
+    loop = levitation(free=())
+    P = cid.linearize(loop.plant, loop.at)
+    outcome = cid.redesign(P, loop.with_effect(effect), 100, 50)
+    assert outcome.stable
+    assert outcome.achieved.phase_margin == pytest.approx(50, abs=1)
+
+
+def test_an_analog_controller_of_a_loop_with_backlash_is_refused_and_no_divergence():
+    loop = levitation(free=()).with_effect(E.InputBacklash(width=1e-3))
+    with pytest.raises(CtrlidError, match="acts on the samples of a digital controller"):
+        cid.redesign(cid.linearize(loop.plant, loop.at), loop, 100, 50)
+
+
+def test_a_pole_at_zero_is_a_delay_of_one_sample(record):
+    text = str(cid.fit_arx(record, 2, 2, constraints=[cid.PoleAt(0)]).estimate)
+    assert "pole at z = 0, a delay of one sample" in text
+    assert "nan" not in text
+
+
+def test_periods_that_differ_by_their_last_digits_are_one(loop, record):
+    single = replace(record, dt=float(np.float32(0.05)))
+    assert cid.fit_loop(loop, single).estimate.n_samples > 0
+    with pytest.raises(
+        CtrlidError, match=r"0\.05 s, the record at 0\.0500002 s.*differ by 2e-07 s"
+    ):
+        cid.fit_loop(loop, replace(record, dt=0.0500002))
+
+
+def test_dollars_in_names_are_drawn_as_they_are(record, tmp_path):
+    named = replace(record, units={"y": "$$"}, names={"y": "$x_", "u": "a$b$"}, name="$")
+    page = cid.write_report(named, tmp_path / "page.html").read_text("utf-8")
+    assert "$$" in page
+
+
+# --- damaged files
+
+
+def test_damaged_diagnoses_are_refused_or_can_be_printed(tmp_path):
+    whole = json.loads((ROOT / "tests" / "saved_diagnosis.json").read_text("utf-8"))
+    rng = random.Random(5)
+
+    def find_places(value, path=()):
+        yield path
+        items = value.items() if isinstance(value, dict) else enumerate(value)
+        for key, inner in items:
+            if isinstance(inner, dict) or (isinstance(inner, list) and len(inner) < 30):
+                yield from find_places(inner, (*path, key))
+            else:
+                yield (*path, key)
+
+    places = [place for place in find_places(whole) if place]
+    refused, file = 0, tmp_path / "found.json"
+    for _ in range(300):
+        damaged = copy.deepcopy(whole)
+        *way, last = rng.choice(places)
+        inner = damaged
+        for key in way:
+            inner = inner[key]
+        value = rng.choice(["", None, 5, -1, "text", [], {}, [1, 2], {"a": 1}, True, "nan", [[1]]])
+        if value == "":
+            del inner[last]
+        else:
+            inner[last] = value
+        file.write_text(json.dumps(damaged), "utf-8")
+        try:
+            str(cid.load_diagnosis(file))
+        except CtrlidError:
+            refused += 1
+    assert refused > 100
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        (b"t,u,y," + b"x" * 200_000 + b"\n0,1,2,3\n0.1,1,2,3\n", "not a line of a table"),
+        (b"# ctrlid []\nt,u,y\n0,1,2\n0.1,1,2\n", "is damaged"),
+        (b"t,u,y\n0,1,2\n0.01,1,2\n0.02,1,2\n1.7e9,1,2\n", "the wild time stamp"),
+        (b"t|u|y\n0|1|2\n1|1|2\n", r"separated by '\|', replace it"),
+        (b"t,u,y\n2026-01-01T00:00:00,1,2\n2026-01-01T00:00:01,1,2\n", "a date or a time of day"),
+        (b"t,u,y\n12:00:01,1,2\n12:00:02,1,2\n", "a date or a time of day"),
+    ],
+)
+def test_a_damaged_or_foreign_table_says_what_to_do(tmp_path, data, words):
+    file = tmp_path / "log.csv"
+    file.write_bytes(data)
+    with pytest.raises(CtrlidError, match=words):
+        cid.Record.from_csv(file, gaps="mask")
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"t,u,y\r0,1,2\r0.1,1,3\r", b"t,u,y\r\n0,1,2\r\n0.1,1,3\r\n",
+        "t,u,y\n0,1,2\n0.1,1,3\n".encode("utf-16"), b"sep=;\nt;u;y\n0;1;2\n0,1;1;3\n",
+        b"sep=|\nt|u|y\n0|1|2\n0.1|1|3\n",
+    ],
+)  # fmt: skip
+def test_tables_of_other_tools_are_read(tmp_path, data):
+    file = tmp_path / "log.csv"
+    file.write_bytes(data)
+    record = cid.Record.from_csv(file)
+    assert record.dt == pytest.approx(0.1)
+    assert record.y.tolist() == [2, 3]
+
+
+def test_damaged_bytes_give_a_record_or_a_refusal(tmp_path):
+    rng = random.Random(2)
+    table = b"t [ms],u [V],y [m]\n" + b"".join(b"%d,%d,%d\n" % (k, k % 5, k) for k in range(30))
+    file, refused = tmp_path / "log.csv", 0
+    pieces = [b",", b"\n", b'"', b"1e400", b"nan", b"\x00", b"\r", b"#", b";", b"99999999999", b"|"]
+    for _ in range(200):
+        data = bytearray(table)
+        for _ in range(rng.choice([1, 2, 5])):
+            at = rng.randrange(len(data))
+            data[at : at + rng.randrange(3)] = rng.choice(pieces)
+        file.write_bytes(data)
+        try:
+            cid.Record.from_csv(file, gaps="mask")
+        except CtrlidError:
+            refused += 1
+    assert 20 < refused < 200
