@@ -454,7 +454,7 @@ def test_a_file_may_have_more_rows_than_are_written_at_once(tmp_path):
 
 
 def test_a_swapped_column_keeps_its_own_name(tmp_path):
-    (tmp_path / "log.csv").write_text("t,duty,gap,i [A]\n0,1,2,3\n1,2,3,4\n")
+    (tmp_path / "log.csv").write_text("t [s],duty,gap,i [A]\n0,1,2,3\n1,2,3,4\n")
     record = cid.Record.from_csv(tmp_path / "log.csv", u="duty", y="gap", extra=["i"])
     swapped = record.with_input("i")
     assert list(swapped.extra) == ["duty"]
@@ -464,7 +464,12 @@ def test_a_swapped_column_keeps_its_own_name(tmp_path):
 def test_rows_taken_out_of_our_own_file_are_noticed(tmp_path):
     path = tmp_path / "a.csv"
     full(valid=None).to_csv(path)
-    lines = path.read_text().splitlines(keepends=True)
+    text = path.read_text()
+    lines = text.splitlines(keepends=True)
+    path.write_text("".join(lines[:10] + lines[14:]))
+    with pytest.raises(cid.CtrlidError, match="says 40 rows, and it has 36"):
+        cid.Record.from_csv(path)
+    lines = text.replace(', "rows": 40', "").splitlines(keepends=True)
     path.write_text("".join(lines[:10] + lines[14:]))
     with pytest.raises(cid.CtrlidError, match="lacks 4 samples in one place"):
         cid.Record.from_csv(path)
