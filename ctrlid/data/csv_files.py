@@ -115,7 +115,13 @@ def read_csv(
             )
         return found[0]
 
-    stored = {k: v for k, v in own.get("columns", {}).items() if sources[k] in (None, k)}
+    for key, each in sources.items():
+        labels_of_key = (each,) if isinstance(each, str | None) else each
+        if not all(isinstance(label, str | None) for label in labels_of_key):
+            raise CtrlidError(f"{key}= names a column, or several in a list; given {each!r}")
+    given = {k: k if v is None else v for k, v in sources.items()}
+    stored = {k: v for k, v in own.get("columns", {}).items() if isinstance(given[k], str)
+              and given[k] == k}  # fmt: skip
     wanted = {k: v for k, v in sources.items() if v is not None} | stored
     if "r" in names:
         wanted = {"r": "r", **wanted}

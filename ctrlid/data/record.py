@@ -181,15 +181,6 @@ class Record(Printed):
         """Which samples count for all outputs, shape (n,)."""
         return self.valid if self.valid.ndim == 1 else self.valid.all(axis=0)
 
-    def list_rows(self) -> list[tuple[str, str, str, Any]]:
-        """Return key, name, unit and samples of each single signal and extra channel."""
-        rows = []
-        for key, names in self.signals.items():
-            units = list_signals(key, self.units.get(key, ("",) * len(names)), len(names))
-            each = np.reshape(getattr(self, key), (-1, len(self)))
-            rows += [(key, *row) for row in zip(names, units, each, strict=True)]
-        return [*rows, *((k, k, self.units.get(k, ""), v) for k, v in self.extra.items())]
-
     def select(
         self, *, r: str | Sequence[str] | None = None, u: str | Sequence[str] | None = None,
         y: str | Sequence[str] | None = None,
@@ -211,6 +202,7 @@ class Record(Printed):
         CtrlidError
             If the record has no such signal.
         """
+        check_arguments(Record.select, locals())
         fields: dict[str, Any] = {}
         names, units = dict(self.names), dict(self.units)
         for key, wanted in (("r", r), ("u", u), ("y", y)):
@@ -624,7 +616,7 @@ class Record(Printed):
                 f"{self.dt:g} s ({self.duration:.4g} s, {self.hold})"]  # fmt: skip
         if not self.valid.all():
             rows[0] += f", {100 * self.valid.mean():.1f} % valid"
-        channels = self.list_rows()
+        channels = list_rows(self)
         numbered = [f"{k}[" for k, names in self.signals.items() if len(names) > 1]
         labels = [name if name == key or name.startswith(tuple(numbered)) else f"{key} ({name})"
                   for key, name, _, _ in channels]  # fmt: skip
@@ -633,6 +625,16 @@ class Record(Printed):
             rows.append(f"  {label:<{width}}  {values.min():.6g} .. {values.max():.6g} "
                         f"{'' if unit == '1' else unit}".rstrip())  # fmt: skip
         return "\n".join(rows)
+
+
+def list_rows(record: Record) -> list[tuple[str, str, str, Any]]:
+    """Return key, name, unit and samples of each single signal and extra channel of a record."""
+    rows = []
+    for key, names in record.signals.items():
+        units = list_signals(key, record.units.get(key, ("",) * len(names)), len(names))
+        each = np.reshape(getattr(record, key), (-1, len(record)))
+        rows += [(key, *row) for row in zip(names, units, each, strict=True)]
+    return [*rows, *((k, k, record.units.get(k, ""), v) for k, v in record.extra.items())]
 
 
 def _rebuild(fields: dict[str, Any]) -> Record:

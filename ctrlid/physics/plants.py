@@ -241,7 +241,7 @@ def pendulum(m: float, length: float, c: float = 0.0, g: float = 9.81) -> Any:
 
 def _require_nonnegative(plant: str, **parameters: float) -> None:
     for name, value in parameters.items():
-        if not (np.isfinite(value) and value >= 0):
+        if not (is_number(value) and np.isfinite(value) and value >= 0):
             raise CtrlidError(f"{plant} needs {name} >= 0 in SI units; given {name}={value!r}")
 
 
@@ -332,6 +332,7 @@ def cart_pole(
     >>> ct.linearize(plant, [0, 0, 0, 0], 0).poles().real.round(2).max()
     np.float64(6.77)
     """
+    check_arguments(cart_pole, locals())
     _require_positive("cart_pole", M=M, m=m, length=length, g=g)
     _require_nonnegative("cart_pole", J=J, c=c, gamma=gamma)
 
@@ -419,6 +420,7 @@ def rotary_pendulum(
     >>> plant.state_labels
     ['theta', 'alpha', 'theta_dot', 'alpha_dot']
     """
+    check_arguments(rotary_pendulum, locals())
     km = kt if km is None else km
     _require_positive(
         "rotary_pendulum", m=m, length=length, arm=arm, arm_inertia=arm_inertia, kt=kt, R=R, g=g
@@ -505,6 +507,7 @@ def ball_on_beam(
     >>> cid.plants.ball_on_beam(m=0.05, J=0.02, radius=0.01).output_labels
     ['r', 'theta']
     """
+    check_arguments(ball_on_beam, locals())
     _require_positive("ball_on_beam", m=m, J=J, radius=radius, g=g)
     ball_inertia = 0.4 * m * radius**2 if ball_inertia is None else ball_inertia
     _require_nonnegative("ball_on_beam", ball_inertia=ball_inertia, c=c)
@@ -572,6 +575,7 @@ def quadrotor_planar(
     >>> plant.ninputs, plant.noutputs
     (2, 3)
     """
+    check_arguments(quadrotor_planar, locals())
     _require_positive("quadrotor_planar", m=m, J=J, arm=arm, g=g)
     _require_nonnegative("quadrotor_planar", c=c)
 

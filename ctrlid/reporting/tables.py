@@ -7,7 +7,7 @@ import numpy as np
 
 from .._base import text as _text
 from .._base.errors import CtrlidError
-from ..data.record import Record
+from ..data.record import Record, list_rows
 from ..design.redesigning import Redesign
 from ..diagnosis import wording
 from ..diagnosis.result import Diagnosis
@@ -136,7 +136,7 @@ def make_blocks(result: Any) -> list[Block]:
 def _make_record_table(record: Record) -> Table:
     rows = tuple(
         (name, unit or "not given", *(f"{f(v):.6g}" for f in (np.min, np.mean, np.max, np.std)))
-        for _, name, unit, v in record.list_rows()
+        for _, name, unit, v in list_rows(record)
     )
     valid = "" if record.valid.all() else f", {100 * record.valid.mean():.1f} % of them valid"
     between = BETWEEN[record.hold]

@@ -8,7 +8,7 @@ import numpy as np
 from ..._base import text as _text
 from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
-from ...data.record import Record
+from ...data.record import Record, list_rows
 from ...data.validity import find_runs
 from ...validation.comparison import Comparison, write_fit
 from .. import pictures as _pictures
@@ -67,7 +67,7 @@ def record(record: Record, axes: Any = None, *, extra: Sequence[str] = ()) -> An
             f"the record has no extra channel {_text.write_list([repr(k) for k in unknown])}; it "
             f"has {', '.join(record.extra) or 'none'}"
         )
-    rows = record.list_rows()
+    rows = list_rows(record)
     outputs, references, inputs = (
         [row[1:] for row in rows if row[0] == key] for key in ("y", "r", "u")
     )
