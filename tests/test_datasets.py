@@ -17,6 +17,11 @@ NAMES = (
     "inteco_pid_step",
     "inteco_coil_step",
     "magnetoshield_r3",
+    "ip02_dirtran",
+    "ip02_rtc",
+    "pendubot",
+    "qube_estimation",
+    "qube_validation",
     "servo_random_steps",
     "servo_swept_sine",
     "silverbox",
@@ -173,6 +178,49 @@ def test_tanks(load, name):
     assert 0.03 < np.mean(record.y == 10) < 0.05
 
 
+def test_rotary_pendulum(load):
+    runs = load("qube_estimation")
+    assert [run.n for run in runs] == [10_000] * 3
+    assert len(load("qube_validation")) == 2
+    run = runs[0]
+    assert run.signals == {"r": ("theta", "alpha"), "u": ("V",), "y": ("theta", "alpha")}
+    # The law as the authors run it: two PD in parallel, each derivative filtered.
+    e, rate, expected = run.r - run.y, np.zeros(2), []
+    before = e[:, 0]
+    for k in range(run.n):
+        rate = (50 * (e[:, k] - before) + rate) / (1 + 50 * run.dt)
+        before = e[:, k]
+        expected.append(-6 * e[0, k] - 1.8 * rate[0] - 30 * e[1, k] - 2.5 * rate[1])
+    np.testing.assert_allclose(run.extra["controller"][500:], expected[500:], atol=1e-10)
+    limited = np.clip(run.extra["controller"] + run.extra["feedforward"], -10, 10)
+    np.testing.assert_allclose(run.u, limited, atol=1e-12)
+    assert run.segments() == [(500, 10_000)]
+
+
+@pytest.mark.parametrize(("name", "n"), [("ip02_rtc", 503), ("ip02_dirtran", 518)])
+def test_cart_with_a_pole(load, name, n):
+    record = load(name)
+    assert len(record) == n
+    assert record.signals == {"u": ("F",), "y": ("x", "theta")}
+    assert record.y[1, 0] == pytest.approx(np.pi)
+    assert abs(record.y[1, -100:]).max() < 0.05
+    assert np.ptp(record.u) == pytest.approx(12)
+
+
+def test_double_pendulum(load):
+    record = load("pendubot")
+    assert record.signals == {"u": ("tau1", "tau2"), "y": ("q1", "q2")}
+    assert record.dt == 0.0025
+    assert np.abs(record.y[0] - np.pi).max() < 0.4
+
+
+def test_a_conversion_is_not_fetched(tmp_path, monkeypatch):
+    monkeypatch.setenv("CTRLID_DATA_DIR", str(tmp_path))
+    words = "qube_estim.npz is a conversion of qube_20230828T161408.*Put it into a folder"
+    with pytest.raises(cid.CtrlidError, match=words):
+        datasets.load("qube_estimation")
+
+
 # --- where they come from ---------------------------------------------------------------------
 
 
@@ -181,7 +229,10 @@ def test_names_and_descriptions():
     for name in NAMES:
         text = datasets.describe(name)
         assert "samples" in text
-        assert "Source: https://raw.githubusercontent.com/" in text
+        made = bool(datasets._CATALOGUE[name][0].originals)
+        place = "github.com/" if made else "raw.githubusercontent.com/"
+        assert f"Source: https://{place}" in text
+        assert not made or datasets._CATALOGUE[name][0].originals[0] in text
         assert "Terms: " in text
     assert "Janot" in datasets.describe("emps")
     assert "Schoukens" in datasets.describe("tanks_estimation")
@@ -196,7 +247,7 @@ def test_unknown_name(function):
 def test_every_file_has_its_address_and_checksum(data_dir):
     for source, _, _ in datasets._CATALOGUE.values():
         assert len(source.commit) == 40
-        assert source.path.endswith(source.file.split("/")[1])
+        assert source.originals or source.path.endswith(source.file.split("/")[1])
         file = data_dir / source.file
         if file.is_file():
             assert hashlib.sha256(file.read_bytes()).hexdigest() == source.sha256

@@ -39,12 +39,20 @@ CHUNK = 20_000
 
 def write_csv(path: Path, record: Any) -> None:
     """Write a record: a comment with its fields, a header with units, one row per sample."""
+    columns = _name_columns(record)
     channels = {"t": record.t}
-    channels |= {k: getattr(record, k) for k in ("r", "u", "y") if getattr(record, k) is not None}
+    units = {"t": "s", **{k: record.units.get(k, "") for k in record.extra}}
+    for key, labels in columns.items():
+        values = np.reshape(getattr(record, key), (len(labels), -1))
+        given = record.units.get(key, "")
+        words = (given,) * len(labels) if isinstance(given, str) else given
+        channels |= dict(zip(labels, values, strict=True))
+        units |= dict(zip(labels, words, strict=True))
     channels |= record.extra
     if not record.valid.all():
-        channels["valid"] = record.valid
-    units = {"t": "s", **record.units}
+        rows = record.valid if record.valid.ndim == 2 else record.valid[None, :]
+        labels = [f"valid {name}" for name in columns["y"]] if len(rows) > 1 else ["valid"]
+        channels |= dict(zip(labels, rows, strict=True))
     line = io.StringIO()
     header = [with_unit(k, units.get(k, "")) for k in channels]
     csv.writer(line, lineterminator="").writerow(header)
@@ -58,6 +66,9 @@ def write_csv(path: Path, record: Any) -> None:
     fields = {key: getattr(record, key) for key in ("name", "dt", "hold", "hold_r")}
     # A file that was cut off by a full disk or a copy is told by its number of rows.
     fields |= {"names": dict(record.names), "rows": len(record)}
+    several = {key: labels for key, labels in columns.items() if len(labels) > 1}
+    if several:
+        fields["columns"] = several
     with replace_file(path) as file:
         file.write(f"{MARK}{json.dumps(fields, ensure_ascii=False)}\n{line.getvalue()}\n")
         for first in range(0, len(record), CHUNK):
@@ -66,10 +77,21 @@ def write_csv(path: Path, record: Any) -> None:
             file.writelines(",".join(map(repr, row)) + "\n" for row in rows.tolist())
 
 
+def _name_columns(record: Any) -> dict[str, list[str]]:
+    """Return the columns of r, u and y: so called where there is one, by name where several."""
+    names = [name for each in record.signals.values() for name in each]
+    taken = {"t", "time", "valid", "r", "u", "y", *record.extra}
+    return {
+        key: [key] if len(each) == 1 else
+        [f"{key}_{name}" if names.count(name) > 1 or name in taken else name for name in each]
+        for key, each in record.signals.items()
+    }  # fmt: skip
+
+
 def read_csv(
-    path: Path, sources: Mapping[str, str | None], time: str | None, dt: float | None,
-    extra: Sequence[str] | None, units: Mapping[str, str] | None, hold: str | None,
-    name: str | None, gaps: str, scale: Mapping[str, float] | None = None,
+    path: Path, sources: Mapping[str, str | Sequence[str] | None], time: str | None,
+    dt: float | None, extra: Sequence[str] | None, units: Mapping[str, Any] | None,
+    hold: str | None, name: str | None, gaps: str, scale: Mapping[str, float] | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """Return the fields of a record; see `Record.from_csv`, `sources` are its r, u and y."""
     if not isinstance(gaps, str) or gaps not in ("error", "mask"):
@@ -93,10 +115,21 @@ def read_csv(
             )
         return found[0]
 
-    wanted = {k: v for k, v in sources.items() if v is not None}
+    for key, each in sources.items():
+        labels_of_key = (each,) if isinstance(each, str | None) else each
+        if not all(isinstance(label, str | None) for label in labels_of_key):
+            raise CtrlidError(f"{key}= names a column, or several in a list; given {each!r}")
+    given = {k: k if v is None else v for k, v in sources.items()}
+    stored = {k: v for k, v in own.get("columns", {}).items() if isinstance(given[k], str)
+              and given[k] == k}  # fmt: skip
+    wanted = {k: v for k, v in sources.items() if v is not None} | stored
     if "r" in names:
         wanted = {"r": "r", **wanted}
-    places = {k: place(v, k) for k, v in wanted.items()}
+    columns = {k: (v,) if isinstance(v, str) else tuple(v) for k, v in wanted.items()}
+    # One place for each column, under its key and its number among those of the key.
+    found = {(k, i): place(v, k) for k, each in columns.items() for i, v in enumerate(each)}
+    places = {k if len(columns[k]) == 1 else f"{k} ({columns[k][i]})": p
+              for (k, i), p in found.items()}  # fmt: skip
     if time is None:
         time = next((label for label in names if label.lower() in TIME), None)
     clock = None if time is None else place(time, "time")
@@ -104,12 +137,17 @@ def read_csv(
         extra = (extra,)
     if extra is None:
         taken = {*places.values(), clock}
-        extra = [label for k, label in enumerate(names) if k not in taken and label != "valid"]
+        extra = [label for k, label in enumerate(names)
+                 if k not in taken and label.partition(" ")[0] != "valid"]  # fmt: skip
         extra = extra if own else ()
     further = {names[k]: k for k in (place(c, "extra") for c in extra)}
     valid = np.ones(len(table), dtype=bool)
     if "valid" in names:
         valid = table[:, place("valid", "valid")] > 0.5
+    each = [f"valid {name}" for name in columns["y"]]
+    rows_valid = None
+    if len(each) > 1 and each[0] in names:
+        rows_valid = table[:, [place(label, "valid") for label in each]] > 0.5
     table, valid = _fill_gaps(table, places, valid, gaps, path)
     start, rows = 0.0, None
     period_given = own.get("dt") if dt is None else dt
@@ -134,22 +172,28 @@ def read_csv(
     if rows is not None and len(rows) != len(table):
         valid = valid[rows] & (np.diff(rows, prepend=-1) > 0)
         table = table[rows]
-    every = {**places, **further}
+        rows_valid = None if rows_valid is None else rows_valid[rows]
+    if rows_valid is not None:
+        valid = (rows_valid & valid[:, None]).T
+    at = {key: [found[key, i] for i in range(len(each))] for key, each in columns.items()}
+    every = {**at, **{label: [k] for label, k in further.items()}}
     factors = _check_scale(scale or {}, every)
     # The unit in the header is that of the numbers before they were scaled.
-    read = {key: labels[k][1] for key, k in every.items() if labels[k][1] and key not in factors}
+    read = {key: tuple(labels[k][1] for k in ks) for key, ks in every.items() if key not in factors}
+    known = {key: tuple(names[k] for k in ks) for key, ks in at.items()}
     return {
-        **{key: table[:, k] * factors.get(key, 1.0) for key, k in places.items()},
+        **{key: table[:, ks].T * factors.get(key, 1.0) for key, ks in at.items()},
         "extra": {label: table[:, k] * factors.get(label, 1.0) for label, k in further.items()},
-        "dt": dt, "start": start, "valid": valid, "units": {**read, **(units or {})},
-        "names": own.get("names", {k: names[p] for k, p in places.items() if names[p] != k}),
+        "dt": dt, "start": start, "valid": valid,
+        "units": {**{key: words for key, words in read.items() if any(words)}, **(units or {})},
+        "names": own.get("names", {k: v for k, v in known.items() if v != (k,)}),
         "hold": hold or own.get("hold", "zoh"),
         "hold_r": own.get("hold_r", "zoh"),
         "name": own.get("name", path.stem) if name is None else name,
     }  # fmt: skip
 
 
-def _check_scale(scale: Mapping[str, float], known: Mapping[str, int]) -> dict[str, float]:
+def _check_scale(scale: Mapping[str, float], known: Mapping[str, Any]) -> dict[str, float]:
     """Return the factors of channels, or refuse what is none."""
     for key, factor in scale.items():
         if key not in known:

@@ -27,10 +27,15 @@ class Source:
     path: str
     sha256: str
     terms: str
+    # A file that holds several published ones, renamed and not otherwise changed, is not published
+    # itself: `path` is their folder, and these are their names.
+    originals: tuple[str, ...] = ()
 
     @property
     def address(self) -> str:
-        """The public address of the file."""
+        """The public address of the file, or of the folder of what it was made of."""
+        if self.originals:
+            return f"https://github.com/{self.repository}/tree/{self.commit}/{self.path}"
         return f"https://raw.githubusercontent.com/{self.repository}/{self.commit}/{self.path}"
 
 
@@ -93,6 +98,43 @@ TANKS = Source(
     "examples/CTS/data/CascadedTanksFiles/dataBenchmark.mat",
     "cb2f88d4388be4d3f2a24c6402fba804976aac5f2e1f26cda59ea0a38d016eab",
     "public benchmark; cite Schoukens, Mattson, Wigren, Noël (2016)",
+)  # fmt: skip
+
+
+_DECAR = "decargroup/closed_loop_koopman", "0b64a62e7f302441ce3580143a44d9d87c83532c"
+QUBE_ESTIMATION = Source(
+    "qube_furuta/qube_estim.npz", *_DECAR, "dataset/controller_20230828",
+    "f202312be19d9f25d349109f8bec64560da91009573b651027505c6dacaf6318", "MIT, (c) 2023 DECAR",
+    ("qube_20230828T161408_751_866_301.csv", "qube_20230828T161843_650_565_746.csv",
+     "qube_20230828T162549_043_857_715.csv"),
+)  # fmt: skip
+QUBE_VALIDATION = Source(
+    "qube_furuta/qube_valid.npz", *_DECAR, "dataset/controller_20230828",
+    "f57066ba254d680baa54f64fa9d01e7db25ae6ee09108048b23f0b96521c393b", "MIT, (c) 2023 DECAR",
+    ("qube_20230828T163141_187_473_481.csv", "qube_20230828T163558_031_071_138.csv"),
+)  # fmt: skip
+
+
+def _make_ip02_source(file: str, sha256: str) -> Source:
+    return Source(
+        f"ip02_cartpole/{file}", "dfki-ric-underactuated-lab/robust_codesign",
+        "fb4dbdd855ae4b8ba6c3f0a596ff40b3d6d51935", f"results/cart_pole/realExperiments/{file}",
+        sha256, "BSD-3-Clause, (c) 2024 DFKI",
+    )  # fmt: skip
+
+
+IP02_RTC = _make_ip02_source(
+    "167332rtc.csv", "8074c448235d7cc18340956441d110dc4b5c287ebf73c9bae2f60d8bf81291fc"
+)
+IP02_DIRTRAN = _make_ip02_source(
+    "167332dirtran.csv", "ff98e6d32a2c27920537e19d42d2f9499685bd9fb7048b6db6d415896d62f7e0"
+)
+PENDUBOT = Source(
+    "dfki_double_pendulum/pendubot_175617.npz", "dfki-ric-underactuated-lab/double_pendulum",
+    "1e8544e67f3da72a51ee52fbbb278e131ce2a43f",
+    "data/experiment_records/design_A.0/20220819/175617-pendubot_tvlqr_lqr_VIDEO",
+    "68dd9bbc6873fcf68d69aca0f147cc78930bfba0a9e93a8a55a19205043f11f9",
+    "BSD-3-Clause, (c) 2022 DFKI", ("trajectory.csv",),
 )  # fmt: skip
 
 
@@ -183,6 +225,54 @@ def _choose_tanks_reader(which: str) -> Callable[[Any], Record]:
     return read
 
 
+def _read_qube(table: Any) -> list[Record]:
+    return [
+        Record(
+            r=table[f"r{k}"].T, u=table[f"u{k}"], y=table[f"y{k}"].T, dt=float(table["dt"]),
+            # The pendulum is raised by hand at first.
+            valid=np.arange(len(table[f"u{k}"])) >= 500,
+            extra={"controller": table[f"uc{k}"], "feedforward": table[f"ff{k}"]},
+            names={"r": ("theta", "alpha"), "u": "V", "y": ("theta", "alpha")},
+            units={"r": "rad", "u": "V", "y": "rad", "controller": "V", "feedforward": "V"},
+            name=str(run).removesuffix(".csv"),
+        )
+        for k, run in enumerate(table["runs"])
+    ]  # fmt: skip
+
+
+def _read_ip02(table: Any) -> Record:
+    return Record(
+        u=table["force"], y=np.array([table["cart_pos"], table["pend_pos"]]), dt=0.01,
+        start=float(table["time"][0]), names={"u": "F", "y": ("x", "theta")},
+        units={"u": "N", "y": ("m", "rad")},
+    )  # fmt: skip
+
+
+def _read_pendubot(table: Any) -> Record:
+    # From here on the arm is held upright, and the clock is uniform.
+    held = table["t"] >= 4.407
+    time = table["t"][held]
+    return Record(
+        u=table["tau_cmd"][held].T, y=table["q"][held].T, dt=0.0025, start=float(time[0]),
+        extra={"measured shoulder torque": table["tau_meas"][held, 0]},
+        names={"u": ("tau1", "tau2"), "y": ("q1", "q2")},
+        units={"u": "N m", "y": "rad", "measured shoulder torque": "N m"},
+    )  # fmt: skip
+
+
+_QUBE_TEXT = (
+    "QUBE-Servo rotary pendulum under two parallel PD, unstable, with independent smooth random "
+    "targets of arm and pendulum and voltage added: a list of {} records of 10000 samples at 2 ms. "
+    "r and y arm theta and pendulum alpha from upright [rad], u voltage [V] = "
+    "extra['controller'] + extra['feedforward'] limited to 10 V. Not valid: the first second, "
+    "where the pendulum is raised by hand. A lossless conversion of the published files {}"
+)
+_IP02_TEXT = (
+    "IP02 linear servo with a weighted pendulum, swung up and balanced by an LQR along a "
+    "trajectory ({}), which is not filed. {} samples at 10 ms; u commanded force F [N], limited to "
+    "6 N, y cart x [m] and pendulum theta from upright [rad]"
+)
+
 _EMPS_TEXT = (
     "Electro-mechanical positioning system (EMPS) in closed loop: a carriage on a screw, one "
     "integrator. 24841 samples at 1 ms; r and y position [m], u drive voltage [V]; 35.15 N/V"
@@ -222,6 +312,21 @@ _CATALOGUE: dict[str, tuple[Source, Callable[[Any], Any], str]] = {
         "to peak added to u, unstable: a list of five records, one per set-point. 1500 samples "
         "each at 3.25 ms; u solenoid voltage [V], y gap [m], extra['current'] of the coil [A], "
         "read after u is applied. Not valid: the magnet on the floor at the start of the first",
+    ),
+    "ip02_dirtran": (IP02_DIRTRAN, _read_ip02, _IP02_TEXT.format("DIRTRAN", 518)),
+    "ip02_rtc": (IP02_RTC, _read_ip02, _IP02_TEXT.format("RTC", 503)),
+    "pendubot": (
+        PENDUBOT, _read_pendubot,
+        "Double pendulum held upright by an LQR at its shoulder, two unstable poles, 6237 samples "
+        "at 2.5 ms; u commanded torques [N m] with friction compensation, y joint angles [rad], "
+        "(pi, 0) upright. The swing-up before it is left out, since its clock is not uniform. A "
+        "lossless conversion of the published trajectory.csv",
+    ),
+    "qube_estimation": (
+        QUBE_ESTIMATION, _read_qube, _QUBE_TEXT.format(3, ", ".join(QUBE_ESTIMATION.originals))
+    ),
+    "qube_validation": (
+        QUBE_VALIDATION, _read_qube, _QUBE_TEXT.format(2, ", ".join(QUBE_VALIDATION.originals))
     ),
     "servo_random_steps": (SERVO_STEPS, _read_servo, _SERVO_TEXT.format("random steps", 59802)),
     "servo_swept_sine": (SERVO_SINE, _read_servo, _SERVO_TEXT.format("swept sine", 60001)),
@@ -308,7 +413,8 @@ def load(name: str) -> Any:
     Returns
     -------
     Record or list of Record
-        The record; ``"magnetoshield_r3"`` is a list of five, one per set-point.
+        The record; ``"magnetoshield_r3"`` is a list of five, one per set-point, and those of the
+        QUBE are lists of three and two runs.
 
     Raises
     ------
@@ -316,15 +422,24 @@ def load(name: str) -> Any:
         If there is no such record, the file cannot be fetched or is not the published one.
     """
     check_arguments(load, locals())
-    # Only who loads a record waits for this import.
-    from scipy import io
-
     source, read, _ = _find_entry(name)
-    table = io.loadmat(_find_file(source))
+    table = _read_file(_find_file(source))
     loaded = read(table)
     if isinstance(loaded, list):
         return [replace(record, name=f"{name} {record.name}") for record in loaded]
     return replace(loaded, name=name)
+
+
+def _read_file(path: Path) -> Any:
+    """Return the arrays of a file by name."""
+    if path.suffix == ".npz":
+        return np.load(path, allow_pickle=False)
+    if path.suffix == ".csv":
+        return np.genfromtxt(path, delimiter=",", names=True)
+    # Only who loads such a record waits for this import.
+    from scipy import io
+
+    return io.loadmat(path)
 
 
 def _find_file(source: Source) -> Path:
@@ -341,6 +456,12 @@ def _find_file(source: Source) -> Path:
                     f"Replace it by {source.address}"
                 )
             return local
+    if source.originals:
+        raise CtrlidError(
+            f"{source.file} is a conversion of {', '.join(source.originals)} of {source.address}, "
+            "and not published itself. Put it into a folder and name that folder in the "
+            f"environment variable {FOLDER_VARIABLE}"
+        )
     # A download is not reported, since it is no news to the user.
     pooch.get_logger().setLevel("ERROR")
     try:

@@ -31,16 +31,21 @@ def find_outliers(record: Record) -> Any:
 
     Returns
     -------
-    ndarray of bool, shape (n,)
+    ndarray of bool, shape (n,) or (outputs, n)
         True for valid samples that are outliers.
     """
+    names = record.signals["y"]
+    if len(names) > 1:
+        return np.array([find_outliers(record.select(y=name)) for name in names])
     valid = np.flatnonzero(record.valid)
     found = np.zeros(len(record), dtype=bool)
     if len(valid) < NEIGHBOURS:
         return found
     away = _stands_out(record.y[valid])
     # Single pulses of the input have real answers, and then every pulse has one.
-    after_pulse = np.concatenate([[False], _stands_out(record.u[valid])[:-1]])
+    inputs = np.reshape(record.u, (-1, len(record)))[:, valid]
+    pulse = np.any([_stands_out(u) for u in inputs], axis=0)
+    after_pulse = np.concatenate([[False], pulse[:-1]])
     found[valid] = away & ~(after_pulse & away[after_pulse].all())
     return found
 
@@ -62,8 +67,15 @@ def mask_outliers(record: Record) -> tuple[Record, Any]:
     return replace(record, valid=record.valid & ~found), found
 
 
-def describe_outliers(record: Record, found: Any) -> str:
+def describe_outliers(record: Record, found: Any, label: str = "y") -> str:
     """Return a sentence on the outliers of a record: how many, where, and how far out."""
+    names = record.signals["y"]
+    if len(names) > 1:
+        return "; ".join(
+            describe_outliers(record.select(y=name), row, name)
+            for name, row in zip(names, found, strict=True)
+            if row.any()
+        )
     places = np.flatnonzero(found)
     times = ", ".join(f"{record.t[k]:.4g}" for k in places[:3])
     more = ", ..." if len(places) > 3 else ""
@@ -72,7 +84,7 @@ def describe_outliers(record: Record, found: Any) -> str:
     unit = record.units.get("y", "")
     one = len(places) == 1
     return (
-        f"{len(places)} OF {np.count_nonzero(record.valid)} READINGS OF y "
+        f"{len(places)} OF {np.count_nonzero(record.valid)} READINGS OF {label} "
         f"{'IS A GROSS OUTLIER' if one else 'ARE GROSS OUTLIERS'}, AND {'WAS' if one else 'WERE'} "
         f"LEFT OUT: at t = {times}{more} s, up to {largest:.3g}{f' {unit}' if unit else ''} from "
         "the median"

@@ -13,6 +13,7 @@ from scipy import signal
 
 from .._base.arguments import check_arguments
 from .._base.errors import CtrlidError
+from .._base.signals import list_signals, require_one_signal
 from .._base.text import Printed
 from . import csv_files as _csv
 from . import responses as _response
@@ -35,11 +36,11 @@ class Record(Printed):
 
     Parameters
     ----------
-    u, y : array_like, shape (n,)
-        Input and output [physical units].
+    u, y : array_like, shape (n,) or (signals, n)
+        Input and output [physical units]; several signals of either, one in a row.
     dt : float
         Sampling period [s].
-    r : array_like, shape (n,), optional
+    r : array_like, shape (n,) or (signals, n), optional
         Reference [output unit], if it was logged.
     hold : {"zoh", "foh", "bandlimited"}, optional
         How u runs between samples: held, as a digital controller does; straight, as a smooth
@@ -48,12 +49,14 @@ class Record(Printed):
         to y.
     extra : mapping of str to array_like, optional
         Further measured channels [as in `units`], for instance a coil current.
-    valid : array_like of bool, shape (n,), optional
-        Which samples count in fits and comparisons; by default all.
+    valid : array_like of bool, shape (n,) or (outputs, n), optional
+        Which samples count in fits and comparisons; by default all. With a row for each output
+        only that reading is left out.
     names : mapping, optional
-        Names of the signals ``"r"``, ``"u"``, ``"y"``, for labels.
+        Names of the signals ``"r"``, ``"u"``, ``"y"``; a tuple for several.
     units : mapping, optional
-        Units of ``"r"``, ``"u"``, ``"y"`` and of the extra channels.
+        Units of ``"r"``, ``"u"``, ``"y"`` and of the extra channels; a tuple for several, or one
+        for all of them.
     name : str, optional
         Name of the experiment.
     start : float, optional
@@ -65,7 +68,7 @@ class Record(Printed):
     Raises
     ------
     CtrlidError
-        If the data are not finite, not one-dimensional, of different lengths or too few, or a word
+        If the data are not finite, of the wrong shape, of different lengths or too few, or a word
         is unknown.
 
     Examples
@@ -74,6 +77,10 @@ class Record(Printed):
     >>> record = cid.Record(r=[1, 1, 1], u=[0.5, 0.4, 0.4], y=[0, 0.3, 0.5], dt=0.1)
     >>> record.duration, len(record[1:])
     (0.30000000000000004, 2)
+    >>> both = cid.Record(u=[0.5, 0.4, 0.4], y=[[0, 0.3, 0.5], [0, 0.1, 0.2]], dt=0.1,
+    ...                   names={"u": "F", "y": ("x", "theta")}, units={"y": ("m", "rad")})
+    >>> both.select(y="theta").y
+    array([0. , 0.1, 0.2])
     """
 
     u: Any
@@ -83,8 +90,8 @@ class Record(Printed):
     hold: Hold = "zoh"
     extra: Mapping[str, Any] = field(default_factory=dict)
     valid: Any = None
-    names: Mapping[str, str] = field(default_factory=dict)
-    units: Mapping[str, str] = field(default_factory=dict)
+    names: Mapping[str, Any] = field(default_factory=dict)
+    units: Mapping[str, Any] = field(default_factory=dict)
     name: str = ""
     start: float = 0.0
     hold_r: Literal["zoh", "foh"] = "zoh"
@@ -94,7 +101,7 @@ class Record(Printed):
         for key in ("u", "y"):
             if given[key] is None:
                 raise CtrlidError(f"a record needs u and y; {key} is None")
-        signals = {k: check_samples(k, v) for k, v in given.items() if v is not None}
+        signals = {k: check_samples(k, v, True) for k, v in given.items() if v is not None}
         if not isinstance(self.extra, Mapping):
             raise CtrlidError(f"extra maps names to channels, as in {{'current': i}}; given "
                               f"{type(self.extra).__name__}")  # fmt: skip
@@ -103,12 +110,13 @@ class Record(Printed):
             raise CtrlidError(f"extra channels need names other than {', '.join(RESERVED)}; given "
                               f"{clash}")  # fmt: skip
         extra = {k: check_samples(f"extra[{k!r}]", v) for k, v in self.extra.items()}
-        sizes = {k: v.size for k, v in (*signals.items(), *extra.items())}
+        sizes = {k: v.shape[-1] for k, v in (*signals.items(), *extra.items())}
         if len(set(sizes.values())) > 1:
             lengths = ", ".join(f"{k}: {n}" for k, n in sizes.items())
             raise CtrlidError(f"all signals must be equally long; given {lengths}. Cut them to the "
                               "samples they have in common")  # fmt: skip
-        n = signals["y"].size
+        n = signals["y"].shape[-1]
+        counts = {k: len(v) if v.ndim == 2 else 1 for k, v in signals.items()}
         if n < 2:
             raise CtrlidError(f"a record needs at least 2 samples; given {n}")
         dt = check_seconds("dt is the sampling period", self.dt)
@@ -124,9 +132,11 @@ class Record(Printed):
             raise CtrlidError("valid is a masked array, and a record would use its masked values: "
                               "give valid.filled(False)")  # fmt: skip
         valid = np.ones(n, dtype=bool) if self.valid is None else np.array(self.valid)
-        if valid.dtype != bool or valid.shape != (n,):
+        several = (counts["y"], n) if counts["y"] > 1 else (n,)
+        if valid.dtype != bool or valid.shape not in ((n,), several):
+            rows = f", or {counts['y']} rows of them" if counts["y"] > 1 else ""
             raise CtrlidError(
-                f"valid must be {n} booleans, one per sample; given {valid.dtype} of shape "
+                f"valid must be {n} booleans, one per sample{rows}; given {valid.dtype} of shape "
                 f"{valid.shape}. A comparison makes booleans, as in y > 0"
             )
         if not isinstance(self.name, str):
@@ -135,13 +145,13 @@ class Record(Printed):
         for key, value in {
             **signals, "extra": MappingProxyType(extra), "valid": valid, "dt": dt,
             "start": check_seconds("start is the time of sample 0", self.start),
-            "names": check_words("names", self.names, SIGNALS),
-            "units": check_words("units", self.units, (*SIGNALS, *extra)),
+            "names": check_words("names", self.names, SIGNALS, counts),
+            "units": check_words("units", self.units, (*SIGNALS, *extra), counts),
         }.items():  # fmt: skip
             object.__setattr__(self, key, value)
 
     def __len__(self) -> int:
-        return int(self.y.size)
+        return int(self.y.shape[-1])
 
     def __reduce__(self) -> Any:
         # A mapping proxy cannot be pickled.
@@ -153,6 +163,66 @@ class Record(Printed):
     def n(self) -> int:
         """Number of samples."""
         return len(self)
+
+    @property
+    def signals(self) -> Mapping[str, tuple[str, ...]]:
+        """The names of the signals of r, u and y; without names ``y``, or ``y[0], y[1], ...``."""
+        given = {k: v for k in SIGNALS if (v := getattr(self, k)) is not None}
+        return {k: list_signals(k, self.names.get(k), v.shape[0] if v.ndim == 2 else 1)
+                for k, v in given.items()}  # fmt: skip
+
+    @property
+    def valid_outputs(self) -> Any:
+        """Which readings count, with a row for each output, shape (outputs, n)."""
+        return np.broadcast_to(self.valid, (len(self.signals["y"]), len(self)))
+
+    @property
+    def valid_samples(self) -> Any:
+        """Which samples count for all outputs, shape (n,)."""
+        return self.valid if self.valid.ndim == 1 else self.valid.all(axis=0)
+
+    def select(
+        self, *, r: str | Sequence[str] | None = None, u: str | Sequence[str] | None = None,
+        y: str | Sequence[str] | None = None,
+    ) -> "Record":  # fmt: skip
+        """Return the record with some of its signals only.
+
+        Parameters
+        ----------
+        r, u, y : str or sequence of str, optional
+            Names of the signals to keep, as in `signals`; by default all.
+
+        Returns
+        -------
+        Record
+            The same experiment.
+
+        Raises
+        ------
+        CtrlidError
+            If the record has no such signal.
+        """
+        check_arguments(Record.select, locals())
+        fields: dict[str, Any] = {}
+        names, units = dict(self.names), dict(self.units)
+        for key, wanted in (("r", r), ("u", u), ("y", y)):
+            if wanted is None:
+                continue
+            known = self.signals.get(key, ())
+            wanted = (wanted,) if isinstance(wanted, str) else tuple(wanted)
+            missing = [name for name in wanted if name not in known]
+            if missing or not wanted:
+                raise CtrlidError(f"the record has no signal {missing[0] if missing else ''!r} in "
+                                  f"{key}; it has {', '.join(known) or 'none'}")  # fmt: skip
+            at = [known.index(name) for name in wanted]
+            fields[key] = np.reshape(getattr(self, key), (len(known), -1))[at]
+            for labels in (names, units):
+                if key in labels:
+                    each = list_signals(key, labels[key], len(known))
+                    labels[key] = tuple(each[k] for k in at)
+            if key == "y" and self.valid.ndim == 2:
+                fields["valid"] = self.valid[at] if len(at) > 1 else self.valid[at[0]]
+        return replace(self, **fields, names=names, units=units)
 
     @property
     def t(self) -> Any:
@@ -187,7 +257,8 @@ class Record(Printed):
         if stop - start < 2:
             raise CtrlidError(f"a record needs at least 2 samples; the slice {start}:{stop} of "
                               f"{len(self)} leaves {max(stop - start, 0)}")  # fmt: skip
-        return self._change_channels(lambda s: s[start:stop], valid=self.valid[start:stop],
+        return self._change_channels(lambda s: s[..., start:stop],
+                         valid=self.valid[..., start:stop],
                          start=self.start + start * self.dt)  # fmt: skip
 
     def between(self, t0: float, t1: float) -> "Record":
@@ -293,9 +364,15 @@ class Record(Printed):
         if q == 1:
             return self
         if not antialias:
-            return self._change_channels(lambda s: s[::q], valid=self.valid[::q], dt=self.dt * q)
+            return self._change_channels(
+                lambda s: s[..., ::q], valid=self.valid[..., ::q], dt=self.dt * q
+            )
         half = 10 * q
-        valid = find_whole_past(np.pad(self.valid, half), 2 * half)[2 * half :: q]
+
+        def passed(mask: Any) -> Any:
+            return find_whole_past(np.pad(mask, half), 2 * half)[2 * half :: q]
+
+        valid = np.apply_along_axis(passed, -1, self.valid)
         if not valid.any():
             longest = max((b - a for a, b in self.segments()), default=0)
             raise CtrlidError(
@@ -312,7 +389,9 @@ class Record(Printed):
             return s[0] + signal.fftconvolve(around, taps, "valid")[::q]
 
         hold = "foh" if self.hold == "zoh" else self.hold
-        return self._change_channels(filtered, valid=valid, dt=self.dt * q, hold=hold)
+        return self._change_channels(
+            lambda s: np.apply_along_axis(filtered, -1, s), valid=valid, dt=self.dt * q, hold=hold
+        )
 
     def with_input(self, channel: str) -> "Record":
         """Return the record with an extra channel as input; the old input becomes an extra one.
@@ -357,6 +436,7 @@ class Record(Printed):
         return self._swap_channels("y", channel)
 
     def _swap_channels(self, key: str, channel: str) -> "Record":
+        require_one_signal({"u": "with_input", "y": "with_output"}[key], self)
         if channel not in self.extra:
             raise CtrlidError(f"the record has no extra channel {channel!r}; it has "
                               f"{', '.join(self.extra) or 'none'}")  # fmt: skip
@@ -385,11 +465,12 @@ class Record(Printed):
         list of (int, int)
             Half-open index pairs in time order.
         """
-        return [(int(a), int(b)) for a, b in zip(*find_runs(self.valid), strict=True)]
+        return [(int(a), int(b)) for a, b in zip(*find_runs(self.valid_samples), strict=True)]
 
     @classmethod
     def from_csv(
-        cls, path: str | Path, *, r: str | None = None, u: str = "u", y: str = "y",
+        cls, path: str | Path, *, r: str | Sequence[str] | None = None,
+        u: str | Sequence[str] = "u", y: str | Sequence[str] = "y",
         time: str | None = None, dt: float | None = None, extra: Sequence[str] | None = None,
         units: Mapping[str, str] | None = None, hold: Hold | None = None, name: str | None = None,
         gaps: Literal["error", "mask"] = "error", scale: Mapping[str, float] | None = None,
@@ -403,8 +484,9 @@ class Record(Printed):
         ----------
         path : str or path
             The file.
-        r, u, y : str, optional
-            Names of the columns; r by default if there is a column so called.
+        r, u, y : str or sequence of str, optional
+            Names of the columns, several for several signals, as in ``y=("theta", "alpha")``; r by
+            default if there is a column so called. A file that `to_csv` wrote knows its own.
         time : str, optional
             Name of the time column; by default one called t, time, timestamp, seconds or Zeit. Its
             unit is s unless the header says ms, us, min or h.
@@ -473,8 +555,8 @@ class Record(Printed):
 
     @classmethod
     def from_response(
-        cls, response: Any, *, r: str | None = None, u: str | None = None, y: str | None = None,
-        **fields: Any,
+        cls, response: Any, *, r: str | Sequence[str] | None = None,
+        u: str | Sequence[str] | None = None, y: str | Sequence[str] | None = None, **fields: Any,
     ) -> "Record":  # fmt: skip
         """Make a record of a `control.TimeResponseData`.
 
@@ -485,10 +567,10 @@ class Record(Printed):
         ----------
         response : control.TimeResponseData
             A single response, uniformly sampled.
-        r, u, y : str, optional
+        r, u, y : str or sequence of str, optional
             Labels of the reference, input and output among the response's inputs and outputs. By
-            default the signals so labelled, else the only other input as u and the only other
-            output as y.
+            default the signals so labelled, else all other inputs as u and all other outputs as
+            y.
         **fields
             Further fields of the record, such as ``hold``, ``names``, ``units``.
 
@@ -534,15 +616,25 @@ class Record(Printed):
                 f"{self.dt:g} s ({self.duration:.4g} s, {self.hold})"]  # fmt: skip
         if not self.valid.all():
             rows[0] += f", {100 * self.valid.mean():.1f} % valid"
-        channels = {k: getattr(self, k) for k in SIGNALS if getattr(self, k) is not None}
-        channels |= self.extra
-        labels = {k: f"{k} ({v})" if (v := self.names.get(k, k)) != k else k for k in channels}
-        width = max(map(len, labels.values()))
-        for key, values in channels.items():
-            unit = self.units.get(key, "")
-            rows.append(f"  {labels[key]:<{width}}  {values.min():.6g} .. {values.max():.6g} "
+        channels = list_rows(self)
+        numbered = [f"{k}[" for k, names in self.signals.items() if len(names) > 1]
+        labels = [name if name == key or name.startswith(tuple(numbered)) else f"{key} ({name})"
+                  for key, name, _, _ in channels]  # fmt: skip
+        width = max(map(len, labels))
+        for label, (_, _, unit, values) in zip(labels, channels, strict=True):
+            rows.append(f"  {label:<{width}}  {values.min():.6g} .. {values.max():.6g} "
                         f"{'' if unit == '1' else unit}".rstrip())  # fmt: skip
         return "\n".join(rows)
+
+
+def list_rows(record: Record) -> list[tuple[str, str, str, Any]]:
+    """Return key, name, unit and samples of each single signal and extra channel of a record."""
+    rows = []
+    for key, names in record.signals.items():
+        units = list_signals(key, record.units.get(key, ("",) * len(names)), len(names))
+        each = np.reshape(getattr(record, key), (-1, len(record)))
+        rows += [(key, *row) for row in zip(names, units, each, strict=True)]
+    return [*rows, *((k, k, record.units.get(k, ""), v) for k, v in record.extra.items())]
 
 
 def _rebuild(fields: dict[str, Any]) -> Record:

@@ -12,8 +12,9 @@ from .._base.text import drop_roundoff, split_unit, with_unit
 EXACT = 1e-20
 
 
-def read_response(response: Any, chosen: dict[str, str | None]) -> dict[str, Any]:
+def read_response(response: Any, chosen: dict[str, Any]) -> dict[str, Any]:
     """Return the fields of a record from a response; `chosen` maps r, u, y to labels or None."""
+    given = {k: (v,) if isinstance(v, str) else v for k, v in chosen.items()}
     if not isinstance(response, ct.TimeResponseData):
         raise CtrlidError(
             "from_response takes a control.TimeResponseData, as forced_response and "
@@ -32,25 +33,24 @@ def read_response(response: Any, chosen: dict[str, str | None]) -> dict[str, Any
     table = {**inputs, **outputs}
     plain = {split_unit(label)[0]: label for label in table}
 
-    def find_label(key: str) -> str | None:
-        given = chosen[key]
-        if given is not None:
-            return given if given in table else plain.get(given)
+    def find_labels(key: str) -> list[str]:
+        if given[key] is not None:
+            known = [label if label in table else plain.get(label) for label in given[key]]
+            return [] if None in known else [str(label) for label in known]
         if key in plain or key == "r":
-            return plain.get(key)
+            return [plain[key]] if key in plain else []
         # A signal that is the reference or the other one is no candidate.
-        taken = {chosen[k] or k for k in ("r", "u", "y") if k != key}
-        others = [c for c in (inputs if key == "u" else outputs)
-                  if c not in taken and split_unit(c)[0] not in taken]  # fmt: skip
-        return others[0] if len(others) == 1 else None
+        taken = {name for k in ("r", "u", "y") if k != key for name in given[k] or (k,)}
+        return [c for c in (inputs if key == "u" else outputs)
+                if c not in taken and split_unit(c)[0] not in taken]  # fmt: skip
 
-    labels = {key: find_label(key) for key in ("r", "u", "y")}
+    labels = {key: find_labels(key) for key in ("r", "u", "y")}
     for key, wanted in labels.items():
-        if wanted is None and (key != "r" or chosen[key] is not None):
+        if not wanted and (key != "r" or chosen[key] is not None):
             raise CtrlidError(
                 f"it is not clear which signal of the response is {key} (given {key}="
                 f"{chosen[key]!r}); name one of the inputs {list(inputs)} or of the outputs "
-                f"{list(outputs)} with {key}="
+                f"{list(outputs)} with {key}=, or several as a list"
             )
     stamps = np.asarray(response.time, dtype=float)
     if len(stamps) < 2:
@@ -63,13 +63,15 @@ def read_response(response: Any, chosen: dict[str, str | None]) -> dict[str, Any
             f"a record is sampled uniformly, but the times of the response are {steps.min():.4g} "
             f"to {steps.max():.4g} s apart. Compute it at np.arange(n) * dt"
         )
-    found = {key: split_unit(label) for key, label in labels.items() if label is not None}
+    found = {key: [split_unit(label) for label in each] for key, each in labels.items() if each}
+    names = {key: tuple(name for name, _ in each) for key, each in found.items()}
+    units = {key: tuple(unit for _, unit in each) for key, each in found.items()}
     return {
-        **{key: table[label] for key, label in labels.items() if label is not None},
+        **{key: np.array([table[label] for label in each]) for key, each in labels.items() if each},
         "dt": dt, "start": float(stamps[0]),
         **(dict.fromkeys(("hold", "hold_r"), "foh") if _runs_straight(response) else {}),
-        "names": {key: name for key, (name, _) in found.items() if name != key},
-        "units": {key: unit for key, (_, unit) in found.items() if unit},
+        "names": {key: each for key, each in names.items() if each != (key,)},
+        "units": {key: each for key, each in units.items() if any(each)},
     }  # fmt: skip
 
 
@@ -99,15 +101,21 @@ def _runs_straight(response: Any) -> bool:
 def write_response(record: Any) -> Any:
     """Return a record as a response with output y and inputs u and, if any, r."""
     keys = [key for key in ("y", "u", "r") if getattr(record, key) is not None]
-    names = [record.names.get(key, key) for key in keys]
-    labels = [
-        with_unit(name if names.count(name) == 1 else key, record.units.get(key, ""))
-        for key, name in zip(keys, names, strict=True)
-    ]
+    signals = record.signals
+    names = [name for key in keys for name in signals[key]]
+    labels, rows = [], []
+    for key in keys:
+        given = record.units.get(key, "")
+        several = len(signals[key]) > 1
+        units = (given,) * len(signals[key]) if isinstance(given, str) else given
+        for name, unit in zip(signals[key], units, strict=True):
+            own = f"{key} {name}" if several else key
+            labels.append(with_unit(name if names.count(name) == 1 else own, unit))
+        rows += list(np.reshape(getattr(record, key), (len(signals[key]), -1)))
+    p = len(signals["y"])
     return ct.TimeResponseData(
-        record.t, np.array(record.y)[None, :],
-        inputs=np.array([getattr(record, key) for key in keys[1:]]), output_labels=labels[:1],
-        input_labels=labels[1:], sysname=record.name or None,
+        record.t, np.array(rows[:p]), inputs=np.array(rows[p:]), output_labels=labels[:p],
+        input_labels=labels[p:], sysname=record.name or None,
     )  # fmt: skip
 
 

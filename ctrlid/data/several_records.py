@@ -112,6 +112,13 @@ def _check_each(first: Record, rest: Iterator[Any]) -> Iterator[Record]:
 
 
 def _require_same_kind(first: Record, record: Record) -> None:
+    if record.signals != first.signals:
+        counts = [{k: len(v) for k, v in one.signals.items()} for one in (first, record)]
+        if any(counts[0].get(k) != counts[1].get(k) for k in ("u", "y")):
+            raise CtrlidError(
+                "records used together need the same inputs and outputs; given "
+                f"{first.signals} and {record.signals}"
+            )
     if not have_same_period(record.dt, first.dt) or record.hold != first.hold:
         raise CtrlidError(
             "records used together need the same sampling period and the same hold; given "

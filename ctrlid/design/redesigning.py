@@ -12,6 +12,7 @@ from .._base.arguments import check_arguments
 from .._base.arrays import Array, freeze_arrays
 from .._base.errors import CtrlidError, ModelCannotRun
 from .._base.rounding import keep_numpy_quiet
+from .._base.signals import require_one_signal
 from .._base.text import Printed, write_polynomial, write_quantity
 from ..estimation.identified_model import IdentifiedModel
 from ..loop.loop import Loop
@@ -244,6 +245,7 @@ def redesign(
     if not isinstance(loop, Loop):
         raise CtrlidError("redesign needs a Loop, on which the controller is tried; given "
                           f"{type(loop).__name__}")  # fmt: skip
+    require_one_signal("redesign", loop)
     # The design needs a plain transfer function with the delay of the fit in it.
     G = G.with_delay() if isinstance(G, IdentifiedModel) else to_transfer_function(G)
     C = design_lead(G, crossover=crossover, phase_margin=phase_margin)

@@ -12,6 +12,7 @@ from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from .._base.interruption import Budget, Stopped, check_seconds, hold_interrupt
 from .._base.jobs import check_jobs, share_out
 from .._base.rounding import keep_numpy_quiet
+from .._base.signals import require_one_signal
 from ..data.record import Record
 from ..data.several_records import as_records, order_model_and_data, require_valid_samples
 from ..effects import CATALOGUE, AbstractEffect
@@ -181,6 +182,7 @@ def diagnose(
     check_catalogue(catalogue)
     loop, record = order_model_and_data(loop, record)
     records = as_records(record)
+    require_one_signal("diagnose", loop, records)
     require_valid_samples(records, "record=")
     given = make_loop(loop, records[0])
     loop = with_units_of(given, records[0])

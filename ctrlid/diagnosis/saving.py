@@ -126,7 +126,9 @@ def _encode(value: Any) -> Any:
         case AbstractEffect():
             own = {} if type(value).__module__.startswith("ctrlid.") else {
                 "module": type(value).__module__}  # fmt: skip
-            fields = {f.name: _encode(getattr(value, f.name)) for f in dataclasses.fields(value)}
+            # An effect of a plant with one place has no place to name.
+            fields = {f.name: _encode(getattr(value, f.name)) for f in dataclasses.fields(value)
+                      if f.name != "at" or value.at}  # fmt: skip
             return {"name": type(value).__name__, **own, "parameters": fields}
         case Loop() | SavedLoop():
             return _encode_loop(value)

@@ -20,6 +20,8 @@ from .scanning import Overview, Range, Scan, Sight
 from .symbolic import append_states, find_spread, trace_hook
 
 Place = Literal["input", "force", "law", "output"]
+# What the name of a place is, in words.
+PLACES = {"input": "an input", "force": "a velocity", "law": "no place", "output": "an output"}
 
 
 @dataclass(frozen=True)
@@ -30,7 +32,18 @@ class AbstractEffect:
     fields (the name of a state, for instance) are structure. A subclass of one of the bases
     `InputEffect`, `ForceEffect`, `LawEffect`, `OutputEffect` or `ReadingEffect` writes its formula
     in one method, with ordinary arithmetic and numpy.
+
+    Parameters
+    ----------
+    at : str, optional
+        Where it acts: the name of an input, of a velocity (a force) or of an output of the plant.
+        Needed where the plant has several of them. A force acts through the mass matrix where the
+        loop knows which input works on the velocity (`Loop.forces`), and its parameters are then in
+        the unit of that input; else it accelerates this coordinate alone.
     """
+
+    # A name; type checkers see that `dataclasses.replace` with values of parameters is sound.
+    at: Any = dataclasses.field(default="", kw_only=True, repr=False)
 
     place: ClassVar[Place]
     # Effects are applied in this order, from the plant's equations outwards.
@@ -166,9 +179,31 @@ class AbstractEffect:
         if loop is not None:
             known: Mapping[str, str] = loop.known_units
             e = loop.equations()
-            names = {"u": e.inputs[0], "y": e.outputs[0], "x": getattr(self, "name", "")}
+            inputs, outputs = (
+                names.index(self.at) if self.at in names else 0 for names in (e.inputs, e.outputs)
+            )
+            names = {"u": e.inputs[inputs], "y": e.outputs[outputs],
+                     "x": getattr(self, "name", "")}  # fmt: skip
             signals = {key: known[name] for key, name in names.items() if name in known}
+            if self.place == "force" and self.at:
+                return self._find_force_units(e, known)
         return {p.name: fill_unit(p.unit, signals) for p in self.parameters()}
+
+    def _find_force_units(self, e: Equations, known: Mapping[str, str]) -> dict[str, str]:
+        """Return the units of a force at a velocity: an acceleration, or that of its input."""
+        found = find_motion(e, self.at)
+        position = "" if found is None else known.get(e.states[found[0]], "")
+        units = {p.name: fill_unit(p.unit, {"y": position} if position else {})
+                 for p in self.parameters()}  # fmt: skip
+        force = ""
+        if found is not None and e.push_units:
+            force = e.push_units[e.velocities.index(found[1])]
+        if not (force and position):
+            return units
+        # Of accelerations and what is counted per velocity or position, these are the forces.
+        forces = {f"{position}/s^2": force, "1/s": f"{force} s/{position}",
+                  "1/s^2": f"{force}/{position}"}  # fmt: skip
+        return {name: forces.get(unit, unit) for name, unit in units.items()}
 
     def text(self, loop: Any = None) -> str:
         """Return the effect in words, with the units of a loop if one is given."""
@@ -202,7 +237,8 @@ class AbstractEffect:
             Empty where the effect makes no sense for the plant.
         """
         neutral = {p.name: p.neutral for p in cls.parameters()}
-        structure = [f for f in dataclasses.fields(cls) if "parameter" not in f.metadata]
+        structure = [f for f in dataclasses.fields(cls)
+                     if "parameter" not in f.metadata and f.name != "at"]  # fmt: skip
         if structure or any(v is None for v in neutral.values()):
             return ()
         return cls._applicable(loop, cls(**neutral))
@@ -272,13 +308,36 @@ class AbstractEffect:
             parameters={**equations.parameters, **values},
             spread=find_spread(equations),
         )
-        m = Moment(e, at, dt, {name: Symbol(s) for name, s in own.items()})
+        here = self._find_place(e)
+        own_point = at
+        if not e.siso:
+            own_point = OperatingPoint(at.states, at.inputs[here[0]], at.outputs[here[1]])
+        m = Moment(e, own_point, dt, {name: Symbol(s) for name, s in own.items()}, *here)
         rates = tuple(trace_hook(symbolic.rates)(m))
         if len(rates) != len(own):
             raise CtrlidError(f"{type(self).__name__}.rates returned {len(rates)} rates for the "
                               f"states {self.states}")  # fmt: skip
         changed = type(self).build(symbolic, e, m)
-        return append_states(changed, label, own, rates, self.rest(at))
+        return append_states(changed, label, own, rates, self.rest(own_point))
+
+    def _find_place(self, e: Equations) -> tuple[int, int, tuple[int, int] | None]:
+        """Return which input, which output and which position and velocity the effect is about."""
+        velocities = tuple(e.states[j] for j in e.velocities)
+        names = {"input": e.inputs, "output": e.outputs, "force": velocities, "law": ()}[self.place]
+        kind = type(self).__name__
+        if self.at and self.at not in names:
+            raise EffectDoesNotApply(
+                f"{kind} acts at {PLACES[self.place]}; given at={self.at!r}, but {e.name} has "
+                f"{', '.join(names) or 'none'}"
+            )
+        if not self.at and not e.siso and len(names) > 1:
+            raise EffectDoesNotApply(
+                f"{kind} acts at {PLACES[self.place]}, and {e.name} has several: say which with "
+                f"at=, one of {', '.join(names)}"
+            )
+        at = names.index(self.at) if self.at else 0
+        motion = find_motion(e, self.at) if self.place == "force" and self.at else None
+        return (at if self.place == "input" else 0, at if self.place == "output" else 0, motion)
 
 
 def _can_take(loop: Any, effect: AbstractEffect) -> bool:
@@ -291,7 +350,7 @@ def _can_take(loop: Any, effect: AbstractEffect) -> bool:
 
 def require_motion(effect: AbstractEffect, e: Equations) -> tuple[int, int]:
     """Return the indices of position and velocity, or refuse."""
-    found = find_motion(e)
+    found = find_motion(e, effect.at if effect.place == "force" else "")
     if found is None:
         raise EffectDoesNotApply(
             f"{type(effect).__name__} acts on a moving mass, but no state of {e.name} is the rate "

@@ -67,7 +67,7 @@ def _find_rest(e: Equations, at: OperatingPoint) -> tuple[float, ...]:
     # Of lags in series each needs the value at rest of the one before.
     for _ in e.lags:
         point = [*at.states, *rest]
-        values = targets.call([0.0, point, at.input, e.values, np.zeros(len(point))])
+        values = targets.call([0.0, point, list(at.inputs), e.values, np.zeros(len(point))])
         for lag, value in zip(e.lags, values, strict=True):
             rest[lag.state - own] = float(value)
     return tuple(rest)

@@ -29,10 +29,11 @@ class Follow:
     shortest: float
 
 
-def find_motion(e: Equations) -> tuple[int, int] | None:
+def find_motion(e: Equations, velocity: str = "") -> tuple[int, int] | None:
     """Return the indices of the position and the velocity that forces act on, None without any.
 
-    Of several moving masses it is the one whose position the output shows, else the first.
+    Of several moving masses it is the one whose position the output shows, else the first; with
+    the name of a velocity it is that one.
     """
     if e.dt:
         return None
@@ -43,6 +44,7 @@ def find_motion(e: Equations) -> tuple[int, int] | None:
         for j in e.velocities
         for i in range(own)
         if i != j and casadi.is_equal(casadi.simplify(e.rhs[i]), e.x[j], 2)
+        if velocity in ("", e.states[j])
     ]
     return min(pairs, key=lambda pair: (pair[0] not in shown, pair), default=None)
 
@@ -68,17 +70,20 @@ class Moment:
         Where deviations are counted from.
     """
 
-    def __init__(self, e: Equations, at: OperatingPoint, dt: float, own: dict[str, Any]) -> None:
-        self._e = e
+    def __init__(
+        self, e: Equations, at: OperatingPoint, dt: float, own: dict[str, Any], u: int = 0,
+        y: int = 0, motion: tuple[int, int] | None = None,
+    ) -> None:  # fmt: skip
+        self._e, self._motion = e, motion
         self.at, self.dt, self.own = at, dt, own
         self.t: Any = Symbol(e.t)
-        self.u: Any = Symbol(e.u)
-        self.y: Any = Symbol(e.output)
+        self.u: Any = Symbol(e.u if len(e.inputs) == 1 else e.u[u])
+        self.y: Any = Symbol(e.output if len(e.outputs) == 1 else e.output[y])
         self.states: dict[str, Any] = {s: Symbol(e.x[k]) for k, s in enumerate(e.states)}
         self.parameters: dict[str, Any] = {s: Symbol(e.p[k]) for k, s in enumerate(e.parameters)}
 
     def _require_motion(self) -> tuple[int, int]:
-        found = find_motion(self._e)
+        found = self._motion or find_motion(self._e)
         if found is None:
             raise EffectDoesNotApply(
                 f"{self._e.name} has no moving mass: no state is the rate of another"

@@ -10,7 +10,7 @@ from .._base.errors import EffectDoesNotApply
 from ..physics.equations import Backlash, Equations
 from ..physics.linearization import OperatingPoint
 from .context import Moment
-from .kinds import InputEffect, choose_first_width
+from .kinds import InputEffect, choose_first_width, require_one_input
 from .parameters import parameter
 from .symbolic import to_expression
 
@@ -105,6 +105,7 @@ class InputDelay(InputEffect):
 
     def build(self, e: Equations, m: Moment) -> Equations:
         """Return the equations with this delay on top of what there is."""
+        require_one_input(self, e)
         delay = to_expression(self.delay)
         return dataclasses.replace(e, delay=delay if e.delay is None else e.delay + delay)
 
@@ -150,6 +151,7 @@ class InputBacklash(InputEffect):
 
     def build(self, e: Equations, m: Moment) -> Equations:
         """Return the equations with the backlash ahead of them."""
+        require_one_input(self, e)
         if e.play is not None:
             raise EffectDoesNotApply(
                 "there is a backlash already; one loop takes a single InputBacklash"

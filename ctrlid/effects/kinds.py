@@ -57,8 +57,12 @@ class ForceEffect(AbstractEffect):
     def build(self, e: Equations, m: Moment) -> Equations:
         """Return the equations with the force added to the rate of the velocity."""
         _, j = require_motion(self, e)
-        rhs = casadi.SX(e.rhs)
-        rhs[j] = rhs[j] + to_expression(trace_hook(self.force)(m))
+        rhs, size = casadi.SX(e.rhs), to_expression(trace_hook(self.force)(m))
+        if self.at and e.pushes is not None:
+            n = e.pushes.shape[0]
+            rhs[:n] = rhs[:n] + e.pushes[:, e.velocities.index(j)] * size
+        else:
+            rhs[j] = rhs[j] + size
         return dataclasses.replace(e, rhs=rhs)
 
 
@@ -75,7 +79,21 @@ class InputEffect(AbstractEffect):
 
     def build(self, e: Equations, m: Moment) -> Equations:
         """Return the equations with the applied input in place of the computed one."""
-        return substitute_symbol(e, e.u, to_expression(trace_hook(self.input)(m)))
+        applied = to_expression(trace_hook(self.input)(m))
+        if len(e.inputs) > 1:
+            each = casadi.vertsplit(e.u)
+            each[e.inputs.index(self.at)] = applied
+            applied = casadi.vertcat(*each)
+        return substitute_symbol(e, e.u, applied)
+
+
+def require_one_input(effect: AbstractEffect, e: Equations) -> None:
+    """Refuse a plant with several inputs, whose memories would be one for all of them."""
+    if len(e.inputs) > 1:
+        raise EffectDoesNotApply(
+            f"{type(effect).__name__} remembers the one input of a plant; {e.name} has "
+            f"{', '.join(e.inputs)}. Write it as states of the plant"
+        )
 
 
 def choose_first_width(loop: Any, record: Any) -> float:
@@ -83,6 +101,15 @@ def choose_first_width(loop: Any, record: Any) -> float:
     if record is None:
         return 0.1 * max(abs(float(loop.point.input)), 1.0)
     return 0.1 * float(np.ptp(record.u))
+
+
+def replace_output(e: Equations, at: str, shown: Any) -> Equations:
+    """Return equations with another expression for the output, or for one of several."""
+    if len(e.outputs) > 1:
+        each = casadi.vertsplit(e.output)
+        each[e.outputs.index(at)] = shown
+        shown = casadi.vertcat(*each)
+    return dataclasses.replace(e, output=shown)
 
 
 class OutputEffect(AbstractEffect):
@@ -98,7 +125,7 @@ class OutputEffect(AbstractEffect):
 
     def build(self, e: Equations, m: Moment) -> Equations:
         """Return the equations with the new output."""
-        return dataclasses.replace(e, output=to_expression(trace_hook(self.output)(m)))
+        return replace_output(e, self.at, to_expression(trace_hook(self.output)(m)))
 
 
 class ReadingEffect(AbstractEffect):
@@ -114,6 +141,11 @@ class ReadingEffect(AbstractEffect):
 
     def build(self, e: Equations, m: Moment) -> Equations:
         """Return the equations with the readout appended to what there is."""
+        if len(e.outputs) > 1:
+            raise EffectDoesNotApply(
+                f"{type(self).__name__} changes a noisy reading, which loops of several outputs do "
+                f"not take yet; {e.name} has {', '.join(e.outputs)}"
+            )
         reading = casadi.SX.sym("reading") if e.reading is None else e.reading
         m.y = Symbol(reading if e.readout is None else e.readout)
         return dataclasses.replace(

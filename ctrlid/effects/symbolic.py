@@ -33,7 +33,8 @@ def substitute_symbol(e: Equations, old: Any, new: Any) -> Equations:
         Lag(lag.state, lag.time_constant, casadi.substitute(lag.target, old, new))
         for lag in e.lags
     )  # fmt: skip
-    return dataclasses.replace(e, rhs=rhs, output=output, lags=lags)
+    pushes = None if e.pushes is None else casadi.substitute(e.pushes, old, new)
+    return dataclasses.replace(e, rhs=rhs, output=output, lags=lags, pushes=pushes)
 
 
 def find_spread(e: Equations) -> Any:

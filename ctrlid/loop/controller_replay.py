@@ -12,6 +12,7 @@ from .._base.arrays import Array
 from .._base.errors import CtrlidError, ModelCannotRun
 from .._base.periods import have_same_period, write_both_periods, write_difference
 from .._base.rounding import keep_numpy_quiet
+from .._base.signals import require_one_signal
 from ..data.record import Record
 from ..data.several_records import order_model_and_data
 from .loop import Loop
@@ -104,6 +105,7 @@ def replay_controller(loop: Loop, record: Record) -> Array:
 
 def replay_from_best_state(loop: Loop, record: Record) -> tuple[Array, Array]:
     """Return what `replay_controller` does, and the controller's initial state that it chose."""
+    require_one_signal("replay_controller", loop, record)
     if not have_same_period(loop.dt, record.dt):
         both = write_both_periods("the loop is sampled", loop.dt, "the record", record.dt)
         raise CtrlidError(f"{both}; give both the same period: "

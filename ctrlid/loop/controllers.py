@@ -153,12 +153,16 @@ class ControlLaw:
     """A controller as equations: ``apply(t, x, r, y) -> (u, next state or rate)``.
 
     `dt` is 0.0 for an analog controller, whose second result is the rate of its state. `rest` is
-    the state at which it waits while r and y stay at the operating point.
+    the state at which it waits while r and y stay at the operating point; there r is `references`,
+    one value for each reference, None for the single one of a loop with one output. A controller
+    that `reads_input` is told the applied input as fifth argument.
     """
 
     dt: float
     rest: tuple[float, ...]
-    apply: Callable[[Any, Any, Any, Any], tuple[Any, Any]]
+    apply: Callable[..., tuple[Any, Any]]
+    references: tuple[float, ...] | None = None
+    reads_input: bool = False
 
 
 def make_control_law(controller: Any, at: OperatingPoint, dt: float) -> ControlLaw:
@@ -210,20 +214,22 @@ def make_control_law(controller: Any, at: OperatingPoint, dt: float) -> ControlL
     order = (1, 0) if swap else (0, 1)
     if isinstance(controller, ct.TransferFunction | ct.StateSpace):
         if isinstance(controller, ct.TransferFunction):
-            _require_proper(controller)
+            require_proper(controller)
         a, b, c, d = to_state_matrices(controller)
         b, d = (m[:, order] if controller.ninputs == 2 else m for m in (b, d))
         return _make_linear_law(a, b, c, d, at, dt if sampled else 0.0)
     return _make_traced_law(controller, at, dt if sampled else 0.0, order)
 
 
-def _require_proper(controller: Any) -> None:
-    for num, den in zip(controller.num[0], controller.den[0], strict=True):
-        if len(num) > len(den):
-            raise CtrlidError(
-                f"the controller has {len(num) - 1} zeros but {len(den) - 1} poles: no circuit and "
-                "no program differentiates without delay; add a filter pole"
-            )
+def require_proper(controller: Any) -> None:
+    """Refuse a transfer function with more zeros than poles."""
+    for nums, dens in zip(controller.num, controller.den, strict=True):
+        for num, den in zip(nums, dens, strict=True):
+            if len(num) > len(den):
+                raise CtrlidError(
+                    f"the controller has {len(num) - 1} zeros but {len(den) - 1} poles: no circuit "
+                    "and no program differentiates without delay; add a filter pole"
+                )
 
 
 def _make_linear_law(a: Any, b: Any, c: Any, d: Any, at: OperatingPoint, dt: float) -> ControlLaw:

@@ -18,10 +18,16 @@ from .._base.text import write_count
 from ..effects import AbstractEffect
 from ..effects.composition import compose_effects, label_effects
 from ..effects.python_control import as_system, linearize_with_effects
-from ..physics.equations import Equations, require_siso
-from ..physics.linearization import OperatingPoint, linearize
+from ..physics.equations import Equations, drive_inputs
+from ..physics.linearization import (
+    OperatingPoint,
+    as_operating_point,
+    linearize,
+    make_state_space,
+)
 from ..physics.trace import trace, with_parameters
 from .controllers import ControlLaw, make_control_law
+from .wiring import Wiring, is_wired_by_name, make_wired_law, make_wiring
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,24 +39,32 @@ class Loop:
     with all signals in absolute physical units and ``u0 = at.input``, the bias that the real
     controller adds. A linear plant acts on deviations: ``y = at.output + G (u - at.input)``.
 
+    A controller of a plant with several signals is wired by name, as `control.interconnect` does
+    it: inputs called after the plant's outputs and inputs (or ``y[i]`` and ``u[i]``) read these,
+    and its signals are absolute. Its other inputs are references by name; where the record has
+    none, ``xd[i]`` and ``ud[i]`` of `control.create_statefbk_iosystem` are held at the states and
+    inputs of `at`. Without names of its own (``u[0], u[1], ...``) it reads r - y, or r and then y.
+    `print` lists the wiring.
+
     Parameters
     ----------
     plant : control.NonlinearIOSystem, control.StateSpace or control.TransferFunction
-        Plant with one input and one output, continuous or with the sampling period `dt`.
+        The plant, continuous or with the sampling period `dt`.
     controller : TransferFunction, StateSpace, NonlinearIOSystem or PID, optional
-        One input (r - y), or two inputs (r, y). A controller in discrete time and a `PID` hold
-        their output between samples, a continuous one is an analog circuit. None: the loop is
-        open, or the controller is unknown.
+        One input (r - y), or two inputs (r, y); or several, wired as above. A controller in
+        discrete time and a `PID` hold their output between samples, a continuous one is an analog
+        circuit. None: the loop is open, or the controller is unknown.
     dt : float
         Sampling period of the record [s].
-    at : OperatingPoint, optional
+    at : OperatingPoint or control.OperatingPoint, optional
         Operating point; by default all zero, which a plant must be defined at.
     free : sequence of str, or mapping of str to float, optional
         Names of the plant parameters that are uncertain; ``{"K": 0.1}`` also says how well each is
         known, by the standard deviation of what is believed, as a share of the value that the loop
         has. Fits weigh that against the data, as a Gaussian prior; infinite is a name alone.
     input_limits : (float, float), optional
-        Limits of the actuator [input unit]; the logged u is the limited one.
+        Limits of the actuator [input unit]; the logged u is the limited one. Each may be a sequence
+        with a value for each input.
     effects : sequence of effects, optional
         Physics that the plant lacks, from `ctrlid.effects`; `with_effect` adds one. Each is known
         by its class name, a second one of a class by name and number: "ViscousFriction2".
@@ -60,6 +74,12 @@ class Loop:
         of the plant, which the plants of `ctrlid.plants` have. Sizes of effects are written in
         them, and as forces if the output is in m and one parameter in kg, or as torques if it is
         in rad and one in kg m^2.
+    driven : sequence of str, optional
+        The inputs that the record has, in its order; the others are zero. By default all.
+    forces : mapping of str to str, optional
+        Which input of the plant works on which velocity, ``{"x_dot": "F", "theta_dot": "tau"}``:
+        random forces act there, through the mass matrix. By default as a plant of `plants` has it;
+        else each velocity is pushed alone.
 
     Raises
     ------
@@ -84,6 +104,8 @@ class Loop:
     input_limits: tuple[float, float] = (-math.inf, math.inf)
     effects: tuple[AbstractEffect, ...] = field(default=(), kw_only=True)
     units: Mapping[str, str] = field(default_factory=dict, kw_only=True)
+    driven: tuple[str, ...] = field(default=(), kw_only=True)
+    forces: Mapping[str, str] | None = field(default=None, kw_only=True)
     _traced: Equations = field(init=False, repr=False)
     _active: Equations = field(init=False, repr=False)
     _kept: Equations = field(init=False, repr=False)
@@ -91,10 +113,9 @@ class Loop:
     def __post_init__(self) -> None:
         if not (isinstance(self.dt, int | float | np.number) and 0 < self.dt < math.inf):
             raise CtrlidError(f"a loop needs its sampling period dt > 0 s; given dt={self.dt!r}")
-        equations = trace(self.plant)
+        equations, inputs = self._trace_plant()
         # A loop is a value: its equations are those of the plant at the time it was made.
         object.__setattr__(self, "_traced", equations)
-        require_siso(equations)
         own = equations.dt and self.plant.dt is not True
         if own and not have_same_period(equations.dt, self.dt):
             both = write_both_periods("the plant is sampled", equations.dt, "the loop", self.dt)
@@ -103,33 +124,55 @@ class Loop:
         if self.at is None and not np.isfinite(equations.evaluate(np.zeros(n), 0.0)[0]).all():
             raise CtrlidError(f"{equations.name} is not defined where all its signals are zero; "
                               "give at=operating_point(plant, output=...)")  # fmt: skip
-        at = OperatingPoint((0.0,) * n, 0.0, 0.0) if self.at is None else self.at
-        if not isinstance(at, OperatingPoint):
-            raise CtrlidError(
-                "at= needs an OperatingPoint, from operating_point(plant, output=...) or given as "
-                f"OperatingPoint(states=, input=, output=); given {type(at).__name__}"
-            )
+        still: Any = [(0.0,) * len(names) for names in (equations.inputs, equations.outputs)]
+        at = as_operating_point(self.at or OperatingPoint((0.0,) * n, *still), equations, inputs)
         if not self.linear_plant and len(at.states) != n:
             raise CtrlidError(
                 f"at= has {write_count(len(at.states), 'state')}, but {equations.name} has {n} "
                 f"({', '.join(equations.states)}); give at=operating_point(plant, output=...)"
             )
-        try:
-            lower, upper = to_real_array(self.input_limits, "input_limits").tolist()
-        except (TypeError, ValueError) as reason:
-            raise CtrlidError("input_limits is a pair (lower, upper) in input units; given "
-                              f"{self.input_limits!r}") from reason  # fmt: skip
-        if not lower < upper:
-            raise CtrlidError(f"input_limits needs lower < upper; given ({lower:g}, {upper:g})")
+        limits = self._check_limits(len(equations.inputs))
         object.__setattr__(self, "dt", float(self.dt))
         object.__setattr__(self, "at", at)
-        object.__setattr__(self, "input_limits", (lower, upper))
+        object.__setattr__(self, "input_limits", limits)
         self._apply_effects()
         self._check_units()
         law = self.law()
         if law and law.dt == 0.0 and equations.dt:
             raise CtrlidError("an analog controller cannot act on a plant in discrete time; give "
                               "the plant in continuous time or sample the controller")  # fmt: skip
+
+    def _trace_plant(self) -> tuple[Equations, tuple[str, ...]]:
+        """Return the equations of the driven plant, and the names of all its inputs."""
+        whole = trace(self.plant)
+        driven = (self.driven,) if isinstance(self.driven, str) else tuple(self.driven)
+        object.__setattr__(self, "driven", driven)
+        names = whole.inputs
+        units = dict(getattr(self.plant, "units", {}))
+        forces = self.forces
+        mechanism = getattr(self.plant, "mechanism", None)
+        if mechanism is not None and not whole.siso:
+            forces = dict(self.plant.forces) if forces is None else forces
+            # The plants of `plants` know where forces work; their parameters may have been changed.
+            if forces and set(forces.values()) <= set(mechanism.input_labels):
+                whole = trace(with_parameters(mechanism, self.plant.params))
+        if not driven and not forces:
+            return whole, names
+        return drive_inputs(whole, driven or names, forces or {}, units), names
+
+    def _check_limits(self, inputs: int) -> Any:
+        """Return the limits of the actuator, as floats or with a value for each input."""
+        given: Any = self.input_limits
+        try:
+            lower, upper = (to_real_array(v, "input_limits") for v in given)
+            pairs = np.broadcast_to(np.array(np.broadcast_arrays(lower, upper)).T, (inputs, 2))
+        except (TypeError, ValueError) as reason:
+            raise CtrlidError("input_limits is a pair (lower, upper) in input units; given "
+                              f"{self.input_limits!r}") from reason  # fmt: skip
+        for low, high in pairs:
+            if not low < high:
+                raise CtrlidError(f"input_limits needs lower < upper; given ({low:g}, {high:g})")
+        return tuple(tuple(v.tolist()) if v.ndim else float(v) for v in (lower, upper))
 
     def _apply_effects(self) -> None:
         """Put the effects into the equations and see that the free parameters exist."""
@@ -195,6 +238,21 @@ class Loop:
         return isinstance(self.plant, ct.TransferFunction | ct.StateSpace)
 
     @property
+    def signals(self) -> Mapping[str, tuple[str, ...]]:
+        """The names of the inputs u and outputs y, and of the references of a wired controller."""
+        wiring = self.wiring
+        several = {"u": self._traced.inputs, "y": self._traced.outputs}
+        return several if wiring is None else {"r": wiring.open, **several}
+
+    @property
+    def wiring(self) -> Wiring | None:
+        """How a controller of several signals is wired to the plant; None for any other."""
+        if self.controller is None or not is_wired_by_name(self.controller, self._traced):
+            return None
+        assert self.at is not None
+        return make_wiring(self.controller, self._traced, self.at)
+
+    @property
     def labelled(self) -> dict[str, AbstractEffect]:
         """The effects by name: that of the class, numbered from the second of a class on."""
         return label_effects(self.effects)
@@ -231,8 +289,9 @@ class Loop:
         if not self.linear_plant:
             return e
         at = self._bare_point
-        rhs = casadi.substitute(e.rhs, e.u, e.u - at.input)
-        output = casadi.substitute(e.output, e.u, e.u - at.input) + at.output
+        u0, y0 = (casadi.DM(v) if np.ndim(v) else v for v in (at.input, at.output))
+        rhs = casadi.substitute(e.rhs, e.u, e.u - u0)
+        output = casadi.substitute(e.output, e.u, e.u - u0) + y0
         return replace(e, rhs=rhs, output=output)
 
     @property
@@ -358,7 +417,14 @@ class Loop:
         if self.controller is None:
             return None
         assert self.at is not None
-        return make_control_law(self.controller, self.at, self.dt)
+        wiring = self.wiring
+        if wiring is None:
+            return make_control_law(self.controller, self.at, self.dt)
+        known = self.__dict__.get("_law")
+        if known is None:
+            known = make_wired_law(self.controller, wiring, self.at, self.dt)
+            object.__setattr__(self, "_law", known)
+        return known
 
     @property
     def analog(self) -> bool:
@@ -403,9 +469,10 @@ class Loop:
         Returns
         -------
         control.TransferFunction or control.StateSpace
-            From deviations of the input to deviations of the output; with ``states=True`` a
-            state-space model in the physical states, first those of the plant in their order,
-            under the names of `equations`, with an underscore for a dot.
+            From deviations of the input to deviations of the output; with ``states=True``, and for
+            a plant with several inputs or outputs, a state-space model in the physical states,
+            first those of the plant in their order, under the names of `equations`, with an
+            underscore for a dot.
 
         Raises
         ------
@@ -422,6 +489,8 @@ class Loop:
         ([[0.0, 1.0], [-5.0, -0.5]], ['x', 'v'], ['V'], ['x'])
         """
         active = {k: e for k, e in self.labelled.items() if not e.neutral and e.in_linear_model}
+        if not active and not self._traced.siso:
+            return make_state_space(self._active, self.point)
         if not active:
             if isinstance(self.plant, ct.TransferFunction) and not states:
                 return self.plant
@@ -435,10 +504,14 @@ class Loop:
         assert self.at is not None
         kind = "no controller" if self.controller is None else (
             "analog controller" if self.analog else "digital controller")  # fmt: skip
-        text = (f"Loop({e.name}, {kind}, dt={self.dt:g} s, at {e.outputs[0]} = "
-                f"{self.at.output:g}, {e.inputs[0]} = {self.at.input:g}")  # fmt: skip
-        if np.isfinite(self.input_limits).any():
-            text += f", {e.inputs[0]} within {self.input_limits[0]:g}..{self.input_limits[1]:g}"
+        pairs = zip((*e.outputs, *e.inputs), (*self.at.outputs, *self.at.inputs), strict=True)
+        point = ", ".join(f"{name} = {value:g}" for name, value in pairs)
+        text = f"Loop({e.name}, {kind}, dt={self.dt:g} s, at {point}"
+        limits = np.broadcast_to(np.array(np.broadcast_arrays(*self.input_limits)).T,
+                                 (len(e.inputs), 2))  # fmt: skip
+        for name, (low, high) in zip(e.inputs, limits, strict=True):
+            if np.isfinite([low, high]).any():
+                text += f", {name} within {low:g}..{high:g}"
         if self.free:
             known = self.free if isinstance(self.free, Mapping) else {}
             names = [
@@ -448,7 +521,10 @@ class Loop:
             text += f", free: {', '.join(names)}"
         if self.effects:
             text += f", effects: {', '.join(self.labelled)}"
-        return text + ")"
+        wiring = self.wiring
+        if wiring is None:
+            return text + ")"
+        return "\n  ".join([text + "), wired:", *wiring.lines])
 
 
 def _check_beliefs(free: Mapping[str, Any], parameters: Mapping[str, float]) -> None:

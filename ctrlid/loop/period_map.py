@@ -1,6 +1,7 @@
 """The map of a loop over one sampling period, as exact equations."""
 
 import functools
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -25,6 +26,7 @@ class PeriodMap:
     the input remembers; w is ``(t, r, d, sensor noise, force noise, next d)``, all held over the
     period but for an input without controller that runs straight from d to the next d. For a
     band-limited input the corners of its pieces, the next sample last, stand in place of next d.
+    `counts` says how many rows each of them has, `reference` the references at rest.
     ``rate(z, w)`` is the derivative of z for a loop with an analog controller, else None.
     """
 
@@ -32,6 +34,43 @@ class PeriodMap:
     rest: tuple[float, ...]
     step: Any
     rate: Any = None
+    counts: tuple[int, ...] = (1,) * 6
+    reference: tuple[float, ...] = ()
+
+    @property
+    def places(self) -> list[slice]:
+        """Where in w each of its signals is."""
+        ends = np.cumsum((0, *self.counts)).tolist()
+        return [slice(a, b) for a, b in itertools.pairwise(ends)]
+
+
+def count_signals(loop: Loop) -> tuple[int, ...]:
+    """Return how many rows t, r, d, sensor noise and force noise have."""
+    e, law = loop.equations(), loop.law()
+    m, p = len(e.inputs), len(e.outputs)
+    references = 1 if law is None or law.references is None else len(law.references)
+    return 1, references, m, p, count_forces(e)
+
+
+def count_forces(e: Equations) -> int:
+    """Return the number of random forces: one for all velocities of a plant of single signals."""
+    if e.pushes is not None:
+        return int(e.pushes.shape[1])
+    return 1 if e.siso else max(len(e.velocities), 1)
+
+
+def push_velocities(e: Equations, force: Any, t: Any, x: Any, p: Any) -> Any:
+    """Return what random forces, held over a period, add to the rates of the states."""
+    n = len(e.states)
+    if e.pushes is not None:
+        given = casadi.Function("push", [e.t, e.x, e.u, e.p], [e.pushes])
+        held = casadi.mtimes(given(t, x, casadi.SX.zeros(len(e.inputs), 1), p), force)
+        # Effects may have added states, which no force moves.
+        return casadi.vertcat(held, casadi.SX.zeros(n - held.shape[0], 1))
+    held = casadi.SX.zeros(n, 1)
+    for k, j in enumerate(e.velocities or (range(n) if e.dt == 0 else ())):
+        held[j] = force[min(k, force.shape[0] - 1)]
+    return held
 
 
 def make_period_map(loop: Loop, substeps: int, hold: str = "zoh", hold_r: str = "zoh") -> PeriodMap:
@@ -68,37 +107,45 @@ def make_period_map(loop: Loop, substeps: int, hold: str = "zoh", hold_r: str = 
     kept = 0 if e.delay is None else late + 1
     size = n + nc + (e.play is not None) + kept
     # Corners of a band-limited input follow the signals that are held; else the next sample does.
-    corners = pieces + 1 if pieces > 1 else 1
+    corners, m = (pieces + 1 if pieces > 1 else 1), len(e.inputs)
     straight_r = loop.analog and hold_r == "foh"
-    z, w = casadi.SX.sym("z", size), casadi.SX.sym("w", 5 + corners + straight_r)
-    t0, r, d, sensor, force, *path = casadi.vertsplit(w)
-    climb = (path.pop() - r) / loop.dt if straight_r else casadi.SX(0)
-    path = path if pieces > 1 else [d, *path]
-    held_rate = casadi.SX.zeros(n, 1)
-    for j in e.velocities or (range(n) if e.dt == 0 else ()):
-        held_rate[j] = force
-    at, (lower, upper) = loop.point, loop.input_limits
+    counts = count_signals(loop)
+    # A straight reference comes last, with its value at the next sample.
+    counts = (*counts, m * corners, *(counts[1:2] if straight_r else ()))
+    z, w = casadi.SX.sym("z", size), casadi.SX.sym("w", sum(counts))
+    t0, r, d, sensor, force, ahead, *last = casadi.vertsplit(w, np.cumsum((0, *counts)).tolist())
+    climb = (last[0] - r) / loop.dt if straight_r else casadi.SX(0)
+    following = casadi.vertsplit(ahead, m)
+    path = following if pieces > 1 else [d, *following]
+    at, limits = loop.point, loop.input_limits
     p = e.values
+    held_rate = push_velocities(e, force, t0, z[:n], p)
+    # Several inputs rest at a column of values.
+    u_rest = casadi.DM(at.inputs) if len(at.inputs) > 1 else at.input
+    lower, upper = (casadi.DM(v) if np.ndim(v) else v for v in limits)
 
     def limit_input(u: Any) -> Any:
-        if math.isfinite(lower):
+        if np.isfinite(limits[0]).any():
             u = casadi.fmax(u, lower)
-        if math.isfinite(upper):
+        if np.isfinite(limits[1]).any():
             u = casadi.fmin(u, upper)
         return u
 
     def compute_input(t: Any, z: Any, y: Any, tau: Any = 0.0) -> tuple[Any, Any]:
-        wish, moved = (
-            law.apply(t, z[n:], r + climb * tau, y) if law else (at.input, casadi.SX(0, 1))
-        )
-        return limit_input(wish + d), moved
+        now = r + climb * tau
+        wish, moved = law.apply(t, z[n:], now, y) if law else (u_rest, casadi.SX(0, 1))
+        u = limit_input(wish + d)
+        if law and law.reads_input:
+            # An observer reads what the actuator applies, at its limits too.
+            moved = law.apply(t, z[n:], now, y, u)[1]
+        return u, moved
 
     def measure_output(t: Any, z: Any, u: Any) -> Any:
         y = e.function(t, z[:n], u, p)[1] + sensor
         return y if e.reader is None else e.reader(y, p)
 
     slope = None
-    y = measure_output(t0, z, at.input)
+    y = measure_output(t0, z, u_rest)
     u, moved = compute_input(t0, z[: n + nc], y)
     if law is None:
         y = measure_output(t0, z, u)
@@ -113,21 +160,21 @@ def make_period_map(loop: Loop, substeps: int, hold: str = "zoh", hold_r: str = 
 
         # The reference jumps or bends only at the samples, so that a period has a smooth motion.
         def rate(tau: Any, z: Any) -> Any:
-            u, charge = compute_input(t0 + tau, z, measure_output(t0 + tau, z, at.input), tau)
+            u, charge = compute_input(t0 + tau, z, measure_output(t0 + tau, z, u_rest), tau)
             return casadi.vertcat(e.function(t0 + tau, z[:n], u, p)[0] + held_rate, charge)
 
         slope = casadi.Function("rate", [z, w], [rate(0.0, z)])
         after, error = integrate(rate, z, loop.dt, substeps)
     else:
         memory: Any = z[n + nc] if e.play is not None else None
-        wanted = [u] if pieces == 1 else [limit_input(at.input + value) for value in path[:-1]]
+        wanted = [u] if pieces == 1 else [limit_input(u_rest + value) for value in path[:-1]]
         applied = []
         for value in wanted:
             behind, memory = apply_backlash(e, memory, value, p)
             applied.append(behind)
         past = [z[k] for k in range(size - kept, size)]
         hold = "zoh" if law else hold
-        ahead = apply_backlash(e, memory, limit_input(at.input + path[-1]), p)[0]
+        ahead = apply_backlash(e, memory, limit_input(u_rest + path[-1]), p)[0]
         # The inputs from the oldest that is remembered to the one of the next sample.
         known = [*reversed(past), *applied, ahead if hold != "zoh" else applied[-1]]
         known = known if kept else [applied[0], *known]
@@ -154,7 +201,10 @@ def make_period_map(loop: Loop, substeps: int, hold: str = "zoh", hold_r: str = 
         input_at_rest = float(casadi.evalf(casadi.SX(apply_backlash(e, memory[0], at.input, p)[0])))
     rest += [*memory, *([input_at_rest] * kept)]
     step = casadi.Function("step", [z, w], [after, y, u, error])
-    return PeriodMap(e.states, tuple(rest), step, slope)
+    reference = at.outputs if e.siso else (0.0,)
+    if law is not None and law.references is not None:
+        reference = law.references
+    return PeriodMap(e.states, tuple(rest), step, slope, counts, reference)
 
 
 def apply_backlash(e: Equations, m: Any, u: Any, p: Any) -> tuple[Any, Any]:
@@ -177,12 +227,16 @@ def _insert_values(e: Equations, pieces: Sequence[Piece], p: Any) -> list[Piece]
     ]
 
 
-def linearize_at_rest(s: PeriodMap, reference: float, function: Any) -> tuple[Array, Array]:
+def linearize_at_rest(s: PeriodMap, function: Any) -> tuple[Array, Array]:
     """Return the derivatives of a function (step, rate) by state and signals at rest."""
-    z, w = casadi.SX.sym("z", len(s.rest)), casadi.SX.sym("w", s.step.size1_in(1))
+    z, w = casadi.SX.sym("z", len(s.rest)), casadi.SX.sym("w", sum(s.counts))
     first = function.call([z, w])[0]
     both = casadi.Function("j", [z, w], [casadi.jacobian(first, z), casadi.jacobian(first, w)])
-    a, b = both(s.rest, [0.0, reference, *[0.0] * (w.shape[0] - 2)])
+    still = np.zeros(sum(s.counts))
+    still[s.places[1]] = s.reference
+    if len(s.counts) > 6:
+        still[s.places[6]] = s.reference
+    a, b = both(s.rest, still)
     return np.asarray(a, float), np.asarray(b, float)
 
 
@@ -216,7 +270,7 @@ def compute_growth_rate(loop: Loop) -> float:
             loop = loop.without_effect(label)
     s = make_period_map(loop, 8)
     function = s.step if s.rate is None else s.rate
-    matrix, _ = linearize_at_rest(s, loop.point.output, function)
+    matrix, _ = linearize_at_rest(s, function)
     if not np.isfinite(matrix).all():
         raise ModelCannotRun(
             f"{loop.equations().name} has no derivative at its operating point, {loop.point}; "

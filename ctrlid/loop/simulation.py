@@ -2,19 +2,25 @@
 
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from .._base.arguments import check_arguments, is_number
+from .._base.arguments import check_arguments
 from .._base.arrays import Array, to_real_array
 from .._base.errors import CtrlidError, CtrlidWarning, ModelCannotRun
 from .._base.rounding import keep_numpy_quiet
 from ..data.reconstruction import PIECES, count_pieces, reconstruct_signal
 from ..data.record import Record
 from .loop import Loop
-from .period_map import compute_growth_rate, linearize_at_rest, make_period_map
+from .period_map import (
+    compute_growth_rate,
+    count_signals,
+    linearize_at_rest,
+    make_period_map,
+)
+from .wiring import stack_references
 
 # Steps are refined until their local error is below this share of each state's excursion.
 TOLERANCE = 1e-9
@@ -43,8 +49,8 @@ def simulate(
     loop: Loop,
     r: Any = None,
     *,
-    sensor_noise: float = 0.0,
-    force_noise: float = 0.0,
+    sensor_noise: Any = 0.0,
+    force_noise: Any = 0.0,
     d: Any = None,
     initial: Sequence[float] | None = None,
     seed: int | None = None,
@@ -61,13 +67,18 @@ def simulate(
     ----------
     loop : Loop
         The loop; without a controller, ``u = at.input + d``.
-    r : array_like, shape (n,), optional
-        Reference [output unit]; needed if the loop has a controller.
-    sensor_noise : float, optional
-        Standard deviation of white noise on the measured output [output unit].
-    force_noise : float, optional
-        Standard deviation of a white acceleration, held over each period [output unit/s^2].
-    d : array_like, shape (n,), optional
+    r : array_like, shape (n,) or (references, n), or mapping of str to array_like, optional
+        Reference [output unit]; needed if the loop has a controller. A controller of several
+        signals has references by name, as `loop.wiring` lists them: one row for each that cannot be
+        held, or for all, or a mapping of their names.
+    sensor_noise : float or sequence of float, optional
+        Standard deviation of white noise on the measured output [output unit], one for each of
+        several outputs.
+    force_noise : float or sequence of float, optional
+        Standard deviation of a white acceleration, held over each period [output unit/s^2]; of a
+        plant with several signals one for each velocity, in the unit of the force that works on it
+        (`Loop.forces`).
+    d : array_like, shape (n,) or (inputs, n), optional
         Signal added to the controller's output, ahead of the limits [input unit]: dither, pulses.
     initial : sequence of float, optional
         Initial plant states, or plant and controller states [their units]; by default those at
@@ -101,13 +112,15 @@ def simulate(
         raise CtrlidError(
             f"simulate needs a Loop(plant, controller, dt=..., at=...); given {type(loop).__name__}"
         )
-    r, d = _check_signals(loop, r, d)
-    noise = _draw_noise(loop, d.size, sensor_noise, force_noise, seed)
+    r, d, names = _check_signals(loop, r, d)
+    noise = _draw_noise(loop, d.shape[-1], sensor_noise, force_noise, seed)
     simulator = Simulator(loop)
     y, u = simulator.run(simulator.start(initial), r, d, noise)
     e = loop.equations()
-    signals = {"r": e.outputs[0], "u": e.inputs[0], "y": e.outputs[0]}
     known = loop.known_units
+    if names is not None or not e.siso:
+        return _make_record(loop, r, u, y, names or ())
+    signals = {"r": e.outputs[0], "u": e.inputs[0], "y": e.outputs[0]}
     units = {key: known[name] for key, name in signals.items() if name in known}
     return Record(
         r=r, u=u, y=y, dt=loop.dt, hold="foh" if loop.analog else "zoh",
@@ -116,7 +129,30 @@ def simulate(
     )  # fmt: skip
 
 
-def _check_signals(loop: Loop, r: Any, d: Any) -> tuple[Array | None, Array]:
+def _make_record(loop: Loop, r: Any, u: Array, y: Array, names: tuple[str, ...]) -> Record:
+    """Return the record of a loop with several signals, with the references that were given."""
+    e, wiring = loop.equations(), loop.wiring
+    known = loop.known_units
+    signals = {"r": names, "u": e.inputs, "y": e.outputs}
+    if names:
+        assert wiring is not None
+        r = r[[wiring.open.index(name) for name in names]]
+    else:
+        signals.pop("r")
+    units = {key: tuple(known.get(name, "") for name in each) for key, each in signals.items()}
+    return Record(
+        r=r if names else None, u=u, y=y, dt=loop.dt, hold="foh" if loop.analog else "zoh",
+        names=signals, name=e.name, units={k: each for k, each in units.items() if any(each)},
+    )  # fmt: skip
+
+
+def _check_signals(
+    loop: Loop, r: Any, d: Any
+) -> tuple[Array | None, Array, tuple[str, ...] | None]:  # fmt: skip
+    """Return references and injected signal as arrays, and the names of several references."""
+    wiring, inputs = loop.wiring, len(loop.equations().inputs)
+    if wiring is not None or inputs > 1:
+        return _check_several_signals(loop, r, d)
     arrays = {}
     for name, value in (("r", r), ("d", d)):
         if value is None:
@@ -139,14 +175,53 @@ def _check_signals(loop: Loop, r: Any, d: Any) -> tuple[Array | None, Array]:
     if len(set(sizes.values())) > 1:
         raise CtrlidError(f"r and d must be equally long; given {sizes}")
     size = next(iter(sizes.values()))
-    return arrays.get("r"), arrays.get("d", np.zeros(size))
+    return arrays.get("r"), arrays.get("d", np.zeros(size)), None
 
 
-def _draw_noise(loop: Loop, n: int, sensor: float, force: float, seed: int | None) -> list[Array]:
-    for name, value in (("sensor_noise", sensor), ("force_noise", force)):
-        if not (is_number(value) and np.isfinite(value) and value >= 0):
-            raise CtrlidError(f"{name} is a standard deviation >= 0; given {value!r}")
-    if force and not loop.equations().velocities:
+def _check_several_signals(loop: Loop, r: Any, d: Any) -> tuple[Array, Array, tuple[str, ...]]:
+    """Return the series of a wired controller's open inputs, the injected ones, and names."""
+    inputs = loop.equations().inputs
+    if isinstance(r, Mapping):
+        r = {name: np.asarray(v, dtype=float) for name, v in r.items()}
+    try:
+        parts = [None if v is None else np.asarray(v, dtype=float) for v in
+                 (None if isinstance(r, Mapping) else r, d)]  # fmt: skip
+    except (TypeError, ValueError) as reason:
+        raise CtrlidError(f"simulate needs r and d as arrays of numbers; {reason}") from reason
+    series = [*parts, *(r.values() if isinstance(r, Mapping) else ())]
+    for v in series:
+        if v is not None and (v.ndim not in (1, 2) or v.shape[-1] < 2 or not np.isfinite(v).all()):
+            raise CtrlidError("simulate needs r and d with at least 2 finite samples, of shape "
+                              f"(n,) or (signals, n); given shape {v.shape}")  # fmt: skip
+    given = r if isinstance(r, Mapping) else parts[0]
+    injected = None if parts[1] is None else np.atleast_2d(parts[1])
+    if injected is not None and len(injected) != len(inputs):
+        raise CtrlidError(f"d needs one row for each input ({', '.join(inputs)}); given "
+                          f"shape {injected.shape}")  # fmt: skip
+    if loop.wiring is None:
+        if injected is None:
+            raise CtrlidError("simulate needs r or d to know how many samples to run; an open loop "
+                              "is driven by d (u = at.input + d)")  # fmt: skip
+        return np.zeros((1, injected.shape[1])), injected, ()
+    n = None if injected is None else injected.shape[1]
+    references, names = stack_references(loop.wiring, given, None, n)
+    n = n or references.shape[1]
+    if references.shape[1] != n:
+        raise CtrlidError(f"r and d must be equally long; given {references.shape[1]} and {n}")
+    return references, np.zeros((len(inputs), n)) if injected is None else injected, names
+
+
+def _draw_noise(loop: Loop, n: int, sensor: Any, force: Any, seed: int | None) -> list[Array]:
+    *_, outputs, forces = count_signals(loop)
+    sizes = []
+    for name, value, count in (("sensor_noise", sensor, outputs), ("force_noise", force, forces)):
+        array = np.ravel(np.asarray(value))
+        good = array.dtype.kind in "fiu" and array.size in (1, count)
+        if not (good and np.isfinite(array).all() and (array >= 0).all()):
+            each = f", or {count} of them" if count > 1 else ""
+            raise CtrlidError(f"{name} is a standard deviation >= 0{each}; given {value!r}")
+        sizes.append(np.broadcast_to(array.astype(float), count))
+    if sizes[1].any() and not loop.equations().velocities:
         raise CtrlidError(
             f"force_noise needs a plant with a moving mass, that is a state whose rate is another "
             f"state; {loop.equations().name} has none. Use d= for a disturbance of the input"
@@ -155,7 +230,9 @@ def _draw_noise(loop: Loop, n: int, sensor: float, force: float, seed: int | Non
         raise CtrlidError(f"seed is a whole number from 0 upwards, or None; given {seed}")
     # Each noise has its own stream, so that switching one on does not change the other.
     streams = np.random.default_rng(seed).spawn(2)
-    return [s.standard_normal(n) * v for s, v in zip(streams, (sensor, force), strict=True)]
+    return [
+        s.standard_normal((len(v), n)) * v[:, None] for s, v in zip(streams, sizes, strict=True)
+    ]
 
 
 class Simulator:
@@ -182,12 +259,12 @@ class Simulator:
         self.loop, self.tolerance, self.most, self.hold = loop, tolerance, most, hold
         self.hold_r = hold_r if loop.analog else "zoh"
         first = make_period_map(loop, 1, hold, self.hold_r)
-        self.plant_states = first.plant_states
+        self.plant_states, self.counts = first.plant_states, first.counts
         self.rest: Array = np.array(first.rest, dtype=float)
         self._steps: dict[int, Any] = {1: first.step}
         self._runners: dict[tuple[int, int], Any] = {}
         e = loop.equations()
-        if not np.isfinite(e.evaluate(first.rest[: len(e.states)], loop.point.input)[0]).all():
+        if not np.isfinite(e.evaluate(first.rest[: len(e.states)], loop.point.inputs)[0]).all():
             raise ModelCannotRun(
                 f"{e.name} is not defined at the operating point, {loop.point}; give "
                 "at=operating_point(plant, output=...)"
@@ -195,11 +272,13 @@ class Simulator:
         # An undamped plant neither grows nor decays; round-off must not decide which.
         self._unstable = loop.controller is None and compute_growth_rate(loop) * loop.dt > 1e-6
         # What a millionth of the operating values does to each state: smaller motion is rest.
-        self._motion = linearize_at_rest(first, loop.point.output, first.step)
+        self._motion = linearize_at_rest(first, first.step)
         a, b = (np.nan_to_num(np.abs(m)) for m in self._motion)
-        self._floor = 1e-6 * (
-            a @ np.abs(self.rest) + (b[:, 2] + b[:, 5:].sum(axis=1)) * abs(loop.point.input)
-        )
+        now, ahead = first.places[2], first.places[5]
+        # The corners of a band-limited input are those of all inputs in turn.
+        inputs = np.abs(loop.point.inputs)
+        following = b[:, ahead].reshape(len(b), -1, len(inputs)).sum(axis=1)
+        self._floor = 1e-6 * (a @ np.abs(self.rest) + (b[:, now] + following) @ inputs)
 
     def start(self, initial: Sequence[float] | None) -> Array:
         """Return the state to start from: at rest, or with the given values."""
@@ -226,11 +305,13 @@ class Simulator:
 
     def _find_path(self, d: Array) -> Array:
         """Return how d runs on within each period: the next sample, or the corners until there."""
-        following = np.append(d[1:], d[-1])
+        following = np.hstack([d[:, 1:], d[:, -1:]])
         if self.loop.controller is not None or count_pieces(self.hold) == 1:
-            return following[None]
-        corners = reconstruct_signal(d).reshape(-1, PIECES)
-        return np.vstack([corners.T, np.append(corners[1:, 0], following[-1])])
+            return following
+        corners = np.array([reconstruct_signal(row).reshape(-1, PIECES).T for row in d])
+        last = np.hstack([corners[:, 0, 1:], following[:, -1:]])
+        path: Array = np.concatenate([*corners.transpose(1, 0, 2), last])
+        return path
 
     def run(
         self, z: Array, r: Array | None, d: Array, noise: Sequence[Array] | None = None,
@@ -240,13 +321,17 @@ class Simulator:
 
         Runs chunk by chunk; the steps of a chunk are halved until its local errors are small.
         """
-        loop, n = self.loop, d.size
-        quiet = np.zeros(n)
-        w = np.vstack([start_time + np.arange(n) * loop.dt, quiet if r is None else r, d,
-                       *(noise or (quiet, quiet)), self._find_path(d)])  # fmt: skip
-        if self.hold_r == "foh" and r is not None:
-            w = np.vstack([w, np.append(r[1:], r[-1])])
-        y, u = np.empty(n), np.empty(n)
+        loop, n = self.loop, d.shape[-1]
+        _, references, inputs, outputs, forces, *_ = self.counts
+        d, quiet = np.reshape(d, (inputs, n)), [np.zeros((k, n)) for k in (outputs, forces)]
+        r = None if r is None else np.reshape(r, (references, n))
+        w = np.vstack([start_time + np.arange(n) * loop.dt,
+                       np.zeros((references, n)) if r is None else r, d, *(noise or quiet),
+                       self._find_path(d)])  # fmt: skip
+        if self.hold_r == "foh":
+            still = np.zeros((references, n))
+            w = np.vstack([w, still if r is None else np.hstack([r[:, 1:], r[:, -1:]])])
+        y, u = np.empty((outputs, n)), np.empty((inputs, n))
         start, reach = z, self._floor
         asked, whole = self._measure_asked(w), loop.controller is None
         substeps, size = 1, min(CHUNK, n)
@@ -262,7 +347,7 @@ class Simulator:
                 stop = self._find_first_bad(states, ys, us, asked)
                 if stop is not None and not whole:
                     # What moves the loop beside the reference asks for motion, too.
-                    asked, whole = max(asked, self._compute_reach(start, w)), True
+                    asked, whole = np.maximum(asked, self._compute_reach(start, w)), True
                     stop = self._find_first_bad(states, ys, us, asked)
                 good = count if stop is None else max(stop - 1, 0)
                 travel = np.max(np.abs(states[:, :good] - start[:, None]), axis=1, initial=0.0)
@@ -283,14 +368,14 @@ class Simulator:
                 pushed = bool(np.any(start != self.rest))
                 stopped = SimulationStopped(
                     _explain_stop(loop, growth, first + stop, inside, ys[:, until], us[:, until], w,
-                                  pushed)
+                                  pushed, self.counts)
                 )  # fmt: skip
                 stopped.unstable = growth > 0
-                stopped.y = np.concatenate([y[:first], ys[0, :stop]])
+                stopped.y = _drop_single_row(np.hstack([y[:, :first], ys[:, :stop]]))
                 raise stopped
             if error > worst:
                 worst, where = error, first
-            y[first : first + count], u[first : first + count] = ys[0], us[0]
+            y[:, first : first + count], u[:, first : first + count] = ys, us
             z, reach = states[:, -1], excursion
             if error < self.tolerance / 1e4 and substeps > 1:
                 substeps //= 2
@@ -301,24 +386,29 @@ class Simulator:
                 f"{MOST_SUBSTEPS} steps in {loop.dt:g} s; simulate with a smaller dt",
                 CtrlidWarning, stacklevel=4,
             )  # fmt: skip
-        return y, u
+        return _drop_single_row(y), _drop_single_row(u)
 
-    def _measure_asked(self, w: Array) -> float:
+    def _measure_asked(self, w: Array) -> Array:
         """Return how far from zero the point of rest, the reference and the noise ask y to be."""
-        rest = self.loop.point.output
+        rest = np.array(self.loop.point.outputs)
         if self.loop.controller is None:
-            return abs(rest)
-        return max(abs(rest), *map(float, np.max(np.abs([w[1] - rest, w[3]]), axis=1)))
+            return np.asarray(np.abs(rest))
+        places = np.cumsum((0, *self.counts))
+        parts = [np.abs(rest), np.max(np.abs(w[places[3] : places[4]]), axis=1)]
+        if self.counts[1] == len(rest) == 1:
+            parts.append(np.max(np.abs(w[1:2] - rest[:, None]), axis=1))
+        return np.asarray(np.max(parts, axis=0))
 
-    def _compute_reach(self, start: Array, w: Array) -> float:
+    def _compute_reach(self, start: Array, w: Array) -> Array:
         """Return how far a start, injected signals, noises and forces move the output from rest.
 
         That is the largest output of the loop linearized at rest, without what would grow by
         itself; infinity where it has no derivative.
         """
         a, n = self._motion[0], w.shape[1]
+        rest_of_outputs = np.array(self.loop.point.outputs)[:, None]
         if not np.isfinite(a).all():
-            return math.inf
+            return np.full(len(rest_of_outputs), math.inf)
         step, rest = self._steps[1].map(n), self.rest[:, None]
         pushes = np.asarray(step(np.repeat(rest, n, axis=1), w)[0], float) - rest
         a = a / max(1.0, float(np.max(np.abs(np.linalg.eigvals(a)), initial=0.0)))
@@ -326,18 +416,27 @@ class Simulator:
         moved[:, 0] = start - self.rest
         for k in range(n - 1):
             moved[:, k + 1] = a @ moved[:, k] + pushes[:, k]
-        y = np.asarray(step(rest + moved, w * np.array([[1], [1], [1], [0], [1], [1]]))[1], float)
-        reach = float(np.max(np.abs(y - self.loop.point.output)))
-        return reach if math.isfinite(reach) else math.inf
+        told = w.copy()
+        places = np.cumsum((0, *self.counts))
+        told[places[3] : places[4]] = 0.0
+        y = np.asarray(step(rest + moved, told)[1], float)
+        reach = np.max(np.abs(y - rest_of_outputs), axis=1)
+        return np.where(np.isfinite(reach), reach, math.inf)
 
-    def _find_first_bad(self, states: Array, ys: Array, us: Array, asked: float) -> int | None:
+    def _find_first_bad(self, states: Array, ys: Array, us: Array, asked: Array) -> int | None:
         """Return the first sample at which the loop is no longer where it can be, or None."""
-        bad = ~(np.isfinite(states).all(axis=0) & np.isfinite(ys[0]) & np.isfinite(us[0]))
+        bad = ~np.isfinite(np.vstack([states, ys, us])).all(axis=0)
         # An open loop may travel far, an integrator must; only an unstable plant runs away from
         # rest.
-        if self.loop.controller is not None or (asked and self._unstable):
-            bad |= np.abs(ys[0] - self.loop.point.output) > RUNAWAY * asked
+        if self.loop.controller is not None or (asked.all() and self._unstable):
+            away = np.abs(ys - np.array(self.loop.point.outputs)[:, None])
+            bad |= (away > RUNAWAY * asked[:, None]).any(axis=0)
         return int(np.argmax(bad)) if bad.any() else None
+
+
+def _drop_single_row(values: Array) -> Array:
+    """Return the samples of a single signal without the axis of several."""
+    return values[0] if len(values) == 1 else values
 
 
 def _compute_known_growth(loop: Loop) -> float:
@@ -349,12 +448,14 @@ def _compute_known_growth(loop: Loop) -> float:
 
 
 def _explain_stop(
-    loop: Loop, growth: float, at: int, inside: bool, ys: Array, us: Array, w: Array, pushed: bool
-) -> str:
+    loop: Loop, growth: float, at: int, inside: bool, ys: Array, us: Array, w: Array, pushed: bool,
+    counts: Sequence[int],
+) -> str:  # fmt: skip
     """Say when and why a simulation broke off."""
     e, op = loop.equations(), loop.point
-    output, inp = e.outputs[0], e.inputs[0]
     k = ys.shape[1] - 1
+    row = int(np.argmax(np.abs(np.nan_to_num(ys[:, k]) - op.outputs)))
+    ys, output, inp = ys[row:], e.outputs[row], e.inputs[0]
     good = max(k - 1, 0)
     text = f"the simulation stops at t = {at * loop.dt:.5g} s (sample {at}): "
     if inside:
@@ -362,7 +463,7 @@ def _explain_stop(
     else:
         text += (f"{output} left the range where the plant is defined. The last values inside are "
                  f"{output} = {ys[0, good]:.4g} and {inp} = {us[0, good]:.4g}.")  # fmt: skip
-    lower, upper = loop.input_limits
+    lower, upper = (float(np.ravel(v)[0]) for v in loop.input_limits)
     recent = us[0, max(0, good - 20) : good + 1]
     if loop.controller is None:
         return (
@@ -375,6 +476,11 @@ def _explain_stop(
         )
     if np.any(recent <= lower) or np.any(recent >= upper):
         text += f" {inp} was at its limit ({lower:g} to {upper:g}) shortly before."
+    if not e.siso or counts[1] != 1:
+        return (
+            f"{text} Near the operating point the loop is stable, so the signals are too large for "
+            "it. Use smaller references, less noise or an initial state that is nearer to rest"
+        )
     asked = float(np.max(np.abs(w[1] - op.output)))
     sizes = [f"the reference is up to {asked:.3g} away from the operating point"] if asked else []
     sizes += [f"{name} is up to {np.max(np.abs(v)):.3g}"

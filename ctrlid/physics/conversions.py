@@ -102,7 +102,7 @@ def to_transfer_function(system: Any) -> Any:
 
 
 def to_state_matrices(system: Any) -> tuple[Array, Array, Array, Array]:
-    """Return state matrices of a linear system with one output; each input has states of its own.
+    """Return state matrices of a linear system; each of its entries has states of its own.
 
     Parameters
     ----------
@@ -112,7 +112,8 @@ def to_state_matrices(system: Any) -> tuple[Array, Array, Array, Array]:
     Returns
     -------
     a, b, c, d : ndarray
-        Of shapes (n, n), (n, inputs), (1, n) and (1, inputs); those of a state space as they are.
+        Of shapes (n, n), (n, inputs), (outputs, n) and (outputs, inputs); those of a state space
+        as they are.
 
     Raises
     ------
@@ -121,17 +122,23 @@ def to_state_matrices(system: Any) -> tuple[Array, Array, Array, Array]:
     """
     if isinstance(system, ct.StateSpace):
         return system.A, system.B, system.C, system.D
-    parts = []
-    for num, den in zip(system.num[0], system.den[0], strict=True):
-        if len(np.trim_zeros(num, "f")) > len(np.trim_zeros(den, "f")):
-            raise CtrlidError(
-                f"{system.name} has more zeros than poles, so that it would differentiate without "
-                "a filter: add the pole that the real one has"
-            )
-        zero = not np.any(num)
-        parts.append(ct.ss([], [], [], [[0]]) if zero else ct.ss(ct.tf(num, den, system.dt)))
-    a, b = (linalg.block_diag(*m) for m in ([s.A for s in parts], [s.B for s in parts]))
-    return a, b, np.hstack([s.C for s in parts]), np.hstack([s.D for s in parts])
+    rows = []
+    for nums, dens in zip(system.num, system.den, strict=True):
+        parts = []
+        for num, den in zip(nums, dens, strict=True):
+            if len(np.trim_zeros(num, "f")) > len(np.trim_zeros(den, "f")):
+                raise CtrlidError(
+                    f"{system.name} has more zeros than poles, so that it would differentiate "
+                    "without a filter: add the pole that the real one has"
+                )
+            zero = not np.any(num)
+            parts.append(ct.ss([], [], [], [[0]]) if zero else ct.ss(ct.tf(num, den, system.dt)))
+        a, b = (linalg.block_diag(*m) for m in ([s.A for s in parts], [s.B for s in parts]))
+        rows.append((a, b, np.hstack([s.C for s in parts]), np.hstack([s.D for s in parts])))
+    if len(rows) == 1:
+        return rows[0]
+    a, b, c, d = zip(*rows, strict=True)
+    return linalg.block_diag(*a), np.vstack(b), linalg.block_diag(*c), np.vstack(d)
 
 
 def sample_held(system: Any, dt: float) -> Any:

@@ -1,8 +1,8 @@
 """The equations of a plant as expressions, with what effects have added to them."""
 
 import functools
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import casadi
@@ -82,6 +82,10 @@ class Equations:
     plain first-order lags; `play` is a memory between controller and plant; `delay` an expression
     of `p` for the time by which the input comes late; `readout` what becomes of the noisy
     `reading`; `rest` the values at rest of states that were added to the plant's own.
+
+    `pushes` has a column for each force that is known to work on a velocity: the derivative of the
+    states' rates by it; `push_units` are the units of these forces. Without, each velocity is
+    pushed alone.
     """
 
     name: str
@@ -103,6 +107,8 @@ class Equations:
     reading: Any = None
     readout: Any = None
     rest: tuple[float, ...] = ()
+    pushes: Any = None
+    push_units: tuple[str, ...] = ()
 
     def __reduce__(self) -> Any:
         # CasADi pickles no expression alone: all go into one package, which keeps the symbols that
@@ -117,6 +123,11 @@ class Equations:
     def values(self) -> Array:
         """The parameter values in the order of `p`."""
         return np.array(list(self.parameters.values()), dtype=float)
+
+    @property
+    def siso(self) -> bool:
+        """Whether the plant has one input and one output."""
+        return len(self.inputs) == 1 and len(self.outputs) == 1
 
     @functools.cached_property
     def velocities(self) -> tuple[int, ...]:
@@ -169,11 +180,67 @@ class Equations:
         return np.asarray(rhs, float).ravel(), np.asarray(output, float).ravel()
 
 
-def require_siso(equations: Equations) -> None:
-    """Refuse a plant that has not exactly one input and one output."""
-    if len(equations.inputs) != 1 or len(equations.outputs) != 1:
+def drive_inputs(
+    equations: Equations, driven: Sequence[str], forces: Mapping[str, str], units: Mapping[str, str]
+) -> Equations:
+    """Return a plant with some of its inputs only, the others zero, and with known forces.
+
+    Parameters
+    ----------
+    equations : Equations
+        The plant with all its inputs.
+    driven : sequence of str
+        The inputs that remain, in this order.
+    forces : mapping of str to str
+        Which input works on which velocity; see `Equations.pushes`.
+    units : mapping of str to str
+        Units of the inputs.
+
+    Returns
+    -------
+    Equations
+        The plant.
+
+    Raises
+    ------
+    CtrlidError
+        If there is no such input or velocity, or the plant is not affine in a force.
+    """
+    e, names = equations, list(equations.inputs)
+    unknown = [name for name in driven if name not in names]
+    if unknown or not driven:
+        raise CtrlidError(f"driven= names {list(driven)}, but the inputs of {e.name} are {names}")
+    velocities = [e.states[j] for j in e.velocities]
+    wrong = {v: u for v, u in forces.items() if v not in velocities or u not in names}
+    if wrong:
         raise CtrlidError(
-            f"the plant {equations.name} has inputs {list(equations.inputs)} and outputs "
-            f"{list(equations.outputs)}; ctrlid works with one input and one output: give ct.nlsys "
-            "an output function that returns the measured signal alone"
+            f"forces= says which input works on which velocity; given {wrong}, but the velocities "
+            f"of {e.name} are {velocities} and its inputs {names}"
         )
+    kept = [names.index(name) for name in driven]
+    u = casadi.SX.sym("u", len(driven)) if list(driven) != names else e.u
+    values = casadi.SX.zeros(len(names), 1)
+    for k, j in enumerate(kept):
+        values[j] = u[k]
+    pushes = None
+    if forces:
+        slopes = casadi.jacobian(e.rhs, e.u)
+        columns = []
+        for j, velocity in zip(e.velocities, velocities, strict=True):
+            if velocity not in forces:
+                columns.append(casadi.SX(casadi.DM.eye(len(e.states))[:, j]))
+                continue
+            at = names.index(forces[velocity])
+            if casadi.depends_on(slopes[:, at], e.u[at]):
+                raise CtrlidError(
+                    f"forces= says that {forces[velocity]} works on {velocity}, but {e.name} is "
+                    "not affine in it: a force enters the accelerations as it is, times a factor"
+                )
+            columns.append(slopes[:, at])
+        pushes = casadi.substitute(casadi.horzcat(*columns), e.u, values)
+    own = tuple(units.get(forces.get(velocity, ""), "") for velocity in velocities)
+    return replace(
+        e, inputs=tuple(driven), u=u, rhs=casadi.substitute(e.rhs, e.u, values),
+        output=casadi.substitute(e.output, e.u, values), pushes=pushes,
+        push_units=own if forces else (),
+    )  # fmt: skip

@@ -13,8 +13,9 @@ from .._base.arguments import check_arguments, is_number
 from .._base.arrays import Array, to_real_array
 from .._base.errors import CtrlidError, ModelCannotRun
 from .._base.rounding import keep_numpy_quiet
+from .._base.text import write_count
 from .conversions import to_polynomials
-from .equations import Equations, require_siso
+from .equations import Equations
 from .trace import trace
 
 # A state with a smaller relative coupling is reached by rounding errors only.
@@ -35,10 +36,11 @@ class OperatingPoint:
     ----------
     states : sequence of float
         State values in the order of the plant's states [their units].
-    input : float
-        The input there [its unit], which is also the bias that a one-input controller adds.
-    output : float
-        The output there [its unit].
+    input : float or tuple of float
+        The input there [its unit], which is also the bias that a one-input controller adds; of a
+        plant with several inputs, one value for each.
+    output : float or tuple of float
+        The output there [its unit], one value for each of several.
 
     Raises
     ------
@@ -50,19 +52,24 @@ class OperatingPoint:
     >>> import ctrlid as cid
     >>> cid.OperatingPoint(states=(0.012, 0.0), input=3.0, output=0.012).input
     3.0
+    >>> cid.OperatingPoint(states=(0, 0, 0, 0), input=0, output=(0, 0)).output
+    (0.0, 0.0)
     """
 
     states: tuple[float, ...]
-    input: float
-    output: float
+    input: Any
+    output: Any
 
     def __post_init__(self) -> None:
-        given = np.atleast_1d(to_real_array(self.states, WANTED))
-        if given.ndim > 1 or not (is_number(self.input) and is_number(self.output)):
-            raise CtrlidError(f"{WANTED}: given {self}")
-        states = tuple(given.tolist())
-        point = (float(self.input), float(self.output))
-        if not np.isfinite([*states, *point]).all():
+        values = []
+        for given in (self.states, self.input, self.output):
+            array = np.atleast_1d(to_real_array(given, WANTED))
+            if array.ndim > 1:
+                raise CtrlidError(f"{WANTED}: given {self}")
+            values.append(tuple(array.tolist()))
+        states, inputs, outputs = values
+        point = tuple(each[0] if len(each) == 1 else each for each in (inputs, outputs))
+        if not np.isfinite([*states, *inputs, *outputs]).all():
             raise ModelCannotRun(
                 f"an operating point must be finite; given states={states}, "
                 f"input={point[0]}, output={point[1]}"
@@ -71,10 +78,68 @@ class OperatingPoint:
         object.__setattr__(self, "input", point[0])
         object.__setattr__(self, "output", point[1])
 
+    @property
+    def inputs(self) -> tuple[float, ...]:
+        """The inputs as a tuple, also where there is one."""
+        return tuple(np.ravel(self.input).tolist())
+
+    @property
+    def outputs(self) -> tuple[float, ...]:
+        """The outputs as a tuple, also where there is one."""
+        return tuple(np.ravel(self.output).tolist())
+
+
+def as_operating_point(at: Any, equations: Equations, inputs: Sequence[str]) -> OperatingPoint:
+    """Return an operating point of ours, also from one of python-control.
+
+    Parameters
+    ----------
+    at : OperatingPoint or control.OperatingPoint
+        The point; what `control.find_operating_point` returns has states and inputs, and its
+        outputs are computed.
+    equations : Equations
+        The plant, with the inputs that it is driven by.
+    inputs : sequence of str
+        All inputs of the plant as it was given; the point may have a value for each.
+
+    Returns
+    -------
+    OperatingPoint
+        The point, with the driven inputs only.
+
+    Raises
+    ------
+    CtrlidError
+        If it is something else, or has another number of states, inputs or outputs than the plant.
+    """
+    if isinstance(at, ct.OperatingPoint):
+        states, given = (np.ravel(np.asarray(v, dtype=float)) for v in (at.states, at.inputs))
+        if len(given) == len(inputs):
+            given = given[[list(inputs).index(name) for name in equations.inputs]]
+        if (len(states), len(given)) == (len(equations.states), len(equations.inputs)):
+            outputs = equations.evaluate(states, given)[1] if at.outputs is None else at.outputs
+            at = OperatingPoint(tuple(states), given, outputs)
+        else:
+            at = OperatingPoint(tuple(states), given, np.zeros(len(equations.outputs)))
+    if not isinstance(at, OperatingPoint):
+        raise CtrlidError(
+            "at= needs an OperatingPoint, from operating_point(plant, output=...) or given as "
+            f"OperatingPoint(states=, input=, output=); given {type(at).__name__}"
+        )
+    for what, values, names in (
+        ("input", at.inputs, equations.inputs), ("output", at.outputs, equations.outputs)
+    ):  # fmt: skip
+        if len(values) != len(names):
+            raise CtrlidError(
+                f"at= has {write_count(len(values), what)}, but {equations.name} has {len(names)} "
+                f"({', '.join(names)}); give {what}=({', '.join(['...'] * len(names))})"
+            )
+    return at
+
 
 @keep_numpy_quiet
 def operating_point(
-    plant: Any, *, output: float, guess: Sequence[float] | OperatingPoint | None = None
+    plant: Any, *, output: Any, guess: Sequence[float] | OperatingPoint | None = None
 ) -> OperatingPoint:
     r"""Return the equilibrium of a plant at a given output.
 
@@ -88,9 +153,9 @@ def operating_point(
     Parameters
     ----------
     plant : control.NonlinearIOSystem, control.StateSpace or control.TransferFunction
-        Plant with one input and one output.
-    output : float
-        The output to rest at [output unit].
+        The plant.
+    output : float or sequence of float
+        The output to rest at [output unit]; of a plant with several outputs, one value for each.
     guess : sequence of float or OperatingPoint, optional
         States near which to look first [their units]; then the equilibrium found from there is
         returned.
@@ -98,7 +163,8 @@ def operating_point(
     Returns
     -------
     OperatingPoint
-        With floats `.input` and `.output` and the tuple `.states`.
+        With floats `.input` and `.output`, tuples where there are several, and the tuple
+        `.states`.
 
     Raises
     ------
@@ -115,14 +181,14 @@ def operating_point(
     """
     check_arguments(operating_point, locals(), "output")
     equations = trace(plant)
-    require_siso(equations)
-    if not (is_number(output) and np.isfinite(float(output))):
+    one = len(equations.outputs) == 1
+    if one and not (is_number(output) and np.isfinite(float(output))):
         raise CtrlidError(f"output must be a finite number; given {output!r}")
-    target = float(output)
+    target = _check_target(equations, output)
     n = len(equations.states)
     residual = equations.rhs - equations.x if equations.dt else equations.rhs
     z = casadi.vertcat(equations.x, equations.u)
-    goal = casadi.vertcat(residual, equations.output - target)
+    goal = casadi.vertcat(residual, equations.output - casadi.DM(target))
     both = casadi.Function("equilibrium", [z, equations.p], [goal, casadi.jacobian(goal, z)])
     values = equations.values
 
@@ -133,7 +199,8 @@ def operating_point(
     found: list[Array] = []
     repeats = 0
     closest: tuple[float, Array] | None = None
-    for trial, start in enumerate(_draw_starts(n, target, guess)):
+    inputs = len(equations.inputs)
+    for trial, start in enumerate(_draw_starts(n, target if one else [0.0], guess, inputs)):
         solution, error = _solve_equilibrium(evaluate, start, damped=trial % 3 == 2)
         if solution is None:
             continue
@@ -152,36 +219,55 @@ def operating_point(
             near = ", ".join(f"{s}={v:.4g}" for s, v in zip(
                 (*equations.states, *equations.inputs), closest[1], strict=True))  # fmt: skip
             hint = f" The nearest point found is {near}, which is no equilibrium."
+        wanted = ", ".join(
+            f"{name} = {value:g}" for name, value in zip(equations.outputs, target, strict=True)
+        )
         raise ModelCannotRun(
-            f"{equations.name} has no equilibrium with {equations.outputs[0]} = {target:g}: from "
-            f"{STARTS} starting points no states and input {equations.inputs[0]} were found that "
+            f"{equations.name} has no equilibrium with {wanted}: from {STARTS} starting points no "
+            f"states and input {', '.join(equations.inputs)} were found that "
             f"hold it there.{hint} Choose an output inside the range of the plant, or give guess= "
             "near an equilibrium"
         )
-    best = min(found, key=lambda s: (s[n] < -1e-12 * abs(s).max(), abs(s[n])))
-    return OperatingPoint(tuple(best[:n].tolist()), float(best[n]) + 0.0, target)
+    if inputs == 1:
+        best = min(found, key=lambda s: (s[n] < -1e-12 * abs(s).max(), abs(s[n])))
+    else:
+        best = min(found, key=lambda s: float(np.sum(s[n:] ** 2)))
+    return OperatingPoint(tuple(best[:n].tolist()), best[n:] + 0.0, target)
 
 
-def _draw_starts(n: int, target: float, guess: Any) -> list[Array]:
+def _check_target(equations: Equations, output: Any) -> list[float]:
+    """Return the outputs to rest at, one for each that the plant has."""
+    values = np.ravel(np.asarray(output))
+    names = equations.outputs
+    if values.dtype.kind not in "fiu" or len(values) != len(names) or not np.isfinite(values).all():
+        raise CtrlidError(
+            f"output needs {write_count(len(names), 'finite number')}, one for each output of "
+            f"{equations.name} ({', '.join(names)}); given {output!r}"
+        )
+    return [float(v) for v in values]
+
+
+def _draw_starts(n: int, target: Sequence[float], guess: Any, inputs: int = 1) -> list[Array]:
     rng = np.random.default_rng(1)
     starts = []
     if isinstance(guess, OperatingPoint):
         if len(guess.states) != n:
             raise CtrlidError(f"guess needs {n} states; given {len(guess.states)}")
-        starts.append(np.array([*guess.states, guess.input]))
+        starts.append(np.array([*guess.states, *guess.inputs]))
     elif guess is not None:
         states = np.atleast_1d(to_real_array(guess, "guess"))
         if states.shape != (n,):
             raise CtrlidError(f"guess needs {n} states; given {states.size}")
-        starts += [np.append(states, s * 10.0**k) for k in range(-2, 3) for s in (1, -1)]
+        sizes = [s * 10.0**k for k in range(-2, 3) for s in (1, -1)]
+        starts += [np.append(states, [size] * inputs) for size in sizes]
     for trial in range(STARTS):
-        size = 10.0 ** rng.uniform(-3, 2, n + 1)
-        start = rng.choice([-1.0, 1.0], n + 1) * size
+        size = 10.0 ** rng.uniform(-3, 2, n + inputs)
+        start = rng.choice([-1.0, 1.0], n + inputs) * size
         # The output is often a state, and the other states are often at rest.
-        start[:n] = np.where(rng.random(n) < 0.6, target, start[:n])
+        start[:n] = np.where(rng.random(n) < 0.6, target[0], start[:n])
         start[1:n] *= rng.random(max(n - 1, 0)) < (0.3 if trial % 2 else 1.0)
         if trial % 3:
-            start[n] = abs(start[n])
+            start[n:] = abs(start[n:])
         starts.append(start)
     return starts
 
@@ -242,10 +328,11 @@ def compute_state_matrices(
         parts = [casadi.substitute(part, e.spread, level) for part in parts]
     jacobians = casadi.Function("jacobians", [e.t, e.x, e.u, e.p], parts)
     a, b, c, d = (np.asarray(casadi.DM(m), float) for m in
-                  jacobians(0.0, list(at.states), at.input, e.values))  # fmt: skip
+                  jacobians(0.0, list(at.states), at.inputs, e.values))  # fmt: skip
     if not all(np.isfinite(m).all() for m in (a, b, c, d)):
         raise ModelCannotRun(
-            f"{e.name} has no derivative at states {at.states}, input {at.input:g}: the point is "
+            f"{e.name} has no derivative at states {at.states}, input "
+            f"{', '.join(f'{v:g}' for v in at.inputs)}: the point is "
             "outside its domain or on a corner; choose another operating point"
         )
     return a, b, c, d
@@ -268,8 +355,8 @@ def linearize(plant: Any, at: OperatingPoint, *, states: bool = False) -> Any:
     Parameters
     ----------
     plant : control.NonlinearIOSystem, control.StateSpace or control.TransferFunction
-        Plant with one input and one output; discrete plants give discrete transfer functions.
-    at : OperatingPoint
+        The plant; discrete plants give discrete models.
+    at : OperatingPoint or control.OperatingPoint
         The point, from `operating_point` or given directly.
     states : bool, optional
         Whether to keep the states of the plant, all of them and in their order.
@@ -277,8 +364,9 @@ def linearize(plant: Any, at: OperatingPoint, *, states: bool = False) -> Any:
     Returns
     -------
     control.TransferFunction or control.StateSpace
-        From the deviation of the input to the deviation of the output; with ``states=True`` a
-        state-space model of the deviations of the plant's states, under their names.
+        From the deviation of the input to the deviation of the output; with ``states=True``, and
+        for a plant with several inputs or outputs, a state-space model of the deviations of the
+        plant's states, under their names, as `control.lqr` needs it.
 
     Raises
     ------
@@ -303,25 +391,27 @@ def linearize(plant: Any, at: OperatingPoint, *, states: bool = False) -> Any:
     ['x', 'v']
     """
     check_arguments(linearize, locals())
-    if not isinstance(at, OperatingPoint):
+    if not isinstance(at, OperatingPoint | ct.OperatingPoint):
         raise CtrlidError(
             f"linearize needs an OperatingPoint, as operating_point() returns; given "
             f"{type(at).__name__}"
         )
     equations = trace(plant)
-    require_siso(equations)
-    matrices = compute_state_matrices(equations, at)
-    dt = equations.dt if equations.dt else 0
-    labels: dict[str, Any] = {
-        "name": f"{equations.name}_linear", "inputs": list(equations.inputs),
-        "outputs": list(equations.outputs),
-    }  # fmt: skip
-    if states:
-        # python-control keeps dots for the names of systems.
-        names = [name.replace(".", "_") for name in equations.states]
-        return ct.ss(*matrices, dt, states=names, **labels)
-    (num,), den = to_polynomials(*_reduce_to_minimal(*matrices))
-    return ct.tf(num, den, dt, **labels)
+    at = as_operating_point(at, equations, equations.inputs)
+    if states or not equations.siso:
+        return make_state_space(equations, at)
+    (num,), den = to_polynomials(*_reduce_to_minimal(*compute_state_matrices(equations, at)))
+    return ct.tf(num, den, equations.dt if equations.dt else 0, name=f"{equations.name}_linear",
+                 inputs=list(equations.inputs), outputs=list(equations.outputs))  # fmt: skip
+
+
+def make_state_space(equations: Equations, at: OperatingPoint) -> Any:
+    """Return the linear model of a plant at a point with all its states, and its names."""
+    e = equations
+    # python-control keeps dots for the names of systems.
+    names = [name.replace(".", "_") for name in e.states]
+    return ct.ss(*compute_state_matrices(e, at), e.dt if e.dt else 0, name=f"{e.name}_linear",
+                 states=names, inputs=list(e.inputs), outputs=list(e.outputs))  # fmt: skip
 
 
 def _reduce_to_minimal(a: Array, b: Array, c: Array, d: Array) -> tuple[Array, Array, Array, Array]:

@@ -143,16 +143,9 @@ def trace(system: Any) -> Equations:
         return system
     if isinstance(system, ct.TransferFunction) and system.issiso() and _is_proper(system):
         return _trace_transfer_function(system)
-    if isinstance(system, ct.TransferFunction) and system.noutputs == 1:
+    if isinstance(system, ct.TransferFunction):
         system = ct.ss(*to_state_matrices(system), system.dt, name=system.name,
                        inputs=system.input_labels, outputs=system.output_labels)  # fmt: skip
-    if isinstance(system, ct.TransferFunction):
-        try:
-            system = ct.ss(system, name=system.name, inputs=system.input_labels,
-                           outputs=system.output_labels)  # fmt: skip
-        except (NotImplementedError, ValueError) as reason:
-            raise CtrlidError(f"{system.name} cannot be made a state space by python-control: "
-                              f"{reason}. Give it as a control.StateSpace") from reason  # fmt: skip
     if not isinstance(system, ct.NonlinearIOSystem):
         raise CtrlidError(
             f"a plant is a control.NonlinearIOSystem (ct.nlsys), a StateSpace or a "

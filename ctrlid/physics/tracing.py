@@ -236,7 +236,9 @@ def rebind(function: Any, memo: dict[int, Any] | None = None) -> Any:
         if isinstance(call, types.FunctionType):
             return types.MethodType(rebind(call, memo), _Instance(function))
         return function
-    if function.__module__ and function.__module__.partition(".")[0] in ("numpy", "control"):
+    library = (function.__module__ or "").partition(".")[0]
+    # Of python-control, functions made for one system (an estimator, a state feedback) are traced.
+    if library == "numpy" or (library == "control" and "<locals>" not in function.__qualname__):
         return function
     scope: dict[str, Any] = {**function.__globals__, "__builtins__": _BUILTINS}
     cells = [types.CellType() for _ in function.__closure__ or ()]

@@ -7,7 +7,7 @@ import numpy as np
 
 from .._base import text as _text
 from .._base.errors import CtrlidError
-from ..data.record import SIGNALS, Record
+from ..data.record import Record, list_rows
 from ..design.redesigning import Redesign
 from ..diagnosis import wording
 from ..diagnosis.result import Diagnosis
@@ -134,12 +134,9 @@ def make_blocks(result: Any) -> list[Block]:
 
 
 def _make_record_table(record: Record) -> Table:
-    channels = [(record.names.get(k, k), record.units.get(k, ""), getattr(record, k))
-                for k in SIGNALS if getattr(record, k) is not None]  # fmt: skip
-    channels += [(k, record.units.get(k, ""), v) for k, v in record.extra.items()]
     rows = tuple(
         (name, unit or "not given", *(f"{f(v):.6g}" for f in (np.min, np.mean, np.max, np.std)))
-        for name, unit, v in channels
+        for _, name, unit, v in list_rows(record)
     )
     valid = "" if record.valid.all() else f", {100 * record.valid.mean():.1f} % of them valid"
     between = BETWEEN[record.hold]

@@ -13,6 +13,7 @@ from .._base.arrays import Array
 from .._base.errors import CtrlidError, CtrlidWarning, EffectDoesNotApply, ModelCannotRun
 from .._base.periods import have_same_period, write_both_periods, write_difference
 from .._base.rounding import keep_numpy_quiet
+from .._base.signals import require_one_signal
 from .._base.text import write_number
 from ..data.record import Record
 from ..data.several_records import order_model_and_data
@@ -92,6 +93,7 @@ def compare(record: Record, model_or_loop: Any, *, horizon: int | None = None) -
             "compare needs a Record and a model; given "
             f"{type(record).__name__} and {type(model_or_loop).__name__}"
         )
+    require_one_signal("compare", model_or_loop, record)
     if horizon is not None and not (isinstance(horizon, Integral) and 1 <= horizon < len(record)):
         raise CtrlidError(
             f"horizon must be between 1 and {len(record) - 1} samples; given {horizon}"

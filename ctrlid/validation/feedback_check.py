@@ -10,6 +10,7 @@ from .._base.arguments import check_arguments
 from .._base.arrays import Array, freeze_arrays
 from .._base.errors import CtrlidError
 from .._base.rounding import keep_numpy_quiet
+from .._base.signals import require_one_signal
 from .._base.statistics import robust_deviation
 from .._base.text import Printed, write_count
 from ..data.record import Record
@@ -122,6 +123,7 @@ def check_feedback(record: Record) -> FeedbackCheck:
     check_arguments(check_feedback, locals())
     if not isinstance(record, Record):
         raise CtrlidError(f"check_feedback needs a Record; given {type(record).__name__}")
+    require_one_signal("check_feedback", record)
     found = _find_feedback(record)
     if not found.closed_loop:
         return found

@@ -13,6 +13,7 @@ from .._base.arrays import Array, freeze_arrays
 from .._base.criterion import bayesian_penalty
 from .._base.errors import CtrlidError
 from .._base.rounding import keep_numpy_quiet
+from .._base.signals import require_one_signal
 from .._base.statistics import regress
 from .._base.text import Printed
 from ..data.record import Record
@@ -161,6 +162,7 @@ def select_order(
     check_arguments(select_order, locals(), "record", "na", "nb", "nk")
     if not isinstance(record, Record):
         raise CtrlidError(f"select_order needs a Record; given {type(record).__name__}")
+    require_one_signal("select_order", record)
     grids = [
         _check_whole_numbers(name, values) for name, values in (("na", na), ("nb", nb), ("nk", nk))
     ]

@@ -10,6 +10,7 @@ import numpy as np
 
 from .._base.errors import CtrlidError
 from .._base.rounding import keep_numpy_quiet
+from .._base.signals import require_one_signal
 from .._base.text import Printed, write_count, write_percent
 from ..data.record import SIGNALS, Record
 from ..data.several_records import order_model_and_data
@@ -167,6 +168,7 @@ def audit(record: Record, loop: Loop | None = None) -> Audit:
             "audit needs a Record and, optionally, its Loop; given "
             f"{type(record).__name__} and {type(loop).__name__}. Audit several records one by one"
         )
+    require_one_signal("audit", record, loop)
     count = int(np.count_nonzero(record.valid))
     if count < 2:
         text = f"the record has {write_count(count, 'valid sample')}. Record longer."

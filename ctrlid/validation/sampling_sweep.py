@@ -11,6 +11,7 @@ from .._base.arguments import check_arguments
 from .._base.errors import CtrlidError, CtrlidWarning, ModelCannotRun
 from .._base.jobs import check_jobs, share_out
 from .._base.rounding import keep_numpy_quiet
+from .._base.signals import require_one_signal
 from .._base.text import write_list, write_percent
 from ..data.record import Record
 from ..estimation.constraints import AbstractConstraint
@@ -174,6 +175,7 @@ def _as_list(constraints: Any) -> Sequence[AbstractConstraint]:
 def _choose_factors(record: Any, periods: Sequence[float] | None) -> list[int]:
     if not isinstance(record, Record):
         raise CtrlidError(f"sweep_sampling_period needs one Record; given {type(record).__name__}")
+    require_one_signal("sweep_sampling_period", record)
     if periods is None:
         return [q for q in FACTORS if q == 1 or record.n // q >= FEWEST]
     ratios = np.asarray(periods, dtype=float) / record.dt

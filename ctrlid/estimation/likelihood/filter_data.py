@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 from typing import Any
 
+import casadi
 import numpy as np
 
 from ..._base.arrays import Array
@@ -11,7 +12,9 @@ from ..._base.periods import have_same_period, write_both_periods, write_differe
 from ..._base.units import fill_unit
 from ...data.reconstruction import count_pieces, reconstruct_signal
 from ...data.record import Record
+from ...data.validity import find_runs
 from ...loop.loop import Loop
+from ...loop.wiring import match_signals, stack_references
 from ...physics.equations import Equations
 from ...physics.linearization import compute_state_matrices
 
@@ -31,18 +34,22 @@ class FilterData:
         The record.
     t, u, r, y : ndarray, shape (n,)
         Time since the start of the experiment [s], input, reference (without one the output) and
-        output, each held where the record is not valid.
+        output, each held where the record is not valid. Several signals have shape (n, signals).
     path : ndarray, shape (n,) or (n * PIECES,)
         The input between the corners of which it runs straight: u itself, or for a band-limited
         one closer points.
     valid, restart : ndarray of bool, shape (n,)
-        Samples that are valid; samples at which the filter starts anew.
+        Samples that are valid, of shape (n, outputs) for several outputs; samples at which the
+        filter starts anew.
     input_variance : ndarray, shape (n,)
         Variance of the input, relative to that of the sensor noise.
     start, spread : ndarray, shapes (states,), (states, states)
         State at a start, and its covariance relative to the variance of the sensor noise.
     scale : float
-        Standard deviation of the sensor noise, roughly [output unit].
+        Standard deviation of the sensor noise, roughly [output unit]; of several outputs that of
+        the first.
+    scales : ndarray, shape (outputs,)
+        The same for each of several outputs.
     """
 
     record: Record
@@ -57,11 +64,12 @@ class FilterData:
     start: Array
     spread: Array
     scale: float
+    scales: Array
 
     @property
     def usable(self) -> Any:
         """Samples that are valid and no start."""
-        return self.valid & ~self.restart
+        return self.valid & ~(self.restart if self.valid.ndim == 1 else self.restart[:, None])
 
 
 def make_filter_data(loop: Loop, record: Record, start_time: float = 0.0) -> FilterData:
@@ -85,6 +93,8 @@ def make_filter_data(loop: Loop, record: Record, start_time: float = 0.0) -> Fil
         both = write_both_periods("the loop is sampled", loop.dt, "the record", record.dt)
         raise CtrlidError(f"{both}; give both the same period: "
                           f"{write_difference(loop.dt, record.dt)}")  # fmt: skip
+    if not loop.equations().siso:
+        return _make_several(loop, record, start_time)
     # The copy is writable as all other arrays are, so that the filter is compiled only once.
     valid = np.array(record.valid)
     if np.count_nonzero(valid) < FEWEST:
@@ -112,11 +122,55 @@ def make_filter_data(loop: Loop, record: Record, start_time: float = 0.0) -> Fil
         start,
         spread,
         scale,
+        np.array([scale]),
     )
 
 
-def find_noise_units(loop: Loop, record: Record) -> tuple[str, str]:
-    """Return the units of sensor noise and of force noise, empty where they are not known."""
+def can_follow_controller(loop: Loop, record: Record) -> bool:
+    """Return whether a known analog controller tells how the input runs between samples."""
+    wiring = loop.wiring
+    known = record.r is not None or (wiring is not None and None not in wiring.held)
+    return known and loop.analog
+
+
+def _make_several(loop: Loop, record: Record, start_time: float) -> FilterData:
+    """Make a record of several signals ready; see `make_filter_data`."""
+    e, wiring = loop.equations(), loop.wiring
+    record = match_signals(record, e)
+    n = len(record)
+    valid = np.array(record.valid_outputs.T)
+    if np.any(valid.sum(axis=0) < FEWEST):
+        raise ModelCannotRun(
+            f"a prediction needs at least {FEWEST} valid samples of each output; the record has "
+            f"{valid.sum(axis=0).tolist()} of {n}"
+        )
+    seen = valid.any(axis=1)
+    last = np.maximum.accumulate(np.where(seen, np.arange(n), 0))
+    each = np.maximum.accumulate(np.where(valid, np.arange(n)[:, None], 0), axis=0)
+    y = np.take_along_axis(np.reshape(record.y, (-1, n)).T, each, axis=0)
+    u = np.ascontiguousarray(np.reshape(record.u, (-1, n)).T[last])
+    r = np.zeros((n, 1))
+    if wiring is not None and can_follow_controller(loop, record):
+        r = stack_references(wiring, record.r, record.signals.get("r"), n)[0].T[last]
+    start, spread, scales = _guess_several_states(loop, record)
+    # An input that was not logged may be anything that it was elsewhere.
+    input_variance = np.where(seen, 0.0, 1.0 / scales[0] ** 2)
+    t = start_time + record.t - record.start
+    path = u
+    if count_pieces(record.hold) > 1:
+        path = np.column_stack([reconstruct_signal(column) for column in u.T])
+    return FilterData(record, t, u, r, np.ascontiguousarray(y), path, valid,
+                      find_segment_starts(loop, record), input_variance, start, spread,
+                      float(scales[0]), scales)  # fmt: skip
+
+
+def find_noise_units(loop: Loop, record: Record) -> tuple[Any, Any]:
+    """Return the units of sensor noise and of force noise, empty where they are not known.
+
+    Of several outputs and forces, tuples of them.
+    """
+    if not loop.equations().siso:
+        return _find_several_units(loop, record)
     of_plant = loop.known_units.get(loop.equations().outputs[0], "")
     unit = record.units.get("y", "") or of_plant
     if unit in ("", "1"):
@@ -125,9 +179,22 @@ def find_noise_units(loop: Loop, record: Record) -> tuple[str, str]:
     return unit, fill_unit("{y}/s^2", {"y": unit}) if loop.equations().velocities else ""
 
 
+def _find_several_units(loop: Loop, record: Record) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    e, known = loop.equations(), loop.known_units
+    given = record.units.get("y", "")
+    sensors = tuple(
+        (given[k] if isinstance(given, tuple) else given) or known.get(name, "")
+        for k, name in enumerate(e.outputs)
+    )
+    rates = [known.get(e.states[j], "") for j in e.velocities]
+    alone = [f"{unit}/s" if unit else "" for unit in rates] or [""]
+    return sensors, tuple(e.push_units) or tuple(alone)
+
+
 def prepare_for_loop(data: FilterData, loop: Loop) -> FilterData:
     """Return data made ready for another model of the same loop; the signals are shared."""
-    start, spread, _ = _guess_initial_state(loop, data.record)
+    guess = _guess_initial_state if loop.equations().siso else _guess_several_states
+    start, spread, _ = guess(loop, data.record)
     return replace(data, restart=find_segment_starts(loop, data.record), start=start, spread=spread)
 
 
@@ -140,7 +207,8 @@ def find_segment_starts(loop: Loop, record: Record) -> Any:
     bridge = BRIDGE if fastest <= 1 else min(BRIDGE, int(np.log(1.5) / np.log(fastest)))
     restart = np.zeros(len(record), dtype=bool)
     last = -BRIDGE - 1
-    for first, stop in record.segments():
+    seen = record.valid_outputs.any(axis=0)
+    for first, stop in zip(*find_runs(seen), strict=True):
         if first - last > bridge:
             restart[max(last, 0) : first + 1] = True
         last = stop
@@ -166,6 +234,39 @@ def _guess_initial_state(loop: Loop, record: Record) -> tuple[Array, Array, floa
     for j in e.velocities:
         wide[j] = speed
     return np.array(rest), np.diag((np.array(wide) / noise) ** 2), noise
+
+
+def _guess_several_states(loop: Loop, record: Record) -> tuple[Array, Array, Array]:
+    """Return an initial state, its covariance and the rough sensor noise of several outputs.
+
+    The covariance is relative to the sensor noise of the first output. A state that outputs show is
+    as uncertain as they are wide, a velocity as its position moves.
+    """
+    e, at = loop.equations(keep=True), loop.point
+    ys = np.reshape(record.y, (len(e.outputs), -1))
+    rest = np.array(find_rest_state(loop, e))
+    # Wide against every kink: only what the outputs show is needed here.
+    _, _, c, _ = compute_state_matrices(e, replace(at, states=tuple(rest)), spread=1e6)
+    wide, moving = np.zeros(len(rest)), np.zeros(len(rest))
+    scales = np.zeros(len(ys))
+    for k, (y, use, middle) in enumerate(zip(ys, record.valid_outputs, at.outputs, strict=True)):
+        seen = y[use]
+        reach = float(np.std(seen)) + abs(float(np.mean(seen)) - middle)
+        # Third differences leave little of a smooth output.
+        noise = float(np.std(np.diff(seen, 3))) / np.sqrt(20)
+        scales[k] = max(noise, 1e-9 * max(abs(middle), reach), 1e-300)
+        speed = max(float(np.std(np.diff(seen))) / record.dt, scales[k] / record.dt)
+        shown = np.abs(c[k]) > 1e-9 * np.max(np.abs(c[k]), initial=0.0)
+        with np.errstate(divide="ignore"):
+            wide = np.where(shown, np.maximum(wide, max(reach, scales[k]) / np.abs(c[k])), wide)
+            moving = np.where(shown, np.maximum(moving, speed / np.abs(c[k])), moving)
+    for j in e.velocities:
+        rates = [i for i in range(len(rest)) if i != j and casadi.is_equal(e.rhs[i], e.x[j], 2)]
+        wide[j] = max(wide[j], *(moving[i] for i in rates), 0.0)
+    # What no output shows directly is as wide as the widest, whatever its unit.
+    wide = np.where(wide > 0, wide, 10 * max(float(wide.max()), float(np.max(np.abs(rest)))))
+    wide = np.maximum(wide, 0.1 * np.abs(rest))
+    return rest, np.diag((wide / scales[0]) ** 2), scales
 
 
 def find_rest_state(loop: Loop, e: Equations) -> tuple[float, ...]:

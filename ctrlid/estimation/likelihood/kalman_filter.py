@@ -50,6 +50,8 @@ class Noise:
     ar, ma : tuple of float
         Coefficients of coloured sensor noise,
         ``n[k] = ar[0] n[k-1] + ... + w[k] + ma[0] w[k-1] + ...``; white if both are empty.
+    sensors : tuple of float
+        Variances of the sensor noise of all further outputs, relative to that of the first.
     tails : Tails or None
         Heavy tails of the sensor noise; None: it is Gaussian.
     """
@@ -60,11 +62,12 @@ class Noise:
     ar: tuple[float, ...] = ()
     ma: tuple[float, ...] = ()
     tails: Tails | None = None
+    sensors: tuple[float, ...] = ()
 
     @property
     def plain(self) -> "Noise":
         """The noise without its colours, of force and sensor."""
-        return Noise(self.force, tails=self.tails)
+        return Noise(self.force, tails=self.tails, sensors=self.sensors)
 
     @property
     def is_coloured(self) -> bool:
@@ -90,7 +93,11 @@ class Noise:
 
 @dataclass(frozen=True, eq=False)
 class Filtered:
-    """What one pass of the filter gives; variances are relative to the sensor noise's."""
+    """What one pass of the filter gives; variances are relative to the sensor noise's.
+
+    Of several outputs innovations and variances have shape (n, outputs), and that of each output is
+    given those of the same sample before it.
+    """
 
     innovations: Array
     variance: Array
@@ -106,6 +113,8 @@ def run_filter(
     """Run the filter along a linearized plant, with sensitivities to its first columns."""
     p = len(plant.index) if columns is None else columns
     p = p if sensitive else 0
+    if lin.output.ndim == 2:
+        return _run_several(data, lin, noise, p)
     n, white, tails = plant.size, noise.sensor_is_white, noise.tails
     force = np.asarray(noise.force, dtype=float)
     if not white:
@@ -129,6 +138,85 @@ def run_filter(
         sensor = np.sqrt(square)
     return Filtered(error, variance, Trajectory(before, after, wide * sensor), slopes,
                     disturbance)  # fmt: skip
+
+
+def predict_outputs(data: FilterData, lin: Linearized, noise: Noise) -> tuple[Array, Array]:
+    """Return errors and variances of each output predicted from the samples before, (n, outputs).
+
+    In one pass only the first output is predicted without those of its own sample.
+    """
+    q = lin.output.shape[1]
+    scale = np.array([1.0, *noise.sensors])
+    errors, variances = [], []
+    for k in range(q):
+        order = [k, *(i for i in range(q) if i != k)]
+        turned = replace(lin, output=lin.output[:, order], c=lin.c[:, order], hp=lin.hp[:, order])
+        moved = replace(data, y=data.y[:, order], valid=data.valid[:, order])
+        out = _run_several(moved, turned, replace(noise, sensors=()), 0, scale[order])
+        errors.append(out.innovations[:, 0])
+        variances.append(out.variance[:, 0])
+    return np.column_stack(errors), np.column_stack(variances)
+
+
+def _run_several(
+    data: FilterData, lin: Linearized, noise: Noise, p: int, sensors: Array | None = None
+) -> Filtered:
+    r"""Run the filter over several outputs, one after another as if each had a sample of its own.
+
+    Sensor noises are independent, so that the outputs of a sample update the state in turn. Between
+    them the state stands still, and a coloured force forgets so little that it has its memory
+    over a whole period, :math:`\rho^{1/q}` in each of q updates.
+    """
+    size, q = lin.output.shape
+    each = _list_updates(lin)
+    scale = np.sqrt([1.0, *noise.sensors] if sensors is None else sensors)
+    memory = noise.memory ** (1 / q)
+    states = lin.step.shape[1]
+    restart = np.zeros((size, q), dtype=bool)
+    restart[:, 0] = data.restart
+    unsure = np.zeros((size, q))
+    unsure[:, -1] = lin.input_variance
+    check_budget()
+    error, variance, before, after, wide, slopes, disturbance = filter_pass(
+        each.step, each.a, each.b, each.du, np.ascontiguousarray(each.dp[:, :, :p]),
+        (lin.output / scale).ravel(), (lin.c / scale[:, None]).reshape(size * q, states),
+        np.ascontiguousarray((lin.hp[:, :, :p] / scale[:, None]).reshape(size * q, p)),
+        each.trajectory.predicted, each.trajectory.filtered, (data.y / scale).ravel(),
+        data.valid.ravel(), restart.ravel(), unsure.ravel(), lin.start, lin.spread, 1.0,
+        GAUSSIAN, np.asarray(noise.force, dtype=float), memory, noise.coloured * (1 - memory**2),
+        (0,) * states, (0,) * (states + bool(noise.drift > 0)),
+    )  # fmt: skip
+    error, variance = error.reshape(size, q) * scale, variance.reshape(size, q) * scale**2
+    # The caller reports a filter that lost the record, so that no warning is needed here.
+    with np.errstate(all="ignore"):
+        sensor = np.sqrt(np.mean((error**2 / variance)[data.usable]))
+    trajectory = Trajectory(before[::q], after[q - 1 :: q], wide[q - 1 :: q] * sensor)
+    return Filtered(error, variance, trajectory, slopes.reshape(size, q, p) * scale[:, None],
+                    disturbance[q - 1 :: q])  # fmt: skip
+
+
+@lru_cache(maxsize=8)
+def _list_updates(lin: Linearized) -> Linearized:
+    """Return the plant with a sample for each output, of which only the last one moves the state.
+
+    A search for the noise filters the same plant many times, so that the last ones are kept.
+    """
+    size, q = lin.output.shape
+
+    def spread_out(values: Array, still: Any) -> Array:
+        """Return what stands still at all outputs of a sample but the last."""
+        out = np.empty((size, q, *values.shape[1:]))
+        out[:] = still
+        out[:, -1] = values
+        return out.reshape(size * q, *values.shape[1:])
+
+    at, before = lin.trajectory, lin.trajectory.predicted[:, None]
+    every = np.repeat(at.predicted, q, axis=0)
+    return replace(
+        lin, step=spread_out(lin.step, before), a=spread_out(lin.a, np.eye(lin.a.shape[1])),
+        b=spread_out(lin.b, 0.0), du=spread_out(lin.du, 0.0), dp=spread_out(lin.dp, 0.0),
+        trajectory=Trajectory(every, spread_out(at.filtered, before), every),
+    )  # fmt: skip
 
 
 def append_sensor_noise(lin: Linearized, force: Array, noise: Noise) -> tuple[Linearized, Array]:
@@ -204,6 +292,14 @@ def compute_memory(noise: Noise, samples: int) -> float:
 
 def choose_settled_samples(data: FilterData, out: Filtered) -> Any:
     """Return the usable samples whose prediction does not depend on the start."""
+    if data.valid.ndim == 2:
+        columns = [
+            choose_settled_samples(
+                replace(data, valid=data.valid[:, k]), replace(out, variance=out.variance[:, k])
+            )
+            for k in range(data.valid.shape[1])
+        ]
+        return np.column_stack(columns)
     known = data.valid & np.isfinite(out.variance)
     return (
         known
@@ -216,18 +312,19 @@ def guess_trajectory(plant: SampledPlant, data: FilterData) -> Trajectory:
     """Return a trajectory to begin with: at rest, states that are measured as measured."""
     n, e = len(data.record), plant.e
     rest = np.tile(plant.pad_controller_states(data.start), (n, 1))
-    seen, values = e.output, data.y
-    # The state of a sensor's lag is nearly equal to what it follows.
-    for _ in range(1 + len(e.lags)):
-        columns = casadi.jacobian(seen, e.x).sparsity().get_col()
-        if len(columns) != 1 or casadi.depends_on(seen, casadi.vertcat(e.t, e.u)):
-            break
-        j = columns[0]
-        rest[:, j] = values = _invert_sensor(plant, seen, e.x[j], float(rest[0, j]), values)
-        behind = [lag.target for lag in e.lags if lag.state == j]
-        if not behind:
-            break
-        seen = behind[0]
+    for row, column in zip(casadi.vertsplit(e.output), np.reshape(data.y, (n, -1)).T, strict=True):
+        seen, values = row, column
+        # The state of a sensor's lag is nearly equal to what it follows.
+        for _ in range(1 + len(e.lags)):
+            columns = casadi.jacobian(seen, e.x).sparsity().get_col()
+            if len(columns) != 1 or casadi.depends_on(seen, casadi.vertcat(e.t, e.u)):
+                break
+            j = columns[0]
+            rest[:, j] = values = _invert_sensor(plant, seen, e.x[j], float(rest[0, j]), values)
+            behind = [lag.target for lag in e.lags if lag.state == j]
+            if not behind:
+                break
+            seen = behind[0]
     for lag in e.lags:
         if casadi.is_equal(lag.target, e.u, 2):
             rest[:, lag.state] = data.u
@@ -291,7 +388,8 @@ def converge_trajectory(
         out = run_filter(plant, data, lin, noise, sensitive=False)
         change = np.abs(out.trajectory.filtered - at.filtered)
         if not np.isfinite(out.innovations).all() or not np.isfinite(change).all():
-            k = int(np.argmin(np.isfinite(out.innovations)))
+            lost = ~np.isfinite(out.innovations).reshape(len(change), -1).all(axis=1)
+            k = int(np.argmax(lost))
             raise ModelCannotRun(
                 f"the Kalman filter of {plant.e.name} diverges at sample {k} "
                 f"(t = {data.record.t[k]:.4g} s): the model contradicts the record there. Check "
@@ -313,7 +411,8 @@ def _linearize_inside_domain(
     if not bad.any():
         lin = plant.linearize(data, theta, at)
         bad = ~(np.isfinite(lin.step).all(axis=1) & np.isfinite(lin.a).all(axis=(1, 2))
-                & np.isfinite(lin.output) & np.isfinite(lin.c).all(axis=1))  # fmt: skip
+                & np.isfinite(lin.output.reshape(len(bad), -1)).all(axis=1)
+                & np.isfinite(lin.c.reshape(len(bad), -1)).all(axis=1))  # fmt: skip
         if not bad.any():
             return at, lin
     rest = guess_trajectory(plant, data)

@@ -12,7 +12,7 @@ from ..._base.arrays import Array
 from ..._base.statistics import pseudo_inverse
 from ...data.record import Record
 from ...loop.loop import Loop
-from .filter_data import FilterData, make_filter_data
+from .filter_data import FilterData, can_follow_controller, make_filter_data
 from .kalman_filter import Filtered, Noise, run_filter
 from .sampled_plant import Linearized, SampledPlant, Trajectory, make_sampled_plant
 from .tails import compute_information_shares
@@ -88,7 +88,7 @@ def make_problem(
     bounds = list_parameter_bounds(loop, names)
     start_times = start_times or [0.0] * len(records)
     data = tuple(make_filter_data(loop, r, b) for r, b in zip(records, start_times, strict=True))
-    follow = records[0].r is not None and loop.analog
+    follow = can_follow_controller(loop, records[0])
     plant = make_sampled_plant(
         loop, tuple(names), records[0].hold, follow, records[0].hold_r if follow else "zoh"
     )
@@ -298,7 +298,9 @@ def _evaluate_at_scale(
             r = float(problem.known.sensor[k])
         else:
             usual = mean if tails is None else tails.find_scale(squares, tails.scale)
-            least = LEAST_SENSOR_SHARE * float(np.var(data.y[keep]) + np.mean(data.y[keep]) ** 2)
+            # Of several outputs the first has this variance, the others have it times a ratio.
+            y = data.y[keep] if keep.ndim == 1 else data.y[keep[:, 0], 0]
+            least = LEAST_SENSOR_SHARE * float(np.var(y) + np.mean(y) ** 2)
             r = max(usual, least, 1e-300)
         if tails is None:
             value -= 0.5 * (len(e) * (math.log(2 * math.pi * r) + mean / r) + np.sum(np.log(s)))

@@ -21,7 +21,7 @@ from .kalman_filter import (
 from .likelihood import Fit, Problem, evaluate_likelihood, list_start_values, relinearize_fit
 from .noise_fit import (
     LOG_STEP,
-    choose_noise_ratio,
+    choose_force_ratios,
     compute_noise_criterion,
     compute_noise_logs,
     fit_noise,
@@ -116,7 +116,11 @@ def _begin_beside_effects(problem: Problem, theta: Array, noise: Noise | None) -
 
 def _begin_with_noise(problem: Problem, theta: Array, noise: Noise | None) -> Fit:
     plant = problem.plant
-    first = noise or Noise((choose_noise_ratio(plant) ** 2 * 1e-2,) * plant.channels)
+    scales = problem.data[0].scales
+    first = noise or Noise(
+        tuple(float(v) ** 2 * 1e-2 for v in choose_force_ratios(problem)),
+        sensors=tuple((float(scale) / float(scales[0])) ** 2 for scale in scales[1:]),
+    )
     guessed = []
     for data in problem.data:
         at = guess_trajectory(plant, data)
@@ -194,7 +198,7 @@ def refit_noise_size(fit: Fit) -> Fit:
 
 def choose_noise(fit: Fit, always: bool = False) -> Fit:
     """Add a coloured force if the Bayesian information criterion wants it."""
-    if fit.known is not None:
+    if fit.known is not None or (fit.noise.sensors and not always):
         return fit
     try:
         richer = try_coloured_force(fit)

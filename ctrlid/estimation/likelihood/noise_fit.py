@@ -61,14 +61,14 @@ def fit_noise(
         return -value if np.isfinite(value) else 1e15
 
     longest = max(len(data.record) for data in problem.data)
-    low, high = (ends[: len(start)] for ends in _bound_logs(plant, noise, longest))
+    low, high = (ends[: len(start)] for ends in _bound_logs(problem, noise, longest))
     start = np.clip(start, low, high)
     if wide:
+        # Several forces are in the same proportion to what is usual for each.
+        apart, rest = low[: plant.channels] - low[0], start[plant.channels :]
         grid = np.linspace(low[0], high[0], 20)
-        best = grid[
-            int(np.argmin(_evaluate_costs(cost, [np.full(plant.channels, g) for g in grid])))
-        ]
-        start[: plant.channels] = best
+        points = [np.append(np.full(plant.channels, g) + apart, rest) for g in grid]
+        start = points[int(np.argmin(_evaluate_costs(cost, points)))]
     fit = evaluate_linearized(
         problem, theta, at(_minimize_by_newton(cost, start, low, high, enough)), lins
     )
@@ -121,6 +121,24 @@ def choose_noise_ratio(plant: SampledPlant) -> float:
     return 1.0 / plant.loop.dt ** (2 if plant.e.velocities else 1)
 
 
+def choose_force_ratios(problem: Problem) -> Array:
+    """Return the reference ratio of each random force to the sensor noise of the first output.
+
+    Of several outputs a force is compared with that on which it shows most: it moves it within a
+    period by as much as its own sensor noise.
+    """
+    plant = problem.plant
+    e, _dt = plant.e, plant.loop.dt
+    if e.siso:
+        return np.full(plant.channels, choose_noise_ratio(plant))
+    scales = problem.data[0].scales
+    a, b, c = plant.linearize_at_rest()
+    # The output moves at once, or else after one period more, where a force changes its rate.
+    moved = np.abs(c @ b) + np.abs(c @ a @ b)
+    shares = moved / (scales / scales[0])[:, None]
+    return np.asarray(1.0 / np.maximum(np.max(shares, axis=0), 1e-300))
+
+
 def compute_noise_logs(noise: Noise, dt: float) -> Array:
     """Return what is searched: logarithms of variances and of the coloured force's time, angles.
 
@@ -128,7 +146,7 @@ def compute_noise_logs(noise: Noise, dt: float) -> Array:
     autoregression, which keeps it stationary, and sin of those of its moving average, which
     reaches the zeros on the unit circle that an average over several samples has.
     """
-    logs = list(np.log(noise.force))
+    logs = [*np.log(noise.force), *np.log(noise.sensors)]
     if noise.drift:
         logs += [math.log(noise.coloured), math.log(-dt / math.log(noise.memory))]
     logs += np.arctanh(_compute_reflections(noise.ar)).tolist()
@@ -141,13 +159,15 @@ def make_noise(logs: Array, like: Noise, dt: float) -> Noise:
     channels, p, q = len(like.force), len(like.ar), len(like.ma)
     force = tuple(np.exp(np.clip(logs[:channels], -300, 300)).tolist())
     ar, ma = np.tanh(logs[len(logs) - p - q : len(logs) - q]), np.sin(logs[len(logs) - q :])
+    further = channels + len(like.sensors)
     noise = Noise(force, ar=_make_coefficients(ar), ma=tuple(-v for v in _make_coefficients(ma)),
+                  sensors=tuple(np.exp(logs[channels:further]).tolist()),
                   tails=like.tails)  # fmt: skip
     if not like.drift:
         return noise
-    memory = math.exp(-dt / math.exp(min(max(logs[channels + 1], -50), 50)))
+    memory = math.exp(-dt / math.exp(min(max(logs[further + 1], -50), 50)))
     memory = min(max(memory, 1e-6), 1 - 1e-9)
-    drift = math.exp(min(max(logs[channels], -300), 300)) * (1 - memory**2)
+    drift = math.exp(min(max(logs[further], -300), 300)) * (1 - memory**2)
     return replace(noise, memory=memory, drift=drift)
 
 
@@ -169,14 +189,18 @@ def _compute_reflections(coefficients: Sequence[float]) -> Array:
     return np.array(found[::-1])
 
 
-def _bound_logs(plant: SampledPlant, noise: Noise, longest: int) -> tuple[Array, Array]:
+def _bound_logs(problem: Problem, noise: Noise, longest: int) -> tuple[Array, Array]:
     """Return bounds of the logarithms of the noise variances, and of the angles.
 
     A force that hardly changes during a record is an offset, not noise.
     """
-    unit, dt = 2 * math.log(choose_noise_ratio(plant)), plant.loop.dt
-    low, high = [unit + LEAST] * plant.channels, [unit + MOST] * plant.channels
+    units, dt = [2 * math.log(v) for v in choose_force_ratios(problem)], problem.plant.loop.dt
+    low, high = [unit + LEAST for unit in units], [unit + MOST for unit in units]
+    scales = problem.data[0].scales
+    usual = [2 * math.log(scale / scales[0]) for scale in scales[1 : 1 + len(noise.sensors)]]
+    low, high = [*low, *(v - MOST for v in usual)], [*high, *(v + MOST for v in usual)]
     if noise.drift:
+        unit = units[0]
         low += [unit + LEAST, math.log(2 * dt)]
         high += [unit + MOST, math.log(max(min(SLOWEST * longest, 2e4), 4.0) * dt)]
     # Sensor noise that is correlated over more than the record would be an offset.

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 from typing import Any
 
+import control as ct
 import numpy as np
 from scipy.stats import norm
 
@@ -12,7 +13,7 @@ from ..._base.criterion import bayesian_penalty
 from ..._base.errors import CtrlidError
 from ..._base.text import Printed, write_number, write_quantity
 from ...loop.loop import Loop
-from ...physics.linearization import operating_point
+from ...physics.linearization import make_state_space, operating_point
 from ..identified_model import compute_root_errors
 
 
@@ -30,10 +31,13 @@ class LoopEstimate(Printed):
         Their covariance [products of units], from the exact information matrix; infinite for what
         is not in the data.
     sensor_noise : tuple of float
-        Standard deviation of the white sensor noise in each record [output unit].
-    force_noise : float
+        Standard deviation of the white sensor noise in each record [output unit]; of several
+        outputs, a tuple for each record.
+    force_noise : float or tuple of float
         Standard deviation of the white acceleration that is held over each period
-        [output unit/s^2]; for a plant without a moving mass, of the noise on the states' rates.
+        [output unit/s^2]; for a plant without a moving mass, of the noise on the states' rates. For
+        a plant with several signals one for each velocity, in the unit of the force that works on
+        it (`Loop.forces`).
     coloured_force : float
         Standard deviation of the coloured acceleration [output unit/s^2]; zero: none was needed.
     force_time : float
@@ -54,15 +58,15 @@ class LoopEstimate(Printed):
     names: tuple[str, ...]
     values: Array
     covariance: Array
-    sensor_noise: tuple[float, ...]
-    force_noise: float
+    sensor_noise: tuple[Any, ...]
+    force_noise: Any
     coloured_force: float
     force_time: float
     log_likelihood: float
     n_samples: int
     active: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
-    units: tuple[str, str] = ("", "")
+    units: tuple[Any, Any] = ("", "")
 
     def __post_init__(self) -> None:
         freeze_arrays(self)
@@ -121,14 +125,21 @@ class LoopEstimate(Printed):
             )
             rows.append(f"  {name:<{width}} = {shown}{' (on its bound)' if bound else ''}")
         size, push = self.units
-        noise = ", ".join(_write_size(v, size) for v in self.sensor_noise)
+        noise = ", ".join(_write_sizes(v, size) for v in self.sensor_noise)
         rows.append(f"  standard deviation of the sensor noise: {noise}; of the white force: "
-                    f"{_write_size(self.force_noise, push)}")  # fmt: skip
+                    f"{_write_sizes(self.force_noise, push)}")  # fmt: skip
         if self.coloured_force:
             rows.append(f"  standard deviation of the coloured force: "
                         f"{_write_size(self.coloured_force, push)}, with a time constant of "
                         f"{write_number(self.force_time, 3)} s")  # fmt: skip
         return "\n".join([*rows, *(f"  note: {note}" for note in self.notes)])
+
+
+def _write_sizes(values: Any, units: Any) -> str:
+    """Return a size with its unit, or several with theirs."""
+    if not isinstance(values, tuple):
+        return _write_size(values, units)
+    return " and ".join(_write_size(v, u) for v, u in zip(values, units, strict=True))
 
 
 def _write_size(value: float, unit: str) -> str:
@@ -158,7 +169,7 @@ class LoopFit(Printed):
     @property
     def poles(self) -> Any:
         """The poles of `model`, in rad/s (in z for a plant in discrete time)."""
-        return np.roots(self.model.den[0][0]).astype(complex)
+        return np.roots(_find_denominator(self.model)).astype(complex)
 
     @property
     def poles_standard_errors(self) -> Array:
@@ -179,7 +190,8 @@ class LoopFit(Printed):
             ends = [
                 _linearize_at_rest(self.loop.with_parameters({name: value + d})) for d in (h, -h)
             ]
-            slopes.append((ends[0].den[0][0] - ends[1].den[0][0])[1:] / (2 * h))
+            above, below = (_find_denominator(end) for end in ends)
+            slopes.append((above - below)[1:] / (2 * h))
         slope = np.column_stack(slopes)
         lost = ~np.isfinite(estimate.standard_errors)
         if np.any(slope[:, lost] != 0):
@@ -191,8 +203,19 @@ class LoopFit(Printed):
         return f"{self.loop!r}\n{self.estimate}"
 
 
+def _find_denominator(model: Any) -> Any:
+    """Return the denominator of a linear model."""
+    return np.poly(model.A) if isinstance(model, ct.StateSpace) else model.den[0][0]
+
+
 def _linearize_at_rest(loop: Loop) -> Any:
     """Return the linear model at the loop's output, with input and states solved for anew."""
+    e = loop.equations()
+    if not e.siso:
+        # The outputs stay; the input that holds them there depends on the parameters.
+        if loop.effects or loop.linear_plant:
+            return loop.linearize()
+        return make_state_space(e, operating_point(e, output=loop.point.output, guess=loop.point))
     if not loop.linear_plant:
         assert loop.at is not None
         at = operating_point(loop.plant, output=loop.at.output, guess=loop.at)

@@ -105,6 +105,12 @@ def fit_loop(
     # A single reading far outside makes any Gaussian likelihood follow it and nothing else.
     masked = [mask_outliers(one) for one in given]
     records = [one for one, _ in masked]
+    if coloured and not loop.equations().siso:
+        raise CtrlidError(
+            "fit_loop fits a coloured random force to a loop with one input and one output; this "
+            f"one has outputs ({', '.join(loop.signals['y'])}). Leave out coloured=True: each "
+            "velocity has a white force of its own"
+        )
     problem = make_problem(loop, names, records)
     if free is not None:
         asked = replace(loop, free=free) if isinstance(free, Mapping) else loop
@@ -122,7 +128,8 @@ def fit_loop(
     fitted = summarize_fit(loop, fit)
     left_out = [describe_outliers(one, found)
                 for one, (_, found) in zip(given, masked, strict=True) if found.any()]  # fmt: skip
-    colour = note_coloured_innovations(fit.standardized, len(fit.theta), _TOO_NARROW)
+    innovations = [row for one in fit.standardized for row in np.atleast_2d(one.T)]
+    colour = note_coloured_innovations(innovations, len(fit.theta), _TOO_NARROW)
     notes = (*left_out, *fitted.estimate.notes, *colour, *_note_unknown_controller(loop, given))
     return replace(fitted, estimate=replace(fitted.estimate, notes=notes))
 
@@ -186,10 +193,14 @@ def summarize_fit(loop: Loop, fit: Fit) -> LoopFit:
                      "parameters can compensate a change of "
                      f"{'them' if len(lost) > 1 else 'it'}")  # fmt: skip
     noise, scale = fit.noise, float(np.mean(fit.sensor))
+    several = not loop.equations().siso
+    forces = np.sqrt(scale * np.array(noise.force))
+    sensors = np.sqrt(np.outer(fit.sensor, [1.0, *noise.sensors]))
     time = -loop.dt / math.log(noise.memory) if noise.drift else math.nan
     estimate = LoopEstimate(
-        names, fit.theta, covariance, tuple(np.sqrt(fit.sensor).tolist()),
-        math.sqrt(scale * float(np.mean(noise.force))),
+        names, fit.theta, covariance,
+        tuple(map(tuple, sensors)) if several else tuple(np.sqrt(fit.sensor).tolist()),
+        tuple(forces.tolist()) if several else math.sqrt(scale * float(np.mean(noise.force))),
         math.sqrt(scale * noise.coloured) if noise.drift else 0.0, time, fit.value, fit.size,
         tuple(n for n, b in zip(names, on_bound, strict=True) if b), tuple(notes),
         find_noise_units(loop, fit.problem.data[0].record),

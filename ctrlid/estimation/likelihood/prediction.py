@@ -20,7 +20,7 @@ from ...data.several_records import order_model_and_data
 from ...data.validity import find_whole_past
 from ...loop.loop import Loop
 from .filter_data import find_noise_units
-from .kalman_filter import Noise, append_sensor_noise
+from .kalman_filter import Noise, append_sensor_noise, predict_outputs
 from .likelihood import Fit, make_problem
 from .maximization import begin_fit, maximize
 from .sampled_plant import Linearized
@@ -37,21 +37,22 @@ class Prediction(Printed):
 
     Parameters
     ----------
-    y : ndarray, shape (n,)
+    y : ndarray, shape (n,) or (outputs, n)
         Prediction of each output sample from the samples before it [output unit].
-    innovations : ndarray, shape (n,)
+    innovations : ndarray, shape (n,) or (outputs, n)
         Measured minus predicted output [output unit], zero where the record is not valid.
-    settled : ndarray of bool, shape (n,)
+    settled : ndarray of bool, shape (n,) or (outputs, n)
         Where the record is valid and the prediction no longer depends on the guess of the state
         at the start, or after a long stretch that does not count.
-    spread : ndarray, shape (n,)
+    spread : ndarray, shape (n,) or (outputs, n)
         Standard deviation of the innovations that the filter expects [output unit].
     states : ndarray, shape (n, states)
         State at each sample [units of the states], given the outputs up to and including it.
     circuit : ndarray, shape (n, controller states)
         State of a known analog controller at each sample [units of the controller], else empty.
-    sensor_noise, force_noise : float
-        Standard deviations of the noise model [output unit, and unit of the acceleration].
+    sensor_noise, force_noise : float or tuple of float
+        Standard deviations of the noise model [output unit, and unit of the acceleration]; one for
+        each of several outputs and forces.
     units : (str, str)
         Units of both noises; empty where neither the record nor the plant has one.
     """
@@ -62,14 +63,16 @@ class Prediction(Printed):
     spread: Array
     states: Array
     circuit: Array
-    sensor_noise: float
-    force_noise: float
-    units: tuple[str, str] = ("", "")
+    sensor_noise: Any
+    force_noise: Any
+    units: tuple[Any, Any] = ("", "")
 
     def __post_init__(self) -> None:
         freeze_arrays(self)
 
     def __str__(self) -> str:
+        if self.y.ndim == 2:
+            return self._write_several()
         unit, push = (f" {u}" if u else "" for u in self.units)
         found = float(np.sqrt(np.mean(self.innovations[self.settled] ** 2)))
         expected = float(np.sqrt(np.mean(self.spread[self.settled] ** 2)))
@@ -80,6 +83,22 @@ class Prediction(Printed):
             f"  standard deviation of the sensor noise: {self.sensor_noise:.3g}{unit}; of the "
             f"white force: {self.force_noise:.3g}{push}"
         )
+
+    def _write_several(self) -> str:
+        sensors, pushes = self.units
+        rows = [f"One-step prediction of {self.y.shape[1]} samples of {len(self.y)} outputs"]
+        for k, (unit, noise) in enumerate(zip(sensors, self.sensor_noise, strict=True)):
+            use = self.settled[k]
+            found, expected = (
+                float(np.sqrt(np.mean(v[k][use] ** 2))) for v in (self.innovations, self.spread)
+            )
+            rows.append(
+                f"  output {k}: RMS of the innovations {found:.3g} {unit}; the filter expects "
+                f"{expected:.3g} {unit}, of which the sensor noise is {noise:.3g} {unit}"
+            )
+        pairs = zip(self.force_noise, pushes, strict=True)
+        forces = " and ".join(f"{v:.3g} {u}".strip() for v, u in pairs)
+        return "\n".join([*rows, f"  standard deviation of the white force: {forces}"])
 
 
 @keep_numpy_quiet
@@ -139,6 +158,10 @@ def predict(loop: Loop, record: Record, noise_ratio: float | None = None) -> Pre
     if noise_ratio is None:
         fit = maximize(begin_fit(problem))
     else:
+        if not loop.equations().siso:
+            raise CtrlidError("noise_ratio= is one ratio of one force to one sensor noise; for "
+                              f"several outputs ({', '.join(loop.signals['y'])}) leave it out: all "
+                              "are estimated")  # fmt: skip
         noise = Noise((max(noise_ratio, 1e-150) ** 2,) * problem.plant.channels)
         fit = begin_fit(problem, noise=noise)
     return make_prediction(fit)
@@ -154,10 +177,19 @@ def make_prediction(fit: Fit) -> Prediction:
             "Check units, signs and the operating point, or exclude samples with valid="
         )
     states = out.trajectory.filtered
+    units = find_noise_units(plant.loop, record)
+    if record.y.ndim == 2:
+        error, variance = predict_outputs(fit.data[0], fit.linearized[0], fit.noise)
+        sizes = sensor * np.sqrt([1.0, *fit.noise.sensors])
+        return Prediction(
+            record.y - error.T, error.T, fit.counts[0].T, sensor * np.sqrt(variance.T),
+            states[:, : plant.n], states[:, plant.n :], tuple(sizes.tolist()),
+            tuple((sensor * np.sqrt(fit.noise.force)).tolist()), units,
+        )  # fmt: skip
     return Prediction(
         record.y - out.innovations, out.innovations, fit.counts[0],
         sensor * np.sqrt(out.variance), states[:, : plant.n], states[:, plant.n :], sensor,
-        sensor * float(np.sqrt(fit.noise.force[0])), find_noise_units(plant.loop, record),
+        sensor * float(np.sqrt(fit.noise.force[0])), units,
     )  # fmt: skip
 
 

@@ -17,7 +17,7 @@ from ...loop.loop import Loop
 from ...physics.block_evaluation import BlockEvaluation, evaluate_blocks
 from ...physics.equations import Equations
 from ...physics.integration import count_delay_samples, substitute_delay
-from .filter_data import FilterData
+from .filter_data import FilterData, find_rest_state
 from .transition_maps import (
     PeriodPlan,
     build_backlash,
@@ -99,6 +99,8 @@ class SampledPlant:
         self.forces = e.velocities or tuple(range(self.n - len(e.rest)))
         # One force on all velocities; without any, each state has a noise of its own.
         self.channels = 1 if e.velocities else len(self.forces)
+        if not e.siso or e.pushes is not None:
+            self.channels = len(self.forces)
         self.scheme = choose_scheme(e, loop, loop.dt / self.pieces)
         self.plan = PeriodPlan(e, self.law, loop.dt, hold, self.scheme, self.forces, self.channels,
                          tuple(self.index), self.delay_samples, self.hold_r)  # fmt: skip
@@ -152,6 +154,7 @@ class SampledPlant:
             data.input_variance + self.initial_conditions.find_input_variance(u, p) / data.scale**2
         )
         w = self._stack_applied_inputs(data, applied)
+        moved = 1e-3 * np.std(u[data.valid if u.ndim == 1 else data.valid.any(axis=1)], axis=0)
         spread = at.spread[:, : self.n].T
         given = (at.filtered.T, w, p, spread, np.zeros(self.channels))
         step, a, b, dp, *by_input = self._evaluate_transition(self.maps.stages, *given)
@@ -165,38 +168,62 @@ class SampledPlant:
             for k, moved in enumerate(self._list_corners(slopes)):
                 dp += dw[:, :, k, None] * moved[:, None, :]
         elif len(rows):
-            du[rows] = self._differentiate_by_input(
-                rows, given, 1e-3 * float(np.std(u[data.valid]))
-            )
+            du[rows] = self._differentiate_by_input(rows, given, moved)
         start, wide = self.initial_conditions.find_initial_state(data, p)
-        output, c, hp = self.maps.sensor(at.predicted.T, w, p, spread)
+        output, c, hp = (
+            _repeat_over_samples(part, len(u))
+            for part in self.maps.sensor(at.predicted.T, w, p, spread)
+        )
+        # Of one output the axis of outputs is left out.
+        seen = 0 if self.e.siso else slice(None)
         return Linearized(
             _repeat_over_samples(step, len(u))[:, :, 0],
             _repeat_over_samples(a, len(u)),
             _repeat_over_samples(b, len(u)),
             du,
             _repeat_over_samples(dp, len(u)),
-            _repeat_over_samples(output, len(u))[:, 0, 0],
-            _repeat_over_samples(c, len(u))[:, 0, :],
-            _repeat_over_samples(hp, len(u))[:, 0, :],
+            output[:, seen, 0],
+            c[:, seen, :],
+            hp[:, seen, :],
             input_variance,
             self.pad_controller_states(start),
             self.pad_controller_states(wide),
             at,
         )
 
-    def _differentiate_by_input(self, rows: Any, given: Sequence[Array], h: float) -> Array:
-        """Return by differences how the state after the samples `rows` depends on the input."""
+    def linearize_at_rest(self) -> tuple[Array, Array, Array]:
+        """Return (A, B, C) of a sample at rest: by the state before, by forces, of the outputs."""
+        p, at = self.e.values, self.loop.point
+        x = self.pad_controller_states(np.array(find_rest_state(self.loop, self.e)))[:, None]
+        law = self.law
+        r = np.zeros(self.plan.references)
+        if law is not None and law.references is not None:
+            r = np.array(law.references)
+        corners = np.tile(at.inputs, self.pieces + 2)
+        references = [r] if self.hold_r == "zoh" else [r, r]
+        w = np.concatenate([[0.0], corners, *references, at.outputs])[:, None]
+        quiet = np.zeros((self.n, 1))
+        stages = self.maps.stages
+        _, a, b, *_ = self._evaluate_transition(stages, x, w, p, quiet, np.zeros(self.channels))
+        return a[0], b[0], self.maps.sensor(x, w, p, quiet)[1][0]
+
+    def _differentiate_by_input(self, rows: Any, given: Sequence[Array], h: Any) -> Array:
+        """Return by differences how the state after the samples `rows` depends on the input.
+
+        Several inputs move together, each by its own step `h`; the derivative is then by what all
+        of them have in common, in thousands of steps.
+        """
         x, w, p, spread, force = given
-        held = np.zeros((len(w), 1))
-        held[1 : self.pieces + 3] = 1.0
+        m = len(self.e.inputs)
+        steps = np.zeros((w.shape[0], 1))
+        steps[1 : 1 + (self.pieces + 2) * m, 0] = np.tile(h, self.pieces + 2)
         above, below = (
             self._evaluate_transition(
-                self.maps.stages, x[:, rows], w[:, rows] + s * h * held, p, spread[:, rows], force
+                self.maps.stages, x[:, rows], w[:, rows] + s * steps, p, spread[:, rows], force
             )[0]
             for s in (1, -1)
         )
-        slope: Array = (above - below)[:, :, 0] / (2 * h)
+        slope: Array = (above - below)[:, :, 0] / (2 * (h if self.e.siso else 1e-3))
         return slope
 
     def _find_applied_input(self, u: Array, p: Array) -> tuple[Array, Array | None]:
@@ -250,7 +277,7 @@ class SampledPlant:
         p = self.e.values
         w = self._stack_applied_inputs(data, self._find_applied_input(data.path, p)[0])[:, rows]
         if not known:
-            w[-1] = self.evaluate_output(data, x, rows)
+            w[-len(self.e.outputs) :] = self.evaluate_output(data, x, rows).T
         quiet = np.zeros((self.n, 1))
         return self._evaluate_transition(
             self.maps.stages, x.T, w, p, quiet, np.zeros(self.channels)
@@ -260,12 +287,14 @@ class SampledPlant:
         """Return the outputs at states (k, n) and the samples `rows`."""
         p = self.e.values
         w = self._stack_applied_inputs(data, self._find_applied_input(data.path, p)[0])[:, rows]
-        return self.maps.sensor(x.T, w, p, np.zeros((self.n, 1)))[0][:, 0, 0]
+        output: Array = self.maps.sensor(x.T, w, p, np.zeros((self.n, 1)))[0][:, :, 0]
+        return output[:, 0] if self.e.siso else output
 
     def _stack_applied_inputs(self, data: FilterData, applied: Array) -> Array:
         """Return the rows (t, input before, now, ..., ahead, r, y) the map is evaluated over."""
         references = [data.r] if self.hold_r == "zoh" else [data.r, shift_signal(data.r, -1)]
-        return np.vstack([data.t, *self._list_corners(applied), *references, data.y])
+        corners = [part.T for part in self._list_corners(applied)]
+        return np.vstack([data.t, *corners, *(part.T for part in references), data.y.T])
 
     def _list_corners(self, path: Array) -> list[Array]:
         """Return what acts at each corner, one before the sample to the one ahead of it."""
@@ -275,7 +304,10 @@ class SampledPlant:
     def pad_controller_states(self, values: Array) -> Array:
         """Add the states of a known analog controller, at rest, to a start."""
         extra = self.size - values.shape[0]
-        return np.pad(values, [(0, extra)] * values.ndim)
+        padded = np.pad(values, [(0, extra)] * values.ndim)
+        if self.law is not None and values.ndim == 1 and extra:
+            padded[-extra:] = self.law.rest
+        return padded
 
 
 def _repeat_over_samples(values: Array, n: int) -> Array:

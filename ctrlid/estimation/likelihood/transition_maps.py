@@ -16,7 +16,7 @@ from ..._base.interruption import keep_interrupt
 from ...data.reconstruction import count_pieces
 from ...loop.controllers import ControlLaw
 from ...loop.loop import Loop
-from ...loop.period_map import apply_backlash
+from ...loop.period_map import apply_backlash, push_velocities
 from ...physics.block_evaluation import BlockEvaluation
 from ...physics.equations import Equations
 from ...physics.integration import Scheme, advance, cut_input, find_lags, integrate
@@ -91,12 +91,19 @@ class PeriodPlan:
         spread = e.smoothed.sx_in(4) if e.spread is None else e.spread
         given, found = [e.t, e.x, e.u, e.p, spread], [e.rhs, e.output]
         found += [part for lag in e.lags for part in (lag.time_constant, lag.target)]
-        found += [] if e.delay is None else [e.delay]
+        found += [part for part in (e.delay, e.pushes) if part is not None]
         if e.play is not None:
             given += [e.play.m, e.play.u]
             found += [e.play.after, e.play.applied, e.play.start]
         if law is not None:
-            state, r, y = casadi.SX.sym("c", len(law.rest)), casadi.SX.sym("r"), casadi.SX.sym("y")
+            state, r, y = (
+                casadi.SX.sym(key, size)
+                for key, size in (
+                    ("c", len(law.rest)),
+                    ("r", self.references),
+                    ("y", self.rows[-1]),
+                )
+            )
             given += [state, r, y]
             found += law.apply(e.t, state, r, y)
         every = casadi.Function("every", given, [casadi.SX(part) for part in found])
@@ -113,6 +120,19 @@ class PeriodPlan:
     def pieces(self) -> int:
         """Number of straight pieces of the input in a period."""
         return count_pieces(self.hold)
+
+    @property
+    def references(self) -> int:
+        """Number of references of the controller; one where there is none."""
+        known = None if self.law is None else self.law.references
+        return 1 if known is None else len(known)
+
+    @property
+    def rows(self) -> tuple[int, ...]:
+        """How many rows time, the input at each corner, reference and output have."""
+        m, q = len(self.equations.inputs), len(self.equations.outputs)
+        references = (self.references,) * (2 if self.hold_r == "foh" else 1)
+        return 1, *(m,) * (self.pieces + 2), *references, q
 
 
 def choose_scheme(e: Equations, loop: Loop, dt: float) -> Scheme:
@@ -212,11 +232,10 @@ def _build_period(plan: PeriodPlan) -> tuple[Any, list[Any], list[Any], dict[str
     e, n, dt = plan.equations, len(plan.equations.states), plan.dt
     x, p, s = (casadi.SX.sym(k, m) for k, m in (("x", plan.size), ("p", e.p.shape[0]),
                                                 ("s", n)))  # fmt: skip
-    t, r, y = (casadi.SX.sym(k) for k in "try")
-    path = casadi.vertsplit(casadi.SX.sym("u", plan.pieces + 2))
+    w = [casadi.SX.sym(f"w{k}", rows) for k, rows in enumerate(plan.rows)]
     # A straight reference comes with the one of the next sample.
-    next_r = casadi.SX.sym("n") if plan.hold_r == "foh" else r
-    w = [t, *path, r, *([next_r] if plan.hold_r == "foh" else []), y]
+    straight = plan.hold_r == "foh"
+    t, *path, r, next_r, y = w if straight else [*w[:-1], w[-2], w[-1]]
     now = path[1]
     if plan.pieces > 1:
         # The corners are off the signal itself, but this mean of three of them is on it.
@@ -225,6 +244,8 @@ def _build_period(plan: PeriodPlan) -> tuple[Any, list[Any], list[Any], dict[str
     held_rate = casadi.SX.zeros(n, 1)
     for k, j in enumerate(plan.forces):
         held_rate[j] = force[k if plan.channels > 1 else 0]
+    if e.pushes is not None:
+        held_rate = push_velocities(e, force, t, x[:n], p)
     # A fit repeats the map often; a single prediction can afford to be exact.
     scheme = plan.scheme if plan.index else _raise_order(plan.scheme, e.kinked)
     part = casadi.SX.sym("i")

@@ -14,6 +14,7 @@ from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
 from ..._base.jobs import check_jobs
 from ..._base.rounding import keep_numpy_quiet
+from ..._base.signals import require_one_signal
 from ...data.record import Record
 from ...data.several_records import VISIBLE_MOTION, measure_input_motion, stream_records
 from ...data.validity import find_whole_past
@@ -103,6 +104,7 @@ def fit_arx(
     structure = check_orders(na, nb, nk)
     known = check_constraints(constraints)
     first, records = stream_records(record)
+    require_one_signal("fit_arx", first)
     motions: list[float] = []
     watched = records if first.hold == "zoh" else _note_motion(records, motions)
     regression = build_arx_regression(watched, structure, intercept, check_jobs(jobs))

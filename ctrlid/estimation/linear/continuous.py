@@ -10,6 +10,7 @@ import numpy as np
 from ..._base.arguments import check_arguments
 from ..._base.errors import CtrlidError, CtrlidWarning
 from ..._base.rounding import keep_numpy_quiet
+from ..._base.signals import require_one_signal
 from ..._base.text import write_list, write_number
 from ...data.record import Record
 from ...data.several_records import VISIBLE_MOTION, as_records, measure_input_motion
@@ -106,6 +107,7 @@ def fit_continuous(
     structure = _check_orders(poles, zeros)
     known = check_constraints(constraints)
     records = as_records(record)
+    require_one_signal("fit_continuous", records)
     circuit = _make_circuit(controller, records)
     if circuit and zeros == poles:
         raise CtrlidError(

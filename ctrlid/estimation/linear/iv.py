@@ -16,6 +16,7 @@ from ..._base.arrays import Array
 from ..._base.criterion import bayesian_penalty
 from ..._base.errors import CtrlidError, CtrlidWarning
 from ..._base.rounding import keep_numpy_quiet
+from ..._base.signals import require_one_signal
 from ..._base.statistics import sum_with_correlations
 from ...data.record import Record
 from ...data.several_records import as_records
@@ -165,6 +166,7 @@ def fit_iv(
     structure = check_orders(na, nb, nk)
     known = check_constraints(constraints)
     records = as_records(record)
+    require_one_signal("fit_iv", records)
     _check_hold(records)
     names = check_instruments(records, instruments)
     task = Task.prepare(records, structure, names, intercept)

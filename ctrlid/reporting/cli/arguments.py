@@ -7,6 +7,7 @@ import importlib.util
 import inspect
 import math
 import os
+import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -116,7 +117,7 @@ def read_controller(text: str) -> Any:
     for key, value in given.items():
         _require_known("a PID", list(types), [key])
         words = types[key] not in (float, float | None)
-        values[key] = value if words else _parse_number(f"--controller {key}=", value)
+        values[key] = value if words else _parse_number(f"--controller {key}=", str(value))
     if "kp" not in values:
         raise CtrlidError(f"a PID needs kp, as in --controller kp=2,ki=1; given {text}")
     return PID(**values)
@@ -168,12 +169,16 @@ def parse_assignment(text: str) -> tuple[str, float]:
         raise argparse.ArgumentTypeError(str(reason)) from reason
 
 
-def parse_assignments(text: str) -> dict[str, str]:
-    """Read NAME=VALUE,NAME=VALUE."""
-    pairs = [part.partition("=") for part in text.split(",") if part.strip()]
+def parse_assignments(text: str) -> dict[str, str | tuple[str, ...]]:
+    """Read NAME=VALUE,NAME=VALUE, or NAME=VALUE,VALUE NAME=VALUE where a name has several."""
+    pairs = [part.partition("=") for part in re.split(r"[,\s]+(?=\w+\s*=)", text) if part.strip()]
     if not pairs or not all(key.strip() and equal and value for key, equal, value in pairs):
         raise argparse.ArgumentTypeError(f"needs NAME=VALUE,NAME=VALUE; given {text}")
-    return {key.strip(): value.strip() for key, _, value in pairs}
+    values = {
+        key.strip(): tuple(v.strip() for v in value.split(",") if v.strip())
+        for key, _, value in pairs
+    }
+    return {key: each[0] if len(each) == 1 else each for key, each in values.items()}
 
 
 def _parse_number(what: str, text: str) -> float:

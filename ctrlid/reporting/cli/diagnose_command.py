@@ -82,7 +82,7 @@ def add_parser(commands: Any) -> None:
     add("--dt", type=float, metavar="S",
         help="sampling period in seconds (default: that of the time column)")  # fmt: skip
     add("--columns", type=parse_assignments, default={}, metavar="r=REF,u=VOLT,y=GAP",
-        help="names of the columns for r, u, y and time")  # fmt: skip
+        help="columns of r, u, y and time; several as in 'y=theta,alpha u=V'")  # fmt: skip
     add("--units", type=parse_assignments, default={}, metavar="y=UNIT,u=UNIT",
         help="units of the channels, instead of those in the header")  # fmt: skip
     add("--scale", type=parse_assignment, nargs="+", action="extend", default=[],

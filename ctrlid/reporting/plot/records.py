@@ -8,7 +8,7 @@ import numpy as np
 from ..._base import text as _text
 from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
-from ...data.record import Record
+from ...data.record import Record, list_rows
 from ...data.validity import find_runs
 from ...validation.comparison import Comparison, write_fit
 from .. import pictures as _pictures
@@ -28,6 +28,8 @@ from .axes import (
 def record(record: Record, ax: Any = None, *, extra: Sequence[str] = ()) -> Picture:
     """Draw an experiment: reference and output, the input below, and extra channels on request.
 
+    Of several outputs each has axes of its own, with the reference of its name, or else the one of
+    its number where there are as many references as outputs; so has each of several inputs.
     Stretches that do not count are shaded. A long record is drawn as the band between the smallest
     and the largest value of neighbouring samples, so that no peak is lost.
 
@@ -36,7 +38,7 @@ def record(record: Record, ax: Any = None, *, extra: Sequence[str] = ()) -> Pict
     record : Record
         The experiment; draw a part with ``record.between(t0, t1)``.
     ax : sequence of matplotlib Axes, optional
-        Two, and one more for each extra channel; by default those of a new figure.
+        One for each output, input and extra channel; by default those of a new figure.
     extra : sequence of str, optional
         Names of extra channels.
 
@@ -68,21 +70,27 @@ def record(record: Record, ax: Any = None, *, extra: Sequence[str] = ()) -> Pict
             f"the record has no extra channel {_text.write_list([repr(k) for k in unknown])}; it "
             f"has {', '.join(record.extra) or 'none'}"
         )
-    axes = take_axes(ax, 2 + len(extra), sharex=True)
-    both = [record.y] if record.r is None else [record.y, record.r]
-    scale, unit = _pictures.choose_scale(both, record.units.get("y", ""))
-    name = record.names.get("y", "y")
-    _draw_trace(axes[0], record, scale * record.y, 0, f"measured {name}")
-    if record.r is not None:
-        _draw_trace(
-            axes[0], record, scale * record.r, 1, f"reference {record.names.get('r', '')}", True
-        )
-    axes[0].set_ylabel(f"{name} [{unit}]")
-    panels = [(record.names.get("u", "u"), record.u, "u", record.hold == "zoh")]
-    panels += [(key, record.extra[key], key, False) for key in extra]
-    for i, (ax, (name, values, key, held)) in enumerate(zip(axes[1:], panels, strict=True)):
-        scale, unit = _pictures.choose_scale([values], record.units.get(key, ""))
-        label = name if i else f"input {name}"
+    rows = list_rows(record)
+    outputs, references, inputs = (
+        [row[1:] for row in rows if row[0] == key] for key in ("y", "r", "u")
+    )
+    axes = take_axes(ax, len(outputs) + len(inputs) + len(extra), sharex=True)
+    for k, (ax, (name, unit, values)) in enumerate(zip(axes, outputs, strict=False)):
+        wanted = _find_reference(references, k, name, len(outputs))
+        both = [values] if wanted is None else [values, wanted[2]]
+        scale, unit = _pictures.choose_scale(both, unit)
+        _draw_trace(ax, record, scale * values, 0, f"measured {name}")
+        if wanted is not None:
+            label = wanted[0] if wanted[0] != "r" else ""
+            _draw_trace(ax, record, scale * wanted[2], 1, f"reference {label}", True)
+        ax.set_ylabel(f"{name} [{unit}]")
+    panels = [(name, values, unit, record.hold == "zoh") for name, unit, values in inputs]
+    panels += [(key, record.extra[key], record.units.get(key, ""), False) for key in extra]
+    for i, (ax, (name, values, unit, held)) in enumerate(
+        zip(axes[len(outputs) :], panels, strict=True)
+    ):
+        scale, unit = _pictures.choose_scale([values], unit)
+        label = name if i >= len(inputs) else f"input {name}"
         _draw_trace(ax, record, scale * values, (2 + i) % len(COLOURS), label, held)
         ax.set_ylabel(f"{name} [{unit}]")
     for ax in axes:
@@ -90,6 +98,14 @@ def record(record: Record, ax: Any = None, *, extra: Sequence[str] = ()) -> Pict
         finish_axes(ax)
     axes[-1].set_xlabel("time [s]")
     return Picture(axes)
+
+
+def _find_reference(references: Any, k: int, name: str, outputs: int) -> Any:
+    """Return name, unit and samples of the reference of an output, None if there is none."""
+    alike = [row for row in references if row[0] == name]
+    if alike:
+        return alike[0]
+    return references[k] if len(references) == outputs else None
 
 
 def comparison(
@@ -253,7 +269,7 @@ def _draw_trace(
 
 def _shade_gaps(ax: Any, record: Record) -> None:
     """Shade the stretches that do not count."""
-    for k, (start, stop) in enumerate(zip(*find_runs(~record.valid), strict=True)):
+    for k, (start, stop) in enumerate(zip(*find_runs(~record.valid_samples), strict=True)):
         t0, t1 = (record.start + i * record.dt for i in (start, stop))
         ax.axvspan(t0, t1, facecolor="0.88", hatch="///", edgecolor="0.6", linewidth=0, zorder=0,
                    label=None if k else "does not count")  # fmt: skip

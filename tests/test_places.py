@@ -1,0 +1,127 @@
+"""Effects at a place: an input, a velocity or an output of a plant with several of them."""
+
+import control as ct
+import numpy as np
+import pytest
+
+import ctrlid as cid
+from ctrlid import effects as E
+from problems import drive
+from test_wiring import CART, DT, QUAD, at_rest, lqr_with_observer, luenberger
+
+START = [0.0, 0.03, 0.0, 0.0]
+
+
+def cart(*effects, plant=CART, **options):
+    loop = cid.Loop(plant, luenberger(CART), dt=DT, at=at_rest(CART), **options)
+    for effect in effects:
+        loop = loop.with_effect(effect)
+    return loop
+
+
+def written_out(push=lambda x, u: (u, 0.0), show=lambda x: x[:2]):
+    """The cart with what acts on it written into its equations by hand."""
+    plant = CART.mechanism
+
+    def update(t, x, u, params):
+        force, torque = push(x, u[0])
+        return plant.updfcn(t, x, [force, torque], plant.params)
+
+    return ct.nlsys(update, lambda t, x, u, params: show(x), inputs=["F"], outputs=["x", "theta"],
+                    states=CART.state_labels, name="by_hand")  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("effect", "plant"),
+    [
+        (E.ViscousFriction(c=0.7, at="x_dot"), written_out(lambda x, u: (u - 0.7 * x[2], 0.0))),
+        (E.ViscousFriction(c=0.01, at="theta_dot"), written_out(lambda x, u: (u, -0.01 * x[3]))),
+        (E.LinearStiffness(k1=2.0, at="x_dot"), written_out(lambda x, u: (u - 2 * x[0], 0.0))),
+        (E.ConstantForce(bias=0.2, at="theta_dot"), written_out(lambda x, u: (u, 0.2))),
+        (E.InputOffset(offset=0.3, at="F"), written_out(lambda x, u: (u + 0.3, 0.0))),
+        (E.SensorGain(error=0.1, at="theta"),
+         written_out(show=lambda x: np.array([x[0], 1.1 * x[1]]))),
+        (E.SensorOffset(offset=0.01, at="theta"),
+         written_out(show=lambda x: np.array([x[0], x[1] + 0.01]))),
+    ],
+)  # fmt: skip
+def test_an_effect_acts_where_it_says(effect, plant):
+    loop = cart(effect)
+    by_hand = cid.Loop(plant, luenberger(CART), dt=DT, at=at_rest(CART))
+    runs = [cid.simulate(one, d=np.full(300, 0.05), initial=START) for one in (loop, by_hand)]
+    np.testing.assert_allclose(runs[0].y, runs[1].y, rtol=1e-7, atol=1e-10)
+    np.testing.assert_allclose(runs[0].u, runs[1].u, rtol=1e-7, atol=1e-10)
+
+
+def test_a_force_without_a_known_input_accelerates_one_coordinate():
+    loop = cart(E.ConstantForce(bias=1.0, at="theta_dot"), forces={})
+    rates = loop.equations().evaluate(np.zeros(4), 0.0)[0]
+    np.testing.assert_allclose(rates, [0, 0, 0, 1], atol=1e-12)
+    known = cart(E.ConstantForce(bias=1.0, at="theta_dot"))
+    rates = known.equations().evaluate(np.zeros(4), 0.0)[0]
+    assert rates[2] != 0
+
+
+def test_sizes_are_in_the_unit_of_what_works_there():
+    units = {
+        "x_dot": (E.CoulombFriction(fc=0.2, at="x_dot"), "fc = 0.2 N", cart()),
+        "theta_dot": (E.ViscousFriction(c=0.1, at="theta_dot"), "c = 0.1 N m s/rad", cart()),
+        "alone": (E.CoulombFriction(fc=0.2, at="theta_dot"), "fc = 0.2 rad/s^2", cart(forces={})),
+        "F": (E.InputOffset(offset=0.3, at="F"), "offset = 0.3 N", cart()),
+        "theta": (E.SensorOffset(offset=0.01, at="theta"), "offset = 0.01 rad", cart()),
+    }
+    for effect, text, loop in units.values():
+        assert effect.text(loop).endswith(text)
+    assert "at = x_dot" in str(E.CoulombFriction(fc=0.2, at="x_dot"))
+
+
+def test_friction_of_the_cart_is_fitted():
+    C = lqr_with_observer(CART)
+    loop = cid.Loop(CART, C, dt=DT, at=at_rest(CART), free=("length",))
+    real = loop.with_effect(E.CoulombFriction(fc=0.3, at="x_dot"))
+    d = 1.0 * cid.random_binary(2000, amplitude=1, hold=50, seed=1)
+    record = cid.simulate(real, d=d, sensor_noise=(1e-4, 5e-4), seed=2)
+    given = loop.with_effect(E.CoulombFriction(fc=0.05, at="x_dot"))
+    estimate = cid.fit_loop(given.with_parameters({"length": 0.28}), record).estimate
+    for name, value in (("CoulombFriction.fc", 0.3), ("length", 0.3)):
+        low, high = estimate.confidence_interval(name, 0.999)
+        assert low < value < high
+
+
+def test_the_linear_model_has_the_effects():
+    loop = cart(E.ViscousFriction(c=0.7, at="x_dot"))
+    plain = cid.plants.cart_pole(**{**CART.params, "c": CART.params["c"] + 0.7})
+    np.testing.assert_allclose(
+        loop.linearize().A, cid.linearize(plain, at_rest(plain)).A, atol=1e-9
+    )
+    rough = cart(E.CoulombFriction(fc=0.3, at="x_dot")).linearize()
+    np.testing.assert_allclose(rough.A, cart().linearize().A, atol=1e-9)
+
+
+def test_one_place_needs_no_name_and_takes_it():
+    r = cid.random_binary(200, amplitude=0.1, hold=20, seed=1)
+    for effect in (E.CoulombFriction, E.InputDeadZone, E.SensorGain):
+        name = effect.parameters()[0].name
+        at = {"force": "v", "input": "V", "output": "x"}[effect.place]
+        runs = [cid.simulate(drive().with_effect(effect(**{name: 0.05}, at=where)), r)
+                for where in ("", at)]  # fmt: skip
+        np.testing.assert_array_equal(runs[0].y, runs[1].y)
+
+
+@pytest.mark.parametrize(
+    ("build", "words"),
+    [
+        (lambda: cart(E.CoulombFriction(fc=0.1)),
+         "acts at a velocity, and cart_pole has several: say which with at=, one of x_dot, theta_"),
+        (lambda: cart(E.SensorGain(error=0.1)), "an output, and cart_pole has several"),
+        (lambda: cart(E.CoulombFriction(fc=0.1, at="x")), "given at='x', but cart_pole has x_dot"),
+        (lambda: cart(E.InputOffset(offset=0.1, at="V")), "an input; given at='V'"),
+        (lambda: drive().with_effect(E.InputOffset(offset=0.1, at="G")), "servo has V"),
+        (lambda: cart(E.Quantization(step=0.1, at="x")), "several outputs do not take yet"),
+        (lambda: cid.Loop(QUAD, dt=DT).with_effect(E.InputDelay(delay=DT, at="F1")),
+         "remembers the one input of a plant; quadrotor_planar has F1, F2"),
+    ],
+)  # fmt: skip
+def test_refused_places(build, words):
+    with pytest.raises(cid.CtrlidError, match=words):
+        build()
