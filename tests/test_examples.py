@@ -73,9 +73,8 @@ def test_magnetoshield_needs_the_delay_and_the_lag(levitations):
 def test_magnetoshield_is_as_fast_at_every_gap(levitations, capsys):
     """The continuous fit, free of the bias: one pair at all set-points, though the gaps differ."""
     series = levitations.set_points()
-    assert np.all((series.rates > 47) & (series.rates < 52))
-    # The sensor noise is fitted too, and has its share in the standard errors.
-    assert np.all(series.rate_errors < 1.5)
+    assert np.all((series.rates > 48) & (series.rates < 52))
+    assert np.all(series.rate_errors < 1)
     line = series.trend
     assert line.p_value > 0.01
     assert line.exponent - 2.6 * line.exponent_error > -0.5  # a ball's would be at -0.5

@@ -141,8 +141,10 @@ def fit_continuous(
     best = find_best_fit(task, known, delay or 0.0)
     notes = note_colour(best)
     if len(notes) > 0:
-        best = colour_noise(best, known)
-        notes = note_colour(best)
+        coloured = colour_noise(best, known)
+        # Noise that leaves its innovations coloured stands for what the plant lacks, and bends it.
+        if not len(note_colour(coloured)):
+            best, notes = coloured, ()
     point, found, rss, settled = best.point, best.found, best.rss, best.settled
     degrees = best.used - found.free - len(point.gain) - int(task.free_delay)
     # Errors that are rounding beside y leave nothing to gain.
