@@ -165,7 +165,7 @@ def test_records_are_matched_by_name():
     ("call", "words"),
     [
         (lambda loop, r: cid.fit_loop(loop, r, coloured=True), "leave out coloured=True"),
-        (lambda loop, r: cid.predict(loop, r, force_noise=1.0), "for several outputs"),
+        (lambda loop, r: cid.predict(loop, r, noise_ratio=1.0), "for several outputs"),
         (lambda loop, r: cid.fit_loop(loop, r[:8]), "at least 10 valid samples of each output"),
     ],
 )

@@ -96,6 +96,7 @@ class Question:
             return otherwise
 
 
+@hold_interrupt()
 @keep_numpy_quiet
 def diagnose(
     loop: Any,
@@ -201,7 +202,7 @@ def diagnose(
 
     try:
         # What has to be done in any case moves the bar, and asks for no time.
-        with hold_interrupt(), budget.running(binding=False):
+        with budget.running(binding=False):
             audits, remarks = look_over_records(given, records)
             check_length(fresh)
             question = Question(

@@ -33,6 +33,7 @@ from .physics_estimate import LoopEstimate, LoopFit
 UNSEEN = 1e-9
 
 
+@hold_interrupt()
 @keep_numpy_quiet
 def fit_loop(
     loop: Loop,
@@ -115,10 +116,9 @@ def fit_loop(
     if free is not None:
         asked = replace(loop, free=free) if isinstance(free, Mapping) else loop
         problem = replace(problem, priors=find_priors(asked, free))
-    with hold_interrupt():
-        fit = refit_noise_size(maximize(begin_fit(problem)))
-        if coloured or coloured is None:
-            fit = choose_noise(fit, always=bool(coloured))
+    fit = refit_noise_size(maximize(begin_fit(problem)))
+    if coloured or coloured is None:
+        fit = choose_noise(fit, always=bool(coloured))
     if not math.isfinite(fit.value):
         raise ModelCannotRun(
             f"the likelihood of {fit.plant.e.name} on this record is not finite: the model has "
