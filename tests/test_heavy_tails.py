@@ -114,6 +114,7 @@ def test_a_clean_record_with_heavy_tails_has_nothing_missing(kind, seed, tmp_pat
     assert again.noise == found.noise
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "seed"), [("student", 205), ("wild", 206)])
 def test_a_dead_zone_is_named_under_heavy_tails(kind, seed):
     loop, record = make_loop_and_record(kind, seed, dead_zone=0.05)

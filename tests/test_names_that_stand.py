@@ -80,6 +80,7 @@ def test_stand_ins_have_a_section_of_their_own(half, tmp_path):
     assert any("CubicStiffness" in label for label in labels)
 
 
+@pytest.mark.slow
 def test_friction_all_along_stands():
     record = simulate_mass(steps(4), lambda t, x, v: rub(v))
     found = cid.diagnose(mass(), record, catalogue=(E.CoulombFriction,), progress=False)
