@@ -63,6 +63,7 @@ def main() -> None:
         model = cid.fit_arx(blocks(path, n), 2, 2, intercept=False, jobs=options.jobs)
         spent = time.perf_counter() - started
         peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
     e = model.estimate
     z = (e.values - [A[1], A[2], B[1], B[2]]) / e.standard_errors
     print(f"{e.n_samples} rows in {spent:.1f} s, peak {peak / 1e6:.1f} MB beside the interpreter")

@@ -2,6 +2,7 @@
 
 import os
 import sys
+import tracemalloc
 from pathlib import Path
 
 import pytest
@@ -25,6 +26,15 @@ def close_pictures():
     yield
     if "matplotlib.pyplot" in sys.modules:
         sys.modules["matplotlib.pyplot"].close("all")
+
+
+@pytest.fixture(autouse=True)
+def leave_no_tracing():
+    """Refuse a test that leaves memory tracing on, which makes all later tests four times slower."""
+    yield
+    left_on = tracemalloc.is_tracing()
+    tracemalloc.stop()
+    assert not left_on, "call tracemalloc.stop()"
 
 
 @pytest.fixture
