@@ -55,6 +55,13 @@ class World:
         ]  # fmt: skip
         self.loop = cid.Loop(servo, gain, dt=0.05, free=("c",))
         self.open = cid.Loop(servo, dt=0.05, free=("c", "k"))
+        law = ct.nlsys(None, lambda t, x, u, params: 3.0 * (u[0] - u[1]), inputs=["r", "y"],
+                       outputs=["u"], dt=0.05)  # fmt: skip
+        self.law = cid.Loop(servo, law, dt=0.05, free=("c",))
+        # Most functions take one input and one output, and are to refuse this loop and its record.
+        cart = cid.plants.cart_pole(M=0.5, m=0.2, length=0.3)
+        self.cart = cid.Loop(cart, dt=0.05, at=cid.OperatingPoint((0.0,) * 4, 0.0, (0.0, 0.0)))
+        self.wide = cid.simulate(self.cart, d=0.1 * rng.standard_normal(20), sensor_noise=1e-3)
         # An integrator without a law wanders, so that its record is short.
         self.pid = cid.Loop(servo, cid.PID(kp=5.0, ki=1.0, kd=0.5), dt=0.05, free=("k",))
         r = cid.random_binary(240, amplitude=0.1, hold=12, seed=int(rng.integers(1e6)))
@@ -113,7 +120,7 @@ def wild(w: World, rng: np.random.Generator) -> Any:
         lambda: rng.standard_normal(239), lambda: rng.standard_normal(240) * 1j,
         lambda: np.ma.array(np.ones(240), mask=np.arange(240) < 100), lambda: np.float32(0.05),
         lambda: np.array(0.05), lambda: np.int8(3), lambda: np.datetime64("2020-01-01"),
-        lambda: w.loop, lambda: w.pid, lambda: w.records[0], lambda: w.records, lambda: w.records[3],
+        lambda: w.cart, lambda: w.wide, lambda: w.law, lambda: w.loop, lambda: w.pid, lambda: w.records[0], lambda: w.records, lambda: w.records[3],
         lambda: w.model, lambda: w.found, lambda: w.fit, lambda: w.comparison,
         lambda: pick(rng, *w.linear), lambda: pick(rng, *w.plants), lambda: cid.Loop,
         lambda: ct.tf([[[1], [1]]], [[[1, 1], [1, 2]]]), lambda: ct.tf([1, 0, 0], [1, 1]),
@@ -200,7 +207,7 @@ RECIPES: dict[str, Recipe] = {
     "Section": lambda w, rng: {"title": "a", "text": pick(rng, "", "b $x$"), "result": pick(rng, None, w.comparison), "figure": None},
     "audit": lambda w, rng: {"record": pick(rng, *w.records), "loop": pick(rng, None, w.loop)},
     "check_feedback": lambda w, rng: {"record": pick(rng, *w.records)},
-    "compare": lambda w, rng: {"record": pick(rng, *w.records), "model_or_loop": pick(rng, w.loop, w.model, w.linear[3]), "horizon": pick(rng, None, 3)},
+    "compare": lambda w, rng: {"record": pick(rng, *w.records), "model_or_loop": pick(rng, w.loop, w.law, w.model, w.linear[3]), "horizon": pick(rng, None, 3)},
     "design_lead": lambda w, rng: {"P": pick(rng, *w.linear), "crossover": 10.0 ** rng.uniform(-1, 1), "phase_margin": rng.uniform(20, 70)},
     "diagnose": lambda w, rng: {"loop": w.loop, "record": w.records[0], "catalogue": (effects.ViscousFriction,), "progress": False},
     "fit_arx": lambda w, rng: {"record": data(w, rng), "na": int(rng.integers(1, 4)), "nb": int(rng.integers(1, 3)), "nk": pick(rng, 1, 2), "constraints": pick(rng, (), (cid.Integrator(),), cid.PoleAt(0.9)), "intercept": pick(rng, True, False), "jobs": None},
@@ -218,11 +225,11 @@ RECIPES: dict[str, Recipe] = {
     "predict": lambda w, rng: {"loop": w.loop, "record": pick(rng, *w.records[:2]), "noise_ratio": pick(rng, None, 0.1)},
     "random_binary": lambda w, rng: {"n": int(rng.integers(1, 300)), "amplitude": 1.0, "hold": 4, "around": rng.normal(), "seed": pick(rng, None, 3)},
     "redesign": lambda w, rng: {"G": pick(rng, w.continuous, w.linear[0]), "loop": w.pid, "crossover": rng.uniform(1, 3), "phase_margin": rng.uniform(30, 60), "step": pick(rng, None, 0.05)},
-    "replay_controller": lambda w, rng: {"loop": pick(rng, w.loop, w.pid), "record": pick(rng, *w.records[:2])},
+    "replay_controller": lambda w, rng: {"loop": pick(rng, w.loop, w.pid, w.law), "record": pick(rng, *w.records[:2])},
     "response_band": lambda w, rng: {"model": pick(rng, w.model, w.continuous), "omega": np.geomspace(0.1, 10, 9), "level": rng.uniform(0.5, 0.99)},
     "robust_margin": lambda w, rng: {"P": pick(rng, *w.linear[:3]), "C": pick(rng, 1.0, ct.tf([1.0, 1], [0.1, 1]))},
     "select_order": lambda w, rng: {"record": pick(rng, *w.records[:3]), "na": range(1, 3), "nb": [1], "nk": pick(rng, [1], (1, 2))},
-    "simulate": lambda w, rng: {"loop": pick(rng, w.loop, w.pid), "r": 0.1 * rng.standard_normal(60), "sensor_noise": pick(rng, 0.0, 1e-3), "force_noise": 0.0, "d": pick(rng, None, np.ones(60)), "initial": pick(rng, None, (0.1, 0.0)), "seed": pick(rng, None, 4)},
+    "simulate": lambda w, rng: {"loop": pick(rng, w.loop, w.pid, w.law), "r": 0.1 * rng.standard_normal(60), "sensor_noise": pick(rng, 0.0, 1e-3), "force_noise": 0.0, "d": pick(rng, None, np.ones(60)), "initial": pick(rng, None, (0.1, 0.0)), "seed": pick(rng, None, 4)},
     "staircase": lambda w, rng: {"n": int(rng.integers(1, 200)), "levels": [0.0, 1.0, 0.5], "hold": 7},
     "sweep_sampling_period": lambda w, rng: {"record": w.records[0], "periods": pick(rng, None, [0.05, 0.1]), "estimators": ["fit_arx"], "constraints": pick(rng, (), {"fit_arx": (cid.Integrator(),)}), "poles": 2, "zeros": 0, "controller": None, "jobs": None},
     "write_report": lambda w, rng: {"result": pick(rng, w.records[0], w.comparison, w.found), "path": FOLDER / "out.html", "title": pick(rng, "", "a & b")},

@@ -113,6 +113,13 @@ CALLS = {
     "nothing valid for validation": lambda loop, record: cid.diagnose(
         loop, record, validation=replace(record, valid=np.zeros(400, bool)), progress=False
     ),
+    "an array without dimensions as effects": lambda loop, record: replace(
+        loop, effects=np.array(1.0)
+    ),
+    "an empty operating point": lambda loop, record: replace(loop, at=np.zeros((0, 3))),
+    "an array without dimensions as constraints": lambda loop, record: cid.fit_arx(
+        record, 2, 2, constraints=np.array(1.0)
+    ),
     "a stuck sensor": lambda loop, record: cid.compare(replace(record, y=np.full(400, 0.1)), loop),
 }
 
@@ -209,6 +216,18 @@ def test_an_analog_controller_of_a_loop_with_backlash_is_refused_and_no_divergen
     loop = levitation(free=()).with_effect(E.InputBacklash(width=1e-3))
     with pytest.raises(CtrlidError, match="acts on the samples of a digital controller"):
         cid.redesign(cid.linearize(loop.plant, loop.at), loop, 100, 50)
+
+
+def test_a_controller_without_states_is_a_function_of_r_and_y(loop):
+    law = ct.nlsys(None, lambda t, x, u, params: 5.0 * (u[0] - u[1]), inputs=["r", "y"],
+                   outputs=["u"], dt=0.05)  # fmt: skip
+    r = cid.random_binary(100, amplitude=0.1, hold=10, seed=1)
+    same = cid.simulate(replace(loop, controller=law), r)
+    assert np.allclose(same.y, cid.simulate(loop, r).y, rtol=1e-12, atol=1e-12)
+
+
+def test_a_robust_margin_is_at_most_one():
+    assert [cid.robust_margin(g, g) for g in (1.5, 0.7, 3.1)] == [1.0, 1.0, 1.0]
 
 
 def test_a_pole_at_zero_is_a_delay_of_one_sample(record):

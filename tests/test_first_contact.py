@@ -3,8 +3,13 @@
 import copy
 import inspect
 import pickle
+import subprocess
+import sys
+import threading
 from dataclasses import replace
 
+import control as ct
+import numpy as np
 import pytest
 
 import ctrlid as cid
@@ -73,3 +78,51 @@ def test_per_cent_are_plain_numbers(share, digits, expected):
 def test_a_comparison_has_no_trailing_blanks(record):
     text = str(cid.compare(record, servo(cid.PID(kp=20.0, kd=1.0), dt=0.01)))
     assert [line for line in text.splitlines() if line != line.rstrip()] == []
+
+
+def make_spring(controller):
+    """Return a loop whose plant has no parameters and consists of lambdas."""
+    plant = ct.nlsys(lambda t, x, u, params: [x[1], u[0] - x[0]], lambda t, x, u, params: x[0],
+                     states=2, inputs=1, outputs=1, name="spring")  # fmt: skip
+    return cid.Loop(plant, controller, dt=0.01)
+
+
+def test_a_plant_of_lambdas_is_diagnosed_and_pickled(tmp_path):
+    """The plant has no parameter either, so that nothing competes with the one effect."""
+    loop = make_spring(cid.PID(kp=6.0, ki=1.0, kd=0.8))
+    record = record_of(loop.with_effect(cid.effects.CoulombFriction(fc=0.1)), swing=0.1, hold=40,
+                       n=500, seed=1, sensor_noise=1e-4)  # fmt: skip
+    found = cid.diagnose(loop, record, catalogue=[cid.effects.CoulombFriction], progress=False)
+    assert [f.name for f in found.findings] == ["CoulombFriction"]
+    for kept in (pickle.loads(pickle.dumps(found)), copy.deepcopy(found), copy.copy(found)):
+        assert str(kept) == str(found)
+        assert np.array_equal(cid.simulate(kept.loop, record.r).y,
+                              cid.simulate(found.loop, record.r).y)  # fmt: skip
+    file = tmp_path / "found.pickle"
+    file.write_bytes(pickle.dumps(found))
+    elsewhere = f"import pickle; print(pickle.load(open({str(file)!r}, 'rb')).loop)"
+    told = subprocess.run([sys.executable, "-c", elsewhere], capture_output=True, text=True)
+    assert told.stdout.strip() == str(found.loop), told.stderr
+
+
+def test_a_controller_of_lambdas_is_pickled():
+    law = ct.nlsys(None, lambda t, x, u, params: 3 * (u[0] - u[1]), inputs=["r", "y"],
+                   outputs=["u"], dt=0.01)  # fmt: skip
+    loop = make_spring(law)
+    r = cid.random_binary(100, amplitude=0.1, hold=10, seed=1)
+    again = pickle.loads(pickle.dumps(loop))
+    assert np.array_equal(cid.simulate(again, r).y, cid.simulate(loop, r).y)
+
+
+def test_a_plant_that_cannot_be_pickled_says_why_not():
+    lock = threading.Lock()
+
+    def rates(t, x, u, params):
+        del t, params
+        return [u[0] - x[0] if lock is not None else u[0]]
+
+    plant = ct.nlsys(rates, None, states=1, inputs=1, outputs=1, name="locked")
+    with pytest.raises(
+        cid.CtrlidError, match=r"the plant of locked cannot be pickled .*lock.*save"
+    ):
+        pickle.dumps(cid.Loop(plant, dt=0.1))

@@ -62,6 +62,11 @@ def is_number(value: Any) -> bool:
     return not isinstance(value, np.ndarray) and _is_float(value)
 
 
+def is_iterable(value: Any) -> bool:
+    """Tell whether a value can be walked through; an array without dimensions only looks so."""
+    return value.ndim > 0 if isinstance(value, np.ndarray) else isinstance(value, Iterable)
+
+
 def check_fields(value: Any, *own: str) -> None:
     """Refuse fields of a dataclass that are not of the kind that it declares.
 

@@ -332,7 +332,7 @@ def pseudo_inverse(matrix: Array, smallest: float = SINGULAR) -> Array:
     """
     size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
     values, vectors = np.linalg.eigh(matrix / np.outer(size, size))
-    keep = values > smallest * values.max()
+    keep = values > smallest * values.max(initial=0.0)
     inverse = (vectors[:, keep] / values[keep]) @ vectors[:, keep].T
     return np.asarray(inverse / np.outer(size, size), dtype=float)
 

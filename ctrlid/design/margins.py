@@ -313,7 +313,7 @@ def robust_margin(P: Any, C: Any) -> float:
     grid = make_frequency_grid(
         loop.dt, [loop.num, loop.den, total, *_compute_spectra(plant, controller)]
     )
-    return find_smallest(margin, grid, (0.0, loop.nyquist))[1]
+    return min(1.0, find_smallest(margin, grid, (0.0, loop.nyquist))[1])
 
 
 def _compute_length(num: ComplexArray, den: ComplexArray) -> Array:

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from .._base import text as _text
-from .._base.arguments import check_arguments
+from .._base.arguments import check_arguments, is_iterable
 from .._base.arrays import Array, freeze_arrays
 from .._base.errors import CtrlidError
 from .._base.jobs import check_jobs, share_out
@@ -223,7 +223,7 @@ def fit_each(
     if not callable(fit):
         raise CtrlidError(f"fit_each needs a function such as fit_iv; given {type(fit).__name__}")
     records = (records,) if isinstance(records, Record) else records
-    if not isinstance(records, Iterable):
+    if not is_iterable(records):
         raise CtrlidError(f"fit_each needs Records; given {type(records).__name__}")
     done = list(share_out(partial(_fit_one, fit, options), enumerate(records, 1), check_jobs(jobs)))
     if not done:

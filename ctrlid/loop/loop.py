@@ -1,8 +1,8 @@
 """The loop: a plant under control, in absolute physical units."""
 
-import copy
 import math
-from collections.abc import Iterable, Mapping
+import pickle
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -10,10 +10,11 @@ import casadi
 import control as ct
 import numpy as np
 
-from .._base.arguments import check_arguments, is_number
+from .._base.arguments import check_arguments, is_iterable, is_number
 from .._base.arrays import to_real_array
 from .._base.errors import CtrlidError, EffectDoesNotApply
 from .._base.periods import have_same_period, write_both_periods
+from .._base.pickling import pack_by_value
 from .._base.text import write_count
 from ..effects import AbstractEffect
 from ..effects.composition import compose_effects, label_effects
@@ -125,7 +126,8 @@ class Loop:
             raise CtrlidError(f"{equations.name} is not defined where all its signals are zero; "
                               "give at=operating_point(plant, output=...)")  # fmt: skip
         still: Any = [(0.0,) * len(names) for names in (equations.inputs, equations.outputs)]
-        at = as_operating_point(self.at or OperatingPoint((0.0,) * n, *still), equations, inputs)
+        given = OperatingPoint((0.0,) * n, *still) if self.at is None else self.at
+        at = as_operating_point(given, equations, inputs)
         if not self.linear_plant and len(at.states) != n:
             raise CtrlidError(
                 f"at= has {write_count(len(at.states), 'state')}, but {equations.name} has {n} "
@@ -141,6 +143,18 @@ class Loop:
         if law and law.dt == 0.0 and equations.dt:
             raise CtrlidError("an analog controller cannot act on a plant in discrete time; give "
                               "the plant in continuous time or sample the controller")  # fmt: skip
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Lambdas and functions inside functions, as plants and controllers are made of, have no
+        # name by which pickle finds them.
+        state = {k: v for k, v in self.__dict__.items() if k != "_law"}
+        for name in ("plant", "controller"):
+            state[name] = pack_by_value(state[name], f"the {name} of {self._traced.name}")
+        return state
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        parts = {name: pickle.loads(state[name]) for name in ("plant", "controller")}
+        self.__dict__.update(state | parts)
 
     def _trace_plant(self) -> tuple[Equations, tuple[str, ...]]:
         """Return the equations of the driven plant, and the names of all its inputs."""
@@ -178,7 +192,7 @@ class Loop:
         """Put the effects into the equations and see that the free parameters exist."""
         for name in ("effects", "free"):
             given = getattr(self, name)
-            if not isinstance(given, Iterable | AbstractEffect):
+            if not isinstance(given, AbstractEffect) and not is_iterable(given):
                 raise CtrlidError(f"a loop needs a sequence as {name}=; given {given!r}")
         effects = (self.effects,) if isinstance(self.effects, AbstractEffect) else self.effects
         effects = tuple(effects)
@@ -406,9 +420,8 @@ class Loop:
 
     def _replace_fields(self, **changes: Any) -> "Loop":
         """Return a copy with other fields, without tracing the plant again."""
-        new = copy.copy(self)
-        for name, value in changes.items():
-            object.__setattr__(new, name, value)
+        new = object.__new__(Loop)
+        new.__dict__.update(self.__dict__ | changes)
         new._apply_effects()
         return new
 

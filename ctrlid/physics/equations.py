@@ -152,11 +152,14 @@ class Equations:
     @functools.cached_property
     def function(self) -> Any:
         """The CasADi function ``(t, x, u, p) -> (rhs, output)``."""
+        # Without states, two indices keep the column that one would turn into a row.
         both = casadi.vertcat(self.rhs, self.output)
         if self.spread is not None:
             both = casadi.substitute(both, self.spread, casadi.SX.zeros(*self.spread.shape))
         n = len(self.states)
-        return casadi.Function("plant", [self.t, self.x, self.u, self.p], [both[:n], both[n:]])
+        return casadi.Function(
+            "plant", [self.t, self.x, self.u, self.p], [both[:n, 0], both[n:, 0]]
+        )
 
     @functools.cached_property
     def smoothed(self) -> Any:

@@ -1,13 +1,13 @@
 """sweep_sampling_period(): which sampling period, and which estimator at it."""
 
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from .._base.arguments import check_arguments
+from .._base.arguments import check_arguments, is_iterable
 from .._base.errors import CtrlidError, CtrlidWarning, ModelCannotRun
 from .._base.jobs import check_jobs, share_out
 from .._base.rounding import keep_numpy_quiet
@@ -168,7 +168,7 @@ def sweep_sampling_period(
 
 def _as_list(constraints: Any) -> Sequence[AbstractConstraint]:
     # What is no sequence is refused by the fits.
-    one = isinstance(constraints, AbstractConstraint) or not isinstance(constraints, Iterable)
+    one = isinstance(constraints, AbstractConstraint) or not is_iterable(constraints)
     return (constraints,) if one else constraints
 
 

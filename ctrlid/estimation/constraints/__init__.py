@@ -22,6 +22,7 @@ with one free number, which is searched for.
 from collections.abc import Mapping
 from typing import Any
 
+from ..._base.arguments import is_iterable
 from ..._base.errors import CtrlidError
 from .base import AbstractConstraint, Branch, Row, equals
 from .coefficients import Bounds, Equal, Fixed, Linear, Nonlinear, StaticGain
@@ -76,7 +77,7 @@ def check_constraints(constraints: Any) -> tuple[AbstractConstraint, ...]:
     if isinstance(constraints, AbstractConstraint):
         constraints = (constraints,)
     known = ", ".join(c.__name__ for c in CONSTRAINTS)
-    if isinstance(constraints, str | Mapping) or not hasattr(constraints, "__iter__"):
+    if isinstance(constraints, str | Mapping) or not is_iterable(constraints):
         raise CtrlidError(
             f"constraints must be a list of constraint objects; given {constraints!r}. "
             f"There are {known}."

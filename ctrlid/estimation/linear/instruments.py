@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from ..._base import text as _text
+from ..._base.arguments import is_iterable
 from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
 from ..._base.statistics import regress
@@ -160,7 +161,7 @@ def check_instruments(records: Sequence[Record], instruments: Any) -> tuple[str,
     CtrlidError
         If a signal is missing, constant, or is u or y itself.
     """
-    one = isinstance(instruments, str) or not isinstance(instruments, Iterable)
+    one = isinstance(instruments, str) or not is_iterable(instruments)
     names = (instruments,) if one else tuple(instruments)
     if not names or not all(isinstance(name, str) for name in names):
         raise CtrlidError(
