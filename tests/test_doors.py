@@ -116,6 +116,12 @@ CALLS = {
     "an array without dimensions as effects": lambda loop, record: replace(
         loop, effects=np.array(1.0)
     ),
+    "a transfer function as limits": lambda loop, record: replace(
+        loop, input_limits=ct.tf([1], [1, 1])
+    ),
+    "rows of different lengths": lambda loop, record: replace(
+        record, valid=[[True], [True, False]]
+    ),
     "an empty operating point": lambda loop, record: replace(loop, at=np.zeros((0, 3))),
     "an array without dimensions as constraints": lambda loop, record: cid.fit_arx(
         record, 2, 2, constraints=np.array(1.0)

@@ -131,7 +131,10 @@ class Record(Printed):
         if np.ma.is_masked(self.valid):
             raise CtrlidError("valid is a masked array, and a record would use its masked values: "
                               "give valid.filled(False)")  # fmt: skip
-        valid = np.ones(n, dtype=bool) if self.valid is None else np.array(self.valid)
+        try:
+            valid = np.ones(n, dtype=bool) if self.valid is None else np.array(self.valid)
+        except ValueError as reason:
+            raise CtrlidError(f"valid must be {n} booleans; {reason}") from reason
         several = (counts["y"], n) if counts["y"] > 1 else (n,)
         if valid.dtype != bool or valid.shape not in ((n,), several):
             rows = f", or {counts['y']} rows of them" if counts["y"] > 1 else ""

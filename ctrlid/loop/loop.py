@@ -178,7 +178,9 @@ class Loop:
         """Return the limits of the actuator, as floats or with a value for each input."""
         given: Any = self.input_limits
         try:
-            lower, upper = (to_real_array(v, "input_limits") for v in given)
+            # A transfer function is asked for its elements, too, and refuses otherwise.
+            pair = tuple(given) if is_iterable(given) else ()
+            lower, upper = (to_real_array(v, "input_limits") for v in pair)
             pairs = np.broadcast_to(np.array(np.broadcast_arrays(lower, upper)).T, (inputs, 2))
         except (TypeError, ValueError) as reason:
             raise CtrlidError("input_limits is a pair (lower, upper) in input units; given "
