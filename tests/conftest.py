@@ -30,7 +30,7 @@ def close_pictures():
 
 @pytest.fixture(autouse=True)
 def leave_no_tracing():
-    """Refuse a test that leaves memory tracing on, which makes all later tests four times slower."""
+    """Refuse a test that leaves memory tracing on, which makes all later ones four times slower."""
     yield
     left_on = tracemalloc.is_tracing()
     tracemalloc.stop()
