@@ -179,7 +179,6 @@ MODEL = ct.tf([1.0], [1.0, 1.0])
         ("fit_arx", lambda r: cid.fit_arx(r, na=2, nb=2)),
         ("fit_iv", lambda r: cid.fit_iv(r, na=2, nb=2)),
         ("fit_continuous", lambda r: cid.fit_continuous(r, poles=2)),
-        ("audit", cid.audit),
         ("compare", lambda r: cid.compare(r, MODEL)),
         ("check_feedback", cid.check_feedback),
         ("select_order", cid.select_order),

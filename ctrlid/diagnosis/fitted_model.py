@@ -22,6 +22,7 @@ from ..estimation.likelihood.likelihood import (
 from ..estimation.likelihood.sampled_plant import SampledPlant, Trajectory
 from ..loop.loop import Loop
 from ..loop.period_map import comes_to_rest
+from ..loop.wiring import knows_references
 from .thresholds import THRESHOLD
 
 
@@ -69,7 +70,7 @@ def can_simulate(model: Model) -> bool:
     loop = model.loop
     if loop.controller is None:
         return comes_to_rest(loop)
-    return all(record.r is not None for record in model.records)
+    return all(knows_references(loop.wiring, record) for record in model.records)
 
 
 def without_random_force(model: Model) -> Model:

@@ -12,30 +12,67 @@ from .._base.arrays import Array
 from .._base.errors import CtrlidError, ModelCannotRun
 from .._base.periods import have_same_period, write_both_periods, write_difference
 from .._base.rounding import keep_numpy_quiet
-from .._base.signals import require_one_signal
 from ..data.record import Record
 from ..data.several_records import order_model_and_data
 from .loop import Loop
+from .wiring import knows_references, match_signals, stack_references
 
 
-def _build_controller_run(loop: Loop, y: Array, r: Array | None) -> tuple[Any, Array]:
-    """Return the controller over all samples as a function of its initial state, and its rest."""
+def _build_controller_run(
+    loop: Loop, y: Array, r: Array | None, u: Array | None = None
+) -> tuple[Any, Array]:
+    """Return the controller over all samples as a function of its initial state, and its rest.
+
+    An observer reads the input `u` that was applied, or without one what the controller computes.
+    """
     law = loop.law()
     if law is None or law.dt == 0.0:
         kind = "no controller" if law is None else "an analog one"
         raise CtrlidError(
             f"only a digital controller can be replayed from the samples; this loop has {kind}"
         )
-    x, w = casadi.SX.sym("x", len(law.rest)), casadi.SX.sym("w", 3)
-    u, after = law.apply(w[0], x, w[1], w[2])
-    lower, upper = loop.input_limits
-    u = casadi.fmin(casadi.fmax(u, lower), upper)
-    step = casadi.Function("controller", [x, w], [casadi.vertcat(after), u])
-    reference = np.full(len(y), loop.point.output) if r is None else np.asarray(r)
-    table = casadi.DM(np.vstack([np.arange(len(y)) * loop.dt, reference, y]))
+    n = y.shape[-1]
+    if r is not None:
+        reference = np.reshape(r, (-1, n))
+    elif law.references is None:
+        reference = np.full((1, n), loop.point.output)
+    else:
+        reference = np.tile(np.array(law.references)[:, None], n)
+    rows = [np.arange(n)[None] * loop.dt, reference, np.reshape(y, (-1, n))]
+    if u is not None and law.reads_input:
+        rows.append(np.reshape(u, (-1, n)))
+    x, w = casadi.SX.sym("x", len(law.rest)), casadi.SX.sym("w", sum(map(len, rows)))
+    t, now, measured, *logged = casadi.vertsplit(w, np.cumsum([0, *map(len, rows)]).tolist())
+    wish, after = law.apply(t, x, now, measured)
+    lower, upper = (casadi.DM(v) if np.ndim(v) else v for v in loop.input_limits)
+    limited = casadi.fmin(casadi.fmax(wish, lower), upper)
+    if law.reads_input:
+        after = law.apply(t, x, now, measured, logged[0] if logged else limited)[1]
+    step = casadi.Function("controller", [x, w], [casadi.vertcat(after), limited])
+    table = casadi.DM(np.vstack(rows))
     start = casadi.MX.sym("start", len(law.rest))
-    outputs = step.mapaccum("run", len(y))(start, table)[1]
+    outputs = step.mapaccum("run", n)(start, table)[1]
     return casadi.Function("outputs", [start], [outputs.T]), np.array(law.rest, dtype=float)
+
+
+def _run(run: Any, start: Array) -> Array:
+    """Return what a controller computes from a state, with a row for each of several inputs."""
+    values = np.asarray(run(start), float).T
+    return values[0] if len(values) == 1 else np.ascontiguousarray(values)
+
+
+def read_references(loop: Loop, record: Record) -> Array | None:
+    """Return the references of a loop's controller along a record, with a row for each of several.
+
+    Raises
+    ------
+    CtrlidError
+        If the controller needs one that the record has not.
+    """
+    wiring = loop.wiring
+    if wiring is None:
+        return None if record.r is None else np.asarray(record.r)
+    return stack_references(wiring, record.r, record.signals.get("r"), len(record))[0]
 
 
 def run_controller(loop: Loop, y: Array, r: Array | None = None) -> Array:
@@ -45,14 +82,14 @@ def run_controller(loop: Loop, y: Array, r: Array | None = None) -> Array:
     ----------
     loop : Loop
         The loop whose controller runs.
-    y : ndarray, shape (n,)
+    y : ndarray, shape (n,) or (outputs, n)
         Measured output.
-    r : ndarray, shape (n,), optional
+    r : ndarray, shape (n,) or (references, n), optional
         Reference; by default constant at the operating point.
 
     Returns
     -------
-    ndarray, shape (n,)
+    ndarray, shape (n,) or (inputs, n)
         The input, within the limits of the loop.
 
     Raises
@@ -61,7 +98,7 @@ def run_controller(loop: Loop, y: Array, r: Array | None = None) -> Array:
         If the loop has no controller, or an analog one.
     """
     run, rest = _build_controller_run(loop, y, r)
-    return np.asarray(run(rest), float).ravel()
+    return _run(run, rest)
 
 
 @keep_numpy_quiet
@@ -70,18 +107,18 @@ def replay_controller(loop: Loop, record: Record) -> Array:
 
     The controller's initial state is not in the record; it is chosen to reproduce the logged u
     best. What then remains between the result and ``record.u`` is not the controller's: injected
-    pulses or dither, a channel logged late, another controller.
+    pulses or dither, a channel logged late, another controller. An observer reads the logged u.
 
     Parameters
     ----------
     loop : Loop
         Loop with a digital controller.
     record : Record
-        Record with a reference.
+        Record with the references that the controller needs.
 
     Returns
     -------
-    ndarray, shape (n,)
+    ndarray, shape (n,) or (inputs, n)
         Input at each sample [input unit].
 
     Raises
@@ -105,21 +142,24 @@ def replay_controller(loop: Loop, record: Record) -> Array:
 
 def replay_from_best_state(loop: Loop, record: Record) -> tuple[Array, Array]:
     """Return what `replay_controller` does, and the controller's initial state that it chose."""
-    require_one_signal("replay_controller", loop, record)
     if not have_same_period(loop.dt, record.dt):
         both = write_both_periods("the loop is sampled", loop.dt, "the record", record.dt)
         raise CtrlidError(f"{both}; give both the same period: "
                           f"{write_difference(loop.dt, record.dt)}")  # fmt: skip
-    if record.r is None:
+    if not loop.equations().siso:
+        record = match_signals(record, loop.equations())
+    if not knows_references(loop.wiring, record):
         raise ModelCannotRun("the record has no reference r, which the controller needs; give it "
                               "r=, a constant for a fixed set-point")  # fmt: skip
-    run, start = _build_controller_run(loop, record.y, record.r)
+    r = read_references(loop, record)
+    run, start = _build_controller_run(loop, record.y, r, record.u)
     replayed, best = _compare_inputs(run, start, record)
     if start.size and np.isfinite(loop.input_limits).any():
         # From the wrong state all may be cut off, and the state is then nowhere to be seen.
         unlimited = replace(loop, input_limits=(-math.inf, math.inf))
-        inside = (record.u > loop.input_limits[0]) & (record.u < loop.input_limits[1])
-        free, _ = _build_controller_run(unlimited, record.y, record.r)
+        low, high = (np.reshape(v, (-1, 1)) if np.ndim(v) else v for v in loop.input_limits)
+        inside = np.ravel((record.u > low) & (record.u < high))
+        free, _ = _build_controller_run(unlimited, record.y, r, record.u)
         moved = _take_gauss_newton_step(
             free, _differentiate_outputs(free, start.size), start, record.u, inside
         )
@@ -127,7 +167,7 @@ def replay_from_best_state(loop: Loop, record: Record) -> tuple[Array, Array]:
         if cost < best:
             start, replayed, best = moved, trial, cost
     # Gauss-Newton: one step where the law is linear in its state, a few more around limits.
-    slope, every = _differentiate_outputs(run, start.size), np.full(len(record), True)
+    slope, every = _differentiate_outputs(run, start.size), np.full(record.u.size, True)
     for _ in range(10 if start.size else 0):
         moved = _take_gauss_newton_step(run, slope, start, record.u, every)
         trial, cost = _compare_inputs(run, moved, record)
@@ -139,7 +179,7 @@ def replay_from_best_state(loop: Loop, record: Record) -> tuple[Array, Array]:
 
 def differentiate_replay(loop: Loop, record: Record) -> tuple[Array, Array, float]:
     """Return what `run_controller` does, its slope by the initial state, and its output at rest."""
-    run, rest = _build_controller_run(loop, record.y, record.r)
+    run, rest = _build_controller_run(loop, record.y, read_references(loop, record), record.u)
     slope = np.asarray(_differentiate_outputs(run, rest.size)(rest).full(), float)
     still = run_controller(loop, np.full(1, loop.point.output))
     return np.asarray(run(rest), float).ravel(), slope, float(still[0])
@@ -147,7 +187,7 @@ def differentiate_replay(loop: Loop, record: Record) -> tuple[Array, Array, floa
 
 def _compare_inputs(run: Any, start: Array, record: Record) -> tuple[Array, float]:
     """Return what a controller computes from a state, and how far the logged input is from it."""
-    replayed = np.asarray(run(start), float).ravel()
+    replayed = _run(run, start)
     return replayed, float(np.sum((replayed - record.u) ** 2))
 
 
@@ -160,6 +200,6 @@ def _differentiate_outputs(run: Any, size: int) -> Any:
 def _take_gauss_newton_step(run: Any, slope: Any, start: Array, u: Array, use: Any) -> Array:
     """Return a state by one Gauss-Newton step towards a logged input, on the samples to use."""
     jacobian = np.asarray(slope(start).full(), float)
-    left = u - np.asarray(run(start), float).ravel()
+    left = np.ravel(u - _run(run, start))
     step = np.linalg.lstsq(jacobian[use], left[use], rcond=1e-12)[0]
     return np.asarray(start + step)

@@ -49,22 +49,27 @@ def find_initial_state(
         The state: where it is measured, no faster than the record moves, and with lags of the
         input within what they follow.
     """
-    spread = max(float(np.std(part.y)), 1e-12 * float(np.abs(part.y).max()), 1e-300)
-    scale = np.maximum(0.01 * np.abs(guess[:fitted]), spread)
-    e = simulator.loop.equations()
-    for j in e.velocities:
-        scale[j] = max(float(np.std(np.diff(part.y))) / part.dt, 1e-300)
-    seen = _set_measured_state(simulator, part, guess)
-    low, high = _bound_initial_state(simulator, part, seen)
+    if simulator.loop.equations().siso:
+        spread: Any = max(float(np.std(part.y)), 1e-12 * float(np.abs(part.y).max()), 1e-300)
+        scale = np.maximum(0.01 * np.abs(guess[:fitted]), spread)
+        for j in simulator.loop.equations().velocities:
+            scale[j] = max(float(np.std(np.diff(part.y))) / part.dt, 1e-300)
+        seen = _set_measured_state(simulator, part, guess)
+        low, high = _bound_initial_state(simulator, part, seen)
+    else:
+        several = _SeveralOutputs(simulator, part)
+        spread, scale = several.spread, several.choose_scale(guess, fitted)
+        seen = several.set_measured_state(guess)
+        low, high = several.bound_state(seen)
     for lag in _find_input_lags(simulator, fitted):
         scale[lag] = max(float(np.std(part.u)), 1e-300)
 
     def compute_misfit(z: Array, count: int) -> Array | None:
         try:
-            y = simulator.run(z, None if r is None else r[:count], d[:count])[0]
+            y = simulator.run(z, None if r is None else r[..., :count], d[..., :count])[0]
         except ModelCannotRun:
             return None
-        return np.asarray((y - part.y[:count]) / spread, dtype=float)
+        return np.ravel(np.asarray((y - part.y[..., :count]) / spread, dtype=float))
 
     def move_state(start: Array, point: Array) -> Array:
         z = start.copy()
@@ -74,7 +79,7 @@ def find_initial_state(
     def search_nearby(start: Array, count: int) -> Array:
         def residual(point: Array) -> Array:
             found = compute_misfit(move_state(start, point), count)
-            return np.full(count, 1e3) if found is None else found
+            return np.full(part.y[..., :count].size, 1e3) if found is None else found
 
         # Bounds keep an absurd start from standing in for a force that acts from the first sample
         # on.
@@ -137,6 +142,75 @@ def _bound_initial_state(simulator: Simulator, part: Record, seen: Array) -> tup
     for lag in _find_input_lags(simulator, len(seen)):
         low[lag], high[lag] = float(part.u.min()), float(part.u.max())
     return low, high
+
+
+class _SeveralOutputs:
+    """What the first samples of a record of several outputs say of its initial state."""
+
+    def __init__(self, simulator: Simulator, part: Record) -> None:
+        self.simulator, self.part = simulator, part
+        loop = simulator.loop
+        e = self.e = loop.equations()
+        self.y = np.reshape(part.y, (len(e.outputs), -1))
+        self.c = np.asarray(compute_state_matrices(e, loop.point, spread=1e6)[2])
+        largest = np.abs(self.y).max(axis=1)
+        self.spreads = np.maximum(np.std(self.y, axis=1), np.maximum(1e-12 * largest, 1e-300))
+        self.spread: Any = self.spreads[:, None] if part.y.ndim == 2 else self.spreads[0]
+        moves = np.std(np.diff(self.y, axis=1), axis=1) / part.dt
+        self.speeds = np.maximum(moves, 1e-300)
+        pairs = [find_motion(e, e.states[j]) for j in e.velocities]
+        self.motions = [pair for pair in pairs if pair is not None]
+
+    def _find_output(self, state: int) -> int | None:
+        """Return the output that shows a state most, beside its own spread."""
+        shown = np.abs(self.c[:, state]) / self.spreads
+        return int(np.argmax(shown)) if shown.any() else None
+
+    def choose_scale(self, guess: Array, fitted: int) -> Array:
+        """Return the step of the search for each state."""
+        least = 0.01 * np.abs(guess[:fitted])
+        scale = np.where(least > 0, least, float(np.min(self.spreads)))
+        for i in range(min(fitted, len(self.e.states))):
+            k = self._find_output(i)
+            if k is not None:
+                scale[i] = max(scale[i], self.spreads[k] / abs(self.c[k, i]))
+        for i, j in self.motions:
+            k = self._find_output(i)
+            if k is not None:
+                scale[j] = self.speeds[k] / abs(self.c[k, i])
+        return np.asarray(scale)
+
+    def set_measured_state(self, guess: Array) -> Array:
+        """Return a guess moved to where the first samples see the plant, and how fast."""
+        start, n = guess.copy(), len(self.e.states)
+        few = min(self.y.shape[1], FEW)
+        slopes, first = np.polyfit(np.arange(few) * self.part.dt, self.y[:, :few].T, 1)
+        at = self.simulator.loop.point
+        off = first - self.e.evaluate(guess[:n], np.array(at.inputs), 0.0)[1]
+        still = [k for k in range(n) if k not in self.e.velocities]
+        start[still] += np.linalg.lstsq(self.c[:, still], off, rcond=1e-9)[0]
+        moving = [i for i, _ in self.motions]
+        speeds = np.linalg.lstsq(self.c[:, moving], slopes, rcond=1e-9)[0]
+        for (i, j), speed in zip(self.motions, speeds, strict=True):
+            if self.c[:, i].any():
+                start[j] = speed
+        return start
+
+    def bound_state(self, seen: Array) -> tuple[Array, Array]:
+        """Return between what values the states may start, around where they are seen."""
+        low, high = np.full(len(seen), -np.inf), np.full(len(seen), np.inf)
+        bent = casadi.depends_on(casadi.jacobian(self.e.output, self.e.x), self.e.x)
+        for i, j in self.motions:
+            k = self._find_output(i)
+            if k is None:
+                continue
+            high[j] = FASTEST * self.speeds[k] / abs(self.c[k, i])
+            low[j] = -high[j]
+            if not bent:
+                steps = np.abs(np.diff(self.y[k]))
+                off = NEAR * max(float(steps[:FEW].max()), 1e-300) / abs(self.c[k, i])
+                low[i], high[i] = seen[i] - off, seen[i] + off
+        return low, high
 
 
 def _find_input_lags(simulator: Simulator, fitted: int) -> list[int]:

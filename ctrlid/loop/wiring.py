@@ -271,6 +271,11 @@ def stack_references(
     return np.array(series).reshape(len(series), n or 0), tuple(names)
 
 
+def knows_references(wiring: Wiring | None, record: Record) -> bool:
+    """Return whether the references of a controller are known, from a record or since held."""
+    return record.r is not None or (wiring is not None and None not in wiring.held)
+
+
 def match_signals(record: Record, plant: Equations) -> Record:
     """Return a record with the inputs and outputs of a plant, in its order.
 

@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Sequence
+from dataclasses import replace
 from numbers import Integral
 from typing import Any
 
@@ -25,6 +26,7 @@ from ..estimation.linear.sampled_motion import discretize_model, list_inputs
 from ..loop.loop import Loop
 from ..loop.period_map import compute_growth_rate
 from ..loop.simulation import Simulator
+from ..loop.wiring import match_signals
 from ..physics.conversions import to_polynomials, to_state_matrices
 from ..physics.trace import timebase
 from .comparison import EXACT, Comparison, Curve
@@ -93,18 +95,29 @@ def compare(record: Record, model_or_loop: Any, *, horizon: int | None = None) -
             "compare needs a Record and a model; given "
             f"{type(record).__name__} and {type(model_or_loop).__name__}"
         )
-    require_one_signal("compare", model_or_loop, record)
+    several = isinstance(model_or_loop, Loop) and not model_or_loop.equations().siso
+    if several:
+        record = match_signals(record, model_or_loop.equations())
+    else:
+        require_one_signal("compare", model_or_loop, record)
     if horizon is not None and not (isinstance(horizon, Integral) and 1 <= horizon < len(record)):
         raise CtrlidError(
             f"horizon must be between 1 and {len(record) - 1} samples; given {horizon}"
         )
-    y = record.y[record.valid]
-    if y.size and np.ptp(y) == 0:
+    for name, row, use in zip(
+        record.signals["y"], np.reshape(record.y, (-1, len(record))), record.valid_outputs,
+        strict=True,
+    ):  # fmt: skip
+        y = row[use]
+        if not (y.size and np.ptp(y) == 0):
+            continue
         raise CtrlidError(
-            f"y is {y[0]:g} in all valid samples, so that no curve can follow it better than "
-            "another: record while the plant moves, or look whether the sensor is stuck"
+            f"{name if several else 'y'} is {y[0]:g} in all valid samples, so that no curve can "
+            "follow it better than another: record while the plant moves, or look whether the sensor is stuck"
         )
     horizon = None if horizon is None else int(horizon)
+    if several:
+        return _compare_several(record, model_or_loop, horizon)
     if isinstance(model_or_loop, Loop):
         return _compare_loop(record, model_or_loop, horizon)
     if isinstance(model_or_loop, ct.TransferFunction):
@@ -146,6 +159,52 @@ def _compare_loop(record: Record, loop: Loop, horizon: int | None) -> Comparison
     return _make_comparison(repr(loop), record, curves, residuals, notes)
 
 
+def _compare_several(record: Record, loop: Loop, horizon: int | None) -> Comparison:
+    """Compare each output of a loop with several signals, all reproduced together."""
+    prediction = predict(loop, record)
+    names, n = loop.signals["y"], len(record)
+    settled, y, errors = (
+        np.reshape(v, (-1, n)) for v in (prediction.settled, prediction.y, prediction.innovations)
+    )
+    made = [(ONE_STEP, np.where(settled, y, np.nan), np.full(len(names), np.nan))]
+    residuals, notes = np.where(settled, errors, np.nan), list[str]()
+    steps = horizon or find_time_constant(compute_moving_poles(loop), loop.equations().dt, record)
+    if steps > 1:
+        index, values = predict_ahead(loop, record, prediction, steps)
+        ahead = np.full((len(names), n), np.nan)
+        ahead[:, index] = values.T
+        spread = np.ravel(predict_spread(loop, record, prediction, steps)[0])
+        made.append((Reproduction("prediction", steps), ahead, spread))
+    rejected = find_rejection(loop, record)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", CtrlidWarning)
+        try:
+            if not rejected:
+                how, free, by_noise, _ = _run_simulation(record, loop, prediction)
+                made.append((how, free, by_noise))
+        except (ModelCannotRun, EffectDoesNotApply) as reason:
+            notes.append(f"no simulation: {reason}")
+    if rejected:
+        notes.append(f"no simulation: the law of the controller is rejected, because {rejected} "
+                     "The prediction uses the logged u instead")  # fmt: skip
+    notes += sorted({str(w.message) for w in caught})[-1:]
+    each = []
+    for k, name in enumerate(names):
+        part = record.select(y=name)
+        curves = [
+            _judge_curve(how, part, values[k],
+                         _list_known_signals(part, max(how.horizon, 1)), float(noise[k]))
+            for how, values, noise in made
+        ]  # fmt: skip
+        each.append(_make_comparison(name, part, curves, residuals[k], []))
+    curves = [replace(c, label=f"{c.label} of {one.what}") for one in each for c in one.curves]
+    tests = tuple(replace(t, name=f"{t.name}, of {one.what}") for one in each for t in one.tests)
+    notes += [f"{note}, of {one.what}" for one in each for note in one.notes]
+    what = repr(loop).partition(", wired:")[0]
+    return Comparison(what, record, tuple(curves), residuals, tests, tuple(notes),
+                      tuple(each))  # fmt: skip
+
+
 def _list_known_signals(record: Record, steps: int) -> list[tuple[Array, int]]:
     """Return the signals that an error `steps` after the last known output should not follow.
 
@@ -153,8 +212,8 @@ def _list_known_signals(record: Record, steps: int) -> list[tuple[Array, int]]:
     reference the input as it was known then.
     """
     if record.r is None:
-        return [(np.asarray(record.u), steps)]
-    return [(np.asarray(record.r), 1)]
+        return [(row, steps) for row in np.reshape(record.u, (-1, len(record)))]
+    return [(row, 1) for row in np.reshape(record.r, (-1, len(record)))]
 
 
 def _make_comparison(
@@ -179,31 +238,45 @@ def _simulate(record: Record, loop: Loop, prediction: Prediction) -> Curve:
             "would drift without bound. Make the loop with the controller of the record: "
             "Loop(plant, controller, ...)"
         )
-    y, injected, noisy = np.full(len(record), np.nan), np.zeros(len(record)), np.zeros(len(record))
+    how, y, by_noise, injected = _run_simulation(record, loop, prediction)
+    driven = [] if record.r is None else [(np.asarray(record.r), 1)]
+    if np.std(injected) > MEANINGFUL * np.std(record.u) and not (driven and not loop.controller):
+        driven.append((injected, 1))
+    return _judge_curve(how, record, y, driven, float(by_noise[0]))
+
+
+def _run_simulation(
+    record: Record, loop: Loop, prediction: Prediction
+) -> tuple[Reproduction, Array, Any, Array]:
+    """Return how a record is simulated, its outputs, what noise makes of each, and what drives it.
+
+    Of several outputs each has a row.
+    """
+    y, noisy = np.full(np.shape(record.y), np.nan), np.zeros(np.shape(record.y))
+    injected = np.zeros(np.shape(record.u))
     simulator = Simulator(loop, hold=record.hold, hold_r=record.hold_r)
     for part in find_long_stretches(record):
         stretch = prepare_stretch(
             simulator, record, part, start_time=0.0, guess=prediction.states[part.start],
             seek_controller=True, set_point=True,
         )  # fmt: skip
-        y[part], injected[part] = stretch.run(simulator)[0], stretch.d
-        noisy[part] = _run_with_noise(simulator, stretch, prediction) - y[part]
-    driven = [] if record.r is None else [(np.asarray(record.r), 1)]
-    if np.std(injected) > MEANINGFUL * np.std(record.u) and not (driven and not loop.controller):
-        driven.append((injected, 1))
+        y[..., part], injected[..., part] = stretch.run(simulator)[0], stretch.d
+        noisy[..., part] = _run_with_noise(simulator, stretch, prediction) - y[..., part]
     # Through a curved law noise moves the mean as well, and that is its doing too.
-    by_noise = float(np.sqrt(np.mean(noisy[np.isfinite(y)] ** 2)))
-    return _judge_curve(CLOSED_LOOP if loop.controller else OPEN_LOOP, record, y, driven, by_noise)
+    rows = zip(*(np.reshape(v, (-1, len(record))) for v in (noisy, y)), strict=True)
+    by_noise = np.array([np.sqrt(np.mean(v[np.isfinite(made)] ** 2)) for v, made in rows])
+    return CLOSED_LOOP if loop.controller else OPEN_LOOP, y, by_noise, injected
 
 
 def _run_with_noise(simulator: Simulator, stretch: Stretch, prediction: Prediction) -> Array:
     """Return the output of one run with the noise of a prediction, NaN where that cannot be."""
-    unknown = np.full(len(stretch.d), np.nan)
+    unknown = np.full((), np.nan)
     if not simulator.loop.equations().velocities:
         # A plant without a moving mass has no place for the force noise of the prediction.
         return unknown
-    streams = np.random.default_rng(0).standard_normal((2, len(stretch.d)))
-    noise = [streams[0] * prediction.sensor_noise, streams[1] * prediction.force_noise]
+    sizes = [np.reshape(v, (-1, 1)) for v in (prediction.sensor_noise, prediction.force_noise)]
+    streams = np.random.default_rng(0).standard_normal((sum(map(len, sizes)), stretch.d.shape[-1]))
+    noise = [streams[: len(sizes[0])] * sizes[0], streams[len(sizes[0]) :] * sizes[1]]
     try:
         return stretch.run(simulator, noise)[0]
     except ModelCannotRun:
@@ -364,7 +437,17 @@ def _test_residuals(record: Record, residuals: Array) -> tuple[Correlation, ...]
     e = np.where(known, residuals, 0.0)
     lags = int(min(25, max(known.sum() // 10, 1)))
     tests = [autocorrelation(e, known, lags),
-             cross_correlation(e, np.asarray(record.u), known, "u", lags, 1)]  # fmt: skip
+             *(cross_correlation(e, row, known, name, lags, 1)
+               for name, row in _list_rows(record, "u"))]  # fmt: skip
     if record.r is not None:
-        tests.append(cross_correlation(e, np.asarray(record.r), known, "r", lags, 0))
+        tests += [cross_correlation(e, row, known, name, lags, 0)
+                  for name, row in _list_rows(record, "r")]  # fmt: skip
     return tuple(tests)
+
+
+def _list_rows(record: Record, key: str) -> list[tuple[str, Array]]:
+    """Return the inputs or references of a record, each with its name where there are several."""
+    values = np.asarray(getattr(record, key))
+    if values.ndim == 1:
+        return [(key, values)]
+    return list(zip(record.signals[key], values, strict=True))

@@ -70,6 +70,9 @@ class Comparison(Printed):
         Residuals with their own past, with past u and with past r.
     notes : tuple of str
         What could not be computed, and why.
+    outputs : tuple of Comparison
+        Of several outputs, a comparison of each, called `what` it is; the curves and tests above
+        are all of theirs. Empty for one output.
     """
 
     what: str
@@ -78,6 +81,7 @@ class Comparison(Printed):
     residuals: Array
     tests: tuple[Correlation, ...]
     notes: tuple[str, ...] = ()
+    outputs: tuple["Comparison", ...] = ()
 
     def __post_init__(self) -> None:
         freeze_arrays(self)
@@ -96,7 +100,9 @@ class Comparison(Printed):
 
     @property
     def verdict(self) -> str:
-        """The comparison in words: the last curve, then the one-step errors."""
+        """The comparison in words: the last curve, then the one-step errors; of each output."""
+        if self.outputs:
+            return " ".join(f"{one.what}: {one.verdict}" for one in self.outputs)
         last = self.curves[-1]
         text = f"The fit of the {last.label} is {write_fit(last.fit)}"
         if last.fit <= 0:
@@ -133,6 +139,7 @@ class Comparison(Printed):
 
     def __str__(self) -> str:
         unit = self.record.units.get("y", "")
+        unit = "" if isinstance(unit, tuple) else unit
         rows = [
             f"Comparison of {self.what} with the record {self.record.name}".rstrip()
             + f" ({len(self.record)} samples, {np.count_nonzero(self.record.valid)} valid)"

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any
 
@@ -10,12 +10,12 @@ import numpy as np
 
 from .._base.errors import CtrlidError
 from .._base.rounding import keep_numpy_quiet
-from .._base.signals import require_one_signal
 from .._base.text import Printed, write_count, write_percent
 from ..data.record import SIGNALS, Record
 from ..data.several_records import order_model_and_data
 from ..data.validity import find_longest_run, find_runs
 from ..loop.loop import Loop
+from ..loop.wiring import match_signals
 from . import signal_defects as defects
 from .controller_check import FAULTS, check_controller
 from .hold_check import check_hold
@@ -51,7 +51,8 @@ class AuditFinding:
         where the stated controller does not compute the logged u, what is wrong with it:
         ``"gain"``, ``"sign"``, ``"bias"``, ``"delay"``, ``"limit"``, ``"filter"`` or ``"unknown"``.
     channel : str
-        ``"r"``, ``"u"`` or ``"y"``; empty where it concerns the whole record.
+        ``"r"``, ``"u"`` or ``"y"``, or the name of one of several signals; empty where it concerns
+        the whole record.
     text : str
         The finding in words, with what to do about it.
     size : float
@@ -168,7 +169,10 @@ def audit(record: Record, loop: Loop | None = None) -> Audit:
             "audit needs a Record and, optionally, its Loop; given "
             f"{type(record).__name__} and {type(loop).__name__}. Audit several records one by one"
         )
-    require_one_signal("audit", record, loop)
+    if any(len(names) > 1 for names in record.signals.values()) or (
+        loop is not None and not loop.equations().siso
+    ):
+        return _audit_several(record, loop)
     count = int(np.count_nonzero(record.valid))
     if count < 2:
         text = f"the record has {write_count(count, 'valid sample')}. Record longer."
@@ -202,6 +206,55 @@ def audit(record: Record, loop: Loop | None = None) -> Audit:
     findings.sort(key=lambda f: not f.harmful)
     return Audit(tuple(findings), MappingProxyType(checks.quantum), checks.repeats,
                  MappingProxyType(checks.saturated))  # fmt: skip
+
+
+def _audit_several(record: Record, loop: Loop | None) -> Audit:
+    """Audit each signal of several, with the checks of a record with one input and one output.
+
+    Steps, limits and repeats are found by the name of the signal.
+    """
+    if loop is not None:
+        record = match_signals(record, loop.equations())
+    findings: list[AuditFinding] = []
+    quantum, saturated = dict[str, float](), dict[str, tuple[float, float, float, float]]()
+    u, y = record.signals["u"], record.signals["y"]
+    r = record.signals.get("r", ())
+    parts = [("u", name, record.select(u=name, y=y[0])) for name in u]
+    parts += [("y", name, record.select(u=u[0], y=name)) for name in y]
+    parts += [("r", name, record.select(u=u[0], y=y[0], r=name)) for name in r]
+    limits = np.broadcast_to(
+        np.array([-np.inf, np.inf] if loop is None else
+                 np.array(np.broadcast_arrays(*loop.input_limits)).T), (len(u), 2)
+    )  # fmt: skip
+    for key, name, part in parts:
+        if key != "r":
+            # Whatever y does beside r is a matter of all references together.
+            part = replace(part, r=None, names={k: v for k, v in part.names.items() if k != "r"},
+                           units={k: v for k, v in part.units.items() if k != "r"})  # fmt: skip
+        if np.count_nonzero(part.valid) < 2:
+            text = f"{name} has {write_count(int(np.count_nonzero(part.valid)), 'valid sample')}."
+            findings.append(AuditFinding("too few samples", "", text, 0, (0, part.n), True))
+            continue
+        stated = tuple(limits[u.index(name)]) if key == "u" else ()
+        checks = _RecordChecks(part, stated)
+        found = [*checks.check_length(), *checks.find_constant(), *checks.find_limits(),
+                 *checks.find_steps()]  # fmt: skip
+        if key == "y":
+            found += [*checks.find_gaps(), *checks.find_outliers()]
+        elif key == "r":
+            found += checks.find_repetition()
+        quantum[name], saturated[name] = checks.quantum[key], checks.saturated[key]
+        findings += [
+            replace(f, channel=name, text=f"{name}: {f.text}") if f.channel else f
+            for f in found if f.channel in ("", key)
+        ]  # fmt: skip
+    if loop is not None:
+        for kind, text, size, harmful in check_controller(loop, record):
+            named = kind if kind in FAULTS else "controller"
+            findings.append(AuditFinding(named, "", text, size, (0, record.n), harmful))
+    findings = list(dict.fromkeys(findings))
+    findings.sort(key=lambda f: not f.harmful)
+    return Audit(tuple(findings), MappingProxyType(quantum), (0, 0), MappingProxyType(saturated))
 
 
 class _RecordChecks:

@@ -9,10 +9,15 @@ from .._base.arrays import Array
 from .._base.errors import ModelCannotRun
 from ..data.record import Record
 from ..estimation.likelihood.filter_data import FEWEST
-from ..loop.controller_replay import replay_from_best_state, run_controller
+from ..loop.controller_replay import (
+    read_references,
+    replay_from_best_state,
+    run_controller,
+)
 from ..loop.controllers import PID
 from ..loop.initial_state import find_initial_state
 from ..loop.simulation import Simulator
+from ..loop.wiring import knows_references
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,10 +107,13 @@ def prepare_stretch(
     initial, fitted = simulator.rest.copy(), len(simulator.plant_states)
     if guess is not None:
         initial[:fitted] = guess
-    r = None if part.r is None else np.asarray(part.r)
-    d = part.u - loop.point.input
+    middle = loop.point.inputs
+    d = part.u - (middle[0] if part.u.ndim == 1 else np.array(middle)[:, None])
+    r = None
+    if loop.controller is not None and not follow and knows_references(loop.wiring, part):
+        r = read_references(loop, part)
     if loop.controller is None:
-        r = None
+        pass
     elif follow:
         r = np.asarray(part.y)
     elif loop.analog:
@@ -114,7 +122,7 @@ def prepare_stretch(
                 "a loop with an analog controller is simulated from its reference, but the record "
                 "has none; give it r=, a constant for a fixed set-point"
             )
-        d = np.zeros(len(part))
+        d = np.zeros(np.shape(part.u))
         fitted = len(initial) if seek_controller else fitted
     elif r is None and set_point:
         pid = loop.controller

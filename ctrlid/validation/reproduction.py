@@ -8,6 +8,7 @@ import numpy as np
 from ..data.record import Record
 from ..loop.loop import Loop
 from ..loop.period_map import comes_to_rest
+from ..loop.wiring import knows_references
 from ..physics.linearization import compute_state_matrices
 from .controller_check import find_rejection
 
@@ -41,7 +42,8 @@ def choose_reproduction(loop: Loop, record: Record) -> Reproduction:
     What a wrong law leaves of the logged input carries the measured output into a simulation, so
     that after a rejected law only a prediction remains, which does not contain the controller.
     """
-    if loop.controller is not None and record.r is not None and not find_rejection(loop, record):
+    known = loop.controller is not None and knows_references(loop.wiring, record)
+    if known and not find_rejection(loop, record):
         return CLOSED_LOOP
     if loop.controller is None and comes_to_rest(loop):
         return OPEN_LOOP

@@ -14,7 +14,7 @@ from ...data.reconstruction import count_pieces, reconstruct_signal
 from ...data.record import Record
 from ...data.validity import find_runs
 from ...loop.loop import Loop
-from ...loop.wiring import match_signals, stack_references
+from ...loop.wiring import knows_references, match_signals, stack_references
 from ...physics.equations import Equations
 from ...physics.linearization import compute_state_matrices
 
@@ -128,9 +128,7 @@ def make_filter_data(loop: Loop, record: Record, start_time: float = 0.0) -> Fil
 
 def can_follow_controller(loop: Loop, record: Record) -> bool:
     """Return whether a known analog controller tells how the input runs between samples."""
-    wiring = loop.wiring
-    known = record.r is not None or (wiring is not None and None not in wiring.held)
-    return known and loop.analog
+    return knows_references(loop.wiring, record) and loop.analog
 
 
 def _make_several(loop: Loop, record: Record, start_time: float) -> FilterData:

@@ -29,6 +29,8 @@ from .sampled_plant import Linearized
 LEAD = 4
 # The spread is averaged over about so many predictions, evenly over the record.
 STARTS = 300
+# The filter of several outputs starts from at most this variance, relative to the sensor noise's.
+WIDE = 1e8
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -223,12 +225,13 @@ def predict_ahead(
     index : ndarray of int
         Samples that are predicted.
     y : ndarray
-        Their predictions.
+        Their predictions; of several outputs, a column for each.
     """
     every = max(1, horizon // 4)
     starts = np.arange(0, len(record) - horizon, every)
-    known = find_whole_past(record.valid, horizon)[starts + horizon]
-    starts = starts[known & prediction.settled[starts]]
+    known = find_whole_past(record.valid_samples, horizon)[starts + horizon]
+    settled = np.atleast_2d(prediction.settled)[:, starts].all(axis=0)
+    starts = starts[known & settled]
     if not len(starts):
         return starts, np.empty(0)
     problem = make_problem(_drop_neutral_effects(loop), (), [record])
@@ -243,7 +246,7 @@ def predict_ahead(
 
 def predict_spread(
     loop: Loop, record: Record, prediction: Prediction, horizon: int
-) -> tuple[float, float]:
+) -> tuple[Any, Any]:
     r"""Return the standard deviation that noise gives predictions several samples ahead.
 
     .. math:: P_{k+1} = A_k P_k A_k^T + Q, \quad \sigma^2 = h P_{k+j} h^T + R
@@ -267,9 +270,11 @@ def predict_spread(
     -------
     both, sensor : float
         Standard deviations by all noise, and by the sensor's alone [output unit]; NaN where no
-        stretch is long enough.
+        stretch is long enough. Of several outputs arrays of them.
     """
     plain = replace(_drop_neutral_effects(loop), controller=None)
+    if not loop.equations().siso:
+        return _predict_several_spreads(plain, record, prediction, horizon)
     r, force = prediction.sensor_noise**2, prediction.force_noise**2
     ratio = max(force / r, 1e-300) if r else 1.0
     problem = make_problem(plain, (), [record])
@@ -280,6 +285,73 @@ def predict_spread(
         for v in (force / r if r else 0.0, 0.0)
     )
     return math.sqrt(r) * both, math.sqrt(r) * sensor
+
+
+def _predict_several_spreads(
+    loop: Loop, record: Record, prediction: Prediction, horizon: int
+) -> tuple[Array, Array]:
+    """Return what `predict_spread` does, for each of several outputs."""
+    problem = make_problem(loop, (), [record])
+    sensor = np.maximum(np.ravel(np.asarray(prediction.sensor_noise, dtype=float)), 1e-150)
+    force = np.ravel(np.asarray(prediction.force_noise, dtype=float))
+    sensors = tuple(((sensor[1:] / sensor[0]) ** 2).tolist())
+    forces = tuple(np.maximum((force / sensor[0]) ** 2, 1e-300).tolist())
+    lin = begin_fit(problem, noise=Noise(forces, sensors=sensors)).linearized[0]
+    quiet = tuple(0.0 for _ in forces)
+    valid = problem.data[0].record.valid_samples
+    both, alone = (
+        sensor[0] * compute_spreads_ahead(lin, Noise(v, sensors=sensors), valid, horizon)
+        for v in (forces, quiet)
+    )
+    return both, alone
+
+
+def compute_spreads_ahead(lin: Linearized, noise: Noise, valid: Any, horizon: int) -> Array:
+    r"""Return the root mean square error that noise gives predictions of each of several outputs.
+
+    .. math:: \sigma_i^2 = h_i P h_i^T + R_i
+
+    as in `compute_spread_ahead`, with white noise.
+
+    Parameters
+    ----------
+    lin : Linearized
+        The plant along a record.
+    noise : Noise
+        The noise.
+    valid : ndarray of bool
+        Samples of the record that are valid.
+    horizon : int
+        Number of samples ahead.
+
+    Returns
+    -------
+    ndarray, shape (outputs,)
+        Errors in standard deviations of the first sensor's noise; NaN where no stretch is long
+        enough.
+    """
+    size, q = lin.output.shape
+    r = np.array([1.0, *noise.sensors])
+    lead = int(np.clip(LEAD * horizon, 50, 500))
+    starts = np.arange(0, size - lead - horizon, max(1, size // STARTS))
+    starts = starts[find_whole_past(valid, lead + horizon)[starts + lead + horizon]]
+    if not len(starts):
+        return np.full(q, math.nan)
+    force = np.asarray(noise.force)
+    # A start that is known hardly at all would be lost to rounding.
+    wide = np.diag(np.minimum(np.diag(lin.spread), WIDE))
+    p = np.broadcast_to(wide, (len(starts), *wide.shape))
+    for j in range(lead + horizon):
+        k = starts + j
+        for i in range(q if j <= lead else 0):
+            h = lin.c[k, i][:, None, :]
+            seen = p @ h.transpose(0, 2, 1)
+            p = p - seen @ seen.transpose(0, 2, 1) / np.maximum(h @ seen + r[i], 1e-300)
+        a, b = lin.a[k], lin.b[k][:, :, : len(force)]
+        p = a @ p @ a.transpose(0, 2, 1) + (b * force) @ b.transpose(0, 2, 1)
+    h = lin.c[starts + lead + horizon]
+    variance = np.mean(np.einsum("sqi,sij,sqj->sq", h, p, h), axis=0)
+    return np.asarray(np.sqrt(np.maximum(variance, 0.0) + r))
 
 
 def compute_spread_ahead(lin: Linearized, noise: Noise, valid: Any, horizon: int) -> float:

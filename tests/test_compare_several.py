@@ -1,0 +1,80 @@
+"""Replay of controllers, audit and compare for loops of several inputs and outputs."""
+
+import control as ct
+import numpy as np
+import pytest
+
+import ctrlid as cid
+from test_wiring import CART, DT, QUAD, at_rest, lqr_with_observer, luenberger
+
+NOISE = {"sensor_noise": (1e-4, 1e-3), "force_noise": (0.05, 0.001)}
+
+
+@pytest.fixture(scope="module")
+def dithered():
+    """A cart with a pole under an observer, white dither added to its force."""
+    loop = cid.Loop(CART, luenberger(CART), dt=DT, at=at_rest(CART))
+    d = 0.3 * np.random.default_rng(3).standard_normal(1000)
+    return loop, cid.simulate(loop, d=d, **NOISE, seed=2), d
+
+
+def test_replay_of_an_observer_is_exact():
+    loop = cid.Loop(CART, lqr_with_observer(CART), dt=DT, at=at_rest(CART))
+    r = cid.random_binary(400, amplitude=0.05, hold=100, seed=1)
+    record = cid.simulate(loop, {"xd[0]": r}, **NOISE, seed=2)
+    assert np.max(np.abs(cid.replay_controller(loop, record) - record.u)) < 1e-9
+    found = cid.audit(record, loop)
+    assert "exactly what the controller" in found["controller"][0].text
+
+
+def test_replay_with_several_inputs_and_no_reference():
+    C = lqr_with_observer(QUAD, weights=[10.0, 10, 10, 1, 1, 1])
+    loop = cid.Loop(QUAD, C, dt=DT, at=at_rest(QUAD))
+    d = 0.1 * np.random.default_rng(4).standard_normal((2, 400))
+    record = cid.simulate(loop, d=d, sensor_noise=1e-4, seed=5)
+    replayed = cid.replay_controller(loop, record)
+    assert replayed.shape == (2, 400)
+    # What the unknown state of the observer takes of the dither dies out.
+    assert np.max(np.abs((record.u - replayed - d)[:, 200:])) < 0.02
+
+
+def test_audit_tells_dither_from_a_wrong_law(dithered):
+    loop, record, _ = dithered
+    assert "that does not depend on the outputs" in cid.audit(record, loop)["controller"][0].text
+    C = loop.controller
+    wrong = ct.ss(C.A, C.B, 2 * C.C, C.D, DT, inputs=C.input_labels, outputs=C.output_labels)
+    found = cid.audit(record, cid.Loop(CART, wrong, dt=DT, at=at_rest(CART)))
+    assert found["unknown"]
+    assert found["unknown"][0].harmful
+
+
+def test_audit_names_the_signal(dithered):
+    _, record, _ = dithered
+    y = np.array(record.y)
+    y[1] = np.round(y[1] / 0.01) * 0.01
+    y[0, 300] += 0.1
+    found = cid.audit(cid.Record(u=record.u, y=y, dt=DT, names=record.names))
+    assert found["quantization"][0].channel == "theta"
+    assert found["quantization"][0].text.startswith("theta: ")
+    assert found["outliers"][0].channel == "x"
+    assert found.quantum["theta"] == pytest.approx(0.01)
+
+
+def test_compare_reproduces_each_output(dithered):
+    loop, record, _ = dithered
+    found = cid.compare(record, loop)
+    assert [c.what for c in found.outputs] == ["x", "theta"]
+    assert found["closed-loop simulation of theta"].fit > 50
+    assert all(t.passed for t in found.tests)
+    assert found.residuals.shape == (2, len(record))
+    assert found["one-step prediction of x"].rms == pytest.approx(1e-4, rel=0.1)
+    assert found.verdict.startswith("x: ")
+    assert "theta: " in str(found)
+
+
+def test_compare_sees_a_wrong_plant(dithered):
+    loop, record, _ = dithered
+    found = cid.compare(loop.with_parameters({"m": 0.4}), record)
+    assert "SOMETHING IS MISSING" in found.verdict
+    with pytest.raises(cid.CtrlidError, match="pick one with"):
+        cid.compare(record, ct.tf([1], [1, 1]))
