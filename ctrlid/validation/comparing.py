@@ -113,7 +113,8 @@ def compare(record: Record, model_or_loop: Any, *, horizon: int | None = None) -
             continue
         raise CtrlidError(
             f"{name if several else 'y'} is {y[0]:g} in all valid samples, so that no curve can "
-            "follow it better than another: record while the plant moves, or look whether the sensor is stuck"
+            "follow it better than another: record while the plant moves, or look whether the "
+            "sensor is stuck"
         )
     horizon = None if horizon is None else int(horizon)
     if several:
