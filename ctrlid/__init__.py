@@ -7,6 +7,7 @@ from ._base.errors import CtrlidError, CtrlidWarning
 from .data import datasets
 from .data.record import Record
 from .data.references import multisine, prbs, random_binary, staircase
+from .design.controller_trial import ControllerTrial, LoopPerformance, ReferenceStep, StepMotion
 from .design.lead import design_lead
 from .design.margins import Margins, loop_margins, nu_gap, robust_margin
 from .design.redesigning import Performance, Redesign, redesign
@@ -71,6 +72,7 @@ __all__ = [
     "Calibrated",
     "Candidate",
     "Comparison",
+    "ControllerTrial",
     "Correlation",
     "CtrlidError",
     "CtrlidWarning",
@@ -90,6 +92,7 @@ __all__ = [
     "Loop",
     "LoopEstimate",
     "LoopFit",
+    "LoopPerformance",
     "Margins",
     "Nonlinear",
     "OperatingPoint",
@@ -102,12 +105,14 @@ __all__ = [
     "ReciprocalPoles",
     "Record",
     "Redesign",
+    "ReferenceStep",
     "ResponseBand",
     "SamplingRow",
     "SamplingSweep",
     "Section",
     "SensorNoise",
     "StaticGain",
+    "StepMotion",
     "SymmetricPoles",
     "__version__",
     "audit",

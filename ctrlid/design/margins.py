@@ -1,6 +1,7 @@
 """How far a loop is from instability: margins, the nu-gap and the robust stability margin."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -74,6 +75,9 @@ class Margins(Printed):
         )
 
 
+UNSTABLE = Margins(False, *(math.nan,) * 6)
+
+
 @keep_numpy_quiet
 def loop_margins(L: Any) -> Margins:
     r"""Return the margins of the loop with negative feedback around L.
@@ -120,23 +124,44 @@ def loop_margins(L: Any) -> Margins:
     """
     loop = to_rational(L, "L")
     poles = find_closed_loop_poles(loop)
-    nan = math.nan
     if poles is None or not is_stable(poles, loop.dt):
-        return Margins(False, nan, nan, nan, nan, nan, nan)
+        return UNSTABLE
     gain = find_gain_crossovers(loop)
-    worst, angle = min(gain, key=lambda pair: abs(pair[1]), default=(nan, math.inf))
+    direct = not loop.dt and bool(abs(loop.at(math.inf)) >= 1)
+    return collect_margins(gain, _find_critical_factors(loop), modulus_margin(loop), direct)
+
+
+def collect_margins(
+    gain: Sequence[tuple[float, float]], factors: Sequence[float], modulus: float, direct: bool
+) -> Margins:
+    """Return the worst of each kind of a stable loop.
+
+    Parameters
+    ----------
+    gain : sequence of (float, float)
+        Frequency [rad/s] and angle from -1 [rad] of each gain crossover.
+    factors : sequence of float
+        Factors on the loop that reach the stability limit.
+    modulus : float
+        Smallest distance of the loop from -1.
+    direct : bool
+        Whether the loop gain stays above 1 up to infinite frequency.
+
+    Returns
+    -------
+    Margins
+        The margins.
+    """
+    worst, angle = min(gain, key=lambda pair: abs(pair[1]), default=(math.nan, math.inf))
     delays = [(angle % (2 * math.pi)) / omega for omega, angle in gain]
-    if not loop.dt and abs(loop.at(math.inf)) >= 1:
-        delays.append(0.0)
-    factors = _find_critical_factors(loop)
     return Margins(
         stable=True,
         crossover=worst,
         phase_margin=math.degrees(abs(angle)),
         gain_margin=min((k for k in factors if k > 1), default=math.inf),
         gain_reduction_margin=max((k for k in factors if k < 1), default=0.0),
-        modulus_margin=modulus_margin(loop),
-        delay_margin=min(delays, default=math.inf),
+        modulus_margin=modulus,
+        delay_margin=0.0 if direct else min(delays, default=math.inf),
     )
 
 

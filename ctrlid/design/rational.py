@@ -265,13 +265,21 @@ def make_frequency_grid(
     `special` polynomials are single points; they may be far off, so they do not set the range.
     """
     s = np.concatenate([find_time_scales(p, dt) for p in acting])
+    points = [np.abs(to_s(find_roots(p), dt).imag) for p in special]
+    return make_grid_of_roots(dt, s, points)
+
+
+def make_grid_of_roots(dt: float, s: ComplexArray, points: Iterable[Array] = ()) -> Array:
+    """Return a grid in rad/s, dense wherever roots in the s-plane act, with further points.
+
+    A resonance at |Im s| is as narrow as |Re s|, so each root brings its own points.
+    """
     sizes = np.abs(s) if len(s) else np.array([1.0 / dt if dt else 1.0])
     top = math.pi / dt if dt else 1e3 * float(max(sizes))
     bottom = 1e-3 * min(float(min(sizes)), top)
     offsets = np.concatenate([[0.0], np.geomspace(0.01, 30.0, 25)])
     offsets = np.concatenate([-offsets, offsets])
     near = (np.abs(s.imag)[:, None] + np.abs(s.real)[:, None] * offsets).ravel()
-    points = [np.abs(to_s(find_roots(p), dt).imag) for p in special]
     count = 30 * math.ceil(math.log10(top / bottom)) + 1
     grid = np.concatenate([np.geomspace(bottom, top, count), near, sizes, *points])
     return np.unique(grid[(grid >= bottom) & (grid <= top)])

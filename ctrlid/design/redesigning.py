@@ -1,9 +1,10 @@
 """redesign(): a controller designed on an identified model, and what it does on the physics."""
 
 import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from numbers import Real
-from typing import Any
+from typing import Any, overload
 
 import control as ct
 import numpy as np
@@ -15,11 +16,13 @@ from .._base.rounding import keep_numpy_quiet
 from .._base.signals import require_one_signal
 from .._base.text import Printed, write_polynomial, write_quantity
 from ..estimation.identified_model import IdentifiedModel
+from ..estimation.likelihood.physics_estimate import LoopFit, linearize_at_rest
 from ..loop.loop import Loop
 from ..loop.period_map import compute_growth_rate
 from ..loop.simulation import SimulationStopped, simulate
-from ..physics.conversions import sample_held, to_transfer_function
+from ..physics.conversions import sample_held, to_state_matrices, to_transfer_function
 from ..physics.trace import timebase
+from .controller_trial import ControllerTrial, try_design
 from .lead import design_lead
 from .margins import loop_margins, nu_gap, robust_margin
 
@@ -187,41 +190,65 @@ class Redesign(Printed):
         return "\n".join([f"controller: ({num}) / ({den})", *rows, step, "  " + self.verdict])
 
 
-@keep_numpy_quiet
+@overload
 def redesign(
     G: Any, loop: Loop, crossover: float, phase_margin: float, *, step: float | None = None
-) -> Redesign:
-    """Design a lead on a model and try it on the physics of a loop.
+) -> Redesign: ...
+@overload
+def redesign(
+    G: Any, loop: Loop, *, design: Callable[[Any], Any],
+    step: float | Mapping[str, float] | None = None,
+) -> ControllerTrial: ...  # fmt: skip
+@keep_numpy_quiet
+def redesign(
+    G: Any, loop: Loop, crossover: float | None = None, phase_margin: float | None = None, *,
+    design: Callable[[Any], Any] | None = None,
+    step: float | Mapping[str, float] | None = None,
+) -> Redesign | ControllerTrial:  # fmt: skip
+    """Design a controller on a model and try it on the physics of a loop.
 
-    The controller is `design_lead` on `G`. Its promise is that of the linear loop with `G`. What it
-    achieves is measured on the loop's own plant: margins on the plant linearized at the
-    operating point (and sampled, for a digital controller), step response on the nonlinear
-    equations, within the loop's input limits.
+    With a crossover and a phase margin the controller is the lead of `design_lead` on `G`. With
+    `design`, a function from the model to a controller, it is any that python-control knows, for
+    any number of signals: ``design=lambda P: ct.create_statefbk_iosystem(P, ct.lqr(P, Q, R)[0])``.
+
+    The promise is that of the linear loop with `G`. What the controller achieves is measured on the
+    loop's own plant: poles and margins on the plant linearized at the operating point (and sampled,
+    for a digital controller), step responses on the nonlinear equations, within the loop's input
+    limits.
 
     Parameters
     ----------
-    G : control.TransferFunction
-        The model, for instance an `IdentifiedModel`. A model in discrete time gives a digital
-        controller at its sampling period, a continuous one an analog controller.
+    G : control.TransferFunction, control.StateSpace, Loop or LoopFit
+        The model, for instance an `IdentifiedModel`; of a loop or a fitted loop its linear model at
+        the operating point, in the states of the plant. A model in discrete time needs a digital
+        controller at its sampling period; the lead on a continuous one is analog.
     loop : Loop
         The physics and its operating point; its own controller is not used.
-    crossover : float
+    crossover : float, optional
         Gain crossover to design for [rad/s].
-    phase_margin : float
+    phase_margin : float, optional
         Phase margin to design for [deg].
-    step : float, optional
+    design : callable, optional
+        Function of the model, with the signal names of the loop; a transfer function of several
+        signals comes as a state space, and with a delay as Padé's approximation. It returns the
+        controller, alone or with the closed loop, as `control.create_statefbk_iosystem` does. The
+        controller is wired as `Loop` says; its own time base decides whether it is digital.
+    step : float or mapping of str to float, optional
         Height of the reference step [output unit]; by default 1 % of the output at the operating
-        point.
+        point, or 0.01. Of several references, a mapping of names says which are tried; by default
+        those that cannot be held and each ``xd[i]`` that is an output.
 
     Returns
     -------
-    Redesign
-        Controller, promise, achievement and a verdict in words as its text.
+    Redesign or ControllerTrial
+        Controller, promise, achievement and a verdict in words as its text: a `ControllerTrial`
+        where a function designed it.
 
     Raises
     ------
     CtrlidError
-        If one lead cannot do it on this model, or the arguments do not fit.
+        If one lead cannot do it on this model, the function fails or returns no controller, or the
+        arguments do not fit.
 
     References
     ----------
@@ -237,15 +264,45 @@ def redesign(
     >>> outcome = cid.redesign(cid.linearize(plant, op), loop, crossover=100, phase_margin=50)
     >>> outcome.stable, round(outcome.achieved.phase_margin, 6)
     (True, 50.0)
+
+    A cart with a pole, under state feedback on an observer:
+
+    >>> import control as ct
+    >>> import numpy as np
+    >>> cart = cid.plants.cart_pole(M=0.5, m=0.2, length=0.3)
+    >>> rig = cid.Loop(cart, dt=0.01)
+    >>> def design(P):
+    ...     K = ct.lqr(P, np.diag([10, 10, 1, 1]), np.eye(1))[0]
+    ...     L = ct.lqe(P, np.eye(1), 1e-4 * np.eye(2))[0]
+    ...     return ct.ss(P.A - L @ P.C - P.B @ K, np.hstack([L, P.B @ K]), -K,
+    ...                  np.hstack([np.zeros((1, 2)), K]), outputs="F",
+    ...                  inputs=["x", "theta", "xd[0]", "xd[1]", "xd[2]", "xd[3]"])
+    >>> trial = cid.redesign(rig, rig, design=design)
+    >>> trial.stable, [s.reference for s in trial.steps]
+    (True, ['xd[0]', 'xd[1]'])
     """
-    check_arguments(redesign, locals(), "loop", "step")
+    check_arguments(redesign, locals(), "loop", "step", "design")
+    if isinstance(G, Loop | LoopFit):
+        G = G.linearize(states=True) if isinstance(G, Loop) else linearize_at_rest(G.loop, True)
     if not isinstance(G, ct.TransferFunction | ct.StateSpace):
         raise CtrlidError("redesign needs a linear model (a TransferFunction, as the fits return); "
                           f"given {type(G).__name__}")  # fmt: skip
     if not isinstance(loop, Loop):
         raise CtrlidError("redesign needs a Loop, on which the controller is tried; given "
                           f"{type(loop).__name__}")  # fmt: skip
-    require_one_signal("redesign", loop)
+    if design is not None:
+        if crossover is not None or phase_margin is not None:
+            raise CtrlidError("redesign takes a crossover and a phase margin, or design= with a "
+                              "function of the model; given both")  # fmt: skip
+        if not callable(design):
+            raise CtrlidError("design= is a function from the model to a controller, such as "
+                              "lambda P: ct.create_statefbk_iosystem(P, ct.lqr(P, Q, R)[0]); given "
+                              f"{design!r}")  # fmt: skip
+        return try_design(_make_plain(G), loop, design, step)
+    require_one_signal("redesign without design=", loop)
+    if crossover is None or phase_margin is None:
+        raise CtrlidError("redesign needs the crossover and the phase margin of a lead, or design= "
+                          "with a function from the model to a controller")  # fmt: skip
     # The design needs a plain transfer function with the delay of the fit in it.
     G = G.with_delay() if isinstance(G, IdentifiedModel) else to_transfer_function(G)
     C = design_lead(G, crossover=crossover, phase_margin=phase_margin)
@@ -283,7 +340,17 @@ def redesign(
                     height, "" if failure is None else failure)  # fmt: skip
 
 
-def _choose_height(loop: Loop, step: float | None) -> float:
+def _make_plain(G: Any) -> Any:
+    """Return a model with its delay; one of several signals by states, as designs take it."""
+    if isinstance(G, IdentifiedModel):
+        return G.with_delay()
+    if isinstance(G, ct.TransferFunction) and not G.issiso():
+        return ct.ss(*to_state_matrices(G), timebase(G) or 0, inputs=G.input_labels,
+                     outputs=G.output_labels)  # fmt: skip
+    return G
+
+
+def _choose_height(loop: Loop, step: Any) -> float:
     if step is None:
         return 0.01 * abs(loop.point.output) or 0.01
     if not isinstance(step, Real) or not np.isfinite(float(step)) or step == 0:

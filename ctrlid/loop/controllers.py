@@ -17,6 +17,7 @@ import control as ct
 import numpy as np
 
 from .._base.arguments import is_number
+from .._base.arrays import Array
 from .._base.errors import CtrlidError
 from .._base.periods import have_same_period, write_both_periods
 from .._base.text import find_near_name
@@ -290,3 +291,33 @@ def _make_pid_law(pid: PID, at: OperatingPoint, dt: float) -> ControlLaw:
         return u, casadi.vertcat(integral + step, error, difference, slope)
 
     return ControlLaw(dt, (0.0, 0.0, (c - 1.0) * at.output, 0.0), apply)
+
+
+def linearize_law(law: ControlLaw, at: OperatingPoint) -> tuple[Array, ...]:
+    """Return the state matrices of a controller at rest.
+
+    Parameters
+    ----------
+    law : ControlLaw
+        The controller.
+    at : OperatingPoint
+        Operating point of its loop.
+
+    Returns
+    -------
+    tuple of ndarray
+        A, B from y, B from u, C and D from y.
+    """
+    nc, p, m = len(law.rest), len(at.outputs), len(at.inputs)
+    r = casadi.SX(casadi.DM(at.outputs if law.references is None else law.references))
+    x, y, u = casadi.SX.sym("x", nc), casadi.SX.sym("y", p), casadi.SX.sym("u", m)
+    given = (0.0, x, r, y, *((u,) if law.reads_input else ()))
+    wish, moved = (casadi.vertcat(v) for v in law.apply(*given))
+    parts = [
+        casadi.jacobian(f, v) for f, v in ((moved, x), (moved, y), (moved, u), (wish, x), (wish, y))
+    ]
+    found = casadi.Function("law", [x, y, u], parts)(list(law.rest), at.outputs, at.inputs)
+    sizes = ((nc, nc), (nc, p), (nc, m), (m, nc), (m, p))
+    return tuple(
+        np.asarray(part, dtype=float).reshape(size) for part, size in zip(found, sizes, strict=True)
+    )

@@ -10,11 +10,12 @@ from typing import Any
 import casadi
 import numpy as np
 
-from .._base.arrays import Array
+from .._base.arrays import Array, ComplexArray
 from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from ..data.reconstruction import count_pieces
 from ..physics.equations import Equations
 from ..physics.integration import Piece, Scheme, advance, count_delay_samples, cut_input, integrate
+from ..physics.linearization import find_reached_states
 from .loop import Loop
 
 
@@ -240,15 +241,65 @@ def linearize_at_rest(s: PeriodMap, function: Any) -> tuple[Array, Array]:
     return np.asarray(a, float), np.asarray(b, float)
 
 
+def compute_closed_loop_poles(loop: Loop, hidden: bool = True) -> ComplexArray:
+    r"""Return the poles of a loop for small deviations [rad/s].
+
+    .. math:: s_i = \ln(\lambda_i) / T
+
+    with the eigenvalues of the linearized map over one sampling period T, with the controller as it
+    runs; with an analog controller the poles of the loop's rates. As in `Loop.linearize`, the steps
+    of a converter, dead zones and backlash are left out: within one step of it at rest, no
+    converter passes anything on.
+
+    Parameters
+    ----------
+    loop : Loop
+        The loop.
+    hidden : bool, optional
+        Whether those of controller states count that no signal reaches, such as the integral of a
+        `PID` without integral gain or the covariance of an observer.
+
+    Returns
+    -------
+    ndarray of complex
+        Poles of plant and controller; minus infinity for what is at rest after one period.
+
+    Raises
+    ------
+    CtrlidError
+        If the plant has no derivative at the operating point.
+    """
+    for label, effect in loop.labelled.items():
+        if not effect.in_linear_model:
+            loop = loop.without_effect(label)
+    s = make_period_map(loop, 8)
+    # The rates give the poles of a stiff circuit without the error of an integration step.
+    matrix, entry = linearize_at_rest(s, s.step if s.rate is None else s.rate)
+    if not np.isfinite(matrix).all():
+        raise ModelCannotRun(
+            f"{loop.equations().name} has no derivative at its operating point, {loop.point}; "
+            "give at=operating_point(plant, output=...)"
+        )
+    if not hidden:
+        n, law = len(s.plant_states), loop.law()
+        of_controller = np.zeros(len(matrix), dtype=bool)
+        of_controller[n : n + (len(law.rest) if law else 0)] = True
+        kept = find_reached_states(matrix, entry) | ~of_controller
+        matrix = matrix[np.ix_(kept, kept)]
+    poles: ComplexArray = np.linalg.eigvals(matrix).astype(complex)
+    if s.rate is not None:
+        return poles
+    with np.errstate(divide="ignore"):
+        rates: ComplexArray = np.log(np.abs(poles)) / loop.dt + 1j * (np.angle(poles) / loop.dt)
+    return rates
+
+
 def compute_growth_rate(loop: Loop) -> float:
     r"""Return the growth rate of small deviations in the closed loop [1/s].
 
-    .. math:: \max_i \ln|\lambda_i| / T
+    .. math:: \max_i \operatorname{Re} s_i
 
-    over the eigenvalues of the linearized map over one sampling period T, with the controller as it
-    runs; with an analog controller the largest real part of the loop's poles. Negative: stable.
-    As in `Loop.linearize`, the steps of a converter, dead zones and backlash are left out: within
-    one step of it at rest, no converter passes anything on.
+    over its poles. Negative: stable.
 
     Parameters
     ----------
@@ -265,23 +316,7 @@ def compute_growth_rate(loop: Loop) -> float:
     CtrlidError
         If the plant has no derivative at the operating point.
     """
-    for label, effect in loop.labelled.items():
-        if not effect.in_linear_model:
-            loop = loop.without_effect(label)
-    s = make_period_map(loop, 8)
-    function = s.step if s.rate is None else s.rate
-    matrix, _ = linearize_at_rest(s, function)
-    if not np.isfinite(matrix).all():
-        raise ModelCannotRun(
-            f"{loop.equations().name} has no derivative at its operating point, {loop.point}; "
-            "give at=operating_point(plant, output=...)"
-        )
-    poles = np.linalg.eigvals(matrix)
-    # The rates give the poles of a stiff circuit without the error of an integration step.
-    if s.rate is not None:
-        return float(np.max(poles.real, initial=-math.inf))
-    largest = np.max(np.abs(poles), initial=0.0)
-    return float(np.log(largest) / loop.dt) if largest > 0 else -math.inf
+    return float(np.max(compute_closed_loop_poles(loop).real, initial=-math.inf))
 
 
 @functools.lru_cache(maxsize=32)

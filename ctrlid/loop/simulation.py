@@ -430,6 +430,10 @@ class Simulator:
         # rest.
         if self.loop.controller is not None or (asked.all() and self._unstable):
             away = np.abs(ys - np.array(self.loop.point.outputs)[:, None])
+            # What moves an output in second order only, as a tilt moves the height of a quadrotor,
+            # is no flight: there the largest of all outputs counts.
+            most = np.max(asked, initial=0.0)
+            asked = np.where(RUNAWAY * asked < most, most, asked)
             bad |= (away > RUNAWAY * asked[:, None]).any(axis=0)
         return int(np.argmax(bad)) if bad.any() else None
 

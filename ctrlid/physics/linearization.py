@@ -416,7 +416,7 @@ def make_state_space(equations: Equations, at: OperatingPoint) -> Any:
 
 def _reduce_to_minimal(a: Array, b: Array, c: Array, d: Array) -> tuple[Array, Array, Array, Array]:
     """Keep the states that the input reaches and the output shows."""
-    keep = _find_reached_states(a, b) & _find_reached_states(a.T, c.T)
+    keep = find_reached_states(a, b) & find_reached_states(a.T, c.T)
     a, b, c = a[np.ix_(keep, keep)], b[keep], c[:, keep]
     if not a.size:
         return a, b, c, d
@@ -432,7 +432,7 @@ def _reduce_to_minimal(a: Array, b: Array, c: Array, d: Array) -> tuple[Array, A
     return w.T @ qa @ w, w.T @ qb, qc @ w, d
 
 
-def _find_reached_states(a: Array, b: Array) -> Any:
+def find_reached_states(a: Array, b: Array) -> Any:
     """Return which states a signal entering through `b` reaches along the non-zero couplings."""
     reached = np.any(b != 0, axis=1)
     for _ in range(len(a)):

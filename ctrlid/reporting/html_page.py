@@ -12,6 +12,7 @@ from .._base.errors import CtrlidError
 from .._base.files import replace_file
 from .._base.text import is_bad_news
 from ..data.record import Record
+from ..design.controller_trial import ControllerTrial
 from ..design.redesigning import Redesign
 from ..diagnosis.result import Diagnosis
 from ..estimation.identified_model import IdentifiedModel
@@ -79,8 +80,8 @@ class Section:
     text : str, optional
         Plain words; an empty line starts a new paragraph.
     result : object, optional
-        A `Table`, `Record`, `IdentifiedModel`, `LoopFit`, `Comparison`, `Redesign` or `Diagnosis`,
-        or a tuple of them.
+        A `Table`, `Record`, `IdentifiedModel`, `LoopFit`, `Comparison`, `Redesign`,
+        `ControllerTrial` or `Diagnosis`, or a tuple of them.
     figure : object, optional
         A `plot.Picture`, a matplotlib figure or axes, or the bytes of a PNG file, or a mapping of
         such by caption. By default the pictures that belong to the result, an empty mapping for
@@ -199,6 +200,12 @@ def _draw_pictures(result: Any) -> dict[str, Any]:
             if result.tests:
                 made["Correlations of the one-step errors."] = plot.residuals(result)
             return made
+        case ControllerTrial():
+            return (
+                {"Response to a step of each reference.": plot.step(result)}
+                if (result.steps)
+                else {}
+            )
         case Redesign():
             return {"Response to a step of the reference.": plot.step(result)}
         case Diagnosis():

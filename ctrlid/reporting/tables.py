@@ -8,6 +8,7 @@ import numpy as np
 from .._base import text as _text
 from .._base.errors import CtrlidError
 from ..data.record import Record, list_rows
+from ..design.controller_trial import ControllerTrial
 from ..design.redesigning import Redesign
 from ..diagnosis import wording
 from ..diagnosis.result import Diagnosis
@@ -99,15 +100,15 @@ def write_heading(result: Any) -> str:
             return f"Physical parameters of {result.loop.plant.name}"
         case Comparison():
             return f"{result.what.split('(')[0]} against the record {result.record.name}".strip()
-        case Redesign():
+        case Redesign() | ControllerTrial():
             return "Redesign: promised against achieved"
         case Diagnosis():
             return f"Diagnosis of {result.record or 'a record'}"
         case Table():
             return result.caption or "Table"
     raise CtrlidError(
-        "a report shows a Record, IdentifiedModel, LoopFit, Comparison, Redesign, Diagnosis, Table "
-        f"or Section, or a sequence of them; given {type(result).__name__}"
+        "a report shows a Record, IdentifiedModel, LoopFit, Comparison, Redesign, ControllerTrial, "
+        f"Diagnosis, Table or Section, or a sequence of them; given {type(result).__name__}"
     )
 
 
@@ -126,6 +127,9 @@ def make_blocks(result: Any) -> list[Block]:
             return [*_make_comparison_tables(result), *result.notes, result.verdict]
         case Redesign():
             return _make_redesign_blocks(result)
+        case ControllerTrial():
+            return [Table(("", "promised on the model", "achieved on the physics"), result.rows),
+                    result.verdict, f"{result.loop!r}."]  # fmt: skip
         case Diagnosis():
             return _make_diagnosis_blocks(result)
     # This refuses a result that no page can show.

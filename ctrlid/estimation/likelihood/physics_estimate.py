@@ -164,7 +164,7 @@ class LoopFit(Printed):
     @property
     def model(self) -> Any:
         """The plant with its effects, linearized where it rests at the loop's output."""
-        return _linearize_at_rest(self.loop)
+        return linearize_at_rest(self.loop)
 
     @property
     def poles(self) -> Any:
@@ -188,7 +188,7 @@ class LoopFit(Printed):
                 slopes.append(np.zeros(len(self.poles)))
                 continue
             ends = [
-                _linearize_at_rest(self.loop.with_parameters({name: value + d})) for d in (h, -h)
+                linearize_at_rest(self.loop.with_parameters({name: value + d})) for d in (h, -h)
             ]
             above, below = (_find_denominator(end) for end in ends)
             slopes.append((above - below)[1:] / (2 * h))
@@ -208,8 +208,21 @@ def _find_denominator(model: Any) -> Any:
     return np.poly(model.A) if isinstance(model, ct.StateSpace) else model.den[0][0]
 
 
-def _linearize_at_rest(loop: Loop) -> Any:
-    """Return the linear model at the loop's output, with input and states solved for anew."""
+def linearize_at_rest(loop: Loop, states: bool = False) -> Any:
+    """Return the linear model at the loop's output, with input and states solved for anew.
+
+    Parameters
+    ----------
+    loop : Loop
+        The loop.
+    states : bool, optional
+        Whether to keep the states of the plant, as `Loop.linearize` does.
+
+    Returns
+    -------
+    control.TransferFunction or control.StateSpace
+        The model.
+    """
     e = loop.equations()
     if not e.siso:
         # The outputs stay; the input that holds them there depends on the parameters.
@@ -220,4 +233,4 @@ def _linearize_at_rest(loop: Loop) -> Any:
         assert loop.at is not None
         at = operating_point(loop.plant, output=loop.at.output, guess=loop.at)
         loop = replace(loop, at=at)
-    return loop.linearize()
+    return loop.linearize(states=states)

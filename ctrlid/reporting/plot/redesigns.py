@@ -6,8 +6,10 @@ from typing import Any
 import numpy as np
 
 from ..._base.errors import CtrlidError
+from ..._base.text import with_unit
+from ...design.controller_trial import ControllerTrial, ReferenceStep, StepMotion
 from ...design.redesigning import Redesign
-from .axes import MARKERS, Picture, choose_line_style, finish_axes, require_kind, take_axes
+from .axes import MARKERS, Picture, choose_line_style, figure, finish_axes, require_kind, take_axes
 
 
 def step(redesigns: Any, ax: Any = None) -> Picture:
@@ -15,8 +17,9 @@ def step(redesigns: Any, ax: Any = None) -> Picture:
 
     Parameters
     ----------
-    redesigns : Redesign or mapping of str to Redesign
-        From `redesign`: one, or several by a label, each with axes of its own.
+    redesigns : Redesign, mapping of str to Redesign, or ControllerTrial
+        From `redesign`: one, or several by a label, each with axes of its own. Of a
+        `ControllerTrial` a column for each reference shows all outputs, then all inputs.
     ax : matplotlib Axes or sequence of them, optional
         By default those of a new figure.
 
@@ -44,10 +47,13 @@ def step(redesigns: Any, ax: Any = None) -> Picture:
     >>> cid.plot.step({"100 rad/s": slow, "200 rad/s": fast})
     Picture with 2 axes
     """
+    if isinstance(redesigns, ControllerTrial):
+        return _draw_trial(redesigns, ax)
     several = redesigns if isinstance(redesigns, Mapping) else {"": redesigns}
     if not several:
         raise CtrlidError("plot.step has nothing to draw: the mapping is empty")
-    needed = "plot.step draws a Redesign, as redesign() returns, or a mapping of them"
+    needed = ("plot.step draws a Redesign, as redesign() returns, or a mapping of them, or one "
+              "ControllerTrial")  # fmt: skip
     for redesign in several.values():
         require_kind(redesign, Redesign, needed)
     size = (7.2, 3.2 * len(several)) if len(several) > 1 else None
@@ -62,6 +68,59 @@ def step(redesigns: Any, ax: Any = None) -> Picture:
         ax.set_xlim(0, max(ends))
         ax.set_xlabel("time after the step [s]" if ax is axes[-1] else "")
     return Picture(axes)
+
+
+def _draw_trial(trial: ControllerTrial, ax: Any) -> Picture:
+    """Draw all signals after a step of each reference, one reference in each column."""
+    signals, units, steps = trial.loop.signals, trial.loop.known_units, trial.steps
+    if not steps:
+        raise CtrlidError("plot.step has nothing to draw: the controller has no reference")
+    rows = [("y", k, name) for k, name in enumerate(signals["y"])]
+    rows += [("u", k, name) for k, name in enumerate(signals["u"])]
+    if ax is None:
+        size = (max(7.2, 4.8 * len(steps)), 1.4 + 1.7 * len(rows))
+        ax = figure(len(rows), len(steps), size, sharex="col").axes.ravel()
+    axes = take_axes(ax, len(rows) * len(steps)).reshape(len(rows), len(steps))
+    for column, step in enumerate(steps):
+        for row, (key, k, name) in enumerate(rows):
+            one = axes[row, column]
+            for i, (what, motion) in enumerate(
+                (
+                    ("promised on the model", step.promised),
+                    ("achieved on the physics", step.achieved),
+                )
+            ):
+                values = getattr(motion, key)[k]
+                label = f"{what}: {_describe_motion(motion, step)}" if row == 0 else None
+                one.plot(step.time[: len(values)], values, label=label, **choose_line_style(i),
+                         marker=MARKERS[i], markevery=max(len(values) // 25, 1),
+                         markersize=4)  # fmt: skip
+            # Short names stand one above another where columns are narrow.
+            one.set_ylabel(with_unit(name, units.get(name, "")))
+            finish_axes(one, legend=row == 0, columns=1, size="small")
+            one.set_xlabel(f"time after the step of {step.reference} [s]" if row == len(rows) - 1
+                           else "")  # fmt: skip
+        axes[-1, column].set_xlim(0, _find_end(step))
+    return Picture(axes.ravel())
+
+
+def _describe_motion(motion: StepMotion, step: ReferenceStep) -> str:
+    """Return how a response went, in a few words."""
+    if motion.failure:
+        return "UNSTABLE"
+    if np.isnan(motion.settling_time):
+        return f"{step.output} returns to rest"
+    if not np.isfinite(motion.settling_time):
+        return "DOES NOT SETTLE"
+    return f"{motion.overshoot:.0f} % overshoot, settling time {motion.settling_time:.2g} s"
+
+
+def _find_end(step: ReferenceStep) -> float:
+    """Return where the axis of time should end."""
+    settled = [t for t in (step.promised.settling_time, step.achieved.settling_time)
+               if np.isfinite(t)]  # fmt: skip
+    last = float(step.time[-1])
+    return min(last, 2 * max(settled)) if settled and max(settled) > 0 else last
 
 
 def _draw_step(ax: Any, redesign: Redesign) -> float:

@@ -1,0 +1,609 @@
+"""A controller of any kind: what it promises on a linear model, and what it does on the physics."""
+
+import math
+import re
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import control as ct
+import numpy as np
+
+from .._base.arguments import is_number
+from .._base.arrays import Array, ComplexArray, freeze_arrays
+from .._base.errors import CtrlidError, ModelCannotRun
+from .._base.text import Printed, write_count, write_list, write_number, write_quantity
+from ..loop.controllers import PID
+from ..loop.loop import Loop
+from ..loop.simulation import SimulationStopped, simulate
+from ..physics.trace import timebase
+from .input_margins import measure_input_margins
+from .margins import Margins
+
+# A response has settled when it stays within this share of its final value.
+SETTLED = 0.02
+# A response so many times the promised one is no longer under control.
+LOST = 20
+# The loss of more than this share of what was promised is reported.
+CLOSE = 0.25
+# A final value below this share of the largest deviation is none: the output returns.
+RETURNS = 0.02
+# A reference is followed if the output ends at no less than this share of it.
+HELD = 0.5
+# A deviation below this share of a step is rounding.
+NOTHING = 1e-9
+# A step response lasts so many time constants of the slowest promised pole.
+LASTING = 8.0
+LONGEST = 20_000
+
+
+@dataclass(frozen=True, eq=False)
+class StepMotion:
+    """What a step of one reference does to all signals of a loop.
+
+    Parameters
+    ----------
+    y, u : ndarray, shape (outputs, k) and (inputs, k)
+        Deviations from rest [their units]; they end early where the simulation broke off.
+    final_value : float
+        Of the output that follows, per unit of the reference; NaN where it is not known.
+    overshoot : float
+        Of that output, in percent of its final value.
+    settling_time : float
+        Until that output stays within 2 % of its final value [s]; infinite if it never does.
+    failure : str
+        Why the simulation broke off, or empty.
+    """
+
+    y: Array
+    u: Array
+    final_value: float
+    overshoot: float
+    settling_time: float
+    failure: str = ""
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
+
+    @property
+    def peak_outputs(self) -> tuple[float, ...]:
+        """Largest deviation of each output [its unit]."""
+        return tuple(np.max(np.abs(self.y), axis=1, initial=0.0).tolist())
+
+    @property
+    def peak_inputs(self) -> tuple[float, ...]:
+        """Largest deviation of each input [its unit]."""
+        return tuple(np.max(np.abs(self.u), axis=1, initial=0.0).tolist())
+
+
+@dataclass(frozen=True, eq=False)
+class ReferenceStep:
+    """A step of one reference, on the model and on the physics.
+
+    Parameters
+    ----------
+    reference : str
+        Its name.
+    height : float
+        Height of the step [unit of the reference].
+    output : str
+        The output that follows it.
+    time : ndarray
+        Time after the step [s].
+    promised, achieved : StepMotion
+        On the model, and on the nonlinear physics within its input limits.
+    """
+
+    reference: str
+    height: float
+    output: str
+    time: Array
+    promised: StepMotion
+    achieved: StepMotion
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
+
+
+@dataclass(frozen=True, eq=False)
+class LoopPerformance:
+    """Poles and margins that a controller promises on a model, or achieves on the physics.
+
+    Parameters
+    ----------
+    stable : bool
+        Whether small deviations die out and every step that was tried ended near where it should.
+    poles : ndarray of complex
+        Closed-loop poles [rad/s], of plant and controller; of a digital one ``log(z) / dt``.
+    margins : tuple of Margins
+        One for each input of the plant: the loop is cut there, all others stay closed. NaN for an
+        unstable loop.
+    disk_margin : float
+        `control.disk_margins` for all inputs at once [1]; NaN where python-control cannot tell.
+    disk_gain : float
+        Factor by which the gains of all inputs may rise or fall at the same time.
+    disk_phase : float
+        Phase [deg] that all inputs may lose or gain at the same time.
+    """
+
+    stable: bool
+    poles: ComplexArray
+    margins: tuple[Margins, ...]
+    disk_margin: float
+    disk_gain: float
+    disk_phase: float
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
+
+    @property
+    def growth_rate(self) -> float:
+        """The largest real part of a pole [1/s]; negative for a stable loop."""
+        return float(np.max(self.poles.real, initial=-math.inf))
+
+    @property
+    def damping(self) -> float:
+        """The smallest damping ratio [1] of a pole that is not at rest after one period."""
+        poles = self.poles[np.isfinite(self.poles) & (self.poles != 0)]
+        return float(np.min(-poles.real / np.abs(poles), initial=1.0))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ControllerTrial(Printed):
+    """A controller that a function designed on a model, with the promise and what came of it.
+
+    Parameters
+    ----------
+    controller : control.TransferFunction, control.StateSpace, control.NonlinearIOSystem or PID
+        What the function returned.
+    promised, achieved : LoopPerformance
+        On the model, and on the physics of the loop near its operating point.
+    steps : tuple of ReferenceStep
+        One for each reference that was stepped.
+    loop : Loop
+        The physics with the new controller.
+    model : control.TransferFunction or control.StateSpace
+        The linear model that the function was given.
+    failure : str
+        Why the physics was not kept stable, or empty.
+    """
+
+    controller: Any
+    promised: LoopPerformance
+    achieved: LoopPerformance
+    steps: tuple[ReferenceStep, ...]
+    loop: Loop
+    model: Any
+    failure: str = ""
+
+    @property
+    def stable(self) -> bool:
+        """Whether the controller keeps the physics stable."""
+        return self.achieved.stable
+
+    @property
+    def verdict(self) -> str:
+        """The outcome in words."""
+        if self.promised.growth_rate >= 0:
+            text = (
+                "The design DOES NOT STABILIZE ITS OWN MODEL: small deviations grow at "
+                f"{self.promised.growth_rate:.3g} 1/s. Check the signs and the weights."
+            )
+            if self.achieved.growth_rate >= 0:
+                return f"{text} Nor does it stabilize the physics."
+            return f"{text} Near its operating point the physics is stable."
+        if self.achieved.growth_rate >= 0:
+            return (
+                "The controller DOES NOT STABILIZE THE PHYSICS: the model is too different from "
+                f"it. {self.failure}"
+            )
+        text = self._compare_margins()
+        if self.failure:
+            return f"{text} This is for small signals: WITH THE STEP THE LOOP DIVERGES. " + (
+                self.failure
+            )
+        restless = [s.reference for s in self.steps if np.isfinite(s.promised.settling_time)
+                    and not np.isfinite(s.achieved.settling_time)]  # fmt: skip
+        if restless:
+            return (f"{text} WITH THE STEP OF {write_list(restless)} THE RESPONSE DOES NOT SETTLE, "
+                    "because an input saturates or the step leaves the linear range.")  # fmt: skip
+        return f"{text} {self._compare_steps()}".rstrip()
+
+    def _compare_margins(self) -> str:
+        """Return what became of the smallest promised phase margin."""
+        inputs = self.loop.signals["u"]
+        pairs = [(p.phase_margin - a.phase_margin, p, a, name) for name, p, a in
+                 zip(inputs, self.promised.margins, self.achieved.margins, strict=True)
+                 if np.isfinite([p.phase_margin, a.phase_margin]).all()]  # fmt: skip
+        if not pairs:
+            return "The controller keeps the physics stable."
+        loss, p, a, name = max(pairs, key=lambda pair: pair[0] / pair[1].phase_margin)
+        text = (
+            f"At {name} the model promises a phase margin of {p.phase_margin:.1f} deg; achieved on "
+            f"the physics are {a.phase_margin:.1f} deg"
+        )
+        if loss > CLOSE * p.phase_margin:
+            return f"{text}: {loss:.1f} DEGREES OF PHASE MARGIN ARE LOST."
+        return f"{text}, so the controller keeps the physics stable."
+
+    def _compare_steps(self) -> str:
+        """Return how far the responses are from the promised ones."""
+        far = []
+        for step in self.steps:
+            k = self.loop.signals["y"].index(step.output)
+            promised, achieved = step.promised.y[k], step.achieved.y[k]
+            size = np.max(np.abs(promised), initial=0.0)
+            if len(promised) == len(achieved) and size:
+                far.append((float(np.max(np.abs(achieved - promised)) / size), step.reference))
+        if not far:
+            return ""
+        share, name = max(far)
+        if share > CLOSE:
+            return (f"THE STEP OF {name} DIFFERS from what is promised by up to "
+                    f"{100 * share:.0f} % of its size.")  # fmt: skip
+        return f"The steps are as promised within {max(math.ceil(100 * share), 1)} % of their size."
+
+    @property
+    def rows(self) -> tuple[tuple[str, str, str], ...]:
+        """Return quantity, promised and achieved value as printed, row by row."""
+        sides = (self.promised, self.achieved)
+
+        def row(label: str, values: Iterable[str]) -> tuple[str, str, str]:
+            promised, achieved = values
+            return label, promised, achieved
+
+        made = [
+            row("slowest pole [rad/s]", (_write_slowest(side.poles) for side in sides)),
+            row("smallest damping ratio", (_write(side.damping, ".3f") for side in sides)),
+        ]
+        for k, name in enumerate(self.loop.signals["u"]):
+            for label, field, form in (
+                ("phase margin at {} [deg]", "phase_margin", ".2f"),
+                ("gain margin at {} [factor]", "gain_margin", ".3f"),
+                ("gain reduction margin at {}", "gain_reduction_margin", ".3f"),
+                ("delay margin at {} [s]", "delay_margin", ".3g"),
+            ):
+                values = (_write(getattr(side.margins[k], field), form) for side in sides)
+                made.append(row(label.format(name), values))
+        if np.isfinite(self.promised.disk_margin):
+            made.append(row("disk margin [1]", (_write(s.disk_margin, ".3f") for s in sides)))
+        for step in self.steps:
+            both = (step.promised, step.achieved)
+            for label, field, form in (
+                (f"final {step.output} per unit", "final_value", ".3f"),
+                (f"overshoot of {step.output} [%]", "overshoot", ".2f"),
+                ("settling time [s]", "settling_time", ".4g"),
+            ):
+                values = (_write(getattr(side, field), form) for side in both)
+                made.append(row(f"step of {step.reference}: {label}", values))
+            made += [
+                row(f"step of {step.reference}: largest {signal}", texts)
+                for signal, texts in self._list_peaks(step)
+            ]
+        return tuple(made)
+
+    def _list_peaks(self, step: ReferenceStep) -> list[tuple[str, list[str]]]:
+        """Return the largest deviations of inputs, and of outputs that do not follow the step."""
+        signals, units = self.loop.signals, self.loop.known_units
+        peaks = [
+            ("peak_outputs", k, name) for k, name in enumerate(signals["y"]) if name != step.output
+        ]
+        peaks += [("peak_inputs", k, name) for k, name in enumerate(signals["u"])]
+        return [
+            (name, [write_quantity(getattr(side, field)[k],
+                                   units.get(name, ""), digits=3) if side.u.size else "-"
+                    for side in (step.promised, step.achieved)])
+            for field, k, name in peaks
+        ]  # fmt: skip
+
+    def __str__(self) -> str:
+        rows = self.rows
+        width = max(len(label) for label, _, _ in rows) + 2
+        table = [
+            f"  {a:<{width}}{b:>18}{c:>18}" for a, b, c in (("", "promised", "achieved"), *rows)
+        ]
+        kind = "analog" if self.loop.analog else f"digital, {self.loop.dt:g} s"
+        wiring = self.loop.wiring
+        lines = () if wiring is None else tuple(f"    {line}" for line in wiring.lines)
+        head = f"controller: {type(self.controller).__name__}, {kind}"
+        heights = [f"{s.reference} by {write_number(s.height, 3)}" for s in self.steps]
+        tried = (
+            f"  Achieved steps ({', '.join(heights)}) are those of the nonlinear physics. With a "
+            "smaller step= they are closer to the promised ones." if heights else
+            "  The controller has no reference to step."
+        )  # fmt: skip
+        lacking = [
+            "  The disk margin of several inputs is not known: python-control needs slycot for it."
+        ] if len(self.promised.margins) > 1 and np.isnan(self.promised.disk_margin) and (
+            self.promised.growth_rate < 0) else []  # fmt: skip
+        return "\n".join([head, *lines, *table, *lacking, tried, "  " + self.verdict])
+
+
+def _write(value: float, form: str) -> str:
+    return "-" if math.isnan(value) else f"{value:{form}}"
+
+
+def _write_slowest(poles: ComplexArray) -> str:
+    """Return the pole with the largest real part."""
+    if not len(poles):
+        return "-"
+    pole = poles[int(np.argmax(poles.real))]
+    if abs(pole.imag) <= 1e-9 * abs(pole):
+        return f"{pole.real:.4g}"
+    return f"{pole.real:.4g} ± {abs(pole.imag):.4g}j"
+
+
+def try_design(
+    model: Any, loop: Loop, design: Callable[[Any], Any], step: Any = None
+) -> ControllerTrial:
+    """Design a controller on a model and try it on the physics of a loop.
+
+    Parameters
+    ----------
+    model : control.TransferFunction or control.StateSpace
+        The linear model.
+    loop : Loop
+        The physics and its operating point.
+    design : callable
+        From the model to a controller.
+    step : float or mapping of str to float, optional
+        Height of the steps, or of each reference.
+
+    Returns
+    -------
+    ControllerTrial
+        Promise and achievement.
+
+    Raises
+    ------
+    CtrlidError
+        If model, controller and loop do not fit together.
+    """
+    model = _name_signals(model, loop)
+    controller = _call_design(design, model)
+    dt = _find_period(controller, loop, timebase(model))
+    at = loop.at
+    promise = Loop(model, controller, dt=dt, at=at, units=_pick_units(loop))
+    trial = replace(loop, controller=controller, dt=dt)
+    sides = [measure_input_margins(side) for side in (promise, trial)]
+    performances = [
+        LoopPerformance(s.stable, s.poles, s.margins, s.disk_margin, s.disk_gain, s.disk_phase)
+        for s in sides
+    ]
+    heights = _choose_steps(trial, model, step)
+    length = _choose_length(performances[0].poles, dt)
+    motions = {name: [_step(side, name, height, length) for side in (promise, trial)]
+               for name, height in heights.items()}  # fmt: skip
+    steps = tuple(
+        _make_step(trial, model, name, heights[name], dt, length, *motions[name])
+        for name in heights
+    )
+    if not isinstance(step, Mapping):
+        # An angle that no controller can hold is a reference by name only.
+        steps = tuple(s for s in steps if not _returns(trial, s)) or steps[:1]
+    rate = performances[1].growth_rate
+    reasons = [s.achieved.failure for s in steps if s.achieved.failure]
+    if rate >= 0:
+        reasons.insert(0, f"Small deviations grow at {rate:.3g} 1/s.")
+    failure = " ".join(dict.fromkeys(reasons[:2]))
+    achieved = replace(performances[1], stable=performances[1].stable and not failure)
+    return ControllerTrial(controller, performances[0], achieved, steps, trial, model, failure)
+
+
+def _name_signals(model: Any, loop: Loop) -> Any:
+    """Return a model with the signals of the loop, refused where it has others."""
+    for key, what, given in (("u", "input", model.input_labels), ("y", "output",
+                                                                 model.output_labels)):  # fmt: skip
+        names = list(loop.signals[key])
+        if len(given) != len(names):
+            raise CtrlidError(
+                f"redesign: the model has {write_count(len(given), what)} ({', '.join(given)}), "
+                f"the loop {len(names)} ({', '.join(names)}); give a model of the same signals"
+            )
+        if list(given) != names and set(given) == set(names):
+            raise CtrlidError(
+                f"redesign: the {what}s of the model are ({', '.join(given)}), those of the loop "
+                f"({', '.join(names)}); put them into the order of the loop"
+            )
+    signals = {"inputs": list(loop.signals["u"]), "outputs": list(loop.signals["y"])}
+    if isinstance(model, ct.StateSpace):
+        return ct.ss(model.A, model.B, model.C, model.D, timebase(model) or 0,
+                     states=model.state_labels, name="model", **signals)  # fmt: skip
+    return ct.tf(model.num, model.den, timebase(model) or 0, name="model", **signals)
+
+
+def _call_design(design: Callable[[Any], Any], model: Any) -> Any:
+    """Return the controller that a function designs, refused where it is none."""
+    try:
+        controller = design(model)
+    except CtrlidError:
+        raise
+    except Exception as reason:
+        raise CtrlidError(
+            f"design raised {type(reason).__name__} on the model with inputs "
+            f"{model.input_labels}, outputs {model.output_labels} and {model.nstates or 'no'} "
+            f"states: {reason}"
+        ) from reason
+    # create_statefbk_iosystem returns the controller, and the closed loop beside it.
+    if isinstance(controller, tuple) and len(controller) == 2:
+        controller = controller[0]
+    if is_number(controller):
+        return ct.tf([float(controller)], [1.0], timebase(model) or 0)
+    if isinstance(controller, PID | ct.TransferFunction | ct.NonlinearIOSystem):
+        return controller
+    given = "nothing" if controller is None else f"a {type(controller).__name__}"
+    hint = (
+        "; of a gain matrix K make one with ct.ss([], [], [], K) or ct.create_statefbk_iosystem"
+        if isinstance(controller, np.ndarray | list | tuple) else ""
+    )  # fmt: skip
+    raise CtrlidError(
+        "design is a function from the model to a controller, a python-control system or a PID; "
+        f"it returned {given}{hint}"
+    )
+
+
+def _find_period(controller: Any, loop: Loop, dt: float) -> float:
+    """Return the sampling period of the loop with a controller [s]."""
+    own = None if isinstance(controller, PID) else controller.dt
+    own = 0.0 if own is None or own is True else float(own)
+    return dt or own or loop.dt
+
+
+def _pick_units(loop: Loop) -> dict[str, str]:
+    names = (*loop.signals["u"], *loop.signals["y"])
+    return {name: unit for name, unit in loop.known_units.items() if name in names}
+
+
+def _list_references(loop: Loop) -> tuple[str, ...]:
+    """Return the names of the references of a loop."""
+    wiring = loop.wiring
+    return loop.signals["y"] if wiring is None else wiring.open
+
+
+def _find_followed(loop: Loop, model: Any, name: str) -> str | None:
+    """Return the output that a reference is for, where its name tells."""
+    outputs = loop.signals["y"]
+    match = re.fullmatch(r"xd\[(\d+)\]", name)
+    if match is not None:
+        states = model.state_labels if isinstance(model, ct.StateSpace) else []
+        known = states[int(match[1])] if int(match[1]) < len(states) else ""
+        return known if known in outputs else None
+    return name if name in outputs else None
+
+
+def _choose_steps(loop: Loop, model: Any, step: Any) -> dict[str, float]:
+    """Return the height of the step of each reference that is tried."""
+    names = _list_references(loop)
+    if isinstance(step, Mapping):
+        unknown = [name for name in step if name not in names]
+        if unknown or not step:
+            raise CtrlidError(
+                f"step= names {write_list([str(n) for n in unknown]) or 'no reference'}; the "
+                f"controller has the references {', '.join(names) or 'none'}"
+            )
+        return {name: _check_height(value) for name, value in step.items()}
+    wiring = loop.wiring
+    held = (None,) * len(names) if wiring is None else wiring.held
+    chosen = [name for name, value in zip(names, held, strict=True)
+              if value is None or _find_followed(loop, model, name) is not None]  # fmt: skip
+    if step is not None:
+        return dict.fromkeys(chosen, _check_height(step))
+    outputs = loop.signals["y"]
+    heights = {}
+    for name in chosen:
+        output = _find_followed(loop, model, name)
+        rest = 0.0 if output is None else loop.point.outputs[outputs.index(output)]
+        heights[name] = 0.01 * abs(rest) or 0.01
+    return heights
+
+
+def _check_height(step: Any) -> float:
+    if not is_number(step) or not np.isfinite(float(step)) or step == 0:
+        raise CtrlidError("step must be the height of the reference step in output units, a "
+                          f"finite number other than zero, or a mapping of references; given "
+                          f"{step!r}")  # fmt: skip
+    return float(step)
+
+
+def _choose_length(poles: ComplexArray, dt: float) -> int:
+    """Return how many samples a step response lasts."""
+    rates = -poles.real[np.isfinite(poles.real)]
+    rates = rates[rates > 1e-6 * np.max(np.abs(rates), initial=0.0)]
+    slow = float(np.min(rates, initial=math.inf))
+    return int(np.clip(LASTING / (slow * dt), 50, LONGEST))
+
+
+@dataclass(frozen=True, eq=False)
+class _Motion:
+    """Deviations of all signals from rest, and why they end early."""
+
+    y: Array
+    u: Array
+    failure: str = ""
+
+
+def _step(loop: Loop, name: str, height: float, n: int) -> _Motion:
+    """Return what a step of one reference does, less what happens without it."""
+    names, law = _list_references(loop), loop.law()
+    assert law is not None
+    rest = np.array(loop.point.outputs if law.references is None else law.references)
+    still, moved = (np.repeat(rest[:, None], n, axis=1) for _ in range(2))
+    moved[names.index(name)] += height
+    single = loop.wiring is None
+    p, m = len(loop.signals["y"]), len(loop.signals["u"])
+    try:
+        first = simulate(loop, still[0] if single else dict(zip(names, still, strict=True)))
+    except ModelCannotRun as reason:
+        return _Motion(np.empty((p, 0)), np.empty((m, 0)), _write_sentence(reason))
+    y, u = np.atleast_2d(first.y), np.atleast_2d(first.u)
+    try:
+        second = simulate(loop, moved[0] if single else dict(zip(names, moved, strict=True)))
+    except SimulationStopped as reason:
+        got = np.atleast_2d(reason.y)
+        return _Motion(got - y[:, : got.shape[1]], np.empty((m, 0)), _write_sentence(reason))
+    moves = [np.atleast_2d(second.y) - y, np.atleast_2d(second.u) - u]
+    for move in moves:
+        move[np.max(np.abs(move), axis=1) < NOTHING * abs(height)] = 0.0
+    return _Motion(*moves)
+
+
+def _write_sentence(reason: CtrlidError) -> str:
+    text = str(reason)
+    return text[0].upper() + text[1:] + "."
+
+
+def _make_step(
+    loop: Loop, model: Any, name: str, height: float, dt: float, n: int,
+    promised: _Motion, achieved: _Motion,
+) -> ReferenceStep:  # fmt: skip
+    outputs = loop.signals["y"]
+    output = _find_followed(loop, model, name) or outputs[_find_nearest(promised.y, height)]
+    k = outputs.index(output)
+    time: Array = np.arange(n, dtype=float) * dt
+    reach = LOST * np.max(np.abs(promised.y[k]), initial=0.0)
+    far = np.abs(achieved.y[k]) > reach
+    if not promised.failure and not achieved.failure and far.any():
+        at = int(np.argmax(far))
+        text = (f"After {at * dt:.4g} s the step of {name} has moved {output} by "
+                f"{achieved.y[k, at]:.4g}")  # fmt: skip
+        limited = _find_limited(loop, achieved.u[:, : at + 1])
+        text += f", with {write_list(limited)} at its limit" if limited else ""
+        achieved = _Motion(achieved.y[:, : at + 1], achieved.u[:, : at + 1], f"{text}.")
+    return ReferenceStep(name, height, output, time, _measure_motion(promised, k, height, time),
+                         _measure_motion(achieved, k, height, time))  # fmt: skip
+
+
+def _find_nearest(y: Array, height: float) -> int:
+    """Return the output that ends nearest to the step, or else moves most."""
+    if not y.shape[1]:
+        return 0
+    ends = np.mean(y[:, -max(y.shape[1] // 20, 1) :], axis=1) / height
+    return int(np.argmin(np.abs(ends - 1)))
+
+
+def _find_limited(loop: Loop, u: Array) -> list[str]:
+    """Return the inputs that were at a limit."""
+    lower, upper = (np.broadcast_to(v, len(u)) for v in loop.input_limits)
+    absolute = u + np.array(loop.point.inputs)[:, None]
+    hit = (absolute <= lower[:, None]) | (absolute >= upper[:, None])
+    return [name for name, any_ in zip(loop.signals["u"], hit.any(axis=1), strict=True) if any_]
+
+
+def _returns(loop: Loop, step: ReferenceStep) -> bool:
+    """Return whether an output goes back to rest though a reference that could be held asks."""
+    wiring = loop.wiring
+    held = wiring is not None and wiring.held[wiring.open.index(step.reference)] is not None
+    return held and abs(step.promised.final_value) < HELD
+
+
+def _measure_motion(motion: _Motion, k: int, height: float, time: Array) -> StepMotion:
+    final = overshoot = settling = math.nan
+    if not motion.failure and motion.y.size:
+        response = motion.y[k] / height
+        final = float(np.mean(response[-max(len(response) // 20, 1) :]))
+        if abs(final) > RETURNS * np.max(np.abs(response)):
+            overshoot = max(0.0, 100 * (float(np.max(response / final)) - 1))
+            outside = np.flatnonzero(np.abs(response / final - 1) > SETTLED)
+            last = int(outside[-1]) + 1 if outside.size else 0
+            settling = float(time[last]) if last < len(time) else math.inf
+    return StepMotion(motion.y, motion.u, final, overshoot, settling, motion.failure)

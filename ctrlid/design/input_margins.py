@@ -1,0 +1,158 @@
+"""Margins of a loop of any number of signals, at each input of its plant, from state matrices."""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import control as ct
+import numpy as np
+import numpy.typing as npt
+
+from .._base.arrays import Array, ComplexArray
+from ..loop.controllers import linearize_law
+from ..loop.loop import Loop
+from ..loop.period_map import compute_closed_loop_poles
+from ..physics.conversions import to_state_matrices
+from ..physics.trace import timebase
+from .margins import UNSTABLE, Margins, collect_margins
+from .rational import are_resolved, find_crossings, find_smallest, make_grid_of_roots, to_s
+
+# At so small a share of the lowest frequency a loop without integrator shows its static gain.
+STILL = 1e-6
+# A response there is real if its imaginary part is below this share.
+REAL = 1e-3
+
+
+def open_at_inputs(loop: Loop) -> Any:
+    r"""Return the linear loop, opened at the inputs of its plant.
+
+    .. math:: L = -C_y(z) P(z)
+
+    from what enters the plant to the negative of what the controller computes from it. An observer
+    inside the controller reads what the controller asks for, as it does in the computer, and not
+    what a wrong actuator makes of it.
+
+    Parameters
+    ----------
+    loop : Loop
+        The loop, with a controller.
+
+    Returns
+    -------
+    control.StateSpace
+        Square, with the time base of the controller.
+    """
+    law = loop.law()
+    assert law is not None
+    plant = loop.linearize(states=True)
+    if law.dt and not timebase(plant):
+        plant = ct.sample_system(plant, law.dt, "zoh")
+    a, b, c, _ = to_state_matrices(plant)
+    ac, by, bu, cc, dy = linearize_law(law, loop.point)
+    n, nc, m = len(a), len(ac), b.shape[1]
+    # The observer's reading of u is what the controller computes: u = cc x_c + dy y.
+    both = np.block([[a, np.zeros((n, nc))], [(by + bu @ dy) @ c, ac + bu @ cc]])
+    entry = np.vstack([b, np.zeros((nc, m))])
+    return ct.ss(both, entry, -np.hstack([dy @ c, cc]), np.zeros((m, m)), law.dt or 0,
+                 inputs=list(loop.signals["u"]))  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class InputMargins:
+    """Poles and margins of a loop.
+
+    Parameters
+    ----------
+    poles : ndarray of complex
+        Closed-loop poles [rad/s].
+    margins : tuple of Margins
+        At each input of the plant, the others closed.
+    disk_margin, disk_gain, disk_phase : float
+        `control.disk_margins` of all inputs at once: size of the disk [1], the factor by which all
+        gains may rise or fall at the same time, and the phase [deg]; NaN where it is not known.
+    """
+
+    poles: ComplexArray
+    margins: tuple[Margins, ...]
+    disk_margin: float
+    disk_gain: float
+    disk_phase: float
+
+    @property
+    def stable(self) -> bool:
+        """Whether small deviations die out."""
+        return all(one.stable for one in self.margins)
+
+
+def measure_input_margins(loop: Loop) -> InputMargins:
+    """Return poles and margins of a loop near its operating point.
+
+    Parameters
+    ----------
+    loop : Loop
+        The loop, with a controller.
+
+    Returns
+    -------
+    InputMargins
+        NaN for the numbers of an unstable loop.
+    """
+    poles = compute_closed_loop_poles(loop, hidden=False)
+    m = len(loop.signals["u"])
+    if np.max(poles.real, initial=-math.inf) >= 0:
+        return InputMargins(poles, (UNSTABLE,) * m, *(math.nan,) * 3)
+    L = open_at_inputs(loop)
+    dt = float(L.dt or 0.0)
+    closed = [L.A - L.B[:, rest] @ L.C[rest] for rest in ([], *_leave_one_out(m), list(range(m)))]
+    roots = np.concatenate([to_s(np.linalg.eigvals(matrix), dt) for matrix in closed])
+    grid = make_grid_of_roots(dt, roots[are_resolved(roots, dt)])
+    margins = tuple(
+        _measure_margins(_Response(L.A - L.B[:, rest] @ L.C[rest], L.B[:, k], L.C[k], dt), grid)
+        for k, rest in enumerate(_leave_one_out(m))
+    )
+    return InputMargins(poles, margins, *_measure_disk(L, grid))
+
+
+def _leave_one_out(m: int) -> list[list[int]]:
+    return [[i for i in range(m) if i != k] for k in range(m)]
+
+
+@dataclass(frozen=True, eq=False)
+class _Response:
+    """The frequency response of one loop, from its state matrices."""
+
+    a: Array
+    b: Array
+    c: Array
+    dt: float
+
+    def __call__(self, omega: npt.ArrayLike) -> ComplexArray:
+        w = np.atleast_1d(np.asarray(omega, dtype=float))
+        points = np.exp(1j * w * self.dt) if self.dt else 1j * w
+        pencil = points[:, None, None] * np.eye(len(self.a)) - self.a
+        states = np.linalg.solve(pencil, np.broadcast_to(self.b[:, None], (len(w), len(self.b), 1)))
+        return np.asarray((self.c @ states)[:, 0], dtype=complex)
+
+
+def _measure_margins(L: _Response, grid: Array) -> Margins:
+    """Return the margins of a loop that is known to be stable."""
+    tiny = np.finfo(float).tiny
+    crossovers = find_crossings(lambda w: np.log(np.abs(L(w)) + tiny), grid)
+    gain = [(omega, float(np.angle(-L(omega)[0]))) for omega in crossovers]
+    turns = find_crossings(lambda w: L(w).imag / (np.abs(L(w)) + tiny), grid)
+    ends = [STILL * grid[0], *([math.pi / L.dt] if L.dt else [])]
+    real = [v for v in (L(end)[0] for end in ends) if abs(v.imag) < REAL * abs(v)]
+    values = [*(complex(L(omega)[0]) for omega in turns), *real]
+    factors = [-1 / v.real for v in values if -1e9 < v.real < -1e-9]
+    _, modulus = find_smallest(lambda w: np.abs(1 + L(w)), grid, tuple(ends))
+    return collect_margins(gain, factors, modulus, direct=False)
+
+
+def _measure_disk(L: Any, grid: Array) -> tuple[float, float, float]:
+    """Return python-control's disk margin, with its gain as a factor and its phase [deg]."""
+    try:
+        size, decibels, phase = ct.disk_margins(L, grid)
+    except ct.ControlMIMONotImplemented:
+        # Of several inputs it is a structured singular value, which python-control has from slycot.
+        return math.nan, math.nan, math.nan
+    return float(size), float(10 ** (decibels / 20)), float(phase)
