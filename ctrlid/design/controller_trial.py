@@ -416,9 +416,9 @@ def _call_design(design: Callable[[Any], Any], model: Any) -> Any:
     """Return the controller that a function designs, refused where it is none."""
     try:
         controller = design(model)
-    except CtrlidError:
-        raise
     except Exception as reason:
+        if isinstance(reason, CtrlidError):
+            raise
         raise CtrlidError(
             f"design raised {type(reason).__name__} on the model with inputs "
             f"{model.input_labels}, outputs {model.output_labels} and {model.nstates or 'no'} "

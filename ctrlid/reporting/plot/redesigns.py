@@ -52,8 +52,8 @@ def step(redesigns: Any, ax: Any = None) -> Picture:
     several = redesigns if isinstance(redesigns, Mapping) else {"": redesigns}
     if not several:
         raise CtrlidError("plot.step has nothing to draw: the mapping is empty")
-    needed = ("plot.step draws a Redesign, as redesign() returns, or a mapping of them, or one "
-              "ControllerTrial")  # fmt: skip
+    needed = ("plot.step draws one ControllerTrial, or a Redesign, as redesign() returns, or a "
+              "mapping of them")  # fmt: skip
     for redesign in several.values():
         require_kind(redesign, Redesign, needed)
     size = (7.2, 3.2 * len(several)) if len(several) > 1 else None
