@@ -164,7 +164,7 @@ def test_inputs_are_cut_one_at_a_time():
 def test_an_exact_model_keeps_its_promise(design):
     found = tried(design)
     assert found.stable
-    assert found.failure == ""
+    assert found.failure is None
     assert found.loop.analog is (design is observer_design)
     assert [s.reference for s in found.steps] == ["xd[0]"]
     (step,) = found.steps

@@ -51,8 +51,8 @@ class StepMotion:
         Of that output, in percent of its final value.
     settling_time : float
         Until that output stays within 2 % of its final value [s]; infinite if it never does.
-    failure : str
-        Why the simulation broke off, or empty.
+    failure : str or None
+        Why the simulation broke off; None if it did not.
     """
 
     y: Array
@@ -60,7 +60,7 @@ class StepMotion:
     final_value: float
     overshoot: float
     settling_time: float
-    failure: str = ""
+    failure: str | None = None
 
     def __post_init__(self) -> None:
         freeze_arrays(self)
@@ -164,8 +164,8 @@ class ControllerTrial(Printed):
         The physics with the new controller.
     model : control.TransferFunction or control.StateSpace
         The linear model that the function was given.
-    failure : str
-        Why the physics was not kept stable, or empty.
+    failure : str or None
+        Why the physics was not kept stable; None if it was.
     """
 
     controller: Any
@@ -174,7 +174,7 @@ class ControllerTrial(Printed):
     steps: tuple[ReferenceStep, ...]
     loop: Loop
     model: Any
-    failure: str = ""
+    failure: str | None = None
 
     @property
     def stable(self) -> bool:
@@ -198,7 +198,7 @@ class ControllerTrial(Printed):
                 f"it. {self.failure}"
             )
         text = self._compare_margins()
-        if self.failure:
+        if self.failure is not None:
             return f"{text} This is for small signals: WITH THE STEP THE LOOP DIVERGES. " + (
                 self.failure
             )
@@ -382,11 +382,11 @@ def try_design(
         # An angle that no controller can hold is a reference by name only.
         steps = tuple(s for s in steps if not _returns(trial, s)) or steps[:1]
     rate = performances[1].growth_rate
-    reasons = [s.achieved.failure for s in steps if s.achieved.failure]
+    reasons = [s.achieved.failure for s in steps if s.achieved.failure is not None]
     if rate >= 0:
         reasons.insert(0, f"Small deviations grow at {rate:.3g} 1/s.")
-    failure = " ".join(dict.fromkeys(reasons[:2]))
-    achieved = replace(performances[1], stable=performances[1].stable and not failure)
+    failure = " ".join(dict.fromkeys(reasons[:2])) if reasons else None
+    achieved = replace(performances[1], stable=not reasons)
     return ControllerTrial(controller, performances[0], achieved, steps, trial, model, failure)
 
 
@@ -519,7 +519,7 @@ class _Motion:
 
     y: Array
     u: Array
-    failure: str = ""
+    failure: str | None = None
 
 
 def _step(loop: Loop, name: str, height: float, n: int) -> _Motion:
@@ -562,7 +562,7 @@ def _make_step(
     time: Array = np.arange(n, dtype=float) * dt
     reach = LOST * np.max(np.abs(promised.y[k]), initial=0.0)
     far = np.abs(achieved.y[k]) > reach
-    if not promised.failure and not achieved.failure and far.any():
+    if promised.failure is None and achieved.failure is None and far.any():
         at = int(np.argmax(far))
         text = (f"After {at * dt:.4g} s the step of {name} has moved {output} by "
                 f"{achieved.y[k, at]:.4g}")  # fmt: skip
@@ -598,7 +598,7 @@ def _returns(loop: Loop, step: ReferenceStep) -> bool:
 
 def _measure_motion(motion: _Motion, k: int, height: float, time: Array) -> StepMotion:
     final = overshoot = settling = math.nan
-    if not motion.failure and motion.y.size:
+    if motion.failure is None and motion.y.size:
         response = motion.y[k] / height
         final = float(np.mean(response[-max(len(response) // 20, 1) :]))
         if abs(final) > RETURNS * np.max(np.abs(response)):

@@ -52,8 +52,7 @@ def step(redesigns: Any, ax: Any = None) -> Picture:
     several = redesigns if isinstance(redesigns, Mapping) else {"": redesigns}
     if not several:
         raise CtrlidError("plot.step has nothing to draw: the mapping is empty")
-    needed = ("plot.step draws one ControllerTrial, or a Redesign, as redesign() returns, or a "
-              "mapping of them")  # fmt: skip
+    needed = "plot.step draws a Redesign, as redesign() returns, or a mapping of them"
     for redesign in several.values():
         require_kind(redesign, Redesign, needed)
     size = (7.2, 3.2 * len(several)) if len(several) > 1 else None
@@ -106,7 +105,7 @@ def _draw_trial(trial: ControllerTrial, ax: Any) -> Picture:
 
 def _describe_motion(motion: StepMotion, step: ReferenceStep) -> str:
     """Return how a response went, in a few words."""
-    if motion.failure:
+    if motion.failure is not None:
         return "UNSTABLE"
     if np.isnan(motion.settling_time):
         return f"{step.output} returns to rest"
