@@ -151,9 +151,11 @@ def _tell_stories(args: argparse.Namespace) -> int:
                 bar.set_description(title)
                 with off_screen():
                     section = _save_figures(next(chapters), number, folder)
+                # Terminal, report and names of the files count the chapters alike.
+                section = replace(section, title=f"{number}. {section.title}")
                 sections.append(section)
                 with tqdm.external_write_mode():
-                    print(_write_text(section, number))
+                    print(_write_text(section))
                 bar.update()
         title = "An unstable plant, identified and diagnosed in closed loop"
         report = write_report(sections, folder / "report.html", title=title)
@@ -173,14 +175,14 @@ def _save_figures(section: Section, number: int, folder: Path) -> Section:
     for letter, (caption, data) in zip("abcdefgh", figures.items(), strict=False):
         words = caption if several else section.title
         slug = re.sub(r"[^a-z]+", "-", words.lower()).strip("-")
-        name = f"{number}{letter if several else ''}-{slug}.png"
+        name = f"{number:02}{letter if several else ''}-{slug}.png"
         with replace_file(folder / name, binary=True) as file:
             file.write(data)
     return replace(section, figure=figures)
 
 
-def _write_text(section: Section, number: int) -> str:
-    lines = [f"{number}. {section.title}"]
+def _write_text(section: Section) -> str:
+    lines = [section.title]
     for paragraph in filter(None, section.text.split("\n\n")):
         lines += [textwrap.fill(paragraph, WIDTH, break_on_hyphens=False), ""]
     results = section.result if isinstance(section.result, tuple) else (section.result,)

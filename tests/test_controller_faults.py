@@ -68,6 +68,51 @@ def test_another_option_of_the_controller_is_named():
     assert "derivative='error'" in found[0].text
 
 
+def record_pid(n=2000, limit=np.inf, measured=False, forward=False, wound=False, b=1.0, tf=0.0):
+    """A mass on a spring under a PID written out in numpy, and the PID that it is stated to be."""
+    rng = np.random.default_rng(11)
+    whole = expm(DT * np.array([[0, 1, 0], [-3, -2, 1], [0, 0, 0]]))
+    r = np.repeat(rng.choice([-0.3, 0.3], n // 40 + 1), 40)[:n]
+    x, u, y = np.zeros(2), np.zeros(n), np.zeros(n)
+    integral = slope = last = 0.0
+    for j in range(n):
+        y[j] = x[0] + 1e-3 * rng.standard_normal()
+        difference = -y[j] if measured else r[j] - y[j]
+        slope = (tf * slope + 4 * (difference - last)) / (tf + DT)
+        last = difference
+        step = 60 * DT * (r[j] - y[j])
+        v = 40 * (b * r[j] - y[j]) + slope + integral + (0 if forward else step)
+        if wound or not abs(v) > limit or v * step < 0:
+            integral += step
+        u[j] = round(float(np.clip(v, -limit, limit)), 3)
+        x = whole[:2, :2] @ x + whole[:2, 2] * u[j]
+    stated = cid.PID(kp=40.0, ki=60.0, kd=4.0, lower=-limit, upper=limit)
+    loop = cid.Loop(cid.plants.servo(m=1.0, c=2.0, k=3.0), stated, dt=DT)
+    return cid.Record(r=r, u=u, y=y, dt=DT), loop
+
+
+@pytest.mark.parametrize(
+    ("true", "said"),
+    [({"measured": True}, "with derivative='measurement':"),
+     ({"forward": True, "limit": 12.0}, "with integral='forward':"),
+     ({"wound": True, "limit": 12.0}, "with anti_windup='none':"),
+     ({"b": 0.0}, "with b=0.0:"),
+     ({"measured": True, "forward": True},
+      "with derivative='measurement' and integral='forward':"),
+     ({"tf": 0.025}, "with filter_time=0.025:"),
+     ({"tf": 0.04, "measured": True}, "with filter_time=0.04 and derivative='measurement':")],
+)  # fmt: skip
+def test_the_options_of_a_pid_are_tried_and_named(true, said):
+    record, loop = record_pid(**true)
+    texts = [f.text for f in cid.audit(record, loop).findings if f.kind in ("filter", "limit")]
+    assert any(said in text for text in texts), texts
+
+
+def test_a_pid_as_stated_stands():
+    record, loop = record_pid(limit=12.0)
+    assert "computes from r and y" in cid.audit(record, loop)["controller"][0].text
+
+
 @pytest.mark.parametrize("added", [{}, {"dither": 0.3}, {"pulses": 0.5}])
 def test_an_exact_law_stands_under_what_is_added(added):
     for seed in range(5):

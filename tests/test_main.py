@@ -52,14 +52,15 @@ def test_the_whole_story(folder, capsys):
         "It was found, and no alternative was named.",
     ):
         assert sentence in text
-    assert out.endswith(f"12 figures and report.html are in ctrlid-report{os.sep}\n")
+    assert out.endswith(f"10 figures and report.html are in ctrlid-report{os.sep}\n")
     files = sorted(p.name for p in (folder / "ctrlid-report").iterdir())
-    assert len([f for f in files if f.endswith(".png")]) == 12
+    assert len([f for f in files if f.endswith(".png")]) == 10
     assert "report.html" in files
-    assert {"3-the-experiment.png", "10-what-is-missing.png"} <= set(files)
+    assert {"03-the-experiment.png", "10-what-is-missing.png"} <= set(files)
     page = (folder / "ctrlid-report" / "report.html").read_text("utf-8")
-    assert page.count('src="data:image/png;base64,') == 12
-    assert all(f"<h2>{title}</h2>" in page for title in (*told.TITLES, *act.TITLES))
+    assert page.count('src="data:image/png;base64,') == 10
+    for number, title in enumerate((*told.TITLES, *act.TITLES), 1):
+        assert f"<h2>{number}. {title}</h2>" in page
 
 
 def test_nothing_is_overwritten(folder, monkeypatch):
@@ -217,6 +218,15 @@ def test_without_noise_the_story_does_not_speak_of_its_harm():
     assert "Without sensor noise" not in plain
     assert "bias" not in known
     assert sections[told.TITLES[7]].text.count("the promise holds") == 3
+
+
+def test_figures_that_are_compared_look_equally_far_ahead_on_one_scale():
+    pictures = list(chapters(told.TITLES[6])[told.TITLES[6]].figures.values())[:2]
+    axes = [picture.axes[0] for picture in pictures]
+    labels = [ax.get_legend_handles_labels()[1][2].split(":")[0] for ax in axes]
+    assert labels == ["8-step prediction"] * 2
+    assert axes[0].get_ylim() == axes[1].get_ylim()
+    assert axes[0].get_xlim() == axes[1].get_xlim()
 
 
 def test_doubts_of_the_estimator_are_passed_on(monkeypatch):

@@ -2,11 +2,12 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import product
 from typing import Any, get_args
 
 import control as ct
 import numpy as np
-from scipy import stats
+from scipy import optimize, stats
 
 from .._base.errors import CtrlidError
 from .._base.statistics import regress
@@ -40,6 +41,12 @@ LEVEL = 1e-3
 MEMORY = 10
 # Below this share of its variance the remainder of a regression is rounding of the computer.
 ROUNDING = 1e-12
+# Time constants of a derivative's filter from which the search starts, in sampling periods.
+FILTER_TIMES = (0.0, 1.0, 3.0, 10.0, 30.0)
+# The search goes on where one of them leaves at most this share of what was unexplained.
+PROMISING = 0.5
+# Changes of a law are put out by so many samples, most of them at once.
+BEGINNING = 1000
 # Directions below this share of the largest are not in a regression's data.
 DETERMINED = 1e-10
 # A remainder of no known kind below this share of u's variance steers no simulation.
@@ -323,8 +330,8 @@ def _explain_remainder(loop: Loop, e: Any, left: float, record: Record) -> Fact:
                 "other gains or another structure. Correct the "
                 "controller, or give None.", left, True)  # fmt: skip
     return ("injected", f"in addition to the output of the controller, u contains a signal of RMS "
-            f"{rms} that does not depend on r and y: excitation, dither or rounding.", left,
-            False)  # fmt: skip
+            f"{rms} that does not depend on y: excitation, dither, rounding, or another "
+            "weight of r.", left, False)  # fmt: skip
 
 
 def _report_bias(constant: float, left: float) -> Fact:
@@ -394,7 +401,11 @@ def _follows(e: Any, record: Record) -> bool:
 
 def _find_wrong_law(loop: Loop, record: Record, left: float, exact_only: bool) -> Fact | None:
     """Return which single change of the stated law leaves only rounding or an added signal."""
+    beginning = record[:BEGINNING]
+    most = CLEARLY * max(_compute_remainder(loop, beginning)[1], left)
     for kind, words, changed in _list_changes(loop, record):
+        if _compute_remainder(changed, beginning)[1] > most:
+            continue
         e, remains = _compute_remainder(changed, record)
         if remains > CLEARLY * left:
             continue
@@ -432,18 +443,61 @@ def _list_changes(loop: Loop, record: Record) -> Iterator[tuple[str, str, Loop]]
     if np.isfinite([pid.lower, pid.upper]).any():
         yield ("limit", "without the limits of the controller", replace(
             loop, controller=replace(pid, lower=-np.inf, upper=np.inf)))  # fmt: skip
-    for name, kind, choices in (("derivative", "filter", get_args(Derivative)),
-                                ("integral", "filter", get_args(Integral)),
-                                ("anti_windup", "limit", get_args(AntiWindup))):  # fmt: skip
-        for choice in choices:
-            if choice == getattr(pid, name) or (choice == "measurement" and pid.c not in (0, 1)):
-                continue
-            tracking = pid.tracking_time or (pid.kp / pid.ki if pid.ki else 1.0)
-            if choice == "back-calculation" and tracking <= 0:
-                # Such a controller does not exist: its integrator would run away.
-                continue
-            other = replace(pid, **{name: choice})
-            yield kind, f"with {name}={choice!r}", replace(loop, controller=other)
+    yield from _list_options(loop, pid)
+    yield from _fit_filter_time(loop, pid, record[:BEGINNING])
+
+
+def _list_options(loop: Loop, pid: PID) -> Iterator[tuple[str, str, Loop]]:
+    """Yield the other forms of a PID that there are, those with the fewest changes first."""
+    limited = np.isfinite([pid.lower, pid.upper]).any()
+    tracking = pid.tracking_time or (pid.kp / pid.ki if pid.ki else 1.0)
+    # With a negative time constant the integrator would run away: no such controller exists.
+    windups = [w for w in get_args(AntiWindup) if w != "back-calculation" or tracking > 0]
+    choices: dict[str, list[Any]] = {
+        "derivative": [*get_args(Derivative)] if pid.kd and pid.c in (0, 1) else [],
+        "integral": [*get_args(Integral)] if pid.ki else [],
+        "b": [0.0, 1.0],
+        "anti_windup": windups if pid.ki and limited else [],
+    }
+    stated = {name: getattr(pid, name) for name in choices}
+    made = [dict(zip(choices, values, strict=True)) for values in product(
+        *({stated[name], *choices[name]} for name in choices))]  # fmt: skip
+    changes = [{k: v for k, v in one.items() if v != stated[k]} for one in made]
+    for change in sorted(changes, key=lambda c: (len(c), str(c))):
+        if change:
+            kind = "limit" if "anti_windup" in change else "filter"
+            yield kind, _write_options(change), replace(loop, controller=replace(pid, **change))
+
+
+def _fit_filter_time(loop: Loop, pid: PID, record: Record) -> Iterator[tuple[str, str, Loop]]:
+    """Yield the law with the time constant of the derivative's filter that explains u best."""
+    if not pid.kd:
+        return
+
+    def explain(time: float, change: dict[str, Any]) -> float:
+        other = replace(pid, filter_time=float(time), **change)
+        return _compute_remainder(replace(loop, controller=other), record)[1]
+
+    stated = _compute_remainder(loop, record)[1]
+    changes: list[dict[str, Any]] = [{}]
+    if pid.derivative == "error" and pid.c in (0, 1):
+        changes.append({"derivative": "measurement"})
+    for change in changes:
+        grid = [k * loop.dt for k in FILTER_TIMES]
+        left = [explain(time, change) for time in grid]
+        if min(left) > PROMISING * stated:
+            continue
+        best = int(np.argmin(left))
+        ends = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
+        found = optimize.minimize_scalar(explain, bounds=ends, method="bounded", args=(change,),
+                                         options={"xatol": 1e-6 * loop.dt})  # fmt: skip
+        other = replace(pid, filter_time=float(found.x), **change)
+        words = _write_options({"filter_time": float(f"{found.x:.4g}"), **change})
+        yield "filter", words, replace(loop, controller=other)
+
+
+def _write_options(change: dict[str, Any]) -> str:
+    return "with " + " and ".join(f"{name}={value!r}" for name, value in change.items())
 
 
 def _list_gains(

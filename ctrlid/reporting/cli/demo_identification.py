@@ -290,7 +290,10 @@ def _tell_comparisons(bench: _Bench, record: Record, models: Models) -> Section:
     # A fit knows nothing of the operating point; like its intercept, the means stand in for it.
     means = replace(bench.op, input=float(record.u.mean()), output=float(record.y.mean()))
     loops = {k: replace(bench.loop, plant=ct.tf(G), at=means) for k, G in models.items()}
-    found = {k: compare(record, loop) for k, loop in {**loops, "physics": bench.loop}.items()}
+    # Curves can be compared where all look equally far ahead: one time constant of the physics.
+    ahead = round(1 / (bench.pole * PERIOD))
+    found = {k: compare(record, loop, horizon=ahead)
+             for k, loop in {**loops, "physics": bench.loop}.items()}  # fmt: skip
     fits = {k: c["one-step"].fit for k, c in found.items()}
     steps = {k: write_fit(fit, 1) for k, fit in fits.items()}
     near = "Curves that are close together, as in figures 6 and 7 of the paper, say little."
@@ -328,6 +331,10 @@ def _draw_comparisons(found: dict[str, Comparison]) -> dict[str, Any]:
         "The constrained model in the loop.": plot.comparison(known, window=window),
         "The model from instruments in the loop.": plot.comparison(good, window=window),
     }
+    axes = [picture.axes[0] for picture in figures.values()]
+    low, high = zip(*(ax.get_ylim() for ax in axes), strict=True)
+    for ax in axes:
+        ax.set_ylim(min(low), max(high))
     if known.tests:
         figures["One-step errors of the constrained model."] = plot.residuals(known)
     return figures
@@ -339,7 +346,7 @@ def _tell_redesigns(bench: _Bench, models: Models) -> Section:
         A lead with a crossover of {crossover:g} rad/s and a phase margin of {margin:g} degrees is
         designed on each model. It is then tried on the nonlinear physics, with a step as large as
         the jumps of the experiment."""
-    rows, figures = [], {}
+    rows, outcomes = [], {}
     for label, model in models.items():
         try:
             outcome = redesign(model, bench.loop, crossover=crossover, phase_margin=margin,
@@ -349,9 +356,10 @@ def _tell_redesigns(bench: _Bench, models: Models) -> Section:
             continue
         text += f"\n\n{label.capitalize()}: {_write_verdict(outcome)}"
         rows.append(_write_performance(label, outcome))
-        figures[f"Step of the reference, designed on: {label}."] = plot.step(outcome)
+        outcomes[f"designed on: {label}"] = outcome
     head = ("designed on", "crossover [rad/s]", "phase margin [deg]", "overshoot [%]")
     table = Table(head, tuple(rows), "Promised / achieved on the physics.") if rows else None
+    figures = {"Steps of the reference.": plot.step(outcomes)} if outcomes else {}
     return Section(TITLES[7], _join_lines(text), table, figures)
 
 
