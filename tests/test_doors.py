@@ -79,6 +79,10 @@ def test_what_would_lose_a_part_is_no_array(values):
         to_real_array(values, "levels")
 
 
+def select_wide(record):
+    return cid.Record(u=record.u, y=np.array([record.y, record.y]), dt=record.dt)
+
+
 CALLS = {
     "imaginary reference": lambda loop, record: cid.simulate(loop, record.r * 1j),
     "imaginary frequency": lambda loop, record: cid.response_band(cid.fit_arx(record, 2, 2), [1j]),
@@ -122,6 +126,8 @@ CALLS = {
     "rows of different lengths": lambda loop, record: replace(
         record, valid=[[True], [True, False]]
     ),
+    "a record of another plant": lambda loop, record: cid.predict(loop, select_wide(record)),
+    "a ball without end": lambda loop, record: cid.plants.ball_on_beam(m=1, J=1, radius=1e300),
     "an empty operating point": lambda loop, record: replace(loop, at=np.zeros((0, 3))),
     "an array without dimensions as constraints": lambda loop, record: cid.fit_arx(
         record, 2, 2, constraints=np.array(1.0)

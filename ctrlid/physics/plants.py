@@ -509,7 +509,7 @@ def ball_on_beam(
     """
     check_arguments(ball_on_beam, locals())
     _require_positive("ball_on_beam", m=m, J=J, radius=radius, g=g)
-    ball_inertia = 0.4 * m * radius**2 if ball_inertia is None else ball_inertia
+    ball_inertia = 0.4 * m * radius * radius if ball_inertia is None else ball_inertia
     _require_nonnegative("ball_on_beam", ball_inertia=ball_inertia, c=c)
 
     def rates(q: Any, v: Any, u: Any, params: Any) -> Any:
@@ -517,7 +517,7 @@ def ball_on_beam(
         along = u[1] + m * q[0] * v[1] ** 2 - m * g * np.sin(q[1])
         turn = u[0] - params["c"] * v[1] - 2 * m * q[0] * v[0] * v[1] - m * g * q[0] * np.cos(q[1])
         return [
-            along / (m + spin / params["radius"] ** 2),
+            along / (m + spin / params["radius"] / params["radius"]),
             turn / (params["J"] + spin + m * q[0] ** 2),
         ]
 

@@ -95,6 +95,7 @@ def make_filter_data(loop: Loop, record: Record, start_time: float = 0.0) -> Fil
                           f"{write_difference(loop.dt, record.dt)}")  # fmt: skip
     if not loop.equations().siso:
         return _make_several(loop, record, start_time)
+    record = match_signals(record, loop.equations())
     # The copy is writable as all other arrays are, so that the filter is compiled only once.
     valid = np.array(record.valid)
     if np.count_nonzero(valid) < FEWEST:
