@@ -50,7 +50,7 @@ def assemble_answer(
     made = [
         _make_finding(f, fitted.loop, errors, summary.shares, found, records) for f in found.found
     ]
-    case = Case(loop, found.final, records, errors)
+    case = Case(loop, found.final, records, errors, gap, found.after.passed)
     judged = [(one, find_ground(case, f)) for one, f in zip(made, found.found, strict=True)]
     judged.sort(key=lambda pair: -pair[0].evidence)
     findings = tuple(one for one, ground in judged if not ground)

@@ -12,7 +12,9 @@ from ..effects import AbstractEffect
 from ..effects.context import find_motion
 from ..loop.loop import Loop
 from .constancy import compare_stretches
+from .findings import Gap
 from .fitted_model import Model
+from .gap import compute_share_closed
 from .removal import Weighed
 from .scans import is_line_of_reference
 from .thresholds import THRESHOLD
@@ -22,13 +24,16 @@ from .thresholds import THRESHOLD
 class Case:
     """What the grounds are judged by: the model as given, the final one, records and errors.
 
-    `errors` are standard errors of the final model's parameters by name.
+    `errors` are standard errors of the final model's parameters by name, `gap` is that on fresh
+    data, and `explained` says whether the tests find noise only in what the final model leaves.
     """
 
     given: Loop
     final: Model
     records: Sequence[Record]
     errors: Mapping[str, float]
+    gap: Gap
+    explained: bool
 
     def read_effect(self, f: Weighed) -> tuple[str, AbstractEffect]:
         """Return the label of an effect in the final model, and the effect with its values."""
@@ -154,10 +159,26 @@ def is_phase_locked(record: Record, frequency: float) -> bool:
     return (1 - min(aligned, 1.0)) ** (len(parts) - 1) < THRESHOLD.differing
 
 
+def narrows_no_gap(case: Case, f: Weighed) -> str:
+    r"""Say if a model that is still wrong is no nearer to fresh data for its effects.
+
+    A likelihood is evidence among models of which one is right. Where the tests reject the model
+    with all its effects, only fresh data speak for their names: together they must close a fair
+    part of what is above the noise floor. Where nothing is, a random force explains everything.
+    """
+    del f
+    gap = case.gap
+    closed = compute_share_closed(gap.before**2 - gap.after**2, gap.before, gap.floor)
+    if case.explained or closed > THRESHOLD.helps:
+        return ""
+    return "something else is missing, and on fresh data the effects do not narrow the gap"
+
+
 # A name stands if none of these has anything to say.
 GROUNDS: tuple[Callable[[Case, Weighed], str], ...] = (
     is_at_a_limit,
     cancels_a_known_force,
     differs_between_stretches,
     follows_the_reference,
+    narrows_no_gap,
 )

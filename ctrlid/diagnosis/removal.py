@@ -158,7 +158,10 @@ def weigh_without_effect(model: Model, position: int) -> tuple[Model, Trial]:
     if lost <= THRESHOLD.gate:
         return smaller, trial
     gain = model.fit.value - smaller.fit.value
-    return smaller, replace(trial, gain=gain, penalty=gain - lost, out=None)
+    # A trial that was put out has lost what a comparison of likelihoods needs; the model has it.
+    label = list(model.loop.labelled)[position]
+    whole = replace(trial, label=label, model=model, out=None)
+    return smaller, replace(whole, gain=gain, penalty=gain - lost)
 
 
 def refit_noise(model: Model) -> Model:
