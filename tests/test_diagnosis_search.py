@@ -20,6 +20,8 @@ from ctrlid.diagnosis.findings import Disturbance, Finding, Gap
 from ctrlid.diagnosis.fitted_model import (
     Model,
     compute_criterion,
+    compute_log_terms,
+    drop_arrays,
     drop_linearization,
     with_linearization,
 )
@@ -716,13 +718,16 @@ def test_the_name_without_which_the_gap_is_narrowest_goes_first(two_found):
 def test_a_standard_error_does_not_overrule_a_likelihood(two_found, monkeypatch):
     model = two_found.final
     smaller, trial = refit_without_effect(model, 0)
-    flat = replace(trial, out=Objection("insignificant", "within 2 standard errors"))
+    bare = replace(trial.model, fit=drop_arrays(trial.model.fit))
+    flat = replace(trial, model=bare, out=Objection("insignificant", "within 2 standard errors"))
     monkeypatch.setattr(removal, "refit_without_effect", lambda *_: (smaller, flat))
     left, kept = removal.weigh_without_effect(model, 0)
     assert kept.out is None
     assert kept.net_gain > 100
     assert compute_criterion(left) < compute_criterion(model) - 100
     assert kept.net_gain == pytest.approx(compute_criterion(model) - compute_criterion(left))
+    # What was put out had lost its likelihood, which a comparison of names needs.
+    assert np.sum(compute_log_terms(kept.model.fit)) == pytest.approx(model.fit.value)
     # What explains as much without the effect takes its place all the same.
     monkeypatch.setattr(removal, "refit_noise", lambda smaller: model)
     assert removal.weigh_without_effect(model, 0)[1] is flat

@@ -9,7 +9,7 @@ import pytest
 import ctrlid as cid
 import ctrlid.effects as E
 from ctrlid.diagnosis.constancy import _estimate_alone
-from ctrlid.diagnosis.grounds import is_phase_locked
+from ctrlid.diagnosis.grounds import Case, is_phase_locked, narrows_no_gap
 from ctrlid.reporting.tables import make_blocks
 
 DT, N = 0.01, 2000
@@ -140,6 +140,19 @@ def test_a_line_at_a_frequency_of_the_reference_is_a_stand_in():
         found = cid.diagnose(mass(()), record, catalogue=(E.PeriodicForce,), progress=False)
         assert bool(found.findings) == stands
         assert bool(found.stand_ins) != stands
+
+
+def test_a_wrong_model_names_what_fresh_data_like(half):
+    def narrows(before, after, explained):
+        gap = replace(half.gap, before=before, after=after)
+        return narrows_no_gap(Case(mass(), None, (), {}, gap, explained), None)
+
+    assert "do not narrow the gap" in narrows(40e-6, 53e-6, explained=False)
+    assert "do not narrow the gap" in narrows(40e-6, 39.5e-6, explained=False)
+    assert not narrows(40e-6, 30e-6, explained=False)
+    # A small effect that leaves noise alone needs no wider gap to be seen.
+    assert not narrows(40e-6, 40e-6, explained=True)
+    assert narrows(np.inf, np.inf, explained=False)
 
 
 def test_the_steps_of_a_converter_are_a_remark():

@@ -220,20 +220,6 @@ def make_simulator(loop: Loop, hold: str = "zoh", hold_r: str = "zoh") -> Simula
     return Simulator(loop, THRESHOLD.gap_integration_error, THRESHOLD.gap_steps, hold, hold_r)
 
 
-def compute_share_closed(closed: float, before: float, floor: float) -> float:
-    r"""Return how much of what is above the noise floor is closed, between 0 and 1.
-
-    .. math:: c / (g^2 - f^2)
-
-    for c, the difference of two squared gaps, g the gap before and f the floor [output unit]. NaN
-    where the gap before is not above the floor, or one of them is not finite.
-    """
-    above = before**2 - (floor**2 if math.isfinite(floor) else 0.0)
-    if not (math.isfinite(closed) and math.isfinite(above)) or above <= 0:
-        return math.nan
-    return float(min(max(closed / above, 0.0), 1.0))
-
-
 @dataclass(frozen=True)
 class Floor:
     """The RMS error that noise leaves through a loop [output unit].

@@ -48,7 +48,7 @@ def summarize_gap(loop: Loop, found: Search, fresh: FreshData) -> GapSummary:
         if len(found.found) > 1:
             label = list(after[0].labelled)[f.position]
             error = shared.measure_gap([x.without_effect(label) for x in after])
-        shares[f.position] = gaps.compute_share_closed(error**2 - left**2, smaller, floor.both)
+        shares[f.position] = _compute_share_closed(error**2 - left**2, smaller, floor.both)
     first = windows[0]
     unit = loop.known_units.get(loop.equations().outputs[0], "")
     trivial = gaps.measure_trivial_error(shared.windows, how.horizon) if how.horizon else math.nan
@@ -161,7 +161,7 @@ def make_fresh_data_test(fresh: FreshData) -> Callable[[Weighed, Model], bool]:
                 return True
         floor = gaps.compute_floor(with_it, model.fit, fresh.windows, fresh.how).both
         gap, before = fresh.measure_gap(with_it), fresh.measure_gap(without)
-        return gaps.compute_share_closed(before**2 - gap**2, before, floor) > THRESHOLD.helps
+        return _compute_share_closed(before**2 - gap**2, before, floor) > THRESHOLD.helps
 
     return helps
 
@@ -178,6 +178,13 @@ def make_size_test(fresh: FreshData) -> Callable[[Model], bool]:
         return chance < THRESHOLD.noise_too_large
 
     return is_larger
+
+
+def _compute_share_closed(closed: float, before: float, floor: float) -> float:
+    above = before**2 - (floor**2 if math.isfinite(floor) else 0.0)
+    if not (math.isfinite(closed) and math.isfinite(above)) or above <= 0:
+        return math.nan
+    return float(min(max(closed / above, 0.0), 1.0))
 
 
 def _measure_disturbance(fit: Fit, loop: Loop, floor: gaps.Floor) -> Disturbance:

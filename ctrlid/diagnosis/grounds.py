@@ -14,7 +14,6 @@ from ..loop.loop import Loop
 from .constancy import compare_stretches
 from .findings import Gap
 from .fitted_model import Model
-from .gap import compute_share_closed
 from .removal import Weighed
 from .scans import is_line_of_reference
 from .thresholds import THRESHOLD
@@ -162,14 +161,15 @@ def is_phase_locked(record: Record, frequency: float) -> bool:
 def narrows_no_gap(case: Case, f: Weighed) -> str:
     r"""Say if a model that is still wrong is no nearer to fresh data for its effects.
 
-    A likelihood is evidence among models of which one is right. Where the tests reject the model
-    with all its effects, only fresh data speak for their names: together they must close a fair
-    part of what is above the noise floor. Where nothing is, a random force explains everything.
+    .. math:: g_1^2 > (1 - h)\, g_0^2
+
+    for the gaps before and after, and a fair part h. A likelihood is evidence among models of which
+    one is right. Where the tests reject the model with all its effects, fresh data alone speak for
+    their names. The floor is no measure here, since a random force of the wrong model is in it.
     """
     del f
     gap = case.gap
-    closed = compute_share_closed(gap.before**2 - gap.after**2, gap.before, gap.floor)
-    if case.explained or closed > THRESHOLD.helps:
+    if case.explained or gap.after**2 < (1 - THRESHOLD.helps) * gap.before**2:
         return ""
     return "something else is missing, and on fresh data the effects do not narrow the gap"
 
