@@ -14,6 +14,7 @@ from ctrlid._base.criterion import bayesian_penalty
 from ctrlid._base.statistics import (
     autocorrelation_time,
     compute_lagged_products,
+    compute_predicted_likelihood,
     fit_autoregression,
     kurtosis_about_zero,
     portmanteau,
@@ -108,6 +109,15 @@ def test_the_order_of_an_autoregression_is_that_of_the_criterion(poles):
 
 def test_nothing_has_no_colour():
     assert fit_autoregression(np.zeros(5), 100).tolist() == [1.0]
+
+
+def test_what_the_past_tells_is_the_gain_of_the_best_predictor():
+    """Of an autoregression of the first order it is that of its one coefficient."""
+    products = 5.0 * 0.6 ** np.arange(8)
+    told = compute_predicted_likelihood(products, 1000)
+    assert told == pytest.approx(-500 * np.log(1 - 0.6**2))
+    assert compute_predicted_likelihood(np.eye(8)[0], 1000) == 0.0
+    assert compute_predicted_likelihood(np.zeros(5), 100) == 0.0
 
 
 def test_reflected_roots_leave_the_spectrum_on_the_circle():

@@ -9,6 +9,7 @@ import ctrlid.effects as E
 from ctrlid.diagnosis.findings import Finding
 from ctrlid.diagnosis.scans import is_line_of_reference
 from ctrlid.diagnosis.wording import describe_aliases, join_names
+from ctrlid.loop.period_map import comes_to_rest
 
 DT, N, FINE = 0.01, 400, 10
 M, C, K = 2.0, 4.0, 3.0
@@ -163,3 +164,11 @@ def test_a_line_of_the_reference():
     rest = cid.Record(dt=DT, u=quiet, y=quiet, r=np.full(len(t), 0.012))
     assert not is_line_of_reference(rest, 1.7)
     assert not is_line_of_reference(cid.Record(dt=DT, u=quiet, y=quiet), 1.7)
+
+
+def test_a_loop_with_two_hums_comes_to_rest() -> None:
+    """Effects that the linear model leaves out are numbered anew as they go."""
+    rest = cid.OperatingPoint((0.0, 0.0), 0.0, 0.0)
+    loop = cid.Loop(cid.plants.servo(m=1.0, c=2.0, k=3.0), 0.5, dt=0.01, at=rest)
+    hums = [E.SensorHum(amplitude=0.1, frequency=f, phase=0.0) for f in (5.0, 7.0)]
+    assert comes_to_rest(loop.with_effect(hums[0]).with_effect(hums[1]))

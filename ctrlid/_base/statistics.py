@@ -1,6 +1,7 @@
 """Statistics that several rooms need: correlations, autoregressions, information matrices."""
 
 import math
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -228,21 +229,54 @@ def fit_autoregression(products: Array, samples: float) -> Array:
     >>> fit_autoregression(0.8 ** np.arange(6), 1000)
     array([ 1. , -0.8])
     """
-    chosen = a = np.ones(1)
+    chosen, least = np.ones(1), 0.0
+    for a, share in _list_autoregressions(products):
+        score = samples * math.log(share) + 2 * bayesian_penalty(len(a) - 1, samples)
+        if score < least:
+            least, chosen = score, a
+    return chosen
+
+
+def _list_autoregressions(products: Array) -> Iterator[tuple[Array, float]]:
+    """Yield the whitening filter of each order, and the share of variance that it leaves."""
+    a, share = np.ones(1), 1.0
     if products[0] <= 0:
-        return chosen
-    # `share` is the share of the variance that past samples do not predict.
-    least, share = 0.0, 1.0
+        return
     for order in range(1, len(products)):
         reflection = -float(a @ products[order:0:-1]) / (share * products[0])
         a = np.append(a, 0.0) + reflection * np.append(a, 0.0)[::-1]
         share *= 1 - reflection**2
         if share <= 0:
-            break
-        score = samples * math.log(share) + 2 * bayesian_penalty(order, samples)
-        if score < least:
-            least, chosen = score, a
-    return chosen
+            return
+        yield a, share
+
+
+def compute_predicted_likelihood(products: Array, samples: float) -> float:
+    r"""Return what the past of a signal tells of it, as a gain of log-likelihood.
+
+    .. math:: \tfrac{N}{2} \ln \frac{\sigma_e^2}{\sigma_\varepsilon^2}
+
+    for the autoregression of the highest order, whose errors are :math:`\varepsilon`.
+
+    Parameters
+    ----------
+    products : ndarray, shape (highest order + 1,)
+        Autocovariances of the signal from lag 0 on, or any multiple of them.
+    samples : float
+        Number N of samples behind them.
+
+    Returns
+    -------
+    float
+        The gain; that of white noise is about half the order, by chance.
+
+    Examples
+    --------
+    >>> round(compute_predicted_likelihood(0.8 ** np.arange(6), 1000), 1)
+    510.8
+    """
+    shares = [1.0, *(share for _, share in _list_autoregressions(products))]
+    return -0.5 * samples * math.log(shares[-1])
 
 
 def reflect_into_circle(roots: ArrayLike, largest: float) -> ComplexArray:

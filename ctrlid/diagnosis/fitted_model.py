@@ -1,5 +1,6 @@
 """A loop fitted to records, and the same fit carried over to another loop."""
 
+import functools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -58,7 +59,7 @@ class Model:
         """The records that it was fitted to."""
         return tuple(one.record for one in self.data)
 
-    @property
+    @functools.cached_property
     def fitted(self) -> Loop:
         """The loop with the fitted values."""
         values = dict(zip(self.names, self.fit.theta.tolist(), strict=True))

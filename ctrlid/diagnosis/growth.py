@@ -10,6 +10,7 @@ import numpy as np
 from .._base.criterion import bayesian_penalty
 from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from .._base.interruption import Stopped
+from .._base.statistics import compute_lagged_products, compute_predicted_likelihood
 from ..effects import AbstractEffect
 from ..estimation.likelihood.likelihood import Fit
 from ..estimation.likelihood.maximization import (
@@ -195,25 +196,40 @@ def _prefer_sensor_noise(
     tests = run_noise_tests(fit)
     if tests.passed and not fit.noise.drift:
         return None
+    # Further noise in the fit of the best effect is paid for as well.
+    more = 0.0
+    if best is not None:
+        parameters = best.model.fit.noise.parameters - fit.noise.parameters
+        more = max(0.0, best.net_gain - bayesian_penalty(parameters, fit.size))
     tried = []
-    if fit.noise.sensor_is_white:
+    if fit.noise.sensor_is_white and _may_be_coloured(fit, more):
         with contextlib.suppress(ModelCannotRun):
             tried.append(choose_sensor_noise(fit))
     if fit.noise.tails is None and tests.has_heavy_tails:
         tried.append(choose_tails(fit))
     other = max(tried, key=compute_noise_criterion, default=fit)
     gain = compute_noise_criterion(other) - compute_noise_criterion(fit)
-    # Further noise in the fit of the best effect is paid for as well.
-    more = 0.0
-    if best is not None:
-        parameters = best.model.fit.noise.parameters - fit.noise.parameters
-        more = max(0.0, best.net_gain - bayesian_penalty(parameters, fit.size))
     if not gain > more:
         return None
     newly_coloured = fit.noise.sensor_is_white and not other.noise.sensor_is_white
     if newly_coloured and is_larger(Model(model.loop, other)):
         return None
     return with_linearization(Model(model.loop, other))
+
+
+def _may_be_coloured(fit: Fit, more: float) -> bool:
+    """Whether coloured sensor noise can gain more than so much, in place of a coloured force.
+
+    What past innovations tell of the next one is what a colour of the noise can explain; with
+    parameters that move along it may be twice as much.
+    """
+    told = 0.0
+    for z in fit.standardized:
+        filled = np.nan_to_num(z)
+        products = compute_lagged_products(filled, filled, THRESHOLD.lags)
+        told += compute_predicted_likelihood(products, float(np.count_nonzero(np.isfinite(z))))
+    least = bayesian_penalty(1 - 2 * bool(fit.noise.drift), fit.size)
+    return THRESHOLD.colour_promise * told > more + least
 
 
 def refuse_larger_noise(found: Search, is_larger: Callable[[Model], bool]) -> Search:

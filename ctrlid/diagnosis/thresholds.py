@@ -289,6 +289,11 @@ class Thresholds:
         0.1, cost="one effect that promises less than this does not stand for two",
         unit="of what leaving one of them out loses",
     )  # fmt: skip
+    colour_promise: float = declare_number(
+        2.0, cost="coloured sensor noise is looked for only where so much could beat the best "
+        "effect: in none of the records looked at did a colour gain more",
+        unit="of what an autoregression of the innovations gains",
+    )  # fmt: skip
     surely_needed: float = declare_number(
         100.0, cost="an effect so significant is not asked whether it is needed",
         unit="times the gate",

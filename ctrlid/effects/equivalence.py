@@ -143,17 +143,16 @@ def _find_scaled(loop: Any, others: Sequence[AbstractEffect]) -> set[str]:
     stretch = np.ones(len(e.states))
     stretch[list(motion)] = 1 + SCALE
     points = _draw_points(loop.point)
-    rates = [stretch * e.evaluate(x / stretch, u, t)[0] for t, (x, u) in enumerate(points)]
+    x, u, t = points
+    rates = stretch * e.evaluate_points(x / stretch, u, t)[0]
     own = [n for n in loop.free if "." not in n]
-    if _can_reproduce(e, own, points, np.concatenate(rates)):
+    if _can_reproduce(e, own, points, rates):
         # The free parameters take it up, so that no effect is left to stand for it.
         return set()
     found = {
         f"parameter {n}"
         for n in e.parameters
-        if "." not in n
-        and n not in own
-        and _can_reproduce(e, [*own, n], points, np.concatenate(rates))
+        if "." not in n and n not in own and _can_reproduce(e, [*own, n], points, rates)
     }
     for effect in others:
         if effect.place == "output" or effect.states:
@@ -167,15 +166,13 @@ def _find_scaled(loop: Any, others: Sequence[AbstractEffect]) -> set[str]:
         if changed.delay is not None or changed.play is not None or changed.readout is not None:
             continue
         unknown = [*own, f"{list(there.labelled)[-1]}.{key}"]
-        if unknown[-1] in changed.parameters and _can_reproduce(
-            changed, unknown, points, np.concatenate(rates)
-        ):
+        if unknown[-1] in changed.parameters and _can_reproduce(changed, unknown, points, rates):
             found.add(type(effect).__name__)
     return found
 
 
 def _can_reproduce(
-    e: Equations, names: Sequence[str], points: Sequence[tuple[Array, float]], wanted: Array
+    e: Equations, names: Sequence[str], points: tuple[Array, Array, Array], wanted: Array
 ) -> bool:
     """Whether some values of named parameters give the wanted rates at all points."""
     if not names:
@@ -187,8 +184,7 @@ def _can_reproduce(
     def compute_error(shift: Array) -> Array:
         values = start.copy()
         values[index] += scale * shift
-        rows = [e.evaluate(x, u, t, values)[0] for t, (x, u) in enumerate(points)]
-        return np.asarray(np.concatenate(rows) - wanted)
+        return np.ravel(e.evaluate_points(*points, values)[0] - wanted)
 
     shift = np.zeros(len(names))
     first = error = compute_error(shift)
@@ -317,19 +313,16 @@ def _compute_change(loop: Any, effect: AbstractEffect, size: float) -> Array | N
 
 
 def _evaluate_at_points(e: Equations, at: Any, values: Array | None = None) -> Array:
-    rows = [
-        np.concatenate(e.evaluate(x, u, t, values)) for t, (x, u) in enumerate(_draw_points(at))
-    ]
-    return np.concatenate(rows)
+    return np.hstack(e.evaluate_points(*_draw_points(at), values)).ravel()
 
 
-def _draw_points(at: Any) -> list[tuple[Array, float]]:
-    """Return random states and inputs around rest."""
+def _draw_points(at: Any) -> tuple[Array, Array, Array]:
+    """Return random states and inputs around rest, and a time for each of them."""
     rng = np.random.default_rng(3)
     rest = np.array([*at.states, at.input])
     scale = np.where(rest == 0, 1.0, 0.3 * np.abs(rest))
     points = rest + scale * rng.uniform(-1, 1, (POINTS, rest.size))
-    return [(z[:-1], float(z[-1])) for z in points]
+    return points[:, :-1], points[:, -1], np.arange(float(POINTS))
 
 
 def _find_factor(first: Array | None, second: Array | None) -> float | None:

@@ -1,5 +1,6 @@
 """The loop: a plant under control, in absolute physical units."""
 
+import functools
 import math
 import pickle
 from collections.abc import Mapping
@@ -190,8 +191,11 @@ class Loop:
                 raise CtrlidError(f"input_limits needs lower < upper; given ({low:g}, {high:g})")
         return tuple(tuple(v.tolist()) if v.ndim else float(v) for v in (lower, upper))
 
-    def _apply_effects(self) -> None:
-        """Put the effects into the equations and see that the free parameters exist."""
+    def _apply_effects(self, like: "Loop | None" = None) -> None:
+        """Put the effects into the equations and see that the free parameters exist.
+
+        Where a loop `like` this one has the same effects at work, its equations are taken over.
+        """
         for name in ("effects", "free"):
             given = getattr(self, name)
             if not isinstance(given, AbstractEffect) and not is_iterable(given):
@@ -209,9 +213,12 @@ class Loop:
         kept = compose_effects(plant, self.labelled, at, self.dt)
         active = {label: e for label, e in self.labelled.items() if not e.neutral}
         object.__setattr__(self, "_kept", kept)
-        changed = (
-            kept if len(active) == len(effects) else compose_effects(plant, active, at, self.dt)
-        )
+        if len(active) == len(effects):
+            changed = kept
+        elif like is not None and self._has_same_at_work(like):
+            changed = like._active
+        else:
+            changed = compose_effects(plant, active, at, self.dt)
         object.__setattr__(self, "_active", changed)
         free: Any = (self.free,) if isinstance(self.free, str) else self.free
         free = dict(free) if isinstance(free, Mapping) else tuple(free)
@@ -235,6 +242,14 @@ class Loop:
                 "a controller would be algebraic; add the lag of the sensor or the actuator to the "
                 "plant. If this is the controller, the order is Loop(plant, controller, ...)"
             )
+
+    def _has_same_at_work(self, other: "Loop") -> bool:
+        """Whether the very same effects are at work on the very same plant in another loop."""
+        mine, its = (
+            [(k, id(e)) for k, e in x.labelled.items() if not e.neutral] for x in (self, other)
+        )
+        plant = self._traced is other._traced and self.at is other.at and self.dt == other.dt
+        return plant and mine == its
 
     def _check_units(self) -> None:
         e = self._traced
@@ -349,7 +364,8 @@ class Loop:
         >>> loop.with_effect(cid.effects.CoulombFriction(fc=0.2)).parameters
         {'m': 2.0, 'c': 1.0, 'k': 3.0, 'CoulombFriction.fc': 0.2}
         """
-        return self._replace_fields(effects=(*self.effects, effect))
+        # Whether a plant takes an effect is found out by adding it, and then it is added again.
+        return _add_effect(self, _Itself(effect))
 
     def without_effect(self, effect: str | AbstractEffect) -> "Loop":
         """Return the loop without one of its effects.
@@ -424,7 +440,7 @@ class Loop:
         """Return a copy with other fields, without tracing the plant again."""
         new = object.__new__(Loop)
         new.__dict__.update(self.__dict__ | changes)
-        new._apply_effects()
+        new._apply_effects(self)
         return new
 
     def law(self) -> ControlLaw | None:
@@ -540,6 +556,25 @@ class Loop:
         if wiring is None:
             return text + ")"
         return "\n  ".join([text + "), wired:", *wiring.lines])
+
+
+class _Itself:
+    """An object as a key that equals no other object, whatever its values are."""
+
+    def __init__(self, given: Any) -> None:
+        self.given = given
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Itself) and self.given is other.given
+
+    def __hash__(self) -> int:
+        return id(self.given)
+
+
+@functools.lru_cache(maxsize=64)
+def _add_effect(loop: Loop, effect: _Itself) -> Loop:
+    """Return a loop with one more effect; the last ones are kept."""
+    return loop._replace_fields(effects=(*loop.effects, effect.given))
 
 
 def _check_beliefs(free: Mapping[str, Any], parameters: Mapping[str, float]) -> None:

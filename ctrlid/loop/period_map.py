@@ -269,7 +269,8 @@ def compute_closed_loop_poles(loop: Loop, hidden: bool = True) -> ComplexArray:
     CtrlidError
         If the plant has no derivative at the operating point.
     """
-    for label, effect in loop.labelled.items():
+    # From the last one on, since the effects of one kind behind it would be numbered anew.
+    for label, effect in reversed(loop.labelled.items()):
         if not effect.in_linear_model:
             loop = loop.without_effect(label)
     s = make_period_map(loop, 8)

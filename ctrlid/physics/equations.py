@@ -182,6 +182,31 @@ class Equations:
         rhs, output = self.function(t, x, u, p)
         return np.asarray(rhs, float).ravel(), np.asarray(output, float).ravel()
 
+    def evaluate_points(
+        self, x: Array, u: Array, t: Array, p: Array | None = None
+    ) -> tuple[Array, Array]:
+        """Return ``rhs`` and ``output`` at many points at once, a row each.
+
+        Parameters
+        ----------
+        x : ndarray, shape (k, n)
+            States.
+        u : ndarray, shape (k,)
+            The input; all inputs have this value where there are several.
+        t : ndarray, shape (k,)
+            Times [s].
+        p : ndarray, optional
+            Values of all parameters, by default those of the equations.
+
+        Returns
+        -------
+        rhs, output : ndarray, shapes (k, n) and (k, outputs)
+        """
+        inputs = np.tile(u, (len(self.inputs), 1))
+        p = self.values if p is None else p
+        rhs, output = self.function(np.reshape(t, (1, -1)), np.transpose(x), inputs, p)
+        return np.asarray(rhs, float).T, np.asarray(output, float).T
+
 
 def drive_inputs(
     equations: Equations, driven: Sequence[str], forces: Mapping[str, str], units: Mapping[str, str]
