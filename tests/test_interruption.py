@@ -22,6 +22,7 @@ from ctrlid._base.files import replace_file
 from ctrlid._base.interruption import Budget, Stopped, check_budget, keep_interrupt
 from ctrlid._base.jobs import run_side_by_side, share_out
 from ctrlid.diagnosis.progress import Progress
+from ctrlid.diagnosis.thresholds import vary_numbers
 
 E = cid.effects
 
@@ -96,8 +97,8 @@ def test_what_was_found_before_the_end_is_kept(record, monkeypatch):
     budgets = []
     tell, make = Progress.tell, Progress.make_budget
 
-    def keep(self, seconds):
-        budgets.append(make(self, seconds))
+    def keep(self, seconds, samples):
+        budgets.append(make(self, seconds, samples))
         return budgets[-1]
 
     def stop(self, step, **options):
@@ -116,6 +117,40 @@ def test_what_was_found_before_the_end_is_kept(record, monkeypatch):
     monkeypatch.undo()
     whole = cid.diagnose(drive(), record, catalogue=few, progress=False, seconds=600)
     assert (whole.verdict, whole.finished, len(whole.findings)) == ("explained", True, 2)
+
+
+def test_a_budget_of_samples_counts_what_is_done_side_by_side():
+    """What helpers go through counts, whether they are threads or processes."""
+    budget = Budget(samples=1000)
+    with budget.running():
+        run_side_by_side(lambda n: check_budget(n), [100] * 5)
+        assert list(share_out(count_samples, [100] * 5, 2)) == [100] * 5
+        assert (budget.spent, budget.left_samples) == (1000, 0)
+        with pytest.raises(Stopped):
+            run_side_by_side(lambda n: check_budget(n), [1] * 5)
+    assert budget.left == 0.0
+    again = Budget(samples=450)
+    with again.running(), pytest.raises(Stopped):
+        list(share_out(count_samples, [100] * 5, 2))
+
+
+def count_samples(n):
+    """Spend samples, in a process of its own."""
+    check_budget(n)
+    return n
+
+
+def test_a_search_ends_at_the_same_sample_whatever_the_jobs(record):
+    """It is stopped by the count, not by the clock."""
+    few = (E.CoulombFriction, E.InputOffset)
+    with vary_numbers(search_samples=1.5e5):
+        one, two = (
+            cid.diagnose(drive(), record, catalogue=few, jobs=jobs, progress=False)
+            for jobs in (None, 2)
+        )
+    assert not one.finished
+    assert "stopped after 0.15 million filtered samples" in one.sentence
+    assert (one.sentence, one.findings) == (two.sentence, two.findings)
 
 
 def test_what_is_shown_without_a_terminal(record, capsys):

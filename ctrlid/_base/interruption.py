@@ -31,14 +31,38 @@ class Budget:
         From now [s]; no end by default.
     beat : callable, optional
         Called without arguments at every pass of a filter, so that something moves on the screen.
+    samples : float, optional
+        How many samples filters may go through, which tells the work without a clock: the search
+        ends at the same place on every machine, whatever is done side by side.
     """
 
     seconds: float = math.inf
     beat: Callable[[], None] | None = None
+    samples: float = math.inf
     start: float = field(default_factory=time.monotonic)
     # A search within a search ends with the one around it.
     outer: "Budget | None" = field(default_factory=lambda: find_budget())
     _stop: threading.Event = field(default_factory=threading.Event)
+    _spent: list[int] = field(default_factory=lambda: [0])
+    _lock: Any = field(default_factory=threading.Lock)
+
+    def spend(self, samples: int) -> None:
+        """Count samples that a filter goes through."""
+        with self._lock:
+            self._spent[0] += samples
+        if self.outer is not None:
+            self.outer.spend(samples)
+
+    @property
+    def spent(self) -> int:
+        """Samples that filters went through."""
+        return self._spent[0]
+
+    @property
+    def left_samples(self) -> float:
+        """Samples that filters may still go through; negative where the last pass was too many."""
+        around = math.inf if self.outer is None else self.outer.left_samples
+        return min(around, self.samples - self.spent)
 
     def stop(self) -> None:
         """Ask the search to end at its next step."""
@@ -51,8 +75,8 @@ class Budget:
 
     @property
     def left(self) -> float:
-        """Seconds that are left; zero after `stop` [s]."""
-        if self.asked:
+        """Seconds that are left; zero after `stop`, and where the samples are used up [s]."""
+        if self.asked or self.left_samples < 0:
             return 0.0
         around = math.inf if self.outer is None else self.outer.left
         return max(0.0, min(around, self.start + self.seconds - time.monotonic()))
@@ -115,13 +139,29 @@ def check_interrupt() -> None:
         raise KeyboardInterrupt
 
 
-def check_budget() -> None:
-    """Raise `Stopped` if this thread works under a budget that is spent."""
+def lend_budget(function: Callable[[], None]) -> Callable[[], None]:
+    """Return a function that another thread calls under the budget of this one."""
+    found = _BUDGET.get()
+    if found is None:
+        return function
+    budget, binding = found
+    lent = Budget(outer=budget)
+
+    def call() -> None:
+        with lent.running(binding):
+            function()
+
+    return call
+
+
+def check_budget(samples: int = 0) -> None:
+    """Raise `Stopped` if this thread works under a budget that is spent, by these samples too."""
     check_interrupt()
     found = _BUDGET.get()
     if found is None:
         return
     budget, binding = found
+    budget.spend(samples)
     if budget.beat is not None:
         budget.beat()
     if binding and not budget.left:

@@ -16,7 +16,7 @@ from numbers import Integral
 from typing import Any, TypeVar
 
 from .errors import CtrlidError
-from .interruption import Budget, check_budget, check_interrupt, find_budget
+from .interruption import Budget, check_budget, check_interrupt, find_budget, lend_budget
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -75,8 +75,8 @@ def share_out(
     with joblib.Parallel(n_jobs=jobs, return_as="generator") as run:
         while batch := list(islice(source, BATCH)):
             try:
-                for result in run(_list_calls(function, batch)):
-                    check_budget()
+                for result, samples in run(_list_calls(function, batch)):
+                    check_budget(samples)
                     yield result
             finally:
                 # A process that Ctrl-C ended before its first item is reported as lost.
@@ -84,25 +84,34 @@ def share_out(
 
 
 def _list_calls(function: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[Any]:
-    """Yield the calls that joblib makes, each with the time that is left when it is handed out."""
+    """Yield the calls that joblib makes, each with what is left when it is handed out."""
     budget = find_budget()
     import joblib
 
     for item in items:
-        left = math.inf if budget is None else budget.left
-        yield joblib.delayed(_call_elsewhere)(function, item, left)
+        left = (math.inf, math.inf) if budget is None else (budget.left, budget.left_samples)
+        yield joblib.delayed(_call_elsewhere)(function, item, *left)
 
 
-def _call_elsewhere(function: Callable[[Item], Result], item: Item, left: float) -> Result:
-    """Call a function in another process or thread, for so many seconds."""
+def _call_elsewhere(
+    function: Callable[[Item], Result], item: Item, left: float, samples: float
+) -> tuple[Result, int]:
+    """Call a function in another process or thread, for so many seconds and samples.
+
+    Returns
+    -------
+    result : object
+        What it returns.
+    samples : int
+        Samples that filters went through for it.
+    """
     process = multiprocessing.parent_process() is not None
     if process and threading.current_thread() is threading.main_thread():
         # Ctrl-C reaches all processes of a terminal; the one that asked decides what it means.
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-    if math.isinf(left):
-        return function(item)
-    with Budget(left).running():
-        return function(item)
+    budget = Budget(left, samples=samples)
+    with budget.running():
+        return function(item), budget.spent
 
 
 def run_side_by_side(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
@@ -138,18 +147,19 @@ def run_side_by_side(function: Callable[[Item], Result], items: Iterable[Item]) 
             # Another thread may have taken the last item.
             except IndexError:
                 return
-            results[k] = function(given[k])
+            try:
+                results[k] = function(given[k])
+            except BaseException:
+                # Nobody waits for the rest any more, after Ctrl-C for instance.
+                waiting.clear()
+                raise
 
+    help_out = lend_budget(take)
     helpers = [
-        _start_threads().submit(take) for _ in range(min(count_processors(), len(given)) - 1)
+        _start_threads().submit(help_out) for _ in range(min(count_processors(), len(given)) - 1)
     ]
-    try:
-        # The calling thread works too, while the others start.
-        take()
-    except BaseException:
-        # Nobody waits for the rest any more, after Ctrl-C for instance.
-        waiting.clear()
-        raise
+    # The calling thread works too, while the others start.
+    take()
     for helper in helpers:
         # A thread that has not started yet is not needed any more.
         if not helper.cancel():

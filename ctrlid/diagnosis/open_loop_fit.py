@@ -120,7 +120,7 @@ class Simulation:
         n, count = plant.size, len(self.runs)
         values, errors, slopes, states = plant.insert_free_values(theta), [], [], []
         for k, (data, run) in enumerate(zip(self.problem.data, self.runs, strict=True)):
-            check_budget()
+            check_budget(len(data.record))
             z = np.concatenate([x0[k], np.zeros(n * p), np.eye(n).ravel()])
             after, seen = (np.asarray(out, float) for out in
                            run(z, plant.stack_inputs(data, theta), values))  # fmt: skip

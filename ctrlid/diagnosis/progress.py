@@ -9,6 +9,7 @@ from tqdm import tqdm
 from .._base.interruption import Budget
 from .._base.text import write_number
 from .candidates import Trial
+from .thresholds import THRESHOLD
 
 # The bar is drawn anew after so many seconds, also while nothing is finished.
 REFRESH = 0.5
@@ -29,8 +30,9 @@ class Progress:
         self.step, self.round = "checking the records", ""
         self.done, self.total, self.ranked = 0, 0, True
         self.leader: Trial | None = None
-        # Where the search was stopped and after how many seconds; empty if it was not.
-        self.ended, self.seconds = "", 0.0
+        # Where the search was stopped and after what; empty if it was not.
+        self.ended = self.spent = ""
+        self.budget: Budget | None = None
         terminal = sys.stderr.isatty()
         self.lines = shown and not terminal
         self.bar = tqdm(total=0, disable=not (shown and terminal), leave=False, bar_format=BAR)
@@ -117,14 +119,21 @@ class Progress:
             words += f"; {self.describe_leader()}"
         return words
 
-    def make_budget(self, seconds: float) -> Budget:
-        """Return a budget that keeps the bar moving."""
-        return Budget(seconds, self.beat)
+    def make_budget(self, seconds: float, samples: float) -> Budget:
+        """Return a budget of seconds and of samples that keeps the bar moving."""
+        self.budget = Budget(seconds, self.beat, samples)
+        return self.budget
 
     def end(self) -> None:
-        """Note where the search is at its end, the first time."""
-        if not self.ended:
-            self.ended, self.seconds = self.describe_place(), time.monotonic() - self.start
+        """Note where the search is at its end and what was spent, the first time."""
+        if self.ended:
+            return
+        self.ended = self.describe_place()
+        if self.budget is not None and self.budget.left_samples < 0:
+            size = write_number(THRESHOLD.search_samples / 1e6, 3)
+            self.spent = f"{size} million filtered samples, as many as it has without seconds="
+        else:
+            self.spent = f"{write_number(time.monotonic() - self.start, 2)} s"
 
     def close(self) -> None:
         """Remove the bar."""

@@ -294,6 +294,10 @@ class Thresholds:
         "effect: in none of the records looked at did a colour gain more",
         unit="of what an autoregression of the innovations gains",
     )  # fmt: skip
+    search_samples: float = declare_number(
+        2.5e8, cost="filtered samples after which a search without seconds= ends unfinished",
+        unit="samples",
+    )  # fmt: skip
     surely_needed: float = declare_number(
         100.0, cost="an effect so significant is not asked whether it is needed",
         unit="times the gate",

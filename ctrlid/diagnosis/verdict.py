@@ -127,7 +127,7 @@ def describe_grounds(stand_ins: Sequence[tuple[Finding, str]]) -> str | None:
     return ", and ".join(words) or None
 
 
-def declare_unfinished(found: Diagnosis, place: str, seconds: float) -> Diagnosis:
+def declare_unfinished(found: Diagnosis, place: str, spent: str) -> Diagnosis:
     """Return a diagnosis whose search was stopped, which claims no more than was checked.
 
     Parameters
@@ -136,8 +136,8 @@ def declare_unfinished(found: Diagnosis, place: str, seconds: float) -> Diagnosi
         The answer so far.
     place : str
         Where the search was, in words.
-    seconds : float
-        How long it had been going on [s].
+    spent : str
+        After how long or how much it was stopped, in words.
 
     Returns
     -------
@@ -152,7 +152,7 @@ def declare_unfinished(found: Diagnosis, place: str, seconds: float) -> Diagnosi
         f"So far the model lacks {join_names(found.findings)}" if named else "Nothing is named yet"
     )
     sentence = (
-        f"THE SEARCH WAS NOT FINISHED: it was stopped after {write_number(seconds, 2)} s "
+        f"THE SEARCH WAS NOT FINISHED: it was stopped after {spent} "
         f"({place}). {so_far}, and {left}. What was not tried may explain it better. Give the "
         "search more time, or fewer effects in catalogue=."
     )

@@ -120,7 +120,7 @@ def run_filter(
     if not white:
         lin, force = append_sensor_noise(lin, force, noise)
     states = lin.step.shape[1]
-    check_budget()
+    check_budget(len(lin.step))
     out = filter_pass(
         lin.step, lin.a, lin.b, lin.du, np.ascontiguousarray(lin.dp[:, :, :p]), lin.output,
         lin.c, np.ascontiguousarray(lin.hp[:, :p]), lin.trajectory.predicted,
@@ -176,7 +176,7 @@ def _run_several(
     restart[:, 0] = data.restart
     unsure = np.zeros((size, q))
     unsure[:, -1] = lin.input_variance
-    check_budget()
+    check_budget(size * q)
     error, variance, before, after, wide, slopes, disturbance = filter_pass(
         each.step, each.a, each.b, each.du, np.ascontiguousarray(each.dp[:, :, :p]),
         (lin.output / scale).ravel(), (lin.c / scale[:, None]).reshape(size * q, states),
