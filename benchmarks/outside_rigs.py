@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize
+from scipy.signal import lfilter
 
 PLANTS = ("ball", "drive", "pendulum", "spring")
 NOISES = ("white", "ar", "averaged", "walk", "pink", "t3", "outliers", "jitter", "converter")
@@ -584,6 +585,23 @@ def log_likelihoods(draw: Draw, columns: np.ndarray, sensor: bool) -> np.ndarray
             F10 * F10 * p0 + 2 * F10 * F11 * p1 + F11 * F11 * p2 + push * dt * dt,
         ])  # fmt: skip
     return np.where(np.isfinite(total), total, -1e12)
+
+
+def measure_visibility(draw: Draw) -> float:
+    """Return the share of the logged u that the stated law leaves, from its best initial state.
+
+    An integral takes a wrong constant over, and a limit that is never reached is none.
+    """
+    law = draw.rig.law
+    assert law is not None
+    size = max(len(law.num), len(law.den))
+    num, den = (np.pad(v, (0, size - len(v))) for v in (law.num, law.den))
+    own = lfilter(num, den, draw.r - draw.y)
+    states = np.eye(size - 1)
+    free = np.stack([lfilter(num, den, np.zeros(len(own)), zi=z)[0] for z in states], axis=1)
+    left = draw.u - law.bias - own
+    left = left - free @ np.linalg.lstsq(free, left, rcond=1e-12)[0]
+    return float(np.mean(left**2) / np.var(draw.u))
 
 
 def fit_filter(draw: Draw, sensor: bool, start: np.ndarray) -> tuple[float, np.ndarray]:

@@ -12,7 +12,7 @@ from ``outside_rigs.py``, a simulator that does not know ctrlid. The classes are
   plant``);
 - ``controller-gain`` and others: the law that is stated is not the one that ran (``--classes
   controller``), scored by the kinds of ``audit(record, loop)`` and by whether diagnose() blames the
-  plant.
+  plant. A fault counts where it leaves something of the logged u.
 
 Each draw becomes a line of JSON in ``--out``; draws that are there already are left out, so that a
 study that was interrupted goes on. ``--print FILE`` prints the table and the misses.
@@ -36,6 +36,7 @@ import outside_rigs as rigs
 
 import ctrlid as cid
 
+SEEN = 1e-6  # of the variance of u: from here on a fault of the controller is seen in it
 HIDDEN = 50.0  # of log-likelihood: from here on a sensor effect counts as hidden
 GROUPS = {
     "all": rigs.CLASSES,
@@ -110,6 +111,8 @@ def run(name: str, plant: str, seed: int, n: int, worth: bool = True) -> dict[st
              "law": rig.law.kind if rig.law else "", "force": rig.force > 0}  # fmt: skip
     if worth and name in rigs.SENSORS:
         line["worth"] = rigs.measure_worth(draw)
+    if name.startswith("controller-"):
+        line["visible"] = rigs.measure_visibility(draw)
     loop, record = make_loop(draw), make_record(draw)
     start = time.process_time()
     with warnings.catch_warnings():
@@ -172,14 +175,20 @@ def blames_the_plant(line: dict[str, Any]) -> bool:
     return any(not set(s) & set(NOT_THE_PLANT) for s in named(line, stand_ins=False))
 
 
+def is_fault_told(line: dict[str, Any]) -> bool:
+    """Whether the audit names the fault of the controller and no other; none where none is seen."""
+    fault = line["class"].removeprefix("controller-")
+    named = [kind for kind in line.get("audit", []) if kind in rigs.FAULTS]
+    return named == ([fault] if line.get("visible", 1.0) > SEEN else [])
+
+
 def is_right(line: dict[str, Any]) -> bool:
     """Whether the answer is the one that is right."""
     name = line["class"]
     if "error" in line:
         return False
     if name.startswith("controller-"):
-        kind = name.removeprefix("controller-")
-        return kind in line["audit"] and not blames_the_plant(line)
+        return is_fault_told(line) and not blames_the_plant(line)
     if is_hidden(line):
         return is_in_set(line) and len(named(line)) == 1
     return line["verdict"] == "nothing missing" and not named(line)
@@ -225,8 +234,11 @@ def write_table(lines: Sequence[dict[str, Any]]) -> str:
          share([any(NAMES[x["class"]] not in s for s in named(x)) for x in plant])),
     ]  # fmt: skip
     for fault in rigs.FAULTS:
-        own = [fault in x.get("audit", []) for x in laws if x["class"] == f"controller-{fault}"]
+        own = [is_fault_told(x) for x in laws
+               if x["class"] == f"controller-{fault}" and x.get("visible", 1.0) > SEEN]  # fmt: skip
         rows.append((f"wrong controller, {fault}: named right", "95 %", share(own)))
+    unseen = [is_fault_told(x) for x in laws if x.get("visible", 1.0) <= SEEN]
+    rows.append(("  fault that u does not show: none named", "", share(unseen)))
     rows.append(("  the plant blamed", "0.5 %", share([blames_the_plant(x) for x in laws])))
     seconds = [x["seconds"] for x in drawn if "seconds" in x]
     if seconds:

@@ -1,5 +1,6 @@
 """What is wrong with a stated controller, told from records of a simulator of its own."""
 
+import control as ct
 import numpy as np
 import pytest
 from scipy.linalg import expm
@@ -140,3 +141,157 @@ def test_a_cut_record_and_a_gap_do_not_blame_the_controller():
     valid[1000:1040], y[1000:1040] = False, 5.0
     gappy = cid.Record(r=record.r, u=record.u, y=y, dt=DT, valid=valid)
     assert name_faults(gappy, stated_loop()) == []
+
+
+# --- filters and other ways of sampling, of a PID and of a transfer function
+
+
+def record_filtered(fault, limit=np.inf, seed=0, n=1500, noise=1e-3):
+    """The mass under a PID with a filtered derivative; one filter or rule is not as stated."""
+    rng = np.random.default_rng([seed, 7])
+    whole = expm(DT * np.array([[0, 1, 0], [-3.0, -2.0, 1.0], [0, 0, 0]]))
+    r = np.repeat(rng.choice([-0.1, 0.1], n // 50 + 1), 50)[:n]
+    share, factor = rng.uniform(0.3, 0.8), rng.uniform(1.2, 1.8)
+    # Only a fast filter by Tustin's rule is not one by differences with another time constant.
+    time = 0.002 if fault == "tustin" else 0.02
+    kp, ki, kd = (k * (factor if fault == name else 1.0)
+                  for k, name in ((KP, "kp"), (KI, "ki"), (KD, "kd")))  # fmt: skip
+    kept = {"another time": factor * time, "no filter": 0.0}.get(fault, time)
+    x, u, y = np.zeros(2), np.zeros(n), np.zeros(n)
+    integral = slope = last = y_slow = e_slow = u_slow = 0.0
+    for j in range(n):
+        y[j] = x[0] + noise * rng.standard_normal()
+        y_slow += (share if fault == "y" else 1.0) * (y[j] - y_slow)
+        e_slow += (share if fault == "error" else 1.0) * (r[j] - y_slow - e_slow)
+        e, moved = e_slow, e_slow - last
+        last = e
+        if fault == "tustin":
+            slope = ((2 * time - DT) * slope + 2 * kd * moved) / (2 * time + DT)
+        else:
+            slope = (kept * slope + kd * moved) / (kept + DT)
+        wish = kp * e + integral + ki * DT * e + slope
+        cut = min(max(wish, -limit), limit)
+        if not ((wish > limit and e > 0) or (wish < -limit and e < 0)):
+            integral += ki * DT * e
+        u_slow += (share if fault == "output" else 1.0) * (cut - u_slow)
+        u[j] = u_slow
+        x = whole[:2, :2] @ x + whole[:2, 2] * u[j]
+    pid = cid.PID(KP, KI, KD, filter_time=time, lower=-limit, upper=limit)
+    loop = cid.Loop(cid.plants.servo(m=1.0, c=2.0, k=3.0), pid, dt=DT)
+    return cid.Record(r=r, u=u, y=y, dt=DT), loop
+
+
+@pytest.mark.parametrize(
+    ("fault", "kind", "words"),
+    [("y", "filter", "that of y behind"), ("error", "filter", "low-pass"),
+     ("output", "filter", "low-pass"), ("another time", "filter", "filter_time="),
+     ("no filter", "filter", "filter_time=0"), ("tustin", "filter", "Tustin"),
+     ("kp", "gain", "proportional"), ("ki", "gain", "integral"), ("kd", "gain", "derivative")],
+)  # fmt: skip
+def test_a_filter_or_one_gain_of_a_pid_is_named(fault, kind, words):
+    found = cid.audit(*record_filtered(fault)).harmful
+    assert [f.kind for f in found] == [kind]
+    assert words in found[0].text
+
+
+@pytest.mark.parametrize("fault", ["y", "error", "output", "another time", "kd"])
+def test_a_filter_is_named_beside_limits(fault):
+    found = cid.audit(*record_filtered(fault, limit=6.0)).harmful
+    assert [f.kind for f in found] == ["gain" if fault == "kd" else "filter"]
+
+
+def sample_lead(kp, kd, time, rule, dt):
+    """Numerator and denominator of (kp + kd s)/(1 + time s), sampled by a rule."""
+    if rule == "tustin":
+        h = 2 / dt
+        return [kp + kd * h, kp - kd * h], [1 + time * h, 1 - time * h]
+    if rule == "backward":
+        return [kp + kd / dt, -kd / dt], [1 + time / dt, -time / dt]
+    if rule == "forward":
+        return [kd / dt, kp - kd / dt], [time / dt, 1 - time / dt]
+    pole = np.exp(-dt / time)
+    high = kd / time
+    return [high, kp - pole * kp - high], [1.0, -pole]
+
+
+@pytest.mark.parametrize("ran", ["tustin", "backward", "forward", "zoh", "slower"])
+def test_another_rule_of_sampling_is_named(ran):
+    rng = np.random.default_rng(3)
+    n, time = 1200, 0.04
+    whole = expm(DT * np.array([[0, 1, 0], [-3.0, -2.0, 1.0], [0, 0, 0]]))
+    stated = "backward" if ran == "tustin" else "tustin"
+    num, den = (np.array(v) for v in (
+        sample_lead(KP, KD, 1.5 * time, "tustin", DT) if ran == "slower"
+        else sample_lead(KP, KD, time, ran, DT)))  # fmt: skip
+    r = np.repeat(rng.choice([-0.1, 0.1], n // 50 + 1), 50)[:n]
+    x, u, y, last, before = np.zeros(2), np.zeros(n), np.zeros(n), 0.0, 0.0
+    for j in range(n):
+        y[j] = x[0] + 1e-3 * rng.standard_normal()
+        e = r[j] - y[j]
+        u[j] = (num[0] * e + num[1] * last - den[1] * before) / den[0]
+        last, before = e, u[j]
+        x = whole[:2, :2] @ x + whole[:2, 2] * u[j]
+    law = ct.tf(*sample_lead(KP, KD, time, stated, DT), DT)
+    loop = cid.Loop(cid.plants.servo(m=1.0, c=2.0, k=3.0), law, dt=DT)
+    found = cid.audit(cid.Record(r=r, u=u, y=y, dt=DT), loop).harmful
+    assert [f.kind for f in found] == ["filter"]
+
+
+# --- an analog controller, of which the log has samples only
+
+
+def record_analog(fault="", noise=0.0, seed=0, n=1000, steps=10):
+    """The mass under an analog lead with one fault, both integrated between the samples."""
+    rng = np.random.default_rng([seed, 8])
+    time = 0.04
+    r = np.repeat(rng.choice([-0.1, 0.1], n // 50 + 1), 50)[:n]
+    factor = rng.choice([rng.uniform(0.5, 0.9), rng.uniform(1.1, 2.0)])
+    gain, bias = (factor if fault == "gain" else 1.0), (0.5 if fault == "bias" else 0.0)
+    slow = rng.uniform(1, 3) * DT
+
+    def compute_input(s, r):
+        e = r - s[0]
+        if fault == "unknown":
+            e += 30 * e * abs(e)
+        wish = gain * (KD / time * e + s[2]) + bias
+        lead = (-s[2] + (KP - KD / time) * e) / time
+        moved = (wish - s[3]) / slow
+        u = s[3] if fault == "filter" else wish
+        return (np.clip(u, -2.5, 2.5) if fault == "limit" else u), lead, moved
+
+    def differentiate(s, r):
+        u, lead, moved = compute_input(s, r)
+        return np.array([s[1], u - 2.0 * s[1] - 3.0 * s[0], lead, moved])
+
+    s, u, y, h = np.zeros(4), np.zeros(n), np.zeros(n), DT / steps
+    for j in range(n):
+        y[j], u[j] = s[0] + noise * rng.standard_normal(), compute_input(s, r[j])[0]
+        for _ in range(steps):
+            k1 = differentiate(s, r[j])
+            k2 = differentiate(s + h / 2 * k1, r[j])
+            k3 = differentiate(s + h / 2 * k2, r[j])
+            s = s + h / 6 * (k1 + 2 * k2 + 2 * k3 + differentiate(s + h * k3, r[j]))
+    u = {"sign": -u, "delay": np.r_[u[0], u[:-1]]}.get(fault, u)
+    loop = cid.Loop(cid.plants.servo(m=1.0, c=2.0, k=3.0), ct.tf([KD, KP], [time, 1.0]), dt=DT)
+    return cid.Record(r=r, u=u, y=y, dt=DT), loop
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-3])
+@pytest.mark.parametrize("fault", [*FAULTS, "filter"])
+def test_the_fault_of_an_analog_controller_is_named(fault, noise):
+    assert name_faults(*record_analog(fault, noise)) == [fault]
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-4, 1e-3])
+def test_an_analog_controller_stands(noise):
+    record, loop = record_analog("", noise)
+    assert name_faults(record, loop) == []
+    if not noise:
+        assert "as far as samples tell" in cid.audit(record, loop)["controller"][0].text
+
+
+def test_a_nonlinear_analog_controller_is_not_checked():
+    record, loop = record_analog()
+    law = ct.nlsys(None, lambda t, x, u, p: 30 * u[0], inputs=1, outputs=1, name="law")
+    nonlinear = cid.Loop(loop.plant, law, dt=DT)
+    assert name_faults(record, nonlinear) == []

@@ -5,7 +5,9 @@ from dataclasses import replace
 from typing import Any
 
 import casadi
+import control as ct
 import numpy as np
+from scipy import linalg
 
 from .._base.arguments import check_arguments
 from .._base.arrays import Array
@@ -14,6 +16,7 @@ from .._base.periods import have_same_period, write_both_periods, write_differen
 from .._base.rounding import keep_numpy_quiet
 from ..data.record import Record
 from ..data.several_records import order_model_and_data
+from ..physics.conversions import to_state_matrices
 from .loop import Loop
 from .wiring import knows_references, match_signals, stack_references
 
@@ -138,6 +141,54 @@ def replay_controller(loop: Loop, record: Record) -> Array:
     loop, record = order_model_and_data(loop, record)
     check_arguments(replay_controller, locals())
     return replay_from_best_state(loop, record)[0]
+
+
+def sample_analog_controller(loop: Loop, hold_r: str, hold_y: str) -> Loop | None:
+    r"""Return the loop with a digital controller that is its analog one at the samples.
+
+    A signal e that runs straight between samples moves the state x of the analog law by
+
+    .. math:: x_{k+1} = \Phi x_k + \Gamma_0 e_k + \Gamma_1 e_{k+1}
+
+    which :math:`x_k - \Gamma_1 e_k` turns into a law that knows nothing of the future; of a signal
+    that is held, :math:`\Gamma_1` is zero.
+
+    Parameters
+    ----------
+    loop : Loop
+        Loop with an analog controller.
+    hold_r, hold_y : {"zoh", "foh"}
+        How reference and output run between the samples.
+
+    Returns
+    -------
+    Loop or None
+        None where the controller is not linear.
+
+    References
+    ----------
+    Franklin, Powell and Workman, *Digital Control of Dynamic Systems*, section 4.3.2 (triangle
+    hold).
+    """
+    law = loop.controller
+    if isinstance(law, int | float | np.number):
+        law = ct.tf([float(law)], [1.0])
+    if not isinstance(law, ct.TransferFunction | ct.StateSpace):
+        return None
+    a, b, c, d = to_state_matrices(law)
+    if law.ninputs == 1:
+        b, d = np.hstack([b, -b]), np.hstack([d, -d])
+    elif list(law.input_labels) == ["y", "r"]:
+        b, d = b[:, ::-1], d[:, ::-1]
+    n, dt = len(a), loop.dt
+    # The input is a signal and its slope over the period.
+    block = np.zeros((n + 4, n + 4))
+    block[:n, :n], block[:n, n : n + 2], block[n : n + 2, n + 2 :] = a, b, np.eye(2) / dt
+    whole = linalg.expm(dt * block)
+    phi, held, slope = whole[:n, :n], whole[:n, n : n + 2], whole[:n, n + 2 :]
+    slope = slope * [hold == "foh" for hold in (hold_r, hold_y)]
+    sampled = ct.ss(phi, held - slope + phi @ slope, c, d + c @ slope, dt, inputs=["r", "y"])
+    return replace(loop, controller=sampled)
 
 
 def replay_from_best_state(loop: Loop, record: Record) -> tuple[Array, Array]:

@@ -1,36 +1,40 @@
 """Whether a logged u is what the controller computes from the logged r and y; if not, why."""
 
-from collections.abc import Iterator
+from collections.abc import Callable
 from dataclasses import replace
-from itertools import product
-from typing import Any, get_args
+from typing import Any
 
-import control as ct
 import numpy as np
-from scipy import optimize, stats
+from scipy import stats
 
 from .._base.errors import CtrlidError
+from .._base.periods import have_same_period
 from .._base.statistics import regress
 from .._base.text import write_percent
 from ..data.record import Record
 from ..data.validity import find_longest_run, find_whole_past
-from ..loop.controller_replay import differentiate_replay, replay_controller, replay_from_best_state
-from ..loop.controllers import PID, AntiWindup, Derivative, Integral
+from ..loop.controller_replay import (
+    differentiate_replay,
+    replay_controller,
+    replay_from_best_state,
+    sample_analog_controller,
+)
+from ..loop.controllers import PID
 from ..loop.loop import Loop
-from ..loop.wiring import knows_references, match_signals
+from .controller_changes import DETERMINED, TRIAL, list_changes
 from .residual_tests import compute_explained_share
 from .signal_defects import find_grid_step
 
 # At most so many samples are replayed, which tell enough and take seconds.
 MOST = 20_000
-# Each shift of a channel is tried on so many samples only, to save time.
-TRIAL = 4000
 # Fewer samples do not tell whether a controller computed the input.
 FEWEST = 20
 # A channel may have been logged so many samples late, or early if negative.
 STEPS = (1, -1, 2, -2, 3, -3)
 # Rounding and printing leave at most this share of u's variance.
 EXACT = 1e-6
+# Between samples that are held or straight, so much of the difference is not resolved.
+UNRESOLVED = 0.5
 # A shift is believed if it leaves less than this share of what was unexplained.
 CLEARLY = 0.1
 # Where the past of an added signal tells it exactly, it follows r and y above this share.
@@ -41,14 +45,8 @@ LEVEL = 1e-3
 MEMORY = 10
 # Below this share of its variance the remainder of a regression is rounding of the computer.
 ROUNDING = 1e-12
-# Time constants of a derivative's filter from which the search starts, in sampling periods.
-FILTER_TIMES = (0.0, 1.0, 3.0, 10.0, 30.0)
-# The search goes on where one of them leaves at most this share of what was unexplained.
-PROMISING = 0.5
 # Changes of a law are put out by so many samples, most of them at once.
 BEGINNING = 1000
-# Directions below this share of the largest are not in a regression's data.
-DETERMINED = 1e-10
 # A remainder of no known kind below this share of u's variance steers no simulation.
 IMMATERIAL = 0.01
 # Kinds of finding after which the stated law is not that of the record.
@@ -61,7 +59,10 @@ Fact = tuple[str, str, float, bool]
 
 
 def check_controller(loop: Loop, record: Record) -> list[Fact]:
-    """Compare the logged input with a replay of the loop's digital controller.
+    """Compare the logged input with a replay of the loop's controller.
+
+    Of an analog controller, the log has r and y at the samples only. What it leaves of u is no more
+    than the log resolves where it is less than what another run of y between the samples would do.
 
     Parameters
     ----------
@@ -74,17 +75,22 @@ def check_controller(loop: Loop, record: Record) -> list[Fact]:
     -------
     list of (str, str, float, bool)
         Kind, words, share of u that the controller does not explain, and whether it is harmful;
-        empty if there is no digital controller, no reference, or too little to compare.
+        empty if there is no controller, a nonlinear analog one, no reference, or too little to
+        compare.
     """
     law = loop.law()
-    if law is None or law.dt == 0.0 or not knows_references(loop.wiring, record):
+    if law is None or record.r is None:
         return []
-    if loop.wiring is not None and (record.r is None or not loop.equations().siso):
-        return _check_wired_controller(loop, record)
     first = int(np.argmax(record.valid))
     if record.n - first < FEWEST:
         return []
     part = record[first : first + MOST]
+    resolution, sample = 0.0, None
+    if law.dt == 0.0:
+        sampled = _sample_analog_law(loop, part)
+        if sampled is None:
+            return []
+        loop, resolution, sample = sampled
     facts: list[Fact] = []
     lower, upper = loop.input_limits
     slack = 1e-6 * (float(np.ptp(part.u)) + 1e-300)
@@ -100,10 +106,14 @@ def check_controller(loop: Loop, record: Record) -> list[Fact]:
     except CtrlidError as reason:  # The audit prints a refusal among its facts.
         return [*facts, ("refused", "u cannot be computed with the controller of the loop: "
                          f"{reason}.", 1.0, True)]  # fmt: skip
-    if _is_rounding(e, left, part):
+    if _is_rounding(e, left, part, resolution):
         constant = _read_constant(loop, part)
         if constant:
             return [*facts, _report_bias(constant, left)]
+        if resolution:
+            return [*facts, ("exact", "the logged u is what the analog controller of the loop "
+                             "computes from r and y, as far as samples tell.", left,
+                             False)]  # fmt: skip
         return [*facts, ("exact", "the logged u is exactly what the controller of the loop "
                          "computes from r and y.", left, False)]  # fmt: skip
     shift = _find_shift(loop, part, left)
@@ -115,122 +125,14 @@ def check_controller(loop: Loop, record: Record) -> list[Fact]:
                       "back before fitting.", left, True))  # fmt: skip
         part = moved
         e, left = _compute_remainder(loop, part)
-        if _is_rounding(e, left, part):
+        if _is_rounding(e, left, part, resolution):
             return facts
-    stated = _explain_remainder(loop, e, left, part)
+    stated = _explain_remainder(loop, e, left, part, resolution)
     # Another form of a derivative adds a function of r, and only its exact replay tells it.
-    exact_only = stated[0] == "injected"
+    exact_only = stated[0] == "injected" and not resolution
     if stated[0] == "bias":
         return [*facts, stated]
-    return [*facts, _find_wrong_law(loop, part, left, exact_only) or stated]
-
-
-def _check_wired_controller(loop: Loop, record: Record) -> list[Fact]:
-    """Compare each logged input with what a controller of several signals computes.
-
-    Of a wrong law it is told that it is wrong, or that a channel is late or a constant is added.
-    """
-    e = loop.equations()
-    record = record if e.siso else match_signals(record, e)
-    first = int(np.argmax(record.valid_samples))
-    if record.n - first < FEWEST:
-        return []
-    part, facts = record[first : first + MOST], list[Fact]()
-    names, inputs = e.inputs, np.reshape(part.u, (len(e.inputs), -1))
-    try:
-        left, share = _compute_remainder(loop, part)
-        rows = np.reshape(left, inputs.shape)
-        whole = all(_is_rounding_of(row, u, part) for row, u in zip(rows, inputs, strict=True))
-        shift = None if whole else _find_shift(loop, part, share)
-    except CtrlidError as reason:  # The audit prints a refusal among its facts.
-        return [("refused", "u cannot be computed with the controller of the loop: "
-                 f"{reason}.", 1.0, True)]  # fmt: skip
-    if whole:
-        return [("exact", "the logged u is exactly what the controller of the loop computes from "
-                 "the logged signals.", share, False)]  # fmt: skip
-    if shift is not None:
-        words, moved, remains = shift
-        facts.append(("delay", f"{words}: the controller of the loop explains "
-                      f"{write_percent(1 - share, 4)} of the variance of u as logged, and "
-                      f"{write_percent(1 - remains, 4)} with this shift removed. Shift the "
-                      "channels back before fitting.", share, True))  # fmt: skip
-        part = moved
-        rows = np.reshape(_compute_remainder(loop, part)[0], (len(names), -1))
-        inputs = np.reshape(part.u, rows.shape)
-    for name, row, u in zip(names, rows, inputs, strict=True):
-        if not _is_rounding_of(row, u, part):
-            facts.append(_explain_row(loop, name, row, u, part))
-    return facts
-
-
-def _is_rounding_of(e: Any, u: Any, record: Record) -> bool:
-    """Tell whether what is left of one input is no more than the rounding of its log."""
-    use = record.valid_samples
-    step = find_grid_step(u[use])
-    small = float(np.mean(e[use] ** 2)) <= EXACT * max(float(np.var(u[use])), 1e-300)
-    return small or (bool(step) and float(np.max(np.abs(e[use]))) <= 0.51 * step)
-
-
-def _explain_row(loop: Loop, name: str, e: Any, u: Any, record: Record) -> Fact:
-    """Say what the part of one of several inputs is that does not come from the controller."""
-    use = record.valid_samples
-    share = float(np.mean(e[use] ** 2)) / max(float(np.var(u[use])), 1e-300)
-    rms = f"{float(np.sqrt(np.mean(e[use] ** 2))):.3g}"
-    if float(np.ptp(e[use])) <= 1e-6 * float(np.ptp(u[use])):
-        return ("bias", f"{name} is the output of the controller of the loop plus a constant of "
-                f"{float(np.mean(e[use])):.4g}. Correct the bias of the controller or the input of "
-                "the operating point.", share, True)  # fmt: skip
-    lower, upper = (np.broadcast_to(v, len(loop.equations().inputs))
-                    for v in loop.input_limits)  # fmt: skip
-    k = loop.equations().inputs.index(name)
-    ys = np.reshape(record.y, (-1, record.n))
-    rs = np.zeros((0, record.n)) if record.r is None else np.reshape(record.r, (-1, record.n))
-    inner = use & (u > lower[k]) & (u < upper[k])
-    if _is_row_independent(e, u - e, ys, rs, inner, use):
-        return ("injected", f"in addition to the output of the controller, {name} contains a "
-                f"signal of RMS {rms} that does not depend on the outputs: excitation, dither or "
-                "rounding.", share, False)  # fmt: skip
-    return ("unknown", "the controller of the loop does not explain "
-            f"{write_percent(min(share, 1.0), 3)} of the variance of {name} (RMS {rms}), and this "
-            "part depends on the outputs: the true controller has other gains or another "
-            "structure. Correct the controller, or give None.", share, True)  # fmt: skip
-
-
-def _is_row_independent(e: Any, law: Any, ys: Any, rs: Any, inner: Any, use: Any) -> bool:
-    """Test whether a remainder is independent of all outputs up to now; see `_is_independent`.
-
-    Of what the law itself made of them it is asked alone, too, which tells another gain best.
-    """
-    moves = use[1:] & use[:-1] & (np.abs(np.diff(ys[0])) > 1e-6 * np.ptp(ys[0][use]))
-    held = np.abs(np.diff(e)) <= 1e-6 * np.ptp(e[use])
-    if moves.any() and np.mean(held[moves]) > 0.5:
-        return True
-    rows = np.flatnonzero(find_whole_past(use, MEMORY) & inner)
-    lags = range(MEMORY + 1)
-
-    def follows() -> bool:
-        moving = [(s, 0) for s in (*ys, *rs) if np.ptp(s[use]) > 0]
-        return compute_explained_share(np.where(use, e, 0.0), moving, use, lags=MEMORY) > FOLLOWS
-
-    if len(rows) <= 4 * ((1 + len(ys) + len(rs)) * MEMORY + 3):
-        return not follows()
-
-    def scale(v: Any) -> Any:
-        return (v - np.mean(v[use])) / max(float(np.std(v[use])), 1e-300)
-
-    e, ys, rs = scale(e), [scale(v) for v in ys], [scale(v) for v in rs]
-    own = np.column_stack([np.ones(len(rows)), *(e[rows - k] for k in lags[1:]),
-                           *(r[rows - k] for r in rs for k in lags)])  # fmt: skip
-    without, few = _regress(own, e[rows])
-    if without <= ROUNDING * len(rows):
-        return not follows()
-    chances = [1.0]
-    for more in ([y[rows - k] for y in ys for k in lags], [scale(law)[rows]]):
-        left, many = _regress(np.column_stack([own, *more]), e[rows])
-        if many > few:
-            ratio = (without - left) / (many - few) / max(left / (len(rows) - many), 1e-300)
-            chances.append(float(stats.f.sf(ratio, many - few, len(rows) - many)))
-    return bool(min(chances) >= LEVEL / 2)
+    return [*facts, _find_wrong_law(loop, part, left, exact_only, resolution, sample) or stated]
 
 
 def find_rejection(loop: Loop, record: Record) -> str:
@@ -252,31 +154,61 @@ def _compute_remainder(loop: Loop, record: Record) -> tuple[Any, float]:
     Samples that do not count leave the state of the controller unknown, so that each stretch is
     replayed from its own best state. What is too short to tell it leaves nothing.
     """
-    e, counts = np.zeros(np.shape(record.u)), np.zeros(record.n, bool)
+    e, counts = np.zeros(record.n), np.zeros(record.n, bool)
     long = [(a, b) for a, b in record.segments() if b - a >= FEWEST]
     for a, b in long or [(0, record.n)]:
-        e[..., a:b] = record.u[..., a:b] - replay_controller(loop, record[a:b])
+        e[a:b] = record.u[a:b] - replay_controller(loop, record[a:b])
         counts[a:b] = True
-    if e.ndim == 2:
-        shares = [float(np.mean(row[counts] ** 2)) / max(float(np.var(u[counts])), 1e-300)
-                  for row, u in zip(e, record.u, strict=True)]  # fmt: skip
-        return e, max(shares)
     spread = float(np.var(record.u[counts]))
     return e, float(np.mean(e[counts] ** 2)) / max(spread, 1e-300)
 
 
-def _is_rounding(e: Any, left: float, record: Record) -> bool:
+def _sample_analog_law(
+    loop: Loop, record: Record
+) -> tuple[Loop, float, Callable[[Any], Loop | None]] | None:
+    """Return the loop with its analog controller at the samples, and the share of u they resolve.
+
+    y is taken as held or as straight, whichever is nearer to u by some factor and constant; half
+    of what is between them is not resolved. Last comes a function of an analog filter that gives
+    such a loop with the filter in it.
+    """
+    part = record[find_longest_run(record.valid)][:TRIAL]
+    runs = []
+    for hold in ("foh", "zoh"):
+        sampled = sample_analog_controller(loop, record.hold_r, hold)
+        if sampled is None:
+            return None
+        free = replace(sampled, input_limits=(-np.inf, np.inf))
+        if not have_same_period(loop.dt, record.dt):
+            return sampled, EXACT, lambda _: None  # The replay refuses it in words.
+        output, responses, rest = differentiate_replay(free, part)
+        table = np.column_stack([output - rest, np.ones(part.n), responses])
+        left = part.u - table @ regress(table, part.u, DETERMINED)
+        runs.append((float(np.mean(left**2)), hold, sampled, output))
+    spread = float(np.var(runs[0][3] - runs[1][3])) / max(float(np.var(part.u)), 1e-300)
+    _, hold, best, _ = min(runs, key=lambda run: run[0])
+
+    def sample(factor: Any) -> Loop | None:
+        changed = replace(loop, controller=factor * loop.controller)
+        return sample_analog_controller(changed, record.hold_r, hold)
+
+    return best, max(EXACT, UNRESOLVED**2 * spread), sample
+
+
+def _is_rounding(e: Any, left: float, record: Record, resolution: float = 0.0) -> bool:
     """Tell whether a remainder is no more than the rounding of the logged u."""
     step = find_grid_step(record.u[record.valid])
-    return left <= EXACT or (bool(step) and float(np.max(np.abs(e))) <= 0.51 * step)
+    return left <= max(EXACT, resolution) or (
+        bool(step) and float(np.max(np.abs(e))) <= 0.51 * step
+    )
 
 
 def _shift_channels(record: Record, u: int, y: int) -> Record:
     """Return the record with u and y taken so many samples later than r."""
     a, b = max(0, -u, -y), record.n - max(0, u, y)
-    cut, valid = record[a:b], record.valid
-    return replace(cut, u=record.u[..., a + u : b + u], y=record.y[..., a + y : b + y],
-                   valid=valid[..., a + u : b + u] & valid[..., a + y : b + y])  # fmt: skip
+    cut = record[a:b]
+    return replace(cut, u=record.u[a + u : b + u], y=record.y[a + y : b + y],
+                   valid=record.valid[a + u : b + u] & record.valid[a + y : b + y])  # fmt: skip
 
 
 def _find_shift(loop: Loop, record: Record, left: float) -> tuple[str, Record, float] | None:
@@ -307,7 +239,7 @@ def _spell_samples(k: int) -> str:
     return f"{('one', 'two', 'three')[k - 1]} sample{'s' if k > 1 else ''}"
 
 
-def _explain_remainder(loop: Loop, e: Any, left: float, record: Record) -> Fact:
+def _explain_remainder(loop: Loop, e: Any, left: float, record: Record, resolution: float) -> Fact:
     """Say what the part of u is that does not come from the controller."""
     assert record.r is not None
     unit = record.units.get("u", "")
@@ -323,7 +255,7 @@ def _explain_remainder(loop: Loop, e: Any, left: float, record: Record) -> Fact:
                     False)  # fmt: skip
     if float(np.ptp(e[record.valid])) <= 1e-6 * float(np.ptp(record.u[record.valid])):
         return _report_bias(float(np.mean(e[record.valid])), left)
-    if not _is_independent(loop, e, record):
+    if not _is_added(loop, e, left, record, resolution):
         share = f"{write_percent(left, 3)} of the variance of u" if left < 1 else "u"
         return ("unknown", f"the controller of the loop does not explain {share} (RMS {rms}), and "
                 "this part depends on y: the true controller has "
@@ -392,6 +324,19 @@ def _regress(table: Any, goal: Any) -> tuple[float, int]:
     return float(np.sum((goal - table @ solution) ** 2)), int(rank)
 
 
+def _is_added(loop: Loop, e: Any, left: float, record: Record, resolution: float) -> bool:
+    """Tell whether a remainder is a signal that was added to what the law computes.
+
+    An analog controller does not see the noise of the logger, which its replay amplifies, so that
+    only what follows the reference beyond the resolution speaks against its law.
+    """
+    if not resolution:
+        return _is_independent(loop, e, record)
+    assert record.r is not None
+    share = compute_explained_share(e, [(record.r, 0)], record.valid, lags=4 * MEMORY)
+    return share <= FOLLOWS or share * left <= resolution
+
+
 def _follows(e: Any, record: Record) -> bool:
     """Tell whether a remainder follows r and y where its own past leaves nothing to be tested."""
     channels = [s for s in (record.y, record.r) if s is not None]
@@ -399,152 +344,28 @@ def _follows(e: Any, record: Record) -> bool:
     return compute_explained_share(e, moving, record.valid, lags=MEMORY) > FOLLOWS
 
 
-def _find_wrong_law(loop: Loop, record: Record, left: float, exact_only: bool) -> Fact | None:
+def _find_wrong_law(
+    loop: Loop, record: Record, left: float, exact_only: bool, resolution: float, sample: Any
+) -> Fact | None:
     """Return which single change of the stated law leaves only rounding or an added signal."""
-    beginning = record[:BEGINNING]
-    most = CLEARLY * max(_compute_remainder(loop, beginning)[1], left)
-    for kind, words, changed in _list_changes(loop, record):
-        if _compute_remainder(changed, beginning)[1] > most:
+    most = CLEARLY * max(_compute_remainder(loop, record[:BEGINNING])[1], left)
+    for change in list_changes(loop, record, sample):
+        try:
+            if not _compute_remainder(change.loop, change.record[:BEGINNING])[1] <= most:
+                continue
+            e, remains = _compute_remainder(change.loop, change.record)
+        except CtrlidError:
+            # A law that cannot run is no candidate.
             continue
-        e, remains = _compute_remainder(changed, record)
-        if remains > CLEARLY * left:
+        if not remains <= CLEARLY * left:
             continue
-        if _is_rounding(e, remains, record) or (
-            not exact_only and _is_independent(changed, e, record)
+        if _is_rounding(e, remains, change.record, resolution) or (
+            not (exact_only or change.exact)
+            and _is_added(change.loop, e, remains, change.record, resolution)
         ):
-            text = (f"u is not what the controller of the loop computes from r and y, but {words}: "
-                    f"what remains unexplained falls from {100 * left:.3g} to {100 * remains:.3g} "
-                    "% of the variance of u. Correct the controller.")  # fmt: skip
-            return kind, text, left, True
-    return None
-
-
-def _list_changes(loop: Loop, record: Record) -> Iterator[tuple[str, str, Loop]]:
-    """Yield the changes of a law that are tried, each as its kind, its words and the loop."""
-    gain = _estimate_gain(loop, record)
-    if gain is not None:
-        yield from _list_gains(loop, *gain)
-    u = record.u[record.valid]
-    ends = [float(end) if np.count_nonzero(u == end) > 2 else side * np.inf
-            for end, side in ((np.min(u), -1), (np.max(u), 1))]  # fmt: skip
-    if np.isfinite(ends).any() and ends[0] < ends[1]:
-        low, high = ends
-        words = f"it is limited to {low:.4g} to {high:.4g}"
-        yield "limit", words, replace(loop, input_limits=(low, high))
-        if isinstance(loop.controller, PID):
-            yield (
-                "limit",
-                words,
-                replace(loop, controller=replace(loop.controller, lower=low, upper=high)),
-            )
-    pid = loop.controller
-    if not isinstance(pid, PID):
-        return
-    if np.isfinite([pid.lower, pid.upper]).any():
-        yield ("limit", "without the limits of the controller", replace(
-            loop, controller=replace(pid, lower=-np.inf, upper=np.inf)))  # fmt: skip
-    yield from _list_options(loop, pid)
-    yield from _fit_filter_time(loop, pid, record[:BEGINNING])
-
-
-def _list_options(loop: Loop, pid: PID) -> Iterator[tuple[str, str, Loop]]:
-    """Yield the other forms of a PID that there are, those with the fewest changes first."""
-    limited = np.isfinite([pid.lower, pid.upper]).any()
-    tracking = pid.tracking_time or (pid.kp / pid.ki if pid.ki else 1.0)
-    # With a negative time constant the integrator would run away: no such controller exists.
-    windups = [w for w in get_args(AntiWindup) if w != "back-calculation" or tracking > 0]
-    choices: dict[str, list[Any]] = {
-        "derivative": [*get_args(Derivative)] if pid.kd and pid.c in (0, 1) else [],
-        "integral": [*get_args(Integral)] if pid.ki else [],
-        "b": [0.0, 1.0],
-        "anti_windup": windups if pid.ki and limited else [],
-    }
-    stated = {name: getattr(pid, name) for name in choices}
-    made = [dict(zip(choices, values, strict=True)) for values in product(
-        *({stated[name], *choices[name]} for name in choices))]  # fmt: skip
-    changes = [{k: v for k, v in one.items() if v != stated[k]} for one in made]
-    for change in sorted(changes, key=lambda c: (len(c), str(c))):
-        if change:
-            kind = "limit" if "anti_windup" in change else "filter"
-            yield kind, _write_options(change), replace(loop, controller=replace(pid, **change))
-
-
-def _fit_filter_time(loop: Loop, pid: PID, record: Record) -> Iterator[tuple[str, str, Loop]]:
-    """Yield the law with the time constant of the derivative's filter that explains u best."""
-    if not pid.kd:
-        return
-
-    def explain(time: float, change: dict[str, Any]) -> float:
-        other = replace(pid, filter_time=float(time), **change)
-        return _compute_remainder(replace(loop, controller=other), record)[1]
-
-    stated = _compute_remainder(loop, record)[1]
-    changes: list[dict[str, Any]] = [{}]
-    if pid.derivative == "error" and pid.c in (0, 1):
-        changes.append({"derivative": "measurement"})
-    for change in changes:
-        grid = [k * loop.dt for k in FILTER_TIMES]
-        left = [explain(time, change) for time in grid]
-        if min(left) > PROMISING * stated:
-            continue
-        best = int(np.argmin(left))
-        ends = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
-        found = optimize.minimize_scalar(explain, bounds=ends, method="bounded", args=(change,),
-                                         options={"xatol": 1e-6 * loop.dt})  # fmt: skip
-        other = replace(pid, filter_time=float(found.x), **change)
-        words = _write_options({"filter_time": float(f"{found.x:.4g}"), **change})
-        yield "filter", words, replace(loop, controller=other)
-
-
-def _write_options(change: dict[str, Any]) -> str:
-    return "with " + " and ".join(f"{name}={value!r}" for name, value in change.items())
-
-
-def _list_gains(
-    loop: Loop, constant: float, factor: float, beside: float
-) -> Iterator[tuple[str, str, Loop]]:
-    """Yield a law about another constant, and so many times the law beside its own constant."""
-    if shifted := _scale_controller(loop, 1.0, constant):
-        yield "bias", f"that about a constant of {constant:.4g}", shifted
-    if factor == 0.0 or not (scaled := _scale_controller(loop, factor, beside)):
-        return
-    words = f"{factor:.4g} times that"
-    if factor < 0:
-        words = ("has the opposite sign" if abs(factor + 1) < 1e-3
-                 else f"has the opposite sign and {-factor:.4g} times the size")  # fmt: skip
-    yield ("sign" if factor < 0 else "gain"), words, scaled
-
-
-def _estimate_gain(loop: Loop, record: Record) -> tuple[float, float, float] | None:
-    """Return the constant between u and the unlimited output of the controller, and its factor.
-
-    First the constant beside a factor of one, then factor and constant together. Both are read from
-    the longest stretch with the controller's unknown state: the state adds its own slow response,
-    which an alternating solution would share out wrongly.
-    """
-    part = record[find_longest_run(record.valid)][:TRIAL]
-    free = replace(loop, input_limits=(-np.inf, np.inf))
-    if isinstance(free.controller, PID):
-        free = replace(free, controller=replace(free.controller, lower=-np.inf, upper=np.inf))
-    output, responses, rest = differentiate_replay(free, part)
-    inner = (part.u > np.min(part.u)) & (part.u < np.max(part.u))
-    table = np.column_stack([output - rest, np.ones(part.n), responses])[inner]
-    if len(table) <= 2 * table.shape[1]:
-        return None
-    goal = part.u[inner]
-    constant = regress(table[:, 1:], goal - table[:, 0], DETERMINED)[0]
-    factor, beside = regress(table, goal, DETERMINED)[:2]
-    return float(constant), float(factor), float(beside)
-
-
-def _scale_controller(loop: Loop, factor: float, constant: float) -> Loop | None:
-    """Return the loop with so many times its controller, about another constant input."""
-    controller = loop.controller
-    if isinstance(controller, PID):
-        other = replace(controller, kp=factor * controller.kp, ki=factor * controller.ki,
-                        kd=factor * controller.kd, bias=constant)  # fmt: skip
-        return replace(loop, controller=other)
-    if isinstance(controller, ct.TransferFunction | ct.StateSpace | int | float):
-        return replace(loop, controller=factor * controller,
-                       at=replace(loop.point, input=constant))  # fmt: skip
+            text = (f"u is not what the controller of the loop computes from r and y, but "
+                    f"{change.words}: what remains unexplained falls from {100 * left:.3g} to "
+                    f"{100 * remains:.3g} % of the variance of u. Correct the controller."
+                    )  # fmt: skip
+            return change.kind, text, left, True
     return None

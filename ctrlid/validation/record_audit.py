@@ -131,8 +131,10 @@ def audit(record: Record, loop: Loop | None = None) -> Audit:
     record : Record
         The record. Record and loop may change places.
     loop : Loop, optional
-        The loop it comes from. If its controller is digital and r was logged, it is also checked
-        whether the logged u is what this controller computes, and if not, why.
+        The loop it comes from. If it has a controller and r was logged, it is also checked
+        whether the logged u is what this controller computes, and if not, why: another gain, sign,
+        constant, limit or filter, or a sample of delay. Of an analog controller only linear ones
+        are checked, as far as the samples tell how y runs between them.
 
     Returns
     -------
