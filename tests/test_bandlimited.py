@@ -10,6 +10,7 @@ import control as ct
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.linalg import expm
 
 import ctrlid as cid
 from ctrlid import effects as E
@@ -210,3 +211,29 @@ def test_an_audit_and_a_fit_speak_of_an_unknown_analog_controller():
     assert not cid.audit(record, loop)["between samples"]
     notes = [cid.fit_loop(one, record).estimate.notes for one in (unknown, loop)]
     assert [any("MOVES BETWEEN THE SAMPLES" in n for n in each) for each in notes] == [True, False]
+
+
+def test_undeclared_feedback_is_warned_of_with_the_size_of_the_bias():
+    rng = np.random.default_rng(0)
+    n, dt = 1500, 0.02
+    whole = expm(dt * np.array([[0, 1, 0], [0, -2.0, 3.0], [0, 0, 0]]))
+    r = np.repeat(rng.choice([-0.1, 0.1], n // 25), 25)
+    x, u, y, last = np.zeros(2), np.zeros(n), np.zeros(n), 0.0
+    for j in range(n):
+        y[j] = x[0] + 1e-3 * rng.standard_normal()
+        u[j] = 20 * (r[j] - y[j]) + 60 * (r[j] - y[j] - last)
+        last = r[j] - y[j]
+        x = whole[:2, :2] @ x + whole[:2, 2] * u[j]
+    record = cid.Record(u=u, y=y, dt=dt, hold="bandlimited")
+    loop = cid.Loop(cid.plants.servo(m=1.0, c=2.0, k=3.0), dt=dt, free=("c",))
+    (found,) = cid.audit(record, loop)["between samples"]
+    biased, held = (cid.fit_loop(loop, replace(record, hold=hold)).estimate.values[0]
+                    for hold in ("bandlimited", "zoh"))  # fmt: skip
+    assert found.harmful
+    assert found.size == pytest.approx(abs(biased / held - 1), rel=0.3)
+    assert "c by" in found.text
+    assert abs(held - biased) > 2 * abs(held - 2.0)
+    assert "reconstructs u between the samples from later ones" in found.text
+    (alone,) = cid.audit(record)["between samples"]
+    assert alone.harmful
+    assert "a fit is biased. Give" in alone.text

@@ -12,6 +12,7 @@ from ..data.several_records import VISIBLE_MOTION, measure_input_motion
 from ..data.validity import find_longest_run
 from ..estimation.likelihood.likelihood import make_problem
 from ..estimation.likelihood.maximization import begin_fit, maximize
+from ..estimation.likelihood.physics_fit import fit_loop
 from ..loop.loop import Loop
 from .feedback_check import FEWEST, ORDER, check_feedback, compute_residual
 
@@ -25,8 +26,9 @@ WORDS = {"zoh": "held", "foh": "straight", "bandlimited": "band-limited"}
 def check_hold(record: Record, loop: Loop | None) -> tuple[str, float, bool] | None:
     """Return what to say of the input between the samples: text, size and whether it harms.
 
-    Of an input that is not held, the sample at the same time takes part in y. Which way it runs is
-    told by the likelihood of the loop with each of them.
+    A band-limited input that reacts to y is reconstructed from samples that contain the noise to be
+    predicted. Of an input that is not held, the sample at the same time takes part in y. Which way
+    it runs is told by the likelihood of the loop with each of them.
 
     Parameters
     ----------
@@ -38,8 +40,9 @@ def check_hold(record: Record, loop: Loop | None) -> tuple[str, float, bool] | N
     Returns
     -------
     tuple or None
-        The size is the gain of log-likelihood, or what u moves from sample to sample as a share of
-        its standard deviation. None where the record is too short or gives no reason to speak.
+        The size is the gain of log-likelihood, what u moves from sample to sample as a share of
+        its standard deviation, or the bias as a share of a free parameter. None where the record is
+        too short or gives no reason to speak.
     """
     if loop is not None and loop.controller is not None:
         return None
@@ -48,7 +51,10 @@ def check_hold(record: Record, loop: Loop | None) -> tuple[str, float, bool] | N
     ):
         return None
     part = record[find_longest_run(record.valid)][:ENOUGH]
-    if check_feedback(record).closed_loop:
+    feedback = check_feedback(record)
+    if feedback.closed_loop and record.hold == "bandlimited":
+        return _warn_of_later_samples(part, loop, float(np.max(np.abs(feedback.correlation))))
+    if feedback.closed_loop:
         moves = measure_input_motion([record])
         if moves <= VISIBLE_MOTION:
             return None
@@ -85,6 +91,41 @@ def check_hold(record: Record, loop: Loop | None) -> tuple[str, float, bool] | N
         f"depend on that: give it hold={best!r}, as in dataclasses.replace(record, hold={best!r}).",
         likely[best] - likely.get(record.hold, max(rest)), True,
     )  # fmt: skip
+
+
+def _warn_of_later_samples(
+    part: Record, loop: Loop | None, correlation: float
+) -> tuple[str, float, bool]:
+    """Return what a band-limited input does to a fit under feedback, with the size of the bias.
+
+    The parameters are fitted with each hold. Those that use no sample of u after the interval err
+    by how u runs within a sample, which is less than what the noise of y in later samples does.
+    """
+    text = ("u reacts to y (correlation of its innovations with those of y "
+            f"{correlation:.2g}), and hold='bandlimited' reconstructs u between the samples from "
+            "later ones, which contain the noise of y: a fit is biased")  # fmt: skip
+    cure = ("Give the loop its controller, or the record hold='zoh' for a digital controller or "
+            "hold='foh' for an analog one.")  # fmt: skip
+    size, which = correlation, ""
+    if loop is not None and loop.free:
+        fits = {}
+        for hold in get_args(Hold):
+            try:
+                fits[hold] = fit_loop(loop, replace(part, hold=hold)).estimate
+            except ModelCannotRun:
+                continue
+        others = [hold for hold in fits if hold != "bandlimited"]
+        if "bandlimited" in fits and others:
+            hold = max(others, key=lambda hold: fits[hold].log_likelihood)
+            ours, theirs = fits["bandlimited"].values, fits[hold].values
+            shares = np.abs(ours - theirs) / np.maximum(np.abs(theirs), 1e-300)
+            k = int(np.argmax(shares))
+            size = float(shares[k])
+            errors = abs(float(ours[k] - theirs[k])) / float(fits[hold].standard_errors[k])
+            which = (f", here {fits[hold].names[k]} by {100 * size:.2g} %, from {theirs[k]:.4g} "
+                     f"with hold={hold!r} to {ours[k]:.4g}, or {errors:.2g} standard "
+                     "errors")  # fmt: skip
+    return f"{text}{which}. {cure}", size, True
 
 
 def _takes_part(part: Record) -> bool:
