@@ -621,3 +621,21 @@ def test_labels_come_apart_again(name, unit):
 )
 def test_labels_of_other_tools(label, parts):
     assert split_unit(label) == parts
+
+
+# --- instants of sampling
+
+
+def test_uneven_instants_are_refused_with_their_size():
+    rng = np.random.default_rng(0)
+    t = 0.01 * np.arange(100) + 0.001 * rng.uniform(-1, 1, 100)
+    x = np.sin(t)
+    with pytest.raises(cid.CtrlidError, match=r"off such a grid by up to [12]\d? ?%.*numpy.interp"):
+        cid.Record(t=t, u=x, y=x)
+    with pytest.raises(cid.CtrlidError, match=r"Give dt=0\.01"):
+        cid.Record(t=0.01 * np.arange(100), u=x, y=x)
+    for wrong in (None, "abc", t[::-1]):
+        with pytest.raises(cid.CtrlidError, match=r"has no t=.*give dt=|has no t=.*Give dt="):
+            cid.Record(t=wrong, u=x, y=x)
+    with pytest.raises(cid.CtrlidError, match="did you mean units"):
+        cid.Record(u=x, y=x, dt=0.01, unit={"y": "m"})

@@ -1,12 +1,13 @@
 """Record: one experiment in one loop, measured or simulated."""
 
+import inspect
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from numbers import Integral
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal, get_args
+from typing import Any, Literal, Self, get_args
 
 import numpy as np
 from scipy import signal
@@ -14,7 +15,7 @@ from scipy import signal
 from .._base.arguments import check_arguments
 from .._base.errors import CtrlidError
 from .._base.signals import list_signals, require_one_signal
-from .._base.text import Printed
+from .._base.text import Printed, find_near_name, write_percent
 from . import csv_files as _csv
 from . import responses as _response
 from .field_checks import check_samples, check_seconds, check_words
@@ -95,6 +96,18 @@ class Record(Printed):
     name: str = ""
     start: float = 0.0
     hold_r: Literal["zoh", "foh"] = "zoh"
+
+    def __new__(cls, **fields: Any) -> Self:
+        """Refuse unknown fields in words, before the generated constructor does so curtly."""
+        if "t" in fields:
+            raise CtrlidError(_write_no_instants(fields["t"]))
+        known = tuple(cls.__dataclass_fields__)
+        for name in fields:
+            if name not in known:
+                near = find_near_name(name, known)
+                hint = f"did you mean {near}=?" if near else f"it has {', '.join(known)}"
+                raise CtrlidError(f"a Record has no {name}=; {hint}")
+        return super().__new__(cls)
 
     def __post_init__(self) -> None:
         given = {k: getattr(self, k) for k in SIGNALS}
@@ -628,6 +641,37 @@ class Record(Printed):
             rows.append(f"  {label:<{width}}  {values.min():.6g} .. {values.max():.6g} "
                         f"{'' if unit == '1' else unit}".rstrip())  # fmt: skip
         return "\n".join(rows)
+
+
+_init = inspect.signature(Record.__init__)
+# Help shows the fields, not the arguments of the check of their names.
+Record.__signature__ = _init.replace(  # type: ignore[attr-defined]
+    parameters=list(_init.parameters.values())[1:]
+)
+
+
+def _write_no_instants(t: Any) -> str:
+    """Say that samples have one period, and what that means for instants as uneven as given."""
+    text = ("a Record has no t=: its samples are taken as evenly spaced by dt, with start= as the "
+            "time of the first")  # fmt: skip
+    try:
+        steps = np.diff(np.asarray(t, dtype=float))
+    except (TypeError, ValueError):
+        steps = np.zeros(0)
+    if steps.ndim != 1 or not steps.size or not np.all(np.isfinite(steps)):
+        return f"{text}. Give dt="
+    dt = float(np.mean(steps))
+    if not dt > 0:
+        return f"{text}; the times given do not increase. Sort the samples, and give dt="
+    uneven = float(np.max(np.abs(np.cumsum(steps - dt)), initial=0.0)) / dt
+    if uneven < 1e-6:
+        return f"{text}. Give dt={dt:.6g}"
+    return (
+        f"{text}; the times given are off such a grid by up to {write_percent(uneven)} of the mean "
+        f"period {dt:.4g} s. Taken as even, each reading is wrong by the speed of y times the "
+        "error of its instant, which is noise to a fit: give dt= where that is small beside the "
+        "sensor noise, else resample r, u and y to an even grid with numpy.interp"
+    )
 
 
 def list_rows(record: Record) -> list[tuple[str, str, str, Any]]:
