@@ -1,0 +1,70 @@
+"""The tables of the frozen study in the manual, printed from the file of its lines."""
+
+import importlib.util
+import sys
+from pathlib import Path
+
+from docutils import nodes
+from docutils.parsers.rst import Directive
+from docutils.statemachine import StringList
+
+BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
+FILE = BENCHMARKS / "frozen_study.jsonl.gz"
+
+
+def load_study():
+    """Return ``benchmarks/study_frozen.py`` as a module."""
+    sys.path.insert(0, str(BENCHMARKS))
+    try:
+        spec = importlib.util.spec_from_file_location(
+            "study_frozen", BENCHMARKS / "study_frozen.py"
+        )
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+    finally:
+        sys.path.remove(str(BENCHMARKS))
+    return module
+
+
+def write_list_table(head, rows, widths):
+    """Return the lines of a list table."""
+    lines = [".. list-table::", "   :header-rows: 1", f"   :widths: {widths}", ""]
+    for first, *rest in [head, *rows]:
+        lines.append(f"   * - {first}")
+        lines += [f"     - {cell}" for cell in rest]
+    return [*lines, ""]
+
+
+def write_tables(path=FILE):
+    """Return the tables of a study as lines of a page; a sentence where there is no file yet."""
+    if not path.exists():
+        return ["The file of this version's run is not there yet; until then there are no figures."]
+    study = load_study()
+    lines = study.read(path)
+    counts = {name: sum(x["class"] == name for x in lines) for name in study.cases.CLASSES}
+    told = ", ".join(f"{count} {name}" for name, count in counts.items() if count)
+    out = [f"Draws by class: {told}.", ""]
+    out += write_list_table(("asked", "target", "measured, with Wilson's 95 % interval"),
+                            study.score(lines), "50 12 38")  # fmt: skip
+    out += ["One effect, by what it is worth:", ""]
+    out += write_list_table(("worth", "a finding", "the truth in a set", "a set without the truth"),
+                            study.find_power(lines), "16 28 28 28")  # fmt: skip
+    out += ["Every answer that is wrong, with what the truth was worth in brackets:", ""]
+    return out + [f"- {miss}" for miss in study.find_misses(lines)]
+
+
+class FrozenStudy(Directive):
+    """Tables and misses of the frozen study, from its file."""
+
+    def run(self):
+        """Return the tables."""
+        place = nodes.Element()
+        text = StringList(write_tables(), source="frozen_study")
+        self.state.nested_parse(text, self.content_offset, place)
+        return place.children
+
+
+def setup(app):
+    """Register the directive."""
+    app.add_directive("frozen-study", FrozenStudy)
+    return {"parallel_read_safe": True}

@@ -1,0 +1,164 @@
+"""The frozen study: a simulator that shares nothing with ctrlid, worths, and a table kept."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from problems import load_script
+
+study = load_script("benchmarks", "study_frozen")
+cases = study.cases
+plants = cases.op
+PARTS = ("outside_rigs", "outside_plants", "outside_worth", "outside_cases")
+
+
+@pytest.mark.parametrize("name", PARTS)
+def test_the_simulator_knows_nothing_of_ctrlid(name):
+    text = (Path(study.__file__).parent / f"{name}.py").read_text("utf-8")
+    assert "import ctrlid" not in text
+    assert "from ctrlid" not in text
+
+
+def make_drive(rng, n=400, size=0.0):
+    """Return a truth with a drive, some Coulomb-free drag beside it, and its record."""
+    at = np.array([0.0, 0.0, 0.0, 0.02])
+    p = np.array([4.0, 1.0, 1.0, 0.0])
+    e = plants.neutral()
+    e[plants.I["stiffness"]] = size
+    x0, spread = np.zeros(plants.MOST), np.full(plants.MOST, 1e-3)
+    moves = 2.0 * np.repeat(rng.choice([-1.0, 1.0], n // 20), 20)
+    sigma, push = 0.01, 0.3
+    u, y, ok = plants.simulate(1, p, e, at, x0, np.array([5.0, -4.5]), np.array([1.0, -0.5]), True,
+                               moves, push * rng.standard_normal(n), sigma * rng.standard_normal(n),
+                               np.full(n, 0.02), 0.0, 100.0)  # fmt: skip
+    assert ok
+    return cases.Truth(
+        1, p, e, at, x0, spread, sigma, push, cases.WHITE, np.ones(1), np.ones(1),
+        {"k": (4.0, np.inf), "c": (1.0, np.inf)}, 1.0, u, y,
+    )  # fmt: skip
+
+
+def test_a_worth_is_the_mean_of_many_log_likelihood_ratios():
+    """By brute force: the ratio of the truth and the best model without it, on fresh records."""
+    truth = make_drive(np.random.default_rng(1), size=2.0)
+    without = plants.neutral()
+    worth, theta = cases.measure_worth(truth, without)
+    assert 10 < worth < 200
+    ratios, worths = [], []
+    for seed in range(60):
+        one = make_drive(np.random.default_rng([seed, 7]), size=2.0)
+        own, other = one.predict(np.zeros(4), one.e), one.predict(theta, without)
+        ratios.append(plants.log_likelihood(one.y, *own, one.weights)
+                      - plants.log_likelihood(one.y, *other, one.weights))  # fmt: skip
+        worths.append(plants.sum_divergence(*own, one.weights, *other, one.weights, plants.NODES,
+                                            plants.MASSES))  # fmt: skip
+    error = np.std(np.array(ratios) - worths, ddof=1) / np.sqrt(len(ratios))
+    assert abs(np.mean(ratios) - np.mean(worths)) < 3.5 * error
+
+
+def test_what_is_absent_is_worth_nothing_and_no_fit_ends_half_way():
+    truth = make_drive(np.random.default_rng(2))
+    assert cases.measure_worth(truth, plants.neutral())[0] < 1e-6
+    last = 0.0
+    for size in (0.1, 0.5, 2.0):
+        truth = make_drive(np.random.default_rng(2), size=size)
+        worth, theta = cases.measure_worth(truth, plants.neutral())
+        assert worth > 1.5 * last
+        elsewhere = theta + np.array([0.05, -0.1, 0.2, -0.5])
+        again, _ = cases.measure_worth(truth, plants.neutral(), start=elsewhere)
+        assert again == pytest.approx(worth, rel=2e-3)
+        last = worth
+
+
+def test_the_filter_of_a_linear_plant_is_the_kalman_filter():
+    truth = make_drive(np.random.default_rng(3), n=60)
+    mean, variance = truth.predict(np.zeros(4), truth.e)
+    dt, k, c = 0.02, 4.0, 1.0
+    decay = np.exp(-c * dt)
+    f = np.array([[1.0, (1 - decay) / c], [0.0, decay]])
+    g = np.array([k * (dt - (1 - decay) / c) / c, k * (1 - decay) / c])
+    push = 0.3 * np.array([dt * dt / 2, dt])
+    x, P = np.zeros(2), np.diag([1e-6, 1e-6])
+    for j, y in enumerate(truth.y):
+        s = P[0, 0] + 1e-4
+        assert mean[j] == pytest.approx(x[0], abs=1e-6)
+        assert variance[j, 0] == pytest.approx(s, rel=1e-4)
+        gain = P[:, 0] / s
+        x = f @ (x + gain * (y - x[0])) + g * truth.u[j]
+        P = f @ (P - np.outer(gain, P[0])) @ f.T + np.outer(push, push)
+
+
+def test_dry_friction_holds_what_rests():
+    e = plants.neutral()
+    e[plants.I["coulomb"]] = 1.0
+    at = np.array([0.0, 0.0, 0.0, 0.02])
+    u = np.r_[np.full(50, 0.2), np.full(50, 0.5), np.zeros(100)]
+    _, y, _ = plants.simulate(1, np.array([4.0, 1.0, 1.0, 0.0]), e, at, np.zeros(plants.MOST),
+                              np.zeros(1), np.ones(1), False, u, np.zeros(200), np.zeros(200),
+                              np.full(200, 0.02), 0.0, 100.0)  # fmt: skip
+    assert np.all(y[:50] == 0)
+    assert y[100] > 0.1
+    assert np.ptp(y[-50:]) == 0
+
+
+def test_a_draw_is_the_same_again_and_its_worth_is_near_what_was_drawn():
+    one, two = (cases.draw_case("faint", 7, 500) for _ in range(2))
+    assert np.array_equal(one.y, two.y)
+    assert one.worth == two.worth
+    assert abs(np.log(one.worth[0] / one.wanted)) < 3 * cases.NEAR
+
+
+def test_names_that_no_record_tells_apart_count_as_one():
+    assert study.classes_of(["ActuatorLag", "SensorLag", "InputDelay"], "drive") == [
+        {"ActuatorLag", "SensorLag"}, {"InputDelay"},
+    ]  # fmt: skip
+    assert len(study.classes_of(["ActuatorLag", "SensorLag"], "ball")) == 2
+
+
+def make_line(kind, seed, truth=(), worth=(), names=(), **more):
+    found = [{"set": list(n), "equal": [], "evidence": 1.0, "values": {}} for n in names]
+    return {"class": kind, "seed": seed, "n": 10, "plant": "drive", "noise": "white",
+            "law": "exact", "redrawn": 0, "dt": 0.01, "truth": list(truth), "worth": list(worth),
+            "sizes": [{} for _ in truth], "findings": found, "stand_ins": [], "wider": 1.0,
+            "verdict": "explained" if names else "nothing missing",
+            "seconds": 1.0, **more}  # fmt: skip
+
+
+def test_the_table_counts_and_the_file_keeps(tmp_path):
+    lines = [
+        make_line("clean", 0),
+        make_line("one", 0, ["InputDelay"], [200.0], [["InputDelay", "SensorLag"]]),
+        make_line("one", 1, ["ActuatorLag"], [200.0], [["SensorLag"]]),
+        make_line("faint", 0, ["InputDelay"], [10.0], [["CoulombFriction"]]),
+        make_line("two", 0, ["InputDelay", "CubicStiffness"], [200.0, 300.0],
+                  [["InputDelay"], ["CubicStiffness"]]),
+    ]  # fmt: skip
+    path = tmp_path / "study.jsonl.gz"
+    for line in lines[::-1]:
+        study.append(path, line)
+    whole = path.read_bytes()
+    path.write_bytes(whole + whole[:20])  # as a run leaves it that was killed
+    assert len(study.read(path)) == len(lines)
+    study.write(path, study.read(path))
+    assert study.read(path) == lines
+    table = {what.strip(): value for what, _, value in study.score(lines)}
+    assert table["one effect, worth over 50: the truth in the set of a finding"].startswith(
+        "2 of 2"
+    )
+    assert table["the same: mean size of the set that has the truth"] == "1.50 of 2"
+    faint = "one effect, worth 5 to 50: sets of findings without the truth"
+    assert table[faint].startswith("1 of 1")
+    assert table["the same: exactly right, a finding for each and no other"].startswith("1 of 1")
+    assert [m.split(" drive")[0] for m in study.find_misses(lines)] == ["faint 0"]
+    page = "\n".join(load_script("docs", "frozen_table").write_tables(path))
+    assert "98 %" in page
+    assert "faint 0 drive" in page
+
+
+def test_a_diagnosis_rerun_from_its_seed_gives_the_same_answer():
+    one, two = (study.run("clean", 1, 400) for _ in range(2))
+    assert "error" not in one, one
+    assert study.same_answer(one, two)
