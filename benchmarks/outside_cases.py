@@ -555,11 +555,9 @@ def _find_size(
 def _weigh_parameter(truth: Truth, plant: str, key: str, factor: float) -> float:
     """Return what the true value of a parameter is worth beside the one that is called exact."""
     index = op.PARAMETERS[op.PLANTS.index(plant)].index(key)
-    m = len(truth.free) + 2 + int(0 < truth.colour[0] < 1)
-    own = truth.predict(np.zeros(m), truth.e)
     wrong = truth.p.copy()
     wrong[index] /= factor
-    return measure_worth(replace(truth, p=wrong), truth.e, own=own)[0]
+    return measure_worth(replace(truth, p=wrong), truth.e, right=truth)[0]
 
 
 def is_same(one: str, other: str, plant: str) -> bool:

@@ -60,7 +60,7 @@ def neutral() -> np.ndarray:
     return e
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def accelerate(plant, p, e, at, x, w, t, moving, dx):
     """Write the rates of all states; `moving` is the sign of what rubs, zero for none.
 
@@ -132,7 +132,7 @@ def accelerate(plant, p, e, at, x, w, t, moving, dx):
         dx[0], dx[1] = v, a
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def advance(plant, p, e, at, x, w, t, h, push, dx, y, s1, s2, s3):
     """Integrate all states over a step `h` in place; `push` is a random force held over it."""
     moving = 0.0
@@ -180,7 +180,7 @@ def advance(plant, p, e, at, x, w, t, h, push, dx, y, s1, s2, s3):
         x[5] = x[iy] - behind + (x[5] - before + behind) * math.exp(-h / e[SENSOR_LAG])
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def actuate(u, k, e, at, memory, t, h, j, parts):
     """Return what reaches the plant in part `j` of period `k`; `memory` holds lag, gap and rate."""
     late = e[DELAY]
@@ -221,7 +221,7 @@ def actuate(u, k, e, at, memory, t, h, j, parts):
     return w
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def read(plant, e, at, x, t):
     """Return what the sensor makes of the states, before its noise and its limits."""
     y = x[5] if e[SENSOR_LAG] != 0.0 else x[1 if plant == TANKS else 0]
@@ -238,7 +238,7 @@ def read(plant, e, at, x, t):
     return y
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def simulate(plant, p, e, at, x0, num, den, closed, moves, pushes, noise, periods, step, reach):
     """Return input and reading of a loop, and whether the output stayed within its reach.
 
@@ -283,7 +283,7 @@ def simulate(plant, p, e, at, x0, num, den, closed, moves, pushes, noise, period
     return u, y, True
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def factorize(P, n, L):
     """Write the Cholesky factor of a covariance; what rounding made negative is almost zero."""
     for i in range(n):
@@ -299,7 +299,7 @@ def factorize(P, n, L):
             L[i, j] = 0.0
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def filter_record(plant, p, e, at, x0, spread, u, y, sigma, push, colour, weights, ratios):
     """Return the means and variances of the predicted readings, a column for each normal law.
 
@@ -483,7 +483,7 @@ NODES, MASSES = np.polynomial.hermite_e.hermegauss(9)
 MASSES = MASSES / MASSES.sum()
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def log_density(v, mean, variance, weights):
     """Return the logarithm of a mixture of normal laws."""
     top, total = -1e300, 0.0
@@ -499,7 +499,7 @@ def log_density(v, mean, variance, weights):
     return top + math.log(total)
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def sum_divergence(mean, variance, weights, other, width, masses, nodes, share):
     r"""Return the divergence of Kullback and Leibler from one filter to another, sample by sample.
 
@@ -524,7 +524,7 @@ def sum_divergence(mean, variance, weights, other, width, masses, nodes, share):
     return total
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def log_likelihood(y, mean, variance, weights):
     """Return the log-likelihood of a record under the predictions of a filter."""
     total = 0.0

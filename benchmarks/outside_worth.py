@@ -85,7 +85,7 @@ def measure_worth(
     without: np.ndarray,
     sizes: tuple[int, ...] = (),
     start: np.ndarray | None = None,
-    own: tuple | None = None,
+    right: Truth | None = None,
 ) -> tuple[float, np.ndarray]:
     """Return what the truth is worth beside the best model without an effect, and that model.
 
@@ -99,8 +99,8 @@ def measure_worth(
         Indices of effects that the model has, whose sizes are refitted.
     start : ndarray, optional
         Where the search begins.
-    own : tuple, optional
-        The predictions of the truth, where `truth` is not it.
+    right : Truth, optional
+        The truth, where `truth` has a wrong value of a parameter that is called exact.
 
     Returns
     -------
@@ -110,13 +110,18 @@ def measure_worth(
         Where it is smallest.
     """
     m = len(truth.free) + 2 + int(0 < truth.colour[0] < 1) + len(sizes)
-    own = own or truth.predict(np.zeros(m), truth.e, sizes)
+    right = right or truth
+    own = right.predict(np.zeros(m), right.e, sizes)
     best, theta = np.inf, np.zeros(m)
     for first in (start, np.zeros(m)):
         if first is None or np.isfinite(best):
             continue
         best, theta = _climb(truth, own, without, sizes, first)
-    return max(best - truth.belief(np.zeros(m)), 0.0), theta
+    if not right.belief(np.zeros(m)):
+        return best, theta
+    # What is believed moves the model that has the effect as well.
+    within, _ = _climb(right, own, right.e, sizes, np.zeros(m))
+    return max(best - within, 0.0), theta
 
 
 def _climb(truth, own, without, sizes, theta):
