@@ -11,6 +11,7 @@ from .._base.text import write_quantity
 from .._base.units import fill_unit
 from ..data.record import Record
 from ..effects import AbstractEffect, Quantization, equivalents
+from ..estimation.likelihood.filter_data import find_noise_units
 from ..estimation.likelihood.likelihood import Fit
 from ..estimation.likelihood.physics_fit import summarize_fit
 from ..loop.loop import Loop
@@ -78,6 +79,12 @@ def assemble_answer(
     if not loop.free:
         notes.append("no parameter of the model was free, so a wrong value counts as a missing "
                      "effect. Name the uncertain parameters in free=")  # fmt: skip
+    if not loop.equations().siso:
+        notes.append(
+            "with several inputs or outputs the noise of each output is taken to be white: "
+            "coloured noise, heavy tails, steps and limits of a sensor, delays of one of several "
+            "inputs, repeats of the experiment and errors of the log are not looked for"
+        )
     if loop.linear_plant and not found.after.passed:
         notes.append(
             "the model is linear. If the errors depend on position, velocity or input, write the "
@@ -109,6 +116,11 @@ def assemble_answer(
 def describe_noise(fit: Fit, unit: str) -> SensorNoise:
     """Return the sensor noise of a fit as a diagnosis tells it."""
     noise, variance = fit.noise, float(np.mean(fit.sensor))
+    if not fit.plant.e.siso:
+        sizes = np.sqrt(variance * np.array([1.0, *noise.sensors])).tolist()
+        units = find_noise_units(fit.plant.loop, fit.data[0].record)[0]
+        rows = tuple(zip(fit.plant.e.outputs, sizes, units, strict=True))
+        return SensorNoise(sizes[0], units[0], outputs=rows)
     if noise.tails is None:
         return SensorNoise(math.sqrt(variance), unit, noise.ar, noise.ma)
     tails = noise.tails
@@ -132,13 +144,17 @@ def _describe_steps(read: Readout, unit: str) -> str:
 def name_records(records: Sequence[Record]) -> str:
     """Return what the records are called, with their size."""
     names = ", ".join(dict.fromkeys(r.name or "record" for r in records))
-    size = sum(int(np.count_nonzero(r.valid)) for r in records)
+    size = sum(int(np.count_nonzero(r.valid_samples)) for r in records)
     many = f"{len(records)} records, " if len(records) > 1 else ""
     return f"{names} ({many}{size} samples, dt = {records[0].dt:g} s)"
 
 
 def _find_units(loop: Loop) -> dict[str, str]:
     e, known = loop.equations(), loop.known_units
+    if not e.siso:
+        changes = {f"change of {name}": known.get(name, "") for name in e.inputs}
+        references = {f"reference {name}": known.get(name, "") for name in e.outputs}
+        return {**changes, **references, "time": "s", **known}
     y, u = known.get(e.outputs[0], ""), known.get(e.inputs[0], "")
     units = {"time": "s", "position": y, "reference": y, "input": u, "input change": u,
              "velocity": fill_unit("{y}/s", {"y": y}) if y else ""}  # fmt: skip
@@ -154,13 +170,13 @@ def _make_finding(
     same = equivalents(effect, loop)
     # With the free parameters moving along, two effects may be one on every record.
     ties = {
-        t.name
+        t.key
         for t in f.rivals
         if abs(t.gain - f.trial.gain) < THRESHOLD.tie and t.penalty == f.trial.penalty
     }
     same = (*same, *sorted(ties - set(same)))
     others = tuple(t.fitted for t in f.rivals)
-    apart = [t for t in f.rivals if t.name not in same]
+    apart = [t for t in f.rivals if t.key not in same]
     words, reference = "", None
     if apart:
         words, reference = find_experiment(f.trial, apart, records[0])
@@ -210,7 +226,7 @@ def _find_sensitivity(found: Search) -> dict[str, float]:
         return sizes
     for t in found.steps[-1].trials:
         size = _find_smallest_visible(t)
-        key = f"{t.name}.{t.effect.parameters()[0].name}" if t.effect.parameters() else t.name
+        key = f"{t.key}.{t.effect.parameters()[0].name}" if t.effect.parameters() else t.key
         if math.isfinite(size) and key not in sizes:
             sizes[key] = size
     return sizes

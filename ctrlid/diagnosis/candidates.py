@@ -11,8 +11,10 @@ from .._base.criterion import bayesian_penalty
 from .._base.errors import CtrlidError, EffectDoesNotApply, ModelCannotRun
 from ..data.record import Record
 from ..effects import AbstractEffect
+from ..effects.base import name_at_place
 from ..estimation.likelihood.sampled_plant import Trajectory
 from .fitted_model import Model, keep_information
+from .places import list_placed_candidates
 
 Ground = Literal[
     "does not apply", "cannot run", "not seen", "vanishes", "on a bound", "insignificant",
@@ -69,6 +71,20 @@ class Trial:
         return type(self.effect).__name__
 
     @property
+    def key(self) -> str:
+        """The name, with the place on a plant that has several."""
+        return name_at_place(self.effect)
+
+    def resembles(self, other: "Trial") -> bool:
+        """Whether another one is known to have this for a look-alike, at a place of its own kind.
+
+        On a plant with several signals it then acts at the same place.
+        """
+        return self.name in type(other.effect).look_alikes and (
+            self.effect.place != other.effect.place or self.effect.at == other.effect.at
+        )
+
+    @property
     def full_penalty(self) -> float:
         """Half the Bayesian penalty if all its parameters count."""
         size = self.model.fit.size
@@ -89,13 +105,17 @@ class Trial:
 
 def is_same_kind(one: AbstractEffect, other: AbstractEffect) -> bool:
     """Whether two effects differ in their values only: of one class, and of one state or name."""
-    return type(one) is type(other) and getattr(one, "name", "") == getattr(other, "name", "")
+    return (
+        type(one) is type(other)
+        and getattr(one, "name", "") == getattr(other, "name", "")
+        and one.at == other.at
+    )
 
 
 def contains(effect: AbstractEffect, simple: AbstractEffect) -> bool:
     """Whether one effect is another with further parameters, as asymmetric friction is friction."""
     more = set(effect.values()) > set(simple.values())
-    return more and type(simple).__name__ in effect.look_alikes
+    return more and type(simple).__name__ in effect.look_alikes and effect.at == simple.at
 
 
 def keep_for_comparison(trial: Trial) -> Trial:
@@ -115,7 +135,10 @@ def list_candidates(
     """Return every effect of a catalogue that a plant can have, at its start."""
     found: list[AbstractEffect] = []
     for kind in catalogue:
-        found += kind.candidates(loop, record)
+        if loop.equations().siso:
+            found += kind.candidates(loop, record)
+        else:
+            found += list_placed_candidates(kind, loop, record)
     return found
 
 

@@ -142,8 +142,11 @@ def _estimate_alone(x: Array, e: Array, j: int) -> tuple[float, float]:
 
 def _test_slow_line(score: Array, size: float, keep: Array) -> float:
     """Return the probability that the score of a constant has as strong a slow line."""
-    filled = np.zeros(len(keep))
+    filled = np.zeros(keep.shape)
     filled[keep] = score
+    if filled.ndim == 2:
+        # What several outputs say at one time belongs together.
+        filled = filled.sum(axis=1)
     power = np.abs(np.fft.rfft(filled)) ** 2 / size
     return compute_line_probability(power[1 : max(int(THRESHOLD.slow_rhythm * len(power)), 2)])
 

@@ -49,7 +49,8 @@ def find_experiment(
     """
     words = type(best.effect).experiment.rstrip(".")
     loop = best.model.fitted
-    if loop.controller is None or record.r is None:
+    if loop.controller is None or record.r is None or not loop.equations().siso:
+        # Of several references no one combination is recommended.
         return words, None
     try:
         simulators = [make_simulator(t.model.fitted) for t in (best, *others)]

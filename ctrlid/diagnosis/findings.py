@@ -5,9 +5,10 @@ from dataclasses import dataclass
 from typing import Literal
 
 from .._base.arrays import Array, freeze_arrays
-from .._base.text import Printed, write_number, write_quantity
+from .._base.text import Printed, write_list, write_number, write_quantity
 from .._base.units import fill_unit
 from ..effects import AbstractEffect
+from ..effects.base import name_at_place
 from ..validation.reproduction import CLOSED_LOOP, OPEN_LOOP, Reproduction
 from .thresholds import THRESHOLD
 
@@ -56,6 +57,12 @@ class Gap:
     samples : int
         How many samples the RMS errors are of, in all records kept back; the curves are those of
         the first. 0 in files of older versions.
+    output : str
+        Of several outputs, the name of the one that this is the gap of.
+    outputs : tuple of Gap
+        Of several outputs, the gap of each. That of all is then in units of the floors: the root of
+        the mean square of each error over the floor of its output. Its `floor` is about 1, and its
+        curves are those of the output whose gap is the widest in these units.
     """
 
     kind: GapKind
@@ -74,6 +81,8 @@ class Gap:
     closed_loop: bool = False
     trivial: float = math.nan
     samples: int = 0
+    output: str = ""
+    outputs: tuple["Gap", ...] = ()
 
     def __post_init__(self) -> None:
         freeze_arrays(self)
@@ -98,6 +107,8 @@ class Gap:
     @property
     def force_unit(self) -> str:
         """The unit of a force per unit of mass, by the unit of the output."""
+        if self.outputs:
+            return ""
         return fill_unit("{y}/s^2", {"y": self.unit or "[y]"})
 
 
@@ -151,8 +162,13 @@ class Finding:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The name of the effect and those of its alternatives."""
-        return (self.name, *(type(e).__name__ for e in self.alternatives))
+        """The name of the effect and those of its alternatives, with places where there are any."""
+        return tuple(name_at_place(e) for e in (self.effect, *self.alternatives))
+
+    @property
+    def at(self) -> str:
+        """The input, velocity or output at which the effect acts, of a plant with several."""
+        return str(self.effect.at)
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,6 +220,8 @@ class BinnedErrors:
         Probability that noise alone looks like this or worse.
     words : str
         Where it sits, in words.
+    output : str
+        Of several outputs, that whose innovations they are.
     """
 
     axis: str
@@ -214,6 +232,7 @@ class BinnedErrors:
     p_before: float
     p_after: float
     words: str
+    output: str = ""
 
     def __post_init__(self) -> None:
         freeze_arrays(self)
@@ -227,17 +246,21 @@ class Disturbance:
     ----------
     white, coloured : float
         Standard deviations of the white force, held over each period, and of the coloured force
-        [output unit/s^2]; zero where there is none.
+        [output unit/s^2]; zero where there is none. Of several forces `white` is NaN.
     time_constant : float
         Time constant of the coloured force [s]; NaN without one.
     share : float
         Share of the floor's variance that these forces make; the rest is sensor noise.
+    forces : tuple of (str, float, str)
+        Of a plant with several signals, each white force: the velocity that it works on, its
+        standard deviation and the unit.
     """
 
     white: float
     coloured: float
     time_constant: float
     share: float
+    forces: tuple[tuple[str, float, str], ...] = ()
 
     @property
     def large(self) -> bool:
@@ -264,6 +287,9 @@ class SensorNoise(Printed):
     share, ratio : float
         Share of wild readings, and how many times as large as the others these are; zero and one:
         there are none.
+    outputs : tuple of (str, float, str)
+        Of several outputs, the name of each, its noise and the unit; `size` is then that of the
+        first.
 
     Examples
     --------
@@ -281,6 +307,7 @@ class SensorNoise(Printed):
     freedom: float = math.inf
     share: float = 0.0
     ratio: float = 1.0
+    outputs: tuple[tuple[str, float, str], ...] = ()
 
     @property
     def kind(self) -> str:
@@ -293,6 +320,10 @@ class SensorNoise(Printed):
     @property
     def words(self) -> str:
         """What it is, with its order and size, as the end of a sentence."""
+        if self.outputs:
+            sizes = [f"{write_quantity(size, unit or f'[{name}]')} RMS at {name}"
+                     for name, size, unit in self.outputs]  # fmt: skip
+            return f"white, of {write_list(sizes)}"
         order = f", ARMA({len(self.ar)}, {len(self.ma)})" if self.ar or self.ma else ""
         text = f"{self.kind}{order}, of {write_quantity(self.size, self.unit or '[y]')} RMS"
         told = ["the reading errs alike in successive samples"] if order else []

@@ -20,10 +20,12 @@ from ..estimation.likelihood.likelihood import Fit, Known, evaluate_likelihood, 
 from ..estimation.likelihood.maximization import begin_fit, maximize
 from ..estimation.likelihood.prediction import (
     compute_spread_ahead,
+    compute_spreads_ahead,
     make_prediction,
     predict_ahead,
 )
 from ..loop.loop import Loop
+from ..loop.wiring import match_signals
 from ..validation.record_audit import FEW
 from ..validation.reproduction import Reproduction, choose_reproduction
 from . import gap as gaps
@@ -114,7 +116,8 @@ class FreshData:
         for loop, window in zip(loops, self.windows, strict=True):
             problem = make_problem(loop, (), [window.record], [window.start_time])
             here = begin_fit(replace(problem, known=known))
-            z = here.standardized[0][window.mask]
+            # Of several outputs the innovations have a column, the mask a row for each.
+            z = here.standardized[0].T[window.mask]
             total += 0.5 * float(np.nansum(z**2 - 1))
         return max(total, 0.0)
 
@@ -135,6 +138,9 @@ class FreshData:
             )
             return gaps.compute_chance_among_runs(self.measure_gap(loops), runs[:, 0])
         known, horizon = Known(fit.noise, np.full(1, float(np.mean(fit.sensor)))), self.how.horizon
+        if not fit.plant.e.siso:
+            # The chance that one output's noise is too large, of several, is that of any.
+            return self._compute_least_chance(loops, known)
         squares = usual = worth = 0.0
         for loop, window in zip(loops, self.windows, strict=True):
             plain, record = replace(loop, controller=None), window.record
@@ -160,6 +166,49 @@ class FreshData:
             return math.nan
         return float(stats.chi2.cdf(worth * squares / usual, worth))
 
+    def _compute_least_chance(self, loops: Sequence[Loop], known: Known) -> float:
+        """Return the probability for the output that predicts the best beside its noise."""
+        horizon, outputs = self.how.horizon, len(known.noise.sensors) + 1
+        squares, usual, worth = np.zeros(outputs), np.zeros(outputs), np.zeros(outputs)
+        for loop, window in zip(loops, self.windows, strict=True):
+            plain, record = replace(loop, controller=None), window.record
+            problem = make_problem(plain, (), [record], [window.start_time])
+            try:
+                here = begin_fit(replace(problem, known=known))
+            except ModelCannotRun:
+                return math.nan
+            index, y = predict_ahead(plain, record, make_prediction(here), horizon)
+            spreads = compute_spreads_ahead(
+                here.linearized[0], known.noise, record.valid_samples, horizon
+            )
+            rows = zip(np.reshape(record.y, (outputs, -1)), y.T,
+                       np.reshape(window.mask, (outputs, -1)), strict=True)  # fmt: skip
+            for k, (measured, made, mask) in enumerate(rows):
+                use = mask[index] & np.isfinite(made)
+                e = (measured[index] - made)[use]
+                if len(e):
+                    squares[k] += float(np.sum(e**2))
+                    usual[k] += len(e) * float(here.sensor[0]) * spreads[k] ** 2
+                    worth[k] += min(len(e) / autocorrelation_time(e, 2), np.count_nonzero(mask))
+        if not (usual > 0).all():
+            return math.nan
+        chances = stats.chi2.cdf(worth * squares / usual, worth)
+        return float(min(1.0, outputs * np.min(chances)))
+
+    def weigh_outputs(self, model: Model) -> Self:
+        """Return the same with several outputs counted in units of the floors of a model."""
+        if self.windows[0].record.y.ndim == 1:
+            return self
+        loops = self.prepare_loops(model)
+        floors = gaps.compute_floor(loops, model.fit, self.windows, self.how).outputs
+        noise = np.sqrt(np.mean(model.fit.sensor) * np.array([1.0, *model.fit.noise.sensors]))
+        scales = tuple(
+            floor.both if math.isfinite(floor.both) and floor.both > 0 else float(size)
+            for floor, size in zip(floors, noise, strict=True)
+        )
+        windows = tuple(replace(w, scales=scales) for w in self.windows)
+        return replace(self, windows=windows)
+
 
 def choose_fresh_data(
     loop: Loop, records: Sequence[Record], validation: Sequence[Record] | None
@@ -176,6 +225,10 @@ def choose_fresh_data(
         if abs(r.dt - loop.dt) > THRESHOLD.same_period * loop.dt:
             both = write_both_periods("validation= is sampled", r.dt, "the loop", loop.dt)
             raise CtrlidError(f"{both}; give both the same period")
+    e = loop.equations()
+    if not e.siso:
+        records = [match_signals(r, e) for r in records]
+        validation = None if validation is None else [match_signals(r, e) for r in validation]
     rest: tuple[Record, ...] | None = None
     if validation is None:
         windows, rest = zip(*(gaps.hold_out(r) for r in records), strict=True)
@@ -194,7 +247,7 @@ def check_length(fresh: FreshData) -> None:
     """
     if fresh.rest is None:
         return
-    left = sum(int(np.count_nonzero(r.valid)) for r in fresh.rest)
+    left = sum(int(np.count_nonzero(r.valid_samples)) for r in fresh.rest)
     if left < FEW:
         raise CtrlidError(
             f"the record is too short for a diagnosis: {write_count(left, 'valid sample')} would "

@@ -28,32 +28,62 @@ class Window:
     """A stretch of a record that is compared, with a lead in which the start may still show.
 
     `start_time` is the time of its first sample since the start of the record, `mask` what is
-    compared.
+    compared. Of several outputs `mask` has a row for each, and their errors count in units of
+    `scales`, the floors.
     """
 
     record: Record
     start_time: float
     mask: Any
+    scales: tuple[float, ...] = ()
+
+    def choose_output(self, k: int) -> "Window":
+        """Return the same for one of several outputs, in its own unit."""
+        part = self.record.select(y=self.record.signals["y"][k])
+        return Window(part, self.start_time, self.mask[k])
+
+    @property
+    def measured(self) -> Array:
+        """The outputs, in units of the scales where there are several."""
+        y = np.asarray(self.record.y)
+        return self.scale(y)
+
+    def scale(self, y: Array) -> Array:
+        """Return outputs in units of the scales where there are several."""
+        return y / np.array(self.scales)[:, None] if self.scales else y
 
 
 def hold_out(record: Record) -> tuple[Window, Record]:
     """Return the last quarter of what counts, less of a long record, and the record before it."""
-    valid = np.flatnonzero(record.valid)
+    valid = np.flatnonzero(record.valid_outputs.any(axis=0))
     first = max(
         int(valid[int((1 - THRESHOLD.held_out) * len(valid))]),
         len(record) - THRESHOLD.held_out_samples,
     )
     start = max(first - max((len(record) - first) // THRESHOLD.lead, THRESHOLD.shortest_lead), 0)
     part = record[start:]
-    mask = np.asarray(part.valid) & (np.arange(len(part)) >= first - start)
-    return Window(part, start * record.dt, mask), record[:first]
+    mask = list_compared(part) & (np.arange(len(part)) >= first - start)
+    return Window(part, start * record.dt, mask, measure_spreads(record)), record[:first]
 
 
 def make_window(record: Record) -> Window:
     """Return a record of which all but the very start is compared."""
-    mask = np.asarray(record.valid).copy()
-    mask[: max(int(THRESHOLD.start_left_out * len(mask)), 1)] = False
-    return Window(record, 0.0, mask)
+    mask = list_compared(record).copy()
+    mask[..., : max(int(THRESHOLD.start_left_out * len(record)), 1)] = False
+    return Window(record, 0.0, mask, measure_spreads(record))
+
+
+def measure_spreads(record: Record) -> tuple[float, ...]:
+    """Return the spread of each of several outputs, by which they count until floors are known."""
+    if record.y.ndim == 1:
+        return ()
+    pairs = zip(record.y, record.valid_outputs, strict=True)
+    return tuple(max(float(np.std(y[use])), THRESHOLD.tiny) for y, use in pairs)
+
+
+def list_compared(record: Record) -> Any:
+    """Return which samples may be compared, with a row for each of several outputs."""
+    return np.array(record.valid if record.y.ndim == 1 else record.valid_outputs)
 
 
 def root_mean_square(windows: Sequence[Window], results: Sequence[Array]) -> float:
@@ -63,7 +93,7 @@ def root_mean_square(windows: Sequence[Window], results: Sequence[Array]) -> flo
         use = window.mask & np.isfinite(y)
         if window.mask.any() and not use.any():
             return math.inf
-        squares += float(np.sum((window.record.y[use] - y[use]) ** 2))
+        squares += float(np.sum((window.measured[use] - window.scale(y)[use]) ** 2))
         count += int(use.sum())
     return math.sqrt(squares / max(count, 1))
 
@@ -96,9 +126,17 @@ def measure_trivial_error(windows: Sequence[Window], horizon: int) -> float:
     while 2 * lengths[-1] <= horizon:
         lengths.append(2 * lengths[-1])
     return min(
-        root_mean_square(windows, [_extrapolate(w.record, horizon, n) for w in windows])
+        root_mean_square(windows, [_extrapolate_outputs(w.record, horizon, n) for w in windows])
         for n in lengths
     )
+
+
+def _extrapolate_outputs(record: Record, horizon: int, samples: int) -> Array:
+    """Return what `_extrapolate` does, for each of several outputs."""
+    if record.y.ndim == 1:
+        return _extrapolate(record, horizon, samples)
+    parts = [record.select(y=name) for name in record.signals["y"]]
+    return np.array([_extrapolate(part, horizon, samples) for part in parts])
 
 
 def _extrapolate(record: Record, horizon: int, samples: int) -> Array:
@@ -121,7 +159,7 @@ def halve_windows(windows: Sequence[Window]) -> tuple[tuple[Window, ...], tuple[
     """Return the windows with the first and with the second half of the compared samples only."""
     halves: tuple[list[Window], list[Window]] = ([], [])
     for window in windows:
-        count = np.cumsum(window.mask)
+        count = np.cumsum(window.mask if window.mask.ndim == 1 else window.mask.any(axis=0))
         first = count <= count[-1] // 2
         for half, part in zip(halves, (first, ~first), strict=True):
             half.append(replace(window, mask=window.mask & part))
@@ -162,6 +200,12 @@ def compute_widening_chance(
     parts = []
     for window, a, b in zip(windows, one, other, strict=True):
         use = window.mask & np.isfinite(a) & np.isfinite(b)
+        if use.ndim == 2:
+            # What several outputs say at one time is not independent.
+            squares = [np.where(use, window.measured - window.scale(v), 0.0) ** 2 for v in (b, a)]
+            d = np.sum(squares[0] - squares[1], axis=0)[use.any(axis=0)]
+            parts.append(d / (max(sizes) or 1.0) ** 2)
+            continue
         y = np.asarray(window.record.y)[use] / (max(sizes) or 1.0)
         a, b = (v[use] / (max(sizes) or 1.0) for v in (a, b))
         parts.append((y - b) ** 2 - (y - a) ** 2)
@@ -197,11 +241,11 @@ def simulate_window(loop: Loop, window: Window, how: Reproduction) -> Array:
         Outputs [output unit]; NaN where there are none.
     """
     record = window.record
-    y = np.full(len(record), np.nan)
+    y = np.full(np.shape(record.y), np.nan)
     try:
         if how.horizon:
             index, values = predict_ahead(loop, record, predict(loop, record), how.horizon)
-            y[index] = values
+            y[..., index] = values.T
             return y
         simulator = make_simulator(loop, record.hold, record.hold_r)
     except (ModelCannotRun, EffectDoesNotApply):
@@ -209,7 +253,7 @@ def simulate_window(loop: Loop, window: Window, how: Reproduction) -> Array:
     for part in find_long_stretches(record):
         try:
             stretch = prepare_stretch(simulator, record, part, start_time=window.start_time)
-            y[part] = stretch.run(simulator)[0]
+            y[..., part] = stretch.run(simulator)[0]
         except ModelCannotRun:
             continue
     return y
@@ -225,12 +269,14 @@ class Floor:
     """The RMS error that noise leaves through a loop [output unit].
 
     `both` with sensor noise and random force, `sensor` with sensor noise alone, `widest` that of
-    the simulation with both that erred most; NaN where they cannot be computed.
+    the simulation with both that erred most; NaN where they cannot be computed. Of several outputs
+    they are in units of the windows' scales, and `outputs` holds the same of each in its own unit.
     """
 
     both: float
     sensor: float
     widest: float
+    outputs: tuple["Floor", ...] = ()
 
 
 def compute_floor(
@@ -260,9 +306,40 @@ def compute_floor(
     Floor
         RMS errors [output unit]; NaN where they cannot be computed.
     """
-    errors = measure_noise_errors(loops, fit, windows, how, runs or THRESHOLD.floor_runs)
+    runs = runs or THRESHOLD.floor_runs
+    if windows[0].record.y.ndim == 1:
+        return _summarize_runs(measure_noise_errors(loops, fit, windows, how, runs))
+    each, counts = _measure_each_output(loops, fit, windows, how, runs)
+    outputs = tuple(_summarize_runs(errors) for errors in each)
+    return replace(_summarize_runs(_weigh_outputs(each, counts, windows)), outputs=outputs)
+
+
+def _summarize_runs(errors: Array) -> Floor:
     both, sensor = np.sqrt(np.mean(errors**2, axis=0)).tolist()
     return Floor(both, sensor, float(np.max(errors[:, 0])))
+
+
+def _weigh_outputs(each: Array, counts: Array, windows: Sequence[Window]) -> Array:
+    """Return the RMS errors of all outputs together, in units of the scales."""
+    scales = np.array(windows[0].scales or np.ones(len(each)))
+    squares = (each / scales[:, None, None]) ** 2 * counts[:, None, None]
+    return np.asarray(np.sqrt(squares.sum(axis=0) / max(counts.sum(), 1)))
+
+
+def _measure_each_output(
+    loops: Sequence[Loop], fit: Fit, windows: Sequence[Window], how: Reproduction, runs: int
+) -> tuple[Array, Array]:
+    """Return what `measure_noise_errors` does for each output, and how many samples count."""
+    q = len(windows[0].record.y)
+    squares, counts = np.zeros((q, runs, 2)), np.zeros(q)
+    for k, (loop, window) in enumerate(zip(loops, windows, strict=True)):
+        noise = float(fit.sensor[min(k, len(fit.sensor) - 1)])
+        try:
+            squares += _simulate_noise(loop, fit, noise, window, how, runs)
+        except (ModelCannotRun, EffectDoesNotApply):
+            return np.full((q, runs, 2), math.nan), counts
+        counts += np.count_nonzero(window.mask, axis=1)
+    return np.sqrt(squares / np.maximum(counts, 1)[:, None, None]), counts
 
 
 def measure_noise_errors(
@@ -270,8 +347,11 @@ def measure_noise_errors(
 ) -> Array:
     """Return the RMS errors that noise leaves in each run, with all noise and with the sensor's.
 
-    NaN where they cannot be computed.
+    NaN where they cannot be computed. Of several outputs, in units of the windows' scales.
     """
+    if windows[0].record.y.ndim == 2:
+        each, counts = _measure_each_output(loops, fit, windows, how, runs)
+        return _weigh_outputs(each, counts, windows)
     squares, count = np.zeros((runs, 2)), 0
     for k, (loop, window) in enumerate(zip(loops, windows, strict=True)):
         noise = float(fit.sensor[min(k, len(fit.sensor) - 1)])
@@ -297,33 +377,46 @@ def compute_chance_among_runs(size: float, runs: Array) -> float:
 def _simulate_noise(
     loop: Loop, fit: Fit, sensor: float, window: Window, how: Reproduction, runs: int
 ) -> Array:
-    """Return what noise leaves in a window, squared and summed over its samples, for each run."""
+    """Return what noise leaves in a window, squared and summed over its samples, for each run.
+
+    Of several outputs, first by the output.
+    """
     record = window.record
-    size = int(np.count_nonzero(window.mask))
+    size = np.count_nonzero(window.mask, axis=-1)
     if how.horizon:
         known = np.array(predict_spread(loop, record, predict(loop, record), how.horizon))
+        if known.ndim == 2:
+            squares = size[:, None, None] * known.T[:, None, :] ** 2
+            return np.tile(squares, (1, runs, 1))
         return np.tile(size * known**2, (runs, 1))
     simulator = make_simulator(loop, record.hold, record.hold_r)
-    squares, count = np.zeros((runs, 2)), 0
+    squares, count = np.zeros((*np.shape(size), runs, 2)), np.zeros_like(size)
     for part in find_long_stretches(record):
-        use = window.mask[part]
+        use = window.mask[..., part]
         if not use.any():
             continue
         stretch = prepare_stretch(simulator, record, part, start_time=window.start_time)
         rest = stretch.run(simulator)[0]
         for seed in range(runs):
-            noise = draw_noise(fit, sensor, len(rest), seed)
+            noise = draw_noise(fit, sensor, rest.shape[-1], seed)
             for k, both in enumerate((noise, [noise[0], 0 * noise[1]])):
                 error = stretch.run(simulator, both)[0] - rest
-                squares[seed, k] += float(np.sum(error[use] ** 2))
-        count += int(use.sum())
-    if not count:
+                if use.ndim == 2:
+                    squares[:, seed, k] += np.sum(np.where(use, error, 0.0) ** 2, axis=1)
+                else:
+                    squares[seed, k] += float(np.sum(error[use] ** 2))
+        count = count + use.sum(axis=-1)
+    if not np.any(count):
         raise ModelCannotRun("no stretch is long enough to be simulated")
-    return squares * (size / count)
+    if np.ndim(size):
+        return np.asarray(squares * (size / np.maximum(count, 1))[:, None, None])
+    return np.asarray(squares * (size / count))
 
 
 def draw_noise(fit: Fit, sensor: float, n: int, seed: int) -> list[Array]:
     """Return sensor noise and force noise of a fit; `sensor` is the variance of the sensor's."""
+    if not fit.plant.e.siso:
+        return _draw_several_noises(fit, sensor, n, seed)
     noise, streams = fit.noise, np.random.default_rng(seed).standard_normal((3, n))
     force = streams[1] * math.sqrt(sensor * float(np.mean(noise.force)))
     if noise.drift:
@@ -341,3 +434,11 @@ def draw_noise(fit: Fit, sensor: float, n: int, seed: int) -> list[Array]:
         colour = [1.0, *noise.ma], [1.0, *(-v for v in noise.ar)]
         reading = drive[0] * signal.lfilter(*colour, reading)[n:]
     return [reading * math.sqrt(sensor), force]
+
+
+def _draw_several_noises(fit: Fit, sensor: float, n: int, seed: int) -> list[Array]:
+    """Return the white noise of each sensor and of each force of a fit."""
+    sizes = [np.sqrt(sensor * np.array(v)) for v in ([1.0, *fit.noise.sensors], fit.noise.force)]
+    streams = [np.random.default_rng([seed, k]).standard_normal((len(size), n))
+               for k, size in enumerate(sizes)]  # fmt: skip
+    return [size[:, None] * s for size, s in zip(sizes, streams, strict=True)]

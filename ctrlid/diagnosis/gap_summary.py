@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from .._base.arrays import Array
+from ..estimation.likelihood.filter_data import find_noise_units
 from ..estimation.likelihood.likelihood import Fit
 from ..loop.loop import Loop
 from ..validation.reproduction import CLOSED_LOOP, Reproduction, find_longest_horizon
@@ -49,6 +50,9 @@ def summarize_gap(loop: Loop, found: Search, fresh: FreshData) -> GapSummary:
             label = list(after[0].labelled)[f.position]
             error = shared.measure_gap([x.without_effect(label) for x in after])
         shares[f.position] = _compute_share_closed(error**2 - left**2, smaller, floor.both)
+    if windows[0].record.y.ndim == 2:
+        gap = _summarize_several(loop, shared, made, floor)
+        return GapSummary(gap, shares, _measure_disturbance(fit, loop, floor))
     first = windows[0]
     unit = loop.known_units.get(loop.equations().outputs[0], "")
     trivial = gaps.measure_trivial_error(shared.windows, how.horizon) if how.horizon else math.nan
@@ -62,6 +66,49 @@ def summarize_gap(loop: Loop, found: Search, fresh: FreshData) -> GapSummary:
         sum(int(np.count_nonzero(w.mask)) for w in shared.windows),
     )  # fmt: skip
     return GapSummary(gap, shares, _measure_disturbance(fit, loop, floor))
+
+
+def _summarize_several(
+    loop: Loop, shared: FreshData, made: "_Reproductions", floor: gaps.Floor
+) -> Gap:
+    """Return the gap of all outputs in units of the floors, with that of each in its own unit."""
+    how, names = shared.how, loop.equations().outputs
+    smaller = made.choose_start(shared.windows)[1]
+    rows = (*made.results, smaller)
+    whole = _make_gap(shared, rows, floor, "", "")
+    outputs = []
+    for k, name in enumerate(names):
+        part = FreshData(tuple(w.choose_output(k) for w in shared.windows), None, how)
+        own = tuple(tuple(y[k] for y in each) for each in rows)
+        unit = loop.known_units.get(name, "")
+        outputs.append(_make_gap(part, own, floor.outputs[k], unit, name))
+    shown = max(outputs, key=lambda g: g.before / g.floor if g.floor > 0 else 0.0)
+    curves = {name: getattr(shown, name) for name in
+              ("time", "measured", "simulated_before", "simulated_after", "output")}  # fmt: skip
+    return replace(whole, **curves, outputs=tuple(outputs))
+
+
+def _make_gap(
+    fresh: FreshData, rows: Sequence[Sequence[Array]], floor: gaps.Floor, unit: str,
+    name: str,
+) -> Gap:  # fmt: skip
+    """Return a gap from what the model as given, recalibrated, complete and at best had before."""
+    how, windows = fresh.how, fresh.windows
+    given, recalibrated, left, before = (gaps.root_mean_square(windows, y) for y in rows)
+    first, alone = windows[0], name != ""
+    mask = first.mask if alone else first.mask.any(axis=0)
+    time = first.start_time + np.asarray(first.record.t - first.record.start)[mask]
+    measured, start, end = (
+        np.asarray(y)[mask] if alone else np.zeros(0)
+        for y in (first.record.y, rows[3][0], rows[2][0])
+    )
+    trivial = gaps.measure_trivial_error(windows, how.horizon) if how.horizon else math.nan
+    kind: GapKind = "prediction" if how.horizon else "simulation"
+    return Gap(
+        kind, given, before, left, floor.both, unit, time, measured, start, end, floor.widest,
+        how.horizon, recalibrated, how == CLOSED_LOOP, trivial,
+        sum(int(np.count_nonzero(w.mask)) for w in windows), name,
+    )  # fmt: skip
 
 
 def lengthen_horizon(loop: Loop, found: Search, fresh: FreshData) -> FreshData:
@@ -192,5 +239,17 @@ def _measure_disturbance(fit: Fit, loop: Loop, floor: gaps.Floor) -> Disturbance
     time_constant = -loop.dt / math.log(noise.memory) if noise.drift else math.nan
     share = 1 - (floor.sensor / floor.both) ** 2 if floor.both > 0 else math.nan
     coloured = math.sqrt(scale * noise.coloured) if noise.drift else 0.0
+    if not fit.plant.e.siso:
+        return _list_forces(fit, share)
     white = math.sqrt(scale * float(np.mean(noise.force)))
     return Disturbance(white, coloured, time_constant, float(np.clip(share, 0.0, 1.0)))
+
+
+def _list_forces(fit: Fit, share: float) -> Disturbance:
+    """Return the random forces of a plant with several signals."""
+    e = fit.plant.e
+    units = find_noise_units(fit.plant.loop, fit.data[0].record)[1]
+    sizes = np.sqrt(float(np.mean(fit.sensor)) * np.array(fit.noise.force))
+    names = [e.states[j] for j in e.velocities] or list(e.states)
+    rows = zip(names, sizes.tolist(), [*units, *[""] * len(names)], strict=False)
+    return Disturbance(math.nan, 0.0, math.nan, float(np.clip(share, 0.0, 1.0)), tuple(rows))

@@ -92,10 +92,12 @@ def cancels_a_known_force(case: Case, f: Weighed) -> str:
     if type(effect).__name__ != "ConstantForce":
         return ""
     e, at = case.given.equations(), case.given.point
-    motion = find_motion(e)
-    if motion is None:
+    motion = find_motion(e, effect.at)
+    if motion is None or e.push_units:
+        # A force through a mass matrix is in another unit than the rate at rest.
         return ""
-    known = float(e.evaluate(np.asarray(at.states, dtype=float), 0.0, 0.0)[0][motion[1]])
+    still = 0.0 if e.siso else np.zeros(len(e.inputs))
+    known = float(e.evaluate(np.asarray(at.states, dtype=float), still, 0.0)[0][motion[1]])
     bias = effect.values()["bias"]
     if not (math.isfinite(known) and known * bias < 0 and 2 * abs(bias) > abs(known)):
         return ""
@@ -147,7 +149,12 @@ def is_phase_locked(record: Record, frequency: float) -> bool:
     """
     if record.r is None or not is_line_of_reference(record, frequency):
         return False
-    keep = record.valid & np.isfinite(record.r)
+    if record.r.ndim == 2:
+        return any(
+            is_phase_locked(record.select(r=name, y=record.signals["y"][0]), frequency)
+            for name in record.signals["r"]
+        )
+    keep = record.valid_samples & np.isfinite(record.r)
     r = np.where(keep, record.r - np.mean(record.r[keep]), 0.0)
     wave = np.exp(-2j * np.pi * frequency * np.asarray(record.t))
     parts = [np.sum(np.hanning(len(one)) * one) for one in np.array_split(r * wave, THRESHOLD.bins)]

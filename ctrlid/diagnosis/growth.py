@@ -12,6 +12,7 @@ from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from .._base.interruption import Stopped
 from .._base.statistics import compute_lagged_products, compute_predicted_likelihood
 from ..effects import AbstractEffect
+from ..effects.base import name_at_place
 from ..estimation.likelihood.likelihood import Fit
 from ..estimation.likelihood.maximization import (
     choose_noise,
@@ -21,7 +22,12 @@ from ..estimation.likelihood.maximization import (
     refit_noise_size,
 )
 from ..estimation.likelihood.noise_fit import compute_noise_criterion
-from .candidates import Trial, contains, is_same_kind, list_missing_candidates
+from .candidates import (
+    Trial,
+    contains,
+    is_same_kind,
+    list_missing_candidates,
+)
 from .fitted_model import (
     Model,
     can_simulate,
@@ -124,7 +130,7 @@ def _grow_model(
     likeliest = model
     while not steps or steps[-1].best is not None:
         if steps and steps[-1].best is not None:
-            tell(f"round {len(steps)}: {steps[-1].best.name} with all else")
+            tell(f"round {len(steps)}: {steps[-1].best.key} with all else")
             reached.model = steps[-1].best.model
             model = refit_noise(order_last_effect(steps[-1].best.model, given))
             model = with_linearization(drop_superfluous(model, given))
@@ -191,7 +197,7 @@ def _prefer_sensor_noise(
     force had to make them so, and where the noise is not larger than the error that it explains.
     """
     fit = model.fit
-    if fit.known is not None or not math.isfinite(fit.value):
+    if fit.known is not None or not math.isfinite(fit.value) or not fit.plant.e.siso:
         return None
     tests = run_noise_tests(fit)
     if tests.passed and not fit.noise.drift:
@@ -314,12 +320,12 @@ def _look_back(
     near = [t for t in last.trials[1 : THRESHOLD.looked_at] if _is_close_rival(t, best, ties)]
     # Effects with a small score beside the best are not scanned again, since scans take longest.
     ranked = sorted(step.trials, key=lambda t: -t.score)
-    likely = {t.name for t in (ranked if step.best is None else ranked[: THRESHOLD.looked_at])}
+    likely = {t.key for t in (ranked if step.best is None else ranked[: THRESHOLD.looked_at])}
     pairs: list[tuple[float, int]] = []
     for k, trial in enumerate(near[: THRESHOLD.looked_back]):
         model = with_linearization(trial.model)
         pool = [c for c in list_missing_candidates(model, catalogue)
-                if not c.is_scanned() or type(c).__name__ in likely]  # fmt: skip
+                if not c.is_scanned() or name_at_place(c) in likely]  # fmt: skip
         tried: list[Trial] = work(lambda effect, model=model: scan_candidate(model, effect), pool)
         tried = sorted(tried, key=lambda t: t.full_penalty - t.score)[:2]
         done = work(lambda t, model=model: refit_candidate(model, t), tried)
@@ -339,14 +345,17 @@ def _is_close_rival(trial: Trial, best: Trial, ties: bool) -> bool:
     if not THRESHOLD.look_back * best.net_gain < trial.net_gain:
         return False
     mine, its = ({t.name, *type(t.effect).look_alikes} for t in (best, trial))
-    return ties or (bool(mine & its) and trial.net_gain < best.net_gain - THRESHOLD.close)
+    apart = best.effect.place == trial.effect.place and best.effect.at != trial.effect.at
+    return ties or (
+        bool(mine & its) and not apart and trial.net_gain < best.net_gain - THRESHOLD.close
+    )
 
 
 def measure_unexplained_likelihood(fit: Fit) -> float:
     """Return the log-likelihood above that of noise which is known; zero where none is known."""
     if fit.known is None:
         return 0.0
-    z = np.concatenate(fit.standardized)
+    z = np.concatenate([np.ravel(part) for part in fit.standardized])
     return max(0.0, 0.5 * float(np.nansum(z**2 - 1)))
 
 
@@ -411,11 +420,11 @@ def exchange_worst_effect(
     given = len(found.base.loop.effects)
     worst = min(found.found, key=lambda f: fresh.gap_of(f.base))
     base = with_linearization(worst.base)
-    out = {worst.trial.name, *refused, *(type(e).__name__ for e in base.loop.effects)}
+    out = {worst.trial.key, *refused, *(name_at_place(e) for e in base.loop.effects)}
     best: dict[str, Trial] = {}
     for t in (*worst.rivals, *(t for step in found.steps for t in step.trials)):
-        if t.net_gain > THRESHOLD.gate and t.name not in out:
-            best[t.name] = max(best.get(t.name, t), t, key=lambda t: t.net_gain)
+        if t.net_gain > THRESHOLD.gate and t.key not in out:
+            best[t.key] = max(best.get(t.key, t), t, key=lambda t: t.net_gain)
     rivals = sorted(best.values(), key=lambda t: -t.net_gain)[: THRESHOLD.looked_at]
     tried = [refit_candidate(base, screen_at(base, t.fitted)) for t in rivals]
     liked = [
@@ -426,4 +435,4 @@ def exchange_worst_effect(
     model = min(liked, key=fresh.gap_of, default=worst.base)
     model, left = weigh_effects(model, given, found.steps)
     after = retest_with_replicas(model)
-    return replace(found, final=model, found=left, after=after), worst.trial.name
+    return replace(found, final=model, found=left, after=after), worst.trial.key

@@ -113,7 +113,7 @@ def _rebuild_loop(loop: Loop, saved: SavedLoop) -> Loop:
         raise CtrlidError(f"the saved diagnosis is of the plant {saved.plant_name!r}; the loop "
                           f"given has {name!r}. Give the loop that was diagnosed")  # fmt: skip
     e, known = loop.equations(), saved.known_units
-    units = {name: known[name] for name in (e.inputs[0], e.outputs[0]) if name in known}
+    units = {name: known[name] for name in (*e.inputs, *e.outputs) if name in known}
     changed = dataclasses.replace(
         loop, dt=saved.dt, at=saved.at, free=(), effects=saved.effects,
         input_limits=saved.input_limits, units={**loop.units, **units},
@@ -125,14 +125,21 @@ def _decode_loop(data: Mapping[str, Any]) -> SavedLoop:
     at = read_numbers(data["at"])
     saved = SavedLoop(
         plant_name=data["plant"], controller_text=data["controller"], dt=read_numbers(data["dt"]),
-        at=OperatingPoint(tuple(at["states"]), at["input"], at["output"]),
-        free=_decode_free(data["free"]), input_limits=tuple(read_numbers(data["input_limits"])),
+        at=OperatingPoint(tuple(at["states"]), *(
+            tuple(v) if isinstance(v, list) else v for v in (at["input"], at["output"])
+        )),
+        free=_decode_free(data["free"]), input_limits=_read_limits(data["input_limits"]),
         effects=tuple(_decode_effect(e) for e in data["effects"]),
         parameters=read_numbers(data["parameters"]), units=data["units"],
         known_units=data.get("known_units", {}),
     )  # fmt: skip
     check_fields(saved)
     return saved
+
+
+def _read_limits(data: Any) -> Any:
+    """Return limits of one input, or with a value for each of several."""
+    return tuple(tuple(v) if isinstance(v, list) else v for v in read_numbers(data))
 
 
 def _decode_free(data: Any) -> tuple[str, ...] | dict[str, float]:
@@ -167,6 +174,10 @@ def _decode(kind: Any, data: Mapping[str, Any]) -> Any:
                 made[field.name] = _decode_effect(value)
             case "alternatives":
                 made[field.name] = tuple(_decode_effect(e) for e in value)
+            case "outputs" if kind is Gap:
+                made[field.name] = tuple(_decode(Gap, part) for part in value)
+            case "outputs" | "forces":
+                made[field.name] = tuple(tuple(read_numbers(row)) for row in value)
             case "equivalents" | "records" | "ar" | "ma":
                 made[field.name] = tuple(value)
             case _:

@@ -82,6 +82,8 @@ def find_log_error(
     # The heads are fitted at the given values, with the noise alone free: a gross error shows.
     heads = [r[: THRESHOLD.log_error_samples] for r in records]
     as_logged = _measure(loop, heads, None)
+    if not loop.equations().siso:
+        return None
     found: list[tuple[float, str]] = []
     for words, input_factor, output_factor in REPAIRS:
         if _measure(loop, _repair(heads, input_factor, output_factor), None, output_factor) < (

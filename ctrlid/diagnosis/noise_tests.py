@@ -1,8 +1,9 @@
 """Step 3: whether innovations are noise: tests that name nothing but miss little."""
 
+import itertools
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 import numpy as np
@@ -38,7 +39,8 @@ class NoiseTests:
     """Probabilities that the innovations are noise, by test, and where they are not.
 
     `axes` holds for each quantity its values at the samples that count, `of_noise` names the tests
-    of what no effect explains, such as heavy tails.
+    of what no effect explains, such as heavy tails. Of several outputs `outputs` holds the same of
+    each, by name, and the tests of one are called after it.
     """
 
     p_values: Mapping[str, float]
@@ -46,6 +48,7 @@ class NoiseTests:
     axes: Mapping[str, Array]
     of_noise: frozenset[str] = frozenset()
     alpha: float = field(default_factory=lambda: THRESHOLD.false_alarm)
+    outputs: Mapping[str, "NoiseTests"] = field(default_factory=dict)
 
     @property
     def worst(self) -> tuple[str, float]:
@@ -103,6 +106,57 @@ def run_noise_tests(fit: Fit) -> NoiseTests:
     """
     if not math.isfinite(fit.value):
         return NoiseTests({"following the record": 0.0}, np.zeros(0), {})
+    if fit.plant.e.siso:
+        found = _test_output(fit, fit.standardized)
+        p_values = {**found.p_values, **run_constancy_tests(fit, found.axes)}
+        return replace(found, p_values=p_values)
+    return _test_several_outputs(fit)
+
+
+def _test_several_outputs(fit: Fit) -> NoiseTests:
+    """Test the innovations of each output, and those of all together.
+
+    Each output is given the others of the same sample that were processed before it, so that the
+    innovations of a right model are white together.
+    """
+    each = {
+        name: _test_output(fit, [z[:, k] for z in fit.standardized])
+        for k, name in enumerate(fit.plant.e.outputs)
+    }
+    p_values = {f"{test} of {name}": p for name, one in each.items()
+                for test, p in one.p_values.items()}  # fmt: skip
+    of_noise = {f"{test} of {name}" for name, one in each.items() for test in one.of_noise}
+    p_values["whiteness across outputs"] = _test_across(fit)
+    parts: dict[str, list[Array]] = {}
+    for z, out, data in zip(fit.standardized, fit.filtered, fit.data, strict=True):
+        keep = np.isfinite(z)
+        for name, values in _find_axes(fit, out, data).items():
+            every = np.broadcast_to(values[:, None], keep.shape)
+            parts.setdefault(name, []).append(every[keep])
+    axes = {name: np.concatenate(v) for name, v in parts.items()}
+    p_values |= run_constancy_tests(fit, axes)
+    z = np.concatenate([part[np.isfinite(part)] for part in fit.standardized])
+    return NoiseTests(p_values, z, axes, frozenset(of_noise), outputs=each)
+
+
+def _test_across(fit: Fit) -> float:
+    r"""Return the probability that innovations of different outputs are as alike by chance.
+
+    .. math:: n \sum_{i \ne j} \sum_{\tau > 0} \hat\rho_{ij}(\tau)^2 \sim \chi^2
+    """
+    value, df = 0.0, 0
+    for z in fit.standardized:
+        filled = np.nan_to_num(z)
+        n = int(np.isfinite(z).all(axis=1).sum())
+        for i, j in itertools.permutations(range(z.shape[1]), 2):
+            rho = compute_lagged_products(filled[:, i], filled[:, j], THRESHOLD.lags)[1:] / n
+            value += float(n * np.sum(rho**2))
+            df += THRESHOLD.lags
+    return float(stats.chi2.sf(value, max(df, 1)))
+
+
+def _test_output(fit: Fit, standardized: Sequence[Array]) -> NoiseTests:
+    """Test the standardized innovations of one output, but for the constancy of parameters."""
     parts: dict[str, list[Array]] = {}
     white = cross = 0.0
     white_df = cross_df = 0
@@ -110,7 +164,7 @@ def run_noise_tests(fit: Fit) -> NoiseTests:
     sizes, sizes_df = 0.0, 0
     # Fitted coefficients of the noise take as many correlations to zero.
     p = len(fit.theta) + len(fit.noise.ar) + len(fit.noise.ma)
-    for z, out, data in zip(fit.standardized, fit.filtered, fit.data, strict=True):
+    for z, out, data in zip(standardized, fit.filtered, fit.data, strict=True):
         keep = np.isfinite(z)
         filled = np.where(keep, z, 0.0)
         n = int(keep.sum())
@@ -124,7 +178,10 @@ def run_noise_tests(fit: Fit) -> NoiseTests:
             products = compute_lagged_products(size, size, THRESHOLD.lags)
             sizes += portmanteau(products[1:] / products[0], n, short=False)
             sizes_df += THRESHOLD.lags
-        value, df = _regress_on_past(filled, keep, data.u, data.r)
+        past = [data.u, data.r]
+        if not fit.plant.e.siso:
+            past = [*data.u.T, *_list_references(data)]
+        value, df = _regress_on_past(filled, keep, past)
         cross += value
         cross_df += df
         lines.append(_test_line(filled, n))
@@ -158,14 +215,23 @@ def run_noise_tests(fit: Fit) -> NoiseTests:
         p_values[f"mean by {name}"] = mean
         p_values[f"size by {name}"] = square
         of_noise.add(f"size by {name}")
-    p_values |= run_constancy_tests(fit, axes)
     return NoiseTests(p_values, z, axes, frozenset(of_noise))
 
 
-def _regress_on_past(z: Array, keep: Array, u: Array, r: Array) -> tuple[float, int]:
+def _list_references(data: FilterData) -> list[Array]:
+    """Return the references of a record of several signals, held where it is not valid."""
+    record = data.record
+    if record.r is None:
+        return []
+    seen = record.valid_outputs.any(axis=0)
+    last = np.maximum.accumulate(np.where(seen, np.arange(len(record)), 0))
+    return [row[last] for row in np.reshape(record.r, (-1, len(record)))]
+
+
+def _regress_on_past(z: Array, keep: Array, past: Sequence[Array]) -> tuple[float, int]:
     """Return the gain of regressing innovations on past signals, and its degrees of freedom."""
     columns = []
-    for signal in (u, r):
+    for signal in past:
         change = np.diff(signal, prepend=signal[0])
         if np.std(change) > 0:
             columns += [np.roll(change, k) for k in THRESHOLD.past_lags]
@@ -237,6 +303,8 @@ def _find_axes(fit: Fit, out: Filtered, data: FilterData) -> dict[str, Array]:
     """Return the quantities in whose bins the innovations are looked at, by name."""
     e = fit.plant.e
     states = out.trajectory.predicted
+    if not e.siso:
+        return _find_several_axes(fit, out, data)
     # The input of the same sample is computed from the very output that is predicted.
     axes = {"time": data.t, "input": np.concatenate([data.u[:1], data.u[:-1]])}
     axes["input change"] = np.diff(axes["input"], prepend=axes["input"][0])
@@ -247,6 +315,20 @@ def _find_axes(fit: Fit, out: Filtered, data: FilterData) -> dict[str, Array]:
         axes["velocity" if len(e.velocities) == 1 else e.states[k]] = states[:, k]
     if data.record.r is not None:
         axes["reference"] = data.r
+    return {name: v for name, v in axes.items() if np.ptp(v) > 0}
+
+
+def _find_several_axes(fit: Fit, out: Filtered, data: FilterData) -> dict[str, Array]:
+    """Return the quantities of a plant with several signals, each by its own name."""
+    e = fit.plant.e
+    axes = {"time": data.t}
+    for name, u in zip(e.inputs, data.u.T, strict=True):
+        axes[name] = np.concatenate([u[:1], u[:-1]])
+        axes[f"change of {name}"] = np.diff(axes[name], prepend=axes[name][0])
+    for k in range(len(e.states) - len(e.rest)):
+        axes[e.states[k]] = out.trajectory.predicted[:, k]
+    for name, r in zip(data.record.signals.get("r", ()), _list_references(data), strict=True):
+        axes[f"reference {name}"] = r
     return {name: v for name, v in axes.items() if np.ptp(v) > 0}
 
 

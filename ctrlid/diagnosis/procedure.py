@@ -12,11 +12,11 @@ from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from .._base.interruption import Budget, Stopped, check_seconds, hold_interrupt
 from .._base.jobs import check_jobs, share_out
 from .._base.rounding import keep_numpy_quiet
-from .._base.signals import require_one_signal
 from ..data.record import Record
 from ..data.several_records import as_records, order_model_and_data, require_valid_samples
 from ..effects import CATALOGUE, AbstractEffect
 from ..loop.loop import Loop
+from ..loop.wiring import match_signals
 from ..validation.record_audit import Audit
 from ..validation.reproduction import OPEN_LOOP
 from .answer import assemble_answer, name_records
@@ -184,9 +184,10 @@ def diagnose(
     check_catalogue(catalogue)
     loop, record = order_model_and_data(loop, record)
     records = as_records(record)
-    require_one_signal("diagnose", loop, records)
     require_valid_samples(records, "record=")
     given = make_loop(loop, records[0])
+    if not given.equations().siso:
+        records = tuple(match_signals(one, given.equations()) for one in records)
     loop = with_units_of(given, records[0])
     fresh = choose_fresh_data(loop, records, None if validation is None else as_records(validation))
     jobs = check_jobs(jobs)
@@ -238,7 +239,8 @@ def _answer_question(q: Question) -> tuple[Diagnosis, Search]:
         search = refuse_larger_noise(search, is_larger)
     else:
         q.end()
-    q = replace(q, fresh=lengthen_horizon(q.loop, search, q.fresh))
+    fresh = lengthen_horizon(q.loop, search, q.fresh)
+    q = replace(q, fresh=fresh.weigh_outputs(search.final))
     helps = make_fresh_data_test(q.fresh)
     if search.finished and (search.found or not search.after.passed):
         # A wrong sign or unit in the log makes the plant look as if almost anything were missing.
@@ -270,7 +272,11 @@ def _answer_question(q: Question) -> tuple[Diagnosis, Search]:
     q.tell("writing the report")
     read = (*readout.found, *([steps] if steps else []))
     result = assemble_answer(q.loop, q.records, search, summary, read)
-    worth = result.verdict not in COMPLETE and _is_worth_simulating(q.fresh, base.records)
+    worth = (
+        q.loop.equations().siso
+        and result.verdict not in COMPLETE
+        and _is_worth_simulating(q.fresh, base.records)
+    )
     if worth and search.finished:
         other = q.attempt(lambda: _answer_by_simulation(q, search, summary.gap, read), None)
         return other or (result, search)

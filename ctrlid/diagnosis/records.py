@@ -9,6 +9,7 @@ import control as ct
 import numpy as np
 
 from .._base.errors import CtrlidError
+from .._base.signals import require_one_signal
 from .._base.text import write_list
 from ..data.record import Record
 from ..effects import AbstractEffect, InputDelay, InputOffset, Quantization, SensorSaturation
@@ -17,7 +18,7 @@ from ..estimation.likelihood.likelihood import Fit
 from ..loop.loop import Loop
 from ..physics.conversions import to_transfer_function
 from ..physics.linearization import OperatingPoint
-from ..validation.record_audit import Audit, audit
+from ..validation.record_audit import Audit, AuditFinding, audit
 from .thresholds import THRESHOLD
 
 ROUNDING = 12  # Rounding to steps q adds a variance of q^2 / 12.
@@ -28,6 +29,7 @@ def make_loop(loop: Any, record: Record) -> Loop:
     """Return the loop; a transfer function becomes one around the means of the record."""
     if isinstance(loop, Loop):
         return loop
+    require_one_signal("diagnose", record)
     if not isinstance(loop, ct.TransferFunction):
         raise CtrlidError(
             "diagnose needs a Loop(plant, controller, dt=..., at=..., free=...) or a transfer "
@@ -45,9 +47,7 @@ def make_loop(loop: Any, record: Record) -> Loop:
 
 def with_units_of(loop: Loop, record: Record) -> Loop:
     """Return the loop with the units of a record, in which the sizes of effects will be written."""
-    e = loop.equations()
-    own = {name: record.units[key] for key, name in (("u", e.inputs[0]), ("y", e.outputs[0]))
-           if record.units.get(key)}  # fmt: skip
+    own = {name: unit for name, unit in _list_units(loop, record) if unit}
     return replace(loop, units={**loop.units, **own}) if own else loop
 
 
@@ -59,7 +59,12 @@ def look_over_records(
     for k, record in enumerate(records):
         found = audit(record, loop)
         audits.append(found)
-        hopeless = [f.text for f in found.findings if f.kind in HOPELESS and f.channel != "r"]
+        references = ("r", *record.signals.get("r", ())) if record.y.ndim == 1 else ()
+        hopeless = [
+            f.text
+            for f in found.findings
+            if f.kind in HOPELESS and f.channel not in references and not _is_still_input(f, record)
+        ]
         if hopeless:
             raise CtrlidError(
                 f"{record.name or 'the record'} cannot be diagnosed: {' '.join(hopeless)}"
@@ -69,12 +74,19 @@ def look_over_records(
     return tuple(audits), tuple(remarks)
 
 
+def _is_still_input(finding: AuditFinding, record: Record) -> bool:
+    """Whether it is one of several inputs that stays constant, while another moves."""
+    inputs = record.signals["u"]
+    moves = np.ptp(np.reshape(record.u, (len(inputs), -1)), axis=1) > 0
+    return len(inputs) > 1 and finding.channel in inputs and bool(moves.any())
+
+
 def _compare_units(loop: Loop, record: Record) -> list[str]:
     """Say where a record has other units than the plant, or none."""
-    e, of_plant = loop.equations(), loop.known_units
+    of_plant, several = loop.known_units, not loop.equations().siso
     remarks, silent = [], []
-    for key, name in (("u", e.inputs[0]), ("y", e.outputs[0])):
-        there, here = record.units.get(key, ""), of_plant.get(name, "")
+    for (name, there), key in zip(_list_units(loop, record), _list_keys(loop), strict=True):
+        here, key = of_plant.get(name, ""), name if several else key
         if here and not there:
             silent.append(f"{key} in {here}")
         elif here and there != here:
@@ -92,9 +104,26 @@ def _compare_units(loop: Loop, record: Record) -> list[str]:
     return remarks
 
 
+def _list_keys(loop: Loop) -> list[str]:
+    """Return for each input and then each output of a loop which of u and y it is."""
+    e = loop.equations()
+    return ["u"] * len(e.inputs) + ["y"] * len(e.outputs)
+
+
+def _list_units(loop: Loop, record: Record) -> list[tuple[str, str]]:
+    """Return the unit of each input and output in a record, by its name in the loop."""
+    e = loop.equations()
+    found = []
+    for key, names in (("u", e.inputs), ("y", e.outputs)):
+        given = record.units.get(key, "")
+        each = given if isinstance(given, tuple) else (given,) * len(names)
+        found += list(zip(names, each, strict=True))
+    return found
+
+
 def find_repeat_periods(parts: Sequence[Record], audits: Sequence[Audit]) -> list[int]:
     """Return after how many samples each record repeats itself; empty if one does not."""
-    if len(parts) != len(audits):
+    if len(parts) != len(audits) or parts[0].y.ndim == 2:
         return []
     periods = [a.repeats[0] for a in audits]
     whole = [p and len(part) // p for p, part in zip(periods, parts, strict=True)]
@@ -124,7 +153,8 @@ def read_limits(
     catalogue: Sequence[type[AbstractEffect]],
 ) -> ReadLimits:  # fmt: skip
     """Return the loop with the sensor's limits and the records without samples that sit on them."""
-    found = read_clipping(records, audits, catalogue)
+    # A reading of several outputs takes no limits and no steps: the audit tells of them.
+    found = read_clipping(records, audits, catalogue) if loop.equations().siso else None
     if found is None:
         return ReadLimits(loop, tuple(records), ())
     used = tuple(censor_record(record, found.effect) for record in records)
@@ -176,6 +206,8 @@ def read_steps(
     Rounding to steps q adds a variance of :math:`q^2/12`; knowing it, the likelihood gains
     :math:`\tfrac{n}{2} \ln r / (r - q^2/12)`.
     """
+    if not fit.plant.e.siso:
+        return None
     step = max((float(a.quantum.get("y", 0.0)) for a in audits), default=0.0)
     noise = float(np.mean(fit.sensor))
     share = step**2 / ROUNDING / noise if noise > 0 else 0.0

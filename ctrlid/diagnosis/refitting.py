@@ -90,8 +90,10 @@ def _compute_null_likelihood(fit: Fit) -> float:
     """Return the likelihood of outputs that scatter about their mean, whatever drives them."""
     value = 0.0
     for data, keep in zip(fit.data, fit.counts, strict=True):
-        y = data.y[keep]
-        value -= 0.5 * len(y) * (math.log(2 * math.pi * float(np.var(y)) + THRESHOLD.tiny) + 1)
+        rows = zip(np.reshape(data.y, (len(data.y), -1)).T,
+                   np.reshape(keep, (len(keep), -1)).T, strict=True)  # fmt: skip
+        for y in (row[use] for row, use in rows):
+            value -= 0.5 * len(y) * (math.log(2 * math.pi * float(np.var(y)) + THRESHOLD.tiny) + 1)
     return value
 
 

@@ -81,7 +81,7 @@ def fuse_effects(model: Model, given: int, steps: Sequence[Round]) -> Model:
     Dry friction found first and a constant force after it may be one asymmetric friction.
     """
     effects = model.fitted.effects
-    richer = {t.name: t.effect for s in steps for t in s.trials}
+    richer = {t.key: t.effect for s in steps for t in s.trials}
     for k, other in itertools.permutations(range(given, len(effects)), 2):
         for start in richer.values():
             if not contains(start, effects[k]):

@@ -8,6 +8,7 @@ from typing import Any
 import control as ct
 import numpy as np
 
+from .._base.arrays import Array
 from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from ..data.record import Record
 from ..estimation.likelihood.likelihood import (
@@ -81,8 +82,8 @@ def _simulate_record(
     y, u = np.array(record.y), np.array(record.u)
     for part in find_long_stretches(record, THRESHOLD.shortest_segment):
         stretch = prepare_stretch(simulator, record, part, start_time=first, follow=follows)
-        noise = draw_noise(model.fit, sensor, len(stretch.d), seed + part.start)
-        y[part], u[part] = stretch.run(simulator, noise)
+        noise = draw_noise(model.fit, sensor, stretch.d.shape[-1], seed + part.start)
+        y[..., part], u[..., part] = stretch.run(simulator, noise)
     return replace(record, y=y, u=u)
 
 
@@ -200,7 +201,9 @@ def follow_record(loop: Loop, record: Record) -> Loop | None:
     """
     if loop.equations().feedthrough:  # No controller acts around it without delay.
         return None
-    u, y = (max(float(np.std(v[record.valid])), THRESHOLD.tiny) for v in (record.u, record.y))
+    use = record.valid_samples
+    u, y = (np.maximum(np.std(np.atleast_2d(v)[:, use], axis=1), THRESHOLD.tiny)
+            for v in (record.u, record.y))  # fmt: skip
     try:
         controller = _design_normalized_controller(loop.linearize(), loop.dt, u, y)
         made = replace(loop, controller=controller)
@@ -209,7 +212,7 @@ def follow_record(loop: Loop, record: Record) -> Loop | None:
         return None
 
 
-def _design_normalized_controller(model: Any, dt: float, u: float, y: float) -> Any:
+def _design_normalized_controller(model: Any, dt: float, u: Array, y: Array) -> Any:
     """Return the controller for a linear model by the sizes of its input and output.
 
     None where python-control finds no solution of the Riccati equations.
@@ -217,15 +220,15 @@ def _design_normalized_controller(model: Any, dt: float, u: float, y: float) -> 
     try:
         plant = ct.ss(model)
         plant = plant if plant.dt else ct.sample_system(plant, dt, "zoh")
-        a, b, c = plant.A, plant.B * u, plant.C / y
-        feedback, _, _ = ct.dlqr(a, b, c.T @ c, np.eye(1))
-        gain, _, _ = ct.dlqe(a, np.eye(len(a)), c, b @ b.T, np.eye(1))
+        a, b, c = plant.A, plant.B * u, plant.C / y[:, None]
+        feedback, _, _ = ct.dlqr(a, b, c.T @ c, np.eye(len(u)))
+        gain, _, _ = ct.dlqe(a, np.eye(len(a)), c, b @ b.T, np.eye(len(y)))
     except ValueError:
         return None
     # The estimate is predicted: what is measured acts at the next sample.
     through = a @ gain
     matrix = a - b @ feedback - through @ c
-    return ct.ss(matrix, through / y, feedback * u, 0, plant.dt)
+    return ct.ss(matrix, through / y, feedback * u[:, None], 0, plant.dt)
 
 
 def forgive_rounding(tests: NoiseTests, model: Model, steps: Readout) -> NoiseTests:

@@ -72,7 +72,8 @@ def _wrap_text(text: str, indent: int, hang: int | None = None) -> list[str]:
 
 def write_gap_lines(gap: Gap) -> list[str]:
     """Return the sizes of the gap as aligned lines."""
-    rows = [f"    {label:<20}{size:>12}   {times}"
+    wide = max(len(label) for label, *_ in wording.list_gap_rows(gap)) if gap.outputs else 0
+    rows = [f"    {label:<{max(wide + 1, 20)}}{size:>12}   {times}"
             for label, size, times in wording.list_gap_rows(gap)]  # fmt: skip
     head = _wrap_text(wording.introduce_gap(gap), 2, hang=4)
     words = (wording.describe_shrinking(gap), wording.describe_trivial(gap))

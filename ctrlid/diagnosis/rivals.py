@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from .._base.arrays import Array
+from ..effects.base import name_at_place
 from ..estimation.likelihood.maximization import maximize
 from .candidates import Trial, contains, is_same_kind
 from .fitted_model import Model, compute_log_terms
@@ -100,7 +101,7 @@ def find_rivals(best: Trial, others: Sequence[Trial], sure: bool = True) -> tupl
         # A larger model that predicts the same contains the best one, and pays for nothing; but one
         # that gains more may be right (a Stribeck curve hardly told from dry friction), and one
         # whose further part may be large, for all the record says, cannot be excluded.
-        alike = trial.name in type(best.effect).look_alikes
+        alike = trial.resembles(best)
         nothing = (
             trial.gain < best.gain + THRESHOLD.close
             and _compute_spread_of_sum(mine - theirs) < THRESHOLD.same_predictions
@@ -144,8 +145,8 @@ def compare_effects(
         if mine.net_gain <= THRESHOLD.gate:
             fewer, left = weigh_effects(refit_noise(smaller), given, steps)
             return compare_effects(fewer, left, given, steps, work)
-        there = {type(e).__name__ for e in smaller.loop.effects}
-        rest = [t for t in _find_close(mine, steps) if t.name not in there]
+        there = {name_at_place(e) for e in smaller.loop.effects}
+        rest = [t for t in _find_close(mine, steps) if t.key not in there]
         again = work(
             lambda t, smaller=smaller: refit_candidate(smaller, screen_at(smaller, t.fitted)), rest
         )
@@ -175,15 +176,14 @@ def _find_close(mine: Trial, steps: Sequence[Round]) -> list[Trial]:
 
     Or that one which resembles it won, whose place it took since.
     """
-    alike = set(type(mine.effect).look_alikes)
-    won = [s for s in steps if s.best is not None and s.best.name == mine.name]
-    lost = [s for s in steps if s.best is not None and s.best.name in alike]
+    won = [s for s in steps if s.best is not None and s.best.key == mine.key]
+    lost = [s for s in steps if s.best is not None and s.best.resembles(mine)]
     for step in [*won, *lost]:
         assert step.best is not None
         near = [
             t for t in step.trials
-            if t.name != mine.name and t.net_gain > THRESHOLD.gate
-            and (t.name in alike or t.net_gain > THRESHOLD.near_winner * step.best.net_gain)
+            if t.key != mine.key and t.net_gain > THRESHOLD.gate
+            and (t.resembles(mine) or t.net_gain > THRESHOLD.near_winner * step.best.net_gain)
         ]  # fmt: skip
         return near[: THRESHOLD.looked_at]
     return []

@@ -15,6 +15,7 @@ import numpy as np
 from .._base.errors import CtrlidError
 from .._base.files import replace_file
 from ..effects import AbstractEffect
+from ..effects.base import name_at_place
 from ..loop.loop import Loop
 from ..physics.linearization import OperatingPoint
 
@@ -49,7 +50,7 @@ class SavedLoop:
     parameters : dict of str to float
         Values of the parameters of plant and effects.
     units : dict of str to dict
-        Units of the parameters of effects, by class name.
+        Units of the parameters of effects, by class name, with the place where there are several.
     known_units : dict of str to str
         Units of signals, states and parameters of the plant, by name.
     """
@@ -78,7 +79,7 @@ class SavedLoop:
 def list_units(loop: Loop | SavedLoop, effect: AbstractEffect) -> dict[str, str]:
     """Return the unit of each parameter of an effect, by a loop or by what was saved of it."""
     if isinstance(loop, SavedLoop):
-        return loop.units.get(type(effect).__name__, effect.units())
+        return loop.units.get(name_at_place(effect), effect.units())
     return effect.units(loop)
 
 
@@ -162,7 +163,7 @@ def _list_effect_units(found: Diagnosis) -> dict[str, dict[str, str]]:
     """Return the units of all effects that a diagnosis speaks of, by class name."""
     spoken = [*found.loop.effects, *(c.effect for c in found.ranking)]
     spoken += [e for f in found.added for e in (f.effect, *f.alternatives)]
-    return {type(e).__name__: list_units(found.loop, e) for e in spoken}
+    return {name_at_place(e): list_units(found.loop, e) for e in spoken}
 
 
 # JSON has no such numbers, so that they are written as texts.

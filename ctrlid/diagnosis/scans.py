@@ -12,16 +12,18 @@ from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from .._base.statistics import pseudo_inverse
 from ..data.record import Record
 from ..effects import AbstractEffect
+from ..effects.context import find_output_of
 from ..estimation.likelihood.kalman_filter import run_filter
 from .candidates import NUMERICAL_FAILURES, Objection, Trial
 from .fitted_model import Model
+from .places import find_force_channel, find_position
 from .screening import screen_candidate, screen_starts
 from .thresholds import THRESHOLD
 
 
 def score_shapes(
     model: Model, shapes: Sequence[Array], parameter: str | None = None, width: int = 1,
-    place: Literal["force", "output"] = "force",
+    place: Literal["force", "output"] = "force", at: str = "",
 ) -> tuple[Array, Array]:  # fmt: skip
     r"""Return what forces of given shapes would gain, with the model's parameters moving along.
 
@@ -43,6 +45,8 @@ def score_shapes(
         Neighbouring shapes that belong together, such as a sine and a cosine.
     place : {"force", "output"}, optional
         Whether the shapes are forces, or are added to the reading.
+    at : str, optional
+        The velocity or the output, of several.
 
     Returns
     -------
@@ -69,17 +73,21 @@ def score_shapes(
             strict=True,
         ):
             part = shape[:, None, first : first + size]
-            shown = np.zeros((len(shape), size))
+            shown = np.zeros((*lin.output.shape, size))
             if place == "output":
-                shown = shape[:, first : first + size]
+                seen = (slice(None), plant.e.outputs.index(at)) if at else slice(None)
+                shown[seen] = shape[:, first : first + size]
                 extra = np.zeros((*lin.dp.shape[:2], size))
             elif parameter is None:
-                extra = lin.b.sum(axis=2)[:, :, None] * part
+                pushed = lin.b.sum(axis=2)
+                if at:
+                    pushed = lin.b[:, :, find_force_channel(plant.e, at)]
+                extra = pushed[:, :, None] * part
             else:
                 extra = lin.dp[:, :, plant.names.index(parameter)][:, :, None] * part
             wide = replace(
                 lin, dp=np.concatenate([lin.dp, extra], axis=2),
-                hp=np.concatenate([lin.hp, shown], axis=1),
+                hp=np.concatenate([lin.hp, shown], axis=-1),
             )  # fmt: skip
             out = run_filter(plant, data, wide, fit.noise, columns=p + size)
             slopes = out.slopes[keep]
@@ -100,9 +108,13 @@ def score_shapes(
 
 @dataclass(frozen=True, eq=False)
 class ModelSight:
-    """What a fitted model sees of its records, for effects that look for their place."""
+    """What a fitted model sees of its records, for effects that look for their place.
+
+    Of a plant with several signals, from the place `at` where the effect acts.
+    """
 
     model: Model
+    at: str = ""
 
     @property
     def dt(self) -> float:
@@ -117,18 +129,33 @@ class ModelSight:
     @property
     def inputs(self) -> Array:
         """The recorded inputs that count, one record after the other [input unit]."""
-        return np.concatenate([data.u[data.valid] for data in self.model.data])
+        inputs = self.model.plant.e.inputs
+        column = inputs.index(self.at) if self.at in inputs else 0
+        if self.model.plant.e.siso:
+            return np.concatenate([data.u[data.valid] for data in self.model.data])
+        return np.concatenate([data.u[data.valid.any(axis=1), column] for data in self.model.data])
 
     @property
     def outputs(self) -> tuple[Array, ...]:
         """The recorded outputs, by record [output unit]."""
-        return tuple(record.y for record in self.model.records)
+        if self.model.plant.e.siso:
+            return tuple(record.y for record in self.model.records)
+        return tuple(
+            np.reshape(record.y, (-1, len(record)))[self._output] for record in self.model.records
+        )
+
+    @property
+    def _output(self) -> int:
+        """The output of the place, or the one that shows its position."""
+        e = self.model.plant.e
+        return e.outputs.index(self.at) if self.at in e.outputs else find_output_of(e, self.at)
 
     @property
     def travel(self) -> float:
         """How far the position moves on samples that count [output unit]."""
         positions, counts = self.positions(), self.model.fit.counts
-        return max(float(np.ptp(x[keep])) for x, keep in zip(positions, counts, strict=True))
+        seen = [keep if keep.ndim == 1 else keep.any(axis=1) for keep in counts]
+        return max(float(np.ptp(x[keep])) for x, keep in zip(positions, seen, strict=True))
 
     @property
     def block(self) -> int:
@@ -144,7 +171,8 @@ class ModelSight:
 
     def positions(self) -> tuple[Array, ...]:
         """Return the filtered position along each record [output unit]."""
-        return self._filtered(self.model.plant.position)
+        plant = self.model.plant
+        return self._filtered(find_position(plant.e, self.at, plant.position))
 
     def _filtered(self, k: int) -> tuple[Array, ...]:
         return tuple(out.trajectory.filtered[:, k] for out in self.model.fit.filtered)
@@ -157,6 +185,7 @@ class ModelSight:
     def strongest_line(self) -> float:
         """Return the frequency of the strongest line in the innovations [Hz]."""
         z = max(self.model.fit.standardized, key=len)
+        z = z if z.ndim == 1 else z[:, self._output]
         return find_strongest_line(np.nan_to_num(z), self.dt)
 
     def score_shapes(
@@ -164,7 +193,7 @@ class ModelSight:
         place: Literal["force", "output"] = "force",
     ) -> tuple[Array, Array]:  # fmt: skip
         """Return what forces of given shapes would gain, and the sizes that gain it."""
-        return score_shapes(self.model, shapes, parameter, width, place)
+        return score_shapes(self.model, shapes, parameter, width, place, self.at)
 
 
 def find_strongest_line(errors: Array, dt: float) -> float:
@@ -192,7 +221,12 @@ def is_line_of_reference(record: Record, frequency: float) -> bool:
     """
     if record.r is None:
         return False
-    keep = record.valid & np.isfinite(record.r)
+    if record.r.ndim == 2:
+        return any(
+            is_line_of_reference(record.select(r=name, y=record.signals["y"][0]), frequency)
+            for name in record.signals["r"]
+        )
+    keep = record.valid_samples & np.isfinite(record.r)
     if not keep.any() or np.ptp(record.r[keep]) == 0:
         return False
     r = record.r[keep] - np.mean(record.r[keep])
@@ -219,7 +253,7 @@ def scan_candidate(model: Model, effect: AbstractEffect) -> Trial:
         The best place; the penalty of the scan is in `scan_penalty`.
     """
     try:
-        scan = effect.scan(ModelSight(model))
+        scan = effect.scan(ModelSight(model, effect.at))
         if scan is None:
             return screen_candidate(model, effect)
         if not scan.starts:

@@ -86,28 +86,25 @@ def _refit_promising(
         return max((*done.values(), *tried), key=lambda t: t.net_gain)
 
     leader = tried[0]
-    wanted = {t.name for t in tried[: THRESHOLD.refitted_first]} | set(
-        type(leader.effect).look_alikes
-    )
+    wanted = {t.key for t in tried[: THRESHOLD.refitted_first]}
+    wanted |= {t.key for t in tried if t.resembles(leader)}
     promising = [t for t in tried if t.score > THRESHOLD.faint * (THRESHOLD.gate + t.full_penalty)]
     first = [
-        t
-        for t in promising
-        if t.name in wanted or t.score > THRESHOLD.refitted_share * leader.score
+        t for t in promising if t.key in wanted or t.score > THRESHOLD.refitted_share * leader.score
     ]
     fit([(t, e, None) for t in first for e in t.others])
     best = fit([(t, t, None) for t in first])
     if math.isfinite(best.net_gain):
-        alike = set(type(best.effect).look_alikes)
+        winner = best
         fit([(t, t, None) for t in tried
-             if id(t) not in done and t.name in alike and t.score > -math.inf])  # fmt: skip
+             if id(t) not in done and t.resembles(winner) and t.score > -math.inf])  # fmt: skip
         best = fit([(t, e, None) for t in tried
-                    if id(t) in done and t.name in {best.name, *alike}
-                    for e in t.effect.other_starts(ModelSight(base))])  # fmt: skip
+                    if id(t) in done and (t.key == winner.key or t.resembles(winner))
+                    for e in t.effect.other_starts(ModelSight(base, t.effect.at))])  # fmt: skip
         stuck = [t for t in _find_stuck(best, tried) if id(t) in done]
         near = without_random_force(best.model)
         fit([(t, done[id(t)].fitted, near) for t in stuck])
-        best = fit([(t, m, None) for t in stuck for m in more if m is not t and m.name == t.name])
+        best = fit([(t, m, None) for t in stuck for m in more if m is not t and m.key == t.key])
         apart = [
             k
             for k, t in done.items()
@@ -135,10 +132,15 @@ def _find_stuck(best: Trial, tried: Sequence[Trial]) -> list[Trial]:
     """
     if not best.net_gain > 0:
         return []
-    own = [t for t in tried if t.name == best.name or contains(best.effect, t.effect)]
-    kin = {name for t in own for name in type(t.effect).look_alikes} - {best.name}
+    own = [t for t in tried if t.key == best.key or contains(best.effect, t.effect)]
     most = len(best.effect.parameters())
-    plain = [t for t in tried if t.name in kin and len(t.effect.parameters()) <= most]
+    plain = [
+        t
+        for t in tried
+        if t.key != best.key
+        and any(t.resembles(o) for o in own)
+        and len(t.effect.parameters()) <= most
+    ]
     return [t for t in plain if has_kinks(t.model)]
 
 
@@ -166,9 +168,8 @@ def _prefer_simplest(base: Model, trials: list[Trial]) -> list[Trial]:
         fewer = len(simple.effect.parameters()) < len(best.effect.parameters())
         if not fewer or simple.net_gain <= THRESHOLD.gate:
             continue
-        if (
-            best.gain - simple.gain > THRESHOLD.simpler_nearly * best.gain
-            or simple.name not in best.effect.look_alikes
+        if best.gain - simple.gain > THRESHOLD.simpler_nearly * best.gain or not simple.resembles(
+            best
         ):
             continue
         more = measure_gain_beyond_simple(base, best, simple)

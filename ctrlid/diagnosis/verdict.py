@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from .._base.text import write_number, write_p_value
 from ..effects import AbstractEffect
+from ..effects.base import name_at_place
 from ..estimation.likelihood.likelihood import Fit
 from .findings import BinnedErrors, Disturbance, Finding, Gap, SensorNoise, Verdict
 from .noise_tests import NoiseTests, choose_alarm_level
@@ -77,7 +78,7 @@ def find_doubt(
     """
     if len(effects) >= THRESHOLD.many_effects:
         return "so many effects together can describe almost any error"
-    for kind, count in Counter(type(e) for e in effects).items():
+    for (kind, _), count in Counter((type(e), e.at) for e in effects).items():
         if count > 1 and kind.doubt_of_several is not None:
             return kind.doubt_of_several
     if len(effects) >= THRESHOLD.some_effects and min(gains) < THRESHOLD.slight_effect * max(gains):
@@ -85,7 +86,7 @@ def find_doubt(
     for one, other in itertools.combinations(range(len(effects)), 2):
         alone = max(gains[one], gains[other]) < THRESHOLD.residue * total
         if alone and _are_look_alikes(effects[one], effects[other]):
-            names = [type(effects[k]).__name__ for k in (one, other)]
+            names = [name_at_place(effects[k]) for k in (one, other)]
             return (f"{names[0]} and {names[1]} are look-alikes, and either alone explains nearly "
                     "all of the error: both may stand in for one other effect")  # fmt: skip
     return None
@@ -93,6 +94,8 @@ def find_doubt(
 
 def _are_look_alikes(one: AbstractEffect, other: AbstractEffect) -> bool:
     """Whether one of two effects is known to resemble the other."""
+    if one.place == other.place and one.at != other.at:
+        return False
     names = type(one).__name__, type(other).__name__
     return names[1] in type(one).look_alikes or names[0] in type(other).look_alikes
 

@@ -14,6 +14,20 @@ def locate_errors(
     before: NoiseTests, after: NoiseTests, units: Mapping[str, str]
 ) -> tuple[BinnedErrors, ...]:
     """Return where the innovations are not noise, before and after; most telling first."""
+    if before.outputs:
+        each = [
+            place
+            for name, one in before.outputs.items()
+            for place in _locate_output(one, after.outputs[name], units, name)
+        ] if after.outputs else []  # fmt: skip
+        return tuple(sorted(each, key=lambda place: place.p_before))
+    return _locate_output(before, after, units)
+
+
+def _locate_output(
+    before: NoiseTests, after: NoiseTests, units: Mapping[str, str], output: str = ""
+) -> tuple[BinnedErrors, ...]:
+    """Return where the innovations of one output are not noise; it has a name among several."""
     found: list[BinnedErrors] = []
     for name, values in before.axes.items():
         if name not in after.axes or len(after.axes[name]) != len(values):
@@ -28,13 +42,13 @@ def locate_errors(
             for o in (before, after)
         )
         unit = units.get(name, "")
-        words = _describe_place(name, unit, edges, before.z, index, count)
-        found.append(BinnedErrors(name, unit, edges, was, now, p_was, p_now, words))
+        words = _describe_place(name, unit, edges, before.z, index, count, output)
+        found.append(BinnedErrors(name, unit, edges, was, now, p_was, p_now, words, output))
     return tuple(sorted(found, key=lambda place: place.p_before))
 
 
 def _describe_place(
-    name: str, unit: str, edges: Array, z: Array, index: Array, count: Array
+    name: str, unit: str, edges: Array, z: Array, index: Array, count: Array, output: str
 ) -> str:
     mean = np.bincount(index, z, minlength=len(count)) / count
     square = np.bincount(index, z**2, minlength=len(count)) / count
@@ -45,7 +59,9 @@ def _describe_place(
     place = f"at {name} from {edges[k]:.4g} to {edges[k + 1]:.4g} {unit}".rstrip()
     if strength[k] >= spread[k]:
         side = "above" if mean[k] > 0 else "below"
-        return (f"{place}, the output is {side} its prediction by {abs(mean[k]):.2g} standard "
+        what = output or "the output"
+        return (f"{place}, {what} is {side} its prediction by {abs(mean[k]):.2g} standard "
                 "deviations on average")  # fmt: skip
     side = "larger" if square[k] > 1 else "smaller"
-    return f"{place}, the one-step errors are {side} than noise"
+    errors = f"the one-step errors of {output}" if output else "the one-step errors"
+    return f"{place}, {errors} are {side} than noise"

@@ -10,7 +10,8 @@ import numpy as np
 
 from .._base.text import choose_prefix, write_list, write_number, write_p_value, write_quantity
 from ..effects import AbstractEffect, ReadingEffect
-from .findings import COMPLETE, BinnedErrors, Finding, Gap
+from ..effects.base import name_at_place
+from .findings import COMPLETE, BinnedErrors, Disturbance, Finding, Gap
 from .noise_tests import choose_alarm_level
 from .saving import list_units
 from .thresholds import THRESHOLD
@@ -88,7 +89,7 @@ def list_names(finding: Finding) -> list[str]:
     """
     same = [ARTICLES.get(name, name) for name in finding.equivalents]
     same = [f"the {name} of the plant" if name.startswith("parameter ") else name for name in same]
-    return list(dict.fromkeys([finding.name, *same, *finding.names[1:]]))
+    return list(dict.fromkeys([finding.names[0], *same, *finding.names[1:]]))
 
 
 def join_alternatives(names: Sequence[str]) -> str:
@@ -121,15 +122,28 @@ def explain_evidence() -> str:
 
 def introduce_gap(gap: Gap) -> str:
     """Say what the gap is."""
-    return (
+    text = (
         f"gap between model and record: RMS error of the {gap.name} of "
         f"{gap.samples or len(gap.time)} samples "
         "kept back"
     )
+    if gap.outputs:
+        names = write_list([part.output for part in gap.outputs])
+        text += f", of {names} together in units of their noise floors"
+    return text
 
 
 def list_gap_rows(gap: Gap) -> list[tuple[str, str, str]]:
     """Return what the gap is, how large, and how many times the noise floor, row by row."""
+    rows = _list_rows(gap)
+    for part in gap.outputs:
+        *sizes, (_, floor, _) = _list_rows(part)
+        rows += [(f"{label}, {part.output}", size, times) for label, size, times in sizes]
+        rows.append((f"noise floor, {part.output}", floor, ""))
+    return rows
+
+
+def _list_rows(gap: Gap) -> list[tuple[str, str, str]]:
     known = [v for v in (gap.floor, gap.after, gap.before) if 0 < v < math.inf]
     known = known or [v for v in (gap.given,) if 0 < v < math.inf]
     middle = math.exp(sum(map(math.log, known)) / len(known)) if known else 0.0
@@ -279,7 +293,7 @@ def describe_certainty(found: Diagnosis, finding: Finding) -> str:
     if many > 1:
         text += f"; ONE OF {many} EFFECTS that explain the record"
     else:
-        kinds = {type(c.effect).__name__ for c in found.ranking}
+        kinds = {name_at_place(c.effect) for c in found.ranking}
         count = len(kinds - set(list_names(finding)))
         text += f"; none of the {count} other effects of the catalogue explains the record as well"
     if found.verdict == "partly explained" and not isinstance(finding.effect, ReadingEffect):
@@ -290,7 +304,7 @@ def describe_certainty(found: Diagnosis, finding: Finding) -> str:
 def list_doubts(found: Diagnosis, finding: Finding) -> list[str]:
     """Say what else it could be, and which experiment would tell."""
     lines = []
-    apart = [e for e in finding.alternatives if type(e).__name__ not in finding.equivalents]
+    apart = [e for e in finding.alternatives if name_at_place(e) not in finding.equivalents]
     if apart:
         others = [f"{type(e).__name__} ({describe_parameters(found, e)})" for e in apart]
         lines.append(f"this record cannot distinguish it from {write_list(others)}")
@@ -339,7 +353,7 @@ def name_finding(finding: Finding) -> str:
     """Name the effect of a finding and say what it is."""
     what = finding.effect.sentence.rstrip(".")
     same = [n for n in list_names(finding) if n not in finding.names or n in finding.equivalents]
-    name = join_alternatives([finding.name, *same])
+    name = join_alternatives([finding.names[0], *same])
     return f"{name}: {what[:1].lower()}{what[1:]}" if what else name
 
 
@@ -355,7 +369,7 @@ def describe_size(found: Diagnosis, finding: Finding) -> str:
 
 def list_sensitivity_rows(found: Diagnosis) -> list[tuple[str, str]]:
     """Return the smallest visible size of each effect."""
-    tried = {type(c.effect).__name__: c.effect for c in found.ranking}
+    tried = {name_at_place(c.effect): c.effect for c in found.ranking}
     rows = []
     for key, size in found.sensitivity.items():
         label, _, name = key.partition(".")
@@ -368,10 +382,26 @@ def list_sensitivity_rows(found: Diagnosis) -> list[tuple[str, str]]:
 def describe_disturbance(found: Diagnosis) -> str:
     """Say how large the random force is, and in capitals if it may hide something."""
     d, unit = found.disturbance, found.gap.force_unit
+    if d.forces:
+        each = [f"{write_quantity(size, unit or '[force]')} RMS at {name}"
+                for name, size, unit in d.forces]  # fmt: skip
+        parts = [f"white ({write_list(each)})"]
+    elif found.gap.outputs:
+        parts = []
+    else:
+        parts = _list_forces(d, unit)
+    return _describe_parts(d, parts)
+
+
+def _list_forces(d: Disturbance, unit: str) -> list[str]:
     parts = [f"white ({write_quantity(d.white, unit)} RMS)"] if d.white else []
     if d.coloured:
         parts.append(f"coloured ({write_quantity(d.coloured, unit)} RMS, time constant "
                      f"{write_quantity(d.time_constant, 's')})")  # fmt: skip
+    return parts
+
+
+def _describe_parts(d: Disturbance, parts: Sequence[str]) -> str:
     if not parts:
         return "random force: none was found; the noise floor is due to sensor noise alone"
     words = " and ".join(parts)

@@ -340,6 +340,19 @@ class AbstractEffect:
         return (at if self.place == "input" else 0, at if self.place == "output" else 0, motion)
 
 
+def name_at_place(effect: AbstractEffect) -> str:
+    """Return the class of an effect, with its place on a plant that has several.
+
+    Examples
+    --------
+    >>> import ctrlid as cid
+    >>> name_at_place(cid.effects.CoulombFriction(fc=0.2, at="theta_dot"))
+    'CoulombFriction at theta_dot'
+    """
+    name = type(effect).__name__
+    return f"{name} at {effect.at}" if effect.at else name
+
+
 def _can_take(loop: Any, effect: AbstractEffect) -> bool:
     try:
         loop.with_effect(effect)

@@ -49,6 +49,17 @@ def find_motion(e: Equations, velocity: str = "") -> tuple[int, int] | None:
     return min(pairs, key=lambda pair: (pair[0] not in shown, pair), default=None)
 
 
+def find_output_of(e: Equations, velocity: str) -> int:
+    """Return the output that shows the position of a velocity, else the first."""
+    motion = find_motion(e, velocity)
+    if motion is not None:
+        shown = casadi.jacobian(e.output, e.x)
+        for k in range(len(e.outputs)):
+            if shown[k, :].sparsity().get_col() == [motion[0]]:
+                return k
+    return 0
+
+
 class Moment:
     """The signals of a loop at one moment, as symbols that understand arithmetic and numpy.
 

@@ -70,6 +70,8 @@ def equivalents(
     if isinstance(loop, type) or not callable(getattr(loop, "with_effect", None)):
         raise CtrlidError(f"equivalents needs a Loop as loop; given {type(loop).__name__}")
     base = loop.without_effect(effect) if effect in loop.effects else loop
+    if not base.equations().siso:
+        return _find_equivalents_at_places(effect, base, catalogue)
     name = type(effect).__name__
     if name == "InputDelay":
         return ("delay of the output",)
@@ -111,6 +113,36 @@ def equivalents(
         found |= new
         todo += new
     return (*sorted(found.keys() - {name}), *sorted(words))
+
+
+def _find_equivalents_at_places(
+    effect: AbstractEffect, loop: Any, catalogue: Sequence[type[AbstractEffect]]
+) -> tuple[str, ...]:
+    """Return what changes rates and outputs alike, of a plant with several signals."""
+    e = loop.equations()
+    if type(effect).__name__ == "InputDelay":
+        return ("delay of all outputs",)
+    velocities = [e.states[j] for j in e.velocities]
+    places = {"input": e.inputs, "output": e.outputs, "force": velocities}
+    found = []
+    for kind in catalogue:
+        given = kind.parameters()
+        if len(given) != 1 or kind.states or given[0].neutral is None:
+            continue
+        for at in places.get(kind.place, ()):
+            if (kind, at) == (type(effect), effect.at):
+                continue
+            try:
+                other = kind(**{given[0].name: given[0].neutral}, at=at)
+                same = _is_same_change(loop, effect, other)
+            except (EffectDoesNotApply, TypeError):
+                # One that names a state of the plant as well is compared with none.
+                continue
+            if same:
+                found.append(f"{kind.__name__} at {at}")
+    words = [f"parameter {key}" for key in e.parameters
+             if "." not in key and _is_change_of_parameter(loop, effect, key)]  # fmt: skip
+    return (*sorted(found), *sorted(words))
 
 
 LAGS = ("ActuatorLag", "SensorLag")
@@ -319,10 +351,12 @@ def _evaluate_at_points(e: Equations, at: Any, values: Array | None = None) -> A
 def _draw_points(at: Any) -> tuple[Array, Array, Array]:
     """Return random states and inputs around rest, and a time for each of them."""
     rng = np.random.default_rng(3)
-    rest = np.array([*at.states, at.input])
+    n, inputs = len(at.states), at.inputs
+    rest = np.array([*at.states, *inputs])
     scale = np.where(rest == 0, 1.0, 0.3 * np.abs(rest))
     points = rest + scale * rng.uniform(-1, 1, (POINTS, rest.size))
-    return points[:, :-1], points[:, -1], np.arange(float(POINTS))
+    u = points[:, n:] if len(inputs) > 1 else points[:, n]
+    return points[:, :n], u, np.arange(float(POINTS))
 
 
 def _find_factor(first: Array | None, second: Array | None) -> float | None:
@@ -347,7 +381,7 @@ def _are_equal(first: Array | None, second: Array | None) -> bool:
 
 
 def _is_same_change(loop: Any, first: AbstractEffect, second: AbstractEffect) -> bool:
-    if type(first) is type(second):
+    if type(first) is type(second) and first.at == second.at:
         return False
     for size in SIZES:
         one = _compute_change(loop, first, size)

@@ -216,7 +216,12 @@ class _SeveralOutputs:
 def _find_input_lags(simulator: Simulator, fitted: int) -> list[int]:
     """Return the states that are lags of the input."""
     e = simulator.loop.equations()
-    return [x.state for x in e.lags if x.state < fitted and casadi.is_equal(x.target, e.u, 2)]
+    inputs = [e.u[k] for k in range(len(e.inputs))]
+    return [
+        lag.state
+        for lag in e.lags
+        if lag.state < fitted and any(casadi.is_equal(lag.target, u, 2) for u in inputs)
+    ]
 
 
 def _differentiate_output(simulator: Simulator) -> Array:

@@ -14,6 +14,7 @@ from .._base.errors import CtrlidError
 from ..diagnosis.findings import BinnedErrors, Candidate, Gap
 from ..diagnosis.result import Diagnosis
 from ..diagnosis.thresholds import THRESHOLD
+from ..effects.base import name_at_place
 from ..physics.trace import timebase
 from ..validation.comparison import Comparison
 
@@ -166,7 +167,7 @@ def make_ranking(found: Diagnosis) -> dict[int, list[Bar]]:
     for finding in found.added:
         # Once it is taken an effect is no candidate any more, so that it was taken in the last
         # round in which it earned a place. One that was read off the record has no bar.
-        own = [c for c in found.ranking if type(c.effect).__name__ == finding.name
+        own = [c for c in found.ranking if name_at_place(c.effect) == finding.names[0]
                and value[id(c)] > 0 and id(c) not in kinds]  # fmt: skip
         earned = [c for c in own if value[id(c)] > THRESHOLD.gate] or own
         if not earned:
@@ -175,7 +176,7 @@ def make_ranking(found: Diagnosis) -> dict[int, list[Bar]]:
         kinds[id(taken)] = "found"
         evidence[id(taken)] = finding.evidence
         for c in found.ranking:
-            if c.round == taken.round and type(c.effect).__name__ in (
+            if c.round == taken.round and name_at_place(c.effect) in (
                 *finding.names[1:], *finding.equivalents
             ):  # fmt: skip
                 kinds.setdefault(id(c), "not told apart")
@@ -185,7 +186,7 @@ def make_ranking(found: Diagnosis) -> dict[int, list[Bar]]:
                        key=lambda c: (id(c) not in kinds, -value[id(c)]))  # fmt: skip
         shown = sorted(tried[:BARS], key=lambda c: -value[id(c)])
         rounds[number] = [
-            Bar(type(c.effect).__name__, value[id(c)],
+            Bar(name_at_place(c.effect), value[id(c)],
                 kinds.get(id(c), "refitted" if math.isfinite(c.gain) else "not refitted"),
                 evidence.get(id(c), math.nan))
             for c in shown
@@ -207,4 +208,5 @@ def scale_edges(place: BinnedErrors) -> tuple[Array, str]:
     if not np.isfinite(edges[-1]):
         edges[-1] = 2 * edges[-2] - edges[-3]
     factor, unit = choose_scale([edges], place.unit)
-    return factor * edges, f"{place.axis} [{unit}]"
+    of = f", errors of {place.output}" if place.output else ""
+    return factor * edges, f"{place.axis} [{unit}]{of}"

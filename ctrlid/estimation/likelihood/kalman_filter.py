@@ -326,8 +326,9 @@ def guess_trajectory(plant: SampledPlant, data: FilterData) -> Trajectory:
                 break
             seen = behind[0]
     for lag in e.lags:
-        if casadi.is_equal(lag.target, e.u, 2):
-            rest[:, lag.state] = data.u
+        for k, u in enumerate(np.reshape(data.u, (n, -1)).T):
+            if casadi.is_equal(lag.target, e.u[k], 2):
+                rest[:, lag.state] = u
     spread = np.sqrt(np.diag(plant.pad_controller_states(data.spread)))
     quiet = np.minimum(spread, 1.0) * data.scale
     return Trajectory(rest, rest.copy(), np.tile(quiet, (n, 1)))

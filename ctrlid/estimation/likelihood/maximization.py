@@ -198,7 +198,7 @@ def refit_noise_size(fit: Fit) -> Fit:
 
 def choose_noise(fit: Fit, always: bool = False) -> Fit:
     """Add a coloured force if the Bayesian information criterion wants it."""
-    if fit.known is not None or (fit.noise.sensors and not always):
+    if fit.known is not None or (not fit.plant.e.siso and not always):
         return fit
     try:
         richer = try_coloured_force(fit)

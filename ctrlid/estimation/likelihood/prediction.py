@@ -188,9 +188,12 @@ def make_prediction(fit: Fit) -> Prediction:
             states[:, : plant.n], states[:, plant.n :], tuple(sizes.tolist()),
             tuple((sensor * np.sqrt(fit.noise.force)).tolist()), units,
         )  # fmt: skip
+    error, variance, counts = (
+        np.reshape(v, record.y.shape) for v in (out.innovations, out.variance, fit.counts[0])
+    )
     return Prediction(
-        record.y - out.innovations, out.innovations, fit.counts[0],
-        sensor * np.sqrt(out.variance), states[:, : plant.n], states[:, plant.n :], sensor,
+        record.y - error, error, counts,
+        sensor * np.sqrt(variance), states[:, : plant.n], states[:, plant.n :], sensor,
         sensor * float(np.sqrt(fit.noise.force[0])), units,
     )  # fmt: skip
 
@@ -303,7 +306,7 @@ def _predict_several_spreads(
         sensor[0] * compute_spreads_ahead(lin, Noise(v, sensors=sensors), valid, horizon)
         for v in (forces, quiet)
     )
-    return both, alone
+    return (both, alone) if record.y.ndim == 2 else (both[0], alone[0])
 
 
 def compute_spreads_ahead(lin: Linearized, noise: Noise, valid: Any, horizon: int) -> Array:

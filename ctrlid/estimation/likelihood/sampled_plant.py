@@ -230,6 +230,10 @@ class SampledPlant:
         """Return the input behind the backlash, and how it depends on the free parameters."""
         if self.e.play is None:
             return u, None
+        if u.ndim == 2:
+            # A backlash has one input, beside several outputs.
+            applied, slopes = self._find_applied_input(u[:, 0], p)
+            return applied[:, None], slopes
         return build_backlash(self.plan).compute_input(
             self.initial_conditions.find_memory(float(u[0]), p)[0], u, p
         )
@@ -351,6 +355,7 @@ class InitialConditions:
             Variances, by the sample at which the input was computed.
         """
         e, variance = self.plan.equations, np.zeros(len(u))
+        u = u if u.ndim == 1 else u[:, 0]
         if e.play is not None:
             late = self.plan.delay_samples // self.plan.pieces
             variance = shift_signal(self._find_backlash_variance(u, p), late)
@@ -382,12 +387,15 @@ class InitialConditions:
         u, y = data.u, data.y
         alone = not data.restart[int(np.argmax(data.valid)) + 1 :].any()
         for k, shown, function in self.lags:
-            time, target, near = (v[:, 0] for v in function(start if shown else u[None, :], p))
+            given = start if shown else np.reshape(u, (len(u), -1)).T
+            time, target, near = (v[:, 0] for v in function(given, p))
             late = float(time[0, 0]) / self.plan.dt
             if shown:
                 spread[k] = spread[:, k] = near[0] @ spread
                 wide = near[0] @ spread @ near[0]
-                change = late**2 * float(np.var(np.diff(y))) / data.scale**2
+                change = late**2 * float(np.var(np.diff(y, axis=0))) / data.scale**2
+                # Outputs in several units tell nothing of each other's motion.
+                change = change if y.ndim == 1 else float(wide)
                 spread[k, k] = wide + min(change, wide) + NEARLY
             else:
                 before = float(np.mean((target - start[k]) ** 2))

@@ -70,11 +70,12 @@ def diagnosis(found: Diagnosis, ax: Any = None) -> Picture:
 
 def _draw_gap(above: Any, below: Any, found: Diagnosis) -> None:
     """Draw the measured output against the model before and after, and the errors below."""
-    gap, part = found.gap, _pictures.find_largest_gap(found.gap)
+    gap = next((g for g in found.gap.outputs if g.output == found.gap.output), found.gap)
+    part = _pictures.find_largest_gap(gap)
     t, y = gap.time[part], gap.measured[part]
     scale, unit = _pictures.choose_scale([y], gap.unit)
     above.plot(t, scale * y, label="measured", **MEASURED)
-    names = " and ".join(f.name for f in found.added[:2])
+    names = " and ".join(f.names[0] for f in found.added[:2])
     names += f" and {len(found.added) - 2} more" if len(found.added) > 2 else ""
     start = "recalibrated model" if gap.before == gap.fitted else "model as given"
     label = "before" if names or gap.before != gap.fitted else "recalibrated"
@@ -100,7 +101,7 @@ def _draw_gap(above: Any, below: Any, found: Diagnosis) -> None:
         above.plot(t[made], shown[made], label=f"{gap.name}, {long}", **style)
         below.plot(t[made], fine * error[made], label=f"{label}: {rms}", **style)
     _limit_view(above, scale * y)
-    above.set_ylabel(f"output [{unit}]")
+    above.set_ylabel(f"{gap.output or 'output'} [{unit}]")
     below.set_ylabel(f"error [{small}]")
     below.set_xlabel(f"time [s], where the gap is largest among {len(gap.time)} samples kept back")
     for ax in (above, below):

@@ -1,0 +1,86 @@
+"""Step 4: the places of a plant with several signals at which each effect may act."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from ..data.record import Record
+from ..effects import AbstractEffect
+from ..effects.context import find_motion, find_output_of
+from ..loop.loop import Loop
+from ..physics.equations import Equations
+from ..physics.linearization import OperatingPoint
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedLoop:
+    """A loop of several signals as an effect sees it that acts at one place.
+
+    Its first input and output are those of the place, so that an effect that was written for one of
+    each finds its scale, and what is added acts there.
+    """
+
+    loop: Loop
+    at: str
+    input: int
+    output: int
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return getattr(self.loop, name)
+
+    @property
+    def point(self) -> OperatingPoint:
+        """The operating point with the input and the output of the place."""
+        at = self.loop.point
+        return OperatingPoint(at.states, at.inputs[self.input], at.outputs[self.output])
+
+    def equations(self, keep: bool = False) -> Equations:
+        """Return the equations of the loop."""
+        return self.loop.equations(keep)
+
+    def with_effect(self, effect: AbstractEffect) -> Loop:
+        """Return the loop with an effect at the place."""
+        return self.loop.with_effect(replace(effect, at=self.at))
+
+
+def list_places(loop: Loop, kind: type[AbstractEffect]) -> list[str]:
+    """Return where an effect may act; nowhere in particular on a plant with one of each."""
+    e = loop.equations()
+    if e.siso:
+        return [""]
+    velocities = [e.states[j] for j in e.velocities]
+    names = {"input": e.inputs, "output": e.outputs, "force": velocities, "law": [""]}
+    return list(names[kind.place])
+
+
+def list_placed_candidates(
+    kind: type[AbstractEffect], loop: Loop, record: Record
+) -> list[AbstractEffect]:
+    """Return an effect at its start, at each place of a plant with several signals."""
+    e = loop.equations()
+    u, y = record.signals["u"], record.signals["y"]
+    found: list[AbstractEffect] = []
+    for at in list_places(loop, kind):
+        i = e.inputs.index(at) if kind.place == "input" else 0
+        k = e.outputs.index(at) if kind.place == "output" else 0
+        k = find_output_of(e, at) if kind.place == "force" else k
+        part = record.select(u=u[i], y=y[k])
+        placed = kind.candidates(PlacedLoop(loop, at, i, k), part)
+        found += [replace(effect, at=at) for effect in placed]
+    return found
+
+
+def find_force_channel(e: Equations, at: str) -> int:
+    """Return which random force works on a velocity."""
+    velocities: Sequence[str] = [e.states[j] for j in e.velocities]
+    return velocities.index(at) if at in velocities else 0
+
+
+def find_position(e: Equations, at: str, otherwise: int) -> int:
+    """Return the state that is the position of a velocity, else another one."""
+    motion = find_motion(e, at) if at else None
+    return otherwise if motion is None else motion[0]
