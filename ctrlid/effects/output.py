@@ -142,7 +142,9 @@ class SensorOffset(OutputEffect):
         """
         del record
         a, _, c, _ = compute_state_matrices(loop.equations(), loop.point, spread=SHIFTED_FAR)
-        matters = np.any(np.abs(a[:, np.flatnonzero(c[0])]).sum(axis=0) > 0)
+        # Of a plant with several outputs a diagnosis asks for one by its number.
+        seen = np.flatnonzero(c[getattr(loop, "output", 0)])
+        matters = np.any(np.abs(a[:, seen]).sum(axis=0) > 0)
         return cls._applicable(loop, cls(0.0)) if matters else ()
 
     def output(self, m: Moment) -> Any:

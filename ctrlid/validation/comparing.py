@@ -233,12 +233,6 @@ def _simulate(record: Record, loop: Loop, prediction: Prediction) -> Curve:
 
     Once more with noise of the size found in the one-step errors, to see what it makes of it.
     """
-    if loop.controller is None and compute_growth_rate(loop) > -1e-9:
-        raise ModelCannotRun(
-            "the plant is not stable and the loop has no controller, so an open-loop simulation "
-            "would drift without bound. Make the loop with the controller of the record: "
-            "Loop(plant, controller, ...)"
-        )
     how, y, by_noise, injected = _run_simulation(record, loop, prediction)
     driven = [] if record.r is None else [(np.asarray(record.r), 1)]
     if np.std(injected) > MEANINGFUL * np.std(record.u) and not (driven and not loop.controller):
@@ -253,6 +247,12 @@ def _run_simulation(
 
     Of several outputs each has a row.
     """
+    if loop.controller is None and compute_growth_rate(loop) > -1e-9:
+        raise ModelCannotRun(
+            "the plant is not stable and the loop has no controller, so an open-loop simulation "
+            "would drift without bound. Make the loop with the controller of the record: "
+            "Loop(plant, controller, ...)"
+        )
     y, noisy = np.full(np.shape(record.y), np.nan), np.zeros(np.shape(record.y))
     injected = np.zeros(np.shape(record.u))
     simulator = Simulator(loop, hold=record.hold, hold_r=record.hold_r)

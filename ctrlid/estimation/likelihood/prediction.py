@@ -353,8 +353,10 @@ def compute_spreads_ahead(lin: Linearized, noise: Noise, valid: Any, horizon: in
         a, b = lin.a[k], lin.b[k][:, :, : len(force)]
         p = a @ p @ a.transpose(0, 2, 1) + (b * force) @ b.transpose(0, 2, 1)
     h = lin.c[starts + lead + horizon]
-    variance = np.mean(np.einsum("sqi,sij,sqj->sq", h, p, h), axis=0)
-    return np.asarray(np.sqrt(np.maximum(variance, 0.0) + r))
+    # What grows beyond all numbers has no spread.
+    with np.errstate(all="ignore"):
+        variance = np.mean(np.einsum("sqi,sij,sqj->sq", h, p, h), axis=0)
+        return np.asarray(np.sqrt(np.maximum(variance, 0.0) + r))
 
 
 def compute_spread_ahead(lin: Linearized, noise: Noise, valid: Any, horizon: int) -> float:

@@ -202,10 +202,11 @@ class SampledPlant:
         corners = np.tile(at.inputs, self.pieces + 2)
         references = [r] if self.hold_r == "zoh" else [r, r]
         w = np.concatenate([[0.0], corners, *references, at.outputs])[:, None]
-        quiet = np.zeros((self.n, 1))
+        # Dry friction, which holds still what rests, damps nothing that moves.
+        wide = np.full((self.n, 1), 1e6)
         stages = self.maps.stages
-        _, a, b, *_ = self._evaluate_transition(stages, x, w, p, quiet, np.zeros(self.channels))
-        return a[0], b[0], self.maps.sensor(x, w, p, quiet)[1][0]
+        _, a, b, *_ = self._evaluate_transition(stages, x, w, p, wide, np.zeros(self.channels))
+        return a[0], b[0], self.maps.sensor(x, w, p, wide)[1][0]
 
     def _differentiate_by_input(self, rows: Any, given: Sequence[Array], h: Any) -> Array:
         """Return by differences how the state after the samples `rows` depends on the input.
