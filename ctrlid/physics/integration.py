@@ -291,7 +291,7 @@ def _map_piece(
     e: Equations, target: Any, duration: Any, level: Any, slope: Any, p: Any
 ) -> tuple[Any, Any]:
     """Return start and slope of a curve of the input over a piece of it, straight as well."""
-    if casadi.is_equal(target, e.u, 2):
+    if len(e.inputs) == 1 and casadi.is_equal(target, e.u, 2):
         return level, slope
     curve = casadi.Function("curve", [e.u, e.p], [target])
     first = curve(level, p)
