@@ -191,8 +191,8 @@ class Equations:
         ----------
         x : ndarray, shape (k, n)
             States.
-        u : ndarray, shape (k,)
-            The input; all inputs have this value where there are several.
+        u : ndarray, shape (k,) or (k, inputs)
+            The input; of several inputs all, or else they all have this value.
         t : ndarray, shape (k,)
             Times [s].
         p : ndarray, optional
@@ -202,7 +202,7 @@ class Equations:
         -------
         rhs, output : ndarray, shapes (k, n) and (k, outputs)
         """
-        inputs = np.tile(u, (len(self.inputs), 1))
+        inputs = np.transpose(u) if u.ndim == 2 else np.tile(u, (len(self.inputs), 1))
         p = self.values if p is None else p
         rhs, output = self.function(np.reshape(t, (1, -1)), np.transpose(x), inputs, p)
         return np.asarray(rhs, float).T, np.asarray(output, float).T
