@@ -36,7 +36,7 @@ from .estimation.constraints import (
     StaticGain,
     SymmetricPoles,
 )
-from .estimation.identified_model import Estimate, IdentifiedModel
+from .estimation.identified_model import Estimate, IdentifiedModel, IdentifiedSystem
 from .estimation.likelihood.physics_estimate import LoopEstimate, LoopFit
 from .estimation.likelihood.physics_fit import fit_loop
 from .estimation.likelihood.prediction import Prediction, predict
@@ -87,6 +87,7 @@ __all__ = [
     "Fixed",
     "Gap",
     "IdentifiedModel",
+    "IdentifiedSystem",
     "Integrator",
     "Linear",
     "Loop",

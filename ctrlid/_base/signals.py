@@ -34,6 +34,11 @@ def list_signals(key: str, given: Any, count: int) -> tuple[str, ...]:
     return (given,) if isinstance(given, str) else tuple(given)
 
 
+def is_several(given: Any) -> bool:
+    """Tell whether a record has several inputs or outputs."""
+    return any(len(given.signals[key]) != 1 for key in ("u", "y"))
+
+
 def require_one_signal(function: str, *given: Any) -> None:
     """Refuse a record or a loop with several signals where a function takes one of each.
 
@@ -60,6 +65,7 @@ def require_one_signal(function: str, *given: Any) -> None:
         listed = write_list([f"{key} = ({', '.join(names)})" for key, names in several])
         raise CtrlidError(
             f"{function} takes one input and one output; the {type(one).__name__.lower()} has "
-            f"{listed}. fit_loop, predict and simulate take several. Of a record, pick one with "
+            f"{listed}. fit_loop, fit_arx, fit_iv, predict, simulate and redesign with "
+            "design= take several. Of a record, pick one with "
             f"record.select({', '.join(f'{key}={names[0]!r}' for key, names in several if names)})"
         )

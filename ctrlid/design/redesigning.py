@@ -15,12 +15,12 @@ from .._base.errors import CtrlidError, ModelCannotRun
 from .._base.rounding import keep_numpy_quiet
 from .._base.signals import require_one_signal
 from .._base.text import Printed, write_polynomial, write_quantity
-from ..estimation.identified_model import IdentifiedModel
+from ..estimation.identified_model import IdentifiedModel, IdentifiedSystem
 from ..estimation.likelihood.physics_estimate import LoopFit, linearize_at_rest
 from ..loop.loop import Loop
 from ..loop.period_map import compute_growth_rate
 from ..loop.simulation import SimulationStopped, simulate
-from ..physics.conversions import sample_held, to_state_matrices, to_transfer_function
+from ..physics.conversions import sample_held, to_transfer_function
 from ..physics.trace import timebase
 from .controller_trial import ControllerTrial, try_design
 from .lead import design_lead
@@ -229,8 +229,8 @@ def redesign(
     phase_margin : float, optional
         Phase margin to design for [deg].
     design : callable, optional
-        Function of the model, with the signal names of the loop; a transfer function of several
-        signals comes as a state space, and with a delay as Padé's approximation. It returns the
+        Function of the model, with the signal names of the loop; what `fit_arx`
+        found of several signals comes in states, a delay as Padé's approximation. It returns the
         controller, alone or with the closed loop, as `control.create_statefbk_iosystem` does. The
         controller is wired as `Loop` says; its own time base decides whether it is digital.
     step : float or mapping of str to float, optional
@@ -344,9 +344,13 @@ def _make_plain(G: Any) -> Any:
     """Return a model with its delay; one of several signals by states, as designs take it."""
     if isinstance(G, IdentifiedModel):
         return G.with_delay()
+    if isinstance(G, IdentifiedSystem):
+        return G.to_states()
     if isinstance(G, ct.TransferFunction) and not G.issiso():
-        return ct.ss(*to_state_matrices(G), timebase(G) or 0, inputs=G.input_labels,
-                     outputs=G.output_labels)  # fmt: skip
+        raise CtrlidError(
+            "redesign needs a model of several signals in states, a StateSpace: a "
+            "transfer function counts a pole for each entry that shows it"
+        )
     return G
 
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import control
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.special import binom
 from scipy.stats import t as student_t
 
@@ -15,7 +16,7 @@ from .._base import text as _text
 from .._base.arguments import check_arguments
 from .._base.arrays import Array, ComplexArray
 from .._base.errors import CtrlidError
-from ..physics.conversions import to_transfer_function
+from ..physics.conversions import reduce_states, to_transfer_function
 
 
 @dataclass(frozen=True)
@@ -36,24 +37,42 @@ class Structure:
         Delay from input to output in samples.
     domain : {"z", "s"}
         Sampled or continuous time.
+    inputs : tuple of str
+        Names of several inputs, each with a numerator of its own; empty for a single one.
 
     Examples
     --------
     >>> Structure(na=2, nb=2).names
     ('a1', 'a2', 'b1', 'b2')
+    >>> Structure(na=1, nb=1, inputs=("F1", "F2")).names
+    ('a1', 'b1[F1]', 'b1[F2]')
     """
 
     na: int
     nb: int
     nk: int = 1
     domain: Literal["z", "s"] = "z"
+    inputs: tuple[str, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the coefficients, in the order of the vector theta of the paper's (7)."""
         a = (f"a{i}" for i in range(1, self.na + 1))
-        b = (f"b{i}" for i in range(1, self.nb + 1))
-        return (*a, *b)
+        numbers = range(1, self.nb + 1)
+        if not self.inputs:
+            return (*a, *(f"b{i}" for i in numbers))
+        return (*a, *(f"b{i}[{name}]" for name in self.inputs for i in numbers))
+
+    @property
+    def numerators(self) -> tuple[slice, ...]:
+        """Where in the vector of coefficients the numerator of each input is."""
+        starts = range(self.na, self.na + self.nb * max(len(self.inputs), 1), self.nb)
+        return tuple(slice(i, i + self.nb) for i in starts)
+
+    @property
+    def span(self) -> int:
+        """Samples in succession that one equation needs."""
+        return max(self.na, self.nk + self.nb - 1) + 1
 
     def vector(self, weights: Mapping[str, float], who: str = "A constraint") -> Array:
         """Return weights by name as a ``(na + nb,)`` vector; unknown names are refused."""
@@ -67,10 +86,10 @@ class Structure:
             row[self.names.index(name)] = weight
         return row
 
-    def fraction(self, theta: Array) -> tuple[Array, Array]:
-        """Return numerator and denominator in falling powers of z (or s)."""
+    def fraction(self, theta: Array, which: int = 0) -> tuple[Array, Array]:
+        """Return an input's numerator, and the denominator, in falling powers of z (or s)."""
         denominator = np.concatenate([[1.0], theta[: self.na]])
-        numerator = np.asarray(theta[self.na :], dtype=float)
+        numerator = np.asarray(theta[self.numerators[which]], dtype=float)
         if self.domain == "s":
             return numerator, denominator
         # Both polynomials in z^-1 are multiplied by the same z^m.
@@ -449,3 +468,127 @@ class IdentifiedModel(control.TransferFunction):
         # The formula looks as python-control shows every transfer function.
         formula: Any = super()._repr_html_(var)
         return f"{formula}\n{_text.write_html(str(self.estimate))}"
+
+
+class IdentifiedSystem(control.TransferFunction):
+    """A fitted transfer function of several signals; each output carries an estimate of its own.
+
+    It is a `control.TransferFunction` and goes wherever one goes. The entries of an output have one
+    denominator, ``A_i y_i = sum of B_ij u_j``. Arithmetic gives plain transfer functions.
+
+    Parameters
+    ----------
+    estimates : mapping of str to Estimate
+        Coefficients with their uncertainty, by the name of the output.
+    inputs : sequence of str
+        Names of the inputs.
+    name : str
+        Name of the system.
+
+    Attributes
+    ----------
+    estimates : mapping of str to Estimate
+        By output; ``G.estimates["alpha"].poles_s``.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> rows = {name: Estimate(
+    ...     structure=Structure(1, 1), values=np.array([-a, 0.5]), covariance=np.zeros((2, 2)),
+    ...     intercepts=np.zeros(1), rss=0.0, residual_variance=0.0, n_samples=10,
+    ...     degrees_of_freedom=8, method="by hand", solver="nothing", dt=0.1, condition=1.0)
+    ...     for name, a in (("x", 0.9), ("theta", 1.1))}
+    >>> G = IdentifiedSystem(rows, ["F"])
+    >>> G.output_labels, G.estimates["theta"]["a1"], G.to_states(order=2).nstates
+    (['x', 'theta'], -1.1, 2)
+    """
+
+    estimates: Mapping[str, Estimate]
+
+    def __init__(
+        self, estimates: Mapping[str, Estimate], inputs: Sequence[str], *, name: str = "identified"
+    ) -> None:
+        rows = [[e.structure.fraction(e.values, j) for j in range(len(inputs))]
+                for e in estimates.values()]  # fmt: skip
+        nums, dens = ([[part[k] for part in row] for row in rows] for k in (0, 1))
+        dt = next(iter(estimates.values())).dt
+        super().__init__(nums, dens, dt, inputs=list(inputs), outputs=list(estimates), name=name)
+        self.estimates = dict(estimates)
+
+    def to_states(self, order: int | None = None) -> control.StateSpace:
+        """Return the model in states.
+
+        They are no physical quantities: a state feedback on them needs an observer. All outputs
+        show one plant, so that where they have as many poles each they get one denominator, the
+        mean weighted by what each of them knows, and the system of all equations is reduced to
+        `order` states by its pulse response.
+
+        Parameters
+        ----------
+        order : int, optional
+            Number of states; by default the largest number of poles of an output. As many as all
+            outputs have together leaves the model as it is.
+
+        Returns
+        -------
+        control.StateSpace
+            With the names of the signals.
+
+        Raises
+        ------
+        CtrlidError
+            If the order is not between 1 and the number of all poles.
+        """
+        check_arguments(IdentifiedSystem.to_states, locals())
+        counts = [e.structure.fraction(e.values)[1].size - 1 for e in self.estimates.values()]
+        order = max(e.structure.na for e in self.estimates.values()) if order is None else order
+        if not 1 <= order <= sum(counts):
+            raise CtrlidError(f"order is a number of states from 1 to {sum(counts)}; given {order}")
+        blocks = []
+        values = self._share_denominator() if order < sum(counts) else None
+        for i, e in enumerate(self.estimates.values()):
+            theta = e.values if values is None else values[i]
+            parts = [e.structure.fraction(theta, j) for j in range(self.ninputs)]
+            den = parts[0][1]
+            n = len(den) - 1
+            padded = [np.concatenate([np.zeros(n + 1 - len(num)), num]) for num, _ in parts]
+            a = np.eye(n, k=1)
+            a[:, 0] -= den[1:]
+            d = np.array([[num[0] for num in padded]])
+            b = np.column_stack([num[1:] - den[1:] * num[0] for num in padded])
+            blocks.append((a, b, np.eye(1, n), d))
+        a, b, c, d = zip(*blocks, strict=True)
+        system = block_diag(*a), np.vstack(b), block_diag(*c)
+        if order < sum(counts):
+            system = reduce_states(*system, order)
+        return control.ss(*system, np.vstack(d), self.dt,
+                          inputs=self.input_labels, outputs=self.output_labels)  # fmt: skip
+
+    def _share_denominator(self) -> list[Array] | None:
+        """Return the coefficients of all outputs with one denominator, by generalized averaging."""
+        estimates = list(self.estimates.values())
+        na = estimates[0].structure.na
+        if any(e.structure.na != na for e in estimates):
+            return None
+        weights = []
+        for e in estimates:
+            part = e.covariance[:na, :na]
+            # What is known exactly, or without noise, counts very much.
+            floor = 1e-10 * np.diag(np.diag(part)) + 1e-16 * np.eye(na)
+            weights.append(np.linalg.inv(part + floor))
+        known = sum(w @ e.values[:na] for w, e in zip(weights, estimates, strict=True))
+        shared = np.linalg.solve(np.sum(weights, axis=0), known)
+        return [
+            np.concatenate([shared, e.values[na:]
+                            + e.covariance[na:, :na] @ w @ (shared - e.values[:na])])
+            for w, e in zip(weights, estimates, strict=True)
+        ]  # fmt: skip
+
+    def __str__(self) -> str:
+        text: Any = super().__str__()
+        return "\n\n".join([text, *(f"{n}: {e}" for n, e in self.estimates.items())])
+
+    def _repr_html_(self, var: str | None = None) -> str:
+        formula: Any = super()._repr_html_(var)
+        words = "\n\n".join(f"{name}: {e}" for name, e in self.estimates.items())
+        return f"{formula}\n{_text.write_html(words)}"

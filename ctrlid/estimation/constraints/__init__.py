@@ -19,7 +19,7 @@ Several branches are alternatives of which the cheapest wins; a branch may hold 
 with one free number, which is searched for.
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 from ..._base.arguments import is_iterable
@@ -44,6 +44,7 @@ __all__ = [
     "StaticGain",
     "SymmetricPoles",
     "check_constraints",
+    "divide_constraints",
     "equals",
 ]
 
@@ -95,3 +96,36 @@ def check_constraints(constraints: Any) -> tuple[AbstractConstraint, ...]:
         if constraint not in kept:
             kept.append(constraint)
     return tuple(kept)
+
+
+def divide_constraints(
+    constraints: Sequence[AbstractConstraint], outputs: Collection[str]
+) -> dict[str, tuple[AbstractConstraint, ...]]:
+    """Return the constraints of each output: those that name it, and those that name none.
+
+    Parameters
+    ----------
+    constraints : sequence of AbstractConstraint
+        All of them.
+    outputs : collection of str
+        Names of the outputs.
+
+    Returns
+    -------
+    dict of str to tuple of AbstractConstraint
+        By output.
+
+    Raises
+    ------
+    CtrlidError
+        If one names an output that there is not.
+    """
+    for constraint in constraints:
+        name = getattr(constraint, "output", "")
+        if name not in ("", *outputs):
+            raise CtrlidError(f"{constraint!r} speaks of the output {name!r}; the record has "
+                              f"{', '.join(outputs)}.")  # fmt: skip
+    return {
+        output: tuple(c for c in constraints if getattr(c, "output", "") in ("", output))
+        for output in outputs
+    }

@@ -95,12 +95,21 @@ class AbstractConstraint(ABC):
         """Return the alternatives, of which one must hold."""
 
 
+@dataclass(frozen=True, repr=False)
 class Known(AbstractConstraint):
-    """The constraints of ctrlid print as the user wrote them."""
+    """The constraints of ctrlid print as the user wrote them.
+
+    Parameters
+    ----------
+    output : str
+        The output whose equation it speaks of; empty for all.
+    """
+
+    output: str = dataclasses.field(default="", kw_only=True)
 
     def __repr__(self) -> str:
         parts = []
-        for field in dataclasses.fields(self):  # type: ignore[arg-type]
+        for field in sorted(dataclasses.fields(self), key=lambda field: bool(field.kw_only)):
             value = getattr(self, field.name)
             if field.default is not dataclasses.MISSING and value == field.default:
                 continue

@@ -34,6 +34,8 @@ class StaticGain(Known):
     ----------
     gain : float
         In output units per input unit.
+    input : str
+        Which of several inputs.
 
     Examples
     --------
@@ -42,21 +44,36 @@ class StaticGain(Known):
     """
 
     gain: float
+    input: str = dataclasses.field(default="", kw_only=True)
 
     def __post_init__(self) -> None:
+        check_fields(self, "gain")
         object.__setattr__(self, "gain", check_finite(self.gain, "StaticGain"))
 
     def branches(self, structure: Structure) -> Sequence[Branch]:
         """See the base class."""
+        which = self._find_input(structure)
         if structure.domain == "z":
             a = [f"a{i}" for i in range(1, structure.na + 1)]
-            b = [f"b{i}" for i in range(1, structure.nb + 1)]
+            b = list(structure.names[structure.numerators[which]])
             one = 1.0
         else:
             a, b, one = [f"a{structure.na}"], [f"b{structure.nb}"], 0.0
         weights = {**dict.fromkeys(a, -self.gain), **dict.fromkeys(b, 1.0)}
         at_rest = equals(dict.fromkeys(a, 1.0), -one)
         return (Branch((equals(weights, self.gain * one),), nonzero=(at_rest,)),)
+
+    def _find_input(self, structure: Structure) -> int:
+        """Return the number of the input whose gain is known."""
+        inputs = structure.inputs
+        # The name of a single input is not part of the structure.
+        if not inputs:
+            return 0
+        if self.input not in inputs:
+            raise CtrlidError(
+                f"StaticGain needs input= with one of {', '.join(inputs)}; given {self.input!r}."
+            )
+        return inputs.index(self.input)
 
 
 @final

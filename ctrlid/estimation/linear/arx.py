@@ -14,28 +14,28 @@ from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
 from ..._base.jobs import check_jobs
 from ..._base.rounding import keep_numpy_quiet
-from ..._base.signals import require_one_signal
+from ..._base.signals import is_several
 from ...data.record import Record
 from ...data.several_records import VISIBLE_MOTION, measure_input_motion, stream_records
 from ...data.validity import find_whole_past
-from ..constraints import AbstractConstraint, check_constraints
+from ..constraints import AbstractConstraint, check_constraints, divide_constraints
 from ..constraints.constrained_minimum import Found, minimize
 from ..constraints.quadratic_program import Cost, NotExcited
-from ..identified_model import Estimate, IdentifiedModel, Structure
+from ..identified_model import Estimate, IdentifiedModel, IdentifiedSystem, Structure
 from ..whiteness import ENOUGH, note_coloured_innovations
-from .regression import Regression, build_arx_regression, check_orders, from_differences
+from .regression import Regression, build_arx_regression, from_differences, list_structures
 
 
 @keep_numpy_quiet
 def fit_arx(
     record: Record | Iterable[Record],
-    na: int,
-    nb: int,
-    nk: int = 1,
+    na: int | Sequence[int],
+    nb: int | Sequence[int],
+    nk: int | Sequence[int] = 1,
     constraints: AbstractConstraint | Sequence[AbstractConstraint] = (),
     intercept: bool = True,
     jobs: int | None = None,
-) -> IdentifiedModel:
+) -> IdentifiedModel | IdentifiedSystem:
     """Fit a difference equation by least squares under constraints, equations (5) and (7) of [1]_.
 
     ``y(k) + a1 y(k-1) + ... + a_na y(k-na) = b1 u(k-nk) + ... + b_nb u(k-nk-nb+1) + c + e(k)``
@@ -44,18 +44,23 @@ def fit_arx(
     without noise. With noise it is unbiased only if e is white; sensor noise, above all in closed
     loop and at short sampling periods, biases it, and a constraint alone does not cure that.
 
+    Of a record of several signals each output is fitted by itself, with a numerator for each input:
+    ``A_i y_i = B_i1 u_1 + B_i2 u_2 + ... + c_i + e_i``. The coefficients are then called ``b1[F1]``
+    after the input, and a constraint may speak of one output, ``ReciprocalPoles(output="alpha")``.
+
     Parameters
     ----------
     record : Record or iterable of Record
         Data; of several records each has its own intercept, since set-points differ. Rows that
         touch a sample marked not valid are left out. An iterator, such as a generator that cuts a
         memory-mapped log into records, is read once and in constant memory.
-    na : int
-        Number of poles.
-    nb : int
-        Number of numerator coefficients.
-    nk : int
-        Samples from u to y: 1 where ``u[k]`` is applied after ``y[k]`` is measured.
+    na : int or sequence of int
+        Number of poles; of several outputs, one for all or one for each.
+    nb : int or sequence of int
+        Number of numerator coefficients, for each input.
+    nk : int or sequence of int
+        Samples from u to y: 1 where ``u[k]`` is applied after ``y[k]`` is measured. Where one input
+        is later than another, `Fixed` holds its first coefficients at zero.
     constraints : AbstractConstraint or sequence of them
         What is known: `ReciprocalPoles`, `PoleAt`, `Integrator`, `StaticGain`, `Fixed`, `Bounds`,
         `Equal`, `Linear`, `Nonlinear`, ...
@@ -68,8 +73,9 @@ def fit_arx(
 
     Returns
     -------
-    IdentifiedModel
-        A `control.TransferFunction` with ``.estimate``.
+    IdentifiedModel or IdentifiedSystem
+        A `control.TransferFunction` with ``.estimate``; of several signals, one of them with
+        ``.estimates`` by output.
 
     Raises
     ------
@@ -101,18 +107,44 @@ def fit_arx(
     array([1.25, 0.8 ])
     """
     check_arguments(fit_arx, locals(), "record", "na", "nb", "nk", "constraints", "jobs")
-    structure = check_orders(na, nb, nk)
     known = check_constraints(constraints)
     first, records = stream_records(record)
-    require_one_signal("fit_arx", first)
+    structures = list_structures(na, nb, nk, first)
+    rows = divide_constraints(known, structures)
+    if not is_several(first):
+        (structure,) = structures.values()
+        estimate = _fit_row(records, first, structure, known, intercept, jobs)
+        if not isinstance(record, Iterator):
+            # An iterator of records was read once, and is gone.
+            estimate = replace(estimate, notes=(*_note_colour(list(records), estimate),
+                                                *estimate.notes))  # fmt: skip
+        names = first.names
+        return IdentifiedModel(estimate, inputs=names.get("u", "u"), outputs=names.get("y", "y"))
+    if isinstance(record, Iterator):
+        raise CtrlidError("fit_arx reads records of several signals once for each output: give a "
+                          "list of records instead of an iterator")  # fmt: skip
+    estimates = {}
+    for output, structure in structures.items():
+        parts = [one.select(y=output) for one in records]
+        estimate = _fit_row(parts, parts[0], structure, rows[output], intercept, jobs)
+        notes = (*_note_colour(parts, estimate), *estimate.notes)
+        estimates[output] = replace(estimate, notes=notes)
+    return IdentifiedSystem(estimates, first.signals["u"])
+
+
+def _fit_row(
+    records: Iterable[Record], first: Record, structure: Structure,
+    known: Sequence[AbstractConstraint], intercept: bool, jobs: int | None,
+) -> Estimate:  # fmt: skip
+    """Fit one output."""
     motions: list[float] = []
     watched = records if first.hold == "zoh" else _note_motion(records, motions)
     regression = build_arx_regression(watched, structure, intercept, check_jobs(jobs))
-    unknowns = na + nb + len(regression.intercept_rows)
+    unknowns = len(structure.names) + len(regression.intercept_rows)
     if regression.rows <= unknowns:
         raise CtrlidError(
             f"Too few samples: {_text.write_count(regression.rows, 'equation')} for {unknowns} "
-            f"unknowns. An equation needs {max(na, nk + nb - 1) + 1} valid samples in succession. "
+            f"unknowns. An equation needs {structure.span} valid samples in succession. "
             "Record longer or lower the orders."
         )
     try:
@@ -121,9 +153,6 @@ def fit_arx(
         message = _explain_no_excitation(regression, trouble.direction)
         raise CtrlidError(message) from None
     estimate = _make_estimate(regression, found, constrained=bool(known), dt=first.dt)
-    if not isinstance(record, Iterator):
-        # An iterator of records was read once, and is gone.
-        estimate = replace(estimate, notes=_note_colour(list(records), estimate))
     share = max(motions, default=0.0)
     if share > VISIBLE_MOTION:
         instead = " with the controller" if first.hold == "foh" else ""
@@ -133,8 +162,7 @@ def fit_arx(
             f"poles are biased. Sample faster, or use fit_continuous{instead}."
         )
         estimate = replace(estimate, notes=(*estimate.notes, note))
-    names = first.names
-    return IdentifiedModel(estimate, inputs=names.get("u", "u"), outputs=names.get("y", "y"))
+    return estimate
 
 
 def _note_motion(records: Iterable[Record], motions: list[float]) -> Iterator[Record]:
@@ -146,14 +174,18 @@ def _note_motion(records: Iterable[Record], motions: list[float]) -> Iterator[Re
 
 def _note_colour(records: Sequence[Record], estimate: Estimate) -> tuple[str, ...]:
     """Return a note if the equation errors are not white; those of the first samples tell."""
-    num, den = estimate.structure.fraction(estimate.values)
+    structure = estimate.structure
+    fractions = [structure.fraction(estimate.values, k) for k in range(len(structure.numerators))]
+    den = fractions[0][1]
     # Both are in falling powers of z, so that a shorter numerator begins later.
-    num = np.concatenate([np.zeros(len(den) - len(num)), num])
+    nums = [np.concatenate([np.zeros(len(den) - len(num)), num]) for num, _ in fractions]
     order, left = len(den) - 1, ENOUGH
     stretches, size = [], 0.0
     for record in records:
         part = record[:left]
-        error = lfilter(den, [1.0], part.y) - lfilter(num, [1.0], part.u)
+        error = lfilter(den, [1.0], part.y)
+        for num, u in zip(nums, np.atleast_2d(part.u), strict=True):
+            error = error - lfilter(num, [1.0], u)
         error[~find_whole_past(part.valid, order)] = np.nan
         stretches.append(error)
         size = max(size, float(np.max(np.abs(part.y[part.valid]), initial=0.0)))
@@ -209,14 +241,18 @@ def _explain_no_excitation(regression: Regression, direction: Array) -> str:
     size = np.linalg.norm(regression.R, axis=0)
     still = size <= 10 * regression.floor
     head = "The data do not determine the coefficients: "
-    for signal, column in (("u", na), ("y", 0)):
+    inputs = structure.inputs or ("u",)
+    starts = [part.start for part in structure.numerators]
+    for signal, column in (*zip(inputs, starts, strict=True), ("y", 0)):
         if still[column]:
             return (
                 f"{head}{signal} is constant in all valid samples. Excite the loop: vary the "
                 "reference (random_binary) or add a signal to u."
             )
     # Weighted by the size of the signals: what the coefficients do to a prediction.
-    effect = np.abs(direction) * np.r_[np.full(na, size[0]), np.full(structure.nb, size[na])]
+    effect = np.abs(direction) * np.concatenate(
+        [np.full(na, size[0]), *(np.full(structure.nb, size[start]) for start in starts)]
+    )
     involved = [n for n, e in zip(structure.names, effect, strict=True) if e > 1e-3 * effect.max()]
     weights = direction / np.abs(direction).max()
     moves = ", ".join(f"{n} by {weights[structure.names.index(n)]:.3g}" for n in involved)

@@ -16,7 +16,7 @@ from ...data.record import Record
 from ...data.several_records import VISIBLE_MOTION, as_records, measure_input_motion
 from ...loop.controllers import PID
 from ...physics.conversions import to_state_matrices
-from ..constraints import AbstractConstraint, check_constraints
+from ..constraints import AbstractConstraint, check_constraints, divide_constraints
 from ..identified_model import Estimate, IdentifiedModel, Structure
 from ..whiteness import ROUNDING, note_coloured_innovations
 from .prediction_error import Minimum, Piece, Task, colour_noise, find_best_fit
@@ -108,6 +108,7 @@ def fit_continuous(
     known = check_constraints(constraints)
     records = as_records(record)
     require_one_signal("fit_continuous", records)
+    divide_constraints(known, records[0].signals["y"])
     circuit = _make_circuit(controller, records)
     if circuit and zeros == poles:
         raise CtrlidError(

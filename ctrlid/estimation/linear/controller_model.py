@@ -133,10 +133,11 @@ def identify_controller(pieces: Sequence[Piece], names: Sequence[str]) -> Linear
     for m in range(_HIGHEST + 1):
         factors, rows = [], 0
         for p in pieces:
-            columns = [np.ones(len(p.u) - m)]
-            columns += [p.u[m - i : len(p.u) - i] for i in range(1, m + 1)]
+            (u,) = p.u
+            columns = [np.ones(len(u) - m)]
+            columns += [u[m - i : len(u) - i] for i in range(1, m + 1)]
             columns += [s[m - i : len(s) - i] for s in (*p.w, p.y) for i in range(m + 1)]
-            table = np.column_stack([*columns, p.u[m:]])
+            table = np.column_stack([*columns, u[m:]])
             rows += len(table)
             factor = np.asarray(np.linalg.qr(table, mode="r"), dtype=float)
             factors.append(factor[1:, 1:])
@@ -196,12 +197,12 @@ def simulate_noise_free_loop(
     found = []
     for i, piece in enumerate(pieces):
         # What came before a stretch is not known, so that it starts from rest at the mean levels.
-        y, u = np.zeros_like(piece.y), np.zeros_like(piece.u)
+        y, u = np.zeros_like(piece.y), np.zeros_like(piece.y)
         for n, w in zip(law.external, piece.w, strict=True):
             y += signal.lfilter(np.convolve(n, b), both, w)
             u += signal.lfilter(np.convolve(n, a), both, w)
         if forces is not None:
             y += signal.lfilter(law.den, both, forces[i])
             u += signal.lfilter(law.feedback, both, forces[i])
-        found.append((y, u))
+        found.append((y, u[None]))
     return found

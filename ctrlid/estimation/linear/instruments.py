@@ -27,15 +27,15 @@ _LONGEST = 8192
 class Piece:
     """A stretch of valid samples of one record, levels taken off.
 
-    ``y`` and ``u`` are ``(n,)``, ``w`` is ``(signals, n)`` with the external signals; ``owner`` is
-    the number of the record and ``levels`` what was taken off y and u.
+    ``y`` is ``(n,)``, ``u`` is ``(inputs, n)``, ``w`` is ``(signals, n)`` with the external
+    signals; ``owner`` is the number of the record and ``levels`` what was taken off y and each u.
     """
 
     owner: int
     y: Array
     u: Array
     w: Array
-    levels: tuple[float, float]
+    levels: tuple[float, ...]
 
 
 def cut_pieces(
@@ -61,15 +61,16 @@ def cut_pieces(
     """
     pieces = []
     for owner, record in enumerate(records):
-        w = np.array([record.r if name == "r" else record.extra[name] for name in names])
-        y0 = u0 = 0.0
+        w = np.vstack([record.r if name == "r" else record.extra[name] for name in names])
+        u = np.atleast_2d(record.u)
+        levels = (0.0,) * (1 + len(u))
         if intercept and record.valid.any():
-            y0, u0 = float(record.y[record.valid].mean()), float(record.u[record.valid].mean())
+            levels = tuple(float(signal[record.valid].mean()) for signal in (record.y, *u))
             w = w - w[:, record.valid].mean(axis=1, keepdims=True)
+        y, u = record.y - levels[0], u - np.array(levels[1:])[:, None]
         for i, j in record.segments():
             if j - i >= shortest:
-                y, u = record.y[i:j] - y0, record.u[i:j] - u0
-                pieces.append(Piece(owner, y, u, w[:, i:j], (y0, u0)))
+                pieces.append(Piece(owner, y[i:j], u[:, i:j], w[:, i:j], levels))
     return pieces
 
 
@@ -106,9 +107,9 @@ def project_on_references(pieces: Sequence[Piece]) -> Signals:
         def fill(out: Array, start: int, stop: int, p: Piece = piece, s: Any = sums) -> None:
             out[:, 0] = 1.0
             out[:, 1 : m + 1] = _average_delays(s, edges, start, stop)
-            out[:, m + 1], out[:, m + 2] = p.y[start:stop], p.u[start:stop]
+            out[:, m + 1], out[:, m + 2 :] = p.y[start:stop], p.u[:, start:stop].T
 
-        factors.append(block_qr(fill, len(piece.y), m + 3)[1:, 1:])
+        factors.append(block_qr(fill, len(piece.y), m + 2 + len(piece.u))[1:, 1:])
     total = merge_factors(factors)
     g = regress(total[:, :m], total[:, m:], 1e-8)
     found = []
@@ -116,7 +117,7 @@ def project_on_references(pieces: Sequence[Piece]) -> Signals:
         sums, n = [_compute_running_sums(w, edges[-1]) for w in piece.w], len(piece.y)
         blocks = [_average_delays(sums, edges, i, min(i + 4096, n)) @ g for i in range(0, n, 4096)]
         both = np.vstack(blocks)
-        found.append((both[:, 0].copy(), both[:, 1].copy()))
+        found.append((both[:, 0].copy(), both[:, 1:].T.copy()))
     return found
 
 
@@ -178,8 +179,8 @@ def check_instruments(records: Sequence[Record], instruments: Any) -> tuple[str,
             channel = record.r if name == "r" else record.extra.get(name)
             if channel is None:
                 raise CtrlidError(_explain_missing(where, name, record))
-            counted = channel[record.valid]
-            if counted.size and np.ptp(counted) == 0:
+            counted = np.atleast_2d(channel)[:, record.valid]
+            if counted.size and not np.ptp(counted, axis=1).any():
                 raise CtrlidError(
                     f"{where} has a constant {name}: nothing from outside moves the loop, so there "
                     "is no instrument. Vary the reference (random_binary), or name an injected "

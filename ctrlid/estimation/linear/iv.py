@@ -16,14 +16,14 @@ from ..._base.arrays import Array
 from ..._base.criterion import bayesian_penalty
 from ..._base.errors import CtrlidError, CtrlidWarning
 from ..._base.rounding import keep_numpy_quiet
-from ..._base.signals import require_one_signal
+from ..._base.signals import is_several
 from ..._base.statistics import sum_with_correlations
 from ...data.record import Record
 from ...data.several_records import as_records
-from ..constraints import AbstractConstraint, check_constraints
+from ..constraints import AbstractConstraint, check_constraints, divide_constraints
 from ..constraints.constrained_minimum import Found, minimize
 from ..constraints.quadratic_program import NotExcited
-from ..identified_model import Estimate, IdentifiedModel, Structure
+from ..identified_model import Estimate, IdentifiedModel, IdentifiedSystem, Structure
 from ..whiteness import note_coloured_innovations
 from .controller_model import (
     LinearController,
@@ -41,7 +41,7 @@ from .iv_equations import (
     separate_nuisances,
 )
 from .prefilter import View, autoregression, reflect_poles
-from .regression import check_orders, to_differences
+from .regression import list_structures, to_differences
 
 # At most so many iterations are made for one noise model.
 _MOST = 40
@@ -56,14 +56,14 @@ _STARTS = 0.5 ** np.arange(1, 10)
 @keep_numpy_quiet
 def fit_iv(
     record: Record | Sequence[Record],
-    na: int,
-    nb: int,
-    nk: int = 1,
+    na: int | Sequence[int],
+    nb: int | Sequence[int],
+    nk: int | Sequence[int] = 1,
     constraints: AbstractConstraint | Sequence[AbstractConstraint] = (),
     controller: Any = None,
     intercept: bool = True,
     instruments: str | Sequence[str] = "r",
-) -> IdentifiedModel:
+) -> IdentifiedModel | IdentifiedSystem:
     r"""Fit a difference equation by refined instrumental variables under constraints.
 
     ``y(k) + a1 y(k-1) + ... + a_na y(k-na) = b1 u(k-nk) + ... + b_nb u(k-nk-nb+1) + c + A v(k)``
@@ -87,23 +87,27 @@ def fit_iv(
 
     Repeated until the coefficients move by less than a thousandth of their standard errors.
 
+    Of a record of several signals each output is fitted by itself, as `fit_arx` does it. The
+    instruments are then what delayed references explain (step 1), since one output does not tell
+    the loop; curvature is sought for a single input only.
+
     Parameters
     ----------
     record : Record or sequence of Record
         Data with a held input; of several records each has its own intercept. Stretches of valid
         samples are used each on their own.
-    na : int
-        Number of poles.
-    nb : int
-        Number of numerator coefficients.
-    nk : int
+    na : int or sequence of int
+        Number of poles; of several outputs, one for all or one for each.
+    nb : int or sequence of int
+        Number of numerator coefficients, for each input.
+    nk : int or sequence of int
         Samples from u to y: 1 where ``u[k]`` is applied after ``y[k]`` is measured.
     constraints : AbstractConstraint or sequence of them
         What is known, as in `fit_arx`.
     controller : control.TransferFunction or control.StateSpace, optional
         The controller in discrete time, of r - y or of (r, y); signals named in `instruments`
         other than r are added to its output. By default it is found in the record by a regression
-        of u on r and y. An inexact one costs precision only.
+        of u on r and y. An inexact one costs precision only. With several signals it is not used.
     intercept : bool
         Estimate the constant c; see `fit_arx`.
     instruments : str or sequence of str
@@ -112,8 +116,9 @@ def fit_iv(
 
     Returns
     -------
-    IdentifiedModel
-        A `control.TransferFunction` with ``.estimate``. Its residual variance is that of the
+    IdentifiedModel or IdentifiedSystem
+        A `control.TransferFunction` with ``.estimate``, of several signals with ``.estimates`` by
+        output. Its residual variance is that of the
         whitened equation error: without plant noise, that of the one-step prediction. Its
         standard errors hold for noise of any colour: where correlations of the residuals
         contradict the noise model, they are computed from those instead, and ``notes`` say so.
@@ -163,16 +168,38 @@ def fit_iv(
     array([1.05, 0.95])
     """
     check_arguments(fit_iv, locals(), "record", "na", "nb", "nk", "constraints", "instruments")
-    structure = check_orders(na, nb, nk)
     known = check_constraints(constraints)
     records = as_records(record)
-    require_one_signal("fit_iv", records)
+    structures = list_structures(na, nb, nk, records[0])
+    rows = divide_constraints(known, structures)
     _check_hold(records)
     names = check_instruments(records, instruments)
+    if not is_several(records[0]):
+        (structure,) = structures.values()
+        estimate = _fit_row(records, structure, known, names, intercept, controller)
+        labels = records[0].names
+        return IdentifiedModel(estimate, inputs=labels.get("u", "u"), outputs=labels.get("y", "y"))
+    if controller is not None:
+        raise CtrlidError("fit_iv does not use controller= with several signals; leave it out")
+    estimates = {
+        output: _fit_row([one.select(y=output) for one in records], structure, rows[output], names,
+                         intercept, None, alone=False)
+        for output, structure in structures.items()
+    }  # fmt: skip
+    return IdentifiedSystem(estimates, records[0].signals["u"])
+
+
+def _fit_row(
+    records: Sequence[Record], structure: Structure, known: Sequence[AbstractConstraint],
+    names: tuple[str, ...], intercept: bool, controller: Any, alone: bool = True,
+) -> Estimate:  # fmt: skip
+    """Fit one output, the only one of the loop if it is alone."""
     task = Task.prepare(records, structure, names, intercept)
-    law = identify_controller(task.pieces, names) if controller is None else None
+    law = None
     if controller is not None:
         law = convert_controller(controller, names, records[0].dt)
+    elif alone and all(len(piece.w) == len(names) for piece in task.pieces):
+        law = identify_controller(task.pieces, names)
     try:
         fit = _refine_noise_model(task, known, law)
     except NotExcited as trouble:
@@ -180,9 +207,8 @@ def fit_iv(
     estimate = _make_estimate(task, fit, constrained=bool(known), dt=records[0].dt)
     _check_strength(estimate, names)
     if not fit.converged:
-        warnings.warn(_NOT_SETTLED, CtrlidWarning, stacklevel=3)
-    labels = records[0].names
-    return IdentifiedModel(estimate, inputs=labels.get("u", "u"), outputs=labels.get("y", "y"))
+        warnings.warn(_NOT_SETTLED, CtrlidWarning, stacklevel=4)
+    return estimate
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,7 +241,8 @@ def _refine_noise_model(
         better = autoregression(
             [part.e for part in separate_nuisances(task, theta, fit.hats, plain)]
         )
-        if view.degree < _DEGREE and _is_curved(task, fit, replace(view, num=better)):
+        highest = 1 if task.structure.inputs else _DEGREE
+        if view.degree < highest and _is_curved(task, fit, replace(view, num=better)):
             view = replace(view, degree=view.degree + 1, curvature=())
             continue
         if len(better) == len(view.num) and np.allclose(better, view.num, atol=0.02):
@@ -358,7 +385,11 @@ def _make_estimate(task: Task, fit: _Fit, constrained: bool, dt: float) -> Estim
     delta = to_differences(s, found.theta)
     # A(1) = -delta_0 and B(1) = beta_0 return the levels that were taken off.
     constants = [
-        part.constant - delta[0] * piece.levels[0] - delta[s.na] * piece.levels[1]
+        part.constant
+        - delta[0] * piece.levels[0]
+        - sum(
+            delta[p.start] * level for p, level in zip(s.numerators, piece.levels[1:], strict=True)
+        )
         for piece, part in zip(task.pieces, residuals, strict=True)
     ]
     return Estimate(

@@ -74,7 +74,7 @@ class Task:
         CtrlidError
             If there are too few samples, or too few in succession.
         """
-        na, span = structure.na, max(structure.na, structure.nk + structure.nb - 1) + 1
+        na, span = structure.na, structure.span
         shortest = span + na + 2 * MOST_COLOURED
         pieces = cut_pieces(records, names, intercept, shortest)
         for number, one in enumerate(records):
@@ -85,7 +85,7 @@ class Task:
                     f"samples in succession; its longest has {longest}. Record longer, leave it "
                     "out or lower the orders."
                 )
-        unknowns = na + structure.nb + len(records) + na * len(pieces)
+        unknowns = len(structure.names) + len(records) + na * len(pieces)
         total = sum(len(piece.y) for piece in pieces)
         if total < 10 * unknowns:
             raise CtrlidError(
@@ -159,7 +159,7 @@ def _multiply_signals(piece: Piece, hats: tuple[Array, Array], view: View) -> li
     if view.degree == 1:
         return []
     y = hats[0] / np.abs(hats[0]).max()
-    u = hats[1] - (view.shift[piece.owner] if view.shift else 0.0)
+    u = hats[1][0] - (view.shift[piece.owner] if view.shift else 0.0)
     u = u / np.abs(u).max()
     degrees = range(2, view.degree + 1)
     return [u ** (total - i) * y**i for total in degrees for i in range(total + 1)]
@@ -217,7 +217,9 @@ def _make_table(
     columns.append(view(np.ones(len(piece.y)))[first:] if task.intercept else np.zeros(n))
     for y, u in (hats, (piece.y, piece.u)):
         ys = _compute_differences(view(y), i, n, s.na + 1)
-        columns += [*ys[:-1], *_compute_differences(view(u), j, n, s.nb)]
+        columns += ys[:-1]
+        for signal in u:
+            columns += _compute_differences(view(signal), j, n, s.nb)
     return [*columns, ys[-1]], nuisances
 
 
@@ -268,8 +270,10 @@ def _estimate_rounding(task: Task, view: View) -> Array:
     ]
     eps = float(np.finfo(float).eps) * np.sqrt(len(s.names))
     y = max(abs(piece.levels[0]) + float(np.abs(piece.y).max()) for piece in task.pieces)
-    u = max(abs(piece.levels[1]) + float(np.abs(piece.u).max()) for piece in task.pieces)
-    sizes = [y * gain for gain in gains[: s.na]] + [u * gain for gain in gains[: s.nb]]
+    sizes = [y * gain for gain in gains[: s.na]]
+    for k in range(len(s.numerators)):
+        u = max(abs(p.levels[1 + k]) + float(np.abs(p.u[k]).max()) for p in task.pieces)
+        sizes += [u * gain for gain in gains[: s.nb]]
     return np.asarray(eps * np.array(sizes, dtype=float))
 
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence, Sized
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
+from operator import mul
+from typing import Any
 
 import numpy as np
 from scipy.linalg import invpascal, pascal
@@ -95,13 +97,15 @@ def from_differences(structure: Structure) -> tuple[Array, Array]:
     origin : (p,) array
         Integers.
     """
-    na, nb = structure.na, structure.nb
+    na, p = structure.na, len(structure.names)
     # invpascal[j, i]: coefficient of z^i in (z - 1)^j.
     powers = np.asarray(invpascal(na + 1, kind="lower"), dtype=float)
-    basis = np.zeros((na + nb, na + nb))
+    basis = np.zeros((p, p))
     basis[:na, :na] = -powers[:na, :na].T[::-1]
-    basis[na:, na:] = np.asarray(invpascal(nb, kind="lower"), dtype=float).T[::-1]
-    origin = np.zeros(na + nb)
+    for part in structure.numerators:
+        block = np.asarray(invpascal(structure.nb, kind="lower"), dtype=float)
+        basis[part, part] = block.T[::-1]
+    origin = np.zeros(p)
     origin[:na] = powers[na, :na][::-1]
     basis.setflags(write=False)
     origin.setflags(write=False)
@@ -114,8 +118,8 @@ def to_differences(structure: Structure, theta: Array) -> Array:
     _, origin = from_differences(structure)
     x = theta - origin
     a = np.asarray(pascal(na, kind="lower"), dtype=float).T @ x[:na][::-1]
-    b = np.asarray(pascal(nb, kind="lower"), dtype=float).T @ x[na:][::-1]
-    return np.concatenate([-a, b])
+    powers = np.asarray(pascal(nb, kind="lower"), dtype=float).T
+    return np.concatenate([-a, *(powers @ x[part][::-1] for part in structure.numerators)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,8 +138,8 @@ class Regression:
         Rows used.
     floor : (p,) array
         Size of the rounding errors in each column.
-    intercept_rows : tuple of (p + 2,) arrays
-        For each record the first row of its factor, and the levels taken off y and u.
+    intercept_rows : tuple of (array, tuple of float)
+        For each record the first row of its factor, and the levels taken off y and each u.
     """
 
     structure: Structure
@@ -144,17 +148,17 @@ class Regression:
     rss: float
     rows: int
     floor: Array
-    intercept_rows: tuple[tuple[Array, float, float], ...]
+    intercept_rows: tuple[tuple[Array, tuple[float, ...]], ...]
 
     def intercepts(self, theta: Array) -> Array:
         """Return c of each record in ``y(k) + a1 y(k-1) + ... = b1 u(k-nk) + ... + c``."""
         delta = to_differences(self.structure, theta)
-        na = self.structure.na
         constants = []
-        for row, y0, u0 in self.intercept_rows:
+        for row, (y0, *u0) in self.intercept_rows:
             constant = (row[-1] - row[1:-1] @ delta) / row[0]
             # A(1) = -delta_0 and B(1) = beta_0 return the levels that were taken off.
-            constants.append(constant - delta[0] * y0 - delta[na] * u0)
+            firsts = [delta[part.start] for part in self.structure.numerators]
+            constants.append(constant - delta[0] * y0 - sum(map(mul, firsts, u0)))
         return np.array(constants)
 
 
@@ -168,16 +172,17 @@ class Part:
 
     factor: Array
     rows: int
-    levels: tuple[float, float]
+    levels: tuple[float, ...]
     samples: int
     valid: int
 
 
 def reduce_record(record: Record, structure: Structure, intercept: bool = True) -> Part:
     """Return the factor of ``[1 | y D y ... | u D u ... | D^na y]`` of one record."""
-    y0, u0 = _find_levels(record) if intercept else (0.0, 0.0)
-    factor, rows = _compute_factor(record, structure, y0, u0, intercept)
-    return Part(factor, rows, (y0, u0), len(record.y), int(record.valid.sum()))
+    u = np.atleast_2d(record.u)
+    levels = _find_levels(record, u) if intercept else (0.0,) * (1 + len(u))
+    factor, rows = _compute_factor(record, u, structure, levels, intercept)
+    return Part(factor, rows, levels, len(record.y), int(record.valid.sum()))
 
 
 def build_arx_regression(
@@ -210,7 +215,7 @@ def build_arx_regression(
     CtrlidError
         If a record has no row at all.
     """
-    p = structure.na + structure.nb
+    p = len(structure.names)
     total, firsts = np.zeros((p + 1, p + 1)), []
     used = 0
     noise = np.zeros(p)
@@ -218,7 +223,7 @@ def build_arx_regression(
     for number, part in enumerate(share_out(task, records, jobs), start=1):
         factor = part.factor
         if not part.rows:
-            needed = max(structure.na, structure.nk + structure.nb - 1) + 1
+            needed = structure.span
             count = f" of {len(records)}" if isinstance(records, Sized) else ""
             raise CtrlidError(
                 f"Record {number}{count} gives no equation: an equation needs {needed} valid "
@@ -227,10 +232,10 @@ def build_arx_regression(
             )
         used += part.rows
         if intercept:
-            firsts.append((factor[0], *part.levels))
+            firsts.append((factor[0], part.levels))
             factor = factor[1:, 1:]
         total = factor if number == 1 else merge_factors([total, factor])
-        noise += _estimate_rounding(factor, structure, *part.levels, part.rows) ** 2
+        noise += _estimate_rounding(factor, structure, part.levels, part.rows) ** 2
     return Regression(
         structure,
         total[:p, :p],
@@ -242,21 +247,21 @@ def build_arx_regression(
     )
 
 
-def _find_levels(record: Record) -> tuple[float, float]:
-    """Return means of y and u where they count: taken off before any product is formed."""
+def _find_levels(record: Record, u: Array) -> tuple[float, ...]:
+    """Return means of y and each u where they count: taken off before any product is formed."""
     if record.valid.all():
-        return float(record.y.mean()), float(record.u.mean())
+        return tuple(float(signal.mean()) for signal in (record.y, *u))
     if not record.valid.any():
-        return 0.0, 0.0
-    return float(record.y.mean(where=record.valid)), float(record.u.mean(where=record.valid))
+        return (0.0,) * (1 + len(u))
+    return tuple(float(signal.mean(where=record.valid)) for signal in (record.y, *u))
 
 
 def _compute_factor(
-    record: Record, structure: Structure, y0: float, u0: float, intercept: bool
+    record: Record, u: Array, structure: Structure, levels: tuple[float, ...], intercept: bool
 ) -> tuple[Array, int]:
     """Return the factor R of ``[1 | y D y ... | u D u ... | D^na y]`` and the rows that count."""
     na, nb, nk = structure.na, structure.nb, structure.nk
-    y, u, valid = record.y, record.u, record.valid
+    y, valid, (y0, *u0) = record.y, record.valid, levels
     first = max(na, nk + nb - 1)
     rows = max(len(y) - first, 0)
     masked = not valid.all()
@@ -269,7 +274,10 @@ def _compute_factor(
         if intercept:
             out[:, 0] = 1.0
         _write_differences(y[i - na : j] - y0, [*out[:, lead : lead + na].T, out[:, -1]])
-        _write_differences(u[i - nk - nb + 1 : j - nk] - u0, list(out[:, lead + na : -1].T))
+        for k, (signal, level) in enumerate(zip(u, u0, strict=True)):
+            first_column = lead + na + k * nb
+            _write_differences(signal[i - nk - nb + 1 : j - nk] - level,
+                               list(out[:, first_column : first_column + nb].T))  # fmt: skip
         used += stop - start
         if masked:
             counts = valid[i:j].copy()
@@ -281,7 +289,7 @@ def _compute_factor(
             out[~counts] = 0.0
             used -= int(np.count_nonzero(~counts))
 
-    factor = block_qr(fill, rows, lead + na + nb + 1)
+    factor = block_qr(fill, rows, lead + na + nb * len(u) + 1)
     return factor, used
 
 
@@ -295,19 +303,56 @@ def _write_differences(signal: Array, columns: Sequence[Array]) -> None:
 
 
 def _estimate_rounding(
-    factor: Array, structure: Structure, y0: float, u0: float, rows: int
+    factor: Array, structure: Structure, levels: tuple[float, ...], rows: int
 ) -> Array:
     """Return the size of the rounding errors of the data in each differenced column."""
     na, nb = structure.na, structure.nb
     eps = float(np.finfo(float).eps)
     norm = np.linalg.norm(factor, axis=0)
-    y = norm[0] + np.sqrt(rows) * abs(y0)
-    u = norm[na] + np.sqrt(rows) * abs(u0)
-    return eps * np.concatenate([y * 2.0 ** np.arange(na), u * 2.0 ** np.arange(nb)])
+    y0, *u0 = levels
+    sizes = [(norm[0] + np.sqrt(rows) * abs(y0)) * 2.0 ** np.arange(na)]
+    sizes += [(norm[part.start] + np.sqrt(rows) * abs(level)) * 2.0 ** np.arange(nb)
+              for part, level in zip(structure.numerators, u0, strict=True)]  # fmt: skip
+    return eps * np.concatenate(sizes)
 
 
 # No computer solves for more coefficients than these.
 MOST_ORDER = 100_000
+
+
+def list_structures(na: Any, nb: Any, nk: Any, record: Record) -> dict[str, Structure]:
+    """Return the orders of each output of a record.
+
+    Parameters
+    ----------
+    na, nb, nk : int or sequence of int
+        Orders of all outputs, or one for each.
+    record : Record
+        The data.
+
+    Returns
+    -------
+    dict of str to Structure
+        By output.
+
+    Raises
+    ------
+    CtrlidError
+        If they are no usable integers, or not one for each output.
+    """
+    outputs, inputs = record.signals["y"], record.signals["u"]
+    columns = []
+    for name, value in (("na", na), ("nb", nb), ("nk", nk)):
+        several = isinstance(value, list | tuple | np.ndarray)
+        if several and len(value) != len(outputs):
+            raise CtrlidError(f"{name} is one integer, or one for each output ({', '.join(outputs)}"
+                              f"); given {value!r}")  # fmt: skip
+        columns.append(list(value) if several else [value] * len(outputs))
+    names = inputs if len(inputs) > 1 else ()
+    return {
+        output: replace(check_orders(*orders), inputs=names)
+        for output, *orders in zip(outputs, *columns, strict=True)
+    }
 
 
 def check_orders(na: object, nb: object, nk: object) -> Structure:
