@@ -279,7 +279,7 @@ def redesign(
     ...                  inputs=["x", "theta", "xd[0]", "xd[1]", "xd[2]", "xd[3]"])
     >>> trial = cid.redesign(rig, rig, design=design)
     >>> trial.stable, [s.reference for s in trial.steps]
-    (True, ['xd[0]', 'xd[1]'])
+    (True, ['xd[0]'])
     """
     check_arguments(redesign, locals(), "loop", "step", "design")
     if isinstance(G, Loop | LoopFit):

@@ -151,7 +151,7 @@ def reduce_states(a: Array, b: Array, c: Array, order: int) -> tuple[Array, Arra
 
     The block Hankel matrix H, each output and input scaled to size one, is factored by its largest
     singular values (Ho and Kalman; Kung). It is so long that an unstable mode grows by no more than
-    a factor of about a hundred.
+    a factor of about seven.
 
     Parameters
     ----------
@@ -179,7 +179,7 @@ def reduce_states(a: Array, b: Array, c: Array, order: int) -> tuple[Array, Arra
     """
     p, m = len(c), b.shape[1]
     growth = float(np.log(np.max(np.abs(np.linalg.eigvals(a)))))
-    size = int(np.clip(2.5 / growth if growth > 0 else LONGEST, 2 * order, LONGEST))
+    size = int(np.clip(1.0 / growth if growth > 0 else LONGEST, 2 * order, LONGEST))
     pulses = [c @ b]
     state = b
     for _ in range(2 * size - 2):

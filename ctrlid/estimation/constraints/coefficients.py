@@ -34,7 +34,9 @@ class StaticGain(Known):
     ----------
     gain : float
         In output units per input unit.
-    input : str
+    output : str, optional
+        The output that it speaks of; by default all.
+    input : str, optional
         Which of several inputs.
 
     Examples
@@ -87,6 +89,8 @@ class Fixed(Known):
         Coefficient, for instance ``"a2"``.
     value : float
         Its value [unit of the coefficient].
+    output : str, optional
+        The output that it speaks of; by default all.
 
     Examples
     --------
@@ -117,6 +121,8 @@ class Bounds(Known):
         Coefficient, for instance ``"b1"``.
     lower, upper : float
         Bounds, both allowed values [unit of the coefficient].
+    output : str, optional
+        The output that it speaks of; by default all.
 
     Examples
     --------
@@ -148,6 +154,8 @@ class Equal(Known):
     ----------
     first, second : str
         Coefficients.
+    output : str, optional
+        The output that it speaks of; by default all.
 
     Examples
     --------
@@ -179,6 +187,8 @@ class Linear(Known):
     ----------
     weights : mapping of str to float
         Weight of each coefficient in the sum.
+    output : str, optional
+        The output that it speaks of; by default all.
     lower, upper : float
         Bounds of the sum [its unit].
     equals : float, optional
@@ -234,6 +244,8 @@ class Nonlinear(Known):
 
     Parameters
     ----------
+    output : str, optional
+        The output that it speaks of; by default all.
     equality, inequality : callable, optional
         Functions g and f of the coefficient vector ``theta = (a1 .. a_na, b1 .. b_nb)``, returning
         a number or an array. They are differentiated numerically, so they should be smooth.

@@ -36,6 +36,11 @@ class ReciprocalPoles(Known):
     itself, where the poles merge, is allowed, and reported in capitals when the estimate sits on
     it. For more poles ``A(z) = A(1/z) = 0`` for some real z, which is searched for.
 
+    Parameters
+    ----------
+    output : str, optional
+        The output that it speaks of; by default all.
+
     Examples
     --------
     >>> for branch in ReciprocalPoles().branches(Structure(2, 2)):
@@ -91,6 +96,11 @@ class SymmetricPoles(Known):
     ``A(p) = A(-p) = 0`` for some p between 1e-3 and 1e5 rad/s, which is searched for. In a
     sampled model the same fact reads z and 1/z, hence the rows of `ReciprocalPoles`, with z > 0.
 
+    Parameters
+    ----------
+    output : str, optional
+        The output that it speaks of; by default all.
+
     Examples
     --------
     >>> SymmetricPoles().branches(Structure(2, 1, domain="s"))[0].rows
@@ -132,6 +142,8 @@ class PoleAt(Known):
     ----------
     pole : float or complex
         In z for a sampled model, in rad/s for a continuous one.
+    output : str, optional
+        The output that it speaks of; by default all.
 
     Examples
     --------
@@ -158,6 +170,11 @@ class PoleAt(Known):
 @dataclass(frozen=True, repr=False)
 class Integrator(Known):
     """A pole at the origin of the s-plane: z = 1 in a sampled model, last a = 0 in s.
+
+    Parameters
+    ----------
+    output : str, optional
+        The output that it speaks of; by default all.
 
     Examples
     --------
