@@ -262,7 +262,7 @@ def test_a_fitted_system_is_redesigned():
         (lambda: cid.redesign(cid.fit_arx(run(1), 4, 4) * 1.0,
                               cid.Loop(ct.ss(A, B, C, 0 * B[:2]), dt=DT), design=abs),
          "redesign needs a model of several signals in states"),
-        (lambda: cid.fit_continuous(run(1).select(u="F1", y="x"), 4, 3,
+        (lambda: cid.fit_continuous(run(1).select(r="a", u="F1", y="x"), 4, 3,
                                     constraints=cid.PoleAt(-1.0, output="z")),
          "speaks of the output 'z'; the record has x"),
         (lambda: cid.fit_continuous(run(1), 4, 3), "fit_continuous takes one input and one output"),

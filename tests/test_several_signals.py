@@ -176,8 +176,6 @@ MODEL = ct.tf([1.0], [1.0, 1.0])
 @pytest.mark.parametrize(
     ("function", "call"),
     [
-        ("fit_arx", lambda r: cid.fit_arx(r, na=2, nb=2)),
-        ("fit_iv", lambda r: cid.fit_iv(r, na=2, nb=2)),
         ("fit_continuous", lambda r: cid.fit_continuous(r, poles=2)),
         ("compare", lambda r: cid.compare(r, MODEL)),
         ("check_feedback", cid.check_feedback),
