@@ -26,7 +26,7 @@ BOUNDARIES = {
     "reporting/cli/arguments.py: parse_assignment",
     "reporting/cli/demo_identification.py: _tell_redesigns",
     "validation/controller_check.py: check_controller",
-    "validation/controller_check.py: _check_wired_controller",
+    "validation/wired_controller_check.py: check_wired_controller",
     "validation/sampling_sweep.py: _fit_row",
 }
 # A refusal is a `ValueError` too: where that is caught, in the rooms that try candidates out.

@@ -42,6 +42,7 @@ from .reproduction import (
     find_time_constant,
 )
 from .residual_tests import Correlation, autocorrelation, compute_explained_share, cross_correlation
+from .wired_controller_check import find_wired_rejection
 
 # An injected signal below this share of the input's standard deviation is rounding.
 MEANINGFUL = 1e-6
@@ -176,7 +177,7 @@ def _compare_several(record: Record, loop: Loop, horizon: int | None) -> Compari
         ahead[:, index] = values.T
         spread = np.ravel(predict_spread(loop, record, prediction, steps)[0])
         made.append((Reproduction("prediction", steps), ahead, spread))
-    rejected = find_rejection(loop, record)
+    rejected = find_wired_rejection(loop, record)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", CtrlidWarning)
         try:

@@ -19,6 +19,7 @@ from ..loop.wiring import match_signals
 from . import signal_defects as defects
 from .controller_check import FAULTS, check_controller
 from .hold_check import check_hold
+from .wired_controller_check import check_wired_controller
 
 # With fewer valid samples no fit says much.
 FEW = 50
@@ -251,7 +252,7 @@ def _audit_several(record: Record, loop: Loop | None) -> Audit:
             for f in found if f.channel in ("", key)
         ]  # fmt: skip
     if loop is not None:
-        for kind, text, size, harmful in check_controller(loop, record):
+        for kind, text, size, harmful in check_wired_controller(loop, record):
             named = kind if kind in FAULTS else "controller"
             findings.append(AuditFinding(named, "", text, size, (0, record.n), harmful))
     findings = list(dict.fromkeys(findings))

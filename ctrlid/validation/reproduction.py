@@ -11,6 +11,7 @@ from ..loop.period_map import comes_to_rest
 from ..loop.wiring import knows_references
 from ..physics.linearization import compute_state_matrices
 from .controller_check import find_rejection
+from .wired_controller_check import find_wired_rejection
 
 Name = Literal["closed-loop simulation", "open-loop simulation", "prediction"]
 
@@ -43,7 +44,8 @@ def choose_reproduction(loop: Loop, record: Record) -> Reproduction:
     that after a rejected law only a prediction remains, which does not contain the controller.
     """
     known = loop.controller is not None and knows_references(loop.wiring, record)
-    if known and not find_rejection(loop, record):
+    reject = find_rejection if loop.equations().siso else find_wired_rejection
+    if known and not reject(loop, record):
         return CLOSED_LOOP
     if loop.controller is None and comes_to_rest(loop):
         return OPEN_LOOP
