@@ -105,6 +105,30 @@ def test_the_mass_of_a_pendulum_moves_on_a_circle():
     assert E.EddyCurrentDamping(0.1).units(loop) == {"ce": "1/(s (N m)^2)"}
 
 
+@pytest.mark.parametrize(
+    ("units", "said"),
+    [({}, " [theta]/s^2"), ({"theta": "rad", "J": "kg m^2"}, " N m at J = 0.5 kg m^2)")],
+)
+def test_an_output_in_degrees_of_an_angle_in_radians_gives_no_unit_to_forces(units, said):
+    """Friction of 3 rad/s^2 was told as 3 °/s^2."""
+    plant = ct.nlsys(
+        lambda t, x, u, p: np.array([x[1], (p["k"] * u[0] - p["c"] * x[1]) / p["J"]]),
+        lambda t, x, u, p: 180 / np.pi * x[0], inputs=["duty"], outputs=["angle"],
+        states=["theta", "omega"], params={"J": 0.5, "c": 0.1, "k": 1.0}, name="disc",
+    )  # fmt: skip
+    loop = cid.Loop(plant, cid.PID(kp=0.2, kd=0.02), dt=DT, free=("k",), units=units)
+    record = record_of(loop, E.CoulombFriction(3.0), 60.0, 0.02, 11, n=1500)
+    record = cid.Record(r=record.r, u=record.u, y=record.y, dt=DT,
+                        units={"r": "°", "u": "%", "y": "°"})  # fmt: skip
+    found = cid.diagnose(loop, record, progress=False, catalogue=[E.CoulombFriction])
+    text = " ".join(str(found).split())
+    assert [f.name for f in found.findings] == ["CoulombFriction"]
+    assert said in text
+    assert "°/s" not in text
+    assert "° RMS" in text
+    assert "°/s" not in str(cid.fit_loop(loop, record).estimate)
+
+
 def test_units_of_a_loop_are_checked():
     with pytest.raises(cid.CtrlidError, match=r"names \['phi'\], but the signals, states and"):
         turntable({"phi": "rad"})

@@ -156,8 +156,9 @@ def _find_units(loop: Loop) -> dict[str, str]:
         references = {f"reference {name}": known.get(name, "") for name in e.outputs}
         return {**changes, **references, "time": "s", **known}
     y, u = known.get(e.outputs[0], ""), known.get(e.inputs[0], "")
-    units = {"time": "s", "position": y, "reference": y, "input": u, "input change": u,
-             "velocity": fill_unit("{y}/s", {"y": y}) if y else ""}  # fmt: skip
+    x = "" if loop.position_unit.startswith("[") else loop.position_unit
+    units = {"time": "s", "position": x, "reference": y, "input": u, "input change": u,
+             "velocity": fill_unit("{x}/s", {"x": x}) if x else ""}  # fmt: skip
     return {**known, **units}
 
 

@@ -63,6 +63,9 @@ class Gap:
         Of several outputs, the gap of each. That of all is then in units of the floors: the root of
         the mean square of each error over the floor of its output. Its `floor` is about 1, and its
         curves are those of the output whose gap is the widest in these units.
+    force_unit : str
+        Unit of a force per unit of mass: that of the position, which an output may show scaled, per
+        s^2; by default by the unit of the output.
     """
 
     kind: GapKind
@@ -83,9 +86,13 @@ class Gap:
     samples: int = 0
     output: str = ""
     outputs: tuple["Gap", ...] = ()
+    force_unit: str = ""
 
     def __post_init__(self) -> None:
         freeze_arrays(self)
+        if not (self.force_unit or self.outputs):
+            unit = fill_unit("{y}/s^2", {"y": self.unit or "[y]"})
+            object.__setattr__(self, "force_unit", unit)
 
     @property
     def name(self) -> str:
@@ -103,13 +110,6 @@ class Gap:
     def fitted(self) -> float:
         """RMS error of the recalibrated model, whether or not it is the smaller [output unit]."""
         return self.before if math.isnan(self.recalibrated) else self.recalibrated
-
-    @property
-    def force_unit(self) -> str:
-        """The unit of a force per unit of mass, by the unit of the output."""
-        if self.outputs:
-            return ""
-        return fill_unit("{y}/s^2", {"y": self.unit or "[y]"})
 
 
 @dataclass(frozen=True, eq=False)

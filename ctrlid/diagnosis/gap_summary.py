@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from .._base.arrays import Array
+from .._base.units import fill_unit
 from ..estimation.likelihood.filter_data import find_noise_units
 from ..estimation.likelihood.likelihood import Fit
 from ..loop.loop import Loop
@@ -64,6 +65,7 @@ def summarize_gap(loop: Loop, found: Search, fresh: FreshData) -> GapSummary:
         results[2][0][first.mask], floor.widest, how.horizon,
         recalibrated, how == CLOSED_LOOP, trivial,
         sum(int(np.count_nonzero(w.mask)) for w in shared.windows),
+        force_unit=fill_unit("{x}/s^2", {"x": loop.position_unit}),
     )  # fmt: skip
     return GapSummary(gap, shares, _measure_disturbance(fit, loop, floor))
 

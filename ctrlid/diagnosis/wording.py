@@ -53,12 +53,12 @@ ARTICLES = {"delay of the output": "a delay of the output"}
 MAINS = (50.0, 60.0)
 HARMONICS = 3
 MAINS_WIDTH = 0.01
-# What a parameter per unit of inertia is times the inertia, by the unit of the output: the unit of
-# that inertia, and the units of the products by the declared unit of the parameter.
+# What a parameter per unit of inertia is times the inertia, by the unit of accelerations: the unit
+# of that inertia, and the units of the products by the declared unit of the parameter.
 FORCES = {
-    "m": ("kg", {"{y}/s^2": "N", "1/s": "N s/m", "1/s^2": "N/m", "1/{y}": "kg/m",
+    "m/s^2": ("kg", {"{y}/s^2": "N", "1/s": "N s/m", "1/s^2": "N/m", "1/{y}": "kg/m",
                  "1/(s^2 {y}^2)": "N/m^3"}),
-    "rad": ("kg m^2", {"{y}/s^2": "N m", "1/s": "N m s/rad", "1/s^2": "N m/rad",
+    "rad/s^2": ("kg m^2", {"{y}/s^2": "N m", "1/s": "N m s/rad", "1/s^2": "N m/rad",
                        "1/{y}": "N m s^2/rad^2", "1/(s^2 {y}^2)": "N m/rad^3"}),
 }  # fmt: skip
 
@@ -264,12 +264,12 @@ def describe_parameters(
 def describe_forces(found: Diagnosis, effect: AbstractEffect) -> str:
     """Write the accelerations among the parameters as forces, or angular ones as torques.
 
-    This takes an output in m (rad) and just one parameter in kg (kg m^2): of several masses it is
+    This takes a position in m (rad) and just one parameter in kg (kg m^2): of several masses it is
     not known which one moves.
     """
-    if effect.place != "force" or found.gap.unit not in FORCES:
+    if effect.place != "force" or found.gap.force_unit not in FORCES:
         return ""
-    unit, products = FORCES[found.gap.unit]
+    unit, products = FORCES[found.gap.force_unit]
     values = found.loop.parameters
     names = [name for name, u in found.loop.known_units.items() if u == unit and name in values]
     if len(names) != 1:

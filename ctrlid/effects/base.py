@@ -185,6 +185,9 @@ class AbstractEffect:
             names = {"u": e.inputs[inputs], "y": e.outputs[outputs],
                      "x": getattr(self, "name", "")}  # fmt: skip
             signals = {key: known[name] for key, name in names.items() if name in known}
+            if self.place in ("force", "law"):
+                # These are counted in the unit of the position, which an output may show scaled.
+                signals["y"] = loop.position_unit
             if self.place == "force" and self.at:
                 return self._find_force_units(e, known)
         return {p.name: fill_unit(p.unit, signals) for p in self.parameters()}

@@ -1,5 +1,6 @@
 """What the formula of an effect sees: the signals of the loop at one moment."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -58,6 +59,36 @@ def find_output_of(e: Equations, velocity: str) -> int:
             if shown[k, :].sparsity().get_col() == [motion[0]]:
                 return k
     return 0
+
+
+def find_position_unit(e: Equations, known: Mapping[str, str]) -> str:
+    """Return the unit of the position that forces act on.
+
+    It is that of the state, or that of an output which shows the state as it is. An output in
+    degrees of an angle in radians says nothing of the angle's unit.
+
+    Parameters
+    ----------
+    e : Equations
+        The plant, without effects.
+    known : mapping of str to str
+        Units of its signals and states by name.
+
+    Returns
+    -------
+    str
+        The unit; where it is not known, a name in brackets.
+    """
+    motion = find_motion(e)
+    if motion is None:
+        return known.get(e.outputs[0], "") or "[y]"
+    state = e.states[motion[0]]
+    slopes = casadi.simplify(casadi.sparsify(casadi.jacobian(e.output, e.x)))
+    for k, output in enumerate(e.outputs):
+        if slopes[k, :].nnz() == 1 and slopes[k, motion[0]].is_one():
+            return known.get(state, known.get(output, "")) or "[y]"
+    # A name that state and output share would be told the unit of the output.
+    return (known.get(state, "") if state not in e.outputs else "") or f"[{state}]"
 
 
 class Moment:

@@ -19,6 +19,7 @@ from .._base.pickling import pack_by_value
 from .._base.text import write_count
 from ..effects import AbstractEffect
 from ..effects.composition import compose_effects, label_effects
+from ..effects.context import find_position_unit
 from ..effects.python_control import as_system, linearize_with_effects
 from ..physics.equations import Equations, drive_inputs
 from ..physics.linearization import (
@@ -297,6 +298,14 @@ class Loop:
     def known_units(self) -> dict[str, str]:
         """Units by the names of the plant: those in `units`, and else those that the plant has."""
         return {**getattr(self.plant, "units", {}), **self.units}
+
+    @property
+    def position_unit(self) -> str:
+        """The unit of the position that forces act on; a name in brackets where it is not known.
+
+        It is that of the state, or that of an output which shows the state as it is.
+        """
+        return find_position_unit(self._traced, self.known_units)
 
     def equations(self, keep: bool = False) -> Equations:
         """Return the traced equations of the plant with its effects, in absolute physical units.

@@ -170,12 +170,16 @@ def find_noise_units(loop: Loop, record: Record) -> tuple[Any, Any]:
     """
     if not loop.equations().siso:
         return _find_several_units(loop, record)
-    of_plant = loop.known_units.get(loop.equations().outputs[0], "")
-    unit = record.units.get("y", "") or of_plant
+    e, known = loop.equations(), loop.known_units
+    unit = record.units.get("y", "") or known.get(e.outputs[0], "")
     if unit in ("", "1"):
         return "", ""
     # Without a moving mass the noise acts on the rates of the states, whose units are not known.
-    return unit, fill_unit("{y}/s^2", {"y": unit}) if loop.equations().velocities else ""
+    # The unit of the record is that of the position, too, where the output shows it as it is.
+    position = unit if loop.position_unit == "[y]" else loop.position_unit
+    if not e.velocities or position.startswith("["):
+        return unit, ""
+    return unit, fill_unit("{x}/s^2", {"x": position})
 
 
 def _find_several_units(loop: Loop, record: Record) -> tuple[tuple[str, ...], tuple[str, ...]]:
