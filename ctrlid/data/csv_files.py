@@ -112,8 +112,8 @@ def read_csv(
             raise CtrlidError(
                 f"{path} has {'no column' if not found else 'several columns'} {label!r} for "
                 f"{what}; its columns are {', '.join(header)}. Name the right one with {what}="
-                ', and the others likewise: from_csv(..., r="setpoint", u="voltage", y="gap"); r= may be '
-                "left out where the file has no reference"
+                ' and the others likewise: from_csv(..., r="setpoint", u="voltage", y="gap"); '
+                "r= may be left out where the file has no reference"
             )
         return found[0]
 
