@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from .._base.text import write_number, write_p_value
+from .._base.text import write_p_value, write_quantity
 from ..effects import AbstractEffect
 from ..effects.base import name_at_place
 from ..estimation.likelihood.likelihood import Fit
@@ -233,9 +233,9 @@ def write_conclusion(
         kind = "A random force"
         if disturbance.coloured:
             kind = (
-                f"A slowly varying random force of {write_number(disturbance.coloured, 2)} "
-                f"{gap.force_unit} RMS with a time constant of "
-                f"{write_number(disturbance.time_constant, 2)} s"
+                "A slowly varying random force of "
+                f"{write_quantity(disturbance.coloured, gap.force_unit, digits=2)} RMS with a time "
+                f"constant of {write_quantity(disturbance.time_constant, 's', digits=2)}"
             )
         text += (f" {kind} causes {100 * disturbance.share:.0f} % of the variance of the noise "
                  "floor. It is treated as noise here, and may hide a missing effect.")  # fmt: skip
