@@ -42,11 +42,12 @@ model = cid.Loop(plant, None, dt=record.dt, at=at, free=("K",))
 # %%
 # What is missing?
 # ----------------
-# `diagnose` names a lag between the duty cycle and the reading of the sensor. It may be one of the
-# actuator or of the sensor, which a single oscillation does not tell apart. It also names an offset
-# of the gap in the law of the force. A small friction, although the ball moves in air, and a gain
-# of the actuator that decreases are named as well, and may stand in for what is left. So does the
-# coloured sensor noise of the last note: it is larger than the gap that remains.
+# `diagnose` finds a lag between the duty cycle and the reading of the sensor, which may be one of
+# the actuator or of the sensor: a single oscillation does not tell them apart. It also finds an
+# offset of the gap in the law of the force. Since the sizes of both differ between stretches of the
+# record, it says that these names describe the record and do not stand. A small friction is named,
+# although the ball moves in air, and may stand in for what is left. The random force is large, so
+# that the prediction over two samples says less than a straight line through the last readings.
 
 found = cid.diagnose(model, record, progress=False)
 print(found)
@@ -68,9 +69,9 @@ def rise(t, start, end, tau):
 
 
 (start, end, tau), _ = optimize.curve_fit(rise, t, i, p0=(i[0], i[-1], 0.02))
-lag = next(f for f in found.findings if "ActuatorLag" in f.names)
+lag = next(f for f in found.added if "ActuatorLag" in f.names)
 mine = next(e for e in (lag.effect, *lag.alternatives) if type(e).__name__ == "ActuatorLag")
-print(f"lag named by the diagnosis {1e3 * mine.tau:.1f} ms, current of the coil alone "
+print(f"lag found by the diagnosis {1e3 * mine.tau:.1f} ms, current of the coil alone "
       f"{1e3 * tau:.1f} ms, the authors 24.9 ms")  # fmt: skip
 print(f"gap {1e6 * found.gap.given:.0f} um as given, "
       f"{1e6 * found.gap.after:.1f} um with the effects")  # fmt: skip
@@ -97,7 +98,7 @@ print(f"lag beside another zero of the law {1e3 * beside_zero:.1f} ms")
 
 given = cid.Loop(plant, None, dt=0.001, at=at)
 physics = given.with_parameters({"K": found.loop.parameters["K"]})
-for effect in (mine if f is lag else f.effect for f in found.findings):
+for effect in (mine if f is lag else f.effect for f in found.added):
     physics = physics.with_effect(effect)
 outcomes = {}
 for name, loop in {"as given": given, "diagnosed": physics}.items():
@@ -113,4 +114,4 @@ assert not outcomes["as given"].achieved.stable
 assert found.verdict == "partly explained"
 assert 0.0249 < mine.tau < 0.033
 assert abs(beside_zero - 0.0249) < 0.004
-assert found.gap.after < 0.1 * found.gap.given
+assert found.gap.after < 0.2 * found.gap.given
