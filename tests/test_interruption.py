@@ -23,8 +23,6 @@ from ctrlid._base.interruption import Budget, Stopped, check_budget, keep_interr
 from ctrlid._base.jobs import run_side_by_side, share_out
 from ctrlid.diagnosis.progress import Progress
 from ctrlid.diagnosis.thresholds import vary_numbers
-from ctrlid.diagnosis.verdict import declare_unfinished
-from problems import ROOT
 
 E = cid.effects
 
@@ -92,12 +90,6 @@ def test_the_answer_so_far(record, tmp_path):
     again = cid.load_diagnosis(found.save(tmp_path / "found.json"))
     assert (again.finished, str(again)) == (False, str(found))
     assert "THE SEARCH WAS NOT FINISHED" in " ".join(str(again).split())
-
-
-def test_the_time_of_a_long_search_is_a_plain_number():
-    found = cid.load_diagnosis(ROOT / "tests" / "saved_diagnosis.json")
-    for seconds, said in ((124.4, "after 124 s ("), (3.21, "after 3.2 s ("), (86400, "86400 s")):
-        assert said in declare_unfinished(found, "round 1", seconds).sentence
 
 
 def test_what_was_found_before_the_end_is_kept(record, monkeypatch):
