@@ -10,7 +10,6 @@ import numpy as np
 from scipy import linalg, optimize, signal
 
 from .._base.arrays import Array
-from .._base.errors import CtrlidError
 from .._base.statistics import regress
 from ..data.record import Record
 from ..data.validity import find_longest_run, find_whole_past
@@ -151,6 +150,9 @@ def _list_single_gains(loop: Loop, pid: PID, record: Record) -> Iterator[LawChan
         table = np.column_stack([whole - others, responses])[inner]
         factor = float(regress(table, part.u[inner] - others[inner], DETERMINED)[0])
         if not np.isfinite(factor) or factor == 0.0:
+            continue
+        if factor < 0 and pid.anti_windup == "back-calculation":
+            # Its integral would run away: no such controller exists.
             continue
         if factor > 0 and _has_limits(loop):
             # The integral remembers the limits, of which the regression knows nothing.
@@ -350,11 +352,7 @@ def _search_value(
 def _measure_remainder(loop: Loop, record: Record) -> float:
     """Return the logarithm of the share of u that a law leaves in the longest stretch."""
     part = _take_longest(record)[:SEARCH]
-    try:
-        left = part.u - replay_controller(loop, part)
-    except CtrlidError:
-        # A law that cannot run is no candidate.
-        return float("inf")
+    left = part.u - replay_controller(loop, part)
     return float(np.log(np.mean(left**2) / max(float(np.var(part.u)), 1e-300) + 1e-30))
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -174,8 +175,9 @@ def _sample_analog_law(
     """
     part = record[find_longest_run(record.valid)][:TRIAL]
     runs = []
-    for hold in ("foh", "zoh"):
-        sampled = sample_analog_controller(loop, record.hold_r, hold)
+    # Which way r runs is for the record to say, and no fault of the law.
+    for hold_r, hold in product(("foh", "zoh"), ("foh", "zoh")):
+        sampled = sample_analog_controller(loop, hold_r, hold)
         if sampled is None:
             return None
         free = replace(sampled, input_limits=(-np.inf, np.inf))
@@ -184,13 +186,14 @@ def _sample_analog_law(
         output, responses, rest = differentiate_replay(free, part)
         table = np.column_stack([output - rest, np.ones(part.n), responses])
         left = part.u - table @ regress(table, part.u, DETERMINED)
-        runs.append((float(np.mean(left**2)), hold, sampled, output))
-    spread = float(np.var(runs[0][3] - runs[1][3])) / max(float(np.var(part.u)), 1e-300)
-    _, hold, best, _ = min(runs, key=lambda run: run[0])
+        runs.append((float(np.mean(left**2)), hold_r, hold, sampled, output))
+    _, hold_r, hold, best, output = min(runs, key=lambda run: run[0])
+    other = next(run[-1] for run in runs if run[1] == hold_r and run[2] != hold)
+    spread = float(np.var(output - other)) / max(float(np.var(part.u)), 1e-300)
 
     def sample(factor: Any) -> Loop | None:
         changed = replace(loop, controller=factor * loop.controller)
-        return sample_analog_controller(changed, record.hold_r, hold)
+        return sample_analog_controller(changed, hold_r, hold)
 
     return best, max(EXACT, UNRESOLVED**2 * spread), sample
 
@@ -350,13 +353,9 @@ def _find_wrong_law(
     """Return which single change of the stated law leaves only rounding or an added signal."""
     most = CLEARLY * max(_compute_remainder(loop, record[:BEGINNING])[1], left)
     for change in list_changes(loop, record, sample):
-        try:
-            if not _compute_remainder(change.loop, change.record[:BEGINNING])[1] <= most:
-                continue
-            e, remains = _compute_remainder(change.loop, change.record)
-        except CtrlidError:
-            # A law that cannot run is no candidate.
+        if not _compute_remainder(change.loop, change.record[:BEGINNING])[1] <= most:
             continue
+        e, remains = _compute_remainder(change.loop, change.record)
         if not remains <= CLEARLY * left:
             continue
         if _is_rounding(e, remains, change.record, resolution) or (
