@@ -83,7 +83,7 @@ def test_healthy_records_are_left_in_peace(healthy):
         harmful += [f for f in found.findings if f.harmful]
         named += [f for f in found.findings if f.kind in NEVER]
         said = found["controller"]
-        assert len(said) == (0 if loop.analog else 1)
+        assert len(said) == 1
         assert all("computes from r and y" in f.text for f in said)
     assert named == []
     assert len(harmful) <= 1, harmful  # one drift in a few hundred records is chance

@@ -18,6 +18,8 @@ from ..loop.controllers import PID, AntiWindup, Derivative, Integral
 from ..loop.loop import Loop
 from ..physics.conversions import to_state_matrices
 
+# Shorter stretches do not tell what computed the input.
+FEWEST = 20
 # The parameters of a change are read from so many samples, which tell enough.
 TRIAL = 4000
 # Directions below this share of the largest are not in a regression's data.
@@ -351,6 +353,9 @@ def _search_value(
 
 def _measure_remainder(loop: Loop, record: Record) -> float:
     """Return the logarithm of the share of u that a law leaves in the longest stretch."""
+    if max((b - a for a, b in record.segments()), default=0) < FEWEST:
+        # Behind a slow filter every stretch may still be its start, which explains nothing.
+        return float(np.log(1e300))
     part = _take_longest(record)[:SEARCH]
     left = part.u - replay_controller(loop, part)
     return float(np.log(np.mean(left**2) / max(float(np.var(part.u)), 1e-300) + 1e-30))
