@@ -284,8 +284,8 @@ def _sample_analog_law(
 
     r and y are taken as held or as straight, whichever leaves least of u; some of what is between
     the two runs of y is not resolved. Only where the law as stated leaves far more with all of
-    them, a factor and a constant are allowed for. Last comes a function of an analog filter that
-    gives such a loop with the filter in it.
+    them, r runs as the record says, and a factor and a constant are allowed for. Last comes a
+    function of an analog filter that gives such a loop with the filter in it.
     """
     part = record[find_longest_run(record.valid)][:TRIAL]
     runs = []
@@ -313,7 +313,7 @@ def _sample_analog_law(
     best = min(runs, key=lambda run: run[0])
     spread = max(float(np.var(part.u)), 1e-300)
     if best[0] > max(EXACT * spread, resolve(best)) / CLEARLY:
-        best = min(runs, key=lambda run: run[1])
+        best = min((run for run in runs if run[2] == record.hold_r), key=lambda run: run[1])
     _, _, hold_r, hold, sampled, _ = best
 
     def sample(factor: Any) -> Loop | None:
