@@ -22,7 +22,6 @@ from ..loop.controller_replay import (
 )
 from ..loop.controllers import PID
 from ..loop.loop import Loop
-from ..loop.wiring import knows_references, match_signals
 from .controller_changes import DETERMINED, FEWEST, TRIAL, list_changes
 from .residual_tests import compute_explained_share
 from .signal_defects import find_grid_step
@@ -79,10 +78,8 @@ def check_controller(loop: Loop, record: Record) -> list[Fact]:
         compare.
     """
     law = loop.law()
-    if law is None or not knows_references(loop.wiring, record):
+    if law is None or record.r is None:
         return []
-    if loop.wiring is not None and (record.r is None or not loop.equations().siso):
-        return [] if law.dt == 0.0 else _check_wired_controller(loop, record)
     first = int(np.argmax(record.valid))
     if record.n - first < FEWEST:
         return []
@@ -137,114 +134,6 @@ def check_controller(loop: Loop, record: Record) -> list[Fact]:
     return [*facts, _find_wrong_law(loop, part, left, exact_only, resolution, sample) or stated]
 
 
-def _check_wired_controller(loop: Loop, record: Record) -> list[Fact]:
-    """Compare each logged input with what a controller of several signals computes.
-
-    Of a wrong law it is told that it is wrong, or that a channel is late or a constant is added.
-    """
-    e = loop.equations()
-    record = record if e.siso else match_signals(record, e)
-    first = int(np.argmax(record.valid_samples))
-    if record.n - first < FEWEST:
-        return []
-    part, facts = record[first : first + MOST], list[Fact]()
-    names, inputs = e.inputs, np.reshape(part.u, (len(e.inputs), -1))
-    try:
-        left, share = _compute_remainder(loop, part)
-        rows = np.reshape(left, inputs.shape)
-        whole = all(_is_rounding_of(row, u, part) for row, u in zip(rows, inputs, strict=True))
-        shift = None if whole else _find_shift(loop, part, share)
-    except CtrlidError as reason:  # The audit prints a refusal among its facts.
-        return [("refused", "u cannot be computed with the controller of the loop: "
-                 f"{reason}.", 1.0, True)]  # fmt: skip
-    if whole:
-        return [("exact", "the logged u is exactly what the controller of the loop computes from "
-                 "the logged signals.", share, False)]  # fmt: skip
-    if shift is not None:
-        words, moved, remains = shift
-        facts.append(("delay", f"{words}: the controller of the loop explains "
-                      f"{write_percent(1 - share, 4)} of the variance of u as logged, and "
-                      f"{write_percent(1 - remains, 4)} with this shift removed. Shift the "
-                      "channels back before fitting.", share, True))  # fmt: skip
-        part = moved
-        rows = np.reshape(_compute_remainder(loop, part)[0], (len(names), -1))
-        inputs = np.reshape(part.u, rows.shape)
-    for name, row, u in zip(names, rows, inputs, strict=True):
-        if not _is_rounding_of(row, u, part):
-            facts.append(_explain_row(loop, name, row, u, part))
-    return facts
-
-
-def _is_rounding_of(e: Any, u: Any, record: Record) -> bool:
-    """Tell whether what is left of one input is no more than the rounding of its log."""
-    use = record.valid_samples
-    step = find_grid_step(u[use])
-    small = float(np.mean(e[use] ** 2)) <= EXACT * max(float(np.var(u[use])), 1e-300)
-    return small or (bool(step) and float(np.max(np.abs(e[use]))) <= 0.51 * step)
-
-
-def _explain_row(loop: Loop, name: str, e: Any, u: Any, record: Record) -> Fact:
-    """Say what the part of one of several inputs is that does not come from the controller."""
-    use = record.valid_samples
-    share = float(np.mean(e[use] ** 2)) / max(float(np.var(u[use])), 1e-300)
-    rms = f"{float(np.sqrt(np.mean(e[use] ** 2))):.3g}"
-    if float(np.ptp(e[use])) <= 1e-6 * float(np.ptp(u[use])):
-        return ("bias", f"{name} is the output of the controller of the loop plus a constant of "
-                f"{float(np.mean(e[use])):.4g}. Correct the bias of the controller or the input of "
-                "the operating point.", share, True)  # fmt: skip
-    lower, upper = (np.broadcast_to(v, len(loop.equations().inputs))
-                    for v in loop.input_limits)  # fmt: skip
-    k = loop.equations().inputs.index(name)
-    ys = np.reshape(record.y, (-1, record.n))
-    rs = np.zeros((0, record.n)) if record.r is None else np.reshape(record.r, (-1, record.n))
-    inner = use & (u > lower[k]) & (u < upper[k])
-    if _is_row_independent(e, u - e, ys, rs, inner, use):
-        return ("injected", f"in addition to the output of the controller, {name} contains a "
-                f"signal of RMS {rms} that does not depend on the outputs: excitation, dither or "
-                "rounding.", share, False)  # fmt: skip
-    return ("unknown", "the controller of the loop does not explain "
-            f"{write_percent(min(share, 1.0), 3)} of the variance of {name} (RMS {rms}), and this "
-            "part depends on the outputs: the true controller has other gains or another "
-            "structure. Correct the controller, or give None.", share, True)  # fmt: skip
-
-
-def _is_row_independent(e: Any, law: Any, ys: Any, rs: Any, inner: Any, use: Any) -> bool:
-    """Test whether a remainder is independent of all outputs up to now; see `_is_independent`.
-
-    Of what the law itself made of them it is asked alone, too, which tells another gain best.
-    """
-    moves = use[1:] & use[:-1] & (np.abs(np.diff(ys[0])) > 1e-6 * np.ptp(ys[0][use]))
-    held = np.abs(np.diff(e)) <= 1e-6 * np.ptp(e[use])
-    if moves.any() and np.mean(held[moves]) > 0.5:
-        return True
-    rows = np.flatnonzero(find_whole_past(use, MEMORY) & inner)
-    lags = range(MEMORY + 1)
-
-    def follows() -> bool:
-        moving = [(s, 0) for s in (*ys, *rs) if np.ptp(s[use]) > 0]
-        return compute_explained_share(np.where(use, e, 0.0), moving, use, lags=MEMORY) > FOLLOWS
-
-    if len(rows) <= 4 * ((1 + len(ys) + len(rs)) * MEMORY + 3):
-        return not follows()
-
-    def scale(v: Any) -> Any:
-        return (v - np.mean(v[use])) / max(float(np.std(v[use])), 1e-300)
-
-    e, ys, rs = scale(e), [scale(v) for v in ys], [scale(v) for v in rs]
-    own = np.column_stack([np.ones(len(rows)), *(e[rows - k] for k in lags[1:]),
-                           *(r[rows - k] for r in rs for k in lags)])  # fmt: skip
-    without, few = _regress(own, e[rows])
-    if without <= ROUNDING * len(rows):
-        return not follows()
-    chances = [1.0]
-    for more in ([y[rows - k] for y in ys for k in lags], [scale(law)[rows]]):
-        left, many = _regress(np.column_stack([own, *more]), e[rows])
-        if many > few:
-            ratio = (without - left) / (many - few) / max(left / (len(rows) - many), 1e-300)
-            chances.append(float(stats.f.sf(ratio, many - few, len(rows) - many)))
-    return bool(min(chances) >= LEVEL / 2)
-
-
 def find_rejection(loop: Loop, record: Record) -> str:
     """Return why the stated law is not what computed the logged u; empty where it stands.
 
@@ -264,15 +153,11 @@ def _compute_remainder(loop: Loop, record: Record) -> tuple[Any, float]:
     Samples that do not count leave the state of the controller unknown, so that each stretch is
     replayed from its own best state. What is too short to tell it leaves nothing.
     """
-    e, counts = np.zeros(np.shape(record.u)), np.zeros(record.n, bool)
+    e, counts = np.zeros(record.n), np.zeros(record.n, bool)
     long = [(a, b) for a, b in record.segments() if b - a >= FEWEST]
     for a, b in long or [(0, record.n)]:
-        e[..., a:b] = record.u[..., a:b] - replay_controller(loop, record[a:b])
+        e[a:b] = record.u[a:b] - replay_controller(loop, record[a:b])
         counts[a:b] = True
-    if e.ndim == 2:
-        shares = [float(np.mean(row[counts] ** 2)) / max(float(np.var(u[counts])), 1e-300)
-                  for row, u in zip(e, record.u, strict=True)]  # fmt: skip
-        return e, max(shares)
     spread = float(np.var(record.u[counts]))
     return e, float(np.mean(e[counts] ** 2)) / max(spread, 1e-300)
 
@@ -334,9 +219,9 @@ def _is_rounding(e: Any, left: float, record: Record, resolution: float = 0.0) -
 def _shift_channels(record: Record, u: int, y: int) -> Record:
     """Return the record with u and y taken so many samples later than r."""
     a, b = max(0, -u, -y), record.n - max(0, u, y)
-    cut, valid = record[a:b], record.valid
-    return replace(cut, u=record.u[..., a + u : b + u], y=record.y[..., a + y : b + y],
-                   valid=valid[..., a + u : b + u] & valid[..., a + y : b + y])  # fmt: skip
+    cut = record[a:b]
+    return replace(cut, u=record.u[a + u : b + u], y=record.y[a + y : b + y],
+                   valid=record.valid[a + u : b + u] & record.valid[a + y : b + y])  # fmt: skip
 
 
 def _find_shift(loop: Loop, record: Record, left: float) -> tuple[str, Record, float] | None:

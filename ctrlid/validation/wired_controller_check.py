@@ -12,7 +12,8 @@ from ..data.validity import find_whole_past
 from ..loop.controller_replay import replay_controller
 from ..loop.loop import Loop
 from ..loop.wiring import knows_references, match_signals
-from .controller_check import EXACT, FEWEST, IMMATERIAL, LEVEL, MEMORY, MOST, REJECTED, Fact
+from .controller_changes import FEWEST
+from .controller_check import EXACT, IMMATERIAL, LEVEL, MEMORY, MOST, REJECTED, Fact
 from .residual_tests import compute_explained_share
 from .signal_defects import find_grid_step
 
