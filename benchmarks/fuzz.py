@@ -88,6 +88,8 @@ class World:
         self.fit = cid.fit_loop(self.loop, self.records[0])
         self.saved = FOLDER / "found.json"
         self.found.save(self.saved)
+        tracks = np.cumsum(rng.standard_normal((2, 240)), axis=1)
+        self.system = cid.fit_arx(cid.Record(u=r, y=tracks, dt=0.05), 2, 2)
         self.csv = FOLDER / "record.csv"
         self.records[0].to_csv(self.csv)
 
@@ -121,7 +123,7 @@ def wild(w: World, rng: np.random.Generator) -> Any:
         lambda: np.ma.array(np.ones(240), mask=np.arange(240) < 100), lambda: np.float32(0.05),
         lambda: np.array(0.05), lambda: np.int8(3), lambda: np.datetime64("2020-01-01"),
         lambda: w.cart, lambda: w.wide, lambda: w.law, lambda: w.loop, lambda: w.pid, lambda: w.records[0], lambda: w.records, lambda: w.records[3],
-        lambda: w.model, lambda: w.found, lambda: w.fit, lambda: w.comparison,
+        lambda: w.model, lambda: w.system, lambda: w.found, lambda: w.fit, lambda: w.comparison,
         lambda: pick(rng, *w.linear), lambda: pick(rng, *w.plants), lambda: cid.Loop,
         lambda: ct.tf([[[1], [1]]], [[[1, 1], [1, 2]]]), lambda: ct.tf([1, 0, 0], [1, 1]),
         lambda: ct.tf([0], [1]), lambda: ct.ss([], [], [], [[1.0]]), lambda: ct.tf([1], [1, 1], True),
@@ -235,6 +237,7 @@ RECIPES: dict[str, Recipe] = {
     "write_report": lambda w, rng: {"result": pick(rng, w.records[0], w.comparison, w.found), "path": FOLDER / "out.html", "title": pick(rng, "", "a & b")},
     "Estimate.confidence_interval": lambda w, rng: {"self": w.model.estimate, "name": pick(rng, "a1", "b1"), "level": rng.uniform(0.1, 0.99)},
     "LoopEstimate.confidence_interval": lambda w, rng: {"self": w.fit.estimate, "name": "c", "level": rng.uniform(0.1, 0.99)},
+    "IdentifiedSystem.to_states": lambda w, rng: {"self": w.system, "order": pick(rng, None, 2, 4)},
     "IdentifiedModel.with_delay": lambda w, rng: {"self": w.continuous, "order": 2},
     "Diagnosis.save": lambda w, rng: {"self": w.found, "path": FOLDER / "again.json"},
     "plants.ball_on_beam": lambda w, rng: {"m": 0.05, "J": rng.uniform(0.01, 1), "radius": 0.01},
@@ -298,8 +301,8 @@ def is_finite_record(given: Arguments, record: Any) -> bool:
 
 def is_finite_model(given: Arguments, model: Any) -> bool:
     """Tell whether a model has finite coefficients and no negative variance."""
-    e = model.estimate
-    return bool(np.isfinite(e.values).all() and (np.diag(e.covariance) >= 0).all())
+    each = model.estimates.values() if hasattr(model, "estimates") else [model.estimate]
+    return all(np.isfinite(e.values).all() and (np.diag(e.covariance) >= 0).all() for e in each)
 
 
 INVARIANTS: dict[str, Callable[[Arguments, Any], bool]] = {

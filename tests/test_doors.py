@@ -106,6 +106,9 @@ CALLS = {
         loop.plant, output=0.2, guess=cid.OperatingPoint((1, 2, 3), 0, 0)
     ),
     "a negative seed": lambda loop, record: cid.simulate(loop, record.r, seed=-1),
+    "a band of two rows": lambda loop, record: cid.multisine(
+        150, amplitude=0.2, band=np.ones((2, 3))
+    ),
     "no folder": lambda loop, record: record.to_csv("/nonexistent/x.csv"),
     "processes without end": lambda loop, record: cid.fit_each(
         cid.fit_arx, [record, record], na=1, nb=1, jobs=10**9

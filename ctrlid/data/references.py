@@ -192,7 +192,7 @@ def multisine(
     amplitude, around = _check_positive(amplitude, "amplitude"), _check_level(around, "around")
     generator = _make_generator(seed)
     try:
-        low, high = to_real_array(band, "band").tolist()
+        low, high = map(float, to_real_array(band, "band"))
     except (TypeError, ValueError):
         low = high = math.nan
     if not 0 <= low < high <= 1:
