@@ -109,6 +109,7 @@ CALLS = {
     "a band of two rows": lambda loop, record: cid.multisine(
         150, amplitude=0.2, band=np.ones((2, 3))
     ),
+    "a period that no float holds": lambda loop, record: replace(loop, dt=10**400),
     "no folder": lambda loop, record: record.to_csv("/nonexistent/x.csv"),
     "processes without end": lambda loop, record: cid.fit_each(
         cid.fit_arx, [record, record], na=1, nb=1, jobs=10**9

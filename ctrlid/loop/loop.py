@@ -114,7 +114,7 @@ class Loop:
     _kept: Equations = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        if not (isinstance(self.dt, int | float | np.number) and 0 < self.dt < math.inf):
+        if not (is_number(self.dt) and 0 < self.dt < math.inf):
             raise CtrlidError(f"a loop needs its sampling period dt > 0 s; given dt={self.dt!r}")
         equations, inputs = self._trace_plant()
         # A loop is a value: its equations are those of the plant at the time it was made.
