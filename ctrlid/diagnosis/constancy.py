@@ -20,8 +20,8 @@ def run_constancy_tests(fit: Fit, axes: Mapping[str, Array]) -> dict[str, float]
     .. math:: U_b = \sum_{k \in b} \frac{x_k e_k}{S_k}, \quad
         I_b = \sum_{k \in b} \frac{x_k^2}{S_k}
 
-    and :math:`\sum_b U_b^2 / I_b` is chi-squared where the parameter is the same in all bins:
-    the slopes are known before the innovations are. At one frequency,
+    and :math:`\sum_b U_b^2 / I_b` has the law of `compute_bin_probability` where the parameter is
+    the same in all bins: the slopes are known before the innovations are. At one frequency,
     :math:`|\sum_k x_k e_k e^{i \omega k} / S_k|^2 / I` is exponential. An effect that a known one
     only nearly describes, or that comes and goes, shows here long before it shows in the
     innovations themselves.
@@ -51,17 +51,18 @@ def run_constancy_tests(fit: Fit, axes: Mapping[str, Array]) -> dict[str, float]
         )
     ]
     scores = np.concatenate([x * (e / s)[:, None] for x, e, s, _ in parts])
-    information = np.concatenate([x**2 / s[:, None] for x, _, s, _ in parts])
+    rows = np.concatenate([x / np.sqrt(s)[:, None] for x, _, s, _ in parts])
     p_values = {}
     for axis, values in axes.items():
         index = find_bins(values, find_bin_edges(values))
         count = np.bincount(index)
         for j, name in enumerate(names):
-            score, size = (np.bincount(index, v[:, j]) for v in (scores, information))
-            use = (count >= THRESHOLD.fewest_in_bin) & (size > 0)
+            score = sum_in_bins(scores[:, [j]], index, len(count))[:, 0]
+            shared = sum_in_bins(rows * rows[:, [j]], index, len(count))
+            use = (count >= THRESHOLD.fewest_in_bin) & (shared[:, j] > 0)
             if use.sum() > 1:
-                p_values[f"constancy of {name} over {axis}"] = float(
-                    stats.chi2.sf(np.sum(score[use] ** 2 / size[use]), use.sum())
+                p_values[f"constancy of {name} over {axis}"] = compute_bin_probability(
+                    score[use], shared[use, j], shared[use], fit
                 )
     for j, name in enumerate(names):
         lines = [_test_slow_line(x[:, j] * e / s, whole, keep) for x, e, s, keep in parts
@@ -69,6 +70,51 @@ def run_constancy_tests(fit: Fit, axes: Mapping[str, Array]) -> dict[str, float]
         if lines:
             p_values[f"rhythm of {name}"] = min(1.0, min(lines) * len(lines))
     return p_values
+
+
+def sum_in_bins(rows: Array, index: Array, bins: int) -> Array:
+    """Return the sums of rows in bins."""
+    sums: Array = np.empty((bins, rows.shape[1]))
+    for j, column in enumerate(rows.T):
+        sums[:, j] = np.bincount(index, column, minlength=bins)
+    return sums
+
+
+def compute_bin_probability(sums: Array, variances: Array, shared: Array, fit: Fit) -> float:
+    r"""Return the probability that noise makes as large sums in bins, the parameters being fitted.
+
+    .. math:: Q = \sum_b u_b^2 / v_b, \quad V = \mathrm{diag}(v) - C F^{-1} C^T
+
+    What the fit has taken out of the sums u, of variance v before it, is told by their covariance C
+    with the score of the parameters and by its information F. Q is a sum of squares weighted by the
+    eigenvalues of V, in units of v, and nearly a chi-squared variable with its mean and variance.
+
+    Parameters
+    ----------
+    sums, variances : ndarray, shape (bins,)
+        Sums in the bins, and their variances if no parameter were fitted.
+    shared : ndarray, shape (bins, parameters)
+        Covariances of the sums with the score of each parameter.
+    fit : Fit
+        The fitted model.
+
+    Returns
+    -------
+    float
+        The probability; one where the fit leaves the bins no freedom.
+
+    References
+    ----------
+    Satterthwaite, Biometrics Bulletin 2 (1946) 110-114 (the chi-squared law of the same mean and
+    variance); Durbin, Annals of Statistics 1 (1973) 279-290 (tests when parameters are estimated).
+    """
+    scaled = shared / np.sqrt(variances)[:, None]
+    matrix = np.eye(len(sums)) - scaled @ pseudo_inverse(fit.normal[0]) @ scaled.T
+    mean, square = float(np.trace(matrix)), float(np.sum(matrix**2))
+    if not mean > THRESHOLD.seen * len(sums):
+        return 1.0
+    value = float(np.sum(sums**2 / variances))
+    return float(stats.chi2.sf(value * mean / square, mean**2 / square))
 
 
 def compare_stretches(fit: Fit, name: str) -> float:
@@ -159,9 +205,7 @@ def compute_line_probability(power: Array) -> float:
 def find_bin_edges(values: Array, bins: int | None = None) -> Array:
     """Return edges of bins that hold equally many samples; what rounding left of zero is zero."""
     edges = np.quantile(values, np.linspace(0, 1, (bins or THRESHOLD.bins) + 1))
-    edges = np.unique(
-        np.where(np.abs(edges) < THRESHOLD.edge_rounding * np.ptp(values), 0.0, edges)
-    )
+    edges = np.unique(np.where(np.abs(edges) < THRESHOLD.rounding * np.ptp(values), 0.0, edges))
     return edges if len(edges) > 2 else np.array([values.min(), values.mean(), values.max()])
 
 

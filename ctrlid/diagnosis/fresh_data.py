@@ -222,7 +222,7 @@ def choose_fresh_data(
     """
     require_valid_samples(validation or (), "validation=")
     for r in validation or ():
-        if abs(r.dt - loop.dt) > THRESHOLD.same_period * loop.dt:
+        if abs(r.dt - loop.dt) > THRESHOLD.rounding * loop.dt:
             both = write_both_periods("validation= is sampled", r.dt, "the loop", loop.dt)
             raise CtrlidError(f"{both}; give both the same period")
     e = loop.equations()

@@ -224,7 +224,7 @@ def make_size_test(fresh: FreshData) -> Callable[[Model], bool]:
 
     def is_larger(model: Model) -> bool:
         chance = fresh.compute_size_chance(fresh.prepare_loops(model), model.fit)
-        return chance < THRESHOLD.noise_too_large
+        return chance < THRESHOLD.beyond_chance
 
     return is_larger
 

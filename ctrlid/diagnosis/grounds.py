@@ -117,7 +117,7 @@ def differs_between_stretches(case: Case, f: Weighed) -> str:
     sizes = [name for name in sizes if name in case.final.names]
     chances = [compare_stretches(case.final.fit, name) for name in sizes]
     p = min((p * len(sizes) for p in chances), default=1.0)
-    if p >= THRESHOLD.differing:
+    if p >= THRESHOLD.beyond_chance:
         return ""
     return f"its size differs between stretches of the record ({write_p_value(p)})"
 
@@ -162,7 +162,7 @@ def is_phase_locked(record: Record, frequency: float) -> bool:
     if size == 0:
         return False
     aligned = float(abs(np.sum(parts)) ** 2) / size / len(parts)
-    return (1 - min(aligned, 1.0)) ** (len(parts) - 1) < THRESHOLD.differing
+    return (1 - min(aligned, 1.0)) ** (len(parts) - 1) < THRESHOLD.beyond_chance
 
 
 def narrows_no_gap(case: Case, f: Weighed) -> str:

@@ -19,7 +19,14 @@ from .._base.statistics import (
 from ..estimation.likelihood.filter_data import FilterData
 from ..estimation.likelihood.kalman_filter import Filtered
 from ..estimation.likelihood.likelihood import Fit
-from .constancy import compute_line_probability, find_bin_edges, find_bins, run_constancy_tests
+from .constancy import (
+    compute_bin_probability,
+    compute_line_probability,
+    find_bin_edges,
+    find_bins,
+    run_constancy_tests,
+    sum_in_bins,
+)
 from .thresholds import THRESHOLD
 
 # The tests of heavy tails.
@@ -69,7 +76,7 @@ class NoiseTests:
         That is what an effect that is still missing would gain, about, or more.
         """
         means = [p for name, p in self.p_values.items() if name not in self.of_noise]
-        return -math.log(max(min(means), THRESHOLD.least_probability))
+        return -math.log(max(min(means), THRESHOLD.tiny))
 
     @property
     def passed(self) -> bool:
@@ -120,7 +127,7 @@ def _test_several_outputs(fit: Fit) -> NoiseTests:
     innovations of a right model are white together.
     """
     each = {
-        name: _test_output(fit, [z[:, k] for z in fit.standardized])
+        name: _test_output(fit, [z[:, k] for z in fit.standardized], k)
         for k, name in enumerate(fit.plant.e.outputs)
     }
     p_values = {f"{test} of {name}": p for name, one in each.items()
@@ -155,17 +162,22 @@ def _test_across(fit: Fit) -> float:
     return float(stats.chi2.sf(value, max(df, 1)))
 
 
-def _test_output(fit: Fit, standardized: Sequence[Array]) -> NoiseTests:
+def _test_output(fit: Fit, standardized: Sequence[Array], output: int | None = None) -> NoiseTests:
     """Test the standardized innovations of one output, but for the constancy of parameters."""
     parts: dict[str, list[Array]] = {}
     white = cross = 0.0
     white_df = cross_df = 0
-    lines, tails, shapes = [], [], []
+    lines, tails, shapes, slopes = [], [], [], []
     sizes, sizes_df = 0.0, 0
     # Fitted coefficients of the noise take as many correlations to zero.
     p = len(fit.theta) + len(fit.noise.ar) + len(fit.noise.ma)
-    for z, out, data in zip(standardized, fit.filtered, fit.data, strict=True):
+    for z, out, data, (_, width) in zip(
+        standardized, fit.filtered, fit.data, fit.working, strict=True
+    ):
         keep = np.isfinite(z)
+        # Those of several outputs have an axis more.
+        own = (out.slopes, width) if output is None else (out.slopes[:, output], width[:, output])
+        slopes.append(own[0][keep] / np.sqrt(own[1][keep])[:, None])
         filled = np.where(keep, z, 0.0)
         n = int(keep.sum())
         # The standardized innovations have variance one, so that these are correlations.
@@ -211,7 +223,7 @@ def _test_output(fit: Fit, standardized: Sequence[Array]) -> NoiseTests:
         p_values["shape of the random force"] = shape
         of_noise.add("shape of the random force")
     for name, values in axes.items():
-        mean, square = _test_bins(z, values)
+        mean, square = _test_bins(z, values, np.concatenate(slopes), fit)
         p_values[f"mean by {name}"] = mean
         p_values[f"size by {name}"] = square
         of_noise.add(f"size by {name}")
@@ -332,7 +344,7 @@ def _find_several_axes(fit: Fit, out: Filtered, data: FilterData) -> dict[str, A
     return {name: v for name, v in axes.items() if np.ptp(v) > 0}
 
 
-def _test_bins(z: Array, values: Array) -> tuple[float, float]:
+def _test_bins(z: Array, values: Array, slopes: Array, fit: Fit) -> tuple[float, float]:
     """Return the probabilities that mean and mean square in bins are those of noise."""
     edges = find_bin_edges(values)
     index = find_bins(values, edges)
@@ -344,9 +356,14 @@ def _test_bins(z: Array, values: Array) -> tuple[float, float]:
     square = np.bincount(index, z**2, minlength=len(count))[use] / count[use]
     flat = kurtosis_about_zero(z) - 1.0
     level = float(np.average(square, weights=count[use]))
-    chi_mean = float(np.sum(count[use] * mean**2))
+    by_mean = compute_bin_probability(
+        count[use] * mean,
+        count[use].astype(float),
+        sum_in_bins(slopes, index, len(count))[use],
+        fit,
+    )
     chi_square = float(np.sum(count[use] * (square - level) ** 2) / max(flat, 0.5))
     return (
-        float(stats.chi2.sf(chi_mean, use.sum())),
+        by_mean,
         float(stats.chi2.sf(chi_square, use.sum() - 1)),
     )

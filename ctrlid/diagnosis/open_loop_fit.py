@@ -150,7 +150,7 @@ class Simulation:
         lower = np.concatenate([self.problem.lower, -free])
         upper = np.concatenate([self.problem.upper, free])
         start = np.concatenate([theta, x0.ravel()])
-        inside = THRESHOLD.inside_bounds * (1.0 + np.abs(start))
+        inside = THRESHOLD.rounding * (1.0 + np.abs(start))
         start = np.clip(start, lower + inside, upper - inside)
         last: dict[bytes, tuple[Array, Array]] = {}
 

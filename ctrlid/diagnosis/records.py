@@ -192,7 +192,7 @@ def read_clipping(
 def censor_record(record: Record, effect: AbstractEffect) -> Record:
     """Return a record in which samples on a limit of the sensor do not count."""
     assert isinstance(effect, SensorSaturation)
-    slack = THRESHOLD.on_limit * float(np.ptp(record.y))
+    slack = THRESHOLD.rounding * float(np.ptp(record.y))
     y = np.asarray(record.y)
     free = (y > effect.lower + slack) & (y < effect.upper - slack)
     return replace(record, valid=np.asarray(record.valid) & free)

@@ -166,8 +166,8 @@ def forgive_filter(tests: NoiseTests, copies: Sequence[Model | None]) -> NoiseTe
     for name, value in tests.p_values.items():
         usual = min(k.get(name, 1.0) for k in known)
         failed = usual < THRESHOLD.false_alarm and math.log(
-            max(value, THRESHOLD.least_probability)
-        ) > THRESHOLD.beyond_replica * math.log(max(usual, THRESHOLD.least_probability))
+            max(value, THRESHOLD.tiny)
+        ) > THRESHOLD.beyond_replica * math.log(max(usual, THRESHOLD.tiny))
         p[name] = max(value, 0.5) if failed else value
     return replace(
         tests, p_values=p, alpha=THRESHOLD.false_alarm_beside_kinks if bent else tests.alpha

@@ -163,7 +163,7 @@ def _merge_calibrated(parts: Sequence[Diagnosis]) -> tuple[tuple[Calibrated, ...
             )
         )
         spread = float(weights @ (values - mean) ** 2)
-        if len(sure) > 1 and stats.chi2.sf(spread, len(sure) - 1) < THRESHOLD.different_values:
+        if len(sure) > 1 and stats.chi2.sf(spread, len(sure) - 1) < THRESHOLD.telling:
             sizes = [f"{with_error(c.after, c.standard_error)} in record {k + 1}"
                      for k, c in enumerate(same)]  # fmt: skip
             differing.append(f"{first.name} = {write_list(sizes)}")

@@ -77,13 +77,15 @@ class Thresholds:
         1e-3, cost="so much of the noise at least is left beside the steps of a converter",
         unit="of the sensor noise's variance",
     )  # fmt: skip
-    on_limit: float = declare_number(
-        1e-9, cost="a sample so near to a limit of the sensor sits on it", unit="of the range of y"
+    rounding: float = declare_number(
+        1e-9, cost="values that differ by less are the same: a sample and a limit of the sensor, "
+        "two periods, an edge and zero, a start and its bound", unit="of the value or its range",
+    )  # fmt: skip
+    tiny: float = declare_number(
+        1e-300,
+        cost="keeps logarithms and quotients of zero finite; smaller probabilities cannot "
+        "be told from zero in double precision",
     )
-    same_period: float = declare_number(
-        1e-9, cost="periods that differ by less are the same", unit="of the sampling period"
-    )
-    tiny: float = declare_number(1e-300, cost="keeps logarithms and quotients of zero finite")
 
     # Step 2: recalibration.
     parameter_range: float = declare_number(
@@ -136,24 +138,18 @@ class Thresholds:
         40, law="below, the transformations of skewness and kurtosis do not hold",
         unit="independent samples", source="Anscombe and Glynn, Biometrika 70 (1983)",
     )  # fmt: skip
-    least_probability: float = declare_number(
-        1e-300, cost="smaller ones cannot be told from zero in double precision"
-    )
     bins: int = declare_number(12, convention="equally filled bins along a quantity", unit="bins")
     fewest_in_bin: int = declare_number(
         40, law="the mean of so many samples is Gaussian enough for a chi-squared test",
         unit="samples",
     )  # fmt: skip
-    edge_rounding: float = declare_number(
-        1e-9, cost="an edge so near to zero is zero", unit="of the range of a quantity"
-    )
     slow_rhythm: float = declare_number(
         0.05, study="up to there a periodic change of a parameter is looked for",
         unit="of Nyquist's frequency",
     )  # fmt: skip
     telling: float = declare_number(
-        1e-3, convention="a place is told to the user if noise alone looks like it less often",
-        unit="probability",
+        1e-3, convention="a place is told to the user, or that a parameter has different values in "
+        "several records, if noise alone looks like it less often", unit="probability",
     )  # fmt: skip
     surely_left: float = declare_number(
         1e-4, convention="the verdict's sentence says where something remains if noise alone "
@@ -416,13 +412,9 @@ class Thresholds:
         8, cost="the same where a gap stands out: loops that hunt differ from run to run",
         unit="runs",
     )  # fmt: skip
-    noise_too_large: float = declare_number(
-        0.01, convention="chance below which noise that leaves as little as the gap is refused, as "
-        "larger than the gap that it explains", unit="probability",
-    )  # fmt: skip
     beyond_chance: float = declare_number(
-        0.01, convention="errors of two models differ beyond chance if chance alone makes such a "
-        "difference less often", unit="probability",
+        0.01, convention="level of every test that decides alone: whether errors of two models "
+        "differ, whether noise is larger than the gap, whether a name stands", unit="probability",
     )  # fmt: skip
     independent_block: float = declare_number(
         4.0, law="means of so long blocks hardly correlate, so that Student's test of them keeps "
@@ -462,18 +454,9 @@ class Thresholds:
                            unit="of log-likelihood")  # fmt: skip
 
     # Names that stand.
-    differing: float = declare_number(
-        0.01, convention="level of the tests that a name has to stand", unit="probability",
-    )  # fmt: skip
     stretches_compared: int = declare_number(
         4, convention="sizes are compared between quarters, as long as what is kept back",
         unit="of each record",
-    )  # fmt: skip
-
-    # Several records.
-    different_values: float = declare_number(
-        1e-3, convention="chance below which a parameter has different values in several records",
-        unit="probability",
     )  # fmt: skip
 
     # Stable plants, by the error of an open-loop simulation.
@@ -486,9 +469,6 @@ class Thresholds:
         1e-10, cost="directions in which the error changes less are left out",
         unit="of the largest singular value",
     )  # fmt: skip
-    inside_bounds: float = declare_number(
-        1e-9, cost="a search begins so far inside its bounds", unit="of the value"
-    )
     line_padding: int = declare_number(
         4, cost="zeros that make the spectrum finer", unit="times the record"
     )
