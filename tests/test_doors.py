@@ -110,6 +110,9 @@ CALLS = {
         150, amplitude=0.2, band=np.ones((2, 3))
     ),
     "a period that no float holds": lambda loop, record: replace(loop, dt=10**400),
+    "an array without dimensions as order": lambda loop, record: cid.fit_arx(
+        record, 2, np.array(1.5)
+    ),
     "no folder": lambda loop, record: record.to_csv("/nonexistent/x.csv"),
     "processes without end": lambda loop, record: cid.fit_each(
         cid.fit_arx, [record, record], na=1, nb=1, jobs=10**9

@@ -296,9 +296,3 @@ def test_a_loop_that_diverges_is_explained():
     C = ct.ss([], [], [], [[5.0, 0.0]], DT, inputs=["x", "theta"])
     with pytest.raises(cid.CtrlidError, match="closed loop is unstable: small deviations grow"):
         cid.simulate(cid.Loop(CART, C, dt=DT), d=np.zeros(20000), initial=[0, 1e-6, 0, 0])
-
-
-def test_a_diagnosis_says_that_it_takes_one_signal():
-    loop = cid.Loop(CART, luenberger(CART), dt=DT)
-    with pytest.raises(cid.CtrlidError, match="diagnose takes one input and one output"):
-        cid.diagnose(loop, cid.simulate(loop, d=np.zeros(50)))

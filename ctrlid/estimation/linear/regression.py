@@ -12,6 +12,7 @@ import numpy as np
 from scipy.linalg import invpascal, pascal
 from scipy.linalg.lapack import dgeqrf, dgeqrf_lwork
 
+from ..._base.arguments import is_iterable
 from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
 from ..._base.jobs import share_out
@@ -343,7 +344,7 @@ def list_structures(na: Any, nb: Any, nk: Any, record: Record) -> dict[str, Stru
     outputs, inputs = record.signals["y"], record.signals["u"]
     columns = []
     for name, value in (("na", na), ("nb", nb), ("nk", nk)):
-        several = isinstance(value, list | tuple | np.ndarray)
+        several = isinstance(value, list | tuple | np.ndarray) and is_iterable(value)
         if several and len(value) != len(outputs):
             raise CtrlidError(f"{name} is one integer, or one for each output ({', '.join(outputs)}"
                               f"); given {value!r}")  # fmt: skip
