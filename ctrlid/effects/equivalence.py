@@ -298,11 +298,11 @@ def _is_seen_by_law_alone(loop: Any, i: int) -> bool:
         return False
     e, shift = loop.equations(), np.zeros(len(loop.point.states))
     shift[i] = size
-    rates = [
-        (changed.evaluate(x, u, t)[0], e.evaluate(x + shift, u, t)[0], e.evaluate(x, u, t)[0])
-        for t, (x, u) in enumerate(_draw_points(loop.point))
-    ]
-    offset, elsewhere, here = (np.concatenate(part) for part in zip(*rates, strict=True))
+    x, u, t = _draw_points(loop.point)
+    offset, elsewhere, here = (
+        np.ravel(one.evaluate_points(z, u, t)[0])
+        for one, z in ((changed, x), (e, x + shift), (e, x))
+    )
     return _are_equal(elsewhere - here, offset - here)
 
 
