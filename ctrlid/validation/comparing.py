@@ -1,10 +1,10 @@
 """compare(): how well a model or a loop reproduces a record, every curve labelled."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from numbers import Integral
-from typing import Any
+from typing import Any, TypeVar
 
 import control as ct
 import numpy as np
@@ -43,6 +43,8 @@ from .reproduction import (
 )
 from .residual_tests import Correlation, autocorrelation, compute_explained_share, cross_correlation
 from .wired_controller_check import find_wired_rejection
+
+Result = TypeVar("Result")
 
 # An injected signal below this share of the input's standard deviation is rounding.
 MEANINGFUL = 1e-6
@@ -136,7 +138,6 @@ def _compare_loop(record: Record, loop: Loop, horizon: int | None) -> Comparison
     residuals = np.where(prediction.settled, prediction.innovations, np.nan)
     one_step = np.where(prediction.settled, prediction.y, np.nan)
     curves = [_judge_curve(ONE_STEP, record, one_step, _list_known_signals(record, 1))]
-    notes = []
     e = loop.equations()
     steps = horizon or find_time_constant(compute_moving_poles(loop), e.dt, record)
     if steps > 1:
@@ -147,18 +148,27 @@ def _compare_loop(record: Record, loop: Loop, horizon: int | None) -> Comparison
                              _list_known_signals(record, steps),
                              predict_spread(loop, record, prediction, steps)[0]))  # fmt: skip
     rejected = find_rejection(loop, record)
+    curve, notes = _try_simulation(rejected, lambda: _simulate(record, loop, prediction))
+    curves += [] if curve is None else [curve]
+    return _make_comparison(repr(loop), record, curves, residuals, notes)
+
+
+def _try_simulation(
+    rejected: str, simulate: Callable[[], Result]
+) -> tuple[Result | None, list[str]]:
+    """Return a simulation where the law stands and the model runs, and notes of what came of it."""
+    made, notes = None, []
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", CtrlidWarning)
         try:
             if not rejected:
-                curves.append(_simulate(record, loop, prediction))
+                made = simulate()
         except (ModelCannotRun, EffectDoesNotApply) as reason:
             notes.append(f"no simulation: {reason}")
     if rejected:
         notes.append(f"no simulation: the law of the controller is rejected, because {rejected} "
                      "The prediction uses the logged u instead")  # fmt: skip
-    notes += sorted({str(w.message) for w in caught})[-1:]
-    return _make_comparison(repr(loop), record, curves, residuals, notes)
+    return made, notes + sorted({str(w.message) for w in caught})[-1:]
 
 
 def _compare_several(record: Record, loop: Loop, horizon: int | None) -> Comparison:
@@ -169,7 +179,7 @@ def _compare_several(record: Record, loop: Loop, horizon: int | None) -> Compari
         np.reshape(v, (-1, n)) for v in (prediction.settled, prediction.y, prediction.innovations)
     )
     made = [(ONE_STEP, np.where(settled, y, np.nan), np.full(len(names), np.nan))]
-    residuals, notes = np.where(settled, errors, np.nan), list[str]()
+    residuals = np.where(settled, errors, np.nan)
     steps = horizon or find_time_constant(compute_moving_poles(loop), loop.equations().dt, record)
     if steps > 1:
         index, values = predict_ahead(loop, record, prediction, steps)
@@ -178,18 +188,8 @@ def _compare_several(record: Record, loop: Loop, horizon: int | None) -> Compari
         spread = np.ravel(predict_spread(loop, record, prediction, steps)[0])
         made.append((Reproduction("prediction", steps), ahead, spread))
     rejected = find_wired_rejection(loop, record)
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", CtrlidWarning)
-        try:
-            if not rejected:
-                how, free, by_noise, _ = _run_simulation(record, loop, prediction)
-                made.append((how, free, by_noise))
-        except (ModelCannotRun, EffectDoesNotApply) as reason:
-            notes.append(f"no simulation: {reason}")
-    if rejected:
-        notes.append(f"no simulation: the law of the controller is rejected, because {rejected} "
-                     "The prediction uses the logged u instead")  # fmt: skip
-    notes += sorted({str(w.message) for w in caught})[-1:]
+    run, notes = _try_simulation(rejected, lambda: _run_simulation(record, loop, prediction))
+    made += [] if run is None else [run[:3]]
     each = []
     for k, name in enumerate(names):
         part = record.select(y=name)

@@ -1,6 +1,6 @@
 """Whether a logged u is what the controller computes from the logged r and y; if not, why."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import product
 from typing import Any
@@ -105,7 +105,7 @@ def check_controller(loop: Loop, record: Record) -> list[Fact]:
     except CtrlidError as reason:  # The audit prints a refusal among its facts.
         return [*facts, ("refused", "u cannot be computed with the controller of the loop: "
                          f"{reason}.", 1.0, True)]  # fmt: skip
-    if _is_rounding(e, left, part, resolution):
+    if is_rounding(e, left, part.u[part.valid], resolution):
         constant = _read_constant(loop, part)
         if constant:
             return [*facts, _report_bias(constant, left)]
@@ -124,7 +124,7 @@ def check_controller(loop: Loop, record: Record) -> list[Fact]:
                       "back before fitting.", left, True))  # fmt: skip
         part = moved
         e, left = _compute_remainder(loop, part)
-        if _is_rounding(e, left, part, resolution):
+        if is_rounding(e, left, part.u[part.valid], resolution):
             return facts
     stated = _explain_remainder(loop, e, left, part, resolution)
     # Another form of a derivative adds a function of r, and only its exact replay tells it.
@@ -141,7 +141,12 @@ def find_rejection(loop: Loop, record: Record) -> str:
     does a remainder without a name that is far smaller than u: no real record is exact to the
     last digit.
     """
-    for kind, text, share, _ in check_controller(loop, record):
+    return pick_rejection(check_controller(loop, record))
+
+
+def pick_rejection(facts: Sequence[Fact]) -> str:
+    """Return the words of the first fact that speaks against a law; empty without one."""
+    for kind, text, share, _ in facts:
         if kind in REJECTED and not (kind == "unknown" and share < IMMATERIAL):
             return text
     return ""
@@ -208,9 +213,12 @@ def _sample_analog_law(
     return sampled, max(EXACT, resolve(best) / spread), sample
 
 
-def _is_rounding(e: Any, left: float, record: Record, resolution: float = 0.0) -> bool:
-    """Tell whether a remainder is no more than the rounding of the logged u."""
-    step = find_grid_step(record.u[record.valid])
+def is_rounding(e: Any, left: float, u: Any, resolution: float = 0.0) -> bool:
+    """Tell whether a remainder, a share of the variance, is no more than rounding of the logged u.
+
+    `e` and `u` are the remainder and the input on the samples that count.
+    """
+    step = find_grid_step(u)
     return left <= max(EXACT, resolution) or (
         bool(step) and float(np.max(np.abs(e))) <= 0.51 * step
     )
@@ -303,36 +311,63 @@ def _read_constant(loop: Loop, record: Record) -> float:
 def _is_independent(loop: Loop, e: Any, record: Record) -> bool:
     """Test whether a remainder is independent of y up to now, given r and its own past.
 
-    Under feedback y follows an added signal, but tells nothing of it that its own past does not.
     The samples at the stated limits are left out, which cut off what was added.
     """
     assert record.r is not None
-    y, u, valid = record.y, record.u, record.valid
-    lower, upper = loop.input_limits
+    u, lower, upper = record.u, *loop.input_limits
     if isinstance(loop.controller, PID):
         lower, upper = max(lower, loop.controller.lower), min(upper, loop.controller.upper)
-    inner = valid & (u > lower) & (u < upper)
-    moves = valid[1:] & valid[:-1] & (np.abs(np.diff(y)) > 1e-6 * np.ptp(y[valid]))
-    held = np.abs(np.diff(e)) <= 1e-6 * np.ptp(e[valid])
+    inner = record.valid & (u > lower) & (u < upper)
+    return is_independent(e, [record.y], [record.r], inner, record.valid)
+
+
+def is_independent(
+    e: Any, ys: Sequence[Any], rs: Sequence[Any], inner: Any, use: Any, law: Any = None
+) -> bool:
+    """Test whether a remainder is independent of the outputs up to now, given r and its own past.
+
+    Under feedback the outputs follow an added signal, but tell nothing of it that its own past does
+    not.
+
+    Parameters
+    ----------
+    e : ndarray, shape (n,)
+        What the law leaves of an input; zero where nothing counts.
+    ys, rs : sequence of ndarray, shape (n,)
+        Outputs and references.
+    inner, use : ndarray of bool
+        Samples that no limit cuts off, and all samples that count.
+    law : ndarray, shape (n,), optional
+        What the law makes of them. It is then asked alone, too, which tells another gain best.
+    """
+    y = ys[0]
+    moves = use[1:] & use[:-1] & (np.abs(np.diff(y)) > 1e-6 * np.ptp(y[use]))
+    held = np.abs(np.diff(e)) <= 1e-6 * np.ptp(e[use])
     # What holds its value while y moves is not computed from y, however regular its steps are.
     if moves.any() and np.mean(held[moves]) > 0.5:
         return True
-    rows = np.flatnonzero(find_whole_past(valid, MEMORY) & inner)
-    if len(rows) <= 4 * (3 * MEMORY + 3):
-        return not _follows(e, record)
-    e, y, r = (
-        (v - np.mean(v[valid])) / max(float(np.std(v[valid])), 1e-300) for v in (e, y, record.r)
-    )
-    own = np.column_stack([np.ones(len(rows)), *(e[rows - k] for k in range(1, MEMORY + 1)),
-                           *(r[rows - k] for k in range(MEMORY + 1))])  # fmt: skip
-    every = np.column_stack([own, *(y[rows - k] for k in range(MEMORY + 1))])
-    (without, few), (with_y, many) = (_regress(table, e[rows]) for table in (own, every))
+    rows, lags = np.flatnonzero(find_whole_past(use, MEMORY) & inner), range(MEMORY + 1)
+    if len(rows) <= 4 * ((1 + len(ys) + len(rs)) * MEMORY + 3):
+        return not _follows(e, (*ys, *rs), use)
+
+    def scale(v: Any) -> Any:
+        return (v - np.mean(v[use])) / max(float(np.std(v[use])), 1e-300)
+
+    z, outputs, references = scale(e), [scale(v) for v in ys], [scale(v) for v in rs]
+    own = np.column_stack([np.ones(len(rows)), *(z[rows - k] for k in lags[1:]),
+                           *(r[rows - k] for r in references for k in lags)])  # fmt: skip
+    without, few = _regress(own, z[rows])
     if without <= ROUNDING * len(rows):
-        return not _follows(e, record)
-    if many == few:
-        return True
-    ratio = (without - with_y) / (many - few) / max(with_y / (len(rows) - many), 1e-300)
-    return bool(stats.f.sf(ratio, many - few, len(rows) - many) >= LEVEL)
+        return not _follows(e, (*ys, *rs), use)
+    more = [[y[rows - k] for y in outputs for k in lags]]
+    more += [] if law is None else [[scale(law)[rows]]]
+    chances = [1.0]
+    for columns in more:
+        left, many = _regress(np.column_stack([own, *columns]), z[rows])
+        if many > few:
+            ratio = (without - left) / (many - few) / max(left / (len(rows) - many), 1e-300)
+            chances.append(float(stats.f.sf(ratio, many - few, len(rows) - many)))
+    return bool(min(chances) >= LEVEL / len(more))
 
 
 def _regress(table: Any, goal: Any) -> tuple[float, int]:
@@ -354,11 +389,10 @@ def _is_added(loop: Loop, e: Any, left: float, record: Record, resolution: float
     return share <= FOLLOWS or share * left <= resolution
 
 
-def _follows(e: Any, record: Record) -> bool:
-    """Tell whether a remainder follows r and y where its own past leaves nothing to be tested."""
-    channels = [s for s in (record.y, record.r) if s is not None]
-    moving = [(s, 0) for s in channels if np.ptp(s[record.valid]) > 0]
-    return compute_explained_share(e, moving, record.valid, lags=MEMORY) > FOLLOWS
+def _follows(e: Any, channels: Sequence[Any], use: Any) -> bool:
+    """Tell whether a remainder follows signals where its own past leaves nothing to be tested."""
+    moving = [(s, 0) for s in channels if np.ptp(s[use]) > 0]
+    return compute_explained_share(e, moving, use, lags=MEMORY) > FOLLOWS
 
 
 def _find_wrong_law(
@@ -374,7 +408,8 @@ def _find_wrong_law(
         e, remains = _compute_remainder(change.loop, change.record)
         if not remains <= CLEARLY * left:
             continue
-        if _is_rounding(e, remains, change.record, resolution) or (
+        u = change.record.u[change.record.valid]
+        if is_rounding(e, remains, u, resolution) or (
             not (exact_only or change.exact)
             and _is_added(change.loop, e, remains, change.record, resolution)
         ):
