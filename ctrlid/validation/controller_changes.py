@@ -143,12 +143,12 @@ def _list_single_gains(loop: Loop, pid: PID, record: Record) -> Iterator[LawChan
     part = _take_longest(record)
     free = _take_limits_off(loop)
     inner = _find_inner(part)
+    whole = differentiate_replay(free, part)[0]
     for name, words in (("kp", "proportional"), ("ki", "integral"), ("kd", "derivative")):
         if not getattr(pid, name):
             continue
         without = replace(free, controller=replace(free.controller, **{name: 0.0}))
         others, responses, _ = differentiate_replay(without, part)
-        whole = differentiate_replay(free, part)[0]
         table = np.column_stack([whole - others, responses])[inner]
         factor = float(regress(table, part.u[inner] - others[inner], DETERMINED)[0])
         if not np.isfinite(factor) or factor == 0.0:
@@ -294,12 +294,13 @@ def _estimate_pole(
     `output` and its `responses` to the initial state of the law are those of the law as stated.
     """
     v, columns = ((s[1:] - instead_of * s[:-1]) / (1 - instead_of) for s in (output, responses))
-    rows = (_find_inner(part)[1:] & _find_inner(part)[:-1])  # fmt: skip
-    return _solve_pole(part.u, v, columns, rows)
+    return _solve_pole(part, part.u, v, columns)
 
 
-def _solve_pole(u: Array, v: Array, columns: Array, rows: Any) -> float | None:
-    """Return p of ``u + p / (1 - p) (u - last u) = v + columns x`` from the rows to use."""
+def _solve_pole(part: Record, u: Array, v: Array, columns: Array) -> float | None:
+    """Return p of ``u + p / (1 - p) (u - last u) = v + columns x`` where no limit is reached."""
+    inner = _find_inner(part)
+    rows = inner[1:] & inner[:-1]
     table = np.column_stack([-np.diff(u), columns])[rows]
     if len(table) <= 2 * table.shape[1]:
         return None
@@ -418,11 +419,15 @@ def _list_moved_poles(
     """
     law = ct.tf(*_read_polynomials(loop.controller), record.dt)
     num, den = law.num[0][0], law.den[0][0]
-    size = max(len(num), len(den))
-    if len(den) < size:
+    if len(num) > len(den):
         return
-    residues, poles, direct = signal.residuez(np.pad(num, (size - len(num), 0)), den)
+    # In powers of 1/z both have as many coefficients.
+    num = np.pad(num, (len(den) - len(num), 0))
+    residues, poles, _ = signal.residuez(num, den)
     e = part.r - part.y
+    whole = signal.lfilter(num, den, e)
+    powers = np.array([[q**k for q in poles.real] for k in range(part.n)])
+    columns = np.column_stack([powers[1:], np.ones(part.n - 1)])
     for residue, pole in zip(residues, poles, strict=True):
         if abs(pole.imag) > 1e-9 or not 1e-9 < abs(pole) < 1 - INTEGRAL:
             continue
@@ -433,19 +438,14 @@ def _list_moved_poles(
             yield _move_pole(loop, record, p, other, moved)
         weight = -r * p / (1 - p)
         term = signal.lfilter([weight, -weight], [1, -p], e)
-        whole = signal.lfilter(*_in_delays(num, den), e)
         others = part.u - (whole - term)
-        powers = np.array([[q**k for q in poles.real] for k in range(part.n)])
         slope = signal.lfilter([weight / (1 - p), -weight / (1 - p)], [1], e)
-        rows = _find_inner(part)[1:] & _find_inner(part)[:-1]
-        columns = np.column_stack([powers[1:], np.ones(part.n - 1)])
-        other = _solve_pole(others, slope[1:], columns, rows)
+        other = _solve_pole(part, others, slope[1:], columns)
         if other is not None:
             gain = weight * (1 - other) / (1 - p)
             rest = law - ct.tf([weight, -weight], [1, -p], record.dt)
             moved = rest + ct.tf([gain, -gain], [1, -other], record.dt)
             yield _move_pole(loop, record, p, other, moved)
-    del direct
 
 
 def _move_pole(loop: Loop, record: Record, old: float, new: float, law: Any) -> LawChange:
@@ -511,21 +511,13 @@ def _sample_matrices(
     a: Any, b: Any, c: Any, d: Any, dt: float, rule: str
 ) -> tuple[Any, Any, Any, Any] | None:
     """Return the matrices in discrete time that a rule of sampling gives, None if unstable."""
-    n = len(a)
     if rule == "zoh":
-        block = np.zeros((n + b.shape[1],) * 2)
-        block[:n, :n], block[:n, n:] = a, b
-        root = linalg.expm(dt * block)
-        return root[:n, :n], root[:n, n:], c, d
+        return signal.cont2discrete((a, b, c, d), dt, "zoh")[:4]
     w = SHARES[rule]
-    middle = np.eye(n) - w * dt * a
-    if np.linalg.cond(middle) > 1e9:
+    if np.linalg.cond(np.eye(len(a)) - w * dt * a) > 1e9:
         return None
-    inverse = np.linalg.inv(middle)
-    whole = inverse @ (np.eye(n) + (1 - w) * dt * a)
-    if np.abs(np.linalg.eigvals(whole)).max() > 1 + 1e-9:
-        return None
-    return whole, dt * inverse @ b, c @ inverse, d + w * dt * c @ inverse @ b
+    sampled = signal.cont2discrete((a, b, c, d), dt, "gbt", alpha=w)[:4]
+    return None if np.abs(np.linalg.eigvals(sampled[0])).max() > 1 + 1e-9 else sampled
 
 
 # --- helpers
@@ -566,8 +558,3 @@ def _read_polynomials(controller: Any) -> tuple[Any, Any]:
     """Return numerator and denominator of a linear controller of one input."""
     law = controller if isinstance(controller, ct.TransferFunction) else ct.ss2tf(controller)
     return np.trim_zeros(law.num[0][0], "f"), np.trim_zeros(law.den[0][0], "f")
-
-
-def _in_delays(num: Array, den: Array) -> tuple[Array, Array]:
-    """Return a proper transfer function's coefficients in powers of 1/z."""
-    return np.pad(num, (len(den) - len(num), 0)), den
