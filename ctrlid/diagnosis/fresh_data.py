@@ -19,7 +19,6 @@ from ..estimation.likelihood.kalman_filter import compute_memory
 from ..estimation.likelihood.likelihood import Fit, Known, evaluate_likelihood, make_problem
 from ..estimation.likelihood.maximization import begin_fit, maximize
 from ..estimation.likelihood.prediction import (
-    compute_spread_ahead,
     compute_spreads_ahead,
     make_prediction,
     predict_ahead,
@@ -138,38 +137,8 @@ class FreshData:
             )
             return gaps.compute_chance_among_runs(self.measure_gap(loops), runs[:, 0])
         known, horizon = Known(fit.noise, np.full(1, float(np.mean(fit.sensor)))), self.how.horizon
-        if not fit.plant.e.siso:
-            # The chance that one output's noise is too large, of several, is that of any.
-            return self._compute_least_chance(loops, known)
-        squares = usual = worth = 0.0
-        for loop, window in zip(loops, self.windows, strict=True):
-            plain, record = replace(loop, controller=None), window.record
-            problem = make_problem(plain, (), [record], [window.start_time])
-            try:
-                here = begin_fit(replace(problem, known=known))
-            except ModelCannotRun:
-                return math.nan
-            index, y = predict_ahead(plain, record, make_prediction(here), horizon)
-            use = window.mask[index] & np.isfinite(y)
-            e = (record.y[index] - y)[use]
-            if not len(e):
-                continue
-            spread = compute_spread_ahead(here.linearized[0], fit.noise, record.valid, horizon)
-            squares += float(np.sum(e**2))
-            usual += len(e) * float(here.sensor[0]) * spread**2
-            # Errors may look more independent than such noise would be.
-            memory = compute_memory(fit.noise, int(np.count_nonzero(window.mask)))
-            worth += min(
-                len(e) / autocorrelation_time(e, 2), np.count_nonzero(window.mask) / memory
-            )
-        if not usual > 0:
-            return math.nan
-        return float(stats.chi2.cdf(worth * squares / usual, worth))
-
-    def _compute_least_chance(self, loops: Sequence[Loop], known: Known) -> float:
-        """Return the probability for the output that predicts the best beside its noise."""
-        horizon, outputs = self.how.horizon, len(known.noise.sensors) + 1
-        squares, usual, worth = np.zeros(outputs), np.zeros(outputs), np.zeros(outputs)
+        outputs = len(fit.noise.sensors) + 1
+        squares, usual, worth = np.zeros((3, outputs))
         for loop, window in zip(loops, self.windows, strict=True):
             plain, record = replace(loop, controller=None), window.record
             problem = make_problem(plain, (), [record], [window.start_time])
@@ -179,19 +148,25 @@ class FreshData:
                 return math.nan
             index, y = predict_ahead(plain, record, make_prediction(here), horizon)
             spreads = compute_spreads_ahead(
-                here.linearized[0], known.noise, record.valid_samples, horizon
+                here.linearized[0], fit.noise, record.valid_samples, horizon
             )
-            rows = zip(np.reshape(record.y, (outputs, -1)), y.T,
-                       np.reshape(window.mask, (outputs, -1)), strict=True)  # fmt: skip
-            for k, (measured, made, mask) in enumerate(rows):
-                use = mask[index] & np.isfinite(made)
-                e = (measured[index] - made)[use]
-                if len(e):
-                    squares[k] += float(np.sum(e**2))
-                    usual[k] += len(e) * float(here.sensor[0]) * spreads[k] ** 2
-                    worth[k] += min(len(e) / autocorrelation_time(e, 2), np.count_nonzero(mask))
+            measured, made, masks = (
+                np.reshape(v, (outputs, -1)) for v in (record.y, y.T, window.mask)
+            )
+            for k, mask in enumerate(masks):
+                use = mask[index] & np.isfinite(made[k])
+                e = (measured[k][index] - made[k])[use]
+                if not len(e):
+                    continue
+                squares[k] += float(np.sum(e**2))
+                usual[k] += len(e) * float(here.sensor[0]) * spreads[k] ** 2
+                # Errors may look more independent than such noise would be.
+                count = int(np.count_nonzero(mask))
+                memory = compute_memory(fit.noise, count)
+                worth[k] += min(len(e) / autocorrelation_time(e, 2), count / memory)
         if not (usual > 0).all():
             return math.nan
+        # The chance that one output's noise is too large, of several, is that of any.
         chances = stats.chi2.cdf(worth * squares / usual, worth)
         return float(min(1.0, outputs * np.min(chances)))
 

@@ -38,7 +38,7 @@ def summarize_gap(loop: Loop, found: Search, fresh: FreshData) -> GapSummary:
     made = _reproduce(loop, found, fresh)
     after, results = made.after, made.results
     shared = replace(fresh, windows=gaps.share_samples(windows, results))
-    given, recalibrated, left = (gaps.root_mean_square(shared.windows, y) for y in results)
+    left = gaps.root_mean_square(shared.windows, results[2])
     smaller, start = made.choose_start(windows)
     fit = found.final.fit
     floor = gaps.compute_floor(after, fit, shared.windows, how)
@@ -51,39 +51,28 @@ def summarize_gap(loop: Loop, found: Search, fresh: FreshData) -> GapSummary:
             label = list(after[0].labelled)[f.position]
             error = shared.measure_gap([x.without_effect(label) for x in after])
         shares[f.position] = _compute_share_closed(error**2 - left**2, smaller, floor.both)
+    rows = (*results, start)
     if windows[0].record.y.ndim == 2:
-        gap = _summarize_several(loop, shared, made, floor)
-        return GapSummary(gap, shares, _measure_disturbance(fit, loop, floor))
-    first = windows[0]
-    unit = loop.known_units.get(loop.equations().outputs[0], "")
-    trivial = gaps.measure_trivial_error(shared.windows, how.horizon) if how.horizon else math.nan
-    kind: GapKind = "prediction" if how.horizon else "simulation"
-    gap = Gap(
-        kind, given, smaller, left, floor.both, unit,
-        first.start_time + np.asarray(first.record.t - first.record.start)[first.mask],
-        np.asarray(first.record.y)[first.mask], start[0][first.mask],
-        results[2][0][first.mask], floor.widest, how.horizon,
-        recalibrated, how == CLOSED_LOOP, trivial,
-        sum(int(np.count_nonzero(w.mask)) for w in shared.windows),
-        force_unit=fill_unit("{x}/s^2", {"x": loop.position_unit}),
-    )  # fmt: skip
+        gap = _summarize_several(loop, shared, rows, floor)
+    else:
+        unit = loop.known_units.get(loop.equations().outputs[0], "")
+        gap = _make_gap(shared, rows, floor, unit, windows[0])
+        gap = replace(gap, force_unit=fill_unit("{x}/s^2", {"x": loop.position_unit}))
     return GapSummary(gap, shares, _measure_disturbance(fit, loop, floor))
 
 
 def _summarize_several(
-    loop: Loop, shared: FreshData, made: "_Reproductions", floor: gaps.Floor
+    loop: Loop, shared: FreshData, rows: Sequence[Sequence[Array]], floor: gaps.Floor
 ) -> Gap:
     """Return the gap of all outputs in units of the floors, with that of each in its own unit."""
     how, names = shared.how, loop.equations().outputs
-    smaller = made.choose_start(shared.windows)[1]
-    rows = (*made.results, smaller)
-    whole = _make_gap(shared, rows, floor, "", "")
+    whole = _make_gap(shared, rows, floor, "", shared.windows[0])
     outputs = []
     for k, name in enumerate(names):
         part = FreshData(tuple(w.choose_output(k) for w in shared.windows), None, how)
         own = tuple(tuple(y[k] for y in each) for each in rows)
         unit = loop.known_units.get(name, "")
-        outputs.append(_make_gap(part, own, floor.outputs[k], unit, name))
+        outputs.append(_make_gap(part, own, floor.outputs[k], unit, part.windows[0], name))
     shown = max(outputs, key=lambda g: g.before / g.floor if g.floor > 0 else 0.0)
     curves = {name: getattr(shown, name) for name in
               ("time", "measured", "simulated_before", "simulated_after", "output")}  # fmt: skip
@@ -92,12 +81,15 @@ def _summarize_several(
 
 def _make_gap(
     fresh: FreshData, rows: Sequence[Sequence[Array]], floor: gaps.Floor, unit: str,
-    name: str,
+    first: gaps.Window, name: str = "",
 ) -> Gap:  # fmt: skip
-    """Return a gap from what the model as given, recalibrated, complete and at best had before."""
+    """Return a gap from what the model as given, recalibrated, complete and at best had before.
+
+    The curves are those of the `first` window; several outputs together have none.
+    """
     how, windows = fresh.how, fresh.windows
     given, recalibrated, left, before = (gaps.root_mean_square(windows, y) for y in rows)
-    first, alone = windows[0], name != ""
+    alone = first.mask.ndim == 1
     mask = first.mask if alone else first.mask.any(axis=0)
     time = first.start_time + np.asarray(first.record.t - first.record.start)[mask]
     measured, start, end = (

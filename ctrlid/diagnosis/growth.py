@@ -22,12 +22,7 @@ from ..estimation.likelihood.maximization import (
     refit_noise_size,
 )
 from ..estimation.likelihood.noise_fit import compute_noise_criterion
-from .candidates import (
-    Trial,
-    contains,
-    is_same_kind,
-    list_missing_candidates,
-)
+from .candidates import Trial, contains, is_same_kind, list_missing_candidates
 from .fitted_model import (
     Model,
     can_simulate,

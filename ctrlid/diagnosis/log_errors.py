@@ -77,13 +77,14 @@ def find_log_error(
     Returns
     -------
     LogError or None
-        The best repair, with those that do as well in the same sentence; None if none helps.
+        The best repair, with those that do as well in the same sentence; None if none helps, or
+        of several signals, which are not asked.
     """
+    if not loop.equations().siso:
+        return None
     # The heads are fitted at the given values, with the noise alone free: a gross error shows.
     heads = [r[: THRESHOLD.log_error_samples] for r in records]
     as_logged = _measure(loop, heads, None)
-    if not loop.equations().siso:
-        return None
     found: list[tuple[float, str]] = []
     for words, input_factor, output_factor in REPAIRS:
         if _measure(loop, _repair(heads, input_factor, output_factor), None, output_factor) < (

@@ -47,7 +47,7 @@ def make_loop(loop: Any, record: Record) -> Loop:
 
 def with_units_of(loop: Loop, record: Record) -> Loop:
     """Return the loop with the units of a record, in which the sizes of effects will be written."""
-    own = {name: unit for name, unit in _list_units(loop, record) if unit}
+    own = {name: unit for _, name, unit in _list_units(loop, record) if unit}
     return replace(loop, units={**loop.units, **own}) if own else loop
 
 
@@ -85,8 +85,8 @@ def _compare_units(loop: Loop, record: Record) -> list[str]:
     """Say where a record has other units than the plant, or none."""
     of_plant, several = loop.known_units, not loop.equations().siso
     remarks, silent = [], []
-    for (name, there), key in zip(_list_units(loop, record), _list_keys(loop), strict=True):
-        here, key = of_plant.get(name, ""), name if several else key
+    for signal, name, there in _list_units(loop, record):
+        here, key = of_plant.get(name, ""), name if several else signal
         if here and not there:
             silent.append(f"{key} in {here}")
         elif here and there != here:
@@ -104,20 +104,14 @@ def _compare_units(loop: Loop, record: Record) -> list[str]:
     return remarks
 
 
-def _list_keys(loop: Loop) -> list[str]:
-    """Return for each input and then each output of a loop which of u and y it is."""
-    e = loop.equations()
-    return ["u"] * len(e.inputs) + ["y"] * len(e.outputs)
-
-
-def _list_units(loop: Loop, record: Record) -> list[tuple[str, str]]:
-    """Return the unit of each input and output in a record, by its name in the loop."""
+def _list_units(loop: Loop, record: Record) -> list[tuple[str, str, str]]:
+    """Return which of u and y each input and output is, its name in the loop, and its unit."""
     e = loop.equations()
     found = []
     for key, names in (("u", e.inputs), ("y", e.outputs)):
         given = record.units.get(key, "")
         each = given if isinstance(given, tuple) else (given,) * len(names)
-        found += list(zip(names, each, strict=True))
+        found += [(key, name, unit) for name, unit in zip(names, each, strict=True)]
     return found
 
 

@@ -9,11 +9,7 @@ from .._base.arrays import Array
 from .._base.errors import ModelCannotRun
 from ..data.record import Record
 from ..estimation.likelihood.filter_data import FEWEST
-from ..loop.controller_replay import (
-    read_references,
-    replay_from_best_state,
-    run_controller,
-)
+from ..loop.controller_replay import read_references, replay_from_best_state, run_controller
 from ..loop.controllers import PID
 from ..loop.initial_state import find_initial_state
 from ..loop.simulation import Simulator

@@ -314,7 +314,7 @@ def compute_spreads_ahead(lin: Linearized, noise: Noise, valid: Any, horizon: in
 
     .. math:: \sigma_i^2 = h_i P h_i^T + R_i
 
-    as in `compute_spread_ahead`, with white noise.
+    as in `compute_spread_ahead`; of several outputs with white noise.
 
     Parameters
     ----------
@@ -333,11 +333,10 @@ def compute_spreads_ahead(lin: Linearized, noise: Noise, valid: Any, horizon: in
         Errors in standard deviations of the first sensor's noise; NaN where no stretch is long
         enough.
     """
-    size, q = lin.output.shape
-    r = np.array([1.0, *noise.sensors])
-    lead = int(np.clip(LEAD * horizon, 50, 500))
-    starts = np.arange(0, size - lead - horizon, max(1, size // STARTS))
-    starts = starts[find_whole_past(valid, lead + horizon)[starts + lead + horizon]]
+    if lin.output.ndim == 1:
+        return np.array([compute_spread_ahead(lin, noise, valid, horizon)])
+    q, r = lin.output.shape[1], np.array([1.0, *noise.sensors])
+    starts, lead = _choose_starts(valid, horizon)
     if not len(starts):
         return np.full(q, math.nan)
     force = np.asarray(noise.force)
@@ -357,6 +356,13 @@ def compute_spreads_ahead(lin: Linearized, noise: Noise, valid: Any, horizon: in
     with np.errstate(all="ignore"):
         variance = np.mean(np.einsum("sqi,sij,sqj->sq", h, p, h), axis=0)
         return np.asarray(np.sqrt(np.maximum(variance, 0.0) + r))
+
+
+def _choose_starts(valid: Any, horizon: int) -> tuple[Any, int]:
+    """Return where a spread is followed from, and so many samples until the filter has settled."""
+    size, lead = len(valid), int(np.clip(LEAD * horizon, 50, 500))
+    starts = np.arange(0, size - lead - horizon, max(1, size // STARTS))
+    return starts[find_whole_past(valid, lead + horizon)[starts + lead + horizon]], lead
 
 
 def compute_spread_ahead(lin: Linearized, noise: Noise, valid: Any, horizon: int) -> float:
@@ -391,10 +397,7 @@ def compute_spread_ahead(lin: Linearized, noise: Noise, valid: Any, horizon: int
         lin, force = append_sensor_noise(lin, force, noise)
         p = np.array(lin.spread)
         p[:n, :n] = np.eye(n)
-    lead = int(np.clip(LEAD * horizon, 50, 500))
-    size = len(lin.output)
-    starts = np.arange(0, size - lead - horizon, max(1, size // STARTS))
-    starts = starts[find_whole_past(valid, lead + horizon)[starts + lead + horizon]]
+    starts, lead = _choose_starts(valid, horizon)
     if not len(starts):
         return math.nan
     p = np.broadcast_to(p, (len(starts), *p.shape))
