@@ -12,7 +12,7 @@ import pytest
 
 import ctrlid as cid
 from ctrlid import CtrlidError
-from ctrlid.design.input_margins import measure_input_margins, open_at_inputs
+from ctrlid.design.input_margins import measure_performance, open_at_inputs
 from problems import levitation
 from test_wiring import CART, QUAD, at_rest
 
@@ -252,7 +252,7 @@ def test_a_controller_without_reference_has_no_step():
 
 def test_margins_of_an_unstable_loop_are_unknown():
     unstable = cid.Loop(BALL.plant, -1 * BALL.controller, dt=1e-3, at=BALL.at)
-    found = measure_input_margins(unstable)
+    found = measure_performance(unstable)
     assert not found.stable
     assert math.isnan(found.disk_margin)
 

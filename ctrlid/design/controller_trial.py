@@ -17,8 +17,7 @@ from ..loop.controllers import PID
 from ..loop.loop import Loop
 from ..loop.simulation import SimulationStopped, simulate
 from ..physics.trace import timebase
-from .input_margins import measure_input_margins
-from .margins import Margins
+from .input_margins import LoopPerformance, measure_performance
 
 # A response has settled when it stays within this share of its final value.
 SETTLED = 0.02
@@ -103,49 +102,6 @@ class ReferenceStep:
 
     def __post_init__(self) -> None:
         freeze_arrays(self)
-
-
-@dataclass(frozen=True, eq=False)
-class LoopPerformance:
-    """Poles and margins that a controller promises on a model, or achieves on the physics.
-
-    Parameters
-    ----------
-    stable : bool
-        Whether small deviations die out and every step that was tried ended near where it should.
-    poles : ndarray of complex
-        Closed-loop poles [rad/s], of plant and controller; of a digital one ``log(z) / dt``.
-    margins : tuple of Margins
-        One for each input of the plant: the loop is cut there, all others stay closed. NaN for an
-        unstable loop.
-    disk_margin : float
-        `control.disk_margins` for all inputs at once [1]; NaN where python-control cannot tell.
-    disk_gain : float
-        Factor by which the gains of all inputs may rise or fall at the same time.
-    disk_phase : float
-        Phase [deg] that all inputs may lose or gain at the same time.
-    """
-
-    stable: bool
-    poles: ComplexArray
-    margins: tuple[Margins, ...]
-    disk_margin: float
-    disk_gain: float
-    disk_phase: float
-
-    def __post_init__(self) -> None:
-        freeze_arrays(self)
-
-    @property
-    def growth_rate(self) -> float:
-        """The largest real part of a pole [1/s]; negative for a stable loop."""
-        return float(np.max(self.poles.real, initial=-math.inf))
-
-    @property
-    def damping(self) -> float:
-        """The smallest damping ratio [1] of a pole that is not at rest after one period."""
-        poles = self.poles[np.isfinite(self.poles) & (self.poles != 0)]
-        return float(np.min(-poles.real / np.abs(poles), initial=1.0))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -365,29 +321,25 @@ def try_design(
     at = loop.at
     promise = Loop(model, controller, dt=dt, at=at, units=_pick_units(loop))
     trial = replace(loop, controller=controller, dt=dt)
-    sides = [measure_input_margins(side) for side in (promise, trial)]
-    performances = [
-        LoopPerformance(s.stable, s.poles, s.margins, s.disk_margin, s.disk_gain, s.disk_phase)
-        for s in sides
-    ]
+    promised, achieved = (measure_performance(side) for side in (promise, trial))
     heights = _choose_steps(trial, model, step)
-    length = _choose_length(performances[0].poles, dt)
-    motions = {name: [_step(side, name, height, length) for side in (promise, trial)]
-               for name, height in heights.items()}  # fmt: skip
+    length = _choose_length(promised.poles, dt)
+    sides = [(side, _stay(side, length)) for side in (promise, trial) if heights]
     steps = tuple(
-        _make_step(trial, model, name, heights[name], dt, length, *motions[name])
-        for name in heights
-    )
+        _make_step(trial, model, name, height, dt, length,
+                   *(_step(side, name, height, length, rest) for side, rest in sides))
+        for name, height in heights.items()
+    )  # fmt: skip
     if not isinstance(step, Mapping):
         # An angle that no controller can hold is a reference by name only.
         steps = tuple(s for s in steps if not _returns(trial, s)) or steps[:1]
-    rate = performances[1].growth_rate
+    rate = achieved.growth_rate
     reasons = [s.achieved.failure for s in steps if s.achieved.failure is not None]
     if rate >= 0:
         reasons.insert(0, f"Small deviations grow at {rate:.3g} 1/s.")
     failure = " ".join(dict.fromkeys(reasons[:2])) if reasons else None
-    achieved = replace(performances[1], stable=not reasons)
-    return ControllerTrial(controller, performances[0], achieved, steps, trial, model, failure)
+    achieved = replace(achieved, stable=not reasons)
+    return ControllerTrial(controller, promised, achieved, steps, trial, model, failure)
 
 
 def _name_signals(model: Any, loop: Loop) -> Any:
@@ -522,29 +474,42 @@ class _Motion:
     failure: str | None = None
 
 
-def _step(loop: Loop, name: str, height: float, n: int) -> _Motion:
-    """Return what a step of one reference does, less what happens without it."""
+def _follow(loop: Loop, n: int, moved: str = "", height: float = 0.0) -> Any:
+    """Return the record of a loop whose references rest, but for one that steps."""
     names, law = _list_references(loop), loop.law()
     assert law is not None
     rest = np.array(loop.point.outputs if law.references is None else law.references)
-    still, moved = (np.repeat(rest[:, None], n, axis=1) for _ in range(2))
-    moved[names.index(name)] += height
-    single = loop.wiring is None
-    p, m = len(loop.signals["y"]), len(loop.signals["u"])
+    references = np.repeat(rest[:, None], n, axis=1)
+    if moved:
+        references[names.index(moved)] += height
+    return simulate(loop, references[0] if loop.wiring is None
+                    else dict(zip(names, references, strict=True)))  # fmt: skip
+
+
+def _stay(loop: Loop, n: int) -> _Motion:
+    """Return what all signals do without a step."""
     try:
-        first = simulate(loop, still[0] if single else dict(zip(names, still, strict=True)))
+        record = _follow(loop, n)
     except ModelCannotRun as reason:
+        p, m = len(loop.signals["y"]), len(loop.signals["u"])
         return _Motion(np.empty((p, 0)), np.empty((m, 0)), _write_sentence(reason))
-    y, u = np.atleast_2d(first.y), np.atleast_2d(first.u)
+    return _Motion(np.atleast_2d(record.y), np.atleast_2d(record.u))
+
+
+def _step(loop: Loop, name: str, height: float, n: int, rest: _Motion) -> _Motion:
+    """Return what a step of one reference does, less what happens without it."""
+    if rest.failure is not None:
+        return rest
     try:
-        second = simulate(loop, moved[0] if single else dict(zip(names, moved, strict=True)))
+        record = _follow(loop, n, name, height)
     except SimulationStopped as reason:
         got = np.atleast_2d(reason.y)
-        return _Motion(got - y[:, : got.shape[1]], np.empty((m, 0)), _write_sentence(reason))
-    moves = [np.atleast_2d(second.y) - y, np.atleast_2d(second.u) - u]
-    for move in moves:
+        return _Motion(got - rest.y[:, : got.shape[1]], np.empty((len(rest.u), 0)),
+                       _write_sentence(reason))  # fmt: skip
+    y, u = np.atleast_2d(record.y) - rest.y, np.atleast_2d(record.u) - rest.u
+    for move in (y, u):
         move[np.max(np.abs(move), axis=1) < NOTHING * abs(height)] = 0.0
-    return _Motion(*moves)
+    return _Motion(y, u)
 
 
 def _write_sentence(reason: CtrlidError) -> str:

@@ -8,7 +8,7 @@ import control as ct
 import numpy as np
 import numpy.typing as npt
 
-from .._base.arrays import Array, ComplexArray
+from .._base.arrays import Array, ComplexArray, freeze_arrays
 from ..loop.controllers import linearize_law
 from ..loop.loop import Loop
 from ..loop.period_map import compute_closed_loop_poles
@@ -58,33 +58,49 @@ def open_at_inputs(loop: Loop) -> Any:
 
 
 @dataclass(frozen=True, eq=False)
-class InputMargins:
-    """Poles and margins of a loop.
+class LoopPerformance:
+    """Poles and margins that a controller promises on a model, or achieves on the physics.
 
     Parameters
     ----------
+    stable : bool
+        Whether small deviations die out and every step that was tried ended near where it should.
     poles : ndarray of complex
-        Closed-loop poles [rad/s].
+        Closed-loop poles [rad/s], of plant and controller; of a digital one ``log(z) / dt``.
     margins : tuple of Margins
-        At each input of the plant, the others closed.
-    disk_margin, disk_gain, disk_phase : float
-        `control.disk_margins` of all inputs at once: size of the disk [1], the factor by which all
-        gains may rise or fall at the same time, and the phase [deg]; NaN where it is not known.
+        One for each input of the plant: the loop is cut there, all others stay closed. NaN for an
+        unstable loop.
+    disk_margin : float
+        `control.disk_margins` for all inputs at once [1]; NaN where python-control cannot tell.
+    disk_gain : float
+        Factor by which the gains of all inputs may rise or fall at the same time.
+    disk_phase : float
+        Phase [deg] that all inputs may lose or gain at the same time.
     """
 
+    stable: bool
     poles: ComplexArray
     margins: tuple[Margins, ...]
     disk_margin: float
     disk_gain: float
     disk_phase: float
 
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
+
     @property
-    def stable(self) -> bool:
-        """Whether small deviations die out."""
-        return all(one.stable for one in self.margins)
+    def growth_rate(self) -> float:
+        """The largest real part of a pole [1/s]; negative for a stable loop."""
+        return float(np.max(self.poles.real, initial=-math.inf))
+
+    @property
+    def damping(self) -> float:
+        """The smallest damping ratio [1] of a pole that is not at rest after one period."""
+        poles = self.poles[np.isfinite(self.poles) & (self.poles != 0)]
+        return float(np.min(-poles.real / np.abs(poles), initial=1.0))
 
 
-def measure_input_margins(loop: Loop) -> InputMargins:
+def measure_performance(loop: Loop) -> LoopPerformance:
     """Return poles and margins of a loop near its operating point.
 
     Parameters
@@ -94,23 +110,25 @@ def measure_input_margins(loop: Loop) -> InputMargins:
 
     Returns
     -------
-    InputMargins
+    LoopPerformance
         NaN for the numbers of an unstable loop.
     """
     poles = compute_closed_loop_poles(loop, hidden=False)
     m = len(loop.signals["u"])
     if np.max(poles.real, initial=-math.inf) >= 0:
-        return InputMargins(poles, (UNSTABLE,) * m, *(math.nan,) * 3)
+        return LoopPerformance(False, poles, (UNSTABLE,) * m, *(math.nan,) * 3)
     L = open_at_inputs(loop)
     dt = float(L.dt or 0.0)
-    closed = [L.A - L.B[:, rest] @ L.C[rest] for rest in ([], *_leave_one_out(m), list(range(m)))]
-    roots = np.concatenate([to_s(np.linalg.eigvals(matrix), dt) for matrix in closed])
+    matrices = [L.A - L.B[:, rest] @ L.C[rest] for rest in _leave_one_out(m)]
+    every = [L.A, *matrices, L.A - L.B @ L.C]
+    roots = np.concatenate([to_s(np.linalg.eigvals(matrix), dt) for matrix in every])
     grid = make_grid_of_roots(dt, roots[are_resolved(roots, dt)])
     margins = tuple(
-        _measure_margins(_Response(L.A - L.B[:, rest] @ L.C[rest], L.B[:, k], L.C[k], dt), grid)
-        for k, rest in enumerate(_leave_one_out(m))
+        _measure_margins(_Response(matrix, L.B[:, k], L.C[k], dt), grid)
+        for k, matrix in enumerate(matrices)
     )
-    return InputMargins(poles, margins, *_measure_disk(L, grid))
+    stable = all(one.stable for one in margins)
+    return LoopPerformance(stable, poles, margins, *_measure_disk(L, grid))
 
 
 def _leave_one_out(m: int) -> list[list[int]]:
