@@ -29,6 +29,7 @@ from typing import Any
 import joblib
 import numpy as np
 from _random_loops import Noise, log_uniform
+from _shares import print_farthest
 from scipy.stats import beta
 from study_iv import design, information_bound, plant
 
@@ -196,13 +197,7 @@ def main() -> None:
         for value in sorted({row[key] for row in rows}, key=str):
             print(line(f"{key} {value}".replace("parameter ", ""),
                        [row for row in rows if row[key] == value]))  # fmt: skip
-    spent = [row["seconds"] for row in rows]
-    print(f"median time {np.median(spent):.2f} s, longest {max(spent):.1f} s")
-    print("farthest off:")
-    for row in sorted(rows, key=lambda row: -abs(row["z"]))[:12]:
-        print("  ", {k: f"{v:.3g}" if isinstance(v, float) else v for k, v in row.items()})
-    for row in failed:
-        print("failed:", row)
+    print_farthest(rows, failed)
 
 
 if __name__ == "__main__":

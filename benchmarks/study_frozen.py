@@ -26,6 +26,7 @@ import control as ct
 import joblib
 import numpy as np
 import outside_cases as cases
+from _shares import wilson
 from scipy import stats
 
 import ctrlid as cid
@@ -245,19 +246,6 @@ def find_interval(line: dict[str, Any]) -> float | None:
                 return None
             return (value - compute(line["sizes"][0], line["dt"])) / error
     return None
-
-
-def wilson(hits: int, count: int, level: float = 1.96) -> tuple[float, float]:
-    """Wilson's interval of a share; `level` is the quantile of the normal law, 95 % by default.
-
-    >>> [round(v, 3) for v in wilson(98, 100)]
-    [0.93, 0.994]
-    """
-    if not count:
-        return 0.0, 1.0
-    p, z = hits / count, level * level / count
-    half = level * math.sqrt(p * (1 - p) / count + z / (4 * count))
-    return (p + z / 2 - half) / (1 + z), (p + z / 2 + half) / (1 + z)
 
 
 def share(hits: Sequence[bool]) -> str:

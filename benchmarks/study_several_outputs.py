@@ -30,6 +30,7 @@ import control as ct
 import joblib
 import numpy as np
 from _random_loops import log_uniform
+from _shares import print_farthest, wilson
 from scipy.stats import norm
 
 import ctrlid as cid
@@ -198,17 +199,6 @@ def run(seed: int, number: int, only: str | None) -> list[dict[str, Any]]:
     return rows
 
 
-def wilson(hits: int, trials: int, level: float) -> tuple[float, float]:
-    """Return Wilson's interval of a share."""
-    z = float(norm.ppf(0.5 + level / 2))
-    share, scale = hits / trials, 1 + z**2 / trials
-    middle = (share + z**2 / (2 * trials)) / scale
-    half = (
-        z * math.sqrt(share * (1 - share) / trials + z**2 / (4 * trials**2)) / (1 + z**2 / trials)
-    )
-    return middle - half, middle + half
-
-
 def line(label: str, rows: list[dict[str, Any]]) -> str:
     """One line of the table."""
     z = np.array([row["z"] for row in rows])
@@ -247,13 +237,7 @@ def main() -> None:
         for value in sorted({row[key] for row in rows}):
             label = value if key in ("kind", "parameter") else f"{key} {value}"
             print(line(label, [row for row in rows if row[key] == value]))
-    spent = [row["seconds"] for row in rows]
-    print(f"median time {np.median(spent):.2f} s, longest {max(spent):.1f} s")
-    print("farthest off:")
-    for row in sorted(rows, key=lambda row: -abs(row["z"]))[:12]:
-        print("  ", {k: f"{v:.3g}" if isinstance(v, float) else v for k, v in row.items()})
-    for row in failed:
-        print("failed:", row)
+    print_farthest(rows, failed)
 
 
 if __name__ == "__main__":

@@ -33,6 +33,7 @@ import control as ct
 import joblib
 import numpy as np
 import outside_rigs as rigs
+from _shares import wilson
 
 import ctrlid as cid
 
@@ -192,15 +193,6 @@ def is_right(line: dict[str, Any]) -> bool:
     if is_hidden(line):
         return is_in_set(line) and len(named(line)) == 1
     return line["verdict"] == "nothing missing" and not named(line)
-
-
-def wilson(hits: int, count: int, level: float = 1.96) -> tuple[float, float]:
-    """Wilson's interval of a share; `level` is the quantile of the normal law, 95 % by default."""
-    if not count:
-        return 0.0, 1.0
-    p, z = hits / count, level * level / count
-    half = level * math.sqrt(p * (1 - p) / count + z / (4 * count))
-    return (p + z / 2 - half) / (1 + z), (p + z / 2 + half) / (1 + z)
 
 
 def share(hits: Sequence[bool]) -> str:
