@@ -1,7 +1,7 @@
 """Figures, axes and the style that all pictures share."""
 
 import io
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
@@ -238,15 +238,30 @@ def take_literally(ax: Any) -> None:
             text.set_parse_math(False)
 
 
-def _place_legend(ax: Any, columns: int, size: str) -> None:
+def fit_legends(axes: Sequence[Any]) -> None:
+    """Give legends fewer columns where the laid out axes are narrower than they are.
+
+    Long labels of one of several axes take room from all that stand above or below it.
+    """
+    axes[0].figure.draw_without_rendering()
+    for ax in axes:
+        made, room = ax.get_legend(), ax.get_window_extent().width
+        if made is not None and made.get_window_extent().width > room:
+            texts = made.get_texts()
+            _place_legend(ax, len(texts), texts[0].get_fontsize(), room)
+
+
+def _place_legend(ax: Any, columns: int, size: Any, room: float | None = None) -> None:
     """Put a legend above the axes, in so many columns that it does not run off the figure."""
+    if room is None:
+        # The layout is made when the figure is drawn.
+        place = ax.get_subplotspec()
+        box = ax.get_position() if place is None else place.get_position(ax.figure)
+        room = box.width * ax.figure.bbox.width
     for number in range(columns, 0, -1):
         made = ax.legend(loc="lower left", bbox_to_anchor=(0, 1.0), ncols=number, frameon=False,
                          borderaxespad=0.3, fontsize=size, handlelength=2.6)  # fmt: skip
         for text in made.get_texts():
             text.set_parse_math(False)
-        # The layout is made when the figure is drawn, and only widens this place.
-        place = ax.get_subplotspec()
-        room = ax.get_position() if place is None else place.get_position(ax.figure)
-        if made.get_window_extent().width <= room.width * ax.figure.bbox.width:
+        if made.get_window_extent().width <= room:
             return

@@ -11,7 +11,16 @@ from ...diagnosis.findings import BinnedErrors
 from ...diagnosis.result import Diagnosis
 from ...diagnosis.thresholds import THRESHOLD
 from .. import pictures as _pictures
-from .axes import COLOURS, MEASURED, Picture, finish_axes, new_figure, require_kind, take_axes
+from .axes import (
+    COLOURS,
+    MEASURED,
+    Picture,
+    finish_axes,
+    fit_legends,
+    new_figure,
+    require_kind,
+    take_axes,
+)
 
 BEFORE = {"color": COLOURS[1], "linestyle": "--", "linewidth": 1.4}
 AFTER = {"color": COLOURS[0], "linestyle": "-", "linewidth": 1.4}
@@ -50,7 +59,8 @@ def diagnosis(found: Diagnosis, ax: Any = None) -> Picture:
     """
     require_kind(found, Diagnosis, "plot.diagnosis draws a Diagnosis, as diagnose() returns")
     rounds = _pictures.make_ranking(found)
-    if ax is None:
+    own = ax is None
+    if own:
         rows = max(sum(len(bars) + 1 for bars in rounds.values()), 3)
         height = 0.21 * rows + 0.9
         layout = [["output"] * 2, ["error"] * 2, ["first", "second"], ["ranking"] * 2]
@@ -65,6 +75,8 @@ def diagnosis(found: Diagnosis, ax: Any = None) -> Picture:
     for ax, place in zip(axes[2:4], [*places, None, None][:2], strict=True):
         _draw_errors(ax, place, found)
     _draw_ranking(axes[4], rounds)
+    if own:
+        fit_legends(axes)
     return Picture(axes)
 
 
