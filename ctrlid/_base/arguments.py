@@ -14,6 +14,7 @@ from typing import Any, Literal, TypeVar, get_args, get_origin
 import numpy as np
 
 from .errors import CtrlidError
+from .text import find_near_name
 
 NUMBERS = {
     float: "a number", int: "a whole number", complex: "a real or complex number",
@@ -86,6 +87,37 @@ def check_fields(value: Any, *own: str) -> None:
     for name, kind in _find_field_kinds(cls).items():
         if name not in own:
             _check_kind(type(value).__name__, name, getattr(value, name), kind)
+
+
+def check_field_names(cls: Any, given: Iterable[str]) -> None:
+    """Refuse unknown fields in words, before a generated constructor does so curtly.
+
+    It stands in ``__new__`` of a dataclass, which `show_fields` then has to follow.
+
+    Parameters
+    ----------
+    cls : type
+        The dataclass.
+    given : iterable of str
+        Names of the fields that are given.
+
+    Raises
+    ------
+    CtrlidError
+        At the first that it does not have, with a near name.
+    """
+    known = tuple(cls.__dataclass_fields__)
+    for name in given:
+        if name not in known:
+            near = find_near_name(name, known)
+            hint = f"did you mean {near}=?" if near else f"it has {', '.join(known)}"
+            raise CtrlidError(f"a {cls.__name__} has no {name}=; {hint}")
+
+
+def show_fields(cls: Any) -> None:
+    """Let help show the fields of a dataclass, not the arguments of the check of their names."""
+    own = inspect.signature(cls.__init__)
+    cls.__signature__ = own.replace(parameters=list(own.parameters.values())[1:])
 
 
 def _check_kind(who: str, name: str, value: Any, kind: Any) -> None:

@@ -1,6 +1,5 @@
 """Record: one experiment in one loop, measured or simulated."""
 
-import inspect
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
@@ -12,10 +11,10 @@ from typing import Any, Literal, Self, get_args
 import numpy as np
 from scipy import signal
 
-from .._base.arguments import check_arguments
+from .._base.arguments import check_arguments, check_field_names, show_fields
 from .._base.errors import CtrlidError
 from .._base.signals import list_signals, require_one_signal
-from .._base.text import Printed, find_near_name, write_percent
+from .._base.text import Printed, write_percent
 from . import csv_files as _csv
 from . import responses as _response
 from .field_checks import check_samples, check_seconds, check_words
@@ -101,12 +100,7 @@ class Record(Printed):
         """Refuse unknown fields in words, before the generated constructor does so curtly."""
         if "t" in fields:
             raise CtrlidError(_write_no_instants(fields["t"]))
-        known = tuple(cls.__dataclass_fields__)
-        for name in fields:
-            if name not in known:
-                near = find_near_name(name, known)
-                hint = f"did you mean {near}=?" if near else f"it has {', '.join(known)}"
-                raise CtrlidError(f"a Record has no {name}=; {hint}")
+        check_field_names(cls, fields)
         return super().__new__(cls)
 
     def __post_init__(self) -> None:
@@ -643,11 +637,7 @@ class Record(Printed):
         return "\n".join(rows)
 
 
-_init = inspect.signature(Record.__init__)
-# Help shows the fields, not the arguments of the check of their names.
-Record.__signature__ = _init.replace(  # type: ignore[attr-defined]
-    parameters=list(_init.parameters.values())[1:]
-)
+show_fields(Record)
 
 
 def _write_no_instants(t: Any) -> str:

@@ -6,7 +6,6 @@ a state, a rule for its next value (or its rate) and the input it applies, in ab
 units.
 """
 
-import inspect
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,11 +15,10 @@ import casadi
 import control as ct
 import numpy as np
 
-from .._base.arguments import is_number
+from .._base.arguments import check_field_names, is_number, show_fields
 from .._base.arrays import Array
 from .._base.errors import CtrlidError
 from .._base.periods import have_same_period, write_both_periods
-from .._base.text import find_near_name
 from ..physics.conversions import to_state_matrices
 from ..physics.linearization import OperatingPoint
 from ..physics.trace import timebase, trace
@@ -102,12 +100,7 @@ class PID:
     def __new__(cls, *args: Any, **fields: Any) -> Self:
         """Refuse unknown fields in words, before the generated constructor does so curtly."""
         del args
-        known = tuple(cls.__dataclass_fields__)
-        for name in fields:
-            if name not in known:
-                near = find_near_name(name, known)
-                hint = f"did you mean {near}=?" if near else f"it has {', '.join(known)}"
-                raise CtrlidError(f"a PID has no {name}=; {hint}")
+        check_field_names(cls, fields)
         return super().__new__(cls)
 
     def __post_init__(self) -> None:
@@ -142,11 +135,7 @@ class PID:
                                   f"ki={self.ki}")  # fmt: skip
 
 
-# Help shows the fields, not the arguments of the check of their names.
-_init = inspect.signature(PID.__init__)
-PID.__signature__ = _init.replace(  # type: ignore[attr-defined]
-    parameters=list(_init.parameters.values())[1:]
-)
+show_fields(PID)
 
 
 @dataclass(frozen=True, eq=False)
