@@ -138,7 +138,7 @@ class FreshData:
             return gaps.compute_chance_among_runs(self.measure_gap(loops), runs[:, 0])
         known, horizon = Known(fit.noise, np.full(1, float(np.mean(fit.sensor)))), self.how.horizon
         outputs = len(fit.noise.sensors) + 1
-        squares, usual, worth = np.zeros((3, outputs))
+        squares, usual, worth = np.zeros(outputs), np.zeros(outputs), np.zeros(outputs)
         for loop, window in zip(loops, self.windows, strict=True):
             plain, record = replace(loop, controller=None), window.record
             problem = make_problem(plain, (), [record], [window.start_time])
