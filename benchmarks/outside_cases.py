@@ -59,7 +59,7 @@ HOSTS = {
     "SensorLag": ANY, "SensorNonlinearity": ANY, "SensorGain": ("ball",),
     "SensorDrift": ("ball", "pendulum", "spring", "cart", "tanks"),
     "SensorHum": ANY,
-    "SensorSaturation": ANY,
+    # No limit of the sensor: readings that sit on it are read off the log, and no filter weighs it.
 }  # fmt: skip
 OUTSIDE = {
     "rate limit": ANY, "changing lag": ANY, "cubic drag": MECHANICAL, "soft stop": MECHANICAL,
@@ -75,6 +75,7 @@ SAME = (
     ({"ConstantForce", "SensorGain", "parameter g"}, ("ball",)),
 )
 TRIES = 200
+LARGEST = 30.0  # times what is easily seen: beyond, a lag is longer than the record
 NEAR = 0.25  # a size is found where the logarithm of its worth is so near to what was drawn
 
 
@@ -345,9 +346,6 @@ def make_effect(rng: np.random.Generator, name: str, rig: Rig, n: int) -> tuple[
         "SensorDrift": ({}, one("sensor_drift", sign * 3 * rig.sigma / end), "sensor_drift"),
         "SensorHum": ({"hum_f": float(rng.uniform(0.05, 0.45)) / dt, "hum_phase": phase},
                       one("hum", 0.3 * rig.sigma), "hum"),
-        "SensorSaturation": ({}, lambda s: {
-            "sensor_upper": rig.at[2] + 2.5 * rig.swing / (0.5 + s),
-            "sensor_lower": rig.at[2] - 2.5 * rig.swing / (0.5 + s)}, ""),
         "rate limit": ({}, lambda s: {"rate": span / dt / (0.5 + s)}, ""),
         "changing lag": ({"changing_f": hertz * rng.uniform(0.05, 0.3)}, one("changing", dt), ""),
         "cubic drag": ({}, one("cubic_drag", 0.1 * a / v**3), "cubic_drag"),
@@ -518,7 +516,7 @@ def _find_size(
         worth, theta = measure_worth(replace(truth, e=full, u=u, y=y), e, indices, start)
         return (full, size, worth, u, y, theta) if np.isfinite(worth) else None
 
-    low, high = 0.0, math.inf
+    low, high = 0.0, LARGEST
     size, best, start = 1.0, None, None
     for _ in range(14):
         found = weigh(size, start)
@@ -540,9 +538,8 @@ def _find_size(
         else:
             step = size / 3
         if not low < step < high:
-            step = math.sqrt(low * high) if low and high < math.inf else (low or size) * (
-                2.0 if high == math.inf else 0.5)  # fmt: skip
-            if low and high < math.inf and high / low < 1.02:
+            step = math.sqrt(low * high) if low else 0.5 * size
+            if low and high / low < 1.02:
                 break
         size = step
     if best is None:

@@ -35,16 +35,16 @@ EFFECTS = (
     "ripple_period", "ripple_phase", "mode_f", "mode_damping", "mode_share", "cubic_drag",
     "soft_stop", "reach", "bouc_wen", "bouc_wen_way",
     "position", "exponent", "which", "drift", "step", "step_time", "loss", "loss_f1", "loss_f2",
-    "sensor_lag", "bend", "scale", "sensor_drift", "hum", "hum_f", "hum_phase", "sensor_lower",
-    "sensor_upper", "play", "growth",
+    "sensor_lag", "bend", "scale", "sensor_drift", "hum", "hum_f", "hum_phase", "play",
+    "growth",
 )  # fmt: skip
 I = {name: i for i, name in enumerate(EFFECTS)}
 (DELAY, LAG, LOWER, UPPER, DEADZONE, BACKLASH, CURVATURE, SATURATION, OFFSET, RATE, CHANGING,
  CHANGING_F, VISCOUS, ASYMMETRIC, COULOMB, COULOMB_D, STRIBECK, STRIBECK_V, DRAG, EDDY, STIFFNESS,
  CUBIC, FORCE, PERIODIC, PERIODIC_F, PERIODIC_P, RIPPLE, RIPPLE_L, RIPPLE_P, MODE_F, MODE_D, MODE_S,
  CUBIC_DRAG, SOFT_STOP, REACH, BOUC_WEN, BOUC_WEN_L, POSITION, EXPONENT, WHICH, DRIFT, STEP, STEP_T,
- LOSS, LOSS_1, LOSS_2, SENSOR_LAG, BEND, SCALE, SENSOR_DRIFT, HUM, HUM_F, HUM_P, SENSOR_LOWER,
- SENSOR_UPPER, PLAY, GROWTH) = range(len(EFFECTS))  # fmt: skip
+ LOSS, LOSS_1, LOSS_2, SENSOR_LAG, BEND, SCALE, SENSOR_DRIFT, HUM, HUM_F, HUM_P, PLAY,
+ GROWTH) = range(len(EFFECTS))  # fmt: skip
 EXTRA = 5  # states beside the plant's: mode (2), hysteresis, lag of the sensor, play of the sensor
 MOST = 2 + EXTRA
 SUBSTEPS = 8  # of the integration in a period
@@ -54,8 +54,7 @@ FINE = 4  # of the same in the filter, where something happens within a period
 def neutral() -> np.ndarray:
     """Return the numbers of the effects, all switched off."""
     e = np.zeros(len(EFFECTS))
-    e[LOWER], e[UPPER], e[RATE] = -np.inf, np.inf, np.inf
-    e[SENSOR_LOWER], e[SENSOR_UPPER], e[EXPONENT] = -np.inf, np.inf, 2.0
+    e[LOWER], e[UPPER], e[RATE], e[EXPONENT] = -np.inf, np.inf, np.inf, 2.0
     e[[STRIBECK_V, BOUC_WEN_L, RIPPLE_L]] = 1.0
     return e
 
@@ -133,47 +132,67 @@ def accelerate(plant, p, e, at, x, w, t, moving, dx):
 
 
 @numba.njit(cache=True, error_model="numpy")
+def step(plant, p, e, at, x, w, t, h, push, moving, new, dx, y, s1, s2, s3):
+    """Write into `new` the states after a Runge-Kutta step of fourth order."""
+    for i in range(MOST):
+        y[i] = x[i]
+    accelerate(plant, p, e, at, y, w, t, moving, dx)
+    if plant != TANKS:
+        dx[1] += push
+    for i in range(MOST):
+        y[i] = x[i] + 0.5 * h * dx[i]
+    accelerate(plant, p, e, at, y, w, t + 0.5 * h, moving, s1)
+    if plant != TANKS:
+        s1[1] += push
+    for i in range(MOST):
+        y[i] = x[i] + 0.5 * h * s1[i]
+    accelerate(plant, p, e, at, y, w, t + 0.5 * h, moving, s2)
+    if plant != TANKS:
+        s2[1] += push
+    for i in range(MOST):
+        y[i] = x[i] + h * s2[i]
+    accelerate(plant, p, e, at, y, w, t + h, moving, s3)
+    if plant != TANKS:
+        s3[1] += push
+    for i in range(MOST):
+        new[i] = x[i] + h * (dx[i] + 2 * s1[i] + 2 * s2[i] + s3[i]) / 6
+
+
+@numba.njit(cache=True, error_model="numpy")
 def advance(plant, p, e, at, x, w, t, h, push, dx, y, s1, s2, s3):
-    """Integrate all states over a step `h` in place; `push` is a random force held over it."""
-    moving = 0.0
+    """Integrate all states over a step `h` in place; `push` is a random force held over it.
+
+    Where dry friction changes its sign, the step ends at the speed zero, and the rest of it is
+    another step, unless the mass is held.
+    """
     iy = 1 if plant == TANKS else 0
-    before = x[iy]
-    held = False
-    if plant != TANKS and (e[COULOMB] != 0.0 or e[STRIBECK] != 0.0):
-        moving = 1.0 if x[1] > 0 else -1.0
-        if x[1] == 0.0:
-            accelerate(plant, p, e, at, x, w, t, 0.0, dx)
-            free = dx[1] + push - e[COULOMB_D]
-            held = abs(free) <= e[COULOMB] + e[STRIBECK]
-            moving = 1.0 if free > 0 else -1.0
-    if not held:
+    before, left, new = x[iy], h, np.empty(MOST)
+    rubbed = plant != TANKS and (e[COULOMB] != 0.0 or e[STRIBECK] != 0.0)
+    for _ in range(4):
+        moving = 0.0
+        if rubbed:
+            moving = 1.0 if x[1] > 0 else -1.0
+            if x[1] == 0.0:
+                accelerate(plant, p, e, at, x, w, t, 0.0, dx)
+                free = dx[1] + push - e[COULOMB_D]
+                if abs(free) <= e[COULOMB] + e[STRIBECK]:
+                    break
+                moving = 1.0 if free > 0 else -1.0
+        step(plant, p, e, at, x, w, t, left, push, moving, new, dx, y, s1, s2, s3)
+        if moving * new[1] < 0 and x[1] != 0.0:
+            part = left * x[1] / (x[1] - new[1])
+            step(plant, p, e, at, x, w, t, part, push, moving, new, dx, y, s1, s2, s3)
+            new[1] = 0.0
+            t, left = t + part, left - part
+        else:
+            left = 0.0
         for i in range(MOST):
-            y[i] = x[i]
-        accelerate(plant, p, e, at, y, w, t, moving, dx)
-        if plant != TANKS:
-            dx[1] += push
-        for i in range(MOST):
-            y[i] = x[i] + 0.5 * h * dx[i]
-        accelerate(plant, p, e, at, y, w, t + 0.5 * h, moving, s1)
-        if plant != TANKS:
-            s1[1] += push
-        for i in range(MOST):
-            y[i] = x[i] + 0.5 * h * s1[i]
-        accelerate(plant, p, e, at, y, w, t + 0.5 * h, moving, s2)
-        if plant != TANKS:
-            s2[1] += push
-        for i in range(MOST):
-            y[i] = x[i] + h * s2[i]
-        accelerate(plant, p, e, at, y, w, t + h, moving, s3)
-        if plant != TANKS:
-            s3[1] += push
-        for i in range(MOST):
-            x[i] += h * (dx[i] + 2 * s1[i] + 2 * s2[i] + s3[i]) / 6
-        if moving != 0.0 and x[1] * moving < 0:
-            x[1] = 0.0
-        if plant == TANKS:
-            x[0] = max(x[0] + h * push, 0.0)
-            x[1] = max(x[1], 0.0)
+            x[i] = new[i]
+        if left <= 0.0:
+            break
+    if plant == TANKS:
+        x[0] = max(x[0] + h * push, 0.0)
+        x[1] = max(x[1], 0.0)
     if e[SENSOR_LAG] != 0.0:
         # The response to a ramp, as which the output moves within a step.
         behind = (x[iy] - before) / h * e[SENSOR_LAG]
@@ -223,7 +242,7 @@ def actuate(u, k, e, at, memory, t, h, j, parts):
 
 @numba.njit(cache=True, error_model="numpy")
 def read(plant, e, at, x, t):
-    """Return what the sensor makes of the states, before its noise and its limits."""
+    """Return what the sensor makes of the states, before its noise."""
     y = x[5] if e[SENSOR_LAG] != 0.0 else x[1 if plant == TANKS else 0]
     if e[PLAY] != 0.0:
         half = 0.5 * e[PLAY]
@@ -257,7 +276,6 @@ def simulate(plant, p, e, at, x0, num, den, closed, moves, pushes, noise, period
         y[k] = shown + noise[k] * (1 + e[GROWTH] * abs(x[iy] - at[2]))
         if step > 0.0:
             y[k] = step * round(y[k] / step)
-        y[k] = min(max(y[k], e[SENSOR_LOWER]), e[SENSOR_UPPER])
         if closed:
             for i in range(len(errors) - 1, 0, -1):
                 errors[i] = errors[i - 1]

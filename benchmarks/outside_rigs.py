@@ -268,14 +268,31 @@ def draw_reference(rng: np.random.Generator, rig: Rig, n: int) -> np.ndarray:
 # --- the simulator
 
 
+def integrate(
+    total: Callable[[float, float, float], float], x: float, v: float, s: float, step: float,
+    dry: float,
+) -> tuple[float, float]:  # fmt: skip
+    """Return position and speed after a Runge-Kutta step of fourth order from the time `s` on."""
+    half = 0.5 * step
+    a1 = total(x, v, s) - dry
+    v2 = v + half * a1
+    a2 = total(x + half * v, v2, s + half) - dry
+    v3 = v + half * a2
+    a3 = total(x + half * v2, v3, s + half) - dry
+    v4 = v + step * a3
+    a4 = total(x + step * v3, v4, s + step) - dry
+    x += step * (v + 2 * v2 + 2 * v3 + v4) / 6
+    return x, v + step * (a1 + 2 * a2 + 2 * a3 + a4) / 6
+
+
 def run_rig(
     rig: Rig, moves: np.ndarray, hidden: Hidden, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     """Return reference, logged input and reading, or None where the rig leaves its range.
 
     Between samples the equations are integrated by Runge-Kutta of fourth order in eight steps.
-    Dry friction keeps its sign within a step; where the speed would cross zero the mass stops, and
-    it stays until the other forces exceed the friction.
+    Where dry friction would change its sign, the step ends at rest, and the mass stays there until
+    the other forces exceed the friction.
     """
     n, dt, x0 = len(moves), rig.dt, rig.at
     accel = acceleration(rig.plant, rig.true)
@@ -341,25 +358,22 @@ def run_rig(
                     a += h.periodic * math.sin(2 * math.pi * h.frequency * (t + s) + phase)
                 return a
 
-            dry = 0.0
-            if h.coulomb:
-                rest = total(x, v, 0.0)
-                if v == 0.0 and abs(rest) <= h.coulomb:
-                    t += step
-                    continue
-                dry = math.copysign(h.coulomb, v if v else rest)
-            half = 0.5 * step
-            a1 = total(x, v, 0.0) - dry
-            v2 = v + half * a1
-            a2 = total(x + half * v, v2, half) - dry
-            v3 = v + half * a2
-            a3 = total(x + half * v2, v3, half) - dry
-            v4 = v + step * a3
-            a4 = total(x + step * v3, v4, step) - dry
-            x += step * (v + 2 * v2 + 2 * v3 + v4) / 6
-            v += step * (a1 + 2 * a2 + 2 * a3 + a4) / 6
-            if dry and v * dry < 0:
-                v = 0.0
+            left, begun = step, 0.0
+            while left > 0.0:
+                dry = 0.0
+                if h.coulomb:
+                    rest = total(x, v, begun)
+                    if v == 0.0 and abs(rest) <= h.coulomb:
+                        break
+                    dry = math.copysign(h.coulomb, v if v else rest)
+                new = integrate(total, x, v, begun, left, dry)
+                taken = left
+                if v and new[1] * dry < 0:
+                    # The step ends at rest; what then follows is a step of its own.
+                    taken = left * v / (v - new[1])
+                    new = integrate(total, x, v, begun, taken, dry)[0], 0.0
+                x, v = new
+                begun, left = begun + taken, left - taken
             t += step
             if not abs(x - x0) < reach:
                 return None

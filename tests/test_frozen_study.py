@@ -104,6 +104,21 @@ def test_dry_friction_holds_what_rests():
     assert np.ptp(y[-50:]) == 0
 
 
+@pytest.mark.parametrize("size", [1e-9, 0.5])
+def test_a_change_of_the_direction_takes_nothing_but_the_friction(size):
+    """A mass thrown against a constant force, with dry friction, has a path in closed form."""
+    e, force, h = plants.neutral(), -400.0, 0.02
+    e[plants.I["coulomb"]], e[plants.I["force"]] = size, force
+    at = np.array([0.0, 0.0, 0.0, h])
+    x, work = np.zeros(plants.MOST), np.zeros((5, plants.MOST))
+    x[1] = 6.1
+    plants.advance(1, np.array([1.0, 0.0, 1.0, 0.0]), e, at, x, 0.0, 0.0, h, 0.0, *work)
+    up = 6.1 / (size - force)
+    top = 0.5 * 6.1 * up
+    assert x[0] == pytest.approx(top + 0.5 * (force + size) * (h - up) ** 2, rel=1e-9)
+    assert x[1] == pytest.approx((force + size) * (h - up), rel=1e-9)
+
+
 def test_a_draw_is_the_same_again_and_its_worth_is_near_what_was_drawn():
     one, two = (cases.draw_case("faint", 7, 500) for _ in range(2))
     assert np.array_equal(one.y, two.y)

@@ -21,6 +21,8 @@ NEAR = 3.0
 FEW = 8
 # A search starts by this share of the scale inside its bounds, as its solver demands.
 NARROW = 1e-6
+# Where a simulation runs away, it errs by so many spreads of the output: its numbers say no more.
+LOST = 1e3
 
 
 def find_initial_state(
@@ -79,7 +81,8 @@ def find_initial_state(
     def search_nearby(start: Array, count: int) -> Array:
         def residual(point: Array) -> Array:
             found = compute_misfit(move_state(start, point), count)
-            return np.full(part.y[..., :count].size, 1e3) if found is None else found
+            lost = np.full(part.y[..., :count].size, LOST)
+            return lost if found is None else np.clip(found, -lost, lost)
 
         # Bounds keep an absurd start from standing in for a force that acts from the first sample
         # on.
