@@ -779,6 +779,22 @@ def test_a_loop_that_hunts_keeps_its_names():
     assert gap_is_wider(gap(6.1), sensor)
 
 
+def test_what_went_astray_beside_an_effect_begins_without_it_as_handed_in():
+    # With another zero of the gap a magnet may be fitted that no ball could hang below.
+    plant = cid.plants.maglev(m=0.037, K=3.8264e-5)
+    op = cid.operating_point(plant, output=0.0154)
+    loop = under_lead(plant, 3e-3, op, crossover=55, free=("K",))
+    r = cid.random_binary(600, amplitude=1.7e-4, hold=40, around=op.output, seed=5)
+    record = cid.simulate(loop, r, sensor_noise=1e-5, seed=2)
+    model = fit_base_model(
+        loop.with_effect(E.PositionOffset(offset=1e-4)), [record], ("K", "PositionOffset.offset")
+    )
+    astray = replace(model, fit=replace(model.fit, theta=np.array([1e13, 1.0]) * model.fit.theta))
+    smaller, _ = refit_without_effect(astray, 0)
+    assert smaller.names == ("K",)
+    assert smaller.fit.theta == pytest.approx([3.8264e-5], rel=0.01)
+
+
 def test_an_effect_without_which_nothing_follows_stays():
     # The saturating gain lets the ball fall: a filter without it cannot follow, however noisy.
     plant = cid.plants.maglev(m=0.037, K=3.8264e-5)

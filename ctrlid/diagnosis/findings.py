@@ -4,6 +4,8 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
+
 from .._base.arrays import Array, freeze_arrays
 from .._base.text import Printed, write_list, write_number, write_quantity
 from .._base.units import fill_unit
@@ -296,6 +298,9 @@ class SensorNoise(Printed):
     >>> import ctrlid as cid
     >>> print(cid.SensorNoise(1e-4, "m"))
     The sensor noise is white, of 0.1 mm RMS.
+    >>> print(cid.SensorNoise(1e-4, "m", ar=(0.999,), ma=(-0.97,)))
+    The sensor noise is coloured, ARMA(1, 1), of 0.1 mm RMS: the reading errs alike over about 1000
+    samples, as that of a sensor that wanders or warms up.
     >>> print(cid.SensorNoise(1e-4, "m", share=0.01, ratio=10.0))
     The sensor noise is heavy-tailed, of 0.1 mm RMS: 1 % of the readings err 10 times as much as ...
     """
@@ -326,7 +331,7 @@ class SensorNoise(Printed):
             return f"white, of {write_list(sizes)}"
         order = f", ARMA({len(self.ar)}, {len(self.ma)})" if self.ar or self.ma else ""
         text = f"{self.kind}{order}, of {write_quantity(self.size, self.unit or '[y]')} RMS"
-        told = ["the reading errs alike in successive samples"] if order else []
+        told = [self._describe_colour()] if order else []
         if math.isfinite(self.freedom):
             told.append("large errors are as frequent as by Student's law with "
                         f"{write_number(self.freedom, 2)} degrees of freedom")  # fmt: skip
@@ -334,6 +339,16 @@ class SensorNoise(Printed):
             told.append(f"{100 * self.share:.2g} % of the readings err "
                         f"{write_number(self.ratio, 2)} times as much as the others")  # fmt: skip
         return text + (f": {' and '.join(told)}" if told else "")
+
+    def _describe_colour(self) -> str:
+        """Say over how many samples the reading errs alike: over many, the sensor wanders."""
+        roots = np.roots([1.0, *(-a for a in self.ar)])
+        slow = [z.real for z in roots if z.real > abs(z.imag)]
+        samples = 1 / max(1 - max(slow, default=0.0), THRESHOLD.tiny)
+        if samples < THRESHOLD.lags:
+            return "the reading errs alike in successive samples"
+        return (f"the reading errs alike over about {samples:.0f} samples, as that of a sensor "
+                "that wanders or warms up")  # fmt: skip
 
     def __str__(self) -> str:
         return f"The sensor noise is {self.words}."

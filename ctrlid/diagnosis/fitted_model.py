@@ -20,6 +20,7 @@ from ..estimation.likelihood.likelihood import (
     list_start_values,
     relinearize_fit,
 )
+from ..estimation.likelihood.noise_fit import count_noise_parameters
 from ..estimation.likelihood.sampled_plant import SampledPlant, Trajectory
 from ..loop.loop import Loop
 from ..loop.period_map import comes_to_rest
@@ -92,7 +93,7 @@ def compute_penalized_likelihood(fit: Fit) -> float:
 def compute_criterion(model: Model) -> float:
     """Return the log-likelihood less the penalty for all that was fitted, the noise included."""
     fit = model.fit
-    value = fit.value - bayesian_penalty(len(fit.theta) + fit.noise.parameters, fit.size)
+    value = fit.value - bayesian_penalty(len(fit.theta) + count_noise_parameters(fit), fit.size)
     return value if math.isfinite(value) else -math.inf
 
 

@@ -21,7 +21,7 @@ from ..estimation.likelihood.maximization import (
     maximize,
     refit_noise_size,
 )
-from ..estimation.likelihood.noise_fit import compute_noise_criterion
+from ..estimation.likelihood.noise_fit import compute_noise_criterion, count_noise_parameters
 from .candidates import Trial, contains, is_same_kind, list_missing_candidates
 from .fitted_model import (
     Model,
@@ -186,22 +186,24 @@ def _end_search(reached: Reached) -> Search:
 def _prefer_sensor_noise(
     model: Model, best: Trial | None, is_larger: Callable[[Model], bool]
 ) -> Model | None:
-    """Return the model with other sensor noise if that gains more than the best effect does.
+    """Return the model with other sensor noise if that gains about as much as the best effect.
 
-    Coloured, or with heavy tails. Only where the innovations are not white noise, or a coloured
-    force had to make them so, and where the noise is not larger than the error that it explains.
+    Coloured, or with heavy tails. An effect has to gain more than the noise by as much as it has to
+    gain beside none: a slow wander of the sensor looks like a drift. Not where the noise is larger
+    than the error that it explains.
     """
     fit = model.fit
     if fit.known is not None or not math.isfinite(fit.value) or not fit.plant.e.siso:
         return None
     tests = run_noise_tests(fit)
-    if tests.passed and not fit.noise.drift:
+    if tests.passed and not fit.noise.drift and best is None:
         return None
     # Further noise in the fit of the best effect is paid for as well.
     more = 0.0
     if best is not None:
-        parameters = best.model.fit.noise.parameters - fit.noise.parameters
-        more = max(0.0, best.net_gain - bayesian_penalty(parameters, fit.size))
+        parameters = count_noise_parameters(best.model.fit) - count_noise_parameters(fit)
+        earned = best.net_gain - bayesian_penalty(parameters, fit.size)
+        more = max(0.0, earned - THRESHOLD.gate)
     tried = []
     if fit.noise.sensor_is_white and _may_be_coloured(fit, more):
         with contextlib.suppress(ModelCannotRun):

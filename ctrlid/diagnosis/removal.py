@@ -1,11 +1,13 @@
 """Step 7: what the model does without: superfluous effects, two that are one, their order."""
 
+import contextlib
 import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from .._base.criterion import bayesian_penalty
+from .._base.errors import ModelCannotRun
 from ..estimation.likelihood.kalman_filter import Noise
 from ..estimation.likelihood.maximization import (
     begin_fit,
@@ -102,8 +104,19 @@ def fuse_effects(model: Model, given: int, steps: Sequence[Round]) -> Model:
 
 
 def _drop_effects(model: Model, positions: Sequence[int]) -> Model:
-    """Return the model without some of its effects, all else as it is."""
-    loop, names = model.fitted, model.names
+    """Return the model without some of its effects, all else as it is where that can run.
+
+    Beside an effect the parameters may have gone to where the plant alone cannot be: a wrong zero
+    of the position lets a magnet be a thousand times too strong. Then it begins as handed in.
+    """
+    with contextlib.suppress(ModelCannotRun):
+        return _carry_without(model, model.fitted, positions)
+    return _carry_without(model, model.loop, positions)
+
+
+def _carry_without(model: Model, loop: Loop, positions: Sequence[int]) -> Model:
+    """Return a loop of the model without some of its effects, on the model's records."""
+    names = model.names
     for position in sorted(positions, reverse=True):
         loop, names = take_out_effect(loop, position, names)
     fit = carry_over_fit(model, loop, names)

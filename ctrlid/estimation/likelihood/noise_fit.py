@@ -30,6 +30,10 @@ CONVEX = 0.05
 SURE = 1 - 1e-9
 # Coefficients of coloured sensor noise from which a fit starts, and those of an average.
 SIZES, AVERAGED = (-0.4, 0.4, 0.8, 0.97), 0.9
+# Steps of a random walk from which a fit of one beside white noise starts, over the white noise.
+WALKS = (0.01, 0.03, 0.1, 0.3)
+# A root this near the limit of what a record tells apart from a random walk lies on it.
+ON_THE_LIMIT = 1e-6
 # Orders of coloured sensor noise: of the autoregression and of the moving average, at most.
 ORDERS = 2, 3
 
@@ -60,7 +64,7 @@ def fit_noise(
         ).value
         return -value if np.isfinite(value) else 1e15
 
-    longest = max(len(data.record) for data in problem.data)
+    longest = find_longest_record(problem)
     low, high = (ends[: len(start)] for ends in _bound_logs(problem, noise, longest))
     start = np.clip(start, low, high)
     if wide:
@@ -203,9 +207,21 @@ def _bound_logs(problem: Problem, noise: Noise, longest: int) -> tuple[Array, Ar
         unit = units[0]
         low += [unit + LEAST, math.log(2 * dt)]
         high += [unit + MOST, math.log(max(min(SLOWEST * longest, 2e4), 4.0) * dt)]
-    # Sensor noise that is correlated over more than the record would be an offset.
-    ends = [math.atanh(1 - 1 / longest)] * len(noise.ar) + [math.pi] * len(noise.ma)
+    ends = [math.atanh(_find_slowest_root(longest))] * len(noise.ar) + [math.pi] * len(noise.ma)
     return np.array([*low, *(-v for v in ends)]), np.array([*high, *ends])
+
+
+def find_longest_record(problem: Problem) -> int:
+    """Return the number of samples of the longest record."""
+    return max(len(data.record) for data in problem.data)
+
+
+def _find_slowest_root(samples: int) -> float:
+    """Return the slowest root of coloured sensor noise, which is a random walk to a record.
+
+    Sensor noise that is correlated over more than the record would be an offset.
+    """
+    return 1 - 1 / samples
 
 
 def _evaluate_costs(cost: Callable[[Array], float], points: Iterable[Array]) -> Array:
@@ -301,7 +317,8 @@ def try_coloured_sensor(fit: Fit) -> Fit:
     """Return the fit with the coloured sensor noise that the BIC prefers, no coloured force beside.
 
     Parameters of the plant stay as they are. From the first order on, a coefficient more is tried
-    on either side until none pays.
+    on either side until none pays. A random walk beside white noise, which hardly shows in any
+    coefficient alone, is tried by itself.
 
     References
     ----------
@@ -321,13 +338,34 @@ def try_coloured_sensor(fit: Fit) -> Fit:
     chains = [
         _fit_best(fit, [Noise(f, ar=ar, tails=tails) for f in forces for ar in values]),
         max((fit_moving(averages) for averages in (values, *longer)), key=compute_noise_criterion),
+        _fit_best(fit, list(_list_walks(fit, forces))),
     ]
     return max((_lengthen_sensor_noise(f) for f in chains), key=compute_noise_criterion)
 
 
+def _list_walks(fit: Fit, forces: Sequence[tuple[float, ...]]) -> Iterable[Noise]:
+    """Return sensor noises that are random walks beside white noise."""
+    root = _find_slowest_root(find_longest_record(fit.problem))
+    for force, step in itertools.product(forces, WALKS):
+        yield Noise(force, ar=(root,), ma=(-root * (1 - step),), tails=fit.noise.tails)
+
+
+def count_noise_parameters(fit: Fit) -> int:
+    """Return how many parameters of the noise are free.
+
+    A root of the sensor noise at its limit is that of a random walk, and is no free parameter.
+    """
+    noise = fit.noise
+    if not noise.ar:
+        return noise.parameters
+    slowest = _find_slowest_root(find_longest_record(fit.problem))
+    walks = np.max(_compute_reflections(noise.ar)) > slowest - ON_THE_LIMIT
+    return noise.parameters - int(walks)
+
+
 def compute_noise_criterion(fit: Fit) -> float:
     """Return the log-likelihood less the penalty for the parameters of the noise."""
-    value = fit.value - bayesian_penalty(fit.noise.parameters, fit.size)
+    value = fit.value - bayesian_penalty(count_noise_parameters(fit), fit.size)
     return value if np.isfinite(value) else -math.inf
 
 
