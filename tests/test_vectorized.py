@@ -152,6 +152,17 @@ def test_constants_and_numbers_in_place_of_arrays():
     np.testing.assert_array_equal(one[0, :, 0], [3.5, 2.0, 0.0, 2.0])
 
 
+def test_rows_that_nothing_reads_still_say_how_many_samples_there_are():
+    x, p = casadi.SX.sym("x", 3), casadi.SX.sym("p")
+    f = BlockEvaluation(casadi.Function("f", [x, p], [2 * p, x[1]]))
+    x_ = np.random.default_rng(6).standard_normal((3, 1300))
+    double, second = f(x_, 2.0)
+    np.testing.assert_array_equal(double, np.full((1300, 1, 1), 4.0))
+    np.testing.assert_array_equal(second[:, 0, 0], x_[1])
+    g = BlockEvaluation(casadi.Function("g", [x, p], [2 * p]))
+    np.testing.assert_array_equal(g(x_, 2.0)[0], double)
+
+
 def test_the_arguments_are_left_alone_and_the_results_are_not_views():
     x = casadi.SX.sym("x", 2)
     f = BlockEvaluation(casadi.Function("f", [x], [x, x + 1, casadi.fabs(x)]))

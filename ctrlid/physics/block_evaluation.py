@@ -40,7 +40,7 @@ class BlockEvaluation:
 
     def __init__(self, function: Any) -> None:
         # `sizes` are the rows of each argument, `tables` first row, rows and columns of each
-        # output.
+        # output, `read` the rows of the arguments that are used at all.
         self.sizes = [function.numel_in(k) for k in range(function.n_in())]
         shapes = [(function.size1_out(k), function.size2_out(k)) for k in range(function.n_out())]
         ends = np.cumsum([0, *(rows * columns for rows, columns in shapes)])
@@ -48,6 +48,7 @@ class BlockEvaluation:
         self.rows_out = int(ends[-1])
         steps, self.constants = _list_instructions(function)
         self.program, self.registers = _allocate_registers(steps)
+        self.read = set(steps[steps[:, 0] == casadi.OP_INPUT, 2].tolist())
 
     def __call__(self, *arguments: Any) -> list[Array]:
         """Evaluate; arguments are numbers or arrays of shape (rows,) or (rows, n).
@@ -177,7 +178,9 @@ def evaluate_blocks(
     n = max([1, *(t.shape[1] for t in tables)])
     rows = [row for t in tables for row in t]
     still = np.array([row[0] for row in rows] + ([] if alone else [0.0]))
-    moving = [k for k, row in enumerate(rows) if len(row) > 1]
+    # Of many programs, such as that of a sensor, most arguments are never read.
+    read = set[int]().union(*(s.read for s in stages))
+    moving = [k for k, row in enumerate(rows) if len(row) > 1 and k in read]
     again = sum(len(t) for t in tables[: len(carried)])
     program, starts, constants = _join_programs(stages)
     room, places = max(s.registers for s in stages), np.array(moving, dtype=np.int64)
@@ -187,8 +190,9 @@ def evaluate_blocks(
     stretch = BLOCK * min(-(-blocks // count_processors()), BLOCKS)
 
     def work(first: int) -> None:
-        columns = [rows[k][first : first + stretch] for k in moving]
-        values = np.array(columns).reshape(len(moving), min(stretch, n - first))
+        values = np.empty((len(moving), min(stretch, n - first)))
+        for row, k in zip(values, moving, strict=True):
+            row[:] = rows[k][first : first + stretch]
         run_programs(
             program,
             starts,
