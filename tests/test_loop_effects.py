@@ -1,6 +1,7 @@
 """A loop with effects: its interface, and each effect against a closed form or formula."""
 
 import math
+from dataclasses import replace
 from functools import partial
 
 import control as ct
@@ -148,6 +149,40 @@ def test_the_order_of_places_does_not_depend_on_the_order_of_effects():
     one = cid.simulate(levitated(effects=several), r)
     two = cid.simulate(levitated(effects=several[::-1]), r)
     np.testing.assert_allclose(one.y, two.y, rtol=1e-9)
+
+
+def test_other_values_keep_the_formulas_and_nothing_else():
+    # The offset moves where the lag rests, and the exponent looks at the numbers of the plant.
+    effects = (E.InputOffset(offset=0.1), E.ActuatorLag(tau=0.004), E.SensorLag(tau=0.002),
+               E.ForceExponent(n=2.1), E.CoulombFriction(fc=0.1))  # fmt: skip
+    changed = {"K": 3e-6, "InputOffset.offset": 0.3, "ActuatorLag.tau": 0.01,
+               "CoulombFriction.fc": 0.2}  # fmt: skip
+    one = levitation(*effects)
+    other = one.with_parameters(changed)
+    anew = cid.Loop(other.plant, other.controller, other.dt, other.at, effects=other.effects)
+    for keep in (True, False):
+        e, known, fresh = (x.equations(keep=keep) for x in (one, other, anew))
+        assert known.parameters == fresh.parameters != e.parameters
+        assert known.rest == fresh.rest != e.rest
+        assert known.velocities == fresh.velocities
+        x = np.array([0.011, 0.02, *fresh.rest])
+        for a, b in zip(known.evaluate(x, 3.1), fresh.evaluate(x, 3.1), strict=True):
+            np.testing.assert_array_equal(a, b)
+    plain = levitation().with_effect(E.CoulombFriction(fc=0.1))
+    faster = plain.with_parameters({"K": 3e-6})
+    assert plain.equations().function is faster.equations().function
+    assert plain.point == faster.point == levitation().point
+
+
+def test_an_effect_may_look_at_the_values_of_the_plant():
+    class Scaled(E.ForceEffect):
+        def build(self, e, m):
+            return replace(e, rhs=e.rhs * e.parameters["k"])
+
+    loop = cid.Loop(mass(k=3.0), dt=0.01, effects=(Scaled(),))
+    for k in (3.0, 5.0, 3.0):
+        rates, _ = loop.with_parameters({"k": k}).equations(keep=True).evaluate([1.0, 2.0], 4.0)
+        np.testing.assert_allclose(rates, [2.0 * k, 4.0 * k])
 
 
 def test_the_system_of_a_loop_is_a_plant_again():

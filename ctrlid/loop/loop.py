@@ -330,9 +330,14 @@ class Loop:
             return e
         at = self._bare_point
         u0, y0 = (casadi.DM(v) if np.ndim(v) else v for v in (at.input, at.output))
-        rhs = casadi.substitute(e.rhs, e.u, e.u - u0)
-        output = casadi.substitute(e.output, e.u, e.u - u0) + y0
-        return replace(e, rhs=rhs, output=output)
+
+        def shift() -> Equations:
+            rhs = casadi.substitute(e.rhs, e.u, e.u - u0)
+            output = casadi.substitute(e.output, e.u, e.u - u0) + y0
+            return replace(e, rhs=rhs, output=output)
+
+        shifted: Equations = e.derive(("absolute", at.input, at.output), shift)
+        return shifted.with_values(e.parameters, e.rest)
 
     @property
     def _bare_point(self) -> OperatingPoint:
@@ -342,7 +347,7 @@ class Loop:
         n = len(self._traced.states)
         return OperatingPoint((0.0,) * n, self.at.input, self.at.output)
 
-    @property
+    @functools.cached_property
     def point(self) -> OperatingPoint:
         """The operating point with the states of this very plant and of its effects."""
         at = self._bare_point
@@ -440,7 +445,8 @@ class Loop:
         ]  # fmt: skip
         if not of_plant:
             return self._replace_fields(effects=tuple(effects))
-        traced = replace(self._traced, parameters={**self._traced.parameters, **of_plant})
+        own = self._traced
+        traced = own.with_values({**own.parameters, **of_plant}, own.rest)
         return self._replace_fields(
             plant=with_parameters(self.plant, of_plant), _traced=traced, effects=tuple(effects)
         )
@@ -449,6 +455,8 @@ class Loop:
         """Return a copy with other fields, without tracing the plant again."""
         new = object.__new__(Loop)
         new.__dict__.update(self.__dict__ | changes)
+        # Effects have states of their own.
+        new.__dict__.pop("point", None)
         new._apply_effects(self)
         return new
 
@@ -457,12 +465,13 @@ class Loop:
         if self.controller is None:
             return None
         assert self.at is not None
-        wiring = self.wiring
-        if wiring is None:
-            return make_control_law(self.controller, self.at, self.dt)
         known = self.__dict__.get("_law")
         if known is None:
-            known = make_wired_law(self.controller, wiring, self.at, self.dt)
+            wiring = self.wiring
+            if wiring is None:
+                known = make_control_law(self.controller, self.at, self.dt)
+            else:
+                known = make_wired_law(self.controller, wiring, self.at, self.dt)
             object.__setattr__(self, "_law", known)
         return known
 

@@ -1,15 +1,17 @@
 """The equations of a plant as expressions, with what effects have added to them."""
 
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import casadi
 import numpy as np
 
 from .._base.arrays import Array
 from .._base.errors import CtrlidError
+
+Found = TypeVar("Found")
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +42,27 @@ class Backlash:
     applied: Any
     start: Any
     reach: Any
+
+
+class Formulas:
+    """What was derived from the formulas of equations, whatever values their parameters have.
+
+    Equations that share it have the same formulas.
+    """
+
+    def __init__(self) -> None:
+        self.derived: dict[Hashable, Any] = {}
+
+
+def _derive_once(compute: Callable[["Equations"], Found]) -> Callable[["Equations"], Found]:
+    """Return a method that derives something from the formulas alone, and so only once for them."""
+
+    @functools.wraps(compute)
+    def find(e: "Equations") -> Found:
+        found: Found = e.derive(compute.__name__, lambda: compute(e))
+        return found
+
+    return find
 
 
 def _pack_value(value: Any, found: list[Any]) -> Any:
@@ -119,6 +142,24 @@ class Equations:
         package.pack(found)
         return _rebuild_equations, (fields, package.encode())
 
+    @functools.cached_property
+    def formulas(self) -> Formulas:
+        """What was derived from the formulas, shared by equations with other values."""
+        return Formulas()
+
+    def derive(self, key: Hashable, compute: Callable[[], Any]) -> Any:
+        """Return what is computed from the formulas alone, at the first call for each key."""
+        derived = self.formulas.derived
+        if key not in derived:
+            derived[key] = compute()
+        return derived[key]
+
+    def with_values(self, parameters: Mapping[str, float], rest: tuple[float, ...]) -> "Equations":
+        """Return the same formulas with other values of the same parameters, and at rest."""
+        changed = replace(self, parameters=parameters, rest=rest)
+        changed.__dict__["formulas"] = self.formulas
+        return changed
+
     @property
     def values(self) -> Array:
         """The parameter values in the order of `p`."""
@@ -129,7 +170,8 @@ class Equations:
         """Whether the plant has one input and one output."""
         return len(self.inputs) == 1 and len(self.outputs) == 1
 
-    @functools.cached_property
+    @property
+    @_derive_once
     def velocities(self) -> tuple[int, ...]:
         """Indices of the plant's own states that are another one's rate: forces act on them."""
         rates = [casadi.simplify(self.rhs[i]) for i in range(len(self.states) - len(self.rest))]
@@ -139,17 +181,20 @@ class Equations:
             if any(casadi.is_equal(rates[i], self.x[j], 2) for i in range(len(rates)) if i != j)
         )
 
-    @functools.cached_property
+    @property
+    @_derive_once
     def feedthrough(self) -> bool:
         """Whether the output depends on the input without delay."""
         return bool(casadi.which_depends(self.output, self.u, 1, False)[0])
 
-    @functools.cached_property
+    @property
+    @_derive_once
     def kinked(self) -> bool:
         """Whether the motion has kinks that a filter smooths, such as dry friction at rest."""
         return self.spread is not None and bool(casadi.depends_on(self.rhs, self.spread))
 
-    @functools.cached_property
+    @property
+    @_derive_once
     def function(self) -> Any:
         """The CasADi function ``(t, x, u, p) -> (rhs, output)``."""
         # Without states, two indices keep the column that one would turn into a row.
@@ -161,7 +206,8 @@ class Equations:
             "plant", [self.t, self.x, self.u, self.p], [both[:n, 0], both[n:, 0]]
         )
 
-    @functools.cached_property
+    @property
+    @_derive_once
     def smoothed(self) -> Any:
         """The CasADi function ``(t, x, u, p, spread) -> (rhs, output)``."""
         spread = casadi.SX.sym("s", len(self.states)) if self.spread is None else self.spread
@@ -169,7 +215,8 @@ class Equations:
             "smoothed", [self.t, self.x, self.u, self.p, spread], [self.rhs, self.output]
         )
 
-    @functools.cached_property
+    @property
+    @_derive_once
     def reader(self) -> Any:
         """The CasADi function ``(noisy output, p) -> reading``, or None."""
         if self.readout is None:

@@ -322,11 +322,7 @@ def compute_state_matrices(
             f"the operating point has {len(at.states)} states {at.states}, but {e.name} has "
             f"{len(e.states)}: {', '.join(e.states)}"
         )
-    parts = [casadi.jacobian(f, z) for f in (e.rhs, e.output) for z in (e.x, e.u)]
-    if e.spread is not None:
-        level = casadi.SX.ones(*e.spread.shape) * spread
-        parts = [casadi.substitute(part, e.spread, level) for part in parts]
-    jacobians = casadi.Function("jacobians", [e.t, e.x, e.u, e.p], parts)
+    jacobians = e.derive(("jacobians", spread), lambda: _build_jacobians(e, spread))
     a, b, c, d = (np.asarray(casadi.DM(m), float) for m in
                   jacobians(0.0, list(at.states), at.inputs, e.values))  # fmt: skip
     if not all(np.isfinite(m).all() for m in (a, b, c, d)):
@@ -336,6 +332,15 @@ def compute_state_matrices(
             "outside its domain or on a corner; choose another operating point"
         )
     return a, b, c, d
+
+
+def _build_jacobians(e: Equations, spread: float) -> Any:
+    """Return the CasADi function ``(t, x, u, p) -> (A, B, C, D)``."""
+    parts = [casadi.jacobian(f, z) for f in (e.rhs, e.output) for z in (e.x, e.u)]
+    if e.spread is not None:
+        level = casadi.SX.ones(*e.spread.shape) * spread
+        parts = [casadi.substitute(part, e.spread, level) for part in parts]
+    return casadi.Function("jacobians", [e.t, e.x, e.u, e.p], parts)
 
 
 @keep_numpy_quiet

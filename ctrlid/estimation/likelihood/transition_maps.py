@@ -88,6 +88,14 @@ class PeriodPlan:
 
     def __post_init__(self) -> None:
         e, law = self.equations, self.law
+        key = ("structure", law, self.references, self.rows[-1])
+        text = e.derive(key, self._write_expressions)
+        lags = tuple(lag.state for lag in e.lags)
+        object.__setattr__(self, "structure", (text, e.dt, len(e.rest), lags, law is not None))
+
+    def _write_expressions(self) -> str:
+        """Return the expressions of equations and law in the text of CasADi."""
+        e, law = self.equations, self.law
         spread = e.smoothed.sx_in(4) if e.spread is None else e.spread
         given, found = [e.t, e.x, e.u, e.p, spread], [e.rhs, e.output]
         found += [part for lag in e.lags for part in (lag.time_constant, lag.target)]
@@ -107,9 +115,7 @@ class PeriodPlan:
             given += [state, r, y]
             found += law.apply(e.t, state, r, y)
         every = casadi.Function("every", given, [casadi.SX(part) for part in found])
-        lags = tuple(lag.state for lag in e.lags)
-        text = every.serialize()
-        object.__setattr__(self, "structure", (text, e.dt, len(e.rest), lags, law is not None))
+        return str(every.serialize())
 
     @property
     def size(self) -> int:
