@@ -6,9 +6,13 @@ from dataclasses import replace
 import control as ct
 import numpy as np
 import pytest
-from scipy import linalg
+from scipy import linalg, stats
 
 import ctrlid as cid
+from ctrlid.estimation.likelihood.kalman_filter import Noise, run_filter
+from ctrlid.estimation.likelihood.likelihood import make_problem
+from ctrlid.estimation.likelihood.maximization import begin_fit
+from ctrlid.estimation.likelihood.tails import JointTails, Tails
 
 M, POLE, LENGTH, INERTIA, G = 0.5, 0.2, 0.3, 0.006, 9.81
 DAMPING, PIVOT, DT = 0.2, 0.002, 0.005
@@ -49,8 +53,12 @@ def design():
     return A, B, C, K, L
 
 
-def simulate(n, friction=(0.0, 0.0), seed=0):
-    """Two outputs and the input of the loop with dither, 20 Runge-Kutta steps in a period."""
+def simulate(n, friction=(0.0, 0.0), seed=0, louder=None):
+    """Two outputs and the input of the loop with dither, 20 Runge-Kutta steps in a period.
+
+    The noise of each reading is `louder` times as large, shape (2, n).
+    """
+    sizes = NOISE[:, None] * (np.ones((2, n)) if louder is None else louder)
     A, B, C, K, L = design()
     rng = np.random.default_rng(seed)
     t = DT * np.arange(n)
@@ -62,7 +70,7 @@ def simulate(n, friction=(0.0, 0.0), seed=0):
     ys, us = np.empty((2, n)), np.empty(n)
     h = DT / 20
     for k in range(n):
-        ys[:, k] = q + NOISE * rng.standard_normal(2)
+        ys[:, k] = q + sizes[:, k] * rng.standard_normal(2)
         us[k] = (-K @ z).item() + d[k]
         for _ in range(20):
             a1 = accelerate(q, v, us[k], friction)
@@ -146,3 +154,97 @@ def test_friction_at_the_pivot_is_not_blamed_on_the_cart():
     found = cid.diagnose(loop, simulate(1000, (0.0, 0.02), seed=3), catalogue=MORE, progress=False)
     assert (found.findings[0].name, found.findings[0].at) == ("CoulombFriction", "theta_dot")
     assert found.gap.kind == "prediction"
+
+
+def make_wild(n, output, seed):
+    """One reading of a hundred of one output errs ten times as much as the others."""
+    louder = np.ones((2, n))
+    louder[output] = np.where(np.random.default_rng([seed, 9]).random(n) < 0.01, 10.0, 1.0)
+    return louder
+
+
+def list_wild_shares(found):
+    return [share for _, share, _ in found.noise.tails]
+
+
+@pytest.mark.parametrize("output", [0, 1])
+def test_wild_readings_of_one_output_are_its_noise(output, tmp_path):
+    record = simulate(800, seed=1, louder=make_wild(800, output, 1))
+    found = cid.diagnose(make_loop(), record, catalogue=FEW, progress=False)
+    assert found.verdict == "nothing missing"
+    shares = list_wild_shares(found)
+    assert 0.003 < shares[output] < 0.03
+    assert shares[1 - output] == 0
+    assert math.isinf(found.noise.tails[1 - output][0])
+    assert found.noise.outputs[1 - output][1] == pytest.approx(NOISE[1 - output], rel=0.1)
+    name = found.noise.outputs[output][0]
+    assert found.noise.kind == "heavy-tailed"
+    assert f"RMS at {name} (" in str(found.noise)
+    again = cid.load_diagnosis(found.save(tmp_path / "found.json"))
+    assert again.noise == found.noise
+
+
+def test_friction_is_named_at_its_place_beside_wild_readings():
+    record = simulate(800, (0.4, 0.0), seed=1, louder=make_wild(800, 1, 1))
+    found = cid.diagnose(make_loop(), record, catalogue=FEW, progress=False)
+    (first,) = found.findings
+    assert (first.name, first.at) == ("CoulombFriction", "x_dot")
+    assert first.effect.fc == pytest.approx(0.4, rel=0.02)
+    assert found.verdict == "explained"
+    assert list_wild_shares(found)[0] == 0 < list_wild_shares(found)[1]
+
+
+def test_readings_that_err_for_a_while_are_no_heavy_tails():
+    louder = np.ones((2, 800))
+    louder[1, 300:360] = 8.0
+    found = cid.diagnose(make_loop(), simulate(800, seed=1, louder=louder), catalogue=FEW,
+                         progress=False)  # fmt: skip
+    assert found.noise.kind == "white"
+    assert found.verdict in ("unknown", "partly explained")
+
+
+def test_the_law_of_several_outputs_is_that_of_each():
+    wild, student = Tails(share=0.02, ratio=8.0), Tails(freedom=3.0)
+    rng = np.random.default_rng(0)
+    z = rng.standard_normal((500, 3)) * [1.0, 4.0, 2.0]
+    joint = JointTails((wild, None, student))
+    for k, law in enumerate((wild, student)):
+        np.testing.assert_array_equal(joint.compute_weight(z)[:, 2 * k],
+                                      law.compute_weight(z[:, 2 * k]))  # fmt: skip
+        np.testing.assert_array_equal(joint.normalize(z)[:, 2 * k], law.normalize(z[:, 2 * k]))
+    np.testing.assert_array_equal(joint.normalize(z)[:, 1], z[:, 1])
+    keep = rng.random((500, 3)) < 0.7
+    density = np.column_stack([
+        wild.compute_log_density(z[:, 0]), stats.norm.logpdf(z[:, 1]),
+        student.compute_log_density(z[:, 2]),
+    ])  # fmt: skip
+    part = joint.choose(keep)
+    np.testing.assert_allclose(part.compute_log_density(z[keep]), density[keep])
+    squares = (3.0 * np.column_stack([
+        np.where(rng.random(20_000) < 0.02, 8.0, 1.0) * rng.standard_normal(20_000),
+        rng.standard_normal(20_000), rng.standard_t(3, 20_000),
+    ])) ** 2  # fmt: skip
+    every = joint.choose(np.ones(squares.shape, dtype=bool))
+    assert every.find_scale(squares.ravel(), 1.0) == pytest.approx(9.0, rel=0.03)
+    assert joint.reorder([2, 0, 1]).each == (student, wild, None)
+
+
+def test_the_filter_passes_over_a_wild_reading_of_one_output_alone():
+    record = simulate(400, seed=1)
+    problem = make_problem(make_loop(free=()), (), [record])
+    plain = Noise((1e2, 1e2), sensors=(25.0,))
+    fit = begin_fit(problem, np.zeros(0), plain)
+    data, lin = problem.data[0], fit.linearized[0]
+    law = JointTails((None, Tails(share=0.01, ratio=10.0)), scale=1e-8)
+    for output, factor in ((0, 1.0), (1, 0.05)):
+        y = data.y.copy()
+        y[200, output] += 100 * NOISE[output]
+        shifted = replace(data, y=y)
+        moved = [
+            run_filter(fit.plant, shifted, lin, noise).trajectory.filtered[200]
+            - run_filter(fit.plant, data, lin, noise).trajectory.filtered[200]
+            for noise in (plain, replace(plain, tails=law))
+        ]
+        assert np.max(np.abs(moved[0])) > 0
+        ratio = np.linalg.norm(moved[1]) / np.linalg.norm(moved[0])
+        assert ratio == pytest.approx(1.0, abs=0.05) if factor == 1.0 else ratio < factor

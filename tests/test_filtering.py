@@ -53,7 +53,7 @@ def run(s, valid=None, restart=None, input_variance=None, start=None, spread=Non
     return filter_pass(
         *s.values(), valid, restart, np.zeros(size) if input_variance is None else input_variance,
         np.zeros(n) if start is None else start, 2.0 * np.eye(n) if spread is None else spread,
-        sensor, (0.0,) * 4, np.full(m, 0.2) if force is None else force, memory, drift,
+        sensor, np.zeros((1, 4)), np.full(m, 0.2) if force is None else force, memory, drift,
         (0,) * n, (0,) * (n + bool(drift)),
     )  # fmt: skip
 
@@ -599,7 +599,7 @@ def test_a_million_samples_of_an_unstable_plant_stay_positive():
     out = filter_pass(
         np.outer(pushes, b), every(a), every(b[:, None]), zero, np.zeros((n, 2, 1)), np.zeros(n),
         every(np.array([1.0, 0.0])), np.zeros((n, 1)), zero, zero, y, np.ones(n, dtype=bool),
-        np.arange(n) == 0, np.zeros(n), np.zeros(2), 1e12 * np.eye(2), 1.0, (0.0,) * 4,
+        np.arange(n) == 0, np.zeros(n), np.zeros(2), 1e12 * np.eye(2), 1.0, np.zeros((1, 4)),
         np.array([ratio]), 0.0, 0.0, (0, 0), (0, 0),
     )  # fmt: skip
     steady = linalg.solve_discrete_are(a.T, np.array([[1.0], [0.0]]), ratio * np.outer(b, b),

@@ -14,6 +14,7 @@ from ..effects import AbstractEffect, Quantization, equivalents
 from ..estimation.likelihood.filter_data import find_noise_units
 from ..estimation.likelihood.likelihood import Fit
 from ..estimation.likelihood.physics_fit import summarize_fit
+from ..estimation.likelihood.tails import JointTails, Tails
 from ..loop.loop import Loop
 from .candidates import Trial, is_same_kind
 from .experiment import find_experiment
@@ -82,7 +83,7 @@ def assemble_answer(
     if not loop.equations().siso:
         notes.append(
             "with several inputs or outputs the noise of each output is taken to be white: "
-            "coloured noise, heavy tails, steps and limits of a sensor, delays of one of several "
+            "coloured noise, steps and limits of a sensor, delays of one of several "
             "inputs, repeats of the experiment and errors of the log are not looked for"
         )
     if loop.linear_plant and not found.after.passed:
@@ -117,11 +118,16 @@ def describe_noise(fit: Fit, unit: str) -> SensorNoise:
     """Return the sensor noise of a fit as a diagnosis tells it."""
     noise, variance = fit.noise, float(np.mean(fit.sensor))
     if not fit.plant.e.siso:
-        sizes = np.sqrt(variance * np.array([1.0, *noise.sensors])).tolist()
+        joint = noise.tails
+        laws = joint.each if isinstance(joint, JointTails) else (None,) * len(fit.plant.e.outputs)
+        worth = [1.0 if law is None else law.variance for law in laws]
+        sizes = np.sqrt(variance * np.array([1.0, *noise.sensors]) * worth).tolist()
+        told = tuple((math.inf, 0.0, 1.0) if law is None else
+                     (law.freedom or math.inf, law.share, law.ratio) for law in laws)  # fmt: skip
         units = find_noise_units(fit.plant.loop, fit.data[0].record)[0]
         rows = tuple(zip(fit.plant.e.outputs, sizes, units, strict=True))
-        return SensorNoise(sizes[0], units[0], outputs=rows)
-    if noise.tails is None:
+        return SensorNoise(sizes[0], units[0], outputs=rows, tails=told if joint else ())
+    if not isinstance(noise.tails, Tails):
         return SensorNoise(math.sqrt(variance), unit, noise.ar, noise.ma)
     tails = noise.tails
     return SensorNoise(

@@ -292,6 +292,8 @@ class SensorNoise(Printed):
     outputs : tuple of (str, float, str)
         Of several outputs, the name of each, its noise and the unit; `size` is then that of the
         first.
+    tails : tuple of (float, float, float)
+        Of several outputs, `freedom`, `share` and `ratio` of each; empty: all are Gaussian.
 
     Examples
     --------
@@ -313,12 +315,14 @@ class SensorNoise(Printed):
     share: float = 0.0
     ratio: float = 1.0
     outputs: tuple[tuple[str, float, str], ...] = ()
+    tails: tuple[tuple[float, float, float], ...] = ()
 
     @property
     def kind(self) -> str:
         """What it is: ``"white"``, ``"coloured"``, ``"heavy-tailed"`` or the two last together."""
         kinds = ["coloured"] if self.ar or self.ma else []
-        if math.isfinite(self.freedom) or self.share:
+        laws = [(self.freedom, self.share), *((law[0], law[1]) for law in self.tails)]
+        if any(math.isfinite(freedom) or share for freedom, share in laws):
             kinds.append("heavy-tailed")
         return " and ".join(kinds) or "white"
 
@@ -326,18 +330,16 @@ class SensorNoise(Printed):
     def words(self) -> str:
         """What it is, with its order and size, as the end of a sentence."""
         if self.outputs:
-            sizes = [f"{write_quantity(size, unit or f'[{name}]')} RMS at {name}"
-                     for name, size, unit in self.outputs]  # fmt: skip
-            return f"white, of {write_list(sizes)}"
+            laws = self.tails or ((math.inf, 0.0, 1.0),) * len(self.outputs)
+            sizes = []
+            for (name, size, unit), law in zip(self.outputs, laws, strict=True):
+                text = f"{write_quantity(size, unit or f'[{name}]')} RMS at {name}"
+                sizes.append(text + "".join(f" ({told})" for told in _describe_tails(*law)))
+            return f"{self.kind}, of {write_list(sizes)}"
         order = f", ARMA({len(self.ar)}, {len(self.ma)})" if self.ar or self.ma else ""
         text = f"{self.kind}{order}, of {write_quantity(self.size, self.unit or '[y]')} RMS"
         told = [self._describe_colour()] if order else []
-        if math.isfinite(self.freedom):
-            told.append("large errors are as frequent as by Student's law with "
-                        f"{write_number(self.freedom, 2)} degrees of freedom")  # fmt: skip
-        if self.share:
-            told.append(f"{100 * self.share:.2g} % of the readings err "
-                        f"{write_number(self.ratio, 2)} times as much as the others")  # fmt: skip
+        told += _describe_tails(self.freedom, self.share, self.ratio)
         return text + (f": {' and '.join(told)}" if told else "")
 
     def _describe_colour(self) -> str:
@@ -352,6 +354,18 @@ class SensorNoise(Printed):
 
     def __str__(self) -> str:
         return f"The sensor noise is {self.words}."
+
+
+def _describe_tails(freedom: float, share: float, ratio: float) -> list[str]:
+    """Say how frequent large errors are, where they are more frequent than Gaussian ones."""
+    told = []
+    if math.isfinite(freedom):
+        told.append("large errors are as frequent as by Student's law with "
+                    f"{write_number(freedom, 2)} degrees of freedom")  # fmt: skip
+    if share:
+        told.append(f"{100 * share:.2g} % of the readings err "
+                    f"{write_number(ratio, 2)} times as much as the others")  # fmt: skip
+    return told
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ from ..estimation.likelihood.likelihood import (
 )
 from ..estimation.likelihood.noise_fit import count_noise_parameters
 from ..estimation.likelihood.sampled_plant import SampledPlant, Trajectory
+from ..estimation.likelihood.tails import JointTails
 from ..loop.loop import Loop
 from ..loop.period_map import comes_to_rest
 from ..loop.wiring import knows_references
@@ -124,8 +125,9 @@ def with_linearization(model: Model) -> Model:
 def compute_log_terms(fit: Fit) -> Array:
     """Return each sample's share of the log-likelihood, records one after the other."""
     parts: list[Any] = []
-    tails = fit.noise.tails
     for out, keep, r in zip(fit.filtered, fit.counts, fit.sensor, strict=True):
+        law = fit.noise.tails
+        tails = law.choose(keep) if isinstance(law, JointTails) else law
         s = out.variance[keep] * r
         if tails is not None:
             density = tails.compute_log_density(out.innovations[keep] / np.sqrt(s))

@@ -16,6 +16,7 @@ from ..data.validity import find_whole_past
 from ..estimation.likelihood.kalman_filter import make_sensor_states
 from ..estimation.likelihood.likelihood import Fit
 from ..estimation.likelihood.prediction import predict, predict_ahead, predict_spread
+from ..estimation.likelihood.tails import JointTails, Tails
 from ..loop.loop import Loop
 from ..loop.simulation import Simulator
 from ..validation.record_simulation import find_long_stretches, prepare_stretch
@@ -427,7 +428,7 @@ def draw_noise(fit: Fit, sensor: float, n: int, seed: int) -> list[Array]:
     if not noise.sensor_is_white:
         # As many samples again let the noise begin anywhere in its stationary run.
         reading = np.append(np.random.default_rng([seed, 1]).standard_normal(n), reading)
-    if tails is not None:
+    if isinstance(tails, Tails):
         reading = tails.draw(reading, seed)
     if not noise.sensor_is_white:
         _, drive, _ = make_sensor_states(noise.ar, noise.ma)
@@ -437,8 +438,11 @@ def draw_noise(fit: Fit, sensor: float, n: int, seed: int) -> list[Array]:
 
 
 def _draw_several_noises(fit: Fit, sensor: float, n: int, seed: int) -> list[Array]:
-    """Return the white noise of each sensor and of each force of a fit."""
+    """Return the noise of each sensor and of each force of a fit."""
     sizes = [np.sqrt(sensor * np.array(v)) for v in ([1.0, *fit.noise.sensors], fit.noise.force)]
     streams = [np.random.default_rng([seed, k]).standard_normal((len(size), n))
                for k, size in enumerate(sizes)]  # fmt: skip
+    if isinstance(fit.noise.tails, JointTails):
+        for k, law in enumerate(fit.noise.tails.each):
+            streams[0][k] = streams[0][k] if law is None else law.draw(streams[0][k], (seed, k))
     return [size[:, None] * s for size, s in zip(sizes, streams, strict=True)]

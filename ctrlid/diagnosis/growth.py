@@ -13,6 +13,7 @@ from .._base.interruption import Stopped
 from .._base.statistics import compute_lagged_products, compute_predicted_likelihood
 from ..effects import AbstractEffect
 from ..effects.base import name_at_place
+from ..estimation.likelihood.kalman_filter import Noise
 from ..estimation.likelihood.likelihood import Fit
 from ..estimation.likelihood.maximization import (
     choose_noise,
@@ -22,6 +23,7 @@ from ..estimation.likelihood.maximization import (
     refit_noise_size,
 )
 from ..estimation.likelihood.noise_fit import compute_noise_criterion, count_noise_parameters
+from ..estimation.likelihood.tails import JointTails
 from .candidates import Trial, contains, is_same_kind, list_missing_candidates
 from .fitted_model import (
     Model,
@@ -193,7 +195,7 @@ def _prefer_sensor_noise(
     than the error that it explains.
     """
     fit = model.fit
-    if fit.known is not None or not math.isfinite(fit.value) or not fit.plant.e.siso:
+    if fit.known is not None or not math.isfinite(fit.value):
         return None
     tests = run_noise_tests(fit)
     if tests.passed and not fit.noise.drift and best is None:
@@ -205,7 +207,8 @@ def _prefer_sensor_noise(
         earned = best.net_gain - bayesian_penalty(parameters, fit.size)
         more = max(0.0, earned - THRESHOLD.gate)
     tried = []
-    if fit.noise.sensor_is_white and _may_be_coloured(fit, more):
+    # Of several outputs no colour is fitted.
+    if fit.plant.e.siso and fit.noise.sensor_is_white and _may_be_coloured(fit, more):
         with contextlib.suppress(ModelCannotRun):
             tried.append(choose_sensor_noise(fit))
     if fit.noise.tails is None and tests.has_heavy_tails:
@@ -243,7 +246,23 @@ def refuse_larger_noise(found: Search, is_larger: Callable[[Model], bool]) -> Se
     fit = found.final.fit
     if fit.noise.sensor_is_white or fit.known is not None or not is_larger(found.final):
         return found
-    plain = refit_noise_size(maximize(replace(fit, noise=fit.noise.plain)))
+    return _weigh_with_noise(found, fit.noise.plain)
+
+
+def refuse_bursts(found: Search) -> Search:
+    """Return the search with Gaussian sensor noise where the wild readings come in bursts.
+
+    These are events of the plant, or of a clock, that heavy tails of several outputs stood for.
+    """
+    noise = found.final.fit.noise
+    if not isinstance(noise.tails, JointTails) or not found.after.has_bursts:
+        return found
+    return _weigh_with_noise(found, replace(noise, tails=None))
+
+
+def _weigh_with_noise(found: Search, noise: Noise) -> Search:
+    """Return the search with what was found weighed anew, beside noise of another kind."""
+    plain = refit_noise_size(maximize(replace(found.final.fit, noise=noise)))
     model = Model(found.final.loop, drop_linearization(choose_noise(plain)))
     model, left = weigh_effects(model, len(found.base.loop.effects), found.steps)
     return replace(found, final=model, found=left, after=retest_with_replicas(model))

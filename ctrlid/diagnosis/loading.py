@@ -176,7 +176,7 @@ def _decode(kind: Any, data: Mapping[str, Any]) -> Any:
                 made[field.name] = tuple(_decode_effect(e) for e in value)
             case "outputs" if kind is Gap:
                 made[field.name] = tuple(_decode(Gap, part) for part in value)
-            case "outputs" | "forces":
+            case "outputs" | "forces" | "tails":
                 made[field.name] = tuple(tuple(read_numbers(row)) for row in value)
             case "equivalents" | "records" | "ar" | "ma":
                 made[field.name] = tuple(value)

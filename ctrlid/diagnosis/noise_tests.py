@@ -17,8 +17,9 @@ from .._base.statistics import (
     portmanteau,
 )
 from ..estimation.likelihood.filter_data import FilterData
-from ..estimation.likelihood.kalman_filter import Filtered
+from ..estimation.likelihood.kalman_filter import Filtered, Noise
 from ..estimation.likelihood.likelihood import Fit
+from ..estimation.likelihood.tails import JointTails
 from .constancy import (
     compute_bin_probability,
     compute_line_probability,
@@ -31,6 +32,8 @@ from .thresholds import THRESHOLD
 
 # The tests of heavy tails.
 TAILS = "heavy tails", "isolated events"
+# The test of whether large errors come one by one.
+SIZES = "independence of sizes"
 
 
 def choose_alarm_level(effects: int) -> float:
@@ -65,9 +68,17 @@ class NoiseTests:
 
     @property
     def has_heavy_tails(self) -> bool:
-        """Whether large errors are more frequent than those of Gaussian noise."""
+        """Whether large errors, of any output, are more frequent than those of Gaussian noise."""
+        if self.outputs:
+            return any(one.has_heavy_tails for one in self.outputs.values())
         tails = (self.p_values.get(name, 1.0) for name in TAILS)
         return min(tails) < self.alpha and compute_excess(self.z) > 0
+
+    @property
+    def has_bursts(self) -> bool:
+        """Whether large errors of an output with heavy tails come together."""
+        sizes = [one.p_values.get(SIZES, 1.0) for one in self.outputs.values()]
+        return min(sizes, default=1.0) * max(len(sizes), 1) < self.alpha
 
     @property
     def evidence(self) -> float:
@@ -185,7 +196,7 @@ def _test_output(fit: Fit, standardized: Sequence[Array], output: int | None = N
         # Without weights for short records: names and verdicts were studied with this statistic.
         white += portmanteau(rho, n, short=False)
         white_df += THRESHOLD.lags
-        if fit.noise.tails is not None:
+        if _has_tails(fit.noise, output):
             size = np.where(keep, z**2 - np.mean(z[keep] ** 2), 0.0)
             products = compute_lagged_products(size, size, THRESHOLD.lags)
             sizes += portmanteau(products[1:] / products[0], n, short=False)
@@ -216,8 +227,8 @@ def _test_output(fit: Fit, standardized: Sequence[Array], output: int | None = N
     }
     if sizes_df:
         # Wild readings come one by one: what comes in bursts is an event of the plant.
-        p_values["independence of sizes"] = float(stats.chi2.sf(sizes, sizes_df))
-        of_noise.add("independence of sizes")
+        p_values[SIZES] = float(stats.chi2.sf(sizes, sizes_df))
+        of_noise.add(SIZES)
     if shapes:
         shape = float(stats.chi2.sf(sum(v**2 for v in shapes), len(shapes)))
         p_values["shape of the random force"] = shape
@@ -228,6 +239,13 @@ def _test_output(fit: Fit, standardized: Sequence[Array], output: int | None = N
         p_values[f"size by {name}"] = square
         of_noise.add(f"size by {name}")
     return NoiseTests(p_values, z, axes, frozenset(of_noise))
+
+
+def _has_tails(noise: Noise, output: int | None) -> bool:
+    """Whether the noise of an output has a law with heavy tails."""
+    if isinstance(noise.tails, JointTails):
+        return output is not None and noise.tails.each[output] is not None
+    return noise.tails is not None
 
 
 def _list_references(data: FilterData) -> list[Array]:

@@ -21,7 +21,7 @@ from ...physics.block_evaluation import BlockEvaluation
 from .filter_data import FilterData
 from .kalman_recursion import filter_pass
 from .sampled_plant import Linearized, SampledPlant, Trajectory
-from .tails import Tails
+from .tails import GAUSSIAN, JointTails, Tails
 
 # While its variance exceeds so many times the median, a prediction depends on the initial state.
 INITIAL_VARIANCE_RATIO = 4.0
@@ -31,8 +31,6 @@ NEWTON = 6
 PASSES = 12
 # A trajectory that moves by less than this share of its standard deviation has converged.
 CONVERGED_MOTION = 1e-3
-# What the compiled filter takes for noise without heavy tails.
-GAUSSIAN = 0.0, 0.0, 0.0, 0.0
 
 
 @dataclass(frozen=True)
@@ -52,8 +50,8 @@ class Noise:
         ``n[k] = ar[0] n[k-1] + ... + w[k] + ma[0] w[k-1] + ...``; white if both are empty.
     sensors : tuple of float
         Variances of the sensor noise of all further outputs, relative to that of the first.
-    tails : Tails or None
-        Heavy tails of the sensor noise; None: it is Gaussian.
+    tails : Tails, JointTails or None
+        Heavy tails of the sensor noise, of several outputs jointly; None: it is Gaussian.
     """
 
     force: tuple[float, ...]
@@ -61,7 +59,7 @@ class Noise:
     drift: float = 0.0
     ar: tuple[float, ...] = ()
     ma: tuple[float, ...] = ()
-    tails: Tails | None = None
+    tails: Tails | JointTails | None = None
     sensors: tuple[float, ...] = ()
 
     @property
@@ -125,7 +123,7 @@ def run_filter(
         lin.step, lin.a, lin.b, lin.du, np.ascontiguousarray(lin.dp[:, :, :p]), lin.output,
         lin.c, np.ascontiguousarray(lin.hp[:, :p]), lin.trajectory.predicted,
         lin.trajectory.filtered, data.y, data.valid, data.restart, lin.input_variance,
-        lin.start, lin.spread, 1.0 if white else 0.0, GAUSSIAN if tails is None else tails.numbers,
+        lin.start, lin.spread, 1.0 if white else 0.0, _list_tails(tails),
         force, noise.memory, noise.drift, (0,) * states,
         (0,) * (states + bool(noise.drift > 0)),
     )  # fmt: skip
@@ -152,7 +150,9 @@ def predict_outputs(data: FilterData, lin: Linearized, noise: Noise) -> tuple[Ar
         order = [k, *(i for i in range(q) if i != k)]
         turned = replace(lin, output=lin.output[:, order], c=lin.c[:, order], hp=lin.hp[:, order])
         moved = replace(data, y=data.y[:, order], valid=data.valid[:, order])
-        out = _run_several(moved, turned, replace(noise, sensors=()), 0, scale[order])
+        tails = noise.tails.reorder(order) if isinstance(noise.tails, JointTails) else None
+        own = replace(noise, sensors=(), tails=tails)
+        out = _run_several(moved, turned, own, 0, scale[order])
         errors.append(out.innovations[:, 0])
         variances.append(out.variance[:, 0])
     return np.column_stack(errors), np.column_stack(variances)
@@ -170,7 +170,7 @@ def _run_several(
     size, q = lin.output.shape
     each = _list_updates(lin)
     scale = np.sqrt([1.0, *noise.sensors] if sensors is None else sensors)
-    memory = noise.memory ** (1 / q)
+    memory, tails = noise.memory ** (1 / q), noise.tails
     states = lin.step.shape[1]
     restart = np.zeros((size, q), dtype=bool)
     restart[:, 0] = data.restart
@@ -183,16 +183,22 @@ def _run_several(
         np.ascontiguousarray((lin.hp[:, :, :p] / scale[:, None]).reshape(size * q, p)),
         each.trajectory.predicted, each.trajectory.filtered, (data.y / scale).ravel(),
         data.valid.ravel(), restart.ravel(), unsure.ravel(), lin.start, lin.spread, 1.0,
-        GAUSSIAN, np.asarray(noise.force, dtype=float), memory, noise.coloured * (1 - memory**2),
-        (0,) * states, (0,) * (states + bool(noise.drift > 0)),
+        _list_tails(tails), np.asarray(noise.force, dtype=float), memory,
+        noise.coloured * (1 - memory**2), (0,) * states, (0,) * (states + bool(noise.drift > 0)),
     )  # fmt: skip
     error, variance = error.reshape(size, q) * scale, variance.reshape(size, q) * scale**2
     # The caller reports a filter that lost the record, so that no warning is needed here.
     with np.errstate(all="ignore"):
-        sensor = np.sqrt(np.mean((error**2 / variance)[data.usable]))
+        squares = (error**2 / variance)[data.usable]
+        sensor = np.sqrt(np.mean(squares) if tails is None else tails.scale)
     trajectory = Trajectory(before[::q], after[q - 1 :: q], wide[q - 1 :: q] * sensor)
     return Filtered(error, variance, trajectory, slopes.reshape(size, q, p) * scale[:, None],
                     disturbance[q - 1 :: q])  # fmt: skip
+
+
+def _list_tails(tails: Tails | JointTails | None) -> Array:
+    """Return the heavy tails as the compiled filter takes them."""
+    return np.array([GAUSSIAN]) if tails is None else tails.numbers
 
 
 @lru_cache(maxsize=8)

@@ -53,9 +53,9 @@ def filter_pass(
         State and covariance at a start.
     sensor : float
         Variance of the sensor noise.
-    tails : (float, float, float, float)
+    tails : ndarray, shape (q, 4)
         Degrees of freedom, share and ratio of wild readings, and scale, as in `Tails`; all zero
-        for Gaussian noise.
+        for Gaussian noise. Samples take the rows in turn.
     force : ndarray, shape (m,)
         Variances of the white forces.
     memory, drift : float
@@ -77,7 +77,6 @@ def filter_pass(
     p = dp.shape[2]
     m = b.shape[2]
     coloured = drift > 0.0
-    freedom, share, ratio, scale = tails
     x, cov, sens = np.zeros(w), np.zeros((w, w)), np.zeros((w, p))
     error, variance = np.zeros(size), np.ones(size)
     before, after = np.empty((size, n)), np.empty((size, n))
@@ -122,6 +121,8 @@ def filter_pass(
             e = y[k] - expected
             error[k] = e
             wild = 0.0
+            law = tails[k % len(tails)]
+            freedom, share, ratio, scale = law[0], law[1], law[2], law[3]
             if freedom > 0.0:
                 wild = e * e / (freedom * scale)
             elif share > 0.0:

@@ -30,7 +30,7 @@ from .noise_fit import (
     try_coloured_sensor,
     try_tails,
 )
-from .tails import compute_information_shares
+from .tails import JointTails, compute_information_shares
 
 # A climb ends after at most so many Gauss-Newton steps.
 ROUNDS = 25
@@ -410,8 +410,8 @@ def compute_information(fit: Fit) -> tuple[Array, Array]:
             shifted[k] += h
             pair.append(compute_innovations(fit.theta, make_noise(shifted, fit.noise, dt)))
         columns.append(_divide_difference(pair, 2 * LOG_STEP))
-    tails = fit.noise.tails
-    mean, scale = compute_information_shares(tails)
+    law = fit.noise.tails
+    shares = compute_information_shares(law)
     count, records = len(columns), len(problem.data) if problem.known is None else 0
     matrix = np.zeros((count + records, count + records))
     score = np.zeros(count + records)
@@ -420,6 +420,9 @@ def compute_information(fit: Fit) -> tuple[Array, Array]:
         size = np.zeros((len(e), records))
         size[:, k : k + 1] = 1.0
         z2 = e**2 / s
+        # Of several outputs each has its own share, which all its samples have.
+        mean, scale = (np.broadcast_to(v, keep.shape)[keep] if np.ndim(v) else v for v in shares)
+        tails = law.choose(keep) if isinstance(law, JointTails) else law
         if tails is not None:
             w = tails.compute_weight(np.sqrt(z2))
             e, z2 = w * e, w * z2

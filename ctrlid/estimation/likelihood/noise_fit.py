@@ -14,7 +14,7 @@ from ..._base.jobs import run_side_by_side
 from .kalman_filter import Noise
 from .likelihood import Fit, Known, Problem, evaluate_linearized
 from .sampled_plant import Linearized, SampledPlant
-from .tails import fit_tails, list_tails
+from .tails import JointTails, Tails, fit_tails, list_tails
 
 # Logarithm of the least variance of a force, below which it affects only the start of a record.
 LEAST = -24.0
@@ -88,18 +88,22 @@ def _refit_tails(fit: Fit, hold_shape: bool) -> Fit:
     assert tails is not None
     if not math.isfinite(fit.value):
         return fit
-    new = replace(tails, scale=float(np.mean(fit.sensor)))
-    if not hold_shape:
-        new, _ = fit_tails(new, *_list_squares(fit))
-    again = evaluate_linearized(
-        fit.problem, fit.theta, replace(fit.noise, tails=new), fit.linearized
-    )
+    noise = replace(fit.noise, tails=replace(tails, scale=float(np.mean(fit.sensor))))
+    if not hold_shape and isinstance(tails, JointTails):
+        laws = [None if law is None else fit_tails(law, *_list_squares(fit, k))[0]
+                for k, law in enumerate(tails.each)]  # fmt: skip
+        noise = _give_laws(fit, laws)
+    elif not hold_shape:
+        assert isinstance(noise.tails, Tails)
+        noise = replace(noise, tails=fit_tails(noise.tails, *_list_squares(fit))[0])
+    again = evaluate_linearized(fit.problem, fit.theta, noise, fit.linearized)
     return again if again.value > fit.value else fit
 
 
-def _list_squares(fit: Fit) -> tuple[Array, float]:
+def _list_squares(fit: Fit, output: int | None = None) -> tuple[Array, float]:
     """Return squared innovations over their relative variances, and half the sum of their logs."""
-    pairs = [(out.innovations[keep] ** 2, out.variance[keep])
+    at = slice(None) if output is None else (slice(None), output)
+    pairs = [(out.innovations[at][keep[at]] ** 2, out.variance[at][keep[at]])
              for out, keep in zip(fit.filtered, fit.counts, strict=True)]  # fmt: skip
     return (np.concatenate([e / s for e, s in pairs]),
             0.5 * float(sum(np.sum(np.log(s)) for _, s in pairs)))  # fmt: skip
@@ -110,6 +114,8 @@ def try_tails(fit: Fit) -> Fit:
 
     Student's law and a share of wild readings compete; parameters of the plant stay as they are.
     """
+    if not fit.plant.e.siso:
+        return _try_joint_tails(fit)
     squares, logs = _list_squares(fit)
     laws = [fit_tails(law, squares, logs) for law in list_tails(squares)]
     tried = []
@@ -118,6 +124,44 @@ def try_tails(fit: Fit) -> Fit:
         noise = replace(fit.noise, tails=law)
         tried.append(fit_noise(fit.problem, fit.theta, fit.linearized, noise))
     return max(tried, key=compute_noise_criterion)
+
+
+def _try_joint_tails(fit: Fit) -> Fit:
+    """Return the fit with the heavy tails of each output that the BIC prefers, or none.
+
+    A wild reading of one output leads the filter astray, which the others then seem to be: with
+    the laws that a first choice gave, each output is asked anew.
+    """
+    tried = [fit]
+    kinds: list[tuple[int, ...]] = []
+    while True:
+        laws = [_choose_law(tried[-1], k) for k in range(len(fit.plant.e.outputs))]
+        kind = tuple(0 if law is None else law.parameters for law in laws)
+        if not any(kind) or kind in kinds:
+            return max(tried, key=compute_noise_criterion)
+        kinds.append(kind)
+        noise = _give_laws(tried[-1], laws)
+        tried.append(fit_noise(fit.problem, fit.theta, fit.linearized, noise))
+
+
+def _choose_law(fit: Fit, output: int) -> Tails | None:
+    """Return the law of one output's innovations that the BIC prefers; None: a Gaussian one."""
+    squares, logs = _list_squares(fit, output)
+    size, scale = len(squares), float(np.mean(squares))
+    gaussian = -0.5 * size * (math.log(2 * math.pi * scale) + 1) - logs
+    each = [fit_tails(law, squares, logs) for law in list_tails(squares)]
+    best, value = max(each, key=lambda p: p[1] - bayesian_penalty(p[0].parameters, size))
+    better = value - bayesian_penalty(best.parameters, size) > gaussian
+    return best if better else None
+
+
+def _give_laws(fit: Fit, laws: Sequence[Tails | None]) -> Noise:
+    """Return the noise with given laws of the outputs, the scale of each told by its own."""
+    scales = np.array([np.mean(_list_squares(fit, k)[0]) if law is None else law.scale
+                       for k, law in enumerate(laws)])  # fmt: skip
+    further = np.array(fit.noise.sensors) * scales[1:] / scales[0]
+    return replace(fit.noise, sensors=tuple(further.tolist()),
+                   tails=JointTails(tuple(laws), float(scales[0])))  # fmt: skip
 
 
 def choose_noise_ratio(plant: SampledPlant) -> float:

@@ -1,7 +1,8 @@
 """Heavy tails of the sensor noise: their law, and what a robust filter makes of a wild reading."""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any
 
@@ -21,6 +22,8 @@ MOST_SHARE, LEAST_RATIO, MOST_RATIO = 0.5, 1.5, 1e3
 SETTLED, STEPS = 1e-6, 200
 # Expectations are sums over so many points, evenly spaced in the inverse hyperbolic sine.
 POINTS, REACH = 4001, 12.0
+# What the compiled filter takes for noise without heavy tails.
+GAUSSIAN = 0.0, 0.0, 0.0, 0.0
 
 
 @dataclass(frozen=True)
@@ -63,9 +66,9 @@ class Tails:
         return 1 + self.share * (self.ratio**2 - 1)
 
     @property
-    def numbers(self) -> tuple[float, float, float, float]:
-        """What the compiled filter takes."""
-        return self.freedom, self.share, self.ratio, self.scale
+    def numbers(self) -> Array:
+        """What the compiled filter takes, in a row."""
+        return np.array([[self.freedom, self.share, self.ratio, self.scale]])
 
     def compute_log_density(self, z: Array) -> Array:
         """Return the logarithm of the density of errors in units of the scale's root."""
@@ -94,9 +97,9 @@ class Tails:
         # Zero stands for what is too small to be written.
         return np.asarray(-np.sign(z) * special.ndtri(np.maximum(beyond, 1e-300)))
 
-    def draw(self, normal: Array, seed: int) -> Array:
+    def draw(self, normal: Array, seed: int | tuple[int, ...]) -> Array:
         """Return noise of the scale one, made of standard normal noise."""
-        rng = np.random.default_rng([seed, 2])
+        rng = np.random.default_rng([*(seed if isinstance(seed, tuple) else (seed,)), 2])
         if self.freedom:
             squares = rng.chisquare(self.freedom, len(normal))
             return np.asarray(normal * np.sqrt(self.freedom / squares))
@@ -107,18 +110,116 @@ class Tails:
 
         .. math:: \sigma^2 = \overline{w(e/\sigma)\, e^2}
         """
-        scale = start
-        for _ in range(STEPS):
-            old = max(scale, 1e-300)
-            scale = float(np.mean(self.compute_weight(np.sqrt(squares / old)) * squares))
-            if abs(scale - old) <= SETTLED * old:
-                break
-        return scale
+        return _find_scale(self, squares, start)
+
+
+@dataclass(frozen=True)
+class JointTails:
+    """The sensor noise of several outputs, of which some have heavy tails of their own.
+
+    Errors are columns, one of each output, in units of one scale: that of an output relative to
+    the first is `Noise.sensors`.
+
+    Parameters
+    ----------
+    each : tuple of Tails or None
+        The law of each output, whose own scale is not used; None: it is Gaussian.
+    scale : float
+        Variance of the usual readings, relative to what each output has.
+    """
+
+    each: tuple[Tails | None, ...]
+    scale: float = 1.0
+
+    @property
+    def parameters(self) -> int:
+        """Number of parameters beyond those of Gaussian noise."""
+        return sum(law.parameters for law in self.each if law is not None)
+
+    @property
+    def numbers(self) -> Array:
+        """What the compiled filter takes, with a row for each output."""
+        laws = [Tails(scale=self.scale) if law is None else law for law in self.each]
+        return np.array([(law.freedom, law.share, law.ratio, self.scale) for law in laws])
+
+    def reorder(self, order: Sequence[int]) -> "JointTails":
+        """Return the same for outputs in another order."""
+        return replace(self, each=tuple(self.each[k] for k in order))
+
+    def choose(self, keep: Any) -> "FlatTails":
+        """Return the law of those errors alone for which `keep` holds, in one row."""
+        return FlatTails(self.each, self.scale, np.nonzero(keep)[1])
+
+    def compute_weight(self, z: Array) -> Array:
+        """Return what errors count for, as `Tails` does."""
+        return self._apply("compute_weight", z)
+
+    def normalize(self, z: Array) -> Array:
+        """Return errors as standard normal deviates, as `Tails` does."""
+        return self._apply("normalize", z)
+
+    def _apply(self, method: str, z: Array) -> Array:
+        flat: Array = getattr(self.choose(np.ones(z.shape, dtype=bool)), method)(z.ravel())
+        return flat.reshape(z.shape)
+
+
+@dataclass(frozen=True, eq=False)
+class FlatTails:
+    """The law of errors of several outputs in one row; `output` says of which output each is."""
+
+    each: tuple[Tails | None, ...]
+    scale: float
+    output: Any = field(repr=False)
+
+    def compute_log_density(self, z: Array) -> Array:
+        """Return the logarithm of the density of errors, as `Tails` does."""
+        return self._apply("compute_log_density", z, stats.norm.logpdf(z))
+
+    def compute_weight(self, z: Array) -> Array:
+        """Return what errors count for, as `Tails` does."""
+        return self._apply("compute_weight", z, np.ones_like(z))
+
+    def normalize(self, z: Array) -> Array:
+        """Return errors as standard normal deviates, as `Tails` does."""
+        return self._apply("normalize", z, z)
+
+    def find_scale(self, squares: Array, start: float) -> float:
+        """Return the likeliest variance of the usual errors of all outputs, as `Tails` does."""
+        return _find_scale(self, squares, start)
+
+    def _apply(self, method: str, z: Array, gaussian: Array) -> Array:
+        found = np.array(gaussian)
+        for k, law in enumerate(self.each):
+            if law is not None:
+                mine = self.output == k
+                found[mine] = getattr(law, method)(z[mine])
+        return found
+
+
+def _find_scale(law: Tails | FlatTails, squares: Array, start: float) -> float:
+    """Return the likeliest variance of the usual errors; see `Tails.find_scale`."""
+    scale = start
+    for _ in range(STEPS):
+        old = max(scale, 1e-300)
+        scale = float(np.mean(law.compute_weight(np.sqrt(squares / old)) * squares))
+        if abs(scale - old) <= SETTLED * old:
+            break
+    return scale
+
+
+def compute_information_shares(tails: Tails | JointTails | None) -> tuple[Any, Any]:
+    """Return what samples tell of a mean and of a scale, relative to samples of Gaussian noise.
+
+    Of several outputs, for each of them.
+    """
+    if isinstance(tails, JointTails):
+        mean, scale = np.transpose([_compute_shares(law) for law in tails.each])
+        return mean, scale
+    return _compute_shares(tails)
 
 
 @lru_cache(maxsize=64)
-def compute_information_shares(tails: Tails | None) -> tuple[float, float]:
-    """Return what samples tell of a mean and of a scale, relative to samples of Gaussian noise."""
+def _compute_shares(tails: Tails | None) -> tuple[float, float]:
     if tails is None:
         return 1.0, 1.0
     grid, step = np.linspace(-REACH, REACH, POINTS, retstep=True)
