@@ -248,3 +248,12 @@ def test_the_filter_passes_over_a_wild_reading_of_one_output_alone():
         assert np.max(np.abs(moved[0])) > 0
         ratio = np.linalg.norm(moved[1]) / np.linalg.norm(moved[0])
         assert ratio == pytest.approx(1.0, abs=0.05) if factor == 1.0 else ratio < factor
+
+
+def test_a_window_is_predicted_that_a_filter_loses_from_its_first_guess():
+    record = simulate(1000, (0.0, 0.02), seed=3)[550:1000]
+    loop = replace(make_loop(free=()), controller=None)
+    loop = loop.with_parameters({"m": 0.19987930886855268, "c": 0.1998788443107679})
+    rubs = cid.effects.CoulombFriction(fc=0.02054333058745406, at="theta_dot")
+    innovations = cid.predict(loop.with_effect(rubs), record).innovations
+    assert (np.std(innovations[:, 20:], axis=1) < 1.2 * NOISE).all()

@@ -77,10 +77,13 @@ def begin_fit(problem: Problem, theta: Array | None = None, noise: Noise | None 
     """
     noise = problem.known.noise if problem.known else noise
     theta = list_start_values(problem.plant.loop, problem.plant.names) if theta is None else theta
+    beside = bool(problem.plant.loop.effects)
     try:
-        return _begin_with_noise(problem, theta, noise)
+        fit = _begin_with_noise(problem, theta, noise)
+        if math.isfinite(fit.value) or not beside:
+            return fit
     except ModelCannotRun:
-        if not problem.plant.loop.effects:
+        if not beside:
             raise
     return _begin_beside_effects(problem, theta, noise)
 
