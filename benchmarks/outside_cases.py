@@ -362,7 +362,7 @@ def make_effect(rng: np.random.Generator, name: str, rig: Rig, n: int) -> tuple[
     return fixed, sized, op.I[main] if main else -1
 
 
-def draw_case(name: str, seed: int, n: int = 2000) -> Case:
+def draw_case(name: str, seed: int, n: int = 1500) -> Case:
     """Return a draw of a class, with its worth.
 
     Parameters

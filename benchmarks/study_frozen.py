@@ -33,7 +33,7 @@ import ctrlid as cid
 
 FULL = {"clean": 600, "one": 400, "faint": 400, "two": 200, "three": 60, "outside": 200,
         "parameter": 100}  # fmt: skip
-SAMPLES = 2000
+SAMPLES = 1500
 FOUND = 50.0  # worth from which an effect has to be found
 BESIDE = 100.0  # the same of each of two
 EDGES = (5, 10, 20, 50, 100, 300, 1000, 3000, 30_000)
