@@ -214,11 +214,11 @@ class AbstractEffect:
         parts = []
         for f in dataclasses.fields(self):
             value = getattr(self, f.name)
-            if value == "":
+            if value == "" or f.name == "at":
                 continue
             shown = f"{value:.4g} {units[f.name]}" if f.name in units else str(value)
             parts.append(f"{f.name} = {shown.strip()}")
-        return f"{type(self).__name__}: {', '.join(parts)}"
+        return f"{name_at_place(self)}: {', '.join(parts)}"
 
     def __str__(self) -> str:
         return self.text()
