@@ -72,7 +72,8 @@ def test_sizes_are_in_the_unit_of_what_works_there():
     }
     for effect, text, loop in units.values():
         assert effect.text(loop).endswith(text)
-    assert str(E.CoulombFriction(fc=0.2, at="x_dot")).startswith("CoulombFriction at x_dot: fc = 0.2")
+    placed = E.CoulombFriction(fc=0.2, at="x_dot")
+    assert str(placed).startswith("CoulombFriction at x_dot: fc = 0.2")
 
 
 def test_friction_of_the_cart_is_fitted():
