@@ -73,22 +73,22 @@ def score_shapes(
             strict=True,
         ):
             part = shape[:, None, first : first + size]
-            shown = np.zeros((*lin.output.shape, size))
+            # The shapes stand behind the parameters of the model.
+            dp = np.zeros((*lin.dp.shape[:2], lin.dp.shape[2] + size))
+            hp = np.zeros((*lin.output.shape, lin.hp.shape[-1] + size))
+            dp[:, :, :-size], hp[..., :-size] = lin.dp, lin.hp
             if place == "output":
                 seen = (slice(None), plant.e.outputs.index(at)) if at else slice(None)
-                shown[seen] = shape[:, first : first + size]
-                extra = np.zeros((*lin.dp.shape[:2], size))
+                hp[..., -size:][seen] = shape[:, first : first + size]
             elif parameter is None:
                 pushed = lin.b.sum(axis=2)
                 if at:
                     pushed = lin.b[:, :, find_force_channel(plant.e, at)]
-                extra = pushed[:, :, None] * part
+                np.multiply(pushed[:, :, None], part, out=dp[:, :, -size:])
             else:
-                extra = lin.dp[:, :, plant.names.index(parameter)][:, :, None] * part
-            wide = replace(
-                lin, dp=np.concatenate([lin.dp, extra], axis=2),
-                hp=np.concatenate([lin.hp, shown], axis=-1),
-            )  # fmt: skip
+                by = lin.dp[:, :, plant.names.index(parameter)]
+                np.multiply(by[:, :, None], part, out=dp[:, :, -size:])
+            wide = replace(lin, dp=dp, hp=hp)
             out = run_filter(plant, data, wide, fit.noise, columns=p + size)
             slopes = out.slopes[keep]
             weighted = slopes / s[keep, None]

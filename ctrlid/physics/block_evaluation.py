@@ -5,6 +5,7 @@ block of samples, with a loop over the block at each instruction, gives the same
 faster and costs no compilation per expression.
 """
 
+import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -22,6 +23,8 @@ from .interpreter import BINARY, UNARY, run_programs
 BLOCK = 512
 # A thread takes at most so many blocks at a time, since their inputs are copied.
 BLOCKS = 64
+# A fit evaluates the same few functions at each step; so many are kept joined.
+JOINED = 16
 
 
 class BlockEvaluation:
@@ -182,7 +185,7 @@ def evaluate_blocks(
     read = set[int]().union(*(s.read for s in stages))
     moving = [k for k, row in enumerate(rows) if len(row) > 1 and k in read]
     again = sum(len(t) for t in tables[: len(carried)])
-    program, starts, constants = _join_programs(stages)
+    program, starts, constants = _join_programs(tuple(stages))
     room, places = max(s.registers for s in stages), np.array(moving, dtype=np.int64)
     last = stages[-1]
     out = np.empty(n * last.rows_out)
@@ -220,7 +223,8 @@ def evaluate_blocks(
     ]  # fmt: skip
 
 
-def _join_programs(stages: Sequence[BlockEvaluation]) -> tuple[Any, Any, Array]:
+@functools.lru_cache(maxsize=JOINED)
+def _join_programs(stages: tuple[BlockEvaluation, ...]) -> tuple[Any, Any, Array]:
     """Return the programs one below the other, where each begins, and all their numbers."""
     programs, count = [], 0
     for stage in stages:

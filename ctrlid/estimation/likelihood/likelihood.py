@@ -68,6 +68,16 @@ class Problem:
     priors: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     @functools.cached_property
+    def least_sensors(self) -> list[float]:
+        """The least variance of the sensor noise of each record."""
+        found = []
+        for data, keep in zip(self.data, self.counts, strict=True):
+            # Of several outputs the first has this variance, the others have it times a ratio.
+            y = data.y[keep] if keep.ndim == 1 else data.y[keep[:, 0], 0]
+            found.append(LEAST_SENSOR_SHARE * float(np.var(y) + np.mean(y) ** 2))
+        return found
+
+    @functools.cached_property
     def beliefs(self) -> tuple[Array, Array]:
         """Mean and information (inverse variance) of what is believed of each parameter."""
         known = [self.priors.get(name, (0.0, math.inf)) for name in self.plant.names]
@@ -286,7 +296,7 @@ def _evaluate_at_scale(
     believed, information = problem.beliefs
     value = -0.5 * float(information @ (theta - believed) ** 2)
     sensors = []
-    for k, (data, out, keep) in enumerate(zip(problem.data, outs, problem.counts, strict=True)):
+    for k, (out, keep) in enumerate(zip(outs, problem.counts, strict=True)):
         e, s = out.innovations[keep], out.variance[keep]
         if problem.periods:
             e, s = _subtract_repeat_mean(out, keep, problem.periods[k])
@@ -300,10 +310,7 @@ def _evaluate_at_scale(
             r = float(problem.known.sensor[k])
         else:
             usual = mean if tails is None else tails.find_scale(squares, tails.scale)
-            # Of several outputs the first has this variance, the others have it times a ratio.
-            y = data.y[keep] if keep.ndim == 1 else data.y[keep[:, 0], 0]
-            least = LEAST_SENSOR_SHARE * float(np.var(y) + np.mean(y) ** 2)
-            r = max(usual, least, 1e-300)
+            r = max(usual, problem.least_sensors[k], 1e-300)
         if tails is None:
             value -= 0.5 * (len(e) * (math.log(2 * math.pi * r) + mean / r) + np.sum(np.log(s)))
         else:

@@ -309,8 +309,10 @@ class SampledPlant:
     def pad_controller_states(self, values: Array) -> Array:
         """Add the states of a known analog controller, at rest, to a start."""
         extra = self.size - values.shape[0]
+        if not extra:
+            return values
         padded = np.pad(values, [(0, extra)] * values.ndim)
-        if self.law is not None and values.ndim == 1 and extra:
+        if self.law is not None and values.ndim == 1:
             padded[-extra:] = self.law.rest
         return padded
 
