@@ -233,7 +233,8 @@ def iterate_program(
     carried[0] = inputs[0, 0]
     for k in range(len(signal)):
         inputs[0, 0], inputs[1, 0] = carried[k], signal[k]
-        run_program(program, constants, inputs, work, outputs, 1)
+        # A number written here would be a type of its own, and all of it compiled once more.
+        run_program(program, constants, inputs, work, outputs, inputs.shape[1])
         carried[k + 1] = outputs[0, 0]
     return carried
 
