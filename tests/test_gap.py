@@ -3,6 +3,7 @@
 from dataclasses import replace
 from types import SimpleNamespace
 
+import control as ct
 import numpy as np
 import pytest
 from scipy import signal
@@ -15,10 +16,14 @@ from ctrlid.diagnosis.gap import (
     Window,
     compute_widening_chance,
     halve_windows,
+    measure_spreads,
     measure_trivial_error,
+    root_mean_square,
+    simulate_window,
 )
 from ctrlid.diagnosis.wording import describe_trivial, list_gap_rows
-from ctrlid.validation.reproduction import Reproduction
+from ctrlid.validation.reproduction import CLOSED_LOOP, Reproduction
+from test_wiring import CART, DT, at_rest, luenberger
 
 NOTHING = Disturbance(0.0, 0.0, np.nan, 0.0)
 
@@ -30,6 +35,35 @@ def window(y, mask=None):
 
 def slow(rng, n, memory):
     return signal.lfilter([1.0], [1.0, -memory], rng.standard_normal(n + 500))[500:]
+
+
+def spring():
+    """Return a mass on a spring under a PD."""
+    plant = ct.nlsys(
+        lambda t, x, u, p: np.array([x[1], u[0] - 4.0 * x[0] - 2.0 * x[1]]),
+        lambda t, x, u, p: x[0], inputs=["F"], outputs=["x"], states=["x", "v"],
+    )  # fmt: skip
+    at = cid.OperatingPoint((0.0, 0.0), 0.0, 0.0)
+    return cid.Loop(plant, cid.PID(kp=10.0, kd=2.0, filter_time=0.05), dt=DT, at=at)
+
+
+def cart():
+    """Return a cart with a pole under an observer."""
+    return cid.Loop(CART, luenberger(CART), dt=DT, at=at_rest(CART))
+
+
+@pytest.mark.parametrize(("loop", "place"), [(spring(), ""), (cart(), "x")])
+def test_what_depends_on_time_acts_from_the_start_of_the_experiment(loop, place):
+    """A late window starts where the sensor has drifted to, and a line has its phase."""
+    drift = cid.effects.SensorDrift(rate=0.005, at=place)
+    line = cid.effects.SensorHum(amplitude=0.002, frequency=1.3, phase=0.4, at=place)
+    real = loop.with_effect(drift).with_effect(line)
+    r = None if place else cid.random_binary(800, amplitude=0.1, hold=40, seed=4)
+    record = cid.simulate(real, r, d=0.01 * np.sin(np.arange(800) / 30))
+    late = record[600:]
+    windows = [Window(late, 600 * DT, np.ones(np.shape(late.y), bool), measure_spreads(late))]
+    y = simulate_window(real, windows[0], CLOSED_LOOP)
+    assert root_mean_square(windows, [y]) < 1e-6
 
 
 @pytest.mark.parametrize("memory", [0.0, 0.9, 0.98])

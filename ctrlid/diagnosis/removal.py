@@ -12,6 +12,7 @@ from ..estimation.likelihood.kalman_filter import Noise
 from ..estimation.likelihood.maximization import (
     begin_fit,
     choose_noise,
+    choose_sensor_noise,
     maximize,
     polish_fit,
     refit_noise_size,
@@ -192,6 +193,8 @@ def refit_noise(model: Model) -> Model:
             return Model(model.loop, plain)
         # The coloured noise that stood in for the effect may be far from the one that remains.
         anew = choose_noise(plain)
+        if not fit.noise.sensor_is_white:
+            anew = max(anew, choose_sensor_noise(plain), key=compute_noise_criterion)
         return Model(model.loop, max(fit, anew, key=compute_noise_criterion))
     return Model(model.loop, choose_noise(fit))
 

@@ -26,8 +26,9 @@ LOST = 1e3
 
 
 def find_initial_state(
-    simulator: Simulator, part: Record, r: Any, d: Array, guess: Array, fitted: int
-) -> Array:
+    simulator: Simulator, part: Record, r: Any, d: Array, guess: Array, fitted: int,
+    start_time: float = 0.0,
+) -> Array:  # fmt: skip
     """Return the initial state whose first entries fit the first samples best.
 
     Parameters
@@ -44,6 +45,8 @@ def find_initial_state(
         A state of plant, controller and input.
     fitted : int
         How many of its first entries are sought; the others are kept.
+    start_time : float, optional
+        Time of the first sample since the start of the experiment, which a drift counts from [s].
 
     Returns
     -------
@@ -56,10 +59,10 @@ def find_initial_state(
         scale = np.maximum(0.01 * np.abs(guess[:fitted]), spread)
         for j in simulator.loop.equations().velocities:
             scale[j] = max(float(np.std(np.diff(part.y))) / part.dt, 1e-300)
-        seen = _set_measured_state(simulator, part, guess)
+        seen = _set_measured_state(simulator, part, guess, start_time)
         low, high = _bound_initial_state(simulator, part, seen)
     else:
-        several = _SeveralOutputs(simulator, part)
+        several = _SeveralOutputs(simulator, part, start_time)
         spread, scale = several.spread, several.choose_scale(guess, fitted)
         seen = several.set_measured_state(guess)
         low, high = several.bound_state(seen)
@@ -68,7 +71,8 @@ def find_initial_state(
 
     def compute_misfit(z: Array, count: int) -> Array | None:
         try:
-            y = simulator.run(z, None if r is None else r[..., :count], d[..., :count])[0]
+            given = None if r is None else r[..., :count]
+            y = simulator.run(z, given, d[..., :count], start_time=start_time)[0]
         except ModelCannotRun:
             return None
         return np.ravel(np.asarray((y - part.y[..., :count]) / spread, dtype=float))
@@ -111,7 +115,9 @@ def find_initial_state(
     return search_nearby(guess, count)
 
 
-def _set_measured_state(simulator: Simulator, part: Record, guess: Array) -> Array:
+def _set_measured_state(
+    simulator: Simulator, part: Record, guess: Array, start_time: float
+) -> Array:
     """Return a guess moved to where the first samples see the plant, and how fast."""
     loop, start = simulator.loop, guess.copy()
     e = loop.equations()
@@ -119,7 +125,7 @@ def _set_measured_state(simulator: Simulator, part: Record, guess: Array) -> Arr
     few = min(len(part), FEW)
     slope, first = np.polyfit(np.arange(few) * part.dt, part.y[:few], 1)
     c = _differentiate_output(simulator)
-    off = first - float(e.evaluate(guess[:n], loop.point.input, 0.0)[1][0])
+    off = first - float(e.evaluate(guess[:n], loop.point.input, start_time)[1][0])
     seen = np.array([0.0 if j in e.velocities else c[j] for j in range(n)])
     if seen.any():
         start[:n] += seen * off / (seen @ seen)
@@ -150,8 +156,8 @@ def _bound_initial_state(simulator: Simulator, part: Record, seen: Array) -> tup
 class _SeveralOutputs:
     """What the first samples of a record of several outputs say of its initial state."""
 
-    def __init__(self, simulator: Simulator, part: Record) -> None:
-        self.simulator, self.part = simulator, part
+    def __init__(self, simulator: Simulator, part: Record, start_time: float) -> None:
+        self.simulator, self.part, self.start_time = simulator, part, start_time
         loop = simulator.loop
         e = self.e = loop.equations()
         self.y = np.reshape(part.y, (len(e.outputs), -1))
@@ -189,7 +195,7 @@ class _SeveralOutputs:
         few = min(self.y.shape[1], FEW)
         slopes, first = np.polyfit(np.arange(few) * self.part.dt, self.y[:, :few].T, 1)
         at = self.simulator.loop.point
-        off = first - self.e.evaluate(guess[:n], np.array(at.inputs), 0.0)[1]
+        off = first - self.e.evaluate(guess[:n], np.array(at.inputs), self.start_time)[1]
         still = [k for k in range(n) if k not in self.e.velocities]
         start[still] += np.linalg.lstsq(self.c[:, still], off, rcond=1e-9)[0]
         moving = [i for i, _ in self.motions]
