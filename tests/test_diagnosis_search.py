@@ -19,6 +19,7 @@ from ctrlid.diagnosis.experiment import _can_survive, find_experiment
 from ctrlid.diagnosis.findings import Disturbance, Finding, Gap
 from ctrlid.diagnosis.fitted_model import (
     Model,
+    carry_over_fit,
     compute_criterion,
     compute_log_terms,
     drop_arrays,
@@ -568,6 +569,23 @@ def test_one_asymmetric_friction_is_not_called_two_effects():
     assert one.fitted.effects[0].fc == pytest.approx(0.2, rel=0.02)
     assert one.fitted.effects[0].difference == pytest.approx(0.15, rel=0.05)
     assert fuse_effects(model, 0, ()) is model
+
+
+def test_friction_beside_asymmetric_friction_is_one():
+    loop = levitation()
+    real = loop.with_effect(E.AsymmetricCoulombFriction(0.2, 0.15))
+    record = record_of(real, E.ConstantForce(0.0), 4e-4, 1e-6, 9411)
+    pair = loop.with_effect(E.CoulombFriction(0.1)).with_effect(
+        E.AsymmetricCoulombFriction(0.1, 0.15)
+    )
+    names = ("K", "AsymmetricCoulombFriction.difference")
+    two = fit_base_model(pair, [record], names)
+    sizes = ("CoulombFriction.fc", "AsymmetricCoulombFriction.fc")
+    model = Model(two.loop, carry_over_fit(two, two.fitted, (*two.names, *sizes)))
+    one = fuse_effects(model, 0, ())
+    assert [type(e).__name__ for e in one.loop.effects] == ["AsymmetricCoulombFriction"]
+    assert one.fitted.effects[0].fc == pytest.approx(0.2, rel=0.02)
+    assert one.fit.value > model.fit.value - 1
 
 
 def test_two_effects_that_are_two_stay_two():

@@ -14,6 +14,7 @@ from ctrlid.diagnosis.findings import Disturbance, Gap
 from ctrlid.diagnosis.fresh_data import FreshData
 from ctrlid.diagnosis.gap import (
     Window,
+    compute_excess_chance,
     compute_widening_chance,
     halve_windows,
     measure_spreads,
@@ -76,6 +77,30 @@ def test_a_difference_by_chance_is_rarely_beyond_chance(memory):
         chance = compute_widening_chance([window(y)], [common + one / 2], [common + other / 2])
         hits += chance < 0.01
     assert hits <= 11  # 4 are expected; more than 11 has a probability of 1e-3
+
+
+@pytest.mark.parametrize("memory", [0.0, 0.9, 0.98])
+def test_errors_of_the_size_of_noise_are_rarely_called_larger(memory):
+    """Predictions that overlap are alike, so that few of them say little of their size."""
+    rng = np.random.default_rng(13)
+    y, floor = np.zeros(400), 1 / np.sqrt(1 - memory**2)
+    hits = larger = 0
+    for _ in range(400):
+        e = slow(rng, 400, memory)
+        hits += compute_excess_chance([window(y)], [e], [floor]) < 0.01
+        larger += compute_excess_chance([window(y)], [2.5 * e], [floor]) < 0.01
+    assert hits <= 20  # 4 are expected of independent ones
+    assert larger > (250 if memory == 0.98 else 390)
+
+
+def test_errors_of_several_outputs_count_in_units_of_their_floors():
+    rng = np.random.default_rng(14)
+    record = cid.Record(u=np.zeros(300), y=np.zeros((2, 300)), dt=0.01)
+    both = Window(record, 0.0, np.ones((2, 300), bool), (1.0, 1.0))
+    e = np.array([[1.0], [50.0]]) * rng.standard_normal((2, 300))
+    assert compute_excess_chance([both], [e], (1.0, 50.0)) > 0.01
+    assert compute_excess_chance([both], [e], (1.0, 35.0)) < 1e-6
+    assert np.isnan(compute_excess_chance([both], [e], (1.0, np.nan)))
 
 
 def test_a_wider_gap_is_seen_although_what_both_models_miss_is_large():

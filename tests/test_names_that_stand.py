@@ -1,6 +1,7 @@
 """Names that stand, and what only describes part of a record."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import control as ct
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 import ctrlid as cid
 import ctrlid.effects as E
 from ctrlid.diagnosis.constancy import _estimate_alone
-from ctrlid.diagnosis.grounds import Case, is_phase_locked, narrows_no_gap
+from ctrlid.diagnosis.grounds import Case, is_one_of_several, is_phase_locked, narrows_no_gap
 from ctrlid.reporting.tables import make_blocks
 
 DT, N = 0.01, 2000
@@ -157,6 +158,24 @@ def test_a_wrong_model_names_what_fresh_data_like(half):
     # A small effect that leaves noise alone needs no wider gap to be seen.
     assert not narrows(40e-6, 40e-6, explained=True)
     assert narrows(np.inf, np.inf, explained=False)
+
+
+def test_several_of_a_kind_in_a_wrong_model_only_describe_it():
+    ripple = E.PositionRipple(amplitude=0.1, period=0.01, phase=0.0)
+    loop = mass()
+    for effect in (ripple, replace(ripple, period=0.02), E.LinearStiffness(k1=3.0)):
+        loop = loop.with_effect(effect)
+
+    def judge(position, explained, given=None):
+        case = Case(given or mass(), SimpleNamespace(fitted=loop), (), {}, None, explained)
+        return is_one_of_several(case, SimpleNamespace(position=position))
+
+    assert "of the same kind" in judge(0, explained=False)
+    assert "of the same kind" in judge(1, explained=False)
+    assert not judge(2, explained=False)
+    assert not judge(0, explained=True)
+    # What the model had from the beginning is known.
+    assert not judge(1, explained=False, given=mass().with_effect(ripple))
 
 
 def test_the_steps_of_a_converter_are_a_remark():

@@ -69,7 +69,9 @@ def assemble_answer(
         final = final if r.effect in final.effects else final.with_effect(r.effect)
     units = _find_units(loop)
     where = locate_errors(found.before, found.after, units)
-    left = gap_is_left(gap, disturbance, found.final.fit)
+    left = gap_is_left(
+        gap, disturbance, found.final.fit, summary.excess_chance, summary.worse_chance
+    )
     total = found.final.fit.value - found.base.fit.value
     effects, gains = [f.trial.effect for f in found.found], [f.trial.gain for f in found.found]
     objection = find_doubt(effects, gains, total if math.isfinite(total) else 0.0)

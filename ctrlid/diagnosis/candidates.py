@@ -166,5 +166,7 @@ def list_missing_candidates(
 
 
 def _has_effect(model: Model, effect: AbstractEffect) -> bool:
-    """Whether the model has this effect already, and a plant can have it only once."""
-    return not effect.repeatable and any(is_same_kind(e, effect) for e in model.loop.effects)
+    """Whether the model has this effect already, alone or in a larger one, and only once."""
+    if effect.repeatable:
+        return False
+    return any(is_same_kind(e, effect) or contains(e, effect) for e in model.loop.effects)

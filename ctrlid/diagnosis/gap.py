@@ -224,6 +224,46 @@ def compute_widening_chance(
     return float(stats.t.sf(float(np.mean(means)) / scatter, count - 1))
 
 
+def compute_excess_chance(
+    windows: Sequence[Window], results: Sequence[Array], floor: Sequence[float]
+) -> float:
+    r"""Return the probability that noise alone makes errors so large.
+
+    .. math:: \sum_i N_i \, \frac{\overline{e_i^2}}{f_i^2} \sim \chi^2_{\sum_i N_i}
+
+    for the errors e of each output in each window, the floor f of the output, and as many
+    independent errors N as they are worth: errors of predictions that overlap are alike.
+
+    Parameters
+    ----------
+    windows : sequence of Window
+        The data.
+    results : sequence of ndarray
+        What a model makes of each window [output unit].
+    floor : sequence of float
+        The RMS error that noise leaves in each output [its unit].
+
+    Returns
+    -------
+    float
+        The probability; NaN where no floor is known.
+    """
+    squares = freedom = 0.0
+    for window, y in zip(windows, results, strict=True):
+        outputs = zip(np.atleast_2d(window.record.y), np.atleast_2d(y), np.atleast_2d(window.mask),
+                      floor, strict=True)  # fmt: skip
+        for measured, made, mask, size in outputs:
+            use = mask & np.isfinite(made)
+            if not use.any():
+                continue
+            e = measured[use] - made[use]
+            independent = len(e) / autocorrelation_time(e, power=2)
+            squares += independent * float(np.mean(e**2)) / max(size, THRESHOLD.tiny) ** 2
+            freedom += independent
+    known = freedom and all(map(math.isfinite, floor))
+    return float(stats.chi2.sf(squares, freedom)) if known else math.nan
+
+
 def simulate_window(loop: Loop, window: Window, how: Reproduction) -> Array:
     """Return what a loop makes of a window: a simulation, or a prediction some samples ahead.
 

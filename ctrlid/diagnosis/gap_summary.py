@@ -25,11 +25,18 @@ from .verdict import gap_is_wider
 
 @dataclass(frozen=True, eq=False)
 class GapSummary:
-    """The gap, what each effect closes of it by its position in the loop, and the random force."""
+    """The gap, what each effect closes of it by its position in the loop, and the random force.
+
+    Chance alone leaves so wide a prediction gap above the floor with the probability
+    `excess_chance`, NaN for a simulation, and so much above the gap of the model as given with
+    `worse_chance`.
+    """
 
     gap: Gap
     shares: Mapping[int, float]
     disturbance: Disturbance
+    excess_chance: float = math.nan
+    worse_chance: float = math.nan
 
 
 def summarize_gap(loop: Loop, found: Search, fresh: FreshData) -> GapSummary:
@@ -58,7 +65,12 @@ def summarize_gap(loop: Loop, found: Search, fresh: FreshData) -> GapSummary:
         unit = loop.known_units.get(loop.equations().outputs[0], "")
         gap = _make_gap(shared, rows, floor, unit, windows[0])
         gap = replace(gap, force_unit=fill_unit("{x}/s^2", {"x": loop.position_unit}))
-    return GapSummary(gap, shares, _measure_disturbance(fit, loop, floor))
+    worse = gaps.compute_widening_chance(shared.windows, results[0], results[2])
+    excess = math.nan
+    if how.horizon:
+        floors = [part.both for part in floor.outputs or (floor,)]
+        excess = gaps.compute_excess_chance(shared.windows, results[2], floors)
+    return GapSummary(gap, shares, _measure_disturbance(fit, loop, floor), excess, worse)
 
 
 def _summarize_several(

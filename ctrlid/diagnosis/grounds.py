@@ -11,6 +11,7 @@ from ..data.record import Record
 from ..effects import AbstractEffect
 from ..effects.context import find_motion
 from ..loop.loop import Loop
+from .candidates import is_same_kind
 from .constancy import compare_stretches
 from .findings import Gap
 from .fitted_model import Model
@@ -187,6 +188,22 @@ def narrows_no_gap(case: Case, f: Weighed) -> str:
     return "something else is missing, and on fresh data the effects do not narrow the gap"
 
 
+def is_one_of_several(case: Case, f: Weighed) -> str:
+    """Say if a model that is still wrong has further effects of the same kind.
+
+    Three ripples are how a search draws the curve of a cause that it does not know, as a sum of
+    sines draws any curve.
+    """
+    if case.explained:
+        return ""
+    effect = case.read_effect(f)[1]
+    given = len(case.given.effects)
+    added = [e for k, e in enumerate(case.final.fitted.effects) if k >= given and k != f.position]
+    if not any(is_same_kind(e, effect) for e in added):
+        return ""
+    return "something else is missing, and other effects of the same kind are needed beside it"
+
+
 # A name stands if none of these has anything to say.
 GROUNDS: tuple[Callable[[Case, Weighed], str], ...] = (
     is_at_a_limit,
@@ -194,4 +211,5 @@ GROUNDS: tuple[Callable[[Case, Weighed], str], ...] = (
     differs_between_stretches,
     follows_the_reference,
     narrows_no_gap,
+    is_one_of_several,
 )

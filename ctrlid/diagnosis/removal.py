@@ -54,7 +54,7 @@ def weigh_effects(
     best = steps[0].best
     alone = len(model.loop.effects) == given + 1 and len(steps) <= 2
     alone = alone and best is not None and list(best.model.names) == list(model.names)
-    if alone and best is not None and _has_same_noise(best.model, model):
+    if alone and best is not None and has_same_noise(best.model, model):
         return model, (Weighed(best, (), steps[0].base, given),)
     one = fuse_effects(model, given, steps)
     if one is not model:
@@ -69,7 +69,8 @@ def weigh_effects(
     return model, tuple(found)
 
 
-def _has_same_noise(one: Model, other: Model) -> bool:
+def has_same_noise(one: Model, other: Model) -> bool:
+    """Whether the noise of two models is of one kind and order."""
     a, b = one.fit.noise, other.fit.noise
     return _list_kinds(a) == _list_kinds(b)
 
@@ -83,6 +84,9 @@ def fuse_effects(model: Model, given: int, steps: Sequence[Round]) -> Model:
 
     Dry friction found first and a constant force after it may be one asymmetric friction.
     """
+    one = _merge_contained_effects(model, given)
+    if one is not model:
+        return one
     effects = model.fitted.effects
     richer = {t.key: t.effect for s in steps for t in s.trials}
     for k, other in itertools.permutations(range(given, len(effects)), 2):
@@ -101,6 +105,25 @@ def fuse_effects(model: Model, given: int, steps: Sequence[Round]) -> Model:
             trial = refit_candidate(smaller, trial, model)
             if trial.net_gain > THRESHOLD.gate and trial.model.fit.value + saved > model.fit.value:
                 return trial.model
+    return model
+
+
+def _merge_contained_effects(model: Model, given: int) -> Model:
+    """Return a model in which an effect and one that contains it are one, if that explains as much.
+
+    Asymmetric friction beside dry friction has one size too many.
+    """
+    effects, labels = model.fitted.effects, list(model.fitted.labelled)
+    for k, other in itertools.permutations(range(given, len(effects)), 2):
+        if not contains(effects[other], effects[k]):
+            continue
+        sizes, shared = effects[other].values(), effects[k].values()
+        sums = {f"{labels[other]}.{name}": sizes[name] + shared[name] for name in shared}
+        loop, names = take_out_effect(model.fitted.with_parameters(sums), k, model.names)
+        fit = maximize(carry_over_fit(model, loop, names), rounds=THRESHOLD.removal_rounds)
+        saved = bayesian_penalty(len(model.names) - len(names), fit.size)
+        if fit.value + saved > model.fit.value:
+            return Model(loop, fit)
     return model
 
 

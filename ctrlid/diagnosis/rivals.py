@@ -10,10 +10,17 @@ from .._base.arrays import Array
 from ..effects.base import name_at_place
 from ..estimation.likelihood.maximization import maximize
 from .candidates import Trial, contains, is_same_kind
-from .fitted_model import Model, compute_log_terms
+from .fitted_model import Model, compute_criterion, compute_log_terms
 from .noise_tests import run_noise_tests
 from .refitting import refit_candidate
-from .removal import Weighed, move_last_effect, refit_noise, refit_without_effect, weigh_effects
+from .removal import (
+    Weighed,
+    has_same_noise,
+    move_last_effect,
+    refit_noise,
+    refit_without_effect,
+    weigh_effects,
+)
 from .screening import screen_at
 from .selection import Round, Work, prefer_plainer
 from .thresholds import THRESHOLD
@@ -147,9 +154,12 @@ def compare_effects(
             return compare_effects(fewer, left, given, steps, work)
         there = {name_at_place(e) for e in smaller.loop.effects}
         rest = [t for t in _find_close(mine, steps) if t.key not in there]
-        again = work(
-            lambda t, smaller=smaller: refit_candidate(smaller, screen_at(smaller, t.fitted)), rest
-        )
+        # Noise that stands for the effect in the smaller model would be paid for by its rivals.
+        bare = smaller
+        if rest and not has_same_noise(smaller, now):
+            bare = refit_without_effect(now, f.position)[0]
+        again = work(lambda t, bare=bare: refit_candidate(bare, screen_at(bare, t.fitted)), rest)
+        again = [_count_from(t, bare, smaller) for t in again]
         again = [t for t in again if _find_on_bounds(t.model) <= _find_on_bounds(mine.model)]
         best = max([mine, *again], key=lambda t: t.net_gain)
         if best.net_gain <= mine.net_gain + THRESHOLD.taken_by_better:
@@ -162,6 +172,15 @@ def compare_effects(
         done.append(Weighed(best, close, smaller, f.position))
     done.sort(key=lambda f: -f.trial.gain)
     return now, tuple(done)
+
+
+def _count_from(trial: Trial, base: Model, other: Model) -> Trial:
+    """Return a trial on top of a base with its gain and penalty beyond another base."""
+    if other is base:
+        return trial
+    gain = base.fit.value - other.fit.value
+    net = compute_criterion(base) - compute_criterion(other)
+    return replace(trial, gain=trial.gain + gain, penalty=trial.penalty + gain - net)
 
 
 def _find_on_bounds(model: Model) -> set[str]:

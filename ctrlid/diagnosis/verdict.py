@@ -46,15 +46,19 @@ def choose_verdict(complete: bool, named: bool) -> Verdict:
     return "partly explained" if named else "unknown"
 
 
-def gap_is_left(gap: Gap, disturbance: Disturbance, fit: Fit) -> bool:
+def gap_is_left(
+    gap: Gap, disturbance: Disturbance, fit: Fit, excess_chance: float, worse_chance: float
+) -> bool:
     """Whether the gap with the effects shows that something is left.
 
     A random force that may do anything explains everything, and nothing: beside one, a gap wider
-    than that of the model as given is no explanation.
+    than that of the model as given is no explanation. Neither counts where it may be chance: few
+    predictions that overlap say as much as one or two.
     """
     blamed = disturbance.large or math.isnan(disturbance.share)
     worse = gap.after > THRESHOLD.worse_than_given * gap.given
-    return gap_stands_out(gap, fit) or (blamed and worse)
+    worse = worse and worse_chance < THRESHOLD.beyond_chance
+    return gap_stands_out(gap, fit, excess_chance) or (blamed and worse)
 
 
 def find_doubt(
@@ -100,16 +104,18 @@ def _are_look_alikes(one: AbstractEffect, other: AbstractEffect) -> bool:
     return names[1] in type(one).look_alikes or names[0] in type(other).look_alikes
 
 
-def gap_stands_out(gap: Gap, fit: Fit) -> bool:
+def gap_stands_out(gap: Gap, fit: Fit, chance: float = math.nan) -> bool:
     """Whether the gap with the effects is wider than noise, as a fit knows it, accounts for.
 
     A loop that hunts leaves a narrow gap in one run and a wide one in another; the record is but
-    one more run, so the widest of several counts.
+    one more run, so the widest of several counts. Of a prediction the `chance` of so wide a gap is
+    known.
     """
     noise = max(gap.floor, gap.widest)
     return (
         math.isfinite(noise)
         and gap.after > THRESHOLD.excess * (2 if fit.noise.drift else 1) * noise
+        and not chance > THRESHOLD.beyond_chance
     )
 
 
