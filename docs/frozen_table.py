@@ -53,13 +53,33 @@ def write_tables(path=FILE):
     return out + [f"- {miss}" for miss in study.find_misses(lines)]
 
 
+def write_summary(path=FILE):
+    """Return what has a target, what was measured and the target, as a list of sentences."""
+    if not path.exists():
+        return ["The file of this version's run is not there yet; until then there are no figures."]
+    study = load_study()
+    out, first = [], ""
+    for what, target, found in study.score(study.read(path)):
+        own = what.strip()
+        if own.startswith("the same: "):
+            own = f"{first}: {own.removeprefix('the same: ')}"
+        else:
+            first = own.rpartition(":")[0] or own
+        if target and "no draw" not in found:
+            out.append(f"- {own[0].upper()}{own[1:]}: {found}; the target is {target}.")
+    return out
+
+
 class FrozenStudy(Directive):
-    """Tables and misses of the frozen study, from its file."""
+    """Tables and misses of the frozen study, or with ``summary`` the main figures alone."""
+
+    optional_arguments = 1
 
     def run(self):
         """Return the tables."""
         place = nodes.Element()
-        text = StringList(write_tables(), source="frozen_study")
+        write = write_summary if self.arguments == ["summary"] else write_tables
+        text = StringList(write(), source="frozen_study")
         self.state.nested_parse(text, self.content_offset, place)
         return place.children
 
