@@ -4,6 +4,7 @@ Groups: one pass; sensitivities; the extended filter; maps over one period; long
 """
 
 import math
+from collections import Counter
 from dataclasses import replace
 from functools import partial
 
@@ -14,9 +15,10 @@ from scipy import integrate, linalg, signal
 
 import ctrlid as cid
 from ctrlid import effects as E
+from ctrlid.estimation.likelihood import kalman_recursion
 from ctrlid.estimation.likelihood.filter_data import find_rest_state, make_filter_data
 from ctrlid.estimation.likelihood.kalman_filter import Noise, converge_trajectory, guess_trajectory
-from ctrlid.estimation.likelihood.kalman_recursion import filter_pass
+from ctrlid.estimation.likelihood.kalman_recursion import choose_sizes, filter_pass
 from ctrlid.estimation.likelihood.likelihood import make_problem
 from ctrlid.estimation.likelihood.maximization import begin_fit
 from ctrlid.estimation.likelihood.sampled_plant import SampledPlant, Trajectory
@@ -44,7 +46,7 @@ def system(rng, size, n, m, p, varying):
 
 
 def run(s, valid=None, restart=None, input_variance=None, start=None, spread=None, sensor=0.3,
-        force=None, memory=0.0, drift=0.0):  # fmt: skip
+        force=None, memory=0.0, drift=0.0, sizes=None):  # fmt: skip
     size, n = s["step"].shape
     m = s["b"].shape[2]
     valid = np.ones(size, dtype=bool) if valid is None else valid
@@ -54,8 +56,24 @@ def run(s, valid=None, restart=None, input_variance=None, start=None, spread=Non
         *s.values(), valid, restart, np.zeros(size) if input_variance is None else input_variance,
         np.zeros(n) if start is None else start, 2.0 * np.eye(n) if spread is None else spread,
         sensor, np.zeros((1, 4)), np.full(m, 0.2) if force is None else force, memory, drift,
-        (0,) * n, (0,) * (n + bool(drift)),
+        *(sizes or ((0,) * n, (0,) * (n + bool(drift)))),
     )  # fmt: skip
+
+
+@pytest.mark.parametrize("drift", [0.0, 0.4])
+def test_a_filter_of_any_size_gives_the_bits_of_one_compiled_for_it(drift, monkeypatch):
+    monkeypatch.setattr(kalman_recursion, "_filtered", Counter())
+    monkeypatch.setattr(kalman_recursion, "OFTEN", 1000)
+    s = system(np.random.default_rng(5), 400, 3, 2, 2, varying=True)
+    widths = 3 + bool(drift)
+    results = []
+    for tuples in (False, False, True):
+        sizes = choose_sizes(3, widths, 400)
+        assert [isinstance(v, tuple) for v in sizes] == [tuples, tuples]
+        assert [len(v) for v in sizes] == [3, widths]
+        results.append(run(s, memory=0.9, drift=drift, sizes=sizes))
+    for one, other in zip(results[0], results[2], strict=True):
+        assert np.array_equal(one, other, equal_nan=True)
 
 
 def textbook(s, valid, restart, input_variance, start, spread, sensor, force, memory, drift):

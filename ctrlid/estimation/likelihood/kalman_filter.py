@@ -19,7 +19,7 @@ from ..._base.interruption import check_budget
 from ..._base.statistics import compute_lagged_products
 from ...physics.block_evaluation import BlockEvaluation
 from .filter_data import FilterData
-from .kalman_recursion import filter_pass
+from .kalman_recursion import choose_sizes, filter_pass
 from .sampled_plant import Linearized, SampledPlant, Trajectory
 from .tails import GAUSSIAN, JointTails, Tails
 
@@ -124,8 +124,8 @@ def run_filter(
         lin.c, np.ascontiguousarray(lin.hp[:, :p]), lin.trajectory.predicted,
         lin.trajectory.filtered, data.y, data.valid, data.restart, lin.input_variance,
         lin.start, lin.spread, 1.0 if white else 0.0, _list_tails(tails),
-        force, noise.memory, noise.drift, (0,) * states,
-        (0,) * (states + bool(noise.drift > 0)),
+        force, noise.memory, noise.drift,
+        *choose_sizes(states, states + bool(noise.drift > 0), len(lin.step)),
     )  # fmt: skip
     error, variance, before, after, wide, slopes, disturbance = out
     before, after, wide = before[:, :n], after[:, :n], wide[:, :n]
@@ -184,7 +184,8 @@ def _run_several(
         each.trajectory.predicted, each.trajectory.filtered, (data.y / scale).ravel(),
         data.valid.ravel(), restart.ravel(), unsure.ravel(), lin.start, lin.spread, 1.0,
         _list_tails(tails), np.asarray(noise.force, dtype=float), memory,
-        noise.coloured * (1 - memory**2), (0,) * states, (0,) * (states + bool(noise.drift > 0)),
+        noise.coloured * (1 - memory**2),
+        *choose_sizes(states, states + bool(noise.drift > 0), size * q),
     )  # fmt: skip
     error, variance = error.reshape(size, q) * scale, variance.reshape(size, q) * scale**2
     # The caller reports a filter that lost the record, so that no warning is needed here.
