@@ -121,7 +121,7 @@ class Case:
     redrawn: int
 
 
-def array_of(plant: str, p: dict[str, float]) -> np.ndarray:
+def make_array(plant: str, p: dict[str, float]) -> np.ndarray:
     """Return parameters in the order of the simulator."""
     return np.array([p[name] for name in op.PARAMETERS[op.PLANTS.index(plant)]], float)
 
@@ -204,7 +204,7 @@ def draw_rig(rng: np.random.Generator, plant: str) -> Rig | None:
     if plant != "tanks":
         true["b"] = 0.0
         rest = find_rest(plant, true, at)[0]
-        a, b = linearize(plant, array_of(plant, true), find_rest(plant, true, at)[1], rest)
+        a, b = linearize(plant, make_array(plant, true), find_rest(plant, true, at)[1], rest)
         # A bias of some hundredths of what moves the plant at its bandwidth.
         true["b"] = float(rng.choice([-1, 1]) * rng.uniform(0.005, 0.05)) * abs(
             rest or pole**2 * 0.1 / b[1, 0]
@@ -212,7 +212,7 @@ def draw_rig(rng: np.random.Generator, plant: str) -> Rig | None:
     else:
         true["b"] = 0.0
     w, x0 = find_rest(plant, true, at)
-    a, b = linearize(plant, array_of(plant, true), x0, w)
+    a, b = linearize(plant, make_array(plant, true), x0, w)
     c = np.eye(2)[[1 if plant == "tanks" else 0]]
     if plant == "tanks":
         band = pole * rng.uniform(1.0, 2.0)
@@ -405,7 +405,7 @@ def _fill_rig(
     moves = draw_moves(rng, rig, n)
     noise, periods, step, colour, weights, ratios = draw_colour(rng, kind, n, rig.dt)
     pushes = rig.push * rng.standard_normal(n)
-    p = array_of(rig.plant, rig.true)
+    p = make_array(rig.plant, rig.true)
     reach = {"ball": 0.4 * rig.at[2], "pendulum": 0.7, "cart": 0.7, "tanks": 0.9 * rig.at[2]}.get(
         rig.plant, 1e3 * rig.swing
     )
@@ -474,7 +474,9 @@ def _fill_rig(
             # Each beside all the others, on the record as it is.
             final = replace(truth, e=e, u=u, y=y)
             worth = [
-                measure_worth(final, _without(e, values), _indices(e, values, indices))[0]
+                measure_worth(final, _switch_off(e, values), _list_other_indices(values, indices))[
+                    0
+                ]
                 for values in sizes
             ]
     r = moves + rig.at[2] if rig.closed else moves + rig.at[1]
@@ -482,12 +484,13 @@ def _fill_rig(
                 attempt)  # fmt: skip
 
 
-def _indices(e: np.ndarray, values: dict[str, float], indices: list[int]) -> tuple[int, ...]:
+def _list_other_indices(values: dict[str, float], indices: list[int]) -> tuple[int, ...]:
+    """Return the indices of the sizes of all effects but the one that has these values."""
     own = {op.I[key] for key in values}
     return tuple(i for i in indices if i not in own)
 
 
-def _without(e: np.ndarray, values: dict[str, float]) -> np.ndarray:
+def _switch_off(e: np.ndarray, values: dict[str, float]) -> np.ndarray:
     """Return the effects with one of them switched off."""
     out, off = e.copy(), op.neutral()
     for key in values:
@@ -495,7 +498,8 @@ def _without(e: np.ndarray, values: dict[str, float]) -> np.ndarray:
     return out
 
 
-def _with(e: np.ndarray, values: dict[str, float]) -> np.ndarray:
+def _insert_values(e: np.ndarray, values: dict[str, float]) -> np.ndarray:
+    """Return the effects with the values of one more."""
     out = e.copy()
     for key, value in values.items():
         out[op.I[key]] = value
@@ -509,7 +513,7 @@ def _find_size(
     """Return the size of an effect that is worth what was drawn, nearly, and its record."""
 
     def weigh(size: float, start: Any) -> tuple | None:
-        full = _with(e, {**fixed, **sized(size)})
+        full = _insert_values(e, {**fixed, **sized(size)})
         u, y, ok = run(full)
         if not ok or not np.isfinite(y).all():
             return None

@@ -1,10 +1,11 @@
 """Plants, effects, sensors and a filter of their own: a simulator that knows nothing of ctrlid.
 
 Everything is in two compiled loops. `simulate` integrates a plant between the samples of a loop by
-Runge-Kutta of fourth order; dry friction keeps its sign within a step, and what would turn back
-stops. `filter_record` is the unscented Kalman filter of the textbooks [1]_ over the same equations,
-with sensor noise that may be white, autoregressive, averaged, walking or a mixture of normal laws.
-An effect is a number in the array that `neutral` returns; all are switched off there.
+Runge-Kutta of fourth order. Where dry friction changes its sign, a step is split at the speed zero;
+what friction can hold stays at rest. `filter_record` is the unscented Kalman filter of the
+textbooks [1]_ over the same equations, with sensor noise that may be white, autoregressive,
+averaged, walking or a mixture of normal laws. An effect is a number in the array that `neutral`
+returns; all are switched off there.
 
 .. [1] Julier and Uhlmann, Proceedings of the IEEE 92 (2004) 401-422; for the mixtures Sorenson and
    Alspach, Automatica 7 (1971) 465-479, collapsed to one normal law at every sample.

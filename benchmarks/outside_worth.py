@@ -70,7 +70,7 @@ class Truth:
         return op.filter_record(self.plant, p, e, self.at, self.x0, self.spread, self.u, self.y,
                                 sigma, push, colour, self.weights, self.ratios)  # fmt: skip
 
-    def belief(self, theta: np.ndarray) -> float:
+    def compute_belief(self, theta: np.ndarray) -> float:
         """Return what the free parameters cost by what is believed of them."""
         total = 0.0
         for value, (name, (given, deviation)) in zip(theta, self.free.items(), strict=False):
@@ -117,7 +117,7 @@ def measure_worth(
         if first is None or np.isfinite(best):
             continue
         best, theta = _climb(truth, own, without, sizes, first)
-    if not right.belief(np.zeros(m)):
+    if not right.compute_belief(np.zeros(m)):
         return best, theta
     # What is believed moves the model that has the effect as well.
     within, _ = _climb(right, own, right.e, sizes, np.zeros(m))
@@ -138,7 +138,7 @@ def _climb(truth, own, without, sizes, theta):
             return np.inf, other, variance
         value = op.sum_divergence(own[0], own[1], truth.weights, other, variance, truth.weights,
                                   op.NODES, op.MASSES)  # fmt: skip
-        return value + truth.belief(t), other, variance
+        return value + truth.compute_belief(t), other, variance
 
     value, mean, variance = cost(theta)
     damping = 1e-3

@@ -182,7 +182,7 @@ def compare_errors(gap: Any, blocks: int = 25) -> float:
 # --- scores
 
 
-def classes_of(names: Iterable[str], plant: str) -> list[set[str]]:
+def group_names(names: Iterable[str], plant: str) -> list[set[str]]:
     """Return names in groups that no record of the plant tells apart."""
     groups: list[set[str]] = []
     for name in names:
@@ -195,42 +195,42 @@ def classes_of(names: Iterable[str], plant: str) -> list[set[str]]:
     return groups
 
 
-def sets_of(line: dict[str, Any], stand_ins: bool = False) -> list[list[set[str]]]:
+def list_sets(line: dict[str, Any], stand_ins: bool = False) -> list[list[set[str]]]:
     """Return the findings of a line, each as groups of names; the resolution is a remark."""
     found = line.get("findings", []) + (line.get("stand_ins", []) if stand_ins else [])
     return [
-        classes_of(dict.fromkeys((*f["set"], *f["equal"])), line["plant"])
+        group_names(dict.fromkeys((*f["set"], *f["equal"])), line["plant"])
         for f in found
         if f["set"][0] != "Quantization"
     ]
 
 
-def has(groups: Sequence[set[str]], truth: str, plant: str) -> bool:
+def holds_truth(groups: Sequence[set[str]], truth: str, plant: str) -> bool:
     """Whether a truth, or what is exactly equivalent, is among the names of a finding."""
     return any(cases.is_same(truth, name, plant) for group in groups for name in group)
 
 
 def is_in_sets(line: dict[str, Any], truth: str) -> bool:
     """Whether a truth is in the set of a finding."""
-    return any(has(groups, truth, line["plant"]) for groups in sets_of(line))
+    return any(holds_truth(groups, truth, line["plant"]) for groups in list_sets(line))
 
 
 def is_first(line: dict[str, Any]) -> bool:
     """Whether the first name is the truth."""
-    sets = sets_of(line)
-    return bool(sets) and has(sets[0][:1], line["truth"][0], line["plant"])
+    sets = list_sets(line)
+    return bool(sets) and holds_truth(sets[0][:1], line["truth"][0], line["plant"])
 
 
 def is_wrong(line: dict[str, Any], groups: Sequence[set[str]]) -> bool:
     """Whether no name of a finding is true."""
-    return not any(has(groups, truth, line["plant"]) for truth in line.get("truth", ()))
+    return not any(holds_truth(groups, truth, line["plant"]) for truth in line.get("truth", ()))
 
 
 def is_exact(line: dict[str, Any]) -> bool:
     """Whether each of several truths is in a finding of its own, and there is no other finding."""
-    return (len(sets_of(line)) == len(line["truth"])
+    return (len(list_sets(line)) == len(line["truth"])
             and all(is_in_sets(line, t) for t in line["truth"])
-            and not any(is_wrong(line, s) for s in sets_of(line)))  # fmt: skip
+            and not any(is_wrong(line, s) for s in list_sets(line)))  # fmt: skip
 
 
 def find_interval(line: dict[str, Any]) -> float | None:
@@ -248,7 +248,7 @@ def find_interval(line: dict[str, Any]) -> float | None:
     return None
 
 
-def share(hits: Sequence[bool]) -> str:
+def write_share(hits: Sequence[bool]) -> str:
     """Return a share in words, with its 95 % interval."""
     low, high = wilson(sum(hits), len(hits))
     if not hits:
@@ -267,47 +267,47 @@ def score(lines: Sequence[dict[str, Any]]) -> list[tuple[str, str, str]]:
     three = [x for x in of["three"] if min(x["worth"]) > BESIDE]
     outside = [x for x in of["outside"] if x["worth"][0] > FOUND]
     fixed = [x for x in of["parameter"] if x["worth"][0] > FOUND]
-    pairs = [(x, s) for x in faint for s in sets_of(x)]
-    right = [s for x in one for s in sets_of(x) if has(s, x["truth"][0], x["plant"])]
+    pairs = [(x, s) for x in faint for s in list_sets(x)]
+    right = [s for x in one for s in list_sets(x) if holds_truth(s, x["truth"][0], x["plant"])]
     rows = [
         ("nothing hidden, under nine kinds of sensor noise: any name, stand-ins included",
-         "<= 1 %", share([bool(sets_of(x, stand_ins=True)) for x in of["clean"]])),
-        ("  the same: a finding", "", share([bool(sets_of(x)) for x in of["clean"]])),
+         "<= 1 %", write_share([bool(list_sets(x, stand_ins=True)) for x in of["clean"]])),
+        ("  the same: a finding", "", write_share([bool(list_sets(x)) for x in of["clean"]])),
         ('  the same: "nothing missing"', "",
-         share([x.get("verdict") == "nothing missing" for x in of["clean"]])),
+         write_share([x.get("verdict") == "nothing missing" for x in of["clean"]])),
         (f"one effect, worth over {FOUND:g}: the truth in the set of a finding", "98 %",
-         share([is_in_sets(x, x["truth"][0]) for x in one])),
-        ("  the same: the truth first", "93 %", share([is_first(x) for x in one])),
+         write_share([is_in_sets(x, x["truth"][0]) for x in one])),
+        ("  the same: the truth first", "93 %", write_share([is_first(x) for x in one])),
         ("  the same: answers with one name that are right", "98 %",
-         share([is_first(x) for x in one
-                if len(sets_of(x)) == 1 and len(sets_of(x)[0]) == 1])),
+         write_share([is_first(x) for x in one
+                      if len(list_sets(x)) == 1 and len(list_sets(x)[0]) == 1])),
         ("  the same: a finding in whose set nothing is true", "",
-         share([any(is_wrong(x, s) for s in sets_of(x)) for x in one])),
+         write_share([any(is_wrong(x, s) for s in list_sets(x)) for x in one])),
         ("  the same: mean size of the set that has the truth", "<= 1.5",
          f"{np.mean([len(s) for s in right]):.2f} of {len(right)}" if right else "no draw"),
         (f"one effect, worth 5 to {FOUND:g}: sets of findings without the truth", "<= 5 %",
-         share([is_wrong(x, s) for x, s in pairs])),
+         write_share([is_wrong(x, s) for x, s in pairs])),
         (f"two effects, each worth over {BESIDE:g} beside the other: both in the sets", "95 %",
-         share([all(is_in_sets(x, t) for t in x["truth"]) for x in two])),
+         write_share([all(is_in_sets(x, t) for t in x["truth"]) for x in two])),
         ("  the same: exactly right, a finding for each and no other", "80 %",
-         share([is_exact(x) for x in two])),
+         write_share([is_exact(x) for x in two])),
         (f"three effects, each worth over {BESIDE:g} beside the others: all in the sets", "",
-         share([all(is_in_sets(x, t) for t in x["truth"]) for x in three])),
+         write_share([all(is_in_sets(x, t) for t in x["truth"]) for x in three])),
         (f"outside the catalogue, worth over {FOUND:g}: a clean bill", "<= 4 %",
-         share([x.get("verdict") == "nothing missing" for x in outside])),
+         write_share([x.get("verdict") == "nothing missing" for x in outside])),
         ('  the same: "explained" by names of the catalogue', "",
-         share([x.get("verdict") == "explained" for x in outside])),
+         write_share([x.get("verdict") == "explained" for x in outside])),
         (f"a parameter called exact is 2 % off, worth over {FOUND:g}: it, or what is exactly "
-         "equivalent, in a set", "", share([is_in_sets(x, x["truth"][0]) for x in fixed])),
+         "equivalent, in a set", "", write_share([is_in_sets(x, x["truth"][0]) for x in fixed])),
         ("  the same: a finding in whose set nothing is true", "",
-         share([any(is_wrong(x, s) for s in sets_of(x)) for x in fixed])),
+         write_share([any(is_wrong(x, s) for s in list_sets(x)) for x in fixed])),
         ("findings, all classes: the gap wider beyond chance (1 %)", "never",
-         share([(x.get("wider") or 1.0) < 0.01 for x in drawn if sets_of(x)])),
+         write_share([(x.get("wider") or 1.0) < 0.01 for x in drawn if list_sets(x)])),
     ]  # fmt: skip
     off = [v for x in of["one"] + of["faint"] if (v := find_interval(x)) is not None]
     rows.append(("one effect, named first: the true size in its 95 % interval", ">= 90 %",
-                 share([abs(v) < 1.96 for v in off])))  # fmt: skip
-    rows.append(("raised, all classes", "none", share(["error" in x for x in drawn])))
+                 write_share([abs(v) < 1.96 for v in off])))  # fmt: skip
+    rows.append(("raised, all classes", "none", write_share(["error" in x for x in drawn])))
     seconds = [x["seconds"] for x in drawn if "seconds" in x]
     if seconds:
         rows.append(("CPU seconds of a diagnosis: median, mean, largest", "",
@@ -325,9 +325,9 @@ def find_power(lines: Sequence[dict[str, Any]]) -> list[tuple[str, str, str, str
     for low, high in itertools.pairwise(EDGES):
         here = [x for x in own if low <= x["worth"][0] < high]
         rows.append((
-            f"{low:g} to {high:g}", share([bool(sets_of(x)) for x in here]),
-            share([is_in_sets(x, x["truth"][0]) for x in here]),
-            share([any(is_wrong(x, s) for s in sets_of(x)) for x in here]),
+            f"{low:g} to {high:g}", write_share([bool(list_sets(x)) for x in here]),
+            write_share([is_in_sets(x, x["truth"][0]) for x in here]),
+            write_share([any(is_wrong(x, s) for s in list_sets(x)) for x in here]),
         ))  # fmt: skip
     return rows
 
@@ -339,12 +339,12 @@ def find_misses(lines: Sequence[dict[str, Any]]) -> list[str]:
         if "undrawn" in x:
             continue
         truths = [t for t, w in zip(x["truth"], x["worth"], strict=True) if w > FOUND]
-        wrong = "error" in x or any(is_wrong(x, s) for s in sets_of(x, stand_ins=not x["truth"]))
+        wrong = "error" in x or any(is_wrong(x, s) for s in list_sets(x, stand_ins=not x["truth"]))
         if x["class"] == "outside":
             wrong = "error" in x or x["verdict"] == "nothing missing"
         elif any(not is_in_sets(x, t) for t in truths):
             wrong = True
-        if (x.get("wider") or 1.0) < 0.01 and sets_of(x):
+        if (x.get("wider") or 1.0) < 0.01 and list_sets(x):
             wrong = True
         if not wrong:
             continue
@@ -370,7 +370,7 @@ def write_tables(lines: Sequence[dict[str, Any]], misses: bool = False) -> str:
 # --- files
 
 
-def key(line: dict[str, Any]) -> tuple[str, int, int]:
+def make_key(line: dict[str, Any]) -> tuple[str, int, int]:
     """Return what tells one draw from another."""
     return line["class"], line["seed"], line["n"]
 
@@ -386,7 +386,7 @@ def read(path: str | Path) -> list[dict[str, Any]]:
             with gzip.open(path, "rt") as file:
                 for text in file:
                     line = json.loads(text)
-                    found[key(line)] = line
+                    found[make_key(line)] = line
         except (EOFError, json.JSONDecodeError, gzip.BadGzipFile):
             pass
     return list(found.values())
@@ -418,7 +418,7 @@ def parse_seeds(text: str) -> range:
     return range(int(first), int(last or first) + 1)
 
 
-def same_answer(one: dict[str, Any], other: dict[str, Any]) -> bool:
+def is_same_answer(one: dict[str, Any], other: dict[str, Any]) -> bool:
     """Whether two lines have the same truth, worth and answer, whatever time they took."""
     told = ("truth", "worth", "verdict", "findings", "stand_ins", "gap", "error")
     return all(one.get(k) == other.get(k) for k in told)
@@ -451,7 +451,10 @@ def main() -> None:
     if options.command == "rerun":
         lines = read(options.file)
         for x in lines[:: max(len(lines) // options.lines, 1)][: options.lines]:
-            print(*key(x), "the same" if same_answer(x, run(*key(x))) else "ANOTHER ANSWER")
+            print(
+                *make_key(x),
+                "the same" if is_same_answer(x, run(*make_key(x))) else "ANOTHER ANSWER",
+            )
         return
     if options.full:
         first = options.first
@@ -459,7 +462,7 @@ def main() -> None:
                   for c in FULL if s < first + FULL[c]]  # fmt: skip
     else:
         wanted = [(c, s) for s in options.seeds for c in options.classes]
-    done = {key(x) for x in read(options.out)}
+    done = {make_key(x) for x in read(options.out)}
     if Path(options.out).exists():
         write(options.out, read(options.out))
     tasks = [(c, s, options.samples) for c, s in wanted if (c, s, options.samples) not in done]
@@ -467,7 +470,7 @@ def main() -> None:
     for line in work(joblib.delayed(run)(*task) for task in tasks):
         append(options.out, line)
         print(
-            *key(line)[:2],
+            *make_key(line)[:2],
             line.get("plant"),
             line.get("truth"),
             line.get("worth"),

@@ -127,10 +127,10 @@ def test_a_draw_is_the_same_again_and_its_worth_is_near_what_was_drawn():
 
 
 def test_names_that_no_record_tells_apart_count_as_one():
-    assert study.classes_of(["ActuatorLag", "SensorLag", "InputDelay"], "drive") == [
+    assert study.group_names(["ActuatorLag", "SensorLag", "InputDelay"], "drive") == [
         {"ActuatorLag", "SensorLag"}, {"InputDelay"},
     ]  # fmt: skip
-    assert len(study.classes_of(["ActuatorLag", "SensorLag"], "ball")) == 2
+    assert len(study.group_names(["ActuatorLag", "SensorLag"], "ball")) == 2
 
 
 def make_line(kind, seed, truth=(), worth=(), names=(), **more):
@@ -181,4 +181,4 @@ def test_the_table_counts_and_the_file_keeps(tmp_path):
 def test_a_diagnosis_rerun_from_its_seed_gives_the_same_answer():
     one, two = (study.run("clean", 1, 400) for _ in range(2))
     assert "error" not in one, one
-    assert study.same_answer(one, two)
+    assert study.is_same_answer(one, two)
