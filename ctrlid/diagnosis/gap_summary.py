@@ -27,9 +27,9 @@ from .verdict import gap_is_wider
 class GapSummary:
     """The gap, what each effect closes of it by its position in the loop, and the random force.
 
-    Chance alone leaves so wide a prediction gap above the floor with the probability
-    `excess_chance`, NaN for a simulation, and so much above the gap of the model as given with
-    `worse_chance`.
+    `excess_chance` is the probability that noise alone makes predictions err so much, NaN for a
+    simulation; `worse_chance` is the probability that chance alone makes the gap so much wider than
+    that of the model as given.
     """
 
     gap: Gap

@@ -54,7 +54,7 @@ def find_ground(case: Case, f: Weighed) -> str:
 
 
 def is_at_a_limit(case: Case, f: Weighed) -> str:
-    """Say which parameter went to its limit: beyond it is another model, whatever is named beside.
+    """Say which parameter went to its limit: beyond it is another model, whatever is named with it.
 
     A parameter of which the record says so little that the limit is within chance of the given
     value is at no limit.
@@ -71,12 +71,14 @@ def is_at_a_limit(case: Case, f: Weighed) -> str:
         # A size may end where its effect begins or vanishes, as in a search.
         ends = own is not None and (own.searched or own.neutral not in (None, low, high))
         moved = abs(value - given.get(name, value))
-        if ends or ("." not in name and moved > _chance(case.errors.get(name, math.nan))):
+        if ends or (
+            "." not in name and moved > _compute_reach_of_chance(case.errors.get(name, math.nan))
+        ):
             return f"{name} went to its limit, {value:.4g}"
     return ""
 
 
-def _chance(error: float) -> float:
+def _compute_reach_of_chance(error: float) -> float:
     """Return how far chance takes a value of this standard error."""
     return THRESHOLD.significant * error if math.isfinite(error) else 0.0
 

@@ -52,8 +52,21 @@ def gap_is_left(
     """Whether the gap with the effects shows that something is left.
 
     A random force that may do anything explains everything, and nothing: beside one, a gap wider
-    than that of the model as given is no explanation. Neither counts where it may be chance: few
-    predictions that overlap say as much as one or two.
+    than that of the model as given is no explanation. Neither counts where it may be chance: forty
+    predictions that overlap by forty samples say as much as one or two.
+
+    Parameters
+    ----------
+    gap : Gap
+        The gap on fresh data.
+    disturbance : Disturbance
+        The random forces of the model.
+    fit : Fit
+        The fit of the model.
+    excess_chance : float
+        Probability that noise alone makes predictions err so much; NaN for a simulation.
+    worse_chance : float
+        Probability that chance alone makes the gap so much wider than that of the model as given.
     """
     blamed = disturbance.large or math.isnan(disturbance.share)
     worse = gap.after > THRESHOLD.worse_than_given * gap.given
@@ -108,8 +121,17 @@ def gap_stands_out(gap: Gap, fit: Fit, chance: float = math.nan) -> bool:
     """Whether the gap with the effects is wider than noise, as a fit knows it, accounts for.
 
     A loop that hunts leaves a narrow gap in one run and a wide one in another; the record is but
-    one more run, so the widest of several counts. Of a prediction the `chance` of so wide a gap is
-    known.
+    one more run, so the widest of several counts.
+
+    Parameters
+    ----------
+    gap : Gap
+        The gap on fresh data.
+    fit : Fit
+        The fit of the model.
+    chance : float, optional
+        Probability that noise alone makes predictions err so much; NaN where it is not known, as
+        for a simulation.
     """
     noise = max(gap.floor, gap.widest)
     return (

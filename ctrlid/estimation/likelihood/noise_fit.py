@@ -176,7 +176,7 @@ def choose_force_ratios(problem: Problem) -> Array:
     period by as much as its own sensor noise.
     """
     plant = problem.plant
-    e, _dt = plant.e, plant.loop.dt
+    e = plant.e
     if e.siso:
         return np.full(plant.channels, choose_noise_ratio(plant))
     scales = problem.data[0].scales
