@@ -131,7 +131,7 @@ def compute_rates(plant: str, p: np.ndarray, x: np.ndarray, w: float) -> np.ndar
     k = op.PLANTS.index(plant)
     full, dx = np.zeros(op.MOST), np.zeros(op.MOST)
     full[:2] = x
-    op.accelerate(k, p, op.neutral(), np.array([1.0, 0, 0, 1.0]), full, w, 0.0, 0.0, dx)
+    op.accelerate(k, p, op.make_neutral(), np.array([1.0, 0, 0, 1.0]), full, w, 0.0, 0.0, dx)
     return dx[:2].copy()
 
 
@@ -185,7 +185,7 @@ def find_rest(plant: str, p: dict[str, float], at: float) -> tuple[float, np.nda
 
 
 def find_peak(f: np.ndarray, g: np.ndarray, c: np.ndarray, num: Any, den: Any) -> float:
-    """Peak of 1/(1 + L), infinite where the sampled loop is not stable."""
+    """Return the peak of 1/(1 + L), infinite where the sampled loop is not stable."""
     plant_den = np.poly(f)
     plant_num = np.poly(f - g @ c) - plant_den
     size = max(len(num), len(den))
@@ -417,7 +417,7 @@ def _fill_rig(
         return op.simulate(plant, p, e, rig.at, x0, rig.num, rig.den, rig.closed, moves, pushes,
                            rig.sigma * noise, periods, step * rig.sigma, reach)  # fmt: skip
 
-    u, y, ok = run(op.neutral())
+    u, y, ok = run(op.make_neutral())
     if not ok:
         return None
     rig = replace(rig, span=float(np.quantile(np.abs(u - rig.at[1]), 0.95)))
@@ -429,13 +429,13 @@ def _fill_rig(
     free = {f: (rig.given[f], rig.deviation[f] * rig.given[f] if f != "b" else np.inf)
             for f in FREE[rig.plant]}  # fmt: skip
     bias = max(abs(rig.true["b"]), 0.05 * rig.span)
-    truth = Truth(plant, p, op.neutral(), rig.at, x0, spread, rig.sigma, rig.push, colour, weights,
-                  ratios, free, bias)  # fmt: skip
+    truth = Truth(plant, p, op.make_neutral(), rig.at, x0, spread, rig.sigma, rig.push, colour,
+                  weights, ratios, free, bias)  # fmt: skip
     hidden: list[str] = []
     sizes: list[dict[str, float]] = []
     worth: list[float] = []
     wanted = 0.0
-    e = op.neutral()
+    e = op.make_neutral()
     if name == "parameter":
         key = EXACT[rig.plant]
         factor = 1 + float(rng.choice([-1, 1])) * 0.02
@@ -492,7 +492,7 @@ def _list_other_indices(values: dict[str, float], indices: list[int]) -> tuple[i
 
 def _switch_off(e: np.ndarray, values: dict[str, float]) -> np.ndarray:
     """Return the effects with one of them switched off."""
-    out, off = e.copy(), op.neutral()
+    out, off = e.copy(), op.make_neutral()
     for key in values:
         out[op.I[key]] = off[op.I[key]]
     return out

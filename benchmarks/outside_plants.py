@@ -4,8 +4,8 @@ Everything is in two compiled loops. `simulate` integrates a plant between the s
 Runge-Kutta of fourth order. Where dry friction changes its sign, a step is split at the speed zero;
 what friction can hold stays at rest. `filter_record` is the unscented Kalman filter of the
 textbooks [1]_ over the same equations, with sensor noise that may be white, autoregressive,
-averaged, walking or a mixture of normal laws. An effect is a number in the array that `neutral`
-returns; all are switched off there.
+averaged, walking or a mixture of normal laws. An effect is a number in the array that
+`make_neutral` returns; all are switched off there.
 
 .. [1] Julier and Uhlmann, Proceedings of the IEEE 92 (2004) 401-422; for the mixtures Sorenson and
    Alspach, Automatica 7 (1971) 465-479, collapsed to one normal law at every sample.
@@ -52,7 +52,7 @@ SUBSTEPS = 8  # of the integration in a period
 FINE = 4  # of the same in the filter, where something happens within a period
 
 
-def neutral() -> np.ndarray:
+def make_neutral() -> np.ndarray:
     """Return the numbers of the effects, all switched off."""
     e = np.zeros(len(EFFECTS))
     e[LOWER], e[UPPER], e[RATE], e[EXPONENT] = -np.inf, np.inf, np.inf, 2.0
@@ -503,7 +503,7 @@ MASSES = MASSES / MASSES.sum()
 
 
 @numba.njit(cache=True, error_model="numpy")
-def log_density(v, mean, variance, weights):
+def compute_log_density(v, mean, variance, weights):
     """Return the logarithm of a mixture of normal laws."""
     top, total = -1e300, 0.0
     for q in range(len(weights)):
@@ -536,17 +536,17 @@ def sum_divergence(mean, variance, weights, other, width, masses, nodes, share):
                     weights[c]
                     * share[j]
                     * (
-                        log_density(v, mean[k], variance[k], weights)
-                        - log_density(v, other[k], width[k], masses)
+                        compute_log_density(v, mean[k], variance[k], weights)
+                        - compute_log_density(v, other[k], width[k], masses)
                     )
                 )
     return total
 
 
 @numba.njit(cache=True, error_model="numpy")
-def log_likelihood(y, mean, variance, weights):
+def compute_log_likelihood(y, mean, variance, weights):
     """Return the log-likelihood of a record under the predictions of a filter."""
     total = 0.0
     for k in range(len(y)):
-        total += log_density(y[k], mean[k], variance[k], weights)
+        total += compute_log_density(y[k], mean[k], variance[k], weights)
     return total

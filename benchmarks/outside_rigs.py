@@ -109,8 +109,8 @@ class Draw:
 FREE = {"ball": ("K",), "drive": ("k", "c"), "pendulum": ("m",), "spring": ("s", "c")}
 
 
-def acceleration(plant: str, p: dict[str, Any]) -> Callable[[Any, Any, Any], Any]:
-    """Acceleration of a plant by position, speed and input; floats or arrays."""
+def make_acceleration(plant: str, p: dict[str, Any]) -> Callable[[Any, Any, Any], Any]:
+    """Return the acceleration of a plant by position, speed and input; floats or arrays."""
     if plant == "ball":
         pull = p["K"] / p["m"]
         return lambda x, v, u: G - pull * u * u / (x * x)
@@ -125,7 +125,7 @@ def acceleration(plant: str, p: dict[str, Any]) -> Callable[[Any, Any, Any], Any
     return lambda x, v, u: u / m - s * x - c * v
 
 
-def rate_of_acceleration(plant: str, p: dict[str, Any]) -> Callable[[Any, Any, Any], Any]:
+def make_slopes(plant: str, p: dict[str, Any]) -> Callable[[Any, Any, Any], Any]:
     """Return derivatives of the acceleration by position, speed and input."""
     if plant == "ball":
         pull = p["K"] / p["m"]
@@ -146,7 +146,7 @@ def log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
 
 
 def draw_plant(rng: np.random.Generator, plant: str) -> tuple[dict[str, float], float, float]:
-    """Parameters, set-point and the pole that sets the time scale [rad/s]."""
+    """Return parameters, set-point and the pole that sets the time scale [rad/s]."""
     if plant == "ball":
         at, m, volts = rng.uniform(5e-3, 2e-2), log_uniform(rng, 0.01, 0.2), rng.uniform(2, 10)
         return {"m": m, "K": m * G * at**2 / volts**2}, at, math.sqrt(2 * G / at)
@@ -195,8 +195,8 @@ def draw_law(
     return Law(kind, tuple(num.tolist()), tuple(den.tolist()), bias), dt, w
 
 
-def largest_sensitivity(slopes: Sequence[float], dt: float, law: Law) -> float:
-    """Peak of 1/(1 + L), infinite where the sampled loop is not stable."""
+def find_largest_sensitivity(slopes: Sequence[float], dt: float, law: Law) -> float:
+    """Return the peak of 1/(1 + L), infinite where the sampled loop is not stable."""
     a, d, b = slopes
     n = 60
     A, B, step = np.array([[0, 1.0], [a, d]]), np.array([0, b]), dt / n
@@ -228,7 +228,7 @@ def draw_rig(rng: np.random.Generator, plant: str, closed: bool | None = None) -
         "pendulum": lambda: -true["m"] * G * true["l"] * math.sin(at),
         "spring": lambda: true["s"] * at,
     }[plant]()
-    slopes = rate_of_acceleration(plant, true)(at, 0.0, rest)
+    slopes = make_slopes(plant, true)(at, 0.0, rest)
     law, dt, w = draw_law(rng, plant, slopes, pole, rest)
     swing = {
         "ball": at * rng.uniform(0.02, 0.06),
@@ -242,7 +242,7 @@ def draw_rig(rng: np.random.Generator, plant: str, closed: bool | None = None) -
     if opened:
         dt, w = rng.uniform(0.06, 0.2) / pole, pole
         swing = swing * true["s"]
-    elif largest_sensitivity(slopes, dt, law) > 2.5:
+    elif find_largest_sensitivity(slopes, dt, law) > 2.5:
         return None
     off = {name: 1 + rng.choice([-1, 1]) * rng.uniform(0.05, 0.2) for name in FREE[plant]}
     given = {name: value * off.get(name, 1.0) for name, value in true.items()}
@@ -251,7 +251,7 @@ def draw_rig(rng: np.random.Generator, plant: str, closed: bool | None = None) -
 
 
 def draw_reference(rng: np.random.Generator, rig: Rig, n: int) -> np.ndarray:
-    """Deviations of the reference: bits or levels held for a while, or ten sines."""
+    """Return deviations of the reference: bits or levels held for a while, or ten sines."""
     if rig.reference == "multisine":
         top = rig.bandwidth / (2 * np.pi)
         f = rng.uniform(0.03, 1.0, 10) * top
@@ -295,7 +295,7 @@ def run_rig(
     the other forces exceed the friction.
     """
     n, dt, x0 = len(moves), rig.dt, rig.at
-    accel = acceleration(rig.plant, rig.true)
+    accel = make_acceleration(rig.plant, rig.true)
     x, v = x0, 0.0
     law = rig.law
     num, den, bias = (law.num, law.den, law.bias) if law else ((0.0,), (1.0,), rig.rest_input)
@@ -386,7 +386,7 @@ def run_rig(
 def draw_noise(
     rng: np.random.Generator, kind: str, sigma: float, n: int, dt: float
 ) -> tuple[np.ndarray, dict[str, float]]:
-    """Sensor noise of a kind and what was drawn for it."""
+    """Return sensor noise of a kind and what was drawn for it."""
     white = rng.standard_normal(n + 500)
     if kind == "ar":
         a = rng.uniform(0.3, 0.95)
@@ -452,7 +452,7 @@ def draw_suspect(
 
 
 def draw_effect(rng: np.random.Generator, kind: str, rig: Rig) -> dict[str, float]:
-    """Size of a plant effect by what moves: accelerations of the swing at the bandwidth."""
+    """Return the size of a plant effect by what moves the swing at the bandwidth."""
     swing = rig.swing if rig.law else rig.swing / rig.true["s"]
     size = swing * rig.bandwidth**2
     if kind == "delay":
@@ -468,7 +468,7 @@ def draw_effect(rng: np.random.Generator, kind: str, rig: Rig) -> dict[str, floa
         return {"periodic": size * log_uniform(rng, 0.02, 0.1), "frequency": hertz}
     if kind == "cubic":
         return {"cubic": size * log_uniform(rng, 0.1, 0.5) / swing**3}
-    weight = rate_of_acceleration(rig.plant, rig.true)(rig.at, 0.0, rig.rest_input)[2]
+    weight = make_slopes(rig.plant, rig.true)(rig.at, 0.0, rig.rest_input)[2]
     return {"deadzone": abs(size / float(weight)) * log_uniform(rng, 0.05, 0.3)}
 
 
@@ -546,8 +546,8 @@ def draw(name: str, plant: str, seed: int, n: int = 3000) -> Draw:
 # --- what a sensor effect is worth
 
 
-def log_likelihoods(draw: Draw, columns: np.ndarray, sensor: bool) -> np.ndarray:
-    """Log-likelihoods of an extended Kalman filter, one for each column of parameters.
+def compute_log_likelihoods(draw: Draw, columns: np.ndarray, sensor: bool) -> np.ndarray:
+    """Return log-likelihoods of an extended Kalman filter, one for each column of parameters.
 
     A column holds the logarithms of the factors on the free parameters, those of the sensor noise
     and the random force, and with `sensor` the sizes of the sensor's effect.
@@ -566,7 +566,7 @@ def log_likelihoods(draw: Draw, columns: np.ndarray, sensor: bool) -> np.ndarray
         added = rig.sigma * draw.shape.T @ sizes
     elif sensor:
         scale = 1 + 0.01 * sizes[0]
-    f, slopes = acceleration(rig.plant, p), rate_of_acceleration(rig.plant, p)
+    f, slopes = make_acceleration(rig.plant, p), make_slopes(rig.plant, p)
     dt = rig.dt
     x, v = rig.at / scale, 0.0 * noise
     P = np.array([(swing**2) + 0 * noise, 0 * noise, (swing * rig.bandwidth) ** 2 + 0 * noise])
@@ -619,7 +619,7 @@ def measure_visibility(draw: Draw) -> float:
 
 
 def fit_filter(draw: Draw, sensor: bool, start: np.ndarray) -> tuple[float, np.ndarray]:
-    """Return the largest likelihood near `start`, over `log_likelihoods`, and where it is.
+    """Return the largest likelihood near `start`, over `compute_log_likelihoods`, and where it is.
 
     Its gradient is one of finite differences, all of which are filtered at once.
     """
@@ -628,7 +628,7 @@ def fit_filter(draw: Draw, sensor: bool, start: np.ndarray) -> tuple[float, np.n
     def cost(theta: np.ndarray) -> tuple[float, np.ndarray]:
         steps = width * np.hstack([np.eye(m), -np.eye(m), np.zeros((m, 1))])
         with np.errstate(all="ignore"):
-            values = -log_likelihoods(draw, theta[:, None] + steps, sensor)
+            values = -compute_log_likelihoods(draw, theta[:, None] + steps, sensor)
         return float(values[-1]), (values[:m] - values[m : 2 * m]) / (2 * width)
 
     bounds = [(-1.5, 1.5)] * free + [(-1.5, 3.0), (-12.0, 2.0)] + [(-50.0, 50.0)] * (m - free - 2)

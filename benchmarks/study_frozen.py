@@ -36,7 +36,7 @@ FULL = {"clean": 600, "one": 400, "faint": 400, "two": 200, "three": 60, "outsid
 SAMPLES = 1500
 FOUND = 50.0  # worth from which an effect has to be found
 BESIDE = 100.0  # the same of each of two
-EDGES = (5, 10, 20, 50, 100, 300, 1000, 3000, 30_000)
+EDGES = (0, 5, 10, 20, 50, 100, 300, 1000, 3000, math.inf)
 G = 9.81
 
 Rates = Callable[[Any, Any, Any], tuple[Any, ...]]
@@ -233,6 +233,12 @@ def is_exact(line: dict[str, Any]) -> bool:
             and not any(is_wrong(line, s) for s in list_sets(line)))  # fmt: skip
 
 
+def is_wider(line: dict[str, Any]) -> bool:
+    """Whether the gap is wider beyond chance (1 %) with the effects than without."""
+    chance = line.get("wider")
+    return chance is not None and chance < 0.01
+
+
 def find_interval(line: dict[str, Any]) -> float | None:
     """Return by how many standard errors a size that was named first is off, None without one."""
     if len(line["truth"]) != 1 or line["truth"][0] not in SIZES or not line.get("findings"):
@@ -302,7 +308,7 @@ def score(lines: Sequence[dict[str, Any]]) -> list[tuple[str, str, str]]:
         ("  the same: a finding in whose set nothing is true", "",
          write_share([any(is_wrong(x, s) for s in list_sets(x)) for x in fixed])),
         ("findings, all classes: the gap wider beyond chance (1 %)", "never",
-         write_share([(x.get("wider") or 1.0) < 0.01 for x in drawn if list_sets(x)])),
+         write_share([is_wider(x) for x in drawn if list_sets(x)])),
     ]  # fmt: skip
     off = [v for x in of["one"] + of["faint"] if (v := find_interval(x)) is not None]
     rows.append(("one effect, named first: the true size in its 95 % interval", ">= 90 %",
@@ -325,7 +331,8 @@ def find_power(lines: Sequence[dict[str, Any]]) -> list[tuple[str, str, str, str
     for low, high in itertools.pairwise(EDGES):
         here = [x for x in own if low <= x["worth"][0] < high]
         rows.append((
-            f"{low:g} to {high:g}", write_share([bool(list_sets(x)) for x in here]),
+            f"{low:g} to {high:g}" if math.isfinite(high) else f"over {low:g}",
+            write_share([bool(list_sets(x)) for x in here]),
             write_share([is_in_sets(x, x["truth"][0]) for x in here]),
             write_share([any(is_wrong(x, s) for s in list_sets(x)) for x in here]),
         ))  # fmt: skip
@@ -344,7 +351,7 @@ def find_misses(lines: Sequence[dict[str, Any]]) -> list[str]:
             wrong = "error" in x or x["verdict"] == "nothing missing"
         elif any(not is_in_sets(x, t) for t in truths):
             wrong = True
-        if (x.get("wider") or 1.0) < 0.01 and list_sets(x):
+        if is_wider(x) and list_sets(x):
             wrong = True
         if not wrong:
             continue

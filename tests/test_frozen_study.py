@@ -26,7 +26,7 @@ def make_drive(rng, n=400, size=0.0):
     """Return a truth with a drive, some Coulomb-free drag beside it, and its record."""
     at = np.array([0.0, 0.0, 0.0, 0.02])
     p = np.array([4.0, 1.0, 1.0, 0.0])
-    e = plants.neutral()
+    e = plants.make_neutral()
     e[plants.I["stiffness"]] = size
     x0, spread = np.zeros(plants.MOST), np.full(plants.MOST, 1e-3)
     moves = 2.0 * np.repeat(rng.choice([-1.0, 1.0], n // 20), 20)
@@ -44,15 +44,15 @@ def make_drive(rng, n=400, size=0.0):
 def test_a_worth_is_the_mean_of_many_log_likelihood_ratios():
     """By brute force: the ratio of the truth and the best model without it, on fresh records."""
     truth = make_drive(np.random.default_rng(1), size=2.0)
-    without = plants.neutral()
+    without = plants.make_neutral()
     worth, theta = cases.measure_worth(truth, without)
     assert 10 < worth < 200
     ratios, worths = [], []
     for seed in range(60):
         one = make_drive(np.random.default_rng([seed, 7]), size=2.0)
         own, other = one.predict(np.zeros(4), one.e), one.predict(theta, without)
-        ratios.append(plants.log_likelihood(one.y, *own, one.weights)
-                      - plants.log_likelihood(one.y, *other, one.weights))  # fmt: skip
+        ratios.append(plants.compute_log_likelihood(one.y, *own, one.weights)
+                      - plants.compute_log_likelihood(one.y, *other, one.weights))  # fmt: skip
         worths.append(plants.sum_divergence(*own, one.weights, *other, one.weights, plants.NODES,
                                             plants.MASSES))  # fmt: skip
     error = np.std(np.array(ratios) - worths, ddof=1) / np.sqrt(len(ratios))
@@ -61,14 +61,14 @@ def test_a_worth_is_the_mean_of_many_log_likelihood_ratios():
 
 def test_what_is_absent_is_worth_nothing_and_no_fit_ends_half_way():
     truth = make_drive(np.random.default_rng(2))
-    assert cases.measure_worth(truth, plants.neutral())[0] < 1e-6
+    assert cases.measure_worth(truth, plants.make_neutral())[0] < 1e-6
     last = 0.0
     for size in (0.1, 0.5, 2.0):
         truth = make_drive(np.random.default_rng(2), size=size)
-        worth, theta = cases.measure_worth(truth, plants.neutral())
+        worth, theta = cases.measure_worth(truth, plants.make_neutral())
         assert worth > 1.5 * last
         elsewhere = theta + np.array([0.05, -0.1, 0.2, -0.5])
-        again, _ = cases.measure_worth(truth, plants.neutral(), start=elsewhere)
+        again, _ = cases.measure_worth(truth, plants.make_neutral(), start=elsewhere)
         assert again == pytest.approx(worth, rel=2e-3)
         last = worth
 
@@ -92,7 +92,7 @@ def test_the_filter_of_a_linear_plant_is_the_kalman_filter():
 
 
 def test_dry_friction_holds_what_rests():
-    e = plants.neutral()
+    e = plants.make_neutral()
     e[plants.I["coulomb"]] = 1.0
     at = np.array([0.0, 0.0, 0.0, 0.02])
     u = np.r_[np.full(50, 0.2), np.full(50, 0.5), np.zeros(100)]
@@ -107,7 +107,7 @@ def test_dry_friction_holds_what_rests():
 @pytest.mark.parametrize("size", [1e-9, 0.5])
 def test_a_change_of_the_direction_takes_nothing_but_the_friction(size):
     """A mass thrown against a constant force, with dry friction, has a path in closed form."""
-    e, force, h = plants.neutral(), -400.0, 0.02
+    e, force, h = plants.make_neutral(), -400.0, 0.02
     e[plants.I["coulomb"]], e[plants.I["force"]] = size, force
     at = np.array([0.0, 0.0, 0.0, h])
     x, work = np.zeros(plants.MOST), np.zeros((5, plants.MOST))
