@@ -701,11 +701,11 @@ class FreshStub:
     def __init__(self, widens):
         self.widens = widens
 
-    def gap_of(self, model):
+    def measure_model_gap(self, model):
         return sum(self.widens.get(name, 0.0) for name in model.loop.labelled)
 
     def compute_widening_chance(self, one, other):
-        return 0.0 if self.gap_of(one) < self.gap_of(other) else 1.0
+        return 0.0 if self.measure_model_gap(one) < self.measure_model_gap(other) else 1.0
 
 
 def test_the_rival_that_fresh_data_like_takes_the_place_of_a_harmful_name(two_found):

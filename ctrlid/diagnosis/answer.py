@@ -44,7 +44,26 @@ def assemble_answer(
     loop: Loop, records: Sequence[Record], found: Search, summary: GapSummary,
     read: Sequence[Readout],
 ) -> Diagnosis:  # fmt: skip
-    """Return verdict, findings, gap and whatever else a diagnosis tells."""
+    """Return verdict, findings, gap and whatever else a diagnosis tells.
+
+    Parameters
+    ----------
+    loop : Loop
+        The model as given.
+    records : sequence of Record
+        The records that were diagnosed.
+    found : Search
+        The end of the search.
+    summary : GapSummary
+        The gap on fresh data, and what each effect closes of it.
+    read : sequence of Readout
+        What the readout of the sensor shows by itself: its limits and the steps of its converter.
+
+    Returns
+    -------
+    Diagnosis
+        The answer, without the remarks of the audit.
+    """
     gap, disturbance = summary.gap, summary.disturbance
     fitted = summarize_fit(found.final.loop, found.final.fit)
     names, known = fitted.estimate.names, found.final.errors
@@ -78,7 +97,25 @@ def assemble_answer(
     objection = objection or describe_grounds(grounds)
     complete = found.after.passed and not left and objection is None
     verdict = choose_verdict(complete, named=bool(findings))
-    notes = list(fitted.estimate.notes)
+    notes = (*fitted.estimate.notes, *_list_notes(loop, found))
+    calibrated = _list_calibrated(loop, found, fitted.loop, errors)
+    tests = dict(found.after.p_values)
+    ranking = _rank_candidates(found)
+    noise = describe_noise(found.final.fit, gap.unit)
+    sentence = write_conclusion(
+        verdict, findings, gap, disturbance, found.after, where, None if left else objection,
+        len({type(c.effect) for c in ranking}), grounds, noise,
+    )  # fmt: skip
+    return Diagnosis(
+        verdict, sentence, findings, final, gap, where, ranking, disturbance,
+        calibrated, _find_sensitivity(found), tests, remarks, notes, noise=noise,
+        stand_ins=stand_ins,
+    )  # fmt: skip
+
+
+def _list_notes(loop: Loop, found: Search) -> list[str]:
+    """Return what the user should know of what was not asked, or of how the model is given."""
+    notes = []
     if not loop.free:
         notes.append("no parameter of the model was free, so a wrong value counts as a missing "
                      "effect. Name the uncertain parameters in free=")  # fmt: skip
@@ -93,26 +130,21 @@ def assemble_answer(
             "the model is linear. If the errors depend on position, velocity or input, write the "
             "equations of the plant with ct.nlsys and diagnose that model"
         )
+    return notes
+
+
+def _list_calibrated(
+    loop: Loop, found: Search, fitted: Loop, errors: Mapping[str, float]
+) -> tuple[Calibrated, ...]:
+    """Return each free parameter of the plant as given, recalibrated and with the effects."""
     first = found.base.fit
     before = dict(zip(found.base.names, first.theta.tolist(), strict=True))
     on_limit = (first.theta == first.problem.lower) | (first.theta == first.problem.upper)
     ended = {name for name, there in zip(found.base.names, on_limit, strict=True) if there}
-    calibrated = tuple(
-        Calibrated(name, loop.parameters[name], before[name], fitted.loop.parameters[name],
+    return tuple(
+        Calibrated(name, loop.parameters[name], before[name], fitted.parameters[name],
                    errors.get(name, math.nan), name in ended)
         for name in loop.free
-    )  # fmt: skip
-    tests = dict(found.after.p_values)
-    ranking = _rank_candidates(found)
-    noise = describe_noise(found.final.fit, gap.unit)
-    sentence = write_conclusion(
-        verdict, findings, gap, disturbance, found.after, where, None if left else objection,
-        len({type(c.effect) for c in ranking}), grounds, noise,
-    )  # fmt: skip
-    return Diagnosis(
-        verdict, sentence, findings, final, gap, where, ranking, disturbance,
-        calibrated, _find_sensitivity(found), tests, remarks, tuple(notes), noise=noise,
-        stand_ins=stand_ins,
     )  # fmt: skip
 
 

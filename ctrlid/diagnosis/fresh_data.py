@@ -94,7 +94,7 @@ class FreshData:
         """Return the RMS error of loops [output unit]."""
         return gaps.root_mean_square(self.windows, self.simulate_outputs(loops))
 
-    def gap_of(self, model: Model) -> float:
+    def measure_model_gap(self, model: Model) -> float:
         """Return the RMS error of a model, made ready for each window [output unit]."""
         return self.measure_gap(self.prepare_loops(model))
 

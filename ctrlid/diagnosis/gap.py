@@ -388,7 +388,18 @@ def measure_noise_errors(
 ) -> Array:
     """Return the RMS errors that noise leaves in each run, with all noise and with the sensor's.
 
-    NaN where they cannot be computed. Of several outputs, in units of the windows' scales.
+    Parameters
+    ----------
+    loops, fit, windows, how
+        As in `compute_floor`.
+    runs : int
+        Simulations with noise.
+
+    Returns
+    -------
+    ndarray, shape (runs, 2)
+        RMS errors [output unit], of several outputs in units of the windows' scales; NaN where they
+        cannot be computed.
     """
     if windows[0].record.y.ndim == 2:
         each, counts = _measure_each_output(loops, fit, windows, how, runs)

@@ -434,7 +434,7 @@ def exchange_worst_effect(
         What models are compared on.
     """
     given = len(found.base.loop.effects)
-    worst = min(found.found, key=lambda f: fresh.gap_of(f.base))
+    worst = min(found.found, key=lambda f: fresh.measure_model_gap(f.base))
     base = with_linearization(worst.base)
     out = {worst.trial.key, *refused, *(name_at_place(e) for e in base.loop.effects)}
     best: dict[str, Trial] = {}
@@ -448,7 +448,7 @@ def exchange_worst_effect(
         if t.net_gain > THRESHOLD.gate
         and fresh.compute_widening_chance(t.model, worst.base) < THRESHOLD.beyond_chance
     ]  # fmt: skip
-    model = min(liked, key=fresh.gap_of, default=worst.base)
+    model = min(liked, key=fresh.measure_model_gap, default=worst.base)
     model, left = weigh_effects(model, given, found.steps)
     after = retest_with_replicas(model)
     return replace(found, final=model, found=left, after=after), worst.trial.key

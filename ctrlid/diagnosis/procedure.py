@@ -293,7 +293,7 @@ def _search_again(
     if not other.finished:
         raise Stopped
     other = refuse_bursts(refuse_larger_noise(other, is_larger))
-    return choose_search(search, other, helps, q.fresh.gap_of)
+    return choose_search(search, other, helps, q.fresh.measure_model_gap)
 
 
 def _blame_log(q: Question, search: Search, wrong: LogError) -> tuple[Diagnosis, Search]:

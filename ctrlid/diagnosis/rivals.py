@@ -140,7 +140,28 @@ def find_rivals(best: Trial, others: Sequence[Trial], sure: bool = True) -> tupl
 def compare_effects(
     model: Model, found: Sequence[Weighed], given: int, steps: Sequence[Round], work: Work
 ) -> tuple[Model, tuple[Weighed, ...]]:
-    """Ask for each effect what else could stand in its place, all others being in the model."""
+    """Ask for each effect what else could stand in its place, all others being in the model.
+
+    Parameters
+    ----------
+    model : Model
+        The model with all effects that were found.
+    found : sequence of Weighed
+        These effects.
+    given : int
+        How many effects the model had from the beginning.
+    steps : sequence of Round
+        The rounds of the search, with the candidates that were refitted in each.
+    work : callable
+        ``work(function, items)``, a map that may run in parallel.
+
+    Returns
+    -------
+    model : Model
+        The model, in which a likelier rival may have taken the place of an effect.
+    found : tuple of Weighed
+        Its effects, each with its rivals, the largest gain first.
+    """
     sure = run_noise_tests(model.fit).passed
     if len(found) == 1 and found[0].trial is steps[0].best:
         best = found[0].trial
