@@ -92,7 +92,7 @@ def cancels_a_known_force(case: Case, f: Weighed) -> str:
     the weight of a ball, and does not add to it.
     """
     effect = case.read_effect(f)[1]
-    if type(effect).__name__ != "ConstantForce":
+    if not effect.constant_force:
         return ""
     e, at = case.given.equations(), case.given.point
     motion = find_motion(e, effect.at)
@@ -101,10 +101,10 @@ def cancels_a_known_force(case: Case, f: Weighed) -> str:
         return ""
     still = 0.0 if e.siso else np.zeros(len(e.inputs))
     known = float(e.evaluate(np.asarray(at.states, dtype=float), still, 0.0)[0][motion[1]])
-    bias = effect.values()["bias"]
+    bias = effect.values()[effect.constant_force]
     if not (math.isfinite(known) and known * bias < 0 and 2 * abs(bias) > abs(known)):
         return ""
-    unit = effect.units(case.given)["bias"]
+    unit = effect.units(case.given)[effect.constant_force]
     return f"it cancels a known constant force of {write_quantity(known, unit)}"
 
 

@@ -56,13 +56,14 @@ class AbstractEffect:
     private: ClassVar[tuple[str, ...]] = ()
     # False says that the effect has no part in small deviations from rest.
     in_linear_model: ClassVar[bool] = True
-    ordered: ClassVar[bool] = (
-        False  # True: a signal passes it, so that its turn among others counts
-    )
+    # True says that a signal passes the effect, so that its turn among others counts.
+    ordered: ClassVar[bool] = False
     # True says that a plant may have several effects of this class at once.
     repeatable: ClassVar[bool] = False
     # This says why several effects of this class at once prove little.
     doubt_of_several: ClassVar[str | None] = None
+    # This names the parameter that is a force which is always there; empty if there is none.
+    constant_force: ClassVar[str] = ""
 
     def __post_init__(self) -> None:
         kind = type(self).__name__

@@ -150,6 +150,7 @@ class ConstantForce(ForceEffect):
         "several operating points with different inputs: a constant force is the same at each, "
         "while the force of an input offset changes with the gain of the plant"
     )
+    constant_force: ClassVar[str] = "bias"
 
     def force(self, m: Moment) -> Any:
         """Return the acceleration."""
