@@ -1,4 +1,4 @@
-"""What studies print alike: shares with their intervals, and the draws that are farthest off."""
+"""What studies read and print alike: seeds, shares with intervals, the draws farthest off."""
 
 from __future__ import annotations
 
@@ -6,6 +6,16 @@ from typing import Any
 
 import numpy as np
 from scipy.stats import binomtest
+
+
+def parse_seeds(text: str) -> range:
+    """Return the seeds of ``3`` or ``0-24``.
+
+    >>> parse_seeds("0-24")
+    range(0, 25)
+    """
+    first, _, last = text.partition("-")
+    return range(int(first), int(last or first) + 1)
 
 
 def wilson(hits: int, count: int, level: float = 0.95) -> tuple[float, float]:

@@ -26,7 +26,7 @@ import control as ct
 import joblib
 import numpy as np
 import outside_cases as cases
-from _shares import wilson
+from _shares import parse_seeds, wilson
 from scipy import stats
 
 import ctrlid as cid
@@ -413,16 +413,6 @@ def append(path: str | Path, line: dict[str, Any]) -> None:
     """Add a line to a file; a gzip file may have several parts."""
     with Path(path).open("ab") as file:
         file.write(gzip.compress((json.dumps(line) + "\n").encode(), 6, mtime=0))
-
-
-def parse_seeds(text: str) -> range:
-    """Return the seeds of ``3`` or ``0-24``.
-
-    >>> parse_seeds("0-24")
-    range(0, 25)
-    """
-    first, _, last = text.partition("-")
-    return range(int(first), int(last or first) + 1)
 
 
 def is_same_answer(one: dict[str, Any], other: dict[str, Any]) -> bool:

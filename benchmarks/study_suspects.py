@@ -33,7 +33,7 @@ import control as ct
 import joblib
 import numpy as np
 import outside_rigs as rigs
-from _shares import wilson
+from _shares import parse_seeds, wilson
 
 import ctrlid as cid
 
@@ -95,7 +95,7 @@ def make_record(draw: rigs.Draw) -> cid.Record:
     return cid.Record(r=r, u=draw.u, y=draw.y, dt=draw.rig.dt)
 
 
-def names_of(findings: Iterable[Any]) -> list[list[str]]:
+def list_names(findings: Iterable[Any]) -> list[list[str]]:
     """Return the names of each finding, those that no record can tell from it among them."""
     return [list(dict.fromkeys((*f.names, *f.equivalents))) for f in findings]
 
@@ -131,9 +131,9 @@ def run(name: str, plant: str, seed: int, n: int, worth: bool = True) -> dict[st
     return line | {
         "verdict": found.verdict,
         "sentence": found.sentence,
-        "findings": names_of(found.findings),
+        "findings": list_names(found.findings),
         "evidence": [f.evidence for f in found.findings],
-        "stand_ins": names_of(getattr(found, "stand_ins", ())),
+        "stand_ins": list_names(getattr(found, "stand_ins", ())),
         "gap": [gap.given, gap.before, gap.after, gap.floor],
         "gap kind": gap.kind,
         "noise": "" if noise is None else str(noise),
@@ -145,7 +145,7 @@ def run(name: str, plant: str, seed: int, n: int, worth: bool = True) -> dict[st
 # --- scores
 
 
-def named(line: dict[str, Any], stand_ins: bool = True) -> list[list[str]]:
+def list_named_sets(line: dict[str, Any], stand_ins: bool = True) -> list[list[str]]:
     """Return the sets of a line; a converter's resolution is a remark and no name."""
     sets = line.get("findings", []) + (line.get("stand_ins", []) if stand_ins else [])
     return [s for s in sets if s[0] != "Quantization"]
@@ -166,14 +166,14 @@ def is_in_set(line: dict[str, Any]) -> bool:
 
 def blames_the_plant_alone(line: dict[str, Any]) -> bool:
     """Whether the record is explained by sets without a name of the sensor."""
-    sets = named(line, stand_ins=False)
+    sets = list_named_sets(line, stand_ins=False)
     return (line.get("verdict") == "explained" and bool(sets)
             and not any(set(s) & set(OF_THE_SENSOR) for s in sets))  # fmt: skip
 
 
 def blames_the_plant(line: dict[str, Any]) -> bool:
     """Whether a finding has names of the plant only."""
-    return any(not set(s) & set(NOT_THE_PLANT) for s in named(line, stand_ins=False))
+    return any(not set(s) & set(NOT_THE_PLANT) for s in list_named_sets(line, stand_ins=False))
 
 
 def is_fault_told(line: dict[str, Any]) -> bool:
@@ -191,11 +191,11 @@ def is_right(line: dict[str, Any]) -> bool:
     if name.startswith("controller-"):
         return is_fault_told(line) and not blames_the_plant(line)
     if is_hidden(line):
-        return is_in_set(line) and len(named(line)) == 1
-    return line["verdict"] == "nothing missing" and not named(line)
+        return is_in_set(line) and len(list_named_sets(line)) == 1
+    return line["verdict"] == "nothing missing" and not list_named_sets(line)
 
 
-def share(hits: Sequence[bool]) -> str:
+def write_share(hits: Sequence[bool]) -> str:
     """Return a share in words, with its 95 % interval."""
     low, high = wilson(sum(hits), len(hits))
     return f"{sum(hits)}/{len(hits)} ({100 * low:.1f} to {100 * high:.1f} %)" if hits else "-"
@@ -210,33 +210,34 @@ def write_table(lines: Sequence[dict[str, Any]]) -> str:
     plant = [x for x in drawn if x["class"].startswith("plant-") and is_hidden(x)]
     laws = [x for x in drawn if x["class"].startswith("controller-")]
     rows = [("nothing wrong in plant or sensor: any name", "<= 1 %",
-             share([bool(named(x)) for x in clean]))]  # fmt: skip
+             write_share([bool(list_named_sets(x)) for x in clean]))]  # fmt: skip
     for name in rigs.NOISES:
         own = [x.get("verdict") == "nothing missing" for x in clean if x["class"] == name]
         target = ">= 90 %" if name in MUST_BE_CLEAN else ""
-        rows.append((f'  "nothing missing", {name}', target, share(own)))
+        rows.append((f'  "nothing missing", {name}', target, write_share(own)))
     rows += [
-        ("sensor effect hidden: in the set", "98 %", share([is_in_set(x) for x in hidden])),
+        ("sensor effect hidden: in the set", "98 %", write_share([is_in_set(x) for x in hidden])),
         ("  the plant alone, explained", "none",
-         share([blames_the_plant_alone(x) for x in hidden])),
+         write_share([blames_the_plant_alone(x) for x in hidden])),
         ('sensor effect not hidden: "nothing missing"', "",
-         share([x.get("verdict") == "nothing missing" for x in faint])),
-        ("plant effect under such noise: in the set", "97 %", share([is_in_set(x) for x in plant])),
+         write_share([x.get("verdict") == "nothing missing" for x in faint])),
+        ("plant effect under such noise: in the set", "97 %",
+         write_share([is_in_set(x) for x in plant])),
         ("  false company", "2 %",
-         share([any(NAMES[x["class"]] not in s for s in named(x)) for x in plant])),
+         write_share([any(NAMES[x["class"]] not in s for s in list_named_sets(x)) for x in plant])),
     ]  # fmt: skip
     for fault in rigs.FAULTS:
         own = [is_fault_told(x) for x in laws
                if x["class"] == f"controller-{fault}" and x.get("visible", 1.0) > SEEN]  # fmt: skip
-        rows.append((f"wrong controller, {fault}: named right", "95 %", share(own)))
+        rows.append((f"wrong controller, {fault}: named right", "95 %", write_share(own)))
     unseen = [is_fault_told(x) for x in laws if x.get("visible", 1.0) <= SEEN]
-    rows.append(("  fault that u does not show: none named", "", share(unseen)))
-    rows.append(("  the plant blamed", "0.5 %", share([blames_the_plant(x) for x in laws])))
+    rows.append(("  fault that u does not show: none named", "", write_share(unseen)))
+    rows.append(("  the plant blamed", "0.5 %", write_share([blames_the_plant(x) for x in laws])))
     seconds = [x["seconds"] for x in drawn if "seconds" in x]
     if seconds:
         rows.append(("CPU seconds: median, mean, largest", "", f"{np.median(seconds):.1f}, "
                      f"{np.mean(seconds):.1f}, {max(seconds):.1f}"))  # fmt: skip
-    rows.append(("raised", "none", share(["error" in x for x in drawn])))
+    rows.append(("raised", "none", write_share(["error" in x for x in drawn])))
     rows.append(("not drawn; drawn again for want of margins", "",
                  f"{len(lines) - len(drawn)}; {sum(x['redrawn'] for x in drawn)}"))  # fmt: skip
     return "\n".join(f"{what:<52} {target:<8} {value}" for what, target, value in rows)
@@ -267,22 +268,12 @@ def read(path: str | Path) -> list[dict[str, Any]]:
     if not Path(path).exists():
         return []
     lines = [json.loads(line) for line in Path(path).read_text().splitlines()]
-    return list({key(x): x for x in lines}.values())
+    return list({make_key(x): x for x in lines}.values())
 
 
-def key(line: dict[str, Any]) -> tuple[Any, ...]:
+def make_key(line: dict[str, Any]) -> tuple[Any, ...]:
     """Return what tells one draw from another."""
     return line["class"], line["plant"], line["seed"], line["n"]
-
-
-def parse_seeds(text: str) -> range:
-    """Return the seeds of ``3`` or ``0-24``.
-
-    >>> parse_seeds("0-24")
-    range(0, 25)
-    """
-    first, _, last = text.partition("-")
-    return range(int(first), int(last or first) + 1)
 
 
 def main() -> None:
@@ -306,7 +297,7 @@ def main() -> None:
         print(write_table(lines), write_misses(lines), sep="\n\n")
         return
     classes = dict.fromkeys(c for name in options.classes for c in GROUPS.get(name, (name,)))
-    done = {key(x) for x in read(options.out)}
+    done = {make_key(x) for x in read(options.out)}
     wanted = [(c, p, s, options.samples)
               for s in options.seeds for c in classes for p in options.plants]  # fmt: skip
     work = joblib.Parallel(n_jobs=options.jobs, return_as="generator")
@@ -314,10 +305,10 @@ def main() -> None:
     for line in work(joblib.delayed(run)(*w, not options.no_worth) for w in tasks):
         with Path(options.out).open("a") as file:
             file.write(json.dumps(line) + "\n")
-        print(*key(line)[:3], "right" if is_right(line) else "MISS", line.get("verdict", ""),
+        print(*make_key(line)[:3], "right" if is_right(line) else "MISS", line.get("verdict", ""),
               line.get("findings", line.get("error")), line.get("seconds", ""),
               flush=True)  # fmt: skip
-    lines = [x for x in read(options.out) if key(x) in set(wanted)]
+    lines = [x for x in read(options.out) if make_key(x) in set(wanted)]
     print(write_table(lines), write_misses(lines), sep="\n\n")
 
 

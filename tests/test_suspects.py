@@ -53,7 +53,7 @@ def test_no_plant_is_blamed_for_what_its_sensor_or_noise_does(name: str, plant: 
         assert not study.blames_the_plant_alone(line), line
         assert study.is_in_set(line), line
     elif name in rigs.NOISES:
-        assert study.named(line) == [], line
+        assert study.list_named_sets(line) == [], line
 
 
 @pytest.mark.parametrize("plant", ["spring", "pendulum"])
@@ -73,7 +73,7 @@ def test_a_walk_of_the_sensor_is_noise_and_a_steady_drift_is_a_drift(plant: str)
         r, u, y = signals
         draw = replace(white, r=r, u=u, y=y, hidden=hidden)
         found = cid.diagnose(study.make_loop(draw), study.make_record(draw), progress=False)
-        names[name] = study.names_of(found.findings)
+        names[name] = study.list_names(found.findings)
         if name == "walk":
             assert found.verdict == "nothing missing"
             # A random force moves a mass on a spring as slowly.
