@@ -22,7 +22,7 @@ from ..estimation.likelihood.likelihood import (
 )
 from ..estimation.likelihood.noise_fit import count_noise_parameters
 from ..estimation.likelihood.sampled_plant import SampledPlant, Trajectory
-from ..estimation.likelihood.tails import JointTails
+from ..estimation.likelihood.tails import choose_law
 from ..loop.loop import Loop
 from ..loop.period_map import comes_to_rest
 from ..loop.wiring import knows_references
@@ -126,8 +126,7 @@ def compute_log_terms(fit: Fit) -> Array:
     """Return each sample's share of the log-likelihood, records one after the other."""
     parts: list[Any] = []
     for out, keep, r in zip(fit.filtered, fit.counts, fit.sensor, strict=True):
-        law = fit.noise.tails
-        tails = law.choose(keep) if isinstance(law, JointTails) else law
+        tails = choose_law(fit.noise.tails, keep)
         s = out.variance[keep] * r
         if tails is not None:
             density = tails.compute_log_density(out.innovations[keep] / np.sqrt(s))

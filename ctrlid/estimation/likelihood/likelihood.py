@@ -15,7 +15,7 @@ from ...loop.loop import Loop
 from .filter_data import FilterData, can_follow_controller, make_filter_data
 from .kalman_filter import Filtered, Noise, run_filter
 from .sampled_plant import Linearized, SampledPlant, Trajectory, make_sampled_plant
-from .tails import FlatTails, JointTails, compute_information_shares
+from .tails import FlatTails, choose_law, compute_information_shares
 
 # The sensor's variance is at least this share of the output's mean square, which keeps the
 # likelihood of a noise-free record finite.
@@ -300,7 +300,7 @@ def _evaluate_at_scale(
         e, s = out.innovations[keep], out.variance[keep]
         if problem.periods:
             e, s = _subtract_repeat_mean(out, keep, problem.periods[k])
-        tails = noise.tails.choose(keep) if isinstance(noise.tails, JointTails) else noise.tails
+        tails = choose_law(noise.tails, keep)
         if not (np.isfinite(e).all() and np.isfinite(s).all() and (s > 0).all()):
             value, e, s = -math.inf, np.ones(1), np.ones(1)
             tails = None if isinstance(tails, FlatTails) else tails

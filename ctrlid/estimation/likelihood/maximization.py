@@ -30,7 +30,7 @@ from .noise_fit import (
     try_coloured_sensor,
     try_tails,
 )
-from .tails import JointTails, compute_information_shares
+from .tails import choose_law, compute_information_shares
 
 # A climb ends after at most so many Gauss-Newton steps.
 ROUNDS = 25
@@ -425,7 +425,7 @@ def compute_information(fit: Fit) -> tuple[Array, Array]:
         z2 = e**2 / s
         # Of several outputs each has its own share, which all its samples have.
         mean, scale = (np.broadcast_to(v, keep.shape)[keep] if np.ndim(v) else v for v in shares)
-        tails = law.choose(keep) if isinstance(law, JointTails) else law
+        tails = choose_law(law, keep)
         if tails is not None:
             w = tails.compute_weight(np.sqrt(z2))
             e, z2 = w * e, w * z2

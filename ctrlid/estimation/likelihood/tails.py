@@ -196,6 +196,11 @@ class FlatTails:
         return found
 
 
+def choose_law(tails: Tails | JointTails | None, keep: Any) -> Tails | FlatTails | None:
+    """Return the law of those errors for which `keep` holds, in one row; None: it is Gaussian."""
+    return tails.choose(keep) if isinstance(tails, JointTails) else tails
+
+
 def _find_scale(law: Tails | FlatTails, squares: Array, start: float) -> float:
     """Return the likeliest variance of the usual errors; see `Tails.find_scale`."""
     scale = start
