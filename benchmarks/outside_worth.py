@@ -124,7 +124,14 @@ def measure_worth(
     return max(best - within, 0.0), theta
 
 
-def _climb(truth, own, without, sizes, theta):
+def _climb(
+    truth: Truth, own: tuple[np.ndarray, np.ndarray], without: np.ndarray,
+    sizes: tuple[int, ...], theta: np.ndarray,
+) -> tuple[float, np.ndarray]:  # fmt: skip
+    """Return the smallest divergence near a point by damped Gauss-Newton steps, and where it is.
+
+    The divergence is that from the predictions of the truth, `own`, to those of the model.
+    """
     m, width = len(theta), 1e-5
     low, high = np.full(m, -2.0), np.full(m, 2.0)
     k = len(truth.free)
