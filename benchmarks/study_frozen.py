@@ -34,7 +34,7 @@ import ctrlid as cid
 FULL = {"clean": 600, "one": 400, "faint": 400, "two": 200, "three": 60, "outside": 200,
         "parameter": 100}  # fmt: skip
 SAMPLES = 1500
-FOUND = 50.0  # worth from which an effect has to be found
+FAINT, FOUND = 5.0, 50.0  # worth from which a wrong name counts, and from which an effect is due
 BESIDE = 100.0  # the same of each of two
 EDGES = (0, 5, 10, 20, 50, 100, 300, 1000, 3000, math.inf)
 G = 9.81
@@ -268,7 +268,7 @@ def score(lines: Sequence[dict[str, Any]]) -> list[tuple[str, str, str]]:
     drawn = [x for x in lines if "undrawn" not in x]
     of = {name: [x for x in drawn if x["class"] == name] for name in cases.CLASSES}
     one = [x for x in of["one"] if x["worth"][0] > FOUND]
-    faint = [x for x in of["faint"] + of["one"] if x["worth"][0] <= FOUND]
+    faint = [x for x in of["faint"] + of["one"] if FAINT <= x["worth"][0] <= FOUND]
     two = [x for x in of["two"] if min(x["worth"]) > BESIDE]
     three = [x for x in of["three"] if min(x["worth"]) > BESIDE]
     outside = [x for x in of["outside"] if x["worth"][0] > FOUND]

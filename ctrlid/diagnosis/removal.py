@@ -113,18 +113,26 @@ def _merge_contained_effects(model: Model, given: int) -> Model:
 
     Asymmetric friction beside dry friction has one size too many.
     """
-    effects, labels = model.fitted.effects, list(model.fitted.labelled)
+    effects = model.fitted.effects
     for k, other in itertools.permutations(range(given, len(effects)), 2):
         if not contains(effects[other], effects[k]):
             continue
-        sizes, shared = effects[other].values(), effects[k].values()
-        sums = {f"{labels[other]}.{name}": sizes[name] + shared[name] for name in shared}
-        loop, names = take_out_effect(model.fitted.with_parameters(sums), k, model.names)
-        fit = maximize(carry_over_fit(model, loop, names), rounds=THRESHOLD.removal_rounds)
-        saved = bayesian_penalty(len(model.names) - len(names), fit.size)
-        if fit.value + saved > model.fit.value:
-            return Model(loop, fit)
+        with contextlib.suppress(ModelCannotRun):
+            one = _merge_effect(model, k, other)
+            saved = bayesian_penalty(len(model.names) - len(one.names), one.fit.size)
+            if one.fit.value + saved > model.fit.value:
+                return one
     return model
+
+
+def _merge_effect(model: Model, k: int, other: int) -> Model:
+    """Return the model with the sizes of one effect added to those of another."""
+    effects, label = model.fitted.effects, list(model.fitted.labelled)[other]
+    sizes, shared = effects[other].values(), effects[k].values()
+    sums = {f"{label}.{name}": sizes[name] + shared[name] for name in shared}
+    loop, names = take_out_effect(model.fitted.with_parameters(sums), k, model.names)
+    fit = maximize(carry_over_fit(model, loop, names), rounds=THRESHOLD.removal_rounds)
+    return Model(loop, fit)
 
 
 def _drop_effects(model: Model, positions: Sequence[int]) -> Model:
