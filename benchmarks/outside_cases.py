@@ -71,6 +71,8 @@ SAME = (
     ({"ActuatorLag", "SensorLag"}, ("drive", "spring")),
     ({"PeriodicForce", "SensorHum"}, ("drive", "spring")),
     ({"ConstantForce", "InputOffset"}, ("drive", "pendulum", "spring")),
+    # The bias of the input is free, and takes what friction has more in one direction.
+    ({"CoulombFriction", "AsymmetricCoulombFriction"}, ("drive", "pendulum", "spring")),
     ({"PositionOffset", "SensorOffset"}, ("ball", "pendulum")),
     ({"ConstantForce", "SensorGain", "parameter g"}, ("ball",)),
 )
@@ -337,11 +339,15 @@ def make_effect(rng: np.random.Generator, name: str, rig: Rig, n: int) -> tuple[
         "PositionOffset": ({}, one("position", sign * 0.02 * abs(rig.at[2])), "position"),
         "ForceExponent": ({}, lambda s: {"exponent": float(np.clip(2 + sign * 0.1 * s, 0.6, 5.9))},
                           ""),
-        "ParameterDrift": ({"which": which}, one("drift", sign * 0.05 / end), "drift"),
+        # No parameter changes its sign before the end.
+        "ParameterDrift": ({"which": which}, lambda s: {"drift": sign * min(0.05 * s, 0.8) / end},
+                           "drift"),
         "ParameterStep": ({"which": which, "step_time": end * rng.uniform(0.15, 0.85)},
                           one("step", sign * 0.03), "step"),
         "SensorLag": ({}, one("sensor_lag", 0.3 * dt), "sensor_lag"),
-        "SensorNonlinearity": ({}, one("bend", sign * 0.05 / rig.swing), "bend"),
+        # Nor is any reading that of two positions.
+        "SensorNonlinearity": ({}, lambda s: {"bend": sign * min(0.05 * s, 0.15) / rig.swing},
+                               "bend"),
         "SensorGain": ({}, one("scale", sign * 0.01), "scale"),
         "SensorDrift": ({}, one("sensor_drift", sign * 3 * rig.sigma / end), "sensor_drift"),
         "SensorHum": ({"hum_f": float(rng.uniform(0.05, 0.45)) / dt, "hum_phase": phase},

@@ -392,7 +392,7 @@ def converge_trajectory(
         If the filter cannot follow the record with this model.
     """
     for count in range(passes):
-        at, lin = _linearize_inside_domain(plant, data, theta, at)
+        at, lin = linearize_inside_domain(plant, data, theta, at)
         out = run_filter(plant, data, lin, noise, sensitive=False)
         change = np.abs(out.trajectory.filtered - at.filtered)
         if not np.isfinite(out.innovations).all() or not np.isfinite(change).all():
@@ -411,10 +411,13 @@ def converge_trajectory(
     return lin, out
 
 
-def _linearize_inside_domain(
+def linearize_inside_domain(
     plant: SampledPlant, data: FilterData, theta: Array, at: Trajectory
 ) -> tuple[Trajectory, Linearized]:
-    """Linearize; samples at which the plant is not defined are set to the state at rest."""
+    """Linearize; samples at which the plant is not defined are set to the state at rest.
+
+    A level that nothing measures may be estimated below zero, where no root of it is defined.
+    """
     bad: Any = ~(np.isfinite(at.filtered) & np.isfinite(at.predicted)).all(axis=1)
     if not bad.any():
         lin = plant.linearize(data, theta, at)

@@ -13,7 +13,7 @@ from ..._base.statistics import pseudo_inverse
 from ...data.record import Record
 from ...loop.loop import Loop
 from .filter_data import FilterData, can_follow_controller, make_filter_data
-from .kalman_filter import Filtered, Noise, run_filter
+from .kalman_filter import Filtered, Noise, linearize_inside_domain, run_filter
 from .sampled_plant import Linearized, SampledPlant, Trajectory, make_sampled_plant
 from .tails import FlatTails, choose_law, compute_information_shares
 
@@ -250,8 +250,8 @@ def evaluate_likelihood(
     problem: Problem, theta: Array, noise: Noise, at: Sequence[Trajectory]
 ) -> Fit:
     """Return the likelihood of parameters and noise, linearized along given trajectories."""
-    plant = problem.plant
-    lins = tuple(plant.linearize(one, theta, a) for one, a in zip(problem.data, at, strict=True))
+    pairs = zip(problem.data, at, strict=True)
+    lins = tuple(linearize_inside_domain(problem.plant, one, theta, a)[1] for one, a in pairs)
     return evaluate_linearized(problem, theta, noise, lins)
 
 

@@ -17,6 +17,7 @@ from .kalman_filter import (
     choose_settled_samples,
     converge_trajectory,
     guess_trajectory,
+    linearize_inside_domain,
 )
 from .likelihood import Fit, Problem, evaluate_likelihood, list_start_values, relinearize_fit
 from .noise_fit import (
@@ -131,7 +132,7 @@ def _begin_with_noise(problem: Problem, theta: Array, noise: Noise | None) -> Fi
             at = converge_trajectory(plant, data, theta, first, at, passes=2)[1].trajectory
         guessed.append((data, at))
     if noise is None:
-        lins = tuple(plant.linearize(data, theta, at) for data, at in guessed)
+        lins = tuple(linearize_inside_domain(plant, data, theta, at)[1] for data, at in guessed)
         counts = tuple(data.usable for data in problem.data)
         first = fit_noise(replace(problem, counts=counts), theta, lins, first, wide=True).noise
     results = [converge_trajectory(plant, data, theta, first, at) for data, at in guessed]
