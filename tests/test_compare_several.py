@@ -53,7 +53,9 @@ def test_audit_names_the_signal(dithered):
     y = np.array(record.y)
     y[1] = np.round(y[1] / 1e-3) * 1e-3
     y[0, 300] += 0.1
-    found = cid.audit(cid.Record(u=record.u, y=y, dt=DT, names=record.names))
+    r = np.sin(0.01 * np.arange(len(record)) * np.array([[1.0], [1.3]]))
+    found = cid.audit(cid.Record(r=r, u=record.u, y=y, dt=DT,
+                                 names={**record.names, "r": ("x", "theta")}))  # fmt: skip
     assert found["quantization"][0].channel == "theta"
     assert found["quantization"][0].text.startswith("theta: ")
     assert found["outliers"][0].channel == "x"

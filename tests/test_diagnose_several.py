@@ -9,6 +9,9 @@ import pytest
 from scipy import linalg, stats
 
 import ctrlid as cid
+from ctrlid.diagnosis.fitted_model import Model
+from ctrlid.diagnosis.records import read_steps
+from ctrlid.diagnosis.replicas import make_replica, with_rounding
 from ctrlid.estimation.likelihood.kalman_filter import Noise, run_filter
 from ctrlid.estimation.likelihood.likelihood import make_problem
 from ctrlid.estimation.likelihood.maximization import begin_fit
@@ -53,10 +56,11 @@ def design():
     return A, B, C, K, L
 
 
-def simulate(n, friction=(0.0, 0.0), seed=0, louder=None):
+def simulate(n, friction=(0.0, 0.0), seed=0, louder=None, step=0.0):
     """Two outputs and the input of the loop with dither, 20 Runge-Kutta steps in a period.
 
-    The noise of each reading is `louder` times as large, shape (2, n).
+    The noise of each reading is `louder` times as large, shape (2, n); the encoder of the angle has
+    steps.
     """
     sizes = NOISE[:, None] * (np.ones((2, n)) if louder is None else louder)
     A, B, C, K, L = design()
@@ -71,6 +75,7 @@ def simulate(n, friction=(0.0, 0.0), seed=0, louder=None):
     h = DT / 20
     for k in range(n):
         ys[:, k] = q + sizes[:, k] * rng.standard_normal(2)
+        ys[1, k] = step * np.round(ys[1, k] / step) if step else ys[1, k]
         us[k] = (-K @ z).item() + d[k]
         for _ in range(20):
             a1 = accelerate(q, v, us[k], friction)
@@ -201,6 +206,74 @@ def test_readings_that_err_for_a_while_are_no_heavy_tails():
                          progress=False)  # fmt: skip
     assert found.noise.kind == "white"
     assert found.verdict in ("unknown", "partly explained")
+
+
+STEP = 3e-3  # What an encoder of 2048 counts in a turn shows.
+
+
+def simulate_encoder(n, friction, seed):
+    """The noise of the angle is far below the step of its encoder."""
+    return simulate(n, friction, seed, louder=np.array([[1.0], [0.2]]) * np.ones((2, n)), step=STEP)
+
+
+@pytest.fixture(scope="module")
+def on_encoder():
+    return [
+        cid.diagnose(make_loop(), simulate_encoder(800, (fc, 0.0), seed=1),
+                     catalogue=[*FEW, cid.effects.Quantization], progress=False)
+        for fc in (0.0, 0.4)
+    ]  # fmt: skip
+
+
+def test_the_steps_of_an_encoder_are_neither_finding_nor_alarm(on_encoder):
+    for found, verdict in zip(on_encoder, ("nothing missing", "explained"), strict=True):
+        assert found.verdict == verdict
+        assert found.noise.outputs[1][1] == pytest.approx(STEP / math.sqrt(12), rel=0.25)
+        (remark,) = (line for line in found.audit if line.startswith("converter: "))
+        assert "theta moves in steps of 0.003 rad" in remark
+        everything = (*found.findings, *found.stand_ins)
+        assert "Quantization" not in [f.name for f in everything]
+        assert "Quantization" not in [type(c.effect).__name__ for c in found.ranking]
+        assert "Quantization" not in [type(effect).__name__ for effect in found.loop.effects]
+
+
+def test_friction_is_named_at_its_place_beside_an_encoder(on_encoder):
+    clean, rubs = on_encoder
+    assert not clean.findings
+    (first,) = rubs.findings
+    assert (first.name, first.at) == ("CoulombFriction", "x_dot")
+    assert first.effect.fc == pytest.approx(0.4, rel=0.02)
+
+
+def test_the_steps_of_an_encoder_alarm_where_they_are_not_read_off():
+    record = simulate_encoder(800, (0.0, 0.0), seed=1)
+    found = cid.diagnose(make_loop(), record, catalogue=FEW, progress=False)
+    assert found.verdict == "unknown"
+
+
+def test_the_steps_of_each_output_are_taken_off_its_noise():
+    record = simulate_encoder(300, (0.0, 0.0), seed=1)
+    loop = make_loop(free=())
+    noise = Noise((1e2, 1e2), sensors=(75.0,))
+    fit = replace(begin_fit(make_problem(loop, (), [record]), np.zeros(0), noise),
+                  sensor=np.array([1e-8]))  # fmt: skip
+    model = Model(loop, fit)
+    (read,) = read_steps(fit, [cid.audit(record, loop)], [cid.effects.Quantization])
+    assert (read.effect.at, read.effect.step) == ("theta", pytest.approx(STEP))
+    rounding = with_rounding(model, [read])
+    left = rounding.fit.sensor[0] * rounding.fit.noise.sensors[0]
+    assert left == pytest.approx(0.05 * 75e-8)
+    assert rounding.fit.sensor[0] == fit.sensor[0]
+    assert rounding.fit.noise.force == noise.force
+    copy = make_replica(rounding)
+    x, theta = copy.records[0].y
+    np.testing.assert_allclose(np.round(theta / STEP), theta / STEP, atol=1e-6)
+    assert np.ptp(np.diff(np.unique(x))) > 0
+    coarser = replace(read, effect=cid.effects.Quantization(step=3e-4, at="x"))
+    both = with_rounding(model, [read, coarser])
+    assert both.fit.sensor[0] == pytest.approx(1e-8 - 3e-4**2 / 12)
+    assert both.fit.sensor[0] * both.fit.noise.sensors[0] == pytest.approx(left)
+    assert both.fit.sensor[0] * both.fit.noise.force[1] == pytest.approx(1e-6)
 
 
 def test_the_law_of_several_outputs_is_that_of_each():

@@ -43,6 +43,10 @@ def written_out(push=lambda x, u: (u, 0.0), show=lambda x: x[:2]):
          written_out(show=lambda x: np.array([x[0], 1.1 * x[1]]))),
         (E.SensorOffset(offset=0.01, at="theta"),
          written_out(show=lambda x: np.array([x[0], x[1] + 0.01]))),
+        (E.Quantization(step=0.002, at="theta"),
+         written_out(show=lambda x: np.array([x[0], 0.002 * np.round(x[1] / 0.002)]))),
+        (E.SensorSaturation(lower=-0.02, upper=0.02, at="theta"),
+         written_out(show=lambda x: np.array([x[0], np.clip(x[1], -0.02, 0.02)]))),
     ],
 )  # fmt: skip
 def test_an_effect_acts_where_it_says(effect, plant):
@@ -51,6 +55,19 @@ def test_an_effect_acts_where_it_says(effect, plant):
     runs = [cid.simulate(one, d=np.full(300, 0.05), initial=START) for one in (loop, by_hand)]
     np.testing.assert_allclose(runs[0].y, runs[1].y, rtol=1e-7, atol=1e-10)
     np.testing.assert_allclose(runs[0].u, runs[1].u, rtol=1e-7, atol=1e-10)
+
+
+def test_each_output_has_readings_of_its_own():
+    saturated = E.SensorSaturation(lower=-0.011, upper=0.011, at="x")
+    loop = cart(
+        E.Quantization(step=0.005, at="x"), saturated, E.Quantization(step=0.02, at="theta")
+    )
+    noise = (1e-3, 2e-3)
+    record = cid.simulate(loop, d=np.full(300, 0.05), sensor_noise=noise, initial=START, seed=1)
+    assert set(np.round(record.y[0], 9)) <= {-0.011, -0.01, -0.005, 0.0, 0.005, 0.01, 0.011}
+    assert {-0.011, 0.011} & set(np.round(record.y[0], 9))
+    np.testing.assert_allclose(np.round(record.y[1] / 0.02), record.y[1] / 0.02, atol=1e-9)
+    assert len(np.unique(record.y[1])) > 2
 
 
 def test_a_force_without_a_known_input_accelerates_one_coordinate():
@@ -118,7 +135,7 @@ def test_one_place_needs_no_name_and_takes_it():
         (lambda: cart(E.CoulombFriction(fc=0.1, at="x")), "given at='x', but cart_pole has x_dot"),
         (lambda: cart(E.InputOffset(offset=0.1, at="V")), "an input; given at='V'"),
         (lambda: drive().with_effect(E.InputOffset(offset=0.1, at="G")), "servo has V"),
-        (lambda: cart(E.Quantization(step=0.1, at="x")), "several outputs do not take yet"),
+        (lambda: cart(E.Quantization(step=0.1)), "say which with at=, one of x, theta"),
         (lambda: cid.Loop(QUAD, dt=DT).with_effect(E.InputDelay(delay=DT, at="F1")),
          "remembers the one input of a plant; quadrotor_planar has F1, F2"),
     ],

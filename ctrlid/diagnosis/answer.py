@@ -79,14 +79,14 @@ def assemble_answer(
     stand_ins = tuple(_doubt_name(one, ground) for one, ground in grounds)
     # The steps of a converter belong to the record; no part of the loop is missing.
     steps = [r for r in read if isinstance(r.effect, Quantization)]
-    remarks = tuple(_describe_steps(r, gap.unit) for r in steps)
+    units = _find_units(loop)
+    remarks = tuple(_describe_steps(r, units.get(r.effect.at, gap.unit)) for r in steps)
     read = [r for r in read if r not in steps]
     findings += tuple(Finding(r.effect, r.errors, (), (), r.evidence) for r in read)
     findings = tuple(sorted(findings, key=lambda f: -f.evidence))
     final = fitted.loop
     for r in read:
         final = final if r.effect in final.effects else final.with_effect(r.effect)
-    units = _find_units(loop)
     where = locate_errors(found.before, found.after, units)
     left = gap_is_left(
         gap, disturbance, found.final.fit, summary.excess_chance, summary.worse_chance
@@ -122,8 +122,8 @@ def _list_notes(loop: Loop, found: Search) -> list[str]:
     if not loop.equations().siso:
         notes.append(
             "with several inputs or outputs the noise of each output is taken to be white: "
-            "coloured noise, steps and limits of a sensor, delays of one of several "
-            "inputs, repeats of the experiment and errors of the log are not looked for"
+            "coloured noise, limits of a sensor, delays of one of several inputs, repeats of the "
+            "experiment and errors of the log are not looked for"
         )
     if loop.linear_plant and not found.after.passed:
         notes.append(
@@ -177,7 +177,8 @@ def _doubt_name(finding: Finding, ground: str) -> Finding:
 
 def _describe_steps(read: Readout, unit: str) -> str:
     step = write_quantity(read.effect.values()["step"], unit)
-    return (f"converter: y moves in steps of {step}, whose rounding makes a good part of the "
+    name = read.effect.at or "y"
+    return (f"converter: {name} moves in steps of {step}, whose rounding makes a good part of the "
             "sensor noise")  # fmt: skip
 
 

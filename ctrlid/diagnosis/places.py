@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from ..data.record import Record
-from ..effects import AbstractEffect
+from ..effects import AbstractEffect, ReadingEffect
 from ..effects.context import find_motion, find_output_of
 from ..loop.loop import Loop
 from ..physics.equations import Equations
@@ -62,6 +62,9 @@ def list_placed_candidates(
 ) -> list[AbstractEffect]:
     """Return an effect at its start, at each place of a plant with several signals."""
     e = loop.equations()
+    if issubclass(kind, ReadingEffect):
+        # The filter does not see what becomes of a noisy reading: steps are read off the record.
+        return []
     u, y = record.signals["u"], record.signals["y"]
     found: list[AbstractEffect] = []
     for at in list_places(loop, kind):

@@ -271,7 +271,7 @@ def _answer_question(q: Question) -> tuple[Diagnosis, Search]:
         search, summary = take_back_widening(q.loop, search, summary, q.fresh)
     # Step 10: the decision table.
     q.tell("writing the report")
-    read = (*readout.found, *([steps] if steps else []))
+    read = (*readout.found, *steps)
     result = assemble_answer(q.loop, q.records, search, summary, read)
     worth = (
         q.loop.equations().siso

@@ -147,7 +147,7 @@ def read_limits(
     catalogue: Sequence[type[AbstractEffect]],
 ) -> ReadLimits:  # fmt: skip
     """Return the loop with the sensor's limits and the records without samples that sit on them."""
-    # A reading of several outputs takes no limits and no steps: the audit tells of them.
+    # Samples on a limit are left out of one output alone; of several the audit tells of them.
     found = read_clipping(records, audits, catalogue) if loop.equations().siso else None
     if found is None:
         return ReadLimits(loop, tuple(records), ())
@@ -194,18 +194,25 @@ def censor_record(record: Record, effect: AbstractEffect) -> Record:
 
 def read_steps(
     fit: Fit, audits: Sequence[Audit], catalogue: Sequence[type[AbstractEffect]]
-) -> Readout | None:
-    r"""Return the step of the sensor if it makes a good part of its noise.
+) -> tuple[Readout, ...]:
+    r"""Return the step of each sensor if it makes a good part of its noise.
 
     Rounding to steps q adds a variance of :math:`q^2/12`; knowing it, the likelihood gains
     :math:`\tfrac{n}{2} \ln r / (r - q^2/12)`.
     """
-    if not fit.plant.e.siso:
-        return None
-    step = max((float(a.quantum.get("y", 0.0)) for a in audits), default=0.0)
-    noise = float(np.mean(fit.sensor))
-    share = step**2 / ROUNDING / noise if noise > 0 else 0.0
-    if Quantization not in catalogue or share < THRESHOLD.coarse_steps:
-        return None
-    gain = -0.5 * fit.size * math.log(max(1 - share, THRESHOLD.noise_beside_steps))
-    return Readout(Quantization(step), gain, {"step": 0.0})
+    e = fit.plant.e
+    if Quantization not in catalogue:
+        return ()
+    found = []
+    for k, name in enumerate(e.outputs):
+        # The audit calls the signals of a plant with one of each u and y.
+        key, at = ("y", "") if e.siso else (name, name)
+        step = max((float(a.quantum.get(key, 0.0)) for a in audits), default=0.0)
+        noise = float(np.mean(fit.sensor)) * (1.0, *fit.noise.sensors)[k]
+        share = step**2 / ROUNDING / noise if noise > 0 else 0.0
+        if share < THRESHOLD.coarse_steps:
+            continue
+        size = fit.size if e.siso else sum(int(keep[:, k].sum()) for keep in fit.counts)
+        gain = -0.5 * size * math.log(max(1 - share, THRESHOLD.noise_beside_steps))
+        found.append(Readout(Quantization(step, at=at), gain, {"step": 0.0}))
+    return tuple(found)

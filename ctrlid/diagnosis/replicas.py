@@ -169,9 +169,12 @@ def forgive_filter(tests: NoiseTests, copies: Sequence[Model | None]) -> NoiseTe
             max(value, THRESHOLD.tiny)
         ) > THRESHOLD.beyond_replica * math.log(max(usual, THRESHOLD.tiny))
         p[name] = max(value, 0.5) if failed else value
-    return replace(
-        tests, p_values=p, alpha=THRESHOLD.false_alarm_beside_kinks if bent else tests.alpha
-    )
+    outputs = {
+        name: replace(one, p_values={test: p[f"{test} of {name}"] for test in one.p_values})
+        for name, one in tests.outputs.items()
+    }
+    alpha = THRESHOLD.false_alarm_beside_kinks if bent else tests.alpha
+    return replace(tests, p_values=p, alpha=alpha, outputs=outputs)
 
 
 def follow_record(loop: Loop, record: Record) -> Loop | None:
@@ -231,22 +234,32 @@ def _design_normalized_controller(model: Any, dt: float, u: Array, y: Array) -> 
     return ct.ss(matrix, through / y, feedback * u[:, None], 0, plant.dt)
 
 
-def forgive_rounding(tests: NoiseTests, model: Model, steps: Readout) -> NoiseTests:
-    """Return the tests without alarms that a rounding sensor raises on replicas as well."""
+def forgive_rounding(tests: NoiseTests, model: Model, steps: Sequence[Readout]) -> NoiseTests:
+    """Return the tests without alarms that rounding sensors raise on replicas as well."""
     rounding = with_rounding(model, steps)
     return forgive_filter(tests, [make_replica(rounding, seed) for seed in (1, 2)])
 
 
-def with_rounding(model: Model, coarse: Readout) -> Model:
-    """Return the model with a rounding sensor, whose steps are then no part of its noise.
+def with_rounding(model: Model, coarse: Sequence[Readout]) -> Model:
+    """Return the model with rounding sensors, whose steps are then no part of their noise.
 
     Rounding is no white noise: a record simulated with it says what it does to the tests.
     """
-    fit = model.fit
-    step = coarse.effect.values()["step"]
-    sensor = np.maximum(fit.sensor - step**2 / ROUNDING, THRESHOLD.sensor_beside_steps * fit.sensor)
-    ratio = float(np.mean(fit.sensor) / np.mean(sensor))
+    fit, loop, outputs = model.fit, model.loop, model.plant.e.outputs
+    steps = dict.fromkeys(outputs, 0.0)
+    for one in coarse:
+        steps[one.effect.at or outputs[0]] = one.effect.values()["step"]
+        loop = loop.with_effect(one.effect)
+    first, *others = (
+        np.maximum(v - step**2 / ROUNDING, THRESHOLD.sensor_beside_steps * v)
+        for v, step in zip(
+            [fit.sensor, *(fit.sensor * size for size in fit.noise.sensors)], steps.values(),
+            strict=True,
+        )
+    )  # fmt: skip
+    # All noises are told in units of that of the first sensor.
+    sensors = tuple(float(np.mean(v) / np.mean(first)) for v in others)
+    ratio = float(np.mean(fit.sensor) / np.mean(first))
     force = tuple(v * ratio for v in fit.noise.force)
-    noise = replace(fit.noise, force=force, drift=fit.noise.drift * ratio)
-    loop = model.loop.with_effect(coarse.effect)
-    return Model(loop, replace(fit, sensor=sensor, noise=noise))
+    noise = replace(fit.noise, sensors=sensors, force=force, drift=fit.noise.drift * ratio)
+    return Model(loop, replace(fit, sensor=first, noise=noise))

@@ -141,13 +141,9 @@ class ReadingEffect(AbstractEffect):
 
     def build(self, e: Equations, m: Moment) -> Equations:
         """Return the equations with the readout appended to what there is."""
-        if len(e.outputs) > 1:
-            raise EffectDoesNotApply(
-                f"{type(self).__name__} changes a noisy reading, which loops of several outputs do "
-                f"not take yet; {e.name} has {', '.join(e.outputs)}"
-            )
-        reading = casadi.SX.sym("reading") if e.reading is None else e.reading
-        m.y = Symbol(reading if e.readout is None else e.readout)
-        return dataclasses.replace(
-            e, reading=reading, readout=to_expression(trace_hook(self.read)(m))
-        )
+        reading = casadi.SX.sym("reading", len(e.outputs)) if e.reading is None else e.reading
+        each = casadi.vertsplit(reading if e.readout is None else e.readout)
+        place = e.outputs.index(self.at) if self.at else 0
+        m.y = Symbol(each[place])
+        each[place] = to_expression(trace_hook(self.read)(m))
+        return dataclasses.replace(e, reading=reading, readout=casadi.vertcat(*each))

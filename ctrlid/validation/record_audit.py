@@ -246,7 +246,9 @@ def _audit_several(record: Record, loop: Loop | None) -> Audit:
             found += [*checks.find_gaps(), *checks.find_outliers()]
         elif key == "r":
             found += checks.find_repetition()
-        quantum[name], saturated[name] = checks.quantum[key], checks.saturated[key]
+        # A reference may have the name of the output that follows it.
+        if key != "r" or name not in y:
+            quantum[name], saturated[name] = checks.quantum[key], checks.saturated[key]
         findings += [
             replace(f, channel=name, text=f"{name}: {f.text}") if f.channel else f
             for f in found if f.channel in ("", key)
