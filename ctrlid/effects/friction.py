@@ -13,10 +13,8 @@ from .kinds import ForceEffect
 from .parameters import parameter
 from .scanning import Range
 
-# Within one sample friction changes the velocity by fc*dt. What sticks creeps in the model at less
-# than this share of that: at a quarter it crept farther than an encoder's noise in half a second,
-# and below a fiftieth the steps of the integration no longer resolve the jump.
-STICKING = 0.05
+# Within one sample friction changes the velocity by fc*dt: samples cannot show how it sticks.
+STICKING = 0.25
 # Stribeck's velocity lies between these shares of the largest usual speed.
 SLOWEST, FASTEST = 1e-3, 3.0
 # Half the difference over the mean friction is at most 1 for friction; the rest is left to the
@@ -102,7 +100,7 @@ class CoulombFriction(ForceEffect):
 
     .. math:: a = -f_c \, \mathrm{sign}(\dot x)
 
-    The jump at rest is spread over what friction changes within a twentieth of a sample, and, in a
+    The jump at rest is spread over what friction changes within a quarter of a sample, and, in a
     filter, over what it does not know of the velocity.
 
     Parameters
