@@ -71,6 +71,14 @@ def test_unreachable_outputs_are_refused(plant, output, words):
         cid.operating_point(plant, output=output)
 
 
+def test_a_plant_that_changes_with_time_has_no_operating_point():
+    plant = ct.nlsys(lambda t, x, u, params: np.array([x[1], np.sin(t) - x[0] + u[0]]),
+                     lambda t, x, u, params: x[0], name="shaken", inputs=1, outputs=1,
+                     states=2)  # fmt: skip
+    with pytest.raises(CtrlidError, match=r"shaken changes with time .* without t, .* input"):
+        cid.operating_point(plant, output=0.1)
+
+
 def two_signs(t, x, u, params):
     return [x[1], u[0] ** 2 - 4 * x[0]]
 

@@ -187,6 +187,12 @@ def operating_point(
     target = _check_target(equations, output)
     n = len(equations.states)
     residual = equations.rhs - equations.x if equations.dt else equations.rhs
+    if casadi.depends_on(casadi.vertcat(residual, equations.output), equations.t):
+        raise ModelCannotRun(
+            f"{equations.name} changes with time by itself, because its equations use t, so that "
+            "it has no operating point. Write the equations without t, and what they read from t "
+            "as a further input or as a parameter held at one value"
+        )
     z = casadi.vertcat(equations.x, equations.u)
     goal = casadi.vertcat(residual, equations.output - casadi.DM(target))
     both = casadi.Function("equilibrium", [z, equations.p], [goal, casadi.jacobian(goal, z)])
