@@ -203,9 +203,14 @@ def too_short(t, x, u, params):
     return [x[1]]
 
 
+def whole_input(t, x, u, params):
+    return np.array([x[1], -x[0] + u])
+
+
 @pytest.mark.parametrize(
     ("update", "words"),
     [
+        (whole_input, ["value 2 of 2 that the update function", r"write u\[0\] in place of u,"]),
         (if_on_state, [r"line \d+ of .*test_tracing.py: if x\[0\] > 0", "np.where"]),
         (conditional_expression, ["np.where"]),
         (chained_comparison, ["& and |"]),

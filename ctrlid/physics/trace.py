@@ -42,6 +42,13 @@ def _stack_expressions(result: Any, rows: int, what: str) -> Any:
     flat = np.asarray(result, dtype=object).reshape(-1)
     if flat.size != rows:
         raise TracingError(f"{what} returned {flat.size} values, but {rows} are declared")
+    wide = next((k for k, v in enumerate(flat) if isinstance(v, np.ndarray)), None)
+    if wide is not None:
+        raise TracingError(
+            f"value {wide + 1} of {rows} that {what} returned is an array, where a number is "
+            "needed: u and x are arrays even if they have one element; write u[0] in place of u, "
+            "or x[0] in place of x"
+        )
     return casadi.SX(casadi.vertcat(*(lift(v) for v in flat)))
 
 
