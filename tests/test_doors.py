@@ -233,8 +233,12 @@ def test_a_redesign_counts_a_converter_and_a_dead_zone_as_small_not_as_unstable(
 
 def test_an_analog_controller_of_a_loop_with_backlash_is_refused_and_no_divergence():
     loop = levitation(free=()).with_effect(E.InputBacklash(width=1e-3))
-    with pytest.raises(CtrlidError, match="acts on the samples of a digital controller"):
-        cid.redesign(cid.linearize(loop.plant, loop.at), loop, 100, 50)
+    P = cid.linearize(loop.plant, loop.at)
+    with pytest.raises(CtrlidError, match="acts on the samples of a digital controller") as refusal:
+        cid.redesign(P, loop, 100, 50)
+    # What the message says to do is done.
+    assert f"ct.sample_system(G, {loop.dt:g})" in str(refusal.value)
+    assert cid.redesign(ct.sample_system(P, loop.dt), loop, 100, 50).controller.dt == loop.dt
 
 
 def test_a_controller_without_states_is_a_function_of_r_and_y(loop):
