@@ -159,7 +159,7 @@ def test_refusals(fields, words):
 
 
 def test_keywords_only():
-    with pytest.raises(TypeError, match="positional"):
+    with pytest.raises(cid.CtrlidError, match=r"Record\(r=.*, dt=.*; given 3 values without"):
         cid.Record(np.ones(3), np.ones(3), 0.1)
 
 

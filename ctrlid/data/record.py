@@ -14,7 +14,7 @@ from scipy import signal
 from .._base.arguments import check_arguments, check_field_names, show_fields
 from .._base.errors import CtrlidError
 from .._base.signals import list_signals, require_one_signal
-from .._base.text import Printed, write_percent
+from .._base.text import Printed, write_count, write_percent
 from . import csv_files as _csv
 from . import responses as _response
 from .field_checks import check_samples, check_seconds, check_words
@@ -96,8 +96,14 @@ class Record(Printed):
     start: float = 0.0
     hold_r: Literal["zoh", "foh"] = "zoh"
 
-    def __new__(cls, **fields: Any) -> Self:
-        """Refuse unknown fields in words, before the generated constructor does so curtly."""
+    def __new__(cls, *values: Any, **fields: Any) -> Self:
+        """Refuse unnamed and unknown fields, before the generated constructor does so curtly."""
+        if values:
+            raise CtrlidError(
+                "the fields of a record are named, because r, u and y look alike: "
+                f"Record(r=..., u=..., y=..., dt=...); given {write_count(len(values), 'value')} "
+                "without a name"
+            )
         if "t" in fields:
             raise CtrlidError(_write_no_instants(fields["t"]))
         check_field_names(cls, fields)
