@@ -212,7 +212,8 @@ def _question_period(dt: float, stamps: Any, path: Path, label: str) -> None:
         warnings.warn(
             f"the time column {label!r} of {path} has no unit, so that it is taken in seconds and "
             f"the period is {dt:g} s. If it is in milliseconds or counts samples, write its unit "
-            f"into the header, as in '{label} [ms]', or give dt=; otherwise write '{label} [s]'",
+            f"into the header, as in '{label} [ms]', or remove the column and give dt=; otherwise "
+            f"write '{label} [s]'",
             CtrlidWarning, stacklevel=4,
         )  # fmt: skip
 
@@ -253,7 +254,8 @@ def _read_table(path: Path) -> tuple[dict[str, Any], list[str], Any]:
         raise CtrlidError(
             f"{path} has a single column, {line[:60]!r}: columns are separated by commas, "
             f"semicolons or tabs. If these are separated by {other!r}, replace it, or say so in a "
-            "first line such as sep=| (Excel reads that, too)"
+            "first line such as sep=| (Excel reads that, too); a line above the header, delete "
+            "it or start it with #"
         )
     if all(_is_number(cell) for cell in header):
         # numpy.savetxt writes its header as a comment.
@@ -306,12 +308,14 @@ def _read_with_blanks(path: Path, body: str, separator: str, above: int) -> Any:
                     raise CtrlidError(
                         f"{path} has a date or a time of day, {cell.strip()!r}, in line "
                         f"{above + k + 1}; times are numbers, in seconds from any start. Convert "
-                        "them, for instance with pandas.to_datetime(column), or give dt= and leave "
-                        "the column out"
+                        "them, for instance with pandas.to_datetime(column), or remove the column "
+                        "from the file and give dt=; a line above the header: delete it or start "
+                        "it with #"
                     ) from None
                 raise CtrlidError(
                     f"{path} is not a table of numbers: {cell.strip()!r} stands in line "
-                    f"{above + k + 1}. Remove it, or leave the cell blank and give gaps='mask'"
+                    f"{above + k + 1}. Remove it, or leave the cell blank and give gaps='mask'; "
+                    "lines above the header or a row of units: delete them or start them with #"
                 ) from None
         rows.append(numbers)
         if len(cells) != len(rows[0]):
@@ -467,7 +471,8 @@ def _make_uniform(stamps: Any, dt: float | None, gaps: str, path: Path) -> tuple
     usual = float(np.mean(regular))
     if dt is not None and not abs(usual - dt) < 0.05 * usual:
         raise CtrlidError(f"the time column of {path} steps by {usual:.4g} s, but dt is {dt:g} s. "
-                          "Leave out dt=, or remove the column")  # fmt: skip
+                          "Leave out dt=, or remove the column; if its times are in another unit, "
+                          "write it into the header, as in 't [ms]'")  # fmt: skip
     if dt is None:
         dt = estimate_period(stamps) if len(regular) == len(steps) else usual
     lost = np.round(steps / dt) - 1
