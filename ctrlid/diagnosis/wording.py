@@ -427,10 +427,11 @@ def describe_remains(found: Diagnosis) -> str:
     together = min(1.0, count * p)
     if found.verdict in COMPLETE or together > choose_alarm_level(len(found.added)):
         text = f"residuals: noise, by {count} tests. The smallest p-value is that of "
-        text += f"{name_test(name)}, {write_p_value(p)}"
         if p < THRESHOLD.telling:
-            text += f" ({write_p_value(together)} when corrected for the number of tests)"
-        return text
+            # Without its size, p < 0.0001 beside a corrected value reads as a contradiction.
+            return (f"{text}{name_test(name)}, p = {p:.2g}, which is {together:.2g} for the "
+                    f"smallest of {count}")  # fmt: skip
+        return f"{text}{name_test(name)}, {write_p_value(p)}"
     failed = sorted((v, k) for k, v in found.tests.items() if v < THRESHOLD.telling) or [(p, name)]
     names = [name_test(name) for _, name in failed[:LISTED]]
     if len(failed) > LISTED:
