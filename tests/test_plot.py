@@ -1,6 +1,7 @@
 """Pictures: units and legends that say what is drawn, refusals in words, nothing global changed."""
 
 from dataclasses import replace
+from types import ModuleType
 
 import control as ct
 import matplotlib as mpl
@@ -403,3 +404,8 @@ def test_png_of_figures_and_axes(record):
         with pytest.raises(cid.CtrlidError, match=r"png\(\) takes a figure or axes"):
             plot.png(wrong)
     assert isinstance(axes[0].figure, Figure)
+
+
+def test_only_what_draws_is_listed():
+    assert dir(cid.plot) == sorted(cid.plot.__all__)
+    assert not [name for name in dir(cid.plot) if isinstance(getattr(cid.plot, name), ModuleType)]

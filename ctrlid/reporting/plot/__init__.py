@@ -25,3 +25,8 @@ __all__ = [
     "style",
     "trend",
 ]
+
+
+def __dir__() -> list[str]:
+    """Return the functions that draw; a notebook completes these names."""
+    return __all__
