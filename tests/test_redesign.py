@@ -154,6 +154,7 @@ def test_limits_that_lose_the_ball_are_not_called_stable():
     assert np.isnan(found.achieved.settling_time)
     assert "WITH A STEP OF 0.00012 THE LOOP DIVERGES. After " in found.verdict
     assert "with V at its limit (2.95 to 3.05)" in found.verdict
+    assert "give a smaller step= to redesign" in found.verdict
     assert len(found.achieved_step) < len(found.time)
     small = cid.redesign(P, tight, crossover=100, phase_margin=50, step=1e-6)
     assert small.stable

@@ -141,7 +141,8 @@ class Redesign(Printed):
             text += f", so the promise holds within {max(math.ceil(100 * worst), 1)} %."
         if not a.stable:
             text += (f" This is for small signals: WITH A STEP OF {self.step:.3g} THE LOOP "
-                     f"DIVERGES. {self.failure}")  # fmt: skip
+                     f"DIVERGES. {self.failure} Where such a step is beyond the range "
+                     "of the plant, give a smaller step= to redesign.")  # fmt: skip
         elif np.isfinite(p.settling_time) and not np.isfinite(a.settling_time):
             text += (f" This is for small signals: WITH A STEP OF {self.step:.3g} THE RESPONSE "
                      "DOES NOT SETTLE, because the input saturates or the step leaves the linear "
