@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 import ctrlid as cid
 from ctrlid import plot
 from ctrlid.reporting import pictures as _pictures
+from ctrlid.reporting.plot import findings
 from ctrlid.reporting.plot.axes import COLOURS
 from problems import legend, record_of, redesigned_levitation, servo
 
@@ -409,3 +410,16 @@ def test_png_of_figures_and_axes(record):
 def test_only_what_draws_is_listed():
     assert dir(cid.plot) == sorted(cid.plot.__all__)
     assert not [name for name in dir(cid.plot) if isinstance(getattr(cid.plot, name), ModuleType)]
+
+
+@pytest.mark.parametrize(
+    ("edges", "ticks"),
+    [
+        ([-40.0, -3.63, 5.0, 30.0, 400.0], [-40.0, 0.0, 30.0, 400.0]),
+        ([-900.0, -10.0, 0.0, 10.0, 900.0], [-900.0, -10.0, 0.0, 10.0, 900.0]),
+    ],
+)
+def test_ticks_keep_apart(edges, ticks):
+    ax = Figure().subplots()
+    ax.set_xscale("symlog", linthresh=max(abs(edges[1]), abs(edges[-2])))
+    assert findings._space_ticks(ax, np.array(edges)) == ticks

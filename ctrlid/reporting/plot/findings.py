@@ -22,6 +22,8 @@ from .axes import (
     take_axes,
 )
 
+# Labels of ticks need this share of the width of an axis.
+APART = 0.13
 BEFORE = {"color": COLOURS[1], "linestyle": "--", "linewidth": 1.4}
 AFTER = {"color": COLOURS[0], "linestyle": "-", "linewidth": 1.4}
 FILLS: dict[str, dict[str, Any]] = {
@@ -154,13 +156,26 @@ def _draw_errors(ax: Any, place: BinnedErrors | None, found: Diagnosis) -> None:
     if np.ptp(inner) < np.ptp(edges) / 4 and np.any(inner):
         # Seldom and far values would leave no room for the others.
         ax.set_xscale("symlog", linthresh=float(np.max(np.abs(inner))))
-        ax.xaxis.set_major_locator(FixedLocator([edges[0], inner[0], 0.0, inner[-1], edges[-1]]))
+        ax.xaxis.set_major_locator(FixedLocator(_space_ticks(ax, edges)))
         ax.xaxis.set_minor_locator(NullLocator())
         ax.xaxis.set_major_formatter(lambda v, _: f"{v:.0f}" if abs(v) >= 100 else f"{v:.3g}")
     if top > 10:
         ax.set_yscale("log")
     else:
         ax.set_ylim(0, 1.1 * top)
+
+
+def _space_ticks(ax: Any, edges: Array) -> list[float]:
+    """Return the ends, zero and the inner ends of bins, without those that would overlap."""
+    scale = ax.xaxis.get_transform()
+    low, high = scale.transform(np.array([edges[0], edges[-1]]))
+    kept, places = [float(edges[0]), float(edges[-1])], [0.0, 1.0]
+    for value in (0.0, float(edges[1]), float(edges[-2])):
+        place = float((scale.transform(np.array([value]))[0] - low) / (high - low))
+        if 0 < place < 1 and min(abs(place - other) for other in places) >= APART:
+            kept.append(value)
+            places.append(place)
+    return sorted(kept)
 
 
 def _draw_ranking(ax: Any, rounds: Mapping[int, Sequence[_pictures.Bar]]) -> None:
