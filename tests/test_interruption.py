@@ -86,6 +86,8 @@ def test_the_answer_so_far(record, tmp_path):
     assert (found.verdict, found.finished, found.findings) == ("unknown", False, ())
     assert found.sentence.startswith("THE SEARCH WAS NOT FINISHED: it was stopped after ")
     assert "(round 1: screening" in found.sentence
+    # The command line prints this sentence too, so that it names no argument of Python.
+    assert found.sentence.endswith("Give the search more time, or fewer effects to try.")
     assert "Nothing is named yet" in found.sentence
     again = cid.load_diagnosis(found.save(tmp_path / "found.json"))
     assert (again.finished, str(again)) == (False, str(found))

@@ -185,7 +185,7 @@ def declare_unfinished(found: Diagnosis, place: str, spent: str) -> Diagnosis:
     sentence = (
         f"THE SEARCH WAS NOT FINISHED: it was stopped after {spent} "
         f"({place}). {so_far}, and {left}. What was not tried may explain it better. Give the "
-        "search more time, or fewer effects in catalogue=."
+        "search more time, or fewer effects to try."
     )
     return replace(found, verdict=choose_verdict(False, named), sentence=sentence, finished=False)
 
