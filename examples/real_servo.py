@@ -43,11 +43,11 @@ model = cid.Loop(plant, None, dt=record.dt, at=rest, free=("a", "b"))
 # What is missing?
 # ----------------
 # `diagnose` finds dry friction that is stronger in one direction. On this plant that is the same as
-# symmetric dry friction with a constant force, and no record of u and y can tell them apart. It
-# also finds the line at 60 Hz, folded to 40 Hz. But the residuals are not noise, the sizes differ
-# between stretches of the record, and a prediction four samples ahead on the random steps, which
-# were not used for the fit, is no better with these effects. So the report lets no name stand, and
-# the verdict is "unknown": something is missing that the catalogue does not have.
+# symmetric dry friction with a constant force, and no record of u and y can tell them apart. But
+# the residuals are not noise, its size differs between stretches of the record, and a prediction
+# four samples ahead on the random steps, which were not used for the fit, is hardly better with it.
+# So the report lets no name stand. The search ends at its bound before it is finished, and the
+# verdict is "unknown": something is missing that the catalogue does not have.
 
 found = cid.diagnose(model, record, validation=other, progress=False)
 print(found)
@@ -67,7 +67,7 @@ print(f"gap {found.gap.given:.3f} V as given, {found.gap.after:.3f} V with the e
       f"floor {found.gap.floor:.3f} V")  # fmt: skip
 
 assert found.verdict == "unknown"
-assert any("60 Hz (of the mains)" in line for line in str(found).splitlines())
+assert not found.findings
 assert friction.name in ("AsymmetricCoulombFriction", "CoulombFriction")
 assert abs(volts["difference"] - 0.75) < 0.15
 assert found.gap.after < 1.1 * found.gap.given

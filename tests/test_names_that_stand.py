@@ -9,8 +9,9 @@ import pytest
 
 import ctrlid as cid
 import ctrlid.effects as E
-from ctrlid.diagnosis.constancy import _estimate_alone
+from ctrlid.diagnosis.constancy import _estimate_alone, compare_stretches
 from ctrlid.diagnosis.grounds import Case, is_one_of_several, is_phase_locked, narrows_no_gap
+from ctrlid.diagnosis.recalibration import fit_base_model
 from ctrlid.reporting.tables import make_blocks
 
 DT, N = 0.01, 2000
@@ -65,6 +66,19 @@ def test_a_size_that_differs_between_stretches_is_a_stand_in(half):
     assert "differs between stretches" in half.stand_ins[0].note
     assert "does not stand" in half.sentence
     assert "CubicStiffness" in repr(half)
+
+
+def test_a_size_that_differs_by_little_is_one_size():
+    """With little noise a record tells sizes apart that differ by a fiftieth."""
+    end = N * DT / 2
+    record = simulate_mass(steps(3), lambda t, x, v: -(253 if t < end else 247) * x**3)
+    found = cid.diagnose(mass(), record, catalogue=(E.CubicStiffness,), progress=False)
+    assert [f.name for f in found.findings] == ["CubicStiffness"]
+    fit = fit_base_model(
+        mass().with_effect(E.CubicStiffness(k3=250.0)), [record], ("CubicStiffness.k3",)
+    ).fit
+    assert compare_stretches(fit, "CubicStiffness.k3") < 0.01
+    assert compare_stretches(fit, "CubicStiffness.k3", 12.0) > 0.1
 
 
 def test_stand_ins_have_a_section_of_their_own(half, tmp_path):

@@ -117,11 +117,11 @@ def compute_bin_probability(sums: Array, variances: Array, shared: Array, fit: F
     return float(stats.chi2.sf(value * mean / square, mean**2 / square))
 
 
-def compare_stretches(fit: Fit, name: str) -> float:
+def compare_stretches(fit: Fit, name: str, harmless: float = 0.0) -> float:
     r"""Return the probability that a parameter is as unlike in stretches of the records by chance.
 
     .. math:: \delta_b = \bigl(I_b^{-1} U_b\bigr)_j, \quad
-        V_b = \bigl(I_b^{-1} J_b I_b^{-1}\bigr)_{jj}, \quad
+        V_b = \bigl(I_b^{-1} J_b I_b^{-1}\bigr)_{jj} + h^2, \quad
         \chi^2 = \sum_b (\delta_b - \bar\delta)^2 / V_b
 
     with score :math:`U_b` and information :math:`I_b` of all parameters in stretch b, so that the
@@ -134,6 +134,9 @@ def compare_stretches(fit: Fit, name: str) -> float:
         The fitted model.
     name : str
         The parameter.
+    harmless : float, optional
+        Differences h that do no harm [unit of the parameter]: with little noise a record tells
+        sizes apart that are one size to whoever uses the model.
 
     Returns
     -------
@@ -159,7 +162,7 @@ def compare_stretches(fit: Fit, name: str) -> float:
             move, variance = _estimate_alone(x, e, j)
             if variance > 0:
                 moves.append(move)
-                sizes.append(variance)
+                sizes.append(variance + harmless**2)
     if len(moves) < 2:
         return 1.0
     d, weights = np.array(moves), 1 / np.array(sizes)

@@ -109,16 +109,22 @@ def cancels_a_known_force(case: Case, f: Weighed) -> str:
 
 
 def differs_between_stretches(case: Case, f: Weighed) -> str:
-    """Say if the sizes from stretches that inform about it differ; an event is in one of them."""
+    """Say if the sizes from stretches that inform about it differ; an event is in one of them.
+
+    A size is how far a parameter is from its neutral value, and small parts of it do not count.
+    """
     if case.final.errors is not None:
         # What was fitted by another criterion has no scores.
         return ""
     label, effect = case.read_effect(f)
     if any(p.instant for p in effect.parameters()):
         return ""
-    sizes = [f"{label}.{p.name}" for p in effect.parameters() if p.neutral is not None]
-    sizes = [name for name in sizes if name in case.final.names]
-    chances = [compare_stretches(case.final.fit, name) for name in sizes]
+    values = effect.values()
+    sizes = {f"{label}.{p.name}": abs(values[p.name] - p.neutral)
+             for p in effect.parameters() if p.neutral is not None}  # fmt: skip
+    sizes = {name: size for name, size in sizes.items() if name in case.final.names}
+    chances = [compare_stretches(case.final.fit, name, THRESHOLD.same_size * size)
+               for name, size in sizes.items()]  # fmt: skip
     p = min((p * len(sizes) for p in chances), default=1.0)
     if p >= THRESHOLD.beyond_chance:
         return ""

@@ -459,6 +459,11 @@ class Thresholds:
         unit="of each record",
     )  # fmt: skip
 
+    same_size: float = declare_number(
+        0.05, convention="quarters whose sizes differ by less have one size for who uses the model",
+        unit="of the size",
+    )  # fmt: skip
+
     # Stable plants, by the error of an open-loop simulation.
     open_loop_samples: int = declare_number(12_000, cost="longer records are not searched so",
                                    unit="samples")  # fmt: skip
