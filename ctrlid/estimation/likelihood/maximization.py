@@ -19,7 +19,14 @@ from .kalman_filter import (
     guess_trajectory,
     linearize_inside_domain,
 )
-from .likelihood import Fit, Problem, evaluate_likelihood, list_start_values, relinearize_fit
+from .likelihood import (
+    Fit,
+    Problem,
+    evaluate_likelihood,
+    list_start_values,
+    rank_by_likelihood,
+    relinearize_fit,
+)
 from .noise_fit import (
     LOG_STEP,
     choose_force_ratios,
@@ -79,14 +86,30 @@ def begin_fit(problem: Problem, theta: Array | None = None, noise: Noise | None 
     noise = problem.known.noise if problem.known else noise
     theta = list_start_values(problem.plant.loop, problem.plant.names) if theta is None else theta
     beside = bool(problem.plant.loop.effects)
+    found = []
     try:
         fit = _begin_with_noise(problem, theta, noise)
-        if math.isfinite(fit.value) or not beside:
+        if not beside or _stays_inside_domain(fit):
             return fit
+        found.append(fit)
     except ModelCannotRun:
         if not beside:
             raise
-    return _begin_beside_effects(problem, theta, noise)
+    try:
+        found.append(_begin_beside_effects(problem, theta, noise))
+    except ModelCannotRun:
+        if not found:
+            raise
+    return max(found, key=rank_by_likelihood)
+
+
+def _stays_inside_domain(fit: Fit) -> bool:
+    """Whether a fit follows the records without leaving where the plant is defined."""
+    if not math.isfinite(fit.value):
+        return False
+    pairs = zip(fit.data, fit.trajectories, strict=True)
+    return all(linearize_inside_domain(fit.plant, one, fit.theta, at)[0] is at
+               for one, at in pairs)  # fmt: skip
 
 
 def _begin_beside_effects(problem: Problem, theta: Array, noise: Noise | None) -> Fit:
