@@ -36,9 +36,7 @@ def write_list_table(head, rows, widths):
 
 
 def write_tables(path=FILE):
-    """Return the tables of a study as lines of a page; a sentence where there is no file yet."""
-    if not path.exists():
-        return ["The file of this version's run is not there yet; until then there are no figures."]
+    """Return the tables of a study as lines of a page."""
     study = load_study()
     lines = study.read(path)
     counts = {name: sum(x["class"] == name for x in lines) for name in study.cases.CLASSES}
@@ -55,8 +53,6 @@ def write_tables(path=FILE):
 
 def write_summary(path=FILE):
     """Return what has a target, what was measured and the target, as a list of sentences."""
-    if not path.exists():
-        return ["The file of this version's run is not there yet; until then there are no figures."]
     study = load_study()
     out, first = [], ""
     for what, target, found in study.score(study.read(path)):

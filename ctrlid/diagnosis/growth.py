@@ -238,7 +238,20 @@ def _may_be_coloured(fit: Fit, more: float) -> bool:
     return THRESHOLD.colour_promise * told > more + least
 
 
-def refuse_larger_noise(found: Search, is_larger: Callable[[Model], bool]) -> Search:
+def refuse_false_noise(found: Search, is_larger: Callable[[Model], bool]) -> Search:
+    """Return the search without sensor noise that stands for something else.
+
+    Parameters
+    ----------
+    found : Search
+        The end of a search.
+    is_larger : callable
+        ``is_larger(model)``: whether the noise of a model exceeds what the model leaves.
+    """
+    return _refuse_bursts(_refuse_larger_noise(found, is_larger))
+
+
+def _refuse_larger_noise(found: Search, is_larger: Callable[[Model], bool]) -> Search:
     """Return the search with white sensor noise in the place of what exceeds the gap that it left.
 
     Coloured noise that was chosen before the effects were found may be too large beside them.
@@ -249,7 +262,7 @@ def refuse_larger_noise(found: Search, is_larger: Callable[[Model], bool]) -> Se
     return _weigh_with_noise(found, fit.noise.plain)
 
 
-def refuse_bursts(found: Search) -> Search:
+def _refuse_bursts(found: Search) -> Search:
     """Return the search with Gaussian sensor noise where the wild readings come in bursts.
 
     These are events of the plant, or of a clock, that heavy tails of several outputs stood for.
@@ -263,7 +276,11 @@ def refuse_bursts(found: Search) -> Search:
 def _weigh_with_noise(found: Search, noise: Noise) -> Search:
     """Return the search with what was found weighed anew, beside noise of another kind."""
     plain = refit_noise_size(maximize(replace(found.final.fit, noise=noise)))
-    model = Model(found.final.loop, drop_linearization(choose_noise(plain)))
+    return _weigh_anew(found, Model(found.final.loop, drop_linearization(choose_noise(plain))))
+
+
+def _weigh_anew(found: Search, model: Model) -> Search:
+    """Return the search with another final model, its effects weighed and what it leaves tested."""
     model, left = weigh_effects(model, len(found.base.loop.effects), found.steps)
     return replace(found, final=model, found=left, after=retest_with_replicas(model))
 
@@ -410,10 +427,7 @@ def keep_main_effects(found: Search, helps: Callable[[Weighed, Model], bool]) ->
     for f in sorted(found.found, key=lambda f: -f.position):
         if f.trial.gain < THRESHOLD.minor * total and not helps(f, found.final):
             model = refit_without_effect(model, f.position)[0]
-    if model is found.final:
-        return found
-    model, left = weigh_effects(model, len(found.base.loop.effects), found.steps)
-    return replace(found, final=model, found=left, after=retest_with_replicas(model))
+    return found if model is found.final else _weigh_anew(found, model)
 
 
 def exchange_worst_effect(
@@ -433,7 +447,6 @@ def exchange_worst_effect(
     fresh : FreshData
         What models are compared on.
     """
-    given = len(found.base.loop.effects)
     worst = min(found.found, key=lambda f: fresh.measure_model_gap(f.base))
     base = with_linearization(worst.base)
     out = {worst.trial.key, *refused, *(name_at_place(e) for e in base.loop.effects)}
@@ -449,6 +462,4 @@ def exchange_worst_effect(
         and fresh.compute_widening_chance(t.model, worst.base) < THRESHOLD.beyond_chance
     ]  # fmt: skip
     model = min(liked, key=fresh.measure_model_gap, default=worst.base)
-    model, left = weigh_effects(model, given, found.steps)
-    after = retest_with_replicas(model)
-    return replace(found, final=model, found=left, after=after), worst.trial.key
+    return _weigh_anew(found, model), worst.trial.key

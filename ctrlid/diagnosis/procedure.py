@@ -36,8 +36,7 @@ from .growth import (
     choose_search,
     compare_names,
     keep_main_effects,
-    refuse_bursts,
-    refuse_larger_noise,
+    refuse_false_noise,
     search_effects,
 )
 from .log_errors import LogError, find_log_error
@@ -237,7 +236,7 @@ def _answer_question(q: Question) -> tuple[Diagnosis, Search]:
     with q.budget.running():
         search = search_effects(base, q.catalogue, q.work, q.tell, is_larger)
     if search.finished:
-        search = refuse_bursts(refuse_larger_noise(search, is_larger))
+        search = refuse_false_noise(search, is_larger)
     else:
         q.end()
     fresh = lengthen_horizon(q.loop, search, q.fresh)
@@ -292,7 +291,7 @@ def _search_again(
     other = search_effects(base, q.catalogue, q.work, q.tell, is_larger, search.other)
     if not other.finished:
         raise Stopped
-    other = refuse_bursts(refuse_larger_noise(other, is_larger))
+    other = refuse_false_noise(other, is_larger)
     return choose_search(search, other, helps, q.fresh.measure_model_gap)
 
 

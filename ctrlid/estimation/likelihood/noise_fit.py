@@ -64,8 +64,7 @@ def fit_noise(
         ).value
         return -value if np.isfinite(value) else 1e15
 
-    longest = find_longest_record(problem)
-    low, high = (ends[: len(start)] for ends in _bound_logs(problem, noise, longest))
+    low, high = (ends[: len(start)] for ends in _bound_logs(problem, noise))
     start = np.clip(start, low, high)
     if wide:
         # Several forces are in the same proportion to what is usual for each.
@@ -237,7 +236,7 @@ def _compute_reflections(coefficients: Sequence[float]) -> Array:
     return np.array(found[::-1])
 
 
-def _bound_logs(problem: Problem, noise: Noise, longest: int) -> tuple[Array, Array]:
+def _bound_logs(problem: Problem, noise: Noise) -> tuple[Array, Array]:
     """Return bounds of the logarithms of the noise variances, and of the angles.
 
     A force that hardly changes during a record is an offset, not noise.
@@ -248,24 +247,24 @@ def _bound_logs(problem: Problem, noise: Noise, longest: int) -> tuple[Array, Ar
     usual = [2 * math.log(scale / scales[0]) for scale in scales[1 : 1 + len(noise.sensors)]]
     low, high = [*low, *(v - MOST for v in usual)], [*high, *(v + MOST for v in usual)]
     if noise.drift:
-        unit = units[0]
+        unit, longest = units[0], _find_longest_record(problem)
         low += [unit + LEAST, math.log(2 * dt)]
         high += [unit + MOST, math.log(max(min(SLOWEST * longest, 2e4), 4.0) * dt)]
-    ends = [math.atanh(_find_slowest_root(longest))] * len(noise.ar) + [math.pi] * len(noise.ma)
+    ends = [math.atanh(_find_slowest_root(problem))] * len(noise.ar) + [math.pi] * len(noise.ma)
     return np.array([*low, *(-v for v in ends)]), np.array([*high, *ends])
 
 
-def find_longest_record(problem: Problem) -> int:
+def _find_longest_record(problem: Problem) -> int:
     """Return the number of samples of the longest record."""
     return max(len(data.record) for data in problem.data)
 
 
-def _find_slowest_root(samples: int) -> float:
+def _find_slowest_root(problem: Problem) -> float:
     """Return the slowest root of coloured sensor noise, which is a random walk to a record.
 
     Sensor noise that is correlated over more than the record would be an offset.
     """
-    return 1 - 1 / samples
+    return 1 - 1 / _find_longest_record(problem)
 
 
 def _evaluate_costs(cost: Callable[[Array], float], points: Iterable[Array]) -> Array:
@@ -389,7 +388,7 @@ def try_coloured_sensor(fit: Fit) -> Fit:
 
 def _list_walks(fit: Fit, forces: Sequence[tuple[float, ...]]) -> Iterable[Noise]:
     """Return sensor noises that are random walks beside white noise."""
-    root = _find_slowest_root(find_longest_record(fit.problem))
+    root = _find_slowest_root(fit.problem)
     for force, step in itertools.product(forces, WALKS):
         yield Noise(force, ar=(root,), ma=(-root * (1 - step),), tails=fit.noise.tails)
 
@@ -402,7 +401,7 @@ def count_noise_parameters(fit: Fit) -> int:
     noise = fit.noise
     if not noise.ar:
         return noise.parameters
-    slowest = _find_slowest_root(find_longest_record(fit.problem))
+    slowest = _find_slowest_root(fit.problem)
     walks = np.max(_compute_reflections(noise.ar)) > slowest - ON_THE_LIMIT
     return noise.parameters - int(walks)
 
