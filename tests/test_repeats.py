@@ -15,7 +15,7 @@ from ctrlid.diagnosis.recalibration import fit_base_model, fit_with_repeat_noise
 from ctrlid.diagnosis.refitting import refit_candidate
 from ctrlid.diagnosis.screening import screen_at
 from ctrlid.estimation.likelihood.likelihood import evaluate_likelihood
-from ctrlid.estimation.likelihood.maximization import maximize
+from ctrlid.estimation.likelihood.maximization import begin_fit, maximize
 from ctrlid.estimation.likelihood.noise_fit import estimate_noise_from_repeats
 
 PERIOD, TIMES = 800, 5
@@ -54,6 +54,25 @@ def test_what_is_left_is_counted_in_units_of_that_noise():
     best = refit_candidate(base, screen_at(base, E.QuadraticDrag(c2=10.0)))
     assert np.nanmean(best.model.fit.standardized[0] ** 2) == pytest.approx(1.0, abs=0.08)
     assert best.fitted.c2 == pytest.approx(20.0, rel=0.05)
+
+
+def test_a_sensor_of_another_scale_sees_as_much_noise():
+    """What repeats show is the share of the output: no scale of the sensor makes noise likelier.
+
+    With all else scaled along, the model is the same, and so is its likelihood.
+    """
+    loop = drive()
+    record = repeated(loop.with_effect(E.CoulombFriction(fc=3.0)), seed=2)
+    base = fit_with_repeat_noise(fit_base_model(loop, [record], loop.free), [PERIOD])
+    scaled = screen_at(base, E.SensorGain(error=1.0)).model
+    names = list(scaled.names)
+    theta = scaled.fit.theta.copy()
+    for name in ("m", "c"):
+        theta[names.index(name)] *= 2
+    same = begin_fit(scaled.fit.problem, theta)
+    assert same.value == pytest.approx(base.fit.value, abs=0.05)
+    assert same.noise.force[0] == pytest.approx(base.fit.noise.force[0] / 4, rel=1e-6)
+    assert not refit_candidate(base, screen_at(base, E.SensorGain(error=0.1))).net_gain > 10
 
 
 def test_known_noise_is_not_tuned():

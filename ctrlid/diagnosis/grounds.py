@@ -179,18 +179,14 @@ def narrows_no_gap(case: Case, f: Weighed) -> str:
 
     .. math:: g_1^2 > (1 - h)\, g_0^2
 
-    for the gaps before and after, and a fair part h; nor if the last value or a straight line
-    predicts fresh data better. A likelihood is evidence among models of which one is right. Where
-    the tests reject the model with all its effects, fresh data alone speak for their names. The
-    floor is no measure here, since a random force of the wrong model is in it.
+    for the gaps before and after, and a fair part h. A likelihood is evidence among models of which
+    one is right. Where the tests reject the model with all its effects, fresh data alone speak for
+    their names. The floor is no measure here, since a random force of the wrong model is in it.
     """
     del f
     gap = case.gap
     if case.explained:
         return ""
-    if gap.trivial < gap.after:
-        return ("something else is missing, and the last value or a straight line predicts fresh "
-                "data better")  # fmt: skip
     if gap.after**2 < (1 - THRESHOLD.helps) * gap.before**2:
         return ""
     return "something else is missing, and on fresh data the effects do not narrow the gap"

@@ -22,7 +22,6 @@ from ..loop.loop import Loop
 from .candidates import Trial, contains
 from .fitted_model import (
     Model,
-    can_simulate,
     carry_over_fit,
     compute_criterion,
     drop_linearization,
@@ -178,13 +177,7 @@ def refit_without_effect(model: Model, position: int) -> tuple[Model, Trial]:
     effect = model.fitted.effects[position]
     # Put back anew, it would come last; and all else may have gone too far astray without it.
     label = list(model.loop.labelled)[position]
-    known = weigh_refit(smaller, Trial(effect, label, model, -math.inf), model.fit)
-    if can_simulate(model):
-        return smaller, known
-    # Where no simulation can check it, a likelihood may be that of absurd values.
-    again = refit_candidate(smaller, screen_at(smaller, effect))
-    # A negative gain says that the refit ended in a wrong maximum.
-    return smaller, again if again.gain > 0 else known
+    return smaller, weigh_refit(smaller, Trial(effect, label, model, -math.inf), model.fit)
 
 
 def weigh_without_effect(model: Model, position: int) -> tuple[Model, Trial]:

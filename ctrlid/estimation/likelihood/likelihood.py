@@ -26,13 +26,31 @@ SAME_SCALE, SCALE_PASSES = 0.05, 5
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """Noise that is known beforehand.
+    r"""Noise that is known beforehand.
 
     Ratios, and the variance of each record's sensor noise; None: what the model leaves.
+
+    What repeats of an experiment show of a random force is its share of the output. Where the noise
+    comes from them, `slope` is that of the output in the states, :math:`|\partial y / \partial x|`,
+    of the model beside which it was found. A sensor of twice the slope sees half the force.
     """
 
     noise: Noise
     sensor: Array | None = None
+    slope: float = 0.0
+
+    def see_through(self, lins: Sequence[Linearized]) -> Noise:
+        """Return the noise that makes the same output beside a model of another slope."""
+        if not self.slope:
+            return self.noise
+        share, noise = (self.slope / measure_slope(lins)) ** 2, self.noise
+        return replace(noise, force=tuple(share * v for v in noise.force), drift=share * noise.drift)
+
+
+def measure_slope(lins: Sequence[Linearized]) -> float:
+    """Return the RMS slope of the outputs in the states, along trajectories."""
+    squares = [np.sum(np.reshape(lin.c, (len(lin.c), -1)) ** 2, axis=1) for lin in lins]
+    return math.sqrt(float(np.mean(np.concatenate(squares))))
 
 
 @dataclass(frozen=True, eq=False)
@@ -272,6 +290,8 @@ def evaluate_linearized(
 
     The filter weighs wild readings by the scale of the usual ones, which it finds itself.
     """
+    if problem.known is not None and problem.known.slope:
+        noise = problem.known.see_through(lins)
     fit = _evaluate_at_scale(problem, theta, noise, lins, sensitive)
     for _ in range(SCALE_PASSES):
         tails, scale = fit.noise.tails, float(np.mean(fit.sensor))

@@ -12,7 +12,7 @@ from ..._base.criterion import bayesian_penalty
 from ..._base.errors import ModelCannotRun
 from ..._base.jobs import run_side_by_side
 from .kalman_filter import Noise
-from .likelihood import Fit, Known, Problem, evaluate_linearized
+from .likelihood import Fit, Known, Problem, evaluate_linearized, measure_slope
 from .sampled_plant import Linearized, SampledPlant
 from .tails import JointTails, Tails, fit_tails, list_tails
 
@@ -49,7 +49,7 @@ def fit_noise(
     """
     plant, dt = problem.plant, problem.plant.loop.dt
     if problem.known is not None:
-        return evaluate_linearized(problem, theta, problem.known.noise, lins)
+        return evaluate_linearized(problem, theta, problem.known.see_through(lins), lins)
 
     held = len(noise.ar) + len(noise.ma) if hold_colour else 0
     start = compute_noise_logs(noise, dt)
@@ -467,4 +467,4 @@ def estimate_noise_from_repeats(fit: Fit, periods: Sequence[int]) -> Known:
     plain = fit_noise(problem, fit.theta, fit.linearized, Noise(fit.noise.force), wide=True)
     richer = try_coloured_force(plain)
     best = richer if richer.value > plain.value + bayesian_penalty(2, fit.size) else plain
-    return Known(best.noise, best.sensor)
+    return Known(best.noise, best.sensor, measure_slope(best.linearized))
