@@ -43,8 +43,9 @@ class Known:
         """Return the noise that makes the same output beside a model of another slope."""
         if not self.slope:
             return self.noise
-        share, noise = (self.slope / measure_slope(lins)) ** 2, self.noise
-        return replace(noise, force=tuple(share * v for v in noise.force), drift=share * noise.drift)
+        share = (self.slope / measure_slope(lins)) ** 2
+        force = tuple(share * v for v in self.noise.force)
+        return replace(self.noise, force=force, drift=share * self.noise.drift)
 
 
 def measure_slope(lins: Sequence[Linearized]) -> float:
