@@ -478,6 +478,20 @@ def test_texts():
 # -- poles ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize(("lag", "said"), [(0.0, False), (0.03, True)])
+def test_a_value_far_beyond_its_stated_uncertainty_is_said_in_capitals(lag, said):
+    """A lag that the model lacks takes the gain from 3 +- 1 % to 2.6, with a small error."""
+    plant = cid.plants.servo(m=1.0, c=2.0, k=3.0)
+    pid = cid.PID(kp=20.0, kd=1.0)
+    loop = cid.Loop(plant, pid, dt=0.01, free={"k": 0.01, "c": 0.5})
+    real = loop.with_effect(E.ActuatorLag(tau=lag)) if lag else loop
+    r = cid.random_binary(3000, amplitude=0.1, hold=50, seed=1)
+    record = cid.simulate(real, r, sensor_noise=1e-4, seed=3)
+    notes = " ".join(cid.fit_loop(loop, record).estimate.notes)
+    assert ("k IS FAR FROM ITS GIVEN VALUE" in notes) == said
+    assert ("the uncertainty that free= states" in notes) == said
+
+
 def test_poles_are_those_of_the_fitted_plant_at_rest():
     """The poles of a drive are known by c and m alone, those of a levitation by g and the gap."""
     loop = drive(("c", "k"))

@@ -31,6 +31,9 @@ from .physics_estimate import LoopEstimate, LoopFit
 
 # A direction of which the scaled information has a smaller relative eigenvalue is not in the data.
 UNSEEN = 1e-9
+# A given value is contradicted where the fit is farther from it than three of its standard
+# deviations, which chance does in 1 of 370 cases.
+CONTRADICTED = 3.0
 
 
 @hold_interrupt()
@@ -130,8 +133,30 @@ def fit_loop(
                 for one, (_, found) in zip(given, masked, strict=True) if found.any()]  # fmt: skip
     innovations = [row for one in fit.standardized for row in np.atleast_2d(one.T)]
     colour = note_coloured_innovations(innovations, len(fit.theta), _TOO_NARROW)
-    notes = (*left_out, *fitted.estimate.notes, *colour, *_note_unknown_controller(loop, given))
+    notes = (
+        *left_out,
+        *fitted.estimate.notes,
+        *colour,
+        *_note_contradicted_values(fit),
+        *_note_unknown_controller(loop, given),
+    )
     return replace(fitted, estimate=replace(fitted.estimate, notes=notes))
+
+
+def _note_contradicted_values(fit: Fit) -> tuple[str, ...]:
+    """Return what to say where the record takes a parameter far beyond its stated uncertainty."""
+    found = []
+    for name, value in zip(fit.plant.names, fit.theta.tolist(), strict=True):
+        mean, deviation = fit.problem.priors.get(name, (value, math.inf))
+        away = abs(value - mean) / deviation
+        if away > CONTRADICTED:
+            found.append(
+                f"{name} IS FAR FROM ITS GIVEN VALUE, {value:.4g} in place of {mean:.4g}: this is "
+                f"{away:.0f} times the uncertainty that free= states for it. Either the given "
+                "value is known less well than that, or the model lacks something that the "
+                "parameter stands in for: diagnose() tells what"
+            )
+    return tuple(found)
 
 
 def _note_unknown_controller(loop: Loop, records: Sequence[Record]) -> tuple[str, ...]:
