@@ -375,3 +375,17 @@ def test_as_many_zeros_as_poles(hold, late):
     assert np.max(np.abs(deviation)) < 4
     assert np.all(e.standard_errors < 0.05 * np.abs(e.values))
     assert e.notes == ()
+
+
+@pytest.mark.parametrize("late", [0.0, 0.005])
+def test_a_delay_that_the_model_lacks_is_said_in_capitals(late):
+    """Half a sample takes the pole from -2 to -1.6 rad/s, with white innovations."""
+    plant = cid.plants.servo(m=1.0, c=2.0, k=3.0)
+    loop = cid.Loop(plant, cid.PID(kp=20.0, kd=1.0), dt=0.01)
+    real = loop.with_effect(cid.effects.InputDelay(delay=late)) if late else loop
+    r = cid.random_binary(3000, amplitude=0.1, hold=50, seed=1)
+    record = cid.simulate(real, r, sensor_noise=1e-5, seed=2)
+    notes = " ".join(cid.fit_continuous(record, poles=2).estimate.notes)
+    assert ("WITH A DELAY OF 5 ms THE MODEL PREDICTS BETTER" in notes) == bool(late)
+    estimated = cid.fit_continuous(record, poles=2, delay=None)
+    assert not any("DELAY" in note for note in estimated.estimate.notes)

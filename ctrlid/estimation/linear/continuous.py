@@ -1,17 +1,20 @@
 """fit_continuous(): a continuous-time transfer function straight from samples."""
 
+import math
 import warnings
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import control as ct
 import numpy as np
+from scipy import stats
 
 from ..._base.arguments import check_arguments
 from ..._base.errors import CtrlidError, CtrlidWarning
 from ..._base.rounding import keep_numpy_quiet
 from ..._base.signals import require_one_signal
-from ..._base.text import write_list, write_number
+from ..._base.text import write_list, write_number, write_p_value, write_quantity
 from ...data.record import Record
 from ...data.several_records import VISIBLE_MOTION, as_records, measure_input_motion
 from ...loop.controllers import PID
@@ -27,6 +30,8 @@ FAST_CIRCUIT = 0.1
 
 # A pole this many times 1/dt decays below the rounding of a number within one period.
 BEYOND = float(-np.log(np.finfo(float).eps))
+# A record without a delay is said to have one in so many cases, by chance.
+MISSED = 1e-3
 
 
 @keep_numpy_quiet
@@ -151,6 +156,8 @@ def fit_continuous(
     # Errors that are rounding beside y leave nothing to gain.
     if not settled and rss > (ROUNDING * size) ** 2 * total:
         notes = (_NOT_CONVERGED, *notes)
+    if delay == 0 and not circuit and task.hold == "zoh" and rss > (ROUNDING * size) ** 2 * total:
+        notes = (*notes, *_note_missed_delay(best, known))
     late = f", delay {point.delay:.6g} s" if task.free_delay else ""
     if best.task.colour:
         late += f", sensor noise a moving average of order {best.task.colour}"
@@ -167,6 +174,26 @@ def fit_continuous(
     model = IdentifiedModel(estimate, inputs=names.get("u", "u"), outputs=names.get("y", "y"))
     model.delay = point.delay
     return model
+
+
+def _note_missed_delay(best: Minimum, known: Sequence[AbstractConstraint]) -> tuple[str, ...]:
+    r"""Return what to say where a free delay explains more than chance does.
+
+    .. math:: N \ln(V_0 / V_1) \sim \chi^2_1
+
+    for the sums of squares without and with the delay, if there is none.
+    """
+    late = find_best_fit(replace(best.task, free_delay=True), known, 0.0)
+    if not 0 < late.rss < best.rss:
+        return ()
+    p = float(stats.chi2.sf(best.used * math.log(best.rss / late.rss), 1))
+    if p >= MISSED:
+        return ()
+    return (
+        f"WITH A DELAY OF {write_quantity(late.point.delay, 's')} THE MODEL PREDICTS BETTER "
+        f"({write_p_value(p)}): something acts later than in this model, and its coefficients "
+        "stand in for that. Give delay=None to estimate a delay, or more poles for a lag.",
+    )
 
 
 _NOT_CONVERGED = (
