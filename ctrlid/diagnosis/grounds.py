@@ -111,7 +111,8 @@ def cancels_a_known_force(case: Case, f: Weighed) -> str:
 def differs_between_stretches(case: Case, f: Weighed) -> str:
     """Say if the sizes from stretches that inform about it differ; an event is in one of them.
 
-    A size is how far a parameter is from its neutral value, and small parts of it do not count.
+    A size is how far a parameter is from its neutral value, that of a limit its value, and small
+    parts of it do not count.
     """
     if case.final.errors is not None:
         # What was fitted by another criterion has no scores.
@@ -120,13 +121,16 @@ def differs_between_stretches(case: Case, f: Weighed) -> str:
     if any(p.instant for p in effect.parameters()):
         return ""
     values = effect.values()
-    sizes = {f"{label}.{p.name}": abs(values[p.name] - p.neutral)
-             for p in effect.parameters() if p.neutral is not None}  # fmt: skip
+    sizes = {
+        f"{label}.{p.name}": abs(values[p.name] - (p.neutral if math.isfinite(p.neutral) else 0.0))
+        for p in effect.parameters()
+        if p.neutral is not None
+    }
     sizes = {name: size for name, size in sizes.items() if name in case.final.names}
     chances = [compare_stretches(case.final.fit, name, THRESHOLD.same_size * size)
                for name, size in sizes.items()]  # fmt: skip
     p = min((p * len(sizes) for p in chances), default=1.0)
-    if p >= THRESHOLD.beyond_chance:
+    if not p < THRESHOLD.beyond_chance:
         return ""
     return f"its size differs between stretches of the record ({write_p_value(p)})"
 
