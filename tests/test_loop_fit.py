@@ -475,9 +475,6 @@ def test_texts():
     assert loop.parameters["K"] == 3.34e-6
 
 
-# -- poles ---------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(("lag", "said"), [(0.0, False), (0.03, True)])
 def test_a_value_far_beyond_its_stated_uncertainty_is_said_in_capitals(lag, said):
     """A lag that the model lacks takes the gain from 3 +- 1 % to 2.6, with a small error."""
@@ -490,6 +487,9 @@ def test_a_value_far_beyond_its_stated_uncertainty_is_said_in_capitals(lag, said
     notes = " ".join(cid.fit_loop(loop, record).estimate.notes)
     assert ("k IS FAR FROM ITS GIVEN VALUE" in notes) == said
     assert ("the uncertainty that free= states" in notes) == said
+
+
+# -- poles ---------------------------------------------------------------------------------------
 
 
 def test_poles_are_those_of_the_fitted_plant_at_rest():

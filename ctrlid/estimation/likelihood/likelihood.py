@@ -41,8 +41,6 @@ class Known:
 
     def see_through(self, lins: Sequence[Linearized]) -> Noise:
         """Return the noise that makes the same output beside a model of another slope."""
-        if not self.slope:
-            return self.noise
         share = (self.slope / measure_slope(lins)) ** 2
         force = tuple(share * v for v in self.noise.force)
         return replace(self.noise, force=force, drift=share * self.noise.drift)

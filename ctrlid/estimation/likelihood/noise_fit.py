@@ -49,7 +49,7 @@ def fit_noise(
     """
     plant, dt = problem.plant, problem.plant.loop.dt
     if problem.known is not None:
-        return evaluate_linearized(problem, theta, problem.known.see_through(lins), lins)
+        return evaluate_linearized(problem, theta, problem.known.noise, lins)
 
     held = len(noise.ar) + len(noise.ma) if hold_colour else 0
     start = compute_noise_logs(noise, dt)

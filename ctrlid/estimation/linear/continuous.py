@@ -3,7 +3,6 @@
 import math
 import warnings
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import control as ct
@@ -22,7 +21,7 @@ from ...physics.conversions import to_state_matrices
 from ..constraints import AbstractConstraint, check_constraints, divide_constraints
 from ..identified_model import Estimate, IdentifiedModel, Structure
 from ..whiteness import ROUNDING, note_coloured_innovations
-from .prediction_error import Minimum, Piece, Task, colour_noise, find_best_fit
+from .prediction_error import Minimum, Piece, Task, add_delay, colour_noise, find_best_fit
 from .sampled_motion import Circuit, list_inputs
 
 # Above this product of dt and the controller's fastest pole, u moves visibly between samples.
@@ -154,9 +153,10 @@ def fit_continuous(
     point, found, rss, settled = best.point, best.found, best.rss, best.settled
     degrees = best.used - found.free - len(point.gain) - int(task.free_delay)
     # Errors that are rounding beside y leave nothing to gain.
-    if not settled and rss > (ROUNDING * size) ** 2 * total:
+    beyond_rounding = rss > (ROUNDING * size) ** 2 * total
+    if not settled and beyond_rounding:
         notes = (_NOT_CONVERGED, *notes)
-    if delay == 0 and not circuit and task.hold == "zoh" and rss > (ROUNDING * size) ** 2 * total:
+    if delay == 0 and not circuit and task.hold == "zoh" and beyond_rounding:
         notes = (*notes, *_note_missed_delay(best, known))
     late = f", delay {point.delay:.6g} s" if task.free_delay else ""
     if best.task.colour:
@@ -183,7 +183,7 @@ def _note_missed_delay(best: Minimum, known: Sequence[AbstractConstraint]) -> tu
 
     for the sums of squares without and with the delay, if there is none.
     """
-    late = find_best_fit(replace(best.task, free_delay=True), known, 0.0)
+    late = add_delay(best, known)
     if not 0 < late.rss < best.rss:
         return ()
     p = float(stats.chi2.sf(best.used * math.log(best.rss / late.rss), 1))

@@ -327,6 +327,16 @@ def find_best_fit(task: Task, known: Sequence[AbstractConstraint], delay: float)
     return Minimum(task, best, found, rss, _compute_residuals(task, best), settled)
 
 
+def add_delay(best: Minimum, known: Sequence[AbstractConstraint]) -> Minimum:
+    """Return the minimum that is reached from another one with a free delay, or that one itself."""
+    task = replace(best.task, free_delay=True)
+    try:
+        point, found, rss, settled = _minimize_errors(task, best.point, known)
+    except NotExcited:
+        return best
+    return Minimum(task, point, found, rss, _compute_residuals(task, point), settled)
+
+
 def colour_noise(white: Minimum, known: Sequence[AbstractConstraint]) -> Minimum:
     """Return the minimum with sensor noise that is a moving average of the best order.
 
