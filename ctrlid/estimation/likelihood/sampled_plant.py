@@ -298,13 +298,19 @@ class SampledPlant:
     def _stack_applied_inputs(self, data: FilterData, applied: Array) -> Array:
         """Return the rows (t, input before, now, ..., ahead, r, y) the map is evaluated over."""
         references = [data.r] if self.hold_r == "zoh" else [data.r, shift_signal(data.r, -1)]
-        corners = [part.T for part in self._list_corners(applied)]
+        # What a delay still holds when the record begins may be anything that the input is in it: a
+        # reference that sets in with the record makes its first sample an unusual one.
+        before = applied[:1] if self.e.delay is None else applied.mean(axis=0, keepdims=True)
+        corners = [part.T for part in self._list_corners(applied, before)]
         return np.vstack([data.t, *corners, *(part.T for part in references), data.y.T])
 
-    def _list_corners(self, path: Array) -> list[Array]:
-        """Return what acts at each corner, one before the sample to the one ahead of it."""
+    def _list_corners(self, path: Array, before: Array | None = None) -> list[Array]:
+        """Return what acts at each corner, one before the sample to the one ahead of it.
+
+        Ahead of the record it is `before`, by default the first value.
+        """
         steps = range(-1, self.pieces + 1)
-        return [shift_signal(path, self.delay_samples - k)[:: self.pieces] for k in steps]
+        return [shift_signal(path, self.delay_samples - k, before)[:: self.pieces] for k in steps]
 
     def pad_controller_states(self, values: Array) -> Array:
         """Add the states of a known analog controller, at rest, to a start."""
@@ -360,11 +366,13 @@ class InitialConditions:
         e, variance = self.plan.equations, np.zeros(len(u))
         u = u if u.ndim == 1 else u[:, 0]
         if e.play is not None:
-            late = self.plan.delay_samples // self.plan.pieces
-            variance = shift_signal(self._find_backlash_variance(u, p), late)
+            whole = self.plan.delay_samples // self.plan.pieces
+            variance = shift_signal(self._find_backlash_variance(u, p), whole)
         if e.delay is not None:
-            far = evaluate_delay(e, p) / self.plan.dt - np.arange(len(u))
-            variance = variance + np.clip(far, 0.0, 1.0) ** 2 * np.var(u)
+            late = evaluate_delay(e, p) / self.plan.dt
+            far = np.clip(late - np.arange(len(u)), 0.0, 1.0)
+            # These samples may all have been off by the same, which the filter takes for chance.
+            variance = variance + far**2 * max(late, 1.0) * np.var(u)
         return variance
 
     def _find_backlash_variance(self, u: Array, p: Array) -> Array:
@@ -430,9 +438,12 @@ def evaluate_delay(e: Equations, p: Array) -> float:
     return float(casadi.evalf(substitute_delay(e, p)))
 
 
-def shift_signal(values: Array, late: int) -> Array:
-    """Return values so many samples later, or earlier if `late` is negative; the ends are held."""
-    first = np.repeat(values[:1], max(late, 0), axis=0)
+def shift_signal(values: Array, late: int, before: Array | None = None) -> Array:
+    """Return values so many samples later, or earlier if `late` is negative.
+
+    The ends are held, but for the first where it is said what was `before`.
+    """
+    first = np.repeat(values[:1] if before is None else before, max(late, 0), axis=0)
     last = np.repeat(values[-1:], max(-late, 0), axis=0)
     return np.concatenate([first, values[max(-late, 0) :], last])[: len(values)]
 
