@@ -336,9 +336,73 @@ def test_friction_stops_a_coasting_mass():
 
 def test_sticking_friction_holds_against_a_smaller_force():
     held = free_run(mass(), E.CoulombFriction(fc=0.5), u=np.full(300, 0.3))
-    assert np.max(np.abs(held)) < 0.01  # creeps by less than a quarter of fc*dt a second
+    assert np.max(np.abs(held)) < 1e-3
     moving = free_run(mass(), E.CoulombFriction(fc=0.5), u=np.full(300, 0.7))
     assert moving[-1] == pytest.approx(0.1 * 2.99**2, rel=0.01)
+
+
+def slide(fc, push, dt, x=0.0, v=0.0):
+    """The position of 1 kg under dry friction [N] and a force held over each period, exactly.
+
+    Between stops the acceleration is constant, so that each part of the motion is a parabola.
+    """
+    shown = []
+    for force in push:
+        shown.append(x)
+        left = dt
+        while left > 0:
+            if v == 0 and abs(force) <= fc:
+                break
+            along = np.sign(v) if v else np.sign(force)
+            a = force - fc * along
+            stops = -v / a if v * a < 0 else np.inf
+            step = min(left, stops)
+            x, v = x + v * step + a * step**2 / 2, 0.0 if stops <= left else v + a * step
+            left -= step
+    return np.array(shown)
+
+
+@pytest.mark.parametrize(("effects", "push"), [
+    ((E.CoulombFriction(2.0),), 1.9),
+    ((E.CoulombFriction(2.0),), -1.0),
+    ((E.AsymmetricCoulombFriction(2.0, 0.8),), 2.5),
+    ((E.AsymmetricCoulombFriction(2.0, 0.8),), -1.0),
+    ((E.CoulombFriction(1.5), E.StribeckFriction(0.5, 0.05)), 1.8),
+])  # fmt: skip
+def test_what_rests_is_held(effects, push):
+    """A force below the friction of its direction moves nothing for a hundred samples."""
+    dt = 0.01
+    loop = cid.Loop(mass(), None, dt=dt)
+    for effect in effects:
+        loop = loop.with_effect(effect)
+    y = cid.simulate(loop, d=np.full(100, push)).y
+    # Without friction it would move by half a force times a second squared.
+    assert abs(y[-1]) < 0.01 * abs(push) / 2
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_mass_sticks_and_slips_as_an_exact_solution_does(seed):
+    rng = np.random.default_rng(seed)
+    dt, fc = 0.01, 2.0
+    push = np.repeat(rng.uniform(-3.5, 3.5, 100), 6)
+    exact = slide(fc, push, dt)
+    assert np.mean(np.diff(exact) == 0) > 0.2
+    y = cid.simulate(cid.Loop(mass(), None, dt=dt).with_effect(E.CoulombFriction(fc)), d=push).y
+    # A mass that crept by its friction's quarter of a sample was off by 3 mm and more.
+    assert np.max(np.abs(y - exact)) < 0.002
+
+
+def test_friction_of_an_exact_solution_is_fitted_without_a_random_force():
+    """A large force and too large a friction are a maximum of the likelihood as well."""
+    rng = np.random.default_rng(5)
+    dt, fc, sigma = 0.01, 2.0, 2e-4
+    push = np.repeat(rng.uniform(-3.5, 3.5, 100), 6)
+    y = slide(fc, push, dt) + sigma * rng.standard_normal(len(push))
+    loop = cid.Loop(mass(), None, dt=dt).with_effect(E.CoulombFriction(1.2 * fc))
+    found = cid.fit_loop(loop, cid.Record(u=push, y=y, dt=dt)).estimate
+    assert found.values[0] == pytest.approx(fc, rel=0.01)
+    assert found.sensor_noise == pytest.approx((sigma,), rel=0.1)
+    assert found.force_noise < 0.1 * fc
 
 
 FORCES = [

@@ -40,7 +40,9 @@ def test_the_noise_is_found_under_a_wrong_model():
     known = estimate_noise_from_repeats(fit, [PERIOD])
     assert np.sqrt(known.sensor[0]) == pytest.approx(SENSOR, rel=0.1)
     force = np.sqrt(known.sensor[0] * known.noise.force[0])
-    assert force == pytest.approx(FORCE, rel=0.15)
+    # What sticks at a turn keeps what the force did to it until it breaks loose; a plant without
+    # friction takes that for more force.
+    assert force == pytest.approx(FORCE, rel=0.2)
     absorbed = np.sqrt(fit.sensor[0] * (fit.noise.force[0] + fit.noise.coloured))
     assert absorbed > 2 * force
 

@@ -9,7 +9,7 @@ from .._base.criterion import bayesian_penalty
 from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from ..estimation.likelihood.kalman_filter import Noise
 from ..estimation.likelihood.likelihood import Fit, evaluate_likelihood, rank_by_likelihood
-from ..estimation.likelihood.maximization import OTHER_NOISE_GAIN, maximize
+from ..estimation.likelihood.maximization import OTHER_NOISE_GAIN, climb_under_quiet_force, maximize
 from .candidates import NUMERICAL_FAILURES, Objection, Trial
 from .fitted_model import Model, can_simulate, carry_over_fit, drop_arrays, drop_linearization
 from .information import count_own_parameters, find_objection
@@ -46,6 +46,9 @@ def refit_candidate(base: Model, trial: Trial, near: Model | None = None) -> Tri
             # Coloured noise that was fitted while the effect was missing may never let it in.
             # (Where no simulation can check it, the likelihood also leads to absurd values.)
             starts.append(replace(start, noise=start.noise.plain))
+        if start.plant.e.kinked and not base.fit.plant.e.kinked and start.problem.known is None:
+            # The force of the model without it stands for what sticks.
+            starts.append(climb_under_quiet_force(start))
         fits = [
             drop_linearization(
                 place_instants(maximize(s, rounds=THRESHOLD.refit_rounds, exact=False))

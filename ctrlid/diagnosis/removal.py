@@ -25,6 +25,7 @@ from .fitted_model import (
     carry_over_fit,
     compute_criterion,
     drop_linearization,
+    with_linearization,
 )
 from .information import estimate_need
 from .refitting import refit_candidate, weigh_refit
@@ -102,8 +103,12 @@ def fuse_effects(model: Model, given: int, steps: Sequence[Round]) -> Model:
             if regained < THRESHOLD.regained * lost:
                 continue
             trial = refit_candidate(smaller, trial, model)
-            if trial.net_gain > THRESHOLD.gate and trial.model.fit.value + saved > model.fit.value:
-                return trial.model
+            if not trial.net_gain > THRESHOLD.gate:
+                continue
+            # Where both say the same of the plant, no climb makes the one exactly as likely.
+            one = replace(trial.model, fit=maximize(with_linearization(trial.model).fit))
+            if one.fit.value + saved > model.fit.value - THRESHOLD.tie:
+                return one
     return model
 
 

@@ -17,6 +17,8 @@ SHARPEST = 1e-12
 # A lag shorter than this share of a sampling period is treated as that long, so that its rate stays
 # finite.
 INSTANT = 1e-6
+# A mass comes to rest within this share of a sampling period: samples cannot show how it sticks.
+STICKING = 0.25
 # This number stands for an infinite distance to a limit, with which CasADi cannot compute.
 FARTHEST = 1e30
 
@@ -117,6 +119,10 @@ class Moment:
         y: int = 0, motion: tuple[int, int] | None = None,
     ) -> None:  # fmt: skip
         self._e, self._motion = e, motion
+        # What a force at a place of its own accelerates its velocity by; else it is one already.
+        self._push: Any = 1.0
+        if motion is not None and e.pushes is not None:
+            self._push = Symbol(e.pushes[motion[1], e.velocities.index(motion[1])])
         self.at, self.dt, self.own = at, dt, own
         self.t: Any = Symbol(e.t)
         self.u: Any = Symbol(e.u if len(e.inputs) == 1 else e.u[u])
@@ -194,16 +200,46 @@ class Moment:
         """
         return Symbol(casadi.erf(v.sx / casadi.sqrt(2 * self._variance(v, width))))
 
-    def moving(self, v: Any, width: Any = 0.0) -> Any:
-        r"""Return one where something moves and zero at rest, averaged as in `sign`.
+    def rub(self, limit: Any, drag: Any = 0.0) -> Any:
+        r"""Return what dry friction of a given limit holds against the motion.
 
-        .. math:: 1 - \frac{w}{\sqrt{s^2 + w^2}}\, e^{-v^2 / 2 (s^2 + w^2)}
+        .. math::
+            f = f_c \, E[\mathrm{sign}(v + \tau b)],
+            \quad b = \frac{a}{(1 + (a / f_c)^8)^{1/8}}, \quad \tau = T / 4
 
-        The square of an average would be no average: what turns back and forth moves all the time.
+        The jump is spread over velocities of the size :math:`\sqrt{2/\pi} \, \tau f_c`, so that
+        near rest f is :math:`v / \tau + b`: it balances what else accelerates the mass, a, up to
+        its limit, and takes the velocity away within a quarter of a sampling period T. This is
+        Karnopp's friction without a switch: the mass sticks, and nothing is too sharp for an
+        integration.
+
+        Parameters
+        ----------
+        limit : Symbol or float
+            The largest friction f_c [unit of the force].
+        drag : Symbol or float, optional
+            A further force of the same effect [unit of the force], which is part of what it
+            balances.
+
+        Returns
+        -------
+        Symbol
+            Between minus and plus the limit [unit of the force].
+
+        References
+        ----------
+        D. Karnopp, Computer simulation of stick-slip friction in mechanical dynamic systems.
+        Journal of Dynamic Systems, Measurement, and Control 107, 1985.
         """
-        rest, both = self._variance(Symbol(casadi.SX(0.0)), width), self._variance(v, width)
-        share = casadi.sqrt(rest / both) * casadi.exp(-(v.sx**2) / (2 * both))
-        return Symbol(1 - share)
+        j = self._require_motion()[1]
+        most, further = self._push * limit, self._push * drag
+        others = self.acceleration + further
+        # A limit without a corner, which would cost an integration many small steps.
+        beyond = (others / (most + SHARPEST)) ** 2
+        balanced = others / np.sqrt(np.sqrt(np.sqrt(1 + (beyond * beyond) ** 2)))
+        short = STICKING * self.dt
+        width = np.sqrt(2 / np.pi) * short * most
+        return limit * self.sign(Symbol(self._e.x[j]) + short * balanced, width)
 
     def abs(self, v: Any, width: Any = 0.0) -> Any:
         """Return the absolute value of an expression, averaged as in `sign`."""

@@ -343,7 +343,7 @@ class FlexibleMode(ForceEffect):
     damping: float = parameter("", lower=0.0)
     coupling: float = parameter("", lower=0.0, upper=0.95, neutral=0.0)
 
-    stage: ClassVar[int] = 2
+    stage: ClassVar[int] = 3
     states: ClassVar[tuple[str, ...]] = ("deflection", "speed")
     look_alikes: ClassVar[tuple[str, ...]] = ("PeriodicForce", "InputDelay", "ActuatorLag")
     sentence: ClassVar[str] = "Part of the moving mass is attached by a spring."

@@ -13,8 +13,8 @@ from .kinds import ForceEffect
 from .parameters import parameter
 from .scanning import Range
 
-# Within one sample friction changes the velocity by fc*dt: samples cannot show how it sticks.
-STICKING = 0.25
+# Dry friction comes after all forces that it may balance.
+LAST_FORCE = 2
 # Stribeck's velocity lies between these shares of the largest usual speed.
 SLOWEST, FASTEST = 1e-3, 3.0
 # Half the difference over the mean friction is at most 1 for friction; the rest is left to the
@@ -100,8 +100,8 @@ class CoulombFriction(ForceEffect):
 
     .. math:: a = -f_c \, \mathrm{sign}(\dot x)
 
-    The jump at rest is spread over what friction changes within a quarter of a sample, and, in a
-    filter, over what it does not know of the velocity.
+    while it moves; at rest it holds against all other forces, up to f_c (`Moment.rub`). In a filter
+    the jump is spread over what it does not know of the velocity.
 
     Parameters
     ----------
@@ -117,6 +117,8 @@ class CoulombFriction(ForceEffect):
 
     fc: float = parameter("{y}/s^2", lower=0.0, neutral=0.0)
 
+    stage: ClassVar[int] = LAST_FORCE
+    in_linear_model: ClassVar[bool] = False
     look_alikes: ClassVar[tuple[str, ...]] = (
         "ViscousFriction", "StribeckFriction", "AsymmetricCoulombFriction", "InputDeadZone",
     )  # fmt: skip
@@ -125,7 +127,7 @@ class CoulombFriction(ForceEffect):
 
     def force(self, m: Moment) -> Any:
         """Return the acceleration."""
-        return -self.fc * m.sign(m.velocity, width=STICKING * self.fc * m.dt)
+        return -m.rub(self.fc)
 
 
 @final
@@ -155,6 +157,8 @@ class AsymmetricCoulombFriction(ForceEffect):
     fc: float = parameter("{y}/s^2", lower=0.0, neutral=0.0)
     difference: float = parameter("{y}/s^2", neutral=0.0)
 
+    stage: ClassVar[int] = LAST_FORCE
+    in_linear_model: ClassVar[bool] = False
     look_alikes: ClassVar[tuple[str, ...]] = (
         "CoulombFriction", "AsymmetricViscousFriction", "ConstantForce",
     )  # fmt: skip
@@ -171,8 +175,7 @@ class AsymmetricCoulombFriction(ForceEffect):
 
     def force(self, m: Moment) -> Any:
         """Return the acceleration."""
-        v, width = m.velocity, STICKING * self.fc * m.dt
-        return -self.fc * m.sign(v, width) - self.difference * m.moving(v, width)
+        return -m.rub(self.fc, drag=-self.difference) - self.difference
 
 
 @final
@@ -201,6 +204,8 @@ class StribeckFriction(ForceEffect):
     fs: float = parameter("{y}/s^2", lower=0.0, neutral=0.0)
     vs: float = parameter("{y}/s", lower=1e-12)
 
+    stage: ClassVar[int] = LAST_FORCE
+    in_linear_model: ClassVar[bool] = False
     look_alikes: ClassVar[tuple[str, ...]] = ("CoulombFriction", "AsymmetricCoulombFriction")
     sentence: ClassVar[str] = "Friction is larger at standstill than in motion."
     experiment: ClassVar[str] = "very slow motion, in which the plant sticks and slips"
@@ -219,8 +224,7 @@ class StribeckFriction(ForceEffect):
 
     def force(self, m: Moment) -> Any:
         """Return the acceleration."""
-        s = m.sign(m.velocity, width=STICKING * self.fs * m.dt)
-        return -self.fs * s * np.exp(-((m.velocity / self.vs) ** 2))
+        return -m.rub(self.fs) * np.exp(-((m.velocity / self.vs) ** 2))
 
 
 @final

@@ -193,7 +193,7 @@ class InputNonlinearity(InputEffect):
 
     curvature: float = parameter("1/{u}", neutral=0.0)
 
-    stage: ClassVar[int] = 3
+    stage: ClassVar[int] = 4
     look_alikes: ClassVar[tuple[str, ...]] = (
         "InputSaturatingGain", "InputOffset", "ForceExponent",
     )  # fmt: skip
@@ -229,7 +229,7 @@ class InputSaturatingGain(InputEffect):
 
     saturation: float = parameter("1/{u}^2", lower=0.0, neutral=0.0)
 
-    stage: ClassVar[int] = 3
+    stage: ClassVar[int] = 4
     look_alikes: ClassVar[tuple[str, ...]] = (
         "InputOffset", "ConstantForce", "InputNonlinearity", "InputSaturation",
     )  # fmt: skip

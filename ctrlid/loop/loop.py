@@ -505,9 +505,9 @@ class Loop:
         """Return the plant with its effects, linearized at the operating point.
 
         The point keeps its output; with effects, its states and input are solved for anew.
-        Friction is taken as in motion that is fast against its jump, where it has no slope; dead
-        zones, backlash, steps of a converter and vibrations are left out; a delay is its Padé
-        approximation of order two; what drifts has its value at time zero.
+        Dry friction, dead zones, backlash, steps of a converter and vibrations are left out, as
+        in motion that is large against them; a delay is its Padé approximation of order two; what
+        drifts has its value at time zero.
 
         Parameters
         ----------
@@ -539,7 +539,7 @@ class Loop:
         """
         active = {k: e for k, e in self.labelled.items() if not e.neutral and e.in_linear_model}
         if not active and not self._traced.siso:
-            return make_state_space(self._active, self.point)
+            return make_state_space(self._traced, self._bare_point)
         if not active:
             if isinstance(self.plant, ct.TransferFunction) and not states:
                 return self.plant

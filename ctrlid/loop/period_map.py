@@ -243,6 +243,28 @@ def linearize_at_rest(s: PeriodMap, function: Any) -> tuple[Array, Array]:
     return np.asarray(a, float), np.asarray(b, float)
 
 
+def leave_out_kinks(loop: Loop, memories: bool = True) -> Loop:
+    """Return a loop without the effects that have no linear model, such as dry friction.
+
+    Parameters
+    ----------
+    loop : Loop
+        The loop.
+    memories : bool, optional
+        Whether those between controller and plant go as well, whose memories are states.
+
+    Returns
+    -------
+    Loop
+        The loop.
+    """
+    # From the last one on, since the effects of one kind behind it would be numbered anew.
+    for label, effect in reversed(loop.labelled.items()):
+        if not effect.in_linear_model and (memories or effect.place != "input"):
+            loop = loop.without_effect(label)
+    return loop
+
+
 def compute_closed_loop_poles(loop: Loop, hidden: bool = True) -> ComplexArray:
     r"""Return the poles of a loop for small deviations [rad/s].
 
@@ -250,8 +272,8 @@ def compute_closed_loop_poles(loop: Loop, hidden: bool = True) -> ComplexArray:
 
     with the eigenvalues of the linearized map over one sampling period T, with the controller as it
     runs; with an analog controller the poles of the loop's rates. As in `Loop.linearize`, the steps
-    of a converter, dead zones and backlash are left out: within one step of it at rest, no
-    converter passes anything on.
+    of a converter, dry friction, dead zones and backlash are left out: within one step of it at
+    rest, no converter passes anything on, and a mass that sticks moves for no small force.
 
     Parameters
     ----------
@@ -271,10 +293,7 @@ def compute_closed_loop_poles(loop: Loop, hidden: bool = True) -> ComplexArray:
     CtrlidError
         If the plant has no derivative at the operating point.
     """
-    # From the last one on, since the effects of one kind behind it would be numbered anew.
-    for label, effect in reversed(loop.labelled.items()):
-        if not effect.in_linear_model:
-            loop = loop.without_effect(label)
+    loop = leave_out_kinks(loop)
     s = make_period_map(loop, 8)
     # The rates give the poles of a stiff circuit without the error of an integration step.
     matrix, entry = linearize_at_rest(s, s.step if s.rate is None else s.rate)

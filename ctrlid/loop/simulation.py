@@ -17,6 +17,7 @@ from .loop import Loop
 from .period_map import (
     compute_growth_rate,
     count_signals,
+    leave_out_kinks,
     linearize_at_rest,
     make_period_map,
 )
@@ -271,8 +272,10 @@ class Simulator:
             )
         # An undamped plant neither grows nor decays; round-off must not decide which.
         self._unstable = loop.controller is None and compute_growth_rate(loop) * loop.dt > 1e-6
-        # What a millionth of the operating values does to each state: smaller motion is rest.
-        self._motion = linearize_at_rest(first, first.step)
+        # What a millionth of the operating values does to each state: smaller motion is rest. What
+        # sticks there says nothing of motion.
+        moving = make_period_map(leave_out_kinks(loop, memories=False), 1, hold, self.hold_r)
+        self._motion = linearize_at_rest(moving, moving.step)
         a, b = (np.nan_to_num(np.abs(m)) for m in self._motion)
         now, ahead = first.places[2], first.places[5]
         # The corners of a band-limited input are those of all inputs in turn.

@@ -21,6 +21,7 @@ from .kalman_filter import (
 )
 from .likelihood import (
     Fit,
+    Known,
     Problem,
     evaluate_likelihood,
     list_start_values,
@@ -56,7 +57,7 @@ SECOND_STEP_GAIN = 30.0
 # Noise found far away must gain so much log-likelihood before the climb goes on from there.
 OTHER_NOISE_GAIN = 2.0
 # A force is hardly any with so small a share of its variance.
-QUIET = 1e-4
+QUIET = 1e-3
 # A step that is expected to gain less log-likelihood is not worth its evaluation.
 LEAST_STEP_GAIN = 1e-3
 
@@ -216,16 +217,43 @@ def refit_noise_size(fit: Fit) -> Fit:
     """Return the fit continued from the best noise of the whole range, if that is far better.
 
     A random force that stood for a wrong parameter at the start may have left no noise to the
-    sensor, from where small changes lead nowhere.
+    sensor, from where small changes lead nowhere. Where the motion has kinks, hardly any force is
+    tried as well.
     """
     plain = fit.noise.plain
     other = fit_noise(fit.problem, fit.theta, fit.linearized, plain, wide=True)
-    return maximize(other) if other.value > fit.value + OTHER_NOISE_GAIN else fit
+    if other.value > fit.value + OTHER_NOISE_GAIN:
+        fit = maximize(other)
+    if fit.plant.e.kinked and fit.known is None:
+        quiet = maximize(climb_under_quiet_force(fit))
+        fit = quiet if quiet.value > fit.value + OTHER_NOISE_GAIN else fit
+    return fit
+
+
+def climb_under_quiet_force(fit: Fit) -> Fit:
+    """Return the start of a climb from the best parameters under hardly any random force.
+
+    Under a large force a filter averages over where a mass sticks, and friction that is averaged
+    leaves much to a force: the likelihood has a maximum with and one without it. From the former no
+    climb leads to the latter while the noise is free.
+    """
+    quiet = quieten_force(fit.noise)
+    held = replace(fit, noise=quiet, problem=replace(fit.problem, known=Known(quiet)))
+    return replace(maximize(held, exact=False), problem=fit.problem)
+
+
+def quieten_force(noise: Noise) -> Noise:
+    """Return noise with hardly any random force."""
+    return replace(noise, force=tuple(QUIET * v for v in noise.force))
 
 
 def choose_noise(fit: Fit, always: bool = False) -> Fit:
-    """Add a coloured force if the Bayesian information criterion wants it."""
-    if fit.known is not None or (not fit.plant.e.siso and not always):
+    """Add a coloured force if the Bayesian information criterion wants it.
+
+    A record that the model loses under a white force tells nothing of a colour.
+    """
+    lost = not math.isfinite(fit.value)
+    if fit.known is not None or ((lost or not fit.plant.e.siso) and not always):
         return fit
     try:
         richer = try_coloured_force(fit)
@@ -249,8 +277,7 @@ def choose_sensor_noise(fit: Fit) -> Fit:
         return fit
     richer = maximize(try_coloured_sensor(fit))
     # A force that stood for the colour may have led a parameter astray, which needs it there.
-    force = tuple(QUIET * v for v in richer.noise.force)
-    quiet = maximize(replace(richer, noise=replace(richer.noise, force=force)), exact=False)
+    quiet = maximize(replace(richer, noise=quieten_force(richer.noise)), exact=False)
     if quiet.value > richer.value + OTHER_NOISE_GAIN:
         anew = try_coloured_sensor(relinearize_fit(quiet))
         richer = maximize(max(quiet, anew, key=compute_noise_criterion))
