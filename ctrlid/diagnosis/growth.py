@@ -22,7 +22,11 @@ from ..estimation.likelihood.maximization import (
     maximize,
     refit_noise_size,
 )
-from ..estimation.likelihood.noise_fit import compute_noise_criterion, count_noise_parameters
+from ..estimation.likelihood.noise_fit import (
+    compute_noise_criterion,
+    count_noise_parameters,
+    measure_walk_gain,
+)
 from ..estimation.likelihood.tails import JointTails
 from .candidates import Trial, contains, is_same_kind, list_missing_candidates
 from .fitted_model import (
@@ -227,8 +231,11 @@ def _may_be_coloured(fit: Fit, more: float) -> bool:
     """Whether coloured sensor noise can gain more than so much, in place of a coloured force.
 
     What past innovations tell of the next one is what a colour of the noise can explain; with
-    parameters that move along it may be twice as much.
+    parameters that move along it may be twice as much. A slow walk of the sensor tells hardly
+    anything from one innovation to the next, the less beside a coloured force that follows it.
     """
+    if THRESHOLD.colour_promise * measure_walk_gain(fit) > more:
+        return True
     told = 0.0
     for z in fit.standardized:
         filled = np.nan_to_num(z)

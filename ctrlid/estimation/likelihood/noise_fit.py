@@ -367,8 +367,7 @@ def try_coloured_sensor(fit: Fit) -> Fit:
     ----------
     Hannan and Rissanen, Biometrika 69 (1982) 81-94, for the choice of orders by a criterion.
     """
-    shares = (1.0, 1e-2, 1e-4, 1e-6, 1e-8)
-    forces = [tuple(share * v for v in fit.noise.force) for share in shares]
+    forces = _list_smaller_forces(fit)
     tails = fit.noise.tails
     values: list[tuple[float, ...]] = [(v,) for v in SIZES]
 
@@ -384,6 +383,21 @@ def try_coloured_sensor(fit: Fit) -> Fit:
         _fit_best(fit, list(_list_walks(fit, forces))),
     ]
     return max((_lengthen_sensor_noise(f) for f in chains), key=compute_noise_criterion)
+
+
+def measure_walk_gain(fit: Fit) -> float:
+    """Return what a random walk of the sensor gains at once, in place of a coloured force.
+
+    Parameters of the plant stay as they are, and the noise is the best of a few.
+    """
+    noise, value = _find_likeliest(fit, list(_list_walks(fit, _list_smaller_forces(fit))))
+    walking = replace(fit, noise=noise, value=value)
+    return compute_noise_criterion(walking) - compute_noise_criterion(fit)
+
+
+def _list_smaller_forces(fit: Fit) -> list[tuple[float, ...]]:
+    shares = (1.0, 1e-2, 1e-4, 1e-6, 1e-8)
+    return [tuple(share * v for v in fit.noise.force) for share in shares]
 
 
 def _list_walks(fit: Fit, forces: Sequence[tuple[float, ...]]) -> Iterable[Noise]:
