@@ -377,9 +377,11 @@ def filter_record(plant, p, e, at, x0, spread, u, y, sigma, push, colour, weight
     new, newP = np.zeros(dim), np.zeros((dim, dim))
     x = np.zeros(MOST)
     a, b, c, f, g = np.zeros((5, MOST))
-    w0 = 1.0 - dim / 3.0
-    wi = 1.0 / 6.0
-    root = math.sqrt(3.0)
+    # Of more than three states the middle would weigh less than nothing, and variances with it.
+    reach = max(dim, 3)
+    w0 = 1.0 - dim / reach
+    wi = 0.5 / reach
+    root = math.sqrt(reach)
     memory = np.full(3, at[1])
     inputs = np.zeros(FINE)
     post, moved = np.zeros(laws), np.zeros(dim)
@@ -407,6 +409,18 @@ def filter_record(plant, p, e, at, x0, spread, u, y, sigma, push, colour, weight
                     shown[s] += points[s, d + i] / math.sqrt(count)
             yhat += (w0 if s == 0 else wi) * shown[s]
             grown += (w0 if s == 0 else wi) * abs(x[iy] - at[2])
+        if e[PLAY] != 0.0:
+            # What the sensor shows has moved with the reading: its mean and variance are new.
+            for i in range(dim):
+                m[i] = 0.0
+                for s in range(2 * dim + 1):
+                    m[i] += (w0 if s == 0 else wi) * points[s, i]
+            for i in range(dim):
+                for j in range(dim):
+                    P[i, j] = 0.0
+                    for s in range(2 * dim + 1):
+                        weight = w0 if s == 0 else wi
+                        P[i, j] += weight * (points[s, i] - m[i]) * (points[s, j] - m[j])
         var = 0.0
         cross[:] = 0.0
         for s in range(2 * dim + 1):
