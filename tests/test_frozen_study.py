@@ -91,6 +91,26 @@ def test_the_filter_of_a_linear_plant_is_the_kalman_filter():
         P = f @ (P - np.outer(gain, P[0])) @ f.T + np.outer(push, push)
 
 
+@pytest.mark.parametrize("colour", [cases.WHITE, np.array([1.0, 0.03, 1.0, 1.0])])
+def test_the_filter_of_a_sensor_with_play_knows_how_far_it_errs(colour):
+    """Four states beside a walk, one of which moves with the reading alone."""
+    rng = np.random.default_rng(8)
+    truth = make_drive(rng, n=800)
+    e = truth.e.copy()
+    e[plants.I["play"]] = 0.1
+    walk = np.cumsum(rng.standard_normal(800)) * colour[1]
+    u, y, _ = plants.simulate(1, truth.p, e, truth.at, truth.x0, np.array([5.0, -4.5]),
+                              np.array([1.0, -0.5]), True, 2.0 * np.repeat([1.0, -1.0] * 20, 20),
+                              truth.push * rng.standard_normal(800),
+                              truth.sigma * (rng.standard_normal(800) + walk),
+                              np.full(800, 0.02), 0.0, 100.0)  # fmt: skip
+    mean, variance = plants.filter_record(
+        1, truth.p, e, truth.at, truth.x0, truth.spread, u, y, truth.sigma, truth.push, colour,
+        np.ones(1), np.ones(1),
+    )  # fmt: skip
+    assert np.mean((y - mean) ** 2 / variance[:, 0]) == pytest.approx(1.0, abs=0.15)
+
+
 def test_dry_friction_holds_what_rests():
     e = plants.make_neutral()
     e[plants.I["coulomb"]] = 1.0

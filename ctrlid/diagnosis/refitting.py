@@ -46,21 +46,26 @@ def refit_candidate(base: Model, trial: Trial, near: Model | None = None) -> Tri
             # Coloured noise that was fitted while the effect was missing may never let it in.
             # (Where no simulation can check it, the likelihood also leads to absurd values.)
             starts.append(replace(start, noise=start.noise.plain))
-        if start.plant.e.kinked and not base.fit.plant.e.kinked and start.problem.known is None:
+        done = max((_climb_and_weigh(base, trial, s) for s in starts), key=_rank_by_value)
+        sticks = start.plant.e.kinked and not base.fit.plant.e.kinked
+        if sticks and start.problem.known is None and done.net_gain > 0:
             # The force of the model without it stands for what sticks.
-            starts.append(climb_under_quiet_force(start))
-        fits = [
-            drop_linearization(
-                place_instants(maximize(s, rounds=THRESHOLD.refit_rounds, exact=False))
-            )
-            for s in starts
-        ]
-        fit = max(fits, key=lambda f: f.value)
-        return weigh_refit(base, trial, fit)
+            quiet = _climb_and_weigh(base, trial, climb_under_quiet_force(start))
+            done = max(done, quiet, key=_rank_by_value)
+        return done
     except (ModelCannotRun, EffectDoesNotApply) as reason:
         return replace(trial, out=Objection.of(reason))
     except NUMERICAL_FAILURES as reason:
         return replace(trial, out=Objection.of_failure(reason))
+
+
+def _climb_and_weigh(base: Model, trial: Trial, start: Fit) -> Trial:
+    fit = place_instants(maximize(start, rounds=THRESHOLD.refit_rounds, exact=False))
+    return weigh_refit(base, trial, drop_linearization(fit))
+
+
+def _rank_by_value(trial: Trial) -> float:
+    return trial.model.fit.value
 
 
 def refit_under_noise(base: Model, trial: Trial, noise: Noise) -> Trial:
