@@ -261,7 +261,7 @@ def test_report_of_rare_cases(found):
 
 
 def test_repr_and_notebook(found):
-    assert repr(found["explained"]).startswith("Diagnosis(explained: CoulombFriction; gap 7.")
+    assert repr(found["explained"]).startswith("Diagnosis(explained: CoulombFriction; gap 8.")
     assert repr(found["unknown"]).startswith("Diagnosis(unknown; gap ")
     page = found["explained"]._repr_html_()
     assert page.startswith('<pre class="ctrlid"')
