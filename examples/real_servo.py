@@ -42,13 +42,12 @@ model = cid.Loop(plant, None, dt=record.dt, at=rest, free=("a", "b"))
 # %%
 # What is missing?
 # ----------------
-# `diagnose` finds dry friction twice: one that is stronger near rest, and one that is stronger in
-# one direction. On this plant the second is the same as symmetric dry friction with a constant
-# force, and no record of u and y can tell them apart. Its size differs between stretches of the
-# record, so its name does not stand. The residuals are not noise, and the search ends at its bound
-# before it is finished: the verdict is "partly explained", and what is named may still stand in for
-# a friction that the catalogue does not have. On the random steps, which were not used for the fit,
-# a prediction four samples ahead errs by a quarter less with both.
+# `diagnose` finds dry friction that is stronger in one direction, with an evidence far above all
+# others. On this plant it is the same as symmetric dry friction with a constant force, and no record
+# of u and y can tell them apart. Its size differs between stretches of the record, so its name does
+# not stand. The residuals are not noise, and the search ends at its bound before it is finished: the
+# verdict is "unknown", and what describes part of the record may stand in for a friction that the
+# catalogue does not have. The difference between the directions is the published offset.
 
 found = cid.diagnose(model, record, validation=other, progress=False)
 print(found)
@@ -64,14 +63,15 @@ b = found.loop.parameters["b"]
 volts = {
     finding.name: {name: value / b for name, value in finding.effect.values().items()}
     for finding in found.added
+    if "Friction" in finding.name
 }
 for name, sizes in volts.items():
     print(name, ", ".join(f"{size} {v:.2f} V" for size, v in sizes.items() if size != "vs"))
 print(f"gap {found.gap.given:.3f} V as given, {found.gap.after:.3f} V with the effects, "
       f"floor {found.gap.floor:.3f} V")  # fmt: skip
 
-assert found.verdict == "partly explained"
-assert [f.name for f in found.findings] == ["StribeckFriction"]
-assert [f.name for f in found.stand_ins] == ["AsymmetricCoulombFriction"]
+assert found.verdict == "unknown"
+assert not found.findings
+assert found.stand_ins[0].name == "AsymmetricCoulombFriction"
 assert abs(volts["AsymmetricCoulombFriction"]["difference"] - 0.75) < 0.15
-assert found.gap.after < 0.8 * found.gap.given
+assert found.gap.after < found.gap.given
