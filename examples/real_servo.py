@@ -43,11 +43,12 @@ model = cid.Loop(plant, None, dt=record.dt, at=rest, free=("a", "b"))
 # What is missing?
 # ----------------
 # `diagnose` finds dry friction that is stronger in one direction, with an evidence far above all
-# others. On this plant it is the same as symmetric dry friction with a constant force, and no record
-# of u and y can tell them apart. Its size differs between stretches of the record, so its name does
-# not stand. The residuals are not noise, and the search ends at its bound before it is finished: the
-# verdict is "unknown", and what describes part of the record may stand in for a friction that the
-# catalogue does not have. The difference between the directions is the published offset.
+# others. On this plant it is the same as symmetric dry friction with a constant force, and no
+# record of u and y can tell them apart. Its size differs between stretches of the record, so its
+# name does not stand. The residuals are not noise, and the search ends at its bound before it is
+# finished: the verdict is "unknown", and what describes part of the record may stand in for a
+# friction that the catalogue does not have. The difference between the directions is near the
+# published offset.
 
 found = cid.diagnose(model, record, validation=other, progress=False)
 print(found)
