@@ -93,7 +93,7 @@ def test_the_filter_of_a_linear_plant_is_the_kalman_filter():
 
 @pytest.mark.parametrize("colour", [cases.WHITE, np.array([1.0, 0.03, 1.0, 1.0])])
 def test_the_filter_of_a_sensor_with_play_knows_how_far_it_errs(colour):
-    """Four states beside a walk, one of which moves with the reading alone."""
+    """Three states, one of which moves with the reading alone, and a walk that makes it four."""
     rng = np.random.default_rng(8)
     truth = make_drive(rng, n=800)
     e = truth.e.copy()

@@ -41,7 +41,7 @@ def test_the_noise_is_found_under_a_wrong_model():
     assert np.sqrt(known.sensor[0]) == pytest.approx(SENSOR, rel=0.1)
     force = np.sqrt(known.sensor[0] * known.noise.force[0])
     # What sticks at a turn keeps what the force did to it until it breaks loose; a plant without
-    # friction takes that for more force.
+    # friction takes that for more force. An exact solution that stops shows 0.345 to 0.348 too.
     assert force == pytest.approx(FORCE, rel=0.2)
     absorbed = np.sqrt(fit.sensor[0] * (fit.noise.force[0] + fit.noise.coloured))
     assert absorbed > 2 * force

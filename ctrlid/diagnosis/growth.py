@@ -234,15 +234,15 @@ def _may_be_coloured(fit: Fit, more: float) -> bool:
     parameters that move along it may be twice as much. A slow walk of the sensor tells hardly
     anything from one innovation to the next, the less beside a coloured force that follows it.
     """
-    if THRESHOLD.colour_promise * measure_walk_gain(fit) > more:
-        return True
     told = 0.0
     for z in fit.standardized:
         filled = np.nan_to_num(z)
         products = compute_lagged_products(filled, filled, THRESHOLD.lags)
         told += compute_predicted_likelihood(products, float(np.count_nonzero(np.isfinite(z))))
     least = bayesian_penalty(1 - 2 * bool(fit.noise.drift), fit.size)
-    return THRESHOLD.colour_promise * told > more + least
+    if THRESHOLD.colour_promise * told > more + least:
+        return True
+    return THRESHOLD.colour_promise * measure_walk_gain(fit) > more
 
 
 def refuse_false_noise(found: Search, is_larger: Callable[[Model], bool]) -> Search:

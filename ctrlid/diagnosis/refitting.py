@@ -46,12 +46,14 @@ def refit_candidate(base: Model, trial: Trial, near: Model | None = None) -> Tri
             # Coloured noise that was fitted while the effect was missing may never let it in.
             # (Where no simulation can check it, the likelihood also leads to absurd values.)
             starts.append(replace(start, noise=start.noise.plain))
-        done = max((_climb_and_weigh(base, trial, s) for s in starts), key=_rank_by_value)
+        fit = max((_climb(s) for s in starts), key=lambda f: f.value)
+        done = weigh_refit(base, trial, fit)
         sticks = start.plant.e.kinked and not base.fit.plant.e.kinked
         if sticks and start.problem.known is None and done.net_gain > 0:
             # The force of the model without it stands for what sticks.
-            quiet = _climb_and_weigh(base, trial, climb_under_quiet_force(start))
-            done = max(done, quiet, key=_rank_by_value)
+            quiet = _climb(climb_under_quiet_force(start))
+            if quiet.value > fit.value:
+                done = weigh_refit(base, trial, quiet)
         return done
     except (ModelCannotRun, EffectDoesNotApply) as reason:
         return replace(trial, out=Objection.of(reason))
@@ -59,13 +61,9 @@ def refit_candidate(base: Model, trial: Trial, near: Model | None = None) -> Tri
         return replace(trial, out=Objection.of_failure(reason))
 
 
-def _climb_and_weigh(base: Model, trial: Trial, start: Fit) -> Trial:
-    fit = place_instants(maximize(start, rounds=THRESHOLD.refit_rounds, exact=False))
-    return weigh_refit(base, trial, drop_linearization(fit))
-
-
-def _rank_by_value(trial: Trial) -> float:
-    return trial.model.fit.value
+def _climb(start: Fit) -> Fit:
+    fit = maximize(start, rounds=THRESHOLD.refit_rounds, exact=False)
+    return drop_linearization(place_instants(fit))
 
 
 def refit_under_noise(base: Model, trial: Trial, noise: Noise) -> Trial:

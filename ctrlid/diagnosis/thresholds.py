@@ -282,7 +282,8 @@ class Thresholds:
         0.1, study="an effect that gains less is a stand-in", unit="of what known noise leaves open"
     )
     regained: float = declare_number(
-        0.05, cost="one effect that promises less than this does not stand for two",
+        0.05, cost="one effect that promises less than this does not stand for two; friction that "
+        "sticks promises little beside the force that stood for it",
         unit="of what leaving one of them out loses",
     )  # fmt: skip
     colour_promise: float = declare_number(

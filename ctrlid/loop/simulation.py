@@ -274,7 +274,8 @@ class Simulator:
         self._unstable = loop.controller is None and compute_growth_rate(loop) * loop.dt > 1e-6
         # What a millionth of the operating values does to each state: smaller motion is rest. What
         # sticks there says nothing of motion.
-        moving = make_period_map(leave_out_kinks(loop, memories=False), 1, hold, self.hold_r)
+        plain = leave_out_kinks(loop, memories=False)
+        moving = first if plain is loop else make_period_map(plain, 1, hold, self.hold_r)
         self._motion = linearize_at_rest(moving, moving.step)
         a, b = (np.nan_to_num(np.abs(m)) for m in self._motion)
         now, ahead = first.places[2], first.places[5]
