@@ -57,7 +57,7 @@ SECOND_STEP_GAIN = 30.0
 # Noise found far away must gain so much log-likelihood before the climb goes on from there.
 OTHER_NOISE_GAIN = 2.0
 # A force is hardly any with so small a share of its variance.
-QUIET = 1e-3
+QUIET = 1e-4
 # A step that is expected to gain less log-likelihood is not worth its evaluation.
 LEAST_STEP_GAIN = 1e-3
 
@@ -217,17 +217,23 @@ def refit_noise_size(fit: Fit) -> Fit:
     """Return the fit continued from the best noise of the whole range, if that is far better.
 
     A random force that stood for a wrong parameter at the start may have left no noise to the
-    sensor, from where small changes lead nowhere. Where the motion has kinks, hardly any force is
-    tried as well.
+    sensor, from where small changes lead nowhere.
     """
     plain = fit.noise.plain
     other = fit_noise(fit.problem, fit.theta, fit.linearized, plain, wide=True)
-    if other.value > fit.value + OTHER_NOISE_GAIN:
-        fit = maximize(other)
-    if fit.plant.e.kinked and fit.known is None:
-        quiet = maximize(climb_under_quiet_force(fit))
-        fit = quiet if quiet.value > fit.value + OTHER_NOISE_GAIN else fit
-    return fit
+    return maximize(other) if other.value > fit.value + OTHER_NOISE_GAIN else fit
+
+
+def refit_quiet_force(fit: Fit) -> Fit:
+    """Return the fit of a plant with kinks continued from hardly any force, if that is far better.
+
+    For a model that is taken to be complete. Beside one that still lacks something a random force
+    stands for it, and without any the parameters would.
+    """
+    if not fit.plant.e.kinked or fit.known is not None:
+        return fit
+    quiet = maximize(climb_under_quiet_force(fit))
+    return quiet if quiet.value > fit.value + OTHER_NOISE_GAIN else fit
 
 
 def climb_under_quiet_force(fit: Fit) -> Fit:

@@ -26,7 +26,14 @@ from ...loop.loop import Loop
 from ..whiteness import note_coloured_innovations
 from .filter_data import find_noise_units
 from .likelihood import Fit, find_priors, list_effect_bounds, make_problem
-from .maximization import begin_fit, choose_noise, compute_information, maximize, refit_noise_size
+from .maximization import (
+    begin_fit,
+    choose_noise,
+    compute_information,
+    maximize,
+    refit_noise_size,
+    refit_quiet_force,
+)
 from .physics_estimate import LoopEstimate, LoopFit
 
 # A direction of which the scaled information has a smaller relative eigenvalue is not in the data.
@@ -119,7 +126,7 @@ def fit_loop(
     if free is not None:
         asked = replace(loop, free=free) if isinstance(free, Mapping) else loop
         problem = replace(problem, priors=find_priors(asked, free))
-    fit = refit_noise_size(maximize(begin_fit(problem)))
+    fit = refit_quiet_force(refit_noise_size(maximize(begin_fit(problem))))
     if coloured or coloured is None:
         fit = choose_noise(fit, always=bool(coloured))
     if not math.isfinite(fit.value):
