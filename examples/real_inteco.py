@@ -42,12 +42,11 @@ model = cid.Loop(plant, None, dt=record.dt, at=at, free=("K",))
 # %%
 # What is missing?
 # ----------------
-# `diagnose` finds a lag between the duty cycle and the reading of the sensor, which may be one of
-# the actuator or of the sensor: a single oscillation does not tell them apart. It also finds an
-# offset of the gap in the law of the force, and a small friction, although the ball moves in air.
-# None of the names stands, since the sizes differ between stretches of the record, and the verdict
-# is "unknown". With all three the prediction over two samples is as good as the last reading, and
-# the random force is large, so that this record says no more.
+# `diagnose` finds a lag of the actuator, an offset of the gap in the law of the force, and a small
+# friction, although the ball moves in air. None of the names stands, since the sizes differ between
+# stretches of the record, and the verdict is "unknown". With all three the prediction over two
+# samples is hardly better than the last reading, and the random force is large, so that this record
+# says no more.
 
 found = cid.diagnose(model, record, progress=False)
 print(found)
