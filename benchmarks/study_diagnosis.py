@@ -14,7 +14,7 @@ kinds are
 - ``lookalike``: where the answer has several names, the recommended experiment is simulated and
   diagnosed.
 
-``--vary look_back=0.5,0.9`` diagnoses the same draws also with other values of a number of the
+``--vary near_winner=0.3,0.9`` diagnoses the same draws also with other values of a number of the
 table in ``ctrlid/diagnosis/thresholds.py``, and prints the tables one after the other. With
 ``--unknown`` the diagnosis does not get the controller. ``--out FILE`` writes the runs as lines of
 JSON, and ``--report FILE...`` prints their tables again.
@@ -941,7 +941,7 @@ def read(paths: Iterable[str]) -> list[Row]:
 
 
 def parse_vary(text: str) -> list[dict[str, float]]:
-    """Return the settings of ``look_back=0.5,0.9``: first the table's own value, then the others.
+    """Return the settings of ``near_winner=0.3,0.9``: first the table's own value, then the others.
 
     >>> parse_vary("gate=4,6")
     [{'gate': 5.0}, {'gate': 4.0}, {'gate': 6.0}]

@@ -39,7 +39,7 @@ from ctrlid.diagnosis.screening import screen_at, screen_candidate
 from ctrlid.diagnosis.selection import Round, prefer_plainer, run_round
 from ctrlid.diagnosis.thresholds import THRESHOLD
 from ctrlid.diagnosis.verdict import find_doubt, gap_is_wider, write_conclusion
-from ctrlid.estimation.likelihood.kalman_filter import guess_trajectory
+from ctrlid.estimation.likelihood.kalman_filter import Noise, guess_trajectory
 from ctrlid.estimation.likelihood.likelihood import make_problem, relinearize_fit
 from ctrlid.estimation.likelihood.maximization import begin_fit, choose_noise, maximize
 from ctrlid.loop.simulation import Simulator
@@ -640,7 +640,7 @@ def test_where_nothing_follows_equals_of_the_best_are_asked():
     force, zero = (refit_candidate(base, screen_candidate(base, *kind.candidates(loop, record)))
                    for kind in (E.ConstantForce, E.SensorOffset))  # fmt: skip
     assert force.net_gain == pytest.approx(zero.net_gain, abs=0.1)
-    first = Round(base, (force, zero), force)
+    first = Round(base, (force, zero), force, (zero,))
     nothing = Round(with_linearization(force.model), (), None)
     other = _look_back(first, nothing, [E.CubicStiffness], lambda f, given: [f(x) for x in given])
     assert other is zero
@@ -945,3 +945,37 @@ def test_a_candidate_whose_arithmetic_fails_fails_alone(two_found, monkeypatch, 
     trial = screen_candidate(with_linearization(base), two_found.found[0].trial.effect)
     monkeypatch.setattr(refitting, "maximize", fail)
     assert refit_candidate(base, trial).out.ground == "cannot run"
+
+
+def test_a_climb_from_noise_that_loses_the_record_is_an_answer():
+    """A fit without its linearization has nothing else to go on where the new noise loses it."""
+    loop = drive(("k",))
+    record = record_of(loop, E.InputDeadZone(0.5), 1.0, 1e-3, 9500, 600)
+    fit = fit_base_model(loop, [record], loop.free).fit
+    lost = replace(drop_linearization(fit), noise=replace(fit.noise, force=(float("nan"),)))
+    assert not maximize(lost, rounds=3, exact=False).value > -float("inf")
+
+
+def test_a_gap_is_that_of_the_friction_which_was_found():
+    """Linearized along its last trajectory, a filter with a stick and hardly any force was lost."""
+    plant = ct.nlsys(
+        lambda t, x, u, p: np.array([
+            x[1], (p["mgl"] * np.sin(x[0]) + p["kt"] * u[0] - p["b"] * x[1]) / p["J"]]),
+        lambda t, x, u, p: x[0], inputs=["V"], outputs=["theta"], states=["theta", "w"],
+        params={"J": 0.012, "mgl": 0.9, "kt": 0.25, "b": 0.02}, name="arm",
+    )  # fmt: skip
+    law = ct.sample_system(ct.tf([0.8, 12.0], [0.01, 1]), 0.01, "tustin")
+    at = cid.operating_point(plant, output=0.0)
+    loop = cid.Loop(plant, law, dt=0.01, at=at, free=("mgl", "kt"))
+    real = loop.with_effect(E.CoulombFriction(4.17))
+    r = cid.random_binary(2000, amplitude=0.05, hold=25, seed=0)
+    record = cid.simulate(real, r, sensor_noise=2e-4, seed=2)
+    problem = make_problem(real, ("mgl", "kt", "CoulombFriction.fc"), [record[:1500]])
+    begun = begin_fit(problem, np.array([0.9, 0.25, 4.17]), Noise((0.24,)))
+    assert begun.value > 10000
+    assert abs(relinearize_fit(begun).value - begun.value) < 1.0
+    found = cid.diagnose(loop, record, catalogue=[E.CoulombFriction], progress=False)
+    assert [f.name for f in found.findings] == ["CoulombFriction"]
+    assert found.verdict == "explained"
+    assert found.gap.after < 1.2 * found.gap.floor
+    assert found.gap.before > 20 * found.gap.floor

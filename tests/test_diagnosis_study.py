@@ -117,8 +117,8 @@ def test_tables_count_what_the_rows_say(capsys):
 
 
 def test_numbers_of_the_table_are_varied_on_the_same_draws(monkeypatch):
-    assert study.parse_vary("look_back=0.5,0.9") == [
-        {"look_back": 0.7}, {"look_back": 0.5}, {"look_back": 0.9}]  # fmt: skip
+    assert study.parse_vary("near_winner=0.3,0.9") == [
+        {"near_winner": 0.5}, {"near_winner": 0.3}, {"near_winner": 0.9}]  # fmt: skip
     assert study.parse_vary("looked_at=3") == [{"looked_at": 5}, {"looked_at": 3}]
     for wrong in ("nonsense=1", "gate=much", "experiment_levels=1", "gate"):
         with pytest.raises(argparse.ArgumentTypeError, match="needs"):

@@ -7,6 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import ctrlid as cid
+from ctrlid import effects as E
+from ctrlid.diagnosis.fitted_model import with_linearization
+from ctrlid.diagnosis.quiet_refitting import refit_quietly
+from ctrlid.diagnosis.recalibration import fit_base_model
+from ctrlid.diagnosis.refitting import refit_candidate
+from ctrlid.diagnosis.screening import screen_candidate
 from problems import load_script
 
 study = load_script("benchmarks", "study_frozen")
@@ -202,3 +209,24 @@ def test_a_diagnosis_rerun_from_its_seed_gives_the_same_answer():
     one, two = (study.run("clean", 1, 400) for _ in range(2))
     assert "error" not in one, one
     assert study.is_same_answer(one, two)
+
+
+def test_the_second_of_two_that_hide_together_shows_under_hardly_any_force():
+    """A dead zone and a delay of six samples: beside the first the second has a small score."""
+    case = cases.draw_case("two", 50017, 1500)
+    assert set(case.hidden) == {"InputDeadZone", "InputDelay"}
+    loop = study.make_loop(case.rig)
+    record = cid.Record(r=case.r, u=case.u, y=case.y, dt=case.rig.dt)
+    base = fit_base_model(loop, [record], tuple(loop.free))
+    (zone,) = E.InputDeadZone.candidates(loop, record)
+    nearly = with_linearization(refit_candidate(base, screen_candidate(base, zone)).model)
+    assert nearly.fitted.effects[0].width == pytest.approx(45.2, abs=3)
+    pool = [e for kind in (E.InputDelay, E.InputBacklash, E.ViscousFriction, E.LinearStiffness)
+            for e in kind.candidates(loop, record)]  # fmt: skip
+    scores = {type(e).__name__: screen_candidate(nearly, e).score for e in pool}
+    assert scores["InputDelay"] < 40
+    best = max(refit_quietly(nearly, pool, lambda f, given: [f(x) for x in given]),
+               key=lambda t: t.net_gain)  # fmt: skip
+    assert best.name == "InputDelay"
+    assert best.net_gain > 300
+    assert best.fitted.delay == pytest.approx(6 * case.rig.dt, rel=0.01)

@@ -107,8 +107,8 @@ def test_every_number_is_used():
 
 def test_numbers_are_varied_within_a_block_and_come_back():
     known = THRESHOLD.gate
-    with vary_numbers(gate=7.0, look_back=0.5):
-        assert (THRESHOLD.gate, THRESHOLD.look_back) == (7.0, 0.5)
+    with vary_numbers(gate=7.0, near_winner=0.3):
+        assert (THRESHOLD.gate, THRESHOLD.near_winner) == (7.0, 0.3)
     assert THRESHOLD.gate == known
 
     def fail():

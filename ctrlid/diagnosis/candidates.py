@@ -1,7 +1,7 @@
 """What may be missing: the candidates of a catalogue, and one of them added to a model."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, Self
 
@@ -16,6 +16,8 @@ from ..estimation.likelihood.sampled_plant import Trajectory
 from .fitted_model import Model, keep_information
 from .places import list_placed_candidates
 
+# A map that may run in parallel: ``work(function, items)``.
+Work = Callable[[Callable[..., Any], Iterable[Any]], list[Any]]
 Ground = Literal[
     "does not apply", "cannot run", "not seen", "vanishes", "on a bound", "insignificant",
     "doubtful", "artefact", "not the simplest",

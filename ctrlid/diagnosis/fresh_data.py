@@ -141,8 +141,8 @@ class FreshData:
         squares, usual, worth = np.zeros(outputs), np.zeros(outputs), np.zeros(outputs)
         for loop, window in zip(loops, self.windows, strict=True):
             plain, record = replace(loop, controller=None), window.record
-            problem = make_problem(plain, (), [record], [window.start_time])
             try:
+                problem = make_problem(plain, (), [record], [window.start_time])
                 here = begin_fit(replace(problem, known=known))
             except ModelCannotRun:
                 return math.nan

@@ -28,7 +28,7 @@ from ..estimation.likelihood.noise_fit import (
     measure_walk_gain,
 )
 from ..estimation.likelihood.tails import JointTails
-from .candidates import Trial, contains, is_same_kind, list_missing_candidates
+from .candidates import Trial, Work, is_same_kind, list_missing_candidates
 from .fitted_model import (
     Model,
     can_simulate,
@@ -38,6 +38,7 @@ from .fitted_model import (
 )
 from .fresh_data import FreshData
 from .noise_tests import NoiseTests, choose_alarm_level, run_noise_tests
+from .quiet_refitting import refit_quietly
 from .recalibration import restore_given_values
 from .refitting import refit_candidate
 from .removal import (
@@ -52,7 +53,7 @@ from .replicas import forgive_filter, make_replica
 from .rivals import compare_effects
 from .scans import scan_candidate
 from .screening import screen_at
-from .selection import Round, Work, run_round
+from .selection import Round, run_round
 from .thresholds import THRESHOLD
 
 
@@ -144,13 +145,15 @@ def _grow_model(
         reached.model = model
         tell(f"round {len(steps) + 1}: screening")
         pool = list_missing_candidates(model, catalogue)
-        step = run_round(model, pool, work, None if steps else restore_given_values(base))
+        given_values = None if steps else restore_given_values(base)
+        step = run_round(model, pool, work, given_values, beside=bool(steps))
         # Noise may be coloured and have heavy tails, one after the other.
         while (other := _prefer_sensor_noise(model, step.best, is_larger)) is not None:
             tell(f"round {len(steps) + 1}: screening beside other sensor noise")
             model, base = other, base if steps else other
             reached.model, reached.base = model, base
-            step = run_round(model, list_missing_candidates(model, catalogue), work)
+            pool = list_missing_candidates(model, catalogue)
+            step = run_round(model, pool, work, beside=bool(steps))
         step = replace(step, base=Model(model.loop, drop_linearization(model.fit)))
         if step.best is not None and _is_stand_in(step.best, model, beside=bool(steps)):
             step = replace(step, best=None)
@@ -347,48 +350,33 @@ def _look_back(
 ) -> Trial | None:
     """Return what would have been the better choice of the last round, now that more is found.
 
-    Where two effects hide together, the one that alone gains most may be a mixture of both. So each
-    effect of its kind that did nearly as well is asked what could follow on it; the best pair wins.
-    Where nothing follows on the best that leaves noise alone, those that did as well are asked: an
-    offset of the sensor moves the middle of a spring, and a constant force does not.
+    Where two effects hide together, the one that alone gains most may be a mixture of both. So what
+    could have been taken in its place is asked what could follow on it; the best pair wins. Where
+    what follows on the best leaves noise alone, only its look-alikes are asked.
     """
     if step.best is None and run_noise_tests(step.base.fit).passed:
         return None
     best = last.best
     assert best is not None
-    ties = step.best is None or not run_noise_tests(step.best.model.fit).passed
-    near = [t for t in last.trials[1 : THRESHOLD.looked_at] if _is_close_rival(t, best, ties)]
+    near = last.others
+    if step.best is not None and run_noise_tests(step.best.model.fit).passed:
+        near = tuple(t for t in near if t.resembles(best) or best.resembles(t))
     # Effects with a small score beside the best are not scanned again, since scans take longest.
     ranked = sorted(step.trials, key=lambda t: -t.score)
     likely = {t.key for t in (ranked if step.best is None else ranked[: THRESHOLD.looked_at])}
     pairs: list[tuple[float, int]] = []
-    for k, trial in enumerate(near[: THRESHOLD.looked_back]):
+    for k, trial in enumerate(near):
         model = with_linearization(trial.model)
         pool = [c for c in list_missing_candidates(model, catalogue)
                 if not c.is_scanned() or name_at_place(c) in likely]  # fmt: skip
         tried: list[Trial] = work(lambda effect, model=model: scan_candidate(model, effect), pool)
-        tried = sorted(tried, key=lambda t: t.full_penalty - t.score)[:2]
+        tried = sorted(tried, key=lambda t: t.full_penalty - t.score)[: THRESHOLD.released]
         done = work(lambda t, model=model: refit_candidate(model, t), tried)
+        done += refit_quietly(model, pool, work)
         pairs.append((trial.net_gain + max((t.net_gain for t in done), default=-math.inf), k))
     total, k = max(pairs, default=(-math.inf, 0))
     own = best.net_gain + (step.best.net_gain if step.best is not None else THRESHOLD.gate)
     return near[k] if total > own + THRESHOLD.gate else None
-
-
-def _is_close_rival(trial: Trial, best: Trial, ties: bool) -> bool:
-    """Whether a candidate did nearly as well as one that resembles it, and is another.
-
-    One that did as well is asked for `ties` only: it is another name for the same, as a rule.
-    """
-    if contains(trial.effect, best.effect) or contains(best.effect, trial.effect):
-        return False
-    if not THRESHOLD.look_back * best.net_gain < trial.net_gain:
-        return False
-    mine, its = ({t.name, *type(t.effect).look_alikes} for t in (best, trial))
-    apart = best.effect.place == trial.effect.place and best.effect.at != trial.effect.at
-    return ties or (
-        bool(mine & its) and not apart and trial.net_gain < best.net_gain - THRESHOLD.close
-    )
 
 
 def measure_unexplained_likelihood(fit: Fit) -> float:

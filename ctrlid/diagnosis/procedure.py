@@ -20,7 +20,7 @@ from ..loop.wiring import match_signals
 from ..validation.record_audit import Audit
 from ..validation.reproduction import OPEN_LOOP
 from .answer import assemble_answer, name_records
-from .candidates import check_catalogue
+from .candidates import Work, check_catalogue
 from .findings import COMPLETE, Disturbance, Gap
 from .fitted_model import Model, compute_penalized_likelihood
 from .fresh_data import FreshData, check_length, choose_fresh_data
@@ -54,7 +54,6 @@ from .records import (
 from .removal import Weighed
 from .replicas import forgive_rounding
 from .result import Diagnosis
-from .selection import Work
 from .several_records import merge_diagnoses
 from .thresholds import THRESHOLD
 from .verdict import declare_unfinished

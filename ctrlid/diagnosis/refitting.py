@@ -46,12 +46,12 @@ def refit_candidate(base: Model, trial: Trial, near: Model | None = None) -> Tri
             # Coloured noise that was fitted while the effect was missing may never let it in.
             # (Where no simulation can check it, the likelihood also leads to absurd values.)
             starts.append(replace(start, noise=start.noise.plain))
-        fit = max((_climb(s) for s in starts), key=lambda f: f.value)
+        fit = max((climb(s) for s in starts), key=lambda f: f.value)
         done = weigh_refit(base, trial, fit)
         sticks = start.plant.e.kinked and not base.fit.plant.e.kinked
         if sticks and start.problem.known is None and done.net_gain > 0:
             # The force of the model without it stands for what sticks.
-            quiet = _climb(climb_under_quiet_force(start))
+            quiet = climb(climb_under_quiet_force(start))
             if quiet.value > fit.value:
                 done = weigh_refit(base, trial, quiet)
         return done
@@ -61,7 +61,8 @@ def refit_candidate(base: Model, trial: Trial, near: Model | None = None) -> Tri
         return replace(trial, out=Objection.of_failure(reason))
 
 
-def _climb(start: Fit) -> Fit:
+def climb(start: Fit) -> Fit:
+    """Return the likeliest fit of a candidate, without the plant along its trajectory."""
     fit = maximize(start, rounds=THRESHOLD.refit_rounds, exact=False)
     return drop_linearization(place_instants(fit))
 

@@ -9,7 +9,7 @@ import numpy as np
 from .._base.arrays import Array
 from ..effects.base import name_at_place
 from ..estimation.likelihood.maximization import maximize
-from .candidates import Trial, contains, is_same_kind
+from .candidates import Trial, Work, contains, is_same_kind
 from .fitted_model import Model, compute_criterion, compute_log_terms
 from .noise_tests import run_noise_tests
 from .refitting import refit_candidate
@@ -22,7 +22,7 @@ from .removal import (
     weigh_effects,
 )
 from .screening import screen_at
-from .selection import Round, Work, prefer_plainer
+from .selection import Round, prefer_plainer
 from .thresholds import THRESHOLD
 
 

@@ -1,40 +1,45 @@
 """Step 6: one round of the search: all screened, the promising refitted, the best checked."""
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 from ..effects import AbstractEffect
 from ..estimation.likelihood.maximization import compute_expected_gain
-from .candidates import Objection, Trial, contains, is_same_kind, keep_for_comparison
+from .candidates import Objection, Trial, Work, contains, is_same_kind, keep_for_comparison
 from .fitted_model import Model, without_random_force
+from .quiet_refitting import refit_quietly
 from .refitting import refit_candidate, refit_under_noise
 from .replicas import has_kinks, make_replica, measure_gain_beyond_simple, measure_gain_on_replicas
 from .scans import ModelSight, scan_candidate
 from .screening import screen_at
 from .thresholds import THRESHOLD
 
-Work = Callable[[Callable[..., Any], Iterable[Any]], list[Any]]
 # A job is the trial that is refitted, the start, and the model near whose values it starts.
 Job = tuple[Trial, Trial | AbstractEffect, Model | None]
 
 
 @dataclass(frozen=True, eq=False)
 class Round:
-    """One round: the model it started from, what was tried, and what won."""
+    """One round: the model it started from, what was tried, and what won.
+
+    The `others` earn a place as well, and are no forms of the best or of each other.
+    """
 
     base: Model
     trials: tuple[Trial, ...]
     best: Trial | None
+    others: tuple[Trial, ...] = ()
 
 
 def run_round(
-    base: Model, pool: Sequence[AbstractEffect], work: Work, other: Model | None = None
-) -> Round:
+    base: Model, pool: Sequence[AbstractEffect], work: Work, other: Model | None = None,
+    beside: bool = False,
+) -> Round:  # fmt: skip
     """Screen all candidates, refit the promising, and return the best that earns its place.
 
-    They are added to the base, and to the `other` model in its place if one is given.
+    They are added to the base, and to the `other` model in its place if one is given. Where an
+    effect was found before, `beside` it, they are also tried under hardly any random force.
     """
     tried: list[Trial] = work(lambda effect: scan_candidate(base, effect), pool)
     more: list[Trial] = []
@@ -51,18 +56,37 @@ def run_round(
     if not tried or not math.isfinite(tried[0].score):
         return Round(base, tuple(tried), None)
     copies: list[Model | None] = []
-    trials = _check_on_replicas(base, _refit_promising(base, tried, more, work), copies)
-    trials = _prefer_simplest(base, trials)
+    trials = _refit_promising(base, tried, more, work)
+    if beside:
+        # Two that hide together leave a large random force, beside which a score tells little.
+        trials += refit_quietly(base, [t.effect for t in tried], work)
+    trials = _prefer_simplest(base, _check_on_replicas(base, trials, copies))
     plain = prefer_plainer(base, trials[0], trials[1:])
     if plain is not trials[0]:
         trials = [plain, *(t for t in trials if not is_same_kind(t.effect, plain.effect))]
         trials = _check_on_replicas(base, trials, copies)
     best = trials[0]
-    trials = [
-        *trials[: THRESHOLD.looked_at],
-        *map(keep_for_comparison, trials[THRESHOLD.looked_at :]),
-    ]
-    return Round(base, tuple(trials), best if best.net_gain > THRESHOLD.gate else None)
+    if best.net_gain <= THRESHOLD.gate:
+        return Round(base, tuple(map(keep_for_comparison, trials)), None)
+    others = _list_other_choices(trials)
+    kept = {id(t) for t in (*trials[: THRESHOLD.looked_at], *others)}
+    trials = [t if id(t) in kept else keep_for_comparison(t) for t in trials]
+    return Round(base, tuple(trials), best, others)
+
+
+def _list_other_choices(trials: Sequence[Trial]) -> tuple[Trial, ...]:
+    """Return what a round could take in place of its best, none a form of another."""
+    choices = list(trials[:1])
+    for t in trials[1:]:
+        forms = (
+            is_same_kind(t.effect, c.effect)
+            or contains(t.effect, c.effect)
+            or contains(c.effect, t.effect)
+            for c in choices
+        )
+        if t.net_gain > THRESHOLD.gate and not any(forms):
+            choices.append(t)
+    return tuple(choices[1 : THRESHOLD.looked_back + 1])
 
 
 def _refit_promising(

@@ -265,11 +265,17 @@ class Thresholds:
         0.1, study="two look-alikes that both add less to each other may be one thing; in 1 011 "
         "runs the rule spoke in four, all of them limited rates", unit="of what all explain",
     )  # fmt: skip
-    look_back: float = declare_number(
-        0.7, study="a candidate that came so close in the last round may be the better half of a "
-        "pair, and is asked what could follow on it", unit="of the best net gain",
+    looked_back: int = declare_number(
+        4, cost="so many choices that a round did not take are asked what could follow on them",
+        unit="candidates",
     )  # fmt: skip
-    looked_back: int = declare_number(2, cost="of those, so many are asked", unit="candidates")
+    tried_quietly: int = declare_number(
+        8, cost="so many are refitted under hardly any random force, those of the best scores",
+        unit="candidates",
+    )  # fmt: skip
+    released: int = declare_number(
+        2, cost="so many of those are refitted with the random force free", unit="candidates"
+    )
     minor: float = declare_number(
         0.15, study="an effect that gains less, beside something unknown, is a stand-in unless it "
         "helps on fresh data", unit="of the whole gain",

@@ -12,6 +12,7 @@ from ..physics.linearization import OperatingPoint
 from .context import Moment
 from .kinds import InputEffect, choose_first_width, require_one_input
 from .parameters import parameter
+from .scanning import Range
 from .symbolic import to_expression
 
 
@@ -102,6 +103,10 @@ class InputDelay(InputEffect):
         """Return a delay of half a period: at zero the derivative has one side only."""
         del record
         return cls._applicable(loop, cls(delay=0.5 * loop.dt))
+
+    def limits(self, seen: Range) -> dict[str, tuple[float, float]]:
+        """Return the length of the record: of a longer delay nothing would arrive."""
+        return {"delay": (0.0, seen.duration)}
 
     def build(self, e: Equations, m: Moment) -> Equations:
         """Return the equations with this delay on top of what there is."""

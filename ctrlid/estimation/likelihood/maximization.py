@@ -58,6 +58,10 @@ SECOND_STEP_GAIN = 30.0
 OTHER_NOISE_GAIN = 2.0
 # A force is hardly any with so small a share of its variance.
 QUIET = 1e-4
+# A trajectory has settled where linearizing along it changes the log-likelihood by less.
+SETTLED_VALUE = 1.0
+# Passes from a trajectory near the record to that of the model.
+FOLLOWING_PASSES = 3
 # A step that is expected to gain less log-likelihood is not worth its evaluation.
 LEAST_STEP_GAIN = 1e-3
 
@@ -164,7 +168,33 @@ def _begin_with_noise(problem: Problem, theta: Array, noise: Noise | None) -> Fi
         pairs = zip(problem.data, results, strict=True)
         counts = tuple(choose_settled_samples(data, out) for data, (_, out) in pairs)
         problem = replace(problem, counts=counts)
-    return evaluate_likelihood(problem, theta, first, [out.trajectory for _, out in results])
+    fit = evaluate_likelihood(problem, theta, first, [out.trajectory for _, out in results])
+    return _follow_records(fit)
+
+
+def _follow_records(fit: Fit) -> Fit:
+    """Return a fit, begun along trajectories that stay near the records if its own do not settle.
+
+    Where dry friction sticks and hardly any force is random, linearizing along the last trajectory
+    may lead from one wrong one to the next. A force that moves the output by as much as the noise
+    of the sensor within a period keeps the filter near the record, and from there it settles.
+    """
+    again = relinearize_fit(fit)
+    if math.isfinite(fit.value) and abs(again.value - fit.value) < SETTLED_VALUE:
+        return fit
+    loud = replace(fit.noise, force=tuple((choose_force_ratios(fit.problem) ** 2).tolist()))
+    try:
+        results = [
+            converge_trajectory(fit.plant, one, fit.theta, loud, guess_trajectory(fit.plant, one))
+            for one in fit.data
+        ]
+    except ModelCannotRun:
+        return fit
+    at = [out.trajectory for _, out in results]
+    near = evaluate_likelihood(fit.problem, fit.theta, fit.noise, at)
+    for _ in range(FOLLOWING_PASSES):
+        near = relinearize_fit(near)
+    return max(fit, near, key=rank_by_likelihood)
 
 
 def maximize(fit: Fit, rounds: int = ROUNDS, exact: bool = True) -> Fit:
@@ -196,6 +226,8 @@ def maximize(fit: Fit, rounds: int = ROUNDS, exact: bool = True) -> Fit:
         )
 
     tuned, far, enough = -math.inf, True, 0.02 if exact else 0.3
+    if not fit.linearized:
+        fit, far = relinearize_fit(fit), False
     for _ in range(rounds):
         # A short step was already evaluated along the trajectory of the pass before.
         again = relinearize_fit(fit) if far else fit
@@ -243,9 +275,13 @@ def climb_under_quiet_force(fit: Fit) -> Fit:
     leaves much to a force: the likelihood has a maximum with and one without it. From the former no
     climb leads to the latter while the noise is free.
     """
+    return replace(maximize(hold_force_quiet(fit), exact=False), problem=fit.problem)
+
+
+def hold_force_quiet(fit: Fit) -> Fit:
+    """Return a fit whose noise is held, with hardly any random force."""
     quiet = quieten_force(fit.noise)
-    held = replace(fit, noise=quiet, problem=replace(fit.problem, known=Known(quiet)))
-    return replace(maximize(held, exact=False), problem=fit.problem)
+    return replace(fit, noise=quiet, problem=replace(fit.problem, known=Known(quiet)))
 
 
 def quieten_force(noise: Noise) -> Noise:

@@ -1,0 +1,79 @@
+"""Steps 5 and 7: candidates refitted under hardly any random force, for what hides together."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from .._base.errors import EffectDoesNotApply, ModelCannotRun
+from ..effects import AbstractEffect
+from ..estimation.likelihood.likelihood import Fit, rank_by_likelihood
+from ..estimation.likelihood.maximization import hold_force_quiet, maximize
+from ..estimation.likelihood.noise_fit import fit_noise
+from .candidates import NUMERICAL_FAILURES, Objection, Trial, Work
+from .fitted_model import Model, carry_over_fit, with_linearization
+from .refitting import climb, weigh_refit
+from .scans import scan_candidate
+from .thresholds import THRESHOLD
+
+
+def refit_quietly(base: Model, effects: Sequence[AbstractEffect], work: Work) -> list[Trial]:
+    """Refit effects under hardly any random force, and the likeliest of them with it again.
+
+    A random force stands for whatever a model lacks. Of two effects that hide together the first
+    leaves a large one, beside which the second gains little at first, and its score says nothing.
+    Under hardly any force the second completes the model, and gains more than any other.
+
+    Parameters
+    ----------
+    base : Model
+        The model with what was found before.
+    effects : sequence of effects
+        The candidates.
+    work : callable
+        ``work(function, items)``, a map that may run in parallel.
+
+    Returns
+    -------
+    list of Trial
+        The likeliest under hardly any force, refitted with the force free; none where the noise is
+        known beforehand, beside which every score is as good.
+    """
+    if base.fit.known is not None:
+        return []
+    fit = with_linearization(base).fit
+    if fit.noise.drift:
+        # A coloured force leaves a white one of any size, which says nothing of how large one was.
+        white = replace(fit.noise, memory=0.0, drift=0.0)
+        fit = fit_noise(fit.problem, fit.theta, fit.linearized, white, wide=True)
+    held = hold_force_quiet(fit)
+    try:
+        quiet = with_linearization(Model(base.loop, maximize(held, exact=False)))
+    except ModelCannotRun:
+        return []
+    tried: list[Trial] = work(lambda effect: scan_candidate(quiet, effect), effects)
+    tried = sorted(tried, key=lambda t: -t.score)[: THRESHOLD.tried_quietly]
+    fits = work(lambda t: _climb_quietly(quiet, t), tried)
+    pairs = [(t, f) for t, f in zip(tried, fits, strict=True) if f is not None]
+    pairs.sort(key=lambda pair: -rank_by_likelihood(pair[1]))
+    return work(lambda pair: _release(base, *pair), pairs[: THRESHOLD.released])
+
+
+def _climb_quietly(quiet: Model, trial: Trial) -> Fit | None:
+    """Return a candidate fitted with the noise held; None if it cannot run."""
+    if trial.out is not None:
+        return None
+    try:
+        start = carry_over_fit(quiet, trial.model.loop, trial.model.names)
+        return maximize(start, rounds=THRESHOLD.refit_rounds, exact=False)
+    except (ModelCannotRun, EffectDoesNotApply, *NUMERICAL_FAILURES):
+        return None
+
+
+def _release(base: Model, trial: Trial, fit: Fit) -> Trial:
+    """Return a trial on top of the base, climbed on with its noise free."""
+    try:
+        free = replace(fit, problem=replace(fit.problem, known=base.fit.known))
+        return weigh_refit(base, trial, climb(free))
+    except (ModelCannotRun, EffectDoesNotApply) as reason:
+        return replace(trial, out=Objection.of(reason))
+    except NUMERICAL_FAILURES as reason:
+        return replace(trial, out=Objection.of_failure(reason))
