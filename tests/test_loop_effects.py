@@ -1,5 +1,6 @@
 """A loop with effects: its interface, and each effect against a closed form or formula."""
 
+import inspect
 import math
 from dataclasses import replace
 from functools import partial
@@ -80,6 +81,43 @@ def test_other_parameters_are_another_loop():
         loop.with_parameters({"ViscousFriction.c": -1.0})
     with pytest.raises(cid.CtrlidError, match="finite"):
         loop.with_parameters({"K": math.nan})
+
+
+@pytest.mark.parametrize(
+    ("values", "named", "words"),
+    [
+        ({"J": 1.0}, {}, r"the loop has no parameter 'J'; it has m, K, g, CoulombFriction.fc$"),
+        (None, {"J": 1.0}, r"the loop has no parameter 'J'; it has m, K, g, CoulombFriction.fc$"),
+        (None, {"k": 1.0}, "no parameter 'k'; .*; did you mean K\\?"),
+        ({"fc": 1.0}, {}, "no parameter 'fc'; .*; did you mean CoulombFriction.fc\\?"),
+        (None, {"K": "3e-6"}, "with_parameters needs a number as K; given '3e-6'"),
+        (None, {"K": [1.0, 2.0]}, r"with_parameters needs a number as K; given \[1.0, 2.0\]"),
+        ({"K": np.ones(2)}, {}, "needs a mapping of a text to a number or None as values"),
+        ("K", {}, "needs a mapping of a text to a number or None as values; given 'K'"),
+    ],
+)
+def test_a_loop_knows_which_parameter_was_meant(values, named, words):
+    loop = levitated(effects=(E.CoulombFriction(fc=0.1),))
+    with pytest.raises(cid.CtrlidError, match=words):
+        loop.with_parameters(values, **named)
+
+
+def test_parameters_are_named_by_keyword_too():
+    loop = levitated(effects=(E.CoulombFriction(fc=0.1),))
+    both = loop.with_parameters({"CoulombFriction.fc": 0.2}, K=3e-6)
+    assert both.parameters == {**loop.parameters, "K": 3e-6, "CoulombFriction.fc": 0.2}
+    assert loop.with_parameters().parameters == loop.parameters
+
+
+def test_an_unknown_field_of_a_loop_is_refused_in_words():
+    loop = levitated()
+    with pytest.raises(cid.CtrlidError, match="a Loop has no unit=; did you mean units="):
+        replace(loop, unit={})
+    with pytest.raises(cid.CtrlidError, match=r"a Loop has no K=; it has plant, .*, forces$"):
+        cid.Loop(loop.plant, dt=0.01, at=loop.at, K=1.0)
+    assert list(inspect.signature(cid.Loop).parameters)[:3] == ["plant", "controller", "dt"]
+    with pytest.raises(cid.CtrlidError, match=r"no effect Coulomb; it has .*mean CoulombFriction"):
+        loop.with_effect(E.CoulombFriction(fc=0.1)).without_effect("Coulomb")
 
 
 def test_parameters_of_an_interconnection():

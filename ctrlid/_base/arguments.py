@@ -106,7 +106,7 @@ def check_field_names(cls: Any, given: Iterable[str]) -> None:
     CtrlidError
         At the first that it does not have, with a near name.
     """
-    known = tuple(cls.__dataclass_fields__)
+    known = [name for name, field in cls.__dataclass_fields__.items() if field.init]
     for name in given:
         if name not in known:
             near = find_near_name(name, known)

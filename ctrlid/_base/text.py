@@ -247,16 +247,44 @@ def find_near_name(name: str, known: Iterable[str]) -> str | None:
     --------
     >>> find_near_name("Coulomb", ("ViscousFriction", "CoulombFriction")), find_near_name("q", "ab")
     ('CoulombFriction', None)
+    >>> find_near_name("fc", ("c", "CoulombFriction.fc"))
+    'CoulombFriction.fc'
     """
     lower = {k.lower(): k for k in sorted(known, reverse=True)}
     typed = name.lower().replace("_", "")
     plain = {k.replace("_", ""): v for k, v in lower.items()}
     if typed in plain:
         return plain[typed]
-    parts = [v for k, v in sorted(plain.items()) if len(typed) > 2
-             and (k.startswith(typed) or k.endswith(typed))]  # fmt: skip
+    # Two letters begin or end too many names, but all that follows a dot is a name of its own.
+    parts = [v for k, v in sorted(plain.items()) if k.endswith(f".{typed}") or (len(typed) > 2
+             and (k.startswith(typed) or k.endswith(typed)))]  # fmt: skip
     alike = parts or [plain[k] for k in difflib.get_close_matches(typed, plain, 1)]
     return alike[0] if alike else None
+
+
+def list_known(name: str, known: Iterable[str]) -> str:
+    """Say which names there are instead of a wrong one, and which of them is near.
+
+    Parameters
+    ----------
+    name : str
+        The name as it was typed.
+    known : iterable of str
+        The names that there are.
+
+    Returns
+    -------
+    str
+        The end of a refusal.
+
+    Examples
+    --------
+    >>> list_known("M", ("m", "c")), list_known("J", ("m", "c")), list_known("J", ())
+    ('it has m, c; did you mean m?', 'it has m, c', 'it has none')
+    """
+    names = list(known)
+    near = find_near_name(name, names)
+    return f"it has {', '.join(names) or 'none'}" + (f"; did you mean {near}?" if near else "")
 
 
 def write_count(number: int, noun: str, plural: str = "") -> str:

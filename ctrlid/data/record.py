@@ -14,7 +14,7 @@ from scipy import signal
 from .._base.arguments import check_arguments, check_field_names, show_fields
 from .._base.errors import CtrlidError
 from .._base.signals import list_signals, require_one_signal
-from .._base.text import Printed, write_count, write_percent
+from .._base.text import Printed, list_known, write_count, write_percent
 from . import csv_files as _csv
 from . import responses as _response
 from .field_checks import check_samples, check_seconds, check_words
@@ -228,8 +228,10 @@ class Record(Printed):
             wanted = (wanted,) if isinstance(wanted, str) else tuple(wanted)
             missing = [name for name in wanted if name not in known]
             if missing or not wanted:
-                raise CtrlidError(f"the record has no signal {missing[0] if missing else ''!r} in "
-                                  f"{key}; it has {', '.join(known) or 'none'}")  # fmt: skip
+                first = missing[0] if missing else ""
+                raise CtrlidError(
+                    f"the record has no signal {first!r} in {key}; {list_known(first, known)}"
+                )
             at = [known.index(name) for name in wanted]
             fields[key] = np.reshape(getattr(self, key), (len(known), -1))[at]
             for labels in (names, units):
@@ -454,8 +456,9 @@ class Record(Printed):
     def _swap_channels(self, key: str, channel: str) -> "Record":
         require_one_signal({"u": "with_input", "y": "with_output"}[key], self)
         if channel not in self.extra:
-            raise CtrlidError(f"the record has no extra channel {channel!r}; it has "
-                              f"{', '.join(self.extra) or 'none'}")  # fmt: skip
+            raise CtrlidError(
+                f"the record has no extra channel {channel!r}; {list_known(channel, self.extra)}"
+            )
         old = self.names.get(key, key)
         if old == key:
             old = {"u": "input", "y": "output"}[key]

@@ -5,18 +5,24 @@ import math
 import pickle
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Self
 
 import casadi
 import control as ct
 import numpy as np
 
-from .._base.arguments import check_arguments, is_iterable, is_number
+from .._base.arguments import (
+    check_arguments,
+    check_field_names,
+    is_iterable,
+    is_number,
+    show_fields,
+)
 from .._base.arrays import to_real_array
 from .._base.errors import CtrlidError, EffectDoesNotApply
 from .._base.periods import have_same_period, write_both_periods
 from .._base.pickling import pack_by_value
-from .._base.text import write_count
+from .._base.text import list_known, write_count
 from ..effects import AbstractEffect
 from ..effects.composition import compose_effects, label_effects
 from ..effects.context import find_position_unit
@@ -112,6 +118,12 @@ class Loop:
     _traced: Equations = field(init=False, repr=False)
     _active: Equations = field(init=False, repr=False)
     _kept: Equations = field(init=False, repr=False)
+
+    def __new__(cls, *args: Any, **fields: Any) -> Self:
+        """Refuse unknown fields in words, before the generated constructor does so curtly."""
+        del args
+        check_field_names(cls, fields)
+        return super().__new__(cls)
 
     def __post_init__(self) -> None:
         if not (is_number(self.dt) and 0 < self.dt < math.inf):
@@ -404,20 +416,22 @@ class Loop:
         label = next((key for key, e in known.items() if key == effect or e is effect), None)
         label = label or next((key for key, e in known.items() if e == effect), None)
         if label is None:
-            raise CtrlidError(f"the loop has no effect {effect}; it has {list(known) or 'none'}")
+            raise CtrlidError(f"the loop has no effect {effect}; {list_known(str(effect), known)}")
         rest = tuple(e for key, e in known.items() if key != label)
         kept = [name for name in self.free if not name.startswith(f"{label}.")]
         free = {n: self.free[n] for n in kept} if isinstance(self.free, Mapping) else tuple(kept)
         return self._replace_fields(effects=rest, free=free)
 
-    def with_parameters(self, values: Mapping[str, float]) -> "Loop":
+    def with_parameters(self, values: Mapping[str, float] | None = None, **named: float) -> "Loop":
         """Return the loop with other values of plant or effect parameters.
 
         Parameters
         ----------
-        values : mapping of str to float
+        values : mapping of str to float, optional
             New values by name as in `parameters`, each in its unit:
             ``{"K": 3e-6, "CoulombFriction.fc": 0.2}``.
+        **named : float
+            The same by keyword, for names that Python can spell: ``with_parameters(K=3e-6)``.
 
         Returns
         -------
@@ -430,11 +444,14 @@ class Loop:
             If there is no such parameter or the value is out of its bounds.
         """
         check_arguments(Loop.with_parameters, locals())
-        unknown = [name for name in values if name not in self.parameters]
-        if unknown:
-            raise CtrlidError(
-                f"the loop has no parameter {unknown[0]!r}; it has {list(self.parameters)}"
-            )
+        values = {**(values or {}), **named}
+        for name, value in values.items():
+            if name not in self.parameters:
+                raise CtrlidError(
+                    f"the loop has no parameter {name!r}; {list_known(name, self.parameters)}"
+                )
+            if not is_number(value):
+                raise CtrlidError(f"with_parameters needs a number as {name}; given {value!r}")
         of_plant = {k: float(v) for k, v in values.items() if k in self._traced.parameters}
         if not np.isfinite(list(of_plant.values())).all():
             raise CtrlidError(f"plant parameters are finite numbers; given {of_plant}")
@@ -574,6 +591,9 @@ class Loop:
         if wiring is None:
             return text + ")"
         return "\n  ".join([text + "), wired:", *wiring.lines])
+
+
+show_fields(Loop)
 
 
 class _Itself:

@@ -17,6 +17,7 @@ import control as ct
 import numpy as np
 
 from ..._base.errors import CtrlidError
+from ..._base.text import list_known
 from ...data.record import Record
 from ...loop.controllers import PID
 from ...loop.loop import Loop
@@ -155,7 +156,7 @@ def import_object(option: str, text: str) -> Any:
 def _require_known(what: str, known: Sequence[str], names: Sequence[str]) -> None:
     for name in names:
         if name not in known:
-            raise CtrlidError(f"{what} has no parameter {name!r}; it has {', '.join(known)}")
+            raise CtrlidError(f"{what} has no parameter {name!r}; {list_known(name, known)}")
 
 
 def parse_assignment(text: str) -> tuple[str, float]:
