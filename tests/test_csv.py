@@ -96,8 +96,9 @@ def test_files_of_other_tools(tmp_path, text):
 
 def test_columns_by_name_with_units_and_old_encodings(tmp_path):
     text = "t [s],Soll [µm],Spannung [V],Weg [µm],Strom [A]\n5,1,2,3,4\n5.5,1,2,3,5\n"
-    record = write(tmp_path, text.encode("cp1252"), u="Spannung", y="Weg", r="Soll",
-                   extra=["Strom"], hold="foh", name="mine", units={"y": "m"})  # fmt: skip
+    with pytest.warns(CtrlidWarning, match="y is in µm by the header"):
+        record = write(tmp_path, text.encode("cp1252"), u="Spannung", y="Weg", r="Soll",
+                       extra=["Strom"], hold="foh", name="mine", units={"y": "m"})  # fmt: skip
     assert dict(record.units) == {"u": "V", "y": "m", "r": "µm", "Strom": "A"}
     assert dict(record.names) == {"u": "Spannung", "y": "Weg", "r": "Soll"}
     assert (record.hold, record.name, record.start, record.dt) == ("foh", "mine", 5.0, 0.5)

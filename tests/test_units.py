@@ -1,6 +1,8 @@
 """Units: where they come from, what they become in powers, and when a size is told in newtons."""
 
 import math
+import re
+from dataclasses import replace
 
 import control as ct
 import numpy as np
@@ -8,7 +10,7 @@ import pytest
 
 import ctrlid as cid
 from ctrlid import effects as E
-from ctrlid._base.units import fill_unit, is_unit
+from ctrlid._base.units import fill_unit, is_same_unit, is_unit
 from problems import record_of as record_any
 
 DT = 0.01
@@ -127,6 +129,49 @@ def test_an_output_in_degrees_of_an_angle_in_radians_gives_no_unit_to_forces(uni
     assert "°/s" not in text
     assert "° RMS" in text
     assert "°/s" not in str(cid.fit_loop(loop, record).estimate)
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "same"),
+    [("°", "deg", True), ("Degrees", "deg", True), ("N m", "N*m", True), ("Nm", "N·m", True),
+     ("m/s^2", "m s^-2", True), ("um", "µm", True), ("[V]", "V", True), ("Volt", "V", True),
+     ("rad/s", "1/s", True), ("N m s/rad", "N m s", True), ("m", "mm", False),
+     ("rad", "deg", False), ("rad", "1", False), ("V", "A", False), ("N m", "N/m", False)],
+)  # fmt: skip
+def test_which_texts_are_the_same_unit(first, second, same):
+    assert is_same_unit(first, second) == is_same_unit(second, first) == same
+
+
+def test_units_that_contradict_each_other_are_told_by_every_door():
+    """A record in degrees of a pendulum in radians was taken without a word by all but one."""
+    plant = cid.plants.pendulum(m=0.35, length=0.3)
+    at = cid.operating_point(plant, output=0.0)
+    loop = cid.Loop(plant, cid.PID(kp=5.0, kd=0.5, bias=0.0), dt=DT, at=at, free=("m",))
+    record = record_of(loop, E.ViscousFriction(0.1), 0.1, 1e-4, 3, n=600)
+    words = r"y is recorded in deg, but the plant has it in rad.*scale=.'y': factor.*units=.'theta'"
+    wrong = replace(record, units={"r": "rad", "u": "Nm", "y": "deg"})
+    (found,) = cid.audit(wrong, loop)["units"]
+    assert found.harmful
+    assert found.channel == "y"
+    assert re.search(words, found.text)
+    told = [*cid.fit_loop(loop, wrong).estimate.notes, *cid.compare(wrong, loop).notes]
+    told = [text for text in told if "UNITS DO NOT AGREE" in text]
+    assert len(told) == 2
+    assert all(re.search(words, text) for text in told)
+    for right in ({"y": "radians", "u": "N*m", "r": "rad"}, {}, {"u": "N m"}):
+        alike = replace(record, units=right)
+        assert cid.audit(alike, loop)["units"] == ()
+        assert not any("UNITS" in text for text in cid.fit_loop(loop, alike).estimate.notes)
+
+
+def test_units_of_a_file_that_are_overruled_without_a_scale_are_questioned(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text("t [s],u [V],y [deg]\n" + "".join(f"{k},1,{k}\n" for k in range(5)))
+    with pytest.warns(cid.CtrlidWarning, match=r"y is in deg by the header .*, and in rad by unit"):
+        record = cid.Record.from_csv(path, units={"y": "rad"})
+    assert record.units["y"] == "rad"
+    cid.Record.from_csv(path, units={"y": "rad"}, scale={"y": math.pi / 180})
+    cid.Record.from_csv(path, units={"y": "°", "u": "volt"})
 
 
 def test_units_of_a_loop_are_checked():

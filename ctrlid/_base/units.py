@@ -10,6 +10,13 @@ ALONE = ("%", "‰", "°", "deg", "grad", "°C", "C", "min", "h", "rpm", "cm", "
          "psi", "rev", "turns", "ticks", "counts", "steps", "LSB")  # fmt: skip
 PREFIXES = ("", "n", "µ", "μ", "u", "m", "k", "M")
 KNOWN = frozenset([*ALONE, *(p + unit for p in PREFIXES for unit in WITH_PREFIX)])
+# Other spellings of these, as they stand in headers.
+SPELLINGS = {
+    "°": "deg", "degree": "deg", "degrees": "deg", "radian": "rad", "radians": "rad", "Nm": "N m",
+    "N.m": "N m", "Ω": "ohm", "°C": "C", "percent": "%", "volt": "V", "volts": "V", "amp": "A",
+    "amps": "A", "ampere": "A", "newton": "N", "newtons": "N", "meter": "m", "metre": "m",
+    "meters": "m", "metres": "m", "sec": "s", "second": "s", "seconds": "s", "l": "L",
+}  # fmt: skip
 MARKS = re.compile(r"[/()*·]|\^-?\d+|[^\s/()*·^]+|\S")
 
 
@@ -69,6 +76,43 @@ def is_unit(text: str) -> bool:
     """
     parts = _parse_unit(text)
     return bool(parts) and KNOWN.issuperset(parts)
+
+
+def is_same_unit(first: str, second: str) -> bool:
+    """Return whether two texts are the same unit in other words.
+
+    Parameters
+    ----------
+    first, second : str
+        Units.
+
+    Returns
+    -------
+    bool
+        True if their symbols have the same powers; a rad beside other symbols is none.
+
+    Examples
+    --------
+    >>> [is_same_unit(*both) for both in (("°", "deg"), ("N m", "Nm"), ("um/s", "µm s^-1"))]
+    [True, True, True]
+    >>> [is_same_unit(*both) for both in (("mm", "m"), ("deg", "rad"), ("rad", "1"))]
+    [False, False, False]
+    """
+    return _spell_alike(first) == _spell_alike(second)
+
+
+def _spell_alike(text: str) -> dict[str, int]:
+    """Return the powers of the symbols in a unit, each in one spelling."""
+    powers: dict[str, int] = {}
+    for symbol, power in _parse_unit(text.strip().strip("[]")).items():
+        plain = SPELLINGS.get(symbol, SPELLINGS.get(symbol.lower(), symbol)).replace("μ", "µ")
+        if plain in KNOWN and plain[0] == "u":
+            plain = f"µ{plain[1:]}"
+        for part in plain.split():
+            powers[part] = powers.get(part, 0) + power
+    if len(powers) > 1:
+        powers.pop("rad", None)
+    return {symbol: n for symbol, n in powers.items() if n}
 
 
 def _parse_unit(text: str) -> dict[str, int]:

@@ -16,6 +16,7 @@ import numpy as np
 from .._base.errors import CtrlidError, CtrlidWarning
 from .._base.files import replace_file
 from .._base.text import drop_roundoff, split_unit, with_unit, write_percent
+from .._base.units import is_same_unit
 
 TIME = ("t", "time", "timestamp", "seconds", "zeit")
 SECONDS = {"": 1.0, "s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6,
@@ -180,8 +181,10 @@ def read_csv(
     at = {key: [found[key, i] for i in range(len(each))] for key, each in columns.items()}
     every = {**at, **{label: [k] for label, k in further.items()}}
     factors = _check_scale(scale or {}, every)
+    header_units = {key: tuple(labels[k][1] for k in ks) for key, ks in every.items()}
+    _question_units(units or {}, header_units, factors, path)
     # The unit in the header is that of the numbers before they were scaled.
-    read = {key: tuple(labels[k][1] for k in ks) for key, ks in every.items() if key not in factors}
+    read = {key: words for key, words in header_units.items() if key not in factors}
     known = {key: tuple(names[k] for k in ks) for key, ks in at.items()}
     return {
         **{key: table[:, ks].T * factors.get(key, 1.0) for key, ks in at.items()},
@@ -204,6 +207,26 @@ def _check_scale(scale: Mapping[str, float], known: Mapping[str, Any]) -> dict[s
         if not number or not math.isfinite(factor) or factor == 0:
             raise CtrlidError(f"scale= needs a number other than zero for {key}; given {factor!r}")
     return {key: float(factor) for key, factor in scale.items()}
+
+
+def _question_units(
+    stated: Mapping[str, Any], written: Mapping[str, Sequence[str]], factors: Mapping[str, float],
+    path: Path,
+) -> None:  # fmt: skip
+    """Warn of channels that are said to be in another unit than in the header, and not scaled."""
+    for key, given in stated.items():
+        header = written.get(key, ())
+        words = (given,) * len(header) if isinstance(given, str) else given
+        if key in factors or not isinstance(words, list | tuple):
+            continue
+        for there, here in zip(header, words, strict=False):
+            if there and here and not is_same_unit(there, str(here)):
+                warnings.warn(
+                    f"{key} is in {there} by the header of {path}, and in {here} by units=, which "
+                    f"is taken; the numbers stay as they are. To convert them, give "
+                    f"scale={{{key!r}: factor}} as well; where the header is wrong, mend it",
+                    CtrlidWarning, stacklevel=4,
+                )  # fmt: skip
 
 
 def _question_period(dt: float, stamps: Any, path: Path, label: str) -> None:

@@ -533,8 +533,8 @@ class Record(Printed):
         Warns
         -----
         CtrlidWarning
-            If the times jitter by more than 1 % of the period, or if they have no unit and are
-            hardly in seconds.
+            If the times jitter by more than 1 % of the period, if they have no unit and are hardly
+            in seconds, or if `units` contradicts the header and `scale` does not convert.
 
         Raises
         ------

@@ -16,6 +16,7 @@ from ..effects import AbstractEffect, InputDelay, InputOffset, Quantization, Sen
 from ..estimation.identified_model import read_delay
 from ..estimation.likelihood.likelihood import Fit
 from ..loop.loop import Loop
+from ..loop.unit_check import list_recorded_units
 from ..physics.conversions import to_transfer_function
 from ..physics.linearization import OperatingPoint
 from ..validation.record_audit import Audit, AuditFinding, audit
@@ -47,7 +48,8 @@ def make_loop(loop: Any, record: Record) -> Loop:
 
 def with_units_of(loop: Loop, record: Record) -> Loop:
     """Return the loop with the units of a record, in which the sizes of effects will be written."""
-    own = {name: unit for _, name, unit in _list_units(loop, record) if unit}
+    given = list_recorded_units(loop, record)
+    own = {name: unit for key, name, unit in given if unit and key != "r"}
     return replace(loop, units={**loop.units, **own}) if own else loop
 
 
@@ -55,7 +57,7 @@ def look_over_records(
     loop: Loop, records: Sequence[Record]
 ) -> tuple[tuple[Audit, ...], tuple[str, ...]]:
     """Return what is remarkable about the records; refuse those that carry nothing."""
-    audits, remarks = [], _compare_units(loop, records[0])
+    audits, remarks = [], _list_silent_units(loop, records[0])
     for k, record in enumerate(records):
         found = audit(record, loop)
         audits.append(found)
@@ -81,38 +83,20 @@ def _is_still_input(finding: AuditFinding, record: Record) -> bool:
     return len(inputs) > 1 and finding.channel in inputs and bool(moves.any())
 
 
-def _compare_units(loop: Loop, record: Record) -> list[str]:
-    """Say where a record has other units than the plant, or none."""
+def _list_silent_units(loop: Loop, record: Record) -> list[str]:
+    """Say where a record has no units and the plant has; those that clash are in the audit."""
     of_plant, several = loop.known_units, not loop.equations().siso
-    remarks, silent = [], []
-    for signal, name, there in _list_units(loop, record):
-        here, key = of_plant.get(name, ""), name if several else signal
-        if here and not there:
-            silent.append(f"{key} in {here}")
-        elif here and there != here:
-            how = "without a unit" if there == "1" else f"in {there}"
-            remarks.append(
-                f"units: {key} is recorded {how}, but the plant has it in {here}. The model takes "
-                "the numbers as they are, and sizes are written in the unit of the record. If the "
-                "plant is right, convert the record: Record.from_csv has scale= for this."
-            )
-    if silent:
-        remarks.append(
-            "units: the record does not say its units, so that those of the plant are written, "
-            f"{write_list(silent)}. Record has units= to state them."
-        )
-    return remarks
-
-
-def _list_units(loop: Loop, record: Record) -> list[tuple[str, str, str]]:
-    """Return which of u and y each input and output is, its name in the loop, and its unit."""
-    e = loop.equations()
-    found = []
-    for key, names in (("u", e.inputs), ("y", e.outputs)):
-        given = record.units.get(key, "")
-        each = given if isinstance(given, tuple) else (given,) * len(names)
-        found += [(key, name, unit) for name, unit in zip(names, each, strict=True)]
-    return found
+    silent = [
+        f"{name if several else key} in {of_plant[name]}"
+        for key, name, there in list_recorded_units(loop, record)
+        if key != "r" and not there and of_plant.get(name)
+    ]
+    if not silent:
+        return []
+    return [
+        "units: the record does not say its units, so that those of the plant are written, "
+        f"{write_list(silent)}. Record has units= to state them."
+    ]
 
 
 def find_repeat_periods(parts: Sequence[Record], audits: Sequence[Audit]) -> list[int]:

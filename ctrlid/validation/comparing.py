@@ -26,6 +26,7 @@ from ..estimation.linear.sampled_motion import discretize_model, list_inputs
 from ..loop.loop import Loop
 from ..loop.period_map import compute_growth_rate
 from ..loop.simulation import Simulator
+from ..loop.unit_check import note_unit_clashes
 from ..loop.wiring import match_signals
 from ..physics.conversions import to_polynomials, to_state_matrices
 from ..physics.trace import timebase
@@ -120,10 +121,10 @@ def compare(record: Record, model_or_loop: Any, *, horizon: int | None = None) -
             "sensor is stuck"
         )
     horizon = None if horizon is None else int(horizon)
-    if several:
-        return _compare_several(record, model_or_loop, horizon)
     if isinstance(model_or_loop, Loop):
-        return _compare_loop(record, model_or_loop, horizon)
+        run = _compare_several if several else _compare_loop
+        made = run(record, model_or_loop, horizon)
+        return replace(made, notes=(*note_unit_clashes(model_or_loop, record), *made.notes))
     if isinstance(model_or_loop, ct.TransferFunction):
         return _compare_model(record, model_or_loop, horizon)
     raise CtrlidError(

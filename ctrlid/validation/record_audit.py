@@ -15,6 +15,7 @@ from ..data.record import SIGNALS, Record
 from ..data.several_records import order_model_and_data
 from ..data.validity import find_longest_run, find_runs
 from ..loop.loop import Loop
+from ..loop.unit_check import find_unit_clashes
 from ..loop.wiring import match_signals
 from . import signal_defects as defects
 from .controller_check import FAULTS, check_controller
@@ -200,6 +201,7 @@ def audit(record: Record, loop: Loop | None = None) -> Audit:
         findings.append(AuditFinding("between samples", "u", text, size, checks.whole, harmful))
     injected = False
     if loop is not None:
+        findings += _list_unit_clashes(loop, record)
         findings += checks.check_operating_point(loop)
         for kind, text, size, harmful in check_controller(loop, record):
             injected = injected or kind == "injected"
@@ -254,12 +256,19 @@ def _audit_several(record: Record, loop: Loop | None) -> Audit:
             for f in found if f.channel in ("", key)
         ]  # fmt: skip
     if loop is not None:
+        findings += _list_unit_clashes(loop, record)
         for kind, text, size, harmful in check_wired_controller(loop, record):
             named = kind if kind in FAULTS else "controller"
             findings.append(AuditFinding(named, "", text, size, (0, record.n), harmful))
     findings = list(dict.fromkeys(findings))
     findings.sort(key=lambda f: not f.harmful)
     return Audit(tuple(findings), MappingProxyType(quantum), (0, 0), MappingProxyType(saturated))
+
+
+def _list_unit_clashes(loop: Loop, record: Record) -> list[AuditFinding]:
+    clashes = find_unit_clashes(loop, record)
+    whole = (0, record.n)
+    return [AuditFinding("units", name, text, 1.0, whole, harmful=True) for name, text in clashes]
 
 
 class _RecordChecks:

@@ -23,6 +23,7 @@ from ...data.several_records import (
     order_model_and_data,
 )
 from ...loop.loop import Loop
+from ...loop.unit_check import note_unit_clashes
 from ..whiteness import note_coloured_innovations
 from .filter_data import find_noise_units
 from .likelihood import Fit, find_priors, list_effect_bounds, make_problem
@@ -141,6 +142,7 @@ def fit_loop(
     innovations = [row for one in fit.standardized for row in np.atleast_2d(one.T)]
     colour = note_coloured_innovations(innovations, len(fit.theta), _TOO_NARROW)
     notes = (
+        *note_unit_clashes(loop, fit.problem.data[0].record),
         *left_out,
         *fitted.estimate.notes,
         *colour,

@@ -1,0 +1,83 @@
+"""Whether a record has the units of the plant, whose equations take its numbers as they are."""
+
+from .._base.units import is_same_unit
+from ..data.record import Record
+from .loop import Loop
+
+
+def list_recorded_units(loop: Loop, record: Record) -> list[tuple[str, str, str]]:
+    """Return which of u and y each input and output is, its name in the loop, and its unit.
+
+    Parameters
+    ----------
+    loop : Loop
+        The loop.
+    record : Record
+        A record with the signals of the loop, in its order.
+
+    Returns
+    -------
+    list of (str, str, str)
+        Key, name, and the unit in the record, which is empty where it has none.
+    """
+    e = loop.equations()
+    found = []
+    for key, names in (("u", e.inputs), ("y", e.outputs)):
+        given = record.units.get(key, "")
+        each = given if isinstance(given, tuple) else (given,) * len(names)
+        found += [(key, name, unit) for name, unit in zip(names, each, strict=True)]
+    if e.siso and record.r is not None:
+        found.append(("r", e.outputs[0], record.units.get("r", "")))
+    return found
+
+
+def find_unit_clashes(loop: Loop, record: Record) -> list[tuple[str, str]]:
+    """Return the signals whose unit in a record is another one than in the loop, and what to do.
+
+    Parameters
+    ----------
+    loop : Loop
+        The loop.
+    record : Record
+        A record with the signals of the loop, in its order.
+
+    Returns
+    -------
+    list of (str, str)
+        Signal, and a sentence; other spellings of the same unit are the same unit.
+    """
+    known, several = loop.known_units, not loop.equations().siso
+    found = []
+    for key, name, there in list_recorded_units(loop, record):
+        here, signal = known.get(name, ""), name if several else key
+        if not (here and there) or is_same_unit(here, there):
+            continue
+        how = "without a unit" if there == "1" else f"in {there}"
+        found.append(
+            (
+                signal,
+                f"{signal} is recorded {how}, but the plant has it in {here}. The model takes the "
+                "numbers as they are. If the plant is right, convert the record: "
+                f"Record.from_csv(..., scale={{{key!r}: factor}}, units={{{key!r}: {here!r}}}). "
+                f"If the record is right, say so: Loop(..., units={{{name!r}: {there!r}}}).",
+            )
+        )
+    return found
+
+
+def note_unit_clashes(loop: Loop, record: Record) -> tuple[str, ...]:
+    """Return the notes of a result whose record has other units than the loop.
+
+    Parameters
+    ----------
+    loop : Loop
+        The loop.
+    record : Record
+        A record with the signals of the loop, in its order.
+
+    Returns
+    -------
+    tuple of str
+        Sentences that begin in capitals; none where the units agree or are not known.
+    """
+    return tuple(f"UNITS DO NOT AGREE: {text}" for _, text in find_unit_clashes(loop, record))
