@@ -9,14 +9,16 @@ import os
 import re
 import sys
 import textwrap
+import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TextIO
 
 from tqdm import tqdm
 
 from . import __version__
-from ._base.errors import CtrlidError
+from ._base.errors import CtrlidError, CtrlidWarning
 from ._base.files import replace_file
 from .diagnosis import Diagnosis
 from .reporting import plot
@@ -24,6 +26,7 @@ from .reporting.cli.demo_diagnosis import TITLES as SECOND
 from .reporting.cli.demo_diagnosis import tell_diagnosis
 from .reporting.cli.demo_identification import TITLES, tell_identification
 from .reporting.cli.diagnose_command import INTERRUPTED, add_parser, make_folder
+from .reporting.cli.options import name_options
 from .reporting.html_page import Section, write_report
 from .reporting.plot.axes import off_screen
 from .reporting.tables import Table
@@ -60,7 +63,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             stream.reconfigure(errors="ctrlid")
     args = _make_parser().parse_args(arguments)
     try:
-        code: int = args.run(args)
+        with warnings.catch_warnings():
+            warnings.showwarning = _show_warning
+            code: int = args.run(args)
         sys.stdout.flush()
     except CtrlidError as refusal:  # The command says any refusal in one line.
         print(f"ctrlid: {' '.join(str(refusal).split())}", file=sys.stderr)
@@ -73,6 +78,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     return code
+
+
+def _show_warning(
+    message: Warning | str, category: type[Warning], filename: str, lineno: int,
+    file: TextIO | None = None, line: str | None = None,
+) -> None:  # fmt: skip
+    """Print a warning of ctrlid as a refusal is printed, without the line of code it comes from."""
+    if not issubclass(category, CtrlidWarning):
+        shown = warnings.formatwarning(message, category, filename, lineno, line)
+        (file or sys.stderr).write(shown)
+        return
+    print(f"ctrlid: {' '.join(name_options(str(message)).split())}", file=sys.stderr)
 
 
 def _spell_out(error: UnicodeError) -> tuple[str, int]:

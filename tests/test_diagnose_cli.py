@@ -1,8 +1,11 @@
 """``ctrlid diagnose``: what the words mean, what is refused, and a diagnosis from a file."""
 
 import argparse
+import inspect
 import math
 import os
+import re
+import warnings
 
 import control as ct
 import numpy as np
@@ -13,6 +16,7 @@ from ctrlid import __main__ as command
 from ctrlid import effects as E
 from ctrlid.reporting.cli import arguments as _spoken
 from ctrlid.reporting.cli import diagnose_command as _command
+from ctrlid.reporting.cli.options import OPTIONS, name_options
 from problems import servo
 
 DT = 0.01
@@ -234,6 +238,78 @@ def test_refusals_say_what_to_do(folder, asked, capsys):
     slow = ("bare.csv", "--dt", 10.0, "--model", "bench.py:loop")
     assert "if the times are in milliseconds, name their column t [ms]" in refused(capsys, *slow)
     assert asked == []
+
+
+def test_refusals_of_the_library_speak_in_options(folder, capsys):
+    """They said ``from_csv(..., r="setpoint")`` and ``time=`` to someone who typed a command."""
+    (folder / "times.csv").write_text("t [ns],r,u,y\n0,1,2,3\n1,1,2,3\n")
+    (folder / "two.csv").write_text("t [s],u,v,y\n0,1,2,3\n1,1,2,4\n2,1,2,3\n")
+    for words, arguments in (
+        ("with --columns u=NAME and the others likewise: --columns r=setpoint,u=voltage,y=gap; "
+         "--columns r=NAME may be left out", ("log.csv", "--columns", "u=volts", *SERVO)),
+        ("Convert it, or remove the column and give --dt", ("times.csv", *SERVO)),
+        ("Leave out --dt, or remove the column", ("log.csv", *COLUMNS, *SERVO, "--dt", 0.03)),
+        ("--scale needs a number other than zero for y",
+         ("log.csv", *COLUMNS, *SERVO, "--scale", "y=0")),
+        ("pick them with --columns u=...", ("two.csv", "--columns", "u=u,v y=y", *SERVO)),
+        ("Choose an output inside the range of the plant, with --at-output",
+         ("log.csv", *COLUMNS, "--model", "maglev", "--param", "m=1", "K=1", "--at-output", -1)),
+        ("give a second record for --validation",
+         ("short.csv", *COLUMNS, *SERVO, "--controller", "kp=20")),
+        ("--seconds is the time after which", ("log.csv", *COLUMNS, *SERVO, "--seconds", -1)),
+        ("--jobs is a number of processes from 1 to 256, or -1",
+         ("log.csv", *COLUMNS, *SERVO, "--jobs", 0)),
+    ):  # fmt: skip
+        lines = (folder / "log.csv").read_text().splitlines()
+        (folder / "short.csv").write_text("\n".join(lines[:60]) + "\n")
+        said = refused(capsys, *arguments)
+        assert words in said
+        assert not re.search(
+            r"\b(time|dt|gaps|scale|units|hold|jobs)=|from_csv|Record[.(]|None", said
+        )
+
+
+def test_every_keyword_of_the_library_has_its_option():
+    """A new option, or a new argument of what the command calls, needs its line in the table."""
+    parser = argparse.ArgumentParser()
+    _command.add_parser(commands := parser.add_subparsers())
+    options = {name for action in commands.choices["diagnose"]._actions
+               for name in action.option_strings}  # fmt: skip
+    named = {option for option in OPTIONS.values() if option.startswith("--")}
+    # These have no keyword: they make the loop, or say where to write and what to show.
+    own = {"-h", "--help", "--model", "--param", "--at-output", "--input-bias", "--save", "--quiet"}
+    assert options == named | own
+    keywords = {name for function in (cid.Record.from_csv, cid.diagnose)
+                for name in inspect.signature(function).parameters}  # fmt: skip
+    # The command has no option for these, or the file and the loop are what it is given.
+    assert keywords - OPTIONS.keys() == {"path", "extra", "name", "loop", "record", "catalogue",
+                                         "progress"}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [("record hold='zoh', as in dataclasses.replace(record, hold='zoh')",
+      "record --hold zoh, as in --hold zoh"),
+     ("give dt=0.02", "give --dt 0.02"),
+     ("not defined; give at=operating_point(plant, output=...)", "not defined; give --at-output"),
+     ("exclude them with valid=.", "exclude them with the column valid."),
+     ("make the loop: Loop(plant, controller, dt=..., at=...)",
+      "make the loop: Loop(plant, controller, dt=..., at=...)"),
+     ("PID needs lower < upper; given lower=1", "PID needs lower < upper; given lower=1")],
+)  # fmt: skip
+def test_keywords_become_options(text, said):
+    assert name_options(text) == said
+
+
+def test_warnings_are_told_as_refusals_are(folder, asked, capsys):
+    """They came with the path of a module of ctrlid and a line of its code."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("always")
+        assert run("log.csv", *COLUMNS, *SERVO, "--units", "y=mm") == 0
+    err = capsys.readouterr().err
+    assert err.startswith("ctrlid: y is in m by the header of log.csv, and in mm by --units, which")
+    assert "give --scale y=factor as well" in err
+    assert err.count("\n") == 1
 
 
 @pytest.mark.parametrize(

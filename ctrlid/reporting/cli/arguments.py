@@ -24,6 +24,7 @@ from ...loop.loop import Loop
 from ...physics import plants
 from ...physics.linearization import OperatingPoint, operating_point
 from ...physics.trace import trace, with_parameters
+from .options import options_in_refusals
 
 PLANTS = {"maglev": ("K",), "servo": ("c", "k"), "tank": ("outlet", "k"), "pendulum": ("m",)}
 CHANNELS = ("r", "u", "y", "time")
@@ -36,16 +37,9 @@ def read_record(path: Path, args: argparse.Namespace) -> Record:
     if unknown:
         raise CtrlidError(f"--columns takes {', '.join(CHANNELS)}, as in --columns u=volt,y=gap; "
                           f"given {unknown[0]}")  # fmt: skip
-    try:
+    with options_in_refusals():
         return Record.from_csv(path, dt=args.dt, hold=args.hold, gaps=args.gaps, units=args.units,
                                scale=dict(args.scale), **args.columns)  # fmt: skip
-    except CtrlidError as reason:  # Any refusal stays one, in the words of the command line.
-        text = str(reason)
-        for key in CHANNELS:
-            text = text.replace(f"with {key}=", f"with --columns {key}=NAME")
-        text = text.replace("give dt=", "give --dt")
-        text = text.replace("gaps='mask'", "--gaps mask").replace("scale=", "--scale")
-        raise CtrlidError(text) from reason
 
 
 def read_loop(args: argparse.Namespace, record: Record) -> Loop:
@@ -76,11 +70,13 @@ def read_loop(args: argparse.Namespace, record: Record) -> Loop:
     if isinstance(model, ct.TransferFunction | ct.StateSpace):
         at = OperatingPoint((), float(np.mean(record.u[record.valid])), output)
     else:
-        at = operating_point(model, output=output)
+        with options_in_refusals():
+            at = operating_point(model, output=output)
     if args.input_bias is not None:
         at = dataclasses.replace(at, input=args.input_bias)
     given_controller = None if args.controller is None else read_controller(args.controller)
-    return Loop(model, given_controller, dt=record.dt, at=at, free=free)
+    with options_in_refusals():
+        return Loop(model, given_controller, dt=record.dt, at=at, free=free)
 
 
 def read_plant(text: str, values: dict[str, float]) -> Any:

@@ -19,6 +19,7 @@ from .. import plot
 from ..html_page import write_report
 from ..plot.axes import off_screen
 from .arguments import PLANTS, parse_assignment, parse_assignments, read_loop, read_record
+from .options import options_in_refusals
 
 # The exit status of a command that Ctrl-C ended, by the convention of shells.
 INTERRUPTED = 128 + signal.SIGINT
@@ -143,7 +144,7 @@ def run_diagnosis(args: argparse.Namespace) -> int:
         settings["validation"] = read_record(args.validation, args)
     folder = None if args.save is None else make_folder(args.save, "--save")
     try:
-        with _stop_on_interrupt() as budget:
+        with _stop_on_interrupt() as budget, options_in_refusals():
             found = diagnose(loop, record, progress=not args.quiet, **settings)
     except BaseException:
         if folder is not None:
