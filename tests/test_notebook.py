@@ -2,7 +2,7 @@
 
 import html
 import re
-from dataclasses import replace
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 
 import control as ct
@@ -68,6 +68,47 @@ def test_every_printed_result_is_shown():
             assert issubclass(value, Printed), name
             assert value.__repr__ is Printed.__repr__ or name == "Diagnosis"
     assert issubclass(cid.Record, Printed)
+
+
+@pytest.fixture(scope="module")
+def parts(loop, record, results):
+    """Public values that are only parts of results, which a user looks at one by one."""
+    friction = cid.effects.CoulombFriction(0.5)
+    real = record_of(loop.with_effect(friction), swing=0.1, hold=50, n=1000, seed=1,
+                     sensor_noise=1e-3)  # fmt: skip
+    found = cid.diagnose(loop, real, progress=False, catalogue=[type(friction)])
+    trial = cid.redesign(
+        ct.ss(loop.linearize(states=True)), loop, design=lambda _: loop.controller, step=0.05
+    )  # fmt: skip
+    compared = results[3]
+    return [
+        found.gap, *found.findings, *found.where, *found.ranking, *found.calibrated,
+        *compared.curves, *compared.tests, *cid.audit(real, loop).findings,
+        *results[6].rows, *results[7].table, trial.promised, trial.achieved, *trial.steps,
+        *(step.achieved for step in trial.steps), results[8].promised, found.disturbance,
+    ]  # fmt: skip
+
+
+def test_parts_of_results_are_short_words_too(parts):
+    """``found.gap`` filled a screen with numbers at a prompt, and a curve with dots."""
+    kinds = {type(shown).__name__ for shown in parts}
+    assert {"Gap", "Finding", "BinnedErrors", "Curve", "Correlation", "AuditFinding", "OrderRow",
+            "SamplingRow", "LoopPerformance", "ReferenceStep", "StepMotion"} <= kinds  # fmt: skip
+    for shown in parts:
+        assert "array(" not in repr(shown), type(shown).__name__
+        assert len(repr(shown)) <= 600, type(shown).__name__
+        if isinstance(shown, Printed):
+            # A notebook folds long sentences, also at a hyphen.
+            assert "".join(read(shown._repr_html_()).split()) == "".join(str(shown).split())
+
+
+def test_no_public_value_with_arrays_shows_them():
+    """A dataclass with an array among its fields has a text of its own."""
+    public = [v for v in vars(cid).values() if isinstance(v, type) and is_dataclass(v)]
+    with_arrays = [v for v in public if any("rray" in str(f.type) for f in fields(v))]
+    assert len(with_arrays) > 10
+    assert [v.__name__ for v in with_arrays if v.__repr__ is v.__dict__.get("__repr__")
+            and v not in (cid.Record, cid.Diagnosis)] == []  # fmt: skip
 
 
 def test_a_model_shows_formula_and_estimate(record):

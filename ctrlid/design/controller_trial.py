@@ -36,8 +36,8 @@ LASTING = 8.0
 LONGEST = 20_000
 
 
-@dataclass(frozen=True, eq=False)
-class StepMotion:
+@dataclass(frozen=True, eq=False, repr=False)
+class StepMotion(Printed):
     """What a step of one reference does to all signals of a loop.
 
     Parameters
@@ -74,9 +74,16 @@ class StepMotion:
         """Largest deviation of each input [its unit]."""
         return tuple(np.max(np.abs(self.u), axis=1, initial=0.0).tolist())
 
+    def __str__(self) -> str:
+        if self.failure is not None:
+            return f"broke off: {self.failure}"
+        return (f"final value {_write(self.final_value, '.4g')}, overshoot "
+                f"{_write(self.overshoot, '.3g')} %, settled after "
+                f"{_write(self.settling_time, '.4g')} s")  # fmt: skip
 
-@dataclass(frozen=True, eq=False)
-class ReferenceStep:
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ReferenceStep(Printed):
     """A step of one reference, on the model and on the physics.
 
     Parameters
@@ -102,6 +109,10 @@ class ReferenceStep:
 
     def __post_init__(self) -> None:
         freeze_arrays(self)
+
+    def __str__(self) -> str:
+        return (f"step of {self.reference} by {self.height:.4g}, followed by {self.output}\n"
+                f"  promised: {self.promised}\n  achieved: {self.achieved}")  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from .._base.arrays import Array, ComplexArray, freeze_arrays
+from .._base.text import Printed, write_count
 from ..loop.controllers import linearize_law
 from ..loop.loop import Loop
 from ..loop.period_map import compute_closed_loop_poles
@@ -57,8 +58,8 @@ def open_at_inputs(loop: Loop) -> Any:
                  inputs=list(loop.signals["u"]))  # fmt: skip
 
 
-@dataclass(frozen=True, eq=False)
-class LoopPerformance:
+@dataclass(frozen=True, eq=False, repr=False)
+class LoopPerformance(Printed):
     """Poles and margins that a controller promises on a model, or achieves on the physics.
 
     Parameters
@@ -98,6 +99,17 @@ class LoopPerformance:
         """The smallest damping ratio [1] of a pole that is not at rest after one period."""
         poles = self.poles[np.isfinite(self.poles) & (self.poles != 0)]
         return float(np.min(-poles.real / np.abs(poles), initial=1.0))
+
+    def __str__(self) -> str:
+        head = "stable loop" if self.stable else "LOOP THAT IS NOT STABLE"
+        text = (f"{head}: {write_count(len(self.poles), 'pole')}, the slowest with real part "
+                f"{self.growth_rate:.4g} 1/s, smallest damping {self.damping:.3g}")  # fmt: skip
+        if not math.isnan(self.disk_margin):
+            text += f", disk margin {self.disk_margin:.3g}"
+        each = [f"  input {k + 1}: phase margin {m.phase_margin:.4g} deg, gain margin "
+                f"{m.gain_margin:.4g}, delay margin {m.delay_margin:.4g} s"
+                for k, m in enumerate(self.margins)]  # fmt: skip
+        return "\n".join([text, *each])
 
 
 def measure_performance(loop: Loop) -> LoopPerformance:

@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 
 from .._base.arrays import Array, freeze_arrays
-from .._base.text import Printed, write_list, write_number, write_quantity
+from .._base.text import Printed, with_unit, write_list, write_number, write_quantity
 from .._base.units import fill_unit
 from ..effects import AbstractEffect
 from ..effects.base import name_at_place
@@ -21,8 +21,8 @@ GapKind = Literal["simulation", "prediction"]
 COMPLETE: tuple[Verdict, ...] = ("explained", "nothing missing")
 
 
-@dataclass(frozen=True, eq=False)
-class Gap:
+@dataclass(frozen=True, eq=False, repr=False)
+class Gap(Printed):
     """How far the model is from the data, on samples that no parameter was fitted to.
 
     Parameters
@@ -113,9 +113,16 @@ class Gap:
         """RMS error of the recalibrated model, whether or not it is the smaller [output unit]."""
         return self.before if math.isnan(self.recalibrated) else self.recalibrated
 
+    def __str__(self) -> str:
+        sizes = [write_quantity(size, self.unit) for size in (self.before, self.after, self.floor)]
+        text = (f"gap of the {self.name}{f' of {self.output}' if self.output else ''}: RMS error "
+                f"{sizes[0]} before, {sizes[1]} with the effects, {sizes[2]} from noise "
+                "alone")  # fmt: skip
+        return "\n".join([text, *(f"  {one}" for one in self.outputs)])
 
-@dataclass(frozen=True, eq=False)
-class Finding:
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Finding(Printed):
     """An effect that was missing.
 
     Parameters
@@ -172,6 +179,13 @@ class Finding:
         """The input, velocity or output at which the effect acts, of a plant with several."""
         return str(self.effect.at)
 
+    def __str__(self) -> str:
+        units, errors = self.effect.units(), self.standard_errors
+        sizes = [f"{name} = {write_quantity(value, units.get(name, ''), errors.get(name))}"
+                 for name, value in self.effect.values().items()]  # fmt: skip
+        return (f"{' or '.join(self.names)}: {', '.join(sizes)}, gain of log-likelihood "
+                f"{self.evidence:.4g}{f'; {self.note}' if self.note else ''}")  # fmt: skip
+
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
@@ -202,8 +216,8 @@ class Candidate:
     remark: str = ""
 
 
-@dataclass(frozen=True, eq=False)
-class BinnedErrors:
+@dataclass(frozen=True, eq=False, repr=False)
+class BinnedErrors(Printed):
     """Where along one quantity the innovations are not noise.
 
     Parameters
@@ -238,6 +252,12 @@ class BinnedErrors:
 
     def __post_init__(self) -> None:
         freeze_arrays(self)
+
+    def __str__(self) -> str:
+        of = f" of {self.output}" if self.output else ""
+        return (f"errors{of} along {with_unit(self.axis, self.unit)}: p = {self.p_before:.2g} that "
+                f"they are noise before, {self.p_after:.2g} with the effects"
+                + (f"; {self.words}" if self.words else ""))  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,8 @@ EXACT = 100 * (1 - 1e-9)
 ENOUGH = 0.75
 
 
-@dataclass(frozen=True, eq=False)
-class Curve:
+@dataclass(frozen=True, eq=False, repr=False)
+class Curve(Printed):
     """One reproduction of the measured output.
 
     Parameters
@@ -50,6 +50,10 @@ class Curve:
 
     def __post_init__(self) -> None:
         freeze_arrays(self)
+
+    def __str__(self) -> str:
+        return (f"{self.label}: fit {write_fit(self.fit)}, RMS error {self.rms:.3e}, of which "
+                f"noise explains {_write_percent(self.noise_share)} of the variance")  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -34,8 +34,8 @@ COSTS = 0.1
 ADDED_NOISE = 1e-6
 
 
-@dataclass(frozen=True, eq=False)
-class OrderRow:
+@dataclass(frozen=True, eq=False, repr=False)
+class OrderRow(Printed):
     """One structure and how it fares.
 
     Parameters
@@ -66,6 +66,11 @@ class OrderRow:
 
     def __post_init__(self) -> None:
         freeze_arrays(self)
+
+    def __str__(self) -> str:
+        return (f"na = {self.na}, nb = {self.nb}, nk = {self.nk}: misfit {self.misfit:.4g}, "
+                f"p = {self.p_value:.2g}, BIC {self.bic:.5g}, held-out error "
+                f"{self.held_out:.4f}")  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -22,6 +22,8 @@ from .controller_check import FAULTS, check_controller
 from .hold_check import check_hold
 from .wired_controller_check import check_wired_controller
 
+# These findings are no matter of one signal.
+OF_THE_LOOP = ("controller", *FAULTS)
 # With fewer valid samples no fit says much.
 FEW = 50
 # A fit needs at least so many valid samples in succession.
@@ -40,8 +42,8 @@ ELSEWHERE = 100.0
 LINE = 1e-5
 
 
-@dataclass(frozen=True)
-class AuditFinding:
+@dataclass(frozen=True, repr=False)
+class AuditFinding(Printed):
     """One thing to know about a record.
 
     Parameters
@@ -74,6 +76,11 @@ class AuditFinding:
     size: float
     where: tuple[int, int]
     harmful: bool = False
+
+    def __str__(self) -> str:
+        kind = self.kind.upper() if self.harmful else self.kind
+        of = f" of {self.channel}" if self.channel and self.kind not in OF_THE_LOOP else ""
+        return f"{kind}{of}: {self.text}"
 
 
 @dataclass(frozen=True, repr=False)
@@ -113,11 +120,7 @@ class Audit(Printed):
         if len(self.findings) == 1:
             harm = "which harms" if bad else "which does not harm"
         rows = [f"Audit: {write_count(len(self.findings), 'finding')}, {harm} a fit"]
-        for f in self.findings:
-            kind = f.kind.upper() if f.harmful else f.kind
-            of = f" of {f.channel}" if f.channel and f.kind not in ("controller", *FAULTS) else ""
-            rows.append(f"  {kind}{of}: {f.text}")
-        return "\n".join(rows)
+        return "\n".join([*rows, *(f"  {finding}" for finding in self.findings)])
 
 
 @keep_numpy_quiet

@@ -13,6 +13,7 @@ from .._base.statistics import (
     compute_whiteness_probability,
     fit_autoregression,
 )
+from .._base.text import Printed, write_percent
 from ..data.validity import find_whole_past
 
 # The bands and tests have this probability of covering what chance does.
@@ -25,8 +26,8 @@ MOST_ORDER = 40
 ROWS = 50_000
 
 
-@dataclass(frozen=True, eq=False)
-class Correlation:
+@dataclass(frozen=True, eq=False, repr=False)
+class Correlation(Printed):
     """A correlation function of residuals with its confidence band and test.
 
     Parameters
@@ -61,6 +62,13 @@ class Correlation:
     def passed(self) -> bool:
         """Whether chance explains the correlations at the 1 % level."""
         return self.p_value >= 1 - LEVEL
+
+    def __str__(self) -> str:
+        worst = int(np.argmax(np.abs(self.values)))
+        judged = "passed" if self.passed else f"NOT PASSED, {write_percent(self.share)} of variance"
+        return (f"correlation {self.name}: largest {self.values[worst]:+.3f} at lag "
+                f"{self.lags[worst]}, chance gives ±{self.band:.3f}, p = {self.p_value:.2g}: "
+                f"{judged}")  # fmt: skip
 
 
 def autocorrelation(e: Array, valid: Any, lags: int = 25, fitted: int = 0) -> Correlation:

@@ -7,15 +7,15 @@ import numpy as np
 
 from .._base.arrays import Array, freeze_arrays
 from .._base.errors import CtrlidError
-from .._base.text import Printed, with_error, write_list
+from .._base.text import Printed, with_error, write_count, write_list
 from ..data.record import Record
 
 # A relative difference beyond this is not told apart from a larger one.
 FAR = 10.0
 
 
-@dataclass(frozen=True, eq=False)
-class SamplingRow:
+@dataclass(frozen=True, eq=False, repr=False)
+class SamplingRow(Printed):
     """One estimator at one sampling period.
 
     Parameters
@@ -76,6 +76,14 @@ class SamplingRow:
     def pole_times_period(self) -> Array:
         """The poles' absolute values times the sampling period."""
         return np.asarray(np.abs(self.poles) * self.period, dtype=float)
+
+    def __str__(self) -> str:
+        result = f"FAILED: {self.failure}"
+        if not self.failed:
+            result = f"poles {_poles(self)} rad/s, one-step errors {_judge_errors(self)}"
+        notes = "".join(f"\n  note: {note}" for note in self.notes)
+        return (f"{self.estimator} at {self.period:g} s ({write_count(self.n, 'sample')}, u "
+                f"{self.input_between}): {result}{notes}")  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -154,8 +162,11 @@ def _write_result(row: SamplingRow, width: int) -> str:
     share = 100 * row.deviation
     off = f"> {100 * FAR:.0f} %" if row.deviation >= FAR else (
         f"{share:.2g} %" if share < 99.5 else f"{share:.0f} %")  # fmt: skip
+    return f"{_poles(row):<{width}}{off:>8}  {_judge_errors(row)}"
+
+
+def _judge_errors(row: SamplingRow) -> str:
     judged = {True: "white", False: "NOT WHITE", None: "not tested"}[row.white]
     if row.independent is not None:
         judged += ", independent" if row.independent else ", CORRELATED WITH u OR r"
-    bound = f"; ON ITS BOUND: {write_list(row.active)}" if row.active else ""
-    return f"{_poles(row):<{width}}{off:>8}  {judged}{bound}"
+    return judged + (f"; ON ITS BOUND: {write_list(row.active)}" if row.active else "")
