@@ -71,6 +71,35 @@ def test_unreachable_outputs_are_refused(plant, output, words):
         cid.operating_point(plant, output=output)
 
 
+@pytest.mark.parametrize("output", [0.0, 0.1])
+@pytest.mark.parametrize(
+    ("acceleration", "bias"),
+    [(lambda x, v, u: u - 0.1 * v, lambda x: 0.0),
+     (lambda x, v, u: u - 3.0 * x - 0.1 * v, lambda x: 3.0 * x),
+     (lambda x, v, u: 9.81 - (u / (x + 0.2)) ** 2, lambda x: (x + 0.2) * np.sqrt(9.81))],
+    ids=["mass", "spring", "magnet"],
+)  # fmt: skip
+def test_a_plant_with_dry_friction_as_a_sign_rests(acceleration, bias, output):
+    """Rounding left a speed of 1e-18, whose friction the input had to balance."""
+    plant = ct.nlsys(
+        lambda t, x, u, p: np.array([x[1], acceleration(x[0], x[1], u[0]) - 0.2 * np.sign(x[1])]),
+        lambda t, x, u, p: x[0], inputs=["u"], outputs=["x"], states=["x", "v"], name="rubbing",
+    )  # fmt: skip
+    at = cid.operating_point(plant, output=output)
+    assert at.states == pytest.approx((output, 0.0), abs=1e-15)
+    assert at.input == pytest.approx(bias(output), rel=1e-9, abs=1e-12)
+    assert np.isfinite(cid.linearize(plant, at)(1j))
+
+
+def test_a_plant_without_a_value_at_rest_says_what_to_write():
+    plant = ct.nlsys(
+        lambda t, x, u, p: np.array([x[1], u[0] - 0.2 * x[1] / abs(x[1])]),
+        lambda t, x, u, p: x[0], inputs=["u"], outputs=["x"], states=["x", "v"], name="rubbing",
+    )  # fmt: skip
+    with pytest.raises(CtrlidError, match=r"has no value at v = 0: write np.sign\(v\)"):
+        cid.operating_point(plant, output=0.1)
+
+
 def test_a_plant_that_changes_with_time_has_no_operating_point():
     plant = ct.nlsys(lambda t, x, u, params: np.array([x[1], np.sin(t) - x[0] + u[0]]),
                      lambda t, x, u, params: x[0], name="shaken", inputs=1, outputs=1,

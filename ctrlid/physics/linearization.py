@@ -225,6 +225,9 @@ def operating_point(
             near = ", ".join(f"{s}={v:.4g}" for s, v in zip(
                 (*equations.states, *equations.inputs), closest[1], strict=True))  # fmt: skip
             hint = f" The nearest point found is {near}, which is no equilibrium."
+        elif n > 1:
+            hint = (" Its equations are not finite wherever the search ended. A quotient such as "
+                    "v / abs(v) has no value at v = 0: write np.sign(v).")  # fmt: skip
         wanted = ", ".join(
             f"{name} = {value:g}" for name, value in zip(equations.outputs, target, strict=True)
         )
@@ -308,11 +311,40 @@ def _solve_equilibrium(
         z, jac = z - damping * step, next_jac
     # A state that is at rest up to rounding is set to zero.
     z = np.where(np.abs(z) < max(1e-12 * np.abs(z).max(), 1e-20), 0.0, z)
+    error = _measure_residual(evaluate, z)
+    if EQUILIBRIUM <= error < np.inf:
+        held = _solve_at_rest(evaluate, z)
+        rest = _measure_residual(evaluate, held)
+        z, error = (held, rest) if rest < error else (z, error)
+    return (z, error) if error < np.inf else (None, np.inf)
+
+
+def _solve_at_rest(evaluate: Any, start: Array) -> Array:
+    """Continue Newton's method with what is zero held at zero.
+
+    Dry friction written as np.sign(v) is zero at rest, but the rounding of a step moves v, and the
+    whole friction is then balanced by an input that no equilibrium has.
+    """
+    z, free = start.copy(), start != 0
+    for _ in range(20):
+        f, jac = evaluate(z)
+        if not (np.isfinite(f).all() and np.isfinite(jac).all()):
+            break
+        step = np.linalg.lstsq(jac[:, free], f, rcond=None)[0]
+        before = z[free]
+        if np.all(np.abs(step) <= 1e-15 * np.abs(before)):
+            break
+        z[free] = np.where(np.abs(before - step) < 1e-12 * np.abs(before), 0.0, before - step)
+    return z
+
+
+def _measure_residual(evaluate: Any, z: Array) -> float:
+    """Return the residual relative to what cancels there; infinite where there is none."""
     f, jac = evaluate(z)
     if not np.isfinite(f).all():
-        return None, np.inf
+        return np.inf
     terms = np.abs(jac) @ np.abs(z) + np.abs(f)
-    return z, float(np.max(np.where(f == 0, 0.0, np.abs(f) / np.where(terms > 0, terms, 1.0))))
+    return float(np.max(np.where(f == 0, 0.0, np.abs(f) / np.where(terms > 0, terms, 1.0))))
 
 
 def compute_state_matrices(
