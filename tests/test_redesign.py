@@ -92,6 +92,36 @@ def test_linear_plants_and_a_point_at_zero():
     assert "the promise holds" in found.verdict
 
 
+@pytest.mark.parametrize(
+    ("unit", "scale"), [("m", 1.0), ("mm", 1e3), ("rad", 1.0), ("deg", 180 / np.pi), ("odd", 1.0)]
+)
+def test_a_step_from_zero_is_the_same_in_other_units(unit, scale):
+    """It was 0.01 of whatever the output is in: 10 µm of a plant in millimetres."""
+    plant = ct.tf([2.0 * scale], [1.0, 0.0, -9.0], inputs="u", outputs="y")
+    loop = cid.Loop(plant, None, dt=0.01, units={"y": unit})
+    found = cid.redesign(plant, loop, crossover=8, phase_margin=45)
+    assert found.step == pytest.approx(0.01 * scale)
+    assert "y rests at zero, and no limit of the input says what is small" in str(found)
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e3])
+def test_a_step_from_zero_leaves_the_input_far_from_its_limits(scale):
+    plant = ct.tf([2.0 * scale], [1.0, 0.0, -9.0], inputs="u", outputs="y")
+    loop = cid.Loop(plant, None, dt=0.01, input_limits=(-5.0, 10.0))
+    found = cid.redesign(plant, loop, crossover=8, phase_margin=45)
+    closed = ct.feedback(found.controller, plant)
+    peak = np.max(np.abs(ct.step_response(closed, np.linspace(0, 5, 5000)).outputs))
+    assert peak * found.step == pytest.approx(0.5, rel=0.05)
+    assert "to move the input by 10 % of its way to a limit" in str(found)
+    assert "to move the input" in found.step_reason
+    # A stated height, or an output at rest elsewhere, needs no reason.
+    given = cid.redesign(plant, loop, crossover=8, phase_margin=45, step=0.1)
+    assert (given.step, given.step_reason) == (0.1, "")
+    trial = cid.redesign(ct.ss(plant), loop, design=lambda P: found.controller)
+    assert [s.height for s in trial.steps] == [pytest.approx(found.step, rel=0.05)]
+    assert "to move the input by 10 %" in str(trial)
+
+
 # --- wrong models
 
 

@@ -1,5 +1,6 @@
 """Units as text: products, powers and quotients, and which texts are units at all."""
 
+import math
 import re
 from collections.abc import Mapping
 
@@ -17,6 +18,10 @@ SPELLINGS = {
     "amps": "A", "ampere": "A", "newton": "N", "newtons": "N", "meter": "m", "metre": "m",
     "meters": "m", "metres": "m", "sec": "s", "second": "s", "seconds": "s", "l": "L",
 }  # fmt: skip
+# How many of these make one of the SI.
+PER_SI = {"n": 1e9, "µ": 1e6, "m": 1e3, "k": 1e-3, "M": 1e-6}
+PER_SI_ALONE = {"deg": 180 / math.pi, "rev": 0.5 / math.pi, "cm": 100.0, "%": 100.0, "g": 1e3,
+                "kg": 1.0, "min": 1 / 60, "h": 1 / 3600}  # fmt: skip
 MARKS = re.compile(r"[/()*·]|\^-?\d+|[^\s/()*·^]+|\S")
 
 
@@ -99,6 +104,34 @@ def is_same_unit(first: str, second: str) -> bool:
     [False, False, False]
     """
     return _spell_alike(first) == _spell_alike(second)
+
+
+def count_per_si_unit(text: str) -> float:
+    """Return how many of a unit make one SI unit of the same quantity.
+
+    Parameters
+    ----------
+    text : str
+        A unit.
+
+    Returns
+    -------
+    float
+        The number; 1 for a unit that is not known, or of several symbols.
+
+    Examples
+    --------
+    >>> count_per_si_unit("mm"), count_per_si_unit("m"), count_per_si_unit("volts")
+    (1000.0, 1.0, 1.0)
+    """
+    powers = _spell_alike(text)
+    if list(powers.values()) != [1]:
+        return 1.0
+    (symbol,) = powers
+    if symbol in PER_SI_ALONE:
+        return PER_SI_ALONE[symbol]
+    prefixed = symbol not in WITH_PREFIX and symbol[1:] in WITH_PREFIX
+    return PER_SI.get(symbol[0], 1.0) if prefixed else 1.0
 
 
 def _spell_alike(text: str) -> dict[str, int]:

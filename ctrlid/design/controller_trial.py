@@ -4,6 +4,7 @@ import math
 import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import control as ct
@@ -18,6 +19,7 @@ from ..loop.loop import Loop
 from ..loop.simulation import SimulationStopped, simulate
 from ..physics.trace import timebase
 from .input_margins import LoopPerformance, measure_performance
+from .step_height import choose_height
 
 # A response has settled when it stays within this share of its final value.
 SETTLED = 0.02
@@ -98,6 +100,8 @@ class ReferenceStep(Printed):
         Time after the step [s].
     promised, achieved : StepMotion
         On the model, and on the nonlinear physics within its input limits.
+    reason : str
+        Why the step has this height where none was given and the output rests at zero, or empty.
     """
 
     reference: str
@@ -106,6 +110,7 @@ class ReferenceStep(Printed):
     time: Array
     promised: StepMotion
     achieved: StepMotion
+    reason: str = ""
 
     def __post_init__(self) -> None:
         freeze_arrays(self)
@@ -173,7 +178,8 @@ class ControllerTrial(Printed):
                     and not np.isfinite(s.achieved.settling_time)]  # fmt: skip
         if restless:
             return (f"{text} WITH THE STEP OF {write_list(restless)} THE RESPONSE DOES NOT SETTLE, "
-                    "because an input saturates or the step leaves the linear range.")  # fmt: skip
+                    "because an input saturates, the step leaves the linear range, or dry friction "
+                    "holds it.")  # fmt: skip
         return f"{text} {self._compare_steps()}".rstrip()
 
     def _compare_margins(self) -> str:
@@ -279,11 +285,12 @@ class ControllerTrial(Printed):
             "smaller step= they are closer to the promised ones." if heights else
             "  The controller has no reference to step."
         )  # fmt: skip
+        reasons = [f"  {text}" for text in dict.fromkeys(s.reason for s in self.steps) if text]
         lacking = [
             "  The disk margin of several inputs is not known: python-control needs slycot for it."
         ] if len(self.promised.margins) > 1 and np.isnan(self.promised.disk_margin) and (
             self.promised.growth_rate < 0) else []  # fmt: skip
-        return "\n".join([head, *lines, *table, *lacking, tried, "  " + self.verdict])
+        return "\n".join([head, *lines, *table, *lacking, tried, *reasons, "  " + self.verdict])
 
 
 def _write(value: float, form: str) -> str:
@@ -333,13 +340,14 @@ def try_design(
     promise = Loop(model, controller, dt=dt, at=at, units=_pick_units(loop))
     trial = replace(loop, controller=controller, dt=dt)
     promised, achieved = (measure_performance(side) for side in (promise, trial))
-    heights = _choose_steps(trial, model, step)
     length = _choose_length(promised.poles, dt)
+    heights = _choose_steps(trial, model, step, partial(_find_peaks, promise, length))
     sides = [(side, _stay(side, length)) for side in (promise, trial) if heights]
     steps = tuple(
-        _make_step(trial, model, name, height, dt, length,
-                   *(_step(side, name, height, length, rest) for side, rest in sides))
-        for name, height in heights.items()
+        replace(_make_step(trial, model, name, height, dt, length,
+                           *(_step(side, name, height, length, rest) for side, rest in sides)),
+                reason=reason)
+        for name, (height, reason) in heights.items()
     )  # fmt: skip
     if not isinstance(step, Mapping):
         # An angle that no controller can hold is a reference by name only.
@@ -434,8 +442,10 @@ def _find_followed(loop: Loop, model: Any, name: str) -> str | None:
     return name if name in outputs else None
 
 
-def _choose_steps(loop: Loop, model: Any, step: Any) -> dict[str, float]:
-    """Return the height of the step of each reference that is tried."""
+def _choose_steps(
+    loop: Loop, model: Any, step: Any, find_peaks: Callable[[str], Array]
+) -> dict[str, tuple[float, str]]:
+    """Return the height of the step of each reference that is tried, and why it is that."""
     names = _list_references(loop)
     if isinstance(step, Mapping):
         unknown = [name for name in step if name not in names]
@@ -444,20 +454,28 @@ def _choose_steps(loop: Loop, model: Any, step: Any) -> dict[str, float]:
                 f"step= names {write_list([str(n) for n in unknown]) or 'no reference'}; the "
                 f"controller has the references {', '.join(names) or 'none'}"
             )
-        return {name: _check_height(value) for name, value in step.items()}
+        return {name: (_check_height(value), "") for name, value in step.items()}
     wiring = loop.wiring
     held = (None,) * len(names) if wiring is None else wiring.held
     chosen = [name for name, value in zip(names, held, strict=True)
               if value is None or _find_followed(loop, model, name) is not None]  # fmt: skip
     if step is not None:
-        return dict.fromkeys(chosen, _check_height(step))
-    outputs = loop.signals["y"]
-    heights = {}
-    for name in chosen:
-        output = _find_followed(loop, model, name)
-        rest = 0.0 if output is None else loop.point.outputs[outputs.index(output)]
-        heights[name] = 0.01 * abs(rest) or 0.01
-    return heights
+        return dict.fromkeys(chosen, (_check_height(step), ""))
+    return {
+        name: choose_height(loop, _find_followed(loop, model, name), partial(find_peaks, name))
+        for name in chosen
+    }
+
+
+def _find_peaks(promise: Loop, n: int, name: str) -> Array:
+    """Return how far each input moves on the model for a step of one reference by 1.
+
+    Infinitely far where the design does not stabilize its own model.
+    """
+    motion = _step(promise, name, 1.0, n, _stay(promise, n))
+    if motion.failure is not None or not motion.u.size:
+        return np.full(len(promise.signals["u"]), np.inf)
+    return np.asarray(np.max(np.abs(motion.u), axis=1))
 
 
 def _check_height(step: Any) -> float:

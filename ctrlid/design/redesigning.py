@@ -25,6 +25,7 @@ from ..physics.trace import timebase
 from .controller_trial import ControllerTrial, try_design
 from .lead import design_lead
 from .margins import loop_margins, nu_gap, robust_margin
+from .step_height import choose_height
 
 # A response has settled when it stays within this share of its final value.
 SETTLED = 0.02
@@ -95,6 +96,8 @@ class Redesign(Printed):
         Height of the reference step that was tried on the physics [output unit].
     failure : str
         Why the physics was not kept stable, or empty.
+    step_reason : str
+        Why the step has this height where none was given and the output rests at zero, or empty.
     """
 
     controller: Any
@@ -108,6 +111,7 @@ class Redesign(Printed):
     achieved_step: Array
     step: float
     failure: str = ""
+    step_reason: str = ""
 
     def __post_init__(self) -> None:
         freeze_arrays(self)
@@ -145,8 +149,8 @@ class Redesign(Printed):
                      "of the plant, give a smaller step= to redesign.")  # fmt: skip
         elif np.isfinite(p.settling_time) and not np.isfinite(a.settling_time):
             text += (f" This is for small signals: WITH A STEP OF {self.step:.3g} THE RESPONSE "
-                     "DOES NOT SETTLE, because the input saturates or the step leaves the linear "
-                     "range.")  # fmt: skip
+                     "DOES NOT SETTLE, because the input saturates, the step leaves the linear "
+                     "range, or dry friction holds it.")  # fmt: skip
         sure = self.nu_gap < self.robust_margin
         return (
             f"{text} Stability near the operating point is {'' if sure else 'not '}guaranteed: "
@@ -186,7 +190,7 @@ class Redesign(Printed):
         step = (
             "  The last three values achieved are for a step of "
             f"{write_quantity(self.step, unit)} on the nonlinear physics. With a smaller step= "
-            "they are closer to the promised values."
+            "they are closer to the promised values." + f" {self.step_reason}".rstrip()
         )
         return "\n".join([f"controller: ({num}) / ({den})", *rows, step, "  " + self.verdict])
 
@@ -236,8 +240,10 @@ def redesign(
         controller is wired as `Loop` says; its own time base decides whether it is digital.
     step : float or mapping of str to float, optional
         Height of the reference step [output unit]; by default 1 % of the output at the operating
-        point, or 0.01. Of several references, a mapping of names says which are tried; by default
-        those that cannot be held and each ``xd[i]`` that is an output.
+        point. Where that is zero, what moves the input by a tenth of its way to a limit by the
+        model, or without limits 0.01 in SI units; the text says which. Of several references, a
+        mapping of names says which are tried; by default those that cannot be held and each
+        ``xd[i]`` that is an output.
 
     Returns
     -------
@@ -312,11 +318,13 @@ def redesign(
     P = loop.linearize()
     if dt and not timebase(P):
         P = sample_held(P, dt)
-    height = _choose_height(loop, step)
     # The response is long enough for the slowest promised pole, at the sampling period of the loop.
     length = int(np.clip(60 / (crossover * trial.dt), 20, 50_000))
     time: Array = np.arange(length, dtype=float) * trial.dt
-    promised_step = _simulate_linear_step(G, C, time)
+    promised_step = _simulate_linear_step(ct.feedback(G * C, 1), time)
+    height, reason = _choose_height(
+        loop, step, lambda: np.max(np.abs(_simulate_linear_step(ct.feedback(C, G), time)))
+    )
     achieved_step, failure, told = _simulate_physical_step(trial, height, promised_step)
     promised = _measure_performance(loop_margins(G * C), time, promised_step)
     margins = loop_margins(P * C)
@@ -338,7 +346,7 @@ def redesign(
     unit = float(np.abs(G(omega)))
     return Redesign(C, promised, achieved, nu_gap(G / unit, P / unit),
                     robust_margin(G / unit, C * unit), trial, time, promised_step, achieved_step,
-                    height, "" if failure is None else failure)  # fmt: skip
+                    height, "" if failure is None else failure, reason)  # fmt: skip
 
 
 def _make_plain(G: Any) -> Any:
@@ -355,17 +363,17 @@ def _make_plain(G: Any) -> Any:
     return G
 
 
-def _choose_height(loop: Loop, step: Any) -> float:
+def _choose_height(loop: Loop, step: Any, find_peak: Callable[[], Any]) -> tuple[float, str]:
+    """Return the height of the step, and why it is that where it was not given."""
     if step is None:
-        return 0.01 * abs(loop.point.output) or 0.01
+        return choose_height(loop, loop.signals["y"][0], find_peak)
     if not isinstance(step, Real) or not np.isfinite(float(step)) or step == 0:
         raise CtrlidError("step must be the height of the reference step in output units, a "
                           f"finite number other than zero; given {step!r}")  # fmt: skip
-    return float(step)
+    return float(step), ""
 
 
-def _simulate_linear_step(G: Any, C: Any, time: Array) -> Array:
-    closed = ct.feedback(G * C, 1)
+def _simulate_linear_step(closed: Any, time: Array) -> Array:
     return np.asarray(ct.forced_response(closed, time, np.ones(len(time))).outputs, float)
 
 
