@@ -83,6 +83,29 @@ def test_other_parameters_are_another_loop():
         loop.with_parameters({"K": math.nan})
 
 
+@pytest.mark.parametrize("lag", [0.0, 3.0])
+@pytest.mark.parametrize(("upper", "runs_over"), [(0.9, False), (0.81, False), (0.75, True)])
+def test_a_limit_of_a_state_is_linearized_where_the_point_is(upper, runs_over, lag):
+    """Half of the overflow was in the model wherever the tank stood: a pole at -2 in place of 0."""
+    dt, plant = 1.0, cid.plants.tank(area=0.0147, outlet=7.7e-5, k=5.9e-5)
+    at = cid.operating_point(plant, output=0.8)
+    loop = cid.Loop(plant, None, dt=dt, at=at).with_effect(E.StateLimit("h", upper=upper))
+    if lag:
+        loop = loop.with_effect(E.ActuatorLag(tau=lag))
+    G = loop.linearize(states=True)
+    assert (G.A[0, 0] < -1) == runs_over
+    rest = cid.operating_point(loop.system(), output=0.8)
+    d, n = 1e-5 * rest.input, 50
+
+    def run(step):
+        given = np.full(n, rest.input - at.input + step)
+        return cid.simulate(loop, d=given, initial=rest.states).y
+
+    moved = (run(d) - run(-d)) / (2 * d)
+    linear = ct.forced_response(G, np.arange(n) * dt, np.ones(n)).outputs
+    np.testing.assert_allclose(moved, linear, rtol=2e-3, atol=1e-4 * np.max(np.abs(linear)))
+
+
 @pytest.mark.parametrize(
     ("values", "named", "words"),
     [

@@ -128,6 +128,14 @@ class AbstractEffect:
         del sight
         return None
 
+    @property
+    def limited_states(self) -> tuple[str, ...]:
+        """States that have a limit, which a linear model takes as it is at the point; none here.
+
+        Other kinks are left out of it, as in motion that is large against them.
+        """
+        return ()
+
     @classmethod
     def is_scanned(cls) -> bool:
         """Whether the effect looks for its place in a record, which takes time."""

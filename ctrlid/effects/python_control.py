@@ -1,7 +1,7 @@
 """Equations with effects as what python-control knows: a system, or a transfer function."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import casadi
@@ -95,7 +95,10 @@ def linearize_with_effects(
     resting = make_ordinary(changed, at)
     guess = OperatingPoint((*at.states, *resting.rest), at.input, at.output)
     point = operating_point(resting, output=at.output, guess=guess)
-    return linearize(make_ordinary(with_spread(changed, FAR), at), point, states=states)
+    # Half of what is beyond a limit would run over at any point if the state were that uncertain.
+    limited = {name for effect in effects.values() for name in effect.limited_states}
+    spread = [0.0 if name in limited else FAR for name in changed.states]
+    return linearize(make_ordinary(with_spread(changed, spread), at), point, states=states)
 
 
 def make_ordinary(e: Equations, at: OperatingPoint) -> Equations:
@@ -139,15 +142,15 @@ def make_ordinary(e: Equations, at: OperatingPoint) -> Equations:
     return with_spread(e, 0.0)
 
 
-def with_spread(e: Equations, size: float) -> Equations:
+def with_spread(e: Equations, size: float | Sequence[float]) -> Equations:
     """Return equations with a number for how uncertain every state is.
 
     Parameters
     ----------
     e : Equations
         Equations with effects.
-    size : float
-        Standard deviation of every state.
+    size : float or sequence of float
+        Standard deviation of every state, or of each.
 
     Returns
     -------
@@ -156,7 +159,7 @@ def with_spread(e: Equations, size: float) -> Equations:
     """
     if e.spread is None:
         return e
-    known = casadi.DM.ones(*e.spread.shape) * size
+    known = casadi.DM.ones(*e.spread.shape) * casadi.DM(size)
     return dataclasses.replace(substitute_symbol(e, e.spread, known), spread=None)
 
 

@@ -59,6 +59,11 @@ class StateLimit(LawEffect):
     sentence: ClassVar[str] = "A state has an upper limit, as a tank that overflows."
     experiment: ClassVar[str] = "large slow steps that take the state up to its limit and beyond"
 
+    @property
+    def limited_states(self) -> tuple[str, ...]:
+        """The state: below its limit nothing runs over, however large the motion may be."""
+        return (self.name,)
+
     @classmethod
     def candidates(cls, loop: Any, record: Any = None) -> tuple[Self, ...]:
         """Return one for each state that is no motion; it spills into the state it feeds."""

@@ -523,8 +523,9 @@ class Loop:
 
         The point keeps its output; with effects, its states and input are solved for anew.
         Dry friction, dead zones, backlash, steps of a converter and vibrations are left out, as
-        in motion that is large against them; a delay is its Padé approximation of order two; what
-        drifts has its value at time zero.
+        in motion that is large against them; a `StateLimit` is as it is at the point, where nothing
+        runs over below the limit; a delay is its Padé approximation of order two; what drifts has
+        its value at time zero.
 
         Parameters
         ----------
