@@ -22,7 +22,7 @@ from problems import ROOT, drive, levitation, tank
 BOUNDARIES = {
     "__main__.py: main",
     "estimation/series.py: _fit_one",
-    "reporting/cli/arguments.py: read_record",
+    "reporting/cli/options.py: options_in_refusals",
     "reporting/cli/arguments.py: parse_assignment",
     "reporting/cli/demo_identification.py: _tell_redesigns",
     "validation/controller_check.py: check_controller",

@@ -183,8 +183,9 @@ class Finding(Printed):
         units, errors = self.effect.units(), self.standard_errors
         sizes = [f"{name} = {write_quantity(value, units.get(name, ''), errors.get(name))}"
                  for name, value in self.effect.values().items()]  # fmt: skip
-        return (f"{' or '.join(self.names)}: {', '.join(sizes)}, gain of log-likelihood "
-                f"{self.evidence:.4g}{f'; {self.note}' if self.note else ''}")  # fmt: skip
+        text = (f"{' or '.join(self.names)}: {', '.join(sizes)}, gain of log-likelihood "
+                f"{self.evidence:.4g}")  # fmt: skip
+        return "; ".join(filter(None, [text, self.note]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,9 +256,9 @@ class BinnedErrors(Printed):
 
     def __str__(self) -> str:
         of = f" of {self.output}" if self.output else ""
-        return (f"errors{of} along {with_unit(self.axis, self.unit)}: p = {self.p_before:.2g} that "
-                f"they are noise before, {self.p_after:.2g} with the effects"
-                + (f"; {self.words}" if self.words else ""))  # fmt: skip
+        text = (f"errors{of} along {with_unit(self.axis, self.unit)}: p = {self.p_before:.2g} that "
+                f"they are noise before, {self.p_after:.2g} with the effects")  # fmt: skip
+        return "; ".join(filter(None, [text, self.words]))
 
 
 @dataclass(frozen=True)

@@ -431,7 +431,8 @@ class Loop:
             New values by name as in `parameters`, each in its unit:
             ``{"K": 3e-6, "CoulombFriction.fc": 0.2}``.
         **named : float
-            The same by keyword, for names that Python can spell: ``with_parameters(K=3e-6)``.
+            The same by keyword, each in its unit, for names that Python can spell:
+            ``with_parameters(K=3e-6)``.
 
         Returns
         -------
