@@ -8,7 +8,7 @@ from functools import partial
 import control as ct
 import numpy as np
 import pytest
-from scipy import special
+from scipy import integrate, special
 
 import ctrlid as cid
 from ctrlid import effects as E
@@ -464,6 +464,47 @@ def test_friction_of_an_exact_solution_is_fitted_without_a_random_force():
     assert found.values[0] == pytest.approx(fc, rel=0.01)
     assert found.sensor_noise == pytest.approx((sigma,), rel=0.1)
     assert found.force_noise < 0.1 * fc
+
+
+def creep(fc, v0, push, dt):
+    """The position of 1 kg under a friction that never sticks, by an implicit solver."""
+    shown, state = [], np.zeros(2)
+    for force in push:
+        shown.append(state[0])
+        state = integrate.solve_ivp(
+            lambda t, z, force=force: [z[1], force - fc * np.tanh(z[1] / v0)], (0, dt), state,
+            method="Radau", rtol=1e-8, atol=1e-10,
+        ).y[:, -1]  # fmt: skip
+    return np.array(shown)
+
+
+@pytest.mark.parametrize("v0", [1e-4, 3e-3, 0.05])
+def test_friction_that_never_sticks_creeps_as_its_formula_does(v0):
+    rng = np.random.default_rng(3)
+    dt, fc = 0.01, 2.0
+    push = np.repeat(rng.uniform(-5.0, 5.0, 30), 20)
+    exact = creep(fc, v0, push, dt)
+    assert np.ptp(exact) > 0.2
+    loop = cid.Loop(mass(), None, dt=dt)
+    y = cid.simulate(loop.with_effect(E.CoulombFriction(fc, creep=v0 / fc)), d=push).y
+    assert np.max(np.abs(y - exact)) < 0.005
+    sigma = 1e-3
+    record = cid.Record(u=push, y=exact + sigma * rng.standard_normal(len(push)), dt=dt)
+    started = loop.with_effect(E.CoulombFriction(0.7 * fc, creep=0.5 * v0 / fc + 0.002))
+    found = cid.fit_loop(started, record).estimate
+    error = np.maximum(found.standard_errors, [0.01, 1e-3])
+    assert np.all(np.abs(found.values - [fc, v0 / fc]) < 3.5 * error)
+    assert found.standard_errors[0] < 0.1 * fc
+
+
+def test_a_time_of_creep_is_a_value_of_friction_only_where_there_is_one():
+    stuck, creeping = E.CoulombFriction(0.2), E.CoulombFriction(0.2, creep=0.01)
+    assert stuck.values() == {"fc": 0.2}
+    assert "creep" not in str(stuck)
+    assert "creep = 0.01 s" in str(creeping)
+    assert list(cid.Loop(mass(), None, dt=0.01).with_effect(stuck).parameters)[-1].endswith("fc")
+    with pytest.raises(cid.CtrlidError, match="creep"):
+        E.CoulombFriction(0.2, creep=-1.0)
 
 
 FORCES = [

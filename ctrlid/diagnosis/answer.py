@@ -275,7 +275,7 @@ def _find_sensitivity(found: Search) -> dict[str, float]:
 
 
 def _find_smallest_visible(t: Trial) -> float:
-    if len(t.effect.parameters()) != 1 or not t.label or not math.isfinite(t.score):
+    if len(t.effect.values()) != 1 or not t.label or not math.isfinite(t.score):
         return math.nan
     fit = t.model.fit
     k = t.model.names.index(f"{t.label}.{t.effect.parameters()[0].name}")

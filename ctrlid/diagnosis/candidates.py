@@ -90,7 +90,7 @@ class Trial:
     def full_penalty(self) -> float:
         """Half the Bayesian penalty if all its parameters count."""
         size = self.model.fit.size
-        return bayesian_penalty(len(self.effect.parameters()), size) + self.scan_penalty
+        return bayesian_penalty(len(self.effect.values()), size) + self.scan_penalty
 
     @property
     def net_gain(self) -> float:

@@ -106,7 +106,7 @@ def find_objection(trial: Trial) -> Objection | None:
     if _is_insignificant(trial, effect):
         words = f"within {THRESHOLD.significant:g} standard errors of its neutral value"
         return Objection("insignificant", words)
-    if not all(f"{trial.label}.{p.name}" in names for p in effect.parameters()):
+    if not all(f"{trial.label}.{name}" in names for name in effect.values()):
         # A parameter that is held at its neutral value is another effect's, which excuses this one.
         return None
     doubt = effect.doubt()
@@ -114,15 +114,22 @@ def find_objection(trial: Trial) -> Objection | None:
 
 
 def _is_insignificant(trial: Trial, effect: AbstractEffect) -> bool:
-    """Whether every parameter that decides about an effect may as well be neutral."""
+    """Whether every parameter that decides about an effect may as well be neutral.
+
+    Or whether one that it may go without is not seen.
+    """
     fit, names = trial.model.fit, trial.model.names
     error = fit.standard_errors
     sure = []
     for p in effect.parameters():
         key = f"{trial.label}.{p.name}"
-        if p.neutral is None or key not in names:
+        if key not in names:
             continue
         k = names.index(key)
+        if p.optional and fit.theta[k] <= THRESHOLD.significant * error[k]:
+            return True
+        if p.neutral is None:
+            continue
         away = math.inf if math.isinf(p.neutral) else abs(fit.theta[k] - p.neutral)
         sure.append(away > THRESHOLD.significant * error[k] and fit.normal[0][k, k] > 0)
     return not any(sure)

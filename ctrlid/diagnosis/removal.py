@@ -93,8 +93,8 @@ def fuse_effects(model: Model, given: int, steps: Sequence[Round]) -> Model:
         for start in richer.values():
             if not contains(start, effects[k]):
                 continue
-            more = len(effects[k].parameters()) + len(effects[other].parameters())
-            saved = bayesian_penalty(more - len(start.parameters()), model.fit.size)
+            more = len(effects[k].values()) + len(effects[other].values())
+            saved = bayesian_penalty(more - len(start.values()), model.fit.size)
             without = _drop_effects(model, [other])
             smaller = _drop_effects(model, [k, other])
             trial = screen_at(smaller, replace(start, **effects[k].values()))

@@ -157,13 +157,11 @@ def _find_stuck(best: Trial, tried: Sequence[Trial]) -> list[Trial]:
     if not best.net_gain > 0:
         return []
     own = [t for t in tried if t.key == best.key or contains(best.effect, t.effect)]
-    most = len(best.effect.parameters())
+    most = len(best.effect.values())
     plain = [
         t
         for t in tried
-        if t.key != best.key
-        and any(t.resembles(o) for o in own)
-        and len(t.effect.parameters()) <= most
+        if t.key != best.key and any(t.resembles(o) for o in own) and len(t.effect.values()) <= most
     ]
     return [t for t in plain if has_kinks(t.model)]
 
@@ -189,7 +187,7 @@ def _prefer_simplest(base: Model, trials: list[Trial]) -> list[Trial]:
     """
     best = trials[0]
     for simple in trials[1 : THRESHOLD.looked_at]:
-        fewer = len(simple.effect.parameters()) < len(best.effect.parameters())
+        fewer = len(simple.effect.values()) < len(best.effect.values())
         if not fewer or simple.net_gain <= THRESHOLD.gate:
             continue
         if best.gain - simple.gain > THRESHOLD.simpler_nearly * best.gain or not simple.resembles(

@@ -173,8 +173,9 @@ class AbstractEffect:
         )
 
     def values(self) -> dict[str, float]:
-        """Return the values of the parameters."""
-        return {p.name: getattr(self, p.name) for p in self.parameters()}
+        """Return the values of the parameters, without an optional one that is not made use of."""
+        values = {p: getattr(self, p.name) for p in self.parameters()}
+        return {p.name: v for p, v in values.items() if not (p.optional and v == 0)}
 
     @property
     def neutral(self) -> bool:
@@ -224,6 +225,8 @@ class AbstractEffect:
         for f in dataclasses.fields(self):
             value = getattr(self, f.name)
             if value == "" or f.name == "at":
+                continue
+            if f.name in units and f.name not in self.values():
                 continue
             shown = f"{value:.4g} {units[f.name]}" if f.name in units else str(value)
             parts.append(f"{f.name} = {shown.strip()}")
@@ -300,9 +303,9 @@ class AbstractEffect:
         """
         symbolic = copy.copy(self)
         symbols = []
-        for p in self.parameters():
-            symbols.append(casadi.SX.sym(f"{label}.{p.name}"))
-            object.__setattr__(symbolic, p.name, Symbol(symbols[-1]))
+        for name in self.values():
+            symbols.append(casadi.SX.sym(f"{label}.{name}"))
+            object.__setattr__(symbolic, name, Symbol(symbols[-1]))
         own = {name: casadi.SX.sym(f"{label}.{name}") for name in self.states}
         if own and equations.dt:
             raise EffectDoesNotApply(

@@ -19,6 +19,8 @@ SHARPEST = 1e-12
 INSTANT = 1e-6
 # A mass comes to rest within this share of a sampling period: samples cannot show how it sticks.
 STICKING = 0.25
+# Friction creeps with the velocity that this share of its limit needs, where more is asked for.
+LARGEST_SHARE = 0.99
 # This number stands for an infinite distance to a limit, with which CasADi cannot compute.
 FARTHEST = 1e30
 
@@ -200,7 +202,7 @@ class Moment:
         """
         return Symbol(casadi.erf(v.sx / casadi.sqrt(2 * self._variance(v, width))))
 
-    def rub(self, limit: Any, drag: Any = 0.0) -> Any:
+    def rub(self, limit: Any, drag: Any = 0.0, creep: Any = 0.0) -> Any:
         r"""Return what dry friction of a given limit holds against the motion.
 
         .. math::
@@ -213,6 +215,18 @@ class Moment:
         Karnopp's friction without a switch: the mass sticks, and nothing is too sharp for an
         integration.
 
+        With a time of creep :math:`\tau_c` it is the friction
+        :math:`f_c \tanh(v / (\tau_c f_c))` that simulations are often written with. It holds no
+        force at rest: where it balances b the mass creeps with
+        :math:`v_c = \tau_c f_c \, \mathrm{artanh}(b / f_c)`, so that
+
+        .. math::
+            f = f_c \, E[\mathrm{sign}(v + \lambda (\tau b - v_c))],
+            \quad \tau = \sqrt{(T/4)^2 + \tau_c^2}, \quad \lambda = (T / 4 \tau)^2
+
+        which needs no small steps where the creep is slow, and is the friction itself where it is
+        fast.
+
         Parameters
         ----------
         limit : Symbol or float
@@ -220,6 +234,8 @@ class Moment:
         drag : Symbol or float, optional
             A further force of the same effect [unit of the force], which is part of what it
             balances.
+        creep : Symbol or float, optional
+            Time of creep [s]: the velocity that half the limit needs, over the limit, by and large.
 
         Returns
         -------
@@ -238,8 +254,14 @@ class Moment:
         beyond = (others / (most + SHARPEST)) ** 2
         balanced = others / np.sqrt(np.sqrt(np.sqrt(1 + (beyond * beyond) ** 2)))
         short = STICKING * self.dt
-        width = np.sqrt(2 / np.pi) * short * most
-        return limit * self.sign(Symbol(self._e.x[j]) + short * balanced, width)
+        if isinstance(creep, int | float) and creep == 0:
+            width = np.sqrt(2 / np.pi) * short * most
+            return limit * self.sign(Symbol(self._e.x[j]) + short * balanced, width)
+        time = np.sqrt(short**2 + creep**2)
+        share = LARGEST_SHARE * balanced / (most + SHARPEST)
+        ahead = time * balanced - creep * most * np.arctanh(share)
+        width = np.sqrt(2 / np.pi) * time * most
+        return limit * self.sign(Symbol(self._e.x[j]) + (short / time) ** 2 * ahead, width)
 
     def abs(self, v: Any, width: Any = 0.0) -> Any:
         """Return the absolute value of an expression, averaged as in `sign`."""

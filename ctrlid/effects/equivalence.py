@@ -322,14 +322,15 @@ def _is_linear(e: Equations, forced: bool = False) -> bool:
 
 def _make_member(cls: type[AbstractEffect], loop: Any) -> AbstractEffect | None:
     """Return an instance of a class that has a single parameter and no states, else None."""
-    if len(cls.parameters()) != 1 or cls.states or cls.parameters()[0].neutral is None:
+    needed = [p for p in cls.parameters() if not p.optional]
+    if len(needed) != 1 or cls.states or needed[0].neutral is None:
         return None
     return next(iter(cls.candidates(loop)), None)
 
 
 def _compute_change(loop: Any, effect: AbstractEffect, size: float) -> Array | None:
     """Return how rates and output change at random points, None where the effect is not static."""
-    if effect.states or len(effect.parameters()) != 1:
+    if effect.states or len(effect.values()) != 1:
         return None
     parameter = effect.parameters()[0]
     if parameter.neutral is None or not np.isfinite(parameter.neutral):

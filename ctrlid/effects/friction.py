@@ -103,10 +103,16 @@ class CoulombFriction(ForceEffect):
     while it moves; at rest it holds against all other forces, up to f_c (`Moment.rub`). In a filter
     the jump is spread over what it does not know of the velocity.
 
+    With a time of creep it is :math:`a = -f_c \tanh(\dot x / (\tau f_c))`, as many simulations
+    have it: nothing sticks, and what is pushed at rest creeps. A simulation with
+    ``fc * tanh(v / v0)`` has ``creep = v0 / fc``.
+
     Parameters
     ----------
     fc : float
         Friction over mass [output unit/s^2].
+    creep : float, optional
+        Time of creep tau [s]; by default zero, which sticks.
 
     Examples
     --------
@@ -116,6 +122,7 @@ class CoulombFriction(ForceEffect):
     """
 
     fc: float = parameter("{y}/s^2", lower=0.0, neutral=0.0)
+    creep: float = parameter("s", lower=0.0, optional=True)
 
     stage: ClassVar[int] = LAST_FORCE
     in_linear_model: ClassVar[bool] = False
@@ -125,9 +132,15 @@ class CoulombFriction(ForceEffect):
     sentence: ClassVar[str] = "A force of constant size against the motion, as of dry surfaces."
     experiment: ClassVar[str] = "slow motion with reversals: the force jumps when the motion turns"
 
+    @classmethod
+    def candidates(cls, loop: Any, record: Any = None) -> tuple[Self, ...]:
+        """Return no friction, which would stick, and one that would creep for a period."""
+        del record
+        return cls._applicable(loop, cls(fc=0.0), cls(fc=0.0, creep=loop.dt))
+
     def force(self, m: Moment) -> Any:
         """Return the acceleration."""
-        return -m.rub(self.fc)
+        return -m.rub(self.fc, creep=self.creep)
 
 
 @final

@@ -17,7 +17,8 @@ class Parameter:
     output and the state that the effect names. `neutral` is the value at which the effect vanishes,
     None for a parameter that does not decide this, such as the frequency of a vibration. `instant`
     says that it is a moment in time, `searched` that it is looked for over a range, on whose edge
-    nothing was found.
+    nothing was found, `optional` that an effect may go without it: at zero it is no value of the
+    effect, and is not fitted.
     """
 
     name: str
@@ -27,6 +28,7 @@ class Parameter:
     neutral: float | None
     instant: bool = False
     searched: bool = False
+    optional: bool = False
 
 
 def parameter(
@@ -38,6 +40,7 @@ def parameter(
     default: Any = dataclasses.MISSING,
     instant: bool = False,
     searched: bool = False,
+    optional: bool = False,
 ) -> Any:
     """Declare a numeric field of an effect.
 
@@ -57,6 +60,8 @@ def parameter(
     searched : bool, optional
         Whether it is looked for over a range that the record sets, such as a frequency; an effect
         that ends on the edge of this range was not found.
+    optional : bool, optional
+        Whether the effect may go without it: at zero, its default, it is not fitted.
 
     Returns
     -------
@@ -64,7 +69,8 @@ def parameter(
         The field.
     """
     about = {"unit": unit, "lower": lower, "upper": upper, "neutral": neutral,
-             "instant": instant, "searched": searched}  # fmt: skip
+             "instant": instant, "searched": searched, "optional": optional}  # fmt: skip
+    default = 0.0 if optional else default
     if default is dataclasses.MISSING:
         return dataclasses.field(metadata={"parameter": about})
     return dataclasses.field(default=default, metadata={"parameter": about})
