@@ -23,7 +23,7 @@ from ..validation.record_audit import Audit, AuditFinding, audit
 from .thresholds import THRESHOLD
 
 ROUNDING = 12  # Rounding to steps q adds a variance of q^2 / 12.
-HOPELESS = ("too few samples", "constant signal", "operating point")
+HOPELESS = ("too few samples", "constant signal", "operating point", "sampled")
 
 
 def make_loop(loop: Any, record: Record) -> Loop:

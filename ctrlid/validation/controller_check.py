@@ -22,6 +22,7 @@ from ..loop.controller_replay import (
 )
 from ..loop.controllers import PID
 from ..loop.loop import Loop
+from ..loop.sampled_form import describe_sampled_form, find_sampled_form
 from .controller_changes import DETERMINED, FEWEST, TRIAL, list_changes
 from .residual_tests import compute_explained_share
 from .signal_defects import find_grid_step
@@ -49,7 +50,7 @@ BEGINNING = 1000
 # A remainder of no known kind below this share of u's variance steers no simulation.
 IMMATERIAL = 0.01
 # Kinds of finding after which the stated law is not that of the record.
-REJECTED = ("gain", "sign", "delay", "limit", "filter", "unknown")
+REJECTED = ("gain", "sign", "delay", "limit", "filter", "sampled", "unknown")
 # What may be wrong with a stated law; a constant that is added to it leaves it standing.
 FAULTS = (*REJECTED, "bias")
 
@@ -62,6 +63,7 @@ def check_controller(loop: Loop, record: Record) -> list[Fact]:
 
     Of an analog controller, the log has r and y at the samples only. What it leaves of u is no more
     than the log resolves where it is less than what another run of y between the samples would do.
+    Where a sampled form of it computes u down to rounding, it was no analog one.
 
     Parameters
     ----------
@@ -86,6 +88,10 @@ def check_controller(loop: Loop, record: Record) -> list[Fact]:
     part = record[first : first + MOST]
     resolution, sample = 0.0, None
     if law.dt == 0.0:
+        form = find_sampled_form(loop.controller, part)
+        if form is not None:
+            text = describe_sampled_form(form, part, "the loop")
+            return [("sampled", text, form.analog, True)]
         sampled = _sample_analog_law(loop, part)
         if sampled is None:
             return []

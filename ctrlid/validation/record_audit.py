@@ -53,7 +53,8 @@ class AuditFinding(Printed):
         ``"drift"``, ``"offset"``, ``"too little excitation"``, ``"constant signal"``,
         ``"too few samples"``, ``"between samples"``, ``"controller"`` or ``"operating point"``;
         where the stated controller does not compute the logged u, what is wrong with it:
-        ``"gain"``, ``"sign"``, ``"bias"``, ``"delay"``, ``"limit"``, ``"filter"`` or ``"unknown"``.
+        ``"gain"``, ``"sign"``, ``"bias"``, ``"delay"``, ``"limit"``, ``"filter"``, ``"sampled"``
+        (it is stated as analog, and was sampled) or ``"unknown"``.
     channel : str
         ``"r"``, ``"u"`` or ``"y"``, or the name of one of several signals; empty where it concerns
         the whole record.
@@ -139,7 +140,8 @@ def audit(record: Record, loop: Loop | None = None) -> Audit:
         The loop it comes from. If it has a controller and r was logged, it is also checked
         whether the logged u is what this controller computes, and if not, why: another gain, sign,
         constant, limit or filter, or a sample of delay. Of an analog controller only linear ones
-        are checked, as far as the samples tell how y runs between them.
+        are checked, as far as the samples tell how y runs between them, and whether u is that of
+        a sampled one.
 
     Returns
     -------

@@ -24,6 +24,7 @@ from ...data.several_records import (
 )
 from ...loop.loop import Loop
 from ...loop.unit_check import note_unit_clashes
+from ...loop.sampled_form import note_sampled_controller
 from ..whiteness import note_coloured_innovations
 from .filter_data import find_noise_units
 from .likelihood import Fit, find_priors, list_effect_bounds, make_problem
@@ -143,6 +144,7 @@ def fit_loop(
     colour = note_coloured_innovations(innovations, len(fit.theta), _TOO_NARROW)
     notes = (
         *note_unit_clashes(loop, fit.problem.data[0].record),
+        *note_sampled_controller(loop.controller, given, "the loop"),
         *left_out,
         *fitted.estimate.notes,
         *colour,

@@ -17,6 +17,7 @@ from ..._base.text import write_list, write_number, write_p_value, write_quantit
 from ...data.record import Record
 from ...data.several_records import VISIBLE_MOTION, as_records, measure_input_motion
 from ...loop.controllers import PID
+from ...loop.sampled_form import note_sampled_controller
 from ...physics.conversions import to_state_matrices
 from ..constraints import AbstractConstraint, check_constraints, divide_constraints
 from ..identified_model import Estimate, IdentifiedModel, Structure
@@ -158,6 +159,7 @@ def fit_continuous(
         notes = (_NOT_CONVERGED, *notes)
     if delay == 0 and not circuit and task.hold == "zoh" and beyond_rounding:
         notes = (*notes, *_note_missed_delay(best, known))
+    notes = (*note_sampled_controller(controller, records, "fit_continuous"), *notes)
     late = f", delay {point.delay:.6g} s" if task.free_delay else ""
     if best.task.colour:
         late += f", sensor noise a moving average of order {best.task.colour}"
