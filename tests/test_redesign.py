@@ -122,6 +122,37 @@ def test_a_step_from_zero_leaves_the_input_far_from_its_limits(scale):
     assert "to move the input by 10 %" in str(trial)
 
 
+# --- kinks at rest
+
+
+def test_with_dry_friction_a_larger_step_is_advised_and_the_verdict_is_that_of_the_table():
+    plant = ct.tf([2.0], [1.0, 0.5, -9.0], inputs="u", outputs="y")
+    bare = cid.Loop(plant, None, dt=0.01)
+    rubbing = bare.with_effect(cid.effects.CoulombFriction(fc=0.02))
+    given = {"crossover": 8, "phase_margin": 45}
+    found = {h: cid.redesign(plant, rubbing, **given, step=h) for h in (0.1, 0.01, 0.001)}
+    off = [abs(f.achieved.final_value - f.promised.final_value) for f in found.values()]
+    assert off == sorted(off)
+    for one in found.values():
+        assert "CoulombFriction counts for more the smaller the step is" in str(one)
+        assert "With a smaller step=" not in str(one)
+    assert "the promise holds" in found[0.1].verdict
+    assert "the promise holds" not in found[0.001].verdict
+    assert (
+        "the margins hold within 1 %. THE RESPONSE TO A STEP of 0.001 ends at"
+        in found[0.001].verdict
+    )
+    smooth = str(cid.redesign(plant, bare, **given))
+    assert "With a smaller step= they are closer to the promised values, unless" in smooth
+
+
+def test_a_trial_advises_a_larger_step_with_dry_friction():
+    plant = ct.tf([2.0], [1.0, 0.5, -9.0], inputs="u", outputs="y")
+    loop = cid.Loop(plant, None, dt=0.01).with_effect(cid.effects.InputDeadZone(width=0.01))
+    lead = cid.design_lead(plant, 8, 45)
+    assert "InputDeadZone counts for more" in str(cid.redesign(plant, loop, design=lambda P: lead))
+
+
 # --- wrong models
 
 

@@ -14,6 +14,14 @@ from .._base.arguments import is_number
 from .._base.arrays import Array, ComplexArray, freeze_arrays
 from .._base.errors import CtrlidError, ModelCannotRun
 from .._base.text import Printed, write_count, write_list, write_number, write_quantity
+from ..effects import (
+    AsymmetricCoulombFriction,
+    CoulombFriction,
+    InputBacklash,
+    InputDeadZone,
+    Quantization,
+    StribeckFriction,
+)
 from ..loop.controllers import PID
 from ..loop.loop import Loop
 from ..loop.simulation import SimulationStopped, simulate
@@ -36,6 +44,11 @@ NOTHING = 1e-9
 # A step response lasts so many time constants of the slowest promised pole.
 LASTING = 8.0
 LONGEST = 20_000
+# These have a kink at rest, of which the smallest signals see most.
+KINKS = (
+    AsymmetricCoulombFriction, CoulombFriction, InputBacklash, InputDeadZone, Quantization,
+    StribeckFriction,
+)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -281,8 +294,8 @@ class ControllerTrial(Printed):
         head = f"controller: {type(self.controller).__name__}, {kind}"
         heights = [f"{s.reference} by {write_number(s.height, 3)}" for s in self.steps]
         tried = (
-            f"  Achieved steps ({', '.join(heights)}) are those of the nonlinear physics. With a "
-            "smaller step= they are closer to the promised ones." if heights else
+            f"  Achieved steps ({', '.join(heights)}) are those of the nonlinear physics. "
+            f"{advise_step(self.loop)}" if heights else
             "  The controller has no reference to step."
         )  # fmt: skip
         reasons = [f"  {text}" for text in dict.fromkeys(s.reason for s in self.steps) if text]
@@ -291,6 +304,27 @@ class ControllerTrial(Printed):
         ] if len(self.promised.margins) > 1 and np.isnan(self.promised.disk_margin) and (
             self.promised.growth_rate < 0) else []  # fmt: skip
         return "\n".join([head, *lines, *table, *lacking, tried, *reasons, "  " + self.verdict])
+
+
+def advise_step(loop: Loop) -> str:
+    """Return which height of a step brings the physics of a loop closer to the promised values.
+
+    What is smooth is linear for small signals. Of a kink at rest, such as dry friction, the
+    smallest signals see most.
+    """
+    kinks = [
+        name for name, e in loop.labelled.items() if not e.neutral and isinstance(e, KINKS)
+    ]  # fmt: skip
+    if kinks:
+        return (
+            f"{write_list(kinks)} {'counts' if len(kinks) == 1 else 'count'} for more the smaller "
+            "the step is, and the promise leaves that out: with a larger step= they are closer to "
+            "the promised values, as far as the input and the range of the plant allow."
+        )
+    return (
+        "With a smaller step= they are closer to the promised values, unless the equations of the "
+        "plant have a kink at rest, such as dry friction."
+    )
 
 
 def _write(value: float, form: str) -> str:

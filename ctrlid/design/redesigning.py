@@ -22,7 +22,7 @@ from ..loop.period_map import compute_growth_rate
 from ..loop.simulation import SimulationStopped, simulate
 from ..physics.conversions import sample_held, to_transfer_function
 from ..physics.trace import timebase
-from .controller_trial import ControllerTrial, try_design
+from .controller_trial import ControllerTrial, advise_step, try_design
 from .lead import design_lead
 from .margins import loop_margins, nu_gap, robust_margin
 from .step_height import choose_height
@@ -135,14 +135,19 @@ class Redesign(Printed):
                 f"{a.crossover:.4g} rad/s")  # fmt: skip
         loss = p.phase_margin - a.phase_margin
         shift = a.crossover / p.crossover - 1
+        apart = a.final_value / p.final_value - 1 if p.final_value else 0.0
+        # An unstable loop has no final value.
+        apart = abs(apart) if np.isfinite(apart) else 0.0
         if loss > CLOSE * p.phase_margin:
             text += f": {loss:.1f} DEGREES OF PHASE MARGIN ARE LOST."
         elif abs(shift) > CLOSE:
             side = "LOWER" if shift < 0 else "HIGHER"
             text += f": THE CROSSOVER IS {side} BY {100 * abs(shift):.0f} %."
         else:
-            worst = max(loss / p.phase_margin, abs(shift))
-            text += f", so the promise holds within {max(math.ceil(100 * worst), 1)} %."
+            worst, which = max(loss / p.phase_margin, abs(shift)), "the margins hold"
+            if apart <= CLOSE:
+                worst, which = max(worst, apart), "the promise holds"
+            text += f", so {which} within {max(math.ceil(100 * worst), 1)} %."
         if not a.stable:
             text += (f" This is for small signals: WITH A STEP OF {self.step:.3g} THE LOOP "
                      f"DIVERGES. {self.failure} Where such a step is beyond the range "
@@ -151,6 +156,9 @@ class Redesign(Printed):
             text += (f" This is for small signals: WITH A STEP OF {self.step:.3g} THE RESPONSE "
                      "DOES NOT SETTLE, because the input saturates, the step leaves the linear "
                      "range, or dry friction holds it.")  # fmt: skip
+        elif apart > CLOSE:
+            text += (f" THE RESPONSE TO A STEP of {self.step:.3g} ends at {a.final_value:.3g} per "
+                     f"unit, where {p.final_value:.3g} is promised.")  # fmt: skip
         sure = self.nu_gap < self.robust_margin
         return (
             f"{text} Stability near the operating point is {'' if sure else 'not '}guaranteed: "
@@ -189,8 +197,8 @@ class Redesign(Printed):
         unit = loop.known_units.get(loop.equations().outputs[0], "")
         step = (
             "  The last three values achieved are for a step of "
-            f"{write_quantity(self.step, unit)} on the nonlinear physics. With a smaller step= "
-            "they are closer to the promised values." + f" {self.step_reason}".rstrip()
+            f"{write_quantity(self.step, unit)} on the nonlinear physics. {advise_step(loop)}"
+            + f" {self.step_reason}".rstrip()
         )
         return "\n".join([f"controller: ({num}) / ({den})", *rows, step, "  " + self.verdict])
 
