@@ -90,6 +90,17 @@ def test_sizes_are_in_the_unit_of_what_works_there():
     for effect, text, loop in units.values():
         assert effect.text(loop).endswith(text)
     placed = E.CoulombFriction(fc=0.2, at="x_dot")
+    # A plant of your own has its units from the loop; a position without one is no reason to err.
+    plant = ct.nlsys(lambda t, x, u, p: [x[2], x[3], u[0], u[1]], lambda t, x, u, p: x[:2],
+                     inputs=["F", "Q"], outputs=["x1", "x2"], states=["x1", "x2", "v1", "v2"],
+                     name="own")  # fmt: skip
+    own = {"forces": {"v1": "F", "v2": "Q"}, "dt": 0.01}
+    known = cid.Loop(plant, units={"F": "N", "x1": "m"}, **own)
+    assert E.CoulombFriction(fc=0.8, at="v1").text(known).endswith("fc = 0.8 N")
+    assert E.ViscousFriction(c=0.8, at="v1").text(known).endswith("c = 0.8 N s/m")
+    half = cid.Loop(plant, units={"F": "N"}, **own)
+    assert E.CoulombFriction(fc=0.8, at="v1").text(half).endswith("fc = 0.8 N")
+    assert E.ViscousFriction(c=0.8, at="v1").text(half).endswith("c = 0.8 N s/[y]")
     assert str(placed).startswith("CoulombFriction at x_dot: fc = 0.2")
 
 

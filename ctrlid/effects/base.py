@@ -205,13 +205,12 @@ class AbstractEffect:
     def _find_force_units(self, e: Equations, known: Mapping[str, str]) -> dict[str, str]:
         """Return the units of a force at a velocity: an acceleration, or that of its input."""
         found = find_motion(e, self.at)
-        position = "" if found is None else known.get(e.states[found[0]], "")
-        units = {p.name: fill_unit(p.unit, {"y": position} if position else {})
-                 for p in self.parameters()}  # fmt: skip
+        position = "[y]" if found is None else known.get(e.states[found[0]], "") or "[y]"
+        units = {p.name: fill_unit(p.unit, {"y": position}) for p in self.parameters()}
         force = ""
         if found is not None and e.push_units:
             force = e.push_units[e.velocities.index(found[1])]
-        if not (force and position):
+        if not force:
             return units
         # Of accelerations and what is counted per velocity or position, these are the forces.
         forces = {f"{position}/s^2": force, "1/s": f"{force} s/{position}",

@@ -176,7 +176,9 @@ class Loop:
         driven = (self.driven,) if isinstance(self.driven, str) else tuple(self.driven)
         object.__setattr__(self, "driven", driven)
         names = whole.inputs
-        units = dict(getattr(self.plant, "units", {}))
+        # What is no mapping of names is refused once the plant is known.
+        stated = self.units if isinstance(self.units, Mapping) else {}
+        units = {**getattr(self.plant, "units", {}), **stated}
         forces = self.forces
         mechanism = getattr(self.plant, "mechanism", None)
         if mechanism is not None and not whole.siso:
