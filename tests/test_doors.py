@@ -5,6 +5,7 @@ wrong, or crashed; damaged files.
 """
 
 import copy
+import inspect
 import json
 import random
 from dataclasses import replace
@@ -395,3 +396,34 @@ def test_damaged_bytes_give_a_record_or_a_refusal(tmp_path):
         except CtrlidError:
             refused += 1
     assert 20 < refused < 200
+
+
+# --- names of arguments
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda: cid.fit_continuous(None, na=2, nb=2), "fit_continuous has no na=; it takes"),
+        (lambda: cid.operating_point(None, out=0), r"no out=; did you mean output=\?"),
+        (lambda: cid.operating_point(None, 0.0), "takes plant without names, and output=, guess="),
+        (lambda: cid.simulate(None, noise=0.1), "did you mean sensor_noise= or force_noise="),
+        (lambda: cid.fit_arx(None, 2, na=2, nb=2), "is given na twice"),
+        (lambda: cid.fit_iv(), "fit_iv needs record=, na= and nb=; it takes record, na, nb, nk"),
+        (lambda: cid.Record(u=[0, 1], y=[0, 1]), "a Record needs dt=; given are u= and y="),
+        (lambda: E.CoulombFriction(f=0.1), r"CoulombFriction has no f=; did you mean fc=\?"),
+    ],
+)
+def test_a_wrong_name_of_an_argument_is_answered_with_the_right_ones(call, words):
+    with pytest.raises(cid.CtrlidError, match=words):
+        call()
+
+
+def test_every_public_function_knows_its_arguments():
+    functions = [f for name in cid.__all__ if inspect.isfunction(f := getattr(cid, name))]
+    assert len(functions) > 25
+    for function in functions:
+        with pytest.raises(cid.CtrlidError, match="has no nonsense="):
+            function(nonsense=1)
+    # Help shows what each takes all the same.
+    assert list(inspect.signature(E.CoulombFriction).parameters) == ["fc", "at"]

@@ -6,15 +6,18 @@ import os
 import sys
 import types
 import typing
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from numbers import Complex, Integral, Real
 from pathlib import Path
-from typing import Any, Literal, TypeVar, get_args, get_origin
+from typing import Any, Literal, ParamSpec, TypeVar, get_args, get_origin
 
 import numpy as np
 
 from .errors import CtrlidError
-from .text import find_near_name
+from .text import find_near_name, write_count, write_list
+
+Given = ParamSpec("Given")
+Answer = TypeVar("Answer")
 
 NUMBERS = {
     float: "a number", int: "a whole number", complex: "a real or complex number",
@@ -56,6 +59,69 @@ def check_arguments(function: Callable[..., Any], given: Mapping[str, Any], *own
     for name, kind in _find_kinds(function).items():
         if name not in own:
             _check_kind(function.__name__, name, given[name], kind)
+
+
+def explain_names(function: Callable[Given, Answer]) -> Callable[Given, Answer]:
+    """Refuse a call of a public function with unknown or missing arguments in words.
+
+    Python's own TypeError names one wrong argument and none that there are.
+
+    Examples
+    --------
+    >>> @explain_names
+    ... def keep(samples, *, name=""):
+    ...     return samples
+    >>> keep(samples=3)
+    3
+    >>> keep(3, names="x")
+    Traceback (most recent call last):
+    ...
+    ctrlid._base.errors.CtrlidError: keep has no names=; did you mean name=?
+    """
+    signature = inspect.signature(function)
+
+    @functools.wraps(function)
+    def handled(*args: Given.args, **kwargs: Given.kwargs) -> Answer:
+        try:
+            signature.bind(*args, **kwargs)
+        except TypeError:
+            raise CtrlidError(_describe_call(function, signature, args, kwargs)) from None
+        return function(*args, **kwargs)
+
+    return handled
+
+
+def _describe_call(
+    function: Any, signature: inspect.Signature, args: tuple[Any, ...], given: Mapping[str, Any]
+) -> str:
+    """Say what is wrong with the arguments of a call that the signature does not take."""
+    who, parameters = function.__name__, signature.parameters
+    fixed = [p for p in parameters.values() if p.kind is p.POSITIONAL_OR_KEYWORD]
+    for name in given:
+        if name not in parameters:
+            return _refuse_name(who, name, tuple(parameters), "takes")
+    if len(args) > len(fixed):
+        named = [f"{name}=" for name in list(parameters)[len(fixed) :]]
+        rest = f", and {', '.join(named)} by name" if named else ""
+        return (f"{who} takes {', '.join(p.name for p in fixed)} without names{rest}; given "
+                f"{write_count(len(args), 'value')} without a name")  # fmt: skip
+    twice = [p.name for p in fixed[: len(args)] if p.name in given]
+    if twice:
+        return f"{who} is given {twice[0]} twice, without its name and as {twice[0]}="
+    seen = {*given, *(p.name for p in fixed[: len(args)])}
+    missing = [p.name for p in parameters.values() if p.default is p.empty and p.name not in seen]
+    return f"{who} needs {write_list([f'{name}=' for name in missing])}; it takes " + ", ".join(
+        parameters
+    )
+
+
+def _refuse_name(who: str, name: str, known: Sequence[str], verb: str) -> str:
+    """Say that there is no such argument, with a near name or all of them."""
+    # A word of a name may be one of several names.
+    near = [one for one in known if name in one.split("_")] or [find_near_name(name, known) or ""]
+    meant = " or ".join(f"{one}=" for one in near if one)
+    hint = f"did you mean {meant}?" if meant else f"it {verb} {', '.join(known)}"
+    return f"{who} has no {name}=; {hint}"
 
 
 def is_number(value: Any) -> bool:
@@ -106,18 +172,43 @@ def check_field_names(cls: Any, given: Iterable[str]) -> None:
     CtrlidError
         At the first that it does not have, with a near name.
     """
-    known = [name for name, field in cls.__dataclass_fields__.items() if field.init]
+    known = _find_fields(cls)
     for name in given:
         if name not in known:
-            near = find_near_name(name, known)
-            hint = f"did you mean {near}=?" if near else f"it has {', '.join(known)}"
-            raise CtrlidError(f"a {cls.__name__} has no {name}=; {hint}")
+            raise CtrlidError(_refuse_name(f"a {cls.__name__}", name, tuple(known), "has"))
+
+
+def check_needed_fields(cls: Any, given: Collection[str]) -> None:
+    """Refuse a dataclass with named fields only of which some are missing; see `check_field_names`.
+
+    Where none is given it is copied or unpickled.
+    """
+    missing = [name for name, needed in _find_fields(cls).items() if needed and name not in given]
+    if given and missing:
+        raise CtrlidError(
+            f"a {cls.__name__} needs {write_list([f'{name}=' for name in missing])}; given are "
+            f"{write_list([f'{name}=' for name in given])}"
+        )
+
+
+@functools.cache
+def _find_fields(cls: Any) -> dict[str, bool]:
+    """Return the arguments of a constructor, and whether each has to be given."""
+    own = list(inspect.signature(cls.__init__).parameters.values())[1:]
+    return {p.name: p.default is p.empty for p in own}
 
 
 def show_fields(cls: Any) -> None:
     """Let help show the fields of a dataclass, not the arguments of the check of their names."""
-    own = inspect.signature(cls.__init__)
-    cls.__signature__ = own.replace(parameters=list(own.parameters.values())[1:])
+    cls.__signature__ = ShownFields().__get__(None, cls)
+
+
+class ShownFields:
+    """The signature of each subclass of a dataclass: its own fields, as `show_fields` has them."""
+
+    def __get__(self, instance: Any, cls: Any) -> inspect.Signature:
+        own = inspect.signature(cls.__init__)
+        return own.replace(parameters=list(own.parameters.values())[1:])
 
 
 def _check_kind(who: str, name: str, value: Any, kind: Any) -> None:

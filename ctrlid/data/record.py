@@ -11,7 +11,12 @@ from typing import Any, Literal, Self, get_args
 import numpy as np
 from scipy import signal
 
-from .._base.arguments import check_arguments, check_field_names, show_fields
+from .._base.arguments import (
+    check_arguments,
+    check_field_names,
+    check_needed_fields,
+    show_fields,
+)
 from .._base.errors import CtrlidError
 from .._base.signals import list_signals, require_one_signal
 from .._base.text import Printed, list_known, write_count, write_percent
@@ -107,6 +112,7 @@ class Record(Printed):
         if "t" in fields:
             raise CtrlidError(_write_no_instants(fields["t"]))
         check_field_names(cls, fields)
+        check_needed_fields(cls, fields)
         return super().__new__(cls)
 
     def __post_init__(self) -> None:

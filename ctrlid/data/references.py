@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from .._base.arguments import is_number
+from .._base.arguments import explain_names, is_number
 from .._base.arrays import Array, to_real_array
 from .._base.errors import CtrlidError
 
@@ -39,6 +39,7 @@ _TAPS = {
 MOST = 10**8
 
 
+@explain_names
 def random_binary(
     n: int, *, amplitude: float, hold: int = 1, around: float = 0.0, seed: int | None = None
 ) -> Array:
@@ -89,6 +90,7 @@ def random_binary(
     return np.asarray(np.repeat(levels, min(hold, n))[:n], dtype=float)
 
 
+@explain_names
 def staircase(n: int, *, levels: Sequence[float] | npt.ArrayLike, hold: int) -> Array:
     """Return a staircase: each level for `hold` samples, over and over.
 
@@ -127,6 +129,7 @@ def staircase(n: int, *, levels: Sequence[float] | npt.ArrayLike, hold: int) -> 
     return np.asarray(values[(np.arange(n) // hold) % len(values)], dtype=float)
 
 
+@explain_names
 def multisine(
     n: int,
     *,
@@ -224,6 +227,7 @@ def multisine(
     return around + wave[np.arange(n) % period]
 
 
+@explain_names
 def prbs(
     n: int, *, amplitude: float, order: int, hold: int = 1, around: float = 0.0, seed: int = 1
 ) -> Array:

@@ -10,7 +10,7 @@ from typing import Any
 import control as ct
 import numpy as np
 
-from .._base.arguments import is_number
+from .._base.arguments import explain_names, is_number
 from .._base.errors import CtrlidError, CtrlidWarning
 from .._base.rounding import keep_numpy_quiet
 from .margins import find_gain_crossovers, modulus_margin
@@ -94,6 +94,7 @@ class _Task:
         )
 
 
+@explain_names
 @keep_numpy_quiet
 def design_lead(P: Any, crossover: float, phase_margin: float) -> Any:
     r"""Design a lead compensator with exactly this gain crossover and phase margin.
@@ -181,7 +182,7 @@ def design_lead(P: Any, crossover: float, phase_margin: float) -> Any:
     if phase_margin < math.pi / 2:
         warnings.warn(
             f"phase_margin is {phase_margin:g} degrees, which is almost none; if it was meant in "
-            f"radians, give {math.degrees(phase_margin):.3g}", CtrlidWarning, stacklevel=3,
+            f"radians, give {math.degrees(phase_margin):.3g}", CtrlidWarning, stacklevel=4,
         )  # fmt: skip
     _check_plant(plant, crossover)
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from .._base.arguments import explain_names
 from .._base.arrays import Array, ComplexArray
 from .._base.rounding import keep_numpy_quiet
 from .._base.text import Printed
@@ -78,6 +79,7 @@ class Margins(Printed):
 UNSTABLE = Margins(False, *(math.nan,) * 6)
 
 
+@explain_names
 @keep_numpy_quiet
 def loop_margins(L: Any) -> Margins:
     r"""Return the margins of the loop with negative feedback around L.
@@ -210,6 +212,7 @@ def _make_grid(loop: Rational, *candidates: Array) -> Array:
     return make_frequency_grid(loop.dt, [loop.num, loop.den, total], candidates)
 
 
+@explain_names
 @keep_numpy_quiet
 def nu_gap(P1: Any, P2: Any) -> float:
     r"""Return Vinnicombe's nu-gap between two plants.
@@ -280,6 +283,7 @@ def nu_gap(P1: Any, P2: Any) -> float:
     return min(1.0, -find_smallest(closeness, grid, (0.0, first.nyquist))[1])
 
 
+@explain_names
 @keep_numpy_quiet
 def robust_margin(P: Any, C: Any) -> float:
     r"""Return the robust stability margin b of a loop, the largest nu-gap it is sure to survive.

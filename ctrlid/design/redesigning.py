@@ -9,7 +9,7 @@ from typing import Any, overload
 import control as ct
 import numpy as np
 
-from .._base.arguments import check_arguments
+from .._base.arguments import check_arguments, explain_names
 from .._base.arrays import Array, freeze_arrays
 from .._base.errors import CtrlidError, ModelCannotRun
 from .._base.rounding import keep_numpy_quiet
@@ -212,6 +212,7 @@ def redesign(
     G: Any, loop: Loop, *, design: Callable[[Any], Any],
     step: float | Mapping[str, float] | None = None,
 ) -> ControllerTrial: ...  # fmt: skip
+@explain_names
 @keep_numpy_quiet
 def redesign(
     G: Any, loop: Loop, crossover: float | None = None, phase_margin: float | None = None, *,

@@ -8,7 +8,7 @@ from typing import Any, get_args
 
 import numpy as np
 
-from .._base.arguments import check_arguments, check_fields
+from .._base.arguments import check_arguments, check_fields, explain_names
 from .._base.errors import CtrlidError
 from ..effects import AbstractEffect
 from ..loop.loop import Loop
@@ -28,6 +28,7 @@ from .result import Diagnosis
 from .saving import FORMAT, SavedLoop, read_numbers
 
 
+@explain_names
 def load_diagnosis(path: str | Path, loop: Loop | None = None) -> Diagnosis:
     """Read a diagnosis that `Diagnosis.save` wrote.
 

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from .._base.arguments import explain_names
 from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from .._base.interruption import Budget, Stopped, check_seconds, hold_interrupt
 from .._base.jobs import check_jobs, share_out
@@ -95,6 +96,7 @@ class Question:
             return otherwise
 
 
+@explain_names
 @hold_interrupt()
 @keep_numpy_quiet
 def diagnose(

@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Literal, Self
 
 import casadi
 
-from .._base.arguments import check_fields, is_number
+from .._base.arguments import ShownFields, check_field_names, check_fields, is_number
 from .._base.errors import CtrlidError, EffectDoesNotApply
 from ..physics.equations import Equations
 from ..physics.linearization import OperatingPoint
@@ -64,6 +64,15 @@ class AbstractEffect:
     doubt_of_several: ClassVar[str | None] = None
     # This names the parameter that is a force which is always there; empty if there is none.
     constant_force: ClassVar[str] = ""
+
+    # Help shows the fields of each effect.
+    __signature__ = ShownFields()
+
+    def __new__(cls, *args: Any, **fields: Any) -> Self:
+        """Refuse unknown fields in words, before the generated constructor does so curtly."""
+        del args
+        check_field_names(cls, fields)
+        return super().__new__(cls)
 
     def __post_init__(self) -> None:
         kind = type(self).__name__

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import t as student_t
 
-from .._base.arguments import check_arguments
+from .._base.arguments import check_arguments, explain_names
 from .._base.arrays import Array, freeze_arrays, to_real_array
 from .._base.errors import CtrlidError
 from .._base.rounding import keep_numpy_quiet
@@ -62,6 +62,7 @@ class ResponseBand(Printed):
         return "\n".join(rows)
 
 
+@explain_names
 @keep_numpy_quiet
 def response_band(model: IdentifiedModel, omega: Any, level: float = 0.95) -> ResponseBand:
     r"""Return the confidence band of a fitted model's frequency response.

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from .._base import text as _text
-from .._base.arguments import check_arguments, is_iterable
+from .._base.arguments import check_arguments, explain_names, is_iterable
 from .._base.arrays import Array, freeze_arrays
 from .._base.errors import CtrlidError
 from .._base.jobs import check_jobs, share_out
@@ -166,6 +166,7 @@ def _write_trend(line: PoleTrend, unit: str) -> str:
     return text + "."
 
 
+@explain_names
 def fit_each(
     fit: Callable[..., IdentifiedModel],
     records: Iterable[Record],

@@ -9,7 +9,7 @@ import control as ct
 import numpy as np
 from scipy import linalg
 
-from .._base.arguments import check_arguments
+from .._base.arguments import check_arguments, explain_names
 from .._base.arrays import Array
 from .._base.errors import CtrlidError, ModelCannotRun
 from .._base.periods import have_same_period, write_both_periods, write_difference
@@ -104,6 +104,7 @@ def run_controller(loop: Loop, y: Array, r: Array | None = None) -> Array:
     return _run(run, rest)
 
 
+@explain_names
 @keep_numpy_quiet
 def replay_controller(loop: Loop, record: Record) -> Array:
     """Return the input that the controller of a loop computes from a record's own r and y.

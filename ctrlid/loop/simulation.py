@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from .._base.arguments import check_arguments
+from .._base.arguments import check_arguments, explain_names
 from .._base.arrays import Array, to_real_array
 from .._base.errors import CtrlidError, CtrlidWarning, ModelCannotRun
 from .._base.rounding import keep_numpy_quiet
@@ -45,6 +45,7 @@ class SimulationStopped(ModelCannotRun):
     unstable: bool = False
 
 
+@explain_names
 @keep_numpy_quiet
 def simulate(
     loop: Loop,
@@ -388,7 +389,7 @@ class Simulator:
                 f"near t = {where * loop.dt:.4g} s the simulation has an error of about "
                 f"{worst:.0e} of the signals: the plant or the controller changes too fast for "
                 f"{MOST_SUBSTEPS} steps in {loop.dt:g} s; simulate with a smaller dt",
-                CtrlidWarning, stacklevel=4,
+                CtrlidWarning, stacklevel=5,
             )  # fmt: skip
         return _drop_single_row(y), _drop_single_row(u)
 

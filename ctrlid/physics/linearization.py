@@ -9,7 +9,7 @@ import control as ct
 import numpy as np
 from scipy import linalg
 
-from .._base.arguments import check_arguments, is_number
+from .._base.arguments import check_arguments, explain_names, is_number
 from .._base.arrays import Array, to_real_array
 from .._base.errors import CtrlidError, ModelCannotRun
 from .._base.rounding import keep_numpy_quiet
@@ -137,6 +137,7 @@ def as_operating_point(at: Any, equations: Equations, inputs: Sequence[str]) -> 
     return at
 
 
+@explain_names
 @keep_numpy_quiet
 def operating_point(
     plant: Any, *, output: Any, guess: Sequence[float] | OperatingPoint | None = None
@@ -381,6 +382,7 @@ def _build_jacobians(e: Equations, spread: float) -> Any:
     return casadi.Function("jacobians", [e.t, e.x, e.u, e.p], parts)
 
 
+@explain_names
 @keep_numpy_quiet
 def linearize(plant: Any, at: OperatingPoint, *, states: bool = False) -> Any:
     r"""Return the linear model of a plant for small deviations from an operating point.

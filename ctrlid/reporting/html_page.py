@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from .._base.arguments import check_arguments, check_fields
+from .._base.arguments import check_arguments, check_fields, explain_names
 from .._base.errors import CtrlidError
 from .._base.files import replace_file
 from .._base.text import is_bad_news
@@ -111,6 +111,7 @@ class Section:
         return {"": self.figure}
 
 
+@explain_names
 def write_report(result: Any, path: str | Path, *, title: str = "") -> Path:
     """Write a result as one self-contained HTML page.
 

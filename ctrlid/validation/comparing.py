@@ -10,6 +10,7 @@ import control as ct
 import numpy as np
 from scipy import signal
 
+from .._base.arguments import explain_names
 from .._base.arrays import Array
 from .._base.errors import CtrlidError, CtrlidWarning, EffectDoesNotApply, ModelCannotRun
 from .._base.periods import have_same_period, write_both_periods, write_difference
@@ -51,6 +52,7 @@ Result = TypeVar("Result")
 MEANINGFUL = 1e-6
 
 
+@explain_names
 @keep_numpy_quiet
 def compare(record: Record, model_or_loop: Any, *, horizon: int | None = None) -> Comparison:
     """Compare a record with a model or a loop.

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from scipy import linalg, stats
 
-from .._base.arguments import check_arguments
+from .._base.arguments import check_arguments, explain_names
 from .._base.arrays import Array, freeze_arrays
 from .._base.errors import CtrlidError
 from .._base.rounding import keep_numpy_quiet
@@ -75,6 +75,7 @@ class FeedbackCheck(Printed):
         return self.text
 
 
+@explain_names
 @keep_numpy_quiet
 def check_feedback(record: Record) -> FeedbackCheck:
     r"""Check whether u was computed from y, from the record alone.

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy import linalg, stats
 
-from .._base.arguments import check_arguments
+from .._base.arguments import check_arguments, explain_names
 from .._base.arrays import Array, freeze_arrays
 from .._base.criterion import bayesian_penalty
 from .._base.errors import CtrlidError
@@ -108,6 +108,7 @@ class OrderChoice(Printed):
         return "\n".join([*lines, self.text])
 
 
+@explain_names
 @keep_numpy_quiet
 def select_order(
     record: Record,

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from .._base.arguments import explain_names
 from .._base.errors import CtrlidError
 from .._base.rounding import keep_numpy_quiet
 from .._base.text import Printed, write_count, write_percent
@@ -124,6 +125,7 @@ class Audit(Printed):
         return "\n".join([*rows, *(f"  {finding}" for finding in self.findings)])
 
 
+@explain_names
 @keep_numpy_quiet
 def audit(record: Record, loop: Loop | None = None) -> Audit:
     """Look a record over before any fit: limits, steps, repeats, gaps, spikes, drift, excitation.

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from .._base.arguments import check_arguments, is_iterable
+from .._base.arguments import check_arguments, explain_names, is_iterable
 from .._base.errors import CtrlidError, CtrlidWarning, ModelCannotRun
 from .._base.jobs import check_jobs, share_out
 from .._base.rounding import keep_numpy_quiet
@@ -31,6 +31,7 @@ FEWEST = 150
 AGREES = 0.1
 
 
+@explain_names
 @keep_numpy_quiet
 def sweep_sampling_period(
     record: Record,

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..._base.arguments import check_arguments
+from ..._base.arguments import check_arguments, explain_names
 from ..._base.arrays import Array
 from ..._base.errors import CtrlidError, ModelCannotRun
 from ..._base.interruption import hold_interrupt
@@ -45,6 +45,7 @@ UNSEEN = 1e-9
 CONTRADICTED = 3.0
 
 
+@explain_names
 @hold_interrupt()
 @keep_numpy_quiet
 def fit_loop(

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ..._base.arguments import is_number
+from ..._base.arguments import explain_names, is_number
 from ..._base.arrays import Array, freeze_arrays
 from ..._base.errors import CtrlidError, ModelCannotRun
 from ..._base.rounding import keep_numpy_quiet
@@ -103,6 +103,7 @@ class Prediction(Printed):
         return "\n".join([*rows, f"  standard deviation of the white force: {forces}"])
 
 
+@explain_names
 @keep_numpy_quiet
 def predict(loop: Loop, record: Record, noise_ratio: float | None = None) -> Prediction:
     r"""Predict each output sample of a record from the samples before it.

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from ..._base import text as _text
-from ..._base.arguments import check_arguments
+from ..._base.arguments import check_arguments, explain_names
 from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
 from ..._base.jobs import check_jobs
@@ -26,6 +26,7 @@ from ..whiteness import ENOUGH, note_coloured_innovations
 from .regression import Regression, build_arx_regression, from_differences, list_structures
 
 
+@explain_names
 @keep_numpy_quiet
 def fit_arx(
     record: Record | Iterable[Record],

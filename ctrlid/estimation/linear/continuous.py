@@ -9,7 +9,7 @@ import control as ct
 import numpy as np
 from scipy import stats
 
-from ..._base.arguments import check_arguments
+from ..._base.arguments import check_arguments, explain_names
 from ..._base.errors import CtrlidError, CtrlidWarning
 from ..._base.rounding import keep_numpy_quiet
 from ..._base.signals import require_one_signal
@@ -34,6 +34,7 @@ BEYOND = float(-np.log(np.finfo(float).eps))
 MISSED = 1e-3
 
 
+@explain_names
 @keep_numpy_quiet
 def fit_continuous(
     record: Record | Sequence[Record],
@@ -245,7 +246,7 @@ def _make_circuit(controller: Any, records: Sequence[Record]) -> Circuit | None:
                 "deviation from sample to sample, and a straight line is assumed between the "
                 "samples; give controller= (and record the reference) so that u can be "
                 "reconstructed, or sample faster",
-                CtrlidWarning, stacklevel=4,
+                CtrlidWarning, stacklevel=5,
             )  # fmt: skip
         return None
     if not isinstance(controller, ct.TransferFunction | ct.StateSpace) or (
@@ -263,7 +264,7 @@ def _make_circuit(controller: Any, records: Sequence[Record]) -> Circuit | None:
                 "the record has no reference, so a straight line is assumed for u between the "
                 "samples, but the fastest pole of the controller times dt is "
                 f"{records[0].dt * circuit.fastest:.2g}; record the reference or sample faster",
-                CtrlidWarning, stacklevel=4,
+                CtrlidWarning, stacklevel=5,
             )  # fmt: skip
         return None
     return circuit

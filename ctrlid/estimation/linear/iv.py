@@ -11,7 +11,7 @@ import numpy as np
 from scipy import stats
 
 from ..._base import text as _text
-from ..._base.arguments import check_arguments
+from ..._base.arguments import check_arguments, explain_names
 from ..._base.arrays import Array
 from ..._base.criterion import bayesian_penalty
 from ..._base.errors import CtrlidError, CtrlidWarning
@@ -53,6 +53,7 @@ _PATIENCE = 8
 _STARTS = 0.5 ** np.arange(1, 10)
 
 
+@explain_names
 @keep_numpy_quiet
 def fit_iv(
     record: Record | Sequence[Record],
@@ -207,7 +208,7 @@ def _fit_row(
     estimate = _make_estimate(task, fit, constrained=bool(known), dt=records[0].dt)
     _check_strength(estimate, names)
     if not fit.converged:
-        warnings.warn(_NOT_SETTLED, CtrlidWarning, stacklevel=4)
+        warnings.warn(_NOT_SETTLED, CtrlidWarning, stacklevel=5)
     return estimate
 
 
