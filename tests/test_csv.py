@@ -296,3 +296,18 @@ def test_rows_lost_at_a_regular_pace_are_not_taken_for_a_slower_clock(tmp_path, 
     slow = float(re.search(r"give dt=([\d.e-]+)", str(refusal.value))[1])
     record = clock(tmp_path, 1e-3 * kept, 3, dt=slow)
     assert (record.dt, len(record), record.valid.all()) == (slow, len(kept), True)
+
+
+def test_text_in_a_column_that_nobody_asked_for_does_no_harm(tmp_path):
+    text = "t,state,r,u,y,date\n0,IDLE,1,2,3,2026-01-01\n0.1,RUN,1,2,4,2026-01-01\n"
+    record = write(tmp_path, text)
+    assert record.y.tolist() == [3, 4]
+    with pytest.raises(CtrlidError, match="'IDLE' stands in line 2, column 'state'"):
+        write(tmp_path, text, extra="state")
+    with pytest.raises(CtrlidError, match="'IDLE' stands in line 2, column 'state'"):
+        write(tmp_path, text, y="state")
+    with pytest.raises(CtrlidError, match=r"time of day: '2026-01-01' .* column 'date'"):
+        write(tmp_path, text, time="date")
+    spoilt = text.replace("1,2,4", "1,off,4")
+    with pytest.raises(CtrlidError, match="'off' stands in line 3, column 'u'"):
+        write(tmp_path, spoilt, gaps="mask")

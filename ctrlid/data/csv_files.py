@@ -21,6 +21,8 @@ from .._base.units import is_same_unit
 TIME = ("t", "time", "timestamp", "seconds", "zeit")
 SECONDS = {"": 1.0, "s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6,
            "min": 60.0, "h": 3600.0}  # fmt: skip
+# The first cell of each column that is no number, by the place of the column, with its line.
+Texts = dict[int, tuple[str, int]]
 MARK = "# ctrlid "
 # The first line in which Excel is told the separator.
 SEPARATOR = "sep="
@@ -97,7 +99,7 @@ def read_csv(
     """Return the fields of a record; see `Record.from_csv`, `sources` are its r, u and y."""
     if not isinstance(gaps, str) or gaps not in ("error", "mask"):
         raise CtrlidError(f"gaps must be 'error' or 'mask'; given {gaps!r}")
-    own, header, table = _read_table(path)
+    own, header, table, texts = _read_table(path)
     if own.get("rows", len(table)) != len(table):
         raise CtrlidError(
             f"{path} is not whole: its line {MARK.strip()!r} says {own['rows']} rows, and it has "
@@ -144,13 +146,17 @@ def read_csv(
                  if k not in taken and label.partition(" ")[0] != "valid"]  # fmt: skip
         extra = extra if own else ()
     further = {names[k]: k for k in (place(c, "extra") for c in extra)}
-    valid = np.ones(len(table), dtype=bool)
-    if "valid" in names:
-        valid = table[:, place("valid", "valid")] > 0.5
+    counting = [place("valid", "valid")] if "valid" in names else []
     each = [f"valid {name}" for name in columns["y"]]
-    rows_valid = None
-    if len(each) > 1 and each[0] in names:
-        rows_valid = table[:, [place(label, "valid") for label in each]] > 0.5
+    counted = len(each) > 1 and each[0] in names
+    apart = [place(label, "valid") for label in each] if counted else []
+    needed = {*places.values(), *further.values(), *counting, *apart, clock}
+    # Text in a column that nobody asked for, such as the state of a machine, does no harm.
+    _refuse_text(path, {k: v for k, v in texts.items() if k in needed}, header)
+    valid = np.ones(len(table), dtype=bool)
+    if counting:
+        valid = table[:, counting[0]] > 0.5
+    rows_valid = table[:, apart] > 0.5 if apart else None
     table, valid = _fill_gaps(table, places, valid, gaps, path)
     start, rows = 0.0, None
     period_given = own.get("dt") if dt is None else dt
@@ -241,8 +247,8 @@ def _question_period(dt: float, stamps: Any, path: Path, label: str) -> None:
         )  # fmt: skip
 
 
-def _read_table(path: Path) -> tuple[dict[str, Any], list[str], Any]:
-    """Return the fields in ctrlid's own comment, the header cells and the values."""
+def _read_table(path: Path) -> tuple[dict[str, Any], list[str], Any, Texts]:
+    """Return the fields in ctrlid's own comment, the header cells, the values and the texts."""
     try:
         data = path.read_bytes()
     except OSError as reason:
@@ -293,14 +299,16 @@ def _read_table(path: Path) -> tuple[dict[str, Any], list[str], Any]:
     if separator != ",":
         # Where commas do not separate columns, they are decimal commas.
         body = body.replace(",", ".")
+    texts: Texts = {}
     try:
         table = np.loadtxt(io.StringIO(body), delimiter=separator, ndmin=2, quotechar='"')
     except ValueError:
-        table = _read_with_blanks(path, body, separator, text.count("\n", 0, stop))
+        table, texts = _read_with_blanks(path, body, separator, text.count("\n", 0, stop))
     if table.shape[1] != len(header):
+        _refuse_text(path, texts, ())
         raise CtrlidError(f"the header of {path} names {len(header)} columns, its rows have "
                           f"{table.shape[1]}; give every column a name")  # fmt: skip
-    return own, header, table
+    return own, header, table, texts
 
 
 def _decode(data: bytes) -> str:
@@ -316,35 +324,49 @@ def _decode(data: bytes) -> str:
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
-def _read_with_blanks(path: Path, body: str, separator: str, above: int) -> Any:
-    """Read a table with blank cells, which are NaN, below so many lines."""
-    rows = []
+def _read_with_blanks(path: Path, body: str, separator: str, above: int) -> tuple[Any, Texts]:
+    """Read a table with blank cells and cells of text, which are NaN, below so many lines.
+
+    The first text of each column is returned beside it.
+    """
+    rows, texts = [], Texts()
     for k, cells in enumerate(_read_cells(body, separator)):
         if not cells or cells[0].lstrip().startswith("#"):
             continue
         numbers = []
-        for cell in cells:
+        for column, cell in enumerate(cells):
             try:
                 numbers.append(float(cell) if cell.strip() else math.nan)
             except ValueError:
-                if CLOCK.match(cell.strip()):
-                    raise CtrlidError(
-                        f"{path} has a date or a time of day, {cell.strip()!r}, in line "
-                        f"{above + k + 1}; times are numbers, in seconds from any start. Convert "
-                        "them, for instance with pandas.to_datetime(column), or remove the column "
-                        "from the file and give dt=; a line above the header: delete it or start "
-                        "it with #"
-                    ) from None
-                raise CtrlidError(
-                    f"{path} is not a table of numbers: {cell.strip()!r} stands in line "
-                    f"{above + k + 1}. Remove it, or leave the cell blank and give gaps='mask'; "
-                    "lines above the header or a row of units: delete them or start them with #"
-                ) from None
+                texts.setdefault(column, (cell.strip(), above + k + 1))
+                numbers.append(math.nan)
         rows.append(numbers)
         if len(cells) != len(rows[0]):
+            # Above a ragged table stands what is no part of it.
+            _refuse_text(path, texts, ())
             raise CtrlidError(f"{path} is not a table of numbers: line {above + k + 1} has "
                               f"{len(cells)} cells, the lines above it {len(rows[0])}")  # fmt: skip
-    return np.array(rows)
+    return np.array(rows), texts
+
+
+def _refuse_text(path: Path, texts: Texts, header: Sequence[str]) -> None:
+    """Refuse the first text among columns of which numbers are needed; their names are optional."""
+    if not texts:
+        return
+    column, (cell, line) = min(texts.items(), key=lambda item: (item[1][1], item[0]))
+    where = f"{cell!r} stands in line {line}"
+    where += f", column {header[column]!r}" if header else ""
+    if CLOCK.match(cell):
+        raise CtrlidError(
+            f"{path} has a date or a time of day: {where}; times are numbers, in seconds from any "
+            "start. Convert them, for instance with pandas.to_datetime(column), or remove the "
+            "column from the file and give dt=; a line above the header: delete it or start it "
+            "with #"
+        )
+    raise CtrlidError(
+        f"{path} is not a table of numbers: {where}. Remove it, or leave the cell blank and give "
+        "gaps='mask'; lines above the header or a row of units: delete them or start them with #"
+    )
 
 
 def _fill_gaps(

@@ -503,7 +503,8 @@ class Record(Printed):
         """Read a record from a CSV file with a header line.
 
         Columns are separated by commas, semicolons or tabs; units are read from headers such as
-        ``u [V]``, ``u (V)`` or ``u/V``. A column called valid tells which samples count.
+        ``u [V]``, ``u (V)`` or ``u/V``. A column called valid tells which samples count. Columns
+        that are not asked for may hold text.
 
         Parameters
         ----------
