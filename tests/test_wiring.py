@@ -236,6 +236,20 @@ def test_other_parameters_reach_the_forces(change):
         np.testing.assert_array_equal(one.linearize().A, again.linearize().A)
 
 
+def test_a_gain_of_all_states_is_not_wired_to_references_and_outputs():
+    K = np.array([[1.0, 2.0, 3.0, 4.0]])
+    with pytest.raises(cid.CtrlidError, match=r"4 states \(x, theta, x_dot, theta_dot\) but 2 out"):
+        cid.Loop(CART, ct.ss([], [], [], -K, DT), dt=DT)
+    # With names it is what it says, and a controller with states has a reason for its inputs.
+    named = ct.ss([], [], [], -K, DT, inputs=["r_x", "r_theta", "x", "theta"])
+    assert "r_x <- reference r_x" in repr(cid.Loop(CART, named, dt=DT))
+    filtered = ct.ss(0.5, np.ones((1, 4)), 1, -K, DT)
+    loop = cid.Loop(CART, filtered, dt=DT)
+    assert "without names read the references and then the outputs" in repr(loop)
+    with pytest.raises(cid.CtrlidError, match=r"so that they read the references .* -K, dt, inp"):
+        cid.simulate(loop, np.zeros((2, 2000)), sensor_noise=1e-3)
+
+
 def pair(**options):
     return ct.ss([], [], [], [[1.0, 1.0]], DT, **options)
 

@@ -21,7 +21,7 @@ from .period_map import (
     linearize_at_rest,
     make_period_map,
 )
-from .wiring import stack_references
+from .wiring import STATE_FEEDBACK, stack_references
 
 # Steps are refined until their local error is below this share of each state's excursion.
 TOLERANCE = 1e-9
@@ -456,6 +456,20 @@ def _compute_known_growth(loop: Loop) -> float:
         return math.nan
 
 
+def _doubt_wiring(loop: Loop) -> str:
+    """Return what a controller reads whose several inputs have no names; empty for any other."""
+    wiring = loop.wiring
+    labels = [] if wiring is None else list(loop.controller.input_labels)
+    if wiring is None or labels != [f"u[{k}]" for k in range(len(labels))]:
+        return ""
+    pairs = len(labels) == len(loop.signals["y"])
+    read = "reference less output" if pairs else "the references and then the outputs"
+    return (
+        f". The {len(labels)} inputs of the controller have no names, so that they read {read}, in "
+        f"the order of the plant. {STATE_FEEDBACK}"
+    )
+
+
 def _explain_stop(
     loop: Loop, growth: float, at: int, inside: bool, ys: Array, us: Array, w: Array, pushed: bool,
     counts: Sequence[int],
@@ -481,7 +495,7 @@ def _explain_stop(
     if growth > 0:
         return (
             f"{text} The closed loop is unstable: small deviations grow at {growth:.3g} 1/s. Check "
-            "the sign and the gain of the controller and the operating point"
+            f"the sign and the gain of the controller and the operating point{_doubt_wiring(loop)}"
         )
     if np.any(recent <= lower) or np.any(recent >= upper):
         text += f" {inp} was at its limit ({lower:g} to {upper:g}) shortly before."

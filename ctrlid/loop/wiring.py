@@ -23,6 +23,11 @@ from .controllers import PID, ControlLaw, require_proper
 STEPS = 120
 # A step is so many times as long as the one before it.
 GROWTH = 1.3
+STATE_FEEDBACK = (
+    "State feedback reads states that are outputs of the plant, under their names, "
+    "ct.ss([], [], [], -K, dt, inputs=[...]), or an observer's, "
+    "ct.create_statefbk_iosystem(P, K, estimator=...)"
+)
 # A residual below this share of the largest signal is rounding.
 AT_REST = 1e-9
 
@@ -119,7 +124,9 @@ def make_wiring(controller: Any, plant: Equations, at: OperatingPoint) -> Wiring
             "PIDs are put together with ct.append or ct.interconnect"
         )
     names = list(controller.input_labels)
-    if names == [f"u[{k}]" for k in range(len(names))]:
+    nameless = names == [f"u[{k}]" for k in range(len(names))]
+    if nameless:
+        _refuse_state_feedback(controller, plant)
         inputs, open_names = _wire_by_position(len(names), plant)
     else:
         inputs, open_names = _wire_by_name(names, plant)
@@ -134,6 +141,8 @@ def make_wiring(controller: Any, plant: Equations, at: OperatingPoint) -> Wiring
             f"({', '.join(plant.outputs)}): give its inputs these names, or y[0], y[1], ..., or "
             f"leave the names u[0], u[1], ... for {len(plant.outputs)} inputs r - y"
         )
+    if nameless and len(names) != len(plant.outputs):
+        lines.append("(inputs without names read the references and then the outputs)")
     outputs = list(controller.output_labels)
     if set(plant.inputs) <= set(outputs):
         drives = [outputs.index(name) for name in plant.inputs]
@@ -147,6 +156,24 @@ def make_wiring(controller: Any, plant: Equations, at: OperatingPoint) -> Wiring
     lines += [f"{name} <- {outputs[k]} of the controller"
               for name, k in zip(plant.inputs, drives, strict=True)]  # fmt: skip
     return Wiring(tuple(inputs), tuple(drives), tuple(open_names), held, tuple(lines))
+
+
+def _refuse_state_feedback(controller: Any, plant: Equations) -> None:
+    """Refuse a gain of the plant's states that would be wired to references and outputs."""
+    count, p = controller.ninputs, len(plant.outputs)
+    linear = isinstance(controller, ct.TransferFunction | ct.StateSpace)
+    if not linear or controller_states(controller) or count != len(plant.states) or count == p:
+        return
+    gain = to_state_matrices(controller)[3]
+    # What weighs references and outputs alike is no feedback of states.
+    if count != 2 * p or not np.array_equal(gain[:, :p], -gain[:, p:]):
+        raise CtrlidError(
+            f"the controller is a gain with {count} inputs without names, and {plant.name} has "
+            f"{count} states ({', '.join(plant.states)}) but {p} outputs "
+            f"({', '.join(plant.outputs)}). {STATE_FEEDBACK}. If it reads "
+            f"{'references and then outputs' if count == 2 * p else 'anything else'}, name its "
+            "inputs likewise"
+        )
 
 
 def _wire_by_position(
