@@ -295,3 +295,27 @@ def test_a_nonlinear_analog_controller_is_not_checked():
     law = ct.nlsys(None, lambda t, x, u, p: 30 * u[0], inputs=1, outputs=1, name="law")
     nonlinear = cid.Loop(loop.plant, law, dt=DT)
     assert name_faults(record, nonlinear) == []
+
+
+# --- what is wrong may be the log
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        ({"u": -1.0}, "but has the opposite sign: "),
+        ({"y": 180 / np.pi, "r": 180 / np.pi}, r"0.01745 times that (pi/180, degrees for radians)"),
+        ({"y": np.pi / 180, "r": np.pi / 180}, r"57.3 times that (180/pi, radians for degrees)"),
+        ({"u": 1e3}, "1000 times that (as between wholes and thousandths (milli))"),
+        ({"u": 1e-2}, "0.01 times that (as between per cent and shares of one)"),
+        ({"u": 1.7}, "1.7 times that: "),
+    ],
+)
+def test_an_audit_blames_the_controller_or_the_log_and_knows_units(spoil, words):
+    loop = cid.Loop(cid.plants.servo(m=1.0, c=2.0, k=3.0), cid.PID(kp=20.0, kd=1.0), dt=DT)
+    r = cid.random_binary(600, amplitude=0.1, hold=25, seed=1)
+    record = cid.simulate(loop, r, sensor_noise=1e-4, seed=1)
+    given = {key: spoil.get(key, 1.0) * getattr(record, key) for key in ("r", "u", "y")}
+    (found,) = [f for f in cid.audit(cid.Record(**given, dt=DT), loop).harmful if f.channel == "u"]
+    assert words in found.text
+    assert found.text.endswith("Correct the controller or the log.")

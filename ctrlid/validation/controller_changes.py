@@ -36,6 +36,16 @@ TIMES = (0.2, 0.4, 0.7, 1.2, 2.0, 4.0, 8.0, 16.0, 32.0)
 SEARCH = 1000
 # A time constant is refined where it leaves less than this share of what the stated law leaves.
 PROMISING = 0.8
+# Factors between units in which a log and a controller may differ, as a share they are known to.
+SAME = 2e-3
+UNITS = (
+    (np.pi / 180, "pi/180, degrees for radians"),
+    (180 / np.pi, "180/pi, radians for degrees"),
+    (1e-3, "as between thousandths (milli) and wholes"),
+    (1e3, "as between wholes and thousandths (milli)"),
+    (1e-2, "as between per cent and shares of one"),
+    (1e2, "as between shares of one and per cent"),
+)
 # Factors about a gain that a regression gave, between which the best one is refined.
 FACTORS = (0.8, 1.0, 1.25)
 
@@ -103,7 +113,16 @@ def _list_gains(
     if factor < 0:
         words = ("has the opposite sign" if abs(factor + 1) < 1e-3
                  else f"has the opposite sign and {-factor:.4g} times the size")  # fmt: skip
+    words += _name_factor(abs(factor))
     yield LawChange("sign" if factor < 0 else "gain", words, scaled, record)
+
+
+def _name_factor(factor: float) -> str:
+    """Return what a factor is known as where units are mixed up; empty for any other."""
+    for known, words in UNITS:
+        if abs(factor / known - 1) < SAME:
+            return f" ({words})"
+    return ""
 
 
 def _estimate_gain(loop: Loop, record: Record) -> tuple[float, float, float] | None:

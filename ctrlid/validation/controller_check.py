@@ -51,6 +51,8 @@ BEGINNING = 1000
 IMMATERIAL = 0.01
 # Kinds of finding after which the stated law is not that of the record.
 REJECTED = ("gain", "sign", "delay", "limit", "filter", "sampled", "unknown")
+# These look the same where the log of a signal has them and not the controller.
+MIRRORED = ("gain", "sign")
 # What may be wrong with a stated law; a constant that is added to it leaves it standing.
 FAULTS = (*REJECTED, "bias")
 
@@ -287,7 +289,7 @@ def _explain_remainder(loop: Loop, e: Any, left: float, record: Record, resoluti
         return ("unknown", f"the controller of the loop does not explain {share} (RMS {rms}), and "
                 "this part depends on y: the true controller has "
                 "other gains or another structure. Correct the "
-                "controller, or give None.", left, True)  # fmt: skip
+                "controller or the log, or give None.", left, True)  # fmt: skip
     if resolution:
         return ("injected", "the logged u is what the analog controller of the loop computes from "
                 f"r and y, and a remainder of RMS {rms} that does not follow r: noise that only "
@@ -421,7 +423,7 @@ def _find_wrong_law(
         ):
             text = (f"u is not what the controller of the loop computes from r and y, but "
                     f"{change.words}: what remains unexplained falls from {100 * left:.3g} to "
-                    f"{100 * remains:.3g} % of the variance of u. Correct the controller."
-                    )  # fmt: skip
+                    f"{100 * remains:.3g} % of the variance of u. Correct the controller"
+                    f"{' or the log' if change.kind in MIRRORED else ''}.")  # fmt: skip
             return change.kind, text, left, True
     return None

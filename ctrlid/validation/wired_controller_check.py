@@ -88,4 +88,4 @@ def _explain_row(loop: Loop, name: str, e: Any, u: Any, record: Record, use: Any
     return ("unknown", "the controller of the loop does not explain "
             f"{write_percent(min(share, 1.0), 3)} of the variance of {name} (RMS {rms}), and this "
             "part depends on the outputs: the true controller has other gains or another "
-            "structure. Correct the controller, or give None.", share, True)  # fmt: skip
+            "structure. Correct the controller or the log, or give None.", share, True)  # fmt: skip
