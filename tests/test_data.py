@@ -150,6 +150,9 @@ HOLES = np.array([0.0, np.nan, 1.0, np.inf])
         ({"extra": {"u": np.ones(N)}}, r"names other than r, u, y, t, time, valid; given \['u'\]"),
         ({"extra": {0: np.ones(N)}}, r"names other than .* given \[0\]"),
         ({"extra": [np.ones(N)]}, "extra maps names to channels, .*given list"),
+        ({"r": {"rpos": np.ones(N)}}, "r is an array, given a mapping of rpos: give the series "
+                                      "alone, .* in names={'r': 'rpos'}"),
+        ({"y": {"a": 1, "b": 2}}, r"in names={'y': \('a', 'b'\)}"),
         ({"name": 3}, "name is the experiment's name in words; given 3"),
     ],
 )  # fmt: skip

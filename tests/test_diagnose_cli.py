@@ -213,6 +213,8 @@ def test_refusals_say_what_to_do(folder, asked, capsys):
          (*COLUMNS, "--model", "bench.py:ball")),
         ("--model bench.py:number is a int; needed is a python-control system",
          (*COLUMNS, "--model", "bench.py:number")),
+        ("wrap it, system = ct.nlsys(update, output_function",
+         (*COLUMNS, "--model", "bench.py:update")),
         ("--model bench.py:nothing returns a NoneType", (*COLUMNS, "--model", "bench.py:nothing")),
         ("bench.py:loop is a ctrlid.Loop, which has its own operating point and controller: leave "
          "out --at-output", (*COLUMNS, "--model", "bench.py:loop", "--at-output", "0")),

@@ -383,6 +383,8 @@ def test_step_draws_redesigns_by_their_labels_over_one_time(outcome):
         plot.step({})
     with pytest.raises(cid.CtrlidError, match="or a mapping of them; given int"):
         plot.step({"first": 3})
+    with pytest.raises(cid.CtrlidError, match=r"draw that with plot.record\(simulate\(loop, r\)\)"):
+        plot.step({"old": outcome.loop, "new": outcome})
 
 
 @pytest.mark.parametrize(

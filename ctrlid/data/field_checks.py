@@ -21,6 +21,13 @@ def check_samples(name: str, values: Any, several: bool = False) -> Any:
             f"{name} is a masked array, and a record would use its masked values: fill them and "
             "give valid=~mask"
         )
+    if isinstance(values, Mapping):
+        words = tuple(map(str, values))
+        raise CtrlidError(
+            f"{name} is an array, given a mapping of {write_list(words) or 'nothing'}: give the "
+            "series alone, several one in a row, and what they are called in names="
+            f"{{{name!r}: {(words[0] if len(words) == 1 else words)!r}}}"
+        )
     try:
         array = np.asarray(values)
     except ValueError as reason:

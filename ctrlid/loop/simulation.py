@@ -11,6 +11,7 @@ from .._base.arguments import check_arguments, explain_names
 from .._base.arrays import Array, to_real_array
 from .._base.errors import CtrlidError, CtrlidWarning, ModelCannotRun
 from .._base.rounding import keep_numpy_quiet
+from .._base.text import write_list
 from ..data.reconstruction import PIECES, count_pieces, reconstruct_signal
 from ..data.record import Record
 from .loop import Loop
@@ -159,12 +160,25 @@ def _check_signals(
     for name, value in (("r", r), ("d", d)):
         if value is None:
             continue
+        if isinstance(value, Mapping):
+            raise CtrlidError(
+                f"simulate takes {name} as an array, because this loop has a single one; given a "
+                f"mapping of {write_list([str(key) for key in value])}. Give its series alone"
+            )
         array = to_real_array(value, f"simulate needs {name} as an array of numbers: they")
+        if array.ndim == 2 and 1 in array.shape:
+            raise CtrlidError(f"simulate needs {name} as a one-dimensional array, one number for "
+                              f"each sample; given shape {array.shape}. Give {name}.ravel()"
+                              )  # fmt: skip
         if array.ndim != 1 or array.size < 2 or not np.isfinite(array).all():
             raise CtrlidError(
                 f"simulate needs {name} as a one-dimensional array of at least 2 finite numbers, "
-                f"one per sample; given shape {array.shape} with "
-                f"{np.count_nonzero(~np.isfinite(array))} not finite"
+                f"one per sample; given shape {array.shape}"
+                + (
+                    f" with {lost} not finite"
+                    if (lost := np.count_nonzero(~np.isfinite(array)))
+                    else ""
+                )
             )
         arrays[name] = array
     if loop.controller is not None and "r" not in arrays:
@@ -193,8 +207,9 @@ def _check_several_signals(loop: Loop, r: Any, d: Any) -> tuple[Array, Array, tu
     series = [*parts, *(r.values() if isinstance(r, Mapping) else ())]
     for v in series:
         if v is not None and (v.ndim not in (1, 2) or v.shape[-1] < 2 or not np.isfinite(v).all()):
+            cure = ". Give its transpose, .T" if v.ndim == 2 and v.shape[0] > v.shape[1] else ""
             raise CtrlidError("simulate needs r and d with at least 2 finite samples, of shape "
-                              f"(n,) or (signals, n); given shape {v.shape}")  # fmt: skip
+                              f"(n,) or (signals, n); given shape {v.shape}{cure}")  # fmt: skip
     given = r if isinstance(r, Mapping) else parts[0]
     injected = None if parts[1] is None else np.atleast_2d(parts[1])
     if injected is not None and len(injected) != len(inputs):

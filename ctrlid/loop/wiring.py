@@ -274,10 +274,15 @@ def stack_references(
         # A record's own names may be others; then its references are taken in order.
         choices = [c for c in (needed, list(wiring.open)) if len(c) == len(rows) and not strict]
         if not choices and rows:
-            what = f"given {write_list(unknown)}" if unknown else f"given {len(rows)}"
+            what = (f"given {write_list(unknown)}, which the controller does not have" if unknown
+                    else f"given {len(rows)}")  # fmt: skip
+            known = write_list(list(wiring.open))
+            every = f"the reference {known}" if len(wiring.open) == 1 else f"the references {known}"
+            which = "" if needed == list(wiring.open) else (
+                f", of which it needs {write_list(needed) or 'none'}")  # fmt: skip
             raise CtrlidError(
-                f"the controller has the references {list(wiring.open)}, of which it needs "
-                f"{needed or 'none'}; {what}. Give one series for each, or a mapping of names"
+                f"the controller has {every}{which}; {what}. Give one series for each, or a "
+                f"mapping such as {{{wiring.open[0]!r}: r}}"
             )
         names = choices[0] if choices else []
     missing = [name for name in needed if name not in names]

@@ -90,6 +90,11 @@ def read_plant(text: str, values: dict[str, float]) -> Any:
     known = inspect.signature(made).parameters
     _require_known(text, list(known), list(values))
     lacking = [k for k, p in known.items() if p.default is p.empty and k not in values]
+    if len(known) in (3, 4) and list(known)[:3] == ["t", "x", "u"]:
+        raise CtrlidError(f"--model {text} is a function of t, x and u, the update function of a "
+                          f"system: wrap it, system = ct.nlsys({made.__name__}, output_function, "
+                          "inputs=..., outputs=..., states=..., params=...), and name that, as in "
+                          f"{text.rpartition(':')[0]}:system")  # fmt: skip
     if lacking:
         raise CtrlidError(f"the model {text} needs {', '.join(lacking)}; give them in SI units, as "
                           f"in --param {' '.join(f'{k}=...' for k in lacking)}")  # fmt: skip

@@ -9,6 +9,7 @@ from ..._base.errors import CtrlidError
 from ..._base.text import with_unit
 from ...design.controller_trial import ControllerTrial, ReferenceStep, StepMotion
 from ...design.redesigning import Redesign
+from ...loop.loop import Loop
 from .axes import MARKERS, Picture, choose_line_style, figure, finish_axes, require_kind, take_axes
 
 
@@ -54,6 +55,9 @@ def step(redesigns: Any, ax: Any = None) -> Picture:
         raise CtrlidError("plot.step has nothing to draw: the mapping is empty")
     needed = "plot.step draws a Redesign, as redesign() returns, or a mapping of them"
     for redesign in several.values():
+        if isinstance(redesign, Loop):
+            raise CtrlidError(f"{needed}; a Loop makes no promise: simulate it on a step of r, and "
+                              "draw that with plot.record(simulate(loop, r))")  # fmt: skip
         require_kind(redesign, Redesign, needed)
     size = (7.2, 3.2 * len(several)) if len(several) > 1 else None
     axes = take_axes(ax, len(several), size, sharex=True)
