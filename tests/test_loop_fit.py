@@ -545,3 +545,44 @@ def test_a_lag_beside_dry_friction_is_within_its_errors(ratio, seed):
     e = cid.fit_loop(loop, record).estimate
     off = [(e[n] - true[n]) / s for n, s in zip(e.names, e.standard_errors, strict=True)]
     assert np.abs(off).max() < 2.9
+
+
+# --- a wrong sign or unit of u
+
+
+@pytest.mark.parametrize(("factor", "on_bound"), [(-1.0, True), (2e3, True), (1.0, False)])
+def test_a_parameter_on_its_bound_by_a_wrong_input_is_said(factor, on_bound):
+    def move(t, x, u, p):
+        return np.array([x[1], p["a"] * np.sin(x[0]) - p["c"] * x[1] + p["b"] * u[0]])
+
+    plant = ct.nlsys(move, lambda t, x, u, p: x[0], name="pend", inputs=["V"], outputs=["theta"],
+                     states=["theta", "omega"], params={"a": 60.0, "b": 20.0, "c": 1.0}
+                     )  # fmt: skip
+    C = ct.sample_system(ct.tf([0.8, 12.0], [0.01, 1.0]), 0.01, "tustin")
+    at = cid.operating_point(plant, output=0.0)
+    loop = cid.Loop(plant, C, dt=0.01, at=at, free=("b",))
+    r = cid.random_binary(800, amplitude=0.05, hold=25, seed=1)
+    record = cid.simulate(loop, r, sensor_noise=2e-4, seed=1)
+    found = cid.fit_loop(loop, replace(record, u=factor * np.asarray(record.u))).estimate
+    assert (found.active == ("b",)) is on_bound
+    said = [note for note in found.notes if note.startswith("THE INPUT HARDLY COUNTS")]
+    assert len(said) == on_bound
+    assert not said or "b IS ON A BOUND. CHECK THE SIGN AND THE UNIT of u" in said[0]
+
+
+def test_a_mass_beyond_all_bounds_is_a_wrong_input_as_well():
+    loop = cid.Loop(cid.plants.servo(m=1.0, c=2.0, k=3.0), cid.PID(kp=20.0, kd=1.0), dt=0.01)
+    r = cid.random_binary(800, amplitude=0.1, hold=25, seed=1)
+    record = cid.simulate(loop, r, sensor_noise=1e-4, seed=1)
+    found = cid.fit_loop(loop, replace(record, u=-np.asarray(record.u)), free=("m",)).estimate
+    assert [note for note in found.notes if note.startswith("THE INPUT HARDLY COUNTS")]
+
+
+def test_friction_that_is_not_there_is_no_reason_to_doubt_the_input():
+    plant = cid.plants.servo(m=1.0, c=1e-9, k=3.0)
+    loop = cid.Loop(plant, cid.PID(kp=20.0, kd=1.0), dt=0.01, free=("c",))
+    record = cid.simulate(loop, cid.random_binary(800, amplitude=0.1, hold=25, seed=1))
+    start = loop.with_parameters({"c": 2.0})
+    found = cid.fit_loop(start, record).estimate
+    assert found.active == ("c",)
+    assert not [note for note in found.notes if "CHECK THE SIGN" in note]

@@ -25,6 +25,7 @@ from ...data.several_records import (
 from ...loop.loop import Loop
 from ...loop.unit_check import note_unit_clashes
 from ...loop.sampled_form import note_sampled_controller
+from ...physics.linearization import compute_state_matrices
 from ..whiteness import note_coloured_innovations
 from .filter_data import find_noise_units
 from .likelihood import Fit, find_priors, list_effect_bounds, make_problem
@@ -43,6 +44,10 @@ UNSEEN = 1e-9
 # A given value is contradicted where the fit is farther from it than three of its standard
 # deviations, which chance does in 1 of 370 cases.
 CONTRADICTED = 3.0
+# An input that counts less than this share of what it did is doubted.
+DISCOUNTED = 0.01
+# So is one that moves the plant less than the random force does.
+OUTDONE = 1.0
 
 
 @explain_names
@@ -147,6 +152,7 @@ def fit_loop(
         *note_unit_clashes(loop, fit.problem.data[0].record),
         *note_sampled_controller(loop.controller, given, "the loop"),
         *left_out,
+        *_note_doubtful_input(loop, given, fitted),
         *fitted.estimate.notes,
         *colour,
         *_note_contradicted_values(fit),
@@ -169,6 +175,44 @@ def _note_contradicted_values(fit: Fit) -> tuple[str, ...]:
                 "parameter stands in for: diagnose() tells what"
             )
     return tuple(found)
+
+
+def _note_doubtful_input(
+    loop: Loop, records: Sequence[Record], fitted: LoopFit
+) -> tuple[str, ...]:  # fmt: skip
+    """Return what to say where the fitted parameters put the input away, or a force its place.
+
+    With the wrong sign of u the best that a plant with positive parameters can do is not to react
+    to u at all. Dry friction that is zero is on a bound as well, and no reason to speak.
+    """
+    estimate, e = fitted.estimate, loop.equations()
+    own = [name for name in estimate.active if name not in list_effect_bounds(loop)]
+    if not e.siso:
+        return ()
+    try:
+        given, now = (
+            np.abs(compute_state_matrices(one.equations(), one.point)[1][:, 0])
+            for one in (loop, fitted.loop)
+        )
+    except ModelCannotRun:
+        return ()  # At a corner nobody can say how much the input counts.
+    seen = given > 0
+    share = float(np.max(now[seen] / given[seen], initial=0.0)) if seen.any() else 1.0
+    spread = max(float(np.std(record.u[record.valid])) for record in records)
+    push = spread * float(np.max(given[list(e.velocities)], initial=0.0))
+    force = math.hypot(float(estimate.force_noise), estimate.coloured_force)
+    bound = f"{write_list(own)} {'IS ON A BOUND' if len(own) == 1 else 'ARE ON THEIR BOUNDS'}"
+    if share < DISCOUNTED:
+        why = (f"THE INPUT HARDLY COUNTS in the fitted model, {share:.2g} times what it does in "
+               f"the model as given{f', and {bound}' if own else ''}")  # fmt: skip
+    elif own and push and force > OUTDONE * push:
+        why = f"{bound}, and the random force that was found outdoes the input"
+    else:
+        return ()
+    return (
+        f"{why}. CHECK THE SIGN AND THE UNIT of u, and those of y: audit(record, loop) compares "
+        "them with the controller of the loop, where it has one",
+    )
 
 
 def _note_unknown_controller(loop: Loop, records: Sequence[Record]) -> tuple[str, ...]:
