@@ -411,6 +411,10 @@ def test_damaged_bytes_give_a_record_or_a_refusal(tmp_path):
         (lambda: cid.fit_arx(None, 2, na=2, nb=2), "is given na twice"),
         (lambda: cid.fit_iv(), "fit_iv needs record=, na= and nb=; it takes record, na, nb, nk"),
         (lambda: cid.Record(u=[0, 1], y=[0, 1]), "a Record needs dt=; given are u= and y="),
+        (lambda: cid.Loop(None, None, 0.1, operating=0), "a Loop has no operating=; it has plant"),
+        (lambda: cid.Loop(None, dt=0.1, effect=0), r"Loop has no effect=; did you mean effects=\?"),
+        (lambda: cid.plants.maglev(m=0.02, k=1), "maglev has no k="),
+        (lambda: cid.plants.servo(m=1.0), "servo needs c= and k=; it takes m, c, k"),
         (lambda: E.CoulombFriction(f=0.1), r"CoulombFriction has no f=; did you mean fc=\?"),
     ],
 )

@@ -9,7 +9,7 @@ from typing import Any
 import control as ct
 import numpy as np
 
-from .._base.arguments import check_arguments, is_number
+from .._base.arguments import check_arguments, explain_names, is_number
 from .._base.errors import CtrlidError
 
 
@@ -32,6 +32,7 @@ def _make_plant(
     return system
 
 
+@explain_names
 def maglev(m: float, K: float, g: float = 9.81) -> Any:
     r"""Return a ball that hangs below an electromagnet.
 
@@ -91,6 +92,7 @@ def maglev(m: float, K: float, g: float = 9.81) -> Any:
     )
 
 
+@explain_names
 def servo(m: float, c: float, k: float) -> Any:
     r"""Return a mass on a drive: a pole at the origin and one from friction.
 
@@ -141,6 +143,7 @@ def servo(m: float, c: float, k: float) -> Any:
     )
 
 
+@explain_names
 def tank(area: float, outlet: float, k: float, g: float = 9.81) -> Any:
     r"""Return a tank that is filled by a pump and drained through a hole.
 
@@ -187,6 +190,7 @@ def tank(area: float, outlet: float, k: float, g: float = 9.81) -> Any:
     return _make_plant("tank", update, ["V"], ["h"], ["h"], parameters, units)
 
 
+@explain_names
 def pendulum(m: float, length: float, c: float = 0.0, g: float = 9.81) -> Any:
     r"""Return an inverted pendulum driven by a torque at its pivot.
 
@@ -279,6 +283,7 @@ def _make_mechanism(
     return systems[0]
 
 
+@explain_names
 def cart_pole(
     M: float, m: float, length: float, J: float = 0.0, c: float = 0.0, gamma: float = 0.0,
     g: float = 9.81,
@@ -357,6 +362,7 @@ def cart_pole(
     )  # fmt: skip
 
 
+@explain_names
 def rotary_pendulum(
     m: float, length: float, arm: float, arm_inertia: float, kt: float, R: float, J: float = 0.0,
     km: float | None = None, c: float = 0.0, gamma: float = 0.0, g: float = 9.81,
@@ -457,6 +463,7 @@ def rotary_pendulum(
     )  # fmt: skip
 
 
+@explain_names
 def ball_on_beam(
     m: float, J: float, radius: float, ball_inertia: float | None = None, c: float = 0.0,
     g: float = 9.81,
@@ -529,6 +536,7 @@ def ball_on_beam(
     )  # fmt: skip
 
 
+@explain_names
 def quadrotor_planar(
     m: float, J: float, arm: float, c: float = 0.0, g: float = 9.81
 ) -> Any:  # fmt: skip
