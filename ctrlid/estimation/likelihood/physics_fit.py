@@ -23,8 +23,8 @@ from ...data.several_records import (
     order_model_and_data,
 )
 from ...loop.loop import Loop
-from ...loop.unit_check import note_unit_clashes
 from ...loop.sampled_form import note_sampled_controller
+from ...loop.unit_check import note_unit_clashes
 from ...physics.linearization import compute_state_matrices
 from ..whiteness import note_coloured_innovations
 from .filter_data import find_noise_units
