@@ -59,6 +59,7 @@ FAULTS = {
     "sign of u": (lambda r, u, y: (r, -u, y), "wrong sign"),
     "degrees": (lambda r, u, y: (np.rad2deg(r), u, np.rad2deg(y)), "degrees where the model has"),
     "milli": (lambda r, u, y: (r, 1e3 * u, y), "u is a thousand times too large"),
+    "early": (lambda r, u, y: (r[:-1], u[:-1], y[1:]), "y is logged one sample early"),
 }
 
 

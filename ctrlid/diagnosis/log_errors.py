@@ -1,7 +1,8 @@
 """Step 7: gross errors of the log: a wrong sign, or a signal in another unit than the model's."""
 
+import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -49,13 +50,16 @@ REPAIRS = (
     ("u is in shares of one where the model has per cent", 1e2, 1.0),
 )
 
+EARLY = "y is logged one sample early, or u one sample late"
+
 
 def find_log_error(
     loop: Loop, records: Sequence[Record], audits: Sequence[Audit], reached: float
 ) -> LogError | None:
     r"""Return the gross error of the log that explains records better than what was found.
 
-    A repair multiplies u by a factor, or y and r. Beside the density of the outputs as they were
+    A repair multiplies u by a factor, or y and r, or logs y a sample later. (A sample earlier would
+    be a delay, which may be true.) Beside the density of the outputs as they were
     logged, that of repaired outputs counts with the factor a of their unit,
 
     .. math:: \ln p(y \mid u) = \ln p(a y \mid u) + N \ln |a|,
@@ -86,13 +90,13 @@ def find_log_error(
     heads = [r[: THRESHOLD.log_error_samples] for r in records]
     as_logged = _measure(loop, heads, None)
     found: list[tuple[float, str]] = []
-    for words, input_factor, output_factor in REPAIRS:
-        if _measure(loop, _repair(heads, input_factor, output_factor), None, output_factor) < (
-            as_logged + THRESHOLD.gate
-        ):
+    for words, repair, factor in _list_repairs():
+        left_out = len(records) if words == EARLY else 0
+        head = _measure(loop, [repair(r) for r in heads], None, factor, left_out)
+        if head < as_logged + THRESHOLD.gate:
             continue
-        repaired = _repair(records, input_factor, output_factor)
-        found.append((_measure(loop, repaired, audits, output_factor) - reached, words))
+        value = _measure(loop, [repair(r) for r in records], audits, factor, left_out)
+        found.append((value - reached, words))
     gains = [gain for gain, _ in found]
     best = max(gains, default=-math.inf)
     if not best > THRESHOLD.gate:
@@ -102,22 +106,36 @@ def find_log_error(
     return LogError(", or ".join(same), best)
 
 
-def _repair(records: Sequence[Record], input_factor: float, output_factor: float) -> list[Record]:
-    """Return records with u, or y and r, multiplied by a factor."""
-    return [
-        replace(
-            record,
-            u=input_factor * np.asarray(record.u),
-            y=output_factor * np.asarray(record.y),
-            r=None if record.r is None else output_factor * np.asarray(record.r),
-        )
-        for record in records
+def _list_repairs() -> list[tuple[str, Callable[[Record], Record], float]]:
+    """Return what may be wrong, what mends a record, and the factor by which that multiplies y."""
+    scaled = [
+        (words, functools.partial(_scale, input_factor=mine, output_factor=factor), factor)
+        for words, mine, factor in REPAIRS
     ]
+    return [*scaled, (EARLY, _delay_output, 1.0)]
+
+
+def _scale(record: Record, input_factor: float, output_factor: float) -> Record:
+    """Return a record with u, and y and r, multiplied by a factor."""
+    return replace(
+        record,
+        u=input_factor * np.asarray(record.u),
+        y=output_factor * np.asarray(record.y),
+        r=None if record.r is None else output_factor * np.asarray(record.r),
+    )
+
+
+def _delay_output(record: Record) -> Record:
+    """Return a record whose output is logged one sample later; the first one is then not known."""
+    y, valid = np.roll(record.y, 1), np.roll(record.valid, 1)
+    y[0], valid[0] = y[1], False
+    return replace(record, y=y, valid=valid & record.valid)
 
 
 def _measure(
-    loop: Loop, records: Sequence[Record], audits: Sequence[Audit] | None, factor: float = 1.0
-) -> float:
+    loop: Loop, records: Sequence[Record], audits: Sequence[Audit] | None, factor: float = 1.0,
+    left_out: int = 0,
+) -> float:  # fmt: skip
     """Return the penalized log-likelihood of y as logged; minus infinity where nothing runs.
 
     Without audits the plant keeps its given values.
@@ -133,4 +151,6 @@ def _measure(
     if not math.isfinite(fit.value):
         return -math.inf
     count = sum(int(np.count_nonzero(np.isfinite(z))) for z in fit.standardized)
-    return compute_penalized_likelihood(fit) + count * math.log(abs(factor))
+    value = compute_penalized_likelihood(fit) + count * math.log(abs(factor))
+    # A sample that a repair leaves out counts as the others do on average.
+    return value * (1 + left_out / max(count, 1))

@@ -1,11 +1,12 @@
 """Steps 5 and 7: candidates refitted under hardly any random force, for what hides together."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
 from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from ..effects import AbstractEffect
-from ..estimation.likelihood.likelihood import Fit, rank_by_likelihood
+from ..estimation.likelihood.likelihood import Fit, rank_by_likelihood, relinearize_fit
 from ..estimation.likelihood.maximization import hold_force_quiet, maximize
 from ..estimation.likelihood.noise_fit import fit_noise
 from .candidates import NUMERICAL_FAILURES, Objection, Trial, Work
@@ -37,18 +38,17 @@ def refit_quietly(base: Model, effects: Sequence[AbstractEffect], work: Work) ->
         The likeliest under hardly any force, refitted with the force free; none where the noise is
         known beforehand, beside which every score is as good.
     """
-    if base.fit.known is not None:
+    if base.fit.known is not None or not math.isfinite(base.fit.value):
         return []
     fit = with_linearization(base).fit
     if fit.noise.drift:
         # A coloured force leaves a white one of any size, which says nothing of how large one was.
         white = replace(fit.noise, memory=0.0, drift=0.0)
         fit = fit_noise(fit.problem, fit.theta, fit.linearized, white, wide=True)
-    held = hold_force_quiet(fit)
-    try:
-        quiet = with_linearization(Model(base.loop, maximize(held, exact=False)))
-    except ModelCannotRun:
+    held = relinearize_fit(hold_force_quiet(fit))
+    if not math.isfinite(held.value):
         return []
+    quiet = with_linearization(Model(base.loop, maximize(held, exact=False)))
     tried: list[Trial] = work(lambda effect: scan_candidate(quiet, effect), effects)
     tried = sorted(tried, key=lambda t: -t.score)[: THRESHOLD.tried_quietly]
     fits = work(lambda t: _climb_quietly(quiet, t), tried)
@@ -63,6 +63,8 @@ def _climb_quietly(quiet: Model, trial: Trial) -> Fit | None:
         return None
     try:
         start = carry_over_fit(quiet, trial.model.loop, trial.model.names)
+        if not math.isfinite(start.value):
+            return None
         return maximize(start, rounds=THRESHOLD.refit_rounds, exact=False)
     except (ModelCannotRun, EffectDoesNotApply, *NUMERICAL_FAILURES):
         return None

@@ -228,6 +228,8 @@ def maximize(fit: Fit, rounds: int = ROUNDS, exact: bool = True) -> Fit:
     tuned, far, enough = -math.inf, True, 0.02 if exact else 0.3
     if not fit.linearized:
         fit, far = relinearize_fit(fit), False
+        if not math.isfinite(fit.value):
+            return fit
     for _ in range(rounds):
         # A short step was already evaluated along the trajectory of the pass before.
         again = relinearize_fit(fit) if far else fit
