@@ -1,11 +1,14 @@
 """Effects at a place: an input, a velocity or an output of a plant with several of them."""
 
+from types import SimpleNamespace
+
 import control as ct
 import numpy as np
 import pytest
 
 import ctrlid as cid
 from ctrlid import effects as E
+from ctrlid.diagnosis.answer import _list_notes
 from problems import drive
 from test_wiring import CART, DT, QUAD, at_rest, lqr_with_observer, luenberger
 
@@ -154,3 +157,13 @@ def test_one_place_needs_no_name_and_takes_it():
 def test_refused_places(build, words):
     with pytest.raises(cid.CtrlidError, match=words):
         build()
+
+
+@pytest.mark.parametrize("passed", [False, True])
+def test_where_something_is_left_a_mechanism_is_told_of_its_forces(passed):
+    bare = cart(plant=written_out())
+    search = SimpleNamespace(after=SimpleNamespace(passed=passed))
+    told = [note for note in _list_notes(bare, search) if "without forces=" in note]
+    assert bool(told) == (not passed)
+    assert not any("without forces=" in note for note in _list_notes(cart(), search))
+    assert all("mass matrix" in note for note in told)

@@ -125,6 +125,15 @@ def _list_notes(loop: Loop, found: Search) -> list[str]:
             "coloured noise, limits of a sensor, delays of one of several inputs, repeats of the "
             "experiment and errors of the log are not looked for"
         )
+    e = loop.equations()
+    if len(e.velocities) > 1 and e.pushes is None and not found.after.passed:
+        first, *_ = (e.states[j] for j in e.velocities)
+        notes.append(
+            "without forces= a force at a velocity accelerates that coordinate alone, while in a "
+            "mechanism it accelerates all of them, through the mass matrix. Say which input works "
+            f"on which velocity, as in forces={{{first!r}: {e.inputs[0]!r}}} of the Loop, and "
+            "diagnose again"
+        )
     if loop.linear_plant and not found.after.passed:
         notes.append(
             "the model is linear. If the errors depend on position, velocity or input, write the "
