@@ -27,7 +27,7 @@ import joblib
 import numpy as np
 import outside_cases as cases
 from _shares import parse_seeds, wilson
-from scipy import stats
+from scipy import signal, stats
 
 import ctrlid as cid
 
@@ -167,16 +167,32 @@ def _describe(finding: Any) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def compare_errors(gap: Any, blocks: int = 25) -> float:
-    """Return the chance that noise alone widens the gap as much, by Student's test of blocks."""
+def compare_errors(gap: Any) -> float:
+    """Return the chance that noise alone widens the gap as much."""
     one, other = gap.simulated_before - gap.measured, gap.simulated_after - gap.measured
     both = np.isfinite(one) & np.isfinite(other)
-    d = (other**2 - one**2)[both]
-    if len(d) < 4 * blocks or not np.ptp(d) > 0:
+    return weigh_mean((other**2 - one**2)[both])
+
+
+def weigh_mean(d: np.ndarray[Any, Any]) -> float:
+    """Return the chance of so large a mean where the true one is zero: Student's test of blocks.
+
+    The blocks are as long as the correlation of the samples asks for. Of 25 blocks of any record,
+    4 % and 11 % are beyond 1 % where errors remember 20 and 50 samples, as in a closed loop.
+    """
+    if len(d) < 2 or not np.ptp(d) > 0:
         return 1.0
-    means = np.array([b.mean() for b in np.array_split(d, blocks)])
-    t = means.mean() / (means.std(ddof=1) / math.sqrt(blocks))
-    return float(stats.t.sf(t, blocks - 1))
+    z = d - d.mean()
+    raw = signal.correlate(z, z, "full")[len(z) - 1 :]
+    rho = raw / raw[0]
+    ends = np.flatnonzero(rho[: len(rho) // 4] <= 0)
+    stop = ends[0] if len(ends) else len(rho) // 4
+    length = max(1, math.ceil(4 * (1 + 2 * rho[1:stop].sum())))
+    count = len(d) // length
+    if count < 2:
+        return 1.0
+    means = d[: count * length].reshape(count, length).mean(axis=1)
+    return float(stats.t.sf(means.mean() / (means.std(ddof=1) / math.sqrt(count)), count - 1))
 
 
 # --- scores

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy import signal
 
 import ctrlid as cid
 from ctrlid import effects as E
@@ -230,3 +231,16 @@ def test_the_second_of_two_that_hide_together_shows_under_hardly_any_force():
     assert best.name == "InputDelay"
     assert best.net_gain > 300
     assert best.fitted.delay == pytest.approx(6 * case.rig.dt, rel=0.01)
+
+
+@pytest.mark.parametrize("memory", [0.0, 0.8, 0.95, 0.98])
+def test_a_wider_gap_is_told_from_chance_at_its_level(memory):
+    """Errors of a closed loop remember tens of samples; blocks of a fixed length err often then."""
+    rng = np.random.default_rng(4)
+    chances = []
+    for _ in range(500):
+        e = signal.lfilter([1.0], [1.0, -memory], rng.standard_normal((2, 900)))[:, 500:875]
+        chances.append(study.weigh_mean(e[1] ** 2 - e[0] ** 2))
+    assert np.mean(np.array(chances) < 0.01) < 0.03
+    louder = 1.6 * e[1]
+    assert study.weigh_mean(np.tile(louder**2 - e[0] ** 2, 40)) < 0.01
