@@ -430,4 +430,4 @@ def test_every_public_function_knows_its_arguments():
         with pytest.raises(cid.CtrlidError, match="has no nonsense="):
             function(nonsense=1)
     # Help shows what each takes all the same.
-    assert list(inspect.signature(E.CoulombFriction).parameters) == ["fc", "at"]
+    assert list(inspect.signature(E.CoulombFriction).parameters) == ["fc", "creep", "at"]

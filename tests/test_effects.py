@@ -161,7 +161,7 @@ def test_parameters_reach_the_equations_with_their_labels(cls, name):
         label = cls.__name__
         with_it = loop.with_effect(neutral_of(effect))
         kept = with_it.equations(keep=True)
-        names = [f"{label}.{p.name}" for p in effect.parameters()]
+        names = [f"{label}.{name}" for name in effect.values()]
         assert names
         assert list(kept.parameters)[-len(names) :] == names
         assert list(with_it.parameters) == list(kept.parameters)

@@ -197,8 +197,8 @@ levitated = partial(levitation, dt=1e-3, free=())
 )  # fmt: skip
 def test_the_machines_derivatives_are_those_of_its_map(hidden, stages, parts):
     loop = levitated(E.CoulombFriction(fc=0.1), *hidden)
-    names = ("K", "m", *(f"{label}.{p.name}" for label, e in loop.labelled.items()
-                         for p in e.parameters()))  # fmt: skip
+    names = ("K", "m", *(f"{label}.{name}" for label, e in loop.labelled.items()
+                         for name in e.values()))  # fmt: skip
     r = cid.random_binary(200, amplitude=2e-4, hold=20, around=0.012, seed=1)
     record = cid.simulate(levitated(), r, sensor_noise=2e-6, seed=2)
     m = SampledPlant(loop, names, "zoh", False)

@@ -94,8 +94,11 @@ def test_the_answer_so_far(record, tmp_path):
     assert "THE SEARCH WAS NOT FINISHED" in " ".join(str(again).split())
 
 
-def test_what_was_found_before_the_end_is_kept(record, monkeypatch):
+def test_what_was_found_before_the_end_is_kept(monkeypatch):
     """Stopped in the second round, the effect of the first one is named, and nothing is claimed."""
+    real = drive().with_effect(E.InputDeadZone(0.4)).with_effect(E.InputOffset(0.8))
+    r = cid.random_binary(1000, amplitude=0.1, hold=50, seed=1)
+    record = cid.simulate(real, r, sensor_noise=1e-4, seed=2)
     budgets = []
     tell, make = Progress.tell, Progress.make_budget
 
@@ -110,7 +113,7 @@ def test_what_was_found_before_the_end_is_kept(record, monkeypatch):
 
     monkeypatch.setattr(Progress, "make_budget", keep)
     monkeypatch.setattr(Progress, "tell", stop)
-    few = (E.CoulombFriction, E.InputOffset)
+    few = (E.InputDeadZone, E.InputOffset)
     found = cid.diagnose(drive(), record, catalogue=few, progress=False)
     assert (found.verdict, found.finished, len(found.findings)) == ("partly explained", False, 1)
     assert "So far the model lacks" in found.sentence
@@ -119,6 +122,15 @@ def test_what_was_found_before_the_end_is_kept(record, monkeypatch):
     monkeypatch.undo()
     whole = cid.diagnose(drive(), record, catalogue=few, progress=False, seconds=600)
     assert (whole.verdict, whole.finished, len(whole.findings)) == ("explained", True, 2)
+
+
+def test_friction_that_crept_in_place_of_what_was_found_later_sticks_at_the_end(record):
+    """Beside the missing offset of the input, the friction of the first round has to creep."""
+    few = (E.CoulombFriction, E.InputOffset)
+    found = cid.diagnose(drive(), record, catalogue=few, progress=False)
+    (friction,) = (f.effect for f in found.findings if f.name == "CoulombFriction")
+    assert friction.fc == pytest.approx(0.5, abs=0.003)
+    assert friction.creep == 0.0
 
 
 def test_a_budget_of_samples_counts_what_is_done_side_by_side():
@@ -177,7 +189,7 @@ def test_what_is_shown_in_a_terminal(record, monkeypatch):
     frames = sys.stderr.getvalue().split("\r")
     # Passes move it too: while nothing is finished, the seconds go on.
     assert len(frames) > 50
-    assert any("round 1: screening" in f and " 1/2" in f for f in frames)
+    assert any("round 1: screening" in f and " 1/3" in f for f in frames)
     assert any("leads with an evidence of" in f and "s more for this step" in f for f in frames)
 
 

@@ -44,6 +44,7 @@ from .refitting import refit_candidate
 from .removal import (
     Weighed,
     drop_superfluous,
+    drop_unseen_values,
     order_last_effect,
     refit_noise,
     refit_without_effect,
@@ -135,6 +136,7 @@ def _grow_model(
             tell(f"round {len(steps)}: {steps[-1].best.key} with all else")
             reached.model = steps[-1].best.model
             model = refit_noise(order_last_effect(steps[-1].best.model, given))
+            model = drop_unseen_values(model, given)
             model = with_linearization(drop_superfluous(model, given))
             likeliest = max(likeliest, model, key=compute_criterion)
         if (

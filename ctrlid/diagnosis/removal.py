@@ -51,6 +51,7 @@ def weigh_effects(
     """Return the model without what is superfluous, and each effect on top of all the others."""
     if len(model.loop.effects) == given:
         return model, ()
+    model = drop_unseen_values(model, given)
     best = steps[0].best
     alone = len(model.loop.effects) == given + 1 and len(steps) <= 2
     alone = alone and best is not None and list(best.model.names) == list(model.names)
@@ -236,6 +237,31 @@ def drop_superfluous(model: Model, given: int) -> Model:
         smaller, trial = weigh_without_effect(model, position)
         if trial.net_gain <= THRESHOLD.gate:
             return drop_superfluous(smaller, given)
+    return model
+
+
+def drop_unseen_values(model: Model, given: int) -> Model:
+    """Return the model without optional values of its effects that earn no place.
+
+    Friction that was found first may have to creep in place of what was found since.
+    """
+    for position in range(given, len(model.loop.effects)):
+        label, effect = list(model.fitted.labelled.items())[position]
+        for p in effect.parameters():
+            name = f"{label}.{p.name}"
+            if not p.optional or name not in model.names:
+                continue
+            effects = list(model.fitted.effects)
+            effects[position] = replace(effect, **{p.name: 0.0})
+            loop = replace(model.fitted, effects=tuple(effects),
+                           free=tuple(n for n in model.fitted.free if n != name))  # fmt: skip
+            names = [n for n in model.names if n != name]
+            start = carry_over_fit(model, loop, names)
+            if not math.isfinite(start.value):
+                continue
+            fit = maximize(start, rounds=THRESHOLD.removal_rounds)
+            if fit.value + bayesian_penalty(1, fit.size) > model.fit.value:
+                return drop_unseen_values(Model(loop, drop_linearization(fit)), given)
     return model
 
 

@@ -127,9 +127,10 @@ def _encode(value: Any) -> Any:
         case AbstractEffect():
             own = {} if type(value).__module__.startswith("ctrlid.") else {
                 "module": type(value).__module__}  # fmt: skip
-            # An effect of a plant with one place has no place to name.
+            # An effect of a plant with one place has no place to name, nor a value out of use.
             fields = {f.name: _encode(getattr(value, f.name)) for f in dataclasses.fields(value)
-                      if f.name != "at" or value.at}  # fmt: skip
+                      if (f.name != "at" or value.at)
+                      and ("parameter" not in f.metadata or f.name in value.values())}  # fmt: skip
             return {"name": type(value).__name__, **own, "parameters": fields}
         case Loop() | SavedLoop():
             return _encode_loop(value)

@@ -252,9 +252,10 @@ def describe_parameters(
     """Write the parameters of an effect with units and standard errors, if they are given."""
     units = list_units(found.loop, effect)
     words = []
+    unused = {p.name for p in effect.parameters()} - set(effect.values())
     for name, value in vars(effect).items():
         if name not in units:
-            words += [f"{name} = {value}"] if value != "" else []
+            words += [f"{name} = {value}"] if value != "" and name not in unused else []
             continue
         error = None if errors is None else errors.get(name)
         words.append(f"{name} = {write_quantity(value, units[name], error)}")

@@ -183,8 +183,11 @@ class AbstractEffect:
 
     def values(self) -> dict[str, float]:
         """Return the values of the parameters, without an optional one that is not made use of."""
-        values = {p: getattr(self, p.name) for p in self.parameters()}
-        return {p.name: v for p, v in values.items() if not (p.optional and v == 0)}
+        return {p.name: getattr(self, p.name) for p in self._list_used()}
+
+    def _list_used(self) -> list[Parameter]:
+        """Return the parameters without an optional one at zero."""
+        return [p for p in self.parameters() if not (p.optional and getattr(self, p.name) == 0)]
 
     @property
     def neutral(self) -> bool:
@@ -209,13 +212,13 @@ class AbstractEffect:
                 signals["y"] = loop.position_unit
             if self.place == "force" and self.at:
                 return self._find_force_units(e, known)
-        return {p.name: fill_unit(p.unit, signals) for p in self.parameters()}
+        return {p.name: fill_unit(p.unit, signals) for p in self._list_used()}
 
     def _find_force_units(self, e: Equations, known: Mapping[str, str]) -> dict[str, str]:
         """Return the units of a force at a velocity: an acceleration, or that of its input."""
         found = find_motion(e, self.at)
         position = "[y]" if found is None else known.get(e.states[found[0]], "") or "[y]"
-        units = {p.name: fill_unit(p.unit, {"y": position}) for p in self.parameters()}
+        units = {p.name: fill_unit(p.unit, {"y": position}) for p in self._list_used()}
         force = ""
         if found is not None and e.push_units:
             force = e.push_units[e.velocities.index(found[1])]
@@ -234,7 +237,7 @@ class AbstractEffect:
             value = getattr(self, f.name)
             if value == "" or f.name == "at":
                 continue
-            if f.name in units and f.name not in self.values():
+            if "parameter" in f.metadata and f.name not in units:
                 continue
             shown = f"{value:.4g} {units[f.name]}" if f.name in units else str(value)
             parts.append(f"{f.name} = {shown.strip()}")

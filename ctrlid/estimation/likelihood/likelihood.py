@@ -20,6 +20,8 @@ from .tails import FlatTails, choose_law, compute_information_shares
 # The sensor's variance is at least this share of the output's mean square, which keeps the
 # likelihood of a noise-free record finite.
 LEAST_SENSOR_SHARE = 1e-14
+# An optional parameter is not in use at zero; one that is fitted comes no nearer.
+LEAST_IN_USE = 1e-12
 # The scale of heavy-tailed noise is known when its logarithm changes by less; it is asked so often.
 SAME_SCALE, SCALE_PASSES = 0.05, 5
 
@@ -140,11 +142,15 @@ def find_priors(
 
 
 def list_effect_bounds(loop: Loop) -> dict[str, tuple[float, float]]:
-    """Return the bounds of the parameters of a loop's effects, by name."""
+    """Return the bounds of the parameters of a loop's effects, by name.
+
+    One that an effect may go without stays in use while it is fitted.
+    """
     return {
-        f"{label}.{p.name}": (p.lower, p.upper)
+        f"{label}.{p.name}": (LEAST_IN_USE if p.optional else p.lower, p.upper)
         for label, effect in loop.labelled.items()
         for p in effect.parameters()
+        if p.name in effect.values()
     }
 
 
