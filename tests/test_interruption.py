@@ -96,7 +96,7 @@ def test_the_answer_so_far(record, tmp_path):
 
 def test_what_was_found_before_the_end_is_kept(monkeypatch):
     """Stopped in the second round, the effect of the first one is named, and nothing is claimed."""
-    real = drive().with_effect(E.InputDeadZone(0.4)).with_effect(E.InputOffset(0.8))
+    real = drive().with_effect(E.CubicStiffness(300.0)).with_effect(E.InputOffset(0.8))
     r = cid.random_binary(1000, amplitude=0.1, hold=50, seed=1)
     record = cid.simulate(real, r, sensor_noise=1e-4, seed=2)
     budgets = []
@@ -113,7 +113,7 @@ def test_what_was_found_before_the_end_is_kept(monkeypatch):
 
     monkeypatch.setattr(Progress, "make_budget", keep)
     monkeypatch.setattr(Progress, "tell", stop)
-    few = (E.InputDeadZone, E.InputOffset)
+    few = (E.CubicStiffness, E.InputOffset)
     found = cid.diagnose(drive(), record, catalogue=few, progress=False)
     assert (found.verdict, found.finished, len(found.findings)) == ("partly explained", False, 1)
     assert "So far the model lacks" in found.sentence

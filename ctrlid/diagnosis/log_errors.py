@@ -90,8 +90,8 @@ def find_log_error(
     heads = [r[: THRESHOLD.log_error_samples] for r in records]
     as_logged = _measure(loop, heads, None)
     found: list[tuple[float, str]] = []
-    for words, repair, factor in _list_repairs():
-        left_out = len(records) if words == EARLY else 0
+    for words, repair, factor, early in _list_repairs():
+        left_out = early * len(records)
         head = _measure(loop, [repair(r) for r in heads], None, factor, left_out)
         if head < as_logged + THRESHOLD.gate:
             continue
@@ -106,13 +106,13 @@ def find_log_error(
     return LogError(", or ".join(same), best)
 
 
-def _list_repairs() -> list[tuple[str, Callable[[Record], Record], float]]:
-    """Return what may be wrong, what mends a record, and the factor by which that multiplies y."""
+def _list_repairs() -> list[tuple[str, Callable[[Record], Record], float, int]]:
+    """Return what may be wrong, what mends a record, its factor of y, and samples that it costs."""
     scaled = [
-        (words, functools.partial(_scale, input_factor=mine, output_factor=factor), factor)
+        (words, functools.partial(_scale, input_factor=mine, output_factor=factor), factor, 0)
         for words, mine, factor in REPAIRS
     ]
-    return [*scaled, (EARLY, _delay_output, 1.0)]
+    return [*scaled, (EARLY, _delay_output, 1.0, 1)]
 
 
 def _scale(record: Record, input_factor: float, output_factor: float) -> Record:
