@@ -42,13 +42,13 @@ model = cid.Loop(plant, None, dt=record.dt, at=rest, free=("a", "b"))
 # %%
 # What is missing?
 # ----------------
-# `diagnose` finds dry friction that is stronger in one direction, with an evidence far above all
-# others. On this plant it is the same as symmetric dry friction with a constant force, and no
-# record of u and y can tell them apart. Its size differs between stretches of the record, so its
-# name does not stand. The residuals are not noise, and the search ends at its bound before it is
-# finished: the verdict is "unknown", and what describes part of the record may stand in for a
-# friction that the catalogue does not have. The difference between the directions is near the
-# published offset.
+# `diagnose` finds two things. One is a line in the reading at 40.03 Hz, or 60 Hz folded at the
+# sampling rate of 100 Hz: the hum of the mains, whose name stands. The other is dry friction that
+# is stronger in one direction, with an evidence far above all others. On this plant it is the same
+# as symmetric dry friction with a constant force, and no record of u and y can tell them apart. Its
+# size differs between stretches of the record, so its name does not stand: it may stand in for a
+# friction that the catalogue does not have. The residuals are not noise, and the search ends at its
+# bound before it is finished. The difference between the directions is near the published offset.
 
 found = cid.diagnose(model, record, validation=other, progress=False)
 print(found)
@@ -71,8 +71,23 @@ for name, sizes in volts.items():
 print(f"gap {found.gap.given:.3f} V as given, {found.gap.after:.3f} V with the effects, "
       f"floor {found.gap.floor:.3f} V")  # fmt: skip
 
-assert found.verdict == "unknown"
-assert not found.findings
+# %%
+# The hum at 1 kHz
+# ----------------
+# The record as it was logged shows the same line where it is, at 60 Hz, and as large.
+
+raw = cid.datasets.load("servo_swept_sine")
+window = np.hanning(raw.n)
+spectrum = 2 * np.abs(np.fft.rfft((raw.y - raw.y.mean()) * window)) / window.sum()
+frequency = np.fft.rfftfreq(raw.n, raw.dt)
+fast = frequency > 50
+line = frequency[fast][np.argmax(spectrum[fast])]
+print(f"the largest line above 50 Hz: {1e3 * spectrum[fast].max():.0f} mV at {line:.2f} Hz")
+
+(hum,) = found.findings
+assert hum.name == "SensorHum"
+assert abs(1 / record.dt - hum.effect.frequency - line) < 0.02
+assert 0.7 < hum.effect.amplitude / spectrum[fast].max() < 1.3
 assert found.stand_ins[0].name == "AsymmetricCoulombFriction"
 assert abs(volts["AsymmetricCoulombFriction"]["difference"] - 0.75) < 0.15
 assert found.gap.after < found.gap.given
