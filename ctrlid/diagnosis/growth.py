@@ -378,6 +378,8 @@ def _look_back(
         pairs.append((trial.net_gain + max((t.net_gain for t in done), default=-math.inf), k))
     total, k = max(pairs, default=(-math.inf, 0))
     own = best.net_gain + (step.best.net_gain if step.best is not None else THRESHOLD.gate)
+    # Other noise may have been chosen since, beside which what follows has less to gain.
+    own += max(0.0, compute_criterion(step.base) - compute_criterion(best.model))
     return near[k] if total > own + THRESHOLD.gate else None
 
 

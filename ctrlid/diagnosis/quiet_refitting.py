@@ -36,7 +36,7 @@ def refit_quietly(base: Model, effects: Sequence[AbstractEffect], work: Work) ->
     -------
     list of Trial
         The likeliest under hardly any force, refitted with the force free; none where the noise is
-        known beforehand, beside which every score is as good.
+        known beforehand, or the model does with hardly any force: there every score is as good.
     """
     if base.fit.known is not None or not math.isfinite(base.fit.value):
         return []
@@ -49,6 +49,8 @@ def refit_quietly(base: Model, effects: Sequence[AbstractEffect], work: Work) ->
     if not math.isfinite(held.value):
         return []
     quiet = with_linearization(Model(base.loop, maximize(held, exact=False)))
+    if quiet.fit.value > base.fit.value - THRESHOLD.gate:
+        return []
     tried: list[Trial] = work(lambda effect: scan_candidate(quiet, effect), effects)
     tried = sorted(tried, key=lambda t: -t.score)[: THRESHOLD.tried_quietly]
     fits = work(lambda t: _climb_quietly(quiet, t), tried)

@@ -266,11 +266,11 @@ class Thresholds:
         "runs the rule spoke in four, all of them limited rates", unit="of what all explain",
     )  # fmt: skip
     looked_back: int = declare_number(
-        4, cost="so many choices that a round did not take are asked what could follow on them",
+        3, cost="so many choices that a round did not take are asked what could follow on them",
         unit="candidates",
     )  # fmt: skip
     tried_quietly: int = declare_number(
-        8, cost="so many are refitted under hardly any random force, those of the best scores",
+        6, cost="so many are refitted under hardly any random force, those of the best scores",
         unit="candidates",
     )  # fmt: skip
     released: int = declare_number(
