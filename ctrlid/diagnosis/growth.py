@@ -378,8 +378,13 @@ def _look_back(
         pairs.append((trial.net_gain + max((t.net_gain for t in done), default=-math.inf), k))
     total, k = max(pairs, default=(-math.inf, 0))
     own = best.net_gain + (step.best.net_gain if step.best is not None else THRESHOLD.gate)
-    # Other noise may have been chosen since, beside which what follows has less to gain.
-    own += max(0.0, compute_criterion(step.base) - compute_criterion(best.model))
+    before, since = best.model.fit.noise, step.base.fit.noise
+    if (before.sensor_is_white, before.tails is None) != (
+        since.sensor_is_white,
+        since.tails is None,
+    ):
+        # Beside other noise of the sensor, which was chosen since, what follows has less to gain.
+        own += max(0.0, compute_criterion(step.base) - compute_criterion(best.model))
     return near[k] if total > own + THRESHOLD.gate else None
 
 
