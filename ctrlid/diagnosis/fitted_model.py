@@ -20,6 +20,7 @@ from ..estimation.likelihood.likelihood import (
     list_start_values,
     relinearize_fit,
 )
+from ..estimation.likelihood.maximization import quieten_force
 from ..estimation.likelihood.noise_fit import count_noise_parameters
 from ..estimation.likelihood.sampled_plant import SampledPlant, Trajectory
 from ..estimation.likelihood.tails import choose_law
@@ -81,8 +82,7 @@ def without_random_force(model: Model) -> Model:
     noise = model.fit.noise
     if model.fit.known is not None:
         return model
-    force = tuple(THRESHOLD.quiet_force * v for v in noise.force)
-    quiet = replace(noise, force=force, memory=0.0, drift=0.0)
+    quiet = replace(quieten_force(noise), memory=0.0, drift=0.0)
     return replace(model, fit=replace(model.fit, noise=quiet))
 
 

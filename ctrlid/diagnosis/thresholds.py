@@ -188,10 +188,6 @@ class Thresholds:
         0.5, cost="a candidate whose score is smaller is not refitted",
         unit="of the score that would earn a place",
     )  # fmt: skip
-    quiet_force: float = declare_number(
-        1e-4, study="kinks are sharp under so small a random force, from which a fit begins anew",
-        unit="of the force's variance",
-    )  # fmt: skip
     significant: float = declare_number(
         2.0, law="a fitted effect that is smaller may as well be absent", unit="standard errors"
     )
