@@ -1,7 +1,7 @@
 """Forces of the EMPS drive: the model that `diagnose` completes, beside the published one.
 
 Run it as ``python benchmarks/emps_forces.py``. It first prints the diagnosis of the story
-``examples/real_emps.py``, which takes about two minutes. The records are downloaded once, or read
+``examples/real_emps.py``, which takes some minutes. The records are downloaded once, or read
 from the folder that the environment variable CTRLID_DATA_DIR names.
 """
 
