@@ -368,24 +368,42 @@ def _look_back(
     likely = {t.key for t in (ranked if step.best is None else ranked[: THRESHOLD.looked_at])}
     pairs: list[tuple[float, int]] = []
     for k, trial in enumerate(near):
-        model = with_linearization(trial.model)
+        model, earned = _adopt_noise(trial.model, best.model, step.base)
         pool = [c for c in list_missing_candidates(model, catalogue)
                 if not c.is_scanned() or name_at_place(c) in likely]  # fmt: skip
         tried: list[Trial] = work(lambda effect, model=model: scan_candidate(model, effect), pool)
         tried = sorted(tried, key=lambda t: t.full_penalty - t.score)[: THRESHOLD.released]
         done = work(lambda t, model=model: refit_candidate(model, t), tried)
         done += refit_quietly(model, pool, work)
-        pairs.append((trial.net_gain + max((t.net_gain for t in done), default=-math.inf), k))
+        follows = max((t.net_gain for t in done), default=-math.inf)
+        pairs.append((trial.net_gain + earned + follows, k))
     total, k = max(pairs, default=(-math.inf, 0))
     own = best.net_gain + (step.best.net_gain if step.best is not None else THRESHOLD.gate)
-    before, since = best.model.fit.noise, step.base.fit.noise
-    if (before.sensor_is_white, before.tails is None) != (
-        since.sensor_is_white,
-        since.tails is None,
-    ):
-        # Beside other noise of the sensor, which was chosen since, what follows has less to gain.
+    if not _has_same_sensor_noise(best.model, step.base):
         own += max(0.0, compute_criterion(step.base) - compute_criterion(best.model))
     return near[k] if total > own + THRESHOLD.gate else None
+
+
+def _adopt_noise(model: Model, before: Model, since: Model) -> tuple[Model, float]:
+    """Return a model with the sensor noise that was chosen since beside another, and what it gains.
+
+    Beside other noise of the sensor what follows has less to gain, so that two choices are
+    compared beside the same. Where it gains nothing, or none was chosen since, the model stays.
+    """
+    model = with_linearization(model)
+    if _has_same_sensor_noise(before, since):
+        return model, 0.0
+    fit = maximize(replace(model.fit, noise=since.fit.noise), exact=False)
+    other = Model(model.loop, fit)
+    earned = compute_criterion(other) - compute_criterion(model)
+    return (with_linearization(other), earned) if earned > 0 else (model, 0.0)
+
+
+def _has_same_sensor_noise(one: Model, other: Model) -> bool:
+    """Whether the sensor noise of two models is of one kind."""
+    a, b = one.fit.noise, other.fit.noise
+    same_tails = (a.tails is None) == (b.tails is None)
+    return a.sensor_is_white == b.sensor_is_white and same_tails
 
 
 def measure_unexplained_likelihood(fit: Fit) -> float:
