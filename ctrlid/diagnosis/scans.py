@@ -13,6 +13,7 @@ from .._base.statistics import pseudo_inverse
 from ..data.record import Record
 from ..effects import AbstractEffect
 from ..effects.context import find_output_of
+from ..estimation.likelihood.force_score import compute_force_scores
 from ..estimation.likelihood.kalman_filter import run_filter
 from .candidates import NUMERICAL_FAILURES, Objection, Trial
 from .fitted_model import Model
@@ -181,6 +182,11 @@ class ModelSight:
         """Return the fitted value of a free parameter of the plant, or None if it is not free."""
         names = self.model.names
         return float(self.model.fit.theta[names.index(name)]) if name in names else None
+
+    def force_scores(self, draws: int) -> list[Array]:
+        """Return the derivative of the log-likelihood by a force held over each single period."""
+        channel = find_force_channel(self.model.plant.e, self.at) if self.at else None
+        return compute_force_scores(self.model.fit, draws, channel)
 
     def strongest_line(self) -> float:
         """Return the frequency of the strongest line in the innovations [Hz]."""

@@ -353,7 +353,7 @@ class Thresholds:
     experiment_shortest: int = declare_number(5000, cost="of a recommended experiment, at least",
                                      unit="samples")  # fmt: skip
     experiment_tried: int = declare_number(
-        5000, cost="on which references are compared", unit="samples"
+        2000, cost="on which references are compared", unit="samples"
     )
     experiment_levels: tuple[float, ...] = declare_number(
         (-1.0, 1.0, -0.5, 0.5, 0.0), convention="set-points that a reference visits",

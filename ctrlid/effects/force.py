@@ -1,6 +1,7 @@
 """Forces that depend on place or time, as accelerations of the moving mass."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Self, final
 
@@ -30,6 +31,10 @@ SLOW_SHARE = 0.25
 NEARLY = 0.7
 # At most so many waves are refitted, to save time.
 PEAKS = 4
+# Records of the same model from which the information on the size of a wave is guessed.
+DRAWS = 32
+# So many waves are summed together, which is faster than one by one.
+TOGETHER = 8
 # A flexible mode is scanned at so many frequencies, to save time.
 MODES = 7
 # A mode with fewer periods in the record is no vibration.
@@ -44,6 +49,30 @@ def _find_peaks(gains: Array, nearly: float, most: int) -> list[int]:
     tops = np.flatnonzero((gains >= padded[:-2]) & (gains > padded[2:]))
     tops = tops[gains[tops] > nearly * gains.max()]
     return [int(k) for k in tops[np.argsort(-gains[tops])][:most]] or [int(np.argmax(gains))]
+
+
+def _guess_gains(sight: Sight, positions: Sequence[Array], numbers: Array) -> Array:
+    r"""Return about what forces :math:`e^{2 \pi i \kappa x}` gain, for evenly spaced wave numbers.
+
+    .. math:: \tfrac12 g^T H^{-1} g, \quad g = \sum_k f_k \lambda_k
+
+    with the variance H of g over records of the same model, which a few draws tell roughly.
+    """
+    scores = sight.force_scores(DRAWS)
+    step = numbers[1] - numbers[0] if len(numbers) > 1 else 0.0
+    waves = [np.exp(2j * np.pi * np.outer(numbers[:TOGETHER], x)) for x in positions]
+    turns = [np.exp(2j * np.pi * TOGETHER * step * x) for x in positions]
+    found: list[float] = []
+    while len(found) < len(numbers):
+        pairs = zip(waves, scores, strict=True)
+        sums = np.sum([(w.real @ s, w.imag @ s) for w, s in pairs], axis=0)
+        for k in range(sums.shape[1]):
+            own, drawn = sums[:, k, 0], sums[:, k, 1:]
+            inverse = np.linalg.pinv(drawn @ drawn.T / DRAWS, hermitian=True)
+            found.append(0.5 * float(own @ inverse @ own))
+        for wave, turn in zip(waves, turns, strict=True):
+            wave *= turn
+    return np.array(found[: len(numbers)])
 
 
 def _find_quantization_step(y: Array) -> float:
@@ -270,7 +299,10 @@ class PositionRipple(ForceEffect):
         return {"period": (-math.inf, seen.travel)}
 
     def scan(self, sight: Sight) -> Scan:
-        """Look at all wavelengths that the travel can show, and then finely at the best of them."""
+        """Look at all wavelengths that the travel can show, and then finely at the best of them.
+
+        What a wave gains is guessed for all of them, and computed for those that may be the best.
+        """
         positions, travel = sight.positions(), sight.travel
         step = max(float(np.quantile(np.abs(np.diff(w)), SLOW_SHARE)) for w in positions)
         grain = max(_find_quantization_step(y) for y in sight.outputs)
@@ -280,24 +312,18 @@ class PositionRipple(ForceEffect):
         finest = 0.25 / travel
         places = max((1.0 / shortest - 1.0 / travel) * travel, 1)
 
-        def gains_of(numbers: Array) -> tuple[Array, Array]:
-            parts = []
-            for k in range(0, len(numbers), sight.block):
-                angles = [2 * np.pi * np.outer(w, numbers[k : k + sight.block]) for w in positions]
-                parts.append(sight.score_shapes([make_waves(a) for a in angles], width=2))
-            gains, sizes = zip(*parts, strict=True)
-            return np.concatenate(gains), np.concatenate(sizes)
-
-        numbers = np.arange(1.0 / travel, 1.0 / shortest, 2 * finest)
-        gains, sizes = gains_of(numbers)
         # A peak is about one over the travel wide: only those that may be the highest are seen
         # finely.
-        tops = _find_peaks(gains, NEARLY**2, 2 * PEAKS)
-        between = np.concatenate([numbers[tops] - finest, numbers[tops] + finest])
-        between = np.unique(between[between > 0])
-        more, theirs = gains_of(between)
-        numbers, first = np.unique(np.concatenate([numbers, between]), return_index=True)
-        gains, sizes = (np.concatenate(x)[first] for x in ((gains, more), (sizes, theirs)))
+        numbers = np.arange(1.0 / travel, 1.0 / shortest, finest)
+        likely = _find_peaks(_guess_gains(sight, positions, numbers[::2]), 0.0, 4 * PEAKS)
+        near = np.unique(np.add.outer(2 * np.array(likely), (-1, 0, 1)))
+        near = near[(near >= 0) & (near < len(numbers))]
+        gains, sizes = np.zeros(len(numbers)), np.zeros((len(numbers), 2))
+        for k in range(0, len(near), sight.block):
+            part = near[k : k + sight.block]
+            angles = [2 * np.pi * np.outer(w, numbers[part]) for w in positions]
+            waves = [make_waves(a) for a in angles]
+            gains[part], sizes[part] = sight.score_shapes(waves, width=2)
 
         def at(k: int) -> PositionRipple:
             amplitude, phase = compute_amplitude_and_phase(sizes[k])

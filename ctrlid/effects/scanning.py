@@ -84,6 +84,20 @@ class Sight(Overview, Protocol):
     def parameter(self, name: str) -> float | None:
         """Return the fitted value of a free parameter of the plant, or None if it is not free."""
 
+    def force_scores(self, draws: int) -> Sequence[Array]:
+        """Return the derivative of the log-likelihood by a force held over each single period.
+
+        Parameters
+        ----------
+        draws : int
+            Of as many records of the same model they are computed as well.
+
+        Returns
+        -------
+        sequence of ndarray, shape (n, 1 + draws)
+            By record, its own scores in the first column.
+        """
+
     def score_shapes(
         self, shapes: Sequence[Array], parameter: str | None = None, width: int = 1,
         place: Literal["force", "output"] = "force",

@@ -113,20 +113,8 @@ def run_filter(
     p = p if sensitive else 0
     if lin.output.ndim == 2:
         return _run_several(data, lin, noise, p)
-    n, white, tails = plant.size, noise.sensor_is_white, noise.tails
-    force = np.asarray(noise.force, dtype=float)
-    if not white:
-        lin, force = append_sensor_noise(lin, force, noise)
-    states = lin.step.shape[1]
-    check_budget(len(lin.step))
-    out = filter_pass(
-        lin.step, lin.a, lin.b, lin.du, np.ascontiguousarray(lin.dp[:, :, :p]), lin.output,
-        lin.c, np.ascontiguousarray(lin.hp[:, :p]), lin.trajectory.predicted,
-        lin.trajectory.filtered, data.y, data.valid, data.restart, lin.input_variance,
-        lin.start, lin.spread, 1.0 if white else 0.0, _list_tails(tails),
-        force, noise.memory, noise.drift,
-        *choose_sizes(states, states + bool(noise.drift > 0), len(lin.step)),
-    )  # fmt: skip
+    n, tails = plant.size, noise.tails
+    out = filter_pass(*_arrange_pass(data, lin, noise, p))
     error, variance, before, after, wide, slopes, disturbance = out
     before, after, wide = before[:, :n], after[:, :n], wide[:, :n]
     counts = data.usable
@@ -168,25 +156,9 @@ def _run_several(
     over a whole period, :math:`\rho^{1/q}` in each of q updates.
     """
     size, q = lin.output.shape
-    each = _list_updates(lin)
-    scale = np.sqrt([1.0, *noise.sensors] if sensors is None else sensors)
-    memory, tails = noise.memory ** (1 / q), noise.tails
-    states = lin.step.shape[1]
-    restart = np.zeros((size, q), dtype=bool)
-    restart[:, 0] = data.restart
-    unsure = np.zeros((size, q))
-    unsure[:, -1] = lin.input_variance
-    check_budget(size * q)
-    error, variance, before, after, wide, slopes, disturbance = filter_pass(
-        each.step, each.a, each.b, each.du, np.ascontiguousarray(each.dp[:, :, :p]),
-        (lin.output / scale).ravel(), (lin.c / scale[:, None]).reshape(size * q, states),
-        np.ascontiguousarray((lin.hp[:, :, :p] / scale[:, None]).reshape(size * q, p)),
-        each.trajectory.predicted, each.trajectory.filtered, (data.y / scale).ravel(),
-        data.valid.ravel(), restart.ravel(), unsure.ravel(), lin.start, lin.spread, 1.0,
-        _list_tails(tails), np.asarray(noise.force, dtype=float), memory,
-        noise.coloured * (1 - memory**2),
-        *choose_sizes(states, states + bool(noise.drift > 0), size * q),
-    )  # fmt: skip
+    scale, tails = np.sqrt([1.0, *noise.sensors] if sensors is None else sensors), noise.tails
+    out = filter_pass(*_arrange_updates(data, lin, noise, p, scale))
+    error, variance, before, after, wide, slopes, disturbance = out
     error, variance = error.reshape(size, q) * scale, variance.reshape(size, q) * scale**2
     # The caller reports a filter that lost the record, so that no warning is needed here.
     with np.errstate(all="ignore"):
@@ -195,6 +167,54 @@ def _run_several(
     trajectory = Trajectory(before[::q], after[q - 1 :: q], wide[q - 1 :: q] * sensor)
     return Filtered(error, variance, trajectory, slopes.reshape(size, q, p) * scale[:, None],
                     disturbance[q - 1 :: q])  # fmt: skip
+
+
+def arrange_pass(data: FilterData, lin: Linearized, noise: Noise) -> tuple[Any, ...]:
+    """Return the arguments of a pass without sensitivities, a sample for each output."""
+    if lin.output.ndim == 1:
+        return _arrange_pass(data, lin, noise, 0)
+    return _arrange_updates(data, lin, noise, 0, np.sqrt([1.0, *noise.sensors]))
+
+
+def _arrange_pass(data: FilterData, lin: Linearized, noise: Noise, p: int) -> tuple[Any, ...]:
+    """Return the arguments of a pass over one output, with sensitivities to p parameters."""
+    white, force = noise.sensor_is_white, np.asarray(noise.force, dtype=float)
+    if not white:
+        lin, force = append_sensor_noise(lin, force, noise)
+    size, states = lin.step.shape
+    check_budget(size)
+    return (
+        lin.step, lin.a, lin.b, lin.du, np.ascontiguousarray(lin.dp[:, :, :p]), lin.output,
+        lin.c, np.ascontiguousarray(lin.hp[:, :p]), lin.trajectory.predicted,
+        lin.trajectory.filtered, data.y, data.valid, data.restart, lin.input_variance,
+        lin.start, lin.spread, 1.0 if white else 0.0, _list_tails(noise.tails),
+        force, noise.memory, noise.drift,
+        *choose_sizes(states, states + bool(noise.drift > 0), size),
+    )  # fmt: skip
+
+
+def _arrange_updates(
+    data: FilterData, lin: Linearized, noise: Noise, p: int, scale: Array
+) -> tuple[Any, ...]:
+    """Return the arguments of a pass over several outputs, each divided by its scale."""
+    size, q = lin.output.shape
+    each, states = _list_updates(lin), lin.step.shape[1]
+    memory = noise.memory ** (1 / q)
+    restart = np.zeros((size, q), dtype=bool)
+    restart[:, 0] = data.restart
+    unsure = np.zeros((size, q))
+    unsure[:, -1] = lin.input_variance
+    check_budget(size * q)
+    return (
+        each.step, each.a, each.b, each.du, np.ascontiguousarray(each.dp[:, :, :p]),
+        (lin.output / scale).ravel(), (lin.c / scale[:, None]).reshape(size * q, states),
+        np.ascontiguousarray((lin.hp[:, :, :p] / scale[:, None]).reshape(size * q, p)),
+        each.trajectory.predicted, each.trajectory.filtered, (data.y / scale).ravel(),
+        data.valid.ravel(), restart.ravel(), unsure.ravel(), lin.start, lin.spread, 1.0,
+        _list_tails(noise.tails), np.asarray(noise.force, dtype=float), memory,
+        noise.coloured * (1 - memory**2),
+        *choose_sizes(states, states + bool(noise.drift > 0), size * q),
+    )  # fmt: skip
 
 
 def _list_tails(tails: Tails | JointTails | None) -> Array:

@@ -1,0 +1,152 @@
+"""How the likelihood depends on a force in every single period: the filter run backwards."""
+
+from typing import Any
+
+import numpy as np
+
+from ..._base.arrays import Array
+from ..._base.compilation import compile_loop
+from ..._base.interruption import keep_interrupt
+from ..._base.statistics import pseudo_inverse
+from .kalman_filter import arrange_pass
+from .kalman_recursion import filter_pass
+from .likelihood import Fit
+
+
+def compute_force_scores(
+    fit: Fit, draws: int = 0, channel: int | None = None, seed: int = 0
+) -> list[Array]:
+    r"""Return the derivative of the log-likelihood by a force that is held over a single period.
+
+    .. math:: \lambda_k = b_k^T p_{k+1}, \quad
+        p_k = c_k^T w_k + (I - K_k c_k)^T A_k^T p_{k+1}, \quad w_k = e_k / s_k
+
+    which is the recursion of the sensitivities of `kalman_recursion.filter_pass` in reverse. A
+    force of any shape f then has the score :math:`\sum_k f_k \lambda_k`, at the price of a sum
+    where a pass of the filter is needed otherwise. The model's own parameters move along.
+
+    Parameters
+    ----------
+    fit : Fit
+        A fit with the plant along its trajectory.
+    draws : int, optional
+        Of as many records of the same model the scores are computed as well: the variance of
+        :math:`\sum_k f_k \lambda_k` over them is the information on the size of the force.
+    channel : int, optional
+        Which of several forces; by default one on all of them.
+    seed : int, optional
+        Seed of the draws.
+
+    Returns
+    -------
+    list of ndarray, shape (n, 1 + draws)
+        For each record, the score of each period; of the record itself in the first column.
+
+    References
+    ----------
+    de Jong, Journal of the American Statistical Association 84 (1989) 1085-1088; Durbin and
+    Koopman, *Time Series Analysis by State Space Methods* (2012), section 4.5.
+    """
+    weights = _weigh_innovations(fit, draws, seed)
+    found = []
+    for data, lin, part in zip(fit.data, fit.linearized, weights, strict=True):
+        arguments = arrange_pass(data, lin, fit.noise)
+        a, b, c, valid, restart = (arguments[k] for k in (1, 2, 6, 11, 12))
+        memory, drift = arguments[19:21]
+        out = filter_pass(*arguments)
+        gain = _find_gains(out, restart, valid, memory, drift)
+        pushed = b.sum(axis=2) if channel is None else np.ascontiguousarray(b[:, :, channel])
+        # Several outputs are updates one after another, of which only the last moves the state.
+        updates = len(a) // len(lin.step)
+        if updates > 1:
+            part = part * np.sqrt([1.0, *fit.noise.sensors])[None, :, None]
+        scores = _carry_back(a, b, pushed, c, gain, valid, restart, memory,
+                             np.ascontiguousarray(part.reshape(len(a), -1)))  # fmt: skip
+        found.append(scores[updates - 1 :: updates])
+    return found
+
+
+def _weigh_innovations(fit: Fit, draws: int, seed: int) -> list[Array]:
+    """Return innovations over their variances, what the model's parameters explain taken out.
+
+    Those of the records come first, then draws of white innovations, each along the last axis.
+    """
+    rng = np.random.default_rng(seed)
+    p = len(fit.theta)
+    information, score = np.zeros((p, p)), np.zeros((p, 1 + draws))
+    parts = []
+    for out, keep, (e, s) in zip(fit.filtered, fit.counts, fit.working, strict=True):
+        weighted = np.zeros((*keep.shape, 1 + draws))
+        weighted[keep, 0] = e[keep] / s[keep]
+        count = int(np.count_nonzero(keep))
+        weighted[keep, 1:] = rng.standard_normal((count, draws)) / np.sqrt(s[keep])[:, None]
+        slopes = out.slopes[keep]
+        information += (slopes / s[keep, None]).T @ slopes
+        score += slopes.T @ weighted[keep]
+        parts.append(weighted)
+    moved = pseudo_inverse(information) @ score if p else score
+    for out, keep, (_, s), weighted in zip(fit.filtered, fit.counts, fit.working, parts,
+                                           strict=True):  # fmt: skip
+        weighted[keep] -= out.slopes[keep] @ moved / s[keep, None]
+    return parts
+
+
+def _find_gains(out: Any, restart: Any, valid: Any, memory: float, drift: float) -> Array:
+    """Return the gain of each update, by which it moved the states for its innovation."""
+    error, _, before, after, _, _, disturbance = out
+    moved = after - before
+    if drift > 0.0:
+        last = np.concatenate([[0.0], disturbance[:-1]])
+        expected = np.where(restart, 0.0, memory * last)
+        moved = np.column_stack([moved, disturbance - expected])
+    # An innovation that is exactly zero moves nothing, and tells nothing of the gain.
+    known = valid & (error != 0.0)
+    return np.asarray(np.where(known[:, None], moved, 0.0) / np.where(known, error, 1.0)[:, None])
+
+
+@keep_interrupt
+@compile_loop(nogil=True, error_model="numpy")
+def _carry_back(
+    a: Any, b: Any, pushed: Any, c: Any, gain: Any, valid: Any, restart: Any, memory: Any,
+    weights: Any,
+) -> Any:  # fmt: skip  # pragma: no cover - compiled
+    """Return the scores of `compute_force_scores`, from the matrices of a pass and its gains.
+
+    A filter has a state more than the plant where there is a coloured force.
+    """
+    size, n = c.shape
+    w, columns = gain.shape[1], weights.shape[1]
+    scores = np.zeros((size, columns))
+    after, before = np.zeros((w, columns)), np.zeros((w, columns))
+    for k in range(size - 1, -1, -1):
+        for q in range(columns):
+            total = 0.0
+            for i in range(n):
+                total += pushed[k, i] * after[i, q]
+            scores[k, q] = total
+        for j in range(n):
+            for q in range(columns):
+                total = 0.0
+                for i in range(n):
+                    total += a[k, i, j] * after[i, q]
+                before[j, q] = total
+        for j in range(n, w):
+            for q in range(columns):
+                total = memory * after[j, q]
+                for i in range(n):
+                    push = 0.0
+                    for m in range(b.shape[2]):
+                        push += b[k, i, m]
+                    total += push * after[i, q]
+                before[j, q] = total
+        for q in range(columns):
+            seen = weights[k, q]
+            if valid[k]:
+                for i in range(w):
+                    seen -= gain[k, i] * before[i, q]
+            for i in range(n):
+                before[i, q] += c[k, i] * seen
+        after, before = before, after
+        if restart[k]:
+            after[:] = 0.0
+    return scores
