@@ -17,6 +17,7 @@ from ctrlid.diagnosis.gap import (
     compute_excess_chance,
     compute_widening_chance,
     halve_windows,
+    measure_constant_error,
     measure_spreads,
     measure_trivial_error,
     root_mean_square,
@@ -232,6 +233,32 @@ def test_a_horizon_at_which_a_straight_line_wins_is_lengthened(monkeypatch):
     assert not replace(gap, after=0.05).trivial_wins
     simulated = FreshData((window(y),), None, Reproduction("closed-loop simulation"))
     assert gap_summary.lengthen_horizon(None, search, simulated) is simulated
+
+
+def test_a_horizon_beyond_which_the_bare_models_lose_the_record_is_not_taken(monkeypatch):
+    y = np.sin(0.002 * np.arange(2000))
+
+    def simulate_outputs(self, loop):
+        # An unstable model errs by e-fold more for every sample that it looks ahead.
+        return (y + (0.005 if loop[0] == "complete" else 1e-4 * np.exp(self.how.horizon)),)
+
+    monkeypatch.setattr(FreshData, "simulate_outputs", simulate_outputs)
+    fresh = FreshData((window(y),), None, Reproduction("prediction", 5))
+    search = SimpleNamespace(base=SimpleNamespace(fitted="bare"),
+                             final=SimpleNamespace(fitted="complete"))  # fmt: skip
+    wins_at_80 = measure_trivial_error(fresh.windows, 80)
+    assert measure_trivial_error(fresh.windows, 20) < 0.005 < wins_at_80
+    assert gap_summary.lengthen_horizon("bare", search, fresh) is fresh
+
+
+def test_a_constant_errs_by_what_the_output_moves():
+    y = np.stack([np.sin(np.arange(400.0)), 3 + np.cos(np.arange(400.0))])
+    mask = np.ones((2, 400), bool)
+    mask[1, 100:] = False
+    record = cid.Record(u=np.zeros(400), y=y, dt=0.01)
+    expected = np.sqrt((np.sum((y[0] - y[0].mean()) ** 2)
+                        + np.sum((y[1, :100] - y[1, :100].mean()) ** 2)) / 500)  # fmt: skip
+    assert measure_constant_error([Window(record, 0.0, mask)]) == pytest.approx(expected)
 
 
 def test_a_gap_is_named_by_its_kind_and_horizon():

@@ -178,6 +178,13 @@ def test_lost_degrees_are_said():
     assert "below the robust margin of 0.208" in found.verdict
 
 
+def test_a_small_robust_margin_is_printed_with_its_digits():
+    found = cid.redesign(gain(1.1), LOOP, crossover=100, phase_margin=50)
+    small = replace(found, nu_gap=3.1e-5, robust_margin=2.3e-4)
+    assert "model and physics is 0.00003" in small.verdict
+    assert "below the robust margin of 0.00023" in small.verdict
+
+
 @pytest.mark.parametrize(
     ("model", "reason"),
     [

@@ -296,24 +296,3 @@ def test_the_number_of_arguments_counts():
     f = BlockEvaluation(casadi.Function("f", [casadi.SX.sym("a"), casadi.SX.sym("b")], [1.0]))
     with pytest.raises(ValueError, match="argument"):
         f(1.0)
-
-
-def test_what_divides_more_than_once_is_inverted_once():
-    x, y, z = (casadi.SX.sym(name) for name in "xyz")
-    function = casadi.Function("shared", [x, y, z], [x / z, y / z, (x + y) / z, x / y])
-    program = BlockEvaluation(function).program
-    counts = {op: int(np.count_nonzero(program[:, 0] == op))
-              for op in (casadi.OP_INV, casadi.OP_MUL, casadi.OP_DIV)}  # fmt: skip
-    assert counts == {casadi.OP_INV: 1, casadi.OP_MUL: 3, casadi.OP_DIV: 1}
-    rng = np.random.default_rng(1)
-    same(function, *rng.standard_normal((3, 1, 700)))
-
-
-def test_a_divisor_whose_register_is_written_again_is_another():
-    x, z = casadi.SX.sym("x"), casadi.SX.sym("z")
-    w, total = z, casadi.SX(0)
-    for _ in range(6):
-        total = total + x / w + casadi.sin(x) / w
-        w = w * z + 1.5
-    rng = np.random.default_rng(2)
-    same(casadi.Function("chain", [x, z], [total]), *rng.uniform(0.5, 1.5, (2, 1, 700)))

@@ -160,10 +160,12 @@ class Redesign(Printed):
             text += (f" THE RESPONSE TO A STEP of {self.step:.3g} ends at {a.final_value:.3g} per "
                      f"unit, where {p.final_value:.3g} is promised.")  # fmt: skip
         sure = self.nu_gap < self.robust_margin
+        # Where the units of a loop make the margin small, it has more digits.
+        digits = max(3, min(15, 1 - math.floor(math.log10(max(self.robust_margin, 1e-14)))))
         return (
             f"{text} Stability near the operating point is {'' if sure else 'not '}guaranteed: "
-            f"the nu-gap between model and physics is {self.nu_gap:.3f}, and it has to be below "
-            f"the robust margin of {self.robust_margin:.3f}."
+            f"the nu-gap between model and physics is {self.nu_gap:.{digits}f}, and it has to be "
+            f"below the robust margin of {self.robust_margin:.{digits}f}."
         )
 
     @property

@@ -132,6 +132,17 @@ def measure_trivial_error(windows: Sequence[Window], horizon: int) -> float:
     )
 
 
+def measure_constant_error(windows: Sequence[Window]) -> float:
+    """Return the RMS error of the mean of each output: how much it moves [output unit]."""
+    constants = []
+    for window in windows:
+        y = np.asarray(window.record.y, dtype=float)
+        count = np.maximum(np.sum(window.mask, axis=-1, keepdims=True), 1)
+        total = np.sum(np.where(window.mask, y, 0.0), axis=-1, keepdims=True)
+        constants.append(np.broadcast_to(total / count, y.shape))
+    return root_mean_square(windows, constants)
+
+
 def _extrapolate_outputs(record: Record, horizon: int, samples: int) -> Array:
     """Return what `_extrapolate` does, for each of several outputs."""
     if record.y.ndim == 1:

@@ -121,7 +121,9 @@ def lengthen_horizon(loop: Loop, found: Search, fresh: FreshData) -> FreshData:
     """Return fresh data with a horizon at which a model predicts better than a trivial predictor.
 
     A horizon at which the last value or a straight line wins says nothing of the models, so it is
-    doubled until it does not, up to a tenth of the record; where none does, it stays as it is.
+    doubled until it does not, up to a tenth of the record; where none does, it stays as it is. It
+    also stays where models without effects already err by more than a constant: the predictions of
+    an unstable plant leave the record further and further, and any effect closes much of that.
     """
     horizon, windows = fresh.how.horizon, fresh.windows
     if not horizon:
@@ -135,7 +137,8 @@ def lengthen_horizon(loop: Loop, found: Search, fresh: FreshData) -> FreshData:
         best = min(gaps.root_mean_square(shared, y) for y in results)
         if best <= gaps.measure_trivial_error(shared, horizon):
             return longer
-        if horizon >= longest:
+        bare = min(gaps.root_mean_square(shared, y) for y in results[:2])
+        if horizon >= longest or bare > gaps.measure_constant_error(shared):
             return fresh
         horizon = min(2 * horizon, longest)
 

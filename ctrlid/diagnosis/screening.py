@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from ..effects import AbstractEffect
-from ..estimation.likelihood.likelihood import Fit, evaluate_likelihood, relinearize_fit
+from ..estimation.likelihood.likelihood import evaluate_likelihood
 from ..estimation.likelihood.maximization import compute_expected_gain
 from .candidates import Objection, Trial
 from .fitted_model import Model, carry_over_fit, drop_arrays
@@ -78,7 +78,7 @@ def screen_at(base: Model, effect: AbstractEffect, scan_penalty: float = 0.0) ->
     if not math.isfinite(fit.value):
         lost = Objection("cannot run", "cannot follow the record")
         return Trial(effect, label, model, -math.inf, scan_penalty, out=lost)
-    score = _compute_score(base, fit)
+    score = fit.value - base.fit.value + compute_expected_gain(fit)
     return Trial(effect, label, Model(loop, drop_arrays(fit)), score, scan_penalty)
 
 
@@ -89,30 +89,20 @@ def screen_starts(base: Model, effects: Sequence[AbstractEffect], scan_penalty: 
         return best
     label, loop, names = best.label, best.model.loop, best.model.names
     start = carry_over_fit(base, loop, names)
-    tried: list[tuple[float, Fit, AbstractEffect]] = []
     for effect in effects[1:]:
         theta = start.theta.copy()
         for field, value in effect.values().items():
             # A parameter that the model's own parameters duplicate is not free.
             if f"{label}.{field}" in names:
                 theta[names.index(f"{label}.{field}")] = value
-        fit = evaluate_likelihood(start.problem, theta, start.noise, start.trajectories)
-        tried.append((_compute_score(base, fit), fit, effect))
-    if start.plant.n == base.plant.n:
-        # The states are about where they were, so that one pass tells which are the best.
-        tried = sorted(tried, key=lambda one: -one[0])[: THRESHOLD.looked_at]
-    for _, first, effect in tried:
+        fit = start
         # The second pass linearizes along the states that the first one found.
-        fit = relinearize_fit(first)
-        score = _compute_score(base, fit)
+        for _ in range(2):
+            fit = evaluate_likelihood(start.problem, theta, start.noise, fit.trajectories)
+        if not math.isfinite(fit.value):
+            continue
+        score = fit.value - base.fit.value + compute_expected_gain(fit)
         if score > best.score:
-            there = loop.with_parameters(dict(zip(names, fit.theta.tolist(), strict=True)))
+            there = loop.with_parameters(dict(zip(names, theta.tolist(), strict=True)))
             best = Trial(effect, label, Model(there, drop_arrays(fit)), score, scan_penalty)
     return best
-
-
-def _compute_score(base: Model, fit: Fit) -> float:
-    """Return what a first step from a fit is expected to gain over a base; -inf if it is lost."""
-    if not math.isfinite(fit.value):
-        return -math.inf
-    return fit.value - base.fit.value + compute_expected_gain(fit)

@@ -50,7 +50,7 @@ class BlockEvaluation:
         self.tables = np.array([(at, *s) for at, s in zip(ends, shapes, strict=False)])
         self.rows_out = int(ends[-1])
         steps, self.constants = _list_instructions(function)
-        self.program, self.registers = _allocate_registers(_share_reciprocals(steps))
+        self.program, self.registers = _allocate_registers(steps)
         self.read = set(steps[steps[:, 0] == casadi.OP_INPUT, 2].tolist())
 
     def __call__(self, *arguments: Any) -> list[Array]:
@@ -102,45 +102,6 @@ def _list_instructions(function: Any) -> tuple[Any, Array]:
                 "evaluated over many samples; write it with ordinary numpy functions"
             )
     return np.array(steps, dtype=np.int64).reshape(-1, 4), np.array(constants, dtype=float)
-
-
-@keep_interrupt
-@compile_loop()
-def _share_reciprocals(steps: Any) -> Any:  # pragma: no cover - compiled
-    """Return instructions that divide by the same value once, and multiply from then on.
-
-    Derivatives of a quotient divide by its denominator again and again, and a division takes as
-    long as several products.
-    """
-    count = len(steps)
-    most = steps.max() + 1 if count else 1
-    # For each of CasADi's registers, the instruction whose result it holds.
-    holds = np.zeros(most, np.int64)
-    divisors = np.full(count, -1)
-    shared = np.zeros(count, np.int64)
-    for k in range(count):
-        op = steps[k, 0]
-        if op == casadi.OP_DIV:
-            divisors[k] = holds[steps[k, 3]]
-            shared[divisors[k]] += 1
-        if op != casadi.OP_OUTPUT:
-            holds[steps[k, 1]] = k
-    out = np.empty((2 * count, 4), np.int64)
-    # For each result, the register that holds its reciprocal.
-    kept = np.full(count, -1)
-    size = 0
-    for k in range(count):
-        out[size] = steps[k]
-        by = divisors[k]
-        if by >= 0 and shared[by] > 1:
-            if kept[by] < 0:
-                kept[by] = most
-                out[size] = casadi.OP_INV, most, steps[k, 3], steps[k, 3]
-                most += 1
-                size += 1
-            out[size] = casadi.OP_MUL, steps[k, 1], steps[k, 2], kept[by]
-        size += 1
-    return out[:size].copy()
 
 
 @keep_interrupt

@@ -236,6 +236,8 @@ class Fit:
         if tails is None:
             return pairs
         share, _ = compute_information_shares(tails)
+        # Where rounding leaves no positive variance, a reading that does not count has no weight.
+        pairs = [(e, np.where(s > 0, s, np.nan)) for e, s in pairs]
         return [(e * tails.compute_weight(e / np.sqrt(s)) / share, s / share) for e, s in pairs]
 
     @functools.cached_property
