@@ -59,14 +59,6 @@ def refit_quietly(base: Model, effects: Sequence[AbstractEffect], work: Work) ->
     return work(lambda pair: _release(base, *pair), pairs[: THRESHOLD.released])
 
 
-def needs_no_force(model: Model) -> bool:
-    """Whether a model does with hardly any random force, so that nothing hides behind one."""
-    fit = with_linearization(model).fit
-    if fit.known is not None or fit.noise.drift or not math.isfinite(fit.value):
-        return False
-    return relinearize_fit(hold_force_quiet(fit)).value > fit.value - THRESHOLD.gate
-
-
 def _climb_quietly(quiet: Model, trial: Trial) -> Fit | None:
     """Return a candidate fitted with the noise held; None if it cannot run."""
     if trial.out is not None:

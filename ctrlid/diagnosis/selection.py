@@ -8,7 +8,7 @@ from ..effects import AbstractEffect
 from ..estimation.likelihood.maximization import compute_expected_gain
 from .candidates import Objection, Trial, Work, contains, is_same_kind, keep_for_comparison
 from .fitted_model import Model, without_random_force
-from .quiet_refitting import needs_no_force, refit_quietly
+from .quiet_refitting import refit_quietly
 from .refitting import refit_candidate, refit_under_noise
 from .replicas import has_kinks, make_replica, measure_gain_beyond_simple, measure_gain_on_replicas
 from .scans import ModelSight, scan_candidate
@@ -57,8 +57,7 @@ def run_round(
         return Round(base, tuple(tried), None)
     copies: list[Model | None] = []
     trials = _refit_promising(base, tried, more, work)
-    best = max(trials, key=lambda t: t.net_gain)
-    if beside and not (best.net_gain > THRESHOLD.gate and needs_no_force(best.model)):
+    if beside:
         # Two that hide together leave a large random force, beside which a score tells little.
         trials += refit_quietly(base, [t.effect for t in tried], work)
     trials = _prefer_simplest(base, _check_on_replicas(base, trials, copies))
