@@ -389,3 +389,38 @@ def test_a_delay_that_the_model_lacks_is_said_in_capitals(late):
     assert ("WITH A DELAY OF 5 ms THE MODEL PREDICTS BETTER" in notes) == bool(late)
     estimated = cid.fit_continuous(record, poles=2, delay=None)
     assert not any("DELAY" in note for note in estimated.estimate.notes)
+
+
+def test_coloured_noise_is_sought_beside_a_lag_that_the_model_lacks():
+    """The coefficients move with each order of the noise, and the observer has to follow them.
+
+    A pendulum whose motor lags: an observer for the coefficients of white noise is unstable for
+    those beside coloured noise, which ended in an error of Python.
+    """
+    plant = cid.plants.pendulum(m=0.32, length=0.25, c=0.01)
+    controller = ct.tf([38.0, -35.0], [1.0, 0.0], 0.01)
+    loop = cid.Loop(plant, controller, dt=0.01, at=cid.operating_point(plant, output=0.0))
+    r = cid.random_binary(1000, amplitude=0.05, hold=25, seed=0)
+    rig = loop.with_effect(cid.effects.ActuatorLag(tau=0.015))
+    fit = cid.fit_continuous(cid.simulate(rig, r, sensor_noise=1e-3, seed=0), poles=2)
+    assert "moving average of order" in fit.estimate.solver
+    assert fit.estimate.poles_s.real.max() > 3
+
+
+def test_a_start_with_an_unstable_observer_is_left_out(monkeypatch):
+    """Sensor noise averaged over two samples, with a start that rounding has spoiled."""
+    rng = np.random.default_rng(3)
+    u = np.repeat(rng.choice([-1.0, 1.0], 100), 5)
+    sampled = ct.ss(ct.tf([2.0], [1, 1.2, 4.0])).sample(0.1)
+    y = ct.forced_response(sampled, 0.1 * np.arange(u.size), u).outputs
+    e = rng.standard_normal(u.size + 1)
+    record = cid.Record(u=u, y=y + 0.1 * (e[1:] + e[:-1]), dt=0.1)
+    asked = []
+
+    def place_outside(best):
+        asked.append(best)
+        return np.array([1e3, 1e3])
+
+    monkeypatch.setattr(prediction_error, "_find_sensor_gain", place_outside)
+    assert np.isfinite(cid.fit_continuous(record, poles=2).estimate.values).all()
+    assert asked

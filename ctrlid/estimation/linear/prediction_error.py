@@ -346,8 +346,11 @@ def colour_noise(white: Minimum, known: Sequence[AbstractConstraint]) -> Minimum
     for order in range(1, MOST_COLOUR + 1):
         task, tried = replace(white.task, colour=order), []
         # From the white minimum, whose observer took up colour, and from that of sensor noise.
-        for gain in (best.point.gain, _find_sensor_gain(white)):
+        for gain in (best.point.gain, _find_sensor_gain(best)):
             start = replace(best.point, gain=np.append(gain, np.zeros(first + order - len(gain))))
+            # Rounding may have placed a pole of the observer outside the unit circle.
+            if not np.isfinite(_evaluate_cost(task, start)[0]):
+                continue
             try:
                 point, found, rss, settled = _minimize_errors(task, start, known)
             except NotExcited:
@@ -360,12 +363,12 @@ def colour_noise(white: Minimum, known: Sequence[AbstractConstraint]) -> Minimum
     return best
 
 
-def _find_sensor_gain(white: Minimum) -> Array:
+def _find_sensor_gain(best: Minimum) -> Array:
     """Return the observer gain of pure sensor noise; that of the minimum where there is none."""
-    motion = _discretize_open_loop(white.task, white.point.theta)
-    poles = _reflect_poles(white.task, np.linalg.eigvals(motion.f))
+    motion = _discretize_open_loop(best.task, best.point.theta)
+    poles = _reflect_poles(best.task, np.linalg.eigvals(motion.f))
     gain = _place_poles(motion.f, motion.c, poles)
-    return white.point.gain if gain is None else gain
+    return best.point.gain if gain is None else gain
 
 
 def _minimize_twice(
