@@ -39,6 +39,23 @@ def record(loop):
 # --- the check of kinds
 
 
+@pytest.mark.parametrize("unit", ["ms", "ns"])
+def test_a_span_of_time_is_no_number(unit):
+    """In nanoseconds numpy makes a float of it: 10 ms would be a period of 1e7 s."""
+    span = np.timedelta64(np.timedelta64(10, "ms"), unit)
+    plant = cid.plants.servo(m=1.0, c=2.0, k=3.0)
+    for call in (
+        lambda: cid.Record(u=np.zeros(9), y=np.zeros(9), dt=span),
+        lambda: cid.Loop(plant, None, dt=span),
+        lambda: cid.operating_point(plant, output=span),
+        lambda: cid.PoleAt(span),
+        lambda: E.ActuatorLag(tau=span),
+        lambda: cid.random_binary(100, amplitude=span, hold=5),
+    ):
+        with pytest.raises(CtrlidError, match=r"timedelta64|loop needs"):
+            call()
+
+
 def greet(
     who: str,
     times: int = 1,

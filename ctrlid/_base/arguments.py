@@ -286,10 +286,13 @@ def _is_kind(value: Any, kind: Any) -> bool:
 
 
 def _is_float(value: Any) -> bool:
-    """Tell whether a value is one real number and no truth value."""
+    """Tell whether a value is one real number, no truth value and no span of time.
+
+    numpy counts its spans of time as whole numbers, of a unit that a float would lose.
+    """
     if isinstance(value, np.ndarray) and value.ndim == 0 and value.dtype.kind in "fiu":
         value = value[()]
-    if isinstance(value, bool | np.bool_) or not isinstance(value, Real):
+    if isinstance(value, bool | np.bool_ | np.timedelta64) or not isinstance(value, Real):
         return False
     try:
         float(value)
