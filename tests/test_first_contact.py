@@ -126,3 +126,18 @@ def test_a_plant_that_cannot_be_pickled_says_why_not():
         cid.CtrlidError, match=r"the plant of locked cannot be pickled .*lock.*save"
     ):
         pickle.dumps(cid.Loop(plant, dt=0.1))
+
+
+@pytest.mark.parametrize("name", ["compare", "simulate", "audit", "replay_controller", "redesign"])
+def test_what_needs_a_loop_says_where_a_fit_has_it(record, name):
+    loop = servo(cid.PID(kp=20.0, kd=1.0), dt=0.01, free=("k",))
+    fit = cid.fit_loop(loop, record[:200])
+    calls = {
+        "compare": lambda: cid.compare(record, fit),
+        "simulate": lambda: cid.simulate(fit, record.r),
+        "audit": lambda: cid.audit(record, fit),
+        "replay_controller": lambda: cid.replay_controller(fit, record),
+        "redesign": lambda: cid.redesign(ct.tf([1.0], [1.0, 1.0]), fit, 10.0, 50.0),
+    }
+    with pytest.raises(cid.CtrlidError, match=r"LoopFit\)?\. Give its \.loop$"):
+        calls[name]()

@@ -129,6 +129,31 @@ def is_number(value: Any) -> bool:
     return not isinstance(value, np.ndarray) and _is_float(value)
 
 
+def point_at_part(value: Any, kind: type) -> str:
+    """Say which part of a result is of the kind that is needed, such as the loop of a fit.
+
+    Parameters
+    ----------
+    value : object
+        What was given.
+    kind : type
+        What is needed.
+
+    Returns
+    -------
+    str
+        A sentence with a full stop before it; empty if the result has no such part.
+
+    Examples
+    --------
+    >>> from types import SimpleNamespace
+    >>> point_at_part(SimpleNamespace(dict={"a": 1}), dict)
+    '. Give its .dict'
+    """
+    name = kind.__name__.lower()
+    return f". Give its .{name}" if isinstance(getattr(value, name, None), kind) else ""
+
+
 def is_iterable(value: Any) -> bool:
     """Tell whether a value can be walked through; an array without dimensions only looks so."""
     return value.ndim > 0 if isinstance(value, np.ndarray) else isinstance(value, Iterable)
@@ -215,8 +240,10 @@ def _check_kind(who: str, name: str, value: Any, kind: Any) -> None:
     if not _is_kind(value, kind):
         shown = " ".join(repr(value).split())
         shown = shown if len(shown) <= 60 else shown[:57] + "..."
+        part = point_at_part(value, kind) if isinstance(kind, type) else ""
         raise CtrlidError(
-            f"{who} needs {_describe_kind(kind)} as {name}; given {shown} ({type(value).__name__})"
+            f"{who} needs {_describe_kind(kind)} as {name}; given {shown} "
+            f"({type(value).__name__}){part}"
         )
 
 

@@ -9,7 +9,7 @@ from typing import Any, overload
 import control as ct
 import numpy as np
 
-from .._base.arguments import check_arguments, explain_names
+from .._base.arguments import check_arguments, explain_names, point_at_part
 from .._base.arrays import Array, freeze_arrays
 from .._base.errors import CtrlidError, ModelCannotRun
 from .._base.rounding import keep_numpy_quiet
@@ -307,7 +307,7 @@ def redesign(
                           f"given {type(G).__name__}")  # fmt: skip
     if not isinstance(loop, Loop):
         raise CtrlidError("redesign needs a Loop, on which the controller is tried; given "
-                          f"{type(loop).__name__}")  # fmt: skip
+                          f"{type(loop).__name__}{point_at_part(loop, Loop)}")  # fmt: skip
     if design is not None:
         if crossover is not None or phase_margin is not None:
             raise CtrlidError("redesign takes a crossover and a phase margin, or design= with a "

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from .._base.arguments import check_arguments, explain_names
+from .._base.arguments import check_arguments, explain_names, point_at_part
 from .._base.arrays import Array, to_real_array
 from .._base.errors import CtrlidError, CtrlidWarning, ModelCannotRun
 from .._base.rounding import keep_numpy_quiet
@@ -113,7 +113,8 @@ def simulate(
     check_arguments(simulate, locals(), "loop", "sensor_noise", "force_noise")
     if not isinstance(loop, Loop):
         raise CtrlidError(
-            f"simulate needs a Loop(plant, controller, dt=..., at=...); given {type(loop).__name__}"
+            "simulate needs a Loop(plant, controller, dt=..., at=...); given "
+            f"{type(loop).__name__}{point_at_part(loop, Loop)}"
         )
     r, d, names = _check_signals(loop, r, d)
     noise = _draw_noise(loop, d.shape[-1], sensor_noise, force_noise, seed)

@@ -10,7 +10,7 @@ import control as ct
 import numpy as np
 from scipy import signal
 
-from .._base.arguments import explain_names
+from .._base.arguments import explain_names, point_at_part
 from .._base.arrays import Array
 from .._base.errors import CtrlidError, CtrlidWarning, EffectDoesNotApply, ModelCannotRun
 from .._base.periods import have_same_period, write_both_periods, write_difference
@@ -131,8 +131,11 @@ def compare(record: Record, model_or_loop: Any, *, horizon: int | None = None) -
         return _compare_model(record, model_or_loop, horizon)
     raise CtrlidError(
         "compare needs a Loop, or a transfer function such as the fits return; given "
-        f"{type(model_or_loop).__name__}. Put a nonlinear plant into a Loop(plant, controller, "
-        "dt=..., at=...)"
+        f"{type(model_or_loop).__name__}"
+        + (
+            point_at_part(model_or_loop, Loop)
+            or ". Put a nonlinear plant into a Loop(plant, controller, dt=..., at=...)"
+        )
     )
 
 

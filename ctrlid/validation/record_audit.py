@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from .._base.arguments import explain_names
+from .._base.arguments import explain_names, point_at_part
 from .._base.errors import CtrlidError
 from .._base.rounding import keep_numpy_quiet
 from .._base.text import Printed, write_count, write_percent
@@ -178,7 +178,8 @@ def audit(record: Record, loop: Loop | None = None) -> Audit:
     if not isinstance(record, Record) or not (loop is None or isinstance(loop, Loop)):
         raise CtrlidError(
             "audit needs a Record and, optionally, its Loop; given "
-            f"{type(record).__name__} and {type(loop).__name__}. Audit several records one by one"
+            f"{type(record).__name__} and {type(loop).__name__}"
+            + (point_at_part(loop, Loop) or ". Audit several records one by one")
         )
     if any(len(names) > 1 for names in record.signals.values()) or (
         loop is not None and not loop.equations().siso
