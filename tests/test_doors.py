@@ -372,6 +372,7 @@ def test_damaged_diagnoses_are_refused_or_can_be_printed(tmp_path):
         (b"t|u|y\n0|1|2\n1|1|2\n", r"separated by '\|', replace it"),
         (b"t,u,y\n2026-01-01T00:00:00,1,2\n2026-01-01T00:00:01,1,2\n", "a date or a time of day"),
         (b"t,u,y\n12:00:01,1,2\n12:00:02,1,2\n", "a date or a time of day"),
+        (b"t,u,y\n12:00:01,1,2\n12:00:02,1,2\n", r"\(t - t\[0\]\).dt.total_seconds\(\)"),
     ],
 )
 def test_a_damaged_or_foreign_table_says_what_to_do(tmp_path, data, words):

@@ -359,9 +359,9 @@ def _refuse_text(path: Path, texts: Texts, header: Sequence[str]) -> None:
     if CLOCK.match(cell):
         raise CtrlidError(
             f"{path} has a date or a time of day: {where}; times are numbers, in seconds from any "
-            "start. Convert them, for instance with pandas.to_datetime(column), or remove the "
-            "column from the file and give dt=; a line above the header: delete it or start it "
-            "with #"
+            "start. Convert them, for instance by t = pandas.to_datetime(column) and then "
+            "(t - t[0]).dt.total_seconds(), or remove the column from the file and give dt=; a "
+            "line above the header: delete it or start it with #"
         )
     raise CtrlidError(
         f"{path} is not a table of numbers: {where}. Remove it, or leave the cell blank and give "
