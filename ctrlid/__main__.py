@@ -61,7 +61,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # A terminal that has no sign for plus or minus is no reason to lose a result.
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="ctrlid")
-    args = _make_parser().parse_args(arguments)
+    parser = _make_parser()
+    args, unknown = parser.parse_known_args(arguments)
+    if unknown:
+        advice = ""
+        if all("=" in word and not word.startswith("-") for word in unknown):
+            advice = (
+                ". The names of --columns and those of --units are one word, with commas between "
+                "them or in quotes: --columns r=ref,u=volt,y=gap"
+            )
+        parser.error(f"unrecognized arguments: {' '.join(unknown)}{advice}")
     try:
         with warnings.catch_warnings():
             warnings.showwarning = _show_warning

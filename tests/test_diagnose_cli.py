@@ -332,6 +332,20 @@ def test_wrong_usage(folder, capsys, arguments, words):
     assert words in err
 
 
+@pytest.mark.parametrize(
+    ("arguments", "advised"),
+    [(("--columns", "r=ref", "u=volt", "y=angle"), True),
+     (("--units", "r=rad", "y=rad"), True), (("--free", "k", "--speed=3"), False)],
+)  # fmt: skip
+def test_names_of_one_option_in_several_words_are_explained(capsys, arguments, advised):
+    with pytest.raises(SystemExit) as end:
+        run("log.csv", *SERVO, *arguments)
+    assert end.value.code == 2
+    err = capsys.readouterr().err
+    assert f"unrecognized arguments: {' '.join(arguments[2:])}" in err
+    assert ("--columns r=ref,u=volt,y=gap" in err.split("error:")[1]) == advised
+
+
 def test_help_has_a_worked_example(capsys):
     with pytest.raises(SystemExit) as end:
         run("--help")
