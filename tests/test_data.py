@@ -94,6 +94,13 @@ def test_copies(clone):
     assert not any(values.flags.writeable for values in channels(twin))
 
 
+def test_few_samples_that_do_not_count_are_not_rounded_away():
+    valid = np.ones(5000, dtype=bool)
+    valid[:2] = False
+    record = cid.Record(u=np.zeros(5000), y=np.zeros(5000), dt=0.1, valid=valid)
+    assert "all but 2 valid" in str(record)
+
+
 def test_text():
     assert str(full(8)) == repr(full(8)) == "\n".join([
         "Record run 3, second try: 8 samples at 0.1 s (0.8 s, foh), 87.5 % valid",

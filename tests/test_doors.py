@@ -433,7 +433,8 @@ def test_damaged_bytes_give_a_record_or_a_refusal(tmp_path):
         (lambda: cid.Loop(None, dt=0.1, effect=0), r"Loop has no effect=; did you mean effects=\?"),
         (lambda: cid.plants.maglev(m=0.02, k=1), "maglev has no k="),
         (lambda: cid.plants.servo(m=1.0), "servo needs c= and k=; it takes m, c, k"),
-        (lambda: E.CoulombFriction(f=0.1), r"CoulombFriction has no f=; did you mean fc=\?"),
+        (lambda: E.CoulombFriction(f=0.1), r"a CoulombFriction has no f=; did you mean fc=\?"),
+        (lambda: E.ActuatorLag(time=0.1), "an ActuatorLag has no time="),
     ],
 )
 def test_a_wrong_name_of_an_argument_is_answered_with_the_right_ones(call, words):

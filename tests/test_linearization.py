@@ -100,6 +100,15 @@ def test_a_plant_without_a_value_at_rest_says_what_to_write():
         cid.operating_point(plant, output=0.1)
 
 
+def test_a_level_below_the_outlet_is_answered_with_the_root_of_a_negative_number():
+    tanks = ct.nlsys(
+        lambda t, x, u, p: np.array([u[0] - np.sqrt(x[0]), np.sqrt(x[0]) - np.sqrt(x[1])]),
+        lambda t, x, u, p: x[1], inputs=["q"], outputs=["level"], states=["h1", "h2"], name="tanks",
+    )  # fmt: skip
+    with pytest.raises(CtrlidError, match="A root or a logarithm of a negative number has no"):
+        cid.operating_point(tanks, output=-1.0)
+
+
 def test_a_plant_that_changes_with_time_has_no_operating_point():
     plant = ct.nlsys(lambda t, x, u, params: np.array([x[1], np.sin(t) - x[0] + u[0]]),
                      lambda t, x, u, params: x[0], name="shaken", inputs=1, outputs=1,

@@ -299,7 +299,7 @@ def test_refused_loops(build, words):
     [
         (None, {"d": np.zeros(9)}, "reads x_d and theta_d, .* no reference of this name is given"),
         (np.zeros((3, 9)), {}, "has the references x_d and theta_d; given 3"),
-        ({"x_d": np.zeros(9)}, {}, "reads theta_d, which is no signal of the plant"),
+        ({"x_d": np.zeros(9)}, {}, "reads theta_d, which is no input and no output of the plant"),
         ({"x_d": np.zeros(9), "w": np.zeros(9)}, {}, "given w"),
         (np.zeros((2, 9)), {"d": np.zeros(8)}, "equally long; given 9 and 8"),
         (np.zeros((2, 9)), {"d": np.zeros((2, 9))}, r"one row for each input \(F\)"),
@@ -312,6 +312,22 @@ def test_refused_simulations(r, options, words):
     C = ct.ss([], [], [], [[3, 40, 1, 1.0]], DT, inputs=["x", "theta", "x_d", "theta_d"])
     with pytest.raises(cid.CtrlidError, match=words):
         cid.simulate(cid.Loop(CART, C, dt=DT), r, **options)
+
+
+def test_a_state_that_is_no_output_is_not_read_in_silence():
+    C = ct.ss([], [], [], [[3, 40, 1, 5.0]], DT, inputs=["x", "theta", "x_dot", "x_d"])
+    loop = cid.Loop(CART, C, dt=DT)
+    assert "x_dot <- reference x_dot (NOT THE STATE, which is no output)\n" in str(loop)
+    assert "x_d <- reference x_d\n" in str(loop)
+    with pytest.raises(cid.CtrlidError, match="A state of the plant is read only where it is an"):
+        cid.simulate(loop, {"x_d": np.zeros(9)})
+
+
+def test_a_long_series_in_place_of_a_number_is_written_short():
+    C = ct.ss([], [], [], [[3, 40.0]], DT, inputs=["x", "theta"])
+    with pytest.raises(cid.CtrlidError, match=r"given array\(\[0\., 0\., .*\.\.\.$") as refused:
+        cid.simulate(cid.Loop(CART, C, dt=DT), d=np.zeros(9), sensor_noise=np.zeros(99))
+    assert "\n" not in str(refused.value)
 
 
 def test_a_loop_that_diverges_is_explained():

@@ -154,6 +154,28 @@ def point_at_part(value: Any, kind: type) -> str:
     return f". Give its .{name}" if isinstance(getattr(value, name, None), kind) else ""
 
 
+def shorten_value(value: Any) -> str:
+    """Write a value that was given, in one line of a message and without most of a long array.
+
+    Parameters
+    ----------
+    value : object
+        The value.
+
+    Returns
+    -------
+    str
+        Its representation, in 60 signs at most.
+
+    Examples
+    --------
+    >>> shorten_value("ab"), len(shorten_value(list(range(1000))))
+    ("'ab'", 60)
+    """
+    shown = " ".join(repr(value).split())
+    return shown if len(shown) <= 60 else shown[:57] + "..."
+
+
 def is_iterable(value: Any) -> bool:
     """Tell whether a value can be walked through; an array without dimensions only looks so."""
     return value.ndim > 0 if isinstance(value, np.ndarray) else isinstance(value, Iterable)
@@ -200,7 +222,7 @@ def check_field_names(cls: Any, given: Iterable[str]) -> None:
     known = _find_fields(cls)
     for name in given:
         if name not in known:
-            raise CtrlidError(_refuse_name(f"a {cls.__name__}", name, tuple(known), "has"))
+            raise CtrlidError(_refuse_name(_add_article(cls.__name__), name, tuple(known), "has"))
 
 
 def check_needed_fields(cls: Any, given: Collection[str]) -> None:
@@ -211,9 +233,13 @@ def check_needed_fields(cls: Any, given: Collection[str]) -> None:
     missing = [name for name, needed in _find_fields(cls).items() if needed and name not in given]
     if given and missing:
         raise CtrlidError(
-            f"a {cls.__name__} needs {write_list([f'{name}=' for name in missing])}; given are "
-            f"{write_list([f'{name}=' for name in given])}"
+            f"{_add_article(cls.__name__)} needs {write_list([f'{name}=' for name in missing])}; "
+            f"given are {write_list([f'{name}=' for name in given])}"
         )
+
+
+def _add_article(name: str) -> str:
+    return f"{'an' if name[:1] in 'AEIOU' else 'a'} {name}"
 
 
 @functools.cache
@@ -238,11 +264,9 @@ class ShownFields:
 
 def _check_kind(who: str, name: str, value: Any, kind: Any) -> None:
     if not _is_kind(value, kind):
-        shown = " ".join(repr(value).split())
-        shown = shown if len(shown) <= 60 else shown[:57] + "..."
         part = point_at_part(value, kind) if isinstance(kind, type) else ""
         raise CtrlidError(
-            f"{who} needs {_describe_kind(kind)} as {name}; given {shown} "
+            f"{who} needs {_describe_kind(kind)} as {name}; given {shorten_value(value)} "
             f"({type(value).__name__}){part}"
         )
 

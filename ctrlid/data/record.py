@@ -641,7 +641,10 @@ class Record(Printed):
         rows = [f"Record {self.name + ': ' if self.name else ''}{len(self)} samples at "
                 f"{self.dt:g} s ({self.duration:.4g} s, {self.hold})"]  # fmt: skip
         if not self.valid.all():
-            rows[0] += f", {100 * self.valid.mean():.1f} % valid"
+            share = f"{100 * self.valid.mean():.1f} %"
+            # Few among many would be rounded away.
+            much = f"all but {np.sum(~self.valid)}" if share == "100.0 %" else share
+            rows[0] += f", {much} valid"
         channels = list_rows(self)
         numbered = [f"{k}[" for k, names in self.signals.items() if len(names) > 1]
         labels = [name if name == key or name.startswith(tuple(numbered)) else f"{key} ({name})"

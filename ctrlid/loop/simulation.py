@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from .._base.arguments import check_arguments, explain_names, point_at_part
+from .._base.arguments import check_arguments, explain_names, point_at_part, shorten_value
 from .._base.arrays import Array, to_real_array
 from .._base.errors import CtrlidError, CtrlidWarning, ModelCannotRun
 from .._base.rounding import keep_numpy_quiet
@@ -237,7 +237,9 @@ def _draw_noise(loop: Loop, n: int, sensor: Any, force: Any, seed: int | None) -
         good = array.dtype.kind in "fiu" and array.size in (1, count)
         if not (good and np.isfinite(array).all() and (array >= 0).all()):
             each = f", or {count} of them" if count > 1 else ""
-            raise CtrlidError(f"{name} is a standard deviation >= 0{each}; given {value!r}")
+            raise CtrlidError(
+                f"{name} is a standard deviation >= 0{each}; given {shorten_value(value)}"
+            )
         sizes.append(np.broadcast_to(array.astype(float), count))
     if sizes[1].any() and not loop.equations().velocities:
         raise CtrlidError(

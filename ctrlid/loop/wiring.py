@@ -232,7 +232,9 @@ def _name_source(
     if kind == "r":
         value = held[k]
         rest = "" if value is None else f", else held at {value:g}"
-        return f"reference {open_names[k]}{rest}"
+        # It was meant to be measured, where a state has its name.
+        doubt = " (NOT THE STATE, which is no output)" if open_names[k] in plant.states else ""
+        return f"reference {open_names[k]}{rest}{doubt}"
     return (plant.outputs if kind == "y" else plant.inputs)[k]
 
 
@@ -288,9 +290,10 @@ def stack_references(
     missing = [name for name in needed if name not in names]
     if missing:
         raise CtrlidError(
-            f"the controller reads {write_list(missing)}, which is no signal of the plant, and no "
-            f"reference of this name is given (given: {', '.join(names) or 'none'}). Give r= with "
-            f"a series for each of {', '.join(needed)}, or rename this input of the controller"
+            f"the controller reads {write_list(missing)}, which is no input and no output of the "
+            f"plant, and no reference of this name is given (given: {', '.join(names) or 'none'}). "
+            f"Give r= with a series for each of {', '.join(needed)}, or rename this input of the "
+            "controller. A state of the plant is read only where it is an output"
         )
     if not rows and n is None:
         raise CtrlidError("simulate needs r or d to know how many samples to run")

@@ -227,7 +227,8 @@ def operating_point(
                 (*equations.states, *equations.inputs), closest[1], strict=True))  # fmt: skip
             hint = f" The nearest point found is {near}, which is no equilibrium."
         elif n > 1:
-            hint = (" Its equations are not finite wherever the search ended. A quotient such as "
+            hint = (" Its equations are not finite wherever the search ended. A root or a "
+                    "logarithm of a negative number has no value. A quotient such as "
                     "v / abs(v) has no value at v = 0: write np.sign(v).")  # fmt: skip
         wanted = ", ".join(
             f"{name} = {value:g}" for name, value in zip(equations.outputs, target, strict=True)
