@@ -199,3 +199,26 @@ def test_what_may_occur_twice_and_what_has_an_order():
     assert not Brake.repeatable
     for kind in E.CATALOGUE:
         assert kind.ordered == (kind.place in ("input", "output"))
+
+
+@dataclass(frozen=True)
+class Formless(E.ForceEffect):
+    """An effect whose method is misspelt."""
+
+    size: float = E.parameter("{y}/s^2", neutral=0.0)
+
+    def forces(self, m):
+        return self.size * m.y
+
+
+class Undecorated(E.ForceEffect):
+    """An effect without the line above its class."""
+
+    size: float = E.parameter("{y}/s^2", neutral=0.0)
+
+
+def test_an_effect_that_is_not_finished_says_what_it_lacks():
+    with pytest.raises(cid.CtrlidError, match=r"of ForceEffect needs a method force\(self, m\)"):
+        cid.simulate(drive().with_effect(Formless(1.0)), np.zeros(9))
+    with pytest.raises(cid.CtrlidError, match=r"declares size, .* write @dataclass\(frozen=True\)"):
+        Undecorated(size=1.0)

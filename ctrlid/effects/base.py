@@ -5,7 +5,7 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal, NoReturn, Self
 
 import casadi
 
@@ -22,6 +22,27 @@ from .symbolic import append_states, find_spread, trace_hook
 Place = Literal["input", "force", "law", "output"]
 # What the name of a place is, in words.
 PLACES = {"input": "an input", "force": "a velocity", "law": "no place", "output": "an output"}
+
+
+def refuse_missing_formula(base: str, method: str) -> NoReturn:
+    """Refuse an effect of a user in which the one method of its base is not written.
+
+    Parameters
+    ----------
+    base : str
+        Name of the base class.
+    method : str
+        Name of the method.
+
+    Raises
+    ------
+    CtrlidError
+        Always.
+    """
+    raise CtrlidError(
+        f"a subclass of {base} needs a method {method} with its formula, and the one given has "
+        "none. Write it, or look whether its name is misspelt"
+    )
 
 
 @dataclass(frozen=True)
@@ -71,6 +92,13 @@ class AbstractEffect:
     def __new__(cls, *args: Any, **fields: Any) -> Self:
         """Refuse unknown fields in words, before the generated constructor does so curtly."""
         del args
+        # The decorator takes the declarations of parameters away.
+        bare = [name for name, value in vars(cls).items() if isinstance(value, dataclasses.Field)]
+        if bare:
+            raise CtrlidError(
+                f"{cls.__name__} declares {', '.join(bare)}, but is no dataclass: write "
+                "@dataclass(frozen=True) in the line above its class"
+            )
         check_field_names(cls, fields)
         return super().__new__(cls)
 
@@ -286,7 +314,7 @@ class AbstractEffect:
 
     def build(self, e: Equations, m: Moment) -> Equations:
         """Return the changed equations; `self` has symbols in place of numbers."""
-        raise NotImplementedError
+        refuse_missing_formula("AbstractEffect", "build(self, e, m)")
 
     def apply(self, equations: Equations, at: OperatingPoint, dt: float, label: str) -> Equations:
         """Return equations with this effect in them.

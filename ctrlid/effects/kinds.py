@@ -9,7 +9,7 @@ import numpy as np
 from .._base.errors import EffectDoesNotApply
 from ..physics.equations import Equations
 from ..physics.symbols import Symbol
-from .base import AbstractEffect, Place, require_motion
+from .base import AbstractEffect, Place, refuse_missing_formula, require_motion
 from .context import Moment
 from .symbolic import substitute_symbol, to_expression, trace_hook
 
@@ -22,7 +22,7 @@ class LawEffect(AbstractEffect):
 
     def law(self, m: Moment) -> dict[str, Any]:
         """Return what the plant sees in place of parameters or states, by their names."""
-        raise NotImplementedError
+        refuse_missing_formula("LawEffect", "law(self, m)")
 
     def build(self, e: Equations, m: Moment) -> Equations:
         """Return the equations with the law's parameters and states replaced.
@@ -52,7 +52,7 @@ class ForceEffect(AbstractEffect):
 
     def force(self, m: Moment) -> Any:
         """Return the acceleration of the moving mass [output unit/s^2]."""
-        raise NotImplementedError
+        refuse_missing_formula("ForceEffect", "force(self, m)")
 
     def build(self, e: Equations, m: Moment) -> Equations:
         """Return the equations with the force added to the rate of the velocity."""
@@ -75,7 +75,7 @@ class InputEffect(AbstractEffect):
 
     def input(self, m: Moment) -> Any:
         """Return the input that is applied [input unit]."""
-        raise NotImplementedError
+        refuse_missing_formula("InputEffect", "input(self, m)")
 
     def build(self, e: Equations, m: Moment) -> Equations:
         """Return the equations with the applied input in place of the computed one."""
@@ -121,7 +121,7 @@ class OutputEffect(AbstractEffect):
 
     def output(self, m: Moment) -> Any:
         """Return the output that the sensor shows [output unit]."""
-        raise NotImplementedError
+        refuse_missing_formula("OutputEffect", "output(self, m)")
 
     def build(self, e: Equations, m: Moment) -> Equations:
         """Return the equations with the new output."""
@@ -137,7 +137,7 @@ class ReadingEffect(AbstractEffect):
 
     def read(self, m: Moment) -> Any:
         """Return what is recorded of the noisy reading ``m.y`` [output unit]."""
-        raise NotImplementedError
+        refuse_missing_formula("ReadingEffect", "read(self, m)")
 
     def build(self, e: Equations, m: Moment) -> Equations:
         """Return the equations with the readout appended to what there is."""
