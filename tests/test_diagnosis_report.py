@@ -4,6 +4,7 @@ import dataclasses
 import json
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import control as ct
 import numpy as np
@@ -600,3 +601,22 @@ def test_noise_that_parts_a_loop_from_itself_explains_a_gap():
         assert (
             "differ only in their noise" in wording.describe_shrinking(replace(gap, before=0.9))
         ) == (loop is rough)
+
+
+@pytest.mark.parametrize(
+    ("rivals", "words"),
+    [
+        ([], "; no other effect of the catalogue explains the record as well"),
+        (["ViscousFriction"], "; no other effect of the catalogue explains the record as well"),
+        (["ViscousFriction", "ActuatorLag"], "; none of the 2 other effects of the catalogue"),
+    ],
+)
+def test_the_rest_of_a_small_catalogue_is_counted_in_words(rivals, words):
+    friction = E.CoulombFriction(fc=0.1)
+    starts = {"ViscousFriction": E.ViscousFriction(c=0.1), "ActuatorLag": E.ActuatorLag(tau=0.1)}
+    tried = [friction, *(starts[name] for name in rivals)]
+    finding = SimpleNamespace(evidence=50.0, share=np.nan, names=("CoulombFriction",),
+                              equivalents=(), effect=friction)  # fmt: skip
+    found = SimpleNamespace(added=(finding,), verdict="explained",
+                            ranking=[SimpleNamespace(effect=e) for e in tried])  # fmt: skip
+    assert words in wording.describe_certainty(found, finding)

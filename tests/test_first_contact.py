@@ -128,7 +128,11 @@ def test_a_plant_that_cannot_be_pickled_says_why_not():
         pickle.dumps(cid.Loop(plant, dt=0.1))
 
 
-@pytest.mark.parametrize("name", ["compare", "simulate", "audit", "replay_controller", "redesign"])
+@pytest.mark.parametrize(
+    "name",
+    ["compare", "simulate", "audit", "replay_controller", "redesign", "fit_loop", "diagnose",
+     "predict"],
+)  # fmt: skip
 def test_what_needs_a_loop_says_where_a_fit_has_it(record, name):
     loop = servo(cid.PID(kp=20.0, kd=1.0), dt=0.01, free=("k",))
     fit = cid.fit_loop(loop, record[:200])
@@ -138,6 +142,9 @@ def test_what_needs_a_loop_says_where_a_fit_has_it(record, name):
         "audit": lambda: cid.audit(record, fit),
         "replay_controller": lambda: cid.replay_controller(fit, record),
         "redesign": lambda: cid.redesign(ct.tf([1.0], [1.0, 1.0]), fit, 10.0, 50.0),
+        "fit_loop": lambda: cid.fit_loop(fit, record),
+        "diagnose": lambda: cid.diagnose(fit, record, progress=False),
+        "predict": lambda: cid.predict(fit, record),
     }
-    with pytest.raises(cid.CtrlidError, match=r"LoopFit\)?\. Give its \.loop$"):
+    with pytest.raises(cid.CtrlidError, match=r"LoopFit( and Record|\))?\. Give its \.loop$"):
         calls[name]()

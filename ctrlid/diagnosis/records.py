@@ -8,6 +8,7 @@ from typing import Any
 import control as ct
 import numpy as np
 
+from .._base.arguments import point_at_part
 from .._base.errors import CtrlidError
 from .._base.signals import require_one_signal
 from .._base.text import write_list
@@ -35,6 +36,7 @@ def make_loop(loop: Any, record: Record) -> Loop:
         raise CtrlidError(
             "diagnose needs a Loop(plant, controller, dt=..., at=..., free=...) or a transfer "
             f"function such as the fits return; given {type(loop).__name__}"
+            f"{point_at_part(loop, Loop)}"
         )
     valid = record.valid
     u, y = float(np.mean(record.u[valid])), float(np.mean(record.y[valid]))

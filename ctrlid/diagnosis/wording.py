@@ -296,7 +296,8 @@ def describe_certainty(found: Diagnosis, finding: Finding) -> str:
     else:
         kinds = {name_at_place(c.effect) for c in found.ranking}
         count = len(kinds - set(list_names(finding)))
-        text += f"; none of the {count} other effects of the catalogue explains the record as well"
+        rest = "none of the {} other effects" if count > 1 else "no other effect"
+        text += f"; {rest.format(count)} of the catalogue explains the record as well"
     if found.verdict == "partly explained" and not isinstance(finding.effect, ReadingEffect):
         text += ". It may stand in for an effect that is not in the catalogue"
     return text

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..._base.arguments import check_arguments, explain_names
+from ..._base.arguments import check_arguments, explain_names, point_at_part
 from ..._base.arrays import Array
 from ..._base.errors import CtrlidError, ModelCannotRun
 from ..._base.interruption import hold_interrupt
@@ -238,7 +238,8 @@ def _choose_free_names(
     loop: Loop, free: Sequence[str] | Mapping[str, float] | None
 ) -> tuple[str, ...]:
     if not isinstance(loop, Loop):
-        raise CtrlidError(f"fit_loop needs a Loop(plant, ..., dt=...); given {type(loop).__name__}")
+        raise CtrlidError("fit_loop needs a Loop(plant, ..., dt=...); given "
+                          f"{type(loop).__name__}{point_at_part(loop, Loop)}")  # fmt: skip
     known = list(loop.equations(keep=True).parameters)
     if free is None:
         names = tuple(dict.fromkeys([*loop.free, *list_effect_bounds(loop)]))

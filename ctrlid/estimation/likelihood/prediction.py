@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ..._base.arguments import explain_names, is_number
+from ..._base.arguments import explain_names, is_number, point_at_part
 from ..._base.arrays import Array, freeze_arrays
 from ..._base.errors import CtrlidError, ModelCannotRun
 from ..._base.rounding import keep_numpy_quiet
@@ -152,7 +152,8 @@ def predict(loop: Loop, record: Record, noise_ratio: float | None = None) -> Pre
     loop, record = order_model_and_data(loop, record)
     if not (isinstance(loop, Loop) and isinstance(record, Record)):
         raise CtrlidError("predict needs a Loop and a Record; given "
-                          f"{type(loop).__name__} and {type(record).__name__}")  # fmt: skip
+                          f"{type(loop).__name__} and {type(record).__name__}"
+                          f"{point_at_part(loop, Loop)}")  # fmt: skip
     if noise_ratio is not None and not (is_number(noise_ratio) and 0 <= noise_ratio < 1e150):
         raise CtrlidError("noise_ratio is the ratio of force noise to sensor noise [1/s^2], >= 0; "
                           f"given {noise_ratio!r}")  # fmt: skip
