@@ -415,8 +415,7 @@ def _describe_kind(kind: Any) -> str:
         return "a sequence, each of it " + one
     if origin is not None or kind is Callable:
         return "a function"
-    name = getattr(kind, "__name__", str(kind))
-    return f"{'an' if name[:1] in 'AEIOU' else 'a'} {name}"
+    return _add_article(getattr(kind, "__name__", str(kind)))
 
 
 def _is_none(kind: Any) -> bool:

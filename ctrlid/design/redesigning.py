@@ -161,7 +161,7 @@ class Redesign(Printed):
                      f"unit, where {p.final_value:.3g} is promised.")  # fmt: skip
         sure = self.nu_gap < self.robust_margin
         # Where the units of a loop make the margin small, it has more digits.
-        digits = max(3, min(15, 1 - math.floor(math.log10(max(self.robust_margin, 1e-14)))))
+        digits = max(3, 1 - math.floor(math.log10(max(self.robust_margin, 1e-14))))
         return (
             f"{text} Stability near the operating point is {'' if sure else 'not '}guaranteed: "
             f"the nu-gap between model and physics is {self.nu_gap:.{digits}f}, and it has to be "

@@ -134,11 +134,10 @@ def lengthen_horizon(loop: Loop, found: Search, fresh: FreshData) -> FreshData:
         longer = replace(fresh, how=Reproduction("prediction", horizon))
         results = [longer.simulate_outputs(x) for x in loops]
         shared = gaps.share_samples(windows, results)
-        best = min(gaps.root_mean_square(shared, y) for y in results)
-        if best <= gaps.measure_trivial_error(shared, horizon):
+        *bare, complete = (gaps.root_mean_square(shared, y) for y in results)
+        if min(*bare, complete) <= gaps.measure_trivial_error(shared, horizon):
             return longer
-        bare = min(gaps.root_mean_square(shared, y) for y in results[:2])
-        if horizon >= longest or bare > gaps.measure_constant_error(shared):
+        if horizon >= longest or min(bare) > gaps.measure_constant_error(shared):
             return fresh
         horizon = min(2 * horizon, longest)
 
