@@ -3,12 +3,15 @@
 Groups: single operations; registers and constants; shapes and blocks; one after another; refusals.
 """
 
+from types import SimpleNamespace
+
 import casadi
 import numpy as np
 import pytest
 
 import ctrlid as cid
 from ctrlid import CtrlidError
+from ctrlid.physics import block_evaluation
 from ctrlid.physics.block_evaluation import (
     BINARY,
     BLOCK,
@@ -161,6 +164,44 @@ def test_rows_that_nothing_reads_still_say_how_many_samples_there_are():
     np.testing.assert_array_equal(second[:, 0, 0], x_[1])
     g = BlockEvaluation(casadi.Function("g", [x, p], [2 * p]))
     np.testing.assert_array_equal(g(x_, 2.0)[0], double)
+
+
+def write_controller():
+    """A function of states, a matrix and signals, with every kind of instruction."""
+    x, s, w = casadi.SX.sym("x", 2), casadi.SX.sym("s", 2, 2), casadi.SX.sym("w", 3)
+    after = casadi.vertcat(0.5 * x[0] + w[0] * w[1], casadi.sin(x[0]) - 0.25 * x[1] + w[2])
+    wish = casadi.fmin(casadi.fmax(3 * x[1] - w[1], -1), casadi.atan2(w[0], 2))
+    outputs = [after, casadi.mtimes(casadi.jacobian(after, x), s), wish, casadi.SX(7.25)]
+    return casadi.Function("step", [x, s, w], outputs)
+
+
+def test_instructions_read_from_the_text_are_those_that_casadi_was_asked_for(monkeypatch):
+    function = write_controller()
+    asked = block_evaluation._ask_for_instructions(function, range(function.n_instructions()))
+    np.testing.assert_array_equal(block_evaluation._decode_instructions(function), asked)
+    steps, constants = block_evaluation._list_instructions(function)
+    # Where CasADi writes another text, it is asked, and nothing else changes.
+    other = SimpleNamespace(serialize=lambda: "abcdefgh" * 99)
+    for name in ("n_instructions", "instruction_id", "instruction_input", "instruction_output",
+                 "instruction_constant"):  # fmt: skip
+        setattr(other, name, getattr(function, name))
+    assert block_evaluation._decode_instructions(other) is None
+    monkeypatch.setattr(block_evaluation, "_decode_instructions", lambda function: None)
+    again, numbers = block_evaluation._list_instructions(function)
+    np.testing.assert_array_equal(steps, again)
+    np.testing.assert_array_equal(constants, numbers)
+
+
+def test_sample_by_sample_it_does_what_casadi_does():
+    function, rng = write_controller(), np.random.default_rng(8)
+    w, start = rng.standard_normal((3, 200)), np.array([0.3, -0.2])
+    found = BlockEvaluation(function).iterate(np.concatenate([start, np.eye(2).ravel()]), w)
+    state, slope = start, np.eye(2)
+    for k in range(200):
+        results = [np.asarray(v) for v in function(state, slope, w[:, k])]
+        state, slope = results[0][:, 0], results[1]
+        expected = np.concatenate([v.ravel(order="F") for v in results])
+        np.testing.assert_allclose(found[k], expected, rtol=1e-12, atol=1e-14)
 
 
 def test_the_arguments_are_left_alone_and_the_results_are_not_views():

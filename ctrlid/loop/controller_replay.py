@@ -1,7 +1,7 @@
 """The input that a loop's controller computes from recorded signals."""
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass
 from typing import Any
 
 import casadi
@@ -16,15 +16,42 @@ from .._base.periods import have_same_period, write_both_periods, write_differen
 from .._base.rounding import keep_numpy_quiet
 from ..data.record import Record
 from ..data.several_records import order_model_and_data
+from ..physics.block_evaluation import BlockEvaluation
 from ..physics.conversions import to_state_matrices
-from .loop import Loop
+from .loop import Loop, exchange_controller
 from .wiring import knows_references, match_signals, stack_references
+
+
+@dataclass(frozen=True, eq=False)
+class _ControllerRun:
+    """A digital controller along the samples of a record, from any initial state.
+
+    `step` returns the next state and the input, `slopes` how both of them depend on the initial
+    state as well, and `rows` holds what they are given at each sample.
+    """
+
+    rest: Array
+    rows: Array
+    step: BlockEvaluation
+    slopes: BlockEvaluation
+
+    def compute_outputs(self, start: Array) -> Array:
+        """Return what the controller computes, with a row for each of several inputs."""
+        values = self.step.iterate(start, self.rows)[:, len(start) :].T
+        return values[0] if len(values) == 1 else np.ascontiguousarray(values)
+
+    def differentiate_outputs(self, start: Array) -> Array:
+        """Return how the outputs depend on the initial state, one output below the other."""
+        n = len(start)
+        found = self.slopes.iterate(np.concatenate([start, np.eye(n).ravel()]), self.rows)
+        shown = found[:, n + n * n :].T
+        return shown.reshape(n, (self.step.rows_out - n) * len(found)).T
 
 
 def _build_controller_run(
     loop: Loop, y: Array, r: Array | None, u: Array | None = None
-) -> tuple[Any, Array]:
-    """Return the controller over all samples as a function of its initial state, and its rest.
+) -> _ControllerRun:
+    """Return the controller of a loop along all samples.
 
     An observer reads the input `u` that was applied, or without one what the controller computes.
     """
@@ -34,7 +61,7 @@ def _build_controller_run(
         raise CtrlidError(
             f"only a digital controller can be replayed from the samples; this loop has {kind}"
         )
-    n = y.shape[-1]
+    n, size = y.shape[-1], len(law.rest)
     if r is not None:
         reference = np.reshape(r, (-1, n))
     elif law.references is None:
@@ -44,24 +71,20 @@ def _build_controller_run(
     rows = [np.arange(n)[None] * loop.dt, reference, np.reshape(y, (-1, n))]
     if u is not None and law.reads_input:
         rows.append(np.reshape(u, (-1, n)))
-    x, w = casadi.SX.sym("x", len(law.rest)), casadi.SX.sym("w", sum(map(len, rows)))
+    x, w = casadi.SX.sym("x", size), casadi.SX.sym("w", sum(map(len, rows)))
     t, now, measured, *logged = casadi.vertsplit(w, np.cumsum([0, *map(len, rows)]).tolist())
     wish, after = law.apply(t, x, now, measured)
     lower, upper = (casadi.DM(v) if np.ndim(v) else v for v in loop.input_limits)
     limited = casadi.fmin(casadi.fmax(wish, lower), upper)
     if law.reads_input:
         after = law.apply(t, x, now, measured, logged[0] if logged else limited)[1]
-    step = casadi.Function("controller", [x, w], [casadi.vertcat(after), limited])
-    table = casadi.DM(np.vstack(rows))
-    start = casadi.MX.sym("start", len(law.rest))
-    outputs = step.mapaccum("run", n)(start, table)[1]
-    return casadi.Function("outputs", [start], [outputs.T]), np.array(law.rest, dtype=float)
-
-
-def _run(run: Any, start: Array) -> Array:
-    """Return what a controller computes from a state, with a row for each of several inputs."""
-    values = np.asarray(run(start), float).T
-    return values[0] if len(values) == 1 else np.ascontiguousarray(values)
+    after = casadi.vertcat(after)
+    s = casadi.SX.sym("s", size, size)
+    moved, shown = (casadi.mtimes(casadi.jacobian(v, x), s) for v in (after, limited))
+    step = casadi.Function("controller", [x, w], [after, limited])
+    slopes = casadi.Function("slopes", [x, s, w], [after, moved, shown])
+    rest = np.array(law.rest, dtype=float)
+    return _ControllerRun(rest, np.vstack(rows), BlockEvaluation(step), BlockEvaluation(slopes))
 
 
 def read_references(loop: Loop, record: Record) -> Array | None:
@@ -100,8 +123,8 @@ def run_controller(loop: Loop, y: Array, r: Array | None = None) -> Array:
     CtrlidError
         If the loop has no controller, or an analog one.
     """
-    run, rest = _build_controller_run(loop, y, r)
-    return _run(run, rest)
+    run = _build_controller_run(loop, y, r)
+    return run.compute_outputs(run.rest)
 
 
 @explain_names
@@ -189,7 +212,7 @@ def sample_analog_controller(loop: Loop, hold_r: str, hold_y: str) -> Loop | Non
     phi, held, slope = whole[:n, :n], whole[:n, n : n + 2], whole[:n, n + 2 :]
     slope = slope * [hold == "foh" for hold in (hold_r, hold_y)]
     sampled = ct.ss(phi, held - slope + phi @ slope, c, d + c @ slope, dt, inputs=["r", "y"])
-    return replace(loop, controller=sampled)
+    return exchange_controller(loop, sampled)
 
 
 def replay_from_best_state(loop: Loop, record: Record) -> tuple[Array, Array]:
@@ -204,24 +227,23 @@ def replay_from_best_state(loop: Loop, record: Record) -> tuple[Array, Array]:
         raise ModelCannotRun("the record has no reference r, which the controller needs; give it "
                               "r=, a constant for a fixed set-point")  # fmt: skip
     r = read_references(loop, record)
-    run, start = _build_controller_run(loop, record.y, r, record.u)
+    run = _build_controller_run(loop, record.y, r, record.u)
+    start = run.rest
     replayed, best = _compare_inputs(run, start, record)
     if start.size and np.isfinite(loop.input_limits).any():
         # From the wrong state all may be cut off, and the state is then nowhere to be seen.
-        unlimited = replace(loop, input_limits=(-math.inf, math.inf))
+        unlimited = exchange_controller(loop, loop.controller, limits=(-math.inf, math.inf))
         low, high = (np.reshape(v, (-1, 1)) if np.ndim(v) else v for v in loop.input_limits)
         inside = np.ravel((record.u > low) & (record.u < high))
-        free, _ = _build_controller_run(unlimited, record.y, r, record.u)
-        moved = _take_gauss_newton_step(
-            free, _differentiate_outputs(free, start.size), start, record.u, inside
-        )
+        free = _build_controller_run(unlimited, record.y, r, record.u)
+        moved = _take_gauss_newton_step(free, start, record.u, inside)
         trial, cost = _compare_inputs(run, moved, record)
         if cost < best:
             start, replayed, best = moved, trial, cost
     # Gauss-Newton: one step where the law is linear in its state, a few more around limits.
-    slope, every = _differentiate_outputs(run, start.size), np.full(record.u.size, True)
+    every = np.full(record.u.size, True)
     for _ in range(10 if start.size else 0):
-        moved = _take_gauss_newton_step(run, slope, start, record.u, every)
+        moved = _take_gauss_newton_step(run, start, record.u, every)
         trial, cost = _compare_inputs(run, moved, record)
         if not cost < best:
             break
@@ -231,27 +253,21 @@ def replay_from_best_state(loop: Loop, record: Record) -> tuple[Array, Array]:
 
 def differentiate_replay(loop: Loop, record: Record) -> tuple[Array, Array, float]:
     """Return what `run_controller` does, its slope by the initial state, and its output at rest."""
-    run, rest = _build_controller_run(loop, record.y, read_references(loop, record), record.u)
-    slope = np.asarray(_differentiate_outputs(run, rest.size)(rest).full(), float)
+    run = _build_controller_run(loop, record.y, read_references(loop, record), record.u)
     still = run_controller(loop, np.full(1, loop.point.output))
-    return np.asarray(run(rest), float).ravel(), slope, float(still[0])
+    slope = run.differentiate_outputs(run.rest)
+    return np.ravel(run.compute_outputs(run.rest)), slope, float(still[0])
 
 
-def _compare_inputs(run: Any, start: Array, record: Record) -> tuple[Array, float]:
+def _compare_inputs(run: _ControllerRun, start: Array, record: Record) -> tuple[Array, float]:
     """Return what a controller computes from a state, and how far the logged input is from it."""
-    replayed = _run(run, start)
+    replayed = run.compute_outputs(start)
     return replayed, float(np.sum((replayed - record.u) ** 2))
 
 
-def _differentiate_outputs(run: Any, size: int) -> Any:
-    """Return how the outputs of a controller depend on its initial state, as a function of it."""
-    state = casadi.MX.sym("state", size)
-    return casadi.Function("slope", [state], [casadi.jacobian(run(state), state)])
-
-
-def _take_gauss_newton_step(run: Any, slope: Any, start: Array, u: Array, use: Any) -> Array:
+def _take_gauss_newton_step(run: _ControllerRun, start: Array, u: Array, use: Any) -> Array:
     """Return a state by one Gauss-Newton step towards a logged input, on the samples to use."""
-    jacobian = np.asarray(slope(start).full(), float)
-    left = np.ravel(u - _run(run, start))
+    jacobian = run.differentiate_outputs(start)
+    left = np.ravel(u - run.compute_outputs(start))
     step = np.linalg.lstsq(jacobian[use], left[use], rcond=1e-12)[0]
     return np.asarray(start + step)

@@ -477,6 +477,8 @@ class Loop:
         new.__dict__.update(self.__dict__ | changes)
         # Effects have states of their own.
         new.__dict__.pop("point", None)
+        if "controller" in changes:
+            new.__dict__.pop("_law", None)
         new._apply_effects(self)
         return new
 
@@ -617,6 +619,19 @@ class _Itself:
 def _add_effect(loop: Loop, effect: _Itself) -> Loop:
     """Return a loop with one more effect; the last ones are kept."""
     return loop._replace_fields(effects=(*loop.effects, effect.given))
+
+
+def exchange_controller(
+    loop: Loop, controller: Any, limits: tuple[float, float] | None = None
+) -> Loop:
+    """Return a loop with another digital controller, or other limits, on the same plant.
+
+    The plant, which was traced and checked when the loop was made, is not traced again: who tries
+    many controllers need not wait for it.
+    """
+    return loop._replace_fields(
+        controller=controller, input_limits=loop.input_limits if limits is None else limits
+    )
 
 
 def _check_beliefs(free: Mapping[str, Any], parameters: Mapping[str, float]) -> None:

@@ -340,9 +340,17 @@ class Simulator:
         self, z: Array, r: Array | None, d: Array, noise: Sequence[Array] | None = None,
         start_time: float = 0.0,
     ) -> tuple[Array, Array]:  # fmt: skip
-        """Return measured output and applied input, from state `z` and time `start_time` on.
+        """Return measured output and applied input, from state `z` and time `start_time` on."""
+        return self.run_in_steps(1, z, r, d, noise, start_time)[:2]
 
-        Runs chunk by chunk; the steps of a chunk are halved until its local errors are small.
+    def run_in_steps(
+        self, substeps: int, z: Array, r: Array | None, d: Array,
+        noise: Sequence[Array] | None = None, start_time: float = 0.0,
+    ) -> tuple[Array, Array, int]:  # fmt: skip
+        """Return output, input, and the steps in a period with which a similar run should begin.
+
+        Runs chunk by chunk, the first one with `substeps` steps in a period; the steps of a chunk
+        are halved until its local errors are small.
         """
         loop, n = self.loop, d.shape[-1]
         _, references, inputs, outputs, forces, *_ = self.counts
@@ -357,7 +365,7 @@ class Simulator:
         y, u = np.empty((outputs, n)), np.empty((inputs, n))
         start, reach = z, self._floor
         asked, whole = self._measure_asked(w), loop.controller is None
-        substeps, size = 1, min(CHUNK, n)
+        size = min(CHUNK, n)
         worst, where = 0.0, 0
         for first in range(0, n, size):
             count = min(size, n - first)
@@ -409,7 +417,7 @@ class Simulator:
                 f"{MOST_SUBSTEPS} steps in {loop.dt:g} s; simulate with a smaller dt",
                 CtrlidWarning, stacklevel=5,
             )  # fmt: skip
-        return _drop_single_row(y), _drop_single_row(u)
+        return _drop_single_row(y), _drop_single_row(u), substeps
 
     def _measure_asked(self, w: Array) -> Array:
         """Return how far from zero the point of rest, the reference and the noise ask y to be."""

@@ -6,7 +6,7 @@ faster and costs no compilation per expression.
 """
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import casadi
@@ -17,7 +17,7 @@ from .._base.compilation import compile_loop
 from .._base.errors import CtrlidError
 from .._base.interruption import keep_interrupt
 from .._base.jobs import count_processors, run_side_by_side
-from .interpreter import BINARY, UNARY, run_programs
+from .interpreter import BINARY, UNARY, iterate_program, run_programs
 
 # A block of so many samples is long enough to hide the cost of its loop and fits into the cache.
 BLOCK = 512
@@ -25,6 +25,10 @@ BLOCK = 512
 BLOCKS = 64
 # A fit evaluates the same few functions at each step; so many are kept joined.
 JOINED = 16
+# CasADi is asked for every so manieth instruction, to be sure where its text holds them.
+ASKED = 50
+# The operations that `run_program` carries out.
+KNOWN = {casadi.OP_CONST, casadi.OP_INPUT, casadi.OP_OUTPUT} | UNARY | BINARY
 
 
 class BlockEvaluation:
@@ -63,14 +67,48 @@ class BlockEvaluation:
         """
         return evaluate_blocks([self], [], arguments)
 
+    def iterate(self, first: Array, signals: Array, *others: Any) -> Array:
+        """Evaluate sample by sample, the first results the first arguments of the next sample.
+
+        Parameters
+        ----------
+        first : ndarray, shape (carried,)
+            What is carried, at the first sample.
+        signals : ndarray, shape (rows, n)
+            Arguments behind those.
+        *others : float or array_like
+            Arguments that stay.
+
+        Returns
+        -------
+        ndarray, shape (n, rows of the results)
+            All results of each sample.
+        """
+        given = np.concatenate([first, np.zeros(len(signals)), *map(np.ravel, others)])[:, None]
+        room = np.empty((self.registers, 1)), np.zeros((self.rows_out, 1))
+        found: Array = iterate_program(
+            self.program, self.constants, given, *room, len(first), np.ascontiguousarray(signals)
+        )
+        return found
+
 
 def _list_instructions(function: Any) -> tuple[Any, Array]:
-    """Return the instructions of a function as CasADi has them, and its numbers.
+    """Return the instructions of a function, and its numbers.
 
     Each as operation, register of the result, operands; for inputs, outputs and constants the row
     of their table stands in place of a register. The elements of inputs and outputs stand one
     column after another, one table after another.
     """
+    table = _decode_instructions(function)
+    if table is None:
+        table = _ask_for_instructions(function, range(function.n_instructions()))
+    op = table[:, 0]
+    unknown = set(op.tolist()) - KNOWN
+    if unknown:
+        raise CtrlidError(
+            f"the equations use an operation (CasADi's number {min(unknown)}) that cannot be "
+            "evaluated over many samples; write it with ordinary numpy functions"
+        )
     into, out = [], []
     first = 0
     for k in range(function.n_in()):
@@ -80,28 +118,60 @@ def _list_instructions(function: Any) -> tuple[Any, Array]:
     for k in range(function.n_out()):
         out.append([first + i for i in function.sparsity_out(k).find()])
         first += function.numel_out(k)
-    steps: list[tuple[int, int, int, int]] = []
-    constants: list[float] = []
-    for k in range(function.n_instructions()):
+    steps = table.astype(np.int64)
+    fixed, read, written = (op == k for k in (casadi.OP_CONST, casadi.OP_INPUT, casadi.OP_OUTPUT))
+    constants = np.ascontiguousarray(table[fixed, 2:]).view(float)[:, 0]
+    steps[fixed, 2] = np.arange(len(constants))
+    steps[read, 2] = [into[k][i] for k, i in table[read, 2:].tolist()]
+    steps[fixed | read, 3] = 0
+    steps[written, 1] = [out[k][i] for k, i in table[written][:, [1, 3]].tolist()]
+    steps[written, 3] = steps[written, 2]
+    return steps, constants
+
+
+def _ask_for_instructions(function: Any, which: Iterable[int]) -> Any:
+    """Return instructions of a function as CasADi keeps them, as 32-bit numbers.
+
+    Each as operation, result and two operands: registers; for an input its table and element as
+    operands; for an output its table as result and its element as second operand; for a constant
+    the two halves of its number as operands.
+    """
+    rows = []
+    for k in which:
         op = function.instruction_id(k)
         to, a = function.instruction_output(k), function.instruction_input(k)
         if op == casadi.OP_CONST:
-            steps.append((op, to[0], len(constants), 0))
-            constants.append(function.instruction_constant(k))
-        elif op == casadi.OP_INPUT:
-            steps.append((op, to[0], into[a[0]][a[1]], 0))
+            a = np.array([function.instruction_constant(k)]).view(np.int32).tolist()
         elif op == casadi.OP_OUTPUT:
-            steps.append((op, out[to[0]][to[1]], a[0], a[0]))
-        elif op in UNARY:
-            steps.append((op, to[0], a[0], a[0]))
-        elif op in BINARY:
-            steps.append((op, to[0], a[0], a[1]))
-        else:
-            raise CtrlidError(
-                f"the equations use an operation (CasADi's number {op}) that cannot be "
-                "evaluated over many samples; write it with ordinary numpy functions"
-            )
-    return np.array(steps, dtype=np.int64).reshape(-1, 4), np.array(constants, dtype=float)
+            a = [a[0], to[1]]
+        rows.append((op, to[0], a[0], a[-1]))
+    return np.array(rows, dtype=np.int32).reshape(-1, 4)
+
+
+def _decode_instructions(function: Any) -> Any:
+    """Return what `_ask_for_instructions` returns for all instructions, or None.
+
+    CasADi hands out one instruction at a time, which takes longer than all else in building a map.
+    Its serialized text holds them one after another, two letters a byte, though it is nowhere
+    promised: so that the place is where instructions stand that CasADi was asked for.
+    """
+    n = function.n_instructions()
+    if not n:
+        return None
+    asked = [*range(0, n, ASKED), n - 1]
+    known = _ask_for_instructions(function, asked)
+    text = np.frombuffer(function.serialize().encode(), np.uint8) - np.uint8(ord("a"))
+    # The text begins with a letter that tells the order of bytes.
+    for shift in range(2):
+        letters = text[shift : shift + (text.size - shift) // 2 * 2]
+        content = (letters[0::2] | letters[1::2] << 4).tobytes()
+        place = content.find(known[0].tobytes())
+        while 0 <= place <= len(content) - 16 * n:
+            table = np.frombuffer(content, np.int32, 4 * n, place).reshape(n, 4)
+            if np.array_equal(table[asked], known):
+                return table
+            place = content.find(known[0].tobytes(), place + 1)
+    return None
 
 
 @keep_interrupt

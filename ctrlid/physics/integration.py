@@ -12,6 +12,8 @@ from .equations import Equations, Lag
 
 # A piece is its duration [s], the input at its start and the slope of the input.
 Piece = tuple[Any, Any, Any]
+# As plain numbers, since CasADi turns each of numpy's into a matrix first, which takes long.
+A, B, C, E3, E5 = (getattr(DOP853, name).tolist() for name in ("A", "B", "C", "E3", "E5"))
 # The transient of a lag is over after so many time constants.
 SHARP = 8.0
 
@@ -65,7 +67,7 @@ def integrate(rate: Any, z: Any, dt: Any, substeps: int) -> tuple[Any, Any]:
 
     def one(start: Any, z: Any) -> list[Any]:
         stages: list[Any] = []
-        for row, c in zip(DOP853.A, DOP853.C, strict=True):
+        for row, c in zip(A, C, strict=True):
             point = z
             for weight, stage in zip(row, stages, strict=False):
                 if weight:
@@ -73,7 +75,7 @@ def integrate(rate: Any, z: Any, dt: Any, substeps: int) -> tuple[Any, Any]:
             stages.append(rate(start + c * h, point))
         total, fifth, third = (
             sum((w * s for w, s in zip(weights, stages, strict=False) if w), casadi.SX(0))
-            for weights in (DOP853.B, DOP853.E5, DOP853.E3)
+            for weights in (B, E5, E3)
         )
         fifth, third = casadi.fabs(h * fifth), casadi.fabs(h * third)
         error = fifth**2 / casadi.sqrt(fifth**2 + 0.01 * third**2 + 1e-300)

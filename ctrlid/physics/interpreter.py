@@ -211,32 +211,37 @@ def run_program(
 @keep_interrupt
 @compile_loop(nogil=True, error_model="numpy")
 def iterate_program(
-    program: Any, constants: Any, inputs: Any, work: Any, outputs: Any, signal: Any
+    program: Any, constants: Any, inputs: Any, work: Any, outputs: Any, carried: int, signals: Any
 ) -> Any:  # pragma: no cover - compiled
-    """Carry out a program once per sample, its result the first input of the next sample.
+    """Carry out a program once per sample, its first results the first inputs of the next sample.
 
     Parameters
     ----------
     program, constants, work, outputs
         As `run_program` takes them, in blocks of one sample.
     inputs : ndarray, shape (rows, 1)
-        Arguments: the first value of what is carried, room for the signal, and others.
-    signal : ndarray, shape (n,)
-        Values of the second argument.
+        Arguments: the first values of what is carried, room for the signals, and others.
+    carried : int
+        How many results are carried.
+    signals : ndarray, shape (signals, n)
+        Values of the arguments behind those.
 
     Returns
     -------
-    ndarray, shape (n + 1,)
-        What is carried: before each sample, and after the last.
+    ndarray, shape (n, rows of the results)
+        The results of each sample.
     """
-    carried = np.empty(len(signal) + 1)
-    carried[0] = inputs[0, 0]
-    for k in range(len(signal)):
-        inputs[0, 0], inputs[1, 0] = carried[k], signal[k]
+    results = np.empty((signals.shape[1], len(outputs)))
+    for k in range(len(results)):
+        for row in range(len(signals)):
+            inputs[carried + row, 0] = signals[row, k]
         # A number written here would be a type of its own, and all of it compiled once more.
         run_program(program, constants, inputs, work, outputs, inputs.shape[1])
-        carried[k + 1] = outputs[0, 0]
-    return carried
+        for row in range(len(outputs)):
+            results[k, row] = outputs[row, 0]
+        for row in range(carried):
+            inputs[row, 0] = outputs[row, 0]
+    return results
 
 
 @keep_interrupt

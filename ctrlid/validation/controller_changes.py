@@ -15,7 +15,7 @@ from ..data.record import Record
 from ..data.validity import find_longest_run, find_whole_past
 from ..loop.controller_replay import differentiate_replay, replay_controller
 from ..loop.controllers import PID, AntiWindup, Derivative, Integral
-from ..loop.loop import Loop
+from ..loop.loop import Loop, exchange_controller
 from ..physics.conversions import to_state_matrices
 
 # Shorter stretches do not tell what computed the input.
@@ -150,7 +150,7 @@ def _scale_controller(loop: Loop, factor: float, constant: float) -> Loop | None
     if isinstance(controller, PID):
         other = replace(controller, kp=factor * controller.kp, ki=factor * controller.ki,
                         kd=factor * controller.kd, bias=constant)  # fmt: skip
-        return replace(loop, controller=other)
+        return exchange_controller(loop, other)
     if isinstance(controller, ct.TransferFunction | ct.StateSpace | int | float):
         return replace(loop, controller=factor * controller,
                        at=replace(loop.point, input=constant))  # fmt: skip
@@ -166,7 +166,7 @@ def _list_single_gains(loop: Loop, pid: PID, record: Record) -> Iterator[LawChan
     for name, words in (("kp", "proportional"), ("ki", "integral"), ("kd", "derivative")):
         if not getattr(pid, name):
             continue
-        without = replace(free, controller=replace(free.controller, **{name: 0.0}))
+        without = exchange_controller(free, replace(free.controller, **{name: 0.0}))
         others, responses, _ = differentiate_replay(without, part)
         table = np.column_stack([whole - others, responses])[inner]
         factor = float(regress(table, part.u[inner] - others[inner], DETERMINED)[0])
@@ -180,14 +180,14 @@ def _list_single_gains(loop: Loop, pid: PID, record: Record) -> Iterator[LawChan
 
             def make_scaled(factor: float, name: str = name) -> tuple[Loop, Record]:
                 changed = replace(pid, **{name: factor * getattr(pid, name)})
-                return replace(loop, controller=changed), record
+                return exchange_controller(loop, changed), record
 
             factor = _search_value(make_scaled, [factor * f for f in FACTORS], np.inf) or factor
         changed = replace(pid, **{name: factor * getattr(pid, name)})
         yield LawChange(
             "gain",
             f"with {factor:.4g} times the {words} gain, {name}={getattr(changed, name):.4g}",
-            replace(loop, controller=changed), record, exact=True,
+            exchange_controller(loop, changed), record, exact=True,
         )  # fmt: skip
 
 
@@ -208,10 +208,11 @@ def _list_limits(loop: Loop, record: Record) -> Iterator[LawChange]:
         choices += [(*pair, True) for pair in once if pair != (low, high)]
     for lower, upper, exact in choices:
         words = f"it is limited to {lower:.4g} to {upper:.4g}"
-        yield LawChange("limit", words, replace(loop, input_limits=(lower, upper)), record, exact)
+        held = exchange_controller(loop, loop.controller, limits=(lower, upper))
+        yield LawChange("limit", words, held, record, exact)
         if isinstance(loop.controller, PID) and lower < upper:
             limited = replace(loop.controller, lower=lower, upper=upper)
-            yield LawChange("limit", words, replace(loop, controller=limited), record, exact)
+            yield LawChange("limit", words, exchange_controller(loop, limited), record, exact)
 
 
 def _list_options(loop: Loop, pid: PID, record: Record) -> Iterator[LawChange]:
@@ -236,7 +237,7 @@ def _list_options(loop: Loop, pid: PID, record: Record) -> Iterator[LawChange]:
     for change in sorted(changes, key=lambda c: (len(c), str(c))):
         if change:
             kind = "limit" if "anti_windup" in change else "filter"
-            other = replace(loop, controller=replace(pid, **change))
+            other = exchange_controller(loop, replace(pid, **change))
             yield LawChange(kind, _write_options(change), other, record)
 
 
@@ -393,7 +394,7 @@ def _list_derivatives(loop: Loop, pid: PID, record: Record, stated: float) -> It
 
         def make(time: float, form: dict[str, Any] = form) -> tuple[Loop, Record]:
             other = replace(pid, filter_time=time, **form)
-            return replace(loop, controller=other), record
+            return exchange_controller(loop, other), record
 
         found = _search_value(make, [record.dt * time for time in TIMES], stated)
         times = [*([0.0] if pid.filter_time else []), *([] if found is None else [found])]
@@ -470,7 +471,7 @@ def _list_moved_poles(
 def _move_pole(loop: Loop, record: Record, old: float, new: float, law: Any) -> LawChange:
     words = [f"{-record.dt / np.log(p):.3g} s" if p > 0 else "none" for p in (old, new)]
     return LawChange("filter", f"with a filter of another time constant ({words[1]} where the "
-                     f"stated law has {words[0]})", replace(loop, controller=law), record,
+                     f"stated law has {words[0]})", exchange_controller(loop, law), record,
                      exact=True)  # fmt: skip
 
 
@@ -492,7 +493,7 @@ def _list_discretizations(loop: Loop, record: Record) -> Iterator[LawChange]:
             yield LawChange(
                 "filter", f"what {RULES[rule]} makes of the analog law behind it, where the stated "
                 f"law is what {RULES[source]} makes of it",
-                replace(loop, controller=ct.ss(*sampled, record.dt)), record, exact=True,
+                exchange_controller(loop, ct.ss(*sampled, record.dt)), record, exact=True,
             )  # fmt: skip
 
 
@@ -567,10 +568,10 @@ def _is_nonlinear(loop: Loop) -> bool:
 
 def _take_limits_off(loop: Loop) -> Loop:
     """Return the loop without limits of its input or its controller."""
-    free = replace(loop, input_limits=(-np.inf, np.inf))
-    if isinstance(free.controller, PID):
-        free = replace(free, controller=replace(free.controller, lower=-np.inf, upper=np.inf))
-    return free
+    controller = loop.controller
+    if isinstance(controller, PID):
+        controller = replace(controller, lower=-np.inf, upper=np.inf)
+    return exchange_controller(loop, controller, limits=(-np.inf, np.inf))
 
 
 def _read_polynomials(controller: Any) -> tuple[Any, Any]:

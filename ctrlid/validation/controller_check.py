@@ -21,7 +21,7 @@ from ..loop.controller_replay import (
     sample_analog_controller,
 )
 from ..loop.controllers import PID
-from ..loop.loop import Loop
+from ..loop.loop import Loop, exchange_controller
 from ..loop.sampled_form import describe_sampled_form, find_sampled_form
 from .controller_changes import DETERMINED, FEWEST, TRIAL, list_changes
 from .residual_tests import compute_explained_share
@@ -107,7 +107,7 @@ def check_controller(loop: Loop, record: Record) -> list[Fact]:
                       f"{upper:g}) for {write_percent(beyond)} of the samples: u was logged before "
                       "the limiter, or the limits are wrong. Limit u before fitting, or correct "
                       "input_limits=.", beyond, True))  # fmt: skip
-        loop = replace(loop, input_limits=(-np.inf, np.inf))
+        loop = exchange_controller(loop, loop.controller, limits=(-np.inf, np.inf))
     try:
         e, left = _compute_remainder(loop, part)
     except CtrlidError as reason:  # The audit prints a refusal among its facts.
@@ -215,7 +215,7 @@ def _sample_analog_law(
     _, _, hold_r, hold, sampled, _ = best
 
     def sample(factor: Any) -> Loop | None:
-        changed = replace(loop, controller=factor * loop.controller)
+        changed = exchange_controller(loop, factor * loop.controller)
         return sample_analog_controller(changed, hold_r, hold)
 
     return sampled, max(EXACT, resolve(best) / spread), sample

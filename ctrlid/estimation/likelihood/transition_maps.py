@@ -20,7 +20,6 @@ from ...loop.period_map import apply_backlash, push_velocities
 from ...physics.block_evaluation import BlockEvaluation
 from ...physics.equations import Equations
 from ...physics.integration import Scheme, advance, cut_input, find_lags, integrate
-from ...physics.interpreter import iterate_program
 from ...physics.linearization import compute_state_matrices
 from .filter_data import find_rest_state
 
@@ -376,11 +375,8 @@ class BacklashMap:
 
     def compute_memories(self, first: float, u: Array, p: Array) -> Array:
         """Return the memory before each of n samples and after the last, shape (n + 1,)."""
-        after = self.after
-        inputs = np.concatenate([[first, 0.0], p])[:, None]
-        room = np.empty((after.registers, 1)), np.zeros((after.rows_out, 1))
-        found: Array = iterate_program(after.program, after.constants, inputs, *room, u)
-        return found
+        after = self.after.iterate(np.array([first]), u[None, :], p)[:, 0]
+        return np.concatenate([[first], after])
 
     def compute_input(self, first: float, u: Array, p: Array) -> tuple[Array, Array]:
         """Return the applied input, shape (n,), and its derivatives by the free parameters.

@@ -3,6 +3,7 @@
 import math
 import warnings
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import control as ct
@@ -11,6 +12,7 @@ from scipy import stats
 
 from ..._base.arguments import check_arguments, explain_names
 from ..._base.errors import CtrlidError, CtrlidWarning
+from ..._base.periods import have_same_period, write_both_periods
 from ..._base.rounding import keep_numpy_quiet
 from ..._base.signals import require_one_signal
 from ..._base.text import write_list, write_number, write_p_value, write_quantity
@@ -22,7 +24,15 @@ from ...physics.conversions import to_state_matrices
 from ..constraints import AbstractConstraint, check_constraints, divide_constraints
 from ..identified_model import Estimate, IdentifiedModel, Structure
 from ..whiteness import ROUNDING, note_coloured_innovations
-from .prediction_error import Minimum, Piece, Task, add_delay, colour_noise, find_best_fit
+from .prediction_error import (
+    Minimum,
+    NotDetermined,
+    Piece,
+    Task,
+    add_delay,
+    colour_noise,
+    find_best_fit,
+)
 from .sampled_motion import Circuit, list_inputs
 
 # Above this product of dt and the controller's fastest pole, u moves visibly between samples.
@@ -151,9 +161,9 @@ def fit_continuous(
         coloured = colour_noise(best, known)
         # Noise that leaves its innovations coloured stands for what the plant lacks, and bends it.
         if not len(note_colour(coloured)):
-            best, notes = coloured, ()
+            best, notes = coloured, _note_missed_pole(coloured)
     point, found, rss, settled = best.point, best.found, best.rss, best.settled
-    degrees = best.used - found.free - len(point.gain) - int(task.free_delay)
+    degrees = best.used - best.fitted
     # Errors that are rounding beside y leave nothing to gain.
     beyond_rounding = rss > (ROUNDING * size) ** 2 * total
     if not settled and beyond_rounding:
@@ -199,6 +209,31 @@ def _note_missed_delay(best: Minimum, known: Sequence[AbstractConstraint]) -> tu
     )
 
 
+def _note_missed_pole(coloured: Minimum) -> tuple[str, ...]:
+    r"""Return what to say where one more pole, with white noise, explains more than coloured noise.
+
+    .. math:: N \ln(V_c / V_1) > (d_1 - d_c) \ln N
+
+    for the sums of squares and the numbers of what is fitted, with coloured noise (c) and with one
+    more pole (1). A moving average follows what a lag leaves in the innovations, and then bends the
+    poles. The larger model has no constraints: they speak of the coefficients of the smaller one.
+    """
+    task = coloured.task
+    larger = Structure(na=task.structure.na + 1, nb=task.structure.nb, domain="s")
+    try:
+        white = find_best_fit(replace(task, structure=larger, colour=0), (), coloured.point.delay)
+    except NotDetermined:
+        return ()
+    gained = coloured.used * math.log(coloured.rss / white.rss) if white.rss > 0 else math.inf
+    if gained <= (white.fitted - coloured.fitted) * math.log(coloured.used):
+        return ()
+    return (
+        f"{larger.na} POLES AND WHITE NOISE PREDICT BETTER than this model with its moving average "
+        f"of order {task.colour}: something acts later than in this model, and its coefficients "
+        "stand in for that. Give more poles for a lag, or delay=None to estimate a delay.",
+    )
+
+
 _NOT_CONVERGED = (
     "THE SEARCH ENDED WITHOUT CONVERGENCE: a further step promised a better fit, and none of those "
     "tried gave it. Lower the orders, add a constraint, or excite the loop more."
@@ -237,6 +272,10 @@ def _make_circuit(controller: Any, records: Sequence[Record]) -> Circuit | None:
         isinstance(controller, ct.InputOutputSystem) and controller.dt not in (0, None)
     ):
         # A digital controller holds u, which is therefore known between the samples.
+        period = getattr(controller, "dt", None)
+        if period and period is not True and not have_same_period(period, records[0].dt):
+            both = write_both_periods("the controller runs", period, "the record", records[0].dt)
+            raise CtrlidError(f"{both}; give the record its period, or the controller that ran")
         return None
     if controller is None:
         moves = measure_input_motion(records)

@@ -44,6 +44,10 @@ SLOWEST = 3
 RESOLVED = 1e-12
 
 
+class NotDetermined(CtrlidError):
+    """The data say nothing of some coefficients of a model."""
+
+
 @dataclass(frozen=True, eq=False)
 class Piece:
     """One valid stretch of a record, as deviations."""
@@ -78,6 +82,11 @@ class Minimum:
         task = self.task
         states = task.structure.na + task.colour + (len(task.circuit.a) if task.circuit else 0)
         return sum(p.n for p in task.pieces) - len(task.pieces) * (states + 1)
+
+    @property
+    def fitted(self) -> int:
+        """Number of coefficients that are free, observer gains and delays fitted."""
+        return self.found.free + len(self.point.gain) + int(self.task.free_delay)
 
     @property
     def criterion(self) -> float:
@@ -117,7 +126,7 @@ class Task:
 def _compute_columns(task: Task, point: Point, piece: Piece) -> Array | None:
     """Return the prediction errors and what initial state and operating point add to them."""
     motion = task.discretize(point.theta, point.delay)
-    errors, _ = compute_prediction_errors(motion, point.gain, piece.signals)
+    errors = compute_prediction_errors(motion, point.gain, piece.signals)
     if errors is None:
         return None
     size, n = len(motion.f), piece.n
@@ -134,7 +143,8 @@ def _compute_columns(task: Task, point: Point, piece: Piece) -> Array | None:
             free[filled : filled + more] = free[:more] @ power
             power, filled = power @ power, filled + more
     ones = {name: np.zeros(n) for name in piece.signals} | list_inputs(np.ones(n), task.hold)
-    rest, _ = compute_prediction_errors(motion, point.gain, ones)
+    rest = compute_prediction_errors(motion, point.gain, ones)
+    assert rest is not None  # The observer is the one that was stable above.
     return np.column_stack([free, rest, errors])
 
 
@@ -170,8 +180,7 @@ def _evaluate_cost(task: Task, point: Point) -> tuple[float, list[Array]]:
 
 def _compute_errors(task: Task, point: Point, piece: Piece) -> Array | None:
     motion = task.discretize(point.theta, max(point.delay, 0.0))
-    errors: Array | None = compute_prediction_errors(motion, point.gain, piece.signals)[0]
-    return errors
+    return compute_prediction_errors(motion, point.gain, piece.signals)
 
 
 def _differentiate_errors(
@@ -295,7 +304,13 @@ def _is_violated(task: Task, point: Point, known: Sequence[AbstractConstraint]) 
 
 
 def find_best_fit(task: Task, known: Sequence[AbstractConstraint], delay: float) -> Minimum:
-    """Search from the most promising starts and return the best minimum."""
+    """Search from the most promising starts and return the best minimum.
+
+    Raises
+    ------
+    NotDetermined
+        If some coefficients change no prediction.
+    """
     starts = _rank_starts(task, delay)
     short = replace(task, pieces=_take_head(task.pieces))
     ranked: list[tuple[float, float, Point]] = []
@@ -307,7 +322,7 @@ def find_best_fit(task: Task, known: Sequence[AbstractConstraint], delay: float)
             continue
         ranked.append((rss, speed, refined))
     if not ranked:
-        raise CtrlidError(
+        raise NotDetermined(
             "The data do not determine the coefficients: from every start of the search some "
             "coefficients changed no prediction. Vary the reference, lower the orders or add a "
             "constraint."
@@ -318,7 +333,7 @@ def find_best_fit(task: Task, known: Sequence[AbstractConstraint], delay: float)
         task = _change_speed(task, speed)
         best, found, rss, settled = _minimize_twice(task, point, known)
     except NotExcited as trouble:
-        raise CtrlidError(
+        raise NotDetermined(
             "The data do not determine the coefficients: a change of "
             f"{write_list(task.structure.names)} in the direction "
             f"{np.array2string(trouble.direction, precision=3)} changes no prediction. Vary the "
@@ -472,9 +487,7 @@ def _fit_numerator(
         slopes = []
         for i in range(s.nb):
             theta = blank.theta + _make_unit_vector(len(s.names), s.na + i)
-            errors, _ = compute_prediction_errors(
-                task.discretize(theta, delay), gain, piece.signals
-            )
+            errors = compute_prediction_errors(task.discretize(theta, delay), gain, piece.signals)
             if errors is None:
                 return None, np.inf
             slopes.append(errors - table[:, -1])

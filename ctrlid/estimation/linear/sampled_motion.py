@@ -9,9 +9,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy import signal
 
 from ..._base.arrays import Array
+from ..._base.compilation import compile_loop
+from ..._base.interruption import keep_interrupt
 from ...data.reconstruction import PIECES, reconstruct_signal
 
 
@@ -231,15 +232,17 @@ def place_gain(motion: DiscreteModel, gain: Array) -> Array:
     return k
 
 
-def compute_prediction_errors(motion: DiscreteModel, gain: Array, signals: dict[str, Array]) -> Any:
-    r"""Return the prediction errors of the model with an observer gain, and the filter behind them.
+def compute_prediction_errors(
+    motion: DiscreteModel, gain: Array, signals: dict[str, Array]
+) -> Array | None:
+    r"""Return the prediction errors of the model with an observer gain.
 
     .. math:: \hat x_{k+1} = F \hat x_k + \sum_i B_i s_{i,k} + K \varepsilon_k, \quad
         \varepsilon_k = y_k - C \hat x_k
 
     Parameters
     ----------
-    motion : Flow
+    motion : DiscreteModel
         The model over one period.
     gain : ndarray
         Observer gain K of the plant's states, then of those of the noise.
@@ -248,33 +251,47 @@ def compute_prediction_errors(motion: DiscreteModel, gain: Array, signals: dict[
 
     Returns
     -------
-    errors : ndarray or None
+    ndarray or None
         The errors from state zero on; None if the observer is unstable.
-    observer : ndarray
-        Denominator of the filter.
     """
     k = place_gain(motion, gain)
     closed = motion.f - np.outer(k, motion.c)
-    if not np.isfinite(closed).all():
-        return None, np.ones(1)
-    poles = np.linalg.eigvals(closed)
-    observer = np.real(np.poly(poles))
-    if not np.isfinite(poles).all() or np.max(np.abs(poles)) >= 1 - 1e-9:
-        return None, observer
-    errors = signals["y"].copy()
-    straight, at_once = motion.direct
+    if not np.isfinite(closed).all() or np.max(np.abs(np.linalg.eigvals(closed))) >= 1 - 1e-9:
+        return None
+    # What of y does not follow u at once is predicted.
+    late, at_once = motion.direct
+    seen = signals["y"]
     if at_once:
-        errors -= at_once * _delay_signal(signals["u"], straight)
-    for name, late, column in (*motion.inputs, ("y", 0, k), ("u", straight, -at_once * k)):
-        if not np.any(column):
-            continue
-        # C (zI - closed)^-1 column, whose poles are those of the observer. The numerator is a
-        # difference of polynomials, linear in the column: a small column would be lost in it.
-        unit = 2.0 ** np.round(np.log2(np.max(np.abs(column))))
-        num = (np.real(np.poly(closed - np.outer(column / unit, motion.c))) - observer) * unit
-        moved = signal.lfilter(-num, observer, _delay_signal(signals[name], late))
-        errors += moved
-    return errors, observer
+        seen = seen - at_once * _delay_signal(signals["u"], late)
+    driving = np.array([_delay_signal(signals[name], shift) for name, shift, _ in motion.inputs])
+    columns = np.column_stack([column for *_, column in motion.inputs])
+    errors: Array = _run_observer(closed, columns, k, motion.c, driving, seen)
+    return errors
+
+
+@keep_interrupt
+@compile_loop(nogil=True)
+def _run_observer(
+    closed: Any, columns: Any, gain: Any, c: Any, driving: Any, seen: Any
+) -> Any:  # pragma: no cover - compiled
+    """Return the errors of a predictor that begins at zero."""
+    n, m = columns.shape
+    state, after = np.zeros(n), np.zeros(n)
+    errors = np.empty(len(seen))
+    for k in range(len(seen)):
+        predicted = 0.0
+        for i in range(n):
+            predicted += c[i] * state[i]
+        errors[k] = seen[k] - predicted
+        for i in range(n):
+            total = gain[i] * seen[k]
+            for j in range(n):
+                total += closed[i, j] * state[j]
+            for j in range(m):
+                total += columns[i, j] * driving[j, k]
+            after[i] = total
+        state[:] = after
+    return errors
 
 
 def _delay_signal(s: Array, samples: int) -> Array:
