@@ -1,6 +1,7 @@
 """``ctrlid diagnose``: what the words mean, what is refused, and a diagnosis from a file."""
 
 import argparse
+import dataclasses
 import inspect
 import math
 import os
@@ -14,6 +15,7 @@ import pytest
 import ctrlid as cid
 from ctrlid import __main__ as command
 from ctrlid import effects as E
+from ctrlid.loop.controller_replay import run_controller
 from ctrlid.reporting.cli import arguments as _spoken
 from ctrlid.reporting.cli import diagnose_command as _command
 from ctrlid.reporting.cli.options import OPTIONS, name_options
@@ -120,6 +122,25 @@ def test_what_is_taken_without_saying(folder, asked, record):
     assert settings == {"progress": True}
     assert run("bare.csv", "--dt", DT, *SERVO, "--free") == 0
     assert asked[1][0].free == ()
+
+
+@pytest.mark.parametrize("controller", ["kp=20,kd=1", "kp=20,kd=1,ki=3", "kp=20,kd=1,bias=0.4"])
+def test_a_bias_that_nobody_stated_is_that_of_the_log(folder, asked, record, controller):
+    """The mean of y is nowhere near the point about which the controller works, which is zero."""
+    y = record.y + 0.05 * np.arange(len(record)) / len(record)
+    named = _spoken.read_controller(controller)
+    bias = 0.4 if named.bias else 0.25
+    loop = servo(dataclasses.replace(named, bias=bias), dt=DT)
+    u = run_controller(loop, y, record.r)
+    rows = np.column_stack([record.t, record.r, u, y])
+    np.savetxt(folder / "off.csv", rows, delimiter=",", comments="", header="time,r,u,y",
+               fmt="%.12g")  # fmt: skip
+    assert run("off.csv", *SERVO, "--controller", controller) == 0
+    ((made, read, _),) = asked
+    assert made.at.output == pytest.approx(y.mean())
+    left = read.u - cid.replay_controller(made, read)
+    assert np.max(np.abs(left)) < 1e-8
+    assert "exactly what the controller of the loop computes" in str(cid.audit(read, made))
 
 
 def test_a_file_with_lost_samples(folder, asked, record, capsys):

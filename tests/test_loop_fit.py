@@ -443,6 +443,10 @@ def test_refusals():
         cid.fit_loop(loop, record, free=("K", "Km"))
     with pytest.raises(CtrlidError, match=r"sampled at 0\.002 s, the record at 0\.004 s"):
         cid.fit_loop(loop, record.decimate(2, antialias=False))
+    still = replace(record, y=np.full(len(record), 0.012))
+    with pytest.raises(CtrlidError, match=r"x stays at one value in all valid samples.*stuck"):
+        cid.fit_loop(loop, still)
+    cid.fit_loop(loop, [still, record])
     other = replace(record, hold="foh")
     with pytest.raises(
         CtrlidError, match=r"the same hold; given 0\.002 s, 'zoh' and 0\.002 s, 'foh'"

@@ -23,6 +23,7 @@ from ..loop.controller_replay import (
 from ..loop.controllers import PID
 from ..loop.loop import Loop, exchange_controller
 from ..loop.sampled_form import describe_sampled_form, find_sampled_form
+from ..loop.wiring import knows_references
 from .controller_changes import DETERMINED, FEWEST, TRIAL, list_changes
 from .residual_tests import compute_explained_share
 from .signal_defects import find_grid_step
@@ -303,6 +304,25 @@ def _report_bias(constant: float, left: float) -> Fact:
     return ("bias", "u is the output of the controller of the loop plus a constant of "
             f"{constant:.4g}. Correct the bias of the controller or the input of the operating "
             "point.", left, True)  # fmt: skip
+
+
+def take_bias_from_log(loop: Loop, record: Record) -> Loop:
+    """Return the loop with the bias that its digital controller adds to the logged u.
+
+    Where nobody has stated a bias, the input that holds the model at rest is no more than a guess;
+    held against the log it would be called a fault of the controller. A PID with a bias of its own
+    and a loop whose log does not show it stay as they are.
+    """
+    stated = isinstance(loop.controller, PID) and loop.controller.bias is not None
+    if loop.controller is None or loop.analog or stated or not loop.equations().siso:
+        return loop
+    if not knows_references(loop.wiring, record):
+        return loop
+    free = exchange_controller(loop, loop.controller, limits=(-np.inf, np.inf))
+    left = (record.u - replay_controller(free, record))[record.valid]
+    # Where limits, pulses and dither act the controller is not alone.
+    bias = loop.point.input + float(np.median(left)) + _read_constant(free, record)
+    return replace(loop, at=replace(loop.point, input=bias))
 
 
 def _read_constant(loop: Loop, record: Record) -> float:

@@ -131,6 +131,7 @@ def fit_loop(
             "velocity has a white force of its own"
         )
     problem = make_problem(loop, names, records)
+    _refuse_rest(records)
     if free is not None:
         asked = replace(loop, free=free) if isinstance(free, Mapping) else loop
         problem = replace(problem, priors=find_priors(asked, free))
@@ -159,6 +160,21 @@ def fit_loop(
         *_note_unknown_controller(loop, given),
     )
     return replace(fitted, estimate=replace(fitted.estimate, notes=notes))
+
+
+def _refuse_rest(records: Sequence[Record]) -> None:
+    """Refuse records in which no output moves, of which any parameter is as likely as another."""
+    for record in records:
+        rows = np.reshape(record.y, (-1, len(record)))
+        seen = (row[use] for row, use in zip(rows, record.valid_outputs, strict=True))
+        if any(values.size and np.ptp(values) for values in seen):
+            return
+    names = records[0].signals["y"]
+    raise CtrlidError(
+        f"{write_list(names)} {'stay' if len(names) > 1 else 'stays'} at one value in all valid "
+        "samples, which says nothing of the parameters: record while the plant moves, or look "
+        "whether the sensor is stuck"
+    )
 
 
 def _note_contradicted_values(fit: Fit) -> tuple[str, ...]:

@@ -24,6 +24,7 @@ from ...loop.loop import Loop
 from ...physics import plants
 from ...physics.linearization import OperatingPoint, operating_point
 from ...physics.trace import trace, with_parameters
+from ...validation.controller_check import take_bias_from_log
 from .options import options_in_refusals
 
 PLANTS = {"maglev": ("K",), "servo": ("c", "k"), "tank": ("outlet", "k"), "pendulum": ("m",)}
@@ -76,7 +77,8 @@ def read_loop(args: argparse.Namespace, record: Record) -> Loop:
         at = dataclasses.replace(at, input=args.input_bias)
     given_controller = None if args.controller is None else read_controller(args.controller)
     with options_in_refusals():
-        return Loop(model, given_controller, dt=record.dt, at=at, free=free)
+        loop = Loop(model, given_controller, dt=record.dt, at=at, free=free)
+    return loop if args.input_bias is not None else take_bias_from_log(loop, record)
 
 
 def read_plant(text: str, values: dict[str, float]) -> Any:

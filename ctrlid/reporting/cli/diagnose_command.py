@@ -78,8 +78,8 @@ def add_parser(commands: Any) -> None:
     add("--at-output", type=float, metavar="Y",
         help="output at the operating point (default: the mean of y)")  # fmt: skip
     add("--input-bias", type=float, metavar="U",
-        help="bias that the controller adds to u (default: the input that holds the model at "
-        "rest)")  # fmt: skip
+        help="bias that the controller adds to u (default: as the log has it where the controller "
+        "is known, else the input that holds the model at rest)")  # fmt: skip
     add("--dt", type=float, metavar="S",
         help="sampling period in seconds (default: that of the time column)")  # fmt: skip
     add("--columns", type=parse_assignments, default={}, metavar="r=REF,u=VOLT,y=GAP",
