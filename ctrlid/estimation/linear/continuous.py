@@ -64,8 +64,8 @@ def fit_continuous(
     mixture of sensor noise and force noise the data hold, the estimate is right under feedback,
     without the reference and without knowing the controller; with white Gaussian noises it is
     maximum likelihood. Where the innovations are not white, the sensor noise becomes a moving
-    average of an order chosen by the Bayesian criterion. Initial state and operating point are
-    estimated for each valid stretch.
+    average of an order chosen by the Bayesian criterion; a note says where one more pole and white
+    noise predict better. Initial state and operating point are estimated for each valid stretch.
 
     Parameters
     ----------
