@@ -3,6 +3,7 @@
 Groups: one pass; sensitivities; the extended filter; maps over one period; long records.
 """
 
+import inspect
 import math
 from collections import Counter
 from dataclasses import replace
@@ -18,7 +19,12 @@ import ctrlid as cid
 from ctrlid import effects as E
 from ctrlid.estimation.likelihood import kalman_recursion
 from ctrlid.estimation.likelihood.filter_data import find_rest_state, make_filter_data
-from ctrlid.estimation.likelihood.kalman_filter import Noise, converge_trajectory, guess_trajectory
+from ctrlid.estimation.likelihood.kalman_filter import (
+    Noise,
+    PassArguments,
+    converge_trajectory,
+    guess_trajectory,
+)
 from ctrlid.estimation.likelihood.kalman_recursion import choose_sizes, filter_pass
 from ctrlid.estimation.likelihood.likelihood import make_problem
 from ctrlid.estimation.likelihood.maximization import begin_fit
@@ -59,6 +65,10 @@ def run(s, valid=None, restart=None, input_variance=None, start=None, spread=Non
         sensor, np.zeros((1, 4)), np.full(m, 0.2) if force is None else force, memory, drift,
         *(sizes or ((0,) * n, (0,) * (n + bool(drift)))),
     )  # fmt: skip
+
+
+def test_arguments_of_a_pass_stand_in_the_order_of_the_pass():
+    assert PassArguments._fields == tuple(inspect.signature(filter_pass).parameters)
 
 
 @pytest.mark.parametrize("drift", [0.0, 0.4])

@@ -50,18 +50,16 @@ def compute_force_scores(
     weights = _weigh_innovations(fit, draws, seed)
     found = []
     for data, lin, part in zip(fit.data, fit.linearized, weights, strict=True):
-        arguments = arrange_pass(data, lin, fit.noise)
-        a, b, c, valid, restart = (arguments[k] for k in (1, 2, 6, 11, 12))
-        memory, drift = arguments[19:21]
-        out = filter_pass(*arguments)
-        gain = _find_gains(out, restart, valid, memory, drift)
+        run = arrange_pass(data, lin, fit.noise)
+        gain = _find_gains(filter_pass(*run), run.restart, run.valid, run.memory, run.drift)
+        b = run.b
         pushed = b.sum(axis=2) if channel is None else np.ascontiguousarray(b[:, :, channel])
         # Several outputs are updates one after another, of which only the last moves the state.
-        updates = len(a) // len(lin.step)
+        updates = len(b) // len(lin.step)
         if updates > 1:
             part = part * np.sqrt([1.0, *fit.noise.sensors])[None, :, None]
-        scores = _carry_back(a, b, pushed, c, gain, valid, restart, memory,
-                             np.ascontiguousarray(part.reshape(len(a), -1)))  # fmt: skip
+        scores = _carry_back(run.a, b, pushed, run.c, gain, run.valid, run.restart, run.memory,
+                             np.ascontiguousarray(part.reshape(len(b), -1)))  # fmt: skip
         found.append(scores[updates - 1 :: updates])
     return found
 

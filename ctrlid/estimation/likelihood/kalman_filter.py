@@ -7,7 +7,7 @@ after two or three passes, and between the passes parameters and noise may move 
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi
 import numpy as np
@@ -169,21 +169,49 @@ def _run_several(
                     disturbance[q - 1 :: q])  # fmt: skip
 
 
-def arrange_pass(data: FilterData, lin: Linearized, noise: Noise) -> tuple[Any, ...]:
+class PassArguments(NamedTuple):
+    """What `kalman_recursion.filter_pass` takes, in its order and by the names it has there."""
+
+    step: Array
+    a: Array
+    b: Array
+    du: Array
+    dp: Array
+    output: Array
+    c: Array
+    hp: Array
+    predicted: Array
+    filtered: Array
+    y: Array
+    valid: Any
+    restart: Any
+    input_variance: Array
+    start: Array
+    spread: Array
+    sensor: float
+    tails: Any
+    force: Array
+    memory: float
+    drift: float
+    states: Any
+    widths: Any
+
+
+def arrange_pass(data: FilterData, lin: Linearized, noise: Noise) -> PassArguments:
     """Return the arguments of a pass without sensitivities, a sample for each output."""
     if lin.output.ndim == 1:
         return _arrange_pass(data, lin, noise, 0)
     return _arrange_updates(data, lin, noise, 0, np.sqrt([1.0, *noise.sensors]))
 
 
-def _arrange_pass(data: FilterData, lin: Linearized, noise: Noise, p: int) -> tuple[Any, ...]:
+def _arrange_pass(data: FilterData, lin: Linearized, noise: Noise, p: int) -> PassArguments:
     """Return the arguments of a pass over one output, with sensitivities to p parameters."""
     white, force = noise.sensor_is_white, np.asarray(noise.force, dtype=float)
     if not white:
         lin, force = append_sensor_noise(lin, force, noise)
     size, states = lin.step.shape
     check_budget(size)
-    return (
+    return PassArguments(
         lin.step, lin.a, lin.b, lin.du, np.ascontiguousarray(lin.dp[:, :, :p]), lin.output,
         lin.c, np.ascontiguousarray(lin.hp[:, :p]), lin.trajectory.predicted,
         lin.trajectory.filtered, data.y, data.valid, data.restart, lin.input_variance,
@@ -195,7 +223,7 @@ def _arrange_pass(data: FilterData, lin: Linearized, noise: Noise, p: int) -> tu
 
 def _arrange_updates(
     data: FilterData, lin: Linearized, noise: Noise, p: int, scale: Array
-) -> tuple[Any, ...]:
+) -> PassArguments:
     """Return the arguments of a pass over several outputs, each divided by its scale."""
     size, q = lin.output.shape
     each, states = _list_updates(lin), lin.step.shape[1]
@@ -205,7 +233,7 @@ def _arrange_updates(
     unsure = np.zeros((size, q))
     unsure[:, -1] = lin.input_variance
     check_budget(size * q)
-    return (
+    return PassArguments(
         each.step, each.a, each.b, each.du, np.ascontiguousarray(each.dp[:, :, :p]),
         (lin.output / scale).ravel(), (lin.c / scale[:, None]).reshape(size * q, states),
         np.ascontiguousarray((lin.hp[:, :, :p] / scale[:, None]).reshape(size * q, p)),
