@@ -624,7 +624,7 @@ def _add_effect(loop: Loop, effect: _Itself) -> Loop:
 def exchange_controller(
     loop: Loop, controller: Any, limits: tuple[float, float] | None = None
 ) -> Loop:
-    """Return a loop with another digital controller, or other limits, on the same plant.
+    """Return a loop with another controller, or other limits, on the same plant.
 
     The plant, which was traced and checked when the loop was made, is not traced again: who tries
     many controllers need not wait for it.
