@@ -1,6 +1,6 @@
 """The input that a loop's controller computes from recorded signals."""
 
-import math
+import functools
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,7 +18,7 @@ from ..data.record import Record
 from ..data.several_records import order_model_and_data
 from ..physics.block_evaluation import BlockEvaluation
 from ..physics.conversions import to_state_matrices
-from .loop import Loop, exchange_controller
+from .loop import Loop, exchange_controller, exchange_limits
 from .wiring import knows_references, match_signals, stack_references
 
 
@@ -26,14 +26,27 @@ from .wiring import knows_references, match_signals, stack_references
 class _ControllerRun:
     """A digital controller along the samples of a record, from any initial state.
 
-    `step` returns the next state and the input, `slopes` how both of them depend on the initial
-    state as well, and `rows` holds what they are given at each sample.
+    `function` returns the next state and the input from the state and a column of `rows`.
     """
 
     rest: Array
     rows: Array
-    step: BlockEvaluation
-    slopes: BlockEvaluation
+    function: casadi.Function
+
+    @functools.cached_property
+    def step(self) -> BlockEvaluation:
+        """The function, for many samples."""
+        return BlockEvaluation(self.function)
+
+    @functools.cached_property
+    def slopes(self) -> BlockEvaluation:
+        """The next state, and how it and the input depend on the initial state."""
+        n = len(self.rest)
+        x, s, w = (casadi.SX.sym(k, *size)
+                   for k, *size in (("x", n), ("s", n, n), ("w", len(self.rows))))  # fmt: skip
+        after, limited = self.function.call([x, w])
+        moved, shown = (casadi.mtimes(casadi.jacobian(v, x), s) for v in (after, limited))
+        return BlockEvaluation(casadi.Function("slopes", [x, s, w], [after, moved, shown]))
 
     def compute_outputs(self, start: Array) -> Array:
         """Return what the controller computes, with a row for each of several inputs."""
@@ -61,7 +74,7 @@ def _build_controller_run(
         raise CtrlidError(
             f"only a digital controller can be replayed from the samples; this loop has {kind}"
         )
-    n, size = y.shape[-1], len(law.rest)
+    n = y.shape[-1]
     if r is not None:
         reference = np.reshape(r, (-1, n))
     elif law.references is None:
@@ -71,20 +84,15 @@ def _build_controller_run(
     rows = [np.arange(n)[None] * loop.dt, reference, np.reshape(y, (-1, n))]
     if u is not None and law.reads_input:
         rows.append(np.reshape(u, (-1, n)))
-    x, w = casadi.SX.sym("x", size), casadi.SX.sym("w", sum(map(len, rows)))
+    x, w = casadi.SX.sym("x", len(law.rest)), casadi.SX.sym("w", sum(map(len, rows)))
     t, now, measured, *logged = casadi.vertsplit(w, np.cumsum([0, *map(len, rows)]).tolist())
     wish, after = law.apply(t, x, now, measured)
     lower, upper = (casadi.DM(v) if np.ndim(v) else v for v in loop.input_limits)
     limited = casadi.fmin(casadi.fmax(wish, lower), upper)
     if law.reads_input:
         after = law.apply(t, x, now, measured, logged[0] if logged else limited)[1]
-    after = casadi.vertcat(after)
-    s = casadi.SX.sym("s", size, size)
-    moved, shown = (casadi.mtimes(casadi.jacobian(v, x), s) for v in (after, limited))
-    step = casadi.Function("controller", [x, w], [after, limited])
-    slopes = casadi.Function("slopes", [x, s, w], [after, moved, shown])
-    rest = np.array(law.rest, dtype=float)
-    return _ControllerRun(rest, np.vstack(rows), BlockEvaluation(step), BlockEvaluation(slopes))
+    step = casadi.Function("controller", [x, w], [casadi.vertcat(after), limited])
+    return _ControllerRun(np.array(law.rest, dtype=float), np.vstack(rows), step)
 
 
 def read_references(loop: Loop, record: Record) -> Array | None:
@@ -232,7 +240,7 @@ def replay_from_best_state(loop: Loop, record: Record) -> tuple[Array, Array]:
     replayed, best = _compare_inputs(run, start, record)
     if start.size and np.isfinite(loop.input_limits).any():
         # From the wrong state all may be cut off, and the state is then nowhere to be seen.
-        unlimited = exchange_controller(loop, loop.controller, limits=(-math.inf, math.inf))
+        unlimited = exchange_limits(loop)
         low, high = (np.reshape(v, (-1, 1)) if np.ndim(v) else v for v in loop.input_limits)
         inside = np.ravel((record.u > low) & (record.u < high))
         free = _build_controller_run(unlimited, record.y, r, record.u)

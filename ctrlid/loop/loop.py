@@ -621,17 +621,18 @@ def _add_effect(loop: Loop, effect: _Itself) -> Loop:
     return loop._replace_fields(effects=(*loop.effects, effect.given))
 
 
-def exchange_controller(
-    loop: Loop, controller: Any, limits: tuple[float, float] | None = None
-) -> Loop:
-    """Return a loop with another controller, or other limits, on the same plant.
+def exchange_controller(loop: Loop, controller: Any) -> Loop:
+    """Return a loop with another controller on the same plant.
 
     The plant, which was traced and checked when the loop was made, is not traced again: who tries
     many controllers need not wait for it.
     """
-    return loop._replace_fields(
-        controller=controller, input_limits=loop.input_limits if limits is None else limits
-    )
+    return loop._replace_fields(controller=controller)
+
+
+def exchange_limits(loop: Loop, lower: float = -math.inf, upper: float = math.inf) -> Loop:
+    """Return a loop with other limits of its input, by default none, on the same plant."""
+    return loop._replace_fields(input_limits=(lower, upper))
 
 
 def _check_beliefs(free: Mapping[str, Any], parameters: Mapping[str, float]) -> None:

@@ -160,17 +160,15 @@ def _decode_instructions(function: Any) -> Any:
         return None
     asked = [*range(0, n, ASKED), n - 1]
     known = _ask_for_instructions(function, asked)
-    text = np.frombuffer(function.serialize().encode(), np.uint8) - np.uint8(ord("a"))
-    # The text begins with a letter that tells the order of bytes.
-    for shift in range(2):
-        letters = text[shift : shift + (text.size - shift) // 2 * 2]
-        content = (letters[0::2] | letters[1::2] << 4).tobytes()
-        place = content.find(known[0].tobytes())
-        while 0 <= place <= len(content) - 16 * n:
-            table = np.frombuffer(content, np.int32, 4 * n, place).reshape(n, 4)
-            if np.array_equal(table[asked], known):
-                return table
-            place = content.find(known[0].tobytes(), place + 1)
+    letters = np.frombuffer(function.serialize().encode(), np.uint8) - np.uint8(ord("a"))
+    pairs = letters[: letters.size // 2 * 2]
+    content = (pairs[0::2] | pairs[1::2] << 4).tobytes()
+    place = content.find(known[0].tobytes())
+    while 0 <= place <= len(content) - 16 * n:
+        table = np.frombuffer(content, np.int32, 4 * n, place).reshape(n, 4)
+        if np.array_equal(table[asked], known):
+            return table
+        place = content.find(known[0].tobytes(), place + 1)
     return None
 
 

@@ -15,7 +15,7 @@ from ..data.record import Record
 from ..data.validity import find_longest_run, find_whole_past
 from ..loop.controller_replay import differentiate_replay, replay_controller
 from ..loop.controllers import PID, AntiWindup, Derivative, Integral
-from ..loop.loop import Loop, exchange_controller
+from ..loop.loop import Loop, exchange_controller, exchange_limits
 from ..physics.conversions import to_state_matrices
 
 # Shorter stretches do not tell what computed the input.
@@ -208,8 +208,7 @@ def _list_limits(loop: Loop, record: Record) -> Iterator[LawChange]:
         choices += [(*pair, True) for pair in once if pair != (low, high)]
     for lower, upper, exact in choices:
         words = f"it is limited to {lower:.4g} to {upper:.4g}"
-        held = exchange_controller(loop, loop.controller, limits=(lower, upper))
-        yield LawChange("limit", words, held, record, exact)
+        yield LawChange("limit", words, exchange_limits(loop, lower, upper), record, exact)
         if isinstance(loop.controller, PID) and lower < upper:
             limited = replace(loop.controller, lower=lower, upper=upper)
             yield LawChange("limit", words, exchange_controller(loop, limited), record, exact)
@@ -568,10 +567,10 @@ def _is_nonlinear(loop: Loop) -> bool:
 
 def _take_limits_off(loop: Loop) -> Loop:
     """Return the loop without limits of its input or its controller."""
-    controller = loop.controller
-    if isinstance(controller, PID):
-        controller = replace(controller, lower=-np.inf, upper=np.inf)
-    return exchange_controller(loop, controller, limits=(-np.inf, np.inf))
+    free = exchange_limits(loop)
+    if isinstance(free.controller, PID):
+        free = exchange_controller(free, replace(free.controller, lower=-np.inf, upper=np.inf))
+    return free
 
 
 def _read_polynomials(controller: Any) -> tuple[Any, Any]:

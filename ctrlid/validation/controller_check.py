@@ -21,7 +21,7 @@ from ..loop.controller_replay import (
     sample_analog_controller,
 )
 from ..loop.controllers import PID
-from ..loop.loop import Loop, exchange_controller
+from ..loop.loop import Loop, exchange_controller, exchange_limits
 from ..loop.sampled_form import describe_sampled_form, find_sampled_form
 from ..loop.wiring import knows_references
 from .controller_changes import DETERMINED, FEWEST, TRIAL, list_changes
@@ -108,7 +108,7 @@ def check_controller(loop: Loop, record: Record) -> list[Fact]:
                       f"{upper:g}) for {write_percent(beyond)} of the samples: u was logged before "
                       "the limiter, or the limits are wrong. Limit u before fitting, or correct "
                       "input_limits=.", beyond, True))  # fmt: skip
-        loop = exchange_controller(loop, loop.controller, limits=(-np.inf, np.inf))
+        loop = exchange_limits(loop)
     try:
         e, left = _compute_remainder(loop, part)
     except CtrlidError as reason:  # The audit prints a refusal among its facts.
@@ -193,7 +193,7 @@ def _sample_analog_law(
         sampled = sample_analog_controller(loop, hold_r, hold)
         if sampled is None:
             return None
-        free = replace(sampled, input_limits=(-np.inf, np.inf))
+        free = exchange_limits(sampled)
         if not have_same_period(loop.dt, record.dt):
             return sampled, EXACT, lambda _: None  # The replay refuses it in words.
         output, responses, rest = differentiate_replay(free, part)
@@ -318,7 +318,7 @@ def take_bias_from_log(loop: Loop, record: Record) -> Loop:
         return loop
     if not knows_references(loop.wiring, record):
         return loop
-    free = exchange_controller(loop, loop.controller, limits=(-np.inf, np.inf))
+    free = exchange_limits(loop)
     left = (record.u - replay_controller(free, record))[record.valid]
     # Where limits, pulses and dither act the controller is not alone.
     bias = loop.point.input + float(np.median(left)) + _read_constant(free, record)

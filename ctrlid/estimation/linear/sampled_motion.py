@@ -130,7 +130,7 @@ def discretize_model(
 
     Returns
     -------
-    Flow
+    DiscreteModel
         The motion.
     """
     n = len(a)
