@@ -527,7 +527,8 @@ def _find_size(
         return (full, size, worth, u, y, theta) if np.isfinite(worth) else None
 
     low, high = 0.0, LARGEST
-    size, best, start = 1.0, None, None
+    size, best = 1.0, None
+    start = np.zeros(len(truth.free) + 2 + int(0 < truth.colour[0] < 1) + len(indices))
     for _ in range(14):
         found = weigh(size, start)
         if found is None:
@@ -556,6 +557,9 @@ def _find_size(
         full = e.copy()
         u, y, _ = run(full)
         return full, 0.0, 0.0, u, y
+    # The search followed one optimum of the noise from size to size; there may be a better one.
+    worth, _ = measure_worth(replace(truth, e=best[0], u=best[3], y=best[4]), e, indices)
+    best = (*best[:2], min(worth, best[2]), *best[3:])
     return best[:5]
 
 

@@ -558,6 +558,37 @@ def sum_divergence(mean, variance, weights, other, width, masses, nodes, share):
 
 
 @numba.njit(cache=True, error_model="numpy")
+def differentiate_divergence(mean, variance, weights, other, width, masses, nodes, share):
+    """Return the divergence, and its derivatives by the other filter's means and variances.
+
+    Of two normal laws in closed form, else by quadrature.
+    """
+    n, laws = width.shape
+    total, by_mean, by_variance = 0.0, np.zeros(n), np.zeros((n, laws))
+    for k in range(n):
+        if laws == 1 and len(weights) == 1:
+            v, w, off = variance[k, 0], width[k, 0], other[k] - mean[k]
+            total += 0.5 * (math.log(w / v) + (v + off * off) / w - 1.0)
+            by_mean[k] = off / w
+            by_variance[k, 0] = 0.5 * (1.0 - (v + off * off) / w) / w
+            continue
+        for c in range(len(weights)):
+            deviation = math.sqrt(variance[k, c])
+            for j in range(len(nodes)):
+                mass = weights[c] * share[j]
+                v = mean[k] + deviation * nodes[j]
+                ours = compute_log_density(v, other[k], width[k], masses)
+                total += mass * (compute_log_density(v, mean[k], variance[k], weights) - ours)
+                for q in range(laws):
+                    w, off = width[k, q], v - other[k]
+                    part = math.log(masses[q]) - 0.5 * (math.log(2 * math.pi * w) + off * off / w)
+                    owed = mass * math.exp(part - ours)
+                    by_mean[k] -= owed * off / w
+                    by_variance[k, q] -= owed * 0.5 * (off * off / w - 1.0) / w
+    return total, by_mean, by_variance
+
+
+@numba.njit(cache=True, error_model="numpy")
 def compute_log_likelihood(y, mean, variance, weights):
     """Return the log-likelihood of a record under the predictions of a filter."""
     total = 0.0

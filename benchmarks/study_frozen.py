@@ -11,6 +11,7 @@ tables with Wilson's 95 % intervals, ``print --misses FILE`` each wrong answer a
 from __future__ import annotations
 
 import argparse
+import contextlib
 import gzip
 import itertools
 import json
@@ -28,6 +29,7 @@ import numpy as np
 import outside_cases as cases
 from _shares import parse_seeds, wilson
 from scipy import signal, stats
+from watched_numbers import watch_numbers
 
 import ctrlid as cid
 
@@ -107,8 +109,12 @@ def make_loop(rig: cases.Rig) -> cid.Loop:
     return cid.Loop(plant, law, dt=rig.dt, at=at, free=free)
 
 
-def run(name: str, seed: int, n: int = SAMPLES) -> dict[str, Any]:
-    """Draw, weigh and diagnose; return the line."""
+def run(name: str, seed: int, n: int = SAMPLES, watched: bool = True) -> dict[str, Any]:
+    """Draw, weigh and diagnose; return the line.
+
+    Its entry "near" counts for each number of judgement the comparisons that would have come out
+    otherwise with half or twice of it (`watched_numbers`); if it is not `watched`, it is left out.
+    """
     line: dict[str, Any] = {"class": name, "seed": seed, "n": n}
     start = time.process_time()
     with warnings.catch_warnings():
@@ -129,7 +135,8 @@ def run(name: str, seed: int, n: int = SAMPLES) -> dict[str, Any]:
         record = cid.Record(r=case.r if rig.closed else None, u=case.u, y=case.y, dt=rig.dt)
         start = time.process_time()
         try:
-            found = cid.diagnose(loop, record, progress=False)
+            with watch_numbers() if watched else contextlib.nullcontext({}) as noted:
+                found = cid.diagnose(loop, record, progress=False)
         except Exception as reason:  # a study counts what a user would see
             seconds = round(time.process_time() - start, 2)
             return line | {"error": f"{type(reason).__name__}: {reason}"[:300], "seconds": seconds}
@@ -142,6 +149,7 @@ def run(name: str, seed: int, n: int = SAMPLES) -> dict[str, Any]:
         "gap kind": gap.name,
         "wider": _digits([compare_errors(gap)])[0],
         "sensor noise": "" if found.noise is None else found.noise.kind,
+        **({"near": dict(sorted(noted.items()))} if watched else {}),
         "seconds": round(time.process_time() - start, 2),
     }
 
@@ -398,18 +406,25 @@ def make_key(line: dict[str, Any]) -> tuple[str, int, int]:
     return line["class"], line["seed"], line["n"]
 
 
-def read(path: str | Path) -> list[dict[str, Any]]:
-    """Return the lines of a file; of a draw that is there twice the last one counts.
+def make_changed_key(line: dict[str, Any]) -> tuple[Any, ...]:
+    """Return what tells one draw from another where a number had another value as well."""
+    return *make_key(line), line["number"], line["factor"]
+
+
+def read(
+    path: str | Path, key: Callable[[dict[str, Any]], tuple[Any, ...]] = make_key
+) -> list[dict[str, Any]]:
+    """Return the lines of a file; of a draw that is there twice, by its key, the last one counts.
 
     What a run that was killed left half written at the end is left out.
     """
-    found: dict[tuple[str, int, int], dict[str, Any]] = {}
+    found: dict[tuple[Any, ...], dict[str, Any]] = {}
     if Path(path).exists():
         try:
             with gzip.open(path, "rt") as file:
                 for text in file:
                     line = json.loads(text)
-                    found[make_key(line)] = line
+                    found[key(line)] = line
         except (EOFError, json.JSONDecodeError, gzip.BadGzipFile):
             pass
     return list(found.values())
@@ -418,7 +433,9 @@ def read(path: str | Path) -> list[dict[str, Any]]:
 def write(path: str | Path, lines: Iterable[dict[str, Any]]) -> None:
     """Write lines as one compressed file, sorted, the same bytes for the same lines."""
     order = {name: i for i, name in enumerate(cases.CLASSES)}
-    ordered = sorted(lines, key=lambda x: (order[x["class"]], x["seed"], x["n"]))
+    changed = ("number", "factor")
+    ordered = sorted(lines, key=lambda x: (order[x["class"]], x["seed"], x["n"],
+                                           *(x[k] for k in changed if k in x)))  # fmt: skip
     text = "".join(json.dumps(x, separators=(",", ":")) + "\n" for x in ordered)
     part = Path(f"{path}.part")
     part.write_bytes(gzip.compress(text.encode(), 9, mtime=0))

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy import signal
+from scipy import optimize, signal
 
 import ctrlid as cid
 from ctrlid import effects as E
@@ -79,6 +79,81 @@ def test_what_is_absent_is_worth_nothing_and_no_fit_ends_half_way():
         again, _ = cases.measure_worth(truth, plants.make_neutral(), start=elsewhere)
         assert again == pytest.approx(worth, rel=2e-3)
         last = worth
+
+
+def make_tanks(rng, n=300):
+    """Return a truth of two tanks with a play, whose outlets are nearly one parameter."""
+    at = np.array([0.0, 2.782, 0.0, 1.1565])
+    names = plants.PARAMETERS[plants.PLANTS.index("tanks")]
+    true = {"o1": 3.876e-4, "o2": 2.73e-4, "k": 2.78e-4, "A": 1.5e-2, "g": 9.81, "b": 0.0}
+    p = np.array([true[name] for name in names])
+    x0 = np.zeros(plants.MOST)
+    x0[0] = (true["k"] * at[1] / true["o1"]) ** 2 / (2 * 9.81)
+    x0[1] = (true["k"] * at[1] / true["o2"]) ** 2 / (2 * 9.81)
+    at[0], at[2] = x0[0], x0[1]
+    x0[5:] = at[2]
+    e = plants.make_neutral()
+    e[plants.I["backlash"]] = 0.1
+    moves = 0.5 * np.repeat(rng.choice([-1.0, 1.0], n // 20), 20)
+    sigma, push = 2e-3, 0.01
+    spread = np.full(plants.MOST, 0.02)
+    u, y, ok = plants.simulate(plants.PLANTS.index("tanks"), p, e, at, x0, np.array([1.0]),
+                               np.array([1.0]), False, moves, push * rng.standard_normal(n),
+                               sigma * rng.standard_normal(n), np.full(n, at[3]), 0.0,
+                               1.0)  # fmt: skip
+    assert ok
+    free = {name: (1.05 * true[name], 0.05 * true[name]) for name in ("o1", "o2", "k")}
+    return cases.Truth(plants.PLANTS.index("tanks"), p, e, at, x0, spread, sigma, push,
+                       cases.WHITE, np.ones(1), np.ones(1), free, 1.0, u, y)  # fmt: skip
+
+
+def test_a_worth_is_the_smallest_where_free_parameters_nearly_are_one():
+    """Against a search that needs no slopes, from where the climb ended and from elsewhere."""
+    truth, without = make_tanks(np.random.default_rng(4)), plants.make_neutral()
+    own = truth.predict(np.zeros(5), truth.e)
+
+    def cost(theta):
+        other = truth.predict(theta, without)
+        if not np.isfinite(other[0]).all():
+            return np.inf
+        divergence = plants.sum_divergence(*own, truth.weights, *other, truth.weights,
+                                           plants.NODES, plants.MASSES)  # fmt: skip
+        return divergence + truth.compute_belief(theta)
+
+    worth, theta = cases.measure_worth(truth, without)
+    least = cost(theta)
+    for start in (theta, np.zeros(5)):
+        found = optimize.minimize(
+            cost,
+            start,
+            method="Nelder-Mead",
+            options={"maxiter": 1500, "fatol": 1e-4, "adaptive": True},
+        )
+        assert least < found.fun + 0.02 * (1 + found.fun / 5)
+    assert 0 < worth < least
+
+
+@pytest.mark.parametrize("laws", [1, 2])
+def test_the_divergence_is_differentiated_by_hand(laws):
+    rng = np.random.default_rng(5)
+    weights = np.array([1.0]) if laws == 1 else np.array([0.9, 0.1])
+    mean, other = rng.standard_normal((2, 7))
+    variance, width = rng.uniform(0.5, 2.0, (2, 7, laws))
+    rest = plants.NODES, plants.MASSES
+    value, by_mean, by_variance = plants.differentiate_divergence(
+        mean, variance, weights, other, width, weights, *rest
+    )
+    plain = lambda o, w: plants.sum_divergence(mean, variance, weights, o, w, weights, *rest)  # noqa: E731
+    assert value == pytest.approx(plain(other, width), rel=1e-10)
+    assert np.sum(by_mean) == pytest.approx(
+        (plain(other + 1e-6, width) - plain(other - 1e-6, width)) / 2e-6, rel=1e-6
+    )
+    for q in range(laws):
+        h = np.zeros((7, laws))
+        h[:, q] = 1e-6
+        assert np.sum(by_variance[:, q]) == pytest.approx(
+            (plain(other, width + h) - plain(other, width - h)) / 2e-6, rel=1e-6
+        )
 
 
 def test_the_filter_of_a_linear_plant_is_the_kalman_filter():
