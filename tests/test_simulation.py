@@ -223,6 +223,14 @@ def test_a_plant_too_sharp_to_integrate_warns():
         (lambda loop: cid.simulate(loop, {"x": np.ones(5)}), "given a mapping of x. Give its ser"),
         (lambda loop: cid.simulate(loop, np.ones(5), d=np.ones(4)), "equally long; given"),
         (lambda loop: cid.simulate(loop, np.ones(5), sensor_noise=-1), "standard deviation >= 0"),
+        (
+            lambda loop: cid.simulate(loop, np.ones(5), sensor_noise=[[1], [1, 2]]),
+            "standard deviation >= 0: it must be an array of numbers",
+        ),
+        (
+            lambda loop: cid.simulate(loop, np.ones(5), force_noise=np.ma.array([1.0], mask=[1])),
+            "masked values would come back",
+        ),
         (lambda loop: cid.simulate(loop, np.ones(5), force_noise="x"), "force_noise is a standard"),
         (lambda loop: cid.simulate(loop, "abc"), "needs r as an array of numbers"),
         (

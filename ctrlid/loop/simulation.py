@@ -233,14 +233,14 @@ def _draw_noise(loop: Loop, n: int, sensor: Any, force: Any, seed: int | None) -
     *_, outputs, forces = count_signals(loop)
     sizes = []
     for name, value, count in (("sensor_noise", sensor, outputs), ("force_noise", force, forces)):
-        array = np.ravel(np.asarray(value))
-        good = array.dtype.kind in "fiu" and array.size in (1, count)
+        array = np.ravel(to_real_array(value, f"{name} is a standard deviation >= 0: it"))
+        good = np.asarray(value).dtype.kind != "b" and array.size in (1, count)
         if not (good and np.isfinite(array).all() and (array >= 0).all()):
             each = f", or {count} of them" if count > 1 else ""
             raise CtrlidError(
                 f"{name} is a standard deviation >= 0{each}; given {shorten_value(value)}"
             )
-        sizes.append(np.broadcast_to(array.astype(float), count))
+        sizes.append(np.broadcast_to(array, count))
     if sizes[1].any() and not loop.equations().velocities:
         raise CtrlidError(
             f"force_noise needs a plant with a moving mass, that is a state whose rate is another "
