@@ -12,11 +12,13 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import functools
 import gzip
 import itertools
 import json
 import math
 import os
+import subprocess
 import time
 import warnings
 from collections.abc import Callable, Iterable, Sequence
@@ -109,13 +111,26 @@ def make_loop(rig: cases.Rig) -> cid.Loop:
     return cid.Loop(plant, law, dt=rig.dt, at=at, free=free)
 
 
+@functools.cache
+def find_commit() -> str:
+    """Return the commit of ctrlid that is diagnosed with, with a plus where files have changed."""
+    here = Path(cid.__file__).parent
+    ask = functools.partial(subprocess.run, cwd=here, capture_output=True, text=True, check=True)
+    try:
+        commit = ask(["git", "rev-parse", "--short=7", "HEAD"]).stdout.strip()
+        changed = ask(["git", "status", "--porcelain", "--untracked-files=no", "."]).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return ""
+    return commit + "+" * bool(changed)
+
+
 def run(name: str, seed: int, n: int = SAMPLES, watched: bool = True) -> dict[str, Any]:
     """Draw, weigh and diagnose; return the line.
 
     Its entry "near" counts for each number of judgement the comparisons that would have come out
     otherwise with half or twice of it (`watched_numbers`); if it is not `watched`, it is left out.
     """
-    line: dict[str, Any] = {"class": name, "seed": seed, "n": n}
+    line: dict[str, Any] = {"class": name, "seed": seed, "n": n, "commit": find_commit()}
     start = time.process_time()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -388,9 +403,21 @@ def find_misses(lines: Sequence[dict[str, Any]]) -> list[str]:
     return out
 
 
+def describe_draws(lines: Sequence[dict[str, Any]]) -> str:
+    """Return in a sentence of which commit the lines are, from what seeds, and of which classes."""
+    seeds = [x["seed"] for x in lines]
+    commits = " and ".join(sorted({x.get("commit") or "unknown" for x in lines}))
+    counts = ((name, sum(x["class"] == name for x in lines)) for name in cases.CLASSES)
+    told = ", ".join(f"{count} {name}" for name, count in counts if count)
+    return f"{len(lines)} draws of commit {commits}, seeds {min(seeds)} to {max(seeds)}: {told}."
+
+
 def write_tables(lines: Sequence[dict[str, Any]], misses: bool = False) -> str:
     """Return the tables of a file as text."""
-    text = [f"{what:<98} {target:<8} {value}" for what, target, value in score(lines)]
+    if not lines:
+        return "no draw"
+    text = [describe_draws(lines), ""]
+    text += [f"{what:<98} {target:<8} {value}" for what, target, value in score(lines)]
     text += ["", "one effect, by worth: a finding; the truth in a set; a set without the truth"]
     text += [f"  {a:<16} {b:<36} {c:<36} {d}" for a, b, c, d in find_power(lines)]
     if misses:

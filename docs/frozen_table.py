@@ -39,9 +39,7 @@ def write_tables(path=FILE):
     """Return the tables of a study as lines of a page."""
     study = load_study()
     lines = study.read(path)
-    counts = {name: sum(x["class"] == name for x in lines) for name in study.cases.CLASSES}
-    told = ", ".join(f"{count} {name}" for name, count in counts.items() if count)
-    out = [f"Draws by class: {told}.", ""]
+    out = [study.describe_draws(lines), ""]
     out += write_list_table(("asked", "target", "measured, with Wilson's 95 % interval"),
                             study.score(lines), "50 12 38")  # fmt: skip
     out += ["One effect, by what it is worth:", ""]
@@ -54,8 +52,9 @@ def write_tables(path=FILE):
 def write_summary(path=FILE):
     """Return what has a target, what was measured and the target, as a list of sentences."""
     study = load_study()
-    out, first = [], ""
-    for what, target, found in study.score(study.read(path)):
+    lines = study.read(path)
+    out, first = [study.describe_draws(lines), ""], ""
+    for what, target, found in study.score(lines):
         own = what.strip()
         if own.startswith("the same: "):
             own = f"{first}: {own.removeprefix('the same: ')}"
