@@ -111,7 +111,6 @@ def make_loop(rig: cases.Rig) -> cid.Loop:
     return cid.Loop(plant, law, dt=rig.dt, at=at, free=free)
 
 
-@functools.cache
 def find_commit() -> str:
     """Return the commit of ctrlid that is diagnosed with, with a plus where files have changed."""
     here = Path(cid.__file__).parent
