@@ -33,8 +33,9 @@ DT = 2e-3
 # What a pass is for is told by the outermost of these functions that asked for it.
 PURPOSES = {
     "recalibrate": "recalibrate", "scan_candidate": "screen", "refit_candidate": "refit",
-    "refit_quietly": "refit quietly", "refit_under_noise": "refit", "_prefer_sensor_noise": "noise",
-    "_check_on_replicas": "replicas", "retest_with_replicas": "replicas", "_look_back": "look back",
+    "refit_quietly": "refit quietly", "refit_under_noise": "refit",
+    "prefer_sensor_noise": "noise", "find_better_choice": "look back",
+    "_check_on_replicas": "replicas", "retest_with_replicas": "replicas",
     "refit_noise": "weigh", "drop_superfluous": "weigh", "order_last_effect": "weigh",
     "weigh_effects": "weigh", "find_log_error": "log errors", "compare_names": "names",
     "summarize_gap": "gap",

@@ -27,7 +27,8 @@ from ctrlid.diagnosis.fitted_model import (
     with_linearization,
 )
 from ctrlid.diagnosis.gap import Window, root_mean_square, share_samples
-from ctrlid.diagnosis.growth import _is_stand_in, _look_back, exchange_worst_effect, search_effects
+from ctrlid.diagnosis.growth import _is_stand_in, exchange_worst_effect, search_effects
+from ctrlid.diagnosis.hindsight import find_better_choice
 from ctrlid.diagnosis.noise_tests import NoiseTests, _compute_force_deviates, run_noise_tests
 from ctrlid.diagnosis.recalibration import fit_base_model
 from ctrlid.diagnosis.refitting import place_instants, refit_candidate, refit_under_noise
@@ -642,7 +643,9 @@ def test_where_nothing_follows_equals_of_the_best_are_asked():
     assert force.net_gain == pytest.approx(zero.net_gain, abs=0.1)
     first = Round(base, (force, zero), force, (zero,))
     nothing = Round(with_linearization(force.model), (), None)
-    other = _look_back(first, nothing, [E.CubicStiffness], lambda f, given: [f(x) for x in given])
+    other = find_better_choice(
+        first, nothing, [E.CubicStiffness], lambda f, given: [f(x) for x in given]
+    )
     assert other is zero
     assert E.equivalents(offset, loop.with_effect(spring)) == ()
 

@@ -7,6 +7,7 @@ wrong, or crashed; damaged files.
 import copy
 import inspect
 import json
+import math
 import random
 from dataclasses import replace
 
@@ -130,6 +131,17 @@ CALLS = {
     "a period that no float holds": lambda loop, record: replace(loop, dt=10**400),
     "an array without dimensions as order": lambda loop, record: cid.fit_arx(
         record, 2, np.array(1.5)
+    ),
+    "a controller that no float holds": lambda loop, record: replace(loop, controller=10**400),
+    "an infinite controller": lambda loop, record: replace(loop, controller=math.inf),
+    "a controller that is no number": lambda loop, record: replace(
+        loop, controller=ct.tf([1.0], [1.0, math.nan])
+    ),
+    "instruments of an infinite controller": lambda loop, record: cid.fit_iv(
+        record, 2, 1, controller=math.inf
+    ),
+    "progress of several kinds": lambda loop, record: cid.diagnose(
+        loop, record, progress=np.array([True, False])
     ),
     "no folder": lambda loop, record: record.to_csv("/nonexistent/x.csv"),
     "processes without end": lambda loop, record: cid.fit_each(

@@ -13,7 +13,7 @@ from scipy.optimize import brentq, minimize_scalar
 from .._base.arguments import is_number
 from .._base.arrays import Array, ComplexArray
 from .._base.errors import CtrlidError
-from ..physics.conversions import to_polynomials
+from ..physics.conversions import require_finite_coefficients, to_polynomials
 
 Function = Callable[[Array], Array]
 
@@ -151,17 +151,13 @@ def to_rational(system: Any, name: str) -> Rational:
             f"{name} is discrete with no sampling period (dt=True), so frequencies in rad/s are "
             f"not defined; give it one in seconds, for example dt=0.001."
         )
+    require_finite_coefficients(system, name)
     dt = float(system.dt or 0.0)
     if isinstance(system, ct.StateSpace):
         (num,), den = to_polynomials(system.A, system.B, system.C, system.D)
     else:
         num, den = (np.array(part[0][0]) for part in (system.num, system.den))
     num, den = num.astype(float), den.astype(float)
-    if not (np.isfinite(num).all() and np.isfinite(den).all()):
-        raise CtrlidError(
-            f"{name} has coefficients that are NaN or infinite: num {num}, den {den}. "
-            "Replace them by finite numbers."
-        )
     num, den = _drop_dust(num, den, dt)
     if len(num) > len(den):
         raise CtrlidError(

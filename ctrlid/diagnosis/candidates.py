@@ -105,6 +105,21 @@ class Trial:
         return self.model.fitted.labelled[self.label]
 
 
+def attempt_trial(attempt: Callable[[], Trial], otherwise: Trial) -> Trial:
+    """Return what an attempt gives; where it fails, another trial that says why it is out.
+
+    An effect may be impossible at a place, as at a frequency outside its bounds, its model may lose
+    the record, and arithmetic may fail with it: a candidate that fails, fails alone.
+    """
+    try:
+        return attempt()
+    except (ModelCannotRun, EffectDoesNotApply) as reason:
+        return replace(otherwise, out=Objection.of(reason))
+    # A decomposition that does not converge, and a function of the equations that CasADi gives up.
+    except NUMERICAL_FAILURES as reason:
+        return replace(otherwise, out=Objection.of_failure(reason))
+
+
 def is_same_kind(one: AbstractEffect, other: AbstractEffect) -> bool:
     """Whether two effects differ in their values only: of one class, and of one state or name."""
     return (

@@ -1,31 +1,20 @@
 """Step 7: the search adds effects, drops superfluous ones and looks back, round by round."""
 
-import contextlib
-import math
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .._base.criterion import bayesian_penalty
 from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from .._base.interruption import Stopped
-from .._base.statistics import compute_lagged_products, compute_predicted_likelihood
 from ..effects import AbstractEffect
 from ..effects.base import name_at_place
 from ..estimation.likelihood.kalman_filter import Noise
 from ..estimation.likelihood.likelihood import Fit
 from ..estimation.likelihood.maximization import (
     choose_noise,
-    choose_sensor_noise,
-    choose_tails,
     maximize,
     refit_noise_size,
-)
-from ..estimation.likelihood.noise_fit import (
-    compute_noise_criterion,
-    count_noise_parameters,
-    measure_walk_gain,
 )
 from ..estimation.likelihood.tails import JointTails
 from .candidates import Trial, Work, is_same_kind, list_missing_candidates
@@ -37,8 +26,9 @@ from .fitted_model import (
     with_linearization,
 )
 from .fresh_data import FreshData
+from .hindsight import find_better_choice
+from .noise_choice import prefer_sensor_noise
 from .noise_tests import NoiseTests, choose_alarm_level, run_noise_tests
-from .quiet_refitting import refit_quietly
 from .recalibration import restore_given_values
 from .refitting import refit_candidate
 from .removal import (
@@ -52,7 +42,6 @@ from .removal import (
 )
 from .replicas import forgive_filter, make_replica
 from .rivals import compare_effects
-from .scans import scan_candidate
 from .screening import screen_at
 from .selection import Round, run_round
 from .thresholds import THRESHOLD
@@ -150,7 +139,7 @@ def _grow_model(
         given_values = None if steps else restore_given_values(base)
         step = run_round(model, pool, work, given_values, beside=bool(steps))
         # Noise may be coloured and have heavy tails, one after the other.
-        while (other := _prefer_sensor_noise(model, step.best, is_larger)) is not None:
+        while (other := prefer_sensor_noise(model, step.best, is_larger)) is not None:
             tell(f"round {len(steps) + 1}: screening beside other sensor noise")
             model, base = other, base if steps else other
             reached.model, reached.base = model, base
@@ -161,7 +150,7 @@ def _grow_model(
             step = replace(step, best=None)
         asked = steps and not first and not changed
         tell(f"round {len(steps) + 1}: checking", ranked=False)
-        better = _look_back(steps[-1], step, catalogue, work) if asked else None
+        better = find_better_choice(steps[-1], step, catalogue, work) if asked else None
         changed = better is not None
         if changed:
             left = left or (*steps, step)
@@ -192,62 +181,6 @@ def _end_search(reached: Reached) -> Search:
     found.sort(key=lambda f: -f.trial.gain)
     before, after = run_noise_tests(base.fit), run_noise_tests(model.fit)
     return Search(base, tuple(reached.steps), model, tuple(found), before, after, finished=False)
-
-
-def _prefer_sensor_noise(
-    model: Model, best: Trial | None, is_larger: Callable[[Model], bool]
-) -> Model | None:
-    """Return the model with other sensor noise if that gains about as much as the best effect.
-
-    Coloured, or with heavy tails. An effect has to gain more than the noise by as much as it has to
-    gain beside none: a slow wander of the sensor looks like a drift. Not where the noise is larger
-    than the error that it explains.
-    """
-    fit = model.fit
-    if fit.known is not None or not math.isfinite(fit.value):
-        return None
-    tests = run_noise_tests(fit)
-    if tests.passed and not fit.noise.drift and best is None:
-        return None
-    # Further noise in the fit of the best effect is paid for as well.
-    more = 0.0
-    if best is not None:
-        parameters = count_noise_parameters(best.model.fit) - count_noise_parameters(fit)
-        earned = best.net_gain - bayesian_penalty(parameters, fit.size)
-        more = max(0.0, earned - THRESHOLD.gate)
-    tried = []
-    # Of several outputs no colour is fitted.
-    if fit.plant.e.siso and fit.noise.sensor_is_white and _may_be_coloured(fit, more):
-        with contextlib.suppress(ModelCannotRun):
-            tried.append(choose_sensor_noise(fit))
-    if fit.noise.tails is None and tests.has_heavy_tails:
-        tried.append(choose_tails(fit))
-    other = max(tried, key=compute_noise_criterion, default=fit)
-    gain = compute_noise_criterion(other) - compute_noise_criterion(fit)
-    if not gain > more:
-        return None
-    newly_coloured = fit.noise.sensor_is_white and not other.noise.sensor_is_white
-    if newly_coloured and is_larger(Model(model.loop, other)):
-        return None
-    return with_linearization(Model(model.loop, other))
-
-
-def _may_be_coloured(fit: Fit, more: float) -> bool:
-    """Whether coloured sensor noise can gain more than so much, in place of a coloured force.
-
-    What past innovations tell of the next one is what a colour of the noise can explain; with
-    parameters that move along it may be twice as much. A slow walk of the sensor tells hardly
-    anything from one innovation to the next, the less beside a coloured force that follows it.
-    """
-    told = 0.0
-    for z in fit.standardized:
-        filled = np.nan_to_num(z)
-        products = compute_lagged_products(filled, filled, THRESHOLD.lags)
-        told += compute_predicted_likelihood(products, float(np.count_nonzero(np.isfinite(z))))
-    least = bayesian_penalty(1 - 2 * bool(fit.noise.drift), fit.size)
-    if THRESHOLD.colour_promise * told > more + least:
-        return True
-    return THRESHOLD.colour_promise * measure_walk_gain(fit) > more
 
 
 def refuse_false_noise(found: Search, is_larger: Callable[[Model], bool]) -> Search:
@@ -345,65 +278,6 @@ def _is_stand_in(best: Trial, model: Model, beside: bool) -> bool:
         return False
     # The tests may be alarmed by the filter itself: replicas, which take their time, forgive that.
     return best.gain < THRESHOLD.small_gain * retest_with_replicas(model).evidence
-
-
-def _look_back(
-    last: Round, step: Round, catalogue: Sequence[type[AbstractEffect]], work: Work
-) -> Trial | None:
-    """Return what would have been the better choice of the last round, now that more is found.
-
-    Where two effects hide together, the one that alone gains most may be a mixture of both. So what
-    could have been taken in its place is asked what could follow on it; the best pair wins. Where
-    what follows on the best leaves noise alone, only its look-alikes are asked.
-    """
-    if step.best is None and run_noise_tests(step.base.fit).passed:
-        return None
-    best = last.best
-    assert best is not None
-    near = last.others
-    if step.best is not None and run_noise_tests(step.best.model.fit).passed:
-        near = tuple(t for t in near if t.resembles(best) or best.resembles(t))
-    # Effects with a small score beside the best are not scanned again, since scans take longest.
-    ranked = sorted(step.trials, key=lambda t: -t.score)
-    likely = {t.key for t in (ranked if step.best is None else ranked[: THRESHOLD.looked_at])}
-    pairs: list[tuple[float, int]] = []
-    for k, trial in enumerate(near):
-        model, earned = _adopt_noise(trial.model, best.model, step.base)
-        pool = [c for c in list_missing_candidates(model, catalogue)
-                if not c.is_scanned() or name_at_place(c) in likely]  # fmt: skip
-        tried: list[Trial] = work(lambda effect, model=model: scan_candidate(model, effect), pool)
-        tried = sorted(tried, key=lambda t: t.full_penalty - t.score)[: THRESHOLD.released]
-        done = work(lambda t, model=model: refit_candidate(model, t), tried)
-        done += refit_quietly(model, pool, work)
-        follows = max((t.net_gain for t in done), default=-math.inf)
-        pairs.append((trial.net_gain + earned + follows, k))
-    total, k = max(pairs, default=(-math.inf, 0))
-    own = best.net_gain + (step.best.net_gain if step.best is not None else THRESHOLD.gate)
-    if not _has_same_sensor_noise(best.model, step.base):
-        own += max(0.0, compute_criterion(step.base) - compute_criterion(best.model))
-    return near[k] if total > own + THRESHOLD.gate else None
-
-
-def _adopt_noise(model: Model, before: Model, since: Model) -> tuple[Model, float]:
-    """Return a model with the sensor noise that was chosen since beside another, and what it gains.
-
-    Beside other noise of the sensor what follows has less to gain, so that two choices are
-    compared beside the same. Where it gains nothing, or none was chosen since, the model stays.
-    """
-    model = with_linearization(model)
-    if _has_same_sensor_noise(before, since):
-        return model, 0.0
-    fit = maximize(replace(model.fit, noise=since.fit.noise), exact=False)
-    other = Model(model.loop, fit)
-    earned = compute_criterion(other) - compute_criterion(model)
-    return (with_linearization(other), earned) if earned > 0 else (model, 0.0)
-
-
-def _has_same_sensor_noise(one: Model, other: Model) -> bool:
-    """Whether the sensor noise of two models is of one kind."""
-    a, b = one.fit.noise, other.fit.noise
-    same_tails = (a.tails is None) == (b.tails is None)
-    return a.sensor_is_white == b.sensor_is_white and same_tails
 
 
 def measure_unexplained_likelihood(fit: Fit) -> float:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from .._base.arguments import explain_names
+from .._base.arguments import check_arguments, explain_names
 from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from .._base.interruption import Budget, Stopped, check_seconds, hold_interrupt
 from .._base.jobs import check_jobs, share_out
@@ -180,6 +180,7 @@ def diagnose(
     >>> found.verdict, found.findings[0].name
     ('explained', 'CoulombFriction')
     """
+    check_arguments(diagnose, locals(), "record", "catalogue", "validation", "jobs", "seconds")
     started = time.perf_counter()
     catalogue = CATALOGUE if catalogue is None else catalogue
     check_catalogue(catalogue)

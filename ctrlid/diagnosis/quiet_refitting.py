@@ -9,7 +9,7 @@ from ..effects import AbstractEffect
 from ..estimation.likelihood.likelihood import Fit, rank_by_likelihood, relinearize_fit
 from ..estimation.likelihood.maximization import hold_force_quiet, maximize
 from ..estimation.likelihood.noise_fit import fit_noise
-from .candidates import NUMERICAL_FAILURES, Objection, Trial, Work
+from .candidates import NUMERICAL_FAILURES, Trial, Work, attempt_trial
 from .fitted_model import Model, carry_over_fit, with_linearization
 from .refitting import climb, weigh_refit
 from .scans import scan_candidate
@@ -74,10 +74,9 @@ def _climb_quietly(quiet: Model, trial: Trial) -> Fit | None:
 
 def _release(base: Model, trial: Trial, fit: Fit) -> Trial:
     """Return a trial on top of the base, climbed on with its noise free."""
-    try:
+
+    def climb_on() -> Trial:
         free = replace(fit, problem=replace(fit.problem, known=base.fit.known))
         return weigh_refit(base, trial, climb(free))
-    except (ModelCannotRun, EffectDoesNotApply) as reason:
-        return replace(trial, out=Objection.of(reason))
-    except NUMERICAL_FAILURES as reason:
-        return replace(trial, out=Objection.of_failure(reason))
+
+    return attempt_trial(climb_on, trial)

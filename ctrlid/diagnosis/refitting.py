@@ -6,11 +6,11 @@ from dataclasses import replace
 import numpy as np
 
 from .._base.criterion import bayesian_penalty
-from .._base.errors import EffectDoesNotApply, ModelCannotRun
+from .._base.errors import EffectDoesNotApply
 from ..estimation.likelihood.kalman_filter import Noise
 from ..estimation.likelihood.likelihood import Fit, evaluate_likelihood, rank_by_likelihood
 from ..estimation.likelihood.maximization import OTHER_NOISE_GAIN, climb_under_quiet_force, maximize
-from .candidates import NUMERICAL_FAILURES, Objection, Trial
+from .candidates import Objection, Trial, attempt_trial
 from .fitted_model import Model, can_simulate, carry_over_fit, drop_arrays, drop_linearization
 from .information import count_own_parameters, find_objection
 from .thresholds import THRESHOLD
@@ -35,30 +35,30 @@ def refit_candidate(base: Model, trial: Trial, near: Model | None = None) -> Tri
     """
     if trial.out is not None:
         return trial
+    return attempt_trial(lambda: _climb_from_starts(base, trial, near), trial)
+
+
+def _climb_from_starts(base: Model, trial: Trial, near: Model | None) -> Trial:
+    """Return the trial of `refit_candidate`, where nothing fails."""
     loop, names = trial.model.loop, trial.model.names
-    try:
-        if near is not None:
-            known = dict(zip(near.names, near.fit.theta.tolist(), strict=True))
-            loop = loop.with_parameters({n: known[n] for n in names if n in known})
-        start = carry_over_fit(near or base, loop, names)
-        starts = [start]
-        if start.noise.is_coloured and start.problem.known is None and can_simulate(base):
-            # Coloured noise that was fitted while the effect was missing may never let it in.
-            # (Where no simulation can check it, the likelihood also leads to absurd values.)
-            starts.append(replace(start, noise=start.noise.plain))
-        fit = max((climb(s) for s in starts), key=lambda f: f.value)
-        done = weigh_refit(base, trial, fit)
-        sticks = start.plant.e.kinked and not base.fit.plant.e.kinked
-        if sticks and start.problem.known is None and done.net_gain > 0:
-            # The force of the model without it stands for what sticks.
-            quiet = climb(climb_under_quiet_force(start))
-            if quiet.value > fit.value:
-                done = weigh_refit(base, trial, quiet)
-        return done
-    except (ModelCannotRun, EffectDoesNotApply) as reason:
-        return replace(trial, out=Objection.of(reason))
-    except NUMERICAL_FAILURES as reason:
-        return replace(trial, out=Objection.of_failure(reason))
+    if near is not None:
+        known = dict(zip(near.names, near.fit.theta.tolist(), strict=True))
+        loop = loop.with_parameters({n: known[n] for n in names if n in known})
+    start = carry_over_fit(near or base, loop, names)
+    starts = [start]
+    if start.noise.is_coloured and start.problem.known is None and can_simulate(base):
+        # Coloured noise that was fitted while the effect was missing may never let it in.
+        # (Where no simulation can check it, the likelihood also leads to absurd values.)
+        starts.append(replace(start, noise=start.noise.plain))
+    fit = max((climb(s) for s in starts), key=lambda f: f.value)
+    done = weigh_refit(base, trial, fit)
+    sticks = start.plant.e.kinked and not base.fit.plant.e.kinked
+    if sticks and start.problem.known is None and done.net_gain > 0:
+        # The force of the model without it stands for what sticks.
+        quiet = climb(climb_under_quiet_force(start))
+        if quiet.value > fit.value:
+            done = weigh_refit(base, trial, quiet)
+    return done
 
 
 def climb(start: Fit) -> Fit:

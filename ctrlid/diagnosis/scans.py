@@ -8,14 +8,13 @@ from typing import Literal
 import numpy as np
 
 from .._base.arrays import Array
-from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from .._base.statistics import pseudo_inverse
 from ..data.record import Record
 from ..effects import AbstractEffect
 from ..effects.context import find_output_of
 from ..estimation.likelihood.force_score import compute_force_scores
 from ..estimation.likelihood.kalman_filter import run_filter
-from .candidates import NUMERICAL_FAILURES, Objection, Trial
+from .candidates import Objection, Trial, attempt_trial
 from .fitted_model import Model
 from .places import find_force_channel, find_position
 from .screening import screen_candidate, screen_starts
@@ -258,21 +257,22 @@ def scan_candidate(model: Model, effect: AbstractEffect) -> Trial:
     Trial
         The best place; the penalty of the scan is in `scan_penalty`.
     """
-    try:
-        scan = effect.scan(ModelSight(model, effect.at))
-        if scan is None:
-            return screen_candidate(model, effect)
-        if not scan.starts:
-            return Trial(effect, "", model, -math.inf, out=Objection("not seen", scan.remark))
-        penalty = math.log(scan.places)
-        if len(scan.starts) == len(scan.starts[0]) == 1:
-            best = screen_candidate(model, scan.starts[0][0], penalty)
-        else:
-            tried = (screen_starts(model, group, penalty) for group in scan.starts)
-            best = max(tried, key=lambda t: t.score)
-        return replace(best, others=scan.others)
-    # An effect may be impossible at a place, as at a frequency outside its bounds.
-    except (ModelCannotRun, EffectDoesNotApply) as reason:
-        return Trial(effect, "", model, -math.inf, out=Objection.of(reason))
-    except NUMERICAL_FAILURES as reason:
-        return Trial(effect, "", model, -math.inf, out=Objection.of_failure(reason))
+    return attempt_trial(
+        lambda: _find_best_place(model, effect), Trial(effect, "", model, -math.inf)
+    )
+
+
+def _find_best_place(model: Model, effect: AbstractEffect) -> Trial:
+    """Return the trial of `scan_candidate`, where nothing fails."""
+    scan = effect.scan(ModelSight(model, effect.at))
+    if scan is None:
+        return screen_candidate(model, effect)
+    if not scan.starts:
+        return Trial(effect, "", model, -math.inf, out=Objection("not seen", scan.remark))
+    penalty = math.log(scan.places)
+    if len(scan.starts) == len(scan.starts[0]) == 1:
+        best = screen_candidate(model, scan.starts[0][0], penalty)
+    else:
+        tried = (screen_starts(model, group, penalty) for group in scan.starts)
+        best = max(tried, key=lambda t: t.score)
+    return replace(best, others=scan.others)

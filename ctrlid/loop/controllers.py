@@ -19,7 +19,7 @@ from .._base.arguments import check_field_names, is_number, show_fields
 from .._base.arrays import Array
 from .._base.errors import CtrlidError
 from .._base.periods import have_same_period, write_both_periods
-from ..physics.conversions import to_state_matrices
+from ..physics.conversions import require_finite_coefficients, to_state_matrices
 from ..physics.linearization import OperatingPoint
 from ..physics.trace import timebase, trace
 
@@ -184,13 +184,14 @@ def make_control_law(controller: Any, at: OperatingPoint, dt: float) -> ControlL
     """
     if isinstance(controller, PID):
         return _make_pid_law(controller, at, dt)
-    if isinstance(controller, int | float | np.number):
+    if is_number(controller):
         controller = ct.tf([float(controller)], [1.0])
     if not isinstance(controller, ct.TransferFunction | ct.NonlinearIOSystem):
         raise CtrlidError(
             "a controller is a TransferFunction, a StateSpace, a python-control system with inputs "
             f"(r, y), a PID, or None; given {type(controller).__name__}"
         )
+    require_finite_coefficients(controller, "the controller")
     if controller.noutputs != 1 or controller.ninputs not in (1, 2):
         raise CtrlidError(
             f"a controller has one output u and one input (r - y) or two inputs (r, y); given "

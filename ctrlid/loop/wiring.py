@@ -13,7 +13,7 @@ from .._base.arrays import Array
 from .._base.errors import CtrlidError
 from .._base.text import write_list
 from ..data.record import Record
-from ..physics.conversions import to_state_matrices
+from ..physics.conversions import require_finite_coefficients, to_state_matrices
 from ..physics.equations import Equations
 from ..physics.linearization import OperatingPoint
 from ..physics.trace import timebase, trace
@@ -374,6 +374,7 @@ def make_wired_law(controller: Any, wiring: Wiring, at: OperatingPoint, dt: floa
         If the controller has another sampling period than the loop, is improper, or computes its
         output from the very input that it drives.
     """
+    require_finite_coefficients(controller, "the controller")
     sampled = timebase(controller) if controller.dt is not True else dt
     if sampled and abs(sampled - dt) > 1e-9 * dt:
         raise CtrlidError(f"the controller runs at {sampled:g} s, the loop at {dt:g} s; "

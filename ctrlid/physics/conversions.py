@@ -18,6 +18,32 @@ from .._base.errors import CtrlidError
 LONGEST = 100
 
 
+def require_finite_coefficients(system: Any, name: str) -> None:
+    """Refuse a linear system in which a coefficient is no finite number.
+
+    Parameters
+    ----------
+    system : control.TransferFunction or control.StateSpace
+        Others have no coefficients, and pass.
+    name : str
+        What it is called in the message.
+
+    Raises
+    ------
+    CtrlidError
+        If a coefficient is NaN or infinite.
+    """
+    parts: list[Any] = []
+    if isinstance(system, ct.StateSpace):
+        parts = [system.A, system.B, system.C, system.D]
+    elif isinstance(system, ct.TransferFunction):
+        parts = [one for table in (system.num, system.den) for row in table for one in row]
+    if not all(np.isfinite(np.asarray(part, dtype=float)).all() for part in parts):
+        raise CtrlidError(
+            f"{name} has coefficients that are NaN or infinite. Replace them by finite numbers"
+        )
+
+
 def to_polynomials(
     a: ArrayLike, b: ArrayLike, c: ArrayLike, d: ArrayLike
 ) -> tuple[list[Array], Array]:

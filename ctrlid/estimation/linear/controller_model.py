@@ -16,7 +16,7 @@ from ..._base.criterion import bayesian_penalty
 from ..._base.errors import CtrlidError
 from ..._base.periods import have_same_period, write_both_periods
 from ..._base.statistics import regress
-from ...physics.conversions import to_polynomials
+from ...physics.conversions import require_finite_coefficients, to_polynomials
 from ..identified_model import Structure
 from .instruments import Piece, Signals
 from .regression import merge_factors
@@ -68,6 +68,7 @@ def convert_controller(controller: Any, names: Sequence[str], dt: float) -> Line
             f"(r, y); given {type(controller).__name__}. Leave controller=None: it is then found "
             "from r, y and u in the record."
         )
+    require_finite_coefficients(controller, "The controller")
     if controller.noutputs != 1 or controller.ninputs not in (1, 2):
         raise CtrlidError(
             "A controller has one output u and one input (r - y) or two inputs (r, y); given "

@@ -1,0 +1,78 @@
+"""Step 7: whether other noise of the sensor explains a record better than the best effect does."""
+
+import contextlib
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from .._base.criterion import bayesian_penalty
+from .._base.errors import ModelCannotRun
+from .._base.statistics import compute_lagged_products, compute_predicted_likelihood
+from ..estimation.likelihood.likelihood import Fit
+from ..estimation.likelihood.maximization import choose_sensor_noise, choose_tails
+from ..estimation.likelihood.noise_fit import (
+    compute_noise_criterion,
+    count_noise_parameters,
+    measure_walk_gain,
+)
+from .candidates import Trial
+from .fitted_model import Model, with_linearization
+from .noise_tests import run_noise_tests
+from .thresholds import THRESHOLD
+
+
+def prefer_sensor_noise(
+    model: Model, best: Trial | None, is_larger: Callable[[Model], bool]
+) -> Model | None:
+    """Return the model with other sensor noise if that gains about as much as the best effect.
+
+    Coloured, or with heavy tails. An effect has to gain more than the noise by as much as it has to
+    gain beside none: a slow wander of the sensor looks like a drift. Not where the noise is larger
+    than the error that it explains.
+    """
+    fit = model.fit
+    if fit.known is not None or not math.isfinite(fit.value):
+        return None
+    tests = run_noise_tests(fit)
+    if tests.passed and not fit.noise.drift and best is None:
+        return None
+    # Further noise in the fit of the best effect is paid for as well.
+    more = 0.0
+    if best is not None:
+        parameters = count_noise_parameters(best.model.fit) - count_noise_parameters(fit)
+        earned = best.net_gain - bayesian_penalty(parameters, fit.size)
+        more = max(0.0, earned - THRESHOLD.gate)
+    tried = []
+    # Of several outputs no colour is fitted.
+    if fit.plant.e.siso and fit.noise.sensor_is_white and _may_be_coloured(fit, more):
+        with contextlib.suppress(ModelCannotRun):
+            tried.append(choose_sensor_noise(fit))
+    if fit.noise.tails is None and tests.has_heavy_tails:
+        tried.append(choose_tails(fit))
+    other = max(tried, key=compute_noise_criterion, default=fit)
+    gain = compute_noise_criterion(other) - compute_noise_criterion(fit)
+    if not gain > more:
+        return None
+    newly_coloured = fit.noise.sensor_is_white and not other.noise.sensor_is_white
+    if newly_coloured and is_larger(Model(model.loop, other)):
+        return None
+    return with_linearization(Model(model.loop, other))
+
+
+def _may_be_coloured(fit: Fit, more: float) -> bool:
+    """Whether coloured sensor noise can gain more than so much, in place of a coloured force.
+
+    What past innovations tell of the next one is what a colour of the noise can explain; with
+    parameters that move along it may be twice as much. A slow walk of the sensor tells hardly
+    anything from one innovation to the next, the less beside a coloured force that follows it.
+    """
+    told = 0.0
+    for z in fit.standardized:
+        filled = np.nan_to_num(z)
+        products = compute_lagged_products(filled, filled, THRESHOLD.lags)
+        told += compute_predicted_likelihood(products, float(np.count_nonzero(np.isfinite(z))))
+    least = bayesian_penalty(1 - 2 * bool(fit.noise.drift), fit.size)
+    if THRESHOLD.colour_promise * told > more + least:
+        return True
+    return THRESHOLD.colour_promise * measure_walk_gain(fit) > more
