@@ -98,6 +98,7 @@ VISIBLE = {
     "FlexibleMode": lambda s: {"frequency": 0.15 / s["dt"], "damping": 0.05, "coupling": 0.05},
     "PositionOffset": lambda s: {"offset": 0.3 * s["Y"]},
     "ForceExponent": lambda s: {"n": 2.2},
+    "ParameterError": lambda s: {"error": 0.05},
     "ParameterDrift": lambda s: {"rate": 0.1 / (SAMPLES * s["dt"])},
     "ParameterStep": lambda s: {"size": 0.05},
     "SensorLag": lambda s: {"tau": 0.5 * s["dt"]},
@@ -333,7 +334,7 @@ class Wrong(effects.LawEffect):
 
 
 def test_the_catalogue_is_explicit_and_public():
-    assert len(set(CATALOGUE)) == len(CATALOGUE) == 34
+    assert len(set(CATALOGUE)) == len(CATALOGUE) == 35
     for cls in CATALOGUE:
         assert getattr(effects, cls.__name__) is cls
         assert cls.__name__ in effects.__all__

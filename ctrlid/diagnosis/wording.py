@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .._base.text import choose_prefix, write_list, write_number, write_p_value, write_quantity
-from ..effects import AbstractEffect, ReadingEffect
+from ..effects import AbstractEffect, ParameterError, ReadingEffect
 from ..effects.base import name_at_place
 from .findings import COMPLETE, BinnedErrors, Disturbance, Finding, Gap
 from .noise_tests import choose_alarm_level
@@ -46,6 +46,8 @@ TESTS_OF = {
     "size by ": "the variance in bins of ",
     "rhythm of ": "a periodic change of ",
 }
+# The first word of what a parameter of the plant is called that is not what the model says.
+PARAMETER = "parameter "
 # What is no effect of the catalogue needs an article in a sentence.
 ARTICLES = {"delay of the output": "a delay of the output"}
 # Lines of the mains [Hz], so many multiples of them, and how far they may be off: by EN 50160,
@@ -87,9 +89,21 @@ def list_names(finding: Finding) -> list[str]:
 
     What no record can tell apart is one name, of which no part stands alone.
     """
-    same = [ARTICLES.get(name, name) for name in finding.equivalents]
-    same = [f"the {name} of the plant" if name.startswith("parameter ") else name for name in same]
-    return list(dict.fromkeys([finding.names[0], *same, *finding.names[1:]]))
+    first, *others = finding.names
+    of_plant = first.startswith(PARAMETER)
+    names = dict.fromkeys([first, *finding.equivalents, *others])
+    return [_write_name(name, of_plant or name in others) for name in names]
+
+
+def _write_name(name: str, missing: bool) -> str:
+    """Return a name as a sentence about what the model lacks has it.
+
+    Of a parameter of the plant the model lacks the right value; beside an effect that does the
+    same, the parameter is named alone.
+    """
+    if name.startswith(PARAMETER):
+        return f"the right value of the {name}" if missing else f"the {name} of the plant"
+    return ARTICLES.get(name, name)
 
 
 def join_alternatives(names: Sequence[str]) -> str:
@@ -250,6 +264,8 @@ def describe_parameters(
     found: Diagnosis, effect: AbstractEffect, errors: dict[str, float] | None = None
 ) -> str:
     """Write the parameters of an effect with units and standard errors, if they are given."""
+    if isinstance(effect, ParameterError):
+        return _describe_parameter_of_plant(found, effect, (errors or {}).get("error"))
     units = list_units(found.loop, effect)
     words = []
     unused = {p.name for p in effect.parameters()} - set(effect.values())
@@ -260,6 +276,16 @@ def describe_parameters(
         error = None if errors is None else errors.get(name)
         words.append(f"{name} = {write_quantity(value, units[name], error)}")
     return ", ".join(words)
+
+
+def _describe_parameter_of_plant(
+    found: Diagnosis, effect: ParameterError, error: float | None
+) -> str:
+    """Write the right value of a parameter of the plant, and the value that the model has."""
+    given, unit = found.loop.parameters[effect.name], found.loop.units.get(effect.name, "")
+    spread = None if error is None else abs(given) * error
+    value = write_quantity(given * (1 + effect.error), unit, spread)
+    return f"{effect.name} = {value} in place of {write_quantity(given, unit)}"
 
 
 def describe_forces(found: Diagnosis, effect: AbstractEffect) -> str:
@@ -295,7 +321,7 @@ def describe_certainty(found: Diagnosis, finding: Finding) -> str:
         text += f"; ONE OF {many} EFFECTS that explain the record"
     else:
         kinds = {name_at_place(c.effect) for c in found.ranking}
-        count = len(kinds - set(list_names(finding)))
+        count = len(kinds - {*finding.names, *finding.equivalents})
         rest = "none of the {} other effects" if count > 1 else "no other effect"
         text += f"; {rest.format(count)} of the catalogue explains the record as well"
     if found.verdict == "partly explained" and not isinstance(finding.effect, ReadingEffect):
@@ -308,7 +334,7 @@ def list_doubts(found: Diagnosis, finding: Finding) -> list[str]:
     lines = []
     apart = [e for e in finding.alternatives if name_at_place(e) not in finding.equivalents]
     if apart:
-        others = [f"{type(e).__name__} ({describe_parameters(found, e)})" for e in apart]
+        others = [f"{name_at_place(e)} ({describe_parameters(found, e)})" for e in apart]
         lines.append(f"this record cannot distinguish it from {write_list(others)}")
     if finding.equivalents:
         same = [ARTICLES.get(name, name) for name in finding.equivalents]
@@ -354,8 +380,10 @@ def describe_aliases(frequency: float, dt: float, width: float = 0.0) -> str:
 def name_finding(finding: Finding) -> str:
     """Name the effect of a finding and say what it is."""
     what = finding.effect.sentence.rstrip(".")
-    same = [n for n in list_names(finding) if n not in finding.names or n in finding.equivalents]
-    name = join_alternatives([finding.names[0], *same])
+    first = finding.names[0]
+    of_plant = first.startswith(PARAMETER)
+    same = [n if of_plant else _write_name(n, False) for n in finding.equivalents]
+    name = join_alternatives([first, *same])
     return f"{name}: {what[:1].lower()}{what[1:]}" if what else name
 
 

@@ -47,7 +47,7 @@ from .output import (
 )
 from .parameters import Parameter, parameter
 from .state_limit import StateLimit
-from .time_varying import ParameterDrift, ParameterStep
+from .time_varying import ParameterDrift, ParameterError, ParameterStep
 
 __all__ = [
     "CATALOGUE",
@@ -77,6 +77,7 @@ __all__ = [
     "OutputEffect",
     "Parameter",
     "ParameterDrift",
+    "ParameterError",
     "ParameterStep",
     "PeriodicForce",
     "PositionOffset",

@@ -126,6 +126,11 @@ class AbstractEffect:
     def check(self) -> None:
         """Refuse values that do not fit together by `EffectDoesNotApply`; nothing by default."""
 
+    @property
+    def called(self) -> str:
+        """What reports call it: its class."""
+        return type(self).__name__
+
     def doubt(self) -> str | None:
         """Say why values that were fitted cannot be this effect; by default None, for they can."""
         return None
@@ -269,7 +274,8 @@ class AbstractEffect:
                 continue
             shown = f"{value:.4g} {units[f.name]}" if f.name in units else str(value)
             parts.append(f"{f.name} = {shown.strip()}")
-        return f"{name_at_place(self)}: {', '.join(parts)}"
+        where = f" at {self.at}" if self.at else ""
+        return f"{type(self).__name__}{where}: {', '.join(parts)}"
 
     def __str__(self) -> str:
         return self.text()
@@ -395,7 +401,7 @@ class AbstractEffect:
 
 
 def name_at_place(effect: AbstractEffect) -> str:
-    """Return the class of an effect, with its place on a plant that has several.
+    """Return what an effect is called, with its place on a plant that has several.
 
     Examples
     --------
@@ -403,8 +409,7 @@ def name_at_place(effect: AbstractEffect) -> str:
     >>> name_at_place(cid.effects.CoulombFriction(fc=0.2, at="theta_dot"))
     'CoulombFriction at theta_dot'
     """
-    name = type(effect).__name__
-    return f"{name} at {effect.at}" if effect.at else name
+    return f"{effect.called} at {effect.at}" if effect.at else effect.called
 
 
 def _can_take(loop: Any, effect: AbstractEffect) -> bool:

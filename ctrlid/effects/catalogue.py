@@ -38,7 +38,7 @@ from .output import (
     SensorSaturation,
 )
 from .state_limit import StateLimit
-from .time_varying import ParameterDrift, ParameterStep
+from .time_varying import ParameterDrift, ParameterError, ParameterStep
 
 CATALOGUE: tuple[type[AbstractEffect], ...] = (
     ActuatorLag,
@@ -64,6 +64,7 @@ CATALOGUE: tuple[type[AbstractEffect], ...] = (
     FlexibleMode,
     PositionOffset,
     ForceExponent,
+    ParameterError,
     ParameterDrift,
     ParameterStep,
     StateLimit,

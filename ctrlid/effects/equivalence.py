@@ -16,6 +16,7 @@ from .base import AbstractEffect
 from .catalogue import CATALOGUE
 from .context import find_motion
 from .law import PositionOffset
+from .time_varying import ParameterError
 
 # Two changes are compared at so many random states and inputs.
 POINTS = 24
@@ -112,7 +113,7 @@ def equivalents(
         new = {type(e).__name__: e for e in equal if type(e).__name__ not in found}
         found |= new
         todo += new
-    return (*sorted(found.keys() - {name}), *sorted(words))
+    return (*sorted(found.keys() - {name}), *sorted(words - {effect.called}))
 
 
 def _find_equivalents_at_places(
@@ -140,9 +141,9 @@ def _find_equivalents_at_places(
                 continue
             if same:
                 found.append(f"{kind.__name__} at {at}")
-    words = [f"parameter {key}" for key in e.parameters
-             if "." not in key and _is_change_of_parameter(loop, effect, key)]  # fmt: skip
-    return (*sorted(found), *sorted(words))
+    words = {f"parameter {key}" for key in e.parameters
+             if "." not in key and _is_change_of_parameter(loop, effect, key)}  # fmt: skip
+    return (*sorted(found), *sorted(words - {effect.called}))
 
 
 LAGS = ("ActuatorLag", "SensorLag")
@@ -321,7 +322,12 @@ def _is_linear(e: Equations, forced: bool = False) -> bool:
 
 
 def _make_member(cls: type[AbstractEffect], loop: Any) -> AbstractEffect | None:
-    """Return an instance of a class that has a single parameter and no states, else None."""
+    """Return an instance of a class that has a single parameter and no states, else None.
+
+    Parameters of the plant are compared by their names.
+    """
+    if cls is ParameterError:
+        return None
     needed = [p for p in cls.parameters() if not p.optional]
     if len(needed) != 1 or cls.states or needed[0].neutral is None:
         return None
@@ -405,6 +411,14 @@ def _is_change_of_parameter(loop: Any, effect: Any, name: str) -> bool:
         one = None if effect is None else _compute_change(loop, effect, size)
         step = 1e-3 * (abs(e.values[k]) or 1.0)
         factor = _find_factor(one, change(step))
-        if factor is None or not _are_equal(one, change(factor * step)):
+        if factor is None:
+            return False
+        for _ in range(NEWTON_STEPS):
+            # What a parameter divides by changes a little less or more than in proportion.
+            correction = _find_factor(one, change(factor * step))
+            if correction is None:
+                return False
+            factor *= correction
+        if not _are_equal(one, change(factor * step)):
             return False
     return True

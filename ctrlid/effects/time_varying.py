@@ -1,4 +1,4 @@
-"""Parameters of the plant that drift or step during a record."""
+"""Parameters of the plant that are off, drift, or step during a record."""
 
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Self, final
@@ -10,6 +10,8 @@ from .kinds import LawEffect
 from .parameters import parameter
 from .scanning import Overview, Range, Scan, Sight
 
+# The acceleration of gravity lies between these everywhere on earth [m/s^2], and is not off.
+GRAVITY = (9.76, 9.84)
 # A step is not looked for in this share of the record at either end.
 EDGE = 0.05
 # A scan looks for a step at so many instants at once.
@@ -18,6 +20,64 @@ TIMES = 40
 SPREAD_TIMES = 12
 # A fit starts from a relative change between these two.
 SMALLEST, LARGEST = -0.9, 10.0
+
+
+@final
+@dataclass(frozen=True)
+class ParameterError(LawEffect):
+    r"""A parameter of the plant is not what the model says.
+
+    .. math:: \theta \to \theta (1 + \epsilon)
+
+    A mass that nobody weighed, a gain from a data sheet. It is tried for each parameter that is not
+    in ``free``, but for the acceleration of gravity: what is free is fitted before any effect is
+    sought.
+
+    Parameters
+    ----------
+    name : str
+        Name of the plant's parameter.
+    error : float
+        Relative error epsilon.
+
+    Examples
+    --------
+    >>> import ctrlid as cid
+    >>> print(cid.effects.ParameterError("K", error=0.03))
+    ParameterError: name = K, error = 0.03
+    """
+
+    name: str
+    error: float = parameter("", neutral=0.0)
+
+    look_alikes: ClassVar[tuple[str, ...]] = (
+        "SensorGain", "ConstantForce", "LinearStiffness", "ViscousFriction",
+    )  # fmt: skip
+    sentence: ClassVar[str] = "A parameter of the plant is not what the model says."
+    experiment: ClassVar[str] = (
+        "a measurement of the parameter itself; if it may be off, name it in free="
+    )
+
+    @property
+    def called(self) -> str:
+        """What reports call it: the parameter."""
+        return f"parameter {self.name}"
+
+    @classmethod
+    def candidates(cls, loop: Any, record: Any = None) -> tuple[Self, ...]:
+        """Return one for each parameter of the plant that is called exact."""
+        del record
+        known = loop.equations().parameters
+        fixed = [
+            k for k, v in known.items()
+            if "." not in k and k not in loop.free and v != 0
+            and not (k == "g" and GRAVITY[0] <= v <= GRAVITY[1])
+        ]  # fmt: skip
+        return cls._applicable(loop, *(cls(name, 0.0) for name in fixed))
+
+    def law(self, m: Moment) -> dict[str, Any]:
+        """Return the parameter as it is."""
+        return {self.name: m.plant_parameter(self.name) * (1 + self.error)}
 
 
 def _list_plant_parameters(loop: Any) -> list[str]:

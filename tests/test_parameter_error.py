@@ -1,0 +1,112 @@
+"""A parameter that the model calls exact is a suspect like any effect."""
+
+import control as ct
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import ctrlid as cid
+from ctrlid import effects as E
+from ctrlid.diagnosis.wording import describe_size, write_headline
+
+DT = 0.01
+TRUE = {"m": 0.2, "l": 0.3, "c": 0.02}
+
+
+def make_plant(**given):
+    """Return a pendulum that stands on its head, written down by its user."""
+    values = {**TRUE, "g": 9.81, **given}
+    return ct.nlsys(
+        lambda t, x, u, p: [x[1], p["g"] / p["l"] * np.sin(x[0])
+                            + (u[0] - p["c"] * x[1]) / (p["m"] * p["l"] ** 2)],
+        lambda t, x, u, p: x[0], inputs=["tau"], outputs=["theta"], states=["theta", "omega"],
+        params=values, name="pendulum",
+    )  # fmt: skip
+
+
+def make_loop(free=(), **given):
+    at = cid.OperatingPoint((0.0, 0.0), 0.0, 0.0)
+    law = ct.tf([3.0, -2.7], [1.0, -0.2], DT) * 1.5
+    return cid.Loop(make_plant(**given), law, dt=DT, at=at, free=free)
+
+
+def swing(seed, n=1500, friction=0.0, **true):
+    """Return a record of the real pendulum, by scipy."""
+    p = {**TRUE, **true}
+    rng = np.random.default_rng(seed)
+    r = 0.15 * np.repeat(rng.choice([-1.0, 1.0], n // 50), 50)
+    x, state, before, us, ys = np.zeros(2), 0.0, 0.0, [], []
+    for k in range(n):
+        y = x[0] + 1e-3 * rng.standard_normal()
+        e = r[k] - y
+        u = 1.5 * (3.0 * e - 2.7 * before) + 0.2 * state
+        before, state = e, u
+        us.append(u)
+        ys.append(y)
+
+        def rates(t, x, u=u):
+            torque = u - p["c"] * x[1] - friction * np.tanh(x[1] / 1e-3)
+            return [x[1], 9.81 / p["l"] * np.sin(x[0]) + torque / (p["m"] * p["l"] ** 2)]
+
+        x = solve_ivp(rates, (0, DT), x, rtol=1e-8, atol=1e-10).y[:, -1]
+    return cid.Record(r=r, u=us, y=ys, dt=DT)
+
+
+def test_it_changes_the_parameter_and_nothing_else():
+    loop = make_loop()
+    changed = loop.with_effect(E.ParameterError("l", error=0.1))
+    expected = make_loop(l=0.33)
+    r = 0.1 * np.sign(np.sin(np.arange(200) / 15))
+    one, other = (cid.simulate(each, r) for each in (changed, expected))
+    np.testing.assert_allclose(one.y, other.y, rtol=0, atol=1e-12)
+
+
+def test_what_is_free_and_what_gravity_is_are_no_suspects():
+    named = lambda loop: [e.name for e in E.ParameterError.candidates(loop)]  # noqa: E731
+    assert named(make_loop()) == ["m", "l", "c"]
+    assert named(make_loop(free=("m", "c"))) == ["l"]
+    assert named(make_loop(g=9.5)) == ["m", "l", "c", "g"]
+    assert named(make_loop(c=0.0)) == ["m", "l"]
+
+
+def test_equivalents_are_other_parameters_and_effects_not_itself():
+    plant = cid.plants.maglev(m=0.02, K=3e-6)
+    loop = cid.Loop(plant, None, dt=1e-3, at=cid.operating_point(plant, output=0.01))
+    assert E.equivalents(E.ParameterError("K", 0.03), loop) == ("parameter m",)
+    assert E.equivalents(E.ParameterError("m", 0.03), loop) == ("parameter K",)
+    assert E.equivalents(E.ConstantForce(0.1), loop)[-1] == "parameter g"
+    assert "ConstantForce" in E.equivalents(E.ParameterError("g", 0.03), loop)
+
+
+@pytest.fixture(scope="module")
+def found():
+    return cid.diagnose(make_loop(), swing(1, m=0.206), progress=False)
+
+
+def test_a_wrong_mass_is_named_where_nothing_is_free(found):
+    assert found.verdict == "explained"
+    (finding,) = found.findings
+    assert finding.names[0] == "parameter m"
+    assert finding.effect.error == pytest.approx(0.03, abs=3 * finding.standard_errors["error"])
+    assert finding.standard_errors["error"] < 3e-3
+    assert found.gap.after < 1.1 * found.gap.floor < found.gap.before
+
+
+def test_a_report_says_the_right_value_in_place_of_the_given_one(found):
+    assert "The model lacks the right value of the parameter m" in write_headline(found)
+    (finding,) = found.findings
+    assert describe_size(found, finding).startswith("m = 0.20")
+    assert describe_size(found, finding).endswith(" in place of 0.2")
+    assert "name = m" not in str(found)
+
+
+def test_friction_beside_a_wrong_mass_keeps_its_name():
+    found = cid.diagnose(make_loop(), swing(2, m=0.206, friction=0.02), progress=False)
+    names = [f.names for f in found.findings]
+    assert any("CoulombFriction" in n for n in names), names
+    assert any("parameter m" in n for n in names), names
+
+
+def test_nothing_is_named_where_all_is_right():
+    found = cid.diagnose(make_loop(), swing(3), progress=False)
+    assert found.verdict == "nothing missing", found
