@@ -178,6 +178,7 @@ def test_a_regular_clock_is_read_exactly_and_quietly(tmp_path, start, dt):
 
 @pytest.mark.parametrize("n", [30, 1500])
 @pytest.mark.parametrize(("dt", "digits"), [(3.25e-3, 3), (1.5e-3, 3), (0.0125, 2), (1 / 3, 2)])
+@pytest.mark.filterwarnings("ignore:.*Read as the slower clock")
 def test_rounded_times_are_a_regular_clock(tmp_path, dt, digits, n):
     record = clock(tmp_path, dt * np.arange(n), digits)
     assert len(record) == n
@@ -281,6 +282,19 @@ def test_blank_cells_are_masked(tmp_path):
     assert record.valid.tolist() == [True, False, False, True, True]
     assert record.u.tolist() == [1, 1, 5, 7, 9]
     assert record.y.tolist() == [2, 4, 4, 8, 10]
+
+
+@pytest.mark.parametrize("every", [3, 4, 5])
+def test_many_rows_lost_at_a_regular_pace_are_warned_of(tmp_path, every):
+    k = np.arange(2000)
+    kept = k[k % every != every - 1]
+    with pytest.warns(UserWarning, match=r"at a regular pace.*Read as the slower clock"):
+        record = clock(tmp_path, 1e-3 * kept, 6)
+    assert record.dt == pytest.approx(1e-3 * every / (every - 1), rel=1e-3)
+    with pytest.warns(UserWarning, match="Read as lost rows"):
+        record = clock(tmp_path, 1e-3 * kept, 6, gaps="mask")
+    assert record.dt == 1e-3
+    np.testing.assert_array_equal(np.flatnonzero(record.valid), kept)
 
 
 @pytest.mark.parametrize("every", [6, 7, 20, 50, 133])

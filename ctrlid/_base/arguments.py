@@ -7,7 +7,7 @@ import sys
 import types
 import typing
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from numbers import Complex, Integral, Real
+from numbers import Complex, Integral
 from pathlib import Path
 from typing import Any, Literal, ParamSpec, TypeVar, get_args, get_origin
 
@@ -19,6 +19,8 @@ from .text import find_near_name, write_count, write_list
 Given = ParamSpec("Given")
 Answer = TypeVar("Answer")
 
+# The largest whole number of a machine word.
+LARGEST = 2**63 - 1
 NUMBERS = {
     float: "a number", int: "a whole number", complex: "a real or complex number",
     bool: "True or False", str: "a text", Path: "the path of a file", type(None): "None",
@@ -339,17 +341,17 @@ def _is_kind(value: Any, kind: Any) -> bool:
 def _is_float(value: Any) -> bool:
     """Tell whether a value is one real number, no truth value and no span of time.
 
-    numpy counts its spans of time as whole numbers, of a unit that a float would lose.
+    numpy counts its spans of time as whole numbers, of a unit that a float would lose. Whole
+    numbers that no machine word holds, and fractions, are objects to numpy, which few of its
+    functions take.
     """
     if isinstance(value, np.ndarray) and value.ndim == 0 and value.dtype.kind in "fiu":
         value = value[()]
-    if isinstance(value, bool | np.bool_ | np.timedelta64) or not isinstance(value, Real):
+    if isinstance(value, bool | np.bool_ | np.timedelta64):
         return False
-    try:
-        float(value)
-    except OverflowError:
-        return False
-    return True
+    if isinstance(value, int):
+        return -LARGEST <= value <= LARGEST
+    return isinstance(value, float | np.floating | np.integer)
 
 
 def _is_plain(value: Any, kind: type) -> bool:

@@ -3,6 +3,7 @@
 import functools
 import math
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -173,7 +174,7 @@ def check_seconds(seconds: Any) -> float:
     if seconds is None:
         return math.inf
     number = isinstance(seconds, int | float) and not isinstance(seconds, bool)
-    if number and seconds > 0:
+    if number and 0 < seconds <= sys.float_info.max:
         return float(seconds)
     raise CtrlidError(
         "seconds is the time after which the search ends with its best answer so far, a number "

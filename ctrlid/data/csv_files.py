@@ -7,12 +7,12 @@ import math
 import re
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from numbers import Real
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from .._base.arguments import is_number
 from .._base.errors import CtrlidError, CtrlidWarning
 from .._base.files import replace_file
 from .._base.text import drop_roundoff, split_unit, with_unit, write_percent
@@ -34,7 +34,7 @@ JITTER = 0.01
 # A step of more periods between two time stamps says that samples are missing.
 GAP = 1.5
 # Where steps of two units come less often than this, rows may have been lost at a regular pace. A
-# recorder that loses a fifth of all rows would have been noticed.
+# recorder that loses a fifth of all rows would have been noticed, so that it is only warned of.
 LOST = 0.2
 # So many rows are written at once, which bounds the memory that their text takes.
 CHUNK = 20_000
@@ -160,6 +160,8 @@ def read_csv(
     table, valid = _fill_gaps(table, places, valid, gaps, path)
     start, rows = 0.0, None
     period_given = own.get("dt") if dt is None else dt
+    if dt is not None and not 0 < dt < math.inf:
+        raise CtrlidError(f"dt is the sampling period, a number of seconds above 0; given {dt!r}")
     if clock is None:
         if period_given is None:
             raise CtrlidError(
@@ -209,7 +211,7 @@ def _check_scale(scale: Mapping[str, float], known: Mapping[str, Any]) -> dict[s
     for key, factor in scale.items():
         if key not in known:
             raise CtrlidError(f"scale= names {key!r}, but the channels are {', '.join(known)}")
-        number = isinstance(factor, Real) and not isinstance(factor, bool)
+        number = is_number(factor)
         if not number or not math.isfinite(factor) or factor == 0:
             raise CtrlidError(f"scale= needs a number other than zero for {key}; given {factor!r}")
     return {key: float(factor) for key, factor in scale.items()}
@@ -467,15 +469,14 @@ def _find_even_period(stamps: Any, rounding: float, dt: float | None) -> float |
     return next((p for p in short if fits(p) and abs(p - slope) <= rounding / n), slope)
 
 
-def _find_lossy_unit(stamps: Any) -> float | None:
-    """Return the step of a clock of which few steps are twice as long, None for other clocks."""
+def _find_doubled_unit(stamps: Any) -> float | None:
+    """Return the step of a clock of which some steps are twice as long, None for other clocks."""
     steps = np.diff(stamps)
-    unit = float(np.median(steps))
+    unit = float(np.min(steps))
     finest = 4 * float(np.spacing(np.abs(stamps).max()))
     longer = np.round(steps / unit) if unit > 0 else np.zeros(0)
-    lossy = 0 < np.count_nonzero(longer > 1) <= LOST * len(steps) + 1
     whole = np.all(np.abs(steps - longer * unit) <= finest)
-    return drop_roundoff(unit, finest) if lossy and whole else None
+    return drop_roundoff(unit, finest) if np.any(longer > 1) and whole else None
 
 
 def estimate_period(stamps: Any) -> float:
@@ -490,17 +491,23 @@ def _make_uniform(stamps: Any, dt: float | None, gaps: str, path: Path) -> tuple
         raise CtrlidError(f"the time column of {path} needs at least 2 values, all finite")
     rounding = _find_resolution(stamps)
     even = _find_even_period(stamps, rounding, dt)
-    if even is not None and dt is None and (unit := _find_lossy_unit(stamps)) is not None:
+    if even is not None and dt is None and (unit := _find_doubled_unit(stamps)) is not None:
         # A slow clock in whole units and a fast one that lost rows write the same stamps.
-        if gaps == "error":
-            longer = int(np.count_nonzero(np.diff(stamps) > GAP * unit))
-            raise CtrlidError(
-                f"the time column of {path} steps by {unit:g} s, and {longer} times, at a regular "
-                f"pace, by twice as much: either rows were lost (give gaps='mask' to fill them and "
-                f"mark them as not valid), or the period is no whole number of {unit:g} s (give "
-                f"dt={even:.10g})"
-            )
-        even, dt = None, unit
+        longer = int(np.count_nonzero(np.diff(stamps) > GAP * unit))
+        either = (
+            f"the time column of {path} steps by {unit:g} s, and {longer} times, at a regular "
+            f"pace, by twice as much: either rows were lost (give gaps='mask' to fill them and "
+            f"mark them as not valid), or the period is no whole number of {unit:g} s (give "
+            f"dt={even:.10g})"
+        )
+        few = longer <= LOST * (len(stamps) - 1) + 1
+        if gaps == "error" and few:
+            raise CtrlidError(either)
+        if not few:
+            here = "lost rows" if gaps == "mask" else "the slower clock"
+            warnings.warn(f"{either}. Read as {here}", CtrlidWarning, stacklevel=5)
+        if gaps == "mask":
+            even, dt = None, unit
     if even is not None:
         return even, np.arange(len(stamps))
     steps = np.diff(stamps)

@@ -3,15 +3,15 @@
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from numbers import Real
 from typing import Any, overload
 
 import control as ct
 import numpy as np
 
-from .._base.arguments import check_arguments, explain_names, point_at_part
+from .._base.arguments import check_arguments, explain_names, is_number, point_at_part
 from .._base.arrays import Array, freeze_arrays
 from .._base.errors import CtrlidError, ModelCannotRun
+from .._base.interruption import hold_interrupt
 from .._base.rounding import keep_numpy_quiet
 from .._base.signals import require_one_signal
 from .._base.text import Printed, write_polynomial, write_quantity
@@ -215,6 +215,7 @@ def redesign(
     step: float | Mapping[str, float] | None = None,
 ) -> ControllerTrial: ...  # fmt: skip
 @explain_names
+@hold_interrupt()
 @keep_numpy_quiet
 def redesign(
     G: Any, loop: Loop, crossover: float | None = None, phase_margin: float | None = None, *,
@@ -378,7 +379,7 @@ def _choose_height(loop: Loop, step: Any, find_peak: Callable[[], Any]) -> tuple
     """Return the height of the step, and why it is that where it was not given."""
     if step is None:
         return choose_height(loop, loop.signals["y"][0], find_peak)
-    if not isinstance(step, Real) or not np.isfinite(float(step)) or step == 0:
+    if not is_number(step) or not np.isfinite(float(step)) or step == 0:
         raise CtrlidError("step must be the height of the reference step in output units, a "
                           f"finite number other than zero; given {step!r}")  # fmt: skip
     return float(step), ""

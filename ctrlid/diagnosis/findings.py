@@ -7,7 +7,14 @@ from typing import Literal
 import numpy as np
 
 from .._base.arrays import Array, freeze_arrays
-from .._base.text import Printed, with_unit, write_list, write_number, write_quantity
+from .._base.text import (
+    Printed,
+    with_unit,
+    write_list,
+    write_number,
+    write_percent,
+    write_quantity,
+)
 from .._base.units import fill_unit
 from ..effects import AbstractEffect
 from ..effects.base import name_at_place
@@ -384,7 +391,7 @@ def _describe_tails(freedom: float, share: float, ratio: float) -> list[str]:
         told.append("large errors are as frequent as by Student's law with "
                     f"{write_number(freedom, 2)} degrees of freedom")  # fmt: skip
     if share:
-        told.append(f"{100 * share:.2g} % of the readings err "
+        told.append(f"{write_percent(share)} of the readings err "
                     f"{write_number(ratio, 2)} times as much as the others")  # fmt: skip
     return told
 

@@ -22,7 +22,7 @@ from .._base.arrays import to_real_array
 from .._base.errors import CtrlidError, EffectDoesNotApply
 from .._base.periods import have_same_period, write_both_periods
 from .._base.pickling import pack_by_value
-from .._base.text import list_known, write_count
+from .._base.text import list_known, write_count, write_percent
 from ..effects import AbstractEffect
 from ..effects.composition import compose_effects, label_effects
 from ..effects.context import find_position_unit
@@ -587,7 +587,7 @@ class Loop:
         if self.free:
             known = self.free if isinstance(self.free, Mapping) else {}
             names = [
-                n if math.isinf(known.get(n, math.inf)) else f"{n} (± {100 * known[n]:.3g} %)"
+                n if math.isinf(known.get(n, math.inf)) else f"{n} (± {write_percent(known[n])})"
                 for n in self.free
             ]
             text += f", free: {', '.join(names)}"

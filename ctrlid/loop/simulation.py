@@ -10,6 +10,7 @@ import numpy as np
 from .._base.arguments import check_arguments, explain_names, point_at_part, shorten_value
 from .._base.arrays import Array, to_real_array
 from .._base.errors import CtrlidError, CtrlidWarning, ModelCannotRun
+from .._base.interruption import hold_interrupt
 from .._base.rounding import keep_numpy_quiet
 from .._base.text import write_list
 from ..data.reconstruction import PIECES, count_pieces, reconstruct_signal
@@ -47,6 +48,7 @@ class SimulationStopped(ModelCannotRun):
 
 
 @explain_names
+@hold_interrupt()
 @keep_numpy_quiet
 def simulate(
     loop: Loop,

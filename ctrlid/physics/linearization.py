@@ -12,6 +12,7 @@ from scipy import linalg
 from .._base.arguments import check_arguments, explain_names, is_number
 from .._base.arrays import Array, to_real_array
 from .._base.errors import CtrlidError, ModelCannotRun
+from .._base.interruption import hold_interrupt
 from .._base.rounding import keep_numpy_quiet
 from .._base.text import write_count
 from .conversions import to_polynomials
@@ -138,6 +139,7 @@ def as_operating_point(at: Any, equations: Equations, inputs: Sequence[str]) -> 
 
 
 @explain_names
+@hold_interrupt()
 @keep_numpy_quiet
 def operating_point(
     plant: Any, *, output: Any, guess: Sequence[float] | OperatingPoint | None = None
@@ -384,6 +386,7 @@ def _build_jacobians(e: Equations, spread: float) -> Any:
 
 
 @explain_names
+@hold_interrupt()
 @keep_numpy_quiet
 def linearize(plant: Any, at: OperatingPoint, *, states: bool = False) -> Any:
     r"""Return the linear model of a plant for small deviations from an operating point.

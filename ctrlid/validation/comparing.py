@@ -13,6 +13,7 @@ from scipy import signal
 from .._base.arguments import explain_names, point_at_part
 from .._base.arrays import Array
 from .._base.errors import CtrlidError, CtrlidWarning, EffectDoesNotApply, ModelCannotRun
+from .._base.interruption import hold_interrupt
 from .._base.periods import have_same_period, write_both_periods, write_difference
 from .._base.rounding import keep_numpy_quiet
 from .._base.signals import require_one_signal
@@ -53,6 +54,7 @@ MEANINGFUL = 1e-6
 
 
 @explain_names
+@hold_interrupt()
 @keep_numpy_quiet
 def compare(record: Record, model_or_loop: Any, *, horizon: int | None = None) -> Comparison:
     """Compare a record with a model or a loop.

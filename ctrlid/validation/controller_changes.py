@@ -566,10 +566,12 @@ def _is_nonlinear(loop: Loop) -> bool:
 
 
 def _take_limits_off(loop: Loop) -> Loop:
-    """Return the loop without limits of its input or its controller."""
+    """Return the loop without limits of its input or its controller, which then needs no windup."""
     free = exchange_limits(loop)
     if isinstance(free.controller, PID):
-        free = exchange_controller(free, replace(free.controller, lower=-np.inf, upper=np.inf))
+        free = exchange_controller(
+            free, replace(free.controller, lower=-np.inf, upper=np.inf, anti_windup="none")
+        )
     return free
 
 

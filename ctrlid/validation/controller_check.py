@@ -441,9 +441,11 @@ def _find_wrong_law(
             not (exact_only or change.exact)
             and _is_added(change.loop, e, remains, change.record, resolution)
         ):
-            text = (f"u is not what the controller of the loop computes from r and y, but "
-                    f"{change.words}: what remains unexplained falls from {100 * left:.3g} to "
-                    f"{100 * remains:.3g} % of the variance of u. Correct the controller"
-                    f"{' or the log' if change.kind in MIRRORED else ''}.")  # fmt: skip
+            what = "the controller or the log" if change.kind in MIRRORED else "the controller"
+            text = (
+                f"u is not what the controller of the loop computes from r and y, but "
+                f"{change.words}: what remains unexplained falls from {write_percent(left)} to "
+                f"{write_percent(remains)} of the variance of u. Correct {what}."
+            )
             return change.kind, text, left, True
     return None

@@ -7,6 +7,7 @@ from typing import get_args
 import numpy as np
 
 from .._base.errors import ModelCannotRun
+from .._base.text import write_percent
 from ..data.record import Hold, Record
 from ..data.several_records import VISIBLE_MOTION, measure_input_motion
 from ..data.validity import find_longest_run
@@ -122,9 +123,10 @@ def _warn_of_later_samples(
             k = int(np.argmax(shares))
             size = float(shares[k])
             errors = abs(float(ours[k] - theirs[k])) / float(fits[hold].standard_errors[k])
-            which = (f", here {fits[hold].names[k]} by {100 * size:.2g} %, from {theirs[k]:.4g} "
-                     f"with hold={hold!r} to {ours[k]:.4g}, or {errors:.2g} standard "
-                     "errors")  # fmt: skip
+            which = (
+                f", here {fits[hold].names[k]} by {write_percent(size)}, from {theirs[k]:.4g} "
+                f"with hold={hold!r} to {ours[k]:.4g}, or {errors:.2g} standard errors"
+            )
     return f"{text}{which}. {cure}", size, True
 
 

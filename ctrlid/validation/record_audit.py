@@ -10,6 +10,7 @@ import numpy as np
 
 from .._base.arguments import explain_names, point_at_part
 from .._base.errors import CtrlidError
+from .._base.interruption import hold_interrupt
 from .._base.rounding import keep_numpy_quiet
 from .._base.text import Printed, write_count, write_percent
 from ..data.record import SIGNALS, Record
@@ -126,6 +127,7 @@ class Audit(Printed):
 
 
 @explain_names
+@hold_interrupt()
 @keep_numpy_quiet
 def audit(record: Record, loop: Loop | None = None) -> Audit:
     """Look a record over before any fit: limits, steps, repeats, gaps, spikes, drift, excitation.

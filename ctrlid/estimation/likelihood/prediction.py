@@ -13,6 +13,7 @@ import numpy as np
 from ..._base.arguments import explain_names, is_number, point_at_part
 from ..._base.arrays import Array, freeze_arrays
 from ..._base.errors import CtrlidError, ModelCannotRun
+from ..._base.interruption import hold_interrupt
 from ..._base.rounding import keep_numpy_quiet
 from ..._base.text import Printed
 from ...data.record import Record
@@ -104,6 +105,7 @@ class Prediction(Printed):
 
 
 @explain_names
+@hold_interrupt()
 @keep_numpy_quiet
 def predict(loop: Loop, record: Record, noise_ratio: float | None = None) -> Prediction:
     r"""Predict each output sample of a record from the samples before it.

@@ -12,6 +12,7 @@ from scipy import stats
 
 from ..._base.arguments import check_arguments, explain_names
 from ..._base.errors import CtrlidError, CtrlidWarning
+from ..._base.interruption import hold_interrupt
 from ..._base.periods import have_same_period, write_both_periods
 from ..._base.rounding import keep_numpy_quiet
 from ..._base.signals import require_one_signal
@@ -45,6 +46,7 @@ MISSED = 1e-3
 
 
 @explain_names
+@hold_interrupt()
 @keep_numpy_quiet
 def fit_continuous(
     record: Record | Sequence[Record],

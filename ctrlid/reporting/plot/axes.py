@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.rcsetup import cycler
 from matplotlib.text import Text
 
+from ..._base.arguments import explain_names
 from ..._base.errors import CtrlidError
 from ..._base.text import write_count
 
@@ -51,6 +52,7 @@ def style() -> dict[str, Any]:
     return dict(STYLE)
 
 
+@explain_names
 def figure(
     rows: int = 1, columns: int = 1, size: tuple[float, float] = (7.2, 4.0), sharex: Any = False
 ) -> Any:
@@ -79,6 +81,7 @@ def figure(
     return Picture(new_figure(size).subplots(rows, columns, squeeze=False, sharex=sharex))
 
 
+@explain_names
 def png(drawn: Any, dpi: float = 150) -> bytes:
     """Return a picture as the bytes of a PNG file.
 

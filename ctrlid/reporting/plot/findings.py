@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from matplotlib.ticker import FixedLocator, NullLocator
 
+from ..._base.arguments import explain_names
 from ..._base.arrays import Array
 from ...diagnosis.findings import BinnedErrors
 from ...diagnosis.result import Diagnosis
@@ -34,6 +35,7 @@ FILLS: dict[str, dict[str, Any]] = {
 }
 
 
+@explain_names
 def diagnosis(found: Diagnosis, ax: Any = None) -> Picture:
     """Draw what a diagnosis found: the gap before and after, where it sits, and the ranking.
 

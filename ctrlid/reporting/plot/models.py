@@ -6,6 +6,7 @@ import numpy as np
 from matplotlib.ticker import MultipleLocator
 
 from ..._base import text as _text
+from ..._base.arguments import explain_names
 from ..._base.arrays import Array, to_real_array
 from ..._base.errors import CtrlidError
 from ...estimation.confidence_band import response_band
@@ -16,6 +17,7 @@ from .. import pictures as _pictures
 from .axes import COLOURS, MARKERS, Picture, choose_line_style, finish_axes, require_kind, take_axes
 
 
+@explain_names
 def poles(models: Any, ax: Any = None, *, truth: Any = None) -> Picture:
     """Draw the poles of models against the border of stability.
 
@@ -80,6 +82,7 @@ def poles(models: Any, ax: Any = None, *, truth: Any = None) -> Picture:
     return Picture(axes)
 
 
+@explain_names
 def bode(models: Any, ax: Any = None, *, omega: Any = None, level: float | None = 0.95) -> Picture:
     """Draw the frequency responses of models, magnitude above phase, of fits with their bands.
 
@@ -188,6 +191,7 @@ def _draw_band(
         ax.autoscale(True, axis="x")
 
 
+@explain_names
 def trend(series: FitSeries, ax: Any = None, *, truth: Any = None) -> Picture:
     """Draw the rightmost pole of each record against its mean output, and the line through them.
 

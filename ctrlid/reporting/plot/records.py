@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from ..._base import text as _text
+from ..._base.arguments import explain_names
 from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
 from ...data.record import Record, list_rows
@@ -25,6 +26,7 @@ from .axes import (
 )
 
 
+@explain_names
 def record(record: Record, ax: Any = None, *, extra: Sequence[str] = ()) -> Picture:
     """Draw an experiment: reference and output, the input below, and extra channels on request.
 
@@ -108,6 +110,7 @@ def _find_reference(references: Any, k: int, name: str, outputs: int) -> Any:
     return references[k] if len(references) == outputs else None
 
 
+@explain_names
 def comparison(
     comparison: Comparison, ax: Any = None, *, window: tuple[float, float] | None = None
 ) -> Picture:
@@ -185,6 +188,7 @@ def comparison(
     return Picture(axes)
 
 
+@explain_names
 def residuals(comparison: Comparison, ax: Any = None) -> Picture:
     """Draw the correlations of the one-step errors with their 99 % bands.
 

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from ..._base.arguments import explain_names
 from ..._base.errors import CtrlidError
 from ..._base.text import with_unit
 from ...design.controller_trial import ControllerTrial, ReferenceStep, StepMotion
@@ -13,6 +14,7 @@ from ...loop.loop import Loop
 from .axes import MARKERS, Picture, choose_line_style, figure, finish_axes, require_kind, take_axes
 
 
+@explain_names
 def step(redesigns: Any, ax: Any = None) -> Picture:
     """Draw what redesigns promised against what they achieved on the physics.
 
