@@ -211,7 +211,8 @@ def test_arrays_of_results_are_read_only(loop, record):
     found = cid.diagnose(loop, record, catalogue=(E.ViscousFriction,), progress=False)
     comparison = cid.compare(record, loop)
     results = [
-        cid.predict(loop, record), comparison, *comparison.curves, *comparison.tests,
+        record, cid.fit_loop(loop, record), cid.predict(loop, record), comparison,
+        *comparison.curves, *comparison.tests,
         cid.redesign(open_loop, loop, 2.0, 50.0), cid.fit_loop(loop, record).estimate,
         found.gap, *found.where, cid.response_band(model, [1.0, 2.0]), cid.check_feedback(record),
         *cid.select_order(record, [1, 2], [1], [1]).rows, model.estimate,
@@ -220,7 +221,12 @@ def test_arrays_of_results_are_read_only(loop, record):
     ]  # fmt: skip
     seen = 0
     for result in results:
-        for name in result.__dataclass_fields__:
+        computed = (
+            k
+            for k, v in inspect.getmembers(type(result))
+            if isinstance(v, property) and k[0] != "_"
+        )
+        for name in (*result.__dataclass_fields__, *computed):
             value = getattr(result, name)
             if isinstance(value, np.ndarray):
                 seen += 1

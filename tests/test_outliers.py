@@ -13,6 +13,7 @@ from scipy import linalg
 import ctrlid as cid
 from ctrlid._base import rounding
 from ctrlid.data.outliers import find_outliers, mask_outliers
+from problems import levitation
 
 MASS, DAMPING, STIFFNESS, DT = 1.0, 2.0, 30.0, 0.02
 
@@ -51,9 +52,27 @@ def bench():
     return cid.Loop(plant, None, dt=DT, free=("c", "k"))
 
 
+@pytest.mark.parametrize("share", [0.1, 0.15])
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_many_outliers_are_all_found_where_they_crowd(share, seed):
+    record, hit = strike(spring(seed), share, 400.0, seed)
+    np.testing.assert_array_equal(find_outliers(record), hit)
+
+
+def test_a_fit_that_says_nothing_of_any_parameter_is_refused():
+    loop = levitation()
+    r = cid.random_binary(2000, amplitude=1e-4, hold=40, around=loop.at.output, seed=1)
+    record = cid.simulate(loop, r, sensor_noise=2e-6, seed=2)
+    hit = np.random.default_rng(0).random(len(record)) < 0.2
+    record = replace(record, y=np.where(hit, 400.0, record.y))
+    with pytest.raises(cid.CtrlidError, match="lost the record"):
+        cid.fit_loop(loop, record)
+
+
+@pytest.mark.parametrize("share", [0.02, 0.05])
 @pytest.mark.parametrize("size", [2.0, 400.0, 1e9])
-def test_a_fit_leaves_gross_outliers_out_and_says_so(size):
-    record, hit = strike(spring(1), 0.02, size)
+def test_a_fit_leaves_gross_outliers_out_and_says_so(size, share):
+    record, hit = strike(spring(1), share, size)
     estimate = cid.fit_loop(bench(), record).estimate
     assert np.isfinite(estimate.log_likelihood)
     for name, true in (("c", DAMPING), ("k", STIFFNESS)):

@@ -1,6 +1,8 @@
 """Arrays of real and of complex numbers: what annotations call them, and how values keep them."""
 
-from typing import Any
+import functools
+from collections.abc import Callable
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +11,8 @@ from .errors import CtrlidError
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
+Owner = TypeVar("Owner")
+Result = TypeVar("Result")
 
 
 def to_real_array(values: Any, what: str) -> Array:
@@ -48,6 +52,32 @@ def to_real_array(values: Any, what: str) -> Array:
             raise
         raise CtrlidError(f"{what} must be an array of numbers; {reason}") from reason
     return np.array(array, dtype=float)
+
+
+def read_only(compute: Callable[[Owner], Result]) -> Callable[[Owner], Result]:
+    """Return a property's function whose array is read-only, as those are that a result keeps.
+
+    What is computed anew at each access would take a value and lose it.
+
+    Examples
+    --------
+    >>> class Twice:
+    ...     @property
+    ...     @read_only
+    ...     def both(self):
+    ...         return np.ones(2)
+    >>> Twice().both.flags.writeable
+    False
+    """
+
+    @functools.wraps(compute)
+    def handled(owner: Owner) -> Result:
+        array = compute(owner)
+        if isinstance(array, np.ndarray):
+            array.setflags(write=False)
+        return array
+
+    return handled
 
 
 def freeze_arrays(value: Any) -> None:

@@ -12,6 +12,8 @@ from .record import Record
 
 # The median of so many neighbours does not follow an outlier, nor two side by side.
 NEIGHBOURS = 5
+# The median of so many medians does not follow where outliers crowd.
+WIDER = 11
 # Gaussian noise goes so many standard deviations away once in 10^23 samples.
 FAR = 10.0
 
@@ -51,9 +53,22 @@ def find_outliers(record: Record) -> Any:
 
 
 def _stands_out(signal: Array) -> Any:
-    middle = ndimage.median_filter(signal, NEIGHBOURS, mode="mirror")
+    middle = _find_middles(signal)
     distance = np.abs(signal - middle)
     return distance > max(FAR * robust_deviation(distance), float(np.ptp(middle)))
+
+
+def _find_middles(signal: Array) -> Any:
+    """Return the median of the neighbours of each value.
+
+    Of many outliers, three may stand among five readings here and there. A median that stands out
+    among its own neighbours gives way to theirs.
+    """
+    middle = ndimage.median_filter(signal, NEIGHBOURS, mode="mirror")
+    wider = ndimage.median_filter(middle, WIDER, mode="mirror")
+    off = np.abs(middle - wider)
+    far = off > max(FAR * robust_deviation(off), float(np.ptp(wider)))
+    return np.where(far, wider, middle)
 
 
 def mask_outliers(record: Record) -> tuple[Record, Any]:

@@ -17,6 +17,7 @@ from .._base.arguments import (
     check_needed_fields,
     show_fields,
 )
+from .._base.arrays import read_only
 from .._base.errors import CtrlidError
 from .._base.signals import list_signals, require_one_signal
 from .._base.text import Printed, list_known, write_count, write_percent
@@ -249,6 +250,7 @@ class Record(Printed):
         return replace(self, **fields, names=names, units=units)
 
     @property
+    @read_only
     def t(self) -> Any:
         """Time of each sample [s]."""
         return self.start + self.dt * np.arange(len(self))

@@ -14,7 +14,7 @@ from scipy.stats import t as student_t
 
 from .._base import text as _text
 from .._base.arguments import check_arguments
-from .._base.arrays import Array, ComplexArray
+from .._base.arrays import Array, ComplexArray, read_only
 from .._base.errors import CtrlidError
 from ..physics.conversions import reduce_states, to_transfer_function
 
@@ -204,6 +204,7 @@ class Estimate(_text.Printed):
         return tuple(str(bound) for bound in self.active_bounds)
 
     @property
+    @read_only
     def standard_errors(self) -> Array:
         """Standard errors of the coefficients, valid for white equation error only."""
         return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
@@ -253,11 +254,13 @@ class Estimate(_text.Printed):
         return np.roots(shifted[::-1]).astype(complex)
 
     @property
+    @read_only
     def poles(self) -> ComplexArray:
         """The na roots of A, in z for a sampled model and in s for a continuous one."""
         return self._shifted_poles + (1.0 if self.structure.domain == "z" else 0.0)
 
     @property
+    @read_only
     def poles_s(self) -> ComplexArray:
         """The poles in the s-plane, ``log(z) / dt`` for a sampled model, in rad/s."""
         if self.structure.domain == "s":
@@ -267,6 +270,7 @@ class Estimate(_text.Printed):
         return np.where(_are_at_zero(self.poles), -np.inf, poles)
 
     @property
+    @read_only
     def poles_standard_errors(self) -> Array:
         """Standard errors of ``poles`` by the delta method.
 
@@ -278,6 +282,7 @@ class Estimate(_text.Printed):
         return compute_root_errors(self.poles, self.covariance[:na, :na])
 
     @property
+    @read_only
     def poles_s_standard_errors(self) -> Array:
         """Standard errors of ``poles_s`` by the delta method, in rad/s."""
         if self.structure.domain == "s":

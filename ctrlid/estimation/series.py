@@ -13,7 +13,7 @@ from scipy.stats import chi2
 
 from .._base import text as _text
 from .._base.arguments import check_arguments, explain_names, is_iterable
-from .._base.arrays import Array, freeze_arrays
+from .._base.arrays import Array, freeze_arrays, read_only
 from .._base.errors import CtrlidError
 from .._base.jobs import check_jobs, share_out
 from ..data.record import Record
@@ -74,11 +74,13 @@ class FitSeries(_text.Printed):
         freeze_arrays(self)
 
     @property
+    @read_only
     def rates(self) -> Array:
         """Real part of the rightmost pole of each model [rad/s]: that of an unstable plant."""
         return np.array([self._list_poles(k)[0].real for k in range(len(self.models))])
 
     @property
+    @read_only
     def rate_errors(self) -> Array:
         """Standard errors of `rates` [rad/s]."""
         return np.array([self._list_errors(k)[0] for k in range(len(self.models))])

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from .._base.arrays import Array, freeze_arrays
+from .._base.arrays import Array, freeze_arrays, read_only
 from .._base.errors import CtrlidError
 from .._base.text import Printed, with_error, write_count, write_list
 from ..data.record import Record
@@ -73,6 +73,7 @@ class SamplingRow(Printed):
         return not len(self.poles)
 
     @property
+    @read_only
     def pole_times_period(self) -> Array:
         """The poles' absolute values times the sampling period."""
         return np.asarray(np.abs(self.poles) * self.period, dtype=float)

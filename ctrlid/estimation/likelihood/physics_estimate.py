@@ -8,7 +8,7 @@ import numpy as np
 from scipy.stats import norm
 
 from ..._base.arguments import check_arguments
-from ..._base.arrays import Array, freeze_arrays
+from ..._base.arrays import Array, freeze_arrays, read_only
 from ..._base.criterion import bayesian_penalty
 from ..._base.errors import CtrlidError
 from ..._base.text import Printed, write_number, write_quantity
@@ -72,6 +72,7 @@ class LoopEstimate(Printed):
         freeze_arrays(self)
 
     @property
+    @read_only
     def standard_errors(self) -> Array:
         """Standard errors of the parameters."""
         return np.asarray(np.sqrt(np.diag(self.covariance)), dtype=float)
@@ -167,11 +168,13 @@ class LoopFit(Printed):
         return linearize_at_rest(self.loop)
 
     @property
+    @read_only
     def poles(self) -> Any:
         """The poles of `model`, in rad/s (in z for a plant in discrete time)."""
         return np.roots(_find_denominator(self.model)).astype(complex)
 
     @property
+    @read_only
     def poles_standard_errors(self) -> Array:
         """The standard errors of `poles`, by the delta method.
 

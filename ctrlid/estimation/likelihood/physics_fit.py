@@ -138,13 +138,13 @@ def fit_loop(
     fit = refit_quiet_force(refit_noise_size(maximize(begin_fit(problem))))
     if coloured or coloured is None:
         fit = choose_noise(fit, always=bool(coloured))
-    if not math.isfinite(fit.value):
+    fitted = summarize_fit(loop, fit) if math.isfinite(fit.value) else None
+    if fitted is None or _says_nothing(fit, fitted):
         raise ModelCannotRun(
-            f"the likelihood of {fit.plant.e.name} on this record is not finite: the model has "
-            "lost the record, and no parameter can be told. Check units, signs and the operating "
+            f"the likelihood of {fit.plant.e.name} on this record is not finite, or says nothing "
+            "of any parameter: the model has lost the record. Check units, signs and the operating "
             "point, and exclude with valid= what the sensor cannot have seen"
         )
-    fitted = summarize_fit(loop, fit)
     left_out = [describe_outliers(one, found)
                 for one, (_, found) in zip(given, masked, strict=True) if found.any()]  # fmt: skip
     innovations = [row for one in fit.standardized for row in np.atleast_2d(one.T)]
@@ -160,6 +160,13 @@ def fit_loop(
         *_note_unknown_controller(loop, given),
     )
     return replace(fitted, estimate=replace(fitted.estimate, notes=notes))
+
+
+def _says_nothing(fit: Fit, fitted: LoopFit) -> bool:
+    """Whether no parameter has any influence, though none is at its limit."""
+    theta, problem = fit.theta, fit.problem
+    inside = np.all((theta > problem.lower) & (theta < problem.upper))
+    return bool(len(theta) and inside and not np.any(fitted.estimate.standard_errors))
 
 
 def _refuse_rest(records: Sequence[Record]) -> None:
