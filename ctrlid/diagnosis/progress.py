@@ -14,6 +14,8 @@ from .thresholds import THRESHOLD
 # The bar is drawn anew after so many seconds, also while nothing is finished.
 REFRESH = 0.5
 BAR = "{desc} |{bar:20}| {n_fmt}/{total_fmt}{postfix}"
+# A step without candidates has nothing to count.
+PLAIN = "{desc}{postfix}"
 
 
 class Progress:
@@ -52,14 +54,14 @@ class Progress:
         if head != self.round:
             if self.lines:
                 self._write_line(head, now)
-            if head.startswith("round "):
-                self.leader = None
+            # What led in a round leads nothing after it.
+            self.leader = None
             self.round, self.begun = head, now
         self.step, self.ranked, self.done, self.total = step, ranked, 0, 0
         self._draw(now)
 
     def _write_line(self, head: str, now: float) -> None:
-        """Write what the round before came to, and how long another may take."""
+        """Write what is begun, how long the round before took, and what led in it."""
         words = f"ctrlid diagnose: {now - self.start:.0f} s, {head}"
         if self.round.startswith("round "):
             last = f"{self.round} took {now - self.begun:.0f} s"
@@ -95,6 +97,7 @@ class Progress:
         if self.bar.disable:
             return
         self.bar.n, self.bar.total = self.done, self.total
+        self.bar.bar_format = BAR if self.total else PLAIN
         self.bar.set_description_str(f"diagnose, {now - self.start:.0f} s: {self.step}",
                                      refresh=False)  # fmt: skip
         more = [self.describe_leader()] if self.leader is not None else []
@@ -107,8 +110,9 @@ class Progress:
     def describe_leader(self) -> str:
         """Say what leads, and by how much."""
         assert self.leader is not None
-        evidence = write_number(self.leader.gain, 3)
-        return f"{self.leader.name} leads with an evidence of {evidence}"
+        gain = self.leader.gain
+        evidence = write_number(gain, 3) if gain < THRESHOLD.certain else f"{gain:.0f}"
+        return f"{self.leader.key} leads with an evidence of {evidence}"
 
     def describe_place(self) -> str:
         """Say where the search is."""
