@@ -48,6 +48,8 @@ UNITS = (
 )
 # Factors about a gain that a regression gave, between which the best one is refined.
 FACTORS = (0.8, 1.0, 1.25)
+# Powers of two times a tracking time that are looked at before the best one is refined.
+TRACKED = range(-6, 7)
 
 
 @dataclass(frozen=True)
@@ -238,6 +240,18 @@ def _list_options(loop: Loop, pid: PID, record: Record) -> Iterator[LawChange]:
             kind = "limit" if "anti_windup" in change else "filter"
             other = exchange_controller(loop, replace(pid, **change))
             yield LawChange(kind, _write_options(change), other, record)
+    if "back-calculation" in choices["anti_windup"]:
+
+        def make_tracked(time: float) -> tuple[Loop, Record]:
+            other = replace(pid, anti_windup="back-calculation", tracking_time=time)
+            return exchange_controller(loop, other), record
+
+        stated_leaves = _measure_remainder(loop, record)
+        times = [tracking * 2.0**k for k in TRACKED]
+        time = _search_value(make_tracked, times, stated_leaves)
+        if time is not None:
+            words = f"with anti_windup='back-calculation' and tracking_time={time:.4g}"
+            yield LawChange("limit", words, *make_tracked(time), exact=True)
 
 
 def _write_options(change: dict[str, Any]) -> str:

@@ -127,14 +127,19 @@ def check_controller(loop: Loop, record: Record) -> list[Fact]:
     shift = _find_shift(loop, part, left)
     if shift is not None:
         words, moved, remains = shift
+        e, least = _compute_remainder(loop, moved)
+        exact = is_rounding(e, least, moved.u[moved.valid], resolution)
+        # A shift that leaves something may stand for another law, which leaves nothing.
+        wrong = None if exact else _find_wrong_law(loop, part, left, True, resolution, sample)
+        if wrong is not None:
+            return [*facts, wrong]
         facts.append(("delay", f"{words}: the controller of the loop explains "
                       f"{write_percent(1 - left, 4)} of the variance of u as logged, and "
                       f"{write_percent(1 - remains, 4)} with this shift removed. Shift the channel "
                       "back before fitting.", left, True))  # fmt: skip
-        part = moved
-        e, left = _compute_remainder(loop, part)
-        if is_rounding(e, left, part.u[part.valid], resolution):
+        if exact:
             return facts
+        part, left = moved, least
     stated = _explain_remainder(loop, e, left, part, resolution)
     # Another form of a derivative adds a function of r, and only its exact replay tells it.
     exact_only = stated[0] == "injected" and not resolution
