@@ -27,7 +27,13 @@ from ctrlid.diagnosis.fitted_model import (
     with_linearization,
 )
 from ctrlid.diagnosis.gap import Window, root_mean_square, share_samples
-from ctrlid.diagnosis.growth import _is_stand_in, exchange_worst_effect, search_effects
+from ctrlid.diagnosis.growth import (
+    Reached,
+    _end_search,
+    _is_stand_in,
+    exchange_worst_effect,
+    search_effects,
+)
 from ctrlid.diagnosis.hindsight import find_better_choice
 from ctrlid.diagnosis.noise_tests import NoiseTests, _compute_force_deviates, run_noise_tests
 from ctrlid.diagnosis.recalibration import fit_base_model
@@ -625,6 +631,22 @@ def test_what_gains_far_less_than_is_missing_only_stands_in_for_it():
     assert 0 < little.gain < 50
     assert _is_stand_in(little, nearly, beside=True)
     assert not _is_stand_in(little, nearly, beside=False)
+
+
+def test_a_search_that_is_stopped_just_after_it_went_back_keeps_the_best_that_it_had():
+    loop = levitation()
+    record = record_of(loop, E.ViscousFriction(0.3), 4e-4, 1e-6, 9425, 3000)
+    base = fit_base_model(loop, [record], loop.free)
+    (friction,) = E.ViscousFriction.candidates(loop, record)
+    best = refit_candidate(base, screen_candidate(base, friction))
+    assert best.net_gain > 50
+    reached = Reached(base, [Round(base, (best,), best)], base)
+    reached.keep(base, best)
+    reached.steps[-1], reached.model = Round(base, (best,), None), base
+    stopped = _end_search(reached)
+    assert [f.trial for f in stopped.found] == [best]
+    assert stopped.final is best.model
+    assert not stopped.finished
 
 
 def test_where_nothing_follows_equals_of_the_best_are_asked():

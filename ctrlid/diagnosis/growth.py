@@ -1,7 +1,7 @@
 """Step 7: the search adds effects, drops superfluous ones and looks back, round by round."""
 
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -93,7 +93,8 @@ def search_effects(
     Search
         The rounds and the final model; where the budget was spent before, those that were reached.
     """
-    reached = Reached(base, list(first), base)
+    before = [(step.base, step.best) for step in first[:-1] if step.best is not None]
+    reached = Reached(base, list(first), base, before)
     try:
         return _grow_model(base, catalogue, work, tell, is_larger, first, reached)
     except Stopped:
@@ -102,11 +103,27 @@ def search_effects(
 
 @dataclass(eq=False)
 class Reached:
-    """How far a search has come: what is left of it when it is stopped."""
+    """How far a search has come: what is left of it when it is stopped.
+
+    `taken` holds each effect as it was taken, with the model that it was added to; `likeliest` is
+    the most probable model so far, for a search may be stopped just after it went back.
+    """
 
     base: Model
     steps: list[Round]
     model: Model
+    taken: list[tuple[Model, Trial]] = field(default_factory=list)
+    likeliest: Model | None = None
+
+    def keep(self, before: Model, best: Trial) -> None:
+        """Keep an effect as it is taken."""
+        self.taken.append((before, best))
+        self.note(best.model)
+
+    def note(self, model: Model) -> None:
+        """Keep a model if it is the most probable one so far."""
+        if self.likeliest is None or compute_criterion(model) > compute_criterion(self.likeliest):
+            self.likeliest = model
 
 
 def _grow_model(
@@ -123,11 +140,13 @@ def _grow_model(
     while not steps or steps[-1].best is not None:
         if steps and steps[-1].best is not None:
             tell(f"round {len(steps)}: {steps[-1].best.key} with all else")
+            reached.keep(steps[-1].base, steps[-1].best)
             reached.model = steps[-1].best.model
             model = refit_noise(order_last_effect(steps[-1].best.model, given))
             model = drop_unseen_values(model, given)
             model = with_linearization(drop_superfluous(model, given))
             likeliest = max(likeliest, model, key=compute_criterion)
+            reached.note(model)
         if (
             len(model.loop.effects) - given >= THRESHOLD.many_effects
             or len(steps) >= THRESHOLD.many_effects + THRESHOLD.more_rounds
@@ -172,11 +191,11 @@ def _grow_model(
 
 def _end_search(reached: Reached) -> Search:
     """Return a search that was stopped, with each effect as it stood in the round that took it."""
-    base, model, found = reached.base, reached.model, list[Weighed]()
+    base, found = reached.base, list[Weighed]()
+    model = max(reached.model, reached.likeliest or reached.model, key=compute_criterion)
     for position in range(len(base.loop.effects), len(model.loop.effects)):
         effect = model.loop.effects[position]
-        taken = [(s.base, s.best) for s in reached.steps
-                 if s.best is not None and is_same_kind(s.best.effect, effect)]  # fmt: skip
+        taken = [pair for pair in reached.taken if is_same_kind(pair[1].effect, effect)]
         found += [Weighed(best, (), before, position) for before, best in taken[-1:]]
     found.sort(key=lambda f: -f.trial.gain)
     before, after = run_noise_tests(base.fit), run_noise_tests(model.fit)

@@ -135,7 +135,7 @@ class Progress:
         self.ended = self.describe_place()
         if self.budget is not None and self.budget.left_samples < 0:
             size = write_number(THRESHOLD.search_samples / 1e6, 3)
-            self.spent = f"{size} million filtered samples, as many as it has without seconds="
+            self.spent = f"the work of {size} million filtered samples that it has without seconds="
         else:
             self.spent = f"{write_number(time.monotonic() - self.start, 2)} s"
 

@@ -27,6 +27,8 @@ from .tails import GAUSSIAN, JointTails, Tails
 INITIAL_VARIANCE_RATIO = 4.0
 # So many Newton steps invert the curve of a sensor.
 NEWTON = 6
+# What goes with a pass, such as a model that is built for it, takes as long as so many samples.
+BESIDE_A_PASS = 7000
 # A trajectory converges in two or three passes; after so many it is taken as it is.
 PASSES = 12
 # A trajectory that moves by less than this share of its standard deviation has converged.
@@ -210,7 +212,7 @@ def _arrange_pass(data: FilterData, lin: Linearized, noise: Noise, p: int) -> Pa
     if not white:
         lin, force = append_sensor_noise(lin, force, noise)
     size, states = lin.step.shape
-    check_budget(size)
+    check_budget(size + BESIDE_A_PASS)
     return PassArguments(
         lin.step, lin.a, lin.b, lin.du, np.ascontiguousarray(lin.dp[:, :, :p]), lin.output,
         lin.c, np.ascontiguousarray(lin.hp[:, :p]), lin.trajectory.predicted,
@@ -232,7 +234,7 @@ def _arrange_updates(
     restart[:, 0] = data.restart
     unsure = np.zeros((size, q))
     unsure[:, -1] = lin.input_variance
-    check_budget(size * q)
+    check_budget(size * q + BESIDE_A_PASS)
     return PassArguments(
         each.step, each.a, each.b, each.du, np.ascontiguousarray(each.dp[:, :, :p]),
         (lin.output / scale).ravel(), (lin.c / scale[:, None]).reshape(size * q, states),
