@@ -479,6 +479,12 @@ def _find_doubled_unit(stamps: Any) -> float | None:
     return drop_roundoff(unit, finest) if np.any(longer > 1) and whole else None
 
 
+def _shorten_period(dt: float, uncertainty: float) -> float:
+    """Return the period with the fewest digits within an uncertainty of another."""
+    short = (float(f"{dt:.{digits}g}") for digits in range(1, 16))
+    return next((p for p in short if abs(p - dt) <= uncertainty), dt)
+
+
 def estimate_period(stamps: Any) -> float:
     """Return the mean period of time stamps, with no digits that only round-off gave it."""
     mean = float(stamps[-1] - stamps[0]) / (len(stamps) - 1)
@@ -489,7 +495,7 @@ def _make_uniform(stamps: Any, dt: float | None, gaps: str, path: Path) -> tuple
     """Return the period of time stamps and, for each uniform sample, its row."""
     if len(stamps) < 2 or not np.isfinite(stamps).all():
         raise CtrlidError(f"the time column of {path} needs at least 2 values, all finite")
-    rounding = _find_resolution(stamps)
+    rounding, period_is_free = _find_resolution(stamps), dt is None
     even = _find_even_period(stamps, rounding, dt)
     if even is not None and dt is None and (unit := _find_doubled_unit(stamps)) is not None:
         # A slow clock in whole units and a fast one that lost rows write the same stamps.
@@ -547,10 +553,14 @@ def _make_uniform(stamps: Any, dt: float | None, gaps: str, path: Path) -> tuple
         )
     jitter = float(np.max(np.abs(steps - (missing + 1) * dt))) / dt
     if jitter > JITTER + rounding / dt:
+        if even is None and period_is_free:
+            # No mean of stamps that jitter is known better than that.
+            dt = _shorten_period(dt, 2 * jitter * dt / (len(stamps) - 1))
         warnings.warn(
             f"the times of {path} jitter by up to {write_percent(jitter)} of the period "
-            f"{dt:.4g} s; they are taken as uniform. If the samples really were taken "
-            "unevenly, resample them first",
+            f"{dt:.10g} s; they are taken as uniform. Give dt= if the clock has another period. If "
+            "the samples really were taken unevenly, resample them at even times first, as with "
+            "numpy.interp",
             CtrlidWarning, stacklevel=4,
         )  # fmt: skip
     return dt, np.repeat(np.arange(len(stamps)), np.append(missing, 0) + 1)

@@ -305,10 +305,16 @@ def redesign(
         G = G.linearize(states=True) if isinstance(G, Loop) else linearize_at_rest(G.loop, True)
     if not isinstance(G, ct.TransferFunction | ct.StateSpace):
         raise CtrlidError("redesign needs a linear model (a TransferFunction, as the fits return); "
-                          f"given {type(G).__name__}")  # fmt: skip
+                          f"given {type(G).__name__}{point_at_part(G, Loop)}")  # fmt: skip
     if not isinstance(loop, Loop):
         raise CtrlidError("redesign needs a Loop, on which the controller is tried; given "
                           f"{type(loop).__name__}{point_at_part(loop, Loop)}")  # fmt: skip
+    if isinstance(design, ct.InputOutputSystem):
+        # A transfer function can be called too, with a frequency.
+        raise CtrlidError(
+            "design= is a function from the model to a controller. To try a controller that there "
+            f"is already, give design=lambda P: C; given {type(design).__name__}"
+        )
     if design is not None:
         if crossover is not None or phase_margin is not None:
             raise CtrlidError("redesign takes a crossover and a phase margin, or design= with a "

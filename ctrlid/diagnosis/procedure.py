@@ -147,7 +147,7 @@ def diagnose(
         After so many seconds the search ends with its best answer so far, and the verdict says that
         it was not finished [s]. The model is recalibrated and the gap measured in any case. By
         default the search ends at the same place on every machine: after so much work that it
-        takes one to two minutes on two processors, and mostly long before.
+        takes some minutes on two processors, and mostly long before.
     progress : bool, optional
         Whether to show on stderr what is done: in a terminal as a bar, elsewhere a line a round.
 

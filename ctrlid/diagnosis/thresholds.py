@@ -294,8 +294,8 @@ class Thresholds:
         unit="of what an autoregression of the innovations gains",
     )  # fmt: skip
     search_samples: float = declare_number(
-        1.5e8, cost="work after which a search without seconds= ends unfinished, about a minute "
-        "or two", unit="filtered samples, and 7000 more for each pass",
+        3e8, cost="work after which a search without seconds= ends unfinished: some minutes",
+        unit="filtered samples, and 2000 more for each pass",
     )  # fmt: skip
     surely_needed: float = declare_number(
         100.0, cost="an effect so significant is not asked whether it is needed",

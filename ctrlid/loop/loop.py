@@ -3,6 +3,7 @@
 import functools
 import math
 import pickle
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Self
@@ -19,7 +20,7 @@ from .._base.arguments import (
     show_fields,
 )
 from .._base.arrays import to_real_array
-from .._base.errors import CtrlidError, EffectDoesNotApply
+from .._base.errors import CtrlidError, CtrlidWarning, EffectDoesNotApply
 from .._base.periods import have_same_period, write_both_periods
 from .._base.pickling import pack_by_value
 from .._base.text import list_known, write_count, write_percent
@@ -127,7 +128,8 @@ class Loop:
 
     def __post_init__(self) -> None:
         if not (is_number(self.dt) and 0 < self.dt < math.inf):
-            raise CtrlidError(f"a loop needs its sampling period dt > 0 s; given dt={self.dt!r}")
+            raise CtrlidError("a loop needs its sampling period dt > 0 s, as in Loop(plant, "
+                              f"controller, dt=0.001); given dt={self.dt!r}")  # fmt: skip
         equations, inputs = self._trace_plant()
         # A loop is a value: its equations are those of the plant at the time it was made.
         object.__setattr__(self, "_traced", equations)
@@ -635,6 +637,18 @@ def exchange_limits(loop: Loop, lower: float = -math.inf, upper: float = math.in
     return loop._replace_fields(input_limits=(lower, upper))
 
 
+def _question_belief(name: str, share: float, value: float) -> None:
+    """Warn of a belief that seems to be a value of the parameter, or a number of per cent."""
+    is_value = share < 1e-3 and 0.5 < share / abs(value) < 2 if value else False
+    if is_value or 1 < share < math.inf:
+        warnings.warn(
+            f"free={{{name!r}: {share:g}}} says that {name} is known to {write_percent(share)} of "
+            f"{value:g}, as a standard deviation. It is no value of {name} and no number of per "
+            f"cent: 10 % is {{{name!r}: 0.1}}, and inf that nothing is known",
+            CtrlidWarning, stacklevel=4,
+        )  # fmt: skip
+
+
 def _check_beliefs(free: Mapping[str, Any], parameters: Mapping[str, float]) -> None:
     """Refuse what does not say how well a parameter is known."""
     for name, share in free.items():
@@ -648,6 +662,7 @@ def _check_beliefs(free: Mapping[str, Any], parameters: Mapping[str, float]) -> 
             problem = (f"{name} is zero in the loop, of which no share can be taken: give inf for "
                        "it, or the value that is believed")  # fmt: skip
         else:
+            _question_belief(name, share, parameters[name])
             continue
         raise CtrlidError(
             "free= as a mapping says how well each parameter is known, by the standard deviation "

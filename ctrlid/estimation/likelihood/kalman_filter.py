@@ -28,7 +28,7 @@ INITIAL_VARIANCE_RATIO = 4.0
 # So many Newton steps invert the curve of a sensor.
 NEWTON = 6
 # What goes with a pass, such as a model that is built for it, takes as long as so many samples.
-BESIDE_A_PASS = 7000
+BESIDE_A_PASS = 2000
 # A trajectory converges in two or three passes; after so many it is taken as it is.
 PASSES = 12
 # A trajectory that moves by less than this share of its standard deviation has converged.

@@ -91,7 +91,9 @@ def read_plant(text: str, values: dict[str, float]) -> Any:
                           "system, a ctrlid.Loop, or a function that returns one")  # fmt: skip
     known = inspect.signature(made).parameters
     _require_known(text, list(known), list(values))
-    lacking = [k for k, p in known.items() if p.default is p.empty and k not in values]
+    rest = (inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL)
+    needed = {k for k, p in known.items() if p.default is p.empty and p.kind not in rest}
+    lacking = [k for k in known if k in needed and k not in values]
     if len(known) in (3, 4) and list(known)[:3] == ["t", "x", "u"]:
         raise CtrlidError(f"--model {text} is a function of t, x and u, the update function of a "
                           f"system: wrap it, system = ct.nlsys({made.__name__}, output_function, "
