@@ -1,5 +1,6 @@
 """What a diagnosis tells while it works: a bar in a terminal, a line a round elsewhere."""
 
+import math
 import sys
 import time
 from typing import Any
@@ -133,7 +134,10 @@ class Progress:
         if self.ended:
             return
         self.ended = self.describe_place()
-        if self.budget is not None and self.budget.left_samples < 0:
+        budget = self.budget
+        # A process of its own that was stopped by its work says no more of what it did.
+        timed = budget is None or math.isfinite(budget.seconds) or budget.asked
+        if budget is not None and (budget.left_samples < 0 or not timed):
             size = write_number(THRESHOLD.search_samples / 1e6, 3)
             self.spent = f"the work of {size} million filtered samples that it has without seconds="
         else:
