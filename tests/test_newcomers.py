@@ -72,3 +72,38 @@ def test_one_letter_is_near_no_name():
 def test_a_loop_without_its_period_says_where_it_stands():
     with pytest.raises(CtrlidError, match=r"Loop\(plant, controller, dt=0.001\)"):
         cid.Loop(cid.plants.servo(m=1, c=1, k=1), 1.0)
+
+
+def test_an_observer_that_began_in_another_state_adds_no_dither():
+    """python-control's estimator begins with a covariance of its own, which dies down."""
+    plant = cid.plants.cart_pole(M=0.5, m=0.2, length=0.3, c=0.1)
+    at, dt = cid.operating_point(plant, output=(0, 0)), 0.005
+    linear = cid.linearize(plant, at, states=True)
+    P = ct.ss(ct.sample_system(linear, dt), inputs=["F"], outputs=["x", "theta"])
+    K = ct.dlqr(P, np.diag([10, 10, 1, 1]), np.eye(1))[0]
+    observer = ct.create_estimator_iosystem(P, np.eye(1), 1e-4 * np.eye(2))
+    feedback, _ = ct.create_statefbk_iosystem(P, K, estimator=observer)
+    held = [f"xd[{k}]" for k in range(4)] + ["ud[0]"]
+    C = ct.interconnect([observer, feedback], inputs=["y[0]", "y[1]", *held], outputs="F")
+    rng = np.random.default_rng(0)
+    r = np.repeat(rng.choice([-0.1, 0.1], 8), 200)
+    x, state = np.array([0, 0.02, 0, 0.0]), np.zeros(C.nstates)
+    us, ys = [], []
+    for k, reference in enumerate(r):
+        y = P.C @ x + 5e-4 * rng.standard_normal(2)
+        seen = np.r_[y, reference, 0, 0, 0, 0]
+        u = np.ravel(C.output(k * dt, state, seen))
+        state = np.ravel(C.dynamics(k * dt, state, seen))
+        us.append(u[0])
+        ys.append(y)
+        x = P.A @ x + P.B @ u
+    names = {"u": "F", "y": ("x", "theta"), "r": "xd[0]"}
+    record = cid.Record(u=us, y=np.array(ys).T, r=r, dt=dt, names=names)
+    told = str(cid.audit(record, cid.Loop(plant, C, dt=dt, at=at)))
+    assert "but for the first" in told
+    assert "began in another state" in told
+    assert "dither" not in told
+    struck = np.array(us) + 0.1 * rng.standard_normal(len(us))
+    told = str(cid.audit(cid.Record(u=struck, y=np.array(ys).T, r=r, dt=dt, names=names),
+                         cid.Loop(plant, C, dt=dt, at=at)))  # fmt: skip
+    assert "dither" in told

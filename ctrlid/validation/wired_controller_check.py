@@ -13,6 +13,11 @@ from ..loop.wiring import knows_references, match_signals
 from .controller_changes import FEWEST
 from .controller_check import MOST, Fact, is_independent, is_rounding, pick_rejection
 
+# What differs in this share of a record at its beginning, and hardly after it, is a start from
+# another state.
+BEGINNING = 0.2
+DIED_DOWN = 1e-2
+
 
 def check_wired_controller(loop: Loop, record: Record) -> list[Fact]:
     """Compare each logged input with what a digital controller of several signals computes.
@@ -61,6 +66,14 @@ def find_wired_rejection(loop: Loop, record: Record) -> str:
     return pick_rejection(check_wired_controller(loop, record))
 
 
+def _find_end_of_start(e: Any) -> int | None:
+    """Return after how many samples a remainder has died down; None if it does not."""
+    first = int(BEGINNING * len(e))
+    if np.sum(e[first:] ** 2) > DIED_DOWN * np.sum(e**2):
+        return None
+    return int(np.flatnonzero(np.abs(e) > 0.01 * np.max(np.abs(e)))[-1]) + 1
+
+
 def _explain_row(loop: Loop, name: str, e: Any, u: Any, record: Record, use: Any) -> Fact | None:
     """Say what the part of one of several inputs is that does not come from the controller.
 
@@ -74,6 +87,12 @@ def _explain_row(loop: Loop, name: str, e: Any, u: Any, record: Record, use: Any
         return ("bias", f"{name} is the output of the controller of the loop plus a constant of "
                 f"{float(np.mean(e[use])):.4g}. Correct the bias of the controller or the input of "
                 "the operating point.", share, True)  # fmt: skip
+    lasts = _find_end_of_start(np.where(use, e, 0.0))
+    if lasts is not None:
+        return ("start", f"{name} is what the controller of the loop computes, but for the first "
+                f"{lasts * record.dt:.3g} s (RMS {rms} over the record): the controller of the rig "
+                "began in another state than that of the loop. Leave these samples out with valid= "
+                "where they matter.", share, False)  # fmt: skip
     inputs = loop.equations().inputs
     lower, upper = (np.broadcast_to(v, len(inputs)) for v in loop.input_limits)
     k = inputs.index(name)
