@@ -107,3 +107,43 @@ def test_an_observer_that_began_in_another_state_adds_no_dither():
     told = str(cid.audit(cid.Record(u=struck, y=np.array(ys).T, r=r, dt=dt, names=names),
                          cid.Loop(plant, C, dt=dt, at=at)))  # fmt: skip
     assert "dither" in told
+
+
+def test_an_audit_says_where_r_and_y_seem_exchanged():
+    loop = levitation()
+    r = cid.random_binary(1500, amplitude=1e-4, hold=40, around=loop.at.output, seed=1)
+    record = cid.simulate(loop, r, sensor_noise=2e-6, seed=2)
+    exchanged = cid.Record(r=record.y, u=record.u, y=record.r, dt=record.dt)
+    assert "with r and y exchanged" in str(cid.audit(exchanged, loop))
+    flipped = cid.Record(r=record.r, u=2 * loop.at.input - record.u, y=record.y, dt=record.dt)
+    told = str(cid.audit(flipped, loop))
+    assert "opposite sign" in told
+    assert "exchanged" not in told
+
+
+PIDS = {
+    "no windup": {"anti_windup": "back-calculation"},
+    "of a time of its own": {"anti_windup": "back-calculation", "tracking_time": 0.05},
+}
+
+
+@pytest.mark.parametrize("hold", [30, 150])
+@pytest.mark.parametrize("real", PIDS.values(), ids=PIDS)
+def test_an_integral_that_is_pulled_back_is_no_delay(real, hold):
+    limits = {"kp": 20.0, "ki": 80.0, "lower": -2.0, "upper": 2.0}
+    loop = servo(cid.PID(**limits, **real), dt=0.01)
+    r = cid.random_binary(1500, amplitude=0.1, hold=hold, seed=2)
+    record = cid.simulate(loop, r, sensor_noise=1e-4, seed=1)
+    told = str(cid.audit(record, servo(cid.PID(**limits, anti_windup="clamp"), dt=0.01)))
+    assert "back-calculation" in told
+    assert "DELAY" not in told
+    if "tracking_time" in real:
+        assert "tracking_time=0.05" in told
+
+
+def test_an_audit_of_a_pid_with_a_windup_of_its_own_does_not_die_of_a_gain_of_zero():
+    pid = cid.PID(kp=20.0, ki=80.0, kd=0.3, anti_windup="back-calculation")
+    r = cid.random_binary(1000, amplitude=0.1, hold=30, seed=2)
+    record = cid.simulate(servo(pid, dt=0.01), r, sensor_noise=1e-4, seed=1)
+    stated = cid.PID(kp=30.0, ki=80.0, anti_windup="back-calculation")
+    assert "controller" in str(cid.audit(record, servo(stated, dt=0.01)))

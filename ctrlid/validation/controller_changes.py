@@ -115,8 +115,17 @@ def _list_gains(
     if factor < 0:
         words = ("has the opposite sign" if abs(factor + 1) < 1e-3
                  else f"has the opposite sign and {-factor:.4g} times the size")  # fmt: skip
+        if abs(factor + 1) < 1e-3 and _seem_exchanged(record):
+            words = "with r and y exchanged (y stays at one value between steps, and r is noisy)"
     words += _name_factor(abs(factor))
     yield LawChange("sign" if factor < 0 else "gain", words, scaled, record)
+
+
+def _seem_exchanged(record: Record) -> bool:
+    """Whether y stays where it is from sample to sample as a reference does, and r moves."""
+    assert record.r is not None
+    still = [float(np.mean(np.diff(signal[record.valid]) == 0)) for signal in (record.r, record.y)]
+    return still[0] < 0.1 and still[1] > 0.5
 
 
 def _name_factor(factor: float) -> str:
