@@ -225,16 +225,29 @@ def test_nobody_waits_for_the_rest_of_interrupted_work():
     assert len(done) < 500
 
 
+WORK = {
+    "diagnose": lambda loop, record: cid.diagnose(
+        loop, record, catalogue=(E.CoulombFriction,), progress=False
+    ),
+    "simulate": lambda loop, record: cid.simulate(loop, record.r),
+    "audit": lambda loop, record: cid.audit(record, loop),
+    "predict": lambda loop, record: cid.predict(loop, record),
+    "linearize": lambda loop, record: cid.linearize(loop.plant, loop.at),
+}
+
+
 @pytest.mark.usefixtures("hears_interrupts")
 @pytest.mark.skipif(os.name != "posix", reason="signals of one process to itself")
-def test_ctrl_c_raises_keyboard_interrupt_and_nothing_else(record):
+@pytest.mark.parametrize("name", WORK)
+def test_ctrl_c_raises_keyboard_interrupt_and_nothing_else(record, name):
     loop = drive()
 
     def work_until_interrupted(seconds):
         alarm = threading.Timer(seconds, os.kill, (os.getpid(), signal.SIGINT))
         alarm.start()
-        for _ in range(100):
-            cid.diagnose(loop, record, catalogue=(E.CoulombFriction,), progress=False)
+        end = time.monotonic() + 20
+        while time.monotonic() < end:
+            WORK[name](loop, record)
         alarm.cancel()
 
     before = signal.getsignal(signal.SIGINT)
