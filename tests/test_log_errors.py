@@ -82,3 +82,10 @@ def test_a_right_log_is_not_blamed(loop, friction):
     found = cid.diagnose(loop, cid.Record(r=r, u=u, y=y, dt=DT), catalogue=small, progress=False)
     assert "LOG" not in found.sentence
     assert [f.name for f in found.findings] == (["CoulombFriction"] if friction else [])
+
+
+def test_who_has_no_time_is_told_of_the_log_all_the_same(loop):
+    r, u, y = FAULTS["degrees"][0](*simulate(seed=2))
+    found = cid.diagnose(loop, cid.Record(r=r, u=u, y=y, dt=DT), seconds=0.2, progress=False)
+    assert found.sentence.startswith("THE LOG LOOKS WRONG"), found.sentence
+    assert (found.verdict, found.findings, found.finished) == ("unknown", (), True)

@@ -18,7 +18,7 @@ from ..estimation.likelihood.tails import JointTails, Tails
 from ..loop.loop import Loop
 from .candidates import Trial, is_same_kind
 from .experiment import find_experiment
-from .findings import Calibrated, Candidate, Finding, SensorNoise
+from .findings import COMPLETE, Calibrated, Candidate, Finding, SensorNoise
 from .gap_summary import GapSummary
 from .grounds import Case, find_ground
 from .growth import Search
@@ -106,11 +106,22 @@ def assemble_answer(
         verdict, findings, gap, disturbance, found.after, where, None if left else objection,
         len({type(c.effect) for c in ranking}), grounds, noise,
     )  # fmt: skip
+    if verdict not in COMPLETE and _lacks_forces(loop):
+        sentence += (
+            " The loop does not say which input works on which velocity, so that no friction of a "
+            "mechanism can be named rightly: give forces=, and diagnose again."
+        )
     return Diagnosis(
         verdict, sentence, findings, final, gap, where, ranking, disturbance,
         calibrated, _find_sensitivity(found), tests, remarks, notes, noise=noise,
         stand_ins=stand_ins,
     )  # fmt: skip
+
+
+def _lacks_forces(loop: Loop) -> bool:
+    """Whether a plant has several velocities, and nobody says what works on them."""
+    e = loop.equations()
+    return len(e.velocities) > 1 and e.pushes is None
 
 
 def _list_notes(loop: Loop, found: Search) -> list[str]:
@@ -126,7 +137,7 @@ def _list_notes(loop: Loop, found: Search) -> list[str]:
             "experiment and errors of the log are not looked for"
         )
     e = loop.equations()
-    if len(e.velocities) > 1 and e.pushes is None and not found.after.passed:
+    if _lacks_forces(loop) and not found.after.passed:
         first, *_ = (e.states[j] for j in e.velocities)
         notes.append(
             "without forces= a force at a velocity accelerates that coordinate alone, while in a "

@@ -85,6 +85,7 @@ class Question:
     tell: Callable[..., None]
     budget: Budget
     end: Callable[[], None]
+    settle: Callable[[], None]
 
     def attempt(self, step: Callable[[], Any], otherwise: Any) -> Any:
         """Return what a step gives, or something else where the budget is spent before."""
@@ -212,8 +213,9 @@ def diagnose(
             audits, remarks = look_over_records(given, records)
             check_length(fresh)
             question = Question(
-                loop, records, audits, fresh, catalogue, work, shown.tell, budget, shown.end
-            )
+                loop, records, audits, fresh, catalogue, work, shown.tell, budget, shown.end,
+                shown.settle,
+            )  # fmt: skip
             result, search = _answer_question(question)
             if len(records) > 1 and not _have_same_effects(result, len(records)):
                 each = question.attempt(lambda: _answer_each_record(question, search), None)
@@ -244,13 +246,20 @@ def _answer_question(q: Question) -> tuple[Diagnosis, Search]:
     fresh = lengthen_horizon(q.loop, search, q.fresh)
     q = replace(q, fresh=fresh.weigh_outputs(search.final))
     helps = make_fresh_data_test(q.fresh)
-    if search.finished and (search.found or not search.after.passed):
+    if search.found or not search.after.passed:
         # A wrong sign or unit in the log makes the plant look as if almost anything were missing.
         q.tell("looking for errors of the log")
         reached = compute_penalized_likelihood(search.final.fit)
-        wrong = q.attempt(
-            lambda: find_log_error(readout.loop, readout.records, q.audits, reached), None
-        )
+
+        def look() -> LogError | None:
+            return find_log_error(readout.loop, readout.records, q.audits, reached)
+
+        if search.finished:
+            wrong = q.attempt(look, None)
+        else:
+            # Who has no time to wait must not be told that the plant lacks something either.
+            with q.budget.running(binding=False):
+                wrong = look()
         if wrong is not None:
             return _blame_log(q, search, wrong)
     if search.other and not search.after.passed:
@@ -299,6 +308,7 @@ def _search_again(
 
 def _blame_log(q: Question, search: Search, wrong: LogError) -> tuple[Diagnosis, Search]:
     """Answer that the log is wrong: nothing is named on a record that contradicts itself."""
+    q.settle()
     empty = replace(search, final=search.base, found=(), after=search.before)
     summary = summarize_gap(q.loop, empty, q.fresh)
     result = assemble_answer(q.loop, q.records, empty, summary, ())

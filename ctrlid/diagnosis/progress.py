@@ -143,6 +143,10 @@ class Progress:
         else:
             self.spent = f"{write_number(time.monotonic() - self.start, 2)} s"
 
+    def settle(self) -> None:
+        """Forget that the search was stopped, for what it had found answers the question."""
+        self.ended = self.spent = ""
+
     def close(self) -> None:
         """Remove the bar."""
         self.bar.close()
