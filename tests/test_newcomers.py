@@ -147,3 +147,21 @@ def test_an_audit_of_a_pid_with_a_windup_of_its_own_does_not_die_of_a_gain_of_ze
     record = cid.simulate(servo(pid, dt=0.01), r, sensor_noise=1e-4, seed=1)
     stated = cid.PID(kp=30.0, ki=80.0, anti_windup="back-calculation")
     assert "controller" in str(cid.audit(record, servo(stated, dt=0.01)))
+
+
+def test_a_fit_says_where_a_record_is_in_another_unit():
+    loop = levitation()
+    r = cid.random_binary(800, amplitude=1e-4, hold=40, around=loop.at.output, seed=1)
+    record = cid.simulate(loop, r, sensor_noise=2e-6, seed=2)
+    far = cid.Record(r=1e3 * record.r, u=record.u, y=1e3 * record.y, dt=record.dt)
+    notes = cid.fit_loop(loop, far).estimate.notes
+    assert any(n.startswith("LOOK AT THE UNITS: y is 99") for n in notes), notes
+    assert not any("UNITS" in n for n in cid.fit_loop(loop, record).estimate.notes)
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-16-le", "utf-16-be", "utf-8"])
+def test_a_file_in_two_bytes_a_sign_is_read_without_its_mark(tmp_path, encoding):
+    path = tmp_path / "log.csv"
+    path.write_bytes("t [s],u,y\n0,1,2\n0.1,3,4\n0.2,5,6\n".encode(encoding))
+    record = cid.Record.from_csv(path)
+    assert record.y.tolist() == [2, 4, 6]

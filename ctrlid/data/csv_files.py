@@ -36,6 +36,8 @@ GAP = 1.5
 # Where steps of two units come less often than this, rows may have been lost at a regular pace. A
 # recorder that loses a fifth of all rows would have been noticed, so that it is only warned of.
 LOST = 0.2
+# So many bytes of a file show in what signs it is written.
+BEGINNING = 200
 # So many rows are written at once, which bounds the memory that their text takes.
 CHUNK = 20_000
 
@@ -317,6 +319,11 @@ def _decode(data: bytes) -> str:
     """Return the text of a file, with line ends of one kind; what tools of all ages write."""
     if data.startswith((b"\xff\xfe", b"\xfe\xff")):
         text = data.decode("utf-16", errors="replace")
+    elif _is_empty(data[1:BEGINNING:2]):
+        # Two bytes a sign, without the mark that says so.
+        text = data.decode("utf-16-le", errors="replace")
+    elif _is_empty(data[0:BEGINNING:2]):
+        text = data.decode("utf-16-be", errors="replace")
     else:
         try:
             text = data.decode("utf-8-sig")
@@ -324,6 +331,11 @@ def _decode(data: bytes) -> str:
             # Older Windows tools write this encoding.
             text = data.decode("cp1252", errors="replace")
     return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+def _is_empty(part: bytes) -> bool:
+    """Whether nearly all bytes are zero, as every other one of a text in two bytes a sign."""
+    return 10 * part.count(0) > 9 * len(part) > 0
 
 
 def _read_with_blanks(path: Path, body: str, separator: str, above: int) -> tuple[Any, Texts]:

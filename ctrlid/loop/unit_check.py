@@ -1,8 +1,15 @@
 """Whether a record has the units of the plant, whose equations take its numbers as they are."""
 
+import math
+
+import numpy as np
+
 from .._base.units import is_same_unit
 from ..data.record import Record
 from .loop import Loop
+
+# A record that is so many times as far out as its operating point is in another unit.
+ELSEWHERE = 100.0
 
 
 def list_recorded_units(loop: Loop, record: Record) -> list[tuple[str, str, str]]:
@@ -81,3 +88,35 @@ def note_unit_clashes(loop: Loop, record: Record) -> tuple[str, ...]:
         Sentences that begin in capitals; none where the units agree or are not known.
     """
     return tuple(f"UNITS DO NOT AGREE: {text}" for _, text in find_unit_clashes(loop, record))
+
+
+def measure_distance(loop: Loop, record: Record) -> float:
+    """Return how many times the output of the operating point a whole record is; 0 if it is near.
+
+    Of a loop with one output, which does not rest at zero.
+
+    Parameters
+    ----------
+    loop : Loop
+        The loop.
+    record : Record
+        A record with valid samples.
+    """
+    if not loop.equations().siso or not record.valid.any():
+        return 0.0
+    y, rest = np.abs(record.y[record.valid]), abs(loop.point.output)
+    ratio = float(np.median(y)) / rest if rest else 0.0
+    far = ratio >= ELSEWHERE and y.min() >= math.sqrt(ELSEWHERE) * rest
+    return ratio if far else 0.0
+
+
+def describe_distance(loop: Loop, record: Record) -> str:
+    """Say that a record is far from the operating point, as in another unit; empty if it is not."""
+    ratio = measure_distance(loop, record)
+    if not ratio:
+        return ""
+    return (
+        f"y is {ratio:.4g} times the output of the operating point, {loop.point.output:.4g}. "
+        "The record may be in another unit than the plant, or u and y may be exchanged. Scale or "
+        "exchange the channels, or give the loop the operating point of this record."
+    )

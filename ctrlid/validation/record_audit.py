@@ -1,6 +1,5 @@
 """audit(): defects of a record, found before anything is fitted to it."""
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
@@ -17,7 +16,7 @@ from ..data.record import SIGNALS, Record
 from ..data.several_records import order_model_and_data
 from ..data.validity import find_longest_run, find_runs
 from ..loop.loop import Loop
-from ..loop.unit_check import find_unit_clashes
+from ..loop.unit_check import describe_distance, find_unit_clashes, measure_distance
 from ..loop.wiring import match_signals
 from . import signal_defects as defects
 from .controller_check import FAULTS, check_controller
@@ -38,8 +37,6 @@ FEW_CHANGES = 4
 SURE = 2e-4
 # If y does not explain more than this share of u's variance, something is added to u.
 OWN = 0.01
-# If y is so many times its value at rest, it is another signal or in other units.
-ELSEWHERE = 100.0
 # A spectral line counts if its power is above this share of the largest one's.
 LINE = 1e-5
 
@@ -454,15 +451,10 @@ class _RecordChecks:
         return out
 
     def check_operating_point(self, loop: Loop) -> list[AuditFinding]:
-        assert loop.at is not None
-        y, rest = np.abs(self.signals["y"][self.valid]), abs(loop.at.output)
-        ratio = float(np.median(y)) / rest if rest else 0.0
-        if ratio < ELSEWHERE or y.min() < math.sqrt(ELSEWHERE) * rest:
+        text = describe_distance(loop, self.record)
+        if not text:
             return []
-        text = (f"y is {ratio:.3g} times the output of the operating point, {loop.at.output:.4g}. "
-                "The record may be in another unit than the plant, or u and y may be exchanged. "
-                "Scale or exchange the channels, or give the loop the operating point of this "
-                "record.")  # fmt: skip
+        ratio = measure_distance(loop, self.record)
         return [AuditFinding("operating point", "y", text, ratio, self.whole, harmful=True)]
 
     def find_repetition(self) -> list[AuditFinding]:

@@ -24,7 +24,7 @@ from ...data.several_records import (
 )
 from ...loop.loop import Loop
 from ...loop.sampled_form import note_sampled_controller
-from ...loop.unit_check import note_unit_clashes
+from ...loop.unit_check import describe_distance, note_unit_clashes
 from ...physics.linearization import compute_state_matrices
 from ..whiteness import note_coloured_innovations
 from .filter_data import find_noise_units
@@ -151,6 +151,11 @@ def fit_loop(
     colour = note_coloured_innovations(innovations, len(fit.theta), _TOO_NARROW)
     notes = (
         *note_unit_clashes(loop, fit.problem.data[0].record),
+        *(
+            f"LOOK AT THE UNITS: {far}"
+            for one in given[:1]
+            if (far := describe_distance(loop, one))
+        ),
         *note_sampled_controller(loop.controller, given, "the loop"),
         *left_out,
         *_note_doubtful_input(loop, given, fitted),
