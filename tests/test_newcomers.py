@@ -155,7 +155,7 @@ def test_a_fit_says_where_a_record_is_in_another_unit():
     record = cid.simulate(loop, r, sensor_noise=2e-6, seed=2)
     far = cid.Record(r=1e3 * record.r, u=record.u, y=1e3 * record.y, dt=record.dt)
     notes = cid.fit_loop(loop, far).estimate.notes
-    assert any(n.startswith("LOOK AT THE UNITS: y is 99") for n in notes), notes
+    assert any(n.startswith("LOOK AT THE UNITS: y is 989.7 times") for n in notes), notes
     assert not any("UNITS" in n for n in cid.fit_loop(loop, record).estimate.notes)
 
 

@@ -151,11 +151,7 @@ def fit_loop(
     colour = note_coloured_innovations(innovations, len(fit.theta), _TOO_NARROW)
     notes = (
         *note_unit_clashes(loop, fit.problem.data[0].record),
-        *(
-            f"LOOK AT THE UNITS: {far}"
-            for one in given[:1]
-            if (far := describe_distance(loop, one))
-        ),
+        *(f"LOOK AT THE UNITS: {far}" for far in [describe_distance(loop, given[0])] if far),
         *note_sampled_controller(loop.controller, given, "the loop"),
         *left_out,
         *_note_doubtful_input(loop, given, fitted),
