@@ -27,6 +27,8 @@ import traceback
 import types
 import warnings
 from collections.abc import Callable
+from decimal import Decimal
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -108,7 +110,8 @@ def wild(w: World, rng: np.random.Generator) -> Any:
     n = int(rng.integers(0, 4))
     makers: list[Callable[[], Any]] = [
         lambda: None, lambda: True, lambda: False, lambda: 0, lambda: -1, lambda: 1, lambda: 2,
-        lambda: 3, lambda: 10**9, lambda: -(10**9), lambda: 10**400, lambda: 0.0, lambda: -0.0,
+        lambda: 3, lambda: 10**9, lambda: -(10**9), lambda: 10**400, lambda: 10**30,
+        lambda: Fraction(1, 3), lambda: Decimal("0.1"), lambda: 0.0, lambda: -0.0,
         lambda: 0.5, lambda: 1.5, lambda: -2.5, lambda: 1e300, lambda: 1e-300, lambda: 5e-324,
         lambda: math.nan, lambda: math.inf, lambda: -math.inf, lambda: 1 + 2j, lambda: "x",
         lambda: "", lambda: "1", lambda: "fit_arx", lambda: "no", lambda: b"bytes", lambda: [],
@@ -259,6 +262,10 @@ RECIPES: dict[str, Recipe] = {
     "plot.residuals": lambda w, rng: {"comparison": w.comparison},
     "plot.step": lambda w, rng: {"redesigns": w.redesign},
     "plot.trend": lambda w, rng: {"series": w.series},
+    "plot.figure": lambda w, rng: {"rows": pick(rng, 1, 2), "columns": pick(rng, 1, 3), "size": (3.0, 2.0), "sharex": pick(rng, False, True, "col")},
+    "plot.png": lambda w, rng: {"drawn": cid.plot.figure(1, 1, (2.0, 1.5)), "dpi": pick(rng, 50, 72.5)},
+    "plot.style": lambda w, rng: {},
+    "effects.parameter": lambda w, rng: {"unit": pick(rng, "", "1/s", "{y}"), "lower": pick(rng, -1.0, 0.0), "upper": 2.0, "neutral": pick(rng, None, 0.0), "instant": False},
     "effects.equivalents": lambda w, rng: {"loop": w.loop, "effect": effects.ViscousFriction(0.1)},
 }  # fmt: skip
 RECIPES |= {
@@ -360,8 +367,8 @@ def find_public() -> set[str]:
     return found
 
 
-# Downloads, and parts of pictures of the user's own.
-LEFT_OUT = {"datasets.load", "plot.figure", "plot.png", "plot.style", "effects.parameter"}
+# Downloads.
+LEFT_OUT = {"datasets.load"}
 
 
 # --- the calls

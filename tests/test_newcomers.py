@@ -165,3 +165,17 @@ def test_a_file_in_two_bytes_a_sign_is_read_without_its_mark(tmp_path, encoding)
     path.write_bytes("t [s],u,y\n0,1,2\n0.1,3,4\n0.2,5,6\n".encode(encoding))
     record = cid.Record.from_csv(path)
     assert record.y.tolist() == [2, 4, 6]
+
+
+def test_a_lead_at_a_frequency_where_nothing_is_left_of_the_plant_is_refused():
+    with pytest.raises(CtrlidError, match="nearer to the poles"):
+        cid.design_lead(ct.tf([1], [1, 0, -1]), crossover=1e300, phase_margin=40)
+
+
+def test_a_figure_says_what_it_takes():
+    with pytest.raises(CtrlidError, match="figure needs a whole number as rows"):
+        cid.plot.figure("a")
+    with pytest.raises(CtrlidError, match="1 to 50 rows"):
+        cid.plot.figure(0)
+    with pytest.raises(CtrlidError, match=r"has no axes=; .*ax"):
+        cid.plot.record(None, axes=None)

@@ -36,6 +36,8 @@ GAP = 1.5
 # Where steps of two units come less often than this, rows may have been lost at a regular pace. A
 # recorder that loses a fifth of all rows would have been noticed, so that it is only warned of.
 LOST = 0.2
+# Sampling periods are shorter, so that times are finite [s].
+LONGEST = 1e12
 # So many bytes of a file show in what signs it is written.
 BEGINNING = 200
 # So many rows are written at once, which bounds the memory that their text takes.
@@ -162,7 +164,7 @@ def read_csv(
     table, valid = _fill_gaps(table, places, valid, gaps, path)
     start, rows = 0.0, None
     period_given = own.get("dt") if dt is None else dt
-    if dt is not None and not 0 < dt < math.inf:
+    if dt is not None and not 0 < dt < LONGEST:
         raise CtrlidError(f"dt is the sampling period, a number of seconds above 0; given {dt!r}")
     if clock is None:
         if period_given is None:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from .._base import units as _units
+from .._base.arguments import check_arguments
 
 
 @dataclass(frozen=True)
@@ -68,6 +69,7 @@ def parameter(
     dataclasses.Field
         The field.
     """
+    check_arguments(parameter, locals(), "default")
     about = {"unit": unit, "lower": lower, "upper": upper, "neutral": neutral,
              "instant": instant, "searched": searched, "optional": optional}  # fmt: skip
     default = 0.0 if optional else default

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.rcsetup import cycler
 from matplotlib.text import Text
 
-from ..._base.arguments import explain_names
+from ..._base.arguments import check_arguments, explain_names
 from ..._base.errors import CtrlidError
 from ..._base.text import write_count
 
@@ -25,6 +25,10 @@ MARKERS = ("o", "s", "^", "D", "v", "P")
 MEASURED = {"color": "0.72", "linewidth": 3.2}
 # A record of more than twice so many samples is drawn as an envelope of so many bins.
 BINS = 1500
+# A figure has so many axes along a side at most, and is so large [inch]; matplotlib draws so many
+# pixels along a side.
+MOST, LARGEST, PIXELS = 50, 100.0, 2**16 - 1
+SHARED = ("none", "all", "row", "col")
 STYLE = {
     "axes.prop_cycle": cycler(color=COLOURS) + cycler(linestyle=DASHES),
     "axes.spines.top": False, "axes.spines.right": False, "axes.axisbelow": True,
@@ -78,6 +82,14 @@ def figure(
     >>> cid.plot.figure(2, 2).axes.shape
     (2, 2)
     """
+    check_arguments(figure, locals(), "sharex")
+    if not (1 <= rows <= MOST and 1 <= columns <= MOST):
+        raise CtrlidError(f"figure() takes 1 to {MOST} rows and columns of axes; given {rows} rows "
+                          f"and {columns} columns")  # fmt: skip
+    if not all(0 < length <= LARGEST for length in size):
+        raise CtrlidError(f"size is a width and a height of up to {LARGEST:g} inches; given {size}")
+    if not isinstance(sharex, bool) and not (isinstance(sharex, str) and sharex in SHARED):
+        raise CtrlidError(f"sharex is True, False or one of {', '.join(SHARED)}; given {sharex!r}")
     return Picture(new_figure(size).subplots(rows, columns, squeeze=False, sharex=sharex))
 
 
@@ -100,7 +112,7 @@ def png(drawn: Any, dpi: float = 150) -> bytes:
     Raises
     ------
     CtrlidError
-        If something else is given.
+        If something else is given, or the picture would have more pixels than matplotlib draws.
 
     Examples
     --------
@@ -108,11 +120,16 @@ def png(drawn: Any, dpi: float = 150) -> bytes:
     >>> cid.plot.png(cid.plot.figure())[1:4]
     b'PNG'
     """
+    check_arguments(png, locals())
     drawn = drawn.figure if isinstance(drawn, Picture) else drawn
     first = np.asarray(drawn, dtype=object).ravel()[0] if np.size(drawn) else None
     picture = first if isinstance(first, Figure) else getattr(first, "figure", None)
     if not isinstance(picture, Figure):
         raise CtrlidError(f"png() takes a figure or axes; given {type(drawn).__name__}")
+    pixels = dpi * max(picture.get_size_inches())
+    if not 1 <= pixels <= PIXELS:
+        raise CtrlidError(f"a picture has up to {PIXELS} pixels along a side; dpi={dpi!r} gives "
+                          f"{pixels:.4g}")  # fmt: skip
     buffer = io.BytesIO()
     # Without the metadata the same picture is the same file.
     picture.savefig(buffer, format="png", dpi=dpi, metadata={"Software": None})
