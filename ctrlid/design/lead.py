@@ -214,12 +214,6 @@ def _check_plant(plant: Rational, crossover: float) -> None:
                 f"cancelled by a zero, so no controller can reach it; if both are rounding "
                 f"errors, remove them, for example with P.minreal()."
             )
-    size = abs(complex(plant.at(crossover)))
-    if not 0 < size < math.inf:
-        raise CtrlidError(
-            f"the gain of P at the crossover {crossover:g} rad/s is {size:g} in double precision; "
-            "choose a crossover nearer to the poles of P"
-        )
     for error, word in zip(plant.rounding(crossover), ("zero", "infinite"), strict=True):
         if error > 1e-4:
             crowd = " (at fast sampling poles crowd around z = 1: sample more slowly, or design on "
@@ -229,6 +223,12 @@ def _check_plant(plant: Rational, crossover: float) -> None:
                 f"coefficients{crowd if plant.dt else ''}, so no compensator gives a gain of 1 "
                 f"there; choose another crossover."
             )
+    size = abs(complex(plant.at(crossover)))
+    if not 0 < size < math.inf:
+        raise CtrlidError(
+            f"the gain of P at the crossover {crossover:g} rad/s is {size:g} in double precision; "
+            "choose a crossover nearer to the poles of P"
+        )
 
 
 def _write_root(value: complex) -> str:
