@@ -171,8 +171,8 @@ def design_lead(P: Any, crossover: float, phase_margin: float) -> Any:
     crossover = _check_number(crossover, "crossover", "rad/s")
     phase_margin = _check_number(phase_margin, "phase_margin", "degrees")
     if not 0 < crossover < FASTEST:
-        raise CtrlidError(f"crossover is {crossover:g} rad/s; needed is a frequency above 0, nearer "
-                          "to the poles of P.")  # fmt: skip
+        raise CtrlidError(f"crossover is {crossover:g} rad/s; needed is a frequency above 0, not "
+                          "too far from the poles of P.")  # fmt: skip
     if crossover >= plant.nyquist * (1 - 1e-9):
         raise CtrlidError(
             f"crossover is {crossover:g} rad/s, but with a sampling period of {plant.dt:g} s it "
