@@ -265,7 +265,7 @@ POINT = cid.operating_point(MAGLEV, output=0.01)
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ({"dt": -1.0}, "sampling period dt > 0 s; given dt=-1.0"),
+        ({"dt": -1.0}, "sampling period dt > 0 s, as in .*; given dt=-1.0"),
         ({}, "sampling period dt > 0"),
         (
             {"at": None, "dt": 0.001},

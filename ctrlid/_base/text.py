@@ -258,7 +258,9 @@ def find_near_name(name: str, known: Iterable[str]) -> str | None:
     # Two letters begin or end too many names, but all that follows a dot is a name of its own.
     parts = [v for k, v in sorted(plain.items()) if k.endswith(f".{typed}") or (len(typed) > 2
              and (k.startswith(typed) or k.endswith(typed)))]  # fmt: skip
-    near = difflib.get_close_matches(typed, plain, 1) if len(typed) > 1 else []
+    near = difflib.get_close_matches(typed, plain, 1)
+    # A single letter begins a name; it is a part of too many.
+    near = [k for k in near if len(typed) > 1 or k.startswith(typed)]
     alike = parts or [plain[k] for k in near]
     return alike[0] if alike else None
 
