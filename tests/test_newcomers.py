@@ -1,5 +1,7 @@
 """What strangers typed first: answers that say what to type."""
 
+import os
+import subprocess
 import sys
 import types
 
@@ -9,6 +11,7 @@ import pytest
 
 import ctrlid as cid
 from ctrlid import CtrlidError, CtrlidWarning
+from ctrlid import __main__ as command
 from ctrlid import effects as E
 from ctrlid.reporting.cli.arguments import read_plant
 from problems import levitation, servo
@@ -179,3 +182,39 @@ def test_a_figure_says_what_it_takes():
         cid.plot.figure(0)
     with pytest.raises(CtrlidError, match=r"has no axes=; .*ax"):
         cid.plot.record(None, axes=None)
+
+
+def test_tables_of_a_notebook_stand_straight():
+    record = cid.Record(u=np.zeros(60), y=np.arange(60.0), dt=0.1)
+    assert "font-family: monospace" in cid.audit(record)._repr_html_()
+
+
+def test_a_regulator_at_zero_is_compared_and_redesigned_like_any_other():
+    plant = cid.plants.servo(m=1.0, c=2.0, k=3.0)
+    at = cid.OperatingPoint((0.0, 0.0), 0.0, 0.0)
+    loop = cid.Loop(plant, cid.PID(kp=20.0, kd=1.0), dt=0.02, at=at)
+    push = np.repeat([0.0, 1.0, -1.0, 0.5], 100)
+    record = cid.simulate(loop, np.zeros(400), d=push, sensor_noise=1e-4, seed=1)
+    told = str(cid.compare(record, loop)) + str(cid.redesign(loop, loop, 3.0, 50.0))
+    assert "ran away" not in told
+
+
+def test_the_help_says_that_a_model_file_is_run(capsys):
+    with pytest.raises(SystemExit):
+        command.main(["diagnose", "--help"])
+    told = " ".join(capsys.readouterr().out.split())
+    assert "the file is run as a Python program" in told
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs a device that is full")
+def test_the_answer_is_saved_before_it_is_printed(tmp_path):
+    loop = servo(cid.PID(kp=20.0, kd=1.0), dt=0.05)
+    r = cid.random_binary(300, amplitude=0.1, hold=10, seed=1)
+    record = cid.simulate(loop, r, sensor_noise=1e-3, seed=1)
+    record.to_csv(tmp_path / "log.csv")
+    words = [sys.executable, "-m", "ctrlid", "diagnose", str(tmp_path / "log.csv"),
+             "--model", "servo", "--param", "m=1", "c=2", "k=3",
+             "--save", str(tmp_path / "found")]  # fmt: skip
+    with open("/dev/full", "w") as full:
+        subprocess.run(words, stdout=full, stderr=subprocess.PIPE, check=False, timeout=300)
+    assert cid.load_diagnosis(tmp_path / "found" / "diagnosis.json").verdict
