@@ -218,3 +218,11 @@ def test_the_answer_is_saved_before_it_is_printed(tmp_path):
     with open("/dev/full", "w") as full:
         subprocess.run(words, stdout=full, stderr=subprocess.PIPE, check=False, timeout=300)
     assert cid.load_diagnosis(tmp_path / "found" / "diagnosis.json").verdict
+
+
+def test_a_plant_without_a_state_is_no_plant_to_follow():
+    record = cid.Record(u=np.sin(np.arange(200.0) ** 1.3), y=np.sin(np.arange(200.0)), dt=0.05)
+    with pytest.raises(CtrlidError, match="has no state"):
+        cid.diagnose(ct.tf([0], [1, 1]), record, progress=False)
+    with pytest.raises(CtrlidError, match="compare needs a Loop"):
+        cid.compare(record, cid.Loop)

@@ -58,7 +58,10 @@ def require_one_signal(function: str, *given: Any) -> None:
         if isinstance(one, list | tuple):
             require_one_signal(function, *one)
             continue
-        signals: Mapping[str, Sequence[str]] = getattr(one, "signals", {})
+        # A class has the property itself, and is refused by whoever needs one of its values.
+        signals: Mapping[str, Sequence[str]] = (
+            {} if isinstance(one, type) else getattr(one, "signals", {})
+        )
         several = [(key, names) for key, names in signals.items() if len(names) != 1]
         if not several:
             continue

@@ -102,7 +102,7 @@ def measure_distance(loop: Loop, record: Record) -> float:
     record : Record
         A record with valid samples.
     """
-    if not loop.equations().siso or not record.valid.any():
+    if not loop.equations().siso or record.y.ndim > 1 or not record.valid.any():
         return 0.0
     y, rest = np.abs(record.y[record.valid]), abs(loop.point.output)
     ratio = float(np.median(y)) / rest if rest else 0.0

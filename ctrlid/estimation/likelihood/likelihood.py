@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..._base.arrays import Array
+from ..._base.errors import CtrlidError
 from ..._base.statistics import pseudo_inverse
 from ...data.record import Record
 from ...loop.loop import Loop
@@ -121,6 +122,11 @@ def make_problem(
     plant = make_sampled_plant(
         loop, tuple(names), records[0].hold, follow, records[0].hold_r if follow else "zoh"
     )
+    if not plant.n:
+        raise CtrlidError(
+            f"{plant.e.name} has no state, so that there is nothing for a filter to follow. Give "
+            "a plant whose output depends on the past of its input"
+        )
     return Problem(plant, data, *bounds, priors=find_priors(loop, loop.free))
 
 
