@@ -28,6 +28,8 @@ BINS = 1500
 # A figure has so many axes along a side at most, and is so large [inch]; matplotlib draws so many
 # pixels along a side.
 MOST, LARGEST, PIXELS = 50, 100.0, 2**16 - 1
+# With fewer pixels an inch no letter can be drawn.
+COARSEST = 10
 SHARED = ("none", "all", "row", "col")
 STYLE = {
     "axes.prop_cycle": cycler(color=COLOURS) + cycler(linestyle=DASHES),
@@ -127,9 +129,9 @@ def png(drawn: Any, dpi: float = 150) -> bytes:
     if not isinstance(picture, Figure):
         raise CtrlidError(f"png() takes a figure or axes; given {type(drawn).__name__}")
     pixels = dpi * max(picture.get_size_inches())
-    if not 1 <= pixels <= PIXELS:
-        raise CtrlidError(f"a picture has up to {PIXELS} pixels along a side; dpi={dpi!r} gives "
-                          f"{pixels:.4g}")  # fmt: skip
+    if not (dpi >= COARSEST and pixels <= PIXELS):
+        raise CtrlidError(f"a picture has {COARSEST} or more pixels an inch and up to {PIXELS} along "
+                          f"a side; dpi={dpi!r} gives {pixels:.4g}")  # fmt: skip
     buffer = io.BytesIO()
     # Without the metadata the same picture is the same file.
     picture.savefig(buffer, format="png", dpi=dpi, metadata={"Software": None})
