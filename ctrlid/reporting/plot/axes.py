@@ -130,8 +130,10 @@ def png(drawn: Any, dpi: float = 150) -> bytes:
         raise CtrlidError(f"png() takes a figure or axes; given {type(drawn).__name__}")
     pixels = dpi * max(picture.get_size_inches())
     if not (dpi >= COARSEST and pixels <= PIXELS):
-        raise CtrlidError(f"a picture has {COARSEST} or more pixels an inch and up to {PIXELS} along "
-                          f"a side; dpi={dpi!r} gives {pixels:.4g}")  # fmt: skip
+        raise CtrlidError(
+            f"a picture has {COARSEST} or more pixels an inch and up to {PIXELS} along a side; "
+            f"dpi={dpi!r} gives {pixels:.4g}"
+        )
     buffer = io.BytesIO()
     # Without the metadata the same picture is the same file.
     picture.savefig(buffer, format="png", dpi=dpi, metadata={"Software": None})
