@@ -479,7 +479,7 @@ def _find_even_period(stamps: Any, rounding: float, dt: float | None) -> float |
     if not fits(slope, 1.25):
         return None
     # Of the periods that the stamps allow, the one with the fewest digits is taken.
-    short = (float(f"{slope:.{digits}g}") for digits in range(1, 16))
+    short = _list_roundings(slope)
     return next((p for p in short if fits(p) and abs(p - slope) <= rounding / n), slope)
 
 
@@ -495,8 +495,12 @@ def _find_doubled_unit(stamps: Any) -> float | None:
 
 def _shorten_period(dt: float, uncertainty: float) -> float:
     """Return the period with the fewest digits within an uncertainty of another."""
-    short = (float(f"{dt:.{digits}g}") for digits in range(1, 16))
-    return next((p for p in short if abs(p - dt) <= uncertainty), dt)
+    return next((p for p in _list_roundings(dt) if abs(p - dt) <= uncertainty), dt)
+
+
+def _list_roundings(period: float) -> Iterator[float]:
+    """Yield a period rounded to one digit, to two, and so on."""
+    return (float(f"{period:.{digits}g}") for digits in range(1, 16))
 
 
 def estimate_period(stamps: Any) -> float:

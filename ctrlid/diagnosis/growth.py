@@ -11,11 +11,7 @@ from ..effects import AbstractEffect
 from ..effects.base import name_at_place
 from ..estimation.likelihood.kalman_filter import Noise
 from ..estimation.likelihood.likelihood import Fit
-from ..estimation.likelihood.maximization import (
-    choose_noise,
-    maximize,
-    refit_noise_size,
-)
+from ..estimation.likelihood.maximization import choose_noise, maximize, refit_noise_size
 from ..estimation.likelihood.tails import JointTails
 from .candidates import Trial, Work, is_same_kind, list_missing_candidates
 from .fitted_model import (

@@ -110,11 +110,8 @@ def measure_distance(loop: Loop, record: Record) -> float:
     return ratio if far else 0.0
 
 
-def describe_distance(loop: Loop, record: Record) -> str:
-    """Say that a record is far from the operating point, as in another unit; empty if it is not."""
-    ratio = measure_distance(loop, record)
-    if not ratio:
-        return ""
+def describe_distance(loop: Loop, ratio: float) -> str:
+    """Say that a record is so many times as far out as the operating point."""
     return (
         f"y is {ratio:.4g} times the output of the operating point, {loop.point.output:.4g}. "
         "The record may be in another unit than the plant, or u and y may be exchanged. Scale or "

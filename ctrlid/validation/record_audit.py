@@ -451,10 +451,10 @@ class _RecordChecks:
         return out
 
     def check_operating_point(self, loop: Loop) -> list[AuditFinding]:
-        text = describe_distance(loop, self.record)
-        if not text:
-            return []
         ratio = measure_distance(loop, self.record)
+        if not ratio:
+            return []
+        text = describe_distance(loop, ratio)
         return [AuditFinding("operating point", "y", text, ratio, self.whole, harmful=True)]
 
     def find_repetition(self) -> list[AuditFinding]:

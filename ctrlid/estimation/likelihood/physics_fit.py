@@ -24,7 +24,7 @@ from ...data.several_records import (
 )
 from ...loop.loop import Loop
 from ...loop.sampled_form import note_sampled_controller
-from ...loop.unit_check import describe_distance, note_unit_clashes
+from ...loop.unit_check import describe_distance, measure_distance, note_unit_clashes
 from ...physics.linearization import compute_state_matrices
 from ..whiteness import note_coloured_innovations
 from .filter_data import find_noise_units
@@ -151,7 +151,7 @@ def fit_loop(
     colour = note_coloured_innovations(innovations, len(fit.theta), _TOO_NARROW)
     notes = (
         *note_unit_clashes(loop, fit.problem.data[0].record),
-        *(f"LOOK AT THE UNITS: {far}" for far in [describe_distance(loop, given[0])] if far),
+        *_note_distance(loop, given[0]),
         *note_sampled_controller(loop.controller, given, "the loop"),
         *left_out,
         *_note_doubtful_input(loop, given, fitted),
@@ -161,6 +161,12 @@ def fit_loop(
         *_note_unknown_controller(loop, given),
     )
     return replace(fitted, estimate=replace(fitted.estimate, notes=notes))
+
+
+def _note_distance(loop: Loop, record: Record) -> list[str]:
+    """Return a note where a record is far from the operating point of its loop."""
+    ratio = measure_distance(loop, record)
+    return [f"LOOK AT THE UNITS: {describe_distance(loop, ratio)}"] if ratio else []
 
 
 def _says_nothing(fit: Fit, fitted: LoopFit) -> bool:
