@@ -69,7 +69,8 @@ def test_another_option_of_the_controller_is_named():
     assert "derivative='error'" in found[0].text
 
 
-def record_pid(n=2000, limit=np.inf, measured=False, forward=False, wound=False, b=1.0, tf=0.0):
+def record_pid(n=2000, limit=np.inf, measured=False, forward=False, wound=False, b=1.0, tf=0.0,
+               ki=60.0, kd=4.0):  # fmt: skip
     """A mass on a spring under a PID written out in numpy, and the PID that it is stated to be."""
     rng = np.random.default_rng(11)
     whole = expm(DT * np.array([[0, 1, 0], [-3, -2, 1], [0, 0, 0]]))
@@ -79,15 +80,15 @@ def record_pid(n=2000, limit=np.inf, measured=False, forward=False, wound=False,
     for j in range(n):
         y[j] = x[0] + 1e-3 * rng.standard_normal()
         difference = -y[j] if measured else r[j] - y[j]
-        slope = (tf * slope + 4 * (difference - last)) / (tf + DT)
+        slope = (tf * slope + kd * (difference - last)) / (tf + DT)
         last = difference
-        step = 60 * DT * (r[j] - y[j])
+        step = ki * DT * (r[j] - y[j])
         v = 40 * (b * r[j] - y[j]) + slope + integral + (0 if forward else step)
         if wound or not abs(v) > limit or v * step < 0:
             integral += step
         u[j] = round(float(np.clip(v, -limit, limit)), 3)
         x = whole[:2, :2] @ x + whole[:2, 2] * u[j]
-    stated = cid.PID(kp=40.0, ki=60.0, kd=4.0, lower=-limit, upper=limit)
+    stated = cid.PID(kp=40.0, ki=ki, kd=kd, lower=-limit, upper=limit)
     loop = cid.Loop(cid.plants.servo(m=1.0, c=2.0, k=3.0), stated, dt=DT)
     return cid.Record(r=r, u=u, y=y, dt=DT), loop
 
@@ -96,6 +97,8 @@ def record_pid(n=2000, limit=np.inf, measured=False, forward=False, wound=False,
     ("true", "said"),
     [({"measured": True}, "with derivative='measurement':"),
      ({"forward": True, "limit": 12.0}, "with integral='forward':"),
+     # Where the integral is slow, 0.99 times the law leaves hardly anything.
+     ({"forward": True, "ki": 20.0, "kd": 0.0}, "with integral='forward':"),
      ({"wound": True, "limit": 12.0}, "with anti_windup='none':"),
      ({"b": 0.0}, "with b=0.0:"),
      ({"measured": True, "forward": True},

@@ -35,9 +35,9 @@ def test_the_help_of_diagnose_begins_with_short_words():
                         ("filtertime", "filter_time"), ("antiWindup", "anti_windup")]
 )  # fmt: skip
 def test_a_pid_knows_what_was_meant(wrong, near):
-    with pytest.raises(cid.CtrlidError, match=f"a PID has no {wrong}=; did you mean {near}="):
+    with pytest.raises(cid.CtrlidError, match=f"PID has no {wrong}=; did you mean {near}="):
         cid.PID(**{wrong: 1.0})
-    with pytest.raises(cid.CtrlidError, match="a PID has no zz=; it has kp, ki, kd"):
+    with pytest.raises(cid.CtrlidError, match="PID has no zz=; it takes kp, ki, kd"):
         cid.PID(kp=1.0, zz=2.0)
 
 

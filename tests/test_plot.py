@@ -144,6 +144,16 @@ def test_record_without_reference_and_with_extra_channels(record):
         plot.record(made, extra=["speed"])
 
 
+def test_a_reference_of_no_output_has_axes_of_its_own():
+    t = np.arange(200) * 0.01
+    made = cid.Record(r=np.sign(np.sin(t)), u=0 * t, y=[np.sin(t), np.cos(t)], dt=0.01,
+                      names={"r": ("xd[0]",), "y": ("x", "theta")})  # fmt: skip
+    axes = plot.record(made)
+    assert [ax.get_ylabel().split()[0] for ax in axes] == ["x", "theta", "xd[0]", "u"]
+    assert legend(axes[2]) == ["reference xd[0]"]
+    assert len(plot.record(replace(made, names={"r": ("theta",), "y": ("x", "theta")}))) == 3
+
+
 def test_long_records_keep_every_peak():
     n = 45_000
     y = np.zeros(n)

@@ -137,3 +137,21 @@ def test_refused_records():
         cid.select_order(cid.Record(u=0 * y, y=y, dt=1.0))
     with pytest.raises(cid.CtrlidError, match="needs a Record"):
         cid.select_order(y)
+
+
+@pytest.mark.parametrize(
+    ("u", "y"), [(1e160, 1.0), (1.0, 1e-200), (1e-200, 1e-200), (1e150, 1e160)]
+)
+def test_any_unit_gives_the_same_choice(u, y):
+    record = random_record(np.random.default_rng(5))[1]
+    one = cid.select_order(record)
+    other = cid.select_order(replace(record, u=u * record.u, y=y * record.y))
+    assert (other.na, other.nb, other.nk) == (one.na, one.nb, one.nk)
+    gain = np.repeat([1.0, y / u], [one.na, one.nb])
+    assert other.rows[0].values == pytest.approx(gain * one.rows[0].values, rel=1e-6)
+
+
+def test_a_ratio_that_no_number_holds_is_refused():
+    record = random_record(np.random.default_rng(5))[1]
+    with pytest.raises(cid.CtrlidError, match="their ratio is no number"):
+        cid.select_order(replace(record, u=1e-200 * record.u, y=1e200 * record.y))

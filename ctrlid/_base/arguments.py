@@ -6,7 +6,7 @@ import os
 import sys
 import types
 import typing
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from numbers import Complex, Integral
 from pathlib import Path
 from typing import Any, Literal, ParamSpec, TypeVar, get_args, get_origin
@@ -18,6 +18,7 @@ from .text import find_near_name, write_count, write_list
 
 Given = ParamSpec("Given")
 Answer = TypeVar("Answer")
+Made = TypeVar("Made")
 
 # The largest whole number of a machine word.
 LARGEST = 2**63 - 1
@@ -204,10 +205,42 @@ def check_fields(value: Any, *own: str) -> None:
             _check_kind(type(value).__name__, name, getattr(value, name), kind)
 
 
+def explain_fields(cls: type[Made]) -> type[Made]:
+    """Refuse unknown, missing and surplus fields of a dataclass in words, as `explain_names` does.
+
+    Examples
+    --------
+    >>> from dataclasses import dataclass
+    >>> @explain_fields
+    ... @dataclass
+    ... class Spring:
+    ...     stiffness: float
+    >>> Spring()
+    Traceback (most recent call last):
+    ...
+    ctrlid._base.errors.CtrlidError: Spring needs stiffness=; it takes stiffness
+    """
+    made, signature = cls.__init__, ShownFields().__get__(None, cls)
+
+    @functools.wraps(made)
+    def init(self: Any, *args: Any, **fields: Any) -> None:
+        try:
+            signature.bind(*args, **fields)
+        except TypeError:
+            raise CtrlidError(_describe_call(cls, signature, args, fields)) from None
+        made(self, *args, **fields)
+
+    cls.__init__ = init  # type: ignore[method-assign]
+    # A class with a ``__new__`` of its own would show the arguments of that.
+    cls.__signature__ = signature  # type: ignore[attr-defined]
+    return cls
+
+
 def check_field_names(cls: Any, given: Iterable[str]) -> None:
     """Refuse unknown fields in words, before a generated constructor does so curtly.
 
-    It stands in ``__new__`` of a dataclass, which `show_fields` then has to follow.
+    It stands in ``__new__`` of a class whose subclasses are dataclasses, and `ShownFields` beside
+    it; a single dataclass has `explain_fields`.
 
     Parameters
     ----------
@@ -224,40 +257,17 @@ def check_field_names(cls: Any, given: Iterable[str]) -> None:
     known = _find_fields(cls)
     for name in given:
         if name not in known:
-            raise CtrlidError(_refuse_name(_add_article(cls.__name__), name, tuple(known), "has"))
-
-
-def check_needed_fields(cls: Any, given: Collection[str]) -> None:
-    """Refuse a dataclass with named fields only of which some are missing; see `check_field_names`.
-
-    Where none is given it is copied or unpickled.
-    """
-    missing = [name for name, needed in _find_fields(cls).items() if needed and name not in given]
-    if given and missing:
-        raise CtrlidError(
-            f"{_add_article(cls.__name__)} needs {write_list([f'{name}=' for name in missing])}; "
-            f"given are {write_list([f'{name}=' for name in given])}"
-        )
-
-
-def _add_article(name: str) -> str:
-    return f"{'an' if name[:1] in 'AEIOU' else 'a'} {name}"
+            raise CtrlidError(_refuse_name(cls.__name__, name, known, "has"))
 
 
 @functools.cache
-def _find_fields(cls: Any) -> dict[str, bool]:
-    """Return the arguments of a constructor, and whether each has to be given."""
-    own = list(inspect.signature(cls.__init__).parameters.values())[1:]
-    return {p.name: p.default is p.empty for p in own}
-
-
-def show_fields(cls: Any) -> None:
-    """Let help show the fields of a dataclass, not the arguments of the check of their names."""
-    cls.__signature__ = ShownFields().__get__(None, cls)
+def _find_fields(cls: Any) -> tuple[str, ...]:
+    """Return the names of the arguments of a constructor."""
+    return tuple(inspect.signature(cls.__init__).parameters)[1:]
 
 
 class ShownFields:
-    """The signature of each subclass of a dataclass: its own fields, as `show_fields` has them."""
+    """The signature of each subclass of a dataclass: its own fields, for help to show."""
 
     def __get__(self, instance: Any, cls: Any) -> inspect.Signature:
         own = inspect.signature(cls.__init__)
@@ -417,7 +427,8 @@ def _describe_kind(kind: Any) -> str:
         return "a sequence, each of it " + one
     if origin is not None or kind is Callable:
         return "a function"
-    return _add_article(getattr(kind, "__name__", str(kind)))
+    name: str = getattr(kind, "__name__", str(kind))
+    return f"{'an' if name[:1] in 'AEIOU' else 'a'} {name}"
 
 
 def _is_none(kind: Any) -> bool:

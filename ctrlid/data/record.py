@@ -13,9 +13,7 @@ from scipy import signal
 
 from .._base.arguments import (
     check_arguments,
-    check_field_names,
-    check_needed_fields,
-    show_fields,
+    explain_fields,
 )
 from .._base.arrays import read_only
 from .._base.errors import CtrlidError
@@ -32,6 +30,7 @@ SIGNALS = ("r", "u", "y")
 RESERVED = (*SIGNALS, "t", "time", "valid")
 
 
+@explain_fields
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Record(Printed):
     """Reference, input and output of one experiment, sampled together.
@@ -112,8 +111,6 @@ class Record(Printed):
             )
         if "t" in fields:
             raise CtrlidError(_write_no_instants(fields["t"]))
-        check_field_names(cls, fields)
-        check_needed_fields(cls, fields)
         return super().__new__(cls)
 
     def __post_init__(self) -> None:
@@ -656,9 +653,6 @@ class Record(Printed):
             rows.append(f"  {label:<{width}}  {values.min():.6g} .. {values.max():.6g} "
                         f"{'' if unit == '1' else unit}".rstrip())  # fmt: skip
         return "\n".join(rows)
-
-
-show_fields(Record)
 
 
 def _write_no_instants(t: Any) -> str:

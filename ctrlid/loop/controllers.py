@@ -9,13 +9,13 @@ units.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal, Self, get_args
+from typing import Any, Literal, get_args
 
 import casadi
 import control as ct
 import numpy as np
 
-from .._base.arguments import check_field_names, is_number, show_fields
+from .._base.arguments import explain_fields, is_number
 from .._base.arrays import Array
 from .._base.errors import CtrlidError
 from .._base.periods import have_same_period, write_both_periods
@@ -28,6 +28,7 @@ Derivative = Literal["error", "measurement"]
 AntiWindup = Literal["clamp", "back-calculation", "none"]
 
 
+@explain_fields
 @dataclass(frozen=True)
 class PID:
     r"""A sampled PID controller with limits, as microcontrollers run it.
@@ -97,12 +98,6 @@ class PID:
     anti_windup: AntiWindup = "clamp"
     tracking_time: float | None = None
 
-    def __new__(cls, *args: Any, **fields: Any) -> Self:
-        """Refuse unknown fields in words, before the generated constructor does so curtly."""
-        del args
-        check_field_names(cls, fields)
-        return super().__new__(cls)
-
     def __post_init__(self) -> None:
         for name in ("kp", "ki", "kd", "b", "c", "filter_time", "bias", "tracking_time"):
             value = getattr(self, name)
@@ -133,9 +128,6 @@ class PID:
                 raise CtrlidError("back-calculation needs tracking_time > 0 s; given "
                                   f"tracking_time={self.tracking_time} with kp={self.kp}, "
                                   f"ki={self.ki}")  # fmt: skip
-
-
-show_fields(PID)
 
 
 @dataclass(frozen=True, eq=False)

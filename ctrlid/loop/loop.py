@@ -6,7 +6,7 @@ import pickle
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Self
+from typing import Any
 
 import casadi
 import control as ct
@@ -14,10 +14,9 @@ import numpy as np
 
 from .._base.arguments import (
     check_arguments,
-    check_field_names,
+    explain_fields,
     is_iterable,
     is_number,
-    show_fields,
 )
 from .._base.arrays import to_real_array
 from .._base.errors import CtrlidError, CtrlidWarning, EffectDoesNotApply
@@ -40,6 +39,7 @@ from .controllers import ControlLaw, make_control_law
 from .wiring import Wiring, is_wired_by_name, make_wired_law, make_wiring
 
 
+@explain_fields
 @dataclass(frozen=True, eq=False)
 class Loop:
     """A plant, its controller and the point around which they work.
@@ -119,12 +119,6 @@ class Loop:
     _traced: Equations = field(init=False, repr=False)
     _active: Equations = field(init=False, repr=False)
     _kept: Equations = field(init=False, repr=False)
-
-    def __new__(cls, *args: Any, **fields: Any) -> Self:
-        """Refuse unknown fields in words, before the generated constructor does so curtly."""
-        del args
-        check_field_names(cls, fields)
-        return super().__new__(cls)
 
     def __post_init__(self) -> None:
         if not (is_number(self.dt) and 0 < self.dt < math.inf):
@@ -599,9 +593,6 @@ class Loop:
         if wiring is None:
             return text + ")"
         return "\n  ".join([text + "), wired:", *wiring.lines])
-
-
-show_fields(Loop)
 
 
 class _Itself:

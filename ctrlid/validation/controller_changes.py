@@ -85,11 +85,14 @@ def list_changes(
     Of an analog controller, `loop` has it at the samples, and `sample` makes such a loop of an
     analog transfer function by which that controller is multiplied.
     """
+    pid = loop.controller
+    if isinstance(pid, PID):
+        # One other option may leave nothing where another gain leaves hardly anything.
+        yield from _list_single_options(loop, pid, record)
     gain = _estimate_gain(loop, record)
     if gain is not None:
         yield from _list_gains(loop, record, *gain)
     yield from _list_limits(loop, record)
-    pid = loop.controller
     if isinstance(pid, PID):
         yield from _list_options(loop, pid, record)
     if sample is not None:
@@ -231,25 +234,15 @@ def _list_options(loop: Loop, pid: PID, record: Record) -> Iterator[LawChange]:
     if limited:
         yield LawChange("limit", "without the limits of the controller", replace(
             loop, controller=replace(pid, lower=-np.inf, upper=np.inf)), record)  # fmt: skip
-    tracking = pid.tracking_time or (pid.kp / pid.ki if pid.ki else 1.0)
-    # With a negative time constant the integrator would run away: no such controller exists.
-    windups = [w for w in get_args(AntiWindup) if w != "back-calculation" or tracking > 0]
-    choices: dict[str, list[Any]] = {
-        "derivative": [*get_args(Derivative)] if pid.kd and pid.c in (0, 1) else [],
-        "integral": [*get_args(Integral)] if pid.ki else [],
-        "b": [0.0, 1.0],
-        "anti_windup": windups if pid.ki and limited else [],
-    }
-    stated = {name: getattr(pid, name) for name in choices}
+    choices, stated = _list_choices(pid)
     made = [dict(zip(choices, values, strict=True)) for values in product(
         *({stated[name], *choices[name]} for name in choices))]  # fmt: skip
     changes = [{k: v for k, v in one.items() if v != stated[k]} for one in made]
     for change in sorted(changes, key=lambda c: (len(c), str(c))):
         if change:
-            kind = "limit" if "anti_windup" in change else "filter"
-            other = exchange_controller(loop, replace(pid, **change))
-            yield LawChange(kind, _write_options(change), other, record)
+            yield _change_options(loop, pid, record, change)
     if "back-calculation" in choices["anti_windup"]:
+        tracking = _find_tracking_time(pid)
 
         def make_tracked(time: float) -> tuple[Loop, Record]:
             other = replace(pid, anti_windup="back-calculation", tracking_time=time)
@@ -261,6 +254,41 @@ def _list_options(loop: Loop, pid: PID, record: Record) -> Iterator[LawChange]:
         if time is not None:
             words = f"with anti_windup='back-calculation' and tracking_time={time:.4g}"
             yield LawChange("limit", words, *make_tracked(time), exact=True)
+
+
+def _list_single_options(loop: Loop, pid: PID, record: Record) -> Iterator[LawChange]:
+    """Yield the PID with one other option, for which only an exact replay speaks."""
+    choices, stated = _list_choices(pid)
+    for name, values in choices.items():
+        for value in values:
+            if value != stated[name]:
+                yield replace(_change_options(loop, pid, record, {name: value}), exact=True)
+
+
+def _list_choices(pid: PID) -> tuple[dict[str, list[Any]], dict[str, Any]]:
+    """Return the options of a PID that make a difference with all their values, and its own."""
+    limited = np.isfinite([pid.lower, pid.upper]).any()
+    # With a negative time constant the integrator would run away: no such controller exists.
+    windups = [w for w in get_args(AntiWindup)
+               if w != "back-calculation" or _find_tracking_time(pid) > 0]  # fmt: skip
+    choices: dict[str, list[Any]] = {
+        "derivative": [*get_args(Derivative)] if pid.kd and pid.c in (0, 1) else [],
+        "integral": [*get_args(Integral)] if pid.ki else [],
+        "b": [0.0, 1.0],
+        "anti_windup": windups if pid.ki and limited else [],
+    }
+    return choices, {name: getattr(pid, name) for name in choices}
+
+
+def _find_tracking_time(pid: PID) -> float:
+    return pid.tracking_time or (pid.kp / pid.ki if pid.ki else 1.0)
+
+
+def _change_options(loop: Loop, pid: PID, record: Record, change: dict[str, Any]) -> LawChange:
+    """Return the PID with other options."""
+    kind = "limit" if "anti_windup" in change else "filter"
+    other = exchange_controller(loop, replace(pid, **change))
+    return LawChange(kind, _write_options(change), other, record)
 
 
 def _write_options(change: dict[str, Any]) -> str:

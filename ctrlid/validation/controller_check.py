@@ -48,6 +48,8 @@ MEMORY = 10
 ROUNDING = 1e-12
 # Changes of a law are put out by so many samples, most of them at once.
 BEGINNING = 1000
+# What is below this share of u's variance is written with all its zeros.
+HARDLY = 1e-5
 # A remainder of no known kind below this share of u's variance steers no simulation.
 IMMATERIAL = 0.01
 # Kinds of finding after which the stated law is not that of the record.
@@ -442,15 +444,27 @@ def _find_wrong_law(
         if not remains <= CLEARLY * left:
             continue
         u = change.record.u[change.record.valid]
-        if is_rounding(e, remains, u, resolution) or (
+        rounded = is_rounding(e, remains, u, resolution)
+        if rounded or (
             not (exact_only or change.exact)
             and _is_added(change.loop, e, remains, change.record, resolution)
         ):
             what = "the controller or the log" if change.kind in MIRRORED else "the controller"
             text = (
                 f"u is not what the controller of the loop computes from r and y, but "
-                f"{change.words}: what remains unexplained falls from {write_percent(left)} to "
-                f"{write_percent(remains)} of the variance of u. Correct {what}."
+                f"{change.words}: what remains unexplained falls from {_write_share(left)} of the "
+                f"variance of u to {_write_rest(remains, rounded)}. Correct {what}."
             )
             return change.kind, text, left, True
     return None
+
+
+def _write_share(share: float) -> str:
+    """Write a share in per cent however small, since a rejected law may leave hardly anything."""
+    if share >= HARDLY:
+        return write_percent(share)
+    return f"{np.format_float_positional(100 * share, 1, fractional=False, trim='-')} %"
+
+
+def _write_rest(share: float, rounded: bool) -> str:
+    return "what rounding leaves" if rounded and share < HARDLY else _write_share(share)

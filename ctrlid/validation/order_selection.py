@@ -1,7 +1,7 @@
 """select_order(): poles, numerator coefficients and delay, held against one long regression."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from numbers import Integral
 from typing import Any
 
@@ -179,6 +179,7 @@ def select_order(
             if np.ptp(getattr(record, key)[record.valid]) == 0:
                 raise CtrlidError(f"{key} is constant, so no structure can be selected. Excite the "
                                   "loop")  # fmt: skip
+    record, gain = _take_scales_off(record)
     length = _choose_length(record, cut, most)
     long = _fit_long_regression(record, 0, cut, length)
     judge = _find_rows(record, cut, record.n, length)
@@ -195,13 +196,25 @@ def select_order(
     unit = max(1.0, min(misfit / free for *_, misfit, free, _, _ in found))
     rows = sorted(
         (OrderRow(a, b, d, misfit, float(stats.chi2.sf(misfit / unit, free)),
-                  misfit / unit + 2 * bayesian_penalty(a + b, long.rows), error, theta)
+                  misfit / unit + 2 * bayesian_penalty(a + b, long.rows), error,
+                  np.concatenate([theta[:a], gain * theta[a:]]))
          for a, b, d, misfit, free, error, theta in found),
         key=lambda row: row.bic,
     )  # fmt: skip
     best = rows[0]
     return OrderChoice(best.na, best.nb, best.nk, tuple(rows), length,
                        _write_choice(rows, unit, length))  # fmt: skip
+
+
+def _take_scales_off(record: Record) -> tuple[Record, float]:
+    """Return the record with u and y of size one, and what that multiplies the coefficients by."""
+    if not record.valid.any():
+        return record, 1.0
+    u, y = (float(np.max(np.abs(s[record.valid]))) for s in (record.u, record.y))
+    if not 0 < (gain := y / u) < np.inf:
+        raise CtrlidError(f"y is up to {y:.3g} and u up to {u:.3g}: their ratio is no number that "
+                          "a computer holds. Give them other units")  # fmt: skip
+    return replace(record, u=record.u / u, y=record.y / y), gain
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,7 +31,8 @@ def record(record: Record, ax: Any = None, *, extra: Sequence[str] = ()) -> Pict
     """Draw an experiment: reference and output, the input below, and extra channels on request.
 
     Of several outputs each has axes of its own, with the reference of its name, or else the one of
-    its number where there are as many references as outputs; so has each of several inputs.
+    its number where there are as many references as outputs; so has each of several inputs, and a
+    reference that belongs to no output, such as that of a state.
     Stretches that do not count are shaded. A long record is drawn as the band between the smallest
     and the largest value of neighbouring samples, so that no peak is lost.
 
@@ -40,7 +41,8 @@ def record(record: Record, ax: Any = None, *, extra: Sequence[str] = ()) -> Pict
     record : Record
         The experiment; draw a part with ``record.between(t0, t1)``.
     ax : sequence of matplotlib Axes, optional
-        One for each output, input and extra channel; by default those of a new figure.
+        One for each output, reference without an output, input and extra channel; by default those
+        of a new figure.
     extra : sequence of str, optional
         Names of extra channels.
 
@@ -76,9 +78,11 @@ def record(record: Record, ax: Any = None, *, extra: Sequence[str] = ()) -> Pict
     outputs, references, inputs = (
         [row[1:] for row in rows if row[0] == key] for key in ("y", "r", "u")
     )
-    axes = take_axes(ax, len(outputs) + len(inputs) + len(extra), sharex=True)
-    for k, (ax, (name, unit, values)) in enumerate(zip(axes, outputs, strict=False)):
-        wanted = _find_reference(references, k, name, len(outputs))
+    followed = [_find_reference(references, k, name, len(outputs))
+                for k, (name, _, _) in enumerate(outputs)]  # fmt: skip
+    alone = [row for row in references if all(row is not one for one in followed)]
+    axes = take_axes(ax, len(outputs) + len(alone) + len(inputs) + len(extra), sharex=True)
+    for ax, (name, unit, values), wanted in zip(axes, outputs, followed, strict=False):
         both = [values] if wanted is None else [values, wanted[2]]
         scale, unit = _pictures.choose_scale(both, unit)
         _draw_trace(ax, record, scale * values, 0, f"measured {name}")
@@ -86,14 +90,16 @@ def record(record: Record, ax: Any = None, *, extra: Sequence[str] = ()) -> Pict
             label = wanted[0] if wanted[0] != "r" else ""
             _draw_trace(ax, record, scale * wanted[2], 1, f"reference {label}", True)
         ax.set_ylabel(f"{name} [{unit}]")
-    panels = [(name, values, unit, record.hold == "zoh") for name, unit, values in inputs]
-    panels += [(key, record.extra[key], record.units.get(key, ""), False) for key in extra]
-    for i, (ax, (name, values, unit, held)) in enumerate(
-        zip(axes[len(outputs) :], panels, strict=True)
+    panels = [(1, f"reference {name}", name, values, unit, True) for name, unit, values in alone]
+    others = [(f"input {name}", name, values, unit, record.hold == "zoh")
+              for name, unit, values in inputs]  # fmt: skip
+    others += [(key, key, record.extra[key], record.units.get(key, ""), False) for key in extra]
+    panels += [(2 + i, *panel) for i, panel in enumerate(others)]
+    for ax, (colour, label, name, values, unit, held) in zip(
+        axes[len(outputs) :], panels, strict=True
     ):
         scale, unit = _pictures.choose_scale([values], unit)
-        label = name if i >= len(inputs) else f"input {name}"
-        _draw_trace(ax, record, scale * values, (2 + i) % len(COLOURS), label, held)
+        _draw_trace(ax, record, scale * values, colour % len(COLOURS), label, held)
         ax.set_ylabel(f"{name} [{unit}]")
     for ax in axes:
         _shade_gaps(ax, record)
