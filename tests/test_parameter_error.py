@@ -110,3 +110,10 @@ def test_friction_beside_a_wrong_mass_keeps_its_name():
 def test_nothing_is_named_where_all_is_right():
     found = cid.diagnose(make_loop(), swing(3), progress=False)
     assert found.verdict == "nothing missing", found
+
+
+def test_a_parameter_is_wrong_by_a_factor_of_ten_at_most():
+    bounds = {p.name: (p.lower, p.upper) for p in E.ParameterError("m", 0.0).parameters()}
+    assert bounds["error"] == (-0.9, 9.0)
+    with pytest.raises(cid.CtrlidError, match="error"):
+        E.ParameterError("m", 200.0)

@@ -218,10 +218,13 @@ def follow_record(loop: Loop, record: Record) -> Loop | None:
 def _design_normalized_controller(model: Any, dt: float, u: Array, y: Array) -> Any:
     """Return the controller for a linear model by the sizes of its input and output.
 
-    None where python-control finds no solution of the Riccati equations.
+    None where python-control finds no solution of the Riccati equations, and where the input moves
+    nothing, as one that rests beyond its limits.
     """
     try:
         plant = ct.ss(model)
+        if not plant.nstates:
+            return None
         plant = plant if plant.dt else ct.sample_system(plant, dt, "zoh")
         a, b, c = plant.A, plant.B * u, plant.C / y[:, None]
         feedback, _, _ = ct.dlqr(a, b, c.T @ c, np.eye(len(u)))

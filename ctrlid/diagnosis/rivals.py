@@ -107,14 +107,16 @@ def find_rivals(best: Trial, others: Sequence[Trial], sure: bool = True) -> tupl
         theirs = compute_log_terms(trial.model.fit)
         # A larger model that predicts the same contains the best one, and pays for nothing; but one
         # that gains more may be right (a Stribeck curve hardly told from dry friction), and one
-        # whose further part may be large, for all the record says, cannot be excluded.
+        # whose further part may be large, for all the record says, cannot be excluded. Nor can a
+        # known look-alike that does not contain it: a limit and a dead zone of an input that only
+        # has two values.
         alike = trial.resembles(best)
+        larger = contains(trial.effect, best.effect)
         nothing = (
             trial.gain < best.gain + THRESHOLD.close
             and _compute_spread_of_sum(mine - theirs) < THRESHOLD.same_predictions
         )
-        if trial.penalty > best.penalty and nothing:
-            larger = contains(trial.effect, best.effect)
+        if trial.penalty > best.penalty and nothing and (larger or not alike):
             share = _compute_share_beyond(trial, best) if larger else math.nan
             hinted = (
                 alike

@@ -86,8 +86,11 @@ class InputSaturation(InputEffect):
         """
         u = sight.inputs
         middle, low, high = float(np.median(u)), float(np.min(u)), float(np.max(u))
-        if not low < middle < high:
+        if not low < high:
             return ()
+        if not low < middle < high:
+            # The median of an input with two values is one of them.
+            middle = 0.5 * (low + high)
         return tuple(
             type(self)(middle - d * (middle - low), middle + d * (high - middle)) for d in DEPTHS
         )

@@ -31,14 +31,15 @@ class ParameterError(LawEffect):
 
     A mass that nobody weighed, a gain from a data sheet. It is tried for each parameter that is not
     in ``free``, but for the acceleration of gravity: what is free is fitted before any effect is
-    sought.
+    sought. From a tenth to ten times the value it is the parameter that is wrong, beyond that the
+    model.
 
     Parameters
     ----------
     name : str
         Name of the plant's parameter.
     error : float
-        Relative error epsilon.
+        Relative error epsilon, from -0.9 to 9.
 
     Examples
     --------
@@ -48,7 +49,7 @@ class ParameterError(LawEffect):
     """
 
     name: str
-    error: float = parameter("", neutral=0.0)
+    error: float = parameter("", lower=-0.9, upper=9.0, neutral=0.0)
 
     look_alikes: ClassVar[tuple[str, ...]] = (
         "SensorGain", "ConstantForce", "LinearStiffness", "ViscousFriction",
