@@ -85,13 +85,20 @@ def explain_names(function: Callable[Given, Answer]) -> Callable[Given, Answer]:
 
     @functools.wraps(function)
     def handled(*args: Given.args, **kwargs: Given.kwargs) -> Answer:
-        try:
-            signature.bind(*args, **kwargs)
-        except TypeError:
-            raise CtrlidError(_describe_call(function, signature, args, kwargs)) from None
+        _check_call(function, signature, args, kwargs)
         return function(*args, **kwargs)
 
     return handled
+
+
+def _check_call(
+    function: Any, signature: inspect.Signature, args: tuple[Any, ...], given: Mapping[str, Any]
+) -> None:
+    """Refuse in words the arguments of a call that the signature does not take."""
+    try:
+        signature.bind(*args, **given)
+    except TypeError:
+        raise CtrlidError(_describe_call(function, signature, args, given)) from None
 
 
 def _describe_call(
@@ -224,10 +231,7 @@ def explain_fields(cls: type[Made]) -> type[Made]:
 
     @functools.wraps(made)
     def init(self: Any, *args: Any, **fields: Any) -> None:
-        try:
-            signature.bind(*args, **fields)
-        except TypeError:
-            raise CtrlidError(_describe_call(cls, signature, args, fields)) from None
+        _check_call(cls, signature, args, fields)
         made(self, *args, **fields)
 
     cls.__init__ = init  # type: ignore[method-assign]

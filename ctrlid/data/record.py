@@ -11,10 +11,7 @@ from typing import Any, Literal, Self, get_args
 import numpy as np
 from scipy import signal
 
-from .._base.arguments import (
-    check_arguments,
-    explain_fields,
-)
+from .._base.arguments import check_arguments, explain_fields
 from .._base.arrays import read_only
 from .._base.errors import CtrlidError
 from .._base.signals import list_signals, require_one_signal

@@ -234,7 +234,8 @@ def _list_options(loop: Loop, pid: PID, record: Record) -> Iterator[LawChange]:
     if limited:
         yield LawChange("limit", "without the limits of the controller", replace(
             loop, controller=replace(pid, lower=-np.inf, upper=np.inf)), record)  # fmt: skip
-    choices, stated = _list_choices(pid)
+    choices = _list_choices(pid)
+    stated = {name: getattr(pid, name) for name in choices}
     made = [dict(zip(choices, values, strict=True)) for values in product(
         *({stated[name], *choices[name]} for name in choices))]  # fmt: skip
     changes = [{k: v for k, v in one.items() if v != stated[k]} for one in made]
@@ -258,26 +259,24 @@ def _list_options(loop: Loop, pid: PID, record: Record) -> Iterator[LawChange]:
 
 def _list_single_options(loop: Loop, pid: PID, record: Record) -> Iterator[LawChange]:
     """Yield the PID with one other option, for which only an exact replay speaks."""
-    choices, stated = _list_choices(pid)
-    for name, values in choices.items():
+    for name, values in _list_choices(pid).items():
         for value in values:
-            if value != stated[name]:
+            if value != getattr(pid, name):
                 yield replace(_change_options(loop, pid, record, {name: value}), exact=True)
 
 
-def _list_choices(pid: PID) -> tuple[dict[str, list[Any]], dict[str, Any]]:
-    """Return the options of a PID that make a difference with all their values, and its own."""
+def _list_choices(pid: PID) -> dict[str, list[Any]]:
+    """Return the options of a PID that make a difference, with all their values."""
     limited = np.isfinite([pid.lower, pid.upper]).any()
     # With a negative time constant the integrator would run away: no such controller exists.
     windups = [w for w in get_args(AntiWindup)
                if w != "back-calculation" or _find_tracking_time(pid) > 0]  # fmt: skip
-    choices: dict[str, list[Any]] = {
+    return {
         "derivative": [*get_args(Derivative)] if pid.kd and pid.c in (0, 1) else [],
         "integral": [*get_args(Integral)] if pid.ki else [],
         "b": [0.0, 1.0],
         "anti_windup": windups if pid.ki and limited else [],
     }
-    return choices, {name: getattr(pid, name) for name in choices}
 
 
 def _find_tracking_time(pid: PID) -> float:

@@ -450,10 +450,12 @@ def _find_wrong_law(
             and _is_added(change.loop, e, remains, change.record, resolution)
         ):
             what = "the controller or the log" if change.kind in MIRRORED else "the controller"
+            hardly = rounded and remains < HARDLY
+            rest = "what rounding leaves" if hardly else _write_share(remains)
             text = (
                 f"u is not what the controller of the loop computes from r and y, but "
                 f"{change.words}: what remains unexplained falls from {_write_share(left)} of the "
-                f"variance of u to {_write_rest(remains, rounded)}. Correct {what}."
+                f"variance of u to {rest}. Correct {what}."
             )
             return change.kind, text, left, True
     return None
@@ -464,7 +466,3 @@ def _write_share(share: float) -> str:
     if share >= HARDLY:
         return write_percent(share)
     return f"{np.format_float_positional(100 * share, 1, fractional=False, trim='-')} %"
-
-
-def _write_rest(share: float, rounded: bool) -> str:
-    return "what rounding leaves" if rounded and share < HARDLY else _write_share(share)

@@ -173,13 +173,13 @@ def select_order(
         _check_whole_numbers(name, values) for name, values in (("na", na), ("nb", nb), ("nk", nk))
     ]
     most = max(grids[0]) + max(grids[1]) + max(grids[2])
-    cut = int(SHARE * record.n)
+    cut, gain = int(SHARE * record.n), 1.0
     if record.valid.any():
         for key in ("u", "y"):
             if np.ptp(getattr(record, key)[record.valid]) == 0:
                 raise CtrlidError(f"{key} is constant, so no structure can be selected. Excite the "
                                   "loop")  # fmt: skip
-    record, gain = _take_scales_off(record)
+        record, gain = _take_scales_off(record)
     length = _choose_length(record, cut, most)
     long = _fit_long_regression(record, 0, cut, length)
     judge = _find_rows(record, cut, record.n, length)
@@ -208,8 +208,6 @@ def select_order(
 
 def _take_scales_off(record: Record) -> tuple[Record, float]:
     """Return the record with u and y of size one, and what that multiplies the coefficients by."""
-    if not record.valid.any():
-        return record, 1.0
     u, y = (float(np.max(np.abs(s[record.valid]))) for s in (record.u, record.y))
     if not 0 < (gain := y / u) < np.inf:
         raise CtrlidError(f"y is up to {y:.3g} and u up to {u:.3g}: their ratio is no number that "
