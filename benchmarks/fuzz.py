@@ -220,6 +220,7 @@ RECIPES: dict[str, Recipe] = {
     "fit_each": lambda w, rng: {"fit": pick(rng, cid.fit_arx, cid.fit_iv), "records": w.records[:2], "jobs": None, "na": 2, "nb": pick(rng, 1, 2)},
     "fit_iv": lambda w, rng: {"record": pick(rng, *w.records[:2]), "na": 2, "nb": 1, "nk": 1, "constraints": (), "controller": None, "intercept": pick(rng, True, False), "instruments": "r"},
     "fit_loop": lambda w, rng: {"loop": pick(rng, w.loop, w.pid), "record": pick(rng, w.records[0], w.records[:2]), "free": pick(rng, None, ("c",)), "coloured": pick(rng, None, False)},
+    "fit_simulation": lambda w, rng: {"loop": pick(rng, w.loop, w.pid), "record": pick(rng, w.records[0], w.records[:2]), "free": pick(rng, None, ("c",)), "intercept": pick(rng, True, False)},
     "linearize": lambda w, rng: {"plant": w.plants[0], "at": cid.OperatingPoint((0.0, 0.0), 0.0, 0.0)},
     "load_diagnosis": lambda w, rng: {"path": w.saved, "loop": w.loop},
     "loop_margins": lambda w, rng: {"L": pick(rng, *w.linear)},
@@ -239,7 +240,7 @@ RECIPES: dict[str, Recipe] = {
     "sweep_sampling_period": lambda w, rng: {"record": w.records[0], "periods": pick(rng, None, [0.05, 0.1]), "estimators": ["fit_arx"], "constraints": pick(rng, (), {"fit_arx": (cid.Integrator(),)}), "poles": 2, "zeros": 0, "controller": None, "jobs": None},
     "write_report": lambda w, rng: {"result": pick(rng, w.records[0], w.comparison, w.found), "path": FOLDER / "out.html", "title": pick(rng, "", "a & b")},
     "Estimate.confidence_interval": lambda w, rng: {"self": w.model.estimate, "name": pick(rng, "a1", "b1"), "level": rng.uniform(0.1, 0.99)},
-    "LoopEstimate.confidence_interval": lambda w, rng: {"self": w.fit.estimate, "name": "c", "level": rng.uniform(0.1, 0.99)},
+    "ParameterEstimate.confidence_interval": lambda w, rng: {"self": w.fit.estimate, "name": "c", "level": rng.uniform(0.1, 0.99)},
     "IdentifiedSystem.to_states": lambda w, rng: {"self": w.system, "order": pick(rng, None, 2, 4)},
     "IdentifiedModel.with_delay": lambda w, rng: {"self": w.continuous, "order": 2},
     "Diagnosis.save": lambda w, rng: {"self": w.found, "path": FOLDER / "again.json"},
@@ -320,6 +321,7 @@ INVARIANTS: dict[str, Callable[[Arguments, Any], bool]] = {
     "simulate": is_finite_record, "fit_arx": is_finite_model, "fit_iv": is_finite_model,
     "fit_continuous": is_finite_model,
     "fit_loop": lambda g, fit: bool(np.isfinite(fit.estimate.values).all()),
+    "fit_simulation": lambda g, fit: bool(np.isfinite(fit.estimate.values).all()),
     "nu_gap": lambda g, v: 0 <= v <= 1, "robust_margin": lambda g, v: 0 <= v <= 1,
     "loop_margins": lambda g, m: not m.stable or (m.gain_margin > 1 > m.gain_reduction_margin >= 0),
     "replay_controller": lambda g, u: bool(np.isfinite(u).all()),
@@ -332,7 +334,7 @@ INVARIANTS: dict[str, Callable[[Arguments, Any], bool]] = {
     "operating_point": lambda g, p: math.isclose(p.output, float(g["output"]), abs_tol=1e-9),
     "response_band": lambda g, b: bool((b.magnitude_low <= b.magnitude_high).all()),
     "Estimate.confidence_interval": lambda g, i: i[0] <= i[1],
-    "LoopEstimate.confidence_interval": lambda g, i: i[0] <= i[1],
+    "ParameterEstimate.confidence_interval": lambda g, i: i[0] <= i[1],
 }  # fmt: skip
 
 

@@ -38,7 +38,12 @@ from .estimation.constraints import (
     SymmetricPoles,
 )
 from .estimation.identified_model import Estimate, IdentifiedModel, IdentifiedSystem
-from .estimation.likelihood.physics_estimate import LoopEstimate, LoopFit
+from .estimation.likelihood.physics_estimate import (
+    LoopEstimate,
+    LoopFit,
+    ParameterEstimate,
+    SimulationEstimate,
+)
 from .estimation.likelihood.physics_fit import fit_loop
 from .estimation.likelihood.prediction import Prediction, predict
 from .estimation.linear.arx import fit_arx
@@ -61,6 +66,7 @@ from .validation.record_audit import Audit, AuditFinding, audit
 from .validation.residual_tests import Correlation
 from .validation.sampling_sweep import sweep_sampling_period
 from .validation.sampling_table import SamplingRow, SamplingSweep
+from .validation.simulation_fit import fit_simulation
 
 __version__ = "0.1.0.dev0"
 
@@ -100,6 +106,7 @@ __all__ = [
     "OperatingPoint",
     "OrderChoice",
     "OrderRow",
+    "ParameterEstimate",
     "Performance",
     "PoleAt",
     "PoleTrend",
@@ -113,6 +120,7 @@ __all__ = [
     "SamplingSweep",
     "Section",
     "SensorNoise",
+    "SimulationEstimate",
     "StaticGain",
     "StepMotion",
     "SymmetricPoles",
@@ -129,6 +137,7 @@ __all__ = [
     "fit_each",
     "fit_iv",
     "fit_loop",
+    "fit_simulation",
     "linearize",
     "load_diagnosis",
     "loop_margins",

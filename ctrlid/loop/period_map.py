@@ -3,7 +3,7 @@
 import functools
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -74,7 +74,9 @@ def push_velocities(e: Equations, force: Any, t: Any, x: Any, p: Any) -> Any:
     return held
 
 
-def make_period_map(loop: Loop, substeps: int, hold: str = "zoh", hold_r: str = "zoh") -> PeriodMap:
+def make_period_map(
+    loop: Loop, substeps: int, hold: str = "zoh", hold_r: str = "zoh", free: Sequence[str] = ()
+) -> PeriodMap:
     """Build the map of a loop over one sampling period.
 
     Parameters
@@ -89,6 +91,9 @@ def make_period_map(loop: Loop, substeps: int, hold: str = "zoh", hold_r: str = 
     hold_r : {"zoh", "foh"}, optional
         How r runs between samples, as an analog controller sees it. If it is straight, the next r
         comes last in w.
+    free : sequence of str, optional
+        Parameters that stay symbols; their values are the third argument of `step`, near those of
+        the loop.
 
     Returns
     -------
@@ -119,7 +124,9 @@ def make_period_map(loop: Loop, substeps: int, hold: str = "zoh", hold_r: str = 
     following = casadi.vertsplit(ahead, m)
     path = following if pieces > 1 else [d, *following]
     at, limits = loop.point, loop.input_limits
-    p = e.values
+    symbols = casadi.SX.sym("free", len(free))
+    p = _insert_symbols(e, free, symbols) if len(free) else e.values
+    given = [z, w, symbols] if len(free) else [z, w]
     held_rate = push_velocities(e, force, t0, z[:n], p)
     # Several inputs rest at a column of values.
     u_rest = casadi.DM(at.inputs) if len(at.inputs) > 1 else at.input
@@ -166,7 +173,7 @@ def make_period_map(loop: Loop, substeps: int, hold: str = "zoh", hold_r: str = 
             u, charge = compute_input(t0 + tau, z, measure_output(t0 + tau, z, u_rest), tau)
             return casadi.vertcat(e.function(t0 + tau, z[:n], u, p)[0] + held_rate, charge)
 
-        slope = casadi.Function("rate", [z, w], [rate(0.0, z)])
+        slope = casadi.Function("rate", given, [rate(0.0, z)])
         after, error = integrate(rate, z, loop.dt, substeps)
     else:
         memory: Any = z[n + nc] if e.play is not None else None
@@ -199,11 +206,12 @@ def make_period_map(loop: Loop, substeps: int, hold: str = "zoh", hold_r: str = 
     memory = []
     if e.play is not None:
         start = casadi.substitute(casadi.vertcat(e.play.start), casadi.vertcat(e.play.u, e.p),
-                                  casadi.vertcat(at.input, p))  # fmt: skip
+                                  casadi.vertcat(at.input, e.values))  # fmt: skip
         memory = [float(casadi.evalf(start))]
-        input_at_rest = float(casadi.evalf(casadi.SX(apply_backlash(e, memory[0], at.input, p)[0])))
+        behind = apply_backlash(e, memory[0], at.input, e.values)[0]
+        input_at_rest = float(casadi.evalf(casadi.SX(behind)))
     rest += [*memory, *([input_at_rest] * kept)]
-    step = casadi.Function("step", [z, w], [after, y, u, error])
+    step = casadi.Function("step", given, [after, y, u, error])
     reference = at.outputs if e.siso else (0.0,)
     if law is not None and law.references is not None:
         reference = law.references
@@ -221,9 +229,17 @@ def apply_backlash(e: Equations, m: Any, u: Any, p: Any) -> tuple[Any, Any]:
     return both[0], both[1]
 
 
+def _insert_symbols(e: Equations, free: Sequence[str], symbols: Any) -> Any:
+    """Return the values of all parameters, with symbols in place of those that are free."""
+    p, names = casadi.SX(casadi.DM(e.values)), list(e.parameters)
+    for k, name in enumerate(free):
+        p[names.index(name)] = symbols[k]
+    return p
+
+
 def _insert_values(e: Equations, pieces: Sequence[Piece], p: Any) -> list[Piece]:
     """Put parameter values into the durations of pieces."""
-    values = casadi.SX(casadi.DM(p))
+    values = casadi.SX(p) if isinstance(p, casadi.SX) else casadi.SX(casadi.DM(p))
     return [
         tuple(casadi.substitute(casadi.SX(part), e.p, values) for part in piece)  # type: ignore[misc]
         for piece in pieces
@@ -232,15 +248,26 @@ def _insert_values(e: Equations, pieces: Sequence[Piece], p: Any) -> list[Piece]
 
 def linearize_at_rest(s: PeriodMap, function: Any) -> tuple[Array, Array]:
     """Return the derivatives of a function (step, rate) by state and signals at rest."""
+    a, b = _differentiate(s, lambda z, w: function.call([z, w])[:1])
+    return a, b
+
+
+def linearize_sensors_at_rest(s: PeriodMap) -> tuple[Array, Array, Array, Array]:
+    """Return A, B, C and D of a loop from the noise of its sensors to its outputs, at rest."""
+    a, b, c, d = _differentiate(s, lambda z, w: s.step.call([z, w])[:2])
+    return a, b[:, s.places[3]], c, d[:, s.places[3]]
+
+
+def _differentiate(s: PeriodMap, evaluate: Callable[[Any, Any], Sequence[Any]]) -> list[Array]:
+    """Return the derivatives of expressions by state and signals at rest, one after the other."""
     z, w = casadi.SX.sym("z", len(s.rest)), casadi.SX.sym("w", sum(s.counts))
-    first = function.call([z, w])[0]
-    both = casadi.Function("j", [z, w], [casadi.jacobian(first, z), casadi.jacobian(first, w)])
+    slopes = [casadi.jacobian(value, by) for value in evaluate(z, w) for by in (z, w)]
     still = np.zeros(sum(s.counts))
     still[s.places[1]] = s.reference
     if len(s.counts) > 6:
         still[s.places[6]] = s.reference
-    a, b = both(s.rest, still)
-    return np.asarray(a, float), np.asarray(b, float)
+    found = casadi.Function("j", [z, w], slopes).call([s.rest, still])
+    return [np.asarray(value, float) for value in found]
 
 
 def leave_out_kinks(loop: Loop, memories: bool = True) -> Loop:

@@ -338,6 +338,21 @@ class Simulator:
         path: Array = np.concatenate([*corners.transpose(1, 0, 2), last])
         return path
 
+    def stack_signals(
+        self, r: Array | None, d: Array, noise: Sequence[Array] | None = None,
+        start_time: float = 0.0,
+    ) -> Array:  # fmt: skip
+        """Return the second argument of the period's map, a column for each sample."""
+        n = d.shape[-1]
+        _, references, inputs, outputs, forces, *_ = self.counts
+        d, quiet = np.reshape(d, (inputs, n)), [np.zeros((k, n)) for k in (outputs, forces)]
+        still = np.zeros((references, n))
+        r = still if r is None else np.reshape(r, (references, n))
+        w = [start_time + np.arange(n) * self.loop.dt, r, d, *(noise or quiet), self._find_path(d)]
+        if self.hold_r == "foh":
+            w.append(np.hstack([r[:, 1:], r[:, -1:]]))
+        return np.vstack(w)
+
     def run(
         self, z: Array, r: Array | None, d: Array, noise: Sequence[Array] | None = None,
         start_time: float = 0.0,
@@ -355,15 +370,8 @@ class Simulator:
         are halved until its local errors are small.
         """
         loop, n = self.loop, d.shape[-1]
-        _, references, inputs, outputs, forces, *_ = self.counts
-        d, quiet = np.reshape(d, (inputs, n)), [np.zeros((k, n)) for k in (outputs, forces)]
-        r = None if r is None else np.reshape(r, (references, n))
-        w = np.vstack([start_time + np.arange(n) * loop.dt,
-                       np.zeros((references, n)) if r is None else r, d, *(noise or quiet),
-                       self._find_path(d)])  # fmt: skip
-        if self.hold_r == "foh":
-            still = np.zeros((references, n))
-            w = np.vstack([w, still if r is None else np.hstack([r[:, 1:], r[:, -1:]])])
+        inputs, outputs = self.counts[2:4]
+        w = self.stack_signals(r, d, noise, start_time)
         y, u = np.empty((outputs, n)), np.empty((inputs, n))
         start, reach = z, self._floor
         asked, whole = self._measure_asked(w), loop.controller is None

@@ -1,5 +1,6 @@
-"""What `fit_loop` returns: physical parameters, how well they are known, and the loop with them."""
+"""Physical parameters, how well they are known, and the loop with them: what fits return."""
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,14 +12,88 @@ from ..._base.arguments import check_arguments
 from ..._base.arrays import Array, freeze_arrays, read_only
 from ..._base.criterion import bayesian_penalty
 from ..._base.errors import CtrlidError
-from ..._base.text import Printed, write_number, write_quantity
+from ..._base.text import Printed, write_list, write_number, write_quantity
 from ...loop.loop import Loop
 from ...physics.linearization import make_state_space, operating_point
 from ..identified_model import compute_root_errors
 
+# A direction of which the scaled information has a smaller relative eigenvalue is not in the data.
+UNSEEN = 1e-9
+
 
 @dataclass(frozen=True, eq=False, repr=False)
-class LoopEstimate(Printed):
+class ParameterEstimate(Printed):
+    """Physical parameters and how well they are known; what fits share.
+
+    Parameters
+    ----------
+    names : tuple of str
+        The parameters that were fitted.
+    values : ndarray, shape (p,)
+        Their values [unit of each parameter].
+    covariance : ndarray, shape (p, p)
+        Their covariance [products of units]; infinite for what is not in the data.
+    """
+
+    names: tuple[str, ...]
+    values: Array
+    covariance: Array
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
+
+    @property
+    @read_only
+    def standard_errors(self) -> Array:
+        """Standard errors of the parameters."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)), dtype=float)
+
+    def __getitem__(self, name: str) -> float:
+        if name not in self.names:
+            raise CtrlidError(f"{name!r} was not fitted; fitted were {', '.join(self.names)}")
+        return float(self.values[self.names.index(name)])
+
+    def confidence_interval(self, name: str, level: float = 0.95) -> tuple[float, float]:
+        """Return the interval that covers the true value of a parameter with a probability.
+
+        Parameters
+        ----------
+        name : str
+            A fitted parameter.
+        level : float, optional
+            The probability, between 0 and 1, for normally distributed errors.
+
+        Returns
+        -------
+        lower, upper : float
+            Lower and upper end [unit of the parameter].
+
+        Raises
+        ------
+        CtrlidError
+            If the parameter was not fitted or the level is no probability.
+        """
+        check_arguments(ParameterEstimate.confidence_interval, locals())
+        if not 0.0 < level < 1.0:
+            raise CtrlidError(f"A confidence level lies between 0 and 1; given {level!r}.")
+        middle = self[name]
+        half = float(norm.ppf((1 + level) / 2)) * self.standard_errors[self.names.index(name)]
+        return float(middle - half), float(middle + half)
+
+    def _list_rows(self, active: tuple[str, ...]) -> list[str]:
+        """Return a line for each parameter."""
+        rows, width = [], max((len(name) for name in self.names), default=0)
+        for name, value, error in zip(self.names, self.values, self.standard_errors, strict=True):
+            bound = name in active
+            shown = (
+                write_number(value, 6) if bound else write_quantity(value, error=error, digits=6)
+            )
+            rows.append(f"  {name:<{width}} = {shown}{' (on its bound)' if bound else ''}")
+        return rows
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class LoopEstimate(ParameterEstimate):
     """Physical parameters, their uncertainty and the noise that was found with them.
 
     Parameters
@@ -55,9 +130,6 @@ class LoopEstimate(Printed):
         plant has one.
     """
 
-    names: tuple[str, ...]
-    values: Array
-    covariance: Array
     sensor_noise: tuple[Any, ...]
     force_noise: Any
     coloured_force: float
@@ -68,63 +140,16 @@ class LoopEstimate(Printed):
     notes: tuple[str, ...] = ()
     units: tuple[Any, Any] = ("", "")
 
-    def __post_init__(self) -> None:
-        freeze_arrays(self)
-
-    @property
-    @read_only
-    def standard_errors(self) -> Array:
-        """Standard errors of the parameters."""
-        return np.asarray(np.sqrt(np.diag(self.covariance)), dtype=float)
-
     @property
     def bic(self) -> float:
         """Bayesian information criterion, smaller is better."""
         extra = len(self.names) + 2 * (self.coloured_force > 0)
         return -2 * self.log_likelihood + 2 * bayesian_penalty(extra, self.n_samples)
 
-    def __getitem__(self, name: str) -> float:
-        if name not in self.names:
-            raise CtrlidError(f"{name!r} was not fitted; fitted were {', '.join(self.names)}")
-        return float(self.values[self.names.index(name)])
-
-    def confidence_interval(self, name: str, level: float = 0.95) -> tuple[float, float]:
-        """Return the interval that covers the true value of a parameter with a probability.
-
-        Parameters
-        ----------
-        name : str
-            A fitted parameter.
-        level : float, optional
-            The probability, between 0 and 1, for normally distributed errors.
-
-        Returns
-        -------
-        lower, upper : float
-            Lower and upper end [unit of the parameter].
-
-        Raises
-        ------
-        CtrlidError
-            If the parameter was not fitted or the level is no probability.
-        """
-        check_arguments(LoopEstimate.confidence_interval, locals())
-        if not 0.0 < level < 1.0:
-            raise CtrlidError(f"A confidence level lies between 0 and 1; given {level!r}.")
-        middle = self[name]
-        half = float(norm.ppf((1 + level) / 2)) * self.standard_errors[self.names.index(name)]
-        return float(middle - half), float(middle + half)
-
     def __str__(self) -> str:
         rows = [f"fit by maximum likelihood, {self.n_samples} samples used, log-likelihood "
                 f"{self.log_likelihood:.1f}"]  # fmt: skip
-        width = max((len(name) for name in self.names), default=0)
-        for name, value, error in zip(self.names, self.values, self.standard_errors, strict=True):
-            bound = name in self.active
-            shown = (
-                write_number(value, 6) if bound else write_quantity(value, error=error, digits=6)
-            )
-            rows.append(f"  {name:<{width}} = {shown}{' (on its bound)' if bound else ''}")
+        rows += self._list_rows(self.active)
         size, push = self.units
         noise = ", ".join(_write_sizes(v, size) for v in self.sensor_noise)
         rows.append(f"  standard deviation of the sensor noise: {noise}; of the white force: "
@@ -133,6 +158,46 @@ class LoopEstimate(Printed):
             rows.append(f"  standard deviation of the coloured force: "
                         f"{_write_size(self.coloured_force, push)}, with a time constant of "
                         f"{write_number(self.force_time, 3)} s")  # fmt: skip
+        return "\n".join([*rows, *(f"  note: {note}" for note in self.notes)])
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class SimulationEstimate(ParameterEstimate):
+    """Physical parameters that make a simulation follow the record, and what it leaves.
+
+    Parameters
+    ----------
+    names : tuple of str
+        The parameters that were fitted.
+    values : ndarray, shape (p,)
+        Their values [unit of each parameter].
+    covariance : ndarray, shape (p, p)
+        Their covariance [products of units], which allows for correlated errors; infinite for what
+        is not in the data.
+    errors : tuple of float
+        Root mean square error of the simulation of each output [output unit].
+    n_samples : int
+        Values of outputs that count.
+    active : tuple of str
+        The parameters that sit on a bound.
+    notes : tuple of str
+        What the user should know before believing the numbers.
+    units : str or tuple of str
+        Units of the errors; empty where neither the record nor the plant has one.
+    """
+
+    errors: tuple[float, ...]
+    n_samples: int
+    active: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    units: Any = ""
+
+    def __str__(self) -> str:
+        rows = [f"fit by the error of the simulation, {self.n_samples} samples used"]
+        rows += self._list_rows(self.active)
+        units = self.units if isinstance(self.units, tuple) else (self.units,)
+        rows.append(f"  root mean square error of the simulation: "
+                    f"{_write_sizes(self.errors, units)}")  # fmt: skip
         return "\n".join([*rows, *(f"  note: {note}" for note in self.notes)])
 
 
@@ -149,18 +214,18 @@ def _write_size(value: float, unit: str) -> str:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LoopFit(Printed):
-    """What `fit_loop` returns.
+    """What `fit_loop` and `fit_simulation` return.
 
     Parameters
     ----------
     loop : Loop
         The loop with the fitted values.
-    estimate : LoopEstimate
-        Values, standard errors and noise.
+    estimate : LoopEstimate or SimulationEstimate
+        Values, standard errors, and the noise or the errors that were found with them.
     """
 
     loop: Loop
-    estimate: LoopEstimate
+    estimate: Any
 
     @property
     def model(self) -> Any:
@@ -237,3 +302,51 @@ def linearize_at_rest(loop: Loop, states: bool = False) -> Any:
         at = operating_point(loop.plant, output=loop.at.output, guess=loop.at)
         loop = replace(loop, at=at)
     return loop.linearize(states=states)
+
+
+def mark_unseen(
+    covariance: Array, matrix: Array, inside: Any, names: tuple[str, ...]
+) -> tuple[Array, tuple[str, ...]]:
+    """Return a covariance that is infinite for what is not in the data, and a note of it.
+
+    Parameters
+    ----------
+    covariance : ndarray, shape (p, p)
+        Covariance of the parameters.
+    matrix : ndarray, shape (q, q)
+        Information of the parameters, and of what was fitted with them.
+    inside : ndarray of bool, shape (q,)
+        Which of them are not on a bound.
+    names : tuple of str
+        The parameters.
+
+    Returns
+    -------
+    covariance : ndarray, shape (p, p)
+        The covariance.
+    notes : tuple of str
+        The note, if there is one.
+    """
+    p, covariance = len(names), covariance.copy()
+    rows = np.flatnonzero(inside & (np.diag(matrix) > 0))
+    lost = [k for k in range(p) if inside[k] and (matrix[k, k] <= 0 or _is_unseen(matrix, rows, k))]
+    for k in lost:
+        covariance[k, :] = covariance[:, k] = 0.0
+        covariance[k, k] = math.inf
+    if not lost:
+        return covariance, ()
+    return covariance, (
+        f"the data do not determine {write_list([names[k] for k in lost])}: other parameters can "
+        f"compensate a change of {'them' if len(lost) > 1 else 'it'}",
+    )
+
+
+def _is_unseen(matrix: Array, rows: Any, k: int) -> bool:
+    """Return whether a parameter takes part in a direction that is not in the data."""
+    if k not in rows:
+        return False
+    part = matrix[np.ix_(rows, rows)]
+    size = np.sqrt(np.diag(part))
+    values, vectors = np.linalg.eigh(part / np.outer(size, size))
+    weak = vectors[list(rows).index(k), values < UNSEEN * values.max()]
+    return bool(np.any(np.abs(weak) > 0.1))

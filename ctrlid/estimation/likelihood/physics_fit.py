@@ -3,12 +3,10 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
 from ..._base.arguments import check_arguments, explain_names, point_at_part
-from ..._base.arrays import Array
 from ..._base.errors import CtrlidError, ModelCannotRun
 from ..._base.interruption import hold_interrupt
 from ..._base.rounding import keep_numpy_quiet
@@ -37,10 +35,8 @@ from .maximization import (
     refit_noise_size,
     refit_quiet_force,
 )
-from .physics_estimate import LoopEstimate, LoopFit
+from .physics_estimate import LoopEstimate, LoopFit, mark_unseen
 
-# A direction of which the scaled information has a smaller relative eigenvalue is not in the data.
-UNSEEN = 1e-9
 # A given value is contradicted where the fit is farther from it than three of its standard
 # deviations, which chance does in 1 of 370 cases.
 CONTRADICTED = 3.0
@@ -295,15 +291,7 @@ def summarize_fit(loop: Loop, fit: Fit) -> LoopFit:
     inverse = pseudo_inverse(matrix[np.ix_(rows, rows)])
     kept = rows[rows < p]
     covariance[np.ix_(kept, kept)] = inverse[: len(kept), : len(kept)]
-    notes = []
-    lost = [k for k in range(p) if inside[k] and (matrix[k, k] <= 0 or _is_unseen(matrix, rows, k))]
-    for k in lost:
-        covariance[k, :] = covariance[:, k] = 0.0
-        covariance[k, k] = math.inf
-    if lost:
-        notes.append(f"the data do not determine {write_list([names[k] for k in lost])}: other "
-                     "parameters can compensate a change of "
-                     f"{'them' if len(lost) > 1 else 'it'}")  # fmt: skip
+    covariance, notes = mark_unseen(covariance, matrix, inside, names)
     noise, scale = fit.noise, float(np.mean(fit.sensor))
     several = not loop.equations().siso
     forces = np.sqrt(scale * np.array(noise.force))
@@ -314,19 +302,8 @@ def summarize_fit(loop: Loop, fit: Fit) -> LoopFit:
         tuple(map(tuple, sensors)) if several else tuple(np.sqrt(fit.sensor).tolist()),
         tuple(forces.tolist()) if several else math.sqrt(scale * float(np.mean(noise.force))),
         math.sqrt(scale * noise.coloured) if noise.drift else 0.0, time, fit.value, fit.size,
-        tuple(n for n, b in zip(names, on_bound, strict=True) if b), tuple(notes),
+        tuple(n for n, b in zip(names, on_bound, strict=True) if b), notes,
         find_noise_units(loop, fit.problem.data[0].record),
     )  # fmt: skip
     fitted = loop.with_parameters(dict(zip(names, fit.theta.tolist(), strict=True)))
     return LoopFit(fitted, estimate)
-
-
-def _is_unseen(matrix: Array, rows: Any, k: int) -> bool:
-    """Return whether a parameter takes part in a direction that is not in the data."""
-    if k not in rows:
-        return False
-    part = matrix[np.ix_(rows, rows)]
-    size = np.sqrt(np.diag(part))
-    values, vectors = np.linalg.eigh(part / np.outer(size, size))
-    weak = vectors[list(rows).index(k), values < UNSEEN * values.max()]
-    return bool(np.any(np.abs(weak) > 0.1))
