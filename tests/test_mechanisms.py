@@ -105,3 +105,27 @@ def test_a_leaning_pole_falls_and_a_pushed_cart_tilts_it_back():
 def test_a_mechanism_refuses_what_physics_does_not_have(change):
     with pytest.raises(cid.CtrlidError, match=f"cart_pole needs {next(iter(change))} >"):
         cid.plants.cart_pole(**{"M": 1.0, "m": 0.2, "length": 0.3, **change})
+
+
+def test_swing_of_a_loop_that_sticks_is_no_flight():
+    # A pole above a cart that sticks falls until the cart slips: the loop swings to and fro without
+    # a reference, as far as the friction lets it.
+    plant = cid.plants.cart_pole(M=0.5, m=0.2, length=0.3, c=0.1)
+    upright = cid.operating_point(plant, output=(0, 0))
+    G = ct.sample_system(cid.linearize(plant, upright), 0.005)
+    K = ct.dlqr(G, np.diag([10.0, 10.0, 1.0, 1.0]), np.eye(1))[0]
+    L = G.A @ ct.dlqe(G.A, G.B, G.C, np.eye(1), 1e-4 * np.eye(2))[0]
+    observer = ct.ss(G.A - L @ G.C, np.hstack([L, G.B]), -K, np.zeros((1, 3)), 0.005,
+                     inputs=["x", "theta", "F"], outputs=["F"])  # fmt: skip
+    loop = cid.Loop(plant, observer, dt=0.005, at=upright)
+    for difference in (0.006, 0.1):
+        rubbing = loop.with_effect(
+            cid.effects.AsymmetricCoulombFriction(fc=0.5, difference=difference, at="x_dot")
+        )
+        tilt = cid.simulate(rubbing, d=np.zeros(2000)).y[1]
+        assert 1e-3 < np.abs(tilt).max() < 0.5
+    # With the wrong sign it does fly, friction or not.
+    wrong = cid.Loop(plant, -observer, dt=0.005, at=upright)
+    rubbing = wrong.with_effect(cid.effects.CoulombFriction(fc=0.01, at="x_dot"))
+    with pytest.raises(cid.CtrlidError, match="diverged"):
+        cid.simulate(rubbing, d=0.1 * np.ones(4000))

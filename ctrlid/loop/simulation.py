@@ -17,6 +17,7 @@ from ..data.reconstruction import PIECES, count_pieces, reconstruct_signal
 from ..data.record import Record
 from .loop import Loop
 from .period_map import (
+    PeriodMap,
     compute_growth_rate,
     count_signals,
     leave_out_kinks,
@@ -282,6 +283,7 @@ class Simulator:
         self.hold_r = hold_r if loop.analog else "zoh"
         first = make_period_map(loop, 1, hold, self.hold_r)
         self.plant_states, self.counts = first.plant_states, first.counts
+        self._references = first.reference
         self.rest: Array = np.array(first.rest, dtype=float)
         self._steps: dict[int, Any] = {1: first.step}
         self._runners: dict[tuple[int, int], Any] = {}
@@ -298,12 +300,35 @@ class Simulator:
         plain = leave_out_kinks(loop, memories=False)
         moving = first if plain is loop else make_period_map(plain, 1, hold, self.hold_r)
         self._motion = linearize_at_rest(moving, moving.step)
+        self._kinks = self._measure_kinks(moving) if moving is not first else 0 * self.rest
         a, b = (np.nan_to_num(np.abs(m)) for m in self._motion)
         now, ahead = first.places[2], first.places[5]
         # The corners of a band-limited input are those of all inputs in turn.
         inputs = np.abs(loop.point.inputs)
         following = b[:, ahead].reshape(len(b), -1, len(inputs)).sum(axis=1)
         self._floor = 1e-6 * (a @ np.abs(self.rest) + (b[:, now] + following) @ inputs)
+
+    def _measure_kinks(self, plain: PeriodMap) -> Array:
+        """Return by how much kinks, such as dry friction, change the states in one period at most.
+
+        They are looked for in motion away from rest, one state at a time. A loop that sticks may
+        swing to and fro by as much without any reference.
+        """
+        size = len(self.rest)
+        if len(plain.rest) != size:
+            return np.zeros(size)
+        sizes = np.concatenate([sign * np.geomspace(1e-6, 1.0, 7) for sign in (1, -1)])
+        away = np.einsum("k,ij->kij", sizes, np.diag(np.maximum(np.abs(self.rest), 1.0)))
+        z = (self.rest + away.reshape(-1, size)).T
+        w = np.zeros(sum(self.counts))
+        w[plain.places[1]] = plain.reference
+        given = z, np.tile(w[:, None], z.shape[1])
+        with_kinks, without = (
+            np.asarray(step.map(z.shape[1])(*given)[0], float)
+            for step in (self._steps[1], plain.step)
+        )
+        found = np.abs(with_kinks - without)
+        return np.asarray(np.max(np.where(np.isfinite(found), found, 0.0), axis=1))
 
     def start(self, initial: Sequence[float] | None) -> Array:
         """Return the state to start from: at rest, or with the given values."""
@@ -462,7 +487,23 @@ class Simulator:
         told[places[3] : places[4]] = 0.0
         y = np.asarray(step(rest + moved, told)[1], float)
         reach = np.max(np.abs(y - rest_of_outputs), axis=1)
+        if self._kinks.any():
+            reach = reach + self._compute_swing(a, n)
         return np.where(np.isfinite(reach), reach, math.inf)
+
+    def _compute_swing(self, a: Array, n: int) -> Array:
+        """Return how far kinks move the outputs if each time they do it in the same way."""
+        moved, pushed = np.zeros(len(a)), np.diag(self._kinks)
+        for _ in range(n):
+            moved += np.abs(pushed).sum(axis=1)
+            pushed = a @ pushed
+            if np.abs(pushed).max() < 1e-6 * moved.max():
+                break
+        w = np.zeros((sum(self.counts), len(a) + 1))
+        w[np.cumsum((0, *self.counts))[1] :][: self.counts[1]] = np.array(self._references)[:, None]
+        z = self.rest[:, None] + np.diag(moved) @ np.eye(len(a), len(a) + 1)
+        y = np.asarray(self._steps[1].map(len(a) + 1)(z, w)[1], float)
+        return np.asarray(np.abs(y[:, :-1] - y[:, -1:]).sum(axis=1))
 
     def _find_first_bad(self, states: Array, ys: Array, us: Array, asked: Array) -> int | None:
         """Return the first sample at which the loop is no longer where it can be, or None."""
