@@ -5,13 +5,19 @@ from dataclasses import replace
 import control as ct
 import numpy as np
 import pytest
+from scipy import linalg
 
 import ctrlid as cid
 import problems
 from ctrlid import effects as E
 from ctrlid.diagnosis.noise_tests import run_noise_tests
 from ctrlid.diagnosis.recalibration import fit_base_model
-from ctrlid.diagnosis.replicas import follow_record, make_replica, measure_gain_on_replicas
+from ctrlid.diagnosis.replicas import (
+    _regress_controller,
+    follow_record,
+    make_replica,
+    measure_gain_on_replicas,
+)
 from ctrlid.diagnosis.selection import run_round
 from ctrlid.loop.period_map import comes_to_rest
 from problems import levitation
@@ -98,3 +104,61 @@ def test_what_is_missing_is_found_beside_friction_all_the_same():
     best = run_round(base, [lag], lambda f, items: list(map(f, items))).best
     assert best is not None
     assert measure_gain_on_replicas([make_replica(base)], best) < 0.1 * best.gain
+
+
+def log_arm(n=4000, seed=3):
+    """Return r, u and y of an arm held upright by a PID that reads an encoder [deg].
+
+    ``y" = 30 y - 4 y' + 60 u + w``, by scipy; nothing is missing in it.
+    """
+    dt, step = 0.01, 360 / 4096
+    rng = np.random.default_rng(seed)
+    r = 2 + np.repeat(rng.choice([-4.0, 4.0], n // 45 + 1), 45)[:n]
+    A = np.array([[0.0, 1.0, 0.0], [30.0, -4.0, 60.0], [0.0, 0.0, 0.0]])
+    F = linalg.expm(A * dt)
+    x, kept, slope, us, ys = np.array([2.0, 0.0]), 0.0, 0.0, [], []
+    last = step * np.round(x[0] / step)
+    for k in range(n):
+        y = step * np.round(x[0] / step)
+        slope = (0.01 * slope - 0.35 * (y - last)) / (0.01 + dt)
+        last = y
+        kept += 6.0 * dt * (r[k] - y)
+        u = 4.0 * (r[k] - y) + kept + slope
+        us.append(u)
+        ys.append(y)
+        x = F[:2, :2] @ x + F[:2, 2] * (u + 25.0 * rng.standard_normal() / 60)
+    return r, np.array(us), np.array(ys)
+
+
+ARM = ct.nlsys(
+    lambda t, x, u, p: np.array([x[1], p["a"] * x[0] - p["c"] * x[1] + p["K"] * u[0]]),
+    lambda t, x, u, p: x[0], inputs=["duty"], outputs=["angle"], states=["angle", "rate"],
+    params={"a": 30.0, "c": 5.0, "K": 50.0}, name="arm",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("filter_time", [0.01, 0.02, None])
+def test_answer_about_a_coarse_encoder_needs_no_controller(filter_time):
+    """The steps reach u through the law, whether it is stated rightly, wrongly or not at all."""
+    r, u, y = log_arm()
+    law = None
+    if filter_time:
+        law = cid.PID(kp=4, ki=6, kd=0.35, filter_time=filter_time, derivative="measurement")
+    record = cid.Record(r=r, u=u, y=y, dt=0.01)
+    at = cid.operating_point(ARM, output=2.0)
+    loop = cid.Loop(ARM, law, dt=0.01, at=at, free=("c", "K"))
+    few = [E.CoulombFriction, E.InputDelay]
+    found = cid.diagnose(loop, record, catalogue=few, progress=False)
+    assert found.verdict == "nothing missing"
+
+
+def test_law_is_found_in_the_recorded_input():
+    r, u, y = log_arm(2000)
+    record = cid.Record(r=r, u=u, y=y, dt=0.01)
+    C = _regress_controller(record, 0.01)
+    # Of a PID with a filtered derivative: u reacts to y as -(4 + 6 T / (1 - 1/z) + 0.35 s / ...).
+    z = np.exp(1j * np.array([0.1, 0.5, 2.0]))
+    wanted = 4 + 0.06 / (1 - 1 / z) + 0.35 * (1 - 1 / z) / (0.02 - 0.01 / z)
+    assert C(z) == pytest.approx(wanted, rel=1e-6)
+    noisy = replace(record, u=u + np.random.default_rng(1).standard_normal(len(u)))
+    assert _regress_controller(noisy, 0.01) is None

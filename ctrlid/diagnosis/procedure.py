@@ -268,7 +268,7 @@ def _answer_question(q: Question) -> tuple[Diagnosis, Search]:
         search = q.attempt(lambda: _search_again(q, base, search, helps, is_larger), search)
     # Step 3 again: what is left is tested with the steps of the converter in the replicas.
     q.tell("comparing on fresh data")
-    steps = read_steps(search.final.fit, q.audits, q.catalogue)
+    steps = read_steps(search.final.fit, q.audits)
     if steps and search.finished and not search.after.passed:
         search = replace(search, after=forgive_rounding(search.after, search.final, steps))
     # Step 8: what else would do in the place of each effect.

@@ -178,17 +178,14 @@ def censor_record(record: Record, effect: AbstractEffect) -> Record:
     return replace(record, valid=np.asarray(record.valid) & free)
 
 
-def read_steps(
-    fit: Fit, audits: Sequence[Audit], catalogue: Sequence[type[AbstractEffect]]
-) -> tuple[Readout, ...]:
+def read_steps(fit: Fit, audits: Sequence[Audit]) -> tuple[Readout, ...]:
     r"""Return the step of each sensor if it makes a good part of its noise.
 
     Rounding to steps q adds a variance of :math:`q^2/12`; knowing it, the likelihood gains
-    :math:`\tfrac{n}{2} \ln r / (r - q^2/12)`.
+    :math:`\tfrac{n}{2} \ln r / (r - q^2/12)`. They belong to the record, and
+    are no candidate of the catalogue.
     """
     e = fit.plant.e
-    if Quantization not in catalogue:
-        return ()
     found = []
     for k, name in enumerate(e.outputs):
         # The audit calls the signals of a plant with one of each u and y.

@@ -1,7 +1,7 @@
 """Step 6: records that a fitted model would have given, in which nothing more is hidden."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy as np
 from .._base.arrays import Array
 from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from ..data.record import Record
+from ..data.validity import find_whole_past
 from ..estimation.likelihood.likelihood import (
     evaluate_likelihood,
     make_problem,
@@ -20,6 +21,7 @@ from ..estimation.likelihood.maximization import begin_fit, maximize
 from ..loop.loop import Loop
 from ..loop.period_map import comes_to_rest
 from ..validation.record_simulation import find_long_stretches, prepare_stretch
+from ..validation.reproduction import choose_reproduction
 from .candidates import Trial
 from .fitted_model import Model, can_simulate, carry_over_fit
 from .gap import draw_noise, make_simulator
@@ -74,7 +76,8 @@ def make_replica(model: Model, seed: int = 0) -> Model | None:
 def _simulate_record(
     model: Model, record: Record, first: float, sensor: float, seed: int
 ) -> Record:
-    follows = not can_simulate(model)
+    # What a rejected law leaves of the recorded input carries the recorded noise into a simulation.
+    follows = not can_simulate(model) or choose_reproduction(model.loop, record).horizon > 0
     loop = follow_record(model.fitted, record) if follows else model.fitted
     if loop is None:
         raise ModelCannotRun("the record cannot be followed")
@@ -182,9 +185,11 @@ def follow_record(loop: Loop, record: Record) -> Loop | None:
 
     .. math:: u = u_{record} + C (y_{record} - y)
 
-    With the recorded input alone an unstable plant leaves the record at once. C is the normalized
-    linear quadratic Gaussian controller of the linearized plant: input and output count by their
-    standard deviations in the record, and so do the noises at input and output.
+    With the recorded input alone an unstable plant leaves the record at once. C is the part of the
+    controller that acts on y, as a regression of the recorded u finds it, where that keeps the
+    plant: then u moves with each step of a converter and each noise as it did. Else it is the
+    normalized linear quadratic Gaussian controller of the linearized plant: input and output count
+    by their standard deviations in the record, and so do the noises at input and output.
 
     Parameters
     ----------
@@ -207,12 +212,47 @@ def follow_record(loop: Loop, record: Record) -> Loop | None:
     use = record.valid_samples
     u, y = (np.maximum(np.std(np.atleast_2d(v)[:, use], axis=1), THRESHOLD.tiny)
             for v in (record.u, record.y))  # fmt: skip
+    if len(u) == len(y) == 1:
+        made = _close_loop(loop, lambda: _regress_controller(record, loop.dt))
+        if made is not None:
+            return made
+    return _close_loop(loop, lambda: _design_normalized_controller(loop.linearize(), loop.dt, u, y))
+
+
+def _close_loop(loop: Loop, design: Callable[[], Any]) -> Loop | None:
+    """Return a loop with a controller that is designed for it, None where it does not keep it."""
     try:
-        controller = _design_normalized_controller(loop.linearize(), loop.dt, u, y)
+        controller = design()
         made = replace(loop, controller=controller)
         return made if controller is not None and comes_to_rest(made) else None
     except (ModelCannotRun, EffectDoesNotApply):
         return None
+
+
+def _regress_controller(record: Record, dt: float) -> Any:
+    r"""Return how the recorded input reacts to y, None where it does so hardly.
+
+    .. math:: A(q)\, u_k = -B(q)\, y_k + F(q)\, r_k + c
+
+    by least squares. A digital law without limits is found exactly, since it computes u from the
+    recorded numbers, their noise included.
+    """
+    order = THRESHOLD.law_order
+    lags = range(order + 1)
+    signals = [record.u, record.y, *([] if record.r is None else [record.r])]
+    whole = find_whole_past(record.valid, order)[order:]
+    columns = np.column_stack([
+        *(v[order - k : len(v) - k] for v in signals for k in lags), np.ones(len(whole))
+    ])[whole]  # fmt: skip
+    if len(columns) <= columns.shape[1]:
+        return None
+    goal, table = columns[:, 0], columns[:, 1:]
+    size = np.maximum(np.sqrt(np.mean(table**2, axis=0)), THRESHOLD.tiny)
+    found = np.linalg.lstsq(table / size, goal, rcond=None)[0] / size
+    left = np.var(goal - table @ found)
+    if left > THRESHOLD.law_left * np.var(np.diff(record.u)[record.valid[1:]]):
+        return None
+    return ct.tf(-found[order : 2 * order + 1], [1, *-found[:order]], dt)
 
 
 def _design_normalized_controller(model: Any, dt: float, u: Array, y: Array) -> Any:

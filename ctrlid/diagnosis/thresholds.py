@@ -233,6 +233,14 @@ class Thresholds:
         0.05, cost="so much sensor noise at least is simulated beside the steps of a converter",
         unit="of the sensor noise's variance",
     )  # fmt: skip
+    law_order: int = declare_number(
+        3, cost="of the regression that finds how the recorded input reacts to y", unit="samples"
+    )
+    law_left: float = declare_number(
+        1e-3, cost="a law that leaves more of the recorded input is not the controller's, which "
+        "computes it from recorded numbers up to their rounding",
+        unit="of the variance of the input's change in a sample",
+    )  # fmt: skip
     simpler_nearly: float = declare_number(
         0.1, study="a simpler effect takes the place of a richer one only if it loses less",
         unit="of the richer one's gain",
