@@ -148,7 +148,9 @@ def test_units_that_contradict_each_other_are_told_by_every_door():
     at = cid.operating_point(plant, output=0.0)
     loop = cid.Loop(plant, cid.PID(kp=5.0, kd=0.5, bias=0.0), dt=DT, at=at, free=("m",))
     record = record_of(loop, E.ViscousFriction(0.1), 0.1, 1e-4, 3, n=600)
-    words = r"y is recorded in deg, but the plant has it in rad.*scale=.'y': factor.*units=.'theta'"
+    words = (
+        r"y is recorded in deg, but the plant has it in rad.*scale=.'y': 0.0174533.*units=.'theta'"
+    )
     wrong = replace(record, units={"r": "rad", "u": "Nm", "y": "deg"})
     (found,) = cid.audit(wrong, loop)["units"]
     assert found.harmful
@@ -158,6 +160,9 @@ def test_units_that_contradict_each_other_are_told_by_every_door():
     told = [text for text in told if "UNITS DO NOT AGREE" in text]
     assert len(told) == 2
     assert all(re.search(words, text) for text in told)
+    # Names of effects have no meaning there, and would cost minutes.
+    with pytest.raises(cid.CtrlidError, match="the units do not agree: " + words):
+        cid.diagnose(loop, wrong, progress=False)
     for right in ({"y": "radians", "u": "N*m", "r": "rad"}, {}, {"u": "N m"}):
         alike = replace(record, units=right)
         assert cid.audit(alike, loop)["units"] == ()

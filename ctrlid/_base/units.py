@@ -22,6 +22,8 @@ SPELLINGS = {
 PER_SI = {"n": 1e9, "µ": 1e6, "m": 1e3, "k": 1e-3, "M": 1e-6}
 PER_SI_ALONE = {"deg": 180 / math.pi, "rev": 0.5 / math.pi, "cm": 100.0, "%": 100.0, "g": 1e3,
                 "kg": 1.0, "min": 1 / 60, "h": 1 / 3600}  # fmt: skip
+SI_UNITS = {"deg": "rad", "rev": "rad", "cm": "m", "%": "1", "1": "1", "g": "kg", "kg": "kg",
+            "min": "s", "h": "s"}  # fmt: skip
 MARKS = re.compile(r"[/()*·]|\^-?\d+|[^\s/()*·^]+|\S")
 
 
@@ -132,6 +134,45 @@ def count_per_si_unit(text: str) -> float:
         return PER_SI_ALONE[symbol]
     prefixed = symbol not in WITH_PREFIX and symbol[1:] in WITH_PREFIX
     return PER_SI.get(symbol[0], 1.0) if prefixed else 1.0
+
+
+def find_factor(given: str, wanted: str) -> float | None:
+    """Return what turns numbers in one unit into numbers in another one of the same quantity.
+
+    Parameters
+    ----------
+    given, wanted : str
+        Units of a single symbol.
+
+    Returns
+    -------
+    float or None
+        The factor; None where they are not known to be of the same quantity.
+
+    Examples
+    --------
+    >>> find_factor("mm", "m"), round(find_factor("deg", "rad"), 6), find_factor("V", "A")
+    (0.001, 0.017453, None)
+    """
+    first, second = _find_si_unit(given), _find_si_unit(wanted)
+    if first is None or first != second:
+        return None
+    return count_per_si_unit(wanted) / count_per_si_unit(given)
+
+
+def _find_si_unit(text: str) -> str | None:
+    """Return the SI unit that `count_per_si_unit` counts in; None where it does not know."""
+    powers = _spell_alike(text)
+    if not powers:
+        return None
+    if list(powers.values()) != [1]:
+        return None
+    (symbol,) = powers
+    if symbol in SI_UNITS:
+        return SI_UNITS[symbol]
+    if symbol in WITH_PREFIX:
+        return symbol
+    return symbol[1:] if symbol[0] in PER_SI and symbol[1:] in WITH_PREFIX else None
 
 
 def _spell_alike(text: str) -> dict[str, int]:

@@ -17,6 +17,7 @@ from ..data.record import Record
 from ..data.several_records import as_records, order_model_and_data, require_valid_samples
 from ..effects import CATALOGUE, AbstractEffect
 from ..loop.loop import Loop
+from ..loop.unit_check import refuse_unit_clashes
 from ..loop.wiring import match_signals
 from ..validation.record_audit import Audit
 from ..validation.reproduction import OPEN_LOOP
@@ -191,6 +192,8 @@ def diagnose(
     given = make_loop(loop, records[0])
     if not given.equations().siso:
         records = tuple(match_signals(one, given.equations()) for one in records)
+    for one in records:
+        refuse_unit_clashes(given, one)
     loop = with_units_of(given, records[0])
     fresh = choose_fresh_data(loop, records, None if validation is None else as_records(validation))
     jobs = check_jobs(jobs)

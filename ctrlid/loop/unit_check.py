@@ -4,7 +4,8 @@ import math
 
 import numpy as np
 
-from .._base.units import is_same_unit
+from .._base.errors import CtrlidError
+from .._base.units import find_factor, is_same_unit
 from ..data.record import Record
 from .loop import Loop
 
@@ -59,13 +60,15 @@ def find_unit_clashes(loop: Loop, record: Record) -> list[tuple[str, str]]:
         here, signal = known.get(name, ""), name if several else key
         if not (here and there) or is_same_unit(here, there):
             continue
+        factor = find_factor(there, here)
+        scale = "factor" if factor is None else f"{factor:.6g}"
         how = "without a unit" if there == "1" else f"in {there}"
         found.append(
             (
                 signal,
                 f"{signal} is recorded {how}, but the plant has it in {here}. The model takes the "
                 "numbers as they are. If the plant is right, convert the record: "
-                f"Record.from_csv(..., scale={{{key!r}: factor}}, units={{{key!r}: {here!r}}}). "
+                f"Record.from_csv(..., scale={{{key!r}: {scale}}}, units={{{key!r}: {here!r}}}). "
                 f"If the record is right, say so: Loop(..., units={{{name!r}: {there!r}}}).",
             )
         )
@@ -88,6 +91,19 @@ def note_unit_clashes(loop: Loop, record: Record) -> tuple[str, ...]:
         Sentences that begin in capitals; none where the units agree or are not known.
     """
     return tuple(f"UNITS DO NOT AGREE: {text}" for _, text in find_unit_clashes(loop, record))
+
+
+def refuse_unit_clashes(loop: Loop, record: Record) -> None:
+    """Refuse a record that says to have other units than the loop says.
+
+    Raises
+    ------
+    CtrlidError
+        If it does: whatever is found with numbers of another size has no meaning.
+    """
+    clashes = find_unit_clashes(loop, record)
+    if clashes:
+        raise CtrlidError("the units do not agree: " + " ".join(text for _, text in clashes))
 
 
 def measure_distance(loop: Loop, record: Record) -> float:
