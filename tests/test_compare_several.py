@@ -80,3 +80,23 @@ def test_compare_sees_a_wrong_plant(dithered):
     assert "SOMETHING IS MISSING" in found.verdict
     with pytest.raises(cid.CtrlidError, match="pick one with"):
         cid.compare(record, ct.tf([1], [1, 1]))
+
+
+def test_pictures_and_report_of_several_outputs(dithered, tmp_path):
+    """Each raised numpy's or matplotlib's own error, or spoke of a picture nobody had asked for."""
+    loop, record, _ = dithered
+    found = cid.compare(record, loop)
+    for window in (None, (0.0, 1.0)):
+        picture = cid.plot.comparison(found, window=window)
+        labels = [ax.get_ylabel() for ax in picture.axes]
+        assert [text.split()[0] for text in labels] == list(loop.signals["y"])
+        assert all("fit" in ax.get_legend_handles_labels()[1][1] for ax in picture.axes)
+    fitted = cid.fit_loop(loop, record, free=("M",))
+    assert cid.plot.poles({"fitted": fitted.model}).axes[0].lines
+    rows = cid.fit_arx(record, 4, 4)
+    page = cid.write_report([record, fitted, found, rows], tmp_path / "page.html").read_text(
+        "utf-8"
+    )
+    for words in ("Poles of the fitted physics", "Poles of each output", "<h3>theta</h3>",
+                  "Measured output, predictions and simulations"):  # fmt: skip
+        assert words in page

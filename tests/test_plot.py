@@ -280,6 +280,20 @@ def test_poles_of_a_fit_are_those_of_its_estimate(record):
     assert len(legend(plot.poles({"fit": G})[0])) == 1
 
 
+TWO_INPUTS = ct.ss(np.zeros((1, 1)), np.zeros((1, 2)), np.zeros((1, 1)), np.zeros((1, 2)))
+
+
+def test_frequency_response_is_that_of_one_signal():
+    with pytest.raises(cid.CtrlidError, match="'a' must have one input and one output"):
+        plot.bode({"a": TWO_INPUTS})
+
+
+def test_poles_of_several_signals_and_a_single_one_at_the_origin():
+    for model in (TWO_INPUTS, ct.tf(1, [1, 0])):
+        (ax,) = plot.poles({"a": model})
+        assert legend(ax) == ["a: 0"]
+
+
 def test_poles_in_the_s_plane():
     (ax,) = plot.poles({"a": ct.tf(1, [1, 2, 10]), "b": ct.tf(1, [1, 0])})
     assert labels(ax) == ("real part of s [rad/s]", "imaginary part of s [rad/s]")
@@ -290,9 +304,7 @@ def test_poles_in_the_s_plane():
 @pytest.mark.parametrize(
     ("models", "words"),
     [({}, "at least one model"), ([1], "takes a mapping from labels to models"),
-     ({"a": 3}, "'a' must be a TransferFunction or StateSpace; given int"),
-     ({"a": ct.ss(np.zeros((1, 1)), np.zeros((1, 2)), np.zeros((1, 1)), np.zeros((1, 2)))},
-      "'a' must have one input and one output")],
+     ({"a": 3}, "'a' must be a TransferFunction or StateSpace; given int")],
 )  # fmt: skip
 def test_models_are_checked(draw, models, words):
     with pytest.raises(cid.CtrlidError, match=words):

@@ -15,7 +15,7 @@ from ..data.record import Record
 from ..design.controller_trial import ControllerTrial
 from ..design.redesigning import Redesign
 from ..diagnosis.result import Diagnosis
-from ..estimation.identified_model import IdentifiedModel
+from ..estimation.identified_model import IdentifiedModel, IdentifiedSystem
 from ..estimation.likelihood.physics_estimate import LoopFit
 from ..validation.comparison import Comparison
 from . import plot
@@ -80,8 +80,8 @@ class Section:
     text : str, optional
         Plain words; an empty line starts a new paragraph.
     result : object, optional
-        A `Table`, `Record`, `IdentifiedModel`, `LoopFit`, `Comparison`, `Redesign`,
-        `ControllerTrial` or `Diagnosis`, or a tuple of them.
+        A `Table`, `Record`, `IdentifiedModel`, `IdentifiedSystem`, `LoopFit`, `Comparison`,
+        `Redesign`, `ControllerTrial` or `Diagnosis`, or a tuple of them.
     figure : object, optional
         A `plot.Picture`, a matplotlib figure or axes, or the bytes of a PNG file, or a mapping of
         such by caption. By default the pictures that belong to the result, an empty mapping for
@@ -121,7 +121,7 @@ def write_report(result: Any, path: str | Path, *, title: str = "") -> Path:
     Parameters
     ----------
     result : Record, IdentifiedModel, LoopFit, Comparison, Redesign, Diagnosis or Section
-        What to report, or several of them in a sequence.
+        What to report (all that a `Section` takes), or several of them in a sequence.
     path : str or Path
         The file; one that exists is replaced.
     title : str, optional
@@ -193,9 +193,14 @@ def _draw_pictures(result: Any) -> dict[str, Any]:
         case IdentifiedModel():
             return {"Poles.": plot.poles({"identified": result}),
                     "Frequency response.": plot.bode({"identified": result})}  # fmt: skip
+        case IdentifiedSystem():
+            rows = {name: result[name, result.input_labels[0]] for name in result.output_labels}
+            return {"Poles of each output.": plot.poles(rows)}
         case LoopFit():
-            return {"Poles of the fitted physics.": plot.poles({"fitted": result.model}),
-                    "Its frequency response.": plot.bode({"fitted": result.model})}  # fmt: skip
+            made = {"Poles of the fitted physics.": plot.poles({"fitted": result.model})}
+            if result.loop.equations().siso:
+                made["Its frequency response."] = plot.bode({"fitted": result.model})
+            return made
         case Comparison():
             made = {"Measured output, predictions and simulations.": plot.comparison(result)}
             if result.tests:

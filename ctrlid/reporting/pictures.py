@@ -57,8 +57,11 @@ def find_telling_window(comparison: Comparison) -> int:
     return int(starts[np.argmin(np.where(lively, usual, np.inf))])
 
 
-def check_models(models: Any, who: str) -> dict[str, Any]:
-    """Return models by label, a single one by its name, or refuse in the name of a picture."""
+def check_models(models: Any, who: str, several: bool = False) -> dict[str, Any]:
+    """Return models by label, a single one by its name, or refuse in the name of a picture.
+
+    Those of several signals are refused unless the picture can show them.
+    """
     if isinstance(models, ct.TransferFunction | ct.StateSpace):
         models = {models.name: models}
     if not isinstance(models, Mapping) or not models:
@@ -68,7 +71,7 @@ def check_models(models: Any, who: str) -> dict[str, Any]:
         if not isinstance(model, ct.TransferFunction | ct.StateSpace):
             raise CtrlidError(f"{who}: {label!r} must be a TransferFunction or StateSpace; given "
                               f"{type(model).__name__}")  # fmt: skip
-        if model.ninputs != 1 or model.noutputs != 1:
+        if not several and (model.ninputs != 1 or model.noutputs != 1):
             raise CtrlidError(f"{who}: {label!r} must have one input and one output")
     return {str(k): m for k, m in models.items()}
 

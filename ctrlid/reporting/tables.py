@@ -12,7 +12,7 @@ from ..design.controller_trial import ControllerTrial
 from ..design.redesigning import Redesign
 from ..diagnosis import wording
 from ..diagnosis.result import Diagnosis
-from ..estimation.identified_model import Estimate, IdentifiedModel
+from ..estimation.identified_model import Estimate, IdentifiedModel, IdentifiedSystem
 from ..estimation.likelihood.physics_estimate import LoopFit
 from ..physics.trace import timebase
 from ..validation.comparison import Comparison, write_fit
@@ -96,6 +96,8 @@ def write_heading(result: Any) -> str:
             return f"Record {result.name}".strip()
         case IdentifiedModel():
             return f"Model by {result.estimate.method}"
+        case IdentifiedSystem():
+            return f"Model by {next(iter(result.estimates.values())).method}"
         case LoopFit():
             return f"Physical parameters of {result.loop.plant.name}"
         case Comparison():
@@ -107,8 +109,9 @@ def write_heading(result: Any) -> str:
         case Table():
             return result.caption or "Table"
     raise CtrlidError(
-        "a report shows a Record, IdentifiedModel, LoopFit, Comparison, Redesign, ControllerTrial, "
-        f"Diagnosis, Table or Section, or a sequence of them; given {type(result).__name__}"
+        "a report shows a Record, IdentifiedModel, IdentifiedSystem, LoopFit, Comparison, "
+        "Redesign, ControllerTrial, Diagnosis, Table or Section, or a sequence of them; given "
+        f"{type(result).__name__}"
     )
 
 
@@ -121,10 +124,16 @@ def make_blocks(result: Any) -> list[Block]:
             return [_make_record_table(result)]
         case IdentifiedModel():
             return _make_estimate_blocks(result.estimate)
+        case IdentifiedSystem():
+            return [block for name, estimate in result.estimates.items()
+                    for block in (Title(name), *_make_estimate_blocks(estimate))]  # fmt: skip
         case LoopFit():
             return _make_loop_fit_blocks(result)
         case Comparison():
-            return [*_make_comparison_tables(result), *result.notes, result.verdict]
+            tables = [
+                t for one in result.outputs or (result,) for t in _make_comparison_tables(one)
+            ]
+            return [*tables, *result.notes, result.verdict]
         case Redesign():
             return _make_redesign_blocks(result)
         case ControllerTrial():

@@ -51,8 +51,9 @@ def poles(models: Any, ax: Any = None, *, truth: Any = None) -> Picture:
     >>> made.axes[0].get_xlabel()
     'real part of z [1]'
     """
-    models = _pictures.check_models(models, "plot.poles")
-    physics = _pictures.check_models({"physics": truth}, "plot.poles") if truth is not None else {}
+    models = _pictures.check_models(models, "plot.poles", several=True)
+    physics = {} if truth is None else {"physics": truth}
+    physics = _pictures.check_models(physics, "plot.poles", several=True) if physics else {}
     dt = _pictures.find_period({**models, **physics})
     found = {k: _pictures.find_poles(m, dt) for k, m in (*models.items(), *physics.items())}
     if not any(p.size for p in found.values()):
@@ -245,7 +246,8 @@ def _choose_view(ax: Any, places: Any) -> None:
     """Choose limits that hold all places, of the same scale in both directions."""
     low, high = places.real.min(), places.real.max()
     tall = np.abs(places.imag).max()
-    pad = 0.15 * max(high - low, tall, 0.1 * max(abs(high), abs(low)))
+    # A single pole at the origin has no size to choose the view by.
+    pad = 0.15 * (max(high - low, tall, 0.1 * max(abs(high), abs(low))) or 1.0)
     half = max(tall + pad, 0.25 * (high - low + 2 * pad))
     width = max(high - low + 2 * pad, 4 * half)
     middle = 0.5 * (low + high)

@@ -126,11 +126,11 @@ def comparison(
     ----------
     comparison : Comparison
         From `compare`.
-    ax : matplotlib Axes, optional
-        By default that of a new figure.
+    ax : matplotlib Axes or sequence of them, optional
+        One for each output; by default those of a new figure.
     window : (float, float), optional
-        From when to when [s]; by default a stretch with a lively output in which the error of the
-        last curve is as large as it usually is, neither the best nor the worst one.
+        From when to when [s]; by default a stretch with a lively (first) output in which the error
+        of its last curve is as large as it usually is, neither the best nor the worst one.
 
     Returns
     -------
@@ -154,7 +154,7 @@ def comparison(
     require_kind(comparison, Comparison, "plot.comparison draws a Comparison, as compare() returns")
     whole = comparison.record
     if window is None:
-        first = _pictures.find_telling_window(comparison)
+        first = _pictures.find_telling_window((*comparison.outputs, comparison)[0])
         stop = min(first + _pictures.WINDOW, len(whole))
     else:
         if not (isinstance(window, tuple | list | np.ndarray) and len(window) == 2):
@@ -162,36 +162,42 @@ def comparison(
         part = whole.between(*window)
         first = round((part.start - whole.start) / whole.dt)
         stop = first + len(part)
-    axes = take_axes(ax, 1)
-    ax = axes[0]
-    t, shown = whole.t[first:stop], slice(first, stop)
+    parts = comparison.outputs or (comparison,)
+    axes = take_axes(ax, len(parts), sharex=True)
+    for ax, one in zip(axes, parts, strict=True):
+        _draw_curves(ax, one, slice(first, stop))
+        finish_axes(ax)
+    ends = [f"{a:.4g} to {a + n * whole.dt:.4g} s" for a, n in
+            ((whole.t[first], stop - first), (whole.start, len(whole)))]  # fmt: skip
+    axes[-1].set_xlabel(f"time [s], {ends[0]} of a record from {ends[1]}")
+    return Picture(axes)
+
+
+def _draw_curves(ax: Any, comparison: Comparison, shown: slice) -> None:
+    """Draw the measured output and what is made of it, in the samples shown."""
+    whole = comparison.record
+    t = whole.t[shown]
     scale, unit = _pictures.choose_scale([whole.y[shown]], whole.units.get("y", ""))
     y = scale * whole.y[shown]
     ax.plot(t, y, label=f"measured {whole.names.get('y', 'y')}", **MEASURED)
+    lines = []
     for i, curve in enumerate(comparison.curves):
         values = scale * curve.y[shown]
         # Long predictions are made from every few samples only; breaks are where nothing counts.
         kept = np.isfinite(values) | ~whole.valid[shown]
         label = f"{curve.label}: fit {write_fit(curve.fit, 1)}"
-        ax.plot(t[kept], values[kept], label=label, **choose_line_style(i))
+        lines += ax.plot(t[kept], values[kept], label=label, **choose_line_style(i))
     # A prediction of a wrong model can be anywhere; what was measured must stay readable.
     span = float(np.ptp(y)) or 1.0
     low, high = ax.get_ylim()
     low, high = max(low, y.min() - 0.8 * span), min(high, y.max() + 0.8 * span)
     ax.set_ylim(low, high)
-    for line, curve in zip(
-        ax.get_lines()[-len(comparison.curves) :], comparison.curves, strict=True
-    ):
-        values = scale * curve.y[shown]
+    for line in lines:
+        values = np.asarray(line.get_ydata(), float)
         if not np.any((low < values) & (values < high)):
             line.set_label(f"{line.get_label()}, outside this picture")
-    _shade_gaps(ax, whole[first:stop])
+    _shade_gaps(ax, whole[shown])
     ax.set_ylabel(f"{whole.names.get('y', 'y')} [{unit}]")
-    ends = [f"{a:.4g} to {a + n * whole.dt:.4g} s" for a, n in
-            ((t[0], len(t)), (whole.start, len(whole)))]  # fmt: skip
-    ax.set_xlabel(f"time [s], {ends[0]} of a record from {ends[1]}")
-    finish_axes(ax)
-    return Picture(axes)
 
 
 @explain_names
