@@ -106,12 +106,12 @@ def test_what_is_missing_is_found_beside_friction_all_the_same():
     assert measure_gain_on_replicas([make_replica(base)], best) < 0.1 * best.gain
 
 
-def log_arm(n=4000, seed=3):
+def log_arm(n=4000, seed=3, step=360 / 4096, zone=0.0):
     """Return r, u and y of an arm held upright by a PID that reads an encoder [deg].
 
-    ``y" = 30 y - 4 y' + 60 u + w``, by scipy; nothing is missing in it.
+    ``y" = 30 y - 4 y' + 60 u + w``, by scipy. In a dead zone w alone acts.
     """
-    dt, step = 0.01, 360 / 4096
+    dt = 0.01
     rng = np.random.default_rng(seed)
     r = 2 + np.repeat(rng.choice([-4.0, 4.0], n // 45 + 1), 45)[:n]
     A = np.array([[0.0, 1.0, 0.0], [30.0, -4.0, 60.0], [0.0, 0.0, 0.0]])
@@ -126,7 +126,8 @@ def log_arm(n=4000, seed=3):
         u = 4.0 * (r[k] - y) + kept + slope
         us.append(u)
         ys.append(y)
-        x = F[:2, :2] @ x + F[:2, 2] * (u + 25.0 * rng.standard_normal() / 60)
+        acting = u - np.clip(u, -zone / 2, zone / 2)
+        x = F[:2, :2] @ x + F[:2, 2] * (acting + 25.0 * rng.standard_normal() / 60)
     return r, np.array(us), np.array(ys)
 
 
@@ -162,3 +163,29 @@ def test_law_is_found_in_the_recorded_input():
     assert C(z) == pytest.approx(wanted, rel=1e-6)
     noisy = replace(record, u=u + np.random.default_rng(1).standard_normal(len(u)))
     assert _regress_controller(noisy, 0.01) is None
+
+
+def test_dead_zone_is_about_zero_where_a_weight_is_held():
+    """It was found about the operating point's input, with the rest of the error unexplained."""
+    r, u, y = log_arm(2500, step=0.01, zone=3.0)
+    record = cid.Record(r=r, u=u, y=y, dt=0.01)
+    law = cid.PID(kp=4, ki=6, kd=0.35, filter_time=0.01, derivative="measurement")
+    at = cid.operating_point(ARM, output=2.0)
+    assert at.input == pytest.approx(-1.2)
+    loop = cid.Loop(ARM, law, dt=0.01, at=at, free=("c", "K"))
+    found = cid.diagnose(loop, record, catalogue=[E.InputDeadZone, E.CoulombFriction],
+                         progress=False)  # fmt: skip
+    assert found.verdict == "explained"
+    (finding,) = found.findings
+    assert finding.effect.centre == 0.0
+    assert finding.equivalents == ()
+    assert abs(finding.effect.width - 3.0) < 4 * finding.standard_errors["width"]
+    assert "centre = 0" in str(found)
+
+
+def test_middle_of_a_dead_zone_is_a_number():
+    assert str(E.InputDeadZone(2.0, centre=0.0)) == "InputDeadZone: width = 2 [u], centre = 0.0"
+    assert "centre" not in str(E.InputDeadZone(2.0))
+    for wrong in ("middle", np.nan, None):
+        with pytest.raises(cid.CtrlidError, match="needs a finite number for centre"):
+            E.InputDeadZone(2.0, centre=wrong)

@@ -294,7 +294,7 @@ def with_rounding(model: Model, coarse: Sequence[Readout]) -> Model:
         steps[one.effect.at or outputs[0]] = one.effect.values()["step"]
         loop = loop.with_effect(one.effect)
     first, *others = (
-        np.maximum(v - step**2 / ROUNDING, THRESHOLD.sensor_beside_steps * v)
+        np.maximum(v - step**2 / ROUNDING, THRESHOLD.noise_beside_steps * v)
         for v, step in zip(
             [fit.sensor, *(fit.sensor * size for size in fit.noise.sensors)], steps.values(),
             strict=True,

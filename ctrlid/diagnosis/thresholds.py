@@ -229,10 +229,6 @@ class Thresholds:
     shortest_segment: int = declare_number(
         10, cost="shorter ones are not simulated anew", unit="samples"
     )
-    sensor_beside_steps: float = declare_number(
-        0.05, cost="so much sensor noise at least is simulated beside the steps of a converter",
-        unit="of the sensor noise's variance",
-    )  # fmt: skip
     law_order: int = declare_number(
         3, cost="of the regression that finds how the recorded input reacts to y", unit="samples"
     )

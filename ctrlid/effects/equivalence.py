@@ -70,6 +70,9 @@ def equivalents(
     check_arguments(equivalents, locals())
     if isinstance(loop, type) or not callable(getattr(loop, "with_effect", None)):
         raise CtrlidError(f"equivalents needs a Loop as loop; given {type(loop).__name__}")
+    if getattr(effect, "centre", "") != "":
+        # From one side of a zone it is an offset, but its record comes from both.
+        return ()
     base = loop.without_effect(effect) if effect in loop.effects else loop
     if not base.equations().siso:
         return _find_equivalents_at_places(effect, base, catalogue)

@@ -10,7 +10,8 @@ from typing import Any, ClassVar, Self, final
 
 import numpy as np
 
-from .._base.errors import EffectDoesNotApply
+from .._base.arguments import is_number
+from .._base.errors import CtrlidError, EffectDoesNotApply
 from .context import Moment
 from .kinds import InputEffect, choose_first_width
 from .parameters import parameter
@@ -18,6 +19,9 @@ from .scanning import CUT_OFF, Scan, Sight
 
 # An input that was limited nearly always may have been limited to these shares of its range.
 DEPTHS = (0.5, 0.25)
+# Where the operating point's input is nearer to zero than this share of its range, a zone about the
+# one is a zone about the other.
+NEAR_ZERO = 0.01
 
 
 def find_range(values: Any, around: float) -> tuple[float, float]:
@@ -103,7 +107,7 @@ class InputSaturation(InputEffect):
 @final
 @dataclass(frozen=True)
 class InputDeadZone(InputEffect):
-    r"""Small deviations of the input do nothing.
+    r"""Small inputs, or small deviations of the input, do nothing.
 
     .. math:: u_a = u - \min(\max(u - u_0, -w/2), w/2)
 
@@ -112,7 +116,10 @@ class InputDeadZone(InputEffect):
     Parameters
     ----------
     width : float
-        Full width w of the zone [input unit], centred at the operating point's input.
+        Full width w of the zone [input unit].
+    centre : float, optional
+        Its middle u_0 [input unit]; by default the operating point's input. `diagnose` tries zero
+        as well, where that of an amplifier or a motor is, if the input comes by.
 
     Examples
     --------
@@ -122,25 +129,47 @@ class InputDeadZone(InputEffect):
     """
 
     width: float = parameter("{u}", lower=0.0, neutral=0.0)
+    # A number; without one nothing is shown of it.
+    centre: Any = ""
 
     in_linear_model: ClassVar[bool] = False
     look_alikes: ClassVar[tuple[str, ...]] = (
         "InputBacklash", "CoulombFriction", "InputSaturation",
     )  # fmt: skip
-    sentence: ClassVar[str] = "Small deviations of the input from the operating point do nothing."
+    sentence: ClassVar[str] = "Small deviations of the input from the middle of a zone do nothing."
     experiment: ClassVar[str] = (
         "small and large signals around the operating point: the gain is lower for small ones"
     )
 
+    def check(self) -> None:
+        """Refuse a middle that is no number."""
+        if isinstance(self.centre, str) and not self.centre:
+            return
+        if not is_number(self.centre) or not math.isfinite(self.centre):
+            raise CtrlidError(f"InputDeadZone needs a finite number for centre; given "
+                              f"{self.centre!r}. Leave it out for the operating point's input"
+                              )  # fmt: skip
+
     @classmethod
     def candidates(cls, loop: Any, record: Any = None) -> tuple[Self, ...]:
-        """Return a zone of a tenth of the range of the recorded input."""
-        return cls._applicable(loop, cls(width=choose_first_width(loop, record)))
+        """Return a zone of a tenth of the range of the recorded input, and one about zero."""
+        first = cls(width=choose_first_width(loop, record))
+        return cls._applicable(loop, first, *([replace(first, centre=0.0)] if
+                               _passes_zero_elsewhere(loop, record) else []))  # fmt: skip
 
     def input(self, m: Moment) -> Any:
         """Return the input without what the zone swallows."""
-        half = self.width / 2
-        return m.u - np.minimum(np.maximum(m.u - m.at.input, -half), half)
+        half, middle = self.width / 2, m.at.input if self.centre == "" else self.centre
+        return m.u - np.minimum(np.maximum(m.u - middle, -half), half)
+
+
+def _passes_zero_elsewhere(loop: Any, record: Any) -> bool:
+    """Whether a recorded input passes zero, and its operating point is visibly elsewhere."""
+    if record is None or not loop.equations().siso:
+        return False
+    u = record.u[record.valid]
+    visible = NEAR_ZERO * float(np.ptp(u)) if u.size else 0.0
+    return bool(u.size and u.min() < 0 < u.max() and abs(loop.point.input) > visible)
 
 
 @final
