@@ -456,6 +456,17 @@ def test_damaged_bytes_give_a_record_or_a_refusal(tmp_path):
         (lambda: cid.plants.maglev(m=0.02, k=1), "maglev has no k="),
         (lambda: cid.plants.servo(m=1.0), "servo needs c= and k=; it takes m, c, k"),
         (lambda: E.CoulombFriction(f=0.1), r"CoulombFriction has no f=; did you mean fc=\?"),
+        (
+            lambda: E.CoulombFriction(1, 2, 3, 4),
+            "takes fc, creep without names, and at= by name; given 4 values without a name",
+        ),
+        (lambda: E.ParameterStep(), "ParameterStep needs name=, time= and size=; it takes name"),
+        (lambda: E.InputSaturation(5), "InputSaturation needs upper=; it takes lower, upper, at"),
+        (lambda: cid.Bounds(), "Bounds needs .*=; it takes"),
+        (
+            lambda: cid.Fixed("a1", 1.0, 2.0),
+            "Fixed takes name, value without names, and output= by name; given 3 values",
+        ),
         (lambda: E.ActuatorLag(time=0.1), "ActuatorLag has no time="),
     ],
 )

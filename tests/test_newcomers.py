@@ -68,7 +68,7 @@ def test_a_function_of_a_model_may_pass_options_on(monkeypatch):
 
 
 def test_one_letter_is_near_no_name():
-    with pytest.raises(CtrlidError, match="no T=; it has tau"):
+    with pytest.raises(CtrlidError, match="no T=; it takes tau"):
         E.ActuatorLag(T=0.1)
 
 

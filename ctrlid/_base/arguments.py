@@ -6,6 +6,7 @@ import os
 import sys
 import types
 import typing
+from abc import ABCMeta
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from numbers import Complex, Integral
 from pathlib import Path
@@ -240,34 +241,35 @@ def explain_fields(cls: type[Made]) -> type[Made]:
     return cls
 
 
-def check_field_names(cls: Any, given: Iterable[str]) -> None:
-    """Refuse unknown fields in words, before a generated constructor does so curtly.
+class CheckedCalls(ABCMeta):
+    """Classes whose subclasses are dataclasses, and refuse the fields of a call in words.
 
-    It stands in ``__new__`` of a class whose subclasses are dataclasses, and `ShownFields` beside
-    it; a single dataclass has `explain_fields`.
+    A single dataclass has `explain_fields`. Copies are made without a call, and are not checked.
 
-    Parameters
-    ----------
-    cls : type
-        The dataclass.
-    given : iterable of str
-        Names of the fields that are given.
-
-    Raises
-    ------
-    CtrlidError
-        At the first that it does not have, with a near name.
+    Examples
+    --------
+    >>> from dataclasses import dataclass
+    >>> class Part(metaclass=CheckedCalls):
+    ...     pass
+    >>> @dataclass
+    ... class Spring(Part):
+    ...     stiffness: float
+    >>> Spring()
+    Traceback (most recent call last):
+    ...
+    ctrlid._base.errors.CtrlidError: Spring needs stiffness=; it takes stiffness
     """
-    known = _find_fields(cls)
-    for name in given:
-        if name not in known:
-            raise CtrlidError(_refuse_name(cls.__name__, name, known, "has"))
+
+    def __call__(cls, *args: Any, **fields: Any) -> Any:
+        """Check the call, and make the object."""
+        if "__dataclass_fields__" in vars(cls):
+            _check_call(cls, _find_signature(cls), args, fields)
+        return super().__call__(*args, **fields)
 
 
 @functools.cache
-def _find_fields(cls: Any) -> tuple[str, ...]:
-    """Return the names of the arguments of a constructor."""
-    return tuple(inspect.signature(cls.__init__).parameters)[1:]
+def _find_signature(cls: Any) -> inspect.Signature:
+    return ShownFields().__get__(None, cls)
 
 
 class ShownFields:

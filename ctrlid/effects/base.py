@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Literal, NoReturn, Self
 
 import casadi
 
-from .._base.arguments import ShownFields, check_field_names, check_fields, is_number
+from .._base.arguments import CheckedCalls, ShownFields, check_fields, is_number
 from .._base.errors import CtrlidError, EffectDoesNotApply
 from ..physics.equations import Equations
 from ..physics.linearization import OperatingPoint
@@ -46,7 +46,7 @@ def refuse_missing_formula(base: str, method: str) -> NoReturn:
 
 
 @dataclass(frozen=True)
-class AbstractEffect:
+class AbstractEffect(metaclass=CheckedCalls):
     """One piece of physics that a model may lack.
 
     An effect is a frozen dataclass: fields declared with `parameter` are its parameters, other
@@ -90,8 +90,8 @@ class AbstractEffect:
     __signature__ = ShownFields()
 
     def __new__(cls, *args: Any, **fields: Any) -> Self:
-        """Refuse unknown fields in words, before the generated constructor does so curtly."""
-        del args
+        """Refuse a class that declares parameters and is no dataclass."""
+        del args, fields
         # The decorator takes the declarations of parameters away.
         bare = [name for name, value in vars(cls).items() if isinstance(value, dataclasses.Field)]
         if bare:
@@ -99,7 +99,6 @@ class AbstractEffect:
                 f"{cls.__name__} declares {', '.join(bare)}, but is no dataclass: write "
                 "@dataclass(frozen=True) in the line above its class"
             )
-        check_field_names(cls, fields)
         return super().__new__(cls)
 
     def __post_init__(self) -> None:

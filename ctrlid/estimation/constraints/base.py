@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 
-from ..._base.arguments import is_number
+from ..._base.arguments import CheckedCalls, is_number
 from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
 from ..identified_model import Structure
@@ -84,7 +84,7 @@ class Branch:
     inequality: Function | None = None
 
 
-class AbstractConstraint(ABC):
+class AbstractConstraint(metaclass=CheckedCalls):
     """Something known about the coefficients; a subclass says which rows that gives."""
 
     # True says that the constraint states an unstable pole of the plant.
