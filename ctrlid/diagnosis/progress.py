@@ -141,7 +141,8 @@ class Progress:
             size = write_number(THRESHOLD.search_samples / 1e6, 3)
             self.spent = f"the work of {size} million filtered samples that it has without seconds="
         else:
-            self.spent = f"{write_number(time.monotonic() - self.start, 2)} s"
+            spent = time.monotonic() - self.start
+            self.spent = f"{spent:.0f} s" if spent >= 10 else f"{spent:.1f} s"
 
     def settle(self) -> None:
         """Forget that the search was stopped, for what it had found answers the question."""
