@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import ctrlid as cid
+from ctrlid.reporting.tables import Table
 from problems import levitation, record_of
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
@@ -104,6 +105,18 @@ def test_a_picture_of_the_screen(page, tmp_path, scheme, paper):
     pixels = np.round(255 * matplotlib.image.imread(shot)[..., :3]).astype(int)
     assert tuple(pixels[3, 3]) == paper
     assert (np.abs(pixels - paper).sum(axis=2) > 200).mean() > 0.01  # something is written on it
+
+
+def test_no_table_is_wider_than_the_paper(tmp_path):
+    """The remarks about candidates were cut: what scrolls on a screen does not on paper."""
+    words = "within 2 standard errors of its neutral value"
+    rows = (("AsymmetricCoulombFriction at theta_dot", "1", "1234.5", "12.3", words),)
+    table = cid.Section("What was tried", result=Table(("candidate", "", "", "", "remark"), rows))
+    page = cid.write_report(table, tmp_path / "report.html")
+    # The browser has a screen only, so that the rules for paper are put to work there.
+    page.write_text(page.read_text("utf-8").replace("@media print", "@media all"), "utf-8")
+    seen = look(page, tmp_path, width=640)
+    assert seen["page"] <= seen["screen"]
 
 
 @pytest.mark.parametrize("scheme", [LIGHT, DARK])

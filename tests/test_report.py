@@ -230,7 +230,8 @@ def test_one_result_has_one_heading(record, tmp_path):
 def test_page_suits_dark_screens_and_paper(tmp_path):
     text = cid.write_report(cid.Section("A", "B"), tmp_path / "r.html").read_text("utf-8")
     assert "@media (prefers-color-scheme: dark)" in text
-    assert "@media print" in text
+    on_paper = text[text.index("@media print") :]
+    assert "tbody th, td:last-child { white-space: normal; }" in on_paper
     assert "figure img { display: block; width: 100%; height: auto; background: #ffffff" in text
 
 

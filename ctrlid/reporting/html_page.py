@@ -57,7 +57,8 @@ footer { margin-top: 3rem; color: var(--faint); font-size: 0.85rem; }
   body { font-size: 10.5pt; } main { max-width: none; padding: 0; }
   figure, table { break-inside: avoid; } h2 { margin-top: 1.6rem; }
   figure img { width: auto; max-width: 15cm; max-height: 21cm; }
-  h2, h3 { break-after: avoid; } .wide { overflow: visible; } }
+  h2, h3 { break-after: avoid; } .wide { overflow: visible; }
+  tbody th, td:last-child { white-space: normal; } }
 """
 
 
