@@ -496,6 +496,17 @@ def test_predictions_at_some_samples_only_are_drawn_as_lines(found):
         assert np.isfinite(drawn[0]).all()
 
 
+def test_simulations_far_away_are_said_to_be_outside_the_picture(found):
+    base = found["explained"]
+    for far, words in ((1.0, ", outside this picture"), (0.0, "")):
+        gap = replace(base.gap, simulated_before=base.gap.simulated_before + far,
+                      simulated_after=base.gap.simulated_after - far)  # fmt: skip
+        output = plot.diagnosis(replace(base, gap=gap))[0]
+        models = ("recalibrated model", "with CoulombFriction")
+        assert legend(output)[1:] == [f"{gap.name}, {which}{words}" for which in models]
+        assert np.ptp(output.get_lines()[0].get_ydata()) >= 0.25 * np.ptp(output.get_ylim())
+
+
 def test_picture_on_given_axes(found):
     axes = plot.figure(5)
     assert list(plot.diagnosis(found["explained"], axes)) == list(axes[:, 0])

@@ -237,6 +237,28 @@ def test_a_curve_far_away_leaves_the_measurement_readable(comparison):
     assert high - low < 3 * 1e3 * np.ptp(comparison.record.y)
 
 
+@pytest.mark.parametrize("side", [-1, 1])
+def test_a_curve_not_so_far_away_is_seen_in_part(comparison, side):
+    """It lay outside, or only its tip was seen, while the measured curve had height to spare."""
+    last, span = comparison.curves[-1], float(np.ptp(comparison.record.y[:300]))
+    for size in (1.5, 2.0):
+        near = replace(last, y=last.y + side * size * span)
+        moved = replace(comparison, curves=(*comparison.curves[:-1], near))
+        (ax,) = plot.comparison(moved, window=(0, 3))
+        assert not any("outside" in text for text in legend(ax))
+        low, high = ax.get_ylim()
+        values = ax.get_lines()[3].get_ydata()
+        assert np.mean((low < values) & (values < high)) >= 0.25
+        assert np.ptp(ax.get_lines()[0].get_ydata()) >= 0.25 * (high - low)
+
+
+def test_a_line_from_below_to_above_the_picture_is_seen(comparison):
+    wild = np.where(np.arange(len(comparison.record)) % 2, 100.0, -100.0)
+    curves = (replace(comparison.curves[-1], y=wild),)
+    (ax,) = plot.comparison(replace(comparison, curves=curves))
+    assert not any("outside" in text for text in legend(ax))
+
+
 def test_predictions_of_every_few_samples_are_connected(comparison):
     curve = comparison.curves[1]
     sparse = np.where(np.arange(len(curve.y)) % 3 == 0, curve.y, np.nan)

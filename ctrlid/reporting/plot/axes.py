@@ -14,6 +14,7 @@ from matplotlib.rcsetup import cycler
 from matplotlib.text import Text
 
 from ..._base.arguments import check_arguments, explain_names
+from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
 from ..._base.text import write_count
 
@@ -23,6 +24,9 @@ DASHES = ("-", "--", "-.", (0, (1, 1)), (0, (5, 1, 1, 1, 1, 1)), (0, (8, 3)))
 MARKERS = ("o", "s", "^", "D", "v", "P")
 # The measured curve is broad and pale, so that what lies on it stays visible.
 MEASURED = {"color": "0.72", "linewidth": 3.2}
+# So much of its span is left free below and above the measured curve, which always fills at least
+# this share of the height.
+BESIDE, READABLE = 0.8, 0.25
 # A record of more than twice so many samples is drawn as an envelope of so many bins.
 BINS = 1500
 # A figure has so many axes along a side at most, and is so large [inch]; matplotlib draws so many
@@ -234,6 +238,35 @@ def choose_line_style(i: int) -> dict[str, Any]:
         "linestyle": DASHES[i % len(DASHES)],
         "linewidth": 1.4,
     }
+
+
+def limit_view(ax: Any, measured: Array, lines: Sequence[Any]) -> None:
+    """Keep what was measured readable wherever a wrong model goes, and say what is not seen.
+
+    A line that is far away is seen in part where there is room for it.
+    """
+    least, most = float(np.min(measured)), float(np.max(measured))
+    span = (most - least) or 1.0
+    low, high = ax.get_ylim()
+    low, high = max(low, least - BESIDE * span), min(high, most + BESIDE * span)
+    drawn = [np.asarray(line.get_ydata(), float) for line in lines]
+    drawn = [values[np.isfinite(values)] for values in drawn]
+    for values in drawn:
+        if values.size:
+            # The nearest quarter of a line is enough to see where it goes.
+            down, up = np.quantile(values, (0.75, 0.25)) + 0.05 * span * np.array([-1, 1])
+            wider = min(low, float(down)), max(high, float(up))
+            if wider[1] - wider[0] <= span / READABLE:
+                low, high = wider
+    ax.set_ylim(low, high)
+    for line, values in zip(lines, drawn, strict=True):
+        if not _crosses(values, low, high):
+            line.set_label(f"{line.get_label()}, outside this picture")
+
+
+def _crosses(values: Array, low: float, high: float) -> bool:
+    """Return whether a line through these values is seen between two limits."""
+    return bool(np.any(values > low) and np.any(values < high))
 
 
 def finish_axes(ax: Any, *, legend: bool = True, columns: int = 2, size: str = "medium") -> Any:

@@ -18,6 +18,7 @@ from .axes import (
     Picture,
     finish_axes,
     fit_legends,
+    limit_view,
     new_figure,
     require_kind,
     take_axes,
@@ -108,28 +109,22 @@ def _draw_gap(above: Any, below: Any, found: Diagnosis) -> None:
         below.axhspan(-2 * fine * gap.floor, 2 * fine * gap.floor, color="0.87", zorder=0,
                       label=f"±2 x noise floor, {fine * gap.floor:.3g}{short}")  # fmt: skip
     below.axhline(0, color="0.3", linewidth=0.8)
+    lines: list[Any] = []
     for (label, values, size, style), error in zip(cases, errors, strict=True):
         rms = "none" if np.isnan(size) else f"RMS {fine * size:.3g}{short}"
         long = {"before": start, "after": f"with {names}"}.get(label, label)
         # A long prediction is made at some of the samples only.
         made = np.isfinite(error) if gap.horizon else slice(None)
         shown = scale * values[part]
-        above.plot(t[made], shown[made], label=f"{gap.name}, {long}", **style)
+        lines += above.plot(t[made], shown[made], label=f"{gap.name}, {long}", **style)
         below.plot(t[made], fine * error[made], label=f"{label}: {rms}", **style)
-    _limit_view(above, scale * y)
+    limit_view(above, scale * y, lines)
     above.set_ylabel(f"{gap.output or 'output'} [{unit}]")
     below.set_ylabel(f"error [{small}]")
     below.set_xlabel(f"time [s], where the gap is largest among {len(gap.time)} samples kept back")
     for ax in (above, below):
         ax.set_xlim(t[0], t[-1])
         finish_axes(ax, columns=1 if ax is above else 3, size="small")
-
-
-def _limit_view(ax: Any, y: Array) -> None:
-    """Keep what was measured readable, wherever a wrong model goes."""
-    span = float(np.ptp(y)) or 1.0
-    low, high = ax.get_ylim()
-    ax.set_ylim(max(low, y.min() - 0.8 * span), min(high, y.max() + 0.8 * span))
 
 
 def _draw_errors(ax: Any, place: BinnedErrors | None, found: Diagnosis) -> None:

@@ -21,6 +21,7 @@ from .axes import (
     Picture,
     choose_line_style,
     finish_axes,
+    limit_view,
     require_kind,
     take_axes,
 )
@@ -163,7 +164,7 @@ def comparison(
         first = round((part.start - whole.start) / whole.dt)
         stop = first + len(part)
     parts = comparison.outputs or (comparison,)
-    axes = take_axes(ax, len(parts), sharex=True)
+    axes = take_axes(ax, len(parts), (7.2, 1.2 + 2.4 * len(parts)), sharex=True)
     for ax, one in zip(axes, parts, strict=True):
         _draw_curves(ax, one, slice(first, stop))
         finish_axes(ax)
@@ -187,15 +188,7 @@ def _draw_curves(ax: Any, comparison: Comparison, shown: slice) -> None:
         kept = np.isfinite(values) | ~whole.valid[shown]
         label = f"{curve.label}: fit {write_fit(curve.fit, 1)}"
         lines += ax.plot(t[kept], values[kept], label=label, **choose_line_style(i))
-    # A prediction of a wrong model can be anywhere; what was measured must stay readable.
-    span = float(np.ptp(y)) or 1.0
-    low, high = ax.get_ylim()
-    low, high = max(low, y.min() - 0.8 * span), min(high, y.max() + 0.8 * span)
-    ax.set_ylim(low, high)
-    for line in lines:
-        values = np.asarray(line.get_ydata(), float)
-        if not np.any((low < values) & (values < high)):
-            line.set_label(f"{line.get_label()}, outside this picture")
+    limit_view(ax, y, lines)
     _shade_gaps(ax, whole[shown])
     ax.set_ylabel(f"{whole.names.get('y', 'y')} [{unit}]")
 
