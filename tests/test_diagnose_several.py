@@ -133,7 +133,11 @@ def test_saved_drawn_and_reported(rubbing, tmp_path):
     again = cid.load_diagnosis(file, loop=make_loop())
     assert str(again) == str(rubbing)
     assert again.gap.outputs[1].after == rubbing.gap.outputs[1].after
-    assert len(cid.plot.diagnosis(rubbing).axes) == 5
+    axes = cid.plot.diagnosis(rubbing).axes
+    assert len(axes) == 5
+    kept = f"{len(rubbing.gap.time)} samples kept back"
+    assert axes[1].get_xlabel().endswith(f"among {kept}")
+    assert f"simulation of {kept}" in str(rubbing)
     cid.write_report(rubbing, tmp_path / "page.html")
     assert "CoulombFriction at x_dot" in (tmp_path / "page.html").read_text()
 

@@ -507,6 +507,21 @@ def test_simulations_far_away_are_said_to_be_outside_the_picture(found):
         assert np.ptp(output.get_lines()[0].get_ydata()) >= 0.25 * np.ptp(output.get_ylim())
 
 
+def test_text_and_picture_count_the_same_samples(found):
+    """The text counted both of two outputs and the picture one, or one record and the text all."""
+    base = found["explained"]
+    part = replace(base.gap, samples=1000, output="x")
+    for gap, kept, among in (
+        (replace(base.gap, samples=2000, outputs=(part, replace(part, output="z"))), 1000, "1000"),
+        (replace(base.gap, samples=2500), 2500, "1000 of 2500"),
+        (replace(base.gap, samples=0), 1000, "1000"),
+    ):
+        same = replace(base, gap=gap)
+        assert f"simulation of {kept} samples kept back" in text(same)
+        label = plot.diagnosis(same)[1].get_xlabel()
+        assert label == f"time [s], where the gap is largest among {among} samples kept back"
+
+
 def test_picture_on_given_axes(found):
     axes = plot.figure(5)
     assert list(plot.diagnosis(found["explained"], axes)) == list(axes[:, 0])

@@ -65,7 +65,7 @@ class Gap(Printed):
         unit]: the last value, or a straight line through the last samples; NaN for a simulation.
     samples : int
         How many samples the RMS errors are of, in all records kept back; the curves are those of
-        the first. 0 in files of older versions.
+        the first. Several outputs together count each of theirs. 0 in files of older versions.
     output : str
         Of several outputs, the name of the one that this is the gap of.
     outputs : tuple of Gap

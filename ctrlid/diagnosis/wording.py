@@ -138,13 +138,17 @@ def introduce_gap(gap: Gap) -> str:
     """Say what the gap is."""
     text = (
         f"gap between model and record: RMS error of the {gap.name} of "
-        f"{gap.samples or len(gap.time)} samples "
-        "kept back"
+        f"{count_samples(gap)} samples kept back"
     )
     if gap.outputs:
         names = write_list([part.output for part in gap.outputs])
         text += f", of {names} together in units of their noise floors"
     return text
+
+
+def count_samples(gap: Gap) -> int:
+    """Return how many samples were kept back; one of several outputs is one sample."""
+    return max(part.samples or len(part.time) for part in gap.outputs or (gap,))
 
 
 def list_gap_rows(gap: Gap) -> list[tuple[str, str, str]]:

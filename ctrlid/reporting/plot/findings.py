@@ -8,6 +8,7 @@ from matplotlib.ticker import FixedLocator, NullLocator
 
 from ..._base.arguments import explain_names
 from ..._base.arrays import Array
+from ...diagnosis import wording
 from ...diagnosis.findings import BinnedErrors
 from ...diagnosis.result import Diagnosis
 from ...diagnosis.thresholds import THRESHOLD
@@ -121,7 +122,9 @@ def _draw_gap(above: Any, below: Any, found: Diagnosis) -> None:
     limit_view(above, scale * y, lines)
     above.set_ylabel(f"{gap.output or 'output'} [{unit}]")
     below.set_ylabel(f"error [{small}]")
-    below.set_xlabel(f"time [s], where the gap is largest among {len(gap.time)} samples kept back")
+    own, kept = len(gap.time), wording.count_samples(found.gap)
+    among = f"{kept}" if own == kept else f"{own} of {kept}"
+    below.set_xlabel(f"time [s], where the gap is largest among {among} samples kept back")
     for ax in (above, below):
         ax.set_xlim(t[0], t[-1])
         finish_axes(ax, columns=1 if ax is above else 3, size="small")
