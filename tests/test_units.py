@@ -163,6 +163,12 @@ def test_units_that_contradict_each_other_are_told_by_every_door():
     # Names of effects have no meaning there, and would cost minutes.
     with pytest.raises(cid.CtrlidError, match="the units do not agree: " + words):
         cid.diagnose(loop, wrong, progress=False)
+    # A duty cycle for a torque may be meant: the model takes the numbers as they are, and says so.
+    other = replace(record[:300], units={"u": "1"})
+    found = cid.diagnose(loop, other, catalogue=[E.ViscousFriction], progress=False)
+    assert "u is recorded without a unit, but the plant has it in N m" in " ".join(
+        str(found).split()
+    )
     for right in ({"y": "radians", "u": "N*m", "r": "rad"}, {}, {"u": "N m"}):
         alike = replace(record, units=right)
         assert cid.audit(alike, loop)["units"] == ()

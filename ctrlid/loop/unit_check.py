@@ -1,6 +1,7 @@
 """Whether a record has the units of the plant, whose equations take its numbers as they are."""
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -39,7 +40,27 @@ def list_recorded_units(loop: Loop, record: Record) -> list[tuple[str, str, str]
     return found
 
 
-def find_unit_clashes(loop: Loop, record: Record) -> list[tuple[str, str]]:
+@dataclass(frozen=True)
+class UnitClash:
+    """A signal whose unit in a record is another one than in the loop.
+
+    Parameters
+    ----------
+    signal : str
+        What it is called.
+    text : str
+        A sentence that says what to do.
+    factor : float or None
+        What converts the record's numbers; None where the two are not known to be units of one
+        quantity.
+    """
+
+    signal: str
+    text: str
+    factor: float | None
+
+
+def find_unit_clashes(loop: Loop, record: Record) -> list[UnitClash]:
     """Return the signals whose unit in a record is another one than in the loop, and what to do.
 
     Parameters
@@ -51,8 +72,8 @@ def find_unit_clashes(loop: Loop, record: Record) -> list[tuple[str, str]]:
 
     Returns
     -------
-    list of (str, str)
-        Signal, and a sentence; other spellings of the same unit are the same unit.
+    list of UnitClash
+        The clashes; other spellings of the same unit are the same unit.
     """
     known, several = loop.known_units, not loop.equations().siso
     found = []
@@ -63,15 +84,13 @@ def find_unit_clashes(loop: Loop, record: Record) -> list[tuple[str, str]]:
         factor = find_factor(there, here)
         scale = "factor" if factor is None else f"{factor:.6g}"
         how = "without a unit" if there == "1" else f"in {there}"
-        found.append(
-            (
-                signal,
-                f"{signal} is recorded {how}, but the plant has it in {here}. The model takes the "
-                "numbers as they are. If the plant is right, convert the record: "
-                f"Record.from_csv(..., scale={{{key!r}: {scale}}}, units={{{key!r}: {here!r}}}). "
-                f"If the record is right, say so: Loop(..., units={{{name!r}: {there!r}}}).",
-            )
+        text = (
+            f"{signal} is recorded {how}, but the plant has it in {here}. The model takes the "
+            "numbers as they are. If the plant is right, convert the record: "
+            f"Record.from_csv(..., scale={{{key!r}: {scale}}}, units={{{key!r}: {here!r}}}). "
+            f"If the record is right, say so: Loop(..., units={{{name!r}: {there!r}}})."
         )
+        found.append(UnitClash(signal, text, factor))
     return found
 
 
@@ -90,20 +109,23 @@ def note_unit_clashes(loop: Loop, record: Record) -> tuple[str, ...]:
     tuple of str
         Sentences that begin in capitals; none where the units agree or are not known.
     """
-    return tuple(f"UNITS DO NOT AGREE: {text}" for _, text in find_unit_clashes(loop, record))
+    return tuple(f"UNITS DO NOT AGREE: {one.text}" for one in find_unit_clashes(loop, record))
 
 
 def refuse_unit_clashes(loop: Loop, record: Record) -> None:
-    """Refuse a record that says to have other units than the loop says.
+    """Refuse a record whose numbers are by a known factor larger or smaller than the loop's.
+
+    Of two quantities, such as a duty cycle and the voltage that it switches, the one may be counted
+    as the other.
 
     Raises
     ------
     CtrlidError
-        If it does: whatever is found with numbers of another size has no meaning.
+        If they are: whatever is found with numbers of another size has no meaning.
     """
-    clashes = find_unit_clashes(loop, record)
-    if clashes:
-        raise CtrlidError("the units do not agree: " + " ".join(text for _, text in clashes))
+    texts = [one.text for one in find_unit_clashes(loop, record) if one.factor is not None]
+    if texts:
+        raise CtrlidError(f"the units do not agree: {' '.join(texts)}")
 
 
 def measure_distance(loop: Loop, record: Record) -> float:

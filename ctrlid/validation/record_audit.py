@@ -273,9 +273,9 @@ def _audit_several(record: Record, loop: Loop | None) -> Audit:
 
 
 def _list_unit_clashes(loop: Loop, record: Record) -> list[AuditFinding]:
-    clashes = find_unit_clashes(loop, record)
     whole = (0, record.n)
-    return [AuditFinding("units", name, text, 1.0, whole, harmful=True) for name, text in clashes]
+    return [AuditFinding("units", one.signal, one.text, 1.0, whole, harmful=True)
+            for one in find_unit_clashes(loop, record)]  # fmt: skip
 
 
 class _RecordChecks:
