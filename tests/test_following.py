@@ -19,6 +19,7 @@ from ctrlid.diagnosis.replicas import (
     measure_gain_on_replicas,
 )
 from ctrlid.diagnosis.selection import run_round
+from ctrlid.diagnosis.wording import find_told_rms
 from ctrlid.loop.period_map import comes_to_rest
 from problems import levitation
 
@@ -176,6 +177,11 @@ def test_dead_zone_is_about_zero_where_a_weight_is_held():
     found = cid.diagnose(loop, record, catalogue=[E.InputDeadZone, E.CoulombFriction],
                          progress=False)  # fmt: skip
     assert found.verdict == "explained"
+    # The number of a place is that of the bin which its words speak of.
+    told = [p for p in found.where if p.words.endswith("than noise")]
+    assert told
+    for place in told:
+        assert ("smaller" in place.words) == (find_told_rms(place, place.before) < 1)
     (finding,) = found.findings
     assert finding.effect.centre == 0.0
     assert finding.equivalents == ()

@@ -246,6 +246,8 @@ class BinnedErrors(Printed):
         Where it sits, in words.
     output : str
         Of several outputs, that whose innovations they are.
+    told : int
+        The bin that `words` speak of; -1 where that is not known.
     """
 
     axis: str
@@ -257,6 +259,7 @@ class BinnedErrors(Printed):
     p_after: float
     words: str
     output: str = ""
+    told: int = -1
 
     def __post_init__(self) -> None:
         freeze_arrays(self)

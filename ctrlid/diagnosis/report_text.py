@@ -88,11 +88,11 @@ def _write_where(found: Diagnosis) -> list[str]:
         return _wrap_text(f"where the error is: {nowhere if axes else 'not known'}", 2, hang=4)
     same = not found.added
     head = "  where the error is: normalized RMS of the one-step errors (1 for noise)"
-    rows = [f"{head:<79}{'worst' if same else 'before':>10}{'' if same else 'after':>10}"]
+    rows = [f"{head:<79}{'there' if same else 'before':>10}{'' if same else 'after':>10}"]
     for place in places:
         first, *more = textwrap.wrap(wording.describe_place(place), 60) or [""]
         before, after = (
-            write_number(wording.find_highest_rms(v), 3) for v in (place.before, place.after)
+            write_number(wording.find_told_rms(place, v), 3) for v in (place.before, place.after)
         )
         after = "" if same else after
         rows.append(f"    {place.axis:<12} {first:<62}{before:>10}{after:>10}")

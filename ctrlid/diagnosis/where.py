@@ -42,14 +42,15 @@ def _locate_output(
             for o in (before, after)
         )
         unit = units.get(name, "")
-        words = _describe_place(name, unit, edges, before.z, index, count, output)
-        found.append(BinnedErrors(name, unit, edges, was, now, p_was, p_now, words, output))
+        words, told = _describe_place(name, unit, edges, before.z, index, count, output)
+        found.append(BinnedErrors(name, unit, edges, was, now, p_was, p_now, words, output, told))
     return tuple(sorted(found, key=lambda place: place.p_before))
 
 
 def _describe_place(
     name: str, unit: str, edges: Array, z: Array, index: Array, count: Array, output: str
-) -> str:
+) -> tuple[str, int]:
+    """Return where the errors are farthest from noise, in words, and the bin."""
     mean = np.bincount(index, z, minlength=len(count)) / count
     square = np.bincount(index, z**2, minlength=len(count)) / count
     strength = np.sqrt(count) * np.abs(mean)
@@ -61,7 +62,7 @@ def _describe_place(
         side = "above" if mean[k] > 0 else "below"
         what = output or "the output"
         return (f"{place}, {what} is {side} its prediction by {abs(mean[k]):.2g} standard "
-                "deviations on average")  # fmt: skip
+                "deviations on average", k)  # fmt: skip
     side = "larger" if square[k] > 1 else "smaller"
     errors = f"the one-step errors of {output}" if output else "the one-step errors"
-    return f"{place}, {errors} are {side} than noise"
+    return f"{place}, {errors} are {side} than noise", k

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .._base.arrays import Array
 from .._base.text import choose_prefix, write_list, write_number, write_p_value, write_quantity
 from ..effects import AbstractEffect, ParameterError, ReadingEffect
 from ..effects.base import name_at_place
@@ -247,10 +248,14 @@ def list_telling_places(found: Diagnosis) -> list[BinnedErrors]:
     return [p for p in found.where if p.p_before < THRESHOLD.telling][:PLACES]
 
 
-def find_highest_rms(levels: Iterable[float]) -> float:
-    """Return the highest RMS among the bins that hold something, from mean squares; NaN without."""
-    known = [v for v in levels if math.isfinite(v)]
-    return math.sqrt(max(known, default=math.nan))
+def find_told_rms(place: BinnedErrors, levels: Array) -> float:
+    """Return the RMS in the bin that a place's words speak of, or the highest, from mean squares.
+
+    NaN where nothing is known.
+    """
+    if place.told >= 0:
+        return math.sqrt(levels[place.told])
+    return math.sqrt(max((v for v in levels if math.isfinite(v)), default=math.nan))
 
 
 def describe_place(place: BinnedErrors) -> str:

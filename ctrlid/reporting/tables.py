@@ -86,7 +86,9 @@ class Title:
 
 
 Block = Table | Title | str
-PLACES = "Normalized RMS of the one-step errors in the bin where it is largest (1 for noise)."
+PLACES = (
+    "Normalized RMS of the one-step errors in the bin that is farthest from noise (1 for noise)."
+)
 
 
 def write_heading(result: Any) -> str:
@@ -268,7 +270,7 @@ def _make_diagnosis_blocks(found: Diagnosis) -> list[Block]:
         (
             p.axis,
             *(
-                _text.write_number(wording.find_highest_rms(v), 3)
+                _text.write_number(wording.find_told_rms(p, v), 3)
                 for v in (p.before, p.after)[:sides]
             ),
             *(_text.write_p_value(v) for v in (p.p_before, p.p_after)[:sides]),

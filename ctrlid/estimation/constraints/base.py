@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ..._base.arguments import CheckedCalls, is_number
+from ..._base.arguments import CheckedCalls, ShownFields, is_number
 from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
 from ..identified_model import Structure
@@ -89,6 +89,9 @@ class AbstractConstraint(metaclass=CheckedCalls):
 
     # True says that the constraint states an unstable pole of the plant.
     unstable: ClassVar[bool] = False
+
+    # Help shows the fields of each constraint.
+    __signature__ = ShownFields()
 
     @abstractmethod
     def branches(self, structure: Structure) -> Sequence[Branch]:
