@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from scipy import optimize
 
-from .._base.arguments import check_arguments, explain_names, point_at_part
+from .._base.arguments import check_arguments, explain_names
 from .._base.arrays import Array, ComplexArray
 from .._base.errors import CtrlidError, ModelCannotRun
 from .._base.interruption import check_budget, hold_interrupt
@@ -22,12 +22,9 @@ from ..data.outliers import describe_outliers, mask_outliers
 from ..data.record import Record
 from ..data.several_records import as_records, order_model_and_data
 from ..estimation.likelihood.filter_data import FEWEST, find_noise_units
-from ..estimation.likelihood.likelihood import list_effect_bounds, list_parameter_bounds
-from ..estimation.likelihood.physics_estimate import (
-    LoopFit,
-    SimulationEstimate,
-    mark_unseen,
-)
+from ..estimation.likelihood.likelihood import list_parameter_bounds
+from ..estimation.likelihood.physics_estimate import LoopFit, SimulationEstimate, mark_unseen
+from ..estimation.likelihood.physics_fit import choose_free_names
 from ..loop.loop import Loop
 from ..loop.period_map import leave_out_kinks, linearize_sensors_at_rest, make_period_map
 from ..loop.sensitivities import (
@@ -138,10 +135,8 @@ def fit_simulation(
     """
     loop, record = order_model_and_data(loop, record)
     check_arguments(fit_simulation, locals(), "loop", "record")
-    if not isinstance(loop, Loop):
-        raise CtrlidError("fit_simulation needs a Loop(plant, controller, dt=...); given "
-                          f"{type(loop).__name__}{point_at_part(loop, Loop)}")  # fmt: skip
-    names = _choose_names(loop, free)
+    names = choose_free_names(loop, free, "fit_simulation")
+    _require_start(loop, names)
     given = as_records(record)
     masked = [mask_outliers(one) for one in given]
     records = tuple(match_signals(one, loop.equations()) for one, _ in masked)
@@ -159,33 +154,28 @@ def fit_simulation(
         point = _fit(point, np.minimum(sizes, point.sizes))
         loop = loop.with_parameters(dict(zip(names, point.theta.tolist(), strict=True)))
         if np.all(np.abs(point.sizes - sizes) < SETTLED * point.sizes):
+            unsettled: tuple[str, ...] = ()
             break
         sizes = point.sizes
+    else:
+        unsettled = (
+            f"THE FIT HAS NOT SETTLED after {ROUNDS} rounds: call fit_simulation again with the "
+            "loop that it returned",
+        )
     left_out = [describe_outliers(one, lost)
                 for one, (_, lost) in zip(given, masked, strict=True) if lost.any()]  # fmt: skip
-    notes = (*note_unit_clashes(loop, records[0]), *left_out)
+    notes = (*note_unit_clashes(loop, records[0]), *left_out, *unsettled)
     return LoopFit(loop, _summarize(point, find_noise_units(loop, records[0])[0], notes))
 
 
-def _choose_names(loop: Loop, free: Any) -> tuple[str, ...]:
-    """Return the parameters to fit, each with a value to start from."""
-    if free is None:
-        names = tuple(dict.fromkeys([*loop.free, *list_effect_bounds(loop)]))
-    else:
-        names = (free,) if isinstance(free, str) else tuple(free)
-    known, used = (list(loop.equations(keep=keep).parameters) for keep in (True, False))
-    unknown = [name for name in names if name not in known]
-    if unknown or not names:
-        what = f"given {unknown}" if unknown else "none was given"
-        raise CtrlidError(f"fit_simulation needs the names of the parameters to fit, {what}. Name "
-                          "them in free= of the loop or of fit_simulation; the loop has "
-                          f"{write_list(known) or 'none'}")  # fmt: skip
+def _require_start(loop: Loop, names: Sequence[str]) -> None:
+    """Refuse effects at values that do nothing: a simulation has no slope to leave them by."""
+    used = loop.equations().parameters
     absent = [name for name in names if name not in used]
     if absent:
         raise CtrlidError(f"fit_simulation needs a start from which each effect acts, but at "
                           f"{write_list(absent)} = 0 there is none: give a size, about as large as "
                           "you expect it")  # fmt: skip
-    return names
 
 
 def _explain(loop: Loop, record: Record) -> str:

@@ -116,7 +116,7 @@ def fit_loop(
     loop, record = order_model_and_data(loop, record)
     check_arguments(fit_loop, locals(), "loop", "record")
     given = as_records(record)
-    names = _choose_free_names(loop, free)
+    names = choose_free_names(loop, free, "fit_loop")
     # A single reading far outside makes any Gaussian likelihood follow it and nothing else.
     masked = [mask_outliers(one) for one in given]
     records = [one for one, _ in masked]
@@ -260,11 +260,27 @@ _TOO_NARROW = (
 )
 
 
-def _choose_free_names(
-    loop: Loop, free: Sequence[str] | Mapping[str, float] | None
+def choose_free_names(
+    loop: Loop, free: Sequence[str] | Mapping[str, float] | None, who: str
 ) -> tuple[str, ...]:
+    """Return the parameters to fit, checked to be those of a loop.
+
+    Parameters
+    ----------
+    loop : Loop
+        The loop.
+    free : sequence of str, mapping of str to float, or None
+        What the user gave; None for the free parameters of the loop and those of its effects.
+    who : str
+        The function that asks.
+
+    Raises
+    ------
+    CtrlidError
+        If there is no loop, no name, or one that the loop does not have.
+    """
     if not isinstance(loop, Loop):
-        raise CtrlidError("fit_loop needs a Loop(plant, ..., dt=...); given "
+        raise CtrlidError(f"{who} needs a Loop(plant, ..., dt=...); given "
                           f"{type(loop).__name__}{point_at_part(loop, Loop)}")  # fmt: skip
     known = list(loop.equations(keep=True).parameters)
     if free is None:
@@ -274,8 +290,8 @@ def _choose_free_names(
     unknown = [name for name in names if name not in known]
     if unknown or not names:
         what = f"given {unknown}" if unknown else "none was given"
-        raise CtrlidError(f"fit_loop needs the names of the parameters to fit, {what}. Name them "
-                          "in free= of the loop or of fit_loop; the loop has "
+        raise CtrlidError(f"{who} needs the names of the parameters to fit, {what}. Name them "
+                          f"in free= of the loop or of {who}; the loop has "
                           f"{', '.join(known) or 'none'}")  # fmt: skip
     return names
 
