@@ -266,7 +266,7 @@ def test_the_steps_of_each_output_are_taken_off_its_noise():
     assert (read.effect.at, read.effect.step) == ("theta", pytest.approx(STEP))
     rounding = with_rounding(model, [read])
     left = rounding.fit.sensor[0] * rounding.fit.noise.sensors[0]
-    assert left == pytest.approx(0.05 * 75e-8)
+    assert left == pytest.approx(1e-3 * 75e-8)
     assert rounding.fit.sensor[0] == fit.sensor[0]
     assert rounding.fit.noise.force == noise.force
     copy = make_replica(rounding)

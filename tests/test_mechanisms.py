@@ -125,7 +125,9 @@ def test_swing_of_a_loop_that_sticks_is_no_flight():
         tilt = cid.simulate(rubbing, d=np.zeros(2000)).y[1]
         assert 1e-3 < np.abs(tilt).max() < 0.5
     # With the wrong sign it does fly, friction or not.
-    wrong = cid.Loop(plant, -observer, dt=0.005, at=upright)
+    flipped = ct.ss(observer.A, observer.B, -observer.C, observer.D, 0.005,
+                    inputs=observer.input_labels, outputs=observer.output_labels)  # fmt: skip
+    wrong = cid.Loop(plant, flipped, dt=0.005, at=upright)
     rubbing = wrong.with_effect(cid.effects.CoulombFriction(fc=0.01, at="x_dot"))
     with pytest.raises(cid.CtrlidError, match="diverged"):
         cid.simulate(rubbing, d=0.1 * np.ones(4000))
