@@ -310,6 +310,19 @@ def test_frequency_response_is_that_of_one_signal():
         plot.bode({"a": TWO_INPUTS})
 
 
+def test_band_that_reaches_zero_goes_down_without_end(monkeypatch):
+    u, y = np.random.default_rng(4).standard_normal((2, 200))
+    model = cid.fit_arx(cid.Record(u=u, y=y, dt=0.1), 1, 1)
+
+    def find_wide_band(*given):
+        band = cid.response_band(*given)
+        return replace(band, magnitude_low=0 * band.magnitude_low)
+
+    monkeypatch.setattr("ctrlid.reporting.plot.models.response_band", find_wide_band)
+    low, high = plot.bode({"noise": model}).axes[0].get_ylim()
+    assert np.isfinite([low, high]).all()
+
+
 def test_poles_of_several_signals_and_a_single_one_at_the_origin():
     for model in (TWO_INPUTS, ct.tf(1, [1, 0])):
         (ax,) = plot.poles({"a": model})

@@ -176,8 +176,10 @@ def _draw_band(
     if not model.estimate.covariance.any():
         return
     shift = phase - band.phase
+    # A band that holds zero goes down without end.
+    lowest = np.maximum(band.magnitude_low, np.finfo(float).tiny)
     sides = [
-        (20 * np.log10(band.magnitude_low), 20 * np.log10(band.magnitude_high)),
+        (20 * np.log10(lowest), 20 * np.log10(band.magnitude_high)),
         (band.phase_low + shift, band.phase_high + shift),
     ]
     for ax, (low, high) in zip(axes, sides, strict=True):
