@@ -110,7 +110,7 @@ def _describe_call(
     fixed = [p for p in parameters.values() if p.kind is p.POSITIONAL_OR_KEYWORD]
     for name in given:
         if name not in parameters:
-            return _refuse_name(who, name, tuple(parameters), "takes")
+            return _refuse_name(who, name, tuple(parameters))
     if len(args) > len(fixed):
         named = [f"{name}=" for name in list(parameters)[len(fixed) :]]
         rest = f", and {', '.join(named)} by name" if named else ""
@@ -126,12 +126,12 @@ def _describe_call(
     )
 
 
-def _refuse_name(who: str, name: str, known: Sequence[str], verb: str) -> str:
+def _refuse_name(who: str, name: str, known: Sequence[str]) -> str:
     """Say that there is no such argument, with a near name or all of them."""
     # A word of a name may be one of several names.
     near = [one for one in known if name in one.split("_")] or [find_near_name(name, known) or ""]
     meant = " or ".join(f"{one}=" for one in near if one)
-    hint = f"did you mean {meant}?" if meant else f"it {verb} {', '.join(known)}"
+    hint = f"did you mean {meant}?" if meant else f"it takes {', '.join(known)}"
     return f"{who} has no {name}=; {hint}"
 
 

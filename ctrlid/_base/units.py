@@ -18,12 +18,13 @@ SPELLINGS = {
     "amps": "A", "ampere": "A", "newton": "N", "newtons": "N", "meter": "m", "metre": "m",
     "meters": "m", "metres": "m", "sec": "s", "second": "s", "seconds": "s", "l": "L",
 }  # fmt: skip
-# How many of these make one of the SI.
+# How many of these make one of the SI: prefixes, and units with that of the SI.
 PER_SI = {"n": 1e9, "µ": 1e6, "m": 1e3, "k": 1e-3, "M": 1e-6}
-PER_SI_ALONE = {"deg": 180 / math.pi, "rev": 0.5 / math.pi, "cm": 100.0, "%": 100.0, "g": 1e3,
-                "kg": 1.0, "min": 1 / 60, "h": 1 / 3600}  # fmt: skip
-SI_UNITS = {"deg": "rad", "rev": "rad", "cm": "m", "%": "1", "1": "1", "g": "kg", "kg": "kg",
-            "min": "s", "h": "s"}  # fmt: skip
+SCALES = {
+    "deg": ("rad", 180 / math.pi), "rev": ("rad", 0.5 / math.pi), "cm": ("m", 100.0),
+    "%": ("1", 100.0), "1": ("1", 1.0), "g": ("kg", 1e3), "kg": ("kg", 1.0), "min": ("s", 1 / 60),
+    "h": ("s", 1 / 3600),
+}  # fmt: skip
 MARKS = re.compile(r"[/()*·]|\^-?\d+|[^\s/()*·^]+|\S")
 
 
@@ -126,14 +127,7 @@ def count_per_si_unit(text: str) -> float:
     >>> count_per_si_unit("mm"), count_per_si_unit("m"), count_per_si_unit("volts")
     (1000.0, 1.0, 1.0)
     """
-    powers = _spell_alike(text)
-    if list(powers.values()) != [1]:
-        return 1.0
-    (symbol,) = powers
-    if symbol in PER_SI_ALONE:
-        return PER_SI_ALONE[symbol]
-    prefixed = symbol not in WITH_PREFIX and symbol[1:] in WITH_PREFIX
-    return PER_SI.get(symbol[0], 1.0) if prefixed else 1.0
+    return _find_scale(text)[1]
 
 
 def find_factor(given: str, wanted: str) -> float | None:
@@ -154,25 +148,23 @@ def find_factor(given: str, wanted: str) -> float | None:
     >>> find_factor("mm", "m"), round(find_factor("deg", "rad"), 6), find_factor("V", "A")
     (0.001, 0.017453, None)
     """
-    first, second = _find_si_unit(given), _find_si_unit(wanted)
-    if first is None or first != second:
-        return None
-    return count_per_si_unit(wanted) / count_per_si_unit(given)
+    (first, per_given), (second, per_wanted) = _find_scale(given), _find_scale(wanted)
+    return per_wanted / per_given if first and first == second else None
 
 
-def _find_si_unit(text: str) -> str | None:
-    """Return the SI unit that `count_per_si_unit` counts in; None where it does not know."""
+def _find_scale(text: str) -> tuple[str, float]:
+    """Return the SI unit of a unit, and how many make one; empty, and 1, for one not known."""
     powers = _spell_alike(text)
-    if not powers:
-        return None
     if list(powers.values()) != [1]:
-        return None
+        return "", 1.0
     (symbol,) = powers
-    if symbol in SI_UNITS:
-        return SI_UNITS[symbol]
+    if symbol in SCALES:
+        return SCALES[symbol]
     if symbol in WITH_PREFIX:
-        return symbol
-    return symbol[1:] if symbol[0] in PER_SI and symbol[1:] in WITH_PREFIX else None
+        return symbol, 1.0
+    if symbol[1:] in WITH_PREFIX and symbol[0] in PER_SI:
+        return symbol[1:], PER_SI[symbol[0]]
+    return "", 1.0
 
 
 def _spell_alike(text: str) -> dict[str, int]:

@@ -182,8 +182,8 @@ def read_steps(fit: Fit, audits: Sequence[Audit]) -> tuple[Readout, ...]:
     r"""Return the step of each sensor if it makes a good part of its noise.
 
     Rounding to steps q adds a variance of :math:`q^2/12`; knowing it, the likelihood gains
-    :math:`\tfrac{n}{2} \ln r / (r - q^2/12)`. They belong to the record, and
-    are no candidate of the catalogue.
+    :math:`\tfrac{n}{2} \ln r / (r - q^2/12)`. They belong to the record, and are no
+    candidate of the catalogue.
     """
     e = fit.plant.e
     found = []

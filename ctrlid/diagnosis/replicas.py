@@ -10,6 +10,7 @@ import numpy as np
 
 from .._base.arrays import Array
 from .._base.errors import EffectDoesNotApply, ModelCannotRun
+from .._base.statistics import regress
 from ..data.record import Record
 from ..data.validity import find_whole_past
 from ..estimation.likelihood.likelihood import (
@@ -247,8 +248,7 @@ def _regress_controller(record: Record, dt: float) -> Any:
     if len(columns) <= columns.shape[1]:
         return None
     goal, table = columns[:, 0], columns[:, 1:]
-    size = np.maximum(np.sqrt(np.mean(table**2, axis=0)), THRESHOLD.tiny)
-    found = np.linalg.lstsq(table / size, goal, rcond=None)[0] / size
+    found = regress(table, goal, len(table) * np.finfo(float).eps)
     left = np.var(goal - table @ found)
     if left > THRESHOLD.law_left * np.var(np.diff(record.u)[record.valid[1:]]):
         return None

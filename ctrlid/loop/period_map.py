@@ -39,6 +39,15 @@ class PeriodMap:
     reference: tuple[float, ...] = ()
 
     @property
+    def still(self) -> Array:
+        """The signals of w at rest."""
+        w = np.zeros(sum(self.counts))
+        w[self.places[1]] = self.reference
+        if len(self.counts) > 6:
+            w[self.places[6]] = self.reference
+        return w
+
+    @property
     def places(self) -> list[slice]:
         """Where in w each of its signals is."""
         ends = np.cumsum((0, *self.counts)).tolist()
@@ -262,11 +271,7 @@ def _differentiate(s: PeriodMap, evaluate: Callable[[Any, Any], Sequence[Any]]) 
     """Return the derivatives of expressions by state and signals at rest, one after the other."""
     z, w = casadi.SX.sym("z", len(s.rest)), casadi.SX.sym("w", sum(s.counts))
     slopes = [casadi.jacobian(value, by) for value in evaluate(z, w) for by in (z, w)]
-    still = np.zeros(sum(s.counts))
-    still[s.places[1]] = s.reference
-    if len(s.counts) > 6:
-        still[s.places[6]] = s.reference
-    found = casadi.Function("j", [z, w], slopes).call([s.rest, still])
+    found = casadi.Function("j", [z, w], slopes).call([s.rest, s.still])
     return [np.asarray(value, float) for value in found]
 
 

@@ -283,7 +283,7 @@ class Simulator:
         self.hold_r = hold_r if loop.analog else "zoh"
         first = make_period_map(loop, 1, hold, self.hold_r)
         self.plant_states, self.counts = first.plant_states, first.counts
-        self._references = first.reference
+        self._still = first.still
         self.rest: Array = np.array(first.rest, dtype=float)
         self._steps: dict[int, Any] = {1: first.step}
         self._runners: dict[tuple[int, int], Any] = {}
@@ -320,9 +320,7 @@ class Simulator:
         sizes = np.concatenate([sign * np.geomspace(1e-6, 1.0, 7) for sign in (1, -1)])
         away = np.einsum("k,ij->kij", sizes, np.diag(np.maximum(np.abs(self.rest), 1.0)))
         z = (self.rest + away.reshape(-1, size)).T
-        w = np.zeros(sum(self.counts))
-        w[plain.places[1]] = plain.reference
-        given = z, np.tile(w[:, None], z.shape[1])
+        given = z, np.tile(self._still[:, None], z.shape[1])
         with_kinks, without = (
             np.asarray(step.map(z.shape[1])(*given)[0], float)
             for step in (self._steps[1], plain.step)
@@ -499,10 +497,10 @@ class Simulator:
             pushed = a @ pushed
             if np.abs(pushed).max() < 1e-6 * moved.max():
                 break
-        w = np.zeros((sum(self.counts), len(a) + 1))
-        w[np.cumsum((0, *self.counts))[1] :][: self.counts[1]] = np.array(self._references)[:, None]
-        z = self.rest[:, None] + np.diag(moved) @ np.eye(len(a), len(a) + 1)
-        y = np.asarray(self._steps[1].map(len(a) + 1)(z, w)[1], float)
+        # One state at a time, and at last the loop at rest.
+        z = self.rest[:, None] + np.eye(len(a), len(a) + 1) * moved[:, None]
+        w = np.tile(self._still[:, None], z.shape[1])
+        y = np.asarray(self._steps[1].map(z.shape[1])(z, w)[1], float)
         return np.asarray(np.abs(y[:, :-1] - y[:, -1:]).sum(axis=1))
 
     def _find_first_bad(self, states: Array, ys: Array, us: Array, asked: Array) -> int | None:

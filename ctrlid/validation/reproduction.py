@@ -37,6 +37,12 @@ OPEN_LOOP = Reproduction("open-loop simulation")
 CLOSED_LOOP = Reproduction("closed-loop simulation")
 
 
+def find_law_rejection(loop: Loop, record: Record) -> str:
+    """Return why the stated law is not what computed the logged input; empty where it stands."""
+    reject = find_rejection if loop.equations().siso else find_wired_rejection
+    return reject(loop, record)
+
+
 def choose_reproduction(loop: Loop, record: Record) -> Reproduction:
     """Return the most telling reproduction that there is: a simulation where one is possible.
 
@@ -44,8 +50,7 @@ def choose_reproduction(loop: Loop, record: Record) -> Reproduction:
     that after a rejected law only a prediction remains, which does not contain the controller.
     """
     known = loop.controller is not None and knows_references(loop.wiring, record)
-    reject = find_rejection if loop.equations().siso else find_wired_rejection
-    if known and not reject(loop, record):
+    if known and not find_law_rejection(loop, record):
         return CLOSED_LOOP
     if loop.controller is None and comes_to_rest(loop):
         return OPEN_LOOP

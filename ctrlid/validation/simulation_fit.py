@@ -35,11 +35,9 @@ from ..loop.sensitivities import (
 from ..loop.simulation import Simulator
 from ..loop.unit_check import note_unit_clashes
 from ..loop.wiring import knows_references, match_signals
-from .controller_check import find_rejection
 from .error_covariance import compute_score_covariance
 from .record_simulation import find_long_stretches, prepare_stretch
-from .reproduction import choose_reproduction
-from .wired_controller_check import find_wired_rejection
+from .reproduction import choose_reproduction, find_law_rejection
 
 # Outputs are weighed by their own errors, which are known after a fit; so many times at most.
 ROUNDS = 6
@@ -190,10 +188,9 @@ def _explain(loop: Loop, record: Record) -> str:
             "it has no reference, which a loop with a controller is simulated from. Give the "
             "record r=, a constant for a fixed set-point."
         )
-    reject = find_rejection if loop.equations().siso else find_wired_rejection
     return (
-        f"the law of the controller is rejected: {reject(loop, record)} With another law the "
-        "measured output would come into the simulation."
+        f"the law of the controller is rejected: {find_law_rejection(loop, record)} With another "
+        "law the measured output would come into the simulation."
     )
 
 
@@ -402,15 +399,18 @@ def _compute_covariance(matrix: Array, middle: Array, free: Any, p: int) -> Arra
 
 def _make_amplification(loop: Loop, sizes: Array) -> Callable[[Array], ComplexArray]:
     """Return how a loop amplifies noise at a frequency, with outputs in units of `sizes`."""
-    loop = leave_out_kinks(loop)
-    made = make_period_map(loop, 1)
-    a, b, c, d = linearize_sensors_at_rest(made)
-    usable = loop.controller is not None and all(np.isfinite(v).all() for v in (a, b, c, d))
+    p = len(sizes)
+
+    def keep(frequencies: Array) -> ComplexArray:
+        return np.broadcast_to(np.eye(p, dtype=complex), (len(frequencies), p, p))
+
+    if loop.controller is None:
+        return keep
+    a, b, c, d = linearize_sensors_at_rest(make_period_map(leave_out_kinks(loop), 1))
+    if not all(np.isfinite(v).all() for v in (a, b, c, d)):
+        return keep
 
     def evaluate(frequencies: Array) -> ComplexArray:
-        p = len(sizes)
-        if not usable:
-            return np.broadcast_to(np.eye(p, dtype=complex), (len(frequencies), p, p))
         ahead = np.exp(1j * frequencies)[:, None, None] * np.eye(len(a)) - a
         found = c @ np.linalg.solve(ahead, np.broadcast_to(b, (len(frequencies), *b.shape))) + d
         left, gains, right = np.linalg.svd(found * sizes / sizes[:, None])

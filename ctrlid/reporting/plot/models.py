@@ -52,8 +52,9 @@ def poles(models: Any, ax: Any = None, *, truth: Any = None) -> Picture:
     'real part of z [1]'
     """
     models = _pictures.check_models(models, "plot.poles", several=True)
-    physics = {} if truth is None else {"physics": truth}
-    physics = _pictures.check_models(physics, "plot.poles", several=True) if physics else {}
+    physics = {"physics": truth} if truth is not None else {}
+    if physics:
+        physics = _pictures.check_models(physics, "plot.poles", several=True)
     dt = _pictures.find_period({**models, **physics})
     found = {k: _pictures.find_poles(m, dt) for k, m in (*models.items(), *physics.items())}
     if not any(p.size for p in found.values()):

@@ -153,9 +153,9 @@ def comparison(
     'time [s], 0 to 5 s of a record from 0 to 10 s'
     """
     require_kind(comparison, Comparison, "plot.comparison draws a Comparison, as compare() returns")
-    whole = comparison.record
+    whole, parts = comparison.record, comparison.outputs or (comparison,)
     if window is None:
-        first = _pictures.find_telling_window((*comparison.outputs, comparison)[0])
+        first = _pictures.find_telling_window(parts[0])
         stop = min(first + _pictures.WINDOW, len(whole))
     else:
         if not (isinstance(window, tuple | list | np.ndarray) and len(window) == 2):
@@ -163,7 +163,6 @@ def comparison(
         part = whole.between(*window)
         first = round((part.start - whole.start) / whole.dt)
         stop = first + len(part)
-    parts = comparison.outputs or (comparison,)
     axes = take_axes(ax, len(parts), (7.2, 1.2 + 2.4 * len(parts)), sharex=True)
     for ax, one in zip(axes, parts, strict=True):
         _draw_curves(ax, one, slice(first, stop))
