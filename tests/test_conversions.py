@@ -80,6 +80,19 @@ def test_each_input_has_states_of_its_own():
     assert len(to_state_matrices(ct.tf([[[0.0], [1.0]]], [[[1.0, 2.0], [1.0]]]))[0]) == 0
 
 
+@pytest.mark.parametrize("unit", [1e-12, 1.0, 1e12])
+@pytest.mark.parametrize("second", [1e-9, 1.0, 1e9])
+def test_a_first_coefficient_of_rounding_lets_nothing_through(unit, second):
+    """Neither the unit of a signal nor that of time makes a small coefficient one of rounding."""
+    den = np.array([1.0, 2.0, 3.0]) * second ** np.arange(2, -1, -1)
+    rounded = ct.tf(unit * np.array([-6e-15 * second**2, second, 2]), den)
+    small = ct.tf(unit * np.array([6e-12 * second**2, second, 2]), den)
+    assert to_state_matrices(rounded)[3] == 0
+    assert to_state_matrices(small)[3][0, 0] == pytest.approx(6e-12 * unit)
+    a, b, c, _ = to_state_matrices(rounded)
+    assert c @ np.linalg.solve(-a, b) == pytest.approx(unit * 2 / 3)
+
+
 @pytest.mark.parametrize("dt", [1e-2, 1e-4, 1e-6])
 def test_fast_sampling_keeps_the_digits_of_the_numerator(dt):
     """Of ``1/(s^2 - alpha)`` both numerators are ``(cosh(sqrt(alpha) dt) - 1)/alpha``."""

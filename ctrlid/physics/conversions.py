@@ -14,6 +14,8 @@ from scipy import linalg
 from .._base.arrays import Array
 from .._base.errors import CtrlidError
 
+# A coefficient so much smaller than the others, at the fastest pole, is zero but for rounding.
+ROUNDING = 1e-14
 # A pulse response is taken for so many samples at most.
 LONGEST = 100
 
@@ -160,14 +162,32 @@ def to_state_matrices(system: Any) -> tuple[Array, Array, Array, Array]:
                     f"{system.name} has more zeros than poles, so that it would differentiate "
                     "without a filter: add the pole that the real one has"
                 )
-            zero = not np.any(num)
-            parts.append(ct.ss([], [], [], [[0]]) if zero else ct.ss(ct.tf(num, den, system.dt)))
-        a, b = (linalg.block_diag(*m) for m in ([s.A for s in parts], [s.B for s in parts]))
-        rows.append((a, b, np.hstack([s.C for s in parts]), np.hstack([s.D for s in parts])))
+            parts.append(_realize_fraction(num, den, system.dt))
+        a, b, c, d = zip(*parts, strict=True)
+        rows.append((linalg.block_diag(*a), linalg.block_diag(*b), np.hstack(c), np.hstack(d)))
     if len(rows) == 1:
         return rows[0]
     a, b, c, d = zip(*rows, strict=True)
     return linalg.block_diag(*a), np.vstack(b), linalg.block_diag(*c), np.vstack(d)
+
+
+def _realize_fraction(num: Array, den: Array, dt: float | None) -> tuple[Array, ...]:
+    """Return the controller form of a fraction of polynomials (Kailath, Linear Systems, 2.2).
+
+    A first coefficient of the numerator that is zero but for rounding is left out: it would let
+    the input through without delay. SciPy judges it by its size, whatever the units, and warns.
+    """
+    num, den = np.trim_zeros(num, "f"), np.trim_zeros(den, "f")
+    if not len(num):
+        return np.empty((0, 0)), np.empty((0, 1)), np.empty((1, 0)), np.zeros((1, 1))
+    n = len(den) - 1
+    fastest = 1.0 if dt else max(np.abs(np.roots(den)), default=1.0) or 1.0
+    parts = np.abs(num) * fastest ** np.arange(len(num))[::-1]
+    first = int(np.argmax(parts > ROUNDING * np.max(parts)))
+    num = np.pad(num[first:], (n + 1 - len(num) + first, 0)) / den[0]
+    den = den / den[0]
+    a = linalg.companion(den) if n else np.empty((0, 0))
+    return a, np.eye(n, 1), (num[1:] - num[0] * den[1:])[None], num[:1, None]
 
 
 def reduce_states(a: Array, b: Array, c: Array, order: int) -> tuple[Array, Array, Array]:
