@@ -24,6 +24,7 @@ from ctrlid.diagnosis.gap import (
     simulate_window,
 )
 from ctrlid.diagnosis.wording import describe_trivial, list_gap_rows
+from ctrlid.estimation.likelihood.prediction import predict_from, predict_spread
 from ctrlid.validation.reproduction import CLOSED_LOOP, Reproduction
 from test_wiring import CART, DT, at_rest, luenberger
 
@@ -66,6 +67,12 @@ def test_what_depends_on_time_acts_from_the_start_of_the_experiment(loop, place)
     windows = [Window(late, 600 * DT, np.ones(np.shape(late.y), bool), measure_spreads(late))]
     y = simulate_window(real, windows[0], CLOSED_LOOP)
     assert root_mean_square(windows, [y]) < 1e-6
+    # Where the controller is not known, predictions go by the same time, and so does their floor.
+    ahead = Reproduction("prediction", 7)
+    assert root_mean_square(windows, [simulate_window(real, windows[0], ahead)]) < 1e-6
+    fit = predict_from(real, late, 600 * DT)
+    both, _ = predict_spread(real, late, fit, 7, 600 * DT)
+    assert np.max(both) < 1e-6
 
 
 @pytest.mark.parametrize("memory", [0.0, 0.9, 0.98])

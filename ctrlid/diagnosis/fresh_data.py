@@ -146,7 +146,9 @@ class FreshData:
                 here = begin_fit(replace(problem, known=known))
             except ModelCannotRun:
                 return math.nan
-            index, y = predict_ahead(plain, record, make_prediction(here), horizon)
+            index, y = predict_ahead(
+                plain, record, make_prediction(here), horizon, window.start_time
+            )
             spreads = compute_spreads_ahead(
                 here.linearized[0], fit.noise, record.valid_samples, horizon
             )

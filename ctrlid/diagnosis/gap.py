@@ -15,7 +15,7 @@ from ..data.record import Record
 from ..data.validity import find_whole_past
 from ..estimation.likelihood.kalman_filter import make_sensor_states
 from ..estimation.likelihood.likelihood import Fit
-from ..estimation.likelihood.prediction import predict, predict_ahead, predict_spread
+from ..estimation.likelihood.prediction import predict_ahead, predict_from, predict_spread
 from ..estimation.likelihood.tails import JointTails, Tails
 from ..loop.loop import Loop
 from ..loop.simulation import Simulator
@@ -296,7 +296,9 @@ def simulate_window(loop: Loop, window: Window, how: Reproduction) -> Array:
     y = np.full(np.shape(record.y), np.nan)
     try:
         if how.horizon:
-            index, values = predict_ahead(loop, record, predict(loop, record), how.horizon)
+            first = window.start_time
+            made = predict_from(loop, record, first)
+            index, values = predict_ahead(loop, record, made, how.horizon, first)
             y[..., index] = values.T
             return y
         simulator = make_simulator(loop, record.hold, record.hold_r)
@@ -447,7 +449,9 @@ def _simulate_noise(
     record = window.record
     size = np.count_nonzero(window.mask, axis=-1)
     if how.horizon:
-        known = np.array(predict_spread(loop, record, predict(loop, record), how.horizon))
+        first = window.start_time
+        made = predict_from(loop, record, first)
+        known = np.array(predict_spread(loop, record, made, how.horizon, first))
         if known.ndim == 2:
             squares = size[:, None, None] * known.T[:, None, :] ** 2
             return np.tile(squares, (1, runs, 1))

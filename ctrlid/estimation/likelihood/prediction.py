@@ -159,18 +159,25 @@ def predict(loop: Loop, record: Record, noise_ratio: float | None = None) -> Pre
     if noise_ratio is not None and not (is_number(noise_ratio) and 0 <= noise_ratio < 1e150):
         raise CtrlidError("noise_ratio is the ratio of force noise to sensor noise [1/s^2], >= 0; "
                           f"given {noise_ratio!r}")  # fmt: skip
-    loop = _drop_neutral_effects(loop)
-    problem = make_problem(loop, (), [record])
+    if noise_ratio is not None and not loop.equations().siso:
+        raise CtrlidError("noise_ratio= is one ratio of one force to one sensor noise; for several "
+                          f"outputs ({', '.join(loop.signals['y'])}) leave it out: all are "
+                          "estimated")  # fmt: skip
+    return predict_from(loop, record, 0.0, noise_ratio)
+
+
+def predict_from(
+    loop: Loop, record: Record, start_time: float, noise_ratio: float | None = None
+) -> Prediction:
+    """Predict a part of a record, of which the first sample is at a time [s] of the whole one.
+
+    What acts at a time of its own, such as a line or a drift, goes by that time.
+    """
+    problem = make_problem(_drop_neutral_effects(loop), (), [record], [start_time])
     if noise_ratio is None:
-        fit = maximize(begin_fit(problem))
-    else:
-        if not loop.equations().siso:
-            raise CtrlidError("noise_ratio= is one ratio of one force to one sensor noise; for "
-                              f"several outputs ({', '.join(loop.signals['y'])}) leave it out: all "
-                              "are estimated")  # fmt: skip
-        noise = Noise((max(noise_ratio, 1e-150) ** 2,) * problem.plant.channels)
-        fit = begin_fit(problem, noise=noise)
-    return make_prediction(fit)
+        return make_prediction(maximize(begin_fit(problem)))
+    noise = Noise((max(noise_ratio, 1e-150) ** 2,) * problem.plant.channels)
+    return make_prediction(begin_fit(problem, noise=noise))
 
 
 def make_prediction(fit: Fit) -> Prediction:
@@ -212,7 +219,7 @@ def _drop_neutral_effects(loop: Loop) -> Loop:
 
 
 def predict_ahead(
-    loop: Loop, record: Record, prediction: Prediction, horizon: int
+    loop: Loop, record: Record, prediction: Prediction, horizon: int, start_time: float = 0.0
 ) -> tuple[Any, Array]:
     """Predict several samples ahead from the filtered states and the measured input.
 
@@ -226,6 +233,8 @@ def predict_ahead(
         What `predict` returned for them.
     horizon : int
         Number of samples to look ahead.
+    start_time : float, optional
+        Time of the first sample since the start of the whole record [s].
 
     Returns
     -------
@@ -241,7 +250,7 @@ def predict_ahead(
     starts = starts[known & settled]
     if not len(starts):
         return starts, np.empty(0)
-    problem = make_problem(_drop_neutral_effects(loop), (), [record])
+    problem = make_problem(_drop_neutral_effects(loop), (), [record], [start_time])
     plant, data = problem.plant, problem.data[0]
     x = np.hstack([prediction.states, prediction.circuit])[starts]
     for j in range(horizon):
@@ -252,7 +261,7 @@ def predict_ahead(
 
 
 def predict_spread(
-    loop: Loop, record: Record, prediction: Prediction, horizon: int
+    loop: Loop, record: Record, prediction: Prediction, horizon: int, start_time: float = 0.0
 ) -> tuple[Any, Any]:
     r"""Return the standard deviation that noise gives predictions several samples ahead.
 
@@ -272,6 +281,8 @@ def predict_spread(
         What `predict` returned.
     horizon : int
         Number of samples ahead.
+    start_time : float, optional
+        Time of the first sample since the start of the whole record [s].
 
     Returns
     -------
@@ -281,10 +292,10 @@ def predict_spread(
     """
     plain = replace(_drop_neutral_effects(loop), controller=None)
     if not loop.equations().siso:
-        return _predict_several_spreads(plain, record, prediction, horizon)
+        return _predict_several_spreads(plain, record, prediction, horizon, start_time)
     r, force = prediction.sensor_noise**2, prediction.force_noise**2
     ratio = max(force / r, 1e-300) if r else 1.0
-    problem = make_problem(plain, (), [record])
+    problem = make_problem(plain, (), [record], [start_time])
     noise = Noise((ratio,) * problem.plant.channels)
     lin = begin_fit(problem, noise=noise).linearized[0]
     both, sensor = (
@@ -295,10 +306,10 @@ def predict_spread(
 
 
 def _predict_several_spreads(
-    loop: Loop, record: Record, prediction: Prediction, horizon: int
+    loop: Loop, record: Record, prediction: Prediction, horizon: int, start_time: float
 ) -> tuple[Array, Array]:
     """Return what `predict_spread` does, for each of several outputs."""
-    problem = make_problem(loop, (), [record])
+    problem = make_problem(loop, (), [record], [start_time])
     sensor = np.maximum(np.ravel(np.asarray(prediction.sensor_noise, dtype=float)), 1e-150)
     force = np.ravel(np.asarray(prediction.force_noise, dtype=float))
     sensors = tuple(((sensor[1:] / sensor[0]) ** 2).tolist())
