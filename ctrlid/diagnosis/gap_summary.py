@@ -12,7 +12,12 @@ from .._base.units import fill_unit
 from ..estimation.likelihood.filter_data import find_noise_units
 from ..estimation.likelihood.likelihood import Fit
 from ..loop.loop import Loop
-from ..validation.reproduction import CLOSED_LOOP, Reproduction, find_longest_horizon
+from ..validation.reproduction import (
+    CLOSED_LOOP,
+    Reproduction,
+    choose_prediction,
+    find_longest_horizon,
+)
 from . import gap as gaps
 from .findings import Disturbance, Gap, GapKind
 from .fitted_model import Model
@@ -71,6 +76,22 @@ def summarize_gap(loop: Loop, found: Search, fresh: FreshData) -> GapSummary:
         floors = [part.both for part in floor.outputs or (floor,)]
         excess = gaps.compute_excess_chance(shared.windows, results[2], floors)
     return GapSummary(gap, shares, _measure_disturbance(fit, loop, floor), excess, worse)
+
+
+def replace_divergence(
+    loop: Loop, found: Search, summary: GapSummary, fresh: FreshData
+) -> tuple[FreshData, GapSummary]:
+    """Return the gap of predictions where the simulation of the completed model diverges.
+
+    Where a controller hardly holds a plant, noise alone drives the right model away from the
+    record: a simulation then tells nothing of what is missing, and would take a right name back.
+    """
+    if fresh.how.horizon or math.isfinite(summary.gap.after):
+        return fresh, summary
+    how = choose_prediction(found.final.fitted, fresh.windows[0].record)
+    ahead = lengthen_horizon(loop, found, replace(fresh, how=how))
+    other = summarize_gap(loop, found, ahead)
+    return (ahead, other) if math.isfinite(other.gap.after) else (fresh, summary)
 
 
 def _summarize_several(

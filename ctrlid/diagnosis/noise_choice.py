@@ -57,7 +57,23 @@ def prefer_sensor_noise(
     newly_coloured = fit.noise.sensor_is_white and not other.noise.sensor_is_white
     if newly_coloured and is_larger(Model(model.loop, other)):
         return None
+    if newly_coloured and best is not None and _is_better_beside(best, other):
+        return None
     return with_linearization(Model(model.loop, other))
+
+
+def _is_better_beside(best: Trial, other: Fit) -> bool:
+    """Whether the best effect beside coloured noise of its own explains more than noise alone.
+
+    A resonance of the noise may take a line nearly for itself, and then hides it from every screen.
+    """
+    if best.net_gain <= THRESHOLD.gate:
+        return False
+    with contextlib.suppress(ModelCannotRun):
+        beside = choose_sensor_noise(with_linearization(best.model).fit)
+        gain = compute_noise_criterion(beside) - compute_noise_criterion(other)
+        return gain - best.penalty > THRESHOLD.gate
+    return False
 
 
 def _may_be_coloured(fit: Fit, more: float) -> bool:

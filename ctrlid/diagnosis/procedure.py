@@ -30,6 +30,7 @@ from .gap_summary import (
     lengthen_horizon,
     make_fresh_data_test,
     make_size_test,
+    replace_divergence,
     summarize_gap,
     take_back_widening,
 )
@@ -59,6 +60,11 @@ from .result import Diagnosis
 from .several_records import merge_diagnoses
 from .thresholds import THRESHOLD
 from .verdict import declare_unfinished
+
+DIVERGES = (
+    "the {} of the completed model diverges on the samples kept back. Where the controller hardly "
+    "holds the plant, noise alone is enough for that, so the gap is that of predictions"
+)
 
 BY_SIMULATION = (
     "in the Kalman filter a random force explained the error, so the effects were found by the "
@@ -280,12 +286,17 @@ def _answer_question(q: Question) -> tuple[Diagnosis, Search]:
         search = q.attempt(lambda: compare_names(keep_main_effects(search, helps), q.work), search)
     # Step 9: the gap before and after. An effect of one of several records may widen the others'.
     summary = summarize_gap(q.loop, search, q.fresh)
+    simulated = q.fresh.how
+    fresh, summary = replace_divergence(q.loop, search, summary, q.fresh)
+    q = replace(q, fresh=fresh)
     if len(q.records) == 1 and search.finished:
         search, summary = take_back_widening(q.loop, search, summary, q.fresh)
     # Step 10: the decision table.
     q.tell("writing the report")
     read = (*readout.found, *steps)
     result = assemble_answer(q.loop, q.records, search, summary, read)
+    if fresh.how != simulated:
+        result = replace(result, notes=(*result.notes, DIVERGES.format(simulated)))
     worth = (
         q.loop.equations().siso
         and result.verdict not in COMPLETE

@@ -54,9 +54,13 @@ def choose_reproduction(loop: Loop, record: Record) -> Reproduction:
         return CLOSED_LOOP
     if loop.controller is None and comes_to_rest(loop):
         return OPEN_LOOP
-    return Reproduction(
-        "prediction", find_time_constant(compute_moving_poles(loop), loop.equations().dt, record)
-    )
+    return choose_prediction(loop, record)
+
+
+def choose_prediction(loop: Loop, record: Record) -> Reproduction:
+    """Return the prediction over the time constant of the plant."""
+    poles = compute_moving_poles(loop)
+    return Reproduction("prediction", find_time_constant(poles, loop.equations().dt, record))
 
 
 def compute_moving_poles(loop: Loop) -> Any:
