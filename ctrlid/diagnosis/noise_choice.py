@@ -9,7 +9,8 @@ import numpy as np
 from .._base.criterion import bayesian_penalty
 from .._base.errors import ModelCannotRun
 from .._base.statistics import compute_lagged_products, compute_predicted_likelihood
-from ..estimation.likelihood.likelihood import Fit
+from ..estimation.likelihood.kalman_filter import Noise
+from ..estimation.likelihood.likelihood import Fit, evaluate_likelihood
 from ..estimation.likelihood.maximization import choose_sensor_noise, choose_tails
 from ..estimation.likelihood.noise_fit import (
     compute_noise_criterion,
@@ -57,23 +58,27 @@ def prefer_sensor_noise(
     newly_coloured = fit.noise.sensor_is_white and not other.noise.sensor_is_white
     if newly_coloured and is_larger(Model(model.loop, other)):
         return None
-    if newly_coloured and best is not None and _is_better_beside(best, other):
-        return None
+    if newly_coloured and best is not None:
+        beside = _colour_beside(best, other)
+        if beside is not None and beside.sensor_is_white:
+            return None
+        if beside is not None:
+            other = evaluate_likelihood(fit.problem, fit.theta, beside, fit.trajectories)
     return with_linearization(Model(model.loop, other))
 
 
-def _is_better_beside(best: Trial, other: Fit) -> bool:
-    """Whether the best effect beside coloured noise of its own explains more than noise alone.
+def _colour_beside(best: Trial, other: Fit) -> Noise | None:
+    """Return the sensor noise beside the best effect where both explain more than noise alone.
 
     A resonance of the noise may take a line nearly for itself, and then hides it from every screen.
     """
     if best.net_gain <= THRESHOLD.gate:
-        return False
+        return None
     with contextlib.suppress(ModelCannotRun):
         beside = choose_sensor_noise(with_linearization(best.model).fit)
         gain = compute_noise_criterion(beside) - compute_noise_criterion(other)
-        return gain - best.penalty > THRESHOLD.gate
-    return False
+        return beside.noise if gain - best.penalty > THRESHOLD.gate else None
+    return None
 
 
 def _may_be_coloured(fit: Fit, more: float) -> bool:
