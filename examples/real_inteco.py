@@ -61,8 +61,8 @@ folded = hum.effect.frequency + np.arange(-5, 5) / record.dt
 waves = np.exp(-2j * np.pi * np.outer(np.abs(folded), t))
 sizes = 2 * np.abs(waves @ y) / len(t)
 line = float(np.abs(folded[np.argmax(sizes)]))
-print(f"in the reading {1e6 * hum.effect.amplitude:.1f} um at {hum.effect.frequency:.2f} Hz; in the "
-      f"raw record {1e6 * sizes.max():.1f} um at {line:.2f} Hz")  # fmt: skip
+print(f"in the reading {1e6 * hum.effect.amplitude:.1f} um at {hum.effect.frequency:.2f} Hz; "
+      f"in the raw record {1e6 * sizes.max():.1f} um at {line:.2f} Hz")  # fmt: skip
 
 # %%
 # The coil alone

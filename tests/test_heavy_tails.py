@@ -8,6 +8,7 @@ import pytest
 from scipy import integrate, stats
 
 import ctrlid as cid
+from ctrlid.estimation.likelihood import tails
 from ctrlid.estimation.likelihood.kalman_filter import Noise, run_filter
 from ctrlid.estimation.likelihood.likelihood import make_problem
 from ctrlid.estimation.likelihood.maximization import begin_fit, choose_tails, maximize
@@ -47,6 +48,16 @@ def test_the_law_is_a_law(law):
     drawn = law.draw(np.random.default_rng(0).standard_normal(20_000), seed=1)
     assert stats.kstest(law.normalize(drawn), "norm").pvalue > 1e-3
     assert law.find_scale(4 * drawn**2, 1.0) == pytest.approx(4, rel=0.05)
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("start", [1e-6, 1.0, 1e4])
+def test_the_scale_solves_its_equation_from_any_start_in_few_steps(law, start, monkeypatch):
+    squares = (3 * law.draw(np.random.default_rng(1).standard_normal(800), seed=2)) ** 2
+    monkeypatch.setattr(tails, "STEPS", 25)
+    found = law.find_scale(squares, start)
+    made = np.mean(law.compute_weight(np.sqrt(squares / found)) * squares)
+    assert made == pytest.approx(found, rel=1e-6)
 
 
 def test_information_is_that_of_students_law():

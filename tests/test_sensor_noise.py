@@ -134,3 +134,24 @@ def test_holding_the_colour_fits_the_force_alone():
     assert held.noise.force != start.noise.force
     assert free.noise.ar[0] == pytest.approx(0.8, abs=0.05)
     assert free.value > held.value > start.value
+
+
+def test_a_line_beside_averaged_noise_is_named():
+    """A resonance of the noise model takes a strong line nearly for itself."""
+    plant = cid.plants.servo(m=1.0, c=2.0, k=3.0)
+    at = cid.OperatingPoint(states=(0.0, 0.0), input=0.0, output=0.0)
+    law = cid.PID(kp=20.0, kd=1.0, filter_time=0.02)
+    loop = cid.Loop(plant, law, dt=0.01, at=at, free=("k", "c"))
+    rng = np.random.default_rng(4)
+    r = np.repeat(rng.choice([-0.1, 0.1], 30), 50)
+    noise = 1e-4 * np.convolve(rng.standard_normal(1503), np.full(4, 0.5), "valid")
+    line = 1e-3 * np.sin(2 * np.pi * 27.3 * 0.01 * np.arange(1500) + 1.9)
+    y, u = simulate_servo(r, noise + line)
+    record = cid.Record(r=r, u=u, y=y, dt=0.01)
+    few = [cid.effects.SensorHum, cid.effects.CoulombFriction, cid.effects.SensorLag]
+    found = cid.diagnose(loop, record, catalogue=few, progress=False)
+    assert found.verdict == "explained"
+    (one,) = found.findings
+    assert one.name == "SensorHum"
+    assert one.effect.amplitude == pytest.approx(1e-3, rel=0.02)
+    assert found.noise.kind == "coloured"

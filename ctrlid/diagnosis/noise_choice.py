@@ -58,13 +58,23 @@ def prefer_sensor_noise(
     newly_coloured = fit.noise.sensor_is_white and not other.noise.sensor_is_white
     if newly_coloured and is_larger(Model(model.loop, other)):
         return None
-    if newly_coloured and best is not None:
+    if newly_coloured and best is not None and _rings_on(other):
         beside = _colour_beside(best, other)
         if beside is not None and beside.sensor_is_white:
             return None
         if beside is not None:
             other = evaluate_likelihood(fit.problem, fit.theta, beside, fit.trajectories)
     return with_linearization(Model(model.loop, other))
+
+
+def _rings_on(fit: Fit) -> bool:
+    r"""Whether a resonance of the sensor noise lasts for a fair part of the record, as a line does.
+
+    A pole p fades to 1/e within :math:`-1/\ln |p|` samples.
+    """
+    poles = np.roots([1.0, *(-np.array(fit.noise.ar))])
+    ringing = np.abs(poles[np.abs(poles.imag) > 0])
+    return bool(np.any(ringing > math.exp(-1 / (THRESHOLD.ringing * fit.size))))
 
 
 def _colour_beside(best: Trial, other: Fit) -> Noise | None:
