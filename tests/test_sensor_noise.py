@@ -16,6 +16,7 @@ from ctrlid.estimation.likelihood.kalman_filter import Noise, compute_memory
 from ctrlid.estimation.likelihood.likelihood import make_problem
 from ctrlid.estimation.likelihood.maximization import begin_fit, choose_sensor_noise, maximize
 from ctrlid.estimation.likelihood.noise_fit import fit_noise
+from problems import load_script
 
 
 def simulate_servo(r, noise, dt=0.01, kp=20.0, kd=1.0, filter_time=0.02, dead_zone=0.0):
@@ -138,20 +139,14 @@ def test_holding_the_colour_fits_the_force_alone():
 
 def test_a_line_beside_averaged_noise_is_named():
     """A resonance of the noise model takes a strong line nearly for itself."""
-    plant = cid.plants.servo(m=1.0, c=2.0, k=3.0)
-    at = cid.OperatingPoint(states=(0.0, 0.0), input=0.0, output=0.0)
-    law = cid.PID(kp=20.0, kd=1.0, filter_time=0.02)
-    loop = cid.Loop(plant, law, dt=0.01, at=at, free=("k", "c"))
-    rng = np.random.default_rng(4)
-    r = np.repeat(rng.choice([-0.1, 0.1], 30), 50)
-    noise = 1e-4 * np.convolve(rng.standard_normal(1503), np.full(4, 0.5), "valid")
-    line = 1e-3 * np.sin(2 * np.pi * 27.3 * 0.01 * np.arange(1500) + 1.9)
-    y, u = simulate_servo(r, noise + line)
-    record = cid.Record(r=r, u=u, y=y, dt=0.01)
-    few = [cid.effects.SensorHum, cid.effects.CoulombFriction, cid.effects.SensorLag]
-    found = cid.diagnose(loop, record, catalogue=few, progress=False)
+    study = load_script("benchmarks", "study_frozen")
+    case = study.cases.draw_case("one", 80031)
+    record = cid.Record(r=case.r, u=case.u, y=case.y, dt=case.rig.dt)
+    few = [cid.effects.SensorHum, cid.effects.SensorLag]
+    found = cid.diagnose(study.make_loop(case.rig), record, catalogue=few, progress=False)
+    assert case.hidden == ("SensorHum",)
     assert found.verdict == "explained"
     (one,) = found.findings
     assert one.name == "SensorHum"
-    assert one.effect.amplitude == pytest.approx(1e-3, rel=0.02)
+    assert one.effect.amplitude == pytest.approx(case.sizes[0]["hum"], rel=0.01)
     assert found.noise.kind == "coloured"
