@@ -707,3 +707,17 @@ def test_what_is_called_equivalent_gives_the_same_record():
     two = cid.simulate(seen, r, initial=(x0 + 2e-4, 0.0))
     np.testing.assert_allclose(one.y, two.y, rtol=1e-9)
     np.testing.assert_allclose(one.u - u0, two.u - u0, atol=1e-7)
+
+
+def test_a_delay_of_very_many_samples_is_asked_about():
+    """Whoever writes 2 may mean samples; a process with a long dead time is taken as it is."""
+    loop = cid.Loop(integrator(), None, dt=0.005)
+    with pytest.warns(cid.CtrlidWarning, match=r"400 sampling periods.* give delay=0\.01$") as told:
+        late = loop.with_effect(E.InputDelay(delay=2))
+    assert told[0].filename == __file__
+    assert late.parameters["InputDelay.delay"] == 2.0
+    with pytest.warns(cid.CtrlidWarning, match="in seconds") as told:
+        cid.Loop(integrator(), None, dt=0.005, effects=(E.InputDelay(delay=2),))
+    assert told[0].filename == __file__
+    # A warning is an error here.
+    loop.with_effect(E.InputDelay(delay=0.5))

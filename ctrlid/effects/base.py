@@ -134,6 +134,17 @@ class AbstractEffect(metaclass=CheckedCalls):
         """Say why values that were fitted cannot be this effect; by default None, for they can."""
         return None
 
+    def question(self, dt: float) -> str | None:
+        """Say what is odd about its values at a sampling period; by default None, for nothing is.
+
+        Parameters
+        ----------
+        dt : float
+            Sampling period of the loop [s].
+        """
+        del dt
+        return None
+
     def limits(self, seen: Range) -> dict[str, tuple[float, float]]:
         """Return what a record limits parameters to, beyond their own bounds; nothing by default.
 

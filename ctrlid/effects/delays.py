@@ -67,6 +67,11 @@ class ActuatorLag(InputEffect):
         return m.own["input"]
 
 
+# A delay of more periods than this is asked about: it may be meant in samples. A process with a
+# long dead time may have it all the same, so that it is not refused.
+MANY_PERIODS = 100
+
+
 @final
 @dataclass(frozen=True)
 class InputDelay(InputEffect):
@@ -103,6 +108,17 @@ class InputDelay(InputEffect):
         """Return a delay of half a period: at zero the derivative has one side only."""
         del record
         return cls._applicable(loop, cls(delay=0.5 * loop.dt))
+
+    def question(self, dt: float) -> str | None:
+        """Ask whether a delay of very many periods was meant in samples."""
+        periods = self.delay / dt
+        if periods <= MANY_PERIODS:
+            return None
+        return (
+            f"InputDelay(delay={self.delay:g}) is a delay of {self.delay:g} s, which is "
+            f"{periods:.6g} sampling periods of {dt:g} s. The delay is in seconds: if "
+            f"{self.delay:g} samples are meant, give delay={self.delay * dt:.6g}"
+        )
 
     def limits(self, seen: Range) -> dict[str, tuple[float, float]]:
         """Return the length of the record: of a longer delay nothing would arrive."""

@@ -148,6 +148,7 @@ class Loop:
         object.__setattr__(self, "at", at)
         object.__setattr__(self, "input_limits", limits)
         self._apply_effects()
+        _question_effects(self.effects, self.dt, stacklevel=5)
         self._check_units()
         law = self.law()
         if law and law.dt == 0.0 and equations.dt:
@@ -389,7 +390,9 @@ class Loop:
         {'m': 2.0, 'c': 1.0, 'k': 3.0, 'CoulombFriction.fc': 0.2}
         """
         # Whether a plant takes an effect is found out by adding it, and then it is added again.
-        return _add_effect(self, _Itself(effect))
+        loop = _add_effect(self, _Itself(effect))
+        _question_effects((effect,), self.dt, stacklevel=3)
+        return loop
 
     def without_effect(self, effect: str | AbstractEffect) -> "Loop":
         """Return the loop without one of its effects.
@@ -626,6 +629,14 @@ def exchange_controller(loop: Loop, controller: Any) -> Loop:
 def exchange_limits(loop: Loop, lower: float = -math.inf, upper: float = math.inf) -> Loop:
     """Return a loop with other limits of its input, by default none, on the same plant."""
     return loop._replace_fields(input_limits=(lower, upper))
+
+
+def _question_effects(effects: tuple[AbstractEffect, ...], dt: float, stacklevel: int) -> None:
+    """Warn of values that are odd at this sampling period, such as a delay of 400 samples."""
+    for effect in effects:
+        text = effect.question(dt)
+        if text is not None:
+            warnings.warn(text, CtrlidWarning, stacklevel=stacklevel)
 
 
 def _question_belief(name: str, share: float, value: float) -> None:
