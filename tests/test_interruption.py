@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 
 import numba
 import numpy as np
@@ -21,6 +22,8 @@ from ctrlid._base.errors import CtrlidError
 from ctrlid._base.files import replace_file
 from ctrlid._base.interruption import Budget, Stopped, check_budget, keep_interrupt
 from ctrlid._base.jobs import run_side_by_side, share_out
+from ctrlid.diagnosis import growth
+from ctrlid.diagnosis.noise_tests import run_noise_tests
 from ctrlid.diagnosis.progress import Progress
 from ctrlid.diagnosis.thresholds import vary_numbers
 
@@ -348,3 +351,23 @@ def test_compiled_loops_without_a_folder_to_keep_them(monkeypatch):
 
     monkeypatch.setattr(numba, "njit", njit)
     assert compile_loop(nogil=True)(lambda x: x + 1)(2) == 3
+
+
+def test_no_round_has_a_number_that_goes_back(record, monkeypatch, capsys):
+    """The search is made to prefer the other effect in hindsight, and then to search again."""
+    first = []
+
+    def prefer_other(last, step, catalogue, work):
+        first.append(last.best.key)
+        return None if first[1:] else next(t for t in last.trials if t.key != last.best.key)
+
+    monkeypatch.setattr(growth, "find_better_choice", prefer_other)
+    monkeypatch.setattr(growth, "retest_with_replicas", lambda model: replace(
+        run_noise_tests(model.fit), alpha=1.0))  # fmt: skip
+    cid.diagnose(drive(), record, catalogue=(E.CoulombFriction, E.InputOffset))
+    heads = [line.split(", ")[1:] for line in capsys.readouterr().err.splitlines()]
+    heads = [", ".join(parts).partition(" (")[0] for parts in heads]
+    numbers = [int(head.split()[1]) for head in heads if head.startswith("round ")]
+    assert numbers == sorted(set(numbers))
+    assert "looking back from round 2" in heads
+    assert [head for head in heads if head.startswith("second search, round ")]

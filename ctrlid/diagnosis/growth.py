@@ -133,9 +133,12 @@ def _grow_model(
     model = with_linearization(first[-1].base) if first else base
     changed, left = False, tuple[Round, ...]()
     likeliest = model
+    # The last round that was begun before the search looked back.
+    seen = 0
     while not steps or steps[-1].best is not None:
         if steps and steps[-1].best is not None:
-            tell(f"round {len(steps)}: {steps[-1].best.key} with all else")
+            head = _name_round(len(steps), seen, again=bool(first))
+            tell(f"{head}: {steps[-1].best.key} with all else")
             reached.keep(steps[-1].base, steps[-1].best)
             reached.model = steps[-1].best.model
             model = refit_noise(order_last_effect(steps[-1].best.model, given))
@@ -149,13 +152,14 @@ def _grow_model(
         ):
             break
         reached.model = model
-        tell(f"round {len(steps) + 1}: screening")
+        head = _name_round(len(steps) + 1, seen, again=bool(first))
+        tell(f"{head}: screening")
         pool = list_missing_candidates(model, catalogue)
         given_values = None if steps else restore_given_values(base)
         step = run_round(model, pool, work, given_values, beside=bool(steps))
         # Noise may be coloured and have heavy tails, one after the other.
         while (other := prefer_sensor_noise(model, step.best, is_larger)) is not None:
-            tell(f"round {len(steps) + 1}: screening beside other sensor noise")
+            tell(f"{head}: screening beside other sensor noise")
             model, base = other, base if steps else other
             reached.model, reached.base = model, base
             pool = list_missing_candidates(model, catalogue)
@@ -164,10 +168,11 @@ def _grow_model(
         if step.best is not None and _is_stand_in(step.best, model, beside=bool(steps)):
             step = replace(step, best=None)
         asked = steps and not first and not changed
-        tell(f"round {len(steps) + 1}: checking", ranked=False)
+        tell(f"{head}: checking", ranked=False)
         better = find_better_choice(steps[-1], step, catalogue, work) if asked else None
         changed = better is not None
         if changed:
+            seen = len(steps) + 1
             left = left or (*steps, step)
             steps[-1] = replace(steps[-1], best=better)
         else:
@@ -183,6 +188,23 @@ def _grow_model(
         model, found = base, ()
     tests = run_noise_tests(base.fit), retest_with_replicas(model)
     return Search(base, tuple(steps), model, found, *tests, left)
+
+
+def _name_round(number: int, seen: int, again: bool) -> str:
+    """Return what a round is called while it is taken, so that its number never goes back.
+
+    Parameters
+    ----------
+    number : int
+        The number of the round, from 1.
+    seen : int
+        The round that was begun when the search looked back, up to which rounds are taken anew.
+    again : bool
+        Whether this is the second search, which begins where the first one changed a choice.
+    """
+    if again:
+        return f"second search, round {number}"
+    return f"looking back from round {seen}" if number <= seen else f"round {number}"
 
 
 def _end_search(reached: Reached) -> Search:

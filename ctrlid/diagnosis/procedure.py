@@ -365,11 +365,17 @@ def _answer_each_record(q: Question, together: Search) -> Diagnosis | None:
     parts: list[Diagnosis] = []
     gained = size = 0.0
     for record, audit in zip(q.records, q.audits, strict=True):
-        q.tell(f"record {len(parts) + 1} alone")
+        head = f"record {len(parts) + 1} alone"
+        q.tell(head)
+
+        def tell(step: str, head: str = head, **options: Any) -> None:
+            # Its rounds count from 1 again.
+            q.tell(f"{head}, {step}", **options)
+
         fresh = choose_fresh_data(q.loop, [record], None)
         try:
             result, search = _answer_question(
-                replace(q, records=(record,), audits=(audit,), fresh=fresh)
+                replace(q, records=(record,), audits=(audit,), fresh=fresh, tell=tell)
             )
         except (ModelCannotRun, EffectDoesNotApply):
             # The record says too little when it stands alone.

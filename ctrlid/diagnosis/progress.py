@@ -41,7 +41,7 @@ class Progress:
         self.bar = tqdm(total=0, disable=not (shown and terminal), leave=False, bar_format=BAR)
 
     def tell(self, step: str, *, ranked: bool = True) -> None:
-        """Begin a step; one that begins with ``round k`` belongs to the round of this number.
+        """Begin a step; what stands before its colon is the round that it belongs to.
 
         Parameters
         ----------
@@ -62,9 +62,9 @@ class Progress:
         self._draw(now)
 
     def _write_line(self, head: str, now: float) -> None:
-        """Write what is begun, how long the round before took, and what led in it."""
+        """Write what is begun, how long what was before it took, and what led in it."""
         words = f"ctrlid diagnose: {now - self.start:.0f} s, {head}"
-        if self.round.startswith("round "):
+        if self.leader is not None or (self.round and now - self.begun >= 1):
             last = f"{self.round} took {now - self.begun:.0f} s"
             if self.leader is not None:
                 last += f", {self.describe_leader()}"
