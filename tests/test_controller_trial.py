@@ -266,7 +266,7 @@ def test_the_report():
         "controller: StateSpace, analog", "theta <- theta", "F <- F of the controller",
         "phase margin at F [deg]", "disk margin [1]", "step of xd[0]: final x per unit",
         "step of xd[0]: largest theta", "step of xd[0]: largest F",
-        "Achieved steps (xd[0] by 0.01) are those of the nonlinear physics.",
+        "Achieved steps (xd[0] by 10 mm) are those of the nonlinear physics.",
     ):  # fmt: skip
         assert words in text
 

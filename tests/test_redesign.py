@@ -12,6 +12,7 @@ import pytest
 
 import ctrlid as cid
 from ctrlid import CtrlidError
+from ctrlid.design.settling import explain_unsettled
 from problems import levitation
 
 DT = 1e-3
@@ -220,7 +221,7 @@ def test_limits_that_lose_the_ball_are_not_called_stable():
     assert not found.stable
     assert found.achieved.phase_margin == pytest.approx(50)  # for small signals
     assert np.isnan(found.achieved.settling_time)
-    assert "WITH A STEP OF 0.00012 THE LOOP DIVERGES. After " in found.verdict
+    assert "WITH A STEP OF 0.12 mm THE LOOP DIVERGES. After " in found.verdict
     assert "with V at its limit (2.95 to 3.05)" in found.verdict
     assert "give a smaller step= to redesign" in found.verdict
     assert len(found.achieved_step) < len(found.time)
@@ -232,7 +233,7 @@ def test_limits_that_lose_the_ball_are_not_called_stable():
 def test_a_step_too_large_for_the_physics():
     found = cid.redesign(P, LOOP, crossover=100, phase_margin=50, step=-0.009)
     assert not found.stable
-    assert "WITH A STEP OF -0.009 THE LOOP DIVERGES. The simulation stops at t = " in found.verdict
+    assert "WITH A STEP OF -9 mm THE LOOP DIVERGES. The simulation stops at t = " in found.verdict
     # What there is before the ball is lost is shown: every sample until the one of the message.
     assert f"(sample {found.achieved_step.size})" in found.verdict
     assert found.achieved_step[0] == pytest.approx(0)
@@ -243,7 +244,80 @@ def test_a_response_that_never_settles_is_said():
     found = cid.redesign(P, LOOP, crossover=100, phase_margin=50)
     assert np.isfinite(found.achieved.settling_time)
     hunting = replace(found, achieved=replace(found.achieved, settling_time=float("inf")))
-    assert "WITH A STEP OF 0.00012 THE RESPONSE DOES NOT SETTLE" in hunting.verdict
+    assert "WITH A STEP OF 0.12 mm THE RESPONSE DOES NOT SETTLE" in hunting.verdict
+    # This loop has neither limits nor friction nor an encoder.
+    assert "In this loop the reason may be: the physics is not linear" in hunting.verdict
+    for absent in ("read in steps", "limit", "holds the plant", "small motions"):
+        assert absent not in hunting.verdict
+
+
+UNSTABLE = ct.tf([2.0], [1.0, 0.5, -9.0], inputs="u", outputs="y")
+
+
+# A digital controller sees the steps of an encoder once a period.
+EACH_PERIOD = ct.sample_system(ct.ss(UNSTABLE), 0.01)
+
+
+def unsettled(loop, **more):
+    return cid.redesign(EACH_PERIOD, loop, crossover=8, phase_margin=45, **more)
+
+
+def design_lead(P):
+    return cid.design_lead(ct.tf(P), 8, 45)
+
+
+def test_only_what_a_loop_has_may_keep_it_from_settling():
+    bare = cid.Loop(UNSTABLE, None, dt=0.01, units={"y": "m"})
+    coarse = unsettled(bare.with_effect(cid.effects.Quantization(step=0.02)), step=0.01)
+    assert coarse.achieved.settling_time == np.inf
+    assert "WITH A STEP OF 10 mm THE RESPONSE DOES NOT SETTLE" in coarse.verdict
+    assert "the margins hold within" in coarse.verdict
+    told = coarse.verdict.partition("DOES NOT SETTLE. ")[2]
+    assert told.startswith("In this loop the reason may be: y is read in steps of 20 mm "
+                           "(Quantization), of which the step of the reference is 0.5, so that the "
+                           "2 % within which")  # fmt: skip
+    for absent in ("limit", "linear", "friction", "Friction", "kink"):
+        assert absent not in told
+    for effect, words in (
+        (cid.effects.CoulombFriction(0.1), "CoulombFriction holds the plant where it stands"),
+        (cid.effects.InputDeadZone(0.1), "InputDeadZone takes away small motions of the input"),
+        (cid.effects.InputSaturation(-1, 1), "InputSaturation limits the input"),
+        (cid.effects.CubicStiffness(1.0), "the physics is not linear"),
+    ):
+        assert words in explain_unsettled(bare.with_effect(effect), "y", 0.01)
+    limited = replace(bare, input_limits=(-1, 2))
+    assert "u reaches its limits (-1 to 2)" in explain_unsettled(limited, "y", 0.01)
+    assert "it is slower than what is simulated" in explain_unsettled(bare, "y", 0.01)
+    rubbing = ct.nlsys(lambda t, x, u, params: [x[1], u[0] - np.sign(x[1])],
+                       lambda t, x, u, params: [x[0]], inputs=1, outputs=1, states=2)  # fmt: skip
+    told = explain_unsettled(cid.Loop(rubbing, dt=0.01), "y[0]", 0.01)
+    assert "the equations of the plant contain a sign" in told
+
+
+def test_a_trial_says_the_unit_of_its_step_and_what_may_hold_it():
+    loop = cid.Loop(UNSTABLE, None, dt=0.01, units={"y": "m"})
+    loop = loop.with_effect(cid.effects.Quantization(step=0.02))
+    text = str(cid.redesign(EACH_PERIOD, loop, design=design_lead, step=0.01))
+    assert "Achieved steps (y by 10 mm) are those of the nonlinear physics" in text
+    assert "WITH THE STEP OF y by 10 mm THE RESPONSE DOES NOT SETTLE. In this loop" in text
+    assert "y is read in steps of 20 mm (Quantization)" in text
+
+
+def test_the_default_step_is_several_steps_of_the_encoder():
+    bare = cid.Loop(UNSTABLE, None, dt=0.01, units={"y": "m"})
+    coarse = bare.with_effect(cid.effects.Quantization(step=0.02))
+    found = unsettled(coarse)
+    assert found.step == pytest.approx(0.2)
+    assert "y is read in steps of 20 mm, of which 10 are taken" in str(found)
+    trial = cid.redesign(EACH_PERIOD, coarse, design=design_lead)
+    assert trial.steps[0].height == pytest.approx(0.2)
+    # A fine encoder changes nothing; where several of its steps are too much, the text says so.
+    fine = unsettled(bare.with_effect(cid.effects.Quantization(step=1e-4)))
+    assert fine.step == unsettled(bare).step
+    limited = unsettled(replace(coarse, input_limits=(-10.0, 10.0)))
+    assert limited.step < 0.02
+    assert "of which this is only 0." in str(limited)
+    assert "10 of them may be too much for this loop" in str(limited)
 
 
 # --- texts

@@ -13,7 +13,7 @@ import numpy as np
 from .._base.arguments import is_number
 from .._base.arrays import Array, ComplexArray, freeze_arrays
 from .._base.errors import CtrlidError, ModelCannotRun
-from .._base.text import Printed, write_count, write_list, write_number, write_quantity
+from .._base.text import Printed, write_count, write_list, write_quantity
 from ..effects import (
     AsymmetricCoulombFriction,
     CoulombFriction,
@@ -27,10 +27,9 @@ from ..loop.loop import Loop
 from ..loop.simulation import SimulationStopped, simulate
 from ..physics.trace import timebase
 from .input_margins import LoopPerformance, measure_performance
+from .settling import SETTLED, explain_unsettled
 from .step_height import choose_height
 
-# A response has settled when it stays within this share of its final value.
-SETTLED = 0.02
 # A response so many times the promised one is no longer under control.
 LOST = 20
 # The loss of more than this share of what was promised is reported.
@@ -187,13 +186,19 @@ class ControllerTrial(Printed):
             return f"{text} This is for small signals: WITH THE STEP THE LOOP DIVERGES. " + (
                 self.failure
             )
-        restless = [s.reference for s in self.steps if np.isfinite(s.promised.settling_time)
+        restless = [s for s in self.steps if np.isfinite(s.promised.settling_time)
                     and not np.isfinite(s.achieved.settling_time)]  # fmt: skip
         if restless:
-            return (f"{text} WITH THE STEP OF {write_list(restless)} THE RESPONSE DOES NOT SETTLE, "
-                    "because an input saturates, the step leaves the linear range, or dry friction "
-                    "holds it.")  # fmt: skip
+            names = write_list([f"{s.reference} by {self._write_height(s)}" for s in restless])
+            reasons = [explain_unsettled(self.loop, s.output, s.height) for s in restless]
+            return (f"{text} WITH THE STEP OF {names} THE RESPONSE DOES NOT SETTLE. "
+                    + " ".join(dict.fromkeys(reasons)))  # fmt: skip
         return f"{text} {self._compare_steps()}".rstrip()
+
+    def _write_height(self, step: ReferenceStep) -> str:
+        """Return the height of a step with the unit of what it asks for, where that is known."""
+        followed = _find_followed(self.loop, self.model, step.reference)
+        return write_quantity(step.height, self.loop.known_units.get(followed or "", ""))
 
     def _compare_margins(self) -> str:
         """Return what became of the smallest promised phase margin."""
@@ -292,7 +297,7 @@ class ControllerTrial(Printed):
         wiring = self.loop.wiring
         lines = () if wiring is None else tuple(f"    {line}" for line in wiring.lines)
         head = f"controller: {type(self.controller).__name__}, {kind}"
-        heights = [f"{s.reference} by {write_number(s.height, 3)}" for s in self.steps]
+        heights = [f"{s.reference} by {self._write_height(s)}" for s in self.steps]
         tried = (
             f"  Achieved steps ({', '.join(heights)}) are those of the nonlinear physics. "
             f"{advise_step(self.loop)}" if heights else

@@ -25,10 +25,9 @@ from ..physics.trace import timebase
 from .controller_trial import ControllerTrial, advise_step, try_design
 from .lead import design_lead
 from .margins import loop_margins, nu_gap, robust_margin
+from .settling import SETTLED, explain_unsettled
 from .step_height import choose_height
 
-# A response has settled when it stays within this share of its final value.
-SETTLED = 0.02
 # A response so many times the promised one is no longer under control.
 LOST = 20
 # The loss of more than this share of a promised phase margin is reported.
@@ -122,6 +121,11 @@ class Redesign(Printed):
         return self.achieved.stable
 
     @property
+    def _unit(self) -> str:
+        """The unit of the output, which is that of the step."""
+        return self.loop.known_units.get(self.loop.signals["y"][0], "")
+
+    @property
     def verdict(self) -> str:
         """The outcome in words."""
         p, a = self.promised, self.achieved
@@ -136,6 +140,8 @@ class Redesign(Printed):
         loss = p.phase_margin - a.phase_margin
         shift = a.crossover / p.crossover - 1
         apart = a.final_value / p.final_value - 1 if p.final_value else 0.0
+        restless = np.isfinite(p.settling_time) and not np.isfinite(a.settling_time)
+        step = write_quantity(self.step, self._unit)
         # An unstable loop has no final value.
         apart = abs(apart) if np.isfinite(apart) else 0.0
         if loss > CLOSE * p.phase_margin:
@@ -145,19 +151,19 @@ class Redesign(Printed):
             text += f": THE CROSSOVER IS {side} BY {100 * abs(shift):.0f} %."
         else:
             worst, which = max(loss / p.phase_margin, abs(shift)), "the margins hold"
-            if apart <= CLOSE:
+            if apart <= CLOSE and not restless:
                 worst, which = max(worst, apart), "the promise holds"
             text += f", so {which} within {max(math.ceil(100 * worst), 1)} %."
         if not a.stable:
-            text += (f" This is for small signals: WITH A STEP OF {self.step:.3g} THE LOOP "
+            text += (f" This is for small signals: WITH A STEP OF {step} THE LOOP "
                      f"DIVERGES. {self.failure} Where such a step is beyond the range "
                      "of the plant, give a smaller step= to redesign.")  # fmt: skip
-        elif np.isfinite(p.settling_time) and not np.isfinite(a.settling_time):
-            text += (f" This is for small signals: WITH A STEP OF {self.step:.3g} THE RESPONSE "
-                     "DOES NOT SETTLE, because the input saturates, the step leaves the linear "
-                     "range, or dry friction holds it.")  # fmt: skip
+        elif restless:
+            why = explain_unsettled(self.loop, self.loop.signals["y"][0], self.step)
+            text += (f" This is for small signals: WITH A STEP OF {step} THE RESPONSE "
+                     f"DOES NOT SETTLE. {why}")  # fmt: skip
         elif apart > CLOSE:
-            text += (f" THE RESPONSE TO A STEP of {self.step:.3g} ends at {a.final_value:.3g} per "
+            text += (f" THE RESPONSE TO A STEP of {step} ends at {a.final_value:.3g} per "
                      f"unit, where {p.final_value:.3g} is promised.")  # fmt: skip
         sure = self.nu_gap < self.robust_margin
         # Where the units of a loop make the margin small, it has more digits.
@@ -195,11 +201,10 @@ class Redesign(Printed):
         variable = "z" if self.controller.dt else "s"
         num, den = (write_polynomial(p[0][0], variable)
                     for p in (self.controller.num, self.controller.den))  # fmt: skip
-        loop = self.loop
-        unit = loop.known_units.get(loop.equations().outputs[0], "")
         step = (
             "  The last three values achieved are for a step of "
-            f"{write_quantity(self.step, unit)} on the nonlinear physics. {advise_step(loop)}"
+            f"{write_quantity(self.step, self._unit)} on the nonlinear physics. "
+            + advise_step(self.loop)
             + f" {self.step_reason}".rstrip()
         )
         return "\n".join([f"controller: ({num}) / ({den})", *rows, step, "  " + self.verdict])
@@ -253,9 +258,10 @@ def redesign(
     step : float or mapping of str to float, optional
         Height of the reference step [output unit]; by default 1 % of the output at the operating
         point. Where that is zero, what moves the input by a tenth of its way to a limit by the
-        model, or without limits 0.01 in SI units; the text says which. Of several references, a
-        mapping of names says which are tried; by default those that cannot be held and each
-        ``xd[i]`` that is an output.
+        model, or without limits 0.01 in SI units; the text says which. Of an output that is read in
+        steps (`Quantization`) it is at least ten of these, where that is not too much. Of several
+        references, a mapping of names says which are tried; by default those that cannot be held
+        and each ``xd[i]`` that is an output.
 
     Returns
     -------

@@ -195,6 +195,23 @@ class Equations:
 
     @property
     @_derive_once
+    def bent(self) -> bool:
+        """Whether rates or outputs are no straight lines in states and inputs."""
+        both, signals = casadi.vertcat(self.rhs, self.output), casadi.vertcat(self.x, self.u)
+        return any(casadi.which_depends(both, signals, 2, True))
+
+    @property
+    @_derive_once
+    def has_sign(self) -> bool:
+        """Whether a sign is in the formulas, as of dry friction.
+
+        Other kinks often guard the range where a formula is valid, and are far from rest.
+        """
+        f = self.function
+        return any(f.instruction_id(k) == casadi.OP_SIGN for k in range(f.n_instructions()))
+
+    @property
+    @_derive_once
     def function(self) -> Any:
         """The CasADi function ``(t, x, u, p) -> (rhs, output)``."""
         # Without states, two indices keep the column that one would turn into a row.
