@@ -129,7 +129,7 @@ def test_dt_without_a_time_column_and_a_valid_column(tmp_path):
         ("t,u,y\n0,1,2\n10,1,2\n20,1,2\n", {"dt": 0.01}, r"another unit, .* as in 't \[ms\]'"),
         ("t,u,y\n0,1,2\n1,,3\n", {}, "has no number for u in row 2"),
         ("t,u,y\n0,1,2\n1,3\n", {}, "is not a table of numbers"),
-        ("t,u,y\n0,1,2,9\n1,3,3,9\n", {}, "names 3 columns, its rows have 4; give every column"),
+        ("t,u,y\n0.5,1,2,9\n1.5,3,3,9\n", {}, "names 3 columns, its rows have 4; give every"),
         ("t,u,y\n", {}, "has no rows of numbers below its header"),
         ("", {}, "has no header line"),
         ("u,y\n1,2\n3,4\n", {}, r"has no time column \(t, time, .*\); its columns are u, y. Name"),
@@ -221,12 +221,12 @@ def test_gaps_are_refused_with_place_and_length(tmp_path):
     assert "lacks 4 samples in 2 places; the longest gap has 3" in text
     assert "0.04 s after t = 0.19 s, at a period of 0.01 s" in text
     assert "gaps='mask'" in text
-    with pytest.raises(CtrlidError, match="lacks 1 samples in one place"):
+    with pytest.raises(CtrlidError, match="lacks 1 sample in one place"):
         clock(tmp_path, np.delete(0.01 * np.arange(100), 50), 2)
-    with pytest.raises(CtrlidError, match="lacks 1 samples in one place"):
+    with pytest.raises(CtrlidError, match="lacks 1 sample in one place"):
         clock(tmp_path, np.delete(0.01 * np.arange(100), 50), 2, dt=0.01)
     rounded = np.delete(3.25e-3 * np.arange(400), 100)
-    with pytest.raises(CtrlidError, match="lacks 1 samples in one place"):
+    with pytest.raises(CtrlidError, match="lacks 1 sample in one place"):
         clock(tmp_path, rounded, 3)
 
 
@@ -325,3 +325,37 @@ def test_text_in_a_column_that_nobody_asked_for_does_no_harm(tmp_path):
     spoilt = text.replace("1,2,4", "1,off,4")
     with pytest.raises(CtrlidError, match="'off' stands in line 3, column 'u'"):
         write(tmp_path, spoilt, gaps="mask")
+
+
+def test_decimal_commas_between_commas_are_named(tmp_path):
+    path = tmp_path / "log.csv"
+    for rows in ("0,005,1,25,3,4\n0,010,1,30,3,5\n", "0,005,1,25,3\n0,010,1,30,3,5\n",
+                 "0,1,3\n0,010,1,30,3,5\n"):  # fmt: skip
+        path.write_text("t,u,y\n" + rows)
+        with pytest.raises(CtrlidError, match="decimal commas, a comma cannot also stand") as told:
+            Record.from_csv(path)
+        long = next(row for row in rows.splitlines() if row.count(",") > 2)
+        assert f"3 columns by its header, but the row {long!r} has" in str(told.value)
+    path.write_text('t,u,y\n0,"1,5",2\n0.1,"1,6",2\n')
+    with pytest.raises(CtrlidError, match=r"'1,5' stands in line 2.*If it is a decimal comma"):
+        Record.from_csv(path)
+    # Columns without a name are refused as before, where no comma separates them.
+    path.write_text("t;u;y\n0;1;2;3\n1;1;2;3\n")
+    with pytest.raises(CtrlidError, match="names 3 columns, its rows have 4"):
+        Record.from_csv(path)
+
+
+def test_a_cell_is_quoted_as_it_stands_in_the_file(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text("t;u;y\n0;1,5;2\n0,1; 1,6 V;2\n")
+    with pytest.raises(CtrlidError, match="' 1,6 V' stands in line 3, column 'u'"):
+        Record.from_csv(path)
+    path.write_text("t;u;y\n0;1.234,5;2\n0,1;1;2\n")
+    with pytest.raises(CtrlidError, match=r"'1\.234,5' stands in line 2"):
+        Record.from_csv(path)
+
+
+def test_blank_cells_are_told_with_the_longest_run(tmp_path):
+    text = "t,u,y\n0,,1\n1,1,1\n2,,1\n3,,1\n4,1,1\n"
+    with pytest.raises(CtrlidError, match="in 3 of 5 rows, at most 2 of them one after the other"):
+        write(tmp_path, text)

@@ -15,7 +15,7 @@ import numpy as np
 from .._base.arguments import is_number
 from .._base.errors import CtrlidError, CtrlidWarning
 from .._base.files import replace_file
-from .._base.text import drop_roundoff, split_unit, with_unit, write_percent
+from .._base.text import drop_roundoff, split_unit, with_unit, write_count, write_percent
 from .._base.units import is_same_unit
 
 TIME = ("t", "time", "timestamp", "seconds", "zeit")
@@ -302,16 +302,16 @@ def _read_table(path: Path) -> tuple[dict[str, Any], list[str], Any, Texts]:
     body = text[stop:]
     if not body.strip():
         raise CtrlidError(f"{path} has no rows of numbers below its header")
-    if separator != ",":
-        # Where commas do not separate columns, they are decimal commas.
-        body = body.replace(",", ".")
-    texts: Texts = {}
+    # Where commas do not separate columns, they are decimal commas.
+    plain = body if separator == "," else body.replace(",", ".")
+    above, texts = text.count("\n", 0, stop), Texts()
     try:
-        table = np.loadtxt(io.StringIO(body), delimiter=separator, ndmin=2, quotechar='"')
+        table = np.loadtxt(io.StringIO(plain), delimiter=separator, ndmin=2, quotechar='"')
     except ValueError:
-        table, texts = _read_with_blanks(path, body, separator, text.count("\n", 0, stop))
+        table, texts = _read_with_blanks(path, body, separator, above, len(header))
     if table.shape[1] != len(header):
         _refuse_text(path, texts, ())
+        _refuse_decimal_commas(path, body.lstrip("\n").partition("\n")[0], separator, len(header))
         raise CtrlidError(f"the header of {path} names {len(header)} columns, its rows have "
                           f"{table.shape[1]}; give every column a name")  # fmt: skip
     return own, header, table, texts
@@ -340,26 +340,48 @@ def _is_empty(part: bytes) -> bool:
     return 10 * part.count(0) > 9 * len(part) > 0
 
 
-def _read_with_blanks(path: Path, body: str, separator: str, above: int) -> tuple[Any, Texts]:
+def _refuse_decimal_commas(path: Path, row: str, separator: str, columns: int) -> None:
+    """Refuse a row of numbers with more cells than there are columns, if commas may be decimal."""
+    cells = _split_cells(row, separator)
+    # Where there is a decimal point, no comma is one.
+    commas = separator == "," and "." not in row
+    if commas and len(cells) > columns and all(map(_is_number, cells)):
+        raise CtrlidError(
+            f"{path} has {write_count(columns, 'column')} by its header, but the row {row!r} has "
+            f"{len(cells)} cells between commas. If its numbers have decimal commas, a comma "
+            "cannot also stand between columns: save the file with semicolons between columns, or "
+            "with decimal points. If they have decimal points, give every column a name"
+        )
+
+
+def _read_with_blanks(
+    path: Path, body: str, separator: str, above: int, columns: int
+) -> tuple[Any, Texts]:
     """Read a table with blank cells and cells of text, which are NaN, below so many lines.
 
-    The first text of each column is returned beside it.
+    The first text of each column is returned beside it, as it stands in the file.
     """
-    rows, texts = [], Texts()
+    rows: list[list[float]] = []
+    texts, first = Texts(), 0
     for k, cells in enumerate(_read_cells(body, separator)):
         if not cells or cells[0].lstrip().startswith("#"):
             continue
         numbers = []
         for column, cell in enumerate(cells):
             try:
-                numbers.append(float(cell) if cell.strip() else math.nan)
+                plain = cell if separator == "," else cell.replace(",", ".")
+                numbers.append(float(plain) if plain.strip() else math.nan)
             except ValueError:
-                texts.setdefault(column, (cell.strip(), above + k + 1))
+                texts.setdefault(column, (cell, above + k + 1))
                 numbers.append(math.nan)
+        first = first if rows else k
         rows.append(numbers)
         if len(cells) != len(rows[0]):
             # Above a ragged table stands what is no part of it.
             _refuse_text(path, texts, ())
+            lines = body.split("\n")
+            for place in (first, k):
+                _refuse_decimal_commas(path, lines[place], separator, columns)
             raise CtrlidError(f"{path} is not a table of numbers: line {above + k + 1} has "
                               f"{len(cells)} cells, the lines above it {len(rows[0])}")  # fmt: skip
     return np.array(rows), texts
@@ -372,12 +394,18 @@ def _refuse_text(path: Path, texts: Texts, header: Sequence[str]) -> None:
     column, (cell, line) = min(texts.items(), key=lambda item: (item[1][1], item[0]))
     where = f"{cell!r} stands in line {line}"
     where += f", column {header[column]!r}" if header else ""
-    if CLOCK.match(cell):
+    if CLOCK.match(cell.strip()):
         raise CtrlidError(
             f"{path} has a date or a time of day: {where}; times are numbers, in seconds from any "
             "start. Convert them, for instance by t = pandas.to_datetime(column) and then "
             "(t - t[0]).dt.total_seconds(), or remove the column from the file and give dt=; a "
             "line above the header: delete it or start it with #"
+        )
+    if "," in cell and _is_number(cell):
+        raise CtrlidError(
+            f"{path} has a number with a comma between columns that commas separate: {where}. If "
+            "it is a decimal comma, save the file with semicolons between columns, or with decimal "
+            "points; if it parts thousands, save the file without it"
         )
     raise CtrlidError(
         f"{path} is not a table of numbers: {where}. Remove it, or leave the cell blank and give "
@@ -398,7 +426,8 @@ def _fill_gaps(
         names = ", ".join(n for n, lacks in zip(places, missing[k], strict=True) if lacks)
         raise CtrlidError(
             f"{path} has no number for {names} in row {k + 1} of the data, and lacks some in "
-            f"{rows.size} of {len(table)} rows. Give gaps='mask' to fill them with the last values "
+            f"{rows.size} of {write_count(len(table), 'row')}, at most {_find_longest_run(rows)} "
+            "of them one after the other. Give gaps='mask' to fill them with the last values "
             "and mark them as not valid"
         )
     table = table.copy()
@@ -409,6 +438,12 @@ def _fill_gaps(
         last = np.maximum.accumulate(np.where(lacks, known[0], np.arange(len(table))))
         table[:, column] = table[last, column]
     return table, valid & ~missing.any(axis=1)
+
+
+def _find_longest_run(rows: Any) -> int:
+    """Return how many of ascending numbers follow one another at most."""
+    ends = np.flatnonzero(np.diff(rows, append=rows[-1] + 2) > 1)
+    return int(np.max(np.diff(ends, prepend=-1)))
 
 
 def _split_cells(line: str, separator: str) -> list[str]:
@@ -565,8 +600,9 @@ def _make_uniform(stamps: Any, dt: float | None, gaps: str, path: Path) -> tuple
         k = int(where[np.argmax(missing[where])])
         places = "one place" if where.size == 1 else f"{where.size} places"
         raise CtrlidError(
-            f"{path} lacks {missing.sum()} samples in {places}; the longest gap has {missing[k]}, "
-            f"{steps[k]:.4g} s after t = {stamps[k]:.6g} s, at a period of {dt:.4g} s. Give "
+            f"{path} lacks {write_count(int(missing.sum()), 'sample')} in {places}; the longest "
+            f"gap has {missing[k]}, {steps[k]:.4g} s after t = {stamps[k]:.6g} s, at a period of "
+            f"{dt:.4g} s. Give "
             "gaps='mask' to fill them with the last values and mark them as not valid"
         )
     jitter = float(np.max(np.abs(steps - (missing + 1) * dt))) / dt
