@@ -2,6 +2,7 @@
 
 import argparse
 import codecs
+import inspect
 import io
 import itertools
 import math
@@ -16,6 +17,8 @@ from pathlib import Path
 from typing import TextIO
 
 from tqdm import tqdm
+
+import ctrlid
 
 from . import __version__
 from ._base.errors import CtrlidError, CtrlidWarning
@@ -62,6 +65,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="ctrlid")
     parser = _make_parser()
+    words = sys.argv[1:] if arguments is None else list(arguments)
+    if words and (advice := _name_python_line(*words[:2])):
+        parser.error(advice)
     args, unknown = parser.parse_known_args(arguments)
     if unknown:
         advice = ""
@@ -87,6 +93,29 @@ def main(arguments: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     return code
+
+
+def _name_python_line(word: str, file: str = "log.csv") -> str:
+    """Say which line of Python does what is no command but a function; empty for other words."""
+    function = getattr(ctrlid, word, None) if word in ctrlid.__all__ else None
+    if word == "diagnose" or not inspect.isfunction(function):
+        return ""
+    parameters = inspect.signature(function).parameters.values()
+    plain = [p for p in parameters if p.kind is p.POSITIONAL_OR_KEYWORD]
+    # An audit says more with a loop.
+    needed = [p.name for p in plain if p.default is p.empty or word == "audit"]
+    lines = ["import ctrlid as cid"]
+    if "record" in needed:
+        file = "log.csv" if file.startswith("-") else file
+        lines.append(f'record = cid.Record.from_csv("{file}", r="ref", u="volt", y="gap")')
+    if "loop" in needed:
+        period = "record.dt" if "record" in needed else "0.001"
+        lines.append(f"loop = cid.Loop(plant, controller, dt={period})")
+    lines.append(f"print(cid.{word}({', '.join(needed)}))")
+    return (
+        f"there is no command {word}, only diagnose; without a command the demonstration runs. "
+        f"In Python it is: {'; '.join(lines)}"
+    )
 
 
 def _show_warning(

@@ -341,6 +341,14 @@ def test_warnings_are_told_as_refusals_are(folder, asked, capsys):
      ((*SERVO,), "the following arguments are required: FILE.csv"),
      (("log.csv", *SERVO, "--param", "k"), "needs NAME=VALUE, as in K=3.3e-6; given k"),
      (("log.csv", *SERVO, "--param", "k=much"), "k= needs a number; given much"),
+     (("log.csv", *SERVO, "--param", "m=0,35"), "needs a number with a decimal point; given 0,35: "
+      "type 0.35"),
+     (("log.csv", *SERVO, "--scale", "y=-1,5e-3"), "given -1,5e-3: type -1.5e-3"),
+     (("log.csv", *SERVO, "--at-output", "0,01"), "argument --at-output: it needs a number with a "
+      "decimal point; given 0,01: type 0.01"),
+     (("log.csv", *SERVO, "--dt", "soon"), "it needs a number; given soon"),
+     (("log.csv", *SERVO, "--param", "m=0.5,c=2"), "takes several with blanks between them, as in "
+      "m=0.5 c=2; given m=0.5,c=2"),
      (("log.csv", *SERVO, "--columns", "volt"), "needs NAME=VALUE,NAME=VALUE; given volt"),
      (("log.csv", *SERVO, "--hold", "spline"), "invalid choice: 'spline'")],
 )  # fmt: skip
@@ -365,6 +373,21 @@ def test_names_of_one_option_in_several_words_are_explained(capsys, arguments, a
     err = capsys.readouterr().err
     assert f"unrecognized arguments: {' '.join(arguments[2:])}" in err
     assert ("--columns r=ref,u=volt,y=gap" in err.split("error:")[1]) == advised
+
+
+def test_commas_separate_names_of_free_parameters(folder, asked):
+    for words in (("k,c",), ("k", "c"), ("k,", "c")):
+        assert run("log.csv", *COLUMNS, *SERVO, "--free", *words) == 0
+        assert asked[-1][0].free == ("k", "c")
+    assert run("log.csv", *COLUMNS, *SERVO, "--free") == 0
+    assert asked[-1][0].free == ()
+
+
+def test_a_decimal_comma_in_a_controller_is_refused(folder, asked, capsys):
+    assert run("log.csv", *COLUMNS, *SERVO, "--controller", "kp=2,5,ki=1") == 1
+    assert "--controller kp= needs a number with a decimal point; given 2,5: type 2.5" in (
+        capsys.readouterr().err
+    )
 
 
 def test_help_has_a_worked_example(capsys):

@@ -125,6 +125,24 @@ def test_wrong_usage(folder, capsys, arguments, words):
     assert list(folder.iterdir()) == []
 
 
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [(["audit", "my.csv"], 'record = cid.Record.from_csv("my.csv", r="ref", u="volt", y="gap"); '
+      "loop = cid.Loop(plant, controller, dt=record.dt); print(cid.audit(record, loop))"),
+     (["fit_arx", "--na", "2"], 'from_csv("log.csv", r="ref", u="volt", y="gap"); '
+      "print(cid.fit_arx(record, na, nb))"),
+     (["redesign"], "loop = cid.Loop(plant, controller, dt=0.001); print(cid.redesign(G, loop))")],
+)  # fmt: skip
+def test_what_is_no_command_but_a_function_is_answered_in_python(capsys, arguments, line):
+    with pytest.raises(SystemExit) as end:
+        command.main(arguments)
+    assert end.value.code == 2
+    err = capsys.readouterr().err
+    assert f"there is no command {arguments[0]}, only diagnose" in err
+    assert line in err
+    assert "invalid choice" not in err
+
+
 def test_help_and_version(capsys):
     with pytest.raises(SystemExit) as end:
         command.main(["--help"])

@@ -29,6 +29,8 @@ from .options import options_in_refusals
 
 PLANTS = {"maglev": ("K",), "servo": ("c", "k"), "tank": ("outlet", "k"), "pendulum": ("m",)}
 CHANNELS = ("r", "u", "y", "time")
+NEXT_NAME = re.compile(r"[,\s]+(?=\w+\s*=)")
+DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
 SYSTEMS = (ct.NonlinearIOSystem, ct.StateSpace, ct.TransferFunction)
 
 
@@ -60,10 +62,10 @@ def read_loop(args: argparse.Namespace, record: Record) -> Loop:
                 advice = "if the times are in milliseconds, name their column t [ms]"
             raise CtrlidError(f"{args.model} is sampled at {model.dt:g} s, the record at "
                               f"{record.dt:g} s; {advice}")  # fmt: skip
-        free = model.free if args.free is None else tuple(args.free)
+        free = model.free if args.free is None else _join_names(args.free)
         _require_known(args.model, list(model.parameters), [*values, *free])
         return dataclasses.replace(model.with_parameters(values), free=free)
-    free = PLANTS.get(args.model, ()) if args.free is None else tuple(args.free)
+    free = PLANTS.get(args.model, ()) if args.free is None else _join_names(args.free)
     _require_known(args.model, list(trace(model).parameters), [*values, *free])
     model = with_parameters(model, values) if values else model
     output = float(np.mean(record.y[record.valid])) if args.at_output is None else args.at_output
@@ -123,7 +125,8 @@ def read_controller(text: str) -> Any:
     for key, value in given.items():
         _require_known("a PID", list(types), [key])
         words = types[key] not in (float, float | None)
-        values[key] = value if words else _parse_number(f"--controller {key}=", str(value))
+        plain = value if isinstance(value, str) else ",".join(value)
+        values[key] = value if words else _parse_number(f"--controller {key}=", plain)
     if "kp" not in values:
         raise CtrlidError(f"a PID needs kp, as in --controller kp=2,ki=1; given {text}")
     return PID(**values)
@@ -158,6 +161,11 @@ def import_object(option: str, text: str) -> Any:
     return getattr(found, name)
 
 
+def _join_names(given: Sequence[Sequence[str]]) -> tuple[str, ...]:
+    """Return the names of an option whose words may hold several with commas between them."""
+    return tuple(name for names in given for name in names)
+
+
 def _require_known(what: str, known: Sequence[str], names: Sequence[str]) -> None:
     for name in names:
         if name not in known:
@@ -167,6 +175,11 @@ def _require_known(what: str, known: Sequence[str], names: Sequence[str]) -> Non
 def parse_assignment(text: str) -> tuple[str, float]:
     """Read NAME=VALUE with a number."""
     name, equal, value = text.partition("=")
+    if "," in value and "=" in value:
+        raise argparse.ArgumentTypeError(
+            "takes several with blanks between them, as in "
+            f"{' '.join(NEXT_NAME.split(text))}; given {text}"
+        )
     if not (name.strip() and equal):
         raise argparse.ArgumentTypeError(f"needs NAME=VALUE, as in K=3.3e-6; given {text}")
     try:
@@ -177,7 +190,7 @@ def parse_assignment(text: str) -> tuple[str, float]:
 
 def parse_assignments(text: str) -> dict[str, str | tuple[str, ...]]:
     """Read NAME=VALUE,NAME=VALUE, or NAME=VALUE,VALUE NAME=VALUE where a name has several."""
-    pairs = [part.partition("=") for part in re.split(r"[,\s]+(?=\w+\s*=)", text) if part.strip()]
+    pairs = [part.partition("=") for part in NEXT_NAME.split(text) if part.strip()]
     if not pairs or not all(key.strip() and equal and value for key, equal, value in pairs):
         raise argparse.ArgumentTypeError(f"needs NAME=VALUE,NAME=VALUE; given {text}")
     values = {
@@ -187,11 +200,29 @@ def parse_assignments(text: str) -> dict[str, str | tuple[str, ...]]:
     return {key: each[0] if len(each) == 1 else each for key, each in values.items()}
 
 
+def parse_decimal(text: str) -> float:
+    """Read a number that is the value of an option."""
+    try:
+        return _parse_number("it", text)
+    except CtrlidError as reason:  # argparse prints what it is told in its own error alone.
+        raise argparse.ArgumentTypeError(str(reason)) from reason
+
+
+def parse_names(text: str) -> list[str]:
+    """Read NAME or NAME,NAME."""
+    return [name.strip() for name in text.split(",") if name.strip()]
+
+
 def _parse_number(what: str, text: str) -> float:
     try:
         value = float(text)
     except ValueError:
         value = math.nan
+    if DECIMAL_COMMA.fullmatch(text.strip()):
+        raise CtrlidError(
+            f"{what} needs a number with a decimal point; given {text}: type "
+            f"{text.strip().replace(',', '.')}"
+        )
     if math.isnan(value):
         raise CtrlidError(f"{what} needs a number; given {text}")
     return value

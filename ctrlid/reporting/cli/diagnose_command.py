@@ -18,7 +18,15 @@ from ...diagnosis import Diagnosis, diagnose
 from .. import plot
 from ..html_page import write_report
 from ..plot.axes import off_screen
-from .arguments import PLANTS, parse_assignment, parse_assignments, read_loop, read_record
+from .arguments import (
+    PLANTS,
+    parse_assignment,
+    parse_assignments,
+    parse_decimal,
+    parse_names,
+    read_loop,
+    read_record,
+)
 from .options import options_in_refusals
 
 # The exit status of a command that Ctrl-C ended, by the convention of shells.
@@ -72,15 +80,16 @@ def add_parser(commands: Any) -> None:
         metavar="NAME=VALUE",
         help="parameters of the model, in SI units",
     )
-    add("--free", nargs="*", metavar="NAME",
-        help="uncertain parameters of the model, which are fitted first (default: "
+    add("--free", nargs="*", type=parse_names, metavar="NAME",
+        help="uncertain parameters of the model, which are fitted first, as in --free K m or "
+        "--free K,m (default: "
         + ", ".join(f"{' and '.join(v)} of {k}" for k, v in PLANTS.items()) + ")")  # fmt: skip
-    add("--at-output", type=float, metavar="Y",
+    add("--at-output", type=parse_decimal, metavar="Y",
         help="output at the operating point (default: the mean of y)")  # fmt: skip
-    add("--input-bias", type=float, metavar="U",
+    add("--input-bias", type=parse_decimal, metavar="U",
         help="bias that the controller adds to u (default: as the log has it where the controller "
         "is known, else the input that holds the model at rest)")  # fmt: skip
-    add("--dt", type=float, metavar="S",
+    add("--dt", type=parse_decimal, metavar="S",
         help="sampling period in seconds (default: that of the time column)")  # fmt: skip
     add("--columns", type=parse_assignments, default={}, metavar="r=REF,u=VOLT,y=GAP",
         help="columns of r, u, y and time; several as in 'y=theta,alpha u=V'")  # fmt: skip
@@ -116,7 +125,7 @@ def add_parser(commands: Any) -> None:
         metavar="DIR",
         help="new folder for the report, its picture and the diagnosis",
     )
-    add("--seconds", type=float, metavar="S",
+    add("--seconds", type=parse_decimal, metavar="S",
         help="end the search after so many seconds with the best answer so far (default: when it "
         "is finished). Ctrl-C does the same at once")  # fmt: skip
     add("--quiet", action="store_true", help="show no progress on the terminal")
