@@ -29,6 +29,11 @@ from ctrlid.estimation.constraints import (
     equals,
 )
 from ctrlid.estimation.linear.arx import fit_arx
+from ctrlid.estimation.linear.regression import (
+    build_arx_regression,
+    count_equations,
+    list_structures,
+)
 
 DT = 1e-3
 
@@ -580,3 +585,28 @@ def test_an_input_that_is_not_held_is_said_in_capitals():
     assert "u CHANGES BETWEEN THE SAMPLES (hold='foh'" in str(smooth)
     slow = Record(u=np.sin(np.arange(300) / 50), y=y, dt=0.1, hold="foh")
     assert fit_arx(slow, 1, 1).estimate.notes == ()
+
+
+def test_equations_are_counted_before_any_is_formed(monkeypatch):
+    """Orders of 2000 took half a minute to be refused."""
+    _, record = sampled_levitation(0.22, n=3000)
+
+    def refuse(*given, **named):
+        raise AssertionError("a regression was formed")
+
+    with monkeypatch.context() as patched:
+        patched.setattr("ctrlid.estimation.linear.arx.build_arx_regression", refuse)
+        with pytest.raises(CtrlidError, match="1000 equations for 4001 unknowns"):
+            fit_arx(record, 2000, 2000)
+        with pytest.raises(CtrlidError, match="Too few samples: 1 equation for 5 unknowns"):
+            fit_arx(record[:3], 2, 2)
+
+
+@pytest.mark.parametrize("orders", [(2, 2, 1), (1, 3, 4), (4, 1, 0), (3, 2, 2)])
+def test_the_count_of_equations_is_that_of_the_regression(orders):
+    rng = np.random.default_rng(3)
+    record = Record(y=rng.normal(size=400), u=rng.normal(size=400), dt=DT,
+                    valid=rng.random(400) > 0.05)  # fmt: skip
+    (structure,) = list_structures(*orders, record).values()
+    rows = build_arx_regression([record], structure).rows
+    assert count_equations(record, structure) == rows > 100

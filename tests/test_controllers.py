@@ -253,10 +253,10 @@ def test_pid_refuses(fields, words):
     ("controller", "words"),
     [
         ("PID", "a controller is a TransferFunction, .* or None; given str"),
-        (ct.ss([], [], [], np.ones((1, 3)), DT), "given 3 inputs and 1 outputs"),
-        (ct.ss([], [], [], np.ones((2, 1)), DT), "given 1 inputs and 2 outputs"),
+        (ct.ss([], [], [], np.ones((1, 3)), DT), "given 3 inputs and 1 output"),
+        (ct.ss([], [], [], np.ones((2, 1)), DT), "given 1 input and 2 outputs"),
         (ct.tf([1], [1, 0.5], 0.2), "runs at 0.2 s, the loop at 0.5 s; convert it"),
-        (ct.tf([1, 0, 0], [1, 1]), "has 2 zeros but 1 poles: no circuit and no program"),
+        (ct.tf([1, 0, 0], [1, 1]), "has 2 zeros but 1 pole: no circuit and no program"),
     ],
 )
 def test_control_law_refuses(controller, words):

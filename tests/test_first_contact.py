@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 from dataclasses import replace
+from types import SimpleNamespace
 
 import control as ct
 import numpy as np
@@ -14,6 +15,8 @@ import pytest
 
 import ctrlid as cid
 from ctrlid._base.text import write_percent
+from ctrlid.diagnosis.noise_tests import NoiseTests
+from ctrlid.diagnosis.verdict import write_conclusion
 from problems import record_of, servo
 
 
@@ -148,3 +151,25 @@ def test_what_needs_a_loop_says_where_a_fit_has_it(record, name):
     }
     with pytest.raises(cid.CtrlidError, match=r"LoopFit( and Record|\))?\. Give its \.loop$"):
         calls[name]()
+
+
+def test_one_of_a_thing_is_no_plural():
+    with pytest.raises(cid.CtrlidError, match=r"the plant 1 output \(x\)"):
+        servo(ct.ss([], [], [], np.ones((1, 3)), 0.01), dt=0.01)
+    gap = SimpleNamespace(name="simulation")
+    tests = NoiseTests({"whiteness": 0.0}, np.zeros(3), {})
+    for tried, words in ((1, "The one effect of the catalogue does not explain it."),
+                         (7, "None of the 7 effects of the catalogue explains it.")):  # fmt: skip
+        assert words in write_conclusion("unknown", [], gap, None, tests, (), tried=tried)
+
+
+def test_milliseconds_that_were_taken_for_seconds_are_suspected(record):
+    slow = replace(record, dt=10.0)
+    words = "10 s is a thousand times as much, so that milliseconds were probably taken for seconds"
+    loop = servo(cid.PID(kp=20.0, kd=1.0), dt=0.01)
+    for call in (lambda: cid.predict(loop, slow), lambda: cid.compare(slow, loop)):
+        with pytest.raises(cid.CtrlidError, match=words):
+            call()
+    with pytest.raises(cid.CtrlidError) as told:
+        cid.predict(loop, replace(record, dt=0.011))
+    assert "milliseconds" not in str(told.value)

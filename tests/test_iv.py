@@ -409,7 +409,7 @@ def test_a_poor_reference_is_named():
         (cid.PID(kp=1.0), "linear controller.*given PID.*Leave controller=None"),
         (ct.tf([1.0], [1.0, 1.0]), "The controller is continuous.*bilinear"),
         (ct.tf([1.0], [1.0, 0.5], 0.3), "runs at 0.3 s, the record at 0.0025 s"),
-        (ct.tf([[[1.0]], [[1.0]]], [[[1.0, 0.1]], [[1.0, 0.1]]], 0.0025), "1 inputs and 2 outputs"),
+        (ct.tf([[[1.0]], [[1.0]]], [[[1.0, 0.1]], [[1.0, 0.1]]], 0.0025), "1 input and 2 outputs"),
         (ct.tf([1.0, 0.0, 0.0], [1.0, 0.5], 0.0025), "more zeros than poles"),
     ],
 )

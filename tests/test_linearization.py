@@ -178,7 +178,7 @@ def test_what_linearize_refuses():
     plant = cid.plants.maglev(m=0.02, K=3e-6)
     with pytest.raises(CtrlidError, match="needs an OperatingPoint"):
         cid.linearize(plant, (0.01, 0.0))
-    with pytest.raises(CtrlidError, match=r"has 1 states .* maglev has 2: x, v"):
+    with pytest.raises(CtrlidError, match=r"has 1 state .* maglev has 2: x, v"):
         cid.linearize(plant, cid.OperatingPoint((0.01,), 3.0, 0.01))
     with pytest.raises(CtrlidError, match="has no derivative"):
         cid.linearize(plant, cid.OperatingPoint((-0.01, 0.0), 3.0, -0.01))

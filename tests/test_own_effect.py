@@ -173,7 +173,7 @@ def test_an_edge_speaks_against_what_was_searched_only():
     class NarrowSearched(Narrow):
         period: float = E.parameter("s", lower=0.1, upper=5.5, searched=True)
 
-    edge = Objection("on a bound", "period ends on its bound 5.5")
+    edge = Objection("on a bound", "period ends on its bound 5.5 s")
     for kind, objection in ((Narrow, None), (NarrowSearched, edge)):
         base = fit_base_model(drive(), [record], ("k",))
         trial = refit_candidate(base, scan_candidate(base, kind(0.5, 5.4)))

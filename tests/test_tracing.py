@@ -218,7 +218,7 @@ def whole_input(t, x, u, params):
         (cubic_spline, ["turned into a plain float", "numpy's functions"]),
         (with_memory, ["do not reproduce", "no memory"]),
         (with_chance, ["the rate of b", "no random numbers"]),
-        (too_short, ["returned 1 values, but 2 are declared"]),
+        (too_short, ["returned 1 value, but 2 are declared"]),
         (Rig().remembering, ["stores self.last", "make it a state"]),
     ],
     ids=lambda v: getattr(v, "__name__", ""),

@@ -3,6 +3,9 @@
 # Periods read from printed times, and those of single precision, differ by their last digits. Over
 # a million samples, the longest of records, such a clock is one sample off.
 SAME = 1e-6
+# Periods that differ by this factor, within a hundredth, are in different units.
+THOUSAND = 1000.0
+NEARLY = 0.01
 
 
 def have_same_period(first: float, second: float) -> bool:
@@ -24,8 +27,18 @@ def write_both_periods(one: str, first: float, other: str, second: float) -> str
     --------
     >>> write_both_periods("the loop is sampled", 0.02, "the record", 0.020001)
     'the loop is sampled at 0.02 s, the record at 0.020001 s'
+    >>> print(write_both_periods("the loop is sampled", 0.005, "the record", 5.0))
+    the loop is sampled at 0.005 s, the record at 5 s (5 s is a thousand times as much, so that
+    milliseconds were probably taken for seconds)
     """
-    return f"{one} at {first:.10g} s, {other} at {second:.10g} s"
+    both = f"{one} at {first:.10g} s, {other} at {second:.10g} s"
+    ratio = max(first, second) / min(first, second)
+    if abs(ratio / THOUSAND - 1) < NEARLY:
+        both += (
+            f" ({max(first, second):.10g} s is a thousand times as much, so that milliseconds were "
+            "probably taken for seconds)"
+        )
+    return both
 
 
 def write_difference(first: float, second: float) -> str:

@@ -312,7 +312,8 @@ def _read_table(path: Path) -> tuple[dict[str, Any], list[str], Any, Texts]:
     if table.shape[1] != len(header):
         _refuse_text(path, texts, ())
         _refuse_decimal_commas(path, body.lstrip("\n").partition("\n")[0], separator, len(header))
-        raise CtrlidError(f"the header of {path} names {len(header)} columns, its rows have "
+        raise CtrlidError(f"the header of {path} names {write_count(len(header), 'column')}, its "
+                          f"rows have "
                           f"{table.shape[1]}; give every column a name")  # fmt: skip
     return own, header, table, texts
 
@@ -383,7 +384,8 @@ def _read_with_blanks(
             for place in (first, k):
                 _refuse_decimal_commas(path, lines[place], separator, columns)
             raise CtrlidError(f"{path} is not a table of numbers: line {above + k + 1} has "
-                              f"{len(cells)} cells, the lines above it {len(rows[0])}")  # fmt: skip
+                              f"{write_count(len(cells), 'cell')}, the lines above it "
+                              f"{len(rows[0])}")  # fmt: skip
     return np.array(rows), texts
 
 

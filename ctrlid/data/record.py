@@ -379,7 +379,7 @@ class Record(Printed):
         check_arguments(Record.decimate, locals(), "q")
         if not isinstance(q, Integral) or not 1 <= q <= len(self) // 2:
             raise CtrlidError(f"decimate needs a whole factor from 1 to {len(self) // 2} for "
-                              f"{len(self)} samples; given {q!r}")  # fmt: skip
+                              f"{write_count(len(self), 'sample')}; given {q!r}")  # fmt: skip
         q = int(q)
         if q == 1:
             return self
@@ -634,7 +634,8 @@ class Record(Printed):
         return _response.write_response(self)
 
     def __repr__(self) -> str:
-        rows = [f"Record {self.name + ': ' if self.name else ''}{len(self)} samples at "
+        rows = [f"Record "
+                f"{self.name + ': ' if self.name else ''}{write_count(len(self), 'sample')} at "
                 f"{self.dt:g} s ({self.duration:.4g} s, {self.hold})"]  # fmt: skip
         if not self.valid.all():
             share = f"{100 * self.valid.mean():.1f} %"

@@ -13,6 +13,7 @@ from scipy.optimize import brentq, minimize_scalar
 from .._base.arguments import is_number
 from .._base.arrays import Array, ComplexArray
 from .._base.errors import CtrlidError
+from .._base.text import write_count
 from ..physics.conversions import require_finite_coefficients, to_polynomials
 
 Function = Callable[[Array], Array]
@@ -143,7 +144,8 @@ def to_rational(system: Any, name: str) -> Rational:
         )
     if (system.ninputs, system.noutputs) != (1, 1):
         raise CtrlidError(
-            f"{name} has {system.ninputs} inputs and {system.noutputs} outputs; needed is one of "
+            f"{name} has {write_count(system.ninputs, 'input')} and "
+            f"{write_count(system.noutputs, 'output')}; needed is one of "
             f"each: pick a channel, for example {name}[0, 0]."
         )
     if system.dt is True:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from .._base.errors import EffectDoesNotApply, ModelCannotRun
-from .._base.text import write_quantity
+from .._base.text import write_count, write_quantity
 from .._base.units import fill_unit
 from ..data.record import Record
 from ..effects import AbstractEffect, Quantization, equivalents
@@ -207,7 +207,7 @@ def name_records(records: Sequence[Record]) -> str:
     names = ", ".join(dict.fromkeys(r.name or "record" for r in records))
     size = sum(int(np.count_nonzero(r.valid_samples)) for r in records)
     many = f"{len(records)} records, " if len(records) > 1 else ""
-    return f"{names} ({many}{size} samples, dt = {records[0].dt:g} s)"
+    return f"{names} ({many}{write_count(size, 'sample')}, dt = {records[0].dt:g} s)"
 
 
 def _find_units(loop: Loop) -> dict[str, str]:

@@ -101,7 +101,8 @@ def find_objection(trial: Trial) -> Objection | None:
         about = next(p for p in effect.parameters() if p.name == name.partition(".")[2])
         on_bound = fit.theta[k] in (low, high)
         if on_bound and (about.searched or about.neutral not in (None, low, high)):
-            words = f"{about.name} ends on its bound {fit.theta[k]:g}"
+            unit = effect.units(trial.model.loop).get(about.name, "")
+            words = f"{about.name} ends on its bound {fit.theta[k]:g} {unit}".rstrip()
             return Objection("on a bound", words)
     if _is_insignificant(trial, effect):
         words = f"within {THRESHOLD.significant:g} standard errors of its neutral value"

@@ -8,7 +8,7 @@ from typing import Any
 from tqdm import tqdm
 
 from .._base.interruption import Budget
-from .._base.text import write_number
+from .._base.text import write_count, write_number
 from .candidates import Trial
 from .thresholds import THRESHOLD
 
@@ -119,7 +119,7 @@ class Progress:
         """Say where the search is."""
         words = self.step
         if self.total:
-            words += f", {self.done} of {self.total} candidates done"
+            words += f", {self.done} of {write_count(self.total, 'candidate')} done"
         if self.leader is not None:
             words += f"; {self.describe_leader()}"
         return words

@@ -190,6 +190,13 @@ def declare_unfinished(found: Diagnosis, place: str, spent: str) -> Diagnosis:
     return replace(found, verdict=choose_verdict(False, named), sentence=sentence, finished=False)
 
 
+def _deny_tried(tried: int) -> str:
+    """Say that nothing which was tried explains the error."""
+    if tried == 1:
+        return "The one effect of the catalogue does not explain it"
+    return f"None of the {tried} effects of the catalogue explains it"
+
+
 def write_conclusion(
     verdict: Verdict, findings: Sequence[Finding], gap: Gap, disturbance: Disturbance,
     after: NoiseTests, where: Sequence[BinnedErrors], objection: str | None = None,
@@ -245,11 +252,11 @@ def write_conclusion(
         every = join_names([*findings, *(f for f, _ in stand_ins)])
         text = f"With {every} the residuals are noise, but {objection}."
     elif verdict == "partly explained":
-        text = (f"{names} {verb} part of the error. The rest is not noise alone: {why}. None of "
-                f"the {tried} effects of the catalogue explains it.")  # fmt: skip
+        text = (f"{names} {verb} part of the error. The rest is not noise alone: {why}. "
+                f"{_deny_tried(tried)}.")  # fmt: skip
     else:
-        text = (f"The error is not noise alone: {why}. None of the {tried} effects of the "
-                "catalogue explains it.")  # fmt: skip
+        text = (f"The error is not noise alone: {why}. {_deny_tried(tried)}."
+                )  # fmt: skip
     doubted = after.passed and objection is not None
     grounds = None if doubted else describe_grounds(stand_ins)
     if grounds is not None:

@@ -9,7 +9,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .._base.arrays import Array
-from .._base.text import choose_prefix, write_list, write_number, write_p_value, write_quantity
+from .._base.text import (
+    choose_prefix,
+    write_count,
+    write_list,
+    write_number,
+    write_p_value,
+    write_quantity,
+)
 from ..effects import AbstractEffect, ParameterError, ReadingEffect
 from ..effects.base import name_at_place
 from .findings import COMPLETE, BinnedErrors, Disturbance, Finding, Gap
@@ -139,7 +146,7 @@ def introduce_gap(gap: Gap) -> str:
     """Say what the gap is."""
     text = (
         f"gap between model and record: RMS error of the {gap.name} of "
-        f"{count_samples(gap)} samples kept back"
+        f"{write_count(count_samples(gap), 'sample')} kept back"
     )
     if gap.outputs:
         names = write_list([part.output for part in gap.outputs])
@@ -359,7 +366,7 @@ def list_doubts(found: Diagnosis, finding: Finding) -> list[str]:
         lines.append(f"to decide, use {finding.experiment}")
     if finding.reference is not None:
         lines.append(f"the reference signal for it is in .reference of this finding "
-                     f"({len(finding.reference)} samples)")  # fmt: skip
+                     f"({write_count(len(finding.reference), 'sample')})")  # fmt: skip
     return [*lines, *([finding.note] if finding.note else [])]
 
 

@@ -19,6 +19,7 @@ from .._base.arguments import explain_fields, is_number
 from .._base.arrays import Array
 from .._base.errors import CtrlidError
 from .._base.periods import have_same_period, write_both_periods
+from .._base.text import write_count
 from ..physics.conversions import require_finite_coefficients, to_state_matrices
 from ..physics.linearization import OperatingPoint
 from ..physics.trace import timebase, trace
@@ -187,7 +188,8 @@ def make_control_law(controller: Any, at: OperatingPoint, dt: float) -> ControlL
     if controller.noutputs != 1 or controller.ninputs not in (1, 2):
         raise CtrlidError(
             f"a controller has one output u and one input (r - y) or two inputs (r, y); given "
-            f"{controller.ninputs} inputs and {controller.noutputs} outputs"
+            f"{write_count(controller.ninputs, 'input')} and "
+            f"{write_count(controller.noutputs, 'output')}"
         )
     sampled = timebase(controller) if controller.dt is not True else dt
     if sampled and not have_same_period(sampled, dt):
@@ -210,7 +212,8 @@ def require_proper(controller: Any) -> None:
         for num, den in zip(nums, dens, strict=True):
             if len(num) > len(den):
                 raise CtrlidError(
-                    f"the controller has {len(num) - 1} zeros but {len(den) - 1} poles: no circuit "
+                    f"the controller has {write_count(len(num) - 1, 'zero')} but "
+                    f"{write_count(len(den) - 1, 'pole')}: no circuit "
                     "and no program differentiates without delay; add a filter pole"
                 )
 

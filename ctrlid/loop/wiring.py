@@ -11,7 +11,7 @@ import numpy as np
 
 from .._base.arrays import Array
 from .._base.errors import CtrlidError
-from .._base.text import write_list
+from .._base.text import write_count, write_list
 from ..data.record import Record
 from ..physics.conversions import require_finite_coefficients, to_state_matrices
 from ..physics.equations import Equations
@@ -139,7 +139,7 @@ def make_wiring(controller: Any, plant: Equations, at: OperatingPoint) -> Wiring
         raise CtrlidError(
             f"the controller reads {names}, and none of these is an output of the plant "
             f"({', '.join(plant.outputs)}): give its inputs these names, or y[0], y[1], ..., or "
-            f"leave the names u[0], u[1], ... for {len(plant.outputs)} inputs r - y"
+            f"leave the names u[0], u[1], ... for {write_count(len(plant.outputs), 'input')} r - y"
         )
     if nameless and len(names) != len(plant.outputs):
         lines.append("(inputs without names read the references and then the outputs)")
@@ -168,8 +168,10 @@ def _refuse_state_feedback(controller: Any, plant: Equations) -> None:
     # What weighs references and outputs alike is no feedback of states.
     if count != 2 * p or not np.array_equal(gain[:, :p], -gain[:, p:]):
         raise CtrlidError(
-            f"the controller is a gain with {count} inputs without names, and {plant.name} has "
-            f"{count} states ({', '.join(plant.states)}) but {p} outputs "
+            f"the controller is a gain with {write_count(count, 'input')} without names, and "
+            f"{plant.name} has "
+            f"{write_count(count, 'state')} ({', '.join(plant.states)}) but "
+            f"{write_count(p, 'output')} "
             f"({', '.join(plant.outputs)}). {STATE_FEEDBACK}. If it reads "
             f"{'references and then outputs' if count == 2 * p else 'anything else'}, name its "
             "inputs likewise"
@@ -183,7 +185,8 @@ def _wire_by_position(
     p = len(plant.outputs)
     if count not in (p, 2 * p):
         raise CtrlidError(
-            f"the controller has {count} inputs without names, the plant {p} outputs "
+            f"the controller has {write_count(count, 'input')} without names, the plant "
+            f"{write_count(p, 'output')} "
             f"({', '.join(plant.outputs)}): give it {p} for r - y, or {2 * p} for r and then y, or "
             "name its inputs after the plant's signals"
         )

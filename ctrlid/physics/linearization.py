@@ -265,12 +265,12 @@ def _draw_starts(n: int, target: Sequence[float], guess: Any, inputs: int = 1) -
     starts = []
     if isinstance(guess, OperatingPoint):
         if len(guess.states) != n:
-            raise CtrlidError(f"guess needs {n} states; given {len(guess.states)}")
+            raise CtrlidError(f"guess needs {write_count(n, 'state')}; given {len(guess.states)}")
         starts.append(np.array([*guess.states, *guess.inputs]))
     elif guess is not None:
         states = np.atleast_1d(to_real_array(guess, "guess"))
         if states.shape != (n,):
-            raise CtrlidError(f"guess needs {n} states; given {states.size}")
+            raise CtrlidError(f"guess needs {write_count(n, 'state')}; given {states.size}")
         sizes = [s * 10.0**k for k in range(-2, 3) for s in (1, -1)]
         starts += [np.append(states, [size] * inputs) for size in sizes]
     for trial in range(STARTS):
@@ -361,7 +361,8 @@ def compute_state_matrices(
     e = equations
     if len(at.states) != len(e.states):
         raise CtrlidError(
-            f"the operating point has {len(at.states)} states {at.states}, but {e.name} has "
+            f"the operating point has {write_count(len(at.states), 'state')} {at.states}, but "
+            f"{e.name} has "
             f"{len(e.states)}: {', '.join(e.states)}"
         )
     jacobians = e.derive(("jacobians", spread), lambda: _build_jacobians(e, spread))

@@ -13,6 +13,7 @@ from control.nlsys import InterconnectedSystem
 
 from .._base.arrays import Array
 from .._base.errors import CtrlidError
+from .._base.text import write_count
 from . import canonical
 from .conversions import to_state_matrices
 from .equations import Equations
@@ -41,7 +42,9 @@ def _stack_expressions(result: Any, rows: int, what: str) -> Any:
     """Turn what a traced function returned into a CasADi column of known height."""
     flat = np.asarray(result, dtype=object).reshape(-1)
     if flat.size != rows:
-        raise TracingError(f"{what} returned {flat.size} values, but {rows} are declared")
+        raise TracingError(
+            f"{what} returned {write_count(flat.size, 'value')}, but {rows} are declared"
+        )
     wide = next((k for k, v in enumerate(flat) if isinstance(v, np.ndarray)), None)
     if wide is not None:
         raise TracingError(

@@ -156,7 +156,8 @@ def _make_record_table(record: Record) -> Table:
     valid = "" if record.valid.all() else f", {100 * record.valid.mean():.1f} % of them valid"
     between = BETWEEN[record.hold]
     caption = (
-        f"{len(record)} samples at {record.dt:g} s, {record.duration:.4g} s in all{valid}; "
+        f"{_text.write_count(len(record), 'sample')} at {record.dt:g} s, {record.duration:.4g} s "
+        f"in all{valid}; "
         f"u {between} between samples."
     )
     head = ("signal", "unit", "smallest", "mean", "largest", "standard deviation")

@@ -17,7 +17,7 @@ from .._base.interruption import hold_interrupt
 from .._base.periods import have_same_period, write_both_periods, write_difference
 from .._base.rounding import keep_numpy_quiet
 from .._base.signals import require_one_signal
-from .._base.text import write_number
+from .._base.text import write_count, write_number
 from ..data.record import Record
 from ..data.several_records import order_model_and_data
 from ..data.validity import find_whole_past
@@ -315,7 +315,8 @@ def _sample_model(model: Any, record: Record, delay: float) -> tuple[dict[str, A
 def _compare_model(record: Record, model: Any, horizon: int | None) -> Comparison:
     if model.ninputs != 1 or model.noutputs != 1:
         raise CtrlidError("compare needs a model with one input and one output; given "
-                          f"{model.ninputs} inputs and {model.noutputs} outputs. Pick a channel, "
+                          f"{write_count(model.ninputs, 'input')} and "
+                          f"{write_count(model.noutputs, 'output')}. Pick a channel, "
                           "for example G[0, 0]")  # fmt: skip
     dt = record.dt if model.dt is True else timebase(model)
     if dt and not have_same_period(dt, record.dt):
@@ -342,8 +343,8 @@ def _compare_model(record: Record, model: Any, horizon: int | None) -> Compariso
     if np.count_nonzero(usable) < FEWEST:
         raise ModelCannotRun(
             f"a model of order {order} needs {FEWEST + order} valid samples in "
-            f"succession; the record has {np.count_nonzero(valid)} valid samples of "
-            f"{len(record)}"
+            "succession; the record has "
+            f"{write_count(int(np.count_nonzero(valid)), 'valid sample')} of {len(record)}"
         )
     y0, u0 = float(np.mean(record.y[valid])), float(np.mean(record.u[valid]))
     y, u = record.y - y0, record.u - u0

@@ -6,7 +6,7 @@ import numpy as np
 
 from .._base.arrays import Array, freeze_arrays
 from .._base.errors import CtrlidError
-from .._base.text import Printed, write_list
+from .._base.text import Printed, write_count, write_list
 from ..data.record import Record
 from .residual_tests import Correlation
 
@@ -146,7 +146,8 @@ class Comparison(Printed):
         unit = "" if isinstance(unit, tuple) else unit
         rows = [
             f"Comparison of {self.what} with the record {self.record.name}".rstrip()
-            + f" ({len(self.record)} samples, {np.count_nonzero(self.record.valid)} valid)"
+            + f" ({write_count(len(self.record), 'sample')}, "
+            f"{np.count_nonzero(self.record.valid)} valid)"
         ]
         size = f"RMS error [{unit}]" if unit else "RMS error"
         rows.append(f"  {'curve':<34}{'fit':>10}{size:>18}{'noise explains':>18}")

@@ -15,7 +15,7 @@ from .._base.errors import CtrlidError
 from .._base.rounding import keep_numpy_quiet
 from .._base.signals import require_one_signal
 from .._base.statistics import regress
-from .._base.text import Printed
+from .._base.text import Printed, write_count
 from ..data.record import Record
 from ..data.validity import find_whole_past
 
@@ -254,7 +254,8 @@ def _fit_long_regression(
 ) -> _Long:
     rows = _find_rows(record, start, stop, max(length, reach))
     if len(rows) < 4 * length + 20:
-        raise CtrlidError(f"a regression on {length} lags needs {4 * length + 20} equations; the "
+        raise CtrlidError(f"a regression on {write_count(length, 'lag')} needs {4 * length + 20} "
+                          f"equations; the "
                           f"first two thirds of the record give {len(rows)}. Record longer, or try "
                           "lower orders")  # fmt: skip
     table, goal = _make_table(record, rows, length)
@@ -330,7 +331,8 @@ def _fit_structure(long: _Long, na: int, nb: int, nk: int) -> tuple[Array, float
 def _write_choice(rows: list[OrderRow], unit: float, length: int) -> str:
     best = rows[0]
     text = (f"Chosen: na={best.na}, nb={best.nb}, nk={best.nk}, by comparison with a long "
-            f"regression on {length} lags of y and u. On the last third of the record, which was "
+            f"regression on {write_count(length, 'lag')} of y and u. On the last third of the "
+            f"record, which was "
             f"not fitted, its one-step error is {best.held_out:.3f} times that of the long "
             "regression.")  # fmt: skip
     if len(rows) > 1:

@@ -12,7 +12,7 @@ from .._base.errors import CtrlidError, CtrlidWarning, ModelCannotRun
 from .._base.jobs import check_jobs, share_out
 from .._base.rounding import keep_numpy_quiet
 from .._base.signals import require_one_signal
-from .._base.text import write_list, write_percent
+from .._base.text import write_count, write_list, write_percent
 from ..data.record import Record
 from ..estimation.constraints import AbstractConstraint
 from ..estimation.linear.arx import fit_arx
@@ -292,7 +292,7 @@ def _recommend(rows: Sequence[SamplingRow], names: Sequence[str]) -> tuple[float
             words.append(f"{name} at every period")
         elif good:
             reach = f"{min(good):.4g}" + (f" to {max(good):.4g}" if len(good) > 1 else "")
-            words.append(f"{name} at {reach} s ({len(good)} of {tried} periods)")
+            words.append(f"{name} at {reach} s ({len(good)} of {write_count(tried, 'period')})")
         else:
             words.append(f"{name} AT NO PERIOD")
     off = (

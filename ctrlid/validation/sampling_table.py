@@ -131,7 +131,8 @@ class SamplingSweep(Printed):
         largest = float(np.max(np.abs(self.poles))) if len(self.poles) else np.nan
         heading = "poles ± standard error [rad/s]"
         width = 2 + max([len(heading), *(len(_poles(row)) for row in self.table)])
-        lines = [f"Sampling period of {self.record.name or 'the record'}: {self.record.n} samples "
+        lines = [f"Sampling period of {self.record.name or 'the record'}: "
+                 f"{write_count(self.record.n, 'sample')} "
                  f"at {self.record.dt:g} s",
                  f"  {'Ts [s]':>9} {'p Ts':>7}  {'estimator':<15}{'samples':>8}  "
                  f"{heading:<{width}}{'distance':>8}  one-step errors"]  # fmt: skip

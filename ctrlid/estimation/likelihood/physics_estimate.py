@@ -12,7 +12,7 @@ from ..._base.arguments import check_arguments
 from ..._base.arrays import Array, freeze_arrays, read_only
 from ..._base.criterion import bayesian_penalty
 from ..._base.errors import CtrlidError
-from ..._base.text import Printed, write_list, write_number, write_quantity
+from ..._base.text import Printed, write_count, write_list, write_number, write_quantity
 from ...loop.loop import Loop
 from ...physics.linearization import make_state_space, operating_point
 from ..identified_model import compute_root_errors
@@ -147,7 +147,8 @@ class LoopEstimate(ParameterEstimate):
         return -2 * self.log_likelihood + 2 * bayesian_penalty(extra, self.n_samples)
 
     def __str__(self) -> str:
-        rows = [f"fit by maximum likelihood, {self.n_samples} samples used, log-likelihood "
+        rows = [f"fit by maximum likelihood, {write_count(self.n_samples, 'sample')} used, "
+                f"log-likelihood "
                 f"{self.log_likelihood:.1f}"]  # fmt: skip
         rows += self._list_rows(self.active)
         size, push = self.units
@@ -193,7 +194,7 @@ class SimulationEstimate(ParameterEstimate):
     units: Any = ""
 
     def __str__(self) -> str:
-        rows = [f"fit by the error of the simulation, {self.n_samples} samples used"]
+        rows = [f"fit by the error of the simulation, {write_count(self.n_samples, 'sample')} used"]
         rows += self._list_rows(self.active)
         units = self.units if isinstance(self.units, tuple) else (self.units,)
         rows.append(f"  root mean square error of the simulation: "

@@ -15,7 +15,7 @@ from ..._base.arrays import Array, freeze_arrays
 from ..._base.errors import CtrlidError, ModelCannotRun
 from ..._base.interruption import hold_interrupt
 from ..._base.rounding import keep_numpy_quiet
-from ..._base.text import Printed
+from ..._base.text import Printed, write_count
 from ...data.record import Record
 from ...data.several_records import order_model_and_data
 from ...data.validity import find_whole_past
@@ -80,7 +80,7 @@ class Prediction(Printed):
         found = float(np.sqrt(np.mean(self.innovations[self.settled] ** 2)))
         expected = float(np.sqrt(np.mean(self.spread[self.settled] ** 2)))
         return (
-            f"One-step prediction of {len(self.y)} samples\n"
+            f"One-step prediction of {write_count(len(self.y), 'sample')}\n"
             f"  RMS of the innovations: {found:.3g}{unit}; the filter expects "
             f"{expected:.3g}{unit}\n"
             f"  standard deviation of the sensor noise: {self.sensor_noise:.3g}{unit}; of the "
@@ -89,7 +89,10 @@ class Prediction(Printed):
 
     def _write_several(self) -> str:
         sensors, pushes = self.units
-        rows = [f"One-step prediction of {self.y.shape[1]} samples of {len(self.y)} outputs"]
+        rows = [
+            f"One-step prediction of {write_count(self.y.shape[1], 'sample')} of "
+            f"{write_count(len(self.y), 'output')}"
+        ]
         for k, (unit, noise) in enumerate(zip(sensors, self.sensor_noise, strict=True)):
             use = self.settled[k]
             found, expected = (

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence, Sized
 from dataclasses import replace
 
 import numpy as np
@@ -23,7 +23,13 @@ from ..constraints.constrained_minimum import Found, minimize
 from ..constraints.quadratic_program import Cost, NotExcited
 from ..identified_model import Estimate, IdentifiedModel, IdentifiedSystem, Structure
 from ..whiteness import ENOUGH, note_coloured_innovations
-from .regression import Regression, build_arx_regression, from_differences, list_structures
+from .regression import (
+    Regression,
+    build_arx_regression,
+    count_equations,
+    from_differences,
+    list_structures,
+)
 
 
 @explain_names
@@ -133,21 +139,39 @@ def fit_arx(
     return IdentifiedSystem(estimates, first.signals["u"])
 
 
+def _require_equations(records: Iterable[Record], structure: Structure, intercept: bool) -> None:
+    """Refuse records with fewer equations than unknowns, before the regression is formed."""
+    each = [count_equations(record, structure) for record in records]
+    unknowns = len(structure.names) + len(each) * intercept
+    # A record that gives none is refused by its number.
+    if min(each) > 0 and sum(each) <= unknowns:
+        raise CtrlidError(_lack_equations(sum(each), unknowns, structure))
+
+
+def _lack_equations(rows: int, unknowns: int, structure: Structure) -> str:
+    """Say that there are too few equations."""
+    return (
+        f"Too few samples: {_text.write_count(rows, 'equation')} for "
+        f"{_text.write_count(unknowns, 'unknown')}. An equation needs "
+        f"{_text.write_count(structure.span, 'valid sample')} in succession. Record longer or "
+        "lower the orders."
+    )
+
+
 def _fit_row(
     records: Iterable[Record], first: Record, structure: Structure,
     known: Sequence[AbstractConstraint], intercept: bool, jobs: int | None,
 ) -> Estimate:  # fmt: skip
     """Fit one output."""
+    if isinstance(records, Sized):
+        # A large regression takes long, and is in vain where it has too few rows.
+        _require_equations(records, structure, intercept)
     motions: list[float] = []
     watched = records if first.hold == "zoh" else _note_motion(records, motions)
     regression = build_arx_regression(watched, structure, intercept, check_jobs(jobs))
     unknowns = len(structure.names) + len(regression.intercept_rows)
     if regression.rows <= unknowns:
-        raise CtrlidError(
-            f"Too few samples: {_text.write_count(regression.rows, 'equation')} for {unknowns} "
-            f"unknowns. An equation needs {structure.span} valid samples in succession. "
-            "Record longer or lower the orders."
-        )
+        raise CtrlidError(_lack_equations(regression.rows, unknowns, structure))
     try:
         found = minimize(make_arx_cost(regression), known, structure)
     except NotExcited as trouble:

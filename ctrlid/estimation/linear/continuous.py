@@ -16,7 +16,7 @@ from ..._base.interruption import hold_interrupt
 from ..._base.periods import have_same_period, write_both_periods
 from ..._base.rounding import keep_numpy_quiet
 from ..._base.signals import require_one_signal
-from ..._base.text import write_list, write_number, write_p_value, write_quantity
+from ..._base.text import write_count, write_list, write_number, write_p_value, write_quantity
 from ...data.record import Record
 from ...data.several_records import VISIBLE_MOTION, as_records, measure_input_motion
 from ...loop.controllers import PID
@@ -138,7 +138,8 @@ def fit_continuous(
     total = sum(p.n for p in pieces)
     if total < needed:
         raise CtrlidError(
-            f"Too few samples: {total} valid samples for {len(structure.names)} coefficients and "
+            f"Too few samples: {write_count(total, 'valid sample')} for "
+            f"{write_count(len(structure.names), 'coefficient')} and "
             f"the noise model, which need {needed}. Record longer or lower the orders."
         )
     if delay is not None and not (np.isfinite(delay) and delay >= 0):
@@ -264,7 +265,8 @@ def _check_orders(poles: Any, zeros: Any) -> Structure:
             raise CtrlidError(f"{name} must be an integer of at least {least}; given {value!r}")
     if zeros > poles:
         raise CtrlidError(
-            f"a plant has no more zeros than poles; given {zeros} zeros and {poles} poles"
+            f"a plant has no more zeros than poles; given {write_count(zeros, 'zero')} and "
+            f"{write_count(poles, 'pole')}"
         )
     return Structure(na=int(poles), nb=int(zeros) + 1, domain="s")
 

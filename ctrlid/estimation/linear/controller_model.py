@@ -16,6 +16,7 @@ from ..._base.criterion import bayesian_penalty
 from ..._base.errors import CtrlidError
 from ..._base.periods import have_same_period, write_both_periods
 from ..._base.statistics import regress
+from ..._base.text import write_count
 from ...physics.conversions import require_finite_coefficients, to_polynomials
 from ..identified_model import Structure
 from .instruments import Piece, Signals
@@ -72,7 +73,8 @@ def convert_controller(controller: Any, names: Sequence[str], dt: float) -> Line
     if controller.noutputs != 1 or controller.ninputs not in (1, 2):
         raise CtrlidError(
             "A controller has one output u and one input (r - y) or two inputs (r, y); given "
-            f"{controller.ninputs} inputs and {controller.noutputs} outputs."
+            f"{write_count(controller.ninputs, 'input')} and "
+            f"{write_count(controller.noutputs, 'output')}."
         )
     if not controller.isdtime(strict=True):
         raise CtrlidError(

@@ -11,6 +11,7 @@ import numpy as np
 from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
 from ..._base.statistics import regress
+from ..._base.text import write_count
 from ...data.record import Record
 from ..constraints.quadratic_program import Cost
 from ..identified_model import Structure
@@ -89,7 +90,8 @@ class Task:
         total = sum(len(piece.y) for piece in pieces)
         if total < 10 * unknowns:
             raise CtrlidError(
-                f"Too few samples: {total} valid samples for {unknowns} unknowns. Instrumental "
+                f"Too few samples: {write_count(total, 'valid sample')} for "
+                f"{write_count(unknowns, 'unknown')}. Instrumental "
                 f"variables need at least {10 * unknowns}. Record longer or lower the orders."
             )
         return cls(structure, pieces, project_on_references(pieces), len(records), intercept)

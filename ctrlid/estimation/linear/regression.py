@@ -16,6 +16,7 @@ from ..._base.arguments import is_iterable
 from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
 from ..._base.jobs import share_out
+from ..._base.text import write_count
 from ...data.record import Record
 from ..identified_model import Structure
 
@@ -186,6 +187,30 @@ def reduce_record(record: Record, structure: Structure, intercept: bool = True) 
     return Part(factor, rows, levels, len(record.y), int(record.valid.sum()))
 
 
+def count_equations(record: Record, structure: Structure) -> int:
+    """Return how many rows the regression of a record has, without forming any.
+
+    Parameters
+    ----------
+    record : Record
+        The data.
+    structure : Structure
+        Orders of the model.
+
+    Returns
+    -------
+    int
+        The rows whose samples are all valid.
+    """
+    na, nb, nk = structure.na, structure.nb, structure.nk
+    rows = np.arange(max(na, nk + nb - 1), len(record))
+    before = np.concatenate([[0], np.cumsum(~record.valid)])
+    # The samples that a row needs of y, and of u.
+    spoilt = before[rows + 1] - before[rows - na]
+    spoilt += before[rows - nk + 1] - before[rows - nk - nb + 1]
+    return int(np.count_nonzero(spoilt == 0))
+
+
 def build_arx_regression(
     records: Iterable[Record],
     structure: Structure,
@@ -227,8 +252,10 @@ def build_arx_regression(
             needed = structure.span
             count = f" of {len(records)}" if isinstance(records, Sized) else ""
             raise CtrlidError(
-                f"Record {number}{count} gives no equation: an equation needs {needed} valid "
-                f"samples in succession, and {part.valid} of its {part.samples} samples are valid. "
+                f"Record {number}{count} gives no equation: an equation needs "
+                f"{write_count(needed, 'valid sample')} in succession, and {part.valid} of its "
+                f"{write_count(part.samples, 'sample')} {'is' if part.samples == 1 else 'are'} "
+                f"valid. "
                 "Leave it out or lower the orders."
             )
         used += part.rows

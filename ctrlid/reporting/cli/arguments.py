@@ -17,6 +17,7 @@ import control as ct
 import numpy as np
 
 from ..._base.errors import CtrlidError
+from ..._base.periods import have_same_period, write_both_periods
 from ..._base.text import list_known
 from ...data.record import Record
 from ...loop.controllers import PID
@@ -56,12 +57,12 @@ def read_loop(args: argparse.Namespace, record: Record) -> Loop:
         if clash:
             raise CtrlidError(f"{args.model} is a ctrlid.Loop, which has its own operating point "
                               f"and controller: leave out {', '.join(clash)}")  # fmt: skip
-        if abs(model.dt - record.dt) > 1e-6 * record.dt:
+        if not have_same_period(model.dt, record.dt):
             advice = "give both the same period"
             if abs(1000 * model.dt - record.dt) < 0.01 * record.dt:
                 advice = "if the times are in milliseconds, name their column t [ms]"
-            raise CtrlidError(f"{args.model} is sampled at {model.dt:g} s, the record at "
-                              f"{record.dt:g} s; {advice}")  # fmt: skip
+            both = write_both_periods(f"{args.model} is sampled", model.dt, "the record", record.dt)
+            raise CtrlidError(f"{both}; {advice}")
         free = model.free if args.free is None else _join_names(args.free)
         _require_known(args.model, list(model.parameters), [*values, *free])
         return dataclasses.replace(model.with_parameters(values), free=free)
