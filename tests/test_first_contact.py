@@ -15,6 +15,7 @@ import pytest
 
 import ctrlid as cid
 from ctrlid._base.text import write_percent
+from ctrlid.diagnosis.findings import Disturbance
 from ctrlid.diagnosis.noise_tests import NoiseTests
 from ctrlid.diagnosis.verdict import write_conclusion
 from problems import record_of, servo
@@ -156,11 +157,12 @@ def test_what_needs_a_loop_says_where_a_fit_has_it(record, name):
 def test_one_of_a_thing_is_no_plural():
     with pytest.raises(cid.CtrlidError, match=r"the plant 1 output \(x\)"):
         servo(ct.ss([], [], [], np.ones((1, 3)), 0.01), dt=0.01)
-    gap = SimpleNamespace(name="simulation")
+    quiet = Disturbance(0.0, 0.0, np.nan, 0.0)
+    gap = SimpleNamespace(name="simulation", outputs=(), after=2.0, before=2.0, floor=1.0)
     tests = NoiseTests({"whiteness": 0.0}, np.zeros(3), {})
     for tried, words in ((1, "The one effect of the catalogue does not explain it."),
                          (7, "None of the 7 effects of the catalogue explains it.")):  # fmt: skip
-        assert words in write_conclusion("unknown", [], gap, None, tests, (), tried=tried)
+        assert words in write_conclusion("unknown", [], gap, quiet, tests, (), tried=tried)
 
 
 def test_milliseconds_that_were_taken_for_seconds_are_suspected(record):
