@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import ctrlid as cid
+from ctrlid import effects as E
 from ctrlid._base.text import write_percent
 from ctrlid.diagnosis.findings import Disturbance
 from ctrlid.diagnosis.noise_tests import NoiseTests
@@ -175,3 +176,19 @@ def test_milliseconds_that_were_taken_for_seconds_are_suspected(record):
     with pytest.raises(cid.CtrlidError) as told:
         cid.predict(loop, replace(record, dt=0.011))
     assert "milliseconds" not in str(told.value)
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [(lambda: E.CoulombFriction(fc=-1), r"between 0 and inf \[output unit/s\^2\]; given -1"),
+     (lambda: E.InputDelay("late"), r"needs a number for delay \[s\]; given 'late'"),
+     (lambda: E.Quantization(np.nan), r"needs a finite step \[output unit\]; given nan"),
+     (lambda: cid.random_binary(9, amplitude=1, hold=0.5), "a whole number of samples, at least 1"),
+     (lambda: cid.random_binary(9, amplitude="1"), "finite number, in the unit of the signal"),
+     (lambda: cid.multisine(9, amplitude=-1), "number above 0, in the unit of the signal"),
+     (lambda: cid.plants.servo(m="1", c=1, k=1), r"needs a number as m \[kg\]; given '1' \(str\)"),
+     (lambda: cid.fit_continuous(3, 2, 1, delay="1"), r"a number or None as delay \[s\]; given")],
+)  # fmt: skip
+def test_a_refused_value_is_told_its_unit(call, words):
+    with pytest.raises(cid.CtrlidError, match=words):
+        call()

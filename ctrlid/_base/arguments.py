@@ -2,7 +2,9 @@
 
 import functools
 import inspect
+import itertools
 import os
+import re
 import sys
 import types
 import typing
@@ -21,6 +23,8 @@ Given = ParamSpec("Given")
 Answer = TypeVar("Answer")
 Made = TypeVar("Made")
 
+# A unit in a docstring stands behind a blank; [1] is a number without one, and [1]_ a citation.
+UNIT = re.compile(r"(?<=\s)\[([^\]\d`][^\]`]*)\]")
 # The largest whole number of a machine word.
 LARGEST = 2**63 - 1
 NUMBERS = {
@@ -62,7 +66,7 @@ def check_arguments(function: Callable[..., Any], given: Mapping[str, Any], *own
     function = getattr(function, "__func__", function)
     for name, kind in _find_kinds(function).items():
         if name not in own:
-            _check_kind(function.__name__, name, given[name], kind)
+            _check_kind(function.__name__, name, given[name], kind, function.__doc__)
 
 
 def explain_names(function: Callable[Given, Answer]) -> Callable[Given, Answer]:
@@ -210,7 +214,7 @@ def check_fields(value: Any, *own: str) -> None:
     cls: Any = type(value)
     for name, kind in _find_field_kinds(cls).items():
         if name not in own:
-            _check_kind(type(value).__name__, name, getattr(value, name), kind)
+            _check_kind(type(value).__name__, name, getattr(value, name), kind, type(value).__doc__)
 
 
 def explain_fields(cls: type[Made]) -> type[Made]:
@@ -280,13 +284,49 @@ class ShownFields:
         return own.replace(parameters=list(own.parameters.values())[1:])
 
 
-def _check_kind(who: str, name: str, value: Any, kind: Any) -> None:
+def _check_kind(who: str, name: str, value: Any, kind: Any, about: str | None) -> None:
     if not _is_kind(value, kind):
         part = point_at_part(value, kind) if isinstance(kind, type) else ""
+        unit = find_unit(about, name)
         raise CtrlidError(
-            f"{who} needs {_describe_kind(kind)} as {name}; given {shorten_value(value)} "
-            f"({type(value).__name__}){part}"
+            f"{who} needs {_describe_kind(kind)} as {name}{unit and f' [{unit}]'}; given "
+            f"{shorten_value(value)} ({type(value).__name__}){part}"
         )
+
+
+def find_unit(about: str | None, name: str) -> str:
+    r"""Return the unit of a parameter, as its docstring says it in square brackets.
+
+    Parameters
+    ----------
+    about : str or None
+        A docstring in the form of numpydoc.
+    name : str
+        The parameter.
+
+    Returns
+    -------
+    str
+        The unit; empty where none is said.
+
+    Examples
+    --------
+    >>> find_unit(find_unit.__doc__, "name"), find_unit(None, "name")
+    ('', '')
+    >>> find_unit("Wait.\n\nlate, early : float\n    How long [s].", "early")
+    's'
+    """
+    if about is None:
+        return ""
+    lines = inspect.cleandoc(about).splitlines()
+    heads = [k for k, line in enumerate(lines) if name in line.partition(" : ")[0].split(", ")
+             and " : " in line]  # fmt: skip
+    for k in heads:
+        words = itertools.takewhile(lambda line: line.startswith(" "), lines[k + 1 :])
+        found = UNIT.search(" " + " ".join(map(str.strip, words)))
+        if found is not None:
+            return found[1]
+    return ""
 
 
 @functools.cache

@@ -300,7 +300,8 @@ def _check_count(value: Any, name: str) -> int:
     except TypeError:
         number = 0
     if isinstance(value, bool) or number < 1:
-        raise CtrlidError(f"{name} is {value!r}; needed is a whole number, at least 1.")
+        counted = "" if name in ("order", "seed") else " of samples"
+        raise CtrlidError(f"{name} is {value!r}; needed is a whole number{counted}, at least 1.")
     if number > MOST:
         raise CtrlidError(f"{name} is {value!r}; needed are at most {MOST:g} samples.")
     return number
@@ -309,14 +310,16 @@ def _check_count(value: Any, name: str) -> int:
 def _check_level(value: Any, name: str) -> float:
     number = float(value) if is_number(value) else math.nan
     if not math.isfinite(number):
-        raise CtrlidError(f"{name} is {value!r}; needed is a finite number.")
+        raise CtrlidError(f"{name} is {value!r}; needed is a finite number, in the unit of the "
+                          "signal.")  # fmt: skip
     return number
 
 
 def _check_positive(value: Any, name: str) -> float:
     number = _check_level(value, name)
     if number <= 0:
-        raise CtrlidError(f"{name} is {value!r}; needed is a number above 0.")
+        raise CtrlidError(f"{name} is {value!r}; needed is a number above 0, in the unit of the "
+                          "signal.")  # fmt: skip
     return number
 
 

@@ -15,7 +15,7 @@ from ..physics.equations import Equations
 from ..physics.linearization import OperatingPoint
 from ..physics.symbols import Symbol
 from .context import Moment, find_motion
-from .parameters import Parameter, fill_unit
+from .parameters import Parameter, fill_unit, write_unit
 from .scanning import Overview, Range, Scan, Sight
 from .symbolic import append_states, find_spread, trace_hook
 
@@ -106,18 +106,19 @@ class AbstractEffect(metaclass=CheckedCalls):
         check_fields(self, *(p.name for p in self.parameters()))
         for p in self.parameters():
             value = getattr(self, p.name)
+            called = f"{p.name}{write_unit(p.unit)}"
             if not is_number(value):
-                raise CtrlidError(f"{kind} needs a number for {p.name}; given {value!r}")
+                raise CtrlidError(f"{kind} needs a number for {called}; given {value!r}")
             value = float(value)
             # An infinite value is a limit that is never met.
             if math.isnan(value) or (math.isinf(value) and value not in (p.lower, p.upper)):
-                raise EffectDoesNotApply(f"{kind} needs a finite {p.name}; given {value!r}")
+                raise EffectDoesNotApply(f"{kind} needs a finite {called}; given {value!r}")
             if math.isinf(value) and (p.neutral is None or not math.isinf(p.neutral)):
-                raise EffectDoesNotApply(f"{kind} needs a finite {p.name}; given {value!r}")
+                raise EffectDoesNotApply(f"{kind} needs a finite {called}; given {value!r}")
             if not p.lower <= value <= p.upper:
                 raise EffectDoesNotApply(
-                    f"{kind} needs {p.name} between {p.lower:g} and {p.upper:g} "
-                    f"[{fill_unit(p.unit)}]; given {value:g}"
+                    f"{kind} needs {p.name} between {p.lower:g} and {p.upper:g}"
+                    f"{write_unit(p.unit)}; given {value:g}"
                 )
             object.__setattr__(self, p.name, value)
         self.check()

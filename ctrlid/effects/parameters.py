@@ -82,3 +82,15 @@ def fill_unit(unit: str, signals: Mapping[str, str] | None = None) -> str:
     """Return a unit with the units of signals in it, or with [u] and [y] where they are unknown."""
     known = {"u": "[u]", "y": "[y]", "x": "[state]", **(signals or {})}
     return _units.fill_unit(unit, known)
+
+
+def write_unit(unit: str) -> str:
+    """Return a unit in brackets, with those of signals in words; nothing for a plain number.
+
+    Examples
+    --------
+    >>> write_unit("s"), write_unit("{y}/s"), write_unit("1/(s {u}^2)"), write_unit("")
+    (' [s]', ' [output unit/s]', ' [1/(s (input unit)^2)]', '')
+    """
+    words = {"u": "input unit", "y": "output unit", "x": "unit of the state"}
+    return f" [{fill_unit(unit, words)}]" if unit else ""
