@@ -24,6 +24,7 @@ BOUNDARIES = {
     "estimation/series.py: _fit_one",
     "reporting/cli/options.py: options_in_refusals",
     "reporting/cli/arguments.py: parse_assignment",
+    "reporting/cli/arguments.py: parse_decimal",
     "reporting/cli/demo_identification.py: _tell_redesigns",
     "validation/controller_check.py: check_controller",
     "validation/wired_controller_check.py: check_wired_controller",

@@ -243,3 +243,49 @@ def test_states_of_effects_follow_those_of_the_plant():
     np.testing.assert_allclose(G(w), bare(w), rtol=1e-9)
     sampled = cid.Loop(ct.tf([1.0], [1.0, -1.1], 0.1, name="G"), None, dt=0.1)
     assert sampled.linearize(states=True).dt == 0.1
+
+
+def at_height(u):
+    return cid.OperatingPoint(states=(0.012, 0.0), input=u, output=0.012)
+
+
+def test_a_loop_says_where_its_plant_does_not_rest():
+    plant = cid.plants.maglev(m=0.0213, K=3.34e-6)
+
+    def text(u):
+        return repr(cid.Loop(plant, None, dt=1e-3, at=at_height(u)))
+
+    # A rounded input, and one that suits a magnet 10 % weaker, are at rest.
+    assert "REST" not in text(3.0)
+    assert "REST" not in text(3.0 / np.sqrt(0.9))
+    assert text(2.5).endswith("V = 2.5 (NOT AT REST THERE: v changes by 3 m/s a second))")
+    off = cid.Loop(plant, None, dt=1e-3, at=at_height(2.5))
+    assert off.linearize().num[0][0] < 0
+    # A force that holds the plant where it does not rest alone, and linear plants, are at rest.
+    weight = ct.nlsys(lambda t, x, u, params: [x[1], u[0] - 9.81 * np.cos(x[0])],
+                      lambda t, x, u, params: [x[0]], inputs=["F"], outputs=["y"],
+                      states=["y", "v"], name="arm")  # fmt: skip
+    arm = cid.Loop(weight, None, dt=0.01)
+    assert "v changes by -9.81 a second" in repr(arm)
+    assert "REST" not in repr(arm.with_effect(cid.effects.ConstantForce(bias=9.81)))
+    at = cid.OperatingPoint((), 5.0, 7.0)
+    assert "REST" not in repr(cid.Loop(ct.tf(1, [1, 1]), None, dt=0.01, at=at))
+    jump = ct.nlsys(lambda t, x, u, params: [0.5 * x[0] + u[0] + 1.0],
+                    lambda t, x, u, params: [x[0]], inputs=1, outputs=1, states=1,
+                    dt=0.1)  # fmt: skip
+    assert "x[0] changes by 1 a sample" in repr(cid.Loop(jump, None, dt=0.1))
+
+
+def test_a_point_without_any_balance_is_not_linearized():
+    plant = cid.plants.maglev(m=0.0213, K=3.34e-6)
+    loop = cid.Loop(plant, None, dt=1e-3, at=at_height(0.0))
+    words = "v changes by 9.81 a second, and the input 0 has no influence on that to first order"
+    for call in (loop.linearize, lambda: loop.linearize(states=True),
+                 lambda: cid.linearize(plant, at_height(0.0))):  # fmt: skip
+        with pytest.raises(cid.CtrlidError, match=words):
+            call()
+    # A body that falls whatever the input is has a linear model, with its gain elsewhere.
+    falling = ct.nlsys(lambda t, x, u, params: [u[0], -9.81], lambda t, x, u, params: [x[0]],
+                       inputs=1, outputs=1, states=2)  # fmt: skip
+    G = cid.linearize(falling, cid.OperatingPoint((0, 0), 0, 0))
+    assert G.num[0][0] == pytest.approx([1.0])

@@ -31,6 +31,7 @@ from ..physics.equations import Equations, drive_inputs
 from ..physics.linearization import (
     OperatingPoint,
     as_operating_point,
+    find_unbalanced_rate,
     linearize,
     make_state_space,
 )
@@ -578,6 +579,7 @@ class Loop:
         pairs = zip((*e.outputs, *e.inputs), (*self.at.outputs, *self.at.inputs), strict=True)
         point = ", ".join(f"{name} = {value:g}" for name, value in pairs)
         text = f"Loop({e.name}, {kind}, dt={self.dt:g} s, at {point}"
+        text += self._describe_imbalance()
         limits = np.broadcast_to(np.array(np.broadcast_arrays(*self.input_limits)).T,
                                  (len(e.inputs), 2))  # fmt: skip
         for name, (low, high) in zip(e.inputs, limits, strict=True):
@@ -596,6 +598,19 @@ class Loop:
         if wiring is None:
             return text + ")"
         return "\n  ".join([text + "), wired:", *wiring.lines])
+
+    def _describe_imbalance(self) -> str:
+        """Say that the plant does not rest at the operating point; empty where it does.
+
+        With effects, such as a constant force, it may rest where the plant alone does not.
+        """
+        found = find_unbalanced_rate(self._shift_to_absolute(), self._bare_point)
+        if found is None or find_unbalanced_rate(self._active, self.point) is None:
+            return ""
+        per = "a sample" if self._traced.dt else "a second"
+        unit = self.known_units.get(found.state, "")
+        rate = f"{found.rate:.3g} {unit}".rstrip()
+        return f" (NOT AT REST THERE: {found.state} changes by {rate} {per})"
 
 
 class _Itself:

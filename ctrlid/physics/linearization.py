@@ -23,6 +23,11 @@ from .trace import trace
 UNREACHABLE = 1e-12
 # An equilibrium is accepted if its residual is below this share of the terms that cancel there.
 EQUILIBRIUM = 1e-9
+# A point is called none where more than this share of the terms is left: a rounded input, or a
+# parameter that is known to ten per cent, leaves less.
+UNBALANCED = 0.05
+# Where nothing balances a rate, this share of the terms is left.
+NOT_AT_ALL = 0.9
 # The search for equilibria starts from so many random points.
 STARTS = 60
 
@@ -88,6 +93,28 @@ class OperatingPoint:
     def outputs(self) -> tuple[float, ...]:
         """The outputs as a tuple, also where there is one."""
         return tuple(np.ravel(self.output).tolist())
+
+
+@dataclass(frozen=True)
+class Imbalance:
+    """A rate of a plant that is not zero at a point.
+
+    Parameters
+    ----------
+    state : str
+        The state that changes.
+    rate : float
+        By how much, a second or a sample [its unit].
+    share : float
+        That beside all terms of the rate; 1 where nothing cancels.
+    steered : bool
+        Whether a small change of the inputs changes the rate, or they are not in it at all.
+    """
+
+    state: str
+    rate: float
+    share: float
+    steered: bool
 
 
 def as_operating_point(at: Any, equations: Equations, inputs: Sequence[str]) -> OperatingPoint:
@@ -351,6 +378,55 @@ def _measure_residual(evaluate: Any, z: Array) -> float:
     return float(np.max(np.where(f == 0, 0.0, np.abs(f) / np.where(terms > 0, terms, 1.0))))
 
 
+def find_unbalanced_rate(equations: Equations, at: OperatingPoint) -> Imbalance | None:
+    """Return the rate that is furthest from zero at a point, beside what cancels in it there.
+
+    Parameters
+    ----------
+    equations : Equations
+        The plant.
+    at : OperatingPoint
+        The point.
+
+    Returns
+    -------
+    Imbalance or None
+        The worst rate; None where all of them are balanced, or the point is out of the domain.
+    """
+    e = equations
+    x, u = np.array(at.states), np.array(at.inputs)
+    rates = e.evaluate(x, u)[0] - (x if e.dt else 0.0)
+    a, b = e.derive(("jacobians", 0.0), lambda: _build_jacobians(e, 0.0))(
+        0.0, x, u, e.values)[:2]  # fmt: skip
+    a, b = np.asarray(casadi.DM(a), float), np.asarray(casadi.DM(b), float)
+    if e.dt:
+        a = a - np.eye(len(x))
+    terms = np.abs(a) @ np.abs(x) + np.abs(b) @ np.abs(u) + np.abs(rates)
+    if not rates.size or not np.isfinite([*rates, *terms]).all():
+        return None
+    shares = np.abs(rates) / np.where(terms > 0, terms, 1.0)
+    k = int(np.argmax(shares))
+    if shares[k] < UNBALANCED:
+        return None
+    steered = bool(np.any(b[k])) or not casadi.depends_on(e.rhs[k], e.u)
+    return Imbalance(e.states[k], float(rates[k]), float(shares[k]), steered)
+
+
+def _refuse_dead_point(equations: Equations, at: OperatingPoint) -> None:
+    """Refuse a point that is no equilibrium, and at which the input cannot balance the plant."""
+    found = find_unbalanced_rate(equations, at)
+    if found is None or found.steered or found.share < NOT_AT_ALL:
+        return
+    e = equations
+    per = "a sample" if e.dt else "a second"
+    raise ModelCannotRun(
+        f"{e.name} does not rest at the operating point, where {found.state} changes by "
+        f"{found.rate:.4g} {per}, and the input {', '.join(f'{v:g}' for v in at.inputs)} has no "
+        "influence on that to first order, so that a linear model would have no gain. Give the "
+        "point where it rests: at=operating_point(plant, output=...)"
+    )
+
+
 def compute_state_matrices(
     equations: Equations, at: OperatingPoint, spread: float = 0.0
 ) -> tuple[Array, Array, Array, Array]:
@@ -450,6 +526,8 @@ def linearize(plant: Any, at: OperatingPoint, *, states: bool = False) -> Any:
     at = as_operating_point(at, equations, equations.inputs)
     if states or not equations.siso:
         return make_state_space(equations, at)
+    if len(at.states) == len(equations.states):
+        _refuse_dead_point(equations, at)
     (num,), den = to_polynomials(*_reduce_to_minimal(*compute_state_matrices(equations, at)))
     return ct.tf(num, den, equations.dt if equations.dt else 0, name=f"{equations.name}_linear",
                  inputs=list(equations.inputs), outputs=list(equations.outputs))  # fmt: skip
@@ -458,6 +536,8 @@ def linearize(plant: Any, at: OperatingPoint, *, states: bool = False) -> Any:
 def make_state_space(equations: Equations, at: OperatingPoint) -> Any:
     """Return the linear model of a plant at a point with all its states, and its names."""
     e = equations
+    if len(at.states) == len(e.states):
+        _refuse_dead_point(e, at)
     # python-control keeps dots for the names of systems.
     names = [name.replace(".", "_") for name in e.states]
     return ct.ss(*compute_state_matrices(e, at), e.dt if e.dt else 0, name=f"{e.name}_linear",
