@@ -323,9 +323,29 @@ def test_the_default_step_is_several_steps_of_the_encoder():
 # --- texts
 
 
+def test_an_analog_lead_in_place_of_a_program_is_said():
+    program = replace(LOOP, controller=ct.tf([-4000.0, 3000.0], [1.0, 0.0], DT))
+    found = cid.redesign(P, program, crossover=100, phase_margin=50)
+    text = str(found)
+    assert "/ (s + 274.748), an analog lead\n  The controller of the loop is a program" in text
+    assert "runs every 0.001 s, and this lead is an analog circuit" in text
+    # What it tells to do works.
+    sampled = cid.redesign(P, program, step=1e-5, design=lambda _: ct.sample_system(
+        found.controller, 0.001, "tustin"))  # fmt: skip
+    assert not sampled.loop.analog
+    (margin,) = sampled.achieved.margins
+    assert 40 < margin.phase_margin < 49
+    digital = cid.redesign(ct.sample_system(ct.ss(P), 0.001), program, 100, 50)
+    assert not digital.loop.analog
+    circuit = replace(LOOP, controller=found.controller)
+    for other in (digital, cid.redesign(P, LOOP, 100, 50), cid.redesign(P, circuit, 100, 50)):
+        assert "is a program" not in str(other)
+    assert ", a digital lead, 0.001 s\n" in str(digital)
+
+
 def test_the_report():
     text = str(cid.redesign(P, LOOP, crossover=100, phase_margin=50)).splitlines()
-    assert text[0] == "controller: (-4890.28 s - 177992) / (s + 274.748)"
+    assert text[0] == "controller: (-4890.28 s - 177992) / (s + 274.748), an analog lead"
     assert text[1].split() == ["promised", "achieved"]
     assert text[2].split() == ["phase", "margin", "[deg]", "50.00", "50.00"]
     assert [line.split("  ")[1] for line in text[2:9]] == [

@@ -77,7 +77,7 @@ class Redesign(Printed):
     Parameters
     ----------
     controller : control.TransferFunction
-        The lead compensator, in the time base of the model.
+        The lead compensator, in the time base of the model: analog on one in continuous time.
     promised, achieved : Performance
         On the model, and on the nonlinear physics of the loop.
     nu_gap : float
@@ -97,6 +97,8 @@ class Redesign(Printed):
         Why the physics was not kept stable, or empty.
     step_reason : str
         Why the step has this height where none was given and the output rests at zero, or empty.
+    hint : str
+        What to do with an analog lead where the controller before it was a program, or empty.
     """
 
     controller: Any
@@ -111,6 +113,7 @@ class Redesign(Printed):
     step: float
     failure: str = ""
     step_reason: str = ""
+    hint: str = ""
 
     def __post_init__(self) -> None:
         freeze_arrays(self)
@@ -207,7 +210,10 @@ class Redesign(Printed):
             + advise_step(self.loop)
             + f" {self.step_reason}".rstrip()
         )
-        return "\n".join([f"controller: ({num}) / ({den})", *rows, step, "  " + self.verdict])
+        kind = "an analog lead" if self.loop.analog else f"a digital lead, {self.loop.dt:g} s"
+        hints = [f"  {self.hint}"] if self.hint else []
+        head = f"controller: ({num}) / ({den}), {kind}"
+        return "\n".join([head, *hints, *rows, step, "  " + self.verdict])
 
 
 @overload
@@ -370,7 +376,21 @@ def redesign(
     unit = float(np.abs(G(omega)))
     return Redesign(C, promised, achieved, nu_gap(G / unit, P / unit),
                     robust_margin(G / unit, C * unit), trial, time, promised_step, achieved_step,
-                    height, "" if failure is None else failure, reason)  # fmt: skip
+                    height, "" if failure is None else failure, reason,
+                    _hint_at_sampling(loop, dt))  # fmt: skip
+
+
+def _hint_at_sampling(loop: Loop, dt: float) -> str:
+    """Say that the lead is a circuit where the controller of the loop is a program."""
+    if dt or loop.controller is None or loop.analog:
+        return ""
+    return (
+        "The controller of the loop is a program that runs every "
+        f"{loop.dt:g} s, and this lead is an analog circuit, because the model is in continuous "
+        "time. As a program it loses phase: sample it and try that, by redesign(G, loop, "
+        f'design=lambda P: ct.sample_system(outcome.controller, {loop.dt:g}, "tustin")), or design '
+        f"on the sampled model, redesign(ct.sample_system(ct.ss(G), {loop.dt:g}), loop, ...)."
+    )
 
 
 def _make_plain(G: Any) -> Any:
