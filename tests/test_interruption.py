@@ -22,7 +22,7 @@ from ctrlid._base.errors import CtrlidError
 from ctrlid._base.files import replace_file
 from ctrlid._base.interruption import Budget, Stopped, check_budget, keep_interrupt
 from ctrlid._base.jobs import run_side_by_side, share_out
-from ctrlid.diagnosis import growth
+from ctrlid.diagnosis import growth, procedure
 from ctrlid.diagnosis.noise_tests import run_noise_tests
 from ctrlid.diagnosis.progress import Progress
 from ctrlid.diagnosis.thresholds import vary_numbers
@@ -105,8 +105,8 @@ def test_what_was_found_before_the_end_is_kept(monkeypatch):
     budgets = []
     tell, make = Progress.tell, Progress.make_budget
 
-    def keep(self, seconds, samples):
-        budgets.append(make(self, seconds, samples))
+    def keep(self, *given):
+        budgets.append(make(self, *given))
         return budgets[-1]
 
     def stop(self, step, **options):
@@ -371,3 +371,29 @@ def test_no_round_has_a_number_that_goes_back(record, monkeypatch, capsys):
     assert numbers == sorted(set(numbers))
     assert "looking back from round 2" in heads
     assert [head for head in heads if head.startswith("second search, round ")]
+
+
+def test_what_comes_before_and_after_the_search_is_part_of_the_seconds(record, monkeypatch):
+    """A budget of 60 s took 66: its clock began late, and the end was not counted in."""
+    budgets, make, choose = [], Progress.make_budget, procedure.choose_fresh_data
+
+    def keep(self, *given):
+        budgets.append(make(self, *given))
+        return budgets[-1]
+
+    def choose_slowly(*given):
+        time.sleep(0.5)
+        return choose(*given)
+
+    monkeypatch.setattr(Progress, "make_budget", keep)
+    monkeypatch.setattr(procedure, "choose_fresh_data", choose_slowly)
+    begun = time.monotonic()
+    cid.diagnose(drive(), record, catalogue=(E.InputOffset,), seconds=600, progress=False)
+    (budget,) = budgets
+    assert budget.start == pytest.approx(begun, abs=0.2)
+    assert 0.5 < budget.kept < time.monotonic() - begun
+    budget = Budget(100.0)
+    budget.keep_back(10.0)
+    assert budget.left == pytest.approx(90.0, abs=0.5)
+    budget.keep_back(90.0)
+    assert budget.left == pytest.approx(75.0, abs=0.5)

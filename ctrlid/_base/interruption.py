@@ -14,6 +14,9 @@ from typing import Any
 
 from .errors import CtrlidError
 
+# Of a budget at most this share is kept for what has to be done after a search.
+MOST_KEPT = 0.25
+
 
 class Stopped(Exception):
     """The budget of a search is spent.
@@ -45,6 +48,7 @@ class Budget:
     outer: "Budget | None" = field(default_factory=lambda: find_budget())
     _stop: threading.Event = field(default_factory=threading.Event)
     _spent: list[int] = field(default_factory=lambda: [0])
+    _kept: list[float] = field(default_factory=lambda: [0.0])
     _lock: Any = field(default_factory=threading.Lock)
 
     def spend(self, samples: int) -> None:
@@ -65,6 +69,15 @@ class Budget:
         around = math.inf if self.outer is None else self.outer.left_samples
         return min(around, self.samples - self.spent)
 
+    def keep_back(self, seconds: float) -> None:
+        """Keep seconds for what has to be done after the search, a quarter of all at most."""
+        self._kept[0] = min(seconds, MOST_KEPT * self.seconds)
+
+    @property
+    def kept(self) -> float:
+        """Seconds that the search leaves for what comes after it [s]."""
+        return self._kept[0]
+
     def stop(self) -> None:
         """Ask the search to end at its next step."""
         self._stop.set()
@@ -80,7 +93,8 @@ class Budget:
         if self.asked or self.left_samples < 0:
             return 0.0
         around = math.inf if self.outer is None else self.outer.left
-        return max(0.0, min(around, self.start + self.seconds - time.monotonic()))
+        end = self.start + self.seconds - self.kept
+        return max(0.0, min(around, end - time.monotonic()))
 
     @contextmanager
     def running(self, binding: bool = True) -> Iterator[None]:

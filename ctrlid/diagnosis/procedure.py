@@ -152,10 +152,10 @@ def diagnose(
         Candidates that are tried at the same time, each in a process of its own, through joblib;
         by default one, or what ``joblib.parallel_config`` says.
     seconds : float, optional
-        After so many seconds the search ends with its best answer so far, and the verdict says that
-        it was not finished [s]. The model is recalibrated and the gap measured in any case. By
-        default the search ends at the same place on every machine: after so much work that it
-        takes some minutes on two processors, and mostly long before.
+        After so many seconds, less what the end needs, the search ends with its best answer so far,
+        and the verdict says that it was not finished [s]. The model is recalibrated and the gap
+        measured in any case. By default the search ends at the same place on every machine: after
+        so much work that it takes some minutes on two processors, and mostly long before.
     progress : bool, optional
         Whether to show on stderr what is done: in a terminal as a bar, elsewhere a line a round.
 
@@ -189,7 +189,7 @@ def diagnose(
     ('explained', 'CoulombFriction')
     """
     check_arguments(diagnose, locals(), "record", "catalogue", "validation", "jobs", "seconds")
-    started = time.perf_counter()
+    started = time.monotonic()
     catalogue = CATALOGUE if catalogue is None else catalogue
     check_catalogue(catalogue)
     loop, record = order_model_and_data(loop, record)
@@ -206,7 +206,7 @@ def diagnose(
     shown = Progress(progress)
     # The clock decides only where it was asked to.
     samples = THRESHOLD.search_samples if seconds is None else math.inf
-    budget = shown.make_budget(check_seconds(seconds), samples)
+    budget = shown.make_budget(check_seconds(seconds), samples, started)
 
     def work(function: Callable[..., Any], items: Iterable[Any]) -> list[Any]:
         given, results = list(items), []
@@ -234,7 +234,7 @@ def diagnose(
     if shown.ended:
         result = declare_unfinished(result, shown.ended, shown.spent)
     return replace(result, audit=(*remarks, *result.audit), record=name_records(records),
-                   seconds=time.perf_counter() - started)  # fmt: skip
+                   seconds=time.monotonic() - started)  # fmt: skip
 
 
 def _answer_question(q: Question) -> tuple[Diagnosis, Search]:
@@ -244,6 +244,10 @@ def _answer_question(q: Question) -> tuple[Diagnosis, Search]:
     # Step 2: a wrong value of a parameter is no missing effect.
     q.tell("recalibrating")
     base = recalibrate(readout.loop, readout.records, q.audits)
+    # The gap and the tests at the end take about as long as what was done so far. Records that are
+    # diagnosed one by one afterwards begin late, and keep what was kept.
+    if not q.budget.kept:
+        q.budget.keep_back(time.monotonic() - q.budget.start)
     # Steps 3 to 7: effects are screened, refitted, decided upon, added and dropped.
     is_larger = make_size_test(q.fresh)
     with q.budget.running():

@@ -124,9 +124,9 @@ class Progress:
             words += f"; {self.describe_leader()}"
         return words
 
-    def make_budget(self, seconds: float, samples: float) -> Budget:
-        """Return a budget of seconds and of samples that keeps the bar moving."""
-        self.budget = Budget(seconds, self.beat, samples)
+    def make_budget(self, seconds: float, samples: float, started: float) -> Budget:
+        """Return a budget of samples, and of seconds since a start, that keeps the bar moving."""
+        self.budget = Budget(seconds, self.beat, samples, started)
         return self.budget
 
     def end(self) -> None:
