@@ -220,3 +220,25 @@ def test_the_notebook_runs_from_top_to_bottom(notebook, monkeypatch, tmp_path):
     assert any("one-step prediction" in page for page in pages)
     assert len(pictures) == 2
     assert np.all([len(out.data["image/png"]) > 10_000 for out in pictures])
+
+
+def test_the_progress_of_a_diagnosis_is_one_line_that_is_redrawn(monkeypatch, tmp_path):
+    """It was a line a round, as for a file."""
+    rig = (
+        "import ctrlid as cid\n"
+        "plant = cid.plants.servo(m=1.0, c=2.0, k=3.0)\n"
+        "loop = cid.Loop(plant, cid.PID(kp=20.0, kd=1.0), dt=0.01, free=('k',))\n"
+        "r = cid.random_binary(600, amplitude=0.1, hold=50, seed=1)\n"
+        "record = cid.simulate(loop, r, sensor_noise=1e-3, seed=2)\n"
+        "few = [cid.effects.InputOffset]\n"
+    )
+    _, shown, silent = run_cells(
+        monkeypatch, tmp_path, rig, "found = cid.diagnose(loop, record, catalogue=few)",
+        "found = cid.diagnose(loop, record, catalogue=few, progress=False)",
+    )  # fmt: skip
+    text = "".join(out.text for out in shown)
+    frames = text.split("\r")
+    assert any("round 1: screening" in frame for frame in frames)
+    assert "\n" not in text
+    assert frames[-1].strip() == ""
+    assert silent == []

@@ -157,7 +157,8 @@ def diagnose(
         measured in any case. By default the search ends at the same place on every machine: after
         so much work that it takes some minutes on two processors, and mostly long before.
     progress : bool, optional
-        Whether to show on stderr what is done: in a terminal as a bar, elsewhere a line a round.
+        Whether to show on stderr what is done: in a terminal or notebook as a bar, elsewhere a
+        line a round.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""What a diagnosis tells while it works: a bar in a terminal, a line a round elsewhere."""
+"""What a diagnosis tells while it works: a bar in terminal or notebook, else a line a round."""
 
 import math
 import sys
@@ -19,6 +19,15 @@ BAR = "{desc} |{bar:20}| {n_fmt}/{total_fmt}{postfix}"
 PLAIN = "{desc}{postfix}"
 
 
+def _runs_in_notebook() -> bool:
+    """Whether a kernel shows what is written, whose front end redraws a line after a return.
+
+    A kernel has IPython loaded, so that nothing is imported here.
+    """
+    shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
+    return getattr(shell, "kernel", None) is not None
+
+
 class Progress:
     """What a diagnosis is doing, how much of it is done, what leads, and how long it may take.
 
@@ -36,7 +45,7 @@ class Progress:
         # Where the search was stopped and after what; empty if it was not.
         self.ended = self.spent = ""
         self.budget: Budget | None = None
-        terminal = sys.stderr.isatty()
+        terminal = sys.stderr.isatty() or _runs_in_notebook()
         self.lines = shown and not terminal
         self.bar = tqdm(total=0, disable=not (shown and terminal), leave=False, bar_format=BAR)
 
