@@ -144,6 +144,7 @@ def test_dt_without_a_time_column_and_a_valid_column(tmp_path):
          "does not increase: 2 s in row 2 of the data is followed by 1 s. Sort the rows"),
         ("t,u,y\n0,1,2\n0,3,4\n1,3,4\n", {}, "does not increase: 0 s in row 1"),
         ("t,u,y\n0,1,2\n1,3,4\n2,5,6\n", {"dt": 0.001}, "steps by 1 s, but dt is 0.001 s"),
+        ("t,u,y\n0,1,2\n1,3,4\n2,5,6\n", {"dt": 5e-324}, "steps by 1 s, but dt is 4.94"),
         ('# ctrlid {"dt": \nt,u,y\n0,1,2\n', {}, "is damaged: .*. Restore or remove it"),
     ],
 )  # fmt: skip

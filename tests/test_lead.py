@@ -339,6 +339,7 @@ P = ct.tf([1], [1, 0, 0])
     [
         (lambda: cid.design_lead(P, 0, 45), "crossover is 0 rad/s; needed is a frequency above 0"),
         (lambda: cid.design_lead(P, -3, 45), "crossover is -3 rad/s"),
+        (lambda: cid.design_lead(ct.tf(1, [1, -1.1], 0.1), 5e-324, 45), "a frequency above 0"),
         (lambda: cid.design_lead(P, np.nan, 45), "crossover is nan; needed is one finite number"),
         (lambda: cid.design_lead(P, [1, 2], 45), r"crossover is \[1, 2\]; needed is one finite"),
         (lambda: cid.design_lead(P, 1, "big"), "phase_margin is 'big'"),

@@ -505,7 +505,8 @@ def _find_even_period(stamps: Any, rounding: float, dt: float | None) -> float |
     if not rounding <= mean or base <= 0:
         return None
     # Steps of 1, 1 and 2 units may also be lost samples, unless there are many, evenly spread.
-    longer = np.round(steps / base)
+    with np.errstate(over="ignore"):  # A period far below the steps is refused by them below.
+        longer = np.round(steps / base)
     if np.all(np.abs(steps - longer * base) <= finest) and (
         dt is not None or np.count_nonzero(longer > 1) < 5
     ):

@@ -170,7 +170,7 @@ def design_lead(P: Any, crossover: float, phase_margin: float) -> Any:
     plant = to_rational(P, "P")
     crossover = _check_number(crossover, "crossover", "rad/s")
     phase_margin = _check_number(phase_margin, "phase_margin", "degrees")
-    if not 0 < crossover < FASTEST:
+    if not 1 / FASTEST < crossover < FASTEST:
         raise CtrlidError(f"crossover is {crossover:g} rad/s; needed is a frequency above 0, not "
                           "too far from the poles of P.")  # fmt: skip
     if crossover >= plant.nyquist * (1 - 1e-9):
