@@ -256,6 +256,15 @@ def legend(ax):
     return [text.get_text() for text in ax.get_legend().get_texts()]
 
 
+def diagnose_draw(name, seed, catalogue):
+    """Return a draw of the frozen study, and its diagnosis with few effects."""
+    study = load_script("benchmarks", "study_frozen")
+    case = study.cases.draw_case(name, seed)
+    record = cid.Record(r=case.r, u=case.u, y=case.y, dt=case.rig.dt)
+    loop = study.make_loop(case.rig)
+    return case, cid.diagnose(loop, record, catalogue=catalogue, progress=False)
+
+
 def load_script(folder, name):
     """Import a file of ``benchmarks`` or ``examples``, which finds its neighbours as a script."""
     place = str(ROOT / folder)

@@ -26,7 +26,7 @@ from ctrlid.diagnosis.gap import (
 from ctrlid.diagnosis.wording import describe_trivial, list_gap_rows
 from ctrlid.estimation.likelihood.prediction import predict_from, predict_spread
 from ctrlid.validation.reproduction import CLOSED_LOOP, Reproduction
-from problems import load_script
+from problems import diagnose_draw
 from test_wiring import CART, DT, at_rest, luenberger
 
 NOTHING = Disturbance(0.0, 0.0, np.nan, 0.0)
@@ -292,11 +292,8 @@ def test_the_time_of_a_force_runs_on_through_a_gap_of_the_log():
 
 def test_a_right_name_whose_simulation_diverges_stays():
     """A cubic force pushes a pendulum over: noise alone takes its simulation out of the record."""
-    study = load_script("benchmarks", "study_frozen")
-    case = study.cases.draw_case("one", 80060)
-    record = cid.Record(r=case.r, u=case.u, y=case.y, dt=case.rig.dt)
     few = [cid.effects.CubicStiffness, cid.effects.CoulombFriction]
-    found = cid.diagnose(study.make_loop(case.rig), record, catalogue=few, progress=False)
+    case, found = diagnose_draw("one", 80060, few)
     assert case.hidden == ("CubicStiffness",)
     assert [one.name for one in found.findings] == ["CubicStiffness"]
     k3, error = found.findings[0].effect.k3, found.findings[0].standard_errors["k3"]

@@ -16,7 +16,7 @@ from ctrlid.estimation.likelihood.kalman_filter import Noise, compute_memory
 from ctrlid.estimation.likelihood.likelihood import make_problem
 from ctrlid.estimation.likelihood.maximization import begin_fit, choose_sensor_noise, maximize
 from ctrlid.estimation.likelihood.noise_fit import fit_noise
-from problems import load_script
+from problems import diagnose_draw
 
 
 def simulate_servo(r, noise, dt=0.01, kp=20.0, kd=1.0, filter_time=0.02, dead_zone=0.0):
@@ -139,11 +139,8 @@ def test_holding_the_colour_fits_the_force_alone():
 
 def test_a_line_beside_averaged_noise_is_named():
     """A resonance of the noise model takes a strong line nearly for itself."""
-    study = load_script("benchmarks", "study_frozen")
-    case = study.cases.draw_case("one", 80031)
-    record = cid.Record(r=case.r, u=case.u, y=case.y, dt=case.rig.dt)
     few = [cid.effects.SensorHum, cid.effects.SensorLag]
-    found = cid.diagnose(study.make_loop(case.rig), record, catalogue=few, progress=False)
+    case, found = diagnose_draw("one", 80031, few)
     assert case.hidden == ("SensorHum",)
     assert found.verdict == "explained"
     (one,) = found.findings

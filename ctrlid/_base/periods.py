@@ -20,6 +20,17 @@ def have_same_period(first: float, second: float) -> bool:
     return abs(first - second) <= SAME * max(abs(first), abs(second))
 
 
+def differ_by_thousand(first: float, second: float) -> bool:
+    """Whether one of two periods is in milliseconds where the other is in seconds.
+
+    Examples
+    --------
+    >>> differ_by_thousand(0.005, 5.0), differ_by_thousand(0.005, 0.05)
+    (True, False)
+    """
+    return abs(max(first, second) / min(first, second) / THOUSAND - 1) < NEARLY
+
+
 def write_both_periods(one: str, first: float, other: str, second: float) -> str:
     """Return that two things run at periods that differ, with as many digits as tell them apart.
 
@@ -32,8 +43,7 @@ def write_both_periods(one: str, first: float, other: str, second: float) -> str
     milliseconds were probably taken for seconds)
     """
     both = f"{one} at {first:.10g} s, {other} at {second:.10g} s"
-    ratio = max(first, second) / min(first, second)
-    if abs(ratio / THOUSAND - 1) < NEARLY:
+    if differ_by_thousand(first, second):
         both += (
             f" ({max(first, second):.10g} s is a thousand times as much, so that milliseconds were "
             "probably taken for seconds)"

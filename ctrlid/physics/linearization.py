@@ -414,7 +414,9 @@ def find_unbalanced_rate(equations: Equations, at: OperatingPoint) -> Imbalance 
 
 def _refuse_dead_point(equations: Equations, at: OperatingPoint) -> None:
     """Refuse a point that is no equilibrium, and at which the input cannot balance the plant."""
-    found = find_unbalanced_rate(equations, at)
+    # A point with other states than the plant's is refused where the matrices are computed.
+    known = len(at.states) == len(equations.states)
+    found = find_unbalanced_rate(equations, at) if known else None
     if found is None or found.steered or found.share < NOT_AT_ALL:
         return
     e = equations
@@ -526,8 +528,7 @@ def linearize(plant: Any, at: OperatingPoint, *, states: bool = False) -> Any:
     at = as_operating_point(at, equations, equations.inputs)
     if states or not equations.siso:
         return make_state_space(equations, at)
-    if len(at.states) == len(equations.states):
-        _refuse_dead_point(equations, at)
+    _refuse_dead_point(equations, at)
     (num,), den = to_polynomials(*_reduce_to_minimal(*compute_state_matrices(equations, at)))
     return ct.tf(num, den, equations.dt if equations.dt else 0, name=f"{equations.name}_linear",
                  inputs=list(equations.inputs), outputs=list(equations.outputs))  # fmt: skip
@@ -536,8 +537,7 @@ def linearize(plant: Any, at: OperatingPoint, *, states: bool = False) -> Any:
 def make_state_space(equations: Equations, at: OperatingPoint) -> Any:
     """Return the linear model of a plant at a point with all its states, and its names."""
     e = equations
-    if len(at.states) == len(e.states):
-        _refuse_dead_point(e, at)
+    _refuse_dead_point(e, at)
     # python-control keeps dots for the names of systems.
     names = [name.replace(".", "_") for name in e.states]
     return ct.ss(*compute_state_matrices(e, at), e.dt if e.dt else 0, name=f"{e.name}_linear",

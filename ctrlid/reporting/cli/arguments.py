@@ -17,7 +17,7 @@ import control as ct
 import numpy as np
 
 from ..._base.errors import CtrlidError
-from ..._base.periods import have_same_period, write_both_periods
+from ..._base.periods import differ_by_thousand, have_same_period, write_both_periods
 from ..._base.text import list_known
 from ...data.record import Record
 from ...loop.controllers import PID
@@ -59,7 +59,7 @@ def read_loop(args: argparse.Namespace, record: Record) -> Loop:
                               f"and controller: leave out {', '.join(clash)}")  # fmt: skip
         if not have_same_period(model.dt, record.dt):
             advice = "give both the same period"
-            if abs(1000 * model.dt - record.dt) < 0.01 * record.dt:
+            if model.dt < record.dt and differ_by_thousand(model.dt, record.dt):
                 advice = "if the times are in milliseconds, name their column t [ms]"
             both = write_both_periods(f"{args.model} is sampled", model.dt, "the record", record.dt)
             raise CtrlidError(f"{both}; {advice}")
