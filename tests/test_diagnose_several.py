@@ -10,8 +10,9 @@ from scipy import linalg, stats
 
 import ctrlid as cid
 from ctrlid.diagnosis.fitted_model import Model
-from ctrlid.diagnosis.records import read_steps
-from ctrlid.diagnosis.replicas import make_replica, with_rounding
+from ctrlid.diagnosis.gap import draw_noise
+from ctrlid.diagnosis.records import add_steps, read_steps
+from ctrlid.diagnosis.replicas import make_replica
 from ctrlid.estimation.likelihood.kalman_filter import Noise, run_filter
 from ctrlid.estimation.likelihood.likelihood import make_problem
 from ctrlid.estimation.likelihood.maximization import begin_fit
@@ -238,7 +239,8 @@ def test_the_steps_of_an_encoder_are_neither_finding_nor_alarm(on_encoder):
         everything = (*found.findings, *found.stand_ins)
         assert "Quantization" not in [f.name for f in everything]
         assert "Quantization" not in [type(c.effect).__name__ for c in found.ranking]
-        assert "Quantization" not in [type(effect).__name__ for effect in found.loop.effects]
+        # What is simulated with the completed loop has the steps of the record.
+        assert found.loop.labelled["Quantization"].step == pytest.approx(STEP)
 
 
 def test_friction_is_named_at_its_place_beside_an_encoder(on_encoder):
@@ -261,23 +263,21 @@ def test_the_steps_of_each_output_are_taken_off_its_noise():
     noise = Noise((1e2, 1e2), sensors=(75.0,))
     fit = replace(begin_fit(make_problem(loop, (), [record]), np.zeros(0), noise),
                   sensor=np.array([1e-8]))  # fmt: skip
-    model = Model(loop, fit)
     (read,) = read_steps(fit, [cid.audit(record, loop)])
     assert (read.effect.at, read.effect.step) == ("theta", pytest.approx(STEP))
-    rounding = with_rounding(model, [read])
-    left = rounding.fit.sensor[0] * rounding.fit.noise.sensors[0]
-    assert left == pytest.approx(1e-3 * 75e-8)
-    assert rounding.fit.sensor[0] == fit.sensor[0]
-    assert rounding.fit.noise.force == noise.force
-    copy = make_replica(rounding)
-    x, theta = copy.records[0].y
+    stepped = add_steps(loop, [read])
+    assert stepped.effects == (read.effect,)
+    assert add_steps(stepped, [read]) is stepped
+    fit = begin_fit(make_problem(stepped, (), [record]), np.zeros(0), noise)
+    # The reading of the angle errs no less than it is rounded.
+    assert fit.sensor[0] * 75 >= STEP**2 / 12 * (1 - 1e-12)
+    model = Model(stepped, replace(fit, sensor=np.array([STEP**2 / 12 / 75])))
+    x, theta = (np.std(v) for v in draw_noise(model.fit, float(model.fit.sensor[0]), 4000, 1)[0])
+    assert x == pytest.approx(STEP / math.sqrt(12 * 75), rel=0.05)
+    assert theta == pytest.approx(math.sqrt(1e-3 / 12) * STEP, rel=0.05)
+    x, theta = make_replica(model).records[0].y
     np.testing.assert_allclose(np.round(theta / STEP), theta / STEP, atol=1e-6)
     assert np.ptp(np.diff(np.unique(x))) > 0
-    coarser = replace(read, effect=cid.effects.Quantization(step=3e-4, at="x"))
-    both = with_rounding(model, [read, coarser])
-    assert both.fit.sensor[0] == pytest.approx(1e-8 - 3e-4**2 / 12)
-    assert both.fit.sensor[0] * both.fit.noise.sensors[0] == pytest.approx(left)
-    assert both.fit.sensor[0] * both.fit.noise.force[1] == pytest.approx(1e-6)
 
 
 def test_the_law_of_several_outputs_is_that_of_each():

@@ -32,7 +32,6 @@ FORMULAS = {
 }
 CONSTANTS = {
     ("procedure", "PROGRESS"),
-    ("records", "ROUNDING"),
     ("replicas", "SEEDS"),
     # Ratios of units, by which a log can be off.
     ("log_errors", "DEGREE"),

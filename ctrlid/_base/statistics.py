@@ -397,3 +397,8 @@ def sum_with_correlations(g: Array) -> Array:
         both = g[lag:].T @ g[: len(g) - lag] * (1 - lag / (lags + 1))
         total = total + both + both.T
     return np.asarray(total)
+
+
+def rounding_variance(step: ArrayLike) -> Array:
+    r"""Return the variance that rounding to steps q adds, :math:`q^2 / 12`."""
+    return np.asarray(np.square(step) / 12, dtype=float)

@@ -10,14 +10,14 @@ from scipy import signal, stats
 
 from .._base.arrays import Array
 from .._base.errors import EffectDoesNotApply, ModelCannotRun
-from .._base.statistics import autocorrelation_time
+from .._base.statistics import autocorrelation_time, rounding_variance
 from ..data.record import Record
 from ..data.validity import find_whole_past
 from ..estimation.likelihood.kalman_filter import make_sensor_states
 from ..estimation.likelihood.likelihood import Fit
 from ..estimation.likelihood.prediction import predict_ahead, predict_from, predict_spread
 from ..estimation.likelihood.tails import JointTails, Tails
-from ..loop.loop import Loop
+from ..loop.loop import Loop, find_converter_steps
 from ..loop.simulation import Simulator
 from ..validation.record_simulation import find_long_stretches, prepare_stretch
 from ..validation.reproduction import Reproduction
@@ -444,7 +444,8 @@ def _simulate_noise(
 ) -> Array:
     """Return what noise leaves in a window, squared and summed over its samples, for each run.
 
-    Of several outputs, first by the output.
+    Of several outputs, first by the output. At least what the steps of a converter in the loop hide
+    of any difference, :math:`q^2 / 12`.
     """
     record = window.record
     size = np.count_nonzero(window.mask, axis=-1)
@@ -475,13 +476,18 @@ def _simulate_noise(
         count = count + use.sum(axis=-1)
     if not np.any(count):
         raise ModelCannotRun("no stretch is long enough to be simulated")
+    hidden = size * rounding_variance(find_converter_steps(loop))
     if np.ndim(size):
-        return np.asarray(squares * (size / np.maximum(count, 1))[:, None, None])
-    return np.asarray(squares * (size / count))
+        squares *= (size / np.maximum(count, 1))[:, None, None]
+        return np.asarray(np.maximum(squares, hidden[:, None, None]))
+    return np.asarray(np.maximum(squares * (size / count), hidden[0]))
 
 
 def draw_noise(fit: Fit, sensor: float, n: int, seed: int) -> list[Array]:
-    """Return sensor noise and force noise of a fit; `sensor` is the variance of the sensor's."""
+    """Return sensor noise and force noise of a fit; `sensor` is the variance of the sensor's.
+
+    What the steps of a converter in the loop add to the noise, its simulation adds by itself.
+    """
     if not fit.plant.e.siso:
         return _draw_several_noises(fit, sensor, n, seed)
     noise, streams = fit.noise, np.random.default_rng(seed).standard_normal((3, n))
@@ -500,15 +506,24 @@ def draw_noise(fit: Fit, sensor: float, n: int, seed: int) -> list[Array]:
         _, drive, _ = make_sensor_states(noise.ar, noise.ma)
         colour = [1.0, *noise.ma], [1.0, *(-v for v in noise.ar)]
         reading = drive[0] * signal.lfilter(*colour, reading)[n:]
-    return [reading * math.sqrt(sensor), force]
+    (beside,) = _list_noises_beside_steps(fit, sensor)
+    return [reading * math.sqrt(beside), force]
 
 
 def _draw_several_noises(fit: Fit, sensor: float, n: int, seed: int) -> list[Array]:
     """Return the noise of each sensor and of each force of a fit."""
-    sizes = [np.sqrt(sensor * np.array(v)) for v in ([1.0, *fit.noise.sensors], fit.noise.force)]
+    sizes = [np.sqrt(_list_noises_beside_steps(fit, sensor)),
+             np.sqrt(sensor * np.array(fit.noise.force))]  # fmt: skip
     streams = [np.random.default_rng([seed, k]).standard_normal((len(size), n))
                for k, size in enumerate(sizes)]  # fmt: skip
     if isinstance(fit.noise.tails, JointTails):
         for k, law in enumerate(fit.noise.tails.each):
             streams[0][k] = streams[0][k] if law is None else law.draw(streams[0][k], (seed, k))
     return [size[:, None] * s for size, s in zip(sizes, streams, strict=True)]
+
+
+def _list_noises_beside_steps(fit: Fit, sensor: float) -> Array:
+    """Return the variance of each sensor's noise without that of rounding, a trace at least."""
+    noises = sensor * np.array([1.0, *fit.noise.sensors])
+    rounding = fit.rounding or fit.problem.rounding
+    return np.maximum(noises - rounding, THRESHOLD.noise_beside_steps * noises)

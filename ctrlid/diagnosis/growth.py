@@ -13,6 +13,7 @@ from ..estimation.likelihood.kalman_filter import Noise
 from ..estimation.likelihood.likelihood import Fit
 from ..estimation.likelihood.maximization import choose_noise, maximize, refit_noise_size
 from ..estimation.likelihood.tails import JointTails
+from ..loop.loop import find_converter_steps
 from .candidates import Trial, Work, is_same_kind, list_missing_candidates
 from .fitted_model import (
     Model,
@@ -330,6 +331,8 @@ def retest_with_replicas(model: Model) -> NoiseTests:
     after = replace(run_noise_tests(model.fit), alpha=choose_alarm_level(len(model.loop.effects)))
     if not after.passed:
         copies = [make_replica(model, seed) for seed in (1, 2)]
+        if any(find_converter_steps(model.loop)):
+            copies.append(make_replica(model, noisy=False))
         after = forgive_filter(after, copies)
     return after
 

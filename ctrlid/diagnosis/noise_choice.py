@@ -17,12 +17,9 @@ from ..estimation.likelihood.noise_fit import (
     count_noise_parameters,
     measure_walk_gain,
 )
-from ..estimation.likelihood.tails import JointTails
-from ..validation.signal_defects import find_grid_step
 from .candidates import Trial
 from .fitted_model import Model, with_linearization
 from .noise_tests import run_noise_tests
-from .records import ROUNDING
 from .thresholds import THRESHOLD
 
 
@@ -36,7 +33,7 @@ def prefer_sensor_noise(
     than the error that it explains.
     """
     fit = model.fit
-    if fit.known is not None or not math.isfinite(fit.value):
+    if fit.known is not None or not math.isfinite(fit.value) or _rounds_most(fit):
         return None
     tests = run_noise_tests(fit)
     if tests.passed and not fit.noise.drift and best is None:
@@ -53,9 +50,7 @@ def prefer_sensor_noise(
         with contextlib.suppress(ModelCannotRun):
             tried.append(choose_sensor_noise(fit))
     if fit.noise.tails is None and tests.has_heavy_tails:
-        heavy = choose_tails(fit)
-        if not _errs_less_than_rounding(heavy):
-            tried.append(heavy)
+        tried.append(choose_tails(fit))
     other = max(tried, key=compute_noise_criterion, default=fit)
     gain = compute_noise_criterion(other) - compute_noise_criterion(fit)
     if not gain > more:
@@ -72,23 +67,10 @@ def prefer_sensor_noise(
     return with_linearization(Model(model.loop, other))
 
 
-def _errs_less_than_rounding(fit: Fit) -> bool:
-    r"""Whether the usual readings of a heavy-tailed sensor err less than its converter rounds.
-
-    Rounding to steps q adds a variance of :math:`q^2/12`. While a plant hardly moves it adds none,
-    and what it adds in motion looks like wild readings.
-    """
-    tails = fit.noise.tails
-    if tails is None:
-        return False
-    laws = tails.each if isinstance(tails, JointTails) else (tails,)
-    usual = float(np.mean(fit.sensor)) * np.array([1.0, *fit.noise.sensors])
-    records = [data.record for data in fit.data]
-    for k, law in enumerate(laws):
-        steps = [find_grid_step(np.atleast_2d(r.y)[k][r.valid_samples]) for r in records]
-        if law is not None and usual[k] < max(steps) ** 2 / ROUNDING:
-            return True
-    return False
+def _rounds_most(fit: Fit) -> bool:
+    """Whether most of a sensor's noise is the rounding of its converter, whose form is known."""
+    noises = float(np.mean(fit.sensor)) * np.array([1.0, *fit.noise.sensors])
+    return bool(np.any(fit.problem.rounding > 0.5 * noises))
 
 
 def _rings_on(fit: Fit) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -16,6 +17,7 @@ from .._base.rounding import keep_numpy_quiet
 from ..data.record import Record
 from ..data.several_records import as_records, order_model_and_data, require_valid_samples
 from ..effects import CATALOGUE, AbstractEffect
+from ..estimation.likelihood.likelihood import make_problem
 from ..loop.loop import Loop
 from ..loop.unit_check import refuse_unit_clashes
 from ..loop.wiring import match_signals
@@ -48,6 +50,7 @@ from .progress import Progress
 from .recalibration import recalibrate
 from .records import (
     Readout,
+    add_steps,
     look_over_records,
     make_loop,
     read_limits,
@@ -55,7 +58,7 @@ from .records import (
     with_units_of,
 )
 from .removal import Weighed
-from .replicas import forgive_rounding
+from .replicas import measure_rounding
 from .result import Diagnosis
 from .several_records import merge_diagnoses
 from .thresholds import THRESHOLD
@@ -245,6 +248,9 @@ def _answer_question(q: Question) -> tuple[Diagnosis, Search]:
     # Step 2: a wrong value of a parameter is no missing effect.
     q.tell("recalibrating")
     base = recalibrate(readout.loop, readout.records, q.audits)
+    stepped = _add_steps(q, base)
+    if stepped is not None:
+        return _answer_question(stepped)
     # The gap and the tests at the end take about as long as what was done so far. Records that are
     # diagnosed one by one afterwards begin late, and keep what was kept.
     if not q.budget.kept:
@@ -253,10 +259,16 @@ def _answer_question(q: Question) -> tuple[Diagnosis, Search]:
     is_larger = make_size_test(q.fresh)
     with q.budget.running():
         search = search_effects(base, q.catalogue, q.work, q.tell, is_larger)
+    if search.finished and not search.after.passed:
+        # Beside what the effects explained, the steps of a converter may be all that is left.
+        stepped = _add_steps(q, search.final)
+        if stepped is not None:
+            return _answer_question(stepped)
     if search.finished:
         search = refuse_false_noise(search, is_larger)
     else:
         q.end()
+    search = replace(search, final=measure_rounding(search.final))
     fresh = lengthen_horizon(q.loop, search, q.fresh)
     q = replace(q, fresh=fresh.weigh_outputs(search.final))
     helps = make_fresh_data_test(q.fresh)
@@ -280,11 +292,7 @@ def _answer_question(q: Question) -> tuple[Diagnosis, Search]:
         # Perhaps neither search explains the record; fresh data tell which of them leads further.
         q.tell("second search")
         search = q.attempt(lambda: _search_again(q, base, search, helps, is_larger), search)
-    # Step 3 again: what is left is tested with the steps of the converter in the replicas.
     q.tell("comparing on fresh data")
-    steps = read_steps(search.final.fit, q.audits)
-    if steps and search.finished and not search.after.passed:
-        search = replace(search, after=forgive_rounding(search.after, search.final, steps))
     # Step 8: what else would do in the place of each effect.
     if search.finished:
         q.tell("comparing names")
@@ -298,7 +306,7 @@ def _answer_question(q: Question) -> tuple[Diagnosis, Search]:
         search, summary = take_back_widening(q.loop, search, summary, q.fresh)
     # Step 10: the decision table.
     q.tell("writing the report")
-    read = (*readout.found, *steps)
+    read = (*readout.found, *read_steps(search.final.fit, q.audits))
     result = assemble_answer(q.loop, q.records, search, summary, read)
     if fresh.how != simulated:
         result = replace(result, notes=(*result.notes, DIVERGES.format(simulated)))
@@ -311,6 +319,20 @@ def _answer_question(q: Question) -> tuple[Diagnosis, Search]:
         other = q.attempt(lambda: _answer_by_simulation(q, search, summary.gap, read), None)
         return other or (result, search)
     return result, search
+
+
+def _add_steps(q: Question, model: Model) -> Question | None:
+    """Return what is asked of a loop with the steps that make a good part of a model's noise.
+
+    None where the loop has them, and where too few readings differ for a fit.
+    """
+    loop = add_steps(q.loop, read_steps(model.fit, q.audits))
+    if loop is q.loop:
+        return None
+    with contextlib.suppress(ModelCannotRun):
+        make_problem(loop, model.names, q.records)
+        return replace(q, loop=loop)
+    return None
 
 
 def _search_again(

@@ -11,19 +11,19 @@ import numpy as np
 from .._base.arguments import point_at_part
 from .._base.errors import CtrlidError
 from .._base.signals import require_one_signal
+from .._base.statistics import rounding_variance
 from .._base.text import write_list
 from ..data.record import Record
 from ..effects import AbstractEffect, InputDelay, InputOffset, Quantization, SensorSaturation
 from ..estimation.identified_model import read_delay
 from ..estimation.likelihood.likelihood import Fit
-from ..loop.loop import Loop
+from ..loop.loop import Loop, find_converter_steps
 from ..loop.unit_check import list_recorded_units
 from ..physics.conversions import to_transfer_function
 from ..physics.linearization import OperatingPoint
 from ..validation.record_audit import Audit, AuditFinding, audit
 from .thresholds import THRESHOLD
 
-ROUNDING = 12  # Rounding to steps q adds a variance of q^2 / 12.
 HOPELESS = ("too few samples", "constant signal", "operating point", "sampled")
 
 
@@ -192,10 +192,23 @@ def read_steps(fit: Fit, audits: Sequence[Audit]) -> tuple[Readout, ...]:
         key, at = ("y", "") if e.siso else (name, name)
         step = max((float(a.quantum.get(key, 0.0)) for a in audits), default=0.0)
         noise = float(np.mean(fit.sensor)) * (1.0, *fit.noise.sensors)[k]
-        share = step**2 / ROUNDING / noise if noise > 0 else 0.0
+        share = float(rounding_variance(step)) / noise if noise > 0 else 0.0
         if share < THRESHOLD.coarse_steps:
             continue
         size = fit.size if e.siso else sum(int(keep[:, k].sum()) for keep in fit.counts)
         gain = -0.5 * size * math.log(max(1 - share, THRESHOLD.noise_beside_steps))
         found.append(Readout(Quantization(step, at=at), gain, {"step": 0.0}))
     return tuple(found)
+
+
+def add_steps(loop: Loop, steps: Sequence[Readout]) -> Loop:
+    """Return the loop with the steps of the converters that it does not have yet.
+
+    Then of equal readings in a row one counts, and what is simulated has the steps as well.
+    """
+    known = dict(zip(loop.signals["y"], find_converter_steps(loop), strict=True))
+    first = loop.signals["y"][0]
+    for one in steps:
+        if not known[one.effect.at or first]:
+            loop = loop.with_effect(one.effect)
+    return loop

@@ -10,16 +10,17 @@ import numpy as np
 
 from .._base.arrays import Array
 from .._base.errors import EffectDoesNotApply, ModelCannotRun
-from .._base.statistics import regress
+from .._base.statistics import regress, rounding_variance
 from ..data.record import Record
 from ..data.validity import find_whole_past
+from ..estimation.likelihood.filter_data import FilterData
 from ..estimation.likelihood.likelihood import (
     evaluate_likelihood,
     make_problem,
     rank_by_likelihood,
 )
 from ..estimation.likelihood.maximization import begin_fit, maximize
-from ..loop.loop import Loop
+from ..loop.loop import Loop, find_converter_steps
 from ..loop.period_map import comes_to_rest
 from ..validation.record_simulation import find_long_stretches, prepare_stretch
 from ..validation.reproduction import choose_reproduction
@@ -27,7 +28,6 @@ from .candidates import Trial
 from .fitted_model import Model, can_simulate, carry_over_fit
 from .gap import draw_noise, make_simulator
 from .noise_tests import NoiseTests, run_noise_tests
-from .records import ROUNDING, Readout
 from .refitting import refit_candidate
 from .screening import screen_at
 from .thresholds import THRESHOLD
@@ -36,7 +36,7 @@ from .thresholds import THRESHOLD
 SEEDS = 101
 
 
-def make_replica(model: Model, seed: int = 0) -> Model | None:
+def make_replica(model: Model, seed: int = 0, noisy: bool = True) -> Model | None:
     """Simulate the records with a fitted model and its noise, and fit the model to them.
 
     Parameters
@@ -46,6 +46,8 @@ def make_replica(model: Model, seed: int = 0) -> Model | None:
         record stands in for that.
     seed : int, optional
         Seed of the noise.
+    noisy : bool, optional
+        Whether there is noise beside the steps of converters in the loop.
 
     Returns
     -------
@@ -56,13 +58,19 @@ def make_replica(model: Model, seed: int = 0) -> Model | None:
     try:
         start_times = [float(data.t[0]) for data in fit.data]
         records = [
-            _simulate_record(model, record, start_time, float(r), seed + SEEDS * k)
+            _simulate_record(
+                model, record, start_time, float(r) if noisy else 0.0, seed + SEEDS * k
+            )
             for k, (record, start_time, r) in enumerate(
                 zip(model.records, start_times, fit.sensor, strict=True)
             )
         ]
         problem = make_problem(loop, model.names, records, start_times)
-        problem = replace(problem, counts=fit.counts, known=fit.known)
+        counts = fit.counts
+        if any(find_converter_steps(loop)):
+            # Other readings are equal, so that other ones count.
+            counts = tuple(map(_count_after_start, problem.data, fit.counts))
+        problem = replace(problem, counts=counts, known=fit.known)
         # With other noise a loop may take another path, so the old one and a new guess are tried.
         along = evaluate_likelihood(problem, fit.theta, fit.noise, fit.trajectories)
         starts = along, begin_fit(problem, fit.theta, fit.noise)
@@ -72,6 +80,12 @@ def make_replica(model: Model, seed: int = 0) -> Model | None:
     except (ModelCannotRun, EffectDoesNotApply):
         return None
     return Model(loop, again) if math.isfinite(again.value) else None
+
+
+def _count_after_start(data: FilterData, counted: Any) -> Any:
+    """Return the usable readings from the first one on that counted in another record."""
+    begun = np.maximum.accumulate(counted, axis=0)
+    return data.usable & begun
 
 
 def _simulate_record(
@@ -89,6 +103,27 @@ def _simulate_record(
         noise = draw_noise(model.fit, sensor, stretch.d.shape[-1], seed + part.start)
         y[..., part], u[..., part] = stretch.run(simulator, noise)
     return replace(record, y=y, u=u)
+
+
+def measure_rounding(model: Model) -> Model:
+    r"""Return the model with the variance that the steps of its converters add to its noise.
+
+    Rounding adds :math:`q^2 / 12` in motion. A controller that works against a reading between
+    two steps keeps it there, where rounding adds three times as much. A record simulated without
+    any other noise tells how much it is.
+
+    References
+    ----------
+    Gouriéroux, Monfort and Renault, Journal of Applied Econometrics 8 (1993) S85-S118 (indirect
+    inference).
+    """
+    steps = find_converter_steps(model.loop)
+    bare = make_replica(model, noisy=False) if any(steps) else None
+    if bare is None:
+        return model
+    seen = float(np.mean(bare.fit.sensor)) * np.array([1.0, *bare.fit.noise.sensors])
+    added = np.maximum(np.where(steps, seen, 0.0), rounding_variance(steps))
+    return replace(model, fit=replace(model.fit, rounding=tuple(added.tolist())))
 
 
 def has_kinks(model: Model) -> bool:
@@ -275,34 +310,3 @@ def _design_normalized_controller(model: Any, dt: float, u: Array, y: Array) -> 
     through = a @ gain
     matrix = a - b @ feedback - through @ c
     return ct.ss(matrix, through / y, feedback * u[:, None], 0, plant.dt)
-
-
-def forgive_rounding(tests: NoiseTests, model: Model, steps: Sequence[Readout]) -> NoiseTests:
-    """Return the tests without alarms that rounding sensors raise on replicas as well."""
-    rounding = with_rounding(model, steps)
-    return forgive_filter(tests, [make_replica(rounding, seed) for seed in (1, 2)])
-
-
-def with_rounding(model: Model, coarse: Sequence[Readout]) -> Model:
-    """Return the model with rounding sensors, whose steps are then no part of their noise.
-
-    Rounding is no white noise: a record simulated with it says what it does to the tests.
-    """
-    fit, loop, outputs = model.fit, model.loop, model.plant.e.outputs
-    steps = dict.fromkeys(outputs, 0.0)
-    for one in coarse:
-        steps[one.effect.at or outputs[0]] = one.effect.values()["step"]
-        loop = loop.with_effect(one.effect)
-    first, *others = (
-        np.maximum(v - step**2 / ROUNDING, THRESHOLD.noise_beside_steps * v)
-        for v, step in zip(
-            [fit.sensor, *(fit.sensor * size for size in fit.noise.sensors)], steps.values(),
-            strict=True,
-        )
-    )  # fmt: skip
-    # All noises are told in units of that of the first sensor.
-    sensors = tuple(float(np.mean(v) / np.mean(first)) for v in others)
-    ratio = float(np.mean(fit.sensor) / np.mean(first))
-    force = tuple(v * ratio for v in fit.noise.force)
-    noise = replace(fit.noise, sensors=sensors, force=force, drift=fit.noise.drift * ratio)
-    return Model(loop, replace(fit, sensor=first, noise=noise))

@@ -15,6 +15,7 @@ from ..physics.linearization import compute_state_matrices
 from .base import AbstractEffect
 from .catalogue import CATALOGUE
 from .context import find_motion
+from .kinds import ReadingEffect
 from .law import PositionOffset
 from .time_varying import ParameterError
 
@@ -199,7 +200,7 @@ def _find_scaled(loop: Any, others: Sequence[AbstractEffect]) -> set[str]:
             changed = there.equations(keep=True)
         except EffectDoesNotApply:
             continue
-        if changed.delay is not None or changed.play is not None or changed.readout is not None:
+        if changed.delay is not None or changed.play is not None:
             continue
         unknown = [*own, f"{list(there.labelled)[-1]}.{key}"]
         if unknown[-1] in changed.parameters and _can_reproduce(changed, unknown, points, rates):
@@ -339,7 +340,7 @@ def _make_member(cls: type[AbstractEffect], loop: Any) -> AbstractEffect | None:
 
 def _compute_change(loop: Any, effect: AbstractEffect, size: float) -> Array | None:
     """Return how rates and output change at random points, None where the effect is not static."""
-    if effect.states or len(effect.values()) != 1:
+    if effect.states or len(effect.values()) != 1 or isinstance(effect, ReadingEffect):
         return None
     parameter = effect.parameters()[0]
     if parameter.neutral is None or not np.isfinite(parameter.neutral):
@@ -349,7 +350,7 @@ def _compute_change(loop: Any, effect: AbstractEffect, size: float) -> Array | N
     except EffectDoesNotApply:
         return None
     e = changed.equations(keep=True)
-    if e.delay is not None or e.play is not None or e.readout is not None:
+    if e.delay is not None or e.play is not None:
         return None
     return _evaluate_at_points(e, loop.point) - _evaluate_at_points(loop.equations(), loop.point)
 

@@ -23,7 +23,7 @@ from .._base.errors import CtrlidError, CtrlidWarning, EffectDoesNotApply
 from .._base.periods import have_same_period, write_both_periods
 from .._base.pickling import pack_by_value
 from .._base.text import list_known, write_count, write_percent
-from ..effects import AbstractEffect
+from ..effects import AbstractEffect, Quantization
 from ..effects.composition import compose_effects, label_effects
 from ..effects.context import find_position_unit
 from ..effects.python_control import as_system, linearize_with_effects
@@ -686,3 +686,17 @@ def _check_beliefs(free: Mapping[str, Any], parameters: Mapping[str, float]) -> 
             f'of what is believed relative to its value, such as {{"{name}": 0.1}} for 10 %; '
             f"{problem}"
         )
+
+
+def find_converter_steps(loop: Loop) -> tuple[float, ...]:
+    """Return the step in which each output is read [its unit], zero for one without `Quantization`.
+
+    Of several steps of one output the largest counts.
+    """
+    names = loop.signals["y"]
+    steps = dict.fromkeys(names, 0.0)
+    for effect in loop.effects:
+        if isinstance(effect, Quantization):
+            name = effect.at or names[0]
+            steps[name] = max(steps[name], effect.step)
+    return tuple(steps.values())

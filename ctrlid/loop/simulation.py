@@ -1,5 +1,6 @@
 """Simulating a loop: sampled or analog controller, held signals, noise, and failures in words."""
 
+import functools
 import math
 import warnings
 from collections.abc import Mapping, Sequence
@@ -15,6 +16,7 @@ from .._base.rounding import keep_numpy_quiet
 from .._base.text import write_list
 from ..data.reconstruction import PIECES, count_pieces, reconstruct_signal
 from ..data.record import Record
+from ..effects import Quantization
 from .loop import Loop
 from .period_map import (
     PeriodMap,
@@ -307,6 +309,17 @@ class Simulator:
         inputs = np.abs(loop.point.inputs)
         following = b[:, ahead].reshape(len(b), -1, len(inputs)).sum(axis=1)
         self._floor = 1e-6 * (a @ np.abs(self.rest) + (b[:, now] + following) @ inputs)
+
+    @functools.cached_property
+    def smooth(self) -> "Simulator":
+        """The same loop without the steps of converters, which hide every small change."""
+        loop = self.loop
+        for effect in self.loop.effects:
+            if isinstance(effect, Quantization):
+                loop = loop.without_effect(effect)
+        if loop is self.loop:
+            return self
+        return Simulator(loop, self.tolerance, self.most, self.hold, self.hold_r)
 
     def _measure_kinks(self, plain: PeriodMap) -> Array:
         """Return by how much kinks, such as dry friction, change the states in one period at most.

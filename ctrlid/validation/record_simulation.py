@@ -135,4 +135,5 @@ def prepare_stretch(
         initial[fitted : fitted + len(state)] = state
         d = part.u - replayed
     time = 0.0 if start_time is None else start_time + float(record.t[samples.start] - record.start)
-    return Stretch(find_initial_state(simulator, part, r, d, initial, fitted, time), r, d, time)
+    start = find_initial_state(simulator.smooth, part, r, d, initial, fitted, time)
+    return Stretch(start, r, d, time)

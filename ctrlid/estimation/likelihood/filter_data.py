@@ -9,11 +9,12 @@ import numpy as np
 from ..._base.arrays import Array
 from ..._base.errors import CtrlidError, ModelCannotRun
 from ..._base.periods import have_same_period, write_both_periods, write_difference
+from ..._base.text import write_count
 from ..._base.units import fill_unit
 from ...data.reconstruction import count_pieces, reconstruct_signal
 from ...data.record import Record
-from ...data.validity import find_runs
-from ...loop.loop import Loop
+from ...data.validity import find_equal_readings, find_runs
+from ...loop.loop import Loop, find_converter_steps
 from ...loop.wiring import knows_references, match_signals, stack_references
 from ...physics.equations import Equations
 from ...physics.linearization import compute_state_matrices
@@ -50,6 +51,9 @@ class FilterData:
         the first.
     scales : ndarray, shape (outputs,)
         The same for each of several outputs.
+    alike, counted : ndarray, shape (n,) or (n, outputs)
+        How many readings in a row err alike with each, and those that enter the likelihood, one of
+        each row.
     """
 
     record: Record
@@ -65,11 +69,13 @@ class FilterData:
     spread: Array
     scale: float
     scales: Array
+    alike: Array
+    counted: Any
 
     @property
     def usable(self) -> Any:
-        """Samples that are valid and no start."""
-        return self.valid & ~(self.restart if self.valid.ndim == 1 else self.restart[:, None])
+        """Readings that count and are no start."""
+        return self.counted & ~(self.restart if self.valid.ndim == 1 else self.restart[:, None])
 
 
 def make_filter_data(loop: Loop, record: Record, start_time: float = 0.0) -> FilterData:
@@ -124,6 +130,7 @@ def make_filter_data(loop: Loop, record: Record, start_time: float = 0.0) -> Fil
         spread,
         scale,
         np.array([scale]),
+        *(v[:, 0] for v in _find_runs_of_readings(loop, y[:, None], valid[:, None])),
     )
 
 
@@ -158,9 +165,29 @@ def _make_several(loop: Loop, record: Record, start_time: float) -> FilterData:
     path = u
     if count_pieces(record.hold) > 1:
         path = np.column_stack([reconstruct_signal(column) for column in u.T])
+    runs = _find_runs_of_readings(loop, y, valid)
     return FilterData(record, t, u, r, np.ascontiguousarray(y), path, valid,
                       find_segment_starts(loop, record), input_variance, start, spread,
-                      float(scales[0]), scales)  # fmt: skip
+                      float(scales[0]), scales, *runs)  # fmt: skip
+
+
+def _find_runs_of_readings(loop: Loop, y: Array, valid: Any) -> tuple[Array, Any]:
+    """Return how many readings err alike with each, and those that count; columns are outputs.
+
+    Equal readings in a row do, where the loop has the steps of a converter (`Quantization`).
+    """
+    alike, counted = np.ones(y.shape), valid.copy()
+    for k, step in enumerate(find_converter_steps(loop)):
+        if not step:
+            continue
+        alike[:, k], counted[:, k] = find_equal_readings(y[:, k], valid[:, k])
+        count = int(np.count_nonzero(counted[:, k]))
+        if count < FEWEST:
+            raise ModelCannotRun(
+                f"{loop.signals['y'][k]} changes its reading only {write_count(count - 1, 'time')}"
+                f", and equal readings in a row count once; a prediction needs {FEWEST} of them"
+            )
+    return alike, counted
 
 
 def find_noise_units(loop: Loop, record: Record) -> tuple[Any, Any]:

@@ -118,6 +118,7 @@ def run_filter(
     n, tails = plant.size, noise.tails
     out = filter_pass(*_arrange_pass(data, lin, noise, p))
     error, variance, before, after, wide, slopes, disturbance = out
+    variance = _count_alone(variance, data, noise)
     before, after, wide = before[:, :n], after[:, :n], wide[:, :n]
     counts = data.usable
     # The caller reports a filter that lost the record, so that no warning is needed here.
@@ -139,7 +140,8 @@ def predict_outputs(data: FilterData, lin: Linearized, noise: Noise) -> tuple[Ar
     for k in range(q):
         order = [k, *(i for i in range(q) if i != k)]
         turned = replace(lin, output=lin.output[:, order], c=lin.c[:, order], hp=lin.hp[:, order])
-        moved = replace(data, y=data.y[:, order], valid=data.valid[:, order])
+        moved = replace(data, y=data.y[:, order], valid=data.valid[:, order],
+                        alike=data.alike[:, order], counted=data.counted[:, order])  # fmt: skip
         tails = noise.tails.reorder(order) if isinstance(noise.tails, JointTails) else None
         own = replace(noise, sensors=(), tails=tails)
         out = _run_several(moved, turned, own, 0, scale[order])
@@ -161,7 +163,8 @@ def _run_several(
     scale, tails = np.sqrt([1.0, *noise.sensors] if sensors is None else sensors), noise.tails
     out = filter_pass(*_arrange_updates(data, lin, noise, p, scale))
     error, variance, before, after, wide, slopes, disturbance = out
-    error, variance = error.reshape(size, q) * scale, variance.reshape(size, q) * scale**2
+    variance = _count_alone(variance.reshape(size, q), data, noise)
+    error, variance = error.reshape(size, q) * scale, variance * scale**2
     # The caller reports a filter that lost the record, so that no warning is needed here.
     with np.errstate(all="ignore"):
         squares = (error**2 / variance)[data.usable]
@@ -169,6 +172,11 @@ def _run_several(
     trajectory = Trajectory(before[::q], after[q - 1 :: q], wide[q - 1 :: q] * sensor)
     return Filtered(error, variance, trajectory, slopes.reshape(size, q, p) * scale[:, None],
                     disturbance[q - 1 :: q])  # fmt: skip
+
+
+def _count_alone(variance: Array, data: FilterData, noise: Noise) -> Array:
+    """Return the variances of innovations of which each reading errs by itself."""
+    return variance - (data.alike - 1.0) if noise.sensor_is_white else variance
 
 
 class PassArguments(NamedTuple):
@@ -190,7 +198,7 @@ class PassArguments(NamedTuple):
     input_variance: Array
     start: Array
     spread: Array
-    sensor: float
+    sensor: Array
     tails: Any
     force: Array
     memory: float
@@ -217,7 +225,7 @@ def _arrange_pass(data: FilterData, lin: Linearized, noise: Noise, p: int) -> Pa
         lin.step, lin.a, lin.b, lin.du, np.ascontiguousarray(lin.dp[:, :, :p]), lin.output,
         lin.c, np.ascontiguousarray(lin.hp[:, :p]), lin.trajectory.predicted,
         lin.trajectory.filtered, data.y, data.valid, data.restart, lin.input_variance,
-        lin.start, lin.spread, 1.0 if white else 0.0, _list_tails(noise.tails),
+        lin.start, lin.spread, data.alike if white else np.zeros(size), _list_tails(noise.tails),
         force, noise.memory, noise.drift,
         *choose_sizes(states, states + bool(noise.drift > 0), size),
     )  # fmt: skip
@@ -240,8 +248,8 @@ def _arrange_updates(
         (lin.output / scale).ravel(), (lin.c / scale[:, None]).reshape(size * q, states),
         np.ascontiguousarray((lin.hp[:, :, :p] / scale[:, None]).reshape(size * q, p)),
         each.trajectory.predicted, each.trajectory.filtered, (data.y / scale).ravel(),
-        data.valid.ravel(), restart.ravel(), unsure.ravel(), lin.start, lin.spread, 1.0,
-        _list_tails(noise.tails), np.asarray(noise.force, dtype=float), memory,
+        data.valid.ravel(), restart.ravel(), unsure.ravel(), lin.start, lin.spread,
+        data.alike.ravel(), _list_tails(noise.tails), np.asarray(noise.force, dtype=float), memory,
         noise.coloured * (1 - memory**2),
         *choose_sizes(states, states + bool(noise.drift > 0), size * q),
     )  # fmt: skip
@@ -352,7 +360,8 @@ def choose_settled_samples(data: FilterData, out: Filtered) -> Any:
     if data.valid.ndim == 2:
         columns = [
             choose_settled_samples(
-                replace(data, valid=data.valid[:, k]), replace(out, variance=out.variance[:, k])
+                replace(data, valid=data.valid[:, k], counted=data.counted[:, k]),
+                replace(out, variance=out.variance[:, k]),
             )
             for k in range(data.valid.shape[1])
         ]

@@ -64,12 +64,11 @@ def filter_pass(
         Output at the nominal predicted state and its derivatives.
     predicted, filtered : ndarray, shape (N, n)
         Nominal trajectory before and after each measurement.
-    y, valid, restart, input_variance : ndarray, shape (N,)
-        Measured output; whether it counts; whether the filter starts anew; variance of the input.
+    y, valid, restart, input_variance, sensor : ndarray, shape (N,)
+        Measured output; whether it counts; whether the filter starts anew; variance of the input;
+        variance of the sensor noise.
     start, spread : ndarray, shapes (n,), (n, n)
         State and covariance at a start.
-    sensor : float
-        Variance of the sensor noise.
     tails : ndarray, shape (q, 4)
         Degrees of freedom, share and ratio of wild readings, and scale, as in `Tails`; all zero
         for Gaussian noise. Samples take the rows in turn.
@@ -119,7 +118,7 @@ def filter_pass(
             expected += c[k, i] * (x[i] - predicted[k, i])
         if coloured:
             row[n] = 0.0
-        s = sensor
+        s = sensor[k]
         for i in range(w):
             total = 0.0
             for j in range(n):
@@ -164,7 +163,7 @@ def filter_pass(
                 along[i] = total
             for i in range(w):
                 for j in range(i + 1):
-                    value = turned[i, j] + ((sensor + wild) * gain[i] - along[i]) * gain[j]
+                    value = turned[i, j] + ((sensor[k] + wild) * gain[i] - along[i]) * gain[j]
                     cov[i, j] = value
                     cov[j, i] = value
         for i in range(n):

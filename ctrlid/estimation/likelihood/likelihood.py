@@ -10,9 +10,9 @@ import numpy as np
 
 from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
-from ..._base.statistics import pseudo_inverse
+from ..._base.statistics import pseudo_inverse, rounding_variance
 from ...data.record import Record
-from ...loop.loop import Loop
+from ...loop.loop import Loop, find_converter_steps
 from .filter_data import FilterData, can_follow_controller, make_filter_data
 from .kalman_filter import Filtered, Noise, linearize_inside_domain, run_filter
 from .sampled_plant import Linearized, SampledPlant, Trajectory, make_sampled_plant
@@ -87,9 +87,22 @@ class Problem:
     periods: tuple[int, ...] = ()
     priors: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
+    def find_least_sensor(self, record: int, noise: Noise) -> float:
+        """Return the least variance of the first output's noise: no reading errs less than rounded.
+
+        Those of further outputs are told relative to it.
+        """
+        ratios = np.array([1.0, *noise.sensors])
+        return max(self.least_sensors[record], float(np.max(self.rounding / ratios)))
+
+    @functools.cached_property
+    def rounding(self) -> Array:
+        """The variance that converters of the loop add to the noise of each output."""
+        return rounding_variance(find_converter_steps(self.plant.loop))
+
     @functools.cached_property
     def least_sensors(self) -> list[float]:
-        """The least variance of the sensor noise of each record."""
+        """The least variance of the sensor noise of each record, for the sake of the arithmetic."""
         found = []
         for data, keep in zip(self.data, self.counts, strict=True):
             # Of several outputs the first has this variance, the others have it times a ratio.
@@ -189,7 +202,8 @@ class Fit:
     """A point of the likelihood, with all that was computed there.
 
     `sensor` holds the variance of each record's sensor noise, `linearized` and `filtered` the last
-    pass, `normal` the held-gain Fisher information of `theta` and its score.
+    pass, `normal` the held-gain Fisher information of `theta` and its score. `rounding` is the
+    variance that converters in the loop add to the noise of each sensor.
     """
 
     problem: Problem
@@ -199,6 +213,7 @@ class Fit:
     sensor: Array
     linearized: tuple[Linearized, ...]
     filtered: tuple[Filtered, ...]
+    rounding: tuple[float, ...] = ()
 
     @property
     def plant(self) -> SampledPlant:
@@ -343,7 +358,7 @@ def _evaluate_at_scale(
             r = float(problem.known.sensor[k])
         else:
             usual = mean if tails is None else tails.find_scale(squares, tails.scale)
-            r = max(usual, problem.least_sensors[k], 1e-300)
+            r = max(usual, problem.find_least_sensor(k, noise), 1e-300)
         if tails is None:
             value -= 0.5 * (len(e) * (math.log(2 * math.pi * r) + mean / r) + np.sum(np.log(s)))
         else:

@@ -20,6 +20,7 @@ from ...data.several_records import (
     measure_input_motion,
     order_model_and_data,
 )
+from ...effects import ReadingEffect
 from ...loop.loop import Loop
 from ...loop.sampled_form import note_sampled_controller
 from ...loop.unit_check import describe_distance, measure_distance, note_unit_clashes
@@ -284,7 +285,10 @@ def choose_free_names(
                           f"{type(loop).__name__}{point_at_part(loop, Loop)}")  # fmt: skip
     known = list(loop.equations(keep=True).parameters)
     if free is None:
-        names = tuple(dict.fromkeys([*loop.free, *list_effect_bounds(loop)]))
+        # What becomes of the noisy reading moves no prediction, so that no record can tell of it.
+        shown = [label for label, e in loop.labelled.items() if isinstance(e, ReadingEffect)]
+        of_effects = [n for n in list_effect_bounds(loop) if n.split(".")[0] not in shown]
+        names = tuple(dict.fromkeys([*loop.free, *of_effects]))
     else:
         names = (free,) if isinstance(free, str) else tuple(free)
     unknown = [name for name in names if name not in known]
