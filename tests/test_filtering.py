@@ -62,8 +62,8 @@ def run(s, valid=None, restart=None, input_variance=None, start=None, spread=Non
     return filter_pass(
         *s.values(), valid, restart, np.zeros(size) if input_variance is None else input_variance,
         np.zeros(n) if start is None else start, 2.0 * np.eye(n) if spread is None else spread,
-        sensor, np.zeros((1, 4)), np.full(m, 0.2) if force is None else force, memory, drift,
-        *(sizes or ((0,) * n, (0,) * (n + bool(drift)))),
+        np.full(size, sensor), np.zeros((1, 4)), np.full(m, 0.2) if force is None else force,
+        memory, drift, *(sizes or ((0,) * n, (0,) * (n + bool(drift)))),
     )  # fmt: skip
 
 
@@ -102,7 +102,7 @@ def textbook(s, valid, restart, input_variance, start, spread, sensor, force, me
             x, p = np.append(start, 0.0)[:wide], first
         c = np.append(s["c"][k], 0.0)[:wide]
         y = s["height"][k] + s["c"][k] @ (x[:n] - s["predicted"][k])
-        var = c @ p @ c + sensor
+        var = c @ p @ c + sensor[k]
         before, e = x[:n], 0.0
         if valid[k]:
             e = s["y"][k] - y
@@ -138,7 +138,8 @@ def test_a_pass_is_the_textbook_filter(seed):
         "input_variance": np.where(valid, 0.0, rng.uniform(0, 2)),
         "start": rng.standard_normal(n),
         "spread": root @ root.T,
-        "sensor": rng.uniform(0.05, 2),
+        # Each reading errs by its own.
+        "sensor": rng.uniform(0.05, 2, size),
         "force": rng.uniform(0, 1, m),
         "memory": 0.0,
         "drift": 0.0,
@@ -653,7 +654,7 @@ def test_a_million_samples_of_an_unstable_plant_stay_positive():
     out = filter_pass(
         np.outer(pushes, b), every(a), every(b[:, None]), zero, np.zeros((n, 2, 1)), np.zeros(n),
         every(np.array([1.0, 0.0])), np.zeros((n, 1)), zero, zero, y, np.ones(n, dtype=bool),
-        np.arange(n) == 0, np.zeros(n), np.zeros(2), 1e12 * np.eye(2), 1.0, np.zeros((1, 4)),
+        np.arange(n) == 0, np.zeros(n), np.zeros(2), 1e12 * np.eye(2), np.ones(n), np.zeros((1, 4)),
         np.array([ratio]), 0.0, 0.0, (0, 0), (0, 0),
     )  # fmt: skip
     steady = linalg.solve_discrete_are(a.T, np.array([[1.0], [0.0]]), ratio * np.outer(b, b),

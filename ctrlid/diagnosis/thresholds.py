@@ -70,7 +70,8 @@ class Thresholds:
         unit="of the samples",
     )  # fmt: skip
     coarse_steps: float = declare_number(
-        0.25, study="steps of the converter that make so much of the noise are worth a remark",
+        0.25, study="steps of the converter that make so much of the noise are worth a remark and "
+        "join the loop, in which equal readings in a row count once",
         unit="of the sensor noise's variance",
     )  # fmt: skip
     noise_beside_steps: float = declare_number(

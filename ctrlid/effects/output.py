@@ -337,6 +337,8 @@ class Quantization(ReadingEffect):
 
     .. math:: y_s = q \, \mathrm{round}(y / q)
 
+    Equal readings in a row err alike, so that together they count as one in fits and predictions.
+
     Parameters
     ----------
     step : float
