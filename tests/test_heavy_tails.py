@@ -8,6 +8,7 @@ import pytest
 from scipy import integrate, stats
 
 import ctrlid as cid
+from ctrlid.diagnosis.noise_choice import _errs_less_than_rounding
 from ctrlid.estimation.likelihood import tails
 from ctrlid.estimation.likelihood.kalman_filter import Noise, run_filter
 from ctrlid.estimation.likelihood.likelihood import make_problem
@@ -144,3 +145,24 @@ def test_white_noise_is_told_as_white():
     assert str(found.noise) == f"The sensor noise is {found.noise.words}."
     assert found.noise.size == pytest.approx(SIZE, rel=0.1)
     assert str(found.noise) not in found.sentence
+
+
+def test_tails_finer_than_the_converter_are_no_noise_of_the_sensor():
+    """At rest a coarse converter errs hardly at all, and its steps in motion look wild."""
+    plant = cid.plants.servo(m=1.0, c=2.0, k=3.0)
+    at = cid.OperatingPoint(states=(0.0, 0.0), input=0.0, output=0.0)
+    law = cid.PID(kp=20.0, kd=1.0, filter_time=0.02)
+    loop = cid.Loop(plant, law, dt=0.01, at=at, free=("k", "c"))
+    r = np.repeat([0.0, 0.1, 0.0, -0.1, 0.0, 0.1], 400)
+    step = 0.004
+    fits = {}
+    for size, q in ((0.0, step), (step, step / 100)):
+        noise = size * np.random.default_rng(1).standard_t(3, len(r))
+        y, u = simulate_servo(r, noise)
+        record = cid.Record(r=r, u=u, y=q * np.round(y / q), dt=0.01)
+        with np.errstate(all="ignore"):
+            fit = choose_tails(maximize(begin_fit(make_problem(loop, ("k", "c"), [record]))))
+        assert fit.noise.tails is not None
+        fits[size] = fit
+    assert _errs_less_than_rounding(fits[0.0])
+    assert not _errs_less_than_rounding(fits[step])

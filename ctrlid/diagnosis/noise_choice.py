@@ -8,7 +8,11 @@ import numpy as np
 
 from .._base.criterion import bayesian_penalty
 from .._base.errors import ModelCannotRun
-from .._base.statistics import compute_lagged_products, compute_predicted_likelihood
+from .._base.statistics import (
+    compute_lagged_products,
+    compute_predicted_likelihood,
+    rounding_variance,
+)
 from ..estimation.likelihood.kalman_filter import Noise
 from ..estimation.likelihood.likelihood import Fit, evaluate_likelihood
 from ..estimation.likelihood.maximization import choose_sensor_noise, choose_tails
@@ -17,6 +21,8 @@ from ..estimation.likelihood.noise_fit import (
     count_noise_parameters,
     measure_walk_gain,
 )
+from ..estimation.likelihood.tails import JointTails
+from ..validation.signal_defects import find_grid_step
 from .candidates import Trial
 from .fitted_model import Model, with_linearization
 from .noise_tests import run_noise_tests
@@ -50,7 +56,9 @@ def prefer_sensor_noise(
         with contextlib.suppress(ModelCannotRun):
             tried.append(choose_sensor_noise(fit))
     if fit.noise.tails is None and tests.has_heavy_tails:
-        tried.append(choose_tails(fit))
+        heavy = choose_tails(fit)
+        if not _errs_less_than_rounding(heavy):
+            tried.append(heavy)
     other = max(tried, key=compute_noise_criterion, default=fit)
     gain = compute_noise_criterion(other) - compute_noise_criterion(fit)
     if not gain > more:
@@ -65,6 +73,25 @@ def prefer_sensor_noise(
         if beside is not None:
             other = evaluate_likelihood(fit.problem, fit.theta, beside, fit.trajectories)
     return with_linearization(Model(model.loop, other))
+
+
+def _errs_less_than_rounding(fit: Fit) -> bool:
+    r"""Whether the usual readings of a heavy-tailed sensor err less than its converter rounds.
+
+    Rounding to steps q adds a variance of :math:`q^2/12`. While a plant hardly moves it adds none,
+    and what it adds in motion looks like wild readings.
+    """
+    tails = fit.noise.tails
+    if tails is None:
+        return False
+    laws = tails.each if isinstance(tails, JointTails) else (tails,)
+    usual = float(np.mean(fit.sensor)) * np.array([1.0, *fit.noise.sensors])
+    records = [data.record for data in fit.data]
+    for k, law in enumerate(laws):
+        steps = [find_grid_step(np.atleast_2d(r.y)[k][r.valid_samples]) for r in records]
+        if law is not None and usual[k] < rounding_variance(max(steps)):
+            return True
+    return False
 
 
 def _rounds_most(fit: Fit) -> bool:

@@ -259,7 +259,7 @@ def _answer_question(q: Question) -> tuple[Diagnosis, Search]:
     is_larger = make_size_test(q.fresh)
     with q.budget.running():
         search = search_effects(base, q.catalogue, q.work, q.tell, is_larger)
-    if search.finished and not search.after.passed:
+    if search.finished and not search.after.passed and q.loop.equations().siso:
         # Beside what the effects explained, the steps of a converter may be all that is left.
         stepped = _add_steps(q, search.final)
         if stepped is not None:
