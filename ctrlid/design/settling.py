@@ -9,10 +9,9 @@ from ..effects import (
     InputBacklash,
     InputDeadZone,
     InputSaturation,
-    Quantization,
     StribeckFriction,
 )
-from ..loop.loop import Loop
+from ..loop.loop import Loop, find_converter_steps
 from ..physics.trace import trace
 
 # A response has settled when it stays within this share of its final value.
@@ -35,10 +34,8 @@ def find_reading_step(loop: Loop, output: str) -> float:
     float
         The largest step of a `Quantization` of this output [unit of the output].
     """
-    first = loop.signals["y"][0]
-    steps = [e.step for e in loop.effects if isinstance(e, Quantization)
-             and (e.at or first) == output]  # fmt: skip
-    return max(steps, default=0.0)
+    steps = dict(zip(loop.signals["y"], find_converter_steps(loop), strict=True))
+    return steps.get(output, 0.0)
 
 
 def explain_unsettled(loop: Loop, output: str, height: float) -> str:
