@@ -70,7 +70,7 @@ def test_another_option_of_the_controller_is_named():
 
 
 def record_pid(n=2000, limit=np.inf, measured=False, forward=False, wound=False, b=1.0, tf=0.0,
-               ki=60.0, kd=4.0):  # fmt: skip
+               ki=60.0, kd=4.0, kp=40.0, rule=None):  # fmt: skip
     """A mass on a spring under a PID written out in numpy, and the PID that it is stated to be."""
     rng = np.random.default_rng(11)
     whole = expm(DT * np.array([[0, 1, 0], [-3, -2, 1], [0, 0, 0]]))
@@ -83,8 +83,14 @@ def record_pid(n=2000, limit=np.inf, measured=False, forward=False, wound=False,
         slope = (tf * slope + kd * (difference - last)) / (tf + DT)
         last = difference
         step = ki * DT * (r[j] - y[j])
-        v = 40 * (b * r[j] - y[j]) + slope + integral + (0 if forward else step)
-        if wound or not abs(v) > limit or v * step < 0:
+        v = kp * (b * r[j] - y[j]) + slope + integral + (0 if forward else step)
+        if rule == "reset" and abs(v) > limit:
+            integral = 0.0
+        elif rule == "half" and abs(v) > limit:
+            integral += 0.5 * step
+        elif rule == "late" and j and abs(u[j - 1]) >= limit:
+            pass
+        elif wound or not abs(v) > limit or v * step < 0:
             integral += step
         u[j] = round(float(np.clip(v, -limit, limit)), 3)
         x = whole[:2, :2] @ x + whole[:2, 2] * u[j]
@@ -110,6 +116,20 @@ def test_the_options_of_a_pid_are_tried_and_named(true, said):
     record, loop = record_pid(**true)
     texts = [f.text for f in cid.audit(record, loop).findings if f.kind in ("filter", "limit")]
     assert any(said in text for text in texts), texts
+
+
+@pytest.mark.parametrize("rule", ["reset", "half", "late"])
+def test_another_rule_at_the_limit_does_not_speak_against_the_law(rule):
+    record, loop = record_pid(limit=12.0, rule=rule)
+    (found,) = cid.audit(record, loop)["anti-windup"]
+    assert "leaves its limits by another rule (anti-windup)" in found.text
+    # What is a hundredth of u steers no simulation; more than that forbids one.
+    simulated = "closed-loop simulation" in [c.label for c in cid.compare(record, loop).curves]
+    assert simulated == (found.size < 0.01) == (rule != "half")
+    # Other gains are no matter of the limits.
+    wrong, _ = record_pid(limit=12.0, rule=rule, kp=44.0)
+    assert not any("Gains and structure are right" in f.text
+                   for f in cid.audit(wrong, loop).findings)  # fmt: skip
 
 
 def test_a_pid_as_stated_stands():

@@ -327,20 +327,48 @@ def test_an_analog_lead_in_place_of_a_program_is_said():
     program = replace(LOOP, controller=ct.tf([-4000.0, 3000.0], [1.0, 0.0], DT))
     found = cid.redesign(P, program, crossover=100, phase_margin=50)
     text = str(found)
-    assert "/ (s + 274.748), an analog lead\n  The controller of the loop is a program" in text
-    assert "runs every 0.001 s, and this lead is an analog circuit" in text
-    # What it tells to do works.
+    assert "while the controller of the loop is a program that runs every 0.001 s" in text
+    # What it says of the program is what the program does, and what it tells to do works.
     sampled = cid.redesign(P, program, step=1e-5, design=lambda _: ct.sample_system(
         found.controller, 0.001, "tustin"))  # fmt: skip
     assert not sampled.loop.analog
     (margin,) = sampled.achieved.margins
     assert 40 < margin.phase_margin < 49
+    assert found.sampled_margin == pytest.approx(margin.phase_margin, abs=1e-6)
+    assert f"a phase margin of {margin.phase_margin:.1f} deg. What follows is the" in text
     digital = cid.redesign(ct.sample_system(ct.ss(P), 0.001), program, 100, 50)
     assert not digital.loop.analog
     circuit = replace(LOOP, controller=found.controller)
     for other in (digital, cid.redesign(P, LOOP, 100, 50), cid.redesign(P, circuit, 100, 50)):
         assert "is a program" not in str(other)
     assert ", a digital lead, 0.001 s\n" in str(digital)
+
+
+@pytest.mark.parametrize(("crossover", "words", "stable"), [
+    (200, "DEGREES ARE LOST BY SAMPLING", True), (600, "it DOES NOT STABILIZE THE PHYSICS", False),
+])  # fmt: skip
+def test_a_fast_lead_that_a_slow_program_cannot_be_is_the_first_sentence(crossover, words, stable):
+    slow = replace(LOOP, dt=0.003, controller=ct.tf([-4000.0, 3000.0], [1.0, 0.0], 0.003))
+    found = cid.redesign(P, slow, crossover=crossover, phase_margin=50, step=1e-5)
+    assert found.stable
+    assert words in found.verdict
+    assert found.verdict.startswith("This lead is an analog circuit")
+    program = cid.redesign(P, slow, step=1e-5, design=lambda _: ct.sample_system(
+        found.controller, 0.003, "tustin"))  # fmt: skip
+    assert program.stable is stable
+    assert np.isfinite(found.sampled_margin) == stable
+
+
+def test_the_limits_of_a_pid_say_what_a_small_step_is():
+    motor = cid.plants.servo(m=0.002, c=0.01, k=0.5)
+    free = cid.Loop(motor, cid.PID(kp=5.0, kd=0.2), dt=0.005)
+    limited = replace(free, controller=cid.PID(kp=5.0, kd=0.2, lower=-2.0, upper=2.0))
+    stated = replace(free, input_limits=(-2.0, 2.0))
+    G = cid.linearize(motor, free.point)
+    for given in ({"crossover": 20, "phase_margin": 60}, {"design": lambda _: ct.tf([5.0], [1.0])}):
+        heights = [cid.redesign(G, loop, **given) for loop in (free, limited, stated)]
+        heights = [trial.steps[0].height if "design" in given else trial.step for trial in heights]
+        assert heights[1] == heights[2] != heights[0]
 
 
 def test_the_report():

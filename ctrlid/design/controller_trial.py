@@ -380,7 +380,13 @@ def try_design(
     trial = replace(loop, controller=controller, dt=dt)
     promised, achieved = (measure_performance(side) for side in (promise, trial))
     length = _choose_length(promised.poles, dt)
-    heights = _choose_steps(trial, model, step, partial(_find_peaks, promise, length))
+    # The limits that the former PID kept tell what is small where the new controller has none.
+    sized = trial if isinstance(controller, PID) else loop
+
+    def choose(output: str | None, name: str) -> tuple[float, str]:
+        return choose_height(sized, output, partial(_find_peaks, promise, length, name))
+
+    heights = _choose_steps(trial, model, step, choose)
     sides = [(side, _stay(side, length)) for side in (promise, trial) if heights]
     steps = tuple(
         replace(_make_step(trial, model, name, height, dt, length,
@@ -482,7 +488,7 @@ def _find_followed(loop: Loop, model: Any, name: str) -> str | None:
 
 
 def _choose_steps(
-    loop: Loop, model: Any, step: Any, find_peaks: Callable[[str], Array]
+    loop: Loop, model: Any, step: Any, choose: Callable[[str | None, str], tuple[float, str]]
 ) -> dict[str, tuple[float, str]]:
     """Return the height of the step of each reference that is tried, and why it is that."""
     names = _list_references(loop)
@@ -500,10 +506,7 @@ def _choose_steps(
               if value is None or _find_followed(loop, model, name) is not None]  # fmt: skip
     if step is not None:
         return dict.fromkeys(chosen, (_check_height(step), ""))
-    return {
-        name: choose_height(loop, _find_followed(loop, model, name), partial(find_peaks, name))
-        for name in chosen
-    }
+    return {name: choose(_find_followed(loop, model, name), name) for name in chosen}
 
 
 def _find_peaks(promise: Loop, n: int, name: str) -> Array:

@@ -97,8 +97,10 @@ class Redesign(Printed):
         Why the physics was not kept stable, or empty.
     step_reason : str
         Why the step has this height where none was given and the output rests at zero, or empty.
-    hint : str
-        What to do with an analog lead where the controller before it was a program, or empty.
+    sampled_margin : float or None
+        Phase margin [deg] of an analog lead that runs as a program with the sampling period of the
+        loop (bilinear rule, held output) on the linearized physics, where the controller of the
+        loop is a program; NaN where that is not stable, None where the question does not arise.
     """
 
     controller: Any
@@ -113,7 +115,7 @@ class Redesign(Printed):
     step: float
     failure: str = ""
     step_reason: str = ""
-    hint: str = ""
+    sampled_margin: float | None = None
 
     def __post_init__(self) -> None:
         freeze_arrays(self)
@@ -131,6 +133,33 @@ class Redesign(Printed):
     @property
     def verdict(self) -> str:
         """The outcome in words."""
+        return f"{self._tell_as_program()} {self._compare()}".lstrip()
+
+    def _tell_as_program(self) -> str:
+        """Return what becomes of an analog lead as a program; empty where nobody asks."""
+        if self.sampled_margin is None:
+            return ""
+        p, dt = self.promised, self.loop.dt
+        start = (
+            "This lead is an analog circuit, because the model is in continuous time, while the "
+            f"controller of the loop is a program that runs every {dt:g} s. As such a program "
+        )
+        cure = (
+            f"Design on the sampled model, redesign(ct.sample_system(ct.ss(G), {dt:g}), loop, "
+            "...), or sample the lead and try that, redesign(G, loop, design=lambda P: "
+            f'ct.sample_system(outcome.controller, {dt:g}, "tustin")).'
+        )
+        if math.isnan(self.sampled_margin):
+            return f"{start}it DOES NOT STABILIZE THE PHYSICS. {cure} What follows is the circuit."
+        lost = p.phase_margin - self.sampled_margin
+        kept = f"{start}(bilinear rule) it has a phase margin of {self.sampled_margin:.1f} deg"
+        if lost > CLOSE * p.phase_margin:
+            return (f"{kept}: {lost:.1f} DEGREES ARE LOST BY SAMPLING. {cure} What follows is the "
+                    "circuit.")  # fmt: skip
+        return f"{kept}. What follows is the circuit."
+
+    def _compare(self) -> str:
+        """Return what was promised against what was achieved."""
         p, a = self.promised, self.achieved
         if not a.stable and not np.isfinite(a.phase_margin):
             return (
@@ -211,9 +240,8 @@ class Redesign(Printed):
             + f" {self.step_reason}".rstrip()
         )
         kind = "an analog lead" if self.loop.analog else f"a digital lead, {self.loop.dt:g} s"
-        hints = [f"  {self.hint}"] if self.hint else []
         head = f"controller: ({num}) / ({den}), {kind}"
-        return "\n".join([head, *hints, *rows, step, "  " + self.verdict])
+        return "\n".join([head, *rows, step, "  " + self.verdict])
 
 
 @overload
@@ -377,20 +405,20 @@ def redesign(
     return Redesign(C, promised, achieved, nu_gap(G / unit, P / unit),
                     robust_margin(G / unit, C * unit), trial, time, promised_step, achieved_step,
                     height, "" if failure is None else failure, reason,
-                    _hint_at_sampling(loop, dt))  # fmt: skip
+                    _measure_sampled(loop, C))  # fmt: skip
 
 
-def _hint_at_sampling(loop: Loop, dt: float) -> str:
-    """Say that the lead is a circuit where the controller of the loop is a program."""
-    if dt or loop.controller is None or loop.analog:
-        return ""
-    return (
-        "The controller of the loop is a program that runs every "
-        f"{loop.dt:g} s, and this lead is an analog circuit, because the model is in continuous "
-        "time. As a program it loses phase: sample it and try that, by redesign(G, loop, "
-        f'design=lambda P: ct.sample_system(outcome.controller, {loop.dt:g}, "tustin")), or design '
-        f"on the sampled model, redesign(ct.sample_system(ct.ss(G), {loop.dt:g}), loop, ...)."
-    )
+def _measure_sampled(loop: Loop, C: Any) -> float | None:
+    """Return the phase margin of an analog lead that runs as a program of the loop [deg].
+
+    NaN where the program does not stabilize the linearized physics; None where no program is asked
+    for, because the lead is one already or the controller of the loop is a circuit.
+    """
+    if timebase(C) or loop.controller is None or loop.analog:
+        return None
+    program = ct.sample_system(C, loop.dt, "tustin")
+    margins = loop_margins(sample_held(loop.linearize(), loop.dt) * program)
+    return margins.phase_margin if margins.stable else math.nan
 
 
 def _make_plain(G: Any) -> Any:

@@ -7,6 +7,7 @@ import numpy as np
 from .._base.arrays import Array
 from .._base.text import write_number, write_percent, write_quantity
 from .._base.units import count_per_si_unit
+from ..loop.controllers import PID
 from ..loop.loop import Loop
 from .settling import find_reading_step
 
@@ -28,7 +29,7 @@ def choose_height(
     Parameters
     ----------
     loop : Loop
-        The loop whose reference steps.
+        The loop whose reference steps; the limits of its PID count as limits of the input.
     output : str or None
         The output that follows, where it is known.
     find_peaks : callable
@@ -66,6 +67,15 @@ def choose_height(
     )
 
 
+def _find_range(loop: Loop) -> tuple[Array, Array]:
+    """Return the limits of each input: those of the loop, and those that its PID keeps."""
+    lower, upper = (np.broadcast_to(v, len(loop.signals["u"])) for v in loop.input_limits)
+    if isinstance(loop.controller, PID):
+        lower = np.maximum(lower, loop.controller.lower)
+        upper = np.minimum(upper, loop.controller.upper)
+    return lower, upper
+
+
 def _choose_smooth_height(
     loop: Loop, output: str | None, find_peaks: Callable[[], Array]
 ) -> tuple[float, str, bool]:
@@ -78,7 +88,7 @@ def _choose_smooth_height(
     if rest:
         return SHARE * abs(rest), "", True
     zero = f"{output} rests at zero" if output else "No output is known to follow"
-    lower, upper = (np.broadcast_to(v, len(loop.signals["u"])) for v in loop.input_limits)
+    lower, upper = _find_range(loop)
     inputs = np.array(loop.point.inputs)
     room = np.minimum(inputs - lower, upper - inputs)
     if np.isfinite(room).any() and (room > 0).all():

@@ -147,7 +147,7 @@ def _estimate_gain(loop: Loop, record: Record) -> tuple[float, float, float] | N
     which an alternating solution would share out wrongly.
     """
     part = _take_longest(record)
-    output, responses, rest = differentiate_replay(_take_limits_off(loop), part)
+    output, responses, rest = differentiate_replay(take_limits_off(loop), part)
     inner = _find_inner(part)
     table = np.column_stack([output - rest, np.ones(part.n), responses])[inner]
     if len(table) <= 2 * table.shape[1]:
@@ -174,7 +174,7 @@ def _scale_controller(loop: Loop, factor: float, constant: float) -> Loop | None
 def _list_single_gains(loop: Loop, pid: PID, record: Record) -> Iterator[LawChange]:
     """Yield the PID with one of its three gains as the logged u has it."""
     part = _take_longest(record)
-    free = _take_limits_off(loop)
+    free = take_limits_off(loop)
     inner = _find_inner(part)
     whole = differentiate_replay(free, part)[0]
     for name, words in (("kp", "proportional"), ("ki", "integral"), ("kd", "derivative")):
@@ -306,7 +306,7 @@ def _list_filters(loop: Loop, record: Record) -> Iterator[LawChange]:
     .. math:: u_k + \gamma (u_k - u_{k-1}) = v_k, \\quad \gamma = p / (1 - p)
     """
     part = _take_longest(record)
-    output, responses, _ = differentiate_replay(_take_limits_off(loop), part)
+    output, responses, _ = differentiate_replay(take_limits_off(loop), part)
     dt, stated = record.dt, _measure_remainder(loop, record)
     times = [dt * time for time in TIMES]
     text = "behind a first-order low-pass filter with a time constant of"
@@ -615,7 +615,7 @@ def _is_nonlinear(loop: Loop) -> bool:
     )
 
 
-def _take_limits_off(loop: Loop) -> Loop:
+def take_limits_off(loop: Loop) -> Loop:
     """Return the loop without limits of its input or its controller, which then needs no windup."""
     free = exchange_limits(loop)
     if isinstance(free.controller, PID):

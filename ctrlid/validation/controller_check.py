@@ -11,7 +11,7 @@ from scipy import stats
 from .._base.errors import CtrlidError
 from .._base.periods import have_same_period
 from .._base.statistics import regress
-from .._base.text import write_percent
+from .._base.text import write_count, write_percent
 from ..data.record import Record
 from ..data.validity import find_longest_run, find_whole_past
 from ..loop.controller_replay import (
@@ -24,7 +24,7 @@ from ..loop.controllers import PID
 from ..loop.loop import Loop, exchange_controller, exchange_limits
 from ..loop.sampled_form import describe_sampled_form, find_sampled_form
 from ..loop.wiring import knows_references
-from .controller_changes import DETERMINED, FEWEST, TRIAL, list_changes
+from .controller_changes import DETERMINED, FEWEST, TRIAL, list_changes, take_limits_off
 from .residual_tests import compute_explained_share
 from .signal_defects import find_grid_step
 
@@ -44,16 +44,20 @@ FOLLOWS = 0.2
 LEVEL = 1e-3
 # An added signal is told by so many samples of its own past, of r and of y.
 MEMORY = 10
+# A law that is asked off its limits alone is asked on at least this share of the samples.
+MOSTLY = 0.5
 # Below this share of its variance the remainder of a regression is rounding of the computer.
 ROUNDING = 1e-12
 # Changes of a law are put out by so many samples, most of them at once.
 BEGINNING = 1000
 # What is below this share of u's variance is written with all its zeros.
 HARDLY = 1e-5
-# A remainder of no known kind below this share of u's variance steers no simulation.
+# A remainder below this share of u's variance steers no simulation.
 IMMATERIAL = 0.01
 # Kinds of finding after which the stated law is not that of the record.
-REJECTED = ("gain", "sign", "delay", "limit", "filter", "sampled", "unknown")
+REJECTED = ("gain", "sign", "delay", "limit", "filter", "sampled", "anti-windup", "unknown")
+# Of these, what leaves an immaterial share of u steers no simulation.
+SMALL_MATTERS = ("anti-windup", "unknown")
 # These look the same where the log of a signal has them and not the controller.
 MIRRORED = ("gain", "sign")
 # What may be wrong with a stated law; a constant that is added to it leaves it standing.
@@ -147,15 +151,16 @@ def check_controller(loop: Loop, record: Record) -> list[Fact]:
     exact_only = stated[0] == "injected" and not resolution
     if stated[0] == "bias":
         return [*facts, stated]
-    return [*facts, _find_wrong_law(loop, part, left, exact_only, resolution, sample) or stated]
+    wrong = _find_wrong_law(loop, part, left, exact_only, resolution, sample)
+    return [*facts, wrong or _find_law_off_limits(loop, part, left, resolution) or stated]
 
 
 def find_rejection(loop: Loop, record: Record) -> str:
     """Return why the stated law is not what computed the logged u; empty where it stands.
 
     An added signal that is independent of y, or a constant one, does not speak against a law. Nor
-    does a remainder without a name that is far smaller than u: no real record is exact to the
-    last digit.
+    does a remainder without a name, or of another rule at the limits, that is far smaller than u:
+    no real record is exact to the last digit.
     """
     return pick_rejection(check_controller(loop, record))
 
@@ -163,7 +168,7 @@ def find_rejection(loop: Loop, record: Record) -> str:
 def pick_rejection(facts: Sequence[Fact]) -> str:
     """Return the words of the first fact that speaks against a law; empty without one."""
     for kind, text, share, _ in facts:
-        if kind in REJECTED and not (kind == "unknown" and share < IMMATERIAL):
+        if kind in REJECTED and not (kind in SMALL_MATTERS and share < IMMATERIAL):
             return text
     return ""
 
@@ -276,6 +281,30 @@ def _spell_samples(k: int) -> str:
     return f"{('one', 'two', 'three')[k - 1]} sample{'s' if k > 1 else ''}"
 
 
+def _find_law_off_limits(loop: Loop, record: Record, left: float, resolution: float) -> Fact | None:
+    """Return that the law is exact but where u is at a limit; None where it is not.
+
+    What an integral does at a limit (anti-windup) is a matter of many recipes, of which a PID of
+    ctrlid knows three. Each visit of a limit leaves another state, so that every stretch between
+    two of them is replayed from its own.
+    """
+    lower, upper = _find_limits(loop)
+    slack = 1e-6 * float(np.ptp(record.u[record.valid]))
+    at_limit = record.valid & ((record.u <= lower + slack) | (record.u >= upper - slack))
+    off = replace(record, valid=record.valid & ~at_limit)
+    long = sum(b - a for a, b in off.segments() if b - a >= FEWEST)
+    if not at_limit.any() or long < MOSTLY * np.count_nonzero(record.valid):
+        return None
+    e, remains = _compute_remainder(take_limits_off(loop), off)
+    if not is_rounding(e, remains, record.u[off.valid], resolution):
+        return None
+    return ("anti-windup", "u is what the controller of the loop computes from r and y, but for "
+            f"the {write_count(int(np.count_nonzero(at_limit)), 'sample')} at a limit of u and the "
+            "state of the controller after them: it leaves its limits by another rule "
+            "(anti-windup) than the stated one. Gains and structure are right.", left,
+            left >= IMMATERIAL)  # fmt: skip
+
+
 def _explain_remainder(loop: Loop, e: Any, left: float, record: Record, resolution: float) -> Fact:
     """Say what the part of u is that does not come from the controller."""
     assert record.r is not None
@@ -343,15 +372,21 @@ def _read_constant(loop: Loop, record: Record) -> float:
     return constant if abs(constant) > seen else 0.0
 
 
+def _find_limits(loop: Loop) -> tuple[float, float]:
+    """Return the limits of the input: those of the loop and of its PID."""
+    lower, upper = loop.input_limits
+    if isinstance(loop.controller, PID):
+        lower, upper = max(lower, loop.controller.lower), min(upper, loop.controller.upper)
+    return lower, upper
+
+
 def _is_independent(loop: Loop, e: Any, record: Record) -> bool:
     """Test whether a remainder is independent of y up to now, given r and its own past.
 
     The samples at the stated limits are left out, which cut off what was added.
     """
     assert record.r is not None
-    u, lower, upper = record.u, *loop.input_limits
-    if isinstance(loop.controller, PID):
-        lower, upper = max(lower, loop.controller.lower), min(upper, loop.controller.upper)
+    u, (lower, upper) = record.u, _find_limits(loop)
     inner = record.valid & (u > lower) & (u < upper)
     return is_independent(e, [record.y], [record.r], inner, record.valid)
 
