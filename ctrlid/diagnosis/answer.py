@@ -175,7 +175,7 @@ def describe_noise(fit: Fit, unit: str) -> SensorNoise:
         joint = noise.tails
         laws = joint.each if isinstance(joint, JointTails) else (None,) * len(fit.plant.e.outputs)
         worth = [1.0 if law is None else law.variance for law in laws]
-        sizes = np.sqrt(variance * np.array([1.0, *noise.sensors]) * worth).tolist()
+        sizes = np.sqrt(fit.sensor_noises * worth).tolist()
         told = tuple((math.inf, 0.0, 1.0) if law is None else
                      (law.freedom or math.inf, law.share, law.ratio) for law in laws)  # fmt: skip
         units = find_noise_units(fit.plant.loop, fit.data[0].record)[0]

@@ -178,7 +178,7 @@ class FreshData:
             return self
         loops = self.prepare_loops(model)
         floors = gaps.compute_floor(loops, model.fit, self.windows, self.how).outputs
-        noise = np.sqrt(np.mean(model.fit.sensor) * np.array([1.0, *model.fit.noise.sensors]))
+        noise = np.sqrt(model.fit.sensor_noises)
         scales = tuple(
             floor.both if math.isfinite(floor.both) and floor.both > 0 else float(size)
             for floor, size in zip(floors, noise, strict=True)

@@ -524,6 +524,6 @@ def _draw_several_noises(fit: Fit, sensor: float, n: int, seed: int) -> list[Arr
 
 def _list_noises_beside_steps(fit: Fit, sensor: float) -> Array:
     """Return the variance of each sensor's noise without that of rounding, a trace at least."""
-    noises = sensor * np.array([1.0, *fit.noise.sensors])
+    noises = sensor * fit.noise.ratios
     rounding = fit.rounding or fit.problem.rounding
     return np.maximum(noises - rounding, THRESHOLD.noise_beside_steps * noises)

@@ -85,7 +85,7 @@ def _errs_less_than_rounding(fit: Fit) -> bool:
     if tails is None:
         return False
     laws = tails.each if isinstance(tails, JointTails) else (tails,)
-    usual = float(np.mean(fit.sensor)) * np.array([1.0, *fit.noise.sensors])
+    usual = fit.sensor_noises
     records = [data.record for data in fit.data]
     for k, law in enumerate(laws):
         steps = [find_grid_step(np.atleast_2d(r.y)[k][r.valid_samples]) for r in records]
@@ -96,8 +96,7 @@ def _errs_less_than_rounding(fit: Fit) -> bool:
 
 def _rounds_most(fit: Fit) -> bool:
     """Whether most of a sensor's noise is the rounding of its converter, whose form is known."""
-    noises = float(np.mean(fit.sensor)) * np.array([1.0, *fit.noise.sensors])
-    return bool(np.any(fit.problem.rounding > 0.5 * noises))
+    return bool(np.any(fit.problem.rounding > 0.5 * fit.sensor_noises))
 
 
 def _rings_on(fit: Fit) -> bool:

@@ -297,6 +297,8 @@ def _answer_question(q: Question) -> tuple[Diagnosis, Search]:
     if search.finished:
         q.tell("comparing names")
         search = q.attempt(lambda: compare_names(keep_main_effects(search, helps), q.work), search)
+    # What was fitted anew has its noise measured anew.
+    search = replace(search, final=measure_rounding(search.final))
     # Step 9: the gap before and after. An effect of one of several records may widen the others'.
     summary = summarize_gap(q.loop, search, q.fresh)
     simulated = q.fresh.how

@@ -191,7 +191,7 @@ def read_steps(fit: Fit, audits: Sequence[Audit]) -> tuple[Readout, ...]:
         # The audit calls the signals of a plant with one of each u and y.
         key, at = ("y", "") if e.siso else (name, name)
         step = max((float(a.quantum.get(key, 0.0)) for a in audits), default=0.0)
-        noise = float(np.mean(fit.sensor)) * (1.0, *fit.noise.sensors)[k]
+        noise = fit.sensor_noises[k]
         share = float(rounding_variance(step)) / noise if noise > 0 else 0.0
         if share < THRESHOLD.coarse_steps:
             continue

@@ -110,7 +110,7 @@ def measure_rounding(model: Model) -> Model:
 
     Rounding adds :math:`q^2 / 12` in motion. A controller that works against a reading between
     two steps keeps it there, where rounding adds three times as much. A record simulated without
-    any other noise tells how much it is.
+    any other noise tells how much it is. A model that was measured before is returned as it is.
 
     References
     ----------
@@ -118,11 +118,11 @@ def measure_rounding(model: Model) -> Model:
     inference).
     """
     steps = find_converter_steps(model.loop)
-    bare = make_replica(model, noisy=False) if any(steps) else None
+    measured = bool(model.fit.rounding)
+    bare = make_replica(model, noisy=False) if any(steps) and not measured else None
     if bare is None:
         return model
-    seen = float(np.mean(bare.fit.sensor)) * np.array([1.0, *bare.fit.noise.sensors])
-    added = np.maximum(np.where(steps, seen, 0.0), rounding_variance(steps))
+    added = np.maximum(np.where(steps, bare.fit.sensor_noises, 0.0), rounding_variance(steps))
     return replace(model, fit=replace(model.fit, rounding=tuple(added.tolist())))
 
 

@@ -57,7 +57,7 @@ def compute_force_scores(
         # Several outputs are updates one after another, of which only the last moves the state.
         updates = len(b) // len(lin.step)
         if updates > 1:
-            part = part * np.sqrt([1.0, *fit.noise.sensors])[None, :, None]
+            part = part * np.sqrt(fit.noise.ratios)[None, :, None]
         scores = _carry_back(run.a, b, pushed, run.c, gain, run.valid, run.restart, run.memory,
                              np.ascontiguousarray(part.reshape(len(b), -1)))  # fmt: skip
         found.append(scores[updates - 1 :: updates])

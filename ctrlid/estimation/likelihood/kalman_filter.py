@@ -65,6 +65,11 @@ class Noise:
     sensors: tuple[float, ...] = ()
 
     @property
+    def ratios(self) -> Array:
+        """Variances of the sensor noise of all outputs, relative to that of the first."""
+        return np.array([1.0, *self.sensors])
+
+    @property
     def plain(self) -> "Noise":
         """The noise without its colours, of force and sensor."""
         return Noise(self.force, tails=self.tails, sensors=self.sensors)
@@ -135,7 +140,7 @@ def predict_outputs(data: FilterData, lin: Linearized, noise: Noise) -> tuple[Ar
     In one pass only the first output is predicted without those of its own sample.
     """
     q = lin.output.shape[1]
-    scale = np.array([1.0, *noise.sensors])
+    scale = noise.ratios
     errors, variances = [], []
     for k in range(q):
         order = [k, *(i for i in range(q) if i != k)]
@@ -160,7 +165,7 @@ def _run_several(
     over a whole period, :math:`\rho^{1/q}` in each of q updates.
     """
     size, q = lin.output.shape
-    scale, tails = np.sqrt([1.0, *noise.sensors] if sensors is None else sensors), noise.tails
+    scale, tails = np.sqrt(noise.ratios if sensors is None else sensors), noise.tails
     out = filter_pass(*_arrange_updates(data, lin, noise, p, scale))
     error, variance, before, after, wide, slopes, disturbance = out
     variance = _count_alone(variance.reshape(size, q), data, noise)

@@ -92,8 +92,8 @@ class Problem:
 
         Those of further outputs are told relative to it.
         """
-        ratios = np.array([1.0, *noise.sensors])
-        return max(self.least_sensors[record], float(np.max(self.rounding / ratios)))
+        least = float(np.max(self.rounding / noise.ratios))
+        return max(self.least_sensors[record], least)
 
     @functools.cached_property
     def rounding(self) -> Array:
@@ -234,6 +234,11 @@ class Fit:
     def known(self) -> Known | None:
         """The noise, where it is not estimated."""
         return self.problem.known
+
+    @property
+    def sensor_noises(self) -> Array:
+        """Variance of each output's sensor noise, in the mean of the records."""
+        return float(np.mean(self.sensor)) * self.noise.ratios
 
     @property
     def trajectories(self) -> list[Trajectory]:

@@ -315,7 +315,7 @@ def summarize_fit(loop: Loop, fit: Fit) -> LoopFit:
     noise, scale = fit.noise, float(np.mean(fit.sensor))
     several = not loop.equations().siso
     forces = np.sqrt(scale * np.array(noise.force))
-    sensors = np.sqrt(np.outer(fit.sensor, [1.0, *noise.sensors]))
+    sensors = np.sqrt(np.outer(fit.sensor, noise.ratios))
     time = -loop.dt / math.log(noise.memory) if noise.drift else math.nan
     estimate = LoopEstimate(
         names, fit.theta, covariance,

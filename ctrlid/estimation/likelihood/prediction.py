@@ -196,7 +196,7 @@ def make_prediction(fit: Fit) -> Prediction:
     units = find_noise_units(plant.loop, record)
     if record.y.ndim == 2:
         error, variance = predict_outputs(fit.data[0], fit.linearized[0], fit.noise)
-        sizes = sensor * np.sqrt([1.0, *fit.noise.sensors])
+        sizes = sensor * np.sqrt(fit.noise.ratios)
         return Prediction(
             record.y - error.T, error.T, fit.counts[0].T, sensor * np.sqrt(variance.T),
             states[:, : plant.n], states[:, plant.n :], tuple(sizes.tolist()),
@@ -353,7 +353,7 @@ def compute_spreads_ahead(lin: Linearized, noise: Noise, valid: Any, horizon: in
     """
     if lin.output.ndim == 1:
         return np.array([compute_spread_ahead(lin, noise, valid, horizon)])
-    q, r = lin.output.shape[1], np.array([1.0, *noise.sensors])
+    q, r = lin.output.shape[1], noise.ratios
     starts, lead = _choose_starts(valid, horizon)
     if not len(starts):
         return np.full(q, math.nan)
