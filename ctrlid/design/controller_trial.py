@@ -563,7 +563,7 @@ def _stay(loop: Loop, n: int) -> _Motion:
         record = _follow(loop, n)
     except ModelCannotRun as reason:
         p, m = len(loop.signals["y"]), len(loop.signals["u"])
-        return _Motion(np.empty((p, 0)), np.empty((m, 0)), _write_sentence(reason))
+        return _Motion(np.empty((p, 0)), np.empty((m, 0)), write_sentence(reason))
     return _Motion(np.atleast_2d(record.y), np.atleast_2d(record.u))
 
 
@@ -576,14 +576,15 @@ def _step(loop: Loop, name: str, height: float, n: int, rest: _Motion) -> _Motio
     except SimulationStopped as reason:
         got = np.atleast_2d(reason.y)
         return _Motion(got - rest.y[:, : got.shape[1]], np.empty((len(rest.u), 0)),
-                       _write_sentence(reason))  # fmt: skip
+                       write_sentence(reason))  # fmt: skip
     y, u = np.atleast_2d(record.y) - rest.y, np.atleast_2d(record.u) - rest.u
     for move in (y, u):
         move[np.max(np.abs(move), axis=1) < NOTHING * abs(height)] = 0.0
     return _Motion(y, u)
 
 
-def _write_sentence(reason: CtrlidError) -> str:
+def write_sentence(reason: CtrlidError) -> str:
+    """Return the words of an error as a sentence."""
     text = str(reason)
     return text[0].upper() + text[1:] + "."
 

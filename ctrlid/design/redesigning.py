@@ -22,16 +22,18 @@ from ..loop.period_map import compute_growth_rate
 from ..loop.simulation import SimulationStopped, simulate
 from ..physics.conversions import sample_held, to_transfer_function
 from ..physics.trace import timebase
-from .controller_trial import ControllerTrial, advise_step, try_design
+from .controller_trial import (
+    CLOSE,
+    LOST,
+    ControllerTrial,
+    advise_step,
+    try_design,
+    write_sentence,
+)
 from .lead import design_lead
 from .margins import loop_margins, nu_gap, robust_margin
 from .settling import SETTLED, explain_unsettled
 from .step_height import choose_height
-
-# A response so many times the promised one is no longer under control.
-LOST = 20
-# The loss of more than this share of a promised phase margin is reported.
-CLOSE = 0.25
 
 
 @dataclass(frozen=True)
@@ -460,14 +462,14 @@ def _simulate_physical_step(
     try:
         still = simulate(loop, rest)
     except SimulationStopped as reason:
-        return np.empty(0), _write_sentence(reason), reason.unstable
+        return np.empty(0), write_sentence(reason), reason.unstable
     except ModelCannotRun as reason:
-        return np.empty(0), _write_sentence(reason), False
+        return np.empty(0), write_sentence(reason), False
     try:
         moved = simulate(loop, rest + height)
     except SimulationStopped as reason:
         response = (reason.y - still.y[: len(reason.y)]) / height
-        return response, _write_sentence(reason), reason.unstable
+        return response, write_sentence(reason), reason.unstable
     response = np.asarray((moved.y - still.y) / height, dtype=float)
     far = np.abs(response) > LOST * np.max(np.abs(promised))
     if not far.any():
@@ -478,11 +480,6 @@ def _simulate_physical_step(
     if np.any(moved.u[: k + 1] <= lower) or np.any(moved.u[: k + 1] >= upper):
         text += f", with {moved.names['u']} at its limit ({lower:g} to {upper:g})"
     return response[: k + 1], text + ".", False
-
-
-def _write_sentence(reason: CtrlidError) -> str:
-    text = str(reason)
-    return text[0].upper() + text[1:] + "."
 
 
 def _measure_performance(margins: Any, time: Array, response: Array) -> Performance:
