@@ -244,7 +244,7 @@ def test_masked_gaps_keep_all_data(tmp_path):
 
 
 def test_a_long_record(tmp_path):
-    n = 1_000_000
+    n = 200_000
     rng = np.random.default_rng(0)
     record = Record(u=rng.standard_normal(n), y=rng.standard_normal(n), dt=1e-3)
     record.to_csv(tmp_path / "long.csv")

@@ -194,6 +194,7 @@ def test_wild_readings_of_one_output_are_its_noise(output, tmp_path):
     assert again.noise == found.noise
 
 
+@pytest.mark.slow
 def test_friction_is_named_at_its_place_beside_wild_readings():
     record = simulate(800, (0.4, 0.0), seed=1, louder=make_wild(800, 1, 1))
     found = cid.diagnose(make_loop(), record, catalogue=FEW, progress=False)

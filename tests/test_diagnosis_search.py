@@ -351,6 +351,7 @@ def test_many_effects_at_once_are_no_explanation():
     assert "so many effects together can describe almost any error" in text
 
 
+@pytest.mark.slow
 def test_a_pair_is_not_taken_for_the_mixture_that_alone_gains_most():
     """Brake and dead zone: a quadratic drag gains more than either, and then needs two more."""
     plant = cid.plants.maglev(m=0.0787, K=1.561e-5)
@@ -406,6 +407,7 @@ def test_units_of_the_record_that_are_not_those_of_the_plant_are_told():
     assert "the record does not say its units" in told
 
 
+@pytest.mark.slow
 def test_a_limit_is_found_behind_a_random_force_that_stood_for_it():
     plant = cid.plants.tank(area=0.0147, outlet=7.7e-5, k=5.9e-5)
     op = cid.operating_point(plant, output=0.8)
@@ -532,6 +534,7 @@ def test_limits_far_inside_are_found_though_none_promises_anything():
     assert first.net_gain > 1.5 * refit_candidate(base, scan_candidate(base, pool[1])).net_gain
 
 
+@pytest.mark.slow
 def test_dry_friction_is_not_lost_to_a_curve_that_contains_it():
     """A fit that a large random force smooths is stuck; one that starts without it is not."""
 
@@ -693,6 +696,7 @@ def test_a_parameter_at_its_bound_does_nothing_for_an_effect(size, alone):
     assert ("AsymmetricViscousFriction.c" in trial.model.names) == alone
 
 
+@pytest.mark.slow
 def test_an_offset_ahead_of_a_curve_is_no_force_behind_it():
     """Alone the two are the same; beside a gain that falls with the input they are not."""
     loop = drive()

@@ -47,6 +47,7 @@ def test_where_nothing_is_missing_nothing_is_named():
     assert row.ratio == pytest.approx(1.0, abs=0.02)
 
 
+@pytest.mark.slow
 def test_what_no_catalogue_has_gets_no_clean_bill():
     row = drawn("outside", list(study.OUTSIDE).index("multiplicative noise"))
     assert row.verdict in ("unknown", "partly explained")

@@ -49,6 +49,7 @@ def make_drive(rng, n=400, size=0.0):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_worth_is_the_mean_of_many_log_likelihood_ratios():
     """By brute force: the ratio of the truth and the best model without it, on fresh records."""
     truth = make_drive(np.random.default_rng(1), size=2.0)
@@ -287,6 +288,7 @@ def test_a_diagnosis_rerun_from_its_seed_gives_the_same_answer():
     assert study.is_same_answer(one, two)
 
 
+@pytest.mark.slow
 def test_the_second_of_two_that_hide_together_shows_under_hardly_any_force():
     """A dead zone and a delay of six samples: beside the first the second has a small score."""
     case = cases.draw_case("two", 50017, 1500)

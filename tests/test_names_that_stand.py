@@ -115,6 +115,7 @@ def test_friction_all_along_stands():
     assert found.stand_ins == ()
 
 
+@pytest.mark.slow
 def test_what_is_beside_a_parameter_at_its_limit_is_a_stand_in():
     record = simulate_mass(steps(5), lambda t, x, v: rub(v), damping=30 * C)
     found = cid.diagnose(mass(), record, catalogue=(E.CoulombFriction,), progress=False)

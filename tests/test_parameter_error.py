@@ -100,6 +100,7 @@ def test_a_report_says_the_right_value_in_place_of_the_given_one(found):
     assert "name = m" not in str(found)
 
 
+@pytest.mark.slow
 def test_friction_beside_a_wrong_mass_keeps_its_name():
     found = cid.diagnose(make_loop(), swing(2, m=0.206, friction=0.02), progress=False)
     names = [f.names for f in found.findings]

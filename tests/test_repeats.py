@@ -94,6 +94,7 @@ def test_known_noise_is_not_tuned():
     assert here.value == pytest.approx(expected, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_a_slow_effect_is_named_where_the_reference_repeats():
     loop = drive()
     real = loop.with_effect(E.CoulombFriction(fc=1.5)).with_effect(

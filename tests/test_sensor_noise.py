@@ -137,6 +137,7 @@ def test_holding_the_colour_fits_the_force_alone():
     assert free.value > held.value > start.value
 
 
+@pytest.mark.slow
 def test_a_line_beside_averaged_noise_is_named():
     """A resonance of the noise model takes a strong line nearly for itself."""
     few = [cid.effects.SensorHum, cid.effects.SensorLag]

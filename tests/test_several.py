@@ -32,6 +32,7 @@ def test_each_record_lacks_something_else(tmp_path):
     assert str(cid.load_diagnosis(found.save(tmp_path / "found.json"), loop)) == str(found)
 
 
+@pytest.mark.slow
 def test_the_same_effect_in_two_sizes():
     loop = drive()
     reals = [loop.with_effect(E.CoulombFriction(fc=fc)) for fc in (0.3, 0.6)]

@@ -125,6 +125,7 @@ def log_drive(r, d, noise, step=0.0):
     return np.array(us), np.array(ys)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["correlated", "encoder"])
 def test_intervals_hold_under_noise_that_is_not_white(kind):
     loop, r = driving()
