@@ -11,7 +11,7 @@ import ctrlid as cid
 from ctrlid.diagnosis.fitted_model import Model
 from ctrlid.diagnosis.fresh_data import choose_fresh_data
 from ctrlid.diagnosis.gap import compute_chance_among_runs
-from ctrlid.diagnosis.gap_summary import make_size_test
+from ctrlid.diagnosis.gap_summary import make_noise_test
 from ctrlid.estimation.likelihood.kalman_filter import Noise, compute_memory
 from ctrlid.estimation.likelihood.likelihood import make_problem
 from ctrlid.estimation.likelihood.maximization import begin_fit, choose_sensor_noise, maximize
@@ -97,17 +97,26 @@ def test_the_order_of_coloured_noise_is_found_and_white_stays_white(b, a, orders
 
 @pytest.mark.parametrize("controller", ["known", "unknown"])
 def test_noise_larger_than_the_gap_is_refused_and_true_noise_is_not(controller):
-    loop, record, _ = make_loop_and_record([1.0], [1.0, -0.9], seed=5)
+    loop, record, _ = make_loop_and_record([1.0], [1.0, -0.9], n=4000, seed=5)
     if controller == "unknown":
         loop = dataclasses.replace(loop, controller=None)
     fit = maximize(begin_fit(make_problem(loop, ("k", "c"), [record])))
     fit = choose_sensor_noise(fit)
     assert not fit.noise.sensor_is_white
-    is_larger = make_size_test(choose_fresh_data(loop, [record], None))
-    assert not is_larger(Model(loop, fit))
+    is_false = make_noise_test(choose_fresh_data(loop, [record], None))
+    assert not is_false(Model(loop, fit))
     # The same record with the noise three times as large as it is.
     larger = dataclasses.replace(fit, sensor=9 * fit.sensor)
-    assert is_larger(Model(loop, larger))
+    assert is_false(Model(loop, larger))
+    # True noise beside which the parameters went astray is refused as well.
+    right = Model(loop, fit)
+    assert not is_false(right, right)
+    plant = cid.plants.servo(m=1.0, c=2.0, k=6.0)
+    astray = dataclasses.replace(loop, plant=plant, free=("c",))
+    bad = maximize(begin_fit(make_problem(astray, ("c",), [record])))
+    bad = choose_sensor_noise(bad)
+    assert is_false(Model(astray, bad), right)
+    assert not is_false(right, Model(astray, bad))
 
 
 def test_the_chance_among_runs_keeps_its_level():

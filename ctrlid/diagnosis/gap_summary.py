@@ -242,18 +242,24 @@ def make_fresh_data_test(fresh: FreshData) -> Callable[[Weighed, Model], bool]:
     return helps
 
 
-def make_size_test(fresh: FreshData) -> Callable[[Model], bool]:
-    """Return whether the noise of a model is larger than the error that the model makes.
+def make_noise_test(fresh: FreshData) -> Callable[..., bool]:
+    """Return whether fresh data falsify the noise of a model.
 
-    Noise leaves errors of its size on fresh data: no prediction is better than what cannot be
-    predicted. A noise model that explains a record only by being larger is falsified.
+    Noise leaves errors of its size there: no prediction is better than what cannot be predicted.
+    A noise model that explains a record only by being larger is falsified. So is one beside which
+    the model errs more than it did before: what belongs to the plant was called noise, and the
+    parameters went after the rest.
     """
 
-    def is_larger(model: Model) -> bool:
+    def is_false(model: Model, before: Model | None = None) -> bool:
+        if before is not None:
+            wider = fresh.compute_widening_chance(before, model)
+            if wider < THRESHOLD.beyond_chance:
+                return True
         chance = fresh.compute_size_chance(fresh.prepare_loops(model), model.fit)
         return chance < THRESHOLD.beyond_chance
 
-    return is_larger
+    return is_false
 
 
 def _compute_share_closed(closed: float, before: float, floor: float) -> float:

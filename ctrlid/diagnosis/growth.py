@@ -65,7 +65,7 @@ class Search:
 
 def search_effects(
     base: Model, catalogue: Sequence[type[AbstractEffect]], work: Work,
-    tell: Callable[..., None], is_larger: Callable[[Model], bool], first: Sequence[Round] = (),
+    tell: Callable[..., None], is_false: Callable[..., bool], first: Sequence[Round] = (),
 ) -> Search:  # fmt: skip
     """Add effects to a base model until nothing more earns a place, and drop what is superfluous.
 
@@ -79,8 +79,8 @@ def search_effects(
         ``work(function, items)``, a map that may run in parallel.
     tell : callable
         Told what is being done.
-    is_larger : callable
-        ``is_larger(model)``: whether the noise of a model exceeds what the model leaves.
+    is_false : callable
+        ``is_false(model)``: whether fresh data falsify the noise of a model.
     first : sequence of Round, optional
         The rounds that another search had taken when it changed a choice. This one goes on from
         there and takes nothing back.
@@ -93,7 +93,7 @@ def search_effects(
     before = [(step.base, step.best) for step in first[:-1] if step.best is not None]
     reached = Reached(base, list(first), base, before)
     try:
-        return _grow_model(base, catalogue, work, tell, is_larger, first, reached)
+        return _grow_model(base, catalogue, work, tell, is_false, first, reached)
     except Stopped:
         return _end_search(reached)
 
@@ -125,7 +125,7 @@ class Reached:
 
 def _grow_model(
     base: Model, catalogue: Sequence[type[AbstractEffect]], work: Work,
-    tell: Callable[..., None], is_larger: Callable[[Model], bool], first: Sequence[Round],
+    tell: Callable[..., None], is_false: Callable[..., bool], first: Sequence[Round],
     reached: Reached,
 ) -> Search:  # fmt: skip
     """Take the rounds of `search_effects`, and keep what was reached."""
@@ -159,7 +159,7 @@ def _grow_model(
         given_values = None if steps else restore_given_values(base)
         step = run_round(model, pool, work, given_values, beside=bool(steps))
         # Noise may be coloured and have heavy tails, one after the other.
-        while (other := prefer_sensor_noise(model, step.best, is_larger)) is not None:
+        while (other := prefer_sensor_noise(model, step.best, is_false)) is not None:
             tell(f"{head}: screening beside other sensor noise")
             model, base = other, base if steps else other
             reached.model, reached.base = model, base
@@ -221,26 +221,26 @@ def _end_search(reached: Reached) -> Search:
     return Search(base, tuple(reached.steps), model, tuple(found), before, after, finished=False)
 
 
-def refuse_false_noise(found: Search, is_larger: Callable[[Model], bool]) -> Search:
+def refuse_false_noise(found: Search, is_false: Callable[..., bool]) -> Search:
     """Return the search without sensor noise that stands for something else.
 
     Parameters
     ----------
     found : Search
         The end of a search.
-    is_larger : callable
-        ``is_larger(model)``: whether the noise of a model exceeds what the model leaves.
+    is_false : callable
+        ``is_false(model)``: whether fresh data falsify the noise of a model.
     """
-    return _refuse_bursts(_refuse_larger_noise(found, is_larger))
+    return _refuse_bursts(_refuse_larger_noise(found, is_false))
 
 
-def _refuse_larger_noise(found: Search, is_larger: Callable[[Model], bool]) -> Search:
+def _refuse_larger_noise(found: Search, is_false: Callable[..., bool]) -> Search:
     """Return the search with white sensor noise in the place of what exceeds the gap that it left.
 
     Coloured noise that was chosen before the effects were found may be too large beside them.
     """
     fit = found.final.fit
-    if fit.noise.sensor_is_white or fit.known is not None or not is_larger(found.final):
+    if fit.noise.sensor_is_white or fit.known is not None or not is_false(found.final):
         return found
     return _weigh_with_noise(found, fit.noise.plain)
 

@@ -30,13 +30,13 @@ from .thresholds import THRESHOLD
 
 
 def prefer_sensor_noise(
-    model: Model, best: Trial | None, is_larger: Callable[[Model], bool]
+    model: Model, best: Trial | None, is_false: Callable[..., bool]
 ) -> Model | None:
     """Return the model with other sensor noise if that gains about as much as the best effect.
 
     Coloured, or with heavy tails. An effect has to gain more than the noise by as much as it has to
-    gain beside none: a slow wander of the sensor looks like a drift. Not where the noise is larger
-    than the error that it explains.
+    gain beside none: a slow wander of the sensor looks like a drift. Not where fresh data falsify
+    the noise, because it is larger than the error that it explains, or because that grows with it.
     """
     fit = model.fit
     if fit.known is not None or not math.isfinite(fit.value) or _rounds_most(fit):
@@ -64,7 +64,7 @@ def prefer_sensor_noise(
     if not gain > more:
         return None
     newly_coloured = fit.noise.sensor_is_white and not other.noise.sensor_is_white
-    if newly_coloured and is_larger(Model(model.loop, other)):
+    if newly_coloured and is_false(Model(model.loop, other), model):
         return None
     if newly_coloured and best is not None and _rings_on(other):
         beside = _colour_beside(best, other)

@@ -31,7 +31,7 @@ from .fresh_data import FreshData, check_length, choose_fresh_data
 from .gap_summary import (
     lengthen_horizon,
     make_fresh_data_test,
-    make_size_test,
+    make_noise_test,
     replace_divergence,
     summarize_gap,
     take_back_widening,
@@ -256,16 +256,16 @@ def _answer_question(q: Question) -> tuple[Diagnosis, Search]:
     if not q.budget.kept:
         q.budget.keep_back(time.monotonic() - q.budget.start)
     # Steps 3 to 7: effects are screened, refitted, decided upon, added and dropped.
-    is_larger = make_size_test(q.fresh)
+    is_false = make_noise_test(q.fresh)
     with q.budget.running():
-        search = search_effects(base, q.catalogue, q.work, q.tell, is_larger)
+        search = search_effects(base, q.catalogue, q.work, q.tell, is_false)
     if search.finished and not search.after.passed and q.loop.equations().siso:
         # Beside what the effects explained, the steps of a converter may be all that is left.
         stepped = _add_steps(q, search.final)
         if stepped is not None:
             return _answer_question(stepped)
     if search.finished:
-        search = refuse_false_noise(search, is_larger)
+        search = refuse_false_noise(search, is_false)
     else:
         q.end()
     search = replace(search, final=measure_rounding(search.final))
@@ -291,7 +291,7 @@ def _answer_question(q: Question) -> tuple[Diagnosis, Search]:
     if search.other and not search.after.passed:
         # Perhaps neither search explains the record; fresh data tell which of them leads further.
         q.tell("second search")
-        search = q.attempt(lambda: _search_again(q, base, search, helps, is_larger), search)
+        search = q.attempt(lambda: _search_again(q, base, search, helps, is_false), search)
     q.tell("comparing on fresh data")
     # Step 8: what else would do in the place of each effect.
     if search.finished:
@@ -339,13 +339,13 @@ def _add_steps(q: Question, model: Model) -> Question | None:
 
 def _search_again(
     q: Question, base: Model, search: Search, helps: Callable[[Weighed, Model], bool],
-    is_larger: Callable[[Model], bool],
+    is_false: Callable[..., bool],
 ) -> Search:  # fmt: skip
     """Return the better of two searches, the second of which keeps what the first took back."""
-    other = search_effects(base, q.catalogue, q.work, q.tell, is_larger, search.other)
+    other = search_effects(base, q.catalogue, q.work, q.tell, is_false, search.other)
     if not other.finished:
         raise Stopped
-    other = refuse_false_noise(other, is_larger)
+    other = refuse_false_noise(other, is_false)
     return choose_search(search, other, helps, q.fresh.measure_model_gap)
 
 
