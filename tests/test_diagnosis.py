@@ -86,6 +86,8 @@ def test_one_effect_is_named_and_closes_the_gap(build, effect, seed, options):
     assert found.ranking[0].gain == max(
         c.gain for c in found.ranking if c.round == 1 and np.isfinite(c.gain) and not c.remark
     )
+    assert type(effect) in [type(c.effect) for c in found.ranking if c.taken]
+    assert len({c.round for c in found.ranking if c.taken}) == sum(c.taken for c in found.ranking)
     assert type(effect).__name__ in str(found)
 
 

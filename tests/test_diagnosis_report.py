@@ -402,8 +402,9 @@ def test_picture_of_an_explanation(found):
         "required net gain, 5",
         "found",
         "not told apart",
-        "refitted",
-        "not refitted",
+        "put out",
+        "fitted, not taken",
+        "screened only, not fitted",
     }
     names = [tick.get_text() for tick in ranking.get_yticklabels()]
     assert names == ["", "CoulombFriction", "StribeckFriction", "ViscousFriction", "ActuatorLag",
@@ -428,10 +429,67 @@ def test_an_effect_is_drawn_as_found_in_the_round_that_took_it(found):
     ranking = tuple(replace(bar, round=k, gain=g) for k, g in ((1, 900.0), (2, 400.0), (3, 2.0)))
     rounds = _pictures.make_ranking(replace(base, ranking=ranking))
     assert {k: bars[0].kind for k, bars in rounds.items()} == {
-        1: "refitted", 2: "found", 3: "refitted"}  # fmt: skip
+        1: "fitted, not taken", 2: "found", 3: "fitted, not taken"}  # fmt: skip
     assert rounds[2][0].evidence == base.findings[0].evidence
     shown = [t.get_text() for t in plot.diagnosis(replace(base, ranking=ranking))[4].texts]
     assert any(t.endswith(f"; evidence {base.findings[0].evidence:.0f}") for t in shown)
+
+
+def test_a_bar_beyond_the_line_that_is_no_name_is_explained(found):
+    """A bar of 55 that no fit had confirmed stood beyond the line, and nothing said what it was."""
+    base = found["explained"]
+    rows = {type(c.effect).__name__: c for c in base.ranking}
+    friction = rows["CoulombFriction"]
+    cases = (
+        (rows["ActuatorLag"], "screened only, not fitted", "was only screened"),
+        (rows["ViscousFriction"], "put out", "is put out"),
+        (replace(rows["ViscousFriction"], remark=""), "fitted, not taken", "takes one effect"),
+        (replace(rows["InputDelay"], round=1, gain=30.0, taken=True),
+         "taken, later replaced or dropped", "gives way"),
+    )  # fmt: skip
+    for other, kind, words in cases:
+        shown = replace(base, ranking=(friction, other))
+        (bars,) = _pictures.make_ranking(shown).values()
+        assert {bar.label: bar.kind for bar in bars} == {
+            "CoulombFriction": "found", type(other.effect).__name__: kind}  # fmt: skip
+        ax = plot.diagnosis(shown)[4]
+        assert kind in legend(ax)
+        caption = " ".join(ax.texts[-1].get_text().split())
+        assert caption.startswith("A bar beyond the dashed line need not be a name")
+        assert words in caption
+        unsure = [t for t in ax.texts if t.get_text().startswith("about ")]
+        assert bool(unsure) == (kind == "screened only, not fitted")
+        below = replace(base, ranking=(friction, replace(other, score=1.0, gain=other.gain * 0)))
+        assert _pictures.explain_bars(_pictures.make_ranking(below)) == ""
+
+
+def test_a_name_that_does_not_stand_is_no_find_in_the_picture(found):
+    base = found["explained"]
+    doubted = replace(base, findings=(), stand_ins=base.findings)
+    kinds = {bar.kind for bar in _pictures.make_ranking(doubted)[1]}
+    assert "in the model, but its name does not stand" in kinds
+    assert "found" not in kinds
+
+
+def test_a_shorter_bar_that_was_taken_is_explained(found):
+    base = found["explained"]
+    friction, *_ = base.ranking
+    longer = replace(friction, effect=E.ViscousFriction(c=6.0), gain=900.0)
+    rounds = _pictures.make_ranking(replace(base, ranking=(friction, longer)))
+    assert "looked back" in _pictures.explain_bars(rounds)
+    longer = replace(longer, gain=500.0)
+    rounds = _pictures.make_ranking(replace(base, ranking=(friction, longer)))
+    assert "looked back" not in _pictures.explain_bars(rounds)
+
+
+def test_the_caption_stays_in_the_figure(found):
+    picture = plot.diagnosis(found["explained"])
+    picture.figure.draw_without_rendering()
+    box, page = picture[4].texts[-1].get_window_extent(), picture.figure.bbox
+    assert page.x0 <= box.x0
+    assert box.x1 <= page.x1
+    assert box.y0 >= page.y0
+    assert box.y1 <= picture[4].xaxis.label.get_window_extent().y0
 
 
 def test_legends_stay_in_the_figure_and_ticks_are_plain_numbers(found):

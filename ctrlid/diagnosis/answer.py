@@ -277,7 +277,8 @@ def _rank_candidates(found: Search) -> tuple[Candidate, ...]:
             effect = t.fitted if refitted else t.effect
             full_penalty = t.penalty if refitted else t.full_penalty
             remark = "" if t.out is None else t.out.words
-            rows.append(Candidate(k + 1, effect, t.score, t.gain, full_penalty, remark))
+            taken = step.best is not None and is_same_kind(t.effect, step.best.effect)
+            rows.append(Candidate(k + 1, effect, t.score, t.gain, full_penalty, remark, taken))
     return tuple(rows)
 
 

@@ -214,6 +214,9 @@ class Candidate:
         Half of the Bayesian penalty for its parameters and for what was scanned.
     remark : str
         Why it is out, or what else was seen; empty if nothing.
+    taken : bool
+        Whether its round took it into the model. It need not be in the answer: a later step may
+        have dropped it, or put another in its place. False in files of earlier versions.
     """
 
     round: int
@@ -222,6 +225,7 @@ class Candidate:
     gain: float
     penalty: float
     remark: str = ""
+    taken: bool = False
 
 
 @dataclass(frozen=True, eq=False, repr=False)

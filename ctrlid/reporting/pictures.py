@@ -135,7 +135,10 @@ def choose_two_most_telling(found: Diagnosis) -> list[BinnedErrors]:
     return sorted(found.where, key=lambda place: place.p_before)[:2]
 
 
-Kind = Literal["found", "not told apart", "refitted", "not refitted"]
+Kind = Literal[
+    "found", "in the model, but its name does not stand", "not told apart",
+    "taken, later replaced or dropped", "fitted, not taken", "put out", "screened only, not fitted",
+]  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -148,18 +151,21 @@ class Bar:
         Its name.
     net_gain : float
         Its gain of log-likelihood less the penalty of the Bayesian criterion.
-    kind : {"found", "not told apart", "refitted", "not refitted"}
-        What became of it; of one that was not refitted the gain is the score, which its first
-        step expects.
+    kind : str
+        What became of it, in the words of the legend; of one that was only screened the gain is
+        the score, which its first step expects.
     evidence : float
         The evidence of what was found, in the end: its gain over the model without it but with all
         other effects; NaN for others.
+    fitted : bool
+        Whether a fit has confirmed the gain.
     """
 
     label: str
     net_gain: float
     kind: Kind
     evidence: float = math.nan
+    fitted: bool = True
 
 
 def make_ranking(found: Diagnosis) -> dict[int, list[Bar]]:
@@ -175,8 +181,9 @@ def make_ranking(found: Diagnosis) -> dict[int, list[Bar]]:
         earned = [c for c in own if value[id(c)] > THRESHOLD.gate] or own
         if not earned:
             continue
-        taken = max(earned, key=lambda c: c.round)
-        kinds[id(taken)] = "found"
+        taken = max(earned, key=lambda c: (c.taken, c.round))
+        stands = finding in found.findings
+        kinds[id(taken)] = "found" if stands else "in the model, but its name does not stand"
         evidence[id(taken)] = finding.evidence
         for c in found.ranking:
             if c.round == taken.round and name_at_place(c.effect) in (
@@ -189,12 +196,56 @@ def make_ranking(found: Diagnosis) -> dict[int, list[Bar]]:
                        key=lambda c: (id(c) not in kinds, -value[id(c)]))  # fmt: skip
         shown = sorted(tried[:BARS], key=lambda c: -value[id(c)])
         rounds[number] = [
-            Bar(name_at_place(c.effect), value[id(c)],
-                kinds.get(id(c), "refitted" if math.isfinite(c.gain) else "not refitted"),
-                evidence.get(id(c), math.nan))
+            Bar(name_at_place(c.effect), value[id(c)], kinds.get(id(c), _tell_kind(c)),
+                evidence.get(id(c), math.nan), math.isfinite(c.gain))
             for c in shown
         ]  # fmt: skip
     return rounds
+
+
+def _tell_kind(c: Candidate) -> Kind:
+    """Return what became of a candidate that is not in the answer."""
+    if c.taken:
+        return "taken, later replaced or dropped"
+    if c.remark:
+        return "put out"
+    return "fitted, not taken" if math.isfinite(c.gain) else "screened only, not fitted"
+
+
+# What is told of bars beyond the line that are no names, by what became of the candidate.
+REASONS: dict[Kind, str] = {
+    "taken, later replaced or dropped": "One that was taken gives way where, at the end, another "
+    "explains the record as well or better, or where it is superfluous or widens the gap.",
+    "put out": "One is put out where its gain proves nothing; 'What was tried' in the report of "
+    "write_report() says why.",
+    "screened only, not fitted": "The gain of one that was only screened is a rough estimate by "
+    "one step of a fit; it fell too far behind the best of its round to be fitted.",
+    "in the model, but its name does not stand": "The note of one whose name does not stand says "
+    "on what ground.",
+}  # fmt: skip
+
+
+def explain_bars(rounds: Mapping[int, Sequence[Bar]]) -> str:
+    """Say why candidates beyond the line need not be names; empty where there are none."""
+    beyond = {bar.kind for bars in rounds.values() for bar in bars
+              if bar.net_gain > THRESHOLD.gate} - {"found"}  # fmt: skip
+    if not beyond:
+        return ""
+    words = ["A bar beyond the dashed line need not be a name: each round takes one effect, and "
+             "the others must earn their place again beside it in the next round."]  # fmt: skip
+    words += [text for kind, text in REASONS.items() if kind in beyond]
+    if any(map(_took_shorter_bar, rounds.values())):
+        words.append("A shorter bar is taken where the search looked back and saw that it leads "
+                     "further, together with the next effect.")  # fmt: skip
+    return " ".join(words)
+
+
+def _took_shorter_bar(bars: Sequence[Bar]) -> bool:
+    """Whether a round took an effect that gains less than another which stood to be taken."""
+    kept = ("found", "in the model, but its name does not stand",
+            "taken, later replaced or dropped")  # fmt: skip
+    best = max((bar.net_gain for bar in bars if bar.kind in kept), default=math.inf)
+    return any(bar.net_gain > best for bar in bars if bar.kind == "fitted, not taken")
 
 
 def _compute_net_gain(c: Candidate) -> float:

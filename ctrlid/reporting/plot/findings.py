@@ -1,5 +1,6 @@
 """The picture of a diagnosis: the gap, where the errors are, and the candidates."""
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -32,9 +33,18 @@ AFTER = {"color": COLOURS[0], "linestyle": "-", "linewidth": 1.4}
 FILLS: dict[str, dict[str, Any]] = {
     "found": {"facecolor": COLOURS[0], "edgecolor": "k"},
     "not told apart": {"facecolor": COLOURS[5], "edgecolor": "k", "hatch": "////"},
-    "refitted": {"facecolor": "0.75", "edgecolor": "0.3"},
-    "not refitted": {"facecolor": "w", "edgecolor": "0.3", "linestyle": "--"},
-}
+    "in the model, but its name does not stand": {
+        "facecolor": COLOURS[0], "edgecolor": "w", "hatch": "xxx"},
+    "taken, later replaced or dropped": {
+        "facecolor": "0.75", "edgecolor": COLOURS[0], "hatch": "...."},
+    "fitted, not taken": {"facecolor": "0.75", "edgecolor": "0.3"},
+    "put out": {"facecolor": "0.92", "edgecolor": "0.3", "hatch": "xxx"},
+    "screened only, not fitted": {
+        "facecolor": "w", "edgecolor": "0.45", "hatch": "////", "linestyle": "--"},
+}  # fmt: skip
+# What explains the bars is broken after so many characters, and begins so far below the axes [pt].
+CAPTION_WIDTH = 100
+CAPTION_BELOW = 38
 
 
 @explain_names
@@ -44,7 +54,8 @@ def diagnosis(found: Diagnosis, ax: Any = None) -> Picture:
     From top to bottom: the measured output against the model before and after, on those samples
     kept back on which it erred most; the errors against the noise floor; RMS one-step errors along
     the two most telling quantities, in units of noise; and the evidence for each candidate, by
-    rounds of the search.
+    rounds of the search. What became of a candidate is in the legend, and below it why one beyond
+    the line that a gain must pass need not be a name.
 
     Parameters
     ----------
@@ -68,7 +79,8 @@ def diagnosis(found: Diagnosis, ax: Any = None) -> Picture:
     own = ax is None
     if own:
         rows = max(sum(len(bars) + 1 for bars in rounds.values()), 3)
-        height = 0.21 * rows + 0.9
+        lines = len(textwrap.wrap(_pictures.explain_bars(rounds), CAPTION_WIDTH))
+        height = 0.21 * rows + 0.9 + 0.16 * lines
         layout = [["output"] * 2, ["error"] * 2, ["first", "second"], ["ranking"] * 2]
         heights = [2.5, 1.9, 2.2, height]
         made = new_figure((8.0, sum(heights))).subplot_mosaic(
@@ -190,11 +202,14 @@ def _draw_ranking(ax: Any, rounds: Mapping[int, Sequence[_pictures.Bar]]) -> Non
         for bar in bars:
             ax.barh(row, bar.net_gain, 0.72, linewidth=0.7, **FILLS[bar.kind],
                     label=None if bar.kind in drawn else bar.kind)  # fmt: skip
-            words = f"{bar.net_gain:.0f}"
+            # The gain of what no fit has confirmed is told as the estimate that it is.
+            about = "" if bar.fitted else "about "
+            words = f"{about}{round(bar.net_gain)}"
             if np.isfinite(bar.evidence):
                 words += f"; evidence {bar.evidence:.0f}"
             ax.annotate(words, (max(bar.net_gain, 0.0), row), (3, 0), va="center",
-                        textcoords="offset points", fontsize="x-small")  # fmt: skip
+                        textcoords="offset points", fontsize="x-small",
+                        bbox={"facecolor": "w", "edgecolor": "none", "pad": 0.5})  # fmt: skip
             drawn.add(bar.kind)
             labels.append(bar.label)
             row += 1
@@ -210,5 +225,11 @@ def _draw_ranking(ax: Any, rounds: Mapping[int, Sequence[_pictures.Bar]]) -> Non
     ax.tick_params(axis="y", length=0)
     ax.set_ylim(row - 0.4, -0.6)
     ax.set_xlabel("net gain in its round, less the Bayesian penalty (BIC) [log-likelihood]")
+    caption = textwrap.fill(_pictures.explain_bars(rounds), CAPTION_WIDTH)
+    if caption:
+        ax.annotate(
+            caption, (0, 0), (0, -CAPTION_BELOW), xycoords="axes fraction", va="top",
+            textcoords="offset points", fontsize="small", annotation_clip=False,
+        )  # fmt: skip
     finish_axes(ax, columns=5, size="small")
     ax.grid(False, axis="y")
