@@ -463,6 +463,30 @@ def test_a_bar_beyond_the_line_that_is_no_name_is_explained(found):
         assert _pictures.explain_bars(_pictures.make_ranking(below)) == ""
 
 
+def test_two_drifts_are_told_apart_by_their_parameters(found, tmp_path):
+    """Headline, picture and page said "ParameterDrift and ParameterDrift", and not of what."""
+    base = found["explained"]
+    drifts = [E.ParameterDrift("K", rate=-0.01), E.ParameterDrift("m", rate=0.02)]
+    one, two = (replace(base.findings[0], effect=e, alternatives=(), standard_errors={"rate": 1e-3})
+                for e in drifts)  # fmt: skip
+    assert wording.join_names([one, two]) == "ParameterDrift of K and ParameterDrift of m"
+    assert wording.join_names([replace(one, alternatives=(drifts[1],))]) == (
+        "ParameterDrift of K or ParameterDrift of m"
+    )
+    rows = tuple(Candidate(1, e, 90.0, g, 5.0) for e, g in zip(drifts, (90.0, 80.0), strict=True))
+    both = replace(base, findings=(two,), ranking=rows,
+                   sensitivity={"ParameterDrift of m.rate": 0.1})  # fmt: skip
+    assert [(bar.label, bar.kind) for bar in _pictures.make_ranking(both)[1]] == [
+        ("ParameterDrift of K", "fitted, not taken"), ("ParameterDrift of m", "found")]  # fmt: skip
+    assert legend(plot.diagnosis(both)[0])[-1].endswith("with ParameterDrift of m")
+    assert "1. ParameterDrift of m: a parameter of the plant drifts" in text(both)
+    assert wording.list_sensitivity_rows(both) == [("ParameterDrift of m.rate", "0.1 1/s")]
+    page = cid.write_report(both, tmp_path / "report.html").read_text("utf-8")
+    assert all(f">ParameterDrift of {name}<" in page for name in "Km")
+    doubted = replace(one, alternatives=(drifts[1],))
+    assert "ONE OF 2 EFFECTS" in wording.describe_certainty(both, doubted)
+
+
 def test_a_name_that_does_not_stand_is_no_find_in_the_picture(found):
     base = found["explained"]
     doubted = replace(base, findings=(), stand_ins=base.findings)
@@ -578,6 +602,43 @@ def test_text_and_picture_count_the_same_samples(found):
         assert f"simulation of {kept} samples kept back" in text(same)
         label = plot.diagnosis(same)[1].get_xlabel()
         assert label == f"time [s], where the gap is largest among {among} samples kept back"
+
+
+def test_predictions_at_some_samples_are_counted_as_a_part_of_those_kept_back(found):
+    """A picture said "375 of 26 samples": of 375 kept back, 26 were predicted."""
+    base = found["explained"]
+    sparse = np.where(np.arange(1000) % 40 == 0, base.gap.simulated_after, np.nan)
+    ahead = replace(base.gap, kind="prediction", horizon=160, simulated_after=sparse, samples=25)
+    several = replace(ahead, samples=60)  # of three records
+    pair = replace(ahead, samples=50, outputs=(ahead, replace(ahead, output="z")))
+    for gap, told, drawn in (
+        (ahead, "at 25 of the 1000 samples kept back", "25 of 1000 samples kept back"),
+        (pair, "at 25 of the 1000 samples kept back", "25 of 1000 samples kept back"),
+        (several, "at 60 of the samples kept back", "25 of 60 samples kept back"),
+    ):
+        same = replace(base, gap=gap)
+        assert f"RMS error of the 160-step prediction {told}" in text(same)
+        label = plot.diagnosis(same)[1].get_xlabel()
+        assert label == f"time [s], where the gap is largest among {drawn}"
+
+
+def test_a_rejected_law_is_said_to_make_the_gap_one_of_predictions(tmp_path):
+    loop = drive()
+    record = record_of(loop, swing=0.1, hold=60, n=600, seed=1, sensor_noise=1e-4)
+    other = replace(loop, controller=cid.PID(kp=4.0, ki=4.0, kd=0.3, filter_time=0.02))
+    words = ("The law of the controller is rejected, since it is not what computed the logged "
+             "input, so that this gap is that of predictions, which use")  # fmt: skip
+    for model, there in ((loop, False), (other, True)):
+        judged = cid.diagnose(model, record, catalogue=(), progress=False)
+        assert (judged.gap.kind == "prediction") == there
+        assert (words in text(judged)) == there
+        page = cid.write_report(judged, tmp_path / "report.html").read_text("utf-8")
+        assert (words in page) == there
+        assert str(load_diagnosis(judged.save(tmp_path / "found.json"))) == str(judged)
+    blind = cid.diagnose(replace(loop, controller=None), record, catalogue=(), progress=False)
+    assert "No controller is given, and the plant alone does not come to rest" in text(blind)
+    mute = cid.diagnose(loop, replace(record, r=None), catalogue=(), progress=False)
+    assert "The record lacks a reference of the controller" in text(mute)
 
 
 def test_picture_on_given_axes(found):
@@ -700,7 +761,7 @@ def test_the_rest_of_a_small_catalogue_is_counted_in_words(rivals, words):
     starts = {"ViscousFriction": E.ViscousFriction(c=0.1), "ActuatorLag": E.ActuatorLag(tau=0.1)}
     tried = [friction, *(starts[name] for name in rivals)]
     finding = SimpleNamespace(evidence=50.0, share=np.nan, names=("CoulombFriction",),
-                              equivalents=(), effect=friction)  # fmt: skip
+                              equivalents=(), effect=friction, alternatives=())  # fmt: skip
     found = SimpleNamespace(added=(finding,), verdict="explained",
                             ranking=[SimpleNamespace(effect=e) for e in tried])  # fmt: skip
     assert words in wording.describe_certainty(found, finding)

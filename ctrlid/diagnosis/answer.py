@@ -11,6 +11,7 @@ from .._base.text import write_count, write_quantity
 from .._base.units import fill_unit
 from ..data.record import Record
 from ..effects import AbstractEffect, Quantization, equivalents
+from ..effects.base import name_with_subject
 from ..estimation.likelihood.filter_data import find_noise_units
 from ..estimation.likelihood.likelihood import Fit
 from ..estimation.likelihood.physics_fit import summarize_fit
@@ -289,7 +290,8 @@ def _find_sensitivity(found: Search) -> dict[str, float]:
         return sizes
     for t in found.steps[-1].trials:
         size = _find_smallest_visible(t)
-        key = f"{t.key}.{t.effect.parameters()[0].name}" if t.effect.parameters() else t.key
+        kind, own = name_with_subject(t.effect), t.effect.parameters()
+        key = f"{kind}.{own[0].name}" if own else kind
         if math.isfinite(size) and key not in sizes:
             sizes[key] = size
     return sizes

@@ -75,6 +75,9 @@ class Gap(Printed):
     force_unit : str
         Unit of a force per unit of mass: that of the position, which an output may show scaled, per
         s^2; by default by the unit of the output.
+    reason : str
+        Why the gap is that of a prediction and not of a simulation, as a clause; empty for a
+        simulation, and in files of earlier versions.
     """
 
     kind: GapKind
@@ -96,6 +99,7 @@ class Gap(Printed):
     output: str = ""
     outputs: tuple["Gap", ...] = ()
     force_unit: str = ""
+    reason: str = ""
 
     def __post_init__(self) -> None:
         freeze_arrays(self)

@@ -14,7 +14,6 @@ from ..estimation.likelihood.likelihood import Fit
 from ..loop.loop import Loop
 from ..validation.reproduction import (
     CLOSED_LOOP,
-    Reproduction,
     choose_prediction,
     find_longest_horizon,
 )
@@ -134,7 +133,7 @@ def _make_gap(
     return Gap(
         kind, given, before, left, floor.both, unit, time, measured, start, end, floor.widest,
         how.horizon, recalibrated, how == CLOSED_LOOP, trivial,
-        sum(int(np.count_nonzero(w.mask)) for w in windows), name,
+        sum(int(np.count_nonzero(w.mask)) for w in windows), name, reason=how.reason,
     )  # fmt: skip
 
 
@@ -152,7 +151,7 @@ def lengthen_horizon(loop: Loop, found: Search, fresh: FreshData) -> FreshData:
     longest = max(find_longest_horizon(w.record) for w in windows)
     loops = [(x,) * len(windows) for x in (loop, found.base.fitted, found.final.fitted)]
     while True:
-        longer = replace(fresh, how=Reproduction("prediction", horizon))
+        longer = replace(fresh, how=replace(fresh.how, horizon=horizon))
         results = [longer.simulate_outputs(x) for x in loops]
         shared = gaps.share_samples(windows, results)
         *bare, complete = (gaps.root_mean_square(shared, y) for y in results)

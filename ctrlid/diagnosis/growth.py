@@ -8,7 +8,7 @@ import numpy as np
 from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from .._base.interruption import Stopped
 from ..effects import AbstractEffect
-from ..effects.base import name_at_place
+from ..effects.base import name_at_place, name_with_subject
 from ..estimation.likelihood.kalman_filter import Noise
 from ..estimation.likelihood.likelihood import Fit
 from ..estimation.likelihood.maximization import choose_noise, maximize, refit_noise_size
@@ -139,7 +139,7 @@ def _grow_model(
     while not steps or steps[-1].best is not None:
         if steps and steps[-1].best is not None:
             head = _name_round(len(steps), seen, again=bool(first))
-            tell(f"{head}: {steps[-1].best.key} with all else")
+            tell(f"{head}: {name_with_subject(steps[-1].best.effect)} with all else")
             reached.keep(steps[-1].base, steps[-1].best)
             reached.model = steps[-1].best.model
             model = refit_noise(order_last_effect(steps[-1].best.model, given))

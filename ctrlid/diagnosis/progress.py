@@ -9,6 +9,7 @@ from tqdm import tqdm
 
 from .._base.interruption import Budget
 from .._base.text import write_count, write_number
+from ..effects.base import name_with_subject
 from .candidates import Trial
 from .thresholds import THRESHOLD
 
@@ -122,7 +123,7 @@ class Progress:
         assert self.leader is not None
         gain = self.leader.gain
         evidence = write_number(gain, 3) if gain < THRESHOLD.certain else f"{gain:.0f}"
-        return f"{self.leader.key} leads with an evidence of {evidence}"
+        return f"{name_with_subject(self.leader.effect)} leads with an evidence of {evidence}"
 
     def describe_place(self) -> str:
         """Say where the search is."""

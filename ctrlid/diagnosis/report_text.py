@@ -76,7 +76,8 @@ def write_gap_lines(gap: Gap) -> list[str]:
     rows = [f"    {label:<{max(wide + 1, 20)}}{size:>12}   {times}"
             for label, size, times in wording.list_gap_rows(gap)]  # fmt: skip
     head = _wrap_text(wording.introduce_gap(gap), 2, hang=4)
-    words = (wording.describe_shrinking(gap), wording.describe_trivial(gap))
+    words = (wording.explain_prediction(gap), wording.describe_shrinking(gap),
+             wording.describe_trivial(gap))  # fmt: skip
     return [*head, *rows, *(line for text in words for line in _wrap_text(text, 4))]
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from .._base.text import write_p_value, write_quantity
 from ..effects import AbstractEffect
-from ..effects.base import name_at_place
+from ..effects.base import name_with_subject
 from ..estimation.likelihood.likelihood import Fit
 from .findings import BinnedErrors, Disturbance, Finding, Gap, SensorNoise, Verdict
 from .noise_tests import NoiseTests, choose_alarm_level
@@ -103,7 +103,7 @@ def find_doubt(
     for one, other in itertools.combinations(range(len(effects)), 2):
         alone = max(gains[one], gains[other]) < THRESHOLD.residue * total
         if alone and _are_look_alikes(effects[one], effects[other]):
-            names = [name_at_place(effects[k]) for k in (one, other)]
+            names = [name_with_subject(effects[k]) for k in (one, other)]
             return (f"{names[0]} and {names[1]} are look-alikes, and either alone explains nearly "
                     "all of the error: both may stand in for one other effect")  # fmt: skip
     return None

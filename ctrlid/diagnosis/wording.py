@@ -18,7 +18,7 @@ from .._base.text import (
     write_quantity,
 )
 from ..effects import AbstractEffect, ParameterError, ReadingEffect
-from ..effects.base import name_at_place
+from ..effects.base import name_at_place, name_with_subject
 from .findings import COMPLETE, BinnedErrors, Disturbance, Finding, Gap
 from .noise_tests import choose_alarm_level
 from .saving import list_units
@@ -100,7 +100,11 @@ def list_names(finding: Finding) -> list[str]:
     first, *others = finding.names
     of_plant = first.startswith(PARAMETER)
     names = dict.fromkeys([first, *finding.equivalents, *others])
-    return [_write_name(name, of_plant or name in others) for name in names]
+    spoken: dict[str, list[str]] = {}
+    for name, effect in zip(finding.names, (finding.effect, *finding.alternatives), strict=True):
+        spoken.setdefault(name, []).append(name_with_subject(effect))
+    return [_write_name(words, of_plant or name in others)
+            for name in names for words in spoken.get(name, [name])]  # fmt: skip
 
 
 def _write_name(name: str, missing: bool) -> str:
@@ -144,10 +148,7 @@ def explain_evidence() -> str:
 
 def introduce_gap(gap: Gap) -> str:
     """Say what the gap is."""
-    text = (
-        f"gap between model and record: RMS error of the {gap.name} of "
-        f"{write_count(count_samples(gap), 'sample')} kept back"
-    )
+    text = f"gap between model and record: RMS error of the {gap.name} {_tell_samples(gap)}"
     if gap.outputs:
         names = write_list([part.output for part in gap.outputs])
         text += f", of {names} together in units of their noise floors"
@@ -157,6 +158,47 @@ def introduce_gap(gap: Gap) -> str:
 def count_samples(gap: Gap) -> int:
     """Return how many samples were kept back; one of several outputs is one sample."""
     return max(part.samples or len(part.time) for part in gap.outputs or (gap,))
+
+
+def _find_counted(gap: Gap) -> tuple[Gap, int, int]:
+    """Return the output that has most samples, how many are kept back, and how many compared.
+
+    Both are those of the first record. A prediction far ahead is not made at each sample, and what
+    a model makes nothing of is not compared.
+    """
+    part = max(gap.outputs or (gap,), key=lambda p: p.samples or len(p.time))
+    known = [np.isfinite(v) for v in (part.simulated_before, part.simulated_after)]
+    known = [mask for mask in known if mask.any()]
+    kept = len(part.time)
+    return part, kept, int(np.count_nonzero(np.logical_and.reduce(known))) if known else kept
+
+
+def _tell_samples(gap: Gap) -> str:
+    """Say at how many samples the RMS errors are, of how many that are kept back."""
+    total, (_, kept, compared) = count_samples(gap), _find_counted(gap)
+    if compared == kept:
+        return f"of {write_count(total, 'sample')} kept back"
+    if total > compared:  # There are further records, of which only the samples are known.
+        return f"at {total} of the samples kept back"
+    return f"at {total} of the {write_count(kept, 'sample')} kept back"
+
+
+def describe_drawn_samples(gap: Gap) -> str:
+    """Say among which samples a picture of the first record shows the largest gap."""
+    total, (_, kept, compared) = count_samples(gap), _find_counted(gap)
+    if total > compared:
+        return f"{compared} of {write_count(total, 'sample')} kept back"
+    if compared == kept:
+        return f"{write_count(total, 'sample')} kept back"
+    return f"{total} of {write_count(kept, 'sample')} kept back"
+
+
+def explain_prediction(gap: Gap) -> str:
+    """Say why the gap is that of predictions and not of a simulation; empty where it is one."""
+    if gap.kind != "prediction" or not gap.reason:
+        return ""
+    return (f"{gap.reason[:1].upper()}{gap.reason[1:]}, so that this gap is that of predictions, "
+            "which use the logged input and earlier outputs, and not of a simulation.")  # fmt: skip
 
 
 def list_gap_rows(gap: Gap) -> list[tuple[str, str, str]]:
@@ -332,7 +374,8 @@ def describe_certainty(found: Diagnosis, finding: Finding) -> str:
     if math.isfinite(finding.share) and len(found.added) > 1:
         share = write_percent(finding.share)
         text += f"; without it, {share} of the mean square error above the noise floor would return"
-    many = len(set(finding.names) - set(finding.equivalents))
+    every = (finding.effect, *finding.alternatives)
+    many = len({name_with_subject(e) for e in every if name_at_place(e) not in finding.equivalents})
     if many > 1:
         text += f"; ONE OF {many} EFFECTS that explain the record"
     else:
@@ -350,7 +393,7 @@ def list_doubts(found: Diagnosis, finding: Finding) -> list[str]:
     lines = []
     apart = [e for e in finding.alternatives if name_at_place(e) not in finding.equivalents]
     if apart:
-        others = [f"{name_at_place(e)} ({describe_parameters(found, e)})" for e in apart]
+        others = [f"{name_with_subject(e)} ({describe_parameters(found, e)})" for e in apart]
         lines.append(f"this record cannot distinguish it from {write_list(others)}")
     if finding.equivalents:
         same = [ARTICLES.get(name, name) for name in finding.equivalents]
@@ -396,7 +439,7 @@ def describe_aliases(frequency: float, dt: float, width: float = 0.0) -> str:
 def name_finding(finding: Finding) -> str:
     """Name the effect of a finding and say what it is."""
     what = finding.effect.sentence.rstrip(".")
-    first = finding.names[0]
+    first = name_with_subject(finding.effect)
     of_plant = first.startswith(PARAMETER)
     same = [n if of_plant else _write_name(n, False) for n in finding.equivalents]
     name = join_alternatives([first, *same])
@@ -415,10 +458,10 @@ def describe_size(found: Diagnosis, finding: Finding) -> str:
 
 def list_sensitivity_rows(found: Diagnosis) -> list[tuple[str, str]]:
     """Return the smallest visible size of each effect."""
-    tried = {name_at_place(c.effect): c.effect for c in found.ranking}
+    tried = {name_with_subject(c.effect): c.effect for c in found.ranking}
     rows = []
     for key, size in found.sensitivity.items():
-        label, _, name = key.partition(".")
+        label, _, name = key.rpartition(".")
         effect = tried.get(label)
         unit = "" if effect is None else list_units(found.loop, effect).get(name, "")
         rows.append((key, write_quantity(size, unit) if math.isfinite(size) else "not visible"))

@@ -423,6 +423,27 @@ def name_at_place(effect: AbstractEffect) -> str:
     return f"{effect.called} at {effect.at}" if effect.at else effect.called
 
 
+def name_with_subject(effect: AbstractEffect) -> str:
+    """Return what a report calls an effect: its name, of which parameter or state, and its place.
+
+    Two drifts are told apart by their parameters only.
+
+    Examples
+    --------
+    >>> import ctrlid as cid
+    >>> name_with_subject(cid.effects.ParameterDrift("K", rate=0.1))
+    'ParameterDrift of K'
+    >>> name_with_subject(cid.effects.ParameterError("K", error=0.1))
+    'parameter K'
+    >>> name_with_subject(cid.effects.CoulombFriction(fc=0.2, at="theta_dot"))
+    'CoulombFriction at theta_dot'
+    """
+    subject = getattr(effect, "name", "")
+    if not (isinstance(subject, str) and subject and effect.called == type(effect).__name__):
+        return name_at_place(effect)
+    return name_at_place(effect).replace(effect.called, f"{effect.called} of {subject}", 1)
+
+
 def _can_take(loop: Any, effect: AbstractEffect) -> bool:
     try:
         loop.with_effect(effect)

@@ -14,7 +14,7 @@ from .._base.errors import CtrlidError
 from ..diagnosis.findings import BinnedErrors, Candidate, Gap
 from ..diagnosis.result import Diagnosis
 from ..diagnosis.thresholds import THRESHOLD
-from ..effects.base import name_at_place
+from ..effects.base import name_at_place, name_with_subject
 from ..physics.trace import timebase
 from ..validation.comparison import Comparison
 
@@ -176,7 +176,8 @@ def make_ranking(found: Diagnosis) -> dict[int, list[Bar]]:
     for finding in found.added:
         # Once it is taken an effect is no candidate any more, so that it was taken in the last
         # round in which it earned a place. One that was read off the record has no bar.
-        own = [c for c in found.ranking if name_at_place(c.effect) == finding.names[0]
+        own = [c for c in found.ranking
+               if name_with_subject(c.effect) == name_with_subject(finding.effect)
                and value[id(c)] > 0 and id(c) not in kinds]  # fmt: skip
         earned = [c for c in own if value[id(c)] > THRESHOLD.gate] or own
         if not earned:
@@ -185,10 +186,13 @@ def make_ranking(found: Diagnosis) -> dict[int, list[Bar]]:
         stands = finding in found.findings
         kinds[id(taken)] = "found" if stands else "in the model, but its name does not stand"
         evidence[id(taken)] = finding.evidence
+        others = {name_with_subject(e) for e in finding.alternatives}
         for c in found.ranking:
-            if c.round == taken.round and name_at_place(c.effect) in (
-                *finding.names[1:], *finding.equivalents
-            ):  # fmt: skip
+            alike = (
+                name_with_subject(c.effect) in others
+                or name_at_place(c.effect) in finding.equivalents
+            )
+            if c.round == taken.round and alike:
                 kinds.setdefault(id(c), "not told apart")
     rounds: dict[int, list[Bar]] = {}
     for number in sorted({c.round for c in found.ranking}):
@@ -196,7 +200,7 @@ def make_ranking(found: Diagnosis) -> dict[int, list[Bar]]:
                        key=lambda c: (id(c) not in kinds, -value[id(c)]))  # fmt: skip
         shown = sorted(tried[:BARS], key=lambda c: -value[id(c)])
         rounds[number] = [
-            Bar(name_at_place(c.effect), value[id(c)], kinds.get(id(c), _tell_kind(c)),
+            Bar(name_with_subject(c.effect), value[id(c)], kinds.get(id(c), _tell_kind(c)),
                 evidence.get(id(c), math.nan), math.isfinite(c.gain))
             for c in shown
         ]  # fmt: skip

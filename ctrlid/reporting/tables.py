@@ -12,6 +12,7 @@ from ..design.controller_trial import ControllerTrial
 from ..design.redesigning import Redesign
 from ..diagnosis import wording
 from ..diagnosis.result import Diagnosis
+from ..effects.base import name_with_subject
 from ..estimation.identified_model import Estimate, IdentifiedModel, IdentifiedSystem
 from ..estimation.likelihood.physics_estimate import LoopFit
 from ..physics.trace import timebase
@@ -242,6 +243,7 @@ def _make_diagnosis_blocks(found: Diagnosis) -> list[Block]:
     made: list[Block] = [
         wording.write_headline(found),
         gap,
+        wording.explain_prediction(found.gap),
         wording.describe_shrinking(found.gap),
         wording.describe_trivial(found.gap),
     ]
@@ -312,7 +314,7 @@ def _make_diagnosis_blocks(found: Diagnosis) -> list[Block]:
     made += [f"{remark.rstrip('.')}." for remark in found.audit]
     made += [f"Note: {remark.rstrip('.')}." for remark in found.notes]
     tried = tuple(
-        (type(c.effect).__name__, str(c.round), f"{c.gain:.1f}", f"{c.penalty:.1f}", c.remark)
+        (name_with_subject(c.effect), str(c.round), f"{c.gain:.1f}", f"{c.penalty:.1f}", c.remark)
         for c in found.ranking if np.isfinite(c.gain)
     )  # fmt: skip
     if tried:

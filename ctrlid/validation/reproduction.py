@@ -1,6 +1,6 @@
 """How a record is reproduced: predicted some samples ahead, or simulated open or closed loop."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
@@ -21,10 +21,12 @@ class Reproduction:
     """What is made of a record: a simulation, or a prediction `horizon` samples ahead.
 
     A prediction uses the measured output up to `horizon` samples before; a simulation uses none.
+    `reason` says why it is no simulation, as a clause; empty where that is not known.
     """
 
     name: Name
     horizon: int = 0
+    reason: str = field(default="", compare=False)
 
     def __str__(self) -> str:
         if not self.horizon:
@@ -35,6 +37,10 @@ class Reproduction:
 ONE_STEP = Reproduction("prediction", 1)
 OPEN_LOOP = Reproduction("open-loop simulation")
 CLOSED_LOOP = Reproduction("closed-loop simulation")
+# Why a record is predicted and not simulated.
+NO_CONTROLLER = "no controller is given, and the plant alone does not come to rest"
+NO_REFERENCE = "the record lacks a reference of the controller"
+REJECTED = "the law of the controller is rejected, since it is not what computed the logged input"
 
 
 def find_law_rejection(loop: Loop, record: Record) -> str:
@@ -49,18 +55,20 @@ def choose_reproduction(loop: Loop, record: Record) -> Reproduction:
     What a wrong law leaves of the logged input carries the measured output into a simulation, so
     that after a rejected law only a prediction remains, which does not contain the controller.
     """
-    known = loop.controller is not None and knows_references(loop.wiring, record)
-    if known and not find_law_rejection(loop, record):
-        return CLOSED_LOOP
-    if loop.controller is None and comes_to_rest(loop):
-        return OPEN_LOOP
-    return choose_prediction(loop, record)
+    if loop.controller is None:
+        return OPEN_LOOP if comes_to_rest(loop) else choose_prediction(loop, record, NO_CONTROLLER)
+    if not knows_references(loop.wiring, record):
+        return choose_prediction(loop, record, NO_REFERENCE)
+    if find_law_rejection(loop, record):
+        return choose_prediction(loop, record, REJECTED)
+    return CLOSED_LOOP
 
 
-def choose_prediction(loop: Loop, record: Record) -> Reproduction:
-    """Return the prediction over the time constant of the plant."""
+def choose_prediction(loop: Loop, record: Record, reason: str = "") -> Reproduction:
+    """Return the prediction over the time constant of the plant; `reason` says why not more."""
     poles = compute_moving_poles(loop)
-    return Reproduction("prediction", find_time_constant(poles, loop.equations().dt, record))
+    horizon = find_time_constant(poles, loop.equations().dt, record)
+    return Reproduction("prediction", horizon, reason)
 
 
 def compute_moving_poles(loop: Loop) -> Any:

@@ -13,6 +13,7 @@ from ...diagnosis import wording
 from ...diagnosis.findings import BinnedErrors
 from ...diagnosis.result import Diagnosis
 from ...diagnosis.thresholds import THRESHOLD
+from ...effects.base import name_with_subject
 from .. import pictures as _pictures
 from .axes import (
     COLOURS,
@@ -105,7 +106,7 @@ def _draw_gap(above: Any, below: Any, found: Diagnosis) -> None:
     t, y = gap.time[part], gap.measured[part]
     scale, unit = _pictures.choose_scale([y], gap.unit)
     above.plot(t, scale * y, label="measured", **MEASURED)
-    names = " and ".join(f.names[0] for f in found.added[:2])
+    names = " and ".join(name_with_subject(f.effect) for f in found.added[:2])
     names += f" and {len(found.added) - 2} more" if len(found.added) > 2 else ""
     start = "recalibrated model" if gap.before == gap.fitted else "model as given"
     label = "before" if names or gap.before != gap.fitted else "recalibrated"
@@ -134,9 +135,8 @@ def _draw_gap(above: Any, below: Any, found: Diagnosis) -> None:
     limit_view(above, scale * y, lines)
     above.set_ylabel(f"{gap.output or 'output'} [{unit}]")
     below.set_ylabel(f"error [{small}]")
-    own, kept = len(gap.time), wording.count_samples(found.gap)
-    among = f"{kept}" if own == kept else f"{own} of {kept}"
-    below.set_xlabel(f"time [s], where the gap is largest among {among} samples kept back")
+    among = wording.describe_drawn_samples(found.gap)
+    below.set_xlabel(f"time [s], where the gap is largest among {among}")
     for ax in (above, below):
         ax.set_xlim(t[0], t[-1])
         finish_axes(ax, columns=1 if ax is above else 3, size="small")
