@@ -212,6 +212,18 @@ def test_comparison_labels_every_curve(comparison):
     assert ax.get_xlabel().endswith("of a record from 0 to 10 s")
 
 
+def test_jitter_of_the_time_stamps_is_not_told(comparison):
+    """A log whose stamps were not perfectly even gave "a record from -7e-06 to 10 s"."""
+    moved = replace(comparison, record=replace(comparison.record, start=-7e-6))
+    (ax,) = plot.comparison(moved)
+    assert ax.get_xlabel().endswith("of a record from 0 to 10 s")
+    with pytest.raises(cid.CtrlidError, match="the record runs from 0 to 10 s"):
+        moved.record.between(20, 30)
+    late = replace(comparison, record=replace(comparison.record, start=1234.565))
+    (ax,) = plot.comparison(late)
+    assert ax.get_xlabel().endswith("of a record from 1234.565 to 1244.565 s")
+
+
 def test_comparison_window(comparison):
     (ax,) = plot.comparison(comparison, window=(2, 3))
     t = ax.get_lines()[0].get_xdata()

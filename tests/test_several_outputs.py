@@ -71,8 +71,12 @@ def test_parameters_and_noises_are_recovered():
     assert fitted.estimate.sensor_noise[0] == pytest.approx(NOISE["sensor_noise"], rel=0.1)
     assert fitted.estimate.force_noise == pytest.approx(NOISE["force_noise"], rel=0.35)
     assert fitted.estimate.units == (("m", "rad"), ("N", "N m"))
-    assert "m and" in str(fitted)
-    assert "N m" in str(fitted)
+    told = str(fitted).splitlines()[-1]
+    assert " m at x and " in told
+    assert " rad at theta; of the white force: " in told
+    assert " N at x_dot and " in told
+    assert told.endswith(" N m at theta_dot")
+    assert told.count(" at ") == 4
     truth = np.sort(loop.linearize().poles().real)
     found, errors = fitted.poles, fitted.poles_standard_errors
     order = np.argsort(found.real)
@@ -150,6 +154,23 @@ def test_predictions_are_as_good_as_the_filter_says():
     ratio = found.innovations[:, 200:].std(axis=1) / found.spread[:, 200:].mean(axis=1)
     assert ratio == pytest.approx([1, 1], rel=0.1)
     assert "2 outputs" in str(found)
+    assert "  theta: RMS of the innovations" in str(found)
+    assert str(found).endswith(" N m at theta_dot")
+
+
+def test_noise_without_a_moving_mass_and_without_units_has_a_place():
+    """Two tanks have two rates and no velocity: the print of their fit raised an error."""
+    tanks = ct.nlsys(lambda t, x, u, p: np.array([p["a"] * u[0] - x[0], x[0] - x[1]]),
+                     lambda t, x, u, p: x, inputs=["q"], outputs=["l1", "l2"],
+                     states=["h1", "h2"], params={"a": 1.0}, name="tanks")  # fmt: skip
+    rest = cid.OperatingPoint((0.0, 0.0), 0.0, (0.0, 0.0))
+    loop = cid.Loop(tanks, None, dt=0.1, at=rest, free=("a",))
+    d = cid.random_binary(600, amplitude=1.0, hold=20, seed=1)
+    record = cid.simulate(loop, d=d, sensor_noise=0.01, seed=2)
+    for told in (str(cid.fit_loop(loop, record)), str(cid.predict(loop, record))):
+        assert all(f" [{name}]" in told for name in ("l1", "l2"))
+        assert " [h1]/s at h1 and " in told
+        assert told.endswith(" [h2]/s at h2")
 
 
 def test_records_are_matched_by_name():

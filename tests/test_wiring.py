@@ -304,6 +304,8 @@ def test_refused_loops(build, words):
         (np.zeros((2, 9)), {"d": np.zeros(8)}, "equally long; given 9 and 8"),
         (np.zeros((2, 9)), {"d": np.zeros((2, 9))}, r"one row for each input \(F\)"),
         (np.zeros((2, 9)), {"sensor_noise": (1, 2, 3)}, "deviation >= 0, or 2 of them"),
+        (np.zeros((9, 2)), {}, r"given 9, an array of shape \(9, 2\)\. It looks transposed.* r\.T"),
+        (np.zeros((2, 9)), {"d": np.zeros((9, 2))}, r"given shape \(9, 2\)\. It looks .* d\.T"),
         ([["a"]], {}, "arrays of numbers"),
         (np.full((2, 9), np.nan), {}, "finite samples"),
     ],

@@ -8,6 +8,7 @@ import math
 import re
 import textwrap
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 from .units import is_unit
 
@@ -313,6 +314,54 @@ def write_count(number: int, noun: str, plural: str = "") -> str:
     ('1 sample', '20 samples')
     """
     return f"{number} {noun if number == 1 else plural or noun + 's'}"
+
+
+def write_noises(values: Any, units: Any, places: Sequence[str] = (), per: str = "") -> str:
+    """Write the size of a noise with its unit, or of several with theirs and their places.
+
+    Parameters
+    ----------
+    values : float or sequence of float
+        The sizes.
+    units : str or sequence of str
+        Their units; empty where they are not known.
+    places : sequence of str, optional
+        Where each noise is, such as an output; a unit that is not known is named after it.
+    per : str, optional
+        What follows such a name.
+
+    Returns
+    -------
+    str
+        The sizes.
+
+    Examples
+    --------
+    >>> write_noises(0.1, "m"), write_noises((0.1, 2.0), ("N", ""), ("v", "omega"), "/s")
+    ('0.1 m', '0.1 N at v and 2 [omega]/s at omega')
+    """
+    if not isinstance(values, tuple):
+        return f"{write_number(values, 3)} {units}".strip()
+    if not places:
+        return write_list([write_noises(v, u) for v, u in zip(values, units, strict=True)])
+    return write_list([f"{write_noises(v, u or f'[{place}]{per}')} at {place}"
+                       for v, u, place in zip(values, units, places, strict=True)])  # fmt: skip
+
+
+def write_time(seconds: float, dt: float) -> str:
+    """Write a time of a record, to a hundredth of the sampling period or finer [s].
+
+    Time stamps of a logger jitter by less, which says nothing.
+
+    Examples
+    --------
+    >>> write_time(-7e-06, 0.01), write_time(12.34567, 0.01), write_time(300.0, 5.0)
+    ('0', '12.3457', '300')
+    """
+    digits = max(2 - math.floor(math.log10(dt)), 0)
+    text = f"{seconds:.{digits}f}"
+    text = text.rstrip("0").rstrip(".") if digits else text
+    return "0" if text in ("-0", "") else text
 
 
 def with_unit(name: str, unit: str) -> str:

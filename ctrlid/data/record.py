@@ -15,7 +15,7 @@ from .._base.arguments import check_arguments, explain_fields
 from .._base.arrays import read_only
 from .._base.errors import CtrlidError
 from .._base.signals import list_signals, require_one_signal
-from .._base.text import Printed, list_known, write_count, write_percent
+from .._base.text import Printed, list_known, write_count, write_percent, write_time
 from . import csv_files as _csv
 from . import responses as _response
 from .field_checks import check_samples, check_seconds, check_words
@@ -311,7 +311,8 @@ class Record(Printed):
         if last - first < 2:
             raise CtrlidError(
                 f"fewer than 2 samples lie between {t0:g} and {t1:g} s; the record runs from "
-                f"{self.start:g} to {self.start + self.duration:g} s"
+                f"{write_time(self.start, self.dt)} to "
+                f"{write_time(self.start + self.duration, self.dt)} s"
             )
         return self[first:last]
 

@@ -26,7 +26,7 @@ from .period_map import (
     linearize_at_rest,
     make_period_map,
 )
-from .wiring import STATE_FEEDBACK, stack_references
+from .wiring import STATE_FEEDBACK, stack_references, suggest_transpose
 
 # Steps are refined until their local error is below this share of each state's excursion.
 TOLERANCE = 1e-9
@@ -219,8 +219,9 @@ def _check_several_signals(loop: Loop, r: Any, d: Any) -> tuple[Array, Array, tu
     given = r if isinstance(r, Mapping) else parts[0]
     injected = None if parts[1] is None else np.atleast_2d(parts[1])
     if injected is not None and len(injected) != len(inputs):
-        raise CtrlidError(f"d needs one row for each input ({', '.join(inputs)}); given "
-                          f"shape {injected.shape}")  # fmt: skip
+        raise CtrlidError(f"d needs one row for each input ({', '.join(inputs)}); given shape "
+                          f"{injected.shape}{suggest_transpose('d', injected)}"
+                          )  # fmt: skip
     if loop.wiring is None:
         if injected is None:
             raise CtrlidError("simulate needs r or d to know how many samples to run; an open loop "

@@ -241,6 +241,22 @@ def _name_source(
     return (plant.outputs if kind == "y" else plant.inputs)[k]
 
 
+def suggest_transpose(name: str, given: Any) -> str:
+    """Say that an array looks transposed, if it has more rows, of signals, than samples.
+
+    Examples
+    --------
+    >>> suggest_transpose("r", np.zeros((100, 2)))
+    '. It looks transposed, with a row for each sample: give r.T'
+    >>> suggest_transpose("r", np.zeros((2, 100)))
+    ''
+    """
+    shape = np.shape(given)
+    if len(shape) != 2 or shape[0] <= shape[1]:
+        return ""
+    return f". It looks transposed, with a row for each sample: give {name}.T"
+
+
 def stack_references(
     wiring: Wiring, given: Any, names: Sequence[str] | None, n: int | None = None
 ) -> tuple[Array, tuple[str, ...]]:
@@ -279,8 +295,10 @@ def stack_references(
         # A record's own names may be others; then its references are taken in order.
         choices = [c for c in (needed, list(wiring.open)) if len(c) == len(rows) and not strict]
         if not choices and rows:
+            shape = np.shape(given)
+            turned = suggest_transpose("r", given)
             what = (f"given {write_list(unknown)}, which the controller does not have" if unknown
-                    else f"given {len(rows)}")  # fmt: skip
+                    else f"given {len(rows)}, an array of shape {shape}{turned}")  # fmt: skip
             known = write_list(list(wiring.open))
             every = f"the reference {known}" if len(wiring.open) == 1 else f"the references {known}"
             which = "" if needed == list(wiring.open) else (

@@ -216,9 +216,18 @@ def _find_several_units(loop: Loop, record: Record) -> tuple[tuple[str, ...], tu
         (given[k] if isinstance(given, tuple) else given) or known.get(name, "")
         for k, name in enumerate(e.outputs)
     )
-    rates = [known.get(e.states[j], "") for j in e.velocities]
-    alone = [f"{unit}/s" if unit else "" for unit in rates] or [""]
+    _, rates = name_noise_places(loop)
+    alone = [f"{known[name]}/s" if known.get(name) else "" for name in rates]
     return sensors, tuple(e.push_units) or tuple(alone)
+
+
+def name_noise_places(loop: Loop) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the output of each sensor noise, and the velocity of each force of several signals.
+
+    A plant without a moving mass has noise on the rates of its states.
+    """
+    e = loop.equations()
+    return tuple(e.outputs), tuple(e.states[j] for j in e.velocities) or tuple(e.states)
 
 
 def prepare_for_loop(data: FilterData, loop: Loop) -> FilterData:

@@ -12,7 +12,14 @@ from ..._base.arguments import check_arguments
 from ..._base.arrays import Array, freeze_arrays, read_only
 from ..._base.criterion import bayesian_penalty
 from ..._base.errors import CtrlidError
-from ..._base.text import Printed, write_count, write_list, write_number, write_quantity
+from ..._base.text import (
+    Printed,
+    write_count,
+    write_list,
+    write_noises,
+    write_number,
+    write_quantity,
+)
 from ...loop.loop import Loop
 from ...physics.linearization import make_state_space, operating_point
 from ..identified_model import compute_root_errors
@@ -128,6 +135,9 @@ class LoopEstimate(ParameterEstimate):
     units : (str, str)
         Units of the sensor noise and of the force noise; empty where neither the record nor the
         plant has one.
+    places : (tuple of str, tuple of str)
+        Of several signals, the output of each sensor noise and the velocity that each force works
+        on; without a moving mass, the state whose rate it is.
     """
 
     sensor_noise: tuple[Any, ...]
@@ -139,6 +149,7 @@ class LoopEstimate(ParameterEstimate):
     active: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     units: tuple[Any, Any] = ("", "")
+    places: tuple[tuple[str, ...], tuple[str, ...]] = ((), ())
 
     @property
     def bic(self) -> float:
@@ -152,9 +163,10 @@ class LoopEstimate(ParameterEstimate):
                 f"{self.log_likelihood:.1f}"]  # fmt: skip
         rows += self._list_rows(self.active)
         size, push = self.units
-        noise = ", ".join(_write_sizes(v, size) for v in self.sensor_noise)
+        outputs, velocities = self.places
+        noise = ", ".join(write_noises(v, size, outputs) for v in self.sensor_noise)
         rows.append(f"  standard deviation of the sensor noise: {noise}; of the white force: "
-                    f"{_write_sizes(self.force_noise, push)}")  # fmt: skip
+                    f"{write_noises(self.force_noise, push, velocities, '/s')}")  # fmt: skip
         if self.coloured_force:
             rows.append(f"  standard deviation of the coloured force: "
                         f"{_write_size(self.coloured_force, push)}, with a time constant of "
@@ -198,15 +210,8 @@ class SimulationEstimate(ParameterEstimate):
         rows += self._list_rows(self.active)
         units = self.units if isinstance(self.units, tuple) else (self.units,)
         rows.append(f"  root mean square error of the simulation: "
-                    f"{_write_sizes(self.errors, units)}")  # fmt: skip
+                    f"{write_noises(self.errors, units)}")  # fmt: skip
         return "\n".join([*rows, *(f"  note: {note}" for note in self.notes)])
-
-
-def _write_sizes(values: Any, units: Any) -> str:
-    """Return a size with its unit, or several with theirs."""
-    if not isinstance(values, tuple):
-        return _write_size(values, units)
-    return " and ".join(_write_size(v, u) for v, u in zip(values, units, strict=True))
 
 
 def _write_size(value: float, unit: str) -> str:

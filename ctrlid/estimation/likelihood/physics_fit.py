@@ -26,7 +26,7 @@ from ...loop.sampled_form import note_sampled_controller
 from ...loop.unit_check import describe_distance, measure_distance, note_unit_clashes
 from ...physics.linearization import compute_state_matrices
 from ..whiteness import note_coloured_innovations
-from .filter_data import find_noise_units
+from .filter_data import find_noise_units, name_noise_places
 from .likelihood import Fit, find_priors, list_effect_bounds, make_problem
 from .maximization import (
     begin_fit,
@@ -324,6 +324,7 @@ def summarize_fit(loop: Loop, fit: Fit) -> LoopFit:
         math.sqrt(scale * noise.coloured) if noise.drift else 0.0, time, fit.value, fit.size,
         tuple(n for n, b in zip(names, on_bound, strict=True) if b), notes,
         find_noise_units(loop, fit.problem.data[0].record),
+        name_noise_places(loop) if several else ((), ()),
     )  # fmt: skip
     fitted = loop.with_parameters(dict(zip(names, fit.theta.tolist(), strict=True)))
     return LoopFit(fitted, estimate)

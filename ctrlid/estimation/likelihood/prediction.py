@@ -15,12 +15,12 @@ from ..._base.arrays import Array, freeze_arrays
 from ..._base.errors import CtrlidError, ModelCannotRun
 from ..._base.interruption import hold_interrupt
 from ..._base.rounding import keep_numpy_quiet
-from ..._base.text import Printed, write_count
+from ..._base.text import Printed, write_count, write_noises
 from ...data.record import Record
 from ...data.several_records import order_model_and_data
 from ...data.validity import find_whole_past
 from ...loop.loop import Loop
-from .filter_data import find_noise_units
+from .filter_data import find_noise_units, name_noise_places
 from .kalman_filter import Noise, append_sensor_noise, predict_outputs
 from .likelihood import Fit, make_problem
 from .maximization import begin_fit, maximize
@@ -58,6 +58,9 @@ class Prediction(Printed):
         each of several outputs and forces.
     units : (str, str)
         Units of both noises; empty where neither the record nor the plant has one.
+    places : (tuple of str, tuple of str)
+        Of several signals, the output of each sensor noise and the velocity that each force works
+        on; without a moving mass, the state whose rate it is.
     """
 
     y: Array
@@ -69,6 +72,7 @@ class Prediction(Printed):
     sensor_noise: Any
     force_noise: Any
     units: tuple[Any, Any] = ("", "")
+    places: tuple[tuple[str, ...], tuple[str, ...]] = ((), ())
 
     def __post_init__(self) -> None:
         freeze_arrays(self)
@@ -88,22 +92,21 @@ class Prediction(Printed):
         )
 
     def _write_several(self) -> str:
-        sensors, pushes = self.units
+        (sensors, pushes), (outputs, velocities) = self.units, self.places
         rows = [
             f"One-step prediction of {write_count(self.y.shape[1], 'sample')} of "
             f"{write_count(len(self.y), 'output')}"
         ]
-        for k, (unit, noise) in enumerate(zip(sensors, self.sensor_noise, strict=True)):
-            use = self.settled[k]
+        for k, (name, noise) in enumerate(zip(outputs, self.sensor_noise, strict=True)):
+            use, unit = self.settled[k], sensors[k] or f"[{name}]"
             found, expected = (
                 float(np.sqrt(np.mean(v[k][use] ** 2))) for v in (self.innovations, self.spread)
             )
             rows.append(
-                f"  output {k}: RMS of the innovations {found:.3g} {unit}; the filter expects "
+                f"  {name}: RMS of the innovations {found:.3g} {unit}; the filter expects "
                 f"{expected:.3g} {unit}, of which the sensor noise is {noise:.3g} {unit}"
             )
-        pairs = zip(self.force_noise, pushes, strict=True)
-        forces = " and ".join(f"{v:.3g} {u}".strip() for v, u in pairs)
+        forces = write_noises(self.force_noise, pushes, velocities, "/s")
         return "\n".join([*rows, f"  standard deviation of the white force: {forces}"])
 
 
@@ -201,6 +204,7 @@ def make_prediction(fit: Fit) -> Prediction:
             record.y - error.T, error.T, fit.counts[0].T, sensor * np.sqrt(variance.T),
             states[:, : plant.n], states[:, plant.n :], tuple(sizes.tolist()),
             tuple((sensor * np.sqrt(fit.noise.force)).tolist()), units,
+            name_noise_places(plant.loop),
         )  # fmt: skip
     error, variance, counts = (
         np.reshape(v, record.y.shape) for v in (out.innovations, out.variance, fit.counts[0])

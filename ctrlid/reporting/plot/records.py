@@ -167,8 +167,10 @@ def comparison(
     for ax, one in zip(axes, parts, strict=True):
         _draw_curves(ax, one, slice(first, stop))
         finish_axes(ax)
-    ends = [f"{a:.4g} to {a + n * whole.dt:.4g} s" for a, n in
-            ((whole.t[first], stop - first), (whole.start, len(whole)))]  # fmt: skip
+    ends = [
+        f"{_text.write_time(a, whole.dt)} to {_text.write_time(a + n * whole.dt, whole.dt)} s"
+        for a, n in ((whole.t[first], stop - first), (whole.start, len(whole)))
+    ]
     axes[-1].set_xlabel(f"time [s], {ends[0]} of a record from {ends[1]}")
     return Picture(axes)
 
