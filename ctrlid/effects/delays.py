@@ -134,11 +134,14 @@ class InputDelay(InputEffect):
 @final
 @dataclass(frozen=True)
 class InputBacklash(InputEffect):
-    r"""Backlash between the actuator and the plant.
+    r"""Backlash of the input, before the plant.
 
     .. math:: m_{k} = \min(\max(m_{k-1}, u_k - w/2), u_k + w/2), \quad u_a = m_k
 
-    The applied input moves only once the computed one has crossed the gap.
+    The applied input moves only once the computed one has crossed the gap, as where the input is a
+    position that a linkage with play carries to a valve or a rudder. Play between a motor and its
+    load is another thing, and not in the catalogue: in the gap no torque acts on the load, which
+    moves on by itself.
 
     Parameters
     ----------
