@@ -14,6 +14,7 @@ from scipy import linalg, signal
 
 import ctrlid as cid
 from ctrlid import CtrlidError, plot
+from ctrlid._base.text import with_error
 from ctrlid.estimation.linear import prediction_error
 from ctrlid.estimation.linear.sampled_motion import (
     Circuit,
@@ -166,8 +167,9 @@ def test_delay_is_estimated_on_request(delay):
     y = ct.forced_response(system, np.arange(len(shifted)) * dt / fine, shifted).outputs[::fine]
     record = cid.Record(u=u, y=y + 1e-4 * rng.standard_normal(len(u)), dt=dt)
     G = cid.fit_continuous(record, 2, delay=None)
-    assert G.delay == pytest.approx(delay, abs=2e-4)
-    assert "delay" in G.estimate.solver
+    low, high = G.estimate.confidence_interval("delay", level=0.999)
+    assert low < delay < high < low + 4e-4
+    assert f"delay = {with_error(G.delay, G.estimate.delay_error)} s\n" in str(G.estimate)
     known = cid.fit_continuous(record, 2, delay=delay)
     assert known.estimate["b1"] == pytest.approx(4.0, rel=0.02)
     # Whoever looks at the model sees the delay.
@@ -379,6 +381,32 @@ def test_as_many_zeros_as_poles(hold, late):
     assert np.max(np.abs(deviation)) < 4
     assert np.all(e.standard_errors < 0.05 * np.abs(e.values))
     assert e.notes == ()
+
+
+@pytest.mark.parametrize("late", [0.0, 0.0003])
+def test_the_interval_of_a_delay_is_honest(late):
+    """In closed loop, with exact motion: nothing but noise tells 2 us from none."""
+    plant = ct.tf([-6.5], [1, 0, -1600])
+    lead = cid.design_lead(plant, crossover=100, phase_margin=50)
+    loop = cid.Loop(plant, lead.sample(0.001, "tustin"), dt=0.001)
+    real = loop.with_effect(cid.effects.InputDelay(delay=late)) if late else loop
+    covered, away = 0, []
+    for seed in range(10):
+        r = cid.random_binary(600, amplitude=1e-4, hold=20, seed=seed)
+        record = cid.simulate(real, r, sensor_noise=1e-6, seed=seed)
+        e = cid.fit_continuous(record, poles=2, delay=None).estimate
+        low, high = e.confidence_interval("delay")
+        covered += low <= late <= high
+        away.append((e.delay - late) / e.delay_error)
+        if not late:
+            assert ("may be none" in str(e)) == (low == 0)
+            # What a negative delay would promise is no reason to call a search unfinished.
+            if any("WITHOUT CONVERGENCE" in note for note in e.notes):
+                alone = cid.fit_continuous(record, poles=2).estimate
+                assert any("WITHOUT CONVERGENCE" in note for note in alone.notes)
+    assert covered >= 8
+    # About half of the delays that are none come out as zero.
+    assert 0.5 < np.sqrt(np.mean(np.square(away)) * (1 if late else 2)) < 1.6
 
 
 @pytest.mark.parametrize("late", [0.0, 0.005])

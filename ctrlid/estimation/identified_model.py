@@ -168,6 +168,8 @@ class Estimate(_text.Printed):
         What the user should know before believing the numbers.
     errors : {"equation error", "prediction error"}
         What the residuals are: those of the ARX equation, or of the output's prediction.
+    delay, delay_error : float
+        Delay of the input [s] and its standard error, zero for one that was not fitted.
     """
 
     structure: Structure
@@ -186,6 +188,8 @@ class Estimate(_text.Printed):
     condition: float
     notes: tuple[str, ...] = ()
     errors: Literal["equation error", "prediction error"] = "prediction error"
+    delay: float = 0.0
+    delay_error: float = 0.0
 
     def __post_init__(self) -> None:
         for field in ("values", "covariance", "intercepts"):
@@ -223,7 +227,7 @@ class Estimate(_text.Printed):
         Parameters
         ----------
         name : str
-            Coefficient, for instance ``"a1"``.
+            Coefficient, for instance ``"a1"``, or ``"delay"``, which is never negative.
         level : float
             Probability, between 0 and 1.
 
@@ -235,9 +239,11 @@ class Estimate(_text.Printed):
         check_arguments(Estimate.confidence_interval, locals())
         if not 0.0 < level < 1.0:
             raise CtrlidError(f"A confidence level lies between 0 and 1; given {level!r}.")
-        i = self._find_index(name)
         half = float(student_t.ppf(0.5 + level / 2, self.degrees_of_freedom))
-        half *= float(self.standard_errors[i])
+        if name == "delay":
+            half *= self.delay_error
+            return max(self.delay - half, 0.0), self.delay + half
+        half *= float(self.standard_errors[self._find_index(name)])
         return self[name] - half, self[name] + half
 
     @property
@@ -341,6 +347,9 @@ def _write_report(e: Estimate) -> str:
             lines.append(f"  {name} = {value:.10g} (fixed)")
         else:
             lines.append(f"  {name} = {_text.with_error(value, error)}")
+    if e.delay_error:
+        none = ", which may be none" if e.confidence_interval("delay")[0] == 0 else ""
+        lines.append(f"  delay = {_text.with_error(e.delay, e.delay_error)} s{none}")
     if e.branch:
         lines.append(f"  branch of the constraint: {e.branch}")
     pairs = zip(e.poles, e.poles_standard_errors, e.poles_s, e.poles_s_standard_errors, strict=True)

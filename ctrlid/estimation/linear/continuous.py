@@ -33,6 +33,7 @@ from .prediction_error import (
     add_delay,
     colour_noise,
     find_best_fit,
+    measure_delay_spread,
 )
 from .sampled_motion import Circuit, list_inputs
 
@@ -88,7 +89,8 @@ def fit_continuous(
     -------
     IdentifiedModel
         The transfer function in s, with `.estimate`. A delay is in the attribute
-        `delay`, and counts wherever ctrlid looks at the model.
+        `delay`, and counts wherever ctrlid looks at the model. One that was estimated has its
+        standard error in `.estimate.delay_error`, and ``.estimate.confidence_interval("delay")``.
 
     Raises
     ------
@@ -174,7 +176,10 @@ def fit_continuous(
     if delay == 0 and not circuit and task.hold == "zoh" and beyond_rounding:
         notes = (*notes, *_note_missed_delay(best, known))
     notes = (*note_sampled_controller(controller, records, "fit_continuous"), *notes)
-    late = f", delay {point.delay:.6g} s" if task.free_delay else ""
+    late, delay_error = "", 0.0
+    if task.free_delay:
+        late = ", with the delay"
+        delay_error = math.sqrt(measure_delay_spread(best) * rss / degrees)
     if best.task.colour:
         late += f", sensor noise a moving average of order {best.task.colour}"
     estimate = Estimate(
@@ -183,7 +188,7 @@ def fit_continuous(
         degrees_of_freedom=degrees, active_bounds=found.active_bounds, branch=found.branch,
         method=("constrained " if known else "") + "prediction error (continuous time)",
         solver=f"Gauss-Newton steps, {found.solver}{late}", dt=0.0, condition=found.condition,
-        notes=notes,
+        notes=notes, delay=point.delay, delay_error=delay_error,
     )  # fmt: skip
     _check_speed(estimate.poles, records[0].dt)
     names = records[0].names

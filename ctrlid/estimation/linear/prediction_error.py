@@ -179,14 +179,20 @@ def _evaluate_cost(task: Task, point: Point) -> tuple[float, list[Array]]:
 
 
 def _compute_errors(task: Task, point: Point, piece: Piece) -> Array | None:
-    motion = task.discretize(point.theta, max(point.delay, 0.0))
+    """Return the prediction errors of a point; None where there is no prediction."""
+    if point.delay < 0:
+        return None
+    motion = task.discretize(point.theta, point.delay)
     return compute_prediction_errors(motion, point.gain, piece.signals)
 
 
 def _differentiate_errors(
     task: Task, piece: Piece, here: Array, h: float, move: Callable[[float], Point]
 ) -> Array:
-    """Difference the errors; one-sided or with shorter steps where the observer turns unstable."""
+    """Difference the errors; one-sided or with shorter steps where there is no prediction.
+
+    The observer may turn unstable, and no delay is negative.
+    """
     for _ in range(8):
         up, down = (_compute_errors(task, move(step), piece) for step in (h, -h))
         if up is not None and down is not None:
@@ -223,6 +229,26 @@ def _compute_jacobian(task: Task, point: Point, tables: list[Array]) -> Array:
     return merge_factors(factors)
 
 
+def measure_delay_spread(best: Minimum) -> float:
+    r"""Return the variance of a delay that was fitted, in units of the residual variance.
+
+    .. math:: R_1 (\eta - \hat\eta) + R_{12} (\theta - \hat\theta) = w, \quad
+        \operatorname{cov} \hat\eta = R_1^{-1} R_1^{-\mathsf T} + W S W^{\mathsf T}, \quad
+        W = R_1^{-1} R_{12}
+
+    for the observer gains and the delay :math:`\eta`, with the rows R of the triangular factor and
+    the spread S of the coefficients. At a delay of zero the slope is that towards larger ones.
+    """
+    task, point = best.task, best.point
+    factor = _compute_jacobian(task, point, _evaluate_cost(task, point)[1])
+    extra = len(point.gain) + 1
+    p = extra + len(task.structure.names)
+    inverse = np.linalg.pinv(factor[:extra, :extra])
+    rows = inverse @ factor[:extra, extra:p]
+    spread = inverse @ inverse.T + rows @ best.found.spread @ rows.T
+    return float(spread[-1, -1])
+
+
 def _measure_coefficients(task: Task, point: Point) -> Array:
     """Return a typical size of each coefficient, in its own unit."""
     s = task.structure
@@ -246,24 +272,21 @@ def _minimize_errors(
     observer is at the border of stability, so that a step of its gain may promise more for ever.
     """
     settled = False
-    extra = len(point.gain) + int(task.free_delay)
     rss, tables = _evaluate_cost(task, point)
     found: Found | None = None
     for _ in range(rounds):
         factor = _compute_jacobian(task, point, tables)
-        p = extra + len(task.structure.names)
-        inner, right = factor[extra:p, extra:p], factor[extra:p, p]
-        size = np.linalg.norm(inner, axis=0)
-        size = np.where(size > 0, size, 1.0)
-        cost = Cost(inner / size, -right, np.diag(1 / size), point.theta)
-        found = minimize(cost, known, task.structure)
+        found, others, predicted = _solve_step(task, point, known, factor, rss)
+        if task.free_delay and point.delay == 0 and others[-1] < 0:
+            # No delay is negative, so that the others find their best beside none. They are known
+            # no better for that: the delay was none by chance.
+            factor = _triangularize(np.delete(factor, len(point.gain), axis=1))
+            spread = found.spread
+            found, others, predicted = _solve_step(task, point, known, factor, rss)
+            found, others = replace(found, spread=spread), np.append(others, 0.0)
         move = found.theta - point.theta
-        others = np.linalg.lstsq(
-            factor[:extra, :extra], -factor[:extra, p] - factor[:extra, extra:p] @ move, rcond=None
-        )[0]
-        predicted = (
-            rss - float(np.sum((inner @ move + right) ** 2)) - float(factor[p:, p] @ factor[p:, p])
-        )
+        p = factor.shape[1] - 1
+        extra = p - len(task.structure.names)
         degrees = max(sum(q.n for q in task.pieces) - p, 1)
         settled = predicted < rss / degrees
         for k in range(12):
@@ -291,6 +314,30 @@ def _minimize_errors(
         left = float(np.sum((alone @ move + right) ** 2))
         settled = float(right @ right) - left < rss / degrees
     return point, found, rss, settled
+
+
+def _solve_step(
+    task: Task, point: Point, known: Sequence[AbstractConstraint], factor: Array, rss: float
+) -> tuple[Found, Array, float]:
+    """Return the best coefficients, the step of gains and delay, and the gain that they promise.
+
+    The columns of `factor` before those of the coefficients are what is stepped.
+    """
+    p = factor.shape[1] - 1
+    extra = p - len(task.structure.names)
+    inner, right = factor[extra:p, extra:p], factor[extra:p, p]
+    size = np.linalg.norm(inner, axis=0)
+    size = np.where(size > 0, size, 1.0)
+    cost = Cost(inner / size, -right, np.diag(1 / size), point.theta)
+    found = minimize(cost, known, task.structure)
+    move = found.theta - point.theta
+    others = np.linalg.lstsq(
+        factor[:extra, :extra], -factor[:extra, p] - factor[:extra, extra:p] @ move, rcond=None
+    )[0]
+    promised = (
+        rss - float(np.sum((inner @ move + right) ** 2)) - float(factor[p:, p] @ factor[p:, p])
+    )
+    return found, others, promised
 
 
 def _is_violated(task: Task, point: Point, known: Sequence[AbstractConstraint]) -> bool:
