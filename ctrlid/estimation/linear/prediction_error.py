@@ -331,9 +331,8 @@ def _solve_step(
     cost = Cost(inner / size, -right, np.diag(1 / size), point.theta)
     found = minimize(cost, known, task.structure)
     move = found.theta - point.theta
-    others = np.linalg.lstsq(
-        factor[:extra, :extra], -factor[:extra, p] - factor[:extra, extra:p] @ move, rcond=None
-    )[0]
+    goal = -factor[:extra, p] - factor[:extra, extra:p] @ move
+    others: Array = np.linalg.lstsq(factor[:extra, :extra], goal, rcond=None)[0].astype(float)
     promised = (
         rss - float(np.sum((inner @ move + right) ** 2)) - float(factor[p:, p] @ factor[p:, p])
     )
