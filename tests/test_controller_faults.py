@@ -1,5 +1,7 @@
 """What is wrong with a stated controller, told from records of a simulator of its own."""
 
+from dataclasses import replace
+
 import control as ct
 import numpy as np
 import pytest
@@ -342,3 +344,25 @@ def test_an_audit_blames_the_controller_or_the_log_and_knows_units(spoil, words)
     (found,) = [f for f in cid.audit(cid.Record(**given, dt=DT), loop).harmful if f.channel == "u"]
     assert words in found.text
     assert found.text.endswith("Correct the controller or the log.")
+
+
+@pytest.mark.parametrize("stated", [{}, {"kp": 60.0, "filter_time": 0.05}])
+def test_a_wrong_sign_is_what_is_said_first(stated):
+    """Also where the gains or the noise of the logger hide that only the sign is wrong."""
+    pid = cid.PID(kp=50.0, ki=20.0, kd=2.0, filter_time=0.02, lower=-5.0, upper=5.0)
+    loop = cid.Loop(cid.plants.servo(m=1.0, c=2.0, k=3.0), pid, dt=DT)
+    r = cid.random_binary(1500, amplitude=0.1, hold=50, seed=1)
+    record = cid.simulate(loop, r, sensor_noise=1e-4, seed=2)
+    other = replace(loop, controller=replace(pid, **stated))
+    noise = 0.02 * np.std(record.u) * np.random.default_rng(0).standard_normal(record.n)
+    for u in (-record.u, -record.u + noise):
+        found = cid.audit(replace(record, u=u), other).findings[0]
+        assert found.kind == "sign"
+        assert "opposite sign" in found.text
+        compared = cid.compare(replace(record, u=u), other)
+        assert compared.verdict.startswith("CHECK THE CONTROLLER AND THE LOG FIRST: u ")
+        assert compared.verdict.index("opposite sign") < compared.verdict.index("The fit")
+    # A law that only has other gains is not said to have another sign.
+    kinds = [f.kind for f in cid.audit(replace(record, u=record.u + noise), other).findings]
+    assert "sign" not in kinds
+    assert cid.compare(record, loop).rejection == ""

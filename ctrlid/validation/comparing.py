@@ -158,7 +158,8 @@ def _compare_loop(record: Record, loop: Loop, horizon: int | None) -> Comparison
     rejected = find_rejection(loop, record)
     curve, notes = _try_simulation(rejected, lambda: _simulate(record, loop, prediction))
     curves += [] if curve is None else [curve]
-    return _make_comparison(repr(loop), record, curves, residuals, notes)
+    made = _make_comparison(repr(loop), record, curves, residuals, notes)
+    return replace(made, rejection=rejected)
 
 
 def _try_simulation(
@@ -174,8 +175,8 @@ def _try_simulation(
         except (ModelCannotRun, EffectDoesNotApply) as reason:
             notes.append(f"no simulation: {reason}")
     if rejected:
-        notes.append(f"no simulation: the law of the controller is rejected, because {rejected} "
-                     "The prediction uses the logged u instead")  # fmt: skip
+        notes.append("no simulation: the law of the controller is rejected, as the last lines say; "
+                     "the prediction uses the logged u instead")  # fmt: skip
     return made, notes + sorted({str(w.message) for w in caught})[-1:]
 
 
@@ -212,7 +213,7 @@ def _compare_several(record: Record, loop: Loop, horizon: int | None) -> Compari
     notes += [f"{note}, of {one.what}" for one in each for note in one.notes]
     what = repr(loop).partition(", wired:")[0]
     return Comparison(what, record, tuple(curves), residuals, tests, tuple(notes),
-                      tuple(each))  # fmt: skip
+                      tuple(each), rejected)  # fmt: skip
 
 
 def _list_known_signals(record: Record, steps: int) -> list[tuple[Array, int]]:

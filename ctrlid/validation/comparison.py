@@ -1,6 +1,6 @@
 """What a comparison found, as a table and in words."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -77,6 +77,8 @@ class Comparison(Printed):
     outputs : tuple of Comparison
         Of several outputs, a comparison of each, called `what` it is; the curves and tests above
         are all of theirs. Empty for one output.
+    rejection : str
+        Why the stated law of the controller is not that of the record; empty where it stands.
     """
 
     what: str
@@ -86,6 +88,7 @@ class Comparison(Printed):
     tests: tuple[Correlation, ...]
     notes: tuple[str, ...] = ()
     outputs: tuple["Comparison", ...] = ()
+    rejection: str = ""
 
     def __post_init__(self) -> None:
         freeze_arrays(self)
@@ -104,7 +107,13 @@ class Comparison(Printed):
 
     @property
     def verdict(self) -> str:
-        """The comparison in words: the last curve, then the one-step errors; of each output."""
+        """The comparison in words: gross errors, the last curve, the one-step errors.
+
+        Of several outputs the curve and the errors of each.
+        """
+        if self.rejection:
+            plain = replace(self, rejection="").verdict
+            return f"CHECK THE CONTROLLER AND THE LOG FIRST: {self.rejection} {plain}"
         if self.outputs:
             return " ".join(f"{one.what}: {one.verdict}" for one in self.outputs)
         last = self.curves[-1]

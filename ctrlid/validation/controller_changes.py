@@ -158,6 +158,27 @@ def _estimate_gain(loop: Loop, record: Record) -> tuple[float, float, float] | N
     return float(constant), float(factor), float(beside)
 
 
+def measure_opposite_sign(loop: Loop, record: Record) -> tuple[float, float]:
+    """Return the factor of a law that fits u best, if it is negative, and what it then explains.
+
+    A share of the variance that neither a constant nor the state of the controller explains; both
+    zero where the factor is not negative.
+    """
+    part = _take_longest(record)
+    output, responses, rest = differentiate_replay(_take_limits_off(loop), part)
+    inner = _find_inner(part)
+    table = np.column_stack([output - rest, np.ones(part.n), responses])[inner]
+    if len(table) <= 2 * table.shape[1]:
+        return 0.0, 0.0
+    goal = part.u[inner]
+    found = regress(table, goal, DETERMINED)
+    without = goal - table[:, 1:] @ regress(table[:, 1:], goal, DETERMINED)
+    left, most = float(np.sum((goal - table @ found) ** 2)), float(np.sum(without**2))
+    if not (found[0] < 0 and most > 0):
+        return 0.0, 0.0
+    return float(found[0]), 1 - left / most
+
+
 def _scale_controller(loop: Loop, factor: float, constant: float) -> Loop | None:
     """Return the loop with so many times its controller, about another constant input."""
     controller = loop.controller

@@ -24,7 +24,14 @@ from ..loop.controllers import PID
 from ..loop.loop import Loop, exchange_controller, exchange_limits
 from ..loop.sampled_form import describe_sampled_form, find_sampled_form
 from ..loop.wiring import knows_references
-from .controller_changes import DETERMINED, FEWEST, TRIAL, list_changes, take_limits_off
+from .controller_changes import (
+    DETERMINED,
+    FEWEST,
+    TRIAL,
+    list_changes,
+    measure_opposite_sign,
+    take_limits_off,
+)
 from .residual_tests import compute_explained_share
 from .signal_defects import find_grid_step
 
@@ -54,6 +61,8 @@ BEGINNING = 1000
 HARDLY = 1e-5
 # A remainder below this share of u's variance steers no simulation.
 IMMATERIAL = 0.01
+# A law that explains so much of u by a negative factor has the wrong sign, whatever else it lacks.
+OPPOSITE = 0.5
 # Kinds of finding after which the stated law is not that of the record.
 REJECTED = ("gain", "sign", "delay", "limit", "filter", "sampled", "anti-windup", "unknown")
 # Of these, what leaves an immaterial share of u steers no simulation.
@@ -152,7 +161,10 @@ def check_controller(loop: Loop, record: Record) -> list[Fact]:
     if stated[0] == "bias":
         return [*facts, stated]
     wrong = _find_wrong_law(loop, part, left, exact_only, resolution, sample)
-    return [*facts, wrong or _find_law_off_limits(loop, part, left, resolution) or stated]
+    wrong = wrong or _find_law_off_limits(loop, part, left, resolution)
+    if wrong is None and stated[0] == "unknown":
+        wrong = _find_opposite_sign(loop, part, left)
+    return [*facts, wrong or stated]
 
 
 def find_rejection(loop: Loop, record: Record) -> str:
@@ -494,6 +506,21 @@ def _find_wrong_law(
             )
             return change.kind, text, left, True
     return None
+
+
+def _find_opposite_sign(loop: Loop, record: Record, left: float) -> Fact | None:
+    """Return that the law has the wrong sign where a negative factor explains most of the input.
+
+    Other gains, a limit or noise may be wrong beside it, so that no single change explains all.
+    """
+    factor, share = measure_opposite_sign(loop, record)
+    if share < OPPOSITE:
+        return None
+    return ("sign", f"u has the opposite sign of what the controller of the loop computes from r "
+            f"and y: {factor:.3g} times that explains {write_percent(share)} of the variance of u, "
+            "and something else differs as well. Look first whether u is logged with the sign that "
+            "the plant has, r and y are not exchanged, and the gains have their right sign; then "
+            "correct the controller or the log.", left, True)  # fmt: skip
 
 
 def _write_share(share: float) -> str:
