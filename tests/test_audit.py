@@ -409,3 +409,23 @@ def test_an_output_in_other_units_than_the_loop():
     servo = problems.servo(cid.PID(kp=5.0))
     far = cid.simulate(servo, 5.0 + cid.random_binary(1000, amplitude=0.1, hold=50, seed=3))
     assert not cid.audit(far, servo)["operating point"]  # which rests at zero: nobody knows
+
+
+@pytest.mark.parametrize("factor", [180 / np.pi, np.pi / 180, 1e3, 1e-3])
+def test_r_in_another_unit_than_y_is_remarked_upon(factor):
+    pid = cid.PID(kp=50.0, ki=80.0, kd=2.0)
+    loop = cid.Loop(cid.plants.servo(m=1.0, c=2.0, k=3.0), pid, dt=0.01)
+    for hold in (25, 100, 400):
+        r = cid.random_binary(2000, amplitude=0.1, hold=hold, seed=1)
+        record = cid.simulate(loop, r, sensor_noise=1e-3, seed=1)
+        assert cid.audit(record)["units"] == ()
+        (found,) = cid.audit(replace(record, r=record.r * factor))["units"]
+        assert not found.harmful
+        assert found.size == pytest.approx(1 / factor, rel=0.04)
+        assert "it looks as if one is in" in found.text
+        # Any other ratio may be that of a loop without integral action, or of another sensor.
+        for other in (0.5, 1.2, 1.1 * factor, 100.0):
+            assert cid.audit(replace(record, r=record.r * other))["units"] == ()
+        # What does not follow r has no ratio to it.
+        unlike = np.random.default_rng(1).standard_normal(record.n) / factor
+        assert cid.audit(replace(record, y=unlike))["units"] == ()

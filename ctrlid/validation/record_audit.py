@@ -37,6 +37,18 @@ FEW_CHANGES = 4
 SURE = 2e-4
 # If y does not explain more than this share of u's variance, something is added to u.
 OWN = 0.01
+# What y does after r is compared with r in means of so many blocks, by which its transients pass.
+BLOCKS = (20, 40, 80)
+# Such means follow each other, and their ratio is that of two units, up to these shares.
+ALIKE = 0.95
+NEAR = 0.04
+# Means that move less than this share of their signal's range say little of it.
+MOVES = 0.02
+# How many of the one unit the other is, and which they are.
+FACTORS = (
+    (180 / np.pi, "one is in degrees and the other in radians"),
+    (1000.0, "one is in thousandths (milli) of what the other is in"),
+)
 # A spectral line counts if its power is above this share of the largest one's.
 LINE = 1e-5
 
@@ -50,7 +62,8 @@ class AuditFinding(Printed):
     kind : str
         ``"saturation"``, ``"quantization"``, ``"repeats"``, ``"dropped samples"``, ``"outliers"``,
         ``"drift"``, ``"offset"``, ``"too little excitation"``, ``"constant signal"``,
-        ``"too few samples"``, ``"between samples"``, ``"controller"`` or ``"operating point"``;
+        ``"too few samples"``, ``"between samples"``, ``"controller"``, ``"units"`` or
+        ``"operating point"``;
         where the stated controller does not compute the logged u, what is wrong with it:
         ``"gain"``, ``"sign"``, ``"bias"``, ``"delay"``, ``"limit"``, ``"filter"``, ``"sampled"``
         (it is stated as analog, and was sampled) or ``"unknown"``.
@@ -201,6 +214,7 @@ def audit(record: Record, loop: Loop | None = None) -> Audit:
         *checks.find_outliers(),
         *checks.find_drift(),
         *checks.find_repetition(),
+        *checks.find_other_unit(),
     ]
     said = check_hold(record, loop)
     if said is not None:
@@ -450,6 +464,30 @@ class _RecordChecks:
                                         self.whole))  # fmt: skip
         return out
 
+    def find_other_unit(self) -> list[AuditFinding]:
+        """Say where y follows r so many times as far as two units of one quantity differ.
+
+        A loop without integral action rests elsewhere than at r, but not just there.
+        """
+        r = self.record.r
+        if r is None:
+            return []
+        part = slice(*self._find_longest())
+        likeness, ratio = max(_compare_means(r[part], self.record.y[part], m) for m in BLOCKS)
+        for factor, words in FACTORS:
+            known = factor if ratio > 1 else 1 / factor
+            if likeness < ALIKE or abs(ratio / known - 1) > NEAR:
+                continue
+            text = (
+                f"y follows r with a ratio of {ratio:.4g}, about {known:.4g}: it looks as if "
+                f"{words}. If so, convert one of them: Record.from_csv has scale=."
+            )
+            return [AuditFinding("units", "r", text, ratio, self.whole)]
+        return []
+
+    def _find_longest(self) -> tuple[int, int]:
+        return max(self.record.segments(), key=lambda ends: ends[1] - ends[0])
+
     def check_operating_point(self, loop: Loop) -> list[AuditFinding]:
         ratio = measure_distance(loop, self.record)
         if not ratio:
@@ -503,6 +541,23 @@ class _RecordChecks:
                     "several frequencies, as multisine gives.")  # fmt: skip
             return [AuditFinding(kind, key, text, 2.0, self.whole, harmful=True)]
         return []
+
+
+def _compare_means(r: Any, y: Any, blocks: int) -> tuple[float, float]:
+    """Return correlation of the means of two signals in so many blocks, and their ratio y to r.
+
+    Both zero for a record too short, or where one of them rests.
+    """
+    size = len(r) // blocks
+    if size < 2:
+        return 0.0, 0.0
+    means = [np.reshape(v[: size * blocks], (blocks, size)).mean(axis=1) for v in (r, y)]
+    spread = [float(np.std(v)) for v in means]
+    if min(spread[0] / max(float(np.ptp(r)), 1e-300), spread[1] / max(float(np.ptp(y)), 1e-300)) < (
+        MOVES
+    ):
+        return 0.0, 0.0
+    return float(np.corrcoef(*means)[0, 1]), spread[1] / spread[0]
 
 
 def _count_lines(v: Any) -> int:
