@@ -9,6 +9,7 @@ import pytest
 import ctrlid as cid
 import problems
 from ctrlid import CtrlidError
+from ctrlid.data.converter_grid import find_grid_step
 from ctrlid.loop.controller_replay import run_controller
 from ctrlid.validation import signal_defects as defects
 
@@ -181,7 +182,7 @@ def test_printed_digits_are_a_step_but_no_news():
 def test_levels_of_a_calibrated_converter():
     raw = np.round(np.random.default_rng(5).standard_normal(5000) * 30)
     y = np.exp(raw / 500)  # evenly spaced in counts, not in units
-    assert defects.find_grid_step(y) == pytest.approx(1 / 500, rel=0.1)
+    assert find_grid_step(y) == pytest.approx(1 / 500, rel=0.1)
 
 
 @pytest.mark.parametrize("lag", [1, 2, -1, -2])

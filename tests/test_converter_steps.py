@@ -8,9 +8,11 @@ import pytest
 
 import ctrlid as cid
 from ctrlid.data.validity import find_equal_readings
+from ctrlid.diagnosis.thresholds import THRESHOLD
 from ctrlid.estimation.likelihood.kalman_filter import Noise
 from ctrlid.estimation.likelihood.likelihood import make_problem
 from ctrlid.estimation.likelihood.maximization import begin_fit
+from ctrlid.loop import step_check
 
 J, DAMPING, TORQUE, WEIGHT = 0.012, 0.05, 0.08, 0.25
 DT, STEP = 0.005, 2 * math.pi / 4096
@@ -156,3 +158,27 @@ def test_an_effect_is_named_behind_an_encoder(hidden, name, size):
     assert finding.names[0] == name
     (value,) = finding.effect.values().values()
     assert value == pytest.approx(size, rel=0.03)
+
+
+def test_steps_that_the_loop_lacks_are_said_with_what_to_type():
+    cure = f"loop.with_effect(ctrlid.effects.Quantization(step={STEP:.6g}))"
+    record, bare = simulate_arm(2000), make_arm()
+    compared = cid.compare(record, bare)
+    assert "SOMETHING IS MISSING" in compared.verdict
+    assert f"steps of {STEP:.6g} rad" in compared.verdict
+    assert compared.verdict.endswith(f"{cure}.")
+    assert any(cure in note for note in cid.fit_loop(bare, record).estimate.notes)
+    stepped = make_arm(cid.effects.Quantization(step=STEP))
+    assert cid.compare(record, stepped).steps == ""
+    assert not any("STEPS" in note for note in cid.fit_loop(stepped, record).estimate.notes)
+    # Steps far below the noise are how numbers are written.
+    assert cid.compare(simulate_arm(2000, noise=4 * STEP), bare).steps == ""
+
+
+def test_the_share_of_the_noise_says_from_which_steps_on_a_word_is_due():
+    assert THRESHOLD.coarse_steps == step_check.COARSE
+    record = simulate_arm(600)
+    for share in (0.2, 0.3):
+        noise = STEP / math.sqrt(12 * share)
+        told = step_check.describe_unstated_steps(make_arm(), record, noise)
+        assert bool(told) == (share > step_check.COARSE)

@@ -219,6 +219,29 @@ def test_small_but_certain_is_said_to_be_small():
     assert "are white and independent" in verdict(0.5, 0.0)
 
 
+def test_noise_is_said_to_explain_nothing_of_what_a_straight_line_does_better():
+    """With u of the wrong sign a large random force explains any error."""
+    pid = cid.PID(kp=50.0, ki=20.0, kd=2.0, filter_time=0.02, b=0.0)
+    loop = cid.Loop(cid.plants.servo(m=1.0, c=2.0, k=3.0), pid, dt=0.01)
+    r = cid.random_binary(1500, amplitude=0.1, hold=50, seed=1)
+    record = cid.simulate(loop, r, sensor_noise=1e-4, seed=2)
+    right = cid.compare(record, loop)
+    assert not any(curve.useless for curve in right.curves)
+    wrong = cid.compare(replace(record, u=-record.u), loop)
+    curve = wrong["50-step"]
+    assert curve.fit < 0
+    assert curve.useless
+    assert curve.written_share == "-"
+    assert "noise explains" not in str(curve)
+    assert "straight line through the last two is nearer to y" in str(wrong)
+    assert "Noise explains" not in wrong.verdict
+    # The last value of a ramp errs by as much as it climbs, the line through the last two does not.
+    ramp = 0.01 * np.arange(400.0) + 0.2 * np.sin(0.02 * np.arange(400.0))
+    climbing = cid.Record(u=np.ones(400), y=ramp, dt=0.01)
+    flat = cid.compare(climbing, ct.tf([1e-9], [1, -0.9], 0.01), horizon=5)
+    assert flat["5-step"].useless
+
+
 def test_a_model_that_cannot_be_simulated_says_why():
     record = noisy(loop_with(DIGITAL), 2000)
     weak = cid.compare(record, loop_with(0.05 * DIGITAL))

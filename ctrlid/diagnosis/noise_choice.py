@@ -13,6 +13,7 @@ from .._base.statistics import (
     compute_predicted_likelihood,
     rounding_variance,
 )
+from ..data.converter_grid import find_grid_step
 from ..estimation.likelihood.kalman_filter import Noise
 from ..estimation.likelihood.likelihood import Fit, evaluate_likelihood
 from ..estimation.likelihood.maximization import choose_sensor_noise, choose_tails
@@ -22,7 +23,6 @@ from ..estimation.likelihood.noise_fit import (
     measure_walk_gain,
 )
 from ..estimation.likelihood.tails import JointTails
-from ..validation.signal_defects import find_grid_step
 from .candidates import Trial
 from .fitted_model import Model, with_linearization
 from .noise_tests import run_noise_tests

@@ -197,7 +197,12 @@ def _make_estimate_blocks(e: Estimate) -> list[Block]:
 def _make_comparison_tables(c: Comparison) -> list[Table]:
     unit = c.record.units.get("y", "unit of y")
     curves = tuple(
-        (q.label, write_fit(q.fit), f"{q.rms:.3g}", f"{100 * q.noise_share:.1f} %")
+        (
+            q.label,
+            write_fit(q.fit),
+            f"{q.rms:.3g}",
+            "-" if q.useless else f"{100 * q.noise_share:.1f} %",
+        )
         for q in c.curves
     )
     tests = tuple(

@@ -28,6 +28,7 @@ from ..estimation.linear.sampled_motion import discretize_model, list_inputs
 from ..loop.loop import Loop
 from ..loop.period_map import compute_growth_rate
 from ..loop.simulation import Simulator
+from ..loop.step_check import describe_unstated_steps
 from ..loop.unit_check import note_unit_clashes
 from ..loop.wiring import match_signals
 from ..physics.conversions import to_polynomials, to_state_matrices
@@ -49,6 +50,8 @@ from .wired_controller_check import find_wired_rejection
 
 Result = TypeVar("Result")
 
+# A curve is useless from this many times the error of a guess without a model; chance is less.
+BEATEN = 1.05
 # An injected signal below this share of the input's standard deviation is rounding.
 MEANINGFUL = 1e-6
 
@@ -159,7 +162,8 @@ def _compare_loop(record: Record, loop: Loop, horizon: int | None) -> Comparison
     curve, notes = _try_simulation(rejected, lambda: _simulate(record, loop, prediction))
     curves += [] if curve is None else [curve]
     made = _make_comparison(repr(loop), record, curves, residuals, notes)
-    return replace(made, rejection=rejected)
+    stepped = describe_unstated_steps(loop, record, prediction.sensor_noise)
+    return replace(made, rejection=rejected, steps=stepped)
 
 
 def _try_simulation(
@@ -213,7 +217,8 @@ def _compare_several(record: Record, loop: Loop, horizon: int | None) -> Compari
     notes += [f"{note}, of {one.what}" for one in each for note in one.notes]
     what = repr(loop).partition(", wired:")[0]
     return Comparison(what, record, tuple(curves), residuals, tests, tuple(notes),
-                      tuple(each), rejected)  # fmt: skip
+                      tuple(each), rejected,
+                      describe_unstated_steps(loop, record, prediction.sensor_noise))  # fmt: skip
 
 
 def _list_known_signals(record: Record, steps: int) -> list[tuple[Array, int]]:
@@ -441,7 +446,27 @@ def _judge_curve(
     share = 1 - follows
     if fit <= EXACT and np.isfinite(noise) and noise < rms:
         share = min(share, (noise / rms) ** 2)
-    return Curve(str(how), np.where(known, y, np.nan), fit, rms, follows, share)
+    useless = rms > 0 and rms > BEATEN * _measure_simple_guesses(record, how.horizon, error, known)
+    return Curve(str(how), np.where(known, y, np.nan), fit, rms, follows, share, useless)
+
+
+def _measure_simple_guesses(record: Record, steps: int, error: Array, known: Any) -> float:
+    """Return the RMS error of the best guess without a model, as one over all samples of a curve.
+
+    A prediction is set beside the last value known and the line through the last two, on the
+    samples where both are known; any curve beside the mean.
+    """
+    y = np.asarray(record.y)
+    rms = float(np.sqrt(np.mean(error[known] ** 2)))
+    best = float(np.std(y[known]))
+    both = known & find_whole_past(np.asarray(record.valid), steps + 1)
+    if not steps or not both.any():
+        return best
+    last, before = np.roll(y, steps), np.roll(y, steps + 1)
+    own = max(float(np.sqrt(np.mean(error[both] ** 2))), 1e-300)
+    for guess in (last, last + steps * (last - before)):
+        best = min(best, rms / own * float(np.sqrt(np.mean((y - guess)[both] ** 2))))
+    return best
 
 
 def _test_residuals(record: Record, residuals: Array) -> tuple[Correlation, ...]:

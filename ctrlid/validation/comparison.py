@@ -17,6 +17,9 @@ EXACT = 100 * (1 - 1e-9)
 # If noise explains so much of an error's variance nothing is missing, since its size is known no
 # better.
 ENOUGH = 0.75
+_USELESS = (
+    "The mean of y, its last value known or a straight line through the last two is nearer to y"
+)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -39,6 +42,9 @@ class Curve(Printed):
     noise_share : float
         Share of the error's variance that noise explains: not more than what follows no signal,
         and not more than noise of the size found in the one-step errors makes of it.
+    useless : bool
+        Whether the mean of y, its last value or a straight line through its last two is nearer to
+        y, so that no share of the error tells anything.
     """
 
     label: str
@@ -47,11 +53,23 @@ class Curve(Printed):
     rms: float
     follows: float
     noise_share: float
+    useless: bool = False
 
     def __post_init__(self) -> None:
         freeze_arrays(self)
 
+    @property
+    def written_share(self) -> str:
+        """What noise explains, in percent; a dash where the curve is useless.
+
+        Noise that a model takes for large explains any error.
+        """
+        return "-" if self.useless else _write_percent(self.noise_share)
+
     def __str__(self) -> str:
+        if self.useless:
+            return (f"{self.label}: fit {write_fit(self.fit)}, RMS error {self.rms:.3e}. "
+                    f"{_USELESS}")  # fmt: skip
         return (f"{self.label}: fit {write_fit(self.fit)}, RMS error {self.rms:.3e}, of which "
                 f"noise explains {_write_percent(self.noise_share)} of the variance")  # fmt: skip
 
@@ -79,6 +97,8 @@ class Comparison(Printed):
         are all of theirs. Empty for one output.
     rejection : str
         Why the stated law of the controller is not that of the record; empty where it stands.
+    steps : str
+        What to do about steps of the readings that the loop does not have; empty without them.
     """
 
     what: str
@@ -89,6 +109,7 @@ class Comparison(Printed):
     notes: tuple[str, ...] = ()
     outputs: tuple["Comparison", ...] = ()
     rejection: str = ""
+    steps: str = ""
 
     def __post_init__(self) -> None:
         freeze_arrays(self)
@@ -114,6 +135,8 @@ class Comparison(Printed):
         if self.rejection:
             plain = replace(self, rejection="").verdict
             return f"CHECK THE CONTROLLER AND THE LOG FIRST: {self.rejection} {plain}"
+        if self.steps:
+            return f"{replace(self, steps='').verdict} {self.steps}"
         if self.outputs:
             return " ".join(f"{one.what}: {one.verdict}" for one in self.outputs)
         last = self.curves[-1]
@@ -137,6 +160,8 @@ class Comparison(Printed):
             )
         elif large:
             text += ". SOMETHING IS MISSING in the model, or its noise is not white."
+        elif last.useless:
+            text += f". {_USELESS}, so that this curve tells nothing of the model."
         else:
             text += (f". Noise explains {_write_percent(last.noise_share)} of the variance of its "
                      "error.")  # fmt: skip
@@ -161,10 +186,11 @@ class Comparison(Printed):
         size = f"RMS error [{unit}]" if unit else "RMS error"
         rows.append(f"  {'curve':<34}{'fit':>10}{size:>18}{'noise explains':>18}")
         rows += [
-            f"  {c.label:<34}{write_fit(c.fit):>10}{c.rms:>18.3e}"
-            f"{_write_percent(c.noise_share):>18}"
+            f"  {c.label:<34}{write_fit(c.fit):>10}{c.rms:>18.3e}{c.written_share:>18}"
             for c in self.curves
         ]
+        if any(c.useless for c in self.curves):
+            rows.append(f"  -: {_USELESS[0].lower()}{_USELESS[1:]}")
         if self.tests:
             rows.append(f"  {'correlation of one-step errors':<34}{'passed?':>10}{'largest':>18}"
                         f"{'variance share':>18}")  # fmt: skip

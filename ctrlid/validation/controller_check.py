@@ -12,6 +12,7 @@ from .._base.errors import CtrlidError
 from .._base.periods import have_same_period
 from .._base.statistics import regress
 from .._base.text import write_count, write_percent
+from ..data.converter_grid import find_grid_step
 from ..data.record import Record
 from ..data.validity import find_longest_run, find_whole_past
 from ..loop.controller_replay import (
@@ -33,7 +34,6 @@ from .controller_changes import (
     take_limits_off,
 )
 from .residual_tests import compute_explained_share
-from .signal_defects import find_grid_step
 
 # At most so many samples are replayed, which tell enough and take seconds.
 MOST = 20_000

@@ -12,6 +12,7 @@ from .._base.errors import CtrlidError
 from .._base.interruption import hold_interrupt
 from .._base.rounding import keep_numpy_quiet
 from .._base.text import Printed, write_count, write_percent
+from ..data.converter_grid import estimate_rounding, find_grid_step
 from ..data.record import SIGNALS, Record
 from ..data.several_records import order_model_and_data
 from ..data.validity import find_longest_run, find_runs
@@ -300,7 +301,7 @@ class _RecordChecks:
         self.signals = {k: v for k in SIGNALS if (v := getattr(record, k)) is not None}
         self.whole = (0, record.n)
         self.quantum = dict.fromkeys(SIGNALS, 0.0) | {
-            k: defects.find_grid_step(v[self.valid])
+            k: find_grid_step(v[self.valid])
             for k, v in self.signals.items()
             if k == "y" or not defects.is_held(v[self.valid])
         }
@@ -332,7 +333,7 @@ class _RecordChecks:
         for key in ("u", "y"):
             v = self.signals[key][self.valid]
             value, long = float(v[0]), ""
-            if np.ptp(v) > defects.estimate_rounding(v):
+            if np.ptp(v) > estimate_rounding(v):
                 share, value = defects.find_stuck(v, driver) if key == "y" else (0.0, 0.0)
                 if not share:
                     continue
@@ -510,9 +511,7 @@ class _RecordChecks:
     def check_excitation(self, injected: bool) -> list[AuditFinding]:
         key = "u" if self.record.r is None else "r"
         v = self.signals[key]
-        moves = (
-            (np.abs(np.diff(v)) > defects.estimate_rounding(v)) & self.valid[1:] & self.valid[:-1]
-        )
+        moves = (np.abs(np.diff(v)) > estimate_rounding(v)) & self.valid[1:] & self.valid[:-1]
         changes = int(np.count_nonzero(moves))
         kind, size = "too little excitation", float(changes)
         if changes == 0:

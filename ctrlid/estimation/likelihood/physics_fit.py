@@ -23,6 +23,7 @@ from ...data.several_records import (
 from ...effects import ReadingEffect
 from ...loop.loop import Loop
 from ...loop.sampled_form import note_sampled_controller
+from ...loop.step_check import describe_unstated_steps
 from ...loop.unit_check import describe_distance, measure_distance, note_unit_clashes
 from ...physics.linearization import compute_state_matrices
 from ..whiteness import note_coloured_innovations
@@ -153,6 +154,7 @@ def fit_loop(
         *left_out,
         *_note_doubtful_input(loop, given, fitted),
         *fitted.estimate.notes,
+        *_note_steps(loop, fit, fitted),
         *colour,
         *_note_contradicted_values(fit),
         *_note_unknown_controller(loop, given),
@@ -164,6 +166,15 @@ def _note_distance(loop: Loop, record: Record) -> list[str]:
     """Return a note where a record is far from the operating point of its loop."""
     ratio = measure_distance(loop, record)
     return [f"LOOK AT THE UNITS: {describe_distance(loop, ratio)}"] if ratio else []
+
+
+def _note_steps(loop: Loop, fit: Fit, fitted: LoopFit) -> list[str]:
+    """Return a note where readings have steps that the loop does not have, of the first record."""
+    found = (
+        describe_unstated_steps(loop, one.record, noise)
+        for one, noise in zip(fit.problem.data, fitted.estimate.sensor_noise, strict=True)
+    )
+    return [text for text in found if text][:1]
 
 
 def _says_nothing(fit: Fit, fitted: LoopFit) -> bool:
