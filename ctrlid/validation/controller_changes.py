@@ -165,7 +165,7 @@ def measure_opposite_sign(loop: Loop, record: Record) -> tuple[float, float]:
     zero where the factor is not negative.
     """
     part = _take_longest(record)
-    output, responses, rest = differentiate_replay(_take_limits_off(loop), part)
+    output, responses, rest = differentiate_replay(take_limits_off(loop), part)
     inner = _find_inner(part)
     table = np.column_stack([output - rest, np.ones(part.n), responses])[inner]
     if len(table) <= 2 * table.shape[1]:
