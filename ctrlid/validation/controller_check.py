@@ -21,6 +21,7 @@ from ..loop.controller_replay import (
     replay_from_best_state,
     sample_analog_controller,
 )
+from ..loop.controller_sight import find_sight
 from ..loop.controllers import PID
 from ..loop.loop import Loop, exchange_controller, exchange_limits
 from ..loop.sampled_form import describe_sampled_form, find_sampled_form
@@ -104,7 +105,7 @@ def check_controller(loop: Loop, record: Record) -> list[Fact]:
     if record.n - first < FEWEST:
         return []
     part = record[first : first + MOST]
-    resolution, sample = 0.0, None
+    resolution, sample, seen = 0.0, None, ""
     if law.dt == 0.0:
         form = find_sampled_form(loop.controller, part)
         if form is not None:
@@ -113,6 +114,9 @@ def check_controller(loop: Loop, record: Record) -> list[Fact]:
         sampled = _sample_analog_law(loop, part)
         if sampled is None:
             return []
+        if find_sight(loop, part) == "output":
+            seen = (" The controller sees the output itself: the noise of y is that of the logger "
+                    "alone.")  # fmt: skip
         loop, resolution, sample = sampled
     facts: list[Fact] = []
     lower, upper = loop.input_limits
@@ -135,7 +139,7 @@ def check_controller(loop: Loop, record: Record) -> list[Fact]:
             return [*facts, _report_bias(constant, left)]
         if resolution:
             return [*facts, ("exact", "the logged u is what the analog controller of the loop "
-                             "computes from r and y, as far as samples tell.", left,
+                             f"computes from r and y, as far as samples tell.{seen}", left,
                              False)]  # fmt: skip
         return [*facts, ("exact", "the logged u is exactly what the controller of the loop "
                          "computes from r and y.", left, False)]  # fmt: skip
@@ -156,6 +160,8 @@ def check_controller(loop: Loop, record: Record) -> list[Fact]:
             return facts
         part, left = moved, least
     stated = _explain_remainder(loop, e, left, part, resolution)
+    if seen and stated[0] == "injected":
+        stated = (stated[0], stated[1] + seen, *stated[2:])
     # Another form of a derivative adds a function of r, and only its exact replay tells it.
     exact_only = stated[0] == "injected" and not resolution
     if stated[0] == "bias":

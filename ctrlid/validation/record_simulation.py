@@ -10,6 +10,7 @@ from .._base.errors import ModelCannotRun
 from ..data.record import Record
 from ..estimation.likelihood.filter_data import FEWEST
 from ..loop.controller_replay import read_references, replay_from_best_state, run_controller
+from ..loop.controller_sight import Sight, find_sight
 from ..loop.controllers import PID
 from ..loop.initial_state import find_initial_state
 from ..loop.simulation import Simulator
@@ -30,12 +31,15 @@ class Stretch:
         What is added to the controller's output [input unit].
     start_time : float
         Time of the first sample since the start of the experiment [s].
+    sight : {"reading", "output"}
+        Whether an analog controller sees the sensor noise, or only the logger does.
     """
 
     initial: Array
     r: Array | None
     d: Array
     start_time: float
+    sight: Sight = "reading"
 
     def run(
         self, simulator: Simulator, noise: Sequence[Array] | None = None
@@ -47,7 +51,11 @@ class Stretch:
         CtrlidError
             If the loop leaves the range in which it can be simulated.
         """
-        return simulator.run(self.initial, self.r, self.d, noise, self.start_time)
+        logged = None
+        if noise is not None and self.sight == "output":
+            logged, noise = noise[0], [0 * noise[0], *noise[1:]]
+        y, u = simulator.run(self.initial, self.r, self.d, noise, self.start_time)
+        return y if logged is None else y + np.reshape(logged, np.shape(y)), u
 
 
 def find_long_stretches(record: Record, shortest: int = FEWEST) -> list[slice]:
@@ -136,4 +144,5 @@ def prepare_stretch(
         d = part.u - replayed
     time = 0.0 if start_time is None else start_time + float(record.t[samples.start] - record.start)
     start = find_initial_state(simulator.smooth, part, r, d, initial, fitted, time)
-    return Stretch(start, r, d, time)
+    sight = find_sight(loop, part) if loop.analog and not follow else "reading"
+    return Stretch(start, r, d, time, sight)

@@ -12,6 +12,7 @@ from ..._base.arrays import Array
 from ..._base.errors import CtrlidError
 from ..._base.statistics import pseudo_inverse, rounding_variance
 from ...data.record import Record
+from ...loop.controller_sight import find_sight
 from ...loop.loop import Loop, find_converter_steps
 from .filter_data import FilterData, can_follow_controller, make_filter_data
 from .kalman_filter import Filtered, Noise, linearize_inside_domain, run_filter
@@ -131,9 +132,9 @@ def make_problem(
     bounds = list_parameter_bounds(loop, names)
     start_times = start_times or [0.0] * len(records)
     data = tuple(make_filter_data(loop, r, b) for r, b in zip(records, start_times, strict=True))
-    follow = can_follow_controller(loop, records[0])
+    sees = find_sight(loop, records[0]) if can_follow_controller(loop, records[0]) else ""
     plant = make_sampled_plant(
-        loop, tuple(names), records[0].hold, follow, records[0].hold_r if follow else "zoh"
+        loop, tuple(names), records[0].hold, sees, records[0].hold_r if sees else "zoh"
     )
     if not plant.n:
         raise CtrlidError(

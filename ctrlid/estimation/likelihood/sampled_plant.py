@@ -76,22 +76,25 @@ class SampledPlant:
         Parameters whose sensitivities are wanted.
     hold : {"zoh", "foh", "bandlimited"}
         How the input runs between samples.
-    follow : bool
-        Whether a known analog controller moves the input between samples.
+    sees : {"", "reading", "output"}
+        What a known analog controller sees that moves the input between samples: the readings with
+        their noise, which stays over a period, or the output itself, where the noise is that of the
+        logger. Empty: the input is that of the record.
     hold_r : {"zoh", "foh"}, optional
         How the reference runs between samples, as such a controller sees it.
     """
 
     def __init__(
-        self, loop: Loop, names: Sequence[str], hold: str, follow: bool, hold_r: str = "zoh"
+        self, loop: Loop, names: Sequence[str], hold: str, sees: str, hold_r: str = "zoh"
     ) -> None:
         self.loop, self.names, self.hold = loop, tuple(names), hold
         e = self.e = loop.equations(keep=True)
         every = list(e.parameters)
         self.index = [every.index(name) for name in self.names]
-        law = loop.law() if follow and e.play is None and e.delay is None else None
+        law = loop.law() if sees and e.play is None and e.delay is None else None
         self.law = law if law is not None and law.dt == 0.0 else None
         self.hold_r = hold_r if self.law else "zoh"
+        self.sees = sees if self.law else ""
         self.n = len(e.states)
         self.size = self.n + (len(self.law.rest) if self.law else 0)
         self.pieces = count_pieces(hold)
@@ -103,13 +106,13 @@ class SampledPlant:
             self.channels = len(self.forces)
         self.scheme = choose_scheme(e, loop, loop.dt / self.pieces)
         self.plan = PeriodPlan(e, self.law, loop.dt, hold, self.scheme, self.forces, self.channels,
-                         tuple(self.index), self.delay_samples, self.hold_r)  # fmt: skip
+                         tuple(self.index), self.delay_samples, self.hold_r, self.sees)  # fmt: skip
         self.maps = build_maps(self.plan)
         self.initial_conditions = InitialConditions(self.plan)
 
     def of_loop(self, loop: Loop, names: Sequence[str]) -> SampledPlant:
         """Return the plant of another loop, for the same kind of record."""
-        return SampledPlant(loop, names, self.hold, self.law is not None, self.hold_r)
+        return SampledPlant(loop, names, self.hold, self.sees, self.hold_r)
 
     def _evaluate_transition(
         self, stages: Sequence[BlockEvaluation], x: Array, *given: Any
@@ -450,7 +453,7 @@ def shift_signal(values: Array, late: int, before: Array | None = None) -> Array
 
 @functools.lru_cache(maxsize=8)
 def make_sampled_plant(
-    loop: Loop, names: tuple[str, ...], hold: str, follow: bool, hold_r: str = "zoh"
+    loop: Loop, names: tuple[str, ...], hold: str, sees: str, hold_r: str = "zoh"
 ) -> SampledPlant:
     """Return the plant of a loop, made once."""
-    return SampledPlant(loop, names, hold, follow, hold_r)
+    return SampledPlant(loop, names, hold, sees, hold_r)

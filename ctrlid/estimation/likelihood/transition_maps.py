@@ -69,6 +69,8 @@ class PeriodPlan:
         Whole pieces by which the input comes late: periods, or parts of one if it is band-limited.
     hold_r : {"zoh", "foh"}
         How the reference of the controller runs between samples.
+    sees : {"reading", "output"}
+        Whether such a controller sees the noise of the readings, or only the logger does.
     structure : tuple
         What is compared in place of equations and law: their expressions without values.
     """
@@ -83,6 +85,7 @@ class PeriodPlan:
     index: tuple[int, ...]
     delay_samples: int
     hold_r: str
+    sees: str
     structure: tuple[Any, ...] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -320,7 +323,9 @@ def _integrate_with_controller(
     e, law, n = plan.equations, plan.law, len(plan.equations.states)
     assert law is not None
     r, climb = path_r[0], (path_r[1] - path_r[0]) / plan.dt
-    noise = y - e.smoothed(t, x[:n], u, p, s)[1]
+    output = e.smoothed(t, x[:n], u, p, s)[1]
+    y = y if plan.sees == "reading" else output
+    noise = y - output
     # The offset holds bias, injected signals and what the controller's state leaves unexplained.
     offset = u - law.apply(t, x[n:], r, y)[0]
 

@@ -19,6 +19,7 @@ from ..._base.signals import require_one_signal
 from ..._base.text import write_count, write_list, write_number, write_p_value, write_quantity
 from ...data.record import Record
 from ...data.several_records import VISIBLE_MOTION, as_records, measure_input_motion
+from ...loop.controller_sight import read_sight
 from ...loop.controllers import PID
 from ...loop.sampled_form import note_sampled_controller
 from ...physics.conversions import to_state_matrices
@@ -305,7 +306,9 @@ def _make_circuit(controller: Any, records: Sequence[Record]) -> Circuit | None:
             f"with one input and one output; given {type(controller).__name__}"
         )
     a, b, c, d = to_state_matrices(controller)
-    circuit = Circuit(a, b[:, 0], c[0], float(d[0, 0]), records[0].hold_r)
+    gain = float(d[0, 0])
+    sight = read_sight(records[0]) if gain else "reading"
+    circuit = Circuit(a, b[:, 0], c[0], gain, records[0].hold_r, sight)
     if any(r.r is None for r in records):
         if records[0].dt * circuit.fastest > FAST_CIRCUIT:
             warnings.warn(

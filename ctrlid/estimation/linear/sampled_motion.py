@@ -14,17 +14,19 @@ from ..._base.arrays import Array
 from ..._base.compilation import compile_loop
 from ..._base.interruption import keep_interrupt
 from ...data.reconstruction import PIECES, reconstruct_signal
+from ...loop.controller_sight import Sight
 
 
 @dataclass(frozen=True, eq=False)
 class Circuit:
-    """A known analog controller of r - y in state-space form."""
+    """A known analog controller of r - y in state-space form, and what it sees of the noise."""
 
     a: Array
     b: Array
     c: Array
     d: float
     hold_r: str = "zoh"
+    sight: Sight = "reading"
 
     @property
     def fastest(self) -> float:
@@ -179,7 +181,8 @@ def list_inputs(u: Array, hold: str, valid: Any = None) -> dict[str, Array]:
 def _discretize_with_circuit(a: Array, b: Array, c: Array, dt: float, k: Circuit) -> DiscreteModel:
     """Return plant, circuit and input as one system, driven by r and sensor noise.
 
-    The noise is held over the period, and so is r, unless it runs straight.
+    The noise is held over the period, and so is r, unless it runs straight. Noise of the logger is
+    none to the circuit.
     """
     n, m = len(a), len(k.a)
     size = n + m + 1
@@ -196,9 +199,11 @@ def _discretize_with_circuit(a: Array, b: Array, c: Array, dt: float, k: Circuit
     motion = _exponential(block * dt)[: n + m]
     f = motion[:, : n + m].copy()
     # e = r - (y_measured - c x): the estimate of the noise at the sample.
-    f[:, x] += np.outer(motion[:, e], c)
     both = np.concatenate([c, np.zeros(m)])
-    signals = [("u", 0, motion[:, v]), ("y", 0, -motion[:, e])]
+    signals = [("u", 0, motion[:, v])]
+    if k.sight == "reading":
+        f[:, x] += np.outer(motion[:, e], c)
+        signals.append(("y", 0, -motion[:, e]))
     if k.hold_r == "foh":
         ramp = motion[:, e + 1]
         signals += [("r", 0, motion[:, e] - ramp), ("r", -1, ramp)]
