@@ -134,6 +134,39 @@ def test_another_rule_at_the_limit_does_not_speak_against_the_law(rule):
                    for f in cid.audit(wrong, loop).findings)  # fmt: skip
 
 
+def record_by_another_converter(read, logged, seed, factor=1.0, still=False, n=2500):
+    """A mass on a spring under a PD controller that reads y with other noise than the logger."""
+    rng = np.random.default_rng(seed)
+    whole = expm(DT * np.array([[0, 1, 0], [-3, -2, 1], [0, 0, 0]]))
+    r = np.repeat(rng.choice([-0.3, 0.3], n // 40 + 1), 40)[:n] * (not still)
+    x, u, y, last = np.array([0.1, 0.0]), np.zeros(n), np.zeros(n), 0.0
+    for k in range(n):
+        error = r[k] - x[0] - read * rng.standard_normal()
+        y[k] = x[0] + logged * rng.standard_normal()
+        u[k] = factor * (40 * error + 16 * (error - last))
+        last = error
+        x = whole[:2, :2] @ x + whole[:2, 2] * (u[k] + 0.05 * rng.standard_normal())
+    loop = cid.Loop(cid.plants.servo(m=1.0, c=2.0, k=3.0), cid.PID(kp=40.0, kd=16 * DT), dt=DT)
+    return cid.Record(r=r, u=u, y=y, dt=DT), loop
+
+
+@pytest.mark.parametrize(("read", "logged"), [(0.0, 1e-3), (1e-4, 1e-3), (1e-3, 1e-3), (0.0, 0.05)])
+def test_a_logger_with_noise_of_its_own_does_not_speak_against_the_law(read, logged):
+    for seed in range(4):
+        record, loop = record_by_another_converter(read, logged, seed)
+        (found,) = [f for f in cid.audit(record, loop).findings if f.kind in (*FAULTS, "logger")]
+        assert found.kind == "logger"
+        assert "Gains and structure are right" in found.text
+
+
+@pytest.mark.parametrize("still", [False, True])
+def test_other_gains_are_no_noise_of_the_logger(still):
+    for seed in range(4):
+        for factor, noise in ((1.1, 0.0), (1.3, 1e-4), (0.7, 1e-4)):
+            record, loop = record_by_another_converter(1e-3, noise, seed, factor, still)
+            assert not cid.audit(record, loop)["logger"]
+
+
 def test_a_pid_as_stated_stands():
     record, loop = record_pid(limit=12.0)
     assert "computes from r and y" in cid.audit(record, loop)["controller"][0].text

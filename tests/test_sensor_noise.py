@@ -1,6 +1,7 @@
 """Coloured sensor noise in the likelihood, against theory and noise made by a filter."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ from scipy import signal
 from scipy.linalg import expm, toeplitz
 
 import ctrlid as cid
+from ctrlid.diagnosis import gap_summary
 from ctrlid.diagnosis.fitted_model import Model
 from ctrlid.diagnosis.fresh_data import choose_fresh_data
 from ctrlid.diagnosis.gap import compute_chance_among_runs
@@ -108,15 +110,23 @@ def test_noise_larger_than_the_gap_is_refused_and_true_noise_is_not(controller):
     # The same record with the noise three times as large as it is.
     larger = dataclasses.replace(fit, sensor=9 * fit.sensor)
     assert is_false(Model(loop, larger))
-    # True noise beside which the parameters went astray is refused as well.
-    right = Model(loop, fit)
-    assert not is_false(right, right)
-    plant = cid.plants.servo(m=1.0, c=2.0, k=6.0)
-    astray = dataclasses.replace(loop, plant=plant, free=("c",))
-    bad = maximize(begin_fit(make_problem(astray, ("c",), [record])))
-    bad = choose_sensor_noise(bad)
-    assert is_false(Model(astray, bad), right)
-    assert not is_false(right, Model(astray, bad))
+
+
+@pytest.mark.parametrize(("floor", "wider", "refused"), [
+    (2.0, 1e-4, True),  # far larger than the error, and the model errs more
+    (2.0, 0.3, False),  # as large by chance, and no harm
+    (1.0, 1e-4, False),  # as large as the error: noise makes it err
+])  # fmt: skip
+def test_a_wander_that_makes_a_model_err_more_is_refused(monkeypatch, floor, wider, refused):
+    fresh = SimpleNamespace(
+        windows=(), how=None, prepare_loops=lambda model: (), measure_gap=lambda loops: 1.0,
+        compute_widening_chance=lambda before, model: wider,
+        compute_size_chance=lambda loops, fit: 0.07,
+    )  # fmt: skip
+    monkeypatch.setattr(gap_summary.gaps, "compute_floor", lambda *_: SimpleNamespace(both=floor))
+    model = SimpleNamespace(fit=None)
+    assert make_noise_test(fresh)(model, model) is refused
+    assert not make_noise_test(fresh)(model)
 
 
 def test_the_chance_among_runs_keeps_its_level():

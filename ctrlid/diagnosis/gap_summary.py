@@ -245,18 +245,19 @@ def make_noise_test(fresh: FreshData) -> Callable[..., bool]:
     """Return whether fresh data falsify the noise of a model.
 
     Noise leaves errors of its size there: no prediction is better than what cannot be predicted.
-    A noise model that explains a record only by being larger is falsified. So is one beside which
-    the model errs more than it did before: what belongs to the plant was called noise, and the
-    parameters went after the rest.
+    A noise model that explains a record only by being larger is falsified. So is one that claims
+    to be far larger than the error, by chance as it may be, and beside which the model errs more
+    than it did before: a wander that nearly never ends takes what is still missing.
     """
 
     def is_false(model: Model, before: Model | None = None) -> bool:
+        loops = fresh.prepare_loops(model)
         if before is not None:
-            wider = fresh.compute_widening_chance(before, model)
-            if wider < THRESHOLD.beyond_chance:
+            floor = gaps.compute_floor(loops, model.fit, fresh.windows, fresh.how).both
+            far = floor > THRESHOLD.excess * fresh.measure_gap(loops)
+            if far and fresh.compute_widening_chance(before, model) < THRESHOLD.beyond_chance:
                 return True
-        chance = fresh.compute_size_chance(fresh.prepare_loops(model), model.fit)
-        return chance < THRESHOLD.beyond_chance
+        return fresh.compute_size_chance(loops, model.fit) < THRESHOLD.beyond_chance
 
     return is_false
 

@@ -65,9 +65,10 @@ IMMATERIAL = 0.01
 # A law that explains so much of u by a negative factor has the wrong sign, whatever else it lacks.
 OPPOSITE = 0.5
 # Kinds of finding after which the stated law is not that of the record.
-REJECTED = ("gain", "sign", "delay", "limit", "filter", "sampled", "anti-windup", "unknown")
+REJECTED = ("gain", "sign", "delay", "limit", "filter", "sampled", "anti-windup", "logger",
+            "unknown")  # fmt: skip
 # Of these, what leaves an immaterial share of u steers no simulation.
-SMALL_MATTERS = ("anti-windup", "unknown")
+SMALL_MATTERS = ("anti-windup", "logger", "unknown")
 # These look the same where the log of a signal has them and not the controller.
 MIRRORED = ("gain", "sign")
 # What may be wrong with a stated law; a constant that is added to it leaves it standing.
@@ -341,6 +342,12 @@ def _explain_remainder(loop: Loop, e: Any, left: float, record: Record, resoluti
         return _report_bias(float(np.mean(e[record.valid])), left)
     if not _is_added(loop, e, left, record, resolution):
         share = f"{write_percent(left, 3)} of the variance of u" if left < 1 else "u"
+        if not resolution and _is_noise_of_log(e, record):
+            return ("logger", f"the controller of the loop explains u but for {share} (RMS {rms}), "
+                    "which follows y but hardly r and u, as noise does that only the "
+                    "logger has: the logged y is not the reading that the controller had (another "
+                    "converter or sensor). Gains and structure are right. Log what the controller "
+                    "reads where that is possible.", left, left >= IMMATERIAL)  # fmt: skip
         return ("unknown", f"the controller of the loop does not explain {share} (RMS {rms}), and "
                 "this part depends on y: the true controller has "
                 "other gains or another structure. Correct the "
@@ -388,6 +395,19 @@ def _read_constant(loop: Loop, record: Record) -> float:
     u = record.u[record.valid]
     seen = max(np.sqrt(EXACT) * float(np.std(u)), 0.5 * find_grid_step(u))
     return constant if abs(constant) > seen else 0.0
+
+
+def _is_noise_of_log(e: Any, record: Record) -> bool:
+    """Tell whether what a law leaves of u comes from noise that only the logged y has.
+
+    The plant never sees such noise, so that what it leaves does not follow r, and what the
+    controller read in its place is in u at most in part. What another law leaves is a function of r
+    and u, from which it was computed.
+    """
+    moving = [(s, 0) for s in (record.r, record.u) if np.ptp(s[record.valid]) > 0]
+    by_all = compute_explained_share(e, moving, record.valid, lags=4 * MEMORY)
+    by_r = compute_explained_share(e, moving[:-1], record.valid, lags=4 * MEMORY)
+    return by_r <= FOLLOWS and by_all <= 1 - FOLLOWS
 
 
 def _find_limits(loop: Loop) -> tuple[float, float]:
