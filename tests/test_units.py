@@ -11,6 +11,7 @@ import pytest
 import ctrlid as cid
 from ctrlid import effects as E
 from ctrlid._base.units import fill_unit, is_same_unit, is_unit
+from ctrlid.estimation.likelihood.filter_data import find_noise_units
 from problems import record_of as record_any
 
 DT = 0.01
@@ -243,3 +244,54 @@ def test_a_record_that_is_too_short_is_called_so(n):
     record = record_of(loop, E.CoulombFriction(3.0), 1.0, 1e-3, 11, n=n)
     with pytest.raises(cid.CtrlidError, match=r"too short for a diagnosis.* at least 67 samples"):
         cid.diagnose(loop, record, progress=False)
+
+
+def robot(factor, units):
+    """Return a cart with a rod whose outputs, named like its states, are these times a factor."""
+    plant = ct.nlsys(
+        lambda t, x, u, p: np.array([x[1], p["k"] * u[0], x[3], p["g"] * x[2] - u[0]]),
+        lambda t, x, u, p: np.array([factor * x[0], 180 / np.pi * x[2]]), inputs=["u"],
+        outputs=["x", "phi"], states=["x", "v", "phi", "w"], params={"k": 1.0, "g": 9.0},
+    )  # fmt: skip
+    return cid.Loop(plant, None, dt=DT, units=units)
+
+
+@pytest.mark.parametrize(
+    ("factor", "stated", "of_x", "unit", "states"),
+    [(1e3, {}, "mm", "[x]/s^2", {}),
+     (1e3, {"v": "m/s"}, "mm", "m/s^2", {"x": "m", "v": "m/s"}),
+     (1e3 * 1e-3, {}, "mm", "mm/s^2", {"x": "mm", "v": "mm/s"}),
+     (1.0, {"v": "m/s"}, "", "m/s^2", {"x": "m", "v": "m/s"}),
+     (1e3, {"v": "rpm"}, "mm", "[x]/s^2", {"v": "rpm"}),
+     (1.0, {"w": "rad/s"}, "", "[y]/s^2", {"w": "rad/s", "phi": "rad"})],
+)  # fmt: skip
+def test_an_acceleration_has_the_unit_of_its_velocity(factor, stated, of_x, unit, states):
+    """A friction at a velocity in m/s was told in mm/s^2, since the output is in mm."""
+    loop = robot(factor, {**stated, **({"x": of_x, "phi": "deg"} if of_x else {})})
+    assert E.CoulombFriction(0.3, at="v").units(loop) == {"fc": unit}
+    angular = "rad/s^2" if "w" in stated else "[phi]/s^2"
+    assert E.CoulombFriction(0.3, at="w").units(loop) == {"fc": angular}
+    assert loop.state_units == states
+    # A gain of the sensor is no gain of the state's unit.
+    with_gain = loop.with_effect(E.SensorGain(1.1, at="x"))
+    assert E.CoulombFriction(0.3, at="v").units(with_gain) == {"fc": unit}
+
+
+def test_random_forces_have_the_units_of_their_velocities():
+    """A white force of a coordinate in m was told in m/s/s, or in the mm of its output."""
+    for stated, units in (({"v": "m/s"}, ("m/s^2", "")), ({"w": "rad/s"}, ("", "rad/s^2"))):
+        loop = robot(1e3, stated)
+        names = {"u": "u", "y": ("x", "phi")}
+        record = cid.Record(u=np.zeros(9), y=np.zeros((2, 9)), dt=DT, names=names,
+                            units={"y": ("mm", "deg")})  # fmt: skip
+        assert find_noise_units(loop, record) == (("mm", "deg"), units)
+    loop = robot(1.0, {})
+    assert find_noise_units(loop, record) == (("mm", "deg"), ("mm/s^2", ""))
+
+
+def test_a_force_of_an_input_without_a_unit_is_named_after_it():
+    """It was told as an acceleration."""
+    plant = robot(1.0, {}).plant
+    loop = cid.Loop(plant, None, dt=DT, units={"v": "m/s"}, forces={"v": "u"})
+    assert E.CoulombFriction(0.3, at="v").units(loop) == {"fc": "[u]"}
+    assert E.CoulombFriction(0.3, at="w").units(loop) == {"fc": "[phi]/s^2"}

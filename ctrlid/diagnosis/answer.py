@@ -80,7 +80,7 @@ def assemble_answer(
     stand_ins = tuple(_doubt_name(one, ground) for one, ground in grounds)
     # The steps of a converter belong to the record; no part of the loop is missing.
     steps = [r for r in read if isinstance(r.effect, Quantization)]
-    units = _find_units(loop)
+    units = loop.known_units
     remarks = tuple(_describe_steps(r, units.get(r.effect.at, gap.unit)) for r in steps)
     read = [r for r in read if r not in steps]
     findings += tuple(Finding(r.effect, r.errors, (), (), r.evidence) for r in read)
@@ -88,7 +88,7 @@ def assemble_answer(
     final = fitted.loop
     for r in read:
         final = final if r.effect in final.effects else final.with_effect(r.effect)
-    where = locate_errors(found.before, found.after, units)
+    where = locate_errors(found.before, found.after, _find_units(loop))
     left = gap_is_left(
         gap, disturbance, found.final.fit, summary.excess_chance, summary.worse_chance
     )
@@ -212,16 +212,18 @@ def name_records(records: Sequence[Record]) -> str:
 
 
 def _find_units(loop: Loop) -> dict[str, str]:
-    e, known = loop.equations(), loop.known_units
+    """Return the units of the quantities by which errors are located, of states and inputs."""
+    e, known, states = loop.equations(), loop.known_units, loop.state_units
     if not e.siso:
         changes = {f"change of {name}": known.get(name, "") for name in e.inputs}
         references = {f"reference {name}": known.get(name, "") for name in e.outputs}
-        return {**changes, **references, "time": "s", **known}
+        inputs = {name: known.get(name, "") for name in e.inputs}
+        return {**changes, **references, "time": "s", **inputs, **states}
     y, u = known.get(e.outputs[0], ""), known.get(e.inputs[0], "")
     x = "" if loop.position_unit.startswith("[") else loop.position_unit
     units = {"time": "s", "position": x, "reference": y, "input": u, "input change": u,
              "velocity": fill_unit("{x}/s", {"x": x}) if x else ""}  # fmt: skip
-    return {**known, **units}
+    return {**states, **units}
 
 
 def _make_finding(

@@ -472,7 +472,7 @@ def describe_disturbance(found: Diagnosis) -> str:
     """Say how large the random force is, and in capitals if it may hide something."""
     d, unit = found.disturbance, found.gap.force_unit
     if d.forces:
-        each = [f"{write_quantity(size, unit or '[force]')} RMS at {name}"
+        each = [f"{write_quantity(size, unit or f'[{name}]/s')} RMS at {name}"
                 for name, size, unit in d.forces]  # fmt: skip
         parts = [f"white ({write_list(each)})"]
     elif found.gap.outputs:

@@ -3,7 +3,7 @@
 import copy
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, NoReturn, Self
 
@@ -243,8 +243,7 @@ class AbstractEffect(metaclass=CheckedCalls):
         """Return the unit of each parameter, in those of a loop if they are known."""
         signals: dict[str, str] = {}
         if loop is not None:
-            known: Mapping[str, str] = loop.known_units
-            e = loop.equations()
+            e, known = loop.equations(), loop.known_units
             inputs, outputs = (
                 names.index(self.at) if self.at in names else 0 for names in (e.inputs, e.outputs)
             )
@@ -253,15 +252,15 @@ class AbstractEffect(metaclass=CheckedCalls):
             signals = {key: known[name] for key, name in names.items() if name in known}
             if self.place in ("force", "law"):
                 # These are counted in the unit of the position, which an output may show scaled.
-                signals["y"] = loop.position_unit
-            if self.place == "force" and self.at:
-                return self._find_force_units(e, known)
+                at = self.at if self.place == "force" else ""
+                signals["y"] = loop.find_position_unit(at)
+                if at:
+                    return self._find_force_units(e, signals["y"])
         return {p.name: fill_unit(p.unit, signals) for p in self._list_used()}
 
-    def _find_force_units(self, e: Equations, known: Mapping[str, str]) -> dict[str, str]:
+    def _find_force_units(self, e: Equations, position: str) -> dict[str, str]:
         """Return the units of a force at a velocity: an acceleration, or that of its input."""
         found = find_motion(e, self.at)
-        position = "[y]" if found is None else known.get(e.states[found[0]], "") or "[y]"
         units = {p.name: fill_unit(p.unit, {"y": position}) for p in self._list_used()}
         force = ""
         if found is not None and e.push_units:
@@ -269,7 +268,7 @@ class AbstractEffect(metaclass=CheckedCalls):
         if not force:
             return units
         # Of accelerations and what is counted per velocity or position, these are the forces.
-        forces = {f"{position}/s^2": force, "1/s": f"{force} s/{position}",
+        forces = {fill_unit("{y}/s^2", {"y": position}): force, "1/s": f"{force} s/{position}",
                   "1/s^2": f"{force}/{position}"}  # fmt: skip
         return {name: forces.get(unit, unit) for name, unit in units.items()}
 

@@ -8,6 +8,7 @@ import casadi
 import numpy as np
 
 from .._base.errors import EffectDoesNotApply
+from .._base.units import fill_unit
 from ..physics.equations import Equations
 from ..physics.linearization import OperatingPoint
 from ..physics.symbols import Symbol
@@ -23,6 +24,8 @@ STICKING = 0.25
 LARGEST_SHARE = 0.99
 # This number stands for an infinite distance to a limit, with which CasADi cannot compute.
 FARTHEST = 1e30
+# A slope that differs from one by less is one but for round-off.
+ONE = 1e-9
 
 
 @dataclass(frozen=True)
@@ -65,11 +68,26 @@ def find_output_of(e: Equations, velocity: str) -> int:
     return 0
 
 
-def find_position_unit(e: Equations, known: Mapping[str, str]) -> str:
-    """Return the unit of the position that forces act on.
+def _list_shown_states(e: Equations) -> dict[int, int]:
+    """Return the states that an output shows as they are, factor one, with that output."""
+    slopes = casadi.simplify(casadi.sparsify(casadi.jacobian(e.output, e.x)))
+    found: dict[int, int] = {}
+    for k in range(len(e.outputs)):
+        places = slopes[k, :].sparsity().get_col()
+        if len(places) != 1:
+            continue
+        slope = slopes[k, places[0]]
+        if slope.is_constant() and abs(float(slope) - 1) < ONE:
+            found.setdefault(places[0], k)
+    return found
 
-    It is that of the state, or that of an output which shows the state as it is. An output in
-    degrees of an angle in radians says nothing of the angle's unit.
+
+def find_state_units(e: Equations, known: Mapping[str, str]) -> dict[str, str]:
+    """Return the units of a plant's states.
+
+    They are those stated for the states, those of outputs which show a state as it is, and, of
+    positions and velocities, those that follow from each other. An output in degrees of an angle in
+    radians says nothing of the angle's unit, even where both have one name.
 
     Parameters
     ----------
@@ -80,19 +98,60 @@ def find_position_unit(e: Equations, known: Mapping[str, str]) -> str:
 
     Returns
     -------
+    dict of str to str
+        The units by the states' names; a state whose unit is not known is not in it.
+    """
+    # A name that state and output share is told the unit of the output.
+    units = {s: known[s] for s in e.states if s not in e.outputs and known.get(s)}
+    for i, k in e.derive("shown states", lambda: _list_shown_states(e)).items():
+        if known.get(e.outputs[k]):
+            units.setdefault(e.states[i], known[e.outputs[k]])
+    for velocity in (e.states[j] for j in e.velocities):
+        motion = find_motion(e, velocity)
+        if motion is None:
+            continue
+        position = e.states[motion[0]]
+        if position in units:
+            units.setdefault(velocity, fill_unit("{x}/s", {"x": units[position]}))
+        elif integrated := _integrate_unit(units.get(velocity, "")):
+            units[position] = integrated
+    return units
+
+
+def _integrate_unit(velocity: str) -> str:
+    """Return the unit of a position by that of its velocity; empty where it is no rate."""
+    unit = fill_unit("{v} s", {"v": velocity}) if velocity else ""
+    return "" if "s" in unit.split() else unit
+
+
+def find_position_unit(e: Equations, known: Mapping[str, str], velocity: str = "") -> str:
+    """Return the unit of the position that forces act on.
+
+    It is that which the unit stated for its velocity asks for, so that m/s gives m; else that of
+    the position, as `find_state_units` has it.
+
+    Parameters
+    ----------
+    e : Equations
+        The plant, without effects.
+    known : mapping of str to str
+        Units of its signals and states by name.
+    velocity : str, optional
+        The velocity, of several; by default that of `find_motion`.
+
+    Returns
+    -------
     str
         The unit; where it is not known, a name in brackets.
     """
-    motion = find_motion(e)
+    motion = find_motion(e, velocity)
     if motion is None:
         return known.get(e.outputs[0], "") or "[y]"
-    state = e.states[motion[0]]
-    slopes = casadi.simplify(casadi.sparsify(casadi.jacobian(e.output, e.x)))
-    for k, output in enumerate(e.outputs):
-        if slopes[k, :].nnz() == 1 and slopes[k, motion[0]].is_one():
-            return known.get(state, known.get(output, "")) or "[y]"
-    # A name that state and output share would be told the unit of the output.
-    return (known.get(state, "") if state not in e.outputs else "") or f"[{state}]"
+    position, speed = (e.states[i] for i in motion)
+    units = find_state_units(e, known)
+    unit = _integrate_unit(units.get(speed, "")) or units.get(position, "")
+    shown = motion[0] in e.derive("shown states", lambda: _list_shown_states(e))
+    return unit or ("[y]" if shown else f"[{position}]")
 
 
 class Moment:

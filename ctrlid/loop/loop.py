@@ -25,7 +25,7 @@ from .._base.pickling import pack_by_value
 from .._base.text import list_known, write_count, write_percent
 from ..effects import AbstractEffect, Quantization
 from ..effects.composition import compose_effects, label_effects
-from ..effects.context import find_position_unit
+from ..effects.context import find_position_unit, find_state_units
 from ..effects.python_control import as_system, linearize_with_effects
 from ..physics.equations import Equations, drive_inputs
 from ..physics.linearization import (
@@ -313,11 +313,32 @@ class Loop:
 
     @property
     def position_unit(self) -> str:
-        """The unit of the position that forces act on; a name in brackets where it is not known.
+        """The unit of the position that forces act on; a name in brackets where it is not known."""
+        return self.find_position_unit()
 
-        It is that of the state, or that of an output which shows the state as it is.
+    @property
+    def state_units(self) -> dict[str, str]:
+        """Units of the plant's states by name, as far as they are known.
+
+        A state that shares its name with an output has the output's unit only where that shows it
+        as it is.
         """
-        return find_position_unit(self._traced, self.known_units)
+        return find_state_units(self._traced, self.known_units)
+
+    def find_position_unit(self, velocity: str = "") -> str:
+        """Return the unit of the position of a velocity; a name in brackets if it is not known.
+
+        Parameters
+        ----------
+        velocity : str, optional
+            A velocity, on which forces act; by default the only one, or that of the first output.
+
+        Returns
+        -------
+        str
+            The unit, as that in which a force there is an acceleration per square second.
+        """
+        return find_position_unit(self._traced, self.known_units, velocity)
 
     def equations(self, keep: bool = False) -> Equations:
         """Return the traced equations of the plant with its effects, in absolute physical units.
@@ -608,7 +629,7 @@ class Loop:
         if found is None or find_unbalanced_rate(self._active, self.point) is None:
             return ""
         per = "a sample" if self._traced.dt else "a second"
-        unit = self.known_units.get(found.state, "")
+        unit = self.state_units.get(found.state, "")
         rate = f"{found.rate:.3g} {unit}".rstrip()
         return f" (NOT AT REST THERE: {found.state} changes by {rate} {per})"
 
@@ -644,6 +665,11 @@ def exchange_controller(loop: Loop, controller: Any) -> Loop:
 def exchange_limits(loop: Loop, lower: float = -math.inf, upper: float = math.inf) -> Loop:
     """Return a loop with other limits of its input, by default none, on the same plant."""
     return loop._replace_fields(input_limits=(lower, upper))
+
+
+def add_units(loop: Loop, units: Mapping[str, str]) -> Loop:
+    """Return the loop with further units, by names of the plant."""
+    return loop._replace_fields(units={**loop.units, **units}) if units else loop
 
 
 def _question_effects(effects: tuple[AbstractEffect, ...], dt: float, stacklevel: int) -> None:

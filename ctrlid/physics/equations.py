@@ -107,8 +107,8 @@ class Equations:
     `reading`; `rest` the values at rest of states that were added to the plant's own.
 
     `pushes` has a column for each force that is known to work on a velocity: the derivative of the
-    states' rates by it; `push_units` are the units of these forces. Without, each velocity is
-    pushed alone.
+    states' rates by it; `push_units` are the units of these forces, or the names of their inputs in
+    brackets, and empty for a velocity that is pushed alone. Without, each velocity is.
     """
 
     name: str
@@ -330,7 +330,10 @@ def drive_inputs(
                 )
             columns.append(slopes[:, at])
         pushes = casadi.substitute(casadi.horzcat(*columns), e.u, values)
-    own = tuple(units.get(forces.get(velocity, ""), "") for velocity in velocities)
+    own = tuple(
+        (units.get(forces[name]) or f"[{forces[name]}]") if name in forces else ""
+        for name in velocities
+    )
     return replace(
         e, inputs=tuple(driven), u=u, rhs=casadi.substitute(e.rhs, e.u, values),
         output=casadi.substitute(e.output, e.u, values), pushes=pushes,

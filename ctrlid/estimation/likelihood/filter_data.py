@@ -14,7 +14,7 @@ from ..._base.units import fill_unit
 from ...data.reconstruction import count_pieces, reconstruct_signal
 from ...data.record import Record
 from ...data.validity import find_equal_readings, find_runs
-from ...loop.loop import Loop, find_converter_steps
+from ...loop.loop import Loop, add_units, find_converter_steps
 from ...loop.wiring import knows_references, match_signals, stack_references
 from ...physics.equations import Equations
 from ...physics.linearization import compute_state_matrices
@@ -195,30 +195,34 @@ def find_noise_units(loop: Loop, record: Record) -> tuple[Any, Any]:
 
     Of several outputs and forces, tuples of them.
     """
-    if not loop.equations().siso:
-        return _find_several_units(loop, record)
-    e, known = loop.equations(), loop.known_units
-    unit = record.units.get("y", "") or known.get(e.outputs[0], "")
-    if unit in ("", "1"):
-        return "", ""
-    # Without a moving mass the noise acts on the rates of the states, whose units are not known.
-    # The unit of the record is that of the position, too, where the output shows it as it is.
-    position = unit if loop.position_unit == "[y]" else loop.position_unit
-    if not e.velocities or position.startswith("["):
-        return unit, ""
-    return unit, fill_unit("{x}/s^2", {"x": position})
-
-
-def _find_several_units(loop: Loop, record: Record) -> tuple[tuple[str, ...], tuple[str, ...]]:
     e, known = loop.equations(), loop.known_units
     given = record.units.get("y", "")
     sensors = tuple(
         (given[k] if isinstance(given, tuple) else given) or known.get(name, "")
         for k, name in enumerate(e.outputs)
     )
-    _, rates = name_noise_places(loop)
-    alone = [f"{known[name]}/s" if known.get(name) else "" for name in rates]
-    return sensors, tuple(e.push_units) or tuple(alone)
+    # The units of the record are those of the states, too, that the outputs show as they are.
+    told = add_units(loop, {n: u for n, u in zip(e.outputs, sensors, strict=True) if u})
+    if not e.siso:
+        _, rates = name_noise_places(loop)
+        forces = e.push_units or ("",) * len(rates)
+        return sensors, tuple(
+            force or _find_rate_unit(told, name) for force, name in zip(forces, rates, strict=True)
+        )
+    if sensors[0] in ("", "1"):
+        return "", ""
+    # Without a moving mass the noise acts on the rates of the states, whose units are not known.
+    return sensors[0], _find_rate_unit(told, "") if e.velocities else ""
+
+
+def _find_rate_unit(loop: Loop, state: str) -> str:
+    """Return the unit of the rate of a state, or of the moving mass; empty if it is not known."""
+    e = loop.equations()
+    if not e.velocities:
+        unit = loop.state_units.get(state, "")
+        return fill_unit("{x}/s", {"x": unit}) if unit else ""
+    position = loop.find_position_unit(state)
+    return "" if position.startswith("[") else fill_unit("{x}/s^2", {"x": position})
 
 
 def name_noise_places(loop: Loop) -> tuple[tuple[str, ...], tuple[str, ...]]:
