@@ -360,3 +360,51 @@ def test_blank_cells_are_told_with_the_longest_run(tmp_path):
     text = "t,u,y\n0,,1\n1,1,1\n2,,1\n3,,1\n4,1,1\n"
     with pytest.raises(CtrlidError, match="in 3 of 5 rows, at most 2 of them one after the other"):
         write(tmp_path, text)
+
+
+def read_robot(tmp_path, **options):
+    path = tmp_path / "robot.csv"
+    path.write_text("t/s;Soll/mm;x/mm;phi/°;u/V\n0;80;1;18;1\n1;80;2;36;2\n2;80;3;54;3\n")
+    return Record.from_csv(path, r="Soll", u="u", y=("x", "phi"), dt=1.0, **options)
+
+
+def test_signals_of_one_channel_are_scaled_each_by_its_name(tmp_path):
+    """Outputs in mm and in degrees could not be brought to SI units."""
+    scale = {"r": 1e-3, "x": 1e-3, "phi": np.pi / 180}
+    record = read_robot(tmp_path, scale=scale, units={"Soll": "m", "x": "m", "phi": "rad"})
+    np.testing.assert_allclose(record.y, [[1e-3, 2e-3, 3e-3], np.pi * np.array([0.1, 0.2, 0.3])])
+    np.testing.assert_allclose(record.r, 0.08)
+    assert record.units == {"r": "m", "u": "V", "y": ("m", "rad")}
+    # What is scaled has no unit unless it is stated; the others keep that of the header.
+    half = read_robot(tmp_path, scale={"x/mm": 1e-3})
+    assert half.units["y"] == ("", "°")
+    np.testing.assert_allclose(half.y[1], [18, 36, 54])
+    whole = read_robot(tmp_path, scale={"y": 2.0}, units={"y": ("a", "b")})
+    np.testing.assert_allclose(whole.y, 2 * np.array([[1, 2, 3], [18, 36, 54]]))
+    assert whole.units["y"] == ("a", "b")
+    with pytest.warns(CtrlidWarning, match=r"^phi is in ° by .* scale=\{'phi': factor\}"):
+        assert read_robot(tmp_path, units={"phi": "rad"}).units["y"] == ("mm", "rad")
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [({"scale": {"z": 2.0}}, "scale= names 'z', but the channels are r, u, y, and of .* x, .* phi"),
+     ({"units": {"z": "m"}}, "units= names 'z', but the channels are r, u, y, and of single"),
+     ({"scale": {"y": 2.0, "x": 3.0}}, "scale= names a signal of y twice, as 'y' and as 'x'"),
+     ({"units": {"phi": "rad", "phi/°": "rad"}}, "units= names a signal of y twice"),
+     ({"units": {"x": ("m", "rad")}}, "units has 2 words for x, which has 1 signal"),
+     ({"units": {"y": ("m",)}}, "units has 1 words for y, which has 2 signals")],
+)  # fmt: skip
+def test_names_of_signals_that_are_unknown_or_given_twice(tmp_path, options, words):
+    with pytest.raises(CtrlidError, match=words):
+        read_robot(tmp_path, **options)
+
+
+def test_a_stored_record_is_scaled_by_the_names_of_its_signals(tmp_path):
+    record = Record(r=[1.0, 2.0], u=[1.0, 2.0], y=[[1.0, 2.0], [3.0, 4.0]], dt=0.1,
+                        names={"r": "x", "u": "F", "y": ("x", "theta")})  # fmt: skip
+    record.to_csv(tmp_path / "stored.csv")
+    made = Record.from_csv(tmp_path / "stored.csv", scale={"theta": 2.0, "x": 10.0})
+    np.testing.assert_allclose(made.y, [[10, 20], [6, 8]])
+    np.testing.assert_allclose(made.r, [10, 20])
+    assert dict(made.names) == dict(record.names)

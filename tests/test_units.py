@@ -12,6 +12,7 @@ import ctrlid as cid
 from ctrlid import effects as E
 from ctrlid._base.units import fill_unit, is_same_unit, is_unit
 from ctrlid.estimation.likelihood.filter_data import find_noise_units
+from ctrlid.loop.unit_check import find_unit_clashes
 from problems import record_of as record_any
 
 DT = 0.01
@@ -295,3 +296,11 @@ def test_a_force_of_an_input_without_a_unit_is_named_after_it():
     loop = cid.Loop(plant, None, dt=DT, units={"v": "m/s"}, forces={"v": "u"})
     assert E.CoulombFriction(0.3, at="v").units(loop) == {"fc": "[u]"}
     assert E.CoulombFriction(0.3, at="w").units(loop) == {"fc": "[phi]/s^2"}
+
+
+def test_of_several_outputs_the_one_in_another_unit_is_to_be_scaled():
+    loop = robot(1.0, {"x": "m", "phi": "deg"})
+    record = cid.Record(u=np.zeros(9), y=np.zeros((2, 9)), dt=DT, names={"u": "u", "y": ("a", "b")},
+                        units={"y": ("mm", "deg")})  # fmt: skip
+    (clash,) = find_unit_clashes(loop, record)
+    assert "scale={'a': 0.001}, units={'a': 'm'}" in clash.text

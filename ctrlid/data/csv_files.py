@@ -17,12 +17,15 @@ from .._base.errors import CtrlidError, CtrlidWarning
 from .._base.files import replace_file
 from .._base.text import drop_roundoff, split_unit, with_unit, write_count, write_percent
 from .._base.units import is_same_unit
+from .field_checks import check_words
 
 TIME = ("t", "time", "timestamp", "seconds", "zeit")
 SECONDS = {"": 1.0, "s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6,
            "min": 60.0, "h": 3600.0}  # fmt: skip
 # The first cell of each column that is no number, by the place of the column, with its line.
 Texts = dict[int, tuple[str, int]]
+# A channel, or a further column, and the number of a signal in it.
+Signal = tuple[str, int]
 MARK = "# ctrlid "
 # The first line in which Excel is told the separator.
 SEPARATOR = "sep="
@@ -192,53 +195,122 @@ def read_csv(
         valid = (rows_valid & valid[:, None]).T
     at = {key: [found[key, i] for i in range(len(each))] for key, each in columns.items()}
     every = {**at, **{label: [k] for label, k in further.items()}}
-    factors = _check_scale(scale or {}, every)
-    header_units = {key: tuple(labels[k][1] for k in ks) for key, ks in every.items()}
-    _question_units(units or {}, header_units, factors, path)
+    called = own.get("names", {})
+    spoken = _list_names(every, names, header, called)
+    factors = _check_scale(scale or {}, spoken, every)
+    stated = _spread_units(units or {}, spoken, every)
+    written = {(key, i): labels[k] for key, ks in every.items() for i, k in enumerate(ks)}
+    _question_units(stated, written, factors, every, path)
     # The unit in the header is that of the numbers before they were scaled.
-    read = {key: words for key, words in header_units.items() if key not in factors}
+    read = {
+        key: tuple(stated.get((key, i), "" if (key, i) in factors else written[key, i][1])
+                   for i in range(len(ks)))
+        for key, ks in every.items()
+    }  # fmt: skip
+    scales = {key: np.array([[factors.get((key, i), 1.0)] for i in range(len(ks))])
+              for key, ks in every.items()}  # fmt: skip
     known = {key: tuple(names[k] for k in ks) for key, ks in at.items()}
     return {
-        **{key: table[:, ks].T * factors.get(key, 1.0) for key, ks in at.items()},
-        "extra": {label: table[:, k] * factors.get(label, 1.0) for label, k in further.items()},
+        **{key: table[:, ks].T * scales[key] for key, ks in at.items()},
+        "extra": {label: table[:, k] * scales[label][0, 0] for label, k in further.items()},
         "dt": dt, "start": start, "valid": valid,
-        "units": {**{key: words for key, words in read.items() if any(words)}, **(units or {})},
-        "names": own.get("names", {k: v for k, v in known.items() if v != (k,)}),
+        "units": {key: words for key, words in read.items() if any(words)},
+        "names": called if "names" in own else {k: v for k, v in known.items() if v != (k,)},
         "hold": hold or own.get("hold", "zoh"),
         "hold_r": own.get("hold_r", "zoh"),
         "name": own.get("name", path.stem) if name is None else name,
     }  # fmt: skip
 
 
-def _check_scale(scale: Mapping[str, float], known: Mapping[str, Any]) -> dict[str, float]:
-    """Return the factors of channels, or refuse what is none."""
-    for key, factor in scale.items():
-        if key not in known:
-            raise CtrlidError(f"scale= names {key!r}, but the channels are {', '.join(known)}")
-        number = is_number(factor)
-        if not number or not math.isfinite(factor) or factor == 0:
-            raise CtrlidError(f"scale= needs a number other than zero for {key}; given {factor!r}")
-    return {key: float(factor) for key, factor in scale.items()}
+def _list_names(
+    every: Mapping[str, Sequence[int]], names: Sequence[str], header: Sequence[str],
+    called: Any,
+) -> dict[str, list[Signal]]:  # fmt: skip
+    """Return which signals a word stands for: a channel, a column, or a signal of a stored record.
+
+    A channel stands for all of its signals, and what r and y are both called for both.
+    """
+    found: dict[str, list[Signal]] = {}
+    for key, columns in every.items():
+        # A comment that was changed by hand may hold anything; the record refuses what is no name.
+        own = called.get(key, ()) if isinstance(called, Mapping) else ()
+        own = [own] if isinstance(own, str) else own if isinstance(own, list) else []
+        for i, k in enumerate(columns):
+            words = (names[k], header[k], *(own[i : i + 1] if len(own) == len(columns) else []))
+            for word in dict.fromkeys(words):
+                found.setdefault(word, []).append((key, i))
+    return {**found, **{key: [(key, i) for i in range(len(ks))] for key, ks in every.items()}}
+
+
+def _find_signals(
+    what: str, given: Mapping[str, Any], spoken: Mapping[str, list[Signal]],
+    every: Mapping[str, Sequence[int]],
+) -> dict[str, list[Signal]]:  # fmt: skip
+    """Return the signals that each given name stands for, or refuse one unknown or named twice."""
+    found: dict[str, list[Signal]] = {}
+    by: dict[Signal, str] = {}
+    for name in given:
+        if name not in spoken:
+            single = [word for word in spoken if word not in every]
+            also = f", and of single signals {', '.join(single)}" if single else ""
+            raise CtrlidError(
+                f"{what}= names {name!r}, but the channels are {', '.join(every)}{also}"
+            )
+        for signal in spoken[name]:
+            if signal in by:
+                raise CtrlidError(
+                    f"{what}= names a signal of {signal[0]} twice, as {by[signal]!r} and as "
+                    f"{name!r}. Leave out one of them"
+                )
+            by[signal] = name
+        found[name] = spoken[name]
+    return found
+
+
+def _check_scale(
+    scale: Mapping[str, float], spoken: Mapping[str, list[Signal]],
+    every: Mapping[str, Sequence[int]],
+) -> dict[Signal, float]:  # fmt: skip
+    """Return the factors of signals, or refuse what is none."""
+    found: dict[Signal, float] = {}
+    for name, signals in _find_signals("scale", scale, spoken, every).items():
+        factor = scale[name]
+        if not is_number(factor) or not math.isfinite(factor) or factor == 0:
+            single = [word for word, own in spoken.items() if len(own) == 1 and own[0] in signals]
+            each = f". Each signal is scaled by its own name, as {' or '.join(single[:2])}"
+            raise CtrlidError(f"scale= needs a number other than zero for {name}; given {factor!r}"
+                              f"{each if len(signals) > 1 else ''}")  # fmt: skip
+        found |= dict.fromkeys(signals, float(factor))
+    return found
+
+
+def _spread_units(
+    units: Mapping[str, Any], spoken: Mapping[str, list[Signal]], every: Mapping[str, Sequence[int]]
+) -> dict[Signal, str]:
+    """Return the stated units of signals; one stands for all signals of a name."""
+    found: dict[Signal, str] = {}
+    for name, signals in _find_signals("units", units, spoken, every).items():
+        words = check_words("units", {name: units[name]}, (name,), {name: len(signals)})[name]
+        found |= dict(zip(signals, (words,) if isinstance(words, str) else words, strict=True))
+    return found
 
 
 def _question_units(
-    stated: Mapping[str, Any], written: Mapping[str, Sequence[str]], factors: Mapping[str, float],
-    path: Path,
+    stated: Mapping[Signal, str], written: Mapping[Signal, tuple[str, str]],
+    factors: Mapping[Signal, float], every: Mapping[str, Sequence[int]], path: Path,
 ) -> None:  # fmt: skip
-    """Warn of channels that are said to be in another unit than in the header, and not scaled."""
-    for key, given in stated.items():
-        header = written.get(key, ())
-        words = (given,) * len(header) if isinstance(given, str) else given
-        if key in factors or not isinstance(words, list | tuple):
+    """Warn of signals that are said to be in another unit than in the header, and not scaled."""
+    for signal, here in stated.items():
+        key, (column, there) = signal[0], written[signal]
+        if signal in factors or not (there and here) or is_same_unit(there, here):
             continue
-        for there, here in zip(header, words, strict=False):
-            if there and here and not is_same_unit(there, str(here)):
-                warnings.warn(
-                    f"{key} is in {there} by the header of {path}, and in {here} by units=, which "
-                    f"is taken; the numbers stay as they are. To convert them, give "
-                    f"scale={{{key!r}: factor}} as well; where the header is wrong, mend it",
-                    CtrlidWarning, stacklevel=4,
-                )  # fmt: skip
+        name = key if len(every[key]) == 1 else column
+        warnings.warn(
+            f"{name} is in {there} by the header of {path}, and in {here} by units=, which "
+            f"is taken; the numbers stay as they are. To convert them, give "
+            f"scale={{{name!r}: factor}} as well; where the header is wrong, mend it",
+            CtrlidWarning, stacklevel=4,
+        )  # fmt: skip
 
 
 def _question_period(dt: float, stamps: Any, path: Path, label: str) -> None:

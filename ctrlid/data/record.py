@@ -494,8 +494,9 @@ class Record(Printed):
         cls, path: str | Path, *, r: str | Sequence[str] | None = None,
         u: str | Sequence[str] = "u", y: str | Sequence[str] = "y",
         time: str | None = None, dt: float | None = None, extra: Sequence[str] | None = None,
-        units: Mapping[str, str] | None = None, hold: Hold | None = None, name: str | None = None,
-        gaps: Literal["error", "mask"] = "error", scale: Mapping[str, float] | None = None,
+        units: Mapping[str, str | Sequence[str]] | None = None, hold: Hold | None = None,
+        name: str | None = None, gaps: Literal["error", "mask"] = "error",
+        scale: Mapping[str, float] | None = None,
     ) -> "Record":  # fmt: skip
         """Read a record from a CSV file with a header line.
 
@@ -518,16 +519,19 @@ class Record(Printed):
         extra : sequence of str, optional
             Further columns to keep; by default all others of a file that `to_csv` wrote, else none.
         units : mapping, optional
-            Units, by signal, instead of those in the header.
+            Units instead of those in the header, by channel (r, u, y or one of `extra`; one unit
+            for all its signals, or a tuple) or by the name of a signal or column.
         hold, name : str, optional
             As in `Record`; by default what `to_csv` wrote, else ``"zoh"`` and the file's name.
         gaps : {"error", "mask"}, optional
             Whether missing samples are refused, or filled with the last values and marked as not
             valid.
         scale : mapping of str to float, optional
-            Factors of channels by name: a log in degrees becomes radians with
-            ``scale={"r": np.pi / 180, "y": np.pi / 180}, units={"r": "rad", "y": "rad"}``. A scaled
-            channel has the unit in `units`, and none without.
+            Factors of channels, for all signals of each, or of single signals or columns by name:
+            a log in degrees becomes radians with
+            ``scale={"r": np.pi / 180, "y": np.pi / 180}, units={"r": "rad", "y": "rad"}``, and two
+            outputs in mm and degrees SI units with ``scale={"x": 1e-3, "phi": np.pi / 180}``. A
+            scaled signal has the unit in `units`, and none without.
 
         Returns
         -------

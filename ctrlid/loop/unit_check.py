@@ -79,6 +79,9 @@ def find_unit_clashes(loop: Loop, record: Record) -> list[UnitClash]:
     found = []
     for key, name, there in list_recorded_units(loop, record):
         here, signal = known.get(name, ""), name if several else key
+        # A channel stands for all of its signals: of several, one is scaled by its name.
+        many = several and key != "r" and len(record.signals[key]) > 1
+        spoken = record.signals[key][loop.signals[key].index(name)] if many else key
         if not (here and there) or is_same_unit(here, there):
             continue
         factor = find_factor(there, here)
@@ -87,7 +90,7 @@ def find_unit_clashes(loop: Loop, record: Record) -> list[UnitClash]:
         text = (
             f"{signal} is recorded {how}, but the plant has it in {here}. The model takes the "
             "numbers as they are. If the plant is right, convert the record: "
-            f"Record.from_csv(..., scale={{{key!r}: {scale}}}, units={{{key!r}: {here!r}}}). "
+            f"Record.from_csv(..., scale={{{spoken!r}: {scale}}}, units={{{spoken!r}: {here!r}}}). "
             f"If the record is right, say so: Loop(..., units={{{name!r}: {there!r}}})."
         )
         found.append(UnitClash(signal, text, factor))

@@ -94,11 +94,12 @@ def add_parser(commands: Any) -> None:
     add("--columns", type=parse_assignments, default={}, metavar="r=REF,u=VOLT,y=GAP",
         help="columns of r, u, y and time; several as in 'y=theta,alpha u=V'")  # fmt: skip
     add("--units", type=parse_assignments, default={}, metavar="y=UNIT,u=UNIT",
-        help="units of the channels, instead of those in the header")  # fmt: skip
+        help="units of the channels r, u and y, or of single columns, instead of those in the "
+        "header")  # fmt: skip
     add("--scale", type=parse_assignment, nargs="+", action="extend", default=[],
         metavar="NAME=FACTOR",
-        help="factors of the channels r, u and y: y=0.0174533 r=0.0174533 makes radians of "
-        "degrees; say the new unit with --units")  # fmt: skip
+        help="factors of the channels r, u and y, or of single columns: y=0.0174533 r=0.0174533 "
+        "makes radians of degrees; say the new unit with --units")  # fmt: skip
     add("--controller", metavar="C",
         help="the controller: MODULE:NAME, FILE.py:NAME, or a PID written as "
         "kp=..,ki=..,kd=.. (default: not known)")  # fmt: skip
