@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 import ctrlid as cid
+from ctrlid.reporting.tables import _make_comparison_tables
 from test_wiring import CART, DT, QUAD, at_rest, lqr_with_observer, luenberger
 
 NOISE = {"sensor_noise": (1e-4, 1e-3), "force_noise": (0.05, 0.001)}
@@ -57,7 +58,11 @@ def test_audit_names_the_signal(dithered):
     found = cid.audit(cid.Record(r=r, u=record.u, y=y, dt=DT,
                                  names={**record.names, "r": ("x", "theta")}))  # fmt: skip
     assert found["quantization"][0].channel == "theta"
-    assert found["quantization"][0].text.startswith("theta: ")
+    assert found["quantization"][0].text.startswith("theta is quantized in steps of ")
+    assert all(f.text.startswith(f"{f.channel} ") for f in found["outliers"])
+    assert {f.text.split(" has ")[0] for f in found["repeats"]} <= {
+        "the reference x", "the reference theta"
+    }  # fmt: skip
     assert found["outliers"][0].channel == "x"
     assert found.quantum["theta"] == pytest.approx(1e-3)
 
@@ -100,3 +105,19 @@ def test_pictures_and_report_of_several_outputs(dithered, tmp_path):
     for words in ("Poles of the fitted physics", "Poles of each output", "<h3>theta</h3>",
                   "Measured output, predictions and simulations"):  # fmt: skip
         assert words in page
+
+
+def test_each_error_of_several_outputs_has_its_unit(dithered):
+    """Millimetres and degrees stood below each other without a unit."""
+    loop, record, _ = dithered
+    found = cid.compare(record, loop)
+    for curve in found.curves:
+        unit = "rad" if curve.label.endswith("theta") else "m"
+        assert curve.unit == unit
+        assert f"RMS error {curve.rms:.3e} {unit}" in str(curve)
+        assert f" {curve.rms:.3e} {unit} " in str(found)
+    assert "RMS error [m]" in str(found.outputs[0])
+    assert "RMS error [" not in str(found)
+    table = _make_comparison_tables(found)[0]
+    assert table.head[2] == "RMS error"
+    assert table.rows[0][2].endswith(" m")

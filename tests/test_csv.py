@@ -241,6 +241,8 @@ def test_masked_gaps_keep_all_data(tmp_path):
     assert record.u[21] == record.u[19]
     np.testing.assert_allclose(record.t[record.valid], 0.01 * kept, atol=1e-9)
     assert record.segments() == [(0, 20), (23, 60), (61, 100)]
+    # The mean of the steps is 0.01 but for round-off, which a model would print.
+    assert record.dt == 0.01
 
 
 def test_a_long_record(tmp_path):

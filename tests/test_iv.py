@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import control as ct
@@ -269,6 +270,10 @@ def test_what_does_not_settle_warns_and_says_so(monkeypatch):
     with pytest.warns(cid.CtrlidWarning, match="DID NOT CONVERGE"):
         model = fit_iv(record, 2, 2)
     assert "DID NOT CONVERGE" in str(model)
+    # Each noise model starts to count anew, and all steps are told elsewhere.
+    (total,) = re.findall(r"(\d+) iterations?,", str(model))
+    told = "1 step" if total == "1" else f"the last 1 of {total} steps"
+    assert f"DID NOT CONVERGE in {told}:" in str(model)
 
 
 def test_noise_that_grows_with_the_signal_shows_in_the_standard_errors():

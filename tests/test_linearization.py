@@ -289,3 +289,18 @@ def test_a_point_without_any_balance_is_not_linearized():
                        inputs=1, outputs=1, states=2)  # fmt: skip
     G = cid.linearize(falling, cid.OperatingPoint((0, 0), 0, 0))
     assert G.num[0][0] == pytest.approx([1.0])
+
+
+def test_an_input_of_round_off_is_zero_and_a_small_one_is_not():
+    """A bearing at rest in its middle was told to need 9.98e-18 A."""
+
+    def make(force):
+        return ct.nlsys(lambda t, x, u, p: np.array([x[1], force(x[0], u[0])]),
+                        lambda t, x, u, p: x[0], inputs=["i"], outputs=["x"],
+                        states=["x", "v"])  # fmt: skip
+
+    bearing = make(lambda x, i: (2 + i) ** 2 / (4e-4 - x) ** 2 - (2 - i) ** 2 / (4e-4 + x) ** 2)
+    at = cid.operating_point(bearing, output=0.0)
+    assert (at.states, at.input) == ((0.0, 0.0), 0.0)
+    small = make(lambda x, i: i - 1e-14)
+    assert cid.operating_point(small, output=0.0).input == pytest.approx(1e-14)

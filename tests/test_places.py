@@ -167,3 +167,18 @@ def test_where_something_is_left_a_mechanism_is_told_of_its_forces(passed):
     assert bool(told) == (not passed)
     assert not any("without forces=" in note for note in _list_notes(cart(), search))
     assert all("mass matrix" in note for note in told)
+
+
+def test_a_loop_says_that_it_does_not_know_the_forces_of_its_mechanism():
+    """That a diagnosis needs them was its last line, after minutes."""
+    bare = cart(plant=written_out())
+    assert "forces={'x_dot': 'F'}" in str(bare)
+    assert str(bare).count("forces=") == 2
+    assert "forces=" not in repr(bare)
+    assert "forces=" not in str(cart())
+    known = cid.Loop(bare.plant, dt=DT, forces={"x_dot": "F"})
+    assert "forces=" not in str(known)
+    # Of a chain of integrators just one state is pushed.
+    chain = ct.nlsys(lambda t, x, u, p: [x[1], x[2], u[0]], lambda t, x, u, p: x[0],
+                     inputs=["u"], outputs=["y"], states=["a", "b", "c"], name="chain")  # fmt: skip
+    assert "forces=" not in str(cid.Loop(chain, dt=DT))

@@ -654,7 +654,8 @@ def _make_uniform(stamps: Any, dt: float | None, gaps: str, path: Path) -> tuple
             "clock, or give dt= and remove the column"
         )
     regular = steps[steps < GAP * np.median(steps)]
-    usual = float(np.mean(regular))
+    # Round-off of the stamps is no digit of the period, also where rows are lost.
+    usual = drop_roundoff(float(np.mean(regular)), 4 * float(np.spacing(np.abs(stamps).max())))
     if dt is not None and not abs(usual - dt) < 0.05 * usual:
         raise CtrlidError(f"the time column of {path} steps by {usual:.4g} s, but dt is {dt:g} s. "
                           "Leave out dt=, or remove the column; if its times are in another unit, "

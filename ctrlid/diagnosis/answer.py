@@ -16,7 +16,7 @@ from ..estimation.likelihood.filter_data import find_noise_units
 from ..estimation.likelihood.likelihood import Fit
 from ..estimation.likelihood.physics_fit import summarize_fit
 from ..estimation.likelihood.tails import JointTails, Tails
-from ..loop.loop import Loop
+from ..loop.loop import Loop, describe_missing_forces, list_unforced_velocities
 from .candidates import Trial, is_same_kind
 from .experiment import find_experiment
 from .findings import COMPLETE, Calibrated, Candidate, Finding, SensorNoise
@@ -107,7 +107,7 @@ def assemble_answer(
         verdict, findings, gap, disturbance, found.after, where, None if left else objection,
         len({type(c.effect) for c in ranking}), grounds, noise,
     )  # fmt: skip
-    if verdict not in COMPLETE and _lacks_forces(loop):
+    if verdict not in COMPLETE and list_unforced_velocities(loop):
         sentence += (
             " The loop does not say which input works on which velocity, so that no friction of a "
             "mechanism can be named rightly: give forces=, and diagnose again."
@@ -117,12 +117,6 @@ def assemble_answer(
         calibrated, _find_sensitivity(found), tests, remarks, notes, noise=noise,
         stand_ins=stand_ins,
     )  # fmt: skip
-
-
-def _lacks_forces(loop: Loop) -> bool:
-    """Whether a plant has several velocities, and nobody says what works on them."""
-    e = loop.equations()
-    return len(e.velocities) > 1 and e.pushes is None
 
 
 def _list_notes(loop: Loop, found: Search) -> list[str]:
@@ -137,15 +131,8 @@ def _list_notes(loop: Loop, found: Search) -> list[str]:
             "coloured noise, limits of a sensor, delays of one of several inputs, repeats of the "
             "experiment and errors of the log are not looked for"
         )
-    e = loop.equations()
-    if _lacks_forces(loop) and not found.after.passed:
-        first, *_ = (e.states[j] for j in e.velocities)
-        notes.append(
-            "without forces= a force at a velocity accelerates that coordinate alone, while in a "
-            "mechanism it accelerates all of them, through the mass matrix. Say which input works "
-            f"on which velocity, as in forces={{{first!r}: {e.inputs[0]!r}}} of the Loop, and "
-            "diagnose again"
-        )
+    if list_unforced_velocities(loop) and not found.after.passed:
+        notes.append(f"{describe_missing_forces(loop)}, and diagnose again")
     if loop.linear_plant and not found.after.passed:
         notes.append(
             "the model is linear. If the errors depend on position, velocity or input, write the "

@@ -25,7 +25,7 @@ from .._base.pickling import pack_by_value
 from .._base.text import list_known, write_count, write_percent
 from ..effects import AbstractEffect, Quantization
 from ..effects.composition import compose_effects, label_effects
-from ..effects.context import find_position_unit, find_state_units
+from ..effects.context import find_motion, find_position_unit, find_state_units
 from ..effects.python_control import as_system, linearize_with_effects
 from ..physics.equations import Equations, drive_inputs
 from ..physics.linearization import (
@@ -620,6 +620,11 @@ class Loop:
             return text + ")"
         return "\n  ".join([text + "), wired:", *wiring.lines])
 
+    def __str__(self) -> str:
+        if not list_unforced_velocities(self):
+            return repr(self)
+        return f"{self!r}\n  note: {describe_missing_forces(self)}."
+
     def _describe_imbalance(self) -> str:
         """Say that the plant does not rest at the operating point; empty where it does.
 
@@ -670,6 +675,27 @@ def exchange_limits(loop: Loop, lower: float = -math.inf, upper: float = math.in
 def add_units(loop: Loop, units: Mapping[str, str]) -> Loop:
     """Return the loop with further units, by names of the plant."""
     return loop._replace_fields(units={**loop.units, **units}) if units else loop
+
+
+def list_unforced_velocities(loop: Loop) -> tuple[str, ...]:
+    """Return the velocities of a mechanism of several coordinates that does not know its forces.
+
+    In a chain of integrators a velocity is the position of the next one, and just one moves.
+    """
+    e = loop.equations()
+    pairs = [pair for j in e.velocities if (pair := find_motion(e, e.states[j]))]
+    moving = sorted({j for _, j in pairs} - {i for i, _ in pairs})
+    return tuple(e.states[j] for j in moving) if len(moving) > 1 and e.pushes is None else ()
+
+
+def describe_missing_forces(loop: Loop) -> str:
+    """Say what a loop of unforced velocities lacks and what to give, without a full stop."""
+    first, *_ = list_unforced_velocities(loop)
+    return (
+        "without forces= a force at a velocity accelerates that coordinate alone, while in a "
+        "mechanism it accelerates all of them, through the mass matrix. Say which input works "
+        f"on which velocity, as in forces={{{first!r}: {loop.signals['u'][0]!r}}} of the Loop"
+    )
 
 
 def _question_effects(effects: tuple[AbstractEffect, ...], dt: float, stacklevel: int) -> None:

@@ -23,6 +23,8 @@ from .trace import trace
 UNREACHABLE = 1e-12
 # An equilibrium is accepted if its residual is below this share of the terms that cancel there.
 EQUILIBRIUM = 1e-9
+# Smaller numbers than this may be round-off of zero, whatever their unit is.
+TINY = 1e-12
 # A point is called none where more than this share of the terms is left: a rounded input, or a
 # parameter that is known to ten per cent, leaves less.
 UNBALANCED = 0.05
@@ -342,12 +344,25 @@ def _solve_equilibrium(
         z, jac = z - damping * step, next_jac
     # A state that is at rest up to rounding is set to zero.
     z = np.where(np.abs(z) < max(1e-12 * np.abs(z).max(), 1e-20), 0.0, z)
+    z = _drop_rounding(evaluate, z)
     error = _measure_residual(evaluate, z)
     if EQUILIBRIUM <= error < np.inf:
         held = _solve_at_rest(evaluate, z)
         rest = _measure_residual(evaluate, held)
         z, error = (held, rest) if rest < error else (z, error)
     return (z, error) if error < np.inf else (None, np.inf)
+
+
+def _drop_rounding(evaluate: Any, z: Array) -> Array:
+    """Return a solution with its tiny values at zero, if the equations hold there as well.
+
+    Where the whole solution is zero nothing else says how large a number of round-off is.
+    """
+    rest = np.where(np.abs(z) < TINY, 0.0, z)
+    if np.array_equal(rest, z):
+        return z
+    f, left = np.abs(evaluate(z)[0]), np.abs(evaluate(rest)[0])
+    return rest if np.isfinite(left).all() and np.all(left <= f) else z
 
 
 def _solve_at_rest(evaluate: Any, start: Array) -> Array:

@@ -195,12 +195,13 @@ def _make_estimate_blocks(e: Estimate) -> list[Block]:
 
 
 def _make_comparison_tables(c: Comparison) -> list[Table]:
-    unit = c.record.units.get("y", "unit of y")
+    # Of several outputs, each error stands with its own unit.
+    unit = "" if c.outputs else f" [{c.record.units.get('y', 'unit of y')}]"
     curves = tuple(
         (
             q.label,
             write_fit(q.fit),
-            f"{q.rms:.3g}",
+            f"{q.rms:.3g} {q.unit if c.outputs else ''}".rstrip(),
             "-" if q.useless else f"{100 * q.noise_share:.1f} %",
         )
         for q in c.curves
@@ -209,9 +210,7 @@ def _make_comparison_tables(c: Comparison) -> list[Table]:
         (t.name, "yes" if t.passed else "NO", f"{np.abs(t.values).max():.3f}",
          f"{t.band:.3f}", _text.write_p_value(t.p_value)) for t in c.tests
     )  # fmt: skip
-    tables = [
-        Table(("curve", "fit", f"RMS error [{unit}]", "noise explains"), curves, f"{c.what}.")
-    ]
+    tables = [Table(("curve", "fit", f"RMS error{unit}", "noise explains"), curves, f"{c.what}.")]
     if tests:
         head = ("correlation", "passed?", "largest", "99 % band", "p-value")
         tables.append(Table(head, tests, "Correlation of the one-step errors."))

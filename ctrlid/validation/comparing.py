@@ -434,9 +434,10 @@ def _judge_curve(
 ) -> Curve:  # fmt: skip
     """Judge a reproduction; `noise` is the error that noise alone makes, NaN if not known."""
     known = np.asarray(record.valid) & np.isfinite(y)
+    unit = record.units.get("y", "")
     if not known.any():
         nan = float("nan")
-        return Curve(str(how), y, nan, nan, nan, nan)
+        return Curve(str(how), y, nan, nan, nan, nan, unit=unit)
     error = np.where(known, record.y - y, 0.0)
     measured = record.y[known]
     size = float(np.linalg.norm(measured - measured.mean())) if np.ptp(measured) > 0 else 0.0
@@ -447,7 +448,7 @@ def _judge_curve(
     if fit <= EXACT and np.isfinite(noise) and noise < rms:
         share = min(share, (noise / rms) ** 2)
     useless = rms > 0 and rms > BEATEN * _measure_simple_guesses(record, how.horizon, error, known)
-    return Curve(str(how), np.where(known, y, np.nan), fit, rms, follows, share, useless)
+    return Curve(str(how), np.where(known, y, np.nan), fit, rms, follows, share, useless, unit)
 
 
 def _measure_simple_guesses(record: Record, steps: int, error: Array, known: Any) -> float:

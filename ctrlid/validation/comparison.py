@@ -45,6 +45,8 @@ class Curve(Printed):
     useless : bool
         Whether the mean of y, its last value or a straight line through its last two is nearer to
         y, so that no share of the error tells anything.
+    unit : str
+        The unit of the output; empty where it is not known.
     """
 
     label: str
@@ -54,6 +56,7 @@ class Curve(Printed):
     follows: float
     noise_share: float
     useless: bool = False
+    unit: str = ""
 
     def __post_init__(self) -> None:
         freeze_arrays(self)
@@ -67,10 +70,10 @@ class Curve(Printed):
         return "-" if self.useless else _write_percent(self.noise_share)
 
     def __str__(self) -> str:
+        size = f"{self.rms:.3e} {self.unit}".rstrip()
         if self.useless:
-            return (f"{self.label}: fit {write_fit(self.fit)}, RMS error {self.rms:.3e}. "
-                    f"{_USELESS}")  # fmt: skip
-        return (f"{self.label}: fit {write_fit(self.fit)}, RMS error {self.rms:.3e}, of which "
+            return f"{self.label}: fit {write_fit(self.fit)}, RMS error {size}. {_USELESS}"
+        return (f"{self.label}: fit {write_fit(self.fit)}, RMS error {size}, of which "
                 f"noise explains {_write_percent(self.noise_share)} of the variance")  # fmt: skip
 
 
@@ -176,8 +179,9 @@ class Comparison(Printed):
         return text
 
     def __str__(self) -> str:
-        unit = self.record.units.get("y", "")
-        unit = "" if isinstance(unit, tuple) else unit
+        # Of several outputs, each error stands with its own unit.
+        unit = "" if self.outputs else self.record.units.get("y", "")
+        own = [f" {c.unit}".rstrip() if self.outputs else "" for c in self.curves]
         rows = [
             f"Comparison of {self.what} with the record {self.record.name}".rstrip()
             + f" ({write_count(len(self.record), 'sample')}, "
@@ -186,8 +190,8 @@ class Comparison(Printed):
         size = f"RMS error [{unit}]" if unit else "RMS error"
         rows.append(f"  {'curve':<34}{'fit':>10}{size:>18}{'noise explains':>18}")
         rows += [
-            f"  {c.label:<34}{write_fit(c.fit):>10}{c.rms:>18.3e}{c.written_share:>18}"
-            for c in self.curves
+            f"  {c.label:<34}{write_fit(c.fit):>10}{f'{c.rms:.3e}{each}':>18}{c.written_share:>18}"
+            for c, each in zip(self.curves, own, strict=True)
         ]
         if any(c.useless for c in self.curves):
             rows.append(f"  -: {_USELESS[0].lower()}{_USELESS[1:]}")

@@ -263,7 +263,7 @@ def _audit_several(record: Record, loop: Loop | None) -> Audit:
             findings.append(AuditFinding("too few samples", "", text, 0, (0, part.n), True))
             continue
         stated = tuple(limits[u.index(name)]) if key == "u" else ()
-        checks = _RecordChecks(part, stated)
+        checks = _RecordChecks(part, stated, {k: each[0] for k, each in part.signals.items()})
         found = [*checks.check_length(), *checks.find_constant(), *checks.find_limits(),
                  *checks.find_steps()]  # fmt: skip
         if key == "y":
@@ -274,7 +274,7 @@ def _audit_several(record: Record, loop: Loop | None) -> Audit:
         if key != "r" or name not in y:
             quantum[name], saturated[name] = checks.quantum[key], checks.saturated[key]
         findings += [
-            replace(f, channel=name, text=f"{name}: {f.text}") if f.channel else f
+            replace(f, channel=name) if f.channel else f
             for f in found if f.channel in ("", key)
         ]  # fmt: skip
     if loop is not None:
@@ -296,7 +296,11 @@ def _list_unit_clashes(loop: Loop, record: Record) -> list[AuditFinding]:
 class _RecordChecks:
     """The checks of one record; later ones use what earlier ones found."""
 
-    def __init__(self, record: Record, limits: tuple[float, ...]) -> None:
+    def __init__(
+        self, record: Record, limits: tuple[float, ...], names: Mapping[str, str] | None = None
+    ) -> None:
+        # What the signals are called in sentences: of several, each by its own name.
+        self.names = names or {key: key for key in SIGNALS}
         self.record, self.valid, self.stated = record, record.valid, limits
         self.signals = {k: v for k in SIGNALS if (v := getattr(record, k)) is not None}
         self.whole = (0, record.n)
@@ -340,7 +344,7 @@ class _RecordChecks:
                 long = (f" for {write_percent(share, 4)} of the samples, although the excitation "
                         "changes")  # fmt: skip
             text = (
-                f"{key} stays at {self.write_value(key, value)}{long}: no model can be "
+                f"{self.names[key]} stays at {self.write_value(key, value)}{long}: no model can be "
                 "identified from it."
             )
             kind = "constant signal"
@@ -379,7 +383,7 @@ class _RecordChecks:
                 cure = (", so it is limited. Fits from u to y are valid if the logged u is the "
                         f"limited one. {advice}.")  # fmt: skip
             where = np.flatnonzero(mask)
-            out.append(AuditFinding("saturation", key, f"{key} is exactly {ends}{cure}",
+            out.append(AuditFinding("saturation", key, f"{self.names[key]} is exactly {ends}{cure}",
                                     float(np.mean(mask[self.valid])),
                                     (int(where[0]), int(where[-1]) + 1), key == "y"))  # fmt: skip
         return out
@@ -393,8 +397,8 @@ class _RecordChecks:
                 continue
             ratio = step / spread
             size = self.write_value(key, step)
-            text = (f"{key} is quantized in steps of {size}, {write_percent(ratio)} of its "
-                    "standard deviation")  # fmt: skip
+            text = (f"{self.names[key]} is quantized in steps of {size}, {write_percent(ratio)} of "
+                    "its standard deviation")  # fmt: skip
             bad = key == "y" and ratio > COARSE
             text += (
                 ": too coarse to show the motion. Excite the loop more strongly." if bad else "."
@@ -412,14 +416,15 @@ class _RecordChecks:
         share = float(np.mean(mask[self.valid]))
         with_u = np.mean([np.ptp(u[a - 1 : b]) == 0 for a, b in zip(first, stop, strict=True)])
         also = with_u > 0.8 and np.mean(np.diff(u) == 0) < 0.5
-        what = "y and u repeat their" if also else "y repeats its"
+        name = self.names["y"]
+        what = f"{name} and {self.names['u']} repeat their" if also else f"{name} repeats its"
         count, places = write_count(int(mask.sum()), "sample"), write_count(len(first), "place")
         text = (f"{what} last value for {count} in {places}, "
                 "although the samples before and after change: ")  # fmt: skip
         every = np.diff(first)
         usual = int(np.median(every)) if len(every) > 10 else 0
         if share > 0.3 and np.mean(every == usual) > 0.9:
-            text += (f"y is measured only once in {usual} samples. Decimate the record by "
+            text += (f"{name} is measured only once in {usual} samples. Decimate the record by "
                      f"{usual} with antialias=False.")  # fmt: skip
         else:
             text += "samples were lost and replaced. Exclude them with valid=."
@@ -433,7 +438,7 @@ class _RecordChecks:
             return []
         worst = at[np.argmax(np.abs(height[at]))]
         text = (
-            f"y has {write_count(at.size, 'isolated spike')}, the largest of "
+            f"{self.names['y']} has {write_count(at.size, 'isolated spike')}, the largest of "
             f"{self.write_value('y', height[worst])} at sample {worst}. No plant moves there and "
             f"back within one sample. Exclude {'it' if at.size == 1 else 'them'} with valid=."
         )
@@ -503,7 +508,9 @@ class _RecordChecks:
             return []
         times = self.record.n // found
         self.repeats = (found, times)
-        text = (f"the reference has a period of {found} samples, and the record has "
+        name = self.names["r"]
+        which = "the reference" if name == "r" else f"the reference {name}"
+        text = (f"{which} has a period of {found} samples, and the record has "
                 f"{self.record.n / found:.3g} periods. Averaging over the periods separates the "
                 "noise from the response.")  # fmt: skip
         return [AuditFinding("repeats", "r", text, times, self.whole)]

@@ -208,7 +208,7 @@ def _fit_row(
     estimate = _make_estimate(task, fit, constrained=bool(known), dt=records[0].dt)
     _check_strength(estimate, names)
     if not fit.converged:
-        warnings.warn(_NOT_SETTLED, CtrlidWarning, stacklevel=5)
+        warnings.warn(_describe_no_end(fit), CtrlidWarning, stacklevel=5)
     return estimate
 
 
@@ -370,7 +370,7 @@ def _make_estimate(task: Task, fit: _Fit, constrained: bool, dt: float) -> Estim
     covariance = found.spread * rss / degrees
     sandwich = _compute_sandwich(moments, found, residuals)
     words = [_text.write_count(fit.iterations, "iteration"), f"instruments from {fit.source}"]
-    notes = [] if fit.converged else [_NOT_SETTLED]
+    notes = [] if fit.converged else [_describe_no_end(fit)]
     if fit.view.degree > 1:
         notes.append(_CURVED.format(degree=fit.view.degree))
     if len(fit.view.num) > 1:
@@ -429,11 +429,6 @@ def _compute_sandwich(moments: Moments, found: Found, residuals: Sequence[Residu
 
 # -- words ---------------------------------------------------------------------------------------
 
-_NOT_SETTLED = (
-    f"THE ITERATIONS DID NOT CONVERGE in {_MOST} steps: the coefficients above are those of the "
-    "step with the smallest prediction error. The orders may be too high, or the reference too "
-    "weak."
-)
 _CURVED = (
     "THE PLANT IS NONLINEAR over the range of this record: products of y and u up to degree "
     "{degree} were fitted as well, and the coefficients above are those of the linear model at the "
@@ -448,6 +443,18 @@ _CORRELATED = (
     "the residuals instead. Check with compare() whether the residuals depend on the reference: "
     "physics may be missing."
 )
+
+
+def _describe_no_end(fit: _Fit) -> str:
+    """Say that the iterations with the last noise model did not end, of all that were made."""
+    count = fit.iterations
+    whole = _text.write_count(count, "step")
+    made = f"the last {_MOST} of {whole}" if count > _MOST else whole
+    return (
+        f"THE ITERATIONS DID NOT CONVERGE in {made}: the coefficients above are those of the "
+        "step with the smallest prediction error. The orders may be too high, or the reference too "
+        "weak."
+    )
 
 
 def _check_hold(records: Sequence[Record]) -> None:
