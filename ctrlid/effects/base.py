@@ -253,7 +253,7 @@ class AbstractEffect(metaclass=CheckedCalls):
             if self.place in ("force", "law"):
                 # These are counted in the unit of the position, which an output may show scaled.
                 at = self.at if self.place == "force" else ""
-                signals["y"] = loop.find_position_unit(at)
+                signals["y"] = loop.position_units.get(at, loop.position_unit)
                 if at:
                     return self._find_force_units(e, signals["y"])
         return {p.name: fill_unit(p.unit, signals) for p in self._list_used()}

@@ -22,7 +22,7 @@ from .._base.arrays import to_real_array
 from .._base.errors import CtrlidError, CtrlidWarning, EffectDoesNotApply
 from .._base.periods import have_same_period, write_both_periods
 from .._base.pickling import pack_by_value
-from .._base.text import list_known, write_count, write_percent
+from .._base.text import Printed, list_known, write_count, write_percent
 from ..effects import AbstractEffect, Quantization
 from ..effects.composition import compose_effects, label_effects
 from ..effects.context import find_motion, find_position_unit, find_state_units
@@ -41,8 +41,8 @@ from .wiring import Wiring, is_wired_by_name, make_wired_law, make_wiring
 
 
 @explain_fields
-@dataclass(frozen=True, eq=False)
-class Loop:
+@dataclass(frozen=True, eq=False, repr=False)
+class Loop(Printed):
     """A plant, its controller and the point around which they work.
 
     .. math:: u = u_0 + C(r - y)
@@ -314,7 +314,13 @@ class Loop:
     @property
     def position_unit(self) -> str:
         """The unit of the position that forces act on; a name in brackets where it is not known."""
-        return self.find_position_unit()
+        return find_position_unit(self._traced, self.known_units)
+
+    @property
+    def position_units(self) -> dict[str, str]:
+        """The unit of the position of each velocity, by its name, as in `position_unit`."""
+        e, known = self._traced, self.known_units
+        return {s: find_position_unit(e, known, s) for s in (e.states[j] for j in e.velocities)}
 
     @property
     def state_units(self) -> dict[str, str]:
@@ -324,21 +330,6 @@ class Loop:
         as it is.
         """
         return find_state_units(self._traced, self.known_units)
-
-    def find_position_unit(self, velocity: str = "") -> str:
-        """Return the unit of the position of a velocity; a name in brackets if it is not known.
-
-        Parameters
-        ----------
-        velocity : str, optional
-            A velocity, on which forces act; by default the only one, or that of the first output.
-
-        Returns
-        -------
-        str
-            The unit, as that in which a force there is an acceleration per square second.
-        """
-        return find_position_unit(self._traced, self.known_units, velocity)
 
     def equations(self, keep: bool = False) -> Equations:
         """Return the traced equations of the plant with its effects, in absolute physical units.
@@ -592,7 +583,7 @@ class Loop:
             self._shift_to_absolute(), active, self._bare_point, self.dt, states
         )
 
-    def __repr__(self) -> str:
+    def _describe(self) -> str:
         e = self._traced
         assert self.at is not None
         kind = "no controller" if self.controller is None else (
@@ -622,8 +613,8 @@ class Loop:
 
     def __str__(self) -> str:
         if not list_unforced_velocities(self):
-            return repr(self)
-        return f"{self!r}\n  note: {describe_missing_forces(self)}."
+            return write_loop(self)
+        return f"{write_loop(self)}\n  note: {describe_missing_forces(self)}."
 
     def _describe_imbalance(self) -> str:
         """Say that the plant does not rest at the operating point; empty where it does.
@@ -675,6 +666,11 @@ def exchange_limits(loop: Loop, lower: float = -math.inf, upper: float = math.in
 def add_units(loop: Loop, units: Mapping[str, str]) -> Loop:
     """Return the loop with further units, by names of the plant."""
     return loop._replace_fields(units={**loop.units, **units}) if units else loop
+
+
+def write_loop(loop: Loop) -> str:
+    """Return what a loop is made of, without a note on what it lacks."""
+    return loop._describe()
 
 
 def list_unforced_velocities(loop: Loop) -> tuple[str, ...]:

@@ -25,7 +25,7 @@ from ..estimation.identified_model import IdentifiedModel, read_delay
 from ..estimation.likelihood.filter_data import FEWEST
 from ..estimation.likelihood.prediction import Prediction, predict, predict_ahead, predict_spread
 from ..estimation.linear.sampled_motion import discretize_model, list_inputs
-from ..loop.loop import Loop
+from ..loop.loop import Loop, write_loop
 from ..loop.period_map import compute_growth_rate
 from ..loop.simulation import Simulator
 from ..loop.step_check import describe_unstated_steps
@@ -161,7 +161,7 @@ def _compare_loop(record: Record, loop: Loop, horizon: int | None) -> Comparison
     rejected = find_rejection(loop, record)
     curve, notes = _try_simulation(rejected, lambda: _simulate(record, loop, prediction))
     curves += [] if curve is None else [curve]
-    made = _make_comparison(repr(loop), record, curves, residuals, notes)
+    made = _make_comparison(write_loop(loop), record, curves, residuals, notes)
     stepped = describe_unstated_steps(loop, record, prediction.sensor_noise)
     return replace(made, rejection=rejected, steps=stepped)
 
@@ -215,7 +215,7 @@ def _compare_several(record: Record, loop: Loop, horizon: int | None) -> Compari
     curves = [replace(c, label=f"{c.label} of {one.what}") for one in each for c in one.curves]
     tests = tuple(replace(t, name=f"{t.name}, of {one.what}") for one in each for t in one.tests)
     notes += [f"{note}, of {one.what}" for one in each for note in one.notes]
-    what = repr(loop).partition(", wired:")[0]
+    what = write_loop(loop).partition(", wired:")[0]
     return Comparison(what, record, tuple(curves), residuals, tests, tuple(notes),
                       tuple(each), rejected,
                       describe_unstated_steps(loop, record, prediction.sensor_noise))  # fmt: skip

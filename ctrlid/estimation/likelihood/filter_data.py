@@ -221,7 +221,7 @@ def _find_rate_unit(loop: Loop, state: str) -> str:
     if not e.velocities:
         unit = loop.state_units.get(state, "")
         return fill_unit("{x}/s", {"x": unit}) if unit else ""
-    position = loop.find_position_unit(state)
+    position = loop.position_units.get(state, loop.position_unit)
     return "" if position.startswith("[") else fill_unit("{x}/s^2", {"x": position})
 
 

@@ -20,7 +20,7 @@ from ..._base.text import (
     write_number,
     write_quantity,
 )
-from ...loop.loop import Loop
+from ...loop.loop import Loop, write_loop
 from ...physics.linearization import make_state_space, operating_point
 from ..identified_model import compute_root_errors
 
@@ -274,7 +274,7 @@ class LoopFit(Printed):
         return compute_root_errors(self.poles, slope @ covariance @ slope.T)
 
     def __str__(self) -> str:
-        return f"{self.loop!r}\n{self.estimate}"
+        return f"{write_loop(self.loop)}\n{self.estimate}"
 
 
 def _find_denominator(model: Any) -> Any:
