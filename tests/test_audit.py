@@ -316,6 +316,61 @@ def test_staircases_and_rest_are_not_saturation():
     assert found.quantum["u"] == 0.0
 
 
+def switch(sizes):
+    """A reference that changes its sign at unequal times, each long enough for rest."""
+    lengths = np.random.default_rng(5).integers(300, 400, len(sizes))
+    return np.repeat(sizes * (-1.0) ** np.arange(len(sizes)), lengths)
+
+
+def kick(r, noise, limits=(-np.inf, np.inf), seed=1):
+    """A lead with feed-through on a mass: u jumps with r for one sample, and is rounded."""
+    lead = ct.tf([30.0, -27.0], [1.0, -0.2], 0.02)
+    loop = cid.Loop(cid.plants.servo(m=1.0, c=10.0, k=50.0), lead, dt=0.02, input_limits=limits)
+    record = cid.simulate(loop, r, sensor_noise=noise, seed=seed)
+    return replace(loop, input_limits=(-np.inf, np.inf)), replace(record, u=record.u.round(4))
+
+
+def test_equal_peaks_of_equal_jumps_are_no_limit():
+    r = switch(np.full(20, 0.1))
+    loop, record = kick(r, 0.0)
+    top = record.u == record.u.max()
+    assert np.count_nonzero(top) >= defects.SOME
+    assert np.diff(np.flatnonzero(top)).min() > 1
+    for found in (cid.audit(record), cid.audit(record, loop)):
+        assert found["saturation"] == ()
+        assert found.saturated["u"][:2] == (0.0, 0.0)
+    # Two references in place of one, of which one rests.
+    several = cid.Record(r=np.array([r, 0 * r]), u=record.u, y=np.array([record.y, record.y]),
+                         dt=record.dt, names={"y": ("x", "z")})  # fmt: skip
+    assert not [f for f in cid.audit(several)["saturation"] if f.channel == "u"]
+
+
+def test_a_limit_of_one_sample_is_still_one():
+    """Noise beside equal peaks, jumps of different heights, or a limit that the loop states."""
+    rng = np.random.default_rng(3)
+    equal, unequal = switch(np.full(20, 0.1)), switch(rng.uniform(0.08, 0.1, 20))
+    limits = (-4.5, 4.5)
+    for r, noise in ((equal, 1e-3), (unequal, 0.0)):
+        loop, record = kick(r, noise, limits)
+        assert np.diff(np.flatnonzero(record.u == 4.5)).min() > 1
+        assert "u is exactly -4.5" in cid.audit(record, loop)["saturation"][0].text
+    loop, record = kick(equal, 0.0, limits)
+    said = cid.audit(record, replace(loop, input_limits=limits))["saturation"][0].text
+    assert "The loop has these limits" in said
+
+
+def test_limits_of_a_pid_are_known(servo):
+    """What the controller of the loop keeps by itself is not asked for once more."""
+    loop, r = servo
+    limited = replace(loop, controller=replace(loop.controller, lower=-2.0, upper=2.0))
+    record = cid.simulate(limited, r, sensor_noise=1e-4, seed=1)
+    found = cid.audit(record, limited)
+    assert found.saturated["u"][2:] == (-2.0, 2.0)
+    assert "The loop has these limits" in found["saturation"][0].text
+    assert "Give the limits" not in str(found)
+    assert "Give the limits" in str(cid.audit(record, loop))
+
+
 @pytest.mark.parametrize("n", [2, 5, 20])
 def test_few_samples(n):
     y = np.random.default_rng(n).standard_normal(n)

@@ -307,7 +307,7 @@ def _find_law_off_limits(loop: Loop, record: Record, left: float, resolution: fl
     ctrlid knows three. Each visit of a limit leaves another state, so that every stretch between
     two of them is replayed from its own.
     """
-    lower, upper = _find_limits(loop)
+    lower, upper = find_input_limits(loop)
     slack = 1e-6 * float(np.ptp(record.u[record.valid]))
     at_limit = record.valid & ((record.u <= lower + slack) | (record.u >= upper - slack))
     off = replace(record, valid=record.valid & ~at_limit)
@@ -410,7 +410,7 @@ def _is_noise_of_log(e: Any, record: Record) -> bool:
     return by_r <= FOLLOWS and by_all <= 1 - FOLLOWS
 
 
-def _find_limits(loop: Loop) -> tuple[float, float]:
+def find_input_limits(loop: Loop) -> tuple[float, float]:
     """Return the limits of the input: those of the loop and of its PID."""
     lower, upper = loop.input_limits
     if isinstance(loop.controller, PID):
@@ -424,7 +424,7 @@ def _is_independent(loop: Loop, e: Any, record: Record) -> bool:
     The samples at the stated limits are left out, which cut off what was added.
     """
     assert record.r is not None
-    u, (lower, upper) = record.u, _find_limits(loop)
+    u, (lower, upper) = record.u, find_input_limits(loop)
     inner = record.valid & (u > lower) & (u < upper)
     return is_independent(e, [record.y], [record.r], inner, record.valid)
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from .._base.arguments import explain_names, point_at_part
+from .._base.arrays import Array
 from .._base.errors import CtrlidError
 from .._base.interruption import hold_interrupt
 from .._base.rounding import keep_numpy_quiet
@@ -20,7 +21,7 @@ from ..loop.loop import Loop
 from ..loop.unit_check import describe_distance, find_unit_clashes, measure_distance
 from ..loop.wiring import match_signals
 from . import signal_defects as defects
-from .controller_check import FAULTS, check_controller
+from .controller_check import FAULTS, check_controller, find_input_limits
 from .hold_check import check_hold
 from .wired_controller_check import check_wired_controller
 
@@ -205,7 +206,8 @@ def audit(record: Record, loop: Loop | None = None) -> Audit:
         still = dict.fromkeys(SIGNALS, (0.0, 0.0, 0.0, 0.0))
         return Audit((few,), MappingProxyType(dict.fromkeys(SIGNALS, 0.0)), (0, 0),
                      MappingProxyType(still))  # fmt: skip
-    checks = _RecordChecks(record, () if loop is None else loop.input_limits)
+    references = () if record.r is None else (record.r,)
+    checks = _RecordChecks(record, () if loop is None else find_input_limits(loop), references)
     findings = [
         *checks.check_length(),
         *checks.find_constant(),
@@ -249,6 +251,7 @@ def _audit_several(record: Record, loop: Loop | None) -> Audit:
     parts = [("u", name, record.select(u=name, y=y[0])) for name in u]
     parts += [("y", name, record.select(u=u[0], y=name)) for name in y]
     parts += [("r", name, record.select(u=u[0], y=y[0], r=name)) for name in r]
+    references = tuple(np.asarray(part.r) for key, _, part in parts if key == "r")
     limits = np.broadcast_to(
         np.array([-np.inf, np.inf] if loop is None else
                  np.array(np.broadcast_arrays(*loop.input_limits)).T), (len(u), 2)
@@ -263,7 +266,8 @@ def _audit_several(record: Record, loop: Loop | None) -> Audit:
             findings.append(AuditFinding("too few samples", "", text, 0, (0, part.n), True))
             continue
         stated = tuple(limits[u.index(name)]) if key == "u" else ()
-        checks = _RecordChecks(part, stated, {k: each[0] for k, each in part.signals.items()})
+        called = {k: each[0] for k, each in part.signals.items()}
+        checks = _RecordChecks(part, stated, references, called)
         found = [*checks.check_length(), *checks.find_constant(), *checks.find_limits(),
                  *checks.find_steps()]  # fmt: skip
         if key == "y":
@@ -297,11 +301,13 @@ class _RecordChecks:
     """The checks of one record; later ones use what earlier ones found."""
 
     def __init__(
-        self, record: Record, limits: tuple[float, ...], names: Mapping[str, str] | None = None
-    ) -> None:
+        self, record: Record, limits: tuple[float, ...], references: tuple[Array, ...],
+        names: Mapping[str, str] | None = None,
+    ) -> None:  # fmt: skip
         # What the signals are called in sentences: of several, each by its own name.
         self.names = names or {key: key for key in SIGNALS}
         self.record, self.valid, self.stated = record, record.valid, limits
+        self.references = references
         self.signals = {k: v for k in SIGNALS if (v := getattr(record, k)) is not None}
         self.whole = (0, record.n)
         self.quantum = dict.fromkeys(SIGNALS, 0.0) | {
@@ -320,6 +326,10 @@ class _RecordChecks:
 
     def compute_spread(self, key: str) -> float:
         return float(np.std(self.signals[key][self.valid]))
+
+    def is_stated(self, value: float) -> bool:
+        """Return whether the loop says that u ends at a value."""
+        return bool(np.isclose(value, self.stated, rtol=1e-3).any())
 
     def check_length(self) -> list[AuditFinding]:
         count = int(np.count_nonzero(self.valid))
@@ -360,6 +370,9 @@ class _RecordChecks:
             for side in (-1, 1):
                 at, limit = defects.find_clipped(v, self.valid, others, self.quantum[key], side,
                                             self.record.r if key == "y" else None)  # fmt: skip
+                known = key == "u" and self.is_stated(limit)
+                if not known and defects.is_one_event(v, at, self.references, self.quantum[key]):
+                    at = np.zeros(len(v), dtype=bool)
                 mask |= at
                 shares.append(float(np.mean(at[self.valid])))
                 values.append(limit)
@@ -377,7 +390,7 @@ class _RecordChecks:
                         "samples, and some before and after them, with valid=.")  # fmt: skip
             else:
                 reached = [v for share, v in zip(shares, values, strict=True) if share]
-                known = all(np.isclose(v, self.stated, rtol=1e-3).any() for v in reached)
+                known = all(self.is_stated(v) for v in reached)
                 advice = ("The loop has these limits" if known else
                           "Give the limits to the loop with input_limits=")  # fmt: skip
                 cure = (", so it is limited. Fits from u to y are valid if the logged u is the "

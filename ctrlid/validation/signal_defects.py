@@ -21,6 +21,9 @@ STUCK = 0.9
 SOME = 4
 # So many samples on either side tell whether a spike stands alone.
 QUIET = 8
+# Responses that repeat exactly are alike within so many steps of a signal, or this share of it.
+REPEATED_STEPS = 3.0
+REPEATED_SHARE = 1e-3
 # A drift is tested on the means of at most so many blocks.
 BLOCKS = 40
 # So many samples tell how large a drift is; of longer records every k-th is used.
@@ -112,6 +115,48 @@ def find_clipped(
     least = SOME if len(find_runs(at)[0]) > 1 else 2 * SOME
     enough = np.count_nonzero(at) >= least + SOME * max(usual, 0.0)
     return (at if enough else none), side * limit
+
+
+def is_one_event(v: Array, at: Any, references: Sequence[Array], step: float) -> bool:
+    """Return whether equal extreme values are the same response, again and again, and no limit.
+
+    A controller with feed-through moves its output at once when a reference jumps. From rest, equal
+    jumps give equal peaks of one sample. A limit holds for longer, or is met after other jumps; and
+    it cuts off what the samples beside it show, which noise makes different each time.
+
+    Parameters
+    ----------
+    v : ndarray, shape (n,)
+        Signal.
+    at : ndarray of bool, shape (n,)
+        Samples on the extreme value.
+    references : sequence of ndarray, shape (n,)
+        What jumps.
+    step : float
+        Quantisation step of the signal, or 0.
+
+    Returns
+    -------
+    bool
+        True where each sample stands alone, all are the one of an equal jump or the one after it,
+        and the samples beside them are equal as well.
+    """
+    k = np.flatnonzero(at)
+    if not len(k) or not references or np.any(np.diff(k) == 1):
+        return False
+
+    def follows_equal_jumps(lag: int) -> bool:
+        heights = [np.diff(r, prepend=r[0])[np.maximum(k - lag, 0)] for r in references]
+        alike = all(np.ptp(h) <= estimate_rounding(r)
+                    for h, r in zip(heights, references, strict=True))  # fmt: skip
+        return alike and any(np.abs(h).min() > estimate_rounding(r)
+                             for h, r in zip(heights, references, strict=True))  # fmt: skip
+
+    if not any(follows_equal_jumps(lag) for lag in (0, 1)):
+        return False
+    beside = [v[np.clip(k + side, 0, len(v) - 1)] for side in (-1, 1)]
+    bound = max(REPEATED_STEPS * step, REPEATED_SHARE * float(np.ptp(v)))
+    return all(float(np.ptp(w)) <= bound for w in beside)
 
 
 def find_repeats(v: Array, valid: Any, step: float, ignore: Any) -> Any:
