@@ -4,6 +4,7 @@ Groups: exact models; wrong models; limits and large steps; texts; refusals.
 """
 
 import re
+import warnings
 from dataclasses import replace
 
 import control as ct
@@ -13,6 +14,7 @@ import pytest
 import ctrlid as cid
 from ctrlid import CtrlidError
 from ctrlid.design.settling import explain_unsettled
+from ctrlid.design.step_height import StepHeight, try_heights
 from problems import levitation
 
 DT = 1e-3
@@ -121,6 +123,79 @@ def test_a_step_from_zero_leaves_the_input_far_from_its_limits(scale):
     trial = cid.redesign(ct.ss(plant), loop, design=lambda P: found.controller)
     assert [s.height for s in trial.steps] == [pytest.approx(found.step, rel=0.05)]
     assert "to move the input by 10 %" in str(trial)
+
+
+def bearing_force(x, u):
+    """Two magnets, 0.4 mm to either side of a shaft."""
+    return 6e-6 * ((2 + u) ** 2 / (4e-4 - x) ** 2 - (2 - u) ** 2 / (4e-4 + x) ** 2)
+
+
+BEARING = cid.Loop(
+    ct.nlsys(lambda t, x, u, p: [x[1], bearing_force(x[0], u[0]) / 2],
+             lambda t, x, u, p: [x[0]], inputs=["i"], outputs=["x"], states=["x", "v"]),
+    dt=2e-4, units={"x": "m", "i": "A"},
+)  # fmt: skip
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("design", [False, True])
+def test_a_guessed_step_that_the_physics_cannot_do_is_a_smaller_one(design):
+    """10 mm were asked of a gap of 0.4 mm, and the verdict was that the loop diverges."""
+    model = BEARING.linearize()
+
+    def make(loop, **more):
+        if not design:
+            found = cid.redesign(model, loop, crossover=2700, phase_margin=45, **more)
+            return found, found.step, found.step_reason
+        found = cid.redesign(model, loop, **more,
+                             design=lambda P: cid.design_lead(model, 2700, 45))  # fmt: skip
+        return found, found.steps[0].height, found.steps[0].reason
+
+    found, height, reason = make(BEARING)
+    assert found.stable
+    assert height in (1e-4, 1e-5)
+    assert "is a guess" in reason
+    assert reason.endswith(f"that {1e6 * height:g} µm was taken.")
+    assert "With 10 mm the physics leaves the range" in str(found)
+    assert "DIVERGES" not in str(found)
+    # Ten times as much does not work, and a height that is given is not exchanged.
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", cid.CtrlidWarning)
+        found, more, reason = make(BEARING, step=10 * height)
+    assert (found.stable, more, reason) == (False, 10 * height, "")
+
+
+def test_where_no_smaller_step_works_the_loop_diverges():
+    class Outcome:
+        def __init__(self, value, least):
+            self.value, self.failure = value, "lost" if value > least else None
+
+    asked = []
+
+    def run(least):
+        def tried(value):
+            asked.append(value)
+            warnings.warn(f"tried {value:g}", cid.CtrlidWarning, stacklevel=2)
+            return Outcome(value, least)
+
+        return tried
+
+    guess = StepHeight(0.01, "A guess.", guessed=True)
+    with pytest.warns(cid.CtrlidWarning, match=r"^tried 0.01$") as told:
+        height, outcome = try_heights(guess, "m", True, run(0.0))
+    assert len(told) == 1
+    assert asked == pytest.approx([0.01 / 10**k for k in range(6)])
+    assert (height.value, outcome.value) == (0.01, 0.01)
+    assert height.reason == "A guess. Steps down to 0.1 µm break off as well."
+    with pytest.warns(cid.CtrlidWarning, match=r"^tried 0.001$") as told:
+        assert try_heights(guess, "m", True, run(0.005))[0].value == 0.001
+    assert len(told) == 1
+    # No height helps where small deviations grow, and what is given or known is no guess.
+    for first, stable in ((guess, False), (StepHeight(0.01, "Known."), True)):
+        asked.clear()
+        with pytest.warns(cid.CtrlidWarning):
+            assert try_heights(first, "m", stable, run(0.005))[0] == first
+        assert asked == [0.01]
 
 
 # --- kinks at rest

@@ -28,7 +28,7 @@ from ..loop.simulation import SimulationStopped, simulate
 from ..physics.trace import timebase
 from .input_margins import LoopPerformance, measure_performance
 from .settling import SETTLED, explain_unsettled
-from .step_height import choose_height
+from .step_height import StepHeight, choose_height, try_heights
 
 # A response so many times the promised one is no longer under control.
 LOST = 20
@@ -383,17 +383,25 @@ def try_design(
     # The limits that the former PID kept tell what is small where the new controller has none.
     sized = trial if isinstance(controller, PID) else loop
 
-    def choose(output: str | None, name: str) -> tuple[float, str]:
+    def choose(output: str | None, name: str) -> StepHeight:
         return choose_height(sized, output, partial(_find_peaks, promise, length, name))
 
     heights = _choose_steps(trial, model, step, choose)
     sides = [(side, _stay(side, length)) for side in (promise, trial) if heights]
-    steps = tuple(
-        replace(_make_step(trial, model, name, height, dt, length,
-                           *(_step(side, name, height, length, rest) for side, rest in sides)),
-                reason=reason)
-        for name, (height, reason) in heights.items()
-    )  # fmt: skip
+
+    def make(name: str, chosen: StepHeight) -> ReferenceStep:
+        unit = loop.known_units.get(_find_followed(trial, model, name) or "", "")
+
+        def run(value: float) -> _Run:
+            motions = (_step(side, name, value, length, rest) for side, rest in sides)
+            return _Run(_make_step(trial, model, name, value, dt, length, *motions))
+
+        # A promise that breaks off is no matter of the height.
+        stable = achieved.growth_rate < 0 and promised.growth_rate < 0
+        height, made = try_heights(chosen, unit, stable, run)
+        return replace(made.step, reason=height.reason)
+
+    steps = tuple(make(name, chosen) for name, chosen in heights.items())
     if not isinstance(step, Mapping):
         # An angle that no controller can hold is a reference by name only.
         steps = tuple(s for s in steps if not _returns(trial, s)) or steps[:1]
@@ -488,8 +496,8 @@ def _find_followed(loop: Loop, model: Any, name: str) -> str | None:
 
 
 def _choose_steps(
-    loop: Loop, model: Any, step: Any, choose: Callable[[str | None, str], tuple[float, str]]
-) -> dict[str, tuple[float, str]]:
+    loop: Loop, model: Any, step: Any, choose: Callable[[str | None, str], StepHeight]
+) -> dict[str, StepHeight]:
     """Return the height of the step of each reference that is tried, and why it is that."""
     names = _list_references(loop)
     if isinstance(step, Mapping):
@@ -499,13 +507,13 @@ def _choose_steps(
                 f"step= names {write_list([str(n) for n in unknown]) or 'no reference'}; the "
                 f"controller has the references {', '.join(names) or 'none'}"
             )
-        return {name: (_check_height(value), "") for name, value in step.items()}
+        return {name: StepHeight(_check_height(value)) for name, value in step.items()}
     wiring = loop.wiring
     held = (None,) * len(names) if wiring is None else wiring.held
     chosen = [name for name, value in zip(names, held, strict=True)
               if value is None or _find_followed(loop, model, name) is not None]  # fmt: skip
     if step is not None:
-        return dict.fromkeys(chosen, (_check_height(step), ""))
+        return dict.fromkeys(chosen, StepHeight(_check_height(step)))
     return {name: choose(_find_followed(loop, model, name), name) for name in chosen}
 
 
@@ -587,6 +595,17 @@ def write_sentence(reason: CtrlidError) -> str:
     """Return the words of an error as a sentence."""
     text = str(reason)
     return text[0].upper() + text[1:] + "."
+
+
+@dataclass(frozen=True, eq=False)
+class _Run:
+    """A step of some height, and why the physics did not follow it."""
+
+    step: ReferenceStep
+
+    @property
+    def failure(self) -> str | None:
+        return self.step.achieved.failure
 
 
 def _make_step(

@@ -33,7 +33,7 @@ from .controller_trial import (
 from .lead import design_lead
 from .margins import loop_margins, nu_gap, robust_margin
 from .settling import SETTLED, explain_unsettled
-from .step_height import choose_height
+from .step_height import StepHeight, choose_height, try_heights
 
 
 @dataclass(frozen=True)
@@ -294,7 +294,8 @@ def redesign(
     step : float or mapping of str to float, optional
         Height of the reference step [output unit]; by default 1 % of the output at the operating
         point. Where that is zero, what moves the input by a tenth of its way to a limit by the
-        model, or without limits 0.01 in SI units; the text says which. Of an output that is read in
+        model, or without limits 0.01 in SI units, or the largest tenth, hundredth, ... of it with
+        which the physics does not break off; the text says which. Of an output that is read in
         steps (`Quantization`) it is at least ten of these, where that is not too much. Of several
         references, a mapping of names says which are tried; by default those that cannot be held
         and each ``xd[i]`` that is an output.
@@ -382,31 +383,37 @@ def redesign(
     length = int(np.clip(60 / (crossover * trial.dt), 20, 50_000))
     time: Array = np.arange(length, dtype=float) * trial.dt
     promised_step = _simulate_linear_step(ct.feedback(G * C, 1), time)
-    height, reason = _choose_height(
+    chosen = _choose_height(
         loop, step, lambda: np.max(np.abs(_simulate_linear_step(ct.feedback(C, G), time)))
     )
-    achieved_step, failure, told = _simulate_physical_step(trial, height, promised_step)
     promised = _measure_performance(loop_margins(G * C), time, promised_step)
     margins = loop_margins(P * C)
     growth = compute_growth_rate(trial)
-    if growth >= 0 or not margins.stable:
+    stable = growth < 0 and margins.stable
+    name = loop.signals["y"][0]
+    height, made = try_heights(
+        chosen, loop.known_units.get(name, ""), stable,
+        lambda value: _simulate_physical_step(trial, value, promised_step),
+    )  # fmt: skip
+    failure = made.failure
+    if not stable:
         achieved = Performance(False, *(float("nan"),) * 7)
-        if not told:
+        if not made.tells_growth:
             # Dry friction holds what is at rest; the loop around it may be unstable all the same.
             why = (f"Small deviations grow at {growth:.3g} 1/s." if growth >= 0 else
                    "Without friction the loop is unstable.")  # fmt: skip
             failure = why if failure is None else f"{why} {failure}"
     else:
         achieved = _measure_performance(
-            margins, time, achieved_step if failure is None else np.empty(0)
+            margins, time, made.response if failure is None else np.empty(0)
         )
         achieved = replace(achieved, stable=failure is None)
     # The model has gain 1 at the crossover, so that volts per metre do not matter.
     omega = np.exp(1j * crossover * dt) if dt else 1j * crossover
     unit = float(np.abs(G(omega)))
     return Redesign(C, promised, achieved, nu_gap(G / unit, P / unit),
-                    robust_margin(G / unit, C * unit), trial, time, promised_step, achieved_step,
-                    height, "" if failure is None else failure, reason,
+                    robust_margin(G / unit, C * unit), trial, time, promised_step, made.response,
+                    height.value, "" if failure is None else failure, height.reason,
                     _measure_sampled(loop, C))  # fmt: skip
 
 
@@ -437,49 +444,56 @@ def _make_plain(G: Any) -> Any:
     return G
 
 
-def _choose_height(loop: Loop, step: Any, find_peak: Callable[[], Any]) -> tuple[float, str]:
+def _choose_height(loop: Loop, step: Any, find_peak: Callable[[], Any]) -> StepHeight:
     """Return the height of the step, and why it is that where it was not given."""
     if step is None:
         return choose_height(loop, loop.signals["y"][0], find_peak)
     if not is_number(step) or not np.isfinite(float(step)) or step == 0:
         raise CtrlidError("step must be the height of the reference step in output units, a "
                           f"finite number other than zero; given {step!r}")  # fmt: skip
-    return float(step), ""
+    return StepHeight(float(step))
 
 
 def _simulate_linear_step(closed: Any, time: Array) -> Array:
     return np.asarray(ct.forced_response(closed, time, np.ones(len(time))).outputs, float)
 
 
-def _simulate_physical_step(
-    loop: Loop, height: float, promised: Array
-) -> tuple[Array, str | None, bool]:
-    """Return the response to a step less that to no step, per unit of reference.
+@dataclass(frozen=True, eq=False)
+class _Response:
+    """The response to a step less that to no step, per unit of reference.
 
     With why it broke off, None if it did not, and whether that says how fast deviations grow.
     """
+
+    response: Array
+    failure: str | None = None
+    tells_growth: bool = False
+
+
+def _simulate_physical_step(loop: Loop, height: float, promised: Array) -> _Response:
+    """Return what a step of some height comes to on the physics."""
     rest: Array = np.full(len(promised), loop.point.output)
     try:
         still = simulate(loop, rest)
     except SimulationStopped as reason:
-        return np.empty(0), write_sentence(reason), reason.unstable
+        return _Response(np.empty(0), write_sentence(reason), reason.unstable)
     except ModelCannotRun as reason:
-        return np.empty(0), write_sentence(reason), False
+        return _Response(np.empty(0), write_sentence(reason))
     try:
         moved = simulate(loop, rest + height)
     except SimulationStopped as reason:
         response = (reason.y - still.y[: len(reason.y)]) / height
-        return response, write_sentence(reason), reason.unstable
+        return _Response(response, write_sentence(reason), reason.unstable)
     response = np.asarray((moved.y - still.y) / height, dtype=float)
     far = np.abs(response) > LOST * np.max(np.abs(promised))
     if not far.any():
-        return response, None, False
+        return _Response(response)
     k = int(np.argmax(far))
     text = f"After {k * loop.dt:.4g} s {moved.names['y']} has diverged to {moved.y[k]:.4g}"
     lower, upper = loop.input_limits
     if np.any(moved.u[: k + 1] <= lower) or np.any(moved.u[: k + 1] >= upper):
         text += f", with {moved.names['u']} at its limit ({lower:g} to {upper:g})"
-    return response[: k + 1], text + ".", False
+    return _Response(response[: k + 1], text + ".")
 
 
 def _measure_performance(margins: Any, time: Array, response: Array) -> Performance:

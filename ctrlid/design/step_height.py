@@ -1,10 +1,14 @@
 """How high a reference steps where nobody says so: by what the loop itself calls small."""
 
+import warnings
 from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
 from .._base.arrays import Array
+from .._base.errors import CtrlidWarning
 from .._base.text import write_number, write_percent, write_quantity
 from .._base.units import count_per_si_unit
 from ..loop.controllers import PID
@@ -19,11 +23,92 @@ ROOM = 0.1
 SEVERAL = 10
 # unless it were more than so many times what is chosen without them.
 MOST = 5.0
+# A guess with which the physics breaks off is divided by ten so many times.
+TENTHS = 5
 
 
-def choose_height(
-    loop: Loop, output: str | None, find_peaks: Callable[[], Array]
-) -> tuple[float, str]:
+@dataclass(frozen=True)
+class StepHeight:
+    """How high a reference steps [unit of the output], and why.
+
+    `reason` is a sentence or more, empty for a height that was given or is a share of the output
+    at rest; `guessed` says that neither the loop nor its user told what is small.
+    """
+
+    value: float
+    reason: str = ""
+    guessed: bool = False
+
+
+class Tried(Protocol):
+    """What a step of some height came to."""
+
+    @property
+    def failure(self) -> str | None:
+        """Why the simulation broke off; None if it did not."""
+
+
+Outcome = TypeVar("Outcome", bound=Tried)
+
+
+def try_heights(
+    first: StepHeight, unit: str, stable: bool, run: Callable[[float], Outcome]
+) -> tuple[StepHeight, Outcome]:
+    """Return what a step came to; of a guess that breaks off the largest tenth that does not.
+
+    Parameters
+    ----------
+    first : StepHeight
+        The height that was chosen.
+    unit : str
+        Of the height.
+    stable : bool
+        Whether small deviations decay; if not, no height is small enough.
+    run : callable
+        From a height to what came of it.
+
+    Returns
+    -------
+    StepHeight, object
+        The height that was taken, with the reason, and its outcome: that of the first where none
+        holds. Warnings are those of the outcome alone.
+    """
+    outcome, doubts = _run_quietly(run, first.value)
+    height = first
+    if outcome.failure is not None and first.guessed and stable:
+        wide = write_quantity(first.value, unit)
+        tries = [first.value / 10**k for k in range(1, TENTHS + 1)]
+        kept: tuple[Outcome, list[Any], float] | None = None
+        for value in tries:
+            tried, own = _run_quietly(run, value)
+            # A simulation with a doubt about it may have jumped over what the physics cannot pass.
+            if tried.failure is None and (kept is None or not own):
+                kept = tried, own, value
+            if kept is not None and not kept[1]:
+                break
+        if kept is None:
+            more = f"Steps down to {write_quantity(tries[-1], unit)} break off as well."
+            height = StepHeight(first.value, f"{first.reason} {more}", guessed=True)
+        else:
+            outcome, doubts, value = kept
+            more = (
+                f"With {wide} the physics leaves the range in which this controller holds it, so "
+                f"that {write_quantity(value, unit)} was taken."
+            )
+            height = StepHeight(value, f"{first.reason} {more}", guessed=True)
+    for doubt in doubts:
+        warnings.warn(doubt.message, stacklevel=3)
+    return height, outcome
+
+
+def _run_quietly(run: Callable[[float], Outcome], value: float) -> tuple[Outcome, list[Any]]:
+    """Return an outcome and the warnings on the way to it."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", CtrlidWarning)
+        return run(value), caught
+
+
+def choose_height(loop: Loop, output: str | None, find_peaks: Callable[[], Array]) -> StepHeight:
     """Return the default height of a reference step, and why it is that.
 
     Parameters
@@ -38,10 +123,8 @@ def choose_height(
 
     Returns
     -------
-    height : float
-        In the unit of the output.
-    reason : str
-        A sentence or more; empty where the height is a share of the output at rest.
+    StepHeight
+        Guessed where nothing but SI units or an encoder tells it.
 
     Notes
     -----
@@ -52,19 +135,21 @@ def choose_height(
     height, reason, bound = _choose_smooth_height(loop, output, find_peaks)
     step = 0.0 if output is None else find_reading_step(loop, output)
     if SEVERAL * step <= height:
-        return height, reason
+        return StepHeight(height, reason, not bound)
     size = write_quantity(step, loop.known_units.get(output or "", ""))
     enough = SEVERAL * step
     read = f"{output} is read in steps of {size}"
     if bound and enough > MOST * height:
-        return height, (
+        words = (
             f"{reason} {read}, of which this is only {write_number(height / step, 2)}, so that the "
             f"response shows mostly the reading; {SEVERAL} of them may be too much for this loop."
-        ).strip()
-    return enough, (
+        )
+        return StepHeight(height, words.strip())
+    words = (
         f"{read}, of which {SEVERAL} are taken: without them the step would have been "
         f"{write_quantity(height, loop.known_units.get(output or '', ''))}."
     )
+    return StepHeight(enough, words, not bound)
 
 
 def _find_range(loop: Loop) -> tuple[Array, Array]:
