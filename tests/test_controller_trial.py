@@ -5,6 +5,7 @@ Groups: numbers against python-control; several signals; texts and pictures; ref
 
 import functools
 import math
+from dataclasses import replace
 
 import control as ct
 import numpy as np
@@ -13,6 +14,7 @@ import pytest
 import ctrlid as cid
 from ctrlid import CtrlidError
 from ctrlid.design.input_margins import measure_performance, open_at_inputs
+from ctrlid.design.settling import settles_otherwise
 from problems import levitation
 from test_wiring import CART, QUAD, at_rest
 
@@ -257,6 +259,21 @@ def test_margins_of_an_unstable_loop_are_unknown():
     assert math.isnan(found.disk_margin)
 
 
+def test_another_settling_time_is_said_beside_a_promise_that_holds():
+    found = tried(observer_design)
+    assert "settles after" not in found.verdict
+    (step,) = found.steps
+    time = step.promised.settling_time
+    slow = replace(step, achieved=replace(step.achieved, settling_time=2 * time))
+    verdict = replace(found, steps=(slow,)).verdict
+    assert "of their size, but xd[0] settles after" in verdict
+    assert f"where {time:.4g} s is promised: the response stays near the edge of the 2 %" in verdict
+    # A difference that the samples do not resolve is none.
+    assert not settles_otherwise(0.01, 0.02, 0.01)
+    assert settles_otherwise(0.1, 0.06, 0.01)
+    assert not settles_otherwise(math.nan, 1.0, 0.01)
+
+
 # --- texts and pictures
 
 
@@ -315,6 +332,15 @@ def test_the_page(tmp_path):
 def test_designs_are_refused_in_words(design, words):
     with pytest.raises(CtrlidError, match=words):
         cid.redesign(RIG, RIG, design=design)
+
+
+def test_a_state_feedback_without_all_states_is_told_of_observers():
+    with pytest.raises(CtrlidError, match=r"needs all 4 states, and the model has 2 outputs: add"):
+        cid.redesign(RIG, RIG, design=lambda P: ct.create_statefbk_iosystem(P, np.ones((1, 4))))
+    # What is wrong elsewhere is no matter of the states.
+    with pytest.raises(CtrlidError, match="design raised ZeroDivisionError") as refusal:
+        cid.redesign(RIG, RIG, design=lambda P: 1 / 0)
+    assert "observer" not in str(refusal.value)
 
 
 @pytest.mark.parametrize(

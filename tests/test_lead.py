@@ -271,6 +271,7 @@ def test_too_little_phase_asked_says_what_a_gain_gives():
     text = str(refusal.value)
     assert "would need a phase lag" in text
     assert "a pure gain gives exactly 45.0000 degrees" in text
+    assert text.endswith("are tried with redesign(G, loop, design=lambda P: C).")
     assert "45.0 to just under 135.0 degrees" in text
     # Without a lead, phase -150 is at tan(60): from there on leads work.
     assert "With 30 degrees, crossovers are possible from about 1.73 rad/s upwards" in text

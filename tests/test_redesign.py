@@ -398,6 +398,14 @@ def test_the_default_step_is_several_steps_of_the_encoder():
 # --- texts
 
 
+def test_another_settling_time_is_said():
+    found = cid.redesign(P, LOOP, crossover=100, phase_margin=50)
+    assert "settles after" not in found.verdict
+    late = 2 * found.promised.settling_time
+    slow = replace(found, achieved=replace(found.achieved, settling_time=late))
+    assert f"The step settles after {late:.4g} s where" in slow.verdict
+
+
 def test_an_analog_lead_in_place_of_a_program_is_said():
     program = replace(LOOP, controller=ct.tf([-4000.0, 3000.0], [1.0, 0.0], DT))
     found = cid.redesign(P, program, crossover=100, phase_margin=50)

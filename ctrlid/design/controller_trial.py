@@ -27,7 +27,7 @@ from ..loop.loop import Loop
 from ..loop.simulation import SimulationStopped, simulate
 from ..physics.trace import timebase
 from .input_margins import LoopPerformance, measure_performance
-from .settling import SETTLED, explain_unsettled
+from .settling import SETTLED, TAIL, explain_unsettled, settles_otherwise
 from .step_height import StepHeight, choose_height, try_heights
 
 # A response so many times the promised one is no longer under control.
@@ -232,7 +232,14 @@ class ControllerTrial(Printed):
         if share > CLOSE:
             return (f"THE STEP OF {name} DIFFERS from what is promised by up to "
                     f"{100 * share:.0f} % of its size.")  # fmt: skip
-        return f"The steps are as promised within {max(math.ceil(100 * share), 1)} % of their size."
+        kept = f"The steps are as promised within {max(math.ceil(100 * share), 1)} % of their size"
+        tails = [
+            f"{s.reference} settles after {s.achieved.settling_time:.4g} s where "
+            f"{s.promised.settling_time:.4g} s is promised"
+            for s in self.steps
+            if settles_otherwise(s.promised.settling_time, s.achieved.settling_time, self.loop.dt)
+        ]
+        return f"{kept}, but {write_list(tails)}: {TAIL}." if tails else f"{kept}."
 
     @property
     def rows(self) -> tuple[tuple[str, str, str], ...]:
@@ -446,7 +453,7 @@ def _call_design(design: Callable[[Any], Any], model: Any) -> Any:
         raise CtrlidError(
             f"design raised {type(reason).__name__} on the model with inputs "
             f"{model.input_labels}, outputs {model.output_labels} and {model.nstates or 'no'} "
-            f"states: {reason}"
+            f"states: {reason}{_advise_observer(reason, model)}"
         ) from reason
     # create_statefbk_iosystem returns the controller, and the closed loop beside it.
     if isinstance(controller, tuple) and len(controller) == 2:
@@ -463,6 +470,20 @@ def _call_design(design: Callable[[Any], Any], model: Any) -> Any:
     raise CtrlidError(
         "design is a function from the model to a controller, a python-control system or a PID; "
         f"it returned {given}{hint}"
+    )
+
+
+def _advise_observer(reason: Exception, model: Any) -> str:
+    """Return what a state feedback lacks on a model that does not measure all of its states."""
+    if not isinstance(reason, ct.ControlArgument) or not isinstance(model, ct.StateSpace):
+        return ""
+    if model.noutputs >= model.nstates:
+        return ""
+    return (
+        f". A state feedback needs all {model.nstates} states, and the model has "
+        f"{write_count(model.noutputs, 'output')}: add an observer, by "
+        "ct.create_estimator_iosystem or as one ct.ss with the gain of ct.lqe (the last example of "
+        "help(ctrlid.redesign))"
     )
 
 

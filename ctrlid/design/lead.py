@@ -26,6 +26,12 @@ LOST = "with any margin a lead gives at this crossover, the loop is unstable"
 FASTEST = 1e100
 COARSE_FAMILY = (0.5, *FAMILY[::16])
 
+# What no lead can do, other controllers may.
+OTHER_DESIGNS = (
+    "Other controllers, such as one with a lag, are tried with redesign(G, loop, design=lambda P: "
+    "C)."
+)
+
 
 @dataclass(frozen=True)
 class _Task:
@@ -197,7 +203,7 @@ def design_lead(P: Any, crossover: float, phase_margin: float) -> Any:
         if LOST not in other:
             found = f"{found} With a gain of the other sign: {other}"
     if isinstance(found, str):
-        raise CtrlidError(f"{found} {_explain_crossovers(task)}")
+        raise CtrlidError(f"{found} {_explain_crossovers(task)} {OTHER_DESIGNS}")
     return ct.tf(found.num, found.den, plant.dt, name="lead", inputs=["e"], outputs=["u"])
 
 

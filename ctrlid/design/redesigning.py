@@ -32,7 +32,7 @@ from .controller_trial import (
 )
 from .lead import design_lead
 from .margins import loop_margins, nu_gap, robust_margin
-from .settling import SETTLED, explain_unsettled
+from .settling import SETTLED, TAIL, explain_unsettled, settles_otherwise
 from .step_height import StepHeight, choose_height, try_heights
 
 
@@ -199,6 +199,9 @@ class Redesign(Printed):
         elif apart > CLOSE:
             text += (f" THE RESPONSE TO A STEP of {step} ends at {a.final_value:.3g} per "
                      f"unit, where {p.final_value:.3g} is promised.")  # fmt: skip
+        elif settles_otherwise(p.settling_time, a.settling_time, self.loop.dt):
+            text += (f" The step settles after {a.settling_time:.4g} s where {p.settling_time:.4g} "
+                     f"s is promised: {TAIL}.")  # fmt: skip
         sure = self.nu_gap < self.robust_margin
         # Where the units of a loop make the margin small, it has more digits.
         digits = max(3, 1 - math.floor(math.log10(max(self.robust_margin, 1e-14))))
@@ -267,7 +270,8 @@ def redesign(
 
     With a crossover and a phase margin the controller is the lead of `design_lead` on `G`. With
     `design`, a function from the model to a controller, it is any that python-control knows, for
-    any number of signals: ``design=lambda P: ct.create_statefbk_iosystem(P, ct.lqr(P, Q, R)[0])``.
+    any number of signals: ``design=lambda P: ct.create_statefbk_iosystem(P, ct.lqr(P, Q, R)[0])``
+    where the outputs of the model are all of its states, else with an observer as below.
 
     The promise is that of the linear loop with `G`. What the controller achieves is measured on the
     loop's own plant: poles and margins on the plant linearized at the operating point (and sampled,

@@ -16,6 +16,9 @@ from ..physics.trace import trace
 
 # A response has settled when it stays within this share of its final value.
 SETTLED = 0.02
+# Settling times that differ by more than this share are said to.
+OTHER_TIME = 0.25
+TAIL = f"the response stays near the edge of the {100 * SETTLED:.0f} % that count as settled"
 FRICTION = (AsymmetricCoulombFriction, CoulombFriction, StribeckFriction)
 
 
@@ -36,6 +39,15 @@ def find_reading_step(loop: Loop, output: str) -> float:
     """
     steps = dict(zip(loop.signals["y"], find_converter_steps(loop), strict=True))
     return steps.get(output, 0.0)
+
+
+def settles_otherwise(promised: float, achieved: float, dt: float) -> bool:
+    """Return whether two settling times [s] differ by much, and by more than the samples resolve.
+
+    A response that is nearly the promised one may have a tail just outside what counts as settled.
+    """
+    apart = abs(achieved - promised)
+    return bool(np.isfinite(apart) and apart > max(OTHER_TIME * promised, 1.5 * dt))
 
 
 def explain_unsettled(loop: Loop, output: str, height: float) -> str:
