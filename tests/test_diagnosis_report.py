@@ -143,10 +143,13 @@ def test_report_of_an_explanation(found):
         "On these samples the effects remove",
         "random force: white (30 mm/s^2 RMS); it causes 12 % of the variance of the noise floor",
         "residuals: noise, by 2 tests. The smallest p-value is that of heavy tails, p = 0.22",
-        "Chance reaches 2 or 3; from 10 on evidence is strong, from 30 on very strong.",
+        "Chance reaches 2 or 3; from 10 on evidence is strong, from 30 on very strong. Names are "
+        "of the catalogue. What is not in it and acts like one of them is taken for that one",
     ):
         assert part in words
     assert "time all the time alike" not in words
+    partly = replace(found["explained"], verdict="partly explained")
+    assert "Names are of the catalogue" not in text(partly)
 
 
 def test_report_of_a_clean_bill(found):
@@ -238,6 +241,16 @@ def test_what_the_effects_close_counts_from_the_smaller_gap(found):
     assert "Recalibration alone decreases" in words
     output = plot.diagnosis(replace(base, gap=gap))[0]
     assert legend(output)[1] == "closed-loop simulation, model as given"
+
+
+def test_a_gap_without_a_noise_floor_says_so(found):
+    base = found["explained"]
+    bare = replace(base, findings=base.findings * 2, gap=replace(base.gap, floor=math.nan))
+    words = text(bare)
+    assert "noise floor none because the completed model breaks off when simulated with" in words
+    assert "of the mean square error would return" in words
+    assert "above the noise floor" not in words
+    assert "due to sensor noise and random force alone" in text(base)
 
 
 def test_report_of_rare_cases(found):

@@ -44,6 +44,8 @@ def write_report_text(found: Diagnosis) -> str:
             lines += _write_finding(found, finding, f"{k}. ")
     if found.added:
         lines += _wrap_text(wording.explain_evidence(), 4)
+        if found.verdict == "explained":
+            lines += _wrap_text(wording.explain_catalogue(), 4)
     elif found.verdict == "nothing missing" and found.sensitivity:
         lines += ["", *_write_sensitivity(found)]
     lines += ["", *_write_parameters(found)]

@@ -146,6 +146,14 @@ def explain_evidence() -> str:
     )
 
 
+def explain_catalogue() -> str:
+    """Say what no diagnosis can rule out about the names in a complete explanation."""
+    return (
+        "Names are of the catalogue. What is not in it and acts like one of them is taken for that "
+        "one, and parameters fitted beside it are then off by more than their standard errors."
+    )
+
+
 def introduce_gap(gap: Gap) -> str:
     """Say what the gap is."""
     text = f"gap between model and record: RMS error of the {gap.name} {_tell_samples(gap)}"
@@ -237,7 +245,10 @@ def _list_rows(gap: Gap) -> list[tuple[str, str, str]]:
     rows = [(label, size(value), times(value)) for label, value in shown]
     if gap.kind == "prediction" and math.isfinite(gap.trivial):
         rows.append(("last value or line", size(gap.trivial), times(gap.trivial)))
-    return [*rows, ("noise floor", size(gap.floor), "due to sensor noise and random force alone")]
+    cause = "due to sensor noise and random force alone"
+    if math.isnan(gap.floor):
+        cause = "because the completed model breaks off when simulated with its noise"
+    return [*rows, ("noise floor", size(gap.floor), cause)]
 
 
 def describe_shrinking(gap: Gap) -> str:
@@ -373,7 +384,8 @@ def describe_certainty(found: Diagnosis, finding: Finding) -> str:
     text = f"evidence {finding.evidence:.{digits}f} ({sure})"
     if math.isfinite(finding.share) and len(found.added) > 1:
         share = write_percent(finding.share)
-        text += f"; without it, {share} of the mean square error above the noise floor would return"
+        above = " above the noise floor" if math.isfinite(found.gap.floor) else ""
+        text += f"; without it, {share} of the mean square error{above} would return"
     every = (finding.effect, *finding.alternatives)
     many = len({name_with_subject(e) for e in every if name_at_place(e) not in finding.equivalents})
     if many > 1:

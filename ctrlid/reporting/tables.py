@@ -266,6 +266,8 @@ def _make_diagnosis_blocks(found: Diagnosis) -> list[Block]:
             made += [f"{_upper(doubt)}." for doubt in wording.list_doubts(found, finding)]
     if found.added:
         made.append(wording.explain_evidence())
+        if found.verdict == "explained":
+            made.append(wording.explain_catalogue())
     if found.where:
         made.append(Title("Where the error is"))
     made += [
