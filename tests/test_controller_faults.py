@@ -69,6 +69,7 @@ def test_another_option_of_the_controller_is_named():
                     cid.PID(kp=KP, kd=KD * 5 * DT, derivative="measurement"), dt=DT)  # fmt: skip
     found = cid.audit(record, loop)["filter"]
     assert "derivative='error'" in found[0].text
+    assert str(found[0]).startswith("ANOTHER FILTER OR RULE: u is not what")
 
 
 def record_pid(n=2000, limit=np.inf, measured=False, forward=False, wound=False, b=1.0, tf=0.0,

@@ -27,6 +27,8 @@ from .wired_controller_check import check_wired_controller
 
 # These findings are no matter of one signal.
 OF_THE_LOOP = ("controller", *FAULTS)
+# A kind covers more than its name says: any other filter, or rule by which an integral is summed.
+LABELS = {"filter": "another filter or rule"}
 # With fewer valid samples no fit says much.
 FEW = 50
 # A fit needs at least so many valid samples in succession.
@@ -68,7 +70,8 @@ class AuditFinding(Printed):
         ``"operating point"``;
         where the stated controller does not compute the logged u, what is wrong with it:
         ``"gain"``, ``"sign"``, ``"bias"``, ``"delay"``, ``"limit"``, ``"filter"``, ``"sampled"``
-        (it is stated as analog, and was sampled) or ``"unknown"``.
+        (it is stated as analog, and was sampled) or ``"unknown"``. A ``"filter"`` is also another
+        rule of sampling, such as ``integral=`` of a `PID`.
     channel : str
         ``"r"``, ``"u"`` or ``"y"``, or the name of one of several signals; empty where it concerns
         the whole record.
@@ -93,7 +96,8 @@ class AuditFinding(Printed):
     harmful: bool = False
 
     def __str__(self) -> str:
-        kind = self.kind.upper() if self.harmful else self.kind
+        label = LABELS.get(self.kind, self.kind)
+        kind = label.upper() if self.harmful else label
         of = f" of {self.channel}" if self.channel and self.kind not in OF_THE_LOOP else ""
         return f"{kind}{of}: {self.text}"
 
