@@ -51,22 +51,24 @@ plt.show()
 # %%
 # The friction and the pole
 # -------------------------
-# Most of the declared viscous friction turns out to be dry friction at the cart. The mass of the
-# pendulum is larger than declared, or what stands for it: the reaction of the pendulum on the cart
-# is. The pendulum is upright where the model is linearized; in motion dry friction damps nothing.
+# Most of the declared viscous friction turns out to be dry friction at the cart. Which law of dry
+# friction it is, the record cannot tell, and the first of the set is decided by last bits. The mass
+# of the pendulum is larger than declared, or what stands for it: the reaction of the pendulum on
+# the cart is. The pendulum is upright where the model is linearized; in motion dry friction damps nothing.
 
-label, friction = next(
-    (label, e) for label, e in found.loop.labelled.items()
-    if isinstance(e, cid.effects.CoulombFriction) and e.at == "x_dot"
-)  # fmt: skip
+dry = (cid.effects.CoulombFriction, cid.effects.StribeckFriction,
+       cid.effects.AsymmetricCoulombFriction)  # fmt: skip
+label, friction = next((label, e) for label, e in found.loop.labelled.items()
+                       if isinstance(e, dry) and e.at == "x_dot")  # fmt: skip
+size = friction.fs if isinstance(friction, cid.effects.StribeckFriction) else friction.fc
 moving = found.loop.without_effect(label)
 viscous = found.loop.parameters["c"]
 poles = [float(ct.poles(loop.linearize(states=True)).real.max()) for loop in (given, moving)]
-print(f"unstable pole {poles[0]:.2f} rad/s as declared, {poles[1]:.2f} rad/s completed; dry "
-      f"friction {friction.fc:.2f} N, viscous {viscous:.2f} N s/m")  # fmt: skip
+print(f"unstable pole {poles[0]:.2f} rad/s as declared, {poles[1]:.2f} rad/s completed; "
+      f"dry friction ({type(friction).__name__}) {size:.2f} N, viscous {viscous:.2f} N s/m")  # fmt: skip
 
 assert found.verdict == "partly explained"
 assert any("CoulombFriction at x_dot" in f.names for f in found.findings)
-assert 0.7 < friction.fc < 1.2
+assert 0.5 < size < 1.2
 assert viscous < 2.0
 assert 6.6 < poles[1] < 7.7

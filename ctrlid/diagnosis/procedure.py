@@ -314,7 +314,7 @@ def _answer_question(q: Question) -> tuple[Diagnosis, Search]:
         result = replace(result, notes=(*result.notes, DIVERGES.format(simulated)))
     worth = (
         q.loop.equations().siso
-        and (result.verdict not in COMPLETE or (result.findings and result.disturbance.large))
+        and result.verdict not in COMPLETE
         and _is_worth_simulating(q.fresh, base.records)
     )
     if worth and search.finished:
