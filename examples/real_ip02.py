@@ -54,7 +54,8 @@ plt.show()
 # Most of the declared viscous friction turns out to be dry friction at the cart. Which law of dry
 # friction it is, the record cannot tell, and the first of the set is decided by last bits. The mass
 # of the pendulum is larger than declared, or what stands for it: the reaction of the pendulum on
-# the cart is. The pendulum is upright where the model is linearized; in motion dry friction damps nothing.
+# the cart is. The pendulum is upright where the model is linearized; in motion dry friction damps
+# nothing.
 
 dry = (cid.effects.CoulombFriction, cid.effects.StribeckFriction,
        cid.effects.AsymmetricCoulombFriction)  # fmt: skip
@@ -65,7 +66,8 @@ moving = found.loop.without_effect(label)
 viscous = found.loop.parameters["c"]
 poles = [float(ct.poles(loop.linearize(states=True)).real.max()) for loop in (given, moving)]
 print(f"unstable pole {poles[0]:.2f} rad/s as declared, {poles[1]:.2f} rad/s completed; "
-      f"dry friction ({type(friction).__name__}) {size:.2f} N, viscous {viscous:.2f} N s/m")  # fmt: skip
+      f"dry friction ({type(friction).__name__}) {size:.2f} N, viscous "
+      f"{viscous:.2f} N s/m")  # fmt: skip
 
 assert found.verdict == "partly explained"
 assert any("CoulombFriction at x_dot" in f.names for f in found.findings)
