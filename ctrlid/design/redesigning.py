@@ -418,10 +418,10 @@ def redesign(
     return Redesign(C, promised, achieved, nu_gap(G / unit, P / unit),
                     robust_margin(G / unit, C * unit), trial, time, promised_step, made.response,
                     height.value, "" if failure is None else failure, height.reason,
-                    _measure_sampled(loop, C))  # fmt: skip
+                    _measure_sampled(loop, C, P))  # fmt: skip
 
 
-def _measure_sampled(loop: Loop, C: Any) -> float | None:
+def _measure_sampled(loop: Loop, C: Any, P: Any) -> float | None:
     """Return the phase margin of an analog lead that runs as a program of the loop [deg].
 
     NaN where the program does not stabilize the linearized physics; None where no program is asked
@@ -430,7 +430,7 @@ def _measure_sampled(loop: Loop, C: Any) -> float | None:
     if timebase(C) or loop.controller is None or loop.analog:
         return None
     program = ct.sample_system(C, loop.dt, "tustin")
-    margins = loop_margins(sample_held(loop.linearize(), loop.dt) * program)
+    margins = loop_margins(sample_held(P, loop.dt) * program)
     return margins.phase_margin if margins.stable else math.nan
 
 

@@ -11,8 +11,7 @@ from .._base.arrays import Array
 from .._base.errors import CtrlidWarning
 from .._base.text import write_number, write_percent, write_quantity
 from .._base.units import count_per_si_unit
-from ..loop.controllers import PID
-from ..loop.loop import Loop
+from ..loop.loop import Loop, find_input_limits
 from .settling import find_reading_step
 
 # A step is this share of the output at rest, so that it stays in the linear range around it.
@@ -152,15 +151,6 @@ def choose_height(loop: Loop, output: str | None, find_peaks: Callable[[], Array
     return StepHeight(enough, words, not bound)
 
 
-def _find_range(loop: Loop) -> tuple[Array, Array]:
-    """Return the limits of each input: those of the loop, and those that its PID keeps."""
-    lower, upper = (np.broadcast_to(v, len(loop.signals["u"])) for v in loop.input_limits)
-    if isinstance(loop.controller, PID):
-        lower = np.maximum(lower, loop.controller.lower)
-        upper = np.minimum(upper, loop.controller.upper)
-    return lower, upper
-
-
 def _choose_smooth_height(
     loop: Loop, output: str | None, find_peaks: Callable[[], Array]
 ) -> tuple[float, str, bool]:
@@ -173,7 +163,7 @@ def _choose_smooth_height(
     if rest:
         return SHARE * abs(rest), "", True
     zero = f"{output} rests at zero" if output else "No output is known to follow"
-    lower, upper = _find_range(loop)
+    lower, upper = (np.broadcast_to(v, len(loop.signals["u"])) for v in find_input_limits(loop))
     inputs = np.array(loop.point.inputs)
     room = np.minimum(inputs - lower, upper - inputs)
     if np.isfinite(room).any() and (room > 0).all():

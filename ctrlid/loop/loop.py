@@ -36,7 +36,7 @@ from ..physics.linearization import (
     make_state_space,
 )
 from ..physics.trace import trace, with_parameters
-from .controllers import ControlLaw, make_control_law
+from .controllers import PID, ControlLaw, make_control_law
 from .wiring import Wiring, is_wired_by_name, make_wired_law, make_wiring
 
 
@@ -656,6 +656,14 @@ def exchange_controller(loop: Loop, controller: Any) -> Loop:
     many controllers need not wait for it.
     """
     return loop._replace_fields(controller=controller)
+
+
+def find_input_limits(loop: Loop) -> tuple[Any, Any]:
+    """Return the limits of the input: those of the loop and of its PID."""
+    lower, upper = loop.input_limits
+    if isinstance(loop.controller, PID):
+        return max(lower, loop.controller.lower), min(upper, loop.controller.upper)
+    return lower, upper
 
 
 def exchange_limits(loop: Loop, lower: float = -math.inf, upper: float = math.inf) -> Loop:

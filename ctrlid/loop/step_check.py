@@ -7,6 +7,7 @@ from .._base.text import write_list, write_percent
 from ..data.converter_grid import find_grid_step
 from ..data.record import Record
 from .loop import Loop, find_converter_steps
+from .unit_check import list_recorded_units
 
 # Rounding that makes so much of the noise's variance is worth a word; `diagnose` adds the steps to
 # the loop from the same share on.
@@ -36,8 +37,7 @@ def describe_unstated_steps(loop: Loop, record: Record, noise: object) -> str:
     e = loop.equations()
     rows = np.reshape(record.y, (-1, len(record)))
     sizes = np.broadcast_to(np.asarray(noise, dtype=float), len(rows))
-    units = record.units.get("y", "")
-    each = units if isinstance(units, tuple) else (units,) * len(rows)
+    each = [unit for key, _, unit in list_recorded_units(loop, record) if key == "y"]
     told, typed = [], []
     for name, y, use, stated, size, unit in zip(
         e.outputs, rows, record.valid_outputs, find_converter_steps(loop), sizes, each, strict=True

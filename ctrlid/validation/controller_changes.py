@@ -15,7 +15,7 @@ from ..data.record import Record
 from ..data.validity import find_longest_run, find_whole_past
 from ..loop.controller_replay import differentiate_replay, replay_controller
 from ..loop.controllers import PID, AntiWindup, Derivative, Integral
-from ..loop.loop import Loop, exchange_controller, exchange_limits
+from ..loop.loop import Loop, exchange_controller, exchange_limits, find_input_limits
 from ..physics.conversions import to_state_matrices
 
 # Shorter stretches do not tell what computed the input.
@@ -491,12 +491,11 @@ def _sample_derivative(loop: Loop, pid: PID, dt: float) -> Loop:
     D = np.array([[pid.b * pid.kp + direct + c * gain, -pid.kp - direct - gain]])
     keep = [0, 1] if pid.ki else [1]
     system = ct.ss(A[np.ix_(keep, keep)], B[keep], C[:, keep], D, dt, inputs=["r", "y"])
-    lower, upper = loop.input_limits
     bias = loop.point.input if pid.bias is None else pid.bias
     # About the output of the operating point, r weighs (b kp) there while y weighs kp.
     bias += pid.kp * (pid.b - 1) * loop.point.output
     return replace(loop, controller=system, at=replace(loop.point, input=bias),
-                   input_limits=(max(lower, pid.lower), min(upper, pid.upper)))  # fmt: skip
+                   input_limits=find_input_limits(exchange_controller(loop, pid)))  # fmt: skip
 
 
 def _list_moved_poles(
@@ -625,9 +624,7 @@ def _find_inner(part: Record) -> Any:
 
 def _has_limits(loop: Loop) -> bool:
     """Tell whether the loop or its controller limits the input."""
-    pid = loop.controller
-    own = (pid.lower, pid.upper) if isinstance(pid, PID) else ()
-    return bool(np.isfinite([*loop.input_limits, *own]).any())
+    return bool(np.isfinite(find_input_limits(loop)).any())
 
 
 def _is_nonlinear(loop: Loop) -> bool:

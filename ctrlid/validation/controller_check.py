@@ -23,7 +23,7 @@ from ..loop.controller_replay import (
 )
 from ..loop.controller_sight import find_sight
 from ..loop.controllers import PID
-from ..loop.loop import Loop, exchange_controller, exchange_limits
+from ..loop.loop import Loop, exchange_controller, exchange_limits, find_input_limits
 from ..loop.sampled_form import describe_sampled_form, find_sampled_form
 from ..loop.wiring import knows_references
 from .controller_changes import (
@@ -408,14 +408,6 @@ def _is_noise_of_log(e: Any, record: Record) -> bool:
     by_all = compute_explained_share(e, moving, record.valid, lags=4 * MEMORY)
     by_r = compute_explained_share(e, moving[:-1], record.valid, lags=4 * MEMORY)
     return by_r <= FOLLOWS and by_all <= 1 - FOLLOWS
-
-
-def find_input_limits(loop: Loop) -> tuple[float, float]:
-    """Return the limits of the input: those of the loop and of its PID."""
-    lower, upper = loop.input_limits
-    if isinstance(loop.controller, PID):
-        lower, upper = max(lower, loop.controller.lower), min(upper, loop.controller.upper)
-    return lower, upper
 
 
 def _is_independent(loop: Loop, e: Any, record: Record) -> bool:

@@ -17,11 +17,11 @@ from ..data.converter_grid import estimate_rounding, find_grid_step
 from ..data.record import SIGNALS, Record
 from ..data.several_records import order_model_and_data
 from ..data.validity import find_longest_run, find_runs
-from ..loop.loop import Loop
+from ..loop.loop import Loop, find_input_limits
 from ..loop.unit_check import describe_distance, find_unit_clashes, measure_distance
 from ..loop.wiring import match_signals
 from . import signal_defects as defects
-from .controller_check import FAULTS, check_controller, find_input_limits
+from .controller_check import FAULTS, check_controller
 from .hold_check import check_hold
 from .wired_controller_check import check_wired_controller
 
