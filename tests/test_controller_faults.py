@@ -63,6 +63,17 @@ def test_the_fault_of_a_controller_is_named(fault, noise):
         assert name_faults(record_servo(fault, noise, seed), stated_loop()) == [fault]
 
 
+@pytest.mark.parametrize("controller", ["tf", "pid"])
+@pytest.mark.parametrize("fault", ["gain", "bias", "unknown"])
+def test_a_fault_is_named_where_an_effect_of_the_loop_has_a_state_of_its_own(fault, controller):
+    effects = (cid.effects.InputBacklash(width=0.01), cid.effects.ActuatorLag(tau=0.03))
+    loop = replace(stated_loop(), effects=effects)
+    if controller == "tf":
+        kp, kd = KP, KD * 5
+        loop = replace(loop, controller=ct.tf([kp + kd, -kd], [1.0, 0.0], DT))
+    assert name_faults(record_servo(fault), loop) == [fault]
+
+
 def test_another_option_of_the_controller_is_named():
     record = record_servo()
     loop = cid.Loop(cid.plants.servo(m=1.0, c=2.0, k=3.0),

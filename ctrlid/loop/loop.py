@@ -671,6 +671,11 @@ def exchange_limits(loop: Loop, lower: float = -math.inf, upper: float = math.in
     return loop._replace_fields(input_limits=(lower, upper))
 
 
+def exchange_constant_input(loop: Loop, constant: float) -> Loop:
+    """Return a loop whose controller adds its part to another constant input."""
+    return replace(loop, at=replace(loop._bare_point, input=constant))
+
+
 def add_units(loop: Loop, units: Mapping[str, str]) -> Loop:
     """Return the loop with further units, by names of the plant."""
     return loop._replace_fields(units={**loop.units, **units}) if units else loop

@@ -15,7 +15,13 @@ from ..data.record import Record
 from ..data.validity import find_longest_run, find_whole_past
 from ..loop.controller_replay import differentiate_replay, replay_controller
 from ..loop.controllers import PID, AntiWindup, Derivative, Integral
-from ..loop.loop import Loop, exchange_controller, exchange_limits, find_input_limits
+from ..loop.loop import (
+    Loop,
+    exchange_constant_input,
+    exchange_controller,
+    exchange_limits,
+    find_input_limits,
+)
 from ..physics.conversions import to_state_matrices
 
 # Shorter stretches do not tell what computed the input.
@@ -187,8 +193,7 @@ def _scale_controller(loop: Loop, factor: float, constant: float) -> Loop | None
                         kd=factor * controller.kd, bias=constant)  # fmt: skip
         return exchange_controller(loop, other)
     if isinstance(controller, ct.TransferFunction | ct.StateSpace | int | float):
-        return replace(loop, controller=factor * controller,
-                       at=replace(loop.point, input=constant))  # fmt: skip
+        return exchange_constant_input(replace(loop, controller=factor * controller), constant)
     return None
 
 
@@ -494,8 +499,8 @@ def _sample_derivative(loop: Loop, pid: PID, dt: float) -> Loop:
     bias = loop.point.input if pid.bias is None else pid.bias
     # About the output of the operating point, r weighs (b kp) there while y weighs kp.
     bias += pid.kp * (pid.b - 1) * loop.point.output
-    return replace(loop, controller=system, at=replace(loop.point, input=bias),
-                   input_limits=find_input_limits(exchange_controller(loop, pid)))  # fmt: skip
+    limits = find_input_limits(exchange_controller(loop, pid))
+    return exchange_constant_input(replace(loop, controller=system, input_limits=limits), bias)
 
 
 def _list_moved_poles(

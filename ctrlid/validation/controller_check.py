@@ -23,7 +23,13 @@ from ..loop.controller_replay import (
 )
 from ..loop.controller_sight import find_sight
 from ..loop.controllers import PID
-from ..loop.loop import Loop, exchange_controller, exchange_limits, find_input_limits
+from ..loop.loop import (
+    Loop,
+    exchange_constant_input,
+    exchange_controller,
+    exchange_limits,
+    find_input_limits,
+)
 from ..loop.sampled_form import describe_sampled_form, find_sampled_form
 from ..loop.wiring import knows_references
 from .controller_changes import (
@@ -383,7 +389,7 @@ def take_bias_from_log(loop: Loop, record: Record) -> Loop:
     left = (record.u - replay_controller(free, record))[record.valid]
     # Where limits, pulses and dither act the controller is not alone.
     bias = loop.point.input + float(np.median(left)) + _read_constant(free, record)
-    return replace(loop, at=replace(loop.point, input=bias))
+    return exchange_constant_input(loop, bias)
 
 
 def _read_constant(loop: Loop, record: Record) -> float:
