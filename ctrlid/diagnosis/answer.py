@@ -128,8 +128,8 @@ def _list_notes(loop: Loop, found: Search) -> list[str]:
     if not loop.equations().siso:
         notes.append(
             "with several inputs or outputs the noise of each output is taken to be white: "
-            "coloured noise, limits of a sensor, delays of one of several inputs, repeats of the "
-            "experiment and errors of the log are not looked for"
+            "coloured noise, limits of a sensor, repeats of the experiment and errors of the log "
+            "are not looked for"
         )
     if list_unforced_velocities(loop) and not found.after.passed:
         notes.append(f"{describe_missing_forces(loop)}, and diagnose again")

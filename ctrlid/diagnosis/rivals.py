@@ -8,11 +8,12 @@ import numpy as np
 
 from .._base.arrays import Array
 from ..effects.base import name_at_place
+from ..estimation.likelihood.kalman_filter import Noise
 from ..estimation.likelihood.maximization import maximize
 from .candidates import Trial, Work, contains, is_same_kind
 from .fitted_model import Model, compute_criterion, compute_log_terms
 from .noise_tests import run_noise_tests
-from .refitting import refit_candidate
+from .refitting import refit_candidate, refit_under_noise
 from .removal import (
     Weighed,
     has_same_noise,
@@ -181,7 +182,14 @@ def compare_effects(
         bare = smaller
         if rest and not has_same_noise(smaller, now):
             bare = refit_without_effect(now, f.position)[0]
-        again = work(lambda t, bare=bare: refit_candidate(bare, screen_at(bare, t.fitted)), rest)
+        noise = now.fit.noise
+
+        def refit(t: Trial, bare: Model = bare, noise: Noise = noise) -> Trial:
+            # Beside the random force of the model without it, a rival may stay short of its place.
+            done = refit_candidate(bare, screen_at(bare, t.fitted))
+            return refit_under_noise(bare, done, noise) if done.net_gain > 0 else done
+
+        again = work(refit, rest)
         again = [_count_from(t, bare, smaller) for t in again]
         again = [t for t in again if _find_on_bounds(t.model) <= _find_on_bounds(mine.model)]
         best = max([mine, *again], key=lambda t: t.net_gain)

@@ -126,9 +126,14 @@ class InputDelay(InputEffect):
 
     def build(self, e: Equations, m: Moment) -> Equations:
         """Return the equations with this delay on top of what there is."""
-        require_one_input(self, e)
-        delay = to_expression(self.delay)
-        return dataclasses.replace(e, delay=delay if e.delay is None else e.delay + delay)
+        k, delay = e.inputs.index(self.at) if len(e.inputs) > 1 else 0, to_expression(self.delay)
+        if e.delay is not None and k != e.late_input:
+            raise EffectDoesNotApply(
+                f"one of several inputs can come late, and {e.inputs[e.late_input]} does already. "
+                "Write the other delay as states of the plant (control.pade)"
+            )
+        delay = delay if e.delay is None else e.delay + delay
+        return dataclasses.replace(e, delay=delay, late_input=k)
 
 
 @final

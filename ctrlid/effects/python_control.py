@@ -9,6 +9,7 @@ import control as ct
 
 from .._base.errors import EffectDoesNotApply
 from ..physics.equations import Equations
+from ..physics.integration import put_entry
 from ..physics.linearization import OperatingPoint, linearize, operating_point
 from .base import AbstractEffect
 from .composition import compose_effects
@@ -169,8 +170,9 @@ def _apply_pade(e: Equations, at: OperatingPoint) -> Equations:
             f"{e.name} is in discrete time (dt = {e.dt:g} s): give the delay as poles at zero"
         )
     late, slope = casadi.SX.sym("late"), casadi.SX.sym("slope")
-    rates = casadi.vertcat(slope, 12 * (e.u - late) - 6 * slope) / e.delay
-    e_late = substitute_symbol(e, e.u, e.u - slope)
+    k = e.late_input
+    rates = casadi.vertcat(slope, 12 * (e.u[k] - late) - 6 * slope) / e.delay
+    e_late = substitute_symbol(e, e.u, put_entry(e.u, k, e.u[k] - slope))
     spread = None if e.spread is None else casadi.vertcat(e.spread, casadi.SX.sym("s", 2))
     return dataclasses.replace(
         e_late,
@@ -179,5 +181,5 @@ def _apply_pade(e: Equations, at: OperatingPoint) -> Equations:
         rhs=casadi.vertcat(e_late.rhs, rates),
         spread=spread,
         delay=None,
-        rest=(*e.rest, at.input, 0.0),
+        rest=(*e.rest, at.inputs[k], 0.0),
     )

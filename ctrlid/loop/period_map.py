@@ -14,7 +14,15 @@ from .._base.arrays import Array, ComplexArray
 from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from ..data.reconstruction import count_pieces
 from ..physics.equations import Equations
-from ..physics.integration import Piece, Scheme, advance, count_delay_samples, cut_input, integrate
+from ..physics.integration import (
+    Piece,
+    Scheme,
+    advance,
+    count_delay_samples,
+    cut_input,
+    integrate,
+    put_entry,
+)
 from ..physics.linearization import find_reached_states
 from .loop import Loop
 
@@ -195,8 +203,12 @@ def make_period_map(
         hold = "zoh" if law else hold
         ahead = apply_backlash(e, memory, limit_input(u_rest + path[-1]), p)[0]
         # The inputs from the oldest that is remembered to the one of the next sample.
-        known = [*reversed(past), *applied, ahead if hold != "zoh" else applied[-1]]
-        known = known if kept else [applied[0], *known]
+        following = [*applied, ahead if hold != "zoh" else applied[-1]]
+        known = [applied[0], *following]
+        if kept:
+            own = [*reversed(past), *(value[e.late_input] for value in following)]
+            pairs = zip(known, own, strict=False)
+            known = [put_entry(each, e.late_input, late) for each, late in pairs]
         straight = [
             piece
             for k in range(pieces)
@@ -208,10 +220,11 @@ def make_period_map(
         )
         after = casadi.vertcat(x, moved, memory)
         if kept:
-            after = casadi.vertcat(after, *[*reversed(applied), *past][:kept])
+            newest = [value[e.late_input] for value in reversed(applied)]
+            after = casadi.vertcat(after, *[*newest, *past][:kept])
         error = casadi.vertcat(error, casadi.SX.zeros(size - n, 1))
     rest = [*at.states, *(law.rest if law else ())]
-    input_at_rest = at.input
+    input_at_rest = at.inputs[e.late_input]
     memory = []
     if e.play is not None:
         start = casadi.substitute(casadi.vertcat(e.play.start), casadi.vertcat(e.play.u, e.p),

@@ -103,8 +103,9 @@ class Equations:
     Effects (`with_effect`) may add more: `spread` are symbols for the standard deviations of the
     states, zero in a simulation, by which a filter smooths kinks; `lags` lists states that are
     plain first-order lags; `play` is a memory between controller and plant; `delay` an expression
-    of `p` for the time by which the input comes late; `readout` what becomes of the noisy
-    `reading`; `rest` the values at rest of states that were added to the plant's own.
+    of `p` for the time by which the input comes late, of several inputs that with the index
+    `late_input`; `readout` what becomes of the noisy `reading`; `rest` the values at rest of states
+    that were added to the plant's own.
 
     `pushes` has a column for each force that is known to work on a velocity: the derivative of the
     states' rates by it; `push_units` are the units of these forces, or the names of their inputs in
@@ -127,6 +128,7 @@ class Equations:
     lags: tuple[Lag, ...] = ()
     play: Backlash | None = None
     delay: Any = None
+    late_input: int = 0
     reading: Any = None
     readout: Any = None
     rest: tuple[float, ...] = ()

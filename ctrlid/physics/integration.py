@@ -133,7 +133,8 @@ def cut_input(e: Equations, dt: float, path: Sequence[Any], hold: str) -> list[P
     dt : float
         Sampling period T [s].
     path : sequence of 3 expressions
-        The input at the samples k - l - 1, k - l and k - l + 1.
+        The input at the samples k - l - 1, k - l and k - l + 1; of several inputs only that which
+        comes late, and the others at k - 1, k and k + 1.
     hold : {"zoh", "foh", "bandlimited"}
         How the input runs between samples: held or straight. A band-limited one is straight
         between many closer samples.
@@ -144,14 +145,23 @@ def cut_input(e: Equations, dt: float, path: Sequence[Any], hold: str) -> list[P
         Duration [s], input at the start of the piece, slope [1/s].
     """
     before, now, ahead = path
-    slopes = [(now - before) / dt, (ahead - now) / dt] if hold != "zoh" else [0.0, 0.0]
+    slopes: list[Any] = [(now - before) / dt, (ahead - now) / dt] if hold != "zoh" else [0.0, 0.0]
     if e.delay is None:
         return [(dt, now, slopes[1])]
     late = substitute_delay(e, e.p) / dt - count_delay_samples(e, dt)
-    return [
-        (late * dt, before + slopes[0] * (1 - late) * dt, slopes[0]),
-        ((1 - late) * dt, now, slopes[1]),
-    ]
+    held, slope, then = before + slopes[0] * (1 - late) * dt, slopes[0], now
+    if len(e.inputs) > 1:
+        # All inputs but one are on time, and run on where that one changes.
+        k = e.late_input
+        held, then = put_entry(now, k, held[k]), put_entry(now + slopes[1] * late * dt, k, now[k])
+        if hold != "zoh":
+            slope = put_entry(slopes[1], k, slopes[0][k])
+    return [(late * dt, held, slope), ((1 - late) * dt, then, slopes[1])]
+
+
+def put_entry(column: Any, k: int, value: Any) -> Any:
+    """Return a column of expressions with another one in place k."""
+    return casadi.vertcat(column[:k], value, column[k + 1 :])
 
 
 def substitute_delay(e: Equations, p: Any) -> Any:

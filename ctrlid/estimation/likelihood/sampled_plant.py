@@ -153,9 +153,8 @@ class SampledPlant:
         p = self.insert_free_values(theta)
         u = data.u
         applied, slopes = self._find_applied_input(data.path, p)
-        input_variance = (
-            data.input_variance + self.initial_conditions.find_input_variance(u, p) / data.scale**2
-        )
+        late_variance = self.initial_conditions.find_input_variance(u, p) / data.scale**2
+        input_variance = data.input_variance + late_variance
         w = self._stack_applied_inputs(data, applied)
         moved = 1e-3 * np.std(u[data.valid if u.ndim == 1 else data.valid.any(axis=1)], axis=0)
         spread = at.spread[:, : self.n].T
@@ -172,6 +171,10 @@ class SampledPlant:
                 dp += dw[:, :, k, None] * moved[:, None, :]
         elif len(rows):
             du[rows] = self._differentiate_by_input(rows, given, moved)
+            rows = np.flatnonzero(late_variance)
+            if len(self.e.inputs) > 1 and len(rows):
+                alone = np.arange(len(moved)) == self.e.late_input
+                du[rows] = self._differentiate_by_input(rows, given, moved * alone)
         start, wide = self.initial_conditions.find_initial_state(data, p)
         output, c, hp = (
             _repeat_over_samples(part, len(u))
@@ -312,8 +315,14 @@ class SampledPlant:
 
         Ahead of the record it is `before`, by default the first value.
         """
-        steps = range(-1, self.pieces + 1)
-        return [shift_signal(path, self.delay_samples - k, before)[:: self.pieces] for k in steps]
+        steps, late = range(-1, self.pieces + 1), self.delay_samples
+        corners = [shift_signal(path, late - k, before)[:: self.pieces] for k in steps]
+        if self.e.delay is not None and len(self.e.inputs) > 1:
+            # All inputs but one are on time.
+            others = np.arange(len(self.e.inputs)) != self.e.late_input
+            for k, corner in zip(steps, corners, strict=True):
+                corner[:, others] = shift_signal(path[:, others], -k)[:: self.pieces]
+        return corners
 
     def pad_controller_states(self, values: Array) -> Array:
         """Add the states of a known analog controller, at rest, to a start."""
@@ -367,7 +376,7 @@ class InitialConditions:
             Variances, by the sample at which the input was computed.
         """
         e, variance = self.plan.equations, np.zeros(len(u))
-        u = u if u.ndim == 1 else u[:, 0]
+        u = u if u.ndim == 1 else u[:, e.late_input]
         if e.play is not None:
             whole = self.plan.delay_samples // self.plan.pieces
             variance = shift_signal(self._find_backlash_variance(u, p), whole)
@@ -375,7 +384,9 @@ class InitialConditions:
             late = evaluate_delay(e, p) / self.plan.dt
             far = np.clip(late - np.arange(len(u)), 0.0, 1.0)
             # These samples may all have been off by the same, which the filter takes for chance.
-            variance = variance + far**2 * max(late, 1.0) * np.var(u)
+            # Beside several signals an input is counted in its standard deviations.
+            size = np.var(u) if e.siso or e.play is not None else 1.0
+            variance = variance + far**2 * max(late, 1.0) * size
         return variance
 
     def _find_backlash_variance(self, u: Array, p: Array) -> Array:

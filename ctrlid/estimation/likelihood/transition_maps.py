@@ -93,7 +93,8 @@ class PeriodPlan:
         key = ("structure", law, self.references, self.rows[-1])
         text = e.derive(key, self._write_expressions)
         lags = tuple(lag.state for lag in e.lags)
-        object.__setattr__(self, "structure", (text, e.dt, len(e.rest), lags, law is not None))
+        parts = (text, e.dt, len(e.rest), lags, law is not None, e.late_input)
+        object.__setattr__(self, "structure", parts)
 
     def _write_expressions(self) -> str:
         """Return the expressions of equations and law in the text of CasADi."""
