@@ -1,6 +1,7 @@
 """A delay at one of several inputs, against a simulator in matrix exponentials of its own."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import control as ct
 import numpy as np
@@ -57,7 +58,7 @@ def follow(u, late, hold, x, first, last):
         slope = (ahead - u[j, k]) / DT
         return u[j, k] + slope * (t - late[j] - k * DT), slope
 
-    for start, end in zip(corners[:-1], corners[1:], strict=True):
+    for start, end in pairwise(corners):
         level, slope = np.array([value(j, start) for j in range(2)]).T
         big = np.zeros((8, 8))
         big[:4, :4], big[:4, 4:6], big[4:6, 6:] = A, B, np.eye(2)

@@ -253,9 +253,23 @@ def test_simulate_refuses_bad_signals(call, words):
         call(make(0.02, 0.01, 3.0)[0])
 
 
-def test_force_noise_needs_a_moving_mass():
-    with pytest.raises(CtrlidError, match="a state whose rate is another state; tank has none"):
-        cid.simulate(tank(dt=1.0), d=np.zeros(10), force_noise=1.0)
+def test_force_noise_acts_on_rates():
+    discrete = cid.Loop(ct.tf([1.0], [1.0, -0.5], 0.1), None, dt=0.1)
+    with pytest.raises(CtrlidError, match="acts on rates, and .* is in discrete time"):
+        cid.simulate(discrete, d=np.zeros(10), force_noise=1.0)
+
+
+def test_without_a_moving_mass_each_state_has_a_noise_of_its_own():
+    """Two integrators in parallel: after k periods the variance is k (T s)^2 of each."""
+    dt, size, n = 0.5, (0.2, 0.0), 4
+    plant = ct.nlsys(lambda t, x, u, p: [0 * x[0], u[0]], lambda t, x, u, p: x[0], inputs=1,
+                     outputs=1, states=["level", "other"], name="pair")  # fmt: skip
+    loop = cid.Loop(plant, None, dt=dt).with_effect(cid.effects.ActuatorLag(tau=0.3))
+    runs = [cid.simulate(loop, d=np.zeros(n), force_noise=size, seed=k).y for k in range(400)]
+    expected = np.arange(n) * (dt * size[0]) ** 2
+    np.testing.assert_allclose(np.var(runs, axis=0), expected, rtol=0.25)
+    still = cid.simulate(loop, d=np.zeros(n), force_noise=(0.0, 0.3), seed=1).y
+    np.testing.assert_allclose(still, 0.0, atol=1e-12)
 
 
 MAGLEV = cid.plants.maglev(m=0.02, K=3e-6)

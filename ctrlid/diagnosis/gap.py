@@ -18,6 +18,7 @@ from ..estimation.likelihood.likelihood import Fit
 from ..estimation.likelihood.prediction import predict_ahead, predict_from, predict_spread
 from ..estimation.likelihood.tails import JointTails, Tails
 from ..loop.loop import Loop, find_converter_steps
+from ..loop.period_map import count_forces
 from ..loop.simulation import Simulator
 from ..validation.record_simulation import find_long_stretches, prepare_stretch
 from ..validation.reproduction import Reproduction
@@ -491,7 +492,12 @@ def draw_noise(fit: Fit, sensor: float, n: int, seed: int) -> list[Array]:
     if not fit.plant.e.siso:
         return _draw_several_noises(fit, sensor, n, seed)
     noise, streams = fit.noise, np.random.default_rng(seed).standard_normal((3, n))
-    force = streams[1] * math.sqrt(sensor * float(np.mean(noise.force)))
+    force = streams[1] * math.sqrt(sensor * noise.force[0])
+    if (rows := count_forces(fit.plant.e)) > 1:
+        # Where nothing moves, each state of the plant has a noise of its own.
+        more = np.random.default_rng([seed, 2]).standard_normal((rows - 1, n))
+        sizes = np.sqrt(sensor * np.array(noise.force[1:rows]))
+        force = np.vstack([force, more * sizes[:, None]])
     if noise.drift:
         steps = streams[2] * math.sqrt(sensor * noise.drift)
         steps[0] *= 1 / math.sqrt(1 - noise.memory**2)

@@ -9,7 +9,11 @@ import numpy as np
 
 from .._base.arrays import Array
 from .._base.units import fill_unit
-from ..estimation.likelihood.filter_data import find_noise_units
+from ..estimation.likelihood.filter_data import (
+    find_noise_units,
+    has_several_noises,
+    name_noise_places,
+)
 from ..estimation.likelihood.likelihood import Fit
 from ..loop.loop import Loop
 from ..validation.reproduction import (
@@ -68,7 +72,10 @@ def summarize_gap(loop: Loop, found: Search, fresh: FreshData) -> GapSummary:
     else:
         unit = loop.known_units.get(loop.equations().outputs[0], "")
         gap = _make_gap(shared, rows, floor, unit, windows[0])
-        gap = replace(gap, force_unit=fill_unit("{x}/s^2", {"x": loop.position_unit}))
+        # Noises on several states' rates have no unit in common.
+        plain = loop.equations().velocities
+        unit = fill_unit("{x}/s^2", {"x": loop.position_unit}) if plain else ""
+        gap = replace(gap, force_unit=unit)
     worse = gaps.compute_widening_chance(shared.windows, results[0], results[2])
     excess = math.nan
     if how.horizon:
@@ -274,17 +281,11 @@ def _measure_disturbance(fit: Fit, loop: Loop, floor: gaps.Floor) -> Disturbance
     time_constant = -loop.dt / math.log(noise.memory) if noise.drift else math.nan
     share = 1 - (floor.sensor / floor.both) ** 2 if floor.both > 0 else math.nan
     coloured = math.sqrt(scale * noise.coloured) if noise.drift else 0.0
-    if not fit.plant.e.siso:
-        return _list_forces(fit, share)
-    white = math.sqrt(scale * float(np.mean(noise.force)))
-    return Disturbance(white, coloured, time_constant, float(np.clip(share, 0.0, 1.0)))
-
-
-def _list_forces(fit: Fit, share: float) -> Disturbance:
-    """Return the random forces of a plant with several signals."""
-    e = fit.plant.e
+    share = float(np.clip(share, 0.0, 1.0))
+    sizes = np.sqrt(scale * np.array(noise.force)).tolist()
+    if not has_several_noises(fit.plant.e):
+        return Disturbance(sizes[0], coloured, time_constant, share)
     units = find_noise_units(fit.plant.loop, fit.data[0].record)[1]
-    sizes = np.sqrt(float(np.mean(fit.sensor)) * np.array(fit.noise.force))
-    names = [e.states[j] for j in e.velocities] or list(e.states)
-    rows = zip(names, sizes.tolist(), [*units, *[""] * len(names)], strict=False)
-    return Disturbance(math.nan, 0.0, math.nan, float(np.clip(share, 0.0, 1.0)), tuple(rows))
+    names = name_noise_places(fit.plant.loop)[1]
+    rows = tuple(zip(names, sizes, units, strict=True))
+    return Disturbance(math.nan, coloured, time_constant, share, rows)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -486,7 +487,7 @@ def describe_disturbance(found: Diagnosis) -> str:
     if d.forces:
         each = [f"{write_quantity(size, unit or f'[{name}]/s')} RMS at {name}"
                 for name, size, unit in d.forces]  # fmt: skip
-        parts = [f"white ({write_list(each)})"]
+        parts = [f"white ({write_list(each)})", *_list_forces(replace(d, white=0.0), "")]
     elif found.gap.outputs:
         parts = []
     else:

@@ -71,10 +71,15 @@ def count_signals(loop: Loop) -> tuple[int, ...]:
 
 
 def count_forces(e: Equations) -> int:
-    """Return the number of random forces: one for all velocities of a plant of single signals."""
+    """Return the number of random forces: one for all velocities of a plant of single signals.
+
+    Where nothing moves, each state of the plant has a noise of its own on its rate.
+    """
     if e.pushes is not None:
         return int(e.pushes.shape[1])
-    return 1 if e.siso else max(len(e.velocities), 1)
+    if not e.velocities:
+        return 1 if e.dt else len(e.states) - len(e.rest)
+    return 1 if e.siso else len(e.velocities)
 
 
 def push_velocities(e: Equations, force: Any, t: Any, x: Any, p: Any) -> Any:
@@ -86,7 +91,8 @@ def push_velocities(e: Equations, force: Any, t: Any, x: Any, p: Any) -> Any:
         # Effects may have added states, which no force moves.
         return casadi.vertcat(held, casadi.SX.zeros(n - held.shape[0], 1))
     held = casadi.SX.zeros(n, 1)
-    for k, j in enumerate(e.velocities or (range(n) if e.dt == 0 else ())):
+    # Effects may have added states, which no force moves.
+    for k, j in enumerate(e.velocities or (range(n - len(e.rest)) if e.dt == 0 else ())):
         held[j] = force[min(k, force.shape[0] - 1)]
     return held
 

@@ -85,7 +85,8 @@ def simulate(
     force_noise : float or sequence of float, optional
         Standard deviation of a white acceleration, held over each period [output unit/s^2]; of a
         plant with several signals one for each velocity, in the unit of the force that works on it
-        (`Loop.forces`).
+        (`Loop.forces`). Without a moving mass, of a noise on the rate of each state, such as a feed
+        that fluctuates: one number for each state [its unit/s], or one for all.
     d : array_like, shape (n,) or (inputs, n), optional
         Signal added to the controller's output, ahead of the limits [input unit]: dither, pulses.
     initial : sequence of float, optional
@@ -247,10 +248,11 @@ def _draw_noise(loop: Loop, n: int, sensor: Any, force: Any, seed: int | None) -
                 f"{name} is a standard deviation >= 0{each}; given {shorten_value(value)}"
             )
         sizes.append(np.broadcast_to(array, count))
-    if sizes[1].any() and not loop.equations().velocities:
+    e = loop.equations()
+    if sizes[1].any() and e.dt and not e.velocities:
         raise CtrlidError(
-            f"force_noise needs a plant with a moving mass, that is a state whose rate is another "
-            f"state; {loop.equations().name} has none. Use d= for a disturbance of the input"
+            f"force_noise acts on rates, and {e.name} is in discrete time without a moving mass. "
+            "Use d= for a disturbance of the input"
         )
     if seed is not None and seed < 0:
         raise CtrlidError(f"seed is a whole number from 0 upwards, or None; given {seed}")

@@ -287,8 +287,9 @@ def _run_simulation(
 def _run_with_noise(simulator: Simulator, stretch: Stretch, prediction: Prediction) -> Array:
     """Return the output of one run with the noise of a prediction, NaN where that cannot be."""
     unknown = np.full((), np.nan)
-    if not simulator.loop.equations().velocities:
-        # A plant without a moving mass has no place for the force noise of the prediction.
+    e = simulator.loop.equations()
+    if e.dt and not e.velocities:
+        # A plant in discrete time has no place for the force noise of the prediction.
         return unknown
     sizes = [np.reshape(v, (-1, 1)) for v in (prediction.sensor_noise, prediction.force_noise)]
     streams = np.random.default_rng(0).standard_normal((sum(map(len, sizes)), stretch.d.shape[-1]))

@@ -203,16 +203,20 @@ def find_noise_units(loop: Loop, record: Record) -> tuple[Any, Any]:
     )
     # The units of the record are those of the states, too, that the outputs show as they are.
     told = add_units(loop, {n: u for n, u in zip(e.outputs, sensors, strict=True) if u})
-    if not e.siso:
+    if has_several_noises(e):
         _, rates = name_noise_places(loop)
         forces = e.push_units or ("",) * len(rates)
-        return sensors, tuple(
+        return sensors[0] if e.siso else sensors, tuple(
             force or _find_rate_unit(told, name) for force, name in zip(forces, rates, strict=True)
         )
     if sensors[0] in ("", "1"):
         return "", ""
-    # Without a moving mass the noise acts on the rates of the states, whose units are not known.
-    return sensors[0], _find_rate_unit(told, "") if e.velocities else ""
+    return sensors[0], _find_rate_unit(told, "" if e.velocities else e.states[0])
+
+
+def has_several_noises(e: Equations) -> bool:
+    """Whether the noises are told one by one: of several outputs, and of several states' rates."""
+    return not e.siso or (not e.velocities and len(e.states) - len(e.rest) > 1)
 
 
 def _find_rate_unit(loop: Loop, state: str) -> str:
@@ -231,7 +235,8 @@ def name_noise_places(loop: Loop) -> tuple[tuple[str, ...], tuple[str, ...]]:
     A plant without a moving mass has noise on the rates of its states.
     """
     e = loop.equations()
-    return tuple(e.outputs), tuple(e.states[j] for j in e.velocities) or tuple(e.states)
+    own = e.states[: len(e.states) - len(e.rest)]
+    return tuple(e.outputs), tuple(e.states[j] for j in e.velocities) or tuple(own)
 
 
 def prepare_for_loop(data: FilterData, loop: Loop) -> FilterData:

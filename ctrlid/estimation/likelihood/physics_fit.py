@@ -27,7 +27,7 @@ from ...loop.step_check import describe_unstated_steps
 from ...loop.unit_check import describe_distance, measure_distance, note_unit_clashes
 from ...physics.linearization import compute_state_matrices
 from ..whiteness import note_coloured_innovations
-from .filter_data import find_noise_units, name_noise_places
+from .filter_data import find_noise_units, has_several_noises, name_noise_places
 from .likelihood import Fit, find_priors, list_effect_bounds, make_problem
 from .maximization import (
     begin_fit,
@@ -238,7 +238,7 @@ def _note_doubtful_input(
     share = float(np.max(now[seen] / given[seen], initial=0.0)) if seen.any() else 1.0
     spread = max(float(np.std(record.u[record.valid])) for record in records)
     push = spread * float(np.max(given[list(e.velocities)], initial=0.0))
-    force = math.hypot(float(estimate.force_noise), estimate.coloured_force)
+    force = math.hypot(float(np.max(estimate.force_noise)), estimate.coloured_force)
     bound = f"{write_list(own)} {'IS ON A BOUND' if len(own) == 1 else 'ARE ON THEIR BOUNDS'}"
     if share < DISCOUNTED:
         why = (f"THE INPUT HARDLY COUNTS in the fitted model, {share:.2g} times what it does in "
@@ -324,14 +324,15 @@ def summarize_fit(loop: Loop, fit: Fit) -> LoopFit:
     covariance[np.ix_(kept, kept)] = inverse[: len(kept), : len(kept)]
     covariance, notes = mark_unseen(covariance, matrix, inside, names)
     noise, scale = fit.noise, float(np.mean(fit.sensor))
-    several = not loop.equations().siso
+    e = loop.equations()
+    several = has_several_noises(e)
     forces = np.sqrt(scale * np.array(noise.force))
     sensors = np.sqrt(np.outer(fit.sensor, noise.ratios))
     time = -loop.dt / math.log(noise.memory) if noise.drift else math.nan
     estimate = LoopEstimate(
         names, fit.theta, covariance,
-        tuple(map(tuple, sensors)) if several else tuple(np.sqrt(fit.sensor).tolist()),
-        tuple(forces.tolist()) if several else math.sqrt(scale * float(np.mean(noise.force))),
+        tuple(np.sqrt(fit.sensor).tolist()) if e.siso else tuple(map(tuple, sensors)),
+        tuple(forces.tolist()) if several else float(forces[0]),
         math.sqrt(scale * noise.coloured) if noise.drift else 0.0, time, fit.value, fit.size,
         tuple(n for n, b in zip(names, on_bound, strict=True) if b), notes,
         find_noise_units(loop, fit.problem.data[0].record),

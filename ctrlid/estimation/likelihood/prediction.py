@@ -20,7 +20,7 @@ from ...data.record import Record
 from ...data.several_records import order_model_and_data
 from ...data.validity import find_whole_past
 from ...loop.loop import Loop
-from .filter_data import find_noise_units, name_noise_places
+from .filter_data import find_noise_units, has_several_noises, name_noise_places
 from .kalman_filter import Noise, append_sensor_noise, predict_outputs
 from .likelihood import Fit, make_problem
 from .maximization import begin_fit, maximize
@@ -80,7 +80,8 @@ class Prediction(Printed):
     def __str__(self) -> str:
         if self.y.ndim == 2:
             return self._write_several()
-        unit, push = (f" {u}" if u else "" for u in self.units)
+        (unit, push), (_, states) = self.units, self.places
+        unit = f" {unit}" if unit else ""
         found = float(np.sqrt(np.mean(self.innovations[self.settled] ** 2)))
         expected = float(np.sqrt(np.mean(self.spread[self.settled] ** 2)))
         return (
@@ -88,7 +89,7 @@ class Prediction(Printed):
             f"  RMS of the innovations: {found:.3g}{unit}; the filter expects "
             f"{expected:.3g}{unit}\n"
             f"  standard deviation of the sensor noise: {self.sensor_noise:.3g}{unit}; of the "
-            f"white force: {self.force_noise:.3g}{push}"
+            f"white force: {write_noises(self.force_noise, push, states, '/s')}"
         )
 
     def _write_several(self) -> str:
@@ -209,10 +210,13 @@ def make_prediction(fit: Fit) -> Prediction:
     error, variance, counts = (
         np.reshape(v, record.y.shape) for v in (out.innovations, out.variance, fit.counts[0])
     )
+    forces = (sensor * np.sqrt(fit.noise.force)).tolist()
+    several = has_several_noises(plant.e)
     return Prediction(
         record.y - error, error, counts,
         sensor * np.sqrt(variance), states[:, : plant.n], states[:, plant.n :], sensor,
-        sensor * float(np.sqrt(fit.noise.force[0])), units,
+        tuple(forces) if several else forces[0], units,
+        name_noise_places(plant.loop) if several else ((), ()),
     )  # fmt: skip
 
 
@@ -300,14 +304,15 @@ def predict_spread(
     plain = replace(_drop_neutral_effects(loop), controller=None)
     if not loop.equations().siso:
         return _predict_several_spreads(plain, record, prediction, horizon, start_time)
-    r, force = prediction.sensor_noise**2, prediction.force_noise**2
-    ratio = max(force / r, 1e-300) if r else 1.0
+    r = prediction.sensor_noise**2
     problem = make_problem(plain, (), [record], [start_time])
-    noise = Noise((ratio,) * problem.plant.channels)
+    sizes = np.resize(np.asarray(prediction.force_noise, dtype=float), problem.plant.channels)
+    forces = np.square(sizes) / r if r else np.zeros(len(sizes))
+    noise = Noise(tuple(np.maximum(forces, 1e-300).tolist()) if r else (1.0,) * len(sizes))
     lin = begin_fit(problem, noise=noise).linearized[0]
     both, sensor = (
-        compute_spread_ahead(lin, Noise((v,) * problem.plant.channels), record.valid, horizon)
-        for v in (force / r if r else 0.0, 0.0)
+        compute_spread_ahead(lin, Noise(tuple(v.tolist())), record.valid, horizon)
+        for v in (forces, 0 * forces)
     )
     return math.sqrt(r) * both, math.sqrt(r) * sensor
 
