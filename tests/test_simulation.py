@@ -255,7 +255,7 @@ def test_simulate_refuses_bad_signals(call, words):
 
 def test_force_noise_acts_on_rates():
     discrete = cid.Loop(ct.tf([1.0], [1.0, -0.5], 0.1), None, dt=0.1)
-    with pytest.raises(CtrlidError, match="acts on rates, and .* is in discrete time"):
+    with pytest.raises(CtrlidError, match=r"acts on rates, and .* is in discrete time"):
         cid.simulate(discrete, d=np.zeros(10), force_noise=1.0)
 
 
