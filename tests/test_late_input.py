@@ -99,6 +99,18 @@ def test_a_simulation_holds_back_one_input_and_not_the_other(place, delay):
     np.testing.assert_allclose(made.y, record.y, atol=1e-9)
 
 
+def test_a_single_input_comes_late_as_one_of_two_does():
+    u, late = draw_inputs(80), 1.4 * DT
+    u[:, :3] = 0.0
+    alone = cid.Loop(cid.plants.servo(m=1.0, c=1.0, k=3.0), None, dt=DT)
+    made = cid.simulate(alone.with_effect(E.InputDelay(delay=late)), d=u[0])
+    system, t = ct.ss([[0, 1], [-3, -1]], [[0], [3]], [[1, 0]], [[0]]), np.arange(80 * 5) * DT / 5
+    pushed = np.repeat(u[0], 5)
+    arrived = np.concatenate([np.zeros(7), pushed])[: len(t)]
+    exact = ct.forced_response(ct.sample_system(system, DT / 5), t, arrived).y[0][::5]
+    np.testing.assert_allclose(made.y, exact, atol=1e-9)
+
+
 @PLACES
 @pytest.mark.parametrize("hold", ["zoh", "foh"])
 def test_the_filter_holds_back_one_input_and_not_the_other(place, delay, hold):

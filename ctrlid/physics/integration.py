@@ -161,7 +161,7 @@ def cut_input(e: Equations, dt: float, path: Sequence[Any], hold: str) -> list[P
 
 def put_entry(column: Any, k: int, value: Any) -> Any:
     """Return a column of expressions with another one in place k."""
-    return casadi.vertcat(column[:k], value, column[k + 1 :])
+    return casadi.vertcat(*(value if i == k else column[i] for i in range(column.shape[0])))
 
 
 def substitute_delay(e: Equations, p: Any) -> Any:
