@@ -104,7 +104,7 @@ def test_a_single_input_comes_late_as_one_of_two_does():
     u[:, :3] = 0.0
     alone = cid.Loop(cid.plants.servo(m=1.0, c=1.0, k=3.0), None, dt=DT)
     made = cid.simulate(alone.with_effect(E.InputDelay(delay=late)), d=u[0])
-    system, t = ct.ss([[0, 1], [-3, -1]], [[0], [3]], [[1, 0]], [[0]]), np.arange(80 * 5) * DT / 5
+    system, t = ct.ss([[0, 1], [0, -1]], [[0], [3]], [[1, 0]], [[0]]), np.arange(80 * 5) * DT / 5
     pushed = np.repeat(u[0], 5)
     arrived = np.concatenate([np.zeros(7), pushed])[: len(t)]
     exact = ct.forced_response(ct.sample_system(system, DT / 5), t, arrived).y[0][::5]

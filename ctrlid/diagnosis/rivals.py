@@ -13,7 +13,7 @@ from ..estimation.likelihood.maximization import maximize
 from .candidates import Trial, Work, contains, is_same_kind
 from .fitted_model import Model, compute_criterion, compute_log_terms
 from .noise_tests import run_noise_tests
-from .refitting import refit_candidate, refit_under_noise
+from .refitting import refit_candidate, refit_under_noise, weigh_refit
 from .removal import (
     Weighed,
     has_same_noise,
@@ -167,8 +167,7 @@ def compare_effects(
     """
     sure = run_noise_tests(model.fit).passed
     if len(found) == 1 and found[0].trial is steps[0].best:
-        best = found[0].trial
-        return model, (replace(found[0], rivals=find_rivals(best, steps[0].trials, sure)),)
+        return _compare_in_round(model, found[0], steps[0], sure, work)
     done, now = [], model
     for f in sorted(found, key=lambda f: f.position):
         smaller, mine = (f.base, f.trial) if now is model else refit_without_effect(now, f.position)
@@ -203,6 +202,27 @@ def compare_effects(
         done.append(Weighed(best, close, smaller, f.position))
     done.sort(key=lambda f: -f.trial.gain)
     return now, tuple(done)
+
+
+def _compare_in_round(
+    model: Model, f: Weighed, step: Round, sure: bool, work: Work
+) -> tuple[Model, tuple[Weighed, ...]]:
+    """Return the model and its only effect, with what came close in the round that it won.
+
+    The fits of a round end early, each with a noise of its own, while the model was fitted on: what
+    came close climbs on from the noise of the model, so that it does not lose by that.
+    """
+    close, noise = _find_close(f.trial, (step,)), model.fit.noise
+    mine = weigh_refit(step.base, f.trial, model.fit)
+    again = work(lambda t: refit_under_noise(step.base, t, noise), close)
+    best = max([mine, *again], key=lambda t: t.net_gain)
+    if best.net_gain > mine.net_gain + THRESHOLD.taken_by_better:
+        model, mine, f = best.model, best, replace(f, trial=best)
+    others = [t for t in again if t is not mine]
+    near = {t.key for t in close} | {mine.key}
+    rest = [t for t in step.trials if t.key not in near]
+    rivals = (*find_rivals(mine, others, sure), *find_rivals(f.trial, rest, sure))
+    return model, (replace(f, rivals=rivals),)
 
 
 def _count_from(trial: Trial, base: Model, other: Model) -> Trial:
