@@ -282,7 +282,7 @@ def test_the_report():
     for words in (
         "controller: StateSpace, analog", "theta <- theta", "F <- F of the controller",
         "phase margin at F [deg]", "disk margin [1]", "step of xd[0]: final x per unit",
-        "step of xd[0]: largest theta", "step of xd[0]: largest F",
+        "step of xd[0]: largest change of theta", "step of xd[0]: largest change of F",
         "Achieved steps (xd[0] by 10 mm) are those of the nonlinear physics.",
     ):  # fmt: skip
         assert words in text
@@ -366,3 +366,56 @@ def test_a_state_feedback_without_all_states_is_told_of_observers():
 def test_refusals(call, words):
     with pytest.raises(CtrlidError, match=words):
         call()
+
+
+# --- a pole at zero, and limits that a PID knew
+
+
+def balancing(plant_states=("angle", "rate", "speed")):
+    """A body that falls, held by a wheel whose speed nobody reads."""
+    plant = ct.nlsys(
+        lambda t, x, u, p: [x[1], p["a"] * np.sin(x[0]) - u[0], 0.7 * u[0]],
+        lambda t, x, u, p: x[0], inputs=["u"], outputs=["angle"], states=list(plant_states),
+        params={"a": 30.0}, name="body",
+    )  # fmt: skip
+    control = cid.PID(kp=-120.0, kd=-14.0, filter_time=0.005)
+    return cid.Loop(plant, control, dt=0.01), control
+
+
+def test_a_pole_at_zero_is_no_instability():
+    loop, control = balancing()
+    trial = cid.redesign(loop, loop, design=lambda P: control, step=0.01)
+    assert trial.stable
+    for side in (trial.promised, trial.achieved):
+        assert side.growth_rate == 0.0
+        assert side.damping > 0
+        assert side.margins[0].phase_margin > 10
+    assert "A pole at zero remains" in trial.verdict
+    assert "STABILIZE" not in trial.verdict
+
+
+def test_a_slow_pole_that_is_not_at_zero_is_an_instability():
+    loop, control = balancing()
+    wrong = replace(control, kp=-29.9)
+    trial = cid.redesign(loop, loop, design=lambda P: wrong, step=0.01)
+    assert 0 < trial.promised.growth_rate < 0.1
+    assert "DOES NOT STABILIZE ITS OWN MODEL" in trial.verdict
+
+
+def test_the_limits_of_the_former_pid_stay_those_of_the_input():
+    plant = cid.plants.servo(m=1.0, c=2.0, k=3.0)
+    loop = cid.Loop(plant, cid.PID(kp=5.0, lower=-0.5, upper=0.4), dt=0.01)
+    free = cid.Loop(plant, cid.PID(kp=5.0), dt=0.01)
+    runs = [cid.redesign(one, one, design=lambda P: ct.tf([20.0], [1.0], 0.01), step=0.1)
+            for one in (loop, free)]  # fmt: skip
+    limited, wide = (run.steps[0].achieved.peak_inputs[0] for run in runs)
+    assert limited == pytest.approx(0.5)
+    assert wide == pytest.approx(2.0)
+    other = cid.PID(kp=20.0, lower=-1.0, upper=1.0)
+    own = cid.redesign(loop, loop, design=lambda P: other, step=0.1)
+    assert own.steps[0].achieved.peak_inputs[0] == pytest.approx(1.0)
+    ball = cid.plants.maglev(m=0.0213, K=3.34e-6)
+    at = cid.operating_point(ball, output=0.012)
+    held = cid.Loop(ball, cid.PID(kp=-3e3, kd=-60.0, lower=0.0, upper=12.0), dt=0.001, at=at)
+    lead = cid.redesign(cid.linearize(ball, at), held, crossover=100, phase_margin=50)
+    assert lead.loop.input_limits == (0.0, 12.0)

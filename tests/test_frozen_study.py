@@ -321,3 +321,17 @@ def test_a_wider_gap_is_told_from_chance_at_its_level(memory):
     assert np.mean(np.array(chances) < 0.01) < 0.03
     louder = 1.6 * e[1]
     assert study.weigh_mean(np.tile(louder**2 - e[0] ** 2, 40)) < 0.01
+
+
+@pytest.mark.parametrize(("seed", "names"), [
+    (90114, {"ActuatorLag", "SensorLag"}),
+    (81002, {"CoulombFriction", "AsymmetricCoulombFriction"}),
+])  # fmt: skip
+def test_what_came_close_to_a_single_finding_is_compared_under_its_noise(seed, names):
+    """Fits of a round end early: a lag of the sensor lost by what its fit had not yet reached."""
+    case = cases.draw_case("one", seed)
+    record = cid.Record(r=case.r, u=case.u, y=case.y, dt=case.rig.dt)
+    found = cid.diagnose(study.make_loop(case.rig), record, progress=False)
+    assert found.verdict == "explained"
+    (finding,) = found.findings
+    assert set(finding.names) == names

@@ -382,17 +382,17 @@ def test_the_default_step_is_several_steps_of_the_encoder():
     bare = cid.Loop(UNSTABLE, None, dt=0.01, units={"y": "m"})
     coarse = bare.with_effect(cid.effects.Quantization(step=0.02))
     found = unsettled(coarse)
-    assert found.step == pytest.approx(0.2)
-    assert "y is read in steps of 20 mm, of which 10 are taken" in str(found)
+    assert found.step == pytest.approx(1.0)
+    assert "y is read in steps of 20 mm, of which 50 are taken" in str(found)
     trial = cid.redesign(EACH_PERIOD, coarse, design=design_lead)
-    assert trial.steps[0].height == pytest.approx(0.2)
+    assert trial.steps[0].height == pytest.approx(1.0)
     # A fine encoder changes nothing; where several of its steps are too much, the text says so.
     fine = unsettled(bare.with_effect(cid.effects.Quantization(step=1e-4)))
     assert fine.step == unsettled(bare).step
     limited = unsettled(replace(coarse, input_limits=(-10.0, 10.0)))
     assert limited.step < 0.02
     assert "of which this is only 0." in str(limited)
-    assert "10 of them may be too much for this loop" in str(limited)
+    assert "50 of them may be too much for this loop" in str(limited)
 
 
 # --- texts

@@ -76,6 +76,21 @@ def test_exact_values_of_a_drive_that_rubs():
     assert found.values == pytest.approx([1.0, 2.0, 0.05], rel=2e-3)
 
 
+def test_steps_of_a_reading_do_not_hide_the_parameters():
+    """A reading in steps has no slope; the values come out as they do without the steps."""
+    loop, r = driving()
+    rough = loop.with_effect(cid.effects.Quantization(step=0.004))
+    record = cid.simulate(rough, r, sensor_noise=2e-3, seed=5)
+    start = rough.with_parameters({"m": 1.2, "c": 1.6})
+    found = cid.fit_simulation(start, record)
+    for name, true in {"m": 1.0, "c": 2.0}.items():
+        low, high = found.estimate.confidence_interval(name, level=0.999)
+        assert low < true < high
+        assert high - low < 0.2 * true
+    assert [type(e) for e in found.loop.effects] == [cid.effects.Quantization]
+    assert found.loop.parameters["m"] == found.estimate["m"]
+
+
 def test_exact_values_of_two_outputs():
     loop, d = standing()
     record = cid.simulate(loop, d=d)

@@ -23,7 +23,7 @@ from ..effects import (
     StribeckFriction,
 )
 from ..loop.controllers import PID
-from ..loop.loop import Loop
+from ..loop.loop import Loop, exchange_limits, find_input_limits
 from ..loop.simulation import SimulationStopped, simulate
 from ..physics.trace import timebase
 from .input_margins import LoopPerformance, measure_performance
@@ -168,20 +168,25 @@ class ControllerTrial(Printed):
     @property
     def verdict(self) -> str:
         """The outcome in words."""
-        if self.promised.growth_rate >= 0:
+        if self.promised.growth_rate > 0:
             text = (
                 "The design DOES NOT STABILIZE ITS OWN MODEL: small deviations grow at "
                 f"{self.promised.growth_rate:.3g} 1/s. Check the signs and the weights."
             )
-            if self.achieved.growth_rate >= 0:
+            if self.achieved.growth_rate > 0:
                 return f"{text} Nor does it stabilize the physics."
             return f"{text} Near its operating point the physics is stable."
-        if self.achieved.growth_rate >= 0:
+        if self.achieved.growth_rate > 0:
             return (
                 "The controller DOES NOT STABILIZE THE PHYSICS: the model is too different from "
                 f"it. {self.failure}"
             )
         text = self._compare_margins()
+        if self.achieved.growth_rate == 0:
+            text += (
+                " A pole at zero remains: a state that the controller does not hold, such as a "
+                "position that it does not read, stays where a push has taken it."
+            )
         if self.failure is not None:
             return f"{text} This is for small signals: WITH THE STEP THE LOOP DIVERGES. " + (
                 self.failure
@@ -275,7 +280,7 @@ class ControllerTrial(Printed):
                 values = (_write(getattr(side, field), form) for side in both)
                 made.append(row(f"step of {step.reference}: {label}", values))
             made += [
-                row(f"step of {step.reference}: largest {signal}", texts)
+                row(f"step of {step.reference}: largest change of {signal}", texts)
                 for signal, texts in self._list_peaks(step)
             ]
         return tuple(made)
@@ -314,7 +319,7 @@ class ControllerTrial(Printed):
         lacking = [
             "  The disk margin of several inputs is not known: python-control needs slycot for it."
         ] if len(self.promised.margins) > 1 and np.isnan(self.promised.disk_margin) and (
-            self.promised.growth_rate < 0) else []  # fmt: skip
+            self.promised.growth_rate <= 0) else []  # fmt: skip
         return "\n".join([head, *lines, *table, *lacking, tried, *reasons, "  " + self.verdict])
 
 
@@ -385,6 +390,9 @@ def try_design(
     at = loop.at
     promise = Loop(model, controller, dt=dt, at=at, units=_pick_units(loop))
     trial = replace(loop, controller=controller, dt=dt)
+    if not isinstance(controller, PID):
+        # What limits the input is the actuator, which stays when the PID that knew it goes.
+        trial = exchange_limits(trial, *find_input_limits(loop))
     promised, achieved = (measure_performance(side) for side in (promise, trial))
     length = _choose_length(promised.poles, dt)
     # The limits that the former PID kept tell what is small where the new controller has none.
@@ -404,7 +412,7 @@ def try_design(
             return _Run(_make_step(trial, model, name, value, dt, length, *motions))
 
         # A promise that breaks off is no matter of the height.
-        stable = achieved.growth_rate < 0 and promised.growth_rate < 0
+        stable = achieved.growth_rate <= 0 and promised.growth_rate <= 0
         height, made = try_heights(chosen, unit, stable, run)
         return replace(made.step, reason=height.reason)
 
@@ -414,7 +422,7 @@ def try_design(
         steps = tuple(s for s in steps if not _returns(trial, s)) or steps[:1]
     rate = achieved.growth_rate
     reasons = [s.achieved.failure for s in steps if s.achieved.failure is not None]
-    if rate >= 0:
+    if rate > 0:
         reasons.insert(0, f"Small deviations grow at {rate:.3g} 1/s.")
     failure = " ".join(dict.fromkeys(reasons[:2])) if reasons else None
     achieved = replace(achieved, stable=not reasons)

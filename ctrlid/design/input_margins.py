@@ -23,6 +23,9 @@ STILL = 1e-6
 # A response there is real if its imaginary part is below this share.
 REAL = 1e-3
 
+# A pole this share of the fastest one, or nearer to zero, is at zero but for rounding.
+ROUNDED = 1e-9
+
 
 def open_at_inputs(loop: Loop) -> Any:
     r"""Return the linear loop, opened at the inputs of its plant.
@@ -91,13 +94,16 @@ class LoopPerformance(Printed):
 
     @property
     def growth_rate(self) -> float:
-        """The largest real part of a pole [1/s]; negative for a stable loop."""
-        return float(np.max(self.poles.real, initial=-math.inf))
+        """The largest real part of a pole [1/s]; negative for a stable loop.
+
+        Zero where a pole at zero remains, such as the position of what is held at a speed.
+        """
+        return find_growth_rate(self.poles)
 
     @property
     def damping(self) -> float:
         """The smallest damping ratio [1] of a pole that is not at rest after one period."""
-        poles = self.poles[np.isfinite(self.poles) & (self.poles != 0)]
+        poles = self.poles[np.isfinite(self.poles) & ~_find_poles_at_zero(self.poles)]
         return float(np.min(-poles.real / np.abs(poles), initial=1.0))
 
     def __str__(self) -> str:
@@ -110,6 +116,16 @@ class LoopPerformance(Printed):
                 f"{m.gain_margin:.4g}, delay margin {m.delay_margin:.4g} s"
                 for k, m in enumerate(self.margins)]  # fmt: skip
         return "\n".join([text, *each])
+
+
+def find_growth_rate(poles: ComplexArray) -> float:
+    """Return the largest real part, with zero for poles that only rounding keeps from zero."""
+    return float(np.max(np.where(_find_poles_at_zero(poles), 0.0, poles.real), initial=-math.inf))
+
+
+def _find_poles_at_zero(poles: ComplexArray) -> Any:
+    fastest = np.max(np.abs(poles[np.isfinite(poles)]), initial=0.0)
+    return np.abs(poles) <= ROUNDED * fastest
 
 
 def measure_performance(loop: Loop) -> LoopPerformance:
@@ -127,7 +143,7 @@ def measure_performance(loop: Loop) -> LoopPerformance:
     """
     poles = compute_closed_loop_poles(loop, hidden=False)
     m = len(loop.signals["u"])
-    if np.max(poles.real, initial=-math.inf) >= 0:
+    if find_growth_rate(poles) > 0:
         return LoopPerformance(False, poles, (UNSTABLE,) * m, *(math.nan,) * 3)
     L = open_at_inputs(loop)
     dt = float(L.dt or 0.0)

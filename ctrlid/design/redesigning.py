@@ -17,7 +17,7 @@ from .._base.signals import require_one_signal
 from .._base.text import Printed, write_polynomial, write_quantity
 from ..estimation.identified_model import IdentifiedModel, IdentifiedSystem
 from ..estimation.likelihood.physics_estimate import LoopFit, linearize_at_rest
-from ..loop.loop import Loop
+from ..loop.loop import Loop, find_input_limits
 from ..loop.period_map import compute_growth_rate
 from ..loop.simulation import SimulationStopped, simulate
 from ..physics.conversions import sample_held, to_transfer_function
@@ -300,7 +300,7 @@ def redesign(
         point. Where that is zero, what moves the input by a tenth of its way to a limit by the
         model, or without limits 0.01 in SI units, or the largest tenth, hundredth, ... of it with
         which the physics does not break off; the text says which. Of an output that is read in
-        steps (`Quantization`) it is at least ten of these, where that is not too much. Of several
+        steps (`Quantization`) it is at least fifty of these, where that is not too much. Of several
         references, a mapping of names says which are tried; by default those that cannot be held
         and each ``xd[i]`` that is an output.
 
@@ -379,7 +379,8 @@ def redesign(
     G = G.with_delay() if isinstance(G, IdentifiedModel) else to_transfer_function(G)
     C = design_lead(G, crossover=crossover, phase_margin=phase_margin)
     dt = timebase(G)
-    trial = replace(loop, controller=C, dt=dt or loop.dt)
+    # What limits the input is the actuator, which stays when a PID that knew it goes.
+    trial = replace(loop, controller=C, dt=dt or loop.dt, input_limits=find_input_limits(loop))
     P = loop.linearize()
     if dt and not timebase(P):
         P = sample_held(P, dt)

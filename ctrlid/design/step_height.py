@@ -18,8 +18,8 @@ from .settling import find_reading_step
 SHARE = 0.01
 # An output that rests at zero steps as far as moves the input by this share of its way to a limit.
 ROOM = 0.1
-# A step is so many of those in which an encoder reads, of which one alone is a response of its own,
-SEVERAL = 10
+# A step is so many of those in which an encoder reads that one of them counts as settled (2 %),
+SEVERAL = 50
 # unless it were more than so many times what is chosen without them.
 MOST = 5.0
 # A guess with which the physics breaks off is divided by ten so many times.

@@ -212,9 +212,11 @@ def _compare_in_round(
     The fits of a round end early, each with a noise of its own, while the model was fitted on: what
     came close climbs on from the noise of the model, so that it does not lose by that.
     """
-    close, noise = _find_close(f.trial, (step,)), model.fit.noise
-    mine = weigh_refit(step.base, f.trial, model.fit)
-    again = work(lambda t: refit_under_noise(step.base, t, noise), close)
+    base, close = step.base, _find_close(f.trial, (step,))
+    mine = weigh_refit(base, f.trial, model.fit)
+    again = work(lambda t: refit_candidate(base, screen_at(base, t.fitted), model), close)
+    if not mine.net_gain > THRESHOLD.gate:
+        mine = f.trial
     best = max([mine, *again], key=lambda t: t.net_gain)
     if best.net_gain > mine.net_gain + THRESHOLD.taken_by_better:
         model, mine, f = best.model, best, replace(f, trial=best)

@@ -21,6 +21,7 @@ from .._base.text import write_list
 from ..data.outliers import describe_outliers, mask_outliers
 from ..data.record import Record
 from ..data.several_records import as_records, order_model_and_data
+from ..effects import Quantization
 from ..estimation.likelihood.filter_data import FEWEST, find_noise_units
 from ..estimation.likelihood.likelihood import list_parameter_bounds
 from ..estimation.likelihood.physics_estimate import LoopFit, SimulationEstimate, mark_unseen
@@ -134,6 +135,7 @@ def fit_simulation(
     loop, record = order_model_and_data(loop, record)
     check_arguments(fit_simulation, locals(), "loop", "record")
     names = choose_free_names(loop, free, "fit_simulation")
+    whole, loop = loop, _take_out_steps(loop, names)
     _require_start(loop, names)
     given = as_records(record)
     masked = [mask_outliers(one) for one in given]
@@ -163,7 +165,19 @@ def fit_simulation(
     left_out = [describe_outliers(one, lost)
                 for one, (_, lost) in zip(given, masked, strict=True) if lost.any()]  # fmt: skip
     notes = (*note_unit_clashes(loop, records[0]), *left_out, *unsettled)
+    loop = whole.with_parameters({name: loop.parameters[name] for name in names})
     return LoopFit(loop, _summarize(point, find_noise_units(loop, records[0])[0], notes))
+
+
+def _take_out_steps(loop: Loop, names: Sequence[str]) -> Loop:
+    """Return the loop without the steps of its converters, which have no slope to go by.
+
+    A reading that moves in steps errs by them, as by other noise; the mean of many does not.
+    """
+    for label, effect in loop.labelled.items():
+        if isinstance(effect, Quantization) and not any(n.startswith(f"{label}.") for n in names):
+            loop = loop.without_effect(label)
+    return loop
 
 
 def _require_start(loop: Loop, names: Sequence[str]) -> None:
