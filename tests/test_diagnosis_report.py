@@ -761,6 +761,15 @@ def test_noise_that_parts_a_loop_from_itself_explains_a_gap():
         ) == (loop is rough)
 
 
+@pytest.mark.parametrize(("before", "shown"), [(1.01, False), (1.15, False), (1.5, True)])
+def test_a_gap_that_was_at_the_floor_shows_no_benefit(before, shown):
+    """Of 1 % above the floor, "100 % removed" says nothing."""
+    gap = Gap("simulation", before, before, 0.99, 1.0, "m", *[np.zeros(3)] * 4, 1.0)
+    told = wording.describe_shrinking(gap)
+    assert ("remove 100 % of the mean square error" in told) == shown
+    assert ("the gap cannot show the benefit" in told) == (not shown)
+
+
 @pytest.mark.parametrize(
     ("rivals", "words"),
     [

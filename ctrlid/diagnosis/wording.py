@@ -252,6 +252,11 @@ def _list_rows(gap: Gap) -> list[tuple[str, str, str]]:
     return [*rows, ("noise floor", size(gap.floor), cause)]
 
 
+def _is_at_floor(size: float, gap: Gap) -> bool:
+    """Whether an error is as small as noise alone leaves, so that nothing was there to close."""
+    return size < THRESHOLD.near_floor * gap.floor
+
+
 def describe_shrinking(gap: Gap) -> str:
     """Say how much of the gap above the noise floor the effects close; empty if they do not."""
     if gap.fitted == gap.after:
@@ -264,7 +269,7 @@ def describe_shrinking(gap: Gap) -> str:
         return ("Two simulations of the completed model that differ only in their noise differ by "
                 f"up to {widest}. So the gap hardly shows the benefit of the effects; the one-step "
                 "errors show it.")  # fmt: skip
-    if above <= 0 and gap.after < THRESHOLD.near_floor * gap.floor:
+    if _is_at_floor(gap.before, gap) and _is_at_floor(gap.after, gap):
         return ("Two simulations of the completed model that differ only in their noise differ by "
                 "as much. So the gap cannot show the benefit of the effects; the one-step errors "
                 "show it.")  # fmt: skip
@@ -383,7 +388,8 @@ def describe_certainty(found: Diagnosis, finding: Finding) -> str:
             "strong" if finding.evidence < THRESHOLD.certain else "very strong")  # fmt: skip
     digits = 0 if finding.evidence >= THRESHOLD.strong else 1
     text = f"evidence {finding.evidence:.{digits}f} ({sure})"
-    if math.isfinite(finding.share) and len(found.added) > 1:
+    told = math.isfinite(finding.share) and not _is_at_floor(found.gap.before, found.gap)
+    if told and len(found.added) > 1:
         share = write_percent(finding.share)
         above = " above the noise floor" if math.isfinite(found.gap.floor) else ""
         text += f"; without it, {share} of the mean square error{above} would return"
