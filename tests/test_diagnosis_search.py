@@ -15,7 +15,7 @@ import problems
 from ctrlid import effects as E
 from ctrlid.diagnosis import growth, refitting, removal, replicas, scans, screening, selection
 from ctrlid.diagnosis.candidates import Objection, _has_effect, contains
-from ctrlid.diagnosis.experiment import _can_survive, find_experiment
+from ctrlid.diagnosis.experiment import _can_survive, _list_references, find_experiment
 from ctrlid.diagnosis.findings import Disturbance, Finding, Gap
 from ctrlid.diagnosis.fitted_model import (
     Model,
@@ -274,6 +274,30 @@ def test_an_experiment_is_recommended_that_tells():
     second = cid.simulate(real, reference, sensor_noise=2e-6, seed=9502)
     best, other = refitted(loop, second, E.ForceExponent(n=2.0), E.PositionOffset(0.0))
     assert find_rivals(best, [other]) == ()
+
+
+def test_an_experiment_is_told_by_the_rival():
+    """What tells a lag of the sensor from a delay does not tell it from a lag of the actuator."""
+    loop = levitation()
+    record = replace(record_of(loop, E.SensorLag(1e-3), 1e-4, 1e-5, 9550), r=None)
+    lags = E.SensorLag(5e-4), E.ActuatorLag(5e-4), E.InputDelay(0.0)
+    best, actuator, late = refitted(loop, record, *lags)
+    words, reference = find_experiment(best, [actuator], record)
+    assert words.startswith("large steps of the input")
+    assert "delay" not in words
+    assert reference is None
+    assert find_experiment(best, [late], record)[0] == E.SensorLag.experiment
+    both = find_experiment(best, [actuator, late], record)[0]
+    assert both == f"{words}; and {E.SensorLag.experiment}"
+
+
+def test_a_reference_is_described_as_it_is():
+    record = record_of(levitation(), E.SensorLag(1e-3), 1e-4, 1e-5, 9550)
+    text, r = _list_references(record)[-1]
+    assert text.endswith("can change at every second sample")
+    changes = np.flatnonzero(np.diff(r))
+    assert np.all(changes % 2 == 1)
+    assert np.ptp(np.diff(changes)) > 0
 
 
 def test_no_experiment_is_recommended_where_none_tells():

@@ -222,6 +222,7 @@ def test_an_effect_explains_itself(cls):
     assert cls.sentence.endswith(".")
     assert cls.sentence.count(".") == 1
     assert len(cls.experiment) > 20
+    assert set(cls.experiment_against) <= set(cls.look_alikes)
     assert ".. math::" in cls.__doc__
     assert ">>>" in cls.__doc__
     assert any(p.neutral is not None for p in cls.parameters())

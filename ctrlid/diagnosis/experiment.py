@@ -47,7 +47,7 @@ def find_experiment(
     reference : ndarray or None
         The reference signal; None where the loop has no controller to run it.
     """
-    words = type(best.effect).experiment.rstrip(".")
+    words = _describe_experiment(best, others)
     loop = best.model.fitted
     if loop.controller is None or record.r is None or not loop.equations().siso:
         # Of several references no one combination is recommended.
@@ -91,6 +91,13 @@ def find_experiment(
             f"{times:.1f} times as much as the reference of this record, with the same number of "
             "samples")  # fmt: skip
     return text, chosen[2]
+
+
+def _describe_experiment(best: Trial, others: Sequence[Trial]) -> str:
+    """Say what tells a finding from its rivals: one clause for all, or one for each of several."""
+    kind = type(best.effect)
+    told = [kind.experiment_against.get(t.name, kind.experiment).rstrip(".") for t in others]
+    return "; and ".join(dict.fromkeys(told))
 
 
 def _choose_clearest(able: Sequence[tuple[float, str, Array]]) -> tuple[float, str, Array] | None:
@@ -148,7 +155,7 @@ def _list_references(record: Record) -> list[tuple[str, Array]]:
         ("slow steps, four times as long, around several set-points", step, times * hold, reach),
         ("steps four times as large that change four times as often", times * step,
          max(2, hold // times), 0.0),
-        ("steps four times as large that change every other sample", times * step, 2, 0.0),
+        ("steps four times as large that can change at every second sample", times * step, 2, 0.0),
     ):  # fmt: skip
         signal = random_binary(n, amplitude=amplitude, hold=width, around=middle, seed=0)
         found.append((label, signal + _visit_levels(n, levels)))

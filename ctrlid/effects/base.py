@@ -3,7 +3,7 @@
 import copy
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, NoReturn, Self
 
@@ -72,6 +72,8 @@ class AbstractEffect(metaclass=CheckedCalls):
     look_alikes: ClassVar[tuple[str, ...]] = ()
     sentence: ClassVar[str] = ""
     experiment: ClassVar[str] = ""
+    # The names of look-alikes that another experiment tells it from, with that experiment.
+    experiment_against: ClassVar[Mapping[str, str]] = {}
     states: ClassVar[tuple[str, ...]] = ()
     # These parameters have other values in another record.
     private: ClassVar[tuple[str, ...]] = ()

@@ -1,6 +1,7 @@
 """Between the plant and the record: lags, scale, curves, offsets, drift, lines and steps."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Self, final
 
@@ -55,6 +56,10 @@ class SensorLag(OutputEffect):
         "fast excitation: at high frequencies the phase of a lag levels off, while that of a delay "
         "continues to fall"
     )
+    experiment_against: ClassVar[Mapping[str, str]] = {
+        "ActuatorLag": "large steps of the input: a lag of the actuator acts before the "
+        "nonlinearities of the plant, a lag of the sensor after them"
+    }
 
     @classmethod
     def candidates(cls, loop: Any, record: Any = None) -> tuple[Self, ...]:
