@@ -784,6 +784,6 @@ def test_the_rest_of_a_small_catalogue_is_counted_in_words(rivals, words):
     tried = [friction, *(starts[name] for name in rivals)]
     finding = SimpleNamespace(evidence=50.0, share=np.nan, names=("CoulombFriction",),
                               equivalents=(), effect=friction, alternatives=())  # fmt: skip
-    found = SimpleNamespace(added=(finding,), verdict="explained",
+    found = SimpleNamespace(added=(finding,), verdict="explained", finished=True,
                             ranking=[SimpleNamespace(effect=e) for e in tried])  # fmt: skip
     assert words in wording.describe_certainty(found, finding)

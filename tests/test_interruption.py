@@ -94,7 +94,7 @@ def test_the_answer_so_far(record, tmp_path):
     assert "Nothing is named yet" in found.sentence
     again = cid.load_diagnosis(found.save(tmp_path / "found.json"))
     assert (again.finished, str(again)) == (False, str(found))
-    assert "THE SEARCH WAS NOT FINISHED" in " ".join(str(again).split())
+    assert "UNKNOWN SO FAR. THE SEARCH WAS NOT FINISHED" in " ".join(str(again).split())
 
 
 def test_what_was_found_before_the_end_is_kept(monkeypatch):
@@ -121,6 +121,13 @@ def test_what_was_found_before_the_end_is_kept(monkeypatch):
     assert (found.verdict, found.finished, len(found.findings)) == ("partly explained", False, 1)
     assert "So far the model lacks" in found.sentence
     assert "(round 2: screening" in found.sentence
+    words = " ".join(str(found).split())
+    assert "PARTLY EXPLAINED SO FAR. THE SEARCH WAS NOT FINISHED" in words
+    assert "STILL MISSING" not in words
+    assert "other effects of the catalogue" not in words
+    assert "no other effect of the catalogue" not in words
+    assert "an effect that is not in the catalogue" not in words
+    assert "The search did not come to compare it with all other effects" in words
     assert found.gap.after < found.gap.before
     monkeypatch.undo()
     whole = cid.diagnose(drive(), record, catalogue=few, progress=False, seconds=600)

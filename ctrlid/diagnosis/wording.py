@@ -40,6 +40,8 @@ HEADLINES = {
     "partly explained": "PARTLY EXPLAINED: SOMETHING IS STILL MISSING",
     "unknown": "UNKNOWN: SOMETHING IS MISSING",
 }
+# Of a search that was stopped, only what was checked is said.
+UNFINISHED = {"partly explained": "PARTLY EXPLAINED SO FAR", "unknown": "UNKNOWN SO FAR"}
 WIDENED = (
     "Recalibration alone decreases the one-step errors but increases this gap, because no values "
     "of the parameters can replace what is missing."
@@ -76,7 +78,10 @@ FORCES = {
 
 def write_headline(found: Diagnosis) -> str:
     """Return the verdict with its sentence."""
-    return f"{HEADLINES[found.verdict]}. {found.sentence}"
+    headline = HEADLINES[found.verdict]
+    if not found.finished:
+        headline = UNFINISHED.get(found.verdict, headline)
+    return f"{headline}. {found.sentence}"
 
 
 def name_test(key: str) -> str:
@@ -397,13 +402,18 @@ def describe_certainty(found: Diagnosis, finding: Finding) -> str:
     many = len({name_with_subject(e) for e in every if name_at_place(e) not in finding.equivalents})
     if many > 1:
         text += f"; ONE OF {many} EFFECTS that explain the record"
-    else:
+    elif found.finished:
         kinds = {name_at_place(c.effect) for c in found.ranking}
         count = len(kinds - {*finding.names, *finding.equivalents})
         rest = "none of the {} other effects" if count > 1 else "no other effect"
         text += f"; {rest.format(count)} of the catalogue explains the record as well"
     if found.verdict == "partly explained" and not isinstance(finding.effect, ReadingEffect):
-        text += ". It may stand in for an effect that is not in the catalogue"
+        text += (
+            ". It may stand in for an effect that is not in the catalogue"
+            if found.finished
+            else ". The search did not come to compare it with all other effects, and it may stand "
+            "in for one of them"
+        )
     return text
 
 
