@@ -17,12 +17,13 @@ from ctrlid.diagnosis import gap as gap_of
 from ctrlid.diagnosis import wording
 from ctrlid.diagnosis.findings import BinnedErrors, Calibrated, Candidate, Disturbance, Finding, Gap
 from ctrlid.diagnosis.loading import load_diagnosis
-from ctrlid.diagnosis.noise_tests import choose_alarm_level
+from ctrlid.diagnosis.noise_tests import NoiseTests, choose_alarm_level
 from ctrlid.diagnosis.recalibration import fit_base_model
 from ctrlid.diagnosis.result import Diagnosis
 from ctrlid.diagnosis.saving import SavedLoop
 from ctrlid.diagnosis.thresholds import THRESHOLD
-from ctrlid.diagnosis.verdict import gap_stands_out
+from ctrlid.diagnosis.verdict import describe_grounds, gap_stands_out
+from ctrlid.diagnosis.where import locate_errors
 from ctrlid.reporting import pictures as _pictures
 from ctrlid.validation.record_simulation import prepare_stretch
 from ctrlid.validation.reproduction import CLOSED_LOOP
@@ -183,6 +184,40 @@ def test_one_of_many_tests_may_look_bad(found):
     assert "p = 8.5e-06, which is 0.00026 for the smallest of 31" in tiny
     assert "NOT NOISE ALONE" not in words
     assert "NOT NOISE ALONE" in text(replace(found["unknown"], tests={**tests, "whiteness": 1e-6}))
+
+
+def test_an_error_that_the_effects_bring_in_has_its_place(found):
+    """A test of the final errors that fails is no test of the errors before."""
+    axes = {"input": np.linspace(0, 1, 800)}
+    z = np.random.default_rng(1).standard_normal(800)
+    moved = np.where(axes["input"] > 0.9, z + 0.7, z)
+    was = NoiseTests({"mean by input": 7e-3, "size by input": 0.5}, z, axes)
+    now = NoiseTests({"mean by input": 1e-7, "size by input": 0.5}, moved, axes)
+    (place,) = locate_errors(was, now, {"input": "V"})
+    assert place.words.startswith("at input from 0.9")
+    assert "V, afterwards the output is above its prediction by " in place.words
+    assert "afterwards" not in locate_errors(now, was, {})[0].words
+    base = found["partly explained"]
+    assert "where the error is: nowhere" not in text(replace(base, where=(place,)))
+    assert "V, afterwards the output is above" in text(replace(base, where=(place,)))
+    # It is not cut off behind those that were there before.
+    strong = [replace(base.where[0], axis=axis) for axis in "abcd"]
+    told = wording.list_telling_places(replace(base, where=(*strong, place)))
+    assert [p.axis for p in told] == ["a", "b", "c", "d", "input"]
+    quiet = replace(place, p_after=0.3)
+    nowhere = text(replace(base, where=(quiet, replace(quiet, output="T"))))
+    assert "where the error is: nowhere. In bins of input, the one-step errors" in nowhere
+
+
+def test_a_name_that_does_not_stand_is_said_once(found):
+    (one,) = found["explained"].findings
+    why = describe_grounds([(one, "A, and on fresh data B"), (one, "A, and on fresh data B")])
+    assert why is not None
+    assert why.count("does not stand") == 1
+    assert why.endswith(" does not stand, since A, and on fresh data B")
+    two = describe_grounds([(one, "A"), (one, "B")])
+    assert two is not None
+    assert two.endswith(" does not stand, since A and since B")
 
 
 def test_an_alarm_of_many_effects_is_told(found):

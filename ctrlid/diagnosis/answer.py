@@ -88,7 +88,9 @@ def assemble_answer(
     final = fitted.loop
     for r in read:
         final = final if r.effect in final.effects else final.with_effect(r.effect)
-    where = locate_errors(found.before, found.after, _find_units(loop))
+    # Where nothing was added, the errors are those of the final model, which the tests are of.
+    before = found.before if findings or stand_ins else found.after
+    where = locate_errors(before, found.after, _find_units(loop))
     left = gap_is_left(
         gap, disturbance, found.final.fit, summary.excess_chance, summary.worse_chance
     )

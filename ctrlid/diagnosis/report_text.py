@@ -86,7 +86,8 @@ def write_gap_lines(gap: Gap) -> list[str]:
 def _write_where(found: Diagnosis) -> list[str]:
     places = wording.list_telling_places(found)
     if not places:
-        axes = write_list([p.axis for p in found.where])
+        # Errors of several outputs have the same axes.
+        axes = write_list(list(dict.fromkeys(p.axis for p in found.where)))
         nowhere = f"nowhere. In bins of {axes}, the one-step errors are noise."
         return _wrap_text(f"where the error is: {nowhere if axes else 'not known'}", 2, hang=4)
     same = not found.added

@@ -154,7 +154,11 @@ def gap_is_wider(gap: Gap, disturbance: Disturbance) -> bool:
 
 def describe_grounds(stand_ins: Sequence[tuple[Finding, str]]) -> str | None:
     """Say why names do not stand, in one clause; None without any."""
-    words = [f"the name {join_names([f])} does not stand, since {why}" for f, why in stand_ins]
+    grounds: dict[str, dict[str, None]] = {}
+    for f, why in stand_ins:
+        grounds.setdefault(join_names([f]), {})[why] = None
+    words = [f"the name {name} does not stand, since {' and since '.join(reasons)}"
+             for name, reasons in grounds.items()]  # fmt: skip
     return ", and ".join(words) or None
 
 

@@ -8,6 +8,7 @@ from .._base.arrays import Array
 from .constancy import find_bin_edges, find_bins
 from .findings import BinnedErrors
 from .noise_tests import NoiseTests
+from .thresholds import THRESHOLD
 
 
 def locate_errors(
@@ -42,14 +43,18 @@ def _locate_output(
             for o in (before, after)
         )
         unit = units.get(name, "")
-        words, told = _describe_place(name, unit, edges, before.z, index, count, output)
+        # What only the effects brought in sits where the errors with them are.
+        brought_in = p_now < THRESHOLD.telling <= p_was
+        z, since = (after.z, "afterwards ") if brought_in else (before.z, "")
+        words, told = _describe_place(name, unit, edges, z, index, count, output, since)
         found.append(BinnedErrors(name, unit, edges, was, now, p_was, p_now, words, output, told))
     return tuple(sorted(found, key=lambda place: place.p_before))
 
 
 def _describe_place(
-    name: str, unit: str, edges: Array, z: Array, index: Array, count: Array, output: str
-) -> tuple[str, int]:
+    name: str, unit: str, edges: Array, z: Array, index: Array, count: Array, output: str,
+    since: str,
+) -> tuple[str, int]:  # fmt: skip
     """Return where the errors are farthest from noise, in words, and the bin."""
     mean = np.bincount(index, z, minlength=len(count)) / count
     square = np.bincount(index, z**2, minlength=len(count)) / count
@@ -61,8 +66,8 @@ def _describe_place(
     if strength[k] >= spread[k]:
         side = "above" if mean[k] > 0 else "below"
         what = output or "the output"
-        return (f"{place}, {what} is {side} its prediction by {abs(mean[k]):.2g} standard "
+        return (f"{place}, {since}{what} is {side} its prediction by {abs(mean[k]):.2g} standard "
                 "deviations on average", k)  # fmt: skip
     side = "larger" if square[k] > 1 else "smaller"
     errors = f"the one-step errors of {output}" if output else "the one-step errors"
-    return f"{place}, {errors} are {side} than noise", k
+    return f"{place}, {since}{errors} are {side} than noise", k

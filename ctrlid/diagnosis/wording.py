@@ -315,8 +315,13 @@ def write_percent(share: float) -> str:
 
 
 def list_telling_places(found: Diagnosis) -> list[BinnedErrors]:
-    """Return the places where the disagreement sits, most telling first."""
-    return [p for p in found.where if p.p_before < THRESHOLD.telling][:PLACES]
+    """Return the places where the disagreement sits, most telling first, then what is left.
+
+    What a test of the final errors finds is told also where the effects brought it in.
+    """
+    first = [p for p in found.where if p.p_before < THRESHOLD.telling][:PLACES]
+    left = [p for p in found.where if p.p_after < THRESHOLD.telling and p not in first]
+    return first + sorted(left, key=lambda place: place.p_after)[:PLACES]
 
 
 def find_told_rms(place: BinnedErrors, levels: Array) -> float:
