@@ -221,6 +221,12 @@ def test_open_loop_third_order_with_a_zero():
         assert error < 0.1 * truth
 
 
+def test_a_decimated_record_is_called_that():
+    record = experiment(loop_at(0.005), sensor_noise=1e-5)
+    with pytest.warns(cid.CtrlidWarning, match=r"hold='foh'.*was decimated, give the one that was"):
+        cid.fit_continuous(record.decimate(4), 2)
+
+
 def test_constraints_hold_exactly():
     record = experiment(loop_at(0.005), sensor_noise=1e-5)
     G = cid.fit_continuous(record, 2, constraints=[*SYMMETRIC, cid.StaticGain(0.004)])

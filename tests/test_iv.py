@@ -387,6 +387,9 @@ def test_without_a_signal_from_outside_it_says_what_can_serve():
 def test_unusable_records_are_refused():
     _, record, _ = sampled_levitation(0.1, n=200)
     refused(replace(record, hold="foh"), "held between samples.*hold='foh'.*fit_continuous")
+    # After the filter of decimate, u of a digital controller is held no longer.
+    cause = r"a digital one after record.decimate\(\).*decimated, give the one that was logged"
+    refused(replace(record, valid=None).decimate(2), cause)
     refused(record[:40], "Too few samples: 40 valid samples for 7 unknowns")
     gaps = np.arange(200) % 20 > 0
     refused(replace(record, valid=gaps), "Record 1 of 1 has no stretch of 25 valid samples")

@@ -350,6 +350,8 @@ class Record(Printed):
         off what is above the new Nyquist frequency. A sample counts only where all 20 q + 1
         samples under the filter count, which costs 10 slow samples at either end. An input that
         was held is smooth afterwards, so `hold` becomes ``"foh"``; a band-limited one stays so.
+        This is for `fit_arx`, with ``nk=0`` and one b more, as u then acts without delay. `fit_iv`
+        and `fit_continuous` take the record as it was logged, whose u is held, at any short period.
 
         Parameters
         ----------

@@ -291,10 +291,11 @@ def _make_circuit(controller: Any, records: Sequence[Record]) -> Circuit | None:
         moves = measure_input_motion(records)
         if moves > VISIBLE_MOTION:
             warnings.warn(
-                f"the input of an analog controller changes by {100 * moves:.0f} % of its standard "
-                "deviation from sample to sample, and a straight line is assumed between the "
-                "samples; give controller= (and record the reference) so that u can be "
-                "reconstructed, or sample faster",
+                f"u is not held (hold={records[0].hold!r}): it changes by {100 * moves:.0f} % of "
+                "its standard deviation from sample to sample, and a straight line is assumed "
+                "between the samples. If the record was decimated, give the one that was logged; "
+                "with an analog controller, give controller= (and record the reference) so that u "
+                "can be reconstructed, or sample faster",
                 CtrlidWarning, stacklevel=5,
             )  # fmt: skip
         return None

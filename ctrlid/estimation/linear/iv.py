@@ -461,10 +461,13 @@ def _check_hold(records: Sequence[Record]) -> None:
     if records[0].hold != "zoh":
         raise CtrlidError(
             "fit_iv needs an input that is held between samples, but this record has "
-            f"hold={records[0].hold!r}: u of an analog controller changes between the samples, and "
-            "a difference equation, which knows it at the samples only, is biased. Use "
-            "fit_continuous with controller=, or fit_loop. If u is held in fact, or r and u are "
-            "smooth and dt is short, use dataclasses.replace(record, hold='zoh')."
+            f"hold={records[0].hold!r}: u changes between the samples, as that of an analog "
+            "controller does, and that of a digital one after record.decimate(), whose filter "
+            "smooths it. A difference equation, which knows u at the samples only, is then biased. "
+            "If the record was decimated, give the one that was logged: fit_iv needs no slower "
+            "period. With an analog controller, use fit_continuous with controller=, or fit_loop. "
+            "If u is held in fact, or r and u are smooth and dt is short, use "
+            "dataclasses.replace(record, hold='zoh')."
         )
 
 
