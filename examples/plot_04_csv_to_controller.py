@@ -57,7 +57,8 @@ print("\n".join(path.read_text().splitlines()[:4]))
 # 1. Read the log
 # ---------------
 # `Record.from_csv` needs the names of the columns. It finds the sampling period from the time
-# column, and would refuse gaps, jitter or a clock that runs backwards. Units in brackets are kept.
+# column, and would refuse gaps, jitter or a clock that runs backwards. Dates such as
+# ``2026-11-27T10:00:00.250`` will do as well as seconds. Units in brackets are kept.
 
 record = cid.Record.from_csv(path, r="setpoint", u="voltage", y="gap", time="time")
 print(record)

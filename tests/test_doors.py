@@ -11,6 +11,7 @@ import json
 import math
 import random
 from dataclasses import replace
+from datetime import datetime, timedelta
 
 import control as ct
 import numpy as np
@@ -383,13 +384,57 @@ def test_damaged_diagnoses_are_refused_or_can_be_printed(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("header", "stamp", "separator"),
+    [
+        ("Timestamp", "{:%Y-%m-%dT%H:%M:%S}.{:03d}Z", ","),
+        ("Timestamp [UTC]", "{:%Y-%m-%d %H:%M:%S}.{:03d}", ","),
+        ("Date/Time", "{:%Y-%m-%d %H:%M:%S},{:03d}", ";"),
+        ("t", '"{:%Y-%m-%d %H:%M:%S},{:03d}+01:00"', ","),
+    ],
+)
+def test_dates_are_times_since_the_first_row(tmp_path, header, stamp, separator):
+    """A log that runs over midnight, four times a second."""
+    begin = datetime(2026, 11, 27, 23, 59, 58, 250_000)
+    moments = [begin + timedelta(milliseconds=250 * k) for k in range(20)]
+    rows = [separator.join([stamp.format(m, m.microsecond // 1000), "1", str(k)])
+            for k, m in enumerate(moments)]  # fmt: skip
+    file = tmp_path / "log.csv"
+    file.write_text("\n".join([separator.join([header, "u", "y"]), *rows]), "utf-8")
+    for options in ({}, {"dt": 0.25}):
+        record = cid.Record.from_csv(file, **options)
+        assert (record.dt, record.t[0], len(record)) == (0.25, 0.0, 20)
+        assert np.all(record.y == np.arange(20))
+    file.write_text("\n".join([separator.join([header, "u", "y"]), *rows[:9], *rows[10:]]), "utf-8")
+    assert np.flatnonzero(~cid.Record.from_csv(file, gaps="mask").valid) == [9]
+
+
+def test_dates_beside_a_period_that_is_given_may_be_coarse(tmp_path):
+    """A column of dates that no name calls the time is asked only where nothing else tells."""
+    file = tmp_path / "log.csv"
+    rows = [f"2026-11-27 10:00:{k // 4:02d},{k},1" for k in range(20)]
+    file.write_text("\n".join(["Date/Time,u,y", *rows]), "utf-8")
+    assert cid.Record.from_csv(file, dt=0.25).dt == 0.25
+    with pytest.raises(CtrlidError, match="does not increase"):
+        cid.Record.from_csv(file)
+    two = [f"{row},2026-11-27 10:00:00" for row in rows]
+    file.write_text("\n".join(["Date/Time,u,y,shift", *two]), "utf-8")
+    with pytest.raises(CtrlidError, match="no time column"):
+        cid.Record.from_csv(file)
+
+
+@pytest.mark.parametrize(
     ("data", "words"),
     [
         (b"t,u,y," + b"x" * 200_000 + b"\n0,1,2,3\n0.1,1,2,3\n", "not a line of a table"),
         (b"# ctrlid []\nt,u,y\n0,1,2\n0.1,1,2\n", "is damaged"),
         (b"t,u,y\n0,1,2\n0.01,1,2\n0.02,1,2\n1.7e9,1,2\n", "the wild time stamp"),
         (b"t|u|y\n0|1|2\n1|1|2\n", r"separated by '\|', replace it"),
-        (b"t,u,y\n2026-01-01T00:00:00,1,2\n2026-01-01T00:00:01,1,2\n", "a date or a time of day"),
+        (b"t,u,y\n27.11.2026 10:00:00,1,2\n27.11.2026 10:00:01,1,2\n", "a date or a time of day"),
+        (b"t,u,y\n2026-13-01T00:00:00,1,2\n2026-13-01T00:00:01,1,2\n", "a date or a time of day"),
+        (b"t,u,y\n2026-11-01T00:00:00,1,2\n2026-11-01T00:00:01Z,1,2\n", "all of them dates with"),
+        (b"t,u,y\n2026-11-01T00:00:00,1,2\nlater,1,2\n", "all of them dates with a time"),
+        (b"t,u,y\n0,1,2026-11-01T00:00:00\n1,1,2026-11-01T00:00:01\n", "column 'y'; times are"),
+        (b"t,u,y\n2026-11-01T00:00:00,1,2\n,1,2\n", "at least 2 values, all finite"),
         (b"t,u,y\n12:00:01,1,2\n12:00:02,1,2\n", "a date or a time of day"),
         (b"t,u,y\n12:00:01,1,2\n12:00:02,1,2\n", r"\(t - t\[0\]\).dt.total_seconds\(\)"),
     ],

@@ -17,6 +17,7 @@ from .._base.errors import CtrlidError, CtrlidWarning
 from .._base.files import replace_file
 from .._base.text import drop_roundoff, split_unit, with_unit, write_count, write_percent
 from .._base.units import is_same_unit
+from .dates import read_seconds
 from .field_checks import check_words
 
 TIME = ("t", "time", "timestamp", "seconds", "zeit")
@@ -106,7 +107,7 @@ def read_csv(
     """Return the fields of a record; see `Record.from_csv`, `sources` are its r, u and y."""
     if not isinstance(gaps, str) or gaps not in ("error", "mask"):
         raise CtrlidError(f"gaps must be 'error' or 'mask'; given {gaps!r}")
-    own, header, table, texts = _read_table(path)
+    own, header, table, texts, dates = _read_table(path)
     if own.get("rows", len(table)) != len(table):
         raise CtrlidError(
             f"{path} is not whole: its line {MARK.strip()!r} says {own['rows']} rows, and it has "
@@ -115,6 +116,7 @@ def read_csv(
         )
     labels = [split_unit(cell) for cell in header]
     names = [label for label, _ in labels]
+    period_given = own.get("dt") if dt is None else dt
 
     def place(label: str, what: str) -> int:
         found = [k for k in range(len(header)) if label in (names[k], header[k])]
@@ -144,6 +146,8 @@ def read_csv(
               for (k, i), p in found.items()}  # fmt: skip
     if time is None:
         time = next((label for label in names if label.lower() in TIME), None)
+    if time is None and period_given is None and len(dates) == 1:
+        time = header[next(iter(dates))]
     clock = None if time is None else place(time, "time")
     if isinstance(extra, str):
         extra = (extra,)
@@ -159,14 +163,15 @@ def read_csv(
     apart = [place(label, "valid") for label in each] if counted else []
     needed = {*places.values(), *further.values(), *counting, *apart, clock}
     # Text in a column that nobody asked for, such as the state of a machine, does no harm.
-    _refuse_text(path, {k: v for k, v in texts.items() if k in needed}, header)
+    dated = clock in dates
+    _refuse_text(path, {k: v for k, v in texts.items()
+                        if k in needed and not (dated and k == clock)}, header)  # fmt: skip
     valid = np.ones(len(table), dtype=bool)
     if counting:
         valid = table[:, counting[0]] > 0.5
     rows_valid = table[:, apart] > 0.5 if apart else None
     table, valid = _fill_gaps(table, places, valid, gaps, path)
     start, rows = 0.0, None
-    period_given = own.get("dt") if dt is None else dt
     if dt is not None and not 0 < dt < LONGEST:
         raise CtrlidError(f"dt is the sampling period, a number of seconds above 0; given {dt!r}")
     if clock is None:
@@ -177,12 +182,13 @@ def read_csv(
             )
         dt = period_given
     else:
-        unit = labels[clock][1]
+        # Behind the name of a column of dates stands a zone, if anything.
+        unit = "s" if dated else labels[clock][1]
         if unit not in SECONDS:
             raise CtrlidError(f"the time column of {path} is in {unit!r}; known units are "
                               f"{', '.join(filter(None, SECONDS))}. Convert it, or remove the "
                               "column and give dt=")  # fmt: skip
-        stamps = table[:, clock] * SECONDS[unit]
+        stamps = dates[clock] if dated else table[:, clock] * SECONDS[unit]
         dt, rows = _make_uniform(stamps, period_given, gaps, path)
         start = float(stamps[0])
         if not unit and names[clock].lower() != "seconds" and period_given is None:
@@ -325,8 +331,8 @@ def _question_period(dt: float, stamps: Any, path: Path, label: str) -> None:
         )  # fmt: skip
 
 
-def _read_table(path: Path) -> tuple[dict[str, Any], list[str], Any, Texts]:
-    """Return the fields in ctrlid's own comment, the header cells, the values and the texts."""
+def _read_table(path: Path) -> tuple[dict[str, Any], list[str], Any, Texts, dict[int, Any]]:
+    """Return the fields in ctrlid's own comment, the header cells, values, texts and dates."""
     try:
         data = path.read_bytes()
     except OSError as reason:
@@ -376,18 +382,18 @@ def _read_table(path: Path) -> tuple[dict[str, Any], list[str], Any, Texts]:
         raise CtrlidError(f"{path} has no rows of numbers below its header")
     # Where commas do not separate columns, they are decimal commas.
     plain = body if separator == "," else body.replace(",", ".")
-    above, texts = text.count("\n", 0, stop), Texts()
+    above, texts, dates = text.count("\n", 0, stop), Texts(), dict[int, Any]()
     try:
         table = np.loadtxt(io.StringIO(plain), delimiter=separator, ndmin=2, quotechar='"')
     except ValueError:
-        table, texts = _read_with_blanks(path, body, separator, above, len(header))
+        table, texts, dates = _read_with_blanks(path, body, separator, above, len(header))
     if table.shape[1] != len(header):
         _refuse_text(path, texts, ())
         _refuse_decimal_commas(path, body.lstrip("\n").partition("\n")[0], separator, len(header))
         raise CtrlidError(f"the header of {path} names {write_count(len(header), 'column')}, its "
                           f"rows have "
                           f"{table.shape[1]}; give every column a name")  # fmt: skip
-    return own, header, table, texts
+    return own, header, table, texts, dates
 
 
 def _decode(data: bytes) -> str:
@@ -429,23 +435,30 @@ def _refuse_decimal_commas(path: Path, row: str, separator: str, columns: int) -
 
 def _read_with_blanks(
     path: Path, body: str, separator: str, above: int, columns: int
-) -> tuple[Any, Texts]:
+) -> tuple[Any, Texts, dict[int, Any]]:
     """Read a table with blank cells and cells of text, which are NaN, below so many lines.
 
-    The first text of each column is returned beside it, as it stands in the file.
+    The first text of each column is returned beside it, as it stands in the file, and the times of
+    columns of dates [s].
     """
     rows: list[list[float]] = []
     texts, first = Texts(), 0
+    # The cells of columns that begin with a text.
+    words: dict[int, list[str]] = {}
     for k, cells in enumerate(_read_cells(body, separator)):
         if not cells or cells[0].lstrip().startswith("#"):
             continue
         numbers = []
         for column, cell in enumerate(cells):
+            if column in words:
+                words[column].append(cell)
             try:
                 plain = cell if separator == "," else cell.replace(",", ".")
                 numbers.append(float(plain) if plain.strip() else math.nan)
             except ValueError:
                 texts.setdefault(column, (cell, above + k + 1))
+                if not rows:
+                    words[column] = [cell]
                 numbers.append(math.nan)
         first = first if rows else k
         rows.append(numbers)
@@ -458,7 +471,8 @@ def _read_with_blanks(
             raise CtrlidError(f"{path} is not a table of numbers: line {above + k + 1} has "
                               f"{write_count(len(cells), 'cell')}, the lines above it "
                               f"{len(rows[0])}")  # fmt: skip
-    return np.array(rows), texts
+    found = {column: read_seconds(cells) for column, cells in words.items()}
+    return np.array(rows), texts, {k: v for k, v in found.items() if v is not None}
 
 
 def _refuse_text(path: Path, texts: Texts, header: Sequence[str]) -> None:
@@ -471,7 +485,8 @@ def _refuse_text(path: Path, texts: Texts, header: Sequence[str]) -> None:
     if CLOCK.match(cell.strip()):
         raise CtrlidError(
             f"{path} has a date or a time of day: {where}; times are numbers, in seconds from any "
-            "start. Convert them, for instance by t = pandas.to_datetime(column) and then "
+            "start, or all of them dates with a time such as 2026-11-27T10:00:00.250. Convert "
+            "them, for instance by t = pandas.to_datetime(column) and then "
             "(t - t[0]).dt.total_seconds(), or remove the column from the file and give dt=; a "
             "line above the header: delete it or start it with #"
         )

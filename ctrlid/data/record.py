@@ -514,8 +514,10 @@ class Record(Printed):
             Names of the columns, several for several signals, as in ``y=("theta", "alpha")``; r by
             default if there is a column so called. A file that `to_csv` wrote knows its own.
         time : str, optional
-            Name of the time column; by default one called t, time, timestamp, seconds or Zeit. Its
-            unit is s unless the header says ms, us, min or h.
+            Name of the time column; by default one called t, time, timestamp, seconds or Zeit, or,
+            without `dt`, the only one with dates. Its unit is s unless the header says ms, us, min
+            or h. Dates with a time, such as ``2026-11-27T10:00:00.250Z`` or ``2026-11-27
+            10:00:00,250``, are read in seconds since the first row.
         dt : float, optional
             Sampling period [s]; by default that of the time column.
         extra : sequence of str, optional
