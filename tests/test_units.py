@@ -304,3 +304,36 @@ def test_of_several_outputs_the_one_in_another_unit_is_to_be_scaled():
                         units={"y": ("mm", "deg")})  # fmt: skip
     (clash,) = find_unit_clashes(loop, record)
     assert "scale={'a': 0.001}, units={'a': 'm'}" in clash.text
+
+
+def test_scales_of_temperature_are_no_factor_apart(tmp_path):
+    """A plant in kelvins and a log in °C: a factor was advised, and the limits were blamed."""
+    plant = ct.nlsys(
+        lambda t, x, u, p: p["a"] * (u - x), lambda t, x, u, p: x[0],
+        inputs=["Tc"], outputs=["T"], states=["T"], params={"a": 0.2}, name="bath",
+    )  # fmt: skip
+    at = cid.operating_point(plant, output=350.0)
+    law = cid.PID(kp=3.0, ki=0.1, bias=350.0, lower=278.15, upper=380.0)
+    loop = cid.Loop(plant, law, dt=0.5, at=at, free=("a",), units={"T": "K", "Tc": "K"})
+    r = cid.random_binary(400, amplitude=2.0, hold=20, around=350.0, seed=1)
+    kelvins = cid.simulate(loop, r, sensor_noise=0.02, seed=2)
+    assert cid.audit(kelvins, loop)["units"] == ()
+    shifted = {key: getattr(kelvins, key) - 273.15 for key in "ruy"}
+    record = replace(kelvins, **shifted, units=dict.fromkeys("ruy", "°C"))
+    found = cid.audit(record, loop)
+    assert [f.channel for f in found["units"]] == ["u", "y", "r"]
+    text = found["units"][1].text
+    assert "recorded in °C, but the plant has it in K, whose zero is another one" in text
+    assert "compute y + 273.15 in the file" in text
+    assert "Loop(..., units={'T': '°C'})" in text
+    assert not any("scale={" in f.text for f in found.findings)
+    assert found["limit"] == ()
+    assert "was not checked" in found["controller"][0].text
+    with pytest.raises(cid.CtrlidError, match=r"the units do not agree: .*Tc?.*273\.15"):
+        cid.diagnose(loop, record, progress=False)
+    path = tmp_path / "log.csv"
+    path.write_text("t [s],u [degF],y [°C]\n" + "".join(f"{k},1,{k}\n" for k in range(5)), "utf-8")
+    with pytest.warns(cid.CtrlidWarning, match=r"compute y \+ 273\.15 in the file and write K"):
+        cid.Record.from_csv(path, units={"y": "K"})
+    with pytest.warns(cid.CtrlidWarning, match=r"compute 0\.555556 \* u - 17\.7778 in the file"):
+        cid.Record.from_csv(path, units={"u": "°C"})

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 # What takes a prefix such as m or k, and what does not.
 WITH_PREFIX = ("m", "g", "s", "A", "K", "Hz", "rad", "N", "Nm", "Pa", "J", "W", "V", "F", "Ω",
                "ohm", "H", "T", "bar", "l", "L")  # fmt: skip
-ALONE = ("%", "‰", "°", "deg", "grad", "°C", "C", "min", "h", "rpm", "cm", "in", "inch", "ft",
+ALONE = ("%", "‰", "°", "deg", "grad", "°C", "C", "°F", "min", "h", "rpm", "cm", "in", "inch", "ft",
          "psi", "rev", "turns", "ticks", "counts", "steps", "LSB")  # fmt: skip
 PREFIXES = ("", "n", "µ", "μ", "u", "m", "k", "M")
 KNOWN = frozenset([*ALONE, *(p + unit for p in PREFIXES for unit in WITH_PREFIX)])
@@ -17,6 +17,7 @@ SPELLINGS = {
     "N.m": "N m", "Ω": "ohm", "°C": "C", "percent": "%", "volt": "V", "volts": "V", "amp": "A",
     "amps": "A", "ampere": "A", "newton": "N", "newtons": "N", "meter": "m", "metre": "m",
     "meters": "m", "metres": "m", "sec": "s", "second": "s", "seconds": "s", "l": "L",
+    "celsius": "C", "degc": "C", "fahrenheit": "°F", "degf": "°F", "kelvin": "K",
 }  # fmt: skip
 # How many of these make one of the SI: prefixes, and units with that of the SI.
 PER_SI = {"n": 1e9, "µ": 1e6, "m": 1e3, "k": 1e-3, "M": 1e-6}
@@ -25,6 +26,8 @@ SCALES = {
     "%": ("1", 100.0), "1": ("1", 1.0), "g": ("kg", 1e3), "kg": ("kg", 1.0), "min": ("s", 1 / 60),
     "h": ("s", 1 / 3600),
 }  # fmt: skip
+# Scales of temperature: kelvins in one degree, and at zero.
+TEMPERATURES = {"K": (1.0, 0.0), "C": (1.0, 273.15), "°F": (5 / 9, 459.67 * 5 / 9)}
 MARKS = re.compile(r"[/()*·]|\^-?\d+|[^\s/()*·^]+|\S")
 
 
@@ -150,6 +153,49 @@ def find_factor(given: str, wanted: str) -> float | None:
     """
     (first, per_given), (second, per_wanted) = _find_scale(given), _find_scale(wanted)
     return per_wanted / per_given if first and first == second else None
+
+
+def find_shift(given: str, wanted: str) -> tuple[float, float] | None:
+    """Return what turns temperatures of one scale into those of another: factor, then shift.
+
+    Parameters
+    ----------
+    given, wanted : str
+        Units.
+
+    Returns
+    -------
+    (float, float) or None
+        As in wanted = factor given + shift; None where they are no scales with different zeros.
+
+    Examples
+    --------
+    >>> find_shift("°C", "K"), find_shift("mm", "m")
+    ((1.0, 273.15), None)
+    >>> factor, shift = find_shift("°F", "°C")
+    >>> round(factor, 6), round(shift, 4)
+    (0.555556, -17.7778)
+    """
+    scales = []
+    for powers in map(_spell_alike, (given, wanted)):
+        symbol = next(iter(powers)) if list(powers.values()) == [1] else ""
+        scales.append(TEMPERATURES.get(symbol))
+    first, second = scales
+    if first is None or second is None or first == second:
+        return None
+    return first[0] / second[0], round((first[1] - second[1]) / second[0], 10)
+
+
+def write_shift(name: str, factor: float, shift: float) -> str:
+    """Return the conversion of a signal between scales with different zeros.
+
+    Examples
+    --------
+    >>> write_shift("y", 1.0, 273.15), write_shift("y", 1.8, 32.0)
+    ('y + 273.15', '1.8 * y + 32')
+    """
+    scaled = name if factor == 1 else f"{factor:.6g} * {name}"
+    return f"{scaled} {'+' if shift > 0 else '-'} {abs(shift):.6g}"
 
 
 def _find_scale(text: str) -> tuple[str, float]:

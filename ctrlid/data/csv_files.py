@@ -16,7 +16,7 @@ from .._base.arguments import is_number
 from .._base.errors import CtrlidError, CtrlidWarning
 from .._base.files import replace_file
 from .._base.text import drop_roundoff, split_unit, with_unit, write_count, write_percent
-from .._base.units import is_same_unit
+from .._base.units import find_shift, is_same_unit, write_shift
 from .dates import read_seconds
 from .field_checks import check_words
 
@@ -311,10 +311,15 @@ def _question_units(
         if signal in factors or not (there and here) or is_same_unit(there, here):
             continue
         name = key if len(every[key]) == 1 else column
+        shift = find_shift(there, here)
+        how = f"give scale={{{name!r}: factor}} as well"
+        if shift is not None:
+            how = (f"compute {write_shift(name, *shift)} in the file and write {here} into its "
+                   "header, as their zeros differ and no scale= does it")  # fmt: skip
         warnings.warn(
             f"{name} is in {there} by the header of {path}, and in {here} by units=, which "
-            f"is taken; the numbers stay as they are. To convert them, give "
-            f"scale={{{name!r}: factor}} as well; where the header is wrong, mend it",
+            f"is taken; the numbers stay as they are. To convert them, {how}; where the header is "
+            "wrong, mend it",
             CtrlidWarning, stacklevel=4,
         )  # fmt: skip
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .._base.errors import CtrlidError
-from .._base.units import find_factor, is_same_unit
+from .._base.units import find_factor, find_shift, is_same_unit, write_shift
 from ..data.record import Record
 from .loop import Loop
 
@@ -52,12 +52,15 @@ class UnitClash:
         A sentence that says what to do.
     factor : float or None
         What converts the record's numbers; None where the two are not known to be units of one
-        quantity.
+        quantity, or where their zeros differ.
+    zeros_differ : bool
+        Whether they are scales with different zeros, such as K and °C.
     """
 
     signal: str
     text: str
     factor: float | None
+    zeros_differ: bool = False
 
 
 def find_unit_clashes(loop: Loop, record: Record) -> list[UnitClash]:
@@ -93,7 +96,17 @@ def find_unit_clashes(loop: Loop, record: Record) -> list[UnitClash]:
             f"Record.from_csv(..., scale={{{spoken!r}: {scale}}}, units={{{spoken!r}: {here!r}}}). "
             f"If the record is right, say so: Loop(..., units={{{name!r}: {there!r}}})."
         )
-        found.append(UnitClash(signal, text, factor))
+        shift = find_shift(there, here)
+        if shift is not None:
+            text = (
+                f"{signal} is recorded in {there}, but the plant has it in {here}, whose zero is "
+                "another one, so that no scale= converts it. The model takes the numbers as they "
+                f"are. Either compute {write_shift(spoken, *shift)} in the file, before the record "
+                f"is read, and write {here} into its header. Or write the plant, its operating "
+                f"point and the limits and bias of the controller in {there}, and say so: "
+                f"Loop(..., units={{{name!r}: {there!r}}})."
+            )
+        found.append(UnitClash(signal, text, factor, shift is not None))
     return found
 
 
@@ -116,7 +129,7 @@ def note_unit_clashes(loop: Loop, record: Record) -> tuple[str, ...]:
 
 
 def refuse_unit_clashes(loop: Loop, record: Record) -> None:
-    """Refuse a record whose numbers are by a known factor larger or smaller than the loop's.
+    """Refuse a record whose numbers are by a known factor or shift other ones than the loop's.
 
     Of two quantities, such as a duty cycle and the voltage that it switches, the one may be counted
     as the other.
@@ -126,7 +139,8 @@ def refuse_unit_clashes(loop: Loop, record: Record) -> None:
     CtrlidError
         If they are: whatever is found with numbers of another size has no meaning.
     """
-    texts = [one.text for one in find_unit_clashes(loop, record) if one.factor is not None]
+    texts = [one.text for one in find_unit_clashes(loop, record)
+             if one.factor is not None or one.zeros_differ]  # fmt: skip
     if texts:
         raise CtrlidError(f"the units do not agree: {' '.join(texts)}")
 

@@ -231,7 +231,9 @@ def audit(record: Record, loop: Loop | None = None) -> Audit:
     if loop is not None:
         findings += _list_unit_clashes(loop, record)
         findings += checks.check_operating_point(loop)
-        for kind, text, size, harmful in check_controller(loop, record):
+        shifted = _list_unchecked_law(loop, record)
+        findings += shifted
+        for kind, text, size, harmful in () if shifted else check_controller(loop, record):
             injected = injected or kind == "injected"
             named = kind if kind in FAULTS else "controller"
             findings.append(AuditFinding(named, "u", text, size, checks.whole, harmful))
@@ -286,8 +288,9 @@ def _audit_several(record: Record, loop: Loop | None) -> Audit:
             for f in found if f.channel in ("", key)
         ]  # fmt: skip
     if loop is not None:
-        findings += _list_unit_clashes(loop, record)
-        for kind, text, size, harmful in check_wired_controller(loop, record):
+        shifted = _list_unchecked_law(loop, record)
+        findings += [*_list_unit_clashes(loop, record), *shifted]
+        for kind, text, size, harmful in () if shifted else check_wired_controller(loop, record):
             named = kind if kind in FAULTS else "controller"
             findings.append(AuditFinding(named, "", text, size, (0, record.n), harmful))
     findings = list(dict.fromkeys(findings))
@@ -299,6 +302,16 @@ def _list_unit_clashes(loop: Loop, record: Record) -> list[AuditFinding]:
     whole = (0, record.n)
     return [AuditFinding("units", one.signal, one.text, 1.0, whole, harmful=True)
             for one in find_unit_clashes(loop, record)]  # fmt: skip
+
+
+def _list_unchecked_law(loop: Loop, record: Record) -> list[AuditFinding]:
+    """Say that a law is not checked by signals whose zero is not that of its limits and bias."""
+    shifted = any(one.zeros_differ for one in find_unit_clashes(loop, record))
+    if not shifted or loop.controller is None:
+        return []
+    text = ("whether the controller of the loop computes the logged u was not checked, since its "
+            "limits and its bias are counted from another zero than the record.")  # fmt: skip
+    return [AuditFinding("controller", "u", text, 0.0, (0, record.n))]
 
 
 class _RecordChecks:
