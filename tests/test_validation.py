@@ -219,6 +219,21 @@ def test_small_but_certain_is_said_to_be_small():
     assert "are white and independent" in verdict(0.5, 0.0)
 
 
+def test_noise_that_is_not_white_is_said_to_be_taken_for_white():
+    loop = loop_with(DIGITAL)
+    record = noisy(loop)
+    white = np.random.default_rng(3).standard_normal(len(record) + 1)
+    # The logger reads twice and takes the mean, which the controller does not see.
+    coloured = cid.Record(r=record.r, u=record.u, y=record.y + 4e-6 * (white[1:] + white[:-1]),
+                          dt=DT)  # fmt: skip
+    said = "the sensor noise is taken for white here"
+    found = cid.compare(coloured, loop)
+    assert not found.tests[0].passed
+    assert f"note: {said}" in str(found)
+    assert "diagnose() fits coloured noise as well" in str(found)
+    assert said not in str(cid.compare(record, loop))
+
+
 def test_noise_is_said_to_explain_nothing_of_what_a_straight_line_does_better():
     """With u of the wrong sign a large random force explains any error."""
     pid = cid.PID(kp=50.0, ki=20.0, kd=2.0, filter_time=0.02, b=0.0)

@@ -70,6 +70,9 @@ def fit(estimator, record):
 def test_coloured_noise_is_said_in_capitals(kind):
     notes = fit("fit_loop", simulate_unstable(kind, 1)).notes
     assert any(SAYS in note for note in notes), notes
+    (said,) = (note for note in notes if SAYS in note)
+    assert "sensor noise is taken for white here" in said
+    assert "diagnose() fits coloured noise as well" in said
 
 
 @pytest.mark.parametrize("kind", ["averaged", "slow"])

@@ -162,8 +162,17 @@ def _compare_loop(record: Record, loop: Loop, horizon: int | None) -> Comparison
     curve, notes = _try_simulation(rejected, lambda: _simulate(record, loop, prediction))
     curves += [] if curve is None else [curve]
     made = _make_comparison(write_loop(loop), record, curves, residuals, notes)
+    if made.tests and not made.tests[0].passed:
+        # The first test is that of their own past.
+        made = replace(made, notes=(*made.notes, _TAKEN_FOR_WHITE))
     stepped = describe_unstated_steps(loop, record, prediction.sensor_noise)
     return replace(made, rejection=rejected, steps=stepped)
+
+
+_TAKEN_FOR_WHITE = (
+    "the sensor noise is taken for white here, and the one-step errors are not white. diagnose() "
+    "fits coloured noise as well, and tells whether anything but its colour is missing"
+)
 
 
 def _try_simulation(

@@ -146,7 +146,8 @@ def fit_loop(
     left_out = [describe_outliers(one, found)
                 for one, (_, found) in zip(given, masked, strict=True) if found.any()]  # fmt: skip
     innovations = [row for one in fit.standardized for row in np.atleast_2d(one.T)]
-    colour = note_coloured_innovations(innovations, len(fit.theta), _TOO_NARROW)
+    told = _TOO_NARROW + (_TELLS_COLOUR if fit.plant.e.siso else _TELLS)
+    colour = note_coloured_innovations(innovations, len(fit.theta), told)
     notes = (
         *note_unit_clashes(loop, fit.problem.data[0].record),
         *_note_distance(loop, given[0]),
@@ -267,9 +268,12 @@ def _note_unknown_controller(loop: Loop, records: Sequence[Record]) -> tuple[str
 
 
 _TOO_NARROW = (
-    "The standard errors are too small, and the values may be biased: diagnose() tells what the "
-    "model lacks."
+    "The sensor noise is taken for white here, so that the standard errors are too small, and the "
+    "values may be biased: diagnose() "
 )
+# Of several outputs a diagnosis takes the noise for white as well.
+_TELLS = "tells what the model lacks."
+_TELLS_COLOUR = "fits coloured noise as well, and tells what else the model lacks."
 
 
 def choose_free_names(
