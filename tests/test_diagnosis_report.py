@@ -379,6 +379,26 @@ def test_a_loop_without_its_plant_says_what_to_do(found, tmp_path):
     assert back.loop.parameters["CoulombFriction.fc"] == 0.3987
     with pytest.raises(cid.CtrlidError, match=r"load_diagnosis\(file, loop=loop\)"):
         back.loop.linearize()
+    with pytest.raises(cid.CtrlidError, match="so that its 'signals' is not known"):
+        cid.compare(record_of(servo(), swing=0.1, hold=20, n=200, seed=1), back.loop)
+
+
+def test_a_finding_by_itself_is_told_as_in_the_report(found, tmp_path):
+    base = found["explained"]
+    (finding,) = base.findings
+    told = replace(finding, units={"fc": "N"})
+    assert "fc = 0.3987 ± 0.0061 N, evidence 812" in str(told)
+    assert "likelihood" not in str(told)
+    assert "evidence 8.0" in str(replace(told, evidence=8.0))
+    back = load_diagnosis(replace(base, findings=(told,)).save(tmp_path / "f.json"))
+    assert str(back.findings[0]) == str(told)
+    # Files of earlier versions do not know the units.
+    path = base.save(tmp_path / "old.json")
+    data = json.loads(path.read_text("utf-8"))
+    for one in data["findings"]:
+        del one["units"]
+    path.write_text(json.dumps(data), "utf-8")
+    assert str(load_diagnosis(path)) == str(base)
 
 
 def test_a_loop_that_does_not_fit_is_refused(found, tmp_path):
@@ -817,8 +837,7 @@ def test_the_rest_of_a_small_catalogue_is_counted_in_words(rivals, words):
     friction = E.CoulombFriction(fc=0.1)
     starts = {"ViscousFriction": E.ViscousFriction(c=0.1), "ActuatorLag": E.ActuatorLag(tau=0.1)}
     tried = [friction, *(starts[name] for name in rivals)]
-    finding = SimpleNamespace(evidence=50.0, share=np.nan, names=("CoulombFriction",),
-                              equivalents=(), effect=friction, alternatives=())  # fmt: skip
+    finding = Finding(friction, {}, (), (), 50.0)
     found = SimpleNamespace(added=(finding,), verdict="explained", finished=True,
                             ranking=[SimpleNamespace(effect=e) for e in tried])  # fmt: skip
     assert words in wording.describe_certainty(found, finding)

@@ -1,5 +1,7 @@
 """A parameter that the model calls exact is a suspect like any effect."""
 
+from types import SimpleNamespace
+
 import control as ct
 import numpy as np
 import pytest
@@ -7,7 +9,7 @@ from scipy.integrate import solve_ivp
 
 import ctrlid as cid
 from ctrlid import effects as E
-from ctrlid.diagnosis.wording import describe_size, write_headline
+from ctrlid.diagnosis.wording import describe_parameters, describe_size, write_headline
 
 DT = 0.01
 TRUE = {"m": 0.2, "l": 0.3, "c": 0.02}
@@ -98,6 +100,23 @@ def test_a_report_says_the_right_value_in_place_of_the_given_one(found):
     assert describe_size(found, finding).startswith("m = 0.20")
     assert describe_size(found, finding).endswith(" in place of 0.2")
     assert "name = m" not in str(found)
+    assert finding.units == finding.effect.units(found.loop)
+
+
+@pytest.mark.parametrize(
+    ("given", "unit", "error", "spread", "words"),
+    [
+        (8750.0, "", 140.5, 4.8, "ER = 8890.5 ± 4.8 in place of 8750"),
+        (8750.0, "", 140.5, None, "ER = 8.89e+03 in place of 8.75e+03"),
+        (0.2, "kg", 0.006, 2e-4, "ER = 0.20600 ± 0.00020 kg in place of 0.2 kg"),
+        (0.5, "", 0.25, 0.1, "ER = 0.75 ± 0.10 in place of 0.5"),
+    ],
+)
+def test_a_value_and_the_one_it_replaces_have_the_same_digits(given, unit, error, spread, words):
+    loop = SimpleNamespace(parameters={"ER": given}, units={"ER": unit})
+    effect = E.ParameterError("ER", error=error / given)
+    errors = None if spread is None else {"error": spread / given}
+    assert describe_parameters(SimpleNamespace(loop=loop), effect, errors) == words
 
 
 @pytest.mark.slow

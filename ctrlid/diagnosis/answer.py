@@ -83,7 +83,9 @@ def assemble_answer(
     units = loop.known_units
     remarks = tuple(_describe_steps(r, units.get(r.effect.at, gap.unit)) for r in steps)
     read = [r for r in read if r not in steps]
-    findings += tuple(Finding(r.effect, r.errors, (), (), r.evidence) for r in read)
+    findings += tuple(
+        Finding(r.effect, r.errors, (), (), r.evidence, units=r.effect.units(loop)) for r in read
+    )
     findings = tuple(sorted(findings, key=lambda f: -f.evidence))
     final = fitted.loop
     for r in read:
@@ -237,7 +239,8 @@ def _make_finding(
     seen = _find_presence(f, found, records)
     note = "" if seen is None else describe_presence(seen, len(records))
     return Finding(effect, own, others, same, f.trial.gain, shares.get(f.position, math.nan),
-                   words, reference, note, tuple(k + 1 for k in seen or ()))  # fmt: skip
+                   words, reference, note, tuple(k + 1 for k in seen or ()),
+                   effect.units(loop))  # fmt: skip
 
 
 def _find_presence(f: Weighed, found: Search, records: Sequence[Record]) -> list[int] | None:

@@ -159,6 +159,8 @@ class Finding(Printed):
     records : tuple of int
         Numbers of the records, from 1, in which it is seen when each of several is fitted alone;
         empty for one record.
+    units : dict of str to str, or None
+        Units of the parameters, by name; None in files of earlier versions.
     """
 
     effect: AbstractEffect
@@ -171,6 +173,7 @@ class Finding(Printed):
     reference: Array | None = None
     note: str = ""
     records: tuple[int, ...] = ()
+    units: dict[str, str] | None = None
 
     def __post_init__(self) -> None:
         freeze_arrays(self)
@@ -190,12 +193,16 @@ class Finding(Printed):
         """The input, velocity or output at which the effect acts, of a plant with several."""
         return str(self.effect.at)
 
+    @property
+    def written_evidence(self) -> str:
+        """The evidence, with a decimal where it is not strong."""
+        return f"{self.evidence:.{0 if self.evidence >= THRESHOLD.strong else 1}f}"
+
     def __str__(self) -> str:
-        units, errors = self.effect.units(), self.standard_errors
+        units, errors = {**self.effect.units(), **(self.units or {})}, self.standard_errors
         sizes = [f"{name} = {write_quantity(value, units.get(name, ''), errors.get(name))}"
                  for name, value in self.effect.values().items()]  # fmt: skip
-        text = (f"{' or '.join(self.names)}: {', '.join(sizes)}, gain of log-likelihood "
-                f"{self.evidence:.4g}")  # fmt: skip
+        text = f"{' or '.join(self.names)}: {', '.join(sizes)}, evidence {self.written_evidence}"
         return "; ".join(filter(None, [text, self.note]))
 
 

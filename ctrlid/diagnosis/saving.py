@@ -71,8 +71,8 @@ class SavedLoop:
             raise AttributeError(name)
         raise CtrlidError(
             f"the loop of this diagnosis was loaded without its plant {self.plant_name!r}, which "
-            f"is Python code and not in the file, so there is no {name}. Give the loop that was "
-            "diagnosed: load_diagnosis(file, loop=loop)"
+            f"is Python code and not in the file, so that its {name!r} is not known. Give the loop "
+            "that was diagnosed: load_diagnosis(file, loop=loop)"
         )
 
 

@@ -370,7 +370,16 @@ def _describe_parameter_of_plant(
     given, unit = found.loop.parameters[effect.name], found.loop.units.get(effect.name, "")
     spread = None if error is None else abs(given) * error
     value = write_quantity(given * (1 + effect.error), unit, spread)
-    return f"{effect.name} = {value} in place of {write_quantity(given, unit)}"
+    return f"{effect.name} = {value} in place of {_write_alike(given, unit, spread)}"
+
+
+def _write_alike(given: float, unit: str, spread: float | None) -> str:
+    """Write a value with the digits of another one beside it, which has a standard error."""
+    if not (given and spread and math.isfinite(spread)):
+        return write_quantity(given, unit)
+    # A standard error has two digits, and from 1e6 on both are written with a power of ten.
+    digits = math.floor(math.log10(abs(given))) - math.floor(math.log10(spread)) + 2
+    return write_quantity(given, unit, digits=min(max(digits, 3), 12))
 
 
 def describe_forces(found: Diagnosis, effect: AbstractEffect) -> str:
@@ -396,8 +405,7 @@ def describe_certainty(found: Diagnosis, finding: Finding) -> str:
     """Say how sure it is that something like this effect is there, and that it is this one."""
     sure = ("WEAK" if finding.evidence < THRESHOLD.strong else
             "strong" if finding.evidence < THRESHOLD.certain else "very strong")  # fmt: skip
-    digits = 0 if finding.evidence >= THRESHOLD.strong else 1
-    text = f"evidence {finding.evidence:.{digits}f} ({sure})"
+    text = f"evidence {finding.written_evidence} ({sure})"
     told = math.isfinite(finding.share) and not _is_at_floor(found.gap.before, found.gap)
     if told and len(found.added) > 1:
         share = write_percent(finding.share)

@@ -93,7 +93,7 @@ class ParameterDrift(LawEffect):
 
     .. math:: \theta(t) = \theta (1 + \rho t)
 
-    A coil that warms up, a battery that runs down.
+    A coil that warms up, a battery that runs down, a heat exchanger that fouls.
 
     Parameters
     ----------
@@ -113,7 +113,7 @@ class ParameterDrift(LawEffect):
     rate: float = parameter("1/s", neutral=0.0)
 
     look_alikes: ClassVar[tuple[str, ...]] = ("ParameterStep", "ConstantForce", "SensorDrift")
-    sentence: ClassVar[str] = "A parameter of the plant drifts, as in a coil that warms up."
+    sentence: ClassVar[str] = "A parameter of the plant drifts, as from warming, wear or fouling."
     experiment: ClassVar[str] = "the same excitation at the beginning and at the end of a record"
 
     @classmethod
