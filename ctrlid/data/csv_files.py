@@ -449,21 +449,21 @@ def _read_with_blanks(
     rows: list[list[float]] = []
     texts, first = Texts(), 0
     # The cells of columns that begin with a text.
-    words: dict[int, list[str]] = {}
+    begun: dict[int, list[str]] = {}
     for k, cells in enumerate(_read_cells(body, separator)):
         if not cells or cells[0].lstrip().startswith("#"):
             continue
         numbers = []
         for column, cell in enumerate(cells):
-            if column in words:
-                words[column].append(cell)
+            if column in begun:
+                begun[column].append(cell)
             try:
                 plain = cell if separator == "," else cell.replace(",", ".")
                 numbers.append(float(plain) if plain.strip() else math.nan)
             except ValueError:
                 texts.setdefault(column, (cell, above + k + 1))
                 if not rows:
-                    words[column] = [cell]
+                    begun[column] = [cell]
                 numbers.append(math.nan)
         first = first if rows else k
         rows.append(numbers)
@@ -476,7 +476,7 @@ def _read_with_blanks(
             raise CtrlidError(f"{path} is not a table of numbers: line {above + k + 1} has "
                               f"{write_count(len(cells), 'cell')}, the lines above it "
                               f"{len(rows[0])}")  # fmt: skip
-    found = {column: read_seconds(cells) for column, cells in words.items()}
+    found = {column: read_seconds(cells) for column, cells in begun.items()}
     return np.array(rows), texts, {k: v for k, v in found.items() if v is not None}
 
 
