@@ -115,9 +115,10 @@ def _rebuild_loop(loop: Loop, saved: SavedLoop) -> Loop:
                           f"given has {name!r}. Give the loop that was diagnosed")  # fmt: skip
     e, known = loop.equations(), saved.known_units
     units = {name: known[name] for name in (*e.inputs, *e.outputs) if name in known}
+    limits: Any = saved.input_limits
     changed = dataclasses.replace(
-        loop, dt=saved.dt, at=saved.at, free=(), effects=saved.effects,
-        input_limits=saved.input_limits, units={**loop.units, **units},
+        loop, dt=saved.dt, at=saved.at, free=(), effects=saved.effects, input_limits=limits,
+        units={**loop.units, **units},
     )  # fmt: skip
     return dataclasses.replace(changed.with_parameters(saved.parameters), free=saved.free)
 

@@ -44,7 +44,7 @@ class SavedLoop:
     free : tuple of str, or dict of str to float
         The uncertain parameters, with how well each was known if that was said.
     input_limits : (float, float)
-        Limits of the actuator.
+        Limits of the actuator; each may be a tuple with a value for every input.
     effects : tuple of AbstractEffect
         The effects, with those that were found.
     parameters : dict of str to float
@@ -60,7 +60,7 @@ class SavedLoop:
     dt: float
     at: OperatingPoint
     free: tuple[str, ...] | dict[str, float]
-    input_limits: tuple[float, float]
+    input_limits: tuple[float | tuple[float, ...], float | tuple[float, ...]]
     effects: tuple[AbstractEffect, ...]
     parameters: dict[str, float]
     units: dict[str, dict[str, str]]

@@ -195,7 +195,9 @@ class Loop(Printed):
             # A transfer function is asked for its elements, too, and refuses otherwise.
             pair = tuple(given) if is_iterable(given) else ()
             lower, upper = (to_real_array(v, "input_limits") for v in pair)
-            pairs = np.broadcast_to(np.array(np.broadcast_arrays(lower, upper)).T, (inputs, 2))
+            # Where one of them differs between the inputs, both have a value for each.
+            lower, upper = np.broadcast_arrays(lower, upper)
+            pairs = np.broadcast_to(np.array([lower, upper]).T, (inputs, 2))
         except (TypeError, ValueError) as reason:
             raise CtrlidError("input_limits is a pair (lower, upper) in input units; given "
                               f"{self.input_limits!r}") from reason  # fmt: skip
