@@ -1,5 +1,8 @@
 """A beam on two magnets: two inputs that act on both coordinates, two references, two outputs."""
 
+from dataclasses import replace
+from functools import partial
+
 import control as ct
 import numpy as np
 import pytest
@@ -74,3 +77,72 @@ def test_limits_of_one_and_of_each_input_survive_a_file(limits, record, tmp_path
         assert back.loop.input_limits == loop.input_limits
         assert str(back) == str(found)
         assert back.save(tmp_path / "again.json").read_text() == file.read_text()
+
+
+# --- names of a record that are not those of the model
+
+
+def call(record, **names):
+    return replace(record, names={**record.names, **names})
+
+
+@pytest.mark.parametrize("judge", [
+    lambda record, loop: cid.audit(record, loop),
+    lambda record, loop: cid.compare(record, loop),
+    lambda record, loop: cid.predict(loop, record),
+    lambda record, loop: cid.fit_loop(loop, record).estimate,
+    lambda record, loop: cid.diagnose(loop, record, catalogue=[E.SensorGain], progress=False),
+], ids=["audit", "compare", "predict", "fit", "diagnose"])  # fmt: skip
+def test_other_names_are_taken_in_order_with_a_warning(judge, record):
+    loop = make_loop()
+    other = call(record, r=("ref1", "ref2"), y=("gap", "tilt"))
+    with pytest.warns(cid.CtrlidWarning) as caught:
+        found = judge(other, loop)
+    texts = [str(w.message) for w in caught]
+    assert len(texts) == 2
+    assert "y of the record is (gap, tilt), and none of these is a name in the loop" in texts[0]
+    assert "Record.from_csv(..., names={'gap': 'z', 'tilt': 'phi'})" in texts[0]
+    assert "in order as (r_z, r_phi)" in texts[1]
+    if hasattr(found, "seconds"):
+        found = replace(found, seconds=0.0)
+        assert str(found) == str(replace(judge(record, loop), seconds=0.0))
+    else:
+        assert str(found) == str(judge(record, loop))
+
+
+def test_signals_without_names_are_taken_in_order_without_a_word(record):
+    bare = replace(record, names={})
+    assert str(cid.compare(bare, make_loop())) == str(cid.compare(record, make_loop()))
+
+
+@pytest.mark.parametrize(("names", "words"), [
+    ({"y": ("phi", "gap")}, r"y of the record is \(phi, gap\), and the loop has \(z, phi\): phi is "
+     r"found by name, but which of the others is z\? Name gap so"),
+    ({"u": ("left", "i2")}, r"i2 is found by name, but which of the others is i1\?"),
+    ({"r": ("ref", "r_z")}, r"r_z is found by name, but which of the others is r_phi\?"),
+])  # fmt: skip
+@pytest.mark.parametrize("judge", [cid.audit, cid.compare, cid.fit_loop, cid.predict])
+def test_some_names_and_not_the_others_are_refused(judge, names, words, record):
+    with pytest.raises(cid.CtrlidError, match=words):
+        judge(call(record, **names), make_loop())
+
+
+def test_columns_get_the_names_of_the_model_as_they_are_read(tmp_path):
+    file = tmp_path / "log.csv"
+    file.write_text("t [s],Soll [mm],Ball [mm],Wippe [mrad],V\n0,0,1,2,3\n0.1,0,1,2,4\n")
+    read = partial(cid.Record.from_csv, file, r="Soll", u="V", y=("Ball", "Wippe"))
+    made = read(names={"Ball": "x", "Wippe": "theta"}, scale={"x": 1e-3, "Wippe": 1e-3},
+                units={"x": "m", "theta": "rad"})  # fmt: skip
+    assert made.names == {"r": "Soll", "u": "V", "y": ("x", "theta")}
+    assert made.units == {"r": "mm", "y": ("m", "rad")}
+    np.testing.assert_allclose(made.y[:, 0], [1e-3, 2e-3])
+    by_channel = read(names={"y": ("x", "theta"), "r": "r_x"})
+    assert by_channel.names == {"r": "r_x", "u": "V", "y": ("x", "theta")}
+    assert read(names={"Ball": "x"}).names["y"] == ("x", "Wippe")
+    made.to_csv(tmp_path / "own.csv")
+    again = cid.Record.from_csv(tmp_path / "own.csv", names={"theta": "alpha"})
+    assert again.names == {**made.names, "y": ("x", "alpha")}
+    with pytest.raises(cid.CtrlidError, match="names= names 'Balken', but the channels are r, u"):
+        read(names={"Balken": "x"})
+    with pytest.raises(cid.CtrlidError, match="names has 1 words for y"):
+        read(names={"y": ("x",)})

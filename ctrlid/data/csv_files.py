@@ -103,6 +103,7 @@ def read_csv(
     path: Path, sources: Mapping[str, str | Sequence[str] | None], time: str | None,
     dt: float | None, extra: Sequence[str] | None, units: Mapping[str, Any] | None,
     hold: str | None, name: str | None, gaps: str, scale: Mapping[str, float] | None = None,
+    renamed: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """Return the fields of a record; see `Record.from_csv`, `sources` are its r, u and y."""
     if not isinstance(gaps, str) or gaps not in ("error", "mask"):
@@ -201,10 +202,16 @@ def read_csv(
         valid = (rows_valid & valid[:, None]).T
     at = {key: [found[key, i] for i in range(len(each))] for key, each in columns.items()}
     every = {**at, **{label: [k] for label, k in further.items()}}
-    called = own.get("names", {})
+    known = {key: tuple(names[k] for k in ks) for key, ks in at.items()}
+    called = own.get("names", {k: v for k, v in known.items() if v != (k,)})
     spoken = _list_names(every, names, header, called)
+    if renamed:
+        own_words = _list_names(at, names, header, called)
+        called = _rename(called, known, _spread_words("names", renamed, own_words, at))
+        # A signal may be scaled by its new name as well.
+        spoken = {**_list_names(every, names, header, called), **spoken}
     factors = _check_scale(scale or {}, spoken, every)
-    stated = _spread_units(units or {}, spoken, every)
+    stated = _spread_words("units", units or {}, spoken, every)
     written = {(key, i): labels[k] for key, ks in every.items() for i, k in enumerate(ks)}
     _question_units(stated, written, factors, every, path)
     # The unit in the header is that of the numbers before they were scaled.
@@ -215,13 +222,12 @@ def read_csv(
     }  # fmt: skip
     scales = {key: np.array([[factors.get((key, i), 1.0)] for i in range(len(ks))])
               for key, ks in every.items()}  # fmt: skip
-    known = {key: tuple(names[k] for k in ks) for key, ks in at.items()}
     return {
         **{key: table[:, ks].T * scales[key] for key, ks in at.items()},
         "extra": {label: table[:, k] * scales[label][0, 0] for label, k in further.items()},
         "dt": dt, "start": start, "valid": valid,
         "units": {key: words for key, words in read.items() if any(words)},
-        "names": called if "names" in own else {k: v for k, v in known.items() if v != (k,)},
+        "names": called,
         "hold": hold or own.get("hold", "zoh"),
         "hold_r": own.get("hold_r", "zoh"),
         "name": own.get("name", path.stem) if name is None else name,
@@ -290,14 +296,28 @@ def _check_scale(
     return found
 
 
-def _spread_units(
-    units: Mapping[str, Any], spoken: Mapping[str, list[Signal]], every: Mapping[str, Sequence[int]]
-) -> dict[Signal, str]:
-    """Return the stated units of signals; one stands for all signals of a name."""
+def _spread_words(
+    what: str, given: Mapping[str, Any], spoken: Mapping[str, list[Signal]],
+    every: Mapping[str, Sequence[int]],
+) -> dict[Signal, str]:  # fmt: skip
+    """Return the stated units or names of signals; one unit stands for all signals of a name."""
     found: dict[Signal, str] = {}
-    for name, signals in _find_signals("units", units, spoken, every).items():
-        words = check_words("units", {name: units[name]}, (name,), {name: len(signals)})[name]
+    for name, signals in _find_signals(what, given, spoken, every).items():
+        words = check_words(what, {name: given[name]}, (name,), {name: len(signals)})[name]
         found |= dict(zip(signals, (words,) if isinstance(words, str) else words, strict=True))
+    return found
+
+
+def _rename(
+    called: Any, known: Mapping[str, Sequence[str]], renamed: Mapping[Signal, str]
+) -> dict[str, Any]:
+    """Return the names of all signals, some of them renamed."""
+    found = dict(called) if isinstance(called, Mapping) else {}
+    for key in {key for key, _ in renamed}:
+        own = found.get(key)
+        own = [own] if isinstance(own, str) else own
+        own = own if isinstance(own, list) and len(own) == len(known[key]) else known[key]
+        found[key] = [renamed.get((key, i), word) for i, word in enumerate(own)]
     return found
 
 

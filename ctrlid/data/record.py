@@ -499,6 +499,7 @@ class Record(Printed):
         units: Mapping[str, str | Sequence[str]] | None = None, hold: Hold | None = None,
         name: str | None = None, gaps: Literal["error", "mask"] = "error",
         scale: Mapping[str, float] | None = None,
+        names: Mapping[str, str | Sequence[str]] | None = None,
     ) -> "Record":  # fmt: skip
         """Read a record from a CSV file with a header line.
 
@@ -536,6 +537,10 @@ class Record(Printed):
             ``scale={"r": np.pi / 180, "y": np.pi / 180}, units={"r": "rad", "y": "rad"}``, and two
             outputs in mm and degrees SI units with ``scale={"x": 1e-3, "phi": np.pi / 180}``. A
             scaled signal has the unit in `units`, and none without.
+        names : mapping, optional
+            What the signals are called, instead of their columns, by column or by channel:
+            ``names={"Ball": "x", "Wippe": "theta"}`` or ``names={"y": ("x", "theta")}``. A loop
+            of several signals finds them by the names in its plant.
 
         Returns
         -------
@@ -557,7 +562,7 @@ class Record(Printed):
         check_arguments(Record.from_csv, locals(), "gaps")
         return cls(**_csv.read_csv(
             Path(path), {"r": r, "u": u, "y": y}, time, dt, extra, units, hold, name, gaps,
-            scale,
+            scale, names,
         ))  # fmt: skip
 
     def to_csv(self, path: str | Path) -> None:

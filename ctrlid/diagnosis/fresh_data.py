@@ -204,8 +204,10 @@ def choose_fresh_data(
             raise CtrlidError(f"{both}; give both the same period")
     e = loop.equations()
     if not e.siso:
-        records = [match_signals(r, e) for r in records]
-        validation = None if validation is None else [match_signals(r, e) for r in validation]
+        records = [match_signals(r, e, loop.wiring) for r in records]
+        validation = (
+            None if validation is None else [match_signals(r, e, loop.wiring) for r in validation]
+        )
     rest: tuple[Record, ...] | None = None
     if validation is None:
         windows, rest = zip(*(gaps.hold_out(r) for r in records), strict=True)

@@ -201,7 +201,7 @@ def diagnose(
     require_valid_samples(records, "record=")
     given = make_loop(loop, records[0])
     if not given.equations().siso:
-        records = tuple(match_signals(one, given.equations()) for one in records)
+        records = tuple(match_signals(one, given.equations(), given.wiring) for one in records)
     for one in records:
         refuse_unit_clashes(given, one)
     loop = with_units_of(given, records[0])

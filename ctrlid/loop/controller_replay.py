@@ -230,7 +230,7 @@ def replay_from_best_state(loop: Loop, record: Record) -> tuple[Array, Array]:
         raise CtrlidError(f"{both}; give both the same period: "
                           f"{write_difference(loop.dt, record.dt)}")  # fmt: skip
     if not loop.equations().siso:
-        record = match_signals(record, loop.equations())
+        record = match_signals(record, loop.equations(), loop.wiring)
     if not knows_references(loop.wiring, record):
         raise ModelCannotRun("the record has no reference r, which the controller needs; give it "
                               "r=, a constant for a fixed set-point")  # fmt: skip

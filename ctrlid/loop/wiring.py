@@ -1,8 +1,9 @@
 """How the signals of a controller are wired to those of a plant, by their names."""
 
 import re
+import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import casadi
@@ -10,7 +11,7 @@ import control as ct
 import numpy as np
 
 from .._base.arrays import Array
-from .._base.errors import CtrlidError
+from .._base.errors import CtrlidError, CtrlidWarning
 from .._base.text import write_count, write_list
 from ..data.record import Record
 from ..physics.conversions import require_finite_coefficients, to_state_matrices
@@ -292,6 +293,10 @@ def stack_references(
     rows = [] if given is None else list(np.atleast_2d(np.asarray(given, dtype=float)))
     if names is None or not set(names) <= set(wiring.open):
         unknown = [] if names is None else [name for name in names if name not in wiring.open]
+        if names is not None and not strict and len(rows) == len(names) > 1:
+            order = _find_reference_order(wiring, len(rows))
+            if order:
+                _refuse_some_names("r", names, order)
         # A record's own names may be others; then its references are taken in order.
         choices = [c for c in (needed, list(wiring.open)) if len(c) == len(rows) and not strict]
         if not choices and rows:
@@ -332,8 +337,11 @@ def knows_references(wiring: Wiring | None, record: Record) -> bool:
     return record.r is not None or (wiring is not None and None not in wiring.held)
 
 
-def match_signals(record: Record, plant: Equations) -> Record:
-    """Return a record with the inputs and outputs of a plant, in its order.
+def match_signals(record: Record, plant: Equations, wiring: Wiring | None = None) -> Record:
+    """Return a record with the inputs and outputs of a plant, in its order and under its names.
+
+    Signals of the plant's names are found by these, in whatever order. Where none has the name of
+    one, they are taken in order, and a warning says so of several that have names.
 
     Parameters
     ----------
@@ -341,29 +349,91 @@ def match_signals(record: Record, plant: Equations) -> Record:
         The data.
     plant : Equations
         The plant.
+    wiring : Wiring, optional
+        The wiring of a controller, whose references are matched likewise.
 
     Returns
     -------
     Record
-        With the signals of the plant's names, or as it is where it has as many of other names.
+        With the names of the plant's signals; those of a plant with one input and one output
+        keep theirs.
 
     Raises
     ------
     CtrlidError
-        If it has neither.
+        If the record has another number of signals, or the names of some of them only.
     """
     chosen: dict[str, Any] = {}
+    placed: dict[str, tuple[str, ...]] = {}
     for key, names in (("u", plant.inputs), ("y", plant.outputs)):
         known = record.signals[key]
         if set(names) <= set(known):
             chosen[key] = names
-        elif len(known) != len(names):
+        elif len(known) == len(names):
+            placed[key] = names
+        else:
             raise CtrlidError(
                 f"{plant.name} has {'inputs' if key == 'u' else 'outputs'} ({', '.join(names)}), "
                 f"but {key} of the record is ({', '.join(known)}): give it these, pick them with "
                 f"record.select({key}=...), or name the inputs that it has with Loop(driven=...)"
             )
-    return record.select(**chosen) if chosen else record
+    record = record.select(**chosen) if chosen else record
+    if plant.siso:
+        return record
+    # A single reference needs no name, so that it keeps its own.
+    given = record.signals.get("r", ())
+    if wiring is not None and len(given) > 1 and not set(given) <= set(wiring.open):
+        order = _find_reference_order(wiring, len(given))
+        placed |= {"r": tuple(order)} if order else {}
+    for key, names in placed.items():
+        _refuse_some_names(key, record.signals[key], names)
+        if len(names) > 1 and key in record.names:
+            _warn_of_order(key, record.names[key], names)
+    # One name stands for one signal, as in every record.
+    called = {key: names[0] if len(names) == 1 else names for key, names in placed.items()}
+    return replace(record, names={**record.names, **called})
+
+
+def _find_reference_order(wiring: Wiring, count: int) -> list[str]:
+    """Return which references so many series without their names are; empty if no such number."""
+    needed = [name for name, v in zip(wiring.open, wiring.held, strict=True) if v is None]
+    return next((c for c in (needed, list(wiring.open)) if len(c) == count), [])
+
+
+def _suggest_names(key: str, given: Sequence[str], wanted: Sequence[str]) -> str:
+    """Say how the signals of a record get the names of those of the loop."""
+    pairs = {a: b for a, b in zip(given, wanted, strict=True) if a != b}
+    return (f"Record.from_csv(..., names={pairs}) where a file has these columns, or "
+            f"dataclasses.replace(record, names={{**record.names, {key!r}: "
+            f"{tuple(wanted)}}})")  # fmt: skip
+
+
+def _refuse_some_names(key: str, given: Sequence[str], wanted: Sequence[str]) -> None:
+    """Refuse signals of which some have the names of the loop and others have not."""
+    common = [name for name in wanted if name in given]
+    if not common:
+        return
+    other = [name for name in given if name not in wanted]
+    rest = [name for name in wanted if name not in given]
+    # The others may stand in any order; the suggestion is no more than one.
+    order = iter(rest)
+    likely = [name if name in wanted else next(order) for name in given]
+    raise CtrlidError(
+        f"{key} of the record is ({', '.join(given)}), and the loop has ({', '.join(wanted)}): "
+        f"{write_list(common)} {'is' if len(common) == 1 else 'are'} found by name, but which of "
+        f"the others is {write_list(rest)}? Name {write_list(other)} so, as in "
+        f"{_suggest_names(key, given, likely)}"
+    )
+
+
+def _warn_of_order(key: str, given: Sequence[str], wanted: Sequence[str]) -> None:
+    """Warn of several signals that are taken in order, since no name of theirs is one of a loop."""
+    warnings.warn(
+        f"{key} of the record is ({', '.join(given)}), and none of these is a name in the loop: "
+        f"they are taken in order as ({', '.join(wanted)}). If that is their order, name them so, "
+        f"with {_suggest_names(key, given, wanted)}; if not, give each its own of these names",
+        CtrlidWarning, stacklevel=4,
+    )  # fmt: skip
 
 
 def make_wired_law(controller: Any, wiring: Wiring, at: OperatingPoint, dt: float) -> ControlLaw:

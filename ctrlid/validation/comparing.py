@@ -108,7 +108,7 @@ def compare(record: Record, model_or_loop: Any, *, horizon: int | None = None) -
         )
     several = isinstance(model_or_loop, Loop) and not model_or_loop.equations().siso
     if several:
-        record = match_signals(record, model_or_loop.equations())
+        record = match_signals(record, model_or_loop.equations(), model_or_loop.wiring)
     else:
         require_one_signal("compare", model_or_loop, record)
     if horizon is not None and not (isinstance(horizon, Integral) and 1 <= horizon < len(record)):

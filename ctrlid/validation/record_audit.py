@@ -249,7 +249,7 @@ def _audit_several(record: Record, loop: Loop | None) -> Audit:
     Steps, limits and repeats are found by the name of the signal.
     """
     if loop is not None:
-        record = match_signals(record, loop.equations())
+        record = match_signals(record, loop.equations(), loop.wiring)
     findings: list[AuditFinding] = []
     quantum, saturated = dict[str, float](), dict[str, tuple[float, float, float, float]]()
     u, y = record.signals["u"], record.signals["y"]

@@ -139,7 +139,7 @@ def fit_simulation(
     _require_start(loop, names)
     given = as_records(record)
     masked = [mask_outliers(one) for one in given]
-    records = tuple(match_signals(one, loop.equations()) for one, _ in masked)
+    records = tuple(match_signals(one, loop.equations(), loop.wiring) for one, _ in masked)
     for one in records:
         how = choose_reproduction(loop, one)
         if how.horizon:

@@ -39,7 +39,7 @@ def check_wired_controller(loop: Loop, record: Record) -> list[Fact]:
     law, e = loop.law(), loop.equations()
     if law is None or law.dt == 0.0 or not knows_references(loop.wiring, record):
         return []
-    record = match_signals(record, e)
+    record = match_signals(record, e, loop.wiring)
     first = int(np.argmax(record.valid_samples))
     if record.n - first < FEWEST:
         return []

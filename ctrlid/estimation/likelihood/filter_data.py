@@ -142,7 +142,7 @@ def can_follow_controller(loop: Loop, record: Record) -> bool:
 def _make_several(loop: Loop, record: Record, start_time: float) -> FilterData:
     """Make a record of several signals ready; see `make_filter_data`."""
     e, wiring = loop.equations(), loop.wiring
-    record = match_signals(record, e)
+    record = match_signals(record, e, wiring)
     n = len(record)
     valid = np.array(record.valid_outputs.T)
     if np.any(valid.sum(axis=0) < FEWEST):
