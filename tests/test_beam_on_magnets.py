@@ -9,6 +9,7 @@ import pytest
 
 import ctrlid as cid
 from ctrlid import effects as E
+from ctrlid.validation.reproduction import find_law_rejection
 
 DT, GAP, CURRENT = 0.002, 0.01, 4.4294
 UNITS = {"z": "m", "phi": "rad", "i1": "A", "i2": "A", "K": "N m^2/A^2", "J": "kg m^2"}
@@ -146,3 +147,56 @@ def test_columns_get_the_names_of_the_model_as_they_are_read(tmp_path):
         read(names={"Balken": "x"})
     with pytest.raises(cid.CtrlidError, match="names has 1 words for y"):
         read(names={"y": ("x",)})
+
+
+# --- signs and exchanged signals
+
+
+def turn(record, key, sign):
+    return replace(record, **{key: getattr(record, key) * np.array(sign)[:, None]})
+
+
+def exchange(record, key):
+    return replace(record, **{key: getattr(record, key)[::-1]})
+
+
+@pytest.fixture(scope="module", params=[0.0, 0.05], ids=["exact", "dither"])
+def moved(request):
+    """A record whose inputs are exact, or have dither of 0.05 A."""
+    rng = np.random.default_rng(5)
+    return make_record(1500, d=request.param * rng.choice([-1.0, 1.0], (2, 1500)))
+
+
+@pytest.mark.parametrize(("kind", "words", "change"), [
+    ("sign", "with the opposite sign of r_phi", lambda record: turn(record, "r", (1, -1))),
+    ("sign", "with the opposite sign of phi", lambda record: turn(record, "y", (1, -1))),
+    ("sign", "with the opposite sign of i2", lambda record: turn(record, "u", (1, -1))),
+    ("exchange", "with i1 and i2 exchanged", lambda record: exchange(record, "u")),
+    ("exchange", "with z and phi exchanged", lambda record: exchange(record, "y")),
+    ("exchange", "with r_z and r_phi exchanged", lambda record: exchange(record, "r")),
+], ids=["r sign", "y sign", "u sign", "u", "y", "r"])  # fmt: skip
+def test_what_is_mixed_up_is_named(kind, words, change, moved):
+    found = cid.audit(change(moved), make_loop())
+    (fact,) = found[kind]
+    assert f"but {words} it is: what remains unexplained falls from" in fact.text
+    assert fact.harmful
+    assert not found["unknown"]
+    assert words in find_law_rejection(make_loop(), change(moved))
+
+
+def test_a_right_log_and_other_gains_are_not_mixed_up(moved):
+    assert not cid.audit(moved, make_loop()).harmful
+    other = replace(make_loop(), controller=make_controller(-1.3))
+    found = cid.audit(moved, other)
+    assert found["unknown"]
+    assert not found["sign"]
+    assert not found["exchange"]
+
+
+def test_signals_at_rest_leave_two_answers():
+    """Without tilt the two magnets are alike, and so are their currents."""
+    n = 1500
+    r_phi = 2e-3 * np.sign(np.sin(np.arange(n) / 20))
+    record = cid.simulate(make_loop(), {"r_z": np.full(n, GAP), "r_phi": r_phi}, seed=1)
+    (fact,) = cid.audit(exchange(record, "u"), make_loop())["exchange"]
+    assert "with i1 and i2 exchanged" in fact.text

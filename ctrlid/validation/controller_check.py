@@ -71,8 +71,8 @@ IMMATERIAL = 0.01
 # A law that explains so much of u by a negative factor has the wrong sign, whatever else it lacks.
 OPPOSITE = 0.5
 # Kinds of finding after which the stated law is not that of the record.
-REJECTED = ("gain", "sign", "delay", "limit", "filter", "sampled", "anti-windup", "logger",
-            "unknown")  # fmt: skip
+REJECTED = ("gain", "sign", "exchange", "delay", "limit", "filter", "sampled", "anti-windup",
+            "logger", "unknown")  # fmt: skip
 # Of these, what leaves an immaterial share of u steers no simulation.
 SMALL_MATTERS = ("anti-windup", "logger", "unknown")
 # These look the same where the log of a signal has them and not the controller.
