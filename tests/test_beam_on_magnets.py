@@ -200,3 +200,25 @@ def test_signals_at_rest_leave_two_answers():
     record = cid.simulate(make_loop(), {"r_z": np.full(n, GAP), "r_phi": r_phi}, seed=1)
     (fact,) = cid.audit(exchange(record, "u"), make_loop())["exchange"]
     assert "with i1 and i2 exchanged" in fact.text
+
+
+# --- a model of two outputs with poles of their own in a redesign
+
+
+def test_outputs_with_poles_of_their_own_keep_them():
+    """Height and tilt are two plants of two poles each, of which two states are no model."""
+    G = cid.fit_iv(make_record(3000), na=2, nb=2)
+    states = G.to_states()
+    assert states.nstates == 4
+    for w in (1.0, 50.0, 400.0):
+        z = np.exp(1j * w * DT)
+        np.testing.assert_allclose(states(z), G(z), rtol=1e-7)
+    given = []
+    outcome = cid.redesign(G, make_loop(), step={"r_z": 5e-5, "r_phi": 1e-3},
+                           design=lambda P: given.append(P) or make_controller())  # fmt: skip
+    assert given[0].nstates == 4
+    assert "DOES NOT STABILIZE" not in str(outcome)
+    assert [(step.reference, step.output) for step in outcome.steps] == [
+        ("r_z", "z"), ("r_phi", "phi"),
+    ]  # fmt: skip
+    assert "(r_z by 50 µm, r_phi by 0.001 rad)" in str(outcome)

@@ -521,7 +521,12 @@ def _find_followed(loop: Loop, model: Any, name: str) -> str | None:
         states = model.state_labels if isinstance(model, ct.StateSpace) else []
         known = states[int(match[1])] if int(match[1]) < len(states) else ""
         return known if known in outputs else None
-    return name if name in outputs else None
+    if name in outputs:
+        return name
+    # One that is called r_z or z_ref is for z, unless it is a state such as z_dot.
+    affixed = [y for y in outputs if re.fullmatch(rf".*[\W_]{re.escape(y)}|{re.escape(y)}[\W_].*",
+               name)]  # fmt: skip
+    return affixed[0] if len(affixed) == 1 and name not in loop.equations().states else None
 
 
 def _choose_steps(

@@ -18,6 +18,11 @@ from .._base.arrays import Array, ComplexArray, read_only
 from .._base.errors import CtrlidError
 from ..physics.conversions import reduce_states, to_transfer_function
 
+# Fewer states stand for a model whose frequency response they change by at most this share.
+NEAR = 0.2
+# The responses are compared at so many frequencies.
+FREQUENCIES = 60
+
 
 @dataclass(frozen=True)
 class Structure:
@@ -532,15 +537,16 @@ class IdentifiedSystem(control.TransferFunction):
     def to_states(self, order: int | None = None) -> control.StateSpace:
         """Return the model in states.
 
-        They are no physical quantities: a state feedback on them needs an observer. All outputs
-        show one plant, so that where they have as many poles each they get one denominator, the
-        mean weighted by what each of them knows, and the system of all equations is reduced to
-        `order` states by its pulse response.
+        They are no physical quantities: a state feedback on them needs an observer. Where all
+        outputs show the same poles they get one denominator, the mean weighted by what each of
+        them knows, and the system of all equations is reduced to `order` states by its pulse
+        response. Outputs that move by poles of their own keep them.
 
         Parameters
         ----------
         order : int, optional
-            Number of states; by default the largest number of poles of an output. As many as all
+            Number of states; by default the smallest from the largest number of poles of an
+            output on whose frequency response is that of the model within a fifth. As many as all
             outputs have together leaves the model as it is.
 
         Returns
@@ -555,7 +561,11 @@ class IdentifiedSystem(control.TransferFunction):
         """
         check_arguments(IdentifiedSystem.to_states, locals())
         counts = [e.structure.fraction(e.values)[1].size - 1 for e in self.estimates.values()]
-        order = max(e.structure.na for e in self.estimates.values()) if order is None else order
+        if order is None:
+            least = min(max(e.structure.na for e in self.estimates.values()), sum(counts))
+            each = (self.to_states(k) for k in range(least, sum(counts)))
+            near = (states for states in each if self._measure_distance(states) <= NEAR)
+            return next(near, None) or self.to_states(sum(counts))
         if not 1 <= order <= sum(counts):
             raise CtrlidError(f"order is a number of states from 1 to {sum(counts)}; given {order}")
         blocks = []
@@ -577,6 +587,19 @@ class IdentifiedSystem(control.TransferFunction):
             system = reduce_states(*system, order)
         return control.ss(*system, np.vstack(d), self.dt,
                           inputs=self.input_labels, outputs=self.output_labels)  # fmt: skip
+
+    def _measure_distance(self, states: control.StateSpace) -> float:
+        """Return by which share the response of a system of states differs from that of the model.
+
+        The mean over frequencies of the output that differs most.
+        """
+        points = np.exp(1j * np.pi * np.logspace(-3, 0, FREQUENCIES))
+        mine, other = (np.array([g(z) for z in points]) for g in (self, states))
+        shape = (len(points), self.noutputs, self.ninputs)
+        mine, other = (np.reshape(v, shape) for v in (mine, other))
+        apart = np.linalg.norm(mine - other, axis=2)
+        share = apart / np.maximum(np.linalg.norm(mine, axis=2), 1e-300)
+        return float(np.max(np.mean(share, axis=0)))
 
     def _share_denominator(self) -> list[Array] | None:
         """Return the coefficients of all outputs with one denominator, by generalized averaging."""
