@@ -9,6 +9,7 @@ import pytest
 
 import ctrlid as cid
 from ctrlid import effects as E
+from ctrlid.estimation.likelihood.physics_estimate import note_absurd_values
 from ctrlid.validation.reproduction import find_law_rejection
 
 DT, GAP, CURRENT = 0.002, 0.01, 4.4294
@@ -222,3 +223,27 @@ def test_outputs_with_poles_of_their_own_keep_them():
         ("r_z", "z"), ("r_phi", "phi"),
     ]  # fmt: skip
     assert "(r_z by 50 µm, r_phi by 0.001 rad)" in str(outcome)
+
+
+# --- what a fit and a loop say
+
+
+def test_a_value_absurdly_far_from_its_start_is_said_so_in_capitals(record):
+    found = cid.fit_loop(make_loop(), exchange(record, "u")).estimate
+    ratio = found["J"] / 0.012
+    assert not 1e-3 < ratio < 1e3
+    (note,) = (note for note in found.notes if note.startswith("ABSURDLY FAR FROM THE START: "))
+    assert "J = " in note
+    assert "in place of 0.012" in note
+    assert "THE START" not in str(cid.fit_loop(make_loop(), record).estimate)
+
+
+def test_values_are_absurd_beyond_a_factor_of_a_thousand():
+    starts = {"J": 0.012, "k": -2.0, "c": 0.0, "m": 1.0}
+    values = np.array([0.011, -1.9, 5.0, 500.0])
+    assert note_absurd_values(tuple(starts), starts, values) == ()
+    values = np.array([0.012e-4, -1.9, 5.0, 5000.0])
+    (note,) = note_absurd_values(tuple(starts), starts, values)
+    assert note.startswith("ABSURDLY FAR FROM THE START: J = 1.2e-06 in place of 0.012 and m = "
+                           "5000 in place of 1. ")  # fmt: skip
+    assert note_absurd_values(("lag",), starts, np.array([1e9])) == ()

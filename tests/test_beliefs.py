@@ -78,9 +78,9 @@ def test_the_covariance_of_two_parameters(record):
 def test_an_unknown_that_the_record_does_not_tell_is_as_believed(record):
     """A mass and the gain of its input, of which the record sees the ratio."""
     plain = cid.fit_loop(servo(("m", "k", "c")), record).estimate
-    assert any("do not determine" in note for note in plain.notes)
+    assert any("DO NOT DETERMINE" in note for note in plain.notes)
     known = cid.fit_loop(servo({"m": 0.05, "k": math.inf, "c": math.inf}), record).estimate
-    assert not any("do not determine" in note for note in known.notes)
+    assert not any("DO NOT DETERMINE" in note for note in known.notes)
     error = known.covariance[0, 0] ** 0.5
     assert error == pytest.approx(0.05 * TRUE["m"], rel=0.02)
     assert known.values[0] == pytest.approx(TRUE["m"], rel=1e-3)

@@ -383,7 +383,7 @@ def test_parameters_that_do_the_same_are_said_to():
     found = fitted.estimate
     assert np.isinf(found.standard_errors).all()
     assert found.notes == (
-        "the data do not determine K and m: other parameters can compensate a change of them",
+        "THE DATA DO NOT DETERMINE K and m: other parameters can compensate a change of them",
     )
     assert str(found).count("(not determined by the data)") == 2
     ratio = fitted.loop.parameters["K"] / fitted.loop.parameters["m"]

@@ -63,7 +63,7 @@ def test_levels_tell_offsets_only_without_an_intercept():
     )
     assert with_levels["InputOffset.offset"] == pytest.approx(0.05, rel=0.01)
     assert np.isinf(without.standard_errors[1])
-    assert "do not determine InputOffset.offset" in str(without)
+    assert "DO NOT DETERMINE InputOffset.offset" in str(without)
     assert without["c"] == pytest.approx(2.0, rel=2e-3)
 
 
@@ -251,4 +251,4 @@ def test_what_the_data_do_not_say():
     found = cid.fit_simulation(loop, record).estimate
     # Mass, friction and force per volt scale together.
     assert np.isinf(found.standard_errors).all()
-    assert "the data do not determine m, c and k" in str(found)
+    assert "THE DATA DO NOT DETERMINE m, c and k" in str(found)

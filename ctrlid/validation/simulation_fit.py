@@ -24,8 +24,13 @@ from ..data.several_records import as_records, order_model_and_data
 from ..effects import Quantization
 from ..estimation.likelihood.filter_data import FEWEST, find_noise_units
 from ..estimation.likelihood.likelihood import list_parameter_bounds
-from ..estimation.likelihood.physics_estimate import LoopFit, SimulationEstimate, mark_unseen
-from ..estimation.likelihood.physics_fit import choose_free_names
+from ..estimation.likelihood.physics_estimate import (
+    LoopFit,
+    SimulationEstimate,
+    mark_unseen,
+    note_absurd_values,
+)
+from ..estimation.likelihood.physics_fit import choose_free_names, list_starts
 from ..loop.loop import Loop
 from ..loop.period_map import leave_out_kinks, linearize_sensors_at_rest, make_period_map
 from ..loop.sensitivities import (
@@ -147,7 +152,7 @@ def fit_simulation(
                 f"fit_simulation cannot simulate this record, because {_explain(loop, one)} "
                 "fit_loop(loop, record) fits the same parameters without a simulation"
             )
-    sizes = np.full(len(loop.signals["y"]), np.inf)
+    sizes, starts = np.full(len(loop.signals["y"]), np.inf), list_starts(loop)
     for _ in range(ROUNDS):
         # Other parameters need other steps of integration, and start at other states.
         point = _start(_prepare(loop, names, records, intercept))
@@ -164,7 +169,8 @@ def fit_simulation(
         )
     left_out = [describe_outliers(one, lost)
                 for one, (_, lost) in zip(given, masked, strict=True) if lost.any()]  # fmt: skip
-    notes = (*note_unit_clashes(loop, records[0]), *left_out, *unsettled)
+    absurd = note_absurd_values(names, starts, point.theta)
+    notes = (*note_unit_clashes(loop, records[0]), *left_out, *unsettled, *absurd)
     loop = whole.with_parameters({name: loop.parameters[name] for name in names})
     return LoopFit(loop, _summarize(point, find_noise_units(loop, records[0])[0], notes))
 

@@ -1,6 +1,7 @@
 """Physical parameters, how well they are known, and the loop with them: what fits return."""
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -26,6 +27,8 @@ from ..identified_model import compute_root_errors
 
 # A direction of which the scaled information has a smaller relative eigenvalue is not in the data.
 UNSEEN = 1e-9
+# A parameter that a fit has moved by more than this factor is hardly one of the plant.
+ABSURD = 1000.0
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -310,6 +313,41 @@ def linearize_at_rest(loop: Loop, states: bool = False) -> Any:
     return loop.linearize(states=states)
 
 
+def note_absurd_values(
+    names: Sequence[str], starts: Mapping[str, float], values: Array
+) -> tuple[str, ...]:
+    """Return a note of parameters that are absurdly far from where a fit began; empty without one.
+
+    Parameters
+    ----------
+    names : sequence of str
+        The parameters.
+    starts : mapping of str to float
+        Their values before the fit; those without one, or of zero, are passed over.
+    values : ndarray, shape (p,)
+        Their values now.
+
+    Returns
+    -------
+    tuple of str
+        The note, if there is one.
+    """
+    far = [
+        f"{name} = {value:.4g} in place of {start:.4g}"
+        for name, value in zip(names, values.tolist(), strict=True)
+        if (start := starts.get(name, 0.0)) and value
+        and not 1 / ABSURD <= abs(value / start) <= ABSURD
+    ]  # fmt: skip
+    if not far:
+        return ()
+    return (
+        f"ABSURDLY FAR FROM THE START: {write_list(far)}. The fit has lost the record, or the "
+        "record says nothing of this. Check that each column is the signal that the loop takes it "
+        "for, with its sign and unit: audit(record, loop) compares them with the controller of the "
+        "loop, where it has one",
+    )
+
+
 def mark_unseen(
     covariance: Array, matrix: Array, inside: Any, names: tuple[str, ...]
 ) -> tuple[Array, tuple[str, ...]]:
@@ -342,7 +380,7 @@ def mark_unseen(
     if not lost:
         return covariance, ()
     return covariance, (
-        f"the data do not determine {write_list([names[k] for k in lost])}: other parameters can "
+        f"THE DATA DO NOT DETERMINE {write_list([names[k] for k in lost])}: other parameters can "
         f"compensate a change of {'them' if len(lost) > 1 else 'it'}",
     )
 

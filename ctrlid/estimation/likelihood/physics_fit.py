@@ -37,7 +37,7 @@ from .maximization import (
     refit_noise_size,
     refit_quiet_force,
 )
-from .physics_estimate import LoopEstimate, LoopFit, mark_unseen
+from .physics_estimate import LoopEstimate, LoopFit, mark_unseen, note_absurd_values
 
 # A given value is contradicted where the fit is farther from it than three of its standard
 # deviations, which chance does in 1 of 370 cases.
@@ -154,6 +154,7 @@ def fit_loop(
         *note_sampled_controller(loop.controller, given, "the loop"),
         *left_out,
         *_note_doubtful_input(loop, given, fitted),
+        *note_absurd_values(fit.plant.names, list_starts(loop), fit.theta),
         *fitted.estimate.notes,
         *_note_steps(loop, fit, fitted),
         *colour,
@@ -274,6 +275,12 @@ _TOO_NARROW = (
 # Of several outputs a diagnosis takes the noise for white as well.
 _TELLS = "tells what the model lacks."
 _TELLS_COLOUR = "fits coloured noise as well, and tells what else the model lacks."
+
+
+def list_starts(loop: Loop) -> dict[str, float]:
+    """Return the values from which a fit begins; those of effects are no more than guesses."""
+    guessed = list_effect_bounds(loop)
+    return {name: v for name, v in loop.parameters.items() if name not in guessed}
 
 
 def choose_free_names(
