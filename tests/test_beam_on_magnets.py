@@ -247,3 +247,35 @@ def test_values_are_absurd_beyond_a_factor_of_a_thousand():
     assert note.startswith("ABSURDLY FAR FROM THE START: J = 1.2e-06 in place of 0.012 and m = "
                            "5000 in place of 1. ")  # fmt: skip
     assert note_absurd_values(("lag",), starts, np.array([1e9])) == ()
+
+
+def test_the_note_on_forces_recommends_only_what_can_be_given():
+    """The magnets pull by the square of their currents, and each acts on both coordinates."""
+    text = str(make_loop())
+    assert "without forces= a force at a velocity accelerates that coordinate alone" in text
+    assert "No input of beam is such a force" in text
+    assert "driven=('i1', 'i2'), forces={'z_dot': 'force'})" in text
+    assert "forces={'z_dot': 'i1'}" not in text
+
+
+def make_pushed(gain):
+    """Two masses on a bench, whose accelerations are a matrix of gains times two inputs."""
+    plant = ct.nlsys(
+        lambda t, x, u, p: np.array([x[2], x[3], *(np.array(gain) @ u)]),
+        lambda t, x, u, p: np.array([x[0], x[1]]), name="masses",
+        inputs=[f"F{k + 1}" for k in range(len(gain[0]))], outputs=["a", "b"],
+        states=["a", "b", "a_dot", "b_dot"],
+    )  # fmt: skip
+    zeros = (0.0,) * len(gain[0])
+    at = cid.OperatingPoint((0.0,) * 4, zeros if len(zeros) > 1 else 0.0, (0.0, 0.0))
+    return cid.Loop(plant, dt=0.01, at=at)
+
+
+@pytest.mark.parametrize(("gain", "words"), [
+    ([[2.0, -0.5], [-0.5, 1.0]], "as in forces={'a_dot': 'F1'} of the Loop"),
+    ([[2.0], [-0.5]], "as in forces={'a_dot': 'F1'} of the Loop"),
+    ([[1.0, 1.0], [1.0, -1.0]], "No input of masses is such a force"),
+    ([[0.0], [0.0]], "No input of masses is such a force"),
+], ids=["arm", "cart", "beam", "none"])  # fmt: skip
+def test_a_force_that_may_be_one_is_recommended(gain, words):
+    assert words in str(make_pushed(gain))

@@ -31,6 +31,7 @@ from ..physics.equations import Equations, drive_inputs
 from ..physics.linearization import (
     OperatingPoint,
     as_operating_point,
+    compute_state_matrices,
     find_unbalanced_rate,
     linearize,
     make_state_space,
@@ -701,12 +702,41 @@ def list_unforced_velocities(loop: Loop) -> tuple[str, ...]:
 
 def describe_missing_forces(loop: Loop) -> str:
     """Say what a loop of unforced velocities lacks and what to give, without a full stop."""
-    first, *_ = list_unforced_velocities(loop)
-    return (
+    text = (
         "without forces= a force at a velocity accelerates that coordinate alone, while in a "
-        "mechanism it accelerates all of them, through the mass matrix. Say which input works "
-        f"on which velocity, as in forces={{{first!r}: {loop.signals['u'][0]!r}}} of the Loop"
+        "mechanism it accelerates all of them, through the mass matrix. "
     )
+    pair = _find_likely_force(loop)
+    if pair is not None:
+        return (f"{text}Say which input works on which velocity, as in "
+                f"forces={{{pair[0]!r}: {pair[1]!r}}} of the Loop")  # fmt: skip
+    velocity, driven = list_unforced_velocities(loop)[0], loop.signals["u"]
+    return (
+        f"{text}No input of {loop.equations().name} is such a force. In a mechanism that is "
+        "coupled, add one for each velocity to the equations of the plant, and say which inputs "
+        f"the record has: Loop(..., driven={driven}, forces={{{velocity!r}: 'force'}})"
+    )
+
+
+def _find_likely_force(loop: Loop) -> tuple[str, str] | None:
+    """Return a velocity and an input that may be the force at it; None where no input can be.
+
+    A force enters the accelerations as it is and moves its own coordinate its own way. As many
+    forces as velocities have the inverse of the mass matrix for a gain, which is symmetric and
+    positive definite; that of two magnets at both ends of a beam is not.
+    """
+    e, names = loop.equations(), list_unforced_velocities(loop)
+    slopes = casadi.jacobian(e.rhs, e.u)
+    if any(casadi.depends_on(slopes[:, k], e.u[k]) for k in range(len(e.inputs))):
+        return None
+    rows = [e.states.index(name) for name in names]
+    gain = compute_state_matrices(e, loop.point)[1][rows]
+    if len(e.inputs) == 1:
+        pushed = [name for name, value in zip(names, gain[:, 0], strict=True) if value > 0]
+        return (pushed[0], e.inputs[0]) if pushed else None
+    if gain.shape[0] != gain.shape[1] or not np.allclose(gain, gain.T, rtol=1e-6, atol=0.0):
+        return None
+    return (names[0], e.inputs[0]) if np.all(np.linalg.eigvalsh(gain) > 0) else None
 
 
 def _question_effects(effects: tuple[AbstractEffect, ...], dt: float, stacklevel: int) -> None:
