@@ -1,5 +1,6 @@
 """A beam on two magnets: two inputs that act on both coordinates, two references, two outputs."""
 
+import re
 from dataclasses import replace
 from functools import partial
 
@@ -9,6 +10,7 @@ import pytest
 
 import ctrlid as cid
 from ctrlid import effects as E
+from ctrlid.diagnosis.report_text import write_gap_lines
 from ctrlid.estimation.likelihood.physics_estimate import note_absurd_values
 from ctrlid.validation.reproduction import find_law_rejection
 
@@ -279,3 +281,37 @@ def make_pushed(gain):
 ], ids=["arm", "cart", "beam", "none"])  # fmt: skip
 def test_a_force_that_may_be_one_is_recommended(gain, words):
     assert words in str(make_pushed(gain))
+
+
+# --- what a diagnosis prints
+
+
+@pytest.fixture(scope="module")
+def found(record):
+    return cid.diagnose(make_loop(), record, catalogue=[E.SensorGain], progress=False)
+
+
+def test_each_axis_of_the_bins_is_named_once(found):
+    _, _, words = " ".join(str(found).split()).partition("In bins of ")
+    axes = words.partition(", the one-step errors")[0].replace(" and ", ", ").split(", ")
+    assert len(axes) == len(set(axes)) > 8
+
+
+def test_a_table_has_its_columns_below_one_another(found):
+    long = {"SensorGain at z.error": 5e-4, "CoulombFriction at phi_dot_of_the_long_beam.fc": 1.0,
+            "SensorGain at phi.error": 1e-3, "EddyCurrentDamping at phi_dot.ce": 0.04}  # fmt: skip
+    for table in (long, {k: v for k, v in long.items() if "long" not in k}):
+        text = str(replace(found, sensitivity=table))
+        rows = text.partition("would have shown\n")[2].partition("\n\n")[0].splitlines()
+        assert max(map(len, rows)) <= 100
+        assert len({row.find(" SensorGain", 6) for row in rows} - {-1}) <= 1
+    gap = found.gap
+    wide = replace(gap, outputs=tuple(replace(part, unit="rad of the beam")
+                                      for part in gap.outputs))  # fmt: skip
+    rows = [line for line in write_gap_lines(wide) if " x the floor" in line]
+    assert len({re.search(r"\S+ x the floor", row).start() for row in rows}) == 1
+
+
+def test_the_unit_of_what_goes_by_an_input_has_that_of_the_input():
+    effect = E.EddyCurrentDamping(ce=0.1, at="phi_dot")
+    assert effect.units(make_loop()) == {"ce": "1/(s A^2)"}

@@ -75,7 +75,8 @@ def _wrap_text(text: str, indent: int, hang: int | None = None) -> list[str]:
 def write_gap_lines(gap: Gap) -> list[str]:
     """Return the sizes of the gap as aligned lines."""
     wide = max(len(label) for label, *_ in wording.list_gap_rows(gap)) if gap.outputs else 0
-    rows = [f"    {label:<{max(wide + 1, 20)}}{size:>12}   {times}"
+    sizes = max((len(size) for _, size, _ in wording.list_gap_rows(gap)), default=0)
+    rows = [f"    {label:<{max(wide + 1, 20)}}{size:>{max(sizes, 12)}}   {times}"
             for label, size, times in wording.list_gap_rows(gap)]  # fmt: skip
     head = _wrap_text(wording.introduce_gap(gap), 2, hang=4)
     words = (wording.explain_prediction(gap), wording.describe_shrinking(gap),
@@ -86,21 +87,23 @@ def write_gap_lines(gap: Gap) -> list[str]:
 def _write_where(found: Diagnosis) -> list[str]:
     places = wording.list_telling_places(found)
     if not places:
-        # Errors of several outputs have the same axes.
+        # Of several outputs the errors of each were looked for along the same axes.
         axes = write_list(list(dict.fromkeys(p.axis for p in found.where)))
         nowhere = f"nowhere. In bins of {axes}, the one-step errors are noise."
         return _wrap_text(f"where the error is: {nowhere if axes else 'not known'}", 2, hang=4)
     same = not found.added
     head = "  where the error is: normalized RMS of the one-step errors (1 for noise)"
-    rows = [f"{head:<79}{'there' if same else 'before':>10}{'' if same else 'after':>10}"]
+    wide = max(12, *(len(place.axis) for place in places))
+    rows = [f"{head:<79}{'there' if same else 'before':>10}"
+            f"{'' if same else 'after':>10}"]  # fmt: skip
     for place in places:
-        first, *more = textwrap.wrap(wording.describe_place(place), 60) or [""]
+        first, *more = textwrap.wrap(wording.describe_place(place), 72 - wide) or [""]
         before, after = (
             write_number(wording.find_told_rms(place, v), 3) for v in (place.before, place.after)
         )
         after = "" if same else after
-        rows.append(f"    {place.axis:<12} {first:<62}{before:>10}{after:>10}")
-        rows += [f"{'':<17}{line}" for line in more]
+        rows.append(f"    {place.axis:<{wide}} {first:<{74 - wide}}{before:>10}{after:>10}")
+        rows += [f"{'':<{wide + 5}}{line}" for line in more]
     return rows
 
 
@@ -118,7 +121,10 @@ def _write_sensitivity(found: Diagnosis) -> list[str]:
     half = (len(rows) + 1) // 2
     right = [*rows[half:], ""][:half]
     head = "  smallest size of each effect that this record would have shown"
-    return [head, *(f"    {a}    {b}" for a, b in zip(rows[:half], right, strict=True))]
+    wide = max(map(len, rows[:half]), default=0)
+    if 8 + wide + max(map(len, right), default=0) > WIDTH:
+        return [head, *(f"    {row}" for row in rows)]
+    return [head, *(f"    {a:<{wide}}    {b}" for a, b in zip(rows[:half], right, strict=True))]
 
 
 def _write_parameters(found: Diagnosis) -> list[str]:

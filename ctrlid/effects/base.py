@@ -257,13 +257,13 @@ class AbstractEffect(metaclass=CheckedCalls):
                 at = self.at if self.place == "force" else ""
                 signals["y"] = loop.position_units.get(at, loop.position_unit)
                 if at:
-                    return self._find_force_units(e, signals["y"])
+                    return self._find_force_units(e, signals)
         return {p.name: fill_unit(p.unit, signals) for p in self._list_used()}
 
-    def _find_force_units(self, e: Equations, position: str) -> dict[str, str]:
+    def _find_force_units(self, e: Equations, signals: Mapping[str, str]) -> dict[str, str]:
         """Return the units of a force at a velocity: an acceleration, or that of its input."""
-        found = find_motion(e, self.at)
-        units = {p.name: fill_unit(p.unit, {"y": position}) for p in self._list_used()}
+        found, position = find_motion(e, self.at), signals["y"]
+        units = {p.name: fill_unit(p.unit, signals) for p in self._list_used()}
         force = ""
         if found is not None and e.push_units:
             force = e.push_units[e.velocities.index(found[1])]
