@@ -197,6 +197,17 @@ def test_an_error_that_the_effects_bring_in_has_its_place(found):
     assert place.words.startswith("at input from 0.9")
     assert "V, afterwards the output is above its prediction by " in place.words
     assert "afterwards" not in locate_errors(now, was, {})[0].words
+
+
+def test_places_of_errors_are_those_of_the_completed_model():
+    """A recalibration that ran away sees states in which the rig never was."""
+    rng = np.random.default_rng(0)
+    p = {"mean by ca": 1e-9, "size by ca": 0.5}
+    away = NoiseTests(p, 3 * rng.standard_normal(500), {"ca": rng.uniform(0.1, 0.2, 500)})
+    true = NoiseTests(p, rng.standard_normal(500), {"ca": rng.uniform(0.4, 0.5, 500)})
+    (place,) = locate_errors(away, true, {"ca": "mol/l"})
+    assert 0.39 < place.edges[0] < place.edges[-1] < 0.51
+    assert "at ca from 0.4" in place.words
     base = found["partly explained"]
     assert "where the error is: nowhere" not in text(replace(base, where=(place,)))
     assert "V, afterwards the output is above" in text(replace(base, where=(place,)))

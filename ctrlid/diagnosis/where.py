@@ -30,8 +30,10 @@ def _locate_output(
 ) -> tuple[BinnedErrors, ...]:
     """Return where the innovations of one output are not noise; it has a name among several."""
     found: list[BinnedErrors] = []
-    for name, values in before.axes.items():
-        if name not in after.axes or len(after.axes[name]) != len(values):
+    for name in before.axes:
+        # The model without the effects may have been where the rig never was.
+        values = after.axes.get(name, np.zeros(0))
+        if len(values) != len(before.axes[name]):
             continue
         edges = find_bin_edges(values)
         index = find_bins(values, edges)
