@@ -197,6 +197,9 @@ def test_an_error_that_the_effects_bring_in_has_its_place(found):
     assert place.words.startswith("at input from 0.9")
     assert "V, afterwards the output is above its prediction by " in place.words
     assert "afterwards" not in locate_errors(now, was, {})[0].words
+    base = found["partly explained"]
+    assert "where the error is: nowhere" not in text(replace(base, where=(place,)))
+    assert "V, afterwards the output is above" in text(replace(base, where=(place,)))
 
 
 def test_places_of_errors_are_those_of_the_completed_model():
@@ -208,9 +211,6 @@ def test_places_of_errors_are_those_of_the_completed_model():
     (place,) = locate_errors(away, true, {"ca": "mol/l"})
     assert 0.39 < place.edges[0] < place.edges[-1] < 0.51
     assert "at ca from 0.4" in place.words
-    base = found["partly explained"]
-    assert "where the error is: nowhere" not in text(replace(base, where=(place,)))
-    assert "V, afterwards the output is above" in text(replace(base, where=(place,)))
     # It is not cut off behind those that were there before.
     strong = [replace(base.where[0], axis=axis) for axis in "abcd"]
     told = wording.list_telling_places(replace(base, where=(*strong, place)))
