@@ -200,6 +200,13 @@ def test_an_error_that_the_effects_bring_in_has_its_place(found):
     base = found["partly explained"]
     assert "where the error is: nowhere" not in text(replace(base, where=(place,)))
     assert "V, afterwards the output is above" in text(replace(base, where=(place,)))
+    # It is not cut off behind those that were there before.
+    strong = [replace(base.where[0], axis=axis) for axis in "abcd"]
+    told = wording.list_telling_places(replace(base, where=(*strong, place)))
+    assert [p.axis for p in told] == ["a", "b", "c", "d", "input"]
+    quiet = replace(place, p_after=0.3)
+    nowhere = text(replace(base, where=(quiet, replace(quiet, output="T"))))
+    assert "where the error is: nowhere. In bins of input, the one-step errors" in nowhere
 
 
 def test_places_of_errors_are_those_of_the_completed_model():
@@ -211,13 +218,6 @@ def test_places_of_errors_are_those_of_the_completed_model():
     (place,) = locate_errors(away, true, {"ca": "mol/l"})
     assert 0.39 < place.edges[0] < place.edges[-1] < 0.51
     assert "at ca from 0.4" in place.words
-    # It is not cut off behind those that were there before.
-    strong = [replace(base.where[0], axis=axis) for axis in "abcd"]
-    told = wording.list_telling_places(replace(base, where=(*strong, place)))
-    assert [p.axis for p in told] == ["a", "b", "c", "d", "input"]
-    quiet = replace(place, p_after=0.3)
-    nowhere = text(replace(base, where=(quiet, replace(quiet, output="T"))))
-    assert "where the error is: nowhere. In bins of input, the one-step errors" in nowhere
 
 
 def test_a_name_that_does_not_stand_is_said_once(found):
