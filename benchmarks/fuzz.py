@@ -185,7 +185,7 @@ RECIPES: dict[str, Recipe] = {
     "Record.with_input": lambda w, rng: {"self": cid.Record(**{**fields(rng), "extra": {}}), "channel": "current"},
     "Record.with_output": lambda w, rng: {"self": cid.Record(u=[0, 1.0], y=[1, 2.0], dt=1.0, extra={"i": [3, 4.0]}), "channel": "i"},
     "Record.segments": lambda w, rng: {"self": pick(rng, *w.records)},
-    "Record.from_csv": lambda w, rng: {"path": w.csv, "r": pick(rng, None, "r"), "u": pick(rng, "u", "y"), "y": "y", "time": pick(rng, None, "t"), "dt": pick(rng, None, 0.05), "extra": None, "units": pick(rng, None, {"y": "m"}), "hold": pick(rng, None, "zoh"), "name": pick(rng, None, "a"), "gaps": pick(rng, "error", "mask")},
+    "Record.from_csv": lambda w, rng: {"path": w.csv, "r": pick(rng, None, "r"), "u": pick(rng, "u", "y"), "y": "y", "time": pick(rng, None, "t"), "dt": pick(rng, None, 0.05), "extra": None, "units": pick(rng, None, {"y": "m"}), "hold": pick(rng, None, "zoh"), "name": pick(rng, None, "a"), "gaps": pick(rng, "error", "mask"), "names": pick(rng, None, {"y": "level"})},
     "Record.to_csv": lambda w, rng: {"self": pick(rng, *w.records), "path": FOLDER / "out.csv"},
     "Record.from_response": lambda w, rng: {"response": ct.step_response(ct.tf([1], [1, 1], inputs="u", outputs="y"), timepts=np.linspace(0, 1, 20)), "r": None, "u": pick(rng, None, "u"), "y": pick(rng, None, "y")},
     "Record.to_response": lambda w, rng: {"self": pick(rng, *w.records)},
