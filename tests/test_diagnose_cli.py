@@ -324,6 +324,13 @@ def test_keywords_become_options(text, said):
     assert name_options(text) == said
 
 
+def test_columns_are_renamed(folder, asked):
+    assert run("log.csv", *COLUMNS, *SERVO, "--names", "volt=V,u=drive") == 1
+    assert run("log.csv", *COLUMNS, *SERVO, "--names", "volt=drive") == 0
+    ((_, read, _),) = asked
+    assert read.names["u"] == "drive"
+
+
 def test_warnings_are_told_as_refusals_are(folder, asked, capsys):
     """They came with the path of a module of ctrlid and a line of its code."""
     with warnings.catch_warnings():

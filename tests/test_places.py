@@ -151,7 +151,7 @@ def test_one_place_needs_no_name_and_takes_it():
         (lambda: cart(E.InputOffset(offset=0.1, at="V")), "an input; given at='V'"),
         (lambda: drive().with_effect(E.InputOffset(offset=0.1, at="G")), "servo has V"),
         (lambda: cart(E.Quantization(step=0.1)), "say which with at=, one of x, theta"),
-        (lambda: cid.Loop(QUAD, dt=DT).with_effect(E.InputDelay(delay=DT, at="F1")),
+        (lambda: cid.Loop(QUAD, dt=DT).with_effect(E.InputBacklash(width=0.1, at="F1")),
          "remembers the one input of a plant; quadrotor_planar has F1, F2"),
     ],
 )  # fmt: skip

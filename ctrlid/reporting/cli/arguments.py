@@ -42,8 +42,10 @@ def read_record(path: Path, args: argparse.Namespace) -> Record:
         raise CtrlidError(f"--columns takes {', '.join(CHANNELS)}, as in --columns u=volt,y=gap; "
                           f"given {unknown[0]}")  # fmt: skip
     with options_in_refusals():
-        return Record.from_csv(path, dt=args.dt, hold=args.hold, gaps=args.gaps, units=args.units,
-                               scale=dict(args.scale), **args.columns)  # fmt: skip
+        return Record.from_csv(
+            path, dt=args.dt, hold=args.hold, gaps=args.gaps, units=args.units,
+            scale=dict(args.scale), names=args.names, **args.columns,
+        )  # fmt: skip
 
 
 def read_loop(args: argparse.Namespace, record: Record) -> Loop:

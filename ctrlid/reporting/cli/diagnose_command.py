@@ -100,6 +100,13 @@ def add_parser(commands: Any) -> None:
         metavar="NAME=FACTOR",
         help="factors of the channels r, u and y, or of single columns: y=0.0174533 r=0.0174533 "
         "makes radians of degrees; say the new unit with --units")  # fmt: skip
+    add(
+        "--names",
+        type=parse_assignments,
+        default={},
+        metavar="COLUMN=NAME",
+        help="what the model calls the signals of columns, as in --names Ball=x,Wippe=theta",
+    )
     add("--controller", metavar="C",
         help="the controller: MODULE:NAME, FILE.py:NAME, or a PID written as "
         "kp=..,ki=..,kd=.. (default: not known)")  # fmt: skip

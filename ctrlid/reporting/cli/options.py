@@ -9,7 +9,8 @@ from ..._base.errors import CtrlidError
 # What a keyword of the library is for someone who typed a command.
 OPTIONS = {
     "r": "--columns", "u": "--columns", "y": "--columns", "time": "--columns", "dt": "--dt",
-    "units": "--units", "scale": "--scale", "hold": "--hold", "gaps": "--gaps", "free": "--free",
+    "units": "--units", "scale": "--scale", "names": "--names", "hold": "--hold",
+    "gaps": "--gaps", "free": "--free",
     "controller": "--controller", "validation": "--validation", "jobs": "--jobs",
     "seconds": "--seconds", "valid": "the column valid",
 }  # fmt: skip
