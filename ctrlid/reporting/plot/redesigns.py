@@ -7,7 +7,7 @@ import numpy as np
 
 from ..._base.arguments import explain_names
 from ..._base.errors import CtrlidError
-from ..._base.text import with_unit
+from ..._base.text import choose_prefix, with_unit
 from ...design.controller_trial import ControllerTrial, ReferenceStep, StepMotion
 from ...design.redesigning import Redesign
 from ...loop.loop import Loop
@@ -86,25 +86,27 @@ def _draw_trial(trial: ControllerTrial, ax: Any) -> Picture:
         size = (max(7.2, 4.8 * len(steps)), 1.4 + 1.7 * len(rows))
         ax = figure(len(rows), len(steps), size, sharex="col").axes.ravel()
     axes = take_axes(ax, len(rows) * len(steps)).reshape(len(rows), len(steps))
-    for column, step in enumerate(steps):
-        for row, (key, k, name) in enumerate(rows):
+    for row, (key, k, name) in enumerate(rows):
+        # A signal has one unit in all columns.
+        sizes = [np.max(np.abs(getattr(motion, key)[k]), initial=0.0)
+                 for step in steps for motion in (step.promised, step.achieved)]  # fmt: skip
+        factor, unit = choose_prefix(float(np.max(sizes)), units.get(name, ""))
+        for column, step in enumerate(steps):
             one = axes[row, column]
             for i, (what, motion) in enumerate(
-                (
-                    ("promised on the model", step.promised),
-                    ("achieved on the physics", step.achieved),
-                )
+                (("promised", step.promised), ("achieved", step.achieved))
             ):
-                values = getattr(motion, key)[k]
+                values = factor * getattr(motion, key)[k]
                 label = f"{what}: {_describe_motion(motion, step)}" if row == 0 else None
                 one.plot(step.time[: len(values)], values, label=label, **choose_line_style(i),
                          marker=MARKERS[i], markevery=max(len(values) // 25, 1),
                          markersize=4)  # fmt: skip
             # Short names stand one above another where columns are narrow.
-            one.set_ylabel(with_unit(name, units.get(name, "")))
+            one.set_ylabel(with_unit(name, unit))
             finish_axes(one, legend=row == 0, columns=1, size="small")
             one.set_xlabel(f"time after the step of {step.reference} [s]" if row == len(rows) - 1
                            else "")  # fmt: skip
+    for column, step in enumerate(steps):
         axes[-1, column].set_xlim(0, _find_end(step))
     return Picture(axes.ravel())
 
