@@ -310,6 +310,10 @@ def test_report_of_rare_cases(found):
     assert "evidence 8.0 (WEAK); without it, 99.5 % of the mean square error above the" in words
     assert "evidence 20 (strong)" in words
     assert "no record of u and y can distinguish it from InputOffset, because on this" in words
+    # The other one may have another value, or the other sign.
+    tied = replace(weak, alternatives=(E.InputOffset(offset=-0.02),))
+    words = text(replace(base, findings=(tied,), where=()))
+    assert "distinguish it from InputOffset (offset = -20 mV), because on this plant" in words
     assert "in 2 of 3 records" in words
     assert "where the error is: not known" in words
     bare = replace(base, calibrated=(), tests={}, disturbance=Disturbance(0.0, 0.0, math.nan, 0.0),

@@ -164,3 +164,4 @@ def test_a_fit_and_a_diagnosis_find_the_delay_and_its_place(place, delay):
     (finding,) = found.findings
     assert isinstance(finding.effect, E.InputDelay)
     assert finding.effect.at == INPUTS[place]
+    assert f"InputDelay at {INPUTS[place]};" in repr(found)

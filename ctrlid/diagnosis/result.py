@@ -104,9 +104,9 @@ class Diagnosis(Printed):
         return write_report_text(self)
 
     def __repr__(self) -> str:
-        names = ": " + ", ".join(f.name for f in self.findings) if self.findings else ""
+        names = ": " + ", ".join(f.names[0] for f in self.findings) if self.findings else ""
         if self.stand_ins:
-            names += "; stand-ins: " + ", ".join(f.name for f in self.stand_ins)
+            names += "; stand-ins: " + ", ".join(f.names[0] for f in self.stand_ins)
         g = self.gap
         sizes = f"{g.before:.3g} before, {g.after:.3g} after, floor {g.floor:.3g} {g.unit}"
         return f"Diagnosis({self.verdict}{names}; gap {sizes.strip()})"

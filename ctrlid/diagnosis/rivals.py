@@ -223,8 +223,10 @@ def _compare_in_round(
     others = [t for t in again if t is not mine]
     near = {t.key for t in close} | {mine.key}
     rest = [t for t in step.trials if t.key not in near]
-    rivals = (*find_rivals(mine, others, sure), *find_rivals(f.trial, rest, sure))
-    return model, (replace(f, rivals=rivals),)
+    # What a noise that was chosen since gains is no evidence of an effect.
+    since = mine.gain - f.trial.gain
+    alike = [replace(t, gain=t.gain - since) for t in find_rivals(mine, others, sure)]
+    return model, (replace(f, rivals=(*alike, *find_rivals(f.trial, rest, sure))),)
 
 
 def _count_from(trial: Trial, base: Model, other: Model) -> Trial:

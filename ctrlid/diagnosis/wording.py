@@ -438,7 +438,10 @@ def list_doubts(found: Diagnosis, finding: Finding) -> list[str]:
         others = [f"{name_with_subject(e)} ({describe_parameters(found, e)})" for e in apart]
         lines.append(f"this record cannot distinguish it from {write_list(others)}")
     if finding.equivalents:
-        same = [ARTICLES.get(name, name) for name in finding.equivalents]
+        # The same influence may take another value, or the other sign.
+        sizes = {name_at_place(e): f" ({describe_parameters(found, e)})"
+                 for e in finding.alternatives}  # fmt: skip
+        same = [f"{ARTICLES.get(name, name)}{sizes.get(name, '')}" for name in finding.equivalents]
         lines.append(
             f"no record of u and y can distinguish it from {write_list(same)}, because on this "
             "plant their influence is the same"
