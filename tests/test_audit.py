@@ -270,6 +270,17 @@ def test_wrong_period_of_the_loop_is_a_finding(servo):
     )
 
 
+def test_an_experiment_repeats_where_all_references_do():
+    rng = np.random.default_rng(5)
+    one, two = (np.tile(rng.choice([-1.0, 1.0], 200), 4) for _ in range(2))
+    other = rng.choice([-1.0, 1.0], 800)
+    for second, repeats in ((two, True), (other, False), (0 * two, True)):
+        r = np.array([one, second])
+        y = np.cumsum(r, axis=1) + 0.01 * rng.standard_normal(r.shape)
+        record = cid.Record(r=r, u=r + y, y=y, dt=0.1)
+        assert ("repeats" in [f.kind for f in cid.audit(record).findings]) == repeats
+
+
 def test_repeats():
     rng = np.random.default_rng(7)
     for _ in range(100):

@@ -258,6 +258,8 @@ def _audit_several(record: Record, loop: Loop | None) -> Audit:
     parts += [("y", name, record.select(u=u[0], y=name)) for name in y]
     parts += [("r", name, record.select(u=u[0], y=y[0], r=name)) for name in r]
     references = tuple(np.asarray(part.r) for key, _, part in parts if key == "r")
+    # An experiment is repeated where all that moves it has the same period.
+    periods = {defects.find_period(v) for v in references if np.ptp(v) > 0}
     limits = np.broadcast_to(
         np.array([-np.inf, np.inf] if loop is None else
                  np.array(np.broadcast_arrays(*loop.input_limits)).T), (len(u), 2)
@@ -278,7 +280,7 @@ def _audit_several(record: Record, loop: Loop | None) -> Audit:
                  *checks.find_steps()]  # fmt: skip
         if key == "y":
             found += [*checks.find_gaps(), *checks.find_outliers()]
-        elif key == "r":
+        elif key == "r" and len(periods) == 1:
             found += checks.find_repetition()
         # A reference may have the name of the output that follows it.
         if key != "r" or name not in y:
