@@ -296,7 +296,7 @@ def test_the_picture_shows_every_signal():
     assert labels == ["x [m]", "x [m]", "theta [rad]", "theta [rad]", "F [N]", "F [N]"]
     assert picture[4].get_xlabel() == "time after the step of xd[0] [s]"
     texts = [t.get_text() for t in picture[1].get_legend().get_texts()]
-    assert texts[0] == "promised on the model: theta returns to rest"
+    assert texts[0] == "promised: theta returns to rest"
 
 
 def test_the_page(tmp_path):
