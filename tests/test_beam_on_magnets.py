@@ -243,12 +243,18 @@ def test_a_value_absurdly_far_from_its_start_is_said_so_in_capitals(record):
 def test_values_are_absurd_beyond_a_factor_of_a_thousand():
     starts = {"J": 0.012, "k": -2.0, "c": 0.0, "m": 1.0}
     values = np.array([0.011, -1.9, 5.0, 500.0])
-    assert note_absurd_values(tuple(starts), starts, values) == ()
-    values = np.array([0.012e-4, -1.9, 5.0, 5000.0])
-    (note,) = note_absurd_values(tuple(starts), starts, values)
-    assert note.startswith("ABSURDLY FAR FROM THE START: J = 1.2e-06 in place of 0.012 and m = "
-                           "5000 in place of 1. ")  # fmt: skip
-    assert note_absurd_values(("lag",), starts, np.array([1e9])) == ()
+    sure, lost = 1e-3 * np.abs(values), np.full(4, np.inf)
+    assert note_absurd_values(tuple(starts), starts, values, lost) == ()
+    values = np.array([120.0, -1.9, 5.0, 5000.0])
+    for errors in (sure, lost):
+        (note,) = note_absurd_values(tuple(starts), starts, values, errors)
+        assert note.startswith("ABSURDLY FAR FROM THE START: J = 120 in place of 0.012 and m = "
+                               "5000 in place of 1. ")  # fmt: skip
+    assert note_absurd_values(("lag",), starts, np.array([1e9]), np.ones(1)) == ()
+    # What may be zero is not far from a trace, and what has gone to zero is told as on its bound.
+    starts = {"friction": 6e-11, "drag": 0.1}
+    values, errors = np.array([2e-5, 1e-12]), np.array([4e-5, 1e-13])
+    assert note_absurd_values(tuple(starts), starts, values, errors) == ()
 
 
 def test_the_note_on_forces_recommends_only_what_can_be_given():

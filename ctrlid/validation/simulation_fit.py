@@ -5,7 +5,7 @@ controller is the one that made the record: with another one the measured output
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -169,10 +169,11 @@ def fit_simulation(
         )
     left_out = [describe_outliers(one, lost)
                 for one, (_, lost) in zip(given, masked, strict=True) if lost.any()]  # fmt: skip
-    absurd = note_absurd_values(names, starts, point.theta)
-    notes = (*note_unit_clashes(loop, records[0]), *left_out, *unsettled, *absurd)
+    notes = (*note_unit_clashes(loop, records[0]), *left_out, *unsettled)
+    estimate = _summarize(point, find_noise_units(loop, records[0])[0], notes)
+    absurd = note_absurd_values(names, starts, point.theta, estimate.standard_errors)
     loop = whole.with_parameters({name: loop.parameters[name] for name in names})
-    return LoopFit(loop, _summarize(point, find_noise_units(loop, records[0])[0], notes))
+    return LoopFit(loop, replace(estimate, notes=(*absurd, *estimate.notes)))
 
 
 def _take_out_steps(loop: Loop, names: Sequence[str]) -> Loop:

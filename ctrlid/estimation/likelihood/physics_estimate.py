@@ -314,9 +314,11 @@ def linearize_at_rest(loop: Loop, states: bool = False) -> Any:
 
 
 def note_absurd_values(
-    names: Sequence[str], starts: Mapping[str, float], values: Array
+    names: Sequence[str], starts: Mapping[str, float], values: Array, errors: Array
 ) -> tuple[str, ...]:
     """Return a note of parameters that are absurdly far from where a fit began; empty without one.
+
+    A friction that began at a trace, or that may be none, is told by its standard error.
 
     Parameters
     ----------
@@ -326,6 +328,8 @@ def note_absurd_values(
         Their values before the fit; those without one, or of zero, are passed over.
     values : ndarray, shape (p,)
         Their values now.
+    errors : ndarray, shape (p,)
+        Their standard errors.
 
     Returns
     -------
@@ -334,9 +338,9 @@ def note_absurd_values(
     """
     far = [
         f"{name} = {value:.4g} in place of {start:.4g}"
-        for name, value in zip(names, values.tolist(), strict=True)
-        if (start := starts.get(name, 0.0)) and value
-        and not 1 / ABSURD <= abs(value / start) <= ABSURD
+        for name, value, error in zip(names, values.tolist(), errors.tolist(), strict=True)
+        if (start := starts.get(name, 0.0)) and abs(value) > ABSURD * abs(start)
+        and not abs(value) < 2 * error < math.inf
     ]  # fmt: skip
     if not far:
         return ()

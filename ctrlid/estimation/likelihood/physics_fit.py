@@ -154,7 +154,9 @@ def fit_loop(
         *note_sampled_controller(loop.controller, given, "the loop"),
         *left_out,
         *_note_doubtful_input(loop, given, fitted),
-        *note_absurd_values(fit.plant.names, list_starts(loop), fit.theta),
+        *note_absurd_values(
+            fit.plant.names, list_starts(loop), fit.theta, fitted.estimate.standard_errors
+        ),
         *fitted.estimate.notes,
         *_note_steps(loop, fit, fitted),
         *colour,
