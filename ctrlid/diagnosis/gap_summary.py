@@ -73,8 +73,8 @@ def summarize_gap(loop: Loop, found: Search, fresh: FreshData) -> GapSummary:
         unit = loop.known_units.get(loop.equations().outputs[0], "")
         gap = _make_gap(shared, rows, floor, unit, windows[0])
         # Noises on several states' rates have no unit in common.
-        plain = loop.equations().velocities
-        unit = fill_unit("{x}/s^2", {"x": loop.position_unit}) if plain else ""
+        moves = loop.equations().velocities
+        unit = fill_unit("{x}/s^2", {"x": loop.position_unit}) if moves else ""
         gap = replace(gap, force_unit=unit)
     worse = gaps.compute_widening_chance(shared.windows, results[0], results[2])
     excess = math.nan

@@ -8,6 +8,7 @@ import numpy as np
 
 from .._base.errors import EffectDoesNotApply
 from ..physics.equations import Equations
+from ..physics.integration import put_entry
 from ..physics.symbols import Symbol
 from .base import AbstractEffect, Place, refuse_missing_formula, require_motion
 from .context import Moment
@@ -81,9 +82,7 @@ class InputEffect(AbstractEffect):
         """Return the equations with the applied input in place of the computed one."""
         applied = to_expression(trace_hook(self.input)(m))
         if len(e.inputs) > 1:
-            each = casadi.vertsplit(e.u)
-            each[e.inputs.index(self.at)] = applied
-            applied = casadi.vertcat(*each)
+            applied = put_entry(e.u, e.inputs.index(self.at), applied)
         return substitute_symbol(e, e.u, applied)
 
 
@@ -106,9 +105,7 @@ def choose_first_width(loop: Any, record: Any) -> float:
 def replace_output(e: Equations, at: str, shown: Any) -> Equations:
     """Return equations with another expression for the output, or for one of several."""
     if len(e.outputs) > 1:
-        each = casadi.vertsplit(e.output)
-        each[e.outputs.index(at)] = shown
-        shown = casadi.vertcat(*each)
+        shown = put_entry(e.output, e.outputs.index(at), shown)
     return dataclasses.replace(e, output=shown)
 
 
