@@ -10,6 +10,7 @@ from ctrlid.diagnosis.findings import Finding
 from ctrlid.diagnosis.scans import is_line_of_reference
 from ctrlid.diagnosis.wording import describe_aliases, join_names
 from ctrlid.loop.period_map import comes_to_rest
+from problems import levitation
 
 DT, N, FINE = 0.01, 400, 10
 M, C, K = 2.0, 4.0, 3.0
@@ -45,9 +46,10 @@ def reference():
 @pytest.mark.parametrize(("effect", "read"), [
     (E.SensorGain(0.05), lambda x, t: 1.05 * x),
     (E.SensorDrift(0.02), lambda x, t: x + 0.02 * t),
+    (E.SensorDrift(0.02, settling=0.4), lambda x, t: x + 0.02 * 0.4 * (1 - np.exp(-t / 0.4))),
     (E.SensorHum(0.01, 7.3, 0.4),
      lambda x, t: x + 0.01 * np.sin(2 * np.pi * 7.3 * t + 0.4)),
-], ids=lambda p: type(p).__name__)  # fmt: skip
+], ids=["scale", "steady drift", "warm-up", "hum"])  # fmt: skip
 def test_the_controller_sees_what_the_sensor_shows(effect, read):
     y, u = simulate_by_hand(read, reference())
     loop = cid.Loop(cid.plants.servo(M, C, K), ct.tf([20.0], [1.0], DT), dt=DT)
@@ -153,6 +155,43 @@ def test_hum_is_never_the_plant_alone():
     text = " ".join(str(found).split())
     assert "60 Hz (of the mains) folded at 100 Hz" in text
     assert " N at " not in text
+
+
+def test_a_drift_that_settles_is_told_from_a_steady_one():
+    loop = cid.Loop(cid.plants.servo(M, C, K), ct.tf([20.0], [1.0], DT), dt=DT, free=("c", "k"))
+    r = np.tile(reference(), 8)
+    last = DT * (len(r) - 1)
+    noise = 1e-3 * np.random.default_rng(6).standard_normal(len(r))
+    time = 0.2 * last
+    for way in (lambda t: t / last, lambda t: 1 - np.exp(-t / time)):
+        y, u = simulate_by_hand(lambda x, t, way=way: x + noise[round(t / DT)] + 2e-2 * way(t), r)
+        found = cid.diagnose(loop, cid.Record(dt=DT, r=r, u=u, y=y),
+                             catalogue=(E.SensorDrift, E.ParameterDrift))  # fmt: skip
+        (finding,) = found.findings
+        assert finding.name == "SensorDrift"
+        values = finding.effect.values()
+        if way(last) == 1:
+            assert set(values) == {"rate"}
+            assert values["rate"] == pytest.approx(2e-2 / last, rel=0.1)
+        else:
+            assert values["settling"] == pytest.approx(time, rel=0.2)
+            assert values["rate"] * values["settling"] == pytest.approx(2e-2, rel=0.1)
+
+
+def test_a_drift_that_settles_is_no_constant_force():
+    servo = cid.Loop(cid.plants.servo(M, C, K), None, dt=DT)
+    assert "ConstantForce" in E.equivalents(E.SensorDrift(0.1), servo)
+    assert E.equivalents(E.SensorDrift(0.1, settling=3.0), servo) == ()
+
+
+def test_hum_on_a_levitated_ball_is_named_beside_the_force_that_fits_as_well():
+    """What a scan found pays for the scan on both sides of a comparison."""
+    loop = levitation()
+    r = 0.012 + cid.random_binary(2000, amplitude=2e-4, hold=60, seed=4)
+    record = cid.simulate(levitation(E.SensorHum(8e-6, 60.0, 0.3)), r, sensor_noise=8e-6, seed=4)
+    found = cid.diagnose(loop, record, catalogue=(E.SensorHum, E.PeriodicForce))
+    (finding,) = found.findings
+    assert set(finding.names) == {"SensorHum", "PeriodicForce"}
 
 
 def test_a_line_of_the_reference():

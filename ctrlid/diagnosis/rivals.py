@@ -214,14 +214,20 @@ def _compare_in_round(
     """
     base, close = step.base, _find_close(f.trial, (step,))
     mine = weigh_refit(base, f.trial, model.fit)
-    again = work(lambda t: refit_candidate(base, screen_at(base, t.fitted), model), close)
+
+    def refit(t: Trial) -> Trial:
+        # It was found by the same scan as before, and pays for that again.
+        return refit_candidate(base, screen_at(base, t.fitted, t.scan_penalty), model)
+
+    again = work(refit, close)
     if not mine.net_gain > THRESHOLD.gate:
         mine = f.trial
-    best = max([mine, *again], key=lambda t: t.net_gain)
+    all_close = [mine, *again]
+    near = {t.key for t in all_close}
+    best = max(all_close, key=lambda t: t.net_gain)
     if best.net_gain > mine.net_gain + THRESHOLD.taken_by_better:
         model, mine, f = best.model, best, replace(f, trial=best)
-    others = [t for t in again if t is not mine]
-    near = {t.key for t in close} | {mine.key}
+    others = [t for t in all_close if t is not mine]
     rest = [t for t in step.trials if t.key not in near]
     # What a noise that was chosen since gains is no evidence of an effect.
     since = mine.gain - f.trial.gain

@@ -90,7 +90,8 @@ def equivalents(
     if name in LAGS:
         return tuple(k for k in LAGS if k != name) if _is_linear(base.equations()) else ()
     others = [e for e in (_make_member(cls, base) for cls in catalogue) if e is not None]
-    tied = _find_tied(base, others)
+    # A drift that settles is no steady motion.
+    tied = _find_tied(base, others) if len(effect.values()) == 1 else []
     found = {name: effect}
     words: set[str] = set()
     todo = [name]

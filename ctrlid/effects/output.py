@@ -9,6 +9,7 @@ import numpy as np
 
 from .._base.errors import EffectDoesNotApply
 from ..physics.linearization import OperatingPoint, compute_state_matrices
+from ..physics.symbols import Symbol
 from .context import Moment
 from .input import find_range
 from .kinds import OutputEffect, ReadingEffect
@@ -24,6 +25,11 @@ from .scanning import (
 
 # At a spread so many times the output every kink is smooth.
 SHIFTED_FAR = 1e6
+# A drift that settles is looked for from this share of the record on, between so many samples, for
+# faster ones are the start of the record, and so many records, where it is steady.
+WARM = 0.3
+SOON = 10
+LATE = 3
 
 
 @final
@@ -192,25 +198,32 @@ class SensorGain(OutputEffect):
 @final
 @dataclass(frozen=True)
 class SensorDrift(OutputEffect):
-    r"""The zero of the sensor drifts steadily.
+    r"""The zero of the sensor drifts, steadily or ever more slowly.
 
-    .. math:: y_s = y + \rho t
+    .. math:: y_s = y + \rho t \quad\text{or}\quad y_s = y + \rho T (1 - e^{-t/T})
 
-    A sensor that warms up. The time t counts from the start of the record.
+    A sensor that warms up drifts by rho T in all, most of it in the first T seconds. The time t
+    counts from the start of the record.
 
     Parameters
     ----------
     rate : float
-        The drift rho [output unit/s].
+        The drift rho at the start of the record [output unit/s].
+    settling : float, optional
+        Time constant T with which the drift comes to its end [s]; by default zero, which is a
+        steady drift without end.
 
     Examples
     --------
     >>> import ctrlid as cid
     >>> print(cid.effects.SensorDrift(rate=1e-6))
     SensorDrift: rate = 1e-06 [y]/s
+    >>> print(cid.effects.SensorDrift(rate=1e-6, settling=20.0))
+    SensorDrift: rate = 1e-06 [y]/s, settling = 20 s
     """
 
     rate: float = parameter("{y}/s", neutral=0.0)
+    settling: float = parameter("s", lower=0.0, optional=True)
 
     look_alikes: ClassVar[tuple[str, ...]] = ("ParameterDrift", "ConstantForce", "InputOffset")
     sentence: ClassVar[str] = "The zero of the sensor drifts."
@@ -218,9 +231,21 @@ class SensorDrift(OutputEffect):
         "a reference measurement at one known position, at the beginning and at the end"
     )
 
+    @classmethod
+    def candidates(cls, loop: Any, record: Any = None) -> tuple[Self, ...]:
+        """Return no drift, which would be steady, and one that would end within the record."""
+        warm = () if record is None else (cls(rate=0.0, settling=WARM * record.duration),)
+        return cls._applicable(loop, cls(rate=0.0), *warm)
+
+    def limits(self, seen: Range) -> dict[str, tuple[float, float]]:
+        """Return how late a drift ends: after some samples, and before it looks steady."""
+        return {"settling": (SOON * seen.dt, LATE * seen.duration)}
+
     def output(self, m: Moment) -> Any:
         """Return the drifting reading."""
-        return m.y + self.rate * m.t
+        if not isinstance(self.settling, Symbol) and self.settling == 0:
+            return m.y + self.rate * m.t
+        return m.y + self.rate * self.settling * (1 - np.exp(-m.t / self.settling))
 
 
 @final

@@ -23,6 +23,10 @@ from ...physics.linearization import compute_state_matrices
 FEWEST = 10
 # The model predicts across gaps of at most so many samples; after longer ones the filter restarts.
 BRIDGE = 20
+# A rough guess of the noise predicts an output from so many samples before, and tells noise from
+# rounding down to this share of the output's standard deviation.
+LAGS = 8
+LEAST_NOISE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -273,9 +277,8 @@ def _guess_initial_state(loop: Loop, record: Record) -> tuple[Array, Array, floa
     e, at = loop.equations(keep=True), loop.point
     y = record.y[record.valid]
     reach = float(np.std(y)) + abs(float(np.mean(y)) - at.output)
-    # Third differences leave little of a smooth output.
-    noise = float(np.std(np.diff(y, 3))) / np.sqrt(20)
-    noise = max(noise, 1e-9 * max(abs(at.output), reach), 1e-300)
+    noise = max(_guess_noise(y, record.u[None, record.valid]), 1e-9 * max(abs(at.output), reach))
+    noise = max(noise, 1e-300)
     speed = max(float(np.std(np.diff(y))) / record.dt, noise / record.dt)
     rest = find_rest_state(loop, e)
     wide = [max(0.1 * abs(v), reach, noise) for v in rest]
@@ -300,8 +303,7 @@ def _guess_several_states(loop: Loop, record: Record) -> tuple[Array, Array, Arr
     for k, (y, use, middle) in enumerate(zip(ys, record.valid_outputs, at.outputs, strict=True)):
         seen = y[use]
         reach = float(np.std(seen)) + abs(float(np.mean(seen)) - middle)
-        # Third differences leave little of a smooth output.
-        noise = float(np.std(np.diff(seen, 3))) / np.sqrt(20)
+        noise = _guess_noise(seen, np.reshape(record.u, (-1, len(use)))[:, use])
         scales[k] = max(noise, 1e-9 * max(abs(middle), reach), 1e-300)
         speed = max(float(np.std(np.diff(seen))) / record.dt, scales[k] / record.dt)
         shown = np.abs(c[k]) > 1e-9 * np.max(np.abs(c[k]), initial=0.0)
@@ -315,6 +317,25 @@ def _guess_several_states(loop: Loop, record: Record) -> tuple[Array, Array, Arr
     wide = np.where(wide > 0, wide, 10 * max(float(wide.max()), float(np.max(np.abs(rest)))))
     wide = np.maximum(wide, 0.1 * np.abs(rest))
     return rest, np.diag((wide / scales[0]) ** 2), scales
+
+
+def _guess_noise(y: Array, u: Array) -> float:
+    """Return a rough standard deviation of the noise of an output, given the inputs as rows.
+
+    It is what third differences leave, which is little of an output that is sampled densely, or
+    what a regression on the samples before leaves, if that is less. A guess far too large would
+    hold the state at the start near rest, against the readings, once a fit finds the noise small.
+    """
+    third = float(np.std(np.diff(y, 3)) / np.sqrt(20))
+    count = len(y) - LAGS
+    if count < 4 * LAGS * (1 + len(u)):
+        return third
+    columns = [s[LAGS - k : len(s) - k] for s in (y, *u) for k in range(1, LAGS + 1)]
+    columns += [s[LAGS:] for s in u]
+    past = np.column_stack([np.ones(count), *columns])
+    left = y[LAGS:] - past @ np.linalg.lstsq(past, y[LAGS:], rcond=None)[0]
+    # Of an output without noise both leave next to nothing, and rounding is no measure.
+    return float(min(third, max(np.std(left), LEAST_NOISE * np.std(y))))
 
 
 def find_rest_state(loop: Loop, e: Equations) -> tuple[float, ...]:
