@@ -60,7 +60,7 @@ def fill_unit(template: str, signals: Mapping[str, str]) -> str:
     for symbol, power in _parse_unit(template).items():
         unit = signals[symbol[1:-1]] if symbol.startswith("{") else symbol
         parts = _parse_unit(unit)
-        if len(parts) > 1 and min(parts.values()) > 0:
+        if len(parts) > 1 and min(parts.values()) > 0 and "s" not in parts:
             parts = {unit: 1}
         for part, times in parts.items():
             filled[part] = filled.get(part, 0) + power * times

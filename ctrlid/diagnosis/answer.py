@@ -16,7 +16,13 @@ from ..estimation.likelihood.filter_data import find_noise_units
 from ..estimation.likelihood.likelihood import Fit
 from ..estimation.likelihood.physics_fit import summarize_fit
 from ..estimation.likelihood.tails import JointTails, Tails
-from ..loop.loop import Loop, describe_missing_forces, list_unforced_velocities
+from ..loop.loop import (
+    Loop,
+    describe_missing_forces,
+    describe_possible_speeds,
+    list_possible_speeds,
+    list_unforced_velocities,
+)
 from .candidates import Trial, is_same_kind
 from .experiment import find_experiment
 from .findings import COMPLETE, Calibrated, Candidate, Finding, SensorNoise
@@ -137,6 +143,9 @@ def _list_notes(loop: Loop, found: Search) -> list[str]:
         )
     if list_unforced_velocities(loop) and not found.after.passed:
         notes.append(f"{describe_missing_forces(loop)}, and diagnose again")
+    speeds = list_possible_speeds(loop)
+    if speeds and not found.after.passed:
+        notes.append(f"{describe_possible_speeds(speeds)}, and diagnose again")
     if loop.linear_plant and not found.after.passed:
         notes.append(
             "the model is linear. If the errors depend on position, velocity or input, write the "

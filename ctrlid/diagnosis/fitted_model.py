@@ -180,8 +180,8 @@ class RecordRange:
 
     @property
     def travel(self) -> float:
-        """How far the position moves [output unit]; infinite without a moving mass."""
-        if not self.plant.e.velocities:
+        """How far the position moves [output unit]; infinite where no state is one."""
+        if not self.plant.e.position_rates:
             return math.inf
         return max(float(np.ptp(a.filtered[:, self.plant.position])) for a in self.at)
 

@@ -72,16 +72,25 @@ def summarize_gap(loop: Loop, found: Search, fresh: FreshData) -> GapSummary:
     else:
         unit = loop.known_units.get(loop.equations().outputs[0], "")
         gap = _make_gap(shared, rows, floor, unit, windows[0])
-        # Noises on several states' rates have no unit in common.
-        moves = loop.equations().velocities
-        unit = fill_unit("{x}/s^2", {"x": loop.position_unit}) if moves else ""
-        gap = replace(gap, force_unit=unit)
+        gap = replace(gap, force_unit=_find_force_unit(loop))
     worse = gaps.compute_widening_chance(shared.windows, results[0], results[2])
     excess = math.nan
     if how.horizon:
         floors = [part.both for part in floor.outputs or (floor,)]
         excess = gaps.compute_excess_chance(shared.windows, results[2], floors)
     return GapSummary(gap, shares, _measure_disturbance(fit, loop, floor), excess, worse)
+
+
+def _find_force_unit(loop: Loop) -> str:
+    """Return the unit of the random force of a plant of single signals; empty without one."""
+    e = loop.equations()
+    if e.velocities:
+        return fill_unit("{x}/s^2", {"x": loop.position_unit})
+    # Noises on several states' rates have no unit in common.
+    if e.dt or len(e.states) - len(e.rest) != 1:
+        return ""
+    state = e.states[0]
+    return fill_unit("{x}/s", {"x": loop.state_units.get(state) or f"[{state}]"})
 
 
 def replace_divergence(

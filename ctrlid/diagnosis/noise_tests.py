@@ -340,7 +340,7 @@ def _find_axes(fit: Fit, out: Filtered, data: FilterData) -> dict[str, Array]:
     axes["input change"] = np.diff(axes["input"], prepend=axes["input"][0])
     others = [k for k in range(len(e.states) - len(e.rest)) if k not in e.velocities]
     for k in others:
-        axes["position" if e.velocities and len(others) == 1 else e.states[k]] = states[:, k]
+        axes["position" if e.position_rates and len(others) == 1 else e.states[k]] = states[:, k]
     for k in e.velocities:
         axes["velocity" if len(e.velocities) == 1 else e.states[k]] = states[:, k]
     if data.record.r is not None:

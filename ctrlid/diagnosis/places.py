@@ -84,6 +84,12 @@ def find_force_channel(e: Equations, at: str) -> int:
 
 
 def find_position(e: Equations, at: str, otherwise: int) -> int:
-    """Return the state that is the position of a velocity, else another one."""
+    """Return the state that is the position of a velocity, else another one.
+
+    A speed whose position is no state stands for it.
+    """
     motion = find_motion(e, at) if at else None
-    return otherwise if motion is None else motion[0]
+    if motion is None:
+        return otherwise
+    position, velocity = motion
+    return velocity if position is None else position

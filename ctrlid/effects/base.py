@@ -392,7 +392,7 @@ class AbstractEffect(metaclass=CheckedCalls):
         changed = type(self).build(symbolic, e, m)
         return append_states(changed, label, own, rates, self.rest(own_point))
 
-    def _find_place(self, e: Equations) -> tuple[int, int, tuple[int, int] | None]:
+    def _find_place(self, e: Equations) -> tuple[int, int, tuple[int | None, int] | None]:
         """Return which input, which output and which position and velocity the effect is about."""
         velocities = tuple(e.states[j] for j in e.velocities)
         names = {"input": e.inputs, "output": e.outputs, "force": velocities, "law": ()}[self.place]
@@ -453,13 +453,25 @@ def _can_take(loop: Any, effect: AbstractEffect) -> bool:
     return True
 
 
-def require_motion(effect: AbstractEffect, e: Equations) -> tuple[int, int]:
-    """Return the indices of position and velocity, or refuse."""
+def require_motion(effect: AbstractEffect, e: Equations) -> tuple[int | None, int]:
+    """Return the indices of position, if it is a state, and velocity, or refuse."""
     found = find_motion(e, effect.at if effect.place == "force" else "")
     if found is None:
         raise EffectDoesNotApply(
             f"{type(effect).__name__} acts on a moving mass, but no state of {e.name} is the rate "
             f"of another one ({', '.join(e.states)}); write the plant with position and velocity "
-            "as states, dx/dt = v"
+            f"as states, dx/dt = v, or say that a state is a speed: Loop(..., "
+            f"forces={{{e.states[-1]!r}: None}})"
         )
     return found
+
+
+def require_position(effect: AbstractEffect, e: Equations) -> tuple[int, int]:
+    """Return the indices of position and velocity, or refuse."""
+    position, velocity = require_motion(effect, e)
+    if position is None:
+        raise EffectDoesNotApply(
+            f"{type(effect).__name__} needs the position of {e.states[velocity]}, which is no "
+            f"state of {e.name}"
+        )
+    return position, velocity

@@ -37,11 +37,11 @@ class Follow:
     shortest: float
 
 
-def find_motion(e: Equations, velocity: str = "") -> tuple[int, int] | None:
+def find_motion(e: Equations, velocity: str = "") -> tuple[int | None, int] | None:
     """Return the indices of the position and the velocity that forces act on, None without any.
 
     Of several moving masses it is the one whose position the output shows, else the first; with
-    the name of a velocity it is that one.
+    the name of a velocity it is that one. The position of a speed may be no state (None).
     """
     if e.dt:
         return None
@@ -49,12 +49,15 @@ def find_motion(e: Equations, velocity: str = "") -> tuple[int, int] | None:
     own = len(e.states) - len(e.rest)
     pairs = [
         (i, j)
-        for j in e.velocities
+        for j in e.position_rates
         for i in range(own)
         if i != j and casadi.is_equal(casadi.simplify(e.rhs[i]), e.x[j], 2)
         if velocity in ("", e.states[j])
     ]
-    return min(pairs, key=lambda pair: (pair[0] not in shown, pair), default=None)
+    if pairs:
+        return min(pairs, key=lambda pair: (pair[0] not in shown, pair))
+    speeds = [e.states.index(name) for name in e.speeds if velocity in ("", name)]
+    return min(((None, j) for j in speeds), key=lambda pair: pair[1] not in shown, default=None)
 
 
 def find_output_of(e: Equations, velocity: str) -> int:
@@ -63,7 +66,7 @@ def find_output_of(e: Equations, velocity: str) -> int:
     if motion is not None:
         shown = casadi.jacobian(e.output, e.x)
         for k in range(len(e.outputs)):
-            if shown[k, :].sparsity().get_col() == [motion[0]]:
+            if shown[k, :].sparsity().get_col() == [motion[1] if motion[0] is None else motion[0]]:
                 return k
     return 0
 
@@ -108,7 +111,7 @@ def find_state_units(e: Equations, known: Mapping[str, str]) -> dict[str, str]:
             units.setdefault(e.states[i], known[e.outputs[k]])
     for velocity in (e.states[j] for j in e.velocities):
         motion = find_motion(e, velocity)
-        if motion is None:
+        if motion is None or motion[0] is None:
             continue
         position = e.states[motion[0]]
         if position in units:
@@ -147,11 +150,14 @@ def find_position_unit(e: Equations, known: Mapping[str, str], velocity: str = "
     motion = find_motion(e, velocity)
     if motion is None:
         return known.get(e.outputs[0], "") or "[y]"
-    position, speed = (e.states[i] for i in motion)
-    units = find_state_units(e, known)
-    unit = _integrate_unit(units.get(speed, "")) or units.get(position, "")
-    shown = motion[0] in e.derive("shown states", lambda: _list_shown_states(e))
-    return unit or ("[y]" if shown else f"[{position}]")
+    speed, units = e.states[motion[1]], find_state_units(e, known)
+    unit = _integrate_unit(units.get(speed, ""))
+    shown = e.derive("shown states", lambda: _list_shown_states(e))
+    if motion[0] is None:
+        name = units.get(speed) or ("[y]" if motion[1] in shown else f"[{speed}]")
+        return unit or f"{name} s"
+    position = e.states[motion[0]]
+    return unit or units.get(position, "") or ("[y]" if motion[0] in shown else f"[{position}]")
 
 
 class Moment:
@@ -177,7 +183,7 @@ class Moment:
 
     def __init__(
         self, e: Equations, at: OperatingPoint, dt: float, own: dict[str, Any], u: int = 0,
-        y: int = 0, motion: tuple[int, int] | None = None,
+        y: int = 0, motion: tuple[int | None, int] | None = None,
     ) -> None:  # fmt: skip
         self._e, self._motion = e, motion
         # What a force at a place of its own accelerates its velocity by; else it is one already.
@@ -191,7 +197,7 @@ class Moment:
         self.states: dict[str, Any] = {s: Symbol(e.x[k]) for k, s in enumerate(e.states)}
         self.parameters: dict[str, Any] = {s: Symbol(e.p[k]) for k, s in enumerate(e.parameters)}
 
-    def _require_motion(self) -> tuple[int, int]:
+    def _require_motion(self) -> tuple[int | None, int]:
         found = self._motion or find_motion(self._e)
         if found is None:
             raise EffectDoesNotApply(
@@ -199,15 +205,24 @@ class Moment:
             )
         return found
 
+    def _require_position(self) -> int:
+        position, velocity = self._require_motion()
+        if position is None:
+            raise EffectDoesNotApply(
+                f"{self._e.states[velocity]} of {self._e.name} is a speed whose position is no "
+                "state"
+            )
+        return position
+
     @property
     def position_name(self) -> str:
         """Name of the state that is the position of the moving mass."""
-        return self._e.states[self._require_motion()[0]]
+        return self._e.states[self._require_position()]
 
     @property
     def position(self) -> Any:
         """Position of the moving mass."""
-        return Symbol(self._e.x[self._require_motion()[0]])
+        return Symbol(self._e.x[self._require_position()])
 
     @property
     def velocity(self) -> Any:
@@ -222,7 +237,7 @@ class Moment:
     @property
     def deviation(self) -> Any:
         """Position of the moving mass, counted from where it is at the operating point."""
-        index = self._require_motion()[0]
+        index = self._require_position()
         return Symbol(self._e.x[index] - self.at.states[index])
 
     def plant_parameter(self, name: str) -> Any:

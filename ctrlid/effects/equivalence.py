@@ -176,10 +176,13 @@ def _find_scaled(loop: Any, others: Sequence[AbstractEffect]) -> set[str]:
     """
     e = loop.equations()
     motion = find_motion(e)
-    if motion is None or not casadi.is_equal(casadi.simplify(e.output), e.x[motion[0]], 2):
+    if motion is None:
+        return set()
+    moving = [k for k in motion if k is not None]
+    if not casadi.is_equal(casadi.simplify(e.output), e.x[moving[0]], 2):
         return set()
     stretch = np.ones(len(e.states))
-    stretch[list(motion)] = 1 + SCALE
+    stretch[moving] = 1 + SCALE
     points = _draw_points(loop.point)
     x, u, t = points
     rates = stretch * e.evaluate_points(x / stretch, u, t)[0]
@@ -283,6 +286,8 @@ def _find_shifted_offsets(name: str, loop: Any) -> set[str]:
     if name not in OFFSETS or found is None:
         return set()
     i, j = found
+    if i is None:
+        return set()
     # The output is the position, but for a constant.
     shown = casadi.simplify(casadi.jacobian(e.output, e.x[i]))
     rest = casadi.substitute(e.output, e.x[i], casadi.SX(0.0))

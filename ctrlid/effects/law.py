@@ -9,7 +9,7 @@ import numpy as np
 
 from .._base.errors import EffectDoesNotApply
 from ..physics.equations import Equations
-from .base import require_motion
+from .base import require_position
 from .context import Moment
 from .kinds import LawEffect
 from .parameters import parameter
@@ -57,7 +57,7 @@ class PositionOffset(LawEffect):
 
     def build(self, e: Equations, m: Moment) -> Equations:
         """Return the changed equations, if the force depends on the position at all."""
-        i, j = require_motion(self, e)
+        i, j = require_position(self, e)
         if not casadi.jacobian(e.rhs[j], e.x[i]).nnz():
             raise EffectDoesNotApply(
                 f"PositionOffset: the force in {e.name} does not depend on "
@@ -101,7 +101,7 @@ class ForceExponent(LawEffect):
 
     def build(self, e: Equations, m: Moment) -> Equations:
         """Return the changed equations, if the force falls with the square of the distance."""
-        i, j = require_motion(self, e)
+        i, j = require_position(self, e)
         rest = m.at.states[i]
         pull = e.rhs[j] - casadi.substitute(e.rhs[j], e.u, casadi.SX.zeros(*e.u.shape))
         falling = casadi.Function("pull", [e.t, e.x, e.u, e.p], [pull])

@@ -60,7 +60,7 @@ def find_initial_state(
     if simulator.loop.equations().siso:
         spread: Any = max(float(np.std(part.y)), 1e-12 * float(np.abs(part.y).max()), 1e-300)
         scale = np.maximum(0.01 * np.abs(guess[:fitted]), spread)
-        for j in simulator.loop.equations().velocities:
+        for j in simulator.loop.equations().position_rates:
             scale[j] = max(float(np.std(np.diff(part.y))) / part.dt, 1e-300)
         seen = _set_measured_state(simulator, part, guess, start_time)
         low, high = _bound_initial_state(simulator, part, seen)
@@ -135,11 +135,11 @@ def _set_measured_state(
     slope, first = np.polyfit(np.arange(few) * part.dt, part.y[:few], 1)
     c = _differentiate_output(simulator)
     off = first - float(e.evaluate(guess[:n], loop.point.input, start_time)[1][0])
-    seen = np.array([0.0 if j in e.velocities else c[j] for j in range(n)])
+    seen = np.array([0.0 if j in e.position_rates else c[j] for j in range(n)])
     if seen.any():
         start[:n] += seen * off / (seen @ seen)
     moving = find_motion(e)
-    if moving is not None and c[moving[0]]:
+    if moving is not None and moving[0] is not None and c[moving[0]]:
         start[moving[1]] = slope / c[moving[0]]
     return start
 
@@ -149,7 +149,7 @@ def _bound_initial_state(simulator: Simulator, part: Record, seen: Array) -> tup
     e = simulator.loop.equations()
     low, high = np.full(len(seen), -np.inf), np.full(len(seen), np.inf)
     moving, c = find_motion(e), _differentiate_output(simulator)
-    if moving is not None and c[moving[0]]:
+    if moving is not None and moving[0] is not None and c[moving[0]]:
         where, speed = moving
         steps = np.diff(part.y)
         high[speed] = FASTEST * float(np.std(steps)) / part.dt / abs(c[where])
@@ -176,8 +176,8 @@ class _SeveralOutputs:
         self.spread: Any = self.spreads[:, None] if part.y.ndim == 2 else self.spreads[0]
         moves = np.std(np.diff(self.y, axis=1), axis=1) / part.dt
         self.speeds = np.maximum(moves, 1e-300)
-        pairs = [find_motion(e, e.states[j]) for j in e.velocities]
-        self.motions = [pair for pair in pairs if pair is not None]
+        pairs = [find_motion(e, e.states[j]) for j in e.position_rates]
+        self.motions = [(p[0], p[1]) for p in pairs if p is not None and p[0] is not None]
 
     def _find_output(self, state: int) -> int | None:
         """Return the output that shows a state most, beside its own spread."""
@@ -205,7 +205,7 @@ class _SeveralOutputs:
         slopes, first = np.polyfit(np.arange(few) * self.part.dt, self.y[:, :few].T, 1)
         at = self.simulator.loop.point
         off = first - self.e.evaluate(guess[:n], np.array(at.inputs), self.start_time)[1]
-        still = [k for k in range(n) if k not in self.e.velocities]
+        still = [k for k in range(n) if k not in self.e.position_rates]
         start[still] += np.linalg.lstsq(self.c[:, still], off, rcond=1e-9)[0]
         moving = [i for i, _ in self.motions]
         speeds = np.linalg.lstsq(self.c[:, moving], slopes, rcond=1e-9)[0]

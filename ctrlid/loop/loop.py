@@ -22,12 +22,12 @@ from .._base.arrays import to_real_array
 from .._base.errors import CtrlidError, CtrlidWarning, EffectDoesNotApply
 from .._base.periods import have_same_period, write_both_periods
 from .._base.pickling import pack_by_value
-from .._base.text import Printed, list_known, write_count, write_percent
+from .._base.text import Printed, list_known, write_count, write_list, write_percent
 from ..effects import AbstractEffect, Quantization
 from ..effects.composition import compose_effects, label_effects
 from ..effects.context import find_motion, find_position_unit, find_state_units
 from ..effects.python_control import as_system, linearize_with_effects
-from ..physics.equations import Equations, drive_inputs
+from ..physics.equations import Equations, drive_inputs, may_be_speed
 from ..physics.linearization import (
     OperatingPoint,
     as_operating_point,
@@ -39,6 +39,9 @@ from ..physics.linearization import (
 from ..physics.trace import trace, with_parameters
 from .controllers import PID, ControlLaw, make_control_law
 from .wiring import Wiring, is_wired_by_name, make_wired_law, make_wiring
+
+# Units by which a state is known as a speed.
+SPEEDS = ("m/s", "mm/s", "cm/s", "km/h", "rad/s", "deg/s", "°/s", "rpm")
 
 
 @explain_fields
@@ -91,7 +94,9 @@ class Loop(Printed):
     forces : mapping of str to str, optional
         Which input of the plant works on which velocity, ``{"x_dot": "F", "theta_dot": "tau"}``:
         random forces act there, through the mass matrix. By default as a plant of `plants` has it;
-        else each velocity is pushed alone.
+        else each velocity is pushed alone. A state that is a speed, though its position is no
+        state, becomes a velocity in this way: a motor with a tachometer, ``{"omega": "tau"}``, or
+        ``{"omega": None}`` where no input is its torque, may then have friction.
 
     Raises
     ------
@@ -117,7 +122,7 @@ class Loop(Printed):
     effects: tuple[AbstractEffect, ...] = field(default=(), kw_only=True)
     units: Mapping[str, str] = field(default_factory=dict, kw_only=True)
     driven: tuple[str, ...] = field(default=(), kw_only=True)
-    forces: Mapping[str, str] | None = field(default=None, kw_only=True)
+    forces: Mapping[str, str | None] | None = field(default=None, kw_only=True)
     _traced: Equations = field(init=False, repr=False)
     _active: Equations = field(init=False, repr=False)
     _kept: Equations = field(init=False, repr=False)
@@ -183,7 +188,7 @@ class Loop(Printed):
         if mechanism is not None and not whole.siso:
             forces = dict(self.plant.forces) if forces is None else forces
             # The plants of `plants` know where forces work; their parameters may have been changed.
-            if forces and set(forces.values()) <= set(mechanism.input_labels):
+            if forces and {*forces.values()} - {None} <= set(mechanism.input_labels):
                 whole = trace(with_parameters(mechanism, self.plant.params))
         if not driven and not forces:
             return whole, names
@@ -695,9 +700,23 @@ def list_unforced_velocities(loop: Loop) -> tuple[str, ...]:
     In a chain of integrators a velocity is the position of the next one, and just one moves.
     """
     e = loop.equations()
-    pairs = [pair for j in e.velocities if (pair := find_motion(e, e.states[j]))]
+    pairs = [pair for j in e.position_rates if (pair := find_motion(e, e.states[j]))]
     moving = sorted({j for _, j in pairs} - {i for i, _ in pairs})
     return tuple(e.states[j] for j in moving) if len(moving) > 1 and e.pushes is None else ()
+
+
+def list_possible_speeds(loop: Loop) -> tuple[str, ...]:
+    """Return the states that may be speeds of which the loop does not say so.
+
+    Where their units are known, it is those in m/s, rad/s and the like; where they are not, those
+    of a plant in which nothing else moves.
+    """
+    e, units = loop.equations(), loop.state_units
+    own = e.states[: len(e.states) - len(e.rest)]
+    free = [s for s in own if e.states.index(s) not in e.velocities and may_be_speed(e, s)]
+    if any(s in units for s in free):
+        return tuple(s for s in free if units.get(s) in SPEEDS)
+    return () if e.velocities else tuple(free)
 
 
 def describe_missing_forces(loop: Loop) -> str:
@@ -715,6 +734,15 @@ def describe_missing_forces(loop: Loop) -> str:
         f"{text}No input of {loop.equations().name} is such a force. In a mechanism that is "
         "coupled, add one for each velocity to the equations of the plant, and say which inputs "
         f"the record has: Loop(..., driven={driven}, forces={{{velocity!r}: 'force'}})"
+    )
+
+
+def describe_possible_speeds(speeds: tuple[str, ...]) -> str:
+    """Say which states may be speeds, and how to say so, without a full stop."""
+    return (
+        f"forces, friction among them, were not looked for at {write_list(speeds)}, for no state "
+        "is its position. If it is a speed, say so, with the input that is its force or torque or "
+        f"None: Loop(..., forces={{{speeds[0]!r}: None}})"
     )
 
 

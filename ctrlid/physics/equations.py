@@ -109,7 +109,8 @@ class Equations:
 
     `pushes` has a column for each force that is known to work on a velocity: the derivative of the
     states' rates by it; `push_units` are the units of these forces, or the names of their inputs in
-    brackets, and empty for a velocity that is pushed alone. Without, each velocity is.
+    brackets, and empty for a velocity that is pushed alone. Without, each velocity is. `speeds`
+    names velocities whose position is no state, as of a drive with a tachometer.
     """
 
     name: str
@@ -134,6 +135,7 @@ class Equations:
     rest: tuple[float, ...] = ()
     pushes: Any = None
     push_units: tuple[str, ...] = ()
+    speeds: tuple[str, ...] = ()
 
     def __reduce__(self) -> Any:
         # CasADi pickles no expression alone: all go into one package, which keeps the symbols that
@@ -175,7 +177,14 @@ class Equations:
     @property
     @_derive_once
     def velocities(self) -> tuple[int, ...]:
-        """Indices of the plant's own states that are another one's rate: forces act on them."""
+        """Indices of the plant's own states that forces act on: rates of others, and speeds."""
+        speeds = (self.states.index(name) for name in self.speeds)
+        return tuple(sorted({*self.position_rates, *speeds}))
+
+    @property
+    @_derive_once
+    def position_rates(self) -> tuple[int, ...]:
+        """Indices of the plant's own states that are another one's rate."""
         rates = [casadi.simplify(self.rhs[i]) for i in range(len(self.states) - len(self.rest))]
         return tuple(
             j
@@ -275,8 +284,9 @@ class Equations:
 
 
 def drive_inputs(
-    equations: Equations, driven: Sequence[str], forces: Mapping[str, str], units: Mapping[str, str]
-) -> Equations:
+    equations: Equations, driven: Sequence[str], forces: Mapping[str, str | None],
+    units: Mapping[str, str],
+) -> Equations:  # fmt: skip
     """Return a plant with some of its inputs only, the others zero, and with known forces.
 
     Parameters
@@ -285,8 +295,9 @@ def drive_inputs(
         The plant with all its inputs.
     driven : sequence of str
         The inputs that remain, in this order.
-    forces : mapping of str to str
-        Which input works on which velocity; see `Equations.pushes`.
+    forces : mapping of str to str or None
+        Which input works on which velocity, None for one that is pushed alone; see
+        `Equations.pushes`.
     units : mapping of str to str
         Units of the inputs.
 
@@ -298,46 +309,69 @@ def drive_inputs(
     Raises
     ------
     CtrlidError
-        If there is no such input or velocity, or the plant is not affine in a force.
+        If there is no such input or state, a position is taken for a velocity, or the plant is
+        not affine in a force.
     """
     e, names = equations, list(equations.inputs)
     unknown = [name for name in driven if name not in names]
     if unknown or not driven:
         raise CtrlidError(f"driven= names {list(driven)}, but the inputs of {e.name} are {names}")
     velocities = [e.states[j] for j in e.velocities]
-    wrong = {v: u for v, u in forces.items() if v not in velocities or u not in names}
+    speeds = tuple(v for v, u in forces.items() if v not in velocities and may_be_speed(e, v, u))
+    known = (*velocities, *speeds)
+    wrong = {v: u for v, u in forces.items() if v not in known or u not in (None, *names)}
     if wrong:
         raise CtrlidError(
             f"forces= says which input works on which velocity; given {wrong}, but the velocities "
-            f"of {e.name} are {velocities} and its inputs {names}"
+            f"of {e.name} are {velocities} and its inputs {names}. A speed whose position is no "
+            "state is a velocity, too, where the input changes its rate"
         )
+    e = replace(e, speeds=speeds)
+    velocities = [e.states[j] for j in e.velocities]
     kept = [names.index(name) for name in driven]
     u = casadi.SX.sym("u", len(driven)) if list(driven) != names else e.u
     values = casadi.SX.zeros(len(names), 1)
     for k, j in enumerate(kept):
         values[j] = u[k]
     pushes = None
-    if forces:
+    # A single mass with a single input and output is pushed by accelerations, as without forces.
+    single = len(velocities) == len(driven) == len(e.outputs) == 1
+    if forces and not single:
         slopes = casadi.jacobian(e.rhs, e.u)
         columns = []
         for j, velocity in zip(e.velocities, velocities, strict=True):
-            if velocity not in forces:
+            force = forces.get(velocity)
+            if force is None:
                 columns.append(casadi.SX(casadi.DM.eye(len(e.states))[:, j]))
                 continue
-            at = names.index(forces[velocity])
+            at = names.index(force)
             if casadi.depends_on(slopes[:, at], e.u[at]):
                 raise CtrlidError(
-                    f"forces= says that {forces[velocity]} works on {velocity}, but {e.name} is "
+                    f"forces= says that {force} works on {velocity}, but {e.name} is "
                     "not affine in it: a force enters the accelerations as it is, times a factor"
                 )
             columns.append(slopes[:, at])
         pushes = casadi.substitute(casadi.horzcat(*columns), e.u, values)
-    own = tuple(
-        (units.get(forces[name]) or f"[{forces[name]}]") if name in forces else ""
-        for name in velocities
-    )
+    given = [forces.get(name) for name in velocities]
+    own = tuple("" if force is None else units.get(force) or f"[{force}]" for force in given)
     return replace(
         e, inputs=tuple(driven), u=u, rhs=casadi.substitute(e.rhs, e.u, values),
         output=casadi.substitute(e.output, e.u, values), pushes=pushes,
-        push_units=own if forces else (),
+        push_units=own if forces and not single else (),
     )  # fmt: skip
+
+
+def may_be_speed(e: Equations, name: str, force: str | None = None) -> bool:
+    """Whether a state may be a velocity whose position is no state.
+
+    Its rate is no other state, which would make it a position, and changes with the force, unless
+    that is none of the inputs (None).
+    """
+    if name not in e.states or e.dt:
+        return False
+    own = e.states.index(name)
+    rate = casadi.simplify(e.rhs[own])
+    if any(casadi.is_equal(rate, e.x[k], 2) for k in range(len(e.states)) if k != own):
+        return False
+    pushed = force in e.inputs and casadi.jacobian(rate, e.u[e.inputs.index(force)]).nnz() > 0
+    return force is None or pushed

@@ -282,7 +282,7 @@ def _guess_initial_state(loop: Loop, record: Record) -> tuple[Array, Array, floa
     speed = max(float(np.std(np.diff(y))) / record.dt, noise / record.dt)
     rest = find_rest_state(loop, e)
     wide = [max(0.1 * abs(v), reach, noise) for v in rest]
-    for j in e.velocities:
+    for j in e.position_rates:
         wide[j] = speed
     return np.array(rest), np.diag((np.array(wide) / noise) ** 2), noise
 

@@ -165,7 +165,7 @@ def _give_laws(fit: Fit, laws: Sequence[Tails | None]) -> Noise:
 
 def choose_noise_ratio(plant: SampledPlant) -> float:
     """Return the reference ratio of force noise to sensor noise, by the sampling period."""
-    return 1.0 / plant.loop.dt ** (2 if plant.e.velocities else 1)
+    return 1.0 / plant.loop.dt ** (2 if plant.e.position_rates else 1)
 
 
 def choose_force_ratios(problem: Problem) -> Array:

@@ -127,8 +127,8 @@ class SampledPlant:
 
     @property
     def position(self) -> int:
-        """Index of the state whose rate is the first velocity."""
-        e, v = self.e, self.e.velocities[0]
+        """Index of the state whose rate is the first velocity, of those that are one."""
+        e, v = self.e, self.e.position_rates[0]
         rates = [casadi.simplify(e.rhs[k]) for k in range(self.n) if k != v]
         found = [casadi.is_equal(rate, e.x[v], 2) for rate in rates]
         return [k for k in range(self.n) if k != v][found.index(True)]
