@@ -1,11 +1,20 @@
-"""What studies read and print alike: seeds, shares with intervals, the draws farthest off."""
+"""What studies read, keep and print alike: seeds, files of lines, shares with intervals."""
 
 from __future__ import annotations
 
+import functools
+import gzip
+import json
+import os
+import subprocess
+from collections.abc import Callable, Iterable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.stats import binomtest
+
+import ctrlid as cid
 
 
 def parse_seeds(text: str) -> range:
@@ -39,3 +48,48 @@ def print_farthest(rows: list[dict[str, Any]], failed: list[dict[str, Any]]) -> 
         print("  ", {k: f"{v:.3g}" if isinstance(v, float) else v for k, v in row.items()})
     for row in failed:
         print("failed:", row)
+
+
+def find_commit() -> str:
+    """Return the commit of ctrlid that is diagnosed with, with a plus where files have changed."""
+    here = Path(cid.__file__).parent
+    ask = functools.partial(subprocess.run, cwd=here, capture_output=True, text=True, check=True)
+    try:
+        commit = ask(["git", "rev-parse", "--short=7", "HEAD"]).stdout.strip()
+        changed = ask(["git", "status", "--porcelain", "--untracked-files=no", "."]).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return ""
+    return commit + "+" * bool(changed)
+
+
+def read_lines(
+    path: str | Path, key: Callable[[dict[str, Any]], tuple[Any, ...]]
+) -> list[dict[str, Any]]:
+    """Return the lines of a file; of a draw that is there twice, by its key, the last one counts.
+
+    What a run that was killed left half written at the end is left out.
+    """
+    found: dict[tuple[Any, ...], dict[str, Any]] = {}
+    if Path(path).exists():
+        try:
+            with gzip.open(path, "rt") as file:
+                for text in file:
+                    line = json.loads(text)
+                    found[key(line)] = line
+        except (EOFError, json.JSONDecodeError, gzip.BadGzipFile):
+            pass
+    return list(found.values())
+
+
+def write_lines(path: str | Path, lines: Iterable[dict[str, Any]]) -> None:
+    """Write lines as one compressed file, the same bytes for the same lines."""
+    text = "".join(json.dumps(x, separators=(",", ":")) + "\n" for x in lines)
+    part = Path(f"{path}.part")
+    part.write_bytes(gzip.compress(text.encode(), 9, mtime=0))
+    os.replace(part, path)
+
+
+def append_line(path: str | Path, line: dict[str, Any]) -> None:
+    """Add a line to a file; a gzip file may have several parts."""
+    with Path(path).open("ab") as file:
+        file.write(gzip.compress((json.dumps(line) + "\n").encode(), 6, mtime=0))

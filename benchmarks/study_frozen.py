@@ -12,13 +12,8 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import functools
-import gzip
 import itertools
-import json
 import math
-import os
-import subprocess
 import time
 import warnings
 from collections.abc import Callable, Iterable, Sequence
@@ -29,7 +24,7 @@ import control as ct
 import joblib
 import numpy as np
 import outside_cases as cases
-from _shares import parse_seeds, wilson
+from _shares import append_line, find_commit, parse_seeds, read_lines, wilson, write_lines
 from scipy import signal, stats
 from watched_numbers import watch_numbers
 
@@ -109,18 +104,6 @@ def make_loop(rig: cases.Rig) -> cid.Loop:
         law = ct.tf((rig.stated_gain * rig.num).tolist(), rig.den.tolist(), rig.dt)
     free = {name: rig.deviation.get(name, math.inf) for name in cases.FREE[rig.plant]}
     return cid.Loop(plant, law, dt=rig.dt, at=at, free=free)
-
-
-def find_commit() -> str:
-    """Return the commit of ctrlid that is diagnosed with, with a plus where files have changed."""
-    here = Path(cid.__file__).parent
-    ask = functools.partial(subprocess.run, cwd=here, capture_output=True, text=True, check=True)
-    try:
-        commit = ask(["git", "rev-parse", "--short=7", "HEAD"]).stdout.strip()
-        changed = ask(["git", "status", "--porcelain", "--untracked-files=no", "."]).stdout.strip()
-    except (OSError, subprocess.CalledProcessError):
-        return ""
-    return commit + "+" * bool(changed)
 
 
 def run(name: str, seed: int, n: int = SAMPLES, watched: bool = True) -> dict[str, Any]:
@@ -440,38 +423,19 @@ def make_changed_key(line: dict[str, Any]) -> tuple[Any, ...]:
 def read(
     path: str | Path, key: Callable[[dict[str, Any]], tuple[Any, ...]] = make_key
 ) -> list[dict[str, Any]]:
-    """Return the lines of a file; of a draw that is there twice, by its key, the last one counts.
-
-    What a run that was killed left half written at the end is left out.
-    """
-    found: dict[tuple[Any, ...], dict[str, Any]] = {}
-    if Path(path).exists():
-        try:
-            with gzip.open(path, "rt") as file:
-                for text in file:
-                    line = json.loads(text)
-                    found[key(line)] = line
-        except (EOFError, json.JSONDecodeError, gzip.BadGzipFile):
-            pass
-    return list(found.values())
+    """Return the lines of a file; of those with the same key the last one counts."""
+    return read_lines(path, key)
 
 
 def write(path: str | Path, lines: Iterable[dict[str, Any]]) -> None:
-    """Write lines as one compressed file, sorted, the same bytes for the same lines."""
+    """Write lines as one compressed file, in the order of classes and seeds."""
     order = {name: i for i, name in enumerate(cases.CLASSES)}
     changed = ("number", "factor")
-    ordered = sorted(lines, key=lambda x: (order[x["class"]], x["seed"], x["n"],
-                                           *(x[k] for k in changed if k in x)))  # fmt: skip
-    text = "".join(json.dumps(x, separators=(",", ":")) + "\n" for x in ordered)
-    part = Path(f"{path}.part")
-    part.write_bytes(gzip.compress(text.encode(), 9, mtime=0))
-    os.replace(part, path)
 
+    def rank(x: dict[str, Any]) -> tuple[Any, ...]:
+        return order[x["class"]], x["seed"], x["n"], *(x[k] for k in changed if k in x)
 
-def append(path: str | Path, line: dict[str, Any]) -> None:
-    """Add a line to a file; a gzip file may have several parts."""
-    with Path(path).open("ab") as file:
-        file.write(gzip.compress((json.dumps(line) + "\n").encode(), 6, mtime=0))
+    write_lines(path, sorted(lines, key=rank))
 
 
 def is_same_answer(one: dict[str, Any], other: dict[str, Any]) -> bool:
@@ -524,7 +488,7 @@ def main() -> None:
     tasks = [(c, s, options.samples) for c, s in wanted if (c, s, options.samples) not in done]
     work = joblib.Parallel(n_jobs=options.jobs, return_as="generator_unordered")
     for line in work(joblib.delayed(run)(*task) for task in tasks):
-        append(options.out, line)
+        append_line(options.out, line)
         print(
             *make_key(line)[:2],
             line.get("plant"),

@@ -14,14 +14,14 @@ from ``outside_rigs.py``, a simulator that does not know ctrlid. The classes are
   controller``), scored by the kinds of ``audit(record, loop)`` and by whether diagnose() blames the
   plant. A fault counts where it leaves something of the logged u.
 
-Each draw becomes a line of JSON in ``--out``; draws that are there already are left out, so that a
-study that was interrupted goes on. ``--print FILE`` prints the table and the misses.
+Each draw becomes a line of JSON in ``--out``, a compressed file; draws that are there already are
+left out, so that a study that was interrupted goes on. ``--print FILE`` prints the table and the
+misses of such a file.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import time
 import warnings
@@ -33,7 +33,7 @@ import control as ct
 import joblib
 import numpy as np
 import outside_rigs as rigs
-from _shares import parse_seeds, wilson
+from _shares import append_line, find_commit, parse_seeds, read_lines, wilson, write_lines
 
 import ctrlid as cid
 
@@ -45,6 +45,12 @@ GROUPS = {
     "sensor": rigs.SENSORS,
     "plant": tuple(f"plant-{name}" for name in rigs.EFFECTS),
     "controller": tuple(f"controller-{name}" for name in rigs.FAULTS),
+}
+PARTS = {
+    "with a noise of the sensor alone": GROUPS["noise"],
+    "with an effect of the sensor": GROUPS["sensor"],
+    "with an effect of the plant under coloured or heavy-tailed noise": GROUPS["plant"],
+    "under another controller than is stated": GROUPS["controller"],
 }
 NAMES = {
     "hum": "SensorHum",
@@ -102,7 +108,8 @@ def list_names(findings: Iterable[Any]) -> list[list[str]]:
 
 def run(name: str, plant: str, seed: int, n: int, worth: bool = True) -> dict[str, Any]:
     """Diagnose a draw and return its line."""
-    line: dict[str, Any] = {"class": name, "plant": plant, "seed": seed, "n": n}
+    line: dict[str, Any] = {"class": name, "plant": plant, "seed": seed, "n": n,
+                            "commit": find_commit()}  # fmt: skip
     try:
         draw = rigs.draw(name, plant, seed, n)
     except RuntimeError as reason:
@@ -130,7 +137,6 @@ def run(name: str, plant: str, seed: int, n: int, worth: bool = True) -> dict[st
     noise, gap = getattr(found, "noise", None), found.gap
     return line | {
         "verdict": found.verdict,
-        "sentence": found.sentence,
         "findings": list_names(found.findings),
         "evidence": [f.evidence for f in found.findings],
         "stand_ins": list_names(getattr(found, "stand_ins", ())),
@@ -201,8 +207,8 @@ def write_share(hits: Sequence[bool]) -> str:
     return f"{sum(hits)}/{len(hits)} ({100 * low:.1f} to {100 * high:.1f} %)" if hits else "-"
 
 
-def write_table(lines: Sequence[dict[str, Any]]) -> str:
-    """Return the table, and class by class."""
+def score(lines: Sequence[dict[str, Any]]) -> list[tuple[str, str, str]]:
+    """Return what is asked, the target and what was found, and the same class by class."""
     drawn = [x for x in lines if not x.get("undrawn")]
     clean = [x for x in drawn if x["class"] in rigs.NOISES]
     hidden = [x for x in drawn if x["class"] in rigs.SENSORS and is_hidden(x)]
@@ -240,11 +246,29 @@ def write_table(lines: Sequence[dict[str, Any]]) -> str:
     rows.append(("raised", "none", write_share(["error" in x for x in drawn])))
     rows.append(("not drawn; drawn again for want of margins", "",
                  f"{len(lines) - len(drawn)}; {sum(x['redrawn'] for x in drawn)}"))  # fmt: skip
-    return "\n".join(f"{what:<52} {target:<8} {value}" for what, target, value in rows)
+    return rows
 
 
-def write_misses(lines: Sequence[dict[str, Any]]) -> str:
-    """Every wrong answer, with the truth and what it is worth."""
+def describe_draws(lines: Sequence[dict[str, Any]]) -> str:
+    """Return in a sentence of which commit the lines are, from what seeds, and of which classes."""
+    commits = " and ".join(sorted({x["commit"] or "unknown" for x in lines}))
+    seeds, sizes = [x["seed"] for x in lines], sorted({x["n"] for x in lines})
+    told = ", ".join(f"{sum(x['class'] in group for x in lines)} {words}"
+                     for words, group in PARTS.items())  # fmt: skip
+    return (f"{len(lines)} draws of {' and '.join(map(str, sizes))} samples, of commit {commits}, "
+            f"seeds {min(seeds)} to {max(seeds)}: {told}.")  # fmt: skip
+
+
+def write_table(lines: Sequence[dict[str, Any]]) -> str:
+    """Return the table as text."""
+    if not lines:
+        return "no draw"
+    rows = (f"{what:<52} {target:<8} {value}" for what, target, value in score(lines))
+    return "\n".join([describe_draws(lines), "", *rows])
+
+
+def find_misses(lines: Sequence[dict[str, Any]]) -> list[str]:
+    """Return every wrong answer, with the truth and what it is worth."""
     out = []
     for x in lines:
         if is_right(x) or x.get("undrawn"):
@@ -260,15 +284,12 @@ def write_misses(lines: Sequence[dict[str, Any]]) -> str:
             answer = f"{x['verdict']}: {sets}" + (f"; stand-ins {stand_ins}" if stand_ins else "")
             answer += f"; audit {', '.join(x['audit'])}" if "audit" in x else ""
         out.append(f"{x['class']} {x['plant']} {x['seed']} ({truth}{worth}): {answer}")
-    return "\n".join(out)
+    return out
 
 
 def read(path: str | Path) -> list[dict[str, Any]]:
     """Return the lines of a file; of a draw that is there twice the last one counts."""
-    if not Path(path).exists():
-        return []
-    lines = [json.loads(line) for line in Path(path).read_text().splitlines()]
-    return list({make_key(x): x for x in lines}.values())
+    return read_lines(path, make_key)
 
 
 def make_key(line: dict[str, Any]) -> tuple[Any, ...]:
@@ -289,12 +310,12 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--no-worth", action="store_true",
                         help="do not weigh sensor effects; all count as hidden")  # fmt: skip
-    parser.add_argument("--out", default="suspects.jsonl", help="the file of results")
+    parser.add_argument("--out", default="suspects.jsonl.gz", help="the file of results")
     parser.add_argument("--print", metavar="FILE", help="print the table of a file")
     options = parser.parse_args()
     if options.print:
         lines = read(options.print)
-        print(write_table(lines), write_misses(lines), sep="\n\n")
+        print(write_table(lines), *find_misses(lines), sep="\n")
         return
     classes = dict.fromkeys(c for name in options.classes for c in GROUPS.get(name, (name,)))
     done = {make_key(x) for x in read(options.out)}
@@ -303,13 +324,13 @@ def main() -> None:
     work = joblib.Parallel(n_jobs=options.jobs, return_as="generator")
     tasks = [w for w in wanted if w not in done]
     for line in work(joblib.delayed(run)(*w, not options.no_worth) for w in tasks):
-        with Path(options.out).open("a") as file:
-            file.write(json.dumps(line) + "\n")
+        append_line(options.out, line)
         print(*make_key(line)[:3], "right" if is_right(line) else "MISS", line.get("verdict", ""),
               line.get("findings", line.get("error")), line.get("seconds", ""),
               flush=True)  # fmt: skip
-    lines = [x for x in read(options.out) if make_key(x) in set(wanted)]
-    print(write_table(lines), write_misses(lines), sep="\n\n")
+    lines = sorted(read(options.out), key=make_key)
+    write_lines(options.out, lines)
+    print(write_table(lines), *find_misses(lines), sep="\n")
 
 
 if __name__ == "__main__":

@@ -701,3 +701,16 @@ def test_machines_share_what_values_do_not_change():
         SampledPlant(servo(None, dt=0.02, free=("k",)), ["k"], "zoh", False),
     ):  # fmt: skip
         assert different.maps is not one.maps
+
+
+@pytest.mark.parametrize("closed", [True, False])
+@pytest.mark.parametrize("dt", [1e-3, 2e-2])
+def test_a_rough_guess_of_the_noise_is_near_it(closed, dt):
+    """Neither a coarse period nor a controller, which computes u from the reading, misleads it."""
+    plant = cid.plants.servo(m=1.0, c=2.0, k=50.0)
+    loop = cid.Loop(plant, 8.0 if closed else None, dt=dt)
+    drive = cid.random_binary(2000, amplitude=0.1, hold=max(2, round(0.04 / dt)), seed=2)
+    signals = {"r": drive} if closed else {"d": drive}
+    record = cid.simulate(loop, **signals, sensor_noise=1e-3, seed=3)
+    guess = make_filter_data(loop, record).scale
+    assert 0.9e-3 < guess < 2e-3

@@ -257,7 +257,7 @@ def test_the_table_counts_and_the_file_keeps(tmp_path):
     ]  # fmt: skip
     path = tmp_path / "study.jsonl.gz"
     for line in lines[::-1]:
-        study.append(path, line)
+        study.append_line(path, line)
     whole = path.read_bytes()
     path.write_bytes(whole + whole[:20])  # as a run leaves it that was killed
     assert len(study.read(path)) == len(lines)
@@ -272,7 +272,7 @@ def test_the_table_counts_and_the_file_keeps(tmp_path):
     assert table[faint].startswith("1 of 1")
     assert table["the same: exactly right, a finding for each and no other"].startswith("1 of 1")
     assert [m.split(" drive")[0] for m in study.find_misses(lines)] == ["faint 0"]
-    table = load_script("docs", "frozen_table")
+    table = load_script("docs", "study_tables")
     page = "\n".join(table.write_tables(path))
     assert "98 %" in page
     assert "faint 0 drive" in page

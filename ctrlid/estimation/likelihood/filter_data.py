@@ -330,8 +330,8 @@ def _guess_noise(y: Array, u: Array) -> float:
     count = len(y) - LAGS
     if count < 4 * LAGS * (1 + len(u)):
         return third
+    # The input of the same sample is left out: under feedback it tells what is to be predicted.
     columns = [s[LAGS - k : len(s) - k] for s in (y, *u) for k in range(1, LAGS + 1)]
-    columns += [s[LAGS:] for s in u]
     past = np.column_stack([np.ones(count), *columns])
     left = y[LAGS:] - past @ np.linalg.lstsq(past, y[LAGS:], rcond=None)[0]
     # Of an output without noise both leave next to nothing, and rounding is no measure.
