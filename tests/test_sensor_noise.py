@@ -12,13 +12,14 @@ import ctrlid as cid
 from ctrlid.diagnosis import gap_summary
 from ctrlid.diagnosis.fitted_model import Model
 from ctrlid.diagnosis.fresh_data import choose_fresh_data
-from ctrlid.diagnosis.gap import compute_chance_among_runs
+from ctrlid.diagnosis.gap import compute_chance_among_runs, measure_noise_errors
 from ctrlid.diagnosis.gap_summary import make_noise_test
+from ctrlid.diagnosis.thresholds import THRESHOLD
 from ctrlid.estimation.likelihood.kalman_filter import Noise, compute_memory
 from ctrlid.estimation.likelihood.likelihood import make_problem
 from ctrlid.estimation.likelihood.maximization import begin_fit, choose_sensor_noise, maximize
 from ctrlid.estimation.likelihood.noise_fit import fit_noise
-from problems import diagnose_draw
+from problems import diagnose_draw, load_script
 
 
 def simulate_servo(r, noise, dt=0.01, kp=20.0, kd=1.0, filter_time=0.02, dead_zone=0.0):
@@ -135,6 +136,31 @@ def test_the_chance_among_runs_keeps_its_level():
     runs = np.sqrt(rng.chisquare(20, (4000, 9)))
     low = [compute_chance_among_runs(float(r[0]), r[1:]) < 0.01 for r in runs]
     assert 0.004 < np.mean(low) < 0.02
+
+
+def test_the_runs_of_a_chance_spread_as_many_more_do():
+    """Of the first 8 seeds errors are alike by chance, which made true noise look false."""
+    loop, record, _ = make_loop_and_record([1.0], [1.0, -0.9], n=4000, seed=5)
+    fit = choose_sensor_noise(maximize(begin_fit(make_problem(loop, ("k", "c"), [record]))))
+    fresh = choose_fresh_data(loop, [record], None)
+    errors = measure_noise_errors(fresh.prepare_loops(Model(loop, fit)), fit, fresh.windows,
+                                  fresh.how, 300)[:, 0]  # fmt: skip
+    spread = np.std(np.log(errors[: THRESHOLD.size_runs]))
+    assert spread == pytest.approx(np.std(np.log(errors)), rel=0.25)
+
+
+@pytest.mark.parametrize(("name", "plant", "orders"), [
+    ("ar", "drive", "ARMA(1, 0)"), ("ar", "pendulum", "ARMA(1, 0)"),
+    ("averaged", "ball", "ARMA(0, "),
+])  # fmt: skip
+def test_the_order_is_asked_again_where_the_colour_has_moved_the_parameters(name, plant, orders):
+    """Beside parameters that a random force had led astray an average looked like a wander."""
+    study = load_script("benchmarks", "study_suspects")
+    draw = study.rigs.draw(name, plant, 721, 3000)
+    found = cid.diagnose(study.make_loop(draw), study.make_record(draw), progress=False,
+                         catalogue=(cid.effects.ConstantForce, cid.effects.SensorLag))  # fmt: skip
+    assert found.verdict == "nothing missing"
+    assert orders in found.noise.words
 
 
 def test_the_memory_of_noise_is_that_of_its_autocorrelation():

@@ -133,7 +133,7 @@ class FreshData:
         """
         if not self.how.horizon:
             runs = gaps.measure_noise_errors(
-                loops, fit, self.windows, self.how, THRESHOLD.floor_more_runs
+                loops, fit, self.windows, self.how, THRESHOLD.size_runs
             )
             return gaps.compute_chance_among_runs(self.measure_gap(loops), runs[:, 0])
         known, horizon = Known(fit.noise, np.full(1, float(np.mean(fit.sensor)))), self.how.horizon

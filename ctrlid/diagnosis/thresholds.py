@@ -425,6 +425,10 @@ class Thresholds:
         8, cost="the same where a gap stands out: loops that hunt differ from run to run",
         unit="runs",
     )  # fmt: skip
+    size_runs: int = declare_number(
+        32, cost="simulations whose spread tells an error that is too small for the noise: of the "
+        "first 8 seeds it is half as wide as of many", unit="runs",
+    )  # fmt: skip
     beyond_chance: float = declare_number(
         0.01, convention="level of every test that decides alone: whether errors of two models "
         "differ, whether noise is larger than the gap, whether a name stands", unit="probability",

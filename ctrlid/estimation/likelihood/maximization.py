@@ -325,7 +325,19 @@ def choose_sensor_noise(fit: Fit) -> Fit:
     if quiet.value > richer.value + OTHER_NOISE_GAIN:
         anew = try_coloured_sensor(relinearize_fit(quiet))
         richer = maximize(max(quiet, anew, key=compute_noise_criterion))
-    return max(fit, richer, key=compute_noise_criterion)
+    if not compute_noise_criterion(richer) > compute_noise_criterion(fit):
+        return fit
+    while True:
+        # The orders were chosen beside parameters that the colour has moved since.
+        anew = try_coloured_sensor(richer)
+        if not _gains_enough(anew, richer):
+            return richer
+        richer = maximize(anew)
+
+
+def _gains_enough(one: Fit, other: Fit) -> bool:
+    """Whether the noise of one fit is better than that of another by what counts elsewhere."""
+    return compute_noise_criterion(one) > compute_noise_criterion(other) + OTHER_NOISE_GAIN
 
 
 def choose_tails(fit: Fit) -> Fit:
