@@ -130,6 +130,35 @@ def test_a_wander_that_makes_a_model_err_more_is_refused(monkeypatch, floor, wid
     assert not make_noise_test(fresh)(model)
 
 
+@pytest.mark.parametrize(("floors", "gaps", "narrower", "refused"), [
+    ((3.0, 10.0), (1.0, 1.0), False, False),  # the other noise exceeds the error by more
+    ((3.0, 2.0), (1.0, 1.0), False, True),
+    ((1.2, 1.0), (1.0, 4.0), True, False),  # the model errs less than beside the other noise
+    ((1.2, 1.0), (1.0, 1.0), False, True),
+])  # fmt: skip
+def test_noise_is_refused_for_what_is_better(monkeypatch, floors, gaps, narrower, refused):
+    model, other = (SimpleNamespace(fit=k) for k in range(2))
+    fresh = SimpleNamespace(
+        windows=(), how=None, prepare_loops=lambda m: m.fit, measure_gap=lambda k: gaps[k],
+        compute_widening_chance=lambda one, two: 1e-4 if narrower and two is other else 0.3,
+        compute_size_chance=lambda loops, k: 1e-4 if floors[k] > gaps[k] else 0.5,
+    )  # fmt: skip
+    monkeypatch.setattr(gap_summary.gaps, "compute_floor",
+                        lambda loops, k, *_: SimpleNamespace(both=floors[k]))  # fmt: skip
+    assert make_noise_test(fresh)(model, other) is refused
+
+
+@pytest.mark.slow
+def test_a_delay_beside_averaged_noise_is_named():
+    """The force that stands for the delay is too large beside any noise of the sensor."""
+    study = load_script("benchmarks", "study_suspects")
+    draw = study.rigs.draw("plant-delay", "pendulum", 731, 3000)
+    found = cid.diagnose(study.make_loop(draw), study.make_record(draw), progress=False)
+    (finding,) = found.findings
+    assert "InputDelay" in finding.names
+    assert found.noise.kind == "coloured"
+
+
 def test_the_chance_among_runs_keeps_its_level():
     # Of true noise one in a hundred is refused.
     rng = np.random.default_rng(7)

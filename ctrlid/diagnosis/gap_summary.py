@@ -263,17 +263,33 @@ def make_noise_test(fresh: FreshData) -> Callable[..., bool]:
     Noise leaves errors of its size there: no prediction is better than what cannot be predicted.
     A noise model that explains a record only by being larger is falsified. So is one that claims
     to be far larger than the error, by chance as it may be, and beside which the model errs more
-    than it did before: a wander that nearly never ends takes what is still missing.
+    than beside the noise that it would take the place of: a wander that nearly never ends takes
+    what is still missing. Not so one that exceeds the error by no more than that other noise does,
+    or beside which the model errs less.
     """
 
-    def is_false(model: Model, before: Model | None = None) -> bool:
-        loops = fresh.prepare_loops(model)
-        if before is not None:
-            floor = gaps.compute_floor(loops, model.fit, fresh.windows, fresh.how).both
-            far = floor > THRESHOLD.excess * fresh.measure_gap(loops)
-            if far and fresh.compute_widening_chance(before, model) < THRESHOLD.beyond_chance:
-                return True
+    def is_too_large(loops: Sequence[Loop], model: Model) -> bool:
         return fresh.compute_size_chance(loops, model.fit) < THRESHOLD.beyond_chance
+
+    def compute_ratio(loops: Sequence[Loop], model: Model) -> float:
+        floor = gaps.compute_floor(loops, model.fit, fresh.windows, fresh.how).both
+        return floor / max(fresh.measure_gap(loops), THRESHOLD.tiny)
+
+    def errs_more(model: Model, other: Model) -> bool:
+        return fresh.compute_widening_chance(other, model) < THRESHOLD.beyond_chance
+
+    def is_false(model: Model, other: Model | None = None) -> bool:
+        loops = fresh.prepare_loops(model)
+        if other is None:
+            return is_too_large(loops, model)
+        ratio = compute_ratio(loops, model)
+        far = ratio > THRESHOLD.excess
+        if far and errs_more(model, other):
+            return True
+        if not is_too_large(loops, model) or (not far and errs_more(other, model)):
+            return False
+        others = fresh.prepare_loops(other)
+        return not (compute_ratio(others, other) >= ratio and is_too_large(others, other))
 
     return is_false
 

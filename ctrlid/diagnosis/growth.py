@@ -242,7 +242,8 @@ def _refuse_larger_noise(found: Search, is_false: Callable[..., bool]) -> Search
     fit = found.final.fit
     if fit.noise.sensor_is_white or fit.known is not None or not is_false(found.final):
         return found
-    return _weigh_with_noise(found, fit.noise.plain)
+    plain = _refit_with_noise(found.final, fit.noise.plain)
+    return _weigh_anew(found, plain) if is_false(found.final, plain) else found
 
 
 def _refuse_bursts(found: Search) -> Search:
@@ -258,8 +259,13 @@ def _refuse_bursts(found: Search) -> Search:
 
 def _weigh_with_noise(found: Search, noise: Noise) -> Search:
     """Return the search with what was found weighed anew, beside noise of another kind."""
-    plain = refit_noise_size(maximize(replace(found.final.fit, noise=noise)))
-    return _weigh_anew(found, Model(found.final.loop, drop_linearization(choose_noise(plain))))
+    return _weigh_anew(found, _refit_with_noise(found.final, noise))
+
+
+def _refit_with_noise(model: Model, noise: Noise) -> Model:
+    """Return a model fitted anew beside noise of another kind."""
+    plain = refit_noise_size(maximize(replace(model.fit, noise=noise)))
+    return Model(model.loop, drop_linearization(choose_noise(plain)))
 
 
 def _weigh_anew(found: Search, model: Model) -> Search:
