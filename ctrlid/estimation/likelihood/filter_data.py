@@ -24,9 +24,12 @@ FEWEST = 10
 # The model predicts across gaps of at most so many samples; after longer ones the filter restarts.
 BRIDGE = 20
 # A rough guess of the noise predicts an output from so many samples before, and tells noise from
-# rounding down to this share of the output's standard deviation.
+# rounding down to this share of the output's standard deviation. It counts where it is less than
+# this share of what third differences leave: a guess twice too large costs a state that starts one
+# width from rest 2 of log-likelihood.
 LAGS = 8
 LEAST_NOISE = 1e-6
+FAR_LESS = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -323,7 +326,7 @@ def _guess_noise(y: Array, u: Array) -> float:
     """Return a rough standard deviation of the noise of an output, given the inputs as rows.
 
     It is what third differences leave, which is little of an output that is sampled densely, or
-    what a regression on the samples before leaves, if that is less. A guess far too large would
+    what a regression on the samples before leaves, if that is far less. A guess far too large would
     hold the state at the start near rest, against the readings, once a fit finds the noise small.
     """
     third = float(np.std(np.diff(y, 3)) / np.sqrt(20))
@@ -335,7 +338,8 @@ def _guess_noise(y: Array, u: Array) -> float:
     past = np.column_stack([np.ones(count), *columns])
     left = y[LAGS:] - past @ np.linalg.lstsq(past, y[LAGS:], rcond=None)[0]
     # Of an output without noise both leave next to nothing, and rounding is no measure.
-    return float(min(third, max(np.std(left), LEAST_NOISE * np.std(y))))
+    noise = float(max(np.std(left), LEAST_NOISE * np.std(y)))
+    return noise if noise < FAR_LESS * third else third
 
 
 def find_rest_state(loop: Loop, e: Equations) -> tuple[float, ...]:

@@ -33,6 +33,7 @@ from .noise_fit import (
     choose_force_ratios,
     compute_noise_criterion,
     compute_noise_logs,
+    count_noise_parameters,
     fit_noise,
     make_noise,
     try_coloured_force,
@@ -327,17 +328,12 @@ def choose_sensor_noise(fit: Fit) -> Fit:
         richer = maximize(max(quiet, anew, key=compute_noise_criterion))
     if not compute_noise_criterion(richer) > compute_noise_criterion(fit):
         return fit
-    while True:
-        # The orders were chosen beside parameters that the colour has moved since.
-        anew = try_coloured_sensor(richer)
-        if not _gains_enough(anew, richer):
-            return richer
-        richer = maximize(anew)
-
-
-def _gains_enough(one: Fit, other: Fit) -> bool:
-    """Whether the noise of one fit is better than that of another by what counts elsewhere."""
-    return compute_noise_criterion(one) > compute_noise_criterion(other) + OTHER_NOISE_GAIN
+    # The orders were chosen beside parameters that the colour has moved since: what was made up
+    # there for wrong parameters needs fewer coefficients now.
+    anew = try_coloured_sensor(richer)
+    fewer = count_noise_parameters(anew) < count_noise_parameters(richer)
+    gained = compute_noise_criterion(anew) - compute_noise_criterion(richer)
+    return maximize(anew) if fewer and gained > OTHER_NOISE_GAIN else richer
 
 
 def choose_tails(fit: Fit) -> Fit:
