@@ -33,7 +33,6 @@ from .noise_fit import (
     choose_force_ratios,
     compute_noise_criterion,
     compute_noise_logs,
-    count_noise_parameters,
     fit_noise,
     make_noise,
     try_coloured_force,
@@ -331,7 +330,7 @@ def choose_sensor_noise(fit: Fit) -> Fit:
     # The orders were chosen beside parameters that the colour has moved since: what was made up
     # there for wrong parameters needs fewer coefficients now.
     anew = try_coloured_sensor(richer)
-    fewer = count_noise_parameters(anew) < count_noise_parameters(richer)
+    fewer = len(anew.noise.ar + anew.noise.ma) < len(richer.noise.ar + richer.noise.ma)
     gained = compute_noise_criterion(anew) - compute_noise_criterion(richer)
     return maximize(anew) if fewer and gained > OTHER_NOISE_GAIN else richer
 
