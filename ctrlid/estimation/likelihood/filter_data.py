@@ -249,7 +249,7 @@ def name_noise_places(loop: Loop) -> tuple[tuple[str, ...], tuple[str, ...]]:
 def prepare_for_loop(data: FilterData, loop: Loop) -> FilterData:
     """Return data made ready for another model of the same loop; the signals are shared."""
     guess = _guess_initial_state if loop.equations().siso else _guess_several_states
-    start, spread, _ = guess(loop, data.record)
+    start, spread, _ = guess(loop, data.record, data.scales)
     return replace(data, restart=find_segment_starts(loop, data.record), start=start, spread=spread)
 
 
@@ -272,16 +272,19 @@ def find_segment_starts(loop: Loop, record: Record) -> Any:
     return restart
 
 
-def _guess_initial_state(loop: Loop, record: Record) -> tuple[Array, Array, float]:
+def _guess_initial_state(
+    loop: Loop, record: Record, noises: Array | None = None
+) -> tuple[Array, Array, float]:
     """Return an initial state at the operating point, uncertain enough for any record.
 
-    Its covariance is relative to the sensor noise, whose rough standard deviation comes last.
+    Its covariance is relative to the sensor noise, whose rough standard deviation comes last; it is
+    guessed unless `noises` has it.
     """
     e, at = loop.equations(keep=True), loop.point
     y = record.y[record.valid]
     reach = float(np.std(y)) + abs(float(np.mean(y)) - at.output)
-    noise = max(_guess_noise(y, record.u[None, record.valid]), 1e-9 * max(abs(at.output), reach))
-    noise = max(noise, 1e-300)
+    known = _guess_noise(y, record.u[None, record.valid]) if noises is None else float(noises[0])
+    noise = max(known, 1e-9 * max(abs(at.output), reach), 1e-300)
     speed = max(float(np.std(np.diff(y))) / record.dt, noise / record.dt)
     rest = find_rest_state(loop, e)
     wide = [max(0.1 * abs(v), reach, noise) for v in rest]
@@ -290,11 +293,14 @@ def _guess_initial_state(loop: Loop, record: Record) -> tuple[Array, Array, floa
     return np.array(rest), np.diag((np.array(wide) / noise) ** 2), noise
 
 
-def _guess_several_states(loop: Loop, record: Record) -> tuple[Array, Array, Array]:
+def _guess_several_states(
+    loop: Loop, record: Record, noises: Array | None = None
+) -> tuple[Array, Array, Array]:
     """Return an initial state, its covariance and the rough sensor noise of several outputs.
 
-    The covariance is relative to the sensor noise of the first output. A state that outputs show is
-    as uncertain as they are wide, a velocity as its position moves.
+    The noise is guessed unless `noises` has it. The covariance is relative to that of the first
+    output. A state that outputs show is as uncertain as they are wide, a velocity as its position
+    moves.
     """
     e, at = loop.equations(keep=True), loop.point
     ys = np.reshape(record.y, (len(e.outputs), -1))
@@ -306,7 +312,8 @@ def _guess_several_states(loop: Loop, record: Record) -> tuple[Array, Array, Arr
     for k, (y, use, middle) in enumerate(zip(ys, record.valid_outputs, at.outputs, strict=True)):
         seen = y[use]
         reach = float(np.std(seen)) + abs(float(np.mean(seen)) - middle)
-        noise = _guess_noise(seen, np.reshape(record.u, (-1, len(use)))[:, use])
+        noise = (_guess_noise(seen, np.reshape(record.u, (-1, len(use)))[:, use])
+                 if noises is None else float(noises[k]))  # fmt: skip
         scales[k] = max(noise, 1e-9 * max(abs(middle), reach), 1e-300)
         speed = max(float(np.std(np.diff(seen))) / record.dt, scales[k] / record.dt)
         shown = np.abs(c[k]) > 1e-9 * np.max(np.abs(c[k]), initial=0.0)
