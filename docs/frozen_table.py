@@ -1,4 +1,4 @@
-"""The tables of two studies in the manual, printed from the files of their lines."""
+"""The tables of the frozen study in the manual, printed from the file of its lines."""
 
 import importlib.util
 import sys
@@ -10,14 +10,15 @@ from docutils.statemachine import StringList
 
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 FILE = BENCHMARKS / "frozen_study.jsonl.gz"
-SUSPECTS = BENCHMARKS / "suspects.jsonl.gz"
 
 
-def load_study(name="study_frozen"):
-    """Return a study of ``benchmarks`` as a module."""
+def load_study():
+    """Return ``benchmarks/study_frozen.py`` as a module."""
     sys.path.insert(0, str(BENCHMARKS))
     try:
-        spec = importlib.util.spec_from_file_location(name, BENCHMARKS / f"{name}.py")
+        spec = importlib.util.spec_from_file_location(
+            "study_frozen", BENCHMARKS / "study_frozen.py"
+        )
         module = importlib.util.module_from_spec(spec)
         spec.loader.exec_module(module)
     finally:
@@ -64,31 +65,6 @@ def write_summary(path=FILE):
     return out
 
 
-def write_suspects(path=SUSPECTS):
-    """Return the table of the study of sensors, noises and controllers, and its misses."""
-    study = load_study("study_suspects")
-    lines = study.read(path)
-    out = [study.describe_draws(lines), ""]
-    out += write_list_table(("asked", "target", "measured, with Wilson's 95 % interval"),
-                            study.score(lines), "50 12 38")  # fmt: skip
-    out += [
-        "Every answer that is wrong, with what the truth was worth where that was measured:",
-        "",
-    ]
-    return out + [f"- {miss}" for miss in study.find_misses(lines)]
-
-
-class SuspectsStudy(Directive):
-    """Table and misses of the study of sensors, noises and controllers."""
-
-    def run(self):
-        """Return the table."""
-        place = nodes.Element()
-        text = StringList(write_suspects(), source="suspects")
-        self.state.nested_parse(text, self.content_offset, place)
-        return place.children
-
-
 class FrozenStudy(Directive):
     """Tables and misses of the frozen study, or with ``summary`` the main figures alone."""
 
@@ -106,5 +82,4 @@ class FrozenStudy(Directive):
 def setup(app):
     """Register the directive."""
     app.add_directive("frozen-study", FrozenStudy)
-    app.add_directive("suspects-study", SuspectsStudy)
     return {"parallel_read_safe": True}
