@@ -7,7 +7,7 @@ import gzip
 import json
 import os
 import subprocess
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +37,19 @@ def wilson(hits: int, count: int, level: float = 0.95) -> tuple[float, float]:
         return 0.0, 1.0
     found = binomtest(hits, count).proportion_ci(confidence_level=level, method="wilson")
     return float(found.low), float(found.high)
+
+
+def write_share(hits: Sequence[bool]) -> str:
+    """Return a share in words, with its 95 % interval.
+
+    >>> write_share([True] * 98 + [False] * 2)
+    '98 of 100: 98.0 % (93.0 to 99.4 %)'
+    """
+    low, high = wilson(sum(hits), len(hits))
+    if not hits:
+        return "no draw"
+    return (f"{sum(hits)} of {len(hits)}: {100 * sum(hits) / len(hits):.1f} % "
+            f"({100 * low:.1f} to {100 * high:.1f} %)")  # fmt: skip
 
 
 def print_farthest(rows: list[dict[str, Any]], failed: list[dict[str, Any]]) -> None:

@@ -24,7 +24,14 @@ import control as ct
 import joblib
 import numpy as np
 import outside_cases as cases
-from _shares import append_line, find_commit, parse_seeds, read_lines, wilson, write_lines
+from _shares import (
+    append_line,
+    find_commit,
+    parse_seeds,
+    read_lines,
+    write_lines,
+    write_share,
+)
 from scipy import signal, stats
 from watched_numbers import watch_numbers
 
@@ -273,15 +280,6 @@ def find_interval(line: dict[str, Any]) -> float | None:
                 return None
             return (value - compute(line["sizes"][0], line["dt"])) / error
     return None
-
-
-def write_share(hits: Sequence[bool]) -> str:
-    """Return a share in words, with its 95 % interval."""
-    low, high = wilson(sum(hits), len(hits))
-    if not hits:
-        return "no draw"
-    return (f"{sum(hits)} of {len(hits)}: {100 * sum(hits) / len(hits):.1f} % "
-            f"({100 * low:.1f} to {100 * high:.1f} %)")  # fmt: skip
 
 
 def score(lines: Sequence[dict[str, Any]]) -> list[tuple[str, str, str]]:

@@ -33,7 +33,14 @@ import control as ct
 import joblib
 import numpy as np
 import outside_rigs as rigs
-from _shares import append_line, find_commit, parse_seeds, read_lines, wilson, write_lines
+from _shares import (
+    append_line,
+    find_commit,
+    parse_seeds,
+    read_lines,
+    write_lines,
+    write_share,
+)
 
 import ctrlid as cid
 
@@ -66,6 +73,17 @@ NAMES = {
 }
 # Speed's friction is a free parameter of these, and the dead zone of a ball lies about 0 V.
 ABSORBED = {("plant-viscous", "drive"), ("plant-viscous", "spring"), ("plant-deadzone", "ball")}
+WORDS = {
+    "white": "white noise",
+    "ar": "autoregressive noise",
+    "averaged": "noise averaged over samples",
+    "walk": "noise beside a random walk",
+    "pink": "pink noise",
+    "t3": "noise of Student's law",
+    "outliers": "noise with outliers",
+    "jitter": "white noise and a jittering clock",
+    "converter": "white noise and a converter",
+}
 MUST_BE_CLEAN = ("white", "ar", "averaged", "t3", "outliers", "converter")
 OF_THE_SENSOR = ("SensorHum", "SensorGain", "SensorDrift")
 NOT_THE_PLANT = ("Quantization", *OF_THE_SENSOR)
@@ -201,49 +219,48 @@ def is_right(line: dict[str, Any]) -> bool:
     return line["verdict"] == "nothing missing" and not list_named_sets(line)
 
 
-def write_share(hits: Sequence[bool]) -> str:
-    """Return a share in words, with its 95 % interval."""
-    low, high = wilson(sum(hits), len(hits))
-    return f"{sum(hits)}/{len(hits)} ({100 * low:.1f} to {100 * high:.1f} %)" if hits else "-"
-
-
 def score(lines: Sequence[dict[str, Any]]) -> list[tuple[str, str, str]]:
-    """Return what is asked, the target and what was found, and the same class by class."""
+    """Return the table: what is asked with its conditions, the target, and what was measured."""
     drawn = [x for x in lines if not x.get("undrawn")]
     clean = [x for x in drawn if x["class"] in rigs.NOISES]
     hidden = [x for x in drawn if x["class"] in rigs.SENSORS and is_hidden(x)]
     faint = [x for x in drawn if x["class"] in rigs.SENSORS and not is_hidden(x)]
     plant = [x for x in drawn if x["class"].startswith("plant-") and is_hidden(x)]
     laws = [x for x in drawn if x["class"].startswith("controller-")]
-    rows = [("nothing wrong in plant or sensor: any name", "<= 1 %",
+    rows = [("nothing wrong in plant or sensor: any name, stand-ins included", "<= 1 %",
              write_share([bool(list_named_sets(x)) for x in clean]))]  # fmt: skip
     for name in rigs.NOISES:
         own = [x.get("verdict") == "nothing missing" for x in clean if x["class"] == name]
         target = ">= 90 %" if name in MUST_BE_CLEAN else ""
-        rows.append((f'  "nothing missing", {name}', target, write_share(own)))
+        rows.append((f'  the same, {WORDS[name]}: "nothing missing"', target, write_share(own)))
     rows += [
-        ("sensor effect hidden: in the set", "98 %", write_share([is_in_set(x) for x in hidden])),
-        ("  the plant alone, explained", "none",
+        (f"an effect of the sensor, worth over {HIDDEN:g}: in the set of a finding", "98 %",
+         write_share([is_in_set(x) for x in hidden])),
+        ("  the same: names of the plant alone, explained", "none",
          write_share([blames_the_plant_alone(x) for x in hidden])),
-        ('sensor effect not hidden: "nothing missing"', "",
+        (f'an effect of the sensor, worth at most {HIDDEN:g}: "nothing missing"', "",
          write_share([x.get("verdict") == "nothing missing" for x in faint])),
-        ("plant effect under such noise: in the set", "97 %",
-         write_share([is_in_set(x) for x in plant])),
-        ("  false company", "2 %",
+        ("an effect of the plant under coloured or heavy-tailed noise, of any worth: in the set of "
+         "a finding", "97 %", write_share([is_in_set(x) for x in plant])),
+        ("  the same: false company, stand-ins included", "<= 2 %",
          write_share([any(NAMES[x["class"]] not in s for s in list_named_sets(x)) for x in plant])),
     ]  # fmt: skip
+    seen = [x for x in laws if x.get("visible", 1.0) > SEEN]
+    rows.append(("another controller than is stated, seen in u: named right", "95 %",
+                 write_share([is_fault_told(x) for x in seen])))  # fmt: skip
     for fault in rigs.FAULTS:
-        own = [is_fault_told(x) for x in laws
-               if x["class"] == f"controller-{fault}" and x.get("visible", 1.0) > SEEN]  # fmt: skip
-        rows.append((f"wrong controller, {fault}: named right", "95 %", write_share(own)))
+        own = [is_fault_told(x) for x in seen if x["class"] == f"controller-{fault}"]
+        rows.append((f"  the same, {fault}: named right", "", write_share(own)))
     unseen = [is_fault_told(x) for x in laws if x.get("visible", 1.0) <= SEEN]
-    rows.append(("  fault that u does not show: none named", "", write_share(unseen)))
-    rows.append(("  the plant blamed", "0.5 %", write_share([blames_the_plant(x) for x in laws])))
+    rows.append(("another controller, not seen in u: no fault named", "", write_share(unseen)))
+    rows.append(("another controller, seen or not: the plant blamed", "<= 0.5 %",
+                 write_share([blames_the_plant(x) for x in laws])))  # fmt: skip
+    rows.append(("raised, all classes", "none", write_share(["error" in x for x in drawn])))
     seconds = [x["seconds"] for x in drawn if "seconds" in x]
     if seconds:
-        rows.append(("CPU seconds: median, mean, largest", "", f"{np.median(seconds):.1f}, "
-                     f"{np.mean(seconds):.1f}, {max(seconds):.1f}"))  # fmt: skip
-    rows.append(("raised", "none", write_share(["error" in x for x in drawn])))
+        rows.append(("CPU seconds of a diagnosis: median, mean, largest", "",
+                     f"{np.median(seconds):.1f}, {np.mean(seconds):.1f}, "
+                     f"{max(seconds):.1f}"))  # fmt: skip
     rows.append(("not drawn; drawn again for want of margins", "",
                  f"{len(lines) - len(drawn)}; {sum(x['redrawn'] for x in drawn)}"))  # fmt: skip
     return rows
@@ -263,7 +280,7 @@ def write_table(lines: Sequence[dict[str, Any]]) -> str:
     """Return the table as text."""
     if not lines:
         return "no draw"
-    rows = (f"{what:<52} {target:<8} {value}" for what, target, value in score(lines))
+    rows = (f"{what:<108} {target:<8} {value}" for what, target, value in score(lines))
     return "\n".join([describe_draws(lines), "", *rows])
 
 
@@ -275,7 +292,8 @@ def find_misses(lines: Sequence[dict[str, Any]]) -> list[str]:
             continue
         truth = ", ".join(f"{k} {v:.3g}" if isinstance(v, float) else f"{k} {v}"
                           for k, v in x["truth"].items())  # fmt: skip
-        worth = f", worth {x['worth']:.0f}" if "worth" in x else ""
+        if "worth" in x:
+            truth = ", ".join(filter(None, (truth, f"worth {x['worth']:.0f}")))
         if "error" in x:
             answer = x["error"][:150]
         else:
@@ -283,7 +301,7 @@ def find_misses(lines: Sequence[dict[str, Any]]) -> list[str]:
             stand_ins = " + ".join("/".join(s) for s in x["stand_ins"])
             answer = f"{x['verdict']}: {sets}" + (f"; stand-ins {stand_ins}" if stand_ins else "")
             answer += f"; audit {', '.join(x['audit'])}" if "audit" in x else ""
-        out.append(f"{x['class']} {x['plant']} {x['seed']} ({truth}{worth}): {answer}")
+        out.append(f"{x['class']} {x['plant']} {x['seed']} ({truth}): {answer}")
     return out
 
 

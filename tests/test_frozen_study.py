@@ -272,11 +272,11 @@ def test_the_table_counts_and_the_file_keeps(tmp_path):
     assert table[faint].startswith("1 of 1")
     assert table["the same: exactly right, a finding for each and no other"].startswith("1 of 1")
     assert [m.split(" drive")[0] for m in study.find_misses(lines)] == ["faint 0"]
-    table = load_script("docs", "frozen_table")
-    page = "\n".join(table.write_tables(path))
+    table = load_script("docs", "study_tables")
+    page = "\n".join(table.write_tables("study_frozen", path))
     assert "98 %" in page
     assert "faint 0 drive" in page
-    summary = "\n".join(table.write_summary(path))
+    summary = "\n".join(table.write_summary("study_frozen", path))
     assert "One effect, worth over 50: the truth first: 2 of 2: 100.0 %" in summary
     assert "the target is 98 %" in summary
     assert "no draw" not in summary

@@ -86,3 +86,45 @@ def test_the_foreign_simulator_knows_nothing_of_ctrlid() -> None:
     """A simulator that shared code with ctrlid would share its errors."""
     assert "import ctrlid" not in Path(rigs.__file__).read_text()
     assert "from ctrlid" not in Path(rigs.__file__).read_text()
+
+
+def make_line(name, plant, seed=0, sets=(), **more):
+    return {"class": name, "plant": plant, "seed": seed, "n": 10, "commit": "abc", "truth": {},
+            "redrawn": 0, "findings": [list(s) for s in sets], "stand_ins": [], "seconds": 1.0,
+            "verdict": "explained" if sets else "nothing missing", **more}  # fmt: skip
+
+
+def test_the_table_counts_what_it_says(tmp_path):
+    lines = [
+        make_line("white", "ball"),
+        make_line("ar", "ball", stand_ins=[["CoulombFriction"]], verdict="unknown"),
+        make_line("hum", "drive", worth=80.0, sets=[["PeriodicForce"]]),
+        make_line("scale", "drive", worth=20.0),
+        make_line("plant-delay", "ball", sets=[["ActuatorLag", "InputDelay"], ["SensorGain"]]),
+        make_line("plant-viscous", "drive"),
+        make_line("controller-gain", "ball", audit=["gain"], visible=0.1),
+        make_line("controller-bias", "ball", audit=[], visible=0.0),
+    ]
+    path = tmp_path / "suspects.jsonl.gz"
+    study.write_lines(path, lines)
+    assert study.read(path) == lines
+    rows = study.score(lines)
+    found = {what.strip(): value.partition(":")[0] for what, _, value in rows}
+    assert found["nothing wrong in plant or sensor: any name, stand-ins included"] == "1 of 2"
+    assert found['the same, autoregressive noise: "nothing missing"'] == "0 of 1"
+    assert found["an effect of the sensor, worth over 50: in the set of a finding"] == "0 of 1"
+    assert found["the same: names of the plant alone, explained"] == "1 of 1"
+    assert found['an effect of the sensor, worth at most 50: "nothing missing"'] == "1 of 1"
+    assert found["the same: false company, stand-ins included"] == "1 of 1"
+    assert found["another controller than is stated, seen in u: named right"] == "1 of 1"
+    assert found["another controller, not seen in u: no fault named"] == "1 of 1"
+    assert [m.split(" (")[0] for m in study.find_misses(lines)] == [
+        "ar ball 0", "hum drive 0", "plant-delay ball 0",
+    ]  # fmt: skip
+    tables = load_script("docs", "study_tables")
+    page = "\n".join(tables.write_tables("study_suspects", path))
+    assert "hum drive 0 (, worth 80)" not in page
+    summary = "\n".join(tables.write_summary("study_suspects", path))
+    assert "Nothing wrong in plant or sensor, autoregressive noise: " in summary
+    assert "the target is 97 %" in summary
+    assert "no draw" not in summary

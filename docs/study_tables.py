@@ -1,4 +1,4 @@
-"""The tables of the frozen study in the manual, printed from the file of its lines."""
+"""The tables of the studies in the manual, printed from the files of their lines."""
 
 import importlib.util
 import sys
@@ -9,21 +9,25 @@ from docutils.parsers.rst import Directive
 from docutils.statemachine import StringList
 
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
-FILE = BENCHMARKS / "frozen_study.jsonl.gz"
+FILES = {"study_frozen": "frozen_study.jsonl.gz", "study_suspects": "suspects.jsonl.gz"}
 
 
-def load_study():
-    """Return ``benchmarks/study_frozen.py`` as a module."""
+def load_study(name):
+    """Return a script of the benchmarks as a module."""
     sys.path.insert(0, str(BENCHMARKS))
     try:
-        spec = importlib.util.spec_from_file_location(
-            "study_frozen", BENCHMARKS / "study_frozen.py"
-        )
+        spec = importlib.util.spec_from_file_location(name, BENCHMARKS / f"{name}.py")
         module = importlib.util.module_from_spec(spec)
         spec.loader.exec_module(module)
     finally:
         sys.path.remove(str(BENCHMARKS))
     return module
+
+
+def read_study(name, path=None):
+    """Return a study as a module, and its lines."""
+    study = load_study(name)
+    return study, study.read(path or BENCHMARKS / FILES[name])
 
 
 def write_list_table(head, rows, widths):
@@ -35,29 +39,30 @@ def write_list_table(head, rows, widths):
     return [*lines, ""]
 
 
-def write_tables(path=FILE):
+def write_tables(name, path=None):
     """Return the tables of a study as lines of a page."""
-    study = load_study()
-    lines = study.read(path)
+    study, lines = read_study(name, path)
     out = [study.describe_draws(lines), ""]
     out += write_list_table(("asked", "target", "measured, with Wilson's 95 % interval"),
                             study.score(lines), "50 12 38")  # fmt: skip
-    out += ["One effect, by what it is worth:", ""]
-    out += write_list_table(("worth", "a finding", "the truth in a set", "a set without the truth"),
-                            study.find_power(lines), "16 28 28 28")  # fmt: skip
-    out += ["Every answer that is wrong, with what the truth was worth in brackets:", ""]
+    if hasattr(study, "find_power"):
+        out += ["One effect, by what it is worth:", ""]
+        out += write_list_table(
+            ("worth", "a finding", "the truth in a set", "a set without the truth"),
+            study.find_power(lines), "16 28 28 28",
+        )  # fmt: skip
+    out += ["Every answer that is wrong, with the truth and, where it was measured, its worth:", ""]
     return out + [f"- {miss}" for miss in study.find_misses(lines)]
 
 
-def write_summary(path=FILE):
+def write_summary(name, path=None):
     """Return what has a target, what was measured and the target, as a list of sentences."""
-    study = load_study()
-    lines = study.read(path)
+    study, lines = read_study(name, path)
     out, first = [study.describe_draws(lines), ""], ""
     for what, target, found in study.score(lines):
         own = what.strip()
-        if own.startswith("the same: "):
-            own = f"{first}: {own.removeprefix('the same: ')}"
+        if own.startswith("the same"):
+            own = first + own.removeprefix("the same")
         else:
             first = own.rpartition(":")[0] or own
         if target and "no draw" not in found:
@@ -65,21 +70,22 @@ def write_summary(path=FILE):
     return out
 
 
-class FrozenStudy(Directive):
-    """Tables and misses of the frozen study, or with ``summary`` the main figures alone."""
+class Study(Directive):
+    """Tables and misses of a study, or with ``summary`` its main figures alone."""
 
+    required_arguments = 1
     optional_arguments = 1
 
     def run(self):
         """Return the tables."""
+        name, *how = self.arguments
         place = nodes.Element()
-        write = write_summary if self.arguments == ["summary"] else write_tables
-        text = StringList(write(), source="frozen_study")
-        self.state.nested_parse(text, self.content_offset, place)
+        lines = write_summary(name) if how == ["summary"] else write_tables(name)
+        self.state.nested_parse(StringList(lines, source=name), self.content_offset, place)
         return place.children
 
 
 def setup(app):
     """Register the directive."""
-    app.add_directive("frozen-study", FrozenStudy)
+    app.add_directive("study", Study)
     return {"parallel_read_safe": True}
