@@ -125,7 +125,7 @@ def test_a_wander_that_makes_a_model_err_more_is_refused(monkeypatch, floor, wid
         compute_size_chance=lambda loops, fit: 0.07,
     )  # fmt: skip
     monkeypatch.setattr(gap_summary.gaps, "compute_floor", lambda *_: SimpleNamespace(both=floor))
-    model = SimpleNamespace(fit=None)
+    model = Model(None, None)
     assert make_noise_test(fresh)(model, model) is refused
     assert not make_noise_test(fresh)(model)
 
@@ -137,7 +137,7 @@ def test_a_wander_that_makes_a_model_err_more_is_refused(monkeypatch, floor, wid
     ((1.2, 1.0), (1.0, 1.0), False, True),
 ])  # fmt: skip
 def test_noise_is_refused_for_what_is_better(monkeypatch, floors, gaps, narrower, refused):
-    model, other = (SimpleNamespace(fit=k) for k in range(2))
+    model, other = (Model(None, k) for k in range(2))
     fresh = SimpleNamespace(
         windows=(), how=None, prepare_loops=lambda m: m.fit, measure_gap=lambda k: gaps[k],
         compute_widening_chance=lambda one, two: 1e-4 if narrower and two is other else 0.3,

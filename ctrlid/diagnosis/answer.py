@@ -16,8 +16,8 @@ from ..estimation.likelihood.filter_data import find_noise_units
 from ..estimation.likelihood.likelihood import Fit
 from ..estimation.likelihood.physics_fit import summarize_fit
 from ..estimation.likelihood.tails import JointTails, Tails
-from ..loop.loop import (
-    Loop,
+from ..loop.loop import Loop
+from ..loop.velocities import (
     describe_missing_forces,
     describe_possible_speeds,
     list_possible_speeds,
@@ -117,7 +117,7 @@ def assemble_answer(
         verdict, findings, gap, disturbance, found.after, where, None if left else objection,
         len({type(c.effect) for c in ranking}), grounds, noise,
     )  # fmt: skip
-    if verdict not in COMPLETE and list_unforced_velocities(loop):
+    if verdict not in COMPLETE and list_unforced_velocities(loop.equations()):
         sentence += (
             " The loop does not say which input works on which velocity, so that no friction of a "
             "mechanism can be named rightly: give forces=, and diagnose again."
@@ -131,19 +131,19 @@ def assemble_answer(
 
 def _list_notes(loop: Loop, found: Search) -> list[str]:
     """Return what the user should know of what was not asked, or of how the model is given."""
-    notes = []
+    notes, e = [], loop.equations()
     if not loop.free:
         notes.append("no parameter of the model was free, so a wrong value counts as a missing "
                      "effect. Name the uncertain parameters in free=")  # fmt: skip
-    if not loop.equations().siso:
+    if not e.siso:
         notes.append(
             "with several inputs or outputs the noise of each output is taken to be white: "
             "coloured noise, limits of a sensor, repeats of the experiment and errors of the log "
             "are not looked for"
         )
-    if list_unforced_velocities(loop) and not found.after.passed:
-        notes.append(f"{describe_missing_forces(loop)}, and diagnose again")
-    speeds = list_possible_speeds(loop)
+    if list_unforced_velocities(e) and not found.after.passed:
+        notes.append(f"{describe_missing_forces(e, loop.point)}, and diagnose again")
+    speeds = list_possible_speeds(e, loop.state_units)
     if speeds and not found.after.passed:
         notes.append(f"{describe_possible_speeds(speeds)}, and diagnose again")
     if loop.linear_plant and not found.after.passed:

@@ -267,11 +267,16 @@ def make_noise_test(fresh: FreshData) -> Callable[..., bool]:
     what is still missing. Not so one that exceeds the error by no more than that other noise does,
     or beside which the model errs less.
     """
+    # A model is asked of alone first, and then beside another: that is computed once.
+    prepare_loops = functools.lru_cache(maxsize=2)(fresh.prepare_loops)
 
-    def is_too_large(loops: Sequence[Loop], model: Model) -> bool:
-        return fresh.compute_size_chance(loops, model.fit) < THRESHOLD.beyond_chance
+    @functools.lru_cache(maxsize=2)
+    def is_too_large(model: Model) -> bool:
+        chance = fresh.compute_size_chance(prepare_loops(model), model.fit)
+        return chance < THRESHOLD.beyond_chance
 
-    def compute_ratio(loops: Sequence[Loop], model: Model) -> float:
+    def compute_ratio(model: Model) -> float:
+        loops = prepare_loops(model)
         floor = gaps.compute_floor(loops, model.fit, fresh.windows, fresh.how).both
         return floor / max(fresh.measure_gap(loops), THRESHOLD.tiny)
 
@@ -279,17 +284,15 @@ def make_noise_test(fresh: FreshData) -> Callable[..., bool]:
         return fresh.compute_widening_chance(other, model) < THRESHOLD.beyond_chance
 
     def is_false(model: Model, other: Model | None = None) -> bool:
-        loops = fresh.prepare_loops(model)
         if other is None:
-            return is_too_large(loops, model)
-        ratio = compute_ratio(loops, model)
+            return is_too_large(model)
+        ratio = compute_ratio(model)
         far = ratio > THRESHOLD.excess
         if far and errs_more(model, other):
             return True
-        if not is_too_large(loops, model) or (not far and errs_more(other, model)):
+        if not is_too_large(model) or (not far and errs_more(other, model)):
             return False
-        others = fresh.prepare_loops(other)
-        return not (compute_ratio(others, other) >= ratio and is_too_large(others, other))
+        return not (compute_ratio(other) >= ratio and is_too_large(other))
 
     return is_false
 

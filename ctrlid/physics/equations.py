@@ -335,8 +335,8 @@ def drive_inputs(
         values[j] = u[k]
     pushes = None
     # A single mass with a single input and output is pushed by accelerations, as without forces.
-    single = len(velocities) == len(driven) == len(e.outputs) == 1
-    if forces and not single:
+    by_forces = bool(forces) and not len(velocities) == len(driven) == len(e.outputs) == 1
+    if by_forces:
         slopes = casadi.jacobian(e.rhs, e.u)
         columns = []
         for j, velocity in zip(e.velocities, velocities, strict=True):
@@ -357,7 +357,7 @@ def drive_inputs(
     return replace(
         e, inputs=tuple(driven), u=u, rhs=casadi.substitute(e.rhs, e.u, values),
         output=casadi.substitute(e.output, e.u, values), pushes=pushes,
-        push_units=own if forces and not single else (),
+        push_units=own if by_forces else (),
     )  # fmt: skip
 
 
