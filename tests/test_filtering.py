@@ -52,6 +52,11 @@ def system(rng, size, n, m, p, varying):
     }  # fmt: skip
 
 
+def of_one_output(s):
+    """The same with an axis of outputs."""
+    return {key: v[:, None] if key in ("height", "c", "hp", "y") else v for key, v in s.items()}
+
+
 def run(s, valid=None, restart=None, input_variance=None, start=None, spread=None, sensor=0.3,
         force=None, memory=0.0, drift=0.0, sizes=None):  # fmt: skip
     size, n = s["step"].shape
@@ -59,12 +64,15 @@ def run(s, valid=None, restart=None, input_variance=None, start=None, spread=Non
     valid = np.ones(size, dtype=bool) if valid is None else valid
     if restart is None:
         restart = np.arange(size) == 0
-    return filter_pass(
-        *s.values(), valid, restart, np.zeros(size) if input_variance is None else input_variance,
+    error, variance, *states, slopes, disturbance = filter_pass(
+        *of_one_output(s).values(), valid[:, None], restart,
+        np.zeros(size) if input_variance is None else input_variance,
         np.zeros(n) if start is None else start, 2.0 * np.eye(n) if spread is None else spread,
-        np.full(size, sensor), np.zeros((1, 4)), np.full(m, 0.2) if force is None else force,
-        memory, drift, *(sizes or ((0,) * n, (0,) * (n + bool(drift)))),
+        np.full(size, sensor)[:, None], np.zeros((1, 4)),
+        np.full(m, 0.2) if force is None else force,
+        memory, drift, *(sizes or ((0,) * n, (0,) * (n + bool(drift)), (0,))),
     )  # fmt: skip
+    return error[:, 0], variance[:, 0], *states, slopes[:, 0], disturbance
 
 
 def test_arguments_of_a_pass_stand_in_the_order_of_the_pass():
@@ -79,9 +87,9 @@ def test_a_filter_of_any_size_gives_the_bits_of_one_compiled_for_it(drift, monke
     widths = 3 + bool(drift)
     results = []
     for tuples in (False, False, True):
-        sizes = choose_sizes(3, widths, 400)
-        assert [isinstance(v, tuple) for v in sizes] == [tuples, tuples]
-        assert [len(v) for v in sizes] == [3, widths]
+        sizes = choose_sizes(3, widths, 1, 400)
+        assert [isinstance(v, tuple) for v in sizes] == [tuples] * 3
+        assert [len(v) for v in sizes] == [3, widths, 1]
         results.append(run(s, memory=0.9, drift=drift, sizes=sizes))
     for one, other in zip(results[0], results[2], strict=True):
         assert np.array_equal(one, other, equal_nan=True)
@@ -652,16 +660,18 @@ def test_a_million_samples_of_an_unstable_plant_stay_positive():
     zero = np.zeros((n, 2))
     ratio = (0.05 / 2e-6) ** 2
     out = filter_pass(
-        np.outer(pushes, b), every(a), every(b[:, None]), zero, np.zeros((n, 2, 1)), np.zeros(n),
-        every(np.array([1.0, 0.0])), np.zeros((n, 1)), zero, zero, y, np.ones(n, dtype=bool),
-        np.arange(n) == 0, np.zeros(n), np.zeros(2), 1e12 * np.eye(2), np.ones(n), np.zeros((1, 4)),
-        np.array([ratio]), 0.0, 0.0, (0, 0), (0, 0),
+        np.outer(pushes, b), every(a), every(b[:, None]), zero, np.zeros((n, 2, 1)),
+        np.zeros((n, 1)), every(np.array([[1.0, 0.0]])), np.zeros((n, 1, 1)), zero, zero,
+        y[:, None], np.ones((n, 1), dtype=bool), np.arange(n) == 0, np.zeros(n), np.zeros(2),
+        1e12 * np.eye(2), np.ones((n, 1)), np.zeros((1, 4)),
+        np.array([ratio]), 0.0, 0.0, (0, 0), (0, 0), (0,),
     )  # fmt: skip
+    error, variance = out[0][:, 0], out[1][:, 0]
     steady = linalg.solve_discrete_are(a.T, np.array([[1.0], [0.0]]), ratio * np.outer(b, b),
                                        np.eye(1))  # fmt: skip
-    assert np.isfinite(out[0]).all()
-    np.testing.assert_allclose(out[1][1000:], steady[0, 0] + 1, rtol=1e-6)
-    z = out[0][1000:] / (2e-6 * np.sqrt(out[1][1000:]))
+    assert np.isfinite(error).all()
+    np.testing.assert_allclose(variance[1000:], steady[0, 0] + 1, rtol=1e-6)
+    z = error[1000:] / (2e-6 * np.sqrt(variance[1000:]))
     assert z.std() == pytest.approx(1.0, abs=0.005)
     assert abs(z[1:] @ z[:-1]) / len(z) < 0.005
 

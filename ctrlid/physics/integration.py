@@ -38,7 +38,9 @@ class Scheme:
     sharp: tuple[int, int] | None = None
 
 
-def integrate(rate: Any, z: Any, dt: Any, substeps: int) -> tuple[Any, Any]:
+def integrate(
+    rate: Any, z: Any, dt: Any, substeps: int, once: bool = True
+) -> tuple[Any, Any]:  # fmt: skip
     """Advance an expression by Dormand and Prince's eighth-order formula.
 
     Parameters
@@ -51,6 +53,9 @@ def integrate(rate: Any, z: Any, dt: Any, substeps: int) -> tuple[Any, Any]:
         Time to advance [s].
     substeps : int
         Number of steps of equal length.
+    once : bool, optional
+        Whether the expression of a step is built once for all of them, so that `rate` is asked in
+        the first one only.
 
     Returns
     -------
@@ -82,14 +87,14 @@ def integrate(rate: Any, z: Any, dt: Any, substeps: int) -> tuple[Any, Any]:
         return [z + h * total, error]
 
     worst = casadi.SX.zeros(z.shape[0], 1)
-    step = _build_once(one, z.shape[0], substeps)
+    step = _build_once(one, z.shape[0], substeps) if once else one
     for k in range(substeps):
         z, error = step(k * h, z)
         worst = casadi.fmax(worst, error)
     return z, worst
 
 
-def integrate_fast(rate: Any, z: Any, dt: Any, substeps: int) -> Any:
+def integrate_fast(rate: Any, z: Any, dt: Any, substeps: int, once: bool = True) -> Any:
     """Advance an expression by the classical fourth-order formula of Runge and Kutta."""
     h = dt / substeps
 
@@ -100,7 +105,7 @@ def integrate_fast(rate: Any, z: Any, dt: Any, substeps: int) -> Any:
         fourth = rate(start + h, z + h * third)
         return [z + h / 6 * (first + 2 * second + 2 * third + fourth)]
 
-    step = _build_once(one, z.shape[0], substeps)
+    step = _build_once(one, z.shape[0], substeps) if once else one
     for k in range(substeps):
         (z,) = step(k * h, z)
     return z
@@ -196,7 +201,7 @@ def _list_spreads(e: Equations) -> list[Any]:
 
 def advance(
     e: Equations, t: Any, x: Any, pieces: Sequence[Piece], p: Any, spread: Any = None,
-    held_rate: Any = None, *, scheme: Scheme,
+    held_rate: Any = None, *, scheme: Scheme, stages: Any = None,
 ) -> tuple[Any, Any]:  # fmt: skip
     """Return the state of a plant after the pieces of its input, and the local error.
 
@@ -221,6 +226,8 @@ def advance(
         Constant added to the rates: a force held over the period.
     scheme : Scheme
         Order and number of the steps.
+    stages : Stages, optional
+        What stands in the place of the plant's rates, so that the result can be differentiated.
 
     Returns
     -------
@@ -235,8 +242,9 @@ def advance(
     worst = casadi.SX.zeros(n, 1)
     driven, seen = find_lags(e)
     hidden = [lag.state for lag in (*driven, *seen)]
+    evaluate, once = (e.smoothed, True) if stages is None else (stages, False)
     if e.dt:
-        return e.smoothed(t, x, pieces[-1][1], p, spread)[0] + held_rate, worst
+        return evaluate(t, x, pieces[-1][1], p, spread)[0] + held_rate, worst
     times = {
         lag.state: casadi.substitute(casadi.SX(lag.time_constant), e.p, casadi.SX(p))
         for lag in e.lags
@@ -262,19 +270,17 @@ def advance(
             filled: Any = filled,
             t: Any = t,
         ) -> Any:
-            rates = (
-                e.smoothed(t + tau, filled(tau, z), level + slope * tau, p, spread)[0] + held_rate
-            )
+            rates = evaluate(t + tau, filled(tau, z), level + slope * tau, p, spread)[0] + held_rate
             for k in hidden:
                 rates[k] = 0
             return rates
 
         order, steps = scheme.sharp if sharp and scheme.sharp else (scheme.order, scheme.steps)
         if order == 8:
-            after, error = integrate(rate, x, duration, steps)
+            after, error = integrate(rate, x, duration, steps, once)
             worst = casadi.fmax(worst, error)
         else:
-            after = integrate_fast(rate, x, duration, steps)
+            after = integrate_fast(rate, x, duration, steps, once)
         after = filled(duration, after)
         for lag in seen:
             ends = [

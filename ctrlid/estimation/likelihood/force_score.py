@@ -8,7 +8,7 @@ from ..._base.arrays import Array
 from ..._base.compilation import compile_loop
 from ..._base.interruption import keep_interrupt
 from ..._base.statistics import pseudo_inverse
-from .kalman_filter import arrange_pass
+from .kalman_filter import PassArguments, arrange_pass
 from .kalman_recursion import filter_pass
 from .likelihood import Fit
 
@@ -50,15 +50,15 @@ def compute_force_scores(
     weights = _weigh_innovations(fit, draws, seed)
     found = []
     for data, lin, part in zip(fit.data, fit.linearized, weights, strict=True):
-        run = arrange_pass(data, lin, fit.noise)
-        gain = _find_gains(filter_pass(*run), run.restart, run.valid, run.memory, run.drift)
+        run = _list_updates(arrange_pass(data, lin, fit.noise, 0, np.sqrt(fit.noise.ratios)))
+        valid, c = run.valid[:, 0], run.c[:, 0]
+        gain = _find_gains(filter_pass(*run), run.restart, valid, run.memory, run.drift)
         b = run.b
         pushed = b.sum(axis=2) if channel is None else np.ascontiguousarray(b[:, :, channel])
-        # Several outputs are updates one after another, of which only the last moves the state.
         updates = len(b) // len(lin.step)
         if updates > 1:
             part = part * np.sqrt(fit.noise.ratios)[None, :, None]
-        scores = _carry_back(run.a, b, pushed, run.c, gain, run.valid, run.restart, run.memory,
+        scores = _carry_back(run.a, b, pushed, c, gain, valid, run.restart, run.memory,
                              np.ascontiguousarray(part.reshape(len(b), -1)))  # fmt: skip
         found.append(scores[updates - 1 :: updates])
     return found
@@ -89,9 +89,45 @@ def _weigh_innovations(fit: Fit, draws: int, seed: int) -> list[Array]:
     return parts
 
 
+def _list_updates(run: PassArguments) -> PassArguments:
+    r"""Return a pass over several outputs as one over updates, each with a sample of its own.
+
+    Only the last update of a sample moves the state. Between them it stands still, and a coloured
+    force forgets so little that it has its memory over a whole period, :math:`\rho^{1/q}` in each
+    of q updates.
+    """
+    size, q = run.output.shape
+    if q == 1:
+        return run
+    states, memory = run.step.shape[1], run.memory ** (1 / q)
+
+    def spread_out(values: Array, still: Any) -> Array:
+        """Return what stands still at all outputs of a sample but the last."""
+        out = np.empty((size, q, *values.shape[1:]), values.dtype)
+        out[:] = still
+        out[:, -1] = values
+        return out.reshape(size * q, *values.shape[1:])
+
+    before = run.predicted[:, None]
+    restart = np.zeros((size, q), dtype=bool)
+    restart[:, 0] = run.restart
+    drift = run.drift / (1 - run.memory**2) * (1 - memory**2)
+    return run._replace(
+        step=spread_out(run.step, before), a=spread_out(run.a, np.eye(states)),
+        b=spread_out(run.b, 0.0), du=spread_out(run.du, 0.0), dp=spread_out(run.dp, 0.0),
+        output=run.output.reshape(-1, 1), c=run.c.reshape(-1, 1, states),
+        hp=run.hp.reshape(size * q, 1, -1), predicted=np.repeat(run.predicted, q, axis=0),
+        filtered=spread_out(run.filtered, before), y=run.y.reshape(-1, 1),
+        valid=run.valid.reshape(-1, 1), restart=restart.ravel(),
+        input_variance=spread_out(run.input_variance, 0.0), sensor=run.sensor.reshape(-1, 1),
+        memory=memory, drift=drift, outputs=np.empty(1),
+    )  # fmt: skip
+
+
 def _find_gains(out: Any, restart: Any, valid: Any, memory: float, drift: float) -> Array:
     """Return the gain of each update, by which it moved the states for its innovation."""
     error, _, before, after, _, _, disturbance = out
+    error = error[:, 0]
     moved = after - before
     if drift > 0.0:
         last = np.concatenate([[0.0], disturbance[:-1]])

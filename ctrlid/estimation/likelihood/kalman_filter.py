@@ -117,21 +117,7 @@ def run_filter(
 ) -> Filtered:  # fmt: skip
     """Run the filter along a linearized plant, with sensitivities to its first columns."""
     p = len(plant.index) if columns is None else columns
-    p = p if sensitive else 0
-    if lin.output.ndim == 2:
-        return _run_several(data, lin, noise, p)
-    n, tails = plant.size, noise.tails
-    out = filter_pass(*_arrange_pass(data, lin, noise, p))
-    error, variance, before, after, wide, slopes, disturbance = out
-    variance = _count_alone(variance, data, noise)
-    before, after, wide = before[:, :n], after[:, :n], wide[:, :n]
-    counts = data.usable
-    # The caller reports a filter that lost the record, so that no warning is needed here.
-    with np.errstate(all="ignore"):
-        square = np.mean(error[counts] ** 2 / variance[counts]) if tails is None else tails.scale
-        sensor = np.sqrt(square)
-    return Filtered(error, variance, Trajectory(before, after, wide * sensor), slopes,
-                    disturbance)  # fmt: skip
+    return _run_pass(data, lin, noise, p if sensitive else 0, noise.ratios)
 
 
 def predict_outputs(data: FilterData, lin: Linearized, noise: Noise) -> tuple[Array, Array]:
@@ -148,35 +134,31 @@ def predict_outputs(data: FilterData, lin: Linearized, noise: Noise) -> tuple[Ar
         moved = replace(data, y=data.y[:, order], valid=data.valid[:, order],
                         alike=data.alike[:, order], counted=data.counted[:, order])  # fmt: skip
         tails = noise.tails.reorder(order) if isinstance(noise.tails, JointTails) else None
-        own = replace(noise, sensors=(), tails=tails)
-        out = _run_several(moved, turned, own, 0, scale[order])
+        out = _run_pass(moved, turned, replace(noise, tails=tails), 0, scale[order])
         errors.append(out.innovations[:, 0])
         variances.append(out.variance[:, 0])
     return np.column_stack(errors), np.column_stack(variances)
 
 
-def _run_several(
-    data: FilterData, lin: Linearized, noise: Noise, p: int, sensors: Array | None = None
-) -> Filtered:
-    r"""Run the filter over several outputs, one after another as if each had a sample of its own.
+def _run_pass(data: FilterData, lin: Linearized, noise: Noise, p: int, ratios: Array) -> Filtered:
+    """Run the filter, with sensitivities to p parameters, and the noise of each output by ratios.
 
-    Sensor noises are independent, so that the outputs of a sample update the state in turn. Between
-    them the state stands still, and a coloured force forgets so little that it has its memory
-    over a whole period, :math:`\rho^{1/q}` in each of q updates.
+    Of one output the axis of outputs is left out.
     """
-    size, q = lin.output.shape
-    scale, tails = np.sqrt(noise.ratios if sensors is None else sensors), noise.tails
-    out = filter_pass(*_arrange_updates(data, lin, noise, p, scale))
+    scale, n, tails = np.sqrt(ratios), lin.step.shape[1], noise.tails
+    out = filter_pass(*arrange_pass(data, lin, noise, p, scale))
     error, variance, before, after, wide, slopes, disturbance = out
-    variance = _count_alone(variance.reshape(size, q), data, noise)
-    error, variance = error.reshape(size, q) * scale, variance * scale**2
+    if lin.output.ndim == 1:
+        error, variance, slopes = error[:, 0], variance[:, 0], slopes[:, 0]
+    variance = _count_alone(variance, data, noise)
+    if lin.output.ndim == 2:
+        error, variance, slopes = error * scale, variance * scale**2, slopes * scale[:, None]
     # The caller reports a filter that lost the record, so that no warning is needed here.
     with np.errstate(all="ignore"):
         squares = (error**2 / variance)[data.usable]
         sensor = np.sqrt(np.mean(squares) if tails is None else tails.scale)
-    trajectory = Trajectory(before[::q], after[q - 1 :: q], wide[q - 1 :: q] * sensor)
-    return Filtered(error, variance, trajectory, slopes.reshape(size, q, p) * scale[:, None],
-                    disturbance[q - 1 :: q])  # fmt: skip
+    trajectory = Trajectory(before[:, :n], after[:, :n], wide[:, :n] * sensor)
+    return Filtered(error, variance, trajectory, slopes, disturbance)
 
 
 def _count_alone(variance: Array, data: FilterData, noise: Noise) -> Array:
@@ -210,83 +192,39 @@ class PassArguments(NamedTuple):
     drift: float
     states: Any
     widths: Any
+    outputs: Any
 
 
-def arrange_pass(data: FilterData, lin: Linearized, noise: Noise) -> PassArguments:
-    """Return the arguments of a pass without sensitivities, a sample for each output."""
-    if lin.output.ndim == 1:
-        return _arrange_pass(data, lin, noise, 0)
-    return _arrange_updates(data, lin, noise, 0, np.sqrt([1.0, *noise.sensors]))
+def arrange_pass(
+    data: FilterData, lin: Linearized, noise: Noise, p: int, scale: Array
+) -> PassArguments:
+    """Return the arguments of a pass, with sensitivities to p parameters.
 
-
-def _arrange_pass(data: FilterData, lin: Linearized, noise: Noise, p: int) -> PassArguments:
-    """Return the arguments of a pass over one output, with sensitivities to p parameters."""
+    Each of several outputs is divided by its scale, after which all noises are alike.
+    """
     white, force = noise.sensor_is_white, np.asarray(noise.force, dtype=float)
     if not white:
         lin, force = append_sensor_noise(lin, force, noise)
     size, states = lin.step.shape
-    check_budget(size + BESIDE_A_PASS)
+    output, c, hp, y, valid = lin.output, lin.c, lin.hp[..., :p], data.y, data.valid
+    sensor = data.alike if white else np.zeros(size)
+    if output.ndim == 1:
+        output, c, hp, y, valid, sensor = (v[:, None] for v in (output, c, hp, y, valid, sensor))
+    else:
+        output, c, hp, y = output / scale, c / scale[:, None], hp / scale[:, None], y / scale
+    check_budget(size * output.shape[1] + BESIDE_A_PASS)
     return PassArguments(
-        lin.step, lin.a, lin.b, lin.du, np.ascontiguousarray(lin.dp[:, :, :p]), lin.output,
-        lin.c, np.ascontiguousarray(lin.hp[:, :p]), lin.trajectory.predicted,
-        lin.trajectory.filtered, data.y, data.valid, data.restart, lin.input_variance,
-        lin.start, lin.spread, data.alike if white else np.zeros(size), _list_tails(noise.tails),
+        lin.step, lin.a, lin.b, lin.du, np.ascontiguousarray(lin.dp[:, :, :p]), output, c,
+        np.ascontiguousarray(hp), lin.trajectory.predicted, lin.trajectory.filtered, y, valid,
+        data.restart, lin.input_variance, lin.start, lin.spread, sensor, _list_tails(noise.tails),
         force, noise.memory, noise.drift,
-        *choose_sizes(states, states + bool(noise.drift > 0), size),
-    )  # fmt: skip
-
-
-def _arrange_updates(
-    data: FilterData, lin: Linearized, noise: Noise, p: int, scale: Array
-) -> PassArguments:
-    """Return the arguments of a pass over several outputs, each divided by its scale."""
-    size, q = lin.output.shape
-    each, states = _list_updates(lin), lin.step.shape[1]
-    memory = noise.memory ** (1 / q)
-    restart = np.zeros((size, q), dtype=bool)
-    restart[:, 0] = data.restart
-    unsure = np.zeros((size, q))
-    unsure[:, -1] = lin.input_variance
-    check_budget(size * q + BESIDE_A_PASS)
-    return PassArguments(
-        each.step, each.a, each.b, each.du, np.ascontiguousarray(each.dp[:, :, :p]),
-        (lin.output / scale).ravel(), (lin.c / scale[:, None]).reshape(size * q, states),
-        np.ascontiguousarray((lin.hp[:, :, :p] / scale[:, None]).reshape(size * q, p)),
-        each.trajectory.predicted, each.trajectory.filtered, (data.y / scale).ravel(),
-        data.valid.ravel(), restart.ravel(), unsure.ravel(), lin.start, lin.spread,
-        data.alike.ravel(), _list_tails(noise.tails), np.asarray(noise.force, dtype=float), memory,
-        noise.coloured * (1 - memory**2),
-        *choose_sizes(states, states + bool(noise.drift > 0), size * q),
+        *choose_sizes(states, states + bool(noise.drift > 0), output.shape[1], size),
     )  # fmt: skip
 
 
 def _list_tails(tails: Tails | JointTails | None) -> Array:
     """Return the heavy tails as the compiled filter takes them."""
     return np.array([GAUSSIAN]) if tails is None else tails.numbers
-
-
-@lru_cache(maxsize=8)
-def _list_updates(lin: Linearized) -> Linearized:
-    """Return the plant with a sample for each output, of which only the last one moves the state.
-
-    A search for the noise filters the same plant many times, so that the last ones are kept.
-    """
-    size, q = lin.output.shape
-
-    def spread_out(values: Array, still: Any) -> Array:
-        """Return what stands still at all outputs of a sample but the last."""
-        out = np.empty((size, q, *values.shape[1:]))
-        out[:] = still
-        out[:, -1] = values
-        return out.reshape(size * q, *values.shape[1:])
-
-    at, before = lin.trajectory, lin.trajectory.predicted[:, None]
-    every = np.repeat(at.predicted, q, axis=0)
-    return replace(
-        lin, step=spread_out(lin.step, before), a=spread_out(lin.a, np.eye(lin.a.shape[1])),
-        b=spread_out(lin.b, 0.0), du=spread_out(lin.du, 0.0), dp=spread_out(lin.dp, 0.0),
-        trajectory=Trajectory(every, spread_out(at.filtered, before), every),
-    )  # fmt: skip
 
 
 def append_sensor_noise(lin: Linearized, force: Array, noise: Noise) -> tuple[Linearized, Array]:

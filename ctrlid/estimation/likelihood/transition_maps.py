@@ -18,6 +18,7 @@ from ...loop.controllers import ControlLaw
 from ...loop.loop import Loop
 from ...loop.period_map import apply_backlash, push_velocities
 from ...physics.block_evaluation import BlockEvaluation
+from ...physics.differentiation import Stages, differentiate
 from ...physics.equations import Equations
 from ...physics.integration import Scheme, advance, cut_input, find_lags, integrate
 from ...physics.linearization import compute_state_matrices
@@ -228,7 +229,7 @@ def build_maps(plan: PeriodPlan) -> TransitionMaps:
     x, ends, given, by, parts = _build_period(plan)
     # Behind backlash, the input itself depends on the free parameters.
     own = ("force", "free") if plan.equations.play is None else ("force", "free", "input")
-    functions = _chain_maps(x, ends, parts, given, [by[key] for key in own])
+    functions = _chain_maps(x, ends, parts, given, [by[key] for key in own], plan.index)
     output = by["output"]
     outputs = [output, casadi.jacobian(output, x), casadi.jacobian(output, by["free"])]
     sensor = casadi.Function("sensor", [x, *given[:3]], outputs, {"cse": True})
@@ -266,12 +267,11 @@ def _build_period(plan: PeriodPlan) -> tuple[Any, list[Any], list[Any], dict[str
         ]
         ends, parts = _build_stages(plan, t, x, pieces, p, s, held_rate, scheme, part)
     else:
-        ends = [
-            _integrate_with_controller(
-                plan, t, x, p, s, held_rate, now, (r, next_r), y, max(scheme.steps, 2)
-            )
-        ]
-        parts = 1
+        stages = Stages(e)
+        end = _integrate_with_controller(
+            plan, stages, t, x, p, s, held_rate, now, (r, next_r), y, max(scheme.steps, 2)
+        )
+        ends, parts = [(end, stages)], 1
     free = casadi.vertcat(*(p[k] for k in plan.index)) if plan.index else casadi.SX(0, 1)
     by = {"force": force, "free": free, "input": casadi.vertcat(*path),
           "output": e.smoothed(t, x[:n], now, p, s)[1]}  # fmt: skip
@@ -294,19 +294,23 @@ def _build_stages(
     """
     e, steps = plan.equations, scheme.steps
     if e.dt or scheme.sharp or steps == 1:
-        return [advance(e, t, x, pieces, p, s, held_rate, scheme=scheme)[0]], 1
+        stages = Stages(e)
+        end = advance(e, t, x, pieces, p, s, held_rate, scheme=scheme, stages=stages)[0]
+        return [(end, stages)], 1
     ends, begin, one = [], t, Scheme(scheme.order, 1)
     for duration, level, slope in pieces:
-        h = duration / steps
+        h, stages = duration / steps, Stages(e)
         piece = (h, level + slope * part * h, slope)
-        after = advance(e, begin + part * h, x, [piece], p, s, held_rate, scheme=one)[0]
-        ends.append(after)
+        after = advance(e, begin + part * h, x, [piece], p, s, held_rate, scheme=one,
+                        stages=stages)[0]  # fmt: skip
+        ends.append((after, stages))
         begin = begin + duration
     return ends, steps
 
 
 def _integrate_with_controller(
     plan: PeriodPlan,
+    stages: Stages,
     t: Any,
     x: Any,
     p: Any,
@@ -321,42 +325,47 @@ def _integrate_with_controller(
 
     The reference runs straight from one value to the next one, or is held if both are the same.
     """
-    e, law, n = plan.equations, plan.law, len(plan.equations.states)
+    law, n = plan.law, len(plan.equations.states)
     assert law is not None
     r, climb = path_r[0], (path_r[1] - path_r[0]) / plan.dt
-    output = e.smoothed(t, x[:n], u, p, s)[1]
+    output = stages(t, x[:n], u, p, s)[1]
     y = y if plan.sees == "reading" else output
     noise = y - output
     # The offset holds bias, injected signals and what the controller's state leaves unexplained.
     offset = u - law.apply(t, x[n:], r, y)[0]
 
     def rate(tau: Any, z: Any) -> Any:
-        seen = e.smoothed(t + tau, z[:n], u, p, s)[1] + noise
+        seen = stages(t + tau, z[:n], u, p, s)[1] + noise
         computed, slope = law.apply(t + tau, z[n:], r + climb * tau, seen)
-        driven = e.smoothed(t + tau, z[:n], computed + offset, p, s)[0] + held_rate
+        driven = stages(t + tau, z[:n], computed + offset, p, s)[0] + held_rate
         return casadi.vertcat(driven, slope)
 
-    return integrate(rate, x, plan.dt, substeps)[0]
+    return integrate(rate, x, plan.dt, substeps, once=False)[0]
 
 
 def _chain_maps(
-    x: Any, ends: Sequence[Any], parts: int, given: Sequence[Any], by: Sequence[Any]
-) -> tuple[casadi.Function, ...]:
+    x: Any, ends: Sequence[tuple[Any, Stages]], parts: int, given: Sequence[Any],
+    by: Sequence[Any], index: Sequence[int],
+) -> tuple[casadi.Function, ...]:  # fmt: skip
     """Return maps that carry the state and its derivatives, by itself first, along.
 
     Kinks have no slope at the kink itself; everything else is exact.
     """
-    n = x.shape[0]
-    before = [casadi.SX.eye(n), *(casadi.SX(n, v.shape[0]) for v in by)]
+    n, sizes = x.shape[0], [x.shape[0], *(v.shape[0] for v in by)]
+    before = [casadi.SX.eye(n), *(casadi.SX(n, size) for size in sizes[1:])]
     carried = []
     if len(ends) * parts > 1:
         before = carried = [casadi.SX.sym("s", *value.shape) for value in before]
+    # The directions: the state as it was, and each further column by itself.
+    own = [casadi.horzcat(*(casadi.SX.eye(size) if k == j else casadi.SX(size, other)
+                            for j, other in enumerate(sizes)))
+           for k, size in enumerate(sizes) if k]  # fmt: skip
+    seeds = [casadi.horzcat(*before), *own]
     functions = []
-    for end in ends:
-        a, *own = (casadi.jacobian(end, v) for v in (x, *by))
-        own = [casadi.SX(n, n), *own]
-        outputs = [casadi.mtimes(a, s) + d for s, d in zip(before, own, strict=True)]
-        functions.append(_make_function([x, *carried, *given], [end, *outputs]))
+    for end, stages in ends:
+        after, slopes = differentiate(end, stages, index, [x, *by], seeds)
+        outputs = casadi.horzsplit(slopes, [0, *np.cumsum(sizes).tolist()])
+        functions.append(_make_function([x, *carried, *given], [after, *outputs]))
     return tuple(functions)
 
 
