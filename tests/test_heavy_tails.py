@@ -13,7 +13,12 @@ from ctrlid.estimation.likelihood import tails
 from ctrlid.estimation.likelihood.kalman_filter import Noise, run_filter
 from ctrlid.estimation.likelihood.likelihood import make_problem
 from ctrlid.estimation.likelihood.maximization import begin_fit, choose_tails, maximize
-from ctrlid.estimation.likelihood.tails import Tails, compute_information_shares, fit_tails
+from ctrlid.estimation.likelihood.tails import (
+    MOST_SHARE,
+    Tails,
+    compute_information_shares,
+    fit_tails,
+)
 from test_sensor_noise import simulate_servo
 
 LAWS = [Tails(freedom=3.0), Tails(share=0.02, ratio=10.0)]
@@ -166,3 +171,27 @@ def test_tails_finer_than_the_converter_are_no_noise_of_the_sensor():
         fits[size] = fit
     assert _errs_less_than_rounding(fits[0.0])
     assert not _errs_less_than_rounding(fits[step])
+
+
+def test_a_search_begins_at_a_limit_as_well():
+    """The logarithm of a share at its limit is infinite, from which no search went on."""
+    squares = np.random.default_rng(8).standard_normal(500) ** 2
+    for share in (MOST_SHARE, 0.5 * MOST_SHARE):
+        law, value = fit_tails(Tails(share=share, ratio=3.0), squares, 0.0)
+        assert np.isfinite([law.share, law.ratio, law.scale, value]).all()
+        assert law.share <= MOST_SHARE
+
+
+def test_a_scale_is_found_where_a_secant_leads_below_zero():
+    """Errors over twenty orders of magnitude, as of a filter that loses its record."""
+    rng, lost = np.random.default_rng(0), 0
+    for _ in range(200):
+        count = int(rng.integers(20, 120))
+        squares = np.concatenate([10 ** rng.uniform(-8, -2, 100),
+                                  np.geomspace(1e-4, 10 ** rng.uniform(10, 22), count)])  # fmt: skip
+        law = Tails(share=0.05, ratio=100.0, scale=10 * float(squares.max()))
+        with np.errstate(all="raise", under="ignore"):
+            scale = law.find_scale(squares, law.scale)
+        again = np.mean(law.compute_weight(np.sqrt(squares / scale)) * squares)
+        lost += not again == pytest.approx(scale, rel=0.02)
+    assert lost == 0

@@ -29,11 +29,11 @@ from .likelihood import (
     relinearize_fit,
 )
 from .noise_fit import (
-    LOG_STEP,
     choose_force_ratios,
     compute_noise_criterion,
     compute_noise_logs,
     fit_noise,
+    list_difference_steps,
     make_noise,
     try_coloured_force,
     try_coloured_sensor,
@@ -319,12 +319,11 @@ def choose_sensor_noise(fit: Fit) -> Fit:
     """
     if fit.known is not None:
         return fit
-    richer = maximize(try_coloured_sensor(fit))
-    # A force that stood for the colour may have led a parameter astray, which needs it there.
-    quiet = maximize(replace(richer, noise=quieten_force(richer.noise)), exact=False)
-    if quiet.value > richer.value + OTHER_NOISE_GAIN:
-        anew = try_coloured_sensor(relinearize_fit(quiet))
-        richer = maximize(max(quiet, anew, key=compute_noise_criterion))
+    richer = _colour_sensor(fit)
+    if fit.noise.drift and not compute_noise_criterion(richer) > compute_noise_criterion(fit):
+        # A coloured force that stood for the colour may have led a parameter so far astray that no
+        # climb beside the colour comes back.
+        richer = _colour_sensor(maximize(replace(fit, noise=fit.noise.plain)))
     if not compute_noise_criterion(richer) > compute_noise_criterion(fit):
         return fit
     # The orders were chosen beside parameters that the colour has moved since: what was made up
@@ -333,6 +332,17 @@ def choose_sensor_noise(fit: Fit) -> Fit:
     fewer = len(anew.noise.ar + anew.noise.ma) < len(richer.noise.ar + richer.noise.ma)
     gained = compute_noise_criterion(anew) - compute_noise_criterion(richer)
     return maximize(anew) if fewer and gained > OTHER_NOISE_GAIN else richer
+
+
+def _colour_sensor(fit: Fit) -> Fit:
+    """Return the fit with coloured sensor noise, whether the BIC wants it or not."""
+    richer = maximize(try_coloured_sensor(fit))
+    # A force that stood for the colour may have led a parameter astray, which needs it there.
+    quiet = maximize(replace(richer, noise=quieten_force(richer.noise)), exact=False)
+    if quiet.value > richer.value + OTHER_NOISE_GAIN:
+        anew = try_coloured_sensor(relinearize_fit(quiet))
+        richer = maximize(max(quiet, anew, key=compute_noise_criterion))
+    return richer
 
 
 def choose_tails(fit: Fit) -> Fit:
@@ -508,13 +518,13 @@ def compute_information(fit: Fit) -> tuple[Array, Array]:
             theta[k] = end
             pair.append(compute_innovations(theta, fit.noise))
         columns.append(_divide_difference(pair, float(ends[1] - ends[0])))
-    for k in range(len(logs)):
+    for k, width in enumerate(list_difference_steps(fit.noise)):
         pair = []
-        for h in (-LOG_STEP, LOG_STEP):
+        for h in (-width, width):
             shifted = logs.copy()
             shifted[k] += h
             pair.append(compute_innovations(fit.theta, make_noise(shifted, fit.noise, dt)))
-        columns.append(_divide_difference(pair, 2 * LOG_STEP))
+        columns.append(_divide_difference(pair, 2 * float(width)))
     law = fit.noise.tails
     shares = compute_information_shares(law)
     count, records = len(columns), len(problem.data) if problem.known is None else 0

@@ -225,8 +225,8 @@ def _find_scale(law: Tails | FlatTails, squares: Array, start: float) -> float:
         scale = found
         if step and before != old:
             slope = (found - previous) / (old - before)
-            if slope < STEEPEST:
-                scale = (found - slope * old) / (1 - slope)
+            further = (found - slope * old) / (1 - slope) if slope < STEEPEST else 0.0
+            scale = further if further > 0 else found
         before, previous = old, found
     return scale
 
@@ -284,7 +284,9 @@ def fit_tails(tails: Tails, squares: Array, logs: float) -> tuple[Tails, float]:
     if tails.freedom:
         start = np.array([math.log(tails.freedom - 2)])
     else:
-        start = np.array([special.logit(tails.share / MOST_SHARE), math.log(tails.ratio - 1)])
+        # At a limit the logarithm is infinite, from which no search goes on.
+        share = min(tails.share / MOST_SHARE, 1 - 1e-6)
+        start = np.array([special.logit(share), math.log(tails.ratio - 1)])
     minimize: Any = optimize.minimize
     found = minimize(
         lambda x: -measure(make(x))[0], start, method="Nelder-Mead",
