@@ -178,18 +178,31 @@ def test_the_runs_of_a_chance_spread_as_many_more_do():
     assert spread == pytest.approx(np.std(np.log(errors)), rel=0.25)
 
 
-@pytest.mark.parametrize(("name", "plant", "orders"), [
-    ("ar", "drive", "ARMA(1, 0)"), ("ar", "pendulum", "ARMA(1, 0)"),
-    ("averaged", "ball", "ARMA(0, "),
+@pytest.mark.parametrize(("name", "plant"), [
+    ("ar", "drive"), ("ar", "pendulum"), ("averaged", "ball"),
 ])  # fmt: skip
-def test_the_order_is_asked_again_where_the_colour_has_moved_the_parameters(name, plant, orders):
+def test_the_order_is_asked_again_where_the_colour_has_moved_the_parameters(name, plant):
     """Beside parameters that a random force had led astray an average looked like a wander."""
     study = load_script("benchmarks", "study_suspects")
     draw = study.rigs.draw(name, plant, 721, 3000)
     found = cid.diagnose(study.make_loop(draw), study.make_record(draw), progress=False,
                          catalogue=(cid.effects.ConstantForce, cid.effects.SensorLag))  # fmt: skip
     assert found.verdict == "nothing missing"
-    assert orders in found.noise.words
+    if name == "ar":
+        assert "ARMA(1, 0)" in found.noise.words
+        return
+    # A small coefficient of the autoregression may be made up by chance; the average is exact.
+    assert np.abs(found.noise.ar).max(initial=0.0) < 0.1
+    ones = np.ones(draw.truth["samples"] - 1)
+    assert np.array(found.noise.ma) == pytest.approx(ones, abs=0.01)
+
+
+@pytest.mark.parametrize("count", [2, 3, 4])
+def test_an_average_over_samples_is_found_as_such(count):
+    """Its zeros are on the unit circle, which a search from within does not reach."""
+    loop, record, _ = make_loop_and_record(np.ones(count), [1.0], n=4000, seed=7)
+    fit = choose_sensor_noise(maximize(begin_fit(make_problem(loop, ("k", "c"), [record]))))
+    assert np.array(fit.noise.ma) == pytest.approx(np.ones(count - 1), abs=0.01)
 
 
 def test_the_memory_of_noise_is_that_of_its_autocorrelation():

@@ -29,11 +29,11 @@ from .likelihood import (
     relinearize_fit,
 )
 from .noise_fit import (
+    LOG_STEP,
     choose_force_ratios,
     compute_noise_criterion,
     compute_noise_logs,
     fit_noise,
-    list_difference_steps,
     make_noise,
     try_coloured_force,
     try_coloured_sensor,
@@ -319,12 +319,13 @@ def choose_sensor_noise(fit: Fit) -> Fit:
     """
     if fit.known is not None:
         return fit
-    richer = _colour_sensor(fit)
-    if fit.noise.drift and not compute_noise_criterion(richer) > compute_noise_criterion(fit):
-        # A coloured force that stood for the colour may have led a parameter so far astray that no
-        # climb beside the colour comes back.
-        richer = _colour_sensor(maximize(replace(fit, noise=fit.noise.plain)))
-    if not compute_noise_criterion(richer) > compute_noise_criterion(fit):
+    richer, promised = _colour_sensor(fit)
+    least = compute_noise_criterion(fit)
+    if not compute_noise_criterion(richer) > least and promised > least and fit.noise.drift:
+        # A coloured force that stood for the colour may have led a parameter so far astray that the
+        # climb beside the colour loses the record.
+        richer, _ = _colour_sensor(maximize(replace(fit, noise=fit.noise.plain)))
+    if not compute_noise_criterion(richer) > least:
         return fit
     # The orders were chosen beside parameters that the colour has moved since: what was made up
     # there for wrong parameters needs fewer coefficients now.
@@ -334,15 +335,16 @@ def choose_sensor_noise(fit: Fit) -> Fit:
     return maximize(anew) if fewer and gained > OTHER_NOISE_GAIN else richer
 
 
-def _colour_sensor(fit: Fit) -> Fit:
-    """Return the fit with coloured sensor noise, whether the BIC wants it or not."""
-    richer = maximize(try_coloured_sensor(fit))
+def _colour_sensor(fit: Fit) -> tuple[Fit, float]:
+    """Return the fit with coloured sensor noise, and the criterion that it had at the start."""
+    start = try_coloured_sensor(fit)
+    richer = maximize(start)
     # A force that stood for the colour may have led a parameter astray, which needs it there.
     quiet = maximize(replace(richer, noise=quieten_force(richer.noise)), exact=False)
     if quiet.value > richer.value + OTHER_NOISE_GAIN:
         anew = try_coloured_sensor(relinearize_fit(quiet))
         richer = maximize(max(quiet, anew, key=compute_noise_criterion))
-    return richer
+    return richer, compute_noise_criterion(start)
 
 
 def choose_tails(fit: Fit) -> Fit:
@@ -518,13 +520,13 @@ def compute_information(fit: Fit) -> tuple[Array, Array]:
             theta[k] = end
             pair.append(compute_innovations(theta, fit.noise))
         columns.append(_divide_difference(pair, float(ends[1] - ends[0])))
-    for k, width in enumerate(list_difference_steps(fit.noise)):
+    for k in range(len(logs)):
         pair = []
-        for h in (-width, width):
+        for h in (-LOG_STEP, LOG_STEP):
             shifted = logs.copy()
             shifted[k] += h
             pair.append(compute_innovations(fit.theta, make_noise(shifted, fit.noise, dt)))
-        columns.append(_divide_difference(pair, 2 * float(width)))
+        columns.append(_divide_difference(pair, 2 * LOG_STEP))
     law = fit.noise.tails
     shares = compute_information_shares(law)
     count, records = len(columns), len(problem.data) if problem.known is None else 0

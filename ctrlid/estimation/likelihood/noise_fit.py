@@ -24,9 +24,6 @@ MOST = 14.0
 SLOWEST = 0.05
 # Derivatives by the logarithm of a variance are differences over this step.
 LOG_STEP = 0.2
-# Derivatives by the angle of a coefficient are differences over this step: the zero of a random
-# walk beside white noise is 0.1 to 0.3 away from the circle, beyond which all comes again.
-ANGLE_STEP = 0.05
 # Above this second derivative by a log variance, a parabola tells how far the minimum is.
 CONVEX = 0.05
 # Partial autocorrelations are read back from coefficients up to this size.
@@ -75,9 +72,9 @@ def fit_noise(
         grid = np.linspace(low[0], high[0], 20)
         points = [np.append(np.full(plant.channels, g) + apart, rest) for g in grid]
         start = points[int(np.argmin(_evaluate_costs(cost, points)))]
-    steps = list_difference_steps(noise)[: len(start)]
-    best = at(_minimize_by_newton(cost, start, low, high, enough, steps))
-    fit = evaluate_linearized(problem, theta, best, lins)
+    fit = evaluate_linearized(
+        problem, theta, at(_minimize_by_newton(cost, start, low, high, enough)), lins
+    )
     return fit if noise.tails is None else _refit_tails(fit, hold_colour)
 
 
@@ -204,13 +201,6 @@ def compute_noise_logs(noise: Noise, dt: float) -> Array:
     return np.array(logs)
 
 
-def list_difference_steps(noise: Noise) -> Array:
-    """Return over which steps of the logarithms and angles of a noise differences are taken."""
-    angles = len(noise.ar) + len(noise.ma)
-    logs = len(noise.force) + len(noise.sensors) + 2 * bool(noise.drift)
-    return np.repeat([LOG_STEP, ANGLE_STEP], [logs, angles])
-
-
 def make_noise(logs: Array, like: Noise, dt: float) -> Noise:
     """Return the noise of the same kind that has such logarithms and angles."""
     channels, p, q = len(like.force), len(like.ar), len(like.ma)
@@ -283,15 +273,15 @@ def _evaluate_costs(cost: Callable[[Array], float], points: Iterable[Array]) -> 
 
 
 def _minimize_by_newton(
-    cost: Callable[[Array], float], x: Array, low: Array, high: Array, enough: float, h: Array
+    cost: Callable[[Array], float], x: Array, low: Array, high: Array, enough: float
 ) -> Array:
-    """Minimise a smooth function by damped Newton steps with differences of the widths `h`.
+    """Minimise a smooth function of a few logarithms by damped Newton steps with differences.
 
     Where a step gained what the parabola g^2/2h foresaw but for e, a function with a third
     derivative has e^2 / (g^2/2h) * 9/4 left to gain: on a line that tells the end. With more
     directions the errors of several may cancel.
     """
-    n = len(x)
+    n, h = len(x), LOG_STEP
     pairs = list(itertools.combinations(range(n), 2))
     unit = np.eye(n)
     around = np.vstack([unit, -unit, *(unit[i] + unit[j] for i, j in pairs)])
@@ -302,7 +292,7 @@ def _minimize_by_newton(
         slope = (ups - downs) / (2 * h)
         hessian = np.diag((ups + downs - 2 * here) / h**2)
         for (i, j), value in zip(pairs, both, strict=True):
-            hessian[i, j] = hessian[j, i] = (value - ups[i] - ups[j] + here) / (h[i] * h[j])
+            hessian[i, j] = hessian[j, i] = (value - ups[i] - ups[j] + here) / h**2
         values, vectors = np.linalg.eigh(hessian)
         convex = n == 1 and values[0] > CONVEX
         values, turned = np.maximum(np.abs(values), 1e-3), vectors.T @ slope
