@@ -39,7 +39,8 @@ def test_derivatives_are_those_of_the_whole_expression(effects, scheme):
     free, n, m = casadi.vertcat(*(p[k] for k in index)), x.shape[0], len(index)
     seeds = [casadi.horzcat(casadi.SX.eye(n), casadi.SX(n, m)),
              casadi.horzcat(casadi.SX(m, n), casadi.SX.eye(m))]  # fmt: skip
-    staged = casadi.Function("staged", given, [*differentiate(end, stages, index, [x, free], seeds)])
+    parts = differentiate(end, stages, index, [x, free], seeds)
+    staged = casadi.Function("staged", given, [*parts])
     rest = np.array(loop.point.states)
     rng = np.random.default_rng(3)
     for _ in range(5):
