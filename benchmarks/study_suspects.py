@@ -71,8 +71,8 @@ NAMES = {
     "plant-cubic": "CubicStiffness",
     "plant-deadzone": "InputDeadZone",
 }
-# Speed's friction is a free parameter of these, and the dead zone of a ball lies about 0 V.
-ABSORBED = {("plant-viscous", "drive"), ("plant-viscous", "spring"), ("plant-deadzone", "ball")}
+# Speed's friction is a free parameter of these.
+ABSORBED = {("plant-viscous", "drive"), ("plant-viscous", "spring")}
 WORDS = {
     "white": "white noise",
     "ar": "autoregressive noise",
