@@ -23,13 +23,14 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
+import control as ct
 import numpy as np
 
 import ctrlid as cid
 from ctrlid import effects as E
 from ctrlid.estimation.likelihood import kalman_filter
 
-DT = 2e-3
+DT, CART_DT = 2e-3, 0.01
 # What a pass is for is told by the outermost of these functions that asked for it.
 PURPOSES = {
     "recalibrate": "recalibrate", "scan_candidate": "screen", "refit_candidate": "refit",
@@ -64,6 +65,35 @@ def make_records(hidden: Sequence[Any], known: Sequence[Any], count: int, sample
     return made
 
 
+def make_cart_loop(outputs: int, law: Any = None) -> cid.Loop:
+    """Return a cart with a pole, seen by its position alone or by the angle as well."""
+    plant = cid.plants.cart_pole(M=0.5, m=0.2, length=0.3, J=0.006, c=0.1, gamma=0.002)
+    if outputs == 1:
+        # The equations are those of the plant, the output is the first of its own.
+        plant = ct.nlsys(plant.updfcn, lambda t, x, u, p: x[0], inputs=plant.input_labels,
+                         outputs=["x"], states=plant.state_labels, params=plant.params,
+                         name="cart")  # fmt: skip
+    at = cid.operating_point(plant, output=0.0 if outputs == 1 else [0.0, 0.0])
+    return cid.Loop(plant, law, dt=CART_DT, at=at, free=("m", "c"))
+
+
+def make_cart_record(hidden: Sequence[Any], samples: int) -> cid.Record:
+    """Return a record of the cart under LQR with an observer, with a dither at the input."""
+    loop = make_cart_loop(2)
+    plant, linear = loop.plant, loop.linearize(states=True)
+    d = ct.c2d(ct.ss(linear.A, linear.B, np.eye(4), 0), CART_DT)
+    gain = ct.dlqr(d.A, d.B, np.diag([10.0, 30, 1, 1]), 0.5 * np.eye(1))[0]
+    slow = ct.dlqe(d.A, np.eye(4), np.eye(2, 4), 1e-4 * np.eye(4), 1e-5 * np.eye(2))[0]
+    law = ct.ss(d.A - slow @ np.eye(2, 4), np.hstack([slow, d.B]), -gain, np.zeros((1, 3)),
+                CART_DT, inputs=[*plant.output_labels, *plant.input_labels],
+                outputs=plant.input_labels)  # fmt: skip
+    real = make_cart_loop(2, law)
+    for effect in hidden:
+        real = real.with_effect(effect)
+    bits = np.random.default_rng(0).choice([-0.8, 0.8], samples // 30 + 1)
+    return cid.simulate(real, d=np.repeat(bits, 30)[:samples], sensor_noise=[2e-4, 5e-4], seed=3)
+
+
 DRAG, OFFSET = E.ViscousFriction(c=0.3), E.InputOffset(offset=0.02)
 LAG, DRY = E.ActuatorLag(tau=0.004), E.CoulombFriction(fc=0.004)
 # For each case what is hidden, what the model knows, the records, and what the catalogue lacks.
@@ -76,6 +106,8 @@ CASES: dict[str, tuple[tuple[Any, ...], tuple[Any, ...], int, tuple[type, ...]]]
     "friction": ((OFFSET,), (DRY,), 1, ()),
     "records": ((DRAG,), (), 3, ()),
 }
+# Dry friction at a cart with a pole: how many outputs are seen.
+CARTS = {"one output": 1, "two outputs": 2}
 
 
 def measure_yardstick() -> float:
@@ -110,12 +142,23 @@ def count_passes(passes: Counter[str]) -> None:
             module.run_filter = run_filter  # type: ignore[attr-defined]
 
 
-def measure_case(case: str, samples: int, jobs: int | None) -> dict[str, Any]:
-    """Diagnose the records of a case, and return what it cost."""
+def make_question(case: str, samples: int) -> tuple[cid.Loop, list[cid.Record], list[type]]:
+    """Return what is diagnosed in a case: a loop, records and the effects to look for."""
+    if case in CARTS:
+        loop = make_cart_loop(CARTS[case]).with_parameters({"m": 0.21})
+        record = make_cart_record([E.CoulombFriction(fc=0.15, at="x_dot")], samples)
+        if CARTS[case] == 1:
+            record = cid.Record(u=record.u, y=np.asarray(record.y)[0], dt=CART_DT)
+        return loop, [record], list(E.CATALOGUE)
     hidden, known, count, lacking = CASES[case]
     records = make_records(hidden, known, count, samples)
     loop = make_loop(*known).with_parameters({"K": 1.05 * 3.34e-6})
-    catalogue = [kind for kind in E.CATALOGUE if kind not in lacking]
+    return loop, records, [kind for kind in E.CATALOGUE if kind not in lacking]
+
+
+def measure_case(case: str, samples: int, jobs: int | None) -> dict[str, Any]:
+    """Diagnose the records of a case, and return what it cost."""
+    loop, records, catalogue = make_question(case, samples)
     cid.diagnose(loop, [r[:1500] for r in records], catalogue=(E.InputOffset,), progress=False)
     passes = Counter[str]()
     count_passes(passes)
@@ -135,12 +178,12 @@ def main() -> None:
     """Print a row for each case."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--samples", type=int, default=20_000)
-    parser.add_argument("--cases", nargs="+", choices=CASES, default=list(CASES))
+    parser.add_argument("--cases", nargs="+", choices=[*CASES, *CARTS], default=[*CASES, *CARTS])
     parser.add_argument("--jobs", type=int, default=None)
     args = parser.parse_args()
     print(f"{args.samples} samples; a yardstick is {measure_yardstick():.3f} s of CPU now")
-    print(f"{'case':<10}{'CPU s':>8}{'wall s':>8}{'yards':>7}{'MB':>6}{'passes':>8}  "
-          + "".join(f"{c:>13}" for c in (*COLUMNS, "other")))  # fmt: skip
+    print(f"{'case':<12}{'CPU s':>8}{'wall s':>8}{'yards':>7}{'MB':>6}{'passes':>8}  "
+          + "".join(f"{c:>14}" for c in (*COLUMNS, "other")))  # fmt: skip
     context = multiprocessing.get_context("spawn")
     for case in args.cases:
         with context.Pool(1) as pool:
@@ -149,10 +192,10 @@ def main() -> None:
             pool.close()
             pool.join()
         passes = done["passes"]
-        row = f"{case:<10}{done['cpu']:>8.1f}{done['wall']:>8.1f}{done['yardsticks']:>7.0f}"
+        row = f"{case:<12}{done['cpu']:>8.1f}{done['wall']:>8.1f}{done['yardsticks']:>7.0f}"
         row += f"{done['peak']:>6.0f}{sum(passes.values()):>8}  "
-        print(row + "".join(f"{passes[c]:>13}" for c in (*COLUMNS, "other")), flush=True)
-        print(f"{'':<10}{done['answer']}", flush=True)
+        print(row + "".join(f"{passes[c]:>14}" for c in (*COLUMNS, "other")), flush=True)
+        print(f"{'':<12}{done['answer']}", flush=True)
 
 
 if __name__ == "__main__":
