@@ -304,3 +304,12 @@ def test_an_input_of_round_off_is_zero_and_a_small_one_is_not():
     assert (at.states, at.input) == ((0.0, 0.0), 0.0)
     small = make(lambda x, i: i - 1e-14)
     assert cid.operating_point(small, output=0.0).input == pytest.approx(1e-14)
+
+
+def test_a_single_output_may_stand_in_a_list():
+    plant = cid.plants.maglev(m=0.02, K=3e-6)
+    alone = cid.operating_point(plant, output=0.01)
+    for given in ([0.01], (0.01,), np.array([0.01])):
+        assert cid.operating_point(plant, output=given) == alone
+    with pytest.raises(cid.CtrlidError, match="one for each output of"):
+        cid.operating_point(plant, output=[0.01, 0.02])

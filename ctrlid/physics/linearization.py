@@ -187,7 +187,8 @@ def operating_point(
     plant : control.NonlinearIOSystem, control.StateSpace or control.TransferFunction
         The plant.
     output : float or sequence of float
-        The output to rest at [output unit]; of a plant with several outputs, one value for each.
+        The output to rest at [output unit]; of a plant with several outputs, one value for each. A
+        single one may stand in a list, too.
     guess : sequence of float or OperatingPoint, optional
         States near which to look first [their units]; then the equilibrium found from there is
         returned.
@@ -214,7 +215,8 @@ def operating_point(
     check_arguments(operating_point, locals(), "output")
     equations = trace(plant)
     one = len(equations.outputs) == 1
-    if one and not (is_number(output) and np.isfinite(float(output))):
+    listed = isinstance(output, list | tuple | np.ndarray)
+    if one and not listed and not (is_number(output) and np.isfinite(float(output))):
         raise CtrlidError(f"output must be a finite number; given {output!r}")
     target = _check_target(equations, output)
     n = len(equations.states)
