@@ -1,6 +1,7 @@
 """Coloured sensor noise in the likelihood, against theory and noise made by a filter."""
 
 import dataclasses
+import weakref
 from types import SimpleNamespace
 
 import numpy as np
@@ -146,6 +147,23 @@ def test_noise_is_refused_for_what_is_better(monkeypatch, floors, gaps, narrower
     monkeypatch.setattr(gap_summary.gaps, "compute_floor",
                         lambda loops, k, *_: SimpleNamespace(both=floors[k]))  # fmt: skip
     assert make_noise_test(fresh)(model, other) is refused
+
+
+def test_a_model_is_simulated_once_for_both_questions_and_not_kept(monkeypatch):
+    asked = []
+    fresh = SimpleNamespace(
+        windows=(), how=None, prepare_loops=lambda m: (), measure_gap=lambda loops: 1.0,
+        compute_widening_chance=lambda one, two: 0.3,
+        compute_size_chance=lambda loops, k: asked.append(k) or 1e-4,
+    )  # fmt: skip
+    monkeypatch.setattr(gap_summary.gaps, "compute_floor", lambda *_: SimpleNamespace(both=1.2))
+    model, is_false = Model(None, 0), make_noise_test(fresh)
+    assert is_false(model)
+    is_false(model, Model(None, 1))
+    assert asked.count(0) == 1
+    kept = weakref.ref(model)
+    del model
+    assert kept() is None
 
 
 @pytest.mark.slow

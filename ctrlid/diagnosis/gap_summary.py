@@ -1,9 +1,10 @@
 """Step 9: the gap before and after, and what each effect closes of it."""
 
-import functools
 import math
+import weakref
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 
@@ -29,6 +30,8 @@ from .growth import Search, exchange_worst_effect
 from .removal import Weighed
 from .thresholds import THRESHOLD
 from .verdict import gap_is_wider
+
+Found = TypeVar("Found")
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,12 +240,24 @@ def take_back_widening(
     return found, summarize_gap(loop, found, reported)
 
 
+def _compute_once(function: Callable[[Model], Found]) -> Callable[[Model], Found]:
+    """Return a function that computes once for each model, and keeps none of them in memory."""
+    found = weakref.WeakKeyDictionary[Model, Found]()
+
+    def find(model: Model) -> Found:
+        if model not in found:
+            found[model] = function(model)
+        return found[model]
+
+    return find
+
+
 def make_fresh_data_test(fresh: FreshData) -> Callable[[Weighed, Model], bool]:
     """Return whether an effect closes a fair part of what is left without it, on fresh data.
 
     Of the gap, or, where noise is known, of the one-step errors: a small fast force is seen there.
     """
-    loops = functools.cache(fresh.prepare_loops)
+    loops = _compute_once(fresh.prepare_loops)
 
     def helps(f: Weighed, model: Model) -> bool:
         with_it, without = loops(model), loops(f.base)
@@ -268,9 +283,9 @@ def make_noise_test(fresh: FreshData) -> Callable[..., bool]:
     or beside which the model errs less.
     """
     # A model is asked of alone first, and then beside another: that is computed once.
-    prepare_loops = functools.lru_cache(maxsize=2)(fresh.prepare_loops)
+    prepare_loops = _compute_once(fresh.prepare_loops)
 
-    @functools.lru_cache(maxsize=2)
+    @_compute_once
     def is_too_large(model: Model) -> bool:
         chance = fresh.compute_size_chance(prepare_loops(model), model.fit)
         return chance < THRESHOLD.beyond_chance
