@@ -24,14 +24,7 @@ import control as ct
 import joblib
 import numpy as np
 import outside_cases as cases
-from _shares import (
-    append_line,
-    find_commit,
-    parse_seeds,
-    read_lines,
-    write_lines,
-    write_share,
-)
+from _shares import append_line, find_commit, parse_seeds, read_lines, write_lines, write_share
 from scipy import signal, stats
 from watched_numbers import watch_numbers
 

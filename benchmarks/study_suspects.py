@@ -33,14 +33,7 @@ import control as ct
 import joblib
 import numpy as np
 import outside_rigs as rigs
-from _shares import (
-    append_line,
-    find_commit,
-    parse_seeds,
-    read_lines,
-    write_lines,
-    write_share,
-)
+from _shares import append_line, find_commit, parse_seeds, read_lines, write_lines, write_share
 
 import ctrlid as cid
 

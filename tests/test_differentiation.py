@@ -22,6 +22,12 @@ def write_period(e, dt, scheme, stages=None):
     return end, x, p, [t, x, *path, p, s]
 
 
+def make_seeds(n, m):
+    """Return the derivatives of n states and m parameters, each by itself."""
+    return [casadi.horzcat(casadi.SX.eye(n), casadi.SX(n, m)),
+            casadi.horzcat(casadi.SX(m, n), casadi.SX.eye(m))]  # fmt: skip
+
+
 @pytest.mark.parametrize("scheme", [Scheme(4, 1), Scheme(4, 3), Scheme(8, 1), Scheme(8, 2, (8, 2))])
 @pytest.mark.parametrize("effects", [
     (), (E.CoulombFriction(fc=0.004),), (E.ActuatorLag(tau=2e-4), E.ViscousFriction(c=0.1)),
@@ -37,8 +43,7 @@ def test_derivatives_are_those_of_the_whole_expression(effects, scheme):
     stages = Stages(e)
     end, x, p, given = write_period(e, dt, scheme, stages)
     free, n, m = casadi.vertcat(*(p[k] for k in index)), x.shape[0], len(index)
-    seeds = [casadi.horzcat(casadi.SX.eye(n), casadi.SX(n, m)),
-             casadi.horzcat(casadi.SX(m, n), casadi.SX.eye(m))]  # fmt: skip
+    seeds = make_seeds(n, m)
     parts = differentiate(end, stages, index, [x, free], seeds)
     staged = casadi.Function("staged", given, [*parts])
     rest = np.array(loop.point.states)
@@ -65,8 +70,7 @@ def test_a_kink_takes_fewer_instructions():
     stages = Stages(e)
     end, x, p, given = write_period(e, 0.01, Scheme(4, 1), stages)
     n, m = x.shape[0], p.shape[0]
-    seeds = [casadi.horzcat(casadi.SX.eye(n), casadi.SX(n, m)),
-             casadi.horzcat(casadi.SX(m, n), casadi.SX.eye(m))]  # fmt: skip
+    seeds = make_seeds(n, m)
     parts = differentiate(end, stages, index, [x, p], seeds)
     staged = casadi.Function("staged", given, [*parts], {"cse": True}).n_instructions()
     assert staged < 0.8 * whole
