@@ -323,6 +323,7 @@ def test_a_wider_gap_is_told_from_chance_at_its_level(memory):
     assert study.weigh_mean(np.tile(louder**2 - e[0] ** 2, 40)) < 0.01
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("seed", "names"), [
     (90114, {"ActuatorLag", "SensorLag"}),
     (81002, {"CoulombFriction", "AsymmetricCoulombFriction"}),

@@ -1,5 +1,7 @@
 """Fits and searches by the error of an open-loop simulation."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -10,6 +12,7 @@ from ctrlid.diagnosis.growth import Search
 from ctrlid.diagnosis.noise_tests import run_noise_tests
 from ctrlid.diagnosis.open_loop_fit import Simulation
 from ctrlid.diagnosis.open_loop_search import search_by_simulation
+from ctrlid.diagnosis.procedure import _is_worth_simulating
 from ctrlid.diagnosis.recalibration import fit_base_model
 from problems import TANKS, tanks
 
@@ -94,3 +97,17 @@ def test_nothing_is_found_where_nothing_is_missing():
     fresh = choose_fresh_data(loop, [record], None)
     catalogue = (E.StateLimit, E.SensorOffset, E.InputNonlinearity)
     assert search_by_simulation(search, fresh, catalogue, lambda t: None, np.inf) is None
+
+
+@pytest.mark.parametrize(("verdict", "after", "asks"), [
+    ("unknown", 1.0, True), ("partly explained", 0.5, True), ("explained", 0.5, False),
+    ("explained", 1.1, True),  # what is named leaves the gap to a random force
+    ("nothing missing", 1.1, False),
+])  # fmt: skip
+def test_which_answers_are_followed_by_a_search_by_simulation(verdict, after, asks):
+    loop, findings = tanks(), () if verdict in ("unknown", "nothing missing") else ("one",)
+    question = SimpleNamespace(loop=loop, fresh=choose_fresh_data(loop, [record_of(loop)], None))
+    result, gap = SimpleNamespace(verdict=verdict, findings=findings), SimpleNamespace(before=1.0)
+    gap.after = after
+    assert _is_worth_simulating(question, result, gap, [range(1000)]) is asks
+    assert not _is_worth_simulating(question, result, gap, [range(10**6)])

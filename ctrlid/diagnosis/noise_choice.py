@@ -3,6 +3,7 @@
 import contextlib
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -14,9 +15,9 @@ from .._base.statistics import (
     rounding_variance,
 )
 from ..data.converter_grid import find_grid_step
-from ..estimation.likelihood.kalman_filter import Noise
-from ..estimation.likelihood.likelihood import Fit, evaluate_likelihood
-from ..estimation.likelihood.maximization import choose_sensor_noise, choose_tails
+from ..effects import AbstractEffect
+from ..estimation.likelihood.likelihood import Fit
+from ..estimation.likelihood.maximization import choose_sensor_noise, choose_tails, maximize
 from ..estimation.likelihood.noise_fit import (
     compute_noise_criterion,
     count_noise_parameters,
@@ -64,15 +65,13 @@ def prefer_sensor_noise(
     if not gain > more:
         return None
     newly_coloured = fit.noise.sensor_is_white and not other.noise.sensor_is_white
-    if newly_coloured and is_false(Model(model.loop, other), model):
+    recoloured = with_linearization(Model(model.loop, other))
+    if newly_coloured and is_false(recoloured, model):
         return None
-    if newly_coloured and best is not None and _rings_on(other):
-        beside = _colour_beside(best, other)
-        if beside is not None and beside.sensor_is_white:
-            return None
-        if beside is not None:
-            other = evaluate_likelihood(fit.problem, fit.theta, beside, fit.trajectories)
-    return with_linearization(Model(model.loop, other))
+    if newly_coloured and best is not None and _takes_line(other, best, model):
+        # The line is taken first, and the colour is chosen anew beside it.
+        return None
+    return recoloured
 
 
 def _errs_less_than_rounding(fit: Fit) -> bool:
@@ -99,28 +98,39 @@ def _rounds_most(fit: Fit) -> bool:
     return bool(np.any(fit.problem.rounding > 0.5 * fit.sensor_noises))
 
 
-def _rings_on(fit: Fit) -> bool:
-    r"""Whether a resonance of the sensor noise lasts for a fair part of the record, as a line does.
+def _takes_line(other: Fit, best: Trial, model: Model) -> bool:
+    """Whether sensor noise has a resonance where a line and other noise explain as much, or more.
 
-    A pole p fades to 1/e within :math:`-1/\ln |p|` samples.
+    A resonance that hardly fades takes a line for itself, and then hides it from every screen. One
+    that is left beside a line in the model, as of mains whose frequency wanders, may stay.
     """
+    known = [e for e in model.fitted.effects if rings_at_line(other, e)]
+    if known or not rings_at_line(other, best.fitted) or best.net_gain <= THRESHOLD.gate:
+        return False
+    fit = with_linearization(best.model).fit
+    beside = max(fit, maximize(replace(fit, noise=other.noise)), key=compute_noise_criterion)
+    gain = compute_noise_criterion(beside) - compute_noise_criterion(other)
+    return gain - best.penalty > -THRESHOLD.gate
+
+
+def rings_at_line(fit: Fit, effect: AbstractEffect) -> bool:
+    r"""Whether a resonance of the sensor noise is where the line of an effect is.
+
+    .. math:: |\arg p - \omega T| < \max(-\ln |p|, 2\pi/N)
+
+    for a pole p of the noise and a line at :math:`\omega`, folded: half the width of the resonance,
+    or what N samples resolve.
+    """
+    frequency = effect.values().get("frequency")
+    if frequency is None or not effect.values().get("amplitude"):
+        return False
+    # The angle between samples is from zero to pi, whatever whole turns the line makes.
+    dt = fit.plant.loop.dt
+    line = abs(math.remainder(2 * math.pi * frequency * dt, 2 * math.pi))
     poles = np.roots([1.0, *(-np.array(fit.noise.ar))])
-    ringing = np.abs(poles[np.abs(poles.imag) > 0])
-    return bool(np.any(ringing > math.exp(-1 / (THRESHOLD.ringing * fit.size))))
-
-
-def _colour_beside(best: Trial, other: Fit) -> Noise | None:
-    """Return the sensor noise beside the best effect where both explain more than noise alone.
-
-    A resonance of the noise may take a line nearly for itself, and then hides it from every screen.
-    """
-    if best.net_gain <= THRESHOLD.gate:
-        return None
-    with contextlib.suppress(ModelCannotRun):
-        beside = choose_sensor_noise(with_linearization(best.model).fit)
-        gain = compute_noise_criterion(beside) - compute_noise_criterion(other)
-        return beside.noise if gain - best.penalty > THRESHOLD.gate else None
-    return None
+    poles = poles[poles.imag > 0]
+    width = np.maximum(-np.log(np.abs(poles)), 2 * math.pi / fit.size)
+    return bool(np.any(np.abs(np.angle(poles) - line) < width))
 
 
 def _may_be_coloured(fit: Fit, more: float) -> bool:

@@ -312,12 +312,7 @@ def _answer_question(q: Question) -> tuple[Diagnosis, Search]:
     result = assemble_answer(q.loop, q.records, search, summary, read)
     if fresh.how != simulated:
         result = replace(result, notes=(*result.notes, DIVERGES.format(simulated)))
-    worth = (
-        q.loop.equations().siso
-        and result.verdict not in COMPLETE
-        and _is_worth_simulating(q.fresh, base.records)
-    )
-    if worth and search.finished:
+    if search.finished and _is_worth_simulating(q, result, summary.gap, base.records):
         other = q.attempt(lambda: _answer_by_simulation(q, search, summary.gap, read), None)
         return other or (result, search)
     return result, search
@@ -377,10 +372,17 @@ def _answer_by_simulation(
     return replace(result, notes=(*result.notes, BY_SIMULATION)), other
 
 
-def _is_worth_simulating(fresh: FreshData, records: Sequence[Record]) -> bool:
-    """Whether a plant runs open loop, and records are short enough for hundreds of simulations."""
+def _is_worth_simulating(
+    q: Question, result: Diagnosis, gap: Gap, records: Sequence[Record]
+) -> bool:
+    """Whether more may be found by simulation: open loop, of records short enough for hundreds.
+
+    Effects that explain the one-step errors and do not narrow the gap leave it to a random force.
+    """
+    useless = bool(result.findings) and gap.after > gap.before
     short = sum(len(r) for r in records) <= THRESHOLD.open_loop_samples
-    return short and fresh.how == OPEN_LOOP
+    asks = result.verdict not in COMPLETE or useless
+    return asks and short and q.fresh.how == OPEN_LOOP and q.loop.equations().siso
 
 
 def _have_same_effects(result: Diagnosis, records: int) -> bool:

@@ -298,11 +298,6 @@ class Thresholds:
         "effect: in none of the records looked at did a colour gain more",
         unit="of what an autoregression of the innovations gains",
     )  # fmt: skip
-    ringing: float = declare_number(
-        0.1, study="a resonance of coloured noise that lasts longer may be a line, and the best "
-        "effect is weighed beside coloured noise as well",
-        unit="of the record",
-    )  # fmt: skip
     search_samples: float = declare_number(
         3e8, cost="work after which a search without seconds= ends unfinished: some minutes",
         unit="filtered samples, and 2000 more for each pass",

@@ -29,11 +29,11 @@ from .likelihood import (
     relinearize_fit,
 )
 from .noise_fit import (
-    LOG_STEP,
     choose_force_ratios,
     compute_noise_criterion,
     compute_noise_logs,
     fit_noise,
+    list_difference_steps,
     make_noise,
     try_coloured_force,
     try_coloured_sensor,
@@ -328,11 +328,13 @@ def choose_sensor_noise(fit: Fit) -> Fit:
     if not compute_noise_criterion(richer) > least:
         return fit
     # The orders were chosen beside parameters that the colour has moved since: what was made up
-    # there for wrong parameters needs fewer coefficients now.
-    anew = try_coloured_sensor(richer)
-    fewer = len(anew.noise.ar + anew.noise.ma) < len(richer.noise.ar + richer.noise.ma)
-    gained = compute_noise_criterion(anew) - compute_noise_criterion(richer)
-    return maximize(anew) if fewer and gained > OTHER_NOISE_GAIN else richer
+    # there for wrong parameters needs fewer coefficients now, or as many others.
+    count = len(richer.noise.ar) + len(richer.noise.ma)
+    for most in range(max(count - 1, 1), count + 1):
+        anew = try_coloured_sensor(richer, most)
+        if compute_noise_criterion(anew) > compute_noise_criterion(richer) + OTHER_NOISE_GAIN:
+            return maximize(anew)
+    return richer
 
 
 def _colour_sensor(fit: Fit) -> tuple[Fit, float]:
@@ -520,13 +522,13 @@ def compute_information(fit: Fit) -> tuple[Array, Array]:
             theta[k] = end
             pair.append(compute_innovations(theta, fit.noise))
         columns.append(_divide_difference(pair, float(ends[1] - ends[0])))
-    for k in range(len(logs)):
+    for k, width in enumerate(list_difference_steps(fit.noise)[: len(logs)]):
         pair = []
-        for h in (-LOG_STEP, LOG_STEP):
+        for h in (-width, width):
             shifted = logs.copy()
             shifted[k] += h
             pair.append(compute_innovations(fit.theta, make_noise(shifted, fit.noise, dt)))
-        columns.append(_divide_difference(pair, 2 * LOG_STEP))
+        columns.append(_divide_difference(pair, 2 * float(width)))
     law = fit.noise.tails
     shares = compute_information_shares(law)
     count, records = len(columns), len(problem.data) if problem.known is None else 0

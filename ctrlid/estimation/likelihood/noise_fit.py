@@ -22,8 +22,18 @@ LEAST = -24.0
 MOST = 14.0
 # A coloured force with a time constant above this share of the record would be an offset.
 SLOWEST = 0.05
+# Sensor noise that rings for tau samples leaves N / 2 tau of log-likelihood to a line within it. At
+# this share of the record that is 25, where a name costs 17 in 3000 samples; more would be a line.
+RINGING = 0.02
 # Derivatives by the logarithm of a variance are differences over this step.
 LOG_STEP = 0.2
+# Derivatives by the angle of a coefficient are differences over this step: the zero of a random
+# walk beside white noise is 0.1 to 0.3 away from the circle, beyond which all comes again.
+ANGLE_STEP = 0.05
+# Of so many directions all mixed derivatives are differences.
+FEW_DIRECTIONS = 3
+# Of a step no direction is longer, and none is shortened more often than leads to this brake.
+LONGEST_STEP, MOST_BRAKE = 2.5, 1e4
 # Above this second derivative by a log variance, a parabola tells how far the minimum is.
 CONVEX = 0.05
 # Partial autocorrelations are read back from coefficients up to this size.
@@ -34,13 +44,15 @@ SIZES, AVERAGED = (-0.4, 0.4, 0.8, 0.97), 0.9
 WALKS = (0.01, 0.03, 0.1, 0.3)
 # A root this near the limit of what a record tells apart from a random walk lies on it.
 ON_THE_LIMIT = 1e-6
+# A search for the noise ends where so much of log-likelihood is left to gain.
+ENOUGH = 0.02
 # Orders of coloured sensor noise: of the autoregression and of the moving average, at most.
 ORDERS = 2, 3
 
 
 def fit_noise(
     problem: Problem, theta: Array, lins: Sequence[Linearized], noise: Noise, wide: bool = False,
-    enough: float = 0.02, hold_colour: bool = False,
+    enough: float = ENOUGH, hold_colour: bool = False,
 ) -> Fit:  # fmt: skip
     """Return the most likely noise for parameters as they are.
 
@@ -58,11 +70,11 @@ def fit_noise(
     def at(logs: Array) -> Noise:
         return make_noise(np.append(logs, colour), noise, dt)
 
-    def cost(logs: Array) -> float:
-        value = evaluate_linearized(
-            problem, theta, at(np.atleast_1d(logs)), lins, sensitive=False
-        ).value
-        return -value if np.isfinite(value) else 1e15
+    def measure(logs: Array) -> Fit:
+        return evaluate_linearized(problem, theta, at(logs), lins, sensitive=False)
+
+    def find_cost(logs: Array) -> float:
+        return _find_cost(measure(logs))
 
     low, high = (ends[: len(start)] for ends in _bound_logs(problem, noise))
     start = np.clip(start, low, high)
@@ -71,10 +83,10 @@ def fit_noise(
         apart, rest = low[: plant.channels] - low[0], start[plant.channels :]
         grid = np.linspace(low[0], high[0], 20)
         points = [np.append(np.full(plant.channels, g) + apart, rest) for g in grid]
-        start = points[int(np.argmin(_evaluate_costs(cost, points)))]
-    fit = evaluate_linearized(
-        problem, theta, at(_minimize_by_newton(cost, start, low, high, enough)), lins
-    )
+        start = points[int(np.argmin(run_side_by_side(find_cost, points)))]
+    steps = list_difference_steps(noise)[: len(start)]
+    best = at(_minimize_by_newton(measure, start, low, high, enough, steps))
+    fit = evaluate_linearized(problem, theta, best, lins)
     return fit if noise.tails is None else _refit_tails(fit, hold_colour)
 
 
@@ -201,6 +213,13 @@ def compute_noise_logs(noise: Noise, dt: float) -> Array:
     return np.array(logs)
 
 
+def list_difference_steps(noise: Noise) -> Array:
+    """Return over which steps of the logarithms and angles of a noise differences are taken."""
+    angles = len(noise.ar) + len(noise.ma)
+    logs = len(noise.force) + len(noise.sensors) + 2 * bool(noise.drift)
+    return np.repeat([LOG_STEP, ANGLE_STEP], [logs, angles])
+
+
 def make_noise(logs: Array, like: Noise, dt: float) -> Noise:
     """Return the noise of the same kind that has such logarithms and angles."""
     channels, p, q = len(like.force), len(like.ar), len(like.ma)
@@ -250,8 +269,14 @@ def _bound_logs(problem: Problem, noise: Noise) -> tuple[Array, Array]:
         unit, longest = units[0], _find_longest_record(problem)
         low += [unit + LEAST, math.log(2 * dt)]
         high += [unit + MOST, math.log(max(min(SLOWEST * longest, 2e4), 4.0) * dt)]
-    ends = [math.atanh(_find_slowest_root(problem))] * len(noise.ar) + [math.pi] * len(noise.ma)
-    return np.array([*low, *(-v for v in ends)]), np.array([*high, *ends])
+    # A random walk stays one, since a root that leaves its limit is a parameter more.
+    slowest = math.atanh(_find_slowest_root(problem))
+    ringing = math.atanh(math.exp(-2 / max(RINGING * _find_longest_record(problem), 2.0)))
+    walks = _compute_reflections(noise.ar) > _find_slowest_root(problem) - ON_THE_LIMIT
+    least = [-slowest, *[-ringing] * (len(walks) - 1)][: len(walks)]
+    low += [*np.where(walks, slowest, least), *[-math.pi] * len(noise.ma)]
+    high += [*[slowest] * len(walks), *[math.pi] * len(noise.ma)]
+    return np.array(low), np.array(high)
 
 
 def _find_longest_record(problem: Problem) -> int:
@@ -267,52 +292,65 @@ def _find_slowest_root(problem: Problem) -> float:
     return 1 - 1 / _find_longest_record(problem)
 
 
-def _evaluate_costs(cost: Callable[[Array], float], points: Iterable[Array]) -> Array:
-    """Return the cost at each point, computed side by side: the filter leaves Python alone."""
-    return np.array(run_side_by_side(cost, points))
+def _find_cost(fit: Fit) -> float:
+    """Return the cost of a fit; a lost record has a large one."""
+    return -fit.value if np.isfinite(fit.value) else 1e15
 
 
 def _minimize_by_newton(
-    cost: Callable[[Array], float], x: Array, low: Array, high: Array, enough: float
+    measure: Callable[[Array], Fit], x: Array, low: Array, high: Array, enough: float, h: Array
 ) -> Array:
-    """Minimise a smooth function of a few logarithms by damped Newton steps with differences.
+    """Minimise a smooth function by damped Newton steps with differences of the widths `h`.
 
     Where a step gained what the parabola g^2/2h foresaw but for e, a function with a third
     derivative has e^2 / (g^2/2h) * 9/4 left to gain: on a line that tells the end. With more
-    directions the errors of several may cancel.
+    directions the errors of several may cancel. Of many directions, mixed derivatives are those
+    of the information, since there would be far more of them than of all else.
     """
-    n, h = len(x), LOG_STEP
-    pairs = list(itertools.combinations(range(n), 2))
+    n = len(x)
+    few = n <= FEW_DIRECTIONS
+    pairs = list(itertools.combinations(range(n), 2)) if few else []
     unit = np.eye(n)
     around = np.vstack([unit, -unit, *(unit[i] + unit[j] for i, j in pairs)])
-    here, damping = cost(x), 0.1
+
+    def look(point: Array) -> tuple[float, list[tuple[Array, Array]]]:
+        fit = measure(point)
+        return _find_cost(fit), [] if few else _list_innovations(fit)
+
+    here, damping = _find_cost(measure(x)), 0.1
     for _ in range(12):
-        costs = _evaluate_costs(cost, np.clip(x + h * around, low, high))
-        ups, downs, both = np.split(costs, [n, 2 * n])
+        found = run_side_by_side(look, np.clip(x + h * around, low, high))
+        ups, downs, both = np.split(np.array([cost for cost, _ in found]), [n, 2 * n])
         slope = (ups - downs) / (2 * h)
         hessian = np.diag((ups + downs - 2 * here) / h**2)
         for (i, j), value in zip(pairs, both, strict=True):
-            hessian[i, j] = hessian[j, i] = (value - ups[i] - ups[j] + here) / h**2
+            hessian[i, j] = hessian[j, i] = (value - ups[i] - ups[j] + here) / (h[i] * h[j])
+        if not few:
+            widths = np.sqrt(np.abs(np.diag(hessian)))
+            moved = [parts for _, parts in found]
+            mixed = _correlate_directions(moved[:n], moved[n:]) * np.outer(widths, widths)
+            hessian += mixed - np.diag(np.diag(mixed))
         values, vectors = np.linalg.eigh(hessian)
         convex = n == 1 and values[0] > CONVEX
         values, turned = np.maximum(np.abs(values), 1e-3), vectors.T @ slope
+        # All directions are shortened alike: a damping of the curvatures would stop the flat ones.
+        brake = 0.0
         while True:
-            step = -vectors @ (turned / (values + damping))
-            step *= min(1.0, 2.5 / max(float(np.abs(step).max()), 1e-300))
-            trial = np.clip(x + step, low, high)
+            step = -turned / (values * (1 + brake) + damping)
+            trial = np.clip(x + vectors @ np.clip(step, -LONGEST_STEP, LONGEST_STEP), low, high)
             taken = vectors.T @ (trial - x)
             foreseen = -float((turned + 0.5 * values * taken) @ taken)
             if convex and foreseen < 0.1 * enough:
                 return x
-            there = cost(trial)
-            if there <= here or damping > 1e6:
+            there = _find_cost(measure(trial))
+            if there <= here or brake > MOST_BRAKE:
                 break
-            damping = max(10 * damping, 1.0)
+            brake = 4 * brake + 1.0
         gain = here - there
         if gain <= 0:
             break
         x, here, damping = trial, there, damping / 10
-        if gain < enough:
+        if gain < enough and not brake:
             break
         if convex:
             # This slope of the quadratic model is left after the step.
@@ -324,6 +362,35 @@ def _minimize_by_newton(
             if left < 0.5 * enough:
                 break
     return x
+
+
+def _list_innovations(fit: Fit) -> list[tuple[Array, Array]]:
+    """Return the innovations of each record and the logarithms of their variances."""
+    return [(out.innovations[keep], np.log(out.variance[keep] * r))
+            for out, keep, r in zip(fit.filtered, fit.counts, fit.sensor, strict=True)]  # fmt: skip
+
+
+def _correlate_directions(
+    ups: Sequence[list[tuple[Array, Array]]], downs: Sequence[list[tuple[Array, Array]]]
+) -> Array:
+    r"""Return the information on steps in several directions, scaled to a unit diagonal.
+
+    .. math:: \sum_k \frac{\Delta_i e_k \Delta_j e_k}{s_k}
+        + \tfrac12 \Delta_i \ln s_k \, \Delta_j \ln s_k
+
+    with the differences of innovations e and logarithms of their variances s between both ends of a
+    step, the mean of the latter taken out, for the size of all noise is fitted along.
+    """
+    rows = []
+    for up, down in zip(ups, downs, strict=True):
+        parts = []
+        for (e1, logs1), (e0, logs0) in zip(up, down, strict=True):
+            turned = (logs1 - logs0) / math.sqrt(2.0)
+            parts += [(e1 - e0) / np.exp(0.25 * (logs1 + logs0)), turned - turned.mean()]
+        rows.append(np.concatenate(parts))
+    moves = np.nan_to_num(np.array(rows), nan=0.0, posinf=0.0, neginf=0.0)
+    moves /= np.maximum(np.linalg.norm(moves, axis=1), 1e-300)[:, None]
+    return np.asarray(moves @ moves.T)
 
 
 def try_coloured_force(fit: Fit) -> Fit:
@@ -356,12 +423,19 @@ def _find_likeliest(fit: Fit, noises: Sequence[Noise]) -> tuple[Noise, float]:
     return noises[k], values[k]
 
 
-def try_coloured_sensor(fit: Fit) -> Fit:
+def try_coloured_sensor(fit: Fit, most: int = sum(ORDERS)) -> Fit:
     """Return the fit with the coloured sensor noise that the BIC prefers, no coloured force beside.
 
     Parameters of the plant stay as they are. From the first order on, a coefficient more is tried
     on either side until none pays. A random walk beside white noise, which hardly shows in any
     coefficient alone, is tried by itself.
+
+    Parameters
+    ----------
+    fit : Fit
+        The fit.
+    most : int, optional
+        Number of coefficients at most, one or more.
 
     References
     ----------
@@ -377,14 +451,17 @@ def try_coloured_sensor(fit: Fit) -> Fit:
     # A converter that averages samples has zeros on the unit circle, all of which it needs at once,
     # and which a search from within nears ever more slowly.
     averages: list[list[tuple[float, ...]]]
-    averages = [[*values, (1.0,)]]
-    averages += [[(AVERAGED,) * q, (1.0,) * q] for q in range(2, ORDERS[1] + 1)]
+    averages = [[(AVERAGED,) * q, (1.0,) * q] for q in range(1, min(ORDERS[1], most) + 1)]
+    averages[0] = [*values, (1.0,)]
     chains = [
         _fit_best(fit, [Noise(f, ar=ar, tails=tails) for f in forces for ar in values]),
         max((fit_moving(each) for each in averages), key=compute_noise_criterion),
-        _fit_best(fit, list(_list_walks(fit, forces))),
     ]
-    return max((_lengthen_sensor_noise(f) for f in chains), key=compute_noise_criterion)
+    if most > 1:
+        chains.append(_fit_best(fit, list(_list_walks(fit, forces))))
+    reached: dict[tuple[int, int], float] = {}
+    return max((_lengthen_sensor_noise(f, most, reached) for f in chains),
+               key=compute_noise_criterion)  # fmt: skip
 
 
 def measure_walk_gain(fit: Fit) -> float:
@@ -434,23 +511,30 @@ def _fit_best(fit: Fit, noises: Sequence[Noise]) -> Fit:
     return fit_noise(fit.problem, fit.theta, fit.linearized, best)
 
 
-def _lengthen_sensor_noise(fit: Fit) -> Fit:
-    """Return the fit with coefficients added to its sensor noise while the BIC wants them."""
+def _lengthen_sensor_noise(fit: Fit, most: int, reached: dict[tuple[int, int], float]) -> Fit:
+    """Return the fit with coefficients added to its sensor noise while the BIC wants them.
+
+    `reached` keeps what was reached with each pair of orders. From orders that another search has
+    passed as likely, nothing else is reached.
+    """
     while True:
-        noise, dt = fit.noise, fit.plant.loop.dt
+        noise, dt, value = fit.noise, fit.plant.loop.dt, compute_noise_criterion(fit)
         logs = compute_noise_logs(noise, dt)
-        p, q = len(noise.ar), len(noise.ma)
+        orders = p, q = len(noise.ar), len(noise.ma)
+        if value <= reached.get(orders, -math.inf) + ENOUGH or p + q >= most:
+            return fit
+        reached[orders] = value
         tried = []
-        for longer, at, most in (
-            (replace(noise, ar=(*noise.ar, 0.0)), len(logs) - q, ORDERS[0]),
-            (replace(noise, ma=(*noise.ma, 0.0)), len(logs), ORDERS[1]),
+        for longer, at, more in (
+            (replace(noise, ar=(*noise.ar, 0.0)), len(logs) - q, p < ORDERS[0]),
+            (replace(noise, ma=(*noise.ma, 0.0)), len(logs), q < ORDERS[1]),
         ):
-            if (p if len(longer.ar) > p else q) >= most:
+            if not more:
                 continue
             near = [make_noise(np.insert(logs, at, v), longer, dt) for v in (-0.5, 0.05, 0.5)]
             tried.append(_fit_best(fit, near))
         better = max(tried, key=compute_noise_criterion, default=fit)
-        if compute_noise_criterion(better) <= compute_noise_criterion(fit):
+        if compute_noise_criterion(better) <= value:
             return fit
         fit = better
 
