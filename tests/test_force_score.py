@@ -15,7 +15,7 @@ from ctrlid.effects.scanning import make_waves
 from ctrlid.estimation.likelihood.force_score import compute_force_scores
 from ctrlid.estimation.likelihood.likelihood import make_problem
 from ctrlid.estimation.likelihood.maximization import begin_fit, choose_tails, maximize
-from ctrlid.estimation.likelihood.noise_fit import try_coloured_force, try_coloured_sensor
+from ctrlid.estimation.likelihood.noise.orders import try_coloured_force, try_coloured_sensor
 from problems import levitation
 from test_several_outputs import swinging
 

@@ -16,7 +16,7 @@ from ctrlid.diagnosis.refitting import refit_candidate
 from ctrlid.diagnosis.screening import screen_at
 from ctrlid.estimation.likelihood.likelihood import evaluate_likelihood
 from ctrlid.estimation.likelihood.maximization import begin_fit, maximize
-from ctrlid.estimation.likelihood.noise_fit import estimate_noise_from_repeats
+from ctrlid.estimation.likelihood.noise.orders import estimate_noise_from_repeats
 
 PERIOD, TIMES = 800, 5
 SENSOR, FORCE = 1e-4, 0.3

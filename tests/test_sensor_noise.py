@@ -20,7 +20,8 @@ from ctrlid.diagnosis.thresholds import THRESHOLD
 from ctrlid.estimation.likelihood.kalman_filter import Noise, compute_memory
 from ctrlid.estimation.likelihood.likelihood import make_problem
 from ctrlid.estimation.likelihood.maximization import begin_fit, choose_sensor_noise, maximize
-from ctrlid.estimation.likelihood.noise_fit import RINGING, fit_noise
+from ctrlid.estimation.likelihood.noise.coordinates import RINGING
+from ctrlid.estimation.likelihood.noise.fit import fit_noise
 from problems import diagnose_draw, load_script
 
 

@@ -21,7 +21,7 @@ from ..estimation.likelihood.likelihood import (
     relinearize_fit,
 )
 from ..estimation.likelihood.maximization import quieten_force
-from ..estimation.likelihood.noise_fit import count_noise_parameters
+from ..estimation.likelihood.noise.coordinates import count_noise_parameters
 from ..estimation.likelihood.sampled_plant import SampledPlant, Trajectory
 from ..estimation.likelihood.tails import choose_law
 from ..loop.loop import Loop

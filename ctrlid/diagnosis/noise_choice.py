@@ -18,11 +18,11 @@ from ..data.converter_grid import find_grid_step
 from ..effects import AbstractEffect
 from ..estimation.likelihood.likelihood import Fit
 from ..estimation.likelihood.maximization import choose_sensor_noise, choose_tails, maximize
-from ..estimation.likelihood.noise_fit import (
+from ..estimation.likelihood.noise.coordinates import (
     compute_noise_criterion,
     count_noise_parameters,
-    measure_walk_gain,
 )
+from ..estimation.likelihood.noise.orders import measure_walk_gain
 from ..estimation.likelihood.tails import JointTails
 from .candidates import Trial
 from .fitted_model import Model, with_linearization

@@ -8,7 +8,7 @@ from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from ..effects import AbstractEffect
 from ..estimation.likelihood.likelihood import Fit, rank_by_likelihood, relinearize_fit
 from ..estimation.likelihood.maximization import hold_force_quiet, maximize
-from ..estimation.likelihood.noise_fit import fit_noise
+from ..estimation.likelihood.noise.fit import fit_noise
 from .candidates import NUMERICAL_FAILURES, Trial, Work, attempt_trial
 from .fitted_model import Model, carry_over_fit, with_linearization
 from .refitting import climb, weigh_refit

@@ -11,7 +11,7 @@ from .._base.errors import ModelCannotRun
 from ..data.record import Record
 from ..estimation.likelihood.likelihood import list_start_values, make_problem
 from ..estimation.likelihood.maximization import begin_fit, choose_noise, maximize, refit_noise_size
-from ..estimation.likelihood.noise_fit import estimate_noise_from_repeats
+from ..estimation.likelihood.noise.orders import estimate_noise_from_repeats
 from ..loop.loop import Loop
 from ..validation.record_audit import Audit
 from .fitted_model import Model

@@ -17,7 +17,7 @@ from ..estimation.likelihood.maximization import (
     polish_fit,
     refit_noise_size,
 )
-from ..estimation.likelihood.noise_fit import compute_noise_criterion
+from ..estimation.likelihood.noise.coordinates import compute_noise_criterion
 from ..loop.loop import Loop
 from .candidates import Trial, contains
 from .fitted_model import (

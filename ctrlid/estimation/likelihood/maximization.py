@@ -28,17 +28,15 @@ from .likelihood import (
     rank_by_likelihood,
     relinearize_fit,
 )
-from .noise_fit import (
+from .noise.coordinates import (
     choose_force_ratios,
     compute_noise_criterion,
     compute_noise_logs,
-    fit_noise,
     list_difference_steps,
     make_noise,
-    try_coloured_force,
-    try_coloured_sensor,
-    try_tails,
 )
+from .noise.fit import fit_noise, try_tails
+from .noise.orders import try_coloured_force, try_coloured_sensor
 from .tails import choose_law, compute_information_shares
 
 # A climb ends after at most so many Gauss-Newton steps.

@@ -1,0 +1,1 @@
+"""The most likely noise of force and sensor, for parameters as they are."""
