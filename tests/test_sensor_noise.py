@@ -10,7 +10,8 @@ from scipy import signal
 from scipy.linalg import expm, toeplitz
 
 import ctrlid as cid
-from ctrlid.diagnosis import gap_summary
+from ctrlid._base.errors import ModelCannotRun
+from ctrlid.diagnosis import gap_summary, noise_choice
 from ctrlid.diagnosis.fitted_model import Model
 from ctrlid.diagnosis.fresh_data import choose_fresh_data
 from ctrlid.diagnosis.gap import compute_chance_among_runs, measure_noise_errors
@@ -297,6 +298,23 @@ def test_a_resonance_is_where_a_line_folds_to(frequency, there):
     assert not rings_at_line(fit, cid.effects.SensorDrift(1.0))
     white = SimpleNamespace(noise=Noise((1.0,)), size=2000, plant=fit.plant)
     assert not rings_at_line(white, hum)
+
+
+def test_a_line_that_cannot_be_fitted_beside_the_noise_is_not_taken_first(monkeypatch):
+    ar = (2 * 0.99 * np.cos(2 * np.pi * 0.4), -(0.99**2))
+    other = SimpleNamespace(noise=Noise((1.0,), ar=ar), size=2000,
+                            plant=SimpleNamespace(loop=SimpleNamespace(dt=0.01)))  # fmt: skip
+    hum = cid.effects.SensorHum(amplitude=1.0, frequency=60.0, phase=0.0)
+    best = SimpleNamespace(fitted=hum, net_gain=100.0, penalty=20.0, model=None)
+    model, asked = SimpleNamespace(fitted=SimpleNamespace(effects=())), []
+
+    def refuse(model):
+        asked.append(model)
+        raise ModelCannotRun("the filter loses the record")
+
+    monkeypatch.setattr(noise_choice, "with_linearization", refuse)
+    assert not noise_choice._takes_line(other, best, model)
+    assert len(asked) == 1
 
 
 @pytest.mark.slow

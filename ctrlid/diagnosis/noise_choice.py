@@ -107,10 +107,12 @@ def _takes_line(other: Fit, best: Trial, model: Model) -> bool:
     known = [e for e in model.fitted.effects if rings_at_line(other, e)]
     if known or not rings_at_line(other, best.fitted) or best.net_gain <= THRESHOLD.gate:
         return False
-    fit = with_linearization(best.model).fit
-    beside = max(fit, maximize(replace(fit, noise=other.noise)), key=compute_noise_criterion)
-    gain = compute_noise_criterion(beside) - compute_noise_criterion(other)
-    return gain - best.penalty > -THRESHOLD.gate
+    with contextlib.suppress(ModelCannotRun):
+        fit = with_linearization(best.model).fit
+        beside = max(fit, maximize(replace(fit, noise=other.noise)), key=compute_noise_criterion)
+        gain = compute_noise_criterion(beside) - compute_noise_criterion(other)
+        return gain - best.penalty > -THRESHOLD.gate
+    return False
 
 
 def rings_at_line(fit: Fit, effect: AbstractEffect) -> bool:

@@ -35,7 +35,7 @@ from .noise.coordinates import (
     list_difference_steps,
     make_noise,
 )
-from .noise.fit import fit_noise, try_tails
+from .noise.fit import ENOUGH, fit_noise, try_tails
 from .noise.orders import try_coloured_force, try_coloured_sensor
 from .tails import choose_law, compute_information_shares
 
@@ -223,7 +223,7 @@ def maximize(fit: Fit, rounds: int = ROUNDS, exact: bool = True) -> Fit:
             fit.problem, fit.theta, fit.linearized, fit.noise, enough=enough, hold_colour=not exact
         )
 
-    tuned, far, enough = -math.inf, True, 0.02 if exact else 0.3
+    tuned, far, enough = -math.inf, True, ENOUGH if exact else 0.3
     if not fit.linearized:
         fit, far = relinearize_fit(fit), False
         if not math.isfinite(fit.value):

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -65,8 +66,8 @@ def compute_noise_logs(noise: Noise, dt: float) -> Array:
     logs = [*np.log(noise.force), *np.log(noise.sensors)]
     if noise.drift:
         logs += [math.log(noise.coloured), math.log(-dt / math.log(noise.memory))]
-    logs += np.arctanh(compute_reflections(noise.ar)).tolist()
-    logs += np.arcsin(compute_reflections([-v for v in noise.ma])).tolist()
+    logs += np.arctanh(_compute_reflections(noise.ar)).tolist()
+    logs += np.arcsin(_compute_reflections([-v for v in noise.ma])).tolist()
     return np.array(logs)
 
 
@@ -102,7 +103,7 @@ def _make_coefficients(reflections: Iterable[float]) -> tuple[float, ...]:
     return tuple(phi.tolist())
 
 
-def compute_reflections(coefficients: Sequence[float]) -> Array:
+def _compute_reflections(coefficients: Sequence[float]) -> Array:
     """Return the partial autocorrelations of an autoregression: Levinson's recursion backwards."""
     phi, found = np.asarray(coefficients, dtype=float), []
     while len(phi):
@@ -129,7 +130,7 @@ def bound_noise_logs(problem: Problem, noise: Noise) -> tuple[Array, Array]:
     # A random walk stays one, since a root that leaves its limit is a parameter more.
     slowest = math.atanh(find_slowest_root(problem))
     ringing = math.atanh(math.exp(-2 / max(RINGING * _find_longest_record(problem), 2.0)))
-    walks = compute_reflections(noise.ar) > find_slowest_root(problem) - ON_THE_LIMIT
+    walks = _find_walks(problem, noise)
     least = [-slowest, *[-ringing] * (len(walks) - 1)][: len(walks)]
     low += [*np.where(walks, slowest, least), *[-math.pi] * len(noise.ma)]
     high += [*[slowest] * len(walks), *[math.pi] * len(noise.ma)]
@@ -154,12 +155,12 @@ def count_noise_parameters(fit: Fit) -> int:
 
     A root of the sensor noise at its limit is that of a random walk, and is no free parameter.
     """
-    noise = fit.noise
-    if not noise.ar:
-        return noise.parameters
-    slowest = find_slowest_root(fit.problem)
-    walks = np.max(compute_reflections(noise.ar)) > slowest - ON_THE_LIMIT
-    return noise.parameters - int(walks)
+    return fit.noise.parameters - int(np.any(_find_walks(fit.problem, fit.noise)))
+
+
+def _find_walks(problem: Problem, noise: Noise) -> Any:
+    """Return which partial autocorrelations of the sensor noise are at the limit: random walks."""
+    return _compute_reflections(noise.ar) > find_slowest_root(problem) - ON_THE_LIMIT
 
 
 def compute_noise_criterion(fit: Fit) -> float:

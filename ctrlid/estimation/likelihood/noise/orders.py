@@ -86,8 +86,8 @@ def try_coloured_sensor(fit: Fit, most: int = sum(ORDERS)) -> Fit:
     # A converter that averages samples has zeros on the unit circle, all of which it needs at once,
     # and which a search from within nears ever more slowly.
     averages: list[list[tuple[float, ...]]]
-    averages = [[(AVERAGED,) * q, (1.0,) * q] for q in range(1, min(ORDERS[1], most) + 1)]
-    averages[0] = [*values, (1.0,)]
+    averages = [[*values, (1.0,)]]
+    averages += [[(AVERAGED,) * q, (1.0,) * q] for q in range(2, min(ORDERS[1], most) + 1)]
     chains = [
         _fit_best(fit, [Noise(f, ar=ar, tails=tails) for f in forces for ar in values]),
         max((fit_moving(each) for each in averages), key=compute_noise_criterion),
