@@ -10,7 +10,13 @@ import pytest
 import ctrlid as cid
 import ctrlid.effects as E
 from ctrlid.diagnosis.constancy import _estimate_alone, compare_stretches
-from ctrlid.diagnosis.grounds import Case, is_one_of_several, is_phase_locked, narrows_no_gap
+from ctrlid.diagnosis.grounds import (
+    Case,
+    is_one_of_several,
+    is_phase_locked,
+    narrows_no_gap,
+    was_not_checked,
+)
 from ctrlid.diagnosis.recalibration import fit_base_model
 from ctrlid.reporting.tables import make_blocks
 
@@ -199,6 +205,18 @@ def test_several_of_a_kind_in_a_wrong_model_only_describe_it():
     assert not judge(0, explained=True)
     # What the model had from the beginning is known.
     assert not judge(1, explained=False, given=mass().with_effect(ripple))
+
+
+def test_a_small_effect_of_a_search_that_was_stopped_was_not_checked():
+    def judge(gain, explained=False, finished=False):
+        case = Case(mass(), None, (), {}, None, explained, gained=1000.0, finished=finished)
+        return was_not_checked(case, SimpleNamespace(trial=SimpleNamespace(gain=gain)))
+
+    assert "was stopped before" in judge(gain=100.0)
+    assert not judge(gain=400.0)
+    # Where only noise is left nothing else is missing, and a search that ended has asked.
+    assert not judge(gain=100.0, explained=True)
+    assert not judge(gain=100.0, finished=True)
 
 
 def test_the_steps_of_a_converter_are_a_remark():

@@ -78,7 +78,11 @@ def assemble_answer(
     made = [
         _make_finding(f, fitted.loop, errors, summary.shares, found, records) for f in found.found
     ]
-    case = Case(loop, found.final, records, errors, gap, found.after.passed)
+    total = found.final.fit.value - found.base.fit.value
+    total = total if math.isfinite(total) else 0.0
+    case = Case(
+        loop, found.final, records, errors, gap, found.after.passed, total, found.finished
+    )  # fmt: skip
     judged = [(one, find_ground(case, f)) for one, f in zip(made, found.found, strict=True)]
     judged.sort(key=lambda pair: -pair[0].evidence)
     findings = tuple(one for one, ground in judged if not ground)
@@ -102,9 +106,8 @@ def assemble_answer(
     left = gap_is_left(
         gap, disturbance, found.final.fit, summary.excess_chance, summary.worse_chance
     )
-    total = found.final.fit.value - found.base.fit.value
     effects, gains = [f.trial.effect for f in found.found], [f.trial.gain for f in found.found]
-    objection = find_doubt(effects, gains, total if math.isfinite(total) else 0.0)
+    objection = find_doubt(effects, gains, total)
     objection = objection or describe_grounds(grounds)
     complete = found.after.passed and not left and objection is None
     verdict = choose_verdict(complete, named=bool(findings))

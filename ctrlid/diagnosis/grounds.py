@@ -26,6 +26,8 @@ class Case:
 
     `errors` are standard errors of the final model's parameters by name, `gap` is that on fresh
     data, and `explained` says whether the tests find noise only in what the final model leaves.
+    `gained` is the log-likelihood above that of the recalibrated model, and `finished` says whether
+    the search came to its end, where effects are compared and taken back.
     """
 
     given: Loop
@@ -34,6 +36,8 @@ class Case:
     errors: Mapping[str, float]
     gap: Gap
     explained: bool
+    gained: float = math.inf
+    finished: bool = True
 
     def read_effect(self, f: Weighed) -> tuple[str, AbstractEffect]:
         """Return the label of an effect in the final model, and the effect with its values."""
@@ -212,6 +216,19 @@ def is_one_of_several(case: Case, f: Weighed) -> str:
     return "something else is missing, and other effects of the same kind are needed beside it"
 
 
+def was_not_checked(case: Case, f: Weighed) -> str:
+    """Say if a search was stopped before it asked whether a small effect stands in for others.
+
+    What a search that ends keeps of such effects is what helps on fresh data.
+    """
+    if case.finished or case.explained or not f.trial.gain < THRESHOLD.minor * case.gained:
+        return ""
+    return (
+        "it gains little beside the others, something else is missing, and the search was stopped "
+        "before it asked what else would do"
+    )
+
+
 # A name stands if none of these has anything to say.
 GROUNDS: tuple[Callable[[Case, Weighed], str], ...] = (
     is_at_a_limit,
@@ -220,4 +237,5 @@ GROUNDS: tuple[Callable[[Case, Weighed], str], ...] = (
     follows_the_reference,
     narrows_no_gap,
     is_one_of_several,
+    was_not_checked,
 )

@@ -279,7 +279,7 @@ class Thresholds:
     )
     minor: float = declare_number(
         0.15, study="an effect that gains less, beside something unknown, is a stand-in unless it "
-        "helps on fresh data", unit="of the whole gain",
+        "helps on fresh data; a search that was stopped did not ask that", unit="of the whole gain",
     )  # fmt: skip
     small_gain: float = declare_number(
         0.6, study="an effect beside others that gains less is a stand-in",
