@@ -9,6 +9,7 @@ import pytest
 from scipy import linalg, signal
 
 import ctrlid as cid
+from ctrlid.estimation.linear.instruments import compute_independence_probability
 from ctrlid.estimation.whiteness import HARMLESS, LEVEL, note_coloured_innovations
 
 SAYS = "INNOVATIONS ARE NOT WHITE"
@@ -134,3 +135,54 @@ def test_an_absurd_pole_is_refused():
     record = cid.Record(u=u, y=x + 1e-3 * rng.standard_normal(len(u)), dt=DT)
     with pytest.raises(cid.CtrlidError, match=r"Lower the number of poles|do not determine"):
         cid.fit_continuous(record, 3)
+
+
+def simulate_coloured(seed, equation, rho=0.0, n=1500):
+    """(q^2 - 1.5 q + 0.56) x = (0.1 q + 0.05) u under a digital law, noise at y or in the sum."""
+    rng = np.random.default_rng(seed)
+    r = np.repeat(rng.choice([-1.0, 1.0], n // 40 + 1), 40)[:n]
+    noise = signal.lfilter([1.0], [1.0, -rho], rng.standard_normal(n))
+    x, y, u = np.zeros(n), np.zeros(n), np.zeros(n)
+    for k in range(n):
+        if k > 1:
+            x[k] = 1.5 * x[k - 1] - 0.56 * x[k - 2] + 0.1 * u[k - 1] + 0.05 * u[k - 2]
+            x[k] += 0.05 * noise[k] if equation else 0.0
+        y[k] = x[k] + (0.0 if equation else noise[k])
+        u[k] = 1.5 * (r[k] - y[k]) - (r[k - 1] - y[k - 1] if k else 0.0)
+    return cid.Record(r=r, u=u, y=y, dt=DT)
+
+
+def test_a_biased_fit_whose_errors_look_white_depends_on_the_past_reference():
+    """Sensor noise of correlation 0.5 hides in the coefficients, and leaves white errors."""
+    said = [cid.fit_arx(simulate_coloured(seed, equation=False, rho=0.5), 2, 2).estimate
+            for seed in range(20)]  # fmt: skip
+    for estimate in said:
+        off = np.abs(estimate.values - [-1.5, 0.56, 0.1, 0.05]) / estimate.standard_errors
+        assert max(off) > 5
+    depend = [e for e in said if any("DEPEND ON THE PAST REFERENCE" in n for n in e.notes)]
+    assert len(depend) >= 18
+
+
+def test_a_right_difference_equation_is_not_doubted():
+    notes = [cid.fit_arx(simulate_coloured(seed, equation=True), 2, 2).estimate.notes
+             for seed in range(100)]  # fmt: skip
+    assert sum(map(bool, notes)) <= 5
+
+
+def test_errors_are_independent_of_references_that_move_nothing():
+    rng = np.random.default_rng(3)
+    e = [rng.standard_normal(400)]
+    assert compute_independence_probability(e, [np.ones((1, 400))]) == 1.0
+    assert compute_independence_probability([e[0][:5]], [rng.standard_normal((1, 5))]) == 1.0
+    r = rng.standard_normal((1, 400))
+    late = np.concatenate([[0.0, 0.0, 0.0], r[0, :-3]])
+    assert compute_independence_probability([e[0] + late], [r]) < 1e-10
+    # Half of the errors unknown, and in two stretches.
+    some = np.where(np.arange(400) % 2, e[0] + late, np.nan)
+    parts = [some[:150], some[150:]]
+    assert compute_independence_probability(parts, [r[:, :150], r[:, 150:]]) < 1e-10
+    # The chances of white errors are uniform.
+    chances = [
+        compute_independence_probability([rng.standard_normal(400)], [r]) for _ in range(400)
+    ]
+    assert abs(np.mean(np.less(chances, 0.1)) - 0.1) < 0.04

@@ -72,8 +72,7 @@ def note_coloured_innovations(
             e = np.where(known, e - np.mean(e[known]), 0.0)
             products += compute_lagged_products(e, e, LAGS)
             samples += int(np.count_nonzero(known))
-    rounding = (ROUNDING * size) ** 2 * samples
-    if samples <= fitted + LAGS or not products[0] > rounding:
+    if samples <= fitted + LAGS or not products[0] > 0 or are_rounding(stretches, size):
         return ()
     rho = products[1:] / products[0]
     p = compute_whiteness_probability(rho, samples, fitted)
@@ -86,3 +85,17 @@ def note_coloured_innovations(
         f"THE INNOVATIONS ARE NOT WHITE ({write_p_value(p)}; correlation {rho[first - 1]:.2f} at a "
         f"lag of {first}): the noise is coloured, or the model lacks something. {consequence}",
     )
+
+
+def are_rounding(stretches: Sequence[Array], size: float) -> bool:
+    """Return whether errors are no larger than those of rounding beside a signal of such a size.
+
+    Parameters
+    ----------
+    stretches : sequence of ndarray
+        Errors; NaN where there are none.
+    size : float
+        Largest value of the signal.
+    """
+    squares = np.concatenate([np.square(part) for part in stretches])
+    return not np.nanmean(squares) > (ROUNDING * size) ** 2

@@ -22,7 +22,8 @@ from ..constraints import AbstractConstraint, check_constraints, divide_constrai
 from ..constraints.constrained_minimum import Found, minimize
 from ..constraints.quadratic_program import Cost, NotExcited
 from ..identified_model import Estimate, IdentifiedModel, IdentifiedSystem, Structure
-from ..whiteness import ENOUGH, note_coloured_innovations
+from ..whiteness import ENOUGH, LEVEL, are_rounding, note_coloured_innovations
+from .instruments import compute_independence_probability
 from .regression import (
     Regression,
     build_arx_regression,
@@ -126,7 +127,7 @@ def fit_arx(
         estimate = _fit_row(records, first, structure, known, intercept, jobs)
         if not isinstance(record, Iterator):
             # An iterator of records was read once, and is gone.
-            estimate = replace(estimate, notes=(*_note_colour(list(records), estimate),
+            estimate = replace(estimate, notes=(*_note_errors(list(records), estimate),
                                                 *estimate.notes))  # fmt: skip
         names = first.names
         return IdentifiedModel(estimate, inputs=names.get("u", "u"), outputs=names.get("y", "y"))
@@ -137,7 +138,7 @@ def fit_arx(
     for output, structure in structures.items():
         parts = [one.select(y=output) for one in records]
         estimate = _fit_row(parts, parts[0], structure, rows[output], intercept, jobs)
-        notes = (*_note_colour(parts, estimate), *estimate.notes)
+        notes = (*_note_errors(parts, estimate), *estimate.notes)
         estimates[output] = replace(estimate, notes=notes)
     return IdentifiedSystem(estimates, first.signals["u"])
 
@@ -200,15 +201,18 @@ def _note_motion(records: Iterable[Record], motions: list[float]) -> Iterator[Re
         yield record
 
 
-def _note_colour(records: Sequence[Record], estimate: Estimate) -> tuple[str, ...]:
-    """Return a note if the equation errors are not white; those of the first samples tell."""
+def _note_errors(records: Sequence[Record], estimate: Estimate) -> tuple[str, ...]:
+    """Return a note if the equation errors are not white, or depend on the past reference.
+
+    Those of the first samples tell.
+    """
     structure = estimate.structure
     fractions = [structure.fraction(estimate.values, k) for k in range(len(structure.numerators))]
     den = fractions[0][1]
     # Both are in falling powers of z, so that a shorter numerator begins later.
     nums = [np.concatenate([np.zeros(len(den) - len(num)), num]) for num, _ in fractions]
     order, left = len(den) - 1, ENOUGH
-    stretches, size = [], 0.0
+    stretches, driven, size = list[Array](), list[tuple[Array, Array]](), 0.0
     for record in records:
         part = record[:left]
         error = lfilter(den, [1.0], part.y)
@@ -216,11 +220,23 @@ def _note_colour(records: Sequence[Record], estimate: Estimate) -> tuple[str, ..
             error = error - lfilter(num, [1.0], u)
         error[~find_whole_past(part.valid, order)] = np.nan
         stretches.append(error)
+        if part.r is not None:
+            driven += [(error[i:j], np.atleast_2d(part.r)[:, i:j]) for i, j in part.segments()]
         size = max(size, float(np.max(np.abs(part.y[part.valid]), initial=0.0)))
         left -= len(part)
         if left <= 0:
             break
-    return note_coloured_innovations(stretches, len(estimate.names), _BIASED, size)
+    coloured = note_coloured_innovations(stretches, len(estimate.names), _BIASED, size)
+    if coloured or not driven or are_rounding(stretches, size):
+        return coloured
+    p = compute_independence_probability(*zip(*driven, strict=True))
+    if p >= LEVEL:
+        return ()
+    return (
+        f"THE ERRORS DEPEND ON THE PAST REFERENCE ({_text.write_p_value(p)}), of which those of a "
+        "right model hold nothing: the noise is that of the sensor and not of the equation, or the "
+        f"orders are too low. {_BIASED}",
+    )
 
 
 _BIASED = (

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy import stats
 
 from ..._base import text as _text
 from ..._base.arguments import is_iterable
@@ -21,6 +22,8 @@ Signals = list[tuple[Array, Array]]
 
 # Delayed references reach back by at most so many samples, which bounds the regression.
 _LONGEST = 8192
+# Singular values of delayed references below this share of the largest are rounding errors.
+_SMALLEST = 1e-8
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +114,7 @@ def project_on_references(pieces: Sequence[Piece]) -> Signals:
 
         factors.append(block_qr(fill, len(piece.y), m + 2 + len(piece.u))[1:, 1:])
     total = merge_factors(factors)
-    g = regress(total[:, :m], total[:, m:], 1e-8)
+    g = regress(total[:, :m], total[:, m:], _SMALLEST)
     found = []
     for piece in pieces:
         sums, n = [_compute_running_sums(w, edges[-1]) for w in piece.w], len(piece.y)
@@ -119,6 +122,60 @@ def project_on_references(pieces: Sequence[Piece]) -> Signals:
         both = np.vstack(blocks)
         found.append((both[:, 0].copy(), both[:, 1:].T.copy()))
     return found
+
+
+def compute_independence_probability(errors: Sequence[Array], references: Sequence[Array]) -> float:
+    r"""Return the probability that white errors depend so much on past references by chance.
+
+    .. math:: e^T P_W e / \hat\sigma^2 \sim \chi^2_m
+
+    for the projection :math:`P_W` on m averages of the references over windows of delays, those of
+    `project_on_references` without the same sample. What has moved the loop before explains
+    nothing of the errors of a right model, also where the references themselves react to y. Errors
+    of a fit, which explains part of them itself, give small probabilities less often.
+
+    Parameters
+    ----------
+    errors : sequence of (n,) array
+        Errors of a model, each stretch without a gap; NaN where there are none.
+    references : sequence of (signals, n) array
+        The references of each stretch.
+
+    Returns
+    -------
+    float
+        The probability; 1 where nothing moves the loop, or too little is known.
+
+    References
+    ----------
+    Ljung, *System Identification*, section 16.6.
+    """
+    edges = _choose_windows(min(_LONGEST, max(map(len, errors)) // 8))[1:]
+    m = (len(edges) - 1) * len(references[0])
+    factors, rows = [], 0
+    for e, w in zip(errors, references, strict=True):
+        sums = [_compute_running_sums(row - row[0], edges[-1]) for row in w]
+        known = np.isfinite(e)
+
+        def fill(
+            out: Array, start: int, stop: int, e: Array = e, s: Any = sums, known: Any = known
+        ) -> None:
+            out[:, 0] = 1.0
+            out[:, 1 : m + 1] = _average_delays(s, edges, start, stop)
+            out[:, m + 1] = e[start:stop]
+            out[~known[start:stop]] = 0.0
+
+        factors.append(block_qr(fill, len(e), m + 2)[1:, 1:])
+        rows += max(int(np.count_nonzero(known)) - 1, 0)
+    total = merge_factors(factors)
+    table, goal = total[:, :m], total[:, m]
+    sizes = np.linalg.svd(table, compute_uv=False)
+    rank = int(np.count_nonzero(sizes > _SMALLEST * sizes.max(initial=0.0)))
+    if not rank or rows <= 2 * rank:
+        return 1.0
+    explained = float(np.sum((table @ regress(table, goal, _SMALLEST)) ** 2))
+    variance = (float(goal @ goal) - explained) / (rows - rank)
+    return float(stats.chi2.sf(explained / variance, rank)) if variance > 0 else 1.0
 
 
 def _choose_windows(reach: int) -> list[int]:
