@@ -342,7 +342,9 @@ def test_a_search_that_does_not_converge_says_so(monkeypatch):
     search = prediction_error._minimize_errors
     monkeypatch.setattr(
         prediction_error, "_minimize_errors",
-        lambda task, point, known, rounds=1: search(task, point, known, 1),
+        lambda task, point, known, rounds=1, hold_gain=False: search(
+            task, point, known, 1, hold_gain
+        ),
     )  # fmt: skip
     assert "ENDED WITHOUT CONVERGENCE" in cid.fit_continuous(record, 2).estimate.notes[0]
     monkeypatch.undo()
@@ -397,7 +399,7 @@ def test_the_interval_of_a_delay_is_honest(late):
     loop = cid.Loop(plant, lead.sample(0.001, "tustin"), dt=0.001)
     real = loop.with_effect(cid.effects.InputDelay(delay=late)) if late else loop
     covered, away = 0, []
-    for seed in range(10):
+    for seed in range(20):
         r = cid.random_binary(600, amplitude=1e-4, hold=20, seed=seed)
         record = cid.simulate(real, r, sensor_noise=1e-6, seed=seed)
         e = cid.fit_continuous(record, poles=2, delay=None).estimate
@@ -410,7 +412,7 @@ def test_the_interval_of_a_delay_is_honest(late):
             if any("WITHOUT CONVERGENCE" in note for note in e.notes):
                 alone = cid.fit_continuous(record, poles=2).estimate
                 assert any("WITHOUT CONVERGENCE" in note for note in alone.notes)
-    assert covered >= 8
+    assert covered >= 17
     # About half of the delays that are none come out as zero.
     assert 0.5 < np.sqrt(np.mean(np.square(away)) * (1 if late else 2)) < 1.6
 

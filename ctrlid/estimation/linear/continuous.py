@@ -35,6 +35,7 @@ from .prediction_error import (
     colour_noise,
     find_best_fit,
     measure_delay_spread,
+    restrict_observer,
 )
 from .sampled_motion import Circuit, list_inputs
 
@@ -67,9 +68,10 @@ def fit_continuous(
     and corrects its state with an observer gain K that is estimated along. Since K takes whatever
     mixture of sensor noise and force noise the data hold, the estimate is right under feedback,
     without the reference and without knowing the controller; with white Gaussian noises it is
-    maximum likelihood. Where the innovations are not white, the sensor noise becomes a moving
-    average of an order chosen by the Bayesian criterion; a note says where one more pole and white
-    noise predict better. Initial state and operating point are estimated for each valid stretch.
+    maximum likelihood, K by the restricted likelihood [3]_. Where the innovations are not white,
+    the sensor noise becomes a moving average of an order chosen by the Bayesian criterion; a note
+    says where one more pole and white noise predict better. Initial state and operating point are
+    estimated for each valid stretch.
 
     Parameters
     ----------
@@ -109,6 +111,7 @@ def fit_continuous(
     ----------
     .. [1] Ljung, *System Identification*, 2nd edition, sections 7.4 and 13.4.
     .. [2] Garnier and Wang (eds.), *Identification of Continuous-time Models from Sampled Data*.
+    .. [3] Patterson and Thompson, Biometrika 58 (1971) 545-554.
 
     Examples
     --------
@@ -168,14 +171,15 @@ def fit_continuous(
         # Noise that leaves its innovations coloured stands for what the plant lacks, and bends it.
         if not len(note_colour(coloured)):
             best, notes = coloured, _note_missed_pole(coloured)
-    point, found, rss, settled = best.point, best.found, best.rss, best.settled
-    degrees = best.used - best.fitted
     # Errors that are rounding beside y leave nothing to gain.
-    beyond_rounding = rss > (ROUNDING * size) ** 2 * total
-    if not settled and beyond_rounding:
+    beyond_rounding = best.rss > (ROUNDING * size) ** 2 * total
+    if not best.settled and beyond_rounding:
         notes = (_NOT_CONVERGED, *notes)
     if delay == 0 and not circuit and task.hold == "zoh" and beyond_rounding:
         notes = (*notes, *_note_missed_delay(best, known))
+    best = restrict_observer(best, known) if beyond_rounding else best
+    point, found, rss = best.point, best.found, best.rss
+    degrees = best.used - best.fitted
     notes = (*note_sampled_controller(controller, records, "fit_continuous"), *notes)
     late, delay_error = "", 0.0
     if task.free_delay:

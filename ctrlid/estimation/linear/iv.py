@@ -39,9 +39,18 @@ from .iv_equations import (
     compute_curved_force,
     compute_moments,
     separate_nuisances,
+    tabulate_errors,
 )
-from .prefilter import View, autoregression, reflect_poles
+from .prefilter import (
+    View,
+    autoregression,
+    find_slowest,
+    fit_moving_average,
+    measure_units,
+    reflect_poles,
+)
 from .regression import list_structures, to_differences
+from .restricted_likelihood import compute_restricted_cost, restrict_likelihood
 
 # At most so many iterations are made for one noise model.
 _MOST = 40
@@ -49,7 +58,8 @@ _MOST = 40
 _DEGREE = 3
 # So many iterations take full steps; later ones take half steps, since full ones may oscillate.
 _PATIENCE = 8
-# Distances from z = 1 of the poles of the first prefilters, from the widest band down.
+# Distances from z = 1 of the poles of the first prefilters, from the widest band down, and of the
+# zeros from which a moving average is sought.
 _STARTS = 0.5 ** np.arange(1, 10)
 
 
@@ -79,8 +89,9 @@ def fit_iv(
     colour of the noise. Z and the prefilter F decide how precise it is, and are refined in turn:
 
     1. First Z is what delayed references explain of y and u.
-    2. F whitens the equation error: 1 / A with the poles outside the unit circle reflected into it,
-       times an autoregression of the residuals where v is coloured.
+    2. F whitens the equation error: 1 / C for the moving average C that it is, which is A with the
+       poles outside the unit circle reflected into it where no random force acts, times an
+       autoregression of the residuals where v is coloured.
     3. Z becomes y and u of the noise-free simulated loop of the last model and the controller. If
        that loop is not stable, or no controller is found, step 1 serves on.
     4. Where the residuals show that the plant is curved, squares and the product of y and u are
@@ -228,28 +239,86 @@ class _Fit:
 def _refine_noise_model(
     task: Task, known: Sequence[AbstractConstraint], law: LinearController | None
 ) -> _Fit:
-    """Iterate: with white noise and a linear plant first, then with what the residuals ask for."""
+    """Return the fit with a force and sensor noise; with sensor noise alone where it has no end."""
     theta = _find_start(task, known)
-    view, count = View(np.ones(1), np.ones(1)), 0
+    fit = _refine_from(task, known, law, theta, (False, True))
+    if not fit.converged:
+        return _refine_from(task, known, law, theta, (False,))
+    return _restrict_noise(task, known, fit) if fit.view.moving else fit
+
+
+def _restrict_noise(task: Task, known: Sequence[AbstractConstraint], fit: _Fit) -> _Fit:
+    """Return the fit beside the moving average of the largest restricted likelihood."""
+    theta, view = fit.found.theta, fit.view
+    samples = sum(len(piece.y) for piece in task.pieces) - fit.moments.nuisances
+
+    def make_view(c: Array) -> View:
+        return replace(view, den=np.concatenate([[1.0], c]))
+
+    def compute_cost(c: Array) -> float:
+        if np.max(np.abs(np.roots(make_view(c).den))) > find_slowest(task.longest):
+            return np.inf
+        return compute_restricted_cost(
+            tabulate_errors(task, theta, fit.hats, make_view(c)), samples
+        )
+
+    errors = _compute_equation_errors(task, theta, view, fit.hats)
+    start = view.den[1:]
+    c = restrict_likelihood(compute_cost, start, measure_units(errors, view.den))
+    view = make_view(c)
+    moments = compute_moments(task, fit.hats, view)
+    found = minimize(moments.cost, known, task.structure)
+    return replace(fit, found=found, moments=moments, view=view)
+
+
+def _refine_from(
+    task: Task, known: Sequence[AbstractConstraint], law: LinearController | None, theta: Array,
+    kinds: Sequence[bool],
+) -> _Fit:  # fmt: skip
+    """Iterate: with white noises and a linear plant first, then with what the residuals ask for."""
+    view, count = View(np.ones(1), np.ones(1), moving=any(kinds)), 0
     for _ in range(6):
         fit = _iterate_instruments(task, known, law, theta, view, count)
         count, theta, view = fit.iterations, fit.found.theta, fit.view
         if fit.moments.rss(theta) <= 1e-20 * fit.moments.size**2:
             # Only rounding errors are left, so that there is no noise to model.
             break
-        # The noise model starts from white again, so that its order can fall as well as rise.
-        plain = replace(view, num=np.ones(1))
-        better = autoregression(
-            [part.e for part in separate_nuisances(task, theta, fit.hats, plain)]
-        )
+        better = _choose_noise_model(task, theta, view, fit.hats, kinds)
         highest = 1 if task.structure.inputs else _DEGREE
-        if view.degree < highest and _is_curved(task, fit, replace(view, num=better)):
+        if view.degree < highest and _is_curved(task, fit, replace(view, num=better.num)):
             view = replace(view, degree=view.degree + 1, curvature=())
             continue
-        if len(better) == len(view.num) and np.allclose(better, view.num, atol=0.02):
+        if better.moving == view.moving and len(better.num) == len(view.num) and np.allclose(
+            better.num, view.num, atol=0.02
+        ):  # fmt: skip
             break
-        view = replace(view, num=better)
+        view = better
     return fit
+
+
+def _choose_noise_model(
+    task: Task, theta: Array, view: View, hats: Signals, kinds: Sequence[bool]
+) -> View:
+    r"""Return the view through the noise model that the Bayesian criterion prefers.
+
+    .. math:: N \ln V + d \ln N
+
+    for V the mean square of the whitened equation errors and d fitted coefficients: of an
+    autoregression alone, beside the reflected poles of the model, or also of the moving average
+    that a random force asks for. Each starts from white noise, so that its order can fall as well
+    as rise.
+    """
+    tried = []
+    for moving in kinds:
+        plain = replace(view, num=np.ones(1), moving=moving)
+        plain = _update_prefilter(task, theta, plain, hats)
+        residuals = [part.e for part in separate_nuisances(task, theta, hats, plain)]
+        model = replace(plain, num=autoregression(residuals))
+        moments = compute_moments(task, hats, model)
+        count = len(model.num) - 1 + moving * task.structure.na
+        cost = moments.rows * np.log(moments.rss(theta) / moments.rows)
+        tried.append((cost + 2 * bayesian_penalty(count, moments.rows), model))
+    return min(tried, key=lambda one: one[0])[1]
 
 
 def _find_start(task: Task, known: Sequence[AbstractConstraint]) -> Array:
@@ -271,7 +340,8 @@ def _find_start(task: Task, known: Sequence[AbstractConstraint]) -> Array:
         except NotExcited as problem:
             trouble = problem
             continue
-        moments = compute_moments(task, task.delayed, _update_prefilter(task, theta, view))
+        updated = _update_prefilter(task, theta, view, task.delayed)
+        moments = compute_moments(task, task.delayed, updated)
         square_sum = moments.rss(theta)
         if square_sum < best[0]:
             best = (square_sum, theta)
@@ -311,9 +381,23 @@ def _average_by_record(task: Task, values: Sequence[float]) -> Array:
     return np.asarray(total / np.bincount(owners, sizes, task.records), dtype=float)
 
 
-def _update_prefilter(task: Task, theta: Array, view: View) -> View:
-    """Return the same view through the denominator of another model."""
-    return replace(view, den=reflect_poles(task.structure, theta, task.longest))
+def _update_prefilter(task: Task, theta: Array, view: View, hats: Signals) -> View:
+    """Return the same view through what whitens the equation errors of another model."""
+    reflected = reflect_poles(task.structure, theta, task.longest)
+    if not view.moving:
+        return replace(view, den=reflected)
+    errors = _compute_equation_errors(task, theta, view, hats)
+    # The search is short from near by only: in the beginning zeros of all speeds are tried.
+    wide = [np.poly(np.full(task.structure.na, 1 - distance)) for distance in _STARTS]
+    known = len(view.den) == len(reflected)
+    starts = [reflected, *([view.den] if known else wide)]
+    return replace(view, den=fit_moving_average(errors, starts, task.longest))
+
+
+def _compute_equation_errors(task: Task, theta: Array, view: View, hats: Signals) -> list[Array]:
+    """Return the equation errors of each stretch with their levels, not yet whitened."""
+    plain = replace(view, den=np.ones(1))
+    return [part.e + part.constant for part in separate_nuisances(task, theta, hats, plain)]
 
 
 def _iterate_instruments(
@@ -328,7 +412,10 @@ def _iterate_instruments(
     best, least = theta, np.inf
     hats = task.delayed
     for step in range(_MOST):
-        view = _update_prefilter(task, theta, view)
+        if not view.moving or (step < _PATIENCE and len(view.num) == 1):
+            # A moving average is held in the end, so that full steps converge, and beside an
+            # autoregression that was fitted to what it left.
+            view = _update_prefilter(task, theta, view, hats)
         simulated = None
         if law is not None:
             forces = compute_curved_force(task, hats, view)
@@ -356,7 +443,7 @@ def _iterate_instruments(
         # The first iterations take full steps; where these oscillate, half of them converge.
         share = 1.0 if step < _PATIENCE else 0.5
         theta = theta + share * (found.theta - theta)
-    view = _update_prefilter(task, best, view)
+    view = _update_prefilter(task, best, view, fit.hats)
     moments = compute_moments(task, fit.hats, view)
     found = minimize(moments.cost, known, task.structure)
     return replace(fit, found=found, moments=moments, view=view, converged=False)
@@ -373,6 +460,8 @@ def _make_estimate(task: Task, fit: _Fit, constrained: bool, dt: float) -> Estim
     notes = [] if fit.converged else [_describe_no_end(fit)]
     if fit.view.degree > 1:
         notes.append(_CURVED.format(degree=fit.view.degree))
+    if fit.view.moving:
+        words.append(f"noise that is a moving average of order {len(fit.view.den) - 1}")
     if len(fit.view.num) > 1:
         words.append(f"a noise model of order {len(fit.view.num) - 1}")
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -320,17 +320,43 @@ def separate_nuisances(task: Task, theta: Array, hats: Signals, view: View) -> l
     list of Residuals
         One for each stretch.
     """
-    s = task.structure
-    p = len(s.names)
-    delta = to_differences(s, theta)
+    found = []
+    for nuisance, z, error in tabulate_errors(task, theta, hats, view):
+        both = np.column_stack([z, error])
+        x = regress(nuisance, both, 1e-12)
+        both -= nuisance @ x
+        curvature, constant = x[len(view.den) - 1 : -1, -1], x[-1, -1]
+        found.append(Residuals(both[:, :-1], both[:, -1], curvature, constant))
+    return found
+
+
+def tabulate_errors(
+    task: Task, theta: Array, hats: Signals, view: View
+) -> list[tuple[Array, Array, Array]]:
+    """Return of each stretch nuisances, instruments, and the filtered equation errors.
+
+    Parameters
+    ----------
+    task : Task
+        The data.
+    theta : (p,) array
+        Coefficients of the model.
+    hats : list of (array, array)
+        Instruments: y and u as the external signals cause them.
+    view : View
+        The prefilter.
+
+    Returns
+    -------
+    list of (array, array, array)
+        The last column of the nuisances is the constant.
+    """
+    p = len(task.structure.names)
+    delta = to_differences(task.structure, theta)
     found = []
     for piece, hat in zip(task.pieces, hats, strict=True):
         columns, skip = _make_table(task, piece, hat, view)
         table, skip = np.column_stack(columns), skip + 1
-        nuisance, z = table[:, :skip], table[:, skip : skip + p]
         error = table[:, -1] - table[:, skip + p : -1] @ delta
-        both = np.column_stack([z, error])
-        x = regress(nuisance, both, 1e-12)
-        both -= nuisance @ x
-        found.append(Residuals(both[:, :-1], both[:, -1], x[s.na : skip - 1, -1], x[skip - 1, -1]))
+        found.append((table[:, :skip], table[:, skip : skip + p], error))
     return found

@@ -18,7 +18,8 @@ from ..constraints import AbstractConstraint
 from ..constraints.constrained_minimum import Found, minimize
 from ..constraints.quadratic_program import Cost, NotExcited
 from ..identified_model import Structure
-from .regression import block_qr, merge_factors
+from .regression import merge_factors, triangularize
+from .restricted_likelihood import compute_restricted_cost, restrict_likelihood
 from .sampled_motion import (
     Circuit,
     DiscreteModel,
@@ -160,11 +161,6 @@ def _compute_residuals(task: Task, point: Point) -> list[Array]:
     return errors
 
 
-def _triangularize(table: Array) -> Array:
-    """Return the triangular factor of a tall table."""
-    return block_qr(lambda out, i, j: np.copyto(out, table[i:j]), *table.shape)
-
-
 def _evaluate_cost(task: Task, point: Point) -> tuple[float, list[Array]]:
     """Return the sum of squared errors with initial states and offsets at their best."""
     total, columns = 0.0, []
@@ -172,7 +168,7 @@ def _evaluate_cost(task: Task, point: Point) -> tuple[float, list[Array]]:
         table = _compute_columns(task, point, piece)
         if table is None or not np.isfinite(table).all():
             return np.inf, []
-        r = _triangularize(table)
+        r = triangularize(table)
         total += float(r[-1, -1] ** 2)
         columns.append(table)
     return total, columns
@@ -205,28 +201,37 @@ def _differentiate_errors(
     return np.zeros_like(here)
 
 
-def _compute_jacobian(task: Task, point: Point, tables: list[Array]) -> Array:
+def _compute_jacobian(task: Task, point: Point, tables: Sequence[Array]) -> Array:
     """Return the triangular factor of ``[gain, delay, theta, errors]``, nuisance projected out."""
-    s = task.structure
-    size = _measure_coefficients(task, point)
     steps: list[tuple[float, Callable[[float], Point]]] = []
     for e in np.eye(len(point.gain)):
         h = 1e-5 * max(abs(float(point.gain @ e)), 1e-3 * float(np.abs(point.gain).max()), 1e-9)
         steps.append((h, lambda h, e=e: replace(point, gain=point.gain + h * e)))  # type: ignore[misc]
     if task.free_delay:
         steps.append((1e-4 * task.dt, lambda h: replace(point, delay=point.delay + h)))
-    for e in np.eye(len(s.names)):
-        h = 1e-5 * max(abs(float(point.theta @ e)), 1e-2 * float(size @ e))
-        steps.append((h, lambda h, e=e: replace(point, theta=point.theta + h * e)))  # type: ignore[misc]
     factors = []
     for piece, table in zip(task.pieces, tables, strict=True):
-        slopes = []
-        for h, move in steps:
-            slopes.append(_differentiate_errors(task, piece, table[:, -1], h, move))
+        here = table[:, -1]
+        slopes = [_differentiate_errors(task, piece, here, h, move) for h, move in steps]
+        slopes += [*_differentiate_by_coefficients(task, point, piece, here).T]
         nuisance = table.shape[1] - 1
-        whole = np.column_stack([table[:, :nuisance], *slopes, table[:, -1]])
-        factors.append(_triangularize(whole)[nuisance:, nuisance:])
+        whole = np.column_stack([table[:, :nuisance], *slopes, here])
+        factors.append(triangularize(whole)[nuisance:, nuisance:])
     return merge_factors(factors)
+
+
+def _differentiate_by_coefficients(task: Task, point: Point, piece: Piece, here: Array) -> Array:
+    """Return what each coefficient does to the prediction errors of a stretch, a column each."""
+    size = _measure_coefficients(task, point)
+    slopes = []
+    for e in np.eye(len(point.theta)):
+        h = 1e-5 * max(abs(float(point.theta @ e)), 1e-2 * float(size @ e))
+
+        def move(h: float, e: Array = e) -> Point:
+            return replace(point, theta=point.theta + h * e)
+
+        slopes.append(_differentiate_errors(task, piece, here, h, move))
+    return np.column_stack(slopes)
 
 
 def measure_delay_spread(best: Minimum) -> float:
@@ -263,9 +268,12 @@ def _make_unit_vector(n: int, i: int) -> Array:
 
 
 def _minimize_errors(
-    task: Task, point: Point, known: Sequence[AbstractConstraint], rounds: int = ROUNDS
-) -> tuple[Point, Found, float, bool]:
+    task: Task, point: Point, known: Sequence[AbstractConstraint], rounds: int = ROUNDS,
+    hold_gain: bool = False,
+) -> tuple[Point, Found, float, bool]:  # fmt: skip
     """Run Gauss-Newton with the constraints in each step; halved until the errors shrink.
+
+    The observer gain may be held, whose errors the spread of the coefficients then leaves out.
 
     The last result says whether it converged: a further step of the coefficients promised less
     than one residual variance, which is half a unit of log-likelihood. At short periods the best
@@ -276,11 +284,13 @@ def _minimize_errors(
     found: Found | None = None
     for _ in range(rounds):
         factor = _compute_jacobian(task, point, tables)
+        held = len(point.gain) if hold_gain else 0
+        factor = triangularize(factor[:, held:]) if held else factor
         found, others, predicted = _solve_step(task, point, known, factor, rss)
         if task.free_delay and point.delay == 0 and others[-1] < 0:
             # No delay is negative, so that the others find their best beside none. They are known
             # no better for that: the delay was none by chance.
-            factor = _triangularize(np.delete(factor, len(point.gain), axis=1))
+            factor = triangularize(np.delete(factor, len(point.gain) - held, axis=1))
             spread = found.spread
             found, others, predicted = _solve_step(task, point, known, factor, rss)
             found, others = replace(found, spread=spread), np.append(others, 0.0)
@@ -291,7 +301,7 @@ def _minimize_errors(
         settled = predicted < rss / degrees
         for k in range(12):
             share = 0.5**k
-            step = share * others
+            step = share * np.append(np.zeros(held), others)
             delay = max(point.delay + (step[-1] if task.free_delay else 0.0), 0.0)
             trial = Point(point.theta + share * move, point.gain + step[: len(point.gain)], delay)
             new, new_tables = _evaluate_cost(task, trial)
@@ -386,6 +396,38 @@ def find_best_fit(task: Task, known: Sequence[AbstractConstraint], delay: float)
             "reference, lower the orders or add a constraint."
         ) from None
     return Minimum(task, best, found, rss, _compute_residuals(task, best), settled)
+
+
+def restrict_observer(best: Minimum, known: Sequence[AbstractConstraint]) -> Minimum:
+    """Return the minimum beside the observer gain of the largest restricted likelihood."""
+    task, gains = best.task, len(best.point.gain)
+    factor = _compute_jacobian(task, best.point, _evaluate_cost(task, best.point)[1])
+    last = factor.shape[1] - 1
+    # The gain stands last, so that its triangle is what the data say of it beside all else.
+    turned = triangularize(factor[:, [*range(gains, last), *range(gains)]])
+    units = np.linalg.pinv(turned[-gains:, -gains:]) * np.sqrt(best.rss / best.used)
+    values, vectors = np.linalg.eigh(best.found.spread)
+    free = vectors[:, values > 0] * np.sqrt(values[values > 0])
+
+    def compute_cost(gain: Array) -> float:
+        point, tables = replace(best.point, gain=gain), []
+        for piece in task.pieces:
+            table = _compute_columns(task, point, piece)
+            if table is None or not np.isfinite(table).all():
+                return np.inf
+            slopes = _differentiate_by_coefficients(task, point, piece, table[:, -1])
+            tables.append((table[:, :-1], slopes @ free, table[:, -1]))
+        return compute_restricted_cost(tables, best.used)
+
+    gain = restrict_likelihood(compute_cost, best.point.gain, units)
+    if gain is best.point.gain:
+        return best
+    start = replace(best.point, gain=gain)
+    point, found, rss, settled = _minimize_errors(task, start, known, hold_gain=True)
+    # The spread is that beside a gain which is not known either.
+    factor = _compute_jacobian(task, point, _evaluate_cost(task, point)[1])
+    spread = _solve_step(task, point, known, factor, rss)[0].spread
+    return Minimum(task, point, replace(found, spread=spread), rss, best.residuals, settled)
 
 
 def add_delay(best: Minimum, known: Sequence[AbstractConstraint]) -> Minimum:
@@ -542,7 +584,7 @@ def _fit_numerator(
         whole = np.column_stack([table[:, :-1], *slopes, table[:, -1]])
         if not np.isfinite(whole).all():
             return None, np.inf
-        blocks.append(_triangularize(whole)[table.shape[1] - 1 :, table.shape[1] - 1 :])
+        blocks.append(triangularize(whole)[table.shape[1] - 1 :, table.shape[1] - 1 :])
     factor = merge_factors(blocks)
     columns = factor[: s.nb, : s.nb]
     if not np.all(np.linalg.norm(columns, axis=0) > 0):

@@ -72,6 +72,11 @@ def block_qr(fill: Fill, rows: int, columns: int, block: int = BLOCK) -> Array:
     return np.array(buffer[:columns])
 
 
+def triangularize(table: Array) -> Array:
+    """Return the triangular factor of a tall table."""
+    return block_qr(lambda out, i, j: np.copyto(out, table[i:j]), *table.shape)
+
+
 def merge_factors(factors: Sequence[Array]) -> Array:
     """Return the triangular factor of matrices stacked on each other, from the factor of each."""
     if len(factors) == 1:
