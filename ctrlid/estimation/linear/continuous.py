@@ -177,7 +177,9 @@ def fit_continuous(
         notes = (_NOT_CONVERGED, *notes)
     if delay == 0 and not circuit and task.hold == "zoh" and beyond_rounding:
         notes = (*notes, *_note_missed_delay(best, known))
-    best = restrict_observer(best, known) if beyond_rounding else best
+    if beyond_rounding and best.settled:
+        # The restricted likelihood is climbed from the largest likelihood, and from nowhere else.
+        best = restrict_observer(best, known)
     point, found, rss = best.point, best.found, best.rss
     degrees = best.used - best.fitted
     notes = (*note_sampled_controller(controller, records, "fit_continuous"), *notes)

@@ -138,7 +138,7 @@ def fit_moving_average(errors: Sequence[Array], starts: Sequence[Array], n: int)
     >>> from scipy.signal import lfilter
     >>> white = np.random.default_rng(0).standard_normal(20_000)
     >>> w = lfilter([1.0, -1.6, 0.63], [1.0], white)
-    >>> fit_moving_average([w], [np.array([1.0, -0.5, 0.0])], len(w)).round(1)
+    >>> fit_moving_average([w], [np.poly([0.9, 0.9])], len(w)).round(1)
     array([ 1. , -1.6,  0.6])
     """
     slowest = find_slowest(n)
