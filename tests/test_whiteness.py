@@ -169,6 +169,15 @@ def test_a_right_difference_equation_is_not_doubted():
     assert sum(map(bool, notes)) <= 5
 
 
+@pytest.mark.parametrize("level", [0.0, 5.0])
+def test_an_exact_fit_about_another_level_has_nothing_to_say(level):
+    """Beside the constant of the equation only rounding is left, which is not noise."""
+    rng = np.random.default_rng(1)
+    r = np.repeat(rng.choice([-1.0, 1.0], 40), 40)
+    y = level + signal.lfilter([0.0, 0.1, 0.05], [1.0, -1.5, 0.56], r)
+    assert cid.fit_arx(cid.Record(r=r, u=r, y=y, dt=DT), 2, 2).estimate.notes == ()
+
+
 def test_errors_are_independent_of_references_that_move_nothing():
     rng = np.random.default_rng(3)
     e = [rng.standard_normal(400)]

@@ -88,14 +88,15 @@ def note_coloured_innovations(
 
 
 def are_rounding(stretches: Sequence[Array], size: float) -> bool:
-    """Return whether errors are no larger than those of rounding beside a signal of such a size.
+    """Return whether errors vary no more than those of rounding beside a signal of such a size.
 
     Parameters
     ----------
     stretches : sequence of ndarray
-        Errors; NaN where there are none.
+        Errors, each stretch about a level of its own; NaN where there are none.
     size : float
         Largest value of the signal.
     """
-    squares = np.concatenate([np.square(part) for part in stretches])
-    return not np.nanmean(squares) > (ROUNDING * size) ** 2
+    known = [e[np.isfinite(e)] for e in stretches]
+    squares = sum(float(np.sum((e - np.mean(e)) ** 2)) for e in known if len(e))
+    return not squares > (ROUNDING * size) ** 2 * sum(map(len, known))

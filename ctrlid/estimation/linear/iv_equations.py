@@ -335,16 +335,7 @@ def tabulate_errors(
 ) -> list[tuple[Array, Array, Array]]:
     """Return of each stretch nuisances, instruments, and the filtered equation errors.
 
-    Parameters
-    ----------
-    task : Task
-        The data.
-    theta : (p,) array
-        Coefficients of the model.
-    hats : list of (array, array)
-        Instruments: y and u as the external signals cause them.
-    view : View
-        The prefilter.
+    The parameters are those of `separate_nuisances`.
 
     Returns
     -------

@@ -201,8 +201,12 @@ def _differentiate_errors(
     return np.zeros_like(here)
 
 
-def _compute_jacobian(task: Task, point: Point, tables: Sequence[Array]) -> Array:
-    """Return the triangular factor of ``[gain, delay, theta, errors]``, nuisance projected out."""
+def _compute_jacobian(task: Task, point: Point, tables: Sequence[Array] | None = None) -> Array:
+    """Return the triangular factor of ``[gain, delay, theta, errors]``, nuisance projected out.
+
+    The tables of the cost may be given where they are known.
+    """
+    tables = _evaluate_cost(task, point)[1] if tables is None else tables
     steps: list[tuple[float, Callable[[float], Point]]] = []
     for e in np.eye(len(point.gain)):
         h = 1e-5 * max(abs(float(point.gain @ e)), 1e-3 * float(np.abs(point.gain).max()), 1e-9)
@@ -245,7 +249,7 @@ def measure_delay_spread(best: Minimum) -> float:
     the spread S of the coefficients. At a delay of zero the slope is that towards larger ones.
     """
     task, point = best.task, best.point
-    factor = _compute_jacobian(task, point, _evaluate_cost(task, point)[1])
+    factor = _compute_jacobian(task, point)
     extra = len(point.gain) + 1
     p = extra + len(task.structure.names)
     inverse = np.linalg.pinv(factor[:extra, :extra])
@@ -401,7 +405,7 @@ def find_best_fit(task: Task, known: Sequence[AbstractConstraint], delay: float)
 def restrict_observer(best: Minimum, known: Sequence[AbstractConstraint]) -> Minimum:
     """Return the minimum beside the observer gain of the largest restricted likelihood."""
     task, gains = best.task, len(best.point.gain)
-    factor = _compute_jacobian(task, best.point, _evaluate_cost(task, best.point)[1])
+    factor = _compute_jacobian(task, best.point)
     last = factor.shape[1] - 1
     # The gain stands last, so that its triangle is what the data say of it beside all else.
     turned = triangularize(factor[:, [*range(gains, last), *range(gains)]])
@@ -425,7 +429,7 @@ def restrict_observer(best: Minimum, known: Sequence[AbstractConstraint]) -> Min
     start = replace(best.point, gain=gain)
     point, found, rss, settled = _minimize_errors(task, start, known, hold_gain=True)
     # The spread is that beside a gain which is not known either.
-    factor = _compute_jacobian(task, point, _evaluate_cost(task, point)[1])
+    factor = _compute_jacobian(task, point)
     spread = _solve_step(task, point, known, factor, rss)[0].spread
     return Minimum(task, point, replace(found, spread=spread), rss, best.residuals, settled)
 
