@@ -89,3 +89,53 @@ def test_who_has_no_time_is_told_of_the_log_all_the_same(loop):
     found = cid.diagnose(loop, cid.Record(r=r, u=u, y=y, dt=DT), seconds=0.2, progress=False)
     assert found.sentence.startswith("THE LOG LOOKS WRONG"), found.sentence
     assert (found.verdict, found.findings, found.finished) == ("unknown", (), True)
+
+
+def simulate_spring(reaches, n=1200, seed=4):
+    """Mass on a spring, m x" = F - s x - c x', driven by steps of F that may not reach it."""
+    rng = np.random.default_rng(seed)
+    mass, stiffness, damping, dt, steps = 1.5, 90.0, 2.5, 0.02, 8
+    u = np.repeat(rng.uniform(-2.0, 2.0, n // 40 + 1), 40)[:n]
+    y, state, h = np.zeros(n), np.array([0.01, 0.0]), dt / steps
+    for k in range(n):
+        y[k] = state[0] + 2e-4 * rng.standard_normal()
+        push = u[k] if reaches else 0.0
+        for _ in range(steps):
+            middle = state + h / 2 * np.array(
+                [state[1], (push - stiffness * state[0] - damping * state[1]) / mass]
+            )
+            state = state + h * np.array(
+                [middle[1], (push - stiffness * middle[0] - damping * middle[1]) / mass]
+            )
+    return u, y, dt
+
+
+def make_spring_loop(dt):
+    plant = ct.nlsys(
+        lambda t, x, u, p: [x[1], (u[0] - p["s"] * x[0] - 2.5 * x[1]) / 1.5],
+        lambda t, x, u, p: x[0],
+        states=["x", "v"], inputs=["F"], outputs=["x"], name="spring", params={"s": 90.0},
+    )  # fmt: skip
+    return cid.Loop(plant, None, dt=dt, free={"s": 0.05})
+
+
+@pytest.mark.parametrize("reaches", [False, True])
+def test_an_input_that_does_nothing_is_the_headline(reaches):
+    u, y, dt = simulate_spring(reaches)
+    loop = make_spring_loop(dt)
+    small = [cid.effects.LinearStiffness, cid.effects.CoulombFriction, cid.effects.InputSaturation]
+    found = cid.diagnose(loop, cid.Record(u=u, y=y, dt=dt), catalogue=small, progress=False)
+    assert found.sentence.startswith("THE INPUT DOES NOT SEEM TO REACH THE PLANT") != reaches
+    assert found.verdict == ("nothing missing" if reaches else "unknown")
+    assert not found.findings
+
+
+def test_an_output_that_does_not_move_is_the_headline():
+    """Dry friction that holds a mass against all that the input does names nothing."""
+    u, _, dt = simulate_spring(True)
+    y = 3e-3 + 2e-4 * np.random.default_rng(5).standard_normal(len(u))
+    loop = make_spring_loop(dt)
+    small = [cid.effects.SensorGain, cid.effects.CoulombFriction, cid.effects.ViscousFriction]
+    found = cid.diagnose(loop, cid.Record(u=u, y=y, dt=dt), catalogue=small, progress=False)
+    assert found.sentence.startswith("THE OUTPUT DOES NOT SEEM TO MOVE"), found.sentence
+    assert (found.verdict, found.findings, found.stand_ins) == ("unknown", (), ())

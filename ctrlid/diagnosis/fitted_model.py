@@ -98,6 +98,18 @@ def compute_criterion(model: Model) -> float:
     return value if math.isfinite(value) else -math.inf
 
 
+def compute_null_likelihood(fit: Fit) -> float:
+    """Return the penalized likelihood of outputs that scatter about means, whatever moves them."""
+    value = 0.0
+    for data, keep in zip(fit.data, fit.counts, strict=True):
+        rows = zip(np.reshape(data.y, (len(data.y), -1)).T,
+                   np.reshape(keep, (len(keep), -1)).T, strict=True)  # fmt: skip
+        for y in (row[use] for row, use in rows):
+            value -= 0.5 * len(y) * (math.log(2 * math.pi * float(np.var(y)) + THRESHOLD.tiny) + 1)
+            value -= bayesian_penalty(1, fit.size)
+    return value
+
+
 def drop_arrays(fit: Fit) -> Fit:
     """Return a fit without its arrays: many candidates on a long record must fit into memory."""
     return keep_information(fit, replace(fit, linearized=(), filtered=()))

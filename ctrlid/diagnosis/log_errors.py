@@ -1,4 +1,4 @@
-"""Step 7: gross errors of the log: a wrong sign, or a signal in another unit than the model's."""
+"""Step 7: gross errors of the log: a wrong sign or unit, or an input that does nothing."""
 
 import functools
 import math
@@ -9,6 +9,7 @@ import numpy as np
 
 from .._base.errors import ModelCannotRun
 from ..data.record import Record
+from ..estimation.likelihood.maximization import choose_sensor_noise
 from ..loop.loop import Loop
 from ..validation.record_audit import Audit
 from .fitted_model import compute_penalized_likelihood
@@ -106,6 +107,49 @@ def find_log_error(
     return LogError(", or ".join(same), best)
 
 
+def seems_idle(
+    loop: Loop, records: Sequence[Record], audits: Sequence[Audit], reached: float
+) -> bool:
+    """Whether records are explained by an input that stands still as well as by what was found.
+
+    Then nothing of the logged input reaches the plant, and all that makes it do nothing explains
+    the record alike, a stiff spring or a limit of a state included: no name says more than that.
+
+    Parameters
+    ----------
+    loop : Loop
+        The model as given.
+    records : sequence of Record
+        The data as logged.
+    audits : sequence of Audit
+        What the records show by themselves.
+    reached : float
+        Penalized log-likelihood of the model that the search ended with.
+
+    Returns
+    -------
+    bool
+        Whether the plant alone, its input at rest, does better by far than with the input, and no
+        worse than with what was found. False of several signals, which are not asked.
+    """
+    if not loop.equations().siso:
+        return False
+    # It stands at rest, or where it is on average, or it is off.
+    levels = {loop.point.input, float(np.mean([np.mean(r.u) for r in records])), 0.0}
+    heads = [r[: THRESHOLD.log_error_samples] for r in records]
+    stood, level = max((_measure(loop, _hold(heads, v), None), v) for v in levels)
+    if stood < _measure(loop, heads, None) + THRESHOLD.gate:
+        return False
+    moved, stood = (_measure(loop, part, audits, coloured=True)
+                    for part in (records, _hold(records, level)))  # fmt: skip
+    return stood > moved + THRESHOLD.gate and stood >= reached
+
+
+def _hold(records: Sequence[Record], level: float) -> list[Record]:
+    """Return records with an input that stands still."""
+    return [replace(r, u=np.full_like(r.u, level)) for r in records]
+
+
 def _list_repairs() -> list[tuple[str, Callable[[Record], Record], float, int]]:
     """Return what may be wrong, what mends a record, its factor of y, and samples that it costs."""
     scaled = [
@@ -134,20 +178,21 @@ def _delay_output(record: Record) -> Record:
 
 def _measure(
     loop: Loop, records: Sequence[Record], audits: Sequence[Audit] | None, factor: float = 1.0,
-    left_out: int = 0,
+    left_out: int = 0, coloured: bool = False,
 ) -> float:  # fmt: skip
     """Return the penalized log-likelihood of y as logged; minus infinity where nothing runs.
 
-    Without audits the plant keeps its given values.
+    Without audits the plant keeps its given values. The noise of the sensor may be `coloured`, as
+    that of a search may.
     """
     try:
         model = (
             fit_base_model(loop, records, ()) if audits is None
             else recalibrate(loop, records, audits)
         )  # fmt: skip
+        fit = choose_sensor_noise(model.fit) if coloured else model.fit
     except ModelCannotRun:
         return -math.inf
-    fit = model.fit
     if not math.isfinite(fit.value):
         return -math.inf
     count = sum(int(np.count_nonzero(np.isfinite(z))) for z in fit.standardized)

@@ -26,7 +26,7 @@ from ..validation.reproduction import OPEN_LOOP
 from .answer import assemble_answer, name_records
 from .candidates import Work, check_catalogue
 from .findings import COMPLETE, Disturbance, Gap
-from .fitted_model import Model, compute_penalized_likelihood
+from .fitted_model import Model, compute_null_likelihood, compute_penalized_likelihood
 from .fresh_data import FreshData, check_length, choose_fresh_data
 from .gap_summary import (
     lengthen_horizon,
@@ -44,7 +44,7 @@ from .growth import (
     refuse_false_noise,
     search_effects,
 )
-from .log_errors import LogError, find_log_error
+from .log_errors import find_log_error, seems_idle
 from .open_loop_search import search_by_simulation
 from .progress import Progress
 from .recalibration import recalibrate
@@ -67,6 +67,27 @@ from .verdict import declare_unfinished
 DIVERGES = (
     "the {} of the completed model diverges on the samples kept back. Where the controller hardly "
     "holds the plant, noise alone is enough for that, so the gap is that of predictions"
+)
+
+WRONG_LOG = (
+    "THE LOG LOOKS WRONG: {0.words}. So repaired, the record is explained better than by any "
+    "effect of the catalogue, by {0.gain:.0f} of log-likelihood. No effect is named on a record that may "
+    "be wrong: check the log, mend it, and diagnose again."
+)
+
+IDLE_INPUT = (
+    "THE INPUT DOES NOT SEEM TO REACH THE PLANT: y moves as it would if u stood still, and that "
+    "explains the record as well as any effect of the catalogue does. Either u is not the signal "
+    "that drives the plant, or the actuator is off, or a dead zone, a gap, a limit or dry friction "
+    "swallows all that u did. No effect is named: check the log and the wiring, and excite the "
+    "plant by larger inputs."
+)
+
+AT_REST = (
+    "THE OUTPUT DOES NOT SEEM TO MOVE: a constant and noise explain y as well as the model does "
+    "with any effect of the catalogue. Either the plant is held, by dry friction, a stop or a brake, or "
+    "the actuator or the sensor is off. No effect is named: check the log and the wiring, and "
+    "excite the plant by larger inputs."
 )
 
 BY_SIMULATION = (
@@ -277,16 +298,22 @@ def _answer_question(q: Question) -> tuple[Diagnosis, Search]:
         q.tell("looking for errors of the log")
         reached = compute_penalized_likelihood(search.final.fit)
 
-        def look() -> LogError | None:
-            return find_log_error(readout.loop, readout.records, q.audits, reached)
+        def look() -> str:
+            if compute_null_likelihood(search.final.fit) >= reached:
+                return AT_REST
+            asked = readout.loop, readout.records, q.audits, reached
+            wrong = find_log_error(*asked)
+            if wrong is not None:
+                return WRONG_LOG.format(wrong)
+            return IDLE_INPUT if seems_idle(*asked) else ""
 
         if search.finished:
-            wrong = q.attempt(look, None)
+            wrong = q.attempt(look, "")
         else:
             # Who has no time to wait must not be told that the plant lacks something either.
             with q.budget.running(binding=False):
                 wrong = look()
-        if wrong is not None:
+        if wrong:
             return _blame_log(q, search, wrong)
     if search.other and not search.after.passed:
         # Perhaps neither search explains the record; fresh data tell which of them leads further.
@@ -344,17 +371,12 @@ def _search_again(
     return choose_search(search, other, helps, q.fresh.measure_model_gap)
 
 
-def _blame_log(q: Question, search: Search, wrong: LogError) -> tuple[Diagnosis, Search]:
+def _blame_log(q: Question, search: Search, sentence: str) -> tuple[Diagnosis, Search]:
     """Answer that the log is wrong: nothing is named on a record that contradicts itself."""
     q.settle()
     empty = replace(search, final=search.base, found=(), after=search.before)
     summary = summarize_gap(q.loop, empty, q.fresh)
     result = assemble_answer(q.loop, q.records, empty, summary, ())
-    sentence = (
-        f"THE LOG LOOKS WRONG: {wrong.words}. So repaired, the record is explained better than by "
-        f"any effect of the catalogue, by {wrong.gain:.0f} of log-likelihood. No effect is named "
-        "on a record that may be wrong: check the log, mend it, and diagnose again."
-    )
     return replace(result, verdict="unknown", sentence=sentence), empty
 
 

@@ -11,7 +11,14 @@ from ..estimation.likelihood.kalman_filter import Noise
 from ..estimation.likelihood.likelihood import Fit, evaluate_likelihood, rank_by_likelihood
 from ..estimation.likelihood.maximization import OTHER_NOISE_GAIN, climb_under_quiet_force, maximize
 from .candidates import Objection, Trial, attempt_trial
-from .fitted_model import Model, can_simulate, carry_over_fit, drop_arrays, drop_linearization
+from .fitted_model import (
+    Model,
+    can_simulate,
+    carry_over_fit,
+    compute_null_likelihood,
+    drop_arrays,
+    drop_linearization,
+)
 from .information import count_own_parameters, find_objection
 from .thresholds import THRESHOLD
 
@@ -83,7 +90,7 @@ def weigh_refit(base: Model, trial: Trial, fit: Fit) -> Trial:
     model = Model(trial.model.loop, fit)
     own = count_own_parameters(trial, fit)
     penalty = bayesian_penalty(own, fit.size) + trial.scan_penalty
-    before = base.fit.value if math.isfinite(base.fit.value) else _compute_null_likelihood(fit)
+    before = base.fit.value if math.isfinite(base.fit.value) else compute_null_likelihood(fit)
     done = replace(trial, model=model, gain=fit.value - before, penalty=penalty)
     try:
         done = replace(done, out=find_objection(done))
@@ -91,17 +98,6 @@ def weigh_refit(base: Model, trial: Trial, fit: Fit) -> Trial:
     except EffectDoesNotApply as reason:
         return replace(trial, out=Objection.of(reason))
     return done if done.net_gain > 0 else replace(done, model=Model(model.loop, drop_arrays(fit)))
-
-
-def _compute_null_likelihood(fit: Fit) -> float:
-    """Return the likelihood of outputs that scatter about their mean, whatever drives them."""
-    value = 0.0
-    for data, keep in zip(fit.data, fit.counts, strict=True):
-        rows = zip(np.reshape(data.y, (len(data.y), -1)).T,
-                   np.reshape(keep, (len(keep), -1)).T, strict=True)  # fmt: skip
-        for y in (row[use] for row, use in rows):
-            value -= 0.5 * len(y) * (math.log(2 * math.pi * float(np.var(y)) + THRESHOLD.tiny) + 1)
-    return value
 
 
 def place_instants(fit: Fit) -> Fit:

@@ -8,12 +8,11 @@ import numpy as np
 
 from .._base.arrays import Array
 from ..effects.base import name_at_place
-from ..estimation.likelihood.kalman_filter import Noise
 from ..estimation.likelihood.maximization import maximize
 from .candidates import Trial, Work, contains, is_same_kind
 from .fitted_model import Model, compute_criterion, compute_log_terms
 from .noise_tests import run_noise_tests
-from .refitting import refit_candidate, refit_under_noise, weigh_refit
+from .refitting import refit_candidate, weigh_refit
 from .removal import (
     Weighed,
     has_same_noise,
@@ -109,8 +108,8 @@ def find_rivals(best: Trial, others: Sequence[Trial], sure: bool = True) -> tupl
         # A larger model that predicts the same contains the best one, and pays for nothing; but one
         # that gains more may be right (a Stribeck curve hardly told from dry friction), and one
         # whose further part may be large, for all the record says, cannot be excluded. Nor can a
-        # known look-alike that does not contain it: a limit and a dead zone of an input that only
-        # has two values.
+        # known look-alike that does not contain it and is held by no bound: a limit and a gain that
+        # saturates predict the same where the input hardly comes back, whatever more one costs.
         alike = trial.resembles(best)
         larger = contains(trial.effect, best.effect)
         nothing = (
@@ -126,6 +125,10 @@ def find_rivals(best: Trial, others: Sequence[Trial], sure: bool = True) -> tupl
             )
             if share > THRESHOLD.small_part or hinted:
                 found.append(trial)
+            continue
+        equal = nothing and alike and best.gain - trial.gain < THRESHOLD.close
+        if equal and not _is_on_own_bound(trial):
+            found.append(trial)
             continue
         z = vuong_statistic(mine, theirs, best.penalty - trial.penalty)
         doubtful = not sure and alike and trial.net_gain > THRESHOLD.doubtful_rival * best.net_gain
@@ -181,12 +184,13 @@ def compare_effects(
         bare = smaller
         if rest and not has_same_noise(smaller, now):
             bare = refit_without_effect(now, f.position)[0]
-        noise = now.fit.noise
 
-        def refit(t: Trial, bare: Model = bare, noise: Noise = noise) -> Trial:
-            # Beside the random force of the model without it, a rival may stay short of its place.
-            done = refit_candidate(bare, screen_at(bare, t.fitted))
-            return refit_under_noise(bare, done, noise) if done.net_gain > 0 else done
+        def refit(t: Trial, bare: Model = bare, now: Model = now) -> Trial:
+            # From the model without the effect, whose values and noise stand for it, a rival may
+            # stay short of its place, and so it may from the model with it.
+            start = screen_at(bare, t.fitted)
+            both = [refit_candidate(bare, start, near) for near in (None, now)]
+            return max(both, key=lambda t: t.net_gain)
 
         again = work(refit, rest)
         again = [_count_from(t, bare, smaller) for t in again]
@@ -242,6 +246,14 @@ def _count_from(trial: Trial, base: Model, other: Model) -> Trial:
     gain = base.fit.value - other.fit.value
     net = compute_criterion(base) - compute_criterion(other)
     return replace(trial, gain=trial.gain + gain, penalty=trial.penalty + gain - net)
+
+
+def _is_on_own_bound(trial: Trial) -> bool:
+    """Whether a parameter of an effect has come to the end of its range."""
+    problem, theta = trial.model.fit.problem, trial.model.fit.theta
+    ends = zip(trial.model.names, theta, problem.lower, problem.upper, strict=True)
+    return any(v in (low, high) for name, v, low, high in ends
+               if name.startswith(f"{trial.label}."))  # fmt: skip
 
 
 def _find_on_bounds(model: Model) -> set[str]:

@@ -10,6 +10,7 @@ from ..._base.arrays import Array
 from ..._base.criterion import bayesian_penalty
 from ..._base.errors import EffectDoesNotApply, ModelCannotRun
 from ..._base.statistics import pseudo_inverse
+from ...effects.base import AbstractEffect
 from .filter_data import prepare_for_loop
 from .kalman_filter import (
     Noise,
@@ -37,6 +38,7 @@ from .noise.coordinates import (
 )
 from .noise.fit import ENOUGH, fit_noise, try_tails
 from .noise.orders import try_coloured_force, try_coloured_sensor
+from .sampled_plant import SampledPlant
 from .tails import choose_law, compute_information_shares
 
 # A climb ends after at most so many Gauss-Newton steps.
@@ -402,6 +404,7 @@ def _take_step(fit: Fit, matrix: Array, score: Array) -> tuple[Fit, float]:
     for k, step in enumerate(share * whole for share in SHARES):
         theta = np.clip(fit.theta + step, problem.lower, problem.upper)
         try:
+            _refuse_conflicts(problem.plant, theta)
             if not problem.plant.is_built_for(theta):
                 problem, fit = _rebuild_plant(fit, theta)
             trial = evaluate_likelihood(problem, theta, fit.noise, fit.trajectories)
@@ -433,7 +436,17 @@ def _take_second_step(fit: Fit) -> Fit:
     theta = np.clip(there.theta + step, problem.lower, problem.upper)
     if not problem.plant.is_built_for(theta):
         return fit
+    _refuse_conflicts(problem.plant, theta)
     return evaluate_likelihood(problem, theta, there.noise, there.trajectories)
+
+
+def _refuse_conflicts(plant: SampledPlant, theta: Array) -> None:
+    """Refuse values that exclude each other by `EffectDoesNotApply`.
+
+    The likelihood has a value beyond, as with a lower limit above the upper one, but no effect has.
+    """
+    if any(type(e).check is not AbstractEffect.check for e in plant.loop.effects):
+        plant.loop.with_parameters(dict(zip(plant.names, theta.tolist(), strict=True)))
 
 
 def _rebuild_plant(fit: Fit, theta: Array) -> tuple[Problem, Fit]:
