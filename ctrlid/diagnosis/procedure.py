@@ -71,8 +71,8 @@ DIVERGES = (
 
 WRONG_LOG = (
     "THE LOG LOOKS WRONG: {0.words}. So repaired, the record is explained better than by any "
-    "effect of the catalogue, by {0.gain:.0f} of log-likelihood. No effect is named on a record that may "
-    "be wrong: check the log, mend it, and diagnose again."
+    "effect of the catalogue, by {0.gain:.0f} of log-likelihood. No effect is named on a record "
+    "that may be wrong: check the log, mend it, and diagnose again."
 )
 
 IDLE_INPUT = (
@@ -85,9 +85,9 @@ IDLE_INPUT = (
 
 AT_REST = (
     "THE OUTPUT DOES NOT SEEM TO MOVE: a constant and noise explain y as well as the model does "
-    "with any effect of the catalogue. Either the plant is held, by dry friction, a stop or a brake, or "
-    "the actuator or the sensor is off. No effect is named: check the log and the wiring, and "
-    "excite the plant by larger inputs."
+    "with any effect of the catalogue. Either the plant is held, by dry friction, a stop or a "
+    "brake, or the actuator or the sensor is off. No effect is named: check the log and the "
+    "wiring, and excite the plant by larger inputs."
 )
 
 BY_SIMULATION = (

@@ -225,6 +225,12 @@ class Thresholds:
         unit="of log-likelihood",
     )  # fmt: skip
     replicas_beside_kink: int = declare_number(4, cost="so many of those replicas", unit="replicas")
+    replica_sharpness: float = declare_number(
+        16.0, study="friction in a replica is as abrupt as with a period so many times shorter; "
+        "four times as sharp, and what mends a filter's friction gains 4 % more", unit="times",
+    )  # fmt: skip
+    replica_steps: int = declare_number(64, cost="sharp friction would ask for more",
+                               unit="steps of the integration in a period")  # fmt: skip
     replica_rounds: int = declare_number(8, cost="of a model fitted to its replica",
                                 unit="steps of the climb")  # fmt: skip
     shortest_segment: int = declare_number(
