@@ -48,9 +48,13 @@ class PlacedLoop:
 
 
 def list_places(loop: Loop, kind: type[AbstractEffect]) -> list[str]:
-    """Return where an effect may act; nowhere in particular on a plant with one of each."""
+    """Return where an effect may act; nowhere in particular on a plant with one of each.
+
+    A force acts at each velocity of a mechanism, whatever is measured, if it is known which input
+    works there.
+    """
     e = loop.equations()
-    if e.siso:
+    if e.siso and not (kind.place == "force" and e.pushes is not None):
         return [""]
     velocities = [e.states[j] for j in e.velocities]
     names = {"input": e.inputs, "output": e.outputs, "force": velocities, "law": [""]}
