@@ -20,6 +20,7 @@ from ..effects import CATALOGUE, AbstractEffect
 from ..estimation.likelihood.likelihood import make_problem
 from ..loop.loop import Loop
 from ..loop.unit_check import refuse_unit_clashes
+from ..loop.velocities import suppose_force
 from ..loop.wiring import match_signals
 from ..validation.record_audit import Audit
 from ..validation.reproduction import OPEN_LOOP
@@ -88,6 +89,12 @@ AT_REST = (
     "with any effect of the catalogue. Either the plant is held, by dry friction, a stop or a "
     "brake, or the actuator or the sensor is off. No effect is named: check the log and the "
     "wiring, and excite the plant by larger inputs."
+)
+
+SUPPOSED_FORCE = (
+    "{1} is taken for the force at {0}, the only velocity that it accelerates its own way; in the "
+    "mechanism a force there accelerates the other coordinates as well. If that is not so, say "
+    "which input works on which velocity in forces= of the Loop"
 )
 
 BY_SIMULATION = (
@@ -226,6 +233,9 @@ def diagnose(
     for one in records:
         refuse_unit_clashes(given, one)
     loop = with_units_of(given, records[0])
+    supposed = suppose_force(loop.equations(), loop.point)
+    if supposed is not None:
+        loop = replace(loop, forces=dict([supposed]))
     fresh = choose_fresh_data(loop, records, None if validation is None else as_records(validation))
     jobs = check_jobs(jobs)
     shown = Progress(progress)
@@ -258,6 +268,8 @@ def diagnose(
         shown.close()
     if shown.ended:
         result = declare_unfinished(result, shown.ended, shown.spent)
+    if supposed is not None:
+        result = replace(result, notes=(*result.notes, SUPPOSED_FORCE.format(*supposed)))
     return replace(result, audit=(*remarks, *result.audit), record=name_records(records),
                    seconds=time.monotonic() - started)  # fmt: skip
 

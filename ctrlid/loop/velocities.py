@@ -37,6 +37,21 @@ def list_possible_speeds(e: Equations, units: Mapping[str, str]) -> tuple[str, .
     return () if e.velocities else tuple(free)
 
 
+def suppose_force(e: Equations, point: OperatingPoint) -> tuple[str, str] | None:
+    """Return the only velocity that the only input of a mechanism can work on, with that input.
+
+    A force accelerates its own coordinate its own way, and through the mass matrix others either
+    way: where one acceleration of several grows with the input, that is where it works. None where
+    the input accelerates one coordinate alone, or several its own way.
+    """
+    pair = _find_likely_force(e, point) if e.siso and list_unforced_velocities(e) else None
+    if pair is None:
+        return None
+    rows = [e.states.index(name) for name in list_unforced_velocities(e)]
+    gains = compute_state_matrices(e, point)[1][rows, 0]
+    return pair if np.count_nonzero(gains) > 1 and np.count_nonzero(gains > 0) == 1 else None
+
+
 def describe_missing_forces(e: Equations, point: OperatingPoint) -> str:
     """Say what a loop of unforced velocities lacks and what to give, without a full stop."""
     text = (

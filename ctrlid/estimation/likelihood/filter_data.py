@@ -15,6 +15,7 @@ from ...data.reconstruction import count_pieces, reconstruct_signal
 from ...data.record import Record
 from ...data.validity import find_equal_readings, find_runs
 from ...loop.loop import Loop, add_units, find_converter_steps
+from ...loop.period_map import count_forces
 from ...loop.wiring import knows_references, match_signals, stack_references
 from ...physics.equations import Equations
 from ...physics.linearization import compute_state_matrices
@@ -222,8 +223,8 @@ def find_noise_units(loop: Loop, record: Record) -> tuple[Any, Any]:
 
 
 def has_several_noises(e: Equations) -> bool:
-    """Whether the noises are told one by one: of several outputs, and of several states' rates."""
-    return not e.siso or (not e.velocities and len(e.states) - len(e.rest) > 1)
+    """Whether the noises are told one by one: of several outputs, and of several forces."""
+    return not e.siso or count_forces(e) > 1
 
 
 def _find_rate_unit(loop: Loop, state: str) -> str:

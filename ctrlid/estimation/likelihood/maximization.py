@@ -94,7 +94,9 @@ def begin_fit(problem: Problem, theta: Array | None = None, noise: Noise | None 
     found = []
     try:
         fit = _begin_with_noise(problem, theta, noise)
-        if not beside or _stays_inside_domain(fit):
+        # A position that no output shows is guessed to rest, from where a filter may stay lost.
+        hidden = len(problem.plant.e.velocities) > len(problem.plant.e.outputs)
+        if not beside or (_stays_inside_domain(fit) and not hidden):
             return fit
         found.append(fit)
     except ModelCannotRun:
