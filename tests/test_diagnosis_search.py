@@ -49,6 +49,7 @@ from ctrlid.diagnosis.verdict import find_doubt, gap_is_wider, write_conclusion
 from ctrlid.estimation.likelihood.kalman_filter import Noise, guess_trajectory
 from ctrlid.estimation.likelihood.likelihood import make_problem, relinearize_fit
 from ctrlid.estimation.likelihood.maximization import begin_fit, choose_noise, maximize
+from ctrlid.loop.loop import sharpen_effects
 from ctrlid.loop.simulation import Simulator
 from problems import drive, levitation, pendulum, tanks, under_lead
 
@@ -1032,3 +1033,57 @@ def test_a_gap_is_that_of_the_friction_which_was_found():
     assert found.verdict == "explained"
     assert found.gap.after < 1.2 * found.gap.floor
     assert found.gap.before > 20 * found.gap.floor
+
+
+def test_a_look_alike_that_predicts_the_same_is_a_rival_whatever_more_it_costs():
+    """Two limits cost a parameter more than a gain that saturates, and so more on a longer record.
+
+    An input of two values shows both alike: neither can be excluded.
+    """
+    loop = drive()
+    record = record_of(loop, E.InputSaturatingGain(0.4), 0.3, 1e-4, 9350, n=6000)
+    base = fit_base_model(loop, [record], loop.free)
+    low, high = np.quantile(record.u, (0.02, 0.98))
+    gain, limits = (refit_candidate(base, screen_candidate(base, e)) for e in (
+        E.InputSaturatingGain(0.0), E.InputSaturation(float(low), float(high))))  # fmt: skip
+    # The same predictions, at the price of one parameter more than chance would forgive.
+    twin = replace(limits, model=gain.model, label=gain.label, gain=gain.gain,
+                   penalty=gain.penalty + THRESHOLD.close + 1.0)  # fmt: skip
+    assert twin.resembles(gain)
+    assert [t.name for t in find_rivals(gain, [twin])] == ["InputSaturation"]
+    fit = gain.model.fit
+    on_end = replace(fit, theta=np.where([n.startswith(f"{gain.label}.") for n in gain.model.names],
+                                         fit.problem.lower, fit.theta))  # fmt: skip
+    ended = replace(twin, model=replace(gain.model, fit=on_end))
+    assert find_rivals(gain, [ended]) == ()
+
+
+def test_a_replica_of_dry_friction_is_as_abrupt_as_nature():
+    """What mends the filter's smoothing gains on a replica as well, so that it is no evidence.
+
+    A Stribeck curve as narrow as the smoothing sharpens friction: of records from an exact
+    simulation it gains, and has to gain as much on what stands for them.
+    """
+    loop = pendulum()
+    record = record_of(loop, E.CoulombFriction(1.2), 0.05, 2e-5, 9360)
+    base = fit_base_model(loop, [record], loop.free)
+    model = refit_candidate(base, screen_at(base, E.CoulombFriction(1.0))).model
+    sharp = sharpen_effects(model.fitted, 16.0)
+    assert sharpen_effects(loop, 16.0) is loop
+    slow = 0.02 * loop.dt * 1.2  # a speed that the filter takes for nearly at rest
+    rates = [
+        float(e.smoothed(0, [0.0, slow], 0, list(e.parameters.values()), [0, 0])[0][1])
+        for e in (model.fitted.equations(), sharp.equations())
+    ]  # fmt: skip
+    assert rates[1] < 2 * rates[0] < 0
+    gained = []
+    for times in (1.0, THRESHOLD.replica_sharpness):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(
+                replicas, "sharpen_effects", lambda one, _, t=times: sharpen_effects(one, t)
+            )
+            copy = make_replica(model)
+        width = np.sqrt(2 / np.pi) * 0.25 * loop.dt * 1.2
+        finer = refit_candidate(copy, screen_at(copy, E.StribeckFriction(fs=0.2, vs=width)))
+        gained.append(finer.gain)
+    assert gained[1] > gained[0]

@@ -29,7 +29,9 @@ def hill(monkeypatch):
 
         problem = SimpleNamespace(
             lower=np.full(len(theta), lower), upper=np.full(len(theta), upper),
-            plant=SimpleNamespace(is_built_for=lambda theta: True),
+            plant=SimpleNamespace(
+                is_built_for=lambda theta: True, loop=SimpleNamespace(effects=())
+            ),
         )  # fmt: skip
         monkeypatch.setattr(maximum, "evaluate_likelihood", evaluate)
         monkeypatch.setattr(maximum, "relinearize_fit", lambda fit: fit)

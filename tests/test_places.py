@@ -1,5 +1,7 @@
 """Effects at a place: an input, a velocity or an output of a plant with several of them."""
 
+import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import control as ct
@@ -9,7 +11,10 @@ import pytest
 import ctrlid as cid
 from ctrlid import effects as E
 from ctrlid.diagnosis.answer import _list_notes
+from ctrlid.diagnosis.candidates import list_candidates
+from ctrlid.estimation.likelihood.filter_data import find_noise_units
 from ctrlid.loop.loop import write_loop
+from ctrlid.loop.velocities import suppose_force
 from problems import drive
 from test_wiring import CART, DT, QUAD, at_rest, lqr_with_observer, luenberger
 
@@ -183,3 +188,87 @@ def test_a_loop_says_that_it_does_not_know_the_forces_of_its_mechanism():
     chain = ct.nlsys(lambda t, x, u, p: [x[1], x[2], u[0]], lambda t, x, u, p: x[0],
                      inputs=["u"], outputs=["y"], states=["a", "b", "c"], name="chain")  # fmt: skip
     assert "forces=" not in str(cid.Loop(chain, dt=DT))
+
+
+def test_a_mechanism_seen_by_one_output_has_its_forces_at_each_velocity():
+    one = ct.nlsys(
+        lambda t, x, u, p: [x[2], x[3], 2 * u[0] - x[1], 30 * x[1] - 5 * u[0]],
+        lambda t, x, u, p: x[0], inputs=["F"], outputs=["x"], states=CART.state_labels, name="cart",
+    )  # fmt: skip
+    bare = cid.Loop(one, dt=DT)
+    record = cid.Record(u=np.zeros(50), y=np.zeros(50), dt=DT)
+    assert [e.at for e in list_candidates([E.ViscousFriction], bare, record)] == [""]
+    assert suppose_force(bare.equations(), bare.point) == ("x_dot", "F")
+    known = replace(bare, forces={"x_dot": "F"})
+    assert suppose_force(known.equations(), known.point) is None
+    found = list_candidates([E.ViscousFriction, E.InputOffset], known, record)
+    assert [(type(e).__name__, e.at) for e in found] == [
+        ("ViscousFriction", "x_dot"), ("ViscousFriction", "theta_dot"), ("InputOffset", "")
+    ]  # fmt: skip
+    # The unit of each random force is told.
+    assert len(find_noise_units(known, record)[1]) == 2
+    # Two masses on a spring: the force accelerates its own mass alone, as a friction there does.
+    chain = ct.nlsys(
+        lambda t, x, u, p: [x[1], u[0] - 30 * (x[0] - x[2]), x[3], 30 * (x[0] - x[2])],
+        lambda t, x, u, p: x[0], inputs=["F"], outputs=["a"],
+        states=["a", "a_dot", "b", "b_dot"], name="chain",
+    )  # fmt: skip
+    two = cid.Loop(chain, dt=DT)
+    assert suppose_force(two.equations(), two.point) is None
+    # A torque that accelerates both its own way may be the force at either.
+    both = ct.nlsys(
+        lambda t, x, u, p: [x[1], 2 * u[0], x[3], u[0]], lambda t, x, u, p: x[0],
+        inputs=["F"], outputs=["a"], states=["a", "a_dot", "b", "b_dot"], name="both",
+    )  # fmt: skip
+    either = cid.Loop(both, dt=DT)
+    assert suppose_force(either.equations(), either.point) is None
+
+
+def test_dry_friction_of_a_cart_is_named_at_the_cart_by_its_position_alone():
+    """The rig is simulated here: a cart of 0.5 kg, 20 mN of friction, a pole, state feedback.
+
+    Friction that did not push the pole was named beside a saturating gain and a dead zone.
+    """
+    heavy, light, length, g, dt = 0.5, 0.2, 0.3, 9.81, 0.005
+    rng = np.random.default_rng(3)
+    gains = np.array([-4.47, -4.77, -31.7, -5.67])
+    x, steps = np.zeros(4), 20
+    n = 2400
+    r = np.repeat(rng.choice([-0.15, 0.15], n // 100 + 1), 100)[:n]
+    u, y = np.zeros(n), np.zeros(n)
+
+    def move(state, force):
+        _, v, th, om = state
+        c, s = math.cos(th), math.sin(th)
+        push = force - 0.02 * math.tanh(v / 2e-3)
+        d = heavy + light * s * s
+        a = (push + light * s * (length * om**2 - g * c)) / d
+        b = ((heavy + light) * g * s - c * (push + light * length * om**2 * s)) / (length * d)
+        return np.array([v, a, om, b])
+
+    for k in range(n):
+        y[k] = x[0] + 2e-4 * rng.standard_normal()
+        u[k] = float(np.clip(-gains @ (x - [r[k], 0, 0, 0]), -15, 15))
+        for _ in range(steps):
+            h = dt / steps
+            middle = x + h / 2 * move(x, u[k])
+            x = x + h * move(middle, u[k])
+    assert np.abs(x).max() < 1.0
+
+    def rates(t, x, u, p):
+        c, s = np.cos(x[2]), np.sin(x[2])
+        d = p["M"] + light * s**2
+        a = (u[0] + light * s * (length * x[3] ** 2 - g * c)) / d
+        b = ((p["M"] + light) * g * s - c * (u[0] + light * length * x[3] ** 2 * s)) / (length * d)
+        return [x[1], a, x[3], b]
+
+    plant = ct.nlsys(rates, lambda t, x, u, p: x[0], inputs=["F"], outputs=["s"],
+                     states=["s", "v", "th", "om"], params={"M": heavy}, name="cart")  # fmt: skip
+    few = [E.CoulombFriction, E.ViscousFriction, E.InputSaturatingGain, E.InputDeadZone]
+    found = cid.diagnose(cid.Loop(plant, dt=dt, free=("M",)), cid.Record(u=u, y=y, r=r, dt=dt),
+                         catalogue=few, progress=False)  # fmt: skip
+    assert found.verdict == "explained", str(found)
+    assert [f.names for f in found.findings] == [("CoulombFriction at v",)]
+    assert found.findings[0].effect.fc == pytest.approx(0.02, rel=0.05)
+    assert any("F is taken for the force at v" in note for note in found.notes)
+    assert found.gap.after < 1.5 * found.gap.floor
