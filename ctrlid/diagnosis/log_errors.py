@@ -11,6 +11,7 @@ from .._base.errors import ModelCannotRun
 from ..data.record import Record
 from ..estimation.likelihood.maximization import choose_sensor_noise
 from ..loop.loop import Loop
+from ..loop.period_map import comes_to_rest
 from ..validation.record_audit import Audit
 from .fitted_model import compute_penalized_likelihood
 from .recalibration import fit_base_model, recalibrate
@@ -130,19 +131,20 @@ def seems_idle(
     -------
     bool
         Whether the plant alone, its input at rest, does better by far than with the input, and no
-        worse than with what was found. False of several signals, which are not asked.
+        worse than with what was found. False of several signals, which are not asked, and of a
+        plant that would not stay where it is with its input at rest.
     """
-    if not loop.equations().siso:
+    if not loop.equations().siso or not comes_to_rest(replace(loop, controller=None)):
         return False
     # It stands at rest, or where it is on average, or it is off.
     levels = {loop.point.input, float(np.mean([np.mean(r.u) for r in records])), 0.0}
     heads = [r[: THRESHOLD.log_error_samples] for r in records]
-    stood, level = max((_measure(loop, _hold(heads, v), None), v) for v in levels)
+    stood = max(_measure(loop, _hold(heads, v), None) for v in levels)
     if stood < _measure(loop, heads, None) + THRESHOLD.gate:
         return False
-    moved, stood = (_measure(loop, part, audits, coloured=True)
-                    for part in (records, _hold(records, level)))  # fmt: skip
-    return stood > moved + THRESHOLD.gate and stood >= reached
+    moved = _measure(loop, records, audits, coloured=True)
+    stood = max(_measure(loop, _hold(records, v), audits, coloured=True) for v in levels)
+    return stood > max(moved + THRESHOLD.gate, reached - THRESHOLD.close)
 
 
 def _hold(records: Sequence[Record], level: float) -> list[Record]:
