@@ -30,7 +30,8 @@ def hill(monkeypatch):
         problem = SimpleNamespace(
             lower=np.full(len(theta), lower), upper=np.full(len(theta), upper),
             plant=SimpleNamespace(
-                is_built_for=lambda theta: True, loop=SimpleNamespace(effects=())
+                is_built_for=lambda theta: True, loop=SimpleNamespace(labelled={}),
+                names=tuple(f"p{k}" for k in range(len(theta))),
             ),
         )  # fmt: skip
         monkeypatch.setattr(maximum, "evaluate_likelihood", evaluate)

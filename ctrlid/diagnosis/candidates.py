@@ -14,7 +14,7 @@ from ..effects import AbstractEffect
 from ..effects.base import name_at_place
 from ..estimation.likelihood.sampled_plant import Trajectory
 from .fitted_model import Model, keep_information
-from .places import list_placed_candidates, list_places
+from .places import list_placed_candidates, needs_place
 
 # A map that may run in parallel: ``work(function, items)``.
 Work = Callable[[Callable[..., Any], Iterable[Any]], list[Any]]
@@ -152,10 +152,10 @@ def list_candidates(
     """Return every effect of a catalogue that a plant can have, at its start."""
     found: list[AbstractEffect] = []
     for kind in catalogue:
-        if list_places(loop, kind) == [""]:
-            found += kind.candidates(loop, record)
-        else:
+        if needs_place(loop, kind):
             found += list_placed_candidates(kind, loop, record)
+        else:
+            found += kind.candidates(loop, record)
     return found
 
 

@@ -314,9 +314,15 @@ def simulate_window(loop: Loop, window: Window, how: Reproduction) -> Array:
     return y
 
 
-def make_simulator(loop: Loop, hold: str = "zoh", hold_r: str = "zoh") -> Simulator:
-    """Return a loop made ready to be simulated many times, as exactly as a gap needs."""
-    return Simulator(loop, THRESHOLD.gap_integration_error, THRESHOLD.gap_steps, hold, hold_r)
+def make_simulator(
+    loop: Loop, hold: str = "zoh", hold_r: str = "zoh", most: int | None = None
+) -> Simulator:
+    """Return a loop made ready to be simulated many times, as exactly as a gap needs.
+
+    In at `most` so many steps of the integration in a period, by default as a gap.
+    """
+    most = THRESHOLD.gap_steps if most is None else most
+    return Simulator(loop, THRESHOLD.gap_integration_error, most, hold, hold_r)
 
 
 @dataclass(frozen=True)

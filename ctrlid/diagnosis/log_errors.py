@@ -55,9 +55,42 @@ REPAIRS = (
 EARLY = "y is logged one sample early, or u one sample late"
 
 
-def find_log_error(
-    loop: Loop, records: Sequence[Record], audits: Sequence[Audit], reached: float
-) -> LogError | None:
+@dataclass(frozen=True, eq=False)
+class Log:
+    """Records of a plant with one input and output, in whose log an error may be.
+
+    Parameters
+    ----------
+    loop : Loop
+        The model as given.
+    records : sequence of Record
+        The data as logged.
+    audits : sequence of Audit
+        What the records show by themselves.
+    reached : float
+        Penalized log-likelihood of the model that the search ended with.
+    """
+
+    loop: Loop
+    records: Sequence[Record]
+    audits: Sequence[Audit]
+    reached: float
+
+    @property
+    def heads(self) -> list[Record]:
+        """The first part of each record."""
+        return [r[: THRESHOLD.log_error_samples] for r in self.records]
+
+    @functools.cached_property
+    def least(self) -> float:
+        """What a repair of the heads has to exceed to be fitted to whole records.
+
+        The heads are fitted at the given values, with the noise alone free: a gross error shows.
+        """
+        return _measure(self.loop, self.heads, None) + THRESHOLD.gate
+
+
+def find_log_error(log: Log) -> LogError | None:
     r"""Return the gross error of the log that explains records better than what was found.
 
     A repair multiplies u by a factor, or y and r, or logs y a sample later. (A sample earlier would
@@ -71,34 +104,23 @@ def find_log_error(
 
     Parameters
     ----------
-    loop : Loop
-        The model as given.
-    records : sequence of Record
-        The data as logged.
-    audits : sequence of Audit
-        What the records show by themselves.
-    reached : float
-        Penalized log-likelihood of the model that the search ended with.
+    log : Log
+        The records and what the search made of them.
 
     Returns
     -------
     LogError or None
-        The best repair, with those that do as well in the same sentence; None if none helps, or
-        of several signals, which are not asked.
+        The best repair, with those that do as well in the same sentence; None if none helps.
     """
-    if not loop.equations().siso:
-        return None
-    # The heads are fitted at the given values, with the noise alone free: a gross error shows.
-    heads = [r[: THRESHOLD.log_error_samples] for r in records]
-    as_logged = _measure(loop, heads, None)
+    loop, heads = log.loop, log.heads
     found: list[tuple[float, str]] = []
     for words, repair, factor, early in _list_repairs():
-        left_out = early * len(records)
-        head = _measure(loop, [repair(r) for r in heads], None, factor, left_out)
-        if head < as_logged + THRESHOLD.gate:
+        left_out = early * len(heads)
+        if _measure(loop, [repair(r) for r in heads], None, factor, left_out) < log.least:
             continue
-        value = _measure(loop, [repair(r) for r in records], audits, factor, left_out)
-        found.append((value - reached, words))
+        whole = [repair(r) for r in log.records]
+        value = _measure(loop, whole, log.audits, factor, left_out)
+        found.append((value - log.reached, words))
     gains = [gain for gain, _ in found]
     best = max(gains, default=-math.inf)
     if not best > THRESHOLD.gate:
@@ -108,9 +130,7 @@ def find_log_error(
     return LogError(", or ".join(same), best)
 
 
-def seems_idle(
-    loop: Loop, records: Sequence[Record], audits: Sequence[Audit], reached: float
-) -> bool:
+def seems_idle(log: Log) -> bool:
     """Whether records are explained by an input that stands still as well as by what was found.
 
     Then nothing of the logged input reaches the plant, and all that makes it do nothing explains
@@ -118,33 +138,26 @@ def seems_idle(
 
     Parameters
     ----------
-    loop : Loop
-        The model as given.
-    records : sequence of Record
-        The data as logged.
-    audits : sequence of Audit
-        What the records show by themselves.
-    reached : float
-        Penalized log-likelihood of the model that the search ended with.
+    log : Log
+        The records and what the search made of them.
 
     Returns
     -------
     bool
         Whether the plant alone, its input at rest, does better by far than with the input, and no
-        worse than with what was found. False of several signals, which are not asked, and of a
-        plant that would not stay where it is with its input at rest.
+        worse than with what was found. False of a plant that would not stay where it is with its
+        input at rest.
     """
-    if not loop.equations().siso or not comes_to_rest(replace(loop, controller=None)):
+    loop, records, audits = log.loop, log.records, log.audits
+    if not comes_to_rest(replace(loop, controller=None)):
         return False
     # It stands at rest, or where it is on average, or it is off.
     levels = {loop.point.input, float(np.mean([np.mean(r.u) for r in records])), 0.0}
-    heads = [r[: THRESHOLD.log_error_samples] for r in records]
-    stood = max(_measure(loop, _hold(heads, v), None) for v in levels)
-    if stood < _measure(loop, heads, None) + THRESHOLD.gate:
+    if max(_measure(loop, _hold(log.heads, v), None) for v in levels) < log.least:
         return False
     moved = _measure(loop, records, audits, coloured=True)
     stood = max(_measure(loop, _hold(records, v), audits, coloured=True) for v in levels)
-    return stood > max(moved + THRESHOLD.gate, reached - THRESHOLD.close)
+    return stood > max(moved + THRESHOLD.gate, log.reached - THRESHOLD.close)
 
 
 def _hold(records: Sequence[Record], level: float) -> list[Record]:

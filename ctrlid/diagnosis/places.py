@@ -47,14 +47,20 @@ class PlacedLoop:
         return self.loop.with_effect(replace(effect, at=self.at))
 
 
-def list_places(loop: Loop, kind: type[AbstractEffect]) -> list[str]:
-    """Return where an effect may act; nowhere in particular on a plant with one of each.
+def needs_place(loop: Loop, kind: type[AbstractEffect]) -> bool:
+    """Whether an effect has to say where it acts, as it has on a plant with several signals.
 
     A force acts at each velocity of a mechanism, whatever is measured, if it is known which input
     works there.
     """
     e = loop.equations()
-    if e.siso and not (kind.place == "force" and e.pushes is not None):
+    return not e.siso or (kind.place == "force" and e.pushes is not None)
+
+
+def list_places(loop: Loop, kind: type[AbstractEffect]) -> list[str]:
+    """Return where an effect may act; nowhere in particular on a plant with one of each."""
+    e = loop.equations()
+    if not needs_place(loop, kind):
         return [""]
     velocities = [e.states[j] for j in e.velocities]
     names = {"input": e.inputs, "output": e.outputs, "force": velocities, "law": [""]}

@@ -45,7 +45,7 @@ from .growth import (
     refuse_false_noise,
     search_effects,
 )
-from .log_errors import find_log_error, seems_idle
+from .log_errors import Log, find_log_error, seems_idle
 from .open_loop_search import search_by_simulation
 from .progress import Progress
 from .recalibration import recalibrate
@@ -313,11 +313,13 @@ def _answer_question(q: Question) -> tuple[Diagnosis, Search]:
         def look() -> str:
             if compute_null_likelihood(search.final.fit) >= reached:
                 return AT_REST
-            asked = readout.loop, readout.records, q.audits, reached
-            wrong = find_log_error(*asked)
+            if not readout.loop.equations().siso:
+                return ""
+            log = Log(readout.loop, readout.records, q.audits, reached)
+            wrong = find_log_error(log)
             if wrong is not None:
                 return WRONG_LOG.format(wrong)
-            return IDLE_INPUT if seems_idle(*asked) else ""
+            return IDLE_INPUT if seems_idle(log) else ""
 
         if search.finished:
             wrong = q.attempt(look, "")
@@ -384,7 +386,7 @@ def _search_again(
 
 
 def _blame_log(q: Question, search: Search, sentence: str) -> tuple[Diagnosis, Search]:
-    """Answer that the log is wrong: nothing is named on a record that contradicts itself."""
+    """Answer that the log is at fault: nothing is named on a record that cannot be trusted."""
     q.settle()
     empty = replace(search, final=search.base, found=(), after=search.before)
     summary = summarize_gap(q.loop, empty, q.fresh)

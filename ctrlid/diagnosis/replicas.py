@@ -22,12 +22,11 @@ from ..estimation.likelihood.likelihood import (
 from ..estimation.likelihood.maximization import begin_fit, maximize
 from ..loop.loop import Loop, find_converter_steps, sharpen_effects
 from ..loop.period_map import comes_to_rest
-from ..loop.simulation import Simulator
 from ..validation.record_simulation import find_long_stretches, prepare_stretch
 from ..validation.reproduction import choose_reproduction
 from .candidates import Trial
 from .fitted_model import Model, can_simulate, carry_over_fit
-from .gap import draw_noise
+from .gap import draw_noise, make_simulator
 from .noise_tests import NoiseTests, run_noise_tests
 from .refitting import refit_candidate
 from .screening import screen_at
@@ -100,8 +99,7 @@ def _simulate_record(
     # A filter smooths what is abrupt over a part of a period. What an effect gains by mending that
     # is no evidence for it, and shows on records that are simulated as abruptly as nature acts.
     loop = sharpen_effects(loop, THRESHOLD.replica_sharpness)
-    simulator = Simulator(loop, THRESHOLD.gap_integration_error, THRESHOLD.replica_steps,
-                          record.hold, record.hold_r)  # fmt: skip
+    simulator = make_simulator(loop, record.hold, record.hold_r, THRESHOLD.replica_steps)
     y, u = np.array(record.y), np.array(record.u)
     for part in find_long_stretches(record, THRESHOLD.shortest_segment):
         stretch = prepare_stretch(simulator, record, part, start_time=first, follow=follows)

@@ -127,7 +127,8 @@ def find_rivals(best: Trial, others: Sequence[Trial], sure: bool = True) -> tupl
                 found.append(trial)
             continue
         equal = nothing and alike and best.gain - trial.gain < THRESHOLD.close
-        if equal and not _is_on_own_bound(trial):
+        ended = [n for n in _find_on_bounds(trial.model) if n.startswith(f"{trial.label}.")]
+        if equal and not ended:
             found.append(trial)
             continue
         z = vuong_statistic(mine, theirs, best.penalty - trial.penalty)
@@ -194,7 +195,8 @@ def compare_effects(
 
         again = work(refit, rest)
         again = [_count_from(t, bare, smaller) for t in again]
-        again = [t for t in again if _find_on_bounds(t.model) <= _find_on_bounds(mine.model)]
+        ended = _find_plant_on_bounds(mine.model)
+        again = [t for t in again if _find_plant_on_bounds(t.model) <= ended]
         best = max([mine, *again], key=lambda t: t.net_gain)
         if best.net_gain <= mine.net_gain + THRESHOLD.taken_by_better:
             best = mine
@@ -248,19 +250,16 @@ def _count_from(trial: Trial, base: Model, other: Model) -> Trial:
     return replace(trial, gain=trial.gain + gain, penalty=trial.penalty + gain - net)
 
 
-def _is_on_own_bound(trial: Trial) -> bool:
-    """Whether a parameter of an effect has come to the end of its range."""
-    problem, theta = trial.model.fit.problem, trial.model.fit.theta
-    ends = zip(trial.model.names, theta, problem.lower, problem.upper, strict=True)
-    return any(v in (low, high) for name, v, low, high in ends
-               if name.startswith(f"{trial.label}."))  # fmt: skip
+def _find_plant_on_bounds(model: Model) -> set[str]:
+    """Return the plant's own parameters that are as far from their given values as is allowed."""
+    return {name for name in _find_on_bounds(model) if "." not in name}
 
 
 def _find_on_bounds(model: Model) -> set[str]:
-    """Return the plant's own parameters that are as far from their given values as is allowed."""
+    """Return the parameters that have come to an end of their range."""
     problem, theta = model.fit.problem, model.fit.theta
     ends = zip(model.names, theta, problem.lower, problem.upper, strict=True)
-    return {name for name, v, low, high in ends if "." not in name and v in (low, high)}
+    return {name for name, v, low, high in ends if v in (low, high)}
 
 
 def _find_close(mine: Trial, steps: Sequence[Round]) -> list[Trial]:

@@ -209,11 +209,13 @@ class Loop(Printed):
                 raise CtrlidError(f"input_limits needs lower < upper; given ({low:g}, {high:g})")
         return tuple(tuple(v.tolist()) if v.ndim else float(v) for v in (lower, upper))
 
-    def _apply_effects(self, like: "Loop | None" = None) -> None:
+    def _apply_effects(self, like: "Loop | None" = None, period: float | None = None) -> None:
         """Put the effects into the equations and see that the free parameters exist.
 
-        Where a loop `like` this one has the same effects at work, its equations are taken over.
+        Where a loop `like` this one has the same effects at work, its equations are taken over. The
+        `period` that effects are told of is the sampling period by default.
         """
+        period = self.dt if period is None else period
         for name in ("effects", "free"):
             given = getattr(self, name)
             if not isinstance(given, AbstractEffect) and not is_iterable(given):
@@ -228,7 +230,7 @@ class Loop(Printed):
             )
         object.__setattr__(self, "effects", effects)
         plant, at = self._shift_to_absolute(), self._bare_point
-        kept = compose_effects(plant, self.labelled, at, self.dt)
+        kept = compose_effects(plant, self.labelled, at, period)
         active = {label: e for label, e in self.labelled.items() if not e.neutral}
         object.__setattr__(self, "_kept", kept)
         if len(active) == len(effects):
@@ -236,7 +238,7 @@ class Loop(Printed):
         elif like is not None and self._has_same_at_work(like):
             changed = like._active
         else:
-            changed = compose_effects(plant, active, at, self.dt)
+            changed = compose_effects(plant, active, at, period)
         object.__setattr__(self, "_active", changed)
         free: Any = (self.free,) if isinstance(self.free, str) else self.free
         free = dict(free) if isinstance(free, Mapping) else tuple(free)
@@ -475,17 +477,13 @@ class Loop(Printed):
         of_plant = {k: float(v) for k, v in values.items() if k in self._traced.parameters}
         if not np.isfinite(list(of_plant.values())).all():
             raise CtrlidError(f"plant parameters are finite numbers; given {of_plant}")
-        effects = [
-            replace(e, **{name: values[f"{label}.{name}"] for name in e.values()
-                          if f"{label}.{name}" in values})
-            for label, e in self.labelled.items()
-        ]  # fmt: skip
+        effects = replace_effect_values(self, values)
         if not of_plant:
-            return self._replace_fields(effects=tuple(effects))
+            return self._replace_fields(effects=effects)
         own = self._traced
         traced = own.with_values({**own.parameters, **of_plant}, own.rest)
         return self._replace_fields(
-            plant=with_parameters(self.plant, of_plant), _traced=traced, effects=tuple(effects)
+            plant=with_parameters(self.plant, of_plant), _traced=traced, effects=effects
         )
 
     def _replace_fields(self, **changes: Any) -> "Loop":
@@ -748,6 +746,21 @@ def find_converter_steps(loop: Loop) -> tuple[float, ...]:
     return tuple(steps.values())
 
 
+def replace_effect_values(loop: Loop, values: Mapping[str, float]) -> tuple[AbstractEffect, ...]:
+    """Return the effects of a loop with other values, by the names of `Loop.parameters`.
+
+    Raises
+    ------
+    CtrlidError
+        If an effect cannot have its values.
+    """
+    return tuple(
+        replace(e, **{name: values[f"{label}.{name}"] for name in e.values()
+                      if f"{label}.{name}" in values})
+        for label, e in loop.labelled.items()
+    )  # fmt: skip
+
+
 def sharpen_effects(loop: Loop, times: float) -> Loop:
     """Return a loop whose effects act as abruptly as with a period so many times shorter.
 
@@ -771,8 +784,5 @@ def sharpen_effects(loop: Loop, times: float) -> Loop:
         return loop
     new = object.__new__(Loop)
     new.__dict__.update(loop.__dict__)
-    plant, at = loop._shift_to_absolute(), loop._bare_point
-    active = {label: e for label, e in loop.labelled.items() if not e.neutral}
-    for name, effects in (("_kept", loop.labelled), ("_active", active)):
-        object.__setattr__(new, name, compose_effects(plant, effects, at, loop.dt / times))
+    new._apply_effects(period=loop.dt / times)
     return new

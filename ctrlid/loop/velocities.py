@@ -5,6 +5,7 @@ from collections.abc import Mapping
 import casadi
 import numpy as np
 
+from .._base.arrays import Array
 from .._base.text import write_list
 from ..effects.context import find_motion
 from ..physics.equations import Equations, may_be_speed
@@ -47,8 +48,7 @@ def suppose_force(e: Equations, point: OperatingPoint) -> tuple[str, str] | None
     pair = _find_likely_force(e, point) if e.siso and list_unforced_velocities(e) else None
     if pair is None:
         return None
-    rows = [e.states.index(name) for name in list_unforced_velocities(e)]
-    gains = compute_state_matrices(e, point)[1][rows, 0]
+    gains = _compute_gains(e, point)
     return pair if np.count_nonzero(gains) > 1 and np.count_nonzero(gains > 0) == 1 else None
 
 
@@ -79,6 +79,12 @@ def describe_possible_speeds(speeds: tuple[str, ...]) -> str:
     )
 
 
+def _compute_gains(e: Equations, point: OperatingPoint) -> Array:
+    """Return what each input adds to the rates of the unforced velocities."""
+    rows = [e.states.index(name) for name in list_unforced_velocities(e)]
+    return np.asarray(compute_state_matrices(e, point)[1][rows])
+
+
 def _find_likely_force(e: Equations, point: OperatingPoint) -> tuple[str, str] | None:
     """Return a velocity and an input that may be the force at it; None where no input can be.
 
@@ -90,8 +96,7 @@ def _find_likely_force(e: Equations, point: OperatingPoint) -> tuple[str, str] |
     slopes = casadi.jacobian(e.rhs, e.u)
     if any(casadi.depends_on(slopes[:, k], e.u[k]) for k in range(len(e.inputs))):
         return None
-    rows = [e.states.index(name) for name in names]
-    gain = compute_state_matrices(e, point)[1][rows]
+    gain = _compute_gains(e, point)
     if len(e.inputs) == 1:
         pushed = [name for name, value in zip(names, gain[:, 0], strict=True) if value > 0]
         return (pushed[0], e.inputs[0]) if pushed else None

@@ -10,7 +10,7 @@ from ..._base.arrays import Array
 from ..._base.criterion import bayesian_penalty
 from ..._base.errors import EffectDoesNotApply, ModelCannotRun
 from ..._base.statistics import pseudo_inverse
-from ...effects.base import AbstractEffect
+from ...loop.loop import replace_effect_values
 from .filter_data import prepare_for_loop
 from .kalman_filter import (
     Noise,
@@ -447,8 +447,7 @@ def _refuse_conflicts(plant: SampledPlant, theta: Array) -> None:
 
     The likelihood has a value beyond, as with a lower limit above the upper one, but no effect has.
     """
-    if any(type(e).check is not AbstractEffect.check for e in plant.loop.effects):
-        plant.loop.with_parameters(dict(zip(plant.names, theta.tolist(), strict=True)))
+    replace_effect_values(plant.loop, dict(zip(plant.names, theta.tolist(), strict=True)))
 
 
 def _rebuild_plant(fit: Fit, theta: Array) -> tuple[Problem, Fit]:
