@@ -36,9 +36,10 @@ from ctrlid.diagnosis.growth import (
 )
 from ctrlid.diagnosis.hindsight import find_better_choice
 from ctrlid.diagnosis.noise_tests import NoiseTests, _compute_force_deviates, run_noise_tests
+from ctrlid.diagnosis.ordering import order_last_effect
 from ctrlid.diagnosis.recalibration import fit_base_model
 from ctrlid.diagnosis.refitting import place_instants, refit_candidate, refit_under_noise
-from ctrlid.diagnosis.removal import fuse_effects, order_last_effect, refit_without_effect
+from ctrlid.diagnosis.removal import fuse_effects, refit_without_effect
 from ctrlid.diagnosis.replicas import make_replica
 from ctrlid.diagnosis.rivals import _find_close, find_rivals
 from ctrlid.diagnosis.scans import scan_candidate
@@ -935,6 +936,27 @@ def test_effects_at_one_place_end_in_the_order_in_which_they_act(order):
         model = fit_base_model(both, [record], (*loop.free, *own))
         names = [type(e).__name__ for e in order_last_effect(model, given=0).fitted.effects]
         assert names == [type(hidden[k]).__name__ for k in order]
+
+
+@pytest.mark.parametrize("seed", [9950, 9960])
+def test_a_lag_behind_a_curve_of_the_input_is_not_taken_for_one_of_the_sensor(seed):
+    """On a linear plant a lag behind the curve and one of the sensor are the same."""
+    plant = ct.nlsys(
+        lambda t, x, u, p: np.array([x[1], u[0] - 40.0 * x[0] - p["c"] * x[1]]),
+        lambda t, x, u, p: x[0], inputs=["F"], outputs=["x"], states=["x", "v"],
+        params={"c": 2.0}, name="spring",
+    )  # fmt: skip
+    loop = cid.Loop(plant, dt=0.02, at=cid.OperatingPoint((0.0, 0.0), 0.0, 0.0), free=("c",))
+    real = loop.with_effect(E.ActuatorLag(0.15)).with_effect(E.InputNonlinearity(0.3))
+    u = cid.random_binary(1500, amplitude=1.0, hold=15, around=0.5, seed=seed)
+    u = u + 0.5 * cid.random_binary(1500, amplitude=1.0, hold=40, around=0.0, seed=seed + 1)
+    record = cid.simulate(real, d=u, sensor_noise=1e-3, seed=seed + 2)
+    catalogue = (E.ActuatorLag, E.InputNonlinearity, E.SensorLag, E.InputDelay)
+    found = cid.diagnose(loop, record, catalogue=catalogue, progress=False)
+    sets = [set(f.names) for f in found.findings]
+    assert found.verdict == "explained" and len(sets) == 2
+    assert any("ActuatorLag" in s for s in sets)
+    assert any("InputNonlinearity" in s for s in sets)
 
 
 def test_an_order_that_makes_no_difference_is_kept():

@@ -204,12 +204,32 @@ def test_the_point_has_the_rest_of_the_effects_states():
 
 
 def test_the_order_of_places_does_not_depend_on_the_order_of_effects():
-    several = (E.EddyCurrentDamping(0.3), E.ActuatorLag(0.003), E.InputSaturation(2.0, 4.0),
+    several = (E.EddyCurrentDamping(0.3), E.InputDelay(0.003), E.InputSaturation(2.0, 4.0),
                E.ForceExponent(2.2), E.SensorLag(0.001), E.PositionOffset(1e-4))  # fmt: skip
     r = cid.random_binary(300, amplitude=1e-4, hold=10, around=0.012, seed=1)
     one = cid.simulate(levitated(effects=several), r)
     two = cid.simulate(levitated(effects=several[::-1]), r)
     np.testing.assert_allclose(one.y, two.y, rtol=1e-9)
+
+
+def test_of_a_curve_and_a_lag_the_one_given_last_is_furthest_from_the_plant():
+    """A step u behind the lag tau has moved by u (1 - exp(-t / tau)), squared or not."""
+    tau, c, dt, u = 0.02, 0.5, 0.01, 2.0
+    plant = ct.nlsys(lambda t, x, u, p: u - 50.0 * x, outputs=["y"], inputs=["u"], states=["y"],
+                     name="tank")  # fmt: skip
+    loop = cid.Loop(plant, dt=dt, at=cid.OperatingPoint((0.0,), 0.0, 0.0))
+    t = dt * np.arange(60)
+    lagged = u * (1 - np.exp(-t / tau))
+    effects = E.ActuatorLag(tau), E.InputNonlinearity(c)
+    for order, reached in ((effects, (u + c * u**2) / u * lagged),
+                           (effects[::-1], lagged + c * lagged**2)):  # fmt: skip
+        changed = loop
+        for effect in order:
+            changed = changed.with_effect(effect)
+        y = cid.simulate(changed, d=np.full(60, u)).y
+        # The plant holds still where what reaches it, less 50 y, is the rate of y.
+        rate = np.gradient(y, dt, edge_order=2)
+        np.testing.assert_allclose(rate[3:-3] + 50 * y[3:-3], reached[3:-3], rtol=0.03)
 
 
 def test_other_values_keep_the_formulas_and_nothing_else():

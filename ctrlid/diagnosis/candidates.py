@@ -100,6 +100,11 @@ class Trial:
         return self.gain - self.penalty
 
     @property
+    def position(self) -> int:
+        """Where among the effects of its model it is, counted from the plant."""
+        return list(self.model.loop.labelled).index(self.label)
+
+    @property
     def fitted(self) -> AbstractEffect:
         """The effect with its fitted parameters."""
         return self.model.fitted.labelled[self.label]

@@ -1,9 +1,9 @@
-"""Step 7: what the model does without: superfluous effects, two that are one, their order."""
+"""Step 7: what the model does without: superfluous effects, and two that are one."""
 
 import contextlib
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from .._base.criterion import bayesian_penalty
@@ -28,6 +28,7 @@ from .fitted_model import (
     with_linearization,
 )
 from .information import estimate_need
+from .ordering import rename_labels
 from .refitting import refit_candidate, weigh_refit
 from .screening import screen_at
 from .selection import Round
@@ -263,59 +264,3 @@ def drop_unseen_values(model: Model, given: int) -> Model:
             if fit.value + bayesian_penalty(1, fit.size) > model.fit.value:
                 return drop_unseen_values(Model(loop, drop_linearization(fit)), given)
     return model
-
-
-def order_last_effect(model: Model, given: int) -> Model:
-    """Return the model with its last effect nearer to the plant, if it fits better there.
-
-    What is found last was found second, which says nothing of where it acts: a valve may have its
-    dead zone before the offset or behind it, and in the wrong order both end beside their values.
-
-    Parameters
-    ----------
-    model : Model
-        The model to which an effect was added last.
-    given : int
-        Effects that it had from the beginning, whose order is known.
-
-    Returns
-    -------
-    Model
-        The order that is likelier by more than 3 units, or the model as it is.
-    """
-    *others, last = model.fitted.effects
-    if not last.ordered:
-        return model
-    best = model
-    for k in range(given, len(others)):
-        if others[k].stage != last.stage:
-            continue
-        tried = move_last_effect(model, k)
-        if math.isfinite(tried.fit.value):
-            tried = replace(
-                tried, fit=maximize(tried.fit, rounds=THRESHOLD.removal_rounds, exact=False)
-            )
-        best = max(best, tried, key=lambda m: m.fit.value)
-    return best if best.fit.value > model.fit.value + THRESHOLD.close else model
-
-
-def move_last_effect(model: Model, position: int) -> Model:
-    """Return the model with its last effect at another position among the effects, all else as is.
-
-    The likelihood is minus infinity if the filter cannot follow the record then.
-    """
-    fitted = model.fitted
-    last = len(fitted.effects) - 1
-    order = [*range(position), last, *range(position, last)]
-    labels = list(fitted.labelled)
-    loop = replace(fitted, effects=tuple(fitted.effects[k] for k in order), free=())
-    renamed = dict(zip([labels[k] for k in order], loop.labelled, strict=True))
-    loop = replace(loop, free=tuple(n for n in fitted.free if "." not in n))
-    names = rename_labels(model.names, renamed)
-    return Model(loop, carry_over_fit(model, loop, names))
-
-
-def rename_labels(names: Sequence[str], labels: Mapping[str, str]) -> list[str]:
-    """Return names of parameters with the new labels of their effects."""
-    parts = [name.partition(".") for name in names]
-    return [f"{labels.get(head, head)}.{tail}" if dot else head for head, dot, tail in parts]

@@ -12,11 +12,11 @@ from ..estimation.likelihood.maximization import maximize
 from .candidates import Trial, Work, contains, is_same_kind
 from .fitted_model import Model, compute_criterion, compute_log_terms
 from .noise_tests import run_noise_tests
+from .ordering import order_trial
 from .refitting import refit_candidate, weigh_refit
 from .removal import (
     Weighed,
     has_same_noise,
-    move_last_effect,
     refit_noise,
     refit_without_effect,
     weigh_effects,
@@ -173,25 +173,27 @@ def compare_effects(
     if len(found) == 1 and found[0].trial is steps[0].best:
         return _compare_in_round(model, found[0], steps[0], sure, work)
     done, now = [], model
+    where = {id(f): f.position for f in found}
     for f in sorted(found, key=lambda f: f.position):
-        smaller, mine = (f.base, f.trial) if now is model else refit_without_effect(now, f.position)
+        place = where[id(f)]
+        smaller, mine = (f.base, f.trial) if now is model else refit_without_effect(now, place)
         # An effect that took the place of another may have made this one superfluous.
         if mine.net_gain <= THRESHOLD.gate:
             fewer, left = weigh_effects(refit_noise(smaller), given, steps)
             return compare_effects(fewer, left, given, steps, work)
         there = {name_at_place(e) for e in smaller.loop.effects}
-        rest = [t for t in _find_close(mine, steps) if t.key not in there]
+        rest = [t for t in _find_close(mine, steps, beside=True) if t.key not in there]
         # Noise that stands for the effect in the smaller model would be paid for by its rivals.
         bare = smaller
         if rest and not has_same_noise(smaller, now):
-            bare = refit_without_effect(now, f.position)[0]
+            bare = refit_without_effect(now, place)[0]
 
         def refit(t: Trial, bare: Model = bare, now: Model = now) -> Trial:
             # From the model without the effect, whose values and noise stand for it, a rival may
             # stay short of its place, and so it may from the model with it.
-            start = screen_at(bare, t.fitted)
+            start = screen_at(bare, t.fitted if t.net_gain > THRESHOLD.gate else t.effect)
             both = [refit_candidate(bare, start, near) for near in (None, now)]
-            return max(both, key=lambda t: t.net_gain)
+            return order_trial(bare, max(both, key=lambda t: t.net_gain), given)
 
         again = work(refit, rest)
         again = [_count_from(t, bare, smaller) for t in again]
@@ -202,12 +204,18 @@ def compare_effects(
             best = mine
         best = prefer_plainer(smaller, best, [mine, *again])
         if best is not mine:
-            now = move_last_effect(best.model, f.position)
-            now = replace(now, fit=maximize(now.fit, rounds=THRESHOLD.rival_rounds))
+            fit = maximize(best.model.fit, rounds=THRESHOLD.rival_rounds)
+            now = replace(best.model, fit=fit)
+            # All that lay between the places of the two has moved by one.
+            for key, k in where.items():
+                k -= k > place
+                where[key] = k + (k >= best.position)
+            where[id(f)] = best.position
         close = find_rivals(best, [t for t in [mine, *again] if t is not best], sure)
-        done.append(Weighed(best, close, smaller, f.position))
-    done.sort(key=lambda f: -f.trial.gain)
-    return now, tuple(done)
+        done.append((f, Weighed(best, close, smaller, place)))
+    weighed = [replace(w, position=where[id(f)]) for f, w in done]
+    weighed.sort(key=lambda f: -f.trial.gain)
+    return now, tuple(weighed)
 
 
 def _compare_in_round(
@@ -262,19 +270,26 @@ def _find_on_bounds(model: Model) -> set[str]:
     return {name for name, v, low, high in ends if v in (low, high)}
 
 
-def _find_close(mine: Trial, steps: Sequence[Round]) -> list[Trial]:
+def _find_close(mine: Trial, steps: Sequence[Round], beside: bool = False) -> list[Trial]:
     """Return the candidates that came close to an effect in the round that it won.
 
-    Or that one which resembles it won, whose place it took since.
+    Or that one which resembles it won, whose place it took since. Where more was found `beside` it,
+    what resembles it may have come nowhere in that round, and is asked again: a lag of the actuator
+    gains nothing while the curve of the input that it acts behind is missing.
     """
     won = [s for s in steps if s.best is not None and s.best.key == mine.key]
     lost = [s for s in steps if s.best is not None and s.best.resembles(mine)]
     for step in [*won, *lost]:
         assert step.best is not None
+        least = THRESHOLD.near_winner * step.best.net_gain
         near = [
-            t for t in step.trials
-            if t.key != mine.key and t.net_gain > THRESHOLD.gate
-            and (t.resembles(mine) or t.net_gain > THRESHOLD.near_winner * step.best.net_gain)
-        ]  # fmt: skip
+            t
+            for t in step.trials
+            if t.key != mine.key
+            and (
+                (t.net_gain > THRESHOLD.gate and (t.resembles(mine) or t.net_gain > least))
+                or (beside and t.resembles(mine) and t.score > -math.inf)
+            )
+        ]
         return near[: THRESHOLD.looked_at]
     return []

@@ -8,6 +8,7 @@ from ..effects import AbstractEffect
 from ..estimation.likelihood.maximization import compute_expected_gain
 from .candidates import Objection, Trial, Work, contains, is_same_kind, keep_for_comparison
 from .fitted_model import Model, without_random_force
+from .ordering import order_trial
 from .quiet_refitting import refit_quietly
 from .refitting import refit_candidate, refit_under_noise
 from .replicas import has_kinks, make_replica, measure_gain_beyond_simple, measure_gain_on_replicas
@@ -33,13 +34,14 @@ class Round:
 
 
 def run_round(
-    base: Model, pool: Sequence[AbstractEffect], work: Work, other: Model | None = None,
-    beside: bool = False,
+    base: Model, pool: Sequence[AbstractEffect], work: Work, given: int,
+    other: Model | None = None, beside: bool = False,
 ) -> Round:  # fmt: skip
     """Screen all candidates, refit the promising, and return the best that earns its place.
 
     They are added to the base, and to the `other` model in its place if one is given. Where an
-    effect was found before, `beside` it, they are also tried under hardly any random force.
+    effect was found before, `beside` it, they are also tried under hardly any random force. The
+    base had `given` effects from the beginning.
     """
     tried: list[Trial] = work(lambda effect: scan_candidate(base, effect), pool)
     more: list[Trial] = []
@@ -56,7 +58,7 @@ def run_round(
     if not tried or not math.isfinite(tried[0].score):
         return Round(base, tuple(tried), None)
     copies: list[Model | None] = []
-    trials = _refit_promising(base, tried, more, work)
+    trials = _refit_promising(base, tried, more, work, given)
     if beside:
         # Two that hide together leave a large random force, beside which a score tells little.
         trials += refit_quietly(base, [t.effect for t in tried], work)
@@ -90,7 +92,7 @@ def _list_other_choices(trials: Sequence[Trial]) -> tuple[Trial, ...]:
 
 
 def _refit_promising(
-    base: Model, tried: Sequence[Trial], more: Sequence[Trial], work: Work
+    base: Model, tried: Sequence[Trial], more: Sequence[Trial], work: Work, given: int
 ) -> list[Trial]:
     """Return the trials, the promising and what resembles the best refitted.
 
@@ -137,6 +139,13 @@ def _refit_promising(
         noise = best.model.fit.noise
         again = work(lambda k: refit_under_noise(base, done[k], noise), apart)
         done |= dict(zip(apart, again, strict=True))
+        near_winner = [
+            k
+            for k, t in done.items()
+            if t.net_gain > THRESHOLD.near_winner * best.net_gain or t.resembles(best)
+        ]
+        again = work(lambda k: order_trial(base, done[k], given), near_winner)
+        done |= dict(zip(near_winner, again, strict=True))
     return [done.get(id(t), t) for t in tried]
 
 

@@ -39,7 +39,6 @@ class ActuatorLag(InputEffect):
 
     tau: float = parameter("s", lower=0.0, neutral=0.0)
 
-    stage: ClassVar[int] = 5
     states: ClassVar[tuple[str, ...]] = ("input",)
     look_alikes: ClassVar[tuple[str, ...]] = ("InputDelay", "SensorLag")
     sentence: ClassVar[str] = "The actuator follows its command with a first-order lag."
@@ -95,7 +94,7 @@ class InputDelay(InputEffect):
 
     delay: float = parameter("s", lower=0.0, neutral=0.0)
 
-    stage: ClassVar[int] = 7
+    stage: ClassVar[int] = 5
     look_alikes: ClassVar[tuple[str, ...]] = ("SensorLag", "ActuatorLag", "ViscousFriction")
     sentence: ClassVar[str] = "The input acts on the plant after a fixed delay."
     experiment: ClassVar[str] = (
@@ -162,7 +161,7 @@ class InputBacklash(InputEffect):
 
     width: float = parameter("{u}", lower=0.0, neutral=0.0)
 
-    stage: ClassVar[int] = 8
+    stage: ClassVar[int] = 6
     in_linear_model: ClassVar[bool] = False
     look_alikes: ClassVar[tuple[str, ...]] = ("InputDeadZone", "InputDelay", "CoulombFriction")
     sentence: ClassVar[str] = (

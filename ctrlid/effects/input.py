@@ -225,7 +225,6 @@ class InputNonlinearity(InputEffect):
 
     curvature: float = parameter("1/{u}", neutral=0.0)
 
-    stage: ClassVar[int] = 4
     look_alikes: ClassVar[tuple[str, ...]] = (
         "InputSaturatingGain", "InputOffset", "ForceExponent",
     )  # fmt: skip
@@ -261,7 +260,6 @@ class InputSaturatingGain(InputEffect):
 
     saturation: float = parameter("1/{u}^2", lower=0.0, neutral=0.0)
 
-    stage: ClassVar[int] = 4
     look_alikes: ClassVar[tuple[str, ...]] = (
         "InputOffset", "ConstantForce", "InputNonlinearity", "InputSaturation",
     )  # fmt: skip

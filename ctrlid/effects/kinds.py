@@ -71,7 +71,7 @@ class InputEffect(AbstractEffect):
     """Something between the computed input and what reaches the plant."""
 
     place: ClassVar[Place] = "input"
-    stage: ClassVar[int] = 6
+    stage: ClassVar[int] = 4
     ordered: ClassVar[bool] = True
 
     def input(self, m: Moment) -> Any:
@@ -113,7 +113,7 @@ class OutputEffect(AbstractEffect):
     """Something between the plant's output and the sensor's noise."""
 
     place: ClassVar[Place] = "output"
-    stage: ClassVar[int] = 9
+    stage: ClassVar[int] = 7
     ordered: ClassVar[bool] = True
 
     def output(self, m: Moment) -> Any:
@@ -129,7 +129,7 @@ class ReadingEffect(AbstractEffect):
     """What happens to a reading after the sensor's noise is in it."""
 
     place: ClassVar[Place] = "output"
-    stage: ClassVar[int] = 10
+    stage: ClassVar[int] = 8
     ordered: ClassVar[bool] = True
 
     def read(self, m: Moment) -> Any:
