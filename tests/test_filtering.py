@@ -379,7 +379,7 @@ def test_an_actuator_lag_of_any_length(ratio, free):
 def test_an_actuator_lag_behind_a_curve_of_the_input(effect, curve, hold, ratio):
     """A lag that follows what an effect makes of the input is as exact as one of the input."""
     tau = ratio * DT
-    loop = levitated(effect, E.ActuatorLag(tau=tau), dt=DT)
+    loop = levitated(E.ActuatorLag(tau=tau), effect, dt=DT)
     e = loop.equations(keep=True)
     scheme = SampledPlant(loop, (), hold, False).scheme
     rng = np.random.default_rng(8)

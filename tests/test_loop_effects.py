@@ -234,7 +234,7 @@ def test_of_a_curve_and_a_lag_the_one_given_last_is_furthest_from_the_plant():
 
 def test_other_values_keep_the_formulas_and_nothing_else():
     # The offset moves where the lag rests, and the exponent looks at the numbers of the plant.
-    effects = (E.InputOffset(offset=0.1), E.ActuatorLag(tau=0.004), E.SensorLag(tau=0.002),
+    effects = (E.ActuatorLag(tau=0.004), E.InputOffset(offset=0.1), E.SensorLag(tau=0.002),
                E.ForceExponent(n=2.1), E.CoulombFriction(fc=0.1))  # fmt: skip
     changed = {"K": 3e-6, "InputOffset.offset": 0.3, "ActuatorLag.tau": 0.01,
                "CoulombFriction.fc": 0.2}  # fmt: skip

@@ -157,14 +157,14 @@ def _grow_model(
         tell(f"{head}: screening")
         pool = list_missing_candidates(model, catalogue)
         given_values = None if steps else restore_given_values(base)
-        step = run_round(model, pool, work, given, given_values, beside=bool(steps))
+        step = run_round(model, pool, work, given_values, given, beside=bool(steps))
         # Noise may be coloured and have heavy tails, one after the other.
         while (other := prefer_sensor_noise(model, step.best, is_false)) is not None:
             tell(f"{head}: screening beside other sensor noise")
             model, base = other, base if steps else other
             reached.model, reached.base = model, base
             pool = list_missing_candidates(model, catalogue)
-            step = run_round(model, pool, work, given, beside=bool(steps))
+            step = run_round(model, pool, work, given=given, beside=bool(steps))
         step = replace(step, base=Model(model.loop, drop_linearization(model.fit)))
         if step.best is not None and _is_stand_in(step.best, model, beside=bool(steps)):
             step = replace(step, best=None)

@@ -34,8 +34,8 @@ class Round:
 
 
 def run_round(
-    base: Model, pool: Sequence[AbstractEffect], work: Work, given: int,
-    other: Model | None = None, beside: bool = False,
+    base: Model, pool: Sequence[AbstractEffect], work: Work, other: Model | None = None,
+    given: int = 0, beside: bool = False,
 ) -> Round:  # fmt: skip
     """Screen all candidates, refit the promising, and return the best that earns its place.
 
