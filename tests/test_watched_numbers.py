@@ -7,6 +7,10 @@ from collections import Counter
 import numpy as np
 import pytest
 
+import problems
+from ctrlid import effects as E
+from ctrlid.diagnosis.recalibration import fit_base_model
+from ctrlid.diagnosis.replicas import make_replica
 from ctrlid.diagnosis.thresholds import THRESHOLD
 from problems import load_script
 
@@ -63,3 +67,13 @@ def test_the_table_is_watched_within_the_block_only():
     assert noted == {"excess": 1}
     assert THRESHOLD.table() == before
     assert set(watched.list_judged_numbers()) == {t.name for t in before if t.kind == "study"}
+
+
+def test_a_number_that_enters_formulas_leaves_python_and_says_so():
+    """Replicas have sharper friction, by a number that the formulas of the effects are told."""
+    loop = problems.drive().with_effect(E.CoulombFriction(0.2))
+    record = problems.record_of(loop, swing=0.3, hold=60, n=600, seed=8, sensor_noise=1e-4)
+    model = fit_base_model(loop, [record], loop.free)
+    with watched.watch_numbers() as noted:
+        assert make_replica(model, 1) is not None
+    assert noted["replica_sharpness, left Python"] > 0

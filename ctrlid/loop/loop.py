@@ -784,5 +784,6 @@ def sharpen_effects(loop: Loop, times: float) -> Loop:
         return loop
     new = object.__new__(Loop)
     new.__dict__.update(loop.__dict__)
-    new._apply_effects(period=loop.dt / times)
+    # The period enters the formulas of the effects, which take a plain number only.
+    new._apply_effects(period=float(loop.dt / times))
     return new
