@@ -919,6 +919,37 @@ def test_an_instant_that_is_dozens_of_samples_off_is_found(late):
     assert place_instants(fit) is fit
 
 
+# --- an input that hardly comes through
+
+
+def test_a_gap_that_swallows_nearly_all_of_the_input_gains_what_it_is_worth():
+    """The model without it follows the readings as if they were exact, which no climb leaves.
+
+    The outside simulator's worth of it is the expected gain of log-likelihood.
+    """
+    study = problems.load_script("benchmarks", "study_frozen")
+    case = study.cases.draw_case("one", 82013, 1500)
+    loop = study.make_loop(case.rig)
+    record = cid.Record(r=case.r, u=case.u, y=case.y, dt=case.rig.dt)
+    base = fit_base_model(loop, [record], loop.free)
+    tried = [refit_candidate(base, screen_at(base, e))
+             for e in E.InputBacklash.candidates(loop, record)]  # fmt: skip
+    best = max(tried, key=lambda t: t.net_gain)
+    assert best.gain == pytest.approx(case.worth[0], rel=0.15)
+    width = case.sizes[0]["backlash"]
+    assert best.fitted.width == pytest.approx(width, rel=0.02)
+    assert width > 0.8 * np.ptp(record.u)
+
+
+def test_a_zone_that_swallows_everything_may_be_any_wider_and_is_named():
+    """Its width has no standard error. The record says as much of limits that meet."""
+    few = (E.InputDeadZone, E.InputSaturation, E.ViscousFriction, E.ActuatorLag)
+    case, found = problems.diagnose_draw("two", 82045, few)
+    assert case.hidden[1] == "InputDeadZone"
+    assert found.verdict == "explained"
+    assert [set(f.names) for f in found.findings] == [{"InputDeadZone", "InputSaturation"}]
+
+
 # --- in which order effects act
 
 

@@ -1,15 +1,21 @@
 """Step 5: a candidate fitted by maximum likelihood, with everything else."""
 
+import contextlib
 import math
 from dataclasses import replace
 
 import numpy as np
 
 from .._base.criterion import bayesian_penalty
-from .._base.errors import EffectDoesNotApply
+from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from ..estimation.likelihood.kalman_filter import Noise
 from ..estimation.likelihood.likelihood import Fit, evaluate_likelihood, rank_by_likelihood
-from ..estimation.likelihood.maximization import OTHER_NOISE_GAIN, climb_under_quiet_force, maximize
+from ..estimation.likelihood.maximization import (
+    OTHER_NOISE_GAIN,
+    begin_fit,
+    climb_under_quiet_force,
+    maximize,
+)
 from .candidates import Objection, Trial, attempt_trial
 from .fitted_model import (
     Model,
@@ -57,6 +63,10 @@ def _climb_from_starts(base: Model, trial: Trial, near: Model | None) -> Trial:
         # Coloured noise that was fitted while the effect was missing may never let it in.
         # (Where no simulation can check it, the likelihood also leads to absurd values.)
         starts.append(replace(start, noise=start.noise.plain))
+    if start.problem.known is None and _takes_readings_as_exact(start):
+        # Nothing tells the noise of the sensor beside such a force, so that no slope leads back.
+        with contextlib.suppress(ModelCannotRun):
+            starts.append(begin_fit(start.problem, start.theta))
     fit = max((climb(s) for s in starts), key=lambda f: f.value)
     done = weigh_refit(base, trial, fit)
     sticks = start.plant.e.kinked and not base.fit.plant.e.kinked
@@ -66,6 +76,13 @@ def _climb_from_starts(base: Model, trial: Trial, near: Model | None) -> Trial:
         if quiet.value > fit.value:
             done = weigh_refit(base, trial, quiet)
     return done
+
+
+def _takes_readings_as_exact(fit: Fit) -> bool:
+    """Whether the one-step errors of the filter are hardly noise of the sensor."""
+    errors = np.concatenate([np.ravel(out.variance) for out in fit.filtered])
+    errors = errors[np.isfinite(errors)]
+    return len(errors) > 0 and float(np.median(errors)) > THRESHOLD.exact_readings
 
 
 def climb(start: Fit) -> Fit:
@@ -94,10 +111,37 @@ def weigh_refit(base: Model, trial: Trial, fit: Fit) -> Trial:
     done = replace(trial, model=model, gain=fit.value - before, penalty=penalty)
     try:
         done = replace(done, out=find_objection(done))
+        if _is_undetermined(done) and _measure_own_gain(base, done) > THRESHOLD.gate:
+            done = replace(done, out=None)
     # Fitted values may exclude each other, as a lower limit above the upper one does.
     except EffectDoesNotApply as reason:
         return replace(trial, out=Objection.of(reason))
     return done if done.net_gain > 0 else replace(done, model=Model(model.loop, drop_arrays(fit)))
+
+
+def _is_undetermined(trial: Trial) -> bool:
+    """Whether an effect gained much, and nothing tells how large it is there.
+
+    A dead zone that swallows all of the input may be any wider: its standard error is infinite, and
+    says nothing of whether it is there.
+    """
+    insignificant = trial.out is not None and trial.out.ground == "insignificant"
+    if not (insignificant and trial.gain - trial.penalty > THRESHOLD.gate):
+        return False
+    names, information = trial.model.names, trial.model.fit.normal[0]
+    deciding = {
+        f"{trial.label}.{p.name}" for p in trial.effect.parameters() if p.neutral is not None
+    }
+    return any(information[k, k] == 0 for k, name in enumerate(names) if name in deciding)
+
+
+def _measure_own_gain(base: Model, trial: Trial) -> float:
+    """Return the net gain over the model without the effect that has all else of it."""
+    known = dict(zip(trial.model.names, trial.model.fit.theta.tolist(), strict=True))
+    loop = base.loop.with_parameters({n: known[n] for n in base.names})
+    start = carry_over_fit(trial.model, loop, base.names)
+    without = maximize(start, rounds=THRESHOLD.refit_rounds, exact=False)
+    return trial.model.fit.value - max(without.value, base.fit.value) - trial.penalty
 
 
 def place_instants(fit: Fit) -> Fit:

@@ -10,7 +10,7 @@ from .._base.errors import EffectDoesNotApply
 from ..physics.equations import Backlash, Equations
 from ..physics.linearization import OperatingPoint
 from .context import Moment
-from .kinds import InputEffect, choose_first_width, require_one_input
+from .kinds import InputEffect, choose_widths, require_one_input
 from .parameters import parameter
 from .scanning import Range
 from .symbolic import to_expression
@@ -174,8 +174,9 @@ class InputBacklash(InputEffect):
 
     @classmethod
     def candidates(cls, loop: Any, record: Any = None) -> tuple[Self, ...]:
-        """Return a gap of a tenth of the range of the recorded input."""
-        return cls._applicable(loop, cls(width=choose_first_width(loop, record)))
+        """Return gaps of a tenth of the range of the recorded input, and of all but a tenth."""
+        widths = choose_widths(loop, record)
+        return cls._applicable(loop, *(cls(width=width) for width in widths))
 
     def build(self, e: Equations, m: Moment) -> Equations:
         """Return the equations with the backlash ahead of them."""

@@ -13,7 +13,7 @@ import numpy as np
 from .._base.arguments import is_number
 from .._base.errors import CtrlidError, EffectDoesNotApply
 from .context import Moment
-from .kinds import InputEffect, choose_first_width
+from .kinds import InputEffect, choose_widths
 from .parameters import parameter
 from .scanning import CUT_OFF, Scan, Sight
 
@@ -152,10 +152,14 @@ class InputDeadZone(InputEffect):
 
     @classmethod
     def candidates(cls, loop: Any, record: Any = None) -> tuple[Self, ...]:
-        """Return a zone of a tenth of the range of the recorded input, and one about zero."""
-        first = cls(width=choose_first_width(loop, record))
-        return cls._applicable(loop, first, *([replace(first, centre=0.0)] if
-                               _passes_zero_elsewhere(loop, record) else []))  # fmt: skip
+        """Return zones of a tenth of the range of the recorded input and of all but a tenth.
+
+        Such zones may also lie about zero.
+        """
+        zones = [cls(width=width) for width in choose_widths(loop, record)]
+        if _passes_zero_elsewhere(loop, record):
+            zones += [replace(zone, centre=0.0) for zone in zones]
+        return cls._applicable(loop, *zones)
 
     def input(self, m: Moment) -> Any:
         """Return the input without what the zone swallows."""

@@ -95,11 +95,15 @@ def require_one_input(effect: AbstractEffect, e: Equations) -> None:
         )
 
 
-def choose_first_width(loop: Any, record: Any) -> float:
-    """Return the width of a gap or a zone to start from: a tenth of the recorded input's range."""
-    if record is None:
-        return 0.1 * max(abs(float(loop.point.input)), 1.0)
-    return 0.1 * float(np.ptp(record.u))
+def choose_widths(loop: Any, record: Any) -> tuple[float, float]:
+    """Return the widths of a gap or a zone to start from.
+
+    It swallows a tenth of the range of the recorded input, or all but a tenth of it: no climb leads
+    from the one to the other.
+    """
+    known = record is not None
+    reach = float(np.ptp(record.u)) if known else max(abs(float(loop.point.input)), 1.0)
+    return 0.1 * reach, 0.9 * reach
 
 
 def replace_output(e: Equations, at: str, shown: Any) -> Equations:
