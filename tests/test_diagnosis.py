@@ -279,7 +279,9 @@ def test_nothing_free_and_no_catalogue():
 @pytest.mark.parametrize(
     ("effect", "seed"),
     [
-        (E.PositionRipple(amplitude=0.3, period=3e-4, phase=0.7), 8600),
+        pytest.param(
+            E.PositionRipple(amplitude=0.3, period=3e-4, phase=0.7), 8600, marks=pytest.mark.slow
+        ),
         (E.ParameterStep(name="K", time=5.0, size=0.02), 8610),
         (E.CoulombFriction(fc=0.2), 8620),
     ],

@@ -969,7 +969,7 @@ def test_effects_at_one_place_end_in_the_order_in_which_they_act(order):
         assert names == [type(hidden[k]).__name__ for k in order]
 
 
-@pytest.mark.parametrize("seed", [9950, 9960])
+@pytest.mark.parametrize("seed", [9950, pytest.param(9960, marks=pytest.mark.slow)])
 def test_a_lag_behind_a_curve_of_the_input_is_not_taken_for_one_of_the_sensor(seed):
     """On a linear plant a lag behind the curve and one of the sensor are the same.
 

@@ -35,7 +35,7 @@ def make_loop():
     return cid.Loop(plant, None, dt=DT, at=at, free=("s", "c"))
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_limits_on_both_sides_are_found(seed):
     found = cid.diagnose(push_spring(seed, 0.45, 1.0), make_loop(), progress=False)
     assert found.verdict == "explained"
