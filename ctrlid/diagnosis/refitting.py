@@ -138,10 +138,13 @@ def _is_undetermined(trial: Trial) -> bool:
 def _measure_own_gain(base: Model, trial: Trial) -> float:
     """Return the net gain over the model without the effect that has all else of it."""
     known = dict(zip(trial.model.names, trial.model.fit.theta.tolist(), strict=True))
-    loop = base.loop.with_parameters({n: known[n] for n in base.names})
-    start = carry_over_fit(trial.model, loop, base.names)
-    without = maximize(start, rounds=THRESHOLD.refit_rounds, exact=False)
-    return trial.model.fit.value - max(without.value, base.fit.value) - trial.penalty
+    loop = base.loop.with_parameters({n: known[n] for n in base.names if n in known})
+    without = base.fit.value
+    with contextlib.suppress(ModelCannotRun):
+        start = carry_over_fit(trial.model, loop, base.names)
+        climbed = maximize(start, rounds=THRESHOLD.refit_rounds, exact=False)
+        without = max(without, climbed.value)
+    return trial.model.fit.value - without - trial.penalty
 
 
 def place_instants(fit: Fit) -> Fit:
