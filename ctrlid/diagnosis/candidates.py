@@ -101,7 +101,7 @@ class Trial:
 
     @property
     def position(self) -> int:
-        """Where among the effects of its model it is, counted from the plant."""
+        """Where it is among the effects of its model, in their order."""
         return list(self.model.loop.labelled).index(self.label)
 
     @property
