@@ -18,6 +18,7 @@ from scipy import integrate, linalg, signal
 import ctrlid as cid
 from ctrlid import effects as E
 from ctrlid.estimation.likelihood import kalman_recursion
+from ctrlid.estimation.likelihood.backlash import InputRange
 from ctrlid.estimation.likelihood.filter_data import find_rest_state, make_filter_data
 from ctrlid.estimation.likelihood.kalman_filter import (
     Noise,
@@ -486,13 +487,16 @@ def test_play_is_followed_with_its_derivative():
 
     m = SampledPlant(loop, ("InputBacklash.width",), "zoh", False)
     data = make_filter_data(loop, record)
-    x = np.tile([0.012, 0.0], (n, 1))
-    at = Trajectory(x, x, np.zeros((n, 2)))
+    # The backlash begins at u[0], which is the last state of the filter.
+    x = np.tile([0.012, 0.0, u[0]], (n, 1))
+    at = Trajectory(x, x, np.zeros((n, 3)))
     lin = m.linearize(data, np.array([width]), at)
     plain = SampledPlant(levitated(dt=DT), (), "zoh", False)
     applied = cid.Record(u=behind(width), y=record.y, dt=DT)
-    expected = plain.linearize(make_filter_data(plain.loop, applied), np.empty(0), at).step
-    np.testing.assert_allclose(lin.step, expected, atol=1e-4 * np.std(expected[:, 1]))
+    there = Trajectory(*(v[:, :2] for v in (at.predicted, at.filtered, at.spread)))
+    expected = plain.linearize(make_filter_data(plain.loop, applied), np.empty(0), there).step
+    np.testing.assert_allclose(lin.step[:, :2], expected, atol=1e-4 * np.std(expected[:, 1]))
+    np.testing.assert_array_equal(lin.step[:, 2], u[0])
     h = 1e-6
     ends = [m.linearize(data, np.array([width + s * h]), at).step for s in (1, -1)]
     slope = (ends[0] - ends[1]) / (2 * h)
@@ -521,10 +525,64 @@ def test_nobody_knows_where_a_play_begins():
         z = out.innovations / np.sqrt(out.variance) / 3e-4
         assert np.abs(z).max() < 5
         assert np.mean(z[:60] ** 2) < 1.6
-        u = record.u[first:]
-        crossed = np.argmax(np.maximum.accumulate(u) - np.minimum.accumulate(u) >= 0.2)
-        assert np.array_equal(np.flatnonzero(lin.input_variance), np.arange(crossed))
-        assert lin.input_variance[0] * data.scale**2 == pytest.approx(10 * 0.2**2 / 12)
+        assert lin.spread[-1, -1] * data.scale**2 == pytest.approx(0.2**2 / 12)
+
+
+def test_what_a_play_hides_is_every_beginning_at_once():
+    """The likelihood is the mean of those of all beginnings, each of which is a known input."""
+    width, sigma, n = 2.0, 2e-3, 300
+    plain = cid.Loop(cid.plants.servo(m=1.0, c=0.8, k=1.0), None, dt=0.05)
+    rng = np.random.default_rng(5)
+    u = 0.7 * np.sin(np.arange(n) / 17) + 0.1 * rng.standard_normal(n)
+    u[200:] += np.linspace(0, 1.6, n - 200)
+
+    def behind(m):
+        out = np.empty(n)
+        for k, value in enumerate(u):
+            m = out[k] = min(max(m, value - width / 2), value + width / 2)
+        return out
+
+    truth = cid.simulate(plain, d=behind(u[0] + 0.55), sensor_noise=sigma, seed=6)
+
+    def filtered(loop, u):
+        record = cid.Record(u=u, y=truth.y, dt=0.05)
+        data = make_filter_data(loop, record)
+        data = replace(data, scale=sigma, spread=data.spread * (data.scale / sigma) ** 2)
+        m = SampledPlant(loop, (), "zoh", False)
+        at = guess_trajectory(m, data)
+        _, out = converge_trajectory(m, data, np.empty(0), Noise((1e-6,)), at, 30)
+        z = out.innovations**2 / out.variance / sigma**2 + np.log(out.variance)
+        return out, -0.5 * np.sum(z)
+
+    # Far from here no beginning is likely.
+    places = u[0] + 0.55 + np.linspace(-2e-3, 2e-3, 81)
+    each = np.array([filtered(plain, behind(m))[1] for m in places])
+    weights = np.exp(each - np.max(each))
+    assert max(weights[0], weights[-1]) < 1e-3
+    mean = np.max(each) + np.log(np.sum(weights) * (places[1] - places[0]) / width)
+    out, found = filtered(plain.with_effect(E.InputBacklash(width)), u)
+    # A uniform distribution is counted as the normal one of the same width.
+    assert found == pytest.approx(mean, abs=1.0)
+    expected = weights @ places / np.sum(weights)
+    spread = np.sqrt(weights @ (places - expected) ** 2 / np.sum(weights))
+    assert out.trajectory.filtered[-1, -1] == pytest.approx(expected, abs=0.5 * spread)
+    assert out.trajectory.spread[-1, -1] == pytest.approx(spread, rel=0.2)
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.1, 3.0])
+def test_the_expected_input_behind_a_play(spread):
+    """Mean and derivatives of a clip of a normal variable, against draws of it."""
+    rng = np.random.default_rng(7)
+    low, high = np.array([-2.0, -0.5, 0.1, 1.2]), np.array([2.0, 0.4, 0.3, 1.2])
+    slopes = np.array([[1.0], [2.0], [3.0], [4.0]])
+    ranges = InputRange(low, high, slopes, -slopes)
+    applied, by_memory, by_free = ranges.linearize(np.full(4, 0.2), np.full(4, spread))
+    m = 0.2 + spread * rng.standard_normal((200_000, 1))
+    inside, off = (low < m) & (m < high), 4 / math.sqrt(len(m))
+    np.testing.assert_allclose(applied, np.clip(m, low, high).mean(axis=0), atol=off)
+    np.testing.assert_allclose(by_memory, inside.mean(axis=0), atol=off)
+    signs = np.where(m >= high, -1.0, np.where(m <= low, 1.0, 0.0))
+    np.testing.assert_allclose(by_free[:, 0], (signs * slopes[:, 0]).mean(axis=0), atol=4 * off)
 
 
 def test_nobody_knows_what_a_delay_brings_at_first():

@@ -108,7 +108,7 @@ class Simulation:
     def make_initial_states(self, starts: Sequence[Mapping[str, float]]) -> Array:
         """Return initial states, shape (records, states); what is not known begins at rest."""
         plant = self.plant
-        rest = [np.resize(data.start, plant.size) for data in self.problem.data]
+        rest = [plant.pad_controller_states(data.start.copy()) for data in self.problem.data]
         for x, known in zip(rest, starts, strict=True):
             for k, name in enumerate(plant.e.states):
                 x[k] = known.get(name, x[k])
@@ -117,7 +117,7 @@ class Simulation:
     def run(self, theta: Array, x0: Array) -> tuple[Array, Array, tuple[Array, ...]]:
         """Return errors, their derivatives and the states, for all records."""
         plant, p = self.plant, len(self.names)
-        n, count = plant.size, len(self.runs)
+        n, count = plant.plan.size, len(self.runs)
         values, errors, slopes, states = plant.insert_free_values(theta), [], [], []
         for k, (data, run) in enumerate(zip(self.problem.data, self.runs, strict=True)):
             check_budget(len(data.record))
@@ -211,5 +211,11 @@ def make_fit(found: Simulated, sensor: Array) -> Fit:
         ),
         counts=tuple(data.valid for data in task.problem.data),
     )
-    at = [Trajectory(x, x.copy(), np.zeros_like(x)) for x in found.states]
+    # The simulation begins in the middle of any backlash.
+    p = task.plant.insert_free_values(found.theta)
+    at = []
+    for data, x in zip(problem.data, found.states, strict=True):
+        first = task.plant.extend_start(data, x[0], data.spread, p)[0]
+        whole = np.hstack([x, np.tile(first[x.shape[1] :], (len(x), 1))])
+        at.append(Trajectory(whole, whole.copy(), np.zeros_like(whole)))
     return evaluate_likelihood(problem, found.theta, silent, at)

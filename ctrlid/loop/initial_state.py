@@ -47,15 +47,16 @@ def find_initial_state(
     guess : ndarray
         A state of plant, controller and input.
     fitted : int
-        How many of its first entries are sought; the others are kept.
+        How many of its first entries are sought, and with them what a backlash remembers; the
+        others are kept.
     start_time : float, optional
         Time of the first sample since the start of the experiment, which a drift counts from [s].
 
     Returns
     -------
     ndarray
-        The state: where it is measured, no faster than the record moves, and with lags of the
-        input within what they follow.
+        The state: where it is measured, no faster than the record moves, with lags of the input
+        within what they follow, and a backlash within its gap.
     """
     if simulator.loop.equations().siso:
         spread: Any = max(float(np.std(part.y)), 1e-12 * float(np.abs(part.y).max()), 1e-300)
@@ -71,6 +72,12 @@ def find_initial_state(
         low, high = several.bound_state(seen)
     for lag in _find_input_lags(simulator, fitted):
         scale[lag] = max(float(np.std(part.u)), 1e-300)
+    sought, memory, memories = list(range(fitted)), _find_memory(simulator, part), [0.0]
+    if memory is not None and memory[0] >= fitted:
+        k, middle, reach = memory
+        sought, scale = [*sought, k], np.append(scale, reach)
+        low[k], high[k] = middle - reach, middle + reach
+        memories = [float(np.clip(guess[k], low[k], high[k])), *np.linspace(low[k], high[k], FEW)]
 
     # Runs of a search differ little, so that each begins with the steps that the last one needed.
     substeps = 1
@@ -88,7 +95,7 @@ def find_initial_state(
 
     def move_state(start: Array, point: Array) -> Array:
         z = start.copy()
-        z[:fitted] += scale * (point - 1)
+        z[sought] += scale * (point - 1)
         return z
 
     def search_nearby(start: Array, count: int) -> Array:
@@ -99,21 +106,33 @@ def find_initial_state(
 
         # Bounds keep an absurd start from standing in for a force that acts from the first sample
         # on.
-        lower, upper = (1 + (v[:fitted] - start[:fitted]) / scale for v in (low, high))
+        lower, upper = (1 + (v - start)[sought] / scale for v in (low, high))
         # Beside a bound far away a narrow room would be lost to rounding.
         far = [np.where(np.isfinite(bound), np.abs(bound), 1.0) for bound in (lower, upper)]
         narrow = NARROW * np.maximum(1.0, np.maximum(*far))
         upper = np.maximum(upper, lower + 4 * narrow)
         # The search is around 1, so that its differences have the relative size that is asked for.
         best = optimize.least_squares(
-            residual, np.clip(np.ones(fitted), lower + narrow, upper - narrow),
+            residual, np.clip(np.ones(len(sought)), lower + narrow, upper - narrow),
             bounds=(lower, upper), diff_step=[1e-4], max_nfev=20, ftol=SETTLED,
         )  # fmt: skip
         return move_state(start, best.x)
 
+    def choose_memory(start: Array, count: int) -> tuple[Array, Array | None]:
+        """Return a start with the memory of a backlash that follows the samples best."""
+        best, least = start, None
+        for value in memories:
+            z = start.copy()
+            z[sought[fitted:]] = value
+            found = compute_misfit(z, count)
+            if found is not None and (least is None or found @ found < least @ least):
+                best, least = z, found
+        return best, least
+
     # From rest a short search does not find a start that is far away.
     count = min(len(part), 400)
-    there, here = compute_misfit(seen, count), compute_misfit(guess, count)
+    guess, here = choose_memory(guess, count)
+    seen, there = choose_memory(seen, count)
     if there is None and here is None:
         # From a rough start an unstable plant diverges soon, so that few samples are fitted first.
         for few in (10, 30, 100):
@@ -229,6 +248,22 @@ class _SeveralOutputs:
                 off = NEAR * max(float(steps[:FEW].max()), 1e-300) / abs(self.c[k, i])
                 low[i], high[i] = seen[i] - off, seen[i] + off
         return low, high
+
+
+def _find_memory(simulator: Simulator, part: Record) -> tuple[int, float, float] | None:
+    """Return where the state of a backlash stands, the middle of its gap at first, and its reach.
+
+    It may lie anywhere in its gap around the first input; None without a gap.
+    """
+    loop = simulator.loop
+    e, law = loop.equations(), loop.law()
+    if e.play is None:
+        return None
+    given = casadi.vertcat(e.play.u, e.p), casadi.vertcat(float(np.ravel(part.u)[0]), e.values)
+    found = casadi.substitute(casadi.vertcat(e.play.start, e.play.reach), *given)
+    middle, reach = np.asarray(casadi.evalf(found), float).ravel().tolist()
+    place = len(e.states) + (len(law.rest) if law else 0)
+    return (place, middle, reach) if reach > 0 else None
 
 
 def _find_input_lags(simulator: Simulator, fitted: int) -> list[int]:

@@ -320,7 +320,8 @@ def choose_settled_samples(data: FilterData, out: Filtered) -> Any:
 def guess_trajectory(plant: SampledPlant, data: FilterData) -> Trajectory:
     """Return a trajectory to begin with: at rest, states that are measured as measured."""
     n, e = len(data.record), plant.e
-    rest = np.tile(plant.pad_controller_states(data.start), (n, 1))
+    start, wide = plant.extend_start(data, data.start, data.spread, e.values)
+    rest = np.tile(start, (n, 1))
     for row, column in zip(casadi.vertsplit(e.output), np.reshape(data.y, (n, -1)).T, strict=True):
         seen, values = row, column
         # The state of a sensor's lag is nearly equal to what it follows.
@@ -338,8 +339,7 @@ def guess_trajectory(plant: SampledPlant, data: FilterData) -> Trajectory:
         for k, u in enumerate(np.reshape(data.u, (n, -1)).T):
             if casadi.is_equal(lag.target, e.u[k], 2):
                 rest[:, lag.state] = u
-    spread = np.sqrt(np.diag(plant.pad_controller_states(data.spread)))
-    quiet = np.minimum(spread, 1.0) * data.scale
+    quiet = np.minimum(np.sqrt(np.diag(wide)), 1.0) * data.scale
     return Trajectory(rest, rest.copy(), np.tile(quiet, (n, 1)))
 
 
@@ -365,8 +365,9 @@ def carry_trajectory(
     """Take states that both have from the old trajectory, and guess the others."""
     mine = list(new.e.states)
     columns = [(mine.index(s), k) for k, s in enumerate(old.e.states) if s in mine]
-    # A delay keeps a known analog controller from being followed, so both plants need its states.
-    if new.size - new.n == old.size - old.n:
+    # A delay keeps a known analog controller from being followed, so both plants need its states,
+    # and only one that has a backlash remembers where that began.
+    if new.size - new.n == old.size - old.n and (new.e.play is None) == (old.e.play is None):
         columns += [(new.n + k, old.n + k) for k in range(old.size - old.n)]
     result = []
     for start, theirs in ((guess.predicted, known.predicted), (guess.filtered, known.filtered),
@@ -406,6 +407,9 @@ def converge_trajectory(
                 "units, signs and the operating point, or exclude these samples with valid="
             )
         size = np.maximum(np.std(out.trajectory.filtered, axis=0), 1e-300)
+        if plant.e.play is not None:
+            # Where a backlash began does not move, but is part of the input that does.
+            size[-1] = max(size[-1], float(np.std(data.u)))
         still = bool((np.sqrt(np.mean(change**2, axis=0)) <= CONVERGED_MOTION * size).all())
         at = out.trajectory
         if still and count:

@@ -52,7 +52,9 @@ class Prediction(Printed):
     states : ndarray, shape (n, states)
         State at each sample [units of the states], given the outputs up to and including it.
     circuit : ndarray, shape (n, controller states)
-        State of a known analog controller at each sample [units of the controller], else empty.
+        State of a known analog controller at each sample [units of the controller]; behind a
+        backlash, what is known at each sample of the input that acted when the record began [input
+        unit]; else empty.
     sensor_noise, force_noise : float or tuple of float
         Standard deviations of the noise model [output unit, and unit of the acceleration]; one for
         each of several outputs and forces.

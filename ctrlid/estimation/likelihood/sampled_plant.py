@@ -17,19 +17,15 @@ from ...loop.loop import Loop
 from ...physics.block_evaluation import BlockEvaluation, evaluate_blocks
 from ...physics.equations import Equations
 from ...physics.integration import count_delay_samples, substitute_delay
+from .backlash import InputRange, find_input_range, find_memory
 from .filter_data import FilterData, find_rest_state
 from .transition_maps import (
     PeriodPlan,
-    build_backlash,
     build_maps,
     choose_scheme,
     is_scheme_suitable,
 )
 
-# Every so many samples it is checked whether the backlash has forgotten where it began.
-FORGOTTEN = 200
-# A lasting error of the input moves the plant as far as white noise of so many times its variance.
-LASTING = 10
 # What a short lag follows is known within this share of the sensor's variance.
 NEARLY = 0.01
 
@@ -96,7 +92,6 @@ class SampledPlant:
         self.hold_r = hold_r if self.law else "zoh"
         self.sees = sees if self.law else ""
         self.n = len(e.states)
-        self.size = self.n + (len(self.law.rest) if self.law else 0)
         self.pieces = count_pieces(hold)
         self.delay_samples = count_delay_samples(e, loop.dt / self.pieces)
         self.forces = e.velocities or tuple(range(self.n - len(e.rest)))
@@ -107,6 +102,8 @@ class SampledPlant:
         self.scheme = choose_scheme(e, loop, loop.dt / self.pieces)
         self.plan = PeriodPlan(e, self.law, loop.dt, hold, self.scheme, self.forces, self.channels,
                          tuple(self.index), self.delay_samples, self.hold_r, self.sees)  # fmt: skip
+        # What the filter estimates beside those: where a backlash stood when the record began.
+        self.size = self.plan.size + (e.play is not None)
         self.maps = build_maps(self.plan)
         self.initial_conditions = InitialConditions(self.plan)
 
@@ -120,7 +117,7 @@ class SampledPlant:
         """Return the state after a period and its derivatives, those by the state first."""
         if not self.maps.carries:
             return evaluate_blocks(stages, [], [x, *given, 0])
-        n = self.size
+        n = self.plan.size
         widths = [size // n for size in stages[0].sizes[2 : -len(given) - 1]]
         still = [np.eye(n).ravel(), *(np.zeros(n * k) for k in widths)]
         return evaluate_blocks(stages, [x, *still], given, self.maps.parts)
@@ -150,52 +147,51 @@ class SampledPlant:
 
     def linearize(self, data: FilterData, theta: Array, at: Trajectory) -> Linearized:
         """Return the plant along a trajectory, for parameter values `theta`."""
-        p = self.insert_free_values(theta)
-        u = data.u
-        applied, slopes = self._find_applied_input(data.path, p)
+        p, u, n = self.insert_free_values(theta), data.u, self.plan.size
         late_variance = self.initial_conditions.find_input_variance(u, p) / data.scale**2
         input_variance = data.input_variance + late_variance
-        w = self._stack_applied_inputs(data, applied)
+        corners, by_memory, by_free = self._find_expected_corners(data, p, at)
+        w = self._stack_signals(data, corners)
         moved = 1e-3 * np.std(u[data.valid if u.ndim == 1 else data.valid.any(axis=1)], axis=0)
         spread = at.spread[:, : self.n].T
-        given = (at.filtered.T, w, p, spread, np.zeros(self.channels))
-        step, a, b, dp, *by_input = self._evaluate_transition(self.maps.stages, *given)
+        given = (at.filtered[:, :n].T, w, p, spread, np.zeros(self.channels))
+        step, a, b, dp, *by_input = (
+            _repeat_over_samples(part, len(u))
+            for part in self._evaluate_transition(self.maps.stages, *given)
+        )
+        step = step[:, :, 0]
         # How the input moves the state matters only where the input is not what was measured.
-        du = np.zeros((len(u), self.size))
+        du = np.zeros((len(u), n))
         rows = np.flatnonzero(input_variance)
-        if slopes is not None:
-            dw = _repeat_over_samples(by_input[0], len(u))
-            du = dw.sum(axis=2)
-            dp = _repeat_over_samples(dp, len(u)).copy()
-            for k, moved in enumerate(self._list_corners(slopes)):
-                dp += dw[:, :, k, None] * moved[:, None, :]
+        if by_input:
+            du = by_input[0].sum(axis=2)
+            dp = dp + np.einsum("nic,cnp->nip", by_input[0], by_free)
         elif len(rows):
             du[rows] = self._differentiate_by_input(rows, given, moved)
             rows = np.flatnonzero(late_variance)
             if len(self.e.inputs) > 1 and len(rows):
                 alone = np.arange(len(moved)) == self.e.late_input
                 du[rows] = self._differentiate_by_input(rows, given, moved * alone)
-        start, wide = self.initial_conditions.find_initial_state(data, p)
         output, c, hp = (
             _repeat_over_samples(part, len(u))
-            for part in self.maps.sensor(at.predicted.T, w, p, spread)
+            for part in self.maps.sensor(at.predicted[:, :n].T, w, p, spread)
         )
+        if by_input:
+            # The memory of a backlash stands still, and nothing but the input shows it.
+            a = np.pad(a, [(0, 0), (0, 1), (0, 1)])
+            a[:, :n, n], a[:, n, n] = np.einsum("nic,cn->ni", by_input[0], by_memory), 1.0
+            step = np.column_stack([step, at.filtered[:, n]])
+            b, du, dp = (np.pad(v, [(0, 0), (0, 1)] + [(0, 0)] * (v.ndim - 2)) for v in (b, du, dp))
+            c = np.pad(c, [(0, 0), (0, 0), (0, 1)])
         # Of one output the axis of outputs is left out.
         seen = 0 if self.e.siso else slice(None)
-        return Linearized(
-            _repeat_over_samples(step, len(u))[:, :, 0],
-            _repeat_over_samples(a, len(u)),
-            _repeat_over_samples(b, len(u)),
-            du,
-            _repeat_over_samples(dp, len(u)),
-            output[:, seen, 0],
-            c[:, seen, :],
-            hp[:, seen, :],
-            input_variance,
-            self.pad_controller_states(start),
-            self.pad_controller_states(wide),
-            at,
+        start, wide = self.extend_start(
+            data, *self.initial_conditions.find_initial_state(data, p), p
         )
+        return Linearized(
+            step, a, b, du, dp, output[:, seen, 0], c[:, seen, :], hp[:, seen, :],
+            input_variance, start, wide, at,
+        )  # fmt: skip
 
     def linearize_at_rest(self) -> tuple[Array, Array, Array]:
         """Return (A, B, C) of a sample at rest: by the state before, by forces, of the outputs."""
@@ -233,17 +229,26 @@ class SampledPlant:
         slope: Array = (above - below)[:, :, 0] / (2 * (h if self.e.siso else 1e-3))
         return slope
 
-    def _find_applied_input(self, u: Array, p: Array) -> tuple[Array, Array | None]:
-        """Return the input behind the backlash, and how it depends on the free parameters."""
+    def _list_input_ranges(self, data: FilterData, p: Array) -> InputRange:
+        """Return what acts behind the backlash at each corner; shapes (corners, n, ...)."""
+        found = find_input_range(self.e, self.index, data.path.ravel(), p)
+        return found.map(lambda values: np.array(self._list_corners(values)))
+
+    def _find_expected_corners(
+        self, data: FilterData, p: Array, at: Trajectory
+    ) -> tuple[Sequence[Array], Any, Any]:
+        """Return the input at each corner, and its derivatives where it is behind a backlash.
+
+        Those by the memory of the backlash have shape (corners, n), those by the free parameters
+        (corners, n, free).
+        """
         if self.e.play is None:
-            return u, None
-        if u.ndim == 2:
-            # A backlash has one input, beside several outputs.
-            applied, slopes = self._find_applied_input(u[:, 0], p)
-            return applied[:, None], slopes
-        return build_backlash(self.plan).compute_input(
-            self.initial_conditions.find_memory(float(u[0]), p)[0], u, p
-        )
+            return self._list_corners(data.path), None, None
+        ranges = self._list_input_ranges(data, p)
+        # Errors of a model that does not fit yet make no memory less certain than it was at first.
+        spread = np.minimum(at.spread[:, -1], find_memory(self.e, data.path.flat[0], p)[1])
+        applied, by_memory, by_free = ranges.linearize(at.filtered[:, -1], spread)
+        return list(applied), by_memory, by_free
 
     def build_sensitivity_map(self) -> casadi.Function:
         """Return one period of the plant, as it is, together with that of its sensitivities.
@@ -251,7 +256,7 @@ class SampledPlant:
         ``f(z, w, p) -> (next z, y and its slopes)``; z stacks the state and its derivatives by the
         free parameters and the initial state, w is a column of `stack_inputs`.
         """
-        n, p = self.size, len(self.index)
+        n, p = self.plan.size, len(self.index)
         sizes = {
             "x": (n, 1),
             "s": (n, p + n),
@@ -275,46 +280,54 @@ class SampledPlant:
         )  # fmt: skip
 
     def stack_inputs(self, data: FilterData, theta: Array) -> Array:
-        """Return the rows over which the map is evaluated, behind any backlash.
+        """Return the rows over which the map is evaluated.
 
-        They have the shape (pieces + 5, n), one more if the reference runs straight.
+        They have the shape (pieces + 5, n), one more if the reference runs straight. A backlash
+        begins in the middle of its gap.
         """
-        return self._stack_applied_inputs(
-            data, self._find_applied_input(data.path, self.insert_free_values(theta))[0]
-        )
+        p = self.insert_free_values(theta)
+        memory = find_memory(self.e, data.path.flat[0], p)[0] if self.e.play is not None else None
+        return self._stack_known_signals(data, p, slice(None), memory)
 
     def advance(self, data: FilterData, x: Array, rows: Any, known: bool = True) -> Array:
         """Return states (k, n) one period after the samples `rows`, with the loop's parameters."""
-        p = self.e.values
-        w = self._stack_applied_inputs(data, self._find_applied_input(data.path, p)[0])[:, rows]
+        p, n = self.e.values, self.plan.size
+        w = self._stack_known_signals(data, p, rows, x[:, n:].T)
         if not known:
             w[-len(self.e.outputs) :] = self.evaluate_output(data, x, rows).T
         quiet = np.zeros((self.n, 1))
-        return self._evaluate_transition(
-            self.maps.stages, x.T, w, p, quiet, np.zeros(self.channels)
+        moved = self._evaluate_transition(
+            self.maps.stages, x[:, :n].T, w, p, quiet, np.zeros(self.channels)
         )[0][:, :, 0]
+        return np.hstack([moved, x[:, n:]])
 
     def evaluate_output(self, data: FilterData, x: Array, rows: Any) -> Array:
         """Return the outputs at states (k, n) and the samples `rows`."""
-        p = self.e.values
-        w = self._stack_applied_inputs(data, self._find_applied_input(data.path, p)[0])[:, rows]
-        output: Array = self.maps.sensor(x.T, w, p, np.zeros((self.n, 1)))[0][:, :, 0]
+        p, n = self.e.values, self.plan.size
+        w = self._stack_known_signals(data, p, rows, x[:, n:].T)
+        output: Array = self.maps.sensor(x[:, :n].T, w, p, np.zeros((self.n, 1)))[0][:, :, 0]
         return output[:, 0] if self.e.siso else output
 
-    def _stack_applied_inputs(self, data: FilterData, applied: Array) -> Array:
+    def _stack_known_signals(self, data: FilterData, p: Array, rows: Any, memory: Any) -> Array:
+        """Return what `_stack_signals` does at some samples, the memory of a backlash known."""
+        if self.e.play is None:
+            return self._stack_signals(data, self._list_corners(data.path))[:, rows]
+        ranges = self._list_input_ranges(data, p).map(lambda values: values[:, rows])
+        return self._stack_signals(data, list(ranges.clip(memory)), rows)
+
+    def _stack_signals(
+        self, data: FilterData, corners: Sequence[Array], rows: Any = slice(None)
+    ) -> Array:
         """Return the rows (t, input before, now, ..., ahead, r, y) the map is evaluated over."""
         references = [data.r] if self.hold_r == "zoh" else [data.r, shift_signal(data.r, -1)]
+        others = (part.T[..., rows] for part in (*references, data.y))
+        return np.vstack([data.t[rows], *(part.T for part in corners), *others])
+
+    def _list_corners(self, path: Array) -> list[Array]:
+        """Return what acts at each corner, one before the sample to the one ahead of it."""
         # What a delay still holds when the record begins may be anything that the input is in it: a
         # reference that sets in with the record makes its first sample an unusual one.
-        before = applied[:1] if self.e.delay is None else applied.mean(axis=0, keepdims=True)
-        corners = [part.T for part in self._list_corners(applied, before)]
-        return np.vstack([data.t, *corners, *(part.T for part in references), data.y.T])
-
-    def _list_corners(self, path: Array, before: Array | None = None) -> list[Array]:
-        """Return what acts at each corner, one before the sample to the one ahead of it.
-
-        Ahead of the record it is `before`, by default the first value.
-        """
+        before = path[:1] if self.e.delay is None else path.mean(axis=0, keepdims=True)
         steps, late = range(-1, self.pieces + 1), self.delay_samples
         corners = [shift_signal(path, late - k, before)[:: self.pieces] for k in steps]
         if self.e.delay is not None and len(self.e.inputs) > 1:
@@ -326,13 +339,28 @@ class SampledPlant:
 
     def pad_controller_states(self, values: Array) -> Array:
         """Add the states of a known analog controller, at rest, to a start."""
-        extra = self.size - values.shape[0]
+        extra = self.plan.size - values.shape[0]
         if not extra:
             return values
         padded = np.pad(values, [(0, extra)] * values.ndim)
         if self.law is not None and values.ndim == 1:
             padded[-extra:] = self.law.rest
         return padded
+
+    def extend_start(
+        self, data: FilterData, start: Array, spread: Array, p: Array
+    ) -> tuple[Array, Array]:
+        """Return start and covariance with what else the filter estimates.
+
+        A known analog controller begins at rest, a backlash anywhere in its gap.
+        """
+        start, spread = (self.pad_controller_states(v) for v in (start, spread))
+        if self.e.play is None:
+            return start, spread
+        memory, deviation = find_memory(self.e, data.path.flat[0], p)
+        wide = np.pad(spread, (0, 1))
+        wide[-1, -1] = (deviation / data.scale) ** 2
+        return np.append(start, memory), wide
 
 
 def _repeat_over_samples(values: Array, n: int) -> Array:
@@ -343,22 +371,13 @@ def _repeat_over_samples(values: Array, n: int) -> Array:
 class InitialConditions:
     """The initial conditions of a plant at the start of a record.
 
-    A lag begins near what it follows. A backlash may lie anywhere in its gap, and what a delay
-    still holds is unknown: until it has passed, the input is uncertain.
+    A lag begins near what it follows. What a delay still holds is unknown: until it has passed, the
+    input is uncertain.
     """
 
     def __init__(self, plan: PeriodPlan) -> None:
         self.plan = plan
         self.lags = _prepare_lags(plan.equations)
-
-    def find_memory(self, u: float, p: Array) -> tuple[float, float]:
-        """Return the memory of the backlash at the start, and how far off it may be."""
-        e = self.plan.equations
-        assert e.play is not None
-        given = casadi.vertcat(e.play.u, e.p), casadi.vertcat(u, p)
-        found = casadi.substitute(casadi.vertcat(e.play.start, e.play.reach), *given)
-        start, reach = np.asarray(casadi.evalf(found), float).ravel().tolist()
-        return start, reach
 
     def find_input_variance(self, u: Array, p: Array) -> Array:
         """Return the variance of the input, as far as it is older than the record.
@@ -377,9 +396,6 @@ class InitialConditions:
         """
         e, variance = self.plan.equations, np.zeros(len(u))
         u = u if u.ndim == 1 else u[:, e.late_input]
-        if e.play is not None:
-            whole = self.plan.delay_samples // self.plan.pieces
-            variance = shift_signal(self._find_backlash_variance(u, p), whole)
         if e.delay is not None:
             late = evaluate_delay(e, p) / self.plan.dt
             far = np.clip(late - np.arange(len(u)), 0.0, 1.0)
@@ -387,23 +403,6 @@ class InitialConditions:
             # Beside several signals an input is counted in its standard deviations.
             size = np.var(u) if e.siso or e.play is not None else 1.0
             variance = variance + far**2 * max(late, 1.0) * size
-        return variance
-
-    def _find_backlash_variance(self, u: Array, p: Array) -> Array:
-        """Return the variance of the input behind the backlash, until it forgets how it began."""
-        variance = np.zeros(len(u))
-        middle, reach = self.find_memory(float(u[0]), p)
-        ends, backlash = [middle - reach, middle + reach], build_backlash(self.plan)
-        for first in range(0, len(u), FORGOTTEN):
-            some = u[first : first + FORGOTTEN]
-            memories = [backlash.compute_memories(z, some, p) for z in ends]
-            low, high = (
-                backlash.slopes(m[None, :-1], some[None, :], p)[0][:, 0, 0] for m in memories
-            )
-            variance[first : first + FORGOTTEN] = LASTING * (high - low) ** 2 / 12
-            if high[-1] == low[-1]:
-                break
-            ends = [float(m[-1]) for m in memories]
         return variance
 
     def find_initial_state(self, data: FilterData, p: Array) -> tuple[Array, Array]:

@@ -10,13 +10,11 @@ import casadi
 import numpy as np
 
 from ..._base.arrays import Array
-from ..._base.compilation import compile_loop
 from ..._base.errors import ModelCannotRun
-from ..._base.interruption import keep_interrupt
 from ...data.reconstruction import count_pieces
 from ...loop.controllers import ControlLaw
 from ...loop.loop import Loop
-from ...loop.period_map import apply_backlash, push_velocities
+from ...loop.period_map import push_velocities
 from ...physics.block_evaluation import BlockEvaluation
 from ...physics.differentiation import Stages, differentiate
 from ...physics.equations import Equations
@@ -375,56 +373,3 @@ def _make_function(inputs: Sequence[Any], outputs: Sequence[Any]) -> casadi.Func
     if plain.n_instructions() > LONG:
         return plain
     return casadi.Function("step", inputs, outputs, {"cse": True})
-
-
-@dataclass(frozen=True, eq=False)
-class BacklashMap:
-    """The backlash of an input over one sample, as functions of memory, input and parameters.
-
-    `after` is the next memory; `slopes` returns the applied input and how it and the next memory
-    depend on the memory and on the free parameters.
-    """
-
-    after: BlockEvaluation
-    slopes: BlockEvaluation
-
-    def compute_memories(self, first: float, u: Array, p: Array) -> Array:
-        """Return the memory before each of n samples and after the last, shape (n + 1,)."""
-        after = self.after.iterate(np.array([first]), u[None, :], p)[:, 0]
-        return np.concatenate([[first], after])
-
-    def compute_input(self, first: float, u: Array, p: Array) -> tuple[Array, Array]:
-        """Return the applied input, shape (n,), and its derivatives by the free parameters.
-
-        Those have shape (n, free); the first memory is held.
-        """
-        memories = self.compute_memories(first, u, p)[:-1]
-        applied, *slopes = self.slopes(memories[None, :], u[None, :], p)
-        seen, carried = (np.broadcast_to(v, (len(u), *v.shape[1:]))[:, 0, :] for v in slopes)
-        by_memory = _carry_sensitivity(carried[:, 0], carried[:, 1:])
-        return applied[:, 0, 0], seen[:, :1] * by_memory + seen[:, 1:]
-
-
-@functools.lru_cache(maxsize=64)
-def build_backlash(plan: PeriodPlan) -> BacklashMap:
-    """Return the backlash of a plan, built once."""
-    e = plan.equations
-    assert e.play is not None
-    m, u, p = casadi.SX.sym("m"), casadi.SX.sym("u"), casadi.SX.sym("p", e.p.shape[0])
-    applied, after = apply_backlash(e, m, u, p)
-    by = casadi.vertcat(m, *(p[k] for k in plan.index))
-    slopes = [applied, casadi.jacobian(applied, by), casadi.jacobian(after, by)]
-    return BacklashMap(
-        *(BlockEvaluation(casadi.Function("backlash", [m, u, p], out)) for out in ([after], slopes))
-    )
-
-
-@keep_interrupt
-@compile_loop(nogil=True, error_model="numpy")
-def _carry_sensitivity(gain: Any, push: Any) -> Any:  # pragma: no cover - compiled
-    """Return what obeys ``s[k + 1] = gain[k] s[k] + push[k]`` and begins at zero."""
-    out = np.zeros(push.shape)
-    for k in range(len(push) - 1):
-        for j in range(push.shape[1]):
-            out[k + 1, j] = gain[k] * out[k, j] + push[k, j]
-    return out

@@ -1,0 +1,164 @@
+"""The input behind a backlash of which nobody knows where it stood when a record began."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import casadi
+import numpy as np
+from scipy import special
+
+from ..._base.arrays import Array
+from ..._base.compilation import compile_loop
+from ..._base.interruption import keep_interrupt
+from ...loop.period_map import apply_backlash
+from ...physics.block_evaluation import BlockEvaluation
+from ...physics.equations import Equations
+
+# Beyond so many standard deviations a corner is met for certain; a spread of zero is no exception.
+CERTAIN = 30.0
+
+
+@dataclass(frozen=True, eq=False)
+class InputRange:
+    r"""What the input behind a backlash may be at each sample, and its derivatives.
+
+    A backlash only ever clips what it remembers, and clips one after another are a clip: from
+    the memory m at the start,
+
+    .. math:: u_a = \min(\max(m, l_k), h_k)
+
+    where l and h are the inputs that follow from the lowest and from the highest memory there is.
+    They are equal from the sample on at which the input has crossed the gap.
+
+    Parameters
+    ----------
+    low, high : ndarray, shape (..., n)
+        The lowest and the highest input.
+    low_slopes, high_slopes : ndarray, shape (..., n, free)
+        Their derivatives by the free parameters.
+    """
+
+    low: Array
+    high: Array
+    low_slopes: Array
+    high_slopes: Array
+
+    def map(self, change: Callable[[Array], Array]) -> InputRange:
+        """Return what becomes of all four by the same change, of their samples, say."""
+        parts = self.low, self.high, self.low_slopes, self.high_slopes
+        return InputRange(*(change(part) for part in parts))
+
+    def clip(self, memory: Array) -> Array:
+        """Return the input that follows from a known memory at the start."""
+        return np.asarray(np.clip(memory, self.low, self.high))
+
+    def linearize(self, memory: Array, spread: Array) -> tuple[Array, Array, Array]:
+        r"""Return the expected input and its derivatives, for a normal memory at the start.
+
+        .. math:: \bar u_a = l + s F\Bigl(\frac{m - l}{s}\Bigr) - s F\Bigl(\frac{m - h}{s}\Bigr),
+            \quad F(z) = z \Phi(z) + \varphi(z)
+
+        with the standard deviation s of the memory (statistical linearization: Gelb, *Applied
+        Optimal Estimation*, section 6.2).
+
+        Parameters
+        ----------
+        memory, spread : ndarray, shape (n,)
+            Mean and standard deviation of the memory, as known at each sample.
+
+        Returns
+        -------
+        applied, by_memory : ndarray, shape (..., n)
+            The input, and its derivative by the memory.
+        by_parameters : ndarray, shape (..., n, free)
+            Its derivatives by the free parameters.
+        """
+        s = np.maximum(spread, np.finfo(float).tiny)
+        with np.errstate(over="ignore"):
+            above_low, above_high = (
+                np.clip((memory - bound) / s, -CERTAIN, CERTAIN) for bound in (self.low, self.high)
+            )
+        inside, beyond = special.ndtr(above_low), special.ndtr(above_high)
+        bent = _density(above_low) - _density(above_high)
+        clipped = self.low * (1 - inside) + self.high * beyond
+        applied = clipped + memory * (inside - beyond) + s * bent
+        by_parameters = (
+            self.low_slopes * (1 - inside)[..., None] + self.high_slopes * beyond[..., None]
+        )
+        return applied, inside - beyond, by_parameters
+
+
+def _density(z: Array) -> Array:
+    return np.asarray(np.exp(-(z**2) / 2) / np.sqrt(2 * np.pi))
+
+
+def find_memory(e: Equations, u: float, p: Array) -> tuple[float, float]:
+    """Return the memory at the start, and its standard deviation: anywhere in the gap."""
+    start, reach = _find_gap(e, u, p)
+    return start, reach / np.sqrt(3)
+
+
+def _find_gap(e: Equations, u: float, p: Array) -> list[float]:
+    """Return the middle of the gap of a first input, and how far its ends are from there."""
+    assert e.play is not None
+    given = casadi.vertcat(e.play.u, e.p), casadi.vertcat(u, p)
+    found = casadi.substitute(casadi.vertcat(e.play.start, e.play.reach), *given)
+    gap: list[float] = np.asarray(casadi.evalf(found), float).ravel().tolist()
+    return gap
+
+
+def find_input_range(e: Equations, index: Sequence[int], u: Array, p: Array) -> InputRange:
+    """Return what the input behind the backlash may be along a record.
+
+    Parameters
+    ----------
+    e : Equations
+        The plant, with a backlash.
+    index : sequence of int
+        Places of the free parameters.
+    u : ndarray, shape (n,)
+        The input before the backlash.
+    p : ndarray
+        Values of all parameters.
+    """
+    after, slopes = e.derive(("backlash", tuple(index)), lambda: _build_maps(e, index))
+    start, reach = _find_gap(e, float(u[0]), p)
+    found = []
+    # A memory outside the gap is clipped to its end, whose derivatives are those of a clip.
+    for first in (start - 2 * reach, start + 2 * reach):
+        follow = after.iterate(np.array([first]), u[None, :], p)[:, 0]
+        memories = np.concatenate([[first], follow[:-1]])
+        applied, *parts = slopes(memories[None, :], u[None, :], p)
+        seen, carried = (np.broadcast_to(v, (len(u), *v.shape[1:]))[:, 0, :] for v in parts)
+        by_memory = _carry_sensitivity(carried[:, 0], carried[:, 1:])
+        found.append((applied[:, 0, 0], seen[:, :1] * by_memory + seen[:, 1:]))
+    (low, low_slopes), (high, high_slopes) = found
+    return InputRange(low, high, low_slopes, high_slopes)
+
+
+def _build_maps(e: Equations, index: Sequence[int]) -> tuple[BlockEvaluation, BlockEvaluation]:
+    """Return the next memory, and the applied input with the derivatives of both.
+
+    Functions of memory, input and parameters; derivatives are by the memory and by the free
+    parameters.
+    """
+    m, u, p = casadi.SX.sym("m"), casadi.SX.sym("u"), casadi.SX.sym("p", e.p.shape[0])
+    applied, after = apply_backlash(e, m, u, p)
+    by = casadi.vertcat(m, *(p[k] for k in index))
+    slopes: list[Any] = [applied, casadi.jacobian(applied, by), casadi.jacobian(after, by)]
+    one, other = (casadi.Function("backlash", [m, u, p], out) for out in ([after], slopes))
+    return BlockEvaluation(one), BlockEvaluation(other)
+
+
+@keep_interrupt
+@compile_loop(nogil=True, error_model="numpy")
+def _carry_sensitivity(gain: Any, push: Any) -> Any:  # pragma: no cover - compiled
+    """Return what obeys ``s[k + 1] = gain[k] s[k] + push[k]`` and begins at zero."""
+    out = np.zeros(push.shape)
+    for k in range(1, len(push)):
+        for j in range(push.shape[1]):
+            out[k, j] = gain[k - 1] * out[k - 1, j] + push[k - 1, j]
+    return out
