@@ -121,6 +121,8 @@ class Case:
     worth: tuple[float, ...]
     wanted: float
     redrawn: int
+    # Whether nothing of the input reaches the plant, so that no record tells what keeps it away.
+    swallowed: bool = False
 
 
 def make_array(plant: str, p: dict[str, float]) -> np.ndarray:
@@ -485,9 +487,13 @@ def _fill_rig(
                 ]
                 for values in sizes
             ]
+    # Then the output is that of the same plant whose input stands still, with the same noise.
+    still = op.simulate(plant, p, e, rig.at, x0, rig.num, rig.den, False, 0.0 * moves, pushes,
+                        rig.sigma * noise, periods, step * rig.sigma, reach)[1]  # fmt: skip
+    swallowed = bool(np.allclose(still, y, rtol=0.0, atol=1e-6 * rig.sigma))
     r = moves + rig.at[2] if rig.closed else moves + rig.at[1]
     return Case(name, seed, rig, kind, r, u, y, tuple(hidden), tuple(sizes), tuple(worth), wanted,
-                attempt)  # fmt: skip
+                attempt, swallowed)  # fmt: skip
 
 
 def _list_other_indices(values: dict[str, float], indices: list[int]) -> tuple[int, ...]:

@@ -37,6 +37,8 @@ FAINT, FOUND = 5.0, 50.0  # worth from which a wrong name counts, and from which
 BESIDE = 100.0  # the same of each of two
 EDGES = (0, 5, 10, 20, 50, 100, 300, 1000, 3000, math.inf)
 G = 9.81
+# How an answer begins that names nothing because the record does not show that the input acts.
+IDLE = ("THE INPUT DOES NOT SEEM TO REACH", "THE OUTPUT DOES NOT SEEM TO MOVE")
 
 Rates = Callable[[Any, Any, Any], tuple[Any, ...]]
 # What a user writes: rates from states, input and parameters; names; the state that is measured.
@@ -126,7 +128,7 @@ def run(name: str, seed: int, n: int = SAMPLES, watched: bool = True) -> dict[st
             "reference": rig.reference, "redrawn": case.redrawn, "dt": rig.dt,
             "truth": list(case.hidden), "sizes": [_round(s) for s in case.sizes],
             "worth": [round(float(w), 3) for w in case.worth],
-            "drawing": round(time.process_time() - start, 2),
+            "swallowed": case.swallowed, "drawing": round(time.process_time() - start, 2),
         }  # fmt: skip
         loop = make_loop(rig)
         record = cid.Record(r=case.r if rig.closed else None, u=case.u, y=case.y, dt=rig.dt)
@@ -140,6 +142,7 @@ def run(name: str, seed: int, n: int = SAMPLES, watched: bool = True) -> dict[st
     gap = found.gap
     return line | {
         "verdict": found.verdict,
+        "idle": found.sentence.startswith(IDLE),
         "findings": [_describe(f) for f in found.findings],
         "stand_ins": [_describe(f) for f in found.stand_ins],
         "gap": _digits([gap.given, gap.before, gap.after, gap.floor]),
@@ -236,6 +239,11 @@ def is_in_sets(line: dict[str, Any], truth: str) -> bool:
     return any(holds_truth(groups, truth, line["plant"]) for groups in list_sets(line))
 
 
+def is_rightly_nameless(line: dict[str, Any]) -> bool:
+    """Whether all of the input is swallowed, by whatever it is, and the answer says just that."""
+    return bool(line.get("swallowed") and line.get("idle"))
+
+
 def is_first(line: dict[str, Any]) -> bool:
     """Whether the first name is the truth."""
     sets = list_sets(line)
@@ -295,6 +303,8 @@ def score(lines: Sequence[dict[str, Any]]) -> list[tuple[str, str, str]]:
          write_share([x.get("verdict") == "nothing missing" for x in of["clean"]])),
         (f"one effect, worth over {FOUND:g}: the truth in the set of a finding", "98 %",
          write_share([is_in_sets(x, x["truth"][0]) for x in one])),
+        ("  the same, and rightly no name where nothing of the input reaches the plant", "",
+         write_share([is_in_sets(x, x["truth"][0]) or is_rightly_nameless(x) for x in one])),
         ("  the same: the truth first", "93 %", write_share([is_first(x) for x in one])),
         ("  the same: answers with one name that are right", "98 %",
          write_share([is_first(x) for x in one
@@ -307,6 +317,9 @@ def score(lines: Sequence[dict[str, Any]]) -> list[tuple[str, str, str]]:
          write_share([is_wrong(x, s) for x, s in pairs])),
         (f"two effects, each worth over {BESIDE:g} beside the other: both in the sets", "95 %",
          write_share([all(is_in_sets(x, t) for t in x["truth"]) for x in two])),
+        ("  the same, and rightly no name where nothing of the input reaches the plant", "",
+         write_share([all(is_in_sets(x, t) for t in x["truth"]) or is_rightly_nameless(x)
+                      for x in two])),
         ("  the same: exactly right, a finding for each and no other", "80 %",
          write_share([is_exact(x) for x in two])),
         (f"three effects, each worth over {BESIDE:g} beside the others: all in the sets", "",
@@ -371,7 +384,8 @@ def find_misses(lines: Sequence[dict[str, Any]]) -> list[str]:
         answer = x.get("error") or " + ".join("/".join(f["set"]) for f in x["findings"])
         stand_ins = " + ".join("/".join(f["set"]) for f in x.get("stand_ins", []))
         out.append(f"{x['class']} {x['seed']} {x['plant']}, {x['noise']} noise, law {x['law']}: "
-                   f"{hidden or 'nothing'} -> {x.get('verdict', 'raised')}: {answer or 'no name'}"
+                   f"{hidden or 'nothing'}{', which swallow all of u' * bool(x.get('swallowed'))} "
+                   f"-> {x.get('verdict', 'raised')}: {answer or 'no name'}"
                    + (f"; stand-ins {stand_ins}" if stand_ins else ""))  # fmt: skip
     return out
 

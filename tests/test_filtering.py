@@ -561,8 +561,9 @@ def test_what_a_play_hides_is_every_beginning_at_once():
     assert max(weights[0], weights[-1]) < 1e-3
     mean = np.max(each) + np.log(np.sum(weights) * (places[1] - places[0]) / width)
     out, found = filtered(plain.with_effect(E.InputBacklash(width)), u)
-    # A uniform distribution is counted as the normal one of the same width.
-    assert found == pytest.approx(mean, abs=1.0)
+    # The filter counts a uniform distribution as the normal one of the same width, and knows little
+    # of the beginning in the first samples; one lasting error as white noise would cost 149.
+    assert found == pytest.approx(mean, abs=2.0)
     expected = weights @ places / np.sum(weights)
     spread = np.sqrt(weights @ (places - expected) ** 2 / np.sum(weights))
     assert out.trajectory.filtered[-1, -1] == pytest.approx(expected, abs=0.5 * spread)

@@ -282,6 +282,26 @@ def test_the_table_counts_and_the_file_keeps(tmp_path):
     assert "no draw" not in summary
 
 
+def test_an_input_that_is_swallowed_whole_is_told_and_counted_apart():
+    """No record tells what keeps all of an input away; the table counts with and without those."""
+    whole, most = (cases.draw_case("one", seed, 1500) for seed in (84503, 84546))
+    assert [c.hidden for c in (whole, most)] == [("InputDeadZone",)] * 2
+    assert whole.sizes[0]["deadzone"] > np.ptp(whole.u)
+    assert (whole.swallowed, most.swallowed) == (True, False)
+    lines = [
+        make_line("one", 0, ["InputDeadZone"], [200.0], swallowed=True, idle=True),
+        make_line("one", 1, ["InputDeadZone"], [200.0], swallowed=False, idle=True),
+        make_line("one", 2, ["InputDeadZone"], [200.0], swallowed=True, idle=False),
+        make_line("one", 3, ["InputDeadZone"], [200.0], [["InputDeadZone"]], swallowed=True),
+    ]
+    (strict, _, found), (apart, _, told) = study.score(lines)[3:5]
+    assert strict.startswith("one effect, worth over 50: the truth in the set")
+    assert found.startswith("1 of 4")
+    assert apart.strip().startswith("the same, and rightly no name")
+    assert told.startswith("2 of 4")
+    assert "which swallow all of u" in study.find_misses(lines)[0]
+
+
 def test_a_diagnosis_rerun_from_its_seed_gives_the_same_answer():
     one, two = (study.run("clean", 1, 400) for _ in range(2))
     assert "error" not in one, one

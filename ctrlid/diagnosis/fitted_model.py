@@ -148,6 +148,13 @@ def compute_log_terms(fit: Fit) -> Array:
     return np.concatenate(parts)
 
 
+def takes_readings_as_exact(fit: Fit) -> bool:
+    """Whether the one-step errors of the filter are hardly noise of the sensor."""
+    errors = np.concatenate([np.ravel(out.variance) for out in fit.filtered])
+    errors = errors[np.isfinite(errors)]
+    return len(errors) > 0 and float(np.median(errors)) > THRESHOLD.exact_readings
+
+
 def carry_over_fit(base: Model, loop: Loop, names: Sequence[str]) -> Fit:
     """Return the likelihood of a larger or smaller model, along the trajectory of the base."""
     old = base.fit.problem

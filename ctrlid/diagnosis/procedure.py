@@ -87,8 +87,9 @@ IDLE_INPUT = (
 AT_REST = (
     "THE OUTPUT DOES NOT SEEM TO MOVE: a constant and noise explain y as well as the model does "
     "with any effect of the catalogue. Either the plant is held, by dry friction, a stop or a "
-    "brake, or the actuator or the sensor is off. No effect is named: check the log and the "
-    "wiring, and excite the plant by larger inputs."
+    "brake, or a dead zone, a gap or a limit swallows all that u did, or the actuator or the "
+    "sensor is off. No effect is named: check the log and the wiring, and excite the plant by "
+    "larger inputs."
 )
 
 SUPPOSED_FORCE = (

@@ -1,5 +1,6 @@
 """Step 2: the model's own free parameters and the noise, fitted before anything is added."""
 
+import contextlib
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -9,12 +10,22 @@ import numpy as np
 from .._base.arrays import Array
 from .._base.errors import ModelCannotRun
 from ..data.record import Record
-from ..estimation.likelihood.likelihood import list_start_values, make_problem
-from ..estimation.likelihood.maximization import begin_fit, choose_noise, maximize, refit_noise_size
+from ..estimation.likelihood.likelihood import (
+    list_start_values,
+    make_problem,
+    rank_by_likelihood,
+)
+from ..estimation.likelihood.maximization import (
+    begin_fit,
+    choose_noise,
+    guess_noise,
+    maximize,
+    refit_noise_size,
+)
 from ..estimation.likelihood.noise.orders import estimate_noise_from_repeats
 from ..loop.loop import Loop
 from ..validation.record_audit import Audit
-from .fitted_model import Model
+from .fitted_model import Model, takes_readings_as_exact
 from .records import find_repeat_periods
 from .thresholds import THRESHOLD
 
@@ -53,7 +64,14 @@ def fit_base_model(
     lower, upper = _narrow_bounds(loop, names, problem.lower, problem.upper)
     problem = replace(problem, lower=lower, upper=upper)
     fit = refit_noise_size(maximize(begin_fit(problem)))
-    return Model(loop, choose_noise(fit))
+    fits = [choose_noise(fit)]
+    if takes_readings_as_exact(fit):
+        # The force that is likeliest at the given values may leave no noise to the sensor, from
+        # where no slope leads back.
+        with contextlib.suppress(ModelCannotRun):
+            usual = begin_fit(fit.problem, noise=guess_noise(fit.problem))
+            fits.append(choose_noise(maximize(usual)))
+    return Model(loop, max(fits, key=rank_by_likelihood))
 
 
 def fit_with_repeat_noise(base: Model, periods: Sequence[int]) -> Model:

@@ -12,7 +12,6 @@ from ..estimation.likelihood.kalman_filter import Noise
 from ..estimation.likelihood.likelihood import Fit, evaluate_likelihood, rank_by_likelihood
 from ..estimation.likelihood.maximization import (
     OTHER_NOISE_GAIN,
-    begin_fit,
     climb_under_quiet_force,
     maximize,
 )
@@ -63,10 +62,6 @@ def _climb_from_starts(base: Model, trial: Trial, near: Model | None) -> Trial:
         # Coloured noise that was fitted while the effect was missing may never let it in.
         # (Where no simulation can check it, the likelihood also leads to absurd values.)
         starts.append(replace(start, noise=start.noise.plain))
-    if start.problem.known is None and _takes_readings_as_exact(start):
-        # Nothing tells the noise of the sensor beside such a force, so that no slope leads back.
-        with contextlib.suppress(ModelCannotRun):
-            starts.append(begin_fit(start.problem, start.theta))
     fit = max((climb(s) for s in starts), key=lambda f: f.value)
     done = weigh_refit(base, trial, fit)
     sticks = start.plant.e.kinked and not base.fit.plant.e.kinked
@@ -76,13 +71,6 @@ def _climb_from_starts(base: Model, trial: Trial, near: Model | None) -> Trial:
         if quiet.value > fit.value:
             done = weigh_refit(base, trial, quiet)
     return done
-
-
-def _takes_readings_as_exact(fit: Fit) -> bool:
-    """Whether the one-step errors of the filter are hardly noise of the sensor."""
-    errors = np.concatenate([np.ravel(out.variance) for out in fit.filtered])
-    errors = errors[np.isfinite(errors)]
-    return len(errors) > 0 and float(np.median(errors)) > THRESHOLD.exact_readings
 
 
 def climb(start: Fit) -> Fit:

@@ -178,9 +178,9 @@ def take_out_effect(
 def refit_without_effect(model: Model, position: int) -> tuple[Model, Trial]:
     """Return the model without one effect, refitted, and the effect as a trial on top of it."""
     bare = _drop_effects(model, [position])
-    smaller = replace(
-        bare, fit=drop_linearization(maximize(bare.fit, rounds=THRESHOLD.removal_rounds))
-    )
+    # What the effect explained is left to a random force, which may have to be far larger.
+    fit = refit_noise_size(maximize(bare.fit, rounds=THRESHOLD.removal_rounds))
+    smaller = replace(bare, fit=drop_linearization(fit))
     effect = model.fitted.effects[position]
     # Put back anew, it would come last; and all else may have gone too far astray without it.
     label = list(model.loop.labelled)[position]

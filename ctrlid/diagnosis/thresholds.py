@@ -93,6 +93,11 @@ class Thresholds:
         10.0, convention="a model whose parameter is further off is another model",
         unit="times the given value, or its inverse",
     )  # fmt: skip
+    exact_readings: float = declare_number(
+        1e4, study="where one-step errors are so much larger than the sensor's noise, the random "
+        "force stands for what is missing, and the model is also fitted from a usual noise",
+        unit="times its variance",
+    )  # fmt: skip
     far_recalibration: float = declare_number(
         0.3, study="a recalibration that moved further is doubted, and candidates are also tried "
         "at the given values", unit="of the given value",
@@ -202,11 +207,6 @@ class Thresholds:
     instant_doublings: int = declare_number(
         11, cost="an instant is moved by 1, 2, 4, ... samples, so many times", unit="doublings"
     )
-    exact_readings: float = declare_number(
-        1e4, study="where one-step errors are so much larger than the sensor's noise, the random "
-        "force stands for what is missing, and a refit also begins with noise of its own",
-        unit="times its variance",
-    )  # fmt: skip
     instant_rounds: int = declare_number(4, cost="of the climb from a better instant",
                                 unit="steps of the climb")  # fmt: skip
 

@@ -148,13 +148,21 @@ def _begin_beside_effects(problem: Problem, theta: Array, noise: Noise | None) -
     return fit
 
 
-def _begin_with_noise(problem: Problem, theta: Array, noise: Noise | None) -> Fit:
-    plant = problem.plant
+def guess_noise(problem: Problem) -> Noise:
+    """Return noise to begin with: a random force that moves the output by a tenth of the sensor's.
+
+    Within a period, that is.
+    """
     scales = problem.data[0].scales
-    first = noise or Noise(
+    return Noise(
         tuple(float(v) ** 2 * 1e-2 for v in choose_force_ratios(problem)),
         sensors=tuple((float(scale) / float(scales[0])) ** 2 for scale in scales[1:]),
     )
+
+
+def _begin_with_noise(problem: Problem, theta: Array, noise: Noise | None) -> Fit:
+    plant = problem.plant
+    first = noise or guess_noise(problem)
     guessed = []
     for data in problem.data:
         at = guess_trajectory(plant, data)
