@@ -10,11 +10,7 @@ from .._base.criterion import bayesian_penalty
 from .._base.errors import EffectDoesNotApply, ModelCannotRun
 from ..estimation.likelihood.kalman_filter import Noise
 from ..estimation.likelihood.likelihood import Fit, evaluate_likelihood, rank_by_likelihood
-from ..estimation.likelihood.maximization import (
-    OTHER_NOISE_GAIN,
-    climb_under_quiet_force,
-    maximize,
-)
+from ..estimation.likelihood.maximization import OTHER_NOISE_GAIN, climb_under_quiet_force, maximize
 from .candidates import Objection, Trial, attempt_trial
 from .fitted_model import (
     Model,

@@ -11,6 +11,7 @@ from .._base.errors import ModelCannotRun
 from ..data.record import Record
 from ..effects.context import find_motion
 from ..physics.linearization import compute_state_matrices
+from .period_map import find_gap
 from .simulation import Simulator
 
 # The initial velocity is at most so many standard deviations of the measured velocity.
@@ -19,6 +20,8 @@ FASTEST = 20.0
 NEAR = 3.0
 # So many samples tell where a record starts and how fast.
 FEW = 8
+# The search for what a backlash remembers begins at the best of so many places in its gap.
+MEMORIES = 8
 # A search starts by this share of the scale inside its bounds, as its solver demands.
 NARROW = 1e-6
 # A search ends where a step gains less than this share of the sum of squares: a hundredth of what
@@ -77,7 +80,8 @@ def find_initial_state(
         k, middle, reach = memory
         sought, scale = [*sought, k], np.append(scale, reach)
         low[k], high[k] = middle - reach, middle + reach
-        memories = [float(np.clip(guess[k], low[k], high[k])), *np.linspace(low[k], high[k], FEW)]
+        at_rest = float(np.clip(guess[k], low[k], high[k]))
+        memories = [at_rest, *np.linspace(low[k], high[k], MEMORIES)]
 
     # Runs of a search differ little, so that each begins with the steps that the last one needed.
     substeps = 1
@@ -259,9 +263,7 @@ def _find_memory(simulator: Simulator, part: Record) -> tuple[int, float, float]
     e, law = loop.equations(), loop.law()
     if e.play is None:
         return None
-    given = casadi.vertcat(e.play.u, e.p), casadi.vertcat(float(np.ravel(part.u)[0]), e.values)
-    found = casadi.substitute(casadi.vertcat(e.play.start, e.play.reach), *given)
-    middle, reach = np.asarray(casadi.evalf(found), float).ravel().tolist()
+    middle, reach = find_gap(e, float(np.ravel(part.u)[0]), e.values)
     place = len(e.states) + (len(law.rest) if law else 0)
     return (place, middle, reach) if reach > 0 else None
 

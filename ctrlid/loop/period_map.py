@@ -233,9 +233,7 @@ def make_period_map(
     input_at_rest = at.inputs[e.late_input]
     memory = []
     if e.play is not None:
-        start = casadi.substitute(casadi.vertcat(e.play.start), casadi.vertcat(e.play.u, e.p),
-                                  casadi.vertcat(at.input, e.values))  # fmt: skip
-        memory = [float(casadi.evalf(start))]
+        memory = [find_gap(e, at.input, e.values)[0]]
         behind = apply_backlash(e, memory[0], at.input, e.values)[0]
         input_at_rest = float(casadi.evalf(casadi.SX(behind)))
     rest += [*memory, *([input_at_rest] * kept)]
@@ -255,6 +253,18 @@ def apply_backlash(e: Equations, m: Any, u: Any, p: Any) -> tuple[Any, Any]:
         casadi.vertcat(e.play.applied, e.play.after), given, casadi.vertcat(m, u, p)
     )
     return both[0], both[1]
+
+
+def find_gap(e: Equations, u: float, p: Any) -> tuple[float, float]:
+    """Return the memory of the backlash that belongs to a resting input, and its reach from there.
+
+    Where nobody knows what went before, the memory may be anywhere within that reach.
+    """
+    assert e.play is not None
+    given = casadi.vertcat(e.play.u, e.p), casadi.vertcat(u, p)
+    found = casadi.substitute(casadi.vertcat(e.play.start, e.play.reach), *given)
+    middle, reach = casadi.DM(casadi.evalf(found)).full().ravel().tolist()
+    return middle, reach
 
 
 def _insert_symbols(e: Equations, free: Sequence[str], symbols: Any) -> Any:

@@ -8,12 +8,12 @@ from typing import Any
 
 import casadi
 import numpy as np
-from scipy import special
+from scipy import special, stats
 
 from ..._base.arrays import Array
 from ..._base.compilation import compile_loop
 from ..._base.interruption import keep_interrupt
-from ...loop.period_map import apply_backlash
+from ...loop.period_map import apply_backlash, find_gap
 from ...physics.block_evaluation import BlockEvaluation
 from ...physics.equations import Equations
 
@@ -82,7 +82,7 @@ class InputRange:
                 np.clip((memory - bound) / s, -CERTAIN, CERTAIN) for bound in (self.low, self.high)
             )
         inside, beyond = special.ndtr(above_low), special.ndtr(above_high)
-        bent = _density(above_low) - _density(above_high)
+        bent = stats.norm.pdf(above_low) - stats.norm.pdf(above_high)
         clipped = self.low * (1 - inside) + self.high * beyond
         applied = clipped + memory * (inside - beyond) + s * bent
         by_parameters = (
@@ -91,23 +91,10 @@ class InputRange:
         return applied, inside - beyond, by_parameters
 
 
-def _density(z: Array) -> Array:
-    return np.asarray(np.exp(-(z**2) / 2) / np.sqrt(2 * np.pi))
-
-
 def find_memory(e: Equations, u: float, p: Array) -> tuple[float, float]:
     """Return the memory at the start, and its standard deviation: anywhere in the gap."""
-    start, reach = _find_gap(e, u, p)
-    return start, reach / np.sqrt(3)
-
-
-def _find_gap(e: Equations, u: float, p: Array) -> list[float]:
-    """Return the middle of the gap of a first input, and how far its ends are from there."""
-    assert e.play is not None
-    given = casadi.vertcat(e.play.u, e.p), casadi.vertcat(u, p)
-    found = casadi.substitute(casadi.vertcat(e.play.start, e.play.reach), *given)
-    gap: list[float] = np.asarray(casadi.evalf(found), float).ravel().tolist()
-    return gap
+    middle, reach = find_gap(e, u, p)
+    return middle, reach / np.sqrt(3)
 
 
 def find_input_range(e: Equations, index: Sequence[int], u: Array, p: Array) -> InputRange:
@@ -125,10 +112,10 @@ def find_input_range(e: Equations, index: Sequence[int], u: Array, p: Array) -> 
         Values of all parameters.
     """
     after, slopes = e.derive(("backlash", tuple(index)), lambda: _build_maps(e, index))
-    start, reach = _find_gap(e, float(u[0]), p)
+    middle, reach = find_gap(e, float(u[0]), p)
     found = []
     # A memory outside the gap is clipped to its end, whose derivatives are those of a clip.
-    for first in (start - 2 * reach, start + 2 * reach):
+    for first in (middle - 2 * reach, middle + 2 * reach):
         follow = after.iterate(np.array([first]), u[None, :], p)[:, 0]
         memories = np.concatenate([[first], follow[:-1]])
         applied, *parts = slopes(memories[None, :], u[None, :], p)

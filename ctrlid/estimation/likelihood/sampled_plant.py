@@ -311,9 +311,11 @@ class SampledPlant:
     def _stack_known_signals(self, data: FilterData, p: Array, rows: Any, memory: Any) -> Array:
         """Return what `_stack_signals` does at some samples, the memory of a backlash known."""
         if self.e.play is None:
-            return self._stack_signals(data, self._list_corners(data.path))[:, rows]
-        ranges = self._list_input_ranges(data, p).map(lambda values: values[:, rows])
-        return self._stack_signals(data, list(ranges.clip(memory)), rows)
+            corners = [corner[rows] for corner in self._list_corners(data.path)]
+        else:
+            ranges = self._list_input_ranges(data, p).map(lambda values: values[:, rows])
+            corners = list(ranges.clip(memory))
+        return self._stack_signals(data, corners, rows)
 
     def _stack_signals(
         self, data: FilterData, corners: Sequence[Array], rows: Any = slice(None)
