@@ -14,6 +14,7 @@ from scipy.integrate import solve_ivp
 import ctrlid as cid
 from ctrlid import CtrlidError
 from ctrlid.loop.period_map import compute_growth_rate
+from ctrlid.loop.simulation import make_simulator
 from problems import REST, drive, held_ball, rough_mass, servo, tank, under_lead
 
 RNG = np.random.default_rng(5)
@@ -257,6 +258,20 @@ def test_force_noise_acts_on_rates():
     discrete = cid.Loop(ct.tf([1.0], [1.0, -0.5], 0.1), None, dt=0.1)
     with pytest.raises(CtrlidError, match=r"acts on rates, and .* is in discrete time"):
         cid.simulate(discrete, d=np.zeros(10), force_noise=1.0)
+
+
+def test_a_loop_that_runs_again_is_not_made_again():
+    loop, other = make(0.02, 0.01, 3.0)[0], make(0.02, 0.01, 3.0)[0]
+    made = make_simulator(loop)
+    assert make_simulator(loop) is made
+    assert make_simulator(other) is not made
+    # What a run leaves behind does not change the next one.
+    r = cid.random_binary(300, amplitude=1e-4, hold=20, around=loop.at.output, seed=1)
+    first, second = (cid.simulate(loop, r, seed=3, sensor_noise=1e-6) for _ in range(2))
+    anew = cid.simulate(other, r, seed=3, sensor_noise=1e-6)
+    for record in (second, anew):
+        np.testing.assert_array_equal(record.y, first.y)
+        np.testing.assert_array_equal(record.u, first.u)
 
 
 def test_without_a_moving_mass_each_state_has_a_noise_of_its_own():

@@ -14,7 +14,7 @@ from ..estimation.likelihood.likelihood import Known, make_problem
 from ..estimation.likelihood.maximization import begin_fit, compute_expected_gain
 from ..loop.simulation import Simulator
 from .candidates import Trial
-from .gap import make_simulator
+from .gap import make_gap_simulator
 from .thresholds import THRESHOLD
 
 
@@ -53,7 +53,7 @@ def find_experiment(
         # Of several references no one combination is recommended.
         return words, None
     try:
-        simulators = [make_simulator(t.model.fitted) for t in (best, *others)]
+        simulators = [make_gap_simulator(t.model.fitted) for t in (best, *others)]
     except (ModelCannotRun, EffectDoesNotApply):
         return words, None
     simulator = simulators[0]

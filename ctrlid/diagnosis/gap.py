@@ -19,7 +19,7 @@ from ..estimation.likelihood.prediction import predict_ahead, predict_from, pred
 from ..estimation.likelihood.tails import JointTails, Tails
 from ..loop.loop import Loop, find_converter_steps
 from ..loop.period_map import count_forces
-from ..loop.simulation import Simulator
+from ..loop.simulation import Simulator, make_simulator
 from ..validation.record_simulation import find_long_stretches, prepare_stretch
 from ..validation.reproduction import Reproduction
 from .thresholds import THRESHOLD
@@ -302,7 +302,7 @@ def simulate_window(loop: Loop, window: Window, how: Reproduction) -> Array:
             index, values = predict_ahead(loop, record, made, how.horizon, first)
             y[..., index] = values.T
             return y
-        simulator = make_simulator(loop, record.hold, record.hold_r)
+        simulator = make_gap_simulator(loop, record.hold, record.hold_r)
     except (ModelCannotRun, EffectDoesNotApply):
         return y
     for part in find_long_stretches(record):
@@ -314,7 +314,7 @@ def simulate_window(loop: Loop, window: Window, how: Reproduction) -> Array:
     return y
 
 
-def make_simulator(
+def make_gap_simulator(
     loop: Loop, hold: str = "zoh", hold_r: str = "zoh", most: int | None = None
 ) -> Simulator:
     """Return a loop made ready to be simulated many times, as exactly as a gap needs.
@@ -322,7 +322,7 @@ def make_simulator(
     In at `most` so many steps of the integration in a period, by default as a gap.
     """
     most = THRESHOLD.gap_steps if most is None else most
-    return Simulator(loop, THRESHOLD.gap_integration_error, most, hold, hold_r)
+    return make_simulator(loop, THRESHOLD.gap_integration_error, most, hold, hold_r)
 
 
 @dataclass(frozen=True)
@@ -464,7 +464,7 @@ def _simulate_noise(
             squares = size[:, None, None] * known.T[:, None, :] ** 2
             return np.tile(squares, (1, runs, 1))
         return np.tile(size * known**2, (runs, 1))
-    simulator = make_simulator(loop, record.hold, record.hold_r)
+    simulator = make_gap_simulator(loop, record.hold, record.hold_r)
     squares, count = np.zeros((*np.shape(size), runs, 2)), np.zeros_like(size)
     for part in find_long_stretches(record):
         use = window.mask[..., part]

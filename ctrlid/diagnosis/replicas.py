@@ -26,7 +26,7 @@ from ..validation.record_simulation import find_long_stretches, prepare_stretch
 from ..validation.reproduction import choose_reproduction
 from .candidates import Trial
 from .fitted_model import Model, can_simulate, carry_over_fit
-from .gap import draw_noise, make_simulator
+from .gap import draw_noise, make_gap_simulator
 from .noise_tests import NoiseTests, run_noise_tests
 from .refitting import refit_candidate
 from .screening import screen_at
@@ -99,7 +99,7 @@ def _simulate_record(
     # A filter smooths what is abrupt over a part of a period. What an effect gains by mending that
     # is no evidence for it, and shows on records that are simulated as abruptly as nature acts.
     loop = sharpen_effects(loop, THRESHOLD.replica_sharpness)
-    simulator = make_simulator(loop, record.hold, record.hold_r, THRESHOLD.replica_steps)
+    simulator = make_gap_simulator(loop, record.hold, record.hold_r, THRESHOLD.replica_steps)
     y, u = np.array(record.y), np.array(record.u)
     for part in find_long_stretches(record, THRESHOLD.shortest_segment):
         stretch = prepare_stretch(simulator, record, part, start_time=first, follow=follows)

@@ -38,6 +38,9 @@ MOST_SUBSTEPS = 128
 CHUNK = 2048
 # An output so many times further from rest than anything that was asked for has run away.
 RUNAWAY = 1e3
+# The last loops that were simulated are kept, ready to run again: making one takes as long as
+# several thousand samples.
+KEPT = 8
 
 
 class SimulationStopped(ModelCannotRun):
@@ -124,7 +127,7 @@ def simulate(
         )
     r, d, names = _check_signals(loop, r, d)
     noise = _draw_noise(loop, d.shape[-1], sensor_noise, force_noise, seed)
-    simulator = Simulator(loop)
+    simulator = make_simulator(loop)
     y, u = simulator.run(simulator.start(initial), r, d, noise)
     e = loop.equations()
     known = loop.known_units
@@ -263,8 +266,17 @@ def _draw_noise(loop: Loop, n: int, sensor: Any, force: Any, seed: int | None) -
     ]
 
 
+@functools.lru_cache(maxsize=KEPT)
+def make_simulator(
+    loop: Loop, tolerance: float = TOLERANCE, most: int = MOST_SUBSTEPS,
+    hold: str = "zoh", hold_r: str = "zoh",
+) -> "Simulator":  # fmt: skip
+    """Return a loop made ready to run many times; the last ones are kept."""
+    return Simulator(loop, tolerance, most, hold, hold_r)
+
+
 class Simulator:
-    """A loop made ready to run many times.
+    """A loop made ready to run many times. `make_simulator` makes it, or finds one that it has kept.
 
     Parameters
     ----------
@@ -322,7 +334,7 @@ class Simulator:
                 loop = loop.without_effect(effect)
         if loop is self.loop:
             return self
-        return Simulator(loop, self.tolerance, self.most, self.hold, self.hold_r)
+        return make_simulator(loop, self.tolerance, self.most, self.hold, self.hold_r)
 
     def _measure_kinks(self, plain: PeriodMap) -> Array:
         """Return by how much kinks, such as dry friction, change the states in one period at most.

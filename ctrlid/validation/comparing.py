@@ -27,7 +27,7 @@ from ..estimation.likelihood.prediction import Prediction, predict, predict_ahea
 from ..estimation.linear.sampled_motion import discretize_model, list_inputs
 from ..loop.loop import Loop, write_loop
 from ..loop.period_map import compute_growth_rate
-from ..loop.simulation import Simulator
+from ..loop.simulation import Simulator, make_simulator
 from ..loop.step_check import describe_unstated_steps
 from ..loop.unit_check import note_unit_clashes
 from ..loop.wiring import match_signals
@@ -279,7 +279,7 @@ def _run_simulation(
         )
     y, noisy = np.full(np.shape(record.y), np.nan), np.zeros(np.shape(record.y))
     injected = np.zeros(np.shape(record.u))
-    simulator = Simulator(loop, hold=record.hold, hold_r=record.hold_r)
+    simulator = make_simulator(loop, hold=record.hold, hold_r=record.hold_r)
     for part in find_long_stretches(record):
         stretch = prepare_stretch(
             simulator, record, part, start_time=0.0, guess=prediction.states[part.start],

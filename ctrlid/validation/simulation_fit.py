@@ -38,7 +38,7 @@ from ..loop.sensitivities import (
     build_sensitive_simulation,
     find_delay_range,
 )
-from ..loop.simulation import Simulator
+from ..loop.simulation import make_simulator
 from ..loop.unit_check import note_unit_clashes
 from ..loop.wiring import knows_references, match_signals
 from .error_covariance import compute_score_covariance
@@ -272,7 +272,7 @@ def _prepare(
     loop: Loop, names: tuple[str, ...], records: Sequence[Record], intercept: bool
 ) -> _Task:
     hold, hold_r = records[0].hold, records[0].hold_r
-    simulator = Simulator(loop, most=SUBSTEPS, hold=hold, hold_r=hold_r)
+    simulator = make_simulator(loop, most=SUBSTEPS, hold=hold, hold_r=hold_r)
     stretches, substeps = [], 1
     for record in records:
         for samples in find_long_stretches(record):
