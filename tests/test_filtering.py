@@ -692,6 +692,48 @@ def test_an_analog_circuit_moves_the_input_between_samples():
     assert np.abs(fit.innovations[late]).max() < 1e-4 * np.std(record.y)
 
 
+@pytest.mark.parametrize(
+    ("effects", "order"),
+    [
+        ((), 4),
+        ((E.CoulombFriction(fc=0.01),), 4),
+        ((E.ActuatorLag(tau=8e-4), E.CoulombFriction(fc=0.01)), 8),
+        ((E.ActuatorLag(tau=4e-4),), 8),
+    ],
+    ids=["smooth", "friction", "lag and friction", "short lag"],
+)
+def test_a_period_under_an_analog_circuit_takes_as_few_steps_as_it_needs(effects, order):
+    """The map of a period beside a tight integration of plant and controller from the same point.
+
+    A velocity of 0.05 m/s does not turn within the period, so that friction is a constant there.
+    """
+    loop = levitated(*effects, analog=True, dt=2e-3)
+    m = SampledPlant(loop, ("m",), "foh", "output")
+    assert m.scheme.order == order
+    c, at, n = ct.ss(loop.controller), loop.at, len(loop.equations().states)
+    e = loop.equations(keep=True)
+    # The state of the controller is zero at the start, in whatever coordinates.
+    z = np.array([at.output + 1e-4, 0.05, *([at.input] * (n - 2)), *([0.0] * c.nstates)])
+    u = 1.02 * at.input
+
+    def control(z):
+        return (c.C @ z[n:])[0] - c.D[0, 0] * (z[0] - at.output)
+
+    offset = u - control(z)
+
+    def rate(t, z):
+        spread = np.full(n, 1e-9)
+        moved = e.smoothed(t, z[:n], control(z) + offset, e.values, spread)[0]
+        return np.r_[np.asarray(moved, float).ravel(), c.A @ z[n:] - c.B[:, 0] * (z[0] - at.output)]
+
+    after = integrate.solve_ivp(
+        rate, (0, loop.dt), z, method="Radau", rtol=1e-10, atol=1e-13
+    ).y[:n, -1]  # fmt: skip
+    given = [0.0, *([u] * (m.plan.pieces + 2)), at.output, z[0]]
+    found = m.maps.functions[0](z, given, e.values, np.full(n, 1e-9), 0.0, 0)[0].full().ravel()[:n]
+    np.testing.assert_allclose(found - z[:n], after - z[:n], rtol=1e-4, atol=1e-9)
+
+
 # --- long records
 
 

@@ -276,7 +276,7 @@ def make_simulator(
 
 
 class Simulator:
-    """A loop made ready to run many times. `make_simulator` makes it, or finds one that it has kept.
+    """A loop made ready to run many times; `make_simulator` makes it, or finds one kept.
 
     Parameters
     ----------

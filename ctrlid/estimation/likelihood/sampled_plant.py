@@ -99,7 +99,7 @@ class SampledPlant:
         self.channels = 1 if e.velocities else len(self.forces)
         if not e.siso or e.pushes is not None:
             self.channels = len(self.forces)
-        self.scheme = choose_scheme(e, loop, loop.dt / self.pieces)
+        self.scheme = choose_scheme(e, loop, loop.dt / self.pieces, self.law)
         self.plan = PeriodPlan(e, self.law, loop.dt, hold, self.scheme, self.forces, self.channels,
                          tuple(self.index), self.delay_samples, self.hold_r, self.sees)  # fmt: skip
         # What the filter estimates beside those: where a backlash stood when the record began.
@@ -143,7 +143,7 @@ class SampledPlant:
             late = evaluate_delay(e, p) / dt + 1e-9
             if not self.delay_samples <= late <= self.delay_samples + 1 + 1e-6:
                 return False
-        return is_scheme_suitable(self.scheme, e, p, dt)
+        return is_scheme_suitable(self.scheme, e, p, dt, self.law)
 
     def linearize(self, data: FilterData, theta: Array, at: Trajectory) -> Linearized:
         """Return the plant along a trajectory, for parameter values `theta`."""

@@ -12,13 +12,13 @@ import numpy as np
 from ..._base.arrays import Array
 from ..._base.errors import ModelCannotRun
 from ...data.reconstruction import count_pieces
-from ...loop.controllers import ControlLaw
+from ...loop.controllers import ControlLaw, linearize_law
 from ...loop.loop import Loop
 from ...loop.period_map import push_velocities
 from ...physics.block_evaluation import BlockEvaluation
 from ...physics.differentiation import Stages, differentiate
 from ...physics.equations import Equations
-from ...physics.integration import Scheme, advance, cut_input, find_lags, integrate
+from ...physics.integration import Scheme, advance, cut_input, find_lags, integrate, integrate_fast
 from ...physics.linearization import compute_state_matrices
 from .filter_data import find_rest_state
 
@@ -30,6 +30,9 @@ LONG = 3000
 SLOW = 0.35
 # More steps of order eight in a period make an expression that takes minutes to build.
 MOST_STEPS = 100
+# Under an analog controller all steps of a period are one expression, so that each is dear; so many
+# of order eight are stable up to twenty radians in a period.
+MOST_STEPS_UNDER_LAW = 4
 # A step of order four follows a lag accurately if it is this share of its time constant.
 LAG_STEP = 0.35
 # Beside the kink of friction this share is enough, since no formula is more accurate there.
@@ -143,26 +146,29 @@ class PeriodPlan:
         return 1, *(m,) * (self.pieces + 2), *references, q
 
 
-def choose_scheme(e: Equations, loop: Loop, dt: float) -> Scheme:
-    """Return the cheapest scheme that integrates the plant over a time dt accurately enough."""
+def choose_scheme(e: Equations, loop: Loop, dt: float, law: ControlLaw | None = None) -> Scheme:
+    """Return the cheapest scheme that integrates the plant over a time dt accurately enough.
+
+    Together with the analog controller `law`, if it moves the input between samples.
+    """
     if e.dt:
         return Scheme(4, 1)
-    hidden = [lag.state for lags in find_lags(e) for lag in lags]
-    plain = [k for k in range(len(e.states)) if k not in hidden]
     time = _find_input_lag_time(e, e.values)
-    driven, cut = np.isfinite(time), bool(time < dt / 8)
-    # The filter's own uncertainty smooths kinks; sharp friction does not make the plant stiff.
+    # Under such a controller a lag has no exact formula: it is a state as others are.
+    driven, cut = np.isfinite(time), bool(time < dt / 8) and law is None
     try:
-        point = replace(loop.point, states=find_rest_state(loop, e))
-        a = compute_state_matrices(e, point, spread=1e6)[0][np.ix_(plain, plain)]
+        own = _find_fastest_rate(e, loop, None) * dt
+        rate = own if law is None else _find_fastest_rate(e, loop, law) * dt
     except ModelCannotRun:
         return Scheme(8, 2, (8, 2) if cut else None)
-    rate = float(np.max(np.abs(np.linalg.eigvals(a)), initial=0.0)) * dt
     if rate <= 3 * SLOW:
         # A velocity that turns within a period crosses the kink of friction there.
-        few = max(KINK_STEPS if e.kinked else 1, math.ceil(rate / SLOW))
+        least = KINK_STEPS if e.kinked else 1 if law is None else 2
+        few = max(least, math.ceil(rate / SLOW))
         if not driven:
             return Scheme(4, few)
+        if law is not None:
+            return Scheme(4, 2 * few if e.kinked else few)
         # A higher order does not help beside a kink.
         if cut and e.kinked:
             return Scheme(4, few, (4, SHARP_STEPS))
@@ -174,14 +180,36 @@ def choose_scheme(e: Equations, loop: Loop, dt: float) -> Scheme:
         )
         if e.kinked or few <= FEW_STEPS:
             return Scheme(4, few)
-    steps = max(2 if e.kinked else 1, math.ceil(rate / 1.5))
-    if steps > MOST_STEPS:
+    if math.ceil(own / 1.5) > MOST_STEPS:
         raise ModelCannotRun(
-            f"{e.name} has a motion at {rate / dt:.3g} rad/s, {rate:.3g} times faster than it "
+            f"{e.name} has a motion at {own / dt:.3g} rad/s, {own:.3g} times faster than it "
             "is sampled. The filter cannot follow a motion that ends within one sample: leave it "
             "out of the plant, or sample faster"
         )
+    steps = max(2 if e.kinked or law else 1, math.ceil(rate / 1.5))
+    if law is not None:
+        return Scheme(8, min(steps, MOST_STEPS_UNDER_LAW))
     return Scheme(8, steps, (8, steps) if cut else None)
+
+
+def _find_fastest_rate(e: Equations, loop: Loop, law: ControlLaw | None) -> float:
+    """Return the rate of the fastest motion that has to be integrated [rad/s]."""
+    point = replace(loop.point, states=find_rest_state(loop, e))
+    # The filter's own uncertainty smooths kinks; sharp friction does not make the plant stiff.
+    a, b, c, d = compute_state_matrices(e, point, spread=1e6)
+    if law is None:
+        # Lags of the input and of the output are advanced exactly.
+        hidden = [lag.state for lags in find_lags(e) for lag in lags]
+        plain = [k for k in range(len(e.states)) if k not in hidden]
+        a = a[np.ix_(plain, plain)]
+    else:
+        ac, by, bu, cc, dy = linearize_law(law, point)
+        # The input by the states of plant and controller, and the output.
+        u = np.linalg.pinv(np.eye(len(b.T)) - dy @ d) @ np.hstack([dy @ c, cc])
+        y = np.hstack([c, np.zeros((len(c), len(ac)))]) + d @ u
+        own = np.hstack([a, np.zeros((len(a), len(ac)))]) + b @ u
+        a = np.vstack([own, np.hstack([np.zeros((len(ac), len(a))), ac]) + by @ y + bu @ u])
+    return float(np.max(np.abs(np.linalg.eigvals(a)), initial=0.0))
 
 
 def _choose_lag_step(e: Equations) -> float:
@@ -189,12 +217,16 @@ def _choose_lag_step(e: Equations) -> float:
     return LAG_STEP_AT_KINK if e.kinked else LAG_STEP
 
 
-def is_scheme_suitable(scheme: Scheme, e: Equations, p: Array, dt: float) -> bool:
+def is_scheme_suitable(
+    scheme: Scheme, e: Equations, p: Array, dt: float, law: ControlLaw | None = None
+) -> bool:
     """Return whether a period is integrated well enough for the lag of the parameters `p`."""
     time = _find_input_lag_time(e, p)
     if scheme.sharp:
         return time < dt / 4
-    return time > (dt / scheme.steps / (2 * _choose_lag_step(e)) if scheme.order == 4 else dt / 16)
+    if scheme.order == 4:
+        return time > dt / scheme.steps / (2 * _choose_lag_step(e))
+    return time > dt / (16 if law is None else 4 * scheme.steps)
 
 
 def _find_input_lag_time(e: Equations, p: Array) -> float:
@@ -267,7 +299,7 @@ def _build_period(plan: PeriodPlan) -> tuple[Any, list[Any], list[Any], dict[str
     else:
         stages = Stages(e)
         end = _integrate_with_controller(
-            plan, stages, t, x, p, s, held_rate, now, (r, next_r), y, max(scheme.steps, 2)
+            plan, stages, t, x, p, s, held_rate, now, (r, next_r), y, scheme
         )
         ends, parts = [(end, stages)], 1
     free = casadi.vertcat(*(p[k] for k in plan.index)) if plan.index else casadi.SX(0, 1)
@@ -317,7 +349,7 @@ def _integrate_with_controller(
     u: Any,
     path_r: tuple[Any, Any],
     y: Any,
-    substeps: int,
+    scheme: Scheme,
 ) -> Any:
     """Advance plant and analog controller together, u being the measured one at the start.
 
@@ -338,7 +370,9 @@ def _integrate_with_controller(
         driven = stages(t + tau, z[:n], computed + offset, p, s)[0] + held_rate
         return casadi.vertcat(driven, slope)
 
-    return integrate(rate, x, plan.dt, substeps, once=False)[0]
+    if scheme.order == 4:
+        return integrate_fast(rate, x, plan.dt, scheme.steps, once=False)
+    return integrate(rate, x, plan.dt, max(scheme.steps, 2), once=False)[0]
 
 
 def _chain_maps(
