@@ -61,15 +61,16 @@ def differentiate(
     end, slopes : casadi.SX
         The expression, and its derivatives with a column for each direction.
     """
-    known, slopes = list(by), [casadi.SX(seed) for seed in seeds]
-    symbols, values = [], []
+    known, slopes = casadi.vertcat(*by), casadi.SX(casadi.vertcat(*seeds))
+    symbols, values, direct = [], [], None
     for symbol, (t, x, u, p, spread) in stages.found:
-        columns = casadi.vertcat(t, x, u)
-        moved = _carry(columns, known, slopes)
+        moved = _carry(casadi.vertcat(t, x, u), known, slopes)
+        if direct is None:
+            # The parameters are the same symbols in every stage.
+            direct = _carry(casadi.vertcat(*(p[k] for k in index)), known, slopes)
         value, by_point, by_parameters = _evaluate(stages.equations, index)(t, x, u, p, spread)
-        direct = _carry(casadi.vertcat(*(p[k] for k in index)), known, slopes)
-        known.append(symbol)
-        slopes.append(casadi.mtimes(by_point, moved) + casadi.mtimes(by_parameters, direct))
+        slope = casadi.mtimes(by_point, moved) + casadi.mtimes(by_parameters, direct)
+        known, slopes = casadi.vertcat(known, symbol), casadi.vertcat(slopes, slope)
         symbols.append(symbol)
         values.append(value)
     found = [casadi.SX(end), _carry(end, known, slopes)]
@@ -78,10 +79,9 @@ def differentiate(
     return found[0], found[1]
 
 
-def _carry(column: Any, known: Sequence[Any], slopes: Sequence[Any]) -> Any:
+def _carry(column: Any, known: Any, slopes: Any) -> Any:
     """Return the derivatives of a column by those of the symbols in it."""
-    jacobian = casadi.jacobian(casadi.SX(column), casadi.vertcat(*known))
-    return casadi.mtimes(jacobian, casadi.vertcat(*slopes))
+    return casadi.mtimes(casadi.jacobian(casadi.SX(column), known), slopes)
 
 
 def _evaluate(e: Equations, index: Sequence[int]) -> Any:
