@@ -146,7 +146,7 @@ def test_another_rule_at_the_limit_does_not_speak_against_the_law(rule):
                    for f in cid.audit(wrong, loop).findings)  # fmt: skip
 
 
-def record_by_another_converter(read, logged, seed, factor=1.0, still=False, n=2500):
+def record_by_another_converter(read, logged, seed, factor=1.0, still=False, n=1200):
     """A mass on a spring under a PD controller that reads y with other noise than the logger."""
     rng = np.random.default_rng(seed)
     whole = expm(DT * np.array([[0, 1, 0], [-3, -2, 1], [0, 0, 0]]))
@@ -187,7 +187,7 @@ def test_a_pid_as_stated_stands():
 @pytest.mark.parametrize("added", [{}, {"dither": 0.3}, {"pulses": 0.5}])
 def test_an_exact_law_stands_under_what_is_added(added):
     for seed in range(5):
-        record = record_servo(seed=seed, **added)
+        record = record_servo(seed=seed, n=1200, **added)
         assert name_faults(record, stated_loop()) == []
         labels = [c.label for c in cid.compare(record, stated_loop()).curves]
         assert "closed-loop simulation" in labels
@@ -396,7 +396,7 @@ def test_a_wrong_sign_is_what_is_said_first(stated):
     """Also where the gains or the noise of the logger hide that only the sign is wrong."""
     pid = cid.PID(kp=50.0, ki=20.0, kd=2.0, filter_time=0.02, lower=-5.0, upper=5.0)
     loop = cid.Loop(cid.plants.servo(m=1.0, c=2.0, k=3.0), pid, dt=DT)
-    r = cid.random_binary(1500, amplitude=0.1, hold=50, seed=1)
+    r = cid.random_binary(600, amplitude=0.1, hold=50, seed=1)
     record = cid.simulate(loop, r, sensor_noise=1e-4, seed=2)
     other = replace(loop, controller=replace(pid, **stated))
     noise = 0.02 * np.std(record.u) * np.random.default_rng(0).standard_normal(record.n)
