@@ -16,7 +16,7 @@ MASS, LENGTH, GRAVITY, DT = 0.35, 0.40, 9.81, 0.005
 INERTIA = MASS * LENGTH**2
 
 
-def simulate(n=1500, seed=0, damping=0.02, friction=0.0, inertia=1.08 * INERTIA):
+def simulate(n=800, seed=0, damping=0.02, friction=0.0, inertia=1.08 * INERTIA):
     rng = np.random.default_rng(seed)
     r = np.repeat(rng.choice([-0.08, 0.08], n // 40 + 1), 40)[:n]
     y, u, angle, rate, before = np.zeros(n), np.zeros(n), 0.0, 0.0, None
