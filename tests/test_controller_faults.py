@@ -146,7 +146,7 @@ def test_another_rule_at_the_limit_does_not_speak_against_the_law(rule):
                    for f in cid.audit(wrong, loop).findings)  # fmt: skip
 
 
-def record_by_another_converter(read, logged, seed, factor=1.0, still=False, n=1200):
+def record_by_another_converter(read, logged, seed, factor=1.0, still=False, n=2500):
     """A mass on a spring under a PD controller that reads y with other noise than the logger."""
     rng = np.random.default_rng(seed)
     whole = expm(DT * np.array([[0, 1, 0], [-3, -2, 1], [0, 0, 0]]))
@@ -175,7 +175,7 @@ def test_a_logger_with_noise_of_its_own_does_not_speak_against_the_law(read, log
 def test_other_gains_are_no_noise_of_the_logger(still):
     for seed in range(4):
         for factor, noise in ((1.1, 0.0), (1.3, 1e-4), (0.7, 1e-4)):
-            record, loop = record_by_another_converter(1e-3, noise, seed, factor, still)
+            record, loop = record_by_another_converter(1e-3, noise, seed, factor, still, 1200)
             assert not cid.audit(record, loop)["logger"]
 
 
@@ -187,7 +187,7 @@ def test_a_pid_as_stated_stands():
 @pytest.mark.parametrize("added", [{}, {"dither": 0.3}, {"pulses": 0.5}])
 def test_an_exact_law_stands_under_what_is_added(added):
     for seed in range(5):
-        record = record_servo(seed=seed, n=1200, **added)
+        record = record_servo(seed=seed, **added)
         assert name_faults(record, stated_loop()) == []
         labels = [c.label for c in cid.compare(record, stated_loop()).curves]
         assert "closed-loop simulation" in labels
