@@ -77,7 +77,7 @@ def test_the_log_is_the_headline_and_nothing_is_named(loop, fault):
 
 @pytest.mark.parametrize("friction", [0.0, 0.06])
 def test_a_right_log_is_not_blamed(loop, friction):
-    r, u, y = simulate(seed=2, friction=friction)
+    r, u, y = simulate(1500, seed=2, friction=friction)
     small = [cid.effects.CoulombFriction, cid.effects.ConstantForce, cid.effects.ViscousFriction]
     found = cid.diagnose(loop, cid.Record(r=r, u=u, y=y, dt=DT), catalogue=small, progress=False)
     assert "LOG" not in found.sentence
