@@ -230,7 +230,7 @@ def test_the_order_is_asked_again_where_the_colour_has_moved_the_parameters(name
 @pytest.mark.parametrize("count", [2, 3, 4])
 def test_an_average_over_samples_is_found_as_such(count):
     """Its zeros are on the unit circle, which a search from within does not reach."""
-    loop, record, _ = make_loop_and_record(np.ones(count), [1.0], n=4000, seed=7)
+    loop, record, _ = make_loop_and_record(np.ones(count), [1.0], n=2000, seed=7)
     fit = choose_sensor_noise(maximize(begin_fit(make_problem(loop, ("k", "c"), [record]))))
     assert np.array(fit.noise.ma) == pytest.approx(np.ones(count - 1), abs=0.01)
 
