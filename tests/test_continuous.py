@@ -127,7 +127,7 @@ def test_intervals_cover_as_promised(analog):
 def test_known_analog_controller_is_followed_between_the_samples():
     """At 5 ms the input of the lead moves within the period, and straight lines miss it."""
     loop = loop_at(0.005, analog=True)
-    clean = experiment(loop)
+    clean = experiment(loop, n=2000)
     G = cid.fit_continuous(clean, 2, constraints=SYMMETRIC, controller=loop.controller)
     assert G.estimate["a2"] == pytest.approx(-ALPHA, rel=1e-6)
     assert G.estimate["b1"] == pytest.approx(-BETA, rel=1e-6)
@@ -137,7 +137,7 @@ def test_known_analog_controller_is_followed_between_the_samples():
     with pytest.warns(cid.CtrlidWarning, match="fastest pole of the controller times dt is 1"):
         cid.fit_continuous(replace(clean, r=None), 2, constraints=SYMMETRIC,
                            controller=loop.controller)  # fmt: skip
-    noisy = experiment(loop, sensor_noise=1e-5)
+    noisy = experiment(loop, n=2000, sensor_noise=1e-5)
     e = cid.fit_continuous(noisy, 2, constraints=SYMMETRIC, controller=loop.controller).estimate
     assert abs(e["a2"] + ALPHA) < 4 * e.standard_errors[1]
 
@@ -145,7 +145,7 @@ def test_known_analog_controller_is_followed_between_the_samples():
 def test_a_smooth_analog_input_needs_no_controller():
     plant = ct.tf([2.0], [1, 1.0, 0])
     loop = cid.Loop(plant, ct.tf([3.0], [1.0]), dt=0.002)
-    r = cid.multisine(6000, amplitude=1.0, band=(0.001, 0.01), seed=1)
+    r = cid.multisine(3000, amplitude=1.0, band=(0.001, 0.01), seed=1)
     record = cid.simulate(loop, r)
     G = cid.fit_continuous(record, 2, constraints=[cid.Integrator()])
     assert G.estimate["a2"] == 0.0
@@ -228,7 +228,7 @@ def test_a_decimated_record_is_called_that():
 
 
 def test_constraints_hold_exactly():
-    record = experiment(loop_at(0.005), sensor_noise=1e-5)
+    record = experiment(loop_at(0.005), n=1500, sensor_noise=1e-5)
     G = cid.fit_continuous(record, 2, constraints=[*SYMMETRIC, cid.StaticGain(0.004)])
     assert G.estimate["b1"] / G.estimate["a2"] == pytest.approx(0.004, rel=1e-12)
     bounded = cid.fit_continuous(record, 2, constraints=[*SYMMETRIC, cid.Bounds("b1", -6.0, 0.0)])

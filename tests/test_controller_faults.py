@@ -175,7 +175,7 @@ def test_a_logger_with_noise_of_its_own_does_not_speak_against_the_law(read, log
 def test_other_gains_are_no_noise_of_the_logger(still):
     for seed in range(4):
         for factor, noise in ((1.1, 0.0), (1.3, 1e-4), (0.7, 1e-4)):
-            record, loop = record_by_another_converter(1e-3, noise, seed, factor, still)
+            record, loop = record_by_another_converter(1e-3, noise, seed, factor, still, 1200)
             assert not cid.audit(record, loop)["logger"]
 
 
@@ -396,7 +396,7 @@ def test_a_wrong_sign_is_what_is_said_first(stated):
     """Also where the gains or the noise of the logger hide that only the sign is wrong."""
     pid = cid.PID(kp=50.0, ki=20.0, kd=2.0, filter_time=0.02, lower=-5.0, upper=5.0)
     loop = cid.Loop(cid.plants.servo(m=1.0, c=2.0, k=3.0), pid, dt=DT)
-    r = cid.random_binary(1500, amplitude=0.1, hold=50, seed=1)
+    r = cid.random_binary(600, amplitude=0.1, hold=50, seed=1)
     record = cid.simulate(loop, r, sensor_noise=1e-4, seed=2)
     other = replace(loop, controller=replace(pid, **stated))
     noise = 0.02 * np.std(record.u) * np.random.default_rng(0).standard_normal(record.n)

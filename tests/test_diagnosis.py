@@ -195,7 +195,7 @@ def test_an_effect_that_only_some_records_have():
 def test_an_effect_that_every_record_has():
     loop = levitation()
     rubbing = loop.with_effect(E.ViscousFriction(c=4.0))
-    both = [experiment(rubbing, 8050 + 10 * k, 1e-4, n=2500, sensor_noise=2e-6) for k in range(2)]
+    both = [experiment(rubbing, 8050 + 10 * k, 1e-4, n=1200, sensor_noise=2e-6) for k in range(2)]
     found = diagnose(loop, both, 8050, catalogue=(E.ViscousFriction, E.CoulombFriction))
     assert found.findings[0].note == "seen in every record"
     assert found.verdict == "explained"
@@ -238,7 +238,8 @@ def test_a_users_own_effect():
 
 def test_two_workers_find_the_same(tmp_path):
     loop = levitation()
-    record = experiment(loop.with_effect(E.ViscousFriction(c=3.0)), 8300, 1e-4, sensor_noise=2e-6)
+    real = loop.with_effect(E.ViscousFriction(c=3.0))
+    record = experiment(real, 8300, 1e-4, n=1000, sensor_noise=2e-6)
     one, two = (diagnose(loop, record, 8300, jobs=jobs, catalogue=FEW) for jobs in (1, 2))
     assert replace(one.disturbance) == two.disturbance
     assert [f.effect for f in one.findings] == [f.effect for f in two.findings]
@@ -282,13 +283,14 @@ def test_nothing_free_and_no_catalogue():
         pytest.param(
             E.PositionRipple(amplitude=0.3, period=3e-4, phase=0.7), 8600, marks=pytest.mark.slow
         ),
-        (E.ParameterStep(name="K", time=5.0, size=0.02), 8610),
+        (E.ParameterStep(name="K", time=2.5, size=0.02), 8610),
         (E.CoulombFriction(fc=0.2), 8620),
     ],
 )
 def test_what_the_catalogue_lacks_is_not_explained_by_a_wrong_name(effect, seed):
     loop = levitation()
-    record = experiment(loop.with_effect(effect), seed, 1e-4, levels=1e-3, sensor_noise=2e-6)
+    n = 2500 if type(effect) is E.ParameterStep else 4000
+    record = experiment(loop.with_effect(effect), seed, 1e-4, levels=1e-3, n=n, sensor_noise=2e-6)
     poor = (E.SensorNonlinearity, E.InputDelay, E.CubicStiffness, E.InputOffset)
     found = diagnose(loop, record, seed, catalogue=poor)
     assert found.verdict in ("unknown", "partly explained")

@@ -133,14 +133,18 @@ def test_a_plant_that_cannot_be_pickled_says_why_not():
         pickle.dumps(cid.Loop(plant, dt=0.1))
 
 
+@pytest.fixture(scope="module")
+def fit(record):
+    """A fit, which all that needs a loop refuses in its place."""
+    return cid.fit_loop(servo(cid.PID(kp=20.0, kd=1.0), dt=0.01, free=("k",)), record[:200])
+
+
 @pytest.mark.parametrize(
     "name",
     ["compare", "simulate", "audit", "replay_controller", "redesign", "fit_loop", "diagnose",
      "predict"],
 )  # fmt: skip
-def test_what_needs_a_loop_says_where_a_fit_has_it(record, name):
-    loop = servo(cid.PID(kp=20.0, kd=1.0), dt=0.01, free=("k",))
-    fit = cid.fit_loop(loop, record[:200])
+def test_what_needs_a_loop_says_where_a_fit_has_it(record, fit, name):
     calls = {
         "compare": lambda: cid.compare(record, fit),
         "simulate": lambda: cid.simulate(fit, record.r),

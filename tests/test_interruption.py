@@ -1,5 +1,6 @@
 """Waiting: a budget of seconds, Ctrl-C, what is shown meanwhile, and files that are whole."""
 
+import contextlib
 import io
 import json
 import os
@@ -43,6 +44,17 @@ def record():
     return cid.simulate(real, r, sensor_noise=1e-4, seed=2)
 
 
+FEW = (E.CoulombFriction, E.InputOffset)
+
+
+@pytest.fixture(scope="module")
+def answer(record):
+    """The whole search with what it shows meanwhile, which several tests look at."""
+    with contextlib.redirect_stderr(io.StringIO()) as shown:
+        found = cid.diagnose(drive(), record, catalogue=FEW)
+    return found, shown.getvalue()
+
+
 @pytest.fixture
 def hears_interrupts():
     """A process started in the background, as some gates are, is born deaf to Ctrl-C."""
@@ -84,8 +96,7 @@ def test_a_budget_that_is_none(record, seconds):
 
 
 def test_the_answer_so_far(record, tmp_path):
-    few = (E.CoulombFriction, E.InputOffset)
-    found = cid.diagnose(drive(), record, catalogue=few, seconds=1e-3, progress=False)
+    found = cid.diagnose(drive(), record, catalogue=FEW, seconds=1e-3, progress=False)
     assert (found.verdict, found.finished, found.findings) == ("unknown", False, ())
     assert found.sentence.startswith("THE SEARCH WAS NOT FINISHED: it was stopped after ")
     assert "(round 1: screening" in found.sentence
@@ -100,7 +111,7 @@ def test_the_answer_so_far(record, tmp_path):
 def test_what_was_found_before_the_end_is_kept(monkeypatch):
     """Stopped in the second round, the effect of the first one is named, and nothing is claimed."""
     real = drive().with_effect(E.CubicStiffness(300.0)).with_effect(E.InputOffset(0.8))
-    r = cid.random_binary(1000, amplitude=0.1, hold=50, seed=1)
+    r = cid.random_binary(600, amplitude=0.1, hold=50, seed=1)
     record = cid.simulate(real, r, sensor_noise=1e-4, seed=2)
     budgets = []
     tell, make = Progress.tell, Progress.make_budget
@@ -134,10 +145,9 @@ def test_what_was_found_before_the_end_is_kept(monkeypatch):
     assert (whole.verdict, whole.finished, len(whole.findings)) == ("explained", True, 2)
 
 
-def test_friction_that_crept_in_place_of_what_was_found_later_sticks_at_the_end(record):
+def test_friction_that_crept_in_place_of_what_was_found_later_sticks_at_the_end(answer):
     """Beside the missing offset of the input, the friction of the first round has to creep."""
-    few = (E.CoulombFriction, E.InputOffset)
-    found = cid.diagnose(drive(), record, catalogue=few, progress=False)
+    found, _ = answer
     (friction,) = (f.effect for f in found.findings if f.name == "CoulombFriction")
     assert friction.fc == pytest.approx(0.5, abs=0.003)
     assert friction.creep == 0.0
@@ -166,10 +176,9 @@ def count_samples(n):
 
 def test_a_search_ends_at_the_same_sample_whatever_the_jobs(record):
     """It is stopped by the count, not by the clock."""
-    few = (E.CoulombFriction, E.InputOffset)
     with vary_numbers(search_samples=1.0e6):
         one, two = (
-            cid.diagnose(drive(), record, catalogue=few, jobs=jobs, progress=False)
+            cid.diagnose(drive(), record, catalogue=FEW, jobs=jobs, progress=False)
             for jobs in (None, 2)
         )
     assert not one.finished
@@ -177,14 +186,12 @@ def test_a_search_ends_at_the_same_sample_whatever_the_jobs(record):
     assert (one.sentence, one.findings) == (two.sentence, two.findings)
 
 
-def test_what_is_shown_without_a_terminal(record, capsys):
-    few = (E.CoulombFriction, E.InputOffset)
-    cid.diagnose(drive(), record, catalogue=few)
-    lines = capsys.readouterr().err.splitlines()
+def test_what_is_shown_without_a_terminal(answer, record, capsys):
+    lines = answer[1].splitlines()
     assert all(re.match(r"ctrlid diagnose: \d+ s, ", line) for line in lines)
     assert sum(", round " in line for line in lines) >= 2
     assert any("round 1 took" in line and "leads with an evidence of" in line for line in lines)
-    cid.diagnose(drive(), record, catalogue=(), progress=False)
+    cid.diagnose(drive(), record[:400], catalogue=(), progress=False)
     assert capsys.readouterr().err == ""
 
 
@@ -195,7 +202,7 @@ def test_what_is_shown_in_a_terminal(record, monkeypatch):
 
     monkeypatch.setattr(sys, "stderr", Terminal())
     monkeypatch.setattr("ctrlid.diagnosis.progress.REFRESH", 0.0)
-    cid.diagnose(drive(), record, catalogue=(E.CoulombFriction, E.InputOffset))
+    cid.diagnose(drive(), record[:400], catalogue=FEW)
     frames = sys.stderr.getvalue().split("\r")
     # Passes move it too: while nothing is finished, the seconds go on.
     assert len(frames) > 50
@@ -371,7 +378,7 @@ def test_no_round_has_a_number_that_goes_back(record, monkeypatch, capsys):
     monkeypatch.setattr(growth, "find_better_choice", prefer_other)
     monkeypatch.setattr(growth, "retest_with_replicas", lambda model: replace(
         run_noise_tests(model.fit), alpha=1.0))  # fmt: skip
-    cid.diagnose(drive(), record, catalogue=(E.CoulombFriction, E.InputOffset))
+    cid.diagnose(drive(), record, catalogue=FEW)
     heads = [line.split(", ")[1:] for line in capsys.readouterr().err.splitlines()]
     heads = [", ".join(parts).partition(" (")[0] for parts in heads]
     numbers = [int(head.split()[1]) for head in heads if head.startswith("round ")]
@@ -395,7 +402,8 @@ def test_what_comes_before_and_after_the_search_is_part_of_the_seconds(record, m
     monkeypatch.setattr(Progress, "make_budget", keep)
     monkeypatch.setattr(procedure, "choose_fresh_data", choose_slowly)
     begun = time.monotonic()
-    cid.diagnose(drive(), record, catalogue=(E.InputOffset,), seconds=600, progress=False)
+    few = (E.InputOffset,)
+    cid.diagnose(drive(), record[:400], catalogue=few, seconds=600, progress=False)
     (budget,) = budgets
     assert budget.start == pytest.approx(begun, abs=0.2)
     assert 0.5 < budget.kept < time.monotonic() - begun

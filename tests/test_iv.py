@@ -169,7 +169,7 @@ def test_the_curvature_of_the_plant_is_taken_out():
 
 
 def test_active_bounds_are_exact():
-    theta, record, _ = sampled_levitation(0.2, n=8000, noise=0.02)
+    theta, record, _ = sampled_levitation(0.2, n=3000, noise=0.02)
     bound = theta[0] - 0.01
     estimate = fit_iv(
         record, 2, 2, constraints=[cid.ReciprocalPoles(), cid.Bounds("a1", upper=bound)]

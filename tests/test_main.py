@@ -295,7 +295,7 @@ def test_the_second_act_names_it(kind):
 
 
 def test_the_second_act_admits_what_it_missed():
-    sections = list(act.tell_diagnosis(samples=4000, seed=2))
+    sections = list(act.tell_diagnosis(samples=1500, seed=2))
     found, effect, loop = sections[1].result, act.hide_effect(2)[0], None
     assert "It was found, and no alternative was named." in sections[2].text
     stranger = cid.effects.Quantization(step=1.0)

@@ -91,7 +91,7 @@ def test_a_limit_is_as_large_as_its_value():
     """It is infinitely far from the limit that has no effect, which is no size to compare with."""
     plant = cid.plants.servo(m=1.0, c=2.0, k=3.0)
     loop = cid.Loop(plant, cid.PID(kp=20.0, kd=1.0), dt=0.01, free=("k", "c"))
-    r = cid.random_binary(3000, amplitude=0.1, hold=50, seed=1)
+    r = cid.random_binary(1200, amplitude=0.1, hold=50, seed=1)
     real = loop.with_effect(E.InputSaturation(-1.5, 1.5))
     record = cid.simulate(real, r, sensor_noise=1e-4, seed=2)
     found = cid.diagnose(loop, record, catalogue=(E.InputSaturation,), progress=False)

@@ -213,7 +213,7 @@ def test_the_answer_is_saved_before_it_is_printed(tmp_path):
     record = cid.simulate(loop, r, sensor_noise=1e-3, seed=1)
     record.to_csv(tmp_path / "log.csv")
     words = [sys.executable, "-m", "ctrlid", "diagnose", str(tmp_path / "log.csv"),
-             "--model", "servo", "--param", "m=1", "c=2", "k=3",
+             "--model", "servo", "--param", "m=1", "c=2", "k=3", "--seconds", "1",
              "--save", str(tmp_path / "found")]  # fmt: skip
     with open("/dev/full", "w") as full:
         subprocess.run(words, stdout=full, stderr=subprocess.PIPE, check=False, timeout=300)

@@ -150,25 +150,39 @@ def test_the_block_suits_light_and_dark():
     assert "background" not in write_html("NO POLE OUTSIDE")
 
 
-def run_cells(monkeypatch, tmp_path, *sources):
-    """Return what a notebook of these cells shows, cell by cell."""
-    monkeypatch.setenv("IPYTHONDIR", str(tmp_path))
-    monkeypatch.setenv("JUPYTER_PLATFORM_DIRS", "1")
-    monkeypatch.setenv("MPLBACKEND", "module://matplotlib_inline.backend_inline")
-    cells = [nbformat.v4.new_code_cell(source) for source in sources]
-    done = nbclient.NotebookClient(
-        nbformat.v4.new_notebook(cells=cells), timeout=300, kernel_name="python3",
-        resources={"metadata": {"path": str(tmp_path)}},
-    ).execute()  # fmt: skip
+PICTURES = (
+    "import ctrlid as cid\nrecord = cid.Record(u=[0, 1, 0, 1], y=[0, 0, 1, 1], dt=0.1)",
+    "cid.plot.record(record)", "picture = cid.plot.record(record)", "picture",
+)  # fmt: skip
+DIAGNOSES = (
+    "plant = cid.plants.servo(m=1.0, c=2.0, k=3.0)\n"
+    "loop = cid.Loop(plant, cid.PID(kp=20.0, kd=1.0), dt=0.01, free=('k',))\n"
+    "r = cid.random_binary(300, amplitude=0.1, hold=50, seed=1)\n"
+    "record = cid.simulate(loop, r, sensor_noise=1e-3, seed=2)\n"
+    "few = [cid.effects.InputOffset]\n",
+    "found = cid.diagnose(loop, record, catalogue=few)",
+    "found = cid.diagnose(loop, record, catalogue=few, progress=False)",
+)
+
+
+@pytest.fixture(scope="module")
+def shown_by_cells(tmp_path_factory):
+    """Return what each of these cells shows: a kernel takes seconds to begin, so they share one."""
+    folder = str(tmp_path_factory.mktemp("cells"))
+    cells = [nbformat.v4.new_code_cell(source) for source in PICTURES + DIAGNOSES]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("IPYTHONDIR", folder)
+        patch.setenv("JUPYTER_PLATFORM_DIRS", "1")
+        patch.setenv("MPLBACKEND", "module://matplotlib_inline.backend_inline")
+        done = nbclient.NotebookClient(
+            nbformat.v4.new_notebook(cells=cells), timeout=300, kernel_name="python3",
+            resources={"metadata": {"path": folder}},
+        ).execute()  # fmt: skip
     return [cell.outputs for cell in done.cells]
 
 
-def test_a_notebook_without_pyplot_shows_each_picture_once(monkeypatch, tmp_path):
-    shown = run_cells(
-        monkeypatch, tmp_path,
-        "import ctrlid as cid\nrecord = cid.Record(u=[0, 1, 0, 1], y=[0, 0, 1, 1], dt=0.1)",
-        "cid.plot.record(record)", "picture = cid.plot.record(record)", "picture",
-    )  # fmt: skip
+def test_a_notebook_without_pyplot_shows_each_picture_once(shown_by_cells):
+    shown = shown_by_cells[: len(PICTURES)]
     assert [sum("image/png" in o.get("data", {}) for o in cell) for cell in shown] == [0, 1, 1, 1]
     assert shown[0] == []  # not even a warning that the bars of progress will be text
     assert not any("array(" in str(cell) for cell in shown)
@@ -222,20 +236,9 @@ def test_the_notebook_runs_from_top_to_bottom(notebook, monkeypatch, tmp_path):
     assert np.all([len(out.data["image/png"]) > 10_000 for out in pictures])
 
 
-def test_the_progress_of_a_diagnosis_is_one_line_that_is_redrawn(monkeypatch, tmp_path):
+def test_the_progress_of_a_diagnosis_is_one_line_that_is_redrawn(shown_by_cells):
     """It was a line a round, as for a file."""
-    rig = (
-        "import ctrlid as cid\n"
-        "plant = cid.plants.servo(m=1.0, c=2.0, k=3.0)\n"
-        "loop = cid.Loop(plant, cid.PID(kp=20.0, kd=1.0), dt=0.01, free=('k',))\n"
-        "r = cid.random_binary(600, amplitude=0.1, hold=50, seed=1)\n"
-        "record = cid.simulate(loop, r, sensor_noise=1e-3, seed=2)\n"
-        "few = [cid.effects.InputOffset]\n"
-    )
-    _, shown, silent = run_cells(
-        monkeypatch, tmp_path, rig, "found = cid.diagnose(loop, record, catalogue=few)",
-        "found = cid.diagnose(loop, record, catalogue=few, progress=False)",
-    )  # fmt: skip
+    _, shown, silent = shown_by_cells[len(PICTURES) :]
     text = "".join(out.text for out in shown)
     frames = text.split("\r")
     assert any("round 1: screening" in frame for frame in frames)

@@ -81,14 +81,14 @@ def test_random_noise_and_analog_controllers(seed, digital):
 
 
 def test_noise_free_records_need_no_slowing_down():
-    record = levitated(0.05, 4000, noise=0.0)
+    record = levitated(0.05, 2000, noise=0.0)
     sweep = cid.sweep_sampling_period(record, [record.dt, 4 * record.dt])
     assert all(row.deviation < 0.2 for row in sweep.table)
     assert sweep["fit_iv"][0].poles.real == pytest.approx([-POLE, POLE], rel=0.02)
 
 
 def test_constraints_by_estimator_and_the_wrong_ones():
-    record = levitated(0.05, 4000)
+    record = levitated(0.05, 2000)
     known = {"fit_arx": [cid.ReciprocalPoles()], "fit_iv": [cid.ReciprocalPoles()],
              "fit_continuous": [cid.SymmetricPoles()]}  # fmt: skip
     sweep = cid.sweep_sampling_period(record, [record.dt, 5 * record.dt], constraints=known)

@@ -1,6 +1,7 @@
 """Coloured sensor noise in the likelihood, against theory and noise made by a filter."""
 
 import dataclasses
+import functools
 import weakref
 from types import SimpleNamespace
 
@@ -102,13 +103,19 @@ def test_the_order_of_coloured_noise_is_found_and_white_stays_white(b, a, orders
     assert np.abs(error).max() < 4
 
 
-@pytest.mark.parametrize("controller", ["known", "unknown"])
-def test_noise_larger_than_the_gap_is_refused_and_true_noise_is_not(controller):
+@functools.cache
+def fit_beside_autoregression(controller):
+    """Return loop, record and fit: two tests ask of the same true noise, which takes seconds."""
     loop, record, _ = make_loop_and_record([1.0], [1.0, -0.9], n=4000, seed=5)
     if controller == "unknown":
         loop = dataclasses.replace(loop, controller=None)
     fit = maximize(begin_fit(make_problem(loop, ("k", "c"), [record])))
-    fit = choose_sensor_noise(fit)
+    return loop, record, choose_sensor_noise(fit)
+
+
+@pytest.mark.parametrize("controller", ["known", "unknown"])
+def test_noise_larger_than_the_gap_is_refused_and_true_noise_is_not(controller):
+    loop, record, fit = fit_beside_autoregression(controller)
     assert not fit.noise.sensor_is_white
     is_false = make_noise_test(choose_fresh_data(loop, [record], None))
     assert not is_false(Model(loop, fit))
@@ -190,8 +197,7 @@ def test_the_chance_among_runs_keeps_its_level():
 
 def test_the_runs_of_a_chance_spread_as_many_more_do():
     """Of the first 8 seeds errors are alike by chance, which made true noise look false."""
-    loop, record, _ = make_loop_and_record([1.0], [1.0, -0.9], n=4000, seed=5)
-    fit = choose_sensor_noise(maximize(begin_fit(make_problem(loop, ("k", "c"), [record]))))
+    loop, record, fit = fit_beside_autoregression("known")
     fresh = choose_fresh_data(loop, [record], None)
     errors = measure_noise_errors(fresh.prepare_loops(Model(loop, fit)), fit, fresh.windows,
                                   fresh.how, 300)[:, 0]  # fmt: skip
@@ -224,7 +230,7 @@ def test_the_order_is_asked_again_where_the_colour_has_moved_the_parameters(name
 @pytest.mark.parametrize("count", [2, 3, 4])
 def test_an_average_over_samples_is_found_as_such(count):
     """Its zeros are on the unit circle, which a search from within does not reach."""
-    loop, record, _ = make_loop_and_record(np.ones(count), [1.0], n=4000, seed=7)
+    loop, record, _ = make_loop_and_record(np.ones(count), [1.0], n=2000, seed=7)
     fit = choose_sensor_noise(maximize(begin_fit(make_problem(loop, ("k", "c"), [record]))))
     assert np.array(fit.noise.ma) == pytest.approx(np.ones(count - 1), abs=0.01)
 

@@ -125,7 +125,7 @@ def test_an_analog_controller_is_followed_between_the_samples():
 
 
 def test_readings_of_one_output_that_do_not_count():
-    loop, record = swinging(free=("length",))
+    loop, record = swinging(n=800, free=("length",))
     valid = np.ones((2, record.n), dtype=bool)
     valid[1, 400:420] = False
     y = record.y.copy()

@@ -55,14 +55,19 @@ def test_which_texts_are_units():
 def degrees():
     """Return a loop, and a record of it with friction, in degrees and per cent."""
     loop = turntable({})
-    record = record_of(loop, E.CoulombFriction(3.0), 1.0, 1e-3, 11, n=1500)
+    record = record_of(loop, E.CoulombFriction(3.0), 1.0, 1e-3, 11, n=400)
     return loop, cid.Record(r=record.r, u=record.u, y=record.y, dt=DT, name="log",
                             units={"r": "deg", "u": "%", "y": "deg"})  # fmt: skip
 
 
-def test_a_log_in_degrees_and_per_cent_is_told_in_them(degrees):
-    loop, record = degrees
-    found = cid.diagnose(loop, record, progress=False, catalogue=[E.CoulombFriction])
+@pytest.fixture(scope="module")
+def found_in_degrees(degrees):
+    """Return the diagnosis of that record, of whose friction several tests ask the unit."""
+    return cid.diagnose(*degrees, progress=False, catalogue=[E.CoulombFriction])
+
+
+def test_a_log_in_degrees_and_per_cent_is_told_in_them(found_in_degrees):
+    found = found_in_degrees
     (friction,) = found.findings
     assert friction.effect.units(found.loop) == {"fc": "deg/s^2"}
     assert found.gap.unit == "deg"
@@ -76,10 +81,9 @@ def test_a_log_in_degrees_and_per_cent_is_told_in_them(degrees):
     assert not any("units: " in remark for remark in found.audit)
 
 
-def test_forces_need_a_length_and_one_mass_in_kilograms(degrees, tmp_path):
-    loop, record = degrees
-    bare = cid.diagnose(loop, record, progress=False, catalogue=[E.CoulombFriction])
-    size = bare.findings[0].effect.fc
+def test_forces_need_a_length_and_one_mass_in_kilograms(degrees, found_in_degrees, tmp_path):
+    _, record = degrees
+    size = found_in_degrees.findings[0].effect.fc
 
     def tell(units, of_y):
         made = cid.Record(r=record.r, u=record.u, y=record.y, dt=DT, units={"y": of_y})
@@ -101,7 +105,7 @@ def test_the_mass_of_a_pendulum_moves_on_a_circle():
     plant = cid.plants.pendulum(m=0.35, length=0.3)
     at = cid.operating_point(plant, output=0.0)
     loop = cid.Loop(plant, cid.PID(kp=5.0, kd=0.5, bias=0.0), dt=DT, at=at, free=("m",))
-    record = record_of(loop, E.ViscousFriction(2.0), 0.1, 1e-4, 3, n=1500)
+    record = record_of(loop, E.ViscousFriction(2.0), 0.1, 1e-4, 3, n=500)
     assert record.units == {"r": "rad", "u": "N m", "y": "rad"}
     found = cid.diagnose(loop, record, progress=False, catalogue=[E.ViscousFriction])
     assert [f.name for f in found.findings] == ["ViscousFriction"]
@@ -121,7 +125,7 @@ def test_an_output_in_degrees_of_an_angle_in_radians_gives_no_unit_to_forces(uni
         states=["theta", "omega"], params={"J": 0.5, "c": 0.1, "k": 1.0}, name="disc",
     )  # fmt: skip
     loop = cid.Loop(plant, cid.PID(kp=0.2, kd=0.02), dt=DT, free=("k",), units=units)
-    record = record_of(loop, E.CoulombFriction(3.0), 60.0, 0.02, 11, n=1500)
+    record = record_of(loop, E.CoulombFriction(3.0), 60.0, 0.02, 11, n=500)
     record = cid.Record(r=record.r, u=record.u, y=record.y, dt=DT,
                         units={"r": "°", "u": "%", "y": "°"})  # fmt: skip
     found = cid.diagnose(loop, record, progress=False, catalogue=[E.CoulombFriction])
