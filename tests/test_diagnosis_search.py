@@ -417,7 +417,7 @@ def test_a_replica_is_fitted_from_its_own_trajectory():
 
 def test_units_of_the_record_that_are_not_those_of_the_plant_are_told():
     loop = drive()
-    record = record_of(loop, E.CoulombFriction(2.0), 0.3, 1e-4, 9850, n=1500)
+    record = record_of(loop, E.CoulombFriction(2.0), 0.3, 1e-4, 9850, n=500)
     volts = replace(record, units={"u": "1", "y": "V"})
     found = cid.diagnose(loop, volts, progress=False, catalogue=[E.CoulombFriction])
     told = [text for text in found.audit if text.startswith("units: ")]
