@@ -35,7 +35,7 @@ OF_OTHERS = {
     "diagnosis/loading.py: load_diagnosis",
     "diagnosis/open_loop_fit.py: fit",  # hands a refusal on
     "diagnosis/replicas.py: _design_normalized_controller",  # runs python-control alone
-    "loop/loop.py: _check_limits",
+    "loop/loop_arguments.py: check_limits",
     "loop/simulation.py: _check_several_signals",
 }
 TRYING = ("diagnosis", "effects", "estimation/likelihood", "loop")

@@ -44,8 +44,12 @@ def test_a_period_that_is_no_short_number_is_not_made_one(tmp_path):
 
 @pytest.mark.parametrize("share", [3.3e-6, 10.0])
 def test_a_belief_that_is_a_value_or_per_cent_is_questioned(share):
-    with pytest.warns(CtrlidWarning, match=r"10 % is \{'K': 0.1\}"):
-        levitation(free={"K": share})
+    plant = levitation().plant
+    op = cid.operating_point(plant, output=0.012)
+    with pytest.warns(CtrlidWarning, match=r"10 % is \{'K': 0.1\}") as caught:
+        cid.Loop(plant, None, dt=0.001, at=op, free={"K": share})
+    # The warning shows the line of whoever made the loop.
+    assert caught[0].filename == __file__
 
 
 @pytest.mark.parametrize("share", [0.1, 1e-6, 1.0, np.inf])

@@ -3,7 +3,6 @@
 import functools
 import math
 import pickle
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -15,11 +14,9 @@ import numpy as np
 from .._base.arguments import (
     check_arguments,
     explain_fields,
-    is_iterable,
     is_number,
 )
-from .._base.arrays import to_real_array
-from .._base.errors import CtrlidError, CtrlidWarning, EffectDoesNotApply
+from .._base.errors import CtrlidError, EffectDoesNotApply
 from .._base.periods import have_same_period, write_both_periods
 from .._base.pickling import pack_by_value
 from .._base.text import Printed, list_known, write_count, write_percent
@@ -37,6 +34,14 @@ from ..physics.linearization import (
 )
 from ..physics.trace import trace, with_parameters
 from .controllers import PID, ControlLaw, make_control_law
+from .loop_arguments import (
+    check_effects,
+    check_free,
+    check_limits,
+    check_units,
+    question_beliefs,
+    question_effects,
+)
 from .velocities import describe_missing_forces, list_unforced_velocities
 from .wiring import Wiring, is_wired_by_name, make_wired_law, make_wiring
 
@@ -147,13 +152,14 @@ class Loop(Printed):
                 f"at= has {write_count(len(at.states), 'state')}, but {equations.name} has {n} "
                 f"({', '.join(equations.states)}); give at=operating_point(plant, output=...)"
             )
-        limits = self._check_limits(len(equations.inputs))
+        limits = check_limits(self.input_limits, len(equations.inputs))
         object.__setattr__(self, "dt", float(self.dt))
         object.__setattr__(self, "at", at)
         object.__setattr__(self, "input_limits", limits)
         self._apply_effects()
-        _question_effects(self.effects, self.dt, stacklevel=5)
-        self._check_units()
+        question_effects(self.effects, self.dt, stacklevel=5)
+        question_beliefs(self.free, self.parameters, stacklevel=5)
+        check_units(self.units, self._traced)
         law = self.law()
         if law and law.dt == 0.0 and equations.dt:
             raise CtrlidError("an analog controller cannot act on a plant in discrete time; give "
@@ -191,24 +197,6 @@ class Loop(Printed):
             return whole, names
         return drive_inputs(whole, driven or names, forces or {}, units), names
 
-    def _check_limits(self, inputs: int) -> Any:
-        """Return the limits of the actuator, as floats or with a value for each input."""
-        given: Any = self.input_limits
-        try:
-            # A transfer function is asked for its elements, too, and refuses otherwise.
-            pair = tuple(given) if is_iterable(given) else ()
-            lower, upper = (to_real_array(v, "input_limits") for v in pair)
-            # Where one of them differs between the inputs, both have a value for each.
-            lower, upper = np.broadcast_arrays(lower, upper)
-            pairs = np.broadcast_to(np.array([lower, upper]).T, (inputs, 2))
-        except (TypeError, ValueError) as reason:
-            raise CtrlidError("input_limits is a pair (lower, upper) in input units; given "
-                              f"{self.input_limits!r}") from reason  # fmt: skip
-        for low, high in pairs:
-            if not low < high:
-                raise CtrlidError(f"input_limits needs lower < upper; given ({low:g}, {high:g})")
-        return tuple(tuple(v.tolist()) if v.ndim else float(v) for v in (lower, upper))
-
     def _apply_effects(self, like: "Loop | None" = None, period: float | None = None) -> None:
         """Put the effects into the equations and see that the free parameters exist.
 
@@ -216,18 +204,7 @@ class Loop(Printed):
         `period` that effects are told of is the sampling period by default.
         """
         period = self.dt if period is None else period
-        for name in ("effects", "free"):
-            given = getattr(self, name)
-            if not isinstance(given, AbstractEffect) and not is_iterable(given):
-                raise CtrlidError(f"a loop needs a sequence as {name}=; given {given!r}")
-        effects = (self.effects,) if isinstance(self.effects, AbstractEffect) else self.effects
-        effects = tuple(effects)
-        strangers = [e for e in effects if not isinstance(e, AbstractEffect)]
-        if strangers:
-            raise CtrlidError(
-                "effects are instances of the classes in ctrlid.effects, such as "
-                f"CoulombFriction(fc=0.1); given {strangers[0]!r}"
-            )
+        effects = check_effects(self.effects)
         object.__setattr__(self, "effects", effects)
         plant, at = self._shift_to_absolute(), self._bare_point
         kept = compose_effects(plant, self.labelled, at, period)
@@ -240,20 +217,7 @@ class Loop(Printed):
         else:
             changed = compose_effects(plant, active, at, period)
         object.__setattr__(self, "_active", changed)
-        free: Any = (self.free,) if isinstance(self.free, str) else self.free
-        free = dict(free) if isinstance(free, Mapping) else tuple(free)
-        if not all(isinstance(name, str) for name in free):
-            raise CtrlidError(f"free= takes names of parameters; given {self.free!r}")
-        free = free if isinstance(free, Mapping) else tuple(dict.fromkeys(free))
-        unknown = [name for name in free if name not in kept.parameters]
-        if unknown:
-            raise CtrlidError(
-                f"free= names {unknown}, but the numeric parameters of {kept.name} are "
-                f"{list(kept.parameters)}; give parameters to ct.nlsys with params={{...}}"
-            )
-        if isinstance(free, dict):
-            _check_beliefs(free, kept.parameters)
-        object.__setattr__(self, "free", free)
+        object.__setattr__(self, "free", check_free(self.free, kept))
         if self.controller is not None and self._active.feedthrough:
             # With effects it is they, or their values, that close the loop without delay.
             refusal = EffectDoesNotApply if effects else CtrlidError
@@ -270,18 +234,6 @@ class Loop(Printed):
         )
         plant = self._traced is other._traced and self.at is other.at and self.dt == other.dt
         return plant and mine == its
-
-    def _check_units(self) -> None:
-        e = self._traced
-        known = (*e.inputs, *e.outputs, *e.states, *e.parameters)
-        given = self.units
-        if not isinstance(given, Mapping) or not all(isinstance(v, str) for v in given.values()):
-            raise CtrlidError("units= maps names of the plant to units, as in "
-                              f"{{{e.outputs[0]!r}: 'm'}}; given {given!r}")  # fmt: skip
-        unknown = [name for name in given if name not in known]
-        if unknown:
-            raise CtrlidError(f"units= names {unknown}, but the signals, states and parameters of "
-                              f"{e.name} are {list(dict.fromkeys(known))}")  # fmt: skip
 
     @property
     def linear_plant(self) -> bool:
@@ -411,7 +363,7 @@ class Loop(Printed):
         """
         # Whether a plant takes an effect is found out by adding it, and then it is added again.
         loop = _add_effect(self, _Itself(effect))
-        _question_effects((effect,), self.dt, stacklevel=3)
+        question_effects((effect,), self.dt, stacklevel=3)
         return loop
 
     def without_effect(self, effect: str | AbstractEffect) -> "Loop":
@@ -688,48 +640,6 @@ def add_units(loop: Loop, units: Mapping[str, str]) -> Loop:
 def write_loop(loop: Loop) -> str:
     """Return what a loop is made of, without a note on what it lacks."""
     return loop._describe()
-
-
-def _question_effects(effects: tuple[AbstractEffect, ...], dt: float, stacklevel: int) -> None:
-    """Warn of values that are odd at this sampling period, such as a delay of 400 samples."""
-    for effect in effects:
-        text = effect.question(dt)
-        if text is not None:
-            warnings.warn(text, CtrlidWarning, stacklevel=stacklevel)
-
-
-def _question_belief(name: str, share: float, value: float) -> None:
-    """Warn of a belief that seems to be a value of the parameter, or a number of per cent."""
-    is_value = share < 1e-3 and 0.5 < share / abs(value) < 2 if value else False
-    if is_value or 1 < share < math.inf:
-        warnings.warn(
-            f"free={{{name!r}: {share:g}}} says that {name} is known to {write_percent(share)} of "
-            f"{value:g}, as a standard deviation. It is no value of {name} and no number of per "
-            f"cent: 10 % is {{{name!r}: 0.1}}, and inf that nothing is known",
-            CtrlidWarning, stacklevel=4,
-        )  # fmt: skip
-
-
-def _check_beliefs(free: Mapping[str, Any], parameters: Mapping[str, float]) -> None:
-    """Refuse what does not say how well a parameter is known."""
-    for name, share in free.items():
-        if not is_number(share):
-            problem = f"given {share!r} for {name}"
-        elif math.isnan(share) or share < 0:
-            problem = f"given {share:g} for {name}"
-        elif share == 0:
-            problem = f"{name} is known exactly by what is given, 0: leave out what is not free"
-        elif parameters[name] == 0 and share < math.inf:
-            problem = (f"{name} is zero in the loop, of which no share can be taken: give inf for "
-                       "it, or the value that is believed")  # fmt: skip
-        else:
-            _question_belief(name, share, parameters[name])
-            continue
-        raise CtrlidError(
-            "free= as a mapping says how well each parameter is known, by the standard deviation "
-            f'of what is believed relative to its value, such as {{"{name}": 0.1}} for 10 %; '
-            f"{problem}"
-        )
 
 
 def find_converter_steps(loop: Loop) -> tuple[float, ...]:
