@@ -30,7 +30,7 @@ from watched_numbers import watch_numbers
 
 import ctrlid as cid
 
-FULL = {"clean": 600, "one": 400, "faint": 400, "two": 200, "three": 60, "outside": 200,
+FULL = {"clean": 600, "one": 400, "faint": 400, "two": 200, "three": 15, "outside": 200,
         "parameter": 100}  # fmt: skip
 SAMPLES = 1500
 FAINT, FOUND = 5.0, 50.0  # worth from which a wrong name counts, and from which an effect is due
