@@ -391,7 +391,8 @@ def test_as_many_zeros_as_poles(hold, late):
     assert e.notes == ()
 
 
-@pytest.mark.parametrize("late", [pytest.param(0.0, marks=pytest.mark.slow), 0.0003])
+@pytest.mark.parametrize("late", [0.0, 0.0003])
+@pytest.mark.slow
 def test_the_interval_of_a_delay_is_honest(late):
     """In closed loop, with exact motion: nothing but noise tells 2 us from none."""
     plant = ct.tf([-6.5], [1, 0, -1600])

@@ -132,7 +132,9 @@ def test_the_options_of_a_pid_are_tried_and_named(true, said):
     assert any(said in text for text in texts), texts
 
 
-@pytest.mark.parametrize("rule", ["reset", "half", "late"])
+@pytest.mark.parametrize(
+    "rule", [*(pytest.param(k, marks=pytest.mark.slow) for k in ("reset", "half")), "late"]
+)
 def test_another_rule_at_the_limit_does_not_speak_against_the_law(rule):
     record, loop = record_pid(limit=12.0, rule=rule)
     (found,) = cid.audit(record, loop)["anti-windup"]
@@ -162,7 +164,10 @@ def record_by_another_converter(read, logged, seed, factor=1.0, still=False, n=2
     return cid.Record(r=r, u=u, y=y, dt=DT), loop
 
 
-@pytest.mark.parametrize(("read", "logged"), [(0.0, 1e-3), (1e-4, 1e-3), (1e-3, 1e-3), (0.0, 0.05)])
+@pytest.mark.parametrize(
+    ("read", "logged"),
+    [(0.0, 1e-3), (1e-4, 1e-3), (1e-3, 1e-3), pytest.param(0.0, 0.05, marks=pytest.mark.slow)],
+)
 def test_a_logger_with_noise_of_its_own_does_not_speak_against_the_law(read, logged):
     for seed in range(4):
         record, loop = record_by_another_converter(read, logged, seed)
@@ -171,7 +176,7 @@ def test_a_logger_with_noise_of_its_own_does_not_speak_against_the_law(read, log
         assert "Gains and structure are right" in found.text
 
 
-@pytest.mark.parametrize("still", [False, True])
+@pytest.mark.parametrize("still", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_other_gains_are_no_noise_of_the_logger(still):
     for seed in range(4):
         for factor, noise in ((1.1, 0.0), (1.3, 1e-4), (0.7, 1e-4)):
@@ -184,7 +189,9 @@ def test_a_pid_as_stated_stands():
     assert "computes from r and y" in cid.audit(record, loop)["controller"][0].text
 
 
-@pytest.mark.parametrize("added", [{}, {"dither": 0.3}, {"pulses": 0.5}])
+@pytest.mark.parametrize(
+    "added", [{}, pytest.param({"dither": 0.3}, marks=pytest.mark.slow), {"pulses": 0.5}]
+)
 def test_an_exact_law_stands_under_what_is_added(added):
     for seed in range(5):
         record = record_servo(seed=seed, **added)
@@ -391,7 +398,9 @@ def test_an_audit_blames_the_controller_or_the_log_and_knows_units(spoil, words)
     assert found.text.endswith("Correct the controller or the log.")
 
 
-@pytest.mark.parametrize("stated", [{}, {"kp": 60.0, "filter_time": 0.05}])
+@pytest.mark.parametrize(
+    "stated", [{}, pytest.param({"kp": 60.0, "filter_time": 0.05}, marks=pytest.mark.slow)]
+)
 def test_a_wrong_sign_is_what_is_said_first(stated):
     """Also where the gains or the noise of the logger hide that only the sign is wrong."""
     pid = cid.PID(kp=50.0, ki=20.0, kd=2.0, filter_time=0.02, lower=-5.0, upper=5.0)

@@ -49,8 +49,8 @@ def within(finding, real, widths=4.5):
          {"swing": 1e-4, "sensor_noise": 2e-6}),
         (levitation, E.ActuatorLag(tau=1e-3), 7200,
          {"swing": 1e-4, "sensor_noise": 2e-6, "force_noise": 0.02}),
-        (drive, E.CoulombFriction(fc=0.4), 7300,
-         {"swing": 0.03, "hold": 60, "sensor_noise": 2e-4}),
+        pytest.param(drive, E.CoulombFriction(fc=0.4), 7300,
+                     {"swing": 0.03, "hold": 60, "sensor_noise": 2e-4}, marks=pytest.mark.slow),
         (beam, E.QuadraticDrag(c2=2.0), 7400,
          {"swing": 0.05, "levels": 0.1, "hold": 60, "sensor_noise": 1e-4}),
     ],
@@ -181,6 +181,7 @@ def test_a_transfer_function_as_the_model():
 # --- several records
 
 
+@pytest.mark.slow
 def test_an_effect_that_only_some_records_have():
     loop = levitation()
     rubbing = loop.with_effect(E.ViscousFriction(c=4.0))
@@ -283,7 +284,7 @@ def test_nothing_free_and_no_catalogue():
         pytest.param(
             E.PositionRipple(amplitude=0.3, period=3e-4, phase=0.7), 8600, marks=pytest.mark.slow
         ),
-        (E.ParameterStep(name="K", time=2.5, size=0.02), 8610),
+        pytest.param(E.ParameterStep(name="K", time=2.5, size=0.02), 8610, marks=pytest.mark.slow),
         (E.CoulombFriction(fc=0.2), 8620),
     ],
 )

@@ -923,6 +923,7 @@ def test_an_instant_that_is_dozens_of_samples_off_is_found(late):
 # --- an input that hardly comes through
 
 
+@pytest.mark.slow
 def test_a_gap_that_swallows_nearly_all_of_the_input_is_found_from_either_side():
     """It is as likely as the input behind it would be if it were known, and so is the width."""
     study = problems.load_script("benchmarks", "study_frozen")
@@ -945,6 +946,7 @@ def test_a_gap_that_swallows_nearly_all_of_the_input_is_found_from_either_side()
     assert best.fitted.width == pytest.approx(width, rel=0.005)
 
 
+@pytest.mark.slow
 def test_a_model_that_takes_readings_for_exact_is_fitted_from_a_usual_noise_as_well():
     """Without what is missing, a large force that leaves no noise to the sensor is a maximum."""
     study = problems.load_script("benchmarks", "study_frozen")
@@ -963,6 +965,7 @@ def test_a_model_that_takes_readings_for_exact_is_fitted_from_a_usual_noise_as_w
         assert other.value < base.value + 2
 
 
+@pytest.mark.slow
 def test_a_zone_that_swallows_everything_may_be_any_wider_and_is_named():
     """Its width has no standard error. The record says as much of limits that meet."""
     few = (E.InputDeadZone, E.InputSaturation, E.ViscousFriction, E.ActuatorLag)
@@ -991,7 +994,8 @@ def test_effects_at_one_place_end_in_the_order_in_which_they_act(order):
         assert names == [type(hidden[k]).__name__ for k in order]
 
 
-@pytest.mark.parametrize("seed", [9950, pytest.param(9960, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seed", [9950, 9960])
+@pytest.mark.slow
 def test_a_lag_behind_a_curve_of_the_input_is_not_taken_for_one_of_the_sensor(seed):
     """On a linear plant a lag behind the curve and one of the sensor are the same.
 
@@ -1045,7 +1049,7 @@ def test_models_are_compared_on_the_samples_that_all_of_them_reach():
     assert sizes == [1.0, 2.0, np.inf]
 
 
-@pytest.mark.parametrize("free", [(), ("k",)])
+@pytest.mark.parametrize("free", [(), pytest.param(("k",), marks=pytest.mark.slow)])
 def test_the_gap_before_is_the_smaller_of_given_and_recalibrated(free):
     """A gain that is twice as large on the fitted part alone spoils the recalibration."""
     dt, n, k = 0.02, 2000, 3.0

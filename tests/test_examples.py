@@ -106,6 +106,7 @@ def test_magnetoshield_is_as_fast_at_every_gap(levitations, capsys):
 
 
 @pytest.mark.usefixtures("fit_each_once")
+@pytest.mark.slow
 def test_real_records_and_their_physics(data_dir, capsys):
     """What statics say, from gaps and currents at rest, is what the fits find in the motion."""
     del data_dir

@@ -77,7 +77,7 @@ def test_what_cannot_be_held_is_left_alone():
     assert follow_record(cid.Loop(hidden, None, dt=0.01), record) is None
 
 
-@pytest.mark.parametrize("fc", [0.0, 1.0])
+@pytest.mark.parametrize("fc", [0.0, pytest.param(1.0, marks=pytest.mark.slow)])
 def test_a_replica_without_a_controller_is_like_the_record(fc, monkeypatch):
     loop = rubbing(fc)
     record = record_of(loop, 3)

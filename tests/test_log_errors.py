@@ -63,7 +63,10 @@ FAULTS = {
 }
 
 
-@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize(
+    "fault",
+    [pytest.param(k, marks=[pytest.mark.slow] * (k in ("milli", "sign of u"))) for k in FAULTS],
+)
 def test_the_log_is_the_headline_and_nothing_is_named(loop, fault):
     spoil, words = FAULTS[fault]
     r, u, y = spoil(*simulate(seed=1))

@@ -197,7 +197,7 @@ def test_as_a_module_into_a_closed_pipe(folder):
     assert (done.returncode, done.stderr) == (1, "")
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, *(pytest.param(k, marks=pytest.mark.slow) for k in (2, 3))])
 def test_the_plain_fit_fails_whatever_the_seed(seed):
     """Equation (6) of the paper is typical of this experiment and no lucky draw."""
     bench = told._make_bench()

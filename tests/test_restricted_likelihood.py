@@ -83,7 +83,7 @@ def drive_under_force(seed, force, n=1500, sigma=0.017):
     return cid.Record(r=r, u=u, y=y, dt=DT), np.array([c, 0.0, k])
 
 
-@pytest.mark.parametrize("force", [0.0, 0.1])
+@pytest.mark.parametrize("force", [0.0, pytest.param(0.1, marks=pytest.mark.slow)])
 def test_instruments_are_as_good_under_a_random_force_as_the_best(force):
     """The scatter of the pole is that of the best unbiased estimate, about."""
     z, ratio = [], []

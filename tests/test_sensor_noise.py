@@ -227,7 +227,7 @@ def test_the_order_is_asked_again_where_the_colour_has_moved_the_parameters(name
     assert alike / alike[0] == pytest.approx(expected, abs=0.05)
 
 
-@pytest.mark.parametrize("count", [2, 3, 4])
+@pytest.mark.parametrize("count", [2, 3, pytest.param(4, marks=pytest.mark.slow)])
 def test_an_average_over_samples_is_found_as_such(count):
     """Its zeros are on the unit circle, which a search from within does not reach."""
     loop, record, _ = make_loop_and_record(np.ones(count), [1.0], n=2000, seed=7)

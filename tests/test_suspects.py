@@ -56,7 +56,7 @@ def test_no_plant_is_blamed_for_what_its_sensor_or_noise_does(name: str, plant: 
         assert study.list_named_sets(line) == [], line
 
 
-@pytest.mark.parametrize("plant", ["spring", "pendulum"])
+@pytest.mark.parametrize("plant", ["spring", pytest.param("pendulum", marks=pytest.mark.slow)])
 def test_a_walk_of_the_sensor_is_noise_and_a_steady_drift_is_a_drift(plant: str) -> None:
     """Both go as far in the end, but a walk does not go steadily."""
     white = rigs.draw("white", plant, 31, 1500)

@@ -45,7 +45,7 @@ def test_limits_on_both_sides_are_found(seed):
     assert finding.effect.upper == pytest.approx(1.0, abs=5e-3)
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_a_limit_stays_beside_a_gain_that_saturates(seed):
     # With an upper limit alone nothing tells the two apart, and the gain has a parameter less.
     found = cid.diagnose(push_spring(seed, -np.inf, 1.0), make_loop(), progress=False)
