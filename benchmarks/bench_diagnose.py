@@ -45,20 +45,23 @@ PURPOSES = {
 COLUMNS = tuple(dict.fromkeys(PURPOSES.values()))
 
 
-def make_loop(*known: Any) -> cid.Loop:
+def make_loop(*known: Any, analog: bool = False) -> cid.Loop:
     """Return a levitation 12 mm below its magnet, with a lead; `known` effects are in the model."""
     plant = cid.plants.maglev(m=0.0213, K=3.34e-6)
     at = cid.operating_point(plant, output=0.012)
     lead = cid.design_lead(cid.linearize(plant, at), crossover=100, phase_margin=50)
-    loop = cid.Loop(plant, lead.sample(DT, "tustin"), dt=DT, at=at, free=("K",))
+    law = lead if analog else lead.sample(DT, "tustin")
+    loop = cid.Loop(plant, law, dt=DT, at=at, free=("K",))
     for effect in known:
         loop = loop.with_effect(effect)
     return loop
 
 
-def make_records(hidden: Sequence[Any], known: Sequence[Any], count: int, samples: int) -> Any:
+def make_records(
+    hidden: Sequence[Any], known: Sequence[Any], count: int, samples: int, analog: bool = False
+) -> Any:
     """Return records of a loop in which effects are hidden."""
-    real = make_loop(*known, *hidden)
+    real = make_loop(*known, *hidden, analog=analog)
     made = []
     for seed in range(1, count + 1):
         r = cid.random_binary(samples // count, amplitude=1e-4, hold=40, around=0.012, seed=seed)
@@ -106,7 +109,9 @@ CASES: dict[str, tuple[tuple[Any, ...], tuple[Any, ...], int, tuple[type, ...]]]
     "unknown": ((LAG,), (), 1, (E.ActuatorLag, E.InputDelay, E.SensorLag)),
     "friction": ((OFFSET,), (DRY,), 1, ()),
     "records": ((DRAG,), (), 3, ()),
+    "analog": ((LAG, DRY), (), 1, ()),
 }
+ANALOG = {"analog"}  # the lead is a circuit
 # Dry friction at a cart with a pole: how many outputs are seen.
 CARTS = {"one output": 1, "two outputs": 2}
 
@@ -152,8 +157,9 @@ def make_question(case: str, samples: int) -> tuple[cid.Loop, list[cid.Record], 
             record = cid.Record(u=record.u, y=np.asarray(record.y)[0], dt=CART_DT)
         return loop, [record], list(E.CATALOGUE)
     hidden, known, count, lacking = CASES[case]
-    records = make_records(hidden, known, count, samples)
-    loop = make_loop(*known).with_parameters({"K": 1.05 * 3.34e-6})
+    analog = case in ANALOG
+    records = make_records(hidden, known, count, samples, analog)
+    loop = make_loop(*known, analog=analog).with_parameters({"K": 1.05 * 3.34e-6})
     return loop, records, [kind for kind in E.CATALOGUE if kind not in lacking]
 
 

@@ -7,7 +7,6 @@ import matplotlib as mpl
 import numpy as np
 import pytest
 
-import ctrlid as cid
 from problems import load_script
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -52,28 +51,6 @@ def levitations(data_dir):
     return load_script("examples", "real_levitations")
 
 
-@pytest.fixture(scope="module")
-def kept_series():
-    """What was asked of `fit_each`, and its answers."""
-    return []
-
-
-@pytest.fixture
-def fit_each_once(kept_series, monkeypatch):
-    """Give the answer again where the same series is asked for: two scripts fit the set-points."""
-    fit_each = cid.fit_each
-
-    def fit_once(estimator, records, **options):
-        asked = estimator, [(record.name, len(record)) for record in records], options
-        known = [series for question, series in kept_series if question == asked]
-        if not known:
-            known = [fit_each(estimator, records, **options)]
-            kept_series.append((asked, known[0]))
-        return known[0]
-
-    monkeypatch.setattr(cid, "fit_each", fit_once)
-
-
 def test_inteco_needs_the_current(levitations, capsys):
     """With the coil's current the pair is real and reciprocal, with the duty it is not."""
     found = levitations.inteco()
@@ -93,7 +70,6 @@ def test_magnetoshield_needs_the_delay_and_the_lag(levitations):
     assert np.ptp(second) > 15
 
 
-@pytest.mark.usefixtures("fit_each_once")
 def test_magnetoshield_is_as_fast_at_every_gap(levitations, capsys):
     """The continuous fit, free of the bias: one pair at all set-points, though the gaps differ."""
     series = levitations.set_points()
@@ -105,7 +81,6 @@ def test_magnetoshield_is_as_fast_at_every_gap(levitations, capsys):
     assert "one model of all five: p = 50.0 ± 0.3" in capsys.readouterr().out
 
 
-@pytest.mark.usefixtures("fit_each_once")
 @pytest.mark.slow
 def test_real_records_and_their_physics(data_dir, capsys):
     """What statics say, from gaps and currents at rest, is what the fits find in the motion."""

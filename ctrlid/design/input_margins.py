@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from .._base.arrays import Array, ComplexArray, freeze_arrays
 from .._base.text import Printed, write_count
-from ..loop.controllers import linearize_law
+from ..loop.controllers import connect_law
 from ..loop.loop import Loop
 from ..loop.period_map import compute_closed_loop_poles
 from ..physics.conversions import to_state_matrices
@@ -52,12 +52,9 @@ def open_at_inputs(loop: Loop) -> Any:
     if law.dt and not timebase(plant):
         plant = ct.sample_system(plant, law.dt, "zoh")
     a, b, c, _ = to_state_matrices(plant)
-    ac, by, bu, cc, dy = linearize_law(law, loop.point)
-    n, nc, m = len(a), len(ac), b.shape[1]
-    # The observer's reading of u is what the controller computes: u = cc x_c + dy y.
-    both = np.block([[a, np.zeros((n, nc))], [(by + bu @ dy) @ c, ac + bu @ cc]])
-    entry = np.vstack([b, np.zeros((nc, m))])
-    return ct.ss(both, entry, -np.hstack([dy @ c, cc]), np.zeros((m, m)), law.dt or 0,
+    both, entry, feedback = connect_law(a, b, c, law, loop.point)
+    m = b.shape[1]
+    return ct.ss(both, entry, -feedback, np.zeros((m, m)), law.dt or 0,
                  inputs=list(loop.signals["u"]))  # fmt: skip
 
 

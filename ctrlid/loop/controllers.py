@@ -6,6 +6,7 @@ a state, a rule for its next value (or its rate) and the input it applies, in ab
 units.
 """
 
+import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -278,8 +279,9 @@ def _make_pid_law(pid: PID, at: OperatingPoint, dt: float) -> ControlLaw:
     return ControlLaw(dt, (0.0, 0.0, (c - 1.0) * at.output, 0.0), apply)
 
 
+@functools.lru_cache(maxsize=64)
 def linearize_law(law: ControlLaw, at: OperatingPoint) -> tuple[Array, ...]:
-    """Return the state matrices of a controller at rest.
+    """Return the state matrices of a controller at rest; the last ones are kept.
 
     Parameters
     ----------
@@ -306,3 +308,34 @@ def linearize_law(law: ControlLaw, at: OperatingPoint) -> tuple[Array, ...]:
     return tuple(
         np.asarray(part, dtype=float).reshape(size) for part, size in zip(found, sizes, strict=True)
     )
+
+
+def connect_law(
+    a: Array, b: Array, c: Array, law: ControlLaw, at: OperatingPoint
+) -> tuple[Array, Array, Array]:
+    r"""Return the state matrices of a plant with its controller, opened at the plant's inputs.
+
+    .. math:: \dot z = A z + B u, \quad u = K z
+
+    with the states z of the plant and then of the controller. Closed, the loop is
+    :math:`A + B K`. An observer in the controller reads the input that the controller asks for.
+
+    Parameters
+    ----------
+    a, b, c : ndarray
+        State matrices of the plant, in the time base of the controller and without feedthrough.
+    law : ControlLaw
+        The controller.
+    at : OperatingPoint
+        Operating point of the loop.
+
+    Returns
+    -------
+    tuple of ndarray
+        A, B and K.
+    """
+    ac, by, bu, cc, dy = linearize_law(law, at)
+    n, nc = len(a), len(ac)
+    # The observer's reading of u is what the controller computes: u = cc x_c + dy y.
+    both = np.block([[a, np.zeros((n, nc))], [(by + bu @ dy) @ c, ac + bu @ cc]])
+    return both, np.vstack([b, np.zeros((nc, b.shape[1]))]), np.hstack([dy @ c, cc])

@@ -11,11 +11,7 @@ import casadi
 import control as ct
 import numpy as np
 
-from .._base.arguments import (
-    check_arguments,
-    explain_fields,
-    is_number,
-)
+from .._base.arguments import check_arguments, explain_fields, is_number
 from .._base.errors import CtrlidError, EffectDoesNotApply
 from .._base.periods import have_same_period, write_both_periods
 from .._base.pickling import pack_by_value
@@ -671,8 +667,11 @@ def replace_effect_values(loop: Loop, values: Mapping[str, float]) -> tuple[Abst
     )  # fmt: skip
 
 
+@functools.lru_cache(maxsize=64)
 def sharpen_effects(loop: Loop, times: float) -> Loop:
     """Return a loop whose effects act as abruptly as with a period so many times shorter.
+
+    The last ones are kept: replicas are simulated with one loop again and again.
 
     Dry friction takes a mass to rest within a share of a period, and a parameter steps within half
     of one. That keeps a filter fast; nature does not wait for samples. The copy is there to be

@@ -12,7 +12,7 @@ import numpy as np
 from ..._base.arrays import Array
 from ..._base.errors import ModelCannotRun
 from ...data.reconstruction import count_pieces
-from ...loop.controllers import ControlLaw, linearize_law
+from ...loop.controllers import ControlLaw, connect_law
 from ...loop.loop import Loop
 from ...loop.period_map import push_velocities
 from ...physics.block_evaluation import BlockEvaluation
@@ -154,21 +154,19 @@ def choose_scheme(e: Equations, loop: Loop, dt: float, law: ControlLaw | None = 
     if e.dt:
         return Scheme(4, 1)
     time = _find_input_lag_time(e, e.values)
-    # Under such a controller a lag has no exact formula: it is a state as others are.
     driven, cut = np.isfinite(time), bool(time < dt / 8) and law is None
     try:
-        own = _find_fastest_rate(e, loop, None) * dt
-        rate = own if law is None else _find_fastest_rate(e, loop, law) * dt
+        rate, rate_under_law = (v * dt for v in _find_fastest_rates(e, loop, law))
     except ModelCannotRun:
         return Scheme(8, 2, (8, 2) if cut else None)
+    # Under whatever controller, a plant that is too fast is refused below.
+    if law is not None and rate / 1.5 <= MOST_STEPS:
+        return _choose_scheme_under_law(e, rate_under_law)
     if rate <= 3 * SLOW:
         # A velocity that turns within a period crosses the kink of friction there.
-        least = KINK_STEPS if e.kinked else 1 if law is None else 2
-        few = max(least, math.ceil(rate / SLOW))
+        few = max(KINK_STEPS if e.kinked else 1, math.ceil(rate / SLOW))
         if not driven:
             return Scheme(4, few)
-        if law is not None:
-            return Scheme(4, 2 * few if e.kinked else few)
         # A higher order does not help beside a kink.
         if cut and e.kinked:
             return Scheme(4, few, (4, SHARP_STEPS))
@@ -180,35 +178,45 @@ def choose_scheme(e: Equations, loop: Loop, dt: float, law: ControlLaw | None = 
         )
         if e.kinked or few <= FEW_STEPS:
             return Scheme(4, few)
-    if math.ceil(own / 1.5) > MOST_STEPS:
+    steps = max(2 if e.kinked else 1, math.ceil(rate / 1.5))
+    if steps > MOST_STEPS:
         raise ModelCannotRun(
-            f"{e.name} has a motion at {own / dt:.3g} rad/s, {own:.3g} times faster than it "
+            f"{e.name} has a motion at {rate / dt:.3g} rad/s, {rate:.3g} times faster than it "
             "is sampled. The filter cannot follow a motion that ends within one sample: leave it "
             "out of the plant, or sample faster"
         )
-    steps = max(2 if e.kinked or law else 1, math.ceil(rate / 1.5))
-    if law is not None:
-        return Scheme(8, min(steps, MOST_STEPS_UNDER_LAW))
     return Scheme(8, steps, (8, steps) if cut else None)
 
 
-def _find_fastest_rate(e: Equations, loop: Loop, law: ControlLaw | None) -> float:
-    """Return the rate of the fastest motion that has to be integrated [rad/s]."""
+def _choose_scheme_under_law(e: Equations, rate: float) -> Scheme:
+    """Return the scheme of a plant and its analog controller, which move together.
+
+    A lag has no exact formula there, and is a state as others are.
+    """
+    if rate > 3 * SLOW:
+        return Scheme(8, min(max(2, math.ceil(rate / 1.5)), MOST_STEPS_UNDER_LAW))
+    few = max(KINK_STEPS if e.kinked else 2, math.ceil(rate / SLOW))
+    return Scheme(4, 2 * few if e.kinked and find_lags(e)[0] else few)
+
+
+def _find_fastest_rates(e: Equations, loop: Loop, law: ControlLaw | None) -> tuple[float, float]:
+    """Return the rates of the fastest motion of the plant, and of it under a controller [rad/s].
+
+    Lags count under the controller only: without one they are advanced exactly.
+    """
     point = replace(loop.point, states=find_rest_state(loop, e))
     # The filter's own uncertainty smooths kinks; sharp friction does not make the plant stiff.
-    a, b, c, d = compute_state_matrices(e, point, spread=1e6)
+    a, b, c, _ = compute_state_matrices(e, point, spread=1e6)
+    hidden = [lag.state for lags in find_lags(e) for lag in lags]
+    plain = [k for k in range(len(e.states)) if k not in hidden]
+    alone = _find_fastest_rate(a[np.ix_(plain, plain)])
     if law is None:
-        # Lags of the input and of the output are advanced exactly.
-        hidden = [lag.state for lags in find_lags(e) for lag in lags]
-        plain = [k for k in range(len(e.states)) if k not in hidden]
-        a = a[np.ix_(plain, plain)]
-    else:
-        ac, by, bu, cc, dy = linearize_law(law, point)
-        # The input by the states of plant and controller, and the output.
-        u = np.linalg.pinv(np.eye(len(b.T)) - dy @ d) @ np.hstack([dy @ c, cc])
-        y = np.hstack([c, np.zeros((len(c), len(ac)))]) + d @ u
-        own = np.hstack([a, np.zeros((len(a), len(ac)))]) + b @ u
-        a = np.vstack([own, np.hstack([np.zeros((len(ac), len(a))), ac]) + by @ y + bu @ u])
+        return alone, alone
+    both, entry, feedback = connect_law(a, b, c, law, loop.point)
+    return alone, _find_fastest_rate(both + entry @ feedback)
+
+
+def _find_fastest_rate(a: Array) -> float:
     return float(np.max(np.abs(np.linalg.eigvals(a)), initial=0.0))
 
 
