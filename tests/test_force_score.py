@@ -7,9 +7,9 @@ import pytest
 
 import ctrlid as cid
 from ctrlid import effects as E
-from ctrlid.diagnosis.fitted_model import Model
 from ctrlid.diagnosis.recalibration import fit_base_model
-from ctrlid.diagnosis.scans import ModelSight, scan_candidate, score_shapes
+from ctrlid.diagnosis.scans import ModelSight, scan_candidate
+from ctrlid.diagnosis.shape_scores import score_shapes
 from ctrlid.effects import force
 from ctrlid.effects.scanning import make_waves
 from ctrlid.estimation.likelihood.force_score import compute_force_scores
@@ -47,7 +47,7 @@ def sum_scores(scores, shapes):
 
 def score_forwards(fit, shapes, at=""):
     """Scores and information of shapes, by the sensitivities of a pass for each."""
-    gains, sizes = score_shapes(Model(fit.plant.loop, fit), shapes, at=at)
+    gains, sizes = score_shapes(fit, shapes, at=at)
     scores = 2 * gains / sizes[:, 0]
     return scores, scores / sizes[:, 0]
 

@@ -551,6 +551,21 @@ def test_a_lag_beside_dry_friction_is_within_its_errors(ratio, seed):
     assert np.abs(off).max() < 2.9
 
 
+@pytest.mark.parametrize("tau", [2e-3, 1e-5])
+def test_a_lag_that_is_not_there_ends_at_nothing(tau):
+    """A lag of nothing is no state any more, and nothing else of the fit may ask for it."""
+    plant, pid = cid.plants.servo(m=2.7, c=10.0, k=11.0), cid.PID(kp=15.0, kd=1.5, filter_time=0.05)
+    r = cid.random_binary(2000, amplitude=0.02, hold=60, seed=1)
+    record = cid.simulate(cid.Loop(plant, pid, dt=0.01), r, sensor_noise=4e-6, seed=2)
+    record = replace(record, y=np.append(record.y[1:], record.y[-1]))  # early, not late
+    lag = cid.effects.ActuatorLag(tau=tau)
+    loop = cid.Loop(plant, pid, dt=0.01, effects=(lag,), free=("k", "ActuatorLag.tau"))
+    estimate = cid.fit_loop(loop, record).estimate
+    assert estimate["ActuatorLag.tau"] == 0.0
+    assert "ActuatorLag.tau" in estimate.active
+    assert not any("HARDLY COUNTS" in note for note in estimate.notes)
+
+
 # --- a wrong sign or unit of u
 
 

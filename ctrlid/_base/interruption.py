@@ -116,6 +116,17 @@ def find_budget() -> Budget | None:
     return None if found is None else found[0]
 
 
+@contextmanager
+def ending() -> Iterator[None]:
+    """Work on after the end of a budget: what is told of a search that was stopped."""
+    budget = find_budget()
+    if budget is None:
+        yield
+        return
+    with budget.running(binding=False):
+        yield
+
+
 # Set between Ctrl-C and the next pass of a filter.
 _INTERRUPTED = threading.Event()
 

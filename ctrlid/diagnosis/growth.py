@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from .._base.errors import EffectDoesNotApply, ModelCannotRun
-from .._base.interruption import Stopped
+from .._base.interruption import Stopped, ending
 from ..effects import AbstractEffect
 from ..effects.base import name_at_place, name_with_subject
 from ..estimation.likelihood.kalman_filter import Noise
@@ -217,7 +217,8 @@ def _end_search(reached: Reached) -> Search:
         taken = [pair for pair in reached.taken if is_same_kind(pair[1].effect, effect)]
         found += [Weighed(best, (), before, position) for before, best in taken[-1:]]
     found.sort(key=lambda f: -f.trial.gain)
-    before, after = run_noise_tests(base.fit), run_noise_tests(model.fit)
+    with ending():
+        before, after = run_noise_tests(base.fit), run_noise_tests(model.fit)
     return Search(base, tuple(reached.steps), model, tuple(found), before, after, finished=False)
 
 

@@ -28,10 +28,13 @@ from .constancy import (
     run_constancy_tests,
     sum_in_bins,
 )
+from .shape_scores import run_shape_tests
 from .thresholds import THRESHOLD
 
 # The tests of heavy tails.
 TAILS = "heavy tails", "isolated events"
+# For each record the quantities in whose bins errors are looked at, by name, at all its samples.
+Axes = Sequence[Mapping[str, Array]]
 # The test of whether large errors come one by one.
 SIZES = "independence of sizes"
 
@@ -124,37 +127,44 @@ def run_noise_tests(fit: Fit) -> NoiseTests:
     """
     if not math.isfinite(fit.value):
         return NoiseTests({"following the record": 0.0}, np.zeros(0), {})
+    axes = _find_common_axes(fit)
     if fit.plant.e.siso:
-        found = _test_output(fit, fit.standardized)
-        p_values = {**found.p_values, **run_constancy_tests(fit, found.axes)}
-        return replace(found, p_values=p_values)
-    return _test_several_outputs(fit)
+        found = _test_output(fit, fit.standardized, axes)
+    else:
+        found = _test_several_outputs(fit, axes)
+    p_values = {
+        **found.p_values, **run_constancy_tests(fit, found.axes), **run_shape_tests(fit, axes)
+    }  # fmt: skip
+    return replace(found, p_values=p_values)
 
 
-def _test_several_outputs(fit: Fit) -> NoiseTests:
+def _test_several_outputs(fit: Fit, axes: Axes) -> NoiseTests:
     """Test the innovations of each output, and those of all together.
 
     Each output is given the others of the same sample that were processed before it, so that the
     innovations of a right model are white together.
     """
     each = {
-        name: _test_output(fit, [z[:, k] for z in fit.standardized], k)
+        name: _test_output(fit, [z[:, k] for z in fit.standardized], axes, k)
         for k, name in enumerate(fit.plant.e.outputs)
     }
     p_values = {f"{test} of {name}": p for name, one in each.items()
                 for test, p in one.p_values.items()}  # fmt: skip
     of_noise = {f"{test} of {name}" for name, one in each.items() for test in one.of_noise}
     p_values["whiteness across outputs"] = _test_across(fit)
-    parts: dict[str, list[Array]] = {}
-    for z, out, data in zip(fit.standardized, fit.filtered, fit.data, strict=True):
-        keep = np.isfinite(z)
-        for name, values in _find_axes(fit, out, data).items():
-            every = np.broadcast_to(values[:, None], keep.shape)
-            parts.setdefault(name, []).append(every[keep])
-    axes = {name: np.concatenate(v) for name, v in parts.items()}
-    p_values |= run_constancy_tests(fit, axes)
-    z = np.concatenate([part[np.isfinite(part)] for part in fit.standardized])
-    return NoiseTests(p_values, z, axes, frozenset(of_noise), outputs=each)
+    shown = [np.isfinite(z) for z in fit.standardized]
+    spread = [
+        {name: np.broadcast_to(v[:, None], keep.shape) for name, v in of.items()}
+        for of, keep in zip(axes, shown, strict=True)
+    ]
+    z = np.concatenate([part[keep] for part, keep in zip(fit.standardized, shown, strict=True)])
+    return NoiseTests(p_values, z, _join_axes(spread, shown), frozenset(of_noise), outputs=each)
+
+
+def _join_axes(axes: Axes, shown: Sequence[Array]) -> dict[str, Array]:
+    """Return the quantities at the samples that count, records one after the other."""
+    return {name: np.concatenate([of[name][keep] for of, keep in zip(axes, shown, strict=True)])
+            for name in axes[0]}  # fmt: skip
 
 
 def _test_across(fit: Fit) -> float:
@@ -173,9 +183,10 @@ def _test_across(fit: Fit) -> float:
     return float(stats.chi2.sf(value, max(df, 1)))
 
 
-def _test_output(fit: Fit, standardized: Sequence[Array], output: int | None = None) -> NoiseTests:
+def _test_output(
+    fit: Fit, standardized: Sequence[Array], by_record: Axes, output: int | None = None
+) -> NoiseTests:
     """Test the standardized innovations of one output, but for the constancy of parameters."""
-    parts: dict[str, list[Array]] = {}
     white = cross = 0.0
     white_df = cross_df = 0
     lines, tails, shapes, slopes = [], [], [], []
@@ -213,10 +224,8 @@ def _test_output(fit: Fit, standardized: Sequence[Array], output: int | None = N
             shapes += _compute_force_deviates(
                 out.disturbance[int(THRESHOLD.force_settling * len(z)) :]
             )
-        for name, values in _find_axes(fit, out, data).items():
-            parts.setdefault(name, []).append(values[keep])
     z = np.concatenate(tails)
-    axes = {name: np.concatenate(v) for name, v in parts.items()}
+    axes = _join_axes(by_record, [np.isfinite(part) for part in standardized])
     tails_and_events = _test_tails(z)
     of_noise = {*tails_and_events}
     p_values = {
@@ -329,6 +338,14 @@ def _compute_force_deviates(force: Array) -> list[float]:
     return [float(first), float(second)]
 
 
+def _find_common_axes(fit: Fit) -> Axes:
+    """Return the quantities that move, at all samples of each record, by name."""
+    axes = [_find_axes(fit, out, data) for out, data in zip(fit.filtered, fit.data, strict=True)]
+    common = [name for name in axes[0] if all(name in of for of in axes)]
+    moving = [name for name in common if np.ptp(np.concatenate([of[name] for of in axes])) > 0]
+    return [{name: of[name] for name in moving} for of in axes]
+
+
 def _find_axes(fit: Fit, out: Filtered, data: FilterData) -> dict[str, Array]:
     """Return the quantities in whose bins the innovations are looked at, by name."""
     e = fit.plant.e
@@ -345,7 +362,7 @@ def _find_axes(fit: Fit, out: Filtered, data: FilterData) -> dict[str, Array]:
         axes["velocity" if len(e.velocities) == 1 else e.states[k]] = states[:, k]
     if data.record.r is not None:
         axes["reference"] = data.r
-    return {name: v for name, v in axes.items() if np.ptp(v) > 0}
+    return axes
 
 
 def _find_several_axes(fit: Fit, out: Filtered, data: FilterData) -> dict[str, Array]:
@@ -359,7 +376,7 @@ def _find_several_axes(fit: Fit, out: Filtered, data: FilterData) -> dict[str, A
         axes[e.states[k]] = out.trajectory.predicted[:, k]
     for name, r in zip(data.record.signals.get("r", ()), _list_references(data), strict=True):
         axes[f"reference {name}"] = r
-    return {name: v for name, v in axes.items() if np.ptp(v) > 0}
+    return axes
 
 
 def _test_bins(z: Array, values: Array, slopes: Array, fit: Fit) -> tuple[float, float]:

@@ -8,102 +8,16 @@ from typing import Literal
 import numpy as np
 
 from .._base.arrays import Array
-from .._base.statistics import pseudo_inverse
 from ..data.record import Record
 from ..effects import AbstractEffect
 from ..effects.context import find_output_of
 from ..estimation.likelihood.force_score import compute_force_scores
-from ..estimation.likelihood.kalman_filter import run_filter
 from .candidates import Objection, Trial, attempt_trial
 from .fitted_model import Model
 from .places import find_force_channel, find_position
 from .screening import screen_candidate, screen_starts
+from .shape_scores import score_shapes
 from .thresholds import THRESHOLD
-
-
-def score_shapes(
-    model: Model, shapes: Sequence[Array], parameter: str | None = None, width: int = 1,
-    place: Literal["force", "output"] = "force", at: str = "",
-) -> tuple[Array, Array]:  # fmt: skip
-    r"""Return what forces of given shapes would gain, with the model's parameters moving along.
-
-    .. math:: \tfrac12 g^T H^{-1} g, \quad g = \sum_k \psi_k e_k / s_k, \quad
-        H = \sum_k \psi_k \psi_k^T / s_k
-
-    where psi is what the shape does to the predictions, projected on what the model's own
-    parameters cannot do.
-
-    Parameters
-    ----------
-    model : Model
-        The fitted model.
-    shapes : sequence of ndarray, shape (n, shapes)
-        For each record, the shapes over its samples.
-    parameter : str, optional
-        What is modulated: by default a force, else the named parameter of the model.
-    width : int, optional
-        Neighbouring shapes that belong together, such as a sine and a cosine.
-    place : {"force", "output"}, optional
-        Whether the shapes are forces, or are added to the reading.
-    at : str, optional
-        The velocity or the output, of several.
-
-    Returns
-    -------
-    gains : ndarray, shape (shapes / width,)
-        Gains of log-likelihood.
-    sizes : ndarray, shape (shapes / width, width)
-        The sizes that the first step gives them.
-    """
-    fit = model.fit
-    plant, count = fit.plant, shapes[0].shape[1]
-    samples = max(len(s) for s in shapes)
-    step = max(width, THRESHOLD.scan_block // (samples * (plant.size + 1)) // width * width)
-    gains, sizes = [], []
-    p = len(fit.theta)
-    for first in range(0, count, step):
-        size = min(step, count - first)
-        matrix, score = np.zeros((p + size, p + size)), np.zeros(p + size)
-        for data, lin, keep, (e, s), shape in zip(
-            fit.data,
-            fit.linearized,
-            fit.counts,
-            fit.working,
-            shapes,
-            strict=True,
-        ):
-            part = shape[:, None, first : first + size]
-            # The shapes stand behind the parameters of the model.
-            dp = np.zeros((*lin.dp.shape[:2], lin.dp.shape[2] + size))
-            hp = np.zeros((*lin.output.shape, lin.hp.shape[-1] + size))
-            dp[:, :, :-size], hp[..., :-size] = lin.dp, lin.hp
-            if place == "output":
-                seen = (slice(None), plant.e.outputs.index(at)) if at else slice(None)
-                hp[..., -size:][seen] = shape[:, first : first + size]
-            elif parameter is None:
-                pushed = lin.b.sum(axis=2)
-                if at:
-                    pushed = lin.b[:, :, find_force_channel(plant.e, at)]
-                np.multiply(pushed[:, :, None], part, out=dp[:, :, -size:])
-            else:
-                by = lin.dp[:, :, plant.names.index(parameter)]
-                np.multiply(by[:, :, None], part, out=dp[:, :, -size:])
-            wide = replace(lin, dp=dp, hp=hp)
-            out = run_filter(plant, data, wide, fit.noise, columns=p + size)
-            slopes = out.slopes[keep]
-            weighted = slopes / s[keep, None]
-            matrix += weighted.T @ slopes
-            score += weighted.T @ e[keep]
-        own = pseudo_inverse(matrix[:p, :p]) if p else np.zeros((0, 0))
-        through = matrix[p:, :p] @ own
-        left = matrix[p:, p:] - through @ matrix[:p, p:]
-        remaining_score = score[p:] - through @ score[:p]
-        for k in range(0, size, width):
-            rows = slice(k, k + width)
-            amount = pseudo_inverse(left[rows, rows]) @ remaining_score[rows]
-            gains.append(0.5 * float(remaining_score[rows] @ amount))
-            sizes.append(amount)
-    return np.array(gains), np.array(sizes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,7 +112,7 @@ class ModelSight:
         place: Literal["force", "output"] = "force",
     ) -> tuple[Array, Array]:  # fmt: skip
         """Return what forces of given shapes would gain, and the sizes that gain it."""
-        return score_shapes(self.model, shapes, parameter, width, place, self.at)
+        return score_shapes(self.model.fit, shapes, parameter, width, place, self.at)
 
 
 def find_strongest_line(errors: Array, dt: float) -> float:

@@ -57,6 +57,10 @@ TESTS_OF = {
     "size by ": "the variance in bins of ",
     "rhythm of ": "a periodic change of ",
 }
+# The same of what may depend on a quantity in any way; the words of the input or the output, where
+# there are several, stand in place of the general ones.
+SHAPES = {"force": "a force", "slope": "an effect of {}", "reading": "an error of {}"}
+OF_ONE = {"slope": "the input", "reading": "the reading"}
 # The first word of what a parameter of the plant is called that is not what the model says.
 PARAMETER = "parameter "
 # What is no effect of the catalogue needs an article in a sentence.
@@ -91,10 +95,18 @@ def name_test(key: str) -> str:
     --------
     >>> name_test("mean by velocity"), name_test("whiteness")
     ('the mean in bins of velocity', 'whiteness')
+    >>> name_test("force by velocity"), name_test("slope of V at x_dot by theta")
+    ('a force that depends on velocity', 'an effect of V at x_dot that depends on theta')
     """
     for start, words in TESTS_OF.items():
         if key.startswith(start):
             return words + key.removeprefix(start)
+    what, _, quantity = key.partition(" by ")
+    what, _, place = what.partition(" at ")
+    kind, _, signal = what.partition(" of ")
+    if quantity and kind in SHAPES:
+        words = SHAPES[kind].format(signal or OF_ONE.get(kind, ""))
+        return f"{words}{f' at {place}' if place else ''} that depends on {quantity}"
     return TESTS.get(key, key)
 
 

@@ -231,17 +231,18 @@ def _note_doubtful_input(
     own = [name for name in estimate.active if name not in list_effect_bounds(loop)]
     if not e.siso:
         return ()
+    # Without effects: what a lag does with the input is no question of how much it counts.
+    bare = [replace(one, effects=(), free=()) for one in (loop, fitted.loop)]
     try:
         given, now = (
-            np.abs(compute_state_matrices(one.equations(), one.point)[1][:, 0])
-            for one in (loop, fitted.loop)
+            np.abs(compute_state_matrices(one.equations(), one.point)[1][:, 0]) for one in bare
         )
     except ModelCannotRun:
         return ()  # At a corner nobody can say how much the input counts.
     seen = given > 0
     share = float(np.max(now[seen] / given[seen], initial=0.0)) if seen.any() else 1.0
     spread = max(float(np.std(record.u[record.valid])) for record in records)
-    push = spread * float(np.max(given[list(e.velocities)], initial=0.0))
+    push = spread * float(np.max(given[list(bare[0].equations().velocities)], initial=0.0))
     force = math.hypot(float(np.max(estimate.force_noise)), estimate.coloured_force)
     bound = f"{write_list(own)} {'IS ON A BOUND' if len(own) == 1 else 'ARE ON THEIR BOUNDS'}"
     if share < DISCOUNTED:

@@ -1,0 +1,252 @@
+"""What errors of a given shape would gain: forces, errors of the reading, parameters that vary."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+from scipy import stats
+
+from .._base.arrays import Array
+from .._base.statistics import pseudo_inverse
+from ..estimation.likelihood.filter_data import name_noise_places
+from ..estimation.likelihood.kalman_filter import run_filter
+from ..estimation.likelihood.likelihood import Fit, relinearize_fit
+from ..estimation.likelihood.sampled_plant import Linearized, SampledPlant
+from .constancy import find_bin_edges, find_bins
+from .places import find_force_channel
+from .thresholds import THRESHOLD
+
+# How the columns of a shape enter the filter: the derivatives of a record's states and outputs.
+Columns = tuple[Array, Array]
+
+
+def score_shapes(
+    fit: Fit, shapes: Sequence[Array], parameter: str | None = None, width: int = 1,
+    place: Literal["force", "output"] = "force", at: str = "",
+) -> tuple[Array, Array]:  # fmt: skip
+    r"""Return what forces of given shapes would gain, with the model's parameters moving along.
+
+    .. math:: \tfrac12 g^T H^{-1} g, \quad g = \sum_k \psi_k e_k / s_k, \quad
+        H = \sum_k \psi_k \psi_k^T / s_k
+
+    where psi is what the shape does to the predictions, projected on what the model's own
+    parameters cannot do.
+
+    Parameters
+    ----------
+    fit : Fit
+        The fit of a model, with the plant along its trajectory.
+    shapes : sequence of ndarray, shape (n, shapes)
+        For each record, the shapes over its samples.
+    parameter : str, optional
+        What is modulated: by default a force, else the named parameter of the model.
+    width : int, optional
+        Neighbouring shapes that belong together, such as a sine and a cosine.
+    place : {"force", "output"}, optional
+        Whether the shapes are forces, or are added to the reading.
+    at : str, optional
+        The velocity or the output, of several.
+
+    Returns
+    -------
+    gains : ndarray, shape (shapes / width,)
+        Gains of log-likelihood.
+    sizes : ndarray, shape (shapes / width, width)
+        The sizes that the first step gives them.
+    """
+    plant, count = fit.plant, shapes[0].shape[1]
+    samples = max(len(s) for s in shapes)
+    step = max(width, THRESHOLD.scan_block // (samples * (plant.size + 1)) // width * width)
+    gains, sizes = [], []
+    for first in range(0, count, step):
+        part = [shape[:, first : first + step] for shape in shapes]
+        columns = [
+            _place_columns(plant, lin, shape, parameter, place, at)
+            for lin, shape in zip(fit.linearized, part, strict=True)
+        ]
+        score, left, _ = score_columns(fit, columns)
+        for k in range(0, len(score), width):
+            rows = slice(k, k + width)
+            amount = pseudo_inverse(left[rows, rows]) @ score[rows]
+            gains.append(0.5 * float(score[rows] @ amount))
+            sizes.append(amount)
+    return np.array(gains), np.array(sizes)
+
+
+def score_columns(fit: Fit, columns: Sequence[Columns]) -> tuple[Array, Array, Array]:
+    """Return the score of shapes and its covariance, both without what the parameters take up.
+
+    Parameters
+    ----------
+    fit : Fit
+        The fit of a model, with the plant along its trajectory.
+    columns : sequence of (ndarray, ndarray)
+        For each record what the shapes do to the states of the next sample, (n, states, shapes),
+        and to the outputs, (n, shapes) or (n, outputs, shapes).
+
+    Returns
+    -------
+    score : ndarray, shape (shapes,)
+        Derivative of the log-likelihood by the sizes of the shapes.
+    left : ndarray, shape (shapes, shapes)
+        Information on the sizes.
+    alone : ndarray, shape (shapes,)
+        Information on each size if nothing else were unknown.
+    """
+    p, size = len(fit.theta), columns[0][0].shape[-1]
+    matrix, score = np.zeros((p + size, p + size)), np.zeros(p + size)
+    for data, lin, keep, (e, s), (states, outputs) in zip(
+        fit.data, fit.linearized, fit.counts, fit.working, columns, strict=True
+    ):
+        # The shapes stand behind the parameters of the model.
+        wide = replace(
+            lin,
+            dp=np.concatenate([lin.dp[..., :p], states], axis=-1),
+            hp=np.concatenate([lin.hp[..., :p], outputs], axis=-1),
+        )
+        slopes = run_filter(fit.plant, data, wide, fit.noise, columns=p + size).slopes[keep]
+        weighted = slopes / s[keep, None]
+        matrix += weighted.T @ slopes
+        score += weighted.T @ e[keep]
+    believed, information = fit.problem.beliefs
+    matrix[range(p), range(p)] += information
+    score[:p] -= information * (fit.theta - believed)
+    own = pseudo_inverse(matrix[:p, :p]) if p else np.zeros((0, 0))
+    through = matrix[p:, :p] @ own
+    left = matrix[p:, p:] - through @ matrix[:p, p:]
+    return score[p:] - through @ score[:p], left, np.diag(matrix)[p:]
+
+
+def _place_columns(
+    plant: SampledPlant, lin: Linearized, shape: Array, parameter: str | None, place: str, at: str
+) -> Columns:
+    """Return what shapes do as a force, as an error of the reading, or by a parameter."""
+    states = np.zeros((*lin.dp.shape[:2], shape.shape[1]))
+    outputs = np.zeros((*lin.output.shape, shape.shape[1]))
+    if place == "output":
+        seen = (slice(None), plant.e.outputs.index(at)) if at else slice(None)
+        outputs[seen] = shape
+    else:
+        if parameter is not None:
+            by = lin.dp[:, :, plant.names.index(parameter)]
+        elif at:
+            by = lin.b[:, :, find_force_channel(plant.e, at)]
+        else:
+            by = lin.b.sum(axis=2)
+        np.multiply(by[:, :, None], shape[:, None], out=states)
+    return states, outputs
+
+
+def run_shape_tests(fit: Fit, axes: Sequence[Mapping[str, Array]]) -> dict[str, float]:
+    r"""Test that no force, no slope of the input and no error of the reading depends on anything.
+
+    With the score g and the information H of `score_shapes`, of a force that is one in one bin of a
+    quantity and zero in all others, for each bin,
+
+    .. math:: g^T H^{-1} g \sim \chi^2
+
+    where there is no force that depends on this quantity in any way. It is the same for a force in
+    proportion to the input, and for an error of the reading. What a force leaves in the innovations
+    is spread over as many samples as the filter needs to follow it, so that their means in the bins
+    themselves say little of a force.
+
+    Parameters
+    ----------
+    fit : Fit
+        The fitted model.
+    axes : sequence of mapping of str to ndarray
+        For each record, the values of each quantity at all its samples.
+
+    Returns
+    -------
+    dict of str to float
+        Probabilities by the name of the test.
+
+    References
+    ----------
+    Rao, Proceedings of the Cambridge Philosophical Society 44 (1948) 50-57 (the score test).
+    """
+    if not fit.linearized:
+        fit = relinearize_fit(fit)
+    # What counts of any output.
+    seen = [keep if keep.ndim == 1 else keep.any(axis=1) for keep in fit.counts]
+    p_values = {}
+    for name in axes[0]:
+        values = [of[name] for of in axes]
+        edges = find_bin_edges(
+            np.concatenate([v[use] for v, use in zip(values, seen, strict=True)])
+        )
+        bins = [np.eye(len(edges) - 1)[find_bins(v, edges)] for v in values]
+        count = sum(b[use].sum(axis=0) for b, use in zip(bins, seen, strict=True))
+        bins = [b[:, count >= THRESHOLD.fewest_in_bin] for b in bins]
+        width = bins[0].shape[1]
+        if width < 2:
+            continue
+        kinds = _list_kinds(fit, bins)
+        columns = [
+            (
+                np.concatenate([states for states, _ in parts], axis=-1),
+                np.concatenate([outputs for _, outputs in parts], axis=-1),
+            )
+            for parts in zip(*kinds.values(), strict=True)
+        ]
+        score, left, alone = score_columns(fit, columns)
+        for k, kind in enumerate(kinds):
+            rows = slice(k * width, (k + 1) * width)
+            p_values[f"{kind} by {name}"] = compute_score_probability(
+                score[rows], left[rows, rows], alone[rows]
+            )
+    return p_values
+
+
+def _list_kinds(fit: Fit, bins: Sequence[Array]) -> dict[str, list[Columns]]:
+    """Return what the bins do in each record, by the kind of what depends on the quantity."""
+    outputs, forces = name_noise_places(fit.plant.loop)
+    inputs = fit.plant.e.inputs
+    kinds: dict[str, list[Columns]] = {}
+    for data, lin, chosen in zip(fit.data, fit.linearized, bins, strict=True):
+        nothing = np.zeros((*lin.output.shape, chosen.shape[1]))
+        u = np.reshape(data.u, (len(data.u), -1))
+        away = u - np.mean(u[np.reshape(data.valid, (len(data.valid), -1)).all(axis=1)], axis=0)
+        for j, name in enumerate(forces):
+            pushed = lin.b[:, :, j, None]
+            place = f" at {name}" if len(forces) > 1 else ""
+            one = pushed * chosen[:, None], nothing
+            kinds.setdefault(f"force{place}", []).append(one)
+            for i, entry in enumerate(inputs):
+                sloped = pushed * (chosen * away[:, i, None])[:, None], nothing
+                of = f" of {entry}" if len(inputs) > 1 else ""
+                kinds.setdefault(f"slope{of}{place}", []).append(sloped)
+        still = np.zeros((*lin.dp.shape[:2], chosen.shape[1]))
+        for k, name in enumerate(outputs):
+            read = nothing.copy()
+            read[(slice(None), k) if lin.output.ndim == 2 else ...] = chosen
+            of = f" of {name}" if len(outputs) > 1 else ""
+            kinds.setdefault(f"reading{of}", []).append((still, read))
+    return kinds
+
+
+def compute_score_probability(score: Array, information: Array, alone: Array) -> float:
+    """Return the probability of so large a score if nothing is there: Rao's test.
+
+    What the parameters of the model do as well counts for nothing.
+
+    Parameters
+    ----------
+    score : ndarray, shape (shapes,)
+        The score.
+    information : ndarray, shape (shapes, shapes)
+        Its covariance.
+    alone : ndarray, shape (shapes,)
+        The variances if no parameter were fitted.
+    """
+    size = np.sqrt(np.maximum(alone, THRESHOLD.tiny))
+    values, vectors = np.linalg.eigh(information / np.outer(size, size))
+    use = values > THRESHOLD.seen
+    if not use.any() or not np.isfinite(score).all():
+        return 1.0
+    along = vectors[:, use].T @ (score / size)
+    return float(stats.chi2.sf(float(np.sum(along**2 / values[use])), int(use.sum())))
