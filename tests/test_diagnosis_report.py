@@ -207,6 +207,12 @@ def test_an_error_that_the_effects_bring_in_has_its_place(found):
     quiet = replace(place, p_after=0.3)
     nowhere = text(replace(base, where=(quiet, replace(quiet, output="T"))))
     assert "where the error is: nowhere. In bins of input, the one-step errors" in nowhere
+    # Tests of what depends on a quantity see more than any of its bins alone.
+    seen = replace(base, where=(quiet,), tests={"mean by input": 0.2, "force by input": 1e-9})
+    assert (
+        "where the error is: in no bin of input do the one-step errors differ from noise by "
+        "themselves, but together they show a force that depends on input" in text(seen)
+    )
 
 
 def test_places_of_errors_are_those_of_the_completed_model():

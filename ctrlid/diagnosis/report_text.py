@@ -5,7 +5,7 @@ from __future__ import annotations
 import textwrap
 from typing import TYPE_CHECKING
 
-from .._base.text import write_list, write_number, write_quantity
+from .._base.text import write_number, write_quantity
 from . import wording
 from .findings import Finding, Gap
 
@@ -87,10 +87,7 @@ def write_gap_lines(gap: Gap) -> list[str]:
 def _write_where(found: Diagnosis) -> list[str]:
     places = wording.list_telling_places(found)
     if not places:
-        # Of several outputs the errors of each were looked for along the same axes.
-        axes = write_list(list(dict.fromkeys(p.axis for p in found.where)))
-        nowhere = f"nowhere. In bins of {axes}, the one-step errors are noise."
-        return _wrap_text(f"where the error is: {nowhere if axes else 'not known'}", 2, hang=4)
+        return _wrap_text(f"where the error is: {wording.describe_nowhere(found)}", 2, hang=4)
     same = not found.added
     head = "  where the error is: normalized RMS of the one-step errors (1 for noise)"
     wide = max(12, *(len(place.axis) for place in places))

@@ -101,13 +101,18 @@ def name_test(key: str) -> str:
     for start, words in TESTS_OF.items():
         if key.startswith(start):
             return words + key.removeprefix(start)
-    what, _, quantity = key.partition(" by ")
-    what, _, place = what.partition(" at ")
-    kind, _, signal = what.partition(" of ")
-    if quantity and kind in SHAPES:
+    if is_shape_test(key):
+        what, _, quantity = key.partition(" by ")
+        what, _, place = what.partition(" at ")
+        kind, _, signal = what.partition(" of ")
         words = SHAPES[kind].format(signal or OF_ONE.get(kind, ""))
         return f"{words}{f' at {place}' if place else ''} that depends on {quantity}"
     return TESTS.get(key, key)
+
+
+def is_shape_test(key: str) -> bool:
+    """Whether a test asks if something depends on a quantity: its name ends in ``by`` and that."""
+    return " by " in key and key.split(maxsplit=1)[0] in SHAPES
 
 
 def list_names(finding: Finding) -> list[str]:
@@ -334,6 +339,24 @@ def list_telling_places(found: Diagnosis) -> list[BinnedErrors]:
     first = [p for p in found.where if p.p_before < THRESHOLD.telling][:PLACES]
     left = [p for p in found.where if p.p_after < THRESHOLD.telling and p not in first]
     return first + sorted(left, key=lambda place: place.p_after)[:PLACES]
+
+
+def describe_nowhere(found: Diagnosis) -> str:
+    """Say that no bin of any quantity shows an error by itself, and what all of them show together.
+
+    Of several outputs the errors of each were looked for along the same axes.
+    """
+    axes = write_list(list(dict.fromkeys(p.axis for p in found.where)))
+    if not axes:
+        return "not known"
+    shown = []
+    if found.verdict not in COMPLETE and found.tests:
+        of_shapes = ((p, key) for key, p in found.tests.items() if is_shape_test(key))
+        shown = [key for p, key in sorted(of_shapes) if p < THRESHOLD.telling]
+    if shown:
+        return (f"in no bin of {axes} do the one-step errors differ from noise by themselves, but "
+                f"together they show {name_test(shown[0])}")  # fmt: skip
+    return f"nowhere. In bins of {axes}, the one-step errors are noise."
 
 
 def find_told_rms(place: BinnedErrors, levels: Array) -> float:
